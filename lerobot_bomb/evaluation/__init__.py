@@ -1,0 +1,1 @@
+"""From episode results to rates with intervals."""

@@ -1,0 +1,88 @@
+"""Reads the episode results that ``--env.results_path`` collects and summarises them."""
+
+import argparse
+import json
+from collections import Counter
+from dataclasses import dataclass
+from pathlib import Path
+from statistics import median
+from typing import Any
+
+from lerobot_bomb.schema import PROTOCOL_VERSION
+from lerobot_bomb.stats import format_rate
+
+Row = dict[str, Any]  # the fields of EpisodeResult
+
+
+@dataclass(frozen=True)
+class Summary:
+    """What a results file says: counts over its episodes and errors of the stones that were released."""
+
+    num_episodes: int
+    num_successes: int
+    median_error_mm: float | None  # over the episodes in which the stone was lifted and let go
+    failures: Counter[str]
+
+    def lines(self) -> list[str]:
+        """The summary as text, a line each."""
+        error = "-" if self.median_error_mm is None else f"{self.median_error_mm:.1f} mm"
+        failures = ", ".join(f"{name} {count}" for name, count in self.failures.most_common()) or "none"
+        return [
+            f"success          {format_rate(self.num_successes, self.num_episodes)} (95 % Wilson interval)",
+            f"placement error  {error} (median of the stones that were put down)",
+            f"failures         {failures}",
+        ]
+
+
+def read_results(path: Path) -> list[Row]:
+    """The rows of a JSON-lines results file; of an episode that was run again, the last one.
+
+    Raises:
+        ValueError: the file is missing, empty, not JSON lines, or of another protocol version.
+    """
+    if not path.is_file():
+        raise ValueError(
+            f"{path}: no such results file; lerobot-eval writes it with --env.results_path={path}"
+        )
+    rows: dict[str, Row] = {}
+    for number, line in enumerate(path.read_text().splitlines(), start=1):
+        try:
+            row = json.loads(line)
+            version = row["protocol_version"]
+            rows[json.dumps(row["spec"])] = row
+        except (json.JSONDecodeError, KeyError, TypeError) as error:
+            raise ValueError(f"{path}:{number}: not an episode result ({error!r})") from error
+        if version != PROTOCOL_VERSION:
+            raise ValueError(
+                f"{path}:{number}: protocol_version {version!r}, this package has {PROTOCOL_VERSION!r}; "
+                "results of different versions do not compare"
+            )
+    if not rows:
+        raise ValueError(f"{path}: no finished episode")
+    return list(rows.values())
+
+
+def summarise(rows: list[Row]) -> Summary:
+    """Counts, rates and the median error of episodes."""
+    errors = [row["placement_error_mm"] for row in rows if row["stage"] == "placed"]
+    return Summary(
+        num_episodes=len(rows),
+        num_successes=sum(row["is_success"] for row in rows),
+        median_error_mm=median(errors) if errors else None,
+        failures=Counter(row["failure"] for row in rows if not row["is_success"]),
+    )
+
+
+def add_results_arguments(parser: argparse.ArgumentParser) -> None:
+    """Declare the arguments of ``lerobot-bomb results``."""
+    parser.add_argument("paths", nargs="+", type=Path, metavar="FILE", help="files of --env.results_path")
+
+
+def run_results(args: argparse.Namespace) -> int:
+    """Print a summary of each file."""
+    for path in args.paths:
+        summary = summarise(read_results(path))
+        print(f"{path}: {summary.num_episodes} episodes")
+        for line in summary.lines():
+            print(f"  {line}")
+    return 0

@@ -1,0 +1,262 @@
+"""The one definition of names, shapes and records that BOMB's parts exchange.
+
+numpy only: simulator workers import this module and must start in under a second.
+"""
+
+import dataclasses
+import json
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from enum import StrEnum
+
+import numpy as np
+
+# Version of task, physics, observation and success rule. Results of different versions do not compare.
+PROTOCOL_VERSION = "0.1"
+
+SUITES = ("place",)
+ROBOTS = ("scara",)
+CONTROL_MODES = ("relative", "absolute")
+SPLITS = ("all", "train", "heldout")
+RENDER_PRESETS = ("fast", "shadows")
+CAMERAS = ("workspace", "wrist")
+COLORS = ("black", "white")
+
+DEFAULT_FPS = 10  # control steps per second
+PHYSICS_HZ = 200  # physics steps per second; a multiple of the control rate
+DEFAULT_IMAGE_SIZE = 256  # pixels, square
+MIN_IMAGE_SIZE, MAX_IMAGE_SIZE = 32, 1024
+MAX_EPISODE_STEPS = {"place": 100}  # at DEFAULT_FPS; scaled with fps
+
+STATE_NAMES = ("x", "y", "z", "finger_opening")  # metres, world frame; opening = distance between the pads
+ACTION_NAMES = {"relative": ("dx", "dy", "dz", "gripper"), "absolute": ("x", "y", "z", "gripper")}
+STATE_DIM = len(STATE_NAMES)
+ACTION_DIM = 4
+MAX_STEP_M = 0.040  # metres that a relative action of 1 commands per control step
+
+# Where the point between the pads' lower ends may be commanded, metres. World frame: origin on the table
+# below the board's centre, x along columns, y towards the far row, z up.
+WORKSPACE_LOW_M = (-0.13, -0.13, 0.006)
+WORKSPACE_HIGH_M = (0.21, 0.13, 0.16)
+
+NUM_STONES = 12  # stones in the compiled model: on the board, to be moved, or parked out of sight
+
+
+@dataclass(frozen=True)
+class BoardGeometry:
+    """Sizes of board and stones in metres. Row 0 is the far row (+y), columns run along +x."""
+
+    num_lines: int = 5
+    pitch_m: float = 0.045
+    margin_m: float = 0.035
+    thickness_m: float = 0.005
+    stone_radius_m: float = 0.013
+    stone_height_m: float = 0.009
+
+    def intersection_xy(self, row: int, column: int) -> np.ndarray:
+        """(2,) world xy in metres of an intersection; (0, 0) is the board's centre."""
+        if not (0 <= row < self.num_lines and 0 <= column < self.num_lines):
+            raise ValueError(
+                f"intersection ({row}, {column}) is off the board: "
+                f"row and column must lie in 0..{self.num_lines - 1}"
+            )
+        middle = (self.num_lines - 1) / 2
+        return np.array([(column - middle) * self.pitch_m, (middle - row) * self.pitch_m])
+
+    def nearest_intersection(self, xy: np.ndarray) -> tuple[int, int]:
+        """(row, column) of the intersection nearest to a world xy in metres."""
+        middle = (self.num_lines - 1) / 2
+        column = np.clip(round(xy[0] / self.pitch_m + middle), 0, self.num_lines - 1)
+        row = np.clip(round(middle - xy[1] / self.pitch_m), 0, self.num_lines - 1)
+        return int(row), int(column)
+
+
+BOARD = BoardGeometry()
+
+
+class Stage(StrEnum):
+    """How far an episode got; each stage includes the ones before it."""
+
+    START = "start"
+    REACHED = "reached"
+    GRASPED = "grasped"
+    LIFTED = "lifted"
+    PLACED = "placed"
+
+
+class Failure(StrEnum):
+    """Why an episode failed; exactly one per failed episode."""
+
+    NEVER_REACHED = "never_reached"
+    MISSED_GRASP = "missed_grasp"
+    DROPPED = "dropped"
+    WRONG_STONE = "wrong_stone"
+    WRONG_INTERSECTION = "wrong_intersection"
+    IMPRECISE = "imprecise"
+    DISTURBED_OTHERS = "disturbed_others"
+    TIMEOUT_HOLDING = "timeout_holding"
+
+
+@dataclass(frozen=True)
+class EpisodeSpec:
+    """Everything that, with the code's version, determines an episode bit for bit."""
+
+    seed: int
+    suite: str = "place"
+    robot: str = "scara"
+    split: str = "all"
+    control_mode: str = "relative"
+    fps: int = DEFAULT_FPS
+    # (row, column) and colour; None draws them from the seed
+    target: tuple[int, int] | None = None
+    color: str | None = None
+    success_tolerance_mm: float = 10.0
+
+    def __post_init__(self) -> None:
+        one_of("--env.task", self.suite, SUITES)
+        one_of("--env.robot", self.robot, ROBOTS)
+        one_of("--env.split", self.split, SPLITS)
+        one_of("--env.control_mode", self.control_mode, CONTROL_MODES)
+        if self.seed < 0:
+            raise ValueError(f"--seed={self.seed} must not be negative")
+        if not (0 < self.fps <= PHYSICS_HZ and PHYSICS_HZ % self.fps == 0):
+            divisors = [n for n in range(1, PHYSICS_HZ + 1) if PHYSICS_HZ % n == 0]
+            raise ValueError(
+                f"--env.fps={self.fps} does not divide the physics rate of {PHYSICS_HZ} Hz; "
+                f"choose one of: {', '.join(map(str, divisors))}"
+            )
+        if self.target is not None:
+            self._check_target(self.target)
+        if self.color is not None:
+            one_of("--env.color", self.color, COLORS)
+        if not 0 < self.success_tolerance_mm <= 1000 * BOARD.pitch_m / 2:
+            raise ValueError(
+                f"--env.success_tolerance_mm={self.success_tolerance_mm} must lie between 0 and half the "
+                f"pitch, {1000 * BOARD.pitch_m / 2} mm: beyond it a stone would be on two intersections"
+            )
+
+    @staticmethod
+    def _check_target(target: tuple[int, int]) -> None:
+        if len(target) != 2 or not all(0 <= line < BOARD.num_lines for line in target):
+            raise ValueError(
+                f"--env.target={list(target)} is off the board; "
+                f"give [row, column], each in 0..{BOARD.num_lines - 1}"
+            )
+
+    def for_task(self, task_id: int) -> "EpisodeSpec":
+        """This spec with target and colour of a numbered task: 25 x colour + 5 x row + column."""
+        num_targets = BOARD.num_lines**2
+        num_tasks = num_targets * len(COLORS)
+        if not 0 <= task_id < num_tasks:
+            raise ValueError(f"--env.task_ids has {task_id}; {self.suite!r} has tasks 0..{num_tasks - 1}")
+        color, point = divmod(task_id, num_targets)
+        target = divmod(point, BOARD.num_lines)
+        return dataclasses.replace(self, target=target, color=COLORS[color])
+
+    def to_dict(self) -> dict[str, object]:
+        """JSON-ready dict."""
+        return dataclasses.asdict(self)
+
+
+@dataclass(frozen=True)
+class RenderOptions:
+    """What the cameras deliver; it changes the observation, never the physics."""
+
+    image_size: int = DEFAULT_IMAGE_SIZE  # width and height in pixels
+    preset: str = "fast"
+
+    def __post_init__(self) -> None:
+        one_of("--env.render_preset", self.preset, RENDER_PRESETS)
+        if not MIN_IMAGE_SIZE <= self.image_size <= MAX_IMAGE_SIZE:
+            raise ValueError(
+                f"--env.image_size={self.image_size} must lie in {MIN_IMAGE_SIZE}..{MAX_IMAGE_SIZE} pixels"
+            )
+
+
+@dataclass(frozen=True)
+class EpisodeResult:
+    """Outcome of one episode; one JSON line in a results file."""
+
+    spec: EpisodeSpec
+    instruction: str
+    target: tuple[int, int]
+    color: str
+    steps: int
+    is_success: bool
+    is_success_bomb_v0: bool
+    failure: str | None
+    stage: str
+    placement_error_mm: float
+    nearest_intersection: tuple[int, int]
+    collateral_mm: float
+    protocol_version: str = PROTOCOL_VERSION
+
+    def to_json(self) -> str:
+        """One line of JSON, keys in the order of the fields."""
+        return json.dumps(dataclasses.asdict(self))
+
+
+@dataclass(frozen=True)
+class PrivilegedState:
+    """The simulator's true state, which the expert reads and no trained policy sees.
+
+    Stones that are parked (not part of the episode) have ``stone_in_play`` False.
+    """
+
+    gripper_xyz: np.ndarray  # (3,) metres, point between the pads' lower ends
+    finger_opening: float  # metres between the pads
+    target_xyz: np.ndarray  # (3,) metres, centre of a stone that rests on the target
+    stone: int  # index of the stone to be moved
+    stone_xyz: np.ndarray = field(repr=False)  # (NUM_STONES, 3) metres, centres
+    stone_is_white: np.ndarray = field(repr=False)  # (NUM_STONES,) bool
+    stone_in_play: np.ndarray = field(repr=False)  # (NUM_STONES,) bool
+    stage: Stage = Stage.START
+
+    DIM = 3 + 1 + 3 + 1 + 1 + 5 * NUM_STONES
+
+    def to_vector(self) -> np.ndarray:
+        """(DIM,) float32, the observation ``environment_state``."""
+        stones = np.concatenate(
+            [self.stone_xyz, self.stone_is_white[:, None], self.stone_in_play[:, None]], axis=1
+        )
+        head = [
+            *self.gripper_xyz,
+            self.finger_opening,
+            *self.target_xyz,
+            self.stone,
+            list(Stage).index(self.stage),
+        ]
+        return np.concatenate([head, stones.ravel()]).astype(np.float32)
+
+    @classmethod
+    def from_vector(cls, vector: np.ndarray) -> "PrivilegedState":
+        """Inverse of `to_vector`, in float64."""
+        vector = np.asarray(vector, dtype=np.float64)
+        if vector.shape != (cls.DIM,):
+            raise ValueError(f"environment_state has shape {vector.shape}, expected ({cls.DIM},)")
+        stones = vector[9:].reshape(NUM_STONES, 5)
+        return cls(
+            gripper_xyz=vector[0:3],
+            finger_opening=float(vector[3]),
+            target_xyz=vector[4:7],
+            stone=int(vector[7]),
+            stage=list(Stage)[int(vector[8])],
+            stone_xyz=stones[:, 0:3],
+            stone_is_white=stones[:, 3] > 0.5,
+            stone_in_play=stones[:, 4] > 0.5,
+        )
+
+
+def action_bounds(control_mode: str) -> tuple[np.ndarray, np.ndarray]:
+    """(low, high), each (ACTION_DIM,) float32, of the action space in the environment's units."""
+    if control_mode == "absolute":
+        low, high = (*WORKSPACE_LOW_M, -1.0), (*WORKSPACE_HIGH_M, 1.0)
+    else:
+        low, high = (-1.0,) * ACTION_DIM, (1.0,) * ACTION_DIM
+    return np.array(low, dtype=np.float32), np.array(high, dtype=np.float32)
+
+
+def one_of(flag: str, value: object, allowed: tuple | Mapping) -> None:
+    """Raise a ValueError that names flag, value and choices unless value is allowed."""
+    if value not in allowed:
+        raise ValueError(f"{flag}={value!r} is unknown; choose one of: {', '.join(map(str, allowed))}")

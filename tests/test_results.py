@@ -1,0 +1,69 @@
+import json
+from pathlib import Path
+
+import pytest
+
+from lerobot_bomb.cli import main
+from lerobot_bomb.evaluation.results import read_results, summarise
+
+
+def row(
+    seed: int, failure: str | None = None, error: float = 1.0, stage: str = "placed", **other: object
+) -> str:
+    values = {
+        "spec": {"seed": seed},
+        "is_success": failure is None,
+        "failure": failure,
+        "stage": stage,
+        "placement_error_mm": error,
+        "protocol_version": "0.1",
+    }
+    return json.dumps(values | other) + "\n"
+
+
+def test_summary_counts_successes_errors_and_failures(tmp_path: Path) -> None:
+    path = tmp_path / "results.jsonl"
+    lines = [row(0), row(1, error=3.0), row(2, "imprecise", 14.0), row(3, "never_reached", 200.0, "start")]
+    path.write_text("".join(lines))
+    summary = summarise(read_results(path))
+    assert (summary.num_episodes, summary.num_successes) == (4, 2)
+    assert summary.median_error_mm == 3.0  # of 1, 3 and 14: the stone that was never lifted has none
+    assert summary.failures == {"imprecise": 1, "never_reached": 1}
+
+
+def test_an_episode_that_was_run_again_counts_once(tmp_path: Path) -> None:
+    path = tmp_path / "results.jsonl"
+    path.write_text(row(0, "dropped") + row(1) + row(0))
+    assert summarise(read_results(path)).num_successes == 2
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("", "no finished episode"),
+        ("not json\n", "results.jsonl:1: not an episode result"),
+        (row(0) + "{}\n", "results.jsonl:2: not an episode result"),
+        (row(0, protocol_version="0.0"), "protocol_version '0.0', this package has '0.1'"),
+    ],
+)
+def test_bad_files_are_named_with_the_line(tmp_path: Path, text: str, message: str) -> None:
+    path = tmp_path / "results.jsonl"
+    path.write_text(text)
+    with pytest.raises(ValueError, match=message):
+        read_results(path)
+
+
+def test_the_command_prints_a_summary(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    path = tmp_path / "results.jsonl"
+    path.write_text(row(0) + row(1, "dropped"))
+    assert main(["results", str(path)]) == 0
+    output = capsys.readouterr().out
+    assert "1/2 = 50.0 %" in output
+    assert "dropped 1" in output
+
+
+def test_the_command_fails_in_one_line(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["results", str(tmp_path / "absent.jsonl")]) == 1
+    error = capsys.readouterr().err
+    assert "absent.jsonl: no such results file" in error
+    assert error.count("\n") == 1
