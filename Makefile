@@ -1,0 +1,46 @@
+# `make` finds a Python >= 3.12 by itself; name one with `make PYTHON=/path/to/python3.12 ...`.
+SHELL := /bin/bash
+.DEFAULT_GOAL := help
+.PHONY: help setup demo test test-long check clean
+
+BIN := .venv/bin
+STAMP := .venv/.installed
+# two torch threads beside another job are many times slower than one
+export OMP_NUM_THREADS ?= 1
+
+help:
+	@echo "make demo       set up, record, train, evaluate; about 10 minutes on 2 cores"
+	@echo "make test       set up and run the tests"
+	@echo "make test-long  the heavy tests as well"
+	@echo "make check      ruff, format, pyright"
+	@echo "make setup      only set up .venv"
+
+setup: $(STAMP)
+	@$(BIN)/python -c "from lerobot_env_bomb.backend import ensure_gl_backend; ensure_gl_backend()" \
+		|| { echo "Set-up is done, but rendering does not work, see above." >&2; exit 1; }
+
+$(STAMP): pyproject.toml constraints.txt lerobot_bomb/__init__.py
+	@python="$$(bash .ci/find-python $(PYTHON))" || exit 1; \
+	$(BIN)/python -c 'import sys; sys.exit(sys.version_info < (3, 12))' 2>/dev/null || \
+		{ echo "Creating .venv with $$python"; "$$python" -m venv --clear .venv || exit 1; }
+	@if [ ! -x $(BIN)/uv ]; then echo "Installing uv into .venv"; $(BIN)/python -m pip install -q uv || exit 1; fi
+	@echo "Installing packages under constraints.txt"
+	@$(BIN)/uv pip install -q -p $(BIN)/python -c constraints.txt -e . --group dev
+	@touch $@
+
+demo: setup
+	@$(BIN)/lerobot-bomb demo
+
+test: setup
+	@$(BIN)/pytest -m "not long"
+
+test-long: setup
+	@$(BIN)/pytest
+
+check: $(STAMP)
+	@$(BIN)/ruff check .
+	@$(BIN)/ruff format --check .
+	@$(BIN)/pyright
+
+clean:
+	rm -rf .venv

@@ -1,0 +1,159 @@
+"""How well the scripted expert does on suite `place`.
+
+    python benchmarks/expert.py --episodes 500 --workers 2 --json expert.json
+
+Prints success with its 95 % Wilson interval, placement error, what happened to the other stones, steps,
+idle steps, and every failure with its seed.
+"""
+
+import argparse
+import json
+import multiprocessing
+from collections import defaultdict
+from collections.abc import Iterable
+from dataclasses import dataclass
+from functools import partial
+from pathlib import Path
+
+import numpy as np
+from tqdm import tqdm
+
+from lerobot_bomb.expert import expert_action
+from lerobot_bomb.schema import (
+    BOARD,
+    CONTROL_MODES,
+    DEFAULT_FPS,
+    MAX_STEP_M,
+    MIN_IMAGE_SIZE,
+    SPLITS,
+    EpisodeSpec,
+    PrivilegedState,
+    RenderOptions,
+)
+from lerobot_bomb.stats import format_rate
+from lerobot_env_bomb.env import BombEnv
+
+PRECISE_MM = 5.0
+IDLE_TRANSLATION_M = 0.0005  # commanded by a step; less counts as none
+IDLE_FINGERS_M = 0.0002  # change of the opening over a step; less counts as none
+NOISE_STREAM = 1000  # apart from the streams that an episode is drawn from
+
+
+@dataclass(frozen=True)
+class Outcome:
+    """One episode of the expert."""
+
+    seed: int
+    is_success: bool
+    is_success_bomb_v0: bool
+    failure: str | None
+    error_mm: float
+    collateral_mm: float
+    steps: int
+    idle_steps: tuple[int, ...]  # which steps
+
+
+def run_episode(seed: int, control_mode: str, fps: int, split: str, noise: float) -> Outcome:
+    """Let the expert play one episode; `noise` is the standard deviation added to x, y, z, 1 = 40 mm."""
+    spec = EpisodeSpec(seed=seed, control_mode=control_mode, fps=fps, split=split)
+    env = BombEnv(spec, RenderOptions(image_size=MIN_IMAGE_SIZE))
+    rng = np.random.default_rng([seed, NOISE_STREAM])
+    unit_m = MAX_STEP_M if control_mode == "relative" else 1.0
+    observation, _ = env.reset()
+    idle, ended, step = [], False, 0
+    while not ended:
+        before = PrivilegedState.from_vector(observation["environment_state"])
+        action = expert_action(before, control_mode, fps)
+        executed = action.copy()
+        executed[:3] += noise * MAX_STEP_M / unit_m * rng.standard_normal(3)
+        observation, _, terminated, truncated, _ = env.step(executed)
+        after = PrivilegedState.from_vector(observation["environment_state"])
+        if is_idle(action, before, after, control_mode) and not is_done(before, spec.success_tolerance_mm):
+            idle.append(step)
+        ended, step = terminated or truncated, step + 1
+    result = env.episode_result()
+    env.close()
+    return Outcome(
+        seed=seed,
+        is_success=result.is_success,
+        is_success_bomb_v0=result.is_success_bomb_v0,
+        failure=result.failure,
+        error_mm=result.placement_error_mm,
+        collateral_mm=result.collateral_mm,
+        steps=result.steps,
+        idle_steps=tuple(idle),
+    )
+
+
+def is_idle(action: np.ndarray, before: PrivilegedState, after: PrivilegedState, control_mode: str) -> bool:
+    """Whether a step neither commands a translation nor moves the fingers."""
+    commanded_m = action[:3] * MAX_STEP_M if control_mode == "relative" else action[:3] - before.gripper_xyz
+    fingers_m = abs(after.finger_opening - before.finger_opening)
+    return bool(np.linalg.norm(commanded_m) < IDLE_TRANSLATION_M and fingers_m < IDLE_FINGERS_M)
+
+
+def is_done(state: PrivilegedState, tolerance_mm: float) -> bool:
+    """Whether the stone lies on the target and the fingers, open, have left it."""
+    stone_xyz = state.stone_xyz[state.stone]
+    error_mm = 1e3 * np.linalg.norm((stone_xyz - state.target_xyz)[:2])
+    is_clear = state.gripper_xyz[2] > stone_xyz[2] + BOARD.stone_height_m
+    is_open = state.finger_opening > 2 * BOARD.stone_radius_m
+    return bool(error_mm <= tolerance_mm and is_clear and is_open)
+
+
+def summarize(outcomes: list[Outcome]) -> dict[str, object]:
+    """Figures of all episodes, ready for JSON."""
+    n = len(outcomes)
+    error_mm = np.array([o.error_mm for o in outcomes])
+    failures = defaultdict(list)
+    for o in outcomes:
+        if o.failure is not None:
+            failures[str(o.failure)].append(o.seed)
+    return {
+        "success": format_rate(sum(o.is_success for o in outcomes), n),
+        "success_bomb_v0": format_rate(sum(o.is_success_bomb_v0 for o in outcomes), n),
+        "success_within_5_mm": format_rate(
+            sum(o.is_success and o.error_mm <= PRECISE_MM for o in outcomes), n
+        ),
+        "error_mm_median_p95_max": [round(float(np.percentile(error_mm, q)), 3) for q in (50, 95, 100)],
+        "collateral_mm_max": round(max(o.collateral_mm for o in outcomes), 3),
+        "steps_median_max": [float(np.median([o.steps for o in outcomes])), max(o.steps for o in outcomes)],
+        "idle_steps": sum(len(o.idle_steps) for o in outcomes),
+        "seeds_with_idle_steps": [o.seed for o in outcomes if o.idle_steps],
+        "failures": dict(failures),
+    }
+
+
+def main() -> None:
+    """Run the benchmark from the command line."""
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument("--episodes", type=int, default=500)
+    parser.add_argument("--seed", type=int, default=0, help="of the first episode; the others count up")
+    parser.add_argument("--control-mode", choices=CONTROL_MODES, default="relative")
+    parser.add_argument("--fps", type=int, default=DEFAULT_FPS)
+    parser.add_argument("--split", choices=SPLITS, default="all")
+    parser.add_argument(
+        "--noise", type=float, default=0.0, help="standard deviation added to x, y, z; 1 = 40 mm"
+    )
+    parser.add_argument("--workers", type=int, default=1)
+    parser.add_argument("--json", type=Path, help="write figures and episodes here")
+    args = parser.parse_args()
+
+    run = partial(
+        run_episode, control_mode=args.control_mode, fps=args.fps, split=args.split, noise=args.noise
+    )
+    with multiprocessing.get_context("forkserver").Pool(args.workers) as pool:
+        results: Iterable[Outcome] = pool.imap(run, range(args.seed, args.seed + args.episodes), chunksize=4)
+        outcomes = list(tqdm(results, total=args.episodes, unit="episode"))
+    figures = summarize(outcomes)
+    for name, value in figures.items():
+        print(f"{name:24} {value}")
+    if args.json:
+        episodes = [vars(o) for o in outcomes]
+        args.json.write_text(json.dumps({"figures": figures, "episodes": episodes}, indent=1) + "\n")
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,20 @@
+"""BOMB's simulator: a SCARA arm that places Go stones, as Gymnasium environments.
+
+Imports neither torch nor lerobot, so that an environment's worker process starts fast; only
+``configuration_bomb`` does, and nothing here imports it.
+"""
+
+import gymnasium
+
+from lerobot_bomb.schema import CONTROL_MODES, SUITES, EpisodeSpec
+
+# Gymnasium id -> what an episode of it is: bomb/place-v0 (relative control), bomb/place-absolute-v0
+GYM_IDS = {
+    f"bomb/{suite}{'' if mode == 'relative' else '-' + mode}-v0": EpisodeSpec(0, suite, control_mode=mode)
+    for suite in SUITES
+    for mode in CONTROL_MODES
+}
+
+for _gym_id, _spec in GYM_IDS.items():
+    # the env truncates by itself, so no max_episode_steps
+    gymnasium.register(_gym_id, entry_point="lerobot_env_bomb.env:BombEnv", kwargs={"spec": _spec})

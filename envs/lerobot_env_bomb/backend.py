@@ -1,0 +1,85 @@
+"""Chooses MuJoCo's OpenGL backend before mujoco is imported."""
+
+import importlib
+import os
+import platform
+import subprocess
+import sys
+
+BACKENDS = ("egl", "osmesa", "glfw")
+PACKAGES = {"egl": "libegl1 libgl1", "osmesa": "libosmesa6"}  # headless ones, in order of speed
+PROBE_TIMEOUT_S = 60
+_PROBE = """
+import mujoco
+context = mujoco.GLContext(16, 16)
+context.make_current()
+context.free()
+"""
+
+
+class NoOpenGLError(RuntimeError):
+    """MuJoCo cannot render on this machine."""
+
+
+def probe(backend: str) -> str:
+    """Try a backend in a fresh process; return '' when it renders, else the last line of its error."""
+    env = os.environ | {"MUJOCO_GL": backend, "PYOPENGL_PLATFORM": backend}
+    try:
+        run = subprocess.run(
+            [sys.executable, "-c", _PROBE], env=env, capture_output=True, text=True, timeout=PROBE_TIMEOUT_S
+        )
+    except subprocess.TimeoutExpired:
+        return f"no answer in {PROBE_TIMEOUT_S} s"
+    if run.returncode == 0:
+        return ""
+    lines = run.stderr.strip().splitlines()
+    return lines[-1] if lines else f"the probe ended with exit code {run.returncode}"
+
+
+def ensure_gl_backend() -> str:
+    """Set MUJOCO_GL (and PYOPENGL_PLATFORM) to a backend that renders and return its name.
+
+    Call it before mujoco is first imported. A backend named by MUJOCO_GL is not probed, so child
+    processes, which inherit it, lose no time. Off Linux, MuJoCo's own default is kept.
+
+    Raises:
+        NoOpenGLError: no backend can render; the message names the Debian packages to install.
+        ValueError: MUJOCO_GL holds an unknown name.
+    """
+    chosen = os.environ.get("MUJOCO_GL", "").lower()
+    if platform.system() != "Linux":
+        return "default"
+    if chosen and chosen not in BACKENDS:
+        raise ValueError(f"MUJOCO_GL={chosen!r} cannot render; choose one of: {', '.join(BACKENDS)}")
+    if not chosen:
+        chosen = _first_working_backend()
+        if "mujoco" in sys.modules:
+            raise NoOpenGLError(
+                "mujoco was imported before an OpenGL backend was chosen; "
+                f"import lerobot_env_bomb.env first, or set MUJOCO_GL={chosen}"
+            )
+    os.environ["MUJOCO_GL"] = chosen
+    # PyOpenGL reads a variable of its own; one left over from another backend makes mujoco raise.
+    if chosen in PACKAGES:
+        os.environ["PYOPENGL_PLATFORM"] = chosen
+    try:
+        importlib.import_module("mujoco")
+    except (AttributeError, ImportError) as error:
+        # this is how a missing libEGL or libOSMesa shows
+        raise NoOpenGLError(_install_advice({chosen: str(error)})) from error
+    return chosen
+
+
+def _first_working_backend() -> str:
+    causes = {}
+    for backend in PACKAGES:
+        causes[backend] = probe(backend)
+        if not causes[backend]:
+            return backend
+    raise NoOpenGLError(_install_advice(causes))
+
+
+def _install_advice(causes: dict[str, str]) -> str:
+    installs = " or ".join(f"`apt-get install {packages}` ({name})" for name, packages in PACKAGES.items())
+    tried = "; ".join(f"{name}: {cause}" for name, cause in causes.items())
+    return f"MuJoCo found no OpenGL library to render with. On Debian or Ubuntu: {installs}. Tried {tried}"

@@ -1,0 +1,125 @@
+"""LeRobot's env type ``bomb``. The only module of this package that imports LeRobot."""
+
+from dataclasses import dataclass, field
+from functools import partial
+from pathlib import Path
+from typing import Any, cast
+
+from lerobot.configs import FeatureType, PolicyFeature
+from lerobot.envs import EnvConfig
+from lerobot.utils.constants import ACTION, OBS_IMAGES, OBS_STATE
+
+from lerobot_bomb.schema import ACTION_DIM, CAMERAS, DEFAULT_FPS, STATE_DIM, EpisodeSpec, RenderOptions
+from lerobot_env_bomb.vector import LazyVectorEnv
+
+AGENT_POS = "agent_pos"
+
+
+@EnvConfig.register_subclass("bomb")
+@dataclass
+class BombEnvConfig(EnvConfig):
+    """Flags of ``--env.type=bomb``; every check happens before an environment is built."""
+
+    # suite: place
+    task: str | None = "place"
+    # numbered tasks, 25 x colour + 5 x row + column with black = 0, white = 1; unset draws one per episode
+    task_ids: list[int] | None = None
+    # control steps per second; a divisor of 200
+    fps: int = DEFAULT_FPS
+    # arm: scara
+    robot: str = "scara"
+    # relative: dx, dy, dz in units of 40 mm; absolute: x, y, z in metres
+    control_mode: str = "relative"
+    # intersections, templates and table colours to draw from: all, train or heldout
+    split: str = "all"
+    # target [row, column]; unset draws one per episode
+    target: list[int] | None = None
+    # colour of the stone to be moved: black or white; unset draws one per episode
+    color: str | None = None
+    # width and height of each camera in pixels
+    image_size: int = 256
+    # fast (no shadows) or shadows
+    render_preset: str = "fast"
+    # distance from the intersection within which a placement counts
+    success_tolerance_mm: float = 10.0
+    # file that gets one JSON line per finished episode: seed, target, error, failure class
+    results_path: str | None = None
+    features: dict[str, PolicyFeature] = field(default_factory=dict)
+    features_map: dict[str, str] = field(default_factory=dict)
+
+    def __post_init__(self) -> None:
+        self.gym_kwargs  # noqa: B018  an invalid flag raises here, before anything is built
+        image = PolicyFeature(type=FeatureType.VISUAL, shape=(self.image_size, self.image_size, 3))
+        cameras = [f"{OBS_IMAGES}.{camera}" for camera in CAMERAS]
+        self.features = {
+            ACTION: PolicyFeature(type=FeatureType.ACTION, shape=(ACTION_DIM,)),
+            AGENT_POS: PolicyFeature(type=FeatureType.STATE, shape=(STATE_DIM,)),
+            **dict.fromkeys(cameras, image),
+        }
+        self.features_map = {ACTION: ACTION, AGENT_POS: OBS_STATE, **{key: key for key in cameras}}
+
+    @property
+    def gym_id(self) -> str:
+        """Gymnasium id of the same environment."""
+        return f"bomb/{self.task}-v0"
+
+    @property
+    def specs(self) -> dict[int, EpisodeSpec]:
+        """The spec of each task id; {0: spec} where targets and colours are drawn per episode."""
+        if self.task_ids == []:
+            raise ValueError("--env.task_ids=[] selects no task; leave it out to draw one per episode")
+        if self.task_ids and (self.target or self.color):
+            raise ValueError("--env.task_ids fixes targets and colours; drop --env.target and --env.color")
+        spec = EpisodeSpec(
+            seed=0,
+            suite=str(self.task),
+            robot=self.robot,
+            split=self.split,
+            control_mode=self.control_mode,
+            fps=self.fps,
+            target=None if self.target is None else cast("tuple[int, int]", tuple(self.target)),
+            color=self.color,
+            success_tolerance_mm=self.success_tolerance_mm,
+        )
+        if self.task_ids is None:
+            return {0: spec}
+        return {task_id: spec.for_task(task_id) for task_id in self.task_ids}
+
+    @property
+    def gym_kwargs(self) -> dict[str, Any]:
+        """Arguments of `BombEnv` for the first task."""
+        return {
+            "spec": next(iter(self.specs.values())),
+            "render_options": RenderOptions(image_size=self.image_size, preset=self.render_preset),
+            "results_path": self.results_path,
+        }
+
+    def create_envs(self, n_envs: int, use_async_envs: bool = False) -> dict[str, dict[int, LazyVectorEnv]]:
+        """{suite: {task id: vector env of n_envs}}; no worker starts before the first reset.
+
+        Raises:
+            NoOpenGLError: MuJoCo cannot render on this machine.
+            ValueError: --env.results_path cannot be written.
+        """
+        from lerobot_env_bomb.env import BombEnv  # chooses an OpenGL backend, imports MuJoCo
+
+        self._prepare_results_path()
+        return {
+            str(self.task): {
+                task_id: LazyVectorEnv(
+                    [partial(BombEnv, **(self.gym_kwargs | {"spec": spec}))] * n_envs,
+                    use_async=use_async_envs and n_envs > 1,
+                )
+                for task_id, spec in self.specs.items()
+            }
+        }
+
+    def _prepare_results_path(self) -> None:
+        if self.results_path is None:
+            return
+        path = Path(self.results_path)
+        try:
+            path.parent.mkdir(parents=True, exist_ok=True)
+            path.open("a").close()
+        except OSError as error:
+            raise ValueError(f"--env.results_path={path} cannot be written: {error}") from error

@@ -1,0 +1,260 @@
+"""BOMB as a Gymnasium environment."""
+
+import os
+from dataclasses import dataclass, replace
+from typing import Any
+
+import gymnasium
+import numpy as np
+from gymnasium import spaces
+from gymnasium.error import ResetNeeded
+
+from lerobot_bomb.schema import (
+    ACTION_DIM,
+    CAMERAS,
+    DEFAULT_FPS,
+    MAX_EPISODE_STEPS,
+    MAX_STEP_M,
+    NUM_STONES,
+    PHYSICS_HZ,
+    EpisodeResult,
+    EpisodeSpec,
+    PrivilegedState,
+    RenderOptions,
+    Stage,
+)
+from lerobot_env_bomb.judge import Judge
+from lerobot_env_bomb.render import CameraRenderer, compose_caption
+from lerobot_env_bomb.scene import MAX_HALF_OPENING_M, WORKSPACE_HIGH, WORKSPACE_LOW, Scene
+from lerobot_env_bomb.task import STONE, Episode, check_target, sample_episode
+
+Observation = dict[str, Any]
+DEFAULT_SPEC = EpisodeSpec(seed=0)
+DEFAULT_RENDER_OPTIONS = RenderOptions()
+PERSON_IMAGE_SIZE = 384  # pixels, either half of render()'s picture
+# Bounds of what the simulator can report, metres. Stones can be flung off the board, so they are wide.
+POSITION_LIMIT_M = 100.0
+
+
+@dataclass(frozen=True)
+class _Run:
+    """What exists once an episode has been started."""
+
+    scene: Scene
+    episode: Episode
+    judge: Judge
+
+
+class BombEnv(gymnasium.Env[Observation, np.ndarray]):
+    """Task: place a Go stone on the intersection that a sentence names by row and column.
+
+    Randomizations: target (always free and legal), colour, sentence, 0-8 stones on the board, gripper
+    and stone at the start.
+    Success: see `Judge`. Reward is 1 on the step that ends in success, else 0.
+
+    Action: float32 (4,). Relative: x, y, z in units of MAX_STEP_M per control step from where the
+    gripper is; absolute: x, y, z in metres. The fourth opens the fingers at >= 0 and closes them below.
+    Once an episode has ended, `step` returns its last transition until `reset`.
+    """
+
+    metadata = {"render_modes": ["rgb_array"], "render_fps": DEFAULT_FPS}  # noqa: RUF012
+
+    def __init__(
+        self,
+        spec: EpisodeSpec = DEFAULT_SPEC,
+        render_options: RenderOptions = DEFAULT_RENDER_OPTIONS,
+        results_path: str | None = None,
+        render_mode: str = "rgb_array",
+    ):
+        check_target(spec)
+        if render_mode not in self.metadata["render_modes"]:
+            raise ValueError(f"render_mode={render_mode!r} is unknown; choose one of: rgb_array")
+        self._num_substeps = PHYSICS_HZ // spec.fps
+        self.metadata = {"render_modes": ["rgb_array"], "render_fps": spec.fps}
+        self.render_mode = render_mode
+        self.task = spec.suite
+        self.task_description = ""
+        self._max_episode_steps = round(MAX_EPISODE_STEPS[spec.suite] * spec.fps / DEFAULT_FPS)
+        self._spec = spec
+        self._render_options = render_options
+        self._results_path = results_path
+        self.action_space = action_space(spec.control_mode)
+        self._action_low, self._action_high = self.action_space.low, self.action_space.high
+        self.observation_space = observation_space(render_options.image_size)
+        self._current_run: _Run | None = None
+        self._renderer: CameraRenderer | None = None
+        self._steps = 0
+        self._last_transition: tuple | None = None
+
+    def reset(
+        self, *, seed: int | None = None, options: dict[str, Any] | None = None
+    ) -> tuple[Observation, dict[str, Any]]:
+        """Start an episode: of `seed`, else of the spec's seed at first, else of a fresh one.
+
+        `options` has no effect; vector environments pass theirs on.
+        """
+        if seed is None and self._current_run is None:
+            seed = self._spec.seed
+        super().reset(seed=seed)
+        if seed is None:
+            seed = int(self.np_random.integers(2**31))
+        episode = sample_episode(replace(self._spec, seed=int(seed)))
+        scene = self._current_run.scene if self._current_run is not None else Scene()
+        scene.reset(episode.layout)
+        self._current_run = _Run(scene, episode, Judge(episode, self._spec.fps, scene.measure()))
+        self.task_description = episode.instruction
+        self._steps = 0
+        self._last_transition = None
+        return self._observe(), self._info()
+
+    def step(self, action: np.ndarray) -> tuple[Observation, float, bool, bool, dict[str, Any]]:
+        """Run one control step. An action outside the action space is clipped."""
+        run = self._run
+        target_xyz, open_fingers = self._decode(action)
+        if self._last_transition is not None:
+            return self._last_transition
+        run.scene.move(target_xyz, open_fingers, self._num_substeps)
+        self._steps += 1
+        terminated = run.judge.update(run.scene.measure())
+        truncated = not terminated and self._steps >= self._max_episode_steps
+        if truncated:
+            run.judge.time_out()
+        transition = (self._observe(), float(run.judge.is_success), terminated, truncated, self._info())
+        if terminated or truncated:
+            self._last_transition = (transition[0], 0.0, *transition[2:])
+            self._write_result()
+        return transition
+
+    def render(self) -> np.ndarray:
+        """(H, W, 3) uint8 picture for people: both cameras, the instruction, how the episode stands."""
+        run = self._run
+        pictures = [self._draw(camera, PERSON_IMAGE_SIZE) for camera in CAMERAS]
+        row, column = run.episode.target
+        error_mm = run.judge.placement_error_mm
+        outcome = "success" if run.judge.is_success else run.judge.failure or run.judge.stage
+        status = f"target row {row}, column {column}   error {error_mm:.0f} mm   {outcome}"
+        return compose_caption(pictures, [run.episode.instruction, status])
+
+    def episode_result(self) -> EpisodeResult:
+        """What became of the episode that has just ended."""
+        if self._last_transition is None:
+            raise ResetNeeded("the episode has not ended yet")
+        episode, judge = self._run.episode, self._run.judge
+        return EpisodeResult(
+            spec=episode.spec,
+            instruction=episode.instruction,
+            target=episode.target,
+            color=episode.color,
+            steps=self._steps,
+            is_success=judge.is_success,
+            is_success_bomb_v0=judge.is_success_bomb_v0,
+            failure=judge.failure,
+            stage=judge.stage,
+            placement_error_mm=judge.placement_error_mm,
+            nearest_intersection=judge.nearest_intersection,
+            collateral_mm=judge.collateral_mm,
+        )
+
+    def close(self) -> None:
+        """Free the OpenGL context."""
+        if self._renderer is not None:
+            self._renderer.close()
+            self._renderer = None
+
+    def privileged_state(self) -> PrivilegedState:
+        """The simulator's true state."""
+        run = self._run
+        now = run.scene.measure()
+        return PrivilegedState(
+            gripper_xyz=now.gripper_xyz,
+            finger_opening=now.finger_opening,
+            target_xyz=run.episode.target_xyz,
+            stone=STONE,
+            stone_xyz=now.stone_xyz,
+            stone_is_white=run.episode.layout.stone_is_white,
+            stone_in_play=run.episode.layout.stone_in_play,
+            stage=run.judge.stage,
+        )
+
+    @property
+    def _run(self) -> _Run:
+        if self._current_run is None:
+            raise ResetNeeded("call reset before anything else")
+        return self._current_run
+
+    def _decode(self, action: np.ndarray) -> tuple[np.ndarray, bool]:
+        """Action -> (3,) commanded position in metres, whether to open the fingers."""
+        action = np.asarray(action, dtype=np.float64)
+        if action.shape != (ACTION_DIM,):
+            raise ValueError(f"action has shape {action.shape}, expected ({ACTION_DIM},)")
+        if not np.isfinite(action).all():
+            raise ValueError(f"action {action.tolist()} is not finite")
+        action = np.clip(action, self._action_low, self._action_high)
+        open_fingers = bool(action[3] >= 0)
+        if self._spec.control_mode == "absolute":
+            return action[:3], open_fingers
+        return self._run.scene.measure().gripper_xyz + MAX_STEP_M * action[:3], open_fingers
+
+    def _observe(self) -> Observation:
+        state = self.privileged_state()
+        size = self._render_options.image_size
+        return {
+            "pixels": {camera: self._draw(camera, size) for camera in CAMERAS},
+            "agent_pos": np.array([*state.gripper_xyz, state.finger_opening], dtype=np.float32),
+            "environment_state": state.to_vector(),
+        }
+
+    def _draw(self, camera: str, size: int) -> np.ndarray:
+        if self._renderer is None:
+            largest = max(self._render_options.image_size, PERSON_IMAGE_SIZE)
+            self._renderer = CameraRenderer(self._run.scene.model, self._render_options, largest)
+        return self._renderer.draw(self._run.scene.data, camera, size)
+
+    def _info(self) -> dict[str, Any]:
+        judge = self._run.judge
+        row, column = judge.nearest_intersection
+        return {
+            "is_success": judge.is_success,
+            "is_success_bomb_v0": judge.is_success_bomb_v0,
+            "placement_error_mm": judge.placement_error_mm,
+            "nearest_row": row,
+            "nearest_column": column,
+            "stage": str(judge.stage),
+            "failure": str(judge.failure or ""),
+            "collateral_mm": judge.collateral_mm,
+            "seed": self._run.episode.spec.seed,
+        }
+
+    def _write_result(self) -> None:
+        if self._results_path is None:
+            return
+        line = self.episode_result().to_json() + "\n"
+        # one write to a file opened for appending: lines of several workers do not mix
+        file = os.open(self._results_path, os.O_WRONLY | os.O_CREAT | os.O_APPEND, 0o644)
+        try:
+            os.write(file, line.encode())
+        finally:
+            os.close(file)
+
+
+def action_space(control_mode: str) -> spaces.Box:
+    """float32 (4,): relative in units of MAX_STEP_M, or absolute in metres; gripper in [-1, 1]."""
+    if control_mode == "relative":
+        return spaces.Box(-1.0, 1.0, (ACTION_DIM,), np.float32)
+    low, high = np.array([*WORKSPACE_LOW, -1.0]), np.array([*WORKSPACE_HIGH, 1.0])
+    return spaces.Box(low.astype(np.float32), high.astype(np.float32), dtype=np.float32)
+
+
+def observation_space(image_size: int) -> spaces.Dict:
+    """Pictures of both cameras, (4,) state of the gripper, and the privileged state for oracles."""
+    shape = (image_size, image_size, 3)
+    # opening fingers overshoot their stops a little
+    reach_m = np.array([1.0, 1.0, 1.0, 2.5 * MAX_HALF_OPENING_M], dtype=np.float32)
+    limit = max(POSITION_LIMIT_M, NUM_STONES, len(Stage))
+    return spaces.Dict(
+        {
+            "pixels": spaces.Dict({camera: spaces.Box(0, 255, shape, np.uint8) for camera in CAMERAS}),
+            "agent_pos": spaces.Box(-reach_m, reach_m, dtype=np.float32),
+            "environment_state": spaces.Box(-limit, limit, (PrivilegedState.DIM,), np.float32),
+        }
+    )

@@ -1,0 +1,124 @@
+"""Follows an episode of suite `place` and says how it stands and how it ended."""
+
+import math
+
+import numpy as np
+
+from lerobot_bomb.schema import BOARD, NUM_STONES, Failure, Stage
+from lerobot_env_bomb.model import REST_HEIGHT_M
+from lerobot_env_bomb.scene import Snapshot
+from lerobot_env_bomb.task import STONE, Episode
+
+REST_S = 0.5  # a stone that was carried and then rests this long ends the episode
+REST_SPEED_M_S = 0.005  # below it a stone rests
+LIFT_M = 0.010  # above its resting height a held stone counts as lifted
+FLAT_TOLERANCE_M = 0.003  # of the height at rest; a stone that leans or lies on another one is higher
+DROP_HEIGHT_M = 0.030  # a stone let go higher than this above the board was dropped, not placed
+OFF_BOARD_M = 0.75 * BOARD.pitch_m  # from the nearest intersection
+COLLATERAL_TOLERANCE_MM = 10.0
+V0_TOLERANCE_MM = 26.0  # of the original benchmark's rule
+
+
+class Judge:
+    """State of one episode, updated with a snapshot after every control step.
+
+    Success: the commanded stone, no longer touched and at rest for `REST_S`, lies flat on the target
+    intersection within the spec's tolerance, and no other stone was moved by more than 10 mm.
+    """
+
+    def __init__(self, episode: Episode, fps: int, start: Snapshot):
+        self.stage = Stage.START
+        self.failure: Failure | None = None
+        self.is_success = False
+        self.is_success_bomb_v0 = False
+        self.collateral_mm = 0.0
+        self._episode = episode
+        self._fps = fps
+        self._start = start
+        self._now = start
+        self._was_lifted: np.ndarray = np.zeros(NUM_STONES, dtype=bool)
+        self._last_touched_z = start.stone_xyz[:, 2].copy()
+        self._rest_steps = np.zeros(NUM_STONES, dtype=int)
+
+    @property
+    def placement_error_mm(self) -> float:
+        """Horizontal distance of the commanded stone from the target."""
+        return 1e3 * float(np.linalg.norm((self._now.stone_xyz[STONE] - self._episode.target_xyz)[:2]))
+
+    @property
+    def nearest_intersection(self) -> tuple[int, int]:
+        """(row, column) of the intersection nearest to the commanded stone."""
+        return BOARD.nearest_intersection(self._now.stone_xyz[STONE, :2])
+
+    def update(self, now: Snapshot) -> bool:
+        """Take in the state after a control step; whether the episode has ended."""
+        touched = now.stone_touched[:, 0] | now.stone_touched[:, 1]
+        held = now.stone_touched[:, 0] & now.stone_touched[:, 1]
+        step_m = now.stone_xyz - self._now.stone_xyz
+        speed_m_s = np.sqrt((step_m**2).sum(axis=1)) * self._fps
+        self._rest_steps = np.where(~touched & (speed_m_s < REST_SPEED_M_S), self._rest_steps + 1, 0)
+        is_high: np.ndarray = now.stone_xyz[:, 2] > REST_HEIGHT_M + LIFT_M
+        self._was_lifted = self._was_lifted | (held & is_high)
+        self._last_touched_z[touched] = now.stone_xyz[touched, 2]
+        self._now = now
+        moved_mm = 1e3 * np.linalg.norm(now.stone_xyz - self._start.stone_xyz, axis=1)
+        self.collateral_mm = max(self.collateral_mm, float(np.delete(moved_mm, STONE).max()))
+        self._update_stage(bool(held[STONE]))
+
+        carried = self._was_lifted.copy()
+        # a stone that was pushed, not carried, onto the target lies on the target all the same
+        carried[STONE] |= self._is_on_target()
+        ended = carried & (self._rest_steps >= math.ceil(REST_S * self._fps))
+        if ended[STONE]:
+            self._judge_placement()
+        elif ended.any():
+            self.failure = Failure.WRONG_STONE
+        return bool(ended.any())
+
+    def time_out(self) -> None:
+        """Say why the episode, which has not ended by itself, failed."""
+        touched = self._now.stone_touched[STONE]
+        if self._was_lifted.any() and not self._was_lifted[STONE]:
+            self.failure = Failure.WRONG_STONE
+        elif self.stage is Stage.START:
+            self.failure = Failure.NEVER_REACHED
+        elif touched.all() or (self._was_lifted[STONE] and (touched.any() or self._is_on_target())):
+            self.failure = Failure.TIMEOUT_HOLDING
+        else:
+            self.failure = Failure.DROPPED if self._was_lifted[STONE] else Failure.MISSED_GRASP
+
+    def _update_stage(self, is_held: bool) -> None:
+        offset = self._now.gripper_xyz - self._now.stone_xyz[STONE]
+        is_around = np.linalg.norm(offset[:2]) < BOARD.stone_radius_m and offset[2] < BOARD.stone_height_m / 2
+        reached = {
+            Stage.REACHED: is_around,
+            Stage.GRASPED: is_held,
+            Stage.LIFTED: self._was_lifted[STONE],
+        }
+        order = list(Stage)
+        for stage, is_reached in reached.items():
+            if is_reached and order.index(stage) > order.index(self.stage):
+                self.stage = stage
+
+    def _is_on_target(self) -> bool:
+        height_m = self._now.stone_xyz[STONE, 2]
+        is_flat = abs(height_m - REST_HEIGHT_M) < FLAT_TOLERANCE_M
+        return bool(is_flat and self.placement_error_mm <= self._episode.spec.success_tolerance_mm)
+
+    def _judge_placement(self) -> None:
+        is_target = self.nearest_intersection == self._episode.target
+        is_flat = abs(self._now.stone_xyz[STONE, 2] - REST_HEIGHT_M) < FLAT_TOLERANCE_M
+        self.is_success_bomb_v0 = bool(is_target and is_flat and self.placement_error_mm <= V0_TOLERANCE_MM)
+        if self._is_on_target():
+            self.stage = Stage.PLACED
+            self.is_success = self.collateral_mm <= COLLATERAL_TOLERANCE_MM
+            self.failure = None if self.is_success else Failure.DISTURBED_OTHERS
+        elif self._was_dropped():
+            self.failure = Failure.DROPPED
+        else:
+            self.failure = Failure.IMPRECISE if is_target else Failure.WRONG_INTERSECTION
+
+    def _was_dropped(self) -> bool:
+        xy = self._now.stone_xyz[STONE, :2]
+        off_m = np.linalg.norm(xy - BOARD.intersection_xy(*self.nearest_intersection))
+        return bool(off_m > OFF_BOARD_M or self._last_touched_z[STONE] > REST_HEIGHT_M + DROP_HEIGHT_M)

@@ -1,0 +1,158 @@
+# pyright: reportAttributeAccessIssue=false, reportInvalidTypeForm=false
+"""Builds BOMB's one MjModel: scene.xml plus board and stones in the sizes of the schema."""
+
+from pathlib import Path
+
+import numpy as np
+
+from lerobot_bomb.schema import BOARD, NUM_STONES
+from lerobot_env_bomb.backend import ensure_gl_backend
+
+ensure_gl_backend()
+
+import mujoco  # noqa: E402  (its names live in C modules that pyright cannot read)
+
+SCENE_XML = Path(__file__).with_name("scene.xml")
+
+TRAY_CENTER_XY = (0.170, 0.0)  # metres; the tray beside the board from which stones are taken
+TRAY_HALF_SIZE_XY = (0.045, 0.125)  # metres; it touches the board
+# Board and tray are equally high, so a stone rests at the same height on both.
+REST_HEIGHT_M = BOARD.thickness_m + BOARD.stone_height_m / 2  # stone's centre above the table
+BOARD_HALF_SIZE_M = (BOARD.num_lines - 1) / 2 * BOARD.pitch_m + BOARD.margin_m
+
+PARKED_XYZ = (1.0, 1.0, -0.5)  # metres, below the table: where stones wait that an episode does not use
+PARKED_SPACING_M = 0.05
+
+# N m s/rad. Stops within a second what would roll or spin on its rim for ever; too little to slow a flight.
+STONE_DAMPING = 3e-6
+
+NUM_FEET = 4  # balls that a stone stands on
+
+WOOD_RGB = (216, 168, 104)
+LINE_RGB = (46, 30, 16)
+LINE_WIDTH_M = 0.0020
+STAR_POINT_RADIUS_M = 0.0036
+TEXTURE_SIZE = 512  # pixels
+
+
+def build_model() -> mujoco.MjModel:
+    """Compile the scene; every episode reuses the result."""
+    spec = mujoco.MjSpec.from_file(str(SCENE_XML))
+    _add_board(spec)
+    _add_tray(spec)
+    for index in range(NUM_STONES):
+        _add_stone(spec, index)
+    model = spec.compile()
+    # Painted after compilation: handing the pixels to MjSpec one by one takes a second.
+    start = model.texture("board").adr[0]
+    picture = board_texture().ravel()
+    model.tex_data[start : start + picture.size] = picture
+    return model
+
+
+def stone_name(index: int) -> str:
+    """Name of body, joint and rim geom of a stone."""
+    return f"stone_{index}"
+
+
+def foot_name(index: int, foot: int) -> str:
+    """Name of one of the balls that a stone stands on."""
+    return f"{stone_name(index)}_foot_{foot}"
+
+
+def parked_xyz(index: int) -> np.ndarray:
+    """(3,) metres, where stone `index` waits while it is not in play."""
+    return np.array(PARKED_XYZ) + np.array([index * PARKED_SPACING_M, 0, 0])
+
+
+def board_texture() -> np.ndarray:
+    """(TEXTURE_SIZE, TEXTURE_SIZE, 3) uint8 picture of the board: wood, grid lines, star point."""
+    metres = (np.arange(TEXTURE_SIZE) + 0.5) / TEXTURE_SIZE * 2 * BOARD_HALF_SIZE_M - BOARD_HALF_SIZE_M
+    x, y = np.meshgrid(metres, metres)
+    grain = 0.5 * np.sin(300 * y + 1.5 * np.sin(25 * x) + 6 * np.sin(17 * y)) + 0.5 * np.sin(
+        900 * y + 2 * np.sin(13 * x + 40 * y)
+    )
+    wood = np.array(WOOD_RGB) * (1 + 0.035 * grain[..., None])
+    pixel_m = 2 * BOARD_HALF_SIZE_M / TEXTURE_SIZE
+    ink = np.zeros_like(x)
+    middle = (BOARD.num_lines - 1) / 2
+    reach = middle * BOARD.pitch_m + LINE_WIDTH_M / 2
+    for line in range(BOARD.num_lines):
+        place = (line - middle) * BOARD.pitch_m
+        for across, along in ((x, y), (y, x)):
+            ink = np.maximum(
+                ink, _coverage(LINE_WIDTH_M / 2 - abs(across - place), pixel_m) * (abs(along) <= reach)
+            )
+    ink = np.maximum(ink, _coverage(STAR_POINT_RADIUS_M - np.hypot(x, y), pixel_m))[..., None]
+    return np.clip((1 - ink) * wood + ink * np.array(LINE_RGB), 0, 255).astype(np.uint8)
+
+
+def _coverage(inside_m: np.ndarray, pixel_m: float) -> np.ndarray:
+    """Share of a pixel in [0, 1] that lies inside a shape, from the distance to its edge."""
+    return np.clip(inside_m / pixel_m + 0.5, 0, 1)
+
+
+def _add_board(spec: mujoco.MjSpec) -> None:
+    half = BOARD_HALF_SIZE_M
+    spec.add_texture(
+        name="board",
+        type=mujoco.mjtTexture.mjTEXTURE_2D,
+        width=TEXTURE_SIZE,
+        height=TEXTURE_SIZE,
+        nchannel=3,
+        builtin=mujoco.mjtBuiltin.mjBUILTIN_FLAT,
+    )
+    material = spec.add_material(name="board", specular=0.1, shininess=0.1)
+    material.textures[mujoco.mjtTextureRole.mjTEXROLE_RGB] = "board"
+    spec.worldbody.add_geom(
+        spec.find_default("support"),
+        name="board",
+        type=mujoco.mjtGeom.mjGEOM_BOX,
+        size=[half, half, BOARD.thickness_m / 2],
+        pos=[0, 0, BOARD.thickness_m / 2],
+        rgba=[*(np.array(WOOD_RGB) / 255 * 0.8), 1],
+    )
+    # The drawn surface floats a tenth of a millimetre above the wood so that the two do not flicker.
+    spec.worldbody.add_geom(
+        name="board_surface",
+        type=mujoco.mjtGeom.mjGEOM_PLANE,
+        size=[half, half, 0.1],
+        pos=[0, 0, BOARD.thickness_m + 1e-4],
+        material="board",
+        contype=0,
+        conaffinity=0,
+    )
+
+
+def _add_tray(spec: mujoco.MjSpec) -> None:
+    spec.worldbody.add_geom(
+        spec.find_default("support"),
+        name="tray",
+        type=mujoco.mjtGeom.mjGEOM_BOX,
+        size=[*TRAY_HALF_SIZE_XY, BOARD.thickness_m / 2],
+        pos=[*TRAY_CENTER_XY, BOARD.thickness_m / 2],
+        material="mat",
+    )
+
+
+def _add_stone(spec: mujoco.MjSpec, index: int) -> None:
+    name = stone_name(index)
+    radius, half_height = BOARD.stone_radius_m, BOARD.stone_height_m / 2
+    body = spec.worldbody.add_body(name=name, pos=parked_xyz(index))
+    body.add_joint(name=name, type=mujoco.mjtJoint.mjJNT_FREE, damping=STONE_DAMPING)
+    body.add_geom(spec.find_default("rim"), name=name, size=[radius, half_height, 0])
+    # A stone stands on balls in its rim: contact of balls with boxes is exact, where that of a flat
+    # cylinder with a flat box, found by search, lets the stone come to rest a millimetre inside the board.
+    for foot in range(NUM_FEET):
+        angle_rad = 2 * np.pi * (foot + 0.5) / NUM_FEET
+        center = (radius - half_height) * np.array([np.cos(angle_rad), np.sin(angle_rad)])
+        body.add_geom(
+            spec.find_default("foot"), name=foot_name(index, foot), size=[half_height, 0, 0], pos=[*center, 0]
+        )
+    body.add_geom(
+        spec.find_default("visual"),
+        name=f"{name}_visual",
+        type=mujoco.mjtGeom.mjGEOM_ELLIPSOID,
+        size=[radius, radius, half_height],
+        material="stone",
+    )

@@ -1,0 +1,78 @@
+# pyright: reportAttributeAccessIssue=false, reportInvalidTypeForm=false
+"""Pictures of BOMB's scene, fast enough for training data without a GPU."""
+
+import weakref
+
+import numpy as np
+
+from lerobot_bomb.schema import RenderOptions
+from lerobot_env_bomb.backend import ensure_gl_backend
+
+ensure_gl_backend()
+
+import mujoco  # noqa: E402  (its names live in C modules that pyright cannot read)
+
+SHADOW_MAP_SIZE = 512  # pixels
+CAPTION_LINE_PX = 26
+CAPTION_BACKGROUND = 40  # grey level
+
+
+class CameraRenderer:
+    """One OpenGL context that draws a model's fixed cameras at any size up to `max_size` pixels."""
+
+    def __init__(self, model: mujoco.MjModel, options: RenderOptions, max_size: int):
+        self._model = model
+        shadows = options.preset == "shadows"
+        quality = model.vis.quality
+        quality.offsamples = 4 if shadows else 0
+        quality.shadowsize = SHADOW_MAP_SIZE if shadows else 0
+        quality.numslices, quality.numstacks, quality.numquads = (28, 16, 4) if shadows else (14, 8, 2)
+        model.vis.global_.offwidth = model.vis.global_.offheight = max_size
+        self._gl = mujoco.GLContext(max_size, max_size)
+        self._gl.make_current()
+        self._context = mujoco.MjrContext(model, mujoco.mjtFontScale.mjFONTSCALE_100)
+        mujoco.mjr_setBuffer(mujoco.mjtFramebuffer.mjFB_OFFSCREEN, self._context)
+        self._scene = mujoco.MjvScene(model, maxgeom=200)
+        self._scene.flags[mujoco.mjtRndFlag.mjRND_SHADOW] = shadows
+        for flag in (mujoco.mjtRndFlag.mjRND_REFLECTION, mujoco.mjtRndFlag.mjRND_SKYBOX):
+            self._scene.flags[flag] = False
+        self._option = mujoco.MjvOption()
+        self._camera = mujoco.MjvCamera()
+        self._camera.type = mujoco.mjtCamera.mjCAMERA_FIXED
+        # also at exit: a context that outlives the OpenGL library raises when it is collected
+        self._finalizer = weakref.finalize(self, _free, self._gl, self._context)
+
+    def draw(self, data: mujoco.MjData, camera: str, size: int) -> np.ndarray:
+        """(size, size, 3) uint8 picture of a named camera."""
+        self._gl.make_current()
+        self._camera.fixedcamid = self._model.camera(camera).id
+        mujoco.mjv_updateScene(
+            self._model, data, self._option, None, self._camera, mujoco.mjtCatBit.mjCAT_ALL, self._scene
+        )
+        viewport = mujoco.MjrRect(0, 0, size, size)
+        mujoco.mjr_render(viewport, self._scene, self._context)
+        rgb = np.empty((size, size, 3), dtype=np.uint8)
+        mujoco.mjr_readPixels(rgb, None, viewport, self._context)
+        return rgb[::-1].copy()
+
+    def close(self) -> None:
+        """Free the OpenGL context."""
+        self._finalizer()
+
+
+def _free(gl: mujoco.GLContext, context: mujoco.MjrContext) -> None:
+    gl.make_current()
+    context.free()
+    gl.free()
+
+
+def compose_caption(pictures: list[np.ndarray], lines: list[str]) -> np.ndarray:
+    """(H, W, 3) uint8: pictures of equal size side by side over a bar of text lines."""
+    import cv2  # only people's pictures need it, and it is slow to import
+
+    row = np.concatenate(pictures, axis=1)
+    bar = np.full((CAPTION_LINE_PX * len(lines) + 8, row.shape[1], 3), CAPTION_BACKGROUND, dtype=np.uint8)
+    for i, line in enumerate(lines):
+        origin = (10, CAPTION_LINE_PX * (i + 1) - 4)
+        cv2.putText(bar, line, origin, cv2.FONT_HERSHEY_SIMPLEX, 0.55, (255, 255, 255), 1, cv2.LINE_AA)
+    return np.concatenate([row, bar])

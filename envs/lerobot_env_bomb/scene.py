@@ -1,0 +1,137 @@
+# pyright: reportAttributeAccessIssue=false, reportInvalidTypeForm=false
+"""Runs BOMB's model: put an episode's layout on the table, move the gripper, measure."""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from lerobot_bomb.schema import NUM_STONES, WORKSPACE_HIGH_M, WORKSPACE_LOW_M
+from lerobot_env_bomb.backend import ensure_gl_backend
+from lerobot_env_bomb.model import (
+    NUM_FEET,
+    REST_HEIGHT_M,
+    build_model,
+    foot_name,
+    parked_xyz,
+    stone_name,
+)
+
+ensure_gl_backend()
+
+import mujoco  # noqa: E402  (its names live in C modules that pyright cannot read)
+
+WORKSPACE_LOW = np.array(WORKSPACE_LOW_M)
+WORKSPACE_HIGH = np.array(WORKSPACE_HIGH_M)
+
+MAX_HALF_OPENING_M = 0.022  # of one finger; outer faces then clear a neighbour at one pitch by 5 mm
+TRAVEL_SHARE = 0.7  # of a control step in which the command travels; the rest lets the arm settle
+
+BASE_XY = np.array([0.0, 0.30])  # metres, the arm's shoulder; as in scene.xml
+LINK_M = 0.27  # length of either link; as in scene.xml
+
+STONE_RGBA = {True: (0.96, 0.96, 0.93, 1.0), False: (0.06, 0.06, 0.07, 1.0)}  # by "is white"
+HIDDEN_RGBA = (0.0, 0.0, 0.0, 0.0)
+
+
+@dataclass(frozen=True)
+class Layout:
+    """Where everything is when an episode starts. Stones rest flat; those not in play are parked."""
+
+    gripper_xyz: np.ndarray  # (3,) metres
+    stone_xy: np.ndarray  # (NUM_STONES, 2) metres
+    stone_is_white: np.ndarray  # (NUM_STONES,) bool
+    stone_in_play: np.ndarray  # (NUM_STONES,) bool
+
+
+@dataclass(frozen=True)
+class Snapshot:
+    """What the simulator measures after a control step."""
+
+    gripper_xyz: np.ndarray  # (3,) metres, point between the pads' lower ends
+    finger_opening: float  # metres between the pads
+    stone_xyz: np.ndarray  # (NUM_STONES, 3) metres, centres
+    stone_touched: np.ndarray  # (NUM_STONES, 2) bool: by the left and the right pad
+
+
+class Scene:
+    """One compiled model and its state."""
+
+    def __init__(self):
+        self.model = build_model()
+        self.data = mujoco.MjData(self.model)
+        names = [stone_name(i) for i in range(NUM_STONES)]
+        self._stone_bodies = np.array([self.model.body(name).id for name in names])
+        self._stone_rims = np.array([self.model.geom(name).id for name in names])
+        feet = [[self.model.geom(foot_name(i, k)).id for k in range(NUM_FEET)] for i in range(NUM_STONES)]
+        self._stone_solids = np.column_stack([self._stone_rims, feet])
+        self._contype, self._conaffinity = self.model.geom_contype.copy(), self.model.geom_conaffinity.copy()
+        self._stone_visuals = np.array([self.model.geom(f"{name}_visual").id for name in names])
+        self._stone_qpos = np.array([self.model.joint(name).qposadr[0] for name in names])
+        self._pads = [self.model.geom(f"{side}_pad").id for side in ("left", "right")]
+        self._fingers = np.array(
+            [self.model.joint(f"{side}_finger").qposadr[0] for side in ("left", "right")]
+        )
+        self._grip = self.model.site("grip").id
+
+    def reset(self, layout: Layout) -> None:
+        """Start from the layout, at rest, with the fingers open."""
+        mujoco.mj_resetData(self.model, self.data)
+        self._show_stones(layout)
+        for i, adr in enumerate(self._stone_qpos):
+            xyz = [*layout.stone_xy[i], REST_HEIGHT_M] if layout.stone_in_play[i] else parked_xyz(i)
+            self.data.qpos[adr : adr + 7] = [*xyz, 1, 0, 0, 0]
+        for joint, value in arm_joints(layout.gripper_xyz).items():
+            self.data.joint(joint).qpos = value
+        self.data.qpos[self._fingers] = MAX_HALF_OPENING_M
+        self.data.ctrl[:] = MAX_HALF_OPENING_M
+        self.data.mocap_pos[0] = layout.gripper_xyz
+        mujoco.mj_forward(self.model, self.data)
+
+    def move(self, target_xyz: np.ndarray, open_fingers: bool, num_substeps: int) -> None:
+        """Move the gripper towards (3,) metres, clipped to the workspace, and open or close it."""
+        start = self.data.mocap_pos[0].copy()
+        target = np.clip(target_xyz, WORKSPACE_LOW, WORKSPACE_HIGH)
+        self.data.ctrl[:] = MAX_HALF_OPENING_M if open_fingers else 0.0
+        num_travel = max(1, round(TRAVEL_SHARE * num_substeps))
+        for substep in range(num_substeps):
+            share = min(1.0, (substep + 1) / num_travel)
+            # smoothstep: no jerk that would shake a held stone
+            self.data.mocap_pos[0] = start + (3 * share**2 - 2 * share**3) * (target - start)
+            mujoco.mj_step(self.model, self.data)
+        # poses and contacts of the state that the last substep ended in
+        mujoco.mj_forward(self.model, self.data)
+
+    def measure(self) -> Snapshot:
+        """Poses and contacts now."""
+        touched = np.zeros((NUM_STONES, 2), dtype=bool)
+        stone_of_geom = {geom: i for i, geom in enumerate(self._stone_rims)}
+        for geom1, geom2 in self.data.contact.geom:
+            for pad, geom in ((geom1, geom2), (geom2, geom1)):
+                if pad in self._pads and geom in stone_of_geom:
+                    touched[stone_of_geom[geom], self._pads.index(pad)] = True
+        return Snapshot(
+            gripper_xyz=self.data.site_xpos[self._grip].copy(),
+            finger_opening=float(self.data.qpos[self._fingers].sum()),
+            stone_xyz=self.data.xpos[self._stone_bodies].copy(),
+            stone_touched=touched,
+        )
+
+    def _show_stones(self, layout: Layout) -> None:
+        """Colour the stones in play; hide the others and take contact and weight from them."""
+        for i in range(NUM_STONES):
+            in_play = bool(layout.stone_in_play[i])
+            rgba = STONE_RGBA[bool(layout.stone_is_white[i])] if in_play else HIDDEN_RGBA
+            self.model.geom_rgba[self._stone_visuals[i]] = rgba
+            solids = self._stone_solids[i]
+            self.model.geom_contype[solids] = self._contype[solids] * in_play
+            self.model.geom_conaffinity[solids] = self._conaffinity[solids] * in_play
+            self.model.body_gravcomp[self._stone_bodies[i]] = not in_play
+
+
+def arm_joints(gripper_xyz: np.ndarray) -> dict[str, float]:
+    """Joint positions (radians, metres) that put the gripper at (3,) metres, elbow to the left."""
+    reach = gripper_xyz[:2] - BASE_XY
+    cosine = (reach @ reach) / (2 * LINK_M**2) - 1
+    elbow = float(np.arccos(np.clip(cosine, -1, 1)))
+    shoulder = float(np.arctan2(reach[1], reach[0])) - elbow / 2
+    return {"shoulder": shoulder, "elbow": elbow, "lift": float(gripper_xyz[2]), "roll": -shoulder - elbow}

@@ -1,0 +1,119 @@
+"""Vector environments whose workers start in under a second and only when they are needed."""
+
+import sys
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
+from functools import partial
+from typing import Any
+
+import gymnasium as gym
+import numpy as np
+from gymnasium.vector import AsyncVectorEnv, AutoresetMode, SyncVectorEnv, VectorEnv
+
+# LeRobot's rollout passes this option with the reset that starts a new episode; autoreset passes none.
+NEW_ROLLOUT_OPTION = "lerobot_new_rollout"
+
+
+class FreezeAfterEnd(gym.Wrapper):
+    """Keep returning the last transition after an episode has ended, through autoreset too.
+
+    LeRobot steps a batch until its slowest episode ends. Without this, the finished ones would be
+    reset by the vector env and simulated for nothing. Only a reset that carries ``NEW_ROLLOUT_OPTION``
+    or a seed starts a new episode.
+    """
+
+    def __init__(self, env: gym.Env) -> None:
+        super().__init__(env)
+        self._last: tuple[Any, dict[str, Any]] | None = None
+
+    def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Any, dict]:
+        if self._last is not None and seed is None and NEW_ROLLOUT_OPTION not in (options or {}):
+            return self._last
+        self._last = None
+        return self.env.reset(seed=seed, options=options)
+
+    def step(self, action: np.ndarray) -> tuple[Any, float, bool, bool, dict[str, Any]]:
+        observation, reward, terminated, truncated, info = self.env.step(action)
+        if terminated or truncated:
+            self._last = (observation, info)
+        return observation, float(reward), terminated, truncated, info
+
+
+@contextmanager
+def light_children() -> Iterator[None]:
+    """Start processes that do not import the parent's main script.
+
+    multiprocessing re-runs the main script's imports in every child (for ``lerobot-eval``: LeRobot and
+    torch, many seconds and hundreds of MB). The env factories live in importable modules, so the
+    children do not need it.
+    """
+    main = sys.modules["__main__"]
+    hidden = {name: main.__dict__.pop(name) for name in ("__file__", "__spec__") if name in main.__dict__}
+    main.__spec__ = None
+    try:
+        yield
+    finally:
+        main.__dict__.update(hidden)
+
+
+def _make_frozen(make_one: Callable[[], gym.Env]) -> gym.Env:
+    return FreezeAfterEnd(make_one())
+
+
+class LazyVectorEnv(VectorEnv):
+    """A vector env that starts its workers on first use.
+
+    An evaluation of many conditions creates one of these per condition; only the one in use holds
+    processes and OpenGL contexts.
+
+    Args:
+        make_ones: one picklable factory per env, of torch-free modules.
+        use_async: a worker process per env (`AsyncVectorEnv`); else all in this process.
+        context: multiprocessing start method of the workers.
+    """
+
+    def __init__(
+        self, make_ones: Sequence[Callable[[], gym.Env]], use_async: bool, context: str = "forkserver"
+    ) -> None:
+        probe = make_ones[0]()
+        self.num_envs = len(make_ones)
+        self.single_observation_space = probe.observation_space
+        self.single_action_space = probe.action_space
+        self.observation_space = gym.vector.utils.batch_space(probe.observation_space, self.num_envs)
+        self.action_space = gym.vector.utils.batch_space(probe.action_space, self.num_envs)
+        self.metadata = probe.metadata | {"autoreset_mode": AutoresetMode.NEXT_STEP}
+        probe.close()
+        self._make_ones = make_ones
+        self._use_async = use_async
+        self._context = context
+        self._envs: SyncVectorEnv | AsyncVectorEnv | None = None
+
+    def _ensure(self) -> SyncVectorEnv | AsyncVectorEnv:
+        """Start the envs unless they run; LeRobot calls this by name to prefetch the next condition."""
+        if self._envs is None:
+            factories = [partial(_make_frozen, make_one) for make_one in self._make_ones]
+            if self._use_async:
+                with light_children():
+                    self._envs = AsyncVectorEnv(
+                        factories, context=self._context, autoreset_mode=AutoresetMode.NEXT_STEP
+                    )
+            else:
+                self._envs = SyncVectorEnv(factories, autoreset_mode=AutoresetMode.NEXT_STEP)
+        return self._envs
+
+    def reset(self, *, seed: Any = None, options: dict[str, Any] | None = None) -> tuple[Any, dict[str, Any]]:
+        return self._ensure().reset(seed=seed, options=options)
+
+    def step(self, actions: np.ndarray) -> tuple[Any, Any, Any, Any, dict[str, Any]]:
+        return self._ensure().step(actions)
+
+    def call(self, name: str, *args: Any, **kwargs: Any) -> Any:
+        return self._ensure().call(name, *args, **kwargs)
+
+    def get_attr(self, name: str) -> Any:
+        return self._ensure().get_attr(name)
+
+    def close(self, **kwargs: Any) -> None:
+        if self._envs is not None:
+            self._envs.close(**kwargs)
+            self._envs = None

@@ -1,0 +1,75 @@
+import os
+import platform
+import subprocess
+import sys
+
+import pytest
+
+pytestmark = pytest.mark.skipif(platform.system() != "Linux", reason="the backend is chosen on Linux only")
+
+
+def choose_backend(preamble: str = "", **environment: str) -> subprocess.CompletedProcess[str]:
+    """Run ensure_gl_backend() in a fresh process without MUJOCO_GL unless given."""
+    clean = {key: value for key, value in os.environ.items() if key not in ("MUJOCO_GL", "PYOPENGL_PLATFORM")}
+    code = f"""
+import os
+from lerobot_env_bomb import backend
+{preamble}
+print(backend.ensure_gl_backend(), os.environ["MUJOCO_GL"], os.environ["PYOPENGL_PLATFORM"])
+"""
+    return subprocess.run(
+        [sys.executable, "-c", code], env=clean | environment, capture_output=True, text=True, check=False
+    )
+
+
+def last_line(run: subprocess.CompletedProcess[str]) -> str:
+    return run.stderr.strip().splitlines()[-1]
+
+
+def test_a_headless_machine_gets_a_working_backend() -> None:
+    run = choose_backend()
+    assert run.returncode == 0, run.stderr
+    assert run.stdout.split() in (["egl"] * 3, ["osmesa"] * 3)
+
+
+def test_osmesa_is_the_second_choice() -> None:
+    run = choose_backend("backend.probe = lambda name: '' if name == 'osmesa' else 'broken'\n"
+                         "backend.importlib.import_module = lambda name: None")  # fmt: skip
+    assert run.stdout.split() == ["osmesa"] * 3, run.stderr
+
+
+def test_without_any_library_the_packages_are_named() -> None:
+    run = choose_backend("backend.probe = lambda name: f'no {name} here'")
+    assert run.returncode != 0
+    message = last_line(run)
+    assert "apt-get install libegl1 libgl1" in message
+    assert "apt-get install libosmesa6" in message
+    assert "egl: no egl here" in message
+
+
+def test_a_chosen_backend_without_its_library_names_the_packages() -> None:
+    preamble = """
+def broken(name):
+    raise AttributeError("'NoneType' object has no attribute 'eglQueryString'")
+backend.importlib.import_module = broken
+"""
+    run = choose_backend(preamble, MUJOCO_GL="egl")
+    assert "apt-get install libegl1 libgl1" in last_line(run)
+
+
+def test_a_stale_pyopengl_platform_does_not_survive() -> None:
+    preamble = "backend.importlib.import_module = lambda name: None"
+    run = choose_backend(preamble, MUJOCO_GL="osmesa", PYOPENGL_PLATFORM="egl")
+    assert run.stdout.split() == ["osmesa"] * 3, run.stderr
+
+
+def test_an_unknown_backend_is_refused() -> None:
+    assert "MUJOCO_GL='vulkan' cannot render; choose one of: egl, osmesa, glfw" in last_line(
+        choose_backend(MUJOCO_GL="vulkan")
+    )
+
+
+def test_mujoco_imported_too_early_is_explained() -> None:
+    message = last_line(choose_backend("import mujoco"))
+    assert "mujoco was imported before an OpenGL backend was chosen" in message
+    assert "set MUJOCO_GL=" in message

@@ -1,0 +1,67 @@
+from pathlib import Path
+
+import pytest
+from lerobot.envs import env_to_policy_features, make_env, make_env_config
+
+from lerobot_env_bomb.configuration_bomb import BombEnvConfig
+from lerobot_env_bomb.vector import LazyVectorEnv
+
+
+def test_policy_side_features() -> None:
+    features = env_to_policy_features(make_env_config("bomb", image_size=64))
+    shapes = {key: (feature.type.value, feature.shape) for key, feature in features.items()}
+    assert shapes == {
+        "action": ("ACTION", (4,)),
+        "observation.state": ("STATE", (4,)),
+        "observation.images.workspace": ("VISUAL", (3, 64, 64)),
+        "observation.images.wrist": ("VISUAL", (3, 64, 64)),
+    }
+
+
+def test_a_suite_maps_task_numbers_to_vector_envs() -> None:
+    envs = make_env(make_env_config("bomb", task_ids=[0, 38]), n_envs=3, use_async_envs=True)
+    assert list(envs) == ["place"]
+    assert list(envs["place"]) == [0, 38]
+    assert all(
+        isinstance(vector, LazyVectorEnv) and vector.num_envs == 3 for vector in envs["place"].values()
+    )
+
+
+def test_task_ids_fix_target_and_colour() -> None:
+    vector = make_env(make_env_config("bomb", task_ids=[38], image_size=32), n_envs=1)["place"][38]
+    assert isinstance(vector, LazyVectorEnv)
+    vector.reset(seed=[3])
+    instruction = vector.call("task_description")[0]
+    assert "white" in instruction
+    assert "2" in instruction and "3" in instruction
+    vector.close()
+
+
+@pytest.mark.parametrize(
+    ("flags", "message"),
+    [
+        ({"task": "plce"}, "--env.task='plce'"),
+        ({"robot": "panda"}, "--env.robot='panda'"),
+        ({"control_mode": "joint"}, "--env.control_mode='joint'"),
+        ({"fps": 7}, "--env.fps=7"),
+        ({"target": [5, 5]}, r"--env.target=\[5, 5\]"),
+        ({"target": [1]}, r"--env.target=\[1\]"),
+        ({"color": "blue"}, "--env.color='blue'"),
+        ({"image_size": -1}, "--env.image_size=-1"),
+        ({"render_preset": "rt"}, "--env.render_preset='rt'"),
+        ({"task_ids": [50]}, "--env.task_ids has 50"),
+        ({"task_ids": []}, r"--env.task_ids=\[\]"),
+        ({"task_ids": [1], "color": "black"}, "drop --env.target and --env.color"),
+    ],
+)
+def test_wrong_flags_fail_before_an_environment_is_built(flags: dict, message: str) -> None:
+    with pytest.raises(ValueError, match=message):
+        BombEnvConfig(**flags)
+
+
+def test_an_unwritable_results_folder_is_refused(tmp_path: Path) -> None:
+    blocker = tmp_path / "file"
+    blocker.write_text("")
+    config = BombEnvConfig(results_path=str(blocker / "results.jsonl"))
+    with pytest.raises(ValueError, match=r"--env\.results_path="):
+        config.create_envs(n_envs=1)

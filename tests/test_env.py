@@ -1,0 +1,251 @@
+import hashlib
+import json
+import subprocess
+import sys
+import warnings
+from collections.abc import Callable, Iterator
+from pathlib import Path
+
+import gymnasium
+import numpy as np
+import pytest
+from gymnasium.error import ResetNeeded
+from gymnasium.utils.env_checker import check_env
+
+import lerobot_env_bomb
+from lerobot_bomb.expert import expert_action
+from lerobot_bomb.schema import PROTOCOL_VERSION, EpisodeSpec, PrivilegedState, RenderOptions
+from lerobot_env_bomb.env import BombEnv
+
+SMALL = RenderOptions(image_size=32)
+STILL = np.array([0, 0, 0, 1], dtype=np.float32)
+SEED = 4
+Policy = Callable[[PrivilegedState, int], np.ndarray]
+
+
+@pytest.fixture(scope="module")
+def env() -> Iterator[BombEnv]:
+    env = BombEnv(EpisodeSpec(seed=0), SMALL)
+    yield env
+    env.close()
+
+
+def expert(state: PrivilegedState, step: int) -> np.ndarray:
+    return expert_action(state)
+
+
+def stands_still(state: PrivilegedState, step: int) -> np.ndarray:
+    return STILL
+
+
+def rollout(env: BombEnv, policy: Policy, seed: int = SEED) -> tuple[dict, int]:
+    """Last info and number of steps of an episode."""
+    env.reset(seed=seed)
+    info, steps, ended = {}, 0, False
+    while not ended:
+        _, _, terminated, truncated, info = env.step(policy(env.privileged_state(), steps))
+        ended, steps = terminated or truncated, steps + 1
+    return info, steps
+
+
+def digest(observation: dict) -> str:
+    arrays = [*observation["pixels"].values(), observation["agent_pos"], observation["environment_state"]]
+    return hashlib.sha256(b"".join(np.ascontiguousarray(array).tobytes() for array in arrays)).hexdigest()
+
+
+def expert_digests(env: BombEnv, seed: int, num_steps: int) -> list[str]:
+    observation, _ = env.reset(seed=seed)
+    digests = [digest(observation)]
+    for _ in range(num_steps):
+        observation, *_ = env.step(expert_action(env.privileged_state()))
+        digests.append(digest(observation))
+    return digests
+
+
+def test_reward_is_1_on_the_last_step_of_a_success_alone(env: BombEnv) -> None:
+    env.reset(seed=SEED)
+    rewards, terminated, truncated = [], False, False
+    while not terminated:
+        _, reward, terminated, truncated, _ = env.step(expert_action(env.privileged_state()))
+        rewards.append(reward)
+    assert not truncated
+    assert rewards == [0.0] * (len(rewards) - 1) + [1.0]
+    # 0.5 s at rest after the release
+    assert len(rewards) > 10
+
+
+def test_an_ended_env_keeps_returning_its_last_transition(env: BombEnv) -> None:
+    rollout(env, expert)
+    first = env.step(STILL)
+    second = env.step(-STILL)
+    assert first[1:4] == second[1:4] == (0.0, True, False)
+    assert first[4] == second[4] and first[4]["is_success"]
+    assert digest(first[0]) == digest(second[0])
+    env.reset(seed=SEED)
+    assert env.step(STILL)[2] is False
+
+
+@pytest.mark.parametrize(("fps", "limit"), [(10, 100), (20, 200), (8, 80)])
+def test_the_horizon_is_10_seconds(fps: int, limit: int) -> None:
+    env = BombEnv(EpisodeSpec(seed=0, fps=fps), SMALL)
+    info, steps = rollout(env, stands_still)
+    env.close()
+    assert steps == limit == env._max_episode_steps
+    assert info["failure"] == "never_reached" and env.metadata["render_fps"] == fps
+
+
+def test_a_relative_action_of_1_moves_40_mm(env: BombEnv) -> None:
+    before = env.reset(seed=SEED)[0]["agent_pos"]
+    after = env.step(np.array([-1, 0, 0.5, 1], dtype=np.float32))[0]["agent_pos"]
+    np.testing.assert_allclose(after[:3] - before[:3], [-0.04, 0, 0.02], atol=1e-3)
+    assert after[3] == pytest.approx(0.044, abs=1e-4)
+
+
+def test_an_absolute_action_is_where_the_gripper_goes() -> None:
+    env = BombEnv(EpisodeSpec(seed=0, control_mode="absolute"), SMALL)
+    env.reset()
+    observation = {}
+    for _ in range(3):
+        observation, *_ = env.step(np.array([0.15, -0.02, 0.07, -1], dtype=np.float32))
+    env.close()
+    np.testing.assert_allclose(observation["agent_pos"][:3], [0.15, -0.02, 0.07], atol=1e-3)
+    assert observation["agent_pos"][3] < 0.001
+
+
+def test_actions_beyond_the_space_are_clipped(env: BombEnv) -> None:
+    env.reset(seed=SEED)
+    clipped = digest(env.step(np.array([-1, 0, 1, 1], dtype=np.float32))[0])
+    env.reset(seed=SEED)
+    assert digest(env.step(np.array([-7, 0, 3, 5], dtype=np.float32))[0]) == clipped
+
+
+@pytest.mark.parametrize(
+    ("action", "message"),
+    [
+        (np.zeros(3), r"action has shape \(3,\), expected \(4,\)"),
+        (np.zeros((1, 4)), r"action has shape \(1, 4\), expected \(4,\)"),
+        (np.array([0, np.nan, 0, 0]), "is not finite"),
+        (np.array([0, np.inf, 0, 0]), "is not finite"),
+    ],
+)
+def test_a_malformed_action_is_refused(env: BombEnv, action: np.ndarray, message: str) -> None:
+    env.reset(seed=SEED)
+    with pytest.raises(ValueError, match=message):
+        env.step(action)
+
+
+def test_a_split_without_the_target_is_refused_at_once() -> None:
+    with pytest.raises(ValueError, match=r"--env\.target=\[2, 2\] is not in --env\.split=heldout"):
+        BombEnv(EpisodeSpec(seed=0, split="heldout", target=(2, 2)))
+
+
+def test_an_unknown_render_mode_is_refused() -> None:
+    with pytest.raises(ValueError, match="render_mode='human' is unknown"):
+        BombEnv(render_mode="human")
+
+
+def test_step_and_render_need_a_reset() -> None:
+    env = BombEnv()
+    for call in (lambda: env.step(STILL), env.render, env.privileged_state, env.episode_result):
+        with pytest.raises(ResetNeeded):
+            call()
+    env.close()
+
+
+def test_resets_without_a_seed_start_with_the_specs_and_go_on_with_fresh_ones() -> None:
+    first, second = (BombEnv(EpisodeSpec(seed=5), SMALL) for _ in range(2))
+    seeds = [[env.reset()[1]["seed"] for _ in range(3)] for env in (first, second)]
+    first.close()
+    second.close()
+    assert seeds[0] == seeds[1]
+    assert seeds[0][0] == 5 and len(set(seeds[0])) == 3
+
+
+def test_observations_do_not_depend_on_earlier_episodes(env: BombEnv) -> None:
+    fresh = BombEnv(EpisodeSpec(seed=0), SMALL)
+    expected = expert_digests(fresh, seed=9, num_steps=15)
+    fresh.close()
+    rollout(env, lambda state, step: np.array([-0.3, 0.1, -0.5, -1.0]))
+    assert expert_digests(env, seed=9, num_steps=15) == expected
+    assert expert_digests(env, seed=9, num_steps=15) == expected
+
+
+def test_another_process_gives_the_same_bits(env: BombEnv) -> None:
+    script = (
+        "from lerobot_env_bomb.env import BombEnv\n"
+        "from lerobot_bomb.schema import EpisodeSpec, RenderOptions\n"
+        "from test_env import expert_digests\n"
+        "env = BombEnv(EpisodeSpec(seed=0), RenderOptions(image_size=32))\n"
+        "print(expert_digests(env, seed=9, num_steps=10)[-1])\n"
+    )
+    here = Path(__file__).parent
+    run = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, cwd=here)
+    assert run.stdout.strip() == expert_digests(env, seed=9, num_steps=10)[-1], run.stderr
+
+
+def test_observations_lie_in_their_space(env: BombEnv) -> None:
+    observation, _ = env.reset(seed=SEED)
+    assert env.observation_space.contains(observation)
+    assert observation["pixels"]["wrist"].shape == (32, 32, 3)
+    state = PrivilegedState.from_vector(observation["environment_state"])
+    np.testing.assert_allclose(observation["agent_pos"], [*state.gripper_xyz, state.finger_opening])
+    rng = np.random.default_rng(0)
+    for _ in range(20):
+        observation, *_ = env.step(rng.uniform(-1, 1, 4).astype(np.float32))
+        assert env.observation_space.contains(observation)
+
+
+def test_info_is_flat(env: BombEnv) -> None:
+    _, info = env.reset(seed=SEED)
+    assert set(info) == {
+        "is_success",
+        "is_success_bomb_v0",
+        "placement_error_mm",
+        "nearest_row",
+        "nearest_column",
+        "stage",
+        "failure",
+        "collateral_mm",
+        "seed",
+    }
+    assert info["seed"] == SEED and info["stage"] == "start" and info["failure"] == ""
+
+
+def test_the_picture_for_people_is_captioned_and_no_observation(env: BombEnv) -> None:
+    env.reset(seed=SEED)
+    picture = env.render()
+    assert picture.dtype == np.uint8 and picture.shape[1] == 768 and picture.shape[0] > 384
+    assert (picture[390:] > 200).any()  # letters
+    assert "stone" in env.task_description and env.task == "place"
+
+
+def test_each_finished_episode_appends_one_line(tmp_path: Path) -> None:
+    path = tmp_path / "results.jsonl"
+    env = BombEnv(EpisodeSpec(seed=0), SMALL, results_path=str(path))
+    rollout(env, expert, seed=SEED)
+    env.step(STILL)
+    rollout(env, stands_still, seed=SEED + 1)
+    env.close()
+    lines = [json.loads(line) for line in path.read_text().splitlines()]
+    assert [line["is_success"] for line in lines] == [True, False]
+    assert [line["spec"]["seed"] for line in lines] == [SEED, SEED + 1]
+    assert lines[1]["failure"] == "never_reached" and lines[1]["steps"] == 100
+    assert lines[0]["protocol_version"] == PROTOCOL_VERSION
+
+
+@pytest.mark.parametrize("gym_id", sorted(lerobot_env_bomb.GYM_IDS))
+def test_gymnasiums_checker_has_nothing_to_say(gym_id: str) -> None:
+    env = gymnasium.make(gym_id, render_options=SMALL).unwrapped
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        # advice on how to scale actions: absolute ones are metres by definition
+        warnings.filterwarnings("ignore", message=".*recommend using a symmetric and normalized space.*")
+        check_env(env)
+    env.close()
+
+
+def test_import_is_light() -> None:
+    heavy = ("torch", "lerobot", "transformers", "cv2")
+    script = f"import sys, lerobot_env_bomb.env; print([m for m in {heavy} if m in sys.modules])"
+    run = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True)
+    assert run.stdout.strip() == "[]", run.stderr

@@ -1,0 +1,122 @@
+import sys
+from functools import partial
+
+import numpy as np
+import pytest
+
+from lerobot_bomb.schema import EpisodeSpec, RenderOptions
+from lerobot_env_bomb.env import BombEnv
+from lerobot_env_bomb.vector import NEW_ROLLOUT_OPTION, FreezeAfterEnd, LazyVectorEnv
+
+SMALL = RenderOptions(image_size=32)
+SEEDS = [11, 12]
+STILL = np.zeros((2, 4), dtype=np.float32)
+
+
+def make_one(**spec: object) -> BombEnv:
+    return BombEnv(spec=EpisodeSpec(**{"seed": 0, **spec}), render_options=SMALL)  # pyright: ignore[reportArgumentType]
+
+
+def rollout(envs: LazyVectorEnv) -> list[dict]:
+    """Observations of a reset and three random steps."""
+    rng = np.random.default_rng(0)
+    observation, _ = envs.reset(seed=SEEDS, options={NEW_ROLLOUT_OPTION: True})
+    observations = [observation]
+    for _ in range(3):
+        action = rng.uniform(-1, 1, size=(2, 4)).astype(np.float32)
+        observations.append(envs.step(action)[0])
+    return [
+        {
+            "agent_pos": observation["agent_pos"].copy(),
+            "environment_state": observation["environment_state"].copy(),
+            **{camera: image.copy() for camera, image in observation["pixels"].items()},
+        }
+        for observation in observations
+    ]
+
+
+@pytest.fixture(scope="module")
+def single_process() -> list[dict]:
+    envs = LazyVectorEnv([make_one] * 2, use_async=False)
+    try:
+        return rollout(envs)
+    finally:
+        envs.close()
+
+
+@pytest.mark.parametrize("context", ["forkserver", "spawn"])
+def test_workers_give_bit_identical_observations(single_process: list[dict], context: str) -> None:
+    envs = LazyVectorEnv([partial(BombEnv, EpisodeSpec(seed=0), SMALL)] * 2, use_async=True, context=context)
+    try:
+        for expected, actual in zip(single_process, rollout(envs), strict=True):
+            for key in expected:
+                np.testing.assert_array_equal(expected[key], actual[key], err_msg=key)
+    finally:
+        envs.close()
+
+
+def test_workers_import_neither_torch_nor_lerobot() -> None:
+    envs = LazyVectorEnv([partial(ImportSpy, EpisodeSpec(seed=0), SMALL)] * 2, use_async=True)
+    try:
+        assert envs.call("heavy_modules") == ([], [])
+    finally:
+        envs.close()
+
+
+class ImportSpy(BombEnv):
+    """Tells what its process has imported."""
+
+    def heavy_modules(self) -> list[str]:
+        return [name for name in ("torch", "lerobot", "transformers") if name in sys.modules]
+
+
+def test_nothing_starts_before_the_first_use() -> None:
+    started = []
+
+    def make() -> BombEnv:
+        started.append(1)
+        return make_one()
+
+    envs = LazyVectorEnv([make] * 2, use_async=False)
+    assert len(started) == 1  # the probe for the spaces, closed again
+    assert envs.observation_space["agent_pos"].shape == (2, 4)  # pyright: ignore[reportIndexIssue]
+    envs.reset(seed=SEEDS)
+    assert len(started) == 3
+    envs.close()
+
+
+def test_an_ended_episode_stays_frozen_through_autoreset() -> None:
+    envs = LazyVectorEnv([partial(make_one, fps=1)] * 2, use_async=False)  # fps 1: ends after 10 steps
+    envs.reset(seed=SEEDS, options={NEW_ROLLOUT_OPTION: True})
+    while True:
+        observation, _, terminated, truncated, info = envs.step(STILL)
+        if (terminated | truncated).all():
+            break
+    last = observation["agent_pos"].copy()
+    for _ in range(3):
+        observation, reward, *_, info = envs.step(STILL + 1)
+        np.testing.assert_array_equal(observation["agent_pos"], last)
+        assert reward.tolist() == [0, 0]
+        assert info["seed"].tolist() == SEEDS
+    observation, info = envs.reset(seed=[21, 22], options={NEW_ROLLOUT_OPTION: True})
+    assert info["seed"].tolist() == [21, 22]
+    envs.close()
+
+
+def test_freezing_uses_lerobots_option_name() -> None:
+    from lerobot.envs.utils import NEW_ROLLOUT_OPTION as LEROBOTS
+
+    assert LEROBOTS == NEW_ROLLOUT_OPTION
+
+
+def test_a_seed_or_the_option_starts_a_new_episode() -> None:
+    env = FreezeAfterEnd(make_one(fps=1))
+    env.reset(seed=1)
+    ended = False
+    while not ended:
+        *_, terminated, truncated, _ = env.step(STILL[0])
+        ended = terminated or truncated
+    assert env.reset()[1]["seed"] == 1
+    assert env.reset(seed=2)[1]["seed"] == 2
+    assert env.reset(options={NEW_ROLLOUT_OPTION: True})[1]["seed"] != 1
+    env.close()
