@@ -1,0 +1,42 @@
+"""What the speed benchmarks share: an idle machine, and tables that are also JSON."""
+
+import argparse
+import json
+import os
+import platform
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+MAX_LOAD_PER_CORE = 0.5  # one-minute load average
+
+
+def add_machine_arguments(parser: argparse.ArgumentParser) -> None:
+    """Declare --json and --force."""
+    parser.add_argument("--json", type=Path, help="also write the figures to this file")
+    parser.add_argument("--force", action="store_true", help="measure on a busy machine all the same")
+
+
+def require_idle_machine(force: bool) -> None:
+    """Print the load average; leave with exit code 1 when other work would spoil the figures."""
+    num_cores = os.cpu_count() or 1
+    load = os.getloadavg()[0]
+    print(f"{platform.processor() or platform.machine()}, {num_cores} cores, load average {load:.2f}")
+    if load > MAX_LOAD_PER_CORE * num_cores and not force:
+        raise SystemExit(
+            f"The load is above {MAX_LOAD_PER_CORE} per core: wait until the machine is idle, or use --force."
+        )
+
+
+def print_table(header: Sequence[str], rows: Sequence[Sequence[str]]) -> None:
+    """Print rows of text, the first column to the left, the others to the right."""
+    widths = [max(len(row[i]) for row in [header, *rows]) for i in range(len(header))]
+    for name, *cells in [header, *rows]:
+        padded = [cell.rjust(width) for cell, width in zip(cells, widths[1:], strict=True)]
+        print("  ".join([name.ljust(widths[0]), *padded]).rstrip())
+
+
+def write_figures(path: Path | None, figures: dict[str, Any]) -> None:
+    """Write the figures of a run, with the load under which it ended, as JSON."""
+    if path is not None:
+        path.write_text(json.dumps({**figures, "load_average": os.getloadavg()[0]}, indent=1) + "\n")

@@ -1,0 +1,114 @@
+"""Frames per second of ``lerobot-bomb record`` against LeRobot's streaming writer fed from memory.
+
+Both write the same episodes: 2 cameras, 256x256, video. The recorder's time holds everything but
+Python's imports: starting its workers, simulation, encoding, merging. The peer gets frames that are
+ready in memory. Two more rows show what one encoder thread per camera and H.264 change for the peer.
+
+    OMP_NUM_THREADS=1 python benchmarks/record_speed.py --json record_speed.json
+"""
+
+import argparse
+import importlib
+import statistics
+import tempfile
+import time
+from pathlib import Path
+
+from machine import add_machine_arguments, print_table, require_idle_machine, write_figures
+
+from lerobot_bomb.data.record import record
+from lerobot_bomb.data.recording import Recording
+from lerobot_bomb.data.rollout import Rollout, RolloutSettings, make_env, play
+
+TARGET = 0.8  # of the peer's frames per second
+RECORDER, PEER = "lerobot-bomb record", "LeRobot's streaming writer"
+ONE_THREAD, H264 = f"{PEER}, 1 encoder thread", f"{PEER}, h264"
+
+
+def main() -> None:
+    """Measure in turn, print medians and ratios."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawTextHelpFormatter)
+    parser.add_argument("--episodes", type=int, default=60, help="episodes in each run (default: 60)")
+    parser.add_argument("--repeats", type=int, default=3, help="runs of each writer (default: 3)")
+    parser.add_argument(
+        "--workers", type=int, default=1, help="the recorder's simulator processes (default: 1)"
+    )
+    add_machine_arguments(parser)
+    args = parser.parse_args()
+    require_idle_machine(args.force)
+
+    # not at the top: the recorder's workers import this file's head and would load torch
+    importlib.import_module("lerobot_bomb.data.blocks")
+    importlib.import_module("datasets").disable_progress_bars()  # one bar per episode of the peer
+
+    recording = Recording("benchmark/bomb", args.episodes)
+    rollouts = collect(recording)
+    num_frames = sum(rollout.result.steps for rollout in rollouts)
+    seconds: dict[str, list[float]] = {name: [] for name in (RECORDER, PEER, ONE_THREAD, H264)}
+    for _ in range(args.repeats):
+        for name, runs in seconds.items():
+            with tempfile.TemporaryDirectory() as folder:
+                root = Path(folder) / "dataset"
+                started = time.perf_counter()
+                if name == RECORDER:
+                    record(recording, root, num_workers=args.workers)
+                else:
+                    write_with_lerobot(recording, root, rollouts, name)
+                runs.append(time.perf_counter() - started)
+
+    frames_per_s = {name: num_frames / statistics.median(runs) for name, runs in seconds.items()}
+    ratio = frames_per_s[RECORDER] / frames_per_s[PEER]
+    rows = [[n, f"{fps:.1f}", f"{fps / frames_per_s[PEER]:.2f}"] for n, fps in frames_per_s.items()]
+    print(f"{len(rollouts)} episodes, {num_frames} frames of 2 cameras, median of {args.repeats} runs")
+    print_table(["", "frames/s", "ratio"], rows)
+    print(f"target: a ratio of at least {TARGET}: {'reached' if ratio >= TARGET else 'missed'}")
+    write_figures(
+        args.json, {"frames": num_frames, "frames_per_s": frames_per_s, "ratio": ratio, "target": TARGET}
+    )
+
+
+def collect(recording: Recording) -> list[Rollout]:
+    """The successful rollouts that the recording will hold."""
+    env = make_env(recording.spec, recording.render_options)
+    settings = RolloutSettings(recording.spec, recording.render_options)
+    rollouts: list[Rollout] = []
+    seed = recording.seed
+    while len(rollouts) < recording.episodes:
+        rollout = play(env, settings, seed)
+        seed += 1
+        if rollout.result.is_success:
+            rollouts.append(rollout)
+    env.close()
+    return rollouts
+
+
+def write_with_lerobot(recording: Recording, root: Path, rollouts: list[Rollout], variant: str) -> None:
+    """Feed LeRobot's streaming writer as its own recording loop does."""
+    from lerobot.configs import RGBEncoderConfig
+    from lerobot.datasets import LeRobotDataset
+
+    from lerobot_bomb.data.blocks import DatasetLayout
+
+    layout = DatasetLayout(recording.repo_id, recording.spec, recording.render_options, use_videos=True)
+    dataset = LeRobotDataset.create(
+        recording.repo_id,
+        fps=recording.fps,
+        features=layout.features,
+        root=root,
+        streaming_encoding=True,
+        encoder_queue_maxsize=0,  # with its default of 30 it drops frames that come faster than it encodes
+        encoder_threads=1 if variant == ONE_THREAD else None,
+        rgb_encoder=RGBEncoderConfig(vcodec="h264") if variant == H264 else None,
+        video_backend="pyav",
+    )
+    for rollout in rollouts:
+        for step in range(rollout.result.steps):
+            frame = {f"observation.images.{camera}": f[step] for camera, f in rollout.frames.items()}
+            frame |= {"observation.state": rollout.states[step], "action": rollout.actions[step]}
+            dataset.add_frame({**frame, "task": rollout.result.instruction})
+        dataset.save_episode()
+    dataset.finalize()
+
+
+if __name__ == "__main__":
+    main()

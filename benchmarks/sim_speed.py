@@ -1,0 +1,246 @@
+"""Speed of BOMB against FetchPickAndPlace-v4 and robosuite's Lift, on this machine and in one run.
+
+Frames are 256x256, rendered off screen through EGL; a step has two cameras, and each environment runs
+at its default control rate. Every environment is measured in processes of its own, in turn.
+
+    OMP_NUM_THREADS=1 python benchmarks/sim_speed.py --json sim_speed.json
+
+robosuite pins packages that LeRobot does not bear, so it gets an environment of its own:
+    python -m venv robosuite-venv && robosuite-venv/bin/pip install robosuite==1.5.2 mujoco==3.8.1
+    python benchmarks/sim_speed.py --robosuite_python robosuite-venv/bin/python
+"""
+
+import argparse
+import json
+import multiprocessing
+import os
+import statistics
+import subprocess
+import sys
+import time
+from collections.abc import Callable
+from pathlib import Path
+
+from machine import add_machine_arguments, print_table, require_idle_machine, write_figures
+
+IMAGE_SIZE = 256
+NUM_FRAMES = 100
+NUM_STEPS = 60  # shorter than an episode
+WARM_UP = 5
+NUM_WORKER_STEPS = 600
+
+# name -> (largest or smallest ratio allowed, text)
+TARGETS = {
+    "frame / Fetch": (1 / 4, "<= 1/4"),
+    "step + 2 cameras / Lift": (1 / 12, "<= 1/12"),
+    "2 workers / 1 worker": (1.8, ">= 1.8"),
+    "start of 2 workers, s": (1.5, "< 1.5 s"),
+}
+
+
+def main() -> None:
+    """Measure in turn, print medians, ratios and targets."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawTextHelpFormatter)
+    parser.add_argument("--repeats", type=int, default=3, help="processes of each environment (default: 3)")
+    parser.add_argument("--robosuite_python", default=sys.executable, help="a Python that has robosuite")
+    parser.add_argument("--measure", choices=MEASURES, help=argparse.SUPPRESS)
+    add_machine_arguments(parser)
+    args = parser.parse_args()
+    if args.measure:
+        print(json.dumps(MEASURES[args.measure]()))
+        return
+    require_idle_machine(args.force)
+    os.environ.setdefault("MUJOCO_GL", "egl")
+    os.environ.setdefault("PYOPENGL_PLATFORM", os.environ["MUJOCO_GL"])
+
+    rates = {str(n): [worker_rate(n) for _ in range(args.repeats)] for n in (1, 2)}
+    milliseconds = compare_environments(args.repeats, args.robosuite_python)
+    figures = {
+        "milliseconds": milliseconds,
+        "steps_per_s": {number: statistics.median(runs) for number, runs in rates.items()},
+        "start_s": {path: start_seconds(path, args.repeats) for path in ("ours", "default")},
+    }
+    figures["ratios"] = ratios(figures)
+    report(figures)
+    write_figures(args.json, figures)
+
+
+def compare_environments(repeats: int, robosuite_python: str) -> dict[str, dict[str, float]]:
+    """{environment: {"frame" or "step": median milliseconds}}; an absent peer is left out."""
+    pythons = {"bomb": sys.executable, "fetch": sys.executable, "lift": robosuite_python}
+    runs: dict[str, list[dict[str, float]]] = {name: [] for name in pythons}
+    for _ in range(repeats):
+        for name, python in pythons.items():
+            output = run_in_process([python, __file__, "--measure", name], allow_failure=name == "lift")
+            if output is not None:
+                runs[name].append(output)
+    return {
+        name: {key: statistics.median(run[key] for run in of) for key in of[0]}
+        for name, of in runs.items()
+        if of
+    }
+
+
+def run_in_process(command: list[str], allow_failure: bool = False) -> dict[str, float] | None:
+    """The JSON on the last line that a command prints; None when it failed and may."""
+    done = subprocess.run(command, capture_output=True, text=True)
+    if done.returncode == 0:
+        return json.loads(done.stdout.splitlines()[-1])
+    if allow_failure:
+        return None
+    raise SystemExit(f"{' '.join(command)} failed:\n{done.stderr}")
+
+
+def median_ms(action: Callable[[], object], number: int) -> float:
+    """Median milliseconds of a call, after a warm-up."""
+    for _ in range(WARM_UP):
+        action()
+    times = []
+    for _ in range(number):
+        started = time.perf_counter()
+        action()
+        times.append(time.perf_counter() - started)
+    return 1000 * statistics.median(times)
+
+
+def make_bomb():
+    """BOMB with its default spec, reset."""
+    import gymnasium
+
+    env = gymnasium.make("lerobot_env_bomb:bomb/place-v0", disable_env_checker=True)
+    env.reset(seed=0)
+    return env
+
+
+def measure_bomb() -> dict[str, float]:
+    """Milliseconds of one camera's frame, and of a step with its two cameras."""
+    env = make_bomb()
+    draw = env.get_wrapper_attr("_draw")  # render() composes a picture for people
+    lift = [0.0, 0.0, 0.2, 1.0]
+    return {
+        "frame": median_ms(lambda: draw("workspace", IMAGE_SIZE), NUM_FRAMES),
+        "step": median_ms(lambda: env.step(lift), NUM_STEPS),
+    }
+
+
+def measure_fetch() -> dict[str, float]:
+    """Milliseconds of one frame."""
+    import gymnasium
+    import gymnasium_robotics
+
+    gymnasium.register_envs(gymnasium_robotics)
+    env = gymnasium.make("FetchPickAndPlace-v4", render_mode="rgb_array", width=IMAGE_SIZE, height=IMAGE_SIZE)
+    env.reset(seed=0)
+    return {"frame": median_ms(env.render, NUM_FRAMES)}
+
+
+def measure_lift() -> dict[str, float]:
+    """Milliseconds of one camera's frame, and of a step with two cameras."""
+    import numpy as np
+    import robosuite  # pyright: ignore[reportMissingImports]
+
+    env = robosuite.make(
+        "Lift",
+        robots="Panda",
+        has_renderer=False,
+        has_offscreen_renderer=True,
+        use_camera_obs=True,
+        camera_names=["agentview", "robot0_eye_in_hand"],
+        camera_heights=IMAGE_SIZE,
+        camera_widths=IMAGE_SIZE,
+    )
+    env.reset()
+    rest = np.zeros(env.action_dim)
+    return {
+        "frame": median_ms(
+            lambda: env.sim.render(IMAGE_SIZE, IMAGE_SIZE, camera_name="agentview"), NUM_FRAMES // 3
+        ),
+        "step": median_ms(lambda: env.step(rest), NUM_STEPS // 2),
+    }
+
+
+MEASURES = {"bomb": measure_bomb, "fetch": measure_fetch, "lift": measure_lift}
+
+
+def worker_rate(num_workers: int) -> float:
+    """Steps per second, with two cameras, of so many processes at once."""
+    context = multiprocessing.get_context("spawn")
+    barrier, queue = context.Barrier(num_workers), context.Queue()
+    workers = [context.Process(target=run_steps, args=(barrier, queue)) for _ in range(num_workers)]
+    for worker in workers:
+        worker.start()
+    seconds = [queue.get(timeout=120) for _ in workers]
+    for worker in workers:
+        worker.join()
+    return num_workers * NUM_WORKER_STEPS / max(seconds)
+
+
+def run_steps(barrier, queue) -> None:
+    """Put the seconds that the steps took; workers start together."""
+    env = make_bomb()
+    env.step([0.0, 0.0, 0.2, 1.0])
+    barrier.wait(timeout=120)
+    started = time.perf_counter()
+    for step in range(NUM_WORKER_STEPS):
+        if step % NUM_STEPS == 0:
+            env.reset(seed=step)
+        env.step([0.0, 0.0, 0.2, 1.0])
+    queue.put(time.perf_counter() - started)
+    env.close()
+
+
+def start_seconds(path: str, repeats: int) -> float:
+    """Median seconds until two async workers have delivered their first observation."""
+    command = [sys.executable, str(Path(__file__).with_name("env_start.py")), path]
+    runs = [run_in_process(command) for _ in range(repeats)]
+    return statistics.median(run["seconds"] for run in runs if run)
+
+
+def ratios(figures: dict) -> dict[str, float | None]:
+    """The figures that have targets."""
+    ms, rate, start = figures["milliseconds"], figures["steps_per_s"], figures["start_s"]
+    return {
+        "frame / Fetch": ms["bomb"]["frame"] / ms["fetch"]["frame"],
+        "frame / Lift": ms["bomb"]["frame"] / ms["lift"]["frame"] if "lift" in ms else None,
+        "step + 2 cameras / Lift": ms["bomb"]["step"] / ms["lift"]["step"] if "lift" in ms else None,
+        "2 workers / 1 worker": rate["2"] / rate["1"],
+        "start of 2 workers, s": start["ours"],
+        "start / LeRobot's default": start["ours"] / start["default"],
+    }
+
+
+def report(figures: dict) -> None:
+    """Print what was measured, then the ratios beside their targets."""
+    rows = []
+    for name in MEASURES:
+        measured = figures["milliseconds"].get(name, {})
+        rows.append([name, *(f"{measured[k]:.2f}" if k in measured else "-" for k in ("frame", "step"))])
+    print_table(["milliseconds", "frame", "step + 2 cameras"], rows)
+    if "lift" not in figures["milliseconds"]:
+        print("lift is absent: robosuite does not run here; see --help for how to install it")
+    print(f"steps/s with two cameras: {figures['steps_per_s']['1']:.0f} in one process, ", end="")
+    print(f"{figures['steps_per_s']['2']:.0f} in two")
+    print(
+        "start of two async workers: ours {ours:.2f} s, LeRobot's default {default:.2f} s\n".format(
+            **figures["start_s"]
+        )
+    )
+    rows = []
+    for name, ratio in figures["ratios"].items():
+        limit, text = TARGETS.get(name, (None, ""))
+        shown = "-" if ratio is None else f"{ratio:.3f}" if ratio >= 1 else f"1/{1 / ratio:.1f}"
+        verdict = ""
+        if limit is not None:
+            verdict = "not measured" if ratio is None else is_reached(ratio, limit, text)
+        rows.append([name, shown, text, verdict])
+    print_table(["", "ratio", "target", ""], rows)
+
+
+def is_reached(ratio: float, limit: float, text: str) -> str:
+    """The verdict on a ratio, in one word."""
+    reached = ratio >= limit if text.startswith(">=") else ratio <= limit
+    return "reached" if reached else "missed"
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,1 @@
+"""Datasets: recording them with the scripted expert."""

@@ -1,0 +1,235 @@
+"""``lerobot-bomb record``: the scripted expert's episodes as a LeRobotDataset.
+
+A recording grows in a folder beside its final place, as blocks that are finished datasets (see
+``blocks.py``); the merged dataset appears under its name at once, complete. LeRobot and torch are
+imported only after the flags have been checked and the workers are playing.
+"""
+
+import argparse
+import shutil
+from collections.abc import Iterable, Iterator
+from dataclasses import asdict, fields
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from filelock import FileLock, Timeout
+from tqdm import tqdm
+
+from lerobot_bomb.data.recording import (
+    BLOCK_FILE,
+    METADATA_FILE,
+    PARAMETERS_FILE,
+    Progress,
+    Recording,
+    check_folders,
+    finished_blocks,
+    read_progress,
+    unfinished_folder,
+    write_json,
+)
+from lerobot_bomb.data.rollout import Expert, Rollout, RolloutPool, RolloutSettings, make_env
+from lerobot_bomb.expert import expert_action
+from lerobot_bomb.schema import (
+    CONTROL_MODES,
+    DEFAULT_FPS,
+    DEFAULT_IMAGE_SIZE,
+    ROBOTS,
+    SPLITS,
+    SUITES,
+)
+
+if TYPE_CHECKING:
+    from lerobot_bomb.data.blocks import DatasetLayout
+
+BLOCK_EPISODES = 20  # what a kill can cost: they are played again on --resume
+# the expert counts as broken when, after so many seeds, fewer succeed
+MIN_TRIED = 20
+MIN_SUCCESS_RATE = 0.1
+
+
+def add_record_arguments(parser: argparse.ArgumentParser) -> None:
+    """Declare the arguments of ``lerobot-bomb record``."""
+    add = parser.add_argument
+    add("--repo_id", required=True, help="name of the dataset on the Hub, USER/NAME")
+    add("--root", type=Path, help="new folder of the dataset (default: LeRobot's, $HF_LEROBOT_HOME/REPO_ID)")
+    add("--episodes", type=int, required=True, help="successful episodes to record")
+    add("--seed", type=int, default=0, help="seed of the first episode; the others count up (default: 0)")
+    add("--task", default="place", help=f"suite: {', '.join(SUITES)} (default: place)")
+    add("--robot", default="scara", help=f"{', '.join(ROBOTS)} (default: scara)")
+    add("--control_mode", default="relative", help=f"{' or '.join(CONTROL_MODES)} (default: relative)")
+    add("--fps", type=int, default=DEFAULT_FPS, help=f"control steps a second (default: {DEFAULT_FPS})")
+    add("--image_size", type=int, default=DEFAULT_IMAGE_SIZE, help="pixels (default: %(default)s)")
+    add("--split", default="all", help=f"draw from {', '.join(SPLITS)} (default: all)")
+    add("--images", **_switch(), help="store images (lossless) instead of videos")
+    add("--workers", type=int, default=1, help="simulator processes; one keeps two cores busy (default: 1)")
+    add(
+        "--noise",
+        type=float,
+        default=0.0,
+        help="standard deviation of noise on the executed action, in units of the largest step, 40 mm; the "
+        "stored action is clean, so recoveries are in the data; the expert bears 0.05 (default: 0)",
+    )
+    add("--resume", **_switch(), help="continue a recording that was interrupted")
+
+
+def run_record(args: argparse.Namespace) -> int:
+    """Record as told; prints which episodes failed and where the dataset is."""
+    flags = vars(args)
+    recording = Recording(**{f.name: flags[f.name] for f in fields(Recording) if f.name in flags})
+    if args.workers < 1:
+        raise ValueError(f"--workers={args.workers} must be at least 1")
+    root = args.root or _default_root(recording.repo_id)
+    progress = record(recording, root, num_workers=args.workers, resume=args.resume)
+    seeds = f"{recording.seed}..{progress.next_seed - 1}"
+    print(
+        f"{progress.num_episodes} episodes, {progress.num_frames} frames, of the seeds {seeds}: {root}\n"
+        f"{describe_failures(progress.failures)}"
+    )
+    return 0
+
+
+def record(
+    recording: Recording,
+    root: Path,
+    num_workers: int = 1,
+    resume: bool = False,
+    expert: Expert = expert_action,
+) -> Progress:
+    """Record into `root`, which must not exist unless `resume` finds the same recording there.
+
+    The dataset depends on `recording` alone, not on the number of workers or on interruptions.
+
+    Raises:
+        ValueError: the folder exists, is missing, cannot be written, or holds another recording.
+        RuntimeError: the expert fails too often, the disk is full, or encoding failed.
+    """
+    folder = unfinished_folder(root)
+    try:
+        check_folders(recording, root, folder, resume)
+        if root.exists():
+            shutil.rmtree(folder, ignore_errors=True)  # left by a kill just after the last rename
+            return read_progress(root / METADATA_FILE)
+        folder.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise ValueError(f"--root={root} cannot be written: {error}") from error
+    try:
+        with FileLock(folder / "lock", timeout=0):
+            write_json(folder / PARAMETERS_FILE, {"recording": asdict(recording)})
+            progress = _record_blocks(recording, folder, num_workers, expert)
+            _publish(recording, progress, folder, root)
+    except Timeout:
+        raise ValueError(f"--root={root}: another process is recording there") from None
+    except (OSError, RuntimeError) as error:
+        raise RuntimeError(f"{error}\n{_what_is_kept(folder)}") from error
+    except KeyboardInterrupt:
+        tqdm.write(_what_is_kept(folder))
+        raise
+    shutil.rmtree(folder)
+    return progress
+
+
+def describe_failures(failures: list[dict[str, Any]]) -> str:
+    """One line that counts the failed episodes, with their classes and seeds."""
+    if not failures:
+        return "No episode failed."
+    seeds: dict[str, list[str]] = {}
+    for failure in failures:
+        seeds.setdefault(failure["failure"], []).append(str(failure["seed"]))
+    classes = "; ".join(f"{len(of)} {name} (seeds {', '.join(of)})" for name, of in sorted(seeds.items()))
+    return f"{len(failures)} failed and were left out: {classes}"
+
+
+def _record_blocks(recording: Recording, folder: Path, num_workers: int, expert: Expert) -> Progress:
+    """Write the blocks that are missing."""
+    blocks = finished_blocks(folder)
+    progress = read_progress(blocks[-1] / BLOCK_FILE) if blocks else Progress(next_seed=recording.seed)
+    if progress.num_episodes == recording.episodes:
+        return progress
+    # MuJoCo's backend is chosen here, or its absence reported; the workers inherit the choice
+    make_env(recording.spec, recording.render_options).close()
+    settings = RolloutSettings(recording.spec, recording.render_options, recording.noise, expert)
+    with RolloutPool(settings, progress.next_seed, num_workers) as pool:
+        from lerobot_bomb.data.blocks import write_block  # takes seconds, in which the workers play
+
+        with tqdm(total=recording.episodes, initial=progress.num_episodes, unit="episode") as bar:
+            while progress.num_episodes < recording.episodes:
+                block = folder / f"block-{progress.num_episodes // BLOCK_EPISODES:05d}"
+                unfinished = block.with_suffix(".tmp")
+                shutil.rmtree(unfinished, ignore_errors=True)
+                size = min(BLOCK_EPISODES, recording.episodes - progress.num_episodes)
+                successes = _successes(pool, size, progress, bar)
+                progress.num_frames += write_block(_layout(recording), unfinished, successes)
+                write_json(unfinished / BLOCK_FILE, asdict(progress))
+                unfinished.rename(block)
+    return progress
+
+
+def _successes(pool: Iterable[Rollout], number: int, progress: Progress, bar: tqdm) -> Iterator[Rollout]:
+    """Yield so many successful rollouts; note the failed ones on the way."""
+    for rollout in pool:
+        progress.next_seed = rollout.result.spec.seed + 1
+        if rollout.result.is_success:
+            progress.num_episodes += 1
+            number -= 1
+            yield rollout
+            bar.update()
+        else:
+            progress.failures.append({"seed": rollout.result.spec.seed, "failure": rollout.result.failure})
+            bar.set_postfix(failed=len(progress.failures))
+            _check_success_rate(progress)
+        if number == 0:
+            return
+
+
+def _check_success_rate(progress: Progress) -> None:
+    num_tried = progress.num_episodes + len(progress.failures)
+    if num_tried >= MIN_TRIED and progress.num_episodes < MIN_SUCCESS_RATE * num_tried:
+        raise RuntimeError(
+            f"only {progress.num_episodes} of {num_tried} episodes succeeded, too few to go on; "
+            f"a smaller --noise may help. {describe_failures(progress.failures)}"
+        )
+
+
+def _publish(recording: Recording, progress: Progress, folder: Path, root: Path) -> None:
+    """Merge the blocks and give the complete dataset its name."""
+    from lerobot_bomb.data.blocks import merge_blocks
+
+    dataset = folder / "dataset"
+    shutil.rmtree(dataset, ignore_errors=True)
+    merge_blocks(_layout(recording), finished_blocks(folder), dataset)
+    write_json(dataset / METADATA_FILE, {"recording": asdict(recording), **asdict(progress)})
+    dataset.rename(root)
+
+
+def _layout(recording: Recording) -> "DatasetLayout":
+    from lerobot_bomb.data.blocks import DatasetLayout
+
+    return DatasetLayout(
+        recording.repo_id, recording.spec, recording.render_options, use_videos=not recording.images
+    )
+
+
+def _what_is_kept(folder: Path) -> str:
+    blocks = finished_blocks(folder)
+    if not blocks:
+        shutil.rmtree(folder)
+        return "No block of episodes was finished, so nothing is kept."
+    num_episodes = read_progress(blocks[-1] / BLOCK_FILE).num_episodes
+    return f"{num_episodes} episodes are kept in {folder}; go on with --resume"
+
+
+def _default_root(repo_id: str) -> Path:
+    from lerobot.utils.constants import HF_LEROBOT_HOME  # imports torch: seconds
+
+    return HF_LEROBOT_HOME / repo_id
+
+
+def _switch() -> dict[str, Any]:
+    """Arguments of a flag that works alone and as LeRobot writes it: --resume, --resume=true."""
+    return {"nargs": "?", "const": True, "default": False, "type": _parse_bool}
+
+
+def _parse_bool(text: str) -> bool:
+    if text.lower() not in ("true", "false"):
+        raise argparse.ArgumentTypeError(f"{text!r} must be true or false")
+    return text.lower() == "true"

@@ -1,0 +1,144 @@
+"""A recording: what determines it, how far it got, and its files.
+
+While a recording grows it is a folder beside its final place:
+    NAME.recording/recording.json   the parameters
+    NAME.recording/block-00000/     a finished LeRobotDataset, and block.json: the progress up to its end
+"""
+
+import json
+import re
+from dataclasses import asdict, dataclass, field, fields
+from pathlib import Path
+from typing import Any
+
+from lerobot_bomb import __version__
+from lerobot_bomb.schema import (
+    DEFAULT_FPS,
+    DEFAULT_IMAGE_SIZE,
+    PROTOCOL_VERSION,
+    EpisodeSpec,
+    RenderOptions,
+)
+
+MAX_NOISE = 1.0  # beyond it the noise exceeds the largest action
+
+PARAMETERS_FILE = "recording.json"  # in the unfinished recording
+BLOCK_FILE = "block.json"  # in each block
+METADATA_FILE = Path("meta") / "bomb.json"  # in the dataset
+
+
+@dataclass(frozen=True)
+class Recording:
+    """What determines a recording frame by frame."""
+
+    repo_id: str
+    episodes: int
+    seed: int = 0
+    task: str = "place"
+    robot: str = "scara"
+    control_mode: str = "relative"
+    fps: int = DEFAULT_FPS
+    image_size: int = DEFAULT_IMAGE_SIZE
+    split: str = "all"
+    images: bool = False
+    noise: float = 0.0
+    protocol_version: str = PROTOCOL_VERSION
+    package_version: str = __version__
+
+    def __post_init__(self) -> None:
+        if not re.fullmatch(r"[\w.-]+/[\w.-]+", self.repo_id):
+            raise ValueError(f"--repo_id={self.repo_id!r} must have the form USER/NAME")
+        if self.episodes < 1:
+            raise ValueError(f"--episodes={self.episodes} must be at least 1")
+        if not 0 <= self.noise <= MAX_NOISE:
+            raise ValueError(
+                f"--noise={self.noise} must lie in 0..{MAX_NOISE:g}; "
+                "it is a standard deviation in units of the largest step, 40 mm"
+            )
+        try:
+            _ = self.spec, self.render_options  # they check the remaining flags
+        except ValueError as error:
+            # the same flags are called --env.* in LeRobot's commands
+            raise ValueError(str(error).replace("--env.", "--")) from None
+
+    @property
+    def spec(self) -> EpisodeSpec:
+        """The spec of the first seed; an episode differs in its seed only."""
+        return EpisodeSpec(
+            seed=self.seed,
+            suite=self.task,
+            robot=self.robot,
+            split=self.split,
+            control_mode=self.control_mode,
+            fps=self.fps,
+        )
+
+    @property
+    def render_options(self) -> RenderOptions:
+        return RenderOptions(image_size=self.image_size)
+
+
+@dataclass
+class Progress:
+    """What has been recorded, and where to go on."""
+
+    next_seed: int
+    num_episodes: int = 0
+    num_frames: int = 0
+    failures: list[dict[str, Any]] = field(default_factory=list)  # [{"seed": ..., "failure": ...}]
+
+
+def unfinished_folder(root: Path) -> Path:
+    """Where a recording grows until it is complete."""
+    root = root.absolute()
+    return root.with_name(f"{root.name}.recording")
+
+
+def check_folders(recording: Recording, root: Path, folder: Path, resume: bool) -> None:
+    """Refuse to overwrite anything, to resume nothing, and to mix two recordings.
+
+    Raises:
+        ValueError: names the flag and what is in the way.
+    """
+    if not resume:
+        if root.exists():
+            raise ValueError(f"--root={root} exists already; name a new folder or delete it")
+        if folder.exists():
+            raise ValueError(f"{folder} holds an unfinished recording; go on with --resume or delete it")
+    elif not root.exists() and not folder.exists():
+        raise ValueError(f"--resume: there is no recording to go on with in --root={root}")
+    elif root.exists() and not (root / METADATA_FILE).exists():
+        raise ValueError(f"--resume: --root={root} holds no {METADATA_FILE}, so it is no recording")
+    else:
+        _check_same_recording(recording, root / METADATA_FILE if root.exists() else folder / PARAMETERS_FILE)
+
+
+def _check_same_recording(recording: Recording, path: Path) -> None:
+    if not path.exists():
+        return  # killed before anything was recorded
+    existing = json.loads(path.read_text())["recording"]
+    differences = [
+        f"--{name}={value} (it has {existing.get(name)})"
+        for name, value in asdict(recording).items()
+        if value != existing.get(name)
+    ]
+    if differences:
+        raise ValueError(f"--resume: the recording in {path.parent} differs in {', '.join(differences)}")
+
+
+def finished_blocks(folder: Path) -> list[Path]:
+    """Folders of the blocks that a resumed recording keeps, in order."""
+    return sorted(path for path in folder.glob("block-*") if path.suffix != ".tmp")
+
+
+def read_progress(path: Path) -> Progress:
+    """Progress from a file of either kind."""
+    values = json.loads(path.read_text())
+    return Progress(**{f.name: values[f.name] for f in fields(Progress)})
+
+
+def write_json(path: Path, values: dict[str, Any]) -> None:
+    """Write a file that is complete whenever it exists."""
+    unfinished = path.with_suffix(".tmp")
+    unfinished.write_text(json.dumps(values, indent=1))
+    unfinished.replace(path)

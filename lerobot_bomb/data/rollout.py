@@ -1,0 +1,168 @@
+"""Episodes of the scripted expert, played in worker processes.
+
+The workers import this module, so it imports neither torch nor LeRobot.
+"""
+
+import atexit
+import itertools
+import multiprocessing
+import os
+import signal
+import threading
+from collections import deque
+from collections.abc import Callable, Iterator
+from concurrent.futures import Future, ProcessPoolExecutor
+from dataclasses import dataclass
+from typing import Self
+
+import gymnasium
+import numpy as np
+
+from lerobot_bomb.expert import expert_action
+from lerobot_bomb.schema import (
+    CAMERAS,
+    MAX_STEP_M,
+    EpisodeResult,
+    EpisodeSpec,
+    PrivilegedState,
+    RenderOptions,
+    action_bounds,
+)
+
+# Importing the part before the colon registers the id; no module of the core imports an environment.
+ENV_ID = "lerobot_env_bomb:bomb/{suite}-v0"
+NOISE_STREAM = 0xDA57  # keeps the noise independent of what the environment draws from the same seed
+LOOKAHEAD = 2  # episodes that wait for the writer, beside one in each worker
+
+# (privileged state, control mode, fps) -> (4,) action
+type Expert = Callable[[PrivilegedState, str, int], np.ndarray]
+
+
+@dataclass(frozen=True)
+class RolloutSettings:
+    """How to play; with a seed it determines a rollout."""
+
+    spec: EpisodeSpec
+    render_options: RenderOptions
+    noise: float = 0.0  # standard deviation on x, y and z, in units of the largest relative step
+    expert: Expert = expert_action
+
+
+@dataclass(frozen=True)
+class Rollout:
+    """One episode of T steps. A failed one carries its result only: its arrays are empty."""
+
+    result: EpisodeResult
+    states: np.ndarray  # (T, 4) float32, metres
+    actions: np.ndarray  # (T, 4) float32, the expert's clean actions
+    frames: dict[str, np.ndarray]  # camera -> (T, H, W, 3) uint8
+
+
+def make_env(spec: EpisodeSpec, render_options: RenderOptions) -> gymnasium.Env:
+    """BOMB from Gymnasium's registry; it starts MuJoCo and OpenGL on its first reset."""
+    return gymnasium.make(
+        ENV_ID.format(suite=spec.suite),
+        disable_env_checker=True,
+        spec=spec,
+        render_options=render_options,
+    )
+
+
+def play(env: gymnasium.Env, settings: RolloutSettings, seed: int) -> Rollout:
+    """Play the episode of a seed; the stored actions are clean, the executed ones carry the noise."""
+    control_mode, fps = settings.spec.control_mode, settings.spec.fps
+    noise_rng = np.random.default_rng((NOISE_STREAM, seed))
+    observation, _ = env.reset(seed=seed)
+    observations, actions = [], []
+    ended = False
+    while not ended:
+        state = PrivilegedState.from_vector(observation["environment_state"])
+        action = settings.expert(state, control_mode, fps)
+        observations.append(observation)
+        actions.append(action)
+        executed = perturb(action, settings.noise, control_mode, noise_rng)
+        observation, _, terminated, truncated, _ = env.step(executed)
+        ended = terminated or truncated
+    result = env.get_wrapper_attr("episode_result")()
+    if not result.is_success:
+        return Rollout(result, np.empty((0, 4), np.float32), np.empty((0, 4), np.float32), {})
+    return Rollout(
+        result=result,
+        states=np.stack([observation["agent_pos"] for observation in observations]),
+        actions=np.stack(actions),
+        frames={camera: np.stack([o["pixels"][camera] for o in observations]) for camera in CAMERAS},
+    )
+
+
+def perturb(action: np.ndarray, noise: float, control_mode: str, rng: np.random.Generator) -> np.ndarray:
+    """(4,) action -> (4,) float32 within its bounds, with Gaussian noise on x, y and z.
+
+    The gripper's command is left alone: its sign opens or closes, so noise on it would drop the stone
+    and not merely push the arm off its path.
+    """
+    scale = noise * (MAX_STEP_M if control_mode == "absolute" else 1.0)
+    offset = np.append(scale * rng.standard_normal(3), 0.0)
+    low, high = action_bounds(control_mode)
+    return np.clip(action + offset, low, high).astype(np.float32)
+
+
+class RolloutPool:
+    """Worker processes that play the episodes of consecutive seeds ahead of the writer.
+
+    Iterating yields the rollouts in the order of their seeds, whatever the number of workers.
+    """
+
+    def __init__(self, settings: RolloutSettings, first_seed: int, num_workers: int) -> None:
+        self._executor = ProcessPoolExecutor(
+            num_workers,
+            # spawned, not forked: a fork of a process with threads may hang
+            mp_context=multiprocessing.get_context("spawn"),
+            initializer=_start_worker,
+            initargs=(settings,),
+        )
+        self._seeds = itertools.count(first_seed)
+        self._pending: deque[Future[Rollout]] = deque()
+        for _ in range(num_workers + LOOKAHEAD):
+            self._submit()
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._executor.shutdown(cancel_futures=True)
+
+    def __iter__(self) -> Iterator[Rollout]:
+        while True:
+            rollout = self._pending.popleft().result()
+            self._submit()
+            yield rollout
+
+    def _submit(self) -> None:
+        self._pending.append(self._executor.submit(_play_in_worker, next(self._seeds)))
+
+
+# What a worker process keeps between episodes: set once by _start_worker.
+_worker: tuple[gymnasium.Env, RolloutSettings] | None = None
+
+
+def _start_worker(settings: RolloutSettings) -> None:
+    global _worker
+    signal.signal(signal.SIGINT, signal.SIG_IGN)  # the parent ends its workers in order
+    threading.Thread(target=_exit_with_parent, daemon=True).start()
+    env = make_env(settings.spec, settings.render_options)
+    atexit.register(env.close)
+    _worker = (env, settings)
+
+
+def _exit_with_parent() -> None:
+    """Leave when the recorder is killed: an idle worker would wait for work forever."""
+    parent = multiprocessing.parent_process()
+    if parent is not None:
+        parent.join()
+        os._exit(1)
+
+
+def _play_in_worker(seed: int) -> Rollout:
+    if _worker is None:
+        raise RuntimeError("this process was not started as a rollout worker")
+    return play(*_worker, seed)

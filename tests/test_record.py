@@ -1,0 +1,290 @@
+"""`lerobot-bomb record`. Simulator workers import this file's head, so LeRobot is imported inside tests."""
+
+import errno
+import json
+import signal
+import subprocess
+import sys
+import time
+from dataclasses import asdict
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from lerobot_bomb import __version__
+from lerobot_bomb.data import record as record_module
+from lerobot_bomb.data.record import describe_failures, record
+from lerobot_bomb.data.recording import METADATA_FILE, Progress, Recording, read_progress, unfinished_folder
+from lerobot_bomb.data.rollout import RolloutSettings, make_env, play
+from lerobot_bomb.expert import expert_action
+from lerobot_bomb.schema import CAMERAS, PROTOCOL_VERSION, EpisodeSpec, PrivilegedState, RenderOptions
+
+SIZE = 64
+SMALL = RenderOptions(image_size=SIZE)
+VIDEO = Recording("test/video", episodes=5, seed=3, image_size=SIZE)
+IMAGES = Recording("test/images", episodes=2, image_size=SIZE, control_mode="absolute", images=True)
+FEATURES = {"observation.images.workspace", "observation.images.wrist", "observation.state", "action"}
+
+
+@pytest.fixture(autouse=True)
+def small_blocks(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Blocks of 2 episodes, so that a short recording is merged from several."""
+    monkeypatch.setattr(record_module, "BLOCK_EPISODES", 2)
+
+
+@pytest.fixture(scope="module")
+def datasets(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
+    """Two uninterrupted recordings."""
+    roots = {name: tmp_path_factory.mktemp("recorded") / name for name in ("video", "images")}
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(record_module, "BLOCK_EPISODES", 2)
+        record(VIDEO, roots["video"])
+        record(IMAGES, roots["images"])
+    return roots
+
+
+def contents(root: Path) -> dict[str, bytes]:
+    return {str(path.relative_to(root)): path.read_bytes() for path in root.rglob("*") if path.is_file()}
+
+
+def episode_rows(root: Path) -> list[Any]:
+    """LeRobot's table of episodes."""
+    from lerobot.datasets import LeRobotDatasetMetadata
+
+    return list(LeRobotDatasetMetadata("test/any", root=root).episodes or [])
+
+
+def stand_still(state: PrivilegedState, control_mode: str, fps: int) -> np.ndarray:
+    return np.array([0, 0, 0, 1], dtype=np.float32)
+
+
+def stand_still_for_white(state: PrivilegedState, control_mode: str, fps: int) -> np.ndarray:
+    act = stand_still if state.stone_is_white[state.stone] else expert_action
+    return act(state, control_mode, fps)
+
+
+@pytest.mark.parametrize("recording", [VIDEO, IMAGES], ids=["video", "images"])
+def test_a_dataset_reads_back_through_lerobot(recording: Recording, datasets: dict[str, Path]) -> None:
+    from lerobot.datasets import LeRobotDataset
+    from lerobot.utils.constants import DEFAULT_FEATURES
+
+    root = datasets["images" if recording.images else "video"]
+    dataset = LeRobotDataset(recording.repo_id, root=root, video_backend="pyav")
+    assert set(dataset.features) == FEATURES | set(DEFAULT_FEATURES)
+    for camera in CAMERAS:
+        feature = dataset.features[f"observation.images.{camera}"]
+        assert feature["dtype"] == ("image" if recording.images else "video")
+        assert feature["shape"] == (SIZE, SIZE, 3)
+        assert feature["names"] == ["height", "width", "channels"]
+    assert dataset.features["observation.state"]["names"] == ["x", "y", "z", "finger_opening"]
+    first = "x" if recording.control_mode == "absolute" else "dx"
+    assert dataset.features["action"]["names"][0] == first
+    assert (dataset.fps, dataset.meta.robot_type) == (10, "bomb_scara")
+    assert dataset.num_episodes == recording.episodes
+    progress = read_progress(root / METADATA_FILE)
+    assert len(dataset) == progress.num_frames
+    for index in (0, len(dataset) - 1):
+        item: Any = dataset[index]
+        assert item["observation.images.wrist"].shape == (3, SIZE, SIZE)
+        assert item["observation.state"].dtype == item["action"].dtype
+        assert item["action"].shape == item["observation.state"].shape == (4,)
+        assert "stone" in item["task"]
+
+
+def test_policies_see_cameras_state_and_action_only(datasets: dict[str, Path]) -> None:
+    from lerobot.datasets import LeRobotDatasetMetadata
+    from lerobot.utils.feature_utils import dataset_to_policy_features
+
+    metadata = LeRobotDatasetMetadata(VIDEO.repo_id, root=datasets["video"])
+    assert set(dataset_to_policy_features(metadata.features)) == FEATURES
+
+
+@pytest.mark.parametrize("recording", [VIDEO, IMAGES], ids=["video", "images"])
+def test_recorded_actions_replay_to_the_same_success(recording: Recording, datasets: dict[str, Path]) -> None:
+    from lerobot.datasets import LeRobotDataset
+
+    root = datasets["images" if recording.images else "video"]
+    dataset = LeRobotDataset(recording.repo_id, root=root, video_backend="pyav")
+    for episode in episode_rows(root):
+        spec = EpisodeSpec(**json.loads(episode["bomb/spec"]))
+        env = make_env(spec, SMALL)
+        observation, info = env.reset(seed=spec.seed)
+        for index in range(episode["dataset_from_index"], episode["dataset_to_index"]):
+            assert not info["is_success"]
+            item: Any = dataset[index]
+            assert item["observation.state"].numpy() == pytest.approx(observation["agent_pos"], abs=0)
+            assert item["task"] == env.get_wrapper_attr("task_description")
+            shown = (item["observation.images.workspace"].numpy().transpose(1, 2, 0) * 255).round()
+            difference = np.abs(shown - observation["pixels"]["workspace"]).mean()
+            assert difference == 0 if recording.images else difference < 8
+            observation, _, _, _, info = env.step(item["action"].numpy())
+        assert info["is_success"]
+        env.close()
+
+
+def test_episodes_carry_what_determines_them(datasets: dict[str, Path]) -> None:
+    rows = episode_rows(datasets["video"])
+    assert [row["bomb/seed"] for row in rows] == [3, 4, 5, 6, 7]
+    assert {row["bomb/protocol_version"] for row in rows} == {PROTOCOL_VERSION}
+    assert {row["bomb/package_version"] for row in rows} == {__version__}
+    assert json.loads(rows[0]["bomb/spec"]) == EpisodeSpec(seed=3).to_dict()
+    (instruction,) = rows[0]["tasks"]
+    row, column = rows[0]["bomb/target"]
+    assert str(row) in instruction
+    assert str(column) in instruction
+    assert rows[0]["bomb/color"] in instruction
+    written = json.loads((datasets["video"] / METADATA_FILE).read_text())["recording"]
+    versions = {"protocol_version": PROTOCOL_VERSION, "package_version": __version__}
+    assert written == {**asdict(VIDEO), **versions}
+
+
+def test_episode_columns_survive_a_merge_with_another_dataset(
+    datasets: dict[str, Path], tmp_path: Path
+) -> None:
+    from lerobot.datasets import aggregate_datasets
+
+    roots = [datasets["images"]] * 2
+    aggregate_datasets(["test/images"] * 2, "test/merged", roots=roots, aggr_root=tmp_path / "merged")
+    assert [row["bomb/seed"] for row in episode_rows(tmp_path / "merged")] == [0, 1, 0, 1]
+
+
+def test_image_statistics_are_sampled_and_right(tmp_path: Path) -> None:
+    recording = Recording("test/full", episodes=1)
+    record(recording, tmp_path / "full")
+    statistics = json.loads((tmp_path / "full" / "meta" / "stats.json").read_text())
+    env = make_env(recording.spec, recording.render_options)
+    rollout = play(env, RolloutSettings(recording.spec, recording.render_options), recording.seed)
+    env.close()
+    for camera, frames in rollout.frames.items():
+        found = statistics[f"observation.images.{camera}"]
+        assert found["count"] == [rollout.result.steps * 128 * 128]
+        assert np.ravel(found["mean"]) == pytest.approx(frames.mean(axis=(0, 1, 2)) / 255, abs=0.005)
+        assert np.ravel(found["std"]) == pytest.approx(frames.std(axis=(0, 1, 2)) / 255, abs=0.005)
+
+
+def test_the_number_of_workers_does_not_change_a_byte(datasets: dict[str, Path], tmp_path: Path) -> None:
+    record(VIDEO, tmp_path / "video", num_workers=2)
+    assert contents(tmp_path / "video") == contents(datasets["video"])
+
+
+def test_failed_episodes_are_left_out_and_counted(tmp_path: Path) -> None:
+    recording = Recording("test/half", episodes=3, image_size=SIZE)
+    progress = record(recording, tmp_path / "half", expert=stand_still_for_white)
+    rows = episode_rows(tmp_path / "half")
+    kept = [row["bomb/seed"] for row in rows]
+    failed = [failure["seed"] for failure in progress.failures]
+    assert {row["bomb/color"] for row in rows} == {"black"}
+    assert failed
+    assert sorted(kept + failed) == list(range(progress.next_seed))
+    assert read_progress(tmp_path / "half" / METADATA_FILE) == progress
+
+
+def test_failures_are_described_by_class_and_seed() -> None:
+    failures = [{"seed": s, "failure": f} for s, f in ((2, "imprecise"), (5, "dropped"), (9, "imprecise"))]
+    expected = "3 failed and were left out: 1 dropped (seeds 5); 2 imprecise (seeds 2, 9)"
+    assert describe_failures(failures) == expected
+    assert describe_failures([]) == "No episode failed."
+
+
+def test_a_broken_expert_ends_the_recording(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(record_module, "MIN_TRIED", 3)
+    with pytest.raises(RuntimeError, match=r"only 0 of 3 episodes succeeded.*never_reached.*0, 1, 2"):
+        record(Recording("test/x", episodes=1, image_size=SIZE), tmp_path / "x", expert=stand_still)
+    assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.parametrize("moment", ["second block", "block's name", "merge", "dataset's name"])
+def test_an_interrupted_recording_resumes_to_the_same_bytes(
+    moment: str, datasets: dict[str, Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    from lerobot_bomb.data import blocks
+
+    root = tmp_path / "video"
+    interrupt_at(moment, blocks, monkeypatch)
+    with pytest.raises(KeyboardInterrupt):
+        record(VIDEO, root)
+    monkeypatch.undo()
+    monkeypatch.setattr(record_module, "BLOCK_EPISODES", 2)
+    assert not root.exists()
+    assert list(tmp_path.iterdir()) == [unfinished_folder(root)]
+    progress = record(VIDEO, root, resume=True)
+    assert progress.num_episodes == 5
+    assert contents(root) == contents(datasets["video"])
+    assert list(tmp_path.iterdir()) == [root]
+
+
+def interrupt_at(moment: str, blocks, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Raise KeyboardInterrupt at a moment between two steps of a recording."""
+    if moment == "second block":
+        write = blocks._write_episode
+        episodes = iter(range(10))
+
+        def write_three(dataset, rollout) -> None:
+            if next(episodes) == 3:
+                raise KeyboardInterrupt
+            write(dataset, rollout)
+
+        monkeypatch.setattr(blocks, "_write_episode", write_three)
+    elif moment == "merge":
+        merge = blocks.merge_blocks
+
+        def merge_in_vain(layout, parts, dataset) -> None:
+            merge(layout, parts, dataset)
+            raise KeyboardInterrupt
+
+        monkeypatch.setattr(blocks, "merge_blocks", merge_in_vain)
+    else:
+        rename = Path.rename
+        last = "block-00001" if moment == "block's name" else "video"
+
+        def rename_others(path: Path, target: Path) -> Path:
+            if target.name == last:
+                raise KeyboardInterrupt
+            return rename(path, target)
+
+        monkeypatch.setattr(Path, "rename", rename_others)
+
+
+def test_a_killed_recording_resumes_to_the_same_bytes(datasets: dict[str, Path], tmp_path: Path) -> None:
+    root = tmp_path / "video"
+    script = (
+        "import sys; from pathlib import Path; from lerobot_bomb.data import record as module\n"
+        "from lerobot_bomb.data.recording import Recording\n"
+        "module.BLOCK_EPISODES = 2\n"
+        f"if __name__ == '__main__': module.record({VIDEO!r}, Path(sys.argv[1]))\n"
+    )
+    process = subprocess.Popen([sys.executable, "-c", script, str(root)], stderr=subprocess.DEVNULL)
+    while not (unfinished_folder(root) / "block-00000").exists():
+        assert process.poll() is None
+        time.sleep(0.01)
+    process.send_signal(signal.SIGKILL)
+    process.wait()
+    assert not root.exists()
+    record(VIDEO, root, resume=True)
+    assert contents(root) == contents(datasets["video"])
+
+
+def test_resuming_a_complete_recording_changes_nothing(datasets: dict[str, Path]) -> None:
+    before = contents(datasets["video"])
+    num_frames = json.loads(before["meta/info.json"])["total_frames"]
+    assert record(VIDEO, datasets["video"], resume=True) == Progress(8, 5, num_frames, [])
+    assert contents(datasets["video"]) == before
+
+
+def test_a_full_disk_is_reported_and_what_was_finished_is_kept(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    from lerobot_bomb.data import blocks
+
+    write_block = blocks.write_block
+
+    def disk_full(layout, folder, rollouts) -> int:
+        if folder.name.startswith("block-00001"):
+            raise OSError(errno.ENOSPC, "No space left on device")
+        return write_block(layout, folder, rollouts)
+
+    monkeypatch.setattr(blocks, "write_block", disk_full)
+    with pytest.raises(RuntimeError, match=r"No space left on device\n2 episodes are kept in .*--resume"):
+        record(VIDEO, tmp_path / "video")

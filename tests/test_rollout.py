@@ -1,0 +1,75 @@
+"""Episodes that the recorder plays, and their noise."""
+
+import subprocess
+import sys
+
+import gymnasium
+import numpy as np
+import pytest
+
+from lerobot_bomb.data.rollout import RolloutPool, RolloutSettings, make_env, perturb, play
+from lerobot_bomb.expert import expert_action
+from lerobot_bomb.schema import EpisodeSpec, PrivilegedState, RenderOptions
+
+SMALL = RenderOptions(image_size=64)
+
+
+class ExecutedActions(gymnasium.Wrapper):
+    """Notes what the environment is told to do, and the state in which it is told."""
+
+    def __init__(self, env: gymnasium.Env) -> None:
+        super().__init__(env)
+        self.actions: list[np.ndarray] = []
+        self.states: list[PrivilegedState] = []
+
+    def step(self, action: np.ndarray):
+        self.actions.append(action)
+        self.states.append(self.env.get_wrapper_attr("privileged_state")())
+        return super().step(action)
+
+
+def test_noise_is_executed_but_not_stored() -> None:
+    settings = RolloutSettings(EpisodeSpec(seed=0), SMALL, noise=0.1)
+    env = ExecutedActions(make_env(settings.spec, SMALL))
+    rollout = play(env, settings, seed=0)
+    assert rollout.result.is_success
+    clean = np.stack([expert_action(PrivilegedState.from_vector(s.to_vector())) for s in env.states])
+    executed = np.stack(env.actions)
+    assert np.array_equal(rollout.actions, clean)
+    assert np.array_equal(executed[:, 3], clean[:, 3])
+    assert 0.05 < np.std(executed[:, :3] - clean[:, :3]) < 0.15
+
+    again = play(env, settings, seed=0)
+    other = play(env, settings, seed=1)
+    env.close()
+    assert np.array_equal(again.actions, rollout.actions)
+    assert np.array_equal(again.frames["wrist"], rollout.frames["wrist"])
+    assert not np.array_equal(other.actions[:5], rollout.actions[:5])
+
+
+@pytest.mark.parametrize(("control_mode", "step"), [("relative", 1.0), ("absolute", 0.04)])
+def test_noise_has_the_same_size_in_both_control_modes(control_mode: str, step: float) -> None:
+    action = np.array([0, 0, 0.1, -1], dtype=np.float32)
+    rng = np.random.default_rng(0)
+    draws = np.stack([perturb(action, 0.05, control_mode, rng) for _ in range(500)])
+    assert np.std(draws[:, :3], axis=0) == pytest.approx([0.05 * step] * 3, rel=0.15)
+    assert (draws[:, 3] == -1).all()
+    assert np.array_equal(perturb(action, 0.0, control_mode, rng), action)
+
+
+def test_a_pool_yields_in_the_order_of_the_seeds() -> None:
+    settings = RolloutSettings(EpisodeSpec(seed=0), SMALL)
+    with RolloutPool(settings, first_seed=7, num_workers=2) as pool:
+        rollouts = [rollout for rollout, _ in zip(pool, range(5), strict=False)]
+    assert [rollout.result.spec.seed for rollout in rollouts] == [7, 8, 9, 10, 11]
+    assert rollouts[0].frames["workspace"].shape == (rollouts[0].result.steps, 64, 64, 3)
+
+
+def test_workers_start_without_torch_and_lerobot() -> None:
+    script = (
+        "import sys, lerobot_bomb.data.record, lerobot_bomb.data.rollout as rollout\n"
+        "from lerobot_bomb.schema import EpisodeSpec, RenderOptions\n"
+        "rollout.make_env(EpisodeSpec(seed=0), RenderOptions()).reset()\n"
+        "assert not {'torch', 'lerobot'} & set(sys.modules)\n"
+    )
+    subprocess.run([sys.executable, "-c", script], check=True)
