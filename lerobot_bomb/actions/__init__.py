@@ -1,0 +1,1 @@
+"""Continuous actions as bins, and bins as integer text."""

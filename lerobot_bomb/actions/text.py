@@ -1,0 +1,85 @@
+"""Numbers as text symbols, and the hiding of numbers while training.
+
+A symbol is one of the twelve tokens that an answer consists of: the digits 0-9, a space, the end.
+Shapes: `B` batch, `N` numbers, `W` digits a number may have, `C` = W + 1 columns a number takes.
+"""
+
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+NUM_SYMBOLS = 12
+SPACE, END = 10, 11
+SYMBOL_TEXTS = (*"0123456789", " ", "<end_of_utterance>")
+
+MASK_LEVELS = ("value", "step", "char")
+
+
+def digits_needed(num_values: int) -> int:
+    """Digits of the largest of ``num_values`` numbers that start at 0."""
+    return len(str(num_values - 1))
+
+
+def number_symbols(numbers_BN: Tensor, width: int, *, zero_padded: bool) -> tuple[Tensor, Tensor]:
+    """Numbers -> symbols (B, N, C) and which of the columns are written (B, N, C).
+
+    A number is a space followed by its digits, right-aligned in its columns; without zero padding the
+    columns of leading zeros are not written.
+    """
+    place_values_W = 10 ** torch.arange(width - 1, -1, -1, device=numbers_BN.device)
+    digits_BNW = numbers_BN[..., None] // place_values_W % 10
+    written_BNW = (numbers_BN[..., None] >= place_values_W) | (place_values_W == 1) | zero_padded
+    space_BN1 = torch.full_like(digits_BNW[..., :1], SPACE)
+    symbols_BNC = torch.cat([space_BN1, digits_BNW], dim=-1)
+    return symbols_BNC, torch.cat([torch.ones_like(space_BN1, dtype=torch.bool), written_BNW], dim=-1)
+
+
+@dataclass(frozen=True)
+class NumberTokens:
+    """Numbers as tokens; all (B, N, C)."""
+
+    ids: Tensor  # int64
+    written: Tensor  # bool, whether the column holds a token
+    trained: Tensor  # bool, whether the loss counts it
+
+    def hide_numbers(self, hidden_BN: Tensor, hidden_id: int) -> "NumberTokens":
+        """One ``hidden_id`` in place of all digits of a number; its space stays and is trained on."""
+        ids_BNC, written_BNC, trained_BNC = self.ids.clone(), self.written.clone(), self.trained.clone()
+        written_BNC[..., 1:-1] &= ~hidden_BN[..., None]
+        trained_BNC[..., 1:] &= ~hidden_BN[..., None]
+        ids_BNC[..., -1] = ids_BNC[..., -1].masked_fill(hidden_BN, hidden_id)
+        return NumberTokens(ids_BNC, written_BNC, trained_BNC)
+
+    def hide_characters(self, hidden_BNC: Tensor, hidden_id: int) -> "NumberTokens":
+        """``hidden_id`` in place of single digits and spaces."""
+        ids_BNC = self.ids.masked_fill(hidden_BNC, hidden_id)
+        return NumberTokens(ids_BNC, self.written, self.trained & ~hidden_BNC)
+
+
+def draw_hidden(
+    eligible_BN: Tensor, max_fraction: float, skip_prob: float, generator: torch.Generator
+) -> Tensor:
+    """Which of the eligible units to hide: (B, N) bool.
+
+    A row hides nothing with probability ``skip_prob``; else floor(count * f) distinct units, f uniform
+    in [0, max_fraction].
+    """
+    batch_size, num_units = eligible_BN.shape
+    device = eligible_BN.device
+    fraction_B = max_fraction * torch.rand(batch_size, generator=generator)
+    fraction_B[torch.rand(batch_size, generator=generator) < skip_prob] = 0
+    draw_BN = torch.rand(batch_size, num_units, generator=generator).to(device)
+    rank_BN = draw_BN.masked_fill(~eligible_BN, 2.0).argsort(dim=1).argsort(dim=1)
+    num_hidden_B = (eligible_BN.sum(dim=1) * fraction_B.to(device)).floor()
+    return rank_BN < num_hidden_B[:, None]
+
+
+def compact(written_BL: Tensor, *columns_BL: Tensor) -> tuple[Tensor, ...]:
+    """Move the written columns of every row to the front, order kept; cut columns no row needs.
+
+    Returns ``written_BL`` and each of ``columns_BL`` rearranged, (B, longest row).
+    """
+    longest = int(written_BL.sum(dim=1).max())
+    order_BL = written_BL.logical_not().to(torch.uint8).argsort(dim=1, stable=True)[:, :longest]
+    return tuple(column.gather(1, order_BL) for column in (written_BL, *columns_BL))

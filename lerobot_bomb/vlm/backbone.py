@@ -1,0 +1,116 @@
+"""SmolVLM behind the few operations a policy needs.
+
+Shapes: `B` batch, `L` tokens, `H` hidden size of the text model, `V` vocabulary, `P` tokens of an image.
+"""
+
+import json
+from pathlib import Path
+from typing import Any
+
+import torch
+from torch import Tensor, nn
+from transformers import (
+    AutoConfig,
+    PreTrainedConfig,
+    SmolVLMConfig,
+    SmolVLMForConditionalGeneration,
+    SmolVLMVisionConfig,
+)
+from transformers.cache_utils import Cache, DynamicCache
+
+from lerobot_bomb.vlm.presets import nano_config
+from lerobot_bomb.vlm.tokenizer import NANO, hub_file, load_tokenizer
+
+
+class SmolVLMBackbone(nn.Module):
+    """A stock ``SmolVLMForConditionalGeneration``, called in parts: images, tokens, text model, head."""
+
+    def __init__(self, vlm: SmolVLMForConditionalGeneration):
+        super().__init__()
+        self.vlm = vlm
+        text_config, vision_config = vlm.config.text_config, vlm.config.vision_config
+        assert isinstance(text_config, PreTrainedConfig) and isinstance(vision_config, SmolVLMVisionConfig)
+        assert isinstance(vision_config.image_size, int)
+        self.text_config = text_config
+        self.image_size = vision_config.image_size  # pixels, square
+        self.tokens_per_image = vlm.model.image_seq_len
+
+    def embed_images(self, pixels_B3SS: Tensor) -> Tensor:
+        """(B, 3, S, S) in [-1, 1] -> (B, P, H).
+
+        Vision model and connector are called directly: ``get_image_features`` takes an image of exactly
+        zeros, that is uniform mid-grey, for padding and drops it.
+        """
+        model = self.vlm.model
+        return model.connector(model.vision_model(pixels_B3SS).last_hidden_state)
+
+    def embed_tokens(self, tokens_BL: Tensor) -> Tensor:
+        """(B, L) token ids -> (B, L, H)."""
+        return self.vlm.get_input_embeddings()(tokens_BL)
+
+    def new_cache(self) -> Cache:
+        return DynamicCache(config=self.text_config)
+
+    def hidden_states(
+        self, embeds_BLH: Tensor, written_BL: Tensor, positions_BL: Tensor, cache: Cache | None = None
+    ) -> Tensor:
+        """Embeddings -> (B, L, H) states after the last layer.
+
+        ``written_BL`` marks the columns that hold a token, cached ones included: (B, cached + L).
+        """
+        return self.vlm.model.text_model(
+            inputs_embeds=embeds_BLH,
+            attention_mask=written_BL.long(),
+            position_ids=positions_BL,
+            past_key_values=cache,
+            use_cache=cache is not None,
+        ).last_hidden_state
+
+    def logits(self, hidden_BLH: Tensor) -> Tensor:
+        """(..., H) -> (..., V)."""
+        return self.vlm.lm_head(hidden_BLH)
+
+
+def load_backbone(vlm_model_name: str) -> SmolVLMBackbone:
+    """Backbone with pretrained weights of a Hub id or a local folder, or ``nano`` with random ones.
+
+    Raises:
+        OSError: config or weights cannot be had; the message names the ways out.
+        ValueError: the model is not of the SmolVLM family.
+    """
+    if vlm_model_name == NANO:
+        return build_backbone(nano_config(load_tokenizer(NANO)))
+    if not Path(vlm_model_name).is_dir():
+        hub_file(vlm_model_name, "config.json")
+    config = AutoConfig.from_pretrained(vlm_model_name)
+    if config.model_type != "smolvlm":
+        raise ValueError(
+            f"--policy.vlm_model_name={vlm_model_name} is a {config.model_type!r} model; "
+            f"vla0_smol needs a 'smolvlm' one"
+        )
+    try:
+        vlm = SmolVLMForConditionalGeneration.from_pretrained(
+            vlm_model_name, config=config, dtype=torch.float32
+        )
+    except OSError as error:
+        raise OSError(
+            f"--policy.vlm_model_name={vlm_model_name}: no weights found. Without network, give "
+            f"--policy.vlm_model_name=nano (a small model built in code) or a local folder with "
+            f"model.safetensors"
+        ) from error
+    return SmolVLMBackbone(vlm)
+
+
+def build_backbone(vlm_config: dict[str, Any]) -> SmolVLMBackbone:
+    """Backbone of the given architecture with random weights in float32."""
+    config = SmolVLMConfig(**vlm_config)
+    for part in (config, config.text_config, config.vision_config):
+        assert isinstance(part, PreTrainedConfig)
+        part.dtype = torch.float32
+    return SmolVLMBackbone(SmolVLMForConditionalGeneration(config))
+
+
+def config_dict(backbone: SmolVLMBackbone) -> dict[str, Any]:
+    """The architecture as a JSON-ready dict, as `build_backbone` takes it."""
+    config: PreTrainedConfig = backbone.vlm.config
+    return json.loads(config.to_json_string(use_diff=False))

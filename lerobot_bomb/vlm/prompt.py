@@ -1,0 +1,95 @@
+"""The fixed parts of the prompt as token ids, for any tokenizer of the SmolVLM family.
+
+The whole sequence is, in SmolVLM2's chat format:
+
+    <|im_start|>User:IMG...IMGTask: {task}, State: s1 ... sS, Actions: <end_of_utterance>
+    Assistant: a1 a2 ... an<end_of_utterance>
+
+with IMG = ``<fake_token_around_image><global-img><image>...<image><fake_token_around_image>``. It is cut
+where the tokenizer cuts anyway (at special tokens, between ``,`` and a space, at digits), so the pieces'
+tokens in a row are the tokens of the whole string.
+"""
+
+import re
+from dataclasses import asdict, dataclass
+
+from tokenizers import Tokenizer
+
+from lerobot_bomb.actions.text import SYMBOL_TEXTS
+from lerobot_bomb.vlm.tokenizer import GLOBAL_IMAGE_TOKEN, HIDDEN_TOKEN, IMAGE_EDGE_TOKEN, IMAGE_TOKEN
+
+
+@dataclass(frozen=True)
+class PromptTokens:
+    """Token ids of everything in a sequence but the task."""
+
+    symbols: list[int]  # digits 0-9, space, <end_of_utterance>
+    hidden: int  # stands for a hidden number
+    start: list[int]  # before the images
+    image_start: list[int]
+    image: int
+    image_end: list[int]
+    state_start: list[int]
+    state_end: list[int]
+    answer_start: list[int]
+
+    @classmethod
+    def from_tokenizer(cls, tokenizer: Tokenizer, vlm_model_name: str) -> "PromptTokens":
+        """Look everything up.
+
+        Raises:
+            ValueError: a digit, the space or a special token is not exactly one token.
+        """
+
+        def one(text: str) -> int:
+            ids = tokenizer.encode(text).ids
+            if len(ids) != 1:
+                raise ValueError(
+                    f"--policy.vlm_model_name={vlm_model_name}: its tokenizer writes {text!r} as {len(ids)} "
+                    f"tokens; the policy needs a SmolVLM-family tokenizer, where it is exactly one"
+                )
+            return ids[0]
+
+        def several(text: str) -> list[int]:
+            return tokenizer.encode(text).ids
+
+        _refuse_merged_digits(tokenizer, vlm_model_name)
+        return cls(
+            symbols=[one(text) for text in SYMBOL_TEXTS],
+            hidden=one(HIDDEN_TOKEN),
+            start=[one("<|im_start|>"), *several("User:")],
+            image_start=[one(IMAGE_EDGE_TOKEN), one(GLOBAL_IMAGE_TOKEN)],
+            image=one(IMAGE_TOKEN),
+            image_end=[one(IMAGE_EDGE_TOKEN)],
+            state_start=several(" State:"),
+            state_end=several(","),
+            answer_start=[*several(" Actions: "), one(SYMBOL_TEXTS[-1]), *several("\nAssistant:")],
+        )
+
+    def to_dict(self) -> dict[str, int | list[int]]:
+        """JSON-ready."""
+        return asdict(self)
+
+
+def _refuse_merged_digits(tokenizer: Tokenizer, vlm_model_name: str) -> None:
+    """Raise unless every number is written as a space and one token a digit."""
+    for text in (" 0", " 10", " 512", " 998 007", " 12345"):
+        tokens = tokenizer.encode(text).tokens
+        if len(tokens) != len(text):
+            raise ValueError(
+                f"--policy.vlm_model_name={vlm_model_name}: its tokenizer merges digits ({text!r} becomes "
+                f"{tokens}); the policy needs one token a digit and one for a lone space"
+            )
+
+
+def normalize_task(task: str) -> str:
+    """Lower case, underscores and line breaks as spaces, no outer spaces."""
+    return re.sub(r"[_\r\n]", " ", task.lower()).strip()
+
+
+def task_ids(tokenizer: Tokenizer, task: str) -> list[int]:
+    """Tokens of the prompt's task part; text that looks like a special token stays text."""
+    tokenizer.encode_special_tokens = True
+    ids = tokenizer.encode(f"Task: {normalize_task(task)},").ids
+    tokenizer.encode_special_tokens = False
+    return ids

@@ -1,0 +1,105 @@
+"""Tokenizers of the backbones, as `tokenizers.Tokenizer`: loading, storing as a tensor, the nano one."""
+
+from pathlib import Path
+
+import torch
+from huggingface_hub import hf_hub_download
+from tokenizers import AddedToken, Tokenizer, decoders, models, pre_tokenizers
+from torch import Tensor
+
+NANO = "nano"
+
+IMAGE_TOKEN = "<image>"
+IMAGE_EDGE_TOKEN = "<fake_token_around_image>"
+GLOBAL_IMAGE_TOKEN = "<global-img>"
+# tile positions go unused, because images are never tiled: the last one marks a hidden number
+HIDDEN_TOKEN = "<row_6_col_6>"
+SPECIAL_TOKENS = (
+    "<|endoftext|>",
+    "<|im_start|>",
+    "<|im_end|>",
+    "<end_of_utterance>",
+    IMAGE_TOKEN,
+    IMAGE_EDGE_TOKEN,
+    GLOBAL_IMAGE_TOKEN,
+    HIDDEN_TOKEN,
+)
+
+# Words that are one token in the nano tokenizer; all other text falls back to beginnings of these
+# words and to bytes.
+NANO_FIRST_WORDS = ("User", "Assistant", "Task")
+NANO_WORDS = (
+    *("State", "Actions"),
+    *("place", "put", "move", "set", "push", "pick", "remove", "swap", "clear", "copy", "capture"),
+    *("black", "white", "stone", "stones", "piece", "block", "object", "go", "board", "intersection"),
+    *("row", "column", "position", "point", "corner", "centre", "center", "star", "edge", "target"),
+    *("left", "right", "nearest", "farthest", "far", "near", "front", "back", "top", "bottom", "supply"),
+    *("a", "an", "the", "at", "on", "onto", "in", "into", "to", "of", "from", "and", "then", "by", "up"),
+    *("is", "it", "one", "two", "your", "next", "between", "with", "without", "counted", "all"),
+)
+
+
+def load_tokenizer(vlm_model_name: str) -> Tokenizer:
+    """Tokenizer of ``nano``, of a local folder, or of a Hub id.
+
+    Raises:
+        OSError: no ``tokenizer.json`` can be had; the message names the ways out.
+    """
+    if vlm_model_name == NANO:
+        return nano_tokenizer()
+    folder = Path(vlm_model_name)
+    if folder.is_dir():
+        path = folder / "tokenizer.json"
+        if not path.is_file():
+            raise FileNotFoundError(
+                f"--policy.vlm_model_name={vlm_model_name}: the folder has no tokenizer.json"
+            )
+        return Tokenizer.from_file(str(path))
+    return Tokenizer.from_file(hub_file(vlm_model_name, "tokenizer.json"))
+
+
+def hub_file(vlm_model_name: str, filename: str) -> str:
+    """Path of a file of a Hub repository in the local cache, downloaded if need be."""
+    try:
+        return hf_hub_download(vlm_model_name, filename)
+    except (OSError, ValueError) as error:
+        raise OSError(
+            f"--policy.vlm_model_name={vlm_model_name}: cannot get {filename} from the Hugging Face Hub or "
+            f"its local cache. Without network, give --policy.vlm_model_name=nano (a small model built in "
+            f"code) or the path of a local folder with the model's files"
+        ) from error
+
+
+def tokenizer_to_tensor(tokenizer: Tokenizer) -> Tensor:
+    """The tokenizer's JSON as uint8 (bytes,)."""
+    return torch.frombuffer(bytearray(tokenizer.to_str().encode()), dtype=torch.uint8)
+
+
+def tokenizer_from_tensor(json_bytes: Tensor) -> Tokenizer:
+    """Inverse of `tokenizer_to_tensor`."""
+    return Tokenizer.from_str(json_bytes.cpu().numpy().tobytes().decode())
+
+
+def nano_tokenizer() -> Tokenizer:
+    """Byte-level BPE as SmolVLM's, whose only merges build the words of the task language.
+
+    A word is merged letter by letter from its start, so a word that is not listed becomes the longest
+    listed beginning and bytes. No digit takes part in a merge: every digit is one token.
+    """
+    alphabet = sorted(pre_tokenizers.ByteLevel.alphabet())
+    vocabulary = {character: i for i, character in enumerate(alphabet)}
+    merges: dict[tuple[str, str], None] = {}
+    for word in (*NANO_FIRST_WORDS, *(f"Ġ{word}" for word in NANO_WORDS)):
+        for length in range(1, len(word)):
+            merges[word[:length], word[length]] = None
+            vocabulary.setdefault(word[: length + 1], len(vocabulary))
+    tokenizer = Tokenizer(models.BPE(vocab=vocabulary, merges=list(merges)))
+    tokenizer.pre_tokenizer = pre_tokenizers.Sequence(
+        [
+            pre_tokenizers.Digits(individual_digits=True),
+            pre_tokenizers.ByteLevel(add_prefix_space=False),
+        ]
+    )
+    tokenizer.decoder = decoders.ByteLevel()
+    tokenizer.add_special_tokens([AddedToken(text, special=True) for text in SPECIAL_TOKENS])
+    return tokenizer

@@ -1,0 +1,210 @@
+"""Config of ``vla0_smol``."""
+
+from dataclasses import dataclass, field
+from typing import Any
+
+from lerobot.configs import NormalizationMode, PreTrainedConfig
+from lerobot.optim import AdamWConfig, CosineDecayWithWarmupSchedulerConfig
+
+from lerobot_bomb.actions.bins import BIN_MODES
+from lerobot_bomb.actions.text import MASK_LEVELS, digits_needed
+from lerobot_bomb.schema import one_of
+
+DTYPES = ("float32", "bfloat16")
+# modes that map the data into [-1, 1], where the bins are
+BOUNDED_MODES = (
+    NormalizationMode.MIN_MAX,
+    NormalizationMode.QUANTILES,
+    NormalizationMode.QUANTILE10,
+    NormalizationMode.IDENTITY,
+)
+MAX_BINS = 10_000
+
+
+@PreTrainedConfig.register_subclass("vla0_smol")
+@dataclass
+class Vla0SmolConfig(PreTrainedConfig):
+    """A SmolVLM writes ``chunk_size`` actions as integers; ``n_action_steps`` of them are executed."""
+
+    # Hub id, path of a local folder, or "nano": a small model with random weights, built in code
+    vlm_model_name: str = "HuggingFaceTB/SmolVLM2-500M-Video-Instruct"
+    # architecture; filled in when the base model is loaded. Set = build this and download nothing:
+    # the weights then come from a checkpoint
+    vlm_config: dict[str, Any] | None = None
+    # token ids of the fixed parts of the prompt; filled in together with vlm_config
+    prompt_tokens: dict[str, Any] | None = None
+
+    n_obs_steps: int = 1
+    # actions in the text
+    chunk_size: int = 10
+    # actions executed before the next prediction
+    n_action_steps: int = 5
+    # statistics to [-1, 1] for what becomes bins; images stay in [0, 1]
+    normalization_mapping: dict[str, NormalizationMode] = field(
+        default_factory=lambda: {
+            "VISUAL": NormalizationMode.IDENTITY,
+            "STATE": NormalizationMode.MIN_MAX,
+            "ACTION": NormalizationMode.MIN_MAX,
+        }
+    )
+
+    # values an action number can take, from 0
+    n_action_bins: int = 512
+    # values a state number can take, from 0
+    n_state_bins: int = 512
+    # "centers" (bins as intervals) or "levels" (bins as points, -1 and 1 included)
+    bin_mode: str = "centers"
+    # digits of every number, zero-padded; 0 = as many as the number has
+    number_width: int = 0
+    # whether the robot's state is in the prompt
+    use_state: bool = True
+
+    # side of the crop as a fraction of the image: random place while training, centre otherwise
+    crop_fraction: float = 0.875
+
+    # what is hidden as one while training: a number, all numbers of a step, or single characters
+    mask_level: str = "value"
+    # upper end of the fraction of numbers (steps, characters) that are hidden
+    mask_max_fraction: float = 0.15
+    # probability that nothing is hidden in a sample
+    mask_skip_prob: float = 0.1
+
+    # whether numbers beyond an episode's end (repeats of the last action) are trained on
+    loss_on_padded_actions: bool = False
+    # frames at an episode's end that no sample starts at
+    drop_n_last_frames: int = 1
+    freeze_vision_encoder: bool = False
+    # "bfloat16" = autocast over float32 weights, in training and in evaluation
+    dtype: str = "float32"
+    gradient_checkpointing: bool = False
+
+    optimizer_lr: float = 5e-5
+    optimizer_betas: tuple[float, float] = (0.9, 0.95)
+    optimizer_eps: float = 1e-8
+    optimizer_weight_decay: float = 0.01
+    optimizer_grad_clip_norm: float = 1.0
+    scheduler_warmup_steps: int = 1_000
+    scheduler_decay_steps: int = 30_000
+    scheduler_decay_lr: float = 5e-6
+
+    push_to_hub: bool = False
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        self._check_choices()
+        self._check_chunk()
+        self._check_numbers()
+        self._check_training()
+
+    def _check_choices(self) -> None:
+        one_of("--policy.bin_mode", self.bin_mode, BIN_MODES)
+        one_of("--policy.mask_level", self.mask_level, MASK_LEVELS)
+        one_of("--policy.dtype", self.dtype, DTYPES)
+        if not self.vlm_model_name:
+            raise ValueError(
+                "--policy.vlm_model_name is empty; give a Hub id, the path of a local folder, or nano"
+            )
+        if self.use_amp:
+            raise ValueError(
+                "--policy.use_amp=true is not used by vla0_smol, in training or evaluation; "
+                "give --policy.dtype=bfloat16 instead"
+            )
+        for kind, allowed in {
+            "VISUAL": (NormalizationMode.IDENTITY,),
+            "STATE": BOUNDED_MODES,
+            "ACTION": BOUNDED_MODES,
+        }.items():
+            one_of(f"--policy.normalization_mapping[{kind}]", self.normalization_mapping.get(kind), allowed)
+
+    def _check_chunk(self) -> None:
+        if self.n_obs_steps != 1:
+            raise ValueError(f"--policy.n_obs_steps={self.n_obs_steps}: vla0_smol reads 1 observation step")
+        if self.chunk_size < 1:
+            raise ValueError(f"--policy.chunk_size={self.chunk_size} must be at least 1")
+        if not 1 <= self.n_action_steps <= self.chunk_size:
+            raise ValueError(
+                f"--policy.n_action_steps={self.n_action_steps} must lie in 1..{self.chunk_size} "
+                f"(--policy.chunk_size)"
+            )
+        if self.drop_n_last_frames < 0:
+            raise ValueError(f"--policy.drop_n_last_frames={self.drop_n_last_frames} must not be negative")
+
+    def _check_numbers(self) -> None:
+        for flag, bins in {"n_action_bins": self.n_action_bins, "n_state_bins": self.n_state_bins}.items():
+            if not 2 <= bins <= MAX_BINS:
+                raise ValueError(f"--policy.{flag}={bins} must lie in 2..{MAX_BINS}")
+            if self.number_width and not digits_needed(bins) <= self.number_width <= digits_needed(MAX_BINS):
+                raise ValueError(
+                    f"--policy.number_width={self.number_width} must be 0 (no padding) or lie in "
+                    f"{digits_needed(bins)}..{digits_needed(MAX_BINS)} for --policy.{flag}={bins}"
+                )
+
+    def _check_training(self) -> None:
+        if not 0 < self.crop_fraction <= 1:
+            raise ValueError(f"--policy.crop_fraction={self.crop_fraction} must lie in (0, 1]")
+        for flag in ("mask_max_fraction", "mask_skip_prob"):
+            if not 0 <= getattr(self, flag) <= 1:
+                raise ValueError(f"--policy.{flag}={getattr(self, flag)} must lie in 0..1")
+        for flag in (
+            "optimizer_lr",
+            "scheduler_decay_lr",
+            "optimizer_weight_decay",
+            "scheduler_warmup_steps",
+        ):
+            if getattr(self, flag) < 0:
+                raise ValueError(f"--policy.{flag}={getattr(self, flag)} must not be negative")
+        if self.scheduler_decay_steps < 1:
+            raise ValueError(
+                f"--policy.scheduler_decay_steps={self.scheduler_decay_steps} must be at least 1"
+            )
+
+    def validate_features(self) -> None:
+        """Raise unless the dataset (or environment) has what the policy reads and writes."""
+        if not self.image_features:
+            raise ValueError(
+                f"vla0_smol needs at least one camera; the dataset has the inputs "
+                f"{sorted(self.input_features or {})}"
+            )
+        for key, feature in self.image_features.items():
+            if len(feature.shape) != 3 or feature.shape[0] != 3:
+                raise ValueError(
+                    f"camera {key!r} has shape {feature.shape}; vla0_smol needs (3, height, width)"
+                )
+        if self.action_feature is None or len(self.action_feature.shape) != 1:
+            raise ValueError(
+                f"vla0_smol needs the feature 'action' of shape (D,); got {self.output_features}"
+            )
+        if self.use_state and (self.robot_state_feature is None or len(self.robot_state_feature.shape) != 1):
+            raise ValueError(
+                f"--policy.use_state=true needs the feature 'observation.state' of shape (S,); the inputs "
+                f"are {sorted(self.input_features or {})}. Give --policy.use_state=false to do without"
+            )
+
+    def get_optimizer_preset(self) -> AdamWConfig:
+        return AdamWConfig(
+            lr=self.optimizer_lr,
+            betas=self.optimizer_betas,
+            eps=self.optimizer_eps,
+            weight_decay=self.optimizer_weight_decay,
+            grad_clip_norm=self.optimizer_grad_clip_norm,
+        )
+
+    def get_scheduler_preset(self) -> CosineDecayWithWarmupSchedulerConfig:
+        return CosineDecayWithWarmupSchedulerConfig(
+            num_warmup_steps=self.scheduler_warmup_steps,
+            num_decay_steps=self.scheduler_decay_steps,
+            peak_lr=self.optimizer_lr,
+            decay_lr=self.scheduler_decay_lr,
+        )
+
+    @property
+    def observation_delta_indices(self) -> None:
+        return None
+
+    @property
+    def action_delta_indices(self) -> list[int]:
+        return list(range(self.chunk_size))
+
+    @property
+    def reward_delta_indices(self) -> None:
+        return None

@@ -1,0 +1,298 @@
+"""``vla0_smol``: actions as integer text.
+
+Sources: VLA-0 (arXiv 2510.13054) and the VLA-0-Smol recipe.
+
+Shapes: `B` batch, `T` actions of a chunk, `D` action dims, `N` = T * D numbers, `C` columns a number
+takes, `L` tokens of a sequence, `A` tokens of an answer, `H` hidden size, `P` tokens of an image.
+"""
+
+from collections import deque
+from dataclasses import dataclass
+from typing import ClassVar
+
+import torch
+from lerobot.policies import PreTrainedPolicy
+from lerobot.utils.constants import ACTION, OBS_LANGUAGE_ATTENTION_MASK, OBS_LANGUAGE_TOKENS, OBS_STATE
+from torch import Tensor
+from torch.nn.functional import cross_entropy
+
+from lerobot_bomb.actions.bins import Bins
+from lerobot_bomb.actions.text import (
+    END,
+    NumberTokens,
+    compact,
+    digits_needed,
+    draw_hidden,
+    number_symbols,
+)
+from lerobot_bomb.decoding.decoder import CachedContinuation, decode_numbers
+from lerobot_bomb.decoding.grammar import NumberGrammar
+from lerobot_bomb.vlm.backbone import SmolVLMBackbone, build_backbone, config_dict, load_backbone
+from lerobot_bomb.vlm.images import crop_and_resize
+from lerobot_bomb.vlm.prompt import PromptTokens
+from lerobot_bomb.vlm.tokenizer import load_tokenizer
+from lerobot_policy_vla0_smol.configuration_vla0_smol import Vla0SmolConfig
+
+IGNORED = -100  # label of a token that the loss does not count
+
+
+@dataclass(frozen=True)
+class TokenRows:
+    """Rows of tokens with gaps: ids (B, L) int64 and which columns hold a token (B, L) bool."""
+
+    ids: Tensor
+    written: Tensor
+
+    @classmethod
+    def join(cls, parts: "list[TokenRows]") -> "TokenRows":
+        return cls(torch.cat([part.ids for part in parts], 1), torch.cat([part.written for part in parts], 1))
+
+
+class Vla0SmolPolicy(PreTrainedPolicy):
+    """A stock SmolVLM that writes the next ``chunk_size`` actions as integers."""
+
+    config_class = Vla0SmolConfig  # pyright: ignore[reportAssignmentType]  LeRobot annotates it as None
+    name = "vla0_smol"  # pyright: ignore[reportAssignmentType]
+    config: Vla0SmolConfig
+    symbol_ids: Tensor
+    # modules that FSDP shards one by one
+    _fsdp_wrap_modules: ClassVar[list[str]] = ["LlamaDecoderLayer", "SmolVLMEncoderLayer"]
+
+    def __init__(self, config: Vla0SmolConfig, **_: object):
+        super().__init__(config)
+        config.validate_features()
+        self.tokens, self.backbone = _build(config)
+        self.register_buffer("symbol_ids", torch.tensor(self.tokens.symbols), persistent=False)
+        self.action_bins = Bins(config.n_action_bins, config.bin_mode)
+        self.state_bins = Bins(config.n_state_bins, config.bin_mode)
+        self.grammar = NumberGrammar(config.n_action_bins, fixed_width=config.number_width)
+        # source of all that is random in training: the crop and the hidden numbers
+        self.generator = torch.Generator().manual_seed(torch.initial_seed())
+        self.reset()
+
+    @classmethod
+    def from_pretrained(cls, *args, **kwargs) -> "Vla0SmolPolicy":
+        """As LeRobot's, but a missing or unexpected tensor is an error."""
+        return super().from_pretrained(*args, **{**kwargs, "strict": True})
+
+    def get_optim_params(self) -> list[torch.nn.Parameter]:
+        return [parameter for parameter in self.parameters() if parameter.requires_grad]
+
+    def reset(self) -> None:
+        self._queue: deque[Tensor] = deque(maxlen=self.config.n_action_steps)
+
+    # Training
+
+    def forward(self, batch: dict[str, Tensor], reduction: str = "mean") -> tuple[Tensor, dict[str, float]]:
+        """Cross-entropy of the answer's tokens, over the kept ones; ``reduction="none"`` gives (B,)."""
+        with self._autocast():
+            prompt = self._prompt(batch)
+            numbers = self._numbers(batch)
+            answer, labels_BA = self._answer(numbers)
+            logits_BAV = self._answer_logits(batch, prompt, answer)
+        kept_BA = labels_BA != IGNORED
+        losses_BA = cross_entropy(
+            logits_BAV.float().transpose(1, 2), labels_BA, ignore_index=IGNORED, reduction="none"
+        )
+        correct_BA = (logits_BAV.detach().argmax(dim=-1) == labels_BA) & kept_BA
+        num_kept = kept_BA.sum()
+        metrics = {"token_accuracy": (correct_BA.sum() / num_kept.clamp(min=1)).item()}
+        if reduction == "none":
+            return losses_BA.sum(dim=1) / kept_BA.sum(dim=1).clamp(min=1), metrics
+        return losses_BA.sum() / num_kept.clamp(min=1), metrics
+
+    def _answer_logits(self, batch: dict[str, Tensor], prompt: TokenRows, answer: TokenRows) -> Tensor:
+        """Teacher-forced logits of every answer token: (B, A, V)."""
+        rows = TokenRows.join([prompt, answer])
+        rows = TokenRows(*reversed(compact(rows.written, rows.ids)))
+        hidden_BLH = self.backbone.hidden_states(
+            self._embeds(batch, rows.ids), rows.written, (rows.written.cumsum(dim=1) - 1).clamp(min=0)
+        )
+        offsets_A = torch.arange(answer.ids.shape[1], device=rows.ids.device)
+        # a token is predicted one column earlier; columns beyond a short row carry no label
+        columns_BA = prompt.written.sum(dim=1, keepdim=True) - 1 + offsets_A
+        columns_BA = columns_BA.clamp(max=rows.ids.shape[1] - 1)
+        index_BAH = columns_BA[..., None].expand(-1, -1, hidden_BLH.shape[-1])
+        return self.backbone.logits(hidden_BLH.gather(1, index_BAH))
+
+    def _numbers(self, batch: dict[str, Tensor]) -> NumberTokens:
+        """Actions (B, T, D) in [-1, 1] -> their tokens, some of them hidden while training."""
+        config = self.config
+        actions_BTD = self._read(batch, ACTION)
+        if actions_BTD.ndim != 3 or actions_BTD.shape[1:] != (config.chunk_size, self._action_dim):
+            raise ValueError(
+                f"batch[{ACTION!r}] has shape {tuple(actions_BTD.shape)}; expected "
+                f"(batch, {config.chunk_size}, {self._action_dim}) (--policy.chunk_size, action dims)"
+            )
+        numbers = self._to_tokens(self.action_bins.encode(actions_BTD).flatten(1), config.n_action_bins)
+        if f"{ACTION}_is_pad" in batch and not config.loss_on_padded_actions:
+            kept_BN = ~batch[f"{ACTION}_is_pad"].bool().repeat_interleave(self._action_dim, dim=1)
+            numbers = NumberTokens(numbers.ids, numbers.written, numbers.trained & kept_BN[..., None])
+        return self._hide(numbers) if self.training else numbers
+
+    def _hide(self, numbers: NumberTokens) -> NumberTokens:
+        """Hide random numbers, steps or characters from the model."""
+        level = self.config.mask_level
+        written_BNC = numbers.written
+        if level == "char":
+            hidden_BM = self._draw_hidden(written_BNC.flatten(1))
+            return numbers.hide_characters(hidden_BM.view_as(written_BNC), self.tokens.hidden)
+        if level == "step":
+            hidden_BT = self._draw_hidden(written_BNC[:, :: self._action_dim, 0])
+            hidden_BN = hidden_BT.repeat_interleave(self._action_dim, dim=1)
+        else:
+            hidden_BN = self._draw_hidden(written_BNC[..., 0])
+        return numbers.hide_numbers(hidden_BN, self.tokens.hidden)
+
+    def _draw_hidden(self, eligible_BM: Tensor) -> Tensor:
+        config = self.config
+        return draw_hidden(eligible_BM, config.mask_max_fraction, config.mask_skip_prob, self.generator)
+
+    def _answer(self, numbers: NumberTokens) -> tuple[TokenRows, Tensor]:
+        """Numbers and the end token without gaps, and labels (B, A)."""
+        end_B1 = self.symbol_ids[END].expand(len(numbers.ids), 1)
+        true_B1 = torch.ones_like(end_B1, dtype=torch.bool)
+        ids_BA, written_BA, trained_BA = (
+            torch.cat([columns.flatten(1), last], dim=1)
+            for columns, last in zip(
+                (numbers.ids, numbers.written, numbers.trained), (end_B1, true_B1, true_B1), strict=True
+            )
+        )
+        labels_BA = ids_BA.masked_fill(~(trained_BA & written_BA), IGNORED)
+        written_BA, ids_BA, labels_BA = compact(written_BA, ids_BA, labels_BA)
+        return TokenRows(ids_BA, written_BA), labels_BA
+
+    # Inference
+
+    def select_action(self, batch: dict[str, Tensor], **_: object) -> Tensor:
+        """(B, D) next normalised action; predicts when the queue of ``n_action_steps`` is empty."""
+        if not self._queue:
+            self._queue.extend(self._predict(batch, self.config.n_action_steps).unbind(dim=1))
+        return self._queue.popleft()
+
+    def predict_action_chunk(self, batch: dict[str, Tensor], **_: object) -> Tensor:
+        """(B, T, D) normalised actions."""
+        return self._predict(batch, self.config.chunk_size)
+
+    @torch.no_grad()
+    def _predict(self, batch: dict[str, Tensor], num_steps: int) -> Tensor:
+        """The first ``num_steps`` actions of the chunk; the model need not write the rest."""
+        self.eval()
+        with self._autocast():
+            prompt = self._prompt(batch)
+            written_BL, ids_BL = compact(prompt.written, prompt.ids)
+            model = CachedContinuation(
+                self.backbone, self._embeds(batch, ids_BL), written_BL, self.symbol_ids
+            )
+            numbers_BN = decode_numbers(
+                model,
+                self.grammar,
+                batch_size=len(ids_BL),
+                num_numbers=self.config.chunk_size * self._action_dim,
+                stop_after=num_steps * self._action_dim,
+            )
+        # casts of weights cached under inference mode cannot be used by a later training step
+        torch.clear_autocast_cache()
+        return self.action_bins.decode(numbers_BN).view(-1, num_steps, self._action_dim)
+
+    # Prompt
+
+    def _prompt(self, batch: dict[str, Tensor]) -> TokenRows:
+        """Everything up to ``Assistant:``, with gaps."""
+        tokens = self.tokens
+        task_ids_BL = self._read(batch, OBS_LANGUAGE_TOKENS)
+        task = TokenRows(task_ids_BL, self._read(batch, OBS_LANGUAGE_ATTENTION_MASK).bool())
+        images = len(self._cameras) * [*tokens.image_start, *self._image_span, *tokens.image_end]
+        parts = [self._fixed([*tokens.start, *images], task_ids_BL), task]
+        if self.config.use_state:
+            state = self._to_tokens(
+                self.state_bins.encode(self._read(batch, OBS_STATE)), self.config.n_state_bins
+            )
+            parts += [
+                self._fixed(tokens.state_start, task_ids_BL),
+                TokenRows(state.ids.flatten(1), state.written.flatten(1)),
+                self._fixed(tokens.state_end, task_ids_BL),
+            ]
+        return TokenRows.join([*parts, self._fixed(tokens.answer_start, task_ids_BL)])
+
+    def _fixed(self, ids: list[int], like_BL: Tensor) -> TokenRows:
+        """The same tokens in every row."""
+        ids_BL = torch.tensor(ids, device=like_BL.device).expand(len(like_BL), -1)
+        return TokenRows(ids_BL, torch.ones_like(ids_BL, dtype=torch.bool))
+
+    def _to_tokens(self, numbers_BN: Tensor, num_values: int) -> NumberTokens:
+        fixed_width = self.config.number_width
+        symbols_BNC, written_BNC = number_symbols(
+            numbers_BN, fixed_width or digits_needed(num_values), zero_padded=fixed_width > 0
+        )
+        return NumberTokens(self.symbol_ids[symbols_BNC], written_BNC, written_BNC)
+
+    def _embeds(self, batch: dict[str, Tensor], ids_BL: Tensor) -> Tensor:
+        """Embeddings (B, L, H) of a sequence that starts with a prompt, image features in place."""
+        generator = self.generator if self.training else None
+        fraction, size = self.config.crop_fraction, self.backbone.image_size
+        pixels = [
+            crop_and_resize(self._image(batch, key), fraction, size, generator) for key in self._cameras
+        ]
+        features_BPH = self.backbone.embed_images(torch.stack(pixels, dim=1).flatten(0, 1))
+        embeds_BLH = self.backbone.embed_tokens(ids_BL)
+        features_BPH = features_BPH.reshape(len(ids_BL), -1, embeds_BLH.shape[-1]).to(embeds_BLH.dtype)
+        return embeds_BLH.index_copy(1, self._image_columns(ids_BL.device), features_BPH)
+
+    def _image_columns(self, device: torch.device) -> Tensor:
+        """Columns of all image tokens; the same in every row, because only the start precedes them."""
+        tokens = self.tokens
+        period = len(tokens.image_start) + len(self._image_span) + len(tokens.image_end)
+        first = len(tokens.start) + len(tokens.image_start)
+        starts = first + period * torch.arange(len(self._cameras), device=device)
+        return (starts[:, None] + torch.arange(len(self._image_span), device=device)).flatten()
+
+    def _image(self, batch: dict[str, Tensor], key: str) -> Tensor:
+        image_B3HW = self._read(batch, key)
+        if image_B3HW.ndim != 4 or image_B3HW.shape[1] != 3 or not image_B3HW.is_floating_point():
+            raise ValueError(
+                f"batch[{key!r}] is {image_B3HW.dtype} of shape {tuple(image_B3HW.shape)}; expected floats "
+                f"in [0, 1] of shape (batch, 3, height, width)"
+            )
+        return image_B3HW
+
+    def _read(self, batch: dict[str, Tensor], key: str) -> Tensor:
+        if key not in batch:
+            raise KeyError(f"vla0_smol needs {key!r}; the batch has {sorted(batch)}")
+        return batch[key]
+
+    @property
+    def _cameras(self) -> list[str]:
+        return sorted(self.config.image_features)
+
+    @property
+    def _image_span(self) -> list[int]:
+        return [self.tokens.image] * self.backbone.tokens_per_image
+
+    @property
+    def _action_dim(self) -> int:
+        assert self.config.action_feature is not None
+        return self.config.action_feature.shape[0]
+
+    def _autocast(self) -> torch.autocast:
+        """The precision of ``config.dtype``, whoever calls: training, evaluation or a user's own loop."""
+        bfloat16 = self.config.dtype == "bfloat16"
+        return torch.autocast(self.symbol_ids.device.type, dtype=torch.bfloat16, enabled=bfloat16)
+
+
+def _build(config: Vla0SmolConfig) -> tuple[PromptTokens, SmolVLMBackbone]:
+    """Base model, or the architecture of a checkpoint; fills in what a checkpoint's config must hold."""
+    if config.vlm_config is None:
+        name = config.vlm_model_name
+        tokens = PromptTokens.from_tokenizer(load_tokenizer(name), name)
+        backbone = load_backbone(name)
+        config.vlm_config, config.prompt_tokens = config_dict(backbone), tokens.to_dict()
+    elif config.prompt_tokens is None:
+        raise ValueError("--policy.vlm_config is set, but not --policy.prompt_tokens, which belongs to it")
+    else:
+        tokens, backbone = PromptTokens(**config.prompt_tokens), build_backbone(config.vlm_config)
+    if config.freeze_vision_encoder:
+        backbone.vlm.model.vision_model.requires_grad_(False)
+    if config.gradient_checkpointing:
+        backbone.vlm.gradient_checkpointing_enable({"use_reentrant": False})
+    return tokens, backbone

@@ -1,0 +1,226 @@
+import json
+from pathlib import Path
+from typing import Any
+
+import pytest
+import torch
+from tokenizers import Tokenizer, models, pre_tokenizers
+
+from lerobot_bomb.vlm.backbone import SmolVLMBackbone, build_backbone, config_dict, load_backbone
+from lerobot_bomb.vlm.images import crop_and_resize
+from lerobot_bomb.vlm.presets import nano_config
+from lerobot_bomb.vlm.prompt import PromptTokens, normalize_task, task_ids
+from lerobot_bomb.vlm.tokenizer import (
+    SPECIAL_TOKENS,
+    load_tokenizer,
+    nano_tokenizer,
+    tokenizer_from_tensor,
+    tokenizer_to_tensor,
+)
+
+TASK = "Place a black stone on the Go board at row 3, column 1."
+
+
+@pytest.fixture(scope="module")
+def smolvlm2(shared_data: Path) -> Path:
+    return shared_data / "SmolVLM2-500M-Video-Instruct"
+
+
+@pytest.fixture(scope="module")
+def nano() -> SmolVLMBackbone:
+    torch.manual_seed(0)
+    return load_backbone("nano").eval()
+
+
+# Tokenizers
+
+
+def test_nano_has_a_token_for_every_word_of_the_task() -> None:
+    assert nano_tokenizer().encode(f"Task: {normalize_task(TASK)},").tokens == [
+        *("Task", ":", "Ġplace", "Ġa", "Ġblack", "Ġstone", "Ġon", "Ġthe", "Ġgo", "Ġboard", "Ġat"),
+        *("Ġrow", "Ġ", "3", ",", "Ġcolumn", "Ġ", "1", ".", ","),
+    ]
+
+
+@pytest.mark.parametrize("text", ["zxq placement of 12_345", "grün \U0001f600 日本語", "tab\tand  spaces"])
+def test_nano_writes_any_text(text: str) -> None:
+    tokenizer = nano_tokenizer()
+    assert tokenizer.decode(tokenizer.encode(text).ids) == text
+
+
+def test_nano_is_the_same_every_time() -> None:
+    assert nano_tokenizer().to_str() == nano_tokenizer().to_str()
+
+
+def test_a_tokenizer_survives_as_a_tensor() -> None:
+    tokenizer = nano_tokenizer()
+    stored = tokenizer_to_tensor(tokenizer)
+    assert stored.dtype == torch.uint8
+    assert tokenizer_from_tensor(stored).to_str() == tokenizer.to_str()
+
+
+def test_the_real_tokenizer_survives_as_a_tensor(smolvlm2: Path) -> None:
+    tokenizer = load_tokenizer(str(smolvlm2))
+    stored = tokenizer_to_tensor(tokenizer)
+    assert stored.numel() < 1_700_000
+    assert task_ids(tokenizer_from_tensor(stored), TASK) == task_ids(tokenizer, TASK)
+
+
+@pytest.mark.parametrize(
+    ("task", "expected"),
+    [
+        (" Pick_the CUBE \n", "pick the cube"),
+        ("one\ntwo\r\nthree", "one two  three"),
+        ("_push_", "push"),
+        ("", ""),
+    ],
+)
+def test_task_text_is_normalized(task: str, expected: str) -> None:
+    assert normalize_task(task) == expected
+
+
+def test_text_that_looks_like_a_special_token_stays_text() -> None:
+    tokenizer = nano_tokenizer()
+    special = {tokenizer.token_to_id(text) for text in SPECIAL_TOKENS}
+    assert not special & set(task_ids(tokenizer, "look at <image> <end_of_utterance>"))
+    assert tokenizer.encode("<image>").ids == [tokenizer.token_to_id("<image>")]
+
+
+# Prompt pieces
+
+
+def test_real_token_ids(smolvlm2: Path) -> None:
+    tokens = PromptTokens.from_tokenizer(load_tokenizer(str(smolvlm2)), str(smolvlm2))
+    assert tokens.symbols == [*range(32, 42), 216, 49279]
+    assert tokens.image == 49190
+    assert tokens.start == [1, 11126, 42]
+
+
+def test_prompt_tokens_survive_as_json() -> None:
+    tokens = PromptTokens.from_tokenizer(nano_tokenizer(), "nano")
+    assert PromptTokens(**json.loads(json.dumps(tokens.to_dict()))) == tokens
+
+
+def test_a_tokenizer_that_merges_digits_is_refused() -> None:
+    alphabet = sorted(pre_tokenizers.ByteLevel.alphabet())
+    vocabulary = {text: i for i, text in enumerate([*alphabet, "51", "512"])}
+    tokenizer = Tokenizer(models.BPE(vocab=vocabulary, merges=[("5", "1"), ("51", "2")]))
+    tokenizer.pre_tokenizer = pre_tokenizers.ByteLevel(add_prefix_space=False)
+    with pytest.raises(ValueError, match=r"--policy.vlm_model_name=some/model: .* merges digits \(' 512'"):
+        PromptTokens.from_tokenizer(tokenizer, "some/model")
+
+
+def test_a_tokenizer_without_the_special_tokens_is_refused() -> None:
+    tokenizer = Tokenizer.from_str(nano_tokenizer().to_str().replace("<end_of_utterance>", "<end_of_turn>"))
+    with pytest.raises(ValueError, match=r"writes '<end_of_utterance>' as .* tokens"):
+        PromptTokens.from_tokenizer(tokenizer, "some/model")
+
+
+# Models
+
+
+def test_nano_is_small_and_of_the_stock_class(nano: SmolVLMBackbone) -> None:
+    assert type(nano.vlm).__name__ == "SmolVLMForConditionalGeneration"
+    assert type(nano.vlm.model.text_model).__name__ == "LlamaModel"
+    assert sum(parameter.numel() for parameter in nano.parameters()) < 3_000_000
+
+
+def test_a_backbone_can_be_built_again_from_its_config(nano: SmolVLMBackbone) -> None:
+    stored = json.loads(json.dumps(config_dict(nano)))
+    again = build_backbone(stored)
+    assert config_dict(again) == stored
+    again.load_state_dict(nano.state_dict())
+
+
+def test_image_features_are_those_of_the_stock_model(nano: SmolVLMBackbone) -> None:
+    pixels = torch.rand(3, 3, nano.image_size, nano.image_size) * 2 - 1
+    stock_model: Any = nano.vlm.model
+    stock = stock_model.get_image_features(pixels[:, None], return_dict=True).pooler_output
+    torch.testing.assert_close(nano.embed_images(pixels), stock)
+    assert stock.shape[1] == nano.tokens_per_image
+
+
+def test_a_mid_grey_image_is_an_image(nano: SmolVLMBackbone) -> None:
+    """The stock model takes an image of zeros for padding and drops it."""
+    size = nano.image_size
+    pixels = torch.stack([torch.zeros(3, size, size), torch.rand(3, size, size)])
+    features = nano.embed_images(pixels)
+    assert features.shape[0] == 2
+    torch.testing.assert_close(features[1:], nano.embed_images(pixels[1:]))
+
+
+def shrunk_real_config(smolvlm2: Path) -> dict[str, Any]:
+    config = json.loads((smolvlm2 / "config.json").read_text())
+    config["text_config"] |= {
+        "num_hidden_layers": 2,
+        "hidden_size": 60,
+        "intermediate_size": 64,
+        "head_dim": 4,
+    }
+    config["vision_config"] |= {"num_hidden_layers": 1, "hidden_size": 24, "intermediate_size": 32}
+    return config
+
+
+def test_the_real_architecture_shrunk(smolvlm2: Path) -> None:
+    """All odd fields of the published config; bfloat16 in it must not reach the weights."""
+    backbone = build_backbone(shrunk_real_config(smolvlm2))
+    assert {parameter.dtype for parameter in backbone.parameters()} == {torch.float32}
+    assert (backbone.image_size, backbone.tokens_per_image) == (512, 64)
+    assert backbone.embed_images(torch.zeros(1, 3, 512, 512)).shape == (1, 64, 60)
+    assert config_dict(build_backbone(config_dict(backbone))) == config_dict(backbone)
+
+
+def test_a_local_folder_is_loaded_with_its_weights(nano: SmolVLMBackbone, tmp_path: Path) -> None:
+    nano.vlm.save_pretrained(tmp_path)
+    nano_tokenizer().save(str(tmp_path / "tokenizer.json"))
+    loaded = load_backbone(str(tmp_path))
+    for name, parameter in nano.named_parameters():
+        assert torch.equal(parameter, loaded.get_parameter(name)), name
+    assert load_tokenizer(str(tmp_path)).to_str() == nano_tokenizer().to_str()
+
+
+@pytest.mark.parametrize("load", [load_tokenizer, load_backbone])
+def test_a_hub_id_without_network_names_both_ways_out(load: Any) -> None:
+    with pytest.raises(
+        OSError, match=r"--policy.vlm_model_name=nobody/has-this: .*=nano .* path of a local folder"
+    ):
+        load("nobody/has-this")
+
+
+def test_a_folder_without_weights_is_refused(tmp_path: Path) -> None:
+    (tmp_path / "config.json").write_text(json.dumps(nano_config(nano_tokenizer())))
+    with pytest.raises(OSError, match="no weights found"):
+        load_backbone(str(tmp_path))
+    with pytest.raises(FileNotFoundError, match=r"no tokenizer.json"):
+        load_tokenizer(str(tmp_path))
+
+
+def test_another_kind_of_model_is_refused(tmp_path: Path) -> None:
+    (tmp_path / "config.json").write_text('{"model_type": "gpt2"}')
+    with pytest.raises(ValueError, match="is a 'gpt2' model; vla0_smol needs a 'smolvlm' one"):
+        load_backbone(str(tmp_path))
+
+
+# Images
+
+
+def test_the_centre_is_cropped_without_a_generator() -> None:
+    image = torch.zeros(1, 3, 8, 8)
+    image[..., 2:6, 2:6] = 1.0
+    cropped = crop_and_resize(image, 0.5, 4, None)
+    assert torch.equal(cropped, torch.ones(1, 3, 4, 4))
+
+
+def test_pixels_are_mapped_to_minus_one_to_one() -> None:
+    levels = torch.tensor([0.0, 0.5, 1.0]).view(3, 1, 1, 1).expand(3, 3, 5, 7)
+    pixels = crop_and_resize(levels, 1.0, 4, None)
+    assert pixels[:, 0, 0, 0].tolist() == pytest.approx([-1.0, 0.0, 1.0], abs=1e-6)
+    assert pixels.shape == (3, 3, 4, 4)
+
+
+def test_random_crops_differ_by_image_and_reach_every_corner() -> None:
+    ramp = (torch.arange(10.0)[:, None] * 10 + torch.arange(10.0)) / 99
+    images = ramp.expand(200, 3, 10, 10)
+    crops = crop_and_resize(images, 0.8, 8, torch.Generator().manual_seed(0))
+    corners = ((crops[:, 0, 0, 0] * 0.5 + 0.5) * 99).round().long()
+    assert set(corners.tolist()) == {10 * row + column for row in range(3) for column in range(3)}

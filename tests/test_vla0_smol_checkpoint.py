@@ -1,0 +1,209 @@
+import copy
+import json
+import os
+import subprocess
+import sys
+from pathlib import Path
+from typing import Any
+
+import pytest
+import torch
+from lerobot.configs import FeatureType, NormalizationMode, PolicyFeature, PreTrainedConfig
+from lerobot.policies.factory import make_pre_post_processors
+from safetensors.torch import load_file, save_file
+from torch import Tensor
+from vla0_smol_cases import STATS, WRIST, make_batch, make_config, make_policy, raw_batch
+
+from lerobot_policy_vla0_smol import make_vla0_smol_pre_post_processors
+from lerobot_policy_vla0_smol.modeling_vla0_smol import Vla0SmolPolicy
+
+# Checkpoints
+
+
+def save(policy: Vla0SmolPolicy, folder: Path) -> None:
+    policy.save_pretrained(folder)
+    for pipeline in make_vla0_smol_pre_post_processors(policy.config, STATS):
+        pipeline.save_pretrained(folder)
+
+
+def test_a_saved_policy_acts_the_same(tmp_path: Path) -> None:
+    policy = make_policy()
+    batch = make_batch(policy, 4)
+    save(policy, tmp_path)
+    loaded = Vla0SmolPolicy.from_pretrained(tmp_path)
+    assert not loaded.training
+    assert torch.equal(loaded.predict_action_chunk(batch), policy.predict_action_chunk(batch))
+    assert loaded.config.vlm_config == policy.config.vlm_config
+    preprocessor, postprocessor = make_pre_post_processors(loaded.config, str(tmp_path))
+    again = preprocessor(raw_batch(4))
+    for key, value in batch.items():
+        if isinstance(value, Tensor):
+            assert torch.equal(again[key], value), key
+    actions = torch.tensor([[0.5, -0.5, 0.0, 1.0]])
+    torch.testing.assert_close(postprocessor(actions), actions)
+
+
+def test_the_four_steps_that_lerobot_overrides_are_there() -> None:
+    pipelines = make_vla0_smol_pre_post_processors(make_config(), STATS)
+    names = [[step["registry_name"] for step in pipeline.get_config()["steps"]] for pipeline in pipelines]
+    assert names == [
+        [
+            "rename_observations_processor",
+            "to_batch_processor",
+            "vla0_smol_task_tokenizer",
+            "device_processor",
+            "normalizer_processor",
+        ],
+        ["unnormalizer_processor", "device_processor"],
+    ]
+
+
+def test_a_missing_or_unexpected_tensor_is_an_error(tmp_path: Path) -> None:
+    make_policy().save_pretrained(tmp_path)
+    weights = load_file(tmp_path / "model.safetensors")
+    head = weights.pop("backbone.vlm.lm_head.weight")
+    save_file(weights, tmp_path / "model.safetensors")
+    with pytest.raises(RuntimeError, match=r"lm_head\.weight"):
+        Vla0SmolPolicy.from_pretrained(tmp_path)
+    weights |= {"backbone.vlm.lm_head.weight": head, "extra": head.clone()}
+    save_file(weights, tmp_path / "model.safetensors")
+    with pytest.raises(RuntimeError, match="extra"):
+        Vla0SmolPolicy.from_pretrained(tmp_path)
+
+
+LOAD = """
+import sys, torch
+from lerobot.configs import PreTrainedConfig
+from lerobot.policies.factory import get_policy_class, make_pre_post_processors
+import lerobot_policy_bomb
+config = PreTrainedConfig.from_pretrained(sys.argv[1])
+policy = get_policy_class(config.type).from_pretrained(sys.argv[1], config=config)
+preprocessor, postprocessor = make_pre_post_processors(config, sys.argv[1])
+batch = torch.load(sys.argv[2])
+torch.save(postprocessor(policy.select_action(preprocessor(batch))), sys.argv[3])
+"""
+
+
+def test_a_checkpoint_needs_nothing_but_itself(tmp_path: Path) -> None:
+    """Another process, no network, empty Hub cache, and a base model that does not exist any more."""
+    policy = make_policy()
+    batch = make_batch(policy, 4)
+    save(policy, tmp_path / "model")
+    config_file = tmp_path / "model" / "config.json"
+    stored = json.loads(config_file.read_text())
+    config_file.write_text(json.dumps({**stored, "vlm_model_name": "nobody/has-this"}))
+    torch.save(raw_batch(4), tmp_path / "batch.pt")
+    subprocess.run(
+        [sys.executable, "-c", LOAD, tmp_path / "model", tmp_path / "batch.pt", tmp_path / "action.pt"],
+        env={**os.environ, "HF_HUB_OFFLINE": "1", "HF_HOME": str(tmp_path / "empty")},
+        check=True,
+    )
+    expected = policy.predict_action_chunk(batch)[:, 0]
+    torch.testing.assert_close(torch.load(tmp_path / "action.pt"), expected)
+
+
+def test_config_survives_as_json(tmp_path: Path) -> None:
+    policy = make_policy(number_width=4)
+    policy.config._save_pretrained(tmp_path)
+    assert PreTrainedConfig.from_pretrained(tmp_path) == policy.config
+
+
+# Processors
+
+
+def test_a_constant_dimension_keeps_its_value() -> None:
+    """LeRobot maps it to -1, whose lowest bin it shares, and back to the constant."""
+    config = make_config()
+    stats = copy.deepcopy(STATS)
+    stats["action"]["min"][2] = stats["action"]["max"][2] = 0.25
+    policy = Vla0SmolPolicy(config)
+    preprocessor, postprocessor = make_vla0_smol_pre_post_processors(config, stats)
+    raw = raw_batch(2)
+    raw["action"][..., 2] = 0.25
+    bins = policy.action_bins.encode(preprocessor(raw)["action"])
+    assert torch.equal(bins[..., 2], torch.zeros(2, 3, dtype=torch.int64))
+    action = postprocessor(policy.action_bins.decode(bins)[:, 0])
+    torch.testing.assert_close(action[:, 2], torch.full((2,), 0.25))
+
+
+@pytest.mark.parametrize("task", [None, [], [3]])
+def test_an_observation_without_a_task_is_an_error(task: Any) -> None:
+    preprocessor, _ = make_vla0_smol_pre_post_processors(make_config(), STATS)
+    with pytest.raises(ValueError, match="needs the instruction under the key 'task'"):
+        preprocessor({**raw_batch(1), "task": task})
+
+
+# Config
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ({"chunk_size": 3, "n_action_steps": 5}, r"--policy.n_action_steps=5 must lie in 1..3"),
+        ({"n_action_steps": 0}, r"--policy.n_action_steps=0 must lie in 1..3"),
+        ({"chunk_size": 0}, r"--policy.chunk_size=0 must be at least 1"),
+        ({"n_obs_steps": 2}, r"--policy.n_obs_steps=2"),
+        ({"n_action_bins": 1}, r"--policy.n_action_bins=1 must lie in 2.."),
+        ({"n_state_bins": -5}, r"--policy.n_state_bins=-5 must lie in 2.."),
+        ({"number_width": 2}, r"--policy.number_width=2 must be 0 \(no padding\) or lie in 3.."),
+        ({"number_width": -1}, r"--policy.number_width=-1"),
+        ({"bin_mode": "round"}, r"--policy.bin_mode='round' is unknown; choose one of: centers, levels"),
+        ({"mask_level": "word"}, r"--policy.mask_level='word' is unknown"),
+        ({"mask_max_fraction": 1.5}, r"--policy.mask_max_fraction=1.5 must lie in 0..1"),
+        ({"mask_skip_prob": -0.1}, r"--policy.mask_skip_prob=-0.1 must lie in 0..1"),
+        ({"crop_fraction": 0.0}, r"--policy.crop_fraction=0.0 must lie in \(0, 1\]"),
+        ({"dtype": "float16"}, r"--policy.dtype='float16' is unknown; choose one of: float32, bfloat16"),
+        ({"use_amp": True, "dtype": "bfloat16"}, r"--policy.use_amp=true .* --policy.dtype=bfloat16 instead"),
+        ({"vlm_model_name": ""}, r"--policy.vlm_model_name is empty"),
+        ({"drop_n_last_frames": -1}, r"--policy.drop_n_last_frames=-1"),
+        ({"scheduler_decay_steps": 0}, r"--policy.scheduler_decay_steps=0"),
+        ({"optimizer_lr": -1.0}, r"--policy.optimizer_lr=-1.0"),
+        (
+            {
+                "normalization_mapping": {
+                    "VISUAL": NormalizationMode.IDENTITY,
+                    "STATE": NormalizationMode.MEAN_STD,
+                }
+            },
+            r"--policy.normalization_mapping\[STATE\]",
+        ),
+    ],
+)
+def test_bad_options_are_refused(options: dict[str, Any], message: str) -> None:
+    with pytest.raises(ValueError, match=message):
+        make_config(**options)
+
+
+STATE_FEATURE = {"observation.state": PolicyFeature(FeatureType.STATE, (4,))}
+IMAGE_FEATURE = {WRIST: PolicyFeature(FeatureType.VISUAL, (3, 64, 64))}
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ({"input_features": STATE_FEATURE}, "needs at least one camera; .*'observation.state'"),
+        ({"input_features": IMAGE_FEATURE}, "--policy.use_state=true needs .* Give --policy.use_state=false"),
+        ({"output_features": {}}, "needs the feature 'action'"),
+        (
+            {"input_features": {**STATE_FEATURE, WRIST: PolicyFeature(FeatureType.VISUAL, (1, 64, 64))}},
+            r"camera 'observation.images.wrist' has shape \(1, 64, 64\)",
+        ),
+    ],
+)
+def test_features_that_do_not_fit_are_refused(options: dict[str, Any], message: str) -> None:
+    with pytest.raises(ValueError, match=message):
+        Vla0SmolPolicy(make_config(**options))
+
+
+def test_a_hub_model_without_network_is_refused_with_both_ways_out() -> None:
+    with pytest.raises(OSError, match=r"--policy.vlm_model_name=nobody/has-this: .*=nano .*local folder"):
+        make_policy(vlm_model_name="nobody/has-this")
+
+
+def test_training_presets() -> None:
+    config = make_config()
+    optimizer, scheduler = config.get_optimizer_preset(), config.get_scheduler_preset()
+    assert (optimizer.lr, optimizer.betas, optimizer.grad_clip_norm) == (5e-5, (0.9, 0.95), 1.0)
+    assert (scheduler.num_warmup_steps, scheduler.num_decay_steps, scheduler.decay_lr) == (1000, 30000, 5e-6)
+    assert config.action_delta_indices == [0, 1, 2]
+    assert config.push_to_hub is False

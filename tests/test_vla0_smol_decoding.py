@@ -1,0 +1,127 @@
+import copy
+from typing import Any
+
+import pytest
+import torch
+from torch import Tensor
+from vla0_smol_cases import WORKSPACE, make_batch, make_policy
+
+from lerobot_bomb.actions.text import SPACE
+from lerobot_bomb.decoding.decoder import pick
+from lerobot_policy_vla0_smol.modeling_vla0_smol import IGNORED, Vla0SmolPolicy
+
+
+@pytest.fixture(scope="module")
+def overfit() -> tuple[Vla0SmolPolicy, dict[str, Any]]:
+    """A policy that has learned four samples by heart."""
+    policy = make_policy(crop_fraction=1.0, mask_max_fraction=0.0)
+    batch = make_batch(policy, 4)
+    optimizer = torch.optim.AdamW(policy.get_optim_params(), lr=2e-3, weight_decay=0.0)
+    policy.train()
+    for _ in range(400):
+        loss, metrics = policy(batch)
+        optimizer.zero_grad()
+        loss.backward()
+        optimizer.step()
+        if loss.item() < 0.02 and metrics["token_accuracy"] == 1.0:
+            break
+    return policy.eval(), batch
+
+
+def rows(batch: dict[str, Any], keep: slice) -> dict[str, Any]:
+    return {key: value[keep] if isinstance(value, Tensor | list) else value for key, value in batch.items()}
+
+
+# Decoding
+
+
+def test_what_was_learned_by_heart_is_decoded(overfit: tuple[Vla0SmolPolicy, dict[str, Any]]) -> None:
+    policy, batch = overfit
+    chunk = policy.predict_action_chunk(batch)
+    trained = policy.action_bins.decode(policy.action_bins.encode(batch["action"]))
+    assert torch.equal(chunk, trained)
+
+
+@torch.no_grad()
+def test_decoding_follows_the_teacher_forced_argmax(overfit: tuple[Vla0SmolPolicy, dict[str, Any]]) -> None:
+    policy, _ = overfit
+    batch = make_batch(policy, 3, seed=9)  # unseen
+    batch["action"] = policy.predict_action_chunk(batch)
+    answer, labels = policy._answer(policy._numbers(batch))
+    logits = policy._answer_logits(batch, policy._prompt(batch), answer)[..., policy.symbol_ids]
+    for row_logits, row_labels in zip(logits, labels, strict=True):
+        state, begun = torch.tensor([policy.grammar.BOUNDARY]), 0
+        for step_logits, label in zip(row_logits, row_labels[row_labels != IGNORED], strict=False):
+            choices = policy.grammar.choices(state, torch.tensor([12 - begun]))
+            symbol = pick(step_logits[None], choices)
+            assert policy.symbol_ids[symbol] == label
+            begun += int(symbol == SPACE)
+            state = policy.grammar.advance(state, symbol)
+        assert begun == 12
+
+
+def test_a_rows_actions_do_not_depend_on_the_batch(overfit: tuple[Vla0SmolPolicy, dict[str, Any]]) -> None:
+    policy, _ = overfit
+    batch = make_batch(policy, 5, seed=3)
+    together = policy.predict_action_chunk(batch)
+    assert len({len(text) for text in batch["task"]}) > 1
+    for row in range(5):
+        assert torch.equal(policy.predict_action_chunk(rows(batch, slice(row, row + 1)))[0], together[row])
+
+
+@pytest.mark.parametrize(
+    "options",
+    [
+        {"n_action_bins": 999, "bin_mode": "levels", "number_width": 3},
+        {"n_action_bins": 2, "n_state_bins": 2, "use_state": False},
+    ],
+)
+def test_an_untrained_model_gives_actions_in_range(options: dict[str, Any]) -> None:
+    policy = make_policy(**options)
+    chunk = policy.predict_action_chunk(make_batch(policy, 2))
+    assert chunk.shape == (2, 3, 4)
+    assert chunk.abs().max() <= 1
+
+
+def test_actions_are_queued_and_forgotten_on_reset(overfit: tuple[Vla0SmolPolicy, dict[str, Any]]) -> None:
+    policy, first = overfit
+    second = {**first, "observation.state": -first["observation.state"], WORKSPACE: 1 - first[WORKSPACE]}
+    chunks = [policy.predict_action_chunk(batch) for batch in (first, second)]
+    assert not torch.equal(chunks[0][:, :2], chunks[1][:, :2])
+    policy.reset()
+    assert torch.equal(policy.select_action(first), chunks[0][:, 0])
+    assert torch.equal(policy.select_action(second), chunks[0][:, 1])  # still of the first prediction
+    assert torch.equal(policy.select_action(second), chunks[1][:, 0])
+    policy.reset()
+    assert torch.equal(policy.select_action(first), chunks[0][:, 0])
+    policy.reset()
+
+
+# Precision
+
+
+def test_bfloat16_is_the_same_for_training_and_decoding() -> None:
+    policy = make_policy(dtype="bfloat16")
+    batch = make_batch(policy, 2)
+    plain = copy.deepcopy(policy)
+    plain.config.dtype = "float32"
+    with torch.no_grad():
+        with torch.autocast("cpu", dtype=torch.bfloat16):
+            inside = policy(batch)[0]
+        assert policy(batch)[0] == inside
+        assert plain(batch)[0] != inside
+    seen: list[torch.dtype] = []
+    policy.backbone.vlm.lm_head.register_forward_hook(lambda *call: seen.append(call[2].dtype))
+    policy.predict_action_chunk(batch)
+    assert set(seen) == {torch.bfloat16}
+
+
+def test_training_goes_on_after_evaluation_inside_one_autocast() -> None:
+    policy = make_policy(dtype="bfloat16")
+    batch = make_batch(policy, 2)
+    with torch.autocast("cpu", dtype=torch.bfloat16):
+        with torch.inference_mode():
+            policy.select_action(batch)
+        loss, _ = policy.train()(batch)
+        loss.backward()
+    assert policy.backbone.vlm.lm_head.weight.grad is not None
