@@ -1,0 +1,34 @@
+"""Draws the README's pictures: `python docs/media/render.py`."""
+
+from pathlib import Path
+
+import imageio.v3 as iio
+import numpy as np
+
+from lerobot_bomb.expert import expert_action
+from lerobot_bomb.schema import EpisodeSpec, PrivilegedState
+from lerobot_env_bomb.env import BombEnv
+
+SEED = 9  # an episode with many stones on the board
+GIF_PAUSE = 8  # frames that the last picture stays
+
+
+def main() -> None:
+    """Play one episode of the expert; write its first picture and all of them as an animation."""
+    folder = Path(__file__).parent
+    env = BombEnv(EpisodeSpec(seed=SEED))
+    observation, _ = env.reset()
+    pictures, ended = [env.render()], False
+    while not ended:
+        state = PrivilegedState.from_vector(observation["environment_state"])
+        observation, _, terminated, truncated, _ = env.step(expert_action(state))
+        pictures.append(env.render())
+        ended = terminated or truncated
+    env.close()
+    iio.imwrite(folder / "scene.png", pictures[0])
+    frames = np.stack([*pictures, *[pictures[-1]] * GIF_PAUSE])
+    iio.imwrite(folder / "episode.gif", frames[:, ::2, ::2], duration=100, loop=0)
+
+
+if __name__ == "__main__":
+    main()

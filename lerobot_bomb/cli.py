@@ -1,0 +1,40 @@
+"""``lerobot-bomb``: what LeRobot's own commands do not do."""
+
+import argparse
+import importlib
+import sys
+from collections.abc import Sequence
+
+# command -> (help, module with add_<command>_arguments and run_<command>); imported only when called
+COMMANDS = {
+    "record": ("record the scripted expert as a LeRobotDataset", "lerobot_bomb.data.record"),
+    "results": ("summarise files written by --env.results_path", "lerobot_bomb.evaluation.results"),
+    "demo": ("record, train and evaluate on this machine in minutes", "lerobot_bomb.demo"),
+    "doctor": ("check this installation", "lerobot_bomb.doctor"),
+}
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """Run one command; a ValueError, OSError or RuntimeError becomes one line on stderr and exit code 1."""
+    argv = sys.argv[1:] if argv is None else list(argv)
+    parser = argparse.ArgumentParser(prog="lerobot-bomb", description=__doc__)
+    commands = parser.add_subparsers(dest="command", required=True, metavar="COMMAND")
+    modules = {}
+    for name, (summary, module) in COMMANDS.items():
+        command = commands.add_parser(name, help=summary, description=summary)
+        if name in argv[:1]:
+            modules[name] = importlib.import_module(module)
+            getattr(modules[name], f"add_{name}_arguments")(command)
+    args = parser.parse_args(argv)
+    try:
+        return getattr(modules[args.command], f"run_{args.command}")(args)
+    except (ValueError, OSError, RuntimeError) as error:
+        print(f"lerobot-bomb {args.command}: {error}", file=sys.stderr)
+        return 1
+    except KeyboardInterrupt:
+        print(f"lerobot-bomb {args.command}: interrupted", file=sys.stderr)
+        return 130
+
+
+if __name__ == "__main__":
+    sys.exit(main())

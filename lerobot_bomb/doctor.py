@@ -1,0 +1,134 @@
+"""``lerobot-bomb doctor``: imports every part loudly and says what is broken.
+
+LeRobot swallows a plugin's import errors and then only says ``invalid choice``; this command shows them.
+"""
+
+import argparse
+import importlib
+import importlib.metadata
+import os
+import platform
+import traceback
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+
+import lerobot_bomb
+
+DISTRIBUTION = "lerobot_policy_bomb"
+ENV_TYPES = ("bomb",)
+POLICY_TYPES = ("vla0_smol", "bomb_expert", "bomb_random")
+DEPENDENCIES = (
+    "lerobot",
+    "torch",
+    "transformers",
+    "mujoco",
+    "gymnasium",
+    "gymnasium-robotics",
+    "opencv-python-headless",
+    "rerun-sdk",
+    "numpy",
+)
+HUB_TIMEOUT_S = 5
+
+
+@dataclass(frozen=True)
+class Finding:
+    """One checked thing; only a broken one makes the installation unusable."""
+
+    name: str
+    detail: str
+    broken: bool = False
+
+
+def check_versions() -> Iterator[Finding]:
+    """Python, this package and its main dependencies."""
+    yield Finding("python", platform.python_version())
+    for name in (DISTRIBUTION, *DEPENDENCIES):
+        try:
+            yield Finding(name, importlib.metadata.version(name))
+        except importlib.metadata.PackageNotFoundError:
+            hint = "LeRobot finds plugins by this name; pip install it" if name == DISTRIBUTION else ""
+            yield Finding(name, f"not installed. {hint}", broken=True)
+
+
+def check_rendering() -> Iterator[Finding]:
+    """Render one frame of the default scene."""
+    backend = importlib.import_module("lerobot_env_bomb.backend").ensure_gl_backend()
+    env = importlib.import_module("lerobot_env_bomb.env").BombEnv()
+    observation, _ = env.reset(seed=0)
+    env.close()
+    contrast = max(int(image.max()) - int(image.min()) for image in observation["pixels"].values())
+    detail = f"{backend} renders"
+    yield Finding("opengl", detail if contrast else f"{backend} renders black frames", broken=not contrast)
+
+
+def check_types() -> Iterator[Finding]:
+    """Env and policy types that LeRobot knows after the plugin's import, with their classes."""
+    importlib.import_module(DISTRIBUTION)
+    from lerobot.configs import PreTrainedConfig
+    from lerobot.envs import EnvConfig
+    from lerobot.policies.factory import get_policy_class
+
+    for name in ENV_TYPES:
+        known = name in EnvConfig.get_known_choices()
+        yield Finding(f"--env.type={name}", "registered" if known else "not registered", broken=not known)
+    for name in POLICY_TYPES:
+        known = name in PreTrainedConfig.get_known_choices()
+        detail = get_policy_class(name).__name__ if known else "not registered"
+        yield Finding(f"--policy.type={name}", detail, broken=not known)
+
+
+def check_gpu() -> Iterator[Finding]:
+    """The accelerator torch would use; none is fine for the nano presets."""
+    torch = importlib.import_module("torch")
+    if torch.cuda.is_available():
+        yield Finding("gpu", torch.cuda.get_device_name())
+    else:
+        yield Finding("gpu", "none (policies run on the CPU; use --policy.vlm_model_name=nano)")
+
+
+def check_hub() -> Iterator[Finding]:
+    """Whether pretrained backbones can be downloaded; not needed for nano or a local folder."""
+    hub = importlib.import_module("huggingface_hub")
+    if hub.constants.HF_HUB_OFFLINE:
+        yield Finding("hugging face hub", "offline by HF_HUB_OFFLINE; nano and local folders work")
+        return
+    try:
+        hub.get_session().head(hub.constants.ENDPOINT, timeout=HUB_TIMEOUT_S)
+        yield Finding("hugging face hub", "reachable")
+    except Exception as error:  # the session's own errors differ by transport
+        yield Finding(
+            "hugging face hub", f"not reachable: {type(error).__name__} (nano and local folders work)"
+        )
+
+
+CHECKS: tuple[Callable[[], Iterator[Finding]], ...] = (
+    check_versions,
+    check_rendering,
+    check_types,
+    check_gpu,
+    check_hub,
+)
+
+
+def add_doctor_arguments(parser: argparse.ArgumentParser) -> None:
+    """``lerobot-bomb doctor`` has no arguments."""
+
+
+def run_doctor(args: argparse.Namespace) -> int:
+    """Print every finding; exit code 1 and the causes when something is broken."""
+    print(f"lerobot_bomb {lerobot_bomb.__version__}, MUJOCO_GL={os.environ.get('MUJOCO_GL', '(unset)')}")
+    num_broken = 0
+    for check in CHECKS:
+        try:
+            for finding in check():
+                num_broken += finding.broken
+                print(
+                    f"{'BROKEN' if finding.broken else 'ok':>6}  {finding.name}: {finding.detail}", flush=True
+                )
+        except Exception:  # any cause must be shown, and the other checks still run
+            num_broken += 1
+            name = check.__name__.removeprefix("check_")
+            print(f"BROKEN  {name}:\n{traceback.format_exc()}", flush=True)
+    print("everything works" if not num_broken else f"{num_broken} broken, see above")
+    return int(num_broken > 0)

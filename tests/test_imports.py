@@ -1,0 +1,69 @@
+"""Who may import whom; see docs/architecture.md."""
+
+import ast
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).parents[1]
+PACKAGES = {
+    path.name for folder in ("envs", "policies") for path in (ROOT / folder).iterdir() if path.is_dir()
+}
+ENTRY = "lerobot_policy_bomb"
+HEAVY = {"torch", "lerobot", "transformers", "rerun", "cv2"}
+
+
+def imported(path: Path, top_level_only: bool = False) -> set[str]:
+    """Top-level names of the modules a file imports."""
+    tree = ast.parse(path.read_text())
+    nodes = tree.body if top_level_only else ast.walk(tree)
+    names = set()
+    for node in nodes:
+        if isinstance(node, ast.Import):
+            names |= {alias.name.split(".")[0] for alias in node.names}
+        elif isinstance(node, ast.ImportFrom) and node.module:
+            names.add(node.module.split(".")[0])
+    return names
+
+
+def files(*folders: str) -> list[Path]:
+    found = [path for folder in folders for path in (ROOT / folder).rglob("*.py")]
+    assert found, f"no Python files in {folders}"
+    return found
+
+
+@pytest.mark.parametrize("path", files("lerobot_bomb"), ids=lambda path: str(path.relative_to(ROOT)))
+def test_core_imports_no_env_and_no_policy(path: Path) -> None:
+    assert not imported(path) & PACKAGES
+
+
+@pytest.mark.parametrize("path", files("envs"), ids=lambda path: str(path.relative_to(ROOT)))
+def test_an_env_imports_no_policy_and_no_other_env(path: Path) -> None:
+    own = path.relative_to(ROOT / "envs").parts[0]
+    assert not imported(path) & (PACKAGES - {own})
+
+
+@pytest.mark.parametrize("path", files("policies"), ids=lambda path: str(path.relative_to(ROOT)))
+def test_a_policy_imports_no_env_and_no_other_policy(path: Path) -> None:
+    own = path.relative_to(ROOT / "policies").parts[0]
+    if own != ENTRY:
+        assert not imported(path) & (PACKAGES - {own})
+
+
+def test_nothing_imports_the_entry_module() -> None:
+    for path in files("lerobot_bomb", "envs", "policies", "benchmarks"):
+        assert ENTRY not in imported(path), path
+
+
+@pytest.mark.parametrize("path", files("envs/lerobot_env_bomb"), ids=lambda path: str(path.relative_to(ROOT)))
+def test_the_simulator_imports_nothing_heavy(path: Path) -> None:
+    if path.name.startswith("configuration_"):
+        assert "lerobot" in imported(path)
+    else:
+        assert not imported(path, top_level_only=True) & HEAVY
+        assert not imported(path) & (HEAVY - {"cv2"})
+
+
+@pytest.mark.parametrize("name", ["schema.py", "stats.py", "expert.py"])
+def test_what_simulator_workers_import_from_the_core_is_light(name: str) -> None:
+    assert not imported(ROOT / "lerobot_bomb" / name) & HEAVY

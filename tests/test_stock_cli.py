@@ -1,0 +1,95 @@
+"""LeRobot's own commands on our types, in one process: what a user types must run end to end."""
+
+import json
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+
+from lerobot_bomb.cli import main
+from lerobot_bomb.evaluation.results import read_results
+
+Run = Callable[..., None]
+REPO_ID = "test/bomb_place"
+
+
+@pytest.fixture(scope="module")
+def dataset(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    root = tmp_path_factory.mktemp("recorded") / "dataset"
+    flags = [f"--repo_id={REPO_ID}", f"--root={root}", "--episodes=2", "--image_size=64", "--images"]
+    assert main(["record", *flags]) == 0
+    return root
+
+
+def evaluate(run: Run, folder: Path, flags: str) -> dict:
+    """eval_info.json of lerobot-eval; episode results go to folder/results.jsonl."""
+    own = (
+        f"--env.type=bomb --env.task=place --env.image_size=64 --env.results_path={folder / 'results.jsonl'}"
+    )
+    run(
+        "lerobot-eval", *own.split(), "--policy.device=cpu", f"--output_dir={folder / 'eval'}", *flags.split()
+    )
+    return json.loads((folder / "eval" / "eval_info.json").read_text())
+
+
+def train(run: Run, dataset: Path, output_dir: Path, flags: str) -> Path:
+    """The checkpoint folder that lerobot-train leaves."""
+    own = "--policy.device=cpu --batch_size=2 --num_workers=0 --wandb.enable=false --save_freq=1"
+    data = [f"--dataset.repo_id={REPO_ID}", f"--dataset.root={dataset}", f"--output_dir={output_dir}"]
+    run("lerobot-train", *data, *own.split(), *flags.split())
+    return output_dir / "checkpoints" / "last" / "pretrained_model"
+
+
+def test_the_expert_places_stones_through_lerobot_eval(stock_cli: Run, tmp_path: Path) -> None:
+    flags = "--policy.type=bomb_expert --eval.n_episodes=4 --eval.batch_size=2 --eval.use_async_envs=true"
+    info = evaluate(stock_cli, tmp_path, f"{flags} --seed=5")
+    assert info["per_group"]["place"]["pc_success"] == 100.0
+    rows = read_results(tmp_path / "results.jsonl")
+    assert sorted(row["spec"]["seed"] for row in rows) == [5, 6, 7, 8]
+    assert all(row["is_success"] and row["placement_error_mm"] < 10 for row in rows)
+    videos = info["overall"]["video_paths"]
+    assert len(videos) == 4
+    assert all(Path(video).stat().st_size > 1000 for video in videos)
+
+
+def test_numbered_tasks_and_absolute_control(stock_cli: Run, tmp_path: Path) -> None:
+    flags = "--env.control_mode=absolute --policy.control_mode=absolute --env.task_ids=[0,38]"
+    flags += " --policy.type=bomb_expert --eval.n_episodes=1 --eval.batch_size=1"
+    info = evaluate(stock_cli, tmp_path, flags)
+    assert [task["task_id"] for task in info["per_task"]] == [0, 38]
+    assert info["overall"]["pc_success"] == 100.0
+
+
+def test_random_actions_fail(stock_cli: Run, tmp_path: Path) -> None:
+    flags = "--policy.type=bomb_random --eval.n_episodes=2 --eval.batch_size=2 --eval.use_async_envs=false"
+    assert evaluate(stock_cli, tmp_path, flags)["overall"]["pc_success"] == 0.0
+    assert all(row["failure"] for row in read_results(tmp_path / "results.jsonl"))
+
+
+def test_vla0_smol_trains_and_its_checkpoint_acts(stock_cli: Run, dataset: Path, tmp_path: Path) -> None:
+    flags = "--policy.type=vla0_smol --policy.vlm_model_name=nano --steps=2"
+    checkpoint = train(stock_cli, dataset, tmp_path / "train", flags)
+    flags = f"--policy.path={checkpoint} --env.fps=2 --eval.n_episodes=1 --eval.batch_size=1"
+    assert evaluate(stock_cli, tmp_path, flags)["overall"]["n_episodes"] == 1
+    (row,) = read_results(tmp_path / "results.jsonl")
+    assert row["is_success"] or row["failure"]
+
+
+def test_a_trained_policy_cannot_see_the_true_state(stock_cli: Run, dataset: Path, tmp_path: Path) -> None:
+    flags = "--policy.type=act --policy.push_to_hub=false --policy.pretrained_backbone_weights=null --steps=1"
+    flags += " --policy.dim_model=32 --policy.n_heads=2 --policy.dim_feedforward=32"
+    checkpoint = train(stock_cli, dataset, tmp_path / "train", flags)
+    features = json.loads((checkpoint / "config.json").read_text())["input_features"]
+    assert sorted(features) == [
+        "observation.images.workspace",
+        "observation.images.wrist",
+        "observation.state",
+    ]
+    flags = f"--policy.path={checkpoint} --env.fps=2 --eval.n_episodes=1 --eval.batch_size=1"
+    assert evaluate(stock_cli, tmp_path, flags)["overall"]["n_episodes"] == 1
+
+
+def test_an_existing_output_folder_is_not_overwritten(stock_cli: Run, dataset: Path, tmp_path: Path) -> None:
+    (tmp_path / "train").mkdir()
+    with pytest.raises(FileExistsError, match="already exists"):
+        train(stock_cli, dataset, tmp_path / "train", "--policy.type=vla0_smol --policy.vlm_model_name=nano")
