@@ -64,6 +64,12 @@ def test_the_simulator_imports_nothing_heavy(path: Path) -> None:
         assert not imported(path) & (HEAVY - {"cv2"})
 
 
-@pytest.mark.parametrize("name", ["schema.py", "stats.py", "expert.py"])
+@pytest.mark.parametrize(
+    "name", ["schema.py", "stats.py", "expert.py", "data/rollout.py", "data/recording.py"]
+)
 def test_what_simulator_workers_import_from_the_core_is_light(name: str) -> None:
     assert not imported(ROOT / "lerobot_bomb" / name) & HEAVY
+
+
+def test_the_recorder_checks_its_flags_before_it_imports_anything_heavy() -> None:
+    assert not imported(ROOT / "lerobot_bomb" / "data" / "record.py", top_level_only=True) & HEAVY

@@ -9,7 +9,7 @@ from lerobot_bomb.expert import expert_action
 from lerobot_bomb.schema import EpisodeSpec, PrivilegedState
 from lerobot_env_bomb.env import BombEnv
 
-SEED = 9  # an episode with many stones on the board
+SEED = 9  # many stones on the board
 GIF_PAUSE = 8  # frames that the last picture stays
 
 

@@ -6,7 +6,6 @@ written is lost. Blocks bound that loss to the episodes of one block, which are 
 
 import json
 import os
-import shutil
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -14,22 +13,21 @@ from pathlib import Path
 from typing import Any
 
 import av
-import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
 from av.logging import WARNING, set_libav_level
-from datasets import config, disable_progress_bars, enable_progress_bars
-from lerobot.datasets import LeRobotDataset, aggregate_datasets, compute_stats
+from datasets import disable_progress_bars, enable_progress_bars
+from lerobot.datasets import LeRobotDataset, aggregate_datasets
 from lerobot.datasets.utils import DEFAULT_EPISODES_PATH, STATS_PATH
 from lerobot.utils.constants import ACTION, OBS_IMAGES, OBS_STATE
 
 from lerobot_bomb import __version__
+from lerobot_bomb._compat import datasets_cache, sampled_image_statistics
 from lerobot_bomb.data.rollout import Rollout
 from lerobot_bomb.schema import ACTION_NAMES, CAMERAS, STATE_NAMES, EpisodeResult, EpisodeSpec, RenderOptions
 
 ENCODER_THREADS = 1  # per camera, which keeps two cores busy; see benchmarks/record_speed.py
 IMAGE_WRITER_THREADS = 4
-STATISTICS_SIZE = 128  # pixels
 
 
 @dataclass(frozen=True)
@@ -79,7 +77,7 @@ def write_block(layout: DatasetLayout, root: Path, rollouts: Iterable[Rollout]) 
         RuntimeError: a video lacks frames, or an encoder failed.
         OSError: the disk is full.
     """
-    with _quiet_libraries(), _sampled_image_statistics():
+    with _quiet_libraries(), sampled_image_statistics():
         dataset = layout.create(root)
         results = []
         for rollout in rollouts:
@@ -99,45 +97,13 @@ def merge_blocks(layout: DatasetLayout, blocks: list[Path], root: Path) -> None:
     to join them LeRobot would read and write all earlier images again for every block.
     """
     repo_ids = [layout.repo_id] * len(blocks)
-    with _quiet_libraries(), _datasets_cache(root.with_name(f"{root.name}.cache")):
+    with _quiet_libraries(), datasets_cache(root.with_name(f"{root.name}.cache")):
         aggregate_datasets(
             repo_ids, layout.repo_id, roots=blocks, aggr_root=root, concatenate_data=layout.use_videos
         )
     # LeRobot writes the keys in the order of a set, which differs from run to run
     stats = root / STATS_PATH
     stats.write_text(json.dumps(json.loads(stats.read_text()), indent=4, sort_keys=True))
-
-
-def sample_pixels(image: np.ndarray) -> np.ndarray:
-    """(C, H, W) -> every n-th pixel of every n-th row, so that about STATISTICS_SIZE of each are left."""
-    stride = max(1, max(image.shape[1:]) // STATISTICS_SIZE)
-    return image[:, ::stride, ::stride]
-
-
-@contextmanager
-def _sampled_image_statistics() -> Iterator[None]:
-    """Let LeRobot's video encoder take image statistics from a sample of the pixels.
-
-    It samples so itself from 300 pixels on; all pixels of a 256x256 frame cost 5 ms of one core.
-    """
-    usual = compute_stats.auto_downsample_height_width
-    compute_stats.auto_downsample_height_width = sample_pixels
-    try:
-        yield
-    finally:
-        compute_stats.auto_downsample_height_width = usual
-
-
-@contextmanager
-def _datasets_cache(folder: Path) -> Iterator[None]:
-    """Let `datasets` cache what it reads here only; in the user's cache a copy of it would stay."""
-    usual = config.HF_DATASETS_CACHE
-    config.HF_DATASETS_CACHE = folder
-    try:
-        yield
-    finally:
-        config.HF_DATASETS_CACHE = usual
-        shutil.rmtree(folder, ignore_errors=True)
 
 
 @contextmanager

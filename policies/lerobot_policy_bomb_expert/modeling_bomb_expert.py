@@ -3,9 +3,9 @@
 import numpy as np
 import torch
 from lerobot.utils.constants import OBS_ENV_STATE
-from lerobot_bomb.expert import expert_action
 from torch import Tensor
 
+from lerobot_bomb.expert import expert_action
 from lerobot_bomb.schema import PrivilegedState
 from lerobot_bomb.scripted import ScriptedPolicy
 from lerobot_policy_bomb_expert.configuration_bomb_expert import BombExpertConfig
