@@ -211,8 +211,11 @@ class PrivilegedState:
     stone_is_white: np.ndarray = field(repr=False)  # (NUM_STONES,) bool
     stone_in_play: np.ndarray = field(repr=False)  # (NUM_STONES,) bool
     stage: Stage = Stage.START
+    # how the environment reads actions
+    control_mode: str = "relative"
+    fps: int = DEFAULT_FPS
 
-    DIM = 3 + 1 + 3 + 1 + 1 + 5 * NUM_STONES
+    DIM = 3 + 1 + 3 + 4 + 5 * NUM_STONES
 
     def to_vector(self) -> np.ndarray:
         """(DIM,) float32, the observation ``environment_state``."""
@@ -225,6 +228,8 @@ class PrivilegedState:
             *self.target_xyz,
             self.stone,
             list(Stage).index(self.stage),
+            CONTROL_MODES.index(self.control_mode),
+            self.fps,
         ]
         return np.concatenate([head, stones.ravel()]).astype(np.float32)
 
@@ -234,13 +239,15 @@ class PrivilegedState:
         vector = np.asarray(vector, dtype=np.float64)
         if vector.shape != (cls.DIM,):
             raise ValueError(f"environment_state has shape {vector.shape}, expected ({cls.DIM},)")
-        stones = vector[9:].reshape(NUM_STONES, 5)
+        stones = vector[11:].reshape(NUM_STONES, 5)
         return cls(
             gripper_xyz=vector[0:3],
             finger_opening=float(vector[3]),
             target_xyz=vector[4:7],
             stone=int(vector[7]),
             stage=list(Stage)[int(vector[8])],
+            control_mode=CONTROL_MODES[int(vector[9])],
+            fps=int(vector[10]),
             stone_xyz=stones[:, 0:3],
             stone_is_white=stones[:, 3] > 0.5,
             stone_in_play=stones[:, 4] > 0.5,

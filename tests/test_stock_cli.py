@@ -53,7 +53,7 @@ def test_the_expert_places_stones_through_lerobot_eval(stock_cli: Run, tmp_path:
 
 
 def test_numbered_tasks_and_absolute_control(stock_cli: Run, tmp_path: Path) -> None:
-    flags = "--env.control_mode=absolute --policy.control_mode=absolute --env.task_ids=[0,38]"
+    flags = "--env.control_mode=absolute --env.task_ids=[0,38]"
     flags += " --policy.type=bomb_expert --eval.n_episodes=1 --eval.batch_size=1"
     info = evaluate(stock_cli, tmp_path, flags)
     assert [task["task_id"] for task in info["per_task"]] == [0, 38]

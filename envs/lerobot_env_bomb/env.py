@@ -174,6 +174,8 @@ class BombEnv(gymnasium.Env[Observation, np.ndarray]):
             stone_is_white=run.episode.layout.stone_is_white,
             stone_in_play=run.episode.layout.stone_in_play,
             stage=run.judge.stage,
+            control_mode=self._spec.control_mode,
+            fps=self._spec.fps,
         )
 
     @property
@@ -250,7 +252,7 @@ def observation_space(image_size: int) -> spaces.Dict:
     shape = (image_size, image_size, 3)
     # opening fingers overshoot their stops a little
     reach_m = np.array([1.0, 1.0, 1.0, 2.5 * MAX_HALF_OPENING_M], dtype=np.float32)
-    limit = max(POSITION_LIMIT_M, NUM_STONES, len(Stage))
+    limit = max(POSITION_LIMIT_M, NUM_STONES, len(Stage), PHYSICS_HZ)
     return spaces.Dict(
         {
             "pixels": spaces.Dict({camera: spaces.Box(0, 255, shape, np.uint8) for camera in CAMERAS}),
