@@ -249,3 +249,17 @@ def test_import_is_light() -> None:
     script = f"import sys, lerobot_env_bomb.env; print([m for m in {heavy} if m in sys.modules])"
     run = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True)
     assert run.stdout.strip() == "[]", run.stderr
+
+
+def test_a_process_that_never_closes_its_env_exits_silently() -> None:
+    # weakref registers one exit handler, when it is first used; here before mujoco registers its own
+    code = """
+import weakref
+anything = set()
+weakref.finalize(anything, int)
+from lerobot_env_bomb.env import BombEnv
+env = BombEnv()
+env.reset()
+"""
+    run = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert run.stderr == ""

@@ -1,6 +1,7 @@
 # pyright: reportAttributeAccessIssue=false, reportInvalidTypeForm=false
 """Pictures of BOMB's scene, fast enough for training data without a GPU."""
 
+import atexit
 import weakref
 
 import numpy as np
@@ -39,8 +40,11 @@ class CameraRenderer:
         self._option = mujoco.MjvOption()
         self._camera = mujoco.MjvCamera()
         self._camera.type = mujoco.mjtCamera.mjCAMERA_FIXED
-        # also at exit: a context that outlives the OpenGL library raises when it is collected
-        self._finalizer = weakref.finalize(self, _free, self._gl, self._context)
+        self._free = weakref.finalize(self, _free, self._gl, self._context)
+        # At exit too, and before mujoco's own exit handler shuts OpenGL down: handlers run last in, first
+        # out, but weakref registers its one handler early.
+        self._free.atexit = False
+        atexit.register(self._free)
 
     def draw(self, data: mujoco.MjData, camera: str, size: int) -> np.ndarray:
         """(size, size, 3) uint8 picture of a named camera."""
@@ -57,7 +61,8 @@ class CameraRenderer:
 
     def close(self) -> None:
         """Free the OpenGL context."""
-        self._finalizer()
+        self._free()
+        atexit.unregister(self._free)
 
 
 def _free(gl: mujoco.GLContext, context: mujoco.MjrContext) -> None:
