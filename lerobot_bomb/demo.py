@@ -12,11 +12,22 @@ from pathlib import Path
 from lerobot_bomb.evaluation.results import read_results, summarise
 
 REPO_ID = "demo/bomb_place"
+MAX_EVAL_BATCH = 10
 TRAIN_FLAGS = (
     "--policy.type=vla0_smol",
     "--policy.vlm_model_name=nano",
     "--policy.device=cpu",
+    # random weights learn faster from short chunks, coarse bins and a high rate than SmolVLM2's recipe
+    "--policy.chunk_size=5",
+    "--policy.n_action_bins=101",
+    "--policy.n_state_bins=101",
+    "--policy.bin_mode=levels",
+    "--policy.crop_fraction=0.95",
+    "--policy.optimizer_lr=2e-3",
+    "--policy.scheduler_decay_lr=4e-5",
+    "--batch_size=16",
     "--num_workers=0",
+    "--log_freq=50",
     "--wandb.enable=false",
 )
 CLOSING = """\
@@ -32,8 +43,8 @@ far it leads. For a real run:
 def add_demo_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the arguments of ``lerobot-bomb demo``."""
     parser.add_argument("--output_dir", type=Path, help="new folder (default: outputs/demo/DATE_TIME)")
-    parser.add_argument("--episodes", type=int, default=60, help="demonstrations to record (default: 60)")
-    parser.add_argument("--steps", type=int, default=400, help="training steps (default: 400)")
+    parser.add_argument("--episodes", type=int, default=100, help="demonstrations to record (default: 100)")
+    parser.add_argument("--steps", type=int, default=800, help="training steps (default: 800)")
     parser.add_argument("--eval_episodes", type=int, default=20, help="evaluation episodes (default: 20)")
 
 
@@ -78,6 +89,8 @@ def run_demo(args: argparse.Namespace) -> int:
 
 
 def _evaluate(output_dir: Path, name: str, policy_flag: str, num_episodes: int) -> None:
+    # a divisor, so that LeRobot plays no more episodes than asked
+    batch_size = max(size for size in range(1, MAX_EVAL_BATCH + 1) if num_episodes % size == 0)
     _run(
         "lerobot-eval",
         policy_flag,
@@ -86,7 +99,7 @@ def _evaluate(output_dir: Path, name: str, policy_flag: str, num_episodes: int) 
         "--env.task=place",
         f"--env.results_path={output_dir / name}.jsonl",
         f"--eval.n_episodes={num_episodes}",
-        f"--eval.batch_size={min(10, num_episodes)}",
+        f"--eval.batch_size={batch_size}",
         "--eval.use_async_envs=false",
         f"--output_dir={output_dir / 'eval' / name}",
     )
