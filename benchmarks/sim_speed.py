@@ -53,7 +53,10 @@ def main() -> None:
     os.environ.setdefault("MUJOCO_GL", "egl")
     os.environ.setdefault("PYOPENGL_PLATFORM", os.environ["MUJOCO_GL"])
 
-    rates = {str(n): [worker_rate(n) for _ in range(args.repeats)] for n in (1, 2)}
+    rates: dict[str, list[float]] = {"1": [], "2": []}
+    for _ in range(args.repeats):  # in turn, for the machine's speed drifts
+        for number, runs in rates.items():
+            runs.append(worker_rate(int(number)))
     milliseconds = compare_environments(args.repeats, args.robosuite_python)
     figures = {
         "milliseconds": milliseconds,
