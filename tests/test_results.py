@@ -7,14 +7,11 @@ from lerobot_bomb.cli import main
 from lerobot_bomb.evaluation.results import read_results, summarise
 
 
-def row(
-    seed: int, failure: str | None = None, error: float = 1.0, stage: str = "placed", **other: object
-) -> str:
+def row(seed: int, failure: str | None = None, error: float = 1.0, **other: object) -> str:
     values = {
         "spec": {"seed": seed},
         "is_success": failure is None,
         "failure": failure,
-        "stage": stage,
         "placement_error_mm": error,
         "protocol_version": "0.1",
     }
@@ -23,12 +20,19 @@ def row(
 
 def test_summary_counts_successes_errors_and_failures(tmp_path: Path) -> None:
     path = tmp_path / "results.jsonl"
-    lines = [row(0), row(1, error=3.0), row(2, "imprecise", 14.0), row(3, "never_reached", 200.0, "start")]
+    lines = [row(0), row(1, error=3.0), row(2, "imprecise", 14.0), row(3, "never_reached", 200.0)]
+    lines += [row(4, "dropped", 99.0), row(5, "wrong_intersection", 45.0), row(6, "disturbed_others", 2.0)]
     path.write_text("".join(lines))
     summary = summarise(read_results(path))
-    assert (summary.num_episodes, summary.num_successes) == (4, 2)
-    assert summary.median_error_mm == 3.0  # of 1, 3 and 14: the stone that was never lifted has none
-    assert summary.failures == {"imprecise": 1, "never_reached": 1}
+    assert (summary.num_episodes, summary.num_successes) == (7, 2)
+    assert summary.median_error_mm == 3.0  # of 1, 2, 3, 14 and 45: only stones that were put down
+    assert summary.failures == {
+        "imprecise": 1,
+        "never_reached": 1,
+        "dropped": 1,
+        "wrong_intersection": 1,
+        "disturbed_others": 1,
+    }
 
 
 def test_an_episode_that_was_run_again_counts_once(tmp_path: Path) -> None:

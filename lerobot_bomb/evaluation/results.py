@@ -8,8 +8,11 @@ from pathlib import Path
 from statistics import median
 from typing import Any
 
-from lerobot_bomb.schema import PROTOCOL_VERSION
+from lerobot_bomb.schema import PROTOCOL_VERSION, Failure
 from lerobot_bomb.stats import format_rate
+
+# outcomes of an episode in which the stone was carried and put down somewhere on the board
+PUT_DOWN = (None, Failure.WRONG_INTERSECTION, Failure.IMPRECISE, Failure.DISTURBED_OTHERS)
 
 Row = dict[str, Any]  # the fields of EpisodeResult
 
@@ -20,7 +23,7 @@ class Summary:
 
     num_episodes: int
     num_successes: int
-    median_error_mm: float | None  # over the episodes in which the stone was lifted and let go
+    median_error_mm: float | None  # over the episodes in which the stone was put down on the board
     failures: Counter[str]
 
     def lines(self) -> list[str]:
@@ -64,7 +67,7 @@ def read_results(path: Path) -> list[Row]:
 
 def summarise(rows: list[Row]) -> Summary:
     """Counts, rates and the median error of episodes."""
-    errors = [row["placement_error_mm"] for row in rows if row["stage"] == "placed"]
+    errors = [row["placement_error_mm"] for row in rows if row["failure"] in PUT_DOWN]
     return Summary(
         num_episodes=len(rows),
         num_successes=sum(row["is_success"] for row in rows),

@@ -1,0 +1,51 @@
+"""Heavy proofs, run by `make test-long`."""
+
+import json
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+
+from lerobot_bomb.cli import main
+from lerobot_bomb.evaluation.results import read_results, summarise
+
+pytestmark = pytest.mark.long
+
+SIZE = 128
+
+
+@pytest.mark.parametrize("control_mode", ["relative", "absolute"])
+def test_the_expert_places_100_stones_precisely(
+    stock_cli: Callable[..., None], tmp_path: Path, control_mode: str
+) -> None:
+    results = tmp_path / "results.jsonl"
+    flags = "--policy.type=bomb_expert --env.type=bomb --env.task=place --env.image_size=32"
+    flags += f" --env.control_mode={control_mode} --env.results_path={results}"
+    flags += " --eval.n_episodes=100 --eval.batch_size=2"
+    stock_cli("lerobot-eval", *flags.split(), f"--output_dir={tmp_path / 'eval'}")
+    rows = read_results(results)
+    assert len(rows) == 100
+    summary = summarise(rows)
+    assert summary.num_successes >= 99
+    assert summary.median_error_mm is not None and summary.median_error_mm <= 2
+    assert max(row["collateral_mm"] for row in rows) < 1
+
+
+def test_two_episodes_learned_by_heart_through_the_stock_commands(
+    stock_cli: Callable[..., None], tmp_path: Path
+) -> None:
+    dataset, train = tmp_path / "dataset", tmp_path / "train"
+    recording = ["--repo_id=test/two", f"--root={dataset}", "--episodes=2", "--seed=40", "--images"]
+    assert main(["record", *recording, f"--image_size={SIZE}"]) == 0
+    flags = "--policy.type=vla0_smol --policy.vlm_model_name=nano --policy.device=cpu --policy.chunk_size=5"
+    flags += " --policy.n_action_bins=101 --policy.n_state_bins=101 --policy.bin_mode=levels"
+    flags += " --policy.crop_fraction=1 --policy.optimizer_lr=2e-3 --policy.scheduler_decay_lr=4e-5"
+    flags += " --steps=300 --save_freq=300 --batch_size=16 --num_workers=0 --wandb.enable=false"
+    data = ["--dataset.repo_id=test/two", f"--dataset.root={dataset}", f"--output_dir={train}"]
+    stock_cli("lerobot-train", *data, *flags.split())
+    checkpoint = train / "checkpoints" / "last" / "pretrained_model"
+    flags = f"--policy.path={checkpoint} --env.type=bomb --env.image_size={SIZE} --seed=40"
+    flags += " --eval.n_episodes=2 --eval.batch_size=2 --eval.use_async_envs=false"
+    stock_cli("lerobot-eval", *flags.split(), f"--output_dir={tmp_path / 'eval'}")
+    info = json.loads((tmp_path / "eval" / "eval_info.json").read_text())
+    assert info["overall"]["pc_success"] == 100.0
