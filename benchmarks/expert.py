@@ -131,7 +131,7 @@ def main() -> None:
     )
     parser.add_argument("--episodes", type=int, default=500)
     parser.add_argument("--seed", type=int, default=0, help="of the first episode; the others count up")
-    parser.add_argument("--control-mode", choices=CONTROL_MODES, default="relative")
+    parser.add_argument("--control_mode", choices=CONTROL_MODES, default="relative")
     parser.add_argument("--fps", type=int, default=DEFAULT_FPS)
     parser.add_argument("--split", choices=SPLITS, default="all")
     parser.add_argument(

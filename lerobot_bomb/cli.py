@@ -5,6 +5,12 @@ import importlib
 import sys
 from collections.abc import Sequence
 
+from lerobot_bomb import __version__
+
+DESCRIPTION = (
+    "What LeRobot's own commands do not do for BOMB. Train with lerobot-train, evaluate with lerobot-eval."
+)
+
 # command -> (help, module with add_<command>_arguments and run_<command>); imported only when called
 COMMANDS = {
     "record": ("record the scripted expert as a LeRobotDataset", "lerobot_bomb.data.record"),
@@ -17,7 +23,9 @@ COMMANDS = {
 def main(argv: Sequence[str] | None = None) -> int:
     """Run one command; a ValueError, OSError or RuntimeError becomes one line on stderr and exit code 1."""
     argv = sys.argv[1:] if argv is None else list(argv)
-    parser = argparse.ArgumentParser(prog="lerobot-bomb", description=__doc__)
+    argv = argv or ["--help"]
+    parser = argparse.ArgumentParser(prog="lerobot-bomb", description=DESCRIPTION)
+    parser.add_argument("--version", action="version", version=f"lerobot-bomb {__version__}")
     commands = parser.add_subparsers(dest="command", required=True, metavar="COMMAND")
     modules = {}
     for name, (summary, module) in COMMANDS.items():

@@ -53,7 +53,11 @@ def check_versions() -> Iterator[Finding]:
 
 def check_rendering() -> Iterator[Finding]:
     """Render one frame of the default scene."""
-    backend = importlib.import_module("lerobot_env_bomb.backend").ensure_gl_backend()
+    try:
+        backend = importlib.import_module("lerobot_env_bomb.backend").ensure_gl_backend()
+    except (RuntimeError, ValueError) as error:
+        yield Finding("opengl", str(error), broken=True)
+        return
     env = importlib.import_module("lerobot_env_bomb.env").BombEnv()
     observation, _ = env.reset(seed=0)
     env.close()

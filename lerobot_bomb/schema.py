@@ -5,7 +5,8 @@ numpy only: simulator workers import this module and must start in under a secon
 
 import dataclasses
 import json
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
 from dataclasses import dataclass, field
 from enum import StrEnum
 
@@ -252,6 +253,22 @@ class PrivilegedState:
             stone_is_white=stones[:, 3] > 0.5,
             stone_in_play=stones[:, 4] > 0.5,
         )
+
+
+class FlagError(Exception):
+    """A config's flag has a value that is not allowed.
+
+    Not a ValueError: LeRobot's parser replaces the text of a ValueError that a config raises.
+    """
+
+
+@contextmanager
+def flag_errors() -> Iterator[None]:
+    """Raise the ValueErrors of a config's checks as FlagError."""
+    try:
+        yield
+    except ValueError as error:
+        raise FlagError(str(error)) from None
 
 
 def action_bounds(control_mode: str) -> tuple[np.ndarray, np.ndarray]:

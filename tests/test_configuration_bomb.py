@@ -3,6 +3,7 @@ from pathlib import Path
 import pytest
 from lerobot.envs import env_to_policy_features, make_env, make_env_config
 
+from lerobot_bomb.schema import FlagError
 from lerobot_env_bomb.configuration_bomb import BombEnvConfig
 from lerobot_env_bomb.vector import LazyVectorEnv
 
@@ -55,7 +56,7 @@ def test_task_ids_fix_target_and_colour() -> None:
     ],
 )
 def test_wrong_flags_fail_before_an_environment_is_built(flags: dict, message: str) -> None:
-    with pytest.raises(ValueError, match=message):
+    with pytest.raises(FlagError, match=message):
         BombEnvConfig(**flags)
 
 

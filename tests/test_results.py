@@ -71,3 +71,13 @@ def test_the_command_fails_in_one_line(tmp_path: Path, capsys: pytest.CaptureFix
     error = capsys.readouterr().err
     assert "absent.jsonl: no such results file" in error
     assert error.count("\n") == 1
+
+
+def test_conditions_are_not_mixed(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    path = tmp_path / "results.jsonl"
+    specs = [{"seed": 0, "fps": 10}, {"seed": 1, "fps": 10}, {"seed": 0, "fps": 20}]
+    path.write_text("".join(row(0, spec=spec) for spec in specs))
+    assert main(["results", str(path)]) == 0
+    output = capsys.readouterr().out
+    assert "results.jsonl (fps=10): 2 episodes" in output
+    assert "results.jsonl (fps=20): 1 episodes" in output

@@ -8,6 +8,7 @@ import pytest
 
 from lerobot_bomb.cli import main
 from lerobot_bomb.evaluation.results import read_results
+from lerobot_bomb.schema import FlagError
 
 Run = Callable[..., None]
 REPO_ID = "test/bomb_place"
@@ -93,3 +94,18 @@ def test_an_existing_output_folder_is_not_overwritten(stock_cli: Run, dataset: P
     (tmp_path / "train").mkdir()
     with pytest.raises(FileExistsError, match="already exists"):
         train(stock_cli, dataset, tmp_path / "train", "--policy.type=vla0_smol --policy.vlm_model_name=nano")
+
+
+def test_a_wrong_policy_flag_is_named_by_lerobot_train(
+    stock_cli: Run, dataset: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    flags = "--policy.type=vla0_smol --policy.vlm_model_name=nano --policy.chunk_size=3"
+    with pytest.raises(SystemExit):
+        train(stock_cli, dataset, tmp_path / "train", f"{flags} --policy.n_action_steps=5")
+    assert "--policy.n_action_steps=5 must lie in 1..3 (--policy.chunk_size)" in capsys.readouterr().err
+
+
+def test_a_wrong_env_flag_is_named_by_lerobot_eval(stock_cli: Run, tmp_path: Path) -> None:
+    with pytest.raises(FlagError, match=r"--env\.target=\[9, 9\] is off the board; give \[row, column\]"):
+        evaluate(stock_cli, tmp_path, "--policy.type=bomb_expert --env.target=[9,9]")
+    assert not (tmp_path / "eval").exists()

@@ -66,7 +66,7 @@ def ensure_gl_backend() -> str:
         importlib.import_module("mujoco")
     except (AttributeError, ImportError) as error:
         # this is how a missing libEGL or libOSMesa shows
-        raise NoOpenGLError(_install_advice({chosen: str(error)})) from error
+        raise NoOpenGLError(f"{_install_advice({chosen: str(error)})}; or unset MUJOCO_GL") from error
     return chosen
 
 

@@ -9,7 +9,15 @@ from lerobot.configs import FeatureType, PolicyFeature
 from lerobot.envs import EnvConfig
 from lerobot.utils.constants import ACTION, OBS_IMAGES, OBS_STATE
 
-from lerobot_bomb.schema import ACTION_DIM, CAMERAS, DEFAULT_FPS, STATE_DIM, EpisodeSpec, RenderOptions
+from lerobot_bomb.schema import (
+    ACTION_DIM,
+    CAMERAS,
+    DEFAULT_FPS,
+    STATE_DIM,
+    EpisodeSpec,
+    RenderOptions,
+    flag_errors,
+)
 from lerobot_env_bomb.vector import LazyVectorEnv
 
 AGENT_POS = "agent_pos"
@@ -48,7 +56,8 @@ class BombEnvConfig(EnvConfig):
     features_map: dict[str, str] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
-        self.gym_kwargs  # noqa: B018  an invalid flag raises here, before anything is built
+        with flag_errors():
+            self.gym_kwargs  # noqa: B018  an invalid flag raises here, before anything is built
         image = PolicyFeature(type=FeatureType.VISUAL, shape=(self.image_size, self.image_size, 3))
         cameras = [f"{OBS_IMAGES}.{camera}" for camera in CAMERAS]
         self.features = {

@@ -131,7 +131,8 @@ class BombEnv(gymnasium.Env[Observation, np.ndarray]):
         pictures = [self._draw(camera, PERSON_IMAGE_SIZE) for camera in CAMERAS]
         row, column = run.episode.target
         error_mm = run.judge.placement_error_mm
-        outcome = "success" if run.judge.is_success else run.judge.failure or run.judge.stage
+        outcome = f"failed: {run.judge.failure}" if run.judge.failure else f"stage: {run.judge.stage}"
+        outcome = "success" if run.judge.is_success else outcome
         status = f"target row {row}, column {column}   error {error_mm:.0f} mm   {outcome}"
         return compose_caption(pictures, [run.episode.instruction, status])
 

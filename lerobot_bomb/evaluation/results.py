@@ -14,6 +14,9 @@ from lerobot_bomb.stats import format_rate
 # outcomes of an episode in which the stone was carried and put down somewhere on the board
 PUT_DOWN = (None, Failure.WRONG_INTERSECTION, Failure.IMPRECISE, Failure.DISTURBED_OTHERS)
 
+# what differs between episodes of one condition
+DRAWN = ("seed", "target", "color")
+
 Row = dict[str, Any]  # the fields of EpisodeResult
 
 
@@ -65,6 +68,17 @@ def read_results(path: Path) -> list[Row]:
     return list(rows.values())
 
 
+def by_condition(rows: list[Row]) -> dict[str, list[Row]]:
+    """Rows apart that do not compare: {"" or " (what differs)": rows}."""
+    specs = [{name: row["spec"][name] for name in row["spec"] if name not in DRAWN} for row in rows]
+    differing = [name for name in specs[0] if any(spec.get(name) != specs[0][name] for spec in specs)]
+    conditions: dict[str, list[Row]] = {}
+    for row, spec in zip(rows, specs, strict=True):
+        label = ", ".join(f"{name}={spec.get(name)}" for name in differing)
+        conditions.setdefault(f" ({label})" if label else "", []).append(row)
+    return conditions
+
+
 def summarise(rows: list[Row]) -> Summary:
     """Counts, rates and the median error of episodes."""
     errors = [row["placement_error_mm"] for row in rows if row["failure"] in PUT_DOWN]
@@ -82,10 +96,11 @@ def add_results_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run_results(args: argparse.Namespace) -> int:
-    """Print a summary of each file."""
+    """Print a summary of each condition of each file."""
     for path in args.paths:
-        summary = summarise(read_results(path))
-        print(f"{path}: {summary.num_episodes} episodes")
-        for line in summary.lines():
-            print(f"  {line}")
+        for condition, rows in by_condition(read_results(path)).items():
+            summary = summarise(rows)
+            print(f"{path}{condition}: {summary.num_episodes} episodes")
+            for line in summary.lines():
+                print(f"  {line}")
     return 0

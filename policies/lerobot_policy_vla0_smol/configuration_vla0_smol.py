@@ -8,7 +8,7 @@ from lerobot.optim import AdamWConfig, CosineDecayWithWarmupSchedulerConfig
 
 from lerobot_bomb.actions.bins import BIN_MODES
 from lerobot_bomb.actions.text import MASK_LEVELS, digits_needed
-from lerobot_bomb.schema import one_of
+from lerobot_bomb.schema import flag_errors, one_of
 
 DTYPES = ("float32", "bfloat16")
 # modes that map the data into [-1, 1], where the bins are
@@ -91,10 +91,11 @@ class Vla0SmolConfig(PreTrainedConfig):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        self._check_choices()
-        self._check_chunk()
-        self._check_numbers()
-        self._check_training()
+        with flag_errors():
+            self._check_choices()
+            self._check_chunk()
+            self._check_numbers()
+            self._check_training()
 
     def _check_choices(self) -> None:
         one_of("--policy.bin_mode", self.bin_mode, BIN_MODES)
