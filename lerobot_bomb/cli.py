@@ -7,9 +7,7 @@ from collections.abc import Sequence
 
 from lerobot_bomb import __version__
 
-DESCRIPTION = (
-    "What LeRobot's own commands do not do for BOMB. Train with lerobot-train, evaluate with lerobot-eval."
-)
+DESCRIPTION = "What lerobot-train and lerobot-eval do not do for BOMB: record, summarise, check."
 
 # command -> (help, module with add_<command>_arguments and run_<command>); imported only when called
 COMMANDS = {
