@@ -18,6 +18,7 @@ from pathlib import Path
 import numpy as np
 from tqdm import tqdm
 
+from lerobot_bomb.data.rollout import perturb
 from lerobot_bomb.expert import expert_action
 from lerobot_bomb.schema import (
     BOARD,
@@ -58,14 +59,12 @@ def run_episode(seed: int, control_mode: str, fps: int, split: str, noise: float
     spec = EpisodeSpec(seed=seed, control_mode=control_mode, fps=fps, split=split)
     env = BombEnv(spec, RenderOptions(image_size=MIN_IMAGE_SIZE))
     rng = np.random.default_rng([seed, NOISE_STREAM])
-    unit_m = MAX_STEP_M if control_mode == "relative" else 1.0
     observation, _ = env.reset()
     idle, ended, step = [], False, 0
     while not ended:
         before = PrivilegedState.from_vector(observation["environment_state"])
         action = expert_action(before, control_mode, fps)
-        executed = action.copy()
-        executed[:3] += noise * MAX_STEP_M / unit_m * rng.standard_normal(3)
+        executed = perturb(action, noise, control_mode, rng)
         observation, _, terminated, truncated, _ = env.step(executed)
         after = PrivilegedState.from_vector(observation["environment_state"])
         if is_idle(action, before, after, control_mode) and not is_done(before, spec.success_tolerance_mm):

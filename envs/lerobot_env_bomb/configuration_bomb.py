@@ -113,10 +113,11 @@ class BombEnvConfig(EnvConfig):
         from lerobot_env_bomb.env import BombEnv  # chooses an OpenGL backend, imports MuJoCo
 
         self._prepare_results_path()
+        kwargs = self.gym_kwargs
         return {
             str(self.task): {
                 task_id: LazyVectorEnv(
-                    [partial(BombEnv, **(self.gym_kwargs | {"spec": spec}))] * n_envs,
+                    [partial(BombEnv, **(kwargs | {"spec": spec}))] * n_envs,
                     use_async=use_async_envs and n_envs > 1,
                 )
                 for task_id, spec in self.specs.items()

@@ -22,10 +22,11 @@ from lerobot_bomb.schema import (
     PrivilegedState,
     RenderOptions,
     Stage,
+    action_bounds,
 )
 from lerobot_env_bomb.judge import Judge
 from lerobot_env_bomb.render import CameraRenderer, compose_caption
-from lerobot_env_bomb.scene import MAX_HALF_OPENING_M, WORKSPACE_HIGH, WORKSPACE_LOW, Scene
+from lerobot_env_bomb.scene import MAX_HALF_OPENING_M, Scene
 from lerobot_env_bomb.task import STONE, Episode, check_target, sample_episode
 
 Observation = dict[str, Any]
@@ -242,10 +243,8 @@ class BombEnv(gymnasium.Env[Observation, np.ndarray]):
 
 def action_space(control_mode: str) -> spaces.Box:
     """float32 (4,): relative in units of MAX_STEP_M, or absolute in metres; gripper in [-1, 1]."""
-    if control_mode == "relative":
-        return spaces.Box(-1.0, 1.0, (ACTION_DIM,), np.float32)
-    low, high = np.array([*WORKSPACE_LOW, -1.0]), np.array([*WORKSPACE_HIGH, 1.0])
-    return spaces.Box(low.astype(np.float32), high.astype(np.float32), dtype=np.float32)
+    low, high = action_bounds(control_mode)
+    return spaces.Box(low, high, dtype=np.float32)
 
 
 def observation_space(image_size: int) -> spaces.Dict:

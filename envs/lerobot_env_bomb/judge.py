@@ -100,15 +100,16 @@ class Judge:
             if is_reached and order.index(stage) > order.index(self.stage):
                 self.stage = stage
 
+    def _is_flat(self) -> bool:
+        return bool(abs(self._now.stone_xyz[STONE, 2] - REST_HEIGHT_M) < FLAT_TOLERANCE_M)
+
     def _is_on_target(self) -> bool:
-        height_m = self._now.stone_xyz[STONE, 2]
-        is_flat = abs(height_m - REST_HEIGHT_M) < FLAT_TOLERANCE_M
-        return bool(is_flat and self.placement_error_mm <= self._episode.spec.success_tolerance_mm)
+        return bool(self._is_flat() and self.placement_error_mm <= self._episode.spec.success_tolerance_mm)
 
     def _judge_placement(self) -> None:
         is_target = self.nearest_intersection == self._episode.target
-        is_flat = abs(self._now.stone_xyz[STONE, 2] - REST_HEIGHT_M) < FLAT_TOLERANCE_M
-        self.is_success_bomb_v0 = bool(is_target and is_flat and self.placement_error_mm <= V0_TOLERANCE_MM)
+        is_near = self.placement_error_mm <= V0_TOLERANCE_MM
+        self.is_success_bomb_v0 = is_target and self._is_flat() and is_near
         if self._is_on_target():
             self.stage = Stage.PLACED
             self.is_success = self.collateral_mm <= COLLATERAL_TOLERANCE_MM
