@@ -70,12 +70,11 @@ def main() -> None:
 def collect(recording: Recording) -> list[Rollout]:
     """The successful rollouts that the recording will hold."""
     env = make_env(recording.spec, recording.render_options)
-    settings = RolloutSettings(recording.spec, recording.render_options)
+    settings = RolloutSettings(recording.render_options)
     rollouts: list[Rollout] = []
-    seed = recording.seed
+    specs = recording.specs(num_tried=0)
     while len(rollouts) < recording.episodes:
-        rollout = play(env, settings, seed)
-        seed += 1
+        rollout = play(env, next(specs), settings)
         if rollout.result.is_success:
             rollouts.append(rollout)
     env.close()

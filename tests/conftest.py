@@ -4,11 +4,17 @@ import os
 import sys
 from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import pytest
+import yaml
 
 os.environ.setdefault("OMP_NUM_THREADS", "1")
 os.environ["HF_HUB_OFFLINE"] = "1"  # no test may need the network
+
+CONFIGS = Path(__file__).parents[1] / "configs"
+# a policy that learns comes with a recipe that learns a few episodes by heart
+POLICY_TYPES = sorted(path.stem.removeprefix("overfit_") for path in CONFIGS.glob("overfit_*.yaml"))
 
 
 @pytest.fixture(scope="session")
@@ -32,3 +38,25 @@ def stock_cli(monkeypatch: pytest.MonkeyPatch) -> Callable[..., None]:
         mains[command]()
 
     return run
+
+
+def pytest_addoption(parser: pytest.Parser) -> None:
+    parser.addoption("--policy.type", dest="policy_type", choices=POLICY_TYPES, help="prove this one only")
+
+
+def pytest_generate_tests(metafunc: pytest.Metafunc) -> None:
+    """Run every test that takes a `policy_type` on each policy that learns, or on --policy.type."""
+    if "policy_type" in metafunc.fixturenames:
+        chosen = metafunc.config.getoption("policy_type")
+        metafunc.parametrize("policy_type", [chosen] if chosen else POLICY_TYPES)
+
+
+@pytest.fixture
+def policy_flags() -> Callable[[str], dict[str, Any]]:
+    """policy_flags("vla0_smol"): what configs/overfit_vla0_smol.yaml sets under `policy`."""
+
+    def read(policy_type: str) -> dict[str, Any]:
+        path = CONFIGS / f"overfit_{policy_type}.yaml"
+        return yaml.safe_load(path.read_text())["policy"]
+
+    return read

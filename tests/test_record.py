@@ -6,7 +6,6 @@ import signal
 import subprocess
 import sys
 import time
-from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
@@ -137,7 +136,7 @@ def test_episodes_carry_what_determines_them(datasets: dict[str, Path]) -> None:
     assert rows[0]["bomb/color"] in instruction
     written = json.loads((datasets["video"] / METADATA_FILE).read_text())["recording"]
     versions = {"protocol_version": PROTOCOL_VERSION, "package_version": __version__}
-    assert written == {**asdict(VIDEO), **versions}
+    assert written == {**VIDEO.to_dict(), **versions}
 
 
 def test_episode_columns_survive_a_merge_with_another_dataset(
@@ -155,7 +154,7 @@ def test_image_statistics_are_sampled_and_right(tmp_path: Path) -> None:
     record(recording, tmp_path / "full")
     statistics = json.loads((tmp_path / "full" / "meta" / "stats.json").read_text())
     env = make_env(recording.spec, recording.render_options)
-    rollout = play(env, RolloutSettings(recording.spec, recording.render_options), recording.seed)
+    rollout = play(env, recording.spec, RolloutSettings(recording.render_options))
     env.close()
     for camera, frames in rollout.frames.items():
         found = statistics[f"observation.images.{camera}"]
@@ -177,8 +176,24 @@ def test_failed_episodes_are_left_out_and_counted(tmp_path: Path) -> None:
     failed = [failure["seed"] for failure in progress.failures]
     assert {row["bomb/color"] for row in rows} == {"black"}
     assert failed
-    assert sorted(kept + failed) == list(range(progress.next_seed))
+    assert sorted(kept + failed) == list(range(progress.num_tried))
     assert read_progress(tmp_path / "half" / METADATA_FILE) == progress
+
+
+def test_every_seed_is_played_with_every_task(tmp_path: Path) -> None:
+    recording = Recording("test/tasks", episodes=3, seed=6, image_size=SIZE, task_ids=(7, 34), images=True)
+    assert [spec.seed for spec, _ in zip(recording.specs(num_tried=3), range(3), strict=False)] == [7, 8, 8]
+    record(recording, tmp_path / "tasks")
+    rows = episode_rows(tmp_path / "tasks")
+    assert [row["bomb/seed"] for row in rows] == [6, 6, 7]
+    assert [(row["bomb/target"], row["bomb/color"]) for row in rows] == [
+        ([1, 2], "black"),
+        ([1, 4], "white"),
+        ([1, 2], "black"),
+    ]
+    spec = json.loads(rows[1]["bomb/spec"])
+    assert (spec["seed"], spec["target"], spec["color"]) == (6, [1, 4], "white")
+    assert record(recording, tmp_path / "tasks", resume=True).num_episodes == 3
 
 
 def test_failures_are_described_by_class_and_seed() -> None:
@@ -269,7 +284,7 @@ def test_a_killed_recording_resumes_to_the_same_bytes(datasets: dict[str, Path],
 def test_resuming_a_complete_recording_changes_nothing(datasets: dict[str, Path]) -> None:
     before = contents(datasets["video"])
     num_frames = json.loads(before["meta/info.json"])["total_frames"]
-    assert record(VIDEO, datasets["video"], resume=True) == Progress(8, 5, num_frames, [])
+    assert record(VIDEO, datasets["video"], resume=True) == Progress(5, num_frames, [])
     assert contents(datasets["video"]) == before
 
 

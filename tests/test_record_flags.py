@@ -1,6 +1,5 @@
 """Flags and folders of `lerobot-bomb record`: what is refused, before long work, and how."""
 
-from dataclasses import asdict
 from pathlib import Path
 
 import pytest
@@ -79,7 +78,7 @@ def test_resume_refuses_other_parameters(
     root = tmp_path / "x"
     path = root / METADATA_FILE if is_complete else unfinished_folder(root) / PARAMETERS_FILE
     path.parent.mkdir(parents=True)
-    write_json(path, {"recording": asdict(Recording("test/x", episodes=1, seed=3))})
+    write_json(path, {"recording": Recording("test/x", episodes=1, seed=3).to_dict()})
     assert cli.main([*FLAGS, f"--root={root}", "--seed=3", "--noise=0.1", "--resume"]) == 1
     message = capsys.readouterr().err
     assert "differs in --noise=0.1 (it has 0.0)" in message
@@ -105,6 +104,22 @@ def test_a_switch_takes_true_or_false(capsys: pytest.CaptureFixture[str]) -> Non
     with pytest.raises(SystemExit):
         cli.main([*FLAGS, "--images=maybe"])
     assert "--images: 'maybe' must be true or false" in capsys.readouterr().err
+
+
+def test_an_unknown_task_is_refused(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert cli.main([*FLAGS, f"--root={tmp_path / 'x'}", "--task_ids=[0,50]"]) == 1
+    assert "--task_ids has 50; 'place' has tasks 0..49" in capsys.readouterr().err
+
+
+def test_task_ids_are_a_list_of_numbers(capsys: pytest.CaptureFixture[str]) -> None:
+    with pytest.raises(SystemExit):
+        cli.main([*FLAGS, "--task_ids=[one]"])
+    assert "--task_ids: '[one]' must be a list of whole numbers, as [0,7]" in capsys.readouterr().err
+
+
+def test_a_task_outside_the_split_is_refused(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert cli.main([*FLAGS, f"--root={tmp_path / 'x'}", "--task_ids=0,3", "--split=train"]) == 1
+    assert "--target=[0, 3] is not in --split=train" in capsys.readouterr().err
 
 
 def test_lerobots_folder_is_the_default(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

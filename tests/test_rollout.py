@@ -2,6 +2,7 @@
 
 import subprocess
 import sys
+from dataclasses import replace
 
 import gymnasium
 import numpy as np
@@ -29,9 +30,9 @@ class ExecutedActions(gymnasium.Wrapper):
 
 
 def test_noise_is_executed_but_not_stored() -> None:
-    settings = RolloutSettings(EpisodeSpec(seed=0), SMALL, noise=0.1)
-    env = ExecutedActions(make_env(settings.spec, SMALL))
-    rollout = play(env, settings, seed=0)
+    spec, settings = EpisodeSpec(seed=0), RolloutSettings(SMALL, noise=0.1)
+    env = ExecutedActions(make_env(spec, SMALL))
+    rollout = play(env, spec, settings)
     assert rollout.result.is_success
     clean = np.stack([expert_action(PrivilegedState.from_vector(s.to_vector())) for s in env.states])
     executed = np.stack(env.actions)
@@ -39,8 +40,8 @@ def test_noise_is_executed_but_not_stored() -> None:
     assert np.array_equal(executed[:, 3], clean[:, 3])
     assert 0.05 < np.std(executed[:, :3] - clean[:, :3]) < 0.15
 
-    again = play(env, settings, seed=0)
-    other = play(env, settings, seed=1)
+    again = play(env, spec, settings)
+    other = play(env, replace(spec, seed=1), settings)
     env.close()
     assert np.array_equal(again.actions, rollout.actions)
     assert np.array_equal(again.frames["wrist"], rollout.frames["wrist"])
@@ -57,11 +58,12 @@ def test_noise_has_the_same_size_in_both_control_modes(control_mode: str, step: 
     assert np.array_equal(perturb(action, 0.0, control_mode, rng), action)
 
 
-def test_a_pool_yields_in_the_order_of_the_seeds() -> None:
-    settings = RolloutSettings(EpisodeSpec(seed=0), SMALL)
-    with RolloutPool(settings, first_seed=7, num_workers=2) as pool:
+def test_a_pool_yields_in_the_order_of_the_specs() -> None:
+    specs = [EpisodeSpec(seed=seed, target=(seed % 2, 3)) for seed in range(7, 20)]
+    with RolloutPool(RolloutSettings(SMALL), iter(specs), num_workers=2) as pool:
         rollouts = [rollout for rollout, _ in zip(pool, range(5), strict=False)]
-    assert [rollout.result.spec.seed for rollout in rollouts] == [7, 8, 9, 10, 11]
+    assert [rollout.result.spec for rollout in rollouts] == specs[:5]
+    assert [rollout.result.target for rollout in rollouts] == [(1, 3), (0, 3), (1, 3), (0, 3), (1, 3)]
     assert rollouts[0].frames["workspace"].shape == (rollouts[0].result.steps, 64, 64, 3)
 
 

@@ -24,6 +24,7 @@ from lerobot_bomb.data.recording import (
     check_folders,
     finished_blocks,
     read_progress,
+    recorder_flags,
     unfinished_folder,
     write_json,
 )
@@ -60,6 +61,13 @@ def add_record_arguments(parser: argparse.ArgumentParser) -> None:
     add("--fps", type=int, default=DEFAULT_FPS, help=f"control steps a second (default: {DEFAULT_FPS})")
     add("--image_size", type=int, default=DEFAULT_IMAGE_SIZE, help="pixels (default: %(default)s)")
     add("--split", default="all", help=f"draw from {', '.join(SPLITS)} (default: all)")
+    add(
+        "--task_ids",
+        type=_parse_numbers,
+        default=(),
+        help="numbered tasks, as [0,7,12]: every seed is played with each (25 x colour + 5 x row + column; "
+        "black = 0, white = 1; default: target and colour are drawn per episode)",
+    )
     add("--images", **_switch(), help="store images (lossless) instead of videos")
     add("--workers", type=int, default=1, help="simulator processes; one keeps two cores busy (default: 1)")
     add(
@@ -80,7 +88,8 @@ def run_record(args: argparse.Namespace) -> int:
         raise ValueError(f"--workers={args.workers} must be at least 1")
     root = args.root or _default_root(recording.repo_id)
     progress = record(recording, root, num_workers=args.workers, resume=args.resume)
-    seeds = f"{recording.seed}..{progress.next_seed - 1}"
+    last_seed = recording.seed + (progress.num_tried - 1) // len(recording.conditions)
+    seeds = f"{recording.seed}..{last_seed}"
     print(
         f"{progress.num_episodes} episodes, {progress.num_frames} frames, of the seeds {seeds}: {root}\n"
         f"{describe_failures(progress.failures)}"
@@ -114,7 +123,7 @@ def record(
         raise ValueError(f"--root={root} cannot be written: {error}") from error
     try:
         with FileLock(folder / "lock", timeout=0):
-            write_json(folder / PARAMETERS_FILE, {"recording": asdict(recording)})
+            write_json(folder / PARAMETERS_FILE, {"recording": recording.to_dict()})
             progress = _record_blocks(recording, folder, num_workers, expert)
             _publish(recording, progress, folder, root)
     except Timeout:
@@ -142,13 +151,15 @@ def describe_failures(failures: list[dict[str, Any]]) -> str:
 def _record_blocks(recording: Recording, folder: Path, num_workers: int, expert: Expert) -> Progress:
     """Write the blocks that are missing."""
     blocks = finished_blocks(folder)
-    progress = read_progress(blocks[-1] / BLOCK_FILE) if blocks else Progress(next_seed=recording.seed)
+    progress = read_progress(blocks[-1] / BLOCK_FILE) if blocks else Progress()
     if progress.num_episodes == recording.episodes:
         return progress
     # MuJoCo's backend is chosen here, or its absence reported; the workers inherit the choice
-    make_env(recording.spec, recording.render_options).close()
-    settings = RolloutSettings(recording.spec, recording.render_options, recording.noise, expert)
-    with RolloutPool(settings, progress.next_seed, num_workers) as pool:
+    with recorder_flags():
+        for spec in recording.conditions:
+            make_env(spec, recording.render_options).close()
+    settings = RolloutSettings(recording.render_options, recording.noise, expert)
+    with RolloutPool(settings, recording.specs(progress.num_tried), num_workers) as pool:
         from lerobot_bomb.data.blocks import write_block  # takes seconds, in which the workers play
 
         with tqdm(total=recording.episodes, initial=progress.num_episodes, unit="episode") as bar:
@@ -167,7 +178,6 @@ def _record_blocks(recording: Recording, folder: Path, num_workers: int, expert:
 def _successes(pool: Iterable[Rollout], number: int, progress: Progress, bar: tqdm) -> Iterator[Rollout]:
     """Yield so many successful rollouts; note the failed ones on the way."""
     for rollout in pool:
-        progress.next_seed = rollout.result.spec.seed + 1
         if rollout.result.is_success:
             progress.num_episodes += 1
             number -= 1
@@ -182,10 +192,9 @@ def _successes(pool: Iterable[Rollout], number: int, progress: Progress, bar: tq
 
 
 def _check_success_rate(progress: Progress) -> None:
-    num_tried = progress.num_episodes + len(progress.failures)
-    if num_tried >= MIN_TRIED and progress.num_episodes < MIN_SUCCESS_RATE * num_tried:
+    if progress.num_tried >= MIN_TRIED and progress.num_episodes < MIN_SUCCESS_RATE * progress.num_tried:
         raise RuntimeError(
-            f"only {progress.num_episodes} of {num_tried} episodes succeeded, too few to go on; "
+            f"only {progress.num_episodes} of {progress.num_tried} episodes succeeded, too few to go on; "
             f"a smaller --noise may help. {describe_failures(progress.failures)}"
         )
 
@@ -197,7 +206,7 @@ def _publish(recording: Recording, progress: Progress, folder: Path, root: Path)
     dataset = folder / "dataset"
     shutil.rmtree(dataset, ignore_errors=True)
     merge_blocks(_layout(recording), finished_blocks(folder), dataset)
-    write_json(dataset / METADATA_FILE, {"recording": asdict(recording), **asdict(progress)})
+    write_json(dataset / METADATA_FILE, {"recording": recording.to_dict(), **asdict(progress)})
     dataset.rename(root)
 
 
@@ -227,6 +236,14 @@ def _default_root(repo_id: str) -> Path:
 def _switch() -> dict[str, Any]:
     """Arguments of a flag that works alone and as LeRobot writes it: --resume, --resume=true."""
     return {"nargs": "?", "const": True, "default": False, "type": _parse_bool}
+
+
+def _parse_numbers(text: str) -> tuple[int, ...]:
+    """(0, 7) from "[0,7]", as LeRobot writes lists, and from "0,7"."""
+    try:
+        return tuple(int(number) for number in text.strip("[]").split(","))
+    except ValueError:
+        raise argparse.ArgumentTypeError(f"{text!r} must be a list of whole numbers, as [0,7]") from None
 
 
 def _parse_bool(text: str) -> bool:

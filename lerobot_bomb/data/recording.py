@@ -5,9 +5,12 @@ While a recording grows it is a folder beside its final place:
     NAME.recording/block-00000/     a finished LeRobotDataset, and block.json: the progress up to its end
 """
 
+import itertools
 import json
 import re
-from dataclasses import asdict, dataclass, field, fields
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import asdict, dataclass, field, fields, replace
 from pathlib import Path
 from typing import Any
 
@@ -40,6 +43,8 @@ class Recording:
     fps: int = DEFAULT_FPS
     image_size: int = DEFAULT_IMAGE_SIZE
     split: str = "all"
+    # numbered tasks, each played from every seed; empty = target and colour are drawn per episode
+    task_ids: tuple[int, ...] = ()
     images: bool = False
     noise: float = 0.0
     protocol_version: str = PROTOCOL_VERSION
@@ -55,15 +60,12 @@ class Recording:
                 f"--noise={self.noise} must lie in 0..{MAX_NOISE:g}; "
                 "it is a standard deviation in units of the largest step, 40 mm"
             )
-        try:
-            _ = self.spec, self.render_options  # they check the remaining flags
-        except ValueError as error:
-            # the same flags are called --env.* in LeRobot's commands
-            raise ValueError(str(error).replace("--env.", "--")) from None
+        with recorder_flags():
+            _ = self.conditions, self.render_options  # they check the remaining flags
 
     @property
     def spec(self) -> EpisodeSpec:
-        """The spec of the first seed; an episode differs in its seed only."""
+        """What all episodes have in common, with the first seed."""
         return EpisodeSpec(
             seed=self.seed,
             suite=self.task,
@@ -73,19 +75,46 @@ class Recording:
             fps=self.fps,
         )
 
+    def to_dict(self) -> dict[str, Any]:
+        """What its JSON reads back as."""
+        return json.loads(json.dumps(asdict(self)))
+
+    @property
+    def conditions(self) -> list[EpisodeSpec]:
+        """The specs that every seed is played with, with the first seed."""
+        return [self.spec.for_task(task_id) for task_id in self.task_ids] or [self.spec]
+
+    def specs(self, num_tried: int) -> Iterator[EpisodeSpec]:
+        """The episodes to try after the first `num_tried`: seeds count up, each with all conditions."""
+        for tried in itertools.count(num_tried):
+            seeds_done, condition = divmod(tried, len(self.conditions))
+            yield replace(self.conditions[condition], seed=self.seed + seeds_done)
+
     @property
     def render_options(self) -> RenderOptions:
         return RenderOptions(image_size=self.image_size)
 
 
+@contextmanager
+def recorder_flags() -> Iterator[None]:
+    """Name flags in error messages as the recorder does; LeRobot's commands call them --env.*."""
+    try:
+        yield
+    except ValueError as error:
+        raise ValueError(str(error).replace("--env.", "--")) from None
+
+
 @dataclass
 class Progress:
-    """What has been recorded, and where to go on."""
+    """What has been recorded."""
 
-    next_seed: int
     num_episodes: int = 0
     num_frames: int = 0
     failures: list[dict[str, Any]] = field(default_factory=list)  # [{"seed": ..., "failure": ...}]
+
+    @property
+    def num_tried(self) -> int:
+        return self.num_episodes + len(self.failures)
 
 
 def unfinished_folder(root: Path) -> Path:
@@ -119,7 +148,7 @@ def _check_same_recording(recording: Recording, path: Path) -> None:
     existing = json.loads(path.read_text())["recording"]
     differences = [
         f"--{name}={value} (it has {existing.get(name)})"
-        for name, value in asdict(recording).items()
+        for name, value in recording.to_dict().items()
         if value != existing.get(name)
     ]
     if differences:

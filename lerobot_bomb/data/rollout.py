@@ -4,7 +4,6 @@ The workers import this module, so it imports neither torch nor LeRobot.
 """
 
 import atexit
-import itertools
 import multiprocessing
 import os
 import signal
@@ -12,7 +11,7 @@ import threading
 from collections import deque
 from collections.abc import Callable, Iterator
 from concurrent.futures import Future, ProcessPoolExecutor
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Self
 
 import gymnasium
@@ -40,9 +39,8 @@ type Expert = Callable[[PrivilegedState, str, int], np.ndarray]
 
 @dataclass(frozen=True)
 class RolloutSettings:
-    """How to play; with a seed it determines a rollout."""
+    """How to play; with a spec it determines a rollout."""
 
-    spec: EpisodeSpec
     render_options: RenderOptions
     noise: float = 0.0  # standard deviation on x, y and z, in units of the largest relative step
     expert: Expert = expert_action
@@ -68,19 +66,21 @@ def make_env(spec: EpisodeSpec, render_options: RenderOptions) -> gymnasium.Env:
     )
 
 
-def play(env: gymnasium.Env, settings: RolloutSettings, seed: int) -> Rollout:
-    """Play the episode of a seed; the stored actions are clean, the executed ones carry the noise."""
-    control_mode, fps = settings.spec.control_mode, settings.spec.fps
-    noise_rng = np.random.default_rng((NOISE_STREAM, seed))
-    observation, _ = env.reset(seed=seed)
+def play(env: gymnasium.Env, spec: EpisodeSpec, settings: RolloutSettings) -> Rollout:
+    """Play a spec's episode in an `env` of that spec, whatever the seed that the `env` was made with.
+
+    The stored actions are clean, the executed ones carry the noise.
+    """
+    noise_rng = np.random.default_rng((NOISE_STREAM, spec.seed))
+    observation, _ = env.reset(seed=spec.seed)
     observations, actions = [], []
     ended = False
     while not ended:
         state = PrivilegedState.from_vector(observation["environment_state"])
-        action = settings.expert(state, control_mode, fps)
+        action = settings.expert(state, spec.control_mode, spec.fps)
         observations.append(observation)
         actions.append(action)
-        executed = perturb(action, settings.noise, control_mode, noise_rng)
+        executed = perturb(action, settings.noise, spec.control_mode, noise_rng)
         observation, _, terminated, truncated, _ = env.step(executed)
         ended = terminated or truncated
     result = env.get_wrapper_attr("episode_result")()
@@ -107,12 +107,12 @@ def perturb(action: np.ndarray, noise: float, control_mode: str, rng: np.random.
 
 
 class RolloutPool:
-    """Worker processes that play the episodes of consecutive seeds ahead of the writer.
+    """Worker processes that play an endless stream of episodes ahead of the writer.
 
-    Iterating yields the rollouts in the order of their seeds, whatever the number of workers.
+    Iterating yields the rollouts in the order of the specs, whatever the number of workers.
     """
 
-    def __init__(self, settings: RolloutSettings, first_seed: int, num_workers: int) -> None:
+    def __init__(self, settings: RolloutSettings, specs: Iterator[EpisodeSpec], num_workers: int) -> None:
         self._executor = ProcessPoolExecutor(
             num_workers,
             # spawned, not forked: a fork of a process with threads may hang
@@ -120,7 +120,7 @@ class RolloutPool:
             initializer=_start_worker,
             initargs=(settings,),
         )
-        self._seeds = itertools.count(first_seed)
+        self._specs = specs
         self._pending: deque[Future[Rollout]] = deque()
         for _ in range(num_workers + LOOKAHEAD):
             self._submit()
@@ -138,20 +138,39 @@ class RolloutPool:
             yield rollout
 
     def _submit(self) -> None:
-        self._pending.append(self._executor.submit(_play_in_worker, next(self._seeds)))
+        self._pending.append(self._executor.submit(_play_in_worker, next(self._specs)))
 
 
-# What a worker process keeps between episodes: set once by _start_worker.
-_worker: tuple[gymnasium.Env, RolloutSettings] | None = None
+class _Worker:
+    """What a worker process keeps between episodes: the environment, as long as only the seed changes."""
+
+    def __init__(self, settings: RolloutSettings) -> None:
+        self._settings = settings
+        self._condition: EpisodeSpec | None = None
+        self._env: gymnasium.Env | None = None
+
+    def play(self, spec: EpisodeSpec) -> Rollout:
+        condition = replace(spec, seed=0)
+        if self._env is None or condition != self._condition:
+            self.close()
+            self._env = make_env(spec, self._settings.render_options)
+            self._condition = condition
+        return play(self._env, spec, self._settings)
+
+    def close(self) -> None:
+        if self._env is not None:
+            self._env.close()
+
+
+_worker: _Worker | None = None  # set once by _start_worker
 
 
 def _start_worker(settings: RolloutSettings) -> None:
     global _worker
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # the parent ends its workers in order
     threading.Thread(target=_exit_with_parent, daemon=True).start()
-    env = make_env(settings.spec, settings.render_options)
-    atexit.register(env.close)
-    _worker = (env, settings)
+    _worker = _Worker(settings)
+    atexit.register(_worker.close)
 
 
 def _exit_with_parent() -> None:
@@ -162,7 +181,7 @@ def _exit_with_parent() -> None:
         os._exit(1)
 
 
-def _play_in_worker(seed: int) -> Rollout:
+def _play_in_worker(spec: EpisodeSpec) -> Rollout:
     if _worker is None:
         raise RuntimeError("this process was not started as a rollout worker")
-    return play(*_worker, seed)
+    return _worker.play(spec)
