@@ -2,13 +2,11 @@
 
 import argparse
 import os
-import shlex
-import subprocess
-import sys
 import time
 from datetime import datetime
 from pathlib import Path
 
+from lerobot_bomb.commands import run_command
 from lerobot_bomb.evaluation.results import read_results, summarise
 
 REPO_ID = "demo/bomb_place"
@@ -62,7 +60,7 @@ def run_demo(args: argparse.Namespace) -> int:
     checkpoint = train / "checkpoints" / "last" / "pretrained_model"
 
     _say(f"1/4  Record {args.episodes} demonstrations of the scripted expert")
-    _run(
+    run_command(
         "lerobot-bomb",
         "record",
         f"--repo_id={REPO_ID}",
@@ -71,7 +69,7 @@ def run_demo(args: argparse.Namespace) -> int:
         f"--workers={os.cpu_count() or 1}",
     )
     _say(f"2/4  Train vla0_smol on the nano backbone for {args.steps} steps")
-    _run(
+    run_command(
         "lerobot-train",
         f"--dataset.repo_id={REPO_ID}",
         f"--dataset.root={dataset}",
@@ -92,7 +90,7 @@ def run_demo(args: argparse.Namespace) -> int:
 def _evaluate(output_dir: Path, name: str, policy_flag: str, num_episodes: int) -> None:
     # a divisor, so that LeRobot plays no more episodes than asked
     batch_size = max(size for size in range(1, MAX_EVAL_BATCH + 1) if num_episodes % size == 0)
-    _run(
+    run_command(
         "lerobot-eval",
         policy_flag,
         "--policy.device=cpu",
@@ -118,12 +116,3 @@ def _report(output_dir: Path, seconds: float) -> None:
 
 def _say(text: str) -> None:
     print(f"\n=== {text}", flush=True)
-
-
-def _run(command: str, *flags: str) -> None:
-    """Show a command as the user would type it, then run it from this Python's environment."""
-    print(shlex.join([command, *flags]), flush=True)
-    path = Path(sys.executable).with_name(command)
-    status = subprocess.run([path, *flags], check=False).returncode
-    if status:
-        raise RuntimeError(f"`{command}` ended with exit code {status}; its output is above")

@@ -7,14 +7,10 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-import yaml
+from recipes import POLICY_TYPES, read_recipe
 
 os.environ.setdefault("OMP_NUM_THREADS", "1")
 os.environ["HF_HUB_OFFLINE"] = "1"  # no test may need the network
-
-CONFIGS = Path(__file__).parents[1] / "configs"
-# a policy that learns comes with a recipe that learns a few episodes by heart
-POLICY_TYPES = sorted(path.stem.removeprefix("overfit_") for path in CONFIGS.glob("overfit_*.yaml"))
 
 
 @pytest.fixture(scope="session")
@@ -56,7 +52,6 @@ def policy_flags() -> Callable[[str], dict[str, Any]]:
     """policy_flags("vla0_smol"): what configs/overfit_vla0_smol.yaml sets under `policy`."""
 
     def read(policy_type: str) -> dict[str, Any]:
-        path = CONFIGS / f"overfit_{policy_type}.yaml"
-        return yaml.safe_load(path.read_text())["policy"]
+        return read_recipe(policy_type)["policy"]
 
     return read

@@ -5,6 +5,7 @@ from collections.abc import Callable
 from pathlib import Path
 
 import pytest
+from recipes import recipe_path
 
 from lerobot_bomb.cli import main
 from lerobot_bomb.evaluation.results import read_results, summarise
@@ -31,21 +32,26 @@ def test_the_expert_places_100_stones_precisely(
     assert max(row["collateral_mm"] for row in rows) < 1
 
 
-def test_two_episodes_learned_by_heart_through_the_stock_commands(
-    stock_cli: Callable[..., None], tmp_path: Path
+def test_two_targets_learned_by_heart_through_the_stock_commands(
+    policy_type: str, stock_cli: Callable[..., None], tmp_path: Path
 ) -> None:
+    """A short form of benchmarks/overfit.py: one start, two targets, no state."""
+    seed, tasks = 1007, [4, 24]
     dataset, train = tmp_path / "dataset", tmp_path / "train"
-    recording = ["--repo_id=test/two", f"--root={dataset}", "--episodes=2", "--seed=40", "--images"]
-    assert main(["record", *recording, f"--image_size={SIZE}"]) == 0
-    flags = "--policy.type=vla0_smol --policy.vlm_model_name=nano --policy.device=cpu --policy.chunk_size=5"
-    flags += " --policy.n_action_bins=101 --policy.n_state_bins=101 --policy.bin_mode=levels"
-    flags += " --policy.crop_fraction=1 --policy.optimizer_lr=2e-3 --policy.scheduler_decay_lr=4e-5"
-    flags += " --steps=300 --save_freq=300 --batch_size=16 --num_workers=0 --wandb.enable=false"
-    data = ["--dataset.repo_id=test/two", f"--dataset.root={dataset}", f"--output_dir={train}"]
-    stock_cli("lerobot-train", *data, *flags.split())
+    recording = ["--repo_id=overfit/two", f"--root={dataset}", "--episodes=2", f"--seed={seed}", "--images"]
+    assert main(["record", *recording, f"--task_ids={tasks}", f"--image_size={SIZE}"]) == 0
+    data = ["--dataset.repo_id=overfit/two", f"--dataset.root={dataset}", f"--output_dir={train}"]
+    stock_cli(
+        "lerobot-train",
+        f"--config_path={recipe_path(policy_type)}",
+        *data,
+        "--steps=500",
+        "--wandb.enable=false",
+    )
     checkpoint = train / "checkpoints" / "last" / "pretrained_model"
-    flags = f"--policy.path={checkpoint} --env.type=bomb --env.image_size={SIZE} --seed=40"
-    flags += " --eval.n_episodes=2 --eval.batch_size=2 --eval.use_async_envs=false"
-    stock_cli("lerobot-eval", *flags.split(), f"--output_dir={tmp_path / 'eval'}")
+    flags = f"--policy.path={checkpoint} --env.type=bomb --env.image_size={SIZE} --seed={seed}"
+    flags += " --eval.n_episodes=1 --eval.batch_size=1 --eval.use_async_envs=false"
+    stock_cli("lerobot-eval", *flags.split(), f"--env.task_ids={tasks}", f"--output_dir={tmp_path / 'eval'}")
     info = json.loads((tmp_path / "eval" / "eval_info.json").read_text())
+    assert info["overall"]["n_episodes"] == 2
     assert info["overall"]["pc_success"] == 100.0

@@ -1,5 +1,6 @@
-"""Entry point of the plugin: LeRobot imports it by name, and it registers every env and policy type."""
+"""Entry point of the plugin: LeRobot imports it by name; it registers env types, policy types, processors."""
 
+import lerobot_bomb.explain.interventions  # noqa: F401
 import lerobot_env_bomb.configuration_bomb  # noqa: F401
 import lerobot_policy_bomb_expert  # noqa: F401
 import lerobot_policy_bomb_random  # noqa: F401

@@ -1,0 +1,234 @@
+"""Can a policy learn a few episodes by heart, and does it do so by looking and reading?
+
+Eight episodes start alike, to the last pixel, and only the sentence says which intersection is meant. A
+policy is trained on them without the robot's state, and evaluated on the same episodes, by LeRobot's own
+commands. Two controls change what the trained policy is shown:
+
+    permuted instructions   each episode is told the sentence of another: the stone must go to the square
+                            that is named, so the sentence decides, not the episode
+    blank images            the cameras show black: the policy must fail, so it uses what it sees
+
+    python benchmarks/overfit.py --policy.type=vla0_smol --json overfit.json
+
+The recipe is configs/overfit_TYPE.yaml. A policy that reads the state passes such a test blind.
+"""
+
+import argparse
+import os
+import sys
+import tempfile
+import time
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from machine import add_machine_arguments, print_table, require_idle_machine, write_figures
+from recipes import POLICY_TYPES, recipe_path
+
+from lerobot_bomb.commands import run_command
+from lerobot_bomb.evaluation.results import Row, read_results
+from lerobot_bomb.schema import Failure
+
+SEED = 1007  # its board is empty, so nothing but the sentence tells the target
+TASK_IDS = (0, 4, 7, 11, 13, 15, 22, 24)  # 5 x row + column, all black
+SHIFT = 3  # an episode is told the sentence of the task so many places further on
+IMAGE_SIZE = 128
+REPO_ID = "overfit/bomb_place"
+MAX_MINUTES = 25
+
+
+@dataclass(frozen=True)
+class Condition:
+    """One evaluation of the trained policy and how many of its episodes should do what is counted."""
+
+    name: str
+    counted: str
+    at_least: int
+    at_most: int
+
+
+LEARNT = Condition("as recorded", "successes", at_least=8, at_most=8)
+PERMUTED = Condition("permuted instructions", "stones on the named square", at_least=6, at_most=8)
+BLANK = Condition("blank images", "successes", at_least=0, at_most=2)
+
+
+def main() -> None:
+    """Record, train, evaluate three times, print what was counted; exit code 1 where a bar is missed."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawTextHelpFormatter)
+    parser.add_argument("--policy.type", dest="policy_type", required=True, choices=POLICY_TYPES)
+    parser.add_argument("--output_dir", type=Path, help="new folder to keep (default: a temporary one)")
+    parser.add_argument("--steps", type=int, help="training steps (default: the recipe's)")
+    add_machine_arguments(parser)
+    args = parser.parse_args()
+    require_idle_machine(args.force)
+    os.environ.setdefault("OMP_NUM_THREADS", "1")
+    with tempfile.TemporaryDirectory() as temporary:
+        folder = args.output_dir or Path(temporary) / "overfit"
+        if folder.exists():
+            parser.error(f"--output_dir={folder} exists already; name a new folder")
+        sys.exit(prove(args, folder))
+
+
+def prove(args: argparse.Namespace, folder: Path) -> int:
+    """The whole proof in `folder`; 0 if every bar was reached."""
+    started = time.monotonic()
+    record(folder / "dataset")
+    sentences = read_sentences(folder / "dataset")
+    checkpoint = train(args.policy_type, args.steps, folder)
+    trained_s = time.monotonic() - started
+    told = {task: TASK_IDS[(i + SHIFT) % len(TASK_IDS)] for i, task in enumerate(TASK_IDS)}
+    shown = change_what_is_shown(checkpoint, {sentences[task]: sentences[told[task]] for task in TASK_IDS})
+    counts = {}
+    for condition, path in ((LEARNT, checkpoint), (PERMUTED, shown[PERMUTED]), (BLANK, shown[BLANK])):
+        rows = evaluate(path, folder / condition.name.replace(" ", "_"))
+        counts[condition] = sum(
+            is_on(row, told[task]) if condition is PERMUTED else row["is_success"]
+            for task, row in rows.items()
+        )
+        print_episodes(condition, rows)
+    minutes = (time.monotonic() - started) / 60
+    return report(args, counts, minutes, trained_s / 60)
+
+
+def record(dataset: Path) -> None:
+    """The expert's episodes: one seed, eight targets."""
+    run_command(
+        "lerobot-bomb",
+        "record",
+        f"--repo_id={REPO_ID}",
+        f"--root={dataset}",
+        f"--episodes={len(TASK_IDS)}",
+        f"--seed={SEED}",
+        f"--task_ids={list(TASK_IDS)}",
+        "--images",
+        f"--image_size={IMAGE_SIZE}",
+    )
+
+
+def read_sentences(dataset: Path) -> dict[int, str]:
+    """{task id: instruction}; leaves with exit code 1 unless all episodes begin with the same frame."""
+    from lerobot.datasets import LeRobotDataset
+
+    frames: Any = LeRobotDataset(REPO_ID, root=dataset, video_backend="pyav")
+    episodes = frames.meta.episodes
+    starts = [frames[episode["dataset_from_index"]] for episode in episodes]
+    for key in ("observation.images.workspace", "observation.images.wrist", "observation.state"):
+        if any(not start[key].equal(starts[0][key]) for start in starts):
+            raise SystemExit(f"the episodes do not start alike: {key} differs")
+    return {task: start["task"] for task, start in zip(TASK_IDS, starts, strict=True)}
+
+
+def train(policy_type: str, steps: int | None, folder: Path) -> Path:
+    """Stock `lerobot-train` on the recipe; the checkpoint's folder."""
+    override = [f"--steps={steps}"] if steps else []
+    run_command(
+        "lerobot-train",
+        f"--config_path={recipe_path(policy_type)}",
+        f"--dataset.root={folder / 'dataset'}",
+        f"--output_dir={folder / 'train'}",
+        "--save_checkpoint=true",
+        *override,
+    )
+    return folder / "train" / "checkpoints" / "last" / "pretrained_model"
+
+
+def change_what_is_shown(checkpoint: Path, replacements: dict[str, str]) -> dict[Condition, Path]:
+    """The controls' checkpoints: the trained weights behind a preprocessor that intervenes."""
+    from lerobot.utils.import_utils import register_third_party_plugins
+
+    from lerobot_bomb.explain.interventions import BlankImages, ReplaceTasks, intervene
+
+    register_third_party_plugins()
+    steps = {PERMUTED: ReplaceTasks(replacements), BLANK: BlankImages()}
+    folders = {}
+    for condition, step in steps.items():
+        folders[condition] = checkpoint.parent / condition.name.replace(" ", "_")
+        intervene(checkpoint, [step], folders[condition])
+    return folders
+
+
+def evaluate(checkpoint: Path, output_dir: Path) -> dict[int, Row]:
+    """Stock `lerobot-eval` on the recorded seed, one episode a task; {task id: result}."""
+    run_command(
+        "lerobot-eval",
+        f"--policy.path={checkpoint}",
+        "--env.type=bomb",
+        f"--env.task_ids={list(TASK_IDS)}",
+        f"--env.image_size={IMAGE_SIZE}",
+        f"--env.results_path={output_dir / 'results.jsonl'}",
+        f"--seed={SEED}",
+        "--eval.n_episodes=1",
+        "--eval.batch_size=1",
+        "--eval.use_async_envs=false",
+        f"--output_dir={output_dir / 'eval'}",
+    )
+    rows = {
+        5 * row["target"][0] + row["target"][1]: row for row in read_results(output_dir / "results.jsonl")
+    }
+    if sorted(rows) != sorted(TASK_IDS):
+        raise SystemExit(f"{output_dir}: results of the tasks {sorted(rows)} instead of {sorted(TASK_IDS)}")
+    return rows
+
+
+def is_on(row: Row, task_id: int) -> bool:
+    """Whether the stone was put down, nearest to this task's intersection, which is not the episode's."""
+    is_there = tuple(row["nearest_intersection"]) == divmod(task_id, 5)
+    return is_there and row["failure"] == Failure.WRONG_INTERSECTION
+
+
+def print_episodes(condition: Condition, rows: dict[int, Row]) -> None:
+    """What became of each episode."""
+    print(f"\n{condition.name}")
+    header = ["target", "stone ends nearest to", "error, mm", "steps", "outcome"]
+    cells = [
+        [
+            str(tuple(row["target"])),
+            str(tuple(row["nearest_intersection"])),
+            f"{row['placement_error_mm']:.1f}",
+            str(row["steps"]),
+            row["failure"] or "success",
+        ]
+        for _, row in sorted(rows.items())
+    ]
+    print_table(header, cells)
+    print(flush=True)
+
+
+def report(
+    args: argparse.Namespace, counts: dict[Condition, int], minutes: float, minutes_to_checkpoint: float
+) -> int:
+    """Print what was counted against its bar; 0 if every bar was reached."""
+    rows, reached = [], minutes <= MAX_MINUTES
+    for condition, count in counts.items():
+        is_reached = condition.at_least <= count <= condition.at_most
+        reached = reached and is_reached
+        bar = f"at least {condition.at_least}" if condition.at_least else f"at most {condition.at_most}"
+        verdict = "reached" if is_reached else "missed"
+        rows.append([condition.name, condition.counted, f"{count}/{len(TASK_IDS)}", bar, verdict])
+    rows.append(
+        [
+            "the whole run",
+            "minutes",
+            f"{minutes:.1f}",
+            f"at most {MAX_MINUTES}",
+            "reached" if minutes <= MAX_MINUTES else "missed",
+        ]
+    )
+    print(f"{args.policy_type}: {len(TASK_IDS)} episodes of seed {SEED}, without state")
+    print_table(["", "counted", "seen", "bar", ""], rows)
+    figures = {condition.name: count for condition, count in counts.items()}
+    write_figures(
+        args.json,
+        {
+            "policy": args.policy_type,
+            "episodes": len(TASK_IDS),
+            **figures,
+            "minutes": minutes,
+            "minutes_to_checkpoint": minutes_to_checkpoint,
+        },
+    )
+    return 0 if reached else 1
+
+
+if __name__ == "__main__":
+    main()

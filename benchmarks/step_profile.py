@@ -1,0 +1,189 @@
+"""Where the time of one training step and of one evaluation step goes.
+
+    OMP_NUM_THREADS=1 python benchmarks/step_profile.py --policy.type=vla0_smol --json step_profile.json
+
+The policy is the recipe of configs/overfit_TYPE.yaml with fresh weights, on demonstrations recorded for
+the purpose. Stages are medians over --repeats steps; the operators are torch's own profile of the
+model's share.
+"""
+
+import argparse
+import statistics
+import tempfile
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+import draccus
+import torch
+from lerobot.configs.train import TrainPipelineConfig
+from lerobot.datasets.factory import make_dataset
+from lerobot.envs import make_env, make_env_config, make_env_pre_post_processors, preprocess_observation
+from lerobot.policies import make_policy, make_pre_post_processors
+from lerobot.utils.import_utils import register_third_party_plugins
+from machine import add_machine_arguments, print_table, require_idle_machine, write_figures
+from overfit import IMAGE_SIZE, record
+from recipes import POLICY_TYPES, read_recipe
+from torch.profiler import ProfilerActivity, profile
+from torch.utils.data import default_collate
+
+NUM_OPERATORS = 8
+
+
+class Stages:
+    """Durations in seconds of named stages."""
+
+    def __init__(self) -> None:
+        self.runs: dict[str, list[float]] = {}
+
+    @contextmanager
+    def __call__(self, name: str) -> Iterator[None]:
+        started = time.perf_counter()
+        yield
+        self.runs.setdefault(name, []).append(time.perf_counter() - started)
+
+    def medians_ms(self) -> dict[str, float]:
+        return {name: 1e3 * statistics.median(runs) for name, runs in self.runs.items()}
+
+
+def main() -> None:
+    """Profile both steps and print where their time goes."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawTextHelpFormatter)
+    parser.add_argument("--policy.type", dest="policy_type", required=True, choices=POLICY_TYPES)
+    parser.add_argument("--repeats", type=int, default=20, help="steps of each kind (default: 20)")
+    add_machine_arguments(parser)
+    args = parser.parse_args()
+    require_idle_machine(args.force)
+    register_third_party_plugins()
+    with tempfile.TemporaryDirectory() as folder:
+        record(Path(folder) / "dataset")
+        cfg = recipe(args.policy_type, Path(folder) / "dataset")
+        dataset: Any = make_dataset(cfg)
+    assert cfg.policy is not None
+    torch.manual_seed(0)
+    policy = make_policy(cfg.policy, ds_meta=dataset.meta)
+    processors = make_pre_post_processors(cfg.policy, dataset_stats=dataset.meta.stats)
+
+    print(f"\ntraining step, batch of {cfg.batch_size}")
+    train = profile_training(cfg, policy, processors[0], dataset, args.repeats)
+    print("\nevaluation step, batch of 1")
+    evaluation = profile_evaluation(cfg, policy, processors, args.repeats)
+    write_figures(args.json, {"policy": args.policy_type, "training_ms": train, "evaluation_ms": evaluation})
+
+
+def recipe(policy_type: str, dataset: Path) -> TrainPipelineConfig:
+    """The training config of configs/overfit_TYPE.yaml for this dataset, as `lerobot-train` reads it."""
+    values = read_recipe(policy_type)
+    values["dataset"] |= {"root": str(dataset), "video_backend": "pyav"}
+    return draccus.decode(TrainPipelineConfig, values)
+
+
+def profile_training(
+    cfg: TrainPipelineConfig, policy: Any, preprocessor: Callable, dataset: Any, repeats: int
+) -> dict[str, float]:
+    """Stages of a training step in milliseconds, as `lerobot-train` runs it with `--num_workers=0`."""
+    optimizer: Any = policy.config.get_optimizer_preset().build(policy.get_optim_params())
+    policy.train()
+    generator = torch.Generator().manual_seed(0)
+    batches = [
+        torch.randint(len(dataset), (cfg.batch_size,), generator=generator).tolist() for _ in range(repeats)
+    ]
+
+    def step(indices: list[int], stage: Stages) -> None:
+        with stage("read frames"):
+            items = [dataset[index] for index in indices]
+        with stage("collate, preprocess"):
+            batch = preprocessor(default_collate(items))
+        with stage("forward"):
+            loss, _ = policy.forward(batch)
+        with stage("backward"):
+            loss.backward()
+        with stage("optimiser"):
+            torch.nn.utils.clip_grad_norm_(policy.parameters(), 1.0)
+            optimizer.step()
+            optimizer.zero_grad()
+
+    for indices in batches[:3]:
+        step(indices, Stages())
+    stages = Stages()
+    for indices in batches:
+        step(indices, stages)
+    medians = stages.medians_ms()
+    print_stages(medians, len(batches))
+    batch = preprocessor(default_collate([dataset[index] for index in batches[0]]))
+    print_operators(lambda: policy.forward(batch)[0].backward())
+    return medians
+
+
+def profile_evaluation(
+    cfg: TrainPipelineConfig, policy: Any, processors: tuple[Any, Any], repeats: int
+) -> dict[str, float]:
+    """Stages of an evaluation step in milliseconds, as `lerobot-eval` runs it."""
+    env_config = make_env_config("bomb", image_size=IMAGE_SIZE)
+    env: Any = make_env(env_config, n_envs=1)["place"][0]
+    env_preprocessor, _ = make_env_pre_post_processors(env_cfg=env_config, policy_cfg=cfg.policy)
+    preprocessor, postprocessor = processors
+    stages = Stages()
+    policy.eval()
+    policy.reset()
+    observation, _ = env.reset(seed=0)
+    predicting = 0
+    while predicting < repeats:
+        with stages("to tensors, preprocess"):
+            batch: dict[str, Any] = preprocess_observation(observation)
+            batch["task"] = list(env.call("task_description"))
+            batch = preprocessor(env_preprocessor(batch))
+        predicts = not policy._queue
+        predicting += predicts
+        name = "select_action that predicts" if predicts else "select_action from the queue"
+        with stages(name), torch.inference_mode():
+            action = policy.select_action(batch)
+        with stages("postprocess"):
+            action = postprocessor(action).numpy()
+        with stages("environment: physics, two cameras"):
+            observation, *_ = env.step(action)
+    medians = stages.medians_ms()
+    print_stages(medians, len(stages.runs["postprocess"]))
+    total_s = sum(map(sum, stages.runs.values()))
+    medians["per step, predictions spread over the steps"] = 1e3 * total_s / len(stages.runs["postprocess"])
+
+    def predict() -> None:
+        policy.reset()
+        with torch.inference_mode():
+            policy.select_action(batch)
+
+    print_operators(predict)
+    env.close()
+    return medians
+
+
+def print_stages(medians_ms: dict[str, float], repeats: int) -> None:
+    """A table of the stages."""
+    total = sum(medians_ms.values())
+    rows = [[name, f"{ms:.1f}", f"{ms / total:.0%}"] for name, ms in medians_ms.items()]
+    print_table(["stage", f"ms (median of {repeats})", "share"], [*rows, ["total", f"{total:.1f}", ""]])
+
+
+def print_operators(run: Callable[[], None]) -> None:
+    """The operators that take the most time of their own."""
+    run()
+    with profile(activities=[ProfilerActivity.CPU]) as profiler:
+        run()
+    events: list[Any] = sorted(profiler.key_averages(), key=lambda event: -event.self_cpu_time_total)
+    total = sum(event.self_cpu_time_total for event in events)
+    rows = [
+        [
+            event.key,
+            str(event.count),
+            f"{event.self_cpu_time_total / 1e3:.1f}",
+            f"{event.self_cpu_time_total / total:.0%}",
+        ]
+        for event in events[:NUM_OPERATORS]
+    ]
+    print_table(["operator", "calls", "ms", "share"], rows)
+
+
+if __name__ == "__main__":
+    main()

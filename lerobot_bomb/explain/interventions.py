@@ -1,0 +1,80 @@
+"""Interventions: what a policy is shown is changed on purpose, to see what its actions depend on.
+
+An intervention is a processor step at the head of a checkpoint's preprocessor. LeRobot's own commands
+run the changed checkpoint, so it works for every policy type and every environment.
+"""
+
+import shutil
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any
+
+import torch
+from lerobot.configs import PipelineFeatureType, PolicyFeature
+from lerobot.processor import (
+    ComplementaryDataProcessorStep,
+    DataProcessorPipeline,
+    ObservationProcessorStep,
+    ProcessorStep,
+    ProcessorStepRegistry,
+)
+from lerobot.utils.constants import OBS_IMAGE, POLICY_PREPROCESSOR_DEFAULT_NAME
+
+PREPROCESSOR_FILE = f"{POLICY_PREPROCESSOR_DEFAULT_NAME}.json"
+
+type Features = dict[PipelineFeatureType, dict[str, PolicyFeature]]
+
+
+@ProcessorStepRegistry.register("bomb_blank_images")
+@dataclass
+class BlankImages(ObservationProcessorStep):
+    """Every camera shows black."""
+
+    def observation(self, observation: dict[str, Any]) -> dict[str, Any]:
+        return {
+            key: torch.zeros_like(value) if key.startswith(OBS_IMAGE) else value
+            for key, value in observation.items()
+        }
+
+    def transform_features(self, features: Features) -> Features:
+        return features
+
+
+@ProcessorStepRegistry.register("bomb_replace_tasks")
+@dataclass
+class ReplaceTasks(ComplementaryDataProcessorStep):
+    """The policy is told another instruction; one that has no replacement is an error."""
+
+    replacements: dict[str, str]  # instruction -> what the policy is told instead
+
+    def complementary_data(self, complementary_data: dict[str, Any]) -> dict[str, Any]:
+        tasks = complementary_data["task"]
+        unknown = sorted(set(tasks) - self.replacements.keys())
+        if unknown:
+            raise ValueError(
+                f"the instruction {unknown[0]!r} has no replacement; there are: {sorted(self.replacements)}"
+            )
+        return {**complementary_data, "task": [self.replacements[task] for task in tasks]}
+
+    def get_config(self) -> dict[str, Any]:
+        return asdict(self)
+
+    def transform_features(self, features: Features) -> Features:
+        return features
+
+
+def intervene(checkpoint: Path, steps: Sequence[ProcessorStep], output: Path) -> None:
+    """Write `output`, a copy of a checkpoint whose preprocessor begins with `steps`.
+
+    Raises:
+        ValueError: `checkpoint` is no checkpoint, or `output` exists.
+    """
+    if not (checkpoint / PREPROCESSOR_FILE).is_file():
+        raise ValueError(f"{checkpoint} holds no {PREPROCESSOR_FILE}, so it is no checkpoint of a policy")
+    if output.exists():
+        raise ValueError(f"{output} exists already; name a new folder")
+    preprocessor = DataProcessorPipeline.from_pretrained(checkpoint, config_filename=PREPROCESSOR_FILE)
+    preprocessor.steps = [*steps, *preprocessor.steps]
+    shutil.copytree(checkpoint, output, ignore=shutil.ignore_patterns(f"{POLICY_PREPROCESSOR_DEFAULT_NAME}*"))
+    preprocessor.save_pretrained(output, config_filename=PREPROCESSOR_FILE)
