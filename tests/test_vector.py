@@ -2,7 +2,6 @@ import sys
 from functools import partial
 
 import numpy as np
-import pytest
 
 from lerobot_bomb.schema import EpisodeSpec, RenderOptions
 from lerobot_env_bomb.env import BombEnv
@@ -15,44 +14,6 @@ STILL = np.zeros((2, 4), dtype=np.float32)
 
 def make_one(**spec: object) -> BombEnv:
     return BombEnv(spec=EpisodeSpec(**{"seed": 0, **spec}), render_options=SMALL)  # pyright: ignore[reportArgumentType]
-
-
-def rollout(envs: LazyVectorEnv) -> list[dict]:
-    """Observations of a reset and three random steps."""
-    rng = np.random.default_rng(0)
-    observation, _ = envs.reset(seed=SEEDS, options={NEW_ROLLOUT_OPTION: True})
-    observations = [observation]
-    for _ in range(3):
-        action = rng.uniform(-1, 1, size=(2, 4)).astype(np.float32)
-        observations.append(envs.step(action)[0])
-    return [
-        {
-            "agent_pos": observation["agent_pos"].copy(),
-            "environment_state": observation["environment_state"].copy(),
-            **{camera: image.copy() for camera, image in observation["pixels"].items()},
-        }
-        for observation in observations
-    ]
-
-
-@pytest.fixture(scope="module")
-def single_process() -> list[dict]:
-    envs = LazyVectorEnv([make_one] * 2, use_async=False)
-    try:
-        return rollout(envs)
-    finally:
-        envs.close()
-
-
-@pytest.mark.parametrize("context", ["forkserver", "spawn"])
-def test_workers_give_bit_identical_observations(single_process: list[dict], context: str) -> None:
-    envs = LazyVectorEnv([partial(BombEnv, EpisodeSpec(seed=0), SMALL)] * 2, use_async=True, context=context)
-    try:
-        for expected, actual in zip(single_process, rollout(envs), strict=True):
-            for key in expected:
-                np.testing.assert_array_equal(expected[key], actual[key], err_msg=key)
-    finally:
-        envs.close()
 
 
 def test_workers_import_neither_torch_nor_lerobot() -> None:

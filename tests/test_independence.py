@@ -1,0 +1,250 @@
+"""An episode depends on seed and spec alone: not on its process, worker or batch, nor on earlier episodes."""
+
+import hashlib
+import json
+import os
+import subprocess
+import sys
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from lerobot_bomb.evaluation.results import read_results
+from lerobot_bomb.expert import expert_action
+from lerobot_bomb.schema import EpisodeSpec, RenderOptions
+from lerobot_env_bomb.env import BombEnv
+from lerobot_env_bomb.vector import NEW_ROLLOUT_OPTION, LazyVectorEnv
+
+SMALL = RenderOptions(image_size=32)
+SEEDS = (9, 10)
+# of a network's actions: a matrix product of another batch size may round otherwise; bins are 100 times wider
+NETWORK_TOLERANCE = 1e-4
+MAKE_ONE = partial(BombEnv, EpisodeSpec(seed=0), SMALL)
+
+type Observations = list[dict[str, np.ndarray]]
+type Run = Callable[..., None]
+
+
+# Observations
+
+
+def flat(observation: dict[str, Any]) -> dict[str, np.ndarray]:
+    """A copy of every key."""
+    others = {key: observation[key] for key in ("agent_pos", "environment_state")}
+    assert {"pixels", *others} == set(observation)
+    return {key: value.copy() for key, value in (others | observation["pixels"]).items()}
+
+
+def play_expert(env: BombEnv, seed: int) -> tuple[np.ndarray, Observations]:
+    """Actions (T, 4) and the T + 1 observations of a whole episode."""
+    observation, _ = env.reset(seed=seed)
+    observations, actions, ended = [flat(observation)], [], False
+    while not ended:
+        actions.append(expert_action(env.privileged_state()))
+        observation, _, terminated, truncated, _ = env.step(actions[-1])
+        observations.append(flat(observation))
+        ended = terminated or truncated
+    return np.stack(actions), observations
+
+
+def play_together(envs: LazyVectorEnv, actions: list[np.ndarray]) -> list[Observations]:
+    """The observations of one episode per env, each as long as its actions."""
+    num_steps = max(map(len, actions))
+    actions_TED = np.stack([np.pad(of, ((0, num_steps - len(of)), (0, 0))) for of in actions], axis=1)
+    observation, _ = envs.reset(seed=list(SEEDS[: len(actions)]), options={NEW_ROLLOUT_OPTION: True})
+    steps = [flat(observation), *(flat(envs.step(actions_ED)[0]) for actions_ED in actions_TED)]
+    return [
+        [{key: values[i] for key, values in step.items()} for step in steps[: len(of) + 1]]
+        for i, of in enumerate(actions)
+    ]
+
+
+def assert_same(observations: Observations, expected: Observations) -> None:
+    for step, (one, other) in enumerate(zip(observations, expected, strict=True)):
+        for key in other:
+            np.testing.assert_array_equal(one[key], other[key], err_msg=f"{key} in step {step}")
+
+
+def digest(observations: Observations) -> str:
+    """Of every bit of every key."""
+    parts = [step[key].tobytes() for step in observations for key in sorted(step)]
+    return hashlib.sha256(b"".join(parts)).hexdigest()
+
+
+@pytest.fixture(scope="module")
+def episodes() -> list[tuple[np.ndarray, Observations]]:
+    """The expert's episodes of SEEDS, each the first of its env."""
+    played = []
+    for seed in SEEDS:
+        env = MAKE_ONE()
+        played.append(play_expert(env, seed))
+        env.close()
+    assert len(played[0][0]) != len(played[1][0])
+    return played
+
+
+@pytest.fixture
+def used_env() -> Iterator[BombEnv]:
+    """An env in which an episode was broken off with a stone in the air, and one with the arm astray."""
+    env = MAKE_ONE()
+    env.reset(seed=3)
+    for _ in range(15):
+        env.step(expert_action(env.privileged_state()))
+    env.reset(seed=4)
+    for _ in range(5):
+        env.step(np.array([-0.3, 0.1, -0.5, -1.0]))
+    yield env
+    env.close()
+
+
+def test_earlier_episodes_leave_nothing_behind(
+    used_env: BombEnv, episodes: list[tuple[np.ndarray, Observations]]
+) -> None:
+    for seed, (actions, expected) in zip((*SEEDS, *SEEDS), (*episodes, *episodes), strict=True):
+        observation, _ = used_env.reset(seed=seed)
+        observations = [flat(observation), *(flat(used_env.step(action)[0]) for action in actions)]
+        assert_same(observations, expected)
+
+
+def test_a_fresh_process_gives_the_same_bits(episodes: list[tuple[np.ndarray, Observations]]) -> None:
+    script = (
+        "from test_independence import MAKE_ONE, SEEDS, digest, play_expert\n"
+        "env = MAKE_ONE()\n"
+        "print([digest(play_expert(env, seed)[1]) for seed in reversed(SEEDS)])\n"
+    )
+    run = subprocess.run(
+        [sys.executable, "-c", script],
+        capture_output=True,
+        text=True,
+        cwd=Path(__file__).parent,
+        env=os.environ | {"PYTHONHASHSEED": "1"},  # another order of sets than here
+    )
+    expected = [digest(observations) for _, observations in reversed(episodes)]
+    assert run.stdout.strip() == str(expected), run.stderr
+
+
+@pytest.mark.parametrize(
+    ("num_envs", "use_async", "context"),
+    [(1, False, "forkserver"), (2, False, "forkserver"), (2, True, "forkserver"), (2, True, "spawn")],
+)
+def test_vector_envs_give_the_same_bits(
+    episodes: list[tuple[np.ndarray, Observations]], num_envs: int, use_async: bool, context: str
+) -> None:
+    envs = LazyVectorEnv([MAKE_ONE] * num_envs, use_async=use_async, context=context)
+    try:
+        played = play_together(envs, [actions for actions, _ in episodes[:num_envs]])
+    finally:
+        envs.close()
+    for observations, (_, expected) in zip(played, episodes, strict=False):
+        assert_same(observations, expected)
+
+
+# Evaluation
+
+
+@dataclass(frozen=True)
+class Outcome:
+    """What lerobot-eval made of one seed: its line of results, and the actions (T, 4) that were executed."""
+
+    row: dict[str, Any]
+    actions: np.ndarray
+
+
+def evaluate(
+    run: Run, folder: Path, flags: list[str], batch_size: int, use_async: bool, num_episodes: int = 4
+) -> dict[int, Outcome]:
+    """lerobot-eval on the seeds from 5 on; the last batch may play more than asked."""
+    from lerobot.scripts import lerobot_eval
+
+    rollout = lerobot_eval.rollout
+    actions: dict[int, np.ndarray] = {}
+
+    def note(*, seeds: list[int], render_callback: object, **others: Any) -> dict:
+        data = rollout(seeds=seeds, **others)  # without a picture of every step
+        for i, seed in enumerate(seeds):
+            num_steps = int(data["done"][i].int().argmax()) + 1
+            actions[seed] = data["action"][i, :num_steps].numpy()
+        return data
+
+    folder.mkdir()
+    own = f"--env.type=bomb --env.image_size=64 --env.results_path={folder / 'results.jsonl'} --seed=5"
+    own += f" --policy.device=cpu --output_dir={folder / 'eval'} --eval.n_episodes={num_episodes}"
+    own += f" --eval.batch_size={batch_size} --eval.use_async_envs={json.dumps(use_async)}"
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(lerobot_eval, "rollout", note)
+        run("lerobot-eval", *own.split(), *flags)
+    rows = {row["spec"]["seed"]: row for row in read_results(folder / "results.jsonl")}
+    assert rows.keys() == actions.keys() >= set(range(5, 5 + num_episodes))
+    return {seed: Outcome(rows[seed], actions[seed]) for seed in rows}
+
+
+def assert_independent(
+    run: Run, folder: Path, flags: list[str], tolerance: float = 0.0
+) -> dict[int, Outcome]:
+    """Evaluate one by one, in batches and in worker processes; the outcomes must be the same."""
+    alone = evaluate(run, folder / "alone", flags, batch_size=1, use_async=False)
+    assert len({outcome.actions.tobytes() for outcome in alone.values()}) == 4
+    for batch_size, use_async in ((3, False), (2, True)):
+        together = evaluate(run, folder / f"in_{batch_size}", flags, batch_size, use_async)
+        for seed, expected in alone.items():
+            assert_alike(together[seed], expected, tolerance, f"seed {seed} in batches of {batch_size}")
+    return alone
+
+
+def assert_alike(actual: Outcome, expected: Outcome, tolerance: float, message: str) -> None:
+    assert len(actual.actions) == len(expected.actions), message
+    np.testing.assert_allclose(actual.actions, expected.actions, rtol=0, atol=tolerance, err_msg=message)
+    assert actual.row.keys() == expected.row.keys()
+    for key, value in expected.row.items():
+        # floats are millimetres; 1000 times the tolerance of an action, whose unit is 40 mm
+        same = pytest.approx(value, rel=0, abs=1e3 * tolerance) if isinstance(value, float) else value
+        assert actual.row[key] == same, f"{key}: {message}"
+
+
+@pytest.mark.parametrize("scripted", ["bomb_expert", "bomb_random"])
+def test_scripted_results_do_not_depend_on_batch_or_workers(
+    stock_cli: Run, tmp_path: Path, scripted: str
+) -> None:
+    outcomes = assert_independent(stock_cli, tmp_path, [f"--policy.type={scripted}", "--env.fps=5"])
+    assert all(outcome.row["is_success"] == (scripted == "bomb_expert") for outcome in outcomes.values())
+    assert len({outcome.row["placement_error_mm"] for outcome in outcomes.values()}) == 4
+
+
+@pytest.fixture
+def checkpoint(tmp_path: Path, policy_type: str, policy_flags: Callable[[str], dict[str, Any]]) -> Path:
+    """Of lerobot-train without an update: every input tells in the actions of random weights."""
+    from lerobot.utils.import_utils import register_third_party_plugins
+    from parity_routes import Recorded, cli_flags, run_train
+
+    register_third_party_plugins()
+    recorded = Recorded.make(tmp_path / "dataset", images=True)
+    flags = cli_flags(policy_type, policy_flags(policy_type), use_state=True)
+    run_train(recorded, tmp_path / "train", flags, finish=None)
+    return tmp_path / "train" / "checkpoints" / "last" / "pretrained_model"
+
+
+def test_a_networks_results_do_not_depend_on_batch_or_workers(
+    stock_cli: Run, tmp_path: Path, checkpoint: Path
+) -> None:
+    # episodes of 20 steps end in the middle of a chunk
+    flags = [f"--policy.path={checkpoint}", "--env.fps=2", "--policy.n_action_steps=3"]
+    outcomes = assert_independent(stock_cli, tmp_path, flags, NETWORK_TOLERANCE)
+    assert len({len(outcome.row["instruction"]) for outcome in outcomes.values()}) > 1  # rows are padded
+    assert min(len(np.unique(outcome.actions, axis=0)) for outcome in outcomes.values()) > 3
+
+
+@pytest.mark.long
+def test_a_networks_results_do_not_depend_on_larger_batches(
+    stock_cli: Run, tmp_path: Path, checkpoint: Path
+) -> None:
+    options = {"flags": [f"--policy.path={checkpoint}"], "use_async": False, "num_episodes": 16}
+    alone = evaluate(stock_cli, tmp_path / "alone", batch_size=1, **options)
+    for batch_size in (5, 16):
+        together = evaluate(stock_cli, tmp_path / f"in_{batch_size}", batch_size=batch_size, **options)
+        for seed, expected in alone.items():
+            assert_alike(together[seed], expected, NETWORK_TOLERANCE, f"seed {seed} in {batch_size}")
