@@ -164,6 +164,17 @@ def test_observations_lie_in_their_space(env: BombEnv) -> None:
         assert env.observation_space.contains(observation)
 
 
+def test_the_workspace_camera_stands_and_the_wrist_camera_moves(env: BombEnv) -> None:
+    before, _ = env.reset(seed=SEED)
+    for _ in range(2):
+        after, *_ = env.step(np.array([-1, 0, 0, 1], dtype=np.float32))
+    changed = {
+        camera: np.mean(np.abs(before["pixels"][camera].astype(int) - after["pixels"][camera]).max(-1) > 20)
+        for camera in ("workspace", "wrist")
+    }
+    assert changed["workspace"] < 0.25 < 0.35 < changed["wrist"]
+
+
 def test_info_is_flat(env: BombEnv) -> None:
     _, info = env.reset(seed=SEED)
     assert set(info) == {

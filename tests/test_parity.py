@@ -15,8 +15,8 @@ from model_inputs import Batch, first_ids, inference_inputs, joined, pixels, pro
 from parity_routes import Recorded, Routes, cli_flags, run_routes
 
 # Least PSNR of a camera's pixels, as the network gets them, between a frame out of a video and the drawn one.
-# Measured: AV1 at 64x64 gives at least 26.8 dB; swapped cameras gave 10.7, BGR for RGB 8.7, a video that is one
-# frame late 13.3.
+# Measured: AV1 at 64x64 gives at least 26.8 dB; swapped cameras gave 10.7, BGR for RGB 8.7, a video that is
+# one frame late 13.3.
 MIN_PSNR_DB = 22.0
 MAX_LEARNING_STEPS, CHECK_EVERY = 300, 20
 VIEWS_PER_BATCH, MAX_VIEW_BATCHES = 32, 8
