@@ -7,7 +7,7 @@ from pathlib import Path
 
 import numpy as np
 from datasets import config
-from lerobot.datasets import compute_stats
+from lerobot.datasets import LeRobotDataset, compute_stats
 
 STATISTICS_SIZE = 128  # pixels
 
@@ -30,6 +30,15 @@ def sampled_image_statistics() -> Iterator[None]:
         yield
     finally:
         compute_stats.auto_downsample_height_width = usual
+
+
+def abandon(dataset: LeRobotDataset) -> None:
+    """End the threads of a dataset that is being written, and let none of it be written later.
+
+    When it is garbage collected, LeRobot would write its table of episodes, and make the folder for it anew.
+    """
+    dataset.clear_episode_buffer()
+    dataset.meta._finalized = True
 
 
 @contextmanager

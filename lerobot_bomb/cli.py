@@ -26,19 +26,19 @@ def main(argv: Sequence[str] | None = None) -> int:
     parser.add_argument("--version", action="version", version=f"lerobot-bomb {__version__}")
     commands = parser.add_subparsers(dest="command", required=True, metavar="COMMAND")
     modules = {}
-    for name, (summary, module) in COMMANDS.items():
-        command = commands.add_parser(name, help=summary, description=summary)
-        if name in argv[:1]:
-            modules[name] = importlib.import_module(module)
-            getattr(modules[name], f"add_{name}_arguments")(command)
-    args = parser.parse_args(argv)
     try:
+        for name, (summary, module) in COMMANDS.items():
+            command = commands.add_parser(name, help=summary, description=summary)
+            if name in argv[:1]:
+                modules[name] = importlib.import_module(module)
+                getattr(modules[name], f"add_{name}_arguments")(command)
+        args = parser.parse_args(argv)
         return getattr(modules[args.command], f"run_{args.command}")(args)
     except (ValueError, OSError, RuntimeError) as error:
-        print(f"lerobot-bomb {args.command}: {error}", file=sys.stderr)
+        print(f"lerobot-bomb {argv[0]}: {error}", file=sys.stderr)
         return 1
     except KeyboardInterrupt:
-        print(f"lerobot-bomb {args.command}: interrupted", file=sys.stderr)
+        print(f"lerobot-bomb {argv[0]}: interrupted", file=sys.stderr)
         return 130
 
 

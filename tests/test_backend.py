@@ -57,6 +57,15 @@ backend.importlib.import_module = broken
     assert "apt-get install libegl1 libgl1" in last_line(run)
 
 
+def test_ctrl_c_while_mujoco_loads_is_no_missing_library() -> None:
+    preamble = """
+def interrupted(name):
+    raise ImportError("initialization failed") from KeyboardInterrupt()
+backend.importlib.import_module = interrupted
+"""
+    assert last_line(choose_backend(preamble, MUJOCO_GL="egl")) == "KeyboardInterrupt"
+
+
 def test_a_stale_pyopengl_platform_does_not_survive() -> None:
     preamble = "backend.importlib.import_module = lambda name: None"
     run = choose_backend(preamble, MUJOCO_GL="osmesa", PYOPENGL_PLATFORM="egl")

@@ -1,21 +1,31 @@
 """Flags and folders of `lerobot-bomb record`: what is refused, before long work, and how."""
 
+import ctypes
+import os
+import subprocess
+import sys
+from dataclasses import asdict
 from pathlib import Path
 
 import pytest
-from filelock import FileLock
 
 from lerobot_bomb import cli
-from lerobot_bomb.data.record import record
 from lerobot_bomb.data.recording import (
+    BLOCK_FILE,
     METADATA_FILE,
     PARAMETERS_FILE,
+    Progress,
     Recording,
+    lock_folder,
     unfinished_folder,
     write_json,
 )
 
 FLAGS = ["record", "--repo_id=test/x", "--episodes=1"]
+RECORDING = Recording("test/x", episodes=1)
+# of Linux
+PR_CAPBSET_DROP = 24
+CAP_DAC_OVERRIDE, CAP_DAC_READ_SEARCH = 1, 2
 
 
 @pytest.mark.parametrize(
@@ -60,9 +70,21 @@ def test_an_existing_folder_is_not_overwritten(tmp_path: Path, capsys: pytest.Ca
 
 
 def test_an_unfinished_recording_needs_resume(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    unfinished_folder(tmp_path / "x").mkdir()
+    folder = unfinished_folder(tmp_path / "x")
+    folder.mkdir()
+    write_json(folder / PARAMETERS_FILE, {"recording": RECORDING.to_dict()})
     assert cli.main([*FLAGS, f"--root={tmp_path / 'x'}"]) == 1
     assert "go on with --resume or delete it" in capsys.readouterr().err
+
+
+def test_a_folder_of_something_else_is_left_alone(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    folder = unfinished_folder(tmp_path / "x")
+    folder.mkdir()
+    (folder / "mine").touch()
+    assert cli.main([*FLAGS, f"--root={tmp_path / 'x'}"]) == 1
+    assert cli.main([*FLAGS, f"--root={tmp_path / 'x'}", "--resume"]) == 1
+    assert f"--resume: {folder} holds no recording.json, so it is no recording" in capsys.readouterr().err
+    assert (folder / "mine").exists()
 
 
 def test_there_must_be_something_to_resume(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
@@ -85,19 +107,87 @@ def test_resume_refuses_other_parameters(
     assert "--seed" not in message
 
 
-def test_a_folder_that_cannot_be_written_is_named(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def record_without_privileges(root: Path, *flags: str) -> str:
+    """Record as one whom permissions bind; return what it says on stderr. LeRobot must not be imported."""
+    script = (
+        "import sys; from lerobot_bomb import cli; code = cli.main(sys.argv[1:])\n"
+        "assert not {'torch', 'lerobot', 'mujoco'} & set(sys.modules); sys.exit(code)"
+    )
+    command = [sys.executable, "-c", script, *FLAGS, f"--root={root}", *flags]
+    run = subprocess.run(command, preexec_fn=be_bound_by_permissions, capture_output=True, text=True)
+    assert run.returncode == 1, run.stderr
+    return run.stderr
+
+
+def be_bound_by_permissions() -> None:
+    """Give up what lets root write anywhere, from the next exec on."""
+    libc = ctypes.CDLL(None, use_errno=True)
+    for capability in (CAP_DAC_OVERRIDE, CAP_DAC_READ_SEARCH):
+        if os.geteuid() == 0 and libc.prctl(PR_CAPBSET_DROP, capability, 0, 0, 0):
+            raise OSError(ctypes.get_errno(), "prctl")
+
+
+def test_a_folder_that_cannot_be_made_is_named(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     (tmp_path / "file").write_text("not a folder")
     root = tmp_path / "file" / "x"
     assert cli.main([*FLAGS, f"--root={root}"]) == 1
     assert f"--root={root} cannot be written" in capsys.readouterr().err
 
 
-def test_a_second_recorder_is_refused(tmp_path: Path) -> None:
-    recording = Recording("test/x", episodes=1)
-    folder = unfinished_folder(tmp_path / "x")
-    folder.mkdir()
-    with FileLock(folder / "lock"), pytest.raises(ValueError, match="another process is recording there"):
-        record(recording, tmp_path / "x", resume=True)
+def test_a_folder_without_write_permission_is_named(tmp_path: Path) -> None:
+    tmp_path.chmod(0o555)
+    root = tmp_path / "x"
+    message = record_without_privileges(root)
+    assert message.startswith(f"lerobot-bomb record: --root={root} cannot be written: [Errno 13] Permission")
+    assert message.count("\n") == 1
+    assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.parametrize("read_only", [".", "x.recording", "x.recording/lock"])
+def test_an_unfinished_recording_without_write_permission_is_kept(read_only: str, tmp_path: Path) -> None:
+    root = tmp_path / "x"
+    (tmp_path / "x.recording" / "block-00000").mkdir(parents=True)
+    (tmp_path / "x.recording" / "lock").touch()
+    write_json(tmp_path / "x.recording" / PARAMETERS_FILE, {"recording": RECORDING.to_dict()})
+    write_json(tmp_path / "x.recording" / "block-00000" / BLOCK_FILE, asdict(Progress(1, 20)))
+    before = sorted(tmp_path.rglob("*"))
+    (tmp_path / read_only).chmod(0o555 if (tmp_path / read_only).is_dir() else 0o444)
+    message = record_without_privileges(root, "--resume")
+    assert message.startswith(f"lerobot-bomb record: --root={root}")
+    assert "[Errno 13] Permission denied" in message
+    assert message.count("\n") == 1
+    assert sorted(tmp_path.rglob("*")) == before
+
+
+def test_a_read_only_file_system_is_named(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    command = ["mount", "-t", "tmpfs", "-o", "ro", "none", str(tmp_path)]
+    mounted = subprocess.run(command, capture_output=True, text=True)
+    if mounted.returncode:
+        pytest.skip(f"no file system can be mounted ({mounted.stderr.strip()}); try `unshare -rm`")
+    try:
+        assert cli.main([*FLAGS, f"--root={tmp_path / 'x'}"]) == 1
+        message = f"--root={tmp_path / 'x'} cannot be written: [Errno 30] Read-only file system"
+        assert message in capsys.readouterr().err
+    finally:
+        subprocess.run(["umount", str(tmp_path)], check=True)
+
+
+def test_a_second_recorder_is_refused(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    with lock_folder(unfinished_folder(tmp_path / "x")):
+        for resume in (False, True):
+            assert cli.main([*FLAGS, f"--root={tmp_path / 'x'}", f"--resume={resume}"]) == 1
+            assert f"another process is recording in {tmp_path / 'x.recording'}" in capsys.readouterr().err
+
+
+def test_ctrl_c_while_a_command_is_imported_is_no_traceback(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    def interrupted(name: str) -> None:
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(cli.importlib, "import_module", interrupted)
+    assert cli.main(FLAGS) == 130
+    assert capsys.readouterr().err == "lerobot-bomb record: interrupted\n"
 
 
 def test_a_switch_takes_true_or_false(capsys: pytest.CaptureFixture[str]) -> None:

@@ -65,6 +65,8 @@ def ensure_gl_backend() -> str:
     try:
         importlib.import_module("mujoco")
     except (AttributeError, ImportError) as error:
+        if isinstance(error.__cause__, KeyboardInterrupt):  # Ctrl-C while its library loads
+            raise error.__cause__ from None
         # this is how a missing libEGL or libOSMesa shows
         raise NoOpenGLError(f"{_install_advice({chosen: str(error)})}; or unset MUJOCO_GL") from error
     return chosen

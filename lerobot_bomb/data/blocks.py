@@ -5,7 +5,9 @@ written is lost. Blocks bound that loss to the episodes of one block, which are 
 """
 
 import json
+import logging
 import os
+import tempfile
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -17,12 +19,13 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 from av.logging import WARNING, set_libav_level
 from datasets import disable_progress_bars, enable_progress_bars
+from datasets.exceptions import DatasetGenerationError
 from lerobot.datasets import LeRobotDataset, aggregate_datasets
 from lerobot.datasets.utils import DEFAULT_EPISODES_PATH, STATS_PATH
 from lerobot.utils.constants import ACTION, OBS_IMAGES, OBS_STATE
 
 from lerobot_bomb import __version__
-from lerobot_bomb._compat import datasets_cache, sampled_image_statistics
+from lerobot_bomb._compat import abandon, datasets_cache, sampled_image_statistics
 from lerobot_bomb.data.rollout import Rollout
 from lerobot_bomb.schema import ACTION_NAMES, CAMERAS, STATE_NAMES, EpisodeResult, EpisodeSpec, RenderOptions
 
@@ -74,16 +77,11 @@ def write_block(layout: DatasetLayout, root: Path, rollouts: Iterable[Rollout]) 
     """Write rollouts as a finished LeRobotDataset and return its number of frames.
 
     Raises:
-        RuntimeError: a video lacks frames, or an encoder failed.
+        RuntimeError: a video lacks frames, or a thread of LeRobot could not write an image or a video.
         OSError: the disk is full.
     """
-    with _quiet_libraries(), sampled_image_statistics():
-        dataset = layout.create(root)
-        results = []
-        for rollout in rollouts:
-            _write_episode(dataset, rollout)
-            results.append(rollout.result)
-        dataset.finalize()
+    with _quiet_libraries(), _temporary_files_in(root.parent), sampled_image_statistics(), _logged_errors():
+        results = _write_episodes(layout.create(root), rollouts)
     _add_episode_columns(root, results)
     num_frames = sum(result.steps for result in results)
     _check_videos(root, num_frames)
@@ -95,12 +93,19 @@ def merge_blocks(layout: DatasetLayout, blocks: list[Path], root: Path) -> None:
 
     Videos and tables are joined up to LeRobot's file sizes. Tables that hold images stay one per block:
     to join them LeRobot would read and write all earlier images again for every block.
+
+    Raises:
+        OSError: the disk is full.
     """
     repo_ids = [layout.repo_id] * len(blocks)
-    with _quiet_libraries(), datasets_cache(root.with_name(f"{root.name}.cache")):
-        aggregate_datasets(
-            repo_ids, layout.repo_id, roots=blocks, aggr_root=root, concatenate_data=layout.use_videos
-        )
+    cache = datasets_cache(root.with_name(f"{root.name}.cache"))
+    with _quiet_libraries(), _temporary_files_in(root.parent), cache:
+        try:
+            aggregate_datasets(
+                repo_ids, layout.repo_id, roots=blocks, aggr_root=root, concatenate_data=layout.use_videos
+            )
+        except DatasetGenerationError as error:
+            raise OSError(f"the blocks could not be read: {error.__cause__}") from error
     # LeRobot writes the keys in the order of a set, which differs from run to run
     stats = root / STATS_PATH
     stats.write_text(json.dumps(json.loads(stats.read_text()), indent=4, sort_keys=True))
@@ -116,6 +121,67 @@ def _quiet_libraries() -> Iterator[None]:
         yield
     finally:
         enable_progress_bars()
+
+
+@contextmanager
+def _temporary_files_in(folder: Path) -> Iterator[None]:
+    """Let LeRobot join videos here, not in the system's folder, where a kill would leave them."""
+    usual = tempfile.tempdir
+    tempfile.tempdir = str(folder)
+    try:
+        yield
+    finally:
+        tempfile.tempdir = usual
+
+
+@contextmanager
+def _logged_errors() -> Iterator[None]:
+    """Raise the first error that LeRobot logs: its threads log an image that could not be written and go on.
+
+    Raises:
+        RuntimeError: with the logged message.
+    """
+    handler = _ErrorCollector()
+    logger = logging.getLogger("lerobot.datasets")
+    logger.addHandler(handler)
+    logger.propagate = False
+    try:
+        yield
+    except (OSError, RuntimeError) as error:
+        # what is raised later may only be its consequence: an image that cannot be read
+        raise RuntimeError(handler.errors[0] if handler.errors else str(error)) from error
+    finally:
+        logger.removeHandler(handler)
+        logger.propagate = True
+    if handler.errors:
+        raise RuntimeError(handler.errors[0])
+
+
+class _ErrorCollector(logging.Handler):
+    """Keeps errors and passes other messages on."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.errors: list[str] = []
+
+    def emit(self, record: logging.LogRecord) -> None:
+        if record.levelno >= logging.ERROR:
+            self.errors.append(record.getMessage())
+        else:
+            logging.getLogger().handle(record)
+
+
+def _write_episodes(dataset: LeRobotDataset, rollouts: Iterable[Rollout]) -> list[EpisodeResult]:
+    results = []
+    try:
+        for rollout in rollouts:
+            _write_episode(dataset, rollout)
+            results.append(rollout.result)
+        dataset.finalize()
+    except BaseException:
+        abandon(dataset)  # its folder may be deleted next
+        raise
+    return results
 
 
 def _write_episode(dataset: LeRobotDataset, rollout: Rollout) -> None:

@@ -7,12 +7,14 @@ imported only after the flags have been checked and the workers are playing.
 
 import argparse
 import shutil
+import signal
+import sys
 from collections.abc import Iterable, Iterator
+from contextlib import contextmanager
 from dataclasses import asdict, fields
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from filelock import FileLock, Timeout
 from tqdm import tqdm
 
 from lerobot_bomb.data.recording import (
@@ -23,8 +25,10 @@ from lerobot_bomb.data.recording import (
     Recording,
     check_folders,
     finished_blocks,
+    lock_folder,
     read_progress,
     recorder_flags,
+    remove_unfinished,
     unfinished_folder,
     write_json,
 )
@@ -87,7 +91,8 @@ def run_record(args: argparse.Namespace) -> int:
     if args.workers < 1:
         raise ValueError(f"--workers={args.workers} must be at least 1")
     root = args.root or _default_root(recording.repo_id)
-    progress = record(recording, root, num_workers=args.workers, resume=args.resume)
+    with _terminated_in_order():
+        progress = record(recording, root, num_workers=args.workers, resume=args.resume)
     last_seed = recording.seed + (progress.num_tried - 1) // len(recording.conditions)
     seeds = f"{recording.seed}..{last_seed}"
     print(
@@ -109,7 +114,7 @@ def record(
     The dataset depends on `recording` alone, not on the number of workers or on interruptions.
 
     Raises:
-        ValueError: the folder exists, is missing, cannot be written, or holds another recording.
+        ValueError: the folder exists, is missing, cannot be written, is in use, or holds another recording.
         RuntimeError: the expert fails too often, the disk is full, or encoding failed.
     """
     folder = unfinished_folder(root)
@@ -118,22 +123,21 @@ def record(
         if root.exists():
             shutil.rmtree(folder, ignore_errors=True)  # left by a kill just after the last rename
             return read_progress(root / METADATA_FILE)
-        folder.mkdir(parents=True, exist_ok=True)
+        lock = lock_folder(folder)
     except OSError as error:
         raise ValueError(f"--root={root} cannot be written: {error}") from error
-    try:
-        with FileLock(folder / "lock", timeout=0):
+    with lock:
+        try:
+            remove_unfinished(folder)  # left by a kill
             write_json(folder / PARAMETERS_FILE, {"recording": recording.to_dict()})
             progress = _record_blocks(recording, folder, num_workers, expert)
             _publish(recording, progress, folder, root)
-    except Timeout:
-        raise ValueError(f"--root={root}: another process is recording there") from None
-    except (OSError, RuntimeError) as error:
-        raise RuntimeError(f"{error}\n{_what_is_kept(folder)}") from error
-    except KeyboardInterrupt:
-        tqdm.write(_what_is_kept(folder))
-        raise
-    shutil.rmtree(folder)
+        except (OSError, RuntimeError) as error:
+            raise RuntimeError(f"--root={root}: {error}; {_keep_finished(folder)}") from error
+        except (KeyboardInterrupt, SystemExit):
+            tqdm.write(_keep_finished(folder), file=sys.stderr)
+            raise
+        shutil.rmtree(folder, ignore_errors=True)  # the dataset is complete, whatever stays of this
     return progress
 
 
@@ -166,7 +170,6 @@ def _record_blocks(recording: Recording, folder: Path, num_workers: int, expert:
             while progress.num_episodes < recording.episodes:
                 block = folder / f"block-{progress.num_episodes // BLOCK_EPISODES:05d}"
                 unfinished = block.with_suffix(".tmp")
-                shutil.rmtree(unfinished, ignore_errors=True)
                 size = min(BLOCK_EPISODES, recording.episodes - progress.num_episodes)
                 successes = _successes(pool, size, progress, bar)
                 progress.num_frames += write_block(_layout(recording), unfinished, successes)
@@ -204,7 +207,6 @@ def _publish(recording: Recording, progress: Progress, folder: Path, root: Path)
     from lerobot_bomb.data.blocks import merge_blocks
 
     dataset = folder / "dataset"
-    shutil.rmtree(dataset, ignore_errors=True)
     merge_blocks(_layout(recording), finished_blocks(folder), dataset)
     write_json(dataset / METADATA_FILE, {"recording": recording.to_dict(), **asdict(progress)})
     dataset.rename(root)
@@ -218,13 +220,25 @@ def _layout(recording: Recording) -> "DatasetLayout":
     )
 
 
-def _what_is_kept(folder: Path) -> str:
+def _keep_finished(folder: Path) -> str:
+    """Delete what is unfinished, which gives a full disk its space back; return what is kept."""
+    remove_unfinished(folder)
     blocks = finished_blocks(folder)
     if not blocks:
-        shutil.rmtree(folder)
-        return "No block of episodes was finished, so nothing is kept."
+        shutil.rmtree(folder, ignore_errors=True)
+        return "no block of episodes was finished, so nothing is kept"
     num_episodes = read_progress(blocks[-1] / BLOCK_FILE).num_episodes
-    return f"{num_episodes} episodes are kept in {folder}; go on with --resume"
+    return f"{num_episodes} episodes are kept in {folder}, go on with --resume"
+
+
+@contextmanager
+def _terminated_in_order() -> Iterator[None]:
+    """Let SIGTERM end the recorder as Ctrl-C does, with the exit code that shells give it, 143."""
+    usual = signal.signal(signal.SIGTERM, lambda number, _: sys.exit(128 + number))
+    try:
+        yield
+    finally:
+        signal.signal(signal.SIGTERM, usual)
 
 
 def _default_root(repo_id: str) -> Path:

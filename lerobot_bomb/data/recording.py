@@ -5,14 +5,19 @@ While a recording grows it is a folder beside its final place:
     NAME.recording/block-00000/     a finished LeRobotDataset, and block.json: the progress up to its end
 """
 
+import errno
 import itertools
 import json
+import os
 import re
+import shutil
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import AbstractContextManager, contextmanager, suppress
 from dataclasses import asdict, dataclass, field, fields, replace
 from pathlib import Path
 from typing import Any
+
+from filelock import FileLock, Timeout
 
 from lerobot_bomb import __version__
 from lerobot_bomb.schema import (
@@ -26,6 +31,8 @@ from lerobot_bomb.schema import (
 MAX_NOISE = 1.0  # beyond it the noise exceeds the largest action
 
 PARAMETERS_FILE = "recording.json"  # in the unfinished recording
+LOCK_FILE = "lock"  # there too; a killed recorder releases it
+LOCK_TIMEOUT_S = 0.5  # a recorder that is refused holds the lock for a moment
 BLOCK_FILE = "block.json"  # in each block
 METADATA_FILE = Path("meta") / "bomb.json"  # in the dataset
 
@@ -128,12 +135,17 @@ def check_folders(recording: Recording, root: Path, folder: Path, resume: bool) 
 
     Raises:
         ValueError: names the flag and what is in the way.
+        OSError: the folder cannot be written.
     """
     if not resume:
         if root.exists():
             raise ValueError(f"--root={root} exists already; name a new folder or delete it")
         if folder.exists():
-            raise ValueError(f"{folder} holds an unfinished recording; go on with --resume or delete it")
+            with lock_folder(folder):
+                if {path.name for path in folder.iterdir()} - {LOCK_FILE}:
+                    raise ValueError(
+                        f"{folder} holds an unfinished recording; go on with --resume or delete it"
+                    )
     elif not root.exists() and not folder.exists():
         raise ValueError(f"--resume: there is no recording to go on with in --root={root}")
     elif root.exists() and not (root / METADATA_FILE).exists():
@@ -144,6 +156,8 @@ def check_folders(recording: Recording, root: Path, folder: Path, resume: bool) 
 
 def _check_same_recording(recording: Recording, path: Path) -> None:
     if not path.exists():
+        if {other.name for other in path.parent.iterdir()} - {LOCK_FILE, path.with_suffix(".tmp").name}:
+            raise ValueError(f"--resume: {path.parent} holds no {path.name}, so it is no recording")
         return  # killed before anything was recorded
     existing = json.loads(path.read_text())["recording"]
     differences = [
@@ -153,6 +167,36 @@ def _check_same_recording(recording: Recording, path: Path) -> None:
     ]
     if differences:
         raise ValueError(f"--resume: the recording in {path.parent} differs in {', '.join(differences)}")
+
+
+def lock_folder(folder: Path) -> AbstractContextManager[object]:
+    """Make the folder and keep other recorders out until the returned context ends.
+
+    Raises:
+        ValueError: another recorder is at work there.
+        OSError: the folder, or its final place beside it, cannot be written.
+    """
+    folder.mkdir(parents=True, exist_ok=True)
+    try:
+        if not os.access(folder.parent, os.W_OK):
+            raise PermissionError(errno.EACCES, os.strerror(errno.EACCES), str(folder.parent))
+        return FileLock(folder / LOCK_FILE).acquire(timeout=LOCK_TIMEOUT_S)
+    except (Timeout, FileNotFoundError):  # it has finished and deleted the folder meanwhile
+        raise ValueError(f"another process is recording in {folder}") from None
+    except OSError:
+        with suppress(OSError):
+            folder.rmdir()  # unless it holds something
+        raise
+
+
+def remove_unfinished(folder: Path) -> None:
+    """Leave only finished blocks, the parameters and the lock."""
+    kept = {folder / LOCK_FILE, folder / PARAMETERS_FILE, *finished_blocks(folder)}
+    for path in set(folder.iterdir()) - kept:
+        if path.is_dir():
+            shutil.rmtree(path, ignore_errors=True)
+        else:
+            path.unlink(missing_ok=True)
 
 
 def finished_blocks(folder: Path) -> list[Path]:

@@ -122,8 +122,14 @@ class RolloutPool:
         )
         self._specs = specs
         self._pending: deque[Future[Rollout]] = deque()
-        for _ in range(num_workers + LOOKAHEAD):
-            self._submit()
+        # A worker inherits the mask. Ctrl-C in a terminal reaches it too, and would end it, with a
+        # traceback, while it still imports; the parent ends its workers in order.
+        usual = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
+        try:
+            for _ in range(num_workers + LOOKAHEAD):
+                self._submit()
+        finally:
+            signal.pthread_sigmask(signal.SIG_SETMASK, usual)
 
     def __enter__(self) -> Self:
         return self
@@ -167,7 +173,6 @@ _worker: _Worker | None = None  # set once by _start_worker
 
 def _start_worker(settings: RolloutSettings) -> None:
     global _worker
-    signal.signal(signal.SIGINT, signal.SIG_IGN)  # the parent ends its workers in order
     threading.Thread(target=_exit_with_parent, daemon=True).start()
     _worker = _Worker(settings)
     atexit.register(_worker.close)
