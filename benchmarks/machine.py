@@ -13,8 +13,22 @@ MAX_LOAD_PER_CORE = 0.5  # one-minute load average
 
 def add_machine_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare --json and --force."""
-    parser.add_argument("--json", type=Path, help="also write the figures to this file")
+    parser.add_argument("--json", type=_new_file, help="also write the figures to this file")
     parser.add_argument("--force", action="store_true", help="measure on a busy machine all the same")
+
+
+def positive(text: str) -> int:
+    """A whole number from 1 on."""
+    if not text.isdecimal() or int(text) < 1:
+        raise argparse.ArgumentTypeError(f"{text!r} must be a whole number from 1 on")
+    return int(text)
+
+
+def _new_file(text: str) -> Path:
+    path = Path(text)
+    if path.is_dir() or not os.access(path.parent, os.W_OK):
+        raise argparse.ArgumentTypeError(f"{text!r} cannot be written")
+    return path
 
 
 def require_idle_machine(force: bool) -> None:

@@ -8,6 +8,7 @@ model's share.
 """
 
 import argparse
+import os
 import statistics
 import tempfile
 import time
@@ -16,6 +17,8 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
+os.environ.setdefault("KINETO_LOG_LEVEL", "5")  # torch's profiler reports a missing GPU as an error
+
 import draccus
 import torch
 from lerobot.configs.train import TrainPipelineConfig
@@ -23,7 +26,7 @@ from lerobot.datasets.factory import make_dataset
 from lerobot.envs import make_env, make_env_config, make_env_pre_post_processors, preprocess_observation
 from lerobot.policies import make_policy, make_pre_post_processors
 from lerobot.utils.import_utils import register_third_party_plugins
-from machine import add_machine_arguments, print_table, require_idle_machine, write_figures
+from machine import add_machine_arguments, positive, print_table, require_idle_machine, write_figures
 from overfit import IMAGE_SIZE, record
 from recipes import POLICY_TYPES, read_recipe
 from torch.profiler import ProfilerActivity, profile
@@ -52,7 +55,9 @@ def main() -> None:
     """Profile both steps and print where their time goes."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawTextHelpFormatter)
     parser.add_argument("--policy.type", dest="policy_type", required=True, choices=POLICY_TYPES)
-    parser.add_argument("--repeats", type=int, default=20, help="steps of each kind (default: 20)")
+    parser.add_argument(
+        "--repeats", type=positive, default=20, help="training steps and predictions (default: 20)"
+    )
     add_machine_arguments(parser)
     args = parser.parse_args()
     require_idle_machine(args.force)
@@ -113,7 +118,7 @@ def profile_training(
     medians = stages.medians_ms()
     print_stages(medians, len(batches))
     batch = preprocessor(default_collate([dataset[index] for index in batches[0]]))
-    print_operators(lambda: policy.forward(batch)[0].backward())
+    print_operators("forward and backward", lambda: policy.forward(batch)[0].backward())
     return medians
 
 
@@ -144,17 +149,21 @@ def profile_evaluation(
             action = postprocessor(action).numpy()
         with stages("environment: physics, two cameras"):
             observation, *_ = env.step(action)
+        with stages("picture for the video (first 10 episodes only)"):
+            env.call("render")
     medians = stages.medians_ms()
-    print_stages(medians, len(stages.runs["postprocess"]))
-    total_s = sum(map(sum, stages.runs.values()))
-    medians["per step, predictions spread over the steps"] = 1e3 * total_s / len(stages.runs["postprocess"])
+    num_steps = len(stages.runs["postprocess"])
+    print_stages(medians, num_steps)
+    per_step_ms = 1e3 * sum(map(sum, stages.runs.values())) / num_steps
+    print(f"a step on average, as one in {num_steps / predicting:.0f} predicts: {per_step_ms:.1f} ms")
+    medians["a step on average"] = per_step_ms
 
     def predict() -> None:
         policy.reset()
         with torch.inference_mode():
             policy.select_action(batch)
 
-    print_operators(predict)
+    print_operators("a prediction", predict)
     env.close()
     return medians
 
@@ -163,13 +172,13 @@ def print_stages(medians_ms: dict[str, float], repeats: int) -> None:
     """A table of the stages."""
     total = sum(medians_ms.values())
     rows = [[name, f"{ms:.1f}", f"{ms / total:.0%}"] for name, ms in medians_ms.items()]
-    print_table(["stage", f"ms (median of {repeats})", "share"], [*rows, ["total", f"{total:.1f}", ""]])
+    print_table(["stage", f"ms (median, {repeats} steps)", "share"], [*rows, ["sum", f"{total:.1f}", ""]])
 
 
-def print_operators(run: Callable[[], None]) -> None:
+def print_operators(what: str, run: Callable[[], None]) -> None:
     """The operators that take the most time of their own."""
     run()
-    with profile(activities=[ProfilerActivity.CPU]) as profiler:
+    with profile(activities=[ProfilerActivity.CPU], acc_events=True) as profiler:
         run()
     events: list[Any] = sorted(profiler.key_averages(), key=lambda event: -event.self_cpu_time_total)
     total = sum(event.self_cpu_time_total for event in events)
@@ -182,6 +191,7 @@ def print_operators(run: Callable[[], None]) -> None:
         ]
         for event in events[:NUM_OPERATORS]
     ]
+    print(f"\nof the model's share ({what}), the time of each operator itself")
     print_table(["operator", "calls", "ms", "share"], rows)
 
 

@@ -40,6 +40,8 @@ MAX_STEP_M = 0.040  # metres that a relative action of 1 commands per control st
 WORKSPACE_LOW_M = (-0.13, -0.13, 0.006)
 WORKSPACE_HIGH_M = (0.21, 0.13, 0.16)
 
+MAX_SEED = 2**32 - 1  # what LeRobot seeds NumPy with
+
 NUM_STONES = 12  # stones in the compiled model: on the board, to be moved, or parked out of sight
 
 
@@ -118,8 +120,8 @@ class EpisodeSpec:
         one_of("--env.robot", self.robot, ROBOTS)
         one_of("--env.split", self.split, SPLITS)
         one_of("--env.control_mode", self.control_mode, CONTROL_MODES)
-        if self.seed < 0:
-            raise ValueError(f"--seed={self.seed} must not be negative")
+        if not 0 <= self.seed <= MAX_SEED:
+            raise ValueError(f"--seed={self.seed} must lie in 0..{MAX_SEED}")
         if not (0 < self.fps <= PHYSICS_HZ and PHYSICS_HZ % self.fps == 0):
             divisors = [n for n in range(1, PHYSICS_HZ + 1) if PHYSICS_HZ % n == 0]
             raise ValueError(

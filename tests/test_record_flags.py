@@ -46,7 +46,8 @@ CAP_DAC_OVERRIDE, CAP_DAC_READ_SEARCH = 1, 2
         ("--fps=0", "1, 2, 4"),
         ("--image_size=-256", "32..1024"),
         ("--image_size=100000", "32..1024"),
-        ("--seed=-1", "must not be negative"),
+        ("--seed=-1", "0..4294967295"),
+        ("--seed=99999999999999999999", "0..4294967295"),
     ],
 )
 def test_a_bad_flag_is_named_with_what_is_allowed(
@@ -201,15 +202,22 @@ def test_an_unknown_task_is_refused(tmp_path: Path, capsys: pytest.CaptureFixtur
     assert "--task_ids has 50; 'place' has tasks 0..49" in capsys.readouterr().err
 
 
-def test_task_ids_are_a_list_of_numbers(capsys: pytest.CaptureFixture[str]) -> None:
+@pytest.mark.parametrize("text", ["[one]", "[1", "[[0,1]]", "[]", "1,", "-1"])
+def test_task_ids_are_a_list_of_numbers(text: str, capsys: pytest.CaptureFixture[str]) -> None:
     with pytest.raises(SystemExit):
-        cli.main([*FLAGS, "--task_ids=[one]"])
-    assert "--task_ids: '[one]' must be a list of whole numbers, as [0,7]" in capsys.readouterr().err
+        cli.main([*FLAGS, f"--task_ids={text}"])
+    assert f"--task_ids: {text!r} must be a list of whole numbers, as [0,7]" in capsys.readouterr().err
+
+
+def test_a_task_is_given_once(capsys: pytest.CaptureFixture[str]) -> None:
+    assert cli.main([*FLAGS, "--task_ids=[1,7,1]"]) == 1
+    assert "--task_ids=[1, 7, 1] has a task twice" in capsys.readouterr().err
 
 
 def test_a_task_outside_the_split_is_refused(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert cli.main([*FLAGS, f"--root={tmp_path / 'x'}", "--task_ids=0,3", "--split=train"]) == 1
-    assert "--target=[0, 3] is not in --split=train" in capsys.readouterr().err
+    assert "the target [0, 3] is not in --split=train" in capsys.readouterr().err
+    assert list(tmp_path.iterdir()) == []
 
 
 def test_lerobots_folder_is_the_default(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

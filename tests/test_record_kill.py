@@ -22,6 +22,7 @@ pytestmark = pytest.mark.skipif(platform.system() != "Linux", reason="processes 
 FLAGS = ("--repo_id=test/killed", "--episodes=3", "--seed=3", "--image_size=64")
 MODES = {"video": FLAGS, "images": (*FLAGS, "--images", "--workers=2")}
 SEED = 0  # of the random moments
+NOTHING = "no block of episodes was finished, so nothing is kept"
 
 # the recorder's own last steps of each stage: what a kill just before them leaves is the most delicate
 STEPS = (
@@ -148,14 +149,15 @@ def test_ctrl_c_and_sigterm_say_what_is_kept(
     for action, code, count in (("Ctrl-C", 130, 1), ("terminate", 143, rng.randint(1, 80))):
         ended = server.record(root, *FLAGS, moment=Moment(action, "block-00000.tmp", count))
         assert ended.exit_code == code
-        assert "no block of episodes was finished, so nothing is kept" in ended.messages
+        assert f"--root={root}: stopped; {NOTHING}" in ended.messages
         assert "Traceback" not in "\n".join(ended.messages)
         assert list(tmp_path.iterdir()) == []
     for action, part, code, kept in (("Ctrl-C", "block-00001.tmp", 130, 2), ("terminate", "dataset", 143, 3)):
         moment = Moment(action, part, rng.randint(1, 30))
         ended = server.record(root, *FLAGS, *resume_flag(root), moment=moment)
         assert ended.exit_code == code, ended.messages
-        assert f"{kept} episodes are kept in {folder}, go on with --resume" in ended.messages
+        what = f"{kept} episodes are kept in {folder}, go on with --resume"
+        assert f"--root={root}: stopped; {what}" in ended.messages
         assert "Traceback" not in "\n".join(ended.messages)
     assert server.record(root, *FLAGS, "--resume").exit_code == 0
     assert contents(root) == references["video"].contents
@@ -184,7 +186,6 @@ def test_a_second_recorder_is_refused_and_the_first_not_disturbed(
 
 
 FULL = "No space left on device"
-NOTHING = "no block of episodes was finished, so nothing is kept"
 # where the disk becomes full, and how many episodes are kept
 FULL_AT = {
     "video": (

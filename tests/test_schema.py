@@ -46,7 +46,7 @@ def test_numbered_tasks_are_25_intersections_in_2_colours() -> None:
         ("control_mode", "joint", "--env.control_mode='joint' is unknown; choose one of: relative, absolute"),
         ("split", "test", "--env.split='test' is unknown; choose one of: all, train, heldout"),
         ("color", "red", "--env.color='red' is unknown; choose one of: black, white"),
-        ("seed", -1, "--seed=-1 must not be negative"),
+        ("seed", -1, "--seed=-1 must lie in 0..4294967295"),
         (
             "fps",
             7,

@@ -6,6 +6,7 @@ imported only after the flags have been checked and the workers are playing.
 """
 
 import argparse
+import re
 import shutil
 import signal
 import sys
@@ -81,7 +82,11 @@ def add_record_arguments(parser: argparse.ArgumentParser) -> None:
         help="standard deviation of noise on the executed action, in units of the largest step, 40 mm; the "
         "stored action is clean, so recoveries are in the data; the expert bears 0.05 (default: 0)",
     )
-    add("--resume", **_switch(), help="continue a recording that was interrupted")
+    add(
+        "--resume",
+        **_switch(),
+        help=f"continue a recording that was interrupted; its blocks of {BLOCK_EPISODES} episodes are kept",
+    )
 
 
 def run_record(args: argparse.Namespace) -> int:
@@ -132,10 +137,13 @@ def record(
             write_json(folder / PARAMETERS_FILE, {"recording": recording.to_dict()})
             progress = _record_blocks(recording, folder, num_workers, expert)
             _publish(recording, progress, folder, root)
+        except ValueError:  # a flag that only the environment can judge
+            _keep_finished(folder)
+            raise
         except (OSError, RuntimeError) as error:
             raise RuntimeError(f"--root={root}: {error}; {_keep_finished(folder)}") from error
         except (KeyboardInterrupt, SystemExit):
-            tqdm.write(_keep_finished(folder), file=sys.stderr)
+            tqdm.write(f"--root={root}: stopped; {_keep_finished(folder)}", file=sys.stderr)
             raise
         shutil.rmtree(folder, ignore_errors=True)  # the dataset is complete, whatever stays of this
     return progress
@@ -254,10 +262,9 @@ def _switch() -> dict[str, Any]:
 
 def _parse_numbers(text: str) -> tuple[int, ...]:
     """(0, 7) from "[0,7]", as LeRobot writes lists, and from "0,7"."""
-    try:
-        return tuple(int(number) for number in text.strip("[]").split(","))
-    except ValueError:
-        raise argparse.ArgumentTypeError(f"{text!r} must be a list of whole numbers, as [0,7]") from None
+    if not re.fullmatch(r"\d+(,\d+)*|\[\d+(,\d+)*\]", text.replace(" ", "")):
+        raise argparse.ArgumentTypeError(f"{text!r} must be a list of whole numbers, as [0,7]")
+    return tuple(int(number) for number in re.findall(r"\d+", text))
 
 
 def _parse_bool(text: str) -> bool:

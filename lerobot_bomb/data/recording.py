@@ -62,6 +62,8 @@ class Recording:
             raise ValueError(f"--repo_id={self.repo_id!r} must have the form USER/NAME")
         if self.episodes < 1:
             raise ValueError(f"--episodes={self.episodes} must be at least 1")
+        if len(set(self.task_ids)) < len(self.task_ids):
+            raise ValueError(f"--task_ids={list(self.task_ids)} has a task twice")
         if not 0 <= self.noise <= MAX_NOISE:
             raise ValueError(
                 f"--noise={self.noise} must lie in 0..{MAX_NOISE:g}; "
@@ -108,7 +110,8 @@ def recorder_flags() -> Iterator[None]:
     try:
         yield
     except ValueError as error:
-        raise ValueError(str(error).replace("--env.", "--")) from None
+        message = str(error).replace("--env.target=", "the target ").replace("--env.", "--")
+        raise ValueError(message) from None
 
 
 @dataclass
@@ -139,7 +142,7 @@ def check_folders(recording: Recording, root: Path, folder: Path, resume: bool) 
     """
     if not resume:
         if root.exists():
-            raise ValueError(f"--root={root} exists already; name a new folder or delete it")
+            raise ValueError(f"--root={root} exists already; name a folder that does not exist yet")
         if folder.exists():
             with lock_folder(folder):
                 if {path.name for path in folder.iterdir()} - {LOCK_FILE}:

@@ -20,6 +20,7 @@ from lerobot.processor import (
     ProcessorStepRegistry,
 )
 from lerobot.utils.constants import OBS_IMAGE, POLICY_PREPROCESSOR_DEFAULT_NAME
+from lerobot.utils.import_utils import register_third_party_plugins
 
 PREPROCESSOR_FILE = f"{POLICY_PREPROCESSOR_DEFAULT_NAME}.json"
 
@@ -48,6 +49,10 @@ class ReplaceTasks(ComplementaryDataProcessorStep):
 
     replacements: dict[str, str]  # instruction -> what the policy is told instead
 
+    def __post_init__(self) -> None:
+        if not isinstance(self.replacements, dict) or not self.replacements:
+            raise ValueError(f"replacements={self.replacements!r} must map instructions to instructions")
+
     def complementary_data(self, complementary_data: dict[str, Any]) -> dict[str, Any]:
         tasks = complementary_data["task"]
         unknown = sorted(set(tasks) - self.replacements.keys())
@@ -64,16 +69,20 @@ class ReplaceTasks(ComplementaryDataProcessorStep):
         return features
 
 
-def intervene(checkpoint: Path, steps: Sequence[ProcessorStep], output: Path) -> None:
+def intervene(checkpoint: Path | str, steps: Sequence[ProcessorStep], output: Path | str) -> None:
     """Write `output`, a copy of a checkpoint whose preprocessor begins with `steps`.
 
     Raises:
-        ValueError: `checkpoint` is no checkpoint, or `output` exists.
+        ValueError: `checkpoint` is no checkpoint, `output` exists, or there are no steps.
     """
+    checkpoint, output = Path(checkpoint), Path(output)
+    if not steps or not all(isinstance(step, ProcessorStep) for step in steps):
+        raise ValueError(f"steps={steps!r} must be a list of processor steps, as [BlankImages()]")
     if not (checkpoint / PREPROCESSOR_FILE).is_file():
         raise ValueError(f"{checkpoint} holds no {PREPROCESSOR_FILE}, so it is no checkpoint of a policy")
     if output.exists():
         raise ValueError(f"{output} exists already; name a new folder")
+    register_third_party_plugins()  # the checkpoint's own steps
     preprocessor = DataProcessorPipeline.from_pretrained(checkpoint, config_filename=PREPROCESSOR_FILE)
     preprocessor.steps = [*steps, *preprocessor.steps]
     shutil.copytree(checkpoint, output, ignore=shutil.ignore_patterns(f"{POLICY_PREPROCESSOR_DEFAULT_NAME}*"))
