@@ -13,8 +13,8 @@ from lerobot_policy_bomb_expert.configuration_bomb_expert import BombExpertConfi
 from lerobot_policy_bomb_random.configuration_bomb_random import BombRandomConfig
 
 
-def make(policy_type: str, **fields: object):
-    config = make_policy_config(policy_type, device="cpu", **fields)
+def make(scripted_type: str, **fields: object):
+    config = make_policy_config(scripted_type, device="cpu", **fields)
     return make_policy(config, env_cfg=BombEnvConfig())
 
 
@@ -60,10 +60,10 @@ def test_expert_policy_acts_as_the_environment_reads_actions(control_mode: str) 
     np.testing.assert_array_equal(action[0].numpy(), expert_action(state, control_mode))
 
 
-@pytest.mark.parametrize("policy_type", ["bomb_expert", "bomb_random"])
-def test_scripted_policies_say_when_they_have_no_true_state(policy_type: str) -> None:
+@pytest.mark.parametrize("scripted_type", ["bomb_expert", "bomb_random"])
+def test_scripted_policies_say_when_they_have_no_true_state(scripted_type: str) -> None:
     with pytest.raises(ValueError, match=r"needs the observation 'observation\.environment_state'"):
-        make(policy_type).select_action({"observation.state": torch.zeros(1, 4)})
+        make(scripted_type).select_action({"observation.state": torch.zeros(1, 4)})
 
 
 @pytest.mark.parametrize("config_class", [BombExpertConfig, BombRandomConfig])
