@@ -171,6 +171,7 @@ def run(job: dict) -> None:
     from lerobot_bomb import cli
 
     signal.signal(signal.SIGCHLD, signal.SIG_DFL)
+    signal.signal(signal.SIGINT, signal.default_int_handler)  # a job in the background starts ignoring it
     os.setpgid(0, 0)
     log = Path(job["log"])
     os.environ[MARK] = str(log)

@@ -57,6 +57,8 @@ def start(root: Path, mode: str) -> subprocess.Popen:
         stdout=subprocess.DEVNULL,
         env=os.environ | {MARK: str(root)},
         start_new_session=True,
+        # a job in the background starts ignoring Ctrl-C, and its children with it
+        preexec_fn=lambda: signal.signal(signal.SIGINT, signal.SIG_DFL),
     )
 
 

@@ -1,7 +1,10 @@
 """Episodes that the recorder plays, and their noise."""
 
+import itertools
+import multiprocessing
 import subprocess
 import sys
+import time
 from dataclasses import replace
 
 import gymnasium
@@ -75,3 +78,29 @@ def test_workers_start_without_torch_and_lerobot() -> None:
         "assert not {'torch', 'lerobot'} & set(sys.modules)\n"
     )
     subprocess.run([sys.executable, "-c", script], check=True)
+
+
+def test_a_worker_that_ends_is_reported_and_the_others_are_ended() -> None:
+    specs = (EpisodeSpec(seed=seed) for seed in itertools.count())
+    with RolloutPool(RolloutSettings(RenderOptions(image_size=256)), specs, num_workers=2) as pool:
+        rollouts = iter(pool)
+        next(rollouts)
+        processes = multiprocessing.active_children()
+        time.sleep(0.5)  # more than a pipe holds: both are sending their next episode
+        processes[0].terminate()
+        with pytest.raises(RuntimeError, match="a simulator process ended with exit code -15"):
+            list(rollouts)
+    assert [process.is_alive() for process in processes] == [False, False]
+
+
+def test_an_error_in_a_worker_is_raised() -> None:
+    settings = RolloutSettings(SMALL, expert=forgets_the_gripper)
+    with (
+        RolloutPool(settings, iter([EpisodeSpec(seed=0)] * 9), num_workers=1) as pool,
+        pytest.raises(ValueError, match=r"\(3,\)"),
+    ):
+        next(iter(pool))
+
+
+def forgets_the_gripper(state: PrivilegedState, control_mode: str, fps: int) -> np.ndarray:
+    return expert_action(state)[:3]

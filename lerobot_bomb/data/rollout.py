@@ -3,15 +3,15 @@
 The workers import this module, so it imports neither torch nor LeRobot.
 """
 
-import atexit
+import itertools
 import multiprocessing
-import os
 import signal
-import threading
-from collections import deque
 from collections.abc import Callable, Iterator
-from concurrent.futures import Future, ProcessPoolExecutor
+from contextlib import suppress
 from dataclasses import dataclass, replace
+from multiprocessing import resource_tracker
+from multiprocessing.connection import Connection
+from multiprocessing.context import SpawnProcess
 from typing import Self
 
 import gymnasium
@@ -31,7 +31,6 @@ from lerobot_bomb.schema import (
 # Importing the part before the colon registers the id; no module of the core imports an environment.
 ENV_ID = "lerobot_env_bomb:bomb/{suite}-v0"
 NOISE_STREAM = 0xDA57  # keeps the noise independent of what the environment draws from the same seed
-LOOKAHEAD = 2  # episodes that wait for the writer, beside one in each worker
 
 # (privileged state, control mode, fps) -> (4,) action
 type Expert = Callable[[PrivilegedState, str, int], np.ndarray]
@@ -109,25 +108,30 @@ def perturb(action: np.ndarray, noise: float, control_mode: str, rng: np.random.
 class RolloutPool:
     """Worker processes that play an endless stream of episodes ahead of the writer.
 
-    Iterating yields the rollouts in the order of the specs, whatever the number of workers.
+    Iterating yields the rollouts in the order of the specs, whatever the number of workers: they take
+    turns. Each has a pipe of its own and no thread or lock is shared, so none can hang another.
+
+    Raises:
+        RuntimeError: a worker has ended by itself.
     """
 
     def __init__(self, settings: RolloutSettings, specs: Iterator[EpisodeSpec], num_workers: int) -> None:
-        self._executor = ProcessPoolExecutor(
-            num_workers,
-            # spawned, not forked: a fork of a process with threads may hang
-            mp_context=multiprocessing.get_context("spawn"),
-            initializer=_start_worker,
-            initargs=(settings,),
-        )
+        context = multiprocessing.get_context("spawn")  # a fork of a process with threads may hang
         self._specs = specs
-        self._pending: deque[Future[Rollout]] = deque()
-        # A worker inherits the mask. Ctrl-C in a terminal reaches it too, and would end it, with a
-        # traceback, while it still imports; the parent ends its workers in order.
+        self._processes: list[SpawnProcess] = []
+        self._pipes: list[Connection] = []
+        resource_tracker.ensure_running()  # starting it, which the first worker would do, unblocks SIGINT
+        # A worker inherits the mask. Ctrl-C in a terminal reaches it too, and would end it with a
+        # traceback; the parent ends its workers.
         usual = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
         try:
-            for _ in range(num_workers + LOOKAHEAD):
-                self._submit()
+            for _ in range(num_workers):
+                pipe, workers_end = context.Pipe()
+                process = context.Process(target=_work, args=(settings, workers_end), daemon=True)
+                process.start()
+                workers_end.close()
+                self._processes.append(process)
+                self._pipes.append(pipe)
         finally:
             signal.pthread_sigmask(signal.SIG_SETMASK, usual)
 
@@ -135,58 +139,58 @@ class RolloutPool:
         return self
 
     def __exit__(self, *_: object) -> None:
-        self._executor.shutdown(cancel_futures=True)
+        for process in self._processes:
+            process.kill()
+        for process in self._processes:
+            process.join()
 
     def __iter__(self) -> Iterator[Rollout]:
-        while True:
-            rollout = self._pending.popleft().result()
-            self._submit()
+        for pipe in (*self._pipes, *self._pipes):  # an episode to play and one to go on with
+            self._submit(pipe)
+        for process, pipe in itertools.cycle(zip(self._processes, self._pipes, strict=True)):
+            try:
+                rollout = pipe.recv()
+            except (EOFError, ConnectionError):
+                process.join()
+                raise RuntimeError(f"a simulator process ended with exit code {process.exitcode}") from None
+            if isinstance(rollout, Exception):
+                raise rollout
+            self._submit(pipe)
             yield rollout
 
-    def _submit(self) -> None:
-        self._pending.append(self._executor.submit(_play_in_worker, next(self._specs)))
+    def _submit(self, pipe: Connection) -> None:
+        with suppress(ConnectionError):  # the worker has ended; receiving from it says so
+            pipe.send(next(self._specs))
+
+
+def _work(settings: RolloutSettings, pipe: Connection) -> None:
+    """A worker's life: specs come, rollouts or an exception go, until the parent ends."""
+    worker = _Worker(settings)
+    with suppress(EOFError, ConnectionError):
+        while True:
+            pipe.send(worker.play(pipe.recv()))
+    worker.close()
 
 
 class _Worker:
-    """What a worker process keeps between episodes: the environment, as long as only the seed changes."""
+    """What a worker keeps between episodes: the environment, as long as only the seed changes."""
 
     def __init__(self, settings: RolloutSettings) -> None:
         self._settings = settings
         self._condition: EpisodeSpec | None = None
         self._env: gymnasium.Env | None = None
 
-    def play(self, spec: EpisodeSpec) -> Rollout:
+    def play(self, spec: EpisodeSpec) -> Rollout | Exception:
         condition = replace(spec, seed=0)
-        if self._env is None or condition != self._condition:
-            self.close()
-            self._env = make_env(spec, self._settings.render_options)
-            self._condition = condition
-        return play(self._env, spec, self._settings)
+        try:
+            if self._env is None or condition != self._condition:
+                self.close()
+                self._env = make_env(spec, self._settings.render_options)
+                self._condition = condition
+            return play(self._env, spec, self._settings)
+        except Exception as error:
+            return error
 
     def close(self) -> None:
         if self._env is not None:
             self._env.close()
-
-
-_worker: _Worker | None = None  # set once by _start_worker
-
-
-def _start_worker(settings: RolloutSettings) -> None:
-    global _worker
-    threading.Thread(target=_exit_with_parent, daemon=True).start()
-    _worker = _Worker(settings)
-    atexit.register(_worker.close)
-
-
-def _exit_with_parent() -> None:
-    """Leave when the recorder is killed: an idle worker would wait for work forever."""
-    parent = multiprocessing.parent_process()
-    if parent is not None:
-        parent.join()
-        os._exit(1)
-
-
-def _play_in_worker(spec: EpisodeSpec) -> Rollout:
-    if _worker is None:
-        raise RuntimeError("this process was not started as a rollout worker")
-    return _worker.play(spec)
