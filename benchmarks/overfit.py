@@ -28,10 +28,11 @@ from recipes import POLICY_TYPES, read_recipe, recipe_path
 
 from lerobot_bomb.commands import run_command
 from lerobot_bomb.evaluation.results import Row, read_results
-from lerobot_bomb.schema import Failure
+from lerobot_bomb.schema import EpisodeSpec, Failure
 
 SEED = 1007  # its board is empty, so nothing but the sentence tells the target
-TASK_IDS = (0, 4, 7, 11, 13, 15, 22, 24)  # 5 x row + column, all black
+TASK_IDS = (0, 4, 7, 11, 13, 15, 22, 24)  # all black
+TARGETS: dict[int, Any] = {task: EpisodeSpec(SEED).for_task(task).target for task in TASK_IDS}
 SHIFT = 3  # an episode is told the sentence of the task so many places further on
 IMAGE_SIZE = 128
 REPO_ID = "overfit/bomb_place"
@@ -163,17 +164,17 @@ def evaluate(checkpoint: Path, output_dir: Path) -> dict[int, Row]:
         "--eval.use_async_envs=false",
         f"--output_dir={output_dir / 'eval'}",
     )
-    rows = {
-        5 * row["target"][0] + row["target"][1]: row for row in read_results(output_dir / "results.jsonl")
-    }
-    if sorted(rows) != sorted(TASK_IDS):
-        raise SystemExit(f"{output_dir}: results of the tasks {sorted(rows)} instead of {sorted(TASK_IDS)}")
-    return rows
+    rows = {tuple(row["target"]): row for row in read_results(output_dir / "results.jsonl")}
+    if rows.keys() != set(TARGETS.values()):
+        raise SystemExit(
+            f"{output_dir}: results of the targets {sorted(rows)}, not of {list(TARGETS.values())}"
+        )
+    return {task: rows[target] for task, target in TARGETS.items()}
 
 
 def is_on(row: Row, task_id: int) -> bool:
     """Whether the stone was put down, nearest to this task's intersection, which is not the episode's."""
-    is_there = tuple(row["nearest_intersection"]) == divmod(task_id, 5)
+    is_there = tuple(row["nearest_intersection"]) == TARGETS[task_id]
     return is_there and row["failure"] == Failure.WRONG_INTERSECTION
 
 
@@ -189,7 +190,7 @@ def print_episodes(condition: Condition, rows: dict[int, Row]) -> None:
             str(row["steps"]),
             row["failure"] or "success",
         ]
-        for _, row in sorted(rows.items())
+        for row in rows.values()
     ]
     print_table(header, cells)
     print(flush=True)
