@@ -4,6 +4,8 @@ Its action is a continuous function of what an observation shows: gripper, measu
 stones, target. It keeps no phase and no counter, and never reads `PrivilegedState.stage`.
 """
 
+from dataclasses import replace
+
 import numpy as np
 
 from lerobot_bomb.schema import (
@@ -25,10 +27,11 @@ FLOOR_M = WORKSPACE_LOW_M[2] + 0.0007  # lowest height asked of the gripper
 PRESS_M = 0.0015  # below its goal: where a descent aims, lest its last millimetre take for ever
 RETREAT_HEIGHT_M = 0.11  # of the gripper after the release
 
-# Finger openings, metres. A held stone measures about 25 mm, open fingers 44 mm.
-EMPTY_OPENING_M = (0.018, 0.021)  # closed on nothing .. a stone may be between the pads
-HELD_OPENING_M = (0.0268, 0.0300)  # holds a stone .. does not yet
-OPEN_OPENING_M = (0.0320, 0.0390)  # still touches a stone .. is clear of it
+# Finger openings. Held, a stone measures about a millimetre less than its diameter.
+EMPTY_M = (-0.008, -0.005)  # from the diameter: closed on nothing .. a stone may be between the pads
+# in shares of the way from the stone's diameter to open fingers
+HELD_SHARE = (0.045, 0.220)  # holds a stone .. does not yet
+OPEN_SHARE = (0.330, 0.720)  # still touches a stone .. is clear of it
 
 # Approach: over the stone, down a funnel, close.
 HOVER_M = 0.040  # pads above their grasping height while the gripper is off to the side
@@ -55,12 +58,20 @@ def expert_action(
     Relative: units of `MAX_STEP_M`, within [-1, 1]; absolute: metres within the workspace.
     """
     one_of("--env.control_mode", control_mode, CONTROL_MODES)
+    state = _anticipate(state)
     motion_m, gripper = _plan(state, DEFAULT_FPS / fps)
     if control_mode == "absolute":
         xyz = np.clip(state.gripper_xyz + motion_m, WORKSPACE_LOW_M, WORKSPACE_HIGH_M)
     else:
         xyz = np.clip(motion_m / MAX_STEP_M, -1, 1)
     return np.array([*xyz, gripper], dtype=np.float32)
+
+
+def _anticipate(state: PrivilegedState) -> PrivilegedState:
+    """The state after the motion that the gripper has been told and, for latency, has not done yet."""
+    stone_xyz = state.stone_xyz.copy()
+    stone_xyz[state.stone] += _held(state, stone_xyz[state.stone]) * state.pending_motion_m
+    return replace(state, gripper_xyz=state.gripper_xyz + state.pending_motion_m, stone_xyz=stone_xyz)
 
 
 def _plan(state: PrivilegedState, tempo: float) -> tuple[np.ndarray, float]:
@@ -81,7 +92,7 @@ def _placed(state: PrivilegedState, stone_xyz: np.ndarray) -> float:
 
     A release moves the stone a little, and must not make the expert want it back.
     """
-    openness = _ramp(state.finger_opening, HELD_OPENING_M[0], OPEN_OPENING_M[0])
+    openness = _openness(state, (HELD_SHARE[0], OPEN_SHARE[0]))
     lateral_m = float(np.linalg.norm((state.target_xyz - stone_xyz)[:2]))
     height_m = float(stone_xyz[2] - state.target_xyz[2])
     # fingers that are as low as they go cannot lower a stone that they hold too high
@@ -95,8 +106,14 @@ def _placed(state: PrivilegedState, stone_xyz: np.ndarray) -> float:
 
 def _held(state: PrivilegedState, stone_xyz: np.ndarray) -> float:
     """How far the fingers hold the stone, in [0, 1]."""
-    closed = 1 - _ramp(state.finger_opening, *HELD_OPENING_M)
-    return _enclosed(state, stone_xyz) * closed * _ramp(state.finger_opening, *EMPTY_OPENING_M)
+    play_m = state.finger_opening - 2 * state.stone_radius_m
+    return _enclosed(state, stone_xyz) * (1 - _openness(state, HELD_SHARE)) * _ramp(play_m, *EMPTY_M)
+
+
+def _openness(state: PrivilegedState, shares: tuple[float, float]) -> float:
+    """How far the fingers are open, in [0, 1], between two shares of their play around a stone."""
+    diameter_m = 2 * state.stone_radius_m
+    return _ramp((state.finger_opening - diameter_m) / (state.max_opening_m - diameter_m), *shares)
 
 
 def _enclosed(state: PrivilegedState, stone_xyz: np.ndarray) -> float:
@@ -115,7 +132,7 @@ def _approach(state: PrivilegedState, stone_xyz: np.ndarray, tempo: float) -> tu
     enclosed = _enclosed(state, stone_xyz)
     funnel_m = np.clip((lateral_m - FUNNEL_MOUTH_M) * FUNNEL_SLOPE, 0, HOVER_M)
     # closed fingers would come down on the stone
-    shut_m = HOVER_M * (1 - _ramp(state.finger_opening, *OPEN_OPENING_M)) * (1 - enclosed)
+    shut_m = HOVER_M * (1 - _openness(state, OPEN_SHARE)) * (1 - enclosed)
     rise_m = max(funnel_m, shut_m) - PRESS_M - above_m
     # away from the stone, low fingers would sweep others off the board: first up, then across
     freedom = max(_ramp(above_m, 0.006, 0.016), 1 - _ramp(lateral_m, 0.005, 0.009))
@@ -123,7 +140,7 @@ def _approach(state: PrivilegedState, stone_xyz: np.ndarray, tempo: float) -> tu
     inside = min(
         1 - lateral_m / CLOSE_LATERAL_M,
         1 - above_m / CLOSE_HEIGHT_M,
-        (state.finger_opening - EMPTY_OPENING_M[0]) / CLOSE_HEIGHT_M,
+        (state.finger_opening - 2 * state.stone_radius_m - EMPTY_M[0]) / CLOSE_HEIGHT_M,
     )
     return motion_m, float(np.clip(-4 * inside, -1, 1))
 
@@ -140,7 +157,7 @@ def _carry(state: PrivilegedState, stone_xyz: np.ndarray, tempo: float) -> np.nd
 
 def _retreat(state: PrivilegedState, tempo: float) -> np.ndarray:
     """Displacement (3,) straight up, as soon as the fingers are clear of the stone."""
-    rise_m = max(0.0, RETREAT_HEIGHT_M - state.gripper_xyz[2]) * _ramp(state.finger_opening, *OPEN_OPENING_M)
+    rise_m = max(0.0, RETREAT_HEIGHT_M - state.gripper_xyz[2]) * _openness(state, OPEN_SHARE)
     return _step(np.zeros(2), rise_m, 1.0, tempo)
 
 

@@ -42,7 +42,7 @@ WORKSPACE_HIGH_M = (0.21, 0.13, 0.16)
 
 MAX_SEED = 2**32 - 1  # what LeRobot seeds NumPy with
 
-NUM_STONES = 12  # stones in the compiled model: on the board, to be moved, or parked out of sight
+NUM_STONES = 16  # stones in the compiled model: on the board, to be moved, or parked out of sight
 
 
 @dataclass(frozen=True)
@@ -217,8 +217,12 @@ class PrivilegedState:
     # how the environment reads actions
     control_mode: str = "relative"
     fps: int = DEFAULT_FPS
+    stone_radius_m: float = BOARD.stone_radius_m
+    max_opening_m: float = 0.044  # between the pads of open fingers
+    # (3,) metres: what the gripper has been told to do and, for latency, has not done yet
+    pending_motion_m: np.ndarray = field(default_factory=lambda: np.zeros(3))
 
-    DIM = 3 + 1 + 3 + 4 + 5 * NUM_STONES
+    DIM = 3 + 1 + 3 + 4 + 2 + 3 + 5 * NUM_STONES
 
     def to_vector(self) -> np.ndarray:
         """(DIM,) float32, the observation ``environment_state``."""
@@ -233,6 +237,9 @@ class PrivilegedState:
             list(Stage).index(self.stage),
             CONTROL_MODES.index(self.control_mode),
             self.fps,
+            self.stone_radius_m,
+            self.max_opening_m,
+            *self.pending_motion_m,
         ]
         return np.concatenate([head, stones.ravel()]).astype(np.float32)
 
@@ -242,7 +249,7 @@ class PrivilegedState:
         vector = np.asarray(vector, dtype=np.float64)
         if vector.shape != (cls.DIM,):
             raise ValueError(f"environment_state has shape {vector.shape}, expected ({cls.DIM},)")
-        stones = vector[11:].reshape(NUM_STONES, 5)
+        stones = vector[16:].reshape(NUM_STONES, 5)
         return cls(
             gripper_xyz=vector[0:3],
             finger_opening=float(vector[3]),
@@ -251,6 +258,9 @@ class PrivilegedState:
             stage=list(Stage)[int(vector[8])],
             control_mode=CONTROL_MODES[int(vector[9])],
             fps=int(vector[10]),
+            stone_radius_m=float(vector[11]),
+            max_opening_m=float(vector[12]),
+            pending_motion_m=vector[13:16],
             stone_xyz=stones[:, 0:3],
             stone_is_white=stones[:, 3] > 0.5,
             stone_in_play=stones[:, 4] > 0.5,

@@ -93,6 +93,9 @@ def test_privileged_state_survives_the_observation() -> None:
         stone_is_white=rng.random(NUM_STONES) > 0.5,
         stone_in_play=rng.random(NUM_STONES) > 0.5,
         stage=Stage.GRASPED,
+        stone_radius_m=0.011,
+        max_opening_m=0.033,
+        pending_motion_m=np.array([0.01, 0.0, -0.02]),
     )
     vector = state.to_vector()
     assert vector.shape == (PrivilegedState.DIM,)
@@ -102,6 +105,8 @@ def test_privileged_state_survives_the_observation() -> None:
     np.testing.assert_array_equal(back.stone_is_white, state.stone_is_white)
     np.testing.assert_array_equal(back.stone_in_play, state.stone_in_play)
     assert back.finger_opening == pytest.approx(0.026)
+    assert (back.stone_radius_m, back.max_opening_m) == pytest.approx((0.011, 0.033))
+    np.testing.assert_allclose(back.pending_motion_m, state.pending_motion_m, rtol=1e-6)
 
 
 def test_privileged_state_refuses_another_size() -> None:

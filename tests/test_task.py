@@ -95,6 +95,19 @@ def test_naming_target_and_colour_leaves_the_other_draws_as_they_were() -> None:
     np.testing.assert_array_equal(named.layout.stone_xy[STONE], drawn.layout.stone_xy[STONE])
 
 
+@settings(max_examples=50, deadline=None)
+@given(SEEDS, st.sampled_from(targets_of("all")), st.sampled_from(targets_of("all")))
+def test_the_board_tells_only_that_the_target_is_free_and_legal(
+    seed: int, one: tuple[int, int], other: tuple[int, int]
+) -> None:
+    for_one, for_other = (
+        opening(sample_episode(EpisodeSpec(seed=seed, color="white", target=target)))
+        for target in (one, other)
+    )
+    if is_legal_move(for_one, other, "white") and is_legal_move(for_other, one, "white"):
+        assert for_one == for_other
+
+
 def test_the_sentence_names_colour_row_and_column() -> None:
     episode = sample_episode(EpisodeSpec(seed=0, target=(3, 4), color="black"))
     sentences = {t.format(color="black", row=3, column=4) for t in TEMPLATES}

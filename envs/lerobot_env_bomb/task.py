@@ -126,8 +126,12 @@ def _sample_layout(rng: dict, target: tuple[int, int], color: str) -> Layout:
 
 
 def _sample_opening(rng: np.random.Generator, target: tuple[int, int], color: str) -> dict:
-    """{(row, column): colour} of 0-8 stones: a legal position in which the move to be made is legal."""
-    cells = [cell for cell in targets_of("all") if cell != target]
+    """{(row, column): colour} of 0-8 stones: a legal position in which the move to be made is legal.
+
+    The candidates do not depend on the move and the first that allows it is taken, so what stands on the
+    board tells nothing of the target but that it is free and legal.
+    """
+    cells = targets_of("all")
     num_stones = rng.integers(MAX_OPENING_STONES + 1)
     while True:
         chosen = rng.choice(len(cells), size=num_stones, replace=False)
