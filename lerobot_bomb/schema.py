@@ -12,6 +12,8 @@ from enum import StrEnum
 
 import numpy as np
 
+from lerobot_bomb.perturbations import NONE, Condition
+
 # Version of task, physics, observation and success rule. Results of different versions do not compare.
 PROTOCOL_VERSION = "0.1"
 
@@ -114,8 +116,11 @@ class EpisodeSpec:
     target: tuple[int, int] | None = None
     color: str | None = None
     success_tolerance_mm: float = 10.0
+    perturbations: str = NONE  # a condition such as "camera:2+light:3"; see `Condition`
 
     def __post_init__(self) -> None:
+        # one spelling, so that equal conditions compare equal
+        object.__setattr__(self, "perturbations", str(Condition.parse(self.perturbations)))
         one_of("--env.task", self.suite, SUITES)
         one_of("--env.robot", self.robot, ROBOTS)
         one_of("--env.split", self.split, SPLITS)
@@ -192,6 +197,7 @@ class EpisodeResult:
     placement_error_mm: float
     nearest_intersection: tuple[int, int]
     collateral_mm: float
+    levels: dict[str, int] = field(default_factory=dict)  # of the perturbation axes that were on
     protocol_version: str = PROTOCOL_VERSION
 
     def to_json(self) -> str:
