@@ -11,7 +11,7 @@ import json
 import multiprocessing
 from collections import defaultdict
 from collections.abc import Iterable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
 
@@ -20,6 +20,7 @@ from tqdm import tqdm
 
 from lerobot_bomb.data.rollout import perturb
 from lerobot_bomb.expert import expert_action
+from lerobot_bomb.perturbations import NONE
 from lerobot_bomb.schema import (
     BOARD,
     CONTROL_MODES,
@@ -54,26 +55,27 @@ class Outcome:
     idle_steps: tuple[int, ...]  # which steps
 
 
-def run_episode(seed: int, control_mode: str, fps: int, split: str, noise: float) -> Outcome:
+def run_episode(spec: EpisodeSpec, noise: float) -> Outcome:
     """Let the expert play one episode; `noise` is the standard deviation added to x, y, z, 1 = 40 mm."""
-    spec = EpisodeSpec(seed=seed, control_mode=control_mode, fps=fps, split=split)
     env = BombEnv(spec, RenderOptions(image_size=MIN_IMAGE_SIZE))
-    rng = np.random.default_rng([seed, NOISE_STREAM])
+    rng = np.random.default_rng([spec.seed, NOISE_STREAM])
     observation, _ = env.reset()
     idle, ended, step = [], False, 0
     while not ended:
         before = PrivilegedState.from_vector(observation["environment_state"])
-        action = expert_action(before, control_mode, fps)
-        executed = perturb(action, noise, control_mode, rng)
+        action = expert_action(before, spec.control_mode, spec.fps)
+        executed = perturb(action, noise, spec.control_mode, rng)
         observation, _, terminated, truncated, _ = env.step(executed)
         after = PrivilegedState.from_vector(observation["environment_state"])
-        if is_idle(action, before, after, control_mode) and not is_done(before, spec.success_tolerance_mm):
+        if is_idle(action, before, after, spec.control_mode) and not is_done(
+            before, spec.success_tolerance_mm
+        ):
             idle.append(step)
         ended, step = terminated or truncated, step + 1
     result = env.episode_result()
     env.close()
     return Outcome(
-        seed=seed,
+        seed=spec.seed,
         is_success=result.is_success,
         is_success_bomb_v0=result.is_success_bomb_v0,
         failure=result.failure,
@@ -96,7 +98,7 @@ def is_done(state: PrivilegedState, tolerance_mm: float) -> bool:
     stone_xyz = state.stone_xyz[state.stone]
     error_mm = 1e3 * np.linalg.norm((stone_xyz - state.target_xyz)[:2])
     is_clear = state.gripper_xyz[2] > stone_xyz[2] + BOARD.stone_height_m
-    is_open = state.finger_opening > 2 * BOARD.stone_radius_m
+    is_open = state.finger_opening > 2 * state.stone_radius_m
     return bool(error_mm <= tolerance_mm and is_clear and is_open)
 
 
@@ -136,15 +138,21 @@ def main() -> None:
     parser.add_argument(
         "--noise", type=float, default=0.0, help="standard deviation added to x, y, z; 1 = 40 mm"
     )
+    parser.add_argument("--perturbations", default=NONE, help="a condition, as camera:3 or all:5")
     parser.add_argument("--workers", type=int, default=1)
     parser.add_argument("--json", type=Path, help="write figures and episodes here")
     args = parser.parse_args()
 
-    run = partial(
-        run_episode, control_mode=args.control_mode, fps=args.fps, split=args.split, noise=args.noise
+    spec = EpisodeSpec(
+        seed=args.seed,
+        control_mode=args.control_mode,
+        fps=args.fps,
+        split=args.split,
+        perturbations=args.perturbations,
     )
+    specs = [replace(spec, seed=args.seed + i) for i in range(args.episodes)]
     with multiprocessing.get_context("forkserver").Pool(args.workers) as pool:
-        results: Iterable[Outcome] = pool.imap(run, range(args.seed, args.seed + args.episodes), chunksize=4)
+        results: Iterable[Outcome] = pool.imap(partial(run_episode, noise=args.noise), specs, chunksize=4)
         outcomes = list(tqdm(results, total=args.episodes, unit="episode"))
     figures = summarize(outcomes)
     for name, value in figures.items():

@@ -27,7 +27,8 @@ FLOOR_M = WORKSPACE_LOW_M[2] + 0.0007  # lowest height asked of the gripper
 PRESS_M = 0.0015  # below its goal: where a descent aims, lest its last millimetre take for ever
 RETREAT_HEIGHT_M = 0.11  # of the gripper after the release
 
-# Finger openings. Held, a stone measures about a millimetre less than its diameter.
+# Finger openings.
+SQUEEZE_M = 0.001  # that a held stone measures less than its diameter
 EMPTY_M = (-0.008, -0.005)  # from the diameter: closed on nothing .. a stone may be between the pads
 # in shares of the way from the stone's diameter to open fingers
 HELD_SHARE = (0.045, 0.220)  # holds a stone .. does not yet
@@ -68,10 +69,15 @@ def expert_action(
 
 
 def _anticipate(state: PrivilegedState) -> PrivilegedState:
-    """The state after the motion that the gripper has been told and, for latency, has not done yet."""
+    """The state after what the gripper has been told and, for latency, has not done yet."""
     stone_xyz = state.stone_xyz.copy()
     stone_xyz[state.stone] += _held(state, stone_xyz[state.stone]) * state.pending_motion_m
-    return replace(state, gripper_xyz=state.gripper_xyz + state.pending_motion_m, stone_xyz=stone_xyz)
+    state = replace(state, gripper_xyz=state.gripper_xyz + state.pending_motion_m, stone_xyz=stone_xyz)
+    if state.pending_gripper == 0:
+        return state
+    closed_m = _enclosed(state, stone_xyz[state.stone]) * (2 * state.stone_radius_m - SQUEEZE_M)
+    opening_m = state.max_opening_m if state.pending_gripper > 0 else min(closed_m, state.finger_opening)
+    return replace(state, finger_opening=opening_m)
 
 
 def _plan(state: PrivilegedState, tempo: float) -> tuple[np.ndarray, float]:

@@ -30,6 +30,7 @@ class Axis:
     magnitudes: dict[str, Magnitude]
 
 
+# Append only: an axis' place in this dict numbers its stream of random numbers.
 AXES = {
     "table": Axis(
         "colour and pattern of the table, colour of the tray",
@@ -46,7 +47,7 @@ AXES = {
         ("images",),
         {
             "gloss": Magnitude(
-                "share", (0.1, 0.2, 0.3, 0.4, 0.5), "specular light of stones, tray and table"
+                "share", (0.08, 0.16, 0.24, 0.32, 0.4), "specular light of stones, tray and table"
             ),
             "glare": Magnitude(
                 "share", (0.08, 0.16, 0.24, 0.32, 0.4), "opacity of a lamp's reflection, drawn on the board"
@@ -74,8 +75,8 @@ AXES = {
         ("images",),
         {
             "balance": Magnitude("share", (0.04, 0.08, 0.12, 0.17, 0.22), "up or down, of a drawn channel"),
-            "brightness": Magnitude("share", (0.05, 0.1, 0.15, 0.2, 0.25), "up or down, of all channels"),
-            "noise": Magnitude("grey levels", (2, 4, 7, 11, 16), "standard deviation, of each pixel"),
+            "brightness": Magnitude("share", (0.03, 0.06, 0.09, 0.12, 0.15), "up or down, of all channels"),
+            "noise": Magnitude("grey levels", (2, 4, 6, 9, 13), "standard deviation, of each pixel"),
         },
     ),
     "camera": Axis(
@@ -94,8 +95,8 @@ AXES = {
         "intensity and direction of the light",
         ("images",),
         {
-            "dim": Magnitude("factor", (0.9, 0.78, 0.67, 0.56, 0.45), "of all light, or"),
-            "bright": Magnitude("factor", (1.12, 1.27, 1.44, 1.62, 1.8), "of all light, whichever is drawn"),
+            "dim": Magnitude("factor", (0.88, 0.76, 0.65, 0.55, 0.45), "of all light, or"),
+            "bright": Magnitude("factor", (1.15, 1.3, 1.46, 1.63, 1.8), "of all light, whichever is drawn"),
             "tilt": Magnitude("degrees", (7, 14, 21, 28, 35), "of the lamp, in a drawn direction"),
         },
     ),
@@ -120,9 +121,9 @@ AXES = {
         "size, shape and shade of the stones",
         ("images", "state"),
         {
-            "radius": Magnitude("mm", (0.3, 0.6, 0.9, 1.2, 1.5), "more or less than 13"),
-            "height": Magnitude("mm", (0.4, 0.8, 1.2, 1.6, 2.0), "more or less than 9"),
-            "shade": Magnitude("share", (0.06, 0.12, 0.18, 0.24, 0.3), "of the way to grey, either colour"),
+            "radius": Magnitude("mm", (0.4, 0.8, 1.2, 1.6, 2.0), "more or less than 13"),
+            "height": Magnitude("mm", (0.5, 1.0, 1.5, 2.0, 2.5), "more or less than 9"),
+            "shade": Magnitude("share", (0.08, 0.16, 0.24, 0.32, 0.4), "of the way to grey, either colour"),
             "flat": Magnitude("yes", (0, 0, 1, 1, 1), "discs instead of lenses"),
         },
     ),

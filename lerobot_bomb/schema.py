@@ -225,10 +225,11 @@ class PrivilegedState:
     fps: int = DEFAULT_FPS
     stone_radius_m: float = BOARD.stone_radius_m
     max_opening_m: float = 0.044  # between the pads of open fingers
-    # (3,) metres: what the gripper has been told to do and, for latency, has not done yet
+    # what the gripper has been told and, for latency, has not done yet: (3,) metres, and its command or 0
     pending_motion_m: np.ndarray = field(default_factory=lambda: np.zeros(3))
+    pending_gripper: float = 0.0
 
-    DIM = 3 + 1 + 3 + 4 + 2 + 3 + 5 * NUM_STONES
+    DIM = 3 + 1 + 3 + 4 + 2 + 4 + 5 * NUM_STONES
 
     def to_vector(self) -> np.ndarray:
         """(DIM,) float32, the observation ``environment_state``."""
@@ -246,6 +247,7 @@ class PrivilegedState:
             self.stone_radius_m,
             self.max_opening_m,
             *self.pending_motion_m,
+            self.pending_gripper,
         ]
         return np.concatenate([head, stones.ravel()]).astype(np.float32)
 
@@ -255,7 +257,7 @@ class PrivilegedState:
         vector = np.asarray(vector, dtype=np.float64)
         if vector.shape != (cls.DIM,):
             raise ValueError(f"environment_state has shape {vector.shape}, expected ({cls.DIM},)")
-        stones = vector[16:].reshape(NUM_STONES, 5)
+        stones = vector[17:].reshape(NUM_STONES, 5)
         return cls(
             gripper_xyz=vector[0:3],
             finger_opening=float(vector[3]),
@@ -267,6 +269,7 @@ class PrivilegedState:
             stone_radius_m=float(vector[11]),
             max_opening_m=float(vector[12]),
             pending_motion_m=vector[13:16],
+            pending_gripper=float(vector[16]),
             stone_xyz=stones[:, 0:3],
             stone_is_white=stones[:, 3] > 0.5,
             stone_in_play=stones[:, 4] > 0.5,

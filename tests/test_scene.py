@@ -4,7 +4,6 @@ import pytest
 from lerobot_bomb.schema import BOARD, CAMERAS, NUM_STONES, PHYSICS_HZ, EpisodeSpec, RenderOptions
 from lerobot_env_bomb.model import (
     BOARD_HALF_SIZE_M,
-    REST_HEIGHT_M,
     TRAY_CENTER_XY,
     TRAY_HALF_SIZE_XY,
     parked_xyz,
@@ -22,6 +21,8 @@ from lerobot_env_bomb.task import STONE, sample_episode
 
 NUM_SUBSTEPS = 20
 BLACK_CELL, WHITE_CELL = (1, 1), (3, 3)
+
+REST_HEIGHT_M = BOARD.thickness_m + BOARD.stone_height_m / 2
 
 
 @pytest.fixture(scope="module")

@@ -96,6 +96,7 @@ def test_privileged_state_survives_the_observation() -> None:
         stone_radius_m=0.011,
         max_opening_m=0.033,
         pending_motion_m=np.array([0.01, 0.0, -0.02]),
+        pending_gripper=-1.0,
     )
     vector = state.to_vector()
     assert vector.shape == (PrivilegedState.DIM,)
@@ -107,6 +108,7 @@ def test_privileged_state_survives_the_observation() -> None:
     assert back.finger_opening == pytest.approx(0.026)
     assert (back.stone_radius_m, back.max_opening_m) == pytest.approx((0.011, 0.033))
     np.testing.assert_allclose(back.pending_motion_m, state.pending_motion_m, rtol=1e-6)
+    assert back.pending_gripper == -1.0
 
 
 def test_privileged_state_refuses_another_size() -> None:

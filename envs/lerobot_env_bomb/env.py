@@ -1,6 +1,7 @@
 """BOMB as a Gymnasium environment."""
 
 import os
+from collections import deque
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -35,6 +36,7 @@ DEFAULT_RENDER_OPTIONS = RenderOptions()
 PERSON_IMAGE_SIZE = 384  # pixels, either half of render()'s picture
 # Bounds of what the simulator can report, metres. Stones can be flung off the board, so they are wide.
 POSITION_LIMIT_M = 100.0
+ACTION_NOISE_STREAM = 300  # of random numbers, apart from those that an episode is drawn from
 
 
 @dataclass(frozen=True)
@@ -44,6 +46,8 @@ class _Run:
     scene: Scene
     episode: Episode
     judge: Judge
+    pending: deque[np.ndarray]  # actions that latency keeps from being executed yet, oldest first
+    noise_rng: np.random.Generator
 
 
 class BombEnv(gymnasium.Env[Observation, np.ndarray]):
@@ -101,8 +105,8 @@ class BombEnv(gymnasium.Env[Observation, np.ndarray]):
             seed = int(self.np_random.integers(2**31))
         episode = sample_episode(replace(self._spec, seed=int(seed)))
         scene = self._current_run.scene if self._current_run is not None else Scene()
-        scene.reset(episode.layout)
-        self._current_run = _Run(scene, episode, Judge(episode, self._spec.fps, scene.measure()))
+        scene.reset(episode.layout, episode.perturbation.model_edits)
+        self._current_run = self._start(scene, episode)
         self.task_description = episode.instruction
         self._steps = 0
         self._last_transition = None
@@ -111,10 +115,13 @@ class BombEnv(gymnasium.Env[Observation, np.ndarray]):
     def step(self, action: np.ndarray) -> tuple[Observation, float, bool, bool, dict[str, Any]]:
         """Run one control step. An action outside the action space is clipped."""
         run = self._run
-        target_xyz, open_fingers = self._decode(action)
+        action = self._check(action)
         if self._last_transition is not None:
             return self._last_transition
-        run.scene.move(target_xyz, open_fingers, self._num_substeps)
+        run.pending.append(action)
+        executed = run.pending.popleft()
+        target_xyz = self._target_xyz(executed) + self._action_noise_m()
+        run.scene.move(target_xyz, bool(executed[3] >= 0), self._num_substeps)
         self._steps += 1
         terminated = run.judge.update(run.scene.measure())
         truncated = not terminated and self._steps >= self._max_episode_steps
@@ -155,6 +162,7 @@ class BombEnv(gymnasium.Env[Observation, np.ndarray]):
             placement_error_mm=judge.placement_error_mm,
             nearest_intersection=judge.nearest_intersection,
             collateral_mm=judge.collateral_mm,
+            levels=episode.perturbation.levels,
         )
 
     def close(self) -> None:
@@ -178,6 +186,10 @@ class BombEnv(gymnasium.Env[Observation, np.ndarray]):
             stage=run.judge.stage,
             control_mode=self._spec.control_mode,
             fps=self._spec.fps,
+            stone_radius_m=run.episode.layout.stone_radius_m,
+            max_opening_m=2 * MAX_HALF_OPENING_M,
+            pending_motion_m=self._pending_motion_m(now.gripper_xyz),
+            pending_gripper=float(run.pending[-1][3]) if run.pending else 0.0,
         )
 
     @property
@@ -186,18 +198,50 @@ class BombEnv(gymnasium.Env[Observation, np.ndarray]):
             raise ResetNeeded("call reset before anything else")
         return self._current_run
 
-    def _decode(self, action: np.ndarray) -> tuple[np.ndarray, bool]:
-        """Action -> (3,) commanded position in metres, whether to open the fingers."""
+    def _start(self, scene: Scene, episode: Episode) -> _Run:
+        """The run of an episode whose layout is in the scene."""
+        start = scene.measure()
+        dynamics = episode.perturbation.dynamics
+        rest = np.zeros(3) if self._spec.control_mode == "relative" else start.gripper_xyz
+        latency = dynamics.latency if dynamics is not None else 0
+        return _Run(
+            scene=scene,
+            episode=episode,
+            judge=Judge(episode, self._spec.fps, start),
+            pending=deque([np.array([*rest, 1.0])] * latency),
+            noise_rng=np.random.default_rng([episode.spec.seed, ACTION_NOISE_STREAM]),
+        )
+
+    def _check(self, action: np.ndarray) -> np.ndarray:
+        """(4,) float64 within the action space."""
         action = np.asarray(action, dtype=np.float64)
         if action.shape != (ACTION_DIM,):
             raise ValueError(f"action has shape {action.shape}, expected ({ACTION_DIM},)")
         if not np.isfinite(action).all():
             raise ValueError(f"action {action.tolist()} is not finite")
-        action = np.clip(action, self._action_low, self._action_high)
-        open_fingers = bool(action[3] >= 0)
+        return np.clip(action, self._action_low, self._action_high)
+
+    def _target_xyz(self, action: np.ndarray) -> np.ndarray:
+        """(3,) metres, where an action that is executed now sends the gripper."""
         if self._spec.control_mode == "absolute":
-            return action[:3], open_fingers
-        return self._run.scene.measure().gripper_xyz + MAX_STEP_M * action[:3], open_fingers
+            return action[:3]
+        return self._run.scene.measure().gripper_xyz + MAX_STEP_M * action[:3]
+
+    def _action_noise_m(self) -> np.ndarray:
+        """(3,) metres, what the axis `dynamics` adds to a step's command."""
+        dynamics = self._run.episode.perturbation.dynamics
+        if dynamics is None:
+            return np.zeros(3)
+        return MAX_STEP_M * dynamics.noise * self._run.noise_rng.standard_normal(3)
+
+    def _pending_motion_m(self, gripper_xyz: np.ndarray) -> np.ndarray:
+        """(3,) metres that the actions still to be executed will move the gripper."""
+        pending = self._run.pending
+        if not pending:
+            return np.zeros(3)
+        if self._spec.control_mode == "absolute":
+            return pending[-1][:3] - gripper_xyz
+        return MAX_STEP_M * np.sum([action[:3] for action in pending], axis=0)
 
     def _observe(self) -> Observation:
         state = self.privileged_state()
@@ -212,7 +256,11 @@ class BombEnv(gymnasium.Env[Observation, np.ndarray]):
         if self._renderer is None:
             largest = max(self._render_options.image_size, PERSON_IMAGE_SIZE)
             self._renderer = CameraRenderer(self._run.scene.model, self._render_options, largest)
-        return self._renderer.draw(self._run.scene.data, camera, size)
+        rgb = self._renderer.draw(self._run.scene.data, camera, size)
+        photometric = self._run.episode.perturbation.photometric
+        if photometric is None:
+            return rgb
+        return photometric(rgb, len(CAMERAS) * self._steps + CAMERAS.index(camera))
 
     def _info(self) -> dict[str, Any]:
         judge = self._run.judge

@@ -5,7 +5,6 @@ import math
 import numpy as np
 
 from lerobot_bomb.schema import BOARD, NUM_STONES, Failure, Stage
-from lerobot_env_bomb.model import REST_HEIGHT_M
 from lerobot_env_bomb.scene import Snapshot
 from lerobot_env_bomb.task import STONE, Episode
 
@@ -57,7 +56,7 @@ class Judge:
         step_m = now.stone_xyz - self._now.stone_xyz
         speed_m_s = np.sqrt((step_m**2).sum(axis=1)) * self._fps
         self._rest_steps = np.where(~touched & (speed_m_s < REST_SPEED_M_S), self._rest_steps + 1, 0)
-        is_high: np.ndarray = now.stone_xyz[:, 2] > REST_HEIGHT_M + LIFT_M
+        is_high: np.ndarray = now.stone_xyz[:, 2] > self._episode.layout.rest_height_m + LIFT_M
         self._was_lifted = self._was_lifted | (held & is_high)
         self._last_touched_z[touched] = now.stone_xyz[touched, 2]
         self._now = now
@@ -89,7 +88,9 @@ class Judge:
 
     def _update_stage(self, is_held: bool) -> None:
         offset = self._now.gripper_xyz - self._now.stone_xyz[STONE]
-        is_around = np.linalg.norm(offset[:2]) < BOARD.stone_radius_m and offset[2] < BOARD.stone_height_m / 2
+        layout = self._episode.layout
+        is_beside = np.linalg.norm(offset[:2]) < layout.stone_radius_m
+        is_around = is_beside and offset[2] < layout.stone_height_m / 2
         reached = {
             Stage.REACHED: is_around,
             Stage.GRASPED: is_held,
@@ -101,7 +102,9 @@ class Judge:
                 self.stage = stage
 
     def _is_flat(self) -> bool:
-        return bool(abs(self._now.stone_xyz[STONE, 2] - REST_HEIGHT_M) < FLAT_TOLERANCE_M)
+        return bool(
+            abs(self._now.stone_xyz[STONE, 2] - self._episode.layout.rest_height_m) < FLAT_TOLERANCE_M
+        )
 
     def _is_on_target(self) -> bool:
         return bool(self._is_flat() and self.placement_error_mm <= self._episode.spec.success_tolerance_mm)
@@ -122,4 +125,7 @@ class Judge:
     def _was_dropped(self) -> bool:
         xy = self._now.stone_xyz[STONE, :2]
         off_m = np.linalg.norm(xy - BOARD.intersection_xy(*self.nearest_intersection))
-        return bool(off_m > OFF_BOARD_M or self._last_touched_z[STONE] > REST_HEIGHT_M + DROP_HEIGHT_M)
+        return bool(
+            off_m > OFF_BOARD_M
+            or self._last_touched_z[STONE] > self._episode.layout.rest_height_m + DROP_HEIGHT_M
+        )

@@ -5,6 +5,7 @@ from pathlib import Path
 
 import numpy as np
 
+from lerobot_bomb.perturbations import MAX_LEVEL, magnitude
 from lerobot_bomb.schema import BOARD, NUM_STONES
 from lerobot_env_bomb.backend import ensure_gl_backend
 
@@ -16,9 +17,10 @@ SCENE_XML = Path(__file__).with_name("scene.xml")
 
 TRAY_CENTER_XY = (0.170, 0.0)  # metres; the tray beside the board from which stones are taken
 TRAY_HALF_SIZE_XY = (0.045, 0.125)  # metres; it touches the board
-# Board and tray are equally high, so a stone rests at the same height on both.
-REST_HEIGHT_M = BOARD.thickness_m + BOARD.stone_height_m / 2  # stone's centre above the table
 BOARD_HALF_SIZE_M = (BOARD.num_lines - 1) / 2 * BOARD.pitch_m + BOARD.margin_m
+
+# How deep board and tray reach into the table: a stone that is pressed into them comes out at the top.
+SUNK_M = 0.05
 
 PARKED_XYZ = (1.0, 1.0, -0.5)  # metres, below the table: where stones wait that an episode does not use
 PARKED_SPACING_M = 0.05
@@ -34,20 +36,37 @@ LINE_WIDTH_M = 0.0020
 STAR_POINT_RADIUS_M = 0.0036
 TEXTURE_SIZE = 512  # pixels
 
+TABLE_PATTERNS = ("stripes", "checks", "speckles")  # of the axis `table`, each at every level
+PATTERN_SIZE = 64  # pixels of a tile
+PATTERN_TILE_M = 0.16  # a tile's edge on the table
+NUM_GLARE_RINGS = 6  # transparent discs that make a lamp's reflection on the board
+GLARE_RADIUS_M = 0.055  # of the largest
+GLARE_HEIGHT_M = 2e-4
+GOAL_MARKER_RGB = (0.10, 0.35, 0.95)
+HIDDEN = 0.0  # opacity of what only a perturbation shows
+
 
 def build_model() -> mujoco.MjModel:
     """Compile the scene; every episode reuses the result."""
     spec = mujoco.MjSpec.from_file(str(SCENE_XML))
     _add_board(spec)
     _add_tray(spec)
+    _add_table_patterns(spec)
+    _add_marks(spec)
     for index in range(NUM_STONES):
         _add_stone(spec, index)
     model = spec.compile()
     # Painted after compilation: handing the pixels to MjSpec one by one takes a second.
-    start = model.texture("board").adr[0]
-    picture = board_texture().ravel()
-    model.tex_data[start : start + picture.size] = picture
+    _paint(model, "board", board_texture())
+    for pattern in TABLE_PATTERNS:
+        for level in range(1, MAX_LEVEL + 1):
+            _paint(model, table_material(pattern, level), pattern_texture(pattern, level))
     return model
+
+
+def _paint(model: mujoco.MjModel, texture: str, picture: np.ndarray) -> None:
+    start = model.texture(texture).adr[0]
+    model.tex_data[start : start + picture.size] = picture.ravel()
 
 
 def stone_name(index: int) -> str:
@@ -58,6 +77,16 @@ def stone_name(index: int) -> str:
 def foot_name(index: int, foot: int) -> str:
     """Name of one of the balls that a stone stands on."""
     return f"{stone_name(index)}_foot_{foot}"
+
+
+def table_material(pattern: str, level: int) -> str:
+    """Name of material and texture of the table's pattern at a level of the axis `table`."""
+    return f"table_{pattern}_{level}"
+
+
+def glare_name(ring: int) -> str:
+    """Name of a disc of the lamp's reflection."""
+    return f"glare_{ring}"
 
 
 def parked_xyz(index: int) -> np.ndarray:
@@ -87,6 +116,18 @@ def board_texture() -> np.ndarray:
     return np.clip((1 - ink) * wood + ink * np.array(LINE_RGB), 0, 255).astype(np.uint8)
 
 
+def pattern_texture(pattern: str, level: int) -> np.ndarray:
+    """(PATTERN_SIZE, PATTERN_SIZE, 3) uint8 tile that darkens the table by up to the level's contrast."""
+    i, j = np.indices((PATTERN_SIZE, PATTERN_SIZE)) * 4 // PATTERN_SIZE
+    darkness = {
+        "stripes": i % 2,
+        "checks": (i + j) % 2,
+        "speckles": np.random.default_rng(0).random((PATTERN_SIZE // 2,) * 2).repeat(2, 0).repeat(2, 1) ** 2,
+    }[pattern]
+    tile = 255 * (1 - magnitude("table", "pattern", level) * darkness)
+    return np.repeat(tile[..., None], 3, axis=2).astype(np.uint8)
+
+
 def _coverage(inside_m: np.ndarray, pixel_m: float) -> np.ndarray:
     """Share of a pixel in [0, 1] that lies inside a shape, from the distance to its edge."""
     return np.clip(inside_m / pixel_m + 0.5, 0, 1)
@@ -108,8 +149,8 @@ def _add_board(spec: mujoco.MjSpec) -> None:
         spec.find_default("support"),
         name="board",
         type=mujoco.mjtGeom.mjGEOM_BOX,
-        size=[half, half, BOARD.thickness_m / 2],
-        pos=[0, 0, BOARD.thickness_m / 2],
+        size=[half, half, (BOARD.thickness_m + SUNK_M) / 2],
+        pos=[0, 0, (BOARD.thickness_m - SUNK_M) / 2],
         rgba=[*(np.array(WOOD_RGB) / 255 * 0.8), 1],
     )
     # The drawn surface floats a tenth of a millimetre above the wood so that the two do not flicker.
@@ -129,9 +170,51 @@ def _add_tray(spec: mujoco.MjSpec) -> None:
         spec.find_default("support"),
         name="tray",
         type=mujoco.mjtGeom.mjGEOM_BOX,
-        size=[*TRAY_HALF_SIZE_XY, BOARD.thickness_m / 2],
-        pos=[*TRAY_CENTER_XY, BOARD.thickness_m / 2],
+        size=[*TRAY_HALF_SIZE_XY, (BOARD.thickness_m + SUNK_M) / 2],
+        pos=[*TRAY_CENTER_XY, (BOARD.thickness_m - SUNK_M) / 2],
         material="mat",
+    )
+
+
+def _add_table_patterns(spec: mujoco.MjSpec) -> None:
+    for pattern in TABLE_PATTERNS:
+        for level in range(1, MAX_LEVEL + 1):
+            name = table_material(pattern, level)
+            spec.add_texture(
+                name=name,
+                type=mujoco.mjtTexture.mjTEXTURE_2D,
+                width=PATTERN_SIZE,
+                height=PATTERN_SIZE,
+                nchannel=3,
+                builtin=mujoco.mjtBuiltin.mjBUILTIN_FLAT,
+            )
+            material = spec.add_material(
+                name=name,
+                specular=0.1,
+                shininess=0.1,
+                texuniform=True,
+                texrepeat=[1 / PATTERN_TILE_M, 1 / PATTERN_TILE_M],
+            )
+            material.textures[mujoco.mjtTextureRole.mjTEXROLE_RGB] = name
+
+
+def _add_marks(spec: mujoco.MjSpec) -> None:
+    """What lies on the board's surface, hidden unless an axis shows it: a lamp's reflection, a dot."""
+    surface_m = BOARD.thickness_m + GLARE_HEIGHT_M
+    for ring in range(NUM_GLARE_RINGS):
+        radius_m = GLARE_RADIUS_M * (ring + 1) / NUM_GLARE_RINGS
+        _add_disc(spec, glare_name(ring), radius_m, surface_m, (1, 1, 1, HIDDEN))
+    _add_disc(spec, "goal_marker", STAR_POINT_RADIUS_M, surface_m, (*GOAL_MARKER_RGB, HIDDEN))
+
+
+def _add_disc(spec: mujoco.MjSpec, name: str, radius_m: float, height_m: float, rgba: tuple) -> None:
+    spec.worldbody.add_geom(
+        spec.find_default("visual"),
+        name=name,
+        type=mujoco.mjtGeom.mjGEOM_CYLINDER,
+        size=[radius_m, 1e-4, 0],
+        pos=[0, 0, height_m],
+        rgba=rgba,
     )
 
 

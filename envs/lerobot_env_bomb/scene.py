@@ -1,15 +1,15 @@
 # pyright: reportAttributeAccessIssue=false, reportInvalidTypeForm=false
 """Runs BOMB's model: put an episode's layout on the table, move the gripper, measure."""
 
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
 
-from lerobot_bomb.schema import NUM_STONES, WORKSPACE_HIGH_M, WORKSPACE_LOW_M
+from lerobot_bomb.schema import BOARD, NUM_STONES, WORKSPACE_HIGH_M, WORKSPACE_LOW_M
 from lerobot_env_bomb.backend import ensure_gl_backend
 from lerobot_env_bomb.model import (
     NUM_FEET,
-    REST_HEIGHT_M,
     build_model,
     foot_name,
     parked_xyz,
@@ -32,6 +32,15 @@ LINK_M = 0.27  # length of either link; as in scene.xml
 STONE_RGBA = {True: (0.96, 0.96, 0.93, 1.0), False: (0.06, 0.06, 0.07, 1.0)}  # by "is white"
 HIDDEN_RGBA = (0.0, 0.0, 0.0, 0.0)
 
+type ModelEdit = Callable[[mujoco.MjModel], None]
+# What edits may change; a reset undoes it.
+EDITABLE = (
+    *("body_inertia", "body_invweight0", "body_mass", "body_subtreemass", "bvh_aabb", "cam_fovy", "cam_pos"),
+    *("cam_quat", "dof_invweight0", "geom_aabb", "geom_friction", "geom_matid", "geom_pos", "geom_rbound"),
+    *("geom_rgba", "geom_size", "geom_type", "light_diffuse", "light_dir", "light_specular", "mat_rgba"),
+    *("mat_shininess", "mat_specular"),
+)
+
 
 @dataclass(frozen=True)
 class Layout:
@@ -41,6 +50,13 @@ class Layout:
     stone_xy: np.ndarray  # (NUM_STONES, 2) metres
     stone_is_white: np.ndarray  # (NUM_STONES,) bool
     stone_in_play: np.ndarray  # (NUM_STONES,) bool
+    stone_radius_m: float = BOARD.stone_radius_m
+    stone_height_m: float = BOARD.stone_height_m
+
+    @property
+    def rest_height_m(self) -> float:
+        """Height of the centre of a stone that rests; board and tray are equally high."""
+        return BOARD.thickness_m + self.stone_height_m / 2
 
 
 @dataclass(frozen=True)
@@ -72,13 +88,20 @@ class Scene:
             [self.model.joint(f"{side}_finger").qposadr[0] for side in ("left", "right")]
         )
         self._grip = self.model.site("grip").id
+        headlight = self.model.vis.headlight
+        arrays = [getattr(self.model, name) for name in EDITABLE] + [headlight.ambient, headlight.diffuse]
+        self._nominal = [(array, array.copy()) for array in arrays]
 
-    def reset(self, layout: Layout) -> None:
-        """Start from the layout, at rest, with the fingers open."""
+    def reset(self, layout: Layout, edits: Sequence[ModelEdit] = ()) -> None:
+        """Start from the layout, at rest, with the fingers open, in a model with these edits only."""
         mujoco.mj_resetData(self.model, self.data)
+        for array, nominal in self._nominal:
+            array[...] = nominal
         self._show_stones(layout)
+        for edit in edits:
+            edit(self.model)
         for i, adr in enumerate(self._stone_qpos):
-            xyz = [*layout.stone_xy[i], REST_HEIGHT_M] if layout.stone_in_play[i] else parked_xyz(i)
+            xyz = [*layout.stone_xy[i], layout.rest_height_m] if layout.stone_in_play[i] else parked_xyz(i)
             self.data.qpos[adr : adr + 7] = [*xyz, 1, 0, 0, 0]
         for joint, value in arm_joints(layout.gripper_xyz).items():
             self.data.joint(joint).qpos = value

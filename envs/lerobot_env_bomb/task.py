@@ -16,7 +16,8 @@ from lerobot_bomb.schema import (
     EpisodeSpec,
 )
 from lerobot_env_bomb.go import is_legal_move, is_legal_position
-from lerobot_env_bomb.model import REST_HEIGHT_M, TRAY_CENTER_XY
+from lerobot_env_bomb.model import TRAY_CENTER_XY
+from lerobot_env_bomb.perturb import Perturbation, draw_perturbation
 from lerobot_env_bomb.scene import Layout
 
 STONE = 0  # index of the stone to be moved; stones 1.. stand on the board
@@ -56,11 +57,12 @@ class Episode:
     color: str
     instruction: str
     layout: Layout
+    perturbation: Perturbation
 
     @property
     def target_xyz(self) -> np.ndarray:
         """(3,) metres, centre of a stone that rests on the target."""
-        return np.array([*BOARD.intersection_xy(*self.target), REST_HEIGHT_M])
+        return np.array([*BOARD.intersection_xy(*self.target), self.layout.rest_height_m])
 
 
 def targets_of(split: str) -> tuple[tuple[int, int], ...]:
@@ -88,7 +90,7 @@ def check_target(spec: EpisodeSpec) -> None:
 
 
 def sample_episode(spec: EpisodeSpec) -> Episode:
-    """Draw target, colour, sentence, opening and start; the same spec gives the same episode."""
+    """Draw target, colour, sentence, opening, start and perturbation; the same spec, the same episode."""
     check_target(spec)
     rng = {stream: np.random.default_rng([spec.seed, stream]) for stream in _Stream}
     targets, templates = targets_of(spec.split), templates_of(spec.split)
@@ -97,17 +99,22 @@ def sample_episode(spec: EpisodeSpec) -> Episode:
     target = (spec.target[0], spec.target[1]) if spec.target is not None else drawn_target
     color = spec.color if spec.color is not None else drawn_color
     template = templates[rng[_Stream.TEMPLATE].integers(len(templates))]
+    instruction = template.format(color=color, row=target[0], column=target[1])
+    opening = _sample_opening(rng[_Stream.OPENING], target, color)
+    perturbation = draw_perturbation(spec, target, color, opening)
+    if perturbation.language is not None:
+        instruction = perturbation.language(target, color)
     return Episode(
         spec=spec,
         target=target,
         color=color,
-        instruction=template.format(color=color, row=target[0], column=target[1]),
-        layout=_sample_layout(rng, target, color),
+        instruction=instruction,
+        layout=perturbation.arrange(_sample_layout(rng, opening, color), STONE),
+        perturbation=perturbation,
     )
 
 
-def _sample_layout(rng: dict, target: tuple[int, int], color: str) -> Layout:
-    opening = _sample_opening(rng[_Stream.OPENING], target, color)
+def _sample_layout(rng: dict, opening: dict[tuple[int, int], str], color: str) -> Layout:
     gripper_xyz = np.array([*TRAY_CENTER_XY, 0.0])
     gripper_xyz[:2] += rng[_Stream.GRIPPER].uniform(-GRIPPER_START_SPREAD_M, GRIPPER_START_SPREAD_M, 2)
     gripper_xyz[2] = rng[_Stream.GRIPPER].uniform(*GRIPPER_START_HEIGHT_M)
