@@ -1,6 +1,6 @@
 """LeRobot's env type ``bomb``. The only module of this package that imports LeRobot."""
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import partial
 from pathlib import Path
 from typing import Any, cast
@@ -9,6 +9,7 @@ from lerobot.configs import FeatureType, PolicyFeature
 from lerobot.envs import EnvConfig
 from lerobot.utils.constants import ACTION, OBS_IMAGES, OBS_STATE
 
+from lerobot_bomb.perturbations import NONE, Condition
 from lerobot_bomb.schema import (
     ACTION_DIM,
     CAMERAS,
@@ -44,6 +45,8 @@ class BombEnvConfig(EnvConfig):
     target: list[int] | None = None
     # colour of the stone to be moved: black or white; unset draws one per episode
     color: str | None = None
+    # conditions, each evaluated as a group of its own: ["none","camera:3","camera:2+light:3","all:1-5"]
+    perturbations: list[str] | None = None
     # width and height of each camera in pixels
     image_size: int = 256
     # fast (no shadows) or shadows
@@ -57,7 +60,8 @@ class BombEnvConfig(EnvConfig):
 
     def __post_init__(self) -> None:
         with flag_errors():
-            self.gym_kwargs  # noqa: B018  an invalid flag raises here, before anything is built
+            # an invalid flag raises here, before anything is built
+            self.conditions, self.gym_kwargs  # noqa: B018
         image = PolicyFeature(type=FeatureType.VISUAL, shape=(self.image_size, self.image_size, 3))
         cameras = [f"{OBS_IMAGES}.{camera}" for camera in CAMERAS]
         self.features = {
@@ -73,8 +77,20 @@ class BombEnvConfig(EnvConfig):
         return f"bomb/{self.task}-v0"
 
     @property
+    def conditions(self) -> dict[str, str]:
+        """{key of a group of results: its condition}; the suite alone where no condition is named."""
+        if self.perturbations is None:
+            return {str(self.task): NONE}
+        if not self.perturbations:
+            raise ValueError('--env.perturbations=[] names no condition; leave it out or give ["none"]')
+        conditions = [Condition.parse(text) for text in self.perturbations]
+        if len(set(conditions)) < len(conditions):
+            raise ValueError(f"--env.perturbations={self.perturbations} has a condition twice")
+        return {f"{self.task}.{condition.key}": str(condition) for condition in conditions}
+
+    @property
     def specs(self) -> dict[int, EpisodeSpec]:
-        """The spec of each task id; {0: spec} where targets and colours are drawn per episode."""
+        """The unperturbed spec of each task id; {0: spec} where target and colour are drawn per episode."""
         if self.task_ids == []:
             raise ValueError("--env.task_ids=[] selects no task; leave it out to draw one per episode")
         if self.task_ids and (self.target or self.color):
@@ -104,7 +120,7 @@ class BombEnvConfig(EnvConfig):
         }
 
     def create_envs(self, n_envs: int, use_async_envs: bool = False) -> dict[str, dict[int, LazyVectorEnv]]:
-        """{suite: {task id: vector env of n_envs}}; no worker starts before the first reset.
+        """{suite and condition: {task id: vector env of n_envs}}; no worker starts before a first reset.
 
         Raises:
             NoOpenGLError: MuJoCo cannot render on this machine.
@@ -115,13 +131,15 @@ class BombEnvConfig(EnvConfig):
         self._prepare_results_path()
         kwargs = self.gym_kwargs
         return {
-            str(self.task): {
+            key: {
                 task_id: LazyVectorEnv(
-                    [partial(BombEnv, **(kwargs | {"spec": spec}))] * n_envs,
+                    [partial(BombEnv, **(kwargs | {"spec": replace(spec, perturbations=condition)}))]
+                    * n_envs,
                     use_async=use_async_envs and n_envs > 1,
                 )
                 for task_id, spec in self.specs.items()
             }
+            for key, condition in self.conditions.items()
         }
 
     def _prepare_results_path(self) -> None:
