@@ -76,7 +76,7 @@ AXES = {
         {
             "balance": Magnitude("share", (0.04, 0.08, 0.12, 0.17, 0.22), "up or down, of a drawn channel"),
             "brightness": Magnitude("share", (0.03, 0.06, 0.09, 0.12, 0.15), "up or down, of all channels"),
-            "noise": Magnitude("grey levels", (2, 4, 6, 9, 13), "standard deviation, of each pixel"),
+            "noise": Magnitude("grey levels", (2, 4, 6, 8, 11), "standard deviation, of each pixel"),
         },
     ),
     "camera": Axis(
@@ -95,8 +95,8 @@ AXES = {
         "intensity and direction of the light",
         ("images",),
         {
-            "dim": Magnitude("factor", (0.88, 0.76, 0.65, 0.55, 0.45), "of all light, or"),
-            "bright": Magnitude("factor", (1.15, 1.3, 1.46, 1.63, 1.8), "of all light, whichever is drawn"),
+            "dim": Magnitude("factor", (0.88, 0.77, 0.67, 0.58, 0.5), "of all light, or"),
+            "bright": Magnitude("factor", (1.15, 1.32, 1.52, 1.75, 2.0), "of all light, whichever is drawn"),
             "tilt": Magnitude("degrees", (7, 14, 21, 28, 35), "of the lamp, in a drawn direction"),
         },
     ),
@@ -123,7 +123,7 @@ AXES = {
         {
             "radius": Magnitude("mm", (0.4, 0.8, 1.2, 1.6, 2.0), "more or less than 13"),
             "height": Magnitude("mm", (0.5, 1.0, 1.5, 2.0, 2.5), "more or less than 9"),
-            "shade": Magnitude("share", (0.08, 0.16, 0.24, 0.32, 0.4), "of the way to grey, either colour"),
+            "shade": Magnitude("share", (0.06, 0.12, 0.19, 0.25, 0.32), "of the way to grey, either colour"),
             "flat": Magnitude("yes", (0, 0, 1, 1, 1), "discs instead of lenses"),
         },
     ),

@@ -39,7 +39,7 @@ TABLE_RGB = (
     (0.28, 0.36, 0.62),
     (0.50, 0.32, 0.58),
     (0.58, 0.44, 0.40),
-    (0.46, 0.48, 0.50),
+    (0.36, 0.38, 0.40),
 )
 HELDOUT_TABLE_RGB = ((0.62, 0.36, 0.48), (0.34, 0.46, 0.34))
 GLARE_SPREAD_M = 0.08  # of the lamp's reflection around the board's middle, in x and in y

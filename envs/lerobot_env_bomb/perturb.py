@@ -55,23 +55,13 @@ class Stones:
     def draw(
         cls, level: int, rng: np.random.Generator, opening: Mapping[Cell, str], target: Cell, color: str
     ) -> Self:
+        directions_rad = rng.uniform(-np.pi, np.pi, BOARD.num_lines**2)
+        shift_m = 1e-3 * magnitude("stones", "shift", level)
         num_extra = int(magnitude("stones", "extra", level))
-        places = BOARD.num_lines**2
-        directions_rad = rng.uniform(-np.pi, np.pi, places)
+        # As for the opening: the candidates do not depend on the move, the first that allows it is taken.
         while True:
-            extra: dict[Cell, str] = {}
-            first = int(rng.integers(len(COLORS)))
-            for place in rng.permutation(places):
-                row, column = divmod(int(place), BOARD.num_lines)
-                grown = {**extra, (row, column): COLORS[(first + len(extra)) % len(COLORS)]}
-                position = {**opening, **grown}
-                is_free = (row, column) not in opening and (row, column) != target
-                if len(extra) == num_extra:
-                    break
-                if is_free and is_legal_position(position) and is_legal_move(position, target, color):
-                    extra = grown
-            if len(extra) == num_extra:
-                shift_m = 1e-3 * magnitude("stones", "shift", level)
+            extra = _grow(opening, num_extra, rng)
+            if len(extra) == num_extra and is_legal_move({**opening, **extra}, target, color):
                 return cls(extra, tuple(directions_rad.tolist()), shift_m)
 
     def __call__(self, layout: Layout, stone: int) -> Layout:
@@ -85,6 +75,20 @@ class Stones:
         angles_rad = np.array(self.directions_rad[: len(on_board)])
         stone_xy[on_board] += self.shift_m * np.column_stack([np.cos(angles_rad), np.sin(angles_rad)])
         return replace(layout, stone_xy=stone_xy, stone_is_white=is_white, stone_in_play=in_play)
+
+
+def _grow(opening: Mapping[Cell, str], num_extra: int, rng: np.random.Generator) -> dict[Cell, str]:
+    """{(row, column): colour} of stones that can join the opening, alternately black and white."""
+    extra: dict[Cell, str] = {}
+    first = int(rng.integers(len(COLORS)))
+    for place in rng.permutation(BOARD.num_lines**2):
+        row, column = divmod(int(place), BOARD.num_lines)
+        if len(extra) == num_extra:
+            break
+        grown = {**extra, (row, column): COLORS[(first + len(extra)) % len(COLORS)]}
+        if (row, column) not in opening and is_legal_position({**opening, **grown}):
+            extra = grown
+    return extra
 
 
 @dataclass(frozen=True)
