@@ -12,7 +12,7 @@ ensure_gl_backend()
 
 import mujoco  # noqa: E402  (its names live in C modules that pyright cannot read)
 
-SCENE_XML = Path(__file__).with_name("scene.xml")
+SCENE_XML = Path(__file__).with_name("scara.xml")
 
 TRAY_CENTER_XY = (0.170, 0.0)  # metres; the tray beside the board from which stones are taken
 TRAY_HALF_SIZE_XY = (0.045, 0.125)  # metres; it touches the board
