@@ -26,6 +26,7 @@ from lerobot_bomb.schema import (
     DEFAULT_FPS,
     MAX_STEP_M,
     MIN_IMAGE_SIZE,
+    ROBOTS,
     SPLITS,
     EpisodeSpec,
     PrivilegedState,
@@ -54,9 +55,9 @@ class Outcome:
     idle_steps: tuple[int, ...]  # which steps
 
 
-def run_episode(seed: int, control_mode: str, fps: int, split: str, noise: float) -> Outcome:
+def run_episode(seed: int, robot: str, control_mode: str, fps: int, split: str, noise: float) -> Outcome:
     """Let the expert play one episode; `noise` is the standard deviation added to x, y, z, 1 = 40 mm."""
-    spec = EpisodeSpec(seed=seed, control_mode=control_mode, fps=fps, split=split)
+    spec = EpisodeSpec(seed=seed, robot=robot, control_mode=control_mode, fps=fps, split=split)
     env = BombEnv(spec, RenderOptions(image_size=MIN_IMAGE_SIZE))
     rng = np.random.default_rng([seed, NOISE_STREAM])
     observation, _ = env.reset()
@@ -130,6 +131,7 @@ def main() -> None:
     )
     parser.add_argument("--episodes", type=int, default=500)
     parser.add_argument("--seed", type=int, default=0, help="of the first episode; the others count up")
+    parser.add_argument("--robot", choices=ROBOTS, default="scara")
     parser.add_argument("--control_mode", choices=CONTROL_MODES, default="relative")
     parser.add_argument("--fps", type=int, default=DEFAULT_FPS)
     parser.add_argument("--split", choices=SPLITS, default="all")
@@ -141,7 +143,12 @@ def main() -> None:
     args = parser.parse_args()
 
     run = partial(
-        run_episode, control_mode=args.control_mode, fps=args.fps, split=args.split, noise=args.noise
+        run_episode,
+        robot=args.robot,
+        control_mode=args.control_mode,
+        fps=args.fps,
+        split=args.split,
+        noise=args.noise,
     )
     with multiprocessing.get_context("forkserver").Pool(args.workers) as pool:
         results: Iterable[Outcome] = pool.imap(run, range(args.seed, args.seed + args.episodes), chunksize=4)

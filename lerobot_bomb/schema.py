@@ -16,7 +16,7 @@ import numpy as np
 PROTOCOL_VERSION = "0.1"
 
 SUITES = ("place",)
-ROBOTS = ("scara",)
+ROBOTS = ("scara", "fetch")
 CONTROL_MODES = ("relative", "absolute")
 SPLITS = ("all", "train", "heldout")
 RENDER_PRESETS = ("fast", "shadows")

@@ -18,6 +18,7 @@ from lerobot_bomb.schema import (
     RenderOptions,
     flag_errors,
 )
+from lerobot_env_bomb.fetch_files import check_robot
 from lerobot_env_bomb.vector import LazyVectorEnv
 
 AGENT_POS = "agent_pos"
@@ -34,7 +35,7 @@ class BombEnvConfig(EnvConfig):
     task_ids: list[int] | None = None
     # control steps per second; a divisor of 200
     fps: int = DEFAULT_FPS
-    # arm: scara
+    # arm: scara, or fetch (of gymnasium-robotics; needs MuJoCo 3)
     robot: str = "scara"
     # relative: dx, dy, dz in units of 40 mm; absolute: x, y, z in metres
     control_mode: str = "relative"
@@ -57,7 +58,7 @@ class BombEnvConfig(EnvConfig):
 
     def __post_init__(self) -> None:
         with flag_errors():
-            self.gym_kwargs  # noqa: B018  an invalid flag raises here, before anything is built
+            check_robot(self.gym_kwargs["spec"])  # an invalid flag raises here, before anything is built
         image = PolicyFeature(type=FeatureType.VISUAL, shape=(self.image_size, self.image_size, 3))
         cameras = [f"{OBS_IMAGES}.{camera}" for camera in CAMERAS]
         self.features = {

@@ -1,18 +1,15 @@
 # pyright: reportAttributeAccessIssue=false, reportInvalidTypeForm=false
-"""Builds BOMB's one MjModel: scene.xml plus board and stones in the sizes of the schema."""
-
-from pathlib import Path
+"""Builds BOMB's one MjModel: a robot's scene plus board and stones in the sizes of the schema."""
 
 import numpy as np
 
 from lerobot_bomb.schema import BOARD, NUM_STONES
 from lerobot_env_bomb.backend import ensure_gl_backend
+from lerobot_env_bomb.robots import Robot
 
 ensure_gl_backend()
 
 import mujoco  # noqa: E402  (its names live in C modules that pyright cannot read)
-
-SCENE_XML = Path(__file__).with_name("scara.xml")
 
 TRAY_CENTER_XY = (0.170, 0.0)  # metres; the tray beside the board from which stones are taken
 TRAY_HALF_SIZE_XY = (0.045, 0.125)  # metres; it touches the board
@@ -35,9 +32,9 @@ STAR_POINT_RADIUS_M = 0.0036
 TEXTURE_SIZE = 512  # pixels
 
 
-def build_model() -> mujoco.MjModel:
+def build_model(robot: Robot) -> mujoco.MjModel:
     """Compile the scene; every episode reuses the result."""
-    spec = mujoco.MjSpec.from_file(str(SCENE_XML))
+    spec = robot.load()
     _add_board(spec)
     _add_tray(spec)
     for index in range(NUM_STONES):
