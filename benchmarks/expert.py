@@ -27,6 +27,7 @@ from lerobot_bomb.schema import (
     DEFAULT_FPS,
     MAX_STEP_M,
     MIN_IMAGE_SIZE,
+    ROBOTS,
     SPLITS,
     EpisodeSpec,
     PrivilegedState,
@@ -132,6 +133,7 @@ def main() -> None:
     )
     parser.add_argument("--episodes", type=int, default=500)
     parser.add_argument("--seed", type=int, default=0, help="of the first episode; the others count up")
+    parser.add_argument("--robot", choices=ROBOTS, default="scara")
     parser.add_argument("--control_mode", choices=CONTROL_MODES, default="relative")
     parser.add_argument("--fps", type=int, default=DEFAULT_FPS)
     parser.add_argument("--split", choices=SPLITS, default="all")
@@ -145,6 +147,7 @@ def main() -> None:
 
     spec = EpisodeSpec(
         seed=args.seed,
+        robot=args.robot,
         control_mode=args.control_mode,
         fps=args.fps,
         split=args.split,

@@ -66,6 +66,15 @@ def check_rendering() -> Iterator[Finding]:
     yield Finding("opengl", detail if contrast else f"{backend} renders black frames", broken=not contrast)
 
 
+def check_fetch() -> Iterator[Finding]:
+    """Whether the arm that comes from gymnasium-robotics can be used; the other needs nothing."""
+    try:
+        importlib.import_module("lerobot_env_bomb.fetch_files").fetch_xml()
+        yield Finding("--env.robot=fetch", "can run")
+    except ValueError as error:
+        yield Finding("--env.robot=fetch", str(error))
+
+
 def check_types() -> Iterator[Finding]:
     """Env and policy types that LeRobot knows after the plugin's import, with their classes."""
     importlib.import_module(DISTRIBUTION)
@@ -109,6 +118,7 @@ def check_hub() -> Iterator[Finding]:
 CHECKS: tuple[Callable[[], Iterator[Finding]], ...] = (
     check_versions,
     check_rendering,
+    check_fetch,
     check_types,
     check_gpu,
     check_hub,

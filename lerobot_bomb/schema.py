@@ -18,7 +18,7 @@ from lerobot_bomb.perturbations import NONE, Condition
 PROTOCOL_VERSION = "0.1"
 
 SUITES = ("place",)
-ROBOTS = ("scara",)
+ROBOTS = ("scara", "fetch")
 CONTROL_MODES = ("relative", "absolute")
 SPLITS = ("all", "train", "heldout")
 RENDER_PRESETS = ("fast", "shadows")

@@ -113,7 +113,7 @@ def test_latency_executes_an_action_one_step_late(make_env: MakeEnv, control_mod
     assert start.pending_gripper == 1.0 and not start.pending_motion_m.any()
     up = np.array([0, 0, 0.5, -1.0])
     if control_mode == "absolute":
-        up = np.array([*start.gripper_xyz, -1.0]) + [0, 0, 0.5 * MAX_STEP_M, 0]
+        up = np.array([*start.gripper_xyz[:2], start.gripper_xyz[2] + 0.5 * MAX_STEP_M, -1.0])
     after_one, after_two = (
         PrivilegedState.from_vector(env.step(up)[0]["environment_state"]) for _ in range(2)
     )

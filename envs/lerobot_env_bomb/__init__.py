@@ -1,4 +1,4 @@
-"""BOMB's simulator: a SCARA arm that places Go stones, as Gymnasium environments.
+"""BOMB's simulator: a robot arm that places Go stones, as Gymnasium environments.
 
 Imports neither torch nor lerobot, so that an environment's worker process starts fast; only
 ``configuration_bomb`` does, and nothing here imports it.

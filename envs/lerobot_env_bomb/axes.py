@@ -39,8 +39,9 @@ TABLE_RGB = (
     (0.28, 0.36, 0.62),
     (0.50, 0.32, 0.58),
     (0.58, 0.44, 0.40),
-    (0.36, 0.38, 0.40),
+    (0.30, 0.50, 0.34),
 )
+TRAY_SHARE = 0.75  # of a table's colour; under bright light a lighter tray is as white as a stone
 HELDOUT_TABLE_RGB = ((0.62, 0.36, 0.48), (0.34, 0.46, 0.34))
 GLARE_SPREAD_M = 0.08  # of the lamp's reflection around the board's middle, in x and in y
 FRAME_MARGIN = 0.015  # of half the picture, that what must stay in view keeps from its edge
@@ -70,10 +71,10 @@ class Table:
         share = magnitude("table", "color", self.level)
         patterned = model.material(table_material(self.pattern, self.level))
         for material, nominal, rgb in (
-            (patterned, model.material("table"), self.table_rgb),
-            (model.material("mat"), model.material("mat"), self.tray_rgb),
+            (patterned, model.material("table"), np.array(self.table_rgb)),
+            (model.material("mat"), model.material("mat"), TRAY_SHARE * np.array(self.tray_rgb)),
         ):
-            material.rgba[:3] = (1 - share) * nominal.rgba[:3] + share * np.array(rgb)
+            material.rgba[:3] = (1 - share) * nominal.rgba[:3] + share * rgb
         model.geom("table").matid = patterned.id
 
 

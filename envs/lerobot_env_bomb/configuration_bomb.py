@@ -19,6 +19,7 @@ from lerobot_bomb.schema import (
     RenderOptions,
     flag_errors,
 )
+from lerobot_env_bomb.fetch_files import check_robot
 from lerobot_env_bomb.vector import LazyVectorEnv
 
 AGENT_POS = "agent_pos"
@@ -35,7 +36,7 @@ class BombEnvConfig(EnvConfig):
     task_ids: list[int] | None = None
     # control steps per second; a divisor of 200
     fps: int = DEFAULT_FPS
-    # arm: scara
+    # arm: scara, or fetch (of gymnasium-robotics; needs MuJoCo 3)
     robot: str = "scara"
     # relative: dx, dy, dz in units of 40 mm; absolute: x, y, z in metres
     control_mode: str = "relative"
@@ -61,7 +62,8 @@ class BombEnvConfig(EnvConfig):
     def __post_init__(self) -> None:
         with flag_errors():
             # an invalid flag raises here, before anything is built
-            self.conditions, self.gym_kwargs  # noqa: B018
+            _ = self.conditions
+            check_robot(self.gym_kwargs["spec"])
         image = PolicyFeature(type=FeatureType.VISUAL, shape=(self.image_size, self.image_size, 3))
         cameras = [f"{OBS_IMAGES}.{camera}" for camera in CAMERAS]
         self.features = {

@@ -25,9 +25,11 @@ from lerobot_bomb.schema import (
     Stage,
     action_bounds,
 )
+from lerobot_env_bomb.fetch_files import check_robot
 from lerobot_env_bomb.judge import Judge
 from lerobot_env_bomb.render import CameraRenderer, compose_caption
-from lerobot_env_bomb.scene import MAX_HALF_OPENING_M, Scene
+from lerobot_env_bomb.robots import ROBOTS
+from lerobot_env_bomb.scene import Scene
 from lerobot_env_bomb.task import STONE, Episode, check_target, sample_episode
 
 Observation = dict[str, Any]
@@ -72,6 +74,7 @@ class BombEnv(gymnasium.Env[Observation, np.ndarray]):
         render_mode: str = "rgb_array",
     ):
         check_target(spec)
+        check_robot(spec)
         if render_mode not in self.metadata["render_modes"]:
             raise ValueError(f"render_mode={render_mode!r} is unknown; choose one of: rgb_array")
         self._num_substeps = PHYSICS_HZ // spec.fps
@@ -104,7 +107,7 @@ class BombEnv(gymnasium.Env[Observation, np.ndarray]):
         if seed is None:
             seed = int(self.np_random.integers(2**31))
         episode = sample_episode(replace(self._spec, seed=int(seed)))
-        scene = self._current_run.scene if self._current_run is not None else Scene()
+        scene = self._current_run.scene if self._current_run is not None else Scene(self._spec.robot)
         scene.reset(episode.layout, episode.perturbation.model_edits)
         self._current_run = self._start(scene, episode)
         self.task_description = episode.instruction
@@ -187,7 +190,7 @@ class BombEnv(gymnasium.Env[Observation, np.ndarray]):
             control_mode=self._spec.control_mode,
             fps=self._spec.fps,
             stone_radius_m=run.episode.layout.stone_radius_m,
-            max_opening_m=2 * MAX_HALF_OPENING_M,
+            max_opening_m=2 * run.scene.robot.max_half_opening_m,
             pending_motion_m=self._pending_motion_m(now.gripper_xyz),
             pending_gripper=float(run.pending[-1][3]) if run.pending else 0.0,
         )
@@ -299,7 +302,8 @@ def observation_space(image_size: int) -> spaces.Dict:
     """Pictures of both cameras, (4,) state of the gripper, and the privileged state for oracles."""
     shape = (image_size, image_size, 3)
     # opening fingers overshoot their stops a little
-    reach_m = np.array([1.0, 1.0, 1.0, 2.5 * MAX_HALF_OPENING_M], dtype=np.float32)
+    widest_m = max(robot.max_half_opening_m for robot in ROBOTS.values())
+    reach_m = np.array([1.0, 1.0, 1.0, 2.5 * widest_m], dtype=np.float32)
     limit = max(POSITION_LIMIT_M, NUM_STONES, len(Stage), PHYSICS_HZ)
     return spaces.Dict(
         {

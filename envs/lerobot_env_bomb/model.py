@@ -1,19 +1,16 @@
 # pyright: reportAttributeAccessIssue=false, reportInvalidTypeForm=false
-"""Builds BOMB's one MjModel: scene.xml plus board and stones in the sizes of the schema."""
-
-from pathlib import Path
+"""Builds BOMB's one MjModel: a robot's scene plus board and stones in the sizes of the schema."""
 
 import numpy as np
 
 from lerobot_bomb.perturbations import MAX_LEVEL, magnitude
 from lerobot_bomb.schema import BOARD, NUM_STONES
 from lerobot_env_bomb.backend import ensure_gl_backend
+from lerobot_env_bomb.robots import Robot
 
 ensure_gl_backend()
 
 import mujoco  # noqa: E402  (its names live in C modules that pyright cannot read)
-
-SCENE_XML = Path(__file__).with_name("scene.xml")
 
 TRAY_CENTER_XY = (0.170, 0.0)  # metres; the tray beside the board from which stones are taken
 TRAY_HALF_SIZE_XY = (0.045, 0.125)  # metres; it touches the board
@@ -46,9 +43,9 @@ GOAL_MARKER_RGB = (0.10, 0.35, 0.95)
 HIDDEN = 0.0  # opacity of what only a perturbation shows
 
 
-def build_model() -> mujoco.MjModel:
+def build_model(robot: Robot) -> mujoco.MjModel:
     """Compile the scene; every episode reuses the result."""
-    spec = mujoco.MjSpec.from_file(str(SCENE_XML))
+    spec = robot.load()
     _add_board(spec)
     _add_tray(spec)
     _add_table_patterns(spec)

@@ -15,6 +15,7 @@ from lerobot_env_bomb.model import (
     parked_xyz,
     stone_name,
 )
+from lerobot_env_bomb.robots import ROBOTS
 
 ensure_gl_backend()
 
@@ -23,11 +24,7 @@ import mujoco  # noqa: E402  (its names live in C modules that pyright cannot re
 WORKSPACE_LOW = np.array(WORKSPACE_LOW_M)
 WORKSPACE_HIGH = np.array(WORKSPACE_HIGH_M)
 
-MAX_HALF_OPENING_M = 0.022  # of one finger; outer faces then clear a neighbour at one pitch by 5 mm
 TRAVEL_SHARE = 0.7  # of a control step in which the command travels; the rest lets the arm settle
-
-BASE_XY = np.array([0.0, 0.30])  # metres, the arm's shoulder; as in scene.xml
-LINK_M = 0.27  # length of either link; as in scene.xml
 
 STONE_RGBA = {True: (0.96, 0.96, 0.93, 1.0), False: (0.06, 0.06, 0.07, 1.0)}  # by "is white"
 HIDDEN_RGBA = (0.0, 0.0, 0.0, 0.0)
@@ -72,8 +69,9 @@ class Snapshot:
 class Scene:
     """One compiled model and its state."""
 
-    def __init__(self):
-        self.model = build_model()
+    def __init__(self, robot: str = "scara"):
+        self.robot = ROBOTS[robot]
+        self.model = build_model(self.robot)
         self.data = mujoco.MjData(self.model)
         names = [stone_name(i) for i in range(NUM_STONES)]
         self._stone_bodies = np.array([self.model.body(name).id for name in names])
@@ -103,10 +101,10 @@ class Scene:
         for i, adr in enumerate(self._stone_qpos):
             xyz = [*layout.stone_xy[i], layout.rest_height_m] if layout.stone_in_play[i] else parked_xyz(i)
             self.data.qpos[adr : adr + 7] = [*xyz, 1, 0, 0, 0]
-        for joint, value in arm_joints(layout.gripper_xyz).items():
+        for joint, value in self.robot.joints(layout.gripper_xyz).items():
             self.data.joint(joint).qpos = value
-        self.data.qpos[self._fingers] = MAX_HALF_OPENING_M
-        self.data.ctrl[:] = MAX_HALF_OPENING_M
+        self.data.qpos[self._fingers] = self.robot.max_half_opening_m
+        self.data.ctrl[:] = self.robot.max_half_opening_m
         self.data.mocap_pos[0] = layout.gripper_xyz
         mujoco.mj_forward(self.model, self.data)
 
@@ -114,7 +112,7 @@ class Scene:
         """Move the gripper towards (3,) metres, clipped to the workspace, and open or close it."""
         start = self.data.mocap_pos[0].copy()
         target = np.clip(target_xyz, WORKSPACE_LOW, WORKSPACE_HIGH)
-        self.data.ctrl[:] = MAX_HALF_OPENING_M if open_fingers else 0.0
+        self.data.ctrl[:] = self.robot.max_half_opening_m if open_fingers else 0.0
         num_travel = max(1, round(TRAVEL_SHARE * num_substeps))
         for substep in range(num_substeps):
             share = min(1.0, (substep + 1) / num_travel)
@@ -149,12 +147,3 @@ class Scene:
             self.model.geom_contype[solids] = self._contype[solids] * in_play
             self.model.geom_conaffinity[solids] = self._conaffinity[solids] * in_play
             self.model.body_gravcomp[self._stone_bodies[i]] = not in_play
-
-
-def arm_joints(gripper_xyz: np.ndarray) -> dict[str, float]:
-    """Joint positions (radians, metres) that put the gripper at (3,) metres, elbow to the left."""
-    reach = gripper_xyz[:2] - BASE_XY
-    cosine = (reach @ reach) / (2 * LINK_M**2) - 1
-    elbow = float(np.arccos(np.clip(cosine, -1, 1)))
-    shoulder = float(np.arctan2(reach[1], reach[0])) - elbow / 2
-    return {"shoulder": shoulder, "elbow": elbow, "lift": float(gripper_xyz[2]), "roll": -shoulder - elbow}

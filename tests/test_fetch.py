@@ -1,0 +1,169 @@
+"""The embodiment shift: another arm, the same task. tests/test_scene.py tests every robot's model."""
+
+import hashlib
+import importlib.metadata
+import importlib.util
+import itertools
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from lerobot_bomb import doctor
+from lerobot_bomb.evaluation.results import read_results
+from lerobot_bomb.expert import expert_action
+from lerobot_bomb.schema import BOARD, EpisodeSpec, FlagError, PrivilegedState, RenderOptions
+from lerobot_env_bomb import fetch_files
+from lerobot_env_bomb.configuration_bomb import BombEnvConfig
+from lerobot_env_bomb.env import BombEnv
+from lerobot_env_bomb.fetch import PREFIX, fetch_joints
+from lerobot_env_bomb.scene import WORKSPACE_HIGH, WORKSPACE_LOW, Layout, Scene
+from lerobot_env_bomb.task import sample_episode
+
+SMALL = RenderOptions(image_size=32)
+SPEC = EpisodeSpec(seed=0, robot="fetch")
+GRID = list(itertools.product(*np.linspace(WORKSPACE_LOW, WORKSPACE_HIGH, 4).T))  # (x, y, z) metres
+
+
+@pytest.fixture(scope="module")
+def env():
+    env = BombEnv(SPEC, SMALL)
+    yield env
+    env.close()
+
+
+@pytest.fixture(scope="module")
+def scene() -> Scene:
+    return Scene("fetch")
+
+
+def play(env: BombEnv, seed: int) -> tuple[str, dict]:
+    """Digest of all observations and actions of the expert's episode, its last info."""
+    observation, info = env.reset(seed=seed)
+    everything, ended = hashlib.sha256(), False
+    while not ended:
+        action = expert_action(PrivilegedState.from_vector(observation["environment_state"]))
+        pixels = observation["pixels"].values()
+        for array in (action, *pixels, observation["agent_pos"], observation["environment_state"]):
+            everything.update(array.tobytes())
+        observation, _, terminated, truncated, info = env.step(action)
+        ended = terminated or truncated
+    return everything.hexdigest(), info
+
+
+def put_gripper(scene: Scene, xyz: tuple[float, ...]) -> None:
+    layout = sample_episode(SPEC).layout
+    scene.reset(Layout(np.array(xyz), layout.stone_xy, layout.stone_is_white, layout.stone_in_play))
+
+
+def test_a_policy_meets_the_same_spaces_and_episodes(env: BombEnv) -> None:
+    scara = BombEnv(EpisodeSpec(seed=0), SMALL)
+    assert env.observation_space == scara.observation_space
+    assert env.action_space == scara.action_space
+    observations = [e.reset(seed=3)[0] for e in (env, scara)]
+    scara.close()
+    assert all(env.observation_space.contains(observation) for observation in observations)
+    states = [PrivilegedState.from_vector(observation["environment_state"]) for observation in observations]
+    np.testing.assert_allclose(states[0].gripper_xyz, states[1].gripper_xyz, atol=1e-6)
+    np.testing.assert_array_equal(states[0].stone_xyz, states[1].stone_xyz)
+    np.testing.assert_array_equal(states[0].target_xyz, states[1].target_xyz)
+    assert (states[0].max_opening_m, states[1].max_opening_m) == pytest.approx((0.033, 0.044))
+    assert states[0].finger_opening == pytest.approx(0.033)
+
+
+def test_the_expert_places_stones_and_moves_no_other(env: BombEnv) -> None:
+    for seed in range(5):
+        info = play(env, seed)[1]
+        assert info["is_success"] and info["placement_error_mm"] < 2 and info["collateral_mm"] < 0.5
+
+
+def test_a_used_and_a_fresh_environment_give_the_same_bits(env: BombEnv) -> None:
+    play(env, 8)
+    again = play(env, 7)[0]
+    fresh = BombEnv(SPEC, SMALL)
+    assert play(fresh, 7)[0] == again
+    fresh.close()
+
+
+def test_the_arm_starts_upright_within_its_joints_and_above_the_board(scene: Scene) -> None:
+    for xyz in GRID:
+        put_gripper(scene, xyz)
+        np.testing.assert_allclose(scene.measure().gripper_xyz, xyz, atol=1e-9)
+        np.testing.assert_allclose(scene.data.site("grip").xmat.reshape(3, 3), np.eye(3), atol=1e-9)
+        for name, angle in fetch_joints(np.array(xyz)).items():
+            low, high = scene.model.joint(name).range
+            assert low == high or low + 0.05 < angle < high - 0.05, name  # the wrist's roll has no limits
+        for name in ("gripper_link", "wrist_roll_link", "wrist_flex_link", "forearm_roll_link"):
+            assert lowest_z(scene, PREFIX + name) > BOARD.thickness_m + 2 * BOARD.stone_height_m, name
+
+
+def test_of_the_arm_only_the_pads_touch_anything(scene: Scene) -> None:
+    arm = [
+        geom
+        for geom in range(scene.model.ngeom)
+        if scene.model.body(scene.model.geom_bodyid[geom]).name.startswith(PREFIX)
+    ]
+    solid = {
+        scene.model.geom(g).name for g in arm if scene.model.geom_contype[g] | scene.model.geom_conaffinity[g]
+    }
+    assert len(arm) > 10 and solid == {"left_pad", "right_pad"}
+
+
+def lowest_z(scene: Scene, mesh_geom: str) -> float:
+    """Height in metres of a mesh's lowest vertex."""
+    model, geom = scene.model, scene.model.geom(mesh_geom)
+    first = model.mesh_vertadr[geom.dataid[0]]
+    vertices = model.mesh_vert[first : first + model.mesh_vertnum[geom.dataid[0]]]
+    placed = scene.data.geom(mesh_geom)
+    return float((vertices @ placed.xmat.reshape(3, 3).T + placed.xpos)[:, 2].min())
+
+
+def mujoco_4(monkeypatch: pytest.MonkeyPatch) -> None:
+    version = importlib.metadata.version
+    monkeypatch.setattr(importlib.metadata, "version", lambda n: "4.0.1" if n == "mujoco" else version(n))
+
+
+def no_package(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(importlib.util, "find_spec", lambda name: None)
+
+
+def no_files(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(fetch_files, "MODEL_FILE", Path("elsewhere.xml"))
+
+
+@pytest.mark.parametrize(
+    ("lack", "message"),
+    [
+        (mujoco_4, r"--env\.robot=fetch cannot .* MuJoCo 4\.0\.1: .* pip install 'mujoco<4'"),
+        (
+            no_package,
+            r"--env\.robot=fetch .* gymnasium-robotics, which is not installed .*MuJoCo [0-9.]+ .*pip",
+        ),
+        (
+            no_files,
+            r"--env\.robot=fetch: .* gymnasium-robotics has no .*elsewhere\.xml .*MuJoCo: [0-9.]+.*pip",
+        ),
+    ],
+)
+def test_what_is_missing_is_said_before_anything_is_built(
+    lack: Callable[[pytest.MonkeyPatch], None], message: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    lack(monkeypatch)
+    with pytest.raises(ValueError, match=message):
+        BombEnv(SPEC)
+    with pytest.raises(FlagError, match=message):
+        BombEnvConfig(robot="fetch")
+    (finding,) = doctor.check_fetch()
+    assert not finding.broken and "scara" in finding.detail
+    BombEnvConfig(robot="scara")
+    BombEnv(EpisodeSpec(seed=0)).close()
+
+
+def test_it_runs_through_lerobot_eval(stock_cli: Callable[..., None], tmp_path: Path) -> None:
+    results = tmp_path / "results.jsonl"
+    env_flags = f"--env.type=bomb --env.robot=fetch --env.image_size=32 --env.results_path={results}"
+    flags = "--policy.type=bomb_expert --policy.device=cpu --eval.n_episodes=1 --eval.batch_size=1"
+    stock_cli("lerobot-eval", *env_flags.split(), *flags.split(), f"--output_dir={tmp_path / 'eval'}")
+    (row,) = read_results(results)
+    assert row["is_success"] and row["spec"]["robot"] == "fetch"
