@@ -167,6 +167,7 @@ class RenderOptions:
 
     image_size: int = DEFAULT_IMAGE_SIZE  # width and height in pixels
     preset: str = "fast"
+    depth: bool = False  # deliver each camera's depth and geometry too; see camera_geometry.py
 
     def __post_init__(self) -> None:
         one_of("--env.render_preset", self.preset, RENDER_PRESETS)

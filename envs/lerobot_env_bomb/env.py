@@ -9,6 +9,7 @@ import numpy as np
 from gymnasium import spaces
 from gymnasium.error import ResetNeeded
 
+from lerobot_bomb.camera_geometry import geometry_shapes
 from lerobot_bomb.schema import (
     ACTION_DIM,
     CAMERAS,
@@ -25,7 +26,7 @@ from lerobot_bomb.schema import (
     action_bounds,
 )
 from lerobot_env_bomb.judge import Judge
-from lerobot_env_bomb.render import CameraRenderer, compose_caption
+from lerobot_env_bomb.render import CameraRenderer, compose_caption, extrinsics, intrinsics
 from lerobot_env_bomb.scene import MAX_HALF_OPENING_M, Scene
 from lerobot_env_bomb.task import STONE, Episode, check_target, sample_episode
 
@@ -81,7 +82,7 @@ class BombEnv(gymnasium.Env[Observation, np.ndarray]):
         self._results_path = results_path
         self.action_space = action_space(spec.control_mode)
         self._action_low, self._action_high = self.action_space.low, self.action_space.high
-        self.observation_space = observation_space(render_options.image_size)
+        self.observation_space = observation_space(render_options)
         self._current_run: _Run | None = None
         self._renderer: CameraRenderer | None = None
         self._steps = 0
@@ -129,7 +130,9 @@ class BombEnv(gymnasium.Env[Observation, np.ndarray]):
     def render(self) -> np.ndarray:
         """(H, W, 3) uint8 picture for people: both cameras, the instruction, how the episode stands."""
         run = self._run
-        pictures = [self._draw(camera, PERSON_IMAGE_SIZE) for camera in CAMERAS]
+        pictures = [
+            self._camera_renderer.draw(run.scene.data, camera, PERSON_IMAGE_SIZE) for camera in CAMERAS
+        ]
         row, column = run.episode.target
         error_mm = run.judge.placement_error_mm
         outcome = f"failed: {run.judge.failure}" if run.judge.failure else f"stage: {run.judge.stage}"
@@ -201,18 +204,32 @@ class BombEnv(gymnasium.Env[Observation, np.ndarray]):
 
     def _observe(self) -> Observation:
         state = self.privileged_state()
-        size = self._render_options.image_size
+        views = {camera: self._view(camera) for camera in CAMERAS}
         return {
-            "pixels": {camera: self._draw(camera, size) for camera in CAMERAS},
+            "pixels": {camera: picture for camera, (picture, _) in views.items()},
             "agent_pos": np.array([*state.gripper_xyz, state.finger_opening], dtype=np.float32),
             "environment_state": state.to_vector(),
+            **{key: value for _, geometry in views.values() for key, value in geometry.items()},
         }
 
-    def _draw(self, camera: str, size: int) -> np.ndarray:
+    def _view(self, camera: str) -> tuple[np.ndarray, dict[str, np.ndarray]]:
+        """(H, W, 3) uint8 picture; depth, intrinsics and extrinsics by key, if they are asked for."""
+        scene, size = self._run.scene, self._render_options.image_size
+        if not self._render_options.depth:
+            return self._camera_renderer.draw(scene.data, camera, size), {}
+        picture, depth_m = self._camera_renderer.draw_depth(scene.data, camera, size)
+        return picture, {
+            f"depth.{camera}": depth_m,
+            f"intrinsics.{camera}": intrinsics(scene.model, camera, size),
+            f"extrinsics.{camera}": extrinsics(scene.data, camera),
+        }
+
+    @property
+    def _camera_renderer(self) -> CameraRenderer:
         if self._renderer is None:
             largest = max(self._render_options.image_size, PERSON_IMAGE_SIZE)
             self._renderer = CameraRenderer(self._run.scene.model, self._render_options, largest)
-        return self._renderer.draw(self._run.scene.data, camera, size)
+        return self._renderer
 
     def _info(self) -> dict[str, Any]:
         judge = self._run.judge
@@ -247,9 +264,9 @@ def action_space(control_mode: str) -> spaces.Box:
     return spaces.Box(low, high, dtype=np.float32)
 
 
-def observation_space(image_size: int) -> spaces.Dict:
-    """Pictures of both cameras, (4,) state of the gripper, and the privileged state for oracles."""
-    shape = (image_size, image_size, 3)
+def observation_space(options: RenderOptions) -> spaces.Dict:
+    """Pictures of both cameras, (4,) state of the gripper, the privileged state for oracles, geometry."""
+    shape = (options.image_size, options.image_size, 3)
     # opening fingers overshoot their stops a little
     reach_m = np.array([1.0, 1.0, 1.0, 2.5 * MAX_HALF_OPENING_M], dtype=np.float32)
     limit = max(POSITION_LIMIT_M, NUM_STONES, len(Stage), PHYSICS_HZ)
@@ -258,5 +275,9 @@ def observation_space(image_size: int) -> spaces.Dict:
             "pixels": spaces.Dict({camera: spaces.Box(0, 255, shape, np.uint8) for camera in CAMERAS}),
             "agent_pos": spaces.Box(-reach_m, reach_m, dtype=np.float32),
             "environment_state": spaces.Box(-limit, limit, (PrivilegedState.DIM,), np.float32),
+            **{
+                key: spaces.Box(-np.inf, np.inf, shape, np.float32)
+                for key, shape in geometry_shapes(options).items()
+            },
         }
     )
