@@ -33,7 +33,7 @@ class CameraRenderer:
         self._gl.make_current()
         self._context = mujoco.MjrContext(model, mujoco.mjtFontScale.mjFONTSCALE_100)
         mujoco.mjr_setBuffer(mujoco.mjtFramebuffer.mjFB_OFFSCREEN, self._context)
-        # Far things are close to 0, where floats are dense: 0.1 um steps at 1.7 m instead of 14 um near 1.
+        # far things are close to 0, where floats are dense: noise of 0.3 um at 1.7 m instead of 5 um near 1
         self._context.readDepthMap = mujoco.mjtDepthMap.mjDEPTH_ZEROFAR
         self._scene = mujoco.MjvScene(model, maxgeom=200)
         self._scene.flags[mujoco.mjtRndFlag.mjRND_SHADOW] = shadows
