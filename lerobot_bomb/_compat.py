@@ -1,13 +1,18 @@
 """The only place that reaches into names of LeRobot and `datasets` that are not their public interface."""
 
 import shutil
-from collections.abc import Iterator
+from collections.abc import Collection, Iterator
 from contextlib import contextmanager
+from functools import partial
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from datasets import config
-from lerobot.datasets import LeRobotDataset, compute_stats
+from lerobot.datasets import LeRobotDataset, aggregate, compute_stats, dataset_writer
+from lerobot.datasets.feature_utils import get_hf_features_from_features
+from lerobot.datasets.io_utils import to_parquet_with_hf_images
+from lerobot.utils.constants import DEFAULT_FEATURES
 
 STATISTICS_SIZE = 128  # pixels
 
@@ -30,6 +35,39 @@ def sampled_image_statistics() -> Iterator[None]:
         yield
     finally:
         compute_stats.auto_downsample_height_width = usual
+
+
+@contextmanager
+def without_statistics(keys: Collection[str]) -> Iterator[None]:
+    """Let LeRobot write no statistics of these features, and so normalise none of them.
+
+    It would take them of every pixel apart: gigabytes of histograms for one depth picture.
+    """
+    usual = dataset_writer.compute_episode_stats
+
+    def compute(data: dict[str, Any], features: dict[str, dict]) -> dict[str, dict]:
+        return usual({key: values for key, values in data.items() if key not in keys}, features)
+
+    dataset_writer.compute_episode_stats = compute
+    try:
+        yield
+    finally:
+        dataset_writer.compute_episode_stats = usual
+
+
+@contextmanager
+def mergeable_arrays(features: dict[str, dict]) -> Iterator[None]:
+    """Let LeRobot merge tables that hold arrays of two dimensions.
+
+    It can where they hold images too, because it then names their types; elsewhere pyarrow must guess them.
+    """
+    usual = aggregate.to_parquet_one_row_group_per_episode
+    types = get_hf_features_from_features(features | DEFAULT_FEATURES)
+    aggregate.to_parquet_one_row_group_per_episode = partial(to_parquet_with_hf_images, features=types)
+    try:
+        yield
+    finally:
+        aggregate.to_parquet_one_row_group_per_episode = usual
 
 
 def abandon(dataset: LeRobotDataset) -> None:

@@ -172,9 +172,14 @@ class RenderOptions:
 
     image_size: int = DEFAULT_IMAGE_SIZE  # width and height in pixels
     preset: str = "fast"
+    depth: bool = False  # deliver each camera's depth and geometry too; see camera_geometry.py
 
     def __post_init__(self) -> None:
         one_of("--env.render_preset", self.preset, RENDER_PRESETS)
+        if self.depth and self.preset != "fast":  # depth would be that of one of the 4 samples of a pixel
+            raise ValueError(
+                f"--env.depth=true needs --env.render_preset=fast (sharp edges), not {self.preset}"
+            )
         if not MIN_IMAGE_SIZE <= self.image_size <= MAX_IMAGE_SIZE:
             raise ValueError(
                 f"--env.image_size={self.image_size} must lie in {MIN_IMAGE_SIZE}..{MAX_IMAGE_SIZE} pixels"
@@ -207,10 +212,7 @@ class EpisodeResult:
 
 @dataclass(frozen=True)
 class PrivilegedState:
-    """The simulator's true state, which the expert reads and no trained policy sees.
-
-    Stones that are parked (not part of the episode) have ``stone_in_play`` False.
-    """
+    """The simulator's true state, which the expert reads and no trained policy sees."""
 
     gripper_xyz: np.ndarray  # (3,) metres, point between the pads' lower ends
     finger_opening: float  # metres between the pads
@@ -218,7 +220,7 @@ class PrivilegedState:
     stone: int  # index of the stone to be moved
     stone_xyz: np.ndarray = field(repr=False)  # (NUM_STONES, 3) metres, centres
     stone_is_white: np.ndarray = field(repr=False)  # (NUM_STONES,) bool
-    stone_in_play: np.ndarray = field(repr=False)  # (NUM_STONES,) bool
+    stone_in_play: np.ndarray = field(repr=False)  # (NUM_STONES,) bool; False: parked out of sight
     stage: Stage = Stage.START
     # how the environment reads actions
     control_mode: str = "relative"

@@ -15,6 +15,7 @@ from lerobot_env_bomb.go import is_legal_move, is_legal_position
 from lerobot_env_bomb.model import BOARD_HALF_SIZE_M, TRAY_CENTER_XY, TRAY_HALF_SIZE_XY, build_model
 from lerobot_env_bomb.perturb import Perturbation
 from lerobot_env_bomb.photometric import Photometric
+from lerobot_env_bomb.robots import ROBOTS
 from lerobot_env_bomb.scene import WORKSPACE_HIGH, WORKSPACE_LOW, Layout, Scene
 from lerobot_env_bomb.task import STONE, Episode, sample_episode
 from lerobot_env_bomb.wording import FORMS, Wording
@@ -100,7 +101,7 @@ def test_a_range_draws_all_its_levels_and_the_axes_of_all_draw_apart() -> None:
 
 
 def test_a_nominal_reset_undoes_every_edit(scene: Scene) -> None:
-    fresh = {name: values.copy() for name, values in number_fields(build_model()).items()}
+    fresh = {name: values.copy() for name, values in number_fields(build_model(ROBOTS["scara"])).items()}
     changed = set()
     for axis in AXES:
         arranged(scene, 1, f"{axis}:5")
@@ -191,7 +192,7 @@ def test_stones_of_any_size_and_mass_rest_where_they_are_put(scene: Scene, seed:
 
 
 def test_mass_and_friction_change_as_if_compiled_so(scene: Scene) -> None:
-    nominal = build_model()
+    nominal = build_model(ROBOTS["scara"])
     stone = nominal.body("stone_3").id
     factors = set()
     for seed in range(20):
@@ -216,11 +217,14 @@ def test_mass_and_friction_change_as_if_compiled_so(scene: Scene) -> None:
 
 def test_the_colours_of_the_table_are_split_and_black_and_white_keep_their_sides() -> None:
     assert len(TABLE_RGB) == 8
-    train = {episode(s, "table:5", split="train").perturbation.table.table_rgb for s in range(200)}
-    heldout = {episode(s, "table:5", split="heldout").perturbation.table.table_rgb for s in range(50)}
+    drawn = {
+        split: {episode(seed, "table:5", split=split).perturbation.table for seed in range(200)}
+        for split in ("train", "heldout")
+    }
+    train, heldout = ({table.table_rgb for table in tables if table} for tables in drawn.values())
     assert train == set(TABLE_RGB) and len(heldout) == 2 and not train & heldout
     look = episode(0, "object:5").perturbation.object
-    model = build_model()
+    model = build_model(ROBOTS["scara"])
     model.geom("stone_0_visual").rgba[:3] = 0.06
     model.geom("stone_1_visual").rgba[:3] = 0.96
     assert look is not None

@@ -7,8 +7,9 @@ from typing import Any, cast
 
 from lerobot.configs import FeatureType, PolicyFeature
 from lerobot.envs import EnvConfig
-from lerobot.utils.constants import ACTION, OBS_IMAGES, OBS_STATE
+from lerobot.utils.constants import ACTION, OBS_IMAGES, OBS_PREFIX, OBS_STATE
 
+from lerobot_bomb.camera_geometry import geometry_shapes
 from lerobot_bomb.perturbations import NONE, Condition
 from lerobot_bomb.schema import (
     ACTION_DIM,
@@ -52,6 +53,8 @@ class BombEnvConfig(EnvConfig):
     image_size: int = 256
     # fast (no shadows) or shadows
     render_preset: str = "fast"
+    # also observe each camera's depth in metres, intrinsics and pose
+    depth: bool = False
     # distance from the intersection within which a placement counts
     success_tolerance_mm: float = 10.0
     # file that gets one JSON line per finished episode: seed, target, error, failure class
@@ -72,6 +75,9 @@ class BombEnvConfig(EnvConfig):
             **dict.fromkeys(cameras, image),
         }
         self.features_map = {ACTION: ACTION, AGENT_POS: OBS_STATE, **{key: key for key in cameras}}
+        for key, shape in geometry_shapes(self.render_options).items():
+            self.features[key] = PolicyFeature(type=FeatureType.STATE, shape=shape)
+            self.features_map[key] = f"{OBS_PREFIX}{key}"  # where LeRobot puts keys it does not know
 
     @property
     def gym_id(self) -> str:
@@ -117,9 +123,13 @@ class BombEnvConfig(EnvConfig):
         """Arguments of `BombEnv` for the first task."""
         return {
             "spec": next(iter(self.specs.values())),
-            "render_options": RenderOptions(image_size=self.image_size, preset=self.render_preset),
+            "render_options": self.render_options,
             "results_path": self.results_path,
         }
+
+    @property
+    def render_options(self) -> RenderOptions:
+        return RenderOptions(image_size=self.image_size, preset=self.render_preset, depth=self.depth)
 
     def create_envs(self, n_envs: int, use_async_envs: bool = False) -> dict[str, dict[int, LazyVectorEnv]]:
         """{suite and condition: {task id: vector env of n_envs}}; no worker starts before a first reset.

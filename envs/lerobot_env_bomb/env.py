@@ -1,7 +1,6 @@
 """BOMB as a Gymnasium environment."""
 
 import os
-from collections import deque
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -10,12 +9,12 @@ import numpy as np
 from gymnasium import spaces
 from gymnasium.error import ResetNeeded
 
+from lerobot_bomb.camera_geometry import geometry_shapes
 from lerobot_bomb.schema import (
     ACTION_DIM,
     CAMERAS,
     DEFAULT_FPS,
     MAX_EPISODE_STEPS,
-    MAX_STEP_M,
     NUM_STONES,
     PHYSICS_HZ,
     EpisodeResult,
@@ -25,9 +24,10 @@ from lerobot_bomb.schema import (
     Stage,
     action_bounds,
 )
+from lerobot_env_bomb.actuator import Actuator
 from lerobot_env_bomb.fetch_files import check_robot
 from lerobot_env_bomb.judge import Judge
-from lerobot_env_bomb.render import CameraRenderer, compose_caption
+from lerobot_env_bomb.render import CameraRenderer, compose_caption, extrinsics, intrinsics
 from lerobot_env_bomb.robots import ROBOTS
 from lerobot_env_bomb.scene import Scene
 from lerobot_env_bomb.task import STONE, Episode, check_target, sample_episode
@@ -38,7 +38,6 @@ DEFAULT_RENDER_OPTIONS = RenderOptions()
 PERSON_IMAGE_SIZE = 384  # pixels, either half of render()'s picture
 # Bounds of what the simulator can report, metres. Stones can be flung off the board, so they are wide.
 POSITION_LIMIT_M = 100.0
-ACTION_NOISE_STREAM = 300  # of random numbers, apart from those that an episode is drawn from
 
 
 @dataclass(frozen=True)
@@ -48,8 +47,7 @@ class _Run:
     scene: Scene
     episode: Episode
     judge: Judge
-    pending: deque[np.ndarray]  # actions that latency keeps from being executed yet, oldest first
-    noise_rng: np.random.Generator
+    actuator: Actuator
 
 
 class BombEnv(gymnasium.Env[Observation, np.ndarray]):
@@ -88,7 +86,7 @@ class BombEnv(gymnasium.Env[Observation, np.ndarray]):
         self._results_path = results_path
         self.action_space = action_space(spec.control_mode)
         self._action_low, self._action_high = self.action_space.low, self.action_space.high
-        self.observation_space = observation_space(render_options.image_size)
+        self.observation_space = observation_space(render_options)
         self._current_run: _Run | None = None
         self._renderer: CameraRenderer | None = None
         self._steps = 0
@@ -109,7 +107,13 @@ class BombEnv(gymnasium.Env[Observation, np.ndarray]):
         episode = sample_episode(replace(self._spec, seed=int(seed)))
         scene = self._current_run.scene if self._current_run is not None else Scene(self._spec.robot)
         scene.reset(episode.layout, episode.perturbation.model_edits)
-        self._current_run = self._start(scene, episode)
+        start, dynamics = scene.measure(), episode.perturbation.dynamics
+        self._current_run = _Run(
+            scene=scene,
+            episode=episode,
+            judge=Judge(episode, self._spec.fps, start),
+            actuator=Actuator(self._spec.control_mode, start.gripper_xyz, dynamics, episode.spec.seed),
+        )
         self.task_description = episode.instruction
         self._steps = 0
         self._last_transition = None
@@ -121,10 +125,8 @@ class BombEnv(gymnasium.Env[Observation, np.ndarray]):
         action = self._check(action)
         if self._last_transition is not None:
             return self._last_transition
-        run.pending.append(action)
-        executed = run.pending.popleft()
-        target_xyz = self._target_xyz(executed) + self._action_noise_m()
-        run.scene.move(target_xyz, bool(executed[3] >= 0), self._num_substeps)
+        target_xyz, open_fingers = run.actuator.command(action, run.scene.measure().gripper_xyz)
+        run.scene.move(target_xyz, open_fingers, self._num_substeps)
         self._steps += 1
         terminated = run.judge.update(run.scene.measure())
         truncated = not terminated and self._steps >= self._max_episode_steps
@@ -191,8 +193,8 @@ class BombEnv(gymnasium.Env[Observation, np.ndarray]):
             fps=self._spec.fps,
             stone_radius_m=run.episode.layout.stone_radius_m,
             max_opening_m=2 * run.scene.robot.max_half_opening_m,
-            pending_motion_m=self._pending_motion_m(now.gripper_xyz),
-            pending_gripper=float(run.pending[-1][3]) if run.pending else 0.0,
+            pending_motion_m=run.actuator.pending_motion_m(now.gripper_xyz),
+            pending_gripper=run.actuator.pending_gripper,
         )
 
     @property
@@ -200,20 +202,6 @@ class BombEnv(gymnasium.Env[Observation, np.ndarray]):
         if self._current_run is None:
             raise ResetNeeded("call reset before anything else")
         return self._current_run
-
-    def _start(self, scene: Scene, episode: Episode) -> _Run:
-        """The run of an episode whose layout is in the scene."""
-        start = scene.measure()
-        dynamics = episode.perturbation.dynamics
-        rest = np.zeros(3) if self._spec.control_mode == "relative" else start.gripper_xyz
-        latency = dynamics.latency if dynamics is not None else 0
-        return _Run(
-            scene=scene,
-            episode=episode,
-            judge=Judge(episode, self._spec.fps, start),
-            pending=deque([np.array([*rest, 1.0])] * latency),
-            noise_rng=np.random.default_rng([episode.spec.seed, ACTION_NOISE_STREAM]),
-        )
 
     def _check(self, action: np.ndarray) -> np.ndarray:
         """(4,) float64 within the action space."""
@@ -224,46 +212,45 @@ class BombEnv(gymnasium.Env[Observation, np.ndarray]):
             raise ValueError(f"action {action.tolist()} is not finite")
         return np.clip(action, self._action_low, self._action_high)
 
-    def _target_xyz(self, action: np.ndarray) -> np.ndarray:
-        """(3,) metres, where an action that is executed now sends the gripper."""
-        if self._spec.control_mode == "absolute":
-            return action[:3]
-        return self._run.scene.measure().gripper_xyz + MAX_STEP_M * action[:3]
-
-    def _action_noise_m(self) -> np.ndarray:
-        """(3,) metres, what the axis `dynamics` adds to a step's command."""
-        dynamics = self._run.episode.perturbation.dynamics
-        if dynamics is None:
-            return np.zeros(3)
-        return MAX_STEP_M * dynamics.noise * self._run.noise_rng.standard_normal(3)
-
-    def _pending_motion_m(self, gripper_xyz: np.ndarray) -> np.ndarray:
-        """(3,) metres that the actions still to be executed will move the gripper."""
-        pending = self._run.pending
-        if not pending:
-            return np.zeros(3)
-        if self._spec.control_mode == "absolute":
-            return pending[-1][:3] - gripper_xyz
-        return MAX_STEP_M * np.sum([action[:3] for action in pending], axis=0)
-
     def _observe(self) -> Observation:
         state = self.privileged_state()
-        size = self._render_options.image_size
+        views = {camera: self._view(camera) for camera in CAMERAS}
         return {
-            "pixels": {camera: self._draw(camera, size) for camera in CAMERAS},
+            "pixels": {camera: picture for camera, (picture, _) in views.items()},
             "agent_pos": np.array([*state.gripper_xyz, state.finger_opening], dtype=np.float32),
             "environment_state": state.to_vector(),
+            **{key: value for _, geometry in views.values() for key, value in geometry.items()},
+        }
+
+    def _view(self, camera: str) -> tuple[np.ndarray, dict[str, np.ndarray]]:
+        """(H, W, 3) uint8 picture; depth, intrinsics and extrinsics by key, if they are asked for."""
+        scene, size = self._run.scene, self._render_options.image_size
+        if not self._render_options.depth:
+            return self._draw(camera, size), {}
+        picture, depth_m = self._camera_renderer.draw_depth(scene.data, camera, size)
+        return self._sense(picture, camera), {
+            f"depth.{camera}": depth_m,
+            f"intrinsics.{camera}": intrinsics(scene.model, camera, size),
+            f"extrinsics.{camera}": extrinsics(scene.data, camera),
         }
 
     def _draw(self, camera: str, size: int) -> np.ndarray:
+        """(size, size, 3) uint8 picture."""
+        return self._sense(self._camera_renderer.draw(self._run.scene.data, camera, size), camera)
+
+    def _sense(self, picture: np.ndarray, camera: str) -> np.ndarray:
+        """The picture as the camera's sensor takes it in this step."""
+        photometric = self._run.episode.perturbation.photometric
+        if photometric is None:
+            return picture
+        return photometric(picture, len(CAMERAS) * self._steps + CAMERAS.index(camera))
+
+    @property
+    def _camera_renderer(self) -> CameraRenderer:
         if self._renderer is None:
             largest = max(self._render_options.image_size, PERSON_IMAGE_SIZE)
             self._renderer = CameraRenderer(self._run.scene.model, self._render_options, largest)
-        rgb = self._renderer.draw(self._run.scene.data, camera, size)
-        photometric = self._run.episode.perturbation.photometric
-        if photometric is None:
-            return rgb
-        return photometric(rgb, len(CAMERAS) * self._steps + CAMERAS.index(camera))
+        return self._renderer
 
     def _info(self) -> dict[str, Any]:
         judge = self._run.judge
@@ -298,9 +285,9 @@ def action_space(control_mode: str) -> spaces.Box:
     return spaces.Box(low, high, dtype=np.float32)
 
 
-def observation_space(image_size: int) -> spaces.Dict:
-    """Pictures of both cameras, (4,) state of the gripper, and the privileged state for oracles."""
-    shape = (image_size, image_size, 3)
+def observation_space(options: RenderOptions) -> spaces.Dict:
+    """Pictures of both cameras, (4,) state of the gripper, the privileged state for oracles, geometry."""
+    shape = (options.image_size, options.image_size, 3)
     # opening fingers overshoot their stops a little
     widest_m = max(robot.max_half_opening_m for robot in ROBOTS.values())
     reach_m = np.array([1.0, 1.0, 1.0, 2.5 * widest_m], dtype=np.float32)
@@ -310,5 +297,9 @@ def observation_space(image_size: int) -> spaces.Dict:
             "pixels": spaces.Dict({camera: spaces.Box(0, 255, shape, np.uint8) for camera in CAMERAS}),
             "agent_pos": spaces.Box(-reach_m, reach_m, dtype=np.float32),
             "environment_state": spaces.Box(-limit, limit, (PrivilegedState.DIM,), np.float32),
+            **{
+                key: spaces.Box(-np.inf, np.inf, shape, np.float32)
+                for key, shape in geometry_shapes(options).items()
+            },
         }
     )

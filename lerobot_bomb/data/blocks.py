@@ -9,7 +9,7 @@ import logging
 import os
 import tempfile
 from collections.abc import Iterable, Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, nullcontext
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -22,10 +22,17 @@ from datasets import disable_progress_bars, enable_progress_bars
 from datasets.exceptions import DatasetGenerationError
 from lerobot.datasets import LeRobotDataset, aggregate_datasets
 from lerobot.datasets.utils import DEFAULT_EPISODES_PATH, STATS_PATH
-from lerobot.utils.constants import ACTION, OBS_IMAGES, OBS_STATE
+from lerobot.utils.constants import ACTION, OBS_IMAGES, OBS_PREFIX, OBS_STATE
 
 from lerobot_bomb import __version__
-from lerobot_bomb._compat import abandon, datasets_cache, sampled_image_statistics
+from lerobot_bomb._compat import (
+    abandon,
+    datasets_cache,
+    mergeable_arrays,
+    sampled_image_statistics,
+    without_statistics,
+)
+from lerobot_bomb.camera_geometry import geometry_shapes
 from lerobot_bomb.data.rollout import Rollout
 from lerobot_bomb.schema import ACTION_NAMES, CAMERAS, STATE_NAMES, EpisodeResult, EpisodeSpec, RenderOptions
 
@@ -53,6 +60,15 @@ class DatasetLayout:
             **{f"{OBS_IMAGES}.{camera}": dict(image) for camera in CAMERAS},
             OBS_STATE: {"dtype": "float32", "shape": (len(STATE_NAMES),), "names": list(STATE_NAMES)},
             ACTION: {"dtype": "float32", "shape": (len(action_names),), "names": list(action_names)},
+            **self.geometry_features,
+        }
+
+    @property
+    def geometry_features(self) -> dict[str, dict[str, Any]]:
+        """Depth, intrinsics and extrinsics as arrays: a policy would take images of them for cameras."""
+        return {
+            f"{OBS_PREFIX}{key}": {"dtype": "float32", "shape": shape, "names": ["row", "column"]}
+            for key, shape in geometry_shapes(self.render_options).items()
         }
 
     def create(self, root: Path) -> LeRobotDataset:
@@ -80,7 +96,13 @@ def write_block(layout: DatasetLayout, root: Path, rollouts: Iterable[Rollout]) 
         RuntimeError: a video lacks frames, or a thread of LeRobot could not write an image or a video.
         OSError: the disk is full.
     """
-    with _quiet_libraries(), _temporary_files_in(root.parent), sampled_image_statistics(), _logged_errors():
+    with (
+        _quiet_libraries(),
+        _temporary_files_in(root.parent),
+        sampled_image_statistics(),
+        without_statistics(layout.geometry_features),
+        _logged_errors(),
+    ):
         results = _write_episodes(layout.create(root), rollouts)
     _add_episode_columns(root, results)
     num_frames = sum(result.steps for result in results)
@@ -91,18 +113,24 @@ def write_block(layout: DatasetLayout, root: Path, rollouts: Iterable[Rollout]) 
 def merge_blocks(layout: DatasetLayout, blocks: list[Path], root: Path) -> None:
     """Merge finished blocks, in their order, into one dataset.
 
-    Videos and tables are joined up to LeRobot's file sizes. Tables that hold images stay one per block:
-    to join them LeRobot would read and write all earlier images again for every block.
+    Videos and tables are joined up to LeRobot's file sizes. Tables that hold images or depth stay one per
+    block: to join them LeRobot would read and write all earlier images again for every block.
 
     Raises:
         OSError: the disk is full.
     """
     repo_ids = [layout.repo_id] * len(blocks)
     cache = datasets_cache(root.with_name(f"{root.name}.cache"))
-    with _quiet_libraries(), _temporary_files_in(root.parent), cache:
+    depth = layout.render_options.depth
+    arrays = mergeable_arrays(layout.features) if depth else nullcontext()
+    with _quiet_libraries(), _temporary_files_in(root.parent), cache, arrays:
         try:
             aggregate_datasets(
-                repo_ids, layout.repo_id, roots=blocks, aggr_root=root, concatenate_data=layout.use_videos
+                repo_ids,
+                layout.repo_id,
+                roots=blocks,
+                aggr_root=root,
+                concatenate_data=layout.use_videos and not depth,
             )
         except DatasetGenerationError as error:
             raise OSError(f"the blocks could not be read: {error.__cause__}") from error
@@ -187,8 +215,9 @@ def _write_episodes(dataset: LeRobotDataset, rollouts: Iterable[Rollout]) -> lis
 def _write_episode(dataset: LeRobotDataset, rollout: Rollout) -> None:
     for step, (state, action) in enumerate(zip(rollout.states, rollout.actions, strict=True)):
         images = {f"{OBS_IMAGES}.{camera}": frames[step] for camera, frames in rollout.frames.items()}
+        geometry = {f"{OBS_PREFIX}{key}": values[step] for key, values in rollout.geometry.items()}
         dataset.add_frame(
-            {**images, OBS_STATE: state, ACTION: action, "task": rollout.result.instruction},
+            {**images, **geometry, OBS_STATE: state, ACTION: action, "task": rollout.result.instruction},
         )
     dataset.save_episode()
 

@@ -74,6 +74,7 @@ def add_record_arguments(parser: argparse.ArgumentParser) -> None:
         "black = 0, white = 1; default: target and colour are drawn per episode)",
     )
     add("--images", **_switch(), help="store images (lossless) instead of videos")
+    add("--depth", **_switch(), help="store each camera's depth (metres, lossless), intrinsics and pose too")
     add("--workers", type=int, default=1, help="simulator processes; one keeps two cores busy (default: 1)")
     add(
         "--noise",

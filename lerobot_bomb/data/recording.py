@@ -53,6 +53,7 @@ class Recording:
     # numbered tasks, each played from every seed; empty = target and colour are drawn per episode
     task_ids: tuple[int, ...] = ()
     images: bool = False
+    depth: bool = False
     noise: float = 0.0
     protocol_version: str = PROTOCOL_VERSION
     package_version: str = __version__
@@ -101,7 +102,7 @@ class Recording:
 
     @property
     def render_options(self) -> RenderOptions:
-        return RenderOptions(image_size=self.image_size)
+        return RenderOptions(image_size=self.image_size, depth=self.depth)
 
 
 @contextmanager

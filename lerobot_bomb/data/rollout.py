@@ -17,6 +17,7 @@ from typing import Self
 import gymnasium
 import numpy as np
 
+from lerobot_bomb.camera_geometry import geometry_shapes
 from lerobot_bomb.expert import expert_action
 from lerobot_bomb.schema import (
     CAMERAS,
@@ -53,6 +54,7 @@ class Rollout:
     states: np.ndarray  # (T, 4) float32, metres
     actions: np.ndarray  # (T, 4) float32, the expert's clean actions
     frames: dict[str, np.ndarray]  # camera -> (T, H, W, 3) uint8
+    geometry: dict[str, np.ndarray]  # key of camera_geometry.py -> (T, ...) float32; {} without depth
 
 
 def make_env(spec: EpisodeSpec, render_options: RenderOptions) -> gymnasium.Env:
@@ -84,12 +86,15 @@ def play(env: gymnasium.Env, spec: EpisodeSpec, settings: RolloutSettings) -> Ro
         ended = terminated or truncated
     result = env.get_wrapper_attr("episode_result")()
     if not result.is_success:
-        return Rollout(result, np.empty((0, 4), np.float32), np.empty((0, 4), np.float32), {})
+        return Rollout(result, np.empty((0, 4), np.float32), np.empty((0, 4), np.float32), {}, {})
     return Rollout(
         result=result,
         states=np.stack([observation["agent_pos"] for observation in observations]),
         actions=np.stack(actions),
         frames={camera: np.stack([o["pixels"][camera] for o in observations]) for camera in CAMERAS},
+        geometry={
+            key: np.stack([o[key] for o in observations]) for key in geometry_shapes(settings.render_options)
+        },
     )
 
 
