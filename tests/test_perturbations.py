@@ -65,7 +65,7 @@ def test_all_stands_for_every_nuisance_and_no_help() -> None:
 def test_a_malformed_condition_is_refused(text: str, message: str) -> None:
     with pytest.raises(ValueError, match=re.escape(message)) as error:
         EpisodeSpec(seed=0, perturbations=text)
-    assert str(error.value).startswith(f"--env.perturbations has {text!r}")
+    assert str(error.value).startswith(f"--env.perturbations={text!r}")
 
 
 def test_magnitudes_grow_with_the_level() -> None:

@@ -2,6 +2,7 @@
 
 import errno
 import json
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -14,6 +15,7 @@ from lerobot_bomb.data.record import describe_failures, record
 from lerobot_bomb.data.recording import METADATA_FILE, Progress, Recording, read_progress, unfinished_folder
 from lerobot_bomb.data.rollout import RolloutSettings, make_env, play
 from lerobot_bomb.expert import expert_action
+from lerobot_bomb.perturbations import NUISANCES
 from lerobot_bomb.schema import CAMERAS, PROTOCOL_VERSION, EpisodeSpec, PrivilegedState, RenderOptions
 
 SIZE = 64
@@ -76,7 +78,7 @@ def test_a_dataset_reads_back_through_lerobot(recording: Recording, datasets: di
     assert dataset.features["observation.state"]["names"] == ["x", "y", "z", "finger_opening"]
     first = "x" if recording.control_mode == "absolute" else "dx"
     assert dataset.features["action"]["names"][0] == first
-    assert (dataset.fps, dataset.meta.robot_type) == (10, "bomb_scara")
+    assert (dataset.fps, dataset.meta.robot_type) == (10, f"bomb_scara_v{PROTOCOL_VERSION}")
     assert dataset.num_episodes == recording.episodes
     progress = read_progress(root / METADATA_FILE)
     assert len(dataset) == progress.num_frames
@@ -190,6 +192,45 @@ def test_every_seed_is_played_with_every_task(tmp_path: Path) -> None:
     spec = json.loads(rows[1]["bomb/spec"])
     assert (spec["seed"], spec["target"], spec["color"]) == (6, [1, 4], "white")
     assert record(recording, tmp_path / "tasks", resume=True).num_episodes == 3
+
+
+def test_every_seed_is_played_under_every_condition_at_the_levels_it_draws(tmp_path: Path) -> None:
+    conditions = ("none", "all:1-5")
+    recording = Recording(
+        "test/perturbed", episodes=4, seed=2, image_size=SIZE, perturbations=conditions, images=True
+    )
+    record(recording, tmp_path / "perturbed")
+    rows = episode_rows(tmp_path / "perturbed")
+    specs = [json.loads(row["bomb/spec"]) for row in rows]
+    assert [(spec["seed"], spec["perturbations"]) for spec in specs] == [
+        (seed, condition) for seed in (2, 3) for condition in conditions
+    ]
+    levels = [json.loads(row["bomb/levels"]) for row in rows]
+    assert levels[0] == levels[2] == {}
+    assert levels[1] != levels[3] and set(levels[1]) == set(NUISANCES)
+    assert rows[0]["bomb/target"] == rows[1]["bomb/target"]  # a pair
+
+
+def test_lerobot_refuses_to_merge_datasets_of_different_protocol_versions(
+    datasets: dict[str, Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    from lerobot.datasets import aggregate_datasets
+
+    from lerobot_bomb.data import blocks
+
+    monkeypatch.setattr(blocks, "PROTOCOL_VERSION", "0.0")
+    record(IMAGES, tmp_path / "old")
+    roots = [datasets["images"], tmp_path / "old"]
+    with pytest.raises(ValueError, match=f"bomb_scara_v{PROTOCOL_VERSION}"):
+        aggregate_datasets(["test/images"] * 2, "test/merged", roots=roots, aggr_root=tmp_path / "merged")
+
+
+def test_a_recording_of_another_protocol_version_is_not_gone_on_with(
+    datasets: dict[str, Path], tmp_path: Path
+) -> None:
+    old = replace(IMAGES, protocol_version="0.0")
+    with pytest.raises(ValueError, match=rf"differs in --protocol_version=0.0 \(it has {PROTOCOL_VERSION}\)"):
+        record(old, datasets["images"], resume=True)
 
 
 def test_failures_are_described_by_class_and_seed() -> None:

@@ -34,7 +34,15 @@ from lerobot_bomb._compat import (
 )
 from lerobot_bomb.camera_geometry import geometry_shapes
 from lerobot_bomb.data.rollout import Rollout
-from lerobot_bomb.schema import ACTION_NAMES, CAMERAS, STATE_NAMES, EpisodeResult, EpisodeSpec, RenderOptions
+from lerobot_bomb.schema import (
+    ACTION_NAMES,
+    CAMERAS,
+    PROTOCOL_VERSION,
+    STATE_NAMES,
+    EpisodeResult,
+    EpisodeSpec,
+    RenderOptions,
+)
 
 ENCODER_THREADS = 1  # per camera, which keeps two cores busy; see benchmarks/record_speed.py
 IMAGE_WRITER_THREADS = 4
@@ -78,7 +86,8 @@ class DatasetLayout:
             fps=self.spec.fps,
             features=self.features,
             root=root,
-            robot_type=f"bomb_{self.spec.robot}",
+            # LeRobot's merge refuses datasets of different robots, hence of different protocol versions too
+            robot_type=f"bomb_{self.spec.robot}_v{PROTOCOL_VERSION}",
             use_videos=self.use_videos,
             streaming_encoding=self.use_videos,
             # unlimited: LeRobot drops frames when this queue is full
@@ -233,6 +242,7 @@ def _add_episode_columns(root: Path, results: list[EpisodeResult]) -> None:
         "bomb/seed": pa.array([result.spec.seed for result in results]),
         "bomb/target": pa.array([list(result.target) for result in results]),
         "bomb/color": pa.array([result.color for result in results]),
+        "bomb/levels": pa.array([json.dumps(result.levels) for result in results]),
         "bomb/spec": pa.array([json.dumps(result.spec.to_dict()) for result in results]),
         "bomb/protocol_version": pa.array([result.protocol_version for result in results]),
         "bomb/package_version": pa.array([__version__] * len(results)),

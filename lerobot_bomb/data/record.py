@@ -35,6 +35,7 @@ from lerobot_bomb.data.recording import (
 )
 from lerobot_bomb.data.rollout import Expert, Rollout, RolloutPool, RolloutSettings, make_env
 from lerobot_bomb.expert import expert_action
+from lerobot_bomb.perturbations import NONE
 from lerobot_bomb.schema import (
     CONTROL_MODES,
     DEFAULT_FPS,
@@ -72,6 +73,14 @@ def add_record_arguments(parser: argparse.ArgumentParser) -> None:
         default=(),
         help="numbered tasks, as [0,7,12]: every seed is played with each (25 x colour + 5 x row + column; "
         "black = 0, white = 1; default: target and colour are drawn per episode)",
+    )
+    add(
+        "--perturbations",
+        "--env.perturbations",
+        type=parse_conditions,
+        default=(NONE,),
+        help='conditions, as ["all:1-5"]: every seed is played with each; a range such as all:1-5 or '
+        "camera:0-3 draws a level per episode and axis (default: none)",
     )
     add("--images", **_switch(), help="store images (lossless) instead of videos")
     add("--depth", **_switch(), help="store each camera's depth (metres, lossless), intrinsics and pose too")
@@ -266,6 +275,11 @@ def _parse_numbers(text: str) -> tuple[int, ...]:
     if not re.fullmatch(r"\d+(,\d+)*|\[\d+(,\d+)*\]", text.replace(" ", "")):
         raise argparse.ArgumentTypeError(f"{text!r} must be a list of whole numbers, as [0,7]")
     return tuple(int(number) for number in re.findall(r"\d+", text))
+
+
+def parse_conditions(text: str) -> tuple[str, ...]:
+    """Read a list of conditions: ("none", "all:1-5") from '["none","all:1-5"]' and from "none,all:1-5"."""
+    return tuple(part.strip(" \"'") for part in text.strip("[] ").split(",") if part.strip())
 
 
 def _parse_bool(text: str) -> bool:

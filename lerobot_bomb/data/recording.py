@@ -20,6 +20,7 @@ from typing import Any
 from filelock import FileLock, Timeout
 
 from lerobot_bomb import __version__
+from lerobot_bomb.perturbations import NONE
 from lerobot_bomb.schema import (
     DEFAULT_FPS,
     DEFAULT_IMAGE_SIZE,
@@ -52,6 +53,7 @@ class Recording:
     split: str = "all"
     # numbered tasks, each played from every seed; empty = target and colour are drawn per episode
     task_ids: tuple[int, ...] = ()
+    perturbations: tuple[str, ...] = (NONE,)  # conditions, each played from every seed, with every task
     images: bool = False
     depth: bool = False
     noise: float = 0.0
@@ -65,13 +67,17 @@ class Recording:
             raise ValueError(f"--episodes={self.episodes} must be at least 1")
         if len(set(self.task_ids)) < len(self.task_ids):
             raise ValueError(f"--task_ids={list(self.task_ids)} has a task twice")
+        if not self.perturbations:
+            raise ValueError('--perturbations=[] names no condition; leave it out or give ["none"]')
         if not 0 <= self.noise <= MAX_NOISE:
             raise ValueError(
                 f"--noise={self.noise} must lie in 0..{MAX_NOISE:g}; "
                 "it is a standard deviation in units of the largest step, 40 mm"
             )
         with recorder_flags():
-            _ = self.conditions, self.render_options  # they check the remaining flags
+            conditions, _ = self.conditions, self.render_options  # they check the remaining flags
+        if len(set(conditions)) < len(conditions):
+            raise ValueError(f"--perturbations={list(self.perturbations)} has a condition twice")
 
     @property
     def spec(self) -> EpisodeSpec:
@@ -92,7 +98,8 @@ class Recording:
     @property
     def conditions(self) -> list[EpisodeSpec]:
         """The specs that every seed is played with, with the first seed."""
-        return [self.spec.for_task(task_id) for task_id in self.task_ids] or [self.spec]
+        tasks = [self.spec.for_task(task_id) for task_id in self.task_ids] or [self.spec]
+        return [replace(task, perturbations=text) for task in tasks for text in self.perturbations]
 
     def specs(self, num_tried: int) -> Iterator[EpisodeSpec]:
         """The episodes to try after the first `num_tried`: seeds count up, each with all conditions."""
