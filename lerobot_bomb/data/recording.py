@@ -77,7 +77,7 @@ class Recording:
         with recorder_flags():
             conditions, _ = self.conditions, self.render_options  # they check the remaining flags
         if len(set(conditions)) < len(conditions):
-            raise ValueError(f"--perturbations={list(self.perturbations)} has a condition twice")
+            raise ValueError(f"--perturbations={','.join(self.perturbations)} has a condition twice")
 
     @property
     def spec(self) -> EpisodeSpec:
