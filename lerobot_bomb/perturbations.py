@@ -58,7 +58,7 @@ AXES = {
         "number of stones on the board, and how exactly they stand",
         ("images", "state"),
         {
-            "extra": Magnitude("stones", (1, 2, 3, 5, 7), "more on the board"),
+            "extra": Magnitude("stones", (1, 2, 3, 4, 5), "more on the board"),
             "shift": Magnitude("mm", (0.8, 1.6, 2.4, 3.2, 4.0), "of each stone, in a drawn direction"),
         },
     ),
@@ -189,8 +189,7 @@ def _parse_part(part: str, text: str) -> tuple[tuple[str, ...], int, int]:
     axis, low, high = match[1], int(match[2]), int(match[3] or match[2])
     if axis != ALL and axis not in AXES:
         raise ValueError(
-            f"--env.perturbations={text!r}: {axis!r} is not an axis; "
-            f"choose one of: {', '.join((*AXES, ALL))}"
+            f"--env.perturbations={text!r}: {axis!r} is not an axis; choose one of: {', '.join((*AXES, ALL))}"
         )
     if not 0 <= low <= high <= MAX_LEVEL:
         raise ValueError(

@@ -33,8 +33,11 @@ class Photometric:
         """(H, W, 3) uint8 -> the same, of the `picture`-th picture of an episode."""
         start = (self.first + picture * NOISE_STRIDE) % NOISE_SPAN
         noise = _noise_bank(rgb.size, self.noise)[start : start + rgb.size].reshape(rgb.shape)
-        values = (rgb * _gain_table(self.gains, rgb.shape)) >> GAIN_BITS
-        return np.clip(values.view(np.int16) + noise, 0, 255).astype(np.uint8)
+        values = rgb * _gain_table(self.gains, rgb.shape)
+        values >>= GAIN_BITS
+        values = values.view(np.int16)
+        values += noise
+        return np.clip(values, 0, 255, out=values).astype(np.uint8)
 
 
 @lru_cache(maxsize=8)
