@@ -1,5 +1,6 @@
 from pathlib import Path
 
+import numpy as np
 import pytest
 from lerobot.envs import env_to_policy_features, make_env, make_env_config
 
@@ -38,9 +39,31 @@ def test_task_ids_fix_target_and_colour() -> None:
     vector.close()
 
 
+def test_each_condition_is_a_group_with_all_tasks() -> None:
+    conditions = ["none", "light:3+camera:2", "all:1-5"]
+    config = make_env_config("bomb", task_ids=[0, 38], perturbations=conditions, image_size=32)
+    envs = make_env(config, n_envs=1)
+    assert list(envs) == ["place.none", "place.camera-2.light-3", "place.all-1to5"]
+    assert all(list(group) == [0, 38] for group in envs.values())
+    instructions, pictures = [], []
+    for key in ("place.none", "place.camera-2.light-3"):
+        vector = envs[key][38]
+        assert isinstance(vector, LazyVectorEnv)
+        pictures.append(vector.reset(seed=[3])[0]["pixels"]["workspace"])
+        instructions.append(vector.call("task_description"))
+        vector.close()
+    assert instructions[0] == instructions[1]
+    assert not np.array_equal(*pictures)
+
+
 @pytest.mark.parametrize(
     ("flags", "message"),
     [
+        ({"perturbations": ["haze:1"]}, r"--env.perturbations='haze:1': 'haze' is not an axis"),
+        ({"perturbations": ["camera:6"]}, r"--env.perturbations='camera:6': the levels of camera must lie"),
+        ({"perturbations": ["camera"]}, r"--env.perturbations='camera': 'camera' is not a perturbation"),
+        ({"perturbations": []}, r"--env.perturbations=\[\] names no condition"),
+        ({"perturbations": ["none", "all:0"]}, "a condition twice"),
         ({"task": "plce"}, "--env.task='plce'"),
         ({"robot": "panda"}, "--env.robot='panda'"),
         ({"control_mode": "joint"}, "--env.control_mode='joint'"),

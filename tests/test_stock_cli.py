@@ -5,6 +5,7 @@ from collections.abc import Callable
 from pathlib import Path
 
 import pytest
+from huggingface_hub.utils import validate_repo_id
 
 from lerobot_bomb.cli import main
 from lerobot_bomb.evaluation.results import read_results
@@ -58,6 +59,31 @@ def test_numbered_tasks_and_absolute_control(stock_cli: Run, tmp_path: Path) -> 
     info = evaluate(stock_cli, tmp_path, flags)
     assert [task["task_id"] for task in info["per_task"]] == [0, 38]
     assert info["overall"]["pc_success"] == 100.0
+
+
+def test_each_condition_has_a_rate_and_a_recording(stock_cli: Run, tmp_path: Path) -> None:
+    flags = '--env.perturbations=["none","camera:3","all:5"] --policy.type=bomb_expert --eval.recording=true'
+    flags += " --eval.n_episodes=2 --eval.batch_size=2 --eval.use_async_envs=false"
+    info = evaluate(stock_cli, tmp_path, flags)
+    keys = ["place.none", "place.camera-3", "place.all-5"]
+    assert {key: info["per_group"][key]["pc_success"] for key in keys} == dict.fromkeys(keys, 100.0)
+    assert {path.name for path in (tmp_path / "eval" / "recordings").iterdir()} == {
+        f"{key}_0" for key in keys
+    }
+    for key in keys:
+        validate_repo_id(f"me/recorded_{key}_0")  # what --eval.recording_repo_id makes of it
+    rows = read_results(tmp_path / "results.jsonl")
+    assert sorted(row["spec"]["perturbations"] for row in rows) == sorted(2 * ["none", "camera:3", "all:5"])
+    # the nominal arm has the same seeds, targets and colours
+    episodes = {
+        condition: [
+            (r["spec"]["seed"], r["target"], r["color"])
+            for r in rows
+            if r["spec"]["perturbations"] == condition
+        ]
+        for condition in ("none", "camera:3", "all:5")
+    }
+    assert episodes["none"] == episodes["camera:3"] == episodes["all:5"]
 
 
 def test_random_actions_fail(stock_cli: Run, tmp_path: Path) -> None:
