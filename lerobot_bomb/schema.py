@@ -15,7 +15,7 @@ import numpy as np
 from lerobot_bomb.perturbations import NONE, Condition
 
 # Version of task, physics, observation and success rule. Results of different versions do not compare.
-PROTOCOL_VERSION = "0.1"
+PROTOCOL_VERSION = "1.0"
 
 SUITES = ("place",)
 ROBOTS = ("scara", "fetch")

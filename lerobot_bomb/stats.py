@@ -1,6 +1,6 @@
-"""Intervals for success rates."""
+"""Intervals and tests for success rates."""
 
-from math import sqrt
+from math import comb, sqrt
 from statistics import NormalDist
 
 
@@ -27,3 +27,13 @@ def format_rate(successes: int, n: int) -> str:
     """'48/50 = 96.0 % [86.5, 98.9]': count, rate and its 95 % Wilson interval."""
     low, high = wilson_interval(successes, n)
     return f"{successes}/{n} = {100 * successes / n:.1f} % [{100 * low:.1f}, {100 * high:.1f}]"
+
+
+def mcnemar_p_value(only_first: int, only_second: int) -> float:
+    """Two-sided exact p-value of the hypothesis that both arms of paired episodes succeed equally often.
+
+    Given the pairs in which one arm alone succeeded, either is as likely as a coin's side (McNemar, 1947).
+    """
+    num_discordant = only_first + only_second
+    tail = sum(comb(num_discordant, k) for k in range(min(only_first, only_second) + 1))
+    return min(1.0, 2 * tail / 2**num_discordant)

@@ -24,13 +24,22 @@ SMALL = RenderOptions(image_size=32)
 SEEDS = (9, 10)
 # of a network's actions: a matrix product of another batch size may round otherwise; bins are 100 times wider
 NETWORK_TOLERANCE = 1e-4
-MAKE_ONE = partial(BombEnv, EpisodeSpec(seed=0), SMALL)
+CONDITIONS = ("none", "all:1-5")
 
 type Observations = list[dict[str, np.ndarray]]
 type Run = Callable[..., None]
 
 
 # Observations
+
+
+def make_one(condition: str) -> BombEnv:
+    return BombEnv(EpisodeSpec(seed=0, perturbations=condition), SMALL)
+
+
+@pytest.fixture(scope="module", params=CONDITIONS)
+def condition(request: pytest.FixtureRequest) -> str:
+    return request.param
 
 
 def flat(observation: dict[str, Any]) -> dict[str, np.ndarray]:
@@ -77,11 +86,11 @@ def digest(observations: Observations) -> str:
 
 
 @pytest.fixture(scope="module")
-def episodes() -> list[tuple[np.ndarray, Observations]]:
+def episodes(condition: str) -> list[tuple[np.ndarray, Observations]]:
     """The expert's episodes of SEEDS, each the first of its env."""
     played = []
     for seed in SEEDS:
-        env = MAKE_ONE()
+        env = make_one(condition)
         played.append(play_expert(env, seed))
         env.close()
     assert len(played[0][0]) != len(played[1][0])
@@ -89,9 +98,9 @@ def episodes() -> list[tuple[np.ndarray, Observations]]:
 
 
 @pytest.fixture
-def used_env() -> Iterator[BombEnv]:
+def used_env(condition: str) -> Iterator[BombEnv]:
     """An env in which an episode was broken off with a stone in the air, and one with the arm astray."""
-    env = MAKE_ONE()
+    env = make_one(condition)
     env.reset(seed=3)
     for _ in range(15):
         env.step(expert_action(env.privileged_state()))
@@ -111,10 +120,12 @@ def test_earlier_episodes_leave_nothing_behind(
         assert_same(observations, expected)
 
 
-def test_a_fresh_process_gives_the_same_bits(episodes: list[tuple[np.ndarray, Observations]]) -> None:
+def test_a_fresh_process_gives_the_same_bits(
+    condition: str, episodes: list[tuple[np.ndarray, Observations]]
+) -> None:
     script = (
-        "from test_independence import MAKE_ONE, SEEDS, digest, play_expert\n"
-        "env = MAKE_ONE()\n"
+        "from test_independence import make_one, SEEDS, digest, play_expert\n"
+        f"env = make_one({condition!r})\n"
         "print([digest(play_expert(env, seed)[1]) for seed in reversed(SEEDS)])\n"
     )
     run = subprocess.run(
@@ -133,9 +144,13 @@ def test_a_fresh_process_gives_the_same_bits(episodes: list[tuple[np.ndarray, Ob
     [(1, False, "forkserver"), (2, False, "forkserver"), (2, True, "forkserver"), (2, True, "spawn")],
 )
 def test_vector_envs_give_the_same_bits(
-    episodes: list[tuple[np.ndarray, Observations]], num_envs: int, use_async: bool, context: str
+    condition: str,
+    episodes: list[tuple[np.ndarray, Observations]],
+    num_envs: int,
+    use_async: bool,
+    context: str,
 ) -> None:
-    envs = LazyVectorEnv([MAKE_ONE] * num_envs, use_async=use_async, context=context)
+    envs = LazyVectorEnv([partial(make_one, condition)] * num_envs, use_async=use_async, context=context)
     try:
         played = play_together(envs, [actions for actions, _ in episodes[:num_envs]])
     finally:

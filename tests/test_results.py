@@ -5,15 +5,16 @@ import pytest
 
 from lerobot_bomb.cli import main
 from lerobot_bomb.evaluation.results import read_results, summarise
+from lerobot_bomb.schema import PROTOCOL_VERSION
 
 
 def row(seed: int, failure: str | None = None, error: float = 1.0, **other: object) -> str:
     values = {
-        "spec": {"seed": seed},
+        "spec": {"seed": seed, "perturbations": "none"},
         "is_success": failure is None,
         "failure": failure,
         "placement_error_mm": error,
-        "protocol_version": "0.1",
+        "protocol_version": PROTOCOL_VERSION,
     }
     return json.dumps(values | other) + "\n"
 
@@ -47,7 +48,7 @@ def test_an_episode_that_was_run_again_counts_once(tmp_path: Path) -> None:
         ("", "no finished episode"),
         ("not json\n", "results.jsonl:1: not an episode result"),
         (row(0) + "{}\n", "results.jsonl:2: not an episode result"),
-        (row(0, protocol_version="0.0"), "protocol_version '0.0', this package has '0.1'"),
+        (row(0, protocol_version="0.0"), f"protocol_version '0.0', this package has '{PROTOCOL_VERSION}'"),
     ],
 )
 def test_bad_files_are_named_with_the_line(tmp_path: Path, text: str, message: str) -> None:
@@ -76,8 +77,27 @@ def test_the_command_fails_in_one_line(tmp_path: Path, capsys: pytest.CaptureFix
 def test_conditions_are_not_mixed(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     path = tmp_path / "results.jsonl"
     specs = [{"seed": 0, "fps": 10}, {"seed": 1, "fps": 10}, {"seed": 0, "fps": 20}]
-    path.write_text("".join(row(0, spec=spec) for spec in specs))
+    path.write_text("".join(row(0, spec=spec | {"perturbations": "none"}) for spec in specs))
     assert main(["results", str(path)]) == 0
     output = capsys.readouterr().out
     assert "results.jsonl (fps=10): 2 episodes" in output
     assert "results.jsonl (fps=20): 1 episodes" in output
+
+
+def test_a_perturbed_arm_is_compared_with_the_same_episodes_unperturbed(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    path = tmp_path / "results.jsonl"
+    outcomes = {"none": "++++++-", "camera:3": "-----++", "all:5": "++"}  # by seed
+    lines = [
+        row(seed, None if outcome == "+" else "dropped", spec={"seed": seed, "perturbations": condition})
+        for condition, of in outcomes.items()
+        for seed, outcome in enumerate(of)
+    ]
+    lines.append(row(99, spec={"seed": 99, "perturbations": "all:5"}))  # has no pair
+    path.write_text("".join(lines))
+    assert main(["results", str(path)]) == 0
+    printed = capsys.readouterr().out
+    assert "camera:3: 7 pairs, 5 lost, 1 won, p = 0.22" in printed
+    assert "all:5: 2 pairs, 0 lost, 0 won, p = 1 " in printed
+    assert f"{path} (perturbations=none): 7 episodes" in printed

@@ -1,6 +1,6 @@
 import pytest
 
-from lerobot_bomb.stats import format_rate, wilson_interval
+from lerobot_bomb.stats import format_rate, mcnemar_p_value, wilson_interval
 
 
 @pytest.mark.parametrize(
@@ -20,3 +20,12 @@ def test_impossible_counts_are_refused(successes: int, n: int) -> None:
 
 def test_format_rate() -> None:
     assert format_rate(48, 50) == "48/50 = 96.0 % [86.5, 98.9]"
+
+
+@pytest.mark.parametrize(
+    ("only_first", "only_second", "p_value"),
+    # 2 * (1 + 6) / 64; 2 / 1024; no more than 1
+    [(0, 0, 1.0), (5, 1, 14 / 64), (1, 5, 14 / 64), (10, 0, 2 / 1024), (3, 3, 1.0)],
+)
+def test_mcnemar_counts_the_tails_of_a_fair_coin(only_first: int, only_second: int, p_value: float) -> None:
+    assert mcnemar_p_value(only_first, only_second) == pytest.approx(p_value)

@@ -8,8 +8,9 @@ from pathlib import Path
 from statistics import median
 from typing import Any
 
+from lerobot_bomb.perturbations import NONE
 from lerobot_bomb.schema import PROTOCOL_VERSION, Failure
-from lerobot_bomb.stats import format_rate
+from lerobot_bomb.stats import format_rate, mcnemar_p_value
 
 # outcomes of an episode in which the stone was carried and put down somewhere on the board
 PUT_DOWN = (None, Failure.WRONG_INTERSECTION, Failure.IMPRECISE, Failure.DISTURBED_OTHERS)
@@ -90,17 +91,48 @@ def summarise(rows: list[Row]) -> Summary:
     )
 
 
+def pair_with_nominal(rows: list[Row]) -> dict[str, list[tuple[Row, Row]]]:
+    """{condition: (unperturbed, perturbed) rows of the same episode}, for the conditions that have both."""
+    nominal = {_episode(row): row for row in rows if row["spec"]["perturbations"] == NONE}
+    pairs: dict[str, list[tuple[Row, Row]]] = {}
+    for row in rows:
+        condition = row["spec"]["perturbations"]
+        if condition != NONE and _episode(row) in nominal:
+            pairs.setdefault(condition, []).append((nominal[_episode(row)], row))
+    return pairs
+
+
+def _episode(row: Row) -> str:
+    """What a row's spec is but for its perturbations."""
+    return json.dumps({name: value for name, value in row["spec"].items() if name != "perturbations"})
+
+
+def _pair_line(condition: str, pairs: list[tuple[Row, Row]]) -> str:
+    lost = sum(nominal["is_success"] and not row["is_success"] for nominal, row in pairs)
+    won = sum(row["is_success"] and not nominal["is_success"] for nominal, row in pairs)
+    p_value = mcnemar_p_value(lost, won)
+    return (
+        f"  {condition}: {len(pairs)} pairs, {lost} lost, {won} won, p = {p_value:.2g} (exact McNemar test)"
+    )
+
+
 def add_results_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the arguments of ``lerobot-bomb results``."""
     parser.add_argument("paths", nargs="+", type=Path, metavar="FILE", help="files of --env.results_path")
 
 
 def run_results(args: argparse.Namespace) -> int:
-    """Print a summary of each condition of each file."""
+    """Print a summary of each condition of each file, and what perturbations changed in paired episodes."""
     for path in args.paths:
-        for condition, rows in by_condition(read_results(path)).items():
+        all_rows = read_results(path)
+        for condition, rows in by_condition(all_rows).items():
             summary = summarise(rows)
             print(f"{path}{condition}: {summary.num_episodes} episodes")
             for line in summary.lines():
                 print(f"  {line}")
+        pairs = pair_with_nominal(all_rows)
+        if pairs:
+            print(f"{path}: against the same episodes unperturbed")
+        for condition, of in pairs.items():
+            print(_pair_line(condition, of))
     return 0
