@@ -13,6 +13,8 @@ DESCRIPTION = "What lerobot-train and lerobot-eval do not do for BOMB: record, s
 COMMANDS = {
     "record": ("record the scripted expert as a LeRobotDataset", "lerobot_bomb.data.record"),
     "results": ("summarise files written by --env.results_path", "lerobot_bomb.evaluation.results"),
+    "view": ("play one episode into a recording for Rerun and a video", "lerobot_bomb.viewing.view"),
+    "gallery": ("draw what every perturbation axis changes", "lerobot_bomb.viewing.gallery"),
     "demo": ("record, train and evaluate on this machine in minutes", "lerobot_bomb.demo"),
     "doctor": ("check this installation", "lerobot_bomb.doctor"),
 }

@@ -58,6 +58,11 @@ class BoardGeometry:
     stone_radius_m: float = 0.013
     stone_height_m: float = 0.009
 
+    @property
+    def half_size_m(self) -> float:
+        """From the board's centre to its edge."""
+        return (self.num_lines - 1) / 2 * self.pitch_m + self.margin_m
+
     def intersection_xy(self, row: int, column: int) -> np.ndarray:
         """(2,) world xy in metres of an intersection; (0, 0) is the board's centre."""
         if not (0 <= row < self.num_lines and 0 <= column < self.num_lines):

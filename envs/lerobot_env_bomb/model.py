@@ -14,7 +14,7 @@ import mujoco  # noqa: E402  (its names live in C modules that pyright cannot re
 
 TRAY_CENTER_XY = (0.170, 0.0)  # metres; the tray beside the board from which stones are taken
 TRAY_HALF_SIZE_XY = (0.045, 0.125)  # metres; it touches the board
-BOARD_HALF_SIZE_M = (BOARD.num_lines - 1) / 2 * BOARD.pitch_m + BOARD.margin_m
+BOARD_HALF_SIZE_M = BOARD.half_size_m
 
 # How deep board and tray reach into the table: a stone that is pressed into them comes out at the top.
 SUNK_M = 0.05

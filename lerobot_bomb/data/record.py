@@ -61,15 +61,10 @@ def add_record_arguments(parser: argparse.ArgumentParser) -> None:
     add("--root", type=Path, help="new folder of the dataset (default: LeRobot's, $HF_LEROBOT_HOME/REPO_ID)")
     add("--episodes", type=int, required=True, help="successful episodes to record")
     add("--seed", type=int, default=0, help="seed of the first episode; the others count up (default: 0)")
-    add("--task", default="place", help=f"suite: {', '.join(SUITES)} (default: place)")
-    add("--robot", default="scara", help=f"{', '.join(ROBOTS)} (default: scara)")
-    add("--control_mode", default="relative", help=f"{' or '.join(CONTROL_MODES)} (default: relative)")
-    add("--fps", type=int, default=DEFAULT_FPS, help=f"control steps a second (default: {DEFAULT_FPS})")
-    add("--image_size", type=int, default=DEFAULT_IMAGE_SIZE, help="pixels (default: %(default)s)")
-    add("--split", default="all", help=f"draw from {', '.join(SPLITS)} (default: all)")
+    add_episode_arguments(parser)
     add(
         "--task_ids",
-        type=_parse_numbers,
+        type=parse_numbers,
         default=(),
         help="numbered tasks, as [0,7,12]: every seed is played with each (25 x colour + 5 x row + column; "
         "black = 0, white = 1; default: target and colour are drawn per episode)",
@@ -97,6 +92,17 @@ def add_record_arguments(parser: argparse.ArgumentParser) -> None:
         **_switch(),
         help=f"continue a recording that was interrupted; its blocks of {BLOCK_EPISODES} episodes are kept",
     )
+
+
+def add_episode_arguments(parser: argparse.ArgumentParser) -> None:
+    """Declare what every command that plays episodes is told about them, but for seeds and targets."""
+    add = parser.add_argument
+    add("--task", default="place", help=f"suite: {', '.join(SUITES)} (default: place)")
+    add("--robot", default="scara", help=f"{', '.join(ROBOTS)} (default: scara)")
+    add("--control_mode", default="relative", help=f"{' or '.join(CONTROL_MODES)} (default: relative)")
+    add("--fps", type=int, default=DEFAULT_FPS, help=f"control steps a second (default: {DEFAULT_FPS})")
+    add("--image_size", type=int, default=DEFAULT_IMAGE_SIZE, help="pixels (default: %(default)s)")
+    add("--split", default="all", help=f"draw from {', '.join(SPLITS)} (default: all)")
 
 
 def run_record(args: argparse.Namespace) -> int:
@@ -270,8 +276,8 @@ def _switch() -> dict[str, Any]:
     return {"nargs": "?", "const": True, "default": False, "type": _parse_bool}
 
 
-def _parse_numbers(text: str) -> tuple[int, ...]:
-    """(0, 7) from "[0,7]", as LeRobot writes lists, and from "0,7"."""
+def parse_numbers(text: str) -> tuple[int, ...]:
+    """Read a list of whole numbers: (0, 7) from "[0,7]", as LeRobot writes lists, and from "0,7"."""
     if not re.fullmatch(r"\d+(,\d+)*|\[\d+(,\d+)*\]", text.replace(" ", "")):
         raise argparse.ArgumentTypeError(f"{text!r} must be a list of whole numbers, as [0,7]")
     return tuple(int(number) for number in re.findall(r"\d+", text))

@@ -1,0 +1,75 @@
+"""Contact sheets: rows of small pictures and of numbers under columns that have names."""
+
+from dataclasses import dataclass, field
+from functools import cache
+
+import numpy as np
+from PIL import Image, ImageDraw, ImageFont
+
+LABEL_WIDTH = 150  # pixels, of the column at the left
+GAP = 4  # pixels between tiles
+FONT_SIZE, TITLE_SIZE = 12, 16  # pixels
+LINE_HEIGHT, TITLE_HEIGHT = 18, 30  # pixels
+PAPER, INK = (255, 255, 255), (20, 20, 20)
+TILE_PAPER = (244, 244, 240)
+
+
+@dataclass(frozen=True)
+class Sheet:
+    """What a contact sheet shows; every row has an entry per column."""
+
+    title: str
+    columns: list[str]
+    texts: dict[str, list[str]] = field(default_factory=dict)  # row label -> words under each column
+    pictures: dict[str, list[np.ndarray]] = field(default_factory=dict)  # -> (S, S, 3) uint8 tiles
+
+    def draw(self) -> np.ndarray:
+        """(H, W, 3) uint8; the tiles are in it as they are, at `tile_origin`."""
+        size = self._tile_size
+        width = LABEL_WIDTH + len(self.columns) * (size + GAP)
+        height = self._top + len(self.pictures) * (size + GAP)
+        sheet = Image.new("RGB", (width, height), PAPER)
+        pen = ImageDraw.Draw(sheet)
+        pen.text((GAP, GAP), self.title, INK, font(TITLE_SIZE))
+        for row, (label, words) in enumerate([("", self.columns), *self.texts.items()]):
+            y = TITLE_HEIGHT + row * LINE_HEIGHT
+            pen.text((GAP, y), label, INK, font(FONT_SIZE))
+            for column, word in enumerate(words):
+                pen.text((LABEL_WIDTH + column * (size + GAP) + GAP, y), word, INK, font(FONT_SIZE))
+        for row, (label, tiles) in enumerate(self.pictures.items()):
+            pen.text((GAP, self.tile_origin(row, 0)[0] + GAP), label, INK, font(FONT_SIZE))
+            for column, tile in enumerate(tiles):
+                y, x = self.tile_origin(row, column)
+                sheet.paste(Image.fromarray(tile), (x, y))
+        return np.asarray(sheet)
+
+    def tile_origin(self, row: int, column: int) -> tuple[int, int]:
+        """(y, x) in pixels of a tile's upper left corner."""
+        step = self._tile_size + GAP
+        return self._top + row * step, LABEL_WIDTH + column * step
+
+    @property
+    def _tile_size(self) -> int:
+        return next(iter(self.pictures.values()))[0].shape[0]
+
+    @property
+    def _top(self) -> int:
+        return TITLE_HEIGHT + (1 + len(self.texts)) * LINE_HEIGHT
+
+
+def text_tile(text: str, size: int) -> np.ndarray:
+    """(size, size, 3) uint8: a sentence, broken into lines; what does not fit is cut off."""
+    tile = Image.new("RGB", (size, size), TILE_PAPER)
+    face = font(FONT_SIZE)
+    lines = [""]
+    for word in text.split():
+        longer = f"{lines[-1]} {word}".strip()
+        lines = [*lines[:-1], longer] if face.getlength(longer) <= size - 2 * GAP else [*lines, word]
+    ImageDraw.Draw(tile).multiline_text((GAP, GAP), "\n".join(lines), INK, face, spacing=2)
+    return np.asarray(tile)
+
+
+@cache
+def font(size: int) -> ImageFont.FreeTypeFont:
+    """Pillow's own typeface, which needs no file of the system."""
+    return ImageFont.load_default(size)  # pyright: ignore[reportReturnType]  a bitmap without FreeType only

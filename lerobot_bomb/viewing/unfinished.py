@@ -1,0 +1,21 @@
+"""Files that appear under their names at once, complete."""
+
+import tempfile
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+
+@contextmanager
+def written_whole(*paths: Path) -> Iterator[list[Path]]:
+    """Give paths to write to; when nothing was raised, what lies there gets the names `paths`.
+
+    All lie in one folder, which is made. What a kill leaves is in a hidden folder there.
+    """
+    folder = paths[0].parent
+    folder.mkdir(parents=True, exist_ok=True)
+    with tempfile.TemporaryDirectory(prefix=".unfinished-", dir=folder) as temporary:
+        unfinished = [Path(temporary) / path.name for path in paths]
+        yield unfinished
+        for source, path in zip(unfinished, paths, strict=True):
+            source.replace(path)

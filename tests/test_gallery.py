@@ -1,0 +1,157 @@
+"""`lerobot-bomb gallery`: the sheets show the environment, the page says what the table says."""
+
+import re
+from pathlib import Path
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from lerobot_bomb import cli
+from lerobot_bomb.data.rollout import make_env
+from lerobot_bomb.perturbations import ALL, AXES
+from lerobot_bomb.schema import BOARD, EpisodeSpec, RenderOptions
+from lerobot_bomb.viewing.gallery import COLUMNS, PATH_RGB, SHEETS, axis_sheet, path_tile
+from lerobot_bomb.viewing.perturbations_page import example_sentences, page
+from lerobot_bomb.viewing.sheet import PAPER, Sheet, text_tile
+
+SIZE = 48
+OPTIONS = RenderOptions(image_size=SIZE)
+DOCS = Path(__file__).parents[1] / "docs"
+
+
+def tile(sheet: Sheet, drawn: np.ndarray, row: int, column: int) -> np.ndarray:
+    y, x = sheet.tile_origin(row, column)
+    return drawn[y : y + SIZE, x : x + SIZE]
+
+
+def start(axis: str, level: int, seed: int) -> tuple[dict[str, np.ndarray], str]:
+    """Both cameras' pictures at the start of an episode, and its instruction."""
+    env = make_env(EpisodeSpec(seed, perturbations=f"{axis}:{level}"), OPTIONS)
+    observation, _ = env.reset(seed=seed)
+    instruction = env.get_wrapper_attr("task_description")
+    env.close()
+    return observation["pixels"], instruction
+
+
+def test_tiles_are_the_environments_own_pictures() -> None:
+    sheet = axis_sheet("camera", (3, 9), OPTIONS)
+    drawn = sheet.draw()
+    assert list(sheet.pictures) == [
+        f"{camera}, seed {seed}" for seed in (3, 9) for camera in ("workspace", "wrist")
+    ]
+    for column in range(6):
+        for i, seed in enumerate((3, 9)):
+            pictures, _ = start("camera", column, seed)
+            assert np.array_equal(tile(sheet, drawn, 2 * i, column), pictures["workspace"])
+            assert np.array_equal(tile(sheet, drawn, 2 * i + 1, column), pictures["wrist"])
+    assert not np.array_equal(tile(sheet, drawn, 0, 0), tile(sheet, drawn, 2, 0))
+
+
+def test_a_sheet_leaves_paper_between_and_around_its_tiles() -> None:
+    black = np.zeros((SIZE, SIZE, 3), np.uint8)
+    sheet = Sheet("x", ["a", "b", "c"], {"size": ["1", "2", "3"]}, {"one": [black] * 3, "two": [black] * 3})
+    drawn = sheet.draw()
+    covered = np.zeros(drawn.shape[:2], bool)
+    for row in range(2):
+        for column in range(3):
+            y, x = sheet.tile_origin(row, column)
+            assert not covered[y : y + SIZE, x : x + SIZE].any()
+            covered[y : y + SIZE, x : x + SIZE] = True
+    y, x = sheet.tile_origin(0, 0)
+    assert sheet.tile_origin(1, 1) > (y + SIZE, x + SIZE)
+    assert sheet.tile_origin(0, 1)[1] > x + SIZE
+    assert (drawn[covered] == 0).all()
+    assert (drawn[y:, x:][~covered[y:, x:]] == PAPER).all()
+    assert (drawn[:y] != PAPER).any(), "the captions"
+
+
+def test_captions_are_the_table() -> None:
+    sheet = axis_sheet("dynamics", (3,), OPTIONS)
+    assert sheet.columns == COLUMNS == ["nominal", "level 1", "level 2", "level 3", "level 4", "level 5"]
+    assert sheet.texts["mass, factor"] == ["", "1.15", "1.3", "1.5", "1.75", "2"]
+    assert sheet.texts["latency, control steps"] == ["", "0", "0", "0", "1", "1"]
+    assert sheet.title.startswith("dynamics: mass and friction of the stones")
+    assert sheet.title.endswith("the images stay as they are")
+    ((label, paths),) = sheet.pictures.items()
+    assert label == "expert's path, seed 3"
+    assert all((path == PATH_RGB).all(axis=2).sum() > SIZE / 2 for path in paths), "the whole way"
+    assert not np.array_equal(paths[5], paths[0])
+
+
+def test_language_shows_sentences() -> None:
+    sheet = axis_sheet("language", (3,), OPTIONS)
+    assert list(sheet.pictures) == ["instruction, seed 3"]
+    for level, shown in enumerate(sheet.pictures["instruction, seed 3"]):
+        _, instruction = start("language", level, 3)
+        assert np.array_equal(shown, text_tile(instruction, SIZE))
+    assert not np.array_equal(text_tile("row 1", SIZE), text_tile("row 2", SIZE))
+
+
+def test_a_sentence_is_broken_into_lines_that_fit() -> None:
+    text = "Place a black stone on the board at row 1, please."
+    inked = (text_tile(text, 200) != text_tile("", 200)).any(axis=2)
+    assert inked[:18].any()
+    assert inked[18:40].any()
+    assert not inked[:, -4:].any()
+
+
+def test_all_shows_everything_that_changes() -> None:
+    sheet = axis_sheet(ALL, (3,), OPTIONS)
+    rows = ["workspace", "wrist", "instruction", "expert's path"]
+    assert list(sheet.pictures) == [f"{row}, seed 3" for row in rows]
+    assert sheet.title == "all: every axis but goal_marker"
+
+
+def test_a_path_is_drawn_where_it_went() -> None:
+    cell = BOARD.intersection_xy(1, 2)
+    start_xy = np.array([0.17, 0.0])
+    drawn = path_tile(np.stack([start_xy, cell]), np.stack([start_xy, start_xy]), 340)
+    inked = np.argwhere((drawn == PATH_RGB).all(axis=2))
+    # 1 mm per pixel, and the workspace's middle, x = 40 mm, in the tile's
+    ends_xy = inked[[inked[:, 1].argmin(), inked[:, 1].argmax()]][:, ::-1] / 1000 * [1, -1] + [-0.13, 0.17]
+    np.testing.assert_allclose(ends_xy, [cell, start_xy], atol=0.0021)
+
+
+def test_the_command_writes_small_sheets_and_replaces_its_own(tmp_path: Path) -> None:
+    folder = tmp_path / "sheets"
+    flags = ["gallery", "--axes=[light,language]", "--seeds=[3]", f"--image_size={SIZE}"]
+    assert cli.main([*flags, f"--output={folder}"]) == 0
+    (folder / "light.jpg").write_bytes(b"an older one")
+    assert cli.main([*flags, f"--output={folder}"]) == 0
+    assert sorted(path.name for path in folder.iterdir()) == ["language.jpg", "light.jpg"]
+    expected = axis_sheet("light", (3,), OPTIONS).draw()
+    shown = np.asarray(Image.open(folder / "light.jpg"))
+    assert shown.shape == expected.shape
+    assert np.abs(shown.astype(int) - expected).mean() < 4
+
+
+@pytest.mark.parametrize(
+    ("flag", "message"),
+    [
+        ("--axes=camra", "--axes='camra' is unknown; choose one of: table, reflectance"),
+        ("--image_size=8", "--image_size=8 must lie in 32..1024"),
+        ("--seeds=99999999999", "--seeds: 99999999999 must lie in 0.."),
+    ],
+)
+def test_a_bad_flag_is_named_and_nothing_is_written(
+    flag: str, message: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert cli.main(["gallery", flag, f"--output={tmp_path / 'x'}"]) == 1
+    assert capsys.readouterr().err.startswith(f"lerobot-bomb gallery: {message}")
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_the_committed_page_is_the_generated_one() -> None:
+    assert (DOCS / "perturbations.md").read_text() == page(example_sentences(), "media/perturbations")
+
+
+def test_the_page_has_every_axis_with_its_magnitudes_and_its_sheet() -> None:
+    text = (DOCS / "perturbations.md").read_text()
+    assert re.findall(r"^## (\w+)$", text, re.MULTILINE) == ["Floors", *AXES, ALL]
+    assert "| angle | 3 | 6 | 9 | 12.5 | 16 | degrees | around the board, in a drawn direction |" in text
+    links = re.findall(r"\]\((.*?\.jpg)\)", text)
+    assert links == [f"media/perturbations/{name}.jpg" for name in SHEETS]
+    for link in links:
+        assert 10_000 < (DOCS / link).stat().st_size < 300_000
+        assert Image.open(DOCS / link).width > 500

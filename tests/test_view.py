@@ -1,0 +1,360 @@
+"""`lerobot-bomb view`: what its files show is what happened in the environment."""
+
+import json
+import shutil
+import subprocess
+import sys
+import time
+from collections import defaultdict
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import av
+import cv2
+import numpy as np
+import pytest
+
+from lerobot_bomb import cli
+from lerobot_bomb.data.rollout import make_env
+from lerobot_bomb.expert import expert_action
+from lerobot_bomb.schema import ACTION_NAMES, BOARD, STATE_NAMES, EpisodeSpec, PrivilegedState, RenderOptions
+from lerobot_bomb.viewing.episode import expert_agent, play
+from lerobot_bomb.viewing.view import write_episode
+from lerobot_env_bomb.env import BombEnv
+
+SPEC = EpisodeSpec(seed=4, target=(3, 2), color="white", fps=5)
+OPTIONS = RenderOptions(image_size=64)
+FLAGS = ["--seed=4", "--target=[3,2]", "--color=white", "--fps=5", "--image_size=64"]
+
+type Logged = dict[str, dict[int | None, dict[str, Any]]]
+
+
+class Played(NamedTuple):
+    """The expert's episode as the environment tells it."""
+
+    instruction: str
+    observations: list[dict[str, Any]]
+    states: list[PrivilegedState]
+    actions: list[np.ndarray]
+    infos: list[dict[str, Any]]
+    pictures: list[Any]
+
+
+@pytest.fixture(scope="module")
+def played() -> Played:
+    env = make_env(SPEC, OPTIONS)
+    observation, info = env.reset(seed=SPEC.seed)
+    instruction = env.get_wrapper_attr("task_description")
+    observations, infos, actions, pictures = [observation], [info], [], [env.render()]
+    ended = False
+    while not ended:
+        state = PrivilegedState.from_vector(observation["environment_state"])
+        actions.append(expert_action(state, SPEC.control_mode, SPEC.fps))
+        observation, _, terminated, truncated, info = env.step(actions[-1])
+        observations.append(observation)
+        infos.append(info)
+        pictures.append(env.render())
+        ended = terminated or truncated
+    env.close()
+    states = [PrivilegedState.from_vector(o["environment_state"]) for o in observations]
+    return Played(instruction, observations, states, actions, infos, pictures)
+
+
+@pytest.fixture(scope="module")
+def viewed(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The two files' path without their suffixes."""
+    stem = tmp_path_factory.mktemp("view") / "some" / "episode.1"
+    assert cli.main(["view", *FLAGS, f"--output={stem}"]) == 0
+    return stem
+
+
+def read_rrd(path: Path) -> Logged:
+    """{entity: {step, or None where it is static: {component: values}}}."""
+    from rerun.experimental import RrdReader
+
+    logged: Logged = defaultdict(lambda: defaultdict(dict))
+    for chunk in RrdReader(path).stream():
+        columns = chunk.to_record_batch().to_pydict()
+        steps = columns.get("step", [None] * len(next(iter(columns.values()))))
+        for name, values in columns.items():
+            for step, value in zip(steps, values, strict=True):
+                if value is not None:
+                    logged[chunk.entity_path][step][name] = value
+    return logged
+
+
+@pytest.fixture(scope="module")
+def logged(viewed: Path) -> Logged:
+    return read_rrd(Path(f"{viewed}.rrd"))
+
+
+def scalars(logged: Logged, entity: str) -> list[float]:
+    rows = logged[entity]
+    return [rows[step]["Scalars:scalars"][0] for step in range(len(rows.keys() - {None}))]
+
+
+def test_cameras_and_state_are_the_environments_to_the_last_moment(logged: Logged, played: Played) -> None:
+    for camera in ("workspace", "wrist"):
+        rows = logged[f"/camera/{camera}"]
+        assert rows.keys() == set(range(len(played.actions) + 1))
+        for step, observation in enumerate(played.observations):
+            png = np.asarray(rows[step]["EncodedImage:blob"][0], np.uint8)
+            shown = cv2.imdecode(png, cv2.IMREAD_COLOR_RGB)
+            assert shown is not None
+            np.testing.assert_array_equal(shown, observation["pixels"][camera])
+    for i, name in enumerate(STATE_NAMES):
+        assert scalars(logged, f"/state/{name}") == [float(o["agent_pos"][i]) for o in played.observations]
+
+
+def test_actions_have_their_names_and_end_before_the_last_moment(logged: Logged, played: Played) -> None:
+    for i, name in enumerate(ACTION_NAMES["relative"]):
+        assert scalars(logged, f"/action/{name}") == [float(action[i]) for action in played.actions]
+
+
+def test_the_scene_shows_stones_trace_and_target(logged: Logged, played: Played) -> None:
+    path = np.array([state.gripper_xyz for state in played.states], np.float32)
+    for step, state in enumerate(played.states):
+        stones = logged["/scene/stones"][step]
+        np.testing.assert_allclose(
+            stones["Ellipsoids3D:centers"], state.stone_xyz[state.stone_in_play], atol=1e-6
+        )
+        light = [color >> 24 > 128 for color in stones["Ellipsoids3D:colors"]]
+        assert light == state.stone_is_white[state.stone_in_play].tolist()
+        np.testing.assert_allclose(logged["/scene/gripper"][step]["Points3D:positions"][0], path[step])
+        (strip,) = logged["/scene/trace"][step]["LineStrips3D:strips"]
+        np.testing.assert_allclose(strip, path[: step + 1])
+    (ring,) = logged["/scene/target"][None]["LineStrips3D:strips"]
+    np.testing.assert_allclose(np.mean(ring[:-1], axis=0)[:2], BOARD.intersection_xy(3, 2), atol=1e-6)
+    (half_size,) = logged["/scene/board"][None]["Boxes3D:half_sizes"]
+    np.testing.assert_allclose(half_size, [0.125, 0.125, 0.0025])
+    (lines,) = (logged["/scene/board/lines"][None]["LineStrips3D:strips"],)
+    assert len(lines) == 10
+    assert {tuple(np.round(np.ptp(line, axis=0), 4)) for line in lines} == {(0.18, 0, 0), (0, 0.18, 0)}
+
+
+def test_words_say_instruction_stages_and_result(logged: Logged, played: Played) -> None:
+    assert logged["/instruction"][None]["TextDocument:text"] == [played.instruction]
+    stages = [info["stage"] for info in played.infos]
+    changes = {k: stage for k, stage in enumerate(stages) if k == 0 or stage != stages[k - 1]}
+    assert {step: row["TextLog:text"][0] for step, row in logged["/stage"].items()} == changes
+    assert list(changes.values())[-1] == "placed"
+    errors = [info["placement_error_mm"] for info in played.infos]
+    assert scalars(logged, "/placement_error_mm") == pytest.approx(errors)
+    (result,) = logged["/result"].values()
+    steps = len(played.actions)
+    assert list(logged["/result"]) == [steps]
+    assert result["TextDocument:text"][0].startswith(
+        f"success after {steps} steps; the stone is {errors[-1]:.1f} mm from the target"
+    )
+
+
+def test_both_timelines_tell_the_same(logged: Logged) -> None:
+    for step, row in logged["/camera/wrist"].items():
+        assert step is not None
+        assert row["time"].total_seconds() == pytest.approx(step / SPEC.fps)
+
+
+def test_the_viewer_is_told_what_to_show(viewed: Path) -> None:
+    from rerun.experimental import RrdReader
+
+    reader = RrdReader(f"{viewed}.rrd")
+    (blueprint,) = reader.blueprints()
+    origins, timelines = set(), set()
+    for chunk in reader.stream(store=blueprint):
+        columns = chunk.to_record_batch().to_pydict()
+        origins |= {value for cell in columns.get("ViewBlueprint:space_origin", []) for value in cell}
+        timelines |= {value for cell in columns.get("TimePanelBlueprint:timeline", []) for value in cell}
+    logged = {"camera/workspace", "camera/wrist", "scene", "instruction", "stage", "result"}
+    assert origins == {f"{name}" for name in logged | {"action", "state", "placement_error_mm"}}
+    assert timelines == {"step"}
+
+
+def test_the_video_shows_every_moment(viewed: Path, played: Played) -> None:
+    with av.open(f"{viewed}.mp4") as video:
+        stream = video.streams.video[0]
+        assert (stream.codec_context.name, stream.pix_fmt, stream.average_rate) == ("h264", "yuv420p", 5)
+        frames = [frame.to_ndarray(format="rgb24") for frame in video.decode(stream)]
+    assert len(frames) == len(played.actions) + 1
+    for frame, picture in zip(frames, played.pictures, strict=True):
+        assert psnr(frame, picture) > 30
+    assert psnr(frames[-2], played.pictures[-1]) < psnr(frames[-1], played.pictures[-1]) - 3
+
+
+def psnr(one: np.ndarray, other: np.ndarray) -> float:
+    return float(-10 * np.log10(np.mean((one / 255.0 - other / 255.0) ** 2)))
+
+
+def test_the_command_tells_the_outcome_and_overwrites_nothing(
+    viewed: Path, played: Played, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert cli.main(["view", *FLAGS, f"--output={tmp_path}"]) == 0
+    lines = capsys.readouterr().out.splitlines()
+    assert lines[0] == played.instruction
+    assert lines[1].startswith("success after ")
+    assert lines[2:] == [f"{tmp_path}/place.none_expert_seed4{suffix}" for suffix in (".rrd", ".mp4")]
+    assert all(Path(line).stat().st_size > 10_000 for line in lines[2:])
+    before = {path: path.read_bytes() for path in viewed.parent.iterdir()}
+    assert len(before) == 2
+    Path(f"{viewed}.rrd").rename(tmp_path / "kept.rrd")  # one of the two is enough
+    assert cli.main(["view", *FLAGS, f"--output={viewed}"]) == 1
+    assert f"{viewed}.mp4 exists already; name other files with --output" in capsys.readouterr().err
+    (tmp_path / "kept.rrd").rename(f"{viewed}.rrd")
+    assert {path: path.read_bytes() for path in viewed.parent.iterdir()} == before
+
+
+def test_random_actions_are_those_of_the_seed_and_fail(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    flags = ["--policy=random", "--fps=2", "--image_size=32", "--control_mode=absolute"]
+    actions = []
+    for name, seed in (("a", 1), ("b", 1), ("c", 2)):
+        assert cli.main(["view", *flags, f"--seed={seed}", f"--output={tmp_path / name}.rrd"]) == 0
+        assert "failed: never_reached after 20 steps" in capsys.readouterr().out
+        logged = read_rrd(tmp_path / f"{name}.rrd")
+        actions.append(np.array([scalars(logged, f"/action/{name}") for name in ACTION_NAMES["absolute"]]))
+        assert "failed: never_reached" in logged["/result"][20]["TextDocument:text"][0]
+    assert actions[0].shape == (4, 20)
+    assert np.array_equal(actions[0], actions[1])
+    assert not np.allclose(actions[0], actions[2])
+
+
+@pytest.fixture(scope="module")
+def checkpoint(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    from vla0_smol_cases import STATS, make_policy
+
+    from lerobot_policy_vla0_smol import make_vla0_smol_pre_post_processors
+
+    stats = {**STATS, "action": {"min": STATS["action"]["min"] / 2, "max": STATS["action"]["max"] / 2}}
+
+    folder = tmp_path_factory.mktemp("policy") / "pretrained_model"
+    policy = make_policy()
+    policy.save_pretrained(folder)
+    for processor in make_vla0_smol_pre_post_processors(policy.config, stats):
+        processor.save_pretrained(folder)
+    return folder
+
+
+def test_a_checkpoint_acts_as_in_lerobot_eval(
+    checkpoint: Path, stock_cli: Callable[..., None], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    import torch
+
+    executed: list[np.ndarray] = []
+    step = BombEnv.step
+
+    def noting(env: BombEnv, action: np.ndarray) -> Any:
+        executed.append(action)
+        return step(env, action)
+
+    monkeypatch.setattr(BombEnv, "step", noting)
+    own = f"--env.type=bomb --env.fps=2 --env.image_size=64 --policy.path={checkpoint} --seed=3"
+    stock_cli(
+        "lerobot-eval",
+        *own.split(),
+        "--eval.n_episodes=1",
+        "--eval.batch_size=1",
+        f"--output_dir={tmp_path / 'eval'}",
+    )
+    expected, executed[:] = np.array(executed), []
+    torch.manual_seed(0)
+    flags = [f"--policy.path={checkpoint}", "--policy.device=cpu", "--fps=2", "--image_size=64", "--seed=3"]
+    assert cli.main(["view", *flags, f"--output={tmp_path / 'seen'}"]) == 0
+    assert expected.shape == (20, 4)
+    assert np.ptp(expected, axis=0).max() > 0.1  # it does not always do the same
+    np.testing.assert_array_equal(np.array(executed), expected)
+    assert torch.initial_seed() == 3, "what a policy draws is drawn as in lerobot-eval"
+    logged = read_rrd(tmp_path / "seen.rrd")
+    shown = np.array([scalars(logged, f"/action/{name}") for name in ACTION_NAMES["relative"]]).T
+    np.testing.assert_allclose(shown, expected)
+
+
+@pytest.mark.parametrize(
+    ("flags", "message"),
+    [
+        ("--policy=oracle", "--policy='oracle' is unknown; choose expert or random, or --policy.path=FOLDER"),
+        ("--policy=expert --policy.path=x", "--policy=expert and --policy.path=x: give one of them"),
+        ("--policy.device=cpu", "--policy.device=cpu needs a checkpoint"),
+        ("--policy.path=nowhere", "--policy.path=nowhere holds no config.json, so it is no checkpoint"),
+        ("--target=[5,0]", "--target=[5, 0] is off the board"),
+        ("--target=[0,3] --split=train", "--target=[0, 3] is not in --split=train"),
+        ("--color=red", "--color='red' is unknown; choose one of: black, white"),
+        ("--robot=ur5", "--robot='ur5' is unknown"),
+        ("--fps=7", "--fps=7 does not divide"),
+        ("--image_size=8", "--image_size=8 must lie in 32..1024"),
+        ("--seed=-1", "--seed=-1 must lie in 0.."),
+        ("--perturbations=camra:3", "--perturbations='camra:3': 'camra' is not an axis"),
+        ("--perturbations=[none,camera:3]", "--perturbations=none,camera:3 must be one condition"),
+        ("--env.perturbations=camera:7", "--perturbations='camera:7': the levels of camera must lie"),
+    ],
+)
+def test_a_bad_flag_is_named_and_nothing_is_written(
+    flags: str, message: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert cli.main(["view", *flags.split(), f"--output={tmp_path / 'x'}"]) == 1
+    error = capsys.readouterr().err
+    assert error.startswith(f"lerobot-bomb view: {message}")
+    assert error.count("\n") == 1
+    assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.parametrize(
+    ("kind", "key", "message"),
+    [
+        ("output_features", "action", "is a checkpoint whose action has shape (7,); BOMB's has (4,)"),
+        ("input_features", "observation.state", "whose observation.state has shape (7,); BOMB's has (4,)"),
+    ],
+)
+def test_a_checkpoint_of_another_robot_is_refused(
+    kind: str,
+    key: str,
+    message: str,
+    checkpoint: Path,
+    tmp_path: Path,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    other = tmp_path / "other"
+    shutil.copytree(checkpoint, other)
+    config = json.loads((other / "config.json").read_text())
+    config[kind][key]["shape"] = [7]
+    (other / "config.json").write_text(json.dumps(config))
+    assert cli.main(["view", f"--policy.path={other}", f"--output={tmp_path / 'x'}"]) == 1
+    assert f"--policy.path={other} {message}"[:60] in (error := capsys.readouterr().err)
+    assert message in error
+    assert [path.name for path in tmp_path.iterdir()] == ["other"]
+
+
+def test_an_error_half_way_leaves_no_file(tmp_path: Path) -> None:
+    env = make_env(SPEC, OPTIONS)
+    expert = expert_agent(SPEC)
+    calls = iter(range(100))
+
+    def falters(observation: dict[str, Any], instruction: str) -> np.ndarray:
+        if next(calls) == 3:
+            raise RuntimeError("out of order")
+        return expert(observation, instruction)
+
+    with pytest.raises(RuntimeError, match="out of order"):
+        write_episode(env, SPEC, falters, "faltering", tmp_path / "x.rrd", tmp_path / "x.mp4")
+    env.close()
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_a_kill_half_way_leaves_no_file_under_the_final_names(tmp_path: Path) -> None:
+    command = [sys.executable, "-m", "lerobot_bomb.cli", "view", "--policy=random", "--fps=200"]
+    process = subprocess.Popen([*command, "--image_size=32", f"--output={tmp_path / 'x'}"])
+    while not any(path.stat().st_size for path in tmp_path.glob(".unfinished-*/x.rrd")):
+        assert process.poll() is None
+        time.sleep(0.02)
+    process.kill()
+    process.wait()
+    assert [path.name[:12] for path in tmp_path.iterdir()] == [".unfinished-"]
+
+
+def test_a_moment_is_seen_before_its_action_is_done() -> None:
+    env = make_env(SPEC, OPTIONS)
+    moments = play(env, SPEC, expert_agent(SPEC))
+    for moment, _ in zip(moments, range(3), strict=False):
+        now = env.get_wrapper_attr("privileged_state")()
+        np.testing.assert_array_equal(moment.observation["environment_state"], now.to_vector())
+    env.close()
