@@ -150,6 +150,37 @@ def test_board_tray_and_stone_stay_in_the_picture(scene: Scene, seed: int, level
     assert (abs(x) < -back * slope).all() and (abs(y) < -back * slope).all()
 
 
+def seen(scene: Scene, camera: str, layout: Layout) -> float:
+    """Share of the stone to be moved that a camera sees, by rays to points of its upper side."""
+    import mujoco
+
+    model, data = scene.model, scene.data
+    pose, visual = data.camera(camera), model.geom("stone_0_visual").id
+    slope = np.tan(np.radians(model.camera(camera).fovy[0]) / 2)
+    drawn_groups = np.array([1, 1, 1, 0, 0, 0], np.uint8)
+    hits = []
+    for angle_rad in np.linspace(0, 2 * np.pi, 12, endpoint=False):
+        offset = 0.6 * layout.stone_radius_m * np.array([np.cos(angle_rad), np.sin(angle_rad), 0.2])
+        ray = data.body("stone_0").xpos + offset - pose.xpos
+        x, y, back = pose.xmat.reshape(3, 3).T @ ray
+        found = np.array([-1], np.int32)
+        mujoco.mj_ray(model, data, pose.xpos, ray, drawn_groups, 1, -1, found)
+        hits.append(found[0] == visual and max(abs(x), abs(y)) < -back * slope)
+    return float(np.mean(hits))
+
+
+@pytest.mark.parametrize(
+    "condition", ["none", "start:3", "start:5", "camera:5", "stones:5", "all:3", "all:5"]
+)
+def test_a_camera_sees_the_stone_at_the_start(scene: Scene, condition: str) -> None:
+    shares = []
+    for seed in SOME_SEEDS:
+        layout = arranged(scene, seed, condition).layout
+        shares.append(max(seen(scene, camera, layout) for camera in CAMERAS))
+    assert min(shares) > (0 if condition == "all:5" else 0.5)
+    assert np.mean(np.array(shares) >= 0.5) >= 0.95
+
+
 @settings(max_examples=60, deadline=None)
 @given(SEEDS, LEVEL)
 def test_a_perturbed_start_is_on_the_tray_and_in_the_workspace(seed: int, level: int) -> None:

@@ -29,9 +29,9 @@ class Start:
     @classmethod
     def draw(cls, level: int, rng: np.random.Generator) -> Self:
         side = float(rng.choice((-1.0, 1.0)))
-        # Towards the board, for beyond the tray is no workspace, and not away from the stone, which the
-        # arm could then hide.
-        angle_rad = side * rng.uniform(np.pi / 2, np.pi)
+        # Towards the board, for beyond the tray is no workspace, and along with the stone, which the arm
+        # would else hide from a camera that has swung.
+        angle_rad = side * rng.uniform(0.5 * np.pi, 0.75 * np.pi)
         stone_m, gripper_m = (1e-3 * magnitude("start", what, level) for what in ("stone", "gripper"))
         gripper_offset = gripper_m * np.cos(angle_rad), gripper_m * np.sin(angle_rad)
         return cls((0.0, side * stone_m), (float(gripper_offset[0]), float(gripper_offset[1])))
