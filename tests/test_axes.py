@@ -1,3 +1,4 @@
+# pyright: reportAttributeAccessIssue=false
 """What the perturbation axes do to an episode, and what they leave alone."""
 
 from dataclasses import fields
