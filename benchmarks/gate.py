@@ -7,7 +7,7 @@ that it has not seen.
     OMP_NUM_THREADS=1 python benchmarks/gate.py one_target --output_dir gate
 
 What is finished stays in the output folder and is not done again: the dataset, the training, each evaluation.
-A training that was killed starts anew.
+A training that was killed starts anew. Flags --policy.NAME=VALUE go to `lerobot-train`.
 """
 
 import argparse
@@ -19,6 +19,7 @@ import sys
 import time
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 from learning_curve import Point, as_figures, count, draw, print_points
 from machine import add_machine_arguments, positive, require_idle_machine, write_figures
@@ -64,7 +65,10 @@ def main() -> None:
     parser.add_argument("--steps", type=positive, help="training steps (default: the rung's)")
     parser.add_argument("--picture", type=Path, help="write the learning curve to this PNG")
     add_machine_arguments(parser)
-    args = parser.parse_args()
+    args, args.policy_flags = parser.parse_known_args()
+    unknown = [flag for flag in args.policy_flags if not flag.startswith("--policy.")]
+    if unknown:
+        parser.error(f"unknown: {' '.join(unknown)}")
     require_idle_machine(args.force)
     os.environ.setdefault("OMP_NUM_THREADS", "1")
     here = str(Path(__file__).parent)
@@ -80,8 +84,15 @@ def climb(args: argparse.Namespace) -> int:
     rung = RUNGS[args.rung]
     demonstrations, steps = args.demonstrations or rung.demonstrations, args.steps or rung.steps
     folder = args.output_dir
+    settings = {
+        "rung": args.rung,
+        "demonstrations": demonstrations,
+        "steps": steps,
+        "policy_flags": args.policy_flags,
+    }
+    claim(folder, settings)
     record(rung, demonstrations, folder / "dataset")
-    training = train(folder, steps)
+    training = train(folder, steps, args.policy_flags)
     points: dict[str, Point] = {}
     rows: list[Row] = []
     for checkpoint in sorted((folder / "train" / "checkpoints").glob("[0-9]*")):
@@ -99,11 +110,21 @@ def climb(args: argparse.Namespace) -> int:
         )
     print_points(points)
     minutes = {f"training_{name}": value for name, value in training.items()}
-    figures = {"rung": args.rung, "demonstrations": demonstrations, "steps": steps, **minutes}
-    write_figures(args.json, {**figures, "points": as_figures(points)})
+    write_figures(args.json, {**settings, **minutes, "points": as_figures(points)})
     is_open = curve[-1].num_successes >= rung.bar * curve[-1].num_episodes
     print(f"bar {100 * rung.bar:.0f} %: {'reached' if is_open else 'MISSED'}")
     return 0 if is_open else 1
+
+
+def claim(folder: Path, settings: dict[str, Any]) -> None:
+    """Make the folder, or refuse one in which something else was run."""
+    path = folder / "settings.json"
+    if path.exists() and json.loads(path.read_text()) != settings:
+        raise RuntimeError(
+            f"--output_dir={folder} holds a run of {path.read_text().strip()}; name another folder"
+        )
+    folder.mkdir(parents=True, exist_ok=True)
+    path.write_text(json.dumps(settings) + "\n")
 
 
 def record(rung: Rung, demonstrations: int, dataset: Path) -> None:
@@ -127,7 +148,7 @@ def record(rung: Rung, demonstrations: int, dataset: Path) -> None:
     )
 
 
-def train(folder: Path, steps: int) -> dict[str, float]:
+def train(folder: Path, steps: int, policy_flags: list[str]) -> dict[str, float]:
     """Stock `lerobot-train` with NUM_CHECKPOINTS checkpoints; {"minutes", "cpu_minutes"} that it took."""
     times = folder / "training.json"
     if times.exists():
@@ -146,6 +167,7 @@ def train(folder: Path, steps: int) -> dict[str, float]:
         f"--steps={steps}",
         f"--save_freq={-(-steps // NUM_CHECKPOINTS)}",
         "--num_workers=0",  # a second process would use a second core
+        *policy_flags,
     )
     minutes = {
         "minutes": (time.monotonic() - started) / 60,

@@ -77,8 +77,8 @@ def draw(points: list[Point], title: str, path: Path) -> None:
     _draw_axes(picture, title, end)
     for point in points:
         low, high = wilson_interval(point.num_successes, point.num_episodes)
-        ends = [_place(point.cpu_minutes / end, share) for share in (low, high)]
-        cv2.line(picture, *ends, BAND, 7)
+        across = point.cpu_minutes / end
+        cv2.line(picture, _place(across, low), _place(across, high), BAND, 7)
     curves = {
         "lifted": ([p.num_lifted / p.num_episodes for p in points], LIFTED_BGR),
         "right intersection": ([p.num_grounded / p.num_episodes for p in points], GROUNDED_BGR),

@@ -72,7 +72,8 @@ def commands(monkeypatch: pytest.MonkeyPatch, stock_cli: Callable[..., None]) ->
         if command == "lerobot-bomb":
             assert lerobot_bomb(flags) == 0
         elif command == "lerobot-train":
-            stock_cli(command, *flags, "--policy.num_channels=8", "--save_checkpoint=true")
+            assert "--policy.num_channels=8" in flags
+            stock_cli(command, *flags)
         else:
             stock_cli(command, *flags, "--env.fps=2", "--eval.batch_size=1")
 
@@ -97,6 +98,7 @@ def test_a_rung_is_climbed_by_stock_commands_and_goes_on_where_it_stopped(
         steps=None,
         picture=tmp_path / "curve.png",
         json=tmp_path / "gate.json",
+        policy_flags=["--policy.num_channels=8"],
     )
     assert gate.climb(args) == 1  # two steps teach nothing
     assert commands == ["lerobot-bomb", "lerobot-train", "lerobot-eval", "lerobot-eval", "lerobot-eval"]
@@ -116,6 +118,10 @@ def test_a_rung_is_climbed_by_stock_commands_and_goes_on_where_it_stopped(
     assert gate.climb(args) == 1
     assert commands == ["lerobot-eval"]
     assert len((folder / "eval_000002" / "results.jsonl").read_text().splitlines()) == 1
+
+    args.steps = 4
+    with pytest.raises(RuntimeError, match=r'holds a run of .*"steps": 2.*; name another folder'):
+        gate.climb(args)
 
 
 # The curve
@@ -172,7 +178,7 @@ class FirstChannel(nn.Module):
 @pytest.mark.parametrize(("column", "line", "x", "y"), [(0, 0, -1, -1), (4, 2, 0, -0.5), (8, 6, 1, 0.5)])
 def test_a_keypoint_is_where_the_heat_is(column: int, line: int, x: float, y: float) -> None:
     encoder = KeypointEncoder(num_keypoints=1, num_channels=8, initial_sharpness=30.0)
-    encoder.layers = FirstChannel()
+    encoder.layers = nn.Sequential(FirstChannel())
     image = torch.zeros(1, 3, 9, 9)
     image[:, :, line, column] = 1.0
     torch.testing.assert_close(encoder(image), torch.tensor([[x, y, 3.0]]), atol=1e-4, rtol=0)
