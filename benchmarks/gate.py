@@ -46,13 +46,13 @@ class Rung:
     task_ids: tuple[int, ...]  # empty: target and colour are drawn for each episode
     demonstrations: int
     steps: int
-    bar: float  # success rate that the last checkpoint must reach
+    bar: float | None  # success rate that the last checkpoint must reach; None: it is only measured
     blind_control: bool  # also evaluate it without the sentence
 
 
 RUNGS = {
     "one_target": Rung((12,), demonstrations=200, steps=3000, bar=0.90, blind_control=False),
-    "all_targets": Rung((), demonstrations=400, steps=6000, bar=0.0, blind_control=True),
+    "all_targets": Rung((), demonstrations=400, steps=3000, bar=None, blind_control=True),
 }
 
 
@@ -111,8 +111,13 @@ def climb(args: argparse.Namespace) -> int:
     print_points(points)
     minutes = {f"training_{name}": value for name, value in training.items()}
     write_figures(args.json, {**settings, **minutes, "points": as_figures(points)})
-    is_open = curve[-1].num_successes >= rung.bar * curve[-1].num_episodes
-    print(f"bar {100 * rung.bar:.0f} %: {'reached' if is_open else 'MISSED'}")
+    return 0 if rung.bar is None else verdict(curve[-1], rung.bar)
+
+
+def verdict(last: Point, bar: float) -> int:
+    """Say whether the last checkpoint reaches the bar; 0 if it does."""
+    is_open = last.num_successes >= bar * last.num_episodes
+    print(f"bar {100 * bar:.0f} %: {'reached' if is_open else 'MISSED'}")
     return 0 if is_open else 1
 
 
