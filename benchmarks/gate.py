@@ -2,7 +2,7 @@
 
 A small image policy (lerobot_policy_keypoint_probe/) is trained by the stock `lerobot-train` on
 demonstrations of the scripted expert, and its checkpoints are evaluated by the stock `lerobot-eval` on seeds
-that it has not seen.
+that it has not seen; the last one twice more: with black images, and without the sentence.
 
     OMP_NUM_THREADS=1 python benchmarks/gate.py one_target --output_dir gate
 
@@ -35,8 +35,8 @@ FIRST_SEED = 1000  # of the demonstrations
 FIRST_UNSEEN_SEED = 100_000
 EVAL_EPISODES = 100
 NUM_CHECKPOINTS = 6
-BLIND_SENTENCE = "Place a stone."
-BLIND = "without the sentence"
+EMPTY_SENTENCE = "Place a stone."
+NO_IMAGES, NO_SENTENCE = "blank images", "without the sentence"
 
 
 @dataclass(frozen=True)
@@ -47,12 +47,11 @@ class Rung:
     demonstrations: int
     steps: int
     bar: float | None  # success rate that the last checkpoint must reach; None: it is only measured
-    blind_control: bool  # also evaluate it without the sentence
 
 
 RUNGS = {
-    "one_target": Rung((12,), demonstrations=200, steps=3000, bar=0.90, blind_control=False),
-    "all_targets": Rung((), demonstrations=400, steps=3000, bar=None, blind_control=True),
+    "one_target": Rung((12,), demonstrations=200, steps=3000, bar=0.90),
+    "all_targets": Rung((), demonstrations=400, steps=3000, bar=None),
 }
 
 
@@ -100,10 +99,10 @@ def climb(args: argparse.Namespace) -> int:
         rows = evaluate(rung, checkpoint / "pretrained_model", folder / f"eval_{checkpoint.name}")
         points[f"step {step}"] = count(rows, step, training["cpu_minutes"] * step / steps)
     curve = list(points.values())
-    if rung.blind_control:
-        last = folder / "train" / "checkpoints" / "last" / "pretrained_model"
-        blind = evaluate(rung, hide_sentences(last, rows), folder / "eval_blind")
-        points[BLIND] = count(blind, steps, training["cpu_minutes"])
+    last = folder / "train" / "checkpoints" / "last" / "pretrained_model"
+    for name, changed in change_what_is_shown(last, rows).items():
+        shown = evaluate(rung, changed, folder / f"eval_{name.replace(' ', '_')}")
+        points[name] = count(shown, steps, training["cpu_minutes"])
     if args.picture is not None:
         draw(
             curve, f"{args.rung}: {demonstrations} demonstrations, {EVAL_EPISODES} unseen seeds", args.picture
@@ -208,16 +207,21 @@ def evaluate(rung: Rung, checkpoint: Path, output_dir: Path) -> list[Row]:
     return read_results(results)
 
 
-def hide_sentences(checkpoint: Path, rows: list[Row]) -> Path:
-    """The checkpoint behind a preprocessor that tells every episode the same, empty sentence."""
+def change_what_is_shown(checkpoint: Path, rows: list[Row]) -> dict[str, Path]:
+    """The controls' checkpoints: black cameras; the same, empty sentence in every episode."""
     import lerobot_policy_keypoint_probe  # noqa: F401  its processor step must be known when it is loaded
 
-    from lerobot_bomb.explain.interventions import ReplaceTasks, intervene
+    from lerobot_bomb.explain.interventions import BlankImages, ReplaceTasks, intervene
 
-    blind = checkpoint.with_name("blind")
-    shutil.rmtree(blind, ignore_errors=True)
-    intervene(checkpoint, [ReplaceTasks({row["instruction"]: BLIND_SENTENCE for row in rows})], blind)
-    return blind
+    steps = {
+        NO_IMAGES: BlankImages(),
+        NO_SENTENCE: ReplaceTasks({row["instruction"]: EMPTY_SENTENCE for row in rows}),
+    }
+    folders = {name: checkpoint.with_name(name.replace(" ", "_")) for name in steps}
+    for name, step in steps.items():
+        shutil.rmtree(folders[name], ignore_errors=True)
+        intervene(checkpoint, [step], folders[name])
+    return folders
 
 
 def _children_cpu_s() -> float:

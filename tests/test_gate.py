@@ -77,7 +77,7 @@ def commands(monkeypatch: pytest.MonkeyPatch, stock_cli: Callable[..., None]) ->
         else:
             stock_cli(command, *flags, "--env.fps=2", "--eval.batch_size=1")
 
-    tiny = gate.Rung((), demonstrations=1, steps=2, bar=0.5, blind_control=True)
+    tiny = gate.Rung((), demonstrations=1, steps=2, bar=0.5)
     for name, value in {"run_command": run, "RUNGS": {"tiny": tiny}, "IMAGE_SIZE": SIZE}.items():
         monkeypatch.setattr(gate, name, value)
     for name, value in {"EVAL_EPISODES": 1, "NUM_CHECKPOINTS": 2, "BATCH_SIZE": 2}.items():
@@ -100,13 +100,14 @@ def test_a_rung_is_climbed_by_stock_commands_and_goes_on_where_it_stopped(
         json=tmp_path / "gate.json",
         policy_flags=["--policy.num_channels=8"],
     )
-    assert gate.climb(args) == 1  # two steps teach nothing
-    assert commands == ["lerobot-bomb", "lerobot-train", "lerobot-eval", "lerobot-eval", "lerobot-eval"]
+    assert gate.climb(args) == 1  # two steps of training teach nothing
+    assert commands == ["lerobot-bomb", "lerobot-train", *["lerobot-eval"] * 4]
     figures = json.loads(args.json.read_text())
     assert [(name, point["step"]) for name, point in figures["points"].items()] == [
         ("step 1", 1),
         ("step 2", 2),
-        (gate.BLIND, 2),
+        (gate.NO_IMAGES, 2),
+        (gate.NO_SENTENCE, 2),
     ]
     assert figures["training_cpu_minutes"] == 2.0
     assert figures["points"]["step 1"]["cpu_minutes"] == 1.0
@@ -223,11 +224,10 @@ def test_each_input_changes_the_action(key: str) -> None:
 
 
 def test_an_action_depends_on_its_own_row_alone() -> None:
-    policy = make_policy()
-    batch = make_batch(
-        "Set a white stone at (1, 2).", "Put a black stone at position (0, 4) on the Go board."
-    )
+    policy, short = make_policy(), "Set a white stone at (1, 2)."
+    batch = make_batch(short, "Put a black stone at position (0, 4) on the Go board.")
     alone = {key: value[:1] for key, value in batch.items() if isinstance(value, Tensor)}
+    alone["observation.language.tokens"] = torch.tensor([word_ids(short)])  # without what fills up the row
     torch.testing.assert_close(policy.select_action(batch)[:1], policy.select_action(alone))
     assert policy.predict_action_chunk(batch).shape == (2, 1, 4)
 
