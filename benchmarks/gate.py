@@ -1,0 +1,234 @@
+"""Can BOMB's demonstrations be learnt at all? The gate that opens before a big model is trained.
+
+A small image policy (lerobot_policy_keypoint_probe/) is trained by the stock `lerobot-train` on
+demonstrations of the scripted expert, and its checkpoints are evaluated by the stock `lerobot-eval` on seeds
+that it has not seen; the last one twice more: with black images, and without the sentence.
+
+    OMP_NUM_THREADS=1 python benchmarks/gate.py one_target --output_dir gate
+
+What is finished stays in the output folder and is not done again: the dataset, the training, each evaluation.
+A training that was killed starts anew. Flags --policy.NAME=VALUE go to `lerobot-train`.
+"""
+
+import argparse
+import json
+import os
+import resource
+import shutil
+import sys
+import time
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from learning_curve import Point, as_figures, count, draw, print_points
+from machine import add_machine_arguments, positive, require_idle_machine, write_figures
+
+from lerobot_bomb.commands import run_command
+from lerobot_bomb.evaluation.results import Row, read_results
+
+PLUGIN = "lerobot_policy_keypoint_probe"  # not installed: LeRobot finds it by --*.discover_packages_path
+IMAGE_SIZE = 64  # pixels
+NOISE = 0.05  # on the executed actions, so that recoveries are in the data
+BATCH_SIZE = 64
+FIRST_SEED = 1000  # of the demonstrations
+FIRST_UNSEEN_SEED = 100_000
+EVAL_EPISODES = 100
+NUM_CHECKPOINTS = 6
+EMPTY_SENTENCE = "Place a stone."
+NO_IMAGES, NO_SENTENCE = "blank images", "without the sentence"
+
+
+@dataclass(frozen=True)
+class Rung:
+    """A step of difficulty: which tasks, how many demonstrations, how long a training."""
+
+    task_ids: tuple[int, ...]  # empty: target and colour are drawn for each episode
+    demonstrations: int
+    steps: int
+    bar: float | None  # success rate that the last checkpoint must reach; None: it is only measured
+
+
+RUNGS = {
+    "one_target": Rung((12,), demonstrations=200, steps=3000, bar=0.90),
+    "all_targets": Rung((), demonstrations=400, steps=3000, bar=None),
+}
+
+
+def main() -> None:
+    """Record, train, evaluate every checkpoint, print the curve; exit code 1 where the bar is missed."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawTextHelpFormatter)
+    parser.add_argument("rung", choices=RUNGS)
+    parser.add_argument("--output_dir", type=Path, required=True, help="folder to keep, or to go on with")
+    parser.add_argument("--demonstrations", type=positive, help="default: the rung's")
+    parser.add_argument("--steps", type=positive, help="training steps (default: the rung's)")
+    parser.add_argument("--picture", type=Path, help="write the learning curve to this PNG")
+    add_machine_arguments(parser)
+    args, args.policy_flags = parser.parse_known_args()
+    unknown = [flag for flag in args.policy_flags if not flag.startswith("--policy.")]
+    if unknown:
+        parser.error(f"unknown: {' '.join(unknown)}")
+    require_idle_machine(args.force)
+    os.environ.setdefault("OMP_NUM_THREADS", "1")
+    here = str(Path(__file__).parent)
+    os.environ["PYTHONPATH"] = os.pathsep.join(filter(None, [here, os.environ.get("PYTHONPATH")]))
+    try:
+        sys.exit(climb(args))
+    except RuntimeError as error:
+        sys.exit(f"gate.py: {error}")
+
+
+def climb(args: argparse.Namespace) -> int:
+    """The whole rung in args.output_dir; 0 if the bar was reached."""
+    rung = RUNGS[args.rung]
+    demonstrations, steps = args.demonstrations or rung.demonstrations, args.steps or rung.steps
+    folder = args.output_dir
+    settings = {
+        "rung": args.rung,
+        "demonstrations": demonstrations,
+        "steps": steps,
+        "policy_flags": args.policy_flags,
+    }
+    claim(folder, settings)
+    record(rung, demonstrations, folder / "dataset")
+    training = train(folder, steps, args.policy_flags)
+    points: dict[str, Point] = {}
+    rows: list[Row] = []
+    for checkpoint in sorted((folder / "train" / "checkpoints").glob("[0-9]*")):
+        step = int(checkpoint.name)
+        rows = evaluate(rung, checkpoint / "pretrained_model", folder / f"eval_{checkpoint.name}")
+        points[f"step {step}"] = count(rows, step, training["cpu_minutes"] * step / steps)
+    curve = list(points.values())
+    last = folder / "train" / "checkpoints" / "last" / "pretrained_model"
+    for name, changed in change_what_is_shown(last, rows).items():
+        shown = evaluate(rung, changed, folder / f"eval_{name.replace(' ', '_')}")
+        points[name] = count(shown, steps, training["cpu_minutes"])
+    if args.picture is not None:
+        draw(
+            curve, f"{args.rung}: {demonstrations} demonstrations, {EVAL_EPISODES} unseen seeds", args.picture
+        )
+    print_points(points)
+    minutes = {f"training_{name}": value for name, value in training.items()}
+    write_figures(args.json, {**settings, **minutes, "points": as_figures(points)})
+    return 0 if rung.bar is None else verdict(curve[-1], rung.bar)
+
+
+def verdict(last: Point, bar: float) -> int:
+    """Say whether the last checkpoint reaches the bar; 0 if it does."""
+    is_open = last.num_successes >= bar * last.num_episodes
+    print(f"bar {100 * bar:.0f} %: {'reached' if is_open else 'MISSED'}")
+    return 0 if is_open else 1
+
+
+def claim(folder: Path, settings: dict[str, Any]) -> None:
+    """Make the folder, or refuse one in which something else was run."""
+    path = folder / "settings.json"
+    if path.exists() and json.loads(path.read_text()) != settings:
+        raise RuntimeError(
+            f"--output_dir={folder} holds a run of {path.read_text().strip()}; name another folder"
+        )
+    folder.mkdir(parents=True, exist_ok=True)
+    path.write_text(json.dumps(settings) + "\n")
+
+
+def record(rung: Rung, demonstrations: int, dataset: Path) -> None:
+    """The expert's episodes."""
+    if dataset.exists():
+        return
+    tasks = [f"--task_ids={list(rung.task_ids)}"] if rung.task_ids else []
+    resume = ["--resume"] if dataset.with_name(f"{dataset.name}.recording").exists() else []
+    run_command(
+        "lerobot-bomb",
+        "record",
+        f"--repo_id=gate/{dataset.parent.name}",
+        f"--root={dataset}",
+        f"--episodes={demonstrations}",
+        f"--seed={FIRST_SEED}",
+        f"--noise={NOISE}",
+        "--images",
+        f"--image_size={IMAGE_SIZE}",
+        *tasks,
+        *resume,
+    )
+
+
+def train(folder: Path, steps: int, policy_flags: list[str]) -> dict[str, float]:
+    """Stock `lerobot-train` with NUM_CHECKPOINTS checkpoints; {"minutes", "cpu_minutes"} that it took."""
+    times = folder / "training.json"
+    if times.exists():
+        return json.loads(times.read_text())
+    shutil.rmtree(folder / "train", ignore_errors=True)
+    started, cpu_started = time.monotonic(), _children_cpu_s()
+    run_command(
+        "lerobot-train",
+        f"--policy.discover_packages_path={PLUGIN}",
+        "--policy.type=keypoint_probe",
+        "--policy.device=cpu",
+        f"--dataset.repo_id=gate/{folder.name}",
+        f"--dataset.root={folder / 'dataset'}",
+        f"--output_dir={folder / 'train'}",
+        f"--batch_size={BATCH_SIZE}",
+        f"--steps={steps}",
+        f"--save_freq={-(-steps // NUM_CHECKPOINTS)}",
+        "--num_workers=0",  # a second process would use a second core
+        *policy_flags,
+    )
+    minutes = {
+        "minutes": (time.monotonic() - started) / 60,
+        "cpu_minutes": (_children_cpu_s() - cpu_started) / 60,
+    }
+    times.write_text(json.dumps(minutes) + "\n")
+    return minutes
+
+
+def evaluate(rung: Rung, checkpoint: Path, output_dir: Path) -> list[Row]:
+    """Stock `lerobot-eval` on EVAL_EPISODES unseen seeds; their results."""
+    results = output_dir / "results.jsonl"
+    finished = output_dir / "finished"  # an evaluation that was killed leaves results of some episodes
+    if not finished.exists():
+        shutil.rmtree(output_dir, ignore_errors=True)
+        tasks = [f"--env.task_ids={list(rung.task_ids)}"] if rung.task_ids else []
+        run_command(
+            "lerobot-eval",
+            # not --policy.*, which would become an override of the checkpoint's config
+            f"--env.discover_packages_path={PLUGIN}",
+            f"--policy.path={checkpoint}",
+            "--env.type=bomb",
+            f"--env.image_size={IMAGE_SIZE}",
+            f"--env.results_path={results}",
+            *tasks,
+            f"--seed={FIRST_UNSEEN_SEED}",
+            f"--eval.n_episodes={EVAL_EPISODES}",
+            "--eval.batch_size=10",
+            "--eval.use_async_envs=false",
+            f"--output_dir={output_dir / 'eval'}",
+        )
+        finished.touch()
+    return read_results(results)
+
+
+def change_what_is_shown(checkpoint: Path, rows: list[Row]) -> dict[str, Path]:
+    """The controls' checkpoints: black cameras; the same, empty sentence in every episode."""
+    import lerobot_policy_keypoint_probe  # noqa: F401  its processor step must be known when it is loaded
+
+    from lerobot_bomb.explain.interventions import BlankImages, ReplaceTasks, intervene
+
+    steps = {
+        NO_IMAGES: BlankImages(),
+        NO_SENTENCE: ReplaceTasks({row["instruction"]: EMPTY_SENTENCE for row in rows}),
+    }
+    folders = {name: checkpoint.with_name(name.replace(" ", "_")) for name in steps}
+    for name, step in steps.items():
+        shutil.rmtree(folders[name], ignore_errors=True)
+        intervene(checkpoint, [step], folders[name])
+    return folders
+
+
+def _children_cpu_s() -> float:
+    """CPU seconds, user and system, of all commands that have ended."""
+    usage = resource.getrusage(resource.RUSAGE_CHILDREN)
+    return usage.ru_utime + usage.ru_stime
+
+
+if __name__ == "__main__":
+    main()
