@@ -2,8 +2,10 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import yaml
 from lerobot.envs import env_to_policy_features, make_env, make_env_config
 
+from lerobot_bomb.perturbations import NUISANCES
 from lerobot_bomb.schema import FlagError
 from lerobot_env_bomb.configuration_bomb import BombEnvConfig
 from lerobot_env_bomb.vector import LazyVectorEnv
@@ -54,6 +56,14 @@ def test_each_condition_is_a_group_with_all_tasks() -> None:
         vector.close()
     assert instructions[0] == instructions[1]
     assert not np.array_equal(*pictures)
+
+
+def test_the_protocol_s_file_names_every_axis() -> None:
+    path = Path(__file__).parents[1] / "configs" / "eval_bomb_place.yaml"
+    flags = yaml.safe_load(path.read_text())["env"]
+    assert flags.pop("type") == "bomb"
+    conditions = set(BombEnvConfig(**flags).conditions.values())
+    assert conditions == {"none", "all:1", "all:3", "all:5", *(f"{axis}:3" for axis in NUISANCES)}
 
 
 @pytest.mark.parametrize(
