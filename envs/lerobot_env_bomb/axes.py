@@ -6,7 +6,7 @@ so that the same seed at a higher level goes further the same way.
 """
 
 from dataclasses import dataclass
-from typing import Self
+from typing import Any, Self
 
 import numpy as np
 
@@ -153,7 +153,7 @@ class Camera:
         workspace, wrist = (model.camera(name) for name in CAMERAS)
         for camera in (workspace, wrist):
             camera.fovy *= self.fov_factor
-        self._swing(wrist, np.zeros(3), self.wrist_angle_rad)
+        self._swing(wrist, model.site("grip").pos, self.wrist_angle_rad)  # of the same body
         backward = _matrix(workspace.quat)[:, 2]
         pivot = workspace.pos - backward * workspace.pos[2] / backward[2]  # where it looks on the table
         distance_m = np.linalg.norm(workspace.pos - pivot) * self.distance_factor
@@ -162,7 +162,8 @@ class Camera:
         distance_m = max(distance_m, _least_distance(camera_from_world, pivot, workspace.fovy[0]))
         workspace.pos[:] = pivot + distance_m * camera_from_world[2]
 
-    def _swing(self, camera: "mujoco.MjModel", pivot: np.ndarray, angle_rad: float) -> None:
+    def _swing(self, camera: Any, pivot: np.ndarray, angle_rad: float) -> None:
+        """Turn a named camera's pose around a point of its body's frame."""
         matrix = _matrix(camera.quat)
         axis = np.cos(self.direction_rad) * matrix[:, 0] + np.sin(self.direction_rad) * matrix[:, 1]
         turn = _rotation(axis, angle_rad)
