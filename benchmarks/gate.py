@@ -2,7 +2,7 @@
 
 A small image policy (lerobot_policy_keypoint_probe/) is trained by the stock `lerobot-train` on
 demonstrations of the scripted expert, and its checkpoints are evaluated by the stock `lerobot-eval` on seeds
-that it has not seen; the last one twice more: with black images, and without the sentence.
+that it has not seen; the last one twice more: with black images, and told the sentence of another episode.
 
     OMP_NUM_THREADS=1 python benchmarks/gate.py one_target --output_dir gate
 
@@ -25,7 +25,7 @@ from learning_curve import Point, as_figures, count, draw, print_points
 from machine import add_machine_arguments, positive, require_idle_machine, write_figures
 
 from lerobot_bomb.commands import run_command
-from lerobot_bomb.evaluation.results import Row, read_results
+from lerobot_bomb.evaluation.results import PUT_DOWN, Row, read_results
 
 PLUGIN = "lerobot_policy_keypoint_probe"  # not installed: LeRobot finds it by --*.discover_packages_path
 IMAGE_SIZE = 64  # pixels
@@ -35,8 +35,7 @@ FIRST_SEED = 1000  # of the demonstrations
 FIRST_UNSEEN_SEED = 100_000
 EVAL_EPISODES = 100
 NUM_CHECKPOINTS = 6
-EMPTY_SENTENCE = "Place a stone."
-NO_IMAGES, NO_SENTENCE = "blank images", "without the sentence"
+NO_IMAGES, OTHER_SENTENCE = "blank images", "another episode's sentence"
 
 
 @dataclass(frozen=True)
@@ -99,17 +98,22 @@ def climb(args: argparse.Namespace) -> int:
         rows = evaluate(rung, checkpoint / "pretrained_model", folder / f"eval_{checkpoint.name}")
         points[f"step {step}"] = count(rows, step, training["cpu_minutes"] * step / steps)
     curve = list(points.values())
+    told = other_sentences(rows)
     last = folder / "train" / "checkpoints" / "last" / "pretrained_model"
-    for name, changed in change_what_is_shown(last, rows).items():
-        shown = evaluate(rung, changed, folder / f"eval_{name.replace(' ', '_')}")
-        points[name] = count(shown, steps, training["cpu_minutes"])
+    shown = {
+        name: evaluate(rung, changed, folder / f"eval_{changed.name}")
+        for name, changed in change_what_is_shown(last, told).items()
+    }
+    points |= {name: count(shown[name], steps, training["cpu_minutes"]) for name in shown}
     if args.picture is not None:
         draw(
             curve, f"{args.rung}: {demonstrations} demonstrations, {EVAL_EPISODES} unseen seeds", args.picture
         )
     print_points(points)
+    num_named = count_named(shown[OTHER_SENTENCE], told)
+    print(f"{OTHER_SENTENCE}: {num_named}/{EVAL_EPISODES} stones put down on the intersection that it names")
     minutes = {f"training_{name}": value for name, value in training.items()}
-    write_figures(args.json, {**settings, **minutes, "points": as_figures(points)})
+    write_figures(args.json, {**settings, **minutes, "points": as_figures(points), "on_named": num_named})
     return 0 if rung.bar is None else verdict(curve[-1], rung.bar)
 
 
@@ -207,18 +211,34 @@ def evaluate(rung: Rung, checkpoint: Path, output_dir: Path) -> list[Row]:
     return read_results(results)
 
 
-def change_what_is_shown(checkpoint: Path, rows: list[Row]) -> dict[str, Path]:
-    """The controls' checkpoints: black cameras; the same, empty sentence in every episode."""
+def other_sentences(rows: list[Row]) -> dict[str, str]:
+    """{instruction: that of another episode}; where all episodes have one target, in other words only."""
+    sentences = sorted({row["instruction"] for row in rows})
+    half = len(sentences) // 2
+    return dict(zip(sentences, sentences[half:] + sentences[:half], strict=True))
+
+
+def count_named(rows: list[Row], told: dict[str, str]) -> int:
+    """Stones put down nearest to the intersection that the policy was told."""
+    targets = {row["instruction"]: row["target"] for row in rows}
+    return sum(
+        row["failure"] in PUT_DOWN and row["nearest_intersection"] == targets[told[row["instruction"]]]
+        for row in rows
+    )
+
+
+def change_what_is_shown(checkpoint: Path, told: dict[str, str]) -> dict[str, Path]:
+    """The controls' checkpoints: black cameras; the sentence of another episode."""
     import lerobot_policy_keypoint_probe  # noqa: F401  its processor step must be known when it is loaded
 
     from lerobot_bomb.explain.interventions import BlankImages, ReplaceTasks, intervene
 
-    steps = {
-        NO_IMAGES: BlankImages(),
-        NO_SENTENCE: ReplaceTasks({row["instruction"]: EMPTY_SENTENCE for row in rows}),
-    }
-    folders = {name: checkpoint.with_name(name.replace(" ", "_")) for name in steps}
-    for name, step in steps.items():
+    folders = {}
+    for name, step, folder in (
+        (NO_IMAGES, BlankImages(), "blank_images"),
+        (OTHER_SENTENCE, ReplaceTasks(told), "other_sentence"),
+    ):
+        folders[name] = checkpoint.with_name(folder)
         shutil.rmtree(folders[name], ignore_errors=True)
         intervene(checkpoint, [step], folders[name])
     return folders

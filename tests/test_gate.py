@@ -107,7 +107,7 @@ def test_a_rung_is_climbed_by_stock_commands_and_goes_on_where_it_stopped(
         ("step 1", 1),
         ("step 2", 2),
         (gate.NO_IMAGES, 2),
-        (gate.NO_SENTENCE, 2),
+        (gate.OTHER_SENTENCE, 2),
     ]
     assert figures["training_cpu_minutes"] == 2.0
     assert figures["points"]["step 1"]["cpu_minutes"] == 1.0
@@ -123,6 +123,19 @@ def test_a_rung_is_climbed_by_stock_commands_and_goes_on_where_it_stopped(
     args.steps = 4
     with pytest.raises(RuntimeError, match=r'holds a run of .*"steps": 2.*; name another folder'):
         gate.climb(args)
+
+
+def test_a_stone_counts_where_the_told_sentence_says() -> None:
+    rows = [
+        row(None, 1.0, instruction="a"),
+        row("wrong_intersection", 45.0, (2, 3), instruction="a"),
+        row("dropped", 45.0, (2, 3), instruction="a"),
+        row(None, 1.0, (2, 3), instruction="b", target=[2, 3]),
+    ]
+    told = gate.other_sentences(rows)
+    assert told == {"a": "b", "b": "a"}
+    assert gate.count_named(rows, told) == 1
+    assert gate.count_named(rows, {"a": "a", "b": "b"}) == 2
 
 
 # The curve
