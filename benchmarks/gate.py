@@ -79,42 +79,30 @@ def main() -> None:
 
 def climb(args: argparse.Namespace) -> int:
     """The whole rung in args.output_dir; 0 if the bar was reached."""
-    rung = RUNGS[args.rung]
+    rung, folder = RUNGS[args.rung], args.output_dir
     demonstrations, steps = args.demonstrations or rung.demonstrations, args.steps or rung.steps
-    folder = args.output_dir
-    settings = {
-        "rung": args.rung,
-        "demonstrations": demonstrations,
-        "steps": steps,
-        "policy_flags": args.policy_flags,
-    }
-    claim(folder, settings)
+    run = {"rung": args.rung, "demonstrations": demonstrations, "steps": steps, "flags": args.policy_flags}
+    claim(folder, run)
     record(rung, demonstrations, folder / "dataset")
-    training = train(folder, steps, args.policy_flags)
-    points: dict[str, Point] = {}
-    rows: list[Row] = []
-    for checkpoint in sorted((folder / "train" / "checkpoints").glob("[0-9]*")):
-        step = int(checkpoint.name)
-        rows = evaluate(rung, checkpoint / "pretrained_model", folder / f"eval_{checkpoint.name}")
-        points[f"step {step}"] = count(rows, step, training["cpu_minutes"] * step / steps)
-    curve = list(points.values())
-    told = other_sentences(rows)
-    last = folder / "train" / "checkpoints" / "last" / "pretrained_model"
-    shown = {
-        name: evaluate(rung, changed, folder / f"eval_{changed.name}")
-        for name, changed in change_what_is_shown(last, told).items()
-    }
-    points |= {name: count(shown[name], steps, training["cpu_minutes"]) for name in shown}
-    if args.picture is not None:
-        draw(
-            curve, f"{args.rung}: {demonstrations} demonstrations, {EVAL_EPISODES} unseen seeds", args.picture
-        )
+    minutes = train(folder, steps, args.policy_flags)
+
+    results = evaluate_checkpoints(rung, folder)
+    told = other_sentences(results[steps])
+    controls = evaluate_controls(rung, folder, told)
+    minutes_per_step = minutes["cpu_minutes"] / steps
+    points = {f"step {step}": count(rows, step, step * minutes_per_step) for step, rows in results.items()}
+    points |= {name: count(rows, steps, minutes["cpu_minutes"]) for name, rows in controls.items()}
+
+    num_named = count_named(controls[OTHER_SENTENCE], told)
     print_points(points)
-    num_named = count_named(shown[OTHER_SENTENCE], told)
     print(f"{OTHER_SENTENCE}: {num_named}/{EVAL_EPISODES} stones put down on the intersection that it names")
-    minutes = {f"training_{name}": value for name, value in training.items()}
-    write_figures(args.json, {**settings, **minutes, "points": as_figures(points), "on_named": num_named})
-    return 0 if rung.bar is None else verdict(curve[-1], rung.bar)
+    if args.picture is not None:
+        title = f"{args.rung}: {demonstrations} demonstrations, {EVAL_EPISODES} unseen seeds"
+        draw([points[f"step {step}"] for step in results], title, args.picture)
+    write_figures(
+        args.json, {**run, "training": minutes, "points": as_figures(points), "on_named": num_named}
+    )
+    return 0 if rung.bar is None else verdict(points[f"step {steps}"], rung.bar)
 
 
 def verdict(last: Point, bar: float) -> int:
@@ -124,15 +112,15 @@ def verdict(last: Point, bar: float) -> int:
     return 0 if is_open else 1
 
 
-def claim(folder: Path, settings: dict[str, Any]) -> None:
+def claim(folder: Path, run: dict[str, Any]) -> None:
     """Make the folder, or refuse one in which something else was run."""
-    path = folder / "settings.json"
-    if path.exists() and json.loads(path.read_text()) != settings:
+    path = folder / "run.json"
+    if path.exists() and json.loads(path.read_text()) != run:
         raise RuntimeError(
             f"--output_dir={folder} holds a run of {path.read_text().strip()}; name another folder"
         )
     folder.mkdir(parents=True, exist_ok=True)
-    path.write_text(json.dumps(settings) + "\n")
+    path.write_text(json.dumps(run) + "\n")
 
 
 def record(rung: Rung, demonstrations: int, dataset: Path) -> None:
@@ -185,6 +173,32 @@ def train(folder: Path, steps: int, policy_flags: list[str]) -> dict[str, float]
     return minutes
 
 
+def evaluate_checkpoints(rung: Rung, folder: Path) -> dict[int, list[Row]]:
+    """{training step: results}."""
+    return {
+        int(path.name): evaluate(rung, path / "pretrained_model", folder / f"eval_{path.name}")
+        for path in sorted((folder / "train" / "checkpoints").glob("[0-9]*"))
+    }
+
+
+def evaluate_controls(rung: Rung, folder: Path, told: dict[str, str]) -> dict[str, list[Row]]:
+    """{control: results} of the last checkpoint with black cameras, and told other sentences."""
+    import lerobot_policy_keypoint_probe  # noqa: F401  its processor step must be known when it is loaded
+
+    from lerobot_bomb.explain.interventions import BlankImages, ReplaceTasks, intervene
+
+    checkpoint = folder / "train" / "checkpoints" / "last" / "pretrained_model"
+    results = {}
+    for name, step, changed in (
+        (NO_IMAGES, BlankImages(), "blank_images"),
+        (OTHER_SENTENCE, ReplaceTasks(told), "other_sentence"),
+    ):
+        shutil.rmtree(checkpoint.with_name(changed), ignore_errors=True)
+        intervene(checkpoint, [step], checkpoint.with_name(changed))
+        results[name] = evaluate(rung, checkpoint.with_name(changed), folder / f"eval_{changed}")
+    return results
+
+
 def evaluate(rung: Rung, checkpoint: Path, output_dir: Path) -> list[Row]:
     """Stock `lerobot-eval` on EVAL_EPISODES unseen seeds; their results."""
     results = output_dir / "results.jsonl"
@@ -225,23 +239,6 @@ def count_named(rows: list[Row], told: dict[str, str]) -> int:
         row["failure"] in PUT_DOWN and row["nearest_intersection"] == targets[told[row["instruction"]]]
         for row in rows
     )
-
-
-def change_what_is_shown(checkpoint: Path, told: dict[str, str]) -> dict[str, Path]:
-    """The controls' checkpoints: black cameras; the sentence of another episode."""
-    import lerobot_policy_keypoint_probe  # noqa: F401  its processor step must be known when it is loaded
-
-    from lerobot_bomb.explain.interventions import BlankImages, ReplaceTasks, intervene
-
-    folders = {}
-    for name, step, folder in (
-        (NO_IMAGES, BlankImages(), "blank_images"),
-        (OTHER_SENTENCE, ReplaceTasks(told), "other_sentence"),
-    ):
-        folders[name] = checkpoint.with_name(folder)
-        shutil.rmtree(folders[name], ignore_errors=True)
-        intervene(checkpoint, [step], folders[name])
-    return folders
 
 
 def _children_cpu_s() -> float:

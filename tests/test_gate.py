@@ -109,7 +109,7 @@ def test_a_rung_is_climbed_by_stock_commands_and_goes_on_where_it_stopped(
         (gate.NO_IMAGES, 2),
         (gate.OTHER_SENTENCE, 2),
     ]
-    assert figures["training_cpu_minutes"] == 2.0
+    assert figures["training"]["cpu_minutes"] == 2.0
     assert figures["points"]["step 1"]["cpu_minutes"] == 1.0
     assert all(point["num_episodes"] == 1 for point in figures["points"].values())
     assert "bar 50 %: MISSED" in capsys.readouterr().out
