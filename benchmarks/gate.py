@@ -28,6 +28,7 @@ from lerobot_bomb.commands import run_command
 from lerobot_bomb.evaluation.results import PUT_DOWN, Row, read_results
 
 PLUGIN = "lerobot_policy_keypoint_probe"  # not installed: LeRobot finds it by --*.discover_packages_path
+REPO_ID = "gate/bomb_place"
 IMAGE_SIZE = 64  # pixels
 NOISE = 0.05  # on the executed actions, so that recoveries are in the data
 BATCH_SIZE = 64
@@ -132,7 +133,7 @@ def record(rung: Rung, demonstrations: int, dataset: Path) -> None:
     run_command(
         "lerobot-bomb",
         "record",
-        f"--repo_id=gate/{dataset.parent.name}",
+        f"--repo_id={REPO_ID}",
         f"--root={dataset}",
         f"--episodes={demonstrations}",
         f"--seed={FIRST_SEED}",
@@ -156,7 +157,7 @@ def train(folder: Path, steps: int, policy_flags: list[str]) -> dict[str, float]
         f"--policy.discover_packages_path={PLUGIN}",
         "--policy.type=keypoint_probe",
         "--policy.device=cpu",
-        f"--dataset.repo_id=gate/{folder.name}",
+        f"--dataset.repo_id={REPO_ID}",
         f"--dataset.root={folder / 'dataset'}",
         f"--output_dir={folder / 'train'}",
         f"--batch_size={BATCH_SIZE}",
