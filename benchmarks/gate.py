@@ -2,7 +2,7 @@
 
 A small image policy (lerobot_policy_keypoint_probe/) is trained by the stock `lerobot-train` on
 demonstrations of the scripted expert, and its checkpoints are evaluated by the stock `lerobot-eval` on seeds
-that it has not seen; the last one twice more: with black images, and without the sentence.
+that it has not seen; the last one twice more: with black images, and told the sentence of another episode.
 
     OMP_NUM_THREADS=1 python benchmarks/gate.py one_target --output_dir gate
 
@@ -25,9 +25,10 @@ from learning_curve import Point, as_figures, count, draw, print_points
 from machine import add_machine_arguments, positive, require_idle_machine, write_figures
 
 from lerobot_bomb.commands import run_command
-from lerobot_bomb.evaluation.results import Row, read_results
+from lerobot_bomb.evaluation.results import PUT_DOWN, Row, read_results
 
 PLUGIN = "lerobot_policy_keypoint_probe"  # not installed: LeRobot finds it by --*.discover_packages_path
+REPO_ID = "gate/bomb_place"
 IMAGE_SIZE = 64  # pixels
 NOISE = 0.05  # on the executed actions, so that recoveries are in the data
 BATCH_SIZE = 64
@@ -35,8 +36,7 @@ FIRST_SEED = 1000  # of the demonstrations
 FIRST_UNSEEN_SEED = 100_000
 EVAL_EPISODES = 100
 NUM_CHECKPOINTS = 6
-EMPTY_SENTENCE = "Place a stone."
-NO_IMAGES, NO_SENTENCE = "blank images", "without the sentence"
+NO_IMAGES, OTHER_SENTENCE = "blank images", "another episode's sentence"
 
 
 @dataclass(frozen=True)
@@ -80,37 +80,30 @@ def main() -> None:
 
 def climb(args: argparse.Namespace) -> int:
     """The whole rung in args.output_dir; 0 if the bar was reached."""
-    rung = RUNGS[args.rung]
+    rung, folder = RUNGS[args.rung], args.output_dir
     demonstrations, steps = args.demonstrations or rung.demonstrations, args.steps or rung.steps
-    folder = args.output_dir
-    settings = {
-        "rung": args.rung,
-        "demonstrations": demonstrations,
-        "steps": steps,
-        "policy_flags": args.policy_flags,
-    }
-    claim(folder, settings)
+    run = {"rung": args.rung, "demonstrations": demonstrations, "steps": steps, "flags": args.policy_flags}
+    claim(folder, run)
     record(rung, demonstrations, folder / "dataset")
-    training = train(folder, steps, args.policy_flags)
-    points: dict[str, Point] = {}
-    rows: list[Row] = []
-    for checkpoint in sorted((folder / "train" / "checkpoints").glob("[0-9]*")):
-        step = int(checkpoint.name)
-        rows = evaluate(rung, checkpoint / "pretrained_model", folder / f"eval_{checkpoint.name}")
-        points[f"step {step}"] = count(rows, step, training["cpu_minutes"] * step / steps)
-    curve = list(points.values())
-    last = folder / "train" / "checkpoints" / "last" / "pretrained_model"
-    for name, changed in change_what_is_shown(last, rows).items():
-        shown = evaluate(rung, changed, folder / f"eval_{name.replace(' ', '_')}")
-        points[name] = count(shown, steps, training["cpu_minutes"])
-    if args.picture is not None:
-        draw(
-            curve, f"{args.rung}: {demonstrations} demonstrations, {EVAL_EPISODES} unseen seeds", args.picture
-        )
+    minutes = train(folder, steps, args.policy_flags)
+
+    results = evaluate_checkpoints(rung, folder)
+    told = other_sentences(results[steps])
+    controls = evaluate_controls(rung, folder, told)
+    minutes_per_step = minutes["cpu_minutes"] / steps
+    points = {f"step {step}": count(rows, step, step * minutes_per_step) for step, rows in results.items()}
+    points |= {name: count(rows, steps, minutes["cpu_minutes"]) for name, rows in controls.items()}
+
+    num_named = count_named(controls[OTHER_SENTENCE], told)
     print_points(points)
-    minutes = {f"training_{name}": value for name, value in training.items()}
-    write_figures(args.json, {**settings, **minutes, "points": as_figures(points)})
-    return 0 if rung.bar is None else verdict(curve[-1], rung.bar)
+    print(f"{OTHER_SENTENCE}: {num_named}/{EVAL_EPISODES} stones put down on the intersection that it names")
+    if args.picture is not None:
+        title = f"{args.rung}: {demonstrations} demonstrations, {EVAL_EPISODES} unseen seeds"
+        draw([points[f"step {step}"] for step in results], title, args.picture)
+    write_figures(
+        args.json, {**run, "training": minutes, "points": as_figures(points), "on_named": num_named}
+    )
+    return 0 if rung.bar is None else verdict(points[f"step {steps}"], rung.bar)
 
 
 def verdict(last: Point, bar: float) -> int:
@@ -120,15 +113,15 @@ def verdict(last: Point, bar: float) -> int:
     return 0 if is_open else 1
 
 
-def claim(folder: Path, settings: dict[str, Any]) -> None:
+def claim(folder: Path, run: dict[str, Any]) -> None:
     """Make the folder, or refuse one in which something else was run."""
-    path = folder / "settings.json"
-    if path.exists() and json.loads(path.read_text()) != settings:
+    path = folder / "run.json"
+    if path.exists() and json.loads(path.read_text()) != run:
         raise RuntimeError(
             f"--output_dir={folder} holds a run of {path.read_text().strip()}; name another folder"
         )
     folder.mkdir(parents=True, exist_ok=True)
-    path.write_text(json.dumps(settings) + "\n")
+    path.write_text(json.dumps(run) + "\n")
 
 
 def record(rung: Rung, demonstrations: int, dataset: Path) -> None:
@@ -140,7 +133,7 @@ def record(rung: Rung, demonstrations: int, dataset: Path) -> None:
     run_command(
         "lerobot-bomb",
         "record",
-        f"--repo_id=gate/{dataset.parent.name}",
+        f"--repo_id={REPO_ID}",
         f"--root={dataset}",
         f"--episodes={demonstrations}",
         f"--seed={FIRST_SEED}",
@@ -164,7 +157,7 @@ def train(folder: Path, steps: int, policy_flags: list[str]) -> dict[str, float]
         f"--policy.discover_packages_path={PLUGIN}",
         "--policy.type=keypoint_probe",
         "--policy.device=cpu",
-        f"--dataset.repo_id=gate/{folder.name}",
+        f"--dataset.repo_id={REPO_ID}",
         f"--dataset.root={folder / 'dataset'}",
         f"--output_dir={folder / 'train'}",
         f"--batch_size={BATCH_SIZE}",
@@ -179,6 +172,32 @@ def train(folder: Path, steps: int, policy_flags: list[str]) -> dict[str, float]
     }
     times.write_text(json.dumps(minutes) + "\n")
     return minutes
+
+
+def evaluate_checkpoints(rung: Rung, folder: Path) -> dict[int, list[Row]]:
+    """{training step: results}."""
+    return {
+        int(path.name): evaluate(rung, path / "pretrained_model", folder / f"eval_{path.name}")
+        for path in sorted((folder / "train" / "checkpoints").glob("[0-9]*"))
+    }
+
+
+def evaluate_controls(rung: Rung, folder: Path, told: dict[str, str]) -> dict[str, list[Row]]:
+    """{control: results} of the last checkpoint with black cameras, and told other sentences."""
+    import lerobot_policy_keypoint_probe  # noqa: F401  its processor step must be known when it is loaded
+
+    from lerobot_bomb.explain.interventions import BlankImages, ReplaceTasks, intervene
+
+    checkpoint = folder / "train" / "checkpoints" / "last" / "pretrained_model"
+    results = {}
+    for name, step, changed in (
+        (NO_IMAGES, BlankImages(), "blank_images"),
+        (OTHER_SENTENCE, ReplaceTasks(told), "other_sentence"),
+    ):
+        shutil.rmtree(checkpoint.with_name(changed), ignore_errors=True)
+        intervene(checkpoint, [step], checkpoint.with_name(changed))
+        results[name] = evaluate(rung, checkpoint.with_name(changed), folder / f"eval_{changed}")
+    return results
 
 
 def evaluate(rung: Rung, checkpoint: Path, output_dir: Path) -> list[Row]:
@@ -207,21 +226,20 @@ def evaluate(rung: Rung, checkpoint: Path, output_dir: Path) -> list[Row]:
     return read_results(results)
 
 
-def change_what_is_shown(checkpoint: Path, rows: list[Row]) -> dict[str, Path]:
-    """The controls' checkpoints: black cameras; the same, empty sentence in every episode."""
-    import lerobot_policy_keypoint_probe  # noqa: F401  its processor step must be known when it is loaded
+def other_sentences(rows: list[Row]) -> dict[str, str]:
+    """{instruction: that of another episode}; where all episodes have one target, in other words only."""
+    sentences = sorted({row["instruction"] for row in rows})
+    half = len(sentences) // 2
+    return dict(zip(sentences, sentences[half:] + sentences[:half], strict=True))
 
-    from lerobot_bomb.explain.interventions import BlankImages, ReplaceTasks, intervene
 
-    steps = {
-        NO_IMAGES: BlankImages(),
-        NO_SENTENCE: ReplaceTasks({row["instruction"]: EMPTY_SENTENCE for row in rows}),
-    }
-    folders = {name: checkpoint.with_name(name.replace(" ", "_")) for name in steps}
-    for name, step in steps.items():
-        shutil.rmtree(folders[name], ignore_errors=True)
-        intervene(checkpoint, [step], folders[name])
-    return folders
+def count_named(rows: list[Row], told: dict[str, str]) -> int:
+    """Stones put down nearest to the intersection that the policy was told."""
+    targets = {row["instruction"]: row["target"] for row in rows}
+    return sum(
+        row["failure"] in PUT_DOWN and row["nearest_intersection"] == targets[told[row["instruction"]]]
+        for row in rows
+    )
 
 
 def _children_cpu_s() -> float:
