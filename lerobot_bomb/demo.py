@@ -31,11 +31,11 @@ TRAIN_FLAGS = (
 CLOSING = """\
 So short a training of so small a model rarely places a stone: it shows that the road is open, not how
 far it leads. For a real run:
-  1. more demonstrations: lerobot-bomb record --repo_id=me/bomb_place --episodes=1000 --noise=0.05
+  1. more demonstrations: lerobot-bomb record --repo_id=me/bomb_place --episodes=900 --noise=0.05
   2. a real backbone on a GPU: drop --policy.vlm_model_name=nano (SmolVLM2-500M is the default) and
      set --policy.device=cuda --policy.dtype=bfloat16
   3. longer: lerobot-train --steps=30000 --batch_size=32
-  4. an honest number: lerobot-eval --eval.n_episodes=300 and at least 3 seeds
+  4. an honest number: docs/benchmark.md
 The pages about libtorchcodec above are LeRobot's: without FFmpeg it reads videos with PyAV."""
 
 

@@ -8,6 +8,7 @@ from dataclasses import replace
 
 import numpy as np
 
+from lerobot_bomb.flags import one_of
 from lerobot_bomb.schema import (
     CONTROL_MODES,
     DEFAULT_FPS,
@@ -15,7 +16,6 @@ from lerobot_bomb.schema import (
     WORKSPACE_HIGH_M,
     WORKSPACE_LOW_M,
     PrivilegedState,
-    one_of,
 )
 
 SPEED_M_S = 0.30  # at most, along each of the horizontal plane and the vertical

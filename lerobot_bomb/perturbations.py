@@ -160,7 +160,11 @@ class Condition:
             axes, low, high = _parse_part(part, text)
             for axis in axes:
                 if axis in ranges:
-                    raise ValueError(f"--env.perturbations={text!r} names the axis {axis} twice")
+                    raise ValueError(
+                        f"--env.perturbations={text!r} names the axis {axis} twice; {ALL} includes it"
+                        if ALL in text
+                        else f"--env.perturbations={text!r} names the axis {axis} twice"
+                    )
                 ranges[axis] = low, high
         return cls(tuple((axis, *ranges[axis]) for axis in AXES if ranges.get(axis, (0, 0)) != (0, 0)))
 
@@ -183,8 +187,9 @@ def _parse_part(part: str, text: str) -> tuple[tuple[str, ...], int, int]:
     match = re.fullmatch(r"([a-z_]+):(-?\d+)(?:-(\d+))?", part)
     if match is None:
         raise ValueError(
-            f"--env.perturbations={text!r}: {part!r} is not a perturbation; write 'none', AXIS:LEVEL "
-            "or AXIS:LOW-HIGH, several joined by +, as 'camera:3', 'camera:2+light:3', 'all:1-5'"
+            f"--env.perturbations={text!r}: {part!r} is not a perturbation; write 'none', AXIS:LEVEL or "
+            "AXIS:LOW-HIGH, several joined by +, without spaces, capitals and fractions, as 'camera:3', "
+            "'camera:2+light:3', 'all:1-5'"
         )
     axis, low, high = match[1], int(match[2]), int(match[3] or match[2])
     if axis != ALL and axis not in AXES:

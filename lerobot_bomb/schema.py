@@ -5,13 +5,13 @@ numpy only: simulator workers import this module and must start in under a secon
 
 import dataclasses
 import json
-from collections.abc import Iterator, Mapping
-from contextlib import contextmanager
 from dataclasses import dataclass, field
 from enum import StrEnum
 
 import numpy as np
 
+from lerobot_bomb import __version__
+from lerobot_bomb.flags import one_of
 from lerobot_bomb.perturbations import NONE, Condition
 
 # Version of task, physics, observation and success rule. Results of different versions do not compare.
@@ -208,6 +208,8 @@ class EpisodeResult:
     nearest_intersection: tuple[int, int]
     collateral_mm: float
     levels: dict[str, int] = field(default_factory=dict)  # of the perturbation axes that were on
+    image_size: int = DEFAULT_IMAGE_SIZE
+    package_version: str = __version__
     protocol_version: str = PROTOCOL_VERSION
 
     def to_json(self) -> str:
@@ -283,22 +285,6 @@ class PrivilegedState:
         )
 
 
-class FlagError(Exception):
-    """A config's flag has a value that is not allowed.
-
-    Not a ValueError: LeRobot's parser replaces the text of a ValueError that a config raises.
-    """
-
-
-@contextmanager
-def flag_errors() -> Iterator[None]:
-    """Raise the ValueErrors of a config's checks as FlagError."""
-    try:
-        yield
-    except ValueError as error:
-        raise FlagError(str(error)) from None
-
-
 def action_bounds(control_mode: str) -> tuple[np.ndarray, np.ndarray]:
     """(low, high), each (ACTION_DIM,) float32, of the action space in the environment's units."""
     if control_mode == "absolute":
@@ -306,9 +292,3 @@ def action_bounds(control_mode: str) -> tuple[np.ndarray, np.ndarray]:
     else:
         low, high = (-1.0,) * ACTION_DIM, (1.0,) * ACTION_DIM
     return np.array(low, dtype=np.float32), np.array(high, dtype=np.float32)
-
-
-def one_of(flag: str, value: object, allowed: tuple | Mapping) -> None:
-    """Raise a ValueError that names flag, value and choices unless value is allowed."""
-    if value not in allowed:
-        raise ValueError(f"{flag}={value!r} is unknown; choose one of: {', '.join(map(str, allowed))}")

@@ -5,8 +5,8 @@ import pytest
 import yaml
 from lerobot.envs import env_to_policy_features, make_env, make_env_config
 
+from lerobot_bomb.flags import FlagError
 from lerobot_bomb.perturbations import NUISANCES
-from lerobot_bomb.schema import FlagError
 from lerobot_env_bomb.configuration_bomb import BombEnvConfig
 from lerobot_env_bomb.vector import LazyVectorEnv
 
@@ -72,6 +72,7 @@ def test_the_protocol_s_file_names_every_axis() -> None:
         ({"perturbations": ["haze:1"]}, r"--env.perturbations='haze:1': 'haze' is not an axis"),
         ({"perturbations": ["camera:6"]}, r"--env.perturbations='camera:6': the levels of camera must lie"),
         ({"perturbations": ["camera"]}, r"--env.perturbations='camera': 'camera' is not a perturbation"),
+        ({"perturbations": "camera:3"}, r"=camera:3 must be a list, with brackets and quotes: --env.perturb"),
         ({"perturbations": []}, r"--env.perturbations=\[\] names no condition"),
         ({"perturbations": ["none", "all:0"]}, "a condition twice"),
         ({"task": "plce"}, "--env.task='plce'"),

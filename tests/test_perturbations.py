@@ -59,7 +59,9 @@ def test_all_stands_for_every_nuisance_and_no_help() -> None:
         ("camera:2 + light:3", "'camera:2 ' is not a perturbation"),
         ("camera:2++light:3", "'' is not a perturbation"),
         ("", "'' is not a perturbation"),
-        ("all:2+camera:3", "names the axis camera twice"),
+        ("camera:2.5", "without spaces, capitals and fractions"),
+        ("all:2+camera:3", "names the axis camera twice; all includes it"),
+        ("camera:2+camera:3", "names the axis camera twice"),
     ],
 )
 def test_a_malformed_condition_is_refused(text: str, message: str) -> None:

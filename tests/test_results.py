@@ -101,3 +101,16 @@ def test_a_perturbed_arm_is_compared_with_the_same_episodes_unperturbed(
     assert "camera:3: 7 pairs, 5 lost, 1 won, p = 0.22" in printed
     assert "all:5: 2 pairs, 0 lost, 0 won, p = 1 " in printed
     assert f"{path} (perturbations=none): 7 episodes" in printed
+
+
+def test_what_a_file_holds_is_said_even_where_nothing_differs(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    path = tmp_path / "results.jsonl"
+    specs = [{"seed": seed, "robot": "fetch", "perturbations": "camera:3"} for seed in (4, 7, 4)]
+    path.write_text("".join(row(0, spec=spec) for spec in specs))
+    assert main(["results", str(path)]) == 0
+    printed = capsys.readouterr().out
+    assert f"protocol {PROTOCOL_VERSION}, robot=fetch, perturbations=camera:3, seeds 4..7" in printed
+    assert "1 lines count no more, a later one is of the same episode" in printed
+    assert 'no unperturbed episodes to compare with; add "none" to --env.perturbations' in printed

@@ -14,7 +14,7 @@ from safetensors.torch import load_file, save_file
 from torch import Tensor
 from vla0_smol_cases import STATS, WRIST, make_batch, make_config, make_policy, raw_batch
 
-from lerobot_bomb.schema import FlagError
+from lerobot_bomb.flags import FlagError
 from lerobot_policy_vla0_smol import make_vla0_smol_pre_post_processors
 from lerobot_policy_vla0_smol.modeling_vla0_smol import Vla0SmolPolicy
 

@@ -10,16 +10,9 @@ from lerobot.envs import EnvConfig
 from lerobot.utils.constants import ACTION, OBS_IMAGES, OBS_PREFIX, OBS_STATE
 
 from lerobot_bomb.camera_geometry import geometry_shapes
+from lerobot_bomb.flags import flag_errors
 from lerobot_bomb.perturbations import NONE, Condition
-from lerobot_bomb.schema import (
-    ACTION_DIM,
-    CAMERAS,
-    DEFAULT_FPS,
-    STATE_DIM,
-    EpisodeSpec,
-    RenderOptions,
-    flag_errors,
-)
+from lerobot_bomb.schema import ACTION_DIM, CAMERAS, DEFAULT_FPS, STATE_DIM, EpisodeSpec, RenderOptions
 from lerobot_env_bomb.fetch_files import check_robot
 from lerobot_env_bomb.vector import LazyVectorEnv
 
@@ -48,7 +41,7 @@ class BombEnvConfig(EnvConfig):
     # colour of the stone to be moved: black or white; unset draws one per episode
     color: str | None = None
     # conditions, each evaluated as a group of its own: ["none","camera:3","camera:2+light:3","all:1-5"]
-    perturbations: list[str] | None = None
+    perturbations: list[str] | str | None = None
     # width and height of each camera in pixels
     image_size: int = 256
     # fast (no shadows) or shadows
@@ -89,6 +82,11 @@ class BombEnvConfig(EnvConfig):
         """{key of a group of results: its condition}; the suite alone where no condition is named."""
         if self.perturbations is None:
             return {str(self.task): NONE}
+        if isinstance(self.perturbations, str):
+            raise ValueError(
+                f"--env.perturbations={self.perturbations} must be a list, with brackets and quotes: "
+                """--env.perturbations='["none","camera:3"]'"""
+            )
         if not self.perturbations:
             raise ValueError('--env.perturbations=[] names no condition; leave it out or give ["none"]')
         conditions = [Condition.parse(text) for text in self.perturbations]

@@ -168,6 +168,7 @@ class BombEnv(gymnasium.Env[Observation, np.ndarray]):
             nearest_intersection=judge.nearest_intersection,
             collateral_mm=judge.collateral_mm,
             levels=episode.perturbation.levels,
+            image_size=self._render_options.image_size,
         )
 
     def close(self) -> None:

@@ -69,6 +69,18 @@ def read_results(path: Path) -> list[Row]:
     return list(rows.values())
 
 
+def _common_settings(rows: list[Row]) -> str:
+    """What the spec of every row says, and the range of seeds."""
+    first = rows[0]["spec"]
+    common = [
+        f"{name}={value}"
+        for name, value in first.items()
+        if name not in DRAWN and all(row["spec"].get(name) == value for row in rows)
+    ]
+    seeds = [row["spec"]["seed"] for row in rows]
+    return f"protocol {PROTOCOL_VERSION}, {', '.join(common)}, seeds {min(seeds)}..{max(seeds)}"
+
+
 def by_condition(rows: list[Row]) -> dict[str, list[Row]]:
     """Rows apart that do not compare: {"" or " (what differs)": rows}."""
     specs = [{name: row["spec"][name] for name in row["spec"] if name not in DRAWN} for row in rows]
@@ -125,6 +137,10 @@ def run_results(args: argparse.Namespace) -> int:
     """Print a summary of each condition of each file, and what perturbations changed in paired episodes."""
     for path in args.paths:
         all_rows = read_results(path)
+        print(f"{path}: {_common_settings(all_rows)}")
+        num_replaced = sum(map(bool, path.read_text().splitlines())) - len(all_rows)
+        if num_replaced:
+            print(f"{path}: {num_replaced} lines count no more, a later one is of the same episode")
         for condition, rows in by_condition(all_rows).items():
             summary = summarise(rows)
             print(f"{path}{condition}: {summary.num_episodes} episodes")
@@ -133,6 +149,8 @@ def run_results(args: argparse.Namespace) -> int:
         pairs = pair_with_nominal(all_rows)
         if pairs:
             print(f"{path}: against the same episodes unperturbed")
+        elif any(row["spec"]["perturbations"] != NONE for row in all_rows):
+            print(f'{path}: no unperturbed episodes to compare with; add "none" to --env.perturbations')
         for condition, of in pairs.items():
             print(_pair_line(condition, of))
     return 0

@@ -11,16 +11,9 @@ from tqdm import tqdm
 
 from lerobot_bomb.data.record import parse_numbers
 from lerobot_bomb.data.rollout import make_env
+from lerobot_bomb.flags import one_of
 from lerobot_bomb.perturbations import ALL, AXES, MAX_LEVEL, NONE, NUISANCES
-from lerobot_bomb.schema import (
-    BOARD,
-    CAMERAS,
-    WORKSPACE_HIGH_M,
-    WORKSPACE_LOW_M,
-    EpisodeSpec,
-    RenderOptions,
-    one_of,
-)
+from lerobot_bomb.schema import BOARD, CAMERAS, WORKSPACE_HIGH_M, WORKSPACE_LOW_M, EpisodeSpec, RenderOptions
 from lerobot_bomb.viewing.episode import expert_agent, play
 from lerobot_bomb.viewing.perturbations_page import write_page
 from lerobot_bomb.viewing.sheet import FONT_SIZE, GAP, INK, TILE_PAPER, Sheet, font, text_tile
@@ -40,7 +33,7 @@ def add_gallery_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the arguments of ``lerobot-bomb gallery``."""
     add = parser.add_argument
     add("--axes", type=_parse_names, default=SHEETS, help=f"as camera,light (default: {','.join(SHEETS)})")
-    add("--seeds", type=parse_numbers, default=DEFAULT_SEEDS, help="episodes, as 2,3 (default: %(default)s)")
+    add("--seeds", type=parse_numbers, default=DEFAULT_SEEDS, help="episodes (default: 2,3)")
     add("--image_size", type=int, default=DEFAULT_TILE_SIZE, help="pixels of a tile (default: %(default)s)")
     add(
         "--output",

@@ -17,6 +17,7 @@ from lerobot_bomb.schema import (
     EpisodeResult,
     EpisodeSpec,
     PrivilegedState,
+    Stage,
 )
 from lerobot_bomb.viewing.episode import Moment
 
@@ -175,9 +176,11 @@ def describe_result(result: EpisodeResult) -> str:
     """One line: success or the class of failure, steps, placement error, where the stone is."""
     outcome = "success" if result.is_success else f"failed: {result.failure}"
     row, column = result.nearest_intersection
+    is_carried = Stage(result.stage) in (Stage.LIFTED, Stage.PLACED)
+    place = f"nearest to row {row}, column {column}" if is_carried else "never lifted"
     return (
         f"{outcome} after {result.steps} steps; the stone is {result.placement_error_mm:.1f} mm from the "
-        f"target, nearest to row {row}, column {column}"
+        f"target, {place}"
     )
 
 

@@ -8,7 +8,7 @@ from lerobot.optim import AdamWConfig, CosineDecayWithWarmupSchedulerConfig
 
 from lerobot_bomb.actions.bins import BIN_MODES
 from lerobot_bomb.actions.text import MASK_LEVELS, digits_needed
-from lerobot_bomb.schema import flag_errors, one_of
+from lerobot_bomb.flags import flag_errors, one_of
 
 DTYPES = ("float32", "bfloat16")
 # modes that map the data into [-1, 1], where the bins are
