@@ -51,7 +51,7 @@ class Rung:
 
 RUNGS = {
     "one_target": Rung((12,), demonstrations=200, steps=3000, bar=0.90),
-    "all_targets": Rung((), demonstrations=400, steps=3000, bar=None),
+    "all_targets": Rung((), demonstrations=400, steps=6000, bar=None),
 }
 
 
