@@ -58,7 +58,7 @@ AXES = {
         "number of stones on the board, and how exactly they stand",
         ("images", "state"),
         {
-            "extra": Magnitude("stones", (1, 2, 3, 4, 5), "more on the board"),
+            "extra": Magnitude("stones", (1, 1, 2, 2, 3), "more on the board"),
             "shift": Magnitude("mm", (0.8, 1.6, 2.4, 3.2, 4.0), "of each stone, in a drawn direction"),
         },
     ),

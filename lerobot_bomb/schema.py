@@ -44,7 +44,7 @@ WORKSPACE_HIGH_M = (0.21, 0.13, 0.16)
 
 MAX_SEED = 2**32 - 1  # what LeRobot seeds NumPy with
 
-NUM_STONES = 14  # stones in the compiled model: on the board, to be moved, or parked out of sight
+NUM_STONES = 12  # stones in the compiled model: on the board, to be moved, or parked out of sight
 
 
 @dataclass(frozen=True)

@@ -196,7 +196,7 @@ def test_a_perturbed_start_is_on_the_tray_and_in_the_workspace(seed: int, level:
 def test_more_stones_keep_the_opening_and_the_move_legal(seed: int, level: int) -> None:
     nominal, drawn = episode(seed), episode(seed, f"stones:{level}")
     stones = drawn.perturbation.stones
-    assert stones is not None and len(stones.extra) == level
+    assert stones is not None and len(stones.extra) == (1, 1, 2, 2, 3)[level - 1]
     before, after = nominal.layout, drawn.layout
     assert after.stone_in_play.sum() == before.stone_in_play.sum() + len(stones.extra)
     on_board = np.flatnonzero(after.stone_in_play)[1:]
