@@ -160,11 +160,8 @@ class Condition:
             axes, low, high = _parse_part(part, text)
             for axis in axes:
                 if axis in ranges:
-                    raise ValueError(
-                        f"--env.perturbations={text!r} names the axis {axis} twice; {ALL} includes it"
-                        if ALL in text
-                        else f"--env.perturbations={text!r} names the axis {axis} twice"
-                    )
+                    reason = f"; {ALL} includes it" if ALL in text else ""
+                    raise ValueError(f"--env.perturbations={text!r} names the axis {axis} twice{reason}")
                 ranges[axis] = low, high
         return cls(tuple((axis, *ranges[axis]) for axis in AXES if ranges.get(axis, (0, 0)) != (0, 0)))
 

@@ -5,8 +5,8 @@ from pathlib import Path
 import imageio.v3 as iio
 import numpy as np
 
-from lerobot_bomb.expert import expert_action
-from lerobot_bomb.schema import EpisodeSpec, PrivilegedState
+from lerobot_bomb.schema import EpisodeSpec
+from lerobot_bomb.viewing.episode import expert_agent, play
 from lerobot_env_bomb.env import BombEnv
 
 SEED = 9  # many stones on the board
@@ -16,14 +16,9 @@ GIF_PAUSE = 8  # frames that the last picture stays
 def main() -> None:
     """Play one episode of the expert; write its first picture and all of them as an animation."""
     folder = Path(__file__).parent
-    env = BombEnv(EpisodeSpec(seed=SEED))
-    observation, _ = env.reset()
-    pictures, ended = [env.render()], False
-    while not ended:
-        state = PrivilegedState.from_vector(observation["environment_state"])
-        observation, _, terminated, truncated, _ = env.step(expert_action(state))
-        pictures.append(env.render())
-        ended = terminated or truncated
+    spec = EpisodeSpec(seed=SEED)
+    env = BombEnv(spec)
+    pictures = [env.render() for _ in play(env, spec, expert_agent(spec))]
     env.close()
     iio.imwrite(folder / "scene.png", pictures[0])
     frames = np.stack([*pictures, *[pictures[-1]] * GIF_PAUSE])

@@ -125,7 +125,7 @@ class BombEnv(gymnasium.Env[Observation, np.ndarray]):
         action = self._check(action)
         if self._last_transition is not None:
             return self._last_transition
-        target_xyz, open_fingers = run.actuator.command(action, run.scene.measure().gripper_xyz)
+        target_xyz, open_fingers = run.actuator.command(action, run.scene.gripper_xyz)
         run.scene.move(target_xyz, open_fingers, self._num_substeps)
         self._steps += 1
         terminated = run.judge.update(run.scene.measure())
