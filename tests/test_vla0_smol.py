@@ -1,4 +1,5 @@
 import json
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -6,7 +7,7 @@ import numpy as np
 import pytest
 import torch
 from torch import Tensor
-from vla0_smol_cases import WORKSPACE, WRIST, make_batch, make_policy, raw_batch
+from vla0_smol_cases import WORKSPACE, WRIST, make_batch, make_policy, numbers_of, raw_batch
 
 from lerobot_bomb.vlm.prompt import normalize_task
 from lerobot_bomb.vlm.tokenizer import load_tokenizer
@@ -17,11 +18,13 @@ from lerobot_policy_vla0_smol.modeling_vla0_smol import IGNORED, Vla0SmolPolicy
 
 def full_text(policy: Vla0SmolPolicy, task: str, state: list[int] | None, numbers: list[int]) -> str:
     """The string that the spec of the policy writes out, for two cameras."""
+    system = policy.config.system_prompt
+    system = "" if system is None else f"System: {system}<end_of_utterance>\n"
     image = "<image>" * policy.backbone.tokens_per_image
     image = f"<fake_token_around_image><global-img>{image}<fake_token_around_image>"
     state_text = "" if state is None else f"State: {' '.join(map(str, state))}, "
     return (
-        f"<|im_start|>User:{image}{image}Task: {normalize_task(task)}, {state_text}Actions: "
+        f"<|im_start|>{system}User:{image}{image}Task: {normalize_task(task)}, {state_text}Actions: "
         f"<end_of_utterance>\n"
         f"Assistant: {' '.join(map(str, numbers))}<end_of_utterance>"
     )
@@ -30,14 +33,15 @@ def full_text(policy: Vla0SmolPolicy, task: str, state: list[int] | None, number
 def sequence(policy: Vla0SmolPolicy, batch: dict[str, Any]) -> list[list[int]]:
     """Token ids of every row, prompt and answer."""
     prompt = policy._prompt(batch)
-    answer, _ = policy._answer(policy._numbers(batch))
+    answer = policy._answer(numbers_of(policy, batch)).rows
     pairs = zip(prompt.ids, prompt.written, answer.ids, answer.written, strict=True)
     return [[*ids[keep].tolist(), *said[kept].tolist()] for ids, keep, said, kept in pairs]
 
 
 @pytest.mark.parametrize("use_state", [True, False])
-def test_sequence_is_the_whole_string_tokenized(use_state: bool) -> None:
-    policy = make_policy(use_state=use_state)
+@pytest.mark.parametrize("system_prompt", [None, "Write numbers, 0 to 511.\nBe precise."])
+def test_sequence_is_the_whole_string_tokenized(use_state: bool, system_prompt: str | None) -> None:
+    policy = make_policy(use_state=use_state, system_prompt=system_prompt)
     batch = make_batch(policy, 3)
     raw = raw_batch(3)
     tokenizer = load_tokenizer("nano")
@@ -67,12 +71,18 @@ def real_tokens_policy(shared_data: Path, tmp_path_factory: pytest.TempPathFacto
     return make_policy(vlm_model_name=str(folder))
 
 
-def test_sequence_equals_the_real_processors(real_tokens_policy: Vla0SmolPolicy, shared_data: Path) -> None:
+@pytest.mark.parametrize("system_prompt", [None, "Write numbers, 0 to 511."])
+def test_sequence_equals_the_real_processors(
+    real_tokens_policy: Vla0SmolPolicy, shared_data: Path, system_prompt: str | None
+) -> None:
     """Chat template, image expansion and tokenization by transformers, without tiling."""
     pytest.importorskip("num2words", reason="SmolVLM's processor cannot be built without num2words")
     from transformers import AutoProcessor
 
     policy = real_tokens_policy
+    if system_prompt is not None:
+        name = policy.config.vlm_model_name
+        policy = make_policy(vlm_model_name=name, system_prompt=system_prompt)
     processor = AutoProcessor.from_pretrained(str(shared_data / "SmolVLM2-500M-Video-Instruct"))
     batch, raw = make_batch(policy, 3), raw_batch(3)
     for row, ids in enumerate(sequence(policy, batch)):
@@ -83,6 +93,8 @@ def test_sequence_equals_the_real_processors(real_tokens_policy: Vla0SmolPolicy,
             {"role": "user", "content": [{"type": "image"}] * 2 + [{"type": "text", "text": request}]},
             {"role": "assistant", "content": [{"type": "text", "text": numbers}]},
         ]
+        if system_prompt is not None:
+            messages.insert(0, {"role": "system", "content": [{"type": "text", "text": system_prompt}]})
         text = processor.apply_chat_template(messages)
         images = [np.zeros((512, 512, 3), dtype=np.uint8)] * 2
         expected = processor(text=text, images=images, do_image_splitting=False)["input_ids"][0]
@@ -156,7 +168,7 @@ def test_values_of_padded_actions_reach_the_loss_through_the_end_only() -> None:
     batch["action_is_pad"] = torch.tensor([[False, True, True]])
 
     def labels(actions: Tensor) -> list[int]:
-        answer_labels = policy._answer(policy._numbers({**batch, "action": actions}))[1]
+        answer_labels = policy._answer(numbers_of(policy, {**batch, "action": actions})).labels
         return answer_labels[answer_labels != IGNORED].tolist()
 
     other = batch["action"].clone()
@@ -169,11 +181,13 @@ def test_values_of_padded_actions_reach_the_loss_through_the_end_only() -> None:
 def test_a_row_with_everything_hidden_gives_loss_zero(monkeypatch: pytest.MonkeyPatch) -> None:
     policy = make_policy(mask_level="char")
     batch = make_batch(policy, 2)
-    numbers = policy._numbers(batch)
+    numbers = numbers_of(policy, batch)
     numbers = numbers.hide_characters(torch.ones_like(numbers.written), policy.tokens.hidden)
-    answer, labels = policy._answer(numbers)
-    assert (labels != IGNORED).sum(dim=1).tolist() == [1, 1]  # the end
-    monkeypatch.setattr(policy, "_answer", lambda _: (answer, torch.full_like(labels, IGNORED)))
+    answer = policy._answer(numbers)
+    assert (answer.labels != IGNORED).sum(dim=1).tolist() == [1, 1]  # the end
+    monkeypatch.setattr(
+        policy, "_answer", lambda _: replace(answer, labels=torch.full_like(answer.labels, IGNORED))
+    )
     for reduction in ("mean", "none"):
         loss, _ = policy(batch, reduction=reduction)
         loss.sum().backward()
@@ -190,15 +204,15 @@ def test_numbers_are_hidden_in_training_only(level: str) -> None:
     policy = make_policy(mask_level=level, mask_max_fraction=1.0, mask_skip_prob=0.0)
     batch = make_batch(policy, 8)
     policy.train()
-    hidden = torch.stack([(policy._numbers(batch).ids == policy.tokens.hidden).any() for _ in range(5)])
+    hidden = torch.stack([(numbers_of(policy, batch).ids == policy.tokens.hidden).any() for _ in range(5)])
     assert hidden.all()
     policy.eval()
-    assert not (policy._numbers(batch).ids == policy.tokens.hidden).any()
+    assert not (numbers_of(policy, batch).ids == policy.tokens.hidden).any()
 
 
 def test_a_hidden_step_hides_all_its_dimensions() -> None:
     policy = make_policy(mask_level="step", mask_max_fraction=1.0, mask_skip_prob=0.0).train()
-    hidden = policy._numbers(make_batch(policy, 32)).ids[..., -1] == policy.tokens.hidden
+    hidden = numbers_of(policy, make_batch(policy, 32)).ids[..., -1] == policy.tokens.hidden
     per_step = hidden.view(32, 3, 4).sum(dim=2)
     assert set(per_step.flatten().tolist()) == {0, 4}
 

@@ -4,7 +4,7 @@ from typing import Any
 import pytest
 import torch
 from torch import Tensor
-from vla0_smol_cases import WORKSPACE, make_batch, make_policy
+from vla0_smol_cases import WORKSPACE, make_batch, make_policy, numbers_of
 
 from lerobot_bomb.actions.text import SPACE
 from lerobot_bomb.decoding.decoder import pick
@@ -47,9 +47,9 @@ def test_decoding_follows_the_teacher_forced_argmax(overfit: tuple[Vla0SmolPolic
     policy, _ = overfit
     batch = make_batch(policy, 3, seed=9)  # unseen
     batch["action"] = policy.predict_action_chunk(batch)
-    answer, labels = policy._answer(policy._numbers(batch))
-    logits = policy._answer_logits(batch, policy._prompt(batch), answer)[..., policy.symbol_ids]
-    for row_logits, row_labels in zip(logits, labels, strict=True):
+    answer = policy._answer(numbers_of(policy, batch))
+    logits = policy._answer_logits(batch, policy._prompt(batch), answer.rows)[..., policy.symbol_ids]
+    for row_logits, row_labels in zip(logits, answer.labels, strict=True):
         state, begun = torch.tensor([policy.grammar.BOUNDARY]), 0
         for step_logits, label in zip(row_logits, row_labels[row_labels != IGNORED], strict=False):
             choices = policy.grammar.choices(state, torch.tensor([12 - begun]))

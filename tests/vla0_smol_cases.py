@@ -5,6 +5,7 @@ from typing import Any
 import torch
 from lerobot.configs import FeatureType, PolicyFeature
 
+from lerobot_bomb.actions.text import NumberTokens
 from lerobot_policy_vla0_smol import Vla0SmolConfig, make_vla0_smol_pre_post_processors
 from lerobot_policy_vla0_smol.modeling_vla0_smol import Vla0SmolPolicy
 
@@ -54,3 +55,8 @@ def raw_batch(batch_size: int, seed: int = 0) -> dict[str, Any]:
 def make_batch(policy: Vla0SmolPolicy, batch_size: int, seed: int = 0) -> dict[str, Any]:
     preprocessor, _ = make_vla0_smol_pre_post_processors(policy.config, STATS)
     return preprocessor(raw_batch(batch_size, seed))
+
+
+def numbers_of(policy: Vla0SmolPolicy, batch: dict[str, Any]) -> NumberTokens:
+    """The actions of a batch as the policy writes them."""
+    return policy._numbers(batch, policy._bins(batch))

@@ -5,7 +5,8 @@ The whole sequence is, in SmolVLM2's chat format:
     <|im_start|>User:IMG...IMGTask: {task}, State: s1 ... sS, Actions: <end_of_utterance>
     Assistant: a1 a2 ... an<end_of_utterance>
 
-with IMG = ``<fake_token_around_image><global-img><image>...<image><fake_token_around_image>``. It is cut
+with IMG = ``<fake_token_around_image><global-img><image>...<image><fake_token_around_image>``. A system
+prompt stands before ``User:`` as ``System: {text}<end_of_utterance>`` and a line break. The sequence is cut
 where the tokenizer cuts anyway (at special tokens, between ``,`` and a space, at digits), so the pieces'
 tokens in a row are the tokens of the whole string.
 """
@@ -25,16 +26,19 @@ class PromptTokens:
 
     symbols: list[int]  # digits 0-9, space, <end_of_utterance>
     hidden: int  # stands for a hidden number
-    start: list[int]  # before the images
+    start: list[int]  # before the images, with the system prompt
     image_start: list[int]
     image: int
     image_end: list[int]
     state_start: list[int]
     state_end: list[int]
     answer_start: list[int]
+    system_prompt: str | None = None
 
     @classmethod
-    def from_tokenizer(cls, tokenizer: Tokenizer, vlm_model_name: str) -> "PromptTokens":
+    def from_tokenizer(
+        cls, tokenizer: Tokenizer, vlm_model_name: str, system_prompt: str | None = None
+    ) -> "PromptTokens":
         """Look everything up.
 
         Raises:
@@ -54,19 +58,24 @@ class PromptTokens:
             return tokenizer.encode(text).ids
 
         _refuse_merged_digits(tokenizer, vlm_model_name)
+        end = one(SYMBOL_TEXTS[-1])
+        system = []
+        if system_prompt is not None:
+            system = [*text_ids(tokenizer, f"System: {system_prompt}"), end, *several("\n")]
         return cls(
             symbols=[one(text) for text in SYMBOL_TEXTS],
             hidden=one(HIDDEN_TOKEN),
-            start=[one("<|im_start|>"), *several("User:")],
+            start=[one("<|im_start|>"), *system, *several("User:")],
             image_start=[one(IMAGE_EDGE_TOKEN), one(GLOBAL_IMAGE_TOKEN)],
             image=one(IMAGE_TOKEN),
             image_end=[one(IMAGE_EDGE_TOKEN)],
             state_start=several(" State:"),
             state_end=several(","),
-            answer_start=[*several(" Actions: "), one(SYMBOL_TEXTS[-1]), *several("\nAssistant:")],
+            answer_start=[*several(" Actions: "), end, *several("\nAssistant:")],
+            system_prompt=system_prompt,
         )
 
-    def to_dict(self) -> dict[str, int | list[int]]:
+    def to_dict(self) -> dict[str, int | list[int] | str | None]:
         """JSON-ready."""
         return asdict(self)
 
@@ -88,8 +97,13 @@ def normalize_task(task: str) -> str:
 
 
 def task_ids(tokenizer: Tokenizer, task: str) -> list[int]:
-    """Tokens of the prompt's task part; text that looks like a special token stays text."""
+    """Tokens of the prompt's task part."""
+    return text_ids(tokenizer, f"Task: {normalize_task(task)},")
+
+
+def text_ids(tokenizer: Tokenizer, text: str) -> list[int]:
+    """Tokens of a user's text; what looks like a special token stays text."""
     tokenizer.encode_special_tokens = True
-    ids = tokenizer.encode(f"Task: {normalize_task(task)},").ids
+    ids = tokenizer.encode(text).ids
     tokenizer.encode_special_tokens = False
     return ids

@@ -7,6 +7,8 @@ from lerobot.configs import NormalizationMode, PreTrainedConfig
 from lerobot.optim import AdamWConfig, CosineDecayWithWarmupSchedulerConfig
 
 from lerobot_bomb.actions.bins import BIN_MODES
+from lerobot_bomb.actions.ensemble import WEIGHTINGS
+from lerobot_bomb.actions.relative import named_dims
 from lerobot_bomb.actions.text import MASK_LEVELS, digits_needed
 from lerobot_bomb.flags import flag_errors, one_of
 
@@ -58,6 +60,27 @@ class Vla0SmolConfig(PreTrainedConfig):
     number_width: int = 0
     # whether the robot's state is in the prompt
     use_state: bool = True
+    # text of a system message before the prompt
+    system_prompt: str | None = None
+
+    # actions as differences to the state that a chunk starts from, converted inside the policy. LeRobot's
+    # name for it, use_relative_actions, makes its fine-tuning look for processor steps of its own
+    relative_actions: bool = False
+    # action dimensions that stay absolute, by (part of) their names
+    relative_exclude_joints: list[str] = field(default_factory=list)
+    # the state dimension of each relative action dimension; None = the same number
+    relative_state_indices: list[int] | None = None
+    # filled in by LeRobot from the dataset
+    action_feature_names: list[str] | None = None
+
+    # chunks that an executed action is the mean of, one predicted every step; 0 = a queue instead
+    temporal_ensemble_size: int = 0
+    # "uniform", "exponential" (exp(coefficient * age)) or "nvlabs" (1 for the newest, 0.5 for others)
+    temporal_ensemble_weighting: str = "uniform"
+    # positive favours old chunks
+    temporal_ensemble_coefficient: float = 0.01
+    # action dimensions that are not averaged, by (part of) their names
+    temporal_ensemble_exclude_joints: list[str] = field(default_factory=list)
 
     # side of the crop as a fraction of the image: random place while training, centre otherwise
     crop_fraction: float = 0.875
@@ -94,6 +117,7 @@ class Vla0SmolConfig(PreTrainedConfig):
         with flag_errors():
             self._check_choices()
             self._check_chunk()
+            self._check_ensemble()
             self._check_numbers()
             self._check_training()
 
@@ -101,6 +125,7 @@ class Vla0SmolConfig(PreTrainedConfig):
         one_of("--policy.bin_mode", self.bin_mode, BIN_MODES)
         one_of("--policy.mask_level", self.mask_level, MASK_LEVELS)
         one_of("--policy.dtype", self.dtype, DTYPES)
+        one_of("--policy.temporal_ensemble_weighting", self.temporal_ensemble_weighting, WEIGHTINGS)
         if not self.vlm_model_name:
             raise ValueError(
                 "--policy.vlm_model_name is empty; give a Hub id, the path of a local folder, or nano"
@@ -129,6 +154,19 @@ class Vla0SmolConfig(PreTrainedConfig):
             )
         if self.drop_n_last_frames < 0:
             raise ValueError(f"--policy.drop_n_last_frames={self.drop_n_last_frames} must not be negative")
+
+    def _check_ensemble(self) -> None:
+        size = self.temporal_ensemble_size
+        if not 0 <= size <= self.chunk_size:
+            raise ValueError(
+                f"--policy.temporal_ensemble_size={size} must be 0 (no ensemble) or lie in "
+                f"1..{self.chunk_size} (--policy.chunk_size)"
+            )
+        if size and self.n_action_steps != 1:
+            raise ValueError(
+                f"--policy.temporal_ensemble_size={size} predicts at every step and needs "
+                f"--policy.n_action_steps=1; got {self.n_action_steps}, which is a queue"
+            )
 
     def _check_numbers(self) -> None:
         for flag, bins in {"n_action_bins": self.n_action_bins, "n_state_bins": self.n_state_bins}.items():
@@ -175,11 +213,48 @@ class Vla0SmolConfig(PreTrainedConfig):
             raise ValueError(
                 f"vla0_smol needs the feature 'action' of shape (D,); got {self.output_features}"
             )
-        if self.use_state and (self.robot_state_feature is None or len(self.robot_state_feature.shape) != 1):
+        for flag in ("use_state", "relative_actions"):
+            state = self.robot_state_feature
+            if getattr(self, flag) and (state is None or len(state.shape) != 1):
+                raise ValueError(
+                    f"--policy.{flag}=true needs the feature 'observation.state' of shape (S,); the inputs "
+                    f"are {sorted(self.input_features or {})}. Give --policy.{flag}=false to do without"
+                )
+
+    @property
+    def action_names(self) -> list[str]:
+        """A name for every action dimension: the dataset's, or its number."""
+        assert self.action_feature is not None
+        num_dims = self.action_feature.shape[0]
+        names = self.action_feature_names or []
+        return list(names) if len(names) == num_dims else [str(dim) for dim in range(num_dims)]
+
+    def relative_dims(self) -> dict[int, int]:
+        """{action dimension that is relative: its state dimension}.
+
+        Raises:
+            ValueError: an excluded name or a state dimension does not exist, or their numbers differ.
+        """
+        assert self.robot_state_feature is not None
+        num_states = self.robot_state_feature.shape[0]
+        flag = "--policy.relative_exclude_joints"
+        excluded = named_dims(self.action_names, self.relative_exclude_joints, flag)
+        dims = [dim for dim in range(len(self.action_names)) if dim not in excluded]
+        indices = self.relative_state_indices
+        if indices is None and num_states == len(self.action_names):
+            indices = dims
+        if indices is None or len(indices) != len(dims):
             raise ValueError(
-                f"--policy.use_state=true needs the feature 'observation.state' of shape (S,); the inputs "
-                f"are {sorted(self.input_features or {})}. Give --policy.use_state=false to do without"
+                f"--policy.relative_actions=true: {len(dims)} of {len(self.action_names)} action dimensions "
+                f"are relative and the state has {num_states}; give --policy.relative_state_indices with "
+                f"{len(dims)} of them, in order"
             )
+        if not all(0 <= index < num_states for index in indices):
+            raise ValueError(
+                f"--policy.relative_state_indices={indices} must lie in 0..{num_states - 1} "
+                f"(dimensions of observation.state)"
+            )
+        return dict(zip(dims, indices, strict=True))
 
     def get_optimizer_preset(self) -> AdamWConfig:
         return AdamWConfig(

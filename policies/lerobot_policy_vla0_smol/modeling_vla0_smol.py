@@ -11,20 +11,26 @@ from dataclasses import dataclass
 from typing import ClassVar
 
 import torch
+from lerobot.datasets import LeRobotDatasetMetadata
 from lerobot.policies import PreTrainedPolicy
 from lerobot.utils.constants import ACTION, OBS_LANGUAGE_ATTENTION_MASK, OBS_LANGUAGE_TOKENS, OBS_STATE
 from torch import Tensor
 from torch.nn.functional import cross_entropy
 
+from lerobot_bomb.actions.accuracy import counted_numbers, exact_numbers, means, read_numbers
 from lerobot_bomb.actions.bins import Bins
+from lerobot_bomb.actions.ensemble import TemporalEnsemble
+from lerobot_bomb.actions.relative import RelativeActions, bounds, named_dims
 from lerobot_bomb.actions.text import (
     END,
+    SPACE,
     NumberTokens,
     compact,
     digits_needed,
     draw_hidden,
     number_symbols,
 )
+from lerobot_bomb.data.columns import episode_bounds, read_columns
 from lerobot_bomb.decoding.decoder import CachedContinuation, decode_numbers
 from lerobot_bomb.decoding.grammar import NumberGrammar
 from lerobot_bomb.vlm.backbone import SmolVLMBackbone, build_backbone, config_dict, load_backbone
@@ -48,6 +54,20 @@ class TokenRows:
         return cls(torch.cat([part.ids for part in parts], 1), torch.cat([part.written for part in parts], 1))
 
 
+@dataclass(frozen=True)
+class Answer:
+    """Numbers and the end token as rows without gaps; all (B, A)."""
+
+    rows: TokenRows
+    labels: Tensor  # int64 token ids, IGNORED where the loss does not count them
+    columns: Tensor  # int64, which of the M = N * C + 1 columns with gaps a token comes from
+
+    def with_gaps(self, values_BA: Tensor, numbers: NumberTokens) -> Tensor:
+        """Values of the tokens back at their columns, (B, M); 0 or False in gaps."""
+        values_BM = values_BA.new_zeros(len(values_BA), numbers.written[0].numel() + 1)
+        return values_BM.scatter(1, self.columns, values_BA)
+
+
 class Vla0SmolPolicy(PreTrainedPolicy):
     """A stock SmolVLM that writes the next ``chunk_size`` actions as integers."""
 
@@ -55,10 +75,13 @@ class Vla0SmolPolicy(PreTrainedPolicy):
     name = "vla0_smol"  # pyright: ignore[reportAssignmentType]
     config: Vla0SmolConfig
     symbol_ids: Tensor
+    action_unit: Tensor
     # modules that FSDP shards one by one
     _fsdp_wrap_modules: ClassVar[list[str]] = ["LlamaDecoderLayer", "SmolVLMEncoderLayer"]
 
-    def __init__(self, config: Vla0SmolConfig, **_: object):
+    def __init__(
+        self, config: Vla0SmolConfig, dataset_meta: LeRobotDatasetMetadata | None = None, **_: object
+    ):
         super().__init__(config)
         config.validate_features()
         self.tokens, self.backbone = _build(config)
@@ -66,20 +89,52 @@ class Vla0SmolPolicy(PreTrainedPolicy):
         self.action_bins = Bins(config.n_action_bins, config.bin_mode)
         self.state_bins = Bins(config.n_state_bins, config.bin_mode)
         self.grammar = NumberGrammar(config.n_action_bins, fixed_width=config.number_width)
+        self.relative = (
+            RelativeActions(self._action_dim, config.relative_dims()) if config.relative_actions else None
+        )
+        # physical size of 1 in normalised actions, known while training: (D,)
+        self.register_buffer("action_unit", torch.full((self._action_dim,), torch.nan), persistent=False)
         # source of all that is random in training: the crop and the hidden numbers
         self.generator = torch.Generator().manual_seed(torch.initial_seed())
+        self._ensemble = _make_ensemble(config)
+        if dataset_meta is not None:
+            self._fit(dataset_meta)
         self.reset()
 
     @classmethod
-    def from_pretrained(cls, *args, **kwargs) -> "Vla0SmolPolicy":
-        """As LeRobot's, but a missing or unexpected tensor is an error."""
-        return super().from_pretrained(*args, **{**kwargs, "strict": True})
+    def from_pretrained(
+        cls, *args, dataset_meta: LeRobotDatasetMetadata | None = None, **kwargs
+    ) -> "Vla0SmolPolicy":
+        """As LeRobot's, but a missing or unexpected tensor is an error; relative actions fit the new data."""
+        policy = super().from_pretrained(*args, **{**kwargs, "strict": True})
+        if dataset_meta is not None:
+            policy._fit(dataset_meta)
+        return policy
+
+    @torch.no_grad()
+    def _fit(self, meta: LeRobotDatasetMetadata) -> None:
+        """Take from a dataset what its normalisers do and how far its actions are from the state."""
+        config = self.config
+        assert meta.stats is not None
+        action_mode, state_mode = (config.normalization_mapping[kind] for kind in ("ACTION", "STATE"))
+        action_bounds = bounds(meta.stats[ACTION], action_mode, self._action_dim)
+        self.action_unit.copy_(torch.from_numpy(action_bounds[1] - action_bounds[0]) / 2)
+        if self.relative is None:
+            return
+        columns = read_columns(meta, (ACTION, OBS_STATE))
+        state_bounds = bounds(meta.stats[OBS_STATE], state_mode, columns[OBS_STATE].shape[1])
+        _, ends = episode_bounds(columns["episode_index"])
+        self.relative.fit(
+            columns[ACTION], columns[OBS_STATE], ends, config.chunk_size, action_bounds, state_bounds
+        )
 
     def get_optim_params(self) -> list[torch.nn.Parameter]:
         return [parameter for parameter in self.parameters() if parameter.requires_grad]
 
     def reset(self) -> None:
         self._queue: deque[Tensor] = deque(maxlen=self.config.n_action_steps)
+        if self._ensemble is not None:
+            self._ensemble.reset()
 
     # Training
 
@@ -87,19 +142,49 @@ class Vla0SmolPolicy(PreTrainedPolicy):
         """Cross-entropy of the answer's tokens, over the kept ones; ``reduction="none"`` gives (B,)."""
         with self._autocast():
             prompt = self._prompt(batch)
-            numbers = self._numbers(batch)
-            answer, labels_BA = self._answer(numbers)
-            logits_BAV = self._answer_logits(batch, prompt, answer)
-        kept_BA = labels_BA != IGNORED
+            bins_BN = self._bins(batch)
+            numbers = self._numbers(batch, bins_BN)
+            answer = self._answer(numbers)
+            logits_BAV = self._answer_logits(batch, prompt, answer.rows)
+        kept_BA = answer.labels != IGNORED
         losses_BA = cross_entropy(
-            logits_BAV.float().transpose(1, 2), labels_BA, ignore_index=IGNORED, reduction="none"
+            logits_BAV.float().transpose(1, 2), answer.labels, ignore_index=IGNORED, reduction="none"
         )
-        correct_BA = (logits_BAV.detach().argmax(dim=-1) == labels_BA) & kept_BA
-        num_kept = kept_BA.sum()
-        metrics = {"token_accuracy": (correct_BA.sum() / num_kept.clamp(min=1)).item()}
+        metrics = self._metrics(logits_BAV.detach(), answer, numbers, bins_BN)
         if reduction == "none":
             return losses_BA.sum(dim=1) / kept_BA.sum(dim=1).clamp(min=1), metrics
-        return losses_BA.sum() / num_kept.clamp(min=1), metrics
+        return losses_BA.sum() / kept_BA.sum().clamp(min=1), metrics
+
+    @torch.no_grad()
+    def _metrics(
+        self, logits_BAV: Tensor, answer: Answer, numbers: NumberTokens, bins_BN: Tensor
+    ) -> dict[str, float]:
+        """Shares of right tokens and of exact numbers, mean absolute errors in the data's units.
+
+        Teacher-forced: every digit is predicted from the true ones before it. Hidden and padded numbers do
+        not count; what nothing counts for is left out.
+        """
+        kept_BA = answer.labels != IGNORED
+        right_BA = logits_BAV.argmax(dim=-1) == answer.labels
+        digits_BA = logits_BAV[..., self.symbol_ids[:SPACE]].argmax(dim=-1)
+        read_BN = read_numbers(numbers, answer.with_gaps(digits_BA, numbers))
+        exact_BN = exact_numbers(numbers, answer.with_gaps(right_BA, numbers))
+        counted_BN = counted_numbers(numbers)
+        bins = self.action_bins
+        errors_BN = (bins.decode(read_BN.clamp(max=bins.num_bins - 1)) - bins.decode(bins_BN)).abs()
+        errors_BTD = errors_BN.unflatten(1, (-1, self._action_dim)) * self._unit
+        counted_BTD = counted_BN.view_as(errors_BTD)
+        return means(
+            {
+                "token_accuracy": (right_BA, kept_BA),
+                "value_accuracy": (exact_BN, counted_BN),
+                "l1": (errors_BTD, counted_BTD),
+                **{
+                    f"l1_{name}": (errors_BTD[..., dim], counted_BTD[..., dim])
+                    for dim, name in enumerate(self.config.action_names)
+                },
+            }
+        )
 
     def _answer_logits(self, batch: dict[str, Tensor], prompt: TokenRows, answer: TokenRows) -> Tensor:
         """Teacher-forced logits of every answer token: (B, A, V)."""
@@ -115,8 +200,8 @@ class Vla0SmolPolicy(PreTrainedPolicy):
         index_BAH = columns_BA[..., None].expand(-1, -1, hidden_BLH.shape[-1])
         return self.backbone.logits(hidden_BLH.gather(1, index_BAH))
 
-    def _numbers(self, batch: dict[str, Tensor]) -> NumberTokens:
-        """Actions (B, T, D) in [-1, 1] -> their tokens, some of them hidden while training."""
+    def _bins(self, batch: dict[str, Tensor]) -> Tensor:
+        """Actions (B, T, D) in [-1, 1] -> bins of what is written, step by step: (B, N) int64."""
         config = self.config
         actions_BTD = self._read(batch, ACTION)
         if actions_BTD.ndim != 3 or actions_BTD.shape[1:] != (config.chunk_size, self._action_dim):
@@ -124,8 +209,14 @@ class Vla0SmolPolicy(PreTrainedPolicy):
                 f"batch[{ACTION!r}] has shape {tuple(actions_BTD.shape)}; expected "
                 f"(batch, {config.chunk_size}, {self._action_dim}) (--policy.chunk_size, action dims)"
             )
-        numbers = self._to_tokens(self.action_bins.encode(actions_BTD).flatten(1), config.n_action_bins)
-        if f"{ACTION}_is_pad" in batch and not config.loss_on_padded_actions:
+        if self.relative is not None:
+            actions_BTD = self.relative.encode(actions_BTD, self._read(batch, OBS_STATE))
+        return self.action_bins.encode(actions_BTD).flatten(1)
+
+    def _numbers(self, batch: dict[str, Tensor], bins_BN: Tensor) -> NumberTokens:
+        """Bins -> their tokens, some of them hidden while training."""
+        numbers = self._to_tokens(bins_BN, self.config.n_action_bins)
+        if f"{ACTION}_is_pad" in batch and not self.config.loss_on_padded_actions:
             kept_BN = ~batch[f"{ACTION}_is_pad"].bool().repeat_interleave(self._action_dim, dim=1)
             numbers = NumberTokens(numbers.ids, numbers.written, numbers.trained & kept_BN[..., None])
         return self._hide(numbers) if self.training else numbers
@@ -148,24 +239,30 @@ class Vla0SmolPolicy(PreTrainedPolicy):
         config = self.config
         return draw_hidden(eligible_BM, config.mask_max_fraction, config.mask_skip_prob, self.generator)
 
-    def _answer(self, numbers: NumberTokens) -> tuple[TokenRows, Tensor]:
-        """Numbers and the end token without gaps, and labels (B, A)."""
+    def _answer(self, numbers: NumberTokens) -> Answer:
+        """Numbers and the end token without gaps, and what the loss compares with."""
         end_B1 = self.symbol_ids[END].expand(len(numbers.ids), 1)
         true_B1 = torch.ones_like(end_B1, dtype=torch.bool)
-        ids_BA, written_BA, trained_BA = (
+        ids_BM, written_BM, trained_BM = (
             torch.cat([columns.flatten(1), last], dim=1)
             for columns, last in zip(
                 (numbers.ids, numbers.written, numbers.trained), (end_B1, true_B1, true_B1), strict=True
             )
         )
-        labels_BA = ids_BA.masked_fill(~(trained_BA & written_BA), IGNORED)
-        written_BA, ids_BA, labels_BA = compact(written_BA, ids_BA, labels_BA)
-        return TokenRows(ids_BA, written_BA), labels_BA
+        labels_BM = ids_BM.masked_fill(~(trained_BM & written_BM), IGNORED)
+        columns_BM = torch.arange(ids_BM.shape[1], device=ids_BM.device).expand_as(ids_BM)
+        written_BA, ids_BA, labels_BA, columns_BA = compact(written_BM, ids_BM, labels_BM, columns_BM)
+        return Answer(TokenRows(ids_BA, written_BA), labels_BA, columns_BA)
 
     # Inference
 
     def select_action(self, batch: dict[str, Tensor], **_: object) -> Tensor:
-        """(B, D) next normalised action; predicts when the queue of ``n_action_steps`` is empty."""
+        """(B, D) next normalised action.
+
+        With a temporal ensemble every call predicts; else when the queue of ``n_action_steps`` is empty.
+        """
+        if self._ensemble is not None:
+            return self._ensemble(self._predict(batch, self.config.temporal_ensemble_size))
         if not self._queue:
             self._queue.extend(self._predict(batch, self.config.n_action_steps).unbind(dim=1))
         return self._queue.popleft()
@@ -176,7 +273,7 @@ class Vla0SmolPolicy(PreTrainedPolicy):
 
     @torch.no_grad()
     def _predict(self, batch: dict[str, Tensor], num_steps: int) -> Tensor:
-        """The first ``num_steps`` actions of the chunk; the model need not write the rest."""
+        """The first ``num_steps`` actions of the chunk, absolute; the model need not write the rest."""
         self.eval()
         with self._autocast():
             prompt = self._prompt(batch)
@@ -193,7 +290,10 @@ class Vla0SmolPolicy(PreTrainedPolicy):
             )
         # casts of weights cached under inference mode cannot be used by a later training step
         torch.clear_autocast_cache()
-        return self.action_bins.decode(numbers_BN).view(-1, num_steps, self._action_dim)
+        actions_BTD = self.action_bins.decode(numbers_BN).view(-1, num_steps, self._action_dim)
+        if self.relative is None:
+            return actions_BTD
+        return self.relative.decode(actions_BTD, self._read(batch, OBS_STATE)).clamp(-1, 1)
 
     # Prompt
 
@@ -274,23 +374,48 @@ class Vla0SmolPolicy(PreTrainedPolicy):
         assert self.config.action_feature is not None
         return self.config.action_feature.shape[0]
 
+    @property
+    def _unit(self) -> Tensor:
+        """(D,) physical size of 1 in what is written."""
+        return self.action_unit if self.relative is None else self.action_unit * self.relative.scale
+
     def _autocast(self) -> torch.autocast:
         """The precision of ``config.dtype``, whoever calls: training, evaluation or a user's own loop."""
         bfloat16 = self.config.dtype == "bfloat16"
         return torch.autocast(self.symbol_ids.device.type, dtype=torch.bfloat16, enabled=bfloat16)
 
 
+def _make_ensemble(config: Vla0SmolConfig) -> TemporalEnsemble | None:
+    if not config.temporal_ensemble_size:
+        return None
+    return TemporalEnsemble(
+        config.temporal_ensemble_size,
+        config.temporal_ensemble_weighting,
+        config.temporal_ensemble_coefficient,
+        named_dims(
+            config.action_names,
+            config.temporal_ensemble_exclude_joints,
+            "--policy.temporal_ensemble_exclude_joints",
+        ),
+    )
+
+
 def _build(config: Vla0SmolConfig) -> tuple[PromptTokens, SmolVLMBackbone]:
     """Base model, or the architecture of a checkpoint; fills in what a checkpoint's config must hold."""
     if config.vlm_config is None:
         name = config.vlm_model_name
-        tokens = PromptTokens.from_tokenizer(load_tokenizer(name), name)
+        tokens = PromptTokens.from_tokenizer(load_tokenizer(name), name, config.system_prompt)
         backbone = load_backbone(name)
         config.vlm_config, config.prompt_tokens = config_dict(backbone), tokens.to_dict()
     elif config.prompt_tokens is None:
         raise ValueError("--policy.vlm_config is set, but not --policy.prompt_tokens, which belongs to it")
     else:
         tokens, backbone = PromptTokens(**config.prompt_tokens), build_backbone(config.vlm_config)
+        if tokens.system_prompt != config.system_prompt:
+            raise ValueError(
+                f"--policy.system_prompt={config.system_prompt!r}: this checkpoint was trained with "
+                f"{tokens.system_prompt!r}, which cannot be changed"
+            )
     if config.freeze_vision_encoder:
         backbone.vlm.model.vision_model.requires_grad_(False)
     if config.gradient_checkpointing:

@@ -1,0 +1,45 @@
+"""How well numbers were predicted, token by token, from the true tokens before each (teacher forcing).
+
+Shapes as in `lerobot_bomb.actions.text`; `M` = N * C + 1 columns, those of all numbers and the end token.
+"""
+
+import math
+from collections.abc import Mapping
+
+import torch
+from torch import Tensor
+
+from lerobot_bomb.actions.text import NumberTokens
+
+
+def counted_numbers(numbers: NumberTokens) -> Tensor:
+    """(B, N) bool: the loss counts every digit, so the number is neither hidden nor padding."""
+    return (numbers.trained | ~numbers.written)[..., 1:].all(dim=-1)
+
+
+def exact_numbers(numbers: NumberTokens, right_BM: Tensor) -> Tensor:
+    """(B, M) bool, the right token was predicted -> (B, N) bool, all of the number was, and that it ends."""
+    right_BNC = right_BM[:, :-1].view_as(numbers.written)
+    # a column after the number there is the next one's space or the end; where untrained, it cannot be wrong
+    trained_BN = torch.cat([numbers.trained[:, 1:, 0], torch.ones_like(numbers.trained[:, :1, 0])], dim=1)
+    ends_BN = right_BM[:, numbers.written.shape[2] :: numbers.written.shape[2]] | ~trained_BN
+    return (right_BNC | ~numbers.written)[..., 1:].all(dim=-1) & ends_BN
+
+
+def read_numbers(numbers: NumberTokens, digits_BM: Tensor) -> Tensor:
+    """(B, M) predicted digits -> (B, N) the numbers that they form, with as many digits as the true ones."""
+    digits_BNW = digits_BM[:, :-1].view_as(numbers.written)[..., 1:] * numbers.written[..., 1:]
+    place_values_W = 10 ** torch.arange(digits_BNW.shape[-1] - 1, -1, -1, device=digits_BM.device)
+    return (digits_BNW * place_values_W).sum(dim=-1)
+
+
+def means(parts: Mapping[str, tuple[Tensor, Tensor]]) -> dict[str, float]:
+    """{name: (values, which count)} -> {name: mean}, in one transfer from the device.
+
+    What nothing counts for, or has no finite mean, is left out.
+    """
+    sums = [torch.where(counted, values, 0).double().sum() for values, counted in parts.values()]
+    counts = [counted.sum().double() for _, counted in parts.values()]
+    pairs = torch.stack([torch.stack(sums), torch.stack(counts)], dim=1).tolist()
+    averages = {name: total / count for name, (total, count) in zip(parts, pairs, strict=True) if count}
+    return {name: average for name, average in averages.items() if math.isfinite(average)}
