@@ -86,13 +86,12 @@ def write_with_lerobot(recording: Recording, root: Path, rollouts: list[Rollout]
     from lerobot.configs import RGBEncoderConfig
     from lerobot.datasets import LeRobotDataset
 
-    from lerobot_bomb.data.blocks import DatasetLayout
+    from lerobot_bomb.data.rollout_dataset import rollout_layout
 
-    layout = DatasetLayout(recording.repo_id, recording.spec, recording.render_options, use_videos=True)
     dataset = LeRobotDataset.create(
         recording.repo_id,
         fps=recording.fps,
-        features=layout.features,
+        features=rollout_layout(recording).features,
         root=root,
         streaming_encoding=True,
         encoder_queue_maxsize=0,  # with its default of 30 it drops frames that come faster than it encodes

@@ -12,6 +12,7 @@ DESCRIPTION = "What lerobot-train and lerobot-eval do not do for BOMB: record, s
 # command -> (help, module with add_<command>_arguments and run_<command>); imported only when called
 COMMANDS = {
     "record": ("record the scripted expert as a LeRobotDataset", "lerobot_bomb.data.record"),
+    "convert": ("published demonstrations as a LeRobotDataset", "lerobot_bomb.data.convert"),
     "results": ("summarise files written by --env.results_path", "lerobot_bomb.evaluation.results"),
     "view": ("play one episode into a recording for Rerun and a video", "lerobot_bomb.viewing.view"),
     "gallery": ("draw what every perturbation axis changes", "lerobot_bomb.viewing.gallery"),

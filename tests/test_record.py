@@ -11,8 +11,9 @@ import pytest
 
 from lerobot_bomb import __version__
 from lerobot_bomb.data import record as record_module
+from lerobot_bomb.data.growing import METADATA_FILE, Progress, read_progress, unfinished_folder
 from lerobot_bomb.data.record import describe_failures, record
-from lerobot_bomb.data.recording import METADATA_FILE, Progress, Recording, read_progress, unfinished_folder
+from lerobot_bomb.data.recording import Recording
 from lerobot_bomb.data.rollout import RolloutSettings, make_env, play
 from lerobot_bomb.expert import expert_action
 from lerobot_bomb.perturbations import NUISANCES
@@ -216,9 +217,9 @@ def test_lerobot_refuses_to_merge_datasets_of_different_protocol_versions(
 ) -> None:
     from lerobot.datasets import aggregate_datasets
 
-    from lerobot_bomb.data import blocks
+    from lerobot_bomb.data import rollout_dataset
 
-    monkeypatch.setattr(blocks, "PROTOCOL_VERSION", "0.0")
+    monkeypatch.setattr(rollout_dataset, "PROTOCOL_VERSION", "0.0")
     record(IMAGES, tmp_path / "old")
     roots = [datasets["images"], tmp_path / "old"]
     with pytest.raises(ValueError, match=f"bomb_scara_v{PROTOCOL_VERSION}"):

@@ -10,16 +10,16 @@ from pathlib import Path
 import pytest
 
 from lerobot_bomb import cli
-from lerobot_bomb.data.recording import (
+from lerobot_bomb.data.growing import (
     BLOCK_FILE,
     METADATA_FILE,
-    PARAMETERS_FILE,
     Progress,
-    Recording,
     lock_folder,
+    parameters_file,
     unfinished_folder,
     write_json,
 )
+from lerobot_bomb.data.recording import Recording
 
 FLAGS = ["record", "--repo_id=test/x", "--episodes=1"]
 RECORDING = Recording("test/x", episodes=1)
@@ -77,7 +77,7 @@ def test_an_existing_folder_is_not_overwritten(tmp_path: Path, capsys: pytest.Ca
 def test_an_unfinished_recording_needs_resume(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     folder = unfinished_folder(tmp_path / "x")
     folder.mkdir()
-    write_json(folder / PARAMETERS_FILE, {"recording": RECORDING.to_dict()})
+    write_json(parameters_file(folder), {"recording": RECORDING.to_dict()})
     assert cli.main([*FLAGS, f"--root={tmp_path / 'x'}"]) == 1
     assert "go on with --resume or delete it" in capsys.readouterr().err
 
@@ -103,7 +103,7 @@ def test_resume_refuses_other_parameters(
     is_complete: bool, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     root = tmp_path / "x"
-    path = root / METADATA_FILE if is_complete else unfinished_folder(root) / PARAMETERS_FILE
+    path = root / METADATA_FILE if is_complete else parameters_file(unfinished_folder(root))
     path.parent.mkdir(parents=True)
     write_json(path, {"recording": Recording("test/x", episodes=1, seed=3).to_dict()})
     assert cli.main([*FLAGS, f"--root={root}", "--seed=3", "--noise=0.1", "--resume"]) == 1
@@ -153,7 +153,7 @@ def test_an_unfinished_recording_without_write_permission_is_kept(read_only: str
     root = tmp_path / "x"
     (tmp_path / "x.recording" / "block-00000").mkdir(parents=True)
     (tmp_path / "x.recording" / "lock").touch()
-    write_json(tmp_path / "x.recording" / PARAMETERS_FILE, {"recording": RECORDING.to_dict()})
+    write_json(parameters_file(tmp_path / "x.recording"), {"recording": RECORDING.to_dict()})
     write_json(tmp_path / "x.recording" / "block-00000" / BLOCK_FILE, asdict(Progress(1, 20)))
     before = sorted(tmp_path.rglob("*"))
     (tmp_path / read_only).chmod(0o555 if (tmp_path / read_only).is_dir() else 0o444)
@@ -181,7 +181,7 @@ def test_a_second_recorder_is_refused(tmp_path: Path, capsys: pytest.CaptureFixt
     with lock_folder(unfinished_folder(tmp_path / "x")):
         for resume in (False, True):
             assert cli.main([*FLAGS, f"--root={tmp_path / 'x'}", f"--resume={resume}"]) == 1
-            assert f"another process is recording in {tmp_path / 'x.recording'}" in capsys.readouterr().err
+            assert f"another process is at work in {tmp_path / 'x.recording'}" in capsys.readouterr().err
 
 
 def test_ctrl_c_while_a_command_is_imported_is_no_traceback(

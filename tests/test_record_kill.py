@@ -15,7 +15,7 @@ import pytest
 from recorder_server import TIMEOUT_S, Moment, RecorderServer
 
 from lerobot_bomb import cli
-from lerobot_bomb.data.recording import METADATA_FILE, finished_blocks, unfinished_folder
+from lerobot_bomb.data.growing import METADATA_FILE, finished_blocks, unfinished_folder
 
 pytestmark = pytest.mark.skipif(platform.system() != "Linux", reason="processes are watched through /proc")
 
@@ -176,11 +176,11 @@ def test_a_second_recorder_is_refused_and_the_first_not_disturbed(
         time.sleep(0.01)
     for flags in ([], ["--resume"]):
         assert cli.main(["record", f"--root={root}", *FLAGS, *flags]) == 1
-        assert f"another process is recording in {root}.recording" in capsys.readouterr().err
+        assert f"another process is at work in {root}.recording" in capsys.readouterr().err
     root.with_suffix(".go").touch()
     ended = sorted((recorder.wait() for recorder in both), key=lambda end: end.exit_code or 0)
     assert [end.exit_code for end in ended] == [0, 1]
-    assert "another process is recording" in "\n".join(ended[1].messages)
+    assert "another process is at work" in "\n".join(ended[1].messages)
     assert contents(root) == references["video"].contents
     assert not unfinished_folder(root).exists()
 

@@ -1,7 +1,7 @@
-"""Blocks of a recording: small finished LeRobotDatasets, merged into one at the end.
+"""Blocks of a growing dataset: small finished LeRobotDatasets, merged into one at the end.
 
 LeRobot's parquet files can be read only after `finalize`, so a dataset that is killed while it is
-written is lost. Blocks bound that loss to the episodes of one block, which are played again.
+written is lost. Blocks bound that loss to the episodes of one block, which are made again.
 """
 
 import json
@@ -10,7 +10,7 @@ import os
 import tempfile
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager, nullcontext
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -22,26 +22,13 @@ from datasets import disable_progress_bars, enable_progress_bars
 from datasets.exceptions import DatasetGenerationError
 from lerobot.datasets import LeRobotDataset, aggregate_datasets
 from lerobot.datasets.utils import DEFAULT_EPISODES_PATH, STATS_PATH
-from lerobot.utils.constants import ACTION, OBS_IMAGES, OBS_PREFIX, OBS_STATE
 
-from lerobot_bomb import __version__
 from lerobot_bomb._compat import (
     abandon,
     datasets_cache,
     mergeable_arrays,
     sampled_image_statistics,
     without_statistics,
-)
-from lerobot_bomb.camera_geometry import geometry_shapes
-from lerobot_bomb.data.rollout import Rollout
-from lerobot_bomb.schema import (
-    ACTION_NAMES,
-    CAMERAS,
-    PROTOCOL_VERSION,
-    STATE_NAMES,
-    EpisodeResult,
-    EpisodeSpec,
-    RenderOptions,
 )
 
 ENCODER_THREADS = 1  # per camera, which keeps two cores busy; see benchmarks/record_speed.py
@@ -53,41 +40,22 @@ class DatasetLayout:
     """What a block and the merged dataset have in common."""
 
     repo_id: str
-    spec: EpisodeSpec
-    render_options: RenderOptions
+    fps: int
+    # LeRobot's merge refuses datasets of different robots
+    robot_type: str
+    features: dict[str, dict[str, Any]]
     use_videos: bool
-
-    @property
-    def features(self) -> dict[str, dict[str, Any]]:
-        """LeRobot's features under the environment's policy-side keys; never `environment_state`."""
-        size = self.render_options.image_size
-        dtype = "video" if self.use_videos else "image"
-        image = {"dtype": dtype, "shape": (size, size, 3), "names": ["height", "width", "channels"]}
-        action_names = ACTION_NAMES[self.spec.control_mode]
-        return {
-            **{f"{OBS_IMAGES}.{camera}": dict(image) for camera in CAMERAS},
-            OBS_STATE: {"dtype": "float32", "shape": (len(STATE_NAMES),), "names": list(STATE_NAMES)},
-            ACTION: {"dtype": "float32", "shape": (len(action_names),), "names": list(action_names)},
-            **self.geometry_features,
-        }
-
-    @property
-    def geometry_features(self) -> dict[str, dict[str, Any]]:
-        """Depth, intrinsics and extrinsics as arrays: a policy would take images of them for cameras."""
-        return {
-            f"{OBS_PREFIX}{key}": {"dtype": "float32", "shape": shape, "names": ["row", "column"]}
-            for key, shape in geometry_shapes(self.render_options).items()
-        }
+    # features that no policy normalises: arrays of two dimensions, such as depth
+    arrays: tuple[str, ...] = ()
 
     def create(self, root: Path) -> LeRobotDataset:
         """An empty dataset that is ready to be written."""
         return LeRobotDataset.create(
             self.repo_id,
-            fps=self.spec.fps,
+            fps=self.fps,
             features=self.features,
             root=root,
-            # LeRobot's merge refuses datasets of different robots, hence of different protocol versions too
-            robot_type=f"bomb_{self.spec.robot}_v{PROTOCOL_VERSION}",
+            robot_type=self.robot_type,
             use_videos=self.use_videos,
             streaming_encoding=self.use_videos,
             # unlimited: LeRobot drops frames when this queue is full
@@ -98,8 +66,16 @@ class DatasetLayout:
         )
 
 
-def write_block(layout: DatasetLayout, root: Path, rollouts: Iterable[Rollout]) -> int:
-    """Write rollouts as a finished LeRobotDataset and return its number of frames.
+@dataclass(frozen=True)
+class Episode:
+    """What a block is made of."""
+
+    frames: Iterable[dict[str, Any]]  # as LeRobot's add_frame takes them
+    columns: dict[str, Any] = field(default_factory=dict)  # of its row in LeRobot's table of episodes
+
+
+def write_block(layout: DatasetLayout, root: Path, episodes: Iterable[Episode]) -> int:
+    """Write episodes as a finished LeRobotDataset and return its number of frames.
 
     Raises:
         RuntimeError: a video lacks frames, or a thread of LeRobot could not write an image or a video.
@@ -109,12 +85,13 @@ def write_block(layout: DatasetLayout, root: Path, rollouts: Iterable[Rollout]) 
         _quiet_libraries(),
         _temporary_files_in(root.parent),
         sampled_image_statistics(),
-        without_statistics(layout.geometry_features),
+        without_statistics(layout.arrays),
         _logged_errors(),
     ):
-        results = _write_episodes(layout.create(root), rollouts)
-    _add_episode_columns(root, results)
-    num_frames = sum(result.steps for result in results)
+        dataset = layout.create(root)
+        rows = _write_episodes(dataset, episodes)
+    _add_episode_columns(root, rows)
+    num_frames = dataset.num_frames
     _check_videos(root, num_frames)
     return num_frames
 
@@ -130,8 +107,7 @@ def merge_blocks(layout: DatasetLayout, blocks: list[Path], root: Path) -> None:
     """
     repo_ids = [layout.repo_id] * len(blocks)
     cache = datasets_cache(root.with_name(f"{root.name}.cache"))
-    depth = layout.render_options.depth
-    arrays = mergeable_arrays(layout.features) if depth else nullcontext()
+    arrays = mergeable_arrays(layout.features) if layout.arrays else nullcontext()
     with _quiet_libraries(), _temporary_files_in(root.parent), cache, arrays:
         try:
             aggregate_datasets(
@@ -139,7 +115,7 @@ def merge_blocks(layout: DatasetLayout, blocks: list[Path], root: Path) -> None:
                 layout.repo_id,
                 roots=blocks,
                 aggr_root=root,
-                concatenate_data=layout.use_videos and not depth,
+                concatenate_data=layout.use_videos and not layout.arrays,
             )
         except DatasetGenerationError as error:
             raise OSError(f"the blocks could not be read: {error.__cause__}") from error
@@ -208,48 +184,36 @@ class _ErrorCollector(logging.Handler):
             logging.getLogger().handle(record)
 
 
-def _write_episodes(dataset: LeRobotDataset, rollouts: Iterable[Rollout]) -> list[EpisodeResult]:
-    results = []
+def _write_episodes(dataset: LeRobotDataset, episodes: Iterable[Episode]) -> list[dict[str, Any]]:
+    """Write them all and return their columns."""
+    rows = []
     try:
-        for rollout in rollouts:
-            _write_episode(dataset, rollout)
-            results.append(rollout.result)
+        for episode in episodes:
+            _write_episode(dataset, episode)
+            rows.append(episode.columns)
         dataset.finalize()
     except BaseException:
         abandon(dataset)  # its folder may be deleted next
         raise
-    return results
+    return rows
 
 
-def _write_episode(dataset: LeRobotDataset, rollout: Rollout) -> None:
-    for step, (state, action) in enumerate(zip(rollout.states, rollout.actions, strict=True)):
-        images = {f"{OBS_IMAGES}.{camera}": frames[step] for camera, frames in rollout.frames.items()}
-        geometry = {f"{OBS_PREFIX}{key}": values[step] for key, values in rollout.geometry.items()}
-        dataset.add_frame(
-            {**images, **geometry, OBS_STATE: state, ACTION: action, "task": rollout.result.instruction},
-        )
+def _write_episode(dataset: LeRobotDataset, episode: Episode) -> None:
+    for frame in episode.frames:
+        dataset.add_frame(frame)
     dataset.save_episode()
 
 
-def _add_episode_columns(root: Path, results: list[EpisodeResult]) -> None:
+def _add_episode_columns(root: Path, rows: list[dict[str, Any]]) -> None:
     """Add what determines each episode to LeRobot's table of episodes.
 
     Columns follow their episodes through load, filter, merge and push; a file beside the table would
     be separated from them by a merge.
     """
     path = root / DEFAULT_EPISODES_PATH.format(chunk_index=0, file_index=0)
-    columns = {
-        "bomb/seed": pa.array([result.spec.seed for result in results]),
-        "bomb/target": pa.array([list(result.target) for result in results]),
-        "bomb/color": pa.array([result.color for result in results]),
-        "bomb/levels": pa.array([json.dumps(result.levels) for result in results]),
-        "bomb/spec": pa.array([json.dumps(result.spec.to_dict()) for result in results]),
-        "bomb/protocol_version": pa.array([result.protocol_version for result in results]),
-        "bomb/package_version": pa.array([__version__] * len(results)),
-    }
     table = pq.read_table(path)
-    for name, column in columns.items():
-        table = table.append_column(name, column)
+    for name in rows[0]:
+        table = table.append_column(name, pa.array([row[name] for row in rows]))
     unfinished = path.with_suffix(".tmp")
     pq.write_table(table, unfinished)
     unfinished.replace(path)

@@ -1,38 +1,28 @@
 """``lerobot-bomb record``: the scripted expert's episodes as a LeRobotDataset.
 
-A recording grows in a folder beside its final place, as blocks that are finished datasets (see
-``blocks.py``); the merged dataset appears under its name at once, complete. LeRobot and torch are
+A recording grows in a folder beside its final place (see ``growing.py``). LeRobot and torch are
 imported only after the flags have been checked and the workers are playing.
 """
 
 import argparse
 import re
-import shutil
-import signal
-import sys
 from collections.abc import Iterable, Iterator
-from contextlib import contextmanager
-from dataclasses import asdict, fields
+from dataclasses import fields
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from tqdm import tqdm
 
-from lerobot_bomb.data.recording import (
-    BLOCK_FILE,
-    METADATA_FILE,
-    PARAMETERS_FILE,
+from lerobot_bomb.data.growing import (
     Progress,
-    Recording,
-    check_folders,
-    finished_blocks,
-    lock_folder,
-    read_progress,
-    recorder_flags,
-    remove_unfinished,
-    unfinished_folder,
-    write_json,
+    default_root,
+    grow,
+    reached,
+    switch,
+    terminated_in_order,
+    write_blocks,
 )
+from lerobot_bomb.data.recording import Recording, recorder_flags
 from lerobot_bomb.data.rollout import Expert, Rollout, RolloutPool, RolloutSettings, make_env
 from lerobot_bomb.expert import expert_action
 from lerobot_bomb.perturbations import NONE
@@ -46,7 +36,7 @@ from lerobot_bomb.schema import (
 )
 
 if TYPE_CHECKING:
-    from lerobot_bomb.data.blocks import DatasetLayout
+    from lerobot_bomb.data.blocks import DatasetLayout, Episode
 
 BLOCK_EPISODES = 20  # what a kill can cost: they are played again on --resume
 # the expert counts as broken when, after so many seeds, fewer succeed
@@ -77,8 +67,8 @@ def add_record_arguments(parser: argparse.ArgumentParser) -> None:
         help='conditions, as ["all:1-5"]: every seed is played with each; a range such as all:1-5 or '
         "camera:0-3 draws a level per episode and axis (default: none)",
     )
-    add("--images", **_switch(), help="store images (lossless) instead of videos")
-    add("--depth", **_switch(), help="store each camera's depth (metres, lossless), intrinsics and pose too")
+    add("--images", **switch(), help="store images (lossless) instead of videos")
+    add("--depth", **switch(), help="store each camera's depth (metres, lossless), intrinsics and pose too")
     add("--workers", type=int, default=1, help="simulator processes; one keeps two cores busy (default: 1)")
     add(
         "--noise",
@@ -89,7 +79,7 @@ def add_record_arguments(parser: argparse.ArgumentParser) -> None:
     )
     add(
         "--resume",
-        **_switch(),
+        **switch(),
         help=f"continue a recording that was interrupted; its blocks of {BLOCK_EPISODES} episodes are kept",
     )
 
@@ -111,8 +101,8 @@ def run_record(args: argparse.Namespace) -> int:
     recording = Recording(**{f.name: flags[f.name] for f in fields(Recording) if f.name in flags})
     if args.workers < 1:
         raise ValueError(f"--workers={args.workers} must be at least 1")
-    root = args.root or _default_root(recording.repo_id)
-    with _terminated_in_order():
+    root = args.root or default_root(recording.repo_id)
+    with terminated_in_order():
         progress = record(recording, root, num_workers=args.workers, resume=args.resume)
     last_seed = recording.seed + (progress.num_tried - 1) // len(recording.conditions)
     seeds = f"{recording.seed}..{last_seed}"
@@ -138,31 +128,13 @@ def record(
         ValueError: the folder exists, is missing, cannot be written, is in use, or holds another recording.
         RuntimeError: the expert fails too often, the disk is full, or encoding failed.
     """
-    folder = unfinished_folder(root)
-    try:
-        check_folders(recording, root, folder, resume)
-        if root.exists():
-            shutil.rmtree(folder, ignore_errors=True)  # left by a kill just after the last rename
-            return read_progress(root / METADATA_FILE)
-        lock = lock_folder(folder)
-    except OSError as error:
-        raise ValueError(f"--root={root} cannot be written: {error}") from error
-    with lock:
-        try:
-            remove_unfinished(folder)  # left by a kill
-            write_json(folder / PARAMETERS_FILE, {"recording": recording.to_dict()})
-            progress = _record_blocks(recording, folder, num_workers, expert)
-            _publish(recording, progress, folder, root)
-        except ValueError:  # a flag that only the environment can judge
-            _keep_finished(folder)
-            raise
-        except (OSError, RuntimeError) as error:
-            raise RuntimeError(f"--root={root}: {error}; {_keep_finished(folder)}") from error
-        except (KeyboardInterrupt, SystemExit):
-            tqdm.write(f"--root={root}: stopped; {_keep_finished(folder)}", file=sys.stderr)
-            raise
-        shutil.rmtree(folder, ignore_errors=True)  # the dataset is complete, whatever stays of this
-    return progress
+    return grow(
+        recording,
+        root,
+        resume,
+        write=lambda folder: _record_blocks(recording, folder, num_workers, expert),
+        layout=lambda: _layout(recording),
+    )
 
 
 def describe_failures(failures: list[dict[str, Any]]) -> str:
@@ -178,8 +150,7 @@ def describe_failures(failures: list[dict[str, Any]]) -> str:
 
 def _record_blocks(recording: Recording, folder: Path, num_workers: int, expert: Expert) -> Progress:
     """Write the blocks that are missing."""
-    blocks = finished_blocks(folder)
-    progress = read_progress(blocks[-1] / BLOCK_FILE) if blocks else Progress()
+    progress = reached(folder)
     if progress.num_episodes == recording.episodes:
         return progress
     # MuJoCo's backend is chosen here, or its absence reported; the workers inherit the choice
@@ -188,27 +159,28 @@ def _record_blocks(recording: Recording, folder: Path, num_workers: int, expert:
             make_env(spec, recording.render_options).close()
     settings = RolloutSettings(recording.render_options, recording.noise, expert)
     with RolloutPool(settings, recording.specs(progress.num_tried), num_workers) as pool:
-        from lerobot_bomb.data.blocks import write_block  # takes seconds, in which the workers play
-
+        layout = _layout(recording)  # takes seconds, in which the workers play
         with tqdm(total=recording.episodes, initial=progress.num_episodes, unit="episode") as bar:
-            while progress.num_episodes < recording.episodes:
-                block = folder / f"block-{progress.num_episodes // BLOCK_EPISODES:05d}"
-                unfinished = block.with_suffix(".tmp")
-                size = min(BLOCK_EPISODES, recording.episodes - progress.num_episodes)
-                successes = _successes(pool, size, progress, bar)
-                progress.num_frames += write_block(_layout(recording), unfinished, successes)
-                write_json(unfinished / BLOCK_FILE, asdict(progress))
-                unfinished.rename(block)
+            write_blocks(
+                folder,
+                layout,
+                progress,
+                recording.episodes,
+                BLOCK_EPISODES,
+                lambda number: _successes(pool, number, progress, bar),
+            )
     return progress
 
 
-def _successes(pool: Iterable[Rollout], number: int, progress: Progress, bar: tqdm) -> Iterator[Rollout]:
+def _successes(pool: Iterable[Rollout], number: int, progress: Progress, bar: tqdm) -> "Iterator[Episode]":
     """Yield so many successful rollouts; note the failed ones on the way."""
+    from lerobot_bomb.data.rollout_dataset import rollout_episode
+
     for rollout in pool:
         if rollout.result.is_success:
             progress.num_episodes += 1
             number -= 1
-            yield rollout
+            yield rollout_episode(rollout)
             bar.update()
         else:
             progress.failures.append({"seed": rollout.result.spec.seed, "failure": rollout.result.failure})
@@ -226,54 +198,10 @@ def _check_success_rate(progress: Progress) -> None:
         )
 
 
-def _publish(recording: Recording, progress: Progress, folder: Path, root: Path) -> None:
-    """Merge the blocks and give the complete dataset its name."""
-    from lerobot_bomb.data.blocks import merge_blocks
-
-    dataset = folder / "dataset"
-    merge_blocks(_layout(recording), finished_blocks(folder), dataset)
-    write_json(dataset / METADATA_FILE, {"recording": recording.to_dict(), **asdict(progress)})
-    dataset.rename(root)
-
-
 def _layout(recording: Recording) -> "DatasetLayout":
-    from lerobot_bomb.data.blocks import DatasetLayout
+    from lerobot_bomb.data.rollout_dataset import rollout_layout
 
-    return DatasetLayout(
-        recording.repo_id, recording.spec, recording.render_options, use_videos=not recording.images
-    )
-
-
-def _keep_finished(folder: Path) -> str:
-    """Delete what is unfinished, which gives a full disk its space back; return what is kept."""
-    remove_unfinished(folder)
-    blocks = finished_blocks(folder)
-    if not blocks:
-        shutil.rmtree(folder, ignore_errors=True)
-        return "no block of episodes was finished, so nothing is kept"
-    num_episodes = read_progress(blocks[-1] / BLOCK_FILE).num_episodes
-    return f"{num_episodes} episodes are kept in {folder}, go on with --resume"
-
-
-@contextmanager
-def _terminated_in_order() -> Iterator[None]:
-    """Let SIGTERM end the recorder as Ctrl-C does, with the exit code that shells give it, 143."""
-    usual = signal.signal(signal.SIGTERM, lambda number, _: sys.exit(128 + number))
-    try:
-        yield
-    finally:
-        signal.signal(signal.SIGTERM, usual)
-
-
-def _default_root(repo_id: str) -> Path:
-    from lerobot.utils.constants import HF_LEROBOT_HOME  # imports torch: seconds
-
-    return HF_LEROBOT_HOME / repo_id
-
-
-def _switch() -> dict[str, Any]:
-    """Arguments of a flag that works alone and as LeRobot writes it: --resume, --resume=true."""
-    return {"nargs": "?", "const": True, "default": False, "type": _parse_bool}
+    return rollout_layout(recording)
 
 
 def parse_numbers(text: str) -> tuple[int, ...]:
@@ -286,9 +214,3 @@ def parse_numbers(text: str) -> tuple[int, ...]:
 def parse_conditions(text: str) -> tuple[str, ...]:
     """Read a list of conditions: ("none", "all:1-5") from '["none","all:1-5"]' and from "none,all:1-5"."""
     return tuple(part.strip(" \"'") for part in text.strip("[] ").split(",") if part.strip())
-
-
-def _parse_bool(text: str) -> bool:
-    if text.lower() not in ("true", "false"):
-        raise argparse.ArgumentTypeError(f"{text!r} must be true or false")
-    return text.lower() == "true"

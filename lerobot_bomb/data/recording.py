@@ -1,25 +1,14 @@
-"""A recording: what determines it, how far it got, and its files.
+"""A recording: what determines it."""
 
-While a recording grows it is a folder beside its final place:
-    NAME.recording/recording.json   the parameters
-    NAME.recording/block-00000/     a finished LeRobotDataset, and block.json: the progress up to its end
-"""
-
-import errno
 import itertools
 import json
-import os
-import re
-import shutil
 from collections.abc import Iterator
-from contextlib import AbstractContextManager, contextmanager, suppress
-from dataclasses import asdict, dataclass, field, fields, replace
-from pathlib import Path
-from typing import Any
-
-from filelock import FileLock, Timeout
+from contextlib import contextmanager
+from dataclasses import asdict, dataclass, replace
+from typing import Any, ClassVar
 
 from lerobot_bomb import __version__
+from lerobot_bomb.data.growing import check_repo_id
 from lerobot_bomb.perturbations import NONE
 from lerobot_bomb.schema import (
     DEFAULT_FPS,
@@ -31,16 +20,12 @@ from lerobot_bomb.schema import (
 
 MAX_NOISE = 1.0  # beyond it the noise exceeds the largest action
 
-PARAMETERS_FILE = "recording.json"  # in the unfinished recording
-LOCK_FILE = "lock"  # there too; a killed recorder releases it
-LOCK_TIMEOUT_S = 0.5  # a recorder that is refused holds the lock for a moment
-BLOCK_FILE = "block.json"  # in each block
-METADATA_FILE = Path("meta") / "bomb.json"  # in the dataset
-
 
 @dataclass(frozen=True)
 class Recording:
     """What determines a recording frame by frame."""
+
+    kind: ClassVar[str] = "recording"
 
     repo_id: str
     episodes: int
@@ -61,8 +46,7 @@ class Recording:
     package_version: str = __version__
 
     def __post_init__(self) -> None:
-        if not re.fullmatch(r"[\w.-]+/[\w.-]+", self.repo_id):
-            raise ValueError(f"--repo_id={self.repo_id!r} must have the form USER/NAME")
+        check_repo_id(self.repo_id)
         if self.episodes < 1:
             raise ValueError(f"--episodes={self.episodes} must be at least 1")
         if len(set(self.task_ids)) < len(self.task_ids):
@@ -120,109 +104,3 @@ def recorder_flags() -> Iterator[None]:
     except ValueError as error:
         message = str(error).replace("--env.target=", "the target ").replace("--env.", "--")
         raise ValueError(message) from None
-
-
-@dataclass
-class Progress:
-    """What has been recorded."""
-
-    num_episodes: int = 0
-    num_frames: int = 0
-    failures: list[dict[str, Any]] = field(default_factory=list)  # [{"seed": ..., "failure": ...}]
-
-    @property
-    def num_tried(self) -> int:
-        return self.num_episodes + len(self.failures)
-
-
-def unfinished_folder(root: Path) -> Path:
-    """Where a recording grows until it is complete."""
-    root = root.absolute()
-    return root.with_name(f"{root.name}.recording")
-
-
-def check_folders(recording: Recording, root: Path, folder: Path, resume: bool) -> None:
-    """Refuse to overwrite anything, to resume nothing, and to mix two recordings.
-
-    Raises:
-        ValueError: names the flag and what is in the way.
-        OSError: the folder cannot be written.
-    """
-    if not resume:
-        if root.exists():
-            raise ValueError(f"--root={root} exists already; name a folder that does not exist yet")
-        if folder.exists():
-            with lock_folder(folder):
-                if {path.name for path in folder.iterdir()} - {LOCK_FILE}:
-                    raise ValueError(
-                        f"{folder} holds an unfinished recording; go on with --resume or delete it"
-                    )
-    elif not root.exists() and not folder.exists():
-        raise ValueError(f"--resume: there is no recording to go on with in --root={root}")
-    elif root.exists() and not (root / METADATA_FILE).exists():
-        raise ValueError(f"--resume: --root={root} holds no {METADATA_FILE}, so it is no recording")
-    else:
-        _check_same_recording(recording, root / METADATA_FILE if root.exists() else folder / PARAMETERS_FILE)
-
-
-def _check_same_recording(recording: Recording, path: Path) -> None:
-    if not path.exists():
-        if {other.name for other in path.parent.iterdir()} - {LOCK_FILE, path.with_suffix(".tmp").name}:
-            raise ValueError(f"--resume: {path.parent} holds no {path.name}, so it is no recording")
-        return  # killed before anything was recorded
-    existing = json.loads(path.read_text())["recording"]
-    differences = [
-        f"--{name}={value} (it has {existing.get(name)})"
-        for name, value in recording.to_dict().items()
-        if value != existing.get(name)
-    ]
-    if differences:
-        raise ValueError(f"--resume: the recording in {path.parent} differs in {', '.join(differences)}")
-
-
-def lock_folder(folder: Path) -> AbstractContextManager[object]:
-    """Make the folder and keep other recorders out until the returned context ends.
-
-    Raises:
-        ValueError: another recorder is at work there.
-        OSError: the folder, or its final place beside it, cannot be written.
-    """
-    folder.mkdir(parents=True, exist_ok=True)
-    try:
-        if not os.access(folder.parent, os.W_OK):
-            raise PermissionError(errno.EACCES, os.strerror(errno.EACCES), str(folder.parent))
-        return FileLock(folder / LOCK_FILE).acquire(timeout=LOCK_TIMEOUT_S)
-    except (Timeout, FileNotFoundError):  # it has finished and deleted the folder meanwhile
-        raise ValueError(f"another process is recording in {folder}") from None
-    except OSError:
-        with suppress(OSError):
-            folder.rmdir()  # unless it holds something
-        raise
-
-
-def remove_unfinished(folder: Path) -> None:
-    """Leave only finished blocks, the parameters and the lock."""
-    kept = {folder / LOCK_FILE, folder / PARAMETERS_FILE, *finished_blocks(folder)}
-    for path in set(folder.iterdir()) - kept:
-        if path.is_dir():
-            shutil.rmtree(path, ignore_errors=True)
-        else:
-            path.unlink(missing_ok=True)
-
-
-def finished_blocks(folder: Path) -> list[Path]:
-    """Folders of the blocks that a resumed recording keeps, in order."""
-    return sorted(path for path in folder.glob("block-*") if path.suffix != ".tmp")
-
-
-def read_progress(path: Path) -> Progress:
-    """Progress from a file of either kind."""
-    values = json.loads(path.read_text())
-    return Progress(**{f.name: values[f.name] for f in fields(Progress)})
-
-
-def write_json(path: Path, values: dict[str, Any]) -> None:
-    """Write a file that is complete whenever it exists."""
-    unfinished = path.with_suffix(".tmp")
-    unfinished.write_text(json.dumps(values, indent=1))
-    unfinished.replace(path)

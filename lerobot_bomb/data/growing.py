@@ -1,0 +1,277 @@
+"""A dataset that grows in blocks beside its final place: a kill costs little and leaves no half dataset.
+
+While it grows it is a folder, for a recording as follows:
+    NAME.recording/recording.json   the parameters
+    NAME.recording/block-00000/     a finished LeRobotDataset, and block.json: the progress up to its end
+The merged dataset appears under its name at once, complete.
+"""
+
+import argparse
+import errno
+import json
+import os
+import re
+import shutil
+import signal
+import sys
+from collections.abc import Callable, Iterator
+from contextlib import AbstractContextManager, contextmanager, suppress
+from dataclasses import asdict, dataclass, field, fields
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, ClassVar, Protocol
+
+from filelock import FileLock, Timeout
+from tqdm import tqdm
+
+if TYPE_CHECKING:
+    from lerobot_bomb.data.blocks import DatasetLayout, Episode
+
+LOCK_FILE = "lock"  # in the growing folder; a killed process releases it
+LOCK_TIMEOUT_S = 0.5  # a process that is refused holds the lock for a moment
+BLOCK_FILE = "block.json"  # in each block
+METADATA_FILE = Path("meta") / "bomb.json"  # in the dataset
+
+
+class Parameters(Protocol):
+    """What determines a dataset frame by frame."""
+
+    kind: ClassVar[str]  # "recording": the noun of messages and the ending of the growing folder
+
+    def to_dict(self) -> dict[str, Any]:
+        """What its JSON reads back as; the keys are flags."""
+        ...
+
+
+@dataclass
+class Progress:
+    """How far a dataset has grown."""
+
+    num_episodes: int = 0
+    num_frames: int = 0
+    failures: list[dict[str, Any]] = field(default_factory=list)  # [{"seed": ..., "failure": ...}]
+
+    @property
+    def num_tried(self) -> int:
+        return self.num_episodes + len(self.failures)
+
+
+def grow(
+    parameters: Parameters,
+    root: Path,
+    resume: bool,
+    write: Callable[[Path], Progress],
+    layout: Callable[[], "DatasetLayout"],
+) -> Progress:
+    """Let `write` fill a folder with the blocks that it lacks, then merge them into `root`.
+
+    Raises:
+        ValueError: the folder exists, is missing, cannot be written, is in use, or holds something else.
+        RuntimeError: `write` gave up, the disk is full, or encoding failed.
+    """
+    folder = unfinished_folder(root, parameters.kind)
+    try:
+        check_folders(parameters, root, folder, resume)
+        if root.exists():
+            shutil.rmtree(folder, ignore_errors=True)  # left by a kill just after the last rename
+            return read_progress(root / METADATA_FILE)
+        lock = lock_folder(folder)
+    except OSError as error:
+        raise ValueError(f"--root={root} cannot be written: {error}") from error
+    with lock:
+        try:
+            remove_unfinished(folder)  # left by a kill
+            write_json(parameters_file(folder), {parameters.kind: parameters.to_dict()})
+            progress = write(folder)
+            _publish(parameters, layout(), progress, folder, root)
+        except ValueError:  # a flag that only the environment can judge
+            _keep_finished(folder)
+            raise
+        except (OSError, RuntimeError) as error:
+            raise RuntimeError(f"--root={root}: {error}; {_keep_finished(folder)}") from error
+        except (KeyboardInterrupt, SystemExit):
+            tqdm.write(f"--root={root}: stopped; {_keep_finished(folder)}", file=sys.stderr)
+            raise
+        shutil.rmtree(folder, ignore_errors=True)  # the dataset is complete, whatever stays of this
+    return progress
+
+
+def write_blocks(
+    folder: Path,
+    layout: "DatasetLayout",
+    progress: Progress,
+    num_episodes: int,
+    block_episodes: int,
+    next_episodes: Callable[[int], Iterator["Episode"]],
+) -> None:
+    """Write the missing blocks; `next_episodes` yields so many and counts them in `progress`."""
+    from lerobot_bomb.data.blocks import write_block
+
+    while progress.num_episodes < num_episodes:
+        block = folder / f"block-{progress.num_episodes // block_episodes:05d}"
+        unfinished = block.with_suffix(".tmp")
+        size = min(block_episodes, num_episodes - progress.num_episodes)
+        progress.num_frames += write_block(layout, unfinished, next_episodes(size))
+        write_json(unfinished / BLOCK_FILE, asdict(progress))
+        unfinished.rename(block)
+
+
+def reached(folder: Path) -> Progress:
+    """Progress up to the end of the last finished block."""
+    blocks = finished_blocks(folder)
+    return read_progress(blocks[-1] / BLOCK_FILE) if blocks else Progress()
+
+
+@contextmanager
+def terminated_in_order() -> Iterator[None]:
+    """Let SIGTERM end the command as Ctrl-C does, with the exit code that shells give it, 143."""
+    usual = signal.signal(signal.SIGTERM, lambda number, _: sys.exit(128 + number))
+    try:
+        yield
+    finally:
+        signal.signal(signal.SIGTERM, usual)
+
+
+def check_repo_id(repo_id: str) -> None:
+    """Raise a ValueError unless it is USER/NAME."""
+    if not re.fullmatch(r"[\w.-]+/[\w.-]+", repo_id):
+        raise ValueError(f"--repo_id={repo_id!r} must have the form USER/NAME")
+
+
+def switch() -> dict[str, Any]:
+    """Arguments of a flag that works alone and as LeRobot writes it: --resume, --resume=true."""
+    return {"nargs": "?", "const": True, "default": False, "type": _parse_bool}
+
+
+def _parse_bool(text: str) -> bool:
+    if text.lower() not in ("true", "false"):
+        raise argparse.ArgumentTypeError(f"{text!r} must be true or false")
+    return text.lower() == "true"
+
+
+def default_root(repo_id: str) -> Path:
+    """Where LeRobot looks for a dataset."""
+    from lerobot.utils.constants import HF_LEROBOT_HOME  # imports torch: seconds
+
+    return HF_LEROBOT_HOME / repo_id
+
+
+def unfinished_folder(root: Path, kind: str = "recording") -> Path:
+    """Where a dataset grows until it is complete."""
+    root = root.absolute()
+    return root.with_name(f"{root.name}.{kind}")
+
+
+def parameters_file(folder: Path) -> Path:
+    """The file that says what grows in a folder: recording.json in NAME.recording."""
+    return folder / f"{folder.suffix[1:]}.json"
+
+
+def check_folders(parameters: Parameters, root: Path, folder: Path, resume: bool) -> None:
+    """Refuse to overwrite anything, to resume nothing, and to mix two datasets.
+
+    Raises:
+        ValueError: names the flag and what is in the way.
+        OSError: the folder cannot be written.
+    """
+    kind = parameters.kind
+    if not resume:
+        if root.exists():
+            raise ValueError(f"--root={root} exists already; name a folder that does not exist yet")
+        if folder.exists():
+            with lock_folder(folder):
+                if {path.name for path in folder.iterdir()} - {LOCK_FILE}:
+                    raise ValueError(f"{folder} holds an unfinished {kind}; go on with --resume or delete it")
+    elif not root.exists() and not folder.exists():
+        raise ValueError(f"--resume: there is no {kind} to go on with in --root={root}")
+    elif root.exists() and not (root / METADATA_FILE).exists():
+        raise ValueError(f"--resume: --root={root} holds no {METADATA_FILE}, so it is no {kind}")
+    else:
+        _check_same(parameters, root / METADATA_FILE if root.exists() else parameters_file(folder))
+
+
+def _check_same(parameters: Parameters, path: Path) -> None:
+    kind = parameters.kind
+    if not path.exists():
+        if {other.name for other in path.parent.iterdir()} - {LOCK_FILE, path.with_suffix(".tmp").name}:
+            raise ValueError(f"--resume: {path.parent} holds no {path.name}, so it is no {kind}")
+        return  # killed before anything was written
+    existing = json.loads(path.read_text()).get(kind)
+    if existing is None:
+        raise ValueError(f"--resume: {path} is not of a {kind}")
+    differences = [
+        f"--{name}={value} (it has {existing.get(name)})"
+        for name, value in parameters.to_dict().items()
+        if value != existing.get(name)
+    ]
+    if differences:
+        raise ValueError(f"--resume: the {kind} in {path.parent} differs in {', '.join(differences)}")
+
+
+def lock_folder(folder: Path) -> AbstractContextManager[object]:
+    """Make the folder and keep others out until the returned context ends.
+
+    Raises:
+        ValueError: another process is at work there.
+        OSError: the folder, or its final place beside it, cannot be written.
+    """
+    folder.mkdir(parents=True, exist_ok=True)
+    try:
+        if not os.access(folder.parent, os.W_OK):
+            raise PermissionError(errno.EACCES, os.strerror(errno.EACCES), str(folder.parent))
+        return FileLock(folder / LOCK_FILE).acquire(timeout=LOCK_TIMEOUT_S)
+    except (Timeout, FileNotFoundError):  # it has finished and deleted the folder meanwhile
+        raise ValueError(f"another process is at work in {folder}") from None
+    except OSError:
+        with suppress(OSError):
+            folder.rmdir()  # unless it holds something
+        raise
+
+
+def remove_unfinished(folder: Path) -> None:
+    """Leave only finished blocks, the parameters and the lock."""
+    kept = {folder / LOCK_FILE, parameters_file(folder), *finished_blocks(folder)}
+    for path in set(folder.iterdir()) - kept:
+        if path.is_dir():
+            shutil.rmtree(path, ignore_errors=True)
+        else:
+            path.unlink(missing_ok=True)
+
+
+def finished_blocks(folder: Path) -> list[Path]:
+    """Folders of the blocks that --resume keeps, in order."""
+    return sorted(path for path in folder.glob("block-*") if path.suffix != ".tmp")
+
+
+def read_progress(path: Path) -> Progress:
+    """Progress from a file of either kind."""
+    values = json.loads(path.read_text())
+    return Progress(**{f.name: values[f.name] for f in fields(Progress)})
+
+
+def write_json(path: Path, values: dict[str, Any]) -> None:
+    """Write a file that is complete whenever it exists."""
+    unfinished = path.with_suffix(".tmp")
+    unfinished.write_text(json.dumps(values, indent=1))
+    unfinished.replace(path)
+
+
+def _publish(
+    parameters: Parameters, layout: "DatasetLayout", progress: Progress, folder: Path, root: Path
+) -> None:
+    """Merge the blocks and give the complete dataset its name."""
+    from lerobot_bomb.data.blocks import merge_blocks
+
+    dataset = folder / "dataset"
+    merge_blocks(layout, finished_blocks(folder), dataset)
+    write_json(dataset / METADATA_FILE, {parameters.kind: parameters.to_dict(), **asdict(progress)})
+    dataset.rename(root)
+
+
+def _keep_finished(folder: Path) -> str:
+    """Delete what is unfinished, which gives a full disk its space back; return what is kept."""
+    remove_unfinished(folder)
+    num_episodes = reached(folder).num_episodes
+    if not num_episodes:
+        shutil.rmtree(folder, ignore_errors=True)
+        return "no block of episodes was finished, so nothing is kept"
+    return f"{num_episodes} episodes are kept in {folder}, go on with --resume"

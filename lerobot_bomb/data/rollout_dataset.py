@@ -1,0 +1,65 @@
+"""Rollouts as episodes of a LeRobotDataset: its features, frames and columns."""
+
+import json
+from typing import Any
+
+from lerobot.utils.constants import ACTION, OBS_IMAGES, OBS_PREFIX, OBS_STATE
+
+from lerobot_bomb import __version__
+from lerobot_bomb.camera_geometry import geometry_shapes
+from lerobot_bomb.data.blocks import DatasetLayout, Episode
+from lerobot_bomb.data.recording import Recording
+from lerobot_bomb.data.rollout import Rollout
+from lerobot_bomb.schema import ACTION_NAMES, CAMERAS, PROTOCOL_VERSION, STATE_NAMES, EpisodeResult
+
+
+def rollout_layout(recording: Recording) -> DatasetLayout:
+    """LeRobot's features under the environment's policy-side keys; never `environment_state`."""
+    size = recording.image_size
+    dtype = "image" if recording.images else "video"
+    image = {"dtype": dtype, "shape": (size, size, 3), "names": ["height", "width", "channels"]}
+    action_names = ACTION_NAMES[recording.control_mode]
+    # arrays, not images: a policy would take images of depth, intrinsics and extrinsics for cameras
+    geometry = {
+        f"{OBS_PREFIX}{key}": {"dtype": "float32", "shape": shape, "names": ["row", "column"]}
+        for key, shape in geometry_shapes(recording.render_options).items()
+    }
+    features = {
+        **{f"{OBS_IMAGES}.{camera}": dict(image) for camera in CAMERAS},
+        OBS_STATE: {"dtype": "float32", "shape": (len(STATE_NAMES),), "names": list(STATE_NAMES)},
+        ACTION: {"dtype": "float32", "shape": (len(action_names),), "names": list(action_names)},
+        **geometry,
+    }
+    # with the protocol's version, so that LeRobot refuses to merge datasets of different ones
+    robot_type = f"bomb_{recording.robot}_v{PROTOCOL_VERSION}"
+    return DatasetLayout(
+        recording.repo_id, recording.fps, robot_type, features, not recording.images, tuple(geometry)
+    )
+
+
+def rollout_episode(rollout: Rollout) -> Episode:
+    """What the dataset stores of one rollout."""
+    frames = (_frame(rollout, step) for step in range(rollout.result.steps))
+    return Episode(frames, _columns(rollout.result))
+
+
+def _frame(rollout: Rollout, step: int) -> dict[str, Any]:
+    return {
+        **{f"{OBS_IMAGES}.{camera}": frames[step] for camera, frames in rollout.frames.items()},
+        **{f"{OBS_PREFIX}{key}": values[step] for key, values in rollout.geometry.items()},
+        OBS_STATE: rollout.states[step],
+        ACTION: rollout.actions[step],
+        "task": rollout.result.instruction,
+    }
+
+
+def _columns(result: EpisodeResult) -> dict[str, Any]:
+    return {
+        "bomb/seed": result.spec.seed,
+        "bomb/target": list(result.target),
+        "bomb/color": result.color,
+        "bomb/levels": json.dumps(result.levels),
+        "bomb/spec": json.dumps(result.spec.to_dict()),
+        "bomb/protocol_version": result.protocol_version,
+        "bomb/package_version": __version__,
+    }
