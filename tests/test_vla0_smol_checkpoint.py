@@ -103,6 +103,19 @@ def test_a_checkpoint_needs_nothing_but_itself(tmp_path: Path) -> None:
     torch.testing.assert_close(torch.load(tmp_path / "action.pt"), expected)
 
 
+def test_a_checkpoint_keeps_its_system_prompt(tmp_path: Path) -> None:
+    policy = make_policy(system_prompt="Be precise.")
+    save(policy, tmp_path)
+    loaded = Vla0SmolPolicy.from_pretrained(tmp_path)
+    batch = make_batch(policy, 2)
+    assert torch.equal(loaded._prompt(batch).ids, policy._prompt(batch).ids)
+    loaded.config.system_prompt = "Be quick."
+    with pytest.raises(
+        ValueError, match=r"--policy.system_prompt='Be quick.': .* trained with 'Be precise.'"
+    ):
+        Vla0SmolPolicy.from_pretrained(tmp_path, config=loaded.config)
+
+
 def test_config_survives_as_json(tmp_path: Path) -> None:
     policy = make_policy(number_width=4)
     policy.config._save_pretrained(tmp_path)
@@ -144,6 +157,12 @@ def test_an_observation_without_a_task_is_an_error(task: Any) -> None:
         ({"n_action_steps": 0}, r"--policy.n_action_steps=0 must lie in 1..3"),
         ({"chunk_size": 0}, r"--policy.chunk_size=0 must be at least 1"),
         ({"n_obs_steps": 2}, r"--policy.n_obs_steps=2"),
+        ({"temporal_ensemble_size": 4}, r"--policy.temporal_ensemble_size=4 must be 0 .* or lie in 1..3"),
+        (
+            {"temporal_ensemble_size": 3, "n_action_steps": 2},
+            r"--policy.temporal_ensemble_size=3 .* needs --policy.n_action_steps=1; got 2, which is a queue",
+        ),
+        ({"temporal_ensemble_weighting": "newest"}, r"--policy.temporal_ensemble_weighting='newest' is unk"),
         ({"n_action_bins": 1}, r"--policy.n_action_bins=1 must lie in 2.."),
         ({"n_state_bins": -5}, r"--policy.n_state_bins=-5 must lie in 2.."),
         ({"number_width": 2}, r"--policy.number_width=2 must be 0 \(no padding\) or lie in 3.."),
@@ -184,6 +203,10 @@ IMAGE_FEATURE = {WRIST: PolicyFeature(FeatureType.VISUAL, (3, 64, 64))}
     [
         ({"input_features": STATE_FEATURE}, "needs at least one camera; .*'observation.state'"),
         ({"input_features": IMAGE_FEATURE}, "--policy.use_state=true needs .* Give --policy.use_state=false"),
+        (
+            {"input_features": IMAGE_FEATURE, "use_state": False, "relative_actions": True},
+            "--policy.relative_actions=true needs .* Give --policy.relative_actions=false",
+        ),
         ({"output_features": {}}, "needs the feature 'action'"),
         (
             {"input_features": {**STATE_FEATURE, WRIST: PolicyFeature(FeatureType.VISUAL, (1, 64, 64))}},

@@ -1,0 +1,119 @@
+"""Relative actions inside the policy: fitted to a dataset, saved, loaded, fitted anew."""
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+from lerobot.datasets import LeRobotDataset, LeRobotDatasetMetadata
+from vla0_smol_cases import make_batch, make_config, make_policy
+
+from lerobot_policy_vla0_smol.modeling_vla0_smol import Vla0SmolPolicy
+
+
+def make_dataset(root: Path, reach: float, *, delta: bool = False) -> LeRobotDatasetMetadata:
+    """Two episodes of 30 frames; the action is the state and up to `reach` more, or the state's change."""
+    names = ["x", "y", "z", "grip"]
+    features = {
+        key: {"dtype": "float32", "shape": (4,), "names": names} for key in ("observation.state", "action")
+    }
+    dataset = LeRobotDataset.create("test/relative", fps=10, features=features, root=root, use_videos=False)
+    generator = np.random.default_rng(0)
+    for _ in range(2):
+        states = np.cumsum(generator.uniform(-1, 1, size=(30, 4)), axis=0)
+        offsets = generator.uniform(-reach, reach, size=(30, 4))
+        actions = np.diff(states, axis=0, append=states[-1:]) if delta else states + offsets
+        for state, action in zip(states, actions, strict=True):
+            frame = {"observation.state": state.astype(np.float32), "action": action.astype(np.float32)}
+            dataset.add_frame({**frame, "task": "push"})
+        dataset.save_episode()
+    dataset.finalize()
+    return LeRobotDatasetMetadata("test/relative", root=root)
+
+
+def build(meta: LeRobotDatasetMetadata | None, **options: Any) -> Vla0SmolPolicy:
+    torch.manual_seed(0)
+    config = make_config(**{"relative_actions": True, "chunk_size": 3, **options})
+    return Vla0SmolPolicy(config, dataset_meta=meta).eval()
+
+
+def test_written_numbers_are_the_residuals(tmp_path: Path) -> None:
+    meta = make_dataset(tmp_path / "data", 0.1)
+    policy = build(meta, n_action_bins=999, bin_mode="levels", action_feature_names=["x", "y", "z", "grip"])
+    assert policy.relative is not None and meta.stats is not None
+    action, state = (meta.stats[key] for key in ("action", "observation.state"))
+    state_raw, action_raw = np.array([0.5, -0.5, 1.0, 0.0]), np.array([0.55, -0.6, 1.0, 0.2])
+    normalise = lambda x, s: torch.from_numpy(2 * (x - s["min"]) / (s["max"] - s["min"]) - 1).float()  # noqa: E731
+    batch = make_batch(policy, 1)
+    batch["observation.state"] = normalise(state_raw, state)[None]
+    batch["action"] = normalise(action_raw, action).expand(1, 3, 4)
+    written = policy.action_bins.decode(policy._bins(batch)).view(3, 4)[0]
+    unit = policy.relative.scale.numpy() * (action["max"] - action["min"]) / 2
+    np.testing.assert_allclose(
+        written * unit, (action_raw - state_raw).clip(-unit, unit), atol=unit.max() / 998
+    )
+    torch.testing.assert_close(policy._unit, torch.from_numpy(unit).float())
+
+
+def test_actions_come_out_absolute_whatever_is_written(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    policy = build(make_dataset(tmp_path / "data", 0.1), bin_mode="levels", n_action_bins=999)
+    batch = make_batch(policy, 2)
+    bins = torch.full((2, 12), 499)  # zero: stay
+    monkeypatch.setattr("lerobot_policy_vla0_smol.modeling_vla0_smol.decode_numbers", lambda *_, **__: bins)
+    chunk = policy.predict_action_chunk(batch)
+    assert policy.relative is not None
+    anchor = (policy.relative.gain * batch["observation.state"] + policy.relative.bias).clamp(-1, 1)
+    torch.testing.assert_close(chunk, anchor[:, None].expand(2, 3, 4))
+
+
+def test_a_checkpoint_keeps_its_scale_and_new_data_replace_it(tmp_path: Path) -> None:
+    policy = build(make_dataset(tmp_path / "data", 0.1))
+    policy.save_pretrained(tmp_path / "checkpoint")
+    loaded = Vla0SmolPolicy.from_pretrained(tmp_path / "checkpoint")
+    batch = make_batch(policy, 2)
+    assert torch.equal(loaded.predict_action_chunk(batch), policy.predict_action_chunk(batch))
+    wider = make_dataset(tmp_path / "wider", 0.9)
+    tuned = Vla0SmolPolicy.from_pretrained(tmp_path / "checkpoint", dataset_meta=wider)
+    assert policy.relative is not None and tuned.relative is not None and loaded.relative is not None
+    assert torch.equal(loaded.relative.scale, policy.relative.scale)
+    fresh = build(wider)
+    assert fresh.relative is not None
+    assert torch.equal(tuned.relative.scale, fresh.relative.scale)
+    assert not torch.equal(tuned.relative.scale, policy.relative.scale)
+
+
+def test_excluded_dimensions_stay_absolute(tmp_path: Path) -> None:
+    names = ["x", "y", "z", "grip"]
+    meta = make_dataset(tmp_path / "data", 0.1)
+    policy = build(meta, action_feature_names=names, relative_exclude_joints=["grip", "y"])
+    assert policy.relative is not None
+    batch = make_batch(policy, 2)
+    relative = policy.relative.encode(batch["action"], batch["observation.state"])
+    assert torch.equal(relative[..., [1, 3]], batch["action"][..., [1, 3]])
+    assert not torch.isclose(relative[..., [0, 2]], batch["action"][..., [0, 2]]).any()
+
+
+def test_delta_control_is_refused(tmp_path: Path) -> None:
+    with pytest.raises(
+        ValueError, match=r"--policy.relative_actions=true: action dimension 0 does not follow"
+    ):
+        build(make_dataset(tmp_path / "data", 0.1, delta=True))
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ({"relative_exclude_joints": ["grip"]}, "no action dimension is called 'grip'; there are 0, 1, 2, 3"),
+        (
+            {"relative_state_indices": [0, 1]},
+            r"4 of 4 action dimensions are relative and the state has 4; give",
+        ),
+        ({"relative_state_indices": [0, 1, 2, 4]}, r"relative_state_indices=\[0, 1, 2, 4\] must lie in 0..3"),
+    ],
+)
+def test_dimensions_that_do_not_fit_are_refused(options: dict[str, Any], message: str) -> None:
+    with pytest.raises(ValueError, match=message):
+        make_policy(relative_actions=True, **options)
