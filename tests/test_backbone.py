@@ -1,13 +1,13 @@
 import json
+import re
 from pathlib import Path
 from typing import Any
 
 import pytest
 import torch
-from tokenizers import Tokenizer, models, pre_tokenizers
+from tokenizers import Tokenizer
 
 from lerobot_bomb.vlm.backbone import SmolVLMBackbone, build_backbone, config_dict, load_backbone
-from lerobot_bomb.vlm.images import crop_and_resize
 from lerobot_bomb.vlm.presets import nano_config
 from lerobot_bomb.vlm.prompt import PromptTokens, normalize_task, task_ids
 from lerobot_bomb.vlm.tokenizer import (
@@ -101,13 +101,25 @@ def test_prompt_tokens_survive_as_json() -> None:
     assert PromptTokens(**json.loads(json.dumps(tokens.to_dict()))) == tokens
 
 
-def test_a_tokenizer_that_merges_digits_is_refused() -> None:
-    alphabet = sorted(pre_tokenizers.ByteLevel.alphabet())
-    vocabulary = {text: i for i, text in enumerate([*alphabet, "51", "512"])}
-    tokenizer = Tokenizer(models.BPE(vocab=vocabulary, merges=[("5", "1"), ("51", "2")]))
-    tokenizer.pre_tokenizer = pre_tokenizers.ByteLevel(add_prefix_space=False)
-    with pytest.raises(ValueError, match=r"--policy.vlm_model_name=some/model: .* merges digits \(' 512'"):
-        PromptTokens.from_tokenizer(tokenizer, "some/model")
+@pytest.mark.parametrize(
+    ("merge", "where"),
+    [
+        ("73", "('73' in '1 72 73 74 7')"),
+        ("Ġ6", "(' 6' in '3 4 5 6 7 8 ')"),
+        ("6Ġ", "('6 ' in ' 4 5 6 7 8 9')"),
+        ("9,", "('9,' in '8 9999,')"),
+        (":Ġ", "(': ' in 'State: 0 1 2')"),
+    ],
+)
+def test_a_tokenizer_that_merges_digits_is_refused(merge: str, where: str) -> None:
+    """Any pair of symbols that becomes one token is found, wherever it stands."""
+    stored = json.loads(nano_tokenizer().to_str())
+    stored["model"]["vocab"][merge] = len(stored["model"]["vocab"]) + len(SPECIAL_TOKENS)
+    stored["model"]["merges"].append(list(merge))
+    stored["pre_tokenizer"] = {**stored["pre_tokenizer"]["pretokenizers"][1], "use_regex": False}
+    message = f"--policy.vlm_model_name=some/model: its tokenizer merges digits or spaces {where}"
+    with pytest.raises(ValueError, match=re.escape(message)):
+        PromptTokens.from_tokenizer(Tokenizer.from_str(json.dumps(stored)), "some/model")
 
 
 def test_a_tokenizer_without_the_special_tokens_is_refused() -> None:
@@ -199,28 +211,3 @@ def test_another_kind_of_model_is_refused(tmp_path: Path) -> None:
     (tmp_path / "config.json").write_text('{"model_type": "gpt2"}')
     with pytest.raises(ValueError, match="is a 'gpt2' model; vla0_smol needs a 'smolvlm' one"):
         load_backbone(str(tmp_path))
-
-
-# Images
-
-
-def test_the_centre_is_cropped_without_a_generator() -> None:
-    image = torch.zeros(1, 3, 8, 8)
-    image[..., 2:6, 2:6] = 1.0
-    cropped = crop_and_resize(image, 0.5, 4, None)
-    assert torch.equal(cropped, torch.ones(1, 3, 4, 4))
-
-
-def test_pixels_are_mapped_to_minus_one_to_one() -> None:
-    levels = torch.tensor([0.0, 0.5, 1.0]).view(3, 1, 1, 1).expand(3, 3, 5, 7)
-    pixels = crop_and_resize(levels, 1.0, 4, None)
-    assert pixels[:, 0, 0, 0].tolist() == pytest.approx([-1.0, 0.0, 1.0], abs=1e-6)
-    assert pixels.shape == (3, 3, 4, 4)
-
-
-def test_random_crops_differ_by_image_and_reach_every_corner() -> None:
-    ramp = (torch.arange(10.0)[:, None] * 10 + torch.arange(10.0)) / 99
-    images = ramp.expand(200, 3, 10, 10)
-    crops = crop_and_resize(images, 0.8, 8, torch.Generator().manual_seed(0))
-    corners = ((crops[:, 0, 0, 0] * 0.5 + 0.5) * 99).round().long()
-    assert set(corners.tolist()) == {10 * row + column for row in range(3) for column in range(3)}

@@ -9,6 +9,7 @@ import torch
 from torch import Tensor
 from vla0_smol_cases import WORKSPACE, WRIST, make_batch, make_policy, numbers_of, raw_batch
 
+from lerobot_bomb.vlm.images import resize
 from lerobot_bomb.vlm.prompt import normalize_task
 from lerobot_bomb.vlm.tokenizer import load_tokenizer
 from lerobot_policy_vla0_smol.modeling_vla0_smol import IGNORED, Vla0SmolPolicy
@@ -120,15 +121,8 @@ def naive_loss(policy: Vla0SmolPolicy, batch: dict[str, Any], row: int) -> Tenso
     numbers = policy.action_bins.encode(batch["action"][row]).flatten().tolist()
     ids = load_tokenizer("nano").encode(full_text(policy, raw["task"][row], state, numbers)).ids
     length = len("".join(f" {number}" for number in numbers)) + 1
-    crops = [
-        torch.nn.functional.interpolate(
-            raw[key][row, :, 4:60, 4:60][None],
-            size=policy.backbone.image_size,
-            mode="bilinear",
-            antialias=True,
-        )
-        for key in (WORKSPACE, WRIST)
-    ]
+    size = policy.backbone.image_size
+    crops = [resize(raw[key][row, :, 4:60, 4:60][None], size) for key in (WORKSPACE, WRIST)]
     logits = policy.backbone.vlm(
         input_ids=torch.tensor([ids]), pixel_values=(torch.stack(crops, dim=1) - 0.5) / 0.5
     ).logits[0]

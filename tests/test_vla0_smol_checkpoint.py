@@ -10,12 +10,15 @@ import pytest
 import torch
 from lerobot.configs import FeatureType, NormalizationMode, PolicyFeature, PreTrainedConfig
 from lerobot.policies.factory import make_pre_post_processors
+from lerobot.utils.constants import OBS_LANGUAGE_TOKENS
 from safetensors.torch import load_file, save_file
+from tokenizers import Tokenizer
 from torch import Tensor
 from vla0_smol_cases import STATS, WRIST, make_batch, make_config, make_policy, raw_batch
 
 from lerobot_bomb.flags import FlagError
-from lerobot_policy_vla0_smol import make_vla0_smol_pre_post_processors
+from lerobot_bomb.vlm.prompt import task_ids
+from lerobot_policy_vla0_smol import make_vla0_smol_pre_post_processors, processor_vla0_smol
 from lerobot_policy_vla0_smol.modeling_vla0_smol import Vla0SmolPolicy
 
 # Checkpoints
@@ -57,6 +60,29 @@ def test_the_four_steps_that_lerobot_overrides_are_there() -> None:
         ],
         ["unnormalizer_processor", "device_processor"],
     ]
+
+
+def test_a_task_is_tokenized_once_and_what_is_kept_is_not_saved(monkeypatch: pytest.MonkeyPatch) -> None:
+    tokenized: list[str] = []
+
+    def count(tokenizer: Tokenizer, task: str) -> list[int]:
+        tokenized.append(task)
+        return task_ids(tokenizer, task)
+
+    monkeypatch.setattr(processor_vla0_smol, "task_ids", count)
+    monkeypatch.setattr(processor_vla0_smol, "MAX_KEPT_TASKS", 3)
+    preprocessor, _ = make_vla0_smol_pre_post_processors(make_config(), STATS)
+    step = preprocessor.steps[2]
+    before = step.get_config(), step.state_dict()
+    first, again = preprocessor(raw_batch(3)), preprocessor(raw_batch(3))
+    assert tokenized == raw_batch(3)["task"]
+    assert torch.equal(first[OBS_LANGUAGE_TOKENS], again[OBS_LANGUAGE_TOKENS])
+    preprocessor(raw_batch(5))
+    assert len(tokenized) == 5  # two more tasks displace those that were kept
+    assert (before[0], before[1].keys()) == (step.get_config(), step.state_dict().keys())
+    step.load_state_dict(step.state_dict())
+    preprocessor(raw_batch(1))
+    assert tokenized[5:] == raw_batch(1)["task"]
 
 
 def test_a_missing_or_unexpected_tensor_is_an_error(tmp_path: Path) -> None:

@@ -12,6 +12,7 @@ from torch import Tensor
 NUM_SYMBOLS = 12
 SPACE, END = 10, 11
 SYMBOL_TEXTS = (*"0123456789", " ", "<end_of_utterance>")
+MAX_DIGITS = 4  # of any number that a policy reads or writes
 
 MASK_LEVELS = ("value", "step", "char")
 

@@ -1,8 +1,14 @@
-"""Camera images -> what a vision model reads, on tensors."""
+"""Camera images -> what a vision model reads, on tensors.
+
+Shapes: `B` images, `H` and `W` their sides, `S` side of the model's input, all in pixels.
+"""
+
+from functools import lru_cache
 
 import torch
 from torch import Tensor
-from torch.nn.functional import interpolate
+
+LANCZOS_LOBES = 3
 
 
 def crop_and_resize(
@@ -11,7 +17,8 @@ def crop_and_resize(
     """(B, 3, H, W) in [0, 1] -> (B, 3, size, size) in [-1, 1].
 
     Cuts a window of ``crop_fraction`` of either side, at a place of its own for every image drawn from
-    ``generator``, or at the centre where that is None.
+    ``generator``, or at the centre where that is None. The window is resized as SmolVLM's own processor
+    does it with ``do_resize=False, do_image_splitting=False``; see `resize`.
     """
     batch_size, _, height, width = images_B3HW.shape
     crop_height, crop_width = max(1, round(height * crop_fraction)), max(1, round(width * crop_fraction))
@@ -24,7 +31,40 @@ def crop_and_resize(
         image[:, top : top + crop_height, left : left + crop_width]
         for image, (top, left) in zip(images_B3HW, offsets_B2.tolist(), strict=True)
     ]
-    resized_B3SS = interpolate(
-        torch.stack(windows), size=(size, size), mode="bilinear", align_corners=False, antialias=True
-    )
-    return (resized_B3SS - 0.5) / 0.5
+    return resize(torch.stack(windows), size).mul_(2).sub_(1)
+
+
+def resize(images_B3HW: Tensor, size: int) -> Tensor:
+    """(B, 3, H, W) in [0, 1] -> (B, 3, size, size) in [0, 1], as Pillow's Lanczos filter does it.
+
+    That is what ``AutoProcessor`` uses for SmolVLM. Lines first, then columns, each the product with a
+    fixed matrix; like Pillow's, both results are 8 bit levels, so overshoot at edges is cut off in between.
+    Pictures that are not square are stretched. Equal to Pillow's but for a level where rounding is a tie.
+    """
+    height, width = images_B3HW.shape[-2:]
+    device = images_B3HW.device
+    across_SW, down_SH = lanczos_weights(width, size, device), lanczos_weights(height, size, device)
+    with torch.autocast(device.type, enabled=False):
+        lines_B3HS = _round_levels(images_B3HW.to(across_SW.dtype) * 255 @ across_SW.T)
+        return _round_levels(down_SH @ lines_B3HS).float().div_(255)
+
+
+def _round_levels(levels: Tensor) -> Tensor:
+    """To whole numbers in 0..255, upwards from the middle between two; in place."""
+    return levels.add_(0.5).floor_().clamp_(0, 255)
+
+
+@lru_cache(maxsize=64)
+def lanczos_weights(old_size: int, new_size: int, device: torch.device) -> Tensor:
+    """Matrix (new_size, old_size) that resamples a line of pixels; its rows sum to 1.
+
+    When it shrinks a line, the filter is widened by as much. On CUDA in float64: LeRobot allows TF32 there,
+    whose rounding would be off by two levels.
+    """
+    scale = old_size / new_size  # old pixels per new one
+    centres_N1 = (torch.arange(new_size, dtype=torch.float64)[:, None] + 0.5) * scale
+    distances_NO = (torch.arange(old_size) + 0.5 - centres_N1) / max(scale, 1.0)
+    lanczos_NO = torch.sinc(distances_NO) * torch.sinc(distances_NO / LANCZOS_LOBES)
+    weights_NO = lanczos_NO.where(distances_NO.abs() < LANCZOS_LOBES, 0)
+    weights_NO /= weights_NO.sum(dim=1, keepdim=True)
+    return weights_NO.to(device, torch.float64 if device.type == "cuda" else torch.float32)

@@ -9,7 +9,7 @@ from lerobot.optim import AdamWConfig, CosineDecayWithWarmupSchedulerConfig
 from lerobot_bomb.actions.bins import BIN_MODES
 from lerobot_bomb.actions.ensemble import WEIGHTINGS
 from lerobot_bomb.actions.relative import named_dims
-from lerobot_bomb.actions.text import MASK_LEVELS, digits_needed
+from lerobot_bomb.actions.text import MASK_LEVELS, MAX_DIGITS, digits_needed
 from lerobot_bomb.flags import flag_errors, one_of
 
 DTYPES = ("float32", "bfloat16")
@@ -20,7 +20,7 @@ BOUNDED_MODES = (
     NormalizationMode.QUANTILE10,
     NormalizationMode.IDENTITY,
 )
-MAX_BINS = 10_000
+MAX_BINS = 10**MAX_DIGITS
 
 
 @PreTrainedConfig.register_subclass("vla0_smol")
@@ -172,10 +172,10 @@ class Vla0SmolConfig(PreTrainedConfig):
         for flag, bins in {"n_action_bins": self.n_action_bins, "n_state_bins": self.n_state_bins}.items():
             if not 2 <= bins <= MAX_BINS:
                 raise ValueError(f"--policy.{flag}={bins} must lie in 2..{MAX_BINS}")
-            if self.number_width and not digits_needed(bins) <= self.number_width <= digits_needed(MAX_BINS):
+            if self.number_width and not digits_needed(bins) <= self.number_width <= MAX_DIGITS:
                 raise ValueError(
                     f"--policy.number_width={self.number_width} must be 0 (no padding) or lie in "
-                    f"{digits_needed(bins)}..{digits_needed(MAX_BINS)} for --policy.{flag}={bins}"
+                    f"{digits_needed(bins)}..{MAX_DIGITS} for --policy.{flag}={bins}"
                 )
 
     def _check_training(self) -> None:
