@@ -1,0 +1,66 @@
+"""Columns of a dataset, read without its pictures."""
+
+from collections.abc import Iterable, Sequence
+
+import numpy as np
+import pyarrow as pa
+import pyarrow.parquet as pq
+from lerobot.datasets import LeRobotDatasetMetadata
+from lerobot.utils.constants import DEFAULT_FEATURES
+
+EPISODE_INDEX = "episode_index"
+
+
+def read_columns(
+    meta: LeRobotDatasetMetadata, keys: Iterable[str], episodes: Sequence[int] | None = None
+) -> dict[str, np.ndarray]:
+    """{key: (N, ...)} of N frames in the dataset's order, `episode_index` (N,) always among them.
+
+    Reads the data files under ``meta.root``; ``LeRobotDataset`` downloads them if they are not there.
+
+    Raises:
+        ValueError: a key is no column of numbers, or an episode does not exist.
+        FileNotFoundError: a data file is absent.
+    """
+    columns = list(dict.fromkeys([*keys, EPISODE_INDEX]))
+    _check_columns(meta, columns)
+    wanted = list(range(meta.total_episodes)) if episodes is None else sorted(set(episodes))
+    absent = [episode for episode in wanted if not 0 <= episode < meta.total_episodes]
+    if absent or not wanted:
+        raise ValueError(
+            f"dataset {meta.repo_id} has the episodes 0..{meta.total_episodes - 1}; "
+            f"asked for {absent or 'none at all'}"
+        )
+    files = dict.fromkeys(meta.get_data_file_path(episode) for episode in wanted)
+    rows = [(EPISODE_INDEX, "in", wanted)]
+    read = list({*columns, "index"})
+    tables = [pq.read_table(meta.root / file, columns=read, filters=rows) for file in files]
+    table = pa.concat_tables(tables).sort_by("index")
+    shapes = {key: () if key in DEFAULT_FEATURES else meta.features[key]["shape"] for key in columns}
+    return {key: _to_array(table[key]).reshape(len(table), *shapes[key]) for key in columns}
+
+
+def episode_bounds(episode_index_N: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """(N,) sorted -> first row of each row's episode and the row after its last one, (N,) each."""
+    return (
+        np.searchsorted(episode_index_N, episode_index_N, side="left"),
+        np.searchsorted(episode_index_N, episode_index_N, side="right"),
+    )
+
+
+def _check_columns(meta: LeRobotDatasetMetadata, columns: list[str]) -> None:
+    pictures_and_texts = ("image", "video", "string", "language")
+    numeric = [key for key, feature in meta.features.items() if feature["dtype"] not in pictures_and_texts]
+    unknown = [key for key in columns if key not in numeric]
+    if unknown:
+        raise ValueError(f"dataset {meta.repo_id} has no columns {unknown}; it has {sorted(numeric)}")
+
+
+def _to_array(column: pa.ChunkedArray) -> np.ndarray:
+    """All numbers of a column of scalars or (nested) lists, in one row."""
+    array = column.combine_chunks()
+    while isinstance(array, pa.ExtensionArray):
+        array = array.storage
+    while pa.types.is_nested(array.type):
+        array = array.flatten()
+    return array.to_numpy(zero_copy_only=False)
