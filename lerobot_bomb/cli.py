@@ -9,16 +9,25 @@ from lerobot_bomb import __version__
 
 DESCRIPTION = "What lerobot-train and lerobot-eval do not do for BOMB: record, summarise, check."
 
-# command -> (help, module with add_<command>_arguments and run_<command>); imported only when called
+# command -> (help, module with add_<command>_arguments and run_<command>, in which a hyphen is an
+# underscore); imported only when called
 COMMANDS = {
     "record": ("record the scripted expert as a LeRobotDataset", "lerobot_bomb.data.record"),
     "convert": ("published demonstrations as a LeRobotDataset", "lerobot_bomb.data.convert"),
     "results": ("summarise files written by --env.results_path", "lerobot_bomb.evaluation.results"),
+    "offline-metrics": (
+        "loss, accuracy and L1 of a checkpoint on recorded frames, beside trivial predictors",
+        "lerobot_bomb.evaluation.offline_metrics",
+    ),
     "view": ("play one episode into a recording for Rerun and a video", "lerobot_bomb.viewing.view"),
     "gallery": ("draw what every perturbation axis changes", "lerobot_bomb.viewing.gallery"),
     "demo": ("record, train and evaluate on this machine in minutes", "lerobot_bomb.demo"),
     "doctor": ("check this installation", "lerobot_bomb.doctor"),
 }
+
+
+def _function(command: str) -> str:
+    return command.replace("-", "_")
 
 
 def main(argv: Sequence[str] | None = None) -> int:
@@ -34,9 +43,9 @@ def main(argv: Sequence[str] | None = None) -> int:
             command = commands.add_parser(name, help=summary, description=summary)
             if name in argv[:1]:
                 modules[name] = importlib.import_module(module)
-                getattr(modules[name], f"add_{name}_arguments")(command)
+                getattr(modules[name], f"add_{_function(name)}_arguments")(command)
         args = parser.parse_args(argv)
-        return getattr(modules[args.command], f"run_{args.command}")(args)
+        return getattr(modules[args.command], f"run_{_function(args.command)}")(args)
     except (ValueError, OSError, RuntimeError) as error:
         print(f"lerobot-bomb {argv[0]}: {error}", file=sys.stderr)
         return 1

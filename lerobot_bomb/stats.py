@@ -1,7 +1,11 @@
-"""Intervals and tests for success rates."""
+"""Intervals and tests for success rates, and intervals for means over episodes."""
 
 from math import comb, sqrt
 from statistics import NormalDist
+
+import numpy as np
+
+NUM_RESAMPLES = 2000
 
 
 def wilson_interval(successes: int, n: int, confidence: float = 0.95) -> tuple[float, float]:
@@ -37,3 +41,17 @@ def mcnemar_p_value(only_first: int, only_second: int) -> float:
     num_discordant = only_first + only_second
     tail = sum(comb(num_discordant, k) for k in range(min(only_first, only_second) + 1))
     return min(1.0, 2 * tail / 2**num_discordant)
+
+
+def bootstrap_interval(sums_E: np.ndarray, counts_E: np.ndarray) -> tuple[float, float] | None:
+    """95 % percentile bootstrap interval of sum / count over E episodes; None for fewer than two.
+
+    Episodes are drawn, not frames: the frames of one resemble each other. The draws are always the same.
+    """
+    num_episodes = len(sums_E)
+    if num_episodes < 2:
+        return None
+    draws = np.random.default_rng(0).integers(num_episodes, size=(NUM_RESAMPLES, num_episodes))
+    means = sums_E[draws].sum(axis=1) / counts_E[draws].sum(axis=1)
+    low, high = np.percentile(means, [2.5, 97.5])
+    return float(low), float(high)

@@ -33,7 +33,8 @@ def read_columns(
         )
     files = dict.fromkeys(meta.get_data_file_path(episode) for episode in wanted)
     rows = [(EPISODE_INDEX, "in", wanted)]
-    tables = [pq.read_table(meta.root / file, columns=[*columns, "index"], filters=rows) for file in files]
+    read = list({*columns, "index"})
+    tables = [pq.read_table(meta.root / file, columns=read, filters=rows) for file in files]
     table = pa.concat_tables(tables).sort_by("index")
     shapes = {key: () if key in DEFAULT_FEATURES else meta.features[key]["shape"] for key in columns}
     return {key: _to_array(table[key]).reshape(len(table), *shapes[key]) for key in columns}

@@ -1,6 +1,5 @@
 """A checkpoint that acts in one environment, loaded and called as lerobot-eval does it."""
 
-from contextlib import nullcontext
 from pathlib import Path
 from typing import Any
 
@@ -8,17 +7,15 @@ import numpy as np
 import torch
 from lerobot.configs import PreTrainedConfig
 from lerobot.envs import EnvConfig, make_env_pre_post_processors, preprocess_observation
-from lerobot.policies import make_policy, make_pre_post_processors
-from lerobot.utils.constants import ACTION, OBS_STATE, POLICY_PREPROCESSOR_DEFAULT_NAME
-from lerobot.utils.device_utils import get_safe_torch_device
-from lerobot.utils.import_utils import register_third_party_plugins
+from lerobot.policies import make_policy
+from lerobot.utils.constants import ACTION, OBS_STATE
 from lerobot.utils.random_utils import set_seed
 
+from lerobot_bomb.checkpoint import autocast, load_processors, read_config
 from lerobot_bomb.schema import ACTION_DIM, STATE_DIM, EpisodeSpec, RenderOptions
 from lerobot_bomb.viewing.episode import Agent
 
 ENV_TYPE = "bomb"
-FILES = ("config.json", f"{POLICY_PREPROCESSOR_DEFAULT_NAME}.json")
 
 
 def checkpoint_agent(path: Path, device: str | None, spec: EpisodeSpec, options: RenderOptions) -> Agent:
@@ -33,18 +30,12 @@ def checkpoint_agent(path: Path, device: str | None, spec: EpisodeSpec, options:
     policy = make_policy(cfg=config, env_cfg=env_config)
     policy.eval()
     policy.reset()
-    preprocess, postprocess = make_pre_post_processors(
-        policy_cfg=config,
-        pretrained_path=str(path),
-        preprocessor_overrides={"device_processor": {"device": str(config.device)}},
-    )
+    preprocess, postprocess = load_processors(config)
     env_preprocess, env_postprocess = make_env_pre_post_processors(env_cfg=env_config, policy_cfg=config)
-    device_type = get_safe_torch_device(str(config.device)).type
 
     def act(observation: dict[str, Any], instruction: str) -> np.ndarray:
         batch = {**preprocess_observation(_batch_of_one(observation)), "task": [instruction]}
-        autocast = torch.autocast(device_type) if config.use_amp else nullcontext()
-        with torch.inference_mode(), autocast:
+        with torch.inference_mode(), autocast(config):
             action = postprocess(policy.select_action(preprocess(env_preprocess(batch))))
         return env_postprocess({ACTION: action})[ACTION].to("cpu").numpy()[0]
 
@@ -52,16 +43,7 @@ def checkpoint_agent(path: Path, device: str | None, spec: EpisodeSpec, options:
 
 
 def _read_config(path: Path, device: str | None) -> PreTrainedConfig:
-    missing = [name for name in FILES if not (path / name).is_file()]
-    if missing:
-        raise ValueError(
-            f"--policy.path={path} holds no {missing[0]}, so it is no checkpoint of a policy; "
-            "give the folder that lerobot-train names pretrained_model"
-        )
-    register_third_party_plugins()
-    overrides = [] if device is None else [f"--device={device}"]
-    config = PreTrainedConfig.from_pretrained(path, cli_overrides=overrides)
-    config.pretrained_path = path
+    config = read_config(path, device)
     features = {**(config.input_features or {}), **(config.output_features or {})}
     for name, shape in ((ACTION, (ACTION_DIM,)), (OBS_STATE, (STATE_DIM,))):
         if name in features and tuple(features[name].shape) != shape:

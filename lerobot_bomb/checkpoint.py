@@ -1,0 +1,53 @@
+"""A checkpoint's folder, read as LeRobot's commands read it."""
+
+from contextlib import AbstractContextManager, nullcontext
+from pathlib import Path
+from typing import Any
+
+import torch
+from lerobot.configs import PreTrainedConfig
+from lerobot.policies import make_pre_post_processors
+from lerobot.processor import PolicyAction, PolicyProcessorPipeline
+from lerobot.utils.constants import POLICY_PREPROCESSOR_DEFAULT_NAME
+from lerobot.utils.device_utils import get_safe_torch_device, is_torch_device_available
+from lerobot.utils.import_utils import register_third_party_plugins
+
+FILES = ("config.json", f"{POLICY_PREPROCESSOR_DEFAULT_NAME}.json")
+
+Preprocessor = PolicyProcessorPipeline[dict[str, Any], dict[str, Any]]
+Postprocessor = PolicyProcessorPipeline[PolicyAction, PolicyAction]
+
+
+def read_config(path: Path, device: str | None) -> PreTrainedConfig:
+    """The config in the folder `pretrained_model`; `device` None means the checkpoint's own.
+
+    Raises:
+        ValueError: the folder holds no checkpoint, or this machine has no such device.
+    """
+    missing = [name for name in FILES if not (path / name).is_file()]
+    if missing:
+        raise ValueError(
+            f"--policy.path={path} holds no {missing[0]}, so it is no checkpoint of a policy; "
+            "give the folder that lerobot-train names pretrained_model"
+        )
+    if device is not None and not is_torch_device_available(device):
+        raise ValueError(f"the device {device} is not available on this machine; cpu is")
+    register_third_party_plugins()
+    overrides = [] if device is None else [f"--device={device}"]
+    config = PreTrainedConfig.from_pretrained(path, cli_overrides=overrides)
+    config.pretrained_path = path
+    return config
+
+
+def load_processors(config: PreTrainedConfig) -> tuple[Preprocessor, Postprocessor]:
+    """The processors saved with a checkpoint, on the config's device."""
+    return make_pre_post_processors(
+        policy_cfg=config,
+        pretrained_path=str(config.pretrained_path),
+        preprocessor_overrides={"device_processor": {"device": str(config.device)}},
+    )
+
+
+def autocast(config: PreTrainedConfig) -> AbstractContextManager:
+    """The precision in which LeRobot's commands call the policy."""
+    return torch.autocast(get_safe_torch_device(str(config.device)).type) if config.use_amp else nullcontext()

@@ -1,0 +1,103 @@
+"""Which episodes of a dataset a checkpoint was trained on, and which it is judged by."""
+
+import json
+import math
+import re
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from lerobot.datasets import LeRobotDatasetMetadata
+from lerobot.utils.constants import HF_LEROBOT_HOME
+
+TRAIN_CONFIG = "train_config.json"
+
+
+@dataclass(frozen=True)
+class Split:
+    """Episodes of the two columns; `seen` are those of the validation that were trained on."""
+
+    train: list[int]
+    validation: list[int]
+    seen: list[int]
+
+
+def parse_episodes(text: str) -> list[int]:
+    """'[180,181]', '180-205' or '[0-9,20]' -> sorted episode numbers, each once.
+
+    Raises:
+        ValueError: it is spelled otherwise.
+    """
+    parts = [part.strip() for part in text.strip().removeprefix("[").removesuffix("]").split(",")]
+    episodes: set[int] = set()
+    for part in parts:
+        match = re.fullmatch(r"(\d+)(?:-(\d+))?", part)
+        first, last = (int(match[1]), int(match[2] or match[1])) if match else (1, 0)
+        if first > last:
+            raise ValueError(f"episodes {text!r}: give numbers and ranges, as [180,181], 180-205 or [0-9,20]")
+        episodes.update(range(first, last + 1))
+    return sorted(episodes)
+
+
+def read_train_config(checkpoint: Path) -> dict[str, Any]:
+    """What lerobot-train was told; empty if the checkpoint does not say."""
+    path = checkpoint / TRAIN_CONFIG
+    return json.loads(path.read_text()) if path.is_file() else {}
+
+
+def trained_episodes(train_config: dict[str, Any], meta: LeRobotDatasetMetadata) -> list[int] | None:
+    """Episodes of this dataset that lerobot-train trained on; None if it trained on another dataset.
+
+    With `dataset.eval_split` LeRobot keeps the last ones of every task for itself.
+    """
+    dataset = train_config.get("dataset") or {}
+    root = Path(dataset.get("root") or HF_LEROBOT_HOME / str(dataset.get("repo_id")))
+    moved = not root.is_dir()  # a checkpoint of another machine names that machine's folder
+    if dataset.get("repo_id") != meta.repo_id or not (moved or root.resolve() == meta.root.resolve()):
+        return None
+    chosen = dataset.get("episodes")
+    chosen = list(range(meta.total_episodes)) if chosen is None else chosen
+    absent = [episode for episode in chosen if episode >= meta.total_episodes]
+    if absent:
+        raise ValueError(
+            f"the checkpoint was trained on the episodes {absent[:5]} of {meta.repo_id}, which in "
+            f"{meta.root} has only 0..{meta.total_episodes - 1}"
+        )
+    by_task: dict[str, list[int]] = {}
+    for episode in chosen:
+        tasks = meta.episodes[episode]["tasks"] if meta.episodes is not None else []
+        by_task.setdefault(tasks[0] if tasks else "", []).append(episode)
+    share = dataset.get("eval_split") or 0.0
+    kept = [episodes[: len(episodes) - math.ceil(len(episodes) * share)] for episodes in by_task.values()]
+    return sorted(episode for episodes in kept for episode in episodes)
+
+
+def make_split(
+    num_episodes: int,
+    trained: list[int] | None,
+    train: list[int] | None,
+    validation: list[int] | None,
+) -> Split:
+    """Default what was not asked for: train on what was trained on, validate on all that is left.
+
+    Raises:
+        ValueError: an episode does not exist or is asked for in both, or no episode is held out.
+    """
+    for flag, episodes in {"--train_episodes": train, "--val_episodes": validation}.items():
+        absent = [episode for episode in episodes or [] if episode >= num_episodes]
+        if absent:
+            raise ValueError(f"{flag}: the dataset has the episodes 0..{num_episodes - 1}, not {absent[:5]}")
+    known = set(trained or [])
+    if train is None:
+        train = sorted(known - set(validation or []))
+    if validation is None:
+        validation = [episode for episode in range(num_episodes) if episode not in known | set(train)]
+    if both := sorted(set(train) & set(validation)):
+        raise ValueError(f"--train_episodes and --val_episodes both name the episodes {both[:5]}")
+    if not validation:
+        raise ValueError(
+            f"all {num_episodes} episodes are training episodes, none is held out; name some with "
+            "--val_episodes=[...] (the loss on those is no validation), or give another dataset with "
+            "--dataset.repo_id and --dataset.root"
+        )
+    return Split(train, validation, sorted(set(validation) & known))
