@@ -4,10 +4,13 @@ import os
 import sys
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import pytest
 from recipes import POLICY_TYPES, read_recipe
+
+if TYPE_CHECKING:
+    from pusht_cases import Demonstrations
 
 os.environ.setdefault("OMP_NUM_THREADS", "1")
 os.environ["HF_HUB_OFFLINE"] = "1"  # no test may need the network
@@ -20,6 +23,39 @@ def shared_data() -> Path:
     if not path.is_dir():
         pytest.skip(f"{path} is absent; set SHARED_DATA to the folder of real inputs")
     return path.resolve()
+
+
+@pytest.fixture(scope="session")
+def pusht_demonstrations(shared_data: Path) -> "Demonstrations":
+    """The first real PushT demonstrations."""
+    from pusht_cases import NUM_EPISODES, ZARR, Demonstrations
+
+    return Demonstrations.read(shared_data / ZARR, NUM_EPISODES)
+
+
+@pytest.fixture(scope="session")
+def pusht_zarr(pusht_demonstrations: "Demonstrations", tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """They alone, as a zarr."""
+    path = tmp_path_factory.mktemp("source") / "small.zarr"
+    pusht_demonstrations.write(path)
+    return path
+
+
+@pytest.fixture(scope="session")
+def pusht_dataset(pusht_zarr: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """They as a LeRobotDataset, through the command line."""
+    from pusht_cases import REPO_ID
+
+    from lerobot_bomb import cli
+    from lerobot_bomb.data import convert
+
+    root = tmp_path_factory.mktemp("converted") / "pusht"
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(convert, "BLOCK_EPISODES", 2)
+        command = ["convert", "pusht-zarr", str(pusht_zarr), f"--repo_id={REPO_ID}", f"--root={root}"]
+        assert cli.main(command) == 0
+    assert list(root.parent.iterdir()) == [root]
+    return root
 
 
 @pytest.fixture

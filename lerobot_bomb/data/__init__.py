@@ -1,1 +1,1 @@
-"""Datasets: recording them with the scripted expert."""
+"""Datasets: recording them with the scripted expert, converting published ones."""
