@@ -92,8 +92,8 @@ class Vla0SmolPolicy(PreTrainedPolicy):
             logits_BAV = self._answer_logits(batch, prompt, answer)
         kept_BA = labels_BA != IGNORED
         losses_BA = cross_entropy(
-            logits_BAV.float().transpose(1, 2), labels_BA, ignore_index=IGNORED, reduction="none"
-        )
+            logits_BAV.float().flatten(0, 1), labels_BA.flatten(), ignore_index=IGNORED, reduction="none"
+        ).view_as(labels_BA)
         correct_BA = (logits_BAV.detach().argmax(dim=-1) == labels_BA) & kept_BA
         num_kept = kept_BA.sum()
         metrics = {"token_accuracy": (correct_BA.sum() / num_kept.clamp(min=1)).item()}
@@ -104,14 +104,12 @@ class Vla0SmolPolicy(PreTrainedPolicy):
     def _answer_logits(self, batch: dict[str, Tensor], prompt: TokenRows, answer: TokenRows) -> Tensor:
         """Teacher-forced logits of every answer token: (B, A, V)."""
         rows = TokenRows.join([prompt, answer])
-        rows = TokenRows(*reversed(compact(rows.written, rows.ids)))
-        hidden_BLH = self.backbone.hidden_states(
-            self._embeds(batch, rows.ids), rows.written, (rows.written.cumsum(dim=1) - 1).clamp(min=0)
-        )
-        offsets_A = torch.arange(answer.ids.shape[1], device=rows.ids.device)
+        _, ids_BL = compact(rows.written, rows.ids)
+        hidden_BLH = self.backbone.hidden_states(self._embeds(batch, ids_BL))
+        offsets_A = torch.arange(answer.ids.shape[1], device=ids_BL.device)
         # a token is predicted one column earlier; columns beyond a short row carry no label
         columns_BA = prompt.written.sum(dim=1, keepdim=True) - 1 + offsets_A
-        columns_BA = columns_BA.clamp(max=rows.ids.shape[1] - 1)
+        columns_BA = columns_BA.clamp(max=ids_BL.shape[1] - 1)
         index_BAH = columns_BA[..., None].expand(-1, -1, hidden_BLH.shape[-1])
         return self.backbone.logits(hidden_BLH.gather(1, index_BAH))
 
