@@ -71,4 +71,4 @@ def lanczos_weights(old_size: int, new_size: int, device: torch.device) -> Tenso
     lanczos_NO = torch.sinc(distances_NO) * torch.sinc(distances_NO / LANCZOS_LOBES)
     weights_NO = lanczos_NO.where(distances_NO.abs() < LANCZOS_LOBES, 0)
     weights_NO /= weights_NO.sum(dim=1, keepdim=True)
-    return weights_NO.to(device, torch.float64 if device.type == "cuda" else torch.float32)
+    return weights_NO.to(torch.float64 if device.type == "cuda" else torch.float32).to(device)
