@@ -1,41 +1,37 @@
-"""Does a policy learn from real data? PushT's human demonstrations, held-out episodes, predictors to beat.
+r"""Does a policy learn from real data? PushT's human demonstrations, held-out episodes, predictors to beat.
 
 The recipe configs/pusht_TYPE.yaml and its variants, each with several seeds, are trained by the stock
 `lerobot-train` on episodes 0-179; `lerobot-bomb offline-metrics` measures the decoded actions on episodes
-180-205, beside predictors that look at no picture. The recipe's checkpoints also play in LeRobot's `pusht`.
+180-205, beside predictors that look at no picture. With --eval_episodes the recipe's checkpoints also play in
+LeRobot's environment `pusht`.
 
-    python benchmarks/pusht_offline.py --policy.type=vla0_smol --output_dir pusht \\
-        --source pusht_cchi_v7_replay.zarr
+    python benchmarks/pusht_offline.py --policy.type=vla0_smol --source pusht_cchi_v7_replay.zarr \
+        --output_dir pusht
 
-What is finished stays in the output folder and is not done again: the dataset, each training, each measurement.
-Every process uses one thread; a training is two processes, one of which reads the frames.
+What is finished stays in the output folder and is not done again: the dataset, each training, each
+measurement. Every process uses one thread; a training is two processes, one of which reads the frames.
 """
 
 import argparse
 import json
-import math
 import os
 import shutil
 import subprocess
 import sys
 import time
-from collections.abc import Iterable
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from pathlib import Path
-from statistics import fmean, stdev
 from typing import Any
 
-import numpy as np
-from machine import positive, print_table, write_figures
+from machine import positive, write_figures
+from pusht_report import Seed, print_report
 from recipes import PUSHT_TYPES, pusht_recipe_path
 
 from lerobot_bomb.commands import run_command
-from lerobot_bomb.stats import bootstrap_interval
 
 REPO_ID = "lerobot_bomb/pusht"
 NUM_TRAIN_EPISODES = 180
-T_QUANTILE = {2: 12.706, 3: 4.303, 4: 3.182, 5: 2.776}  # 97.5 % of Student's t, by number of seeds
 MAX_COVERAGE_REWARD = 0.95  # coverage from which gym-pusht's reward is 1
 
 RECIPE = "recipe"
@@ -63,38 +59,60 @@ class Run:
 
 
 def main() -> None:
-    """Convert, train, measure, print the table; exit code 1 unless the recipe beats every trivial predictor."""
+    """Convert, train, measure, print the tables; exit code 1 where the recipe does not beat a predictor."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawTextHelpFormatter)
     parser.add_argument("--policy.type", dest="policy_type", required=True, choices=PUSHT_TYPES)
     parser.add_argument("--source", type=Path, help="the zarr; not needed once it is converted")
     parser.add_argument("--output_dir", type=Path, required=True, help="folder to keep, or to go on with")
     parser.add_argument("--variants", nargs="+", help="default: all")
     parser.add_argument("--seeds", type=positive, default=3, help="trainings of each (default: 3)")
-    parser.add_argument("--jobs", type=positive, default=2, help="at once (default: 2)")
+    parser.add_argument("--jobs", type=positive, default=2, help="trainings at once (default: 2)")
     parser.add_argument("--frames", type=positive, default=1000, help="held-out frames (default: 1000)")
-    parser.add_argument("--eval_episodes", type=positive, help="episodes in the environment, by seed")
+    parser.add_argument("--eval_episodes", type=positive, help="episodes in the environment, each seed")
     parser.add_argument("--json", type=Path, help="also write the figures to this file")
     args = parser.parse_args()
-    variants = VARIANTS[args.policy_type]
-    chosen = args.variants or list(variants)
-    if unknown := set(chosen) - set(variants):
-        parser.error(f"--variants: unknown {sorted(unknown)}; choose from {', '.join(variants)}")
+    known = VARIANTS[args.policy_type]
+    if unknown := set(args.variants or ()) - set(known):
+        parser.error(f"--variants: unknown {sorted(unknown)}; choose from {', '.join(known)}")
     os.environ["OMP_NUM_THREADS"] = "1"
     try:
-        dataset = convert(args.source, args.output_dir / "dataset")
-        runs = [
-            Run(variant, seed, args.output_dir / f"{variant}_{seed}")
-            for seed in range(args.seeds)
-            for variant in chosen
-        ]
-        with ThreadPoolExecutor(args.jobs) as pool:
-            list(pool.map(lambda run: train(run, args.policy_type, dataset), runs))
-            metrics = list(pool.map(lambda run: measure(run, dataset, args.frames), runs))
-        played = [run for run in runs if run.variant == RECIPE] if args.eval_episodes else []
-        coverages = {run.seed: play(run, args.eval_episodes) for run in played}
+        variants = prove(args, args.variants or list(known))
     except RuntimeError as error:
         sys.exit(f"pusht_offline.py: {error}")
-    sys.exit(report(args, dict(zip(runs, metrics, strict=True)), coverages))
+    print(f"\n{args.policy_type}, episodes {NUM_TRAIN_EPISODES}-205, {args.seeds} seeds")
+    beaten = print_report(variants, RECIPE)
+    write_figures(args.json, {"policy": args.policy_type, "variants": as_figures(variants)})
+    sys.exit(0 if beaten else 1)
+
+
+def prove(args: argparse.Namespace, chosen: list[str]) -> dict[str, list[Seed]]:
+    """{variant: what was measured of each of its seeds}."""
+    dataset = convert(args.source, args.output_dir / "dataset")
+    runs = [
+        Run(variant, seed, args.output_dir / f"{variant}_{seed}")
+        for seed in range(args.seeds)
+        for variant in chosen
+    ]
+    with ThreadPoolExecutor(args.jobs) as pool:
+        list(pool.map(lambda run: train(run, args.policy_type, dataset), runs))
+        columns = list(pool.map(lambda run: measure(run, dataset, args.frames), runs))
+        is_played = [args.eval_episodes is not None and run.variant == RECIPE for run in runs]
+        coverages = list(
+            pool.map(lambda run, yes: play(run, args.eval_episodes) if yes else [], runs, is_played)
+        )
+    variants: dict[str, list[Seed]] = {}
+    for run, of_run, coverage in zip(runs, columns, coverages, strict=True):
+        minutes = json.loads((run.folder / "training.json").read_text())
+        seed = Seed(
+            of_run["train"], of_run["validation"], minutes["minutes"], minutes["cpu_minutes"], coverage
+        )
+        variants.setdefault(run.variant, []).append(seed)
+    return variants
+
+
+def as_figures(variants: dict[str, list[Seed]]) -> dict[str, list[dict[str, Any]]]:
+    """JSON-ready."""
+    return {name: [asdict(seed) for seed in seeds] for name, seeds in variants.items()}
 
 
 def convert(source: Path | None, dataset: Path) -> Path:
@@ -183,42 +201,5 @@ def run_logged(log: Path, command: str, *flags: str) -> float:
     return usage.ru_utime + usage.ru_stime
 
 
-def report(
-    args: argparse.Namespace, metrics: dict[Run, dict[str, Any]], coverages: dict[int, list[float]]
-) -> int:
-    """Print and write the tables; 0 if the recipe's L1 is below every trivial predictor's."""
-    of_variant = {variant: [] for variant in dict.fromkeys(run.variant for run in metrics)}
-    for run, columns in metrics.items():
-        of_variant[run.variant].append((run, columns))
-    print(f"\n{args.policy_type}, {args.seeds} seeds; mean and 95 % t-interval over seeds")
-    header = ["", "L1 held out, px", "of the seeds", "L1 train, px", "value accuracy", "loss", "CPU min"]
-    print_table(header, [row(variant, of) for variant, of in of_variant.items()])
-    validation = next(iter(metrics.values()))["validation"]
-    trivial = {name: of for name, of in validation["l1"].items() if name != "policy"}
-    print("\nL1 held out by step of the chunk, px")
-    first = next(iter(of_variant))
-    steps = {first: [fmean(each) for each in zip(*(step_means(c, "policy") for _, c in of_variant[first]), strict=True)]}
-    steps |= {name: step_means({"validation": validation}, name) for name in trivial}
-    shown = [i for i in (0, 1, 2, 4, 7, 9, 15) if i < len(steps[first])]
-    print_table(
-        ["", "all", *(str(i + 1) for i in shown)],
-        [
-            [name, f"{overall(validation, name, of_variant[first]):.1f}", *(f"{values[i]:.1f}" for i in shown)]
-            for name, values in steps.items()
-        ],
-    )
-    for seed, values in coverages.items():
-        print(f"pusht, seed {seed}: maximal coverage {interval_text(values)} over {len(values)} episodes")
-    missed = verdict(of_variant.get(RECIPE, []), trivial)
-    write_figures(
-        args.json,
-        {
-            "policy": args.policy_type,
-            "runs": [
-                {"variant": run.variant, "seed": run.seed, **times(run), **columns}
-                for run, columns in metrics.items()
-            ],
-            "coverages": coverages,
-        },
-    )
-    return 1 if missed else 0
+if __name__ == "__main__":
+    main()

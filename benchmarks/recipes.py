@@ -1,4 +1,4 @@
-"""The policies that learn, and the recipe with which each learns a few episodes by heart."""
+"""The policies that learn, and the recipes with which small ones of each do so on a CPU."""
 
 from pathlib import Path
 from typing import Any
@@ -8,6 +8,8 @@ import yaml
 FOLDER = Path(__file__).parents[1] / "configs"
 # a policy that learns comes with such a file; every proof runs on all of them
 POLICY_TYPES = sorted(path.stem.removeprefix("overfit_") for path in FOLDER.glob("overfit_*.yaml"))
+# and those that learn PushT with such a file
+PUSHT_TYPES = sorted(path.stem.removeprefix("pusht_") for path in FOLDER.glob("pusht_*.yaml"))
 
 
 def recipe_path(policy_type: str) -> Path:
@@ -18,3 +20,8 @@ def recipe_path(policy_type: str) -> Path:
 def read_recipe(policy_type: str) -> dict[str, Any]:
     """The recipe's values."""
     return yaml.safe_load(recipe_path(policy_type).read_text())
+
+
+def pusht_recipe_path(policy_type: str) -> Path:
+    """A config for `lerobot-train --config_path` on the PushT demonstrations, without dataset."""
+    return FOLDER / f"pusht_{policy_type}.yaml"

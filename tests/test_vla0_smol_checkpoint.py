@@ -80,9 +80,10 @@ def test_a_task_is_tokenized_once_and_what_is_kept_is_not_saved(monkeypatch: pyt
     preprocessor(raw_batch(5))
     assert len(tokenized) == 5  # two more tasks displace those that were kept
     assert (before[0], before[1].keys()) == (step.get_config(), step.state_dict().keys())
-    step.load_state_dict(step.state_dict())
     preprocessor(raw_batch(1))
-    assert tokenized[5:] == raw_batch(1)["task"]
+    step.load_state_dict(step.state_dict())  # another tokenizer may write another sequence
+    preprocessor(raw_batch(1))
+    assert tokenized[5:] == 2 * raw_batch(1)["task"]
 
 
 def test_a_missing_or_unexpected_tensor_is_an_error(tmp_path: Path) -> None:

@@ -52,15 +52,21 @@ class SmolVLMBackbone(nn.Module):
         return DynamicCache(config=self.text_config)
 
     def hidden_states(
-        self, embeds_BLH: Tensor, written_BL: Tensor, positions_BL: Tensor, cache: Cache | None = None
+        self,
+        embeds_BLH: Tensor,
+        written_BL: Tensor | None = None,
+        positions_BL: Tensor | None = None,
+        cache: Cache | None = None,
     ) -> Tensor:
         """Embeddings -> (B, L, H) states after the last layer.
 
-        ``written_BL`` marks the columns that hold a token, cached ones included: (B, cached + L).
+        ``written_BL`` marks the columns that hold a token, cached ones included: (B, cached + L). Without
+        it, rows must start with their tokens and are read from position 0: attention is causal, so what
+        follows a row's end changes nothing before it, and torch attends faster without a mask.
         """
         return self.vlm.model.text_model(
             inputs_embeds=embeds_BLH,
-            attention_mask=written_BL.long(),
+            attention_mask=None if written_BL is None else written_BL.long(),
             position_ids=positions_BL,
             past_key_values=cache,
             use_cache=cache is not None,

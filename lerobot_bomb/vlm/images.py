@@ -31,7 +31,7 @@ def crop_and_resize(
         image[:, top : top + crop_height, left : left + crop_width]
         for image, (top, left) in zip(images_B3HW, offsets_B2.tolist(), strict=True)
     ]
-    return resize(torch.stack(windows), size).mul_(2).sub_(1)
+    return _resized_levels(torch.stack(windows), size).mul_(2 / 255).sub_(1)
 
 
 def resize(images_B3HW: Tensor, size: int) -> Tensor:
@@ -41,12 +41,16 @@ def resize(images_B3HW: Tensor, size: int) -> Tensor:
     fixed matrix; like Pillow's, both results are 8 bit levels, so overshoot at edges is cut off in between.
     Pictures that are not square are stretched. Equal to Pillow's but for a level where rounding is a tie.
     """
+    return _resized_levels(images_B3HW, size).div_(255)
+
+
+def _resized_levels(images_B3HW: Tensor, size: int) -> Tensor:
     height, width = images_B3HW.shape[-2:]
     device = images_B3HW.device
     across_SW, down_SH = lanczos_weights(width, size, device), lanczos_weights(height, size, device)
     with torch.autocast(device.type, enabled=False):
-        lines_B3HS = _round_levels(images_B3HW.to(across_SW.dtype) * 255 @ across_SW.T)
-        return _round_levels(down_SH @ lines_B3HS).float().div_(255)
+        lines_B3HS = _round_levels(images_B3HW.to(across_SW.dtype) @ (255 * across_SW).T)
+        return _round_levels(down_SH @ lines_B3HS).float()
 
 
 def _round_levels(levels: Tensor) -> Tensor:
@@ -67,4 +71,4 @@ def lanczos_weights(old_size: int, new_size: int, device: torch.device) -> Tenso
     lanczos_NO = torch.sinc(distances_NO) * torch.sinc(distances_NO / LANCZOS_LOBES)
     weights_NO = lanczos_NO.where(distances_NO.abs() < LANCZOS_LOBES, 0)
     weights_NO /= weights_NO.sum(dim=1, keepdim=True)
-    return weights_NO.to(device, torch.float64 if device.type == "cuda" else torch.float32)
+    return weights_NO.to(torch.float64 if device.type == "cuda" else torch.float32).to(device)

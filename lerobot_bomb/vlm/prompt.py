@@ -86,13 +86,17 @@ def _check_numbers(tokenizer: Tokenizer, symbol_ids: list[int], vlm_model_name: 
 
     The policy turns numbers into tokens by arithmetic and asks no tokenizer: this is its only check. 0.2 s.
     """
-    ids = dict(zip(SYMBOL_TEXTS, symbol_ids, strict=True))
+    ids: dict[str, int] = dict(zip(SYMBOL_TEXTS, symbol_ids, strict=True))
     numbers = [f" {number:0{width}}" for width in range(1, MAX_DIGITS + 1) for number in range(10**width)]
     answer = "".join(numbers)
     for before, after in ((" State:", ","), ("Assistant:", SYMBOL_TEXTS[END])):
         text = f"{before}{answer}{after}"
         written = tokenizer.encode(text)
-        expected = [*tokenizer.encode(before).ids, *map(ids.get, answer), *tokenizer.encode(after).ids]
+        expected = [
+            *tokenizer.encode(before).ids,
+            *(ids[symbol] for symbol in answer),
+            *tokenizer.encode(after).ids,
+        ]
         if written.ids != expected:
             pairs = enumerate(zip(written.ids, expected, strict=False))
             first, last = written.offsets[next(i for i, (one, other) in pairs if one != other)]

@@ -148,8 +148,8 @@ class Vla0SmolPolicy(PreTrainedPolicy):
             logits_BAV = self._answer_logits(batch, prompt, answer.rows)
         kept_BA = answer.labels != IGNORED
         losses_BA = cross_entropy(
-            logits_BAV.float().transpose(1, 2), answer.labels, ignore_index=IGNORED, reduction="none"
-        )
+            logits_BAV.float().flatten(0, 1), answer.labels.flatten(), ignore_index=IGNORED, reduction="none"
+        ).view_as(answer.labels)
         metrics = self._metrics(logits_BAV.detach(), answer, numbers, bins_BN)
         if reduction == "none":
             return losses_BA.sum(dim=1) / kept_BA.sum(dim=1).clamp(min=1), metrics
@@ -189,14 +189,12 @@ class Vla0SmolPolicy(PreTrainedPolicy):
     def _answer_logits(self, batch: dict[str, Tensor], prompt: TokenRows, answer: TokenRows) -> Tensor:
         """Teacher-forced logits of every answer token: (B, A, V)."""
         rows = TokenRows.join([prompt, answer])
-        rows = TokenRows(*reversed(compact(rows.written, rows.ids)))
-        hidden_BLH = self.backbone.hidden_states(
-            self._embeds(batch, rows.ids), rows.written, (rows.written.cumsum(dim=1) - 1).clamp(min=0)
-        )
-        offsets_A = torch.arange(answer.ids.shape[1], device=rows.ids.device)
+        _, ids_BL = compact(rows.written, rows.ids)
+        hidden_BLH = self.backbone.hidden_states(self._embeds(batch, ids_BL))
+        offsets_A = torch.arange(answer.ids.shape[1], device=ids_BL.device)
         # a token is predicted one column earlier; columns beyond a short row carry no label
         columns_BA = prompt.written.sum(dim=1, keepdim=True) - 1 + offsets_A
-        columns_BA = columns_BA.clamp(max=rows.ids.shape[1] - 1)
+        columns_BA = columns_BA.clamp(max=ids_BL.shape[1] - 1)
         index_BAH = columns_BA[..., None].expand(-1, -1, hidden_BLH.shape[-1])
         return self.backbone.logits(hidden_BLH.gather(1, index_BAH))
 
