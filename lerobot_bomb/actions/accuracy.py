@@ -38,8 +38,8 @@ def means(parts: Mapping[str, tuple[Tensor, Tensor]]) -> dict[str, float]:
 
     What nothing counts for, or has no finite mean, is left out.
     """
-    sums = [torch.where(counted, values, 0).double().sum() for values, counted in parts.values()]
-    counts = [counted.sum().double() for _, counted in parts.values()]
+    sums = [torch.where(counted, values, 0).float().sum() for values, counted in parts.values()]
+    counts = [counted.sum().float() for _, counted in parts.values()]
     pairs = torch.stack([torch.stack(sums), torch.stack(counts)], dim=1).tolist()
     averages = {name: total / count for name, (total, count) in zip(parts, pairs, strict=True) if count}
     return {name: average for name, average in averages.items() if math.isfinite(average)}
