@@ -31,7 +31,7 @@ def pusht_demonstrations(shared_data: Path) -> "Demonstrations":
     """The first real PushT demonstrations."""
     from pusht_cases import NUM_EPISODES, ZARR, Demonstrations
 
-    return Demonstrations.read(shared_data / ZARR, NUM_EPISODES)
+    return Demonstrations.read(shared_data / ZARR, range(NUM_EPISODES))
 
 
 @pytest.fixture(scope="session")
