@@ -4,6 +4,7 @@
 recorded states and executes their actions, which leads through the recorded states again.
 """
 
+import itertools
 import sys
 from pathlib import Path
 from typing import Any
@@ -95,7 +96,7 @@ def run_pusht_eval(
 
 def test_both_routes_give_the_same_tokens_and_nearly_the_same_pixels(routes: Routes) -> None:
     psnr_db = []
-    for trained, evaluated in routes.frames():
+    for trained, evaluated in itertools.islice(routes.frames(), 0, None, 3):
         expected = inference_inputs(routes.training.policy, trained)
         actual = inference_inputs(routes.evaluation.policy, evaluated)
         ids = first_ids(expected)
@@ -105,7 +106,6 @@ def test_both_routes_give_the_same_tokens_and_nearly_the_same_pixels(routes: Rou
         stored, drawn = (pixels(routes.training.policy, seen, 1) for seen in (expected, actual))
         errors = (stored - drawn).square().mean()
         psnr_db.append(float(10 * torch.log10((drawn.max() - drawn.min()) ** 2 / errors)))
-    print("PSNR", min(psnr_db))
     assert min(psnr_db) >= MIN_PSNR_DB
 
 
