@@ -10,11 +10,13 @@ commands. Two controls change what the trained policy is shown:
 
     python benchmarks/overfit.py --policy.type=vla0_smol --json overfit.json
 
-The recipe is configs/overfit_TYPE.yaml. A policy that reads the state passes such a test blind.
+The recipe is configs/overfit_TYPE.yaml. A policy that reads the state passes such a test blind. Flags
+--policy.NAME=VALUE go to `lerobot-train`, so that the proof can be repeated with an option of the policy.
 """
 
 import argparse
 import os
+import re
 import signal
 import sys
 import tempfile
@@ -61,7 +63,10 @@ def main() -> None:
     parser.add_argument("--output_dir", type=Path, help="new folder to keep (default: a temporary one)")
     parser.add_argument("--steps", type=positive, help="training steps (default: the recipe's)")
     add_machine_arguments(parser)
-    args = parser.parse_args()
+    args, args.policy_flags = parser.parse_known_args()
+    unknown = [flag for flag in args.policy_flags if not re.fullmatch(r"--policy\.\w+=.*", flag)]
+    if unknown:
+        parser.error(f"unknown: {' '.join(unknown)}; flags for lerobot-train are --policy.NAME=VALUE")
     if args.output_dir is not None and args.output_dir.exists():
         parser.error(f"--output_dir={args.output_dir} exists already; name a new folder or delete it")
     require_idle_machine(args.force)
@@ -79,7 +84,7 @@ def prove(args: argparse.Namespace, folder: Path) -> int:
     started = time.monotonic()
     record(folder / "dataset")
     sentences = read_sentences(folder / "dataset")
-    checkpoint = train(args.policy_type, args.steps, folder)
+    checkpoint = train(args, folder)
     trained_s = time.monotonic() - started
     told = {task: TASK_IDS[(i + SHIFT) % len(TASK_IDS)] for i, task in enumerate(TASK_IDS)}
     shown = change_what_is_shown(checkpoint, {sentences[task]: sentences[told[task]] for task in TASK_IDS})
@@ -123,16 +128,17 @@ def read_sentences(dataset: Path) -> dict[int, str]:
     return {task: start["task"] for task, start in zip(TASK_IDS, starts, strict=True)}
 
 
-def train(policy_type: str, steps: int | None, folder: Path) -> Path:
+def train(args: argparse.Namespace, folder: Path) -> Path:
     """Stock `lerobot-train` on the recipe; the checkpoint's folder."""
-    override = [f"--steps={steps}"] if steps else []
+    override = [f"--steps={args.steps}"] if args.steps else []
     run_command(
         "lerobot-train",
-        f"--config_path={recipe_path(policy_type)}",
+        f"--config_path={recipe_path(args.policy_type)}",
         f"--dataset.root={folder / 'dataset'}",
         f"--output_dir={folder / 'train'}",
         "--save_checkpoint=true",
         *override,
+        *args.policy_flags,
     )
     return folder / "train" / "checkpoints" / "last" / "pretrained_model"
 
@@ -209,13 +215,15 @@ def report(
     is_in_time = minutes <= MAX_MINUTES
     missed += [] if is_in_time else ["the time"]
     rows.append(["the whole run", "minutes", f"{minutes:.1f}", f"at most {MAX_MINUTES}", verdict(is_in_time)])
-    print(f"{args.policy_type}: {len(TASK_IDS)} episodes of seed {SEED}, without state")
+    trained = " ".join([args.policy_type, *args.policy_flags])
+    print(f"{trained}: {len(TASK_IDS)} episodes of seed {SEED}, without state")
     print_table(["", "counted", "seen", "bar", "verdict"], rows)
     print(f"Missed: {', '.join(missed)}." if missed else "Every bar was kept.")
     if LEARNT.name in missed:
         print("What was not learnt cannot be controlled: the other conditions say nothing.")
     figures = {
         "policy": args.policy_type,
+        "flags": args.policy_flags,
         "seed": SEED,
         "steps": args.steps or read_recipe(args.policy_type)["steps"],
         "episodes": len(TASK_IDS),

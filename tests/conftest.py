@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 import pytest
 from recipes import POLICY_TYPES, read_recipe
+from variants import variants_of
 
 if TYPE_CHECKING:
     from pusht_cases import Demonstrations
@@ -30,7 +31,7 @@ def pusht_demonstrations(shared_data: Path) -> "Demonstrations":
     """The first real PushT demonstrations."""
     from pusht_cases import NUM_EPISODES, ZARR, Demonstrations
 
-    return Demonstrations.read(shared_data / ZARR, NUM_EPISODES)
+    return Demonstrations.read(shared_data / ZARR, range(NUM_EPISODES))
 
 
 @pytest.fixture(scope="session")
@@ -77,10 +78,20 @@ def pytest_addoption(parser: pytest.Parser) -> None:
 
 
 def pytest_generate_tests(metafunc: pytest.Metafunc) -> None:
-    """Run every test that takes a `policy_type` on each policy that learns, or on --policy.type."""
-    if "policy_type" in metafunc.fixturenames:
-        chosen = metafunc.config.getoption("policy_type")
-        metafunc.parametrize("policy_type", [chosen] if chosen else POLICY_TYPES)
+    """Run every test that takes a `policy_type` on each policy that learns, or on --policy.type.
+
+    A test that takes `options` too runs on the variants of each.
+    """
+    if "policy_type" not in metafunc.fixturenames:
+        return
+    chosen = metafunc.config.getoption("policy_type")
+    types = [chosen] if chosen else POLICY_TYPES
+    if "options" in metafunc.fixturenames:
+        is_long = metafunc.definition.get_closest_marker("long") is not None
+        variants = [variant for each in types for variant in variants_of(each, is_long=is_long)]
+        metafunc.parametrize(("policy_type", "options"), variants)
+    else:
+        metafunc.parametrize("policy_type", types)
 
 
 @pytest.fixture

@@ -4,7 +4,6 @@
 recorded actions are executed, so both routes pass the same frames.
 """
 
-import json
 import sys
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field, fields
@@ -19,15 +18,17 @@ from lerobot.datasets import LeRobotDataset
 from lerobot.policies import PreTrainedPolicy
 from lerobot.scripts import lerobot_eval, lerobot_train
 from lerobot.utils.constants import ACTION
+from model_inputs import Batch, joined
 from torch import Tensor, nn
+from variants import as_flags
 
 from lerobot_bomb.data.record import record
 from lerobot_bomb.data.recording import Recording
 
 REPO_ID = "test/parity"
 SEED, EPISODES, SIZE = 5, 2, 64
+MAX_LEARNING_STEPS, CHECK_EVERY = 300, 20
 
-type Batch = dict[str, Any]
 type Finish = Callable[[PreTrainedPolicy, dict[int, Batch]], None]
 
 
@@ -90,10 +91,34 @@ def cli_flags(policy_type: str, options: dict[str, Any], *, use_state: bool) -> 
         options = options | {"use_state": use_state}
     elif not use_state:
         pytest.skip(f"{policy_type} always reads the state")
-    return [
-        f"--policy.{name}={value if isinstance(value, str) else json.dumps(value)}"
-        for name, value in options.items()
-    ]
+    return as_flags(options)
+
+
+def resolution(policy: PreTrainedPolicy) -> float:
+    """Largest error of a value in [-1, 1] that is learned by heart: half a bin where there are bins."""
+    num_bins = getattr(policy.config, "n_action_bins", None)
+    if num_bins is None:
+        return 0.05
+    num_gaps = num_bins if getattr(policy.config, "bin_mode", "levels") == "centers" else num_bins - 1
+    return 1.0001 / num_gaps
+
+
+def learn_by_heart(policy: PreTrainedPolicy, batches: list[Batch], bar: float | Tensor) -> None:
+    """Train on a few frames, as evaluation shows them, until their chunks are reproduced within the bar."""
+    batch = joined(batches)
+    policy.eval()  # neither crops nor masks at random
+    optimizer = torch.optim.AdamW(policy.get_optim_params(), lr=2e-3, weight_decay=0.0)
+    for step in range(1, MAX_LEARNING_STEPS + 1):
+        loss = policy(batch)[0]
+        optimizer.zero_grad()
+        loss.backward()
+        optimizer.step()
+        if step % CHECK_EVERY == 0:
+            policy.reset()
+            error = (policy.predict_action_chunk(batch) - batch[ACTION]).abs()
+            if (error <= bar)[~batch["action_is_pad"]].all():
+                return
+    pytest.fail(f"{len(batches)} frames were not learned by heart in {MAX_LEARNING_STEPS} steps")
 
 
 def run_routes(recorded: Recorded, folder: Path, flags: list[str], finish: Finish | None) -> Routes:

@@ -3,9 +3,11 @@
 import json
 from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import pytest
 from recipes import recipe_path
+from variants import as_flags
 
 from lerobot_bomb.cli import main
 from lerobot_bomb.evaluation.results import read_results, summarise
@@ -33,7 +35,7 @@ def test_the_expert_places_100_stones_precisely(
 
 
 def test_two_targets_learned_by_heart_through_the_stock_commands(
-    policy_type: str, stock_cli: Callable[..., None], tmp_path: Path
+    policy_type: str, options: dict[str, Any], stock_cli: Callable[..., None], tmp_path: Path
 ) -> None:
     """A short form of benchmarks/overfit.py: one start, two targets, no state."""
     seed, tasks = 1007, [4, 24]
@@ -42,7 +44,7 @@ def test_two_targets_learned_by_heart_through_the_stock_commands(
     assert main(["record", *recording, f"--task_ids={tasks}", f"--image_size={SIZE}"]) == 0
     data = ["--dataset.repo_id=overfit/two", f"--dataset.root={dataset}", f"--output_dir={train}"]
     flags = f"--config_path={recipe_path(policy_type)} --steps=500 --num_workers=0"
-    stock_cli("lerobot-train", *flags.split(), *data)
+    stock_cli("lerobot-train", *flags.split(), *data, *as_flags(options))
     checkpoint = train / "checkpoints" / "last" / "pretrained_model"
     flags = f"--policy.path={checkpoint} --env.type=bomb --env.image_size={SIZE} --seed={seed}"
     flags += " --eval.n_episodes=1 --eval.batch_size=1 --eval.use_async_envs=false"

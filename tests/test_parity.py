@@ -1,24 +1,25 @@
 """A policy gets the same inputs in training and in evaluation, and its actions come out as recorded."""
 
 import functools
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
 import torch
+from lerobot.configs import PreTrainedConfig
 from lerobot.policies import PreTrainedPolicy
 from lerobot.utils.constants import ACTION
 from lerobot.utils.import_utils import register_third_party_plugins
-from model_inputs import Batch, first_ids, inference_inputs, joined, pixels, probes, repeated
-from parity_routes import Recorded, Routes, cli_flags, run_routes
+from model_inputs import Batch, first_ids, inference_inputs, pixels, probes, repeated
+from parity_routes import Recorded, Routes, cli_flags, learn_by_heart, resolution, run_routes
+from variants import Options
 
 # Least PSNR of a camera's pixels, as the network gets them, between a frame out of a video and the drawn one.
 # Measured: AV1 at 64x64 gives at least 26.8 dB; swapped cameras gave 10.7, BGR for RGB 8.7, a video that is
 # one frame late 13.3.
 MIN_PSNR_DB = 22.0
-MAX_LEARNING_STEPS, CHECK_EVERY = 300, 20
 VIEWS_PER_BATCH, MAX_VIEW_BATCHES = 32, 8
 
 MakeRoutes = Callable[..., Routes]
@@ -47,18 +48,25 @@ def routes(
     cache: dict[tuple, Routes],
     tmp_path: Path,
 ) -> MakeRoutes:
-    """routes(images, use_state, control_mode): both routes of the policy, run once per module."""
+    """routes(options, images, use_state, control_mode): both routes of the policy, run once per module."""
 
-    def make(images: bool = True, use_state: bool = True, control_mode: str = "relative") -> Routes:
-        key = (policy_type, images, use_state, control_mode)
+    def make(
+        options: Options | None = None,
+        images: bool = True,
+        use_state: bool = True,
+        control_mode: str = "relative",
+    ) -> Routes:
+        key = (policy_type, str(options or {}), images, use_state, control_mode)
         if key not in cache:
             register_third_party_plugins()
-            flags = cli_flags(policy_type, policy_flags(policy_type), use_state=use_state)
+            own = policy_flags(policy_type) | (options or {})
+            flags = cli_flags(policy_type, own, use_state=use_state)
             data = recorded(images, control_mode)
             learns = images and use_state
 
             def finish(policy: PreTrainedPolicy, batches: dict[int, Batch]) -> None:
-                learn_by_heart(policy, [batches[index] for index in data.turning_points])
+                chosen = [batches[index] for index in data.turning_points]
+                learn_by_heart(policy, chosen, resolution(policy))
 
             cache[key] = run_routes(data, tmp_path, flags, finish if learns else None)
         return cache[key]
@@ -66,39 +74,21 @@ def routes(
     return make
 
 
-def resolution(policy: PreTrainedPolicy) -> float:
-    """Largest error of a normalised action that is learned by heart: half a bin where there are bins."""
-    num_bins = getattr(policy.config, "n_action_bins", None)
-    return 1.0001 / (num_bins - 1) if num_bins else 0.05
-
-
-def learn_by_heart(policy: PreTrainedPolicy, batches: list[Batch]) -> None:
-    """Train on a few frames, as evaluation shows them, until their chunks are reproduced."""
-    batch = joined(batches)
-    policy.eval()  # neither crops nor masks at random
-    optimizer = torch.optim.AdamW(policy.get_optim_params(), lr=2e-3, weight_decay=0.0)
-    for step in range(1, MAX_LEARNING_STEPS + 1):
-        loss = policy(batch)[0]
-        optimizer.zero_grad()
-        loss.backward()
-        optimizer.step()
-        if step % CHECK_EVERY == 0:
-            policy.reset()
-            error = (policy.predict_action_chunk(batch) - batch[ACTION]).abs()[~batch["action_is_pad"]]
-            if error.max() <= resolution(policy):
-                return
-    pytest.fail(f"{len(batches)} frames were not learned by heart in {MAX_LEARNING_STEPS} steps")
-
-
-@pytest.mark.parametrize("use_state", [True, False])
-def test_images_give_exactly_the_same_inputs(routes: MakeRoutes, use_state: bool) -> None:
-    both = routes(use_state=use_state)
+def require_same_inputs(both: Routes) -> None:
     for trained, evaluated in both.frames():
         expected = inference_inputs(both.training.policy, trained)
         actual = inference_inputs(both.evaluation.policy, evaluated)
         assert expected.keys() == actual.keys()
         for name, calls in expected.items():
             assert all(map(torch.equal, calls, actual[name])), f"{name}, frame {int(trained['index'])}"
+
+
+def test_images_give_exactly_the_same_inputs(routes: MakeRoutes, options: Options) -> None:
+    require_same_inputs(routes(options))
+
+
+def test_images_give_exactly_the_same_inputs_without_state(routes: MakeRoutes) -> None:
+    require_same_inputs(routes(use_state=False))
 
 
 def test_video_gives_the_same_tokens_and_nearly_the_same_pixels(routes: MakeRoutes) -> None:
@@ -115,8 +105,8 @@ def test_video_gives_the_same_tokens_and_nearly_the_same_pixels(routes: MakeRout
     assert torch.cat(psnr_db).min() > MIN_PSNR_DB
 
 
-def test_evaluation_is_one_of_the_views_of_training(routes: MakeRoutes) -> None:
-    both = routes()
+def test_evaluation_is_one_of_the_views_of_training(routes: MakeRoutes, options: Options) -> None:
+    both = routes(options)
     trained, evaluated = next(both.frames())
     alone = inference_inputs(both.evaluation.policy, evaluated)
     together = inference_inputs(both.evaluation.policy, repeated(evaluated, VIEWS_PER_BATCH))
@@ -141,8 +131,8 @@ def test_evaluation_is_one_of_the_views_of_training(routes: MakeRoutes) -> None:
     pytest.fail(f"training never shows what evaluation shows; by camera: {found}")
 
 
-def test_targets_are_the_actions_from_the_frame_on(routes: MakeRoutes) -> None:
-    both = routes()
+def test_targets_are_the_actions_from_the_frame_on(routes: MakeRoutes, options: Options) -> None:
+    both = routes(options)
     for index, batch in both.training.batches.items():
         chunk = both.evaluation.postprocessor(batch[ACTION])[0].numpy()
         last = both.recorded.last_of_episode(index)
@@ -151,19 +141,43 @@ def test_targets_are_the_actions_from_the_frame_on(routes: MakeRoutes) -> None:
         assert batch["action_is_pad"][0].tolist() == (steps > last).tolist()
 
 
-CONTROL_MODES = ["relative", pytest.param("absolute", marks=pytest.mark.long)]
-
-
-@pytest.mark.parametrize("control_mode", CONTROL_MODES)
-def test_learned_actions_reach_the_environment_in_their_order(routes: MakeRoutes, control_mode: str) -> None:
-    both = routes(control_mode=control_mode)
+def require_recorded_actions(both: Routes) -> None:
+    """Each action of a policy that learned the turning points, after each call, is what was recorded."""
     policy, actions = both.evaluation.policy, both.recorded.actions
-    num_steps = getattr(policy.config, "n_action_steps")  # noqa: B009  a field of every policy's own config
     bar = resolution(policy) * (actions.max(axis=0) - actions.min(axis=0)) / 2
-    for index in both.recorded.turning_points:
+    for shown in both.recorded.turning_points, both.recorded.turning_points[::-1]:
         policy.reset()
-        for step in range(index, index + num_steps):
-            # later steps come from the queue, whatever the batch
-            action = both.evaluation.postprocessor(policy.select_action(both.evaluation.batches[index]))
-            assert (np.abs(action[0].numpy() - actions[step]) <= bar).all(), f"frame {index}, step {step}"
+        for step, (index, expected) in enumerate(expected_actions(policy.config, shown, actions)):
+            selected = policy.select_action(both.evaluation.batches[index])
+            action = both.evaluation.postprocessor(selected)[0].numpy()
+            assert (np.abs(action - expected) <= bar).all(), f"frame {index}, step {step}"
     policy.reset()
+
+
+def expected_actions(
+    config: PreTrainedConfig, shown: list[int], actions: np.ndarray
+) -> Iterator[tuple[int, np.ndarray]]:
+    """Frames that are shown one after the other, and the action that must follow each.
+
+    A queue is filled by a frame and emptied whatever is shown then. An ensemble takes the mean of what the
+    last frames foresaw for this step, and as they are from different moments, it is far from each of them.
+    """
+    num_chunks = getattr(config, "temporal_ensemble_size", 0)
+    num_steps = getattr(config, "n_action_steps")  # noqa: B009  a field of every policy's own config
+    if not num_chunks:
+        for index in shown:
+            for step in range(num_steps):
+                yield index, actions[index + step]
+        return
+    for last, index in enumerate([*shown, shown[0]]):
+        newest_first = [*shown, shown[0]][last::-1][:num_chunks]
+        yield index, np.mean([actions[i + age] for age, i in enumerate(newest_first)], axis=0)
+
+
+def test_learned_actions_reach_the_environment_in_their_order(routes: MakeRoutes, options: Options) -> None:
+    require_recorded_actions(routes(options))
+
+
+@pytest.mark.long
+def test_learned_absolute_actions_reach_the_environment_in_their_order(routes: MakeRoutes) -> None:
+    require_recorded_actions(routes(control_mode="absolute"))

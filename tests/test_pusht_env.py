@@ -5,7 +5,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from pusht_cases import Demonstrations
+from pusht_cases import Demonstrations, put
 
 gym_pusht = pytest.importorskip("gym_pusht")
 
@@ -29,15 +29,9 @@ def vector_env() -> Iterator[SyncVectorEnv]:
 
 
 def set_state(env: SyncVectorEnv, state: np.ndarray) -> None:
-    """Put agent and block where `state` (5) says; `reset_to_state` turns the block about another point."""
+    """Put agent and block where `state` (5) says."""
     env.reset(seed=0)
-    pusht: Any = env.envs[0].unwrapped
-    x, y, block_x, block_y, angle_rad = (float(value) for value in state)
-    pusht.agent.position = (x, y)
-    pusht.block.angle = angle_rad
-    pusht.block.position = (block_x, block_y)
-    for body in (pusht.agent, pusht.block):
-        pusht.space.reindex_shapes_for_body(body)
+    put(env.envs[0].unwrapped, state)
 
 
 def policy_view(env: SyncVectorEnv) -> tuple[np.ndarray, np.ndarray]:

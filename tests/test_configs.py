@@ -1,0 +1,95 @@
+"""What configs/ holds is read by LeRobot's own parser, says what it claims, and trains."""
+
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import draccus
+import pytest
+import yaml
+from lerobot.configs import PreTrainedConfig
+from lerobot.configs.train import TrainPipelineConfig
+from lerobot.policies.factory import get_policy_class
+from lerobot.utils.import_utils import register_third_party_plugins
+from recipes import FOLDER
+
+# all that lerobot-train reads; the evaluation's configs name an environment and no policy
+TRAINING = sorted(path for path in FOLDER.rglob("*.yaml") if "policy:" in path.read_text())
+RECIPE = FOLDER / "train_vla0_smol_pusht.yaml"
+ABLATIONS = sorted((FOLDER / "ablations").glob("*.yaml"))
+# what each row of the published table changes in the recipe on PushT, which has relative actions, the state
+# in the prompt and masking; rows without a number were published as relative actions with state, unmasked
+NO_MASKING, NO_STATE = {"mask_max_fraction": 0.0}, {"use_state": False}
+CHANGES: dict[str, dict[str, Any]] = {
+    "absolute": {**NO_MASKING, **NO_STATE, "relative_actions": False},
+    "absolute_state": {**NO_MASKING, "relative_actions": False},
+    "ensemble": {
+        **NO_MASKING,
+        "n_action_steps": 1,
+        "temporal_ensemble_size": 10,
+        "temporal_ensemble_weighting": "uniform",
+    },
+    "frozen_vision": {**NO_MASKING, **NO_STATE, "freeze_vision_encoder": True},
+    "lr_1e-4": {**NO_MASKING, **NO_STATE, "optimizer_lr": 1e-4, "scheduler_decay_lr": 1e-5},
+    "lr_1e-5": {**NO_MASKING, **NO_STATE, "optimizer_lr": 1e-5, "scheduler_decay_lr": 1e-6},
+    "lr_5e-6": {**NO_MASKING, **NO_STATE, "optimizer_lr": 5e-6, "scheduler_decay_lr": 5e-7},
+    "masking": {},
+    "relative": {**NO_MASKING, **NO_STATE},
+    "relative_state": NO_MASKING,
+    "system_prompt": {
+        **NO_MASKING,
+        "system_prompt": "Look at the picture and read the task. "
+        "Write the next 10 actions as 20 numbers from 0 to 511.",
+    },
+}
+
+
+def name_of(path: Path) -> str:
+    return path.stem.removeprefix("vla0_smol_pusht_")
+
+
+@pytest.mark.parametrize("path", TRAINING, ids=lambda path: path.stem)
+def test_lerobots_parser_reads_it(path: Path) -> None:
+    register_third_party_plugins()
+    written = yaml.safe_load(path.read_text())
+    config = draccus.decode(TrainPipelineConfig, written)
+    assert config.steps == written["steps"] and config.batch_size == written["batch_size"]
+    assert isinstance(config.policy, PreTrainedConfig) and config.policy.type == written["policy"].pop("type")
+    for name, value in written["policy"].items():
+        # LeRobot takes another device where the machine has none such
+        assert name == "device" or getattr(config.policy, name) == value, name
+    # the first line is the command, with the file's own name
+    first_line = path.read_text().splitlines()[0]
+    assert "lerobot-train" in first_line and f"--config_path=configs/{path.relative_to(FOLDER)}" in first_line
+
+
+def test_the_table_names_every_ablation() -> None:
+    assert [name_of(path) for path in ABLATIONS] == sorted(CHANGES)
+
+
+@pytest.mark.parametrize("path", ABLATIONS, ids=name_of)
+def test_an_ablation_changes_what_its_row_says(path: Path) -> None:
+    recipe, ablation = yaml.safe_load(RECIPE.read_text()), yaml.safe_load(path.read_text())
+    assert ablation == {**recipe, "policy": {**recipe["policy"], **CHANGES[name_of(path)]}}
+
+
+ONE_IS_ENOUGH = "ensemble"  # it differs most from what other fast tests train
+RUNS = [
+    pytest.param(path, marks=() if name_of(path) == ONE_IS_ENOUGH else pytest.mark.long, id=path.stem)
+    for path in (RECIPE, *ABLATIONS)
+]
+
+
+@pytest.mark.parametrize("path", RUNS)
+def test_the_stock_command_trains_it(
+    path: Path, stock_cli: Callable[..., None], pusht_dataset: Path, tmp_path: Path
+) -> None:
+    """One step on the real demonstrations, on a small network and a CPU."""
+    own = "--policy.vlm_model_name=nano --policy.device=cpu --policy.dtype=float32 --wandb.enable=false"
+    own += " --batch_size=2 --num_workers=0 --steps=1 --save_freq=1"
+    data = [f"--dataset.root={pusht_dataset}", f"--output_dir={tmp_path / 'train'}"]
+    stock_cli("lerobot-train", f"--config_path={path}", *data, *own.split())
+    checkpoint = tmp_path / "train" / "checkpoints" / "last" / "pretrained_model"
+    policy = get_policy_class("vla0_smol").from_pretrained(checkpoint)
+    for name, value in yaml.safe_load(path.read_text())["policy"].items():
+        assert name in ("device", "dtype") or getattr(policy.config, name) == value, name

@@ -1,0 +1,51 @@
+"""Options of the policies that every proof is repeated with, over the flags of the policy's recipe."""
+
+import json
+from typing import Any
+
+import pytest
+
+type Options = dict[str, Any]
+
+ENSEMBLE: Options = {"temporal_ensemble_size": 3, "n_action_steps": 1}
+NO_MASKING: Options = {"mask_max_fraction": 0.0}
+CENTERS: Options = {"bin_mode": "centers"}
+FIXED_WIDTH: Options = {"number_width": 4}  # a digit more than the bins need
+
+# by policy type
+SINGLE: dict[str, dict[str, Options]] = {
+    "vla0_smol": {
+        "ensemble": ENSEMBLE,
+        "no_masking": NO_MASKING,
+        "centers": CENTERS,
+        "fixed_width": FIXED_WIDTH,
+    }
+}
+# two at once, for the fast tests: what passes with both holds for each, and costs half
+PAIRS: dict[str, dict[str, Options]] = {
+    "vla0_smol": {
+        "centers_no_masking": CENTERS | NO_MASKING,
+        # two chunks, as every predicted step costs
+        "fixed_width_ensemble": FIXED_WIDTH | ENSEMBLE | {"temporal_ensemble_size": 2},
+    }
+}
+
+
+def variants_of(policy_type: str, *, is_long: bool) -> list[Any]:
+    """Parameters (policy_type, options): the recipe, then options, in pairs unless there is time for each."""
+    variants = [pytest.param(policy_type, {}, id=policy_type)]
+    for group, marks in ((PAIRS, ()), (SINGLE, (pytest.mark.long,))):
+        if group is SINGLE or not is_long:
+            variants += [
+                pytest.param(policy_type, options, id=f"{policy_type}-{name}", marks=marks)
+                for name, options in group.get(policy_type, {}).items()
+            ]
+    return variants
+
+
+def as_flags(options: Options) -> list[str]:
+    """--policy.* flags of LeRobot's commands."""
+    return [
+        f"--policy.{name}={value if isinstance(value, str) else json.dumps(value)}"
+        for name, value in options.items()
+    ]
