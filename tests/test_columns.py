@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from lerobot.datasets import LeRobotDataset, LeRobotDatasetMetadata
 
-from lerobot_bomb.data.columns import episode_bounds, read_columns
+from lerobot_bomb.data.columns import dim_names, episode_bounds, read_columns
 from lerobot_bomb.data.record import record
 from lerobot_bomb.data.recording import Recording
 
@@ -61,3 +61,9 @@ def test_episode_bounds() -> None:
     starts, ends = episode_bounds(np.array([3, 3, 3, 5, 8, 8]))
     assert starts.tolist() == [0, 0, 0, 3, 4, 4]
     assert ends.tolist() == [3, 3, 3, 4, 6, 6]
+
+
+def test_names_of_dimensions() -> None:
+    assert dim_names({"shape": (2,), "names": ["a", "b"]}) == ["a", "b"]
+    assert dim_names({"shape": [2], "names": {"motors": ["a", "b"]}}) == ["a", "b"]
+    assert dim_names({"shape": (2,), "names": None}) == ["0", "1"]

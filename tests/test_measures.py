@@ -1,7 +1,7 @@
 import numpy as np
 import pytest
 
-from lerobot_bomb.evaluation.measures import dim_names, measure, measure_l1
+from lerobot_bomb.evaluation.measures import measure, measure_l1
 
 
 def test_padded_steps_do_not_count() -> None:
@@ -28,9 +28,3 @@ def test_the_interval_draws_episodes_not_frames() -> None:
 def test_a_frame_counts_as_often_as_it_has_numbers() -> None:
     values = np.array([[1.0, 1.0], [4.0, np.nan], [np.nan, np.nan]])
     assert measure(values, np.array([0, 1, 2])).mean == 2.0
-
-
-def test_names_of_dimensions() -> None:
-    assert dim_names({"shape": (2,), "names": ["a", "b"]}) == ["a", "b"]
-    assert dim_names({"shape": [2], "names": {"motors": ["a", "b"]}}) == ["a", "b"]
-    assert dim_names({"shape": (2,), "names": None}) == ["0", "1"]

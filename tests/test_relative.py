@@ -114,6 +114,11 @@ def test_bounds_are_those_of_the_normaliser() -> None:
         assert [bound.tolist() for bound in bounds(statistics, mode, 1)] == [[low], [high]]
 
 
+def test_missing_statistics_are_named() -> None:
+    with pytest.raises(ValueError, match=r"QUANTILES needs the statistics q01, q99, .* it has max, min"):
+        bounds({"min": np.zeros(1), "max": np.ones(1)}, NormalizationMode.QUANTILES, 1)
+
+
 def test_dimensions_by_name() -> None:
     names = ["shoulder.pos", "elbow.pos", "gripper.pos"]
     assert named_dims(names, ["Gripper", "elbow"], "--f") == [1, 2]

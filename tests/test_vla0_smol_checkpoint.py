@@ -8,6 +8,7 @@ from typing import Any
 
 import pytest
 import torch
+from accelerate import FullyShardedDataParallelPlugin
 from lerobot.configs import FeatureType, NormalizationMode, PolicyFeature, PreTrainedConfig
 from lerobot.policies.factory import make_pre_post_processors
 from lerobot.utils.constants import OBS_LANGUAGE_TOKENS
@@ -258,3 +259,16 @@ def test_training_presets() -> None:
     assert (scheduler.num_warmup_steps, scheduler.num_decay_steps, scheduler.decay_lr) == (1000, 30000, 5e-6)
     assert config.action_delta_indices == [0, 1, 2]
     assert config.push_to_hub is False
+
+
+# Sharding
+
+
+def test_fsdp_shards_the_layers_of_both_models() -> None:
+    policy = make_policy()
+    plugin = FullyShardedDataParallelPlugin(auto_wrap_policy="transformer_based_wrap")
+    plugin.set_auto_wrap_policy(policy)
+    wraps: Any = plugin.auto_wrap_policy
+    sharded = [module for module in policy.modules() if wraps(module, recurse=False, nonwrapped_numel=0)]
+    layers: Any = policy.backbone.vlm.config
+    assert len(sharded) == layers.text_config.num_hidden_layers + layers.vision_config.num_hidden_layers

@@ -7,14 +7,18 @@ import numpy as np
 import pytest
 import torch
 from lerobot.datasets import LeRobotDataset, LeRobotDatasetMetadata
+from lerobot.policies import factory
 from vla0_smol_cases import make_batch, make_config, make_policy
 
 from lerobot_policy_vla0_smol.modeling_vla0_smol import Vla0SmolPolicy
 
+NAMES = ["x", "y", "z", "grip"]
 
-def make_dataset(root: Path, reach: float, *, delta: bool = False) -> LeRobotDatasetMetadata:
+
+def make_dataset(
+    root: Path, reach: float, *, delta: bool = False, names: Any = NAMES
+) -> LeRobotDatasetMetadata:
     """Two episodes of 30 frames; the action is the state and up to `reach` more, or the state's change."""
-    names = ["x", "y", "z", "grip"]
     features = {
         key: {"dtype": "float32", "shape": (4,), "names": names} for key in ("observation.state", "action")
     }
@@ -86,14 +90,46 @@ def test_a_checkpoint_keeps_its_scale_and_new_data_replace_it(tmp_path: Path) ->
 
 
 def test_excluded_dimensions_stay_absolute(tmp_path: Path) -> None:
-    names = ["x", "y", "z", "grip"]
     meta = make_dataset(tmp_path / "data", 0.1)
-    policy = build(meta, action_feature_names=names, relative_exclude_joints=["grip", "y"])
+    policy = build(meta, relative_exclude_joints=["grip", "y"])
     assert policy.relative is not None
     batch = make_batch(policy, 2)
     relative = policy.relative.encode(batch["action"], batch["observation.state"])
     assert torch.equal(relative[..., [1, 3]], batch["action"][..., [1, 3]])
     assert not torch.isclose(relative[..., [0, 2]], batch["action"][..., [0, 2]]).any()
+
+
+def test_names_that_a_dataset_groups_are_found_by_lerobots_factory(tmp_path: Path) -> None:
+    """As those of lerobot/pusht are; from scratch, and from a checkpoint."""
+    meta = make_dataset(tmp_path / "data", 0.1, names={"motors": NAMES})
+    config = make_config(relative_actions=True, relative_exclude_joints=["grip"])
+    for _ in range(2):
+        policy = factory.make_policy(config, ds_meta=meta)
+        assert isinstance(policy, Vla0SmolPolicy) and policy.relative is not None
+        assert policy.config.action_names == NAMES
+        assert policy.relative.state_of_dim == {0: 0, 1: 1, 2: 2}
+        policy.save_pretrained(tmp_path / "checkpoint")
+        config.pretrained_path = tmp_path / "checkpoint"
+
+
+def test_the_scale_is_that_of_the_episodes_that_are_here(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Of a dataset on the Hub, LeRobot downloads the data files of --dataset.episodes; streamed, none."""
+    here = build(make_dataset(tmp_path / "here", 0.1)).relative
+    meta = make_dataset(tmp_path / "data", 0.1)
+    file = meta.get_data_file_path(0)
+    elsewhere = Path("data/chunk-000/file-001.parquet")
+    monkeypatch.setattr(meta, "get_data_file_path", lambda episode: file if episode < 2 else elsewhere)
+    meta.info.total_episodes = 3
+    policy = build(meta)
+    assert here is not None and policy.relative is not None
+    assert torch.equal(policy.relative.scale, here.scale)
+    (meta.root / file).unlink()
+    with pytest.raises(
+        ValueError, match=r"relative_actions=true .* no data file of test/relative; .*streaming"
+    ):
+        build(meta)
 
 
 def test_delta_control_is_refused(tmp_path: Path) -> None:

@@ -23,9 +23,18 @@ MAX_RESIDUALS = 20_000_000  # a dimension; of more, evenly spaced frames are tak
 def bounds(
     statistics: dict[str, np.ndarray], mode: NormalizationMode, num_dims: int
 ) -> tuple[np.ndarray, np.ndarray]:
-    """(D,) values that become -1 and (D,) values that become 1 when LeRobot normalises."""
+    """(D,) values that become -1 and (D,) values that become 1 when LeRobot normalises.
+
+    Raises:
+        ValueError: the dataset has no such statistics.
+    """
     if mode is NormalizationMode.IDENTITY:
         return -np.ones(num_dims), np.ones(num_dims)
+    if missing := [name for name in BOUND_STATISTICS[mode] if name not in statistics]:
+        raise ValueError(
+            f"--policy.normalization_mapping: {mode.value} needs the statistics {', '.join(missing)}, which "
+            f"the dataset lacks; it has {', '.join(sorted(statistics))}"
+        )
     low, high = (np.asarray(statistics[name], dtype=np.float64) for name in BOUND_STATISTICS[mode])
     return low, high
 

@@ -1,6 +1,7 @@
 """Columns of a dataset, read without its pictures."""
 
 from collections.abc import Iterable, Sequence
+from typing import Any
 
 import numpy as np
 import pyarrow as pa
@@ -38,6 +39,15 @@ def read_columns(
     table = pa.concat_tables(tables).sort_by("index")
     shapes = {key: () if key in DEFAULT_FEATURES else meta.features[key]["shape"] for key in columns}
     return {key: _to_array(table[key]).reshape(len(table), *shapes[key]) for key in columns}
+
+
+def dim_names(feature: dict[str, Any]) -> list[str]:
+    """Names of a feature's dimensions; numbers where the dataset has no names."""
+    names = feature.get("names") or []
+    if isinstance(names, dict):
+        names = [name for group in names.values() for name in (group if isinstance(group, list) else [group])]
+    (num_dims,) = feature["shape"]
+    return list(map(str, names if len(names) == num_dims else range(num_dims)))
 
 
 def episode_bounds(episode_index_N: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

@@ -4,7 +4,6 @@ Shapes: `R` frames, `T` actions of a chunk, `D` action dims, `E` episodes.
 """
 
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 
@@ -65,12 +64,3 @@ def measure_l1(
         dims={name: measure(errors_RTD[..., i], episode_R) for i, name in enumerate(dim_names)},
         steps=[measure(errors_RTD[:, step], episode_R) for step in range(num_steps)],
     )
-
-
-def dim_names(feature: dict[str, Any]) -> list[str]:
-    """Names of a feature's dimensions; numbers where the dataset has no names."""
-    names = feature.get("names") or []
-    if isinstance(names, dict):
-        names = [name for group in names.values() for name in (group if isinstance(group, list) else [group])]
-    (num_dims,) = feature["shape"]
-    return list(map(str, names if len(names) == num_dims else range(num_dims)))

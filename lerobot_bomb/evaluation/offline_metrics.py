@@ -18,7 +18,8 @@ from lerobot.policies import PreTrainedPolicy
 from lerobot.utils.constants import ACTION, HF_LEROBOT_HOME
 
 from lerobot_bomb.checkpoint import read_config
-from lerobot_bomb.evaluation.measures import L1, Measure, dim_names, measure, measure_l1
+from lerobot_bomb.data.columns import dim_names
+from lerobot_bomb.evaluation.measures import L1, Measure, measure, measure_l1
 from lerobot_bomb.evaluation.predictions import check_policy, load_dataset, load_policy, predict
 from lerobot_bomb.evaluation.splits import (
     Split,

@@ -30,7 +30,7 @@ from lerobot_bomb.actions.text import (
     draw_hidden,
     number_symbols,
 )
-from lerobot_bomb.data.columns import episode_bounds, read_columns
+from lerobot_bomb.data.columns import dim_names, episode_bounds, read_columns
 from lerobot_bomb.decoding.decoder import CachedContinuation, decode_numbers
 from lerobot_bomb.decoding.grammar import NumberGrammar
 from lerobot_bomb.vlm.backbone import SmolVLMBackbone, build_backbone, config_dict, load_backbone
@@ -76,14 +76,16 @@ class Vla0SmolPolicy(PreTrainedPolicy):
     config: Vla0SmolConfig
     symbol_ids: Tensor
     action_unit: Tensor
-    # modules that FSDP shards one by one
+    # modules that FSDP shards one by one; accelerate reads the second name
     _fsdp_wrap_modules: ClassVar[list[str]] = ["LlamaDecoderLayer", "SmolVLMEncoderLayer"]
+    _no_split_modules = _fsdp_wrap_modules
 
     def __init__(
         self, config: Vla0SmolConfig, dataset_meta: LeRobotDatasetMetadata | None = None, **_: object
     ):
         super().__init__(config)
         config.validate_features()
+        _take_action_names(config, dataset_meta)
         self.tokens, self.backbone = _build(config)
         self.register_buffer("symbol_ids", torch.tensor(self.tokens.symbols), persistent=False)
         self.action_bins = Bins(config.n_action_bins, config.bin_mode)
@@ -103,10 +105,15 @@ class Vla0SmolPolicy(PreTrainedPolicy):
 
     @classmethod
     def from_pretrained(
-        cls, *args, dataset_meta: LeRobotDatasetMetadata | None = None, **kwargs
+        cls,
+        *args,
+        config: Vla0SmolConfig | None = None,
+        dataset_meta: LeRobotDatasetMetadata | None = None,
+        **kwargs,
     ) -> "Vla0SmolPolicy":
         """As LeRobot's, but a missing or unexpected tensor is an error; relative actions fit the new data."""
-        policy = super().from_pretrained(*args, **{**kwargs, "strict": True})
+        _take_action_names(config, dataset_meta)
+        policy = super().from_pretrained(*args, config=config, **{**kwargs, "strict": True})
         if dataset_meta is not None:
             policy._fit(dataset_meta)
         return policy
@@ -121,7 +128,7 @@ class Vla0SmolPolicy(PreTrainedPolicy):
         self.action_unit.copy_(torch.from_numpy(action_bounds[1] - action_bounds[0]) / 2)
         if self.relative is None:
             return
-        columns = read_columns(meta, (ACTION, OBS_STATE))
+        columns = read_columns(meta, (ACTION, OBS_STATE), _present_episodes(meta))
         state_bounds = bounds(meta.stats[OBS_STATE], state_mode, columns[OBS_STATE].shape[1])
         _, ends = episode_bounds(columns["episode_index"])
         self.relative.fit(
@@ -381,6 +388,24 @@ class Vla0SmolPolicy(PreTrainedPolicy):
         """The precision of ``config.dtype``, whoever calls: training, evaluation or a user's own loop."""
         bfloat16 = self.config.dtype == "bfloat16"
         return torch.autocast(self.symbol_ids.device.type, dtype=torch.bfloat16, enabled=bfloat16)
+
+
+def _present_episodes(meta: LeRobotDatasetMetadata) -> list[int]:
+    """Episodes whose data files are here: LeRobot downloads those of --dataset.episodes only."""
+    present = [i for i in range(meta.total_episodes) if (meta.root / meta.get_data_file_path(i)).is_file()]
+    if not present:
+        raise ValueError(
+            f"--policy.relative_actions=true reads actions and states of all frames before training, but "
+            f"{meta.root} holds no data file of {meta.repo_id}; a dataset that is streamed "
+            f"(--dataset.streaming=true) must be downloaded first"
+        )
+    return present
+
+
+def _take_action_names(config: Vla0SmolConfig | None, meta: LeRobotDatasetMetadata | None) -> None:
+    """The dataset's names in one row; LeRobot keeps only those of groups where a dataset groups them."""
+    if config is not None and meta is not None:
+        config.action_feature_names = dim_names(meta.features[ACTION])
 
 
 def _make_ensemble(config: Vla0SmolConfig) -> TemporalEnsemble | None:
