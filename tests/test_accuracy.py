@@ -1,5 +1,3 @@
-import math
-
 import pytest
 import torch
 from torch import Tensor
@@ -58,12 +56,11 @@ def test_hidden_and_padded_numbers_do_not_count() -> None:
     assert counted_numbers(NUMBERS.hide_characters(one_digit, 99)).tolist() == [[False, True]]
 
 
-def test_means_leave_out_what_nothing_counts_for() -> None:
+def test_means_are_zero_where_nothing_counts() -> None:
     values = torch.tensor([1.0, 2.0, 6.0])
     none = torch.zeros(3, dtype=torch.bool)
     counted = torch.tensor([True, False, True])
-    nan = torch.full((3,), math.nan)
-    assert means({"a": (values, counted), "b": (values, none), "c": (nan, counted)}) == {"a": 3.5}
+    assert means({"a": (values, counted), "b": (values, none)}) == {"a": 3.5, "b": 0.0}
 
 
 def told(
@@ -83,6 +80,7 @@ def test_metrics_of_a_policy(monkeypatch: pytest.MonkeyPatch, off_by: int, exact
         n_action_bins=101, bin_mode="levels", number_width=3, action_feature_names=["x", "y", "z", "grip"]
     )
     policy.action_unit.copy_(torch.tensor([1.0, 10.0, 100.0, 0.5]))
+    policy._knows_units = True
     batch = make_batch(policy, 4)
     batch["action"] = batch["action"] * 0.9  # one bin more stays in range
     metrics = told(policy, batch, monkeypatch, off_by)
@@ -96,7 +94,7 @@ def test_metrics_of_a_policy(monkeypatch: pytest.MonkeyPatch, off_by: int, exact
 
 def test_padded_steps_do_not_enter_the_metrics(monkeypatch: pytest.MonkeyPatch) -> None:
     policy = make_policy(n_action_bins=101, bin_mode="levels", number_width=3)
-    policy.action_unit.fill_(1.0)
+    policy._knows_units = True
     batch = make_batch(policy, 1)
     right = policy._bins(batch)
     batch["action_is_pad"][0, 1:] = True

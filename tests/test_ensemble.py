@@ -46,7 +46,15 @@ def test_dimensions_that_are_not_averaged_come_from_the_newest_chunk() -> None:
 def test_weights_by_age() -> None:
     assert age_weights("uniform", 3, 5.0).tolist() == [1, 1, 1]
     assert age_weights("nvlabs", 3, 5.0).tolist() == [1, 0.5, 0.5]
-    torch.testing.assert_close(age_weights("exponential", 3, -math.log(2)), torch.tensor([1, 0.5, 0.25]))
+    weights = age_weights("exponential", 3, -math.log(2))
+    torch.testing.assert_close(weights / weights[0], torch.tensor([1, 0.5, 0.25]))
+
+
+def test_no_coefficient_overflows() -> None:
+    ensemble = TemporalEnsemble(3, "exponential", 500.0)
+    for value in (1.0, 2.0, 4.0):
+        action = ensemble(torch.full((1, 3, 1), value))
+    assert action.item() == 1.0  # the oldest
 
 
 def test_a_policy_averages_what_it_foresaw_and_forgets_it_on_reset() -> None:

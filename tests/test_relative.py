@@ -104,6 +104,16 @@ def test_delta_control_is_refused() -> None:
         relative.fit(steps, states, np.full(100, 100), 5, span, span)
 
 
+def test_an_action_may_lead_its_state_by_a_whole_step() -> None:
+    """At a coarse rate a position is reached one frame later, and jumps far in between."""
+    actions = np.array([[0.0], [9.0], [1.0], [8.0], [0.0]])
+    states = np.array([[5.0], [0.0], [9.0], [1.0], [8.0]])
+    span = (np.array([0.0]), np.array([9.0]))
+    relative = RelativeActions(1, {0: 0})
+    relative.fit(actions, states, np.full(5, 5), 1, span, span)
+    assert relative.scale.item() > 1.5
+
+
 def test_bounds_are_those_of_the_normaliser() -> None:
     statistics = {name: np.array([value]) for name, value in (("min", 1), ("max", 5), ("q01", 2), ("q99", 4))}
     for mode, low, high in (

@@ -128,7 +128,7 @@ def test_a_checkpoint_needs_nothing_but_itself(tmp_path: Path) -> None:
         check=True,
     )
     expected = policy.predict_action_chunk(batch)[:, 0]
-    torch.testing.assert_close(torch.load(tmp_path / "action.pt"), expected)
+    assert torch.equal(torch.load(tmp_path / "action.pt"), expected)
 
 
 def test_a_checkpoint_keeps_its_system_prompt(tmp_path: Path) -> None:
@@ -191,6 +191,12 @@ def test_an_observation_without_a_task_is_an_error(task: Any) -> None:
             r"--policy.temporal_ensemble_size=3 .* needs --policy.n_action_steps=1; got 2, which is a queue",
         ),
         ({"temporal_ensemble_weighting": "newest"}, r"--policy.temporal_ensemble_weighting='newest' is unk"),
+        ({"n_action_bins": 10_001}, r"--policy.n_action_bins=10001 must lie in 2..10000"),
+        ({"number_width": 5}, r"--policy.number_width=5 must be 0 \(no padding\) or lie in 3..4"),
+        (
+            {"temporal_ensemble_coefficient": float("nan")},
+            r"temporal_ensemble_coefficient=nan must be finite",
+        ),
         ({"n_action_bins": 1}, r"--policy.n_action_bins=1 must lie in 2.."),
         ({"n_state_bins": -5}, r"--policy.n_state_bins=-5 must lie in 2.."),
         ({"number_width": 2}, r"--policy.number_width=2 must be 0 \(no padding\) or lie in 3.."),
@@ -234,6 +240,17 @@ IMAGE_FEATURE = {WRIST: PolicyFeature(FeatureType.VISUAL, (3, 64, 64))}
         (
             {"input_features": IMAGE_FEATURE, "use_state": False, "relative_actions": True},
             "--policy.relative_actions=true needs .* Give --policy.relative_actions=false",
+        ),
+        (  # LIBERO: 8 numbers of state, 7 of action
+            {
+                "relative_actions": True,
+                "input_features": {
+                    **IMAGE_FEATURE,
+                    "observation.state": PolicyFeature(FeatureType.STATE, (8,)),
+                },
+                "output_features": {"action": PolicyFeature(FeatureType.ACTION, (7,))},
+            },
+            "7 of 7 action dimensions are relative and the state has 8; give --policy.relative_state_indices",
         ),
         ({"output_features": {}}, "needs the feature 'action'"),
         (

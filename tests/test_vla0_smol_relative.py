@@ -55,7 +55,7 @@ def test_written_numbers_are_the_residuals(tmp_path: Path) -> None:
     written = policy.action_bins.decode(policy._bins(batch)).view(3, 4)[0]
     unit = policy.relative.scale.numpy() * (action["max"] - action["min"]) / 2
     np.testing.assert_allclose(
-        written * unit, (action_raw - state_raw).clip(-unit, unit), atol=unit.max() / 998
+        written.numpy() * unit, (action_raw - state_raw).clip(-unit, unit), atol=unit.max() / 998
     )
     torch.testing.assert_close(policy._unit, torch.from_numpy(unit).float())
 
@@ -87,6 +87,17 @@ def test_a_checkpoint_keeps_its_scale_and_new_data_replace_it(tmp_path: Path) ->
     assert fresh.relative is not None
     assert torch.equal(tuned.relative.scale, fresh.relative.scale)
     assert not torch.equal(tuned.relative.scale, policy.relative.scale)
+
+
+def test_a_checkpoint_without_relative_actions_cannot_get_them(tmp_path: Path) -> None:
+    make_policy().save_pretrained(tmp_path)
+    config = make_config(relative_actions=True)
+    trained = make_policy().config
+    config.vlm_config, config.prompt_tokens = trained.vlm_config, trained.prompt_tokens
+    with pytest.raises(
+        ValueError, match=r"--policy.relative_actions is not what this checkpoint was trained"
+    ):
+        Vla0SmolPolicy.from_pretrained(tmp_path, config=config)
 
 
 def test_excluded_dimensions_stay_absolute(tmp_path: Path) -> None:

@@ -3,7 +3,6 @@
 Shapes as in `lerobot_bomb.actions.text`; `M` = N * C + 1 columns, those of all numbers and the end token.
 """
 
-import math
 from collections.abc import Mapping
 
 import torch
@@ -36,10 +35,8 @@ def read_numbers(numbers: NumberTokens, digits_BM: Tensor) -> Tensor:
 def means(parts: Mapping[str, tuple[Tensor, Tensor]]) -> dict[str, float]:
     """{name: (values, which count)} -> {name: mean}, in one transfer from the device.
 
-    What nothing counts for, or has no finite mean, is left out.
+    0 where nothing counts: LeRobot averages over processes by the names' order, so none may come and go.
     """
     sums = [torch.where(counted, values, 0).float().sum() for values, counted in parts.values()]
-    counts = [counted.sum().float() for _, counted in parts.values()]
-    pairs = torch.stack([torch.stack(sums), torch.stack(counts)], dim=1).tolist()
-    averages = {name: total / count for name, (total, count) in zip(parts, pairs, strict=True) if count}
-    return {name: average for name, average in averages.items() if math.isfinite(average)}
+    counts = [counted.sum().clamp(min=1) for _, counted in parts.values()]
+    return dict(zip(parts, (torch.stack(sums) / torch.stack(counts)).tolist(), strict=True))

@@ -10,7 +10,7 @@ WEIGHTINGS = ("uniform", "exponential", "nvlabs")
 
 
 def age_weights(weighting: str, num_chunks: int, coefficient: float) -> Tensor:
-    """(num_chunks,) weights of chunks, the newest first.
+    """(num_chunks,) weights of chunks, the newest first, up to a factor.
 
     ``uniform``: all alike (VLA-0, arXiv 2510.13054). ``exponential``: exp(coefficient * age), so a positive
     coefficient favours old chunks, as in ACT (arXiv 2304.13705), and -ln 2 halves the weight with every
@@ -20,7 +20,7 @@ def age_weights(weighting: str, num_chunks: int, coefficient: float) -> Tensor:
     if weighting == "uniform":
         return torch.ones(num_chunks)
     if weighting == "exponential":
-        return torch.exp(coefficient * ages)
+        return torch.softmax(coefficient * ages, dim=0)  # cannot overflow; only the ratios matter
     return torch.where(ages == 0, 1.0, 0.5)
 
 
@@ -31,7 +31,7 @@ class TemporalEnsemble:
     """
 
     def __init__(self, size: int, weighting: str, coefficient: float, newest_only: Sequence[int] = ()):
-        self._weights = age_weights(weighting, size, coefficient)
+        self._weighting, self._coefficient = weighting, coefficient
         self._newest_only = list(newest_only)
         self._chunks: deque[Tensor] = deque(maxlen=size)
 
@@ -43,7 +43,8 @@ class TemporalEnsemble:
         """(B, T, D) newest chunk, T at least the ensemble's size -> (B, D) action of this step."""
         self._chunks.appendleft(chunk_BTD)
         actions_BID = torch.stack([chunk[:, age] for age, chunk in enumerate(self._chunks)], dim=1)
-        weights_I1 = self._weights[: actions_BID.shape[1], None].to(actions_BID)
+        weights_I = age_weights(self._weighting, len(self._chunks), self._coefficient)
+        weights_I1 = weights_I[:, None].to(actions_BID)
         action_BD = (weights_I1 * actions_BID).sum(dim=1) / weights_I1.sum()
         action_BD[:, self._newest_only] = actions_BID[:, 0, self._newest_only]
         return action_BD

@@ -65,6 +65,7 @@ class RelativeActions(nn.Module):
     gain: Tensor  # (D,)
     bias: Tensor  # (D,)
     scale: Tensor  # (D,)
+    state_indices: Tensor  # (D,) int64
 
     def __init__(self, num_dims: int, state_of_dim: dict[int, int]):
         """``state_of_dim``: {action dimension that is relative: its state dimension}."""
@@ -72,7 +73,8 @@ class RelativeActions(nn.Module):
         self.state_of_dim = state_of_dim
         relative = torch.zeros(num_dims)
         relative[list(state_of_dim)] = 1
-        self.state_indices = [state_of_dim.get(dim, 0) for dim in range(num_dims)]
+        state_indices = torch.tensor([state_of_dim.get(dim, 0) for dim in range(num_dims)])
+        self.register_buffer("state_indices", state_indices, persistent=False)
         self.register_buffer("gain", relative)
         self.register_buffer("bias", torch.zeros(num_dims))
         self.register_buffer("scale", 1 + relative)  # two values in [-1, 1] differ by at most 2
@@ -111,7 +113,7 @@ class RelativeActions(nn.Module):
                 self.gain[dim], self.bias[dim], self.scale[dim] = 0, 0, 1
                 continue
             actions_N, states_N = actions_ND[:, dim], states_NS[:, state_dim]
-            _require_tracking(actions_N, states_N, dim, state_dim)
+            _require_tracking(actions_N, states_N, episode_ends_N, dim, state_dim)
             state_low, state_high = state_bounds[0][state_dim], state_bounds[1][state_dim]
             self.gain[dim] = float((state_high - state_low) / (high - low))
             self.bias[dim] = float((state_high + state_low - high - low) / (high - low))
@@ -119,14 +121,18 @@ class RelativeActions(nn.Module):
             self.scale[dim] = float(np.quantile(np.abs(residuals), QUANTILE) * 2 / (high - low)) or 1.0
 
 
-def _require_tracking(actions_N: np.ndarray, states_N: np.ndarray, dim: int, state_dim: int) -> None:
-    """Raise unless the action varies less around the state than by itself."""
-    spread, residual_spread = float(actions_N.std()), float((actions_N - states_N).std())
-    if not residual_spread < spread:
+def _require_tracking(
+    actions_N: np.ndarray, states_N: np.ndarray, episode_ends_N: np.ndarray, dim: int, state_dim: int
+) -> None:
+    """Raise unless the action varies less around the state, or the state that follows, than by itself."""
+    following_N = np.minimum(np.arange(len(states_N)) + 1, episode_ends_N - 1)
+    spread = float(actions_N.std())
+    distance = min(float((actions_N - of).std()) for of in (states_N, states_N[following_N]))
+    if not distance < spread:
         raise ValueError(
             f"--policy.relative_actions=true: action dimension {dim} does not follow state dimension "
-            f"{state_dim} (standard deviation {spread:.3g}, and {residual_spread:.3g} relative to the "
-            f"state). Actions that are already differences (delta control) must stay absolute: give "
+            f"{state_dim} (standard deviation {spread:.3g}, and {distance:.3g} around the state). Actions "
+            f"that are already differences (delta control) must stay absolute: give "
             f"--policy.relative_actions=false, or name such dimensions in --policy.relative_exclude_joints, "
             f"or the right state dimensions in --policy.relative_state_indices"
         )

@@ -1,5 +1,6 @@
 """Config of ``vla0_smol``."""
 
+import math
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -166,6 +167,11 @@ class Vla0SmolConfig(PreTrainedConfig):
             raise ValueError(
                 f"--policy.temporal_ensemble_size={size} predicts at every step and needs "
                 f"--policy.n_action_steps=1; got {self.n_action_steps}, which is a queue"
+            )
+
+        if not math.isfinite(self.temporal_ensemble_coefficient):
+            raise ValueError(
+                f"--policy.temporal_ensemble_coefficient={self.temporal_ensemble_coefficient} must be finite"
             )
 
     def _check_numbers(self) -> None:

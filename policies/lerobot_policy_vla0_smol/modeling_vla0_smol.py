@@ -95,7 +95,8 @@ class Vla0SmolPolicy(PreTrainedPolicy):
             RelativeActions(self._action_dim, config.relative_dims()) if config.relative_actions else None
         )
         # physical size of 1 in normalised actions, known while training: (D,)
-        self.register_buffer("action_unit", torch.full((self._action_dim,), torch.nan), persistent=False)
+        self.register_buffer("action_unit", torch.ones(self._action_dim), persistent=False)
+        self._knows_units = False
         # source of all that is random in training: the crop and the hidden numbers
         self.generator = torch.Generator().manual_seed(torch.initial_seed())
         self._ensemble = _make_ensemble(config)
@@ -113,7 +114,15 @@ class Vla0SmolPolicy(PreTrainedPolicy):
     ) -> "Vla0SmolPolicy":
         """As LeRobot's, but a missing or unexpected tensor is an error; relative actions fit the new data."""
         _take_action_names(config, dataset_meta)
-        policy = super().from_pretrained(*args, config=config, **{**kwargs, "strict": True})
+        try:
+            policy = super().from_pretrained(*args, config=config, **{**kwargs, "strict": True})
+        except RuntimeError as error:
+            if "relative.scale" in str(error):
+                raise ValueError(
+                    "--policy.relative_actions is not what this checkpoint was trained with, "
+                    "and cannot be changed"
+                ) from error
+            raise
         if dataset_meta is not None:
             policy._fit(dataset_meta)
         return policy
@@ -126,8 +135,14 @@ class Vla0SmolPolicy(PreTrainedPolicy):
         action_mode, state_mode = (config.normalization_mapping[kind] for kind in ("ACTION", "STATE"))
         action_bounds = bounds(meta.stats[ACTION], action_mode, self._action_dim)
         self.action_unit.copy_(torch.from_numpy(action_bounds[1] - action_bounds[0]) / 2)
+        self._knows_units = True
         if self.relative is None:
             return
+        if OBS_STATE not in meta.features:
+            raise ValueError(
+                f"--policy.relative_actions=true needs {OBS_STATE!r} under this name in the dataset; it has "
+                f"{sorted(meta.features)}"
+            )
         columns = read_columns(meta, (ACTION, OBS_STATE), _present_episodes(meta))
         state_bounds = bounds(meta.stats[OBS_STATE], state_mode, columns[OBS_STATE].shape[1])
         _, ends = episode_bounds(columns["episode_index"])
@@ -147,6 +162,8 @@ class Vla0SmolPolicy(PreTrainedPolicy):
 
     def forward(self, batch: dict[str, Tensor], reduction: str = "mean") -> tuple[Tensor, dict[str, float]]:
         """Cross-entropy of the answer's tokens, over the kept ones; ``reduction="none"`` gives (B,)."""
+        if reduction not in ("mean", "none"):
+            raise ValueError(f"reduction={reduction!r} is unknown; choose mean or none")
         with self._autocast():
             prompt = self._prompt(batch)
             bins_BN = self._bins(batch)
@@ -169,7 +186,7 @@ class Vla0SmolPolicy(PreTrainedPolicy):
         """Shares of right tokens and of exact numbers, mean absolute errors in the data's units.
 
         Teacher-forced: every digit is predicted from the true ones before it. Hidden and padded numbers do
-        not count; what nothing counts for is left out.
+        not count. Errors are known where a dataset was given, that is while training.
         """
         kept_BA = answer.labels != IGNORED
         right_BA = logits_BAV.argmax(dim=-1) == answer.labels
@@ -181,17 +198,12 @@ class Vla0SmolPolicy(PreTrainedPolicy):
         errors_BN = (bins.decode(read_BN.clamp(max=bins.num_bins - 1)) - bins.decode(bins_BN)).abs()
         errors_BTD = errors_BN.unflatten(1, (-1, self._action_dim)) * self._unit
         counted_BTD = counted_BN.view_as(errors_BTD)
-        return means(
-            {
-                "token_accuracy": (right_BA, kept_BA),
-                "value_accuracy": (exact_BN, counted_BN),
-                "l1": (errors_BTD, counted_BTD),
-                **{
-                    f"l1_{name}": (errors_BTD[..., dim], counted_BTD[..., dim])
-                    for dim, name in enumerate(self.config.action_names)
-                },
-            }
-        )
+        parts = {"token_accuracy": (right_BA, kept_BA), "value_accuracy": (exact_BN, counted_BN)}
+        if self._knows_units:
+            parts["l1"] = errors_BTD, counted_BTD
+            for dim, name in enumerate(self.config.action_names):
+                parts[f"l1_{name}"] = errors_BTD[..., dim], counted_BTD[..., dim]
+        return means(parts)
 
     def _answer_logits(self, batch: dict[str, Tensor], prompt: TokenRows, answer: TokenRows) -> Tensor:
         """Teacher-forced logits of every answer token: (B, A, V)."""
