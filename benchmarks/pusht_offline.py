@@ -5,6 +5,9 @@ The recipe configs/pusht_TYPE.yaml and its variants, each with several seeds, ar
 180-205, beside predictors that look at no picture. With --eval_episodes the recipe's checkpoints also play in
 LeRobot's environment `pusht`.
 
+All start from one small backbone that has learned to see before, on the same episodes: from random weights, a
+model that may read the state never comes to look at the picture (docs/pusht.md).
+
     python benchmarks/pusht_offline.py --policy.type=vla0_smol --source pusht_cchi_v7_replay.zarr \
         --output_dir pusht
 
@@ -34,6 +37,18 @@ REPO_ID = "lerobot_bomb/pusht"
 NUM_TRAIN_EPISODES = 180
 MAX_COVERAGE_REWARD = 0.95  # coverage from which gym-pusht's reward is 1
 
+# absolute positions that no state tells must be found in the picture
+BASE_FLAGS: dict[str, list[str]] = {
+    "vla0_smol": [
+        "--policy.relative_actions=false",
+        "--policy.use_state=false",
+        "--policy.chunk_size=10",
+        "--policy.optimizer_lr=1.0e-3",
+        "--batch_size=32",
+        "--steps=2500",
+        "--save_freq=500",
+    ],
+}
 RECIPE = "recipe"
 VARIANTS: dict[str, dict[str, list[str]]] = {
     "vla0_smol": {
@@ -54,8 +69,12 @@ class Run:
     folder: Path
 
     @property
+    def train_dir(self) -> Path:
+        return self.folder / "train"
+
+    @property
     def checkpoint(self) -> Path:
-        return self.folder / "train" / "checkpoints" / "last" / "pretrained_model"
+        return self.train_dir / "checkpoints" / "last" / "pretrained_model"
 
 
 def main() -> None:
@@ -88,13 +107,17 @@ def main() -> None:
 def prove(args: argparse.Namespace, chosen: list[str]) -> dict[str, list[Seed]]:
     """{variant: what was measured of each of its seeds}."""
     dataset = convert(args.source, args.output_dir / "dataset")
+    base = learn_to_see(args.policy_type, dataset, args.output_dir)
     runs = [
         Run(variant, seed, args.output_dir / f"{variant}_{seed}")
         for seed in range(args.seeds)
         for variant in chosen
     ]
     with ThreadPoolExecutor(args.jobs) as pool:
-        list(pool.map(lambda run: train(run, args.policy_type, dataset), runs))
+        flags = [
+            [f"--policy.vlm_model_name={base}", *VARIANTS[args.policy_type][run.variant]] for run in runs
+        ]
+        list(pool.map(lambda run, own: train(run, args.policy_type, dataset, own), runs, flags))
         columns = list(pool.map(lambda run: measure(run, dataset, args.frames), runs))
         is_played = [args.eval_episodes is not None and run.variant == RECIPE for run in runs]
         coverages = list(
@@ -126,7 +149,17 @@ def convert(source: Path | None, dataset: Path) -> Path:
     return dataset
 
 
-def train(run: Run, policy_type: str, dataset: Path) -> None:
+def learn_to_see(policy_type: str, dataset: Path, folder: Path) -> Path:
+    """The backbone that all trainings start from, as a folder for --policy.vlm_model_name."""
+    run, backbone = Run("base", 0, folder / "base"), folder / "base" / "backbone"
+    train(run, policy_type, dataset, BASE_FLAGS[policy_type])
+    if not backbone.exists():
+        flags = [f"--policy.path={run.checkpoint}", f"--output={backbone}"]
+        run_logged(run.folder / "export.log", "lerobot-bomb", "export-backbone", *flags)
+    return backbone.resolve()
+
+
+def train(run: Run, policy_type: str, dataset: Path, flags: list[str]) -> None:
     """Stock `lerobot-train`; a training that was killed starts anew."""
     times = run.folder / "training.json"
     if times.exists():
@@ -140,9 +173,9 @@ def train(run: Run, policy_type: str, dataset: Path) -> None:
         f"--dataset.repo_id={REPO_ID}",
         f"--dataset.root={dataset}",
         f"--dataset.episodes={list(range(NUM_TRAIN_EPISODES))}",
-        f"--output_dir={run.folder / 'train'}",
+        f"--output_dir={run.train_dir}",
         f"--seed={run.seed}",
-        *VARIANTS[policy_type][run.variant],
+        *flags,
     )
     minutes = {"minutes": (time.monotonic() - started) / 60, "cpu_minutes": cpu_s / 60}
     times.write_text(json.dumps(minutes) + "\n")

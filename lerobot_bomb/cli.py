@@ -19,6 +19,10 @@ COMMANDS = {
         "loss, accuracy and L1 of a checkpoint on recorded frames, beside trivial predictors",
         "lerobot_bomb.evaluation.offline_metrics",
     ),
+    "export-backbone": (
+        "a checkpoint's vision-language model as a folder that other policies can start from",
+        "lerobot_bomb.vlm.export",
+    ),
     "view": ("play one episode into a recording for Rerun and a video", "lerobot_bomb.viewing.view"),
     "gallery": ("draw what every perturbation axis changes", "lerobot_bomb.viewing.gallery"),
     "demo": ("record, train and evaluate on this machine in minutes", "lerobot_bomb.demo"),
