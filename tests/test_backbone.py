@@ -211,3 +211,18 @@ def test_another_kind_of_model_is_refused(tmp_path: Path) -> None:
     (tmp_path / "config.json").write_text('{"model_type": "gpt2"}')
     with pytest.raises(ValueError, match="is a 'gpt2' model; vla0_smol needs a 'smolvlm' one"):
         load_backbone(str(tmp_path))
+
+
+@torch.no_grad()
+def test_fresh_nano_features_tell_pictures_apart() -> None:
+    """Even patches vanish, so a small spot is not drowned by the background."""
+    torch.manual_seed(0)
+    backbone = load_backbone("nano")
+    embed = backbone.vlm.model.vision_model.embeddings.patch_embedding
+    even = torch.ones(1, 3, 128, 128)
+    assert embed(even).abs().max() < 1e-4
+    spots = even.repeat(4, 1, 1, 1)
+    for row, spot in enumerate(spots):
+        spot[:, 32 * row : 32 * row + 8, 60:68] = -1
+    features = backbone.embed_images(spots)
+    assert features.std(dim=0).mean() > 0.2 * features.std()

@@ -85,7 +85,9 @@ def load_backbone(vlm_model_name: str) -> SmolVLMBackbone:
         ValueError: the model is not of the SmolVLM family.
     """
     if vlm_model_name == NANO:
-        return build_backbone(nano_config(load_tokenizer(NANO)))
+        backbone = build_backbone(nano_config(load_tokenizer(NANO)))
+        _centre_patch_filters(backbone)
+        return backbone
     if not Path(vlm_model_name).is_dir():
         hub_file(vlm_model_name, "config.json")
     config = AutoConfig.from_pretrained(vlm_model_name)
@@ -105,6 +107,17 @@ def load_backbone(vlm_model_name: str) -> SmolVLMBackbone:
             f"model.safetensors"
         ) from error
     return SmolVLMBackbone(vlm)
+
+
+@torch.no_grad()
+def _centre_patch_filters(backbone: SmolVLMBackbone) -> None:
+    """Take its mean from every filter of the patch embedding, so that an even patch becomes nothing.
+
+    Most of a robot's picture is even and never changes. Drawn at random, the filters turn it into one large
+    constant; what differs between pictures is a tenth of that and gets lost before it is learned from.
+    """
+    filters = backbone.vlm.model.vision_model.embeddings.patch_embedding.weight
+    filters -= filters.mean(dim=(1, 2, 3), keepdim=True)
 
 
 def build_backbone(vlm_config: dict[str, Any]) -> SmolVLMBackbone:
