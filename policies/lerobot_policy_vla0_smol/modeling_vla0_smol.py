@@ -20,7 +20,7 @@ from torch.nn.functional import cross_entropy
 from lerobot_bomb.actions.accuracy import counted_numbers, exact_numbers, means, read_numbers
 from lerobot_bomb.actions.bins import Bins
 from lerobot_bomb.actions.ensemble import TemporalEnsemble
-from lerobot_bomb.actions.relative import RelativeActions, bounds, named_dims
+from lerobot_bomb.actions.relative import RelativeActions, bounds, named_dims, present_episodes
 from lerobot_bomb.actions.text import (
     END,
     SPACE,
@@ -143,7 +143,7 @@ class Vla0SmolPolicy(PreTrainedPolicy):
                 f"--policy.relative_actions=true needs {OBS_STATE!r} under this name in the dataset; it has "
                 f"{sorted(meta.features)}"
             )
-        columns = read_columns(meta, (ACTION, OBS_STATE), _present_episodes(meta))
+        columns = read_columns(meta, (ACTION, OBS_STATE), present_episodes(meta))
         state_bounds = bounds(meta.stats[OBS_STATE], state_mode, columns[OBS_STATE].shape[1])
         _, ends = episode_bounds(columns["episode_index"])
         self.relative.fit(
@@ -400,18 +400,6 @@ class Vla0SmolPolicy(PreTrainedPolicy):
         """The precision of ``config.dtype``, whoever calls: training, evaluation or a user's own loop."""
         bfloat16 = self.config.dtype == "bfloat16"
         return torch.autocast(self.symbol_ids.device.type, dtype=torch.bfloat16, enabled=bfloat16)
-
-
-def _present_episodes(meta: LeRobotDatasetMetadata) -> list[int]:
-    """Episodes whose data files are here: LeRobot downloads those of --dataset.episodes only."""
-    present = [i for i in range(meta.total_episodes) if (meta.root / meta.get_data_file_path(i)).is_file()]
-    if not present:
-        raise ValueError(
-            f"--policy.relative_actions=true reads actions and states of all frames before training, but "
-            f"{meta.root} holds no data file of {meta.repo_id}; a dataset that is streamed "
-            f"(--dataset.streaming=true) must be downloaded first"
-        )
-    return present
 
 
 def _take_action_names(config: Vla0SmolConfig | None, meta: LeRobotDatasetMetadata | None) -> None:
