@@ -218,7 +218,7 @@ def test_fresh_nano_features_tell_pictures_apart() -> None:
     """Even patches vanish, so a small spot is not drowned by the background."""
     torch.manual_seed(0)
     backbone = load_backbone("nano")
-    embed = backbone.vlm.model.vision_model.embeddings.patch_embedding
+    embed = backbone.vlm.model.vision_model.get_submodule("embeddings.patch_embedding")
     even = torch.ones(1, 3, 128, 128)
     assert embed(even).abs().max() < 1e-4
     spots = even.repeat(4, 1, 1, 1)

@@ -116,8 +116,9 @@ def _centre_patch_filters(backbone: SmolVLMBackbone) -> None:
     Most of a robot's picture is even and never changes. Drawn at random, the filters turn it into one large
     constant; what differs between pictures is a tenth of that and gets lost before it is learned from.
     """
-    filters = backbone.vlm.model.vision_model.embeddings.patch_embedding.weight
-    filters -= filters.mean(dim=(1, 2, 3), keepdim=True)
+    embedding = backbone.vlm.model.vision_model.get_submodule("embeddings.patch_embedding")
+    assert isinstance(embedding, nn.Conv2d)
+    embedding.weight -= embedding.weight.mean(dim=(1, 2, 3), keepdim=True)
 
 
 def build_backbone(vlm_config: dict[str, Any]) -> SmolVLMBackbone:
