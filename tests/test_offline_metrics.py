@@ -64,12 +64,11 @@ def by_heart(checkpoint: Path, root: Path, tmp_path_factory: pytest.TempPathFact
     batch = load_processors(config)[0](raw)
     optimizer = torch.optim.AdamW(policy.get_optim_params(), lr=2e-3, weight_decay=0.0)
     for _ in range(400):
-        loss, metrics = policy.forward(batch)
+        loss, _ = policy.forward(batch)
         optimizer.zero_grad()
         loss.backward()
         optimizer.step()
-        assert metrics is not None
-        if metrics["token_accuracy"] == 1.0:
+        if loss < 0.01:
             break
     path = tmp_path_factory.mktemp("by_heart") / "pretrained_model"
     shutil.copytree(checkpoint, path)
