@@ -7,11 +7,11 @@ from typing import Any
 
 import cv2
 import numpy as np
-from machine import print_table
 
 from lerobot_bomb.evaluation.results import PUT_DOWN, Row
 from lerobot_bomb.schema import Failure, Stage
 from lerobot_bomb.stats import format_rate, wilson_interval
+from lerobot_bomb.tables import print_table
 
 NEAR_MM = 20.0
 LIFTED = (Stage.LIFTED, Stage.PLACED)

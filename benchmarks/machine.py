@@ -4,7 +4,6 @@ import argparse
 import json
 import os
 import platform
-from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -40,14 +39,6 @@ def require_idle_machine(force: bool) -> None:
         raise SystemExit(
             f"The load is above {MAX_LOAD_PER_CORE} per core: wait until the machine is idle, or use --force."
         )
-
-
-def print_table(header: Sequence[str], rows: Sequence[Sequence[str]]) -> None:
-    """Print rows of text, the first column to the left, the others to the right."""
-    widths = [max(len(row[i]) for row in [header, *rows]) for i in range(len(header))]
-    for name, *cells in [header, *rows]:
-        padded = [cell.rjust(width) for cell, width in zip(cells, widths[1:], strict=True)]
-        print("  ".join([name.ljust(widths[0]), *padded]).rstrip())
 
 
 def write_figures(path: Path | None, figures: dict[str, Any]) -> None:

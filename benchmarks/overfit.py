@@ -25,12 +25,13 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from machine import add_machine_arguments, positive, print_table, require_idle_machine, write_figures
+from machine import add_machine_arguments, positive, require_idle_machine, write_figures
 from recipes import POLICY_TYPES, read_recipe, recipe_path
 
 from lerobot_bomb.commands import run_command
 from lerobot_bomb.evaluation.results import Row, read_results
 from lerobot_bomb.schema import EpisodeSpec, Failure
+from lerobot_bomb.tables import print_table
 
 SEED = 1007  # its board is empty, so nothing but the sentence tells the target
 TASK_IDS = (0, 4, 7, 11, 13, 15, 22, 24)  # all black

@@ -12,10 +12,11 @@ from functools import partial
 from statistics import median
 
 import numpy as np
-from machine import add_machine_arguments, positive, print_table, require_idle_machine, write_figures
+from machine import add_machine_arguments, positive, require_idle_machine, write_figures
 
 from lerobot_bomb.perturbations import AXES, MAX_LEVEL
 from lerobot_bomb.schema import EpisodeSpec, RenderOptions
+from lerobot_bomb.tables import print_table
 from lerobot_env_bomb.env import BombEnv
 
 NUM_STEPS = 8  # of each episode

@@ -7,9 +7,9 @@ from statistics import fmean, stdev
 from typing import Any
 
 import numpy as np
-from machine import print_table
 
 from lerobot_bomb.stats import bootstrap_interval
+from lerobot_bomb.tables import print_table
 
 T_QUANTILES = {2: 12.706, 3: 4.303, 4: 3.182, 5: 2.776}  # 97.5 % of Student's t, by number of seeds
 SHOWN_STEPS = (1, 2, 3, 5, 8, 10, 12, 16)  # of the chunk

@@ -14,11 +14,12 @@ import tempfile
 import time
 from pathlib import Path
 
-from machine import add_machine_arguments, print_table, require_idle_machine, write_figures
+from machine import add_machine_arguments, require_idle_machine, write_figures
 
 from lerobot_bomb.data.record import record
 from lerobot_bomb.data.recording import Recording
 from lerobot_bomb.data.rollout import Rollout, RolloutSettings, make_env, play
+from lerobot_bomb.tables import print_table
 
 TARGET = 0.8  # of the peer's frames per second
 RECORDER, PEER = "lerobot-bomb record", "LeRobot's streaming writer"

@@ -21,7 +21,9 @@ import time
 from collections.abc import Callable
 from pathlib import Path
 
-from machine import add_machine_arguments, print_table, require_idle_machine, write_figures
+from machine import add_machine_arguments, require_idle_machine, write_figures
+
+from lerobot_bomb.tables import print_table
 
 IMAGE_SIZE = 256
 NUM_FRAMES = 100

@@ -26,11 +26,13 @@ from lerobot.datasets.factory import make_dataset
 from lerobot.envs import make_env, make_env_config, make_env_pre_post_processors, preprocess_observation
 from lerobot.policies import make_policy, make_pre_post_processors
 from lerobot.utils.import_utils import register_third_party_plugins
-from machine import add_machine_arguments, positive, print_table, require_idle_machine, write_figures
+from machine import add_machine_arguments, positive, require_idle_machine, write_figures
 from overfit import IMAGE_SIZE, record
 from recipes import POLICY_TYPES, read_recipe
 from torch.profiler import ProfilerActivity, profile
 from torch.utils.data import default_collate
+
+from lerobot_bomb.tables import print_table
 
 NUM_OPERATORS = 8
 

@@ -26,13 +26,14 @@ import torch
 from lerobot.datasets.factory import make_dataset
 from lerobot.policies import make_policy, make_pre_post_processors
 from lerobot.utils.import_utils import register_third_party_plugins
-from machine import add_machine_arguments, positive, print_table, require_idle_machine, write_figures
+from machine import add_machine_arguments, positive, require_idle_machine, write_figures
 from overfit import record
 from step_profile import Stages, print_stages, recipe
 from torch import Tensor
 from torch.utils.data import default_collate
 from train_speed_strings import StringPath
 
+from lerobot_bomb.tables import print_table
 from lerobot_bomb.vlm.images import crop_and_resize
 
 MIN_RATIO = 1.5

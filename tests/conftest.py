@@ -48,11 +48,11 @@ def pusht_dataset(pusht_zarr: Path, tmp_path_factory: pytest.TempPathFactory) ->
     from pusht_cases import REPO_ID
 
     from lerobot_bomb import cli
-    from lerobot_bomb.data import convert
+    from lerobot_bomb.data import growing
 
     root = tmp_path_factory.mktemp("converted") / "pusht"
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(convert, "BLOCK_EPISODES", 2)
+        patch.setattr(growing, "BLOCK_EPISODES", 2)
         command = ["convert", "pusht-zarr", str(pusht_zarr), f"--repo_id={REPO_ID}", f"--root={root}"]
         assert cli.main(command) == 0
     assert list(root.parent.iterdir()) == [root]

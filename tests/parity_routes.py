@@ -30,6 +30,8 @@ SEED, EPISODES, SIZE = 5, 2, 64
 MAX_LEARNING_STEPS, CHECK_EVERY = 300, 20
 
 type Finish = Callable[[PreTrainedPolicy, dict[int, Batch]], None]
+# (rollout of a replay, seed) -> (what the rollout returned, the episode's batches by index in the dataset)
+type Play = Callable[[Callable[[Any], dict], int], tuple[dict, dict[int, Batch]]]
 
 
 @dataclass(frozen=True)
@@ -169,6 +171,21 @@ class Replay(nn.Module):
 
 def run_eval(recorded: Recorded, output_dir: Path, checkpoint: Path) -> Route:
     """lerobot-eval on the recorded seeds."""
+
+    def play(rollout: Callable[[Any], dict], seed: int) -> tuple[dict, dict[int, Batch]]:
+        start, end = recorded.bounds[seed - SEED : seed - SEED + 2]
+        replay = Replay(recorded.actions[start:end])
+        result = rollout(replay)
+        assert len(replay.batches) == end - start and bool(result["success"][0, -1])
+        return result, dict(enumerate(replay.batches, start))
+
+    flags = f"--env.type=bomb --env.image_size={SIZE} --seed={SEED} --eval.n_episodes={EPISODES}"
+    flags += f" --env.control_mode={recorded.control_mode}"
+    return tap_eval(checkpoint, output_dir, flags, play)
+
+
+def tap_eval(checkpoint: Path, output_dir: Path, flags: str, play: Play) -> Route:
+    """lerobot-eval, an episode at a time; `play` gets its rollout, in which a replay replaces the policy."""
     route = Route()
     rollout = lerobot_eval.rollout
 
@@ -182,21 +199,18 @@ def run_eval(recorded: Recorded, output_dir: Path, checkpoint: Path) -> Route:
         seeds: list[int],
         **_: Any,
     ) -> dict:
-        episode = seeds[0] - SEED
-        start, end = recorded.bounds[episode : episode + 2]
-        replay: Any = Replay(recorded.actions[start:end])
-        as_recorded: Any = lambda action: action  # noqa: E731
-        result = rollout(env, replay, env_preprocessor, env_postprocessor, preprocessor, as_recorded, seeds)
-        assert len(replay.batches) == end - start and bool(result["success"][0, -1])
+        def of(replay: Any) -> dict:
+            as_recorded: Any = lambda action: action  # noqa: E731
+            return rollout(env, replay, env_preprocessor, env_postprocessor, preprocessor, as_recorded, seeds)
+
         route.policy, route.postprocessor = policy, postprocessor
-        route.batches |= dict(enumerate(replay.batches, start))
+        result, batches = play(of, seeds[0])
+        route.batches |= batches
         return result
 
-    flags = f"--env.type=bomb --env.image_size={SIZE} --policy.device=cpu --seed={SEED}"
-    flags += f" --env.control_mode={recorded.control_mode} --eval.n_episodes={EPISODES} --eval.batch_size=1"
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(lerobot_eval, "rollout", note)
         command = ["lerobot-eval", f"--policy.path={checkpoint}", f"--output_dir={output_dir}"]
-        patch.setattr(sys, "argv", [*command, *flags.split()])
+        patch.setattr(sys, "argv", [*command, "--policy.device=cpu", "--eval.batch_size=1", *flags.split()])
         lerobot_eval.main()
     return route

@@ -193,11 +193,11 @@ def run(job: dict) -> None:
 def serve() -> None:
     """Fork a recorder for each line of stdin and print its process id."""
     # the seconds that recorders save
-    from lerobot_bomb.data import blocks, record  # noqa: F401
+    from lerobot_bomb.data import blocks, growing, record  # noqa: F401
     from lerobot_env_bomb.backend import ensure_gl_backend
 
     ensure_gl_backend()
-    record.BLOCK_EPISODES = 2
+    growing.BLOCK_EPISODES = 2
     signal.signal(signal.SIGCHLD, signal.SIG_IGN)  # ended recorders leave no zombies
     for line in sys.stdin:
         pid = os.fork()

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from lerobot_bomb.cli import main
-from lerobot_bomb.data import record as record_module
+from lerobot_bomb.data import growing
 from lerobot_bomb.data.record import record
 from lerobot_bomb.data.recording import Recording
 from lerobot_bomb.data.rollout import Rollout, RolloutSettings, make_env, play
@@ -43,7 +43,7 @@ def dataset(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFac
     root = tmp_path_factory.mktemp("recorded") / "dataset"
     flags = [f"--repo_id={REPO_ID}", f"--root={root}", f"--episodes={EPISODES}", f"--seed={SEED}"]
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(record_module, "BLOCK_EPISODES", 2)
+        patch.setattr(growing, "BLOCK_EPISODES", 2)
         assert main(["record", *flags, f"--image_size={SIZE}", "--depth", request.param]) == 0
     return root
 
@@ -91,7 +91,7 @@ def test_an_interrupted_recording_resumes_to_the_same_bytes(
 ) -> None:
     from lerobot_bomb.data import blocks
 
-    monkeypatch.setattr(record_module, "BLOCK_EPISODES", 1)
+    monkeypatch.setattr(growing, "BLOCK_EPISODES", 1)
     recording = Recording(REPO_ID, episodes=2, seed=SEED, image_size=SIZE, depth=True)
     record(recording, tmp_path / "whole")
     write, started = blocks._write_episode, iter(range(9))

@@ -5,7 +5,7 @@ recorded states and executes their actions, which leads through the recorded sta
 """
 
 import itertools
-import sys
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -13,11 +13,20 @@ import numpy as np
 import pytest
 import torch
 from lerobot.policies import PreTrainedPolicy
-from lerobot.scripts import lerobot_eval
 from lerobot.utils.constants import ACTION, OBS_STATE
 from lerobot.utils.import_utils import register_third_party_plugins
 from model_inputs import Batch, first_ids, inference_inputs, pixels
-from parity_routes import Recorded, Replay, Route, Routes, cli_flags, learn_by_heart, resolution, run_train
+from parity_routes import (
+    Recorded,
+    Replay,
+    Route,
+    Routes,
+    cli_flags,
+    learn_by_heart,
+    resolution,
+    run_train,
+    tap_eval,
+)
 from pusht_cases import ZARR, Demonstrations, convert, starting_at
 from recipes import read_recipe
 from torch import Tensor
@@ -57,41 +66,19 @@ def run_pusht_eval(
     recorded: Recorded, demonstrations: Demonstrations, folder: Path, checkpoint: Path
 ) -> Route:
     """lerobot-eval from the recorded first states, one episode after the other."""
-    route = Route()
-    rollout = lerobot_eval.rollout
+    longest = max(np.diff(recorded.bounds))
 
-    def note(
-        env: Any,
-        policy: PreTrainedPolicy,
-        env_preprocessor: Any,
-        env_postprocessor: Any,
-        preprocessor: Any,
-        postprocessor: Any,
-        seeds: list[int],
-        **_: Any,
-    ) -> dict:
-        start, end = recorded.bounds[seeds[0] : seeds[0] + 2]
+    def play(rollout: Callable[[Any], dict], episode: int) -> tuple[dict, dict[int, Batch]]:
+        start, end = recorded.bounds[episode : episode + 2]
         # the environment goes on after the demonstration's end
         held = recorded.actions[end - 1 : end].repeat(longest, axis=0)
-        replay: Any = Replay(np.concatenate([recorded.actions[start:end], held]))
-        as_recorded: Any = lambda action: action  # noqa: E731
+        replay = Replay(np.concatenate([recorded.actions[start:end], held]))
         with starting_at(demonstrations.states[start]):
-            result = rollout(
-                env, replay, env_preprocessor, env_postprocessor, preprocessor, as_recorded, seeds
-            )
-        route.policy, route.postprocessor = policy, postprocessor
-        route.batches |= dict(enumerate(replay.batches[: end - start], start))
-        return result
+            result = rollout(replay)
+        return result, dict(enumerate(replay.batches[: end - start], start))
 
-    longest = max(np.diff(recorded.bounds))
-    flags = f"--env.type=pusht --env.episode_length={longest} --policy.device=cpu --seed=0"
-    flags += f" --eval.n_episodes={len(EPISODES)} --eval.batch_size=1 --eval.use_async_envs=false"
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(lerobot_eval, "rollout", note)
-        command = ["lerobot-eval", f"--policy.path={checkpoint}", f"--output_dir={folder}"]
-        patch.setattr(sys, "argv", [*command, *flags.split()])
-        lerobot_eval.main()
-    return route
+    flags = f"--env.type=pusht --env.episode_length={longest} --seed=0 --eval.n_episodes={len(EPISODES)}"
+    return tap_eval(checkpoint, folder, f"{flags} --eval.use_async_envs=false", play)
 
 
 def test_both_routes_give_the_same_tokens_and_nearly_the_same_pixels(routes: Routes) -> None:

@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 
 from lerobot_bomb import __version__
+from lerobot_bomb.data import growing
 from lerobot_bomb.data import record as record_module
 from lerobot_bomb.data.growing import METADATA_FILE, Progress, read_progress, unfinished_folder
 from lerobot_bomb.data.record import describe_failures, record
@@ -29,7 +30,7 @@ FEATURES = {"observation.images.workspace", "observation.images.wrist", "observa
 @pytest.fixture(autouse=True)
 def small_blocks(monkeypatch: pytest.MonkeyPatch) -> None:
     """Blocks of 2 episodes, so that a short recording is merged from several."""
-    monkeypatch.setattr(record_module, "BLOCK_EPISODES", 2)
+    monkeypatch.setattr(growing, "BLOCK_EPISODES", 2)
 
 
 @pytest.fixture(scope="module")
@@ -37,7 +38,7 @@ def datasets(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
     """Two uninterrupted recordings."""
     roots = {name: tmp_path_factory.mktemp("recorded") / name for name in ("video", "images")}
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(record_module, "BLOCK_EPISODES", 2)
+        patch.setattr(growing, "BLOCK_EPISODES", 2)
         record(VIDEO, roots["video"])
         record(IMAGES, roots["images"])
     return roots

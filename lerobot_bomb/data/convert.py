@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, Any, ClassVar
 from tqdm import tqdm
 
 from lerobot_bomb.data.growing import (
+    BLOCK_EPISODES,
     Progress,
     check_folders,
     check_repo_id,
@@ -28,7 +29,6 @@ from lerobot_bomb.data.pusht_zarr import IMAGE_SIZE, PushtZarr
 if TYPE_CHECKING:
     from lerobot_bomb.data.blocks import DatasetLayout, Episode
 
-BLOCK_EPISODES = 20  # what a kill can cost: they are written again on --resume
 FPS = 10  # of the demonstrations and of LeRobot's environment `pusht`
 
 
@@ -109,7 +109,6 @@ def _write_pusht(source: PushtZarr, conversion: Conversion, folder: Path) -> Pro
             _pusht_layout(conversion.repo_id),
             progress,
             source.num_episodes,
-            BLOCK_EPISODES,
             lambda number: _pusht_episodes(source, conversion.task, number, progress, bar),
         )
     return progress

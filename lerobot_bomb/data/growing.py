@@ -26,6 +26,7 @@ from tqdm import tqdm
 if TYPE_CHECKING:
     from lerobot_bomb.data.blocks import DatasetLayout, Episode
 
+BLOCK_EPISODES = 20  # what a kill can cost: they are played or written again on --resume
 LOCK_FILE = "lock"  # in the growing folder; a killed process releases it
 LOCK_TIMEOUT_S = 0.5  # a process that is refused holds the lock for a moment
 BLOCK_FILE = "block.json"  # in each block
@@ -100,16 +101,15 @@ def write_blocks(
     layout: "DatasetLayout",
     progress: Progress,
     num_episodes: int,
-    block_episodes: int,
     next_episodes: Callable[[int], Iterator["Episode"]],
 ) -> None:
     """Write the missing blocks; `next_episodes` yields so many and counts them in `progress`."""
     from lerobot_bomb.data.blocks import write_block
 
     while progress.num_episodes < num_episodes:
-        block = folder / f"block-{progress.num_episodes // block_episodes:05d}"
+        block = folder / f"block-{progress.num_episodes // BLOCK_EPISODES:05d}"
         unfinished = block.with_suffix(".tmp")
-        size = min(block_episodes, num_episodes - progress.num_episodes)
+        size = min(BLOCK_EPISODES, num_episodes - progress.num_episodes)
         progress.num_frames += write_block(layout, unfinished, next_episodes(size))
         write_json(unfinished / BLOCK_FILE, asdict(progress))
         unfinished.rename(block)

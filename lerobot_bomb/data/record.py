@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING, Any
 from tqdm import tqdm
 
 from lerobot_bomb.data.growing import (
+    BLOCK_EPISODES,
     Progress,
     default_root,
     grow,
@@ -38,7 +39,6 @@ from lerobot_bomb.schema import (
 if TYPE_CHECKING:
     from lerobot_bomb.data.blocks import DatasetLayout, Episode
 
-BLOCK_EPISODES = 20  # what a kill can cost: they are played again on --resume
 # the expert counts as broken when, after so many seeds, fewer succeed
 MIN_TRIED = 20
 MIN_SUCCESS_RATE = 0.1
@@ -166,7 +166,6 @@ def _record_blocks(recording: Recording, folder: Path, num_workers: int, expert:
                 layout,
                 progress,
                 recording.episodes,
-                BLOCK_EPISODES,
                 lambda number: _successes(pool, number, progress, bar),
             )
     return progress

@@ -29,6 +29,7 @@ from lerobot_bomb.evaluation.splits import (
     trained_episodes,
 )
 from lerobot_bomb.evaluation.trivial import Demonstrations
+from lerobot_bomb.tables import print_table
 from lerobot_bomb.viewing.unfinished import written_whole
 
 POLICY = "policy"
@@ -183,7 +184,6 @@ def print_columns(columns: dict[str, Column]) -> None:
     """Print the columns side by side, and the last one's L1 by step of the chunk."""
     shown = list(columns.values())
     rows = [
-        ["", *columns],
         ["episodes", *(str(len(column.episodes)) for column in shown)],
         ["frames", *(f"{column.num_frames_measured} of {column.num_frames}" for column in shown)],
     ]
@@ -194,27 +194,17 @@ def print_columns(columns: dict[str, Column]) -> None:
         rows.append([f"L1, {name}", *(str(column.l1[name].all) for column in shown)])
         if name == POLICY and len(l1.dims) > 1:
             rows += [[f"  {dim}", *(str(column.l1[name].dims[dim]) for column in shown)] for dim in l1.dims]
-    print_table(rows)
+    print_table(["", *columns], rows)
     l1 = shown[-1].l1
     num_steps = len(l1[POLICY].steps)
     steps = sorted({step for step in SHOWN_STEPS if step < num_steps} | {num_steps})
     print(f"\nL1 by step of the chunk, {list(columns)[-1]}")
     print_table(
-        [
-            ["step", *l1],
-            *([str(step), *(f"{of.steps[step - 1].mean:.4g}" for of in l1.values())] for step in steps),
-        ]
+        ["step", *l1],
+        [[str(step), *(f"{of.steps[step - 1].mean:.4g}" for of in l1.values())] for step in steps],
     )
     print("\n[95 % bootstrap interval over episodes]; L1 of decoded actions, in the dataset's units")
 
 
 def _text(measure: Measure | None) -> str:
     return "-" if measure is None else str(measure)
-
-
-def print_table(rows: list[list[str]]) -> None:
-    """Print rows of text, the first column to the left, the others to the right."""
-    widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
-    for first, *cells in rows:
-        padded = [cell.rjust(width) for cell, width in zip(cells, widths[1:], strict=True)]
-        print("  ".join([first.ljust(widths[0]), *padded]).rstrip())
