@@ -215,7 +215,7 @@ def test_another_kind_of_model_is_refused(tmp_path: Path) -> None:
 
 @torch.no_grad()
 def test_fresh_nano_features_tell_pictures_apart() -> None:
-    """Even patches vanish, so a small spot is not drowned by the background."""
+    """Even patches vanish, and a small spot is drowned neither by the background nor by training."""
     torch.manual_seed(0)
     backbone = load_backbone("nano")
     embed = backbone.vlm.model.vision_model.get_submodule("embeddings.patch_embedding")
@@ -224,5 +224,7 @@ def test_fresh_nano_features_tell_pictures_apart() -> None:
     spots = even.repeat(4, 1, 1, 1)
     for row, spot in enumerate(spots):
         spot[:, 32 * row : 32 * row + 8, 60:68] = -1
-    features = backbone.embed_images(spots)
-    assert features.std(dim=0).mean() > 0.2 * features.std()
+    # large beside what training adds to biases in its first hundred steps, about 0.1 at a rate of 1e-3
+    assert embed(spots).std(dim=0).amax(dim=(1, 2)).mean() > 1
+    features_BPH = backbone.embed_images(spots)
+    assert features_BPH.std(dim=0).mean(dim=1).max() > 0.25 * features_BPH.std()

@@ -18,7 +18,7 @@ from transformers import (
 )
 from transformers.cache_utils import Cache, DynamicCache
 
-from lerobot_bomb.vlm.presets import nano_config
+from lerobot_bomb.vlm.presets import INITIALIZER_RANGE, nano_config
 from lerobot_bomb.vlm.tokenizer import NANO, hub_file, load_tokenizer
 
 
@@ -86,7 +86,7 @@ def load_backbone(vlm_model_name: str) -> SmolVLMBackbone:
     """
     if vlm_model_name == NANO:
         backbone = build_backbone(nano_config(load_tokenizer(NANO)))
-        _centre_patch_filters(backbone)
+        _spread_pictures(backbone)
         return backbone
     if not Path(vlm_model_name).is_dir():
         hub_file(vlm_model_name, "config.json")
@@ -110,15 +110,20 @@ def load_backbone(vlm_model_name: str) -> SmolVLMBackbone:
 
 
 @torch.no_grad()
-def _centre_patch_filters(backbone: SmolVLMBackbone) -> None:
-    """Take its mean from every filter of the patch embedding, so that an even patch becomes nothing.
+def _spread_pictures(backbone: SmolVLMBackbone) -> None:
+    """Let random weights tell different pictures apart, and go on doing so while they are trained.
 
-    Most of a robot's picture is even and never changes. Drawn at random, the filters turn it into one large
-    constant; what differs between pictures is a tenth of that and gets lost before it is learned from.
+    Most of a robot's picture is even and never changes: filters of zero mean turn an even patch into nothing.
+    Patch and position embeddings start at unit scale: at that of the other weights, what Adam's first hundred
+    steps add to the vision model's biases is larger, and every picture's features become the same.
     """
-    embedding = backbone.vlm.model.vision_model.get_submodule("embeddings.patch_embedding")
-    assert isinstance(embedding, nn.Conv2d)
-    embedding.weight -= embedding.weight.mean(dim=(1, 2, 3), keepdim=True)
+    embeddings = backbone.vlm.model.vision_model.get_submodule("embeddings")
+    filters = embeddings.get_submodule("patch_embedding").weight
+    positions = embeddings.get_submodule("position_embedding").weight
+    assert isinstance(filters, nn.Parameter) and isinstance(positions, nn.Parameter)
+    filters -= filters.mean(dim=(1, 2, 3), keepdim=True)
+    filters /= INITIALIZER_RANGE
+    positions /= INITIALIZER_RANGE
 
 
 def build_backbone(vlm_config: dict[str, Any]) -> SmolVLMBackbone:
