@@ -42,9 +42,9 @@ BASE_FLAGS: dict[str, list[str]] = {
     "vla0_smol": [
         "--policy.relative_actions=false",
         "--policy.use_state=false",
-        "--policy.chunk_size=10",
+        "--policy.chunk_size=4",
+        "--policy.n_action_steps=4",
         "--policy.optimizer_lr=1.0e-3",
-        "--batch_size=32",
         "--steps=2500",
         "--save_freq=500",
     ],
