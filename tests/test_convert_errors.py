@@ -114,10 +114,10 @@ def test_resume_refuses_another_source_and_another_flag(
     other = replace(pusht_demonstrations, actions=pusht_demonstrations.actions[::-1])
     other.write(tmp_path / "other.zarr")
     with pytest.raises(
-        ValueError, match=r"--resume: the conversion in .* differs in --source=pusht-zarr \w{64} "
+        ValueError, match=r"--resume: the conversion in .* differs in source='pusht-zarr \w{64}' "
     ):
         convert_pusht(tmp_path / "other.zarr", REPO_ID, pusht_dataset, resume=True)
-    with pytest.raises(ValueError, match=r"differs in --task=Push. \(it has \)"):
+    with pytest.raises(ValueError, match=r"differs in task='Push.' \(it has ''\)"):
         convert_pusht(pusht_zarr, REPO_ID, pusht_dataset, task="Push.", resume=True)
     with pytest.raises(ValueError, match="there is no conversion to go on with"):
         convert_pusht(pusht_zarr, REPO_ID, tmp_path / "x", resume=True)
@@ -160,5 +160,5 @@ def test_a_missing_zarr_package_is_named(
     flags = [f"--repo_id={REPO_ID}", f"--root={tmp_path / 'x'}"]
     assert cli.main(["convert", "pusht-zarr", str(pusht_zarr), *flags]) == 1
     (error,) = capsys.readouterr().err.splitlines()
-    assert 'pip install "lerobot_policy_bomb[pusht]"' in error
+    assert "pip install zarr" in error
     assert list(tmp_path.iterdir()) == []

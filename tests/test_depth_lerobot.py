@@ -105,7 +105,7 @@ def test_an_interrupted_recording_resumes_to_the_same_bytes(
     with monkeypatch.context() as patch, pytest.raises(KeyboardInterrupt):
         patch.setattr(blocks, "_write_episode", write_one)
         record(recording, root)
-    with pytest.raises(ValueError, match=r"--resume: .* differs in --depth=False \(it has True\)"):
+    with pytest.raises(ValueError, match=r"--resume: .* differs in depth=False \(it has True\)"):
         record(Recording(REPO_ID, episodes=2, seed=SEED, image_size=SIZE), root, resume=True)
     record(recording, root, resume=True)
     whole, resumed = (

@@ -231,7 +231,9 @@ def test_a_recording_of_another_protocol_version_is_not_gone_on_with(
     datasets: dict[str, Path], tmp_path: Path
 ) -> None:
     old = replace(IMAGES, protocol_version="0.0")
-    with pytest.raises(ValueError, match=rf"differs in --protocol_version=0.0 \(it has {PROTOCOL_VERSION}\)"):
+    with pytest.raises(
+        ValueError, match=rf"differs in protocol_version='0.0' \(it has {PROTOCOL_VERSION!r}\)"
+    ):
         record(old, datasets["images"], resume=True)
 
 

@@ -108,7 +108,7 @@ def test_resume_refuses_other_parameters(
     write_json(path, {"recording": Recording("test/x", episodes=1, seed=3).to_dict()})
     assert cli.main([*FLAGS, f"--root={root}", "--seed=3", "--noise=0.1", "--resume"]) == 1
     message = capsys.readouterr().err
-    assert "differs in --noise=0.1 (it has 0.0)" in message
+    assert "differs in noise=0.1 (it has 0.0)" in message
     assert "--seed" not in message
 
 

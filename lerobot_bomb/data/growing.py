@@ -199,7 +199,7 @@ def _check_same(parameters: Parameters, path: Path) -> None:
     if existing is None:
         raise ValueError(f"--resume: {path} is not of a {kind}")
     differences = [
-        f"--{name}={value} (it has {existing.get(name)})"
+        f"{name}={value!r} (it has {existing.get(name)!r})"
         for name, value in parameters.to_dict().items()
         if value != existing.get(name)
     ]

@@ -96,6 +96,8 @@ class PushtZarr:
             ValueError: names the file that is missing or cannot be decoded, or holds what PushT cannot have.
         """
         chunks = [(name, chunk) for name in ARRAYS for chunk in np.ndindex(self._arrays[name].cdata_shape)]
+        for name, chunk in chunks:
+            self._present_file(name, chunk)
         for name, chunk in tqdm(chunks, desc="checking", unit="chunk"):
             block, layout = self._read_chunk(name, chunk), ARRAYS[name]
             allowed = layout.are_allowed(block)
@@ -132,13 +134,17 @@ class PushtZarr:
 
     def _read_chunk(self, name: str, chunk: tuple[int, ...]) -> np.ndarray:
         """The values of one chunk; zarr itself takes a missing file for zeros."""
-        file = self._file(name, chunk)
-        if not file.is_file():
-            raise ValueError(f"{file} is missing, so frames are lost; get the data again")
+        file = self._present_file(name, chunk)
         try:
             return np.asarray(self._arrays[name].get_block_selection(chunk))
         except Exception as error:  # of whatever type the codec has
             raise ValueError(f"{file} cannot be decoded ({error}); get the data again") from error
+
+    def _present_file(self, name: str, chunk: tuple[int, ...]) -> Path:
+        file = self._file(name, chunk)
+        if not file.is_file():
+            raise ValueError(f"{file} is missing, so frames are lost; get the data again")
+        return file
 
     def _file(self, name: str, chunk: tuple[int, ...]) -> Path:
         return self.path / name / self._arrays[name].metadata.encode_chunk_key(chunk)
@@ -155,5 +161,5 @@ def _import_zarr() -> Any:
     try:
         import zarr
     except ImportError as error:
-        raise RuntimeError(f'{error}: run pip install "lerobot_policy_bomb[pusht]"') from error
+        raise RuntimeError(f"{error}: run pip install zarr") from error
     return zarr

@@ -121,7 +121,8 @@ def _split(args: argparse.Namespace, meta: LeRobotDatasetMetadata, train_config:
             "trained on; name those to judge it by with --val_episodes"
         )
     train, validation = (
-        None if text is None else parse_episodes(text) for text in (args.train_episodes, args.val_episodes)
+        None if text is None else parse_episodes(flag, text)
+        for flag, text in (("--train_episodes", args.train_episodes), ("--val_episodes", args.val_episodes))
     )
     split = make_split(meta.total_episodes, trained_episodes(train_config, meta), train, validation)
     if split.seen:

@@ -22,7 +22,7 @@ class Split:
     seen: list[int]
 
 
-def parse_episodes(text: str) -> list[int]:
+def parse_episodes(flag: str, text: str) -> list[int]:
     """'[180,181]', '180-205' or '[0-9,20]' -> sorted episode numbers, each once.
 
     Raises:
@@ -34,7 +34,7 @@ def parse_episodes(text: str) -> list[int]:
         match = re.fullmatch(r"(\d+)(?:-(\d+))?", part)
         first, last = (int(match[1]), int(match[2] or match[1])) if match else (1, 0)
         if first > last:
-            raise ValueError(f"episodes {text!r}: give numbers and ranges, as [180,181], 180-205 or [0-9,20]")
+            raise ValueError(f"{flag}={text}: give numbers and ranges, as [180,181], 180-205 or [0-9,20]")
         episodes.update(range(first, last + 1))
     return sorted(episodes)
 
@@ -86,7 +86,7 @@ def make_split(
     for flag, episodes in {"--train_episodes": train, "--val_episodes": validation}.items():
         absent = [episode for episode in episodes or [] if episode >= num_episodes]
         if absent:
-            raise ValueError(f"{flag}: the dataset has the episodes 0..{num_episodes - 1}, not {absent[:5]}")
+            raise ValueError(f"{flag}: the dataset has the episodes 0..{num_episodes - 1}, not {absent[0]}")
     known = set(trained or [])
     if train is None:
         train = sorted(known - set(validation or []))

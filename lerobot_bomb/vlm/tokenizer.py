@@ -60,6 +60,8 @@ def load_tokenizer(vlm_model_name: str) -> Tokenizer:
 
 def hub_file(vlm_model_name: str, filename: str) -> str:
     """Path of a file of a Hub repository in the local cache, downloaded if need be."""
+    if vlm_model_name.count("/") > 1 or vlm_model_name.startswith((".", "~", "/")):
+        raise OSError(f"--policy.vlm_model_name={vlm_model_name}: there is no such folder")
     try:
         return hf_hub_download(vlm_model_name, filename)
     except (OSError, ValueError) as error:
