@@ -45,6 +45,7 @@ BASE_FLAGS: dict[str, list[str]] = {
         "--policy.chunk_size=4",
         "--policy.n_action_steps=4",
         "--policy.optimizer_lr=1.0e-3",
+        "--policy.scheduler_decay_steps=2500",
         "--steps=2500",
         "--save_freq=500",
     ],
@@ -75,6 +76,15 @@ class Run:
     @property
     def checkpoint(self) -> Path:
         return self.train_dir / "checkpoints" / "last" / "pretrained_model"
+
+    @property
+    def times_path(self) -> Path:
+        """Written when the training is complete."""
+        return self.folder / "training.json"
+
+    def times(self) -> dict[str, float]:
+        """Minutes that the training took, by the clock and of CPU."""
+        return json.loads(self.times_path.read_text())
 
 
 def main() -> None:
@@ -113,23 +123,19 @@ def prove(args: argparse.Namespace, chosen: list[str]) -> dict[str, list[Seed]]:
         for seed in range(args.seeds)
         for variant in chosen
     ]
-    with ThreadPoolExecutor(args.jobs) as pool:
-        flags = [
-            [f"--policy.vlm_model_name={base}", *VARIANTS[args.policy_type][run.variant]] for run in runs
-        ]
-        list(pool.map(lambda run, own: train(run, args.policy_type, dataset, own), runs, flags))
-        columns = list(pool.map(lambda run: measure(run, dataset, args.frames), runs))
-        is_played = [args.eval_episodes is not None and run.variant == RECIPE for run in runs]
-        coverages = list(
-            pool.map(lambda run, yes: play(run, args.eval_episodes) if yes else [], runs, is_played)
-        )
+
+    def prove_one(run: Run) -> Seed:
+        own = [f"--policy.vlm_model_name={base}", *VARIANTS[args.policy_type][run.variant]]
+        train(run, args.policy_type, dataset, own)
+        columns = measure(run, dataset, args.frames)
+        num_episodes = args.eval_episodes if run.variant == RECIPE else None
+        coverages = [] if num_episodes is None else play(run, num_episodes)
+        return Seed(columns["train"], columns["validation"], max_coverages=coverages, **run.times())
+
     variants: dict[str, list[Seed]] = {}
-    for run, of_run, coverage in zip(runs, columns, coverages, strict=True):
-        minutes = json.loads((run.folder / "training.json").read_text())
-        seed = Seed(
-            of_run["train"], of_run["validation"], minutes["minutes"], minutes["cpu_minutes"], coverage
-        )
-        variants.setdefault(run.variant, []).append(seed)
+    with ThreadPoolExecutor(args.jobs) as pool:
+        for run, seed in zip(runs, pool.map(prove_one, runs), strict=True):
+            variants.setdefault(run.variant, []).append(seed)
     return variants
 
 
@@ -161,8 +167,7 @@ def learn_to_see(policy_type: str, dataset: Path, folder: Path) -> Path:
 
 def train(run: Run, policy_type: str, dataset: Path, flags: list[str]) -> None:
     """Stock `lerobot-train`; a training that was killed starts anew."""
-    times = run.folder / "training.json"
-    if times.exists():
+    if run.times_path.exists():
         return
     shutil.rmtree(run.folder, ignore_errors=True)
     started = time.monotonic()
@@ -178,7 +183,7 @@ def train(run: Run, policy_type: str, dataset: Path, flags: list[str]) -> None:
         *flags,
     )
     minutes = {"minutes": (time.monotonic() - started) / 60, "cpu_minutes": cpu_s / 60}
-    times.write_text(json.dumps(minutes) + "\n")
+    run.times_path.write_text(json.dumps(minutes) + "\n")
 
 
 def measure(run: Run, dataset: Path, num_frames: int) -> dict[str, Any]:
