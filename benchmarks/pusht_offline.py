@@ -37,17 +37,22 @@ REPO_ID = "lerobot_bomb/pusht"
 NUM_TRAIN_EPISODES = 180
 MAX_COVERAGE_REWARD = 0.95  # coverage from which gym-pusht's reward is 1
 
-# absolute positions that no state tells must be found in the picture
-BASE_FLAGS: dict[str, list[str]] = {
+# absolute positions that no state tells must be found in the picture; the near ones are found first
+LOOK_FLAGS = [
+    "--policy.relative_actions=false",
+    "--policy.use_state=false",
+    "--policy.optimizer_lr=1.0e-3",
+]
+BASE_STAGES: dict[str, list[list[str]]] = {
     "vla0_smol": [
-        "--policy.relative_actions=false",
-        "--policy.use_state=false",
-        "--policy.chunk_size=4",
-        "--policy.n_action_steps=4",
-        "--policy.optimizer_lr=1.0e-3",
-        "--policy.scheduler_decay_steps=2500",
-        "--steps=2500",
-        "--save_freq=500",
+        [
+            *LOOK_FLAGS,
+            "--policy.chunk_size=4",
+            "--policy.n_action_steps=4",
+            "--policy.scheduler_decay_steps=2500",
+            "--steps=2500",
+        ],
+        LOOK_FLAGS,
     ],
 }
 RECIPE = "recipe"
@@ -117,7 +122,7 @@ def main() -> None:
 def prove(args: argparse.Namespace, chosen: list[str]) -> dict[str, list[Seed]]:
     """{variant: what was measured of each of its seeds}."""
     dataset = convert(args.source, args.output_dir / "dataset")
-    base = learn_to_see(args.policy_type, dataset, args.output_dir)
+    start = learn_to_see(args.policy_type, dataset, args.output_dir)
     runs = [
         Run(variant, seed, args.output_dir / f"{variant}_{seed}")
         for seed in range(args.seeds)
@@ -125,8 +130,7 @@ def prove(args: argparse.Namespace, chosen: list[str]) -> dict[str, list[Seed]]:
     ]
 
     def prove_one(run: Run) -> Seed:
-        own = [f"--policy.vlm_model_name={base}", *VARIANTS[args.policy_type][run.variant]]
-        train(run, args.policy_type, dataset, own)
+        train(run, args.policy_type, dataset, [*start, *VARIANTS[args.policy_type][run.variant]])
         columns = measure(run, dataset, args.frames)
         num_episodes = args.eval_episodes if run.variant == RECIPE else None
         coverages = [] if num_episodes is None else play(run, num_episodes)
@@ -155,14 +159,18 @@ def convert(source: Path | None, dataset: Path) -> Path:
     return dataset
 
 
-def learn_to_see(policy_type: str, dataset: Path, folder: Path) -> Path:
-    """The backbone that all trainings start from, as a folder for --policy.vlm_model_name."""
-    run, backbone = Run("base", 0, folder / "base"), folder / "base" / "backbone"
-    train(run, policy_type, dataset, BASE_FLAGS[policy_type])
-    if not backbone.exists():
-        flags = [f"--policy.path={run.checkpoint}", f"--output={backbone}"]
-        run_logged(run.folder / "export.log", "lerobot-bomb", "export-backbone", *flags)
-    return backbone.resolve()
+def learn_to_see(policy_type: str, dataset: Path, folder: Path) -> list[str]:
+    """Flags that start a training from the backbone that has learned to see."""
+    start: list[str] = []
+    for stage, flags in enumerate(BASE_STAGES[policy_type]):
+        run = Run("base", 0, folder / f"base_{stage}")
+        train(run, policy_type, dataset, [*flags, *start])
+        backbone = run.folder / "backbone"
+        if not backbone.exists():
+            export = [f"--policy.path={run.checkpoint}", f"--output={backbone}"]
+            run_logged(run.folder / "export.log", "lerobot-bomb", "export-backbone", *export)
+        start = [f"--policy.vlm_model_name={backbone.resolve()}"]
+    return start
 
 
 def train(run: Run, policy_type: str, dataset: Path, flags: list[str]) -> None:
