@@ -6,7 +6,7 @@ The recipe configs/pusht_TYPE.yaml and its variants, each with several seeds, ar
 LeRobot's environment `pusht`.
 
 All start from one small backbone that has learned to see before, on the same episodes: from random weights, a
-model that may read the state never comes to look at the picture (docs/pusht.md).
+model that may read the state does not look at the picture for a long time (docs/pusht.md).
 
     python benchmarks/pusht_offline.py --policy.type=vla0_smol --source pusht_cchi_v7_replay.zarr \
         --output_dir pusht

@@ -1,6 +1,7 @@
 import copy
 import json
 import os
+import re
 import subprocess
 import sys
 from pathlib import Path
@@ -267,6 +268,12 @@ def test_features_that_do_not_fit_are_refused(options: dict[str, Any], message: 
 def test_a_hub_model_without_network_is_refused_with_both_ways_out() -> None:
     with pytest.raises(OSError, match=r"--policy.vlm_model_name=nobody/has-this: .*=nano .*local folder"):
         make_policy(vlm_model_name="nobody/has-this")
+
+
+@pytest.mark.parametrize("name", ["/nowhere/base", "./base", "outputs/base/backbone"])
+def test_a_folder_that_is_missing_is_not_looked_for_on_the_hub(name: str) -> None:
+    with pytest.raises(OSError, match=f"--policy.vlm_model_name={re.escape(name)}: there is no such folder"):
+        make_policy(vlm_model_name=name)
 
 
 def test_training_presets() -> None:
