@@ -9,10 +9,11 @@ import torch
 from torch import Tensor
 from vla0_smol_cases import WORKSPACE, WRIST, make_batch, make_policy, numbers_of, raw_batch
 
+from lerobot_bomb.actions.text import IGNORED
 from lerobot_bomb.vlm.images import resize
 from lerobot_bomb.vlm.prompt import normalize_task
 from lerobot_bomb.vlm.tokenizer import load_tokenizer
-from lerobot_policy_vla0_smol.modeling_vla0_smol import IGNORED, Vla0SmolPolicy
+from lerobot_policy_vla0_smol.modeling_vla0_smol import Vla0SmolPolicy
 
 # Sequence
 

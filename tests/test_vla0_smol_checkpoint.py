@@ -192,6 +192,7 @@ def test_an_observation_without_a_task_is_an_error(task: Any) -> None:
             r"--policy.temporal_ensemble_size=3 .* needs --policy.n_action_steps=1; got 2, which is a queue",
         ),
         ({"temporal_ensemble_weighting": "newest"}, r"--policy.temporal_ensemble_weighting='newest' is unk"),
+        ({"draft": "previous"}, r"--policy.draft='previous' is unknown; choose one of: none, linear"),
         ({"n_action_bins": 10_001}, r"--policy.n_action_bins=10001 must lie in 2..10000"),
         ({"number_width": 5}, r"--policy.number_width=5 must be 0 \(no padding\) or lie in 3..4"),
         (

@@ -6,9 +6,9 @@ import torch
 from torch import Tensor
 from vla0_smol_cases import WORKSPACE, make_batch, make_policy, numbers_of
 
-from lerobot_bomb.actions.text import SPACE
+from lerobot_bomb.actions.text import IGNORED
 from lerobot_bomb.decoding.decoder import pick
-from lerobot_policy_vla0_smol.modeling_vla0_smol import IGNORED, Vla0SmolPolicy
+from lerobot_policy_vla0_smol.modeling_vla0_smol import Vla0SmolPolicy
 
 
 @pytest.fixture(scope="module")
@@ -50,14 +50,21 @@ def test_decoding_follows_the_teacher_forced_argmax(overfit: tuple[Vla0SmolPolic
     answer = policy._answer(numbers_of(policy, batch))
     logits = policy._answer_logits(batch, policy._prompt(batch), answer.rows)[..., policy.symbol_ids]
     for row_logits, row_labels in zip(logits, answer.labels, strict=True):
-        state, begun = torch.tensor([policy.grammar.BOUNDARY]), 0
-        for step_logits, label in zip(row_logits, row_labels[row_labels != IGNORED], strict=False):
-            choices = policy.grammar.choices(state, torch.tensor([12 - begun]))
-            symbol = pick(step_logits[None], choices)
+        place = policy.grammar.start(1)
+        # every answer begins with a space
+        for step_logits, label in zip(row_logits[1:], row_labels[row_labels != IGNORED][1:], strict=False):
+            symbol = pick(step_logits[None], policy.grammar.penalties(place))
             assert policy.symbol_ids[symbol] == label
-            begun += int(symbol == SPACE)
-            state = policy.grammar.advance(state, symbol)
-        assert begun == 12
+            place = policy.grammar.advance(place, symbol)
+        assert place.prefix == policy.grammar.DONE
+
+
+@pytest.mark.parametrize("options", [{"number_width": 3}, {"n_action_bins": 99, "bin_mode": "levels"}])
+def test_a_draft_changes_no_action(options: dict[str, Any]) -> None:
+    policies = [make_policy(draft=draft, **options) for draft in ("none", "linear")]
+    batch = make_batch(policies[0], 4)
+    chunks = [policy.predict_action_chunk(batch) for policy in policies]
+    assert torch.equal(*chunks)
 
 
 def test_a_rows_actions_do_not_depend_on_the_batch(overfit: tuple[Vla0SmolPolicy, dict[str, Any]]) -> None:
@@ -111,7 +118,8 @@ def test_bfloat16_is_the_same_for_training_and_decoding() -> None:
         assert policy(batch)[0] == inside
         assert plain(batch)[0] != inside
     seen: list[torch.dtype] = []
-    policy.backbone.vlm.lm_head.register_forward_hook(lambda *call: seen.append(call[2].dtype))
+    last_layer = policy.backbone.vlm.model.text_model.get_submodule("layers")[-1]  # pyright: ignore[reportIndexIssue]
+    last_layer.mlp.down_proj.register_forward_hook(lambda *call: seen.append(call[2].dtype))
     policy.predict_action_chunk(batch)
     assert set(seen) == {torch.bfloat16}
 
@@ -125,3 +133,19 @@ def test_training_goes_on_after_evaluation_inside_one_autocast() -> None:
         loss, _ = policy.train()(batch)
         loss.backward()
     assert policy.backbone.vlm.lm_head.weight.grad is not None
+
+
+def test_a_batch_on_another_device_is_refused() -> None:
+    policy = make_policy()
+    batch = make_batch(policy, 2)
+    batch["observation.state"] = batch["observation.state"].to("meta")
+    with pytest.raises(ValueError, match=r"batch\['observation.state'\] is on meta, the policy on cpu"):
+        policy.predict_action_chunk(batch)
+
+
+def test_an_answer_that_does_not_fit_the_model_is_refused() -> None:
+    policy = make_policy(chunk_size=300, n_action_steps=300)
+    with pytest.raises(
+        ValueError, match=r"and the model has 4096 positions; give a smaller --policy.chunk_size"
+    ):
+        policy.predict_action_chunk(make_batch(policy, 1))

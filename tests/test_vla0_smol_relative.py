@@ -10,6 +10,7 @@ from lerobot.datasets import LeRobotDataset, LeRobotDatasetMetadata
 from lerobot.policies import factory
 from vla0_smol_cases import make_batch, make_config, make_policy
 
+from lerobot_bomb.decoding.decoder import Decoded
 from lerobot_policy_vla0_smol.modeling_vla0_smol import Vla0SmolPolicy
 
 NAMES = ["x", "y", "z", "grip"]
@@ -66,7 +67,8 @@ def test_actions_come_out_absolute_whatever_is_written(
     policy = build(make_dataset(tmp_path / "data", 0.1), bin_mode="levels", n_action_bins=999)
     batch = make_batch(policy, 2)
     bins = torch.full((2, 12), 499)  # zero: stay
-    monkeypatch.setattr("lerobot_policy_vla0_smol.modeling_vla0_smol.decode_numbers", lambda *_, **__: bins)
+    decode = "lerobot_policy_vla0_smol.modeling_vla0_smol.decode_numbers"
+    monkeypatch.setattr(decode, lambda *_, **__: Decoded(bins, num_passes=1))
     chunk = policy.predict_action_chunk(batch)
     assert policy.relative is not None
     anchor = (policy.relative.gain * batch["observation.state"] + policy.relative.bias).clamp(-1, 1)

@@ -14,12 +14,19 @@ SPACE, END = 10, 11
 SYMBOL_TEXTS = (*"0123456789", " ", "<end_of_utterance>")
 MAX_DIGITS = 4  # of any number that a policy reads or writes
 
+IGNORED = -100  # label of a token that the loss does not count
+
 MASK_LEVELS = ("value", "step", "char")
 
 
 def digits_needed(num_values: int) -> int:
     """Digits of the largest of ``num_values`` numbers that start at 0."""
     return len(str(num_values - 1))
+
+
+def digits_of(numbers: Tensor) -> Tensor:
+    """How many digits each number has; up to `MAX_DIGITS`."""
+    return (numbers[..., None] >= 10 ** torch.arange(1, MAX_DIGITS, device=numbers.device)).sum(dim=-1) + 1
 
 
 def number_symbols(numbers_BN: Tensor, width: int, *, zero_padded: bool) -> tuple[Tensor, Tensor]:
@@ -84,3 +91,50 @@ def compact(written_BL: Tensor, *columns_BL: Tensor) -> tuple[Tensor, ...]:
     longest = int(written_BL.sum(dim=1).max())
     order_BL = written_BL.logical_not().to(torch.uint8).argsort(dim=1, stable=True)[:, :longest]
     return tuple(column.gather(1, order_BL) for column in (written_BL, *columns_BL))
+
+
+@dataclass(frozen=True)
+class TokenRows:
+    """Rows of tokens with gaps: ids (B, L) int64 and which columns hold a token (B, L) bool."""
+
+    ids: Tensor
+    written: Tensor
+
+    @classmethod
+    def join(cls, parts: "list[TokenRows]") -> "TokenRows":
+        return cls(torch.cat([part.ids for part in parts], 1), torch.cat([part.written for part in parts], 1))
+
+    def without_gaps(self) -> "TokenRows":
+        """Rows that start with their tokens."""
+        written_BL, ids_BL = compact(self.written, self.ids)
+        return TokenRows(ids_BL, written_BL)
+
+
+@dataclass(frozen=True)
+class Answer:
+    """Numbers and the end token as rows without gaps; all (B, A), A the tokens of the longest."""
+
+    rows: TokenRows
+    labels: Tensor  # int64 token ids, IGNORED where the loss does not count them
+    columns: Tensor  # int64, which of the M = N * C + 1 columns with gaps a token comes from
+
+    @classmethod
+    def of(cls, numbers: NumberTokens, end_id: Tensor) -> "Answer":
+        """Close the gaps, and label what is trained."""
+        end_B1 = end_id.expand(len(numbers.ids), 1)
+        true_B1 = torch.ones_like(end_B1, dtype=torch.bool)
+        ids_BM, written_BM, trained_BM = (
+            torch.cat([columns.flatten(1), last], dim=1)
+            for columns, last in zip(
+                (numbers.ids, numbers.written, numbers.trained), (end_B1, true_B1, true_B1), strict=True
+            )
+        )
+        labels_BM = ids_BM.masked_fill(~(trained_BM & written_BM), IGNORED)
+        columns_BM = torch.arange(ids_BM.shape[1], device=ids_BM.device).expand_as(ids_BM)
+        written_BA, ids_BA, labels_BA, columns_BA = compact(written_BM, ids_BM, labels_BM, columns_BM)
+        return cls(TokenRows(ids_BA, written_BA), labels_BA, columns_BA)
+
+    def with_gaps(self, values_BA: Tensor, numbers: NumberTokens) -> Tensor:
+        """Values of the tokens back at their columns, (B, M); 0 or False in gaps."""
+        values_BM = values_BA.new_zeros(len(values_BA), numbers.written[0].numel() + 1)
+        return values_BM.scatter(1, self.columns, values_BA)

@@ -1,89 +1,125 @@
-"""Greedy decoding of numbers, one symbol a step."""
+"""Greedy decoding of numbers, several symbols a pass where they can be guessed.
+
+A pass reads the symbol chosen last and some that are guessed to follow it, and gives the greedy choice after
+each. As far as the guesses are these choices they are right, and so is the first choice that differs from its
+guess: what is written is what one symbol a pass would write (speculative decoding, arXiv 2211.17192, for
+greedy choices).
+
+Shapes: `B` batch, `S` symbols, `A` symbols of the longest answer, `N` numbers, `G` guesses, `K` = 1 + G.
+"""
 
 from collections.abc import Callable
+from dataclasses import dataclass
 
 import torch
 from torch import Tensor
-from torch.nn.functional import pad
 
 from lerobot_bomb.actions.text import END, SPACE
-from lerobot_bomb.decoding.grammar import NumberGrammar
+from lerobot_bomb.decoding.grammar import NumberGrammar, Place
 from lerobot_bomb.vlm.backbone import SmolVLMBackbone
+from lerobot_bomb.vlm.cached_llama import CachedLlama
 
-# (B,) last symbols, or None for the prompt -> (B, NUM_SYMBOLS) logits of the next symbol
-NextLogits = Callable[[Tensor | None], Tensor]
+# (B, K) symbols, (B,) the column of each row's first in its answer -> (B, K, S) logits of the symbols after
+NextLogits = Callable[[Tensor, Tensor], Tensor]
+# (B, A) symbols written, END beyond, and where each row stands -> (B, G) guesses of what comes next
+Guess = Callable[[Tensor, Place], Tensor]
+
+MAX_GUESSES = 8
+PASSES_BETWEEN_SYNCS = 8  # of a device that works while the host runs ahead
+
+
+@dataclass(frozen=True)
+class Decoded:
+    """What was written, and in how many passes, the prompt's included."""
+
+    numbers: Tensor  # (B, stop_after) int64
+    num_passes: int
 
 
 class CachedContinuation:
-    """Next-symbol logits of a backbone: one pass over the prompt, then one token a call on its cache."""
+    """Symbol logits of a backbone: the prompt is read in the first pass, then only new symbols."""
 
-    def __init__(self, backbone: SmolVLMBackbone, embeds_BLH: Tensor, written_BL: Tensor, symbol_ids: Tensor):
+    def __init__(
+        self,
+        backbone: SmolVLMBackbone,
+        prompt_BLH: Tensor,
+        written_BL: Tensor,
+        symbol_ids: Tensor,
+        max_symbols: int,
+    ):
         self._backbone = backbone
         self._symbol_ids = symbol_ids
-        self._prompt_BLH = embeds_BLH
-        self._written_BL = written_BL
-        self._length_B = written_BL.sum(dim=1)
-        self._cache = backbone.new_cache()
-
-    def __call__(self, symbol_B: Tensor | None) -> Tensor:
-        """(B,) symbols just chosen, None at first -> (B, NUM_SYMBOLS) logits."""
-        last_BH = self._read_prompt() if symbol_B is None else self._read_symbol(symbol_B)
-        return self._backbone.logits(last_BH)[:, self._symbol_ids]
-
-    def _read_prompt(self) -> Tensor:
-        positions_BL = (self._written_BL.cumsum(dim=1) - 1).clamp(min=0)
-        hidden_BLH = self._backbone.hidden_states(
-            self._prompt_BLH, self._written_BL, positions_BL, self._cache
+        self._head = backbone.head(symbol_ids)
+        self._length_B1 = written_BL.sum(dim=1, keepdim=True)
+        self._text = CachedLlama(
+            backbone.vlm.model.text_model, len(prompt_BLH), prompt_BLH.shape[1] + max_symbols
         )
-        rows_B = torch.arange(len(hidden_BLH), device=hidden_BLH.device)
-        return hidden_BLH[rows_B, self._length_B - 1]
+        columns_BL = (written_BL.cumsum(dim=1) - 1).masked_fill(~written_BL, self._text.unread_column)
+        self._unread: tuple[Tensor, Tensor] | None = prompt_BLH, columns_BL
 
-    def _read_symbol(self, symbol_B: Tensor) -> Tensor:
-        embeds_B1H = self._backbone.embed_tokens(self._symbol_ids[symbol_B])[:, None]
-        self._written_BL = pad(self._written_BL, (0, 1), value=True)
-        hidden_B1H = self._backbone.hidden_states(
-            embeds_B1H, self._written_BL, self._length_B[:, None], self._cache
-        )
-        self._length_B = self._length_B + 1
-        return hidden_B1H[:, 0]
-
-
-def pick(logits_BS: Tensor, choices_BS: Tensor) -> Tensor:
-    """(B,) the likeliest symbol among the choices; a choice is taken even where logits are -inf or NaN."""
-    finite_BS = logits_BS.float().nan_to_num(neginf=torch.finfo(torch.float32).min)
-    return finite_BS.masked_fill(~choices_BS, -torch.inf).argmax(dim=1)
+    def __call__(self, symbol_BK: Tensor, first_B: Tensor) -> Tensor:
+        num_symbols = symbol_BK.shape[1]
+        embeds = self._backbone.embed_tokens(self._symbol_ids[symbol_BK])
+        columns = self._length_B1 + first_B[:, None] + torch.arange(num_symbols, device=first_B.device)
+        columns = columns.clamp(max=self._text.unread_column)
+        if self._unread is not None:
+            prompt_BLH, columns_BL = self._unread
+            embeds, columns = torch.cat([prompt_BLH, embeds], 1), torch.cat([columns_BL, columns], 1)
+            self._unread = None
+        return self._head(self._text(embeds, columns)[:, -num_symbols:])
 
 
+def pick(logits: Tensor, penalty: Tensor) -> Tensor:
+    """(..., S) -> (...) the likeliest allowed symbol; one is taken even from logits of -inf or NaN."""
+    finite = logits.float().nan_to_num(neginf=torch.finfo(torch.float32).min)
+    return (finite + penalty).argmax(dim=-1)
+
+
+@torch.no_grad()
 def decode_numbers(
-    next_logits: NextLogits,
-    grammar: NumberGrammar,
-    *,
-    batch_size: int,
-    num_numbers: int,
-    stop_after: int,
-) -> Tensor:
-    """The first ``stop_after`` of ``num_numbers`` greedily written numbers: (B, stop_after) int64.
+    next_logits: NextLogits, grammar: NumberGrammar, guess: Guess, *, batch_size: int, stop_after: int
+) -> Decoded:
+    """The first ``stop_after`` greedily written numbers of each row.
 
-    Only what the grammar allows is ever chosen, so every row is well-formed by construction. Rows
-    finish at different steps; one that is done is fed the end symbol and no longer read.
+    Only what the grammar allows is ever chosen, so every row is well-formed by construction. Rows get on
+    differently far in a pass; one that is done goes on unread until all are.
     """
-    device = grammar.value.device
-    state_B = torch.full((batch_size,), grammar.BOUNDARY, device=device)
-    begun_B = torch.zeros(batch_size, dtype=torch.int64, device=device)
-    done_B = torch.zeros(batch_size, dtype=torch.bool, device=device)
-    numbers_BN = torch.zeros(batch_size, stop_after, dtype=torch.int64, device=device)
-    symbol_B = None
+
+    def is_done(place: Place) -> Tensor:
+        complete_B = (place.number == stop_after - 1) & grammar.must_end[place.prefix]
+        return complete_B | (place.number >= stop_after) | (place.prefix == grammar.DONE)
+
+    place = grammar.start(batch_size)
+    symbols_BA = place.prefix.new_full((batch_size, grammar.max_symbols + MAX_GUESSES + 1), END)
+    symbols_BA[:, 0] = SPACE
+    num_written_B = torch.ones_like(place.prefix)
+    columns_A = torch.arange(symbols_BA.shape[1], device=symbols_BA.device)
+    num_passes = 0
     while True:
-        choices_BS = grammar.choices(state_B, num_numbers - begun_B)
-        symbol_B = pick(next_logits(symbol_B), choices_BS).masked_fill(done_B, END)
-        closes_B = grammar.is_number[state_B] & (symbol_B >= SPACE) & ~done_B
-        current_B1 = (begun_B - 1).clamp(min=0)[:, None]
-        written_B1 = torch.where(
-            closes_B[:, None], grammar.value[state_B][:, None], numbers_BN.gather(1, current_B1)
-        )
-        numbers_BN.scatter_(1, current_B1, written_B1)
-        done_B = done_B | (closes_B & (begun_B == stop_after))
-        if bool(done_B.all()):
-            return numbers_BN
-        begun_B = begun_B + ((symbol_B == SPACE) & ~done_B)
-        state_B = grammar.advance(state_B, symbol_B)
+        guess_BG = guess(symbols_BA, place)
+        columns_BK = num_written_B[:, None] + columns_A[: guess_BG.shape[1] + 1]
+        last_B1 = symbols_BA.gather(1, columns_BK[:, :1] - 1)
+        logits_BKS = next_logits(torch.cat([last_B1, guess_BG], dim=1), num_written_B - 1)
+        num_passes += 1
+        places_BK = grammar.walk(place, guess_BG)
+        picks_BK = pick(logits_BKS, grammar.penalties(places_BK))
+        num_right_B = (picks_BK[:, :-1] == guess_BG).cumprod(dim=1).sum(dim=1)
+        place = grammar.advance(places_BK.at(num_right_B), picks_BK.gather(1, num_right_B[:, None])[:, 0])
+        num_written_B = (num_written_B + num_right_B + 1).clamp(max=grammar.max_symbols)
+        symbols_BA.scatter_(1, columns_BK, picks_BK)
+        # what follows a wrong guess is not written
+        symbols_BA.masked_fill_(columns_A >= num_written_B[:, None], END)
+        on_host = symbols_BA.device.type == "cpu"
+        if (on_host or num_passes % PASSES_BETWEEN_SYNCS == 0) and bool(is_done(place).all()):
+            return Decoded(read_answer(symbols_BA, stop_after), num_passes)
+
+
+def read_answer(symbol_BA: Tensor, num_numbers: int) -> Tensor:
+    """(B, num_numbers) the first numbers that rows of symbols spell, the first symbol being a space."""
+    is_digit_BA = symbol_BA < SPACE
+    column_A = torch.arange(symbol_BA.shape[1], device=symbol_BA.device)
+    end_BA = torch.where(is_digit_BA, len(column_A), column_A).flip(1).cummin(dim=1).values.flip(1)
+    value_BA = torch.where(is_digit_BA, symbol_BA * 10 ** (end_BA - 1 - column_A).clamp(min=0), 0)
+    number_BA = ((~is_digit_BA).cumsum(dim=1) - 1).clamp(max=num_numbers)
+    sums_BN = symbol_BA.new_zeros(len(symbol_BA), num_numbers + 1).scatter_add(1, number_BA, value_BA)
+    return sums_BN[:, :num_numbers]

@@ -1,48 +1,86 @@
 """The language of answers: `` n1 n2 ... nN<end>``, as a deterministic automaton on tensors.
 
 Every number is in 0..num_values - 1, without sign or leading zeros, or zero-padded to a fixed width.
+Shapes: `B` batch, `S` symbols, `A` symbols of the longest answer.
 """
+
+from dataclasses import dataclass
 
 import torch
 from torch import Tensor, nn
 
-from lerobot_bomb.actions.text import END, SPACE
+from lerobot_bomb.actions.text import END, NUM_SYMBOLS, SPACE, digits_needed
+
+
+@dataclass(frozen=True)
+class Place:
+    """Where in an answer rows of symbols stand; both of the same shape, int64."""
+
+    prefix: Tensor  # state of `NumberGrammar`: the digits of the number so far
+    number: Tensor  # which number they belong to, from 0
+
+    def at(self, index_B: Tensor) -> "Place":
+        """(B, K) places -> (B,) that of one column in each row."""
+        index_B1 = index_B[:, None]
+        return Place(self.prefix.gather(1, index_B1)[:, 0], self.number.gather(1, index_B1)[:, 0])
 
 
 class NumberGrammar(nn.Module):
-    """Transition tables over digit prefixes; the count of numbers is kept by the caller.
+    """Transition tables of answers of ``num_numbers`` numbers.
 
-    State 0 is the boundary before a number's space; state ``1 + i`` is the i-th prefix. A number is
-    complete in the states where `is_number` holds, and `value` is its value there.
+    A state is a beginning of a number; `START` is the empty one, just after a space, and `DONE` follows the
+    end. A number is complete where `is_number` holds.
+
+    Raises:
+        ValueError: there is no number to write, or no value that it can take, or the width is too small.
     """
 
-    allowed: Tensor  # (states, NUM_SYMBOLS) bool, space and end as far as the prefix decides
-    next_state: Tensor  # (states, NUM_SYMBOLS) int64; where not allowed: 0
-    value: Tensor  # (states,) int64
+    penalty: Tensor  # (2, states, S) float32: 0 where a symbol may follow, else -inf; [1]: the last number
+    next_state: Tensor  # (states, S) int64
     is_number: Tensor  # (states,) bool
+    must_end: Tensor  # (states,) bool: complete, and no digit may follow
+    num_digits: Tensor  # (states,) int64
+    value: Tensor  # (states,) int64
 
-    BOUNDARY = 0
+    DONE, START = 0, 1
 
-    def __init__(self, num_values: int, *, fixed_width: int = 0):
+    def __init__(self, num_values: int, num_numbers: int, *, fixed_width: int = 0):
         super().__init__()
-        self.num_values = num_values
-        self.fixed_width = fixed_width
+        if num_values < 1 or num_numbers < 1:
+            raise ValueError(f"a grammar of {num_numbers} numbers with {num_values} values has no answers")
+        if fixed_width and fixed_width < digits_needed(num_values):
+            raise ValueError(
+                f"{num_values} values do not fit into {fixed_width} digits; {digits_needed(num_values)} do"
+            )
+        self.num_values, self.num_numbers, self.fixed_width = num_values, num_numbers, fixed_width
         prefixes = self._prefixes()
-        state_of = {prefix: 1 + i for i, prefix in enumerate(prefixes)}
-        to_space = [0] * SPACE + [state_of[""], 0]
-        next_state = [to_space]  # 0 where a symbol is not allowed, and after the end
-        for prefix in prefixes:
-            digits = [state_of.get(f"{prefix}{digit}", 0) for digit in range(10)]
-            next_state.append([*digits, *(to_space[SPACE:] if self._is_number(prefix) else (0, 0))])
+        state_of = {prefix: self.START + i for i, prefix in enumerate(prefixes)}
+        digits_PD = [
+            [state_of.get(f"{prefix}{digit}", self.DONE) for digit in range(10)] for prefix in prefixes
+        ]
         is_number = torch.tensor([False, *map(self._is_number, prefixes)])
-        table = torch.tensor(next_state)
-        allowed = table > 0
-        allowed[:, END] = is_number
-        self.register_buffer("next_state", table, persistent=False)
-        self.register_buffer("allowed", allowed, persistent=False)
-        self.register_buffer("is_number", is_number, persistent=False)
-        values = torch.tensor([0, *(int(prefix or 0) for prefix in prefixes)])
-        self.register_buffer("value", values, persistent=False)
+        next_state = torch.full((1 + len(prefixes), NUM_SYMBOLS), self.DONE)
+        next_state[1:, :SPACE] = torch.tensor(digits_PD)
+        next_state[is_number, SPACE] = self.START
+        allowed = torch.stack([next_state != self.DONE] * 2)
+        allowed[1, :, SPACE] = False
+        allowed[1, :, END] = is_number
+        allowed[:, self.DONE, END] = True  # rows that are done go on saying so
+        penalty = torch.zeros(allowed.shape).masked_fill(~allowed, -torch.inf)
+        for name, table in {
+            "penalty": penalty,
+            "next_state": next_state,
+            "is_number": is_number,
+            "must_end": is_number & (next_state[:, :SPACE] == self.DONE).all(dim=1),
+            "num_digits": torch.tensor([0, *map(len, prefixes)]),
+            "value": torch.tensor([0, *(int(prefix or 0) for prefix in prefixes)]),
+        }.items():
+            self.register_buffer(name, table, persistent=False)
+
+    @property
+    def width(self) -> int:
+        """Digits of the longest number."""
+        return self.fixed_width or digits_needed(self.num_values)
 
     def _prefixes(self) -> list[str]:
         """All beginnings of all numbers, the empty one first."""
@@ -53,13 +91,34 @@ class NumberGrammar(nn.Module):
     def _is_number(self, prefix: str) -> bool:
         return len(prefix) == self.fixed_width if self.fixed_width else prefix != ""
 
-    def choices(self, state_B: Tensor, numbers_left_B: Tensor) -> Tensor:
-        """(B, NUM_SYMBOLS) bool: what may follow when ``numbers_left_B`` numbers have yet to begin."""
-        choices_BS = self.allowed[state_B].clone()
-        choices_BS[:, SPACE] &= numbers_left_B > 0
-        choices_BS[:, END] &= numbers_left_B == 0
-        return choices_BS
+    @property
+    def max_symbols(self) -> int:
+        """A, of the longest answer."""
+        return self.num_numbers * (1 + self.width) + 1
 
-    def advance(self, state_B: Tensor, symbol_B: Tensor) -> Tensor:
-        """(B,) states after one symbol each; the end leads back to the boundary."""
-        return self.next_state[state_B, symbol_B]
+    def start(self, batch_size: int) -> Place:
+        """(B,) places after the first space, which every answer begins with."""
+        prefix_B = torch.full((batch_size,), self.START, device=self.next_state.device)
+        return Place(prefix_B, torch.zeros_like(prefix_B))
+
+    def advance(self, place: Place, symbol: Tensor) -> Place:
+        """One symbol further."""
+        return Place(self.next_state[place.prefix, symbol], place.number + (symbol == SPACE))
+
+    def walk(self, place: Place, symbol_BG: Tensor) -> Place:
+        """(B,) -> (B, 1 + G) places: this one and those after each of the symbols."""
+        places = [place]
+        for symbol_B in symbol_BG.unbind(dim=1):
+            places.append(self.advance(places[-1], symbol_B))
+        return Place(
+            torch.stack([place.prefix for place in places], 1),
+            torch.stack([place.number for place in places], 1),
+        )
+
+    def is_last(self, place: Place) -> Tensor:
+        """Whether the number is the answer's last, which the end follows instead of a space."""
+        return place.number == self.num_numbers - 1
+
+    def penalties(self, place: Place) -> Tensor:
+        """(..., S): 0 for what may follow, -inf for what may not."""
+        return self.penalty[self.is_last(place).long(), place.prefix]

@@ -4,11 +4,13 @@ Shapes: `B` batch, `L` tokens, `H` hidden size of the text model, `V` vocabulary
 """
 
 import json
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
 import torch
 from torch import Tensor, nn
+from torch.nn.functional import linear
 from transformers import (
     AutoConfig,
     PreTrainedConfig,
@@ -16,7 +18,6 @@ from transformers import (
     SmolVLMForConditionalGeneration,
     SmolVLMVisionConfig,
 )
-from transformers.cache_utils import Cache, DynamicCache
 
 from lerobot_bomb.vlm.presets import INITIALIZER_RANGE, nano_config
 from lerobot_bomb.vlm.tokenizer import NANO, hub_file, load_tokenizer
@@ -48,29 +49,20 @@ class SmolVLMBackbone(nn.Module):
         """(B, L) token ids -> (B, L, H)."""
         return self.vlm.get_input_embeddings()(tokens_BL)
 
-    def new_cache(self) -> Cache:
-        return DynamicCache(config=self.text_config)
+    def hidden_states(self, embeds_BLH: Tensor) -> Tensor:
+        """Embeddings of rows that start with their tokens -> (B, L, H) states after the last layer.
 
-    def hidden_states(
-        self,
-        embeds_BLH: Tensor,
-        written_BL: Tensor | None = None,
-        positions_BL: Tensor | None = None,
-        cache: Cache | None = None,
-    ) -> Tensor:
-        """Embeddings -> (B, L, H) states after the last layer.
-
-        ``written_BL`` marks the columns that hold a token, cached ones included: (B, cached + L). Without
-        it, rows must start with their tokens and are read from position 0: attention is causal, so what
-        follows a row's end changes nothing before it, and torch attends faster without a mask.
+        Attention is causal, so what follows a row's end changes nothing before it.
         """
-        return self.vlm.model.text_model(
-            inputs_embeds=embeds_BLH,
-            attention_mask=None if written_BL is None else written_BL.long(),
-            position_ids=positions_BL,
-            past_key_values=cache,
-            use_cache=cache is not None,
-        ).last_hidden_state
+        return self.vlm.model.text_model(inputs_embeds=embeds_BLH, use_cache=False).last_hidden_state
+
+    def head(self, token_ids: Tensor) -> Callable[[Tensor], Tensor]:
+        """The output head of a few tokens: (..., H) -> (..., len(token_ids))."""
+        head = self.vlm.lm_head
+        if type(head) is not nn.Linear:  # such as one with an adapter
+            return lambda hidden: head(hidden)[..., token_ids]
+        rows, bias = head.weight[token_ids], None if head.bias is None else head.bias[token_ids]
+        return lambda hidden: linear(hidden, rows, bias)
 
     def logits(self, hidden_BLH: Tensor) -> Tensor:
         """(..., H) -> (..., V)."""

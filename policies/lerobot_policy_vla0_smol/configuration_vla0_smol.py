@@ -13,6 +13,7 @@ from lerobot_bomb.actions.relative import named_dims
 from lerobot_bomb.actions.text import MASK_LEVELS, MAX_DIGITS, digits_needed
 from lerobot_bomb.flags import flag_errors, one_of
 
+DRAFTS = ("none", "linear")
 DTYPES = ("float32", "bfloat16")
 # modes that map the data into [-1, 1], where the bins are
 BOUNDED_MODES = (
@@ -83,6 +84,10 @@ class Vla0SmolConfig(PreTrainedConfig):
     # action dimensions that are not averaged, by (part of) their names
     temporal_ensemble_exclude_joints: list[str] = field(default_factory=list)
 
+    # what a pass of the model guesses and checks beside the next token: "linear" (actions go on as in the
+    # answer's last two steps) or "none". Same actions, fewer passes
+    draft: str = "linear"
+
     # side of the crop as a fraction of the image: random place while training, centre otherwise
     crop_fraction: float = 0.875
 
@@ -125,6 +130,7 @@ class Vla0SmolConfig(PreTrainedConfig):
     def _check_choices(self) -> None:
         one_of("--policy.bin_mode", self.bin_mode, BIN_MODES)
         one_of("--policy.mask_level", self.mask_level, MASK_LEVELS)
+        one_of("--policy.draft", self.draft, DRAFTS)
         one_of("--policy.dtype", self.dtype, DTYPES)
         one_of("--policy.temporal_ensemble_weighting", self.temporal_ensemble_weighting, WEIGHTINGS)
         if not self.vlm_model_name:

@@ -7,7 +7,6 @@ takes, `L` tokens of a sequence, `A` tokens of an answer, `H` hidden size, `P` t
 """
 
 from collections import deque
-from dataclasses import dataclass
 from typing import ClassVar
 
 import torch
@@ -23,49 +22,24 @@ from lerobot_bomb.actions.ensemble import TemporalEnsemble
 from lerobot_bomb.actions.relative import RelativeActions, bounds, named_dims, present_episodes
 from lerobot_bomb.actions.text import (
     END,
+    IGNORED,
     SPACE,
+    Answer,
     NumberTokens,
-    compact,
+    TokenRows,
     digits_needed,
     draw_hidden,
     number_symbols,
 )
 from lerobot_bomb.data.columns import dim_names, episode_bounds, read_columns
 from lerobot_bomb.decoding.decoder import CachedContinuation, decode_numbers
+from lerobot_bomb.decoding.draft import KnownSymbols, LinearDraft
 from lerobot_bomb.decoding.grammar import NumberGrammar
 from lerobot_bomb.vlm.backbone import SmolVLMBackbone, build_backbone, config_dict, load_backbone
 from lerobot_bomb.vlm.images import crop_and_resize
 from lerobot_bomb.vlm.prompt import PromptTokens
 from lerobot_bomb.vlm.tokenizer import load_tokenizer
 from lerobot_policy_vla0_smol.configuration_vla0_smol import Vla0SmolConfig
-
-IGNORED = -100  # label of a token that the loss does not count
-
-
-@dataclass(frozen=True)
-class TokenRows:
-    """Rows of tokens with gaps: ids (B, L) int64 and which columns hold a token (B, L) bool."""
-
-    ids: Tensor
-    written: Tensor
-
-    @classmethod
-    def join(cls, parts: "list[TokenRows]") -> "TokenRows":
-        return cls(torch.cat([part.ids for part in parts], 1), torch.cat([part.written for part in parts], 1))
-
-
-@dataclass(frozen=True)
-class Answer:
-    """Numbers and the end token as rows without gaps; all (B, A)."""
-
-    rows: TokenRows
-    labels: Tensor  # int64 token ids, IGNORED where the loss does not count them
-    columns: Tensor  # int64, which of the M = N * C + 1 columns with gaps a token comes from
-
-    def with_gaps(self, values_BA: Tensor, numbers: NumberTokens) -> Tensor:
-        """Values of the tokens back at their columns, (B, M); 0 or False in gaps."""
-        values_BM = values_BA.new_zeros(len(values_BA), numbers.written[0].numel() + 1)
-        return values_BM.scatter(1, self.columns, values_BA)
 
 
 class Vla0SmolPolicy(PreTrainedPolicy):
@@ -90,7 +64,14 @@ class Vla0SmolPolicy(PreTrainedPolicy):
         self.register_buffer("symbol_ids", torch.tensor(self.tokens.symbols), persistent=False)
         self.action_bins = Bins(config.n_action_bins, config.bin_mode)
         self.state_bins = Bins(config.n_state_bins, config.bin_mode)
-        self.grammar = NumberGrammar(config.n_action_bins, fixed_width=config.number_width)
+        self.grammar = NumberGrammar(
+            config.n_action_bins, config.chunk_size * self._action_dim, fixed_width=config.number_width
+        )
+        self._guess = (
+            KnownSymbols(self.grammar)
+            if config.draft == "none"
+            else LinearDraft(self.grammar, self._action_dim)
+        )
         self.relative = (
             RelativeActions(self._action_dim, config.relative_dims()) if config.relative_actions else None
         )
@@ -207,8 +188,7 @@ class Vla0SmolPolicy(PreTrainedPolicy):
 
     def _answer_logits(self, batch: dict[str, Tensor], prompt: TokenRows, answer: TokenRows) -> Tensor:
         """Teacher-forced logits of every answer token: (B, A, V)."""
-        rows = TokenRows.join([prompt, answer])
-        _, ids_BL = compact(rows.written, rows.ids)
+        ids_BL = TokenRows.join([prompt, answer]).without_gaps().ids
         hidden_BLH = self.backbone.hidden_states(self._embeds(batch, ids_BL))
         offsets_A = torch.arange(answer.ids.shape[1], device=ids_BL.device)
         # a token is predicted one column earlier; columns beyond a short row carry no label
@@ -257,19 +237,7 @@ class Vla0SmolPolicy(PreTrainedPolicy):
         return draw_hidden(eligible_BM, config.mask_max_fraction, config.mask_skip_prob, self.generator)
 
     def _answer(self, numbers: NumberTokens) -> Answer:
-        """Numbers and the end token without gaps, and what the loss compares with."""
-        end_B1 = self.symbol_ids[END].expand(len(numbers.ids), 1)
-        true_B1 = torch.ones_like(end_B1, dtype=torch.bool)
-        ids_BM, written_BM, trained_BM = (
-            torch.cat([columns.flatten(1), last], dim=1)
-            for columns, last in zip(
-                (numbers.ids, numbers.written, numbers.trained), (end_B1, true_B1, true_B1), strict=True
-            )
-        )
-        labels_BM = ids_BM.masked_fill(~(trained_BM & written_BM), IGNORED)
-        columns_BM = torch.arange(ids_BM.shape[1], device=ids_BM.device).expand_as(ids_BM)
-        written_BA, ids_BA, labels_BA, columns_BA = compact(written_BM, ids_BM, labels_BM, columns_BM)
-        return Answer(TokenRows(ids_BA, written_BA), labels_BA, columns_BA)
+        return Answer.of(numbers, self.symbol_ids[END])
 
     # Inference
 
@@ -293,21 +261,21 @@ class Vla0SmolPolicy(PreTrainedPolicy):
         """The first ``num_steps`` actions of the chunk, absolute; the model need not write the rest."""
         self.eval()
         with self._autocast():
-            prompt = self._prompt(batch)
-            written_BL, ids_BL = compact(prompt.written, prompt.ids)
+            prompt = self._prompt(batch).without_gaps()
+            embeds_BLH = self._embeds(batch, prompt.ids)
             model = CachedContinuation(
-                self.backbone, self._embeds(batch, ids_BL), written_BL, self.symbol_ids
+                self.backbone, embeds_BLH, prompt.written, self.symbol_ids, self.grammar.max_symbols
             )
-            numbers_BN = decode_numbers(
+            decoded = decode_numbers(
                 model,
                 self.grammar,
-                batch_size=len(ids_BL),
-                num_numbers=self.config.chunk_size * self._action_dim,
+                self._guess,
+                batch_size=len(embeds_BLH),
                 stop_after=num_steps * self._action_dim,
             )
         # casts of weights cached under inference mode cannot be used by a later training step
         torch.clear_autocast_cache()
-        actions_BTD = self.action_bins.decode(numbers_BN).view(-1, num_steps, self._action_dim)
+        actions_BTD = self.action_bins.decode(decoded.numbers).view(-1, num_steps, self._action_dim)
         if self.relative is None:
             return actions_BTD
         return self.relative.decode(actions_BTD, self._read(batch, OBS_STATE)).clamp(-1, 1)
@@ -376,6 +344,10 @@ class Vla0SmolPolicy(PreTrainedPolicy):
     def _read(self, batch: dict[str, Tensor], key: str) -> Tensor:
         if key not in batch:
             raise KeyError(f"vla0_smol needs {key!r}; the batch has {sorted(batch)}")
+        if batch[key].device != self.symbol_ids.device:
+            raise ValueError(
+                f"batch[{key!r}] is on {batch[key].device}, the policy on {self.symbol_ids.device}"
+            )
         return batch[key]
 
     @property

@@ -1,0 +1,75 @@
+"""The public way to decode under a grammar: transformers' `generate` and xgrammar's logits processor.
+
+Also the text model as transformers runs it, for the table of our decoder's features.
+"""
+
+from typing import Any
+
+import torch
+import xgrammar
+from torch import Tensor
+from transformers.cache_utils import DynamicCache
+from xgrammar.contrib.hf import LogitsProcessor
+
+from lerobot_bomb.actions.text import END, SYMBOL_TEXTS
+from lerobot_bomb.decoding.decoder import read_answer
+from lerobot_bomb.decoding.grammar import NumberGrammar
+from lerobot_bomb.vlm.backbone import SmolVLMBackbone
+
+
+class XgrammarGenerate:
+    """Greedy search after given prompt embeddings; the language is ours, told to xgrammar."""
+
+    def __init__(self, backbone: SmolVLMBackbone, symbol_ids: Tensor, grammar: NumberGrammar):
+        self._backbone, self._symbol_ids, self._grammar = backbone, symbol_ids, grammar
+        width = grammar.fixed_width
+        values = " | ".join(f'"{str(value).zfill(width)}"' for value in range(grammar.num_values))
+        rules = f'root ::= {" ".join(["value"] * grammar.num_numbers)}\nvalue ::= " " ({values})\n'
+        vocabulary = [f"<{token}>" for token in range(backbone.vlm.lm_head.out_features)]
+        for token, text in zip(symbol_ids.tolist(), SYMBOL_TEXTS, strict=True):
+            vocabulary[token] = text
+        self._end_id = int(symbol_ids[END])
+        tokenizer = xgrammar.TokenizerInfo(
+            vocabulary, vocab_type=xgrammar.VocabType.RAW, stop_token_ids=[self._end_id]
+        )
+        self._grammar_of_peer = xgrammar.GrammarCompiler(tokenizer).compile_grammar(rules)
+
+    def __call__(
+        self, embeds_BLH: Tensor, written_BL: Tensor, max_symbols: int | None = None
+    ) -> tuple[Tensor, int]:
+        """(B, N) numbers and the passes they took."""
+        embeds_BLH, mask_BL = _padded_left(embeds_BLH, written_BL)
+        model: Any = self._backbone.vlm
+        ids_BA = model.generate(
+            inputs_embeds=embeds_BLH,
+            attention_mask=mask_BL.long(),
+            max_new_tokens=max_symbols or self._grammar.max_symbols,
+            do_sample=False,
+            logits_processor=[LogitsProcessor(self._grammar_of_peer)],
+            eos_token_id=self._end_id,
+            pad_token_id=self._end_id,
+        )
+        symbols_BA = (ids_BA[..., None] == self._symbol_ids).long().argmax(dim=-1)
+        return read_answer(symbols_BA, self._grammar.num_numbers), symbols_BA.shape[1]
+
+
+def _padded_left(embeds_BLH: Tensor, written_BL: Tensor) -> tuple[Tensor, Tensor]:
+    order_BL = written_BL.to(torch.uint8).argsort(dim=1, stable=True)
+    return (
+        embeds_BLH.gather(1, order_BL[..., None].expand_as(embeds_BLH)),
+        written_BL.gather(1, order_BL),
+    )
+
+
+class OneTokenText:
+    """Stands in for `CachedLlama`: a single row, one token a pass, on transformers' growing cache."""
+
+    def __init__(self, model: Any, batch_size: int, num_columns: int):
+        assert batch_size == 1
+        self._model, self.unread_column = model, num_columns
+        self._cache = DynamicCache(config=model.config)
+
+    def __call__(self, embeds_BKH: Tensor, columns_BK: Tensor) -> Tensor:
+        return self._model(
+            inputs_embeds=embeds_BKH, position_ids=columns_BK, past_key_values=self._cache, use_cache=True
+        ).last_hidden_state

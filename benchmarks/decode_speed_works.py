@@ -1,0 +1,140 @@
+"""What `decode_speed.py` measures: answers that a trained policy is asked for, and two ways to write them."""
+
+import argparse
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from typing import Any
+from unittest.mock import patch
+
+import torch
+from decode_speed_peer import XgrammarGenerate
+from lerobot.configs import PreTrainedConfig
+from lerobot.datasets import LeRobotDataset
+from lerobot.policies import make_policy, make_pre_post_processors
+from torch import Tensor
+from torch.utils.data import default_collate
+
+from lerobot_bomb.decoding.decoder import CachedContinuation, Guess, decode_numbers
+from lerobot_bomb.decoding.grammar import NumberGrammar
+from lerobot_bomb.vlm.backbone import SmolVLMBackbone
+
+MODELING = "lerobot_policy_vla0_smol.modeling_vla0_smol"
+
+
+@dataclass(frozen=True)
+class Work:
+    """A batch of prompts, and what is to be written after each."""
+
+    backbone: SmolVLMBackbone
+    embeds: Tensor  # (B, L, H)
+    written: Tensor  # (B, L) bool
+    symbol_ids: Tensor
+    grammar: NumberGrammar
+    stop_after: int
+    guess: Guess
+
+
+@dataclass(frozen=True)
+class Timed:
+    """One answer of each row."""
+
+    numbers: Tensor
+    prefill_s: float
+    decode_s: float
+    num_passes: int  # the prompt's included
+
+
+class Episodes:
+    """A trained policy with other flags, and the frames that it meets."""
+
+    def __init__(self, args: argparse.Namespace):
+        self._path, self._first = args.policy_path, args.episode
+        self.config: Any = PreTrainedConfig.from_pretrained(self._path)
+        self._dataset = LeRobotDataset(args.repo_id, root=args.root)
+
+    def works(self, batch_size: int, num_predictions: int, **options: Any) -> list[Work]:
+        """What the policy asks of the decoder, one row an episode, one prediction every `n_action_steps`."""
+        config: Any = PreTrainedConfig.from_pretrained(self._path)
+        config.pretrained_path = self._path
+        for name, value in options.items():
+            setattr(config, name, value)
+        policy: Any = make_policy(config, ds_meta=self._dataset.meta).eval()
+        preprocessor, _ = make_pre_post_processors(config, self._path)
+        works: list[Work] = []
+        with _captured(works):
+            for prediction in range(num_predictions):
+                frames = [self._frame(row, prediction * config.n_action_steps) for row in range(batch_size)]
+                policy.reset()
+                policy.select_action(preprocessor(default_collate(frames)))
+        return works
+
+    def _frame(self, row: int, step: int) -> dict[str, Any]:
+        episodes: Any = self._dataset.meta.episodes
+        episode = episodes[self._first + row]
+        first, end = episode["dataset_from_index"], episode["dataset_to_index"]
+        item: Any = self._dataset[first + step % (end - first)]
+        return item
+
+
+@contextmanager
+def _captured(works: list[Work]) -> Iterator[None]:
+    prompts: list[tuple[Any, ...]] = []
+
+    def continuation(*prompt: Any) -> CachedContinuation:
+        prompts.append(prompt)
+        return CachedContinuation(*prompt)  # pyright: ignore[reportCallIssue]
+
+    def decode(model: Any, grammar: Any, guess: Any, *, batch_size: int, stop_after: int) -> Any:
+        backbone, embeds, written, symbol_ids, _ = prompts[-1]
+        works.append(Work(backbone, embeds, written, symbol_ids, grammar, stop_after, guess))
+        return decode_numbers(model, grammar, guess, batch_size=batch_size, stop_after=stop_after)
+
+    with patch(f"{MODELING}.CachedContinuation", continuation), patch(f"{MODELING}.decode_numbers", decode):
+        yield
+
+
+def ours(work: Work) -> Timed:
+    """The decoder; the first pass reads the prompt."""
+    marks = [time.perf_counter()]
+
+    def next_logits(symbol_BK: Tensor, first_B: Tensor) -> Tensor:
+        logits = model(symbol_BK, first_B)
+        if len(marks) == 1:
+            _synchronize(logits)
+            marks.append(time.perf_counter())
+        return logits
+
+    model = CachedContinuation(
+        work.backbone, work.embeds, work.written, work.symbol_ids, work.grammar.max_symbols
+    )
+    decoded = decode_numbers(
+        next_logits,
+        work.grammar,
+        work.guess,
+        batch_size=len(work.embeds),
+        stop_after=work.stop_after,
+    )
+    _synchronize(decoded.numbers)
+    started, prompt_read = marks
+    return Timed(
+        decoded.numbers, prompt_read - started, time.perf_counter() - prompt_read, decoded.num_passes
+    )
+
+
+def peer(work: Work) -> Timed:
+    """The whole answer by `generate`, and one symbol by it: what it takes to read the prompt."""
+    generate = XgrammarGenerate(work.backbone, work.symbol_ids, work.grammar)
+    generate(work.embeds, work.written, max_symbols=1)
+    started = time.perf_counter()
+    generate(work.embeds, work.written, max_symbols=1)
+    prompt_read = time.perf_counter()
+    numbers, num_passes = generate(work.embeds, work.written)
+    whole_s, prefill_s = time.perf_counter() - prompt_read, prompt_read - started
+    return Timed(numbers, prefill_s, whole_s - prefill_s, num_passes)
+
+
+def _synchronize(tensor: Tensor) -> None:
+    if tensor.device.type == "cuda":
+        torch.cuda.synchronize()

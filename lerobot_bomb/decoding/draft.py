@@ -1,0 +1,83 @@
+"""Guesses of what an answer goes on with; right or wrong, they change only how many passes it takes.
+
+Shapes: `B` batch, `A` symbols of the longest answer, `N` numbers, `D` action dims, `T` = N / D, `G` guesses.
+"""
+
+import torch
+from torch import Tensor
+from torch.nn.functional import pad
+
+from lerobot_bomb.actions.text import END, SPACE, compact, digits_of, number_symbols
+from lerobot_bomb.decoding.decoder import MAX_GUESSES, read_answer
+from lerobot_bomb.decoding.grammar import NumberGrammar, Place
+
+
+class KnownSymbols:
+    """The space or the end after a number that cannot go on: a guess that is never wrong."""
+
+    def __init__(self, grammar: NumberGrammar):
+        self._grammar = grammar
+
+    def __call__(self, _: Tensor, place: Place) -> Tensor:
+        """(B, G), without any guess where the host sees that no row's number has to end."""
+        must_end_B = self._grammar.must_end[place.prefix]
+        if must_end_B.device.type == "cpu" and not bool(must_end_B.any()):
+            return place.prefix.new_empty(len(place.prefix), 0)
+        return torch.where(self._grammar.is_last(place), END, SPACE)[:, None]
+
+
+class LinearDraft:
+    """Every action dimension goes on as it went in the last two steps of the answer itself."""
+
+    def __init__(self, grammar: NumberGrammar, num_dims: int):
+        self._grammar, self._num_dims = grammar, num_dims
+
+    def __call__(self, symbol_BA: Tensor, place: Place) -> Tensor:
+        """(B, G) guesses."""
+        number_BN = read_answer(symbol_BA, self._grammar.num_numbers)
+        begun_BN = number_BN.scatter(1, place.number[:, None], self._complete(number_BN, place)[:, None])
+        number_BN = self._extrapolate(begun_BN, place.number + 1)
+        symbols_BNC, written_BNC = number_symbols(
+            number_BN, self._grammar.width, zero_padded=self._grammar.fixed_width > 0
+        )
+        _, symbol_BA = compact(written_BNC.flatten(1), symbols_BNC.flatten(1))
+        symbol_BA = pad(symbol_BA, (0, MAX_GUESSES + 1), value=END)
+        before_BN = torch.arange(number_BN.shape[1], device=number_BN.device) < place.number[:, None]
+        next_B = (written_BNC.sum(dim=2) * before_BN).sum(dim=1) + 1 + self._grammar.num_digits[place.prefix]
+        columns_BG = next_B[:, None] + torch.arange(MAX_GUESSES, device=next_B.device)
+        return symbol_BA.gather(1, columns_BG)
+
+    def _complete(self, number_BN: Tensor, place: Place) -> Tensor:
+        """(B,) the number that is being written: of those that begin as it does, the nearest to the line."""
+        grammar = self._grammar
+        expected_B = self._line(*self._last_two(number_BN, place.number[:, None])).squeeze(1)
+        num_digits_B = grammar.num_digits[place.prefix]
+        rest_B = grammar.fixed_width or digits_of(expected_B)
+        value_B, scale_B = grammar.value[place.prefix], 10 ** (rest_B - num_digits_B).clamp(min=0)
+        low_B, high_B = value_B * scale_B, (value_B + 1) * scale_B - 1
+        nearest_B = torch.where(low_B < grammar.num_values, expected_B.clamp(low_B, high_B), value_B)
+        return torch.where(num_digits_B > 0, nearest_B, expected_B)
+
+    def _extrapolate(self, number_BN: Tensor, num_known_B: Tensor) -> Tensor:
+        """(B, N) numbers as far as they are known, then as the lines go on."""
+        num_dims = self._num_dims
+        index_N = torch.arange(number_BN.shape[1], device=number_BN.device)
+        # the step of each number before which its dimension is not known: (B, N)
+        unknown_BN = num_known_B[:, None] + (index_N - num_known_B[:, None]) % num_dims
+        steps_BN = (index_N - unknown_BN) // num_dims
+        line_BN = self._line(*self._last_two(number_BN, unknown_BN), steps_BN)
+        return torch.where(steps_BN >= 0, line_BN, number_BN)
+
+    def _last_two(self, number_BN: Tensor, index_BX: Tensor) -> tuple[Tensor, Tensor]:
+        """A dimension's numbers one and two steps before, both (B, X); at first the middle, no slope."""
+        middle = (self._grammar.num_values - 1) // 2
+        last_BX, before_BX = (
+            number_BN.gather(1, (index_BX - steps * self._num_dims).clamp(0, number_BN.shape[1] - 1))
+            for steps in (1, 2)
+        )
+        last_BX = torch.where(index_BX >= self._num_dims, last_BX, middle)
+        return last_BX, torch.where(index_BX >= 2 * self._num_dims, before_BX, last_BX)
+
+    def _line(self, last: Tensor, before: Tensor, steps: Tensor | int = 0) -> Tensor:
+        """A dimension's number ``steps`` after the next."""
+        return (last + (last - before) * (steps + 1)).clamp(0, self._grammar.num_values - 1)

@@ -1,0 +1,108 @@
+"""The text model of a SmolVLM on a static key-value cache, for passes of a few tokens.
+
+The layers' own modules are called in transformers' order, without what surrounds them there (building masks,
+growing caches, recording outputs), which takes most of the time of a small model's pass.
+
+Shapes: `B` batch, `K` tokens of a pass, `C` columns of the cache, `H` hidden size, `V` key-value heads, `G`
+query heads for each, `E` size of a head.
+"""
+
+from dataclasses import dataclass
+from typing import Any
+
+import torch
+from torch import Tensor
+from torch.nn.functional import rms_norm, scaled_dot_product_attention
+
+
+@dataclass(frozen=True)
+class _Columns:
+    """Where the tokens of a pass stand, as the layers need it."""
+
+    slots: Tensor  # (B * K,) int64 rows of the flat cache
+    cos: Tensor  # (B, K, 1, E)
+    sin: Tensor  # (B, K, 1, E), negative in the first half
+    penalty: Tensor  # (B, 1, K * G, C): 0 for columns that a query reads, else -inf
+
+
+class CachedLlama:
+    """Hidden states of new tokens, which read what was cached before them.
+
+    A token's column in the cache is its position. One at a column that is written already takes its place, so
+    what is no longer wanted is written over. Gaps go to `unread_column`.
+
+    Raises:
+        ValueError: the model has fewer positions than ``num_columns``.
+    """
+
+    def __init__(self, model: Any, batch_size: int, num_columns: int):
+        config = model.config
+        if num_columns > config.max_position_embeddings:
+            raise ValueError(
+                f"prompt and answer take up to {num_columns} tokens, and the model has "
+                f"{config.max_position_embeddings} positions; give a smaller --policy.chunk_size"
+            )
+        self._model = model
+        self._num_heads, self._num_groups = config.num_key_value_heads, config.num_attention_heads
+        self._num_groups //= self._num_heads
+        self.unread_column = num_columns
+        embedding = model.embed_tokens.weight
+        self._columns_C = torch.arange(num_columns + 1, device=embedding.device)
+        cos_1CE, sin_1CE = model.rotary_emb(embedding, self._columns_C[None])
+        first_half, second_half = sin_1CE[0].chunk(2, dim=-1)
+        self._cos_CE, self._sin_CE = cos_1CE[0], torch.cat([-first_half, second_half], dim=-1)
+        device = embedding.device.type
+        dtype = torch.get_autocast_dtype(device) if torch.is_autocast_enabled(device) else embedding.dtype
+        shape = (2, batch_size * (num_columns + 1), self._num_heads, config.head_dim)
+        self._caches = [
+            torch.zeros(shape, dtype=dtype, device=embedding.device) for _ in range(config.num_hidden_layers)
+        ]
+
+    def __call__(self, embeds_BKH: Tensor, columns_BK: Tensor) -> Tensor:
+        """Embeddings of tokens at columns -> (B, K, H) states after the last layer."""
+        columns = self._locate(columns_BK)
+        x_BKH = embeds_BKH
+        for layer, cache in zip(self._model.layers, self._caches, strict=True):
+            x_BKH = x_BKH + self._attend(layer.self_attn, _norm(layer.input_layernorm, x_BKH), cache, columns)
+            x_BKH = x_BKH + layer.mlp(_norm(layer.post_attention_layernorm, x_BKH))
+        return _norm(self._model.norm, x_BKH)
+
+    def _locate(self, columns_BK: Tensor) -> _Columns:
+        rows_B1 = torch.arange(len(columns_BK), device=columns_BK.device)[:, None]
+        unread_BKC = self._columns_C > columns_BK[..., None]
+        penalty_BKC = torch.zeros(unread_BKC.shape, device=columns_BK.device, dtype=self._caches[0].dtype)
+        penalty_BKC.masked_fill_(unread_BKC, -torch.inf)
+        return _Columns(
+            slots=(columns_BK + len(self._columns_C) * rows_B1).flatten(),
+            cos=self._cos_CE[columns_BK][:, :, None],
+            sin=self._sin_CE[columns_BK][:, :, None],
+            penalty=penalty_BKC.repeat_interleave(self._num_groups, dim=1)[:, None],
+        )
+
+    def _attend(self, attention: Any, x_BKH: Tensor, cache: Tensor, columns: _Columns) -> Tensor:
+        batch_size, num_tokens, _ = x_BKH.shape
+        heads = batch_size, num_tokens, -1, cache.shape[-1]
+        query, key = (
+            _rotate(projection(x_BKH).view(heads), columns)
+            for projection in (attention.q_proj, attention.k_proj)
+        )
+        new = key, attention.v_proj(x_BKH).view(heads)
+        for cached, part in zip(cache, new, strict=True):
+            cached.index_copy_(0, columns.slots, part.flatten(0, 1).to(cache.dtype))
+        # the queries that share a key stand beside each other: one product a key-value head
+        query_BVXE = query.to(cache.dtype).unflatten(2, (-1, self._num_groups)).transpose(1, 2).flatten(2, 3)
+        keys_BVCE, values_BVCE = (cached.unflatten(0, (batch_size, -1)).transpose(1, 2) for cached in cache)
+        read_BVXE = scaled_dot_product_attention(
+            query_BVXE, keys_BVCE, values_BVCE, attn_mask=columns.penalty, scale=attention.scaling
+        )
+        read = read_BVXE.unflatten(2, (num_tokens, -1)).transpose(1, 2).flatten(2)
+        return attention.o_proj(read)
+
+
+def _rotate(heads: Tensor, columns: _Columns) -> Tensor:
+    """(B, K, heads, E) with rotary positions."""
+    return heads * columns.cos + heads.roll(heads.shape[-1] // 2, dims=-1) * columns.sin
+
+
+def _norm(norm: Any, x_BKH: Tensor) -> Tensor:
+    return rms_norm(x_BKH, x_BKH.shape[-1:], norm.weight, norm.variance_epsilon)
