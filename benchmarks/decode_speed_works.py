@@ -4,7 +4,7 @@ import argparse
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 from unittest.mock import patch
 
@@ -16,7 +16,9 @@ from lerobot.policies import make_policy, make_pre_post_processors
 from torch import Tensor
 from torch.utils.data import default_collate
 
+from lerobot_bomb.actions.text import digits_of, number_symbols
 from lerobot_bomb.decoding.decoder import CachedContinuation, Guess, decode_numbers
+from lerobot_bomb.decoding.draft import LinearDraft
 from lerobot_bomb.decoding.grammar import NumberGrammar
 from lerobot_bomb.vlm.backbone import SmolVLMBackbone
 
@@ -56,19 +58,39 @@ class Episodes:
 
     def works(self, batch_size: int, num_predictions: int, **options: Any) -> list[Work]:
         """What the policy asks of the decoder, one row an episode, one prediction every `n_action_steps`."""
+        policy, preprocessor = self._load(**options)
+        num_steps = policy.config.n_action_steps
+        works: list[Work] = []
+        for prediction in range(num_predictions):
+            frames = [self._frame(row, prediction * num_steps) for row in range(batch_size)]
+            policy.reset()
+            with _captured(works):
+                policy.select_action(preprocessor(default_collate(frames)))
+        return works
+
+    def planned(self, num_predictions: int, num_steps: int) -> list[Work]:
+        """The same, batch of 1, with guesses from what the last chunk left unexecuted; held at its end."""
+        policy, preprocessor = self._load(n_action_steps=num_steps)
+        works: list[Work] = []
+        plan_BTD = None
+        for prediction in range(num_predictions + 1):
+            batch = preprocessor(default_collate([self._frame(0, prediction * num_steps)]))
+            with _captured(works):
+                chunk_BTD = policy.predict_action_chunk(batch)
+            if plan_BTD is not None:
+                number_BN = policy._bins({**batch, "action": plan_BTD})
+                works[-1] = replace(works[-1], guess=PlanDraft(policy.grammar, chunk_BTD.shape[2], number_BN))
+            held_BTD = chunk_BTD[:, -1:].expand(-1, num_steps, -1)
+            plan_BTD = torch.cat([chunk_BTD[:, num_steps:], held_BTD], dim=1)
+        return works[1:]
+
+    def _load(self, **options: Any) -> tuple[Any, Any]:
         config: Any = PreTrainedConfig.from_pretrained(self._path)
         config.pretrained_path = self._path
         for name, value in options.items():
             setattr(config, name, value)
-        policy: Any = make_policy(config, ds_meta=self._dataset.meta).eval()
-        preprocessor, _ = make_pre_post_processors(config, self._path)
-        works: list[Work] = []
-        with _captured(works):
-            for prediction in range(num_predictions):
-                frames = [self._frame(row, prediction * config.n_action_steps) for row in range(batch_size)]
-                policy.reset()
-                policy.select_action(preprocessor(default_collate(frames)))
-        return works
+        policy = make_policy(config, ds_meta=self._dataset.meta).eval()
+        return policy, make_pre_post_processors(config, self._path)[0]
 
     def _frame(self, row: int, step: int) -> dict[str, Any]:
         episodes: Any = self._dataset.meta.episodes
@@ -76,6 +98,18 @@ class Episodes:
         first, end = episode["dataset_from_index"], episode["dataset_to_index"]
         item: Any = self._dataset[first + step % (end - first)]
         return item
+
+
+class PlanDraft(LinearDraft):
+    """Numbers that were foreseen; one that is being written becomes the nearest that begins as it does."""
+
+    def __init__(self, grammar: NumberGrammar, num_dims: int, plan_BN: Tensor):
+        super().__init__(grammar, num_dims)
+        self._plan_BN = plan_BN
+
+    def _expect(self, number_BN: Tensor, index_BX: Tensor, steps: Tensor | int) -> Tensor:
+        index_BX = (index_BX + steps * self._num_dims).clamp(max=number_BN.shape[1] - 1)
+        return self._plan_BN.gather(1, index_BX)
 
 
 @contextmanager
@@ -138,3 +172,32 @@ def peer(work: Work) -> Timed:
 def _synchronize(tensor: Tensor) -> None:
     if tensor.device.type == "cuda":
         torch.cuda.synchronize()
+
+
+def num_symbols(grammar: NumberGrammar, number_BN: Tensor) -> int:
+    """Tokens of the answers, spaces and ends included."""
+    num_digits = grammar.fixed_width * number_BN.numel() or int(digits_of(number_BN).sum())
+    return num_digits + number_BN.numel() + len(number_BN)
+
+
+def margin_at_difference(work: Work, written_N: Tensor, theirs_N: Tensor) -> float:
+    """Difference of the two largest allowed logits at the first symbol that differs."""
+    ours_A, theirs_A = (spell(work.grammar, numbers) for numbers in (written_N, theirs_N))
+    at = int((ours_A[: len(theirs_A)] != theirs_A[: len(ours_A)]).nonzero()[0])
+    model = CachedContinuation(
+        work.backbone, work.embeds, work.written, work.symbol_ids, work.grammar.max_symbols
+    )
+    logits = model(ours_A[None, :at], torch.zeros(1, dtype=torch.int64))[0, -1].float()
+    place = work.grammar.start(1)
+    for symbol in ours_A[1:at]:
+        place = work.grammar.advance(place, symbol[None])
+    first, second = (logits + work.grammar.penalties(place)[0]).topk(2).values
+    return float(first - second)
+
+
+def spell(grammar: NumberGrammar, number_N: Tensor) -> Tensor:
+    """(A,) symbols of an answer."""
+    symbols_NC, written_NC = number_symbols(
+        number_N[None], grammar.width, zero_padded=grammar.fixed_width > 0
+    )
+    return symbols_NC[written_NC]

@@ -50,7 +50,7 @@ class LinearDraft:
     def _complete(self, number_BN: Tensor, place: Place) -> Tensor:
         """(B,) the number that is being written: of those that begin as it does, the nearest to the line."""
         grammar = self._grammar
-        expected_B = self._line(*self._last_two(number_BN, place.number[:, None])).squeeze(1)
+        expected_B = self._expect(number_BN, place.number[:, None], 0).squeeze(1)
         num_digits_B = grammar.num_digits[place.prefix]
         rest_B = grammar.fixed_width or digits_of(expected_B)
         value_B, scale_B = grammar.value[place.prefix], 10 ** (rest_B - num_digits_B).clamp(min=0)
@@ -65,19 +65,20 @@ class LinearDraft:
         # the step of each number before which its dimension is not known: (B, N)
         unknown_BN = num_known_B[:, None] + (index_N - num_known_B[:, None]) % num_dims
         steps_BN = (index_N - unknown_BN) // num_dims
-        line_BN = self._line(*self._last_two(number_BN, unknown_BN), steps_BN)
-        return torch.where(steps_BN >= 0, line_BN, number_BN)
+        expected_BN = self._expect(number_BN, unknown_BN, steps_BN.clamp(min=0))
+        return torch.where(steps_BN >= 0, expected_BN, number_BN)
 
-    def _last_two(self, number_BN: Tensor, index_BX: Tensor) -> tuple[Tensor, Tensor]:
-        """A dimension's numbers one and two steps before, both (B, X); at first the middle, no slope."""
+    def _expect(self, number_BN: Tensor, index_BX: Tensor, steps: Tensor | int) -> Tensor:
+        """(B, X) the number ``steps`` after an unknown one, on the line through the two steps before that.
+
+        At the answer's start: the middle of the range, then no slope.
+        """
         middle = (self._grammar.num_values - 1) // 2
         last_BX, before_BX = (
-            number_BN.gather(1, (index_BX - steps * self._num_dims).clamp(0, number_BN.shape[1] - 1))
-            for steps in (1, 2)
+            number_BN.gather(1, (index_BX - back * self._num_dims).clamp(0, number_BN.shape[1] - 1))
+            for back in (1, 2)
         )
         last_BX = torch.where(index_BX >= self._num_dims, last_BX, middle)
-        return last_BX, torch.where(index_BX >= 2 * self._num_dims, before_BX, last_BX)
-
-    def _line(self, last: Tensor, before: Tensor, steps: Tensor | int = 0) -> Tensor:
-        """A dimension's number ``steps`` after the next."""
-        return (last + (last - before) * (steps + 1)).clamp(0, self._grammar.num_values - 1)
+        before_BX = torch.where(index_BX >= 2 * self._num_dims, before_BX, last_BX)
+        line_BX = last_BX + (last_BX - before_BX) * (steps + 1)
+        return line_BX.clamp(0, self._grammar.num_values - 1)
