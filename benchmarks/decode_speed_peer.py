@@ -43,7 +43,7 @@ class XgrammarGenerate:
         ids_BA = model.generate(
             inputs_embeds=embeds_BLH,
             attention_mask=mask_BL.long(),
-            max_new_tokens=max_symbols or self._grammar.max_symbols,
+            max_new_tokens=max_symbols or self._grammar.max_symbols(self._grammar.num_numbers),
             do_sample=False,
             logits_processor=[LogitsProcessor(self._grammar_of_peer)],
             eos_token_id=self._end_id,

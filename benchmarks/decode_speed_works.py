@@ -16,7 +16,7 @@ from lerobot.policies import make_policy, make_pre_post_processors
 from torch import Tensor
 from torch.utils.data import default_collate
 
-from lerobot_bomb.actions.text import digits_of, number_symbols
+from lerobot_bomb.actions.text import END, digits_of, number_symbols
 from lerobot_bomb.decoding.decoder import CachedContinuation, Guess, decode_numbers
 from lerobot_bomb.decoding.draft import LinearDraft
 from lerobot_bomb.decoding.grammar import NumberGrammar
@@ -79,7 +79,9 @@ class Episodes:
                 chunk_BTD = policy.predict_action_chunk(batch)
             if plan_BTD is not None:
                 number_BN = policy._bins({**batch, "action": plan_BTD})
-                works[-1] = replace(works[-1], guess=PlanDraft(policy.grammar, chunk_BTD.shape[2], number_BN))
+                num_dims = chunk_BTD.shape[2]
+                guess = PlanDraft(policy.grammar, num_dims, number_BN)
+                works[-1] = replace(works[-1], guess=guess, stop_after=num_steps * num_dims)
             held_BTD = chunk_BTD[:, -1:].expand(-1, num_steps, -1)
             plan_BTD = torch.cat([chunk_BTD[:, num_steps:], held_BTD], dim=1)
         return works[1:]
@@ -136,12 +138,11 @@ def ours(work: Work) -> Timed:
     def next_logits(symbol_BK: Tensor, first_B: Tensor) -> Tensor:
         logits = model(symbol_BK, first_B)
         if len(marks) == 1:
-            _synchronize(logits)
             marks.append(time.perf_counter())
         return logits
 
     model = CachedContinuation(
-        work.backbone, work.embeds, work.written, work.symbol_ids, work.grammar.max_symbols
+        work.backbone, work.embeds, work.written, work.symbol_ids, work.grammar.max_symbols(work.stop_after)
     )
     decoded = decode_numbers(
         next_logits,
@@ -150,7 +151,6 @@ def ours(work: Work) -> Timed:
         batch_size=len(work.embeds),
         stop_after=work.stop_after,
     )
-    _synchronize(decoded.numbers)
     started, prompt_read = marks
     return Timed(
         decoded.numbers, prompt_read - started, time.perf_counter() - prompt_read, decoded.num_passes
@@ -169,11 +169,6 @@ def peer(work: Work) -> Timed:
     return Timed(numbers, prefill_s, whole_s - prefill_s, num_passes)
 
 
-def _synchronize(tensor: Tensor) -> None:
-    if tensor.device.type == "cuda":
-        torch.cuda.synchronize()
-
-
 def num_symbols(grammar: NumberGrammar, number_BN: Tensor) -> int:
     """Tokens of the answers, spaces and ends included."""
     num_digits = grammar.fixed_width * number_BN.numel() or int(digits_of(number_BN).sum())
@@ -185,7 +180,7 @@ def margin_at_difference(work: Work, written_N: Tensor, theirs_N: Tensor) -> flo
     ours_A, theirs_A = (spell(work.grammar, numbers) for numbers in (written_N, theirs_N))
     at = int((ours_A[: len(theirs_A)] != theirs_A[: len(ours_A)]).nonzero()[0])
     model = CachedContinuation(
-        work.backbone, work.embeds, work.written, work.symbol_ids, work.grammar.max_symbols
+        work.backbone, work.embeds, work.written, work.symbol_ids, work.grammar.max_symbols(work.stop_after)
     )
     logits = model(ours_A[None, :at], torch.zeros(1, dtype=torch.int64))[0, -1].float()
     place = work.grammar.start(1)
@@ -196,8 +191,8 @@ def margin_at_difference(work: Work, written_N: Tensor, theirs_N: Tensor) -> flo
 
 
 def spell(grammar: NumberGrammar, number_N: Tensor) -> Tensor:
-    """(A,) symbols of an answer."""
+    """(A,) symbols of an answer, its end included."""
     symbols_NC, written_NC = number_symbols(
         number_N[None], grammar.width, zero_padded=grammar.fixed_width > 0
     )
-    return symbols_NC[written_NC]
+    return torch.cat([symbols_NC[written_NC], torch.tensor([END])])

@@ -1,16 +1,12 @@
-from typing import Any
-
 import pytest
 import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from torch import Tensor
-from transformers import LogitsProcessor
 
-from lerobot_bomb.actions.text import END, NUM_SYMBOLS, SPACE, SYMBOL_TEXTS, TokenRows
+from lerobot_bomb.actions.text import END, NUM_SYMBOLS, SPACE, SYMBOL_TEXTS
 from lerobot_bomb.decoding.decoder import (
     MAX_GUESSES,
-    CachedContinuation,
     Decoded,
     Guess,
     NextLogits,
@@ -20,7 +16,6 @@ from lerobot_bomb.decoding.decoder import (
 )
 from lerobot_bomb.decoding.draft import KnownSymbols, LinearDraft
 from lerobot_bomb.decoding.grammar import NumberGrammar, Place
-from lerobot_bomb.vlm.backbone import SmolVLMBackbone, load_backbone
 
 
 def speaker(*texts: str) -> NextLogits:
@@ -110,7 +105,8 @@ def test_stopping_early_gives_the_first_numbers() -> None:
 def test_malformed_wishes_become_legal_numbers() -> None:
     """It wants an early end, a leading zero and 600 of 512."""
     numbers = decode(speaker("# 07 600#"), NumberGrammar(512, 3), 1).numbers
-    assert ((numbers >= 0) & (numbers < 512)).all()
+    # a refused wish is one for any: the first symbol that is allowed
+    assert numbers.tolist() == [[0, 7, 60]]
 
 
 @pytest.mark.parametrize("bad", [float("nan"), float("inf"), -float("inf")])
@@ -124,7 +120,7 @@ def test_symbols_that_cannot_be_otherwise_take_no_pass() -> None:
     """Three digits a number: the space after them, and the end, are known."""
     grammar = NumberGrammar(512, 4, fixed_width=3)
     text = " 007 511 100 042#"
-    assert grammar.max_symbols == len(text)
+    assert grammar.max_symbols(4) == len(text)
     decoded = decode(speaker(text), grammar, 1)
     assert decoded.numbers.tolist() == [[7, 511, 100, 42]]
     assert decoded.num_passes == 12
@@ -144,34 +140,7 @@ def test_what_goes_on_as_before_takes_few_passes(text: str, num_values: int, wid
     assert drafted.num_passes <= undrafted.num_passes + -(-rest // MAX_GUESSES)
 
 
-@pytest.mark.parametrize(
-    ("written", "guessed"),
-    [
-        ("", "255 255 "),  # nothing to go by: the middle
-        ("10 20", "9 10 209"),  # the second is not known to be complete
-        ("10 20 13", " 20 16 "),
-        ("10 20 13 ", "20 16 20"),
-        ("10 20 13 2", "0 16 20#"),
-        ("10 20 13 3", "0 16 40#"),  # 20 was expected; the nearest number with this beginning
-        ("10 20 13 1", "9 16 18#"),
-        ("500 3 510 1 511", " 0###"),  # within the bins' range
-        ("10 20 30 40 50", " 60###"),  # the last number
-    ],
-)
-def test_the_line_is_drawn_through_the_last_two_steps(written: str, guessed: str) -> None:
-    grammar = NumberGrammar(512, 6)
-    symbols = [SPACE, *map(SYMBOL_TEXTS.index, written)]
-    place = grammar.start(1)
-    for symbol in symbols[1:]:
-        place = grammar.advance(place, torch.tensor([symbol]))
-    row = torch.full((1, grammar.max_symbols + MAX_GUESSES + 1), END)
-    row[0, : len(symbols)] = torch.tensor(symbols)
-    guess = LinearDraft(grammar, 2)(row, place)[0].tolist()
-    said = "".join("#" if symbol == END else SYMBOL_TEXTS[symbol] for symbol in guess)
-    assert said.startswith(guessed)
-
-
-FORMS = st.tuples(st.sampled_from([2, 10, 512, 999, 1001]), st.booleans())
+FORMS = st.tuples(st.sampled_from([1, 2, 10, 512, 999, 1001, 10_000]), st.booleans())
 
 
 @settings(max_examples=80, deadline=None)
@@ -216,110 +185,21 @@ def test_no_guess_changes_what_is_written(wrong: int, seed: int) -> None:
     assert decode(random_model(seed), grammar, 3, guess=random_guess).numbers.tolist() == greedy
 
 
+@pytest.mark.parametrize("drafted", [False, True])
+def test_a_device_that_is_seldom_asked_writes_the_same(
+    monkeypatch: pytest.MonkeyPatch, drafted: bool
+) -> None:
+    """Rows go on beyond their end until somebody looks, as on a GPU."""
+    monkeypatch.setattr("lerobot_bomb.decoding.decoder.PASSES_ON_HOST", 8)
+    for seed, (num_numbers, stop) in enumerate([(1, 1), (2, 1), (6, 2), (6, 6)]):
+        grammar = NumberGrammar(512, num_numbers)
+        greedy = torch.tensor(one_by_one(random_model(seed), grammar, 3))
+        guess = LinearDraft(grammar, 1) if drafted else KnownSymbols(grammar)
+        decoded = decode(random_model(seed), grammar, 3, guess=guess, stop_after=stop)
+        assert decoded.num_passes % 8 == 0
+        assert torch.equal(decoded.numbers, greedy[:, :stop])
+
+
 def test_answers_are_read_to_the_wanted_number() -> None:
     symbols = torch.tensor([[10, 1, 2, 10, 0, 10, 9, 9, 9], [10, 7, 10, 8, 11, 11, 11, 11, 11]])
     assert read_answer(symbols, 2).tolist() == [[12, 0], [7, 8]]
-
-
-# On a model
-
-SYMBOL_IDS = torch.arange(20, 20 + NUM_SYMBOLS)
-
-
-@pytest.fixture(scope="module")
-def backbone() -> SmolVLMBackbone:
-    torch.manual_seed(0)
-    return load_backbone("nano").eval()
-
-
-def prompts(backbone: SmolVLMBackbone, seed: int, lengths: list[int]) -> TokenRows:
-    generator = torch.Generator().manual_seed(seed)
-    ids = torch.randint(40, 300, (len(lengths), max(lengths)), generator=generator)
-    return TokenRows(ids, torch.arange(max(lengths)) < torch.tensor(lengths)[:, None])
-
-
-def continuation(backbone: SmolVLMBackbone, rows: TokenRows, max_symbols: int) -> CachedContinuation:
-    return CachedContinuation(
-        backbone, backbone.embed_tokens(rows.ids), rows.written, SYMBOL_IDS, max_symbols
-    )
-
-
-@torch.no_grad()
-def test_the_cache_gives_the_logits_of_a_full_pass(backbone: SmolVLMBackbone) -> None:
-    """Rows of different lengths that get on differently far, one of them twice over the same columns."""
-    rows = prompts(backbone, 0, [9, 4])
-    said = torch.tensor([[3, 10, 4, 1, 9, 10, 2], [10, 8, 5, 7, 1, 10, 6]])
-    model = continuation(backbone, rows, 9)
-    model(said[:, :2], torch.tensor([0, 0]))
-    model(torch.tensor([[4, 1, 9], [0, 0, 0]]), torch.tensor([2, 2]))  # wrong guesses in the second row
-    cached = model(torch.stack([said[0, 5:7], said[1, 2:4]]), torch.tensor([5, 2]))
-    for row, (length, num_said) in enumerate([(9, 7), (4, 4)]):
-        full = torch.cat([rows.ids[row, :length], SYMBOL_IDS[said[row, :num_said]]])[None]
-        expected = backbone.logits(backbone.hidden_states(backbone.embed_tokens(full)))[0, -2:, SYMBOL_IDS]
-        torch.testing.assert_close(cached[row], expected)
-
-
-class GrammarProcessor(LogitsProcessor):
-    """The grammar for transformers' `generate`, told by a regular expression's worth of Python."""
-
-    def __init__(self, num_values: int, num_numbers: int, prompt_length: int):
-        self.num_values, self.num_numbers, self.prompt_length = num_values, num_numbers, prompt_length
-
-    def __call__(self, input_ids: Tensor, scores: Tensor) -> Tensor:  # pyright: ignore[reportIncompatibleMethodOverride]
-        masked = torch.full_like(scores, -torch.inf)
-        for row, ids in enumerate(input_ids[:, self.prompt_length :].tolist()):
-            text = "".join(SYMBOL_TEXTS[token - 20] if token != 20 + END else "#" for token in ids)
-            for symbol in self.choices(text):
-                masked[row, 20 + symbol] = scores[row, 20 + symbol]
-        return masked
-
-    def choices(self, text: str) -> list[int]:
-        if "#" in text or not text:
-            return [END] if text else list(range(10))
-        *_, number = text.split(" ")
-        more = [digit for digit in range(10) if number != "0" and int(f"{number}{digit}") < self.num_values]
-        if not number:
-            return more
-        return [*more, SPACE if text.count(" ") + 1 < self.num_numbers else END]
-
-
-@torch.no_grad()
-@pytest.mark.parametrize("lengths", [[30], [30, 24, 17, 30, 5, 12, 29, 30]])
-@pytest.mark.parametrize("drafted", [False, True])
-def test_it_writes_what_generate_writes(backbone: SmolVLMBackbone, lengths: list[int], drafted: bool) -> None:
-    """transformers' own greedy search with its own cache, left-padded, under the same language."""
-    grammar, batch_size = NumberGrammar(512, 12), len(lengths)
-    for seed in range(4):
-        rows = prompts(backbone, seed, lengths)
-        guess = LinearDraft(grammar, 3) if drafted else KnownSymbols(grammar)
-        model = continuation(backbone, rows, grammar.max_symbols)
-        ours = decode(model, grammar, batch_size, guess=guess).numbers
-        longest = max(lengths) + 1
-        ids = torch.zeros(batch_size, longest, dtype=torch.long)
-        mask = torch.zeros_like(ids)
-        for row, length in enumerate(lengths):
-            ids[row, -length - 1 :] = torch.cat([rows.ids[row, :length], SYMBOL_IDS[SPACE : SPACE + 1]])
-            mask[row, -length - 1 :] = 1
-        model_of_peer: Any = backbone.vlm
-        written = model_of_peer.generate(
-            input_ids=ids,
-            attention_mask=mask,
-            max_new_tokens=grammar.max_symbols,
-            do_sample=False,
-            logits_processor=[GrammarProcessor(512, 12, longest)],
-            eos_token_id=20 + END,
-            pad_token_id=20 + END,
-        )
-        for row in range(batch_size):
-            symbols = (written[row, longest:] - 20).tolist()
-            text = "".join(SYMBOL_TEXTS[symbol] for symbol in symbols if symbol != END)
-            assert ours[row].tolist() == [int(part) for part in text.split()]
-
-
-def test_an_answer_longer_than_the_models_positions_is_refused(backbone: SmolVLMBackbone) -> None:
-    rows = prompts(backbone, 0, [30])
-    with pytest.raises(
-        ValueError, match=r"up to 4097 tokens, and the model has 4096 positions; give a smaller"
-    ):
-        continuation(backbone, rows, 4067)
-    continuation(backbone, rows, 4066)

@@ -7,7 +7,7 @@ from torch import Tensor
 from vla0_smol_cases import WORKSPACE, make_batch, make_policy, numbers_of
 
 from lerobot_bomb.actions.text import IGNORED
-from lerobot_bomb.decoding.decoder import pick
+from lerobot_bomb.decoding.decoder import Decoded, decode_numbers, pick
 from lerobot_policy_vla0_smol.modeling_vla0_smol import Vla0SmolPolicy
 
 
@@ -59,12 +59,42 @@ def test_decoding_follows_the_teacher_forced_argmax(overfit: tuple[Vla0SmolPolic
         assert place.prefix == policy.grammar.DONE
 
 
-@pytest.mark.parametrize("options", [{"number_width": 3}, {"n_action_bins": 99, "bin_mode": "levels"}])
-def test_a_draft_changes_no_action(options: dict[str, Any]) -> None:
-    policies = [make_policy(draft=draft, **options) for draft in ("none", "linear")]
-    batch = make_batch(policies[0], 4)
-    chunks = [policy.predict_action_chunk(batch) for policy in policies]
+LINE: dict[str, Any] = {
+    "mask_max_fraction": 0.0,
+    "crop_fraction": 1.0,
+    "n_action_bins": 99,
+    "bin_mode": "levels",
+    "chunk_size": 6,
+}
+
+
+def test_a_draft_changes_no_action_and_saves_passes(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Weights that have learned chunks along a line."""
+    policy = make_policy(**LINE)
+    batch = make_batch(policy, 2)
+    steps = torch.arange(6.0)[:, None]
+    batch["action"] = torch.stack([steps * 0.1 - 0.3 * torch.ones(4), 0.5 - steps * torch.full((4,), 0.08)])
+    batch["action_is_pad"] = torch.zeros(2, 6, dtype=torch.bool)
+    optimizer = torch.optim.AdamW(policy.get_optim_params(), lr=2e-3, weight_decay=0.0)
+    policy.train()
+    for _ in range(60):
+        loss, _ = policy(batch)
+        optimizer.zero_grad()
+        loss.backward()
+        optimizer.step()
+    undrafted = make_policy(**{**LINE, "draft": "none"})
+    undrafted.load_state_dict(policy.state_dict())
+    seen: list[Decoded] = []
+
+    def decode(*args: Any, **options: Any) -> Decoded:
+        seen.append(decode_numbers(*args, **options))
+        return seen[-1]
+
+    monkeypatch.setattr("lerobot_policy_vla0_smol.modeling_vla0_smol.decode_numbers", decode)
+    chunks = [one.predict_action_chunk(batch) for one in (policy, undrafted)]
     assert torch.equal(*chunks)
+    drafted, plain = (decoded.num_passes for decoded in seen)
+    assert drafted < 0.6 * plain
 
 
 def test_a_rows_actions_do_not_depend_on_the_batch(overfit: tuple[Vla0SmolPolicy, dict[str, Any]]) -> None:

@@ -5,7 +5,8 @@ each. As far as the guesses are these choices they are right, and so is the firs
 guess: what is written is what one symbol a pass would write (speculative decoding, arXiv 2211.17192, for
 greedy choices).
 
-Shapes: `B` batch, `S` symbols, `A` symbols of the longest answer, `N` numbers, `G` guesses, `K` = 1 + G.
+Shapes: `B` batch, `S` symbols, `A` columns of a row of symbols (the longest answer's and some to spare), `N`
+numbers, `G` guesses, `K` = 1 + G.
 """
 
 from collections.abc import Callable
@@ -21,11 +22,13 @@ from lerobot_bomb.vlm.cached_llama import CachedLlama
 
 # (B, K) symbols, (B,) the column of each row's first in its answer -> (B, K, S) logits of the symbols after
 NextLogits = Callable[[Tensor, Tensor], Tensor]
-# (B, A) symbols written, END beyond, and where each row stands -> (B, G) guesses of what comes next
+# (B, A) symbols written, END beyond, and where each row stands -> (B, G) guesses of what comes next, at most
+# MAX_GUESSES
 Guess = Callable[[Tensor, Place], Tensor]
 
 MAX_GUESSES = 8
-PASSES_BETWEEN_SYNCS = 8  # of a device that works while the host runs ahead
+# between two looks at whether all rows are done; a device works while the host runs ahead
+PASSES_ON_HOST, PASSES_ON_DEVICE = 1, 8
 
 
 @dataclass(frozen=True)
@@ -55,17 +58,17 @@ class CachedContinuation:
             backbone.vlm.model.text_model, len(prompt_BLH), prompt_BLH.shape[1] + max_symbols
         )
         columns_BL = (written_BL.cumsum(dim=1) - 1).masked_fill(~written_BL, self._text.unread_column)
-        self._unread: tuple[Tensor, Tensor] | None = prompt_BLH, columns_BL
+        self._prompt: tuple[Tensor, Tensor] | None = prompt_BLH, columns_BL
 
     def __call__(self, symbol_BK: Tensor, first_B: Tensor) -> Tensor:
         num_symbols = symbol_BK.shape[1]
         embeds = self._backbone.embed_tokens(self._symbol_ids[symbol_BK])
         columns = self._length_B1 + first_B[:, None] + torch.arange(num_symbols, device=first_B.device)
         columns = columns.clamp(max=self._text.unread_column)
-        if self._unread is not None:
-            prompt_BLH, columns_BL = self._unread
+        if self._prompt is not None:
+            prompt_BLH, columns_BL = self._prompt
             embeds, columns = torch.cat([prompt_BLH, embeds], 1), torch.cat([columns_BL, columns], 1)
-            self._unread = None
+            self._prompt = None
         return self._head(self._text(embeds, columns)[:, -num_symbols:])
 
 
@@ -82,18 +85,19 @@ def decode_numbers(
     """The first ``stop_after`` greedily written numbers of each row.
 
     Only what the grammar allows is ever chosen, so every row is well-formed by construction. Rows get on
-    differently far in a pass; one that is done goes on unread until all are.
+    differently far in a pass; what one writes after it is done is ignored.
     """
 
     def is_done(place: Place) -> Tensor:
         complete_B = (place.number == stop_after - 1) & grammar.must_end[place.prefix]
         return complete_B | (place.number >= stop_after) | (place.prefix == grammar.DONE)
 
-    place = grammar.start(batch_size)
-    symbols_BA = place.prefix.new_full((batch_size, grammar.max_symbols + MAX_GUESSES + 1), END)
+    place, max_symbols = grammar.start(batch_size), grammar.max_symbols(grammar.num_numbers)
+    symbols_BA = place.prefix.new_full((batch_size, max_symbols + MAX_GUESSES + 1), END)
     symbols_BA[:, 0] = SPACE
     num_written_B = torch.ones_like(place.prefix)
     columns_A = torch.arange(symbols_BA.shape[1], device=symbols_BA.device)
+    passes_between_checks = PASSES_ON_HOST if symbols_BA.device.type == "cpu" else PASSES_ON_DEVICE
     num_passes = 0
     while True:
         guess_BG = guess(symbols_BA, place)
@@ -105,12 +109,11 @@ def decode_numbers(
         picks_BK = pick(logits_BKS, grammar.penalties(places_BK))
         num_right_B = (picks_BK[:, :-1] == guess_BG).cumprod(dim=1).sum(dim=1)
         place = grammar.advance(places_BK.at(num_right_B), picks_BK.gather(1, num_right_B[:, None])[:, 0])
-        num_written_B = (num_written_B + num_right_B + 1).clamp(max=grammar.max_symbols)
+        num_written_B = (num_written_B + num_right_B + 1).clamp(max=max_symbols)
         symbols_BA.scatter_(1, columns_BK, picks_BK)
         # what follows a wrong guess is not written
         symbols_BA.masked_fill_(columns_A >= num_written_B[:, None], END)
-        on_host = symbols_BA.device.type == "cpu"
-        if (on_host or num_passes % PASSES_BETWEEN_SYNCS == 0) and bool(is_done(place).all()):
+        if num_passes % passes_between_checks == 0 and bool(is_done(place).all()):
             return Decoded(read_answer(symbols_BA, stop_after), num_passes)
 
 

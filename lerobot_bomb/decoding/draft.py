@@ -1,19 +1,19 @@
 """Guesses of what an answer goes on with; right or wrong, they change only how many passes it takes.
 
-Shapes: `B` batch, `A` symbols of the longest answer, `N` numbers, `D` action dims, `T` = N / D, `G` guesses.
+Shapes: `B` batch, `A` columns of a row of symbols, `N` numbers, `C` columns a number may take, `M` = N * C,
+`G` guesses.
 """
 
 import torch
 from torch import Tensor
-from torch.nn.functional import pad
 
-from lerobot_bomb.actions.text import END, SPACE, compact, digits_of, number_symbols
+from lerobot_bomb.actions.text import END, SPACE, digits_of, number_symbols
 from lerobot_bomb.decoding.decoder import MAX_GUESSES, read_answer
 from lerobot_bomb.decoding.grammar import NumberGrammar, Place
 
 
 class KnownSymbols:
-    """The space or the end after a number that cannot go on: a guess that is never wrong."""
+    """The space or the end, which is right wherever a number cannot go on."""
 
     def __init__(self, grammar: NumberGrammar):
         self._grammar = grammar
@@ -40,29 +40,38 @@ class LinearDraft:
         symbols_BNC, written_BNC = number_symbols(
             number_BN, self._grammar.width, zero_padded=self._grammar.fixed_width > 0
         )
-        _, symbol_BA = compact(written_BNC.flatten(1), symbols_BNC.flatten(1))
-        symbol_BA = pad(symbol_BA, (0, MAX_GUESSES + 1), value=END)
         before_BN = torch.arange(number_BN.shape[1], device=number_BN.device) < place.number[:, None]
         next_B = (written_BNC.sum(dim=2) * before_BN).sum(dim=1) + 1 + self._grammar.num_digits[place.prefix]
         columns_BG = next_B[:, None] + torch.arange(MAX_GUESSES, device=next_B.device)
-        return symbol_BA.gather(1, columns_BG)
+        return self._spell(symbols_BNC.flatten(1), written_BNC.flatten(1)).gather(1, columns_BG)
+
+    def _spell(self, symbol_BM: Tensor, written_BM: Tensor) -> Tensor:
+        """Written symbols without the gaps between them, then ends; no row's length has to be known."""
+        num_columns = symbol_BM.shape[1] + MAX_GUESSES + 1
+        column_BM = (written_BM.cumsum(dim=1) - 1).masked_fill(~written_BM, num_columns)
+        spelled = symbol_BM.new_full((len(symbol_BM), num_columns + 1), END)
+        return spelled.scatter(1, column_BM, symbol_BM)
 
     def _complete(self, number_BN: Tensor, place: Place) -> Tensor:
-        """(B,) the number that is being written: of those that begin as it does, the nearest to the line."""
+        """(B,) the number that is being written, as near to what is expected as its beginning allows.
+
+        Of numbers without zero padding, those with as many digits as expected come into question.
+        """
         grammar = self._grammar
         expected_B = self._expect(number_BN, place.number[:, None], 0).squeeze(1)
         num_digits_B = grammar.num_digits[place.prefix]
         rest_B = grammar.fixed_width or digits_of(expected_B)
         value_B, scale_B = grammar.value[place.prefix], 10 ** (rest_B - num_digits_B).clamp(min=0)
         low_B, high_B = value_B * scale_B, (value_B + 1) * scale_B - 1
-        nearest_B = torch.where(low_B < grammar.num_values, expected_B.clamp(low_B, high_B), value_B)
+        goes_on_B = (low_B < grammar.num_values) & ~grammar.must_end[place.prefix]
+        nearest_B = torch.where(goes_on_B, expected_B.clamp(low_B, high_B), value_B)
         return torch.where(num_digits_B > 0, nearest_B, expected_B)
 
     def _extrapolate(self, number_BN: Tensor, num_known_B: Tensor) -> Tensor:
         """(B, N) numbers as far as they are known, then as the lines go on."""
         num_dims = self._num_dims
         index_N = torch.arange(number_BN.shape[1], device=number_BN.device)
-        # the step of each number before which its dimension is not known: (B, N)
+        # the first number of the same dimension that is not known: (B, N)
         unknown_BN = num_known_B[:, None] + (index_N - num_known_B[:, None]) % num_dims
         steps_BN = (index_N - unknown_BN) // num_dims
         expected_BN = self._expect(number_BN, unknown_BN, steps_BN.clamp(min=0))

@@ -91,10 +91,9 @@ class NumberGrammar(nn.Module):
     def _is_number(self, prefix: str) -> bool:
         return len(prefix) == self.fixed_width if self.fixed_width else prefix != ""
 
-    @property
-    def max_symbols(self) -> int:
-        """A, of the longest answer."""
-        return self.num_numbers * (1 + self.width) + 1
+    def max_symbols(self, num_numbers: int) -> int:
+        """Of the longest answer that begins with so many numbers, up to the symbol after them."""
+        return num_numbers * (1 + self.width) + 1
 
     def start(self, batch_size: int) -> Place:
         """(B,) places after the first space, which every answer begins with."""

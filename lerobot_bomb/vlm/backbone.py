@@ -61,8 +61,8 @@ class SmolVLMBackbone(nn.Module):
         head = self.vlm.lm_head
         if type(head) is not nn.Linear:  # such as one with an adapter
             return lambda hidden: head(hidden)[..., token_ids]
-        rows, bias = head.weight[token_ids], None if head.bias is None else head.bias[token_ids]
-        return lambda hidden: linear(hidden, rows, bias)
+        rows = head.weight[token_ids]
+        return lambda hidden: linear(hidden, rows)
 
     def logits(self, hidden_BLH: Tensor) -> Tensor:
         """(..., H) -> (..., V)."""

@@ -45,15 +45,16 @@ class CachedLlama:
         self._model = model
         self._num_heads, self._num_groups = config.num_key_value_heads, config.num_attention_heads
         self._num_groups //= self._num_heads
-        self.unread_column = num_columns
         embedding = model.embed_tokens.weight
-        self._columns_C = torch.arange(num_columns + 1, device=embedding.device)
+        # a multiple of 8, which attention on CUDA wants of its masks
+        self._columns_C = torch.arange(-(-(num_columns + 1) // 8) * 8, device=embedding.device)
+        self.unread_column = len(self._columns_C) - 1
         cos_1CE, sin_1CE = model.rotary_emb(embedding, self._columns_C[None])
         first_half, second_half = sin_1CE[0].chunk(2, dim=-1)
         self._cos_CE, self._sin_CE = cos_1CE[0], torch.cat([-first_half, second_half], dim=-1)
         device = embedding.device.type
         dtype = torch.get_autocast_dtype(device) if torch.is_autocast_enabled(device) else embedding.dtype
-        shape = (2, batch_size * (num_columns + 1), self._num_heads, config.head_dim)
+        shape = (2, batch_size * len(self._columns_C), self._num_heads, config.head_dim)
         self._caches = [
             torch.zeros(shape, dtype=dtype, device=embedding.device) for _ in range(config.num_hidden_layers)
         ]

@@ -263,15 +263,16 @@ class Vla0SmolPolicy(PreTrainedPolicy):
         with self._autocast():
             prompt = self._prompt(batch).without_gaps()
             embeds_BLH = self._embeds(batch, prompt.ids)
+            stop_after = num_steps * self._action_dim
             model = CachedContinuation(
-                self.backbone, embeds_BLH, prompt.written, self.symbol_ids, self.grammar.max_symbols
+                self.backbone,
+                embeds_BLH,
+                prompt.written,
+                self.symbol_ids,
+                self.grammar.max_symbols(stop_after),
             )
             decoded = decode_numbers(
-                model,
-                self.grammar,
-                self._guess,
-                batch_size=len(embeds_BLH),
-                stop_after=num_steps * self._action_dim,
+                model, self.grammar, self._guess, batch_size=len(embeds_BLH), stop_after=stop_after
             )
         # casts of weights cached under inference mode cannot be used by a later training step
         torch.clear_autocast_cache()

@@ -1,0 +1,158 @@
+"""The decoder on a model, against the model's own full passes and transformers' `generate`."""
+
+import copy
+from typing import Any
+
+import pytest
+import torch
+from torch import Tensor
+from transformers import LogitsProcessor
+
+from lerobot_bomb.actions.text import END, NUM_SYMBOLS, SPACE, SYMBOL_TEXTS, TokenRows
+from lerobot_bomb.decoding.decoder import CachedContinuation, decode_numbers
+from lerobot_bomb.decoding.draft import KnownSymbols, LinearDraft
+from lerobot_bomb.decoding.grammar import NumberGrammar
+from lerobot_bomb.vlm.backbone import SmolVLMBackbone, load_backbone
+
+SYMBOL_IDS = torch.arange(20, 20 + NUM_SYMBOLS)
+
+
+@pytest.fixture(scope="module")
+def backbone() -> SmolVLMBackbone:
+    torch.manual_seed(0)
+    return load_backbone("nano").eval()
+
+
+def prompts(backbone: SmolVLMBackbone, seed: int, lengths: list[int]) -> TokenRows:
+    generator = torch.Generator().manual_seed(seed)
+    ids = torch.randint(40, 300, (len(lengths), max(lengths)), generator=generator)
+    return TokenRows(ids, torch.arange(max(lengths)) < torch.tensor(lengths)[:, None])
+
+
+def continuation(backbone: SmolVLMBackbone, rows: TokenRows, max_symbols: int) -> CachedContinuation:
+    return CachedContinuation(
+        backbone, backbone.embed_tokens(rows.ids), rows.written, SYMBOL_IDS, max_symbols
+    )
+
+
+@torch.no_grad()
+def test_the_cache_gives_the_logits_of_a_full_pass(backbone: SmolVLMBackbone) -> None:
+    """Rows of different lengths that get on differently far, one of them twice over the same columns."""
+    rows = prompts(backbone, 0, [9, 4])
+    said = torch.tensor([[3, 10, 4, 1, 9, 10, 2], [10, 8, 5, 7, 1, 10, 6]])
+    model = continuation(backbone, rows, 9)
+    model(said[:, :2], torch.tensor([0, 0]))
+    model(torch.tensor([[4, 1, 9], [0, 0, 0]]), torch.tensor([2, 2]))  # wrong guesses in the second row
+    cached = model(torch.stack([said[0, 5:7], said[1, 2:4]]), torch.tensor([5, 2]))
+    for row, (length, num_said) in enumerate([(9, 7), (4, 4)]):
+        full = torch.cat([rows.ids[row, :length], SYMBOL_IDS[said[row, :num_said]]])[None]
+        expected = backbone.logits(backbone.hidden_states(backbone.embed_tokens(full)))[0, -2:, SYMBOL_IDS]
+        torch.testing.assert_close(cached[row], expected)
+
+
+@torch.no_grad()
+def test_the_cache_in_bfloat16_is_as_exact_as_a_full_pass(backbone: SmolVLMBackbone) -> None:
+    rows = prompts(backbone, 0, [9])
+    said = torch.tensor([[3, 10, 4, 1]])
+    full = torch.cat([rows.ids[0], SYMBOL_IDS[said[0]]])[None]
+    exact = backbone.logits(backbone.hidden_states(backbone.embed_tokens(full)))[0, -4:, SYMBOL_IDS]
+    with torch.autocast("cpu", dtype=torch.bfloat16):
+        whole = backbone.logits(backbone.hidden_states(backbone.embed_tokens(full)))[0, -4:, SYMBOL_IDS]
+        model = continuation(backbone, rows, 9)
+        cached = torch.cat([model(said[:, :2], torch.tensor([0])), model(said[:, 2:], torch.tensor([2]))], 1)[
+            0
+        ]
+    assert cached.dtype == torch.bfloat16
+    error, error_of_whole = ((logits.float() - exact).abs().max() for logits in (cached, whole))
+    assert 0 < error < 2 * error_of_whole
+
+
+@torch.no_grad()
+def test_adapters_count(backbone: SmolVLMBackbone) -> None:
+    """A head or a projection that a module wraps, as PEFT does."""
+
+    class Doubled(torch.nn.Module):
+        def __init__(self, base: torch.nn.Module):
+            super().__init__()
+            self.base = base
+
+        def forward(self, x: Tensor) -> Tensor:
+            return 2 * self.base(x)
+
+    adapted = copy.deepcopy(backbone)
+    vlm: Any = adapted.vlm
+    vlm.lm_head = Doubled(vlm.lm_head)
+    layer: Any = adapted.vlm.model.text_model.get_submodule("layers.1")
+    layer.self_attn.v_proj = Doubled(layer.self_attn.v_proj)
+    rows, said = prompts(backbone, 0, [9]), torch.tensor([[3, 10, 4]])
+    full = torch.cat([rows.ids[0], SYMBOL_IDS[said[0]]])[None]
+    expected = adapted.logits(adapted.hidden_states(adapted.embed_tokens(full)))[0, -3:, SYMBOL_IDS]
+    cached = continuation(adapted, rows, 9)(said, torch.tensor([0]))[0]
+    torch.testing.assert_close(cached, expected)
+    assert not torch.allclose(cached, continuation(backbone, rows, 9)(said, torch.tensor([0]))[0])
+
+
+class GrammarProcessor(LogitsProcessor):
+    """The grammar for transformers' `generate`, told by a regular expression's worth of Python."""
+
+    def __init__(self, num_values: int, num_numbers: int, prompt_length: int):
+        self.num_values, self.num_numbers, self.prompt_length = num_values, num_numbers, prompt_length
+
+    def __call__(self, input_ids: Tensor, scores: Tensor) -> Tensor:  # pyright: ignore[reportIncompatibleMethodOverride]
+        masked = torch.full_like(scores, -torch.inf)
+        for row, ids in enumerate(input_ids[:, self.prompt_length :].tolist()):
+            text = "".join(SYMBOL_TEXTS[token - 20] if token != 20 + END else "#" for token in ids)
+            for symbol in self.choices(text):
+                masked[row, 20 + symbol] = scores[row, 20 + symbol]
+        return masked
+
+    def choices(self, text: str) -> list[int]:
+        if "#" in text or not text:
+            return [END] if text else list(range(10))
+        *_, number = text.split(" ")
+        more = [digit for digit in range(10) if number != "0" and int(f"{number}{digit}") < self.num_values]
+        if not number:
+            return more
+        return [*more, SPACE if text.count(" ") + 1 < self.num_numbers else END]
+
+
+@torch.no_grad()
+@pytest.mark.parametrize("lengths", [[30], [30, 24, 17, 30, 5, 12, 29, 30]])
+@pytest.mark.parametrize("drafted", [False, True])
+def test_it_writes_what_generate_writes(backbone: SmolVLMBackbone, lengths: list[int], drafted: bool) -> None:
+    """transformers' own greedy search with its own cache, left-padded, under the same language."""
+    grammar, batch_size = NumberGrammar(512, 12), len(lengths)
+    for seed in range(4):
+        rows = prompts(backbone, seed, lengths)
+        guess = LinearDraft(grammar, 3) if drafted else KnownSymbols(grammar)
+        model = continuation(backbone, rows, grammar.max_symbols(12))
+        ours = decode_numbers(model, grammar, guess, batch_size=batch_size, stop_after=12).numbers
+        longest = max(lengths) + 1
+        ids = torch.zeros(batch_size, longest, dtype=torch.long)
+        mask = torch.zeros_like(ids)
+        for row, length in enumerate(lengths):
+            ids[row, -length - 1 :] = torch.cat([rows.ids[row, :length], SYMBOL_IDS[SPACE : SPACE + 1]])
+            mask[row, -length - 1 :] = 1
+        model_of_peer: Any = backbone.vlm
+        written = model_of_peer.generate(
+            input_ids=ids,
+            attention_mask=mask,
+            max_new_tokens=grammar.max_symbols(12),
+            do_sample=False,
+            logits_processor=[GrammarProcessor(512, 12, longest)],
+            eos_token_id=20 + END,
+            pad_token_id=20 + END,
+        )
+        for row in range(batch_size):
+            symbols = (written[row, longest:] - 20).tolist()
+            text = "".join(SYMBOL_TEXTS[symbol] for symbol in symbols if symbol != END)
+            assert ours[row].tolist() == [int(part) for part in text.split()]
+
+
+def test_an_answer_longer_than_the_models_positions_is_refused(backbone: SmolVLMBackbone) -> None:
+    rows = prompts(backbone, 0, [30])
+    with pytest.raises(
+        ValueError, match=r"up to 4097 tokens, and the model has 4096 positions; give a smaller"
+    ):
+        continuation(backbone, rows, 4067)
+    continuation(backbone, rows, 4066)
