@@ -11,11 +11,8 @@ from lerobot_bomb.decoding.decoder import Decoded, decode_numbers, pick
 from lerobot_policy_vla0_smol.modeling_vla0_smol import Vla0SmolPolicy
 
 
-@pytest.fixture(scope="module")
-def overfit() -> tuple[Vla0SmolPolicy, dict[str, Any]]:
-    """A policy that has learned four samples by heart."""
-    policy = make_policy(crop_fraction=1.0, mask_max_fraction=0.0)
-    batch = make_batch(policy, 4)
+def learn(policy: Vla0SmolPolicy, batch: dict[str, Any]) -> None:
+    """Train until the batch is known by heart."""
     optimizer = torch.optim.AdamW(policy.get_optim_params(), lr=2e-3, weight_decay=0.0)
     policy.train()
     for _ in range(400):
@@ -25,6 +22,14 @@ def overfit() -> tuple[Vla0SmolPolicy, dict[str, Any]]:
         optimizer.step()
         if loss.item() < 0.02 and metrics["token_accuracy"] == 1.0:
             break
+
+
+@pytest.fixture(scope="module")
+def overfit() -> tuple[Vla0SmolPolicy, dict[str, Any]]:
+    """A policy that has learned four samples by heart."""
+    policy = make_policy(crop_fraction=1.0, mask_max_fraction=0.0)
+    batch = make_batch(policy, 4)
+    learn(policy, batch)
     return policy.eval(), batch
 
 
@@ -75,13 +80,7 @@ def test_a_draft_changes_no_action_and_saves_passes(monkeypatch: pytest.MonkeyPa
     steps = torch.arange(6.0)[:, None]
     batch["action"] = torch.stack([steps * 0.1 - 0.3 * torch.ones(4), 0.5 - steps * torch.full((4,), 0.08)])
     batch["action_is_pad"] = torch.zeros(2, 6, dtype=torch.bool)
-    optimizer = torch.optim.AdamW(policy.get_optim_params(), lr=2e-3, weight_decay=0.0)
-    policy.train()
-    for _ in range(60):
-        loss, _ = policy(batch)
-        optimizer.zero_grad()
-        loss.backward()
-        optimizer.step()
+    learn(policy, batch)
     undrafted = make_policy(**{**LINE, "draft": "none"})
     undrafted.load_state_dict(policy.state_dict())
     seen: list[Decoded] = []

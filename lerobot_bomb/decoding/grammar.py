@@ -1,7 +1,7 @@
 """The language of answers: `` n1 n2 ... nN<end>``, as a deterministic automaton on tensors.
 
 Every number is in 0..num_values - 1, without sign or leading zeros, or zero-padded to a fixed width.
-Shapes: `B` batch, `S` symbols, `A` symbols of the longest answer.
+Shapes: `B` batch, `S` symbols, `G` symbols of a walk, `K` = 1 + G.
 """
 
 from dataclasses import dataclass
@@ -29,7 +29,7 @@ class NumberGrammar(nn.Module):
     """Transition tables of answers of ``num_numbers`` numbers.
 
     A state is a beginning of a number; `START` is the empty one, just after a space, and `DONE` follows the
-    end. A number is complete where `is_number` holds.
+    end.
 
     Raises:
         ValueError: there is no number to write, or no value that it can take, or the width is too small.
@@ -37,8 +37,7 @@ class NumberGrammar(nn.Module):
 
     penalty: Tensor  # (2, states, S) float32: 0 where a symbol may follow, else -inf; [1]: the last number
     next_state: Tensor  # (states, S) int64
-    is_number: Tensor  # (states,) bool
-    must_end: Tensor  # (states,) bool: complete, and no digit may follow
+    must_end: Tensor  # (states,) bool: a number that no digit may follow
     num_digits: Tensor  # (states,) int64
     value: Tensor  # (states,) int64
 
@@ -70,7 +69,6 @@ class NumberGrammar(nn.Module):
         for name, table in {
             "penalty": penalty,
             "next_state": next_state,
-            "is_number": is_number,
             "must_end": is_number & (next_state[:, :SPACE] == self.DONE).all(dim=1),
             "num_digits": torch.tensor([0, *map(len, prefixes)]),
             "value": torch.tensor([0, *(int(prefix or 0) for prefix in prefixes)]),
