@@ -131,29 +131,30 @@ def _captured(works: list[Work]) -> Iterator[None]:
         yield
 
 
-def ours(work: Work) -> Timed:
-    """The decoder; the first pass reads the prompt."""
-    marks = [time.perf_counter()]
+class TimedContinuation(CachedContinuation):
+    """Knows when the prompt had been read."""
 
-    def next_logits(symbol_BK: Tensor, first_B: Tensor) -> Tensor:
-        logits = model(symbol_BK, first_B)
-        if len(marks) == 1:
-            marks.append(time.perf_counter())
+    prompt_read_s = 0.0
+
+    def __call__(self, symbol_BK: Tensor, first_B: Tensor) -> Tensor:
+        logits = super().__call__(symbol_BK, first_B)
+        self.prompt_read_s = self.prompt_read_s or time.perf_counter()
         return logits
 
-    model = CachedContinuation(
-        work.backbone, work.embeds, work.written, work.symbol_ids, work.grammar.max_symbols(work.stop_after)
-    )
+
+def ours(work: Work) -> Timed:
+    """The decoder; the first pass reads the prompt."""
+    started = time.perf_counter()
+    max_symbols = work.grammar.max_symbols(work.stop_after)
+    model = TimedContinuation(work.backbone, work.embeds, work.written, work.symbol_ids, max_symbols)
     decoded = decode_numbers(
-        next_logits,
-        work.grammar,
-        work.guess,
-        batch_size=len(work.embeds),
-        stop_after=work.stop_after,
+        model, work.grammar, work.guess, batch_size=len(work.embeds), stop_after=work.stop_after
     )
-    started, prompt_read = marks
     return Timed(
-        decoded.numbers, prompt_read - started, time.perf_counter() - prompt_read, decoded.num_passes
+        decoded.numbers,
+        model.prompt_read_s - started,
+        time.perf_counter() - model.prompt_read_s,
+        decoded.num_passes,
     )
 
 

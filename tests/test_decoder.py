@@ -6,10 +6,11 @@ from torch import Tensor
 
 from lerobot_bomb.actions.text import END, NUM_SYMBOLS, SPACE, SYMBOL_TEXTS
 from lerobot_bomb.decoding.decoder import (
+    FIRST_GUESSES,
     MAX_GUESSES,
+    Continuation,
     Decoded,
     Guess,
-    NextLogits,
     decode_numbers,
     pick,
     read_answer,
@@ -18,40 +19,49 @@ from lerobot_bomb.decoding.draft import KnownSymbols, LinearDraft
 from lerobot_bomb.decoding.grammar import NumberGrammar, Place
 
 
-def speaker(*texts: str) -> NextLogits:
+class Speaker(Continuation):
     """A model that wants to say ``texts``, one per row, whatever it is fed."""
-    wishes = torch.full((len(texts), max(map(len, texts))), END)
-    for row, text in enumerate(texts):
-        symbols = [END if character == "#" else SYMBOL_TEXTS.index(character) for character in text]
-        wishes[row, : len(text)] = torch.tensor(symbols)
 
-    def next_logits(symbol_BK: Tensor, first_B: Tensor) -> Tensor:
+    def __init__(self, *texts: str):
+        self.wishes = torch.full((len(texts), max(map(len, texts))), END)
+        self.batch_sizes: list[int] = []
+        for row, text in enumerate(texts):
+            symbols = [END if character == "#" else SYMBOL_TEXTS.index(character) for character in text]
+            self.wishes[row, : len(text)] = torch.tensor(symbols)
+
+    def __call__(self, symbol_BK: Tensor, first_B: Tensor) -> Tensor:
+        self.batch_sizes.append(len(symbol_BK))
         columns_BK = first_B[:, None] + 1 + torch.arange(symbol_BK.shape[1])
-        wanted_BK = wishes.gather(1, columns_BK.clamp(max=wishes.shape[1] - 1))
+        wanted_BK = self.wishes.gather(1, columns_BK.clamp(max=self.wishes.shape[1] - 1))
         return torch.nn.functional.one_hot(wanted_BK, NUM_SYMBOLS).float()
 
-    return next_logits
+    def keep(self, row_B: Tensor) -> None:
+        self.wishes = self.wishes[row_B]
 
 
-def random_model(seed: int) -> NextLogits:
+class RandomModel(Continuation):
     """Logits that depend on all symbols before, a small causal network of fixed random numbers."""
-    generator = torch.Generator().manual_seed(seed)
-    table = torch.randn(2000, NUM_SYMBOLS, NUM_SYMBOLS, generator=generator)
-    history: dict[tuple[int, int], int] = {}
 
-    def next_logits(symbol_BK: Tensor, first_B: Tensor) -> Tensor:
-        rows = []
-        for row, (symbols, first) in enumerate(zip(symbol_BK.tolist(), first_B.tolist(), strict=True)):
+    def __init__(self, seed: int, batch_size: int):
+        generator = torch.Generator().manual_seed(seed)
+        self.table = torch.randn(2000, NUM_SYMBOLS, NUM_SYMBOLS, generator=generator)
+        self.history: dict[tuple[int, int], int] = {}
+        self.rows = list(range(batch_size))
+
+    def __call__(self, symbol_BK: Tensor, first_B: Tensor) -> Tensor:
+        logits = []
+        for row, symbols, first in zip(self.rows, symbol_BK.tolist(), first_B.tolist(), strict=True):
             for column, symbol in enumerate(symbols, first):
-                before = history.get((row, column - 1), row)
-                history[row, column] = (before * 31 + symbol * 7 + column) % len(table)
-                rows.append(table[history[row, column], symbol])
-        return torch.stack(rows).view(*symbol_BK.shape, NUM_SYMBOLS)
+                before = self.history.get((row, column - 1), row)
+                self.history[row, column] = (before * 31 + symbol * 7 + column) % len(self.table)
+                logits.append(self.table[self.history[row, column], symbol])
+        return torch.stack(logits).view(*symbol_BK.shape, NUM_SYMBOLS)
 
-    return next_logits
+    def keep(self, row_B: Tensor) -> None:
+        self.rows = [self.rows[row] for row in row_B]
 
 
-def one_by_one(model: NextLogits, grammar: NumberGrammar, batch_size: int) -> list[list[int]]:
+def one_by_one(model: Continuation, grammar: NumberGrammar, batch_size: int) -> list[list[int]]:
     """Plain greedy decoding, one row and one symbol at a time."""
     answers = []
     for row in range(batch_size):
@@ -67,7 +77,7 @@ def one_by_one(model: NextLogits, grammar: NumberGrammar, batch_size: int) -> li
 
 
 def decode(
-    model: NextLogits,
+    model: Continuation,
     grammar: NumberGrammar,
     batch_size: int,
     *,
@@ -84,27 +94,57 @@ def decode(
 
 
 def test_what_the_model_says_is_read() -> None:
-    decoded = decode(speaker(" 5 0 511#", " 42 77 100#"), NumberGrammar(512, 3), 2)
+    decoded = decode(Speaker(" 5 0 511#", " 42 77 100#"), NumberGrammar(512, 3), 2)
     assert decoded.numbers.tolist() == [[5, 0, 511], [42, 77, 100]]
 
 
 def test_rows_that_finish_at_different_passes_do_not_disturb_each_other() -> None:
     texts = [" 1 2#", " 400 500#", " 9 311#"]
-    together = decode(speaker(*texts), NumberGrammar(512, 2), 3).numbers
+    together = decode(Speaker(*texts), NumberGrammar(512, 2), 3).numbers
     assert together.tolist() == [[1, 2], [400, 500], [9, 311]]
     for row, text in enumerate(texts):
-        assert torch.equal(decode(speaker(text), NumberGrammar(512, 2), 1).numbers[0], together[row])
+        assert torch.equal(decode(Speaker(text), NumberGrammar(512, 2), 1).numbers[0], together[row])
+
+
+def test_rows_that_are_done_leave_the_batch() -> None:
+    grammar = NumberGrammar(10_000, 2)
+    texts = [" 1 2#", " 1 30#", " 1 40#", " 1 50#", " 1 6000#", " 1 7000#", " 1 8000#", " 1 9001#"]
+    model = Speaker(*texts)
+    decoded = decode(model, grammar, 8)
+    assert decoded.numbers.tolist() == [[int(part) for part in text[:-1].split()] for text in texts]
+    # a symbol a pass
+    assert model.batch_sizes == [8, 8, 8, 8, 7, 4]
+
+
+def test_as_many_guesses_are_asked_for_as_come_true() -> None:
+    grammar = NumberGrammar(10, 40)
+    asked: list[int] = []
+
+    class Ear(Speaker):
+        def __call__(self, symbol_BK: Tensor, first_B: Tensor) -> Tensor:
+            asked.append(symbol_BK.shape[1] - 1)
+            return super().__call__(symbol_BK, first_B)
+
+    def guess(_: Tensor, place: Place) -> Tensor:
+        """Right up to the 20th number; the space and a 7 in turn."""
+        after_digit_B1 = place.prefix[:, None] != grammar.START
+        guess_BG = torch.where((torch.arange(MAX_GUESSES) % 2 == 0) == after_digit_B1, SPACE, 7)
+        return torch.where(place.number[:, None] < 20, guess_BG, 3)
+
+    decode(Ear(" 7" * 40 + "#"), grammar, 1, guess=guess)
+    assert asked[:4] == [FIRST_GUESSES, 9, MAX_GUESSES, MAX_GUESSES]
+    assert set(asked[5:]) == {1}
 
 
 def test_stopping_early_gives_the_first_numbers() -> None:
-    decoded = decode(speaker(" 5 17 511 3#"), NumberGrammar(512, 4), 1, stop_after=2)
+    decoded = decode(Speaker(" 5 17 511 3#"), NumberGrammar(512, 4), 1, stop_after=2)
     assert decoded.numbers.tolist() == [[5, 17]]
     assert decoded.num_passes == 5  # 17 may go on to 170
 
 
 def test_malformed_wishes_become_legal_numbers() -> None:
     """It wants an early end, a leading zero and 600 of 512."""
-    numbers = decode(speaker("# 07 600#"), NumberGrammar(512, 3), 1).numbers
+    numbers = decode(Speaker("# 07 600#"), NumberGrammar(512, 3), 1).numbers
     # a refused wish is one for any: the first symbol that is allowed
     assert numbers.tolist() == [[0, 7, 60]]
 
@@ -121,7 +161,7 @@ def test_symbols_that_cannot_be_otherwise_take_no_pass() -> None:
     grammar = NumberGrammar(512, 4, fixed_width=3)
     text = " 007 511 100 042#"
     assert grammar.max_symbols(4) == len(text)
-    decoded = decode(speaker(text), grammar, 1)
+    decoded = decode(Speaker(text), grammar, 1)
     assert decoded.numbers.tolist() == [[7, 511, 100, 42]]
     assert decoded.num_passes == 12
 
@@ -133,8 +173,8 @@ def test_what_goes_on_as_before_takes_few_passes(text: str, num_values: int, wid
     """Two dimensions: the first two steps are written symbol by symbol, the others are guessed."""
     grammar = NumberGrammar(num_values, 8, fixed_width=width)
     first_steps = " ".join(text[:-1].split(" ")[:5])
-    undrafted = decode(speaker(text), NumberGrammar(num_values, 8, fixed_width=width), 1, stop_after=4)
-    drafted = decode(speaker(text), grammar, 1, guess=LinearDraft(grammar, 2))
+    undrafted = decode(Speaker(text), NumberGrammar(num_values, 8, fixed_width=width), 1, stop_after=4)
+    drafted = decode(Speaker(text), grammar, 1, guess=LinearDraft(grammar, 2))
     assert drafted.numbers.tolist() == [[int(part) for part in text[:-1].split()]]
     rest = len(text) - len(first_steps) - 1
     assert drafted.num_passes <= undrafted.num_passes + -(-rest // MAX_GUESSES)
@@ -165,10 +205,10 @@ def test_it_writes_what_greedy_decoding_writes(
     num_values, zero_padded = form
     width = len(str(num_values - 1)) if zero_padded else 0
     grammar = NumberGrammar(num_values, num_steps * num_dims, fixed_width=width)
-    greedy = torch.tensor(one_by_one(random_model(seed), grammar, batch_size))
+    greedy = torch.tensor(one_by_one(RandomModel(seed, batch_size), grammar, batch_size))
     guess = LinearDraft(grammar, num_dims) if drafted else KnownSymbols(grammar)
     stop_after = min(stop, num_steps) * num_dims
-    decoded = decode(random_model(seed), grammar, batch_size, guess=guess, stop_after=stop_after)
+    decoded = decode(RandomModel(seed, batch_size), grammar, batch_size, guess=guess, stop_after=stop_after)
     assert torch.equal(decoded.numbers, greedy[:, :stop_after])
 
 
@@ -181,8 +221,8 @@ def test_no_guess_changes_what_is_written(wrong: int, seed: int) -> None:
     def random_guess(_: Tensor, place: Place) -> Tensor:
         return torch.randint(NUM_SYMBOLS, (len(place.number), MAX_GUESSES), generator=generator)
 
-    greedy = one_by_one(random_model(seed), grammar, 3)
-    assert decode(random_model(seed), grammar, 3, guess=random_guess).numbers.tolist() == greedy
+    greedy = one_by_one(RandomModel(seed, 3), grammar, 3)
+    assert decode(RandomModel(seed, 3), grammar, 3, guess=random_guess).numbers.tolist() == greedy
 
 
 @pytest.mark.parametrize("drafted", [False, True])
@@ -190,12 +230,13 @@ def test_a_device_that_is_seldom_asked_writes_the_same(
     monkeypatch: pytest.MonkeyPatch, drafted: bool
 ) -> None:
     """Rows go on beyond their end until somebody looks, as on a GPU."""
-    monkeypatch.setattr("lerobot_bomb.decoding.decoder.PASSES_ON_HOST", 8)
+    for module in ("decoder", "draft"):
+        monkeypatch.setattr(f"lerobot_bomb.decoding.{module}.on_host", lambda _: False)
     for seed, (num_numbers, stop) in enumerate([(1, 1), (2, 1), (6, 2), (6, 6)]):
         grammar = NumberGrammar(512, num_numbers)
-        greedy = torch.tensor(one_by_one(random_model(seed), grammar, 3))
+        greedy = torch.tensor(one_by_one(RandomModel(seed, 3), grammar, 3))
         guess = LinearDraft(grammar, 1) if drafted else KnownSymbols(grammar)
-        decoded = decode(random_model(seed), grammar, 3, guess=guess, stop_after=stop)
+        decoded = decode(RandomModel(seed, 3), grammar, 3, guess=guess, stop_after=stop)
         assert decoded.num_passes % 8 == 0
         assert torch.equal(decoded.numbers, greedy[:, :stop])
 

@@ -1,18 +1,21 @@
 """The decoder on a model, against the model's own full passes and transformers' `generate`."""
 
 import copy
+from pathlib import Path
 from typing import Any
 
 import pytest
 import torch
 from torch import Tensor
-from transformers import LogitsProcessor
+from transformers import AutoTokenizer, LogitsProcessor
 
 from lerobot_bomb.actions.text import END, NUM_SYMBOLS, SPACE, SYMBOL_TEXTS, TokenRows
 from lerobot_bomb.decoding.decoder import CachedContinuation, decode_numbers
 from lerobot_bomb.decoding.draft import KnownSymbols, LinearDraft
 from lerobot_bomb.decoding.grammar import NumberGrammar
-from lerobot_bomb.vlm.backbone import SmolVLMBackbone, load_backbone
+from lerobot_bomb.vlm.backbone import SmolVLMBackbone, build_backbone, load_backbone
+from lerobot_bomb.vlm.presets import nano_config
+from lerobot_bomb.vlm.tokenizer import NANO, load_tokenizer
 
 SYMBOL_IDS = torch.arange(20, 20 + NUM_SYMBOLS)
 
@@ -29,10 +32,23 @@ def prompts(backbone: SmolVLMBackbone, seed: int, lengths: list[int]) -> TokenRo
     return TokenRows(ids, torch.arange(max(lengths)) < torch.tensor(lengths)[:, None])
 
 
-def continuation(backbone: SmolVLMBackbone, rows: TokenRows, max_symbols: int) -> CachedContinuation:
+def continuation(
+    backbone: SmolVLMBackbone, rows: TokenRows, max_symbols: int, symbol_ids: Tensor = SYMBOL_IDS
+) -> CachedContinuation:
     return CachedContinuation(
-        backbone, backbone.embed_tokens(rows.ids), rows.written, SYMBOL_IDS, max_symbols
+        backbone, backbone.embed_tokens(rows.ids), rows.written, symbol_ids, max_symbols
     )
+
+
+def vocabulary(shared_data: Path, name: str) -> tuple[SmolVLMBackbone, Tensor]:
+    """A nano backbone with the vocabulary of a real tokenizer, and the ids of the symbols in it."""
+    tokenizer: Any = AutoTokenizer.from_pretrained(str(shared_data / name))
+    ids = [tokenizer.convert_tokens_to_ids(tokenizer.tokenize(text)) for text in SYMBOL_TEXTS[:END]]
+    symbol_ids = torch.tensor([*ids, [tokenizer.eos_token_id]])[:, 0]
+    config = nano_config(load_tokenizer(NANO))
+    config["text_config"]["vocab_size"] = len(tokenizer)
+    torch.manual_seed(0)
+    return build_backbone(config).eval(), symbol_ids
 
 
 @torch.no_grad()
@@ -92,18 +108,23 @@ def test_adapters_count(backbone: SmolVLMBackbone) -> None:
     assert not torch.allclose(cached, continuation(backbone, rows, 9)(said, torch.tensor([0]))[0])
 
 
+def spelled(symbols: list[int]) -> str:
+    return "".join("#" if symbol == END else SYMBOL_TEXTS[symbol] for symbol in symbols)
+
+
 class GrammarProcessor(LogitsProcessor):
     """The grammar for transformers' `generate`, told by a regular expression's worth of Python."""
 
-    def __init__(self, num_values: int, num_numbers: int, prompt_length: int):
+    def __init__(self, num_values: int, num_numbers: int, prompt_length: int, symbol_ids: Tensor):
         self.num_values, self.num_numbers, self.prompt_length = num_values, num_numbers, prompt_length
+        self.ids = symbol_ids.tolist()
 
     def __call__(self, input_ids: Tensor, scores: Tensor) -> Tensor:  # pyright: ignore[reportIncompatibleMethodOverride]
         masked = torch.full_like(scores, -torch.inf)
         for row, ids in enumerate(input_ids[:, self.prompt_length :].tolist()):
-            text = "".join(SYMBOL_TEXTS[token - 20] if token != 20 + END else "#" for token in ids)
+            text = spelled([self.ids.index(token) for token in ids])
             for symbol in self.choices(text):
-                masked[row, 20 + symbol] = scores[row, 20 + symbol]
+                masked[row, self.ids[symbol]] = scores[row, self.ids[symbol]]
         return masked
 
     def choices(self, text: str) -> list[int]:
@@ -116,37 +137,60 @@ class GrammarProcessor(LogitsProcessor):
         return [*more, SPACE if text.count(" ") + 1 < self.num_numbers else END]
 
 
+def generated(backbone: SmolVLMBackbone, rows: TokenRows, symbol_ids: Tensor) -> list[list[int]]:
+    """What transformers' own greedy search writes with its own cache, left-padded: 12 numbers below 512."""
+    lengths = rows.written.sum(dim=1).tolist()
+    longest = max(lengths) + 1
+    ids = torch.zeros(len(lengths), longest, dtype=torch.long)
+    mask = torch.zeros_like(ids)
+    for row, length in enumerate(lengths):
+        ids[row, -length - 1 :] = torch.cat([rows.ids[row, :length], symbol_ids[SPACE : SPACE + 1]])
+        mask[row, -length - 1 :] = 1
+    model: Any = backbone.vlm
+    end_id = int(symbol_ids[END])
+    written = model.generate(
+        input_ids=ids,
+        attention_mask=mask,
+        max_new_tokens=12 * 4,
+        do_sample=False,
+        logits_processor=[GrammarProcessor(512, 12, longest, symbol_ids)],
+        eos_token_id=end_id,
+        pad_token_id=end_id,
+    )
+    symbols_BA = (written[:, longest:, None] == symbol_ids).long().argmax(dim=-1)
+    texts = [spelled(symbols).rstrip("#") for symbols in symbols_BA.tolist()]
+    return [[int(part) for part in text.split()] for text in texts]
+
+
+def ours(backbone: SmolVLMBackbone, rows: TokenRows, symbol_ids: Tensor, *, drafted: bool) -> list[list[int]]:
+    grammar = NumberGrammar(512, 12)
+    guess = LinearDraft(grammar, 3) if drafted else KnownSymbols(grammar)
+    model = continuation(backbone, rows, grammar.max_symbols(12), symbol_ids)
+    return decode_numbers(model, grammar, guess, batch_size=len(rows.ids), stop_after=12).numbers.tolist()
+
+
+LENGTHS = [30, 24, 17, 30, 5, 12, 29, 30]
+
+
 @torch.no_grad()
-@pytest.mark.parametrize("lengths", [[30], [30, 24, 17, 30, 5, 12, 29, 30]])
+@pytest.mark.parametrize("lengths", [[30], LENGTHS])
 @pytest.mark.parametrize("drafted", [False, True])
 def test_it_writes_what_generate_writes(backbone: SmolVLMBackbone, lengths: list[int], drafted: bool) -> None:
-    """transformers' own greedy search with its own cache, left-padded, under the same language."""
-    grammar, batch_size = NumberGrammar(512, 12), len(lengths)
     for seed in range(4):
         rows = prompts(backbone, seed, lengths)
-        guess = LinearDraft(grammar, 3) if drafted else KnownSymbols(grammar)
-        model = continuation(backbone, rows, grammar.max_symbols(12))
-        ours = decode_numbers(model, grammar, guess, batch_size=batch_size, stop_after=12).numbers
-        longest = max(lengths) + 1
-        ids = torch.zeros(batch_size, longest, dtype=torch.long)
-        mask = torch.zeros_like(ids)
-        for row, length in enumerate(lengths):
-            ids[row, -length - 1 :] = torch.cat([rows.ids[row, :length], SYMBOL_IDS[SPACE : SPACE + 1]])
-            mask[row, -length - 1 :] = 1
-        model_of_peer: Any = backbone.vlm
-        written = model_of_peer.generate(
-            input_ids=ids,
-            attention_mask=mask,
-            max_new_tokens=grammar.max_symbols(12),
-            do_sample=False,
-            logits_processor=[GrammarProcessor(512, 12, longest)],
-            eos_token_id=20 + END,
-            pad_token_id=20 + END,
-        )
-        for row in range(batch_size):
-            symbols = (written[row, longest:] - 20).tolist()
-            text = "".join(SYMBOL_TEXTS[symbol] for symbol in symbols if symbol != END)
-            assert ours[row].tolist() == [int(part) for part in text.split()]
+        assert ours(backbone, rows, SYMBOL_IDS, drafted=drafted) == generated(backbone, rows, SYMBOL_IDS)
+
+
+@torch.no_grad()
+@pytest.mark.parametrize("name", ["SmolVLM2-500M-Video-Instruct", "qwen2_5_vl"])
+def test_it_does_so_in_real_vocabularies(shared_data: Path, name: str) -> None:
+    backbone, symbol_ids = vocabulary(shared_data, name)
+    assert len(set(symbol_ids.tolist())) == NUM_SYMBOLS
+    for seed, lengths in enumerate([[30], LENGTHS]):
+        rows = prompts(backbone, seed, lengths)
+        expected = generated(backbone, rows, symbol_ids)
+        assert ours(backbone, rows, symbol_ids, drafted=True) == expected
+        assert ours(backbone, rows, symbol_ids, drafted=False) == expected
 
 
 def test_an_answer_longer_than_the_models_positions_is_refused(backbone: SmolVLMBackbone) -> None:

@@ -3,7 +3,7 @@
 A pass reads the symbol chosen last and some that are guessed to follow it, and gives the greedy choice after
 each. As far as the guesses are these choices they are right, and so is the first choice that differs from its
 guess: what is written is what one symbol a pass would write (speculative decoding, arXiv 2211.17192, for
-greedy choices).
+greedy choices). Rows get on differently far in a pass, and leave the batch when they are done.
 
 Shapes: `B` batch, `S` symbols, `A` columns of a row of symbols (the longest answer's and some to spare), `N`
 numbers, `G` guesses, `K` = 1 + G.
@@ -11,6 +11,7 @@ numbers, `G` guesses, `K` = 1 + G.
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from typing import Protocol
 
 import torch
 from torch import Tensor
@@ -18,17 +19,29 @@ from torch import Tensor
 from lerobot_bomb.actions.text import END, SPACE
 from lerobot_bomb.decoding.grammar import NumberGrammar, Place
 from lerobot_bomb.vlm.backbone import SmolVLMBackbone
-from lerobot_bomb.vlm.cached_llama import CachedLlama
+from lerobot_bomb.vlm.cached_llama import CachedLlama, on_host
 
-# (B, K) symbols, (B,) the column of each row's first in its answer -> (B, K, S) logits of the symbols after
-NextLogits = Callable[[Tensor, Tensor], Tensor]
 # (B, A) symbols written, END beyond, and where each row stands -> (B, G) guesses of what comes next, at most
 # MAX_GUESSES
 Guess = Callable[[Tensor, Place], Tensor]
 
-MAX_GUESSES = 8
-# between two looks at whether all rows are done; a device works while the host runs ahead
-PASSES_ON_HOST, PASSES_ON_DEVICE = 1, 8
+MAX_GUESSES = 16
+# where the host looks at every pass: how many are asked for in the first, which also reads the prompt
+FIRST_GUESSES = 4
+# between two looks at which rows are done; a device works while the host runs ahead
+PASSES_ON_DEVICE = 8
+
+
+class Continuation(Protocol):
+    """A model that goes on with rows of symbols."""
+
+    def __call__(self, symbol_BK: Tensor, first_B: Tensor) -> Tensor:
+        """(B, K) symbols, (B,) column of each row's first in its answer -> (B, K, S) logits after each."""
+        ...
+
+    def keep(self, row_B: Tensor) -> None:
+        """Only these rows are gone on with, in this order."""
+        ...
 
 
 @dataclass(frozen=True)
@@ -39,7 +52,7 @@ class Decoded:
     num_passes: int
 
 
-class CachedContinuation:
+class CachedContinuation(Continuation):
     """Symbol logits of a backbone: the prompt is read in the first pass, then only new symbols."""
 
     def __init__(
@@ -71,6 +84,10 @@ class CachedContinuation:
             self._prompt = None
         return self._head(self._text(embeds, columns)[:, -num_symbols:])
 
+    def keep(self, row_B: Tensor) -> None:
+        self._length_B1 = self._length_B1[row_B]
+        self._text.keep(row_B)
+
 
 def pick(logits: Tensor, penalty: Tensor) -> Tensor:
     """(..., S) -> (...) the likeliest allowed symbol; one is taken even from logits of -inf or NaN."""
@@ -80,12 +97,12 @@ def pick(logits: Tensor, penalty: Tensor) -> Tensor:
 
 @torch.no_grad()
 def decode_numbers(
-    next_logits: NextLogits, grammar: NumberGrammar, guess: Guess, *, batch_size: int, stop_after: int
+    model: Continuation, grammar: NumberGrammar, guess: Guess, *, batch_size: int, stop_after: int
 ) -> Decoded:
     """The first ``stop_after`` greedily written numbers of each row.
 
-    Only what the grammar allows is ever chosen, so every row is well-formed by construction. Rows get on
-    differently far in a pass; what one writes after it is done is ignored.
+    Only what the grammar allows is ever chosen, so every row is well-formed by construction. What a row
+    writes after it is done is ignored.
     """
 
     def is_done(place: Place) -> Tensor:
@@ -93,17 +110,19 @@ def decode_numbers(
         return complete_B | (place.number >= stop_after) | (place.prefix == grammar.DONE)
 
     place, max_symbols = grammar.start(batch_size), grammar.max_symbols(grammar.num_numbers)
+    row_B = torch.arange(batch_size, device=place.prefix.device)
+    numbers = place.prefix.new_empty(batch_size, stop_after)
     symbols_BA = place.prefix.new_full((batch_size, max_symbols + MAX_GUESSES + 1), END)
     symbols_BA[:, 0] = SPACE
     num_written_B = torch.ones_like(place.prefix)
     columns_A = torch.arange(symbols_BA.shape[1], device=symbols_BA.device)
-    passes_between_checks = PASSES_ON_HOST if symbols_BA.device.type == "cpu" else PASSES_ON_DEVICE
-    num_passes = 0
+    looks_at_every_pass = on_host(symbols_BA)
+    num_passes, num_guesses = 0, FIRST_GUESSES if looks_at_every_pass else MAX_GUESSES
     while True:
-        guess_BG = guess(symbols_BA, place)
+        guess_BG = guess(symbols_BA, place)[:, :num_guesses]
         columns_BK = num_written_B[:, None] + columns_A[: guess_BG.shape[1] + 1]
         last_B1 = symbols_BA.gather(1, columns_BK[:, :1] - 1)
-        logits_BKS = next_logits(torch.cat([last_B1, guess_BG], dim=1), num_written_B - 1)
+        logits_BKS = model(torch.cat([last_B1, guess_BG], dim=1), num_written_B - 1)
         num_passes += 1
         places_BK = grammar.walk(place, guess_BG)
         picks_BK = pick(logits_BKS, grammar.penalties(places_BK))
@@ -113,8 +132,19 @@ def decode_numbers(
         symbols_BA.scatter_(1, columns_BK, picks_BK)
         # what follows a wrong guess is not written
         symbols_BA.masked_fill_(columns_A >= num_written_B[:, None], END)
-        if num_passes % passes_between_checks == 0 and bool(is_done(place).all()):
-            return Decoded(read_answer(symbols_BA, stop_after), num_passes)
+        if looks_at_every_pass:  # wrong guesses cost time there: twice as many as were right, and one
+            num_guesses = min(MAX_GUESSES, 1 + round(2 * float(num_right_B.float().mean())))
+        elif num_passes % PASSES_ON_DEVICE:
+            continue
+        kept_B = (~is_done(place)).nonzero()[:, 0]
+        if len(kept_B) == len(row_B):
+            continue
+        numbers[row_B] = read_answer(symbols_BA, stop_after)
+        if not len(kept_B):
+            return Decoded(numbers, num_passes)
+        model.keep(kept_B)
+        row_B, place, num_written_B = row_B[kept_B], place.keep(kept_B), num_written_B[kept_B]
+        symbols_BA = symbols_BA[kept_B]
 
 
 def read_answer(symbol_BA: Tensor, num_numbers: int) -> Tensor:

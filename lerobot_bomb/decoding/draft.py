@@ -1,7 +1,7 @@
 """Guesses of what an answer goes on with; right or wrong, they change only how many passes it takes.
 
-Shapes: `B` batch, `A` columns of a row of symbols, `N` numbers, `C` columns a number may take, `M` = N * C,
-`G` guesses.
+Shapes: `B` batch, `A` columns of a row of symbols, `N` numbers, `W` those that guesses can reach, `C` columns
+a number may take, `M` = (1 + W) * C, `G` guesses.
 """
 
 import torch
@@ -10,6 +10,7 @@ from torch import Tensor
 from lerobot_bomb.actions.text import END, SPACE, digits_of, number_symbols
 from lerobot_bomb.decoding.decoder import MAX_GUESSES, read_answer
 from lerobot_bomb.decoding.grammar import NumberGrammar, Place
+from lerobot_bomb.vlm.cached_llama import on_host
 
 
 class KnownSymbols:
@@ -21,7 +22,7 @@ class KnownSymbols:
     def __call__(self, _: Tensor, place: Place) -> Tensor:
         """(B, G), without any guess where the host sees that no row's number has to end."""
         must_end_B = self._grammar.must_end[place.prefix]
-        if must_end_B.device.type == "cpu" and not bool(must_end_B.any()):
+        if on_host(must_end_B) and not bool(must_end_B.any()):
             return place.prefix.new_empty(len(place.prefix), 0)
         return torch.where(self._grammar.is_last(place), END, SPACE)[:, None]
 
@@ -34,16 +35,21 @@ class LinearDraft:
 
     def __call__(self, symbol_BA: Tensor, place: Place) -> Tensor:
         """(B, G) guesses."""
-        number_BN = read_answer(symbol_BA, self._grammar.num_numbers)
-        begun_BN = number_BN.scatter(1, place.number[:, None], self._complete(number_BN, place)[:, None])
-        number_BN = self._extrapolate(begun_BN, place.number + 1)
-        symbols_BNC, written_BNC = number_symbols(
-            number_BN, self._grammar.width, zero_padded=self._grammar.fixed_width > 0
+        grammar, first_B1 = self._grammar, place.number[:, None]
+        number_BN = read_answer(symbol_BA, grammar.num_numbers)
+        begun_B1 = self._complete(number_BN, place)[:, None]
+        known_BN = number_BN.scatter(1, first_B1, begun_B1)
+        # every number takes two symbols or more
+        ahead_W = torch.arange(MAX_GUESSES // 2, device=number_BN.device)
+        next_BW = self._expect(known_BN, first_B1 + 1 + ahead_W % self._num_dims, ahead_W // self._num_dims)
+        symbols_BWC, written_BWC = number_symbols(
+            torch.cat([begun_B1, next_BW], dim=1), grammar.width, zero_padded=grammar.fixed_width > 0
         )
-        before_BN = torch.arange(number_BN.shape[1], device=number_BN.device) < place.number[:, None]
-        next_B = (written_BNC.sum(dim=2) * before_BN).sum(dim=1) + 1 + self._grammar.num_digits[place.prefix]
-        columns_BG = next_B[:, None] + torch.arange(MAX_GUESSES, device=next_B.device)
-        return self._spell(symbols_BNC.flatten(1), written_BNC.flatten(1)).gather(1, columns_BG)
+        written_BWC[:, 1:] &= (first_B1 + 1 + ahead_W < grammar.num_numbers)[..., None]
+        # the space and the digits that stand are no guesses
+        start_B1 = 1 + grammar.num_digits[place.prefix][:, None]
+        columns_BG = start_B1 + torch.arange(MAX_GUESSES, device=number_BN.device)
+        return self._spell(symbols_BWC.flatten(1), written_BWC.flatten(1)).gather(1, columns_BG)
 
     def _spell(self, symbol_BM: Tensor, written_BM: Tensor) -> Tensor:
         """Written symbols without the gaps between them, then ends; no row's length has to be known."""
@@ -66,16 +72,6 @@ class LinearDraft:
         goes_on_B = (low_B < grammar.num_values) & ~grammar.must_end[place.prefix]
         nearest_B = torch.where(goes_on_B, expected_B.clamp(low_B, high_B), value_B)
         return torch.where(num_digits_B > 0, nearest_B, expected_B)
-
-    def _extrapolate(self, number_BN: Tensor, num_known_B: Tensor) -> Tensor:
-        """(B, N) numbers as far as they are known, then as the lines go on."""
-        num_dims = self._num_dims
-        index_N = torch.arange(number_BN.shape[1], device=number_BN.device)
-        # the first number of the same dimension that is not known: (B, N)
-        unknown_BN = num_known_B[:, None] + (index_N - num_known_B[:, None]) % num_dims
-        steps_BN = (index_N - unknown_BN) // num_dims
-        expected_BN = self._expect(number_BN, unknown_BN, steps_BN.clamp(min=0))
-        return torch.where(steps_BN >= 0, expected_BN, number_BN)
 
     def _expect(self, number_BN: Tensor, index_BX: Tensor, steps: Tensor | int) -> Tensor:
         """(B, X) the number ``steps`` after an unknown one, on the line through the two steps before that.

@@ -24,6 +24,10 @@ class Place:
         index_B1 = index_B[:, None]
         return Place(self.prefix.gather(1, index_B1)[:, 0], self.number.gather(1, index_B1)[:, 0])
 
+    def keep(self, row_B: Tensor) -> "Place":
+        """Those of these rows."""
+        return Place(self.prefix[row_B], self.number[row_B])
+
 
 class NumberGrammar(nn.Module):
     """Transition tables of answers of ``num_numbers`` numbers.
@@ -104,13 +108,11 @@ class NumberGrammar(nn.Module):
 
     def walk(self, place: Place, symbol_BG: Tensor) -> Place:
         """(B,) -> (B, 1 + G) places: this one and those after each of the symbols."""
-        places = [place]
+        prefixes = [place.prefix]
         for symbol_B in symbol_BG.unbind(dim=1):
-            places.append(self.advance(places[-1], symbol_B))
-        return Place(
-            torch.stack([place.prefix for place in places], 1),
-            torch.stack([place.number for place in places], 1),
-        )
+            prefixes.append(self.next_state[prefixes[-1], symbol_B])
+        num_spaces_BK = nn.functional.pad((symbol_BG == SPACE).cumsum(dim=1), (1, 0))
+        return Place(torch.stack(prefixes, dim=1), place.number[:, None] + num_spaces_BK)
 
     def is_last(self, place: Place) -> Tensor:
         """Whether the number is the answer's last, which the end follows instead of a space."""
