@@ -3,6 +3,7 @@
 Shapes: `B` images, `H` and `W` their sides, `S` side of the model's input, all in pixels.
 """
 
+from dataclasses import dataclass
 from functools import lru_cache
 
 import torch
@@ -11,27 +12,50 @@ from torch import Tensor
 LANCZOS_LOBES = 3
 
 
+@dataclass(frozen=True)
+class CropWindows:
+    """Where each picture of a batch is cut, in its pixels; all windows are equally large."""
+
+    offsets: Tensor  # (B, 2) integers: first line and first column of each window
+    height: int
+    width: int
+
+    def cut(self, images_BxHW: Tensor) -> Tensor:
+        """(B, ..., H, W) -> (B, ..., height, width): pictures, or what lies on the same pixels, as depth."""
+        offsets = self.offsets.tolist()
+        return torch.stack(
+            [
+                image[..., top : top + self.height, left : left + self.width]
+                for image, (top, left) in zip(images_BxHW, offsets, strict=True)
+            ]
+        )
+
+
+def draw_windows(images_BxHW: Tensor, crop_fraction: float, generator: torch.Generator | None) -> CropWindows:
+    """Windows of ``crop_fraction`` of either side of (B, ..., H, W) pictures.
+
+    Each at a place of its own drawn from ``generator``, or at the centre where that is None.
+    """
+    height, width = images_BxHW.shape[-2:]
+    crop_height, crop_width = max(1, round(height * crop_fraction)), max(1, round(width * crop_fraction))
+    room = torch.tensor([height - crop_height, width - crop_width])
+    if generator is None:
+        offsets_B2 = (room // 2).expand(len(images_BxHW), 2)
+    else:
+        offsets_B2 = (torch.rand(len(images_BxHW), 2, generator=generator) * (room + 1)).long()
+    return CropWindows(offsets_B2, crop_height, crop_width)
+
+
 def crop_and_resize(
     images_B3HW: Tensor, crop_fraction: float, size: int, generator: torch.Generator | None
 ) -> Tensor:
     """(B, 3, H, W) in [0, 1] -> (B, 3, size, size) in [-1, 1].
 
-    Cuts a window of ``crop_fraction`` of either side, at a place of its own for every image drawn from
-    ``generator``, or at the centre where that is None. The window is resized as SmolVLM's own processor
-    does it with ``do_resize=False, do_image_splitting=False``; see `resize`.
+    Cuts the windows of `draw_windows`, and resizes them as SmolVLM's own processor does it with
+    ``do_resize=False, do_image_splitting=False``; see `resize`.
     """
-    batch_size, _, height, width = images_B3HW.shape
-    crop_height, crop_width = max(1, round(height * crop_fraction)), max(1, round(width * crop_fraction))
-    room = torch.tensor([height - crop_height, width - crop_width])
-    if generator is None:
-        offsets_B2 = (room // 2).expand(batch_size, 2)
-    else:
-        offsets_B2 = (torch.rand(batch_size, 2, generator=generator) * (room + 1)).long()
-    windows = [
-        image[:, top : top + crop_height, left : left + crop_width]
-        for image, (top, left) in zip(images_B3HW, offsets_B2.tolist(), strict=True)
-    ]
-    return _resized_levels(torch.stack(windows), size).mul_(2 / 255).sub_(1)
+    windows = draw_windows(images_B3HW, crop_fraction, generator)
+    return _resized_levels(windows.cut(images_B3HW), size).mul_(2 / 255).sub_(1)
 
 
 def resize(images_B3HW: Tensor, size: int) -> Tensor:
