@@ -1,0 +1,89 @@
+"""Grids from data: what a dataset's actions are once normalised, and the cuts that they ask for.
+
+Shapes: `N` samples, `D` action dims.
+"""
+
+import math
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from lerobot_bomb.actions.grid_edges import Cut, circular_mean, cut, to_polar, unrolled
+from lerobot_bomb.actions.grid_settings import ActionGroup, GridSettings
+
+MIN_RHO = 1e-3  # a shorter motion has no direction to fit, where there is no bin for "no motion"
+EQUAL_BOUNDS = 1e-8  # LeRobot's width of a dimension whose bounds are equal
+
+
+def normalised(actions_ND: np.ndarray, low_D: np.ndarray, high_D: np.ndarray) -> np.ndarray:
+    """Actions -> float64 in which low is -1 and high is 1, as LeRobot's normaliser; not clipped."""
+    width_D = np.where(high_D == low_D, EQUAL_BOUNDS, high_D - low_D)
+    return 2 * (actions_ND.astype(np.float64) - low_D) / width_D - 1
+
+
+def normalised_rest(low_D: np.ndarray, high_D: np.ndarray) -> np.ndarray:
+    """(D,) what an action of 0 becomes, the "no motion" of relative actions; 0 where it is out of range."""
+    inside_D = (low_D < 0) & (high_D > 0)
+    return np.where(inside_D, normalised(np.zeros((1, len(low_D))), low_D, high_D)[0], 0.0)
+
+
+def check_actions(actions_ND: np.ndarray | Tensor) -> Tensor:
+    """(N, D) float64 on the CPU.
+
+    Raises:
+        ValueError: there are none, or some are not finite.
+    """
+    actions_ND = torch.as_tensor(actions_ND).detach().to("cpu", torch.float64)
+    if actions_ND.ndim != 2 or not len(actions_ND):
+        raise ValueError(f"a grid is fitted on actions (N, D), not on shape {tuple(actions_ND.shape)}")
+    bad_N = ~actions_ND.isfinite().all(dim=1)
+    if bad_N.any():
+        first = int(bad_N.nonzero()[0, 0])
+        raise ValueError(
+            f"a grid cannot be fitted: {int(bad_N.sum())} of {len(bad_N)} actions are not finite, the first "
+            f"at index {first}: {actions_ND[first].tolist()}"
+        )
+    return actions_ND
+
+
+def fit_cuts(actions_ND: Tensor, rest_D: np.ndarray, settings: GridSettings) -> list[Cut]:
+    """Of every coordinate, for actions in [-1, 1] (N, D) float64; without samples, about equal widths."""
+    rest = torch.from_numpy(rest_D)
+    cuts = []
+    for group in settings.groups:
+        values = actions_ND[:, list(group.dims)]
+        if group.transform == "polar":
+            cuts += _polar_cuts(values, rest[list(group.dims)], group, settings)
+        elif group.transform == "binary":
+            cuts.append(cut(values[:, 0], -1, 1, 2, "uniform", settings.min_sigma))
+        else:
+            cuts += [
+                cut(of, -1, 1, bins, settings.distribution, settings.min_sigma)
+                for of, bins in zip(values.T, group.bins, strict=True)
+            ]
+    return cuts
+
+
+def _polar_cuts(xyz_N3: Tensor, rest: Tensor, group: ActionGroup, settings: GridSettings) -> list[Cut]:
+    """Of theta and phi, in which motions that are too short do not count, and of rho."""
+    options = (settings.distribution, settings.min_sigma)
+    theta_bins, phi_bins, rho_bins = group.bins
+    theta, phi, rho = to_polar(xyz_N3 - rest).unbind(dim=-1)
+    moving = rho >= (settings.rho_dead if settings.zero_radius_bin else MIN_RHO)
+    theta, phi = theta[moving], phi[moving]
+    middle = circular_mean(phi) if settings.phi_fit == "wrapped" else 0.0
+    low, high = middle - math.pi, middle + math.pi
+    highest = float((1 + rest.abs()).norm())  # the corner of [-1, 1] that is farthest from rest
+    if settings.zero_radius_bin:
+        above = cut(rho[moving], settings.rho_dead, highest, rho_bins - 1, *options)
+        first = above.edges.new_tensor([0.0, settings.rho_dead / 2])
+        edges, means = torch.cat([first[:1], above.edges]), torch.cat([first[1:], above.means])
+        of_rho = Cut(edges, means, above.mean, above.std)
+    else:
+        of_rho = cut(rho, 0, highest, rho_bins, *options)
+    return [
+        cut(theta, 0, math.pi, theta_bins, *options),
+        cut(unrolled(phi, low, high), low, high, phi_bins, *options),
+        of_rho,
+    ]
