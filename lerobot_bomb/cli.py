@@ -19,6 +19,10 @@ COMMANDS = {
         "loss, accuracy and L1 of a checkpoint on recorded frames, beside trivial predictors",
         "lerobot_bomb.evaluation.offline_metrics",
     ),
+    "fit-grid": (
+        "an action grid on a dataset: its fit, its edges and what it rounds off",
+        "lerobot_bomb.actions.fit_grid",
+    ),
     "export-backbone": (
         "a checkpoint's vision-language model as a folder that other policies can start from",
         "lerobot_bomb.vlm.export",

@@ -18,6 +18,7 @@ from lerobot_bomb.actions.grid_edges import Cut, from_polar, gaussian_cut, to_po
 from lerobot_bomb.actions.grid_fit import check_actions, fit_cuts
 from lerobot_bomb.actions.grid_settings import ActionGroup, GridSettings, check_groups, default_groups
 
+CLIP_TOLERANCE = 1e-3  # LeRobot estimates quantiles: an extreme that many actions have may lie a hair beyond
 PUBLISHED_KEYS = ("theta", "phi", "r", "roll", "pitch", "yaw")
 
 
@@ -73,7 +74,7 @@ class ActionGrids(nn.Module):
     def encode(self, actions: Tensor) -> Tensor:
         """(..., D) -> (..., G) int64, within each group; actions beyond [-1, 1] are clipped."""
         self._check_dims(actions.shape[-1])
-        values_CN = self._coordinates(actions.to(self.edges.dtype).clamp(-1, 1)).reshape(-1, len(self.bins)).T
+        values_CN = self.coordinates(actions.to(self.edges.dtype).clamp(-1, 1)).reshape(-1, len(self.bins)).T
         # bins are closed on the left: the number of edges up to the value, but for the first
         bins_CN = torch.searchsorted(self.edges[:, 1:].contiguous(), values_CN.contiguous(), right=True)
         bins_CN = torch.minimum(bins_CN, self._last_bin)
@@ -107,8 +108,8 @@ class ActionGrids(nn.Module):
             values = torch.where(bins[-1][..., None] == 0, rest, values)
         return values.clamp(-1, 1)
 
-    def _coordinates(self, actions: Tensor) -> Tensor:
-        """(..., D) -> (..., C), phi within its edges."""
+    def coordinates(self, actions: Tensor) -> Tensor:
+        """(..., D) -> what is cut into bins (..., C), phi within its edges; polar angles in radians."""
         actions, rest, parts = actions[..., self._dims], self.rest[self._dims], []
         for group, rows, columns in zip(self.groups, self._rows, self._columns, strict=True):
             values = actions[..., columns]
@@ -152,7 +153,7 @@ class ActionGrids(nn.Module):
         """
         actions_ND = check_actions(actions_ND)
         self._check_dims(actions_ND.shape[1])
-        num_clipped = int((actions_ND.abs() > 1).any(dim=1).sum())
+        num_clipped = int((actions_ND.abs() > 1 + CLIP_TOLERANCE).any(dim=1).sum())
         actions_ND = actions_ND.clamp(-1, 1)
         rest_D = np.zeros(self.num_dims) if rest_D is None else np.clip(rest_D, -1, 1)
         self._set(fit_cuts(actions_ND, rest_D, self.settings), rest_D)

@@ -1,15 +1,31 @@
 """Columns of a dataset, read without its pictures."""
 
 from collections.abc import Iterable, Sequence
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
 from lerobot.datasets import LeRobotDatasetMetadata
-from lerobot.utils.constants import DEFAULT_FEATURES
+from lerobot.utils.constants import DEFAULT_FEATURES, HF_LEROBOT_HOME
 
 EPISODE_INDEX = "episode_index"
+
+
+def read_meta(repo_id: str, root: Path | None) -> LeRobotDatasetMetadata:
+    """A dataset's metadata; a folder that is named must exist, LeRobot's own may be filled from the Hub."""
+    if root is not None and not (root / "meta" / "info.json").is_file():
+        raise ValueError(f"--dataset.root={root} holds no meta/info.json, so it is no LeRobotDataset")
+    try:
+        return LeRobotDatasetMetadata(repo_id, root=root)
+    except (OSError, ValueError) as error:
+        if root is not None:
+            raise
+        raise ValueError(
+            f"--dataset.repo_id={repo_id} is neither in {HF_LEROBOT_HOME} nor could it be had from the Hub "
+            f"({type(error).__name__}); name its folder with --dataset.root"
+        ) from error
 
 
 def read_columns(

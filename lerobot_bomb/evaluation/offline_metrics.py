@@ -5,7 +5,6 @@ Shapes: `R` frames that are measured.
 
 import argparse
 import json
-import os
 import sys
 from dataclasses import asdict, dataclass
 from pathlib import Path
@@ -15,10 +14,10 @@ import numpy as np
 from lerobot.configs import PreTrainedConfig
 from lerobot.datasets import LeRobotDataset, LeRobotDatasetMetadata
 from lerobot.policies import PreTrainedPolicy
-from lerobot.utils.constants import ACTION, HF_LEROBOT_HOME
+from lerobot.utils.constants import ACTION
 
 from lerobot_bomb.checkpoint import read_config
-from lerobot_bomb.data.columns import dim_names
+from lerobot_bomb.data.columns import dim_names, read_meta
 from lerobot_bomb.evaluation.measures import L1, Measure, measure, measure_l1
 from lerobot_bomb.evaluation.predictions import check_policy, load_dataset, load_policy, predict
 from lerobot_bomb.evaluation.splits import (
@@ -30,7 +29,7 @@ from lerobot_bomb.evaluation.splits import (
 )
 from lerobot_bomb.evaluation.trivial import Demonstrations
 from lerobot_bomb.tables import print_table
-from lerobot_bomb.viewing.unfinished import written_whole
+from lerobot_bomb.viewing.unfinished import check_writable, written_whole
 
 POLICY = "policy"
 SHOWN_STEPS = (1, 2, 3, 5, 10, 20, 50, 100)  # of the chunk, in the printed table
@@ -69,7 +68,7 @@ def run_offline_metrics(args: argparse.Namespace) -> int:
     """Measure, print the tables, write the JSON file."""
     _check_flags(args)
     config = read_config(args.policy_path, args.device)
-    meta = _read_meta(args.repo_id, args.root)
+    meta = read_meta(args.repo_id, args.root)
     train_config = read_train_config(args.policy_path)
     check_policy(config, meta, train_config.get("rename_map") or {})
     split = _split(args, meta, train_config)
@@ -95,23 +94,8 @@ def _check_flags(args: argparse.Namespace) -> None:
     for flag, lowest in {"max_frames": 0, "batch_size": 1}.items():
         if getattr(args, flag) < lowest:
             raise ValueError(f"--{flag}={getattr(args, flag)} must be at least {lowest}")
-    if args.json is not None and (args.json.is_dir() or not os.access(args.json.parent, os.W_OK)):
-        raise ValueError(f"--json={args.json} cannot be written; give a file in a folder that exists")
-
-
-def _read_meta(repo_id: str, root: Path | None) -> LeRobotDatasetMetadata:
-    """A dataset's metadata; a folder that is named must exist, LeRobot's own may be filled from the Hub."""
-    if root is not None and not (root / "meta" / "info.json").is_file():
-        raise ValueError(f"--dataset.root={root} holds no meta/info.json, so it is no LeRobotDataset")
-    try:
-        return LeRobotDatasetMetadata(repo_id, root=root)
-    except (OSError, ValueError) as error:
-        if root is not None:
-            raise
-        raise ValueError(
-            f"--dataset.repo_id={repo_id} is neither in {HF_LEROBOT_HOME} nor could it be had from the Hub "
-            f"({type(error).__name__}); name its folder with --dataset.root"
-        ) from error
+    if args.json is not None:
+        check_writable("--json", args.json)
 
 
 def _split(args: argparse.Namespace, meta: LeRobotDatasetMetadata, train_config: dict[str, Any]) -> Split:

@@ -1,9 +1,16 @@
 """Files that appear under their names at once, complete."""
 
+import os
 import tempfile
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
+
+
+def check_writable(flag: str, path: Path) -> None:
+    """Raise a ValueError unless a file can be made at the path that a flag gives."""
+    if path.is_dir() or not os.access(path.parent, os.W_OK):
+        raise ValueError(f"{flag}={path} cannot be written; give a file in a folder that exists")
 
 
 @contextmanager

@@ -1,0 +1,165 @@
+"""``lerobot-bomb fit-grid`` on recorded and converted demonstrations."""
+
+import json
+import re
+import shutil
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from lerobot.datasets import LeRobotDatasetMetadata
+from lerobot.utils.constants import ACTION
+from PIL import Image
+from pusht_cases import REPO_ID as PUSHT
+
+from lerobot_bomb.actions.fit_grid import UNIFORM, action_bounds, quantisation_errors
+from lerobot_bomb.actions.grid_fit import normalised, normalised_rest
+from lerobot_bomb.actions.grid_settings import GridSettings, default_groups
+from lerobot_bomb.actions.grids import ActionGrids
+from lerobot_bomb.cli import main
+from lerobot_bomb.data.columns import read_columns
+from lerobot_bomb.data.record import record
+from lerobot_bomb.data.recording import Recording
+from lerobot_bomb.viewing.grid_picture import BAR_RGB, EDGE_RGB, ROW_HEIGHT, Row, draw_rows, edge_x
+
+REPO_ID = "test/grid"
+
+
+@pytest.fixture(scope="module")
+def root(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Four episodes of BOMB, about 20 frames each."""
+    path = tmp_path_factory.mktemp("grid") / "dataset"
+    record(Recording(REPO_ID, episodes=4, seed=0, image_size=32, images=True), path)
+    return path
+
+
+def fit_grid(root: Path, *flags: str, repo_id: str = REPO_ID) -> int:
+    return main(["fit-grid", f"--dataset.repo_id={repo_id}", f"--dataset.root={root}", *flags])
+
+
+def table(text: str, title: str) -> dict[str, dict[str, float]]:
+    """{row: {column: number}} of the printed table under a title."""
+    lines = text[text.index(title) :].splitlines()[1:]
+    header = re.split(r"\s{2,}", lines[0].strip())
+    rows = [line.split() for line in lines[1 : lines.index("") if "" in lines else None]]
+    return {name: dict(zip(header, map(float, cells), strict=True)) for name, *cells in rows}
+
+
+def fitted(meta: LeRobotDatasetMetadata) -> tuple[ActionGrids, np.ndarray, float | np.ndarray]:
+    """The default grid of a dataset, its normalised actions (N, D) and their unit (D,)."""
+    low, high = action_bounds(meta)
+    actions = normalised(read_columns(meta, (ACTION,))[ACTION], low, high)
+    grids = ActionGrids(GridSettings(default_groups(len(low))), len(low))
+    grids.fit(actions, normalised_rest(low, high))
+    return grids, actions.clip(-1, 1), (high - low) / 2
+
+
+def test_the_tables_are_the_errors_of_recorded_actions(
+    root: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert fit_grid(root) == 0
+    text = capsys.readouterr().out
+    grids, actions, unit = fitted(LeRobotDatasetMetadata(REPO_ID, root=root))
+    assert text.startswith(f"{REPO_ID}: {len(actions)} actions; ")
+    errors = quantisation_errors(grids, actions)
+    names = ["dx", "dy", "dz", "gripper"]
+    for title, scale in (("in normalised units", np.ones(4)), ("in the dataset's units", unit)):
+        shown = table(text, title)
+        for column, error_D in errors.items():
+            values = [shown[name][column] for name in names]
+            assert values == pytest.approx(error_D * scale, rel=1e-3), column
+    fit = table(text, "Coordinates, theta and phi in radians")
+    assert {name: row["bins"] for name, row in fit.items()} == {
+        "theta": 16,
+        "phi": 32,
+        "rho": 8,
+        "gripper": 16,
+    }
+    rho = grids.group_edges(0)[2].tolist()
+    assert f"rho: {' '.join(f'{edge:.4f}' for edge in rho)}\n" in text
+    assert fit["rho"]["mean"] == pytest.approx(grids.gaussians[2, 0].item(), rel=1e-3)
+
+
+def test_recorded_actions_come_back_nearer_than_with_midpoints(root: Path) -> None:
+    grids, actions, _ = fitted(LeRobotDatasetMetadata(REPO_ID, root=root))
+    errors = {name: error_D.mean() for name, error_D in quantisation_errors(grids, actions).items()}
+    assert errors["centroid"] < errors["cond_mean"] < 0.7 * min(errors["mid"], errors[UNIFORM])
+
+
+def test_pusht_has_two_coordinates_in_pixels(pusht_dataset: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert fit_grid(pusht_dataset, "--policy.grid_distribution=quantile", repo_id=PUSHT) == 0
+    text = capsys.readouterr().out
+    normal, pixels = (table(text, title) for title in ("in normalised units", "in the dataset's units"))
+    low, high = action_bounds(LeRobotDatasetMetadata(PUSHT, root=pusht_dataset))
+    for dim, name in enumerate(["target_x", "target_y"]):
+        ratio = pixels[name]["cond_mean"] / normal[name]["cond_mean"]
+        assert ratio == pytest.approx((high - low)[dim] / 2, rel=1e-3)
+        assert pixels[name]["cond_mean"] < 2.5  # pixels of 512
+
+
+def test_the_picture_has_the_edges_where_the_grid_has_them(root: Path, tmp_path: Path) -> None:
+    assert fit_grid(root, f"--picture={tmp_path / 'grid.png'}") == 0
+    assert [path.name for path in tmp_path.iterdir()] == ["grid.png"]
+    picture = np.asarray(Image.open(tmp_path / "grid.png"))
+    grids, _, _ = fitted(LeRobotDatasetMetadata(REPO_ID, root=root))
+    edges = [of.numpy() for i in range(2) for of in grids.group_edges(i)]
+    for row, of in enumerate(edges):
+        line = picture[row * ROW_HEIGHT + 10]
+        assert np.flatnonzero((line == EDGE_RGB).all(axis=1)).tolist() == sorted({*edge_x(of).tolist()})
+
+
+def test_bars_of_a_histogram_are_where_the_values_are() -> None:
+    values = np.repeat([0.25, 0.75], [100, 25])
+    picture = draw_rows([Row(["label"], values, np.array([0.0, 0.5, 1.0]))])
+    heights = (picture == BAR_RGB).all(axis=2).sum(axis=0)
+    first, second = (int(edge_x(np.array([0, value, 1]))[1]) for value in (0.25, 0.75))
+    assert heights[first - 2 : first + 6].max() == pytest.approx(
+        2 * heights[second - 2 : second + 6].max(), abs=2
+    )
+    assert np.count_nonzero(heights) == 8
+
+
+# Bad input
+
+
+@pytest.mark.parametrize(
+    ("flag", "message"),
+    [
+        ("--dataset.root=nowhere", "--dataset.root=nowhere holds no meta/info.json"),
+        (
+            "--policy.grid_distribution=cauchy",
+            "--policy.grid_distribution='cauchy' is unknown; choose one of",
+        ),
+        ("--policy.grid_min_sigma=-1", "--policy.grid_min_sigma=-1.0 must be a number of at least 0"),
+        ("--picture=nowhere/grid.png", "--picture=nowhere/grid.png cannot be written"),
+    ],
+)
+def test_bad_flags_are_one_line(
+    flag: str, message: str, root: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert fit_grid(root, flag) == 1
+    error = capsys.readouterr().err
+    assert error.startswith(f"lerobot-bomb fit-grid: {message}")
+    assert error.count("\n") == 1
+
+
+def edited(root: Path, folder: Path, drop: tuple[str, ...]) -> Path:
+    """A copy of the dataset without some statistics of its actions."""
+    shutil.copytree(root, folder)
+    path = folder / "meta" / "stats.json"
+    statistics: dict[str, Any] = json.loads(path.read_text())
+    for name in drop:
+        del statistics[ACTION][name]
+    path.write_text(json.dumps(statistics))
+    return folder
+
+
+def test_missing_quantiles_name_the_command_that_adds_them(
+    root: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    folder = edited(root, tmp_path / "old", ("q01", "q99"))
+    assert fit_grid(folder) == 1
+    error = capsys.readouterr().err
+    assert "test/grid has no statistics q01 and q99 of its actions" in error
+    assert f"lerobot.scripts.augment_dataset_quantile_stats --repo-id=test/grid --root={folder}\n" in error
