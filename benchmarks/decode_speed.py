@@ -163,7 +163,7 @@ def no_guess(_: Tensor, place: Place) -> Tensor:
 
 def plain_short_head(work: Work) -> Timed:
     """Ours on transformers' layers and growing cache."""
-    with patch("lerobot_bomb.decoding.decoder.CachedLlama", OneTokenText):
+    with patch("lerobot_bomb.decoding.decoder.CachedText", OneTokenText):
         return ours(work)
 
 

@@ -62,7 +62,7 @@ def _padded_left(embeds_BLH: Tensor, written_BL: Tensor) -> tuple[Tensor, Tensor
 
 
 class OneTokenText:
-    """Stands in for `CachedLlama`: a single row, one token a pass, on transformers' growing cache."""
+    """Stands in for `CachedText`: a single row, one token a pass, on transformers' growing cache."""
 
     def __init__(self, model: Any, batch_size: int, num_columns: int):
         assert batch_size == 1

@@ -63,8 +63,8 @@ def inference_inputs(policy: PreTrainedPolicy, batch: Batch) -> Inputs:
 
 
 def first_ids(seen: Inputs) -> dict[str, Tensor]:
-    """What every embedding looks up in its first call."""
-    return {name: calls[0] for name, calls in seen.items() if name.startswith("ids")}
+    """What every embedding looks up in its first call, where that is rows of prompts and no choice."""
+    return {name: calls[0] for name, calls in seen.items() if name.startswith("ids") and calls[0].ndim == 2}
 
 
 def pixels(policy: PreTrainedPolicy, seen: Inputs, batch_size: int) -> Tensor:

@@ -16,7 +16,25 @@ from recipes import FOLDER
 # all that lerobot-train reads; the evaluation's configs name an environment and no policy
 TRAINING = sorted(path for path in FOLDER.rglob("*.yaml") if "policy:" in path.read_text())
 RECIPE = FOLDER / "train_vla0_smol_pusht.yaml"
-ABLATIONS = sorted((FOLDER / "ablations").glob("*.yaml"))
+ABLATIONS = sorted((FOLDER / "ablations").glob("vla0_smol_*.yaml"))
+GRID_RECIPE = FOLDER / "train_spatialvla_grid_bomb.yaml"
+GRID_ABLATIONS = sorted((FOLDER / "ablations").glob("spatialvla_grid_*.yaml"))
+EVEN = {"grid_distribution": "uniform", "decode_point": "mid"}
+GRID_CHANGES: dict[str, dict[str, Any]] = {
+    "linear_bins": {
+        **EVEN,
+        "action_groups": [{"dims": [dim], "transform": "identity", "bins": [256]} for dim in range(4)],
+    },
+    "no_ego3d": {"depth_source": "none"},
+    "small_grid": {
+        "action_groups": [
+            {"dims": [0, 1, 2], "transform": "polar", "bins": [8, 16, 4]},
+            {"dims": [3], "transform": "identity", "bins": [8]},
+        ]
+    },
+    "trained_embeddings": {"freeze_llm_embeddings": False},
+    "uniform_grid": EVEN,
+}
 # what each row of the published table changes in the recipe on PushT, which has relative actions, the state
 # in the prompt and masking; rows without a number were published as relative actions with state, unmasked
 NO_MASKING, NO_STATE = {"mask_max_fraction": 0.0}, {"use_state": False}
@@ -71,6 +89,17 @@ def test_the_table_names_every_ablation() -> None:
 def test_an_ablation_changes_what_its_row_says(path: Path) -> None:
     recipe, ablation = yaml.safe_load(RECIPE.read_text()), yaml.safe_load(path.read_text())
     assert ablation == {**recipe, "policy": {**recipe["policy"], **CHANGES[name_of(path)]}}
+
+
+def test_the_grids_ablations_change_what_their_rows_say() -> None:
+    recipe = yaml.safe_load(GRID_RECIPE.read_text())
+    found = {
+        path.stem.removeprefix("spatialvla_grid_"): yaml.safe_load(path.read_text())
+        for path in GRID_ABLATIONS
+    }
+    assert found == {
+        name: {**recipe, "policy": {**recipe["policy"], **changes}} for name, changes in GRID_CHANGES.items()
+    }
 
 
 ONE_IS_ENOUGH = "ensemble"  # it differs most from what other fast tests train

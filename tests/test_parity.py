@@ -13,7 +13,7 @@ from lerobot.policies import PreTrainedPolicy
 from lerobot.utils.constants import ACTION
 from lerobot.utils.import_utils import register_third_party_plugins
 from model_inputs import Batch, first_ids, inference_inputs, pixels, probes, repeated
-from parity_routes import Recorded, Routes, cli_flags, learn_by_heart, resolution, run_routes
+from parity_routes import Recorded, Routes, as_written, cli_flags, learn_by_heart, resolution, run_routes
 from variants import Options
 
 # Least PSNR of a camera's pixels, as the network gets them, between a frame out of a video and the drawn one.
@@ -143,7 +143,7 @@ def test_targets_are_the_actions_from_the_frame_on(routes: MakeRoutes, options: 
 
 def require_recorded_actions(both: Routes) -> None:
     """Each action of a policy that learned the turning points, after each call, is what was recorded."""
-    policy, actions = both.evaluation.policy, both.recorded.actions
+    policy, actions = both.evaluation.policy, recorded_as_written(both)
     bar = resolution(policy) * (actions.max(axis=0) - actions.min(axis=0)) / 2
     for shown in both.recorded.turning_points, both.recorded.turning_points[::-1]:
         policy.reset()
@@ -152,6 +152,19 @@ def require_recorded_actions(both: Routes) -> None:
             action = both.evaluation.postprocessor(selected)[0].numpy()
             assert (np.abs(action - expected) <= bar).all(), f"frame {index}, step {step}"
     policy.reset()
+
+
+def recorded_as_written(both: Routes) -> np.ndarray:
+    """(N, D) recorded actions; of a policy with grids, what their cells stand for."""
+    policy, actions = both.evaluation.policy, both.recorded.actions
+    if not hasattr(policy, "grids"):
+        return actions
+    actions = actions.copy()
+    for index, batch in both.training.batches.items():
+        for step in (~batch["action_is_pad"][0]).nonzero()[:, 0].tolist():
+            written = as_written(policy, batch[ACTION][:, step])
+            actions[index + step] = both.evaluation.postprocessor(written)[0].numpy()
+    return actions
 
 
 def expected_actions(

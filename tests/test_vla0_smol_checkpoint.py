@@ -19,8 +19,9 @@ from torch import Tensor
 from vla0_smol_cases import STATS, WRIST, make_batch, make_config, make_policy, raw_batch
 
 from lerobot_bomb.flags import FlagError
+from lerobot_bomb.vlm import task_tokenizer
 from lerobot_bomb.vlm.prompt import task_ids
-from lerobot_policy_vla0_smol import make_vla0_smol_pre_post_processors, processor_vla0_smol
+from lerobot_policy_vla0_smol import make_vla0_smol_pre_post_processors
 from lerobot_policy_vla0_smol.modeling_vla0_smol import Vla0SmolPolicy
 
 # Checkpoints
@@ -56,7 +57,7 @@ def test_the_four_steps_that_lerobot_overrides_are_there() -> None:
         [
             "rename_observations_processor",
             "to_batch_processor",
-            "vla0_smol_task_tokenizer",
+            "bomb_task_tokenizer",
             "device_processor",
             "normalizer_processor",
         ],
@@ -67,12 +68,12 @@ def test_the_four_steps_that_lerobot_overrides_are_there() -> None:
 def test_a_task_is_tokenized_once_and_what_is_kept_is_not_saved(monkeypatch: pytest.MonkeyPatch) -> None:
     tokenized: list[str] = []
 
-    def count(tokenizer: Tokenizer, task: str) -> list[int]:
+    def count(tokenizer: Tokenizer, task: str, template: str) -> list[int]:
         tokenized.append(task)
-        return task_ids(tokenizer, task)
+        return task_ids(tokenizer, task, template)
 
-    monkeypatch.setattr(processor_vla0_smol, "task_ids", count)
-    monkeypatch.setattr(processor_vla0_smol, "MAX_KEPT_TASKS", 3)
+    monkeypatch.setattr(task_tokenizer, "task_ids", count)
+    monkeypatch.setattr(task_tokenizer, "MAX_KEPT_TASKS", 3)
     preprocessor, _ = make_vla0_smol_pre_post_processors(make_config(), STATS)
     step = preprocessor.steps[2]
     before = step.get_config(), step.state_dict()

@@ -11,6 +11,9 @@ ENSEMBLE: Options = {"temporal_ensemble_size": 3, "n_action_steps": 1}
 NO_MASKING: Options = {"mask_max_fraction": 0.0}
 CENTERS: Options = {"bin_mode": "centers"}
 FIXED_WIDTH: Options = {"number_width": 4}  # a digit more than the bins need
+CAUSAL: Options = {"prefix_attention": "causal"}
+UNIFORM: Options = {"grid_distribution": "uniform", "decode_point": "mid"}
+FULL_LOSS: Options = {"loss_vocab": "full"}
 
 # by policy type
 SINGLE: dict[str, dict[str, Options]] = {
@@ -19,7 +22,13 @@ SINGLE: dict[str, dict[str, Options]] = {
         "no_masking": NO_MASKING,
         "centers": CENTERS,
         "fixed_width": FIXED_WIDTH,
-    }
+    },
+    "spatialvla_grid": {
+        "ensemble": ENSEMBLE,
+        "causal": CAUSAL,
+        "uniform": UNIFORM,
+        "full_loss": FULL_LOSS,
+    },
 }
 # two at once, for the fast tests: what passes with both holds for each, and costs half
 PAIRS: dict[str, dict[str, Options]] = {
@@ -27,7 +36,11 @@ PAIRS: dict[str, dict[str, Options]] = {
         "centers_no_masking": CENTERS | NO_MASKING,
         # two chunks, as every predicted step costs
         "fixed_width_ensemble": FIXED_WIDTH | ENSEMBLE | {"temporal_ensemble_size": 2},
-    }
+    },
+    "spatialvla_grid": {
+        "causal_uniform": CAUSAL | UNIFORM,
+        "full_loss_ensemble": FULL_LOSS | ENSEMBLE | {"temporal_ensemble_size": 2},
+    },
 }
 
 

@@ -5,8 +5,9 @@ from collections.abc import Sequence
 
 import torch
 from torch import Tensor
+from torch.nn.functional import cosine_similarity
 
-WEIGHTINGS = ("uniform", "exponential", "nvlabs")
+WEIGHTINGS = ("uniform", "exponential", "nvlabs", "adaptive")
 
 
 def age_weights(weighting: str, num_chunks: int, coefficient: float) -> Tensor:
@@ -27,7 +28,9 @@ def age_weights(weighting: str, num_chunks: int, coefficient: float) -> Tensor:
 class TemporalEnsemble:
     """Weighted mean over the newest chunks; predicts anew at every step.
 
-    ``newest_only``: dimensions that are not averaged, such as a gripper that is open or closed.
+    ``adaptive`` weights an action by exp(coefficient * its cosine with the newest one), so a chunk of another
+    mind counts less (CogACT, arXiv 2411.19650). ``newest_only``: dimensions that are not averaged, such as a
+    gripper that is open or closed.
     """
 
     def __init__(self, size: int, weighting: str, coefficient: float, newest_only: Sequence[int] = ()):
@@ -43,8 +46,14 @@ class TemporalEnsemble:
         """(B, T, D) newest chunk, T at least the ensemble's size -> (B, D) action of this step."""
         self._chunks.appendleft(chunk_BTD)
         actions_BID = torch.stack([chunk[:, age] for age, chunk in enumerate(self._chunks)], dim=1)
-        weights_I = age_weights(self._weighting, len(self._chunks), self._coefficient)
-        weights_I1 = weights_I[:, None].to(actions_BID)
-        action_BD = (weights_I1 * actions_BID).sum(dim=1) / weights_I1.sum()
+        weights_BI1 = self._weights(actions_BID)[..., None]
+        action_BD = (weights_BI1 * actions_BID).sum(dim=1) / weights_BI1.sum(dim=1)
         action_BD[:, self._newest_only] = actions_BID[:, 0, self._newest_only]
         return action_BD
+
+    def _weights(self, actions_BID: Tensor) -> Tensor:
+        """(B, I), or (1, I) where they are the same for all rows."""
+        if self._weighting == "adaptive":
+            return torch.exp(self._coefficient * cosine_similarity(actions_BID, actions_BID[:, :1], dim=2))
+        weights_I = age_weights(self._weighting, actions_BID.shape[1], self._coefficient)
+        return weights_I[None].to(actions_BID)

@@ -4,6 +4,7 @@ Shapes: `N` samples, `D` action dims, `G` groups, `C` coordinates of all groups,
 `V` cells of all groups, `P` dims of the widest group.
 """
 
+import json
 import math
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import asdict, replace
@@ -205,7 +206,7 @@ class ActionGrids(nn.Module):
             others = (self.centroids != self._cond_means()).any(dim=1).nonzero()[:, 0].tolist()
             fitted["centroids"] = {str(cell): self.centroids[cell].tolist() for cell in others}
         settings = replace(self.settings, decode_point=self.decode_point)
-        return {"settings": asdict(settings), **fitted}
+        return {"settings": json.loads(json.dumps(asdict(settings))), **fitted}
 
     @classmethod
     def from_dict(cls, parameters: dict[str, Any], num_dims: int) -> Self:

@@ -101,6 +101,12 @@ class TokenRows:
     written: Tensor
 
     @classmethod
+    def constant(cls, ids: list[int], like_BL: Tensor) -> "TokenRows":
+        """The same tokens in every row, as many rows as ``like_BL`` has and on its device."""
+        ids_BL = torch.tensor(ids, dtype=torch.int64, device=like_BL.device).expand(len(like_BL), -1)
+        return cls(ids_BL, torch.ones_like(ids_BL, dtype=torch.bool))
+
+    @classmethod
     def join(cls, parts: "list[TokenRows]") -> "TokenRows":
         return cls(torch.cat([part.ids for part in parts], 1), torch.cat([part.written for part in parts], 1))
 

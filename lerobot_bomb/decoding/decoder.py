@@ -19,7 +19,7 @@ from torch import Tensor
 from lerobot_bomb.actions.text import END, SPACE
 from lerobot_bomb.decoding.grammar import NumberGrammar, Place
 from lerobot_bomb.vlm.backbone import SmolVLMBackbone
-from lerobot_bomb.vlm.cached_llama import CachedLlama, on_host
+from lerobot_bomb.vlm.cached_text import CachedText, on_host
 
 # (B, A) symbols written, END beyond, and where each row stands -> (B, G) guesses of what comes next, at most
 # MAX_GUESSES
@@ -67,7 +67,7 @@ class CachedContinuation(Continuation):
         self._symbol_ids = symbol_ids
         self._head = backbone.head(symbol_ids)
         self._length_B1 = written_BL.sum(dim=1, keepdim=True)
-        self._text = CachedLlama(
+        self._text = CachedText(
             backbone.vlm.model.text_model, len(prompt_BLH), prompt_BLH.shape[1] + max_symbols
         )
         columns_BL = (written_BL.cumsum(dim=1) - 1).masked_fill(~written_BL, self._text.unread_column)

@@ -10,7 +10,7 @@ from torch import Tensor
 from lerobot_bomb.actions.text import END, SPACE, digits_of, number_symbols
 from lerobot_bomb.decoding.decoder import MAX_GUESSES, read_answer
 from lerobot_bomb.decoding.grammar import NumberGrammar, Place
-from lerobot_bomb.vlm.cached_llama import on_host
+from lerobot_bomb.vlm.cached_text import on_host
 
 
 class KnownSymbols:

@@ -4,7 +4,8 @@ Shapes: `B` batch, `L` tokens, `H` hidden size of the text model, `V` vocabulary
 """
 
 import json
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -14,6 +15,7 @@ from torch.nn.functional import linear
 from transformers import (
     AutoConfig,
     PreTrainedConfig,
+    PreTrainedModel,
     SmolVLMConfig,
     SmolVLMForConditionalGeneration,
     SmolVLMVisionConfig,
@@ -78,38 +80,55 @@ def load_backbone(vlm_model_name: str) -> SmolVLMBackbone:
     """
     if vlm_model_name == NANO:
         backbone = build_backbone(nano_config(load_tokenizer(NANO)))
-        _spread_pictures(backbone)
+        spread_pictures(backbone.vlm.model.vision_model)
         return backbone
-    if not Path(vlm_model_name).is_dir():
-        hub_file(vlm_model_name, "config.json")
-    config = AutoConfig.from_pretrained(vlm_model_name)
+    config = read_vlm_config(vlm_model_name)
     if config.model_type != "smolvlm":
         raise ValueError(
             f"--policy.vlm_model_name={vlm_model_name} is a {config.model_type!r} model; "
             f"vla0_smol needs a 'smolvlm' one"
         )
-    try:
-        vlm = SmolVLMForConditionalGeneration.from_pretrained(
-            vlm_model_name, config=config, dtype=torch.float32
+    with weights_errors(vlm_model_name):
+        return SmolVLMBackbone(
+            SmolVLMForConditionalGeneration.from_pretrained(
+                vlm_model_name, config=config, dtype=torch.float32
+            )
         )
+
+
+def read_vlm_config(vlm_model_name: str) -> PreTrainedConfig:
+    """Config of a Hub id or a local folder.
+
+    Raises:
+        OSError: it cannot be had; the message names the ways out.
+    """
+    if not Path(vlm_model_name).is_dir():
+        hub_file(vlm_model_name, "config.json")
+    return AutoConfig.from_pretrained(vlm_model_name)
+
+
+@contextmanager
+def weights_errors(vlm_model_name: str) -> Iterator[None]:
+    """Tell the ways out where the weights cannot be had."""
+    try:
+        yield
     except OSError as error:
         raise OSError(
             f"--policy.vlm_model_name={vlm_model_name}: no weights found. Without network, give "
             f"--policy.vlm_model_name=nano (a small model built in code) or a local folder with "
             f"model.safetensors"
         ) from error
-    return SmolVLMBackbone(vlm)
 
 
 @torch.no_grad()
-def _spread_pictures(backbone: SmolVLMBackbone) -> None:
+def spread_pictures(vision_model: nn.Module) -> None:
     """Let random weights tell different pictures apart, and go on doing so while they are trained.
 
     Most of a robot's picture is even and never changes: filters of zero mean turn an even patch into nothing.
     Patch and position embeddings start at unit scale: at that of the other weights, what Adam's first hundred
     steps add to the vision model's biases is larger, and every picture's features become the same.
     """
-    embeddings = backbone.vlm.model.vision_model.get_submodule("embeddings")
+    embeddings = next(module for name, module in vision_model.named_modules() if name.endswith("embeddings"))
     filters = embeddings.get_submodule("patch_embedding").weight
     positions = embeddings.get_submodule("position_embedding").weight
     assert isinstance(filters, nn.Parameter) and isinstance(positions, nn.Parameter)
@@ -121,13 +140,16 @@ def _spread_pictures(backbone: SmolVLMBackbone) -> None:
 def build_backbone(vlm_config: dict[str, Any]) -> SmolVLMBackbone:
     """Backbone of the given architecture with random weights in float32."""
     config = SmolVLMConfig(**vlm_config)
-    for part in (config, config.text_config, config.vision_config):
-        assert isinstance(part, PreTrainedConfig)
-        part.dtype = torch.float32
+    set_float32(config, config.text_config, config.vision_config)
     return SmolVLMBackbone(SmolVLMForConditionalGeneration(config))
 
 
-def config_dict(backbone: SmolVLMBackbone) -> dict[str, Any]:
+def set_float32(*configs: Any) -> None:
+    """Let models that are built of these have weights in float32."""
+    for config in configs:
+        config.dtype = torch.float32
+
+
+def config_dict(vlm: PreTrainedModel) -> dict[str, Any]:
     """The architecture as a JSON-ready dict, as `build_backbone` takes it."""
-    config: PreTrainedConfig = backbone.vlm.config
-    return json.loads(config.to_json_string(use_diff=False))
+    return json.loads(vlm.config.to_json_string(use_diff=False))

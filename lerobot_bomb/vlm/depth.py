@@ -5,7 +5,7 @@ Depth is in metres along the optical axis; what is not finite or not positive is
 """
 
 from collections.abc import Mapping
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import torch
 from torch import Tensor, nn
@@ -136,6 +136,13 @@ def zoedepth_pixels(pixels_B3SS: Tensor) -> Tensor:
 
 def _zoedepth_margin(size: int) -> int:
     return int(ZOEDEPTH_MARGIN * (size / 2) ** 0.5)
+
+
+def build_zoedepth(depth_config: dict[str, Any]) -> ZoeDepth:
+    """The architecture of a checkpoint, with random weights."""
+    from transformers import ZoeDepthConfig, ZoeDepthForDepthEstimation
+
+    return ZoeDepth(ZoeDepthForDepthEstimation(ZoeDepthConfig(**depth_config)))
 
 
 def load_zoedepth(depth_model_name: str) -> ZoeDepth:

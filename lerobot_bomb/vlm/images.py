@@ -19,6 +19,7 @@ class CropWindows:
     offsets: Tensor  # (B, 2) integers: first line and first column of each window
     height: int
     width: int
+    image_size: tuple[int, int]  # height, width of the whole pictures
 
     def cut(self, images_BxHW: Tensor) -> Tensor:
         """(B, ..., H, W) -> (B, ..., height, width): pictures, or what lies on the same pixels, as depth."""
@@ -43,7 +44,7 @@ def draw_windows(images_BxHW: Tensor, crop_fraction: float, generator: torch.Gen
         offsets_B2 = (room // 2).expand(len(images_BxHW), 2)
     else:
         offsets_B2 = (torch.rand(len(images_BxHW), 2, generator=generator) * (room + 1)).long()
-    return CropWindows(offsets_B2, crop_height, crop_width)
+    return CropWindows(offsets_B2, crop_height, crop_width, (height, width))
 
 
 def crop_and_resize(
@@ -54,8 +55,12 @@ def crop_and_resize(
     Cuts the windows of `draw_windows`, and resizes them as SmolVLM's own processor does it with
     ``do_resize=False, do_image_splitting=False``; see `resize`.
     """
-    windows = draw_windows(images_B3HW, crop_fraction, generator)
-    return _resized_levels(windows.cut(images_B3HW), size).mul_(2 / 255).sub_(1)
+    return resized_pixels(draw_windows(images_B3HW, crop_fraction, generator).cut(images_B3HW), size)
+
+
+def resized_pixels(images_B3HW: Tensor, size: int) -> Tensor:
+    """(B, 3, H, W) in [0, 1] -> (B, 3, size, size) in [-1, 1]; see `resize`."""
+    return _resized_levels(images_B3HW, size).mul_(2 / 255).sub_(1)
 
 
 def resize(images_B3HW: Tensor, size: int) -> Tensor:

@@ -43,3 +43,40 @@ def nano_config(tokenizer: Tokenizer) -> dict[str, Any]:
             "tie_word_embeddings": False,
         },
     }
+
+
+def nano_paligemma_config(tokenizer: Tokenizer) -> dict[str, Any]:
+    """Config of a PaliGemma 2 of about a million parameters for 128x128 images, 64 tokens each."""
+    return {
+        "model_type": "paligemma",
+        "image_token_index": tokenizer.token_to_id("<image>"),
+        "projection_dim": 128,
+        "hidden_size": 128,
+        "vision_config": {
+            "model_type": "siglip_vision_model",
+            "hidden_size": 96,
+            "intermediate_size": 256,
+            "num_hidden_layers": 3,
+            "num_attention_heads": 3,
+            "image_size": 128,
+            "patch_size": 16,
+            "vision_use_head": False,
+            "initializer_range": INITIALIZER_RANGE,
+        },
+        "text_config": {
+            "model_type": "gemma2",
+            "vocab_size": tokenizer.get_vocab_size(),
+            "hidden_size": 128,
+            "intermediate_size": 320,
+            "num_hidden_layers": 4,
+            "num_attention_heads": 4,
+            "num_key_value_heads": 2,
+            "head_dim": 32,
+            "query_pre_attn_scalar": 32,
+            "max_position_embeddings": 4096,
+            "initializer_range": INITIALIZER_RANGE,
+            "pad_token_id": tokenizer.token_to_id("<|im_end|>"),
+            "bos_token_id": tokenizer.token_to_id("<|im_start|>"),
+            "eos_token_id": tokenizer.token_to_id("<end_of_utterance>"),
+        },
+    }

@@ -19,6 +19,8 @@ from tokenizers import Tokenizer
 from lerobot_bomb.actions.text import END, MAX_DIGITS, SYMBOL_TEXTS
 from lerobot_bomb.vlm.tokenizer import GLOBAL_IMAGE_TOKEN, HIDDEN_TOKEN, IMAGE_EDGE_TOKEN, IMAGE_TOKEN
 
+TASK_TEMPLATE = "Task: {},"
+
 
 @dataclass(frozen=True)
 class PromptTokens:
@@ -112,14 +114,14 @@ def normalize_task(task: str) -> str:
     return re.sub(r"[_\r\n]", " ", task.lower()).strip()
 
 
-def task_ids(tokenizer: Tokenizer, task: str) -> list[int]:
-    """Tokens of the prompt's task part."""
-    return text_ids(tokenizer, f"Task: {normalize_task(task)},")
+def task_ids(tokenizer: Tokenizer, task: str, template: str = TASK_TEMPLATE) -> list[int]:
+    """Tokens of the prompt's task part; ``{}`` in the template stands for the task."""
+    return text_ids(tokenizer, template.format(normalize_task(task)))
 
 
 def text_ids(tokenizer: Tokenizer, text: str) -> list[int]:
     """Tokens of a user's text; what looks like a special token stays text."""
     tokenizer.encode_special_tokens = True
-    ids = tokenizer.encode(text).ids
+    ids = tokenizer.encode(text, add_special_tokens=False).ids
     tokenizer.encode_special_tokens = False
     return ids

@@ -37,6 +37,7 @@ from lerobot_bomb.decoding.draft import KnownSymbols, LinearDraft
 from lerobot_bomb.decoding.grammar import NumberGrammar
 from lerobot_bomb.vlm.backbone import SmolVLMBackbone, build_backbone, config_dict, load_backbone
 from lerobot_bomb.vlm.images import crop_and_resize
+from lerobot_bomb.vlm.inputs import read_actions, read_image, read_tensor
 from lerobot_bomb.vlm.prompt import PromptTokens
 from lerobot_bomb.vlm.tokenizer import load_tokenizer
 from lerobot_policy_vla0_smol.configuration_vla0_smol import Vla0SmolConfig
@@ -199,13 +200,8 @@ class Vla0SmolPolicy(PreTrainedPolicy):
 
     def _bins(self, batch: dict[str, Tensor]) -> Tensor:
         """Actions (B, T, D) in [-1, 1] -> bins of what is written, step by step: (B, N) int64."""
-        config = self.config
-        actions_BTD = self._read(batch, ACTION)
-        if actions_BTD.ndim != 3 or actions_BTD.shape[1:] != (config.chunk_size, self._action_dim):
-            raise ValueError(
-                f"batch[{ACTION!r}] has shape {tuple(actions_BTD.shape)}; expected "
-                f"(batch, {config.chunk_size}, {self._action_dim}) (--policy.chunk_size, action dims)"
-            )
+        shape = self.config.chunk_size, self._action_dim
+        actions_BTD = read_actions(batch, ACTION, "vla0_smol", self.symbol_ids.device, shape)
         if self.relative is not None:
             actions_BTD = self.relative.encode(actions_BTD, self._read(batch, OBS_STATE))
         return self.action_bins.encode(actions_BTD).flatten(1)
@@ -289,22 +285,17 @@ class Vla0SmolPolicy(PreTrainedPolicy):
         task_ids_BL = self._read(batch, OBS_LANGUAGE_TOKENS)
         task = TokenRows(task_ids_BL, self._read(batch, OBS_LANGUAGE_ATTENTION_MASK).bool())
         images = len(self._cameras) * [*tokens.image_start, *self._image_span, *tokens.image_end]
-        parts = [self._fixed([*tokens.start, *images], task_ids_BL), task]
+        parts = [TokenRows.constant([*tokens.start, *images], task_ids_BL), task]
         if self.config.use_state:
             state = self._to_tokens(
                 self.state_bins.encode(self._read(batch, OBS_STATE)), self.config.n_state_bins
             )
             parts += [
-                self._fixed(tokens.state_start, task_ids_BL),
+                TokenRows.constant(tokens.state_start, task_ids_BL),
                 TokenRows(state.ids.flatten(1), state.written.flatten(1)),
-                self._fixed(tokens.state_end, task_ids_BL),
+                TokenRows.constant(tokens.state_end, task_ids_BL),
             ]
-        return TokenRows.join([*parts, self._fixed(tokens.answer_start, task_ids_BL)])
-
-    def _fixed(self, ids: list[int], like_BL: Tensor) -> TokenRows:
-        """The same tokens in every row."""
-        ids_BL = torch.tensor(ids, device=like_BL.device).expand(len(like_BL), -1)
-        return TokenRows(ids_BL, torch.ones_like(ids_BL, dtype=torch.bool))
+        return TokenRows.join([*parts, TokenRows.constant(tokens.answer_start, task_ids_BL)])
 
     def _to_tokens(self, numbers_BN: Tensor, num_values: int) -> NumberTokens:
         fixed_width = self.config.number_width
@@ -317,9 +308,8 @@ class Vla0SmolPolicy(PreTrainedPolicy):
         """Embeddings (B, L, H) of a sequence that starts with a prompt, image features in place."""
         generator = self.generator if self.training else None
         fraction, size = self.config.crop_fraction, self.backbone.image_size
-        pixels = [
-            crop_and_resize(self._image(batch, key), fraction, size, generator) for key in self._cameras
-        ]
+        images = [read_image(batch, key, "vla0_smol", ids_BL.device) for key in self._cameras]
+        pixels = [crop_and_resize(image, fraction, size, generator) for image in images]
         features_BPH = self.backbone.embed_images(torch.stack(pixels, dim=1).flatten(0, 1))
         embeds_BLH = self.backbone.embed_tokens(ids_BL)
         features_BPH = features_BPH.reshape(len(ids_BL), -1, embeds_BLH.shape[-1]).to(embeds_BLH.dtype)
@@ -333,23 +323,8 @@ class Vla0SmolPolicy(PreTrainedPolicy):
         starts = first + period * torch.arange(len(self._cameras), device=device)
         return (starts[:, None] + torch.arange(len(self._image_span), device=device)).flatten()
 
-    def _image(self, batch: dict[str, Tensor], key: str) -> Tensor:
-        image_B3HW = self._read(batch, key)
-        if image_B3HW.ndim != 4 or image_B3HW.shape[1] != 3 or not image_B3HW.is_floating_point():
-            raise ValueError(
-                f"batch[{key!r}] is {image_B3HW.dtype} of shape {tuple(image_B3HW.shape)}; expected floats "
-                f"in [0, 1] of shape (batch, 3, height, width)"
-            )
-        return image_B3HW
-
     def _read(self, batch: dict[str, Tensor], key: str) -> Tensor:
-        if key not in batch:
-            raise KeyError(f"vla0_smol needs {key!r}; the batch has {sorted(batch)}")
-        if batch[key].device != self.symbol_ids.device:
-            raise ValueError(
-                f"batch[{key!r}] is on {batch[key].device}, the policy on {self.symbol_ids.device}"
-            )
-        return batch[key]
+        return read_tensor(batch, key, "vla0_smol", self.symbol_ids.device)
 
     @property
     def _cameras(self) -> list[str]:
@@ -402,7 +377,7 @@ def _build(config: Vla0SmolConfig) -> tuple[PromptTokens, SmolVLMBackbone]:
         name = config.vlm_model_name
         tokens = PromptTokens.from_tokenizer(load_tokenizer(name), name, config.system_prompt)
         backbone = load_backbone(name)
-        config.vlm_config, config.prompt_tokens = config_dict(backbone), tokens.to_dict()
+        config.vlm_config, config.prompt_tokens = config_dict(backbone.vlm), tokens.to_dict()
     elif config.prompt_tokens is None:
         raise ValueError("--policy.vlm_config is set, but not --policy.prompt_tokens, which belongs to it")
     else:

@@ -1,4 +1,4 @@
-"""The text model of a SmolVLM on a static key-value cache, for passes of a few tokens.
+"""Text models of the Llama and Gemma 2 families on a static key-value cache, for passes of a few tokens.
 
 The layers' own modules are called in transformers' order, without what surrounds them there (building masks,
 growing caches, recording outputs), which takes most of the time of a small model's pass.
@@ -13,6 +13,7 @@ from typing import Any
 import torch
 from torch import Tensor
 from torch.nn.functional import rms_norm, scaled_dot_product_attention
+from transformers.models.gemma2.modeling_gemma2 import Gemma2DecoderLayer, Gemma2RMSNorm
 
 
 @dataclass(frozen=True)
@@ -25,22 +26,27 @@ class _Columns:
     penalty: Tensor  # (B, 1, K * G, columns in use): 0 for those that a query reads, else -inf
 
 
-class CachedLlama:
+class CachedText:
     """Hidden states of new tokens, which read what was cached before them.
 
-    A token's column in the cache is its position. One at a column that is written already takes its place, so
-    what is no longer wanted is written over. Gaps go to `unread_column`.
+    A token's column in the cache is its position, counted from 0; the model counts from ``first_position``.
+    One at a column that is written already takes its place, so what is no longer wanted is written over. Gaps
+    go to `unread_column`.
 
     Raises:
         ValueError: the model has fewer positions than ``num_columns``.
     """
 
-    def __init__(self, model: Any, batch_size: int, num_columns: int):
+    def __init__(self, model: Any, batch_size: int, num_columns: int, first_position: int = 0):
         config = model.config
-        if num_columns > config.max_position_embeddings:
+        # layers with a sliding window see all of a shorter sequence
+        num_positions = min(
+            config.max_position_embeddings, getattr(config, "sliding_window", None) or torch.inf
+        )
+        if num_columns > num_positions:
             raise ValueError(
                 f"prompt and answer take up to {num_columns} tokens, and the model has "
-                f"{config.max_position_embeddings} positions; give a smaller --policy.chunk_size"
+                f"{num_positions} positions; give a smaller --policy.chunk_size"
             )
         self._model = model
         self._num_heads, self._num_groups = config.num_key_value_heads, config.num_attention_heads
@@ -49,7 +55,7 @@ class CachedLlama:
         # a multiple of 8, which attention on CUDA wants of its masks
         self._columns_C = torch.arange(-(-(num_columns + 1) // 8) * 8, device=embedding.device)
         self.unread_column = len(self._columns_C) - 1
-        cos_1CE, sin_1CE = model.rotary_emb(embedding, self._columns_C[None])
+        cos_1CE, sin_1CE = model.rotary_emb(embedding, first_position + self._columns_C[None])
         first_half, second_half = sin_1CE[0].chunk(2, dim=-1)
         self._cos_CE, self._sin_CE = cos_1CE[0], torch.cat([-first_half, second_half], dim=-1)
         device = embedding.device.type
@@ -62,13 +68,22 @@ class CachedLlama:
         heads_BV = torch.arange(batch_size * self._num_heads, device=embedding.device)
         self._first_slot_B1V = heads_BV.view(batch_size, 1, -1) * len(self._columns_C)
 
-    def __call__(self, embeds_BKH: Tensor, columns_BK: Tensor) -> Tensor:
-        """Embeddings of tokens at columns -> (B, K, H) states after the last layer."""
-        columns = self._locate(columns_BK)
+    def __call__(self, embeds_BKH: Tensor, columns_BK: Tensor, reach_BK: Tensor | None = None) -> Tensor:
+        """Embeddings of tokens at columns -> (B, K, H) states after the last layer.
+
+        A token reads the columns up to ``reach_BK``; without it, up to its own.
+        """
+        columns = self._locate(columns_BK, columns_BK if reach_BK is None else reach_BK)
         x_BKH = embeds_BKH
         for layer, cache in zip(self._model.layers, self._caches, strict=True):
-            x_BKH = x_BKH + self._attend(layer.self_attn, _norm(layer.input_layernorm, x_BKH), cache, columns)
-            x_BKH = x_BKH + self._mix(layer.mlp, _norm(layer.post_attention_layernorm, x_BKH))
+            read_BKH = self._attend(layer.self_attn, _norm(layer.input_layernorm, x_BKH), cache, columns)
+            if isinstance(layer, Gemma2DecoderLayer):
+                x_BKH = x_BKH + _norm(layer.post_attention_layernorm, read_BKH)
+                mixed_BKH = self._mix(layer.mlp, _norm(layer.pre_feedforward_layernorm, x_BKH))
+                x_BKH = x_BKH + _norm(layer.post_feedforward_layernorm, mixed_BKH)
+            else:
+                x_BKH = x_BKH + read_BKH
+                x_BKH = x_BKH + self._mix(layer.mlp, _norm(layer.post_attention_layernorm, x_BKH))
         return _norm(self._model.norm, x_BKH)
 
     def keep(self, row_B: Tensor) -> None:
@@ -76,8 +91,8 @@ class CachedLlama:
         self._caches = [cache[:, row_B] for cache in self._caches]
         self._first_slot_B1V = self._first_slot_B1V[: len(row_B)]
 
-    def _locate(self, columns_BK: Tensor) -> _Columns:
-        unread_BKC = self._columns_C[: self._count_columns(columns_BK)] > columns_BK[..., None]
+    def _locate(self, columns_BK: Tensor, reach_BK: Tensor) -> _Columns:
+        unread_BKC = self._columns_C[: self._count_columns(columns_BK)] > reach_BK[..., None]
         penalty_BKC = torch.where(unread_BKC, -torch.inf, 0.0).to(self._caches[0].dtype)
         return _Columns(
             slots=(self._first_slot_B1V + columns_BK[..., None]).flatten(),
@@ -104,15 +119,22 @@ class CachedLlama:
         # the queries that share a key stand beside each other: one product a key-value head
         query_BVXE = query.to(cache.dtype).unflatten(2, (-1, self._num_groups)).transpose(1, 2).flatten(2, 3)
         keys_BVCE, values_BVCE = cache[..., : columns.penalty.shape[-1], :]
-        read_BVXE = scaled_dot_product_attention(
-            query_BVXE, keys_BVCE, values_BVCE, attn_mask=columns.penalty, scale=attention.scaling
-        )
+        softcap = getattr(attention, "attn_logit_softcapping", None)
+        if softcap is None:
+            read_BVXE = scaled_dot_product_attention(
+                query_BVXE, keys_BVCE, values_BVCE, attn_mask=columns.penalty, scale=attention.scaling
+            )
+        else:
+            scores_BVXC = query_BVXE @ keys_BVCE.transpose(2, 3) * (attention.scaling / softcap)
+            scores_BVXC = softcap * torch.tanh(scores_BVXC) + columns.penalty
+            read_BVXE = scores_BVXC.softmax(dim=-1, dtype=torch.float32).to(cache.dtype) @ values_BVCE
         read = read_BVXE.unflatten(2, (len(x_BKH[0]), -1)).transpose(1, 2).flatten(2)
         return attention.o_proj(read)
 
     def _mix(self, mlp: Any, x_BKH: Tensor) -> Tensor:
         gate = mlp.gate_proj(x_BKH)
-        is_slow = on_host(gate) and gate.dtype == torch.float32 and self._model.config.hidden_act == "silu"
+        is_silu = getattr(self._model.config, "hidden_act", None) == "silu"
+        is_slow = is_silu and on_host(gate) and gate.dtype == torch.float32
         # torch's own silu takes 3.5 times as long there
         activated = gate / (1 + torch.exp(-gate)) if is_slow else mlp.act_fn(gate)
         return mlp.down_proj(activated * mlp.up_proj(x_BKH))
@@ -129,4 +151,7 @@ def _rotate(heads: Tensor, columns: _Columns) -> Tensor:
 
 
 def _norm(norm: Any, x_BKH: Tensor) -> Tensor:
+    if isinstance(norm, Gemma2RMSNorm):
+        weight = 1 + norm.weight.float()
+        return rms_norm(x_BKH.float(), x_BKH.shape[-1:], weight, norm.eps).type_as(x_BKH)
     return rms_norm(x_BKH, x_BKH.shape[-1:], norm.weight, norm.variance_epsilon)

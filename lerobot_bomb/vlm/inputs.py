@@ -1,0 +1,37 @@
+"""Reading a batch, with errors that say what is amiss."""
+
+import torch
+from torch import Tensor
+
+
+def read_tensor(batch: dict[str, Tensor], key: str, policy_type: str, device: torch.device) -> Tensor:
+    """The batch's value; an error if it is absent or on another device."""
+    if key not in batch:
+        raise KeyError(f"{policy_type} needs {key!r}; the batch has {sorted(batch)}")
+    if batch[key].device != device:
+        raise ValueError(f"batch[{key!r}] is on {batch[key].device}, the policy on {device}")
+    return batch[key]
+
+
+def read_image(batch: dict[str, Tensor], key: str, policy_type: str, device: torch.device) -> Tensor:
+    """(B, 3, H, W) floats in [0, 1]."""
+    image_B3HW = read_tensor(batch, key, policy_type, device)
+    if image_B3HW.ndim != 4 or image_B3HW.shape[1] != 3 or not image_B3HW.is_floating_point():
+        raise ValueError(
+            f"batch[{key!r}] is {image_B3HW.dtype} of shape {tuple(image_B3HW.shape)}; expected floats "
+            f"in [0, 1] of shape (batch, 3, height, width)"
+        )
+    return image_B3HW
+
+
+def read_actions(
+    batch: dict[str, Tensor], key: str, policy_type: str, device: torch.device, shape: tuple[int, int]
+) -> Tensor:
+    """(B, T, D) of the given ``shape`` (T, D)."""
+    actions_BTD = read_tensor(batch, key, policy_type, device)
+    if actions_BTD.ndim != 3 or actions_BTD.shape[1:] != shape:
+        raise ValueError(
+            f"batch[{key!r}] has shape {tuple(actions_BTD.shape)}; expected (batch, {shape[0]}, {shape[1]}) "
+            f"(--policy.chunk_size, action dims)"
+        )
+    return actions_BTD

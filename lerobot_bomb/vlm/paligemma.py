@@ -1,0 +1,168 @@
+"""PaliGemma 2 behind the few operations a policy needs.
+
+Shapes: `B` batch, `L` tokens, `H` hidden size of the text model, `E` of the vision model, `V` vocabulary, `P`
+tokens of an image.
+"""
+
+from dataclasses import asdict, dataclass
+from typing import Any
+
+import torch
+from tokenizers import Tokenizer
+from torch import Tensor, nn
+from transformers import PaliGemmaConfig, PaliGemmaForConditionalGeneration
+
+from lerobot_bomb.actions.text import END, SYMBOL_TEXTS
+from lerobot_bomb.vlm.backbone import read_vlm_config, set_float32, spread_pictures, weights_errors
+from lerobot_bomb.vlm.presets import nano_paligemma_config
+from lerobot_bomb.vlm.tokenizer import IMAGE_TOKEN, NANO, load_tokenizer
+
+# PaliGemma counts positions from 1
+FIRST_POSITION = 1
+
+
+@dataclass(frozen=True)
+class PaliGemmaPrompt:
+    """Token ids of everything in a prompt but the task: IMG..., start, task, state, its numbers, task_end."""
+
+    image: int
+    start: list[int]
+    state_start: list[int]
+    symbols: list[int]  # digits 0-9, space
+    task_end: list[int]
+    end: int  # of an answer
+
+    @classmethod
+    def from_tokenizer(cls, tokenizer: Tokenizer, vlm_model_name: str) -> "PaliGemmaPrompt":
+        """Look everything up.
+
+        Raises:
+            ValueError: a digit, the space or a special token is not exactly one token.
+        """
+
+        def several(text: str) -> list[int]:
+            return tokenizer.encode(text, add_special_tokens=False).ids
+
+        def one(*texts: str) -> int:
+            found = [ids[0] for ids in map(several, texts) if len(ids) == 1]
+            if not found:
+                raise ValueError(
+                    f"--policy.vlm_model_name={vlm_model_name}: its tokenizer has no single token for "
+                    f"{' or '.join(map(repr, texts))}; the policy needs a PaliGemma tokenizer, which has"
+                )
+            return found[0]
+
+        # the second of each pair is the nano tokenizer's
+        return cls(
+            image=one(IMAGE_TOKEN),
+            start=[one("<bos>", "<|im_start|>")],
+            state_start=several(" state:"),
+            symbols=[one(text) for text in SYMBOL_TEXTS[:END]],
+            task_end=several("\n"),
+            end=one("<eos>", "<end_of_utterance>"),
+        )
+
+    def to_dict(self) -> dict[str, int | list[int]]:
+        """JSON-ready."""
+        return asdict(self)
+
+
+class PaliGemmaBackbone(nn.Module):
+    """A stock ``PaliGemmaForConditionalGeneration`` with Gemma 2, called in parts.
+
+    Gemma 2 multiplies embeddings by sqrt(H); transformers 5 does so inside ``embed_tokens``, and image
+    features are not divided by it. What else becomes the text model's input is to be of that scale.
+    """
+
+    def __init__(self, vlm: PaliGemmaForConditionalGeneration):
+        super().__init__()
+        self.vlm = vlm
+        text_config: Any = vlm.config.text_config
+        vision_config: Any = vlm.config.vision_config
+        self.text_config = text_config
+        self.image_size: int = vision_config.image_size  # pixels, square
+        self.patches_per_side = vision_config.image_size // vision_config.patch_size
+        self.vision_hidden_size: int = vision_config.hidden_size
+        self.embed_scale = text_config.hidden_size**0.5
+        self.softcap: float | None = text_config.final_logit_softcapping
+
+    @property
+    def tokens_per_image(self) -> int:
+        return self.patches_per_side**2
+
+    @property
+    def text_model(self) -> Any:
+        return self.vlm.model.language_model
+
+    def see(self, pixels_B3SS: Tensor) -> Tensor:
+        """(B, 3, S, S) in [-1, 1] -> (B, P, E) features of the vision model."""
+        return self.vlm.model.vision_tower(pixels_B3SS).last_hidden_state
+
+    def project(self, features_BPE: Tensor) -> Tensor:
+        """(B, P, E) -> (B, P, H)."""
+        return self.vlm.model.multi_modal_projector(features_BPE)
+
+    def embed_tokens(self, tokens_BL: Tensor) -> Tensor:
+        """(B, L) token ids -> (B, L, H)."""
+        return self.vlm.get_input_embeddings()(tokens_BL)
+
+    def hidden_states(self, embeds_BLH: Tensor, columns_BL: Tensor, reads_BLL: Tensor) -> Tensor:
+        """(B, L, H) states after the last layer.
+
+        ``columns_BL``: places in the sequence, from 0; ``reads_BLL``: whether a token (row) reads another.
+        """
+        penalty_BLL = torch.where(reads_BLL, 0.0, torch.finfo(embeds_BLH.dtype).min).to(embeds_BLH.dtype)
+        mask = penalty_BLL[:, None]
+        return self.text_model(
+            inputs_embeds=embeds_BLH,
+            attention_mask={"full_attention": mask, "sliding_attention": mask},
+            position_ids=columns_BL + FIRST_POSITION,
+            use_cache=False,
+        ).last_hidden_state
+
+    def cap(self, logits: Tensor) -> Tensor:
+        """Gemma 2's soft limit of logits, which keeps their order."""
+        return logits if self.softcap is None else self.softcap * torch.tanh(logits / self.softcap)
+
+
+def load_paligemma(vlm_model_name: str) -> PaliGemmaBackbone:
+    """Backbone with pretrained weights of a Hub id or a local folder, or ``nano`` with random ones.
+
+    Raises:
+        OSError: config or weights cannot be had; the message names the ways out.
+        ValueError: the model is not a PaliGemma 2.
+    """
+    if vlm_model_name == NANO:
+        backbone = build_paligemma(nano_paligemma_config(load_tokenizer(NANO)))
+        spread_pictures(backbone.vlm.model.vision_tower)
+        return backbone
+    config: Any = read_vlm_config(vlm_model_name)
+    if config.model_type != "paligemma" or config.text_config.model_type != "gemma2":
+        raise ValueError(
+            f"--policy.vlm_model_name={vlm_model_name} is a {config.model_type!r} model; spatialvla_grid "
+            f"needs a 'paligemma' one with 'gemma2' as its text model (PaliGemma 2)"
+        )
+    with weights_errors(vlm_model_name):
+        return PaliGemmaBackbone(
+            PaliGemmaForConditionalGeneration.from_pretrained(
+                vlm_model_name,
+                config=config,
+                dtype=torch.float32,
+                attn_implementation=_attention(config.text_config),
+            )
+        )
+
+
+def build_paligemma(vlm_config: dict[str, Any]) -> PaliGemmaBackbone:
+    """Backbone of the given architecture with random weights in float32."""
+    config = PaliGemmaConfig(**vlm_config)
+    text_config: Any = config.text_config
+    set_float32(config, text_config, config.vision_config)
+    model: Any = PaliGemmaForConditionalGeneration
+    return PaliGemmaBackbone(model._from_config(config, attn_implementation=_attention(text_config)))
+
+
+def _attention(text_config: Any) -> dict[str, str]:
+    """Of transformers' kinds, ``sdpa`` leaves out the soft limit of attention's logits."""
+    kind = "sdpa" if text_config.attn_logit_softcapping is None else "eager"
+    return {"text_config": kind, "vision_config": "sdpa"}

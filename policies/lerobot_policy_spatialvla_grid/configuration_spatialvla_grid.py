@@ -1,0 +1,284 @@
+"""Config of ``spatialvla_grid``."""
+
+import math
+from dataclasses import dataclass, field
+from typing import Any
+
+from lerobot.configs import NormalizationMode, PreTrainedConfig
+from lerobot.optim import AdamWConfig, CosineDecayWithWarmupSchedulerConfig
+
+from lerobot_bomb.actions.ensemble import WEIGHTINGS
+from lerobot_bomb.actions.grid_settings import ActionGroup, GridSettings, check_groups, default_groups
+from lerobot_bomb.flags import flag_errors, one_of
+
+DTYPES = ("float32", "bfloat16")
+# modes that map the data into [-1, 1], where the grids are
+BOUNDED_MODES = (
+    NormalizationMode.QUANTILES,
+    NormalizationMode.QUANTILE10,
+    NormalizationMode.MIN_MAX,
+    NormalizationMode.IDENTITY,
+)
+DEPTH_SOURCES = ("none", "observation", "zoedepth")
+PREFIX_ATTENTIONS = ("bidirectional", "causal")
+LOSS_VOCABULARIES = ("slot", "full")
+NUM_STATE_BINS = 256
+
+
+@PreTrainedConfig.register_subclass("spatialvla_grid")
+@dataclass
+class SpatialvlaGridConfig(PreTrainedConfig):
+    """A PaliGemma 2 chooses one grid cell for each group of action dimensions and step."""
+
+    # Hub id, path of a local folder, or "nano": a small model with random weights, built in code
+    vlm_model_name: str = "google/paligemma2-3b-pt-224"
+    # architecture; filled in when the base model is loaded. Set = build this and download nothing:
+    # the weights then come from a checkpoint
+    vlm_config: dict[str, Any] | None = None
+    # token ids of the fixed parts of the prompt; filled in together with vlm_config
+    prompt_tokens: dict[str, Any] | None = None
+
+    n_obs_steps: int = 1
+    # actions of a chunk
+    chunk_size: int = 4
+    # actions executed before the next prediction
+    n_action_steps: int = 4
+    # statistics to [-1, 1] for what becomes cells; images stay in [0, 1]
+    normalization_mapping: dict[str, NormalizationMode] = field(
+        default_factory=lambda: {
+            "VISUAL": NormalizationMode.IDENTITY,
+            "STATE": NormalizationMode.QUANTILES,
+            "ACTION": NormalizationMode.QUANTILES,
+        }
+    )
+    # whether the robot's state, in 256 bins, is in the prompt
+    use_state: bool = False
+
+    # [{"dims": [0, 1, 2], "transform": "polar", "bins": [16, 32, 8]}, ...]: one token each a step; None = by
+    # the number of action dimensions
+    action_groups: list[dict[str, Any]] | None = None
+    # how edges are placed: by the Gaussian or by the quantiles of the data, or evenly
+    grid_distribution: str = "gaussian"
+    # lower limit of the fitted standard deviations, in normalised units
+    grid_min_sigma: float = 0.0
+    # what a cell decodes to: "mid" (bin's middle), "cond_mean" (mean of the fitted Gaussian within the bin)
+    # or "centroid" (mean of the data within the cell)
+    decode_point: str = "cond_mean"
+    # whether a polar group's smallest radius means "no motion" exactly, and up to which it does
+    zero_radius_bin: bool = True
+    rho_dead: float = 0.02
+    # whether the angle phi is cut opposite the data's mean direction ("wrapped") or at pi ("linear")
+    phi_fit: str = "wrapped"
+    # edges and all else of the grids; filled in from the training data
+    grid_params: dict[str, Any] | None = None
+    # whether a checkpoint's grids are fitted anew to the data it is trained on, its cells' embeddings moved
+    adapt_embeddings: bool = True
+
+    # where depth comes from: "none", "observation" (key observation.depth.CAMERA) or "zoedepth"
+    depth_source: str = "none"
+    depth_model_name: str = "Intel/zoedepth-nyu-kitti"
+    # architecture of that model; filled in when it is loaded, for checkpoints
+    depth_config: dict[str, Any] | None = None
+    # {camera: 3x3 matrix in pixels of its picture}, where the batch has no observation.intrinsics.CAMERA
+    camera_intrinsics: dict[str, list[list[float]]] = field(default_factory=dict)
+    # 3-D points of a patch, per side
+    ego3d_patch_reso: int = 2
+    ego3d_n_freqs: int = 8
+    # whether the 3-D points change nothing before training
+    ego3d_zero_init: bool = True
+
+    # "bidirectional": every token of the prompt reads all of it; "causal": what stands before it
+    prefix_attention: str = "bidirectional"
+    # what a cell competes with in the loss: the cells of its "slot", or the "full" vocabulary
+    loss_vocab: str = "slot"
+    # whether actions beyond an episode's end (repeats of the last one) are trained on
+    loss_on_padded_actions: bool = False
+    # frames at an episode's end that no sample starts at
+    drop_n_last_frames: int = 1
+
+    # chunks that an executed action is the mean of, one predicted every step; 0 = a queue instead
+    temporal_ensemble_size: int = 0
+    # "uniform", "exponential" (exp(coefficient * age)) or "nvlabs" (1 for the newest, 0.5 for others)
+    temporal_ensemble_weighting: str = "uniform"
+    # positive favours old chunks
+    temporal_ensemble_coefficient: float = 0.01
+
+    # side of the crop as a fraction of the image: random place while training, centre otherwise
+    crop_fraction: float = 0.9
+    freeze_vision_encoder: bool = False
+    # the words' embeddings; those of the cells are always trained
+    freeze_llm_embeddings: bool = True
+    # "bfloat16" = autocast over float32 weights, in training and in evaluation
+    dtype: str = "float32"
+    gradient_checkpointing: bool = False
+
+    optimizer_lr: float = 2e-5
+    optimizer_betas: tuple[float, float] = (0.9, 0.999)
+    optimizer_eps: float = 1e-8
+    optimizer_weight_decay: float = 0.0
+    optimizer_grad_clip_norm: float = 1.0
+    scheduler_warmup_steps: int = 500
+    scheduler_decay_steps: int = 30_000
+    scheduler_decay_lr: float = 0.0
+
+    push_to_hub: bool = False
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        with flag_errors():
+            self._check_choices()
+            self._check_chunk()
+            if self.action_feature is not None:
+                self.grid_settings()
+            self._check_training()
+
+    def _check_choices(self) -> None:
+        for flag, allowed in {
+            "depth_source": DEPTH_SOURCES,
+            "prefix_attention": PREFIX_ATTENTIONS,
+            "loss_vocab": LOSS_VOCABULARIES,
+            "dtype": DTYPES,
+            "temporal_ensemble_weighting": WEIGHTINGS,
+        }.items():
+            one_of(f"--policy.{flag}", getattr(self, flag), allowed)
+        if not self.vlm_model_name:
+            raise ValueError(
+                "--policy.vlm_model_name is empty; give a Hub id, the path of a local folder, or nano"
+            )
+        if self.use_amp:
+            raise ValueError(
+                "--policy.use_amp=true is not used by spatialvla_grid, in training or evaluation; "
+                "give --policy.dtype=bfloat16 instead"
+            )
+        for kind, allowed in {
+            "VISUAL": (NormalizationMode.IDENTITY,),
+            "STATE": BOUNDED_MODES,
+            "ACTION": BOUNDED_MODES,
+        }.items():
+            one_of(f"--policy.normalization_mapping[{kind}]", self.normalization_mapping.get(kind), allowed)
+
+    def _check_chunk(self) -> None:
+        if self.n_obs_steps != 1:
+            raise ValueError(
+                f"--policy.n_obs_steps={self.n_obs_steps}: spatialvla_grid reads 1 observation step"
+            )
+        if self.chunk_size < 1:
+            raise ValueError(f"--policy.chunk_size={self.chunk_size} must be at least 1")
+        if not 1 <= self.n_action_steps <= self.chunk_size:
+            raise ValueError(
+                f"--policy.n_action_steps={self.n_action_steps} must lie in 1..{self.chunk_size} "
+                f"(--policy.chunk_size)"
+            )
+        size = self.temporal_ensemble_size
+        if not 0 <= size <= self.chunk_size:
+            raise ValueError(
+                f"--policy.temporal_ensemble_size={size} must be 0 (no ensemble) or lie in "
+                f"1..{self.chunk_size} (--policy.chunk_size)"
+            )
+        if size and self.n_action_steps != 1:
+            raise ValueError(
+                f"--policy.temporal_ensemble_size={size} predicts at every step and needs "
+                f"--policy.n_action_steps=1; got {self.n_action_steps}, which is a queue"
+            )
+        if not math.isfinite(self.temporal_ensemble_coefficient):
+            raise ValueError(
+                f"--policy.temporal_ensemble_coefficient={self.temporal_ensemble_coefficient} must be finite"
+            )
+
+    def _check_training(self) -> None:
+        if not 0 < self.crop_fraction <= 1:
+            raise ValueError(f"--policy.crop_fraction={self.crop_fraction} must lie in (0, 1]")
+        for flag in ("ego3d_patch_reso", "ego3d_n_freqs", "scheduler_decay_steps"):
+            if getattr(self, flag) < 1:
+                raise ValueError(f"--policy.{flag}={getattr(self, flag)} must be at least 1")
+        for flag in (
+            "grid_min_sigma",
+            "drop_n_last_frames",
+            "optimizer_lr",
+            "scheduler_decay_lr",
+            "optimizer_weight_decay",
+            "scheduler_warmup_steps",
+        ):
+            if getattr(self, flag) < 0:
+                raise ValueError(f"--policy.{flag}={getattr(self, flag)} must not be negative")
+
+    def validate_features(self) -> None:
+        """Raise unless the dataset (or environment) has what the policy reads and writes."""
+        if not self.image_features:
+            raise ValueError(
+                f"spatialvla_grid needs at least one camera; the dataset has the inputs "
+                f"{sorted(self.input_features or {})}"
+            )
+        for key, feature in self.image_features.items():
+            if len(feature.shape) != 3 or feature.shape[0] != 3:
+                raise ValueError(
+                    f"camera {key!r} has shape {feature.shape}; spatialvla_grid needs (3, height, width)"
+                )
+        if self.action_feature is None or len(self.action_feature.shape) != 1:
+            raise ValueError(
+                f"spatialvla_grid needs the feature 'action' of shape (D,); got {self.output_features}"
+            )
+        state = self.robot_state_feature
+        if self.use_state and (state is None or len(state.shape) != 1):
+            raise ValueError(
+                f"--policy.use_state=true needs the feature 'observation.state' of shape (S,); the inputs "
+                f"are {sorted(self.input_features or {})}. Give --policy.use_state=false to do without"
+            )
+
+    def grid_settings(self) -> GridSettings:
+        """How new grids are made for the dataset's actions.
+
+        Raises:
+            ValueError: a flag of it is wrong, or the groups do not have every action dimension once.
+        """
+        assert self.action_feature is not None
+        (num_dims,) = self.action_feature.shape
+        groups = default_groups(num_dims)
+        if self.action_groups is not None:
+            groups = tuple(_read_group(group) for group in self.action_groups)
+            check_groups(groups, num_dims)
+        return GridSettings(
+            groups,
+            distribution=self.grid_distribution,
+            min_sigma=self.grid_min_sigma,
+            decode_point=self.decode_point,
+            zero_radius_bin=self.zero_radius_bin,
+            rho_dead=self.rho_dead,
+            phi_fit=self.phi_fit,
+        )
+
+    def get_optimizer_preset(self) -> AdamWConfig:
+        return AdamWConfig(
+            lr=self.optimizer_lr,
+            betas=self.optimizer_betas,
+            eps=self.optimizer_eps,
+            weight_decay=self.optimizer_weight_decay,
+            grad_clip_norm=self.optimizer_grad_clip_norm,
+        )
+
+    def get_scheduler_preset(self) -> CosineDecayWithWarmupSchedulerConfig:
+        return CosineDecayWithWarmupSchedulerConfig(
+            num_warmup_steps=self.scheduler_warmup_steps,
+            num_decay_steps=self.scheduler_decay_steps,
+            peak_lr=self.optimizer_lr,
+            decay_lr=self.scheduler_decay_lr,
+        )
+
+    @property
+    def observation_delta_indices(self) -> None:
+        return None
+
+    @property
+    def action_delta_indices(self) -> list[int]:
+        return list(range(self.chunk_size))
+
+    @property
+    def reward_delta_indices(self) -> None:
+        return None
+
+
+def _read_group(group: dict[str, Any]) -> ActionGroup:
+    keys = {"dims", "transform", "bins"}
+    if set(group) != keys:
+        raise ValueError(f"--policy.action_groups: {group} must have exactly the keys {sorted(keys)}")
+    return ActionGroup(tuple(group["dims"]), group["transform"], tuple(group["bins"]))

@@ -1,0 +1,446 @@
+"""``spatialvla_grid``: actions as cells of adaptive grids.
+
+Sources: SpatialVLA (arXiv 2501.15830); PaliGemma 2 (arXiv 2412.03555).
+
+Shapes: `B` batch, `T` actions of a chunk, `D` action dims, `G` groups of them, `S` = T * G slots of an
+answer, `L` tokens of a prompt, `X` of a prompt and an answer, `H` hidden size, `P` tokens of an image, `C`
+cells of a group.
+"""
+
+import logging
+from collections import deque
+from collections.abc import Callable, Sequence
+from functools import partial
+from typing import ClassVar
+
+import numpy as np
+import torch
+from lerobot.datasets import LeRobotDatasetMetadata
+from lerobot.policies import PreTrainedPolicy
+from lerobot.utils.constants import (
+    ACTION,
+    OBS_IMAGES,
+    OBS_LANGUAGE_ATTENTION_MASK,
+    OBS_LANGUAGE_TOKENS,
+    OBS_STATE,
+)
+from torch import Tensor, nn
+from torch.nn.functional import cross_entropy, linear
+
+from lerobot_bomb.actions.accuracy import means
+from lerobot_bomb.actions.bins import Bins
+from lerobot_bomb.actions.ensemble import TemporalEnsemble
+from lerobot_bomb.actions.grid_fit import normalised, normalised_rest
+from lerobot_bomb.actions.grid_rows import interpolate_rows
+from lerobot_bomb.actions.grid_settings import ActionGroup
+from lerobot_bomb.actions.grids import ActionGrids
+from lerobot_bomb.actions.relative import bounds, present_episodes
+from lerobot_bomb.actions.text import TokenRows, digits_needed, number_symbols
+from lerobot_bomb.data.columns import dim_names, read_columns
+from lerobot_bomb.decoding.slots import PromptContinuation, decode_slots
+from lerobot_bomb.vlm.backbone import config_dict
+from lerobot_bomb.vlm.cached_text import CachedText
+from lerobot_bomb.vlm.depth import (
+    ZoeDepth,
+    build_zoedepth,
+    lattice_points,
+    load_zoedepth,
+    observed_depth,
+    observed_intrinsics,
+)
+from lerobot_bomb.vlm.ego3d import Ego3D
+from lerobot_bomb.vlm.images import CropWindows, draw_windows, resized_pixels
+from lerobot_bomb.vlm.inputs import read_actions, read_image, read_tensor
+from lerobot_bomb.vlm.intrinsics import crop_intrinsics, default_intrinsics, resize_intrinsics
+from lerobot_bomb.vlm.paligemma import (
+    FIRST_POSITION,
+    PaliGemmaBackbone,
+    PaliGemmaPrompt,
+    build_paligemma,
+    load_paligemma,
+)
+from lerobot_bomb.vlm.tokenizer import load_tokenizer
+from lerobot_policy_spatialvla_grid.configuration_spatialvla_grid import NUM_STATE_BINS, SpatialvlaGridConfig
+
+logger = logging.getLogger(__name__)
+
+
+class SpatialvlaGridPolicy(PreTrainedPolicy):
+    """A PaliGemma 2 that chooses the next ``chunk_size`` actions, one cell of each grid a step."""
+
+    config_class = SpatialvlaGridConfig  # pyright: ignore[reportAssignmentType]  LeRobot annotates it as None
+    name = "spatialvla_grid"  # pyright: ignore[reportAssignmentType]
+    config: SpatialvlaGridConfig
+    symbol_ids: Tensor
+    action_unit: Tensor
+    # modules that FSDP shards one by one; accelerate reads the second name
+    _fsdp_wrap_modules: ClassVar[list[str]] = ["Gemma2DecoderLayer", "SiglipEncoderLayer"]
+    _no_split_modules = _fsdp_wrap_modules
+
+    def __init__(
+        self, config: SpatialvlaGridConfig, dataset_meta: LeRobotDatasetMetadata | None = None, **_: object
+    ):
+        super().__init__(config)
+        config.validate_features()
+        self.tokens, self.backbone = _build(config)
+        self.register_buffer("symbol_ids", torch.tensor(self.tokens.symbols), persistent=False)
+        self.zoedepth = _build_depth(config)
+        self.ego3d = Ego3D(
+            self.backbone.vision_hidden_size,
+            self.backbone.patches_per_side,
+            config.ego3d_patch_reso,
+            config.ego3d_n_freqs,
+            config.ego3d_zero_init,
+        )
+        self.grids = _make_grids(config, dataset_meta)
+        hidden_size = self.backbone.text_config.hidden_size
+        self.cell_embedding = nn.Embedding(self.grids.num_tokens, hidden_size)
+        self.cell_head = nn.Linear(hidden_size, self.grids.num_tokens, bias=False)
+        self._init_cells()
+        self.state_bins = Bins(NUM_STATE_BINS, "centers")
+        # physical size of 1 in normalised actions, known while training: (D,)
+        self.register_buffer("action_unit", torch.ones(self._action_dim), persistent=False)
+        self._take_units(dataset_meta)
+        # source of all that is random in training: the crop
+        self.generator = torch.Generator().manual_seed(torch.initial_seed())
+        self._ensemble = _make_ensemble(config, self.grids.groups)
+        self.reset()
+
+    @classmethod
+    def from_pretrained(
+        cls,
+        *args,
+        config: SpatialvlaGridConfig | None = None,
+        dataset_meta: LeRobotDatasetMetadata | None = None,
+        **kwargs,
+    ) -> "SpatialvlaGridPolicy":
+        """As LeRobot's, but a missing or unexpected tensor is an error; the grids adapt to the new data."""
+        policy = super().from_pretrained(*args, config=config, **{**kwargs, "strict": True})
+        if dataset_meta is not None:
+            if policy.config.adapt_embeddings:
+                policy._adapt(dataset_meta)
+            policy._take_units(dataset_meta)
+        return policy
+
+    @torch.no_grad()
+    def _init_cells(self) -> None:
+        """Around the mean of the words' embeddings, as a tokenizer's new tokens are."""
+        words = self.backbone.vlm.get_input_embeddings().weight
+        assert isinstance(words, Tensor)
+        for table in (self.cell_embedding.weight, self.cell_head.weight):
+            nn.init.normal_(table, std=self.backbone.text_config.initializer_range)
+            table += words.mean(dim=0)
+
+    @torch.no_grad()
+    def _adapt(self, meta: LeRobotDatasetMetadata) -> None:
+        """Fit the grids to another dataset; a cell's rows become those of where it lies in the old grids."""
+        old, new = self.grids, ActionGrids(self.grids.settings, self._action_dim)
+        _fit(new, self.config, meta)
+        if new.to_dict() == old.to_dict():  # a training that is resumed
+            return
+        for table in (self.cell_embedding.weight, self.cell_head.weight):
+            table.copy_(interpolate_rows(old, new, table))
+        logger.info("Action grids adapted.\nold: %s\nnew: %s", old.to_dict(), new.to_dict())
+        self.grids = new.to(self.symbol_ids.device)
+        self.config.grid_params = new.to_dict()
+
+    @torch.no_grad()
+    def _take_units(self, meta: LeRobotDatasetMetadata | None) -> None:
+        self._action_names = None
+        if meta is None:
+            return
+        assert meta.stats is not None
+        mode = self.config.normalization_mapping["ACTION"]
+        low, high = bounds(meta.stats[ACTION], mode, self._action_dim)
+        self.action_unit.copy_(torch.from_numpy(high - low) / 2)
+        self._action_names = dim_names(meta.features[ACTION])
+
+    def get_optim_params(self) -> list[nn.Parameter]:
+        return [parameter for parameter in self.parameters() if parameter.requires_grad]
+
+    def reset(self) -> None:
+        self._queue: deque[Tensor] = deque(maxlen=self.config.n_action_steps)
+        if self._ensemble is not None:
+            self._ensemble.reset()
+
+    # Training
+
+    def forward(self, batch: dict[str, Tensor], reduction: str = "mean") -> tuple[Tensor, dict[str, float]]:
+        """Cross-entropy of the cells, over the kept ones; ``reduction="none"`` gives (B,)."""
+        if reduction not in ("mean", "none"):
+            raise ValueError(f"reduction={reduction!r} is unknown; choose mean or none")
+        shape = self.config.chunk_size, self._action_dim
+        actions_BTD = read_actions(batch, ACTION, self.config.type, self.symbol_ids.device, shape)
+        cells_BTG = self.grids.encode(actions_BTD)
+        with self._autocast():
+            hidden_BTGH = self._hidden(batch, cells_BTG)
+            losses_BTG, chosen_BTG = self._losses(hidden_BTGH, cells_BTG)
+        kept_BTG = self._kept(batch)[..., None].expand_as(losses_BTG)
+        metrics = self._metrics(chosen_BTG, cells_BTG, kept_BTG)
+        losses_BTG = losses_BTG * kept_BTG
+        if reduction == "none":
+            losses_B, counts_B = losses_BTG.sum(dim=(1, 2)), kept_BTG.sum(dim=(1, 2))
+            return losses_B / counts_B.clamp(min=1), metrics
+        return losses_BTG.sum() / kept_BTG.sum().clamp(min=1), metrics
+
+    def _hidden(self, batch: dict[str, Tensor], cells_BTG: Tensor) -> Tensor:
+        """(B, T, G, H) teacher-forced states that predict the cells."""
+        prompt = self._prompt(batch)
+        cells_BS = (cells_BTG + self._offsets).flatten(1)
+        embeds_BXH = torch.cat([self._embeds(batch, prompt.ids), self._embed_cells(cells_BS[:, :-1])], dim=1)
+        written_BX = torch.cat([prompt.written, torch.ones_like(cells_BS[:, 1:], dtype=torch.bool)], dim=1)
+        index_X = torch.arange(written_BX.shape[1], device=written_BX.device)
+        reads_XX = index_X <= index_X[:, None]
+        if self._prompt_reads_all:
+            reads_XX |= (index_X < prompt.ids.shape[1]) & (index_X[:, None] < prompt.ids.shape[1])
+        hidden_BXH = self.backbone.hidden_states(
+            embeds_BXH,
+            (written_BX.cumsum(dim=1) - 1).clamp(min=0),
+            reads_XX & written_BX[:, None],
+        )
+        return hidden_BXH[:, -cells_BS.shape[1] :].unflatten(1, cells_BTG.shape[1:])
+
+    def _losses(self, hidden_BTGH: Tensor, cells_BTG: Tensor) -> tuple[Tensor, Tensor]:
+        """(B, T, G) losses and the likeliest cells, group by group."""
+        losses, chosen = [], []
+        for group, hidden_BTH in enumerate(hidden_BTGH.unbind(dim=2)):
+            logits_BTC = self._cell_logits(group, hidden_BTH).float()
+            chosen.append(logits_BTC.detach().argmax(dim=-1))
+            labels_BT = cells_BTG[..., group]
+            if self.config.loss_vocab == "full":
+                logits_BTC, labels_BT = self._full_logits(hidden_BTH), labels_BT + self._offsets[group]
+            losses.append(cross_entropy(logits_BTC.transpose(1, 2), labels_BT, reduction="none"))
+        return torch.stack(losses, dim=2), torch.stack(chosen, dim=2)
+
+    def _full_logits(self, hidden_BTH: Tensor) -> Tensor:
+        """(B, T, all cells, then the vocabulary)."""
+        logits = [self.cell_head(hidden_BTH), self.backbone.vlm.lm_head(hidden_BTH)]
+        return self.backbone.cap(torch.cat(logits, dim=-1).float())
+
+    def _kept(self, batch: dict[str, Tensor]) -> Tensor:
+        """(B, T) bool: which actions are trained on."""
+        if f"{ACTION}_is_pad" in batch and not self.config.loss_on_padded_actions:
+            return ~batch[f"{ACTION}_is_pad"].bool()
+        return torch.ones_like(batch[ACTION][..., 0], dtype=torch.bool)
+
+    @torch.no_grad()
+    def _metrics(self, chosen_BTG: Tensor, cells_BTG: Tensor, kept_BTG: Tensor) -> dict[str, float]:
+        """Share of right cells, mean absolute errors of what cells decode to in the data's units.
+
+        Teacher-forced: every cell is predicted from the true ones before it. Padded actions do not count.
+        Errors are known where a dataset was given, that is while training.
+        """
+        parts = {"token_accuracy": (chosen_BTG == cells_BTG, kept_BTG)}
+        if self._action_names is not None:
+            errors_BTD = (self.grids.decode(chosen_BTG) - self.grids.decode(cells_BTG)).abs()
+            errors_BTD = errors_BTD * self.action_unit
+            kept_BTD = kept_BTG[..., :1].expand_as(errors_BTD)
+            parts["l1"] = errors_BTD, kept_BTD
+            for dim, name in enumerate(self._action_names):
+                parts[f"l1_{name}"] = errors_BTD[..., dim], kept_BTD[..., dim]
+        return means(parts)
+
+    # Inference
+
+    def select_action(self, batch: dict[str, Tensor], **_: object) -> Tensor:
+        """(B, D) next normalised action.
+
+        With a temporal ensemble every call predicts; else when the queue of ``n_action_steps`` is empty.
+        """
+        if self._ensemble is not None:
+            return self._ensemble(self._predict(batch, self.config.temporal_ensemble_size))
+        if not self._queue:
+            self._queue.extend(self._predict(batch, self.config.n_action_steps).unbind(dim=1))
+        return self._queue.popleft()
+
+    def predict_action_chunk(self, batch: dict[str, Tensor], **_: object) -> Tensor:
+        """(B, T, D) normalised actions."""
+        return self._predict(batch, self.config.chunk_size)
+
+    def _predict(self, batch: dict[str, Tensor], num_steps: int) -> Tensor:
+        """The first ``num_steps`` actions of the chunk; the model need not choose the rest."""
+        return self.grids.decode(self._choose(batch, num_steps))
+
+    @torch.no_grad()
+    def _choose(self, batch: dict[str, Tensor], num_steps: int) -> Tensor:
+        """(B, num_steps, G) cells."""
+        self.eval()
+        num_groups = len(self.grids.groups)
+        with self._autocast():
+            prompt = self._prompt(batch)
+            text = CachedText(
+                self.backbone.text_model,
+                len(prompt.ids),
+                prompt.ids.shape[1] + num_steps * num_groups,
+                FIRST_POSITION,
+            )
+            model = PromptContinuation(
+                text,
+                self._embeds(batch, prompt.ids),
+                prompt.written,
+                prompt_reads_all=self._prompt_reads_all,
+            )
+            heads = [partial(self._cell_logits, group) for group in range(num_groups)]
+            cells_BS = decode_slots(model, num_steps * heads, num_steps * self._cell_embedders())
+        # casts of weights cached under inference mode cannot be used by a later training step
+        torch.clear_autocast_cache()
+        return cells_BS.unflatten(1, (num_steps, num_groups))
+
+    def _cell_embedders(self) -> list[Callable[[Tensor], Tensor]]:
+        """For each group: (B,) cells -> (B, H)."""
+        offsets = self.grids.offsets
+        return [lambda cells_B, first=first: self._embed_cells(cells_B + first) for first in offsets]
+
+    # Cells
+
+    def _embed_cells(self, tokens: Tensor) -> Tensor:
+        """Cells of all groups, numbered on -> (..., H), at the scale of the words' embeddings."""
+        return self.cell_embedding(tokens) * self.backbone.embed_scale
+
+    def _cell_logits(self, group: int, hidden: Tensor) -> Tensor:
+        """(..., H) -> (..., cells of the group)."""
+        first = self.grids.offsets[group]
+        rows = self.cell_head.weight[first : first + self.grids.num_cells[group]]
+        return self.backbone.cap(linear(hidden, rows))
+
+    @property
+    def _offsets(self) -> Tensor:
+        return torch.tensor(self.grids.offsets, device=self.symbol_ids.device)
+
+    # Prompt
+
+    def _prompt(self, batch: dict[str, Tensor]) -> TokenRows:
+        """Everything before the answer, with gaps; its last column has none."""
+        tokens = self.tokens
+        task_ids_BL = self._read(batch, OBS_LANGUAGE_TOKENS)
+        task = TokenRows(task_ids_BL, self._read(batch, OBS_LANGUAGE_ATTENTION_MASK).bool())
+        images = len(self._cameras) * self.backbone.tokens_per_image * [tokens.image]
+        parts = [TokenRows.constant([*images, *tokens.start], task_ids_BL), task]
+        if self.config.use_state:
+            numbers_BN = self.state_bins.encode(self._read(batch, OBS_STATE))
+            symbols_BNC, written_BNC = number_symbols(
+                numbers_BN, digits_needed(NUM_STATE_BINS), zero_padded=False
+            )
+            state = TokenRows(self.symbol_ids[symbols_BNC].flatten(1), written_BNC.flatten(1))
+            parts += [TokenRows.constant(tokens.state_start, task_ids_BL), state]
+        return TokenRows.join([*parts, TokenRows.constant(tokens.task_end, task_ids_BL)])
+
+    def _embeds(self, batch: dict[str, Tensor], ids_BL: Tensor) -> Tensor:
+        """Embeddings (B, L, H) of a prompt, image features in place."""
+        features = [self._see(batch, key) for key in self._cameras]
+        features_BPH = self.backbone.project(torch.cat(features, dim=1))
+        words_BLH = self.backbone.embed_tokens(ids_BL[:, features_BPH.shape[1] :])
+        return torch.cat([features_BPH.to(words_BLH.dtype), words_BLH], dim=1)
+
+    def _see(self, batch: dict[str, Tensor], key: str) -> Tensor:
+        """Features of a camera's patches, which know where they are: (B, P, vision model's hidden size)."""
+        image = read_image(batch, key, self.config.type, self.symbol_ids.device)
+        windows = draw_windows(image, self.config.crop_fraction, self.generator if self.training else None)
+        pixels = resized_pixels(windows.cut(image), self.backbone.image_size)
+        points = self._points(batch, key.removeprefix(f"{OBS_IMAGES}."), windows, pixels)
+        features_BPE = self.backbone.see(pixels)
+        return features_BPE + self.ego3d(points).to(features_BPE.dtype)
+
+    def _points(self, batch: dict[str, Tensor], camera: str, windows: CropWindows, pixels: Tensor) -> Tensor:
+        """(B, R, R, 3) metres in the camera's frame of what the lattice's pixels show; NaN: not known."""
+        config, size = self.config, self.ego3d.lattice_size
+        if config.depth_source == "none":
+            return pixels.new_full((len(pixels), size, size, 3), torch.nan)
+        image_size = windows.image_size
+        default = None if self.zoedepth is None else default_intrinsics(*image_size)
+        intrinsics = observed_intrinsics(batch, camera, config.camera_intrinsics, default)
+        intrinsics = crop_intrinsics(intrinsics.to(pixels.device), windows)
+        if self.zoedepth is None:
+            return lattice_points(windows.cut(observed_depth(batch, camera, image_size)), intrinsics, size)
+        side = self.backbone.image_size
+        intrinsics = resize_intrinsics(intrinsics, (windows.height, windows.width), (side, side))
+        return lattice_points(self.zoedepth(pixels), intrinsics, size)
+
+    def _read(self, batch: dict[str, Tensor], key: str) -> Tensor:
+        return read_tensor(batch, key, self.config.type, self.symbol_ids.device)
+
+    @property
+    def _cameras(self) -> list[str]:
+        return sorted(self.config.image_features)
+
+    @property
+    def _action_dim(self) -> int:
+        assert self.config.action_feature is not None
+        return self.config.action_feature.shape[0]
+
+    @property
+    def _prompt_reads_all(self) -> bool:
+        return self.config.prefix_attention == "bidirectional"
+
+    def _autocast(self) -> torch.autocast:
+        """The precision of ``config.dtype``, whoever calls: training, evaluation or a user's own loop."""
+        bfloat16 = self.config.dtype == "bfloat16"
+        return torch.autocast(self.symbol_ids.device.type, dtype=torch.bfloat16, enabled=bfloat16)
+
+
+def _build_depth(config: SpatialvlaGridConfig) -> ZoeDepth | None:
+    """As `_build`: a checkpoint brings its own."""
+    if config.depth_source != "zoedepth":
+        return None
+    if config.depth_config is not None:
+        return build_zoedepth(config.depth_config)
+    zoedepth = load_zoedepth(config.depth_model_name)
+    config.depth_config = config_dict(zoedepth.model)
+    return zoedepth
+
+
+def _make_grids(config: SpatialvlaGridConfig, meta: LeRobotDatasetMetadata | None) -> ActionGrids:
+    """A checkpoint's grids, or those that fit the data, or even ones where there is neither."""
+    assert config.action_feature is not None
+    num_dims = config.action_feature.shape[0]
+    if config.grid_params is not None:
+        return ActionGrids.from_dict(config.grid_params, num_dims)
+    grids = ActionGrids(config.grid_settings(), num_dims)
+    if meta is not None:
+        _fit(grids, config, meta)
+    config.grid_params = grids.to_dict()
+    return grids
+
+
+def _fit(grids: ActionGrids, config: SpatialvlaGridConfig, meta: LeRobotDatasetMetadata) -> None:
+    """Take the cells from all actions of a dataset, normalised as LeRobot will."""
+    assert meta.stats is not None
+    actions_ND = read_columns(meta, (ACTION,), present_episodes(meta))[ACTION].astype(np.float64)
+    low_D, high_D = bounds(meta.stats[ACTION], config.normalization_mapping["ACTION"], actions_ND.shape[1])
+    num_clipped = grids.fit(normalised(actions_ND, low_D, high_D), normalised_rest(low_D, high_D))
+    if num_clipped:
+        logger.info(
+            "%d of %d actions of %s lie outside the range of the action grids and are clipped to it",
+            *(num_clipped, len(actions_ND), meta.repo_id),
+        )
+
+
+def _make_ensemble(config: SpatialvlaGridConfig, groups: Sequence[ActionGroup]) -> TemporalEnsemble | None:
+    if not config.temporal_ensemble_size:
+        return None
+    return TemporalEnsemble(
+        config.temporal_ensemble_size,
+        config.temporal_ensemble_weighting,
+        config.temporal_ensemble_coefficient,
+        [dim for group in groups if group.transform == "binary" for dim in group.dims],
+    )
+
+
+def _build(config: SpatialvlaGridConfig) -> tuple[PaliGemmaPrompt, PaliGemmaBackbone]:
+    """Base model, or the architecture of a checkpoint; fills in what a checkpoint's config must hold."""
+    if config.vlm_config is None:
+        name = config.vlm_model_name
+        tokens = PaliGemmaPrompt.from_tokenizer(load_tokenizer(name), name)
+        backbone = load_paligemma(name)
+        config.vlm_config, config.prompt_tokens = config_dict(backbone.vlm), tokens.to_dict()
+    elif config.prompt_tokens is None:
+        raise ValueError("--policy.vlm_config is set, but not --policy.prompt_tokens, which belongs to it")
+    else:
+        tokens, backbone = PaliGemmaPrompt(**config.prompt_tokens), build_paligemma(config.vlm_config)
+    if config.freeze_vision_encoder:
+        backbone.vlm.model.vision_tower.requires_grad_(False)
+    if config.freeze_llm_embeddings:
+        backbone.vlm.get_input_embeddings().requires_grad_(False)
+    if config.gradient_checkpointing:
+        backbone.vlm.gradient_checkpointing_enable({"use_reentrant": False})
+    return tokens, backbone

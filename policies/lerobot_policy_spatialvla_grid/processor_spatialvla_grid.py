@@ -1,0 +1,36 @@
+"""Processors of ``spatialvla_grid``: LeRobot's default pipelines plus the tokenizer of the task."""
+
+from typing import Any
+
+from lerobot.processor import (
+    PolicyAction,
+    PolicyProcessorPipeline,
+    make_default_policy_processor_steps,
+    make_policy_processor_pipelines,
+)
+from torch import Tensor
+
+from lerobot_bomb.vlm.task_tokenizer import TaskTokenizerStep
+from lerobot_bomb.vlm.tokenizer import load_tokenizer
+from lerobot_policy_spatialvla_grid.configuration_spatialvla_grid import SpatialvlaGridConfig
+
+
+def make_spatialvla_grid_pre_post_processors(
+    config: SpatialvlaGridConfig, dataset_stats: dict[str, dict[str, Tensor]] | None = None
+) -> tuple[
+    PolicyProcessorPipeline[dict[str, Any], dict[str, Any]],
+    PolicyProcessorPipeline[PolicyAction, PolicyAction],
+]:
+    """Rename, batch, tokenize, device, normalise; and unnormalise, to CPU."""
+    steps = make_default_policy_processor_steps(config, dataset_stats)
+    tokenizer = TaskTokenizerStep(load_tokenizer(config.vlm_model_name))
+    return make_policy_processor_pipelines(
+        input_steps=[
+            steps.rename_observations,
+            steps.add_batch_dim,
+            tokenizer,
+            steps.to_device,
+            steps.normalize,
+        ],
+        output_steps=[steps.unnormalize, steps.to_cpu],
+    )

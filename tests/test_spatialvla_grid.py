@@ -1,0 +1,288 @@
+"""The policy `spatialvla_grid` on the nano backbone."""
+
+import copy
+from typing import Any
+
+import pytest
+import torch
+from spatialvla_grid_cases import SIZE, WORKSPACE, make_batch, make_config, make_policy
+from torch import Tensor, nn
+from torch.nn.functional import cross_entropy
+
+from lerobot_bomb.flags import FlagError
+from lerobot_policy_spatialvla_grid.modeling_spatialvla_grid import SpatialvlaGridPolicy
+
+PLAIN: dict[str, Any] = {"crop_fraction": 1.0}
+
+
+def learn(policy: SpatialvlaGridPolicy, batch: dict[str, Any], max_steps: int = 200) -> None:
+    optimizer = torch.optim.AdamW(policy.get_optim_params(), lr=1e-3, weight_decay=0.0)
+    for _ in range(max_steps):
+        policy.train()
+        loss, metrics = policy(batch)
+        optimizer.zero_grad()
+        loss.backward()
+        optimizer.step()
+        if metrics["token_accuracy"] == 1 and loss < 0.05:
+            return
+    pytest.fail(f"not learned by heart in {max_steps} steps; loss {float(loss)}")
+
+
+def with_depth(policy: SpatialvlaGridPolicy, batch: dict[str, Any], seed: int = 0) -> dict[str, Any]:
+    generator = torch.Generator().manual_seed(seed)
+    size = len(batch["task"]), SIZE, SIZE
+    camera = torch.tensor([[80.0, 0, 31.5], [0, 80, 31.5], [0, 0, 1]])
+    for key in policy._cameras:
+        name = key.removeprefix("observation.images.")
+        batch[f"observation.depth.{name}"] = 0.5 + torch.rand(size, generator=generator)
+        batch[f"observation.intrinsics.{name}"] = camera.expand(size[0], 3, 3)
+    return batch
+
+
+# Learning
+
+
+@pytest.mark.parametrize(
+    ("num_dims", "options"),
+    [
+        (4, {}),
+        (7, {"use_state": True, "prefix_attention": "causal"}),
+        (2, {"loss_vocab": "full"}),
+        (14, {"chunk_size": 2, "n_action_steps": 2, "dtype": "bfloat16"}),
+        (4, {"depth_source": "observation"}),
+    ],
+)
+def test_chunks_are_learned_by_heart(num_dims: int, options: dict[str, Any]) -> None:
+    policy = make_policy(num_dims=num_dims, **PLAIN, **options)
+    batch = with_depth(policy, make_batch(policy, 3))
+    learn(policy, batch)
+    expected = policy.grids.decode(policy.grids.encode(batch["action"]))
+    assert torch.equal(policy.predict_action_chunk(batch), expected)
+
+
+def test_the_loss_is_the_likelihood_among_a_slots_cells() -> None:
+    policy = make_policy(num_dims=7, **PLAIN)
+    batch = make_batch(policy, 2)
+    loss, _ = policy(batch)
+    cells_BTG = policy.grids.encode(batch["action"])
+    logits = policy.backbone.cap(policy.cell_head(policy._hidden(batch, cells_BTG)))
+    expected = torch.stack(
+        [
+            cross_entropy(
+                logits[:, :, group, first : first + num].flatten(0, 1), cells_BTG[..., group].flatten()
+            )
+            for group, (first, num) in enumerate(
+                zip(policy.grids.offsets, policy.grids.num_cells, strict=True)
+            )
+        ]
+    ).mean()
+    torch.testing.assert_close(loss, expected)
+    policy.config.loss_vocab = "full"
+    words = policy.backbone.vlm.lm_head(policy._hidden(batch, cells_BTG))
+    whole = torch.cat([logits, policy.backbone.cap(words)], dim=-1).flatten(0, 2)
+    labels = (cells_BTG + torch.tensor(policy.grids.offsets)).flatten()
+    torch.testing.assert_close(policy(batch)[0], cross_entropy(whole, labels))
+
+
+def test_padded_steps_carry_neither_loss_nor_gradient() -> None:
+    policy = make_policy(**PLAIN)
+    batch = make_batch(policy, 2)
+    batch["action_is_pad"] = torch.tensor([[False, False, True, True], [False] * 4])
+    changed = {**batch, "action": batch["action"].clone()}
+    changed["action"][0, 2:] *= -1
+    results = []
+    for each in (batch, changed):
+        policy.zero_grad()
+        loss, metrics = policy(each)
+        loss.backward()
+        gradients = [p.grad.clone() for p in policy.parameters() if p.grad is not None]
+        results.append((loss, metrics, gradients))
+    (loss, metrics, gradients), (other, other_metrics, other_gradients) = results
+    # later cells are read by nothing that counts
+    torch.testing.assert_close(loss, other, rtol=0, atol=1e-6)
+    assert metrics == other_metrics
+    for one, another in zip(gradients, other_gradients, strict=True):
+        torch.testing.assert_close(one, another, rtol=1e-4, atol=1e-6)
+    policy.config.loss_on_padded_actions = True
+    assert not torch.isclose(policy(batch)[0], policy(changed)[0])
+
+
+def test_one_loss_a_sample_when_asked() -> None:
+    policy = make_policy(**PLAIN)
+    batch = make_batch(policy, 3)
+    losses, _ = policy(batch, reduction="none")
+    assert losses.shape == (3,)
+    torch.testing.assert_close(losses.mean(), policy(batch)[0])
+    with pytest.raises(ValueError, match="reduction='sum' is unknown; choose mean or none"):
+        policy(batch, reduction="sum")
+
+
+def test_words_embeddings_are_frozen_and_cells_are_trained() -> None:
+    policy = make_policy()
+    assert not policy.backbone.vlm.get_input_embeddings().weight.requires_grad
+    policy(make_batch(policy, 2))[0].backward()
+    for table in (policy.cell_embedding.weight, policy.cell_head.weight):
+        assert table.grad is not None and table.grad.abs().sum() > 0
+    assert make_policy(freeze_llm_embeddings=False).backbone.vlm.get_input_embeddings().weight.requires_grad
+
+
+def test_cells_are_embedded_at_the_scale_of_words() -> None:
+    """transformers 5 multiplies by sqrt(H) inside `embed_tokens`."""
+    policy = make_policy()
+    words: Any = policy.backbone.vlm.get_input_embeddings()
+    with torch.no_grad():
+        policy.cell_embedding.weight[7] = words.weight[42]
+    cell, word = policy._embed_cells(torch.tensor([7])), policy.backbone.embed_tokens(torch.tensor([42]))
+    torch.testing.assert_close(cell, word)
+    torch.testing.assert_close(word[0].norm(), 128**0.5 * words.weight[42].norm())
+
+
+def saved_bytes(loss_vocab: str) -> int:
+    """What the loss keeps for the backward pass, at PaliGemma 2's vocabulary and a tiny width."""
+    policy = make_policy(num_dims=7, loss_vocab=loss_vocab)
+    hidden_size = 8
+    policy.backbone.vlm.lm_head = nn.Linear(hidden_size, 257_152, bias=False)
+    policy.cell_head = nn.Linear(hidden_size, policy.grids.num_tokens, bias=False)
+    hidden_BTGH = torch.randn(8, 4, 3, hidden_size, requires_grad=True)
+    cells_BTG = policy.grids.encode(torch.rand(8, 4, 7) * 2 - 1)
+    kept: dict[int, int] = {}
+
+    def keep(tensor: Tensor) -> Tensor:
+        if not isinstance(tensor, nn.Parameter):
+            kept[tensor.untyped_storage().data_ptr()] = tensor.untyped_storage().nbytes()
+        return tensor
+
+    with torch.autograd.graph.saved_tensors_hooks(keep, lambda tensor: tensor):
+        policy._losses(hidden_BTGH, cells_BTG)[0].mean().backward()
+    return sum(kept.values())
+
+
+def test_a_slots_loss_keeps_less_than_a_quarter_of_the_full_ones() -> None:
+    assert saved_bytes("slot") < saved_bytes("full") / 4
+
+
+# Depth
+
+
+def test_depth_changes_nothing_before_training_and_something_after() -> None:
+    policy, blind = make_policy(**PLAIN, depth_source="observation"), make_policy(**PLAIN)
+    batch = with_depth(policy, make_batch(policy, 2))
+    assert torch.equal(policy(batch)[0], blind(batch)[0])
+    learn(policy, batch)
+    trained = policy(batch)[0]
+    assert not torch.isclose(policy(with_depth(policy, dict(batch), seed=1))[0], trained, rtol=1e-6)
+
+
+def test_depth_follows_the_crop(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A pixel's depth and place in the camera's frame stay with what is seen there."""
+    policy = make_policy(depth_source="observation", crop_fraction=0.5)
+    batch = make_batch(policy, 1)
+    with_depth(policy, batch)
+    rows = torch.arange(SIZE).float()
+    batch["observation.depth.workspace"] = (1 + rows[:, None] + rows / 100).expand(1, -1, -1).contiguous()
+    seen: list[Tensor] = []
+    policy.ego3d.register_forward_pre_hook(lambda _, args: seen.append(args[0]))
+    policy.train()
+    policy(batch)
+    points = seen[0][0]
+    depth, width = points[..., 2], SIZE / 2 / policy.ego3d.lattice_size
+    # the depth says which line and column of the whole picture a point was read from
+    lines, columns = depth.long() - 1, ((depth % 1) * 100).round()
+    assert torch.equal(lines[1:, 0] - lines[:-1, 0], torch.full((15,), int(2 * width / 2)))
+    x_of_pixel = (columns - 31.5) / 80 * depth
+    assert ((points[..., 0] - x_of_pixel).abs() <= (0.5 * width + 0.5) / 80 * depth).all()
+
+
+# Inference
+
+
+def test_actions_are_queued_and_forgotten_on_reset() -> None:
+    policy = make_policy(n_action_steps=2)
+    first, second = make_batch(policy, 2, seed=1), make_batch(policy, 2, seed=2)
+    chunks = [policy.predict_action_chunk(batch) for batch in (first, second)]
+    assert not torch.equal(chunks[0][:, :2], chunks[1][:, :2])
+    assert torch.equal(policy.select_action(first), chunks[0][:, 0])
+    assert torch.equal(policy.select_action(second), chunks[0][:, 1])  # still of the first prediction
+    assert torch.equal(policy.select_action(second), chunks[1][:, 0])
+    policy.reset()
+    assert torch.equal(policy.select_action(first), chunks[0][:, 0])
+
+
+def test_an_ensemble_averages_but_for_the_gripper() -> None:
+    options: dict[str, Any] = {"n_action_steps": 1, "temporal_ensemble_size": 2}
+    policy = make_policy(num_dims=7, **options)
+    first, second = make_batch(policy, 1, seed=1), make_batch(policy, 1, seed=2)
+    chunks = [policy.predict_action_chunk(batch) for batch in (first, second)]
+    policy.reset()
+    policy.select_action(first)
+    action = policy.select_action(second)
+    torch.testing.assert_close(action[:, :6], (chunks[0][:, 1, :6] + chunks[1][:, 0, :6]) / 2)
+    assert torch.equal(action[:, 6], chunks[1][:, 0, 6])
+
+
+def test_training_goes_on_after_evaluation_inside_one_autocast() -> None:
+    policy = make_policy(dtype="bfloat16")
+    batch = make_batch(policy, 2)
+    with torch.autocast("cpu", dtype=torch.bfloat16):
+        with torch.inference_mode():
+            policy.select_action(batch)
+        loss, _ = policy.train()(batch)
+        loss.backward()
+    assert policy.cell_head.weight.grad is not None
+
+
+# Bad input
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ({"chunk_size": 0}, "--policy.chunk_size=0 must be at least 1"),
+        ({"n_action_steps": 5}, "--policy.n_action_steps=5 must lie in 1..4"),
+        ({"grid_distribution": "normal"}, "--policy.grid_distribution"),
+        ({"decode_point": "median"}, "--policy.decode_point"),
+        ({"depth_source": "lidar"}, "--policy.depth_source"),
+        ({"loss_vocab": "all"}, "--policy.loss_vocab"),
+        ({"crop_fraction": 0.0}, r"--policy.crop_fraction=0.0 must lie in \(0, 1\]"),
+        ({"temporal_ensemble_size": 2}, "needs --policy.n_action_steps=1; got 4"),
+        ({"use_amp": True}, "--policy.dtype=bfloat16 instead"),
+        ({"ego3d_patch_reso": 0}, "--policy.ego3d_patch_reso=0 must be at least 1"),
+        (
+            {"action_groups": [{"dims": [0, 1], "transform": "identity", "bins": [8, 8]}]},
+            "--policy.action_groups: the groups have the dims",
+        ),
+        ({"action_groups": [{"dims": [0]}]}, "must have exactly the keys"),
+    ],
+)
+def test_wrong_flags_are_told(options: dict[str, Any], message: str) -> None:
+    with pytest.raises((FlagError, ValueError), match=message):
+        make_config(**options)
+
+
+def test_depth_that_is_asked_for_must_be_there() -> None:
+    policy = make_policy(depth_source="observation")
+    batch = make_batch(policy, 2)
+    with pytest.raises(KeyError, match=r"observation\.intrinsics|observation\.depth"):
+        policy(batch)
+
+
+def test_a_batch_without_a_camera_is_told() -> None:
+    policy = make_policy()
+    batch = make_batch(policy, 2)
+    del batch[WORKSPACE]
+    with pytest.raises(KeyError, match=f"spatialvla_grid needs '{WORKSPACE}'"):
+        policy(batch)
+
+
+def test_actions_of_another_shape_are_told() -> None:
+    policy = make_policy()
+    batch = make_batch(policy, 2)
+    batch["action"] = batch["action"][:, :2]
+    with pytest.raises(ValueError, match=r"expected \(batch, 4, 4\)"):
+        policy(batch)
+
+
+def test_a_copy_of_the_policy_acts_alike() -> None:
+    policy = make_policy()
+    batch = make_batch(policy, 2)
+    assert torch.equal(copy.deepcopy(policy).predict_action_chunk(batch), policy.predict_action_chunk(batch))
