@@ -23,6 +23,10 @@ COMMANDS = {
         "an action grid on a dataset: its fit, its edges and what it rounds off",
         "lerobot_bomb.actions.fit_grid",
     ),
+    "convert-spatialvla": (
+        "a published SpatialVLA folder as a checkpoint of spatialvla_grid",
+        "lerobot_bomb.vlm.convert_spatialvla",
+    ),
     "export-backbone": (
         "a checkpoint's vision-language model as a folder that other policies can start from",
         "lerobot_bomb.vlm.export",
