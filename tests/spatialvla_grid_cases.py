@@ -15,12 +15,18 @@ SIZE = 64
 TASKS = ("put the black stone on the center", "go", "push the white stone to the left edge")
 
 
-def make_config(num_dims: int = 4, **options: Any) -> SpatialvlaGridConfig:
+def make_config(num_dims: int = 4, *, has_depth: bool = True, **options: Any) -> SpatialvlaGridConfig:
     visual, state = PolicyFeature(FeatureType.VISUAL, (3, SIZE, SIZE)), PolicyFeature(FeatureType.STATE, (4,))
+    shapes = {"depth": (SIZE, SIZE), "intrinsics": (3, 3)} if has_depth else {}
+    geometry = {
+        f"observation.{kind}.{camera}": PolicyFeature(FeatureType.STATE, shape)
+        for kind, shape in shapes.items()
+        for camera in ("workspace", "wrist")
+    }
     config = SpatialvlaGridConfig(
         vlm_model_name="nano",
         device="cpu",
-        input_features={WORKSPACE: visual, WRIST: visual, "observation.state": state},
+        input_features={WORKSPACE: visual, WRIST: visual, "observation.state": state, **geometry},
         output_features={"action": PolicyFeature(FeatureType.ACTION, (num_dims,))},
         **options,
     )

@@ -260,10 +260,17 @@ def test_wrong_flags_are_told(options: dict[str, Any], message: str) -> None:
 
 
 def test_depth_that_is_asked_for_must_be_there() -> None:
+    """A dataset's features tell before any training, a batch's keys later."""
+    message = r"needs observation\.depth\.\w+, .*Record with --depth and evaluate with --env\.depth=true"
+    with pytest.raises(ValueError, match=message):
+        make_policy(depth_source="observation", has_depth=False)
+    with pytest.raises(ValueError, match=r"needs observation\.depth\.\w+, observation\.depth\.\w+;"):
+        square = [[80.0, 0, 32], [0, 80, 32], [0, 0, 1]]
+        intrinsics = {"workspace": square, "wrist": square}
+        make_policy(depth_source="observation", has_depth=False, camera_intrinsics=intrinsics)
     policy = make_policy(depth_source="observation")
-    batch = make_batch(policy, 2)
-    with pytest.raises(KeyError, match=r"observation\.intrinsics|observation\.depth"):
-        policy(batch)
+    with pytest.raises(KeyError, match=r"observation\.depth\.\w+'; .*Record with --depth"):
+        policy(make_batch(policy, 2))
 
 
 def test_a_batch_without_a_camera_is_told() -> None:

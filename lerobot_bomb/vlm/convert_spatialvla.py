@@ -69,7 +69,7 @@ def run_convert_spatialvla(args: argparse.Namespace) -> int:
     policy = get_policy_class(config.type)(config)
     policy.load_state_dict(_weights(args.folder, original, policy.state_dict()), strict=True)
     pipelines = make_pre_post_processors(config, dataset_stats={ACTION: scales})
-    policy.config.vlm_model_name = args.folder.resolve().name  # nothing is read there any more
+    config.vlm_model_name = args.folder.resolve().name  # nothing is read there any more
     with written_whole(args.output) as (folder,):
         policy.save_pretrained(folder)
         for pipeline in pipelines:
@@ -95,9 +95,7 @@ def _action_scales(statistics: dict[str, Any], name: str) -> dict[str, Tensor]:
     return {"q01": q01.where(scaled, 0.0), "q99": q99.where(scaled, 1.0)}
 
 
-def _config(
-    args: argparse.Namespace, original: dict[str, Any], chunk_size: int, grids: ActionGrids
-) -> PreTrainedConfig:
+def _config(args: argparse.Namespace, original: dict[str, Any], chunk_size: int, grids: ActionGrids) -> Any:
     text_config = {
         **original["text_config"],
         "model_type": "gemma2",

@@ -6,6 +6,7 @@ from typing import Any
 
 from lerobot.configs import NormalizationMode, PreTrainedConfig
 from lerobot.optim import AdamWConfig, CosineDecayWithWarmupSchedulerConfig
+from lerobot.utils.constants import OBS_IMAGES
 
 from lerobot_bomb.actions.ensemble import WEIGHTINGS
 from lerobot_bomb.actions.grid_settings import ActionGroup, GridSettings, check_groups, default_groups
@@ -223,6 +224,24 @@ class SpatialvlaGridConfig(PreTrainedConfig):
             raise ValueError(
                 f"--policy.use_state=true needs the feature 'observation.state' of shape (S,); the inputs "
                 f"are {sorted(self.input_features or {})}. Give --policy.use_state=false to do without"
+            )
+
+        if self.depth_source == "observation":
+            self._check_depth()
+
+    def _check_depth(self) -> None:
+        cameras = [key.removeprefix(f"{OBS_IMAGES}.") for key in self.image_features]
+        given = set(self.input_features or {})
+        wanted = [f"observation.depth.{camera}" for camera in cameras]
+        wanted += [
+            f"observation.intrinsics.{camera}" for camera in cameras if camera not in self.camera_intrinsics
+        ]
+        missing = [key for key in wanted if key not in given]
+        if missing:
+            raise ValueError(
+                f"--policy.depth_source=observation needs {', '.join(missing)}; the inputs are "
+                f"{sorted(given)}. Record with --depth and evaluate with --env.depth=true, or choose "
+                f"--policy.depth_source=none; --policy.camera_intrinsics stands in for intrinsics"
             )
 
     def grid_settings(self) -> GridSettings:

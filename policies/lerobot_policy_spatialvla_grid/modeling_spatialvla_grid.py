@@ -347,11 +347,13 @@ class SpatialvlaGridPolicy(PreTrainedPolicy):
         if config.depth_source == "none":
             return pixels.new_full((len(pixels), size, size, 3), torch.nan)
         image_size = windows.image_size
+        depth = None if self.zoedepth is not None else observed_depth(batch, camera, image_size)
         default = None if self.zoedepth is None else default_intrinsics(*image_size)
         intrinsics = observed_intrinsics(batch, camera, config.camera_intrinsics, default)
         intrinsics = crop_intrinsics(intrinsics.to(pixels.device), windows)
-        if self.zoedepth is None:
-            return lattice_points(windows.cut(observed_depth(batch, camera, image_size)), intrinsics, size)
+        if depth is not None:
+            return lattice_points(windows.cut(depth), intrinsics, size)
+        assert self.zoedepth is not None
         side = self.backbone.image_size
         intrinsics = resize_intrinsics(intrinsics, (windows.height, windows.width), (side, side))
         return lattice_points(self.zoedepth(pixels), intrinsics, size)
