@@ -96,11 +96,7 @@ def quantisation_errors(grids: ActionGrids, actions_ND: np.ndarray) -> dict[str,
 
 def _mean_error(grids: ActionGrids, actions_ND: np.ndarray, point: str) -> np.ndarray:
     """(D,) mean absolute error."""
-    cells_NG = grids.encode(torch.from_numpy(actions_ND))
-    parts = [grids.decode_group(i, cells_NG[:, i], point) for i in range(len(grids.groups))]
-    decoded_ND = np.empty_like(actions_ND)
-    for group, part in zip(grids.groups, parts, strict=True):
-        decoded_ND[:, group.dims] = part.numpy()
+    decoded_ND = grids.decode(grids.encode(torch.from_numpy(actions_ND)), point).numpy()
     return np.abs(decoded_ND - actions_ND).mean(axis=0)
 
 

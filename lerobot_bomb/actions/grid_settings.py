@@ -3,6 +3,7 @@
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Any
 
 from lerobot_bomb.flags import one_of
 
@@ -41,6 +42,14 @@ class ActionGroup:
             raise ValueError(f"{FLAG}: a binary group has bins [2], not {list(self.bins)}")
         if not all(2 <= bins <= MAX_BINS for bins in self.bins):
             raise ValueError(f"{FLAG}: bins {list(self.bins)} must each be in 2..{MAX_BINS}")
+
+    @classmethod
+    def from_dict(cls, group: dict[str, Any]) -> "ActionGroup":
+        """Of JSON."""
+        keys = {"dims", "transform", "bins"}
+        if set(group) != keys:
+            raise ValueError(f"{FLAG}: {group} must have exactly the keys {sorted(keys)}")
+        return cls(tuple(group["dims"]), group["transform"], tuple(group["bins"]))
 
     @property
     def num_cells(self) -> int:

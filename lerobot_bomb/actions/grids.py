@@ -82,9 +82,9 @@ class ActionGrids(nn.Module):
         cells = [self._cell(i, bins_CN[rows]) for i, rows in enumerate(self._rows)]
         return torch.stack(cells, dim=-1).view(*actions.shape[:-1], len(self.groups))
 
-    def decode(self, cells: Tensor) -> Tensor:
-        """(..., G) -> (..., D) float32 in [-1, 1]."""
-        parts = [self.decode_group(i, cells[..., i]) for i in range(len(self.groups))]
+    def decode(self, cells: Tensor, point: str | None = None) -> Tensor:
+        """(..., G) -> (..., D) float32 in [-1, 1]; ``point``: another decode point than the grid's."""
+        parts = [self.decode_group(i, cells[..., i], point) for i in range(len(self.groups))]
         return torch.cat(parts, dim=-1)[..., self._order]
 
     def decode_group(self, index: int, cells: Tensor, point: str | None = None) -> Tensor:
@@ -212,10 +212,7 @@ class ActionGrids(nn.Module):
     def from_dict(cls, parameters: dict[str, Any], num_dims: int) -> Self:
         """The grid of `to_dict` for actions of ``num_dims`` dims."""
         settings = dict(parameters["settings"])
-        groups = tuple(
-            ActionGroup(tuple(of["dims"]), of["transform"], tuple(of["bins"]))
-            for of in settings.pop("groups")
-        )
+        groups = tuple(map(ActionGroup.from_dict, settings.pop("groups")))
         grids = cls(GridSettings(groups, **settings), num_dims)
         rows = (parameters[key] for key in ("edges", "means", "gaussians"))
         cuts = [

@@ -70,7 +70,7 @@ class CachedContinuation(Continuation):
         self._text = CachedText(
             backbone.vlm.model.text_model, len(prompt_BLH), prompt_BLH.shape[1] + max_symbols
         )
-        columns_BL = (written_BL.cumsum(dim=1) - 1).masked_fill(~written_BL, self._text.unread_column)
+        columns_BL = self._text.columns_of(written_BL)
         self._prompt: tuple[Tensor, Tensor] | None = prompt_BLH, columns_BL
 
     def __call__(self, symbol_BK: Tensor, first_B: Tensor) -> Tensor:

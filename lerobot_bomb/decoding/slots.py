@@ -24,7 +24,7 @@ class PromptContinuation:
     def __init__(self, text: CachedText, prompt_BLH: Tensor, written_BL: Tensor, *, prompt_reads_all: bool):
         self._text = text
         self._column_B1 = written_BL.sum(dim=1, keepdim=True) - 1
-        columns_BL = (written_BL.cumsum(dim=1) - 1).masked_fill(~written_BL, text.unread_column)
+        columns_BL = text.columns_of(written_BL)
         reach_BL = self._column_B1.expand_as(columns_BL) if prompt_reads_all else columns_BL
         hidden_BLH = text(prompt_BLH, columns_BL, reach_BL)
         self.hidden = hidden_BLH[:, -1]  # (B, H) after the newest token

@@ -86,6 +86,10 @@ class CachedText:
                 x_BKH = x_BKH + self._mix(layer.mlp, _norm(layer.post_attention_layernorm, x_BKH))
         return _norm(self._model.norm, x_BKH)
 
+    def columns_of(self, written_BL: Tensor) -> Tensor:
+        """Which columns of rows hold a token -> (B, L) its column in the cache, gaps out of the way."""
+        return (written_BL.cumsum(dim=1) - 1).masked_fill(~written_BL, self.unread_column)
+
     def keep(self, row_B: Tensor) -> None:
         """Only these rows are gone on with, in this order."""
         self._caches = [cache[:, row_B] for cache in self._caches]

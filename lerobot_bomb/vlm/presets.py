@@ -7,6 +7,26 @@ from tokenizers import Tokenizer
 # 1 / sqrt(width): SmolVLM's 0.02 suits its own width; at this one it starts all layers near zero
 INITIALIZER_RANGE = 0.08
 
+NANO_VISION = {
+    "hidden_size": 96,
+    "intermediate_size": 256,
+    "num_hidden_layers": 3,
+    "num_attention_heads": 3,
+    "image_size": 128,
+    "patch_size": 16,
+    "initializer_range": INITIALIZER_RANGE,
+}
+NANO_TEXT = {
+    "hidden_size": 128,
+    "intermediate_size": 320,
+    "num_hidden_layers": 4,
+    "num_attention_heads": 4,
+    "num_key_value_heads": 2,
+    "head_dim": 32,
+    "max_position_embeddings": 4096,
+    "initializer_range": INITIALIZER_RANGE,
+}
+
 
 def nano_config(tokenizer: Tokenizer) -> dict[str, Any]:
     """Config of a SmolVLM of about a million parameters for 128x128 images, 16 tokens each."""
@@ -16,27 +36,12 @@ def nano_config(tokenizer: Tokenizer) -> dict[str, Any]:
         "pad_token_id": tokenizer.token_to_id("<|im_end|>"),
         "scale_factor": 2,
         "tie_word_embeddings": False,
-        "vision_config": {
-            "hidden_size": 96,
-            "intermediate_size": 256,
-            "num_hidden_layers": 3,
-            "num_attention_heads": 3,
-            "image_size": 128,
-            "patch_size": 16,
-            "initializer_range": INITIALIZER_RANGE,
-        },
+        "vision_config": dict(NANO_VISION),
         "text_config": {
+            **NANO_TEXT,
             "model_type": "llama",
             "vocab_size": tokenizer.get_vocab_size(),
-            "hidden_size": 128,
-            "intermediate_size": 320,
-            "num_hidden_layers": 4,
-            "num_attention_heads": 4,
-            "num_key_value_heads": 2,
-            "head_dim": 32,
-            "max_position_embeddings": 4096,
             "rms_norm_eps": 1e-5,
-            "initializer_range": INITIALIZER_RANGE,
             "pad_token_id": tokenizer.token_to_id("<|im_end|>"),
             "bos_token_id": tokenizer.token_to_id("<|im_start|>"),
             "eos_token_id": tokenizer.token_to_id("<end_of_utterance>"),
@@ -53,28 +58,15 @@ def nano_paligemma_config(tokenizer: Tokenizer) -> dict[str, Any]:
         "projection_dim": 128,
         "hidden_size": 128,
         "vision_config": {
+            **NANO_VISION,
             "model_type": "siglip_vision_model",
-            "hidden_size": 96,
-            "intermediate_size": 256,
-            "num_hidden_layers": 3,
-            "num_attention_heads": 3,
-            "image_size": 128,
-            "patch_size": 16,
             "vision_use_head": False,
-            "initializer_range": INITIALIZER_RANGE,
         },
         "text_config": {
+            **NANO_TEXT,
             "model_type": "gemma2",
             "vocab_size": tokenizer.get_vocab_size(),
-            "hidden_size": 128,
-            "intermediate_size": 320,
-            "num_hidden_layers": 4,
-            "num_attention_heads": 4,
-            "num_key_value_heads": 2,
-            "head_dim": 32,
             "query_pre_attn_scalar": 32,
-            "max_position_embeddings": 4096,
-            "initializer_range": INITIALIZER_RANGE,
             "pad_token_id": tokenizer.token_to_id("<|im_end|>"),
             "bos_token_id": tokenizer.token_to_id("<|im_start|>"),
             "eos_token_id": tokenizer.token_to_id("<end_of_utterance>"),

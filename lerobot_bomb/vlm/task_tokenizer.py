@@ -1,4 +1,4 @@
-"""The processor step that turns an instruction into tokens.
+"""The processor step that turns an instruction into tokens, and the pipelines around it.
 
 It reads only the task; everything else of a prompt depends on a policy's config and is put together inside
 the policy.
@@ -8,8 +8,16 @@ from dataclasses import dataclass, field
 from typing import Any
 
 import torch
-from lerobot.configs import PipelineFeatureType, PolicyFeature
-from lerobot.processor import ObservationProcessorStep, ProcessorStepRegistry, TransitionKey
+from lerobot.configs import PipelineFeatureType, PolicyFeature, PreTrainedConfig
+from lerobot.processor import (
+    ObservationProcessorStep,
+    PolicyAction,
+    PolicyProcessorPipeline,
+    ProcessorStepRegistry,
+    TransitionKey,
+    make_default_policy_processor_steps,
+    make_policy_processor_pipelines,
+)
 from lerobot.utils.constants import OBS_LANGUAGE_ATTENTION_MASK, OBS_LANGUAGE_TOKENS
 from tokenizers import Tokenizer
 from torch import Tensor
@@ -71,3 +79,25 @@ class TaskTokenizerStep(ObservationProcessorStep):
         self, features: dict[PipelineFeatureType, dict[str, PolicyFeature]]
     ) -> dict[PipelineFeatureType, dict[str, PolicyFeature]]:
         return features
+
+
+def make_task_processors(
+    config: PreTrainedConfig,
+    dataset_stats: dict[str, dict[str, Tensor]] | None,
+    tokenizer_step: TaskTokenizerStep,
+) -> tuple[
+    PolicyProcessorPipeline[dict[str, Any], dict[str, Any]],
+    PolicyProcessorPipeline[PolicyAction, PolicyAction],
+]:
+    """Rename, batch, tokenize, device, normalise; and unnormalise, to CPU."""
+    steps = make_default_policy_processor_steps(config, dataset_stats)
+    return make_policy_processor_pipelines(
+        input_steps=[
+            steps.rename_observations,
+            steps.add_batch_dim,
+            tokenizer_step,
+            steps.to_device,
+            steps.normalize,
+        ],
+        output_steps=[steps.unnormalize, steps.to_cpu],
+    )

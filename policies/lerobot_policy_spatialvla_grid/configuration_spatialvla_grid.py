@@ -1,6 +1,5 @@
 """Config of ``spatialvla_grid``."""
 
-import math
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -11,6 +10,18 @@ from lerobot.utils.constants import OBS_IMAGES
 from lerobot_bomb.actions.ensemble import WEIGHTINGS
 from lerobot_bomb.actions.grid_settings import ActionGroup, GridSettings, check_groups, default_groups
 from lerobot_bomb.flags import flag_errors, one_of
+from lerobot_bomb.policy_flags import (
+    adamw,
+    check_cameras_and_action,
+    check_chunk,
+    check_ensemble,
+    check_model_name_and_precision,
+    check_not_negative,
+    check_positive,
+    check_state,
+    check_training,
+    cosine_decay,
+)
 
 DTYPES = ("float32", "bfloat16")
 # modes that map the data into [-1, 1], where the grids are
@@ -128,10 +139,13 @@ class SpatialvlaGridConfig(PreTrainedConfig):
         super().__post_init__()
         with flag_errors():
             self._check_choices()
-            self._check_chunk()
+            check_chunk(self)
+            check_ensemble(self)
             if self.action_feature is not None:
                 self.grid_settings()
-            self._check_training()
+            check_training(self)
+            check_not_negative(self, ("grid_min_sigma",))
+            check_positive(self, ("ego3d_patch_reso", "ego3d_n_freqs"))
 
     def _check_choices(self) -> None:
         for flag, allowed in {
@@ -142,15 +156,7 @@ class SpatialvlaGridConfig(PreTrainedConfig):
             "temporal_ensemble_weighting": WEIGHTINGS,
         }.items():
             one_of(f"--policy.{flag}", getattr(self, flag), allowed)
-        if not self.vlm_model_name:
-            raise ValueError(
-                "--policy.vlm_model_name is empty; give a Hub id, the path of a local folder, or nano"
-            )
-        if self.use_amp:
-            raise ValueError(
-                "--policy.use_amp=true is not used by spatialvla_grid, in training or evaluation; "
-                "give --policy.dtype=bfloat16 instead"
-            )
+        check_model_name_and_precision(self)
         for kind, allowed in {
             "VISUAL": (NormalizationMode.IDENTITY,),
             "STATE": BOUNDED_MODES,
@@ -158,74 +164,10 @@ class SpatialvlaGridConfig(PreTrainedConfig):
         }.items():
             one_of(f"--policy.normalization_mapping[{kind}]", self.normalization_mapping.get(kind), allowed)
 
-    def _check_chunk(self) -> None:
-        if self.n_obs_steps != 1:
-            raise ValueError(
-                f"--policy.n_obs_steps={self.n_obs_steps}: spatialvla_grid reads 1 observation step"
-            )
-        if self.chunk_size < 1:
-            raise ValueError(f"--policy.chunk_size={self.chunk_size} must be at least 1")
-        if not 1 <= self.n_action_steps <= self.chunk_size:
-            raise ValueError(
-                f"--policy.n_action_steps={self.n_action_steps} must lie in 1..{self.chunk_size} "
-                f"(--policy.chunk_size)"
-            )
-        size = self.temporal_ensemble_size
-        if not 0 <= size <= self.chunk_size:
-            raise ValueError(
-                f"--policy.temporal_ensemble_size={size} must be 0 (no ensemble) or lie in "
-                f"1..{self.chunk_size} (--policy.chunk_size)"
-            )
-        if size and self.n_action_steps != 1:
-            raise ValueError(
-                f"--policy.temporal_ensemble_size={size} predicts at every step and needs "
-                f"--policy.n_action_steps=1; got {self.n_action_steps}, which is a queue"
-            )
-        if not math.isfinite(self.temporal_ensemble_coefficient):
-            raise ValueError(
-                f"--policy.temporal_ensemble_coefficient={self.temporal_ensemble_coefficient} must be finite"
-            )
-
-    def _check_training(self) -> None:
-        if not 0 < self.crop_fraction <= 1:
-            raise ValueError(f"--policy.crop_fraction={self.crop_fraction} must lie in (0, 1]")
-        for flag in ("ego3d_patch_reso", "ego3d_n_freqs", "scheduler_decay_steps"):
-            if getattr(self, flag) < 1:
-                raise ValueError(f"--policy.{flag}={getattr(self, flag)} must be at least 1")
-        for flag in (
-            "grid_min_sigma",
-            "drop_n_last_frames",
-            "optimizer_lr",
-            "scheduler_decay_lr",
-            "optimizer_weight_decay",
-            "scheduler_warmup_steps",
-        ):
-            if getattr(self, flag) < 0:
-                raise ValueError(f"--policy.{flag}={getattr(self, flag)} must not be negative")
-
     def validate_features(self) -> None:
         """Raise unless the dataset (or environment) has what the policy reads and writes."""
-        if not self.image_features:
-            raise ValueError(
-                f"spatialvla_grid needs at least one camera; the dataset has the inputs "
-                f"{sorted(self.input_features or {})}"
-            )
-        for key, feature in self.image_features.items():
-            if len(feature.shape) != 3 or feature.shape[0] != 3:
-                raise ValueError(
-                    f"camera {key!r} has shape {feature.shape}; spatialvla_grid needs (3, height, width)"
-                )
-        if self.action_feature is None or len(self.action_feature.shape) != 1:
-            raise ValueError(
-                f"spatialvla_grid needs the feature 'action' of shape (D,); got {self.output_features}"
-            )
-        state = self.robot_state_feature
-        if self.use_state and (state is None or len(state.shape) != 1):
-            raise ValueError(
-                f"--policy.use_state=true needs the feature 'observation.state' of shape (S,); the inputs "
-                f"are {sorted(self.input_features or {})}. Give --policy.use_state=false to do without"
-            )
-
+        check_cameras_and_action(self)
+        check_state(self, ("use_state",))
         if self.depth_source == "observation":
             self._check_depth()
 
@@ -254,7 +196,7 @@ class SpatialvlaGridConfig(PreTrainedConfig):
         (num_dims,) = self.action_feature.shape
         groups = default_groups(num_dims)
         if self.action_groups is not None:
-            groups = tuple(_read_group(group) for group in self.action_groups)
+            groups = tuple(ActionGroup.from_dict(group) for group in self.action_groups)
             check_groups(groups, num_dims)
         return GridSettings(
             groups,
@@ -267,21 +209,10 @@ class SpatialvlaGridConfig(PreTrainedConfig):
         )
 
     def get_optimizer_preset(self) -> AdamWConfig:
-        return AdamWConfig(
-            lr=self.optimizer_lr,
-            betas=self.optimizer_betas,
-            eps=self.optimizer_eps,
-            weight_decay=self.optimizer_weight_decay,
-            grad_clip_norm=self.optimizer_grad_clip_norm,
-        )
+        return adamw(self)
 
     def get_scheduler_preset(self) -> CosineDecayWithWarmupSchedulerConfig:
-        return CosineDecayWithWarmupSchedulerConfig(
-            num_warmup_steps=self.scheduler_warmup_steps,
-            num_decay_steps=self.scheduler_decay_steps,
-            peak_lr=self.optimizer_lr,
-            decay_lr=self.scheduler_decay_lr,
-        )
+        return cosine_decay(self)
 
     @property
     def observation_delta_indices(self) -> None:
@@ -294,10 +225,3 @@ class SpatialvlaGridConfig(PreTrainedConfig):
     @property
     def reward_delta_indices(self) -> None:
         return None
-
-
-def _read_group(group: dict[str, Any]) -> ActionGroup:
-    keys = {"dims", "transform", "bins"}
-    if set(group) != keys:
-        raise ValueError(f"--policy.action_groups: {group} must have exactly the keys {sorted(keys)}")
-    return ActionGroup(tuple(group["dims"]), group["transform"], tuple(group["bins"]))

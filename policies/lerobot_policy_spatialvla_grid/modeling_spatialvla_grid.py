@@ -73,6 +73,7 @@ class SpatialvlaGridPolicy(PreTrainedPolicy):
     config: SpatialvlaGridConfig
     symbol_ids: Tensor
     action_unit: Tensor
+    first_cells: Tensor  # (G,) int64, of each group among all cells
     # modules that FSDP shards one by one; accelerate reads the second name
     _fsdp_wrap_modules: ClassVar[list[str]] = ["Gemma2DecoderLayer", "SiglipEncoderLayer"]
     _no_split_modules = _fsdp_wrap_modules
@@ -93,6 +94,7 @@ class SpatialvlaGridPolicy(PreTrainedPolicy):
             config.ego3d_zero_init,
         )
         self.grids = _make_grids(config, dataset_meta)
+        self.register_buffer("first_cells", torch.tensor(self.grids.offsets), persistent=False)
         hidden_size = self.backbone.text_config.hidden_size
         self.cell_embedding = nn.Embedding(self.grids.num_tokens, hidden_size)
         self.cell_head = nn.Linear(hidden_size, self.grids.num_tokens, bias=False)
@@ -186,7 +188,7 @@ class SpatialvlaGridPolicy(PreTrainedPolicy):
     def _hidden(self, batch: dict[str, Tensor], cells_BTG: Tensor) -> Tensor:
         """(B, T, G, H) teacher-forced states that predict the cells."""
         prompt = self._prompt(batch)
-        cells_BS = (cells_BTG + self._offsets).flatten(1)
+        cells_BS = (cells_BTG + self.first_cells).flatten(1)
         embeds_BXH = torch.cat([self._embeds(batch, prompt.ids), self._embed_cells(cells_BS[:, :-1])], dim=1)
         written_BX = torch.cat([prompt.written, torch.ones_like(cells_BS[:, 1:], dtype=torch.bool)], dim=1)
         index_X = torch.arange(written_BX.shape[1], device=written_BX.device)
@@ -208,7 +210,7 @@ class SpatialvlaGridPolicy(PreTrainedPolicy):
             chosen.append(logits_BTC.detach().argmax(dim=-1))
             labels_BT = cells_BTG[..., group]
             if self.config.loss_vocab == "full":
-                logits_BTC, labels_BT = self._full_logits(hidden_BTH), labels_BT + self._offsets[group]
+                logits_BTC, labels_BT = self._full_logits(hidden_BTH), labels_BT + self.first_cells[group]
             losses.append(cross_entropy(logits_BTC.transpose(1, 2), labels_BT, reduction="none"))
         return torch.stack(losses, dim=2), torch.stack(chosen, dim=2)
 
@@ -303,10 +305,6 @@ class SpatialvlaGridPolicy(PreTrainedPolicy):
         rows = self.cell_head.weight[first : first + self.grids.num_cells[group]]
         return self.backbone.cap(linear(hidden, rows))
 
-    @property
-    def _offsets(self) -> Tensor:
-        return torch.tensor(self.grids.offsets, device=self.symbol_ids.device)
-
     # Prompt
 
     def _prompt(self, batch: dict[str, Tensor]) -> TokenRows:
@@ -346,17 +344,15 @@ class SpatialvlaGridPolicy(PreTrainedPolicy):
         config, size = self.config, self.ego3d.lattice_size
         if config.depth_source == "none":
             return pixels.new_full((len(pixels), size, size, 3), torch.nan)
-        image_size = windows.image_size
-        depth = None if self.zoedepth is not None else observed_depth(batch, camera, image_size)
-        default = None if self.zoedepth is None else default_intrinsics(*image_size)
+        if self.zoedepth is None:
+            depth, default = windows.cut(observed_depth(batch, camera, windows.image_size)), None
+        else:
+            depth, default = self.zoedepth(pixels), default_intrinsics(*windows.image_size)
         intrinsics = observed_intrinsics(batch, camera, config.camera_intrinsics, default)
         intrinsics = crop_intrinsics(intrinsics.to(pixels.device), windows)
-        if depth is not None:
-            return lattice_points(windows.cut(depth), intrinsics, size)
-        assert self.zoedepth is not None
-        side = self.backbone.image_size
-        intrinsics = resize_intrinsics(intrinsics, (windows.height, windows.width), (side, side))
-        return lattice_points(self.zoedepth(pixels), intrinsics, size)
+        depth_size = depth.shape[-2], depth.shape[-1]
+        intrinsics = resize_intrinsics(intrinsics, (windows.height, windows.width), depth_size)
+        return lattice_points(depth, intrinsics, size)
 
     def _read(self, batch: dict[str, Tensor], key: str) -> Tensor:
         return read_tensor(batch, key, self.config.type, self.symbol_ids.device)

@@ -2,15 +2,10 @@
 
 from typing import Any
 
-from lerobot.processor import (
-    PolicyAction,
-    PolicyProcessorPipeline,
-    make_default_policy_processor_steps,
-    make_policy_processor_pipelines,
-)
+from lerobot.processor import PolicyAction, PolicyProcessorPipeline
 from torch import Tensor
 
-from lerobot_bomb.vlm.task_tokenizer import TaskTokenizerStep
+from lerobot_bomb.vlm.task_tokenizer import TaskTokenizerStep, make_task_processors
 from lerobot_bomb.vlm.tokenizer import load_tokenizer
 from lerobot_policy_spatialvla_grid.configuration_spatialvla_grid import SpatialvlaGridConfig
 
@@ -22,15 +17,5 @@ def make_spatialvla_grid_pre_post_processors(
     PolicyProcessorPipeline[PolicyAction, PolicyAction],
 ]:
     """Rename, batch, tokenize, device, normalise; and unnormalise, to CPU."""
-    steps = make_default_policy_processor_steps(config, dataset_stats)
-    tokenizer = TaskTokenizerStep(load_tokenizer(config.vlm_model_name))
-    return make_policy_processor_pipelines(
-        input_steps=[
-            steps.rename_observations,
-            steps.add_batch_dim,
-            tokenizer,
-            steps.to_device,
-            steps.normalize,
-        ],
-        output_steps=[steps.unnormalize, steps.to_cpu],
-    )
+    tokenizer_step = TaskTokenizerStep(load_tokenizer(config.vlm_model_name))
+    return make_task_processors(config, dataset_stats, tokenizer_step)

@@ -1,6 +1,5 @@
 """Config of ``vla0_smol``."""
 
-import math
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -12,6 +11,16 @@ from lerobot_bomb.actions.ensemble import WEIGHTINGS
 from lerobot_bomb.actions.relative import named_dims
 from lerobot_bomb.actions.text import MASK_LEVELS, MAX_DIGITS, digits_needed
 from lerobot_bomb.flags import flag_errors, one_of
+from lerobot_bomb.policy_flags import (
+    adamw,
+    check_cameras_and_action,
+    check_chunk,
+    check_ensemble,
+    check_model_name_and_precision,
+    check_state,
+    check_training,
+    cosine_decay,
+)
 
 DRAFTS = ("none", "linear")
 DTYPES = ("float32", "bfloat16")
@@ -122,8 +131,8 @@ class Vla0SmolConfig(PreTrainedConfig):
         super().__post_init__()
         with flag_errors():
             self._check_choices()
-            self._check_chunk()
-            self._check_ensemble()
+            check_chunk(self)
+            check_ensemble(self)
             self._check_numbers()
             self._check_training()
 
@@ -133,52 +142,13 @@ class Vla0SmolConfig(PreTrainedConfig):
         one_of("--policy.draft", self.draft, DRAFTS)
         one_of("--policy.dtype", self.dtype, DTYPES)
         one_of("--policy.temporal_ensemble_weighting", self.temporal_ensemble_weighting, WEIGHTINGS)
-        if not self.vlm_model_name:
-            raise ValueError(
-                "--policy.vlm_model_name is empty; give a Hub id, the path of a local folder, or nano"
-            )
-        if self.use_amp:
-            raise ValueError(
-                "--policy.use_amp=true is not used by vla0_smol, in training or evaluation; "
-                "give --policy.dtype=bfloat16 instead"
-            )
+        check_model_name_and_precision(self)
         for kind, allowed in {
             "VISUAL": (NormalizationMode.IDENTITY,),
             "STATE": BOUNDED_MODES,
             "ACTION": BOUNDED_MODES,
         }.items():
             one_of(f"--policy.normalization_mapping[{kind}]", self.normalization_mapping.get(kind), allowed)
-
-    def _check_chunk(self) -> None:
-        if self.n_obs_steps != 1:
-            raise ValueError(f"--policy.n_obs_steps={self.n_obs_steps}: vla0_smol reads 1 observation step")
-        if self.chunk_size < 1:
-            raise ValueError(f"--policy.chunk_size={self.chunk_size} must be at least 1")
-        if not 1 <= self.n_action_steps <= self.chunk_size:
-            raise ValueError(
-                f"--policy.n_action_steps={self.n_action_steps} must lie in 1..{self.chunk_size} "
-                f"(--policy.chunk_size)"
-            )
-        if self.drop_n_last_frames < 0:
-            raise ValueError(f"--policy.drop_n_last_frames={self.drop_n_last_frames} must not be negative")
-
-    def _check_ensemble(self) -> None:
-        size = self.temporal_ensemble_size
-        if not 0 <= size <= self.chunk_size:
-            raise ValueError(
-                f"--policy.temporal_ensemble_size={size} must be 0 (no ensemble) or lie in "
-                f"1..{self.chunk_size} (--policy.chunk_size)"
-            )
-        if size and self.n_action_steps != 1:
-            raise ValueError(
-                f"--policy.temporal_ensemble_size={size} predicts at every step and needs "
-                f"--policy.n_action_steps=1; got {self.n_action_steps}, which is a queue"
-            )
-
-        if not math.isfinite(self.temporal_ensemble_coefficient):
-            raise ValueError(
-                f"--policy.temporal_ensemble_coefficient={self.temporal_ensemble_coefficient} must be finite"
-            )
 
     def _check_numbers(self) -> None:
         for flag, bins in {"n_action_bins": self.n_action_bins, "n_state_bins": self.n_state_bins}.items():
@@ -191,47 +161,15 @@ class Vla0SmolConfig(PreTrainedConfig):
                 )
 
     def _check_training(self) -> None:
-        if not 0 < self.crop_fraction <= 1:
-            raise ValueError(f"--policy.crop_fraction={self.crop_fraction} must lie in (0, 1]")
+        check_training(self)
         for flag in ("mask_max_fraction", "mask_skip_prob"):
             if not 0 <= getattr(self, flag) <= 1:
                 raise ValueError(f"--policy.{flag}={getattr(self, flag)} must lie in 0..1")
-        for flag in (
-            "optimizer_lr",
-            "scheduler_decay_lr",
-            "optimizer_weight_decay",
-            "scheduler_warmup_steps",
-        ):
-            if getattr(self, flag) < 0:
-                raise ValueError(f"--policy.{flag}={getattr(self, flag)} must not be negative")
-        if self.scheduler_decay_steps < 1:
-            raise ValueError(
-                f"--policy.scheduler_decay_steps={self.scheduler_decay_steps} must be at least 1"
-            )
 
     def validate_features(self) -> None:
         """Raise unless the dataset (or environment) has what the policy reads and writes."""
-        if not self.image_features:
-            raise ValueError(
-                f"vla0_smol needs at least one camera; the dataset has the inputs "
-                f"{sorted(self.input_features or {})}"
-            )
-        for key, feature in self.image_features.items():
-            if len(feature.shape) != 3 or feature.shape[0] != 3:
-                raise ValueError(
-                    f"camera {key!r} has shape {feature.shape}; vla0_smol needs (3, height, width)"
-                )
-        if self.action_feature is None or len(self.action_feature.shape) != 1:
-            raise ValueError(
-                f"vla0_smol needs the feature 'action' of shape (D,); got {self.output_features}"
-            )
-        for flag in ("use_state", "relative_actions"):
-            state = self.robot_state_feature
-            if getattr(self, flag) and (state is None or len(state.shape) != 1):
-                raise ValueError(
-                    f"--policy.{flag}=true needs the feature 'observation.state' of shape (S,); the inputs "
-                    f"are {sorted(self.input_features or {})}. Give --policy.{flag}=false to do without"
-                )
+        check_cameras_and_action(self)
+        check_state(self, ("use_state", "relative_actions"))
 
     @property
     def action_names(self) -> list[str]:
@@ -269,21 +207,10 @@ class Vla0SmolConfig(PreTrainedConfig):
         return dict(zip(dims, indices, strict=True))
 
     def get_optimizer_preset(self) -> AdamWConfig:
-        return AdamWConfig(
-            lr=self.optimizer_lr,
-            betas=self.optimizer_betas,
-            eps=self.optimizer_eps,
-            weight_decay=self.optimizer_weight_decay,
-            grad_clip_norm=self.optimizer_grad_clip_norm,
-        )
+        return adamw(self)
 
     def get_scheduler_preset(self) -> CosineDecayWithWarmupSchedulerConfig:
-        return CosineDecayWithWarmupSchedulerConfig(
-            num_warmup_steps=self.scheduler_warmup_steps,
-            num_decay_steps=self.scheduler_decay_steps,
-            peak_lr=self.optimizer_lr,
-            decay_lr=self.scheduler_decay_lr,
-        )
+        return cosine_decay(self)
 
     @property
     def observation_delta_indices(self) -> None:

@@ -2,16 +2,11 @@
 
 from typing import Any
 
-from lerobot.processor import (
-    PolicyAction,
-    PolicyProcessorPipeline,
-    make_default_policy_processor_steps,
-    make_policy_processor_pipelines,
-)
+from lerobot.processor import PolicyAction, PolicyProcessorPipeline
 from torch import Tensor
 
 from lerobot_bomb.vlm.prompt import TASK_TEMPLATE
-from lerobot_bomb.vlm.task_tokenizer import TaskTokenizerStep
+from lerobot_bomb.vlm.task_tokenizer import TaskTokenizerStep, make_task_processors
 from lerobot_bomb.vlm.tokenizer import load_tokenizer
 from lerobot_policy_vla0_smol.configuration_vla0_smol import Vla0SmolConfig
 
@@ -23,15 +18,5 @@ def make_vla0_smol_pre_post_processors(
     PolicyProcessorPipeline[PolicyAction, PolicyAction],
 ]:
     """Rename, batch, tokenize, device, normalise; and unnormalise, to CPU."""
-    steps = make_default_policy_processor_steps(config, dataset_stats)
-    tokenizer = TaskTokenizerStep(load_tokenizer(config.vlm_model_name), TASK_TEMPLATE)
-    return make_policy_processor_pipelines(
-        input_steps=[
-            steps.rename_observations,
-            steps.add_batch_dim,
-            tokenizer,
-            steps.to_device,
-            steps.normalize,
-        ],
-        output_steps=[steps.unnormalize, steps.to_cpu],
-    )
+    tokenizer_step = TaskTokenizerStep(load_tokenizer(config.vlm_model_name), TASK_TEMPLATE)
+    return make_task_processors(config, dataset_stats, tokenizer_step)

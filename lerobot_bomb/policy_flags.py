@@ -1,0 +1,136 @@
+"""Checks and presets that the configs of all our policies share; errors name the flag.
+
+A config calls those of the fields that it has.
+"""
+
+import math
+from collections.abc import Iterable
+from typing import Any
+
+from lerobot.optim import AdamWConfig, CosineDecayWithWarmupSchedulerConfig
+
+
+def check_model_name_and_precision(config: Any) -> None:
+    """A backbone is named, and precision is left to ``dtype``."""
+    if not config.vlm_model_name:
+        raise ValueError(
+            "--policy.vlm_model_name is empty; give a Hub id, the path of a local folder, or nano"
+        )
+    if config.use_amp:
+        raise ValueError(
+            f"--policy.use_amp=true is not used by {config.type}, in training or evaluation; "
+            f"give --policy.dtype=bfloat16 instead"
+        )
+
+
+def check_chunk(config: Any) -> None:
+    """One observation step, and of a chunk's actions some are executed."""
+    if config.n_obs_steps != 1:
+        raise ValueError(f"--policy.n_obs_steps={config.n_obs_steps}: {config.type} reads 1 observation step")
+    if config.chunk_size < 1:
+        raise ValueError(f"--policy.chunk_size={config.chunk_size} must be at least 1")
+    if not 1 <= config.n_action_steps <= config.chunk_size:
+        raise ValueError(
+            f"--policy.n_action_steps={config.n_action_steps} must lie in 1..{config.chunk_size} "
+            f"(--policy.chunk_size)"
+        )
+
+
+def check_ensemble(config: Any) -> None:
+    """A temporal ensemble fits the chunk and has no queue beside it."""
+    size = config.temporal_ensemble_size
+    if not 0 <= size <= config.chunk_size:
+        raise ValueError(
+            f"--policy.temporal_ensemble_size={size} must be 0 (no ensemble) or lie in "
+            f"1..{config.chunk_size} (--policy.chunk_size)"
+        )
+    if size and config.n_action_steps != 1:
+        raise ValueError(
+            f"--policy.temporal_ensemble_size={size} predicts at every step and needs "
+            f"--policy.n_action_steps=1; got {config.n_action_steps}, which is a queue"
+        )
+    if not math.isfinite(config.temporal_ensemble_coefficient):
+        raise ValueError(
+            f"--policy.temporal_ensemble_coefficient={config.temporal_ensemble_coefficient} must be finite"
+        )
+
+
+def check_training(config: Any) -> None:
+    """Crop, optimiser and schedule."""
+    if not 0 < config.crop_fraction <= 1:
+        raise ValueError(f"--policy.crop_fraction={config.crop_fraction} must lie in (0, 1]")
+    check_not_negative(
+        config,
+        (
+            "drop_n_last_frames",
+            "optimizer_lr",
+            "scheduler_decay_lr",
+            "optimizer_weight_decay",
+            "scheduler_warmup_steps",
+        ),
+    )
+    check_positive(config, ("scheduler_decay_steps",))
+
+
+def check_not_negative(config: Any, flags: Iterable[str]) -> None:
+    """Numbers of at least 0."""
+    for flag in flags:
+        if getattr(config, flag) < 0:
+            raise ValueError(f"--policy.{flag}={getattr(config, flag)} must not be negative")
+
+
+def check_positive(config: Any, flags: Iterable[str]) -> None:
+    """Whole numbers of at least 1."""
+    for flag in flags:
+        if getattr(config, flag) < 1:
+            raise ValueError(f"--policy.{flag}={getattr(config, flag)} must be at least 1")
+
+
+def check_cameras_and_action(config: Any) -> None:
+    """A camera at least, and one vector of actions."""
+    if not config.image_features:
+        raise ValueError(
+            f"{config.type} needs at least one camera; the dataset has the inputs "
+            f"{sorted(config.input_features or {})}"
+        )
+    for key, feature in config.image_features.items():
+        if len(feature.shape) != 3 or feature.shape[0] != 3:
+            raise ValueError(
+                f"camera {key!r} has shape {feature.shape}; {config.type} needs (3, height, width)"
+            )
+    if config.action_feature is None or len(config.action_feature.shape) != 1:
+        raise ValueError(
+            f"{config.type} needs the feature 'action' of shape (D,); got {config.output_features}"
+        )
+
+
+def check_state(config: Any, flags: Iterable[str]) -> None:
+    """The robot's state is there if one of these flags needs it."""
+    state = config.robot_state_feature
+    for flag in flags:
+        if getattr(config, flag) and (state is None or len(state.shape) != 1):
+            raise ValueError(
+                f"--policy.{flag}=true needs the feature 'observation.state' of shape (S,); the inputs "
+                f"are {sorted(config.input_features or {})}. Give --policy.{flag}=false to do without"
+            )
+
+
+def adamw(config: Any) -> AdamWConfig:
+    """Of the fields optimizer_*."""
+    return AdamWConfig(
+        lr=config.optimizer_lr,
+        betas=config.optimizer_betas,
+        eps=config.optimizer_eps,
+        weight_decay=config.optimizer_weight_decay,
+        grad_clip_norm=config.optimizer_grad_clip_norm,
+    )
+
+
+def cosine_decay(config: Any) -> CosineDecayWithWarmupSchedulerConfig:
+    """Of the fields scheduler_*."""
+    return CosineDecayWithWarmupSchedulerConfig(
+        num_warmup_steps=config.scheduler_warmup_steps,
+        num_decay_steps=config.scheduler_decay_steps,
+        peak_lr=config.optimizer_lr,
+        decay_lr=config.scheduler_decay_lr,
+    )
