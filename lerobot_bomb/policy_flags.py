@@ -3,6 +3,7 @@
 A config calls those of the fields that it has.
 """
 
+import json
 import math
 from collections.abc import Iterable
 from typing import Any
@@ -112,6 +113,22 @@ def check_state(config: Any, flags: Iterable[str]) -> None:
             raise ValueError(
                 f"--policy.{flag}=true needs the feature 'observation.state' of shape (S,); the inputs "
                 f"are {sorted(config.input_features or {})}. Give --policy.{flag}=false to do without"
+            )
+
+
+def trained_with(config: Any, flags: Iterable[str]) -> dict[str, Any]:
+    """The values of flags, as JSON has them."""
+    return json.loads(json.dumps({flag: getattr(config, flag) for flag in flags}))
+
+
+def check_as_trained(config: Any) -> None:
+    """A checkpoint's flags still are what its weights were trained with."""
+    then = config.trained_with or {}
+    for flag, value in trained_with(config, then).items():
+        if value != then[flag]:
+            raise ValueError(
+                f"--policy.{flag}={value!r}: this checkpoint was trained with {then[flag]!r}, which only "
+                f"another training can change"
             )
 
 

@@ -196,7 +196,7 @@ def test_it_does_so_in_real_vocabularies(shared_data: Path, name: str) -> None:
 def test_an_answer_longer_than_the_models_positions_is_refused(backbone: SmolVLMBackbone) -> None:
     rows = prompts(backbone, 0, [30])
     with pytest.raises(
-        ValueError, match=r"up to 4097 tokens, and the model has 4096 positions; give a smaller"
+        ValueError, match=r"take 4097 tokens, and the model has 4096 positions; give a smaller"
     ):
         continuation(backbone, rows, 4067)
     continuation(backbone, rows, 4066)

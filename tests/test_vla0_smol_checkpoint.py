@@ -146,6 +146,20 @@ def test_a_checkpoint_keeps_its_system_prompt(tmp_path: Path) -> None:
         Vla0SmolPolicy.from_pretrained(tmp_path, config=loaded.config)
 
 
+@pytest.mark.parametrize(
+    ("option", "value", "then"),
+    [("n_action_bins", 100, 512), ("chunk_size", 4, 3), ("bin_mode", "levels", "'centers'")],
+)
+def test_what_a_checkpoint_was_trained_with_cannot_be_changed_in_evaluation(
+    option: str, value: Any, then: Any, tmp_path: Path
+) -> None:
+    make_policy().save_pretrained(tmp_path)
+    config: Any = PreTrainedConfig.from_pretrained(tmp_path, cli_overrides=[f"--{option}={value}"])
+    message = rf"--policy.{option}={value!r}: this checkpoint was trained with {then}, which only another"
+    with pytest.raises(ValueError, match=message):
+        Vla0SmolPolicy.from_pretrained(tmp_path, config=config)
+
+
 def test_config_survives_as_json(tmp_path: Path) -> None:
     policy = make_policy(number_width=4)
     policy.config._save_pretrained(tmp_path)

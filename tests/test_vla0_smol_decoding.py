@@ -173,8 +173,13 @@ def test_a_batch_on_another_device_is_refused() -> None:
 
 
 def test_an_answer_that_does_not_fit_the_model_is_refused() -> None:
-    policy = make_policy(chunk_size=300, n_action_steps=300)
+    policy = make_policy(chunk_size=253, n_action_steps=253)
     with pytest.raises(
         ValueError, match=r"and the model has 4096 positions; give a smaller --policy.chunk_size"
     ):
         policy.predict_action_chunk(make_batch(policy, 1))
+
+
+def test_an_answer_that_can_never_fit_the_model_is_refused_before_training() -> None:
+    with pytest.raises(ValueError, match=r"prompt and answer take 4833 tokens, and the model has 4096"):
+        make_policy(chunk_size=300, n_action_steps=300)

@@ -6,6 +6,7 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
+from lerobot.configs import PreTrainedConfig
 from lerobot.datasets import LeRobotDataset, LeRobotDatasetMetadata
 from lerobot.policies import factory
 from vla0_smol_cases import make_batch, make_config, make_policy
@@ -89,6 +90,19 @@ def test_a_checkpoint_keeps_its_scale_and_new_data_replace_it(tmp_path: Path) ->
     assert fresh.relative is not None
     assert torch.equal(tuned.relative.scale, fresh.relative.scale)
     assert not torch.equal(tuned.relative.scale, policy.relative.scale)
+
+
+def test_another_training_may_change_what_numbers_mean(tmp_path: Path) -> None:
+    policy = build(make_dataset(tmp_path / "data", 0.1))
+    policy.save_pretrained(tmp_path / "checkpoint")
+    flags = ["--n_action_bins=100"]
+    config: Any = PreTrainedConfig.from_pretrained(tmp_path / "checkpoint", cli_overrides=flags)
+    data = make_dataset(tmp_path / "other", 0.9)
+    tuned = Vla0SmolPolicy.from_pretrained(tmp_path / "checkpoint", config=config, dataset_meta=data)
+    tuned.save_pretrained(tmp_path / "tuned")
+    stored: Any = PreTrainedConfig.from_pretrained(tmp_path / "tuned")
+    assert stored.trained_with["n_action_bins"] == 100
+    Vla0SmolPolicy.from_pretrained(tmp_path / "tuned", config=stored)
 
 
 def test_a_checkpoint_without_relative_actions_cannot_get_them(tmp_path: Path) -> None:

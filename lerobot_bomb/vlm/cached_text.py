@@ -7,6 +7,7 @@ Shapes: `B` batch, `K` tokens of a pass, `C` columns of the cache, `H` hidden si
 query heads for each, `E` size of a head.
 """
 
+import math
 from dataclasses import dataclass
 from typing import Any
 
@@ -26,6 +27,21 @@ class _Columns:
     penalty: Tensor  # (B, 1, K * G, columns in use): 0 for those that a query reads, else -inf
 
 
+def check_positions(config: Any, num_tokens: int) -> None:
+    """A text model of this config can read so many tokens.
+
+    Raises:
+        ValueError: it has fewer positions.
+    """
+    # layers with a sliding window see all of a shorter sequence
+    num_positions = min(config.max_position_embeddings, getattr(config, "sliding_window", None) or math.inf)
+    if num_tokens > num_positions:
+        raise ValueError(
+            f"prompt and answer take {num_tokens} tokens, and the model has {num_positions} positions; "
+            f"give a smaller --policy.chunk_size"
+        )
+
+
 class CachedText:
     """Hidden states of new tokens, which read what was cached before them.
 
@@ -39,15 +55,7 @@ class CachedText:
 
     def __init__(self, model: Any, batch_size: int, num_columns: int, first_position: int = 0):
         config = model.config
-        # layers with a sliding window see all of a shorter sequence
-        num_positions = min(
-            config.max_position_embeddings, getattr(config, "sliding_window", None) or torch.inf
-        )
-        if num_columns > num_positions:
-            raise ValueError(
-                f"prompt and answer take up to {num_columns} tokens, and the model has "
-                f"{num_positions} positions; give a smaller --policy.chunk_size"
-            )
+        check_positions(config, num_columns)
         self._model = model
         self._num_heads, self._num_groups = config.num_key_value_heads, config.num_attention_heads
         self._num_groups //= self._num_heads

@@ -32,6 +32,8 @@ BOUNDED_MODES = (
     NormalizationMode.IDENTITY,
 )
 MAX_BINS = 10**MAX_DIGITS
+# flags that say what the model's tokens mean
+AS_TRAINED = ("chunk_size", "n_action_bins", "n_state_bins", "bin_mode", "number_width", "use_state")
 
 
 @PreTrainedConfig.register_subclass("vla0_smol")
@@ -115,6 +117,8 @@ class Vla0SmolConfig(PreTrainedConfig):
     # "bfloat16" = autocast over float32 weights, in training and in evaluation
     dtype: str = "float32"
     gradient_checkpointing: bool = False
+    # values of AS_TRAINED; filled in for checkpoints
+    trained_with: dict[str, Any] | None = None
 
     optimizer_lr: float = 5e-5
     optimizer_betas: tuple[float, float] = (0.9, 0.95)

@@ -35,12 +35,14 @@ from lerobot_bomb.data.columns import dim_names, episode_bounds, read_columns
 from lerobot_bomb.decoding.decoder import CachedContinuation, decode_numbers
 from lerobot_bomb.decoding.draft import KnownSymbols, LinearDraft
 from lerobot_bomb.decoding.grammar import NumberGrammar
+from lerobot_bomb.policy_flags import check_as_trained, trained_with
 from lerobot_bomb.vlm.backbone import SmolVLMBackbone, build_backbone, config_dict, load_backbone
+from lerobot_bomb.vlm.cached_text import check_positions
 from lerobot_bomb.vlm.images import crop_and_resize
 from lerobot_bomb.vlm.inputs import read_actions, read_image, read_tensor
 from lerobot_bomb.vlm.prompt import PromptTokens
 from lerobot_bomb.vlm.tokenizer import load_tokenizer
-from lerobot_policy_vla0_smol.configuration_vla0_smol import Vla0SmolConfig
+from lerobot_policy_vla0_smol.configuration_vla0_smol import AS_TRAINED, Vla0SmolConfig
 
 
 class Vla0SmolPolicy(PreTrainedPolicy):
@@ -61,6 +63,7 @@ class Vla0SmolPolicy(PreTrainedPolicy):
         super().__init__(config)
         config.validate_features()
         _take_action_names(config, dataset_meta)
+        config.trained_with = trained_with(config, AS_TRAINED)
         self.tokens, self.backbone = _build(config)
         self.register_buffer("symbol_ids", torch.tensor(self.tokens.symbols), persistent=False)
         self.action_bins = Bins(config.n_action_bins, config.bin_mode)
@@ -68,6 +71,8 @@ class Vla0SmolPolicy(PreTrainedPolicy):
         self.grammar = NumberGrammar(
             config.n_action_bins, config.chunk_size * self._action_dim, fixed_width=config.number_width
         )
+        num_answer = self.grammar.max_symbols(self.grammar.num_numbers)
+        check_positions(self.backbone.text_config, len(self._cameras) * len(self._image_span) + num_answer)
         self._guess = (
             KnownSymbols(self.grammar)
             if config.draft == "none"
@@ -96,6 +101,8 @@ class Vla0SmolPolicy(PreTrainedPolicy):
     ) -> "Vla0SmolPolicy":
         """As LeRobot's, but a missing or unexpected tensor is an error; relative actions fit the new data."""
         _take_action_names(config, dataset_meta)
+        if config is not None and dataset_meta is None:
+            check_as_trained(config)
         try:
             policy = super().from_pretrained(*args, config=config, **{**kwargs, "strict": True})
         except RuntimeError as error:
