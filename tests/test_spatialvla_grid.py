@@ -5,7 +5,8 @@ from typing import Any
 
 import pytest
 import torch
-from spatialvla_grid_cases import SIZE, WORKSPACE, make_batch, make_config, make_policy
+from lerobot.policies.factory import make_pre_post_processors
+from spatialvla_grid_cases import SIZE, WORKSPACE, WRIST, make_batch, make_config, make_policy, stats
 from torch import Tensor, nn
 from torch.nn.functional import cross_entropy
 
@@ -293,3 +294,17 @@ def test_a_copy_of_the_policy_acts_alike() -> None:
     policy = make_policy()
     batch = make_batch(policy, 2)
     assert torch.equal(copy.deepcopy(policy).predict_action_chunk(batch), policy.predict_action_chunk(batch))
+
+
+@pytest.mark.parametrize("tasks", [["", ""], ["", "go"]])
+def test_an_environment_may_name_no_task(tasks: list[str]) -> None:
+    """As PushT does: its text is empty."""
+    policy = make_policy()
+    preprocessor, _ = make_pre_post_processors(policy.config, dataset_stats=stats())
+    batch = make_batch(policy, 2)
+    shown = {key: batch[key] for key in (WORKSPACE, WRIST, "observation.state", "action")}
+    batch = preprocessor({**shown, "task": tasks})
+    num_tokens = policy._prompt(batch).written.sum(dim=1)
+    assert (num_tokens > num_tokens.min()).tolist() == [False, tasks[1] == "go"]
+    assert policy(batch)[0].isfinite()
+    assert policy.predict_action_chunk(batch).shape == (2, 4, 4)

@@ -1,6 +1,7 @@
 """``lerobot-bomb export-backbone``: a checkpoint's vision-language model as a folder, a base for others.
 
-A policy of any type that reads SmolVLM can start from it: ``--policy.vlm_model_name=FOLDER``.
+A policy of any type that reads the same family of models can start from it:
+``--policy.vlm_model_name=FOLDER``.
 """
 
 import argparse
@@ -12,6 +13,7 @@ from tokenizers import Tokenizer
 from lerobot_bomb.checkpoint import Preprocessor, load_processors, read_config
 from lerobot_bomb.viewing.unfinished import written_whole
 from lerobot_bomb.vlm.backbone import SmolVLMBackbone
+from lerobot_bomb.vlm.paligemma import PaliGemmaBackbone
 
 
 def add_export_backbone_arguments(parser: argparse.ArgumentParser) -> None:
@@ -36,11 +38,11 @@ def run_export_backbone(args: argparse.Namespace) -> int:
     return 0
 
 
-def _backbone(policy: PreTrainedPolicy) -> SmolVLMBackbone:
+def _backbone(policy: PreTrainedPolicy) -> SmolVLMBackbone | PaliGemmaBackbone:
     for module in policy.modules():
-        if isinstance(module, SmolVLMBackbone):
+        if isinstance(module, SmolVLMBackbone | PaliGemmaBackbone):
             return module
-    raise ValueError(f"a policy of type {policy.config.type} holds no SmolVLM to export")
+    raise ValueError(f"a policy of type {policy.config.type} holds no vision-language model to export")
 
 
 def _tokenizer(preprocessor: Preprocessor) -> Tokenizer:

@@ -62,7 +62,7 @@ class TaskTokenizerStep(ObservationProcessorStep):
         if task not in self._ids:
             if len(self._ids) == MAX_KEPT_TASKS:
                 self._ids.clear()
-            self._ids[task] = torch.tensor(task_ids(self.tokenizer, task, self.template))
+            self._ids[task] = torch.tensor(task_ids(self.tokenizer, task, self.template), dtype=torch.int64)
         return self._ids[task]
 
     def get_config(self) -> dict[str, Any]:
