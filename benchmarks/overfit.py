@@ -21,6 +21,7 @@ import signal
 import sys
 import tempfile
 import time
+from collections.abc import Iterable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -38,6 +39,8 @@ TASK_IDS = (0, 4, 7, 11, 13, 15, 22, 24)  # all black
 TARGETS: dict[int, Any] = {task: EpisodeSpec(SEED).for_task(task).target for task in TASK_IDS}
 SHIFT = 3  # an episode is told the sentence of the task so many places further on
 IMAGE_SIZE = 128
+PICTURES = (f"image_size={IMAGE_SIZE}",)
+DEPTH_PICTURES = ("image_size=64", "depth=true")  # LeRobot takes 85 ms to read a sample with larger depth
 REPO_ID = "overfit/bomb_place"
 MAX_MINUTES = 25
 
@@ -63,6 +66,8 @@ def main() -> None:
     parser.add_argument("--policy.type", dest="policy_type", required=True, choices=POLICY_TYPES)
     parser.add_argument("--output_dir", type=Path, help="new folder to keep (default: a temporary one)")
     parser.add_argument("--steps", type=positive, help="training steps (default: the recipe's)")
+    depth = "record and show depth, and train with --policy.depth_source=observation"
+    parser.add_argument("--depth", action="store_true", help=depth)
     add_machine_arguments(parser)
     args, args.policy_flags = parser.parse_known_args()
     unknown = [flag for flag in args.policy_flags if not re.fullmatch(r"--policy\.\w+=.*", flag)]
@@ -70,6 +75,8 @@ def main() -> None:
         parser.error(f"unknown: {' '.join(unknown)}; flags for lerobot-train are --policy.NAME=VALUE")
     if args.output_dir is not None and args.output_dir.exists():
         parser.error(f"--output_dir={args.output_dir} exists already; name a new folder or delete it")
+    if args.depth:
+        args.policy_flags.append("--policy.depth_source=observation")
     require_idle_machine(args.force)
     os.environ.setdefault("OMP_NUM_THREADS", "1")
     signal.signal(signal.SIGTERM, lambda number, _: sys.exit(128 + number))  # deletes the temporary folder
@@ -83,7 +90,8 @@ def main() -> None:
 def prove(args: argparse.Namespace, folder: Path) -> int:
     """The whole proof in `folder`; 0 if every bar was reached."""
     started = time.monotonic()
-    record(folder / "dataset")
+    pictures = DEPTH_PICTURES if args.depth else PICTURES
+    record(folder / "dataset", pictures)
     sentences = read_sentences(folder / "dataset")
     checkpoint = train(args, folder)
     trained_s = time.monotonic() - started
@@ -91,7 +99,7 @@ def prove(args: argparse.Namespace, folder: Path) -> int:
     shown = change_what_is_shown(checkpoint, {sentences[task]: sentences[told[task]] for task in TASK_IDS})
     counts = {}
     for condition, path in ((LEARNT, checkpoint), (PERMUTED, shown[PERMUTED]), (BLANK, shown[BLANK])):
-        rows = evaluate(path, folder / condition.name.replace(" ", "_"))
+        rows = evaluate(path, folder / condition.name.replace(" ", "_"), pictures)
         counts[condition] = sum(
             is_on(row, told[task]) if condition is PERMUTED else row["is_success"]
             for task, row in rows.items()
@@ -101,8 +109,8 @@ def prove(args: argparse.Namespace, folder: Path) -> int:
     return report(args, counts, minutes, trained_s / 60)
 
 
-def record(dataset: Path) -> None:
-    """The expert's episodes: one seed, eight targets."""
+def record(dataset: Path, pictures: Iterable[str] = PICTURES) -> None:
+    """The expert's episodes: one seed, eight targets; ``pictures``: flags, without their dashes."""
     run_command(
         "lerobot-bomb",
         "record",
@@ -112,7 +120,7 @@ def record(dataset: Path) -> None:
         f"--seed={SEED}",
         f"--task_ids={list(TASK_IDS)}",
         "--images",
-        f"--image_size={IMAGE_SIZE}",
+        *(f"--{flag}" for flag in pictures),
     )
 
 
@@ -156,14 +164,14 @@ def change_what_is_shown(checkpoint: Path, replacements: dict[str, str]) -> dict
     return folders
 
 
-def evaluate(checkpoint: Path, output_dir: Path) -> dict[int, Row]:
+def evaluate(checkpoint: Path, output_dir: Path, pictures: Iterable[str]) -> dict[int, Row]:
     """Stock `lerobot-eval` on the recorded seed, one episode a task; {task id: result}."""
     run_command(
         "lerobot-eval",
         f"--policy.path={checkpoint}",
         "--env.type=bomb",
         f"--env.task_ids={list(TASK_IDS)}",
-        f"--env.image_size={IMAGE_SIZE}",
+        *(f"--env.{flag}" for flag in pictures),
         f"--env.results_path={output_dir / 'results.jsonl'}",
         f"--seed={SEED}",
         "--eval.n_episodes=1",

@@ -1,6 +1,6 @@
 """What is wrong with a flag, said so that LeRobot's parser passes it on."""
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Collection, Iterator
 from contextlib import contextmanager
 
 
@@ -20,7 +20,7 @@ def flag_errors() -> Iterator[None]:
         raise FlagError(str(error)) from None
 
 
-def one_of(flag: str, value: object, allowed: tuple | Mapping) -> None:
+def one_of(flag: str, value: object, allowed: Collection) -> None:
     """Raise a ValueError that names flag, value and choices unless value is allowed."""
     if value not in allowed:
         raise ValueError(f"{flag}={value!r} is unknown; choose one of: {', '.join(map(str, allowed))}")

@@ -40,7 +40,7 @@ def make_policy(seed: int = 0, num_dims: int = 4, **options: Any) -> SpatialvlaG
 
 def stats(num_dims: int = 4) -> dict[str, dict[str, Tensor]]:
     return {
-        key: {"q01": -torch.ones(size), "q99": torch.ones(size)}
+        key: {"min": -torch.ones(size), "max": torch.ones(size)}
         for key, size in (("observation.state", 4), ("action", num_dims))
     }
 

@@ -26,7 +26,7 @@ def published(tmp_path: Path, shared_data: Path) -> Folder:
     """As the original's code saves itself: weights in two files, and a policy of ours that acts alike."""
     grid = json.loads((shared_data / "spatialvla" / "gs_bridge.json").read_text())
     params = ActionGrids.from_published(grid, 0.5, "mid").to_dict()
-    policy = make_policy(3, 7, grid_params=params, ego3d_zero_init=False)
+    policy = make_policy(3, 7, grid_params=params, decode_point="mid", ego3d_zero_init=False)
     state = policy.state_dict()
     vlm = policy.config.vlm_config
     assert vlm is not None

@@ -8,12 +8,13 @@ from typing import Any
 
 import numpy as np
 import pytest
+from lerobot.configs import NormalizationMode
 from lerobot.datasets import LeRobotDatasetMetadata
 from lerobot.utils.constants import ACTION
 from PIL import Image
 from pusht_cases import REPO_ID as PUSHT
 
-from lerobot_bomb.actions.fit_grid import UNIFORM, action_bounds, quantisation_errors
+from lerobot_bomb.actions.fit_grid import CLIPPING, UNIFORM, action_bounds, quantisation_errors
 from lerobot_bomb.actions.grid_fit import normalised, normalised_rest
 from lerobot_bomb.actions.grid_settings import GridSettings, default_groups
 from lerobot_bomb.actions.grids import ActionGrids
@@ -24,6 +25,7 @@ from lerobot_bomb.data.recording import Recording
 from lerobot_bomb.viewing.grid_picture import BAR_RGB, EDGE_RGB, ROW_HEIGHT, Row, draw_rows, edge_x
 
 REPO_ID = "test/grid"
+QUANTILES = '--policy.normalization_mapping={"ACTION": "QUANTILES"}'
 
 
 @pytest.fixture(scope="module")
@@ -48,11 +50,11 @@ def table(text: str, title: str) -> dict[str, dict[str, float]]:
 
 def fitted(meta: LeRobotDatasetMetadata) -> tuple[ActionGrids, np.ndarray, float | np.ndarray]:
     """The default grid of a dataset, its normalised actions (N, D) and their unit (D,)."""
-    low, high = action_bounds(meta)
+    low, high = action_bounds(meta, NormalizationMode.MIN_MAX)
     actions = normalised(read_columns(meta, (ACTION,))[ACTION], low, high)
     grids = ActionGrids(GridSettings(default_groups(len(low))), len(low))
     grids.fit(actions, normalised_rest(low, high))
-    return grids, actions.clip(-1, 1), (high - low) / 2
+    return grids, actions, (high - low) / 2
 
 
 def test_the_tables_are_the_errors_of_recorded_actions(
@@ -61,7 +63,7 @@ def test_the_tables_are_the_errors_of_recorded_actions(
     assert fit_grid(root) == 0
     text = capsys.readouterr().out
     grids, actions, unit = fitted(LeRobotDatasetMetadata(REPO_ID, root=root))
-    assert text.startswith(f"{REPO_ID}: {len(actions)} actions; ")
+    assert text.startswith(f"{REPO_ID}: {len(actions)} actions, -1 and 1 at min and max\nnone of ")
     errors = quantisation_errors(grids, actions)
     names = ["dx", "dy", "dz", "gripper"]
     for title, scale in (("in normalised units", np.ones(4)), ("in the dataset's units", unit)):
@@ -91,11 +93,40 @@ def test_pusht_has_two_coordinates_in_pixels(pusht_dataset: Path, capsys: pytest
     assert fit_grid(pusht_dataset, "--policy.grid_distribution=quantile", repo_id=PUSHT) == 0
     text = capsys.readouterr().out
     normal, pixels = (table(text, title) for title in ("in normalised units", "in the dataset's units"))
-    low, high = action_bounds(LeRobotDatasetMetadata(PUSHT, root=pusht_dataset))
+    low, high = action_bounds(LeRobotDatasetMetadata(PUSHT, root=pusht_dataset), NormalizationMode.MIN_MAX)
     for dim, name in enumerate(["target_x", "target_y"]):
         ratio = pixels[name]["cond_mean"] / normal[name]["cond_mean"]
         assert ratio == pytest.approx((high - low)[dim] / 2, rel=1e-3)
         assert pixels[name]["cond_mean"] < 2.5  # pixels of 512
+
+
+def test_errors_include_what_quantiles_clip(root: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """Of a dimension that is far beyond them, clipping is nearly all of the error."""
+    assert fit_grid(root, QUANTILES) == 0
+    text = capsys.readouterr().out
+    assert "actions are beyond the grid and are clipped to it" in text and "MIN_MAX clips nothing" in text
+    shown = table(text, "in the dataset's units")
+    meta = LeRobotDatasetMetadata(REPO_ID, root=root)
+    low, high = action_bounds(meta, NormalizationMode.QUANTILES)
+    actions = read_columns(meta, (ACTION,))[ACTION].astype(float)
+    lost = np.abs(actions - actions.clip(low, high)).mean(axis=0)
+    assert lost[0] > 1e-3
+    for name, error in zip(["dx", "dy", "dz", "gripper"], lost, strict=True):
+        assert shown[name][CLIPPING] == pytest.approx(error, rel=1e-3, abs=1e-7)
+        assert shown[name]["cond_mean"] > 0.9 * error
+
+
+def test_groups_and_coordinates_are_as_asked_for(root: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    groups = [
+        {"dims": [0, 1], "transform": "identity", "bins": [5, 6]},
+        {"dims": [2, 3], "transform": "identity", "bins": [7, 8]},
+    ]
+    flags = f"--policy.action_groups={json.dumps(groups)}", "--policy.grid_distribution=uniform"
+    assert fit_grid(root, *flags) == 0
+    text = capsys.readouterr().out
+    fit = table(text, "Coordinates, theta and phi in radians")
+    assert {name: row["bins"] for name, row in fit.items()} == {"dx": 5, "dy": 6, "dz": 7, "gripper": 8}
+    assert "dx: -1.0000 -0.6000 -0.2000 0.2000 0.6000 1.0000\n" in text
 
 
 def test_the_picture_has_the_edges_where_the_grid_has_them(root: Path, tmp_path: Path) -> None:
@@ -132,6 +163,11 @@ def test_bars_of_a_histogram_are_where_the_values_are() -> None:
             "--policy.grid_distribution='cauchy' is unknown; choose one of",
         ),
         ("--policy.grid_min_sigma=-1", "--policy.grid_min_sigma=-1.0 must be a number of at least 0"),
+        ("--policy.rho_dead=2", "--policy.rho_dead=2.0 must be in"),
+        (
+            '--policy.normalization_mapping={"ACTION": "MEAN_STD"}',
+            "--policy.normalization_mapping[ACTION]='MEAN_STD' is unknown; choose one of: MIN_MAX",
+        ),
         ("--picture=nowhere/grid.png", "--picture=nowhere/grid.png cannot be written"),
     ],
 )
@@ -155,11 +191,12 @@ def edited(root: Path, folder: Path, drop: tuple[str, ...]) -> Path:
     return folder
 
 
-def test_missing_quantiles_name_the_command_that_adds_them(
+def test_quantiles_are_wanted_only_where_they_are_asked_for(
     root: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     folder = edited(root, tmp_path / "old", ("q01", "q99"))
-    assert fit_grid(folder) == 1
+    assert fit_grid(folder) == 0
+    assert fit_grid(folder, QUANTILES) == 1
     error = capsys.readouterr().err
-    assert "test/grid has no statistics q01 and q99 of its actions" in error
-    assert f"lerobot.scripts.augment_dataset_quantile_stats --repo-id=test/grid --root={folder}\n" in error
+    assert "QUANTILES needs the statistics q01, q99, which the dataset lacks" in error
+    assert "lerobot.scripts.augment_dataset_quantile_stats adds them\n" in error

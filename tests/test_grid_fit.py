@@ -16,6 +16,7 @@ from torch import Tensor
 
 from lerobot_bomb.actions.grid_edges import MIN_WIDTH, cut, gaussian_cut, to_polar
 from lerobot_bomb.actions.grid_fit import normalised, normalised_rest
+from lerobot_bomb.actions.grid_report import clipping_text
 from lerobot_bomb.actions.grid_settings import ActionGroup, GridSettings, default_groups
 from lerobot_bomb.actions.grids import ActionGrids
 
@@ -169,9 +170,19 @@ def test_actions_out_of_range_are_clipped_and_counted() -> None:
     actions = normal_actions(100, 4) * 0.9
     actions[3, 0], actions[3, 1], actions[7, 3], actions[9, 2] = 1.5, -2.0, -1.1, 1.0005  # the last: a hair
     grids, clipped = ActionGrids(GridSettings(default_groups(4)), 4), fitted(actions.clamp(-1, 1))
-    assert grids.fit(actions) == 2
+    grids.fit(actions)
+    text, is_much = clipping_text(actions.numpy(), ["x", "y", "z", "gripper"])
+    assert text.startswith("2 of 100 actions are beyond the grid")
+    assert text.endswith("x 1.0% by up to 0.5, y 1.0% by up to 1, gripper 1.0% by up to 0.1") and not is_much
     assert torch.equal(grids.edges, clipped.edges) and torch.equal(grids.centroids, clipped.centroids)
     assert torch.equal(grids.encode(actions), grids.encode(actions.clamp(-1, 1)))
+
+
+def test_a_range_that_cuts_off_more_than_quantiles_do_is_named_with_the_remedy() -> None:
+    actions = np.linspace(-1.2, 1, 100)[:, None]
+    text, is_much = clipping_text(actions, ["x"])
+    assert is_much and "ACTION: MIN_MAX clips nothing" in text
+    assert clipping_text(actions.clip(-1, 1), ["x"]) == ("none of 100 actions is beyond the grid", False)
 
 
 @pytest.mark.parametrize(

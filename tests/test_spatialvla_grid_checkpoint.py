@@ -1,5 +1,6 @@
 """Saving, loading and adapting `spatialvla_grid`."""
 
+import json
 import logging
 import os
 import subprocess
@@ -10,6 +11,7 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
+from lerobot.configs import PreTrainedConfig
 from lerobot.datasets import LeRobotDatasetMetadata
 from lerobot.policies.factory import make_pre_post_processors
 from safetensors.torch import load_file, save_file
@@ -21,6 +23,13 @@ from lerobot_bomb.data.recording import Recording
 from lerobot_policy_spatialvla_grid.modeling_spatialvla_grid import SpatialvlaGridPolicy
 
 REPO_ID = "test/grids"
+GRIPPER = {"dims": [3], "transform": "identity", "bins": [16]}
+
+
+def changed(checkpoint: Path, options: dict[str, Any]) -> Any:
+    """A checkpoint's config with other flags, as LeRobot's commands read it."""
+    flags = [f"--{flag}={json.dumps(value)}" for flag, value in options.items()]
+    return PreTrainedConfig.from_pretrained(checkpoint, cli_overrides=flags)
 
 
 @pytest.fixture(scope="module")
@@ -34,7 +43,7 @@ def physical_rms(policy: SpatialvlaGridPolicy, meta: LeRobotDatasetMetadata) -> 
     """What the grids round off of a dataset's actions, in normalised units."""
     assert meta.stats is not None
     actions = read_columns(meta, ("action",))["action"]
-    low, high = meta.stats["action"]["q01"], meta.stats["action"]["q99"]
+    low, high = meta.stats["action"]["min"], meta.stats["action"]["max"]
     normalised = torch.from_numpy(2 * (actions - low) / (high - low) - 1).float().clamp(-1, 1)
     return float((policy.grids.decode(policy.grids.encode(normalised)) - normalised).square().mean().sqrt())
 
@@ -44,7 +53,7 @@ def test_grids_are_fitted_to_the_training_data(meta: LeRobotDatasetMetadata) -> 
     fitted = SpatialvlaGridPolicy(make_config(), dataset_meta=meta)
     assert physical_rms(fitted, meta) < 0.8 * physical_rms(even, meta)
     assert fitted.config.grid_params == fitted.grids.to_dict()
-    unit = torch.from_numpy(np.asarray(meta.stats["action"]["q99"] - meta.stats["action"]["q01"])) / 2  # pyright: ignore[reportOptionalSubscript]
+    unit = torch.from_numpy(np.asarray(meta.stats["action"]["max"] - meta.stats["action"]["min"])) / 2  # pyright: ignore[reportOptionalSubscript]
     torch.testing.assert_close(fitted.action_unit, unit.float())
     batch = make_batch(fitted, 2)
     names = {"l1_dx", "l1_dy", "l1_dz", "l1_gripper"}
@@ -127,6 +136,62 @@ def test_fine_tuning_moves_the_grids_and_both_tables(
     again = SpatialvlaGridPolicy.from_pretrained(tmp_path / "adapted")
     batch = make_batch(new, 2)
     assert torch.equal(again.predict_action_chunk(batch), new.eval().predict_action_chunk(batch))
+
+
+@pytest.mark.parametrize(
+    "options",
+    [
+        {"grid_distribution": "quantile", "rho_dead": 0.05},
+        {"action_groups": [{"dims": [0, 1, 2], "transform": "polar", "bins": [4, 8, 6]}, GRIPPER]},
+    ],
+)
+def test_fine_tuning_takes_the_grids_that_flags_ask_for(
+    options: dict[str, Any], meta: LeRobotDatasetMetadata, tmp_path: Path
+) -> None:
+    make_policy().save_pretrained(tmp_path)
+    new = SpatialvlaGridPolicy.from_pretrained(tmp_path, config=changed(tmp_path, options), dataset_meta=meta)
+    fresh = SpatialvlaGridPolicy(make_config(**options), dataset_meta=meta)
+    assert new.grids.to_dict() == fresh.grids.to_dict() == new.config.grid_params
+    assert new.cell_head.weight.shape == fresh.cell_head.weight.shape
+    batch = make_batch(new, 2)
+    new(batch)[0].backward()
+    assert new.cell_embedding.weight.grad is not None
+    new.save_pretrained(tmp_path / "new")
+    again = SpatialvlaGridPolicy.from_pretrained(tmp_path / "new")
+    assert torch.equal(again.predict_action_chunk(batch), new.predict_action_chunk(batch))
+
+
+def test_a_checkpoint_may_decode_to_another_point(meta: LeRobotDatasetMetadata, tmp_path: Path) -> None:
+    policy = SpatialvlaGridPolicy(make_config(), dataset_meta=meta)
+    policy.save_pretrained(tmp_path)
+    options = {"decode_point": "mid"}
+    middle = SpatialvlaGridPolicy.from_pretrained(tmp_path, config=changed(tmp_path, options))
+    cells = torch.arange(policy.grids.num_cells[0])
+    assert torch.equal(middle.grids.decode_group(0, cells), policy.grids.decode_group(0, cells, "mid"))
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        (
+            {"grid_distribution": "uniform"},
+            "grid_distribution='uniform': this checkpoint's grids have 'gauss",
+        ),
+        ({"rho_dead": 0.1}, "rho_dead=0.1: this checkpoint's grids have 0.02, which only a training"),
+        ({"decode_point": "centroid"}, "decode_point='centroid': this checkpoint's grids have 'cond_mean'"),
+        ({"chunk_size": 8}, "chunk_size=8: this checkpoint was trained with 4"),
+        (
+            {"prefix_attention": "causal"},
+            "prefix_attention='causal': this checkpoint was trained with 'bidir",
+        ),
+    ],
+)
+def test_what_a_checkpoint_was_trained_with_cannot_be_changed_in_evaluation(
+    options: dict[str, Any], message: str, tmp_path: Path
+) -> None:
+    make_policy().save_pretrained(tmp_path)
+    with pytest.raises(ValueError, match=rf"--policy\.{message}"):
+        SpatialvlaGridPolicy.from_pretrained(tmp_path, config=changed(tmp_path, options))
 
 
 def test_fine_tuning_may_keep_the_grids(meta: LeRobotDatasetMetadata, tmp_path: Path) -> None:

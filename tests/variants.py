@@ -12,7 +12,7 @@ NO_MASKING: Options = {"mask_max_fraction": 0.0}
 CENTERS: Options = {"bin_mode": "centers"}
 FIXED_WIDTH: Options = {"number_width": 4}  # a digit more than the bins need
 CAUSAL: Options = {"prefix_attention": "causal"}
-UNIFORM: Options = {"grid_distribution": "uniform", "decode_point": "mid"}
+QUANTILE: Options = {"grid_distribution": "quantile", "decode_point": "centroid"}
 FULL_LOSS: Options = {"loss_vocab": "full"}
 
 # by policy type
@@ -26,7 +26,7 @@ SINGLE: dict[str, dict[str, Options]] = {
     "spatialvla_grid": {
         "ensemble": ENSEMBLE,
         "causal": CAUSAL,
-        "uniform": UNIFORM,
+        "quantile": QUANTILE,
         "full_loss": FULL_LOSS,
     },
 }
@@ -38,7 +38,7 @@ PAIRS: dict[str, dict[str, Options]] = {
         "fixed_width_ensemble": FIXED_WIDTH | ENSEMBLE | {"temporal_ensemble_size": 2},
     },
     "spatialvla_grid": {
-        "causal_uniform": CAUSAL | UNIFORM,
+        "causal_quantile": CAUSAL | QUANTILE,
         "full_loss_ensemble": FULL_LOSS | ENSEMBLE | {"temporal_ensemble_size": 2},
     },
 }

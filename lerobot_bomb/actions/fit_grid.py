@@ -4,9 +4,11 @@ Shapes: `N` actions, `D` action dims.
 """
 
 import argparse
-import textwrap
+import json
+from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import torch
@@ -16,82 +18,113 @@ from lerobot.utils.constants import ACTION
 from PIL import Image
 
 from lerobot_bomb.actions.grid_fit import normalised, normalised_rest
-from lerobot_bomb.actions.grid_settings import DECODE_POINTS, GridSettings, default_groups
+from lerobot_bomb.actions.grid_report import clipping_text, coordinate_edges, coordinate_names, edges_text
+from lerobot_bomb.actions.grid_settings import DECODE_POINTS, ActionGroup, GridSettings, default_groups
 from lerobot_bomb.actions.grids import ActionGrids
 from lerobot_bomb.actions.relative import BOUND_STATISTICS, bounds
 from lerobot_bomb.data.columns import dim_names, read_columns, read_meta
+from lerobot_bomb.flags import one_of
 from lerobot_bomb.tables import print_table
 from lerobot_bomb.viewing.grid_picture import Row, draw_rows
 from lerobot_bomb.viewing.unfinished import check_writable, written_whole
 
-UNIFORM = "uniform mid"
-LINE_WIDTH = 110  # characters
+UNIFORM, CLIPPING = "uniform mid", "clipping alone"
 
 
 def add_fit_grid_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the arguments of ``lerobot-bomb fit-grid``."""
-    add = parser.add_argument
+    add, default = parser.add_argument, GridSettings(())
     add("--dataset.repo_id", dest="repo_id", required=True, help="name of the dataset")
     root = "folder of the dataset (default: LeRobot's, $HF_LEROBOT_HOME/REPO_ID)"
     add("--dataset.root", dest="root", type=Path, help=root)
+    groups = (
+        """as JSON: '[{"dims": [0, 1], "transform": "identity", "bins": [64, 64]}, ...]' (default: by size)"""
+    )
+    add("--policy.action_groups", dest="groups", type=json_of(list), help=groups)
     distribution = "of the edges: gaussian, uniform or quantile (default: gaussian)"
-    add("--policy.grid_distribution", dest="distribution", default="gaussian", help=distribution)
+    add("--policy.grid_distribution", dest="distribution", default=default.distribution, help=distribution)
     sigma = "least standard deviation of a coordinate, in its unit (default: 0)"
-    add("--policy.grid_min_sigma", dest="min_sigma", type=float, default=0.0, help=sigma)
+    add("--policy.grid_min_sigma", dest="min_sigma", type=float, default=default.min_sigma, help=sigma)
+    rho_dead = f"length below which there is no motion (default: {default.rho_dead})"
+    add("--policy.rho_dead", dest="rho_dead", type=float, default=default.rho_dead, help=rho_dead)
+    phi_fit = "where the angle phi is cut: wrapped or linear (default: wrapped)"
+    add("--policy.phi_fit", dest="phi_fit", default=default.phi_fit, help=phi_fit)
+    mapping = """as JSON, of which ACTION is read: '{"ACTION": "QUANTILES"}' (default: MIN_MAX)"""
+    add("--policy.normalization_mapping", dest="mapping", type=json_of(dict), default={}, help=mapping)
     add("--picture", type=Path, help="also draw histograms with the edges into this file, as PNG")
+
+
+def json_of(kind: type) -> Callable[[str], Any]:
+    """A reader of flags that are JSON of this type."""
+
+    def read(text: str) -> Any:
+        value = json.loads(text)
+        if not isinstance(value, kind):
+            raise ValueError
+        return value
+
+    read.__name__ = f"JSON {kind.__name__}"  # what argparse calls it
+    return read
 
 
 def run_fit_grid(args: argparse.Namespace) -> int:
     """Fit, print the tables, draw the picture."""
     if args.picture is not None:
         check_writable("--picture", args.picture)
+    mode = args.mapping.get("ACTION", NormalizationMode.MIN_MAX)
+    one_of("--policy.normalization_mapping[ACTION]", mode, [of.value for of in BOUND_STATISTICS])
+    mode = NormalizationMode(mode)
     meta = read_meta(args.repo_id, args.root)
-    low_D, high_D = action_bounds(meta)
-    settings = GridSettings(default_groups(len(low_D)), args.distribution, args.min_sigma)
-    grids = ActionGrids(settings, len(low_D))
+    low_D, high_D = action_bounds(meta, mode)
+    num_dims = len(low_D)
+    groups = (
+        default_groups(num_dims) if args.groups is None else tuple(map(ActionGroup.from_dict, args.groups))
+    )
+    options = {name: getattr(args, name) for name in ("distribution", "min_sigma", "rho_dead", "phi_fit")}
+    grids = ActionGrids(GridSettings(groups, **options), num_dims)
     actions_ND = normalised(read_columns(meta, (ACTION,))[ACTION], low_D, high_D)
-    num_clipped = grids.fit(actions_ND, normalised_rest(low_D, high_D))
-    actions_ND = actions_ND.clip(-1, 1)
-    print(f"{meta.repo_id}: {len(actions_ND)} actions; {num_clipped} are beyond q01..q99 and were clipped")
+    grids.fit(actions_ND, normalised_rest(low_D, high_D))
     names = dim_names(meta.features[ACTION])
+    print(f"{meta.repo_id}: {len(actions_ND)} actions, -1 and 1 at {' and '.join(BOUND_STATISTICS[mode])}")
+    print(clipping_text(actions_ND, names)[0])
     print_fit(grids, names)
     errors = quantisation_errors(grids, actions_ND)
-    print_errors("in normalised units, where q01 is -1 and q99 is 1", errors, names)
+    print_errors("in normalised units", errors, names)
     physical = {name: error_D * (high_D - low_D) / 2 for name, error_D in errors.items()}
     print_errors("in the dataset's units", physical, names)
     if args.picture is not None:
-        picture = draw_rows(picture_rows(grids, actions_ND, names))
+        picture = draw_rows(picture_rows(grids, actions_ND.clip(-1, 1), names))
         with written_whole(args.picture) as (path,):
             Image.fromarray(picture).save(path, format="PNG")
         print(f"\n{args.picture}")
     return 0
 
 
-def action_bounds(meta: LeRobotDatasetMetadata) -> tuple[np.ndarray, np.ndarray]:
-    """(D,) q01 and (D,) q99 of a dataset's actions.
+def action_bounds(meta: LeRobotDatasetMetadata, mode: NormalizationMode) -> tuple[np.ndarray, np.ndarray]:
+    """(D,) actions that become -1 and (D,) actions that become 1.
 
     Raises:
         ValueError: the dataset has no actions, or no such statistics of them.
     """
     if ACTION not in meta.features:
         raise ValueError(f"dataset {meta.repo_id} has no {ACTION!r}; it has {sorted(meta.features)}")
-    statistics = (meta.stats or {}).get(ACTION, {})
-    mode = NormalizationMode.QUANTILES
-    if not statistics.keys() >= {*BOUND_STATISTICS[mode]}:
-        raise ValueError(
-            f"dataset {meta.repo_id} has no statistics q01 and q99 of its actions; add them with: python -m "
-            f"lerobot.scripts.augment_dataset_quantile_stats --repo-id={meta.repo_id} --root={meta.root}"
-        )
     (num_dims,) = meta.features[ACTION]["shape"]
-    return bounds(statistics, mode, num_dims)
+    return bounds((meta.stats or {}).get(ACTION, {}), mode, num_dims)
 
 
 def quantisation_errors(grids: ActionGrids, actions_ND: np.ndarray) -> dict[str, np.ndarray]:
-    """{decode point, or uniform edges with midpoints: mean absolute error (D,)} of normalised actions."""
+    """Mean absolute errors (D,) of normalised actions, clipping included.
+
+    Of each decode point, of uniform edges with midpoints, and of clipping alone.
+    """
     uniform = ActionGrids(replace(grids.settings, distribution="uniform", decode_point="mid"), grids.num_dims)
     uniform.fit(actions_ND, grids.rest.numpy())
     of_point = {point: _mean_error(grids, actions_ND, point) for point in DECODE_POINTS}
-    return {**of_point, UNIFORM: _mean_error(uniform, actions_ND, "mid")}
+    return {
+        **of_point,
+        UNIFORM: _mean_error(uniform, actions_ND, "mid"),
+        CLIPPING: np.abs(actions_ND.clip(-1, 1) - actions_ND).mean(axis=0),
+    }
 
 
 def _mean_error(grids: ActionGrids, actions_ND: np.ndarray, point: str) -> np.ndarray:
@@ -111,10 +144,7 @@ def print_fit(grids: ActionGrids, names: list[str]) -> None:
             for label, of, (mean, std) in zip(labels, edges, grids.gaussians.tolist(), strict=True)
         ],
     )
-    print("\nEdges")
-    for label, of in zip(labels, edges, strict=True):
-        text = f"{label}: {' '.join(f'{edge:.4f}' for edge in of)}"
-        print(textwrap.fill(text, LINE_WIDTH, subsequent_indent="  "))
+    print(f"\nEdges\n{edges_text(grids, names)}")
 
 
 def print_errors(unit: str, errors: dict[str, np.ndarray], names: list[str]) -> None:
@@ -124,16 +154,6 @@ def print_errors(unit: str, errors: dict[str, np.ndarray], names: list[str]) -> 
         ["", *errors],
         [[name, *(f"{error_D[i]:.4g}" for error_D in errors.values())] for i, name in enumerate(names)],
     )
-
-
-def coordinate_names(grids: ActionGrids, names: list[str]) -> list[str]:
-    """Of all groups."""
-    return [label for group in grids.groups for label in group.coordinate_names(names)]
-
-
-def coordinate_edges(grids: ActionGrids) -> list[np.ndarray]:
-    """(bins + 1,) of each coordinate of all groups."""
-    return [of.numpy() for i in range(len(grids.groups)) for of in grids.group_edges(i)]
 
 
 def picture_rows(grids: ActionGrids, actions_ND: np.ndarray, names: list[str]) -> list[Row]:

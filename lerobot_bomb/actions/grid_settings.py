@@ -1,8 +1,9 @@
 """How a grid is made: which action dims share a token, in which coordinates, cut where."""
 
+import json
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from typing import Any
 
 from lerobot_bomb.flags import one_of
@@ -16,6 +17,8 @@ POLAR_BINS = (16, 32, 8)
 LINEAR_BINS = 16
 MAX_BINS = 4096  # of a coordinate
 FLAG = "--policy.action_groups"
+# flags of the policy that are called otherwise than the field of `GridSettings`
+FLAG_NAMES = {"groups": "action_groups", "distribution": "grid_distribution", "min_sigma": "grid_min_sigma"}
 
 
 @dataclass(frozen=True)
@@ -113,3 +116,16 @@ class GridSettings:
             raise ValueError(f"--policy.grid_min_sigma={self.min_sigma} must be a number of at least 0")
         if not 1e-3 <= self.rho_dead <= 0.5:
             raise ValueError(f"--policy.rho_dead={self.rho_dead} must be in [0.001, 0.5]")
+
+    @classmethod
+    def from_dict(cls, settings: dict[str, Any]) -> "GridSettings":
+        """Of `to_dict`."""
+        return cls(**{**settings, "groups": tuple(map(ActionGroup.from_dict, settings["groups"]))})
+
+    def to_dict(self) -> dict[str, Any]:
+        """For JSON."""
+        return json.loads(json.dumps(asdict(self)))
+
+    def flags(self) -> dict[str, Any]:
+        """{flag of the policy: value} that ask for this grid."""
+        return {FLAG_NAMES.get(name, name): value for name, value in self.to_dict().items()}

@@ -4,10 +4,9 @@ Shapes: `N` samples, `D` action dims, `G` groups, `C` coordinates of all groups,
 `V` cells of all groups, `P` dims of the widest group.
 """
 
-import json
 import math
 from collections.abc import Callable, Iterable, Sequence
-from dataclasses import asdict, replace
+from dataclasses import replace
 from itertools import accumulate, pairwise
 from typing import Any, Self
 
@@ -19,7 +18,6 @@ from lerobot_bomb.actions.grid_edges import Cut, from_polar, gaussian_cut, to_po
 from lerobot_bomb.actions.grid_fit import check_actions, fit_cuts
 from lerobot_bomb.actions.grid_settings import ActionGroup, GridSettings, check_groups, default_groups
 
-CLIP_TOLERANCE = 1e-3  # LeRobot estimates quantiles: an extreme that many actions have may lie a hair beyond
 PUBLISHED_KEYS = ("theta", "phi", "r", "roll", "pitch", "yaw")
 
 
@@ -144,8 +142,8 @@ class ActionGrids(nn.Module):
     # Fitted values
 
     @torch.no_grad()
-    def fit(self, actions_ND: np.ndarray | Tensor, rest_D: np.ndarray | None = None) -> int:
-        """Take the cells from normalised actions; how many of these (rows) are beyond [-1, 1] and clipped.
+    def fit(self, actions_ND: np.ndarray | Tensor, rest_D: np.ndarray | None = None) -> None:
+        """Take the cells from normalised actions, clipped to [-1, 1].
 
         ``rest_D``: the normalised action that means "no motion", clipped to [-1, 1]; zeros if not given.
 
@@ -154,12 +152,10 @@ class ActionGrids(nn.Module):
         """
         actions_ND = check_actions(actions_ND)
         self._check_dims(actions_ND.shape[1])
-        num_clipped = int((actions_ND.abs() > 1 + CLIP_TOLERANCE).any(dim=1).sum())
         actions_ND = actions_ND.clamp(-1, 1)
         rest_D = np.zeros(self.num_dims) if rest_D is None else np.clip(rest_D, -1, 1)
         self._set(fit_cuts(actions_ND, rest_D, self.settings), rest_D)
         self._set_centroids(actions_ND)
-        return num_clipped
 
     @classmethod
     def from_published(
@@ -205,22 +201,19 @@ class ActionGrids(nn.Module):
         if self.decode_point == "centroid":
             others = (self.centroids != self._cond_means()).any(dim=1).nonzero()[:, 0].tolist()
             fitted["centroids"] = {str(cell): self.centroids[cell].tolist() for cell in others}
-        settings = replace(self.settings, decode_point=self.decode_point)
-        return {"settings": json.loads(json.dumps(asdict(settings))), **fitted}
+        return {"settings": replace(self.settings, decode_point=self.decode_point).to_dict(), **fitted}
 
     @classmethod
     def from_dict(cls, parameters: dict[str, Any], num_dims: int) -> Self:
         """The grid of `to_dict` for actions of ``num_dims`` dims."""
-        settings = dict(parameters["settings"])
-        groups = tuple(map(ActionGroup.from_dict, settings.pop("groups")))
-        grids = cls(GridSettings(groups, **settings), num_dims)
+        grids = cls(GridSettings.from_dict(parameters["settings"]), num_dims)
         rows = (parameters[key] for key in ("edges", "means", "gaussians"))
         cuts = [
             Cut(torch.tensor(edges, dtype=torch.float64), torch.tensor(means), mean, std)
             for edges, means, (mean, std) in zip(*rows, strict=True)
         ]
         grids._set(cuts, np.array(parameters["rest"]))
-        if settings["decode_point"] == "centroid":
+        if grids.decode_point == "centroid":
             for cell, values in parameters["centroids"].items():
                 grids.centroids[int(cell)] = torch.tensor(values)
         return grids

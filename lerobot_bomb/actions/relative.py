@@ -37,7 +37,8 @@ def bounds(
     if missing := [name for name in BOUND_STATISTICS[mode] if name not in statistics]:
         raise ValueError(
             f"--policy.normalization_mapping: {mode.value} needs the statistics {', '.join(missing)}, which "
-            f"the dataset lacks; it has {', '.join(sorted(statistics))}"
+            f"the dataset lacks; it has {', '.join(sorted(statistics))}. MIN_MAX needs no quantiles, "
+            f"lerobot.scripts.augment_dataset_quantile_stats adds them"
         )
     low, high = (np.asarray(statistics[name], dtype=np.float64) for name in BOUND_STATISTICS[mode])
     return low, high

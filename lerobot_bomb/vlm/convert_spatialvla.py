@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Any
 
 import torch
-from lerobot.configs import FeatureType, PolicyFeature, PreTrainedConfig
+from lerobot.configs import FeatureType, NormalizationMode, PolicyFeature, PreTrainedConfig
 from lerobot.policies import get_policy_class, make_pre_post_processors
 from lerobot.utils.constants import ACTION, OBS_IMAGES
 from lerobot.utils.import_utils import register_third_party_plugins
@@ -120,6 +120,12 @@ def _config(args: argparse.Namespace, original: dict[str, Any], chunk_size: int,
         ).to_dict(),
         chunk_size=chunk_size,
         n_action_steps=chunk_size,
+        normalization_mapping={
+            "VISUAL": NormalizationMode.IDENTITY,
+            "STATE": NormalizationMode.QUANTILES,
+            "ACTION": NormalizationMode.QUANTILES,
+        },
+        **grids.settings.flags(),
         grid_params=grids.to_dict(),
         ego3d_patch_reso=original["ego3d_patch_reso"],
         ego3d_n_freqs=original["n_freqs"],

@@ -35,6 +35,8 @@ DEPTH_SOURCES = ("none", "observation", "zoedepth")
 PREFIX_ATTENTIONS = ("bidirectional", "causal")
 LOSS_VOCABULARIES = ("slot", "full")
 NUM_STATE_BINS = 256
+# flags that say what the model reads and writes, beside the grids' own
+AS_TRAINED = ("chunk_size", "use_state", "prefix_attention")
 
 
 @PreTrainedConfig.register_subclass("spatialvla_grid")
@@ -55,12 +57,13 @@ class SpatialvlaGridConfig(PreTrainedConfig):
     chunk_size: int = 4
     # actions executed before the next prediction
     n_action_steps: int = 4
-    # statistics to [-1, 1] for what becomes cells; images stay in [0, 1]
+    # statistics to [-1, 1] for what becomes cells; images stay in [0, 1]. Not QUANTILES, which LeRobot
+    # averages over episodes: far more than 2 % of a dataset's actions may lie beyond, and are clipped
     normalization_mapping: dict[str, NormalizationMode] = field(
         default_factory=lambda: {
             "VISUAL": NormalizationMode.IDENTITY,
-            "STATE": NormalizationMode.QUANTILES,
-            "ACTION": NormalizationMode.QUANTILES,
+            "STATE": NormalizationMode.MIN_MAX,
+            "ACTION": NormalizationMode.MIN_MAX,
         }
     )
     # whether the robot's state, in 256 bins, is in the prompt
@@ -123,6 +126,8 @@ class SpatialvlaGridConfig(PreTrainedConfig):
     # "bfloat16" = autocast over float32 weights, in training and in evaluation
     dtype: str = "float32"
     gradient_checkpointing: bool = False
+    # values of AS_TRAINED; filled in for checkpoints
+    trained_with: dict[str, Any] | None = None
 
     optimizer_lr: float = 2e-5
     optimizer_betas: tuple[float, float] = (0.9, 0.999)
@@ -207,6 +212,20 @@ class SpatialvlaGridConfig(PreTrainedConfig):
             rho_dead=self.rho_dead,
             phi_fit=self.phi_fit,
         )
+
+    def check_grid_as_trained(self, *, is_refitted: bool) -> None:
+        """Raise where flags ask for other grids than the checkpoint has, unless new ones are fitted."""
+        if self.grid_params is None:
+            return
+        then = GridSettings.from_dict(self.grid_params["settings"]).flags()
+        for flag, value in self.grid_settings().flags().items():
+            # both kinds of mean are in every checkpoint, those of the cells only where they are used
+            is_stored = flag == "decode_point" and value != "centroid"
+            if value != then[flag] and not is_refitted and not is_stored:
+                raise ValueError(
+                    f"--policy.{flag}={value!r}: this checkpoint's grids have {then[flag]!r}, which only a "
+                    f"training with --policy.adapt_embeddings=true can change"
+                )
 
     def get_optimizer_preset(self) -> AdamWConfig:
         return adamw(self)

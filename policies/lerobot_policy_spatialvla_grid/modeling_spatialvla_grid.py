@@ -31,6 +31,7 @@ from lerobot_bomb.actions.accuracy import means
 from lerobot_bomb.actions.bins import Bins
 from lerobot_bomb.actions.ensemble import TemporalEnsemble
 from lerobot_bomb.actions.grid_fit import normalised, normalised_rest
+from lerobot_bomb.actions.grid_report import clipping_text, edges_text
 from lerobot_bomb.actions.grid_rows import interpolate_rows
 from lerobot_bomb.actions.grid_settings import ActionGroup
 from lerobot_bomb.actions.grids import ActionGrids
@@ -38,6 +39,7 @@ from lerobot_bomb.actions.relative import bounds, present_episodes
 from lerobot_bomb.actions.text import TokenRows, digits_needed, number_symbols
 from lerobot_bomb.data.columns import dim_names, read_columns
 from lerobot_bomb.decoding.slots import PromptContinuation, decode_slots
+from lerobot_bomb.policy_flags import check_as_trained, trained_with
 from lerobot_bomb.vlm.backbone import config_dict
 from lerobot_bomb.vlm.cached_text import CachedText
 from lerobot_bomb.vlm.depth import (
@@ -60,7 +62,11 @@ from lerobot_bomb.vlm.paligemma import (
     load_paligemma,
 )
 from lerobot_bomb.vlm.tokenizer import load_tokenizer
-from lerobot_policy_spatialvla_grid.configuration_spatialvla_grid import NUM_STATE_BINS, SpatialvlaGridConfig
+from lerobot_policy_spatialvla_grid.configuration_spatialvla_grid import (
+    AS_TRAINED,
+    NUM_STATE_BINS,
+    SpatialvlaGridConfig,
+)
 
 logger = logging.getLogger(__name__)
 
@@ -83,6 +89,7 @@ class SpatialvlaGridPolicy(PreTrainedPolicy):
     ):
         super().__init__(config)
         config.validate_features()
+        config.trained_with = trained_with(config, AS_TRAINED)
         self.tokens, self.backbone = _build(config)
         self.register_buffer("symbol_ids", torch.tensor(self.tokens.symbols), persistent=False)
         self.zoedepth = _build_depth(config)
@@ -117,6 +124,10 @@ class SpatialvlaGridPolicy(PreTrainedPolicy):
         **kwargs,
     ) -> "SpatialvlaGridPolicy":
         """As LeRobot's, but a missing or unexpected tensor is an error; the grids adapt to the new data."""
+        if config is not None:
+            if dataset_meta is None:
+                check_as_trained(config)
+            config.check_grid_as_trained(is_refitted=dataset_meta is not None and config.adapt_embeddings)
         policy = super().from_pretrained(*args, config=config, **{**kwargs, "strict": True})
         if dataset_meta is not None:
             if policy.config.adapt_embeddings:
@@ -136,14 +147,18 @@ class SpatialvlaGridPolicy(PreTrainedPolicy):
     @torch.no_grad()
     def _adapt(self, meta: LeRobotDatasetMetadata) -> None:
         """Fit the grids to another dataset; a cell's rows become those of where it lies in the old grids."""
-        old, new = self.grids, ActionGrids(self.grids.settings, self._action_dim)
+        old, new = self.grids, ActionGrids(self.config.grid_settings(), self._action_dim)
         _fit(new, self.config, meta)
         if new.to_dict() == old.to_dict():  # a training that is resumed
             return
-        for table in (self.cell_embedding.weight, self.cell_head.weight):
-            table.copy_(interpolate_rows(old, new, table))
-        logger.info("Action grids adapted.\nold: %s\nnew: %s", old.to_dict(), new.to_dict())
+        for table in (self.cell_embedding, self.cell_head):
+            table.weight = nn.Parameter(interpolate_rows(old, new, table.weight))
+        self.cell_embedding.num_embeddings = self.cell_head.out_features = new.num_tokens
+        names = dim_names(meta.features[ACTION])
+        edges = edges_text(old, names), edges_text(new, names)
+        logger.info("Action grids adapted.\nOld edges\n%s\nNew edges\n%s", *edges)
         self.grids = new.to(self.symbol_ids.device)
+        self.first_cells = torch.tensor(new.offsets, device=self.symbol_ids.device)
         self.config.grid_params = new.to_dict()
 
     @torch.no_grad()
@@ -392,7 +407,9 @@ def _make_grids(config: SpatialvlaGridConfig, meta: LeRobotDatasetMetadata | Non
     assert config.action_feature is not None
     num_dims = config.action_feature.shape[0]
     if config.grid_params is not None:
-        return ActionGrids.from_dict(config.grid_params, num_dims)
+        grids = ActionGrids.from_dict(config.grid_params, num_dims)
+        grids.decode_point = config.decode_point
+        return grids
     grids = ActionGrids(config.grid_settings(), num_dims)
     if meta is not None:
         _fit(grids, config, meta)
@@ -405,12 +422,10 @@ def _fit(grids: ActionGrids, config: SpatialvlaGridConfig, meta: LeRobotDatasetM
     assert meta.stats is not None
     actions_ND = read_columns(meta, (ACTION,), present_episodes(meta))[ACTION].astype(np.float64)
     low_D, high_D = bounds(meta.stats[ACTION], config.normalization_mapping["ACTION"], actions_ND.shape[1])
-    num_clipped = grids.fit(normalised(actions_ND, low_D, high_D), normalised_rest(low_D, high_D))
-    if num_clipped:
-        logger.info(
-            "%d of %d actions of %s lie outside the range of the action grids and are clipped to it",
-            *(num_clipped, len(actions_ND), meta.repo_id),
-        )
+    actions_ND = normalised(actions_ND, low_D, high_D)
+    grids.fit(actions_ND, normalised_rest(low_D, high_D))
+    text, is_much = clipping_text(actions_ND, dim_names(meta.features[ACTION]))
+    logger.log(logging.WARNING if is_much else logging.INFO, "%s: %s", meta.repo_id, text)
 
 
 def _make_ensemble(config: SpatialvlaGridConfig, groups: Sequence[ActionGroup]) -> TemporalEnsemble | None:

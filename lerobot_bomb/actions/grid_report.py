@@ -1,0 +1,62 @@
+"""A grid in words: its coordinates' names and edges, and what it clips.
+
+Shapes: `N` actions, `D` action dims.
+"""
+
+import textwrap
+from collections.abc import Sequence
+
+import numpy as np
+
+from lerobot_bomb.actions.grids import ActionGrids
+
+CLIP_TOLERANCE = 1e-3  # LeRobot estimates quantiles: an extreme that many actions have may lie a hair beyond
+LINE_WIDTH = 110  # characters
+# of a dim's actions: what lies beyond the 1 % and 99 % quantiles, twice
+MUCH_CLIPPED = 0.04
+
+
+def coordinate_names(grids: ActionGrids, dim_names: Sequence[str]) -> list[str]:
+    """Of all groups."""
+    return [label for group in grids.groups for label in group.coordinate_names(dim_names)]
+
+
+def coordinate_edges(grids: ActionGrids) -> list[np.ndarray]:
+    """(bins + 1,) of each coordinate of all groups."""
+    return [of.numpy() for i in range(len(grids.groups)) for of in grids.group_edges(i)]
+
+
+def edges_text(grids: ActionGrids, dim_names: Sequence[str]) -> str:
+    """Lines of edges, coordinate by coordinate."""
+    labels = coordinate_names(grids, dim_names)
+    lines = [
+        f"{label}: {' '.join(f'{edge:.4f}' for edge in of)}"
+        for label, of in zip(labels, coordinate_edges(grids), strict=True)
+    ]
+    return "\n".join(textwrap.fill(line, LINE_WIDTH, subsequent_indent="  ") for line in lines)
+
+
+def clipping_text(actions_ND: np.ndarray, dim_names: Sequence[str]) -> tuple[str, bool]:
+    """What is lost of normalised actions beyond [-1, 1], and whether it is more than quantiles cut off."""
+    beyond_ND = (np.abs(actions_ND) - 1).clip(min=0)
+    is_clipped_ND = beyond_ND > CLIP_TOLERANCE
+    if not is_clipped_ND.any():
+        return f"none of {len(actions_ND)} actions is beyond the grid", False
+    dims = [
+        f"{name} {clipped:.1%} by up to {most:.2g}"
+        for name, clipped, most in zip(
+            dim_names, is_clipped_ND.mean(axis=0), beyond_ND.max(axis=0), strict=True
+        )
+        if clipped
+    ]
+    text = (
+        f"{is_clipped_ND.any(axis=1).sum()} of {len(actions_ND)} actions are beyond the grid and are clipped "
+        f"to it, in units of half its range: {', '.join(dims)}"
+    )
+    is_much = bool((is_clipped_ND.mean(axis=0) > MUCH_CLIPPED).any())
+    if is_much:
+        text += (
+            ". LeRobot averages quantiles over episodes, so that they are not the data's; "
+            "--policy.normalization_mapping with ACTION: MIN_MAX clips nothing"
+        )
+    return text, is_much
