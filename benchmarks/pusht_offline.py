@@ -38,29 +38,28 @@ NUM_TRAIN_EPISODES = 180
 MAX_COVERAGE_REWARD = 0.95  # coverage from which gym-pusht's reward is 1
 
 # absolute positions that no state tells must be found in the picture; the near ones are found first
-LOOK_FLAGS = [
-    "--policy.relative_actions=false",
-    "--policy.use_state=false",
-    "--policy.optimizer_lr=1.0e-3",
+LOOK_FLAGS = ["--policy.use_state=false", "--policy.optimizer_lr=1.0e-3"]
+NEAR_FLAGS = [
+    "--policy.chunk_size=4",
+    "--policy.n_action_steps=4",
+    "--policy.scheduler_decay_steps=2500",
+    "--steps=2500",
 ]
+ABSOLUTE = ["--policy.relative_actions=false"]
 BASE_STAGES: dict[str, list[list[str]]] = {
-    "vla0_smol": [
-        [
-            *LOOK_FLAGS,
-            "--policy.chunk_size=4",
-            "--policy.n_action_steps=4",
-            "--policy.scheduler_decay_steps=2500",
-            "--steps=2500",
-        ],
-        LOOK_FLAGS,
-    ],
+    "spatialvla_grid": [[*LOOK_FLAGS, *NEAR_FLAGS], LOOK_FLAGS],
+    "vla0_smol": [[*LOOK_FLAGS, *ABSOLUTE, *NEAR_FLAGS], [*LOOK_FLAGS, *ABSOLUTE]],
 }
 RECIPE = "recipe"
 VARIANTS: dict[str, dict[str, list[str]]] = {
+    "spatialvla_grid": {
+        RECIPE: [],
+        "no_state": ["--policy.use_state=false"],
+    },
     "vla0_smol": {
         RECIPE: [],
         "no_masking": ["--policy.mask_max_fraction=0"],
-        "absolute": ["--policy.relative_actions=false"],
+        "absolute": ABSOLUTE,
         "no_state": ["--policy.use_state=false"],
     },
 }
