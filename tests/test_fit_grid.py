@@ -22,7 +22,15 @@ from lerobot_bomb.cli import main
 from lerobot_bomb.data.columns import read_columns
 from lerobot_bomb.data.record import record
 from lerobot_bomb.data.recording import Recording
-from lerobot_bomb.viewing.grid_picture import BAR_RGB, EDGE_RGB, ROW_HEIGHT, Row, draw_rows, edge_x
+from lerobot_bomb.viewing.grid_picture import (
+    BAR_RGB,
+    EDGE_RGB,
+    ROW_HEIGHT,
+    TITLE_HEIGHT,
+    Row,
+    draw_rows,
+    edge_x,
+)
 
 REPO_ID = "test/grid"
 QUANTILES = '--policy.normalization_mapping={"ACTION": "QUANTILES"}'
@@ -136,14 +144,14 @@ def test_the_picture_has_the_edges_where_the_grid_has_them(root: Path, tmp_path:
     grids, _, _ = fitted(LeRobotDatasetMetadata(REPO_ID, root=root))
     edges = [of.numpy() for i in range(2) for of in grids.group_edges(i)]
     for row, of in enumerate(edges):
-        line = picture[row * ROW_HEIGHT + 10]
+        line = picture[TITLE_HEIGHT + row * ROW_HEIGHT + 10]
         assert np.flatnonzero((line == EDGE_RGB).all(axis=1)).tolist() == sorted({*edge_x(of).tolist()})
 
 
 def test_bars_of_a_histogram_are_where_the_values_are() -> None:
     values = np.repeat([0.25, 0.75], [100, 25])
-    picture = draw_rows([Row(["label"], values, np.array([0.0, 0.5, 1.0]))])
-    heights = (picture == BAR_RGB).all(axis=2).sum(axis=0)
+    picture = draw_rows("", [Row(["label"], values, np.array([0.0, 0.5, 1.0]))])
+    heights = (picture[TITLE_HEIGHT:] == BAR_RGB).all(axis=2).sum(axis=0)
     first, second = (int(edge_x(np.array([0, value, 1]))[1]) for value in (0.25, 0.75))
     assert heights[first - 2 : first + 6].max() == pytest.approx(
         2 * heights[second - 2 : second + 6].max(), abs=2

@@ -93,7 +93,10 @@ def run_fit_grid(args: argparse.Namespace) -> int:
     physical = {name: error_D * (high_D - low_D) / 2 for name, error_D in errors.items()}
     print_errors("in the dataset's units", physical, names)
     if args.picture is not None:
-        picture = draw_rows(picture_rows(grids, actions_ND.clip(-1, 1), names))
+        title = (
+            f"{meta.repo_id}: {len(actions_ND)} actions and the {grids.settings.distribution} bins of a grid"
+        )
+        picture = draw_rows(title, picture_rows(grids, actions_ND.clip(-1, 1), names))
         with written_whole(args.picture) as (path,):
             Image.fromarray(picture).save(path, format="PNG")
         print(f"\n{args.picture}")

@@ -10,6 +10,7 @@ from lerobot_bomb.viewing.sheet import FONT_SIZE, GAP, INK, LABEL_WIDTH, PAPER, 
 PLOT_WIDTH, PLOT_HEIGHT = 640, 90  # pixels
 ROW_HEIGHT = PLOT_HEIGHT + FONT_SIZE + 3 * GAP  # pixels
 BAR_WIDTH = 4  # pixels
+TITLE_HEIGHT = 2 * FONT_SIZE + 4 * GAP  # pixels, the legend's line included
 BAR_RGB, EDGE_RGB = (150, 160, 175), (210, 40, 30)
 
 
@@ -22,13 +23,20 @@ class Row:
     edges: np.ndarray  # (E + 1,) of its bins
 
 
-def draw_rows(rows: list[Row]) -> np.ndarray:
-    """(H, W, 3) uint8: histograms with edges, one above the other."""
-    size = (LABEL_WIDTH + PLOT_WIDTH + 2 * GAP, len(rows) * ROW_HEIGHT + GAP)
+def draw_rows(title: str, rows: list[Row]) -> np.ndarray:
+    """(H, W, 3) uint8: histograms with edges, one above the other, under a title and a legend."""
+    size = (LABEL_WIDTH + PLOT_WIDTH + 2 * GAP, TITLE_HEIGHT + len(rows) * ROW_HEIGHT + GAP)
     picture = Image.new("RGB", size, PAPER)
     pen = ImageDraw.Draw(picture)
+    pen.text((GAP, GAP), title, INK, font(FONT_SIZE))
+    x = GAP
+    for rgb, text in ((BAR_RGB, "square root of how many actions"), (EDGE_RGB, "edges of the bins")):
+        top = 2 * GAP + FONT_SIZE
+        pen.rectangle((x, top, x + FONT_SIZE, top + FONT_SIZE), rgb)
+        pen.text((x + FONT_SIZE + GAP, top), text, INK, font(FONT_SIZE))
+        x += FONT_SIZE + 4 * GAP + round(pen.textlength(text, font(FONT_SIZE)))
     for i, row in enumerate(rows):
-        _draw_row(pen, row, GAP + i * ROW_HEIGHT)
+        _draw_row(pen, row, TITLE_HEIGHT + i * ROW_HEIGHT)
     return np.asarray(picture)
 
 

@@ -30,7 +30,6 @@ class PaliGemmaPrompt:
     state_start: list[int]
     symbols: list[int]  # digits 0-9, space
     task_end: list[int]
-    end: int  # of an answer
 
     @classmethod
     def from_tokenizer(cls, tokenizer: Tokenizer, vlm_model_name: str) -> "PaliGemmaPrompt":
@@ -59,7 +58,6 @@ class PaliGemmaPrompt:
             state_start=several(" state:"),
             symbols=[one(text) for text in SYMBOL_TEXTS[:END]],
             task_end=several("\n"),
-            end=one("<eos>", "<end_of_utterance>"),
         )
 
     def to_dict(self) -> dict[str, int | list[int]]:
