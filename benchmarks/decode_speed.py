@@ -12,7 +12,6 @@ prompt (prefill) is reported apart; bars are on the rest (decode).
 import argparse
 import logging
 import statistics
-import sys
 import time
 from collections.abc import Callable
 from dataclasses import replace
@@ -20,17 +19,17 @@ from typing import Any
 from unittest.mock import patch
 
 import torch
+from decode_speed_compare import Timed, compare, finish, print_rows
 from decode_speed_peer import OneTokenText
-from decode_speed_works import Episodes, Timed, Work, margin_at_difference, num_symbols, ours, peer
+from decode_speed_works import Episodes, Work, margin_at_difference, num_symbols, ours, peer
 from lerobot.utils.import_utils import register_third_party_plugins
-from machine import add_machine_arguments, positive, require_idle_machine, write_figures
+from machine import add_machine_arguments, positive, require_idle_machine
 from torch import Tensor
 
 from lerobot_bomb.actions.text import NUM_SYMBOLS
 from lerobot_bomb.decoding.decoder import MAX_GUESSES, Continuation, Guess, decode_numbers
 from lerobot_bomb.decoding.draft import KnownSymbols, LinearDraft
 from lerobot_bomb.decoding.grammar import NumberGrammar, Place
-from lerobot_bomb.tables import print_table
 from lerobot_bomb.vlm.backbone import SmolVLMBackbone, build_backbone
 from lerobot_bomb.vlm.presets import nano_config
 from lerobot_bomb.vlm.tokenizer import NANO, load_tokenizer
@@ -76,9 +75,7 @@ def main() -> None:
             "256M": time_256m(bars),
             "bfloat16": compare_bfloat16(episodes, args.repeats),
         }
-    print("\n".join(f"{'ok' if holds else 'MISSED'}: {bar}" for bar, holds in bars.items()))
-    write_figures(args.json, {**figures, "bars": bars})
-    sys.exit(0 if all(bars.values()) else 1)
+    finish(args.json, figures, bars)
 
 
 def count_passes(episodes: Episodes, repeats: int, bars: dict[str, bool]) -> dict[str, Any]:
@@ -270,43 +267,6 @@ def compare_bfloat16(episodes: Episodes, repeats: int) -> dict[str, float]:
         f"likeliest symbols are at most {figures['largest_margin']:.3f} apart"
     )
     return figures
-
-
-def compare(runs: dict[str, tuple[Callable[[Work], Timed], list[Work]]]) -> dict[str, dict[str, float]]:
-    """Every way on every work, in turn; they must write the same. Gains are over the first."""
-    timed: dict[str, list[Timed]] = {name: [] for name in runs}
-    for run, works in runs.values():
-        run(works[0])
-    for i in range(max(len(works) for _, works in runs.values())):
-        for name, (run, works) in runs.items():
-            timed[name].append(run(works[i]))
-        expected, *others = (answers[-1].numbers for answers in timed.values())
-        if not all(torch.equal(numbers, expected[:, : numbers.shape[1]]) for numbers in others):
-            raise SystemExit(f"answer {i}: {', '.join(runs)} do not write the same numbers")
-    figures = {
-        name: {
-            "prefill_ms": 1e3 * statistics.median(answer.prefill_s for answer in answers),
-            "decode_ms": 1e3 * statistics.median(answer.decode_s for answer in answers),
-            "passes": statistics.mean(answer.num_passes for answer in answers),
-            "whole_ms": 1e3 * statistics.median(answer.prefill_s + answer.decode_s for answer in answers),
-        }
-        for name, answers in timed.items()
-    }
-    slowest, *_ = figures.values()
-    for row in figures.values():
-        row["decode_gain"] = slowest["decode_ms"] / row["decode_ms"]
-        row["whole_gain"] = slowest["whole_ms"] / row["whole_ms"]
-    return figures
-
-
-def print_rows(title: str, figures: dict[str, dict[str, float]]) -> None:
-    """A table of rows of figures."""
-    print()
-    header = next(iter(figures.values()))
-    print_table(
-        [title, *(name.replace("_", " ") for name in header)],
-        [[name, *(f"{value:.2f}" for value in row.values())] for name, row in figures.items()],
-    )
 
 
 if __name__ == "__main__":

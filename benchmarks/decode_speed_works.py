@@ -9,6 +9,7 @@ from typing import Any
 from unittest.mock import patch
 
 import torch
+from decode_speed_compare import Timed
 from decode_speed_peer import XgrammarGenerate
 from lerobot.configs import PreTrainedConfig
 from lerobot.datasets import LeRobotDataset
@@ -36,16 +37,6 @@ class Work:
     grammar: NumberGrammar
     stop_after: int
     guess: Guess
-
-
-@dataclass(frozen=True)
-class Timed:
-    """One answer of each row."""
-
-    numbers: Tensor
-    prefill_s: float
-    decode_s: float
-    num_passes: int  # the prompt's included
 
 
 class Episodes:

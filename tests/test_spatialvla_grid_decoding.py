@@ -1,62 +1,14 @@
 """The decoder against transformers' own model, masks, cache and greedy search."""
 
-import copy
 from typing import Any
 
 import pytest
 import torch
+from decode_speed_grid import StockGenerate
 from spatialvla_grid_cases import make_batch, make_policy, rows
-from torch import Tensor, nn
-from transformers import LogitsProcessor
+from torch import Tensor
 
 from lerobot_bomb.vlm.cached_text import CachedText
-from lerobot_bomb.vlm.images import crop_and_resize
-from lerobot_policy_spatialvla_grid.modeling_spatialvla_grid import SpatialvlaGridPolicy
-
-
-class Slots(LogitsProcessor):
-    """Lets only a slot's cells through."""
-
-    def __init__(self, policy: SpatialvlaGridPolicy, first_cell: int, prompt_length: int):
-        self.grids, self.first_cell, self.prompt_length = policy.grids, first_cell, prompt_length
-
-    def __call__(self, input_ids: Tensor, scores: Tensor) -> Tensor:  # pyright: ignore[reportIncompatibleMethodOverride]
-        group = (input_ids.shape[1] - self.prompt_length) % len(self.grids.groups)
-        first = self.first_cell + self.grids.offsets[group]
-        allowed = slice(first, first + self.grids.num_cells[group])
-        masked = torch.full_like(scores, -torch.inf)
-        masked[:, allowed] = scores[:, allowed]
-        return masked
-
-
-def generated(policy: SpatialvlaGridPolicy, batch: dict[str, Any]) -> Tensor:
-    """(B, T, G) cells: the stock model with the cells as words, its prompt padded on the left."""
-    vlm: Any = copy.deepcopy(policy.backbone.vlm)
-    words = vlm.get_input_embeddings()
-    first_cell = len(words.weight)
-    words.weight = nn.Parameter(torch.cat([words.weight, policy.cell_embedding.weight]))
-    vlm.lm_head.weight = nn.Parameter(torch.cat([vlm.lm_head.weight, policy.cell_head.weight]))
-    vlm.config.text_config.vocab_size = vlm.model.vocab_size = len(words.weight)
-    prompt = policy._prompt(batch)
-    ids, written = (torch.zeros_like(column) for column in (prompt.ids, prompt.written))
-    for row, kept in enumerate(prompt.written):
-        ids[row, -int(kept.sum()) :], written[row, -int(kept.sum()) :] = prompt.ids[row, kept], True
-    pixels = torch.stack(
-        [crop_and_resize(batch[key], 0.9, policy.backbone.image_size, None) for key in policy._cameras], 1
-    )
-    num_slots = policy.config.chunk_size * len(policy.grids.groups)
-    tokens = vlm.generate(
-        input_ids=ids,
-        attention_mask=written.long(),
-        token_type_ids=torch.zeros_like(ids),
-        pixel_values=pixels.flatten(0, 1),
-        max_new_tokens=num_slots,
-        min_new_tokens=num_slots,
-        do_sample=False,
-        logits_processor=[Slots(policy, first_cell, ids.shape[1])],
-    )
-    cells = tokens[:, ids.shape[1] :].unflatten(1, (policy.config.chunk_size, -1)) - first_cell
-    return cells - torch.tensor(policy.grids.offsets)
 
 
 @torch.no_grad()
@@ -65,7 +17,9 @@ def test_it_chooses_what_generate_chooses(batch_size: int, num_dims: int) -> Non
     for seed in range(3):
         policy = make_policy(seed, num_dims)
         batch = make_batch(policy, batch_size, seed)
-        assert torch.equal(policy._choose(batch, policy.config.chunk_size), generated(policy, batch))
+        generate = StockGenerate(policy)
+        cells = policy._choose(batch, policy.config.chunk_size)
+        assert torch.equal(cells.flatten(1), generate(generate.inputs(batch)).numbers)
 
 
 @torch.no_grad()
