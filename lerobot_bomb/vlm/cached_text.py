@@ -8,12 +8,15 @@ query heads for each, `E` size of a head.
 """
 
 import math
+from collections.abc import Callable
 from dataclasses import dataclass
+from functools import partial
 from typing import Any
 
 import torch
-from torch import Tensor
-from torch.nn.functional import rms_norm, scaled_dot_product_attention
+from torch import Tensor, nn
+from torch.nn.functional import linear, rms_norm, scaled_dot_product_attention
+from transformers.activations import SiLUActivation
 from transformers.models.gemma2.modeling_gemma2 import Gemma2DecoderLayer, Gemma2RMSNorm
 
 
@@ -21,7 +24,7 @@ from transformers.models.gemma2.modeling_gemma2 import Gemma2DecoderLayer, Gemma
 class _Columns:
     """Where the tokens of a pass stand, as the layers need it."""
 
-    slots: Tensor  # (B * K * V,) int64 rows of the flat cache
+    slots: Tensor  # (B * K * 2 * V,) int64 rows of the flat cache, keys' before values'
     cos: Tensor  # (B, K, 1, E)
     sin: Tensor  # (B, K, 1, E), negative in the first half
     penalty: Tensor  # (B, 1, K * G, columns in use): 0 for those that a query reads, else -inf
@@ -56,9 +59,8 @@ class CachedText:
     def __init__(self, model: Any, batch_size: int, num_columns: int, first_position: int = 0):
         config = model.config
         check_positions(config, num_columns)
-        self._model = model
-        self._num_heads, self._num_groups = config.num_key_value_heads, config.num_attention_heads
-        self._num_groups //= self._num_heads
+        num_heads = config.num_key_value_heads
+        self._num_groups = config.num_attention_heads // num_heads
         embedding = model.embed_tokens.weight
         # a multiple of 8, which attention on CUDA wants of its masks
         self._columns_C = torch.arange(-(-(num_columns + 1) // 8) * 8, device=embedding.device)
@@ -67,14 +69,18 @@ class CachedText:
         first_half, second_half = sin_1CE[0].chunk(2, dim=-1)
         self._cos_CE, self._sin_CE = cos_1CE[0], torch.cat([-first_half, second_half], dim=-1)
         device = embedding.device.type
-        dtype = torch.get_autocast_dtype(device) if torch.is_autocast_enabled(device) else embedding.dtype
-        # keys and values; a head's columns beside each other, as attention reads them
-        shape = (2, batch_size, self._num_heads, len(self._columns_C), config.head_dim)
-        self._caches = [
-            torch.zeros(shape, dtype=dtype, device=embedding.device) for _ in range(config.num_hidden_layers)
+        cast = torch.is_autocast_enabled(device)
+        self._dtype = torch.get_autocast_dtype(device) if cast else embedding.dtype
+        # keys and values of a head, its columns beside each other, as attention reads them
+        shape = batch_size, num_heads, 2, len(self._columns_C), config.head_dim
+        self._layers = [
+            _Layer(layer, torch.zeros(shape, dtype=self._dtype, device=embedding.device))
+            for layer in model.layers
         ]
-        heads_BV = torch.arange(batch_size * self._num_heads, device=embedding.device)
-        self._first_slot_B1V = heads_BV.view(batch_size, 1, -1) * len(self._columns_C)
+        self._norm = _RMSNorm(model.norm)
+        blocks_BV2 = torch.arange(math.prod(shape[:3]), device=embedding.device).view(shape[:3])
+        # (B, 1, 2 * V), of each row's keys and values
+        self._first_slot = blocks_BV2.transpose(1, 2).reshape(batch_size, 1, -1) * len(self._columns_C)
 
     def __call__(self, embeds_BKH: Tensor, columns_BK: Tensor, reach_BK: Tensor | None = None) -> Tensor:
         """Embeddings of tokens at columns -> (B, K, H) states after the last layer.
@@ -83,16 +89,9 @@ class CachedText:
         """
         columns = self._locate(columns_BK, columns_BK if reach_BK is None else reach_BK)
         x_BKH = embeds_BKH
-        for layer, cache in zip(self._model.layers, self._caches, strict=True):
-            read_BKH = self._attend(layer.self_attn, _norm(layer.input_layernorm, x_BKH), cache, columns)
-            if isinstance(layer, Gemma2DecoderLayer):
-                x_BKH = x_BKH + _norm(layer.post_attention_layernorm, read_BKH)
-                mixed_BKH = self._mix(layer.mlp, _norm(layer.pre_feedforward_layernorm, x_BKH))
-                x_BKH = x_BKH + _norm(layer.post_feedforward_layernorm, mixed_BKH)
-            else:
-                x_BKH = x_BKH + read_BKH
-                x_BKH = x_BKH + self._mix(layer.mlp, _norm(layer.post_attention_layernorm, x_BKH))
-        return _norm(self._model.norm, x_BKH)
+        for layer in self._layers:
+            x_BKH = layer(x_BKH, columns)
+        return self._norm(x_BKH)
 
     def columns_of(self, written_BL: Tensor) -> Tensor:
         """Which columns of rows hold a token -> (B, L) its column in the cache, gaps out of the way."""
@@ -100,16 +99,18 @@ class CachedText:
 
     def keep(self, row_B: Tensor) -> None:
         """Only these rows are gone on with, in this order."""
-        self._caches = [cache[:, row_B] for cache in self._caches]
-        self._first_slot_B1V = self._first_slot_B1V[: len(row_B)]
+        for layer in self._layers:
+            layer.keep(row_B)
+        self._first_slot = self._first_slot[: len(row_B)]
 
     def _locate(self, columns_BK: Tensor, reach_BK: Tensor) -> _Columns:
         unread_BKC = self._columns_C[: self._count_columns(columns_BK)] > reach_BK[..., None]
-        penalty_BKC = torch.where(unread_BKC, -torch.inf, 0.0).to(self._caches[0].dtype)
+        penalty_BKC = torch.where(unread_BKC, -torch.inf, 0.0).to(self._dtype)
+        columns_BK1 = columns_BK[..., None]
         return _Columns(
-            slots=(self._first_slot_B1V + columns_BK[..., None]).flatten(),
-            cos=self._cos_CE[columns_BK][:, :, None],
-            sin=self._sin_CE[columns_BK][:, :, None],
+            slots=(self._first_slot + columns_BK1).flatten(),
+            cos=self._cos_CE[columns_BK1],
+            sin=self._sin_CE[columns_BK1],
             penalty=penalty_BKC.repeat_interleave(self._num_groups, dim=1)[:, None],
         )
 
@@ -119,37 +120,126 @@ class CachedText:
             return len(self._columns_C)
         return int(torch.where(columns_BK == self.unread_column, 0, columns_BK).max()) + 1
 
-    def _attend(self, attention: Any, x_BKH: Tensor, cache: Tensor, columns: _Columns) -> Tensor:
-        heads = *x_BKH.shape[:2], -1, cache.shape[-1]
-        query, key = (
-            _rotate(projection(x_BKH).view(heads), columns)
-            for projection in (attention.q_proj, attention.k_proj)
-        )
-        new = key, attention.v_proj(x_BKH).view(heads)
-        for cached, part in zip(cache.flatten(1, 3), new, strict=True):
-            cached.index_copy_(0, columns.slots, part.flatten(0, 2).to(cache.dtype))
+
+class _Layer:
+    """A layer, its modules looked up once, with the keys and values that it has computed."""
+
+    def __init__(self, layer: Any, cache_BV2CE: Tensor):
+        attention, mlp = layer.self_attn, layer.mlp
+        self._qkv = [_product(part) for part in (attention.q_proj, attention.k_proj, attention.v_proj)]
+        self._out, self._scale = _product(attention.o_proj), attention.scaling
+        self._softcap: float | None = getattr(attention, "attn_logit_softcapping", None)
+        self._gate, self._up, self._down = map(_product, (mlp.gate_proj, mlp.up_proj, mlp.down_proj))
+        self._activate = mlp.act_fn
+        self._is_silu = isinstance(mlp.act_fn, SiLUActivation | nn.SiLU)
+        self._before_attention = _RMSNorm(layer.input_layernorm)
+        is_gemma = isinstance(layer, Gemma2DecoderLayer)
+        after = layer.post_attention_layernorm
+        self._before_mlp = _RMSNorm(layer.pre_feedforward_layernorm if is_gemma else after)
+        self._after_attention = _RMSNorm(after) if is_gemma else None
+        self._after_mlp = _RMSNorm(layer.post_feedforward_layernorm) if is_gemma else None
+        self._take(cache_BV2CE)
+
+    def __call__(self, x_BKH: Tensor, columns: _Columns) -> Tensor:
+        """(B, K, H) -> (B, K, H)."""
+        read_BKH = self._attend(self._before_attention(x_BKH), columns)
+        x_BKH = _add(x_BKH, read_BKH, self._after_attention)
+        return _add(x_BKH, self._mix(self._before_mlp(x_BKH)), self._after_mlp)
+
+    def keep(self, row_B: Tensor) -> None:
+        """Only these rows are gone on with, in this order."""
+        self._take(self._cache_BV2CE[row_B])
+
+    def _take(self, cache_BV2CE: Tensor) -> None:
+        self._cache_BV2CE, self._flat = cache_BV2CE, cache_BV2CE.flatten(0, 3)
+        self._keys_BVCE, self._values_BVCE = cache_BV2CE.unbind(dim=2)
+
+    def _attend(self, x_BKH: Tensor, columns: _Columns) -> Tensor:
+        num_keys, size, dtype = self._keys_BVCE.shape[1], self._flat.shape[1], self._flat.dtype
+        parts = torch.cat([project(x_BKH) for project in self._qkv], dim=-1).to(columns.cos.dtype)
+        heads = parts.view(*x_BKH.shape[:2], -1, size)
+        _rotate_(heads[:, :, :-num_keys], columns)
+        new = heads[:, :, -2 * num_keys :].reshape(-1, size)
+        self._flat.index_copy_(0, columns.slots, new.to(dtype))
+        query = (heads[:, :, : -2 * num_keys] * self._scale).to(dtype)
         # the queries that share a key stand beside each other: one product a key-value head
-        query_BVXE = query.to(cache.dtype).unflatten(2, (-1, self._num_groups)).transpose(1, 2).flatten(2, 3)
-        keys_BVCE, values_BVCE = cache[..., : columns.penalty.shape[-1], :]
-        softcap = getattr(attention, "attn_logit_softcapping", None)
-        if softcap is None:
+        query_BVXE = query.view(*x_BKH.shape[:2], num_keys, -1, size).transpose(1, 2).flatten(2, 3)
+        num_columns = columns.penalty.shape[-1]
+        keys_BVCE = self._keys_BVCE.narrow(2, 0, num_columns)
+        values_BVCE = self._values_BVCE.narrow(2, 0, num_columns)
+        if self._softcap is None:
             read_BVXE = scaled_dot_product_attention(
-                query_BVXE, keys_BVCE, values_BVCE, attn_mask=columns.penalty, scale=attention.scaling
+                query_BVXE, keys_BVCE, values_BVCE, attn_mask=columns.penalty, scale=1.0
             )
         else:
-            scores_BVXC = query_BVXE @ keys_BVCE.transpose(2, 3) * (attention.scaling / softcap)
-            scores_BVXC = softcap * torch.tanh(scores_BVXC) + columns.penalty
-            read_BVXE = scores_BVXC.softmax(dim=-1, dtype=torch.float32).to(cache.dtype) @ values_BVCE
-        read = read_BVXE.unflatten(2, (len(x_BKH[0]), -1)).transpose(1, 2).flatten(2)
-        return attention.o_proj(read)
+            read_BVXE = _capped_attention(query_BVXE, keys_BVCE, values_BVCE, columns.penalty, self._softcap)
+        read_BVKGE = read_BVXE.view(len(x_BKH), num_keys, x_BKH.shape[1], -1, size)
+        return self._out(read_BVKGE.transpose(1, 2).flatten(2))
 
-    def _mix(self, mlp: Any, x_BKH: Tensor) -> Tensor:
-        gate = mlp.gate_proj(x_BKH)
-        is_silu = getattr(self._model.config, "hidden_act", None) == "silu"
-        is_slow = is_silu and on_host(gate) and gate.dtype == torch.float32
+    def _mix(self, x_BKH: Tensor) -> Tensor:
+        gate = self._gate(x_BKH)
         # torch's own silu takes 3.5 times as long there
-        activated = gate / (1 + torch.exp(-gate)) if is_slow else mlp.act_fn(gate)
-        return mlp.down_proj(activated * mlp.up_proj(x_BKH))
+        is_slow = self._is_silu and _in_float32_on_host(gate)
+        activated = gate / (1 + torch.exp(-gate)) if is_slow else self._activate(gate)
+        return self._down(activated * self._up(x_BKH))
+
+
+def _product(module: nn.Module) -> Callable[[Tensor], Tensor]:
+    """A projection; a plain one without `Module.__call__`, which is half of a small product's time."""
+    if type(module) is nn.Linear and not (module._forward_hooks or module._forward_pre_hooks):
+        return partial(linear, weight=module.weight, bias=module.bias)
+    return module
+
+
+class _RMSNorm:
+    """A model's norm; what its weight alone decides is computed once.
+
+    On a CPU torch's own takes three times as long as the same in four operations.
+    """
+
+    def __init__(self, norm: Any):
+        self._is_gemma = isinstance(norm, Gemma2RMSNorm)
+        self._eps = norm.eps if self._is_gemma else norm.variance_epsilon
+        self._weight = 1 + norm.weight.float() if self._is_gemma else norm.weight
+        width = len(norm.weight)
+        self.scale, self._least_length = self._weight * width**0.5, torch.tensor((width * self._eps) ** 0.5)
+
+    def __call__(self, x: Tensor) -> Tensor:
+        """(..., H) -> (..., H)."""
+        if _in_float32_on_host(x):
+            return self.unscaled(x).mul_(self.scale)
+        if self._is_gemma:
+            return rms_norm(x.float(), x.shape[-1:], self._weight, self._eps).type_as(x)
+        return rms_norm(x, x.shape[-1:], self._weight, self._eps)
+
+    def unscaled(self, x: Tensor) -> Tensor:
+        """(..., H) of length 1, or less where eps counts."""
+        return x / torch.hypot(torch.linalg.vector_norm(x, dim=-1, keepdim=True), self._least_length)
+
+
+def _add(x: Tensor, new: Tensor, norm: _RMSNorm | None) -> Tensor:
+    """Of the same shape: x and what a part of a layer adds to it."""
+    if norm is None:
+        return x + new
+    if _in_float32_on_host(x) and _in_float32_on_host(new):
+        return torch.addcmul(x, norm.unscaled(new), norm.scale)
+    return x + norm(new)
+
+
+def _capped_attention(
+    query_BVXE: Tensor, keys_BVCE: Tensor, values_BVCE: Tensor, penalty_B1XC: Tensor, softcap: float
+) -> Tensor:
+    """(B, V, X, E) read by X queries a head, each product p limited to ``softcap * tanh(p / softcap)``."""
+    # 2 * softcap * sigmoid(2 * p / softcap), which is larger by softcap: the same after softmax, and faster
+    query = (query_BVXE * (2 / softcap)).flatten(0, 1)
+    scores = torch.bmm(query, keys_BVCE.flatten(0, 1).transpose(1, 2)).float().sigmoid_()
+    scores_BVXC = torch.add(penalty_B1XC, scores.view(*query_BVXE.shape[:3], -1), alpha=2 * softcap)
+    weights = scores_BVXC.softmax(dim=-1).to(values_BVCE.dtype).flatten(0, 1)
+    return torch.bmm(weights, values_BVCE.flatten(0, 1)).view(query_BVXE.shape)
+
+
+def _in_float32_on_host(x: Tensor) -> bool:
+    return x.dtype == torch.float32 and on_host(x)
 
 
 def on_host(tensor: Tensor) -> bool:
@@ -157,13 +247,7 @@ def on_host(tensor: Tensor) -> bool:
     return tensor.device.type == "cpu"
 
 
-def _rotate(heads: Tensor, columns: _Columns) -> Tensor:
-    """(B, K, heads, E) with rotary positions."""
-    return heads * columns.cos + heads.roll(heads.shape[-1] // 2, dims=-1) * columns.sin
-
-
-def _norm(norm: Any, x_BKH: Tensor) -> Tensor:
-    if isinstance(norm, Gemma2RMSNorm):
-        weight = 1 + norm.weight.float()
-        return rms_norm(x_BKH.float(), x_BKH.shape[-1:], weight, norm.eps).type_as(x_BKH)
-    return rms_norm(x_BKH, x_BKH.shape[-1:], norm.weight, norm.variance_epsilon)
+def _rotate_(heads: Tensor, columns: _Columns) -> None:
+    """(B, K, heads, E) get their rotary positions in place."""
+    half_turned = heads.roll(heads.shape[-1] // 2, dims=-1)
+    heads.mul_(columns.cos).addcmul_(half_turned, columns.sin)

@@ -297,7 +297,8 @@ class SpatialvlaGridPolicy(PreTrainedPolicy):
                 prompt.written,
                 prompt_reads_all=self._prompt_reads_all,
             )
-            heads = [partial(self._cell_logits, group) for group in range(num_groups)]
+            # the cap on logits keeps their order
+            heads = [partial(self._uncapped_logits, group) for group in range(num_groups)]
             cells_BS = decode_slots(model, num_steps * heads, num_steps * self._cell_embedders())
         # casts of weights cached under inference mode cannot be used by a later training step
         torch.clear_autocast_cache()
@@ -316,9 +317,11 @@ class SpatialvlaGridPolicy(PreTrainedPolicy):
 
     def _cell_logits(self, group: int, hidden: Tensor) -> Tensor:
         """(..., H) -> (..., cells of the group)."""
+        return self.backbone.cap(self._uncapped_logits(group, hidden))
+
+    def _uncapped_logits(self, group: int, hidden: Tensor) -> Tensor:
         first = self.grids.offsets[group]
-        rows = self.cell_head.weight[first : first + self.grids.num_cells[group]]
-        return self.backbone.cap(linear(hidden, rows))
+        return linear(hidden, self.cell_head.weight[first : first + self.grids.num_cells[group]])
 
     # Prompt
 
