@@ -79,7 +79,7 @@ def make_batches(policy: SpatialvlaGridPolicy, batch_size: int, num_batches: int
     """Preprocessed, the sentences of different lengths."""
     bounds = torch.ones(policy.grids.num_dims)
     preprocessor, _ = make_pre_post_processors(
-        policy.config, dataset_stats={"action": {"q01": -bounds, "q99": bounds}}
+        policy.config, dataset_stats={"action": {"min": -bounds, "max": bounds}}
     )
     generator = torch.Generator().manual_seed(0)
     shape = batch_size, 3, IMAGE_SIZE, IMAGE_SIZE
