@@ -47,14 +47,14 @@ NEAR_FLAGS = [
 ]
 ABSOLUTE = ["--policy.relative_actions=false"]
 BASE_STAGES: dict[str, list[list[str]]] = {
-    "spatialvla_grid": [[*LOOK_FLAGS, *NEAR_FLAGS], LOOK_FLAGS],
+    "spatialvla_grid": [NEAR_FLAGS],
     "vla0_smol": [[*LOOK_FLAGS, *ABSOLUTE, *NEAR_FLAGS], [*LOOK_FLAGS, *ABSOLUTE]],
 }
 RECIPE = "recipe"
 VARIANTS: dict[str, dict[str, list[str]]] = {
     "spatialvla_grid": {
         RECIPE: [],
-        "no_state": ["--policy.use_state=false"],
+        "uniform": ["--policy.grid_distribution=uniform"],
     },
     "vla0_smol": {
         RECIPE: [],
