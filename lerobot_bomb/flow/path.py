@@ -1,0 +1,57 @@
+"""The straight path from noise to actions, and what two heads learn on it.
+
+A^tau = (1 - tau) z + tau A0: noise z ~ N(0, I) at tau = 0, clean actions A0 at tau = 1 (flow matching, Lipman
+et al. 2022, arXiv 2210.02747). Shapes: `B` batch, `K` action steps, `D` action dims.
+"""
+
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from lerobot_bomb.flags import one_of
+
+TIME_SAMPLINGS = ("uniform", "beta")
+BETA_SHAPE, BETA_END = 1.5, 0.999  # pi0, arXiv 2410.24164, appendix B
+
+
+@dataclass(frozen=True)
+class PathPoint:
+    """Noisy actions, in normalised units, and the targets of both heads there."""
+
+    actions: Tensor  # (B, K, D) A^tau
+    tau: Tensor  # (B,) in [0, 1], one for all of a chunk
+    velocity: Tensor  # (B, K, D) A0 - z = (A0 - A^tau) / (1 - tau)
+    noise: Tensor  # (B, K, D) z = A^tau - tau * velocity
+
+
+def path_point(clean_BKD: Tensor, noise_BKD: Tensor, tau_B: Tensor) -> PathPoint:
+    """Where the paths from noise z to clean actions A0 are at tau."""
+    tau_B11 = tau_B[:, None, None]
+    actions_BKD = (1 - tau_B11) * noise_BKD + tau_B11 * clean_BKD
+    return PathPoint(actions_BKD, tau_B, clean_BKD - noise_BKD, noise_BKD)
+
+
+def draw_tau(time_sampling: str, batch_size: int, generator: torch.Generator) -> Tensor:
+    """(B,) float32 in [0, 1) on the generator's device, for training.
+
+    ``uniform``, or ``beta``: pi0's 0.999 (1 - u) with u ~ Beta(1.5, 1), most of it near the noise.
+
+    Raises:
+        ValueError: ``time_sampling`` is none of these.
+    """
+    one_of("time_sampling", time_sampling, TIME_SAMPLINGS)
+    uniform_B = torch.rand(batch_size, generator=generator, device=generator.device)
+    if time_sampling == "uniform":
+        return uniform_B
+    return BETA_END * (1 - uniform_B ** (1 / BETA_SHAPE))  # u^a is the distribution function of Beta(a, 1)
+
+
+def draw_noise(generator: torch.Generator, batch_size: int, shape: tuple[int, ...]) -> Tensor:
+    """(B, *shape) float32 of N(0, I) on the generator's device, for sampling.
+
+    Drawn once and the same for every row, so what a row becomes depends on neither the size of the batch nor
+    its place in it. The rows share memory: not to be written to.
+    """
+    noise = torch.randn(shape, generator=generator, device=generator.device)
+    return noise.expand(batch_size, *shape)
