@@ -1,0 +1,127 @@
+"""What a velocity head v and a noise head eps are trained on: a regression each, and that they agree.
+
+Conditional means satisfy eps* = A^tau - tau v* at every tau, so the term that asks for it is zero at the
+optimum of the others. It replaces equations 5 to 7 of FDVLA, which equate a Jacobian with a velocity.
+Shapes: `B` batch, `K` action steps, `D` action dims.
+"""
+
+import torch
+from torch import Tensor
+
+from lerobot_bomb.flags import one_of
+from lerobot_bomb.flow.path import PathPoint
+
+CONSISTENCIES = ("linear", "energy_vjp", "off")
+DETACHES = ("none", "flow", "denoise")
+REDUCTIONS = ("mean", "none")
+
+
+def check_objective(
+    consistency: str,
+    consistency_detach: str,
+    consistency_loss_weight: float,
+    use_flow_head: bool,
+    use_denoise_head: bool,
+) -> None:
+    """Raise a ValueError that names the flag of the loss that is wrong or lacks a head."""
+    one_of("consistency", consistency, CONSISTENCIES)
+    one_of("consistency_detach", consistency_detach, DETACHES)
+    if not use_flow_head and not use_denoise_head:
+        raise ValueError("use_flow_head and use_denoise_head are both off; at least one head is needed")
+    needs_both = consistency != "off" and consistency_loss_weight > 0
+    if needs_both and not (use_flow_head and use_denoise_head):
+        missing = "use_denoise_head" if use_flow_head else "use_flow_head"
+        raise ValueError(
+            f"consistency_loss_weight={consistency_loss_weight} compares both heads, but {missing} is off; "
+            "set it to 0, or consistency=off"
+        )
+
+
+def masked_mean(values_BKD: Tensor, kept_BK: Tensor, reduction: str = "mean") -> Tensor:
+    """Mean over the elements that are kept, () or with ``reduction="none"`` (B,) over each row's own.
+
+    Zero where nothing is kept.
+    """
+    one_of("reduction", reduction, REDUCTIONS)
+    kept_BKD = kept_BK[..., None].expand_as(values_BKD)
+    dims = (1, 2) if reduction == "none" else (0, 1, 2)
+    return (values_BKD * kept_BKD).sum(dims) / kept_BKD.sum(dims).clamp(min=1)
+
+
+def consistency_residual(velocity_BKD: Tensor, noise_BKD: Tensor, point: PathPoint) -> Tensor:
+    """What the heads disagree by, (B, K, D): eps + tau v - A^tau, tau times the difference in velocity."""
+    return noise_BKD + point.tau[:, None, None] * velocity_BKD - point.actions
+
+
+def energy_noise(noise_BKD: Tensor, point: PathPoint, kept_BK: Tensor, differentiable: bool = True) -> Tensor:
+    """(1 - tau) J^T eps with J the Jacobian of eps by A^tau, (B, K, D); the noise itself if it is eps*.
+
+    That holds for a point mass of clean actions only: then eps* = (A^tau - tau A0) / (1 - tau). It is the
+    sound reading of FDVLA's equation 6: the gradient of an energy |eps|^2 / 2, here of the kept elements.
+    ``noise_BKD`` must have been computed from ``point.actions``, which ``requires_grad``. ``differentiable``:
+    whether the result can be trained through, by a second backward pass that fused attention lacks.
+    """
+    energy = (noise_BKD * kept_BK[..., None]).square().sum() / 2
+    (gradient_BKD,) = torch.autograd.grad(
+        energy, point.actions, retain_graph=True, create_graph=differentiable
+    )
+    return (1 - point.tau[:, None, None]) * gradient_BKD
+
+
+def joint_loss(
+    velocity_BKD: Tensor | None,
+    noise_BKD: Tensor | None,
+    point: PathPoint,
+    kept_BK: Tensor,
+    *,
+    flow_loss_weight: float = 1.0,
+    denoise_loss_weight: float = 1.0,
+    consistency_loss_weight: float = 0.1,
+    consistency: str = "linear",
+    consistency_detach: str = "none",
+    reduction: str = "mean",
+) -> tuple[Tensor, dict[str, Tensor]]:
+    """Weighted sum of the terms that there are heads for, and the terms as metrics.
+
+    Metrics are of the batch, () and detached: ``flow_loss``, ``denoise_loss``, ``consistency_loss``, and as
+    ``consistency_residual_rms`` the root mean square of `consistency_residual`, whatever ``consistency`` is.
+
+    Args:
+        velocity_BKD: what the flow head predicts, None without one.
+        noise_BKD: what the denoising head predicts, None without one.
+        point: of the straight path; its targets at elements that are not kept do not count.
+        kept_BK: bool, the actions to train on.
+        flow_loss_weight: of the mean square of v - (A0 - z).
+        denoise_loss_weight: of the mean square of eps - z.
+        consistency_loss_weight: of the mean square of the residual.
+        consistency: ``linear``: `consistency_residual`; ``energy_vjp``: the same of `energy_noise`; ``off``.
+        consistency_detach: the head that the consistency does not train: ``flow``, ``denoise`` or ``none``.
+        reduction: ``mean`` over the kept elements of the batch, ``none`` for (B,) of each row.
+
+    Raises:
+        ValueError: an unknown choice, no head, or a consistency without both heads.
+    """
+    has_heads = velocity_BKD is not None, noise_BKD is not None
+    check_objective(consistency, consistency_detach, consistency_loss_weight, *has_heads)
+    terms, metrics = {}, {}
+    if velocity_BKD is not None:
+        terms["flow_loss"] = flow_loss_weight, velocity_BKD - point.velocity
+    if noise_BKD is not None:
+        terms["denoise_loss"] = denoise_loss_weight, noise_BKD - point.noise
+    if velocity_BKD is not None and noise_BKD is not None:
+        residual_BKD = consistency_residual(velocity_BKD, noise_BKD, point).detach()
+        metrics["consistency_residual_rms"] = masked_mean(residual_BKD.square(), kept_BK).sqrt()
+        if consistency != "off" and consistency_loss_weight > 0:
+            if consistency == "energy_vjp":
+                noise_BKD = energy_noise(noise_BKD, point, kept_BK, consistency_detach != "denoise")
+            if consistency_detach == "flow":
+                velocity_BKD = velocity_BKD.detach()
+            elif consistency_detach == "denoise":
+                noise_BKD = noise_BKD.detach()
+            residual_BKD = consistency_residual(velocity_BKD, noise_BKD, point)
+            terms["consistency_loss"] = consistency_loss_weight, residual_BKD
+    loss = torch.zeros((), device=kept_BK.device)
+    for name, (weight, error_BKD) in terms.items():
+        loss = loss + weight * masked_mean(error_BKD.square(), kept_BK, reduction)
+        metrics[name] = masked_mean(error_BKD.detach().square(), kept_BK)
+    return loss, metrics
