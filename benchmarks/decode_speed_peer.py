@@ -15,6 +15,7 @@ from lerobot_bomb.actions.text import END, SYMBOL_TEXTS
 from lerobot_bomb.decoding.decoder import read_answer
 from lerobot_bomb.decoding.grammar import NumberGrammar
 from lerobot_bomb.vlm.backbone import SmolVLMBackbone
+from lerobot_bomb.vlm.cached_text import CachedText
 
 
 class XgrammarGenerate:
@@ -63,6 +64,8 @@ def _padded_left(embeds_BLH: Tensor, written_BL: Tensor) -> tuple[Tensor, Tensor
 
 class OneTokenText:
     """Stands in for `CachedText`: a single row, one token a pass, on transformers' growing cache."""
+
+    columns_of = CachedText.columns_of
 
     def __init__(self, model: Any, batch_size: int, num_columns: int):
         assert batch_size == 1
