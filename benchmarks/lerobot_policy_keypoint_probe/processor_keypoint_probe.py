@@ -12,12 +12,11 @@ from lerobot.processor import (
     PolicyProcessorPipeline,
     ProcessorStepRegistry,
     TransitionKey,
-    make_default_policy_processor_steps,
-    make_policy_processor_pipelines,
 )
 from lerobot.utils.constants import OBS_LANGUAGE_TOKENS
 from torch import Tensor
 
+from lerobot_bomb.vlm.task_tokenizer import make_task_processors
 from lerobot_policy_keypoint_probe.configuration_keypoint_probe import KeypointProbeConfig
 
 NO_WORD = 0  # fills up short sentences
@@ -61,14 +60,4 @@ def make_keypoint_probe_pre_post_processors(
     PolicyProcessorPipeline[PolicyAction, PolicyAction],
 ]:
     """Rename, batch, words, device, normalise; and unnormalise, to CPU."""
-    steps = make_default_policy_processor_steps(config, dataset_stats)
-    return make_policy_processor_pipelines(
-        input_steps=[
-            steps.rename_observations,
-            steps.add_batch_dim,
-            WordsStep(),
-            steps.to_device,
-            steps.normalize,
-        ],
-        output_steps=[steps.unnormalize, steps.to_cpu],
-    )
+    return make_task_processors(config, dataset_stats, WordsStep())

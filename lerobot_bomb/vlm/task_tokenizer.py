@@ -84,18 +84,18 @@ class TaskTokenizerStep(ObservationProcessorStep):
 def make_task_processors(
     config: PreTrainedConfig,
     dataset_stats: dict[str, dict[str, Tensor]] | None,
-    tokenizer_step: TaskTokenizerStep,
+    task_step: ObservationProcessorStep,
 ) -> tuple[
     PolicyProcessorPipeline[dict[str, Any], dict[str, Any]],
     PolicyProcessorPipeline[PolicyAction, PolicyAction],
 ]:
-    """Rename, batch, tokenize, device, normalise; and unnormalise, to CPU."""
+    """Rename, batch, ``task_step`` (which reads the task), device, normalise; and unnormalise, to CPU."""
     steps = make_default_policy_processor_steps(config, dataset_stats)
     return make_policy_processor_pipelines(
         input_steps=[
             steps.rename_observations,
             steps.add_batch_dim,
-            tokenizer_step,
+            task_step,
             steps.to_device,
             steps.normalize,
         ],

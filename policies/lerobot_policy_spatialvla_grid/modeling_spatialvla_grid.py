@@ -9,11 +9,10 @@ cells of a group.
 
 import logging
 from collections import deque
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from functools import partial
 from typing import ClassVar
 
-import numpy as np
 import torch
 from lerobot.datasets import LeRobotDatasetMetadata
 from lerobot.policies import PreTrainedPolicy
@@ -29,24 +28,17 @@ from torch.nn.functional import cross_entropy, linear
 
 from lerobot_bomb.actions.accuracy import means
 from lerobot_bomb.actions.bins import Bins
-from lerobot_bomb.actions.ensemble import TemporalEnsemble
-from lerobot_bomb.actions.grid_fit import normalised, normalised_rest
-from lerobot_bomb.actions.grid_report import clipping_text, edges_text
+from lerobot_bomb.actions.grid_report import edges_text
 from lerobot_bomb.actions.grid_rows import interpolate_rows
-from lerobot_bomb.actions.grid_settings import ActionGroup
 from lerobot_bomb.actions.grids import ActionGrids
-from lerobot_bomb.actions.relative import bounds, present_episodes
+from lerobot_bomb.actions.relative import bounds
 from lerobot_bomb.actions.text import TokenRows, digits_needed, number_symbols
-from lerobot_bomb.data.columns import dim_names, read_columns
+from lerobot_bomb.data.columns import dim_names
 from lerobot_bomb.decoding.slots import PromptContinuation, decode_slots
 from lerobot_bomb.policy_flags import check_as_trained, trained_with
-from lerobot_bomb.vlm.backbone import config_dict
 from lerobot_bomb.vlm.cached_text import CachedText
 from lerobot_bomb.vlm.depth import (
-    ZoeDepth,
-    build_zoedepth,
     lattice_points,
-    load_zoedepth,
     observed_depth,
     observed_intrinsics,
 )
@@ -56,12 +48,14 @@ from lerobot_bomb.vlm.inputs import read_actions, read_image, read_tensor
 from lerobot_bomb.vlm.intrinsics import crop_intrinsics, default_intrinsics, resize_intrinsics
 from lerobot_bomb.vlm.paligemma import (
     FIRST_POSITION,
-    PaliGemmaBackbone,
-    PaliGemmaPrompt,
-    build_paligemma,
-    load_paligemma,
 )
-from lerobot_bomb.vlm.tokenizer import load_tokenizer
+from lerobot_policy_spatialvla_grid.building_spatialvla_grid import (
+    build_depth,
+    build_model,
+    fit_to_data,
+    make_ensemble,
+    make_grids,
+)
 from lerobot_policy_spatialvla_grid.configuration_spatialvla_grid import (
     AS_TRAINED,
     NUM_STATE_BINS,
@@ -90,9 +84,9 @@ class SpatialvlaGridPolicy(PreTrainedPolicy):
         super().__init__(config)
         config.validate_features()
         config.trained_with = trained_with(config, AS_TRAINED)
-        self.tokens, self.backbone = _build(config)
+        self.tokens, self.backbone = build_model(config)
         self.register_buffer("symbol_ids", torch.tensor(self.tokens.symbols), persistent=False)
-        self.zoedepth = _build_depth(config)
+        self.zoedepth = build_depth(config)
         self.ego3d = Ego3D(
             self.backbone.vision_hidden_size,
             self.backbone.patches_per_side,
@@ -100,7 +94,7 @@ class SpatialvlaGridPolicy(PreTrainedPolicy):
             config.ego3d_n_freqs,
             config.ego3d_zero_init,
         )
-        self.grids = _make_grids(config, dataset_meta)
+        self.grids = make_grids(config, dataset_meta)
         self.register_buffer("first_cells", torch.tensor(self.grids.offsets), persistent=False)
         hidden_size = self.backbone.text_config.hidden_size
         self.cell_embedding = nn.Embedding(self.grids.num_tokens, hidden_size)
@@ -112,7 +106,7 @@ class SpatialvlaGridPolicy(PreTrainedPolicy):
         self._take_units(dataset_meta)
         # source of all that is random in training: the crop
         self.generator = torch.Generator().manual_seed(torch.initial_seed())
-        self._ensemble = _make_ensemble(config, self.grids.groups)
+        self._ensemble = make_ensemble(config, self.grids.groups)
         self.reset()
 
     @classmethod
@@ -148,7 +142,7 @@ class SpatialvlaGridPolicy(PreTrainedPolicy):
     def _adapt(self, meta: LeRobotDatasetMetadata) -> None:
         """Fit the grids to another dataset; a cell's rows become those of where it lies in the old grids."""
         old, new = self.grids, ActionGrids(self.config.grid_settings(), self._action_dim)
-        _fit(new, self.config, meta)
+        fit_to_data(new, self.config, meta)
         if new.to_dict() == old.to_dict():  # a training that is resumed
             return
         for table in (self.cell_embedding, self.cell_head):
@@ -392,71 +386,3 @@ class SpatialvlaGridPolicy(PreTrainedPolicy):
         """The precision of ``config.dtype``, whoever calls: training, evaluation or a user's own loop."""
         bfloat16 = self.config.dtype == "bfloat16"
         return torch.autocast(self.symbol_ids.device.type, dtype=torch.bfloat16, enabled=bfloat16)
-
-
-def _build_depth(config: SpatialvlaGridConfig) -> ZoeDepth | None:
-    """As `_build`: a checkpoint brings its own."""
-    if config.depth_source != "zoedepth":
-        return None
-    if config.depth_config is not None:
-        return build_zoedepth(config.depth_config)
-    zoedepth = load_zoedepth(config.depth_model_name)
-    config.depth_config = config_dict(zoedepth.model)
-    return zoedepth
-
-
-def _make_grids(config: SpatialvlaGridConfig, meta: LeRobotDatasetMetadata | None) -> ActionGrids:
-    """A checkpoint's grids, or those that fit the data, or even ones where there is neither."""
-    assert config.action_feature is not None
-    num_dims = config.action_feature.shape[0]
-    if config.grid_params is not None:
-        grids = ActionGrids.from_dict(config.grid_params, num_dims)
-        grids.decode_point = config.decode_point
-        return grids
-    grids = ActionGrids(config.grid_settings(), num_dims)
-    if meta is not None:
-        _fit(grids, config, meta)
-    config.grid_params = grids.to_dict()
-    return grids
-
-
-def _fit(grids: ActionGrids, config: SpatialvlaGridConfig, meta: LeRobotDatasetMetadata) -> None:
-    """Take the cells from all actions of a dataset, normalised as LeRobot will."""
-    assert meta.stats is not None
-    actions_ND = read_columns(meta, (ACTION,), present_episodes(meta))[ACTION].astype(np.float64)
-    low_D, high_D = bounds(meta.stats[ACTION], config.normalization_mapping["ACTION"], actions_ND.shape[1])
-    actions_ND = normalised(actions_ND, low_D, high_D)
-    grids.fit(actions_ND, normalised_rest(low_D, high_D))
-    text, is_much = clipping_text(actions_ND, dim_names(meta.features[ACTION]))
-    logger.log(logging.WARNING if is_much else logging.INFO, "%s: %s", meta.repo_id, text)
-
-
-def _make_ensemble(config: SpatialvlaGridConfig, groups: Sequence[ActionGroup]) -> TemporalEnsemble | None:
-    if not config.temporal_ensemble_size:
-        return None
-    return TemporalEnsemble(
-        config.temporal_ensemble_size,
-        config.temporal_ensemble_weighting,
-        config.temporal_ensemble_coefficient,
-        [dim for group in groups if group.transform == "binary" for dim in group.dims],
-    )
-
-
-def _build(config: SpatialvlaGridConfig) -> tuple[PaliGemmaPrompt, PaliGemmaBackbone]:
-    """Base model, or the architecture of a checkpoint; fills in what a checkpoint's config must hold."""
-    if config.vlm_config is None:
-        name = config.vlm_model_name
-        tokens = PaliGemmaPrompt.from_tokenizer(load_tokenizer(name), name)
-        backbone = load_paligemma(name)
-        config.vlm_config, config.prompt_tokens = config_dict(backbone.vlm), tokens.to_dict()
-    elif config.prompt_tokens is None:
-        raise ValueError("--policy.vlm_config is set, but not --policy.prompt_tokens, which belongs to it")
-    else:
-        tokens, backbone = PaliGemmaPrompt(**config.prompt_tokens), build_paligemma(config.vlm_config)
-    if config.freeze_vision_encoder:
-        backbone.vlm.model.vision_tower.requires_grad_(False)
-    if config.freeze_llm_embeddings:
-        backbone.vlm.get_input_embeddings().requires_grad_(False)
-    if config.gradient_checkpointing:
-        backbone.vlm.gradient_checkpointing_enable({"use_reentrant": False})
-    return tokens, backbone

@@ -1,0 +1,92 @@
+"""The parts of a ``spatialvla_grid``, from its config, a checkpoint's or a dataset."""
+
+import logging
+from collections.abc import Sequence
+
+import numpy as np
+from lerobot.datasets import LeRobotDatasetMetadata
+from lerobot.utils.constants import ACTION
+
+from lerobot_bomb.actions.ensemble import TemporalEnsemble
+from lerobot_bomb.actions.grid_fit import normalised, normalised_rest
+from lerobot_bomb.actions.grid_report import clipping_text
+from lerobot_bomb.actions.grid_settings import ActionGroup
+from lerobot_bomb.actions.grids import ActionGrids
+from lerobot_bomb.actions.relative import bounds, present_episodes
+from lerobot_bomb.data.columns import dim_names, read_columns
+from lerobot_bomb.vlm.backbone import config_dict
+from lerobot_bomb.vlm.depth import ZoeDepth, build_zoedepth, load_zoedepth
+from lerobot_bomb.vlm.paligemma import PaliGemmaBackbone, PaliGemmaPrompt, build_paligemma, load_paligemma
+from lerobot_bomb.vlm.tokenizer import load_tokenizer
+from lerobot_policy_spatialvla_grid.configuration_spatialvla_grid import SpatialvlaGridConfig
+
+logger = logging.getLogger(__name__)
+
+
+def build_depth(config: SpatialvlaGridConfig) -> ZoeDepth | None:
+    """As `build_model`: a checkpoint brings its own."""
+    if config.depth_source != "zoedepth":
+        return None
+    if config.depth_config is not None:
+        return build_zoedepth(config.depth_config)
+    zoedepth = load_zoedepth(config.depth_model_name)
+    config.depth_config = config_dict(zoedepth.model)
+    return zoedepth
+
+
+def make_grids(config: SpatialvlaGridConfig, meta: LeRobotDatasetMetadata | None) -> ActionGrids:
+    """A checkpoint's grids, or those that fit the data, or even ones where there is neither."""
+    assert config.action_feature is not None
+    num_dims = config.action_feature.shape[0]
+    if config.grid_params is not None:
+        grids = ActionGrids.from_dict(config.grid_params, num_dims)
+        grids.decode_point = config.decode_point
+        return grids
+    grids = ActionGrids(config.grid_settings(), num_dims)
+    if meta is not None:
+        fit_to_data(grids, config, meta)
+    config.grid_params = grids.to_dict()
+    return grids
+
+
+def fit_to_data(grids: ActionGrids, config: SpatialvlaGridConfig, meta: LeRobotDatasetMetadata) -> None:
+    """Take the cells from all actions of a dataset, normalised as LeRobot will."""
+    assert meta.stats is not None
+    actions_ND = read_columns(meta, (ACTION,), present_episodes(meta))[ACTION].astype(np.float64)
+    low_D, high_D = bounds(meta.stats[ACTION], config.normalization_mapping["ACTION"], actions_ND.shape[1])
+    actions_ND = normalised(actions_ND, low_D, high_D)
+    grids.fit(actions_ND, normalised_rest(low_D, high_D))
+    text, is_much = clipping_text(actions_ND, dim_names(meta.features[ACTION]))
+    logger.log(logging.WARNING if is_much else logging.INFO, "%s: %s", meta.repo_id, text)
+
+
+def make_ensemble(config: SpatialvlaGridConfig, groups: Sequence[ActionGroup]) -> TemporalEnsemble | None:
+    """None: a queue instead."""
+    if not config.temporal_ensemble_size:
+        return None
+    return TemporalEnsemble(
+        config.temporal_ensemble_size,
+        config.temporal_ensemble_weighting,
+        config.temporal_ensemble_coefficient,
+        [dim for group in groups if group.transform == "binary" for dim in group.dims],
+    )
+
+
+def build_model(config: SpatialvlaGridConfig) -> tuple[PaliGemmaPrompt, PaliGemmaBackbone]:
+    """Base model, or the architecture of a checkpoint; fills in what a checkpoint's config must hold."""
+    if config.vlm_config is None:
+        name = config.vlm_model_name
+        tokens = PaliGemmaPrompt.from_tokenizer(load_tokenizer(name), name)
+        backbone = load_paligemma(name)
+        config.vlm_config, config.prompt_tokens = config_dict(backbone.vlm), tokens.to_dict()
+    elif config.prompt_tokens is None:
+        raise ValueError("--policy.vlm_config is set, but not --policy.prompt_tokens, which belongs to it")
+    else:
+        tokens, backbone = PaliGemmaPrompt(**config.prompt_tokens), build_paligemma(config.vlm_config)
+    if config.freeze_vision_encoder:
+        backbone.vlm.model.vision_tower.requires_grad_(False)
+    if config.freeze_llm_embeddings:
+        backbone.vlm.get_input_embeddings().requires_grad_(False)
+    if config.gradient_checkpointing:
+        backbone.vlm.gradient_checkpointing_enable({"use_reentrant": False})
+    return tokens, backbone
