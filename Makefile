@@ -1,7 +1,7 @@
 # `make` finds a Python >= 3.12 by itself; name one with `make PYTHON=/path/to/python3.12 ...`.
 SHELL := /bin/bash
 .DEFAULT_GOAL := help
-.PHONY: help setup demo test test-long judges check clean
+.PHONY: help setup demo test test-long test-cuda judges check clean
 
 BIN := .venv/bin
 STAMP := .venv/.installed
@@ -12,6 +12,7 @@ help:
 	@echo "make demo       set up, record, train, evaluate; about 10 minutes on 2 cores"
 	@echo "make test       set up and run the tests"
 	@echo "make test-long  the heavy tests as well"
+	@echo "make test-cuda  checks that need a CUDA device"
 	@echo "make judges     LeRobot's own tests on our types: LEROBOT_SRC=checkout of its tag"
 	@echo "make check      ruff, format, pyright"
 	@echo "make setup      only set up .venv"
@@ -37,6 +38,9 @@ test: setup
 
 test-long: setup
 	@$(BIN)/pytest
+
+test-cuda: setup
+	@$(BIN)/pytest tests/outside/check_cuda.py
 
 judges: setup
 	@$(BIN)/python tests/outside/run_judges.py "$(LEROBOT_SRC)"

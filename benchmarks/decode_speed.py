@@ -27,7 +27,7 @@ from machine import add_machine_arguments, positive, require_idle_machine
 from torch import Tensor
 
 from lerobot_bomb.actions.text import NUM_SYMBOLS
-from lerobot_bomb.decoding.decoder import MAX_GUESSES, Continuation, Guess, decode_numbers
+from lerobot_bomb.decoding.decoder import MAX_GUESSES, Continuation, Guess, Prompt, decode_numbers
 from lerobot_bomb.decoding.draft import KnownSymbols, LinearDraft
 from lerobot_bomb.decoding.grammar import NumberGrammar, Place
 from lerobot_bomb.vlm.backbone import SmolVLMBackbone, build_backbone
@@ -160,7 +160,7 @@ def no_guess(_: Tensor, place: Place) -> Tensor:
 
 def plain_short_head(work: Work) -> Timed:
     """Ours on transformers' layers and growing cache."""
-    with patch("lerobot_bomb.decoding.decoder.CachedText", OneTokenText):
+    with patch("lerobot_bomb.decoding.writer.CachedText", OneTokenText):
         return ours(work)
 
 
@@ -183,7 +183,7 @@ def time_256m(bars: dict[str, bool]) -> dict[str, Any]:
     prompt = torch.randn(1, 190, SHAPE_256M["hidden_size"])
     written = torch.ones(1, 190, dtype=torch.bool)
     works = [
-        Work(backbone, prompt + i, written, torch.arange(30, 42), grammar, 40, KnownSymbols(grammar))
+        Work(backbone, Prompt(prompt + i, written), torch.arange(30, 42), grammar, 40, KnownSymbols(grammar))
         for i in range(3)
     ]
     figures = compare(

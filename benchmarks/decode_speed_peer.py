@@ -16,6 +16,7 @@ from lerobot_bomb.decoding.decoder import read_answer
 from lerobot_bomb.decoding.grammar import NumberGrammar
 from lerobot_bomb.vlm.backbone import SmolVLMBackbone
 from lerobot_bomb.vlm.cached_text import CachedText
+from lerobot_bomb.vlm.text_layers import TextLayers
 
 
 class XgrammarGenerate:
@@ -67,10 +68,10 @@ class OneTokenText:
 
     columns_of = CachedText.columns_of
 
-    def __init__(self, model: Any, batch_size: int, num_columns: int):
+    def __init__(self, layers: TextLayers, batch_size: int, num_columns: int):
         assert batch_size == 1
-        self._model, self.unread_column = model, num_columns
-        self._cache = DynamicCache(config=model.config)
+        self._model, self.unread_column = layers.model, num_columns
+        self._cache = DynamicCache(config=layers.config)
 
     def __call__(self, embeds_BKH: Tensor, columns_BK: Tensor) -> Tensor:
         return self._model(

@@ -18,12 +18,18 @@ from torch import Tensor
 from torch.utils.data import default_collate
 
 from lerobot_bomb.actions.text import END, digits_of, number_symbols
-from lerobot_bomb.decoding.decoder import CachedContinuation, Guess, decode_numbers
+from lerobot_bomb.decoding.decoder import (
+    CachedContinuation,
+    Continuation,
+    Decoded,
+    Guess,
+    Prompt,
+    decode_numbers,
+)
 from lerobot_bomb.decoding.draft import LinearDraft
 from lerobot_bomb.decoding.grammar import NumberGrammar
+from lerobot_bomb.decoding.writer import NumberWriter, continue_prompt
 from lerobot_bomb.vlm.backbone import SmolVLMBackbone
-
-MODELING = "lerobot_policy_vla0_smol.modeling_vla0_smol"
 
 
 @dataclass(frozen=True)
@@ -31,8 +37,7 @@ class Work:
     """A batch of prompts, and what is to be written after each."""
 
     backbone: SmolVLMBackbone
-    embeds: Tensor  # (B, L, H)
-    written: Tensor  # (B, L) bool
+    prompt: Prompt
     symbol_ids: Tensor
     grammar: NumberGrammar
     stop_after: int
@@ -107,39 +112,42 @@ class PlanDraft(LinearDraft):
 
 @contextmanager
 def _captured(works: list[Work]) -> Iterator[None]:
-    prompts: list[tuple[Any, ...]] = []
+    write = NumberWriter.__call__
 
-    def continuation(*prompt: Any) -> CachedContinuation:
-        prompts.append(prompt)
-        return CachedContinuation(*prompt)  # pyright: ignore[reportCallIssue]
+    def captured(writer: NumberWriter, prompt: Prompt, symbol_ids: Tensor, stop_after: int) -> Decoded:
+        works.append(Work(writer._backbone, prompt, symbol_ids, writer._grammar, stop_after, writer._guess))
+        return write(writer, prompt, symbol_ids, stop_after)
 
-    def decode(model: Any, grammar: Any, guess: Any, *, batch_size: int, stop_after: int) -> Any:
-        backbone, embeds, written, symbol_ids, _ = prompts[-1]
-        works.append(Work(backbone, embeds, written, symbol_ids, grammar, stop_after, guess))
-        return decode_numbers(model, grammar, guess, batch_size=batch_size, stop_after=stop_after)
-
-    with patch(f"{MODELING}.CachedContinuation", continuation), patch(f"{MODELING}.decode_numbers", decode):
+    with patch.object(NumberWriter, "__call__", captured):
         yield
 
 
-class TimedContinuation(CachedContinuation):
+class Timer(Continuation):
     """Knows when the prompt had been read."""
 
     prompt_read_s = 0.0
 
+    def __init__(self, model: Continuation):
+        self._model, self.keep = model, model.keep
+
     def __call__(self, symbol_BK: Tensor, first_B: Tensor) -> Tensor:
-        logits = super().__call__(symbol_BK, first_B)
+        logits = self._model(symbol_BK, first_B)
         self.prompt_read_s = self.prompt_read_s or time.perf_counter()
         return logits
+
+
+def begin(work: Work) -> CachedContinuation:
+    """The model that goes on with the prompts."""
+    max_symbols = work.grammar.max_symbols(work.stop_after)
+    return continue_prompt(work.backbone, work.prompt, work.symbol_ids, max_symbols)
 
 
 def ours(work: Work) -> Timed:
     """The decoder; the first pass reads the prompt."""
     started = time.perf_counter()
-    max_symbols = work.grammar.max_symbols(work.stop_after)
-    model = TimedContinuation(work.backbone, work.embeds, work.written, work.symbol_ids, max_symbols)
+    model = Timer(begin(work))
     decoded = decode_numbers(
-        model, work.grammar, work.guess, batch_size=len(work.embeds), stop_after=work.stop_after
+        model, work.grammar, work.guess, batch_size=len(work.prompt.embeds), stop_after=work.stop_after
     )
     return Timed(
         decoded.numbers,
@@ -152,11 +160,11 @@ def ours(work: Work) -> Timed:
 def peer(work: Work) -> Timed:
     """The whole answer by `generate`, and one symbol by it: what it takes to read the prompt."""
     generate = XgrammarGenerate(work.backbone, work.symbol_ids, work.grammar)
-    generate(work.embeds, work.written, max_symbols=1)
+    generate(*work.prompt, max_symbols=1)
     started = time.perf_counter()
-    generate(work.embeds, work.written, max_symbols=1)
+    generate(*work.prompt, max_symbols=1)
     prompt_read = time.perf_counter()
-    numbers, num_passes = generate(work.embeds, work.written)
+    numbers, num_passes = generate(*work.prompt)
     whole_s, prefill_s = time.perf_counter() - prompt_read, prompt_read - started
     return Timed(numbers, prefill_s, whole_s - prefill_s, num_passes)
 
@@ -171,9 +179,7 @@ def margin_at_difference(work: Work, written_N: Tensor, theirs_N: Tensor) -> flo
     """Difference of the two largest allowed logits at the first symbol that differs."""
     ours_A, theirs_A = (spell(work.grammar, numbers) for numbers in (written_N, theirs_N))
     at = int((ours_A[: len(theirs_A)] != theirs_A[: len(ours_A)]).nonzero()[0])
-    model = CachedContinuation(
-        work.backbone, work.embeds, work.written, work.symbol_ids, work.grammar.max_symbols(work.stop_after)
-    )
+    model = begin(work)
     logits = model(ours_A[None, :at], torch.zeros(1, dtype=torch.int64))[0, -1].float()
     place = work.grammar.start(1)
     for symbol in ours_A[1:at]:

@@ -10,11 +10,15 @@ from torch import Tensor
 from transformers import AutoTokenizer, LogitsProcessor
 
 from lerobot_bomb.actions.text import END, NUM_SYMBOLS, SPACE, SYMBOL_TEXTS, TokenRows
-from lerobot_bomb.decoding.decoder import CachedContinuation, decode_numbers
+from lerobot_bomb.decoding.ahead import RecordedAnswers
+from lerobot_bomb.decoding.decoder import CachedContinuation, Prompt, decode_numbers
 from lerobot_bomb.decoding.draft import KnownSymbols, LinearDraft
 from lerobot_bomb.decoding.grammar import NumberGrammar
+from lerobot_bomb.decoding.writer import continue_prompt
 from lerobot_bomb.vlm.backbone import SmolVLMBackbone, build_backbone, load_backbone
+from lerobot_bomb.vlm.cached_text import CachedText
 from lerobot_bomb.vlm.presets import nano_config
+from lerobot_bomb.vlm.text_layers import TextLayers
 from lerobot_bomb.vlm.tokenizer import NANO, load_tokenizer
 
 SYMBOL_IDS = torch.arange(20, 20 + NUM_SYMBOLS)
@@ -35,9 +39,8 @@ def prompts(backbone: SmolVLMBackbone, seed: int, lengths: list[int]) -> TokenRo
 def continuation(
     backbone: SmolVLMBackbone, rows: TokenRows, max_symbols: int, symbol_ids: Tensor = SYMBOL_IDS
 ) -> CachedContinuation:
-    return CachedContinuation(
-        backbone, backbone.embed_tokens(rows.ids), rows.written, symbol_ids, max_symbols
-    )
+    prompt = Prompt(backbone.embed_tokens(rows.ids), rows.written)
+    return continue_prompt(backbone, prompt, symbol_ids, max_symbols)
 
 
 def vocabulary(shared_data: Path, name: str) -> tuple[SmolVLMBackbone, Tensor]:
@@ -191,6 +194,32 @@ def test_it_does_so_in_real_vocabularies(shared_data: Path, name: str) -> None:
         expected = generated(backbone, rows, symbol_ids)
         assert ours(backbone, rows, symbol_ids, drafted=True) == expected
         assert ours(backbone, rows, symbol_ids, drafted=False) == expected
+
+
+@torch.no_grad()
+def test_on_a_copy_it_writes_what_the_model_writes_now(backbone: SmolVLMBackbone) -> None:
+    """The way that is recorded on CUDA, step by step; prompts have gaps there."""
+    grammar, changing = NumberGrammar(512, 12), copy.deepcopy(backbone)
+    guess = LinearDraft(grammar, 3)
+    layers = TextLayers(changing.vlm.model.text_model, copy_dtype=torch.float32)
+    head, max_symbols = changing.vlm.lm_head, grammar.max_symbols(12)
+    embeds_SH, head_SH = changing.embed_tokens(SYMBOL_IDS), head.weight[SYMBOL_IDS]
+    text = CachedText(layers, len(LENGTHS), max(LENGTHS) + 3 + max_symbols)
+    recorded = RecordedAnswers(grammar, guess, embeds_SH, head_SH, text)
+    answers = []
+    for seed in range(3):
+        rows = prompts(changing, seed, LENGTHS)
+        gap = torch.zeros(len(LENGTHS), 3, dtype=torch.long)
+        gapped = TokenRows.join([TokenRows(gap, gap.bool()), rows])
+        prompt = Prompt(changing.embed_tokens(gapped.ids), gapped.written)
+        written = recorded(prompt, embeds_SH, head_SH, 12).numbers.tolist()
+        assert written == ours(changing, rows, SYMBOL_IDS, drafted=True)
+        answers.append(written)
+        for module in changing.vlm.model.text_model.modules():
+            if isinstance(module, torch.nn.Linear):
+                module.weight.mul_(1.5)
+        layers.refresh()
+    assert answers[0] != ours(changing, prompts(changing, 0, LENGTHS), SYMBOL_IDS, drafted=True)
 
 
 def test_an_answer_longer_than_the_models_positions_is_refused(backbone: SmolVLMBackbone) -> None:

@@ -52,7 +52,7 @@ def test_only_what_is_executed_is_decoded_with_one_pass_a_cell(monkeypatch: pyte
             passes.append(args[0].shape[1])
             return super().__call__(*args)
 
-    monkeypatch.setattr("lerobot_policy_spatialvla_grid.modeling_spatialvla_grid.CachedText", Counted)
+    monkeypatch.setattr("lerobot_bomb.decoding.slots.CachedText", Counted)
     assert torch.equal(policy.select_action(batch), chunk[:, 0])
     assert torch.equal(policy.select_action(batch), chunk[:, 1])
     assert len(passes) == 2 * 3 and passes[1:] == [1] * 5

@@ -89,7 +89,7 @@ def test_a_draft_changes_no_action_and_saves_passes(monkeypatch: pytest.MonkeyPa
         seen.append(decode_numbers(*args, **options))
         return seen[-1]
 
-    monkeypatch.setattr("lerobot_policy_vla0_smol.modeling_vla0_smol.decode_numbers", decode)
+    monkeypatch.setattr("lerobot_bomb.decoding.writer.decode_numbers", decode)
     chunks = [one.predict_action_chunk(batch) for one in (policy, undrafted)]
     assert torch.equal(*chunks)
     drafted, plain = (decoded.num_passes for decoded in seen)

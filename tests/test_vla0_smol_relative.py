@@ -68,7 +68,7 @@ def test_actions_come_out_absolute_whatever_is_written(
     policy = build(make_dataset(tmp_path / "data", 0.1), bin_mode="levels", n_action_bins=999)
     batch = make_batch(policy, 2)
     bins = torch.full((2, 12), 499)  # zero: stay
-    decode = "lerobot_policy_vla0_smol.modeling_vla0_smol.decode_numbers"
+    decode = "lerobot_bomb.decoding.writer.decode_numbers"
     monkeypatch.setattr(decode, lambda *_, **__: Decoded(bins, num_passes=1))
     chunk = policy.predict_action_chunk(batch)
     assert policy.relative is not None

@@ -9,8 +9,6 @@ cells of a group.
 
 import logging
 from collections import deque
-from collections.abc import Callable
-from functools import partial
 from typing import ClassVar
 
 import torch
@@ -34,9 +32,9 @@ from lerobot_bomb.actions.grids import ActionGrids
 from lerobot_bomb.actions.relative import bounds
 from lerobot_bomb.actions.text import TokenRows, digits_needed, number_symbols
 from lerobot_bomb.data.columns import dim_names
-from lerobot_bomb.decoding.slots import PromptContinuation, decode_slots
+from lerobot_bomb.decoding.decoder import Prompt
+from lerobot_bomb.decoding.slots import SlotWriter
 from lerobot_bomb.policy_flags import check_as_trained, trained_with
-from lerobot_bomb.vlm.cached_text import CachedText
 from lerobot_bomb.vlm.depth import (
     lattice_points,
     observed_depth,
@@ -100,6 +98,12 @@ class SpatialvlaGridPolicy(PreTrainedPolicy):
         self.cell_embedding = nn.Embedding(self.grids.num_tokens, hidden_size)
         self.cell_head = nn.Linear(hidden_size, self.grids.num_tokens, bias=False)
         self._init_cells()
+        self._writer = SlotWriter(
+            self.backbone.text_model,
+            FIRST_POSITION,
+            prompt_reads_all=self._prompt_reads_all,
+            compiled=config.compile_model,
+        )
         self.state_bins = Bins(NUM_STATE_BINS, "centers")
         # physical size of 1 in normalised actions, known while training: (D,)
         self.register_buffer("action_unit", torch.ones(self._action_dim), persistent=False)
@@ -279,29 +283,17 @@ class SpatialvlaGridPolicy(PreTrainedPolicy):
         num_groups = len(self.grids.groups)
         with self._autocast():
             prompt = self._prompt(batch)
-            text = CachedText(
-                self.backbone.text_model,
-                len(prompt.ids),
-                prompt.ids.shape[1] + num_steps * num_groups,
-                FIRST_POSITION,
-            )
-            model = PromptContinuation(
-                text,
-                self._embeds(batch, prompt.ids),
-                prompt.written,
-                prompt_reads_all=self._prompt_reads_all,
-            )
+            embeds_BLH = self._embeds(batch, prompt.ids)
             # the cap on logits keeps their order
-            heads = [partial(self._uncapped_logits, group) for group in range(num_groups)]
-            cells_BS = decode_slots(model, num_steps * heads, num_steps * self._cell_embedders())
+            cells_BS = self._writer(
+                Prompt(embeds_BLH, prompt.written),
+                num_steps * self._group_rows,
+                self.cell_embedding.weight * self.backbone.embed_scale,
+                self.cell_head.weight,
+            )
         # casts of weights cached under inference mode cannot be used by a later training step
         torch.clear_autocast_cache()
         return cells_BS.unflatten(1, (num_steps, num_groups))
-
-    def _cell_embedders(self) -> list[Callable[[Tensor], Tensor]]:
-        """For each group: (B,) cells -> (B, H)."""
-        offsets = self.grids.offsets
-        return [lambda cells_B, first=first: self._embed_cells(cells_B + first) for first in offsets]
 
     # Cells
 
@@ -311,11 +303,13 @@ class SpatialvlaGridPolicy(PreTrainedPolicy):
 
     def _cell_logits(self, group: int, hidden: Tensor) -> Tensor:
         """(..., H) -> (..., cells of the group)."""
-        return self.backbone.cap(self._uncapped_logits(group, hidden))
+        return self.backbone.cap(linear(hidden, self.cell_head.weight[self._group_rows[group]]))
 
-    def _uncapped_logits(self, group: int, hidden: Tensor) -> Tensor:
-        first = self.grids.offsets[group]
-        return linear(hidden, self.cell_head.weight[first : first + self.grids.num_cells[group]])
+    @property
+    def _group_rows(self) -> list[slice]:
+        """Which rows of the tables are each group's cells."""
+        counts = zip(self.grids.offsets, self.grids.num_cells, strict=True)
+        return [slice(first, first + count) for first, count in counts]
 
     # Prompt
 

@@ -32,9 +32,10 @@ from lerobot_bomb.actions.text import (
     number_symbols,
 )
 from lerobot_bomb.data.columns import dim_names, episode_bounds, read_columns
-from lerobot_bomb.decoding.decoder import CachedContinuation, decode_numbers
+from lerobot_bomb.decoding.decoder import Prompt
 from lerobot_bomb.decoding.draft import KnownSymbols, LinearDraft
 from lerobot_bomb.decoding.grammar import NumberGrammar
+from lerobot_bomb.decoding.writer import NumberWriter
 from lerobot_bomb.policy_flags import check_as_trained, trained_with
 from lerobot_bomb.vlm.backbone import SmolVLMBackbone, build_backbone, config_dict, load_backbone
 from lerobot_bomb.vlm.cached_text import check_positions
@@ -73,11 +74,12 @@ class Vla0SmolPolicy(PreTrainedPolicy):
         )
         num_answer = self.grammar.max_symbols(self.grammar.num_numbers)
         check_positions(self.backbone.text_config, len(self._cameras) * len(self._image_span) + num_answer)
-        self._guess = (
+        guess = (
             KnownSymbols(self.grammar)
             if config.draft == "none"
             else LinearDraft(self.grammar, self._action_dim)
         )
+        self._writer = NumberWriter(self.backbone, self.grammar, guess, compiled=config.compile_model)
         self.relative = (
             RelativeActions(self._action_dim, config.relative_dims()) if config.relative_actions else None
         )
@@ -264,18 +266,12 @@ class Vla0SmolPolicy(PreTrainedPolicy):
         """The first ``num_steps`` actions of the chunk, absolute; the model need not write the rest."""
         self.eval()
         with self._autocast():
-            prompt = self._prompt(batch).without_gaps()
+            prompt = self._prompt(batch)
+            if not prompt.ids.is_cuda:  # prompts of other lengths would be recorded anew there
+                prompt = prompt.without_gaps()
             embeds_BLH = self._embeds(batch, prompt.ids)
-            stop_after = num_steps * self._action_dim
-            model = CachedContinuation(
-                self.backbone,
-                embeds_BLH,
-                prompt.written,
-                self.symbol_ids,
-                self.grammar.max_symbols(stop_after),
-            )
-            decoded = decode_numbers(
-                model, self.grammar, self._guess, batch_size=len(embeds_BLH), stop_after=stop_after
+            decoded = self._writer(
+                Prompt(embeds_BLH, prompt.written), self.symbol_ids, num_steps * self._action_dim
             )
         # casts of weights cached under inference mode cannot be used by a later training step
         torch.clear_autocast_cache()

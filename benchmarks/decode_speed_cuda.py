@@ -1,0 +1,267 @@
+"""Writing an answer on a GPU: ours against transformers' `generate` with xgrammar's logits processor.
+
+    python benchmarks/decode_speed_cuda.py --json decode_speed_cuda.json
+
+A model of SmolVLM2-500M's shape with random weights and random prompts: nothing it writes can be guessed. In
+bfloat16 the peer's weights are bfloat16 and ours are float32, cast once an answer; in float32 both must write
+the same numbers. Reading the prompt (prefill) is reported apart; bars are on the rest (decode). Then a policy
+of this shape, from pictures to actions.
+"""
+
+import argparse
+import copy
+import logging
+import statistics
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from typing import Any
+from unittest.mock import patch
+
+import torch
+from decode_speed_compare import Timed, compare, finish, print_rows
+from decode_speed_peer import XgrammarGenerate
+from lerobot.configs import FeatureType, PolicyFeature
+from lerobot.policies import make_pre_post_processors
+from machine import add_machine_arguments, positive, require_idle_machine
+from torch import Tensor
+
+from lerobot_bomb.decoding.decoder import Guess, Prompt
+from lerobot_bomb.decoding.draft import KnownSymbols, LinearDraft
+from lerobot_bomb.decoding.grammar import NumberGrammar
+from lerobot_bomb.decoding.writer import NumberWriter
+from lerobot_bomb.vlm.backbone import SmolVLMBackbone, build_backbone
+from lerobot_bomb.vlm.graphs import Recorded
+from lerobot_bomb.vlm.presets import nano_config
+from lerobot_bomb.vlm.prompt import PromptTokens
+from lerobot_bomb.vlm.tokenizer import NANO, load_tokenizer
+from lerobot_policy_vla0_smol import Vla0SmolConfig
+from lerobot_policy_vla0_smol.modeling_vla0_smol import Vla0SmolPolicy
+
+MIN_RATIO = 8.0  # in bfloat16, one prompt at a time
+PARTS = "decode", "policy"
+BATCH_SIZES = 1, 16
+PROMPT_LENGTH, NUM_STEPS, NUM_DIMS = 190, 10, 7
+CAMERAS = "observation.images.workspace", "observation.images.wrist"
+# of SmolVLM2-500M-Video-Instruct
+TEXT_500M = {
+    "vocab_size": 49280,
+    "hidden_size": 960,
+    "intermediate_size": 2560,
+    "num_hidden_layers": 32,
+    "num_attention_heads": 15,
+    "num_key_value_heads": 5,
+    "head_dim": 64,
+    "max_position_embeddings": 8192,
+    "initializer_range": 0.02,
+}
+VISION_500M = {
+    "hidden_size": 768,
+    "intermediate_size": 3072,
+    "num_hidden_layers": 12,
+    "num_attention_heads": 12,
+    "image_size": 512,
+    "patch_size": 16,
+    "initializer_range": 0.02,
+}
+
+
+def main() -> None:
+    """Time both, print the tables; exit code 1 where a bar is missed."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawTextHelpFormatter)
+    parser.add_argument("--repeats", type=positive, default=10, help="answers of each (default: 10)")
+    parser.add_argument("--parts", nargs="+", choices=PARTS, default=PARTS, help="default: all")
+    add_machine_arguments(parser)
+    args = parser.parse_args()
+    require_idle_machine(args.force)
+    if not torch.cuda.is_available():
+        raise SystemExit("No CUDA device is there; benchmarks/decode_speed.py measures on a CPU.")
+    print(torch.cuda.get_device_name(), f"torch {torch.__version__}")
+    logging.disable(logging.WARNING)
+    torch.manual_seed(0)
+    figures: dict[str, Any] = {"device": torch.cuda.get_device_name()}
+    bars: dict[str, bool] = {}
+    if "decode" in args.parts:
+        figures |= time_decoding_all(args.repeats, bars)
+    if "policy" in args.parts:
+        figures["policy"] = time_policy(args.repeats)
+    finish(args.json, figures, bars)
+
+
+def time_decoding_all(repeats: int, bars: dict[str, bool]) -> dict[str, Any]:
+    """Both precisions, both sizes of batch."""
+    figures = {}
+    backbone = build_backbone(config_500m()).cuda().eval()
+    with torch.inference_mode():
+        for dtype in (torch.float32, torch.bfloat16):
+            for batch_size in BATCH_SIZES:
+                name = f"{str(dtype).removeprefix('torch.')}, batch of {batch_size}"
+                num_answers = repeats if dtype == torch.bfloat16 else min(repeats, 3)
+                figures[name] = time_decoding(backbone, dtype, batch_size, num_answers, bars, name)
+    return figures
+
+
+def config_500m() -> dict[str, Any]:
+    """Config of a SmolVLM of this shape with our symbols' tokens."""
+    config = nano_config(load_tokenizer(NANO))
+    config["text_config"] |= TEXT_500M
+    return config | {"scale_factor": 4, "vision_config": VISION_500M}
+
+
+def time_decoding(
+    backbone: SmolVLMBackbone,
+    dtype: torch.dtype,
+    batch_size: int,
+    repeats: int,
+    bars: dict[str, bool],
+    name: str,
+) -> dict[str, dict[str, float]]:
+    """Whole chunks by the peer and by us, without and with drafts."""
+    grammar = NumberGrammar(512, NUM_STEPS * NUM_DIMS).cuda()
+    written = torch.ones(batch_size, PROMPT_LENGTH, dtype=torch.bool, device="cuda")
+    prompts = [
+        Prompt(torch.randn(batch_size, PROMPT_LENGTH, TEXT_500M["hidden_size"], device="cuda"), written)
+        for _ in range(repeats)
+    ]
+    symbol_ids = torch.arange(30, 42, device="cuda")
+    stock = copy.deepcopy(backbone).to(dtype)
+    known, linear = KnownSymbols(grammar), LinearDraft(grammar, NUM_DIMS)
+    ways: dict[str, tuple[Guess, bool]] = {
+        "ours, no draft": (known, False),
+        "ours, no draft, compiled": (known, True),
+        "ours, linear draft, compiled": (linear, True),
+    }
+    ours = {
+        way: Ours(NumberWriter(backbone, grammar, guess, compiled=compiled), symbol_ids, dtype)
+        for way, (guess, compiled) in ways.items()
+    }
+    figures = compare(
+        {
+            "generate, xgrammar": (Peer(stock, symbol_ids, grammar, dtype), prompts),
+            **{way: (write, prompts) for way, write in ours.items()},
+        },
+        must_agree=dtype == torch.float32,
+    )
+    print_rows(f"{name}, medians of {repeats}", figures)
+    gain = figures["ours, no draft"]["decode_gain"]
+    if (dtype, batch_size) == (torch.bfloat16, 1):
+        bars[f"{name}: decode {gain:.1f} times faster (bar {MIN_RATIO:g})"] = gain >= MIN_RATIO
+    return figures
+
+
+def wait_and_time(run: Callable[[], Any]) -> tuple[Any, float]:
+    """What it gives, and the seconds until the device has done it."""
+    torch.cuda.synchronize()
+    started = time.perf_counter()
+    result = run()
+    torch.cuda.synchronize()
+    return result, time.perf_counter() - started
+
+
+class Peer:
+    """The whole answer by `generate`, and one symbol by it: what it takes to read the prompt."""
+
+    def __init__(
+        self, backbone: SmolVLMBackbone, symbol_ids: Tensor, grammar: NumberGrammar, dtype: torch.dtype
+    ):
+        self._generate = XgrammarGenerate(backbone, symbol_ids, grammar)
+        self._dtype = dtype
+
+    def __call__(self, prompt: Prompt) -> Timed:
+        embeds = prompt.embeds.to(self._dtype)
+        _, prefill_s = wait_and_time(lambda: self._generate(embeds, prompt.written, max_symbols=1))
+        (numbers, num_passes), whole_s = wait_and_time(lambda: self._generate(embeds, prompt.written))
+        return Timed(numbers, prefill_s, whole_s - prefill_s, num_passes)
+
+
+class Ours:
+    """The whole answer, and its first pass, which reads the prompt."""
+
+    def __init__(self, writer: NumberWriter, symbol_ids: Tensor, dtype: torch.dtype):
+        self._writer, self._symbol_ids, self._dtype = writer, symbol_ids, dtype
+
+    def __call__(self, prompt: Prompt) -> Timed:
+        started = torch.cuda.Event(enable_timing=True)
+        with (
+            torch.autocast("cuda", dtype=torch.bfloat16, enabled=self._dtype == torch.bfloat16),
+            ends_of_passes() as ends,
+        ):
+            torch.cuda.synchronize()
+            started.record()
+            decoded, whole_s = wait_and_time(
+                lambda: self._writer(prompt, self._symbol_ids, NUM_STEPS * NUM_DIMS)
+            )
+        prefill_s = started.elapsed_time(ends[0]) / 1e3
+        return Timed(decoded.numbers, prefill_s, whole_s - prefill_s, decoded.num_passes)
+
+
+@contextmanager
+def ends_of_passes() -> Iterator[list[torch.cuda.Event]]:
+    """When the device was done with each recorded pass."""
+    ends: list[torch.cuda.Event] = []
+    replay: Callable[..., Any] = Recorded.__call__
+
+    def timed(*args: Any) -> Any:
+        returned = replay(*args)
+        ends.append(torch.cuda.Event(enable_timing=True))
+        ends[-1].record()
+        return returned
+
+    with patch.object(Recorded, "__call__", timed):
+        yield ends
+
+
+def time_policy(repeats: int) -> dict[str, dict[str, float]]:
+    """Pictures, sentence and state to a chunk of actions, without what LeRobot does around it."""
+    figures = {}
+    for compiled in (False, True):
+        policy = make_policy(compiled)
+        for batch_size in BATCH_SIZES:
+            batch = make_batch(policy, batch_size)
+            with torch.inference_mode():
+                runs = [
+                    wait_and_time(lambda policy=policy, batch=batch: policy.predict_action_chunk(batch))[1]
+                    for _ in range(repeats + 2)
+                ][2:]
+            latency_s = statistics.median(runs)
+            figures[f"batch of {batch_size}{', compiled' if compiled else ''}"] = {
+                "latency_ms": 1e3 * latency_s,
+                "actions_a_second": batch_size * NUM_STEPS / latency_s,
+            }
+    print_rows(f"policy, chunks of {NUM_STEPS} actions of {NUM_DIMS}, all executed, no draft right", figures)
+    return figures
+
+
+def make_policy(compiled: bool) -> Vla0SmolPolicy:
+    """Of this shape, with random weights."""
+    picture = PolicyFeature(FeatureType.VISUAL, (3, 256, 256))
+    config = Vla0SmolConfig(
+        vlm_config=config_500m(),
+        prompt_tokens=PromptTokens.from_tokenizer(load_tokenizer(NANO), NANO).to_dict(),
+        dtype="bfloat16",
+        compile_model=compiled,
+        device="cuda",
+        chunk_size=NUM_STEPS,
+        n_action_steps=NUM_STEPS,
+        input_features=dict.fromkeys(CAMERAS, picture)
+        | {"observation.state": PolicyFeature(FeatureType.STATE, (NUM_DIMS,))},
+        output_features={"action": PolicyFeature(FeatureType.ACTION, (NUM_DIMS,))},
+    )
+    config.vlm_model_name = NANO  # its tokenizer
+    return Vla0SmolPolicy(config).cuda().eval()
+
+
+def make_batch(policy: Vla0SmolPolicy, batch_size: int) -> dict[str, Any]:
+    """Preprocessed observations."""
+    bounds = {"min": -torch.ones(NUM_DIMS), "max": torch.ones(NUM_DIMS)}
+    preprocessor, _ = make_pre_post_processors(
+        policy.config, dataset_stats={"action": bounds, "observation.state": bounds}
+    )
+    return preprocessor(
+        {key: torch.rand(batch_size, 3, 256, 256) for key in CAMERAS}
+        | {"observation.state": torch.zeros(batch_size, NUM_DIMS), "task": batch_size * ["put it down"]}
+    )
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,93 @@
+"""Decoding on a device that the host runs ahead of: every pass has the same shapes, and is recorded.
+
+Shapes: `B` batch, `S` symbols, `L` tokens of a prompt, `H` hidden size.
+"""
+
+from collections.abc import Callable, Iterator
+
+import torch
+from torch import Tensor
+from torch.nn.functional import embedding, linear
+
+from lerobot_bomb.decoding.decoder import (
+    MAX_GUESSES,
+    CachedContinuation,
+    Decoded,
+    Guess,
+    Progress,
+    Prompt,
+    read_answer,
+    write,
+)
+from lerobot_bomb.decoding.grammar import NumberGrammar
+from lerobot_bomb.vlm.cached_text import CachedText
+from lerobot_bomb.vlm.graphs import Recorded
+
+
+class RecordedAnswers:
+    """Answers to prompts of one shape.
+
+    Rows that are done go on until all are: a smaller batch would have to be recorded, too.
+    """
+
+    def __init__(
+        self, grammar: NumberGrammar, guess: Guess, embeds_SH: Tensor, head_SH: Tensor, text: CachedText
+    ):
+        """``embeds_SH``, ``head_SH``: the symbols' rows of the embedding and of the output head."""
+        self._text, self._grammar, self._guess = text, grammar, guess
+        self._embeds_SH, self._head_SH = embeds_SH.clone(), head_SH.clone()
+        # a model that is moved replaces its tables; recordings read those of their time
+        self._tables = list(grammar.buffers())
+        self._first, self._next = Recorded(self._write_first), Recorded(self._write)
+
+    def __call__(self, prompt: Prompt, embeds_SH: Tensor, head_SH: Tensor, stop_after: int) -> Decoded:
+        """As `decode_numbers`, with the rows as they are now."""
+        self._embeds_SH.copy_(embeds_SH)
+        self._head_SH.copy_(head_SH)
+        return decode_ahead(self._passes(prompt), self._grammar, stop_after)
+
+    def _passes(self, prompt: Prompt) -> Iterator[Progress]:
+        length_B = prompt.written.sum(dim=1)
+        progress = self._first(*prompt, length_B, *Progress.start(self._grammar, len(length_B)))
+        while True:
+            yield Progress(*progress)
+            progress = self._next(length_B, *progress)
+
+    def _write_first(self, embeds_BLH: Tensor, written_BL: Tensor, *state: Tensor) -> tuple[Tensor, ...]:
+        self._text.clear()
+        return self._write(*state, prompt=Prompt(embeds_BLH, written_BL))
+
+    def _write(self, length_B: Tensor, *progress: Tensor, prompt: Prompt | None = None) -> tuple[Tensor, ...]:
+        model = CachedContinuation(self._text, self._embed, self._head, length_B, prompt)
+        return tuple(write(model, self._grammar, self._guess, Progress(*progress), MAX_GUESSES)[0])
+
+    def _embed(self, symbols: Tensor) -> Tensor:
+        return embedding(symbols, self._embeds_SH)
+
+    def _head(self, hidden: Tensor) -> Tensor:
+        return linear(hidden, self._head_SH)
+
+
+def decode_ahead(passes: Iterator[Progress], grammar: NumberGrammar, stop_after: int) -> Decoded:
+    """As `decode_numbers`; the host hears that all rows are done while the next pass runs."""
+    was_done = None
+    for num_passes, progress in enumerate(passes, 1):
+        if was_done is not None and was_done():
+            return Decoded(read_answer(progress.symbols, stop_after), num_passes)
+        was_done = _fetch(progress.is_done(grammar, stop_after).all())
+    raise AssertionError("an answer has an end")
+
+
+def _fetch(flag: Tensor) -> Callable[[], bool]:
+    """Ask a device for a value; the answer is waited for when it is called."""
+    copied = flag.to("cpu", non_blocking=True)
+    if not flag.is_cuda:
+        return lambda: bool(copied)
+    event = torch.cuda.Event()
+    event.record()
+
+    def wait() -> bool:
+        event.synchronize()
+        return bool(copied)
+
+    return wait

@@ -1,0 +1,57 @@
+"""What a policy asks for numbers: the decoder that suits the device.
+
+Shapes: `B` batch, `L` tokens of a prompt, `H` hidden size, `S` symbols.
+"""
+
+from functools import partial
+
+import torch
+from torch import Tensor, nn
+
+from lerobot_bomb.decoding.ahead import RecordedAnswers
+from lerobot_bomb.decoding.decoder import CachedContinuation, Decoded, Guess, Prompt, decode_numbers
+from lerobot_bomb.decoding.grammar import NumberGrammar
+from lerobot_bomb.vlm.backbone import SmolVLMBackbone
+from lerobot_bomb.vlm.cached_text import CachedText
+from lerobot_bomb.vlm.recordings import Recordings
+from lerobot_bomb.vlm.text_layers import TextLayers
+
+
+class NumberWriter:
+    """Numbers after prompts; on CUDA with the recorded passes of every shape of prompts that it has met."""
+
+    def __init__(
+        self, backbone: SmolVLMBackbone, grammar: NumberGrammar, guess: Guess, *, compiled: bool = False
+    ):
+        self._backbone, self._grammar, self._guess = backbone, grammar, guess
+        self._recordings = Recordings[RecordedAnswers](backbone.vlm.model.text_model, compiled=compiled)
+
+    @torch.no_grad()
+    def __call__(self, prompt: Prompt, symbol_ids: Tensor, stop_after: int) -> Decoded:
+        """The first ``stop_after`` numbers of each row."""
+        max_symbols = self._grammar.max_symbols(stop_after)
+        head = self._backbone.vlm.lm_head
+        if prompt.embeds.is_cuda and type(head) is nn.Linear:
+            with torch.inference_mode(False), torch.no_grad():
+                rows = self._backbone.embed_tokens(symbol_ids), head.weight[symbol_ids]
+                make = partial(RecordedAnswers, self._grammar, self._guess, *rows)
+                recorded = self._recordings.find(prompt.embeds, max_symbols, make)
+                return recorded(prompt, *rows, stop_after)
+        model = continue_prompt(self._backbone, prompt, symbol_ids, max_symbols)
+        return decode_numbers(
+            model, self._grammar, self._guess, batch_size=len(prompt.embeds), stop_after=stop_after
+        )
+
+
+def continue_prompt(
+    backbone: SmolVLMBackbone, prompt: Prompt, symbol_ids: Tensor, max_symbols: int
+) -> CachedContinuation:
+    """A continuation by a backbone as it is now."""
+    layers = TextLayers(backbone.vlm.model.text_model)
+    return CachedContinuation(
+        CachedText(layers, len(prompt.embeds), prompt.embeds.shape[1] + max_symbols),
+        lambda symbols: backbone.embed_tokens(symbol_ids[symbols]),
+        backbone.head(symbol_ids),
+        prompt.written.sum(dim=1),
+        prompt,
+    )

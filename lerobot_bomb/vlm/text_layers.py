@@ -1,0 +1,263 @@
+"""Layers of text models of the Llama and Gemma 2 families, for passes of a few tokens.
+
+The layers' own modules are called in transformers' order, without what surrounds them there (building masks,
+growing caches, recording outputs), which takes most of the time of a small model's pass.
+
+Shapes: `B` batch, `K` tokens of a pass, `C` columns of the cache, `H` hidden size, `V` key-value heads, `G`
+query heads for each, `E` size of a head.
+"""
+
+import copy
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from functools import partial
+from typing import Any, TypeGuard
+
+import torch
+from torch import Tensor, nn
+from torch.nn.functional import linear, rms_norm, scaled_dot_product_attention
+from transformers.activations import SiLUActivation
+from transformers.models.gemma2.modeling_gemma2 import Gemma2DecoderLayer, Gemma2RMSNorm
+
+# sizes of passes that may be compiled in a process; torch's own limit is 8
+MAX_COMPILED = 64
+
+
+@dataclass(frozen=True)
+class Columns:
+    """Where the tokens of a pass stand, as the layers need it."""
+
+    slots: Tensor  # (B * K * 2 * V,) int64 rows of a layer's flat cache, keys' before values'
+    cos: Tensor  # (B, K, 1, E)
+    sin: Tensor  # (B, K, 1, E), negative in the first half
+    penalty: Tensor  # (B, 1, K * G, columns in use): 0 for those that a query reads, else -inf
+
+
+class TextLayers:
+    """A text model's layers and its last norm, with its weights or with a copy of them."""
+
+    def __init__(self, model: Any, *, copy_dtype: torch.dtype | None = None, compiled: bool = False):
+        """``copy_dtype``: of a copy's products, which stays where it is, whatever becomes of the model.
+
+        ``compiled``: by `torch.compile`, which fuses what is not a product.
+        """
+        self.model, self.config = model, model.config
+        self.embedding: Tensor = model.embed_tokens.weight
+        self.rotary_emb: Callable[..., tuple[Tensor, Tensor]] = model.rotary_emb
+        modules = [*model.layers, model.norm]
+        self._copied: list[tuple[Tensor, nn.Module, str]] = []
+        if copy_dtype is not None:
+            copies = [_copy(module, copy_dtype) for module in modules]
+            for copied, source in zip(copies, modules, strict=True):
+                self._copied += _same_parameters(copied, source)
+            modules = copies
+        *layers, norm = modules
+        self._layers = [_Layer(layer, is_copy=copy_dtype is not None) for layer in layers]
+        self._norm = _RMSNorm(norm)
+        self._run = _compile_layer() if compiled else _Layer.__call__
+
+    def __len__(self) -> int:
+        return len(self._layers)
+
+    def __call__(self, x_BKH: Tensor, columns: Columns, caches: Sequence[Tensor]) -> Tensor:
+        """(B, K, H) embeddings -> (B, K, H) states after the last layer.
+
+        ``caches``: of each layer (B, V, 2, C, E), keys before values, a head's columns beside each other, as
+        attention reads them; what is new comes into them.
+        """
+        for layer, cache_BV2CE in zip(self._layers, caches, strict=True):
+            x_BKH = self._run(layer, x_BKH, columns, cache_BV2CE)
+        return self._norm(x_BKH)
+
+    @torch.no_grad()
+    def refresh(self) -> None:
+        """Give a copy the weights that the model has now."""
+        copies = [copied for copied, _, _ in self._copied]
+        weights = [getattr(module, name) for _, module, name in self._copied]
+        torch._foreach_copy_(copies, weights)  # pyright: ignore[reportPrivateImportUsage]
+        for norm in [*(norm for layer in self._layers for norm in layer.norms), self._norm]:
+            norm.refresh()
+
+
+def _copy(module: nn.Module, dtype: torch.dtype) -> nn.Module:
+    copied = copy.deepcopy(module)
+    for part in copied.modules():
+        if isinstance(part, nn.Linear):
+            part.to(dtype)
+    return copied
+
+
+def _same_parameters(copied: nn.Module, source: nn.Module) -> list[tuple[Tensor, nn.Module, str]]:
+    """Parameters of a copy, and where each is a copy of."""
+    return [
+        (parameter, part, name)
+        for copied_part, part in zip(copied.modules(), source.modules(), strict=True)
+        for name, parameter in copied_part.named_parameters(recurse=False)
+    ]
+
+
+class _Layer:
+    """A layer, its modules looked up once."""
+
+    def __init__(self, layer: Any, *, is_copy: bool):
+        attention, mlp = layer.self_attn, layer.mlp
+        products = _joined_products if is_copy else _products
+        self._qkv = products([attention.q_proj, attention.k_proj, attention.v_proj])
+        self._gate_up = products([mlp.gate_proj, mlp.up_proj])
+        self._out, self._down = _product(attention.o_proj), _product(mlp.down_proj)
+        self._scale = attention.scaling
+        self._softcap: float | None = getattr(attention, "attn_logit_softcapping", None)
+        self._activate = mlp.act_fn
+        self._is_silu = isinstance(mlp.act_fn, SiLUActivation | nn.SiLU)
+        self._before_attention = _RMSNorm(layer.input_layernorm)
+        is_gemma = isinstance(layer, Gemma2DecoderLayer)
+        after = _RMSNorm(layer.post_attention_layernorm)
+        self._before_mlp = _RMSNorm(layer.pre_feedforward_layernorm) if is_gemma else after
+        self._after_attention = after if is_gemma else None
+        self._after_mlp = _RMSNorm(layer.post_feedforward_layernorm) if is_gemma else None
+
+    @property
+    def norms(self) -> "list[_RMSNorm]":
+        """All of them, none twice."""
+        norms = self._before_attention, self._after_attention, self._before_mlp, self._after_mlp
+        return [norm for norm in norms if norm is not None]
+
+    def __call__(self, x_BKH: Tensor, columns: Columns, cache_BV2CE: Tensor) -> Tensor:
+        """(B, K, H) -> (B, K, H)."""
+        read_BKH = self._attend(self._before_attention(x_BKH), columns, cache_BV2CE)
+        x_BKH = _add(x_BKH, read_BKH, self._after_attention)
+        return _add(x_BKH, self._mix(self._before_mlp(x_BKH)), self._after_mlp)
+
+    def _attend(self, x_BKH: Tensor, columns: Columns, cache_BV2CE: Tensor) -> Tensor:
+        _, num_keys, _, _, size = cache_BV2CE.shape
+        dtype = cache_BV2CE.dtype
+        parts = self._qkv(x_BKH)
+        joined = parts[0] if len(parts) == 1 else torch.cat(parts, dim=-1)
+        heads = joined.to(columns.cos.dtype).view(*x_BKH.shape[:2], -1, size)
+        _rotate_(heads[:, :, :-num_keys], columns)
+        new = heads[:, :, -2 * num_keys :].reshape(-1, size)
+        cache_BV2CE.view(-1, size).index_copy_(0, columns.slots, new.to(dtype))
+        query = (heads[:, :, : -2 * num_keys] * self._scale).to(dtype)
+        # the queries that share a key stand beside each other: one product a key-value head
+        query_BVXE = query.view(*x_BKH.shape[:2], num_keys, -1, size).transpose(1, 2).flatten(2, 3)
+        used_BV2CE = cache_BV2CE.narrow(3, 0, columns.penalty.shape[-1])
+        keys_BVCE, values_BVCE = used_BV2CE.unbind(dim=2)
+        if self._softcap is None:
+            read_BVXE = scaled_dot_product_attention(
+                query_BVXE, keys_BVCE, values_BVCE, attn_mask=columns.penalty, scale=1.0
+            )
+        else:
+            read_BVXE = _capped_attention(query_BVXE, keys_BVCE, values_BVCE, columns.penalty, self._softcap)
+        read_BVKGE = read_BVXE.view(len(x_BKH), num_keys, x_BKH.shape[1], -1, size)
+        return self._out(read_BVKGE.transpose(1, 2).flatten(2))
+
+    def _mix(self, x_BKH: Tensor) -> Tensor:
+        parts = self._gate_up(x_BKH)
+        gate, up = parts if len(parts) == 2 else parts[0].chunk(2, dim=-1)
+        # torch's own silu takes 3.5 times as long there
+        is_slow = self._is_silu and _in_float32_on_host(gate)
+        activated = gate / (1 + torch.exp(-gate)) if is_slow else self._activate(gate)
+        return self._down(activated * up)
+
+
+def _compile_layer() -> Callable[[_Layer, Tensor, Columns, Tensor], Tensor]:
+    """One piece of code for all layers, which differ only in their tensors; another for each size of pass."""
+    torch._dynamo.config.recompile_limit = max(torch._dynamo.config.recompile_limit, MAX_COMPILED)
+    return torch.compile(_Layer.__call__, dynamic=False)
+
+
+_Products = Callable[[Tensor], list[Tensor]]
+
+
+def _products(modules: list[nn.Module]) -> _Products:
+    """Projections of the same input."""
+    products = [_product(module) for module in modules]
+    return lambda x: [product(x) for product in products]
+
+
+def _joined_products(modules: list[nn.Module]) -> _Products:
+    """The same as a single one, where they are plain; their weights move beside each other."""
+    if not all(_is_plain(module) for module in modules):
+        return _products(modules)
+    joined = nn.Linear(1, 1, bias=getattr(modules[0], "bias", None) is not None)
+    for name, _ in list(joined.named_parameters()):
+        parts = [module.get_parameter(name) for module in modules]
+        whole = torch.cat([part.detach() for part in parts])
+        setattr(joined, name, nn.Parameter(whole, requires_grad=False))
+        for part, own in zip(parts, whole.split([len(part) for part in parts]), strict=True):
+            part.data = own
+    return _products([joined])
+
+
+def _product(module: nn.Module) -> Callable[[Tensor], Tensor]:
+    """A projection; a plain one without `Module.__call__`, which is half of a small product's time."""
+    if _is_plain(module):
+        return partial(linear, weight=module.weight, bias=module.bias)
+    return module
+
+
+def _is_plain(module: nn.Module) -> TypeGuard[nn.Linear]:
+    return type(module) is nn.Linear and not (module._forward_hooks or module._forward_pre_hooks)
+
+
+class _RMSNorm:
+    """A model's norm; what its weight alone decides is computed once.
+
+    On a CPU torch's own takes three times as long as the same in four operations.
+    """
+
+    def __init__(self, norm: Any):
+        self._is_gemma = isinstance(norm, Gemma2RMSNorm)
+        self._eps = norm.eps if self._is_gemma else norm.variance_epsilon
+        self._source: Tensor = norm.weight
+        self._weight = 1 + norm.weight.float() if self._is_gemma else norm.weight
+        width = len(norm.weight)
+        self.scale, self._least_length = self._weight * width**0.5, torch.tensor((width * self._eps) ** 0.5)
+
+    def refresh(self) -> None:
+        """The module has another weight; off the CPU, where the scale is not used."""
+        if self._is_gemma:
+            torch.add(self._source, 1, out=self._weight)
+
+    def __call__(self, x: Tensor) -> Tensor:
+        """(..., H) -> (..., H)."""
+        if _in_float32_on_host(x):
+            return self.unscaled(x).mul_(self.scale)
+        if self._is_gemma:
+            return rms_norm(x.float(), x.shape[-1:], self._weight, self._eps).type_as(x)
+        return rms_norm(x, x.shape[-1:], self._weight, self._eps)
+
+    def unscaled(self, x: Tensor) -> Tensor:
+        """(..., H) of length 1, or less where eps counts."""
+        return x / torch.hypot(torch.linalg.vector_norm(x, dim=-1, keepdim=True), self._least_length)
+
+
+def _add(x: Tensor, new: Tensor, norm: _RMSNorm | None) -> Tensor:
+    """Of the same shape: x and what a part of a layer adds to it."""
+    if norm is None:
+        return x + new
+    if _in_float32_on_host(x) and _in_float32_on_host(new):
+        return torch.addcmul(x, norm.unscaled(new), norm.scale)
+    return x + norm(new)
+
+
+def _capped_attention(
+    query_BVXE: Tensor, keys_BVCE: Tensor, values_BVCE: Tensor, penalty_B1XC: Tensor, softcap: float
+) -> Tensor:
+    """(B, V, X, E) read by X queries a head, each product p limited to ``softcap * tanh(p / softcap)``."""
+    # 2 * softcap * sigmoid(2 * p / softcap), which is larger by softcap: the same after softmax, and faster
+    query = (query_BVXE * (2 / softcap)).flatten(0, 1)
+    scores = torch.bmm(query, keys_BVCE.flatten(0, 1).transpose(1, 2)).float().sigmoid_()
+    scores_BVXC = torch.add(penalty_B1XC, scores.view(*query_BVXE.shape[:3], -1), alpha=2 * softcap)
+    weights = scores_BVXC.softmax(dim=-1).to(values_BVCE.dtype).flatten(0, 1)
+    return torch.bmm(weights, values_BVCE.flatten(0, 1)).view(query_BVXE.shape)
+
+
+def _in_float32_on_host(x: Tensor) -> bool:
+    return x.dtype == torch.float32 and x.device.type == "cpu"
+
+
+def _rotate_(heads: Tensor, columns: Columns) -> None:
+    """(B, K, heads, E) get their rotary positions in place."""
+    half_turned = heads.roll(heads.shape[-1] // 2, dims=-1)
+    heads.mul_(columns.cos).addcmul_(half_turned, columns.sin)

@@ -1,0 +1,114 @@
+"""Answers that are recorded on a GPU; `make test-cuda` runs this where one is, CI has none."""
+
+import copy
+import pickle
+from collections.abc import Callable, Iterator
+from typing import Any
+
+import pytest
+import spatialvla_grid_cases
+import torch
+import vla0_smol_cases
+from torch import Tensor
+
+CASES = {
+    "vla0_smol, drafts": lambda **options: vla0_smol_cases.make_policy(**options),
+    "vla0_smol, no drafts": lambda **options: vla0_smol_cases.make_policy(draft="none", **options),
+    "spatialvla_grid": lambda **options: spatialvla_grid_cases.make_policy(0, 7, **options),
+    "spatialvla_grid, causal": lambda **options: spatialvla_grid_cases.make_policy(
+        0, 7, prefix_attention="causal", use_state=True, **options
+    ),
+}
+
+
+@pytest.fixture(params=CASES)
+def make(request: pytest.FixtureRequest) -> Callable[..., Any]:
+    return CASES[request.param]
+
+
+@pytest.fixture(autouse=True)
+def exact() -> Iterator[None]:
+    assert torch.cuda.is_available(), "these checks need a CUDA device"
+    torch.backends.cuda.matmul.allow_tf32 = torch.backends.cudnn.allow_tf32 = False
+    yield
+
+
+def batch_for(policy: Any, batch_size: int, seed: int = 0) -> dict[str, Any]:
+    cases = vla0_smol_cases if policy.name == "vla0_smol" else spatialvla_grid_cases
+    return cases.make_batch(policy, batch_size, seed)
+
+
+def on(device: str, batch: dict[str, Any]) -> dict[str, Any]:
+    return {key: value.to(device) if isinstance(value, Tensor) else value for key, value in batch.items()}
+
+
+def predict(policy: Any, batch: dict[str, Any]) -> Tensor:
+    device = str(next(policy.parameters()).device)
+    return policy.predict_action_chunk(on(device, batch)).cpu()
+
+
+def same(actions: Tensor, others: Tensor) -> bool:
+    """The same choices: what they decode to is computed on each device, and neighbours are farther apart."""
+    return torch.allclose(actions, others, rtol=0, atol=1e-5)
+
+
+def test_a_gpu_answers_as_a_cpu_does(make: Callable[..., Any]) -> None:
+    host = make()
+    device = copy.deepcopy(host).cuda()
+    for batch_size in (1, 5, 1, 16):
+        for seed in range(3):
+            batch = batch_for(host, batch_size, seed)
+            with torch.inference_mode(seed % 2 == 0):
+                assert same(predict(device, batch), predict(host, batch))
+
+
+def test_so_do_compiled_layers(make: Callable[..., Any]) -> None:
+    host, device = make(), make(compile_model=True).cuda()
+    for seed in range(3):
+        batch = batch_for(host, 3, seed)
+        assert same(predict(device, batch), predict(host, batch))
+
+
+def test_fewer_actions_are_the_first_of_more(make: Callable[..., Any]) -> None:
+    device = make(n_action_steps=2).cuda()
+    batch = on("cuda", batch_for(device, 4))
+    chunk = device.predict_action_chunk(batch)
+    assert torch.equal(device.select_action(batch), chunk[:, 0])
+    assert torch.equal(device.select_action(batch), chunk[:, 1])
+
+
+def test_recordings_follow_weights_and_devices(make: Callable[..., Any]) -> None:
+    host = make()
+    device, batch = copy.deepcopy(host).cuda(), batch_for(host, 2)
+    first = predict(device, batch)
+    with torch.no_grad():
+        for policy in (host, device):
+            for parameter in policy.parameters():
+                parameter.data.mul_(1.3)
+    second = predict(device, batch)
+    assert same(second, predict(host, batch)) and not same(second, first)
+    for moved in (device.cpu().cuda(), copy.deepcopy(device), pickle.loads(pickle.dumps(device))):
+        assert torch.equal(predict(moved, batch), second)
+
+
+def test_training_goes_on_after_a_prediction(make: Callable[..., Any]) -> None:
+    for dtype in ("float32", "bfloat16"):
+        device = make(dtype=dtype).cuda()
+        batch = on("cuda", batch_for(device, 2))
+        optimizer = torch.optim.SGD(device.get_optim_params(), lr=1e-3)
+        for _ in range(2):
+            device.train()
+            loss, _ = device.forward(batch)
+            loss.backward()
+            optimizer.step()
+            optimizer.zero_grad()
+            with torch.inference_mode():
+                assert device.predict_action_chunk(batch).isfinite().all()
+
+
+def test_in_bfloat16_it_answers_nearly_the_same(make: Callable[..., Any]) -> None:
+    """Most of the likeliest choices stay so."""
+    host, device = make(), make(dtype="bfloat16").cuda()
+    batches = [batch_for(host, 8, seed) for seed in range(4)]
+    same = torch.cat([predict(host, batch) == predict(device, batch) for batch in batches])
+    assert 0.3 < same.float().mean() < 1
