@@ -1,7 +1,8 @@
 """The only place that reaches into names of LeRobot and `datasets` that are not their public interface."""
 
 import shutil
-from collections.abc import Collection, Iterator
+import sys
+from collections.abc import Callable, Collection, Iterator, Sequence
 from contextlib import contextmanager
 from functools import partial
 from pathlib import Path
@@ -89,3 +90,16 @@ def datasets_cache(folder: Path) -> Iterator[None]:
     finally:
         config.HF_DATASETS_CACHE = usual
         shutil.rmtree(folder, ignore_errors=True)
+
+
+def lerobot_eval_with(flags: Sequence[str], wrap: Callable[[Any, Any], Any]) -> None:
+    """Run lerobot-eval with these flags, on what `wrap(config, environments)` makes of its environments."""
+    from lerobot.scripts import lerobot_eval
+
+    usual, argv = lerobot_eval.make_env, sys.argv
+    lerobot_eval.make_env = lambda config, **options: wrap(config, usual(config, **options))
+    sys.argv = ["lerobot-eval", *flags]  # which LeRobot's parser also reads elsewhere
+    try:
+        lerobot_eval.main()
+    finally:
+        lerobot_eval.make_env, sys.argv = usual, argv

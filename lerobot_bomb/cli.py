@@ -15,6 +15,14 @@ COMMANDS = {
     "record": ("record the scripted expert as a LeRobotDataset", "lerobot_bomb.data.record"),
     "convert": ("published demonstrations as a LeRobotDataset", "lerobot_bomb.data.convert"),
     "results": ("summarise files written by --env.results_path", "lerobot_bomb.evaluation.results"),
+    "eval": (
+        "lerobot-eval, which also writes the executed actions to a file",
+        "lerobot_bomb.evaluation.eval_logged",
+    ),
+    "smoothness": (
+        "second and third differences of executed actions, of demonstrations and evaluations",
+        "lerobot_bomb.evaluation.smoothness_report",
+    ),
     "offline-metrics": (
         "loss, accuracy and L1 of a checkpoint on recorded frames, beside trivial predictors",
         "lerobot_bomb.evaluation.offline_metrics",

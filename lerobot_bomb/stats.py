@@ -48,10 +48,25 @@ def bootstrap_interval(sums_E: np.ndarray, counts_E: np.ndarray) -> tuple[float,
 
     Episodes are drawn, not frames: the frames of one resemble each other. The draws are always the same.
     """
-    num_episodes = len(sums_E)
-    if num_episodes < 2:
+    return None if len(sums_E) < 2 else _percentiles(_resampled_means(sums_E, counts_E))
+
+
+def paired_bootstrap_interval(
+    first: tuple[np.ndarray, np.ndarray], second: tuple[np.ndarray, np.ndarray]
+) -> tuple[float, float] | None:
+    """The same of the second mean minus the first, (sums_E, counts_E) each, drawn together as pairs."""
+    if len(first[0]) < 2:
         return None
+    return _percentiles(_resampled_means(*second) - _resampled_means(*first))
+
+
+def _resampled_means(sums_E: np.ndarray, counts_E: np.ndarray) -> np.ndarray:
+    """(NUM_RESAMPLES,), with the same draws for the same E."""
+    num_episodes = len(sums_E)
     draws = np.random.default_rng(0).integers(num_episodes, size=(NUM_RESAMPLES, num_episodes))
-    means = sums_E[draws].sum(axis=1) / counts_E[draws].sum(axis=1)
+    return sums_E[draws].sum(axis=1) / counts_E[draws].sum(axis=1)
+
+
+def _percentiles(means: np.ndarray) -> tuple[float, float]:
     low, high = np.percentile(means, [2.5, 97.5])
     return float(low), float(high)

@@ -1,6 +1,13 @@
+import numpy as np
 import pytest
 
-from lerobot_bomb.stats import format_rate, mcnemar_p_value, wilson_interval
+from lerobot_bomb.stats import (
+    bootstrap_interval,
+    format_rate,
+    mcnemar_p_value,
+    paired_bootstrap_interval,
+    wilson_interval,
+)
 
 
 @pytest.mark.parametrize(
@@ -29,3 +36,11 @@ def test_format_rate() -> None:
 )
 def test_mcnemar_counts_the_tails_of_a_fair_coin(only_first: int, only_second: int, p_value: float) -> None:
     assert mcnemar_p_value(only_first, only_second) == pytest.approx(p_value)
+
+
+def test_a_paired_interval_is_that_of_the_differences() -> None:
+    counts, first = np.array([2.0, 2, 2, 2]), np.array([1.0, 50, -30, 400])
+    differences = np.array([1.0, 2, 3, 4])
+    paired = paired_bootstrap_interval((first, counts), (first + differences, counts))
+    assert paired == pytest.approx(bootstrap_interval(differences, counts))
+    assert paired_bootstrap_interval((first[:1], counts[:1]), (first[:1], counts[:1])) is None

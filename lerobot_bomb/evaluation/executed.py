@@ -1,0 +1,104 @@
+"""Executed actions, from a dataset or from the file that ``lerobot-bomb eval`` writes.
+
+Shapes: `T` actions of an episode, `D` action dims.
+"""
+
+import json
+import os
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from lerobot.datasets import LeRobotDatasetMetadata
+from lerobot.utils.constants import ACTION
+
+from lerobot_bomb.data.columns import EPISODE_INDEX, read_columns, read_meta
+
+
+@dataclass(frozen=True)
+class Executed:
+    """Actions of whole episodes, in order of time."""
+
+    name: str  # of the dataset or file
+    fps: float  # actions a second
+    episodes: dict[str, np.ndarray]  # {what tells an episode apart: (T, D)}
+    is_seeded: bool  # the same episode of another file has the same start
+
+    def __post_init__(self) -> None:
+        if not self.episodes:
+            raise ValueError(f"{self.name}: no episode")
+        if len({actions_TD.shape[1] for actions_TD in self.episodes.values()}) > 1:
+            raise ValueError(f"{self.name}: episodes differ in the number of action dims")
+        if self.fps <= 0:
+            raise ValueError(f"{self.name}: fps={self.fps} must be positive")
+        for episode, actions_TD in self.episodes.items():
+            if not np.isfinite(actions_TD).all():
+                raise ValueError(f"{self.name}: episode {episode} has actions that are not finite")
+
+    @property
+    def num_dims(self) -> int:
+        return next(iter(self.episodes.values())).shape[1]
+
+
+def read_executed(path: Path) -> Executed:
+    """Of a file of ``lerobot-bomb eval`` or of a LeRobotDataset's folder.
+
+    Raises:
+        ValueError: it is neither, or holds no whole episodes.
+    """
+    if path.is_dir():
+        if not (path / "meta" / "info.json").is_file():
+            raise ValueError(f"{path} holds no meta/info.json, so it is no LeRobotDataset")
+        return executed_in_dataset(read_meta(path.name, path), str(path))
+    if not path.is_file():
+        raise ValueError(f"{path}: no such file or folder; `lerobot-bomb eval {path} ...` writes such a file")
+    return read_action_log(path)
+
+
+def executed_in_dataset(meta: LeRobotDatasetMetadata, name: str) -> Executed:
+    """All recorded actions, each episode under its number."""
+    if ACTION not in meta.features:
+        raise ValueError(f"dataset {name} has no {ACTION!r}; it has {sorted(meta.features)}")
+    columns = read_columns(meta, (ACTION,))
+    numbers, starts = np.unique(columns[EPISODE_INDEX], return_index=True)
+    of_episodes = np.split(columns[ACTION], starts[1:])
+    return Executed(name, meta.fps, dict(zip(map(str, numbers), of_episodes, strict=True)), False)
+
+
+def append_episode(
+    path: Path, group: str, task_id: int, seed: int, fps: float, actions_TD: np.ndarray
+) -> None:
+    """Add an episode's line; the first four tell it apart from others and how fast it was."""
+    row = {"group": group, "task_id": task_id, "seed": seed, "fps": fps, "actions": actions_TD.tolist()}
+    # one write to a file opened for appending: lines of tasks that run at once do not mix
+    file = os.open(path, os.O_WRONLY | os.O_CREAT | os.O_APPEND, 0o644)
+    try:
+        os.write(file, (json.dumps(row) + "\n").encode())
+    finally:
+        os.close(file)
+
+
+def read_action_log(path: Path) -> Executed:
+    """The episodes that ``append_episode`` wrote.
+
+    Raises:
+        ValueError: a line is none of those, is of an episode that came before or of another rate.
+    """
+    episodes: dict[str, np.ndarray] = {}
+    rates = set()
+    for number, line in enumerate(path.read_bytes().splitlines(), start=1):
+        try:
+            row = json.loads(line)
+            episode = f"{row['group']}, task {row['task_id']}, seed {row['seed']}"
+            actions_TD = np.array(row["actions"], dtype=np.float64)
+            rates.add(float(row["fps"]))
+        except (ValueError, KeyError, TypeError) as error:
+            raise ValueError(f"{path}:{number}: not the actions of an episode ({error!r})") from error
+        if actions_TD.ndim != 2:
+            raise ValueError(f"{path}:{number}: actions have the shape {actions_TD.shape}, not (T, D)")
+        if episode in episodes:
+            raise ValueError(f"{path}:{number}: {episode} was there already; a file holds one evaluation")
+        episodes[episode] = actions_TD
+    if len(rates) > 1:
+        raise ValueError(f"{path}: episodes of different rates, {sorted(rates)} actions a second")
+    return Executed(str(path), rates.pop() if rates else 0.0, episodes, True)

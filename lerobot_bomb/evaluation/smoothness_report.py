@@ -1,0 +1,230 @@
+"""``lerobot-bomb smoothness``: how smoothly people and policies moved, side by side.
+
+Shapes: `R` executed actions of all episodes, `D` action dims, `E` episodes.
+"""
+
+import argparse
+import json
+import math
+import sys
+from dataclasses import asdict, dataclass, replace
+from pathlib import Path
+
+import numpy as np
+from lerobot.utils.constants import ACTION
+
+from lerobot_bomb.data.columns import dim_names, read_meta
+from lerobot_bomb.evaluation.executed import Executed, executed_in_dataset, read_executed
+from lerobot_bomb.evaluation.measures import Measure
+from lerobot_bomb.flow.smoothness import smoothness
+from lerobot_bomb.stats import paired_bootstrap_interval
+from lerobot_bomb.tables import print_table
+from lerobot_bomb.viewing.unfinished import check_writable, written_whole
+
+MIN_ACTIONS = 4  # that a third difference takes
+GRIPPER = "gripper"  # in the names of dims that do not count
+ORDERS = {"J2": 2, "J3": 3, "J2, normalised": 2, "J3, normalised": 3}  # of the differences
+LEGEND = """
+Mean length of second (J2) and third (J3) differences {per}; in the dataset's units, and normalised by the
+standard deviations in {dataset} [95 % bootstrap interval over episodes]"""
+
+
+@dataclass(frozen=True)
+class Units:
+    """What everything that is compared is measured in."""
+
+    exclude: list[int]  # dims that do not count
+    std: np.ndarray  # (D,) standard deviations, which are 1 in normalised units
+    per_second: bool  # per s^2 and s^3 instead of per step
+
+
+@dataclass(frozen=True)
+class Row:
+    """The smoothness of a dataset or an evaluation; every dict has the keys of ORDERS."""
+
+    fps: float
+    num_skipped: int  # episodes that are too short
+    num_actions: dict[str, int]  # of each episode
+    measures: dict[str, Measure]  # of all
+    episodes: dict[str, dict[str, float]]  # of each
+
+
+@dataclass(frozen=True)
+class Difference:
+    """How much rougher an evaluation is than another one, on the episodes that both have."""
+
+    num_pairs: int
+    measures: dict[str, Measure]
+
+
+def add_smoothness_arguments(parser: argparse.ArgumentParser) -> None:
+    """Declare the arguments of ``lerobot-bomb smoothness``."""
+    add = parser.add_argument
+    add("--dataset.repo_id", dest="repo_id", required=True, help="name of the dataset, whose units count")
+    root = "folder of the dataset (default: LeRobot's, $HF_LEROBOT_HOME/REPO_ID)"
+    add("--dataset.root", dest="root", type=Path, help=root)
+    paths = "to compare with it: files of `lerobot-bomb eval`, folders of LeRobotDatasets"
+    add("paths", nargs="*", type=Path, metavar="PATH", help=paths)
+    exclude = f"action dims that do not count, as x,y; empty: all count (default: all named {GRIPPER!r})"
+    add("--exclude", type=lambda text: [name for name in text.split(",") if name], help=exclude)
+    add("--per_second", action="store_true", help="differences per s^2 and s^3 instead of per step")
+    add("--fps", type=float, help="actions a second (default: as each dataset and file says)")
+    add("--json", type=Path, help="also write all figures to this file, those of every episode too")
+
+
+def run_smoothness(args: argparse.Namespace) -> int:
+    """Measure, print the tables, write the JSON file."""
+    _check_flags(args)
+    meta = read_meta(args.repo_id, args.root)
+    dataset = executed_in_dataset(meta, args.repo_id)
+    names = dim_names(meta.features[ACTION])
+    units = make_units(dataset, names, args.exclude, args.per_second)
+    compared = [dataset, *map(read_executed, args.paths)]
+    if args.fps is not None:
+        compared = [replace(executed, fps=args.fps) for executed in compared]
+    _check_comparable(compared, args.per_second)
+    rows = {executed.name: measure_row(executed, units) for executed in compared}
+    first, *others = [executed.name for executed in compared if executed.is_seeded] or [""]
+    differences = {name: measure_difference(first, name, rows) for name in others}
+    excluded = [names[dim] for dim in units.exclude]
+    print(f"action dims {', '.join(names)}; left out: {', '.join(excluded) or 'none'}")
+    print_rows(rows)
+    if differences:
+        print_differences(first, differences)
+    per = "per s^2 and s^3" if units.per_second else "per step"
+    print(LEGEND.format(per=per, dataset=args.repo_id))
+    if args.json is not None:
+        figures = {
+            "dims": names,
+            "excluded": excluded,
+            "std": units.std.tolist(),
+            "per_second": units.per_second,
+            "rows": {name: asdict(row) for name, row in rows.items()},
+            "differences": {name: {"from": first, **asdict(of)} for name, of in differences.items()},
+        }
+        with written_whole(args.json) as (path,):
+            path.write_text(json.dumps(figures, indent=1, allow_nan=False) + "\n")
+    return 0
+
+
+def _check_flags(args: argparse.Namespace) -> None:
+    if args.json is not None:
+        check_writable("--json", args.json)
+    if args.fps is not None and not 0 < args.fps < math.inf:
+        raise ValueError(f"--fps={args.fps:g} must be a positive number of actions a second")
+
+
+def make_units(dataset: Executed, names: list[str], exclude: list[str] | None, per_second: bool) -> Units:
+    """Those of a dataset.
+
+    Raises:
+        ValueError: a name in `exclude` is unknown, no dim is left, or one of those left never changes.
+    """
+    if exclude is None:
+        exclude = [name for name in names if GRIPPER in name.lower()]
+    if unknown := [name for name in exclude if name not in names]:
+        raise ValueError(f"--exclude={','.join(exclude)}: no action dim {unknown[0]!r}; there are {names}")
+    std_D = np.concatenate(list(dataset.episodes.values())).astype(np.float64).std(axis=0)
+    left = [name for name in names if name not in exclude]
+    if not left:
+        raise ValueError(f"--exclude={','.join(exclude)} leaves none of the action dims {names}")
+    if constant := [name for name, std in zip(names, std_D, strict=True) if name in left and std == 0]:
+        raise ValueError(
+            f"{dataset.name}: the action dim {constant[0]!r} never changes, so that it has no normalised "
+            f"unit; leave it out with --exclude={','.join([*exclude, *constant])}"
+        )
+    return Units([names.index(name) for name in exclude], std_D, per_second)
+
+
+def _check_comparable(compared: list[Executed], per_second: bool) -> None:
+    dataset, *others = compared
+    names = [executed.name for executed in compared]
+    if doubled := [name for name in names if names.count(name) > 1]:
+        raise ValueError(f"{doubled[0]} is named twice")
+    for executed in others:
+        if executed.num_dims != dataset.num_dims:
+            raise ValueError(
+                f"{executed.name}: actions have {executed.num_dims} dims, those of {dataset.name} "
+                f"{dataset.num_dims}"
+            )
+        if executed.fps != dataset.fps and not per_second:
+            print(
+                f"warning: {executed.name} has {executed.fps:g} actions a second, {dataset.name} "
+                f"{dataset.fps:g}: differences per step do not compare, those of --per_second do",
+                file=sys.stderr,
+            )
+
+
+def measure_row(executed: Executed, units: Units) -> Row:
+    """Every difference within an episode counts the same.
+
+    Raises:
+        ValueError: no episode has the actions that a third difference takes.
+    """
+    episodes = {name: of for name, of in executed.episodes.items() if len(of) >= MIN_ACTIONS}
+    if not episodes:
+        raise ValueError(f"{executed.name}: no episode has {MIN_ACTIONS} actions")
+    num_actions = {name: len(of) for name, of in episodes.items()}
+    actions_RD = np.concatenate(list(episodes.values()))
+    episode_R = np.repeat(np.arange(len(episodes)), list(num_actions.values()))
+    dt_s = 1 / executed.fps if units.per_second else None
+    return Row(
+        executed.fps,
+        len(executed.episodes) - len(episodes),
+        num_actions,
+        _measures(actions_RD, episode_R, units, dt_s),
+        {
+            name: {key: of.mean for key, of in _measures(actions_TD, zeros, units, dt_s).items()}
+            for name, actions_TD in episodes.items()
+            for zeros in [np.zeros(len(actions_TD))]
+        },
+    )
+
+
+def _measures(
+    actions_RD: np.ndarray, episode_R: np.ndarray, units: Units, dt_s: float | None
+) -> dict[str, Measure]:
+    options = {"exclude": units.exclude, "dt_s": dt_s}
+    raw = smoothness(actions_RD, episode_R, **options)
+    normalised = smoothness(actions_RD, episode_R, std_D=units.std, **options)
+    return dict(zip(ORDERS, (raw.j2, raw.j3, normalised.j2, normalised.j3), strict=True))
+
+
+def measure_difference(first: str, second: str, rows: dict[str, Row]) -> Difference:
+    """The second one's means minus the first one's, episodes drawn as pairs.
+
+    Raises:
+        ValueError: they have no episode in common.
+    """
+    pairs = [name for name in rows[first].episodes if name in rows[second].episodes]
+    if not pairs:
+        raise ValueError(f"{first} and {second} have no episode of the same group, task and seed")
+    measures = {}
+    for key, order in ORDERS.items():
+        sums_E, counts_E = np.empty((2, len(pairs))), np.empty((2, len(pairs)))
+        for i, row in enumerate((rows[first], rows[second])):
+            counts_E[i] = [row.num_actions[name] - order for name in pairs]
+            sums_E[i] = counts_E[i] * [row.episodes[name][key] for name in pairs]
+        means = sums_E.sum(axis=1) / counts_E.sum(axis=1)
+        interval = paired_bootstrap_interval(*zip(sums_E, counts_E, strict=True))
+        measures[key] = Measure(float(means[1] - means[0]), *(interval or (None, None)))
+    return Difference(len(pairs), measures)
+
+
+def print_rows(rows: dict[str, Row]) -> None:
+    """Print a row per dataset or evaluation."""
+    cells = [
+        [name, str(len(row.episodes)), str(sum(row.num_actions.values())), *map(str, row.measures.values())]
+        for name, row in rows.items()
+    ]
+    print_table(["", "episodes", "actions", *ORDERS], cells)
+    for name, row in rows.items():
+        if row.num_skipped:
+            print(f"{name}: {row.num_skipped} more with fewer than {MIN_ACTIONS} actions do not count")
+
+
+def print_differences(first: str, differences: dict[str, Difference]) -> None:
+    """Print a row per evaluation that was compared with the first."""
+    print(f"\nDifference from {first} on the same episodes")
+    cells = [[name, str(of.num_pairs), *map(str, of.measures.values())] for name, of in differences.items()]
+    print_table(["", "pairs", *ORDERS], cells)
