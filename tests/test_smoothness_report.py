@@ -5,7 +5,6 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from lerobot.datasets import LeRobotDataset
 from pusht_cases import REPO_ID, Demonstrations
 
 from lerobot_bomb.cli import main
@@ -90,7 +89,11 @@ def logs(pusht_demonstrations: Demonstrations, tmp_path: Path) -> list[Path]:
 
 
 def test_people_and_policies_side_by_side(
-    pusht_dataset: Path, logs: list[Path], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+    pusht_demonstrations: Demonstrations,
+    pusht_dataset: Path,
+    logs: list[Path],
+    tmp_path: Path,
+    capsys: pytest.CaptureFixture[str],
 ) -> None:
     path = tmp_path / "figures.json"
     flags = [f"--dataset.repo_id={REPO_ID}", f"--dataset.root={pusht_dataset}", f"--json={path}"]
@@ -104,9 +107,8 @@ def test_people_and_policies_side_by_side(
     assert smooth["measures"] == people["measures"] == folder["measures"]
     assert list(people["episodes"]) == ["0", "1", "2"]
     assert list(seams["episodes"]) == [f"pusht, task 0, seed {seed}" for seed in range(3)]
-    dataset = LeRobotDataset(REPO_ID, root=pusht_dataset)
-    actions = np.stack([np.asarray(frame["action"]) for frame in dataset.hf_dataset])
-    assert figures["std"] == pytest.approx(actions.astype(np.float64).std(axis=0))
+    std = pusht_demonstrations.actions.astype(np.float64).std(axis=0)
+    assert figures["std"] == pytest.approx(std)
     [(name, difference)] = figures["differences"].items()
     assert (name, difference["from"], difference["num_pairs"]) == (str(logs[1]), str(logs[0]), 3)
     for key, of in difference["measures"].items():

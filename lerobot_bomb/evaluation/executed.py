@@ -29,7 +29,7 @@ class Executed:
             raise ValueError(f"{self.name}: no episode")
         if len({actions_TD.shape[1] for actions_TD in self.episodes.values()}) > 1:
             raise ValueError(f"{self.name}: episodes differ in the number of action dims")
-        if self.fps <= 0:
+        if not self.fps > 0:
             raise ValueError(f"{self.name}: fps={self.fps} must be positive")
         for episode, actions_TD in self.episodes.items():
             if not np.isfinite(actions_TD).all():
