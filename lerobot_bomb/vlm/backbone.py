@@ -132,9 +132,15 @@ def spread_pictures(vision_model: nn.Module) -> None:
     filters = embeddings.get_submodule("patch_embedding").weight
     positions = embeddings.get_submodule("position_embedding").weight
     assert isinstance(filters, nn.Parameter) and isinstance(positions, nn.Parameter)
-    filters -= filters.mean(dim=(1, 2, 3), keepdim=True)
-    filters /= INITIALIZER_RANGE
+    spread_filters(filters)
     positions /= INITIALIZER_RANGE
+
+
+@torch.no_grad()
+def spread_filters(filters: nn.Parameter) -> None:
+    """What `spread_pictures` does to the filters that embed patches, (channels, ...)."""
+    filters -= filters.flatten(1).mean(dim=1).view(-1, *[1] * (filters.ndim - 1))
+    filters /= INITIALIZER_RANGE
 
 
 def build_backbone(vlm_config: dict[str, Any]) -> SmolVLMBackbone:

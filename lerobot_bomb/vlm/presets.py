@@ -72,3 +72,35 @@ def nano_paligemma_config(tokenizer: Tokenizer) -> dict[str, Any]:
             "eos_token_id": tokenizer.token_to_id("<end_of_utterance>"),
         },
     }
+
+
+def nano_qwen_config(tokenizer: Tokenizer) -> dict[str, Any]:
+    """Config of a Qwen2.5-VL of about a million parameters, a token for 28x28 pixels."""
+    return {
+        "model_type": "qwen2_5_vl",
+        "image_token_id": tokenizer.token_to_id("<image>"),
+        "video_token_id": tokenizer.get_vocab_size(),  # none
+        "vision_start_token_id": tokenizer.token_to_id("<fake_token_around_image>"),
+        "vision_end_token_id": tokenizer.token_to_id("<fake_token_around_image>"),
+        "tie_word_embeddings": True,
+        "vision_config": {
+            "depth": 3,
+            "hidden_size": 96,
+            "intermediate_size": 256,
+            "num_heads": 3,
+            "out_hidden_size": 128,
+            "window_size": 56,
+            "fullatt_block_indexes": [0, 2],
+            "initializer_range": INITIALIZER_RANGE,
+        },
+        "text_config": {
+            **{key: value for key, value in NANO_TEXT.items() if key != "head_dim"},
+            "model_type": "qwen2_5_vl_text",
+            "vocab_size": tokenizer.get_vocab_size(),
+            "rope_parameters": {"rope_type": "default", "rope_theta": 10.0, "mrope_section": [4, 6, 6]},
+            "pad_token_id": tokenizer.token_to_id("<|im_end|>"),
+            "bos_token_id": tokenizer.token_to_id("<|im_start|>"),
+            "eos_token_id": tokenizer.token_to_id("<end_of_utterance>"),
+            "tie_word_embeddings": True,
+        },
+    }

@@ -1,0 +1,251 @@
+"""Qwen2.5-VL behind the few operations a policy needs.
+
+A prefix (pictures and text) is read once; short segments of embeddings then go on from it, as often as wanted,
+and change nothing of what is kept.
+
+Shapes: `B` batch, `L` tokens of a prefix, `T` of a segment, `H` hidden size, `P` tokens of an image, `S` side
+of an image in pixels, `V` key-value heads, `E` size of a head.
+"""
+
+from dataclasses import asdict, dataclass
+from typing import Any
+
+import torch
+from tokenizers import Tokenizer
+from torch import Tensor, nn
+from torch.utils.checkpoint import checkpoint
+from transformers import Qwen2_5_VLConfig, Qwen2_5_VLForConditionalGeneration
+from transformers.image_utils import OPENAI_CLIP_MEAN, OPENAI_CLIP_STD
+
+from lerobot_bomb.vlm.backbone import read_vlm_config, set_float32, spread_filters, weights_errors
+from lerobot_bomb.vlm.presets import nano_qwen_config
+from lerobot_bomb.vlm.tokenizer import IMAGE_EDGE_TOKEN, IMAGE_TOKEN, NANO, load_tokenizer
+
+# of the chat format, where the user gives none
+SYSTEM_TEXT = "system\nYou are a helpful assistant."
+
+type KeysValues = tuple[Tensor, Tensor]  # (B, V, L, E) each
+
+
+@dataclass(frozen=True)
+class QwenPrompt:
+    """Token ids of everything in a prompt but the task: start, images, task, whatever else, end."""
+
+    start: list[int]
+    image_start: int
+    image: int
+    image_end: int
+    end: list[int]
+
+    @classmethod
+    def from_tokenizer(cls, tokenizer: Tokenizer, vlm_model_name: str) -> "QwenPrompt":
+        """Look everything up.
+
+        Raises:
+            ValueError: a special token is not exactly one token.
+        """
+
+        def several(text: str) -> list[int]:
+            return tokenizer.encode(text, add_special_tokens=False).ids
+
+        def one(*texts: str) -> int:
+            found = [ids[0] for ids in map(several, texts) if len(ids) == 1]
+            if not found:
+                raise ValueError(
+                    f"--policy.vlm_model_name={vlm_model_name}: its tokenizer has no single token for "
+                    f"{' or '.join(map(repr, texts))}; the policy needs a Qwen2.5-VL tokenizer, which has"
+                )
+            return found[0]
+
+        turn, turn_end, line_break = one("<|im_start|>"), one("<|im_end|>"), several("\n")
+        return cls(
+            start=[turn, *several(SYSTEM_TEXT), turn_end, *line_break, turn, *several("user\n")],
+            # the second of each pair is the nano tokenizer's
+            image_start=one("<|vision_start|>", IMAGE_EDGE_TOKEN),
+            image=one("<|image_pad|>", IMAGE_TOKEN),
+            image_end=one("<|vision_end|>", IMAGE_EDGE_TOKEN),
+            end=[turn_end, *line_break, turn, *several("assistant\n")],
+        )
+
+    def to_dict(self) -> dict[str, int | list[int]]:
+        """JSON-ready."""
+        return asdict(self)
+
+
+@dataclass(frozen=True)
+class Prefix:
+    """What the model keeps of pictures and text that it has read."""
+
+    hidden: Tensor  # (B, L, H) after the last layer
+    written: Tensor  # (B, L) bool, others are gaps
+    next_position: Tensor  # (B, 1) int64, of what follows
+    layers: list[KeysValues]
+
+
+class _Reader:
+    """Stands where a layer expects a cache: what is kept is read and not changed."""
+
+    def __init__(self, kept: KeysValues | None):
+        self._kept, self.new = kept, kept
+
+    def update(self, keys_BVTE: Tensor, values_BVTE: Tensor, _: int) -> KeysValues:
+        self.new = keys_BVTE, values_BVTE
+        if self._kept is None:
+            return self.new
+        return torch.cat([self._kept[0], keys_BVTE], dim=2), torch.cat([self._kept[1], values_BVTE], dim=2)
+
+
+class QwenBackbone(nn.Module):
+    """A stock ``Qwen2_5_VLForConditionalGeneration``, called in parts.
+
+    ``checkpointed``: whether the text model's layers are computed again in the backward pass.
+
+    Raises:
+        ValueError: ``image_size`` does not consist of whole tokens.
+    """
+
+    pixel_mean: Tensor  # (3, 1, 1)
+    pixel_std: Tensor
+
+    def __init__(
+        self, vlm: Qwen2_5_VLForConditionalGeneration, image_size: int, *, checkpointed: bool = False
+    ):
+        super().__init__()
+        self.vlm = vlm
+        self.text_config: Any = vlm.config.text_config
+        vision_config: Any = vlm.config.vision_config
+        self._patch, self._merge = vision_config.patch_size, vision_config.spatial_merge_size
+        self._frames = vision_config.temporal_patch_size
+        if image_size < 1 or image_size % (self._patch * self._merge):
+            raise ValueError(
+                f"--policy.image_size={image_size} must be a multiple of {self._patch * self._merge} pixels: "
+                f"a token stands for {self._merge} x {self._merge} patches of {self._patch} pixels"
+            )
+        self.image_size = image_size  # pixels, square
+        self.tokens_per_side = image_size // (self._patch * self._merge)
+        self._checkpointed = checkpointed
+        for name, values in (("pixel_mean", OPENAI_CLIP_MEAN), ("pixel_std", OPENAI_CLIP_STD)):
+            self.register_buffer(name, torch.tensor(values)[:, None, None], persistent=False)
+
+    @property
+    def tokens_per_image(self) -> int:
+        return self.tokens_per_side**2
+
+    @property
+    def text_model(self) -> Any:
+        return self.vlm.model.language_model
+
+    def embed_images(self, pixels_B3SS: Tensor) -> Tensor:
+        """(B, 3, S, S) in [0, 1] -> (B, P, H)."""
+        patches = self._patches((pixels_B3SS - self.pixel_mean) / self.pixel_std)
+        side = self.tokens_per_side * self._merge
+        grid_B3 = torch.tensor([[1, side, side]]).expand(len(pixels_B3SS), 3)
+        features = self.vlm.model.visual(patches, grid_thw=grid_B3).pooler_output
+        return features.unflatten(0, (len(pixels_B3SS), -1))
+
+    def _patches(self, pixels_B3SS: Tensor) -> Tensor:
+        """A row of values for each patch, as a film of equal frames; the patches of a token in a row."""
+        side = self.tokens_per_side, self._merge, self._patch
+        cells = pixels_B3SS.unflatten(3, side).unflatten(2, side)  # B, 3, line, its patch, pixel, column, ...
+        cells = cells.permute(0, 2, 5, 3, 6, 1, 4, 7)  # B, line, column, patch, patch, 3, pixel, pixel
+        frames = cells[..., None, :, :].expand(*cells.shape[:6], self._frames, *cells.shape[6:])
+        return frames.flatten(5).flatten(0, 4)
+
+    def embed_tokens(self, tokens_BL: Tensor) -> Tensor:
+        """(B, L) token ids -> (B, L, H)."""
+        return self.vlm.get_input_embeddings()(tokens_BL)
+
+    def read_prefix(self, embeds_BLH: Tensor, is_image_BL: Tensor, written_BL: Tensor) -> Prefix:
+        """Read rows whose first column is written; ``is_image_BL``: which tokens are parts of pictures."""
+        positions_3BL, next_B1 = self._positions(is_image_BL, written_BL)
+        causal_LL = torch.ones_like(written_BL[0]).expand(written_BL.shape[1], -1).tril()
+        hidden_BLH, layers = self._read(embeds_BLH, positions_3BL, causal_LL & written_BL[:, None])
+        return Prefix(hidden_BLH, written_BL, next_B1, layers)
+
+    def read_segment(self, prefix: Prefix, embeds_BTH: Tensor, reads_BTT: Tensor) -> Tensor:
+        """(B, T, H) states after the last layer of tokens that follow a prefix and read all of it.
+
+        ``reads_BTT``: whether a token of the segment (row) reads another.
+        """
+        positions_BT = prefix.next_position + torch.arange(embeds_BTH.shape[1], device=embeds_BTH.device)
+        prefix_BTL = prefix.written[:, None].expand(-1, embeds_BTH.shape[1], -1)
+        reads_BTX = torch.cat([prefix_BTL, reads_BTT], dim=2)
+        return self._read(embeds_BTH, positions_BT.expand(3, -1, -1), reads_BTX, prefix.layers)[0]
+
+    def _read(
+        self,
+        x_BTH: Tensor,
+        positions_3BT: Tensor,
+        reads_BTX: Tensor,
+        kept: list[KeysValues] | None = None,
+    ) -> tuple[Tensor, list[KeysValues]]:
+        """States after the last layer, and the keys and values of every layer."""
+        rotation = self.text_model.rotary_emb(x_BTH, positions_3BT)
+        layers = []
+        for i, layer in enumerate(self.text_model.layers):
+            inputs = layer, x_BTH, reads_BTX[:, None], rotation, None if kept is None else kept[i]
+            if self._checkpointed and torch.is_grad_enabled():
+                x_BTH, new = checkpoint(_read_layer, *inputs, use_reentrant=False)
+            else:
+                x_BTH, new = _read_layer(*inputs)
+            layers.append(new)
+        return self.text_model.norm(x_BTH), layers
+
+    def _positions(self, is_image_BL: Tensor, written_BL: Tensor) -> tuple[Tensor, Tensor]:
+        """(3, B, L) time, line and column that the model takes a token to be at, and (B, 1) what follows.
+
+        Text moves all three on by one. A picture stands still in time, its lines and columns count from
+        there, and what follows it is at the first place beyond.
+        """
+        side = self.tokens_per_side
+        place_BL = (is_image_BL.cumsum(dim=1) - 1) % side**2
+        is_last_BL = place_BL == side**2 - 1
+        steps_BL = torch.where(is_image_BL, side * is_last_BL, written_BL.long())
+        ends_BL = steps_BL.cumsum(dim=1)
+        starts_BL = ends_BL - steps_BL
+        lines_BL, columns_BL = place_BL // side * is_image_BL, place_BL % side * is_image_BL
+        return torch.stack([starts_BL, starts_BL + lines_BL, starts_BL + columns_BL]), ends_BL[:, -1:]
+
+
+def _read_layer(
+    layer: nn.Module,
+    x_BTH: Tensor,
+    reads_B1TX: Tensor,
+    rotation: tuple[Tensor, Tensor],
+    kept: KeysValues | None,
+) -> tuple[Tensor, KeysValues]:
+    reader: Any = _Reader(kept)
+    x_BTH = layer(x_BTH, attention_mask=reads_B1TX, position_embeddings=rotation, past_key_values=reader)
+    return x_BTH, reader.new
+
+
+def load_qwen(vlm_model_name: str, image_size: int) -> QwenBackbone:
+    """Backbone with pretrained weights of a Hub id or a local folder, or ``nano`` with random ones.
+
+    Raises:
+        OSError: config or weights cannot be had; the message names the ways out.
+        ValueError: the model is not a Qwen2.5-VL, or as `QwenBackbone`.
+    """
+    if vlm_model_name == NANO:
+        backbone = build_qwen(nano_qwen_config(load_tokenizer(NANO)), image_size)
+        spread_filters(backbone.vlm.model.visual.patch_embed.proj.weight)
+        return backbone
+    config = read_vlm_config(vlm_model_name)
+    if config.model_type != "qwen2_5_vl":
+        raise ValueError(
+            f"--policy.vlm_model_name={vlm_model_name} is a {config.model_type!r} model; "
+            f"fdvla needs a 'qwen2_5_vl' one"
+        )
+    with weights_errors(vlm_model_name):
+        vlm = Qwen2_5_VLForConditionalGeneration.from_pretrained(
+            vlm_model_name, config=config, dtype=torch.float32, attn_implementation="sdpa"
+        )
+    return QwenBackbone(vlm, image_size)
+
+
+def build_qwen(vlm_config: dict[str, Any], image_size: int) -> QwenBackbone:
+    """Backbone of the given architecture with random weights in float32."""
+    config = Qwen2_5_VLConfig(**vlm_config)
+    set_float32(config, config.text_config, config.vision_config)
+    model: Any = Qwen2_5_VLForConditionalGeneration
+    return QwenBackbone(model._from_config(config, attn_implementation="sdpa"), image_size)
