@@ -137,7 +137,7 @@ def spread_pictures(vision_model: nn.Module) -> None:
 
 
 @torch.no_grad()
-def spread_filters(filters: nn.Parameter) -> None:
+def spread_filters(filters: Tensor) -> None:
     """What `spread_pictures` does to the filters that embed patches, (channels, ...)."""
     filters -= filters.flatten(1).mean(dim=1).view(-1, *[1] * (filters.ndim - 1))
     filters /= INITIALIZER_RANGE

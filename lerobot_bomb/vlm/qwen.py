@@ -1,13 +1,14 @@
 """Qwen2.5-VL behind the few operations a policy needs.
 
-A prefix (pictures and text) is read once; short segments of embeddings then go on from it, as often as wanted,
-and change nothing of what is kept.
+A prefix (pictures and text) is read once; short segments of embeddings then go on from it, as often as
+wanted, and change nothing of what is kept.
 
 Shapes: `B` batch, `L` tokens of a prefix, `T` of a segment, `H` hidden size, `P` tokens of an image, `S` side
 of an image in pixels, `V` key-value heads, `E` size of a head.
 """
 
 from dataclasses import asdict, dataclass
+from functools import partial
 from typing import Any
 
 import torch
@@ -15,7 +16,7 @@ from tokenizers import Tokenizer
 from torch import Tensor, nn
 from torch.utils.checkpoint import checkpoint
 from transformers import Qwen2_5_VLConfig, Qwen2_5_VLForConditionalGeneration
-from transformers.image_utils import OPENAI_CLIP_MEAN, OPENAI_CLIP_STD
+from transformers.utils.constants import OPENAI_CLIP_MEAN, OPENAI_CLIP_STD
 
 from lerobot_bomb.vlm.backbone import read_vlm_config, set_float32, spread_filters, weights_errors
 from lerobot_bomb.vlm.presets import nano_qwen_config
@@ -98,8 +99,6 @@ class _Reader:
 class QwenBackbone(nn.Module):
     """A stock ``Qwen2_5_VLForConditionalGeneration``, called in parts.
 
-    ``checkpointed``: whether the text model's layers are computed again in the backward pass.
-
     Raises:
         ValueError: ``image_size`` does not consist of whole tokens.
     """
@@ -107,9 +106,7 @@ class QwenBackbone(nn.Module):
     pixel_mean: Tensor  # (3, 1, 1)
     pixel_std: Tensor
 
-    def __init__(
-        self, vlm: Qwen2_5_VLForConditionalGeneration, image_size: int, *, checkpointed: bool = False
-    ):
+    def __init__(self, vlm: Qwen2_5_VLForConditionalGeneration, image_size: int):
         super().__init__()
         self.vlm = vlm
         self.text_config: Any = vlm.config.text_config
@@ -123,9 +120,14 @@ class QwenBackbone(nn.Module):
             )
         self.image_size = image_size  # pixels, square
         self.tokens_per_side = image_size // (self._patch * self._merge)
-        self._checkpointed = checkpointed
+        self._is_checkpointed = False
         for name, values in (("pixel_mean", OPENAI_CLIP_MEAN), ("pixel_std", OPENAI_CLIP_STD)):
             self.register_buffer(name, torch.tensor(values)[:, None, None], persistent=False)
+
+    def checkpoint_gradients(self) -> None:
+        """Compute what is inside a layer again in the backward pass instead of keeping it."""
+        self._is_checkpointed = True  # transformers' own kind gives layers no cache
+        self.vlm.model.visual.gradient_checkpointing_enable({"use_reentrant": False})
 
     @property
     def tokens_per_image(self) -> int:
@@ -181,13 +183,12 @@ class QwenBackbone(nn.Module):
     ) -> tuple[Tensor, list[KeysValues]]:
         """States after the last layer, and the keys and values of every layer."""
         rotation = self.text_model.rotary_emb(x_BTH, positions_3BT)
+        read: Any = _read_layer
+        if self._is_checkpointed and torch.is_grad_enabled():
+            read = partial(checkpoint, _read_layer, use_reentrant=False)
         layers = []
         for i, layer in enumerate(self.text_model.layers):
-            inputs = layer, x_BTH, reads_BTX[:, None], rotation, None if kept is None else kept[i]
-            if self._checkpointed and torch.is_grad_enabled():
-                x_BTH, new = checkpoint(_read_layer, *inputs, use_reentrant=False)
-            else:
-                x_BTH, new = _read_layer(*inputs)
+            x_BTH, new = read(layer, x_BTH, reads_BTX[:, None], rotation, kept and kept[i])
             layers.append(new)
         return self.text_model.norm(x_BTH), layers
 
