@@ -16,7 +16,7 @@ import lerobot_bomb
 
 DISTRIBUTION = "lerobot_policy_bomb"
 ENV_TYPES = ("bomb",)
-POLICY_TYPES = ("vla0_smol", "spatialvla_grid", "bomb_expert", "bomb_random")
+POLICY_TYPES = ("vla0_smol", "spatialvla_grid", "fdvla", "bomb_expert", "bomb_random")
 DEPENDENCIES = (
     "lerobot",
     "torch",

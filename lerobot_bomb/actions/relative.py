@@ -20,6 +20,7 @@ BOUND_STATISTICS = {
     NormalizationMode.QUANTILES: ("q01", "q99"),
     NormalizationMode.QUANTILE10: ("q10", "q90"),
 }
+CENTRE_AND_DISTANCE = ("mean", "std")
 QUANTILE = 0.999  # of the residuals' sizes; what lies beyond saturates
 MAX_RESIDUALS = 20_000_000  # a dimension; of more, evenly spaced frames are taken
 
@@ -34,14 +35,15 @@ def bounds(
     """
     if mode is NormalizationMode.IDENTITY:
         return -np.ones(num_dims), np.ones(num_dims)
-    if missing := [name for name in BOUND_STATISTICS[mode] if name not in statistics]:
+    names = CENTRE_AND_DISTANCE if mode is NormalizationMode.MEAN_STD else BOUND_STATISTICS[mode]
+    if missing := [name for name in names if name not in statistics]:
         raise ValueError(
             f"--policy.normalization_mapping: {mode.value} needs the statistics {', '.join(missing)}, which "
             f"the dataset lacks; it has {', '.join(sorted(statistics))}. MIN_MAX needs no quantiles, "
             f"lerobot.scripts.augment_dataset_quantile_stats adds them"
         )
-    low, high = (np.asarray(statistics[name], dtype=np.float64) for name in BOUND_STATISTICS[mode])
-    return low, high
+    low, high = (np.asarray(statistics[name], dtype=np.float64) for name in names)
+    return (low - high, low + high) if names is CENTRE_AND_DISTANCE else (low, high)
 
 
 def named_dims(names: Sequence[str], wanted: Iterable[str], flag: str) -> list[int]:

@@ -14,6 +14,7 @@ from lerobot_bomb.checkpoint import Preprocessor, load_processors, read_config
 from lerobot_bomb.viewing.unfinished import written_whole
 from lerobot_bomb.vlm.backbone import SmolVLMBackbone
 from lerobot_bomb.vlm.paligemma import PaliGemmaBackbone
+from lerobot_bomb.vlm.qwen import QwenBackbone
 
 
 def add_export_backbone_arguments(parser: argparse.ArgumentParser) -> None:
@@ -38,9 +39,9 @@ def run_export_backbone(args: argparse.Namespace) -> int:
     return 0
 
 
-def _backbone(policy: PreTrainedPolicy) -> SmolVLMBackbone | PaliGemmaBackbone:
+def _backbone(policy: PreTrainedPolicy) -> SmolVLMBackbone | PaliGemmaBackbone | QwenBackbone:
     for module in policy.modules():
-        if isinstance(module, SmolVLMBackbone | PaliGemmaBackbone):
+        if isinstance(module, SmolVLMBackbone | PaliGemmaBackbone | QwenBackbone):
             return module
     raise ValueError(f"a policy of type {policy.config.type} holds no vision-language model to export")
 

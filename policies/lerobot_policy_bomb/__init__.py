@@ -4,5 +4,6 @@ import lerobot_bomb.explain.interventions  # noqa: F401
 import lerobot_env_bomb.configuration_bomb  # noqa: F401
 import lerobot_policy_bomb_expert  # noqa: F401
 import lerobot_policy_bomb_random  # noqa: F401
+import lerobot_policy_fdvla  # noqa: F401
 import lerobot_policy_spatialvla_grid  # noqa: F401
 import lerobot_policy_vla0_smol  # noqa: F401

@@ -1,0 +1,44 @@
+"""LeRobot's real-time chunking on our samplers: a new chunk goes on from what is left of the last one.
+
+LeRobot's time runs from 1 (noise) to 0 (actions), and its velocity points to the noise.
+Shapes: `B` batch, `K` action steps, `D` action dims.
+"""
+
+from lerobot.policies.rtc import RTCProcessor
+from torch import Tensor
+
+from lerobot_bomb.flow.samplers import Heads
+
+
+def guided(
+    heads: Heads,
+    processor: RTCProcessor,
+    leftover_KD: Tensor | None,
+    inference_delay: int,
+    execution_horizon: int | None = None,
+) -> Heads:
+    """The heads with a velocity that leads to the actions not executed yet, (B, K, D) or (K, D), normalised.
+
+    The noise head stays as it is. None left: nothing is changed.
+    """
+
+    def guided_heads(actions_BKD: Tensor, tau_B: Tensor) -> tuple[Tensor | None, Tensor | None]:
+        predicted: list[tuple[Tensor | None, Tensor | None]] = []
+
+        def velocity_to_noise(actions_BKD: Tensor) -> Tensor:
+            predicted.append(heads(actions_BKD, tau_B))
+            velocity_BKD, _ = predicted[-1]
+            assert velocity_BKD is not None
+            return -velocity_BKD.float()
+
+        guided_BKD = processor.denoise_step(
+            x_t=actions_BKD,
+            prev_chunk_left_over=leftover_KD,
+            inference_delay=inference_delay,
+            time=1 - tau_B[:, None, None],
+            original_denoise_step_partial=velocity_to_noise,
+            execution_horizon=execution_horizon,
+        )
+        return -guided_BKD.detach(), predicted[-1][1]
+
+    return guided_heads

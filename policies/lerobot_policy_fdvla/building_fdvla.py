@@ -1,0 +1,35 @@
+"""The vision-language model of an ``fdvla``, from its config or a checkpoint's."""
+
+from lerobot_bomb.vlm.backbone import config_dict
+from lerobot_bomb.vlm.qwen import QwenBackbone, QwenPrompt, build_qwen, load_qwen
+from lerobot_bomb.vlm.tokenizer import load_tokenizer
+from lerobot_policy_fdvla.configuration_fdvla import FdvlaConfig
+
+
+def build_model(config: FdvlaConfig) -> tuple[QwenPrompt, QwenBackbone]:
+    """Base model, or the architecture of a checkpoint; fills in what a checkpoint's config must hold."""
+    if config.vlm_config is None:
+        name = config.vlm_model_name
+        tokens = QwenPrompt.from_tokenizer(load_tokenizer(name), name)
+        backbone = load_qwen(name, config.image_size)
+        config.vlm_config, config.prompt_tokens = config_dict(backbone.vlm), tokens.to_dict()
+    elif config.prompt_tokens is None:
+        raise ValueError("--policy.vlm_config is set, but not --policy.prompt_tokens, which belongs to it")
+    else:
+        tokens, backbone = (
+            QwenPrompt(**config.prompt_tokens),
+            build_qwen(config.vlm_config, config.image_size),
+        )
+    _freeze(config, backbone)
+    if config.gradient_checkpointing:
+        backbone.checkpoint_gradients()
+    return tokens, backbone
+
+
+def _freeze(config: FdvlaConfig, backbone: QwenBackbone) -> None:
+    vlm = backbone.vlm
+    vlm.requires_grad_(config.train_vlm == "full")
+    if config.freeze_vision_encoder:
+        vlm.model.visual.requires_grad_(False)
+    if vlm.lm_head.weight is not vlm.get_input_embeddings().weight:
+        vlm.lm_head.requires_grad_(False)  # no word is written

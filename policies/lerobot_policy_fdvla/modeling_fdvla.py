@@ -1,0 +1,416 @@
+"""``fdvla``: noise to actions in a few steps, by a flow head and a denoising head together.
+
+Source: FDVLA; where its equations contradict each other, the sound reading is in `lerobot_bomb.flow`.
+
+Shapes: `B` batch, `K` actions of a chunk, `D` action dims, `L` tokens of a prompt, `T` = K + 3 of a segment
+(begin, time, actions, end), `H` hidden size, `P` tokens of an image, `N` sampling steps.
+"""
+
+import logging
+from collections import deque
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from functools import partial
+from typing import ClassVar
+
+import torch
+from lerobot.datasets import LeRobotDatasetMetadata
+from lerobot.policies import PreTrainedPolicy
+from lerobot.policies.rtc import RTCProcessor
+from lerobot.utils.constants import ACTION, OBS_LANGUAGE_ATTENTION_MASK, OBS_LANGUAGE_TOKENS, OBS_STATE
+from torch import Tensor, nn
+from torch.nn.attention import SDPBackend, sdpa_kernel
+
+from lerobot_bomb.actions.accuracy import means
+from lerobot_bomb.actions.relative import bounds
+from lerobot_bomb.actions.text import TokenRows
+from lerobot_bomb.data.columns import dim_names
+from lerobot_bomb.flow.dual_mod import masked_mean_pool
+from lerobot_bomb.flow.losses import joint_loss
+from lerobot_bomb.flow.path import PathPoint, draw_noise, draw_tau, path_point
+from lerobot_bomb.flow.real_time import guided
+from lerobot_bomb.flow.samplers import SAMPLERS, sample
+from lerobot_bomb.policy_flags import check_as_trained, trained_with
+from lerobot_bomb.vlm.cached_text import check_positions
+from lerobot_bomb.vlm.images import draw_windows, resize
+from lerobot_bomb.vlm.inputs import read_actions, read_image, read_tensor
+from lerobot_bomb.vlm.qwen import Prefix
+from lerobot_policy_fdvla.building_fdvla import build_model
+from lerobot_policy_fdvla.configuration_fdvla import AS_TRAINED, FdvlaConfig
+from lerobot_policy_fdvla.networks_fdvla import NUM_MARKS, ActionSegment, Head
+
+logger = logging.getLogger(__name__)
+
+SAMPLING_SEED = 0
+
+
+@dataclass(frozen=True)
+class Context:
+    """An observation as every sampling step reads it."""
+
+    prefix: Prefix
+    pooled: Tensor  # (B, H)
+
+
+class FdvlaPolicy(PreTrainedPolicy):
+    """A Qwen2.5-VL that reads noisy actions; two heads predict where they go and what noise is in them."""
+
+    config_class = FdvlaConfig  # pyright: ignore[reportAssignmentType]  LeRobot annotates it as None
+    name = "fdvla"  # pyright: ignore[reportAssignmentType]
+    config: FdvlaConfig
+    action_unit: Tensor
+    # modules that FSDP shards one by one; accelerate reads the second name
+    _fsdp_wrap_modules: ClassVar[list[str]] = ["Qwen2_5_VLDecoderLayer", "Qwen2_5_VLVisionBlock"]
+    _no_split_modules = _fsdp_wrap_modules
+
+    def __init__(self, config: FdvlaConfig, dataset_meta: LeRobotDatasetMetadata | None = None, **_: object):
+        super().__init__(config)
+        config.validate_features()
+        config.trained_with = trained_with(config, AS_TRAINED)
+        self.tokens, self.backbone = build_model(config)
+        num_fixed = len(self._head_ids) + len(self._tail_ids) + config.chunk_size + NUM_MARKS
+        check_positions(self.backbone.text_config, num_fixed)
+        hidden_size = self.backbone.text_config.hidden_size
+        self.segment = ActionSegment(config.chunk_size, self._action_dim, hidden_size)
+        self.state_embedding = self._make_state_embedding(hidden_size)
+        make_head = partial(Head, hidden_size, config.head_dim, self._action_dim)
+        self.flow_head = (
+            make_head(config.dualmod_dim if config.dualmod_flow else None) if config.use_flow_head else None
+        )
+        self.denoise_head = (
+            make_head(config.dualmod_dim if config.dualmod_denoise else None)
+            if config.use_denoise_head
+            else None
+        )
+        # physical size of 1 in normalised actions, known while training: (D,)
+        self.register_buffer("action_unit", torch.ones(self._action_dim), persistent=False)
+        self._take_units(dataset_meta)
+        # source of all that is random in training: the crop, the time, the noise
+        self.generator = torch.Generator().manual_seed(torch.initial_seed())
+        logger.info("fdvla: %s", self.parameter_counts)
+        self.init_rtc_processor()
+        self.reset()
+
+    @classmethod
+    def from_pretrained(
+        cls,
+        *args,
+        config: FdvlaConfig | None = None,
+        dataset_meta: LeRobotDatasetMetadata | None = None,
+        **kwargs,
+    ) -> "FdvlaPolicy":
+        """As LeRobot's, but a missing or unexpected tensor is an error."""
+        if config is not None and dataset_meta is None:
+            check_as_trained(config)
+        policy = super().from_pretrained(*args, config=config, **{**kwargs, "strict": True})
+        policy._take_units(dataset_meta)
+        return policy
+
+    @torch.no_grad()
+    def _take_units(self, meta: LeRobotDatasetMetadata | None) -> None:
+        self._action_names = None
+        if meta is None:
+            return
+        assert meta.stats is not None
+        mode = self.config.normalization_mapping["ACTION"]
+        low, high = bounds(meta.stats[ACTION], mode, self._action_dim)
+        self.action_unit.copy_(torch.from_numpy(high - low) / 2)
+        self._action_names = dim_names(meta.features[ACTION])
+
+    def _make_state_embedding(self, hidden_size: int) -> nn.Linear | None:
+        if not self.config.use_state:
+            return None
+        assert self.config.robot_state_feature is not None
+        return nn.Linear(self.config.robot_state_feature.shape[0], hidden_size)
+
+    @property
+    def parameter_counts(self) -> dict[str, int]:
+        """Of each part, and of those that are trained in all."""
+        counts = {name: sum(p.numel() for p in part.parameters()) for name, part in self.named_children()}
+        return {**counts, "trained": sum(p.numel() for p in self.get_optim_params())}
+
+    def get_optim_params(self) -> list[nn.Parameter]:
+        return [parameter for parameter in self.parameters() if parameter.requires_grad]
+
+    def reset(self) -> None:
+        self._queue: deque[Tensor] = deque(maxlen=self.config.n_action_steps)
+        self._sampling_generator = torch.Generator().manual_seed(SAMPLING_SEED)
+
+    # Training
+
+    def forward(self, batch: dict[str, Tensor], reduction: str = "mean") -> tuple[Tensor, dict[str, float]]:
+        """Losses of both heads at a random time of each chunk; ``reduction="none"`` gives (B,)."""
+        actions_BKD = self._actions(batch)
+        kept_BK = self._kept(batch)
+        point = self._draw_point(actions_BKD)
+        has_energy = self.config.consistency == "energy_vjp" and self.config.used_consistency_weight > 0
+        with self._autocast(), second_derivatives(has_energy):
+            point.actions.requires_grad_(has_energy)
+            velocity_BKD, noise_BKD = self._heads(self._read(batch), point.actions, point.tau, kept_BK)
+            loss, terms = joint_loss(
+                None if velocity_BKD is None else velocity_BKD.float(),
+                None if noise_BKD is None else noise_BKD.float(),
+                point,
+                kept_BK,
+                flow_loss_weight=self.config.flow_loss_weight,
+                denoise_loss_weight=self.config.denoise_loss_weight,
+                consistency_loss_weight=self.config.used_consistency_weight,
+                consistency=self.config.consistency,
+                consistency_detach=self.config.consistency_detach,
+                reduction=reduction,
+            )
+        return loss, self._metrics(terms, velocity_BKD, noise_BKD, point, actions_BKD, kept_BK)
+
+    def _actions(self, batch: dict[str, Tensor]) -> Tensor:
+        """(B, K, D) normalised."""
+        shape = self.config.chunk_size, self._action_dim
+        actions_BKD = read_actions(batch, ACTION, self.config.type, self.action_unit.device, shape)
+        if not actions_BKD.isfinite().all():
+            rows = (~actions_BKD.isfinite()).any(dim=2).any(dim=1).nonzero()[:, 0].tolist()
+            raise ValueError(f"batch['action'] is not finite in the rows {rows} (NaN or infinite)")
+        return actions_BKD.float()
+
+    def _kept(self, batch: dict[str, Tensor]) -> Tensor:
+        """(B, K) bool: which actions are read by others and trained on."""
+        if f"{ACTION}_is_pad" in batch and not self.config.loss_on_padded_actions:
+            return ~self._of_batch(batch, f"{ACTION}_is_pad").bool()
+        return torch.ones_like(batch[ACTION][..., 0], dtype=torch.bool)
+
+    def _draw_point(self, actions_BKD: Tensor) -> PathPoint:
+        tau_B = draw_tau(self.config.time_sampling, len(actions_BKD), self.generator)
+        noise_BKD = torch.randn(actions_BKD.shape, generator=self.generator)
+        return path_point(actions_BKD, noise_BKD.to(actions_BKD.device), tau_B.to(actions_BKD.device))
+
+    @torch.no_grad()
+    def _metrics(
+        self,
+        terms: dict[str, Tensor],
+        velocity_BKD: Tensor | None,
+        noise_BKD: Tensor | None,
+        point: PathPoint,
+        actions_BKD: Tensor,
+        kept_BK: Tensor,
+    ) -> dict[str, float]:
+        """The loss's terms, and errors of the actions that A^tau and a head imply, in the data's units.
+
+        Errors are known where a dataset was given, that is while training. Padded actions do not count.
+        """
+        parts = {name: (term, torch.ones_like(term, dtype=torch.bool)) for name, term in terms.items()}
+        if self._action_names is not None:
+            errors_BKD = self._implied_actions(velocity_BKD, noise_BKD, point) - actions_BKD
+            errors_BKD = errors_BKD.abs() * self.action_unit
+            kept_BKD = kept_BK[..., None].expand_as(errors_BKD)
+            parts["l1"] = errors_BKD, kept_BKD
+            for dim, name in enumerate(self._action_names):
+                parts[f"l1_{name}"] = errors_BKD[..., dim], kept_BKD[..., dim]
+        return means(parts)
+
+    def _implied_actions(
+        self, velocity_BKD: Tensor | None, noise_BKD: Tensor | None, point: PathPoint
+    ) -> Tensor:
+        """(B, K, D) where the rest of a straight path leads, by the flow head if there is one."""
+        tau_B11 = point.tau[:, None, None]
+        if velocity_BKD is not None:
+            return point.actions + (1 - tau_B11) * velocity_BKD.float()
+        assert noise_BKD is not None
+        tau_B11 = tau_B11.clamp(min=self.config.denoise_tau_min)
+        clean_BKD = (point.actions - (1 - tau_B11) * noise_BKD.float()) / tau_B11
+        return clean_BKD.clamp(-self.config.clip_sample_range, self.config.clip_sample_range)
+
+    # Inference
+
+    def select_action(self, batch: dict[str, Tensor], noise: Tensor | None = None, **_: object) -> Tensor:
+        """(B, D) next normalised action, of a new chunk where the queue of ``n_action_steps`` is empty."""
+        if not self._queue:
+            chunk_BKD = self.predict_action_chunk(batch, noise)
+            self._queue.extend(chunk_BKD[:, : self.config.n_action_steps].unbind(dim=1))
+        return self._queue.popleft()
+
+    @torch.no_grad()
+    def predict_action_chunk(
+        self,
+        batch: dict[str, Tensor],
+        noise: Tensor | None = None,
+        *,
+        inference_delay: int | None = None,
+        prev_chunk_left_over: Tensor | None = None,
+        execution_horizon: int | None = None,
+        **_: object,
+    ) -> Tensor:
+        """(B, K, D) normalised actions, from ``noise`` (B, K, D) or else the next of this episode.
+
+        The others are of LeRobot's real-time chunking, if the config's ``rtc_config`` enables it: actions of
+        the last chunk that are not executed yet, and how many will be when this one arrives.
+        """
+        self.eval()
+        config = self.config
+        with self._autocast():
+            context = self._read(batch)
+            shape = len(context.pooled), config.chunk_size, self._action_dim
+            heads = partial(self._heads, context)
+            if self.rtc_processor is not None and prev_chunk_left_over is not None:
+                delay = inference_delay or 0
+                heads = guided(heads, self.rtc_processor, prev_chunk_left_over, delay, execution_horizon)
+            actions_BKD = sample(
+                heads,
+                self._noise(noise, shape),
+                sampler=config.used_sampler,
+                solver=config.solver,
+                num_inference_steps=config.num_inference_steps,
+                refine_alpha=config.refine_alpha,
+                denoise_tau_min=config.denoise_tau_min,
+                clip_sample_range=config.clip_sample_range,
+                step_noise_BNKD=self._step_noise(shape),
+            )
+        # casts of weights cached under inference mode cannot be used by a later training step
+        torch.clear_autocast_cache()
+        return actions_BKD
+
+    def _noise(self, given: Tensor | None, shape: tuple[int, int, int]) -> Tensor:
+        if given is None:
+            return self._draw(shape[0], shape[1:])
+        if given.shape != shape:
+            raise ValueError(f"noise has shape {tuple(given.shape)}; expected {shape} (batch, chunk, dims)")
+        return given
+
+    def _step_noise(self, shape: tuple[int, int, int]) -> Tensor | None:
+        if self.config.used_sampler != "sde":
+            return None
+        return self._draw(shape[0], (self.config.num_inference_steps, *shape[1:]))
+
+    def _draw(self, batch_size: int, shape: tuple[int, ...]) -> Tensor:
+        return draw_noise(self._sampling_generator, batch_size, shape).to(self.action_unit.device)
+
+    def supports_rtc(self) -> bool:
+        """Whether the sampler follows a velocity, which real-time chunking guides."""
+        return "flow" in SAMPLERS[self.config.used_sampler]
+
+    def init_rtc_processor(self) -> None:
+        """Take ``config.rtc_config``, which LeRobot sets after the policy was made."""
+        self.rtc_processor = None
+        rtc_config = self.config.rtc_config
+        if rtc_config is None or not rtc_config.enabled:
+            return
+        if not self.supports_rtc():
+            raise ValueError(
+                f"--policy.rtc_config: real-time chunking guides a velocity, and sampler="
+                f"{self.config.used_sampler} has none; give --policy.sampler=flow or residual"
+            )
+        self.rtc_processor = RTCProcessor(rtc_config)
+
+    # Model
+
+    def _heads(
+        self, context: Context, actions_BKD: Tensor, tau_B: Tensor, kept_BK: Tensor | None = None
+    ) -> tuple[Tensor | None, Tensor | None]:
+        """Velocity and noise (B, K, D) predicted at noisy actions and times; None for a missing head.
+
+        One pass over the segment. Its shapes are static, and nothing in it waits for the device.
+        """
+        if kept_BK is None:
+            kept_BK = torch.ones_like(actions_BKD[..., 0], dtype=torch.bool)
+        reads_BTT = self.segment.reads(kept_BK, causal=self.config.segment_attention == "causal")
+        states_BTH = self.backbone.read_segment(context.prefix, self.segment(actions_BKD, tau_B), reads_BTT)
+        states_BKH = self.segment.of_actions(states_BTH)
+        velocity_BKD, noise_BKD = (
+            None if head is None else head(states_BKH, context.pooled)
+            for head in (self.flow_head, self.denoise_head)
+        )
+        return velocity_BKD, noise_BKD
+
+    def _read(self, batch: dict[str, Tensor]) -> Context:
+        """The prompt, once for all sampling steps."""
+        rows, is_task_BL = self._prompt(batch)
+        prefix = self.backbone.read_prefix(
+            self._embeds(batch, rows.ids), rows.ids == self.tokens.image, rows.written
+        )
+        return Context(prefix, masked_mean_pool(prefix.hidden, self._pooled(rows.written, is_task_BL)))
+
+    def _pooled(self, written_BL: Tensor, is_task_BL: Tensor) -> Tensor:
+        """(B, L) bool: the tokens that are pooled; all of them where there is no instruction."""
+        if self.config.reasoning_pool == "text":
+            return torch.where(is_task_BL.any(dim=1, keepdim=True), is_task_BL, written_BL)
+        if self.config.reasoning_pool == "all_prefix":
+            return written_BL
+        index_L = torch.arange(written_BL.shape[1], device=written_BL.device)
+        return (index_L == written_BL.shape[1] - 1).expand_as(written_BL)
+
+    # Prompt: start, images, task (with gaps), a place for the state, end
+
+    def _prompt(self, batch: dict[str, Tensor]) -> tuple[TokenRows, Tensor]:
+        """Its tokens, and which of them (B, L) are the task's."""
+        task_ids_BL = self._of_batch(batch, OBS_LANGUAGE_TOKENS)
+        task = TokenRows(task_ids_BL, self._of_batch(batch, OBS_LANGUAGE_ATTENTION_MASK).bool())
+        head = TokenRows.constant(self._head_ids, task_ids_BL)
+        tail = TokenRows.constant(self._tail_ids, task_ids_BL)
+        nowhere = [torch.zeros_like(part.written) for part in (head, tail)]
+        is_task_BL = torch.cat([nowhere[0], task.written, nowhere[1]], dim=1)
+        return TokenRows.join([head, task, tail]), is_task_BL
+
+    def _embeds(self, batch: dict[str, Tensor], ids_BL: Tensor) -> Tensor:
+        """Embeddings (B, L, H) of a prompt, image features and state in place."""
+        generator = self.generator if self.training else None
+        images = [read_image(batch, key, self.config.type, ids_BL.device) for key in self._cameras]
+        pixels = [
+            resize(
+                draw_windows(image, self.config.crop_fraction, generator).cut(image), self.config.image_size
+            )
+            for image in images
+        ]
+        features = self.backbone.embed_images(torch.stack(pixels, dim=1).flatten(0, 1))
+        embeds_BLH = self.backbone.embed_tokens(ids_BL)
+        features_BPH = features.reshape(len(ids_BL), -1, embeds_BLH.shape[-1]).to(embeds_BLH.dtype)
+        embeds_BLH = embeds_BLH.index_copy(1, self._image_columns(ids_BL.device), features_BPH)
+        if self.state_embedding is None:
+            return embeds_BLH
+        state_BH = self.state_embedding(self._of_batch(batch, OBS_STATE)).to(embeds_BLH.dtype)
+        column = ids_BL.shape[1] - len(self._tail_ids)
+        return embeds_BLH.index_copy(1, torch.tensor([column], device=ids_BL.device), state_BH[:, None])
+
+    def _image_columns(self, device: torch.device) -> Tensor:
+        """Columns of all image tokens; the same in every row, because only the start precedes them."""
+        num_tokens = self.backbone.tokens_per_image
+        starts = (
+            len(self.tokens.start) + 1 + (num_tokens + 2) * torch.arange(len(self._cameras), device=device)
+        )
+        return (starts[:, None] + torch.arange(num_tokens, device=device)).flatten()
+
+    @property
+    def _head_ids(self) -> list[int]:
+        tokens = self.tokens
+        image = [tokens.image_start, *self.backbone.tokens_per_image * [tokens.image], tokens.image_end]
+        return [*tokens.start, *len(self._cameras) * image]
+
+    @property
+    def _tail_ids(self) -> list[int]:
+        # the state's embedding takes the place of a token
+        place = [self.tokens.image_end] if self.config.use_state else []
+        return [*place, *self.tokens.end]
+
+    def _of_batch(self, batch: dict[str, Tensor], key: str) -> Tensor:
+        return read_tensor(batch, key, self.config.type, self.action_unit.device)
+
+    @property
+    def _cameras(self) -> list[str]:
+        return sorted(self.config.image_features)
+
+    @property
+    def _action_dim(self) -> int:
+        assert self.config.action_feature is not None
+        return self.config.action_feature.shape[0]
+
+    def _autocast(self) -> torch.autocast:
+        """The precision of ``config.dtype``, whoever calls: training, evaluation or a user's own loop."""
+        bfloat16 = self.config.dtype == "bfloat16"
+        return torch.autocast(self.action_unit.device.type, dtype=torch.bfloat16, enabled=bfloat16)
+
+
+@contextmanager
+def second_derivatives(enabled: bool) -> Iterator[None]:
+    """Let attention be differentiated twice, which its fused kernels cannot be."""
+    if not enabled:
+        yield
+        return
+    with torch.enable_grad(), sdpa_kernel(SDPBackend.MATH):
+        yield
