@@ -21,6 +21,7 @@ SMALL: dict[str, Any] = {
     "chunk_size": 4,
     "n_action_steps": 2,
     "num_inference_steps": 3,
+    "draws_per_chunk": 4,
     "head_dim": 32,
     "dualmod_dim": 16,
 }

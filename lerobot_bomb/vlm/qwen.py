@@ -82,6 +82,12 @@ class Prefix:
     next_position: Tensor  # (B, 1) int64, of what follows
     layers: list[KeysValues]
 
+    def repeated(self, times: int) -> "Prefix":
+        """Every row so many times, beside each other."""
+        repeat = partial(torch.repeat_interleave, repeats=times, dim=0)
+        layers = [(repeat(keys), repeat(values)) for keys, values in self.layers]
+        return Prefix(repeat(self.hidden), repeat(self.written), repeat(self.next_position), layers)
+
 
 class _Reader:
     """Stands where a layer expects a cache: what is kept is read and not changed."""

@@ -104,6 +104,8 @@ class FdvlaConfig(PreTrainedConfig):
     consistency_detach: str = "none"
     # how much noise training shows: "uniform", or "beta", which shows much of it more often
     time_sampling: str = "uniform"
+    # times and noises that each chunk of a batch is trained at; the prompt is read once for all
+    draws_per_chunk: int = 1
 
     # "residual", "flow", "ddim", "sde" or "paper"; None = residual with both heads, else that of the one
     sampler: str | None = None
@@ -150,7 +152,7 @@ class FdvlaConfig(PreTrainedConfig):
             check_chunk(self)
             with _policy_flags():
                 self._check_heads()
-            check_positive(self, ("head_dim", "dualmod_dim", "image_size"))
+            check_positive(self, ("head_dim", "dualmod_dim", "image_size", "draws_per_chunk"))
             check_not_negative(self, ("flow_loss_weight", "denoise_loss_weight"))
             check_training(self)
 
@@ -172,7 +174,7 @@ class FdvlaConfig(PreTrainedConfig):
             one_of(f"--policy.normalization_mapping[{kind}]", self.normalization_mapping.get(kind), allowed)
         if self.train_vlm == "frozen" and not self.freeze_vision_encoder:
             raise ValueError(
-                "--policy.freeze_vision_encoder=false needs --policy.train_vlm=full: frozen is the whole model"
+                "--policy.freeze_vision_encoder=false needs --policy.train_vlm=full: frozen freezes both"
             )
 
     def _check_heads(self) -> None:

@@ -52,6 +52,10 @@ class Context:
     prefix: Prefix
     pooled: Tensor  # (B, H)
 
+    def repeated(self, times: int) -> "Context":
+        """Every row so many times, beside each other."""
+        return Context(self.prefix.repeated(times), self.pooled.repeat_interleave(times, dim=0))
+
 
 class FdvlaPolicy(PreTrainedPolicy):
     """A Qwen2.5-VL that reads noisy actions; two heads predict where they go and what noise is in them."""
@@ -140,14 +144,20 @@ class FdvlaPolicy(PreTrainedPolicy):
     # Training
 
     def forward(self, batch: dict[str, Tensor], reduction: str = "mean") -> tuple[Tensor, dict[str, float]]:
-        """Losses of both heads at a random time of each chunk; ``reduction="none"`` gives (B,)."""
-        actions_BKD = self._actions(batch)
-        kept_BK = self._kept(batch)
+        """Losses of both heads at random times of each chunk; ``reduction="none"`` gives (B,).
+
+        As CogACT (arXiv 2411.19650) does, ``draws_per_chunk`` of them; `B` counts these from here on.
+        """
+        draws = self.config.draws_per_chunk
+        actions_BKD = self._actions(batch).repeat_interleave(draws, dim=0)
+        kept_BK = self._kept(batch).repeat_interleave(draws, dim=0)
         point = self._draw_point(actions_BKD)
         has_energy = self.config.consistency == "energy_vjp" and self.config.used_consistency_weight > 0
         with self._autocast(), second_derivatives(has_energy):
             point.actions.requires_grad_(has_energy)
-            velocity_BKD, noise_BKD = self._heads(self._read(batch), point.actions, point.tau, kept_BK)
+            velocity_BKD, noise_BKD = self._heads(
+                self._read(batch).repeated(draws), point.actions, point.tau, kept_BK
+            )
             loss, terms = joint_loss(
                 None if velocity_BKD is None else velocity_BKD.float(),
                 None if noise_BKD is None else noise_BKD.float(),
@@ -160,6 +170,7 @@ class FdvlaPolicy(PreTrainedPolicy):
                 consistency_detach=self.config.consistency_detach,
                 reduction=reduction,
             )
+        loss = loss.unflatten(0, (-1, draws)).mean(dim=1) if reduction == "none" else loss
         return loss, self._metrics(terms, velocity_BKD, noise_BKD, point, actions_BKD, kept_BK)
 
     def _actions(self, batch: dict[str, Tensor]) -> Tensor:

@@ -1,0 +1,404 @@
+"""The policy `fdvla` on the nano backbone: what it trains, what it reads, what it refuses."""
+
+import copy
+from typing import Any
+
+import pytest
+import torch
+from fdvla_cases import SIZE, SMALL, WORKSPACE, WRIST, make_batch, make_config, make_policy, rows
+from torch import Tensor
+
+from lerobot_bomb.flags import FlagError
+from lerobot_bomb.flow.path import PathPoint, path_point
+from lerobot_bomb.flow.samplers import SAMPLERS
+from lerobot_policy_fdvla.modeling_fdvla import FdvlaPolicy
+
+FLOW_ONLY: dict[str, Any] = {"use_denoise_head": False}
+DENOISE_ONLY: dict[str, Any] = {"use_flow_head": False}
+ENERGY: dict[str, Any] = {"consistency": "energy_vjp"}
+
+
+def fixed_point(policy: FdvlaPolicy, batch: dict[str, Any], seed: int = 0) -> PathPoint:
+    generator = torch.Generator().manual_seed(seed)
+    actions = batch["action"]
+    noise = torch.randn(actions.shape, generator=generator)
+    return path_point(actions, noise, torch.rand(len(actions), generator=generator))
+
+
+def train_alike(
+    policy: FdvlaPolicy, batch: dict[str, Any]
+) -> tuple[Tensor, dict[str, float], dict[str, Tensor]]:
+    """Loss, metrics and gradients of a step with the noise of seed 0."""
+    policy.generator.manual_seed(0)
+    policy.zero_grad()
+    loss, metrics = policy(batch)
+    loss.backward()
+    gradients = {name: p.grad.clone() for name, p in policy.named_parameters() if p.grad is not None}
+    return loss.detach(), metrics, gradients
+
+
+def wake_dualmod(policy: FdvlaPolicy) -> FdvlaPolicy:
+    """As after some training: pooled states do change the features."""
+    torch.manual_seed(1)
+    for head in (policy.flow_head, policy.denoise_head):
+        if head is not None and head.film is not None:
+            torch.nn.init.normal_(head.film.layers[-1].get_parameter("weight"), std=0.5)
+    return policy
+
+
+# Learning
+
+
+@pytest.mark.parametrize(
+    ("num_dims", "options"),
+    [
+        (4, {}),
+        (7, {"cameras": (WORKSPACE,), "dtype": "bfloat16"}),
+        (2, {"has_state": False, "use_state": False, **FLOW_ONLY}),
+        (14, {"segment_attention": "causal", "reasoning_pool": "last", **DENOISE_ONLY}),
+    ],
+)
+def test_chunks_are_learned(num_dims: int, options: dict[str, Any]) -> None:
+    policy = make_policy(num_dims=num_dims, **options)
+    batch = make_batch(policy, 2)
+    before = (policy.predict_action_chunk(batch) - batch["action"]).abs().mean()
+    optimizer = torch.optim.AdamW(policy.get_optim_params(), lr=2e-3, weight_decay=0.0)
+    for _ in range(80):
+        loss, _ = policy(batch)
+        optimizer.zero_grad()
+        loss.backward()
+        optimizer.step()
+    policy.reset()
+    after = (policy.predict_action_chunk(batch) - batch["action"]).abs().mean()
+    assert after < 0.35 and after < before / 3
+
+
+def test_the_loss_is_that_of_both_heads() -> None:
+    policy = make_policy()
+    batch = make_batch(policy, 3)
+    policy.generator.manual_seed(0)
+    loss, metrics = policy(batch)
+    assert set(metrics) == {"flow_loss", "denoise_loss", "consistency_loss", "consistency_residual_rms"}
+    assert all(isinstance(value, float) for value in metrics.values())
+    total = metrics["flow_loss"] + metrics["denoise_loss"] + 0.1 * metrics["consistency_loss"]
+    assert loss.item() == pytest.approx(total, rel=1e-5)
+    policy.generator.manual_seed(0)
+    losses, _ = policy(batch, reduction="none")
+    assert losses.shape == (3,)
+    torch.testing.assert_close(losses.mean(), loss)
+    with pytest.raises(ValueError, match="reduction"):
+        policy(batch, reduction="sum")
+
+
+@pytest.mark.parametrize(
+    ("options", "names"),
+    [
+        (FLOW_ONLY, {"flow_loss"}),
+        (DENOISE_ONLY, {"denoise_loss"}),
+        ({"consistency": "off"}, {"flow_loss", "denoise_loss", "consistency_residual_rms"}),
+    ],
+)
+def test_terms_are_those_of_the_heads_there_are(options: dict[str, Any], names: set[str]) -> None:
+    policy = make_policy(**options)
+    assert set(policy(make_batch(policy, 2))[1]) == names
+
+
+@pytest.mark.parametrize("options", [{}, {"segment_attention": "causal"}, ENERGY])
+def test_padded_steps_change_neither_loss_nor_gradient(options: dict[str, Any]) -> None:
+    policy = wake_dualmod(make_policy(**options))
+    batch = make_batch(policy, 2)
+    batch["action_is_pad"] = torch.tensor([[False, False, True, True], [False] * 4])
+    changed = {**batch, "action": batch["action"].clone()}
+    changed["action"][0, 2:] = 100
+    loss, metrics, gradients = train_alike(policy, batch)
+    other, other_metrics, other_gradients = train_alike(policy, changed)
+    assert torch.equal(loss, other) and metrics == other_metrics
+    assert all(torch.equal(gradients[name], other_gradients[name]) for name in gradients)
+    policy.config.loss_on_padded_actions = True
+    assert not torch.isclose(policy(batch)[0], policy(changed)[0], rtol=0.1)
+
+
+def test_a_batch_of_padding_has_no_loss() -> None:
+    policy = make_policy()
+    batch = make_batch(policy, 2)
+    batch["action_is_pad"] = torch.ones(2, 4, dtype=torch.bool)
+    loss, _, gradients = train_alike(policy, batch)
+    assert loss == 0 and not any(gradient.any() for gradient in gradients.values())
+
+
+def test_the_energys_gradient_passes_through_the_model() -> None:
+    """It takes second derivatives, which fused attention lacks, also where evaluation keeps no gradients."""
+    policy = make_policy(**ENERGY)
+    batch = make_batch(policy, 2)
+    _, metrics, gradients = train_alike(policy, batch)
+    assert metrics["consistency_loss"] > 0
+    linear = make_policy()
+    assert metrics["consistency_loss"] != train_alike(linear, batch)[1]["consistency_loss"]
+    other = train_alike(linear, batch)[2]
+    assert not torch.allclose(gradients["segment.positions"], other["segment.positions"])
+    with torch.no_grad():
+        policy.generator.manual_seed(0)
+        assert policy(batch)[1] == metrics
+
+
+# What is trained
+
+
+@pytest.mark.parametrize(
+    ("options", "vision", "language"),
+    [
+        ({}, False, True),
+        ({"freeze_vision_encoder": False}, True, True),
+        ({"train_vlm": "frozen"}, False, False),
+    ],
+)
+def test_gradients_reach_what_is_trained(options: dict[str, Any], vision: bool, language: bool) -> None:
+    policy = wake_dualmod(make_policy(gradient_checkpointing=True, **options)).train()
+    _, _, gradients = train_alike(policy, make_batch(policy, 2))
+    trained = {name for name, parameter in policy.named_parameters() if parameter.requires_grad}
+    assert gradients.keys() == trained
+    assert sum(p.numel() for p in policy.get_optim_params()) == policy.parameter_counts["trained"]
+    parts = {"visual": vision, "language_model": language}
+    for name in policy.backbone.state_dict():
+        part = next(part for part in [*parts, "lm_head"] if part in name)
+        assert (f"backbone.{name}" in trained) == parts.get(part, language), name
+    for name in trained:
+        if "backbone" not in name:
+            assert gradients[name].any(), name
+
+
+def test_gradient_checkpointing_changes_no_gradient() -> None:
+    batches = []
+    for checkpointing in (False, True):
+        policy = make_policy(gradient_checkpointing=checkpointing, freeze_vision_encoder=False).train()
+        batches.append(train_alike(policy, make_batch(policy, 2)))
+    (loss, _, gradients), (other, _, other_gradients) = batches
+    assert torch.equal(loss, other) and gradients.keys() == other_gradients.keys()
+    for name, gradient in gradients.items():
+        torch.testing.assert_close(gradient, other_gradients[name], msg=name)
+
+
+def test_a_head_of_words_that_is_no_embedding_is_frozen() -> None:
+    policy = make_policy()
+    config = {**(policy.config.vlm_config or {}), "tie_word_embeddings": False}
+    untied = make_policy(vlm_config=config, prompt_tokens=policy.config.prompt_tokens)
+    assert not untied.backbone.vlm.lm_head.weight.requires_grad
+    assert untied.backbone.vlm.get_input_embeddings().weight.requires_grad
+
+
+def test_every_part_is_counted() -> None:
+    counts = make_policy().parameter_counts
+    assert list(counts) == [
+        *("backbone", "segment", "state_embedding", "flow_head", "denoise_head", "trained"),
+    ]
+    plain = make_policy(dualmod_flow=False, dualmod_denoise=False).parameter_counts
+    film = 2 * 128 + (128 * 16 + 16) + (16 * 64 + 64)
+    assert counts["flow_head"] - plain["flow_head"] == counts["denoise_head"] - plain["denoise_head"] == film
+
+
+# What is read
+
+
+@torch.no_grad()
+def test_heads_say_the_same_in_training_and_in_sampling() -> None:
+    """At the same noisy actions and time, whatever else is in the batch."""
+    policy = wake_dualmod(make_policy())
+    batch = make_batch(policy, 3)
+    point = fixed_point(policy, batch)
+    seen: list[tuple[Tensor, Tensor]] = []
+    heads = policy._heads
+
+    def note(*args: Any) -> tuple[Tensor | None, Tensor | None]:
+        seen.append(heads(*args))  # pyright: ignore[reportArgumentType]
+        return seen[-1]
+
+    policy._heads, policy._draw_point = note, lambda _: point
+    policy(batch)
+    for row in range(3):
+        context = policy._read(rows(batch, [row]))
+        alone = heads(context, point.actions[row : row + 1], point.tau[row : row + 1])
+        for trained, sampled in zip(seen[0], alone, strict=True):
+            assert sampled is not None
+            torch.testing.assert_close(sampled, trained[row : row + 1], rtol=0, atol=1e-5)
+
+
+@torch.no_grad()
+def test_the_prompt_never_reads_the_actions() -> None:
+    policy = make_policy()
+    batch = make_batch(policy, 2)
+    states: list[Tensor] = []
+    read_prefix = policy.backbone.read_prefix
+
+    def note(*args: Any) -> Any:
+        prefix = read_prefix(*args)
+        states.extend([prefix.hidden, *prefix.layers[-1]])
+        return prefix
+
+    policy.backbone.read_prefix = note
+    policy(batch)
+    policy({**batch, "action": batch["action"] + 1})
+    policy.predict_action_chunk(batch)
+    assert all(torch.equal(states[i], states[i % 3]) for i in range(9))
+
+
+@torch.no_grad()
+@pytest.mark.parametrize("attention", ["bidirectional", "causal"])
+def test_which_actions_read_which(attention: str) -> None:
+    policy = make_policy(segment_attention=attention)
+    batch = make_batch(policy, 1)
+    context, point = policy._read(batch), fixed_point(policy, batch)
+    changed = point.actions.clone()
+    changed[:, 2] += 1
+    velocities = [policy._heads(context, actions, point.tau)[0] for actions in (point.actions, changed)]
+    assert velocities[0] is not None and velocities[1] is not None
+    differs = (velocities[0] != velocities[1]).any(dim=2)[0].tolist()
+    assert differs == ([True] * 4 if attention == "bidirectional" else [False, False, True, True])
+
+
+@torch.no_grad()
+def test_dualmod_is_the_identity_before_training() -> None:
+    policy = make_policy()
+    plain = make_policy(dualmod_flow=False, dualmod_denoise=False)
+    missing, unexpected = plain.load_state_dict(policy.state_dict(), strict=False)
+    assert not missing and unexpected and all(".film." in name for name in unexpected)
+    batch = make_batch(policy, 3)
+    noise = torch.randn(3, 4, 4)
+    assert torch.equal(policy.predict_action_chunk(batch, noise), plain.predict_action_chunk(batch, noise))
+
+
+@torch.no_grad()
+@pytest.mark.parametrize("pool", ["text", "all_prefix", "last"])
+def test_what_is_pooled(pool: str) -> None:
+    policy = make_policy(reasoning_pool=pool)
+    batch = make_batch(policy, 3, tasks=("put the black stone on the center", "go", ""))
+    rows_BL, is_task_BL = policy._prompt(batch)
+    context = policy._read(batch)
+    hidden = context.prefix.hidden
+    for row in range(3):
+        kept = rows_BL.written[row]
+        if pool == "text" and is_task_BL[row].any():
+            kept = is_task_BL[row]
+        expected = hidden[row, -1] if pool == "last" else hidden[row, kept].mean(dim=0)
+        torch.testing.assert_close(context.pooled[row], expected)
+    lengths = is_task_BL.sum(dim=1)
+    assert lengths[0] > lengths[1] > lengths[2] == 0
+    end = len(policy._tail_ids)
+    assert rows_BL.written[:, -end:].all() and not is_task_BL[:, -end:].any()
+
+
+@torch.no_grad()
+def test_pictures_sentence_state_and_time_matter() -> None:
+    policy = wake_dualmod(make_policy(crop_fraction=0.9))
+    batch = make_batch(policy, 1)
+    noise = torch.zeros(1, 4, 4)
+    usual = policy.predict_action_chunk(batch, noise)
+    other = make_batch(policy, 1, seed=1, tasks=("push the white stone",))
+    keys = (WORKSPACE, WRIST, "observation.state", "observation.language.tokens")
+    for key in keys:
+        changed = {**batch, key: other[key]}
+        if "tokens" in key:
+            changed["observation.language.attention_mask"] = other["observation.language.attention_mask"]
+        assert not torch.allclose(policy.predict_action_chunk(changed, noise), usual, atol=1e-4), key
+    swapped = {**batch, WORKSPACE: batch[WRIST], WRIST: batch[WORKSPACE]}
+    assert not torch.allclose(policy.predict_action_chunk(swapped, noise), usual, atol=1e-4)
+    context, point = policy._read(batch), fixed_point(policy, batch)
+    early, late = (policy._heads(context, point.actions, torch.tensor([tau]))[1] for tau in (0.1, 0.9))
+    assert early is not None and late is not None and not torch.allclose(early, late, atol=1e-3)
+
+
+@pytest.mark.parametrize("tasks", [("", ""), ("", "go")])
+def test_an_environment_may_name_no_task(tasks: tuple[str, ...]) -> None:
+    """As PushT does: its text is empty."""
+    policy = wake_dualmod(make_policy())
+    batch = make_batch(policy, 2, tasks=tasks)
+    assert policy(batch)[0].isfinite()
+    assert policy.predict_action_chunk(batch).isfinite().all()
+
+
+# Bad input
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ({"chunk_size": 0}, "--policy.chunk_size=0 must be at least 1"),
+        ({"n_action_steps": 5}, "--policy.n_action_steps=5 must lie in 1..4"),
+        ({"use_flow_head": False, "use_denoise_head": False}, "--policy.use_flow_head .* at least one head"),
+        ({**FLOW_ONLY, "sampler": "residual"}, "--policy.sampler=residual .* but use_denoise_head is off"),
+        ({**FLOW_ONLY, "sampler": "ddim"}, "--policy.sampler=ddim .* but use_denoise_head is off"),
+        ({**DENOISE_ONLY, "sampler": "flow"}, "--policy.sampler=flow .* but use_flow_head is off"),
+        ({**FLOW_ONLY, "consistency_loss_weight": 0.1}, "--policy.consistency_loss_weight=0.1 compares both"),
+        ({"consistency_loss_weight": -1.0}, "--policy.consistency_loss_weight=-1.0 must not be negative"),
+        ({"flow_loss_weight": -1.0}, "--policy.flow_loss_weight=-1.0 must not be negative"),
+        ({"refine_alpha": 1.5}, r"--policy.refine_alpha=1.5 must lie in \[0, 1\]"),
+        ({"refine_alpha": -0.1}, "--policy.refine_alpha=-0.1"),
+        ({"num_inference_steps": 0}, "--policy.num_inference_steps=0 must be at least 1"),
+        ({"sampler": "sde", "solver": "heun"}, "--policy.solver=heun is for sampler residual, flow, paper"),
+        ({"sampler": "ddpm"}, "--policy.sampler='ddpm' is unknown"),
+        ({"denoise_tau_min": 0.0}, "--policy.denoise_tau_min=0.0"),
+        ({"clip_sample_range": 0.0}, "--policy.clip_sample_range=0.0 must be positive"),
+        ({"consistency": "trace"}, "--policy.consistency='trace' is unknown"),
+        ({"consistency_detach": "both"}, "--policy.consistency_detach='both' is unknown"),
+        ({"time_sampling": "cosine"}, "--policy.time_sampling='cosine' is unknown"),
+        ({"reasoning_pool": "mean"}, "--policy.reasoning_pool='mean' is unknown"),
+        ({"segment_attention": "full"}, "--policy.segment_attention='full' is unknown"),
+        ({"train_vlm": "lora"}, "--policy.train_vlm='lora' is unknown"),
+        ({"train_vlm": "frozen", "freeze_vision_encoder": False}, "needs --policy.train_vlm=full"),
+        ({"head_dim": 0}, "--policy.head_dim=0 must be at least 1"),
+        ({"crop_fraction": 0.0}, r"--policy.crop_fraction=0.0 must lie in \(0, 1\]"),
+        ({"use_amp": True}, "--policy.dtype=bfloat16 instead"),
+        ({"n_obs_steps": 2}, "--policy.n_obs_steps=2"),
+    ],
+)
+def test_wrong_flags_are_told(options: dict[str, Any], message: str) -> None:
+    with pytest.raises(FlagError, match=message):
+        make_config(**options)
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ({"image_size": 100}, "--policy.image_size=100 must be a multiple of 28 pixels"),
+        ({"chunk_size": 4096}, "and the model has 4096 positions; give a smaller --policy.chunk_size"),
+        ({"has_state": False}, "--policy.use_state=true needs the feature 'observation.state'"),
+        ({"cameras": ()}, "fdvla needs at least one camera"),
+        ({"vlm_config": {}}, "--policy.vlm_config is set, but not --policy.prompt_tokens"),
+    ],
+)
+def test_what_cannot_be_built_is_told(options: dict[str, Any], message: str) -> None:
+    with pytest.raises(ValueError, match=message):
+        make_policy(**options)
+
+
+@pytest.mark.parametrize("value", [torch.nan, torch.inf])
+def test_actions_that_are_not_finite_are_told(value: float) -> None:
+    policy = make_policy()
+    batch = make_batch(policy, 3)
+    batch["action"][1, 2, 0] = value
+    with pytest.raises(ValueError, match=r"batch\['action'\] is not finite in the rows \[1\]"):
+        policy(batch)
+
+
+def test_a_batch_that_lacks_something_is_told() -> None:
+    policy = make_policy()
+    batch = make_batch(policy, 2)
+    for key in (WORKSPACE, "observation.state", "observation.language.tokens"):
+        with pytest.raises(KeyError, match=f"fdvla needs '{key}'"):
+            policy.predict_action_chunk({k: v for k, v in batch.items() if k != key})
+    with pytest.raises(ValueError, match=r"expected \(batch, 4, 4\)"):
+        policy({**batch, "action": batch["action"][:, :2]})
+    with pytest.raises(ValueError, match=r"expected floats in \[0, 1\]"):
+        policy({**batch, WRIST: torch.zeros(2, SIZE, SIZE, 3)})
+
+
+def test_defaults_follow_the_heads() -> None:
+    both, flow, denoise = (make_config(**options) for options in ({}, FLOW_ONLY, DENOISE_ONLY))
+    assert [config.used_sampler for config in (both, flow, denoise)] == ["residual", "flow", "ddim"]
+    assert [config.used_consistency_weight for config in (both, flow, denoise)] == [0.1, 0, 0]
+    assert set(SAMPLERS) > {"residual", "flow", "ddim"} and SMALL["dtype"] == "float32"
+
+
+def test_a_copy_of_the_policy_acts_alike() -> None:
+    policy = make_policy()
+    batch = make_batch(policy, 2)
+    assert torch.equal(copy.deepcopy(policy).predict_action_chunk(batch), policy.predict_action_chunk(batch))
