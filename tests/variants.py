@@ -13,6 +13,10 @@ CENTERS: Options = {"bin_mode": "centers"}
 FIXED_WIDTH: Options = {"number_width": 4}  # a digit more than the bins need
 CAUSAL: Options = {"prefix_attention": "causal"}
 QUANTILE: Options = {"grid_distribution": "quantile", "decode_point": "centroid"}
+FLOW_ONLY: Options = {"use_denoise_head": False}
+DENOISE_ONLY: Options = {"use_flow_head": False}
+CAUSAL_SEGMENT: Options = {"segment_attention": "causal"}
+POOL_ALL: Options = {"reasoning_pool": "all_prefix"}
 FULL_LOSS: Options = {"loss_vocab": "full"}
 
 # by policy type
@@ -29,6 +33,12 @@ SINGLE: dict[str, dict[str, Options]] = {
         "quantile": QUANTILE,
         "full_loss": FULL_LOSS,
     },
+    "fdvla": {
+        "flow_only": FLOW_ONLY,
+        "denoise_only": DENOISE_ONLY,
+        "causal_segment": CAUSAL_SEGMENT,
+        "pool_all": POOL_ALL,
+    },
 }
 # two at once, for the fast tests: what passes with both holds for each, and costs half
 PAIRS: dict[str, dict[str, Options]] = {
@@ -40,6 +50,10 @@ PAIRS: dict[str, dict[str, Options]] = {
     "spatialvla_grid": {
         "causal_quantile": CAUSAL | QUANTILE,
         "full_loss_ensemble": FULL_LOSS | ENSEMBLE | {"temporal_ensemble_size": 2},
+    },
+    "fdvla": {
+        "flow_only_causal_segment": FLOW_ONLY | CAUSAL_SEGMENT,
+        "pool_all": POOL_ALL,
     },
 }
 
