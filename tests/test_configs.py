@@ -19,6 +19,16 @@ RECIPE = FOLDER / "train_vla0_smol_pusht.yaml"
 ABLATIONS = sorted((FOLDER / "ablations").glob("vla0_smol_*.yaml"))
 GRID_RECIPE = FOLDER / "train_spatialvla_grid_bomb.yaml"
 GRID_ABLATIONS = sorted((FOLDER / "ablations").glob("spatialvla_grid_*.yaml"))
+FDVLA_RECIPE = FOLDER / "train_fdvla_bomb.yaml"
+FDVLA_ABLATIONS = sorted((FOLDER / "ablations").glob("fdvla_*.yaml"))
+FDVLA_CHANGES: dict[str, dict[str, Any]] = {
+    "causal_segment": {"segment_attention": "causal"},
+    "diffusion_only": {"use_flow_head": False},
+    "flow_only": {"use_denoise_head": False},
+    "no_denoise_mod": {"dualmod_denoise": False},
+    "no_dualmod": {"dualmod_flow": False, "dualmod_denoise": False},
+    "no_flow_mod": {"dualmod_flow": False},
+}
 EVEN = {"grid_distribution": "uniform", "decode_point": "mid"}
 GRID_CHANGES: dict[str, dict[str, Any]] = {
     "linear_bins": {
@@ -91,14 +101,22 @@ def test_an_ablation_changes_what_its_row_says(path: Path) -> None:
     assert ablation == {**recipe, "policy": {**recipe["policy"], **CHANGES[name_of(path)]}}
 
 
-def test_the_grids_ablations_change_what_their_rows_say() -> None:
-    recipe = yaml.safe_load(GRID_RECIPE.read_text())
+@pytest.mark.parametrize(
+    ("policy_name", "recipe_file", "ablations", "all_changes"),
+    [
+        ("spatialvla_grid", GRID_RECIPE, GRID_ABLATIONS, GRID_CHANGES),
+        ("fdvla", FDVLA_RECIPE, FDVLA_ABLATIONS, FDVLA_CHANGES),
+    ],
+)
+def test_ablations_on_bomb_change_what_their_rows_say(
+    policy_name: str, recipe_file: Path, ablations: list[Path], all_changes: dict[str, dict[str, Any]]
+) -> None:
+    recipe = yaml.safe_load(recipe_file.read_text())
     found = {
-        path.stem.removeprefix("spatialvla_grid_"): yaml.safe_load(path.read_text())
-        for path in GRID_ABLATIONS
+        path.stem.removeprefix(f"{policy_name}_"): yaml.safe_load(path.read_text()) for path in ablations
     }
     assert found == {
-        name: {**recipe, "policy": {**recipe["policy"], **changes}} for name, changes in GRID_CHANGES.items()
+        name: {**recipe, "policy": {**recipe["policy"], **changes}} for name, changes in all_changes.items()
     }
 
 
