@@ -20,6 +20,7 @@ from lerobot.scripts import lerobot_eval, lerobot_train
 from lerobot.utils.constants import ACTION
 from model_inputs import Batch, joined
 from torch import Tensor, nn
+from torch.optim.lr_scheduler import LambdaLR
 from variants import as_flags
 
 from lerobot_bomb.data.record import record
@@ -103,12 +104,12 @@ def as_written(policy: PreTrainedPolicy, actions: Tensor) -> Tensor:
 
 
 def resolution(policy: PreTrainedPolicy) -> float:
-    """Largest error of a value in [-1, 1] that is learned by heart: half a bin where there are bins."""
+    """Largest error of a normalised value that is learned by heart: half a bin where there are bins."""
     if hasattr(policy, "grids"):
         return 1e-3
     num_bins = getattr(policy.config, "n_action_bins", None)
     if num_bins is None:
-        return 0.05
+        return 0.1
     num_gaps = num_bins if getattr(policy.config, "bin_mode", "levels") == "centers" else num_bins - 1
     return 1.0001 / num_gaps
 
@@ -118,11 +119,14 @@ def learn_by_heart(policy: PreTrainedPolicy, batches: list[Batch], bar: float | 
     batch = joined(batches)
     policy.eval()  # neither crops nor masks at random
     optimizer = torch.optim.AdamW(policy.get_optim_params(), lr=2e-3, weight_decay=0.0)
+    # what is trained on random noise settles at a falling rate only
+    scheduler = LambdaLR(optimizer, lambda step: min(1.0, 2 * (1 - step / MAX_LEARNING_STEPS)))
     for step in range(1, MAX_LEARNING_STEPS + 1):
         loss = policy(batch)[0]
         optimizer.zero_grad()
         loss.backward()
         optimizer.step()
+        scheduler.step()
         if step % CHECK_EVERY == 0:
             policy.reset()
             error = (policy.predict_action_chunk(batch) - as_written(policy, batch[ACTION])).abs()

@@ -52,8 +52,7 @@ PAIRS: dict[str, dict[str, Options]] = {
         "full_loss_ensemble": FULL_LOSS | ENSEMBLE | {"temporal_ensemble_size": 2},
     },
     "fdvla": {
-        "flow_only_causal_segment": FLOW_ONLY | CAUSAL_SEGMENT,
-        "pool_all": POOL_ALL,
+        "flow_only_causal_segment_pool_all": FLOW_ONLY | CAUSAL_SEGMENT | POOL_ALL,
     },
 }
 
