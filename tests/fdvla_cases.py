@@ -13,6 +13,8 @@ from lerobot_policy_fdvla.modeling_fdvla import FdvlaPolicy
 WORKSPACE, WRIST = "observation.images.workspace", "observation.images.wrist"
 SIZE, STATE_DIMS = 64, 4
 TASKS = ("put the black stone on the center", "go", "push the white stone to the left edge")
+FLOW_ONLY: dict[str, Any] = {"use_denoise_head": False}
+DENOISE_ONLY: dict[str, Any] = {"use_flow_head": False}
 SMALL: dict[str, Any] = {
     "vlm_model_name": "nano",
     "device": "cpu",

@@ -1,27 +1,20 @@
-"""The policy `fdvla` on the nano backbone: what it trains, what it reads, what it refuses."""
+"""The policy `fdvla` on the nano backbone: what it trains and what it reads."""
 
-import copy
 from typing import Any
 
 import pytest
 import torch
-from fdvla_cases import SIZE, SMALL, WORKSPACE, WRIST, make_batch, make_config, make_policy, rows
+from fdvla_cases import DENOISE_ONLY, FLOW_ONLY, WORKSPACE, WRIST, make_batch, make_policy, rows
 from torch import Tensor
 
-from lerobot_bomb.flags import FlagError
 from lerobot_bomb.flow.path import PathPoint, path_point
-from lerobot_bomb.flow.samplers import SAMPLERS
 from lerobot_policy_fdvla.modeling_fdvla import FdvlaPolicy
 
-FLOW_ONLY: dict[str, Any] = {"use_denoise_head": False}
-DENOISE_ONLY: dict[str, Any] = {"use_flow_head": False}
-# a noise head says little of the actions where there is little but noise: it needs more of both
-PATIENT: dict[str, Any] = {"num_inference_steps": 10, "draws_per_chunk": 16}
 ENERGY: dict[str, Any] = {"consistency": "energy_vjp"}
 
 
-def fixed_point(policy: FdvlaPolicy, batch: dict[str, Any], seed: int = 0) -> PathPoint:
-    generator = torch.Generator().manual_seed(seed)
+def fixed_point(batch: dict[str, Any]) -> PathPoint:
+    generator = torch.Generator().manual_seed(0)
     actions = batch["action"]
     noise = torch.randn(actions.shape, generator=generator)
     return path_point(actions, noise, torch.rand(len(actions), generator=generator))
@@ -57,22 +50,25 @@ def wake_dualmod(policy: FdvlaPolicy) -> FdvlaPolicy:
         (4, {}),
         (7, {"cameras": (WORKSPACE,), "dtype": "bfloat16"}),
         (2, {"has_state": False, "use_state": False, **FLOW_ONLY}),
-        (14, {"segment_attention": "causal", "reasoning_pool": "last", **DENOISE_ONLY, **PATIENT}),
+        (14, {"segment_attention": "causal", "reasoning_pool": "last"}),
+        # a noise head alone says little of the actions where there is little but noise
+        (4, {"num_inference_steps": 10, "draws_per_chunk": 16, **DENOISE_ONLY}),
     ],
 )
 def test_chunks_are_learned(num_dims: int, options: dict[str, Any]) -> None:
     policy = make_policy(num_dims=num_dims, **options)
     batch = make_batch(policy, 2)
-    before = (policy.predict_action_chunk(batch) - batch["action"]).abs().mean()
     optimizer = torch.optim.AdamW(policy.get_optim_params(), lr=2e-3, weight_decay=0.0)
-    for _ in range(100):
+    for step in range(300):
         loss, _ = policy(batch)
         optimizer.zero_grad()
         loss.backward()
         optimizer.step()
-    policy.reset()
-    after = (policy.predict_action_chunk(batch) - batch["action"]).abs().mean()
-    assert after < 0.4 and after < before / 3
+        if step % 25 == 24:
+            policy.reset()
+            if (policy.predict_action_chunk(batch) - batch["action"]).abs().mean() < 0.25:
+                return
+    pytest.fail(f"not learned in 300 steps; loss {float(loss)}")
 
 
 def test_the_loss_is_that_of_both_heads() -> None:
@@ -202,31 +198,30 @@ def test_every_part_is_counted() -> None:
 
 
 @torch.no_grad()
-def test_heads_say_the_same_in_training_and_in_sampling() -> None:
+def test_heads_say_the_same_in_training_and_in_sampling(monkeypatch: pytest.MonkeyPatch) -> None:
     """At the same noisy actions and time, whatever else is in the batch."""
-    policy = wake_dualmod(make_policy())
+    policy = wake_dualmod(make_policy(draws_per_chunk=1))
     batch = make_batch(policy, 3)
-    point = fixed_point(policy, batch)
+    point = fixed_point(batch)
     seen: list[tuple[Tensor, Tensor]] = []
-    heads = policy._heads
+    heads: Any = policy._heads
 
-    def note(*args: Any) -> tuple[Tensor | None, Tensor | None]:
-        seen.append(heads(*args))  # pyright: ignore[reportArgumentType]
+    def note(*args: Any) -> tuple[Tensor, Tensor]:
+        seen.append(heads(*args))
         return seen[-1]
 
-    policy._heads, policy._draw_point = note, lambda _: point
-    policy.config.draws_per_chunk = 1
+    monkeypatch.setattr(policy, "_heads", note)
+    monkeypatch.setattr(policy, "_draw_point", lambda _: point)
     policy(batch)
     for row in range(3):
         context = policy._read(rows(batch, [row]))
         alone = heads(context, point.actions[row : row + 1], point.tau[row : row + 1])
         for trained, sampled in zip(seen[0], alone, strict=True):
-            assert sampled is not None
             torch.testing.assert_close(sampled, trained[row : row + 1], rtol=0, atol=1e-5)
 
 
 @torch.no_grad()
-def test_the_prompt_never_reads_the_actions() -> None:
+def test_the_prompt_never_reads_the_actions(monkeypatch: pytest.MonkeyPatch) -> None:
     policy = make_policy()
     batch = make_batch(policy, 2)
     states: list[Tensor] = []
@@ -237,7 +232,7 @@ def test_the_prompt_never_reads_the_actions() -> None:
         states.extend([prefix.hidden, *prefix.layers[-1]])
         return prefix
 
-    policy.backbone.read_prefix = note
+    monkeypatch.setattr(policy.backbone, "read_prefix", note)
     policy(batch)
     policy({**batch, "action": batch["action"] + 1})
     policy.predict_action_chunk(batch)
@@ -249,7 +244,7 @@ def test_the_prompt_never_reads_the_actions() -> None:
 def test_which_actions_read_which(attention: str) -> None:
     policy = make_policy(segment_attention=attention)
     batch = make_batch(policy, 1)
-    context, point = policy._read(batch), fixed_point(policy, batch)
+    context, point = policy._read(batch), fixed_point(batch)
     changed = point.actions.clone()
     changed[:, 2] += 1
     velocities = [policy._heads(context, actions, point.tau)[0] for actions in (point.actions, changed)]
@@ -304,7 +299,7 @@ def test_pictures_sentence_state_and_time_matter() -> None:
         assert not torch.allclose(policy.predict_action_chunk(changed, noise), usual, atol=1e-4), key
     swapped = {**batch, WORKSPACE: batch[WRIST], WRIST: batch[WORKSPACE]}
     assert not torch.allclose(policy.predict_action_chunk(swapped, noise), usual, atol=1e-4)
-    context, point = policy._read(batch), fixed_point(policy, batch)
+    context, point = policy._read(batch), fixed_point(batch)
     early, late = (policy._heads(context, point.actions, torch.tensor([tau]))[1] for tau in (0.1, 0.9))
     assert early is not None and late is not None and not torch.allclose(early, late, atol=1e-3)
 
@@ -316,92 +311,3 @@ def test_an_environment_may_name_no_task(tasks: tuple[str, ...]) -> None:
     batch = make_batch(policy, 2, tasks=tasks)
     assert policy(batch)[0].isfinite()
     assert policy.predict_action_chunk(batch).isfinite().all()
-
-
-# Bad input
-
-
-@pytest.mark.parametrize(
-    ("options", "message"),
-    [
-        ({"chunk_size": 0}, "--policy.chunk_size=0 must be at least 1"),
-        ({"n_action_steps": 5}, "--policy.n_action_steps=5 must lie in 1..4"),
-        ({"use_flow_head": False, "use_denoise_head": False}, "--policy.use_flow_head .* at least one head"),
-        ({**FLOW_ONLY, "sampler": "residual"}, "--policy.sampler=residual .* but use_denoise_head is off"),
-        ({**FLOW_ONLY, "sampler": "ddim"}, "--policy.sampler=ddim .* but use_denoise_head is off"),
-        ({**DENOISE_ONLY, "sampler": "flow"}, "--policy.sampler=flow .* but use_flow_head is off"),
-        ({**FLOW_ONLY, "consistency_loss_weight": 0.1}, "--policy.consistency_loss_weight=0.1 compares both"),
-        ({"consistency_loss_weight": -1.0}, "--policy.consistency_loss_weight=-1.0 must not be negative"),
-        ({"flow_loss_weight": -1.0}, "--policy.flow_loss_weight=-1.0 must not be negative"),
-        ({"refine_alpha": 1.5}, r"--policy.refine_alpha=1.5 must lie in \[0, 1\]"),
-        ({"refine_alpha": -0.1}, "--policy.refine_alpha=-0.1"),
-        ({"num_inference_steps": 0}, "--policy.num_inference_steps=0 must be at least 1"),
-        ({"sampler": "sde", "solver": "heun"}, "--policy.solver=heun is for sampler residual, flow, paper"),
-        ({"sampler": "ddpm"}, "--policy.sampler='ddpm' is unknown"),
-        ({"denoise_tau_min": 0.0}, "--policy.denoise_tau_min=0.0"),
-        ({"clip_sample_range": 0.0}, "--policy.clip_sample_range=0.0 must be positive"),
-        ({"consistency": "trace"}, "--policy.consistency='trace' is unknown"),
-        ({"consistency_detach": "both"}, "--policy.consistency_detach='both' is unknown"),
-        ({"time_sampling": "cosine"}, "--policy.time_sampling='cosine' is unknown"),
-        ({"reasoning_pool": "mean"}, "--policy.reasoning_pool='mean' is unknown"),
-        ({"segment_attention": "full"}, "--policy.segment_attention='full' is unknown"),
-        ({"train_vlm": "lora"}, "--policy.train_vlm='lora' is unknown"),
-        ({"train_vlm": "frozen", "freeze_vision_encoder": False}, "needs --policy.train_vlm=full"),
-        ({"head_dim": 0}, "--policy.head_dim=0 must be at least 1"),
-        ({"crop_fraction": 0.0}, r"--policy.crop_fraction=0.0 must lie in \(0, 1\]"),
-        ({"use_amp": True}, "--policy.dtype=bfloat16 instead"),
-        ({"n_obs_steps": 2}, "--policy.n_obs_steps=2"),
-    ],
-)
-def test_wrong_flags_are_told(options: dict[str, Any], message: str) -> None:
-    with pytest.raises(FlagError, match=message):
-        make_config(**options)
-
-
-@pytest.mark.parametrize(
-    ("options", "message"),
-    [
-        ({"image_size": 100}, "--policy.image_size=100 must be a multiple of 28 pixels"),
-        ({"chunk_size": 4096}, "and the model has 4096 positions; give a smaller --policy.chunk_size"),
-        ({"has_state": False}, "--policy.use_state=true needs the feature 'observation.state'"),
-        ({"cameras": ()}, "fdvla needs at least one camera"),
-        ({"vlm_config": {}}, "--policy.vlm_config is set, but not --policy.prompt_tokens"),
-    ],
-)
-def test_what_cannot_be_built_is_told(options: dict[str, Any], message: str) -> None:
-    with pytest.raises(ValueError, match=message):
-        make_policy(**options)
-
-
-@pytest.mark.parametrize("value", [torch.nan, torch.inf])
-def test_actions_that_are_not_finite_are_told(value: float) -> None:
-    policy = make_policy()
-    batch = make_batch(policy, 3)
-    batch["action"][1, 2, 0] = value
-    with pytest.raises(ValueError, match=r"batch\['action'\] is not finite in the rows \[1\]"):
-        policy(batch)
-
-
-def test_a_batch_that_lacks_something_is_told() -> None:
-    policy = make_policy()
-    batch = make_batch(policy, 2)
-    for key in (WORKSPACE, "observation.state", "observation.language.tokens"):
-        with pytest.raises(KeyError, match=f"fdvla needs '{key}'"):
-            policy.predict_action_chunk({k: v for k, v in batch.items() if k != key})
-    with pytest.raises(ValueError, match=r"expected \(batch, 4, 4\)"):
-        policy({**batch, "action": batch["action"][:, :2]})
-    with pytest.raises(ValueError, match=r"expected floats in \[0, 1\]"):
-        policy({**batch, WRIST: torch.zeros(2, SIZE, SIZE, 3)})
-
-
-def test_defaults_follow_the_heads() -> None:
-    both, flow, denoise = (make_config(**options) for options in ({}, FLOW_ONLY, DENOISE_ONLY))
-    assert [config.used_sampler for config in (both, flow, denoise)] == ["residual", "flow", "ddim"]
-    assert [config.used_consistency_weight for config in (both, flow, denoise)] == [0.1, 0, 0]
-    assert set(SAMPLERS) > {"residual", "flow", "ddim"} and SMALL["dtype"] == "float32"
-
-
-def test_a_copy_of_the_policy_acts_alike() -> None:
-    policy = make_policy()
-    batch = make_batch(policy, 2)
-    assert torch.equal(copy.deepcopy(policy).predict_action_chunk(batch), policy.predict_action_chunk(batch))

@@ -1,5 +1,6 @@
 """Saving and loading `fdvla`, and what it takes from a dataset."""
 
+import copy
 import json
 from pathlib import Path
 from typing import Any
@@ -40,6 +41,12 @@ def test_a_loaded_checkpoint_acts_as_the_saved_one(options: dict[str, Any], tmp_
     assert torch.equal(loaded.predict_action_chunk(batch), policy.predict_action_chunk(batch))
     assert loaded.config.vlm_config == policy.config.vlm_config
     assert not any("generator" in name for name in load_file(tmp_path / "model.safetensors"))
+
+
+def test_a_copy_of_the_policy_acts_alike() -> None:
+    policy = make_policy()
+    batch = make_batch(policy, 2)
+    assert torch.equal(copy.deepcopy(policy).predict_action_chunk(batch), policy.predict_action_chunk(batch))
 
 
 def test_a_missing_or_unexpected_tensor_is_an_error(tmp_path: Path) -> None:

@@ -52,7 +52,7 @@ PAIRS: dict[str, dict[str, Options]] = {
         "full_loss_ensemble": FULL_LOSS | ENSEMBLE | {"temporal_ensemble_size": 2},
     },
     "fdvla": {
-        "flow_only_causal_segment_pool_all": FLOW_ONLY | CAUSAL_SEGMENT | POOL_ALL,
+        "flow_only_pool_all": FLOW_ONLY | POOL_ALL,
     },
 }
 
