@@ -22,8 +22,9 @@ from lerobot_env_bomb.vector import NEW_ROLLOUT_OPTION, LazyVectorEnv
 
 SMALL = RenderOptions(image_size=32)
 SEEDS = (9, 10)
-# of a network's actions: a matrix product of another batch size may round otherwise; bins are 100 times wider
-NETWORK_TOLERANCE = 1e-4
+# of a network's actions: a matrix product of another batch size may round otherwise, and where actions are no
+# bins (which are 10 times wider), the next picture then shows what was done otherwise
+NETWORK_TOLERANCE = 2e-3
 CONDITIONS = ("none", "all:1-5")
 
 type Observations = list[dict[str, np.ndarray]]
