@@ -206,16 +206,21 @@ def test_heads_say_the_same_in_training_and_in_sampling(monkeypatch: pytest.Monk
     seen: list[tuple[Tensor, Tensor]] = []
     heads: Any = policy._heads
 
-    def note(*args: Any) -> tuple[Tensor, Tensor]:
-        seen.append(heads(*args))
-        return seen[-1]
+    def noted(*context: Any) -> Any:
+        predict = heads(*context)
 
-    monkeypatch.setattr(policy, "_heads", note)
+        def note(*args: Tensor) -> tuple[Tensor, Tensor]:
+            seen.append(predict(*args))
+            return seen[-1]
+
+        return note
+
+    monkeypatch.setattr(policy, "_heads", noted)
     monkeypatch.setattr(policy, "_draw_point", lambda _: point)
     policy(batch)
     for row in range(3):
         context = policy._read(rows(batch, [row]))
-        alone = heads(context, point.actions[row : row + 1], point.tau[row : row + 1])
+        alone = heads(context)(point.actions[row : row + 1], point.tau[row : row + 1])
         for trained, sampled in zip(seen[0], alone, strict=True):
             torch.testing.assert_close(sampled, trained[row : row + 1], rtol=0, atol=1e-5)
 
@@ -247,7 +252,7 @@ def test_which_actions_read_which(attention: str) -> None:
     context, point = policy._read(batch), fixed_point(batch)
     changed = point.actions.clone()
     changed[:, 2] += 1
-    velocities = [policy._heads(context, actions, point.tau)[0] for actions in (point.actions, changed)]
+    velocities = [policy._heads(context)(actions, point.tau)[0] for actions in (point.actions, changed)]
     assert velocities[0] is not None and velocities[1] is not None
     differs = (velocities[0] != velocities[1]).any(dim=2)[0].tolist()
     assert differs == ([True] * 4 if attention == "bidirectional" else [False, False, True, True])
@@ -300,7 +305,7 @@ def test_pictures_sentence_state_and_time_matter() -> None:
     swapped = {**batch, WORKSPACE: batch[WRIST], WRIST: batch[WORKSPACE]}
     assert not torch.allclose(policy.predict_action_chunk(swapped, noise), usual, atol=1e-4)
     context, point = policy._read(batch), fixed_point(batch)
-    early, late = (policy._heads(context, point.actions, torch.tensor([tau]))[1] for tau in (0.1, 0.9))
+    early, late = (policy._heads(context)(point.actions, torch.tensor([tau]))[1] for tau in (0.1, 0.9))
     assert early is not None and late is not None and not torch.allclose(early, late, atol=1e-3)
 
 

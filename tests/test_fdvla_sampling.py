@@ -40,7 +40,7 @@ def test_a_chunk_is_what_the_sampler_makes_of_the_heads(options: dict[str, Any])
     generator = torch.Generator().manual_seed(0)
     step_noise = torch.randn(4, 4, 4, generator=generator).expand(2, -1, -1, -1) if name == "sde" else None
     expected = sample(
-        lambda actions, tau: policy._heads(context, actions, tau),
+        policy._heads(context),
         noise,
         num_inference_steps=4,
         refine_alpha=0.5,

@@ -31,6 +31,11 @@ class FiLM(nn.Module):
             nn.LayerNorm(state_size), nn.Linear(state_size, dualmod_dim), nn.SiLU(), last
         )
 
-    def forward(self, features_BKH: Tensor, pooled_BR: Tensor) -> Tensor:
+    def coefficients(self, pooled_BR: Tensor) -> tuple[Tensor, Tensor]:
+        """Gamma and beta, (B, 1, H) each."""
         gamma_B1H, beta_B1H = self.layers(pooled_BR)[:, None].chunk(2, dim=-1)
+        return gamma_B1H, beta_B1H
+
+    def forward(self, features_BKH: Tensor, pooled_BR: Tensor) -> Tensor:
+        gamma_B1H, beta_B1H = self.coefficients(pooled_BR)
         return gamma_B1H * features_BKH + beta_B1H

@@ -1,12 +1,12 @@
 """CUDA graphs: the kernels of a function, recorded once and started together afterwards."""
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
 from typing import Any
 
 import torch
-from torch import Tensor
+from torch import Tensor, nn
 
 
 @dataclass(frozen=True)
@@ -58,6 +58,48 @@ class Recorded:
         with torch.cuda.graph(graph, capture_error_mode="thread_local"):
             returned = self._function(*taken)
         return _Recording(graph, taken, returned)
+
+
+class RecordedModel:
+    """A function of tensors that also reads the weights of modules, where these lie.
+
+    With autocast, products' weights are cast once in its course. It is recorded anew when weights have moved.
+    Arguments are as for `Recorded`.
+    """
+
+    def __init__(self, function: Callable[..., tuple[Tensor, ...]], modules: Iterable[nn.Module]):
+        self._call = _Call(function, modules)
+        self._state: Any = None
+        self._recorded = Recorded(self._run)
+
+    def __call__(self, settings: Any, *tensors: Tensor) -> tuple[Tensor, ...]:
+        """What the function returns; ``settings``: whatever else it reads."""
+        state = settings, [parameter.data_ptr() for parameter in self._call.parameters()]
+        if state != self._state:
+            self._state, self._recorded = state, Recorded(self._run)
+        return self._recorded(*tensors)
+
+    def _run(self, *tensors: Tensor) -> tuple[Tensor, ...]:
+        weights: dict[str, Tensor] = {}
+        if torch.is_autocast_enabled("cuda"):
+            dtype = torch.get_autocast_dtype("cuda")
+            products = [(name, part) for name, part in self._call.named_modules() if type(part) is nn.Linear]
+            for name, product in products:
+                for kind, parameter in product.named_parameters(recurse=False):
+                    weights[f"{name}.{kind}"] = parameter.to(dtype)
+        return torch.func.functional_call(self._call, weights, tensors)
+
+
+class _Call(nn.Module):
+    """A function as a module of what it reads."""
+
+    def __init__(self, function: Callable[..., tuple[Tensor, ...]], modules: Iterable[nn.Module]):
+        super().__init__()
+        self._modules_read = nn.ModuleList(modules)
+        self._function = function
+
+    def forward(self, *tensors: Tensor) -> tuple[Tensor, ...]:
+        return self._function(*tensors)
 
 
 @contextmanager

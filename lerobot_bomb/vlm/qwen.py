@@ -7,6 +7,7 @@ Shapes: `B` batch, `L` tokens of a prefix, `T` of a segment, `H` hidden size, `P
 of an image in pixels, `V` key-value heads, `E` size of a head.
 """
 
+from collections.abc import Sequence
 from dataclasses import asdict, dataclass
 from functools import partial
 from typing import Any
@@ -81,6 +82,21 @@ class Prefix:
     written: Tensor  # (B, L) bool, others are gaps
     next_position: Tensor  # (B, 1) int64, of what follows
     layers: list[KeysValues]
+
+    def tensors(self) -> list[Tensor]:
+        """All of it, as `of` takes it."""
+        return [
+            self.hidden,
+            self.written,
+            self.next_position,
+            *(part for layer in self.layers for part in layer),
+        ]
+
+    @classmethod
+    def of(cls, tensors: Sequence[Tensor]) -> "Prefix":
+        """The inverse of `tensors`."""
+        hidden, written, next_position, *layers = tensors
+        return cls(hidden, written, next_position, list(zip(layers[::2], layers[1::2], strict=True)))
 
     def repeated(self, times: int) -> "Prefix":
         """Every row so many times, beside each other."""

@@ -180,17 +180,21 @@ class FdvlaConfig(PreTrainedConfig):
     def _check_heads(self) -> None:
         heads = self.use_flow_head, self.use_denoise_head
         check_objective(self.consistency, self.consistency_detach, self.used_consistency_weight, *heads)
-        check_sampling(
-            self.used_sampler,
-            self.solver,
-            self.num_inference_steps,
-            self.refine_alpha,
-            self.denoise_tau_min,
-            self.clip_sample_range,
-        )
+        check_sampling(**self.sampling())
         check_heads(self.used_sampler, *heads)
         if self.used_consistency_weight < 0:
             raise ValueError(f"consistency_loss_weight={self.consistency_loss_weight} must not be negative")
+
+    def sampling(self) -> dict[str, Any]:
+        """Options of `lerobot_bomb.flow.samplers.sample`."""
+        return {
+            "sampler": self.used_sampler,
+            "solver": self.solver,
+            "num_inference_steps": self.num_inference_steps,
+            "refine_alpha": self.refine_alpha,
+            "denoise_tau_min": self.denoise_tau_min,
+            "clip_sample_range": self.clip_sample_range,
+        }
 
     @property
     def used_sampler(self) -> str:

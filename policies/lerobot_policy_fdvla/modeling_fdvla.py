@@ -8,7 +8,7 @@ Shapes: `B` batch, `K` actions of a chunk, `D` action dims, `L` tokens of a prom
 
 import logging
 from collections import deque
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from functools import partial
@@ -30,9 +30,10 @@ from lerobot_bomb.flow.dual_mod import masked_mean_pool
 from lerobot_bomb.flow.losses import joint_loss
 from lerobot_bomb.flow.path import PathPoint, draw_noise, draw_tau, path_point
 from lerobot_bomb.flow.real_time import guided
-from lerobot_bomb.flow.samplers import SAMPLERS, sample
+from lerobot_bomb.flow.samplers import SAMPLERS, Heads, sample
 from lerobot_bomb.policy_flags import check_as_trained, trained_with
 from lerobot_bomb.vlm.cached_text import check_positions
+from lerobot_bomb.vlm.graphs import RecordedModel
 from lerobot_bomb.vlm.images import draw_windows, resize
 from lerobot_bomb.vlm.inputs import read_actions, read_image, read_tensor
 from lerobot_bomb.vlm.qwen import Prefix
@@ -55,6 +56,15 @@ class Context:
     def repeated(self, times: int) -> "Context":
         """Every row so many times, beside each other."""
         return Context(self.prefix.repeated(times), self.pooled.repeat_interleave(times, dim=0))
+
+    def tensors(self) -> list[Tensor]:
+        """All of it, as `of` takes it."""
+        return [self.pooled, *self.prefix.tensors()]
+
+    @classmethod
+    def of(cls, tensors: Sequence[Tensor]) -> "Context":
+        """The inverse of `tensors`."""
+        return cls(Prefix.of(tensors[1:]), tensors[0])
 
 
 class FdvlaPolicy(PreTrainedPolicy):
@@ -93,6 +103,8 @@ class FdvlaPolicy(PreTrainedPolicy):
         # source of all that is random in training: the crop, the time, the noise
         self.generator = torch.Generator().manual_seed(torch.initial_seed())
         logger.info("fdvla: %s", self.parameter_counts)
+        heads = [head for head in (self.flow_head, self.denoise_head) if head is not None]
+        self._recorded = RecordedModel(self._sample, [self.backbone.text_model, self.segment, *heads])
         self.init_rtc_processor()
         self.reset()
 
@@ -155,9 +167,8 @@ class FdvlaPolicy(PreTrainedPolicy):
         has_energy = self.config.consistency == "energy_vjp" and self.config.used_consistency_weight > 0
         with self._autocast(), second_derivatives(has_energy):
             point.actions.requires_grad_(has_energy)
-            velocity_BKD, noise_BKD = self._heads(
-                self._read(batch).repeated(draws), point.actions, point.tau, kept_BK
-            )
+            heads = self._heads(self._read(batch).repeated(draws), kept_BK)
+            velocity_BKD, noise_BKD = heads(point.actions, point.tau)
             loss, terms = joint_loss(
                 None if velocity_BKD is None else velocity_BKD.float(),
                 None if noise_BKD is None else noise_BKD.float(),
@@ -255,28 +266,32 @@ class FdvlaPolicy(PreTrainedPolicy):
         the last chunk that are not executed yet, and how many will be when this one arrives.
         """
         self.eval()
-        config = self.config
         with self._autocast():
             context = self._read(batch)
-            shape = len(context.pooled), config.chunk_size, self._action_dim
-            heads = partial(self._heads, context)
+            shape = len(context.pooled), self.config.chunk_size, self._action_dim
+            noises = self._noise(noise, shape), self._step_noise(shape)
             if self.rtc_processor is not None and prev_chunk_left_over is not None:
-                delay = inference_delay or 0
+                delay, heads = inference_delay or 0, self._heads(context)
                 heads = guided(heads, self.rtc_processor, prev_chunk_left_over, delay, execution_horizon)
-            actions_BKD = sample(
-                heads,
-                self._noise(noise, shape),
-                sampler=config.used_sampler,
-                solver=config.solver,
-                num_inference_steps=config.num_inference_steps,
-                refine_alpha=config.refine_alpha,
-                denoise_tau_min=config.denoise_tau_min,
-                clip_sample_range=config.clip_sample_range,
-                step_noise_BNKD=self._step_noise(shape),
-            )
+                actions_BKD = self._denoise(heads, *noises)
+            elif self.action_unit.is_cuda:
+                with torch.inference_mode(False), torch.no_grad():
+                    actions_BKD = self._recorded(self.config.sampling(), *noises, *context.tensors())[
+                        0
+                    ].clone()
+            else:
+                actions_BKD = self._sample(*noises, *context.tensors())[0]
         # casts of weights cached under inference mode cannot be used by a later training step
         torch.clear_autocast_cache()
         return actions_BKD
+
+    def _sample(self, noise_BKD: Tensor, step_noise: Tensor, *context: Tensor) -> tuple[Tensor]:
+        """All sampling steps, as a function of tensors."""
+        return (self._denoise(self._heads(Context.of(context)), noise_BKD, step_noise),)
+
+    def _denoise(self, heads: Heads, noise_BKD: Tensor, step_noise: Tensor) -> Tensor:
+        step_noise_BNKD = step_noise if self.config.used_sampler == "sde" else None
+        return sample(heads, noise_BKD, **self.config.sampling(), step_noise_BNKD=step_noise_BNKD)
 
     def _noise(self, given: Tensor | None, shape: tuple[int, int, int]) -> Tensor:
         if given is None:
@@ -285,10 +300,10 @@ class FdvlaPolicy(PreTrainedPolicy):
             raise ValueError(f"noise has shape {tuple(given.shape)}; expected {shape} (batch, chunk, dims)")
         return given
 
-    def _step_noise(self, shape: tuple[int, int, int]) -> Tensor | None:
-        if self.config.used_sampler != "sde":
-            return None
-        return self._draw(shape[0], (self.config.num_inference_steps, *shape[1:]))
+    def _step_noise(self, shape: tuple[int, int, int]) -> Tensor:
+        """(B, N, K, D) for ``sde``, none of it for others."""
+        num_steps = self.config.num_inference_steps if self.config.used_sampler == "sde" else 0
+        return self._draw(shape[0], (num_steps, *shape[1:]))
 
     def _draw(self, batch_size: int, shape: tuple[int, ...]) -> Tensor:
         return draw_noise(self._sampling_generator, batch_size, shape).to(self.action_unit.device)
@@ -312,23 +327,29 @@ class FdvlaPolicy(PreTrainedPolicy):
 
     # Model
 
-    def _heads(
-        self, context: Context, actions_BKD: Tensor, tau_B: Tensor, kept_BK: Tensor | None = None
-    ) -> tuple[Tensor | None, Tensor | None]:
-        """Velocity and noise (B, K, D) predicted at noisy actions and times; None for a missing head.
+    def _heads(self, context: Context, kept_BK: Tensor | None = None) -> Heads:
+        """Noisy actions and times -> velocity and noise (B, K, D); None for a missing head.
 
-        One pass over the segment. Its shapes are static, and nothing in it waits for the device.
+        A call is one pass over the segment. Its shapes are static, and nothing in it waits for the device.
         """
         if kept_BK is None:
-            kept_BK = torch.ones_like(actions_BKD[..., 0], dtype=torch.bool)
+            shape = len(context.pooled), self.config.chunk_size
+            kept_BK = torch.ones(shape, dtype=torch.bool, device=context.pooled.device)
         reads_BTT = self.segment.reads(kept_BK, causal=self.config.segment_attention == "causal")
-        states_BTH = self.backbone.read_segment(context.prefix, self.segment(actions_BKD, tau_B), reads_BTT)
-        states_BKH = self.segment.of_actions(states_BTH)
-        velocity_BKD, noise_BKD = (
-            None if head is None else head(states_BKH, context.pooled)
-            for head in (self.flow_head, self.denoise_head)
-        )
-        return velocity_BKD, noise_BKD
+        heads = self.flow_head, self.denoise_head
+        modulations = [None if head is None else head.modulation(context.pooled) for head in heads]
+
+        def predict(actions_BKD: Tensor, tau_B: Tensor) -> tuple[Tensor | None, Tensor | None]:
+            embeds_BTH = self.segment(actions_BKD, tau_B)
+            states_BTH = self.backbone.read_segment(context.prefix, embeds_BTH, reads_BTT)
+            states_BKH = self.segment.of_actions(states_BTH)
+            velocity_BKD, noise_BKD = (
+                None if head is None else head(states_BKH, modulation)
+                for head, modulation in zip(heads, modulations, strict=True)
+            )
+            return velocity_BKD, noise_BKD
+
+        return predict
 
     def _read(self, batch: dict[str, Tensor]) -> Context:
         """The prompt, once for all sampling steps."""

@@ -61,7 +61,7 @@ class ActionSegment(nn.Module):
 
 
 class Head(nn.Module):
-    """States of the action tokens (B, K, H) -> (B, K, D), modulated by pooled states (B, H) of the prompt."""
+    """States of the action tokens -> (B, K, D), modulated by pooled states of the prompt."""
 
     def __init__(self, hidden_size: int, head_dim: int, action_dim: int, dualmod_dim: int | None):
         super().__init__()
@@ -69,8 +69,14 @@ class Head(nn.Module):
         self.film = None if dualmod_dim is None else FiLM(hidden_size, dualmod_dim, head_dim)
         self.out = nn.Linear(head_dim, action_dim)
 
-    def forward(self, states_BKH: Tensor, pooled_BH: Tensor) -> Tensor:
+    def forward(self, states_BKH: Tensor, modulation: tuple[Tensor, Tensor] | None) -> Tensor:
+        """(B, K, H) states, and what `modulation` gave for the prompt -> (B, K, D)."""
         features_BKF = self.features(states_BKH)
-        if self.film is not None:
-            features_BKF = self.film(features_BKF, pooled_BH)
+        if modulation is not None:
+            gamma_B1F, beta_B1F = modulation
+            features_BKF = gamma_B1F * features_BKF + beta_B1F
         return self.out(features_BKF)
+
+    def modulation(self, pooled_BH: Tensor) -> tuple[Tensor, Tensor] | None:
+        """What (B, H) pooled states make of the features, the same in all sampling steps."""
+        return None if self.film is None else self.film.coefficients(pooled_BH)

@@ -1,0 +1,199 @@
+"""A query of `fdvla`: the prompt read once, against reading it anew in every sampling step.
+
+    OMP_NUM_THREADS=1 python benchmarks/fdvla_speed.py --json fdvla_speed.json
+    python benchmarks/fdvla_speed.py --device=cuda --json fdvla_speed_cuda.json
+
+All are the same policy with the same weights, see the same random pictures and start from the same noise;
+their actions must agree. Weights are random: nano, and the shape of Qwen2.5-0.5B with a vision model of 3
+layers. The bar is over reading the whole prompt, pictures included, in every step; where only the language
+model reads it anew stands beside. On CUDA a query's sampling steps are one CUDA graph; a row is without it.
+"""
+
+import argparse
+import logging
+import statistics
+import time
+from collections.abc import Callable
+from functools import partial
+from typing import Any
+from unittest.mock import patch
+
+import torch
+from decode_speed_compare import finish, print_rows
+from lerobot.configs import FeatureType, PolicyFeature
+from lerobot.policies import make_pre_post_processors
+from machine import add_machine_arguments, positive, require_idle_machine
+from torch import Tensor
+
+from lerobot_bomb.vlm.presets import nano_qwen_config
+from lerobot_bomb.vlm.qwen import QwenPrompt
+from lerobot_bomb.vlm.tokenizer import NANO, load_tokenizer
+from lerobot_policy_fdvla import FdvlaConfig
+from lerobot_policy_fdvla.modeling_fdvla import FdvlaPolicy
+
+MIN_RATIO = 3.0
+EVERY_STEP, ONCE = "prompt read in every step", "prompt read once"
+TOLERANCES = {"float32": 1e-3, "bfloat16": 0.2}  # of actions of unit spread, after all steps
+BATCH_SIZES = {"nano": (1, 8), "0.5B": (1,)}
+CAMERAS = "observation.images.workspace", "observation.images.wrist"
+IMAGE_SIZE, NUM_DIMS = 224, 7
+SENTENCES = "put the black stone on the center", "go", "push the white stone to the left edge"
+# the text model of Qwen2.5-0.5B
+TEXT_05B = {
+    "hidden_size": 896,
+    "intermediate_size": 4864,
+    "num_hidden_layers": 24,
+    "num_attention_heads": 14,
+    "num_key_value_heads": 2,
+    "initializer_range": 0.02,
+    "rope_parameters": {"rope_type": "default", "rope_theta": 1e6, "mrope_section": [8, 12, 12]},
+}
+
+
+def main() -> None:
+    """Time both, print the tables; exit code 1 where a bar is missed."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawTextHelpFormatter)
+    parser.add_argument("--device", choices=("cpu", "cuda"), default="cpu")
+    parser.add_argument("--repeats", type=positive, default=10, help="queries of each (default: 10)")
+    add_machine_arguments(parser)
+    args = parser.parse_args()
+    require_idle_machine(args.force)
+    logging.disable(logging.WARNING)
+    figures: dict[str, Any] = {"device": args.device}
+    if args.device == "cuda":
+        figures["device"] = torch.cuda.get_device_name()
+    print(figures["device"], f"torch {torch.__version__}")
+    bars: dict[str, bool] = {}
+    for model in BATCH_SIZES:
+        for dtype in ("float32", "bfloat16") if args.device == "cuda" else ("float32",):
+            policy = make_policy(model, args.device, dtype)
+            for batch_size in BATCH_SIZES[model]:
+                name = f"{model}, {dtype}, batch of {batch_size}"
+                figures[name] = time_queries(policy, make_batches(policy, batch_size, args.repeats))
+                title = (
+                    f"{name}, {policy.config.num_inference_steps} steps, chunks of {policy.config.chunk_size}"
+                )
+                print_rows(title, figures[name])
+                gain = figures[name][ONCE]["gain"]
+                if batch_size == 1:
+                    bars[f"{name}: {gain:.1f} times faster (bar {MIN_RATIO:g})"] = gain >= MIN_RATIO
+            del policy
+    print()
+    finish(args.json, figures, bars)
+
+
+def make_policy(model: str, device: str, dtype: str) -> FdvlaPolicy:
+    """Random weights, the default chunk, steps and sampler."""
+    torch.manual_seed(0)
+    tokenizer = load_tokenizer(NANO)
+    vlm_config = nano_qwen_config(tokenizer)
+    if model == "0.5B":
+        vlm_config["text_config"] |= TEXT_05B
+        vlm_config["vision_config"]["out_hidden_size"] = TEXT_05B["hidden_size"]
+    config = FdvlaConfig(
+        vlm_model_name=NANO,
+        vlm_config=vlm_config,
+        prompt_tokens=QwenPrompt.from_tokenizer(tokenizer, NANO).to_dict(),
+        device=device,
+        dtype=dtype,
+        input_features=dict.fromkeys(CAMERAS, PolicyFeature(FeatureType.VISUAL, (3, IMAGE_SIZE, IMAGE_SIZE)))
+        | {"observation.state": PolicyFeature(FeatureType.STATE, (NUM_DIMS,))},
+        output_features={"action": PolicyFeature(FeatureType.ACTION, (NUM_DIMS,))},
+    )
+    return FdvlaPolicy(config).to(device).eval()
+
+
+def make_batches(policy: FdvlaPolicy, batch_size: int, num_batches: int) -> list[dict[str, Any]]:
+    """Preprocessed, the sentences of different lengths."""
+    units = {"mean": torch.zeros(NUM_DIMS), "std": torch.ones(NUM_DIMS)}
+    preprocessor, _ = make_pre_post_processors(
+        policy.config, dataset_stats={"action": units, "observation.state": units}
+    )
+    generator = torch.Generator().manual_seed(0)
+    shape = batch_size, 3, IMAGE_SIZE, IMAGE_SIZE
+    return [
+        preprocessor(
+            {key: torch.rand(shape, generator=generator) for key in CAMERAS}
+            | {"observation.state": torch.randn(batch_size, NUM_DIMS, generator=generator)}
+            | {"task": [SENTENCES[(first + row) % len(SENTENCES)] for row in range(batch_size)]}
+        )
+        for first in range(num_batches)
+    ]
+
+
+def time_queries(policy: FdvlaPolicy, batches: list[dict[str, Any]]) -> dict[str, dict[str, float]]:
+    """Every way on every batch, in turn; the first one's actions are what the others must give."""
+    ways: dict[str, Callable[[dict[str, Any]], Tensor]] = {
+        EVERY_STEP: partial(read_in_every_step, policy, sees_once=False),
+        "the same, pictures seen once": partial(read_in_every_step, policy, sees_once=True),
+        ONCE: policy.predict_action_chunk,
+    }
+    if policy.config.device == "cuda":
+        ways[f"{ONCE}, not recorded"] = partial(unrecorded, policy)
+    seconds: dict[str, list[float]] = {name: [] for name in ways}
+    for i, batch in enumerate([batches[0], *batches]):
+        answers = []
+        for name, query in ways.items():
+            policy.reset()
+            with torch.inference_mode():
+                actions, elapsed_s = timed(partial(query, batch))
+            answers.append(actions)
+            if i:  # the first is to get warm
+                seconds[name].append(elapsed_s)
+        expected, *others = answers
+        if not all(torch.allclose(expected, other, atol=TOLERANCES[policy.config.dtype]) for other in others):
+            raise SystemExit(f"query {i}: {', '.join(ways)} do not give the same actions")
+    latencies = {name: statistics.median(runs) for name, runs in seconds.items()}
+    num_actions = len(expected) * policy.config.chunk_size
+    return {
+        name: {
+            "latency_ms": 1e3 * latency_s,
+            "actions_a_second": num_actions / latency_s,
+            "gain": latencies[EVERY_STEP] / latency_s,
+        }
+        for name, latency_s in latencies.items()
+    }
+
+
+def timed(query: Callable[[], Tensor]) -> tuple[Tensor, float]:
+    """Its actions, and the seconds until the device has them."""
+    _wait()
+    started = time.perf_counter()
+    actions = query()
+    _wait()
+    return actions, time.perf_counter() - started
+
+
+def _wait() -> None:
+    if torch.cuda.is_available():
+        torch.cuda.synchronize()
+
+
+def read_in_every_step(policy: FdvlaPolicy, batch: dict[str, Any], *, sees_once: bool) -> Tensor:
+    """The language model reads the prompt anew in every step; the vision model, too, unless it sees once."""
+    embed = policy._embeds
+    with policy._autocast(), torch.no_grad():
+        if sees_once:
+            embeds = embed(batch, policy._prompt(batch)[0].ids)
+            embed = lambda *_: embeds  # noqa: E731
+        with patch.object(policy, "_embeds", embed):
+
+            def heads(actions: Tensor, tau: Tensor) -> tuple[Tensor | None, Tensor | None]:
+                return policy._heads(policy._read(batch))(actions, tau)
+
+            shape = len(batch["observation.state"]), policy.config.chunk_size, NUM_DIMS
+            return policy._denoise(heads, policy._noise(None, shape), policy._step_noise(shape))
+
+
+def unrecorded(policy: FdvlaPolicy, batch: dict[str, Any]) -> Tensor:
+    """The policy's own way, kernel by kernel."""
+
+    def sample(_: object, *tensors: Tensor) -> tuple[Tensor, ...]:
+        return policy._sample(*tensors)
+
+    with patch.object(policy, "_recorded", sample):
+        return policy.predict_action_chunk(batch)
+
+
+if __name__ == "__main__":
+    main()
