@@ -184,16 +184,6 @@ def test_a_head_of_words_that_is_no_embedding_is_frozen() -> None:
     assert untied.backbone.vlm.get_input_embeddings().weight.requires_grad
 
 
-def test_every_part_is_counted() -> None:
-    counts = make_policy().parameter_counts
-    assert list(counts) == [
-        *("backbone", "segment", "state_embedding", "flow_head", "denoise_head", "trained"),
-    ]
-    plain = make_policy(dualmod_flow=False, dualmod_denoise=False).parameter_counts
-    film = 2 * 128 + (128 * 16 + 16) + (16 * 64 + 64)
-    assert counts["flow_head"] - plain["flow_head"] == counts["denoise_head"] - plain["denoise_head"] == film
-
-
 # What is read
 
 
@@ -307,12 +297,3 @@ def test_pictures_sentence_state_and_time_matter() -> None:
     context, point = policy._read(batch), fixed_point(batch)
     early, late = (policy._heads(context)(point.actions, torch.tensor([tau]))[1] for tau in (0.1, 0.9))
     assert early is not None and late is not None and not torch.allclose(early, late, atol=1e-3)
-
-
-@pytest.mark.parametrize("tasks", [("", ""), ("", "go")])
-def test_an_environment_may_name_no_task(tasks: tuple[str, ...]) -> None:
-    """As PushT does: its text is empty."""
-    policy = wake_dualmod(make_policy())
-    batch = make_batch(policy, 2, tasks=tasks)
-    assert policy(batch)[0].isfinite()
-    assert policy.predict_action_chunk(batch).isfinite().all()

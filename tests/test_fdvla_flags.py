@@ -1,4 +1,4 @@
-"""What `fdvla` refuses, and what follows from flags that are not given."""
+"""What `fdvla` refuses, what it does without, and what follows from flags that are not given."""
 
 from typing import Any
 
@@ -95,3 +95,22 @@ def test_defaults_follow_the_heads() -> None:
     both, flow, denoise = (make_config(**options) for options in ({}, FLOW_ONLY, DENOISE_ONLY))
     assert [config.used_sampler for config in (both, flow, denoise)] == ["residual", "flow", "ddim"]
     assert [config.used_consistency_weight for config in (both, flow, denoise)] == [0.1, 0, 0]
+
+
+def test_every_part_is_counted() -> None:
+    counts = make_policy().parameter_counts
+    assert list(counts) == [
+        *("backbone", "segment", "state_embedding", "flow_head", "denoise_head", "trained"),
+    ]
+    plain = make_policy(dualmod_flow=False, dualmod_denoise=False).parameter_counts
+    film = 2 * 128 + (128 * 16 + 16) + (16 * 64 + 64)
+    assert counts["flow_head"] - plain["flow_head"] == counts["denoise_head"] - plain["denoise_head"] == film
+
+
+@pytest.mark.parametrize("tasks", [("", ""), ("", "go")])
+def test_an_environment_may_name_no_task(tasks: tuple[str, ...]) -> None:
+    """As PushT does: its text is empty."""
+    policy = make_policy()
+    batch = make_batch(policy, 2, tasks=tasks)
+    assert policy(batch)[0].isfinite()
+    assert policy.predict_action_chunk(batch).isfinite().all()
