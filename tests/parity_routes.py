@@ -114,6 +114,15 @@ def resolution(policy: PreTrainedPolicy) -> float:
     return 1.0001 / num_gaps
 
 
+def tolerance(policy: PreTrainedPolicy) -> float:
+    """Of normalised actions in an episode: one that samples had not all of its noise while it learned.
+
+    A gripper that closes or opens a step early or late is off by about 2.
+    """
+    samples = hasattr(policy.config, "num_inference_steps")
+    return 3 * resolution(policy) if samples else resolution(policy)
+
+
 def learn_by_heart(policy: PreTrainedPolicy, batches: list[Batch], bar: float | Tensor) -> None:
     """Train on a few frames, as evaluation shows them, until their chunks are reproduced within the bar."""
     batch = joined(batches)

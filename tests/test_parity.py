@@ -13,7 +13,16 @@ from lerobot.policies import PreTrainedPolicy
 from lerobot.utils.constants import ACTION
 from lerobot.utils.import_utils import register_third_party_plugins
 from model_inputs import Batch, first_ids, inference_inputs, pixels, probes, repeated
-from parity_routes import Recorded, Routes, as_written, cli_flags, learn_by_heart, resolution, run_routes
+from parity_routes import (
+    Recorded,
+    Routes,
+    as_written,
+    cli_flags,
+    learn_by_heart,
+    resolution,
+    run_routes,
+    tolerance,
+)
 from variants import Options
 
 # Least PSNR of a camera's pixels, as the network gets them, between a frame out of a video and the drawn one.
@@ -144,7 +153,7 @@ def test_targets_are_the_actions_from_the_frame_on(routes: MakeRoutes, options: 
 def require_recorded_actions(both: Routes) -> None:
     """Each action of a policy that learned the turning points, after each call, is what was recorded."""
     policy, actions = both.evaluation.policy, recorded_as_written(both)
-    bar = resolution(policy) * (actions.max(axis=0) - actions.min(axis=0)) / 2
+    bar = tolerance(policy) * (actions.max(axis=0) - actions.min(axis=0)) / 2
     for shown in both.recorded.turning_points, both.recorded.turning_points[::-1]:
         policy.reset()
         for step, (index, expected) in enumerate(expected_actions(policy.config, shown, actions)):
