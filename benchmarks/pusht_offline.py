@@ -47,11 +47,17 @@ NEAR_FLAGS = [
 ]
 ABSOLUTE = ["--policy.relative_actions=false"]
 BASE_STAGES: dict[str, list[list[str]]] = {
+    "fdvla": [NEAR_FLAGS],
     "spatialvla_grid": [NEAR_FLAGS],
     "vla0_smol": [[*LOOK_FLAGS, *ABSOLUTE, *NEAR_FLAGS], [*LOOK_FLAGS, *ABSOLUTE]],
 }
 RECIPE = "recipe"
 VARIANTS: dict[str, dict[str, list[str]]] = {
+    "fdvla": {
+        RECIPE: [],
+        "flow_only": ["--policy.use_denoise_head=false"],
+        "diffusion_only": ["--policy.use_flow_head=false"],
+    },
     "spatialvla_grid": {
         RECIPE: [],
         "uniform": ["--policy.grid_distribution=uniform"],

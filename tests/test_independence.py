@@ -22,9 +22,10 @@ from lerobot_env_bomb.vector import NEW_ROLLOUT_OPTION, LazyVectorEnv
 
 SMALL = RenderOptions(image_size=32)
 SEEDS = (9, 10)
-# of a network's actions: a matrix product of another batch size may round otherwise, and where actions are no
-# bins (which are 10 times wider), the next picture then shows what was done otherwise
-NETWORK_TOLERANCE = 2e-3
+# of a network's actions: a matrix product of another batch size may round otherwise; bins are 100 times wider
+BINS_TOLERANCE = 1e-4
+# where actions are no bins, the next picture shows what was rounded otherwise
+TOLERANCES = {"fdvla": 2e-3}
 CONDITIONS = ("none", "all:1-5")
 
 type Observations = list[dict[str, np.ndarray]]
@@ -244,12 +245,17 @@ def checkpoint(tmp_path: Path, policy_type: str, policy_flags: Callable[[str], d
     return tmp_path / "train" / "checkpoints" / "last" / "pretrained_model"
 
 
+def tolerance_of(checkpoint: Path) -> float:
+    policy_type = json.loads((checkpoint / "config.json").read_text())["type"]
+    return TOLERANCES.get(policy_type, BINS_TOLERANCE)
+
+
 def test_a_networks_results_do_not_depend_on_batch_or_workers(
     stock_cli: Run, tmp_path: Path, checkpoint: Path
 ) -> None:
     # episodes of 20 steps end in the middle of a chunk
     flags = [f"--policy.path={checkpoint}", "--env.fps=2", "--policy.n_action_steps=3"]
-    outcomes = assert_independent(stock_cli, tmp_path, flags, NETWORK_TOLERANCE)
+    outcomes = assert_independent(stock_cli, tmp_path, flags, tolerance_of(checkpoint))
     assert len({len(outcome.row["instruction"]) for outcome in outcomes.values()}) > 1  # rows are padded
     assert min(len(np.unique(outcome.actions, axis=0)) for outcome in outcomes.values()) > 3
 
@@ -260,7 +266,8 @@ def test_a_networks_results_do_not_depend_on_larger_batches(
 ) -> None:
     options = {"flags": [f"--policy.path={checkpoint}"], "use_async": False, "num_episodes": 16}
     alone = evaluate(stock_cli, tmp_path / "alone", batch_size=1, **options)
+    tolerance = tolerance_of(checkpoint)
     for batch_size in (5, 16):
         together = evaluate(stock_cli, tmp_path / f"in_{batch_size}", batch_size=batch_size, **options)
         for seed, expected in alone.items():
-            assert_alike(together[seed], expected, NETWORK_TOLERANCE, f"seed {seed} in {batch_size}")
+            assert_alike(together[seed], expected, tolerance, f"seed {seed} in {batch_size}")
