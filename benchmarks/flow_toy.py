@@ -1,0 +1,218 @@
+"""Do the heads of ``fdvla`` learn a distribution with two modes, and which of them a word means?
+
+Points of the plane stand for actions: "left" and "right" name a mode, "any" means both. Heads, DualMod,
+segment, loss and samplers are the policy's. One transformer layer takes the place of the vision-language
+model, and a word reaches the heads through DualMod alone, as the control without it shows.
+Leaves with exit code 1 if a bar is missed.
+
+    python benchmarks/flow_toy.py --json flow_toy.json --picture docs/media/flow_toy.png
+
+Shapes: `B` points of a batch, each a chunk of K = 1 action with D = 2 dims, `N` samples, `M` = 2 modes,
+`H` width.
+"""
+
+import argparse
+import time
+from dataclasses import asdict, dataclass
+from functools import partial
+from pathlib import Path
+
+import torch
+from flow_toy_picture import draw_picture, near_modes
+from machine import positive, write_figures
+from torch import Tensor, nn
+from torch.optim.lr_scheduler import CosineAnnealingLR
+
+from lerobot_bomb.flow.losses import joint_loss
+from lerobot_bomb.flow.path import draw_tau, path_point
+from lerobot_bomb.flow.samplers import sample
+from lerobot_bomb.tables import print_table
+from lerobot_policy_fdvla.configuration_fdvla import CONSISTENCY_LOSS_WEIGHT
+from lerobot_policy_fdvla.networks_fdvla import ActionSegment, Head
+
+MODES_MD = torch.tensor([[-1.0, 0.0], [1.0, 0.0]])
+STD = 0.2
+NEAR = 4 * STD  # what is farther from both modes is in neither
+LEFT, RIGHT, BOTH = (1.0, 0.0), (0.0, 1.0), (0.5, 0.5)  # the data's share in each mode
+WORDS = {"left": LEFT, "right": RIGHT, "any": BOTH}
+
+WIDTH = 64
+BATCH_SIZE = 256
+LEARNING_RATE = 2e-3
+SAMPLING_STEPS = 100  # few steps make the spread too small, whatever the heads have learned
+
+# bars: least and largest share of the samples near a mode, by the data's
+SHARE_BARS = {1.0: (0.99, 1.0), 0.5: (0.4, 0.6), 0.0: (0.0, 0.01)}
+MEAN_BAR, STD_BAR = 0.1, 0.15  # largest errors of a mode
+
+
+@dataclass(frozen=True)
+class Variant:
+    """Which parts there are, and the sampler for them."""
+
+    sampler: str
+    use_flow_head: bool = True
+    use_denoise_head: bool = True
+    use_dualmod: bool = True
+
+
+VARIANTS = {
+    "both heads": Variant("residual"),
+    "flow head": Variant("flow", use_denoise_head=False),
+    "denoising head": Variant("ddim", use_flow_head=False),
+    "control: no DualMod": Variant("residual", use_dualmod=False),
+}
+
+
+@dataclass(frozen=True)
+class Row:
+    """What a variant makes of a word, measured on the modes that are meant."""
+
+    variant: str
+    word: str
+    meant: tuple[float, float]  # share of each mode
+    shares: list[float]  # of the samples that are near each mode
+    mean_error: float  # largest distance of a mode's mean to the data's; NaN if a mode is empty
+    std_error: float  # largest of all modes and dims, as a share of the data's; NaN likewise
+    passes: bool
+
+
+class Toy(nn.Module):
+    """`FdvlaPolicy` with a layer in place of the vision-language model and a word in place of the prompt."""
+
+    def __init__(self, variant: Variant):
+        super().__init__()
+        self.words = nn.Embedding(len(WORDS), WIDTH)
+        self.segment = ActionSegment(1, 2, WIDTH)
+        self.layer = nn.TransformerEncoderLayer(
+            WIDTH, nhead=4, dim_feedforward=4 * WIDTH, dropout=0, batch_first=True, norm_first=True
+        )
+        make_head = partial(Head, WIDTH, WIDTH, 2, WIDTH if variant.use_dualmod else None)
+        self.flow_head = make_head() if variant.use_flow_head else None
+        self.denoise_head = make_head() if variant.use_denoise_head else None
+
+    def forward(
+        self, words_B: Tensor, actions_BKD: Tensor, tau_B: Tensor
+    ) -> tuple[Tensor | None, Tensor | None]:
+        """Velocity and noise (B, K, D); None for a missing head."""
+        states_BKH = self.segment.of_actions(self.layer(self.segment(actions_BKD, tau_B)))
+        pooled_BH = self.words(words_B)
+        velocity_BKD, noise_BKD = (
+            None if head is None else head(states_BKH, pooled_BH)
+            for head in (self.flow_head, self.denoise_head)
+        )
+        return velocity_BKD, noise_BKD
+
+
+def main() -> None:
+    """Train the variants, print what they make of each word."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawTextHelpFormatter)
+    parser.add_argument("--steps", type=positive, default=1000, help="of training, each variant")
+    parser.add_argument("--samples", type=positive, default=1000, help="of each word")
+    parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument("--json", type=Path, help="also write the figures to this file")
+    parser.add_argument("--picture", type=Path, help="draw the samples into this file")
+    args = parser.parse_args()
+    seconds, samples, rows = {}, {}, []
+    for name, variant in VARIANTS.items():
+        start = time.process_time()
+        toy = train(variant, args.steps, args.seed)
+        samples[name] = draw_samples(toy, variant.sampler, args.samples, args.seed)
+        seconds[name] = time.process_time() - start
+        # the control hears no word
+        rows += [
+            measure(name, word, WORDS[word] if variant.use_dualmod else BOTH, points_ND)
+            for word, points_ND in samples[name].items()
+        ]
+    print_rows(rows, seconds)
+    settings = {"steps": args.steps, "samples": args.samples, "seed": args.seed}
+    write_figures(args.json, {**settings, "cpu_s": seconds, "rows": [asdict(row) for row in rows]})
+    if args.picture is not None:
+        generator = torch.Generator().manual_seed(args.seed)
+        words = {word: torch.full((args.samples,), i) for i, word in enumerate(WORDS)}
+        data = {word: draw_points(words_N, generator)[:, 0] for word, words_N in words.items()}
+        draw_picture(args.picture, {"data": data, **samples}, MODES_MD, NEAR)
+    if not all(row.passes for row in rows):
+        raise SystemExit(1)
+
+
+def train(variant: Variant, num_steps: int, seed: int) -> Toy:
+    """A toy that has learned all words."""
+    torch.manual_seed(seed)
+    toy, generator = Toy(variant), torch.Generator().manual_seed(seed)
+    optimizer = torch.optim.AdamW(toy.parameters(), LEARNING_RATE)
+    scheduler = CosineAnnealingLR(optimizer, num_steps)
+    kept_BK = torch.ones(BATCH_SIZE, 1, dtype=torch.bool)
+    for _ in range(num_steps):
+        words_B = torch.randint(len(WORDS), (BATCH_SIZE,), generator=generator)
+        z_BKD = torch.randn(BATCH_SIZE, 1, 2, generator=generator)
+        tau_B = draw_tau("uniform", BATCH_SIZE, generator)
+        point = path_point(draw_points(words_B, generator), z_BKD, tau_B)
+        velocity_BKD, noise_BKD = toy(words_B, point.actions, point.tau)
+        weight = CONSISTENCY_LOSS_WEIGHT if variant.use_flow_head and variant.use_denoise_head else 0.0
+        loss, _ = joint_loss(velocity_BKD, noise_BKD, point, kept_BK, consistency_loss_weight=weight)
+        optimizer.zero_grad()
+        loss.backward()
+        optimizer.step()
+        scheduler.step()
+    return toy.eval()
+
+
+def draw_points(words_B: Tensor, generator: torch.Generator) -> Tensor:
+    """(B, 1, 2) data that the words mean."""
+    shares_BM = torch.tensor([*WORDS.values()])[words_B]
+    modes_B = shares_BM.multinomial(1, generator=generator)[:, 0]
+    return (MODES_MD[modes_B] + STD * torch.randn(len(words_B), 2, generator=generator))[:, None]
+
+
+@torch.no_grad()
+def draw_samples(toy: Toy, sampler: str, num_samples: int, seed: int) -> dict[str, Tensor]:
+    """(N, 2) of each word, all from the same noise."""
+    noise_NKD = torch.randn(num_samples, 1, 2, generator=torch.Generator().manual_seed(seed))
+    heads = {word: partial(toy, torch.full((num_samples,), i)) for i, word in enumerate(WORDS)}
+    return {
+        word: sample(of_word, noise_NKD, sampler=sampler, num_inference_steps=SAMPLING_STEPS)[:, 0]
+        for word, of_word in heads.items()
+    }
+
+
+def measure(variant: str, word: str, meant: tuple[float, float], points_ND: Tensor) -> Row:
+    """Samples (N, 2) against the data's modes, and whether they meet the bars."""
+    near_MN = near_modes(points_ND, MODES_MD, NEAR)
+    shares = near_MN.float().mean(dim=1).tolist()
+    meant_modes = [m for m, share in enumerate(meant) if share]
+    clouds = [points_ND[near_MN[m]] for m in meant_modes]
+    means_MD = torch.stack([cloud_ND.mean(dim=0) for cloud_ND in clouds])
+    variances_MD = torch.stack([cloud_ND.square().mean(dim=0) for cloud_ND in clouds]) - means_MD.square()
+    mean_error = (means_MD - MODES_MD[meant_modes]).norm(dim=1).max().item()
+    std_error = (variances_MD.sqrt() / STD - 1).abs().max().item()
+    bars = [SHARE_BARS[share] for share in meant]
+    passes = all(low <= share <= high for share, (low, high) in zip(shares, bars, strict=True))
+    passes = passes and mean_error <= MEAN_BAR and std_error <= STD_BAR
+    return Row(variant, word, meant, shares, mean_error, std_error, passes)
+
+
+def print_rows(rows: list[Row], cpu_s: dict[str, float]) -> None:
+    """A table, a line for each variant and word."""
+    header = [
+        "", "word", "left", "right", "error of means", "error of spreads", "bars", "CPU s",
+    ]  # fmt: skip
+    print_table(
+        header,
+        [
+            [
+                row.variant,
+                row.word,
+                *(f"{share:.1%}" for share in row.shares),
+                f"{row.mean_error:.3f}",
+                f"{row.std_error:.1%}",
+                "met" if row.passes else "missed",
+                f"{cpu_s[row.variant]:.1f}",
+            ]
+            for row in rows
+        ],
+    )
+
+
+if __name__ == "__main__":
+    main()
