@@ -1,5 +1,8 @@
 """What `fdvla` refuses, what it does without, and what follows from flags that are not given."""
 
+import re
+from dataclasses import fields
+from pathlib import Path
 from typing import Any
 
 import pytest
@@ -16,6 +19,7 @@ from fdvla_cases import (
 )
 
 from lerobot_bomb.flags import FlagError
+from lerobot_policy_fdvla.configuration_fdvla import FdvlaConfig
 
 
 @pytest.mark.parametrize(
@@ -114,3 +118,17 @@ def test_an_environment_may_name_no_task(tasks: tuple[str, ...]) -> None:
     batch = make_batch(policy, 2, tasks=tasks)
     assert policy(batch)[0].isfinite()
     assert policy.predict_action_chunk(batch).isfinite().all()
+
+
+def test_the_policys_page_has_every_flag_in_its_table() -> None:
+    page = (Path(__file__).parents[1] / "docs" / "fdvla.md").read_text()
+    table = page.split("## Flags")[1].split("\n## ")[0]
+    listed = {
+        name for row in re.findall(r"^\| (`.*?) \|", table, re.M) for name in re.findall(r"`(\w+\*?)`", row)
+    }
+    flags = {
+        re.sub("^(optimizer|scheduler)_.*", r"\1_*", field.name)
+        for field in fields(FdvlaConfig)
+        if field.name in vars(FdvlaConfig)["__annotations__"]
+    }
+    assert listed == flags
