@@ -5,10 +5,12 @@ from typing import Any
 import pytest
 import torch
 from fdvla_cases import make_batch, make_config, make_policy, rows
-from lerobot.policies.rtc import RTCConfig
+from flow_cases import gaussian_heads
+from lerobot.policies.rtc import RTCConfig, RTCProcessor
 from lerobot.rollout.inference.rtc import supports_rtc_inference
 from torch import Tensor
 
+from lerobot_bomb.flow.real_time import guided
 from lerobot_bomb.flow.samplers import SAMPLERS, sample
 from lerobot_policy_fdvla.modeling_fdvla import FdvlaPolicy
 
@@ -159,6 +161,19 @@ def test_a_new_chunk_goes_on_from_what_is_left() -> None:
     assert (following - left).abs().mean() < 0.1 * (free - left).abs().mean()
     partly = policy.predict_action_chunk(batch, noise, inference_delay=1, prev_chunk_left_over=left[0, :2])
     assert (partly - left)[:, 0].abs().mean() < 0.2 * (free - left)[:, 0].abs().mean()
+
+
+@pytest.mark.parametrize("refine_alpha", [0.3, 1.0])
+def test_guidance_is_not_taken_back(refine_alpha: float) -> None:
+    """Where the heads agree, `residual` is `flow`, guided or not."""
+    heads, noise, left = gaussian_heads(0.0, 0.5), draw(make_policy(), 1), torch.ones(4, 4)
+    processor = RTCProcessor(RTCConfig(execution_horizon=4))
+    flow, residual = (
+        sample(guided(heads, processor, left, 2), noise, sampler=sampler, refine_alpha=refine_alpha)
+        for sampler in ("flow", "residual")
+    )
+    torch.testing.assert_close(residual, flow)
+    assert (flow - left).abs().mean() < 0.5 * (sample(heads, noise) - left).abs().mean()
 
 
 def test_real_time_chunking_needs_a_velocity() -> None:

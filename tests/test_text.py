@@ -6,6 +6,7 @@ import torch
 from lerobot_bomb.actions.text import (
     SYMBOL_TEXTS,
     NumberTokens,
+    TokenRows,
     compact,
     digits_needed,
     draw_hidden,
@@ -105,3 +106,11 @@ def test_the_same_seed_hides_the_same() -> None:
     draws = [draw_hidden(eligible, 0.5, 0.0, torch.Generator().manual_seed(s)) for s in (3, 3, 4)]
     assert torch.equal(draws[0], draws[1])
     assert not torch.equal(draws[0], draws[2])
+
+
+def test_rows_are_rounded_up_with_gaps() -> None:
+    rows = TokenRows(torch.tensor([[4, 5, 6]]), torch.tensor([[True, False, True]]))
+    rounded = rows.rounded(4)
+    assert rounded.ids.shape == (1, 4) and rounded.written.tolist() == [[True, False, True, False]]
+    assert rounded.without_gaps().ids.tolist() == [[4, 6]]
+    assert rounded.rounded(4).ids.shape == (1, 4)

@@ -7,7 +7,7 @@ Shapes: `B` batch, `N` numbers, `W` digits a number may have, `C` = W + 1 column
 from dataclasses import dataclass
 
 import torch
-from torch import Tensor
+from torch import Tensor, nn
 
 NUM_SYMBOLS = 12
 SPACE, END = 10, 11
@@ -109,6 +109,11 @@ class TokenRows:
     @classmethod
     def join(cls, parts: "list[TokenRows]") -> "TokenRows":
         return cls(torch.cat([part.ids for part in parts], 1), torch.cat([part.written for part in parts], 1))
+
+    def rounded(self, multiple: int) -> "TokenRows":
+        """With gaps at the end, up to a multiple of so many columns."""
+        width = -self.ids.shape[1] % multiple
+        return TokenRows(nn.functional.pad(self.ids, (0, width)), nn.functional.pad(self.written, (0, width)))
 
     def without_gaps(self) -> "TokenRows":
         """Rows that start with their tokens."""

@@ -19,7 +19,8 @@ def guided(
 ) -> Heads:
     """The heads with a velocity that leads to the actions not executed yet, (B, K, D) or (K, D), normalised.
 
-    The noise head stays as it is. None left: nothing is changed.
+    The noise goes with it, so that the heads disagree as before: `residual` would take part of the guidance
+    back. None left: nothing is changed.
     """
 
     def guided_heads(actions_BKD: Tensor, tau_B: Tensor) -> tuple[Tensor | None, Tensor | None]:
@@ -39,6 +40,11 @@ def guided(
             original_denoise_step_partial=velocity_to_noise,
             execution_horizon=execution_horizon,
         )
-        return -guided_BKD.detach(), predicted[-1][1]
+        velocity_BKD, noise_BKD = predicted[-1]
+        assert velocity_BKD is not None
+        guided_BKD = -guided_BKD.detach()
+        if noise_BKD is not None:  # a velocity that is larger by d implies a noise that is smaller by tau d
+            noise_BKD = noise_BKD.float() - tau_B[:, None, None] * (guided_BKD - velocity_BKD.float())
+        return guided_BKD, noise_BKD
 
     return guided_heads

@@ -8,6 +8,9 @@ from typing import Any
 import torch
 from torch import Tensor, nn
 
+# columns of text: sentences of any length up to a multiple share what is recorded
+TEXT_COLUMNS = 16
+
 
 @dataclass(frozen=True)
 class _Recording:

@@ -33,7 +33,7 @@ from lerobot_bomb.flow.real_time import guided
 from lerobot_bomb.flow.samplers import SAMPLERS, Heads, sample
 from lerobot_bomb.policy_flags import check_as_trained, trained_with
 from lerobot_bomb.vlm.cached_text import check_positions
-from lerobot_bomb.vlm.graphs import RecordedModel
+from lerobot_bomb.vlm.graphs import TEXT_COLUMNS, RecordedModel
 from lerobot_bomb.vlm.images import draw_windows, resize
 from lerobot_bomb.vlm.inputs import read_actions, read_image, read_tensor
 from lerobot_bomb.vlm.qwen import Prefix
@@ -374,6 +374,8 @@ class FdvlaPolicy(PreTrainedPolicy):
         """Its tokens, and which of them (B, L) are the task's."""
         task_ids_BL = self._of_batch(batch, OBS_LANGUAGE_TOKENS)
         task = TokenRows(task_ids_BL, self._of_batch(batch, OBS_LANGUAGE_ATTENTION_MASK).bool())
+        if task_ids_BL.is_cuda:
+            task = task.rounded(TEXT_COLUMNS)
         head = TokenRows.constant(self._head_ids, task_ids_BL)
         tail = TokenRows.constant(self._tail_ids, task_ids_BL)
         nowhere = [torch.zeros_like(part.written) for part in (head, tail)]

@@ -41,6 +41,7 @@ from lerobot_bomb.vlm.depth import (
     observed_intrinsics,
 )
 from lerobot_bomb.vlm.ego3d import Ego3D
+from lerobot_bomb.vlm.graphs import TEXT_COLUMNS
 from lerobot_bomb.vlm.images import CropWindows, draw_windows, resized_pixels
 from lerobot_bomb.vlm.inputs import read_actions, read_image, read_tensor
 from lerobot_bomb.vlm.intrinsics import crop_intrinsics, default_intrinsics, resize_intrinsics
@@ -318,6 +319,8 @@ class SpatialvlaGridPolicy(PreTrainedPolicy):
         tokens = self.tokens
         task_ids_BL = self._read(batch, OBS_LANGUAGE_TOKENS)
         task = TokenRows(task_ids_BL, self._read(batch, OBS_LANGUAGE_ATTENTION_MASK).bool())
+        if task_ids_BL.is_cuda:
+            task = task.rounded(TEXT_COLUMNS)
         images = len(self._cameras) * self.backbone.tokens_per_image * [tokens.image]
         parts = [TokenRows.constant([*images, *tokens.start], task_ids_BL), task]
         if self.config.use_state:

@@ -39,6 +39,7 @@ from lerobot_bomb.decoding.writer import NumberWriter
 from lerobot_bomb.policy_flags import check_as_trained, trained_with
 from lerobot_bomb.vlm.backbone import SmolVLMBackbone, build_backbone, config_dict, load_backbone
 from lerobot_bomb.vlm.cached_text import check_positions
+from lerobot_bomb.vlm.graphs import TEXT_COLUMNS
 from lerobot_bomb.vlm.images import crop_and_resize
 from lerobot_bomb.vlm.inputs import read_actions, read_image, read_tensor
 from lerobot_bomb.vlm.prompt import PromptTokens
@@ -287,6 +288,8 @@ class Vla0SmolPolicy(PreTrainedPolicy):
         tokens = self.tokens
         task_ids_BL = self._read(batch, OBS_LANGUAGE_TOKENS)
         task = TokenRows(task_ids_BL, self._read(batch, OBS_LANGUAGE_ATTENTION_MASK).bool())
+        if task_ids_BL.is_cuda:
+            task = task.rounded(TEXT_COLUMNS)
         images = len(self._cameras) * [*tokens.image_start, *self._image_span, *tokens.image_end]
         parts = [TokenRows.constant([*tokens.start, *images], task_ids_BL), task]
         if self.config.use_state:

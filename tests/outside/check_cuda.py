@@ -21,8 +21,9 @@ WRITERS = {
     ),
 }
 SAMPLERS = {
+    # near noise ddim divides by tau: what an untrained network is off by is more than all of the actions
     f"fdvla, {sampler}": lambda sampler=sampler, **options: fdvla_cases.make_policy(
-        0, 7, sampler=sampler, **options
+        0, 7, sampler=sampler, denoise_tau_min=0.5, **options
     )
     for sampler in ("residual", "ddim", "sde")
 }
