@@ -98,7 +98,7 @@ class Toy(nn.Module):
         states_BKH = self.segment.of_actions(self.layer(self.segment(actions_BKD, tau_B)))
         pooled_BH = self.words(words_B)
         velocity_BKD, noise_BKD = (
-            None if head is None else head(states_BKH, pooled_BH)
+            None if head is None else head(states_BKH, head.modulation(pooled_BH))
             for head in (self.flow_head, self.denoise_head)
         )
         return velocity_BKD, noise_BKD

@@ -76,7 +76,7 @@ def check_training(config: Any) -> None:
 def check_not_negative(config: Any, flags: Iterable[str]) -> None:
     """Numbers of at least 0."""
     for flag in flags:
-        if getattr(config, flag) < 0:
+        if not getattr(config, flag) >= 0:  # NaN is no number
             raise ValueError(f"--policy.{flag}={getattr(config, flag)} must not be negative")
 
 

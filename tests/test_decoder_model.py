@@ -18,6 +18,7 @@ from lerobot_bomb.decoding.writer import continue_prompt
 from lerobot_bomb.vlm.backbone import SmolVLMBackbone, build_backbone, load_backbone
 from lerobot_bomb.vlm.cached_text import CachedText
 from lerobot_bomb.vlm.presets import nano_config
+from lerobot_bomb.vlm.recordings import Recordings
 from lerobot_bomb.vlm.text_layers import TextLayers
 from lerobot_bomb.vlm.tokenizer import NANO, load_tokenizer
 
@@ -220,6 +221,22 @@ def test_on_a_copy_it_writes_what_the_model_writes_now(backbone: SmolVLMBackbone
                 module.weight.mul_(1.5)
         layers.refresh()
     assert answers[0] != ours(changing, prompts(changing, 0, LENGTHS), SYMBOL_IDS, drafted=True)
+
+
+@torch.no_grad()
+def test_what_was_recorded_is_forgotten_when_the_model_gets_other_modules(backbone: SmolVLMBackbone) -> None:
+    changing = copy.deepcopy(backbone)
+    model: Any = changing.vlm.model.text_model
+    recordings = Recordings[CachedText](model)
+    prompt_BLH = torch.zeros(1, 8, model.config.hidden_size)
+    first = recordings.find(prompt_BLH, 4, lambda text: text)
+    assert recordings.find(prompt_BLH, 4, lambda text: text) is first
+    assert recordings.find(prompt_BLH, 5, lambda text: text) is not first
+    model.layers[0].mlp = torch.nn.Sequential(model.layers[0].mlp)[0]
+    assert recordings.find(prompt_BLH, 4, lambda text: text) is first  # the same modules
+    model.layers[0].mlp = copy.deepcopy(model.layers[0].mlp)
+    assert recordings.find(prompt_BLH, 4, lambda text: text) is not first
+    assert not vars(copy.deepcopy(recordings))["_made"]
 
 
 def test_an_answer_longer_than_the_models_positions_is_refused(backbone: SmolVLMBackbone) -> None:

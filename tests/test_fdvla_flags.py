@@ -33,6 +33,15 @@ from lerobot_policy_fdvla.configuration_fdvla import FdvlaConfig
         ({**DENOISE_ONLY, "sampler": "flow"}, "--policy.sampler=flow .* but use_flow_head is off"),
         ({**FLOW_ONLY, "consistency_loss_weight": 0.1}, "--policy.consistency_loss_weight=0.1 compares both"),
         ({"consistency_loss_weight": -1.0}, "--policy.consistency_loss_weight=-1.0 must not be negative"),
+        (
+            {"consistency_loss_weight": float("nan")},
+            "--policy.consistency_loss_weight=nan must not",
+        ),
+        ({"flow_loss_weight": float("nan")}, "--policy.flow_loss_weight=nan must not be negative"),
+        (
+            {"consistency": "energy_vjp", "gradient_checkpointing": True},
+            "consistency=energy_vjp takes",
+        ),
         ({"flow_loss_weight": -1.0}, "--policy.flow_loss_weight=-1.0 must not be negative"),
         ({"refine_alpha": 1.5}, r"--policy.refine_alpha=1.5 must lie in \[0, 1\]"),
         ({"refine_alpha": -0.1}, "--policy.refine_alpha=-0.1"),

@@ -24,10 +24,6 @@ class Place:
         index_B1 = index_B[:, None]
         return Place(self.prefix.gather(1, index_B1)[:, 0], self.number.gather(1, index_B1)[:, 0])
 
-    def keep(self, row_B: Tensor) -> "Place":
-        """Those of these rows."""
-        return Place(self.prefix[row_B], self.number[row_B])
-
 
 class NumberGrammar(nn.Module):
     """Transition tables of answers of ``num_numbers`` numbers.

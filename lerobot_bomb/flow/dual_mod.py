@@ -14,6 +14,11 @@ def masked_mean_pool(states_BTR: Tensor, kept_BT: Tensor) -> Tensor:
     return (states_BTR * kept_BT1).sum(dim=1) / kept_BT1.sum(dim=1).clamp(min=1)
 
 
+def modulate(features_BKH: Tensor, gamma_B1H: Tensor, beta_B1H: Tensor) -> Tensor:
+    """Features scaled and shifted, (B, K, H)."""
+    return gamma_B1H * features_BKH + beta_B1H
+
+
 class FiLM(nn.Module):
     """gamma * h + beta, with gamma and beta (B, H) from pooled states (B, R), the same for all action steps.
 
@@ -37,5 +42,4 @@ class FiLM(nn.Module):
         return gamma_B1H, beta_B1H
 
     def forward(self, features_BKH: Tensor, pooled_BR: Tensor) -> Tensor:
-        gamma_B1H, beta_B1H = self.coefficients(pooled_BR)
-        return gamma_B1H * features_BKH + beta_B1H
+        return modulate(features_BKH, *self.coefficients(pooled_BR))

@@ -5,8 +5,12 @@ optimum of the others. It replaces equations 5 to 7 of FDVLA, which equate a Jac
 Shapes: `B` batch, `K` action steps, `D` action dims.
 """
 
+from collections.abc import Iterator
+from contextlib import contextmanager
+
 import torch
 from torch import Tensor
+from torch.nn.attention import SDPBackend, sdpa_kernel
 
 from lerobot_bomb.flags import one_of
 from lerobot_bomb.flow.path import PathPoint
@@ -125,3 +129,13 @@ def joint_loss(
         loss = loss + weight * masked_mean(error_BKD.square(), kept_BK, reduction)
         metrics[name] = masked_mean(error_BKD.detach().square(), kept_BK)
     return loss, metrics
+
+
+@contextmanager
+def second_derivatives(enabled: bool) -> Iterator[None]:
+    """Let attention be differentiated twice, which its fused kernels cannot be."""
+    if not enabled:
+        yield
+        return
+    with torch.enable_grad(), sdpa_kernel(SDPBackend.MATH):
+        yield

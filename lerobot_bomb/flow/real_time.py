@@ -4,6 +4,7 @@ LeRobot's time runs from 1 (noise) to 0 (actions), and its velocity points to th
 Shapes: `B` batch, `K` action steps, `D` action dims.
 """
 
+import torch
 from lerobot.policies.rtc import RTCProcessor
 from torch import Tensor
 
@@ -27,7 +28,8 @@ def guided(
         predicted: list[tuple[Tensor | None, Tensor | None]] = []
 
         def velocity_to_noise(actions_BKD: Tensor) -> Tensor:
-            predicted.append(heads(actions_BKD, tau_B))
+            with torch.no_grad():  # the guidance is a gradient with respect to the actions alone
+                predicted.append(heads(actions_BKD, tau_B))
             velocity_BKD, _ = predicted[-1]
             assert velocity_BKD is not None
             return -velocity_BKD.float()

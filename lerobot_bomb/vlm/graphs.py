@@ -30,9 +30,10 @@ class Recorded:
     def __init__(self, function: Callable[..., tuple[Tensor, ...]]):
         self._function = function
         self._recordings: dict[Any, _Recording] = {}
+        self._pool: Any = None  # memory of all recordings, which take turns
 
     def __getstate__(self) -> dict[str, Any]:
-        return {"_function": self._function, "_recordings": {}}
+        return {"_function": self._function, "_recordings": {}, "_pool": None}
 
     def __call__(self, *tensors: Tensor) -> tuple[Tensor, ...]:
         """What the function returns for these; call it outside of inference mode."""
@@ -58,8 +59,9 @@ class Recorded:
         torch.cuda.current_stream().wait_stream(stream)
         graph = torch.cuda.CUDAGraph()
         # other threads, such as those of a data loader, may go on
-        with torch.cuda.graph(graph, capture_error_mode="thread_local"):
+        with torch.cuda.graph(graph, self._pool, capture_error_mode="thread_local"):
             returned = self._function(*taken)
+        self._pool = graph.pool()
         return _Recording(graph, taken, returned)
 
 
@@ -77,7 +79,8 @@ class RecordedModel:
 
     def __call__(self, settings: Any, *tensors: Tensor) -> tuple[Tensor, ...]:
         """What the function returns; ``settings``: whatever else it reads."""
-        state = settings, [parameter.data_ptr() for parameter in self._call.parameters()]
+        read = [*self._call.parameters(), *self._call.buffers()]
+        state = settings, [tensor.data_ptr() for tensor in read]
         if state != self._state:
             self._state, self._recorded = state, Recorded(self._run)
         return self._recorded(*tensors)

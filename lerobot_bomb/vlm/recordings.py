@@ -4,7 +4,7 @@ from collections.abc import Callable
 from typing import Any
 
 import torch
-from torch import Tensor
+from torch import Tensor, nn
 
 from lerobot_bomb.vlm.cached_text import CachedText
 from lerobot_bomb.vlm.text_layers import TextLayers
@@ -19,14 +19,22 @@ class Recordings[T]:
     def __init__(self, text_model: Any, first_position: int = 0, *, compiled: bool = False):
         """``compiled``: layers by `torch.compile`, which fuses what is not a product."""
         self._text_model, self._first_position, self._compiled = text_model, first_position, compiled
+        self._forget()
+
+    def __getstate__(self) -> dict[str, Any]:
+        return {**vars(self), "_modules": [], "_layers": {}, "_made": {}}
+
+    def _forget(self) -> None:
+        self._modules: list[nn.Module] = []
         self._layers: dict[Any, TextLayers] = {}
         self._made: dict[Any, T] = {}
 
-    def __getstate__(self) -> dict[str, Any]:
-        return {**vars(self), "_layers": {}, "_made": {}}
-
     def find(self, prompt_BLH: Tensor, num_new: int, make: Callable[[CachedText], T]) -> T:
         """What was made for such prompts and so many new tokens, with the weights that the model has now."""
+        modules = list(self._text_model.modules())
+        if modules != self._modules:  # such as an adapter that was added
+            self._forget()
+            self._modules = modules
         device = prompt_BLH.device
         cast = torch.is_autocast_enabled(device.type)
         dtype = torch.get_autocast_dtype(device.type) if cast else prompt_BLH.dtype

@@ -182,8 +182,18 @@ class FdvlaConfig(PreTrainedConfig):
         check_objective(self.consistency, self.consistency_detach, self.used_consistency_weight, *heads)
         check_sampling(**self.sampling())
         check_heads(self.used_sampler, *heads)
-        if self.used_consistency_weight < 0:
+        if not self.used_consistency_weight >= 0:
             raise ValueError(f"consistency_loss_weight={self.consistency_loss_weight} must not be negative")
+        if self.has_energy and self.gradient_checkpointing:
+            raise ValueError(
+                "consistency=energy_vjp takes second derivatives, which --policy.gradient_checkpointing=true "
+                "cannot compute again; give one of them up"
+            )
+
+    @property
+    def has_energy(self) -> bool:
+        """Whether the loss has a term that takes second derivatives."""
+        return self.consistency == "energy_vjp" and self.used_consistency_weight > 0
 
     def sampling(self) -> dict[str, Any]:
         """Options of `lerobot_bomb.flow.samplers.sample`."""

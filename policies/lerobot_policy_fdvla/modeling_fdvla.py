@@ -8,8 +8,7 @@ Shapes: `B` batch, `K` actions of a chunk, `D` action dims, `L` tokens of a prom
 
 import logging
 from collections import deque
-from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import partial
 from typing import ClassVar
@@ -20,14 +19,13 @@ from lerobot.policies import PreTrainedPolicy
 from lerobot.policies.rtc import RTCProcessor
 from lerobot.utils.constants import ACTION, OBS_LANGUAGE_ATTENTION_MASK, OBS_LANGUAGE_TOKENS, OBS_STATE
 from torch import Tensor, nn
-from torch.nn.attention import SDPBackend, sdpa_kernel
 
 from lerobot_bomb.actions.accuracy import means
 from lerobot_bomb.actions.relative import bounds
 from lerobot_bomb.actions.text import TokenRows
 from lerobot_bomb.data.columns import dim_names
 from lerobot_bomb.flow.dual_mod import masked_mean_pool
-from lerobot_bomb.flow.losses import joint_loss
+from lerobot_bomb.flow.losses import joint_loss, second_derivatives
 from lerobot_bomb.flow.path import PathPoint, draw_noise, draw_tau, path_point
 from lerobot_bomb.flow.real_time import guided
 from lerobot_bomb.flow.samplers import SAMPLERS, Heads, sample
@@ -164,9 +162,9 @@ class FdvlaPolicy(PreTrainedPolicy):
         actions_BKD = self._actions(batch).repeat_interleave(draws, dim=0)
         kept_BK = self._kept(batch).repeat_interleave(draws, dim=0)
         point = self._draw_point(actions_BKD)
-        has_energy = self.config.consistency == "energy_vjp" and self.config.used_consistency_weight > 0
-        with self._autocast(), second_derivatives(has_energy):
-            point.actions.requires_grad_(has_energy)
+        with self._autocast(), second_derivatives(self.config.has_energy):
+            if self.config.has_energy:
+                point.actions.requires_grad_()
             heads = self._heads(self._read(batch).repeated(draws), kept_BK)
             velocity_BKD, noise_BKD = heads(point.actions, point.tau)
             loss, terms = joint_loss(
@@ -249,7 +247,6 @@ class FdvlaPolicy(PreTrainedPolicy):
             self._queue.extend(chunk_BKD[:, : self.config.n_action_steps].unbind(dim=1))
         return self._queue.popleft()
 
-    @torch.no_grad()
     def predict_action_chunk(
         self,
         batch: dict[str, Tensor],
@@ -266,7 +263,8 @@ class FdvlaPolicy(PreTrainedPolicy):
         the last chunk that are not executed yet, and how many will be when this one arrives.
         """
         self.eval()
-        with self._autocast():
+        # real-time chunking takes gradients, and what is recorded is written over
+        with torch.inference_mode(False), torch.no_grad(), self._autocast():
             context = self._read(batch)
             shape = len(context.pooled), self.config.chunk_size, self._action_dim
             noises = self._noise(noise, shape), self._step_noise(shape)
@@ -275,10 +273,8 @@ class FdvlaPolicy(PreTrainedPolicy):
                 heads = guided(heads, self.rtc_processor, prev_chunk_left_over, delay, execution_horizon)
                 actions_BKD = self._denoise(heads, *noises)
             elif self.action_unit.is_cuda:
-                with torch.inference_mode(False), torch.no_grad():
-                    actions_BKD = self._recorded(self.config.sampling(), *noises, *context.tensors())[
-                        0
-                    ].clone()
+                recorded = self._recorded(self.config.sampling(), *noises, *context.tensors())
+                actions_BKD = recorded[0].clone()
             else:
                 actions_BKD = self._sample(*noises, *context.tensors())[0]
         # casts of weights cached under inference mode cannot be used by a later training step
@@ -298,7 +294,7 @@ class FdvlaPolicy(PreTrainedPolicy):
             return self._draw(shape[0], shape[1:])
         if given.shape != shape:
             raise ValueError(f"noise has shape {tuple(given.shape)}; expected {shape} (batch, chunk, dims)")
-        return given
+        return given.to(self.action_unit.device)
 
     def _step_noise(self, shape: tuple[int, int, int]) -> Tensor:
         """(B, N, K, D) for ``sde``, none of it for others."""
@@ -438,13 +434,3 @@ class FdvlaPolicy(PreTrainedPolicy):
         """The precision of ``config.dtype``, whoever calls: training, evaluation or a user's own loop."""
         bfloat16 = self.config.dtype == "bfloat16"
         return torch.autocast(self.action_unit.device.type, dtype=torch.bfloat16, enabled=bfloat16)
-
-
-@contextmanager
-def second_derivatives(enabled: bool) -> Iterator[None]:
-    """Let attention be differentiated twice, which its fused kernels cannot be."""
-    if not enabled:
-        yield
-        return
-    with torch.enable_grad(), sdpa_kernel(SDPBackend.MATH):
-        yield

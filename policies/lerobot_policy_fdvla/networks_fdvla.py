@@ -9,7 +9,7 @@ import math
 import torch
 from torch import Tensor, nn
 
-from lerobot_bomb.flow.dual_mod import FiLM
+from lerobot_bomb.flow.dual_mod import FiLM, modulate
 
 NUM_MARKS = 3  # tokens of a segment that are no action: its begin, the time, its end
 TIME_SIZE = 256
@@ -73,8 +73,7 @@ class Head(nn.Module):
         """(B, K, H) states, and what `modulation` gave for the prompt -> (B, K, D)."""
         features_BKF = self.features(states_BKH)
         if modulation is not None:
-            gamma_B1F, beta_B1F = modulation
-            features_BKF = gamma_B1F * features_BKF + beta_B1F
+            features_BKF = modulate(features_BKF, *modulation)
         return self.out(features_BKF)
 
     def modulation(self, pooled_BH: Tensor) -> tuple[Tensor, Tensor] | None:

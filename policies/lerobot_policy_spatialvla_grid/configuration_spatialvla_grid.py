@@ -126,7 +126,7 @@ class SpatialvlaGridConfig(PreTrainedConfig):
     # "bfloat16" = autocast over float32 weights, in training and in evaluation
     dtype: str = "float32"
     gradient_checkpointing: bool = False
-    # answers on CUDA by `torch.compile`: a minute at first, then faster
+    # answers on CUDA by `torch.compile`: some ten seconds for every size of batch, then faster
     compile_model: bool = False
     # values of AS_TRAINED; filled in for checkpoints
     trained_with: dict[str, Any] | None = None
