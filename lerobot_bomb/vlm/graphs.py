@@ -8,9 +8,6 @@ from typing import Any
 import torch
 from torch import Tensor, nn
 
-# columns of text: sentences of any length up to a multiple share what is recorded
-TEXT_COLUMNS = 16
-
 
 @dataclass(frozen=True)
 class _Recording:

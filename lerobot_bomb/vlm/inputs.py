@@ -1,7 +1,13 @@
 """Reading a batch, with errors that say what is amiss."""
 
 import torch
+from lerobot.utils.constants import OBS_LANGUAGE_ATTENTION_MASK, OBS_LANGUAGE_TOKENS
 from torch import Tensor
+
+from lerobot_bomb.actions.text import TokenRows
+
+# on CUDA, sentences of any length up to a multiple share what is recorded
+TEXT_COLUMNS = 16
 
 
 def read_tensor(batch: dict[str, Tensor], key: str, policy_type: str, device: torch.device) -> Tensor:
@@ -22,6 +28,16 @@ def read_image(batch: dict[str, Tensor], key: str, policy_type: str, device: tor
             f"in [0, 1] of shape (batch, 3, height, width)"
         )
     return image_B3HW
+
+
+def read_task(batch: dict[str, Tensor], policy_type: str, device: torch.device) -> TokenRows:
+    """The sentences' tokens, with gaps."""
+    ids_BL, mask_BL = (
+        read_tensor(batch, key, policy_type, device)
+        for key in (OBS_LANGUAGE_TOKENS, OBS_LANGUAGE_ATTENTION_MASK)
+    )
+    task = TokenRows(ids_BL, mask_BL.bool())
+    return task.rounded(TEXT_COLUMNS) if ids_BL.is_cuda else task
 
 
 def read_actions(

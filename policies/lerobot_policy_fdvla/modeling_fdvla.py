@@ -17,7 +17,7 @@ import torch
 from lerobot.datasets import LeRobotDatasetMetadata
 from lerobot.policies import PreTrainedPolicy
 from lerobot.policies.rtc import RTCProcessor
-from lerobot.utils.constants import ACTION, OBS_LANGUAGE_ATTENTION_MASK, OBS_LANGUAGE_TOKENS, OBS_STATE
+from lerobot.utils.constants import ACTION, OBS_STATE
 from torch import Tensor, nn
 
 from lerobot_bomb.actions.accuracy import means
@@ -31,9 +31,9 @@ from lerobot_bomb.flow.real_time import guided
 from lerobot_bomb.flow.samplers import SAMPLERS, Heads, sample
 from lerobot_bomb.policy_flags import check_as_trained, trained_with
 from lerobot_bomb.vlm.cached_text import check_positions
-from lerobot_bomb.vlm.graphs import TEXT_COLUMNS, RecordedModel
+from lerobot_bomb.vlm.graphs import RecordedModel
 from lerobot_bomb.vlm.images import draw_windows, resize
-from lerobot_bomb.vlm.inputs import read_actions, read_image, read_tensor
+from lerobot_bomb.vlm.inputs import read_actions, read_image, read_task, read_tensor
 from lerobot_bomb.vlm.qwen import Prefix
 from lerobot_policy_fdvla.building_fdvla import build_model
 from lerobot_policy_fdvla.configuration_fdvla import AS_TRAINED, FdvlaConfig
@@ -368,12 +368,9 @@ class FdvlaPolicy(PreTrainedPolicy):
 
     def _prompt(self, batch: dict[str, Tensor]) -> tuple[TokenRows, Tensor]:
         """Its tokens, and which of them (B, L) are the task's."""
-        task_ids_BL = self._of_batch(batch, OBS_LANGUAGE_TOKENS)
-        task = TokenRows(task_ids_BL, self._of_batch(batch, OBS_LANGUAGE_ATTENTION_MASK).bool())
-        if task_ids_BL.is_cuda:
-            task = task.rounded(TEXT_COLUMNS)
-        head = TokenRows.constant(self._head_ids, task_ids_BL)
-        tail = TokenRows.constant(self._tail_ids, task_ids_BL)
+        task = read_task(batch, self.config.type, self.action_unit.device)
+        head = TokenRows.constant(self._head_ids, task.ids)
+        tail = TokenRows.constant(self._tail_ids, task.ids)
         nowhere = [torch.zeros_like(part.written) for part in (head, tail)]
         is_task_BL = torch.cat([nowhere[0], task.written, nowhere[1]], dim=1)
         return TokenRows.join([head, task, tail]), is_task_BL

@@ -17,8 +17,6 @@ from lerobot.policies import PreTrainedPolicy
 from lerobot.utils.constants import (
     ACTION,
     OBS_IMAGES,
-    OBS_LANGUAGE_ATTENTION_MASK,
-    OBS_LANGUAGE_TOKENS,
     OBS_STATE,
 )
 from torch import Tensor, nn
@@ -41,9 +39,8 @@ from lerobot_bomb.vlm.depth import (
     observed_intrinsics,
 )
 from lerobot_bomb.vlm.ego3d import Ego3D
-from lerobot_bomb.vlm.graphs import TEXT_COLUMNS
 from lerobot_bomb.vlm.images import CropWindows, draw_windows, resized_pixels
-from lerobot_bomb.vlm.inputs import read_actions, read_image, read_tensor
+from lerobot_bomb.vlm.inputs import read_actions, read_image, read_task, read_tensor
 from lerobot_bomb.vlm.intrinsics import crop_intrinsics, default_intrinsics, resize_intrinsics
 from lerobot_bomb.vlm.paligemma import (
     FIRST_POSITION,
@@ -317,20 +314,17 @@ class SpatialvlaGridPolicy(PreTrainedPolicy):
     def _prompt(self, batch: dict[str, Tensor]) -> TokenRows:
         """Everything before the answer, with gaps; its last column has none."""
         tokens = self.tokens
-        task_ids_BL = self._read(batch, OBS_LANGUAGE_TOKENS)
-        task = TokenRows(task_ids_BL, self._read(batch, OBS_LANGUAGE_ATTENTION_MASK).bool())
-        if task_ids_BL.is_cuda:
-            task = task.rounded(TEXT_COLUMNS)
+        task = read_task(batch, self.config.type, self.symbol_ids.device)
         images = len(self._cameras) * self.backbone.tokens_per_image * [tokens.image]
-        parts = [TokenRows.constant([*images, *tokens.start], task_ids_BL), task]
+        parts = [TokenRows.constant([*images, *tokens.start], task.ids), task]
         if self.config.use_state:
             numbers_BN = self.state_bins.encode(self._read(batch, OBS_STATE))
             symbols_BNC, written_BNC = number_symbols(
                 numbers_BN, digits_needed(NUM_STATE_BINS), zero_padded=False
             )
             state = TokenRows(self.symbol_ids[symbols_BNC].flatten(1), written_BNC.flatten(1))
-            parts += [TokenRows.constant(tokens.state_start, task_ids_BL), state]
-        return TokenRows.join([*parts, TokenRows.constant(tokens.task_end, task_ids_BL)])
+            parts += [TokenRows.constant(tokens.state_start, task.ids), state]
+        return TokenRows.join([*parts, TokenRows.constant(tokens.task_end, task.ids)])
 
     def _embeds(self, batch: dict[str, Tensor], ids_BL: Tensor) -> Tensor:
         """Embeddings (B, L, H) of a prompt, image features in place."""

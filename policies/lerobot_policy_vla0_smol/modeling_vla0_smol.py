@@ -12,7 +12,7 @@ from typing import ClassVar
 import torch
 from lerobot.datasets import LeRobotDatasetMetadata
 from lerobot.policies import PreTrainedPolicy
-from lerobot.utils.constants import ACTION, OBS_LANGUAGE_ATTENTION_MASK, OBS_LANGUAGE_TOKENS, OBS_STATE
+from lerobot.utils.constants import ACTION, OBS_STATE
 from torch import Tensor
 from torch.nn.functional import cross_entropy
 
@@ -39,9 +39,8 @@ from lerobot_bomb.decoding.writer import NumberWriter
 from lerobot_bomb.policy_flags import check_as_trained, trained_with
 from lerobot_bomb.vlm.backbone import SmolVLMBackbone, build_backbone, config_dict, load_backbone
 from lerobot_bomb.vlm.cached_text import check_positions
-from lerobot_bomb.vlm.graphs import TEXT_COLUMNS
 from lerobot_bomb.vlm.images import crop_and_resize
-from lerobot_bomb.vlm.inputs import read_actions, read_image, read_tensor
+from lerobot_bomb.vlm.inputs import read_actions, read_image, read_task, read_tensor
 from lerobot_bomb.vlm.prompt import PromptTokens
 from lerobot_bomb.vlm.tokenizer import load_tokenizer
 from lerobot_policy_vla0_smol.configuration_vla0_smol import AS_TRAINED, Vla0SmolConfig
@@ -286,22 +285,19 @@ class Vla0SmolPolicy(PreTrainedPolicy):
     def _prompt(self, batch: dict[str, Tensor]) -> TokenRows:
         """Everything up to ``Assistant:``, with gaps."""
         tokens = self.tokens
-        task_ids_BL = self._read(batch, OBS_LANGUAGE_TOKENS)
-        task = TokenRows(task_ids_BL, self._read(batch, OBS_LANGUAGE_ATTENTION_MASK).bool())
-        if task_ids_BL.is_cuda:
-            task = task.rounded(TEXT_COLUMNS)
+        task = read_task(batch, self.config.type, self.symbol_ids.device)
         images = len(self._cameras) * [*tokens.image_start, *self._image_span, *tokens.image_end]
-        parts = [TokenRows.constant([*tokens.start, *images], task_ids_BL), task]
+        parts = [TokenRows.constant([*tokens.start, *images], task.ids), task]
         if self.config.use_state:
             state = self._to_tokens(
                 self.state_bins.encode(self._read(batch, OBS_STATE)), self.config.n_state_bins
             )
             parts += [
-                TokenRows.constant(tokens.state_start, task_ids_BL),
+                TokenRows.constant(tokens.state_start, task.ids),
                 TokenRows(state.ids.flatten(1), state.written.flatten(1)),
-                TokenRows.constant(tokens.state_end, task_ids_BL),
+                TokenRows.constant(tokens.state_end, task.ids),
             ]
-        return TokenRows.join([*parts, TokenRows.constant(tokens.answer_start, task_ids_BL)])
+        return TokenRows.join([*parts, TokenRows.constant(tokens.answer_start, task.ids)])
 
     def _to_tokens(self, numbers_BN: Tensor, num_values: int) -> NumberTokens:
         fixed_width = self.config.number_width
