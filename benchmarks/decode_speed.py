@@ -1,6 +1,6 @@
 """Writing an answer: ours against transformers' `generate` with xgrammar's logits processor.
 
-    OMP_NUM_THREADS=1 python benchmarks/decode_speed.py --policy.path=CHECKPOINT \
+    python benchmarks/decode_speed.py --policy.path=CHECKPOINT \
         --dataset.repo_id=USER/pusht --dataset.root=pusht --json decode_speed.json
 
 Both have the same weights, read the same prompt embeddings and must write the same numbers. The prompts are

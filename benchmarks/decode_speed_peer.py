@@ -11,8 +11,7 @@ from torch import Tensor
 from transformers.cache_utils import DynamicCache
 from xgrammar.contrib.hf import LogitsProcessor
 
-from lerobot_bomb.actions.text import END, SYMBOL_TEXTS
-from lerobot_bomb.decoding.decoder import read_answer
+from lerobot_bomb.actions.text import END, SPACE, SYMBOL_TEXTS
 from lerobot_bomb.decoding.grammar import NumberGrammar
 from lerobot_bomb.vlm.backbone import SmolVLMBackbone
 from lerobot_bomb.vlm.cached_text import CachedText
@@ -53,6 +52,17 @@ class XgrammarGenerate:
         )
         symbols_BA = (ids_BA[..., None] == self._symbol_ids).long().argmax(dim=-1)
         return read_answer(symbols_BA, self._grammar.num_numbers), symbols_BA.shape[1]
+
+
+def read_answer(symbol_BA: Tensor, num_numbers: int) -> Tensor:
+    """(B, num_numbers) the first numbers that rows of symbols spell, the first symbol being a space."""
+    is_digit_BA = symbol_BA < SPACE
+    column_A = torch.arange(symbol_BA.shape[1], device=symbol_BA.device)
+    end_BA = torch.where(is_digit_BA, len(column_A), column_A).flip(1).cummin(dim=1).values.flip(1)
+    value_BA = torch.where(is_digit_BA, symbol_BA * 10 ** (end_BA - 1 - column_A).clamp(min=0), 0)
+    number_BA = ((~is_digit_BA).cumsum(dim=1) - 1).clamp(max=num_numbers)
+    sums_BN = symbol_BA.new_zeros(len(symbol_BA), num_numbers + 1).scatter_add(1, number_BA, value_BA)
+    return sums_BN[:, :num_numbers]
 
 
 def _padded_left(embeds_BLH: Tensor, written_BL: Tensor) -> tuple[Tensor, Tensor]:

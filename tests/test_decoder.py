@@ -17,7 +17,6 @@ from lerobot_bomb.decoding.decoder import (
     Progress,
     decode_numbers,
     pick,
-    read_answer,
     write,
 )
 from lerobot_bomb.decoding.draft import KnownSymbols, LinearDraft
@@ -137,8 +136,11 @@ def test_as_many_guesses_are_asked_for_as_come_true() -> None:
         return torch.where(place.number[:, None] < 20, guess_BG, 3)
 
     decode(Ear(" 7" * 40 + "#"), grammar, 1, guess=guess)
-    assert asked[:4] == [FIRST_GUESSES, 9, MAX_GUESSES, MAX_GUESSES]
+    assert asked[:4] == [FIRST_GUESSES, 9, 19, MAX_GUESSES]
     assert set(asked[5:]) == {1}
+    asked.clear()
+    decode(Ear(" 7" * 40 + "#"), grammar, 1, guess=guess, stop_after=2)
+    assert asked == [3]  # of `` 7 7 `` the first space is given, and one symbol is no guess
 
 
 def test_stopping_early_gives_the_first_numbers() -> None:
@@ -252,8 +254,3 @@ def test_a_device_that_the_host_runs_ahead_of_writes_the_same(drafted: bool) -> 
             if progress.is_done(grammar, stop).all()
         )
         assert decoded.num_passes == next(needed) + 1
-
-
-def test_answers_are_read_to_the_wanted_number() -> None:
-    symbols = torch.tensor([[10, 1, 2, 10, 0, 10, 9, 9, 9], [10, 7, 10, 8, 11, 11, 11, 11, 11]])
-    assert read_answer(symbols, 2).tolist() == [[12, 0], [7, 8]]

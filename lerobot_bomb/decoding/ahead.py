@@ -10,18 +10,18 @@ from torch import Tensor
 from torch.nn.functional import embedding, linear
 
 from lerobot_bomb.decoding.decoder import (
-    MAX_GUESSES,
     CachedContinuation,
     Decoded,
     Guess,
     Progress,
     Prompt,
-    read_answer,
     write,
 )
 from lerobot_bomb.decoding.grammar import NumberGrammar
 from lerobot_bomb.vlm.cached_text import CachedText
 from lerobot_bomb.vlm.graphs import Recorded
+
+NUM_GUESSES = 16  # of every pass
 
 
 class RecordedAnswers:
@@ -59,7 +59,7 @@ class RecordedAnswers:
 
     def _write(self, length_B: Tensor, *progress: Tensor, prompt: Prompt | None = None) -> tuple[Tensor, ...]:
         model = CachedContinuation(self._text, self._embed, self._head, length_B, prompt)
-        return tuple(write(model, self._grammar, self._guess, Progress(*progress), MAX_GUESSES)[0])
+        return tuple(write(model, self._grammar, self._guess, Progress(*progress), NUM_GUESSES)[0])
 
     def _embed(self, symbols: Tensor) -> Tensor:
         return embedding(symbols, self._embeds_SH)
@@ -73,7 +73,7 @@ def decode_ahead(passes: Iterator[Progress], grammar: NumberGrammar, stop_after:
     was_done = None
     for num_passes, progress in enumerate(passes, 1):
         if was_done is not None and was_done():
-            return Decoded(read_answer(progress.symbols, stop_after), num_passes)
+            return Decoded(progress.answer(grammar)[:, :stop_after], num_passes)
         was_done = _fetch(progress.is_done(grammar, stop_after).all())
     raise AssertionError("an answer has an end")
 

@@ -5,8 +5,8 @@ each. As far as the guesses are these choices they are right, and so is the firs
 guess: what is written is what one symbol a pass would write (speculative decoding, arXiv 2211.17192, for
 greedy choices). Rows get on differently far in a pass, and leave the batch when they are done.
 
-Shapes: `B` batch, `S` symbols, `A` columns of a row of symbols (the longest answer's and some to spare), `N`
-numbers, `L` tokens of a prompt, `H` hidden size, `G` guesses, `K` = 1 + G.
+Shapes: `B` batch, `S` symbols, `N` numbers, `L` tokens of a prompt, `H` hidden size, `G` guesses,
+`K` = 1 + G.
 """
 
 from collections.abc import Callable
@@ -16,15 +16,15 @@ from typing import NamedTuple, Protocol
 import torch
 from torch import Tensor
 
-from lerobot_bomb.actions.text import END, SPACE
+from lerobot_bomb.actions.text import SPACE
 from lerobot_bomb.decoding.grammar import NumberGrammar, Place
 from lerobot_bomb.vlm.cached_text import CachedText
 
-# (B, A) symbols written, END beyond, and where each row stands -> (B, G) guesses of what comes next, at most
+# (B, N) numbers that are complete, and where each row stands -> (B, G) guesses of what comes next, at most
 # MAX_GUESSES
 Guess = Callable[[Tensor, Place], Tensor]
 
-MAX_GUESSES = 16
+MAX_GUESSES = 24
 # where wrong ones cost time: how many are asked for in the first pass, which also reads the prompt
 FIRST_GUESSES = 4
 
@@ -82,7 +82,8 @@ class CachedContinuation(Continuation):
 class Progress(NamedTuple):
     """How far rows of symbols are written."""
 
-    symbols: Tensor  # (B, A) int64, END beyond what is written
+    numbers: Tensor  # (B, N) int64 those that are complete, else 0
+    last: Tensor  # (B,) int64, the symbol written last
     num_symbols: Tensor  # (B,) int64
     prefix: Tensor  # (B,) int64, of a `Place`
     number: Tensor  # (B,) int64, of a `Place`
@@ -91,10 +92,9 @@ class Progress(NamedTuple):
     def start(cls, grammar: NumberGrammar, batch_size: int) -> "Progress":
         """The space that every answer begins with is written."""
         place = grammar.start(batch_size)
-        num_columns = grammar.max_symbols(grammar.num_numbers) + MAX_GUESSES + 1
-        symbols_BA = place.prefix.new_full((batch_size, num_columns), END)
-        symbols_BA[:, 0] = SPACE
-        return cls(symbols_BA, torch.ones_like(place.prefix), place.prefix, place.number)
+        numbers_BN = place.prefix.new_zeros(batch_size, grammar.num_numbers)
+        ones_B = torch.ones_like(place.prefix)
+        return cls(numbers_BN, SPACE * ones_B, ones_B, place.prefix, place.number)
 
     @property
     def place(self) -> Place:
@@ -104,6 +104,10 @@ class Progress(NamedTuple):
         """(B,) whether so many numbers are written."""
         complete_B = (self.number == num_numbers - 1) & grammar.must_end[self.prefix]
         return complete_B | (self.number >= num_numbers) | (self.prefix == grammar.DONE)
+
+    def answer(self, grammar: NumberGrammar) -> Tensor:
+        """(B, N) the numbers, with the one that stands where rows are."""
+        return self.numbers.scatter_add(1, self.number[:, None], grammar.value[self.prefix][:, None])
 
     def keep(self, row_B: Tensor) -> "Progress":
         """Those of these rows."""
@@ -128,22 +132,22 @@ def write(
     model: Continuation, grammar: NumberGrammar, guess: Guess, progress: Progress, num_guesses: int
 ) -> tuple[Progress, Tensor]:
     """One pass: further progress, and (B,) how many guesses were right."""
-    symbols_BA, num_written_B, place = progress.symbols, progress.num_symbols, progress.place
-    max_symbols = grammar.max_symbols(grammar.num_numbers)
-    guess_BG = guess(symbols_BA, place)[:, :num_guesses]
-    columns_A = torch.arange(symbols_BA.shape[1], device=symbols_BA.device)
-    columns_BK = num_written_B[:, None] + columns_A[: guess_BG.shape[1] + 1]
-    last_B1 = symbols_BA.gather(1, columns_BK[:, :1] - 1)
-    logits_BKS = model(torch.cat([last_B1, guess_BG], dim=1), num_written_B - 1)
+    place = progress.place
+    guess_BG = guess(progress.numbers, place)[:, :num_guesses]
+    logits_BKS = model(torch.cat([progress.last[:, None], guess_BG], dim=1), progress.num_symbols - 1)
     places_BK = grammar.walk(place, guess_BG)
     picks_BK = pick(logits_BKS, grammar.penalties(places_BK))
     num_right_B = (picks_BK[:, :-1] == guess_BG).cumprod(dim=1).sum(dim=1)
-    place = grammar.advance(places_BK.at(num_right_B), picks_BK.gather(1, num_right_B[:, None])[:, 0])
-    num_written_B = (num_written_B + num_right_B + 1).clamp(max=max_symbols)
-    symbols_BA = symbols_BA.scatter(1, columns_BK, picks_BK)
+    column_K = torch.arange(picks_BK.shape[1], device=picks_BK.device)
     # what follows a wrong guess is not written
-    symbols_BA = symbols_BA.masked_fill(columns_A >= num_written_B[:, None], END)
-    return Progress(symbols_BA, num_written_B, place.prefix, place.number), num_right_B
+    completes_BK = (picks_BK >= SPACE) & (column_K <= num_right_B[:, None])
+    index_BK = places_BK.number.clamp(max=grammar.num_numbers - 1)
+    numbers_BN = progress.numbers.scatter_add(1, index_BK, grammar.value[places_BK.prefix] * completes_BK)
+    last_B = picks_BK.gather(1, num_right_B[:, None])[:, 0]
+    place = grammar.advance(places_BK.at(num_right_B), last_B)
+    max_symbols = grammar.max_symbols(grammar.num_numbers)
+    num_symbols_B = (progress.num_symbols + num_right_B + 1).clamp(max=max_symbols)
+    return Progress(numbers_BN, last_B, num_symbols_B, place.prefix, place.number), num_right_B
 
 
 @torch.no_grad()
@@ -158,28 +162,19 @@ def decode_numbers(
     progress = Progress.start(grammar, batch_size)
     row_B = torch.arange(batch_size, device=progress.number.device)
     numbers = progress.number.new_empty(batch_size, stop_after)
+    max_symbols = grammar.max_symbols(stop_after)
     num_passes, num_guesses = 0, FIRST_GUESSES
     while True:
-        progress, num_right_B = write(model, grammar, guess, progress, num_guesses)
+        num_left = max(1, max_symbols - int(progress.num_symbols.min()))
+        progress, num_right_B = write(model, grammar, guess, progress, min(num_guesses, num_left - 1))
         num_passes += 1
         # twice as many as were right, and one
         num_guesses = min(MAX_GUESSES, 1 + round(2 * float(num_right_B.float().mean())))
         kept_B = (~progress.is_done(grammar, stop_after)).nonzero()[:, 0]
         if len(kept_B) == len(row_B):
             continue
-        numbers[row_B] = read_answer(progress.symbols, stop_after)
+        numbers[row_B] = progress.answer(grammar)[:, :stop_after]
         if not len(kept_B):
             return Decoded(numbers, num_passes)
         model.keep(kept_B)
         row_B, progress = row_B[kept_B], progress.keep(kept_B)
-
-
-def read_answer(symbol_BA: Tensor, num_numbers: int) -> Tensor:
-    """(B, num_numbers) the first numbers that rows of symbols spell, the first symbol being a space."""
-    is_digit_BA = symbol_BA < SPACE
-    column_A = torch.arange(symbol_BA.shape[1], device=symbol_BA.device)
-    end_BA = torch.where(is_digit_BA, len(column_A), column_A).flip(1).cummin(dim=1).values.flip(1)
-    value_BA = torch.where(is_digit_BA, symbol_BA * 10 ** (end_BA - 1 - column_A).clamp(min=0), 0)
-    number_BA = ((~is_digit_BA).cumsum(dim=1) - 1).clamp(max=num_numbers)
-    sums_BN = symbol_BA.new_zeros(len(symbol_BA), num_numbers + 1).scatter_add(1, number_BA, value_BA)
-    return sums_BN[:, :num_numbers]

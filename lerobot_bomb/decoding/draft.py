@@ -1,14 +1,14 @@
 """Guesses of what an answer goes on with; right or wrong, they change only how many passes it takes.
 
-Shapes: `B` batch, `A` columns of a row of symbols, `N` numbers, `W` those that guesses can reach, `C` columns
-a number may take, `M` = (1 + W) * C, `G` guesses.
+Shapes: `B` batch, `N` numbers, `W` those that guesses can reach, `C` columns a number may take,
+`M` = (1 + W) * C, `G` guesses.
 """
 
 import torch
 from torch import Tensor
 
-from lerobot_bomb.actions.text import END, SPACE, digits_of, number_symbols
-from lerobot_bomb.decoding.decoder import MAX_GUESSES, read_answer
+from lerobot_bomb.actions.text import END, SPACE
+from lerobot_bomb.decoding.decoder import MAX_GUESSES
 from lerobot_bomb.decoding.grammar import NumberGrammar, Place
 
 
@@ -32,23 +32,21 @@ class LinearDraft:
     def __init__(self, grammar: NumberGrammar, num_dims: int):
         self._grammar, self._num_dims = grammar, num_dims
 
-    def __call__(self, symbol_BA: Tensor, place: Place) -> Tensor:
+    def __call__(self, number_BN: Tensor, place: Place) -> Tensor:
         """(B, G) guesses."""
         grammar, first_B1 = self._grammar, place.number[:, None]
-        number_BN = read_answer(symbol_BA, grammar.num_numbers)
         begun_B1 = self._complete(number_BN, place)[:, None]
         known_BN = number_BN.scatter(1, first_B1, begun_B1)
         # every number takes two symbols or more
         ahead_W = torch.arange(MAX_GUESSES // 2, device=number_BN.device)
         next_BW = self._expect(known_BN, first_B1 + 1 + ahead_W % self._num_dims, ahead_W // self._num_dims)
-        symbols_BWC, written_BWC = number_symbols(
-            torch.cat([begun_B1, next_BW], dim=1), grammar.width, zero_padded=grammar.fixed_width > 0
-        )
+        numbers = torch.cat([begun_B1, next_BW], dim=1)
+        written_BWC = grammar.is_spelled[numbers]
         written_BWC[:, 1:] &= (first_B1 + 1 + ahead_W < grammar.num_numbers)[..., None]
         # the space and the digits that stand are no guesses
         start_B1 = 1 + grammar.num_digits[place.prefix][:, None]
         columns_BG = start_B1 + torch.arange(MAX_GUESSES, device=number_BN.device)
-        return self._spell(symbols_BWC.flatten(1), written_BWC.flatten(1)).gather(1, columns_BG)
+        return self._spell(grammar.spelling[numbers].flatten(1), written_BWC.flatten(1)).gather(1, columns_BG)
 
     def _spell(self, symbol_BM: Tensor, written_BM: Tensor) -> Tensor:
         """Written symbols without the gaps between them, then ends; no row's length has to be known."""
@@ -65,8 +63,8 @@ class LinearDraft:
         grammar = self._grammar
         expected_B = self._expect(number_BN, place.number[:, None], 0).squeeze(1)
         num_digits_B = grammar.num_digits[place.prefix]
-        rest_B = grammar.fixed_width or digits_of(expected_B)
-        value_B, scale_B = grammar.value[place.prefix], 10 ** (rest_B - num_digits_B).clamp(min=0)
+        rest_B = grammar.is_spelled[expected_B].sum(dim=1) - 1 - num_digits_B
+        value_B, scale_B = grammar.value[place.prefix], 10 ** rest_B.clamp(min=0)
         low_B, high_B = value_B * scale_B, (value_B + 1) * scale_B - 1
         goes_on_B = (low_B < grammar.num_values) & ~grammar.must_end[place.prefix]
         nearest_B = torch.where(goes_on_B, expected_B.clamp(low_B, high_B), value_B)

@@ -1,7 +1,8 @@
 """The language of answers: `` n1 n2 ... nN<end>``, as a deterministic automaton on tensors.
 
 Every number is in 0..num_values - 1, without sign or leading zeros, or zero-padded to a fixed width.
-Shapes: `B` batch, `S` symbols, `G` symbols of a walk, `K` = 1 + G.
+Shapes: `B` batch, `S` symbols, `G` symbols of a walk, `K` = 1 + G, `V` values of a number, `C` columns that a
+number may take.
 """
 
 from dataclasses import dataclass
@@ -9,7 +10,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor, nn
 
-from lerobot_bomb.actions.text import END, NUM_SYMBOLS, SPACE, digits_needed
+from lerobot_bomb.actions.text import END, NUM_SYMBOLS, SPACE, digits_needed, number_symbols
 
 
 @dataclass(frozen=True)
@@ -40,6 +41,8 @@ class NumberGrammar(nn.Module):
     must_end: Tensor  # (states,) bool: a number that no digit may follow
     num_digits: Tensor  # (states,) int64
     value: Tensor  # (states,) int64
+    spelling: Tensor  # (V, C) int64 symbols of every number, the space before it first
+    is_spelled: Tensor  # (V, C) bool, which of them are written
 
     DONE, START = 0, 1
 
@@ -66,12 +69,16 @@ class NumberGrammar(nn.Module):
         allowed[1, :, END] = is_number
         allowed[:, self.DONE, END] = True  # rows that are done go on saying so
         penalty = torch.zeros(allowed.shape).masked_fill(~allowed, -torch.inf)
+        values_V1 = torch.arange(num_values)[:, None]
+        spelling, is_spelled = number_symbols(values_V1, self.width, zero_padded=fixed_width > 0)
         for name, table in {
             "penalty": penalty,
             "next_state": next_state,
             "must_end": is_number & (next_state[:, :SPACE] == self.DONE).all(dim=1),
             "num_digits": torch.tensor([0, *map(len, prefixes)]),
             "value": torch.tensor([0, *(int(prefix or 0) for prefix in prefixes)]),
+            "spelling": spelling.squeeze(1),
+            "is_spelled": is_spelled.squeeze(1),
         }.items():
             self.register_buffer(name, table, persistent=False)
 

@@ -93,7 +93,7 @@ class CachedText:
             slots=(self._first_slot + columns_BK1).flatten(),
             cos=self._cos_CE[columns_BK1],
             sin=self._sin_CE[columns_BK1],
-            penalty=penalty_BKC.repeat_interleave(self._num_groups, dim=1)[:, None],
+            penalty=penalty_BKC[:, None, :, None].expand(-1, -1, -1, self._num_groups, -1).flatten(2, 3),
         )
 
     def _count_columns(self, columns_BK: Tensor) -> int:
