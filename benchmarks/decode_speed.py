@@ -21,7 +21,15 @@ from unittest.mock import patch
 import torch
 from decode_speed_compare import Timed, compare, finish, print_rows
 from decode_speed_peer import OneTokenText
-from decode_speed_works import Episodes, Work, margin_at_difference, num_symbols, ours, peer
+from decode_speed_works import (
+    Episodes,
+    Work,
+    add_episode_arguments,
+    margin_at_difference,
+    num_symbols,
+    ours,
+    peer,
+)
 from lerobot.utils.import_utils import register_third_party_plugins
 from machine import add_machine_arguments, positive, require_idle_machine
 from torch import Tensor
@@ -54,10 +62,7 @@ SHAPE_256M = {
 def main() -> None:
     """Count passes, time answers, print the tables; exit code 1 where a bar is missed."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawTextHelpFormatter)
-    parser.add_argument("--policy.path", dest="policy_path", required=True, help="trained vla0_smol")
-    parser.add_argument("--dataset.repo_id", dest="repo_id", required=True)
-    parser.add_argument("--dataset.root", dest="root")
-    parser.add_argument("--episode", type=int, default=180, help="first episode to read (default: 180)")
+    add_episode_arguments(parser, "vla0_smol")
     parser.add_argument("--repeats", type=positive, default=20, help="answers of each (default: 20)")
     add_machine_arguments(parser)
     args = parser.parse_args()

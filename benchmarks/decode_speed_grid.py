@@ -1,11 +1,13 @@
 """Choosing a chunk's cells: `spatialvla_grid` against transformers' `generate`.
 
-    OMP_NUM_THREADS=1 python benchmarks/decode_speed_grid.py --json decode_speed_grid.json
+    python benchmarks/decode_speed_grid.py --policy.path=CHECKPOINT --dataset.repo_id=USER/pusht \
+        --dataset.root=pusht --json decode_speed_grid.json
 
 The peer is the stock PaliGemma of the same weights whose words end with the cells; a logits processor lets
-only the slot's cells through. Both see the same random pictures and sentences and must choose the same cells.
-Weights are random (nano). Seeing and reading the prompt (prefill) is reported apart; bars are on the rest
-(decode). Of the peer's prefill, cutting the pictures and putting the prompt together is left out.
+only the slot's cells through. Both see the same and must choose the same cells: a trained nano policy, frames
+of held-out episodes; one of random weights, random pictures and sentences, where a draft has little to go by.
+Seeing and reading the prompt (prefill) is reported apart; bars are on the rest (decode). Of the peer's
+prefill, cutting the pictures and putting the prompt together is left out.
 """
 
 import argparse
@@ -20,8 +22,10 @@ from unittest.mock import patch
 
 import torch
 from decode_speed_compare import Timed, compare, finish, print_rows
+from decode_speed_works import Episodes, add_episode_arguments
 from lerobot.configs import FeatureType, PolicyFeature
 from lerobot.policies import make_pre_post_processors
+from lerobot.utils.import_utils import register_third_party_plugins
 from machine import add_machine_arguments, positive, require_idle_machine
 from torch import Tensor, nn
 from transformers import LogitsProcessor
@@ -29,12 +33,12 @@ from transformers import LogitsProcessor
 from lerobot_bomb.vlm.cached_text import CachedText
 from lerobot_bomb.vlm.images import crop_and_resize
 from lerobot_policy_spatialvla_grid import SpatialvlaGridConfig
+from lerobot_policy_spatialvla_grid.configuration_spatialvla_grid import DRAFTS
 from lerobot_policy_spatialvla_grid.modeling_spatialvla_grid import SpatialvlaGridPolicy
 
 MIN_RATIO = 3.0
 BATCH_SIZES = 1, 16
-# action dims, and whether there is a bar: that of the original, and BOMB's
-ACTION_DIMS = {7: True, 4: False}
+ACTION_DIMS = 7, 4  # of the original, and BOMB's
 CAMERAS = "observation.images.workspace", "observation.images.wrist"
 IMAGE_SIZE = 128
 SENTENCES = "put the black stone on the center", "go", "push the white stone to the left edge"
@@ -43,21 +47,29 @@ SENTENCES = "put the black stone on the center", "go", "push the white stone to 
 def main() -> None:
     """Time both, print the tables; exit code 1 where a bar is missed."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawTextHelpFormatter)
+    add_episode_arguments(parser, "spatialvla_grid")
     parser.add_argument("--repeats", type=positive, default=20, help="answers of each (default: 20)")
     add_machine_arguments(parser)
     args = parser.parse_args()
     require_idle_machine(args.force)
     logging.disable(logging.WARNING)
+    register_third_party_plugins()
+    episodes = Episodes(args)
     figures: dict[str, Any] = {}
     bars: dict[str, bool] = {}
     with torch.inference_mode():
+        for batch_size in BATCH_SIZES:
+            trained = episodes.batches(batch_size, args.repeats)
+            name = f"trained, batch of {batch_size}"
+            figures[name] = time_decoding(name, *trained, bars)
+            gain = figures[name]["ours, repeat"]["decode_gain"]
+            bars[f"{name}: decode {gain:.1f} times faster (bar {MIN_RATIO:g})"] = gain >= MIN_RATIO
         for num_dims in ACTION_DIMS:
             policy = make_policy(num_dims)
             for batch_size in BATCH_SIZES:
-                name = f"{num_dims} action dims, batch of {batch_size}"
-                figures[name] = time_decoding(policy, make_batches(policy, batch_size, args.repeats))
-                print_rows(f"{name}, medians of {args.repeats}", figures[name])
-                bars |= check(policy, name, figures[name]["ours"])
+                name = f"random, {num_dims} action dims, batch of {batch_size}"
+                batches = make_batches(policy, batch_size, args.repeats)
+                figures[name] = time_decoding(name, policy, batches, bars)
     print()
     finish(args.json, figures, bars)
 
@@ -92,20 +104,17 @@ def make_batches(policy: SpatialvlaGridPolicy, batch_size: int, num_batches: int
     ]
 
 
-def time_decoding(policy: SpatialvlaGridPolicy, batches: list[dict[str, Any]]) -> dict[str, dict[str, float]]:
+def time_decoding(
+    name: str, policy: SpatialvlaGridPolicy, batches: list[dict[str, Any]], bars: dict[str, bool]
+) -> dict[str, dict[str, float]]:
     """Whole chunks by the peer and by us."""
     peer = StockGenerate(policy)
-    stock_inputs = [peer.inputs(batch) for batch in batches]
-    return compare({"generate": (peer, stock_inputs), "ours": (partial(choose, policy), batches)})
-
-
-def check(policy: SpatialvlaGridPolicy, name: str, ours: dict[str, float]) -> dict[str, bool]:
-    """The bars of one table."""
-    num_cells, gain = num_slots(policy), ours["decode_gain"]
-    bars = {f"{name}: {ours['passes']:g} passes for {num_cells} cells": ours["passes"] == num_cells}
-    if ACTION_DIMS[policy.grids.num_dims]:
-        bars[f"{name}: decode {gain:.1f} times faster (bar {MIN_RATIO:g})"] = gain >= MIN_RATIO
-    return bars
+    runs = {f"ours, {draft}": (partial(choose, policy, draft), batches) for draft in DRAFTS}
+    figures = compare({"generate": (peer, [peer.inputs(batch) for batch in batches]), **runs})
+    print_rows(f"{name}, medians of {len(batches)}", figures)
+    num_cells, num_passes = num_slots(policy), figures["ours, none"]["passes"]
+    bars[f"{name}: {num_passes:g} passes for {num_cells} cells"] = num_passes == num_cells
+    return figures
 
 
 def num_slots(policy: SpatialvlaGridPolicy) -> int:
@@ -113,8 +122,9 @@ def num_slots(policy: SpatialvlaGridPolicy) -> int:
     return policy.config.chunk_size * len(policy.grids.groups)
 
 
-def choose(policy: SpatialvlaGridPolicy, batch: dict[str, Any]) -> Timed:
+def choose(policy: SpatialvlaGridPolicy, draft: str, batch: dict[str, Any]) -> Timed:
     """The policy's own way."""
+    policy._writer.drafted = draft != "none"
     started = time.perf_counter()
     with _moments_of_passes() as moments_s:
         cells_BTG = policy._choose(batch, policy.config.chunk_size)
@@ -147,6 +157,11 @@ class StockGenerate:
         words.weight = nn.Parameter(torch.cat([words.weight, policy.cell_embedding.weight]))
         head = self._vlm.lm_head
         head.weight = nn.Parameter(torch.cat([head.weight, policy.cell_head.weight]))
+        # what a policy without depth learned to add to every patch
+        size = policy.ego3d.lattice_size
+        no_depth_E = policy.ego3d(torch.full((1, size, size, 3), torch.nan))[0, 0]
+        norm = self._vlm.model.vision_tower.get_submodule("vision_model.post_layernorm")
+        norm.bias = nn.Parameter(norm.bias + no_depth_E)
         self._vlm.config.text_config.vocab_size = self._vlm.model.vocab_size = len(words.weight)
 
     def inputs(self, batch: dict[str, Any]) -> dict[str, Tensor]:

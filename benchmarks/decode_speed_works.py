@@ -44,6 +44,14 @@ class Work:
     guess: Guess
 
 
+def add_episode_arguments(parser: argparse.ArgumentParser, policy_type: str) -> None:
+    """What `Episodes` needs."""
+    parser.add_argument("--policy.path", dest="policy_path", required=True, help=f"trained {policy_type}")
+    parser.add_argument("--dataset.repo_id", dest="repo_id", required=True)
+    parser.add_argument("--dataset.root", dest="root")
+    parser.add_argument("--episode", type=int, default=180, help="first episode to read (default: 180)")
+
+
 class Episodes:
     """A trained policy with other flags, and the frames that it meets."""
 
@@ -54,15 +62,22 @@ class Episodes:
 
     def works(self, batch_size: int, num_predictions: int, **options: Any) -> list[Work]:
         """What the policy asks of the decoder, one row an episode, one prediction every `n_action_steps`."""
-        policy, preprocessor = self._load(**options)
-        num_steps = policy.config.n_action_steps
+        policy, batches = self.batches(batch_size, num_predictions, **options)
         works: list[Work] = []
-        for prediction in range(num_predictions):
-            frames = [self._frame(row, prediction * num_steps) for row in range(batch_size)]
+        for batch in batches:
             policy.reset()
             with _captured(works):
-                policy.select_action(preprocessor(default_collate(frames)))
+                policy.select_action(batch)
         return works
+
+    def batches(self, batch_size: int, num_predictions: int, **options: Any) -> tuple[Any, list[Any]]:
+        """The policy with such flags, and what it sees: one row an episode, every `n_action_steps`."""
+        policy, preprocessor = self._load(**options)
+        frames = [
+            [self._frame(row, prediction * policy.config.n_action_steps) for row in range(batch_size)]
+            for prediction in range(num_predictions)
+        ]
+        return policy, [preprocessor(default_collate(rows)) for rows in frames]
 
     def planned(self, num_predictions: int, num_steps: int) -> list[Work]:
         """The same, batch of 1, with guesses from what the last chunk left unexecuted; held at its end."""

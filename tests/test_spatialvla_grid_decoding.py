@@ -41,10 +41,9 @@ def test_a_rows_actions_do_not_depend_on_the_batch() -> None:
         assert torch.equal(alone[0], together[row])
 
 
-def test_only_what_is_executed_is_decoded_with_one_pass_a_cell(monkeypatch: pytest.MonkeyPatch) -> None:
-    policy = make_policy(0, 7, n_action_steps=2)
-    batch = make_batch(policy, 2)
-    chunk = policy.predict_action_chunk(batch)
+@pytest.fixture
+def passes(monkeypatch: pytest.MonkeyPatch) -> list[int]:
+    """Tokens of every pass, the prompt's first."""
     passes: list[int] = []
 
     class Counted(CachedText):
@@ -53,6 +52,27 @@ def test_only_what_is_executed_is_decoded_with_one_pass_a_cell(monkeypatch: pyte
             return super().__call__(*args)
 
     monkeypatch.setattr("lerobot_bomb.decoding.slots.CachedText", Counted)
+    return passes
+
+
+def test_a_draft_saves_passes_and_changes_no_cell(passes: list[int]) -> None:
+    policy = make_policy(2, 7)
+    batch = make_batch(policy, 1, 2)
+    drafted = policy._choose(batch, 4)
+    # cells of the same group follow each other here, but not always
+    assert 0.5 < (drafted[:, 1:] == drafted[:, :-1]).float().mean() < 1
+    assert len(passes) < 12
+    passes.clear()
+    policy._writer.drafted = False
+    assert torch.equal(policy._choose(batch, 4), drafted)
+    assert passes[1:] == [1] * 11
+
+
+def test_only_what_is_executed_is_decoded_with_one_pass_a_cell(passes: list[int]) -> None:
+    policy = make_policy(0, 7, n_action_steps=2)
+    batch = make_batch(policy, 2)
+    chunk = policy.predict_action_chunk(batch)
+    passes.clear()
     assert torch.equal(policy.select_action(batch), chunk[:, 0])
     assert torch.equal(policy.select_action(batch), chunk[:, 1])
     assert len(passes) == 2 * 3 and passes[1:] == [1] * 5

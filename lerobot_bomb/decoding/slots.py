@@ -1,19 +1,22 @@
-"""Greedy decoding of answers with one choice a slot, one pass of the model each.
+"""Greedy decoding of answers with one choice a slot, one pass of the model each, or less.
 
-What may stand in a slot does not depend on what stands before it, so the language needs no automaton: the
-output head has only the slot's rows.
+An answer has steps of the same slots. What may stand in a slot does not depend on what stands before it, so
+the language needs no automaton: the output head has only the slot's rows.
 
-Shapes: `B` batch, `L` tokens of a prompt, `H` hidden size, `S` slots, `C` choices of all kinds of slots.
+Shapes: `B` batch, `L` tokens of a prompt, `H` hidden size, `G` slots of a step, `S` of an answer, `C` choices
+of all kinds of slots, `K` tokens of a pass.
 """
 
 from functools import partial
+from itertools import accumulate
+from operator import and_, eq
 from typing import Any
 
 import torch
 from torch import Tensor
 from torch.nn.functional import embedding, linear
 
-from lerobot_bomb.decoding.decoder import Prompt
+from lerobot_bomb.decoding.decoder import MAX_GUESSES, Prompt
 from lerobot_bomb.vlm.cached_text import CachedText
 from lerobot_bomb.vlm.graphs import Recorded
 from lerobot_bomb.vlm.recordings import Recordings
@@ -28,28 +31,45 @@ class SlotWriter:
     """
 
     def __init__(
-        self, text_model: Any, first_position: int, *, prompt_reads_all: bool, compiled: bool = False
+        self,
+        text_model: Any,
+        first_position: int,
+        *,
+        prompt_reads_all: bool,
+        drafted: bool = False,
+        compiled: bool = False,
     ):
+        """``drafted``: guess that a step is as the one before, on a CPU and in a batch of 1."""
         self._text_model, self._first_position = text_model, first_position
-        self._reads_all = prompt_reads_all
+        self._reads_all, self.drafted = prompt_reads_all, drafted
         self._recordings = Recordings[RecordedChoices](text_model, first_position, compiled=compiled)
 
     @torch.no_grad()
-    def __call__(self, prompt: Prompt, slots: list[slice], embeds_CH: Tensor, head_CH: Tensor) -> Tensor:
+    def __call__(
+        self, prompt: Prompt, slots: list[slice], num_steps: int, embeds_CH: Tensor, head_CH: Tensor
+    ) -> Tensor:
         """(B, S) the likeliest choice in every slot, given those before it.
 
-        ``slots``: which of the choices come into question, counted from the first of them; ``embeds_CH`` and
-        ``head_CH``: the choices' rows of the embedding and of the output head.
+        ``slots``: of a step, which of the choices come into question, counted from the first of them;
+        ``embeds_CH`` and ``head_CH``: the choices' rows of the embedding and of the output head.
         """
+        num_slots = num_steps * len(slots)
         if prompt.embeds.is_cuda:
             with torch.inference_mode(False), torch.no_grad():
-                make = partial(RecordedChoices, slots, self._reads_all, embeds_CH, head_CH)
-                recorded = self._recordings.find(prompt.embeds, len(slots), make)
+                make = partial(RecordedChoices, num_steps * slots, self._reads_all, embeds_CH, head_CH)
+                recorded = self._recordings.find(prompt.embeds, num_slots, make)
                 return recorded(prompt, embeds_CH, head_CH)
         batch_size, num_columns, _ = prompt.embeds.shape
         layers = TextLayers(self._text_model)
-        text = CachedText(layers, batch_size, num_columns + len(slots), self._first_position)
-        return choose(text, prompt, slots, embeds_CH, head_CH, prompt_reads_all=self._reads_all)
+        text = CachedText(layers, batch_size, num_columns + num_slots, self._first_position)
+        tables = embeds_CH, head_CH
+        # rows that agree on how far guesses are right are rare
+        is_drafted = self.drafted and batch_size == 1
+        singly = slots if is_drafted else num_steps * slots
+        choices_BS = choose(text, prompt, singly, *tables, prompt_reads_all=self._reads_all)
+        if not is_drafted:
+            return choices_BS
+        return repeat(text, int(prompt.written.sum()), slots, num_slots, choices_BS, *tables)
 
 
 class RecordedChoices:
@@ -96,3 +116,36 @@ def choose(
             embeds_BH = embedding(choices[-1] + slot.start, embeds_CH)
             hidden_BKH = text(embeds_BH[:, None], last_B1 + column)
     return torch.stack(choices, dim=1)
+
+
+def repeat(
+    text: CachedText,
+    length: int,
+    slots: list[slice],
+    num_slots: int,
+    step_1G: Tensor,
+    embeds_CH: Tensor,
+    head_CH: Tensor,
+) -> Tensor:
+    """(1, S) the same as one choice a pass, after a prompt of this length and the first step.
+
+    A pass reads the choice made last and guesses that go on as the step before. As far as guesses are the
+    likeliest choices they are right, and so is the first choice that differs from its guess.
+    """
+    num_kinds = len(slots)
+    chosen: list[int] = step_1G[0].tolist()
+    num_tokens = 1
+    while len(chosen) < num_slots:
+        kinds = [(len(chosen) + ahead) % num_kinds for ahead in range(num_tokens)]
+        guesses = [chosen[ahead % num_kinds - num_kinds] for ahead in range(num_tokens)]
+        read = [chosen[-1] + slots[kinds[0] - 1].start]
+        read += [guess + slots[kind].start for guess, kind in zip(guesses[:-1], kinds, strict=False)]
+        column_K = torch.arange(num_tokens, device=step_1G.device) + length + len(chosen) - 1
+        (hidden_KH,) = text(embeds_CH[read][None], column_K[None])
+        heads = [head_CH[slots[kind]] for kind in kinds]
+        picks = [int((head @ hidden).argmax()) for head, hidden in zip(heads, hidden_KH, strict=True)]
+        # one that was not read may be right, too: it says how many to read in the next pass
+        num_right = sum(accumulate(map(eq, picks, guesses), and_))
+        chosen += picks[: num_right + 1]
+        num_tokens = min(MAX_GUESSES, 1 + 2 * num_right, num_slots - len(chosen))
+    return step_1G.new_tensor([chosen])

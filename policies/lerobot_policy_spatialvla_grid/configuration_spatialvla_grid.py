@@ -34,6 +34,7 @@ BOUNDED_MODES = (
 DEPTH_SOURCES = ("none", "observation", "zoedepth")
 PREFIX_ATTENTIONS = ("bidirectional", "causal")
 LOSS_VOCABULARIES = ("slot", "full")
+DRAFTS = ("none", "repeat")
 NUM_STATE_BINS = 256
 # flags that say what the model reads and writes, beside the grids' own
 AS_TRAINED = ("chunk_size", "use_state", "prefix_attention")
@@ -118,6 +119,10 @@ class SpatialvlaGridConfig(PreTrainedConfig):
     # positive favours old chunks
     temporal_ensemble_coefficient: float = 0.01
 
+    # what a pass guesses beside the next cell: "none", or that a step is as the one before ("repeat"); the
+    # cells are the same, up to ties within rounding. Not on CUDA
+    draft: str = "repeat"
+
     # side of the crop as a fraction of the image: random place while training, centre otherwise
     crop_fraction: float = 0.9
     freeze_vision_encoder: bool = False
@@ -159,6 +164,7 @@ class SpatialvlaGridConfig(PreTrainedConfig):
             "depth_source": DEPTH_SOURCES,
             "prefix_attention": PREFIX_ATTENTIONS,
             "loss_vocab": LOSS_VOCABULARIES,
+            "draft": DRAFTS,
             "dtype": DTYPES,
             "temporal_ensemble_weighting": WEIGHTINGS,
         }.items():

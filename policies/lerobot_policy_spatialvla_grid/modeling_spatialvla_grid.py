@@ -100,6 +100,7 @@ class SpatialvlaGridPolicy(PreTrainedPolicy):
             self.backbone.text_model,
             FIRST_POSITION,
             prompt_reads_all=self._prompt_reads_all,
+            drafted=config.draft != "none",
             compiled=config.compile_model,
         )
         self.state_bins = Bins(NUM_STATE_BINS, "centers")
@@ -285,7 +286,8 @@ class SpatialvlaGridPolicy(PreTrainedPolicy):
             # the cap on logits keeps their order
             cells_BS = self._writer(
                 Prompt(embeds_BLH, prompt.written),
-                num_steps * self._group_rows,
+                self._group_rows,
+                num_steps,
                 self.cell_embedding.weight * self.backbone.embed_scale,
                 self.cell_head.weight,
             )
