@@ -65,6 +65,7 @@ def check_training(config: Any) -> None:
         (
             "drop_n_last_frames",
             "optimizer_lr",
+            "optimizer_eps",
             "scheduler_decay_lr",
             "optimizer_weight_decay",
             "scheduler_warmup_steps",
@@ -74,10 +75,13 @@ def check_training(config: Any) -> None:
 
 
 def check_not_negative(config: Any, flags: Iterable[str]) -> None:
-    """Numbers of at least 0."""
+    """Finite numbers of at least 0."""
     for flag in flags:
-        if not getattr(config, flag) >= 0:  # NaN is no number
-            raise ValueError(f"--policy.{flag}={getattr(config, flag)} must not be negative")
+        value = getattr(config, flag)
+        if not math.isfinite(value):
+            raise ValueError(f"--policy.{flag}={value} must be finite")
+        if value < 0:
+            raise ValueError(f"--policy.{flag}={value} must not be negative")
 
 
 def check_positive(config: Any, flags: Iterable[str]) -> None:
@@ -129,6 +133,17 @@ def check_as_trained(config: Any) -> None:
             raise ValueError(
                 f"--policy.{flag}={value!r}: this checkpoint was trained with {then[flag]!r}, which only "
                 f"another training can change"
+            )
+
+
+def check_weights_fit(config: Any, flags: Iterable[str]) -> None:
+    """A training goes on from a checkpoint with flags that its weights have the shapes for."""
+    then = config.trained_with or {}
+    for flag, value in trained_with(config, [flag for flag in flags if flag in then]).items():
+        if value != then[flag]:
+            raise ValueError(
+                f"--policy.{flag}={value!r}: the weights of this checkpoint are made for {then[flag]!r}; "
+                f"only a training without --policy.path can change it"
             )
 
 

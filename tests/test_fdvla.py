@@ -93,7 +93,7 @@ def test_the_loss_is_that_of_both_heads() -> None:
     [
         (FLOW_ONLY, {"flow_loss"}),
         (DENOISE_ONLY, {"denoise_loss"}),
-        ({"consistency": "off"}, {"flow_loss", "denoise_loss", "consistency_residual_rms"}),
+        ({"consistency": "none"}, {"flow_loss", "denoise_loss", "consistency_residual_rms"}),
     ],
 )
 def test_terms_are_those_of_the_heads_there_are(options: dict[str, Any], names: set[str]) -> None:

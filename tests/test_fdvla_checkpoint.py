@@ -135,6 +135,34 @@ def test_errors_are_told_in_the_datasets_units(options: dict[str, Any], meta: Le
     assert policy(batch)[1]["l1"] == pytest.approx(once / 2)
 
 
+@pytest.mark.parametrize(
+    ("options", "then"),
+    [
+        ({"chunk_size": 8}, "4"),
+        ({"head_dim": 64}, "32"),
+        ({"dualmod_dim": 8}, "16"),
+        ({"use_denoise_head": False}, "True"),
+        ({"use_state": False}, "True"),
+    ],
+)
+def test_a_training_cannot_go_on_with_other_shapes(
+    options: dict[str, Any], then: str, meta: LeRobotDatasetMetadata, tmp_path: Path
+) -> None:
+    make_policy().save_pretrained(tmp_path)
+    [(flag, value)] = options.items()
+    message = rf"--policy\.{flag}={value}: the weights of this checkpoint are made for {then}; only a"
+    with pytest.raises(ValueError, match=message):
+        FdvlaPolicy.from_pretrained(tmp_path, config=changed(tmp_path, options), dataset_meta=meta)
+
+
+def test_a_training_may_go_on_otherwise(meta: LeRobotDatasetMetadata, tmp_path: Path) -> None:
+    make_policy().save_pretrained(tmp_path)
+    options = {"image_size": 84, "segment_attention": "causal", "reasoning_pool": "last"}
+    config = changed(tmp_path, options)
+    policy = FdvlaPolicy.from_pretrained(tmp_path, config=config, dataset_meta=meta)
+    assert policy.config.trained_with is not None and options.items() <= policy.config.trained_with.items()
+
+
 def test_mean_and_deviation_bound_the_unit() -> None:
     statistics = {"mean": np.array([1.0, -2.0]), "std": np.array([0.5, 4.0])}
     low, high = bounds(statistics, NormalizationMode.MEAN_STD, 2)

@@ -1,5 +1,6 @@
 """What `fdvla` refuses, what it does without, and what follows from flags that are not given."""
 
+import math
 import re
 from dataclasses import fields
 from pathlib import Path
@@ -33,11 +34,12 @@ from lerobot_policy_fdvla.configuration_fdvla import FdvlaConfig
         ({**DENOISE_ONLY, "sampler": "flow"}, "--policy.sampler=flow .* but use_flow_head is off"),
         ({**FLOW_ONLY, "consistency_loss_weight": 0.1}, "--policy.consistency_loss_weight=0.1 compares both"),
         ({"consistency_loss_weight": -1.0}, "--policy.consistency_loss_weight=-1.0 must not be negative"),
-        (
-            {"consistency_loss_weight": float("nan")},
-            "--policy.consistency_loss_weight=nan must not",
-        ),
-        ({"flow_loss_weight": float("nan")}, "--policy.flow_loss_weight=nan must not be negative"),
+        ({"consistency_loss_weight": math.nan}, "--policy.consistency_loss_weight=nan must be finite"),
+        ({"consistency_loss_weight": math.inf}, "--policy.consistency_loss_weight=inf must be finite"),
+        ({"flow_loss_weight": math.nan}, "--policy.flow_loss_weight=nan must be finite"),
+        ({"denoise_loss_weight": math.inf}, "--policy.denoise_loss_weight=inf must be finite"),
+        ({"optimizer_lr": math.nan}, "--policy.optimizer_lr=nan must be finite"),
+        ({"optimizer_lr": math.inf}, "--policy.optimizer_lr=inf must be finite"),
         (
             {"consistency": "energy_vjp", "gradient_checkpointing": True},
             "consistency=energy_vjp takes",
@@ -57,6 +59,14 @@ from lerobot_policy_fdvla.configuration_fdvla import FdvlaConfig
         ({"segment_attention": "full"}, "--policy.segment_attention='full' is unknown"),
         ({"train_vlm": "lora"}, "--policy.train_vlm='lora' is unknown"),
         ({"train_vlm": "frozen", "freeze_vision_encoder": False}, "needs --policy.train_vlm=full"),
+        ({"image_size": 100}, "--policy.image_size=100 must be a multiple of 28 pixels"),
+        (
+            {"flow_loss_weight": 0.0, "consistency_detach": "flow"},
+            "--policy.flow_loss_weight=0.0 leaves .*, or use_flow_head=false",
+        ),
+        ({"denoise_loss_weight": 0.0, "consistency": "none"}, "--policy.denoise_loss_weight=0.0 leaves"),
+        ({**FLOW_ONLY, "flow_loss_weight": 0.0}, "--policy.flow_loss_weight=0.0 leaves"),
+        ({"flow_loss_weight": 0.0, "denoise_loss_weight": 0.0}, "--policy.flow_loss_weight=0.0 leaves"),
         ({"head_dim": 0}, "--policy.head_dim=0 must be at least 1"),
         ({"crop_fraction": 0.0}, r"--policy.crop_fraction=0.0 must lie in \(0, 1\]"),
         ({"use_amp": True}, "--policy.dtype=bfloat16 instead"),
@@ -71,7 +81,6 @@ def test_wrong_flags_are_told(options: dict[str, Any], message: str) -> None:
 @pytest.mark.parametrize(
     ("options", "message"),
     [
-        ({"image_size": 100}, "--policy.image_size=100 must be a multiple of 28 pixels"),
         ({"chunk_size": 4096}, "and the model has 4096 positions; give a smaller --policy.chunk_size"),
         ({"has_state": False}, "--policy.use_state=true needs the feature 'observation.state'"),
         ({"cameras": ()}, "fdvla needs at least one camera"),
@@ -108,6 +117,15 @@ def test_defaults_follow_the_heads() -> None:
     both, flow, denoise = (make_config(**options) for options in ({}, FLOW_ONLY, DENOISE_ONLY))
     assert [config.used_sampler for config in (both, flow, denoise)] == ["residual", "flow", "ddim"]
     assert [config.used_consistency_weight for config in (both, flow, denoise)] == [0.1, 0, 0]
+
+
+@pytest.mark.parametrize("head", ["flow", "denoise"])
+def test_a_head_learns_from_the_other_by_agreeing(head: str) -> None:
+    options: dict[str, Any] = {f"{head}_loss_weight": 0.0}
+    policy = make_policy(**options)
+    policy(make_batch(policy, 2))[0].backward()
+    gradients = [parameter.grad for parameter in getattr(policy, f"{head}_head").out.parameters()]
+    assert all(gradient is not None and gradient.any() for gradient in gradients)
 
 
 def test_every_part_is_counted() -> None:

@@ -50,7 +50,7 @@ def test_every_term_has_a_weight() -> None:
     assert loss.item() == pytest.approx(2 * 0.025 + 3 * 0.01 + 4 * 0.0140625)
 
 
-@pytest.mark.parametrize("off", [{"consistency": "off"}, {"consistency_loss_weight": 0.0}])
+@pytest.mark.parametrize("off", [{"consistency": "none"}, {"consistency_loss_weight": 0.0}])
 def test_without_consistency_its_residual_is_still_measured(off: dict[str, Any]) -> None:
     loss, metrics = joint_loss(VELOCITY, NOISE, POINT, KEPT, **off)
     assert loss.item() == pytest.approx(0.035)
@@ -59,7 +59,7 @@ def test_without_consistency_its_residual_is_still_measured(off: dict[str, Any])
 
 
 def test_one_head() -> None:
-    loss, metrics = joint_loss(VELOCITY, None, POINT, KEPT, consistency="off")
+    loss, metrics = joint_loss(VELOCITY, None, POINT, KEPT, consistency="none")
     assert loss.item() == pytest.approx(0.025) and set(metrics) == {"flow_loss"}
     loss, metrics = joint_loss(None, NOISE, POINT, KEPT, consistency_loss_weight=0)
     assert loss.item() == pytest.approx(0.01) and set(metrics) == {"denoise_loss"}

@@ -48,7 +48,7 @@ def expected_gradient(std: float, **options: Any) -> Tensor:
 
 
 @pytest.mark.parametrize("std", [0.0, 0.5, 2.0])
-@pytest.mark.parametrize("options", [{}, {"consistency_loss_weight": 10.0}, {"consistency": "off"}])
+@pytest.mark.parametrize("options", [{}, {"consistency_loss_weight": 10.0}, {"consistency": "none"}])
 def test_conditional_means_are_the_optimum_whatever_the_consistency_weighs(
     std: float, options: dict[str, Any]
 ) -> None:

@@ -15,7 +15,7 @@ from torch.nn.attention import SDPBackend, sdpa_kernel
 from lerobot_bomb.flags import one_of
 from lerobot_bomb.flow.path import PathPoint
 
-CONSISTENCIES = ("linear", "energy_vjp", "off")
+CONSISTENCIES = ("linear", "energy_vjp", "none")
 DETACHES = ("none", "flow", "denoise")
 REDUCTIONS = ("mean", "none")
 
@@ -32,13 +32,43 @@ def check_objective(
     one_of("consistency_detach", consistency_detach, DETACHES)
     if not use_flow_head and not use_denoise_head:
         raise ValueError("use_flow_head and use_denoise_head are both off; at least one head is needed")
-    needs_both = consistency != "off" and consistency_loss_weight > 0
+    needs_both = consistency != "none" and consistency_loss_weight > 0
     if needs_both and not (use_flow_head and use_denoise_head):
         missing = "use_denoise_head" if use_flow_head else "use_flow_head"
         raise ValueError(
             f"consistency_loss_weight={consistency_loss_weight} compares both heads, but {missing} is off; "
-            "set it to 0, or consistency=off"
+            "set it to 0, or consistency=none"
         )
+
+
+def check_learning(
+    flow_loss_weight: float,
+    denoise_loss_weight: float,
+    consistency_loss_weight: float,
+    consistency: str,
+    consistency_detach: str,
+    use_flow_head: bool,
+    use_denoise_head: bool,
+) -> None:
+    """Raise a ValueError that names the weight that leaves a head without a gradient, or both without data.
+
+    A head without a term of its own can still learn from the other one, by agreeing with it.
+    """
+    own = {
+        head: weight
+        for head, weight, used in (
+            ("flow", flow_loss_weight, use_flow_head),
+            ("denoise", denoise_loss_weight, use_denoise_head),
+        )
+        if used
+    }
+    agrees = consistency != "none" and consistency_loss_weight > 0
+    for head, weight in own.items():
+        if weight == 0 and not (agrees and consistency_detach != head and any(own.values())):
+            raise ValueError(
+                f"{head}_loss_weight={weight} leaves the {head} head nothing to learn from; give a positive "
+                f"one, or use_{head}_head=false"
+            )
 
 
 def masked_mean(values_BKD: Tensor, kept_BK: Tensor, reduction: str = "mean") -> Tensor:
@@ -98,7 +128,7 @@ def joint_loss(
         flow_loss_weight: of the mean square of v - (A0 - z).
         denoise_loss_weight: of the mean square of eps - z.
         consistency_loss_weight: of the mean square of the residual.
-        consistency: ``linear``: `consistency_residual`; ``energy_vjp``: the same of `energy_noise`; ``off``.
+        consistency: ``linear``: `consistency_residual`; ``energy_vjp``: the same of `energy_noise`; ``none``.
         consistency_detach: the head that the consistency does not train: ``flow``, ``denoise`` or ``none``.
         reduction: ``mean`` over the kept elements of the batch, ``none`` for (B,) of each row.
 
@@ -115,7 +145,7 @@ def joint_loss(
     if velocity_BKD is not None and noise_BKD is not None:
         residual_BKD = consistency_residual(velocity_BKD, noise_BKD, point).detach()
         metrics["consistency_residual_rms"] = masked_mean(residual_BKD.square(), kept_BK).sqrt()
-        if consistency != "off" and consistency_loss_weight > 0:
+        if consistency != "none" and consistency_loss_weight > 0:
             if consistency == "energy_vjp":
                 noise_BKD = energy_noise(noise_BKD, point, kept_BK, consistency_detach != "denoise")
             if consistency_detach == "flow":

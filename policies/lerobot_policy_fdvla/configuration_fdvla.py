@@ -10,7 +10,7 @@ from lerobot.optim import AdamWConfig, CosineDecayWithWarmupSchedulerConfig
 from lerobot.policies.rtc import RTCConfig
 
 from lerobot_bomb.flags import flag_errors, one_of
-from lerobot_bomb.flow.losses import check_objective
+from lerobot_bomb.flow.losses import check_learning, check_objective
 from lerobot_bomb.flow.path import TIME_SAMPLINGS
 from lerobot_bomb.flow.samplers import check_heads, check_sampling
 from lerobot_bomb.policy_flags import (
@@ -30,13 +30,11 @@ TRAIN_VLM = ("full", "frozen")
 SEGMENT_ATTENTIONS = ("bidirectional", "causal")
 REASONING_POOLS = ("text", "all_prefix", "last")
 CONSISTENCY_LOSS_WEIGHT = 0.1
-# flags that say what the model's tokens mean and which parts it has
-AS_TRAINED = (
+PIXELS_PER_TOKEN = 28  # of a side: 2 patches of 14
+# flags that say which weights there are, and their shapes
+SHAPES = (
     "chunk_size",
-    "image_size",
     "use_state",
-    "segment_attention",
-    "reasoning_pool",
     "use_flow_head",
     "use_denoise_head",
     "dualmod_flow",
@@ -44,6 +42,8 @@ AS_TRAINED = (
     "head_dim",
     "dualmod_dim",
 )
+# the same, and flags that say what the model's tokens mean
+AS_TRAINED = (*SHAPES, "image_size", "segment_attention", "reasoning_pool")
 
 
 @PreTrainedConfig.register_subclass("fdvla")
@@ -98,7 +98,7 @@ class FdvlaConfig(PreTrainedConfig):
     denoise_loss_weight: float = 1.0
     # of the heads' disagreement; None = 0.1 with both heads, else 0
     consistency_loss_weight: float | None = None
-    # what agrees: "linear", "energy_vjp" (second derivatives: small models only) or "off"
+    # what agrees: "linear", "energy_vjp" (second derivatives: small models only) or "none"
     consistency: str = "linear"
     # the head that agreeing does not train: "none", "flow" or "denoise"
     consistency_detach: str = "none"
@@ -150,10 +150,14 @@ class FdvlaConfig(PreTrainedConfig):
         with flag_errors():
             self._check_choices()
             check_chunk(self)
+            self._check_loss_weights()
             with _policy_flags():
                 self._check_heads()
             check_positive(self, ("head_dim", "dualmod_dim", "image_size", "draws_per_chunk"))
-            check_not_negative(self, ("flow_loss_weight", "denoise_loss_weight"))
+            if self.image_size % PIXELS_PER_TOKEN:
+                raise ValueError(
+                    f"--policy.image_size={self.image_size} must be a multiple of {PIXELS_PER_TOKEN} pixels"
+                )
             check_training(self)
 
     def _check_choices(self) -> None:
@@ -177,13 +181,24 @@ class FdvlaConfig(PreTrainedConfig):
                 "--policy.freeze_vision_encoder=false needs --policy.train_vlm=full: frozen freezes both"
             )
 
+    def _check_loss_weights(self) -> None:
+        check_not_negative(self, ("flow_loss_weight", "denoise_loss_weight"))
+        if self.consistency_loss_weight is not None:
+            check_not_negative(self, ("consistency_loss_weight",))
+
     def _check_heads(self) -> None:
         heads = self.use_flow_head, self.use_denoise_head
         check_objective(self.consistency, self.consistency_detach, self.used_consistency_weight, *heads)
         check_sampling(**self.sampling())
         check_heads(self.used_sampler, *heads)
-        if not self.used_consistency_weight >= 0:
-            raise ValueError(f"consistency_loss_weight={self.consistency_loss_weight} must not be negative")
+        check_learning(
+            self.flow_loss_weight,
+            self.denoise_loss_weight,
+            self.used_consistency_weight,
+            self.consistency,
+            self.consistency_detach,
+            *heads,
+        )
         if self.has_energy and self.gradient_checkpointing:
             raise ValueError(
                 "consistency=energy_vjp takes second derivatives, which --policy.gradient_checkpointing=true "

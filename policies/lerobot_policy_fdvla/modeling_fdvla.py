@@ -29,14 +29,14 @@ from lerobot_bomb.flow.losses import joint_loss, second_derivatives
 from lerobot_bomb.flow.path import PathPoint, draw_noise, draw_tau, path_point
 from lerobot_bomb.flow.real_time import guided
 from lerobot_bomb.flow.samplers import SAMPLERS, Heads, sample
-from lerobot_bomb.policy_flags import check_as_trained, trained_with
+from lerobot_bomb.policy_flags import check_as_trained, check_weights_fit, trained_with
 from lerobot_bomb.vlm.cached_text import check_positions
 from lerobot_bomb.vlm.graphs import RecordedModel
 from lerobot_bomb.vlm.images import draw_windows, resize
 from lerobot_bomb.vlm.inputs import read_actions, read_image, read_task, read_tensor
 from lerobot_bomb.vlm.qwen import Prefix
 from lerobot_policy_fdvla.building_fdvla import build_model
-from lerobot_policy_fdvla.configuration_fdvla import AS_TRAINED, FdvlaConfig
+from lerobot_policy_fdvla.configuration_fdvla import AS_TRAINED, SHAPES, FdvlaConfig
 from lerobot_policy_fdvla.networks_fdvla import NUM_MARKS, ActionSegment, Head
 
 logger = logging.getLogger(__name__)
@@ -115,8 +115,11 @@ class FdvlaPolicy(PreTrainedPolicy):
         **kwargs,
     ) -> "FdvlaPolicy":
         """As LeRobot's, but a missing or unexpected tensor is an error."""
-        if config is not None and dataset_meta is None:
-            check_as_trained(config)
+        if config is not None:
+            if dataset_meta is None:
+                check_as_trained(config)
+            else:
+                check_weights_fit(config, SHAPES)
         policy = super().from_pretrained(*args, config=config, **{**kwargs, "strict": True})
         policy._take_units(dataset_meta)
         return policy
