@@ -3,8 +3,12 @@ import re
 from pathlib import Path
 from typing import Any
 
+import fdvla_cases
 import pytest
+import spatialvla_grid_cases
 import torch
+import vla0_smol_cases
+from lerobot.policies import get_policy_class
 from tokenizers import Tokenizer
 
 from lerobot_bomb.vlm.backbone import SmolVLMBackbone, build_backbone, config_dict, load_backbone
@@ -207,10 +211,34 @@ def test_a_folder_without_weights_is_refused(tmp_path: Path) -> None:
         load_tokenizer(str(tmp_path))
 
 
-def test_another_kind_of_model_is_refused(tmp_path: Path) -> None:
-    (tmp_path / "config.json").write_text('{"model_type": "gpt2"}')
-    with pytest.raises(ValueError, match="is a 'gpt2' model; vla0_smol needs a 'smolvlm' one"):
+@pytest.mark.parametrize(
+    ("config", "message"),
+    [
+        ({"model_type": "gpt2"}, "is a 'gpt2' model; vla0_smol needs a 'smolvlm' one"),
+        (
+            {"type": "act"},
+            "is a checkpoint of the policy 'act'; `lerobot-bomb export-backbone --policy.path=",
+        ),
+    ],
+)
+def test_another_kind_of_model_is_refused(config: dict[str, str], message: str, tmp_path: Path) -> None:
+    (tmp_path / "config.json").write_text(json.dumps(config))
+    with pytest.raises(ValueError, match=message):
         load_backbone(str(tmp_path))
+
+
+@pytest.mark.parametrize(
+    "config",
+    [vla0_smol_cases.make_config(), fdvla_cases.make_config(), spatialvla_grid_cases.make_config()],
+    ids=lambda config: config.type,
+)
+def test_another_family_is_told_before_its_tokenizer_is_missed(config: Any, tmp_path: Path) -> None:
+    config.vlm_model_name = str(tmp_path)
+    with pytest.raises(FileNotFoundError, match=r"the folder has no config.json"):
+        get_policy_class(config.type)(config)
+    (tmp_path / "config.json").write_text('{"model_type": "gpt2"}')
+    with pytest.raises(ValueError, match=f"is a 'gpt2' model; {config.type} needs"):
+        get_policy_class(config.type)(config)
 
 
 @torch.no_grad()

@@ -24,6 +24,8 @@ from transformers import (
 from lerobot_bomb.vlm.presets import INITIALIZER_RANGE, nano_config
 from lerobot_bomb.vlm.tokenizer import NANO, hub_file, load_tokenizer
 
+FAMILIES = {"vla0_smol": "smolvlm", "spatialvla_grid": "paligemma", "fdvla": "qwen2_5_vl"}  # of base models
+
 
 class SmolVLMBackbone(nn.Module):
     """A stock ``SmolVLMForConditionalGeneration``, called in parts: images, tokens, text model, head."""
@@ -76,18 +78,13 @@ def load_backbone(vlm_model_name: str) -> SmolVLMBackbone:
 
     Raises:
         OSError: config or weights cannot be had; the message names the ways out.
-        ValueError: the model is not of the SmolVLM family.
+        ValueError: as `check_family`.
     """
     if vlm_model_name == NANO:
         backbone = build_backbone(nano_config(load_tokenizer(NANO)))
         spread_pictures(backbone.vlm.model.vision_model)
         return backbone
-    config = read_vlm_config(vlm_model_name)
-    if config.model_type != "smolvlm":
-        raise ValueError(
-            f"--policy.vlm_model_name={vlm_model_name} is a {config.model_type!r} model; "
-            f"vla0_smol needs a 'smolvlm' one"
-        )
+    config = read_vlm_config(vlm_model_name, "vla0_smol")
     with weights_errors(vlm_model_name):
         return SmolVLMBackbone(
             SmolVLMForConditionalGeneration.from_pretrained(
@@ -96,14 +93,38 @@ def load_backbone(vlm_model_name: str) -> SmolVLMBackbone:
         )
 
 
-def read_vlm_config(vlm_model_name: str) -> PreTrainedConfig:
-    """Config of a Hub id or a local folder.
+def check_family(vlm_model_name: str, policy: str) -> None:
+    """The base model of a policy is of the family that it reads, as ``nano`` always is.
 
     Raises:
-        OSError: it cannot be had; the message names the ways out.
+        OSError: there is no config; the message names the ways out.
+        ValueError: it is another family's, or a policy's.
     """
-    if not Path(vlm_model_name).is_dir():
-        hub_file(vlm_model_name, "config.json")
+    if vlm_model_name == NANO:
+        return
+    path = Path(vlm_model_name) / "config.json"
+    if not path.parent.is_dir():
+        path = Path(hub_file(vlm_model_name, path.name))
+    if not path.is_file():
+        raise FileNotFoundError(f"--policy.vlm_model_name={vlm_model_name}: the folder has no config.json")
+    config = json.loads(path.read_text())
+    family = config.get("model_type")
+    if family is None and "type" in config:
+        raise ValueError(
+            f"--policy.vlm_model_name={vlm_model_name} is a checkpoint of the policy {config['type']!r}; "
+            f"`lerobot-bomb export-backbone --policy.path={vlm_model_name} --output=FOLDER` makes a folder "
+            f"to start from. (To train on: --policy.path={vlm_model_name})"
+        )
+    if family != FAMILIES[policy]:
+        raise ValueError(
+            f"--policy.vlm_model_name={vlm_model_name} is a {family!r} model; "
+            f"{policy} needs a {FAMILIES[policy]!r} one"
+        )
+
+
+def read_vlm_config(vlm_model_name: str, policy: str) -> Any:
+    """Config of a Hub id or a local folder, for a policy; raises as `check_family`."""
+    check_family(vlm_model_name, policy)
     return AutoConfig.from_pretrained(vlm_model_name)
 
 

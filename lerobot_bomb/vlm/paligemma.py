@@ -5,6 +5,7 @@ tokens of an image.
 """
 
 from dataclasses import asdict, dataclass
+from functools import partial
 from typing import Any
 
 import torch
@@ -15,7 +16,7 @@ from transformers import PaliGemmaConfig, PaliGemmaForConditionalGeneration
 from lerobot_bomb.actions.text import END, SYMBOL_TEXTS
 from lerobot_bomb.vlm.backbone import read_vlm_config, set_float32, spread_pictures, weights_errors
 from lerobot_bomb.vlm.presets import nano_paligemma_config
-from lerobot_bomb.vlm.tokenizer import IMAGE_TOKEN, NANO, load_tokenizer
+from lerobot_bomb.vlm.tokenizer import IMAGE_TOKEN, NANO, load_tokenizer, single_id, token_ids
 
 # PaliGemma counts positions from 1
 FIRST_POSITION = 1
@@ -38,19 +39,8 @@ class PaliGemmaPrompt:
         Raises:
             ValueError: a digit, the space or a special token is not exactly one token.
         """
-
-        def several(text: str) -> list[int]:
-            return tokenizer.encode(text, add_special_tokens=False).ids
-
-        def one(*texts: str) -> int:
-            found = [ids[0] for ids in map(several, texts) if len(ids) == 1]
-            if not found:
-                raise ValueError(
-                    f"--policy.vlm_model_name={vlm_model_name}: its tokenizer has no single token for "
-                    f"{' or '.join(map(repr, texts))}; the policy needs a PaliGemma tokenizer, which has"
-                )
-            return found[0]
-
+        several = partial(token_ids, tokenizer)
+        one = partial(single_id, tokenizer, vlm_model_name, "PaliGemma")
         # the second of each pair is the nano tokenizer's
         return cls(
             image=one(IMAGE_TOKEN),
@@ -128,17 +118,17 @@ def load_paligemma(vlm_model_name: str) -> PaliGemmaBackbone:
 
     Raises:
         OSError: config or weights cannot be had; the message names the ways out.
-        ValueError: the model is not a PaliGemma 2.
+        ValueError: the model is not a PaliGemma 2, or as `check_family`.
     """
     if vlm_model_name == NANO:
         backbone = build_paligemma(nano_paligemma_config(load_tokenizer(NANO)))
         spread_pictures(backbone.vlm.model.vision_tower)
         return backbone
-    config: Any = read_vlm_config(vlm_model_name)
-    if config.model_type != "paligemma" or config.text_config.model_type != "gemma2":
+    config = read_vlm_config(vlm_model_name, "spatialvla_grid")
+    if config.text_config.model_type != "gemma2":
         raise ValueError(
-            f"--policy.vlm_model_name={vlm_model_name} is a {config.model_type!r} model; spatialvla_grid "
-            f"needs a 'paligemma' one with 'gemma2' as its text model (PaliGemma 2)"
+            f"--policy.vlm_model_name={vlm_model_name} has {config.text_config.model_type!r} as its text "
+            f"model; spatialvla_grid needs 'gemma2' (PaliGemma 2)"
         )
     with weights_errors(vlm_model_name):
         return PaliGemmaBackbone(

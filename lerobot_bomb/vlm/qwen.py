@@ -21,7 +21,14 @@ from transformers.utils.constants import OPENAI_CLIP_MEAN, OPENAI_CLIP_STD
 
 from lerobot_bomb.vlm.backbone import read_vlm_config, set_float32, spread_filters, weights_errors
 from lerobot_bomb.vlm.presets import nano_qwen_config
-from lerobot_bomb.vlm.tokenizer import IMAGE_EDGE_TOKEN, IMAGE_TOKEN, NANO, load_tokenizer
+from lerobot_bomb.vlm.tokenizer import (
+    IMAGE_EDGE_TOKEN,
+    IMAGE_TOKEN,
+    NANO,
+    load_tokenizer,
+    single_id,
+    token_ids,
+)
 
 # of the chat format, where the user gives none
 SYSTEM_TEXT = "system\nYou are a helpful assistant."
@@ -46,19 +53,8 @@ class QwenPrompt:
         Raises:
             ValueError: a special token is not exactly one token.
         """
-
-        def several(text: str) -> list[int]:
-            return tokenizer.encode(text, add_special_tokens=False).ids
-
-        def one(*texts: str) -> int:
-            found = [ids[0] for ids in map(several, texts) if len(ids) == 1]
-            if not found:
-                raise ValueError(
-                    f"--policy.vlm_model_name={vlm_model_name}: its tokenizer has no single token for "
-                    f"{' or '.join(map(repr, texts))}; the policy needs a Qwen2.5-VL tokenizer, which has"
-                )
-            return found[0]
-
+        several = partial(token_ids, tokenizer)
+        one = partial(single_id, tokenizer, vlm_model_name, "Qwen2.5-VL")
         turn, turn_end, line_break = one("<|im_start|>"), one("<|im_end|>"), several("\n")
         return cls(
             start=[turn, *several(SYSTEM_TEXT), turn_end, *line_break, turn, *several("user\n")],
@@ -247,18 +243,13 @@ def load_qwen(vlm_model_name: str, image_size: int) -> QwenBackbone:
 
     Raises:
         OSError: config or weights cannot be had; the message names the ways out.
-        ValueError: the model is not a Qwen2.5-VL, or as `QwenBackbone`.
+        ValueError: as `check_family` and `QwenBackbone`.
     """
     if vlm_model_name == NANO:
         backbone = build_qwen(nano_qwen_config(load_tokenizer(NANO)), image_size)
         spread_filters(backbone.vlm.model.visual.patch_embed.proj.weight)
         return backbone
-    config = read_vlm_config(vlm_model_name)
-    if config.model_type != "qwen2_5_vl":
-        raise ValueError(
-            f"--policy.vlm_model_name={vlm_model_name} is a {config.model_type!r} model; "
-            f"fdvla needs a 'qwen2_5_vl' one"
-        )
+    config = read_vlm_config(vlm_model_name, "fdvla")
     with weights_errors(vlm_model_name):
         vlm = Qwen2_5_VLForConditionalGeneration.from_pretrained(
             vlm_model_name, config=config, dtype=torch.float32, attn_implementation="sdpa"

@@ -72,6 +72,26 @@ def hub_file(vlm_model_name: str, filename: str) -> str:
         ) from error
 
 
+def token_ids(tokenizer: Tokenizer, text: str) -> list[int]:
+    """Tokens of a fixed part of a prompt, special ones in it included."""
+    return tokenizer.encode(text, add_special_tokens=False).ids
+
+
+def single_id(tokenizer: Tokenizer, vlm_model_name: str, family: str, *texts: str) -> int:
+    """The first of these texts that is exactly one token.
+
+    Raises:
+        ValueError: none is; the message names the family of tokenizers that have one.
+    """
+    found = [ids[0] for text in texts if len(ids := token_ids(tokenizer, text)) == 1]
+    if not found:
+        raise ValueError(
+            f"--policy.vlm_model_name={vlm_model_name}: its tokenizer has no single token for "
+            f"{' or '.join(map(repr, texts))}; the policy needs a {family} tokenizer, which has"
+        )
+    return found[0]
+
+
 def tokenizer_to_tensor(tokenizer: Tokenizer) -> Tensor:
     """The tokenizer's JSON as uint8 (bytes,)."""
     return torch.frombuffer(bytearray(tokenizer.to_str().encode()), dtype=torch.uint8)

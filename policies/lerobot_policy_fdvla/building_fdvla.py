@@ -1,6 +1,6 @@
 """The vision-language model of an ``fdvla``, from its config or a checkpoint's."""
 
-from lerobot_bomb.vlm.backbone import config_dict
+from lerobot_bomb.vlm.backbone import check_family, config_dict
 from lerobot_bomb.vlm.qwen import QwenBackbone, QwenPrompt, build_qwen, load_qwen
 from lerobot_bomb.vlm.tokenizer import load_tokenizer
 from lerobot_policy_fdvla.configuration_fdvla import FdvlaConfig
@@ -10,6 +10,7 @@ def build_model(config: FdvlaConfig) -> tuple[QwenPrompt, QwenBackbone]:
     """Base model, or the architecture of a checkpoint; fills in what a checkpoint's config must hold."""
     if config.vlm_config is None:
         name = config.vlm_model_name
+        check_family(name, config.type)
         tokens = QwenPrompt.from_tokenizer(load_tokenizer(name), name)
         backbone = load_qwen(name, config.image_size)
         config.vlm_config, config.prompt_tokens = config_dict(backbone.vlm), tokens.to_dict()

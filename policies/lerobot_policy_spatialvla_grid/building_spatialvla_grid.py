@@ -14,7 +14,7 @@ from lerobot_bomb.actions.grid_settings import ActionGroup
 from lerobot_bomb.actions.grids import ActionGrids
 from lerobot_bomb.actions.relative import bounds, present_episodes
 from lerobot_bomb.data.columns import dim_names, read_columns
-from lerobot_bomb.vlm.backbone import config_dict
+from lerobot_bomb.vlm.backbone import check_family, config_dict
 from lerobot_bomb.vlm.depth import ZoeDepth, build_zoedepth, load_zoedepth
 from lerobot_bomb.vlm.paligemma import PaliGemmaBackbone, PaliGemmaPrompt, build_paligemma, load_paligemma
 from lerobot_bomb.vlm.tokenizer import load_tokenizer
@@ -76,6 +76,7 @@ def build_model(config: SpatialvlaGridConfig) -> tuple[PaliGemmaPrompt, PaliGemm
     """Base model, or the architecture of a checkpoint; fills in what a checkpoint's config must hold."""
     if config.vlm_config is None:
         name = config.vlm_model_name
+        check_family(name, config.type)
         tokens = PaliGemmaPrompt.from_tokenizer(load_tokenizer(name), name)
         backbone = load_paligemma(name)
         config.vlm_config, config.prompt_tokens = config_dict(backbone.vlm), tokens.to_dict()

@@ -37,7 +37,13 @@ from lerobot_bomb.decoding.draft import KnownSymbols, LinearDraft
 from lerobot_bomb.decoding.grammar import NumberGrammar
 from lerobot_bomb.decoding.writer import NumberWriter
 from lerobot_bomb.policy_flags import check_as_trained, trained_with
-from lerobot_bomb.vlm.backbone import SmolVLMBackbone, build_backbone, config_dict, load_backbone
+from lerobot_bomb.vlm.backbone import (
+    SmolVLMBackbone,
+    build_backbone,
+    check_family,
+    config_dict,
+    load_backbone,
+)
 from lerobot_bomb.vlm.cached_text import check_positions
 from lerobot_bomb.vlm.images import crop_and_resize
 from lerobot_bomb.vlm.inputs import read_actions, read_image, read_task, read_tensor
@@ -377,6 +383,7 @@ def _build(config: Vla0SmolConfig) -> tuple[PromptTokens, SmolVLMBackbone]:
     """Base model, or the architecture of a checkpoint; fills in what a checkpoint's config must hold."""
     if config.vlm_config is None:
         name = config.vlm_model_name
+        check_family(name, config.type)
         tokens = PromptTokens.from_tokenizer(load_tokenizer(name), name, config.system_prompt)
         backbone = load_backbone(name)
         config.vlm_config, config.prompt_tokens = config_dict(backbone.vlm), tokens.to_dict()
