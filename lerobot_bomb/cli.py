@@ -64,7 +64,9 @@ def main(argv: Sequence[str] | None = None) -> int:
             if name in argv[:1]:
                 modules[name] = importlib.import_module(module)
                 getattr(modules[name], f"add_{_function(name)}_arguments")(command)
-        args = parser.parse_args(argv)
+        args, unknown = parser.parse_known_args(argv)
+        if unknown:
+            commands.choices[args.command].error(f"unrecognized arguments: {' '.join(unknown)}")
         return getattr(modules[args.command], f"run_{_function(args.command)}")(args)
     except (ValueError, OSError, RuntimeError) as error:
         print(f"lerobot-bomb {argv[0]}: {error}", file=sys.stderr)

@@ -135,6 +135,7 @@ def test_rates_that_differ_are_told(
         (["--fps=0"], "--fps=0 must be a positive number"),
         (["--fps=nan"], "--fps=nan must be a positive number"),
         (["--json=absent/figures.json"], "--json=absent/figures.json cannot be written"),
+        (["--json=short.jsonl"], "--json=short.jsonl exists already; name a new file or delete it"),
         (["absent.jsonl"], "absent.jsonl: no such file or folder; `lerobot-bomb eval absent.jsonl"),
         (["short.jsonl"], "short.jsonl: no episode has 4 actions"),
         (["three.jsonl"], f"three.jsonl: actions have 3 dims, those of {REPO_ID} 2"),
@@ -160,6 +161,13 @@ def test_bad_input_is_one_line(
     assert error.startswith("lerobot-bomb smoothness: ") and error.count("\n") == 1
     with pytest.raises(ValueError, match=message):
         raise ValueError(error)
+
+
+def test_an_unknown_flag_shows_the_commands_own_usage(capsys: pytest.CaptureFixture[str]) -> None:
+    with pytest.raises(SystemExit, match="2"):
+        main(["smoothness", f"--dataset.repo_id={REPO_ID}", "--per_seconds_"])
+    error = capsys.readouterr().err
+    assert error.startswith("usage: lerobot-bomb smoothness") and "unrecognized arguments: --per_sec" in error
 
 
 def test_a_dim_that_never_changes_has_no_unit() -> None:

@@ -65,7 +65,9 @@ def add_eval_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the arguments of ``lerobot-bomb eval``."""
     parser.usage = "lerobot-bomb eval FILE --policy.path=... --env.type=... (all flags of lerobot-eval)"
     parser.add_argument("path", type=Path, metavar="FILE", help="new file: a JSON line per finished episode")
-    parser.add_argument("flags", nargs=argparse.REMAINDER, metavar="FLAG", help="flags of lerobot-eval")
+    flags = "flags of lerobot-eval"
+    rest = parser.add_argument("flags", nargs=argparse.REMAINDER, metavar="FLAG", help=flags)
+    rest.required = False  # without FILE, argparse would ask for both
 
 
 def run_eval(args: argparse.Namespace) -> int:

@@ -93,7 +93,9 @@ def read_action_log(path: Path) -> Executed:
             actions_TD = np.array(row["actions"], dtype=np.float64)
             rates.add(float(row["fps"]))
         except (ValueError, KeyError, TypeError) as error:
-            raise ValueError(f"{path}:{number}: not the actions of an episode ({error!r})") from error
+            raise ValueError(
+                f"{path}:{number}: not the actions of an episode, as `lerobot-bomb eval` writes them"
+            ) from error
         if actions_TD.ndim != 2:
             raise ValueError(f"{path}:{number}: actions have the shape {actions_TD.shape}, not (T, D)")
         if episode in episodes:

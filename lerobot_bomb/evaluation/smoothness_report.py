@@ -69,7 +69,7 @@ def add_smoothness_arguments(parser: argparse.ArgumentParser) -> None:
     add("--exclude", type=lambda text: [name for name in text.split(",") if name], help=exclude)
     add("--per_second", action="store_true", help="differences per s^2 and s^3 instead of per step")
     add("--fps", type=float, help="actions a second (default: as each dataset and file says)")
-    add("--json", type=Path, help="also write all figures to this file, those of every episode too")
+    add("--json", type=Path, help="also write all figures to this new file, those of every episode too")
 
 
 def run_smoothness(args: argparse.Namespace) -> int:
@@ -109,6 +109,8 @@ def run_smoothness(args: argparse.Namespace) -> int:
 
 def _check_flags(args: argparse.Namespace) -> None:
     if args.json is not None:
+        if args.json.exists():
+            raise ValueError(f"--json={args.json} exists already; name a new file or delete it")
         check_writable("--json", args.json)
     if args.fps is not None and not 0 < args.fps < math.inf:
         raise ValueError(f"--fps={args.fps:g} must be a positive number of actions a second")
