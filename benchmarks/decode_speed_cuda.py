@@ -23,7 +23,7 @@ from decode_speed_compare import Timed, compare, finish, print_rows
 from decode_speed_peer import XgrammarGenerate
 from lerobot.configs import FeatureType, PolicyFeature
 from lerobot.policies import make_pre_post_processors
-from machine import add_machine_arguments, positive, require_idle_machine
+from machine import add_machine_arguments, positive, require_cuda, require_idle_machine
 from torch import Tensor
 
 from lerobot_bomb.decoding.decoder import Guess, Prompt
@@ -73,9 +73,8 @@ def main() -> None:
     parser.add_argument("--parts", nargs="+", choices=PARTS, default=PARTS, help="default: all")
     add_machine_arguments(parser)
     args = parser.parse_args()
+    require_cuda("benchmarks/decode_speed.py measures on a CPU.")
     require_idle_machine(args.force)
-    if not torch.cuda.is_available():
-        raise SystemExit("No CUDA device is there; benchmarks/decode_speed.py measures on a CPU.")
     print(torch.cuda.get_device_name(), f"torch {torch.__version__}")
     logging.disable(logging.WARNING)
     torch.manual_seed(0)

@@ -22,7 +22,7 @@ import torch
 from decode_speed_compare import finish, print_rows
 from lerobot.configs import FeatureType, PolicyFeature
 from lerobot.policies import make_pre_post_processors
-from machine import add_machine_arguments, positive, require_idle_machine
+from machine import add_machine_arguments, positive, require_cuda, require_idle_machine
 from torch import Tensor
 
 from lerobot_bomb.vlm.presets import nano_qwen_config
@@ -55,8 +55,12 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawTextHelpFormatter)
     parser.add_argument("--device", choices=("cpu", "cuda"), default="cpu")
     parser.add_argument("--repeats", type=positive, default=10, help="queries of each (default: 10)")
+    parts = tuple(BATCH_SIZES)
+    parser.add_argument("--parts", nargs="+", choices=parts, default=parts, help="models (default: all)")
     add_machine_arguments(parser)
     args = parser.parse_args()
+    if args.device == "cuda":
+        require_cuda("give --device=cpu.")
     require_idle_machine(args.force)
     logging.disable(logging.WARNING)
     figures: dict[str, Any] = {"device": args.device}
@@ -64,7 +68,7 @@ def main() -> None:
         figures["device"] = torch.cuda.get_device_name()
     print(figures["device"], f"torch {torch.__version__}")
     bars: dict[str, bool] = {}
-    for model in BATCH_SIZES:
+    for model in args.parts:
         for dtype in ("float32", "bfloat16") if args.device == "cuda" else ("float32",):
             policy = make_policy(model, args.device, dtype)
             for batch_size in BATCH_SIZES[model]:

@@ -9,12 +9,11 @@ Shapes: `B` samples, each a chunk of K = 1 action with D = 1 dim, `N` sampling s
 """
 
 import argparse
-from pathlib import Path
 from statistics import NormalDist
 from typing import Any
 
 import torch
-from machine import write_figures
+from machine import writable, write_figures
 from torch import Tensor
 
 from lerobot_bomb.flow.samplers import Heads, sample
@@ -35,7 +34,7 @@ NUM_SAMPLES = 20_000  # of two modes
 def main() -> None:
     """Print a table for each distribution."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawTextHelpFormatter)
-    parser.add_argument("--json", type=Path, help="also write the figures to this file")
+    parser.add_argument("--json", type=writable, help="also write the figures to this file")
     args = parser.parse_args()
     one_mode = {name: [of_one_mode(options, n) for n in NUM_STEPS] for name, options in SETTINGS.items()}
     two_modes = {name: [of_two_modes(options, n) for n in NUM_STEPS] for name, options in SETTINGS.items()}

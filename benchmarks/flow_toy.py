@@ -15,11 +15,10 @@ import argparse
 import time
 from dataclasses import asdict, dataclass
 from functools import partial
-from pathlib import Path
 
 import torch
-from flow_toy_picture import draw_picture, near_modes
-from machine import positive, write_figures
+from flow_toy_picture import draw_picture, near_modes, picture
+from machine import positive, writable, write_figures
 from torch import Tensor, nn
 from torch.optim.lr_scheduler import CosineAnnealingLR
 
@@ -39,6 +38,7 @@ WORDS = {"left": LEFT, "right": RIGHT, "any": BOTH}
 WIDTH = 64
 BATCH_SIZE = 256
 LEARNING_RATE = 2e-3
+MIN_SAMPLES = 100  # of a word: a cloud with none has no mean
 SAMPLING_STEPS = 100  # few steps make the spread too small, whatever the heads have learned
 
 # bars: least and largest share of the samples near a mode, by the data's
@@ -110,9 +110,11 @@ def main() -> None:
     parser.add_argument("--steps", type=positive, default=1000, help="of training, each variant")
     parser.add_argument("--samples", type=positive, default=1000, help="of each word")
     parser.add_argument("--seed", type=int, default=0)
-    parser.add_argument("--json", type=Path, help="also write the figures to this file")
-    parser.add_argument("--picture", type=Path, help="draw the samples into this file")
+    parser.add_argument("--json", type=writable, help="also write the figures to this file")
+    parser.add_argument("--picture", type=picture, help="draw the samples into this file")
     args = parser.parse_args()
+    if args.samples < MIN_SAMPLES:
+        parser.error(f"--samples={args.samples} is too few to measure clouds; at least {MIN_SAMPLES}")
     seconds, samples, rows = {}, {}, []
     for name, variant in VARIANTS.items():
         start = time.process_time()

@@ -1,15 +1,18 @@
 """Samples in the plane as clouds of dots: a row for each word, a column for the data and each variant."""
 
+import argparse
 from pathlib import Path
 
 import imageio.v3 as iio
 import numpy as np
 import torch
+from machine import writable
 from PIL import Image, ImageDraw
 from torch import Tensor
 
 from lerobot_bomb.viewing.sheet import GAP, INK, TILE_PAPER, TITLE_SIZE, Sheet, font
 
+SUFFIXES = ".png", ".jpg"
 TILE_SIZE = 190  # pixels
 SCALE = 3  # drawn so many times as large, then shrunk
 HALF_RANGE = 1.9  # a tile shows this far to every side of the origin
@@ -17,6 +20,14 @@ DOT_RADIUS = 0.7  # pixels
 DATA_RGB, SAMPLE_RGB, RING_RGB = (95, 100, 110), (30, 90, 190), (215, 60, 40)
 
 Clouds = dict[str, Tensor]  # word -> (N, 2)
+
+
+def picture(text: str) -> Path:
+    """A file that a picture can be written to."""
+    path = writable(text)
+    if path.suffix.lower() not in SUFFIXES:
+        raise argparse.ArgumentTypeError(f"{text!r} must end in {' or '.join(SUFFIXES)}")
+    return path
 
 
 def near_modes(points_N2: Tensor, modes_M2: Tensor, radius: float) -> Tensor:

@@ -7,12 +7,14 @@ import platform
 from pathlib import Path
 from typing import Any
 
+import torch
+
 MAX_LOAD_PER_CORE = 0.5  # one-minute load average
 
 
 def add_machine_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare --json and --force."""
-    parser.add_argument("--json", type=_new_file, help="also write the figures to this file")
+    parser.add_argument("--json", type=writable, help="also write the figures to this file")
     parser.add_argument("--force", action="store_true", help="measure on a busy machine all the same")
 
 
@@ -23,7 +25,8 @@ def positive(text: str) -> int:
     return int(text)
 
 
-def _new_file(text: str) -> Path:
+def writable(text: str) -> Path:
+    """A file in a folder that exists."""
     path = Path(text)
     if path.is_dir() or not os.access(path.parent, os.W_OK):
         raise argparse.ArgumentTypeError(f"{text!r} cannot be written")
@@ -39,6 +42,12 @@ def require_idle_machine(force: bool) -> None:
         raise SystemExit(
             f"The load is above {MAX_LOAD_PER_CORE} per core: wait until the machine is idle, or use --force."
         )
+
+
+def require_cuda(instead: str) -> None:
+    """Leave with exit code 1, and what to do instead, where no CUDA device is."""
+    if not torch.cuda.is_available():
+        raise SystemExit(f"No CUDA device is there; {instead}")
 
 
 def write_figures(path: Path | None, figures: dict[str, Any]) -> None:

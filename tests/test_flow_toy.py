@@ -34,6 +34,24 @@ def test_a_short_training_hears_words_through_dualmod_only(
     assert iio.imread(picture_path).std() > 10
 
 
+@pytest.mark.parametrize(
+    ("flag", "message"),
+    [
+        ("--samples=10", "--samples=10 is too few to measure clouds; at least 100"),
+        ("--picture=toy.txt", "'toy.txt' must end in .png or .jpg"),
+        ("--picture=absent/toy.png", "'absent/toy.png' cannot be written"),
+        ("--json=absent/toy.json", "'absent/toy.json' cannot be written"),
+    ],
+)
+def test_flags_are_checked_before_training(
+    flag: str, message: str, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setattr("sys.argv", ["flow_toy.py", flag])
+    with pytest.raises(SystemExit, match="2"):
+        flow_toy.main()
+    assert message in capsys.readouterr().err
+
+
 @pytest.fixture
 def cloud() -> Tensor:
     """(1000, 2) around the left mode."""
