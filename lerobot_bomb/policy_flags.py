@@ -69,6 +69,7 @@ def check_training(config: Any) -> None:
             "scheduler_decay_lr",
             "optimizer_weight_decay",
             "scheduler_warmup_steps",
+            "trained_batches",
         ),
     )
     check_positive(config, ("scheduler_decay_steps",))

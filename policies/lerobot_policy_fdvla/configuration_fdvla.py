@@ -133,6 +133,8 @@ class FdvlaConfig(PreTrainedConfig):
     gradient_checkpointing: bool = False
     # values of AS_TRAINED; filled in for checkpoints
     trained_with: dict[str, Any] | None = None
+    # batches trained on so far; what is random in the next ones follows from it
+    trained_batches: int = 0
 
     optimizer_lr: float = 2e-5
     optimizer_betas: tuple[float, float] = (0.9, 0.95)

@@ -30,6 +30,7 @@ from lerobot_bomb.flow.path import PathPoint, draw_noise, draw_tau, path_point
 from lerobot_bomb.flow.real_time import guided
 from lerobot_bomb.flow.samplers import SAMPLERS, Heads, sample
 from lerobot_bomb.policy_flags import check_as_trained, check_weights_fit, trained_with
+from lerobot_bomb.training_draws import begin_batch
 from lerobot_bomb.vlm.cached_text import check_positions
 from lerobot_bomb.vlm.graphs import RecordedModel
 from lerobot_bomb.vlm.images import draw_windows, resize
@@ -98,7 +99,7 @@ class FdvlaPolicy(PreTrainedPolicy):
         # physical size of 1 in normalised actions, known while training: (D,)
         self.register_buffer("action_unit", torch.ones(self._action_dim), persistent=False)
         self._take_units(dataset_meta)
-        # source of all that is random in training: the crop, the time, the noise
+        # of all that is random in training: the crop, the time, the noise
         self.generator = torch.Generator().manual_seed(torch.initial_seed())
         logger.info("fdvla: %s", self.parameter_counts)
         heads = [head for head in (self.flow_head, self.denoise_head) if head is not None]
@@ -161,6 +162,8 @@ class FdvlaPolicy(PreTrainedPolicy):
 
         As CogACT (arXiv 2411.19650) does, ``draws_per_chunk`` of them; `B` counts these from here on.
         """
+        if self.training:
+            begin_batch(self.config, self.generator)
         draws = self.config.draws_per_chunk
         actions_BKD = self._actions(batch).repeat_interleave(draws, dim=0)
         kept_BK = self._kept(batch).repeat_interleave(draws, dim=0)

@@ -33,6 +33,7 @@ from lerobot_bomb.data.columns import dim_names
 from lerobot_bomb.decoding.decoder import Prompt
 from lerobot_bomb.decoding.slots import SlotWriter
 from lerobot_bomb.policy_flags import check_as_trained, trained_with
+from lerobot_bomb.training_draws import begin_batch
 from lerobot_bomb.vlm.depth import (
     lattice_points,
     observed_depth,
@@ -107,7 +108,7 @@ class SpatialvlaGridPolicy(PreTrainedPolicy):
         # physical size of 1 in normalised actions, known while training: (D,)
         self.register_buffer("action_unit", torch.ones(self._action_dim), persistent=False)
         self._take_units(dataset_meta)
-        # source of all that is random in training: the crop
+        # of all that is random in training: the crop
         self.generator = torch.Generator().manual_seed(torch.initial_seed())
         self._ensemble = make_ensemble(config, self.grids.groups)
         self.reset()
@@ -183,6 +184,8 @@ class SpatialvlaGridPolicy(PreTrainedPolicy):
         """Cross-entropy of the cells, over the kept ones; ``reduction="none"`` gives (B,)."""
         if reduction not in ("mean", "none"):
             raise ValueError(f"reduction={reduction!r} is unknown; choose mean or none")
+        if self.training:
+            begin_batch(self.config, self.generator)
         shape = self.config.chunk_size, self._action_dim
         actions_BTD = read_actions(batch, ACTION, self.config.type, self.symbol_ids.device, shape)
         cells_BTG = self.grids.encode(actions_BTD)

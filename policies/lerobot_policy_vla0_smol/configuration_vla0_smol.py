@@ -121,6 +121,8 @@ class Vla0SmolConfig(PreTrainedConfig):
     compile_model: bool = False
     # values of AS_TRAINED; filled in for checkpoints
     trained_with: dict[str, Any] | None = None
+    # batches trained on so far; what is random in the next ones follows from it
+    trained_batches: int = 0
 
     optimizer_lr: float = 5e-5
     optimizer_betas: tuple[float, float] = (0.9, 0.95)

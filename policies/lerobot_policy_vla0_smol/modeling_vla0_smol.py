@@ -37,6 +37,7 @@ from lerobot_bomb.decoding.draft import KnownSymbols, LinearDraft
 from lerobot_bomb.decoding.grammar import NumberGrammar
 from lerobot_bomb.decoding.writer import NumberWriter
 from lerobot_bomb.policy_flags import check_as_trained, trained_with
+from lerobot_bomb.training_draws import begin_batch
 from lerobot_bomb.vlm.backbone import (
     SmolVLMBackbone,
     build_backbone,
@@ -92,7 +93,7 @@ class Vla0SmolPolicy(PreTrainedPolicy):
         # physical size of 1 in normalised actions, known while training: (D,)
         self.register_buffer("action_unit", torch.ones(self._action_dim), persistent=False)
         self._knows_units = False
-        # source of all that is random in training: the crop and the hidden numbers
+        # of all that is random in training: the crop and the hidden numbers
         self.generator = torch.Generator().manual_seed(torch.initial_seed())
         self._ensemble = _make_ensemble(config)
         if dataset_meta is not None:
@@ -161,6 +162,8 @@ class Vla0SmolPolicy(PreTrainedPolicy):
         """Cross-entropy of the answer's tokens, over the kept ones; ``reduction="none"`` gives (B,)."""
         if reduction not in ("mean", "none"):
             raise ValueError(f"reduction={reduction!r} is unknown; choose mean or none")
+        if self.training:
+            begin_batch(self.config, self.generator)
         with self._autocast():
             prompt = self._prompt(batch)
             bins_BN = self._bins(batch)
