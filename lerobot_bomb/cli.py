@@ -31,6 +31,10 @@ COMMANDS = {
         "an action grid on a dataset: its fit, its edges and what it rounds off",
         "lerobot_bomb.actions.fit_grid",
     ),
+    "init": (
+        "a policy before its training, as a checkpoint that adapters can be trained on",
+        "lerobot_bomb.base_checkpoint",
+    ),
     "convert-spatialvla": (
         "a published SpatialVLA folder as a checkpoint of spatialvla_grid",
         "lerobot_bomb.vlm.convert_spatialvla",
@@ -65,7 +69,9 @@ def main(argv: Sequence[str] | None = None) -> int:
                 modules[name] = importlib.import_module(module)
                 getattr(modules[name], f"add_{_function(name)}_arguments")(command)
         args, unknown = parser.parse_known_args(argv)
-        if unknown:
+        if "rest" in args:  # of a command that has LeRobot's parser read them
+            args.rest = unknown
+        elif unknown:
             commands.choices[args.command].error(f"unrecognized arguments: {' '.join(unknown)}")
         return getattr(modules[args.command], f"run_{_function(args.command)}")(args)
     except (ValueError, OSError, RuntimeError) as error:
