@@ -11,7 +11,7 @@ from collections import deque
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import partial
-from typing import ClassVar
+from typing import Any, ClassVar
 
 import torch
 from lerobot.datasets import LeRobotDatasetMetadata
@@ -23,6 +23,7 @@ from torch import Tensor, nn
 from lerobot_bomb.actions.accuracy import means
 from lerobot_bomb.actions.relative import bounds
 from lerobot_bomb.actions.text import TokenRows
+from lerobot_bomb.adapters import peft_targets
 from lerobot_bomb.data.columns import dim_names
 from lerobot_bomb.flow.dual_mod import masked_mean_pool
 from lerobot_bomb.flow.losses import joint_loss, second_derivatives
@@ -43,6 +44,8 @@ from lerobot_policy_fdvla.networks_fdvla import NUM_MARKS, ActionSegment, Head
 logger = logging.getLogger(__name__)
 
 SAMPLING_SEED = 0
+# not of the base model: trained whole beside its adapters
+NEW_PARTS = ("segment", "state_embedding", "flow_head", "denoise_head")
 
 
 @dataclass(frozen=True)
@@ -150,6 +153,9 @@ class FdvlaPolicy(PreTrainedPolicy):
 
     def get_optim_params(self) -> list[nn.Parameter]:
         return [parameter for parameter in self.parameters() if parameter.requires_grad]
+
+    def _get_default_peft_targets(self) -> dict[str, Any]:
+        return peft_targets(self, "language_model", NEW_PARTS)
 
     def reset(self) -> None:
         self._queue: deque[Tensor] = deque(maxlen=self.config.n_action_steps)

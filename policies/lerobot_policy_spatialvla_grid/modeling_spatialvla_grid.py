@@ -9,7 +9,7 @@ cells of a group.
 
 import logging
 from collections import deque
-from typing import ClassVar
+from typing import Any, ClassVar
 
 import torch
 from lerobot.datasets import LeRobotDatasetMetadata
@@ -29,6 +29,7 @@ from lerobot_bomb.actions.grid_rows import interpolate_rows
 from lerobot_bomb.actions.grids import ActionGrids
 from lerobot_bomb.actions.relative import bounds
 from lerobot_bomb.actions.text import TokenRows, digits_needed, number_symbols
+from lerobot_bomb.adapters import check_buffers_are_the_bases, frozen_buffers, peft_targets
 from lerobot_bomb.data.columns import dim_names
 from lerobot_bomb.decoding.decoder import Prompt
 from lerobot_bomb.decoding.slots import SlotWriter
@@ -60,6 +61,9 @@ from lerobot_policy_spatialvla_grid.configuration_spatialvla_grid import (
 )
 
 logger = logging.getLogger(__name__)
+
+# not of the base model: trained whole beside its adapters
+NEW_PARTS = ("cell_embedding", "cell_head", "ego3d")
 
 
 class SpatialvlaGridPolicy(PreTrainedPolicy):
@@ -111,6 +115,7 @@ class SpatialvlaGridPolicy(PreTrainedPolicy):
         # of all that is random in training: the crop
         self.generator = torch.Generator().manual_seed(torch.initial_seed())
         self._ensemble = make_ensemble(config, self.grids.groups)
+        self._base_buffers: dict[str, Tensor] | None = None  # of the checkpoint, before it was fitted to data
         self.reset()
 
     @classmethod
@@ -128,6 +133,7 @@ class SpatialvlaGridPolicy(PreTrainedPolicy):
             config.check_grid_as_trained(is_refitted=dataset_meta is not None and config.adapt_embeddings)
         policy = super().from_pretrained(*args, config=config, **{**kwargs, "strict": True})
         if dataset_meta is not None:
+            policy._base_buffers = frozen_buffers(policy)
             if policy.config.adapt_embeddings:
                 policy._adapt(dataset_meta)
             policy._take_units(dataset_meta)
@@ -172,6 +178,13 @@ class SpatialvlaGridPolicy(PreTrainedPolicy):
 
     def get_optim_params(self) -> list[nn.Parameter]:
         return [parameter for parameter in self.parameters() if parameter.requires_grad]
+
+    def _get_default_peft_targets(self) -> dict[str, Any]:
+        return peft_targets(self, "language_model", NEW_PARTS)
+
+    def _validate_peft_config(self, peft_config: Any) -> None:
+        super()._validate_peft_config(peft_config)
+        check_buffers_are_the_bases(self, self._base_buffers, "give --policy.adapt_embeddings=false")
 
     def reset(self) -> None:
         self._queue: deque[Tensor] = deque(maxlen=self.config.n_action_steps)

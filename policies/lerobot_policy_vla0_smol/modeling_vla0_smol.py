@@ -7,7 +7,7 @@ takes, `L` tokens of a sequence, `A` tokens of an answer, `H` hidden size, `P` t
 """
 
 from collections import deque
-from typing import ClassVar
+from typing import Any, ClassVar
 
 import torch
 from lerobot.datasets import LeRobotDatasetMetadata
@@ -31,6 +31,7 @@ from lerobot_bomb.actions.text import (
     draw_hidden,
     number_symbols,
 )
+from lerobot_bomb.adapters import check_buffers_are_the_bases, frozen_buffers, peft_targets
 from lerobot_bomb.data.columns import dim_names, episode_bounds, read_columns
 from lerobot_bomb.decoding.decoder import Prompt
 from lerobot_bomb.decoding.draft import KnownSymbols, LinearDraft
@@ -96,6 +97,7 @@ class Vla0SmolPolicy(PreTrainedPolicy):
         # of all that is random in training: the crop and the hidden numbers
         self.generator = torch.Generator().manual_seed(torch.initial_seed())
         self._ensemble = _make_ensemble(config)
+        self._base_buffers: dict[str, Tensor] | None = None  # of the checkpoint, before it was fitted to data
         if dataset_meta is not None:
             self._fit(dataset_meta)
         self.reset()
@@ -122,6 +124,7 @@ class Vla0SmolPolicy(PreTrainedPolicy):
                 ) from error
             raise
         if dataset_meta is not None:
+            policy._base_buffers = frozen_buffers(policy)
             policy._fit(dataset_meta)
         return policy
 
@@ -150,6 +153,15 @@ class Vla0SmolPolicy(PreTrainedPolicy):
 
     def get_optim_params(self) -> list[torch.nn.Parameter]:
         return [parameter for parameter in self.parameters() if parameter.requires_grad]
+
+    def _get_default_peft_targets(self) -> dict[str, Any]:
+        return peft_targets(self, "text_model", ())
+
+    def _validate_peft_config(self, peft_config: Any) -> None:
+        super()._validate_peft_config(peft_config)
+        check_buffers_are_the_bases(
+            self, self._base_buffers, "start from one that lerobot-bomb init writes for this dataset"
+        )
 
     def reset(self) -> None:
         self._queue: deque[Tensor] = deque(maxlen=self.config.n_action_steps)

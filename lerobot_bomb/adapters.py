@@ -1,0 +1,44 @@
+"""What LoRA and other adapters of `peft` change of our policies; LeRobot asks a policy for it."""
+
+from collections.abc import Iterable
+from typing import Any
+
+import torch
+from torch import Tensor, nn
+
+PROJECTIONS = "q|k|v|o|gate|up|down"  # of a layer's attention and MLP
+
+
+def peft_targets(policy: nn.Module, text_model: str, new_parts: Iterable[str]) -> dict[str, Any]:
+    """Adapters on every projection of the text model's layers; parts that are new are trained as they are.
+
+    Of ``new_parts``, those that the policy has.
+    """
+    return {
+        "target_modules": rf"backbone\.vlm\.model\.{text_model}\.layers\..*\.({PROJECTIONS})_proj",
+        "modules_to_save": [name for name in new_parts if getattr(policy, name, None) is not None],
+    }
+
+
+def frozen_buffers(policy: nn.Module) -> dict[str, Tensor]:
+    """Copies of what a checkpoint holds besides parameters; of adapters, none does."""
+    parameters = dict(policy.named_parameters(remove_duplicate=False))
+    return {name: held.clone() for name, held in policy.state_dict().items() if name not in parameters}
+
+
+def check_buffers_are_the_bases(policy: nn.Module, base: dict[str, Tensor] | None, advice: str) -> None:
+    """Raise a ValueError if the policy was fitted to other data than the checkpoint ``base`` is of.
+
+    Adapters are loaded on that checkpoint again, which would not know of it.
+    """
+    fitted = frozen_buffers(policy)
+    changed = [name for name in fitted if base is not None and not _equal(fitted[name], base.get(name))]
+    if changed:
+        raise ValueError(
+            f"adapters cannot be trained on this checkpoint: {', '.join(changed)} would be fitted to the new "
+            f"dataset, but only the checkpoint holds them; {advice}"
+        )
+
+
+def _equal(ours: Tensor, theirs: Tensor | None) -> bool:
+    return theirs is not None and torch.equal(ours.cpu(), theirs.cpu())

@@ -1,0 +1,155 @@
+"""LoRA adapters on our policies: through `lerobot-train` and `lerobot-eval`, and in the fast decoders."""
+
+import copy
+import json
+import shutil
+from collections.abc import Callable
+from pathlib import Path
+from types import ModuleType
+from typing import Any
+
+import fdvla_cases
+import pytest
+import spatialvla_grid_cases
+import torch
+import vla0_smol_cases
+from lerobot.datasets import LeRobotDatasetMetadata
+from safetensors.torch import load_file
+
+from lerobot_bomb.cli import main
+from lerobot_bomb.data.record import record
+from lerobot_bomb.data.recording import Recording
+
+peft = pytest.importorskip("peft")
+
+Run = Callable[..., None]
+REPO_ID = "test/lora"
+CASES: dict[str, ModuleType] = {
+    "fdvla": fdvla_cases,
+    "spatialvla_grid": spatialvla_grid_cases,
+    "vla0_smol": vla0_smol_cases,
+}
+NEW_PARTS = {
+    "fdvla": {"segment", "state_embedding", "flow_head", "denoise_head"},
+    "spatialvla_grid": {"cell_embedding", "cell_head", "ego3d"},
+    "vla0_smol": set(),
+}
+SMALL = {
+    "fdvla": "--policy.image_size=56 --policy.head_dim=32 --policy.dualmod_dim=16 --policy.dtype=float32",
+    "spatialvla_grid": "--policy.depth_source=none --policy.dtype=float32",
+    "vla0_smol": "--policy.dtype=float32",
+}
+LAYERS = 7  # projections of a layer
+
+
+def adapted(policy_type: str) -> tuple[Any, Any]:
+    """A policy and a copy of it that has learned, with adapters that are not 0."""
+    policy = CASES[policy_type].make_policy(dtype="float32")
+    policy.config.pretrained_path = Path("base")
+    wrapped = copy.deepcopy(policy).wrap_with_peft(peft_cli_overrides={"method_type": "LORA", "r": 4})
+    generator = torch.Generator().manual_seed(0)
+    with torch.no_grad():
+        for name, parameter in wrapped.named_parameters():
+            if parameter.requires_grad:
+                size = 0.2 if "lora_B" in name else 0.02
+                parameter.add_(size * torch.randn(parameter.shape, generator=generator))
+    return policy, wrapped.eval()
+
+
+def test_text_layers_get_adapters_and_new_parts_are_trained_whole(policy_type: str) -> None:
+    policy, wrapped = adapted(policy_type)
+    trained = [name for name, parameter in wrapped.named_parameters() if parameter.requires_grad]
+    num_layers = policy.backbone.text_config.num_hidden_layers
+    assert sum("lora_A" in name for name in trained) == LAYERS * num_layers
+    assert all(".layers." in name for name in trained if "lora_" in name)
+    assert not any("visi" in name or "visual" in name for name in trained)
+    whole = {name.split(".modules_to_save")[0].split(".")[-1] for name in trained if "lora_" not in name}
+    assert whole == NEW_PARTS[policy_type]
+
+
+def test_decoders_see_adapters_as_merged_weights(policy_type: str) -> None:
+    policy, wrapped = adapted(policy_type)
+    batch = CASES[policy_type].make_batch(policy, 3)
+    plain, actions = (each.predict_action_chunk(batch) for each in (policy, wrapped))
+    assert not torch.allclose(actions, plain, atol=1e-3)
+    wrapped.reset()
+    with wrapped.disable_adapter():
+        assert torch.equal(wrapped.predict_action_chunk(batch), plain)
+    wrapped.reset()
+    merged = wrapped.merge_and_unload()
+    assert not any("lora" in name for name, _ in merged.named_modules())
+    merged.reset()
+    torch.testing.assert_close(merged.predict_action_chunk(batch), actions, atol=1e-4, rtol=0)
+
+
+# The stock commands
+
+
+@pytest.fixture(scope="module")
+def dataset(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    root = tmp_path_factory.mktemp("recorded") / "dataset"
+    recording = Recording(REPO_ID, episodes=1, seed=3, image_size=64, images=True, control_mode="absolute")
+    record(recording, root)
+    return root
+
+
+def make_base(policy_type: str, dataset: Path, folder: Path) -> Path:
+    own = f"--policy.type={policy_type} --policy.vlm_model_name=nano --policy.device=cpu"
+    own += f" --policy.chunk_size=3 --policy.n_action_steps=3 {SMALL[policy_type]}"
+    data = f"--dataset.repo_id={REPO_ID} --dataset.root={dataset}"
+    assert main(["init", *own.split(), *data.split(), f"--output={folder}"]) == 0
+    return folder
+
+
+def train(run: Run, flags: str, output_dir: Path) -> Path:
+    """The last checkpoint."""
+    run("lerobot-train", *flags.split(), f"--output_dir={output_dir}")
+    return output_dir / "checkpoints" / "last" / "pretrained_model"
+
+
+def test_adapters_are_trained_resumed_and_evaluated_by_stock_commands(
+    policy_type: str, dataset: Path, stock_cli: Run, tmp_path: Path
+) -> None:
+    base = make_base(policy_type, dataset, tmp_path / "base")
+    flags = f"--policy.path={base} --dataset.repo_id={REPO_ID} --dataset.root={dataset} --batch_size=2"
+    flags += " --num_workers=0 --steps=2 --save_freq=1 --peft.method_type=LORA --peft.r=4"
+    whole = train(stock_cli, flags, tmp_path / "whole")
+    assert not (whole / "model.safetensors").exists()
+    first = tmp_path / "second" / "checkpoints" / "000001"
+    shutil.copytree(tmp_path / "whole" / "checkpoints" / "000001", first)
+    flags = f"--config_path={first}/pretrained_model/train_config.json --resume=true"
+    second = train(stock_cli, flags, tmp_path / "second")
+    weights = [load_file(each / "adapter_model.safetensors") for each in (whole, second)]
+    assert weights[0].keys() == weights[1].keys()
+    assert all(tensor.any() for name, tensor in weights[0].items() if "lora_B" in name)
+    assert all(torch.equal(weights[1][name], tensor) for name, tensor in weights[0].items())
+    assert json.loads((second / "config.json").read_text())["trained_batches"] == 2
+    flags = f"--policy.path={second} --env.type=bomb --env.task=place --env.image_size=64 --env.fps=2"
+    flags += " --eval.n_episodes=1 --eval.batch_size=1 --eval.use_async_envs=false"
+    stock_cli("lerobot-eval", *flags.split(), f"--output_dir={tmp_path / 'eval'}")
+    assert json.loads((tmp_path / "eval" / "eval_info.json").read_text())["overall"]["n_episodes"] == 1
+
+
+# Other data
+
+
+@pytest.mark.parametrize(
+    ("kind", "options", "message"),
+    [
+        ("vla0_smol", {"relative_actions": True}, r"relative\.scale.* lerobot-bomb init writes"),
+        ("spatialvla_grid", {}, r"grids\..* --policy\.adapt_embeddings=false"),
+    ],
+)
+def test_adapters_on_a_checkpoint_of_other_data_are_refused(
+    kind: str, options: dict[str, Any], message: str, dataset: Path, tmp_path: Path
+) -> None:
+    policy = CASES[kind].make_policy(**options)
+    policy.save_pretrained(tmp_path)
+    meta = LeRobotDatasetMetadata(REPO_ID, root=dataset)
+    loaded = type(policy).from_pretrained(tmp_path, config=policy.config, dataset_meta=meta)
+    loaded.config.pretrained_path = tmp_path
+    with pytest.raises(ValueError, match=message):
+        loaded.wrap_with_peft(peft_cli_overrides={"method_type": "LORA", "r": 4})
+    loaded.save_pretrained(tmp_path / "fitted")
+    fitted = type(policy).from_pretrained(tmp_path / "fitted", config=loaded.config, dataset_meta=meta)
+    assert fitted.wrap_with_peft(peft_cli_overrides={"method_type": "LORA", "r": 4}).config.use_peft
