@@ -35,6 +35,7 @@ COMMANDS = {
         "a policy before its training, as a checkpoint that adapters can be trained on",
         "lerobot_bomb.base_checkpoint",
     ),
+    "merge": ("adapters and their base as one checkpoint", "lerobot_bomb.merge"),
     "convert-spatialvla": (
         "a published SpatialVLA folder as a checkpoint of spatialvla_grid",
         "lerobot_bomb.vlm.convert_spatialvla",

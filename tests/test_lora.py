@@ -14,8 +14,11 @@ import spatialvla_grid_cases
 import torch
 import vla0_smol_cases
 from lerobot.datasets import LeRobotDatasetMetadata
+from lerobot.envs import make_env_config
+from lerobot.policies import get_policy_class, make_policy
 from safetensors.torch import load_file
 
+from lerobot_bomb.checkpoint import read_config
 from lerobot_bomb.cli import main
 from lerobot_bomb.data.record import record
 from lerobot_bomb.data.recording import Recording
@@ -128,6 +131,42 @@ def test_adapters_are_trained_resumed_and_evaluated_by_stock_commands(
     flags += " --eval.n_episodes=1 --eval.batch_size=1 --eval.use_async_envs=false"
     stock_cli("lerobot-eval", *flags.split(), f"--output_dir={tmp_path / 'eval'}")
     assert json.loads((tmp_path / "eval" / "eval_info.json").read_text())["overall"]["n_episodes"] == 1
+    check_merged(second, tmp_path / "merged")
+
+
+def check_merged(adapters: Path, output: Path) -> None:
+    """It acts as they do, and needs no base."""
+    config = read_config(adapters, "cpu")
+    wrapped = make_policy(config, env_cfg=make_env_config("bomb", image_size=64)).eval()
+    assert main(["merge", f"--policy.path={adapters}", f"--output={output}"]) == 0
+    base = Path(peft.PeftConfig.from_pretrained(str(adapters)).base_model_name_or_path)
+    base.rename(base.with_name("moved"))
+    policy = get_policy_class(config.type).from_pretrained(str(output))
+    assert not policy.config.use_peft and {"README.md"} >= {
+        path.name for path in output.iterdir() if path.suffix not in (".json", ".safetensors")
+    }
+    batch = CASES[config.type].make_batch(policy, 2)
+    actions = wrapped.predict_action_chunk(batch)
+    torch.testing.assert_close(policy.predict_action_chunk(batch), actions, atol=1e-4, rtol=0)
+
+
+def test_what_cannot_be_merged_is_told(
+    dataset: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    base = make_base("vla0_smol", dataset, tmp_path / "base")
+    assert main(["merge", f"--policy.path={base}", f"--output={tmp_path / 'merged'}"]) == 1
+    assert "is a whole checkpoint: there is nothing to merge" in capsys.readouterr().err
+    policy = get_policy_class("vla0_smol").from_pretrained(str(base))
+    policy.config.pretrained_path = tmp_path / "elsewhere"
+    wrapped = policy.wrap_with_peft(peft_cli_overrides={"method_type": "LORA", "r": 4})
+    wrapped.save_pretrained(tmp_path / "adapters")
+    policy.config.save_pretrained(tmp_path / "adapters")
+    for state in base.glob("policy_p*"):
+        shutil.copy(state, tmp_path / "adapters")
+    assert main(["merge", f"--policy.path={tmp_path / 'adapters'}", f"--output={tmp_path / 'merged'}"]) == 1
+    error = capsys.readouterr().err
+    assert "elsewhere, which cannot be loaded: " in error and error.count("\n") == 1
+    assert not (tmp_path / "merged").exists()
 
 
 # Other data

@@ -1,0 +1,55 @@
+"""``lerobot-bomb merge``: adapters and their base as one checkpoint, which needs neither nor `peft`."""
+
+import argparse
+from pathlib import Path
+
+from lerobot.configs import PreTrainedConfig
+from lerobot.policies import PreTrainedPolicy, get_policy_class
+
+from lerobot_bomb.checkpoint import load_processors, read_config
+from lerobot_bomb.viewing.unfinished import written_whole
+
+
+def add_merge_arguments(parser: argparse.ArgumentParser) -> None:
+    """Declare the arguments of ``lerobot-bomb merge``."""
+    path = "folder of the adapters' checkpoint that lerobot-train names pretrained_model"
+    parser.add_argument("--policy.path", dest="policy_path", type=Path, required=True, help=path)
+    parser.add_argument("--output", type=Path, required=True, help="new folder for the checkpoint")
+
+
+def run_merge(args: argparse.Namespace) -> int:
+    """Write config, merged weights and processors."""
+    if args.output.exists():
+        raise ValueError(f"--output={args.output} exists already; name a new folder or delete it")
+    config = read_config(args.policy_path, "cpu")
+    if not config.use_peft:
+        raise ValueError(f"--policy.path={args.policy_path} is a whole checkpoint: there is nothing to merge")
+    pipelines = load_processors(config)
+    policy = merged(config, args.policy_path)
+    with written_whole(args.output) as (folder,):
+        policy.save_pretrained(folder)
+        for pipeline in pipelines:
+            pipeline.save_pretrained(folder)
+    print(f"written to {args.output}: --policy.path={args.output}")
+    return 0
+
+
+def merged(config: PreTrainedConfig, adapters: Path) -> PreTrainedPolicy:
+    """The policy whose weights are those of the base and its adapters; the config is of a whole one then."""
+    try:
+        import peft  # pyright: ignore[reportMissingImports]
+    except ImportError as error:
+        raise ValueError("adapters need the package peft: pip install 'lerobot_policy_bomb[lora]'") from error
+    of_adapters = peft.PeftConfig.from_pretrained(str(adapters))
+    base = str(of_adapters.base_model_name_or_path)
+    config.use_peft, config.pretrained_path = False, None
+    try:
+        policy = get_policy_class(config.type).from_pretrained(
+            base, config=config, revision=of_adapters.revision
+        )
+    except (OSError, ValueError) as error:
+        raise ValueError(
+            f"--policy.path={adapters} holds adapters of {base}, which cannot be loaded: "
+            f"{str(error).splitlines()[0]}"
+        ) from error
+    return peft.PeftModel.from_pretrained(policy, str(adapters)).merge_and_unload()
