@@ -69,7 +69,7 @@ def read_results(path: Path) -> list[Row]:
     return list(rows.values())
 
 
-def _common_settings(rows: list[Row]) -> str:
+def common_settings(rows: list[Row]) -> str:
     """What the spec of every row says, and the range of seeds."""
     first = rows[0]["spec"]
     common = [
@@ -137,7 +137,7 @@ def run_results(args: argparse.Namespace) -> int:
     """Print a summary of each condition of each file, and what perturbations changed in paired episodes."""
     for path in args.paths:
         all_rows = read_results(path)
-        print(f"{path}: {_common_settings(all_rows)}")
+        print(f"{path}: {common_settings(all_rows)}")
         num_replaced = sum(map(bool, path.read_text().splitlines())) - len(all_rows)
         if num_replaced:
             print(f"{path}: {num_replaced} lines count no more, a later one is of the same episode")

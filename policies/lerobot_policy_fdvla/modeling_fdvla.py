@@ -30,6 +30,7 @@ from lerobot_bomb.flow.losses import joint_loss, second_derivatives
 from lerobot_bomb.flow.path import PathPoint, draw_noise, draw_tau, path_point
 from lerobot_bomb.flow.real_time import guided
 from lerobot_bomb.flow.samplers import SAMPLERS, Heads, sample
+from lerobot_bomb.hub.card import WithModelCard
 from lerobot_bomb.policy_flags import check_as_trained, check_weights_fit, trained_with
 from lerobot_bomb.training_draws import begin_batch
 from lerobot_bomb.vlm.cached_text import check_positions
@@ -38,6 +39,7 @@ from lerobot_bomb.vlm.images import draw_windows, resize
 from lerobot_bomb.vlm.inputs import read_actions, read_image, read_task, read_tensor
 from lerobot_bomb.vlm.qwen import Prefix
 from lerobot_policy_fdvla.building_fdvla import build_model
+from lerobot_policy_fdvla.card_fdvla import METHOD
 from lerobot_policy_fdvla.configuration_fdvla import AS_TRAINED, SHAPES, FdvlaConfig
 from lerobot_policy_fdvla.networks_fdvla import NUM_MARKS, ActionSegment, Head
 
@@ -69,11 +71,12 @@ class Context:
         return cls(Prefix.of(tensors[1:]), tensors[0])
 
 
-class FdvlaPolicy(PreTrainedPolicy):
+class FdvlaPolicy(WithModelCard, PreTrainedPolicy):
     """A Qwen2.5-VL that reads noisy actions; two heads predict where they go and what noise is in them."""
 
     config_class = FdvlaConfig  # pyright: ignore[reportAssignmentType]  LeRobot annotates it as None
     name = "fdvla"  # pyright: ignore[reportAssignmentType]
+    method = METHOD
     config: FdvlaConfig
     action_unit: Tensor
     # modules that FSDP shards one by one; accelerate reads the second name

@@ -33,6 +33,7 @@ from lerobot_bomb.adapters import check_buffers_are_the_bases, frozen_buffers, p
 from lerobot_bomb.data.columns import dim_names
 from lerobot_bomb.decoding.decoder import Prompt
 from lerobot_bomb.decoding.slots import SlotWriter
+from lerobot_bomb.hub.card import WithModelCard
 from lerobot_bomb.policy_flags import check_as_trained, trained_with
 from lerobot_bomb.training_draws import begin_batch
 from lerobot_bomb.vlm.depth import (
@@ -54,6 +55,7 @@ from lerobot_policy_spatialvla_grid.building_spatialvla_grid import (
     make_ensemble,
     make_grids,
 )
+from lerobot_policy_spatialvla_grid.card_spatialvla_grid import METHOD
 from lerobot_policy_spatialvla_grid.configuration_spatialvla_grid import (
     AS_TRAINED,
     NUM_STATE_BINS,
@@ -66,11 +68,12 @@ logger = logging.getLogger(__name__)
 NEW_PARTS = ("cell_embedding", "cell_head", "ego3d")
 
 
-class SpatialvlaGridPolicy(PreTrainedPolicy):
+class SpatialvlaGridPolicy(WithModelCard, PreTrainedPolicy):
     """A PaliGemma 2 that chooses the next ``chunk_size`` actions, one cell of each grid a step."""
 
     config_class = SpatialvlaGridConfig  # pyright: ignore[reportAssignmentType]  LeRobot annotates it as None
     name = "spatialvla_grid"  # pyright: ignore[reportAssignmentType]
+    method = METHOD
     config: SpatialvlaGridConfig
     symbol_ids: Tensor
     action_unit: Tensor

@@ -37,6 +37,7 @@ from lerobot_bomb.decoding.decoder import Prompt
 from lerobot_bomb.decoding.draft import KnownSymbols, LinearDraft
 from lerobot_bomb.decoding.grammar import NumberGrammar
 from lerobot_bomb.decoding.writer import NumberWriter
+from lerobot_bomb.hub.card import WithModelCard
 from lerobot_bomb.policy_flags import check_as_trained, trained_with
 from lerobot_bomb.training_draws import begin_batch
 from lerobot_bomb.vlm.backbone import (
@@ -51,14 +52,16 @@ from lerobot_bomb.vlm.images import crop_and_resize
 from lerobot_bomb.vlm.inputs import read_actions, read_image, read_task, read_tensor
 from lerobot_bomb.vlm.prompt import PromptTokens
 from lerobot_bomb.vlm.tokenizer import load_tokenizer
+from lerobot_policy_vla0_smol.card_vla0_smol import METHOD
 from lerobot_policy_vla0_smol.configuration_vla0_smol import AS_TRAINED, Vla0SmolConfig
 
 
-class Vla0SmolPolicy(PreTrainedPolicy):
+class Vla0SmolPolicy(WithModelCard, PreTrainedPolicy):
     """A stock SmolVLM that writes the next ``chunk_size`` actions as integers."""
 
     config_class = Vla0SmolConfig  # pyright: ignore[reportAssignmentType]  LeRobot annotates it as None
     name = "vla0_smol"  # pyright: ignore[reportAssignmentType]
+    method = METHOD
     config: Vla0SmolConfig
     symbol_ids: Tensor
     action_unit: Tensor

@@ -1,0 +1,1 @@
+"""Checkpoints and recorded datasets on the Hub: cards and pushing."""

@@ -1,0 +1,258 @@
+"""The model card of our policy types: what the checkpoint is, how to use it, how good it is, whom to cite."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, ClassVar
+
+from huggingface_hub import ModelCard, ModelCardData, constants
+from huggingface_hub.utils import get_session, hf_raise_for_status
+from lerobot import __version__ as lerobot_version
+from lerobot.configs import PreTrainedConfig
+from lerobot.configs.train import TrainPipelineConfig
+
+from lerobot_bomb import __version__
+from lerobot_bomb.evaluation.results import by_condition, common_settings, summarise
+from lerobot_bomb.hub.commands import command, train_command
+from lerobot_bomb.hub.dataset import INFO_FILE, DatasetFacts, Row, eval_flags_of, protocol_version
+from lerobot_bomb.hub.method import Method
+from lerobot_bomb.hub.names import is_hub_id
+from lerobot_bomb.stats import wilson_interval
+
+if TYPE_CHECKING:
+    from lerobot.datasets import LeRobotDatasetMetadata
+
+NO_REPO_ID = "USER/NAME"
+NANO = "nano"
+BAD_REQUEST = 400
+
+
+class PolicyCard(ModelCard):
+    """A model card that the Hub in use checks, be it the public one or another."""
+
+    def validate(self, repo_type: str | None = None) -> None:
+        """As huggingface_hub's, which asks the public Hub whatever HF_ENDPOINT says.
+
+        Raises:
+            ValueError: the Hub does not take the card's metadata.
+        """
+        response = get_session().post(
+            f"{constants.ENDPOINT}/api/validate-yaml",
+            json={"repoType": repo_type or self.repo_type, "content": str(self)},
+            headers={"Accept": "text/plain"},
+        )
+        if response.status_code == BAD_REQUEST:
+            raise ValueError(response.text)
+        hf_raise_for_status(response)
+
+
+@dataclass(frozen=True)
+class Checkpoint:
+    """All that a card tells of one checkpoint."""
+
+    config: PreTrainedConfig
+    method: Method
+    repo_id: str
+    dataset_id: str | None
+    training: TrainPipelineConfig | None = None
+    dataset: DatasetFacts | None = None
+    results: Sequence[list[Row]] = ()  # of each results file
+    license: str | None = None
+    tags: list[str] = field(default_factory=list)
+
+    def card(self) -> PolicyCard:
+        """The card, not validated."""
+        return PolicyCard(f"---\n{self._metadata().to_yaml()}\n---\n\n{self._text()}")
+
+    @property
+    def base_model(self) -> str | None:
+        """The backbone's Hub id; None: it has none, or not one that is known."""
+        name = getattr(self.config, "vlm_model_name", None)
+        return name if name and is_hub_id(name) else None
+
+    def _metadata(self) -> ModelCardData:
+        license, license_name = self._license()
+        return ModelCardData(
+            license=license,
+            license_name=license_name,
+            library_name="lerobot",
+            pipeline_tag="robotics",
+            tags=sorted({*self.tags, "robotics", "lerobot", "lerobot_bomb", self.config.type}),
+            model_name=self.config.type,
+            datasets=self.dataset_id,
+            base_model=self.base_model,
+        )
+
+    def _license(self) -> tuple[str | None, str | None]:
+        """What was asked for, or what the backbone's weights have; none where that is not known."""
+        if self.license is not None:
+            return self.license, None
+        if self.base_model == self.method.backbone:
+            return self.method.backbone_license, self.method.backbone_license_name
+        is_nano = getattr(self.config, "vlm_model_name", None) == NANO
+        return ("apache-2.0" if is_nano else None), None
+
+    def _text(self) -> str:
+        sections = {
+            "Install": self._install(),
+            "Evaluate": self._evaluate(),
+            "Train": self._train(),
+            "In Python": self._python(),
+            "Data": self._data(),
+            "Results": self._results(),
+            "Citation": self._citation(),
+        }
+        start = f"# {self.repo_id.split('/')[-1]}\n\n{self._introduction()}\n"
+        return start + "".join(f"\n## {title}\n\n{text}\n" for title, text in sections.items())
+
+    def _introduction(self) -> str:
+        protocol = protocol_version(self.dataset, bool(self.results))
+        benchmark = f" Benchmark: BOMB, protocol version {protocol}." if protocol else ""
+        return (
+            f"{self.method.summary}\n\nA checkpoint of LeRobot's policy type `{self.config.type}`, which the "
+            f"plugin `lerobot_policy_bomb` adds. Backbone: {self._backbone()}; the checkpoint holds all "
+            f"weights and the tokenizer, so nothing else is downloaded.{benchmark}"
+        )
+
+    def _backbone(self) -> str:
+        if self.base_model is not None:
+            return f"`{self.base_model}`"
+        name = getattr(self.config, "vlm_model_name", None)
+        return "a small one with random weights" if name == NANO else "a local one"
+
+    def _install(self) -> str:
+        return (
+            f"The plugin, {__version__} or newer (with LeRobot {lerobot_version}), in a checkout of "
+            "lerobot_bomb:\n\n" + fenced("pip install .\nlerobot-bomb doctor")
+        )
+
+    def _evaluate(self) -> str:
+        flags = self.dataset.eval_flags() if self.dataset is not None else None
+        if flags is None and self.results:
+            flags = eval_flags_of(self.results[0][0])
+        is_bomb = flags is not None and "--env.type=bomb" in flags
+        results = ["--env.results_path=results.jsonl"] if is_bomb else []
+        line = command(
+            "lerobot-eval",
+            f"--policy.path={self.repo_id}",
+            *(["--env.type=ENV"] if flags is None else flags),
+            "--eval.n_episodes=200" if is_bomb else "--eval.n_episodes=50",
+            "--eval.batch_size=10",
+            *results,
+        )
+        if flags is None:
+            return f"{fenced(line)}\n\n`ENV` is an environment with the dataset's cameras, state and action."
+        return fenced(f"{line}\nlerobot-bomb results results.jsonl" if is_bomb else line)
+
+    def _train(self) -> str:
+        notes = []
+        start = self.config.pretrained_path
+        if start and not is_hub_id(start):
+            notes.append("It started from a checkpoint that has no name on the Hub.")
+        if self._backbone() == "a local one":
+            notes.append(
+                "Its backbone came from a folder; the command starts from the type's usual one."
+                if not start
+                else "Its backbone came from a folder."
+            )
+        dataset_id = self.dataset_id or NO_REPO_ID
+        fine_tune = command(
+            "lerobot-train",
+            f"--policy.path={self.repo_id}",
+            "--policy.repo_id=USER/NEW_NAME",
+            "--policy.push_to_hub=true",
+            f"--dataset.repo_id={dataset_id}",
+            f"--output_dir=outputs/{self.config.type}",
+        )
+        return "\n\n".join(
+            [
+                "As this checkpoint was; `train_config.json` has all values:",
+                fenced(train_command(self.config, self.training, dataset_id)),
+                *notes,
+                "From this checkpoint on:",
+                fenced(fine_tune),
+            ]
+        )
+
+    def _python(self) -> str:
+        return fenced(
+            "from lerobot.policies.factory import get_policy_class, make_pre_post_processors\n"
+            "from lerobot.utils.import_utils import register_third_party_plugins\n\n"
+            "register_third_party_plugins()\n"
+            f'policy = get_policy_class("{self.config.type}").from_pretrained("{self.repo_id}")\n'
+            f'preprocess, postprocess = make_pre_post_processors(policy.config, "{self.repo_id}")\n'
+            "action = postprocess(policy.select_action(preprocess(observation)))",
+            "python",
+        )
+
+    def _data(self) -> str:
+        lines = [f"- dataset: `{self.dataset_id}`"] if self.dataset_id else []
+        lines += self.dataset.lines() if self.dataset is not None else []
+        features = {**(self.config.input_features or {}), **(self.config.output_features or {})}
+        rows = [f"| `{name}` | {each.type.value} | {tuple(each.shape)} |" for name, each in features.items()]
+        return "\n".join([*lines, "", "| feature | type | shape |", "|---|---|---|", *rows]).lstrip("\n")
+
+    def _results(self) -> str:
+        if not self.results:
+            return "No evaluation is attached to this checkpoint."
+        return "\n\n".join(map(results_table, self.results))
+
+    def _citation(self) -> str:
+        return fenced("\n\n".join(paper.bibtex() for paper in self.method.papers), "bibtex")
+
+
+def fenced(text: str, language: str = "") -> str:
+    """A block of code."""
+    return f"```{language}\n{text}\n```"
+
+
+def results_table(rows: list[Row]) -> str:
+    """Markdown: a row for each condition of a results file."""
+    lines = [
+        f"{common_settings(rows)}:",
+        "",
+        "| condition | n | successes | success rate | 95 % Wilson interval |",
+        "|---|---|---|---|---|",
+    ]
+    for condition, of in by_condition(rows).items():
+        summary = summarise(of)
+        n, successes = summary.num_episodes, summary.num_successes
+        low, high = (100 * bound for bound in wilson_interval(successes, n))
+        name = condition.strip(" ()") or f"perturbations={of[0]['spec']['perturbations']}"
+        lines.append(
+            f"| {name} | {n} | {successes} | {100 * successes / n:.1f} % | {low:.1f} to {high:.1f} % |"
+        )
+    return "\n".join(lines)
+
+
+class WithModelCard:
+    """A policy whose `generate_model_card` is right for it; stands before LeRobot's `PreTrainedPolicy`."""
+
+    method: ClassVar[Method]
+    config: Any
+
+    def generate_model_card(
+        self,
+        dataset_repo_id: str,
+        model_type: str,
+        license: str | None,
+        tags: list[str] | None,
+        cfg: TrainPipelineConfig | None = None,
+        dataset_meta: "LeRobotDatasetMetadata | None" = None,
+    ) -> ModelCard:
+        """The card that `lerobot-train --policy.push_to_hub=true` publishes."""
+        assert model_type == self.config.type
+        root = Path(dataset_meta.root) if dataset_meta is not None else None
+        has_dataset = root is not None and (root / INFO_FILE).is_file()
+        card = Checkpoint(
+            config=self.config,
+            method=self.method,
+            repo_id=self.config.repo_id or NO_REPO_ID,
+            dataset_id=dataset_repo_id,
+            training=cfg,
+            dataset=DatasetFacts.read(root) if root is not None and has_dataset else None,
+            license=license,
+            tags=tags or [],
+        ).card()
+        card.validate()
+        return card

@@ -1,0 +1,78 @@
+"""The commands of a model card, in the words of one checkpoint."""
+
+import json
+import shlex
+from dataclasses import MISSING, Field, fields
+from typing import Any
+
+import draccus
+from lerobot.configs import PreTrainedConfig
+from lerobot.configs.train import TrainPipelineConfig
+
+from lerobot_bomb.hub.names import has_local_path, is_hub_id
+
+# a policy's fields that are filled in, or that say where it runs and goes
+NOT_FLAGS = {
+    "input_features",
+    "output_features",
+    "vlm_config",
+    "depth_config",
+    "prompt_tokens",
+    "grid_params",
+    "trained_with",
+    "action_feature_names",
+    "device",
+    "repo_id",
+    "private",
+    "tags",
+    "license",
+    "push_to_hub",
+    "pretrained_path",
+    "pretrained_revision",
+}
+WIDTH = 100
+
+
+def train_command(config: PreTrainedConfig, training: TrainPipelineConfig | None, dataset_id: str) -> str:
+    """How the checkpoint was trained, but for local paths."""
+    start = f"--policy.type={config.type}"
+    if config.pretrained_path and is_hub_id(config.pretrained_path):
+        start = f"--policy.path={config.pretrained_path}"
+    flags = [start, *_policy_flags(config), f"--dataset.repo_id={dataset_id}"]
+    if training is not None:
+        if training.dataset.episodes is not None:
+            flags.append(f"--dataset.episodes={_text(training.dataset.episodes)}")
+        flags += [f"--{name}={getattr(training, name)}" for name in ("batch_size", "steps", "seed")]
+    return command("lerobot-train", *flags, f"--output_dir=outputs/{config.type}")
+
+
+def _policy_flags(config: PreTrainedConfig) -> list[str]:
+    """Those that differ from the type's defaults."""
+    flags = []
+    for each in fields(config):
+        value = draccus.encode(getattr(config, each.name))
+        if each.name in NOT_FLAGS or not each.init or value == _default(each) or has_local_path(value):
+            continue
+        flags.append(f"--policy.{each.name}={_text(value)}")
+    return flags
+
+
+def _default(of: Field) -> Any:
+    value = of.default if of.default_factory is MISSING else of.default_factory()
+    return None if value is MISSING else draccus.encode(value)
+
+
+def _text(value: Any) -> str:
+    return value if isinstance(value, str) else json.dumps(value)
+
+
+def command(name: str, *flags: str) -> str:
+    """A command line, broken where it is long."""
+    lines, line = [], name
+    for flag in map(shlex.quote, flags):
+        if len(line) + len(flag) > WIDTH:
+            lines.append(line)
+            line = f"   {flag}"
+        else:
+            line = f"{line} {flag}"
+    return " \\\n".join([*lines, line])

@@ -1,0 +1,35 @@
+"""What a policy type's model card says whichever checkpoint it is of."""
+
+from dataclasses import dataclass
+
+
+@dataclass(frozen=True)
+class Paper:
+    """What a checkpoint's user should cite."""
+
+    key: str  # of the BibTeX entry
+    title: str
+    authors: str
+    year: int | None = None
+    arxiv: str | None = None
+
+    def bibtex(self) -> str:
+        """A BibTeX entry."""
+        entry = {"title": f"{{{self.title}}}", "author": self.authors}
+        if self.year is not None:
+            entry["year"] = str(self.year)
+        if self.arxiv is not None:
+            entry |= {"eprint": self.arxiv, "archivePrefix": "arXiv"}
+        fields = ",\n".join(f"  {name} = {{{value}}}" for name, value in entry.items())
+        return f"@misc{{{self.key},\n{fields}\n}}"
+
+
+@dataclass(frozen=True)
+class Method:
+    """A policy type in words, the backbone it starts from unless told otherwise, and its sources."""
+
+    summary: str
+    backbone: str  # Hub id
+    backbone_license: str  # as a card's metadata names it
+    papers: tuple[Paper, ...]
+    backbone_license_name: str | None = None  # where the former is "other"

@@ -1,0 +1,37 @@
+"""What is a name on the Hub, and what is a path that nobody else has."""
+
+import re
+from pathlib import Path
+from typing import Any
+
+
+def is_hub_id(name: object) -> bool:
+    """Whether it has the form USER/NAME and is no folder here."""
+    text = str(name)
+    return re.fullmatch(r"\w[\w.-]*/[\w.-]+", text) is not None and not Path(text).exists()
+
+
+def is_local_path(value: object) -> bool:
+    """Whether a text names a place on this machine."""
+    if not isinstance(value, str | Path) or not str(value):
+        return False
+    text = str(value)
+    return text.startswith(("/", "~", "./", "../")) or ("/" in text and Path(text).exists())
+
+
+def has_local_path(value: Any) -> bool:
+    """The same, of anything inside lists and dicts."""
+    if isinstance(value, dict):
+        return any(map(has_local_path, value.values()))
+    if isinstance(value, list | tuple):
+        return any(map(has_local_path, value))
+    return is_local_path(value)
+
+
+def without_local_paths(value: Any) -> Any:
+    """JSON-ready values with None for each such text."""
+    if isinstance(value, dict):
+        return {key: without_local_paths(each) for key, each in value.items()}
+    if isinstance(value, list):
+        return [without_local_paths(each) for each in value]
+    return None if is_local_path(value) else value
