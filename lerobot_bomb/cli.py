@@ -44,6 +44,7 @@ COMMANDS = {
         "a checkpoint's vision-language model as a folder that other policies can start from",
         "lerobot_bomb.vlm.export",
     ),
+    "push": ("a checkpoint to the Hub, with a card and its evaluation", "lerobot_bomb.hub.push"),
     "view": ("play one episode into a recording for Rerun and a video", "lerobot_bomb.viewing.view"),
     "gallery": ("draw what every perturbation axis changes", "lerobot_bomb.viewing.gallery"),
     "demo": ("record, train and evaluate on this machine in minutes", "lerobot_bomb.demo"),

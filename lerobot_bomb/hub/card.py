@@ -180,7 +180,10 @@ class Checkpoint:
             "from lerobot.utils.import_utils import register_third_party_plugins\n\n"
             "register_third_party_plugins()\n"
             f'policy = get_policy_class("{self.config.type}").from_pretrained("{self.repo_id}")\n'
-            f'preprocess, postprocess = make_pre_post_processors(policy.config, "{self.repo_id}")\n'
+            'device = {"device_processor": {"device": policy.config.device}}\n'
+            "preprocess, postprocess = make_pre_post_processors(\n"
+            f'    policy.config, "{self.repo_id}", preprocessor_overrides=device\n'
+            ")\n"
             "action = postprocess(policy.select_action(preprocess(observation)))",
             "python",
         )

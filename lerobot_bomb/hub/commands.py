@@ -72,7 +72,7 @@ def command(name: str, *flags: str) -> str:
     for flag in map(shlex.quote, flags):
         if len(line) + len(flag) > WIDTH:
             lines.append(line)
-            line = f"   {flag}"
+            line = f"    {flag}"
         else:
             line = f"{line} {flag}"
     return " \\\n".join([*lines, line])

@@ -74,7 +74,7 @@ class DatasetFacts:
             f"{recording['image_size']} px",
             f"- perturbation axes: `{', '.join(recording['perturbations'])}`; noise on actions: "
             f"{recording['noise']:g}; tasks: {tasks}",
-            f"- seeds {first}..{last}; {num_failed} failed episodes were left out",
+            f"- seeds {first}..{last}; failed episodes that were left out: {num_failed}",
             f"- recorded with lerobot_bomb {recording['package_version']}",
         ]
 

@@ -26,12 +26,3 @@ def has_local_path(value: Any) -> bool:
     if isinstance(value, list | tuple):
         return any(map(has_local_path, value))
     return is_local_path(value)
-
-
-def without_local_paths(value: Any) -> Any:
-    """JSON-ready values with None for each such text."""
-    if isinstance(value, dict):
-        return {key: without_local_paths(each) for key, each in value.items()}
-    if isinstance(value, list):
-        return [without_local_paths(each) for each in value]
-    return None if is_local_path(value) else value

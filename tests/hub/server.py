@@ -155,14 +155,14 @@ class _Handler(BaseHTTPRequestHandler):
         name = f"{asked['organization']}/{asked['name']}" if asked.get("organization") else asked["name"]
         key = f"{asked.get('type') or 'model'}s/{name}"
         status = 409 if key in self.hub.repositories else 200
-        self.hub.repositories.setdefault(key, Repository(is_private=bool(asked.get("private"))))
+        self.hub.repositories.setdefault(key, Repository(is_private=asked.get("visibility") == "private"))
         prefix = "datasets/" if key.startswith("datasets/") else ""
         self._json({"url": f"{self.hub.endpoint}/{prefix}{name}", "name": name, "id": name}, status)
 
     def validate(self) -> None:
         content = json.loads(self.body)["content"]
         parts = content.split("---\n", 2)
-        if len(parts) != 3 or not isinstance(yaml.safe_load(parts[1]), dict):
+        if len(parts) != 3 or not yaml.safe_load(parts[1]):
             raise HubError(400, "BadRequest", "the card has no metadata")
         self.hub.cards.append(content)
         self._json({"errors": [], "warnings": []})

@@ -11,6 +11,15 @@ from hub.server import TOKEN, LoopbackHub
 DATASET = "me/bomb_place"
 FIRST, SECOND = "me/first", "me/second"
 CARD_PARTS = ("lerobot-train --policy.type=", f"--policy.path={FIRST}", "pip install .", "@misc{")
+# what the card says of Python, but for the observation that it supposes
+CARD_CODE = """
+from huggingface_hub import hf_hub_download
+text = open(hf_hub_download("me/first", "README.md")).read()
+code = text.split("```python\\n")[1].split("```")[0]
+exec(code[: code.index("action = ")])
+assert policy.config.repo_id == "me/first"
+assert preprocess.steps and postprocess.steps
+"""
 SMALL = {
     "vla0_smol": "--policy.chunk_size=2 --policy.n_action_steps=2",
     "spatialvla_grid": "--policy.chunk_size=2 --policy.n_action_steps=2",
@@ -55,6 +64,7 @@ def loop(hub: LoopbackHub, folder: Path, policy_type: str) -> str:
             train(folder, "first", *flags, f"--policy.repo_id={FIRST}"),
             FORGET,
             evaluate(FIRST, folder / "eval", "--policy.pretrained_revision=main"),
+            ["python", CARD_CODE],
             train(folder, "second", f"--policy.path={FIRST}", f"--policy.repo_id={SECOND}"),
         ],
         hub.endpoint,

@@ -1,0 +1,137 @@
+"""Whether a checkpoint's folder is whole and works on another machine."""
+
+import json
+from pathlib import Path
+from typing import Any
+
+from accelerate import init_empty_weights
+from lerobot.configs import PreTrainedConfig
+from lerobot.policies import PreTrainedPolicy
+from lerobot.policies.factory import get_policy_class
+from lerobot.utils.constants import POLICY_POSTPROCESSOR_DEFAULT_NAME, POLICY_PREPROCESSOR_DEFAULT_NAME
+from safetensors import SafetensorError, safe_open
+
+CONFIG, WEIGHTS = "config.json", "model.safetensors"
+PROCESSORS = (f"{POLICY_PREPROCESSOR_DEFAULT_NAME}.json", f"{POLICY_POSTPROCESSOR_DEFAULT_NAME}.json")
+
+type Shapes = dict[str, tuple[int, ...]]
+
+
+def checkpoint_files(folder: Path) -> list[str]:
+    """Names of the files that make up a checkpoint, each whole.
+
+    Raises:
+        ValueError: one is missing, truncated or of another format.
+    """
+    if not folder.is_dir():
+        raise ValueError(f"{folder} is no folder; give the one that lerobot-train names pretrained_model")
+    names = [CONFIG, *PROCESSORS, WEIGHTS]
+    for name in names:
+        if not (folder / name).is_file():
+            raise ValueError(
+                f"{folder} holds no {name}, so it is no checkpoint of a policy; give the folder that "
+                "lerobot-train names pretrained_model"
+            )
+    read_json(folder / CONFIG)
+    for processor in PROCESSORS:
+        steps = read_json(folder / processor).get("steps", [])
+        states = [step["state_file"] for step in steps if step.get("state_file")]
+        missing = [name for name in states if not (folder / name).is_file()]
+        if missing:
+            raise ValueError(f"{folder} holds no {missing[0]}, which its {processor} needs")
+        names += states
+    for name in names:
+        if name.endswith(".safetensors"):
+            tensor_shapes(folder / name)
+    return list(dict.fromkeys(names))
+
+
+def read_json(path: Path) -> dict[str, Any]:
+    """A JSON object from a file.
+
+    Raises:
+        ValueError: it is something else, or truncated.
+    """
+    try:
+        values = json.loads(path.read_text())
+    except ValueError as error:
+        raise ValueError(f"{path} is not JSON, or truncated: {error}") from None
+    if not isinstance(values, dict):
+        raise ValueError(f"{path} is not a JSON object")
+    return values
+
+
+def tensor_shapes(path: Path) -> Shapes:
+    """Of all tensors in a file, from its header.
+
+    Raises:
+        ValueError: the file is truncated or of another format.
+    """
+    try:
+        with safe_open(path, "pt") as tensors:
+            return {name: tuple(tensors.get_slice(name).get_shape()) for name in tensors.keys()}  # noqa: SIM118
+    except SafetensorError as error:
+        raise ValueError(f"{path} is truncated or no safetensors file: {error}") from None
+
+
+def policy_class(folder: Path) -> type[PreTrainedPolicy]:
+    """The class of a checkpoint's type, which has a card of its own.
+
+    Raises:
+        ValueError: the type is not one of ours.
+    """
+    name = read_json(folder / CONFIG).get("type")
+    found = get_policy_class(name) if name in PreTrainedConfig.get_known_choices() else None
+    if found is None or not hasattr(found, "method"):
+        raise ValueError(
+            f"{folder / CONFIG}: the type {name!r} is not one that lerobot-bomb pushes; "
+            "lerobot-train --policy.push_to_hub=true pushes LeRobot's own"
+        )
+    return found
+
+
+def check_config(folder: Path, config: Any) -> None:
+    """A checkpoint needs nothing but its own files."""
+    if config.vlm_config is None or config.prompt_tokens is None:
+        raise ValueError(
+            f"{folder / CONFIG} does not hold the architecture (vlm_config and prompt_tokens), so loading it "
+            f"elsewhere would need the base model {config.vlm_model_name}"
+        )
+    if getattr(config, "depth_source", None) == "zoedepth" and config.depth_config is None:
+        raise ValueError(
+            f"{folder / CONFIG} does not hold depth_config, so loading it elsewhere would need "
+            f"{config.depth_model_name}"
+        )
+
+
+def check_weights(folder: Path, config: PreTrainedConfig, policy_type: type[PreTrainedPolicy]) -> None:
+    """The weights are those of the config's policy, by their names and shapes; no memory is taken.
+
+    Raises:
+        ValueError: names the first tensor that is missing, not known, or of another shape.
+    """
+    with init_empty_weights():
+        policy = policy_type(config)
+    expected = {name: tuple(tensor.shape) for name, tensor in policy.state_dict().items()}
+    saved = tensor_shapes(folder / WEIGHTS)
+    start = f"{folder / WEIGHTS} is not of the {config.type} that {CONFIG} describes: "
+    missing = sorted(expected.keys() - saved.keys() - _tied(policy, set(saved)))
+    if missing:
+        raise ValueError(f"{start}it lacks {missing[0]} ({len(missing)} in all)")
+    unknown = sorted(saved.keys() - expected.keys())
+    if unknown:
+        raise ValueError(f"{start}it has {unknown[0]} ({len(unknown)} in all)")
+    for name, shape in saved.items():
+        if shape != expected[name]:
+            raise ValueError(f"{start}{name} has shape {shape}, not {expected[name]}")
+
+
+def _tied(policy: PreTrainedPolicy, saved: set[str]) -> set[str]:
+    """Tensors that are the same as a saved one, under another name."""
+    found = set()
+    for prefix, module in policy.named_modules():
+        for pair in (getattr(module, "all_tied_weights_keys", None) or {}).items():
+            names = {f"{prefix}.{name}" for name in pair}
+            if names & saved:
+                found |= names
+    return found

@@ -1,0 +1,127 @@
+"""``lerobot-bomb push``: a checkpoint that was trained earlier, with its card, to the Hub."""
+
+import argparse
+import json
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from lerobot_bomb.data.growing import check_repo_id, switch
+from lerobot_bomb.evaluation.results import read_results
+from lerobot_bomb.hub.dataset import INFO_FILE, DatasetFacts, Row
+from lerobot_bomb.hub.names import is_local_path
+
+if TYPE_CHECKING:
+    from lerobot.configs.train import TrainPipelineConfig
+
+    from lerobot_bomb.hub.card import Checkpoint
+
+CONFIG, TRAIN_CONFIG, CARD = "config.json", "train_config.json", "README.md"
+# what means nothing on another machine; of other paths the last part stays, as a name
+LEFT_OUT = {"pretrained_path", "root", "output_dir", "checkpoint_path"}
+
+
+def add_push_arguments(parser: argparse.ArgumentParser) -> None:
+    """Declare the arguments of ``lerobot-bomb push``."""
+    add = parser.add_argument
+    folder = "the folder that lerobot-train names pretrained_model"
+    add("checkpoint", type=Path, metavar="CHECKPOINT", help=folder)
+    add("--repo_id", required=True, help="name of the model on the Hub, USER/NAME")
+    add(
+        "--results",
+        nargs="+",
+        type=Path,
+        default=[],
+        metavar="RESULTS.jsonl",
+        help="files that --env.results_path wrote for this checkpoint; the card states their rates",
+    )
+    add(
+        "--dataset.root",
+        dest="dataset_root",
+        type=Path,
+        help="folder of the dataset, if it is no longer where the training found it; the card states what "
+        "it shows",
+    )
+    add("--private", **switch(), help="make a new repository that only you see")
+
+
+def run_push(args: argparse.Namespace) -> int:
+    """Check the checkpoint, then publish all of it in one commit; prints where."""
+    check_repo_id(args.repo_id)
+    results = [read_results(path) for path in args.results]
+    from lerobot_bomb.hub.checks import checkpoint_files  # imports torch: seconds
+    from lerobot_bomb.hub.upload import check_token, hub_errors, upload
+
+    check_token()
+    names = checkpoint_files(args.checkpoint)
+    checkpoint = _read_checkpoint(args.checkpoint, args.repo_id, args.dataset_root, results)
+    card = checkpoint.card()
+    with hub_errors(args.repo_id):
+        card.validate()
+    files = {**_files(args.checkpoint, names), CARD: str(card).encode()}
+    message = f"{checkpoint.config.type}: weights, processors, configs and card"
+    print(upload(args.repo_id, "model", files, message, private=args.private or None))
+    return 0
+
+
+def _read_checkpoint(
+    folder: Path, repo_id: str, dataset_root: Path | None, results: list[list[Row]]
+) -> "Checkpoint":
+    """What its card is made of, after all checks."""
+    from lerobot.configs import PreTrainedConfig
+    from lerobot.utils.import_utils import register_third_party_plugins
+
+    from lerobot_bomb.hub.card import Checkpoint
+    from lerobot_bomb.hub.checks import check_config, check_weights, policy_class
+
+    register_third_party_plugins()
+    policy_type: Any = policy_class(folder)
+    config = PreTrainedConfig.from_pretrained(folder, cli_overrides=["--device=cpu"])
+    check_config(folder, config)
+    check_weights(folder, config, policy_type)
+    training = _read_training(folder)
+    return Checkpoint(
+        config=config,
+        method=policy_type.method,
+        repo_id=repo_id,
+        dataset_id=training.dataset.repo_id if training is not None else None,
+        training=training,
+        dataset=_read_dataset(training, dataset_root),
+        results=results,
+        license=config.license,
+        tags=config.tags or [],
+    )
+
+
+def _files(folder: Path, names: list[str]) -> dict[str, Path | bytes]:
+    files: dict[str, Path | bytes] = {name: folder / name for name in names}
+    for name in (CONFIG, TRAIN_CONFIG):
+        if (folder / name).is_file():
+            files[name] = json.dumps(portable(json.loads((folder / name).read_text())), indent=4).encode()
+    return files
+
+
+def portable(value: Any, key: str = "") -> Any:
+    """A config's JSON without paths of this machine."""
+    if isinstance(value, dict):
+        return {name: portable(each, name) for name, each in value.items()}
+    if isinstance(value, list):
+        return [portable(each, key) for each in value]
+    if not is_local_path(value) and not (key in LEFT_OUT - {"pretrained_path"} and isinstance(value, str)):
+        return value
+    return None if key in LEFT_OUT else Path(value).name
+
+
+def _read_training(folder: Path) -> "TrainPipelineConfig | None":
+    from lerobot.configs.train import TrainPipelineConfig
+
+    if not (folder / TRAIN_CONFIG).is_file():
+        return None
+    return TrainPipelineConfig.from_pretrained(folder)
+
+
+def _read_dataset(training: "TrainPipelineConfig | None", given: Path | None) -> DatasetFacts | None:
+    """Of the folder given, or of that of the training if it still is there."""
+    if given is not None:
+        return DatasetFacts.read(given)
+    root = training.dataset.root if training is not None else None
+    return DatasetFacts.read(Path(root)) if root and (Path(root) / INFO_FILE).is_file() else None

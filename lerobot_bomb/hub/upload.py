@@ -1,0 +1,50 @@
+"""Files to a repository in one commit: before it there is nothing, after it everything."""
+
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
+from pathlib import Path
+
+import httpx
+from huggingface_hub import CommitOperationAdd, HfApi, constants, get_token
+from huggingface_hub.errors import HfHubHTTPError, OfflineModeIsEnabled
+
+
+def check_token() -> None:
+    """Raise unless the Hub can know who pushes."""
+    if get_token() is None:
+        raise ValueError("the Hub asks who you are: run `hf auth login`, or set HF_TOKEN")
+
+
+def upload(
+    repo_id: str, repo_type: str, files: Mapping[str, Path | bytes], message: str, private: bool | None
+) -> str:
+    """Make the repository unless it exists, add all files in one commit and return the commit's URL.
+
+    `HfApi.upload_folder` would make several commits where Xet is installed.
+
+    Raises:
+        RuntimeError: the Hub cannot be reached or does not take them.
+    """
+    api = HfApi()
+    with hub_errors(repo_id):
+        repo_id = api.create_repo(repo_id, repo_type=repo_type, private=private, exist_ok=True).repo_id
+        operations = [
+            CommitOperationAdd(path_in_repo=name, path_or_fileobj=content) for name, content in files.items()
+        ]
+        return api.create_commit(repo_id, operations, commit_message=message, repo_type=repo_type).commit_url
+
+
+@contextmanager
+def hub_errors(repo_id: str) -> Iterator[None]:
+    """Say in one line what the Hub, or the way to it, has against this."""
+    try:
+        yield
+    except OfflineModeIsEnabled:
+        raise RuntimeError("HF_HUB_OFFLINE is set, so nothing can be pushed") from None
+    except HfHubHTTPError as error:
+        reason = error.server_message or f"{error.response.status_code} {error.response.reason_phrase}"
+        raise RuntimeError(f"--repo_id={repo_id}: the Hub answers: {' '.join(reason.split())}") from None
+    except httpx.HTTPError as error:
+        raise RuntimeError(
+            f"--repo_id={repo_id}: the Hub at {constants.ENDPOINT} cannot be reached: {error}"
+        ) from None

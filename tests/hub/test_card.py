@@ -1,0 +1,113 @@
+"""What a card says, by the checkpoint."""
+
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import pytest
+import yaml
+from lerobot.configs.default import DatasetConfig
+from lerobot.configs.train import TrainPipelineConfig
+from vla0_smol_cases import make_config
+
+from hub.server import LoopbackHub
+from lerobot_bomb.hub.card import Checkpoint, PolicyCard
+from lerobot_bomb.hub.dataset import DatasetFacts
+from lerobot_policy_fdvla.card_fdvla import METHOD as FDVLA
+from lerobot_policy_spatialvla_grid.card_spatialvla_grid import METHOD as GRID
+from lerobot_policy_vla0_smol.card_vla0_smol import METHOD as VLA0
+
+HUB_NAME = "HuggingFaceTB/SmolVLM2-500M-Video-Instruct"
+INFO = {"total_episodes": 3, "total_frames": 60, "fps": 10}
+RECORDING: dict[str, Any] = {
+    "task": "place",
+    "robot": "fetch",
+    "control_mode": "absolute",
+    "fps": 10,
+    "image_size": 128,
+    "split": "train",
+    "seed": 5,
+    "task_ids": [],
+    "perturbations": ["none", "camera:1-5"],
+    "depth": True,
+    "noise": 0.05,
+    "protocol_version": "1.0",
+    "package_version": "0.1.0",
+}
+BOMB = DatasetFacts(INFO, {"recording": RECORDING, "num_episodes": 3, "failures": [{"seed": 6}]})
+
+
+def checkpoint(name: str = HUB_NAME, **options: Any) -> Checkpoint:
+    return Checkpoint(make_config(vlm_model_name=name, **options), VLA0, "me/x", "me/d")
+
+
+def metadata(of: Checkpoint) -> dict[str, Any]:
+    return yaml.safe_load(str(of.card()).split("---\n")[1])
+
+
+def test_metadata_of_a_public_backbone() -> None:
+    assert metadata(checkpoint()) == {
+        "license": "apache-2.0",
+        "library_name": "lerobot",
+        "pipeline_tag": "robotics",
+        "tags": ["lerobot", "lerobot_bomb", "robotics", "vla0_smol"],
+        "model_name": "vla0_smol",
+        "datasets": "me/d",
+        "base_model": HUB_NAME,
+    }
+
+
+@pytest.mark.parametrize(("name", "license"), [("nano", "apache-2.0"), ("/data/models/SmolVLM", None)])
+def test_a_backbone_without_a_name_is_no_base_model(name: str, license: str | None) -> None:
+    of = metadata(checkpoint(name))
+    assert "base_model" not in of
+    assert of.get("license") == license
+    assert "/data" not in str(checkpoint(name).card())
+
+
+def test_weights_keep_the_license_of_their_backbone() -> None:
+    grid = replace(checkpoint(GRID.backbone), method=GRID)
+    fdvla = replace(checkpoint(FDVLA.backbone), method=FDVLA)
+    assert metadata(grid)["license"] == "gemma"
+    assert (metadata(fdvla)["license"], metadata(fdvla)["license_name"]) == ("other", "qwen-research")
+    assert metadata(replace(checkpoint(), license="mit"))["license"] == "mit"
+
+
+def test_commands_are_those_of_the_training_and_of_what_the_dataset_shows(tmp_path: Path) -> None:
+    training = TrainPipelineConfig(
+        DatasetConfig("me/d", root=str(tmp_path), episodes=[0, 1]), batch_size=4, steps=7, seed=3
+    )
+    of = replace(checkpoint(temporal_ensemble_size=0), training=training, dataset=BOMB)
+    text = str(of.card()).replace(" \\\n    ", " ")
+    assert (
+        "lerobot-train --policy.type=vla0_smol --policy.chunk_size=3 --policy.n_action_steps=2 "
+        "--dataset.repo_id=me/d '--dataset.episodes=[0, 1]' --batch_size=4 --steps=7 --seed=3 "
+        "--output_dir=outputs/vla0_smol\n"
+    ) in text
+    assert (
+        "lerobot-eval --policy.path=me/x --env.type=bomb --env.task=place --env.robot=fetch "
+        "--env.control_mode=absolute --env.fps=10 --env.image_size=128 --env.depth=true"
+    ) in text
+    assert "seeds 5..6; failed episodes that were left out: 1" in text  # 4 tried, 2 a seed
+    assert "protocol version 1.0" in text
+    assert str(tmp_path) not in text
+
+
+def test_pusht_and_datasets_of_others() -> None:
+    pusht = DatasetFacts(INFO, {"conversion": {"source": "pusht-zarr 0123"}})
+    assert "--env.type=pusht" in str(replace(checkpoint(), dataset=pusht).card())
+    others = str(replace(checkpoint(), dataset=DatasetFacts(INFO, {})).card())
+    assert "--env.type=ENV" in others
+    assert "protocol" not in others
+
+
+@pytest.mark.parametrize(("method", "source"), [(VLA0, "2510.13054"), (GRID, "2501.15830"), (FDVLA, "FDVLA")])
+def test_the_method_is_cited(method: Any, source: str) -> None:
+    assert source in str(replace(checkpoint(), method=method).card())
+
+
+def test_the_hub_in_use_judges_the_metadata(online: LoopbackHub) -> None:
+    checkpoint().card().validate()
+    assert online.requests == ["POST /api/validate-yaml"]
+    with pytest.raises(ValueError, match="no metadata"):
+        PolicyCard("text").validate()

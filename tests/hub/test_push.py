@@ -1,0 +1,194 @@
+"""`lerobot-bomb push`: what is published, what is refused, and what a push that is cut off leaves."""
+
+import json
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+import torch
+import yaml
+from fdvla_cases import make_policy as make_fdvla
+from safetensors.torch import load_file, save_file
+from vla0_smol_cases import STATS, make_batch, make_policy
+
+from hub.server import TOKEN, LoopbackHub
+from lerobot_bomb.cli import main
+from lerobot_bomb.schema import EpisodeResult, EpisodeSpec
+from lerobot_policy_vla0_smol import make_vla0_smol_pre_post_processors
+from lerobot_policy_vla0_smol.modeling_vla0_smol import Vla0SmolPolicy
+
+REPO_ID = "me/x"
+LOCAL = "/data/models/SmolVLM2-500M-Video-Instruct"
+
+
+def result(seed: int, is_success: bool) -> str:
+    return EpisodeResult(
+        spec=EpisodeSpec(seed=seed),
+        instruction="Place a black stone on the Go board at row 0, column 1.",
+        target=(0, 1),
+        color="black",
+        steps=20,
+        is_success=is_success,
+        is_success_bomb_v0=is_success,
+        failure=None if is_success else "dropped",
+        stage="released",
+        placement_error_mm=1.0,
+        nearest_intersection=(0, 1),
+        collateral_mm=0.0,
+    ).to_json()
+
+
+@pytest.fixture
+def checkpoint(tmp_path: Path) -> Path:
+    """As lerobot-train leaves it, of a backbone from a folder."""
+    folder = tmp_path / "pretrained_model"
+    policy = make_policy()
+    for processor in make_vla0_smol_pre_post_processors(policy.config, STATS):
+        processor.save_pretrained(folder)
+    policy.config.vlm_model_name = LOCAL
+    policy.save_pretrained(folder)
+    (folder / "optimizer.pkl").write_bytes(b"not for others")
+    return folder
+
+
+def push(checkpoint: Path, *flags: str) -> int:
+    return main(["push", str(checkpoint), f"--repo_id={REPO_ID}", *flags])
+
+
+def test_one_commit_holds_all_that_is_needed_and_nothing_of_this_machine(
+    online: LoopbackHub, checkpoint: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    results = tmp_path / "results.jsonl"
+    results.write_text("\n".join(result(seed, is_success=seed < 1008) for seed in range(1000, 1010)))
+    assert push(checkpoint, "--results", str(results), "--private") == 0
+    repository = online.model(REPO_ID)
+    assert len(repository.messages) == 1
+    assert repository.is_private
+    files = repository.files()
+    assert {Path(name).suffix for name in files} == {".json", ".safetensors", ".md"}
+    assert not any(b"/data/" in content or TOKEN.encode() in content for content in files.values())
+    assert TOKEN not in "".join(capsys.readouterr())
+    card = files["README.md"].decode()
+    metadata = yaml.safe_load(card.split("---\n")[1])
+    assert "base_model" not in metadata
+    assert "license" not in metadata
+    assert "| 10 | 8 | 80.0 % | 49.0 to 94.3 % |" in card  # Wilson's interval of 8 in 10
+    for flag in (f"--policy.path={REPO_ID}", "--env.robot=scara", "--env.fps=10", "--env.image_size=256"):
+        assert flag in card
+    pulled = tmp_path / "pulled"
+    pulled.mkdir()
+    for name, content in files.items():
+        (pulled / name).write_bytes(content)
+    ours, theirs = (Vla0SmolPolicy.from_pretrained(folder) for folder in (checkpoint, pulled))
+    batch = make_batch(make_policy(), 2)
+    assert torch.equal(ours.predict_action_chunk(batch), theirs.predict_action_chunk(batch))
+
+
+def remove_weights(folder: Path) -> None:
+    (folder / "model.safetensors").unlink()
+
+
+def truncate_weights(folder: Path) -> None:
+    path = folder / "model.safetensors"
+    path.write_bytes(path.read_bytes()[:-10])
+
+
+def remove_processor_state(folder: Path) -> None:
+    next(folder.glob("policy_preprocessor_*.safetensors")).unlink()
+
+
+def truncate_config(folder: Path) -> None:
+    path = folder / "config.json"
+    path.write_text(path.read_text()[:-10])
+
+
+def take_other_weights(folder: Path) -> None:
+    make_fdvla().save_pretrained(folder / "other")
+    (folder / "other" / "model.safetensors").rename(folder / "model.safetensors")
+
+
+def take_other_shape(folder: Path) -> None:
+    weights = load_file(folder / "model.safetensors")
+    name = min(weights)
+    save_file({**weights, name: torch.zeros(1)}, folder / "model.safetensors")
+
+
+def change_config(**values: object) -> Callable[[Path], None]:
+    def change(folder: Path) -> None:
+        path = folder / "config.json"
+        path.write_text(json.dumps(json.loads(path.read_text()) | values))
+
+    return change
+
+
+BROKEN = {
+    "holds no model.safetensors, so it is no checkpoint": remove_weights,
+    "model.safetensors is truncated or no safetensors file": truncate_weights,
+    "which its policy_preprocessor.json needs": remove_processor_state,
+    "config.json is not JSON, or truncated": truncate_config,
+    "is not of the vla0_smol that config.json describes: it lacks backbone.": take_other_weights,
+    "has shape (1,), not (": take_other_shape,
+    f"would need the base model {LOCAL}": change_config(vlm_config=None),
+    "the type 'act' is not one that lerobot-bomb pushes": change_config(type="act"),
+}
+
+
+@pytest.mark.parametrize("message", BROKEN)
+def test_a_broken_checkpoint_is_refused_in_one_line_before_anything_is_sent(
+    message: str, online: LoopbackHub, checkpoint: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    BROKEN[message](checkpoint)
+    assert push(checkpoint) == 1
+    error = capsys.readouterr().err.strip()
+    assert message in error
+    assert len(error.splitlines()) == 1
+    assert online.requests == []
+
+
+def test_no_token_a_wrong_one_and_no_hub(
+    online: LoopbackHub, checkpoint: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    from huggingface_hub import constants
+
+    errors = []
+    monkeypatch.setenv("HF_TOKEN", "hf_wrong")
+    assert push(checkpoint) == 1
+    errors.append(capsys.readouterr().err)
+    monkeypatch.setattr(constants, "ENDPOINT", "http://127.0.0.1:9")
+    assert push(checkpoint) == 1
+    errors.append(capsys.readouterr().err)
+    monkeypatch.delenv("HF_TOKEN")
+    monkeypatch.setattr("lerobot_bomb.hub.upload.get_token", lambda: None)
+    assert push(checkpoint) == 1
+    errors.append(capsys.readouterr().err)
+    parts = ("Invalid username or password", "http://127.0.0.1:9 cannot be reached", "run `hf auth login`")
+    for error, part in zip(errors, parts, strict=True):
+        assert part in error
+        assert "hf_wrong" not in error
+        assert len(error.strip().splitlines()) == 1
+    assert online.repositories == {}
+
+
+def test_a_push_that_is_cut_off_anywhere_leaves_nothing_or_everything(
+    online: LoopbackHub, checkpoint: Path
+) -> None:
+    assert push(checkpoint) == 0
+    whole, num_requests = online.model(REPO_ID).files(), len(online.requests)
+    assert num_requests >= 6
+    seen = set()
+    for last in range(num_requests):
+        online.repositories.clear()
+        online.blobs.clear()
+        online.requests.clear()
+
+        def cut(_: str, last: int = last) -> None:
+            if len(online.requests) > last:
+                raise ConnectionAbortedError
+
+        online.before = cut
+        push(checkpoint)
+        repository = online.repositories.get(f"models/{REPO_ID}")
+        files = {} if repository is None else repository.files()
+        assert files in ({}, whole)
+        seen.add(bool(files))
+    assert False in seen
