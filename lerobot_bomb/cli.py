@@ -45,6 +45,7 @@ COMMANDS = {
         "lerobot_bomb.vlm.export",
     ),
     "push": ("a checkpoint to the Hub, with a card and its evaluation", "lerobot_bomb.hub.push"),
+    "push-dataset": ("a recorded dataset to the Hub, with a card", "lerobot_bomb.hub.push_dataset"),
     "view": ("play one episode into a recording for Rerun and a video", "lerobot_bomb.viewing.view"),
     "gallery": ("draw what every perturbation axis changes", "lerobot_bomb.viewing.gallery"),
     "demo": ("record, train and evaluate on this machine in minutes", "lerobot_bomb.demo"),

@@ -13,10 +13,11 @@ from lerobot.configs.train import TrainPipelineConfig
 
 from lerobot_bomb import __version__
 from lerobot_bomb.evaluation.results import by_condition, common_settings, summarise
-from lerobot_bomb.hub.commands import command, train_command
 from lerobot_bomb.hub.dataset import INFO_FILE, DatasetFacts, Row, eval_flags_of, protocol_version
+from lerobot_bomb.hub.markdown import command, fenced
 from lerobot_bomb.hub.method import Method
 from lerobot_bomb.hub.names import is_hub_id
+from lerobot_bomb.hub.training import train_command
 from lerobot_bomb.stats import wilson_interval
 
 if TYPE_CHECKING:
@@ -202,11 +203,6 @@ class Checkpoint:
 
     def _citation(self) -> str:
         return fenced("\n\n".join(paper.bibtex() for paper in self.method.papers), "bibtex")
-
-
-def fenced(text: str, language: str = "") -> str:
-    """A block of code."""
-    return f"```{language}\n{text}\n```"
 
 
 def results_table(rows: list[Row]) -> str:

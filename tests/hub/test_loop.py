@@ -34,8 +34,7 @@ def record(root: Path) -> list[str]:
 
 def train(folder: Path, name: str, *flags: str) -> list[str]:
     own = "--policy.device=cpu --batch_size=2 --num_workers=0 --steps=2 --policy.push_to_hub=true"
-    data = [f"--dataset.repo_id={DATASET}", f"--dataset.root={folder / 'dataset'}"]
-    data.append(f"--output_dir={folder / name}")
+    data = [f"--dataset.repo_id={DATASET}", f"--output_dir={folder / name}"]
     return ["lerobot-train", *own.split(), *data, *flags]
 
 
@@ -58,10 +57,12 @@ def check_no_secret(hub: LoopbackHub, ended: Ended, folder: Path) -> None:
 def loop(hub: LoopbackHub, folder: Path, policy_type: str) -> str:
     """The card that was published; what comes after it starts from the Hub alone."""
     flags = [f"--policy.type={policy_type}", "--policy.vlm_model_name=nano", *SMALL[policy_type].split()]
+    root = f"--dataset.root={folder / 'dataset'}"  # after that the dataset is the Hub's
     ended = run(
         [
             record(folder / "dataset"),
-            train(folder, "first", *flags, f"--policy.repo_id={FIRST}"),
+            ["lerobot-bomb", "push-dataset", f"{folder / 'dataset'}", f"--repo_id={DATASET}"],
+            train(folder, "first", *flags, f"--policy.repo_id={FIRST}", root),
             FORGET,
             evaluate(FIRST, folder / "eval", "--policy.pretrained_revision=main"),
             ["python", CARD_CODE],

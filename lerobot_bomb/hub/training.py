@@ -1,7 +1,6 @@
-"""The commands of a model card, in the words of one checkpoint."""
+"""How a checkpoint was trained, as a command."""
 
 import json
-import shlex
 from dataclasses import MISSING, Field, fields
 from typing import Any
 
@@ -9,6 +8,7 @@ import draccus
 from lerobot.configs import PreTrainedConfig
 from lerobot.configs.train import TrainPipelineConfig
 
+from lerobot_bomb.hub.markdown import command
 from lerobot_bomb.hub.names import has_local_path, is_hub_id
 
 # a policy's fields that are filled in, or that say where it runs and goes
@@ -30,7 +30,6 @@ NOT_FLAGS = {
     "pretrained_path",
     "pretrained_revision",
 }
-WIDTH = 100
 
 
 def train_command(config: PreTrainedConfig, training: TrainPipelineConfig | None, dataset_id: str) -> str:
@@ -64,15 +63,3 @@ def _default(of: Field) -> Any:
 
 def _text(value: Any) -> str:
     return value if isinstance(value, str) else json.dumps(value)
-
-
-def command(name: str, *flags: str) -> str:
-    """A command line, broken where it is long."""
-    lines, line = [], name
-    for flag in map(shlex.quote, flags):
-        if len(line) + len(flag) > WIDTH:
-            lines.append(line)
-            line = f"    {flag}"
-        else:
-            line = f"{line} {flag}"
-    return " \\\n".join([*lines, line])

@@ -1,0 +1,126 @@
+"""``lerobot-bomb push-dataset``: a recorded dataset, with its card, to the Hub."""
+
+import argparse
+from contextlib import suppress
+from pathlib import Path
+
+from huggingface_hub import DatasetCardData, HfApi
+from huggingface_hub.errors import RevisionNotFoundError
+
+from lerobot_bomb.data.growing import METADATA_FILE, check_repo_id, switch
+from lerobot_bomb.hub.dataset import DatasetFacts
+from lerobot_bomb.hub.markdown import command, fenced
+from lerobot_bomb.hub.upload import check_token, hub_errors, upload
+
+CARD = "README.md"
+FOLDERS = ("meta", "data", "videos")
+
+
+def add_push_dataset_arguments(parser: argparse.ArgumentParser) -> None:
+    """Declare the arguments of ``lerobot-bomb push-dataset``."""
+    add = parser.add_argument
+    add("root", type=Path, metavar="ROOT", help="folder that lerobot-bomb record or convert wrote")
+    add("--repo_id", required=True, help="name of the dataset on the Hub, USER/NAME")
+    add("--private", **switch(), help="make a new repository that only you see")
+
+
+def run_push_dataset(args: argparse.Namespace) -> int:
+    """Check the dataset, publish all of it in one commit and tag it for LeRobot; prints where."""
+    check_repo_id(args.repo_id)
+    facts = DatasetFacts.read(args.root)
+    if not facts.bomb:
+        raise ValueError(
+            f"{args.root} holds no {METADATA_FILE}, so lerobot-bomb did not write it; "
+            "LeRobotDataset.push_to_hub publishes other datasets"
+        )
+    check_frames(args.root, facts)
+    check_token()
+    files: dict[str, Path | bytes] = {
+        path.relative_to(args.root).as_posix(): path
+        for folder in FOLDERS
+        for path in sorted((args.root / folder).rglob("*"))
+        if path.is_file()
+    }
+    files[CARD] = dataset_card(args.repo_id, facts).encode()
+    message = f"{facts.info['total_episodes']} episodes and card"
+    url = upload(args.repo_id, "dataset", files, message, private=args.private or None)
+    with hub_errors(args.repo_id):
+        _tag(args.repo_id, facts.info["codebase_version"])
+    print(url)
+    return 0
+
+
+def check_frames(root: Path, facts: DatasetFacts) -> None:
+    """The data's files are whole and hold the frames, and every camera has its videos.
+
+    Raises:
+        ValueError: names the file, or says how many frames there are.
+    """
+    from pyarrow import ArrowInvalid
+    from pyarrow.parquet import read_metadata
+
+    num_frames = 0
+    for path in sorted((root / "data").rglob("*.parquet")):
+        try:
+            num_frames += read_metadata(path).num_rows
+        except ArrowInvalid as error:
+            raise ValueError(f"{path} is truncated or no parquet file: {error}") from None
+    if num_frames != facts.info["total_frames"]:
+        raise ValueError(f"{root / 'data'} holds {num_frames} frames, not {facts.info['total_frames']}")
+    for name, feature in facts.info["features"].items():
+        if feature["dtype"] == "video" and not any((root / "videos" / name).rglob("*.mp4")):
+            raise ValueError(f"{root / 'videos' / name} holds no video")
+
+
+def dataset_card(repo_id: str, facts: DatasetFacts) -> str:
+    """What the dataset shows, and how to train on it."""
+    metadata = DatasetCardData(
+        license="apache-2.0",
+        tags=["LeRobot", "lerobot_bomb"],
+        task_categories=["robotics"],
+        configs=[{"config_name": "default", "data_files": "data/*/*.parquet"}],
+    )
+    rows = [
+        f"| `{name}` | {feature['dtype']} | {tuple(feature['shape'])} |"
+        for name, feature in facts.info["features"].items()
+    ]
+    train = command(
+        "lerobot-train",
+        f"--dataset.repo_id={repo_id}",
+        "--policy.type=vla0_smol",
+        "--policy.push_to_hub=false",
+        "--output_dir=outputs/vla0_smol",
+    )
+    flags = facts.eval_flags() or []
+    evaluate = command(
+        "lerobot-eval", "--policy.path=outputs/vla0_smol/checkpoints/last/pretrained_model", *flags
+    )
+    lines = [
+        f"# {repo_id.split('/')[-1]}",
+        "",
+        f"A LeRobotDataset {facts.info['codebase_version']}, written by `lerobot-bomb`.",
+        "",
+        *facts.lines(),
+        "",
+        "## Use",
+        "",
+        "`pip install .` in a checkout of lerobot_bomb adds the policy types and the environment to LeRobot.",
+        "",
+        fenced(f"{train}\n{evaluate}"),
+        "",
+        "## Features",
+        "",
+        "| feature | type | shape |",
+        "|---|---|---|",
+        *rows,
+        "",
+    ]
+    return f"---\n{metadata.to_yaml()}\n---\n\n" + "\n".join(lines)
+
+
+def _tag(repo_id: str, version: str) -> None:
+    """LeRobot loads the commit that has the version's tag."""
+    api = HfApi()
+    with suppress(RevisionNotFoundError):
+        api.delete_tag(repo_id, tag=version, repo_type="dataset")
+    api.create_tag(repo_id, tag=version, repo_type="dataset")

@@ -1,0 +1,102 @@
+"""`lerobot-bomb push-dataset`: what is published and what is refused; tests/hub/test_loop.py trains on it."""
+
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+import yaml
+
+from hub.server import TOKEN, LoopbackHub
+from lerobot_bomb.cli import main
+
+REPO_ID = "me/d"
+
+
+@pytest.fixture(scope="module")
+def recorded(tmp_path_factory: pytest.TempPathFactory) -> Callable[[Path], Path]:
+    root = tmp_path_factory.mktemp("recorded") / "dataset"
+    flags = ["--episodes=2", "--seed=7", "--image_size=64", "--images", "--perturbations=camera:2"]
+    assert main(["record", f"--repo_id={REPO_ID}", f"--root={root}", *flags]) == 0
+    return lambda folder: copy(root, folder / "dataset")
+
+
+def copy(root: Path, folder: Path) -> Path:
+    for path in root.rglob("*"):
+        if path.is_file():
+            target = folder / path.relative_to(root)
+            target.parent.mkdir(parents=True, exist_ok=True)
+            target.write_bytes(path.read_bytes())
+    return folder
+
+
+def push(root: Path) -> int:
+    return main(["push-dataset", str(root), f"--repo_id={REPO_ID}"])
+
+
+def test_one_commit_tagged_for_lerobot_with_a_card(
+    online: LoopbackHub, recorded: Callable[[Path], Path], tmp_path: Path
+) -> None:
+    root = recorded(tmp_path)
+    assert push(root) == 0
+    repository = online.dataset(REPO_ID)
+    assert len(repository.messages) == 1
+    assert repository.refs["v3.0"] == repository.refs["main"]
+    files = repository.files()
+    for path in root.rglob("*.*"):
+        assert files[path.relative_to(root).as_posix()] == path.read_bytes()
+    card = files["README.md"].decode()
+    assert yaml.safe_load(card.split("---\n")[1])["task_categories"] == ["robotics"]
+    for part in (
+        "suite `place`",
+        "`camera:2`",
+        "seeds 7..8",
+        "--env.type=bomb",
+        f"--dataset.repo_id={REPO_ID}",
+    ):
+        assert part in card
+    assert str(tmp_path) not in card
+    assert push(root) == 0  # again: the tag moves on
+    assert repository.refs["v3.0"] == repository.refs["main"]
+
+
+def truncate_data(root: Path) -> None:
+    path = next((root / "data").rglob("*.parquet"))
+    path.write_bytes(path.read_bytes()[:-10])
+
+
+def remove_data(root: Path) -> None:
+    next((root / "data").rglob("*.parquet")).unlink()
+
+
+def remove_metadata(root: Path) -> None:
+    (root / "meta" / "bomb.json").unlink()
+
+
+def remove_info(root: Path) -> None:
+    (root / "meta" / "info.json").unlink()
+
+
+BROKEN = {
+    "is truncated or no parquet file": truncate_data,
+    "holds 0 frames, not": remove_data,
+    "so lerobot-bomb did not write it": remove_metadata,
+    "so it is no LeRobotDataset": remove_info,
+}
+
+
+@pytest.mark.parametrize("message", BROKEN)
+def test_a_broken_dataset_is_refused_in_one_line_before_anything_is_sent(
+    message: str,
+    online: LoopbackHub,
+    recorded: Callable[[Path], Path],
+    tmp_path: Path,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    root = recorded(tmp_path)
+    BROKEN[message](root)
+    assert push(root) == 1
+    error = capsys.readouterr().err.strip()
+    assert message in error
+    assert len(error.splitlines()) == 1
+    assert TOKEN not in error
+    assert online.requests == []
