@@ -20,6 +20,8 @@ exec(code[: code.index("action = ")])
 assert policy.config.repo_id == "me/first"
 assert preprocess.steps and postprocess.steps
 """
+TAG = "v1"
+TAG_CODE = f"from huggingface_hub import HfApi; HfApi().create_tag('{FIRST}', tag='{TAG}')"
 SMALL = {
     "vla0_smol": "--policy.chunk_size=2 --policy.n_action_steps=2",
     "spatialvla_grid": "--policy.chunk_size=2 --policy.n_action_steps=2",
@@ -63,8 +65,9 @@ def loop(hub: LoopbackHub, folder: Path, policy_type: str) -> str:
             record(folder / "dataset"),
             ["lerobot-bomb", "push-dataset", f"{folder / 'dataset'}", f"--repo_id={DATASET}"],
             train(folder, "first", *flags, f"--policy.repo_id={FIRST}", root),
+            ["python", TAG_CODE],
             FORGET,
-            evaluate(FIRST, folder / "eval", "--policy.pretrained_revision=main"),
+            evaluate(FIRST, folder / "eval", f"--policy.pretrained_revision={TAG}"),
             ["python", CARD_CODE],
             train(folder, "second", f"--policy.path={FIRST}", f"--policy.repo_id={SECOND}"),
         ],
@@ -74,6 +77,8 @@ def loop(hub: LoopbackHub, folder: Path, policy_type: str) -> str:
     )
     assert ended.code == 0, ended.text
     assert (folder / "eval" / "eval_info.json").is_file()
+    # of all files LeRobot 0.6.1's evaluation takes these alone from a revision
+    assert f"HEAD /{FIRST}/resolve/{TAG}/model.safetensors" in hub.requests
     for repo_id in (FIRST, SECOND):
         endings = {Path(path).suffix for path in hub.model(repo_id).files()}
         assert endings == {".json", ".safetensors", ".md"}
