@@ -16,9 +16,10 @@ from lerobot.policies import make_policy, make_pre_post_processors
 from lerobot.utils.import_utils import register_third_party_plugins
 from lerobot.utils.random_utils import set_seed
 
+from lerobot_bomb.checkpoint import write_checkpoint
 from lerobot_bomb.data.columns import read_meta
 from lerobot_bomb.flags import FlagError
-from lerobot_bomb.viewing.unfinished import written_whole
+from lerobot_bomb.viewing.unfinished import check_new_folder
 
 PREFIX = "--policy."
 
@@ -47,18 +48,14 @@ def add_init_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run_init(args: argparse.Namespace) -> int:
     """Write config, weights and processors with the dataset's features and statistics."""
-    if args.output.exists():
-        raise ValueError(f"--output={args.output} exists already; name a new folder or delete it")
+    check_new_folder("--output", args.output)
     register_third_party_plugins()
     config = parse_policy(args.rest)
     meta = read_meta(args.repo_id, args.root)
     set_seed(args.seed)
     policy = make_policy(config, ds_meta=meta)
     pipelines = make_pre_post_processors(config, dataset_stats=cast("Any", meta.stats))
-    with written_whole(args.output) as (folder,):
-        policy.save_pretrained(folder)
-        for pipeline in pipelines:
-            pipeline.save_pretrained(folder)
+    write_checkpoint(args.output, policy, pipelines)
     print(f"written to {args.output}: train it with lerobot-train --policy.path={args.output}")
     return 0
 

@@ -1,16 +1,19 @@
-"""A checkpoint's folder, read as LeRobot's commands read it."""
+"""A checkpoint's folder, read as LeRobot's commands read it, and written."""
 
+from collections.abc import Iterable
 from contextlib import AbstractContextManager, nullcontext
 from pathlib import Path
 from typing import Any
 
 import torch
 from lerobot.configs import PreTrainedConfig
-from lerobot.policies import make_pre_post_processors
+from lerobot.policies import PreTrainedPolicy, make_pre_post_processors
 from lerobot.processor import PolicyAction, PolicyProcessorPipeline
 from lerobot.utils.constants import POLICY_PREPROCESSOR_DEFAULT_NAME
 from lerobot.utils.device_utils import get_safe_torch_device, is_torch_device_available
 from lerobot.utils.import_utils import register_third_party_plugins
+
+from lerobot_bomb.viewing.unfinished import written_whole
 
 FILES = ("config.json", f"{POLICY_PREPROCESSOR_DEFAULT_NAME}.json")
 
@@ -46,6 +49,16 @@ def load_processors(config: PreTrainedConfig) -> tuple[Preprocessor, Postprocess
         pretrained_path=str(config.pretrained_path),
         preprocessor_overrides={"device_processor": {"device": str(config.device)}},
     )
+
+
+def write_checkpoint(
+    path: Path, policy: PreTrainedPolicy, processors: Iterable[PolicyProcessorPipeline[Any, Any]]
+) -> None:
+    """Config, weights and processors in a new folder, which appears complete."""
+    with written_whole(path) as (folder,):
+        policy.save_pretrained(folder)
+        for processor in processors:
+            processor.save_pretrained(folder)
 
 
 def autocast(config: PreTrainedConfig) -> AbstractContextManager:

@@ -6,8 +6,8 @@ from pathlib import Path
 from lerobot.configs import PreTrainedConfig
 from lerobot.policies import PreTrainedPolicy, get_policy_class
 
-from lerobot_bomb.checkpoint import load_processors, read_config
-from lerobot_bomb.viewing.unfinished import written_whole
+from lerobot_bomb.checkpoint import load_processors, read_config, write_checkpoint
+from lerobot_bomb.viewing.unfinished import check_new_folder
 
 
 def add_merge_arguments(parser: argparse.ArgumentParser) -> None:
@@ -19,17 +19,13 @@ def add_merge_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run_merge(args: argparse.Namespace) -> int:
     """Write config, merged weights and processors."""
-    if args.output.exists():
-        raise ValueError(f"--output={args.output} exists already; name a new folder or delete it")
+    check_new_folder("--output", args.output)
     config = read_config(args.policy_path, "cpu")
     if not config.use_peft:
         raise ValueError(f"--policy.path={args.policy_path} is a whole checkpoint: there is nothing to merge")
     pipelines = load_processors(config)
     policy = merged(config, args.policy_path)
-    with written_whole(args.output) as (folder,):
-        policy.save_pretrained(folder)
-        for pipeline in pipelines:
-            pipeline.save_pretrained(folder)
+    write_checkpoint(args.output, policy, pipelines)
     print(f"written to {args.output}: --policy.path={args.output}")
     return 0
 

@@ -19,12 +19,12 @@ from lerobot_bomb.hub.method import Method
 from lerobot_bomb.hub.names import is_hub_id
 from lerobot_bomb.hub.training import train_command
 from lerobot_bomb.stats import wilson_interval
+from lerobot_bomb.vlm.tokenizer import NANO
 
 if TYPE_CHECKING:
     from lerobot.datasets import LeRobotDatasetMetadata
 
 NO_REPO_ID = "USER/NAME"
-NANO = "nano"
 BAD_REQUEST = 400
 
 

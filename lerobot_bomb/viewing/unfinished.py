@@ -13,6 +13,12 @@ def check_writable(flag: str, path: Path) -> None:
         raise ValueError(f"{flag}={path} cannot be written; give a file in a folder that exists")
 
 
+def check_new_folder(flag: str, path: Path) -> None:
+    """Raise a ValueError if there is something at the path that a flag gives."""
+    if path.exists():
+        raise ValueError(f"{flag}={path} exists already; name a new folder or delete it")
+
+
 @contextmanager
 def written_whole(*paths: Path) -> Iterator[list[Path]]:
     """Give paths to write to; when nothing was raised, what lies there gets the names `paths`.

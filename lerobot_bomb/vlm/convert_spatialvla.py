@@ -17,7 +17,8 @@ from safetensors.torch import load_file
 from torch import Tensor
 
 from lerobot_bomb.actions.grids import ActionGrids
-from lerobot_bomb.viewing.unfinished import written_whole
+from lerobot_bomb.checkpoint import write_checkpoint
+from lerobot_bomb.viewing.unfinished import check_new_folder
 from lerobot_bomb.vlm.paligemma import PaliGemmaPrompt
 from lerobot_bomb.vlm.tokenizer import load_tokenizer
 
@@ -50,8 +51,7 @@ def add_convert_spatialvla_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run_convert_spatialvla(args: argparse.Namespace) -> int:
     """Write the checkpoint."""
-    if args.output.exists():
-        raise ValueError(f"--output={args.output} exists already; name a new folder or delete it")
+    check_new_folder("--output", args.output)
     original = _read_json(args.folder, "config.json")
     if original.get("model_type") != "spatialvla":
         raise ValueError(
@@ -70,10 +70,7 @@ def run_convert_spatialvla(args: argparse.Namespace) -> int:
     policy.load_state_dict(_weights(args.folder, original, policy.state_dict()), strict=True)
     pipelines = make_pre_post_processors(config, dataset_stats={ACTION: scales})
     config.vlm_model_name = args.folder.resolve().name  # nothing is read there any more
-    with written_whole(args.output) as (folder,):
-        policy.save_pretrained(folder)
-        for pipeline in pipelines:
-            pipeline.save_pretrained(folder)
+    write_checkpoint(args.output, policy, pipelines)
     print(f"written to {args.output}: --policy.path={args.output}")
     return 0
 

@@ -11,7 +11,7 @@ from lerobot.policies import PreTrainedPolicy, get_policy_class
 from tokenizers import Tokenizer
 
 from lerobot_bomb.checkpoint import Preprocessor, load_processors, read_config
-from lerobot_bomb.viewing.unfinished import written_whole
+from lerobot_bomb.viewing.unfinished import check_new_folder, written_whole
 from lerobot_bomb.vlm.backbone import SmolVLMBackbone
 from lerobot_bomb.vlm.paligemma import PaliGemmaBackbone
 from lerobot_bomb.vlm.qwen import QwenBackbone
@@ -26,8 +26,7 @@ def add_export_backbone_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run_export_backbone(args: argparse.Namespace) -> int:
     """Write config, weights and tokenizer in transformers' format."""
-    if args.output.exists():
-        raise ValueError(f"--output={args.output} exists already; name a new folder or delete it")
+    check_new_folder("--output", args.output)
     config = read_config(args.policy_path, "cpu")
     policy = get_policy_class(config.type).from_pretrained(str(args.policy_path), config=config)
     backbone = _backbone(policy)
