@@ -17,7 +17,8 @@ from lerobot_bomb.decoding.grammar import NumberGrammar
 from lerobot_bomb.decoding.writer import continue_prompt
 from lerobot_bomb.vlm.backbone import SmolVLMBackbone, build_backbone, load_backbone
 from lerobot_bomb.vlm.cached_text import CachedText
-from lerobot_bomb.vlm.presets import nano_config
+from lerobot_bomb.vlm.paligemma import build_paligemma
+from lerobot_bomb.vlm.presets import nano_config, nano_paligemma_config
 from lerobot_bomb.vlm.recordings import Recordings
 from lerobot_bomb.vlm.text_layers import TextLayers
 from lerobot_bomb.vlm.tokenizer import NANO, load_tokenizer
@@ -221,6 +222,27 @@ def test_on_a_copy_it_writes_what_the_model_writes_now(backbone: SmolVLMBackbone
                 module.weight.mul_(1.5)
         layers.refresh()
     assert answers[0] != ours(changing, prompts(changing, 0, LENGTHS), SYMBOL_IDS, drafted=True)
+
+
+@pytest.mark.long
+@pytest.mark.parametrize("name", ["smolvlm", "paligemma"])
+@torch.no_grad()
+def test_compiled_layers_compute_the_same(name: str) -> None:
+    nano = load_tokenizer(NANO)
+    vlm = (
+        build_backbone(nano_config(nano))
+        if name == "smolvlm"
+        else build_paligemma(nano_paligemma_config(nano))
+    ).vlm
+    model: Any = vlm.model.text_model if name == "smolvlm" else vlm.model.language_model
+    embeds_BKH = torch.randn(3, 6, model.config.hidden_size, generator=torch.Generator().manual_seed(0))
+    columns_BK = torch.arange(6).expand(3, 6)
+    states = []
+    for compiled in False, True:
+        text = CachedText(TextLayers(model, compiled=compiled), 3, 20)
+        prompt = text(embeds_BKH[:, :5], columns_BK[:, :5])
+        states.append(torch.cat([prompt, text(embeds_BKH[:, 5:], columns_BK[:, 5:])], dim=1))
+    torch.testing.assert_close(states[1], states[0], rtol=0, atol=1e-4)
 
 
 @torch.no_grad()

@@ -42,19 +42,21 @@ class CachedText:
     def __init__(self, layers: TextLayers, batch_size: int, num_columns: int, first_position: int = 0):
         config, embedding = layers.config, layers.embedding
         check_positions(config, num_columns)
-        num_heads = config.num_key_value_heads
-        self._num_groups = config.num_attention_heads // num_heads
+        self._num_heads = config.num_key_value_heads
+        self._num_groups = config.num_attention_heads // self._num_heads
         self._layers = layers
         # a multiple of 8, which attention on CUDA wants of its masks
         self._columns_C = torch.arange(-(-(num_columns + 1) // 8) * 8, device=embedding.device)
         self.unread_column = len(self._columns_C) - 1
         cos_1CE, sin_1CE = layers.rotary_emb(embedding, first_position + self._columns_C[None])
         first_half, second_half = sin_1CE[0].chunk(2, dim=-1)
-        self._cos_CE, self._sin_CE = cos_1CE[0], torch.cat([-first_half, second_half], dim=-1)
+        # cosines, then sines
+        self._turns_C1E = torch.cat([cos_1CE[0], -first_half, second_half], dim=-1)[:, None]
         device = embedding.device.type
         cast = torch.is_autocast_enabled(device)
         dtype = torch.get_autocast_dtype(device) if cast else embedding.dtype
-        shape = batch_size, num_heads, 2, len(self._columns_C), config.head_dim
+        self._barred, self._open = torch.tensor([-torch.inf, 0.0], dtype=dtype, device=embedding.device)
+        shape = batch_size, self._num_heads, 2, len(self._columns_C), config.head_dim
         self._take(torch.zeros(len(layers), *shape, dtype=dtype, device=embedding.device))
         blocks_BV2 = torch.arange(math.prod(shape[:3]), device=embedding.device).view(shape[:3])
         # (B, 1, 2 * V), of each row's keys and values
@@ -83,16 +85,18 @@ class CachedText:
 
     def _take(self, cache: Tensor) -> None:
         self._cache = cache
-        self._layer_caches = cache.unbind()
+        self._layer_caches = cache.flatten(1, 2).unbind()
 
     def _locate(self, columns_BK: Tensor, reach_BK: Tensor) -> Columns:
         unread_BKC = self._columns_C[: self._count_columns(columns_BK)] > reach_BK[..., None]
-        penalty_BKC = torch.where(unread_BKC, -torch.inf, 0.0).to(self._cache.dtype)
-        columns_BK1 = columns_BK[..., None]
+        penalty_BKC = torch.where(unread_BKC, self._barred, self._open)
+        cos_N1E, sin_N1E = self._turns_C1E[columns_BK.flatten()].chunk(2, dim=-1)
+        (batch_size, num_tokens), size = columns_BK.shape, self._cache.shape[-1]
         return Columns(
-            slots=(self._first_slot + columns_BK1).flatten(),
-            cos=self._cos_CE[columns_BK1],
-            sin=self._sin_CE[columns_BK1],
+            shape=(batch_size, num_tokens, self._num_heads, self._num_groups, size),
+            slots=(self._first_slot + columns_BK[..., None]).flatten(0, 1),
+            cos=cos_N1E,
+            sin=sin_N1E,
             penalty=penalty_BKC[:, None, :, None].expand(-1, -1, -1, self._num_groups, -1).flatten(2, 3),
         )
 

@@ -3,8 +3,8 @@
 The layers' own modules are called in transformers' order, without what surrounds them there (building masks,
 growing caches, recording outputs), which takes most of the time of a small model's pass.
 
-Shapes: `B` batch, `K` tokens of a pass, `C` columns of the cache, `H` hidden size, `V` key-value heads, `G`
-query heads for each, `E` size of a head.
+Shapes: `B` batch, `K` tokens of a row in a pass, `N` of all rows, `C` columns of the cache, `H` hidden size,
+`V` key-value heads, `Z` of all rows, `G` query heads for each, `X` queries of one, `E` size of a head.
 """
 
 import copy
@@ -15,7 +15,7 @@ from typing import Any, TypeGuard
 
 import torch
 from torch import Tensor, nn
-from torch.nn.functional import linear, rms_norm, scaled_dot_product_attention
+from torch.nn.functional import rms_norm, scaled_dot_product_attention
 from transformers.models.gemma2.modeling_gemma2 import Gemma2DecoderLayer, Gemma2RMSNorm
 
 # sizes of passes that may be compiled in a process; torch's own limit is 8
@@ -26,10 +26,11 @@ MAX_COMPILED = 64
 class Columns:
     """Where the tokens of a pass stand, as the layers need it."""
 
-    slots: Tensor  # (B * K * 2 * V,) int64 rows of a layer's flat cache, keys' before values'
-    cos: Tensor  # (B, K, 1, E)
-    sin: Tensor  # (B, K, 1, E), negative in the first half
-    penalty: Tensor  # (B, 1, K * G, columns in use): 0 for those that a query reads, else -inf
+    shape: tuple[int, int, int, int, int]  # B, K, V, G, E
+    slots: Tensor  # (N, 2 * V) int64 rows of a layer's flat cache, keys' before values'
+    cos: Tensor  # (N, 1, E)
+    sin: Tensor  # (N, 1, E), negative in the first half
+    penalty: Tensor  # (B, 1, X, C): 0 for those that a query reads, else -inf
 
 
 class TextLayers:
@@ -61,12 +62,13 @@ class TextLayers:
     def __call__(self, x_BKH: Tensor, columns: Columns, caches: Sequence[Tensor]) -> Tensor:
         """(B, K, H) embeddings -> (B, K, H) states after the last layer.
 
-        ``caches``: of each layer (B, V, 2, C, E), keys before values, a head's columns beside each other, as
-        attention reads them; what is new comes into them.
+        ``caches``: of each layer (Z, 2, C, E), keys before values; what is new comes into them.
         """
-        for layer, cache_BV2CE in zip(self._layers, caches, strict=True):
-            x_BKH = self._run(layer, x_BKH, columns, cache_BV2CE)
-        return self._norm(x_BKH)
+        # one row a token: fewer dimensions to get ready for in each of many small operations
+        x_NH = x_BKH.flatten(0, 1)
+        for layer, cache_Z2CE in zip(self._layers, caches, strict=True):
+            x_NH = self._run(layer, x_NH, columns, cache_Z2CE)
+        return self._norm(x_NH).view(x_BKH.shape)
 
     @torch.no_grad()
     def refresh(self) -> None:
@@ -100,13 +102,14 @@ class _Layer:
 
     def __init__(self, layer: Any, *, is_copy: bool):
         attention, mlp = layer.self_attn, layer.mlp
-        products = _joined_products if is_copy else _products
-        self._qkv = products([attention.q_proj, attention.k_proj, attention.v_proj])
-        self._gate_up = products([mlp.gate_proj, mlp.up_proj])
+        qkv, gate_up = [attention.q_proj, attention.k_proj, attention.v_proj], [mlp.gate_proj, mlp.up_proj]
+        # those of a model are small beside its others: joining them anew costs less than it brings
+        self._qkv = _joined_products(qkv, are_copies=is_copy)
+        self._gate_up = _joined_products(gate_up, are_copies=True) if is_copy else _products(gate_up)
         self._out, self._down = _product(attention.o_proj), _product(mlp.down_proj)
-        self._scale = attention.scaling
         self._softcap: float | None = getattr(attention, "attn_logit_softcapping", None)
-        self._activate = mlp.act_fn
+        self._scale: float = attention.scaling * (1 if self._softcap is None else 2 / self._softcap)
+        self._activate: Callable[[Tensor], Tensor] = mlp.act_fn.forward
         self._before_attention = _RMSNorm(layer.input_layernorm)
         is_gemma = isinstance(layer, Gemma2DecoderLayer)
         after = _RMSNorm(layer.post_attention_layernorm)
@@ -120,37 +123,47 @@ class _Layer:
         norms = self._before_attention, self._after_attention, self._before_mlp, self._after_mlp
         return [norm for norm in norms if norm is not None]
 
-    def __call__(self, x_BKH: Tensor, columns: Columns, cache_BV2CE: Tensor) -> Tensor:
-        """(B, K, H) -> (B, K, H)."""
-        read_BKH = self._attend(self._before_attention(x_BKH), columns, cache_BV2CE)
-        x_BKH = _add(x_BKH, read_BKH, self._after_attention)
-        return _add(x_BKH, self._mix(self._before_mlp(x_BKH)), self._after_mlp)
+    def __call__(self, x_NH: Tensor, columns: Columns, cache_Z2CE: Tensor) -> Tensor:
+        """(N, H) -> (N, H)."""
+        read_NH = self._attend(self._before_attention(x_NH), columns, cache_Z2CE)
+        x_NH = _add(x_NH, read_NH, self._after_attention)
+        return _add(x_NH, self._mix(self._before_mlp(x_NH)), self._after_mlp)
 
-    def _attend(self, x_BKH: Tensor, columns: Columns, cache_BV2CE: Tensor) -> Tensor:
-        _, num_keys, _, _, size = cache_BV2CE.shape
-        dtype = cache_BV2CE.dtype
-        parts = self._qkv(x_BKH)
+    def _attend(self, x_NH: Tensor, columns: Columns, cache_Z2CE: Tensor) -> Tensor:
+        batch_size, num_tokens, num_keys, _, size = columns.shape
+        dtype = cache_Z2CE.dtype
+        parts = self._qkv(x_NH)
         joined = parts[0] if len(parts) == 1 else torch.cat(parts, dim=-1)
-        heads = joined.to(columns.cos.dtype).view(*x_BKH.shape[:2], -1, size)
-        _rotate_(heads[:, :, :-num_keys], columns)
-        new = heads[:, :, -2 * num_keys :].reshape(-1, size)
-        cache_BV2CE.view(-1, size).index_copy_(0, columns.slots, new.to(dtype))
-        query = (heads[:, :, : -2 * num_keys] * self._scale).to(dtype)
+        heads = _cast(joined, columns.cos.dtype).view(batch_size * num_tokens, -1, size)
+        _rotate_(heads[:, :-num_keys], columns)
+        cache_Z2CE.view(-1, size).index_put_((columns.slots,), _cast(heads[:, -2 * num_keys :], dtype))
+        query = _cast(heads[:, : -2 * num_keys] * self._scale, dtype)
         # the queries that share a key stand beside each other: one product a key-value head
-        query_BVXE = query.view(*x_BKH.shape[:2], num_keys, -1, size).transpose(1, 2).flatten(2, 3)
-        used_BV2CE = cache_BV2CE.narrow(3, 0, columns.penalty.shape[-1])
-        keys_BVCE, values_BVCE = used_BV2CE.unbind(dim=2)
-        if self._softcap is None:
-            read_BVXE = scaled_dot_product_attention(
-                query_BVXE, keys_BVCE, values_BVCE, attn_mask=columns.penalty, scale=1.0
-            )
-        else:
-            read_BVXE = _capped_attention(query_BVXE, keys_BVCE, values_BVCE, columns.penalty, self._softcap)
-        read_BVKGE = read_BVXE.view(len(x_BKH), num_keys, x_BKH.shape[1], -1, size)
-        return self._out(read_BVKGE.transpose(1, 2).flatten(2))
+        query_BVKGE = query.view(columns.shape).transpose(1, 2)
+        query_BVXE = query_BVKGE.reshape(batch_size, num_keys, -1, size)
+        keys_ZCE, values_ZCE = cache_Z2CE.narrow(2, 0, columns.penalty.shape[-1]).unbind(dim=1)
+        read_BVXE = self._read(query_BVXE, keys_ZCE, values_ZCE, columns.penalty)
+        read_BKVGE = read_BVXE.view(query_BVKGE.shape).transpose(1, 2)
+        return self._out(read_BKVGE.reshape(batch_size * num_tokens, -1))
 
-    def _mix(self, x_BKH: Tensor) -> Tensor:
-        parts = self._gate_up(x_BKH)
+    def _read(self, query_BVXE: Tensor, keys_ZCE: Tensor, values_ZCE: Tensor, penalty_B1XC: Tensor) -> Tensor:
+        """(B, V, X, E) what queries read."""
+        if self._softcap is None:
+            shape = *query_BVXE.shape[:2], -1, query_BVXE.shape[-1]
+            keys_BVCE, values_BVCE = keys_ZCE.view(shape), values_ZCE.view(shape)
+            return scaled_dot_product_attention(
+                query_BVXE, keys_BVCE, values_BVCE, attn_mask=penalty_B1XC, scale=1.0
+            )
+        # of p = 2 * product / softcap, softcap * tanh(p / 2) is 2 * softcap * sigmoid(p) but for a constant,
+        # which softmax does not see; the sigmoid is faster
+        products_ZXC = torch.bmm(query_BVXE.flatten(0, 1), keys_ZCE.transpose(1, 2))
+        likeness_BVXC = _cast(products_ZXC, torch.float32).sigmoid_().view(*query_BVXE.shape[:3], -1)
+        scores_BVXC = torch.add(penalty_B1XC, likeness_BVXC, alpha=2 * self._softcap)
+        weights_BVXC = _cast(scores_BVXC.softmax(dim=-1), query_BVXE.dtype)
+        return torch.bmm(weights_BVXC.flatten(0, 1), values_ZCE).view(query_BVXE.shape)
+
+    def _mix(self, x_NH: Tensor) -> Tensor:
+        parts = self._gate_up(x_NH)
         gate, up = parts if len(parts) == 2 else parts[0].chunk(2, dim=-1)
         return self._down(self._activate(gate).mul_(up))
 
@@ -170,25 +183,29 @@ def _products(modules: list[nn.Module]) -> _Products:
     return lambda x: [product(x) for product in products]
 
 
-def _joined_products(modules: list[nn.Module]) -> _Products:
-    """The same as a single one, where they are plain; their weights move beside each other."""
-    if not all(_is_plain(module) for module in modules):
+def _joined_products(modules: list[nn.Module], *, are_copies: bool) -> _Products:
+    """The same as a single one, where they are plain; the weights of copies move beside each other."""
+    linears = [module for module in modules if _is_plain(module)]
+    if len(linears) < len(modules):
         return _products(modules)
-    joined = nn.Linear(1, 1, bias=getattr(modules[0], "bias", None) is not None)
-    for name, _ in list(joined.named_parameters()):
-        parts = [module.get_parameter(name) for module in modules]
-        whole = torch.cat([part.detach() for part in parts])
-        setattr(joined, name, nn.Parameter(whole, requires_grad=False))
-        for part, own in zip(parts, whole.split([len(part) for part in parts]), strict=True):
-            part.data = own
-    return _products([joined])
+    joined = []
+    for parts in zip(*(linear.parameters() for linear in linears), strict=True):
+        joined.append(torch.cat([part.detach() for part in parts]))
+        if are_copies:
+            for part, own in zip(parts, joined[-1].split([len(part) for part in parts]), strict=True):
+                part.data = own
+    product = _multiply(*joined)
+    return lambda x: [product(x)]
 
 
 def _product(module: nn.Module) -> Callable[[Tensor], Tensor]:
     """A projection; a plain one without `Module.__call__`, which is half of a small product's time."""
-    if _is_plain(module):
-        return partial(linear, weight=module.weight, bias=module.bias)
-    return module
+    return _multiply(*module.parameters()) if _is_plain(module) else module
+
+
+def _multiply(weight: Tensor, bias: Tensor | None = None) -> Callable[[Tensor], Tensor]:
+    transposed = weight.detach().t()
+    return partial(torch.mm, mat2=transposed) if bias is None else partial(torch.addmm, bias, mat2=transposed)
 
 
 def _is_plain(module: nn.Module) -> TypeGuard[nn.Linear]:
@@ -236,16 +253,9 @@ def _add(x: Tensor, new: Tensor, norm: _RMSNorm | None) -> Tensor:
     return x + norm(new)
 
 
-def _capped_attention(
-    query_BVXE: Tensor, keys_BVCE: Tensor, values_BVCE: Tensor, penalty_B1XC: Tensor, softcap: float
-) -> Tensor:
-    """(B, V, X, E) read by X queries a head, each product p limited to ``softcap * tanh(p / softcap)``."""
-    # 2 * softcap * sigmoid(2 * p / softcap), which is larger by softcap: the same after softmax, and faster
-    query = (query_BVXE * (2 / softcap)).flatten(0, 1)
-    scores = torch.bmm(query, keys_BVCE.flatten(0, 1).transpose(1, 2)).float().sigmoid_()
-    scores_BVXC = torch.add(penalty_B1XC, scores.view(*query_BVXE.shape[:3], -1), alpha=2 * softcap)
-    weights = scores_BVXC.softmax(dim=-1).to(values_BVCE.dtype).flatten(0, 1)
-    return torch.bmm(weights, values_BVCE.flatten(0, 1)).view(query_BVXE.shape)
+def _cast(x: Tensor, dtype: torch.dtype) -> Tensor:
+    # `Tensor.to` takes as long as a small product even where there is nothing to do
+    return x if x.dtype == dtype else x.to(dtype)
 
 
 def _in_float32_on_host(x: Tensor) -> bool:
@@ -253,6 +263,6 @@ def _in_float32_on_host(x: Tensor) -> bool:
 
 
 def _rotate_(heads: Tensor, columns: Columns) -> None:
-    """(B, K, heads, E) get their rotary positions in place."""
+    """(N, heads, E) get their rotary positions in place."""
     half_turned = heads.roll(heads.shape[-1] // 2, dims=-1)
     heads.mul_(columns.cos).addcmul_(half_turned, columns.sin)
