@@ -176,21 +176,24 @@ def test_with_real_time_chunking_each_chunk_goes_on_from_the_last(
     # the horizon is longer than the chunk, and so is what LeRobot fills up with zeros
     arm = rollout(path, 20, "--fps=10", "--inference.type=rtc", "--inference.queue_threshold=4")
     monkeypatch.undo()
-    assert len(calls) >= 3 and calls[0].left_over is None
-    guided, free = Loaded.of(path), Loaded.of(path)
-    chunks = []
-    for before, call in zip([None, *calls], calls, strict=False):
+    assert calls[0].left_over is None
+    free = Loaded.of(path)
+    chunks, num_guided = [], 0
+    for i, call in enumerate(calls):
         free_1KD = free.policy.predict_action_chunk(call.batch)  # of the same noise
-        if before is None or call.left_over is None:
-            torch.testing.assert_close(call.chunk, free_1KD)
-        else:
-            left_KD = call.left_over[call.left_over.any(dim=1)]
-            assert 0 < len(left_KD) <= CHUNK < len(call.left_over)
-            assert torch.equal(left_KD, before.chunk[0, CHUNK - len(left_KD) :])
+        left_KD = torch.zeros(0, len(KEYS)) if call.left_over is None else call.left_over
+        left_KD = left_KD[left_KD.any(dim=1)]
+        if len(left_KD):
+            assert call.left_over is not None and len(call.left_over) > CHUNK
+            assert torch.equal(left_KD, calls[i - 1].chunk[0, CHUNK - len(left_KD) :])
             firm = min(max(call.delay, 1), len(left_KD))
             distances = [(of[0, :firm] - left_KD[:firm]).abs().mean() for of in (call.chunk, free_1KD)]
             assert distances[0] < 0.3 * distances[1]
-        chunks.append(guided.physical(call.chunk))
+            num_guided += 1
+        else:  # the first one, and where a slow machine left nothing
+            torch.testing.assert_close(call.chunk, free_1KD)
+        chunks.append(free.physical(call.chunk))
+    assert num_guided > 0
     # told: rows of the chunks, one after the other, and of a new chunk none that is over already
     places = [place_of(action_D, chunks) for action_D in told(arm)]
     assert places[0][0] == 0 and places == sorted(places)
