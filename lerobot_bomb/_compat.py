@@ -103,3 +103,17 @@ def lerobot_eval_with(flags: Sequence[str], wrap: Callable[[Any, Any], Any]) -> 
         lerobot_eval.main()
     finally:
         lerobot_eval.make_env, sys.argv = usual, argv
+
+
+def serve_registered_policies(config: Any) -> None:
+    """Run LeRobot's policy server, a PolicyServerConfig's, for every registered policy type until Ctrl-C.
+
+    It knows a list of LeRobot's own types, and imports no plugins.
+    """
+    from lerobot.async_inference import policy_server
+    from lerobot.configs import PreTrainedConfig
+    from lerobot.utils.import_utils import register_third_party_plugins
+
+    register_third_party_plugins()
+    policy_server.SUPPORTED_POLICIES[:] = sorted(PreTrainedConfig.get_known_choices())
+    policy_server.serve(config)

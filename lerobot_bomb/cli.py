@@ -44,6 +44,10 @@ COMMANDS = {
         "a checkpoint's vision-language model as a folder that other policies can start from",
         "lerobot_bomb.vlm.export",
     ),
+    "serve": (
+        "LeRobot's server of action chunks for a robot elsewhere, for every policy type",
+        "lerobot_bomb.serve",
+    ),
     "push": ("a checkpoint to the Hub, with a card and its evaluation", "lerobot_bomb.hub.push"),
     "push-dataset": ("a recorded dataset to the Hub, with a card", "lerobot_bomb.hub.push_dataset"),
     "view": ("play one episode into a recording for Rerun and a video", "lerobot_bomb.viewing.view"),

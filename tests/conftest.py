@@ -1,5 +1,6 @@
 """Fixtures that several test modules use."""
 
+import importlib
 import os
 import sys
 from collections.abc import Callable
@@ -64,11 +65,9 @@ def stock_cli(monkeypatch: pytest.MonkeyPatch) -> Callable[..., None]:
     """Run a stock LeRobot command in this process: stock_cli("lerobot-eval", "--env.type=bomb", ...)."""
 
     def run(command: str, *flags: str) -> None:
-        from lerobot.scripts import lerobot_eval, lerobot_train
-
-        mains = {"lerobot-eval": lerobot_eval.main, "lerobot-train": lerobot_train.main}
+        module = importlib.import_module(f"lerobot.scripts.{command.replace('-', '_')}")
         monkeypatch.setattr(sys, "argv", [command, *flags])
-        mains[command]()
+        module.main()
 
     return run
 

@@ -1,12 +1,25 @@
-"""Documents: nothing points nowhere, nothing is left to be filled in."""
+"""Documents: nothing points nowhere, nothing is left to be filled in, commands for robots can be parsed."""
 
+import importlib
+import inspect
 import re
+import shlex
+import sys
+from dataclasses import is_dataclass
 from pathlib import Path
+from string import Template
+from typing import Any
 
+import draccus
 import pytest
+
+from lerobot_bomb import cli
 
 ROOT = Path(__file__).parents[1]
 PAGES = [ROOT / "README.md", *sorted((ROOT / "docs").glob("*.md"))]
+REAL_ROBOT = ROOT / "docs" / "real_robot.md"
+NOT_LEROBOTS = {"pip", "ssh"}
+WITHOUT_CONFIG = {"lerobot-find-port", "lerobot-find-cameras"}  # read no flags, or one word
 
 
 @pytest.mark.parametrize("page", PAGES, ids=lambda page: page.name)
@@ -16,3 +29,69 @@ def test_links_and_pictures_exist_and_no_place_is_left_open(page: Path) -> None:
     missing = [link for link in links if "://" not in link and not (page.parent / link).exists()]
     assert missing == []
     assert re.findall(r"\{[A-Z_]{3,}\}|TODO|FIXME", text) == []
+
+
+def commands(page: Path) -> list[list[str]]:
+    """Of all blocks of a page, as a shell reads them, variables that the page sets in place."""
+    text = "".join(re.findall(r"^```\n(.*?)^```", page.read_text(), flags=re.DOTALL | re.MULTILINE))
+    assignment = re.compile(r"^([A-Z]+)='(.*?)'\n", flags=re.DOTALL | re.MULTILINE)
+    variables = {name: " ".join(value.split()) for name, value in assignment.findall(text)}
+    text = Template(assignment.sub("", text).replace("\\\n", " ")).substitute(variables)
+    return [words for line in text.splitlines() if (words := shlex.split(line))]
+
+
+def parsed(module_name: str, flags: list[str], monkeypatch: pytest.MonkeyPatch) -> Any:
+    """The config that a command of LeRobot makes of its flags, by its own parser."""
+    module = importlib.import_module(module_name)
+    (config_class,) = {
+        parameter.annotation
+        for function in vars(module).values()
+        if getattr(function, "__module__", None) == module_name and hasattr(function, "__wrapped__")
+        for parameter in inspect.signature(function).parameters.values()
+        if is_dataclass(parameter.annotation)
+    }
+
+    def keep(config: Any) -> Any:
+        return config
+
+    keep.__annotations__ = {"config": config_class}
+    wrap = module.parser.wrap if hasattr(module, "parser") else draccus.wrap
+    monkeypatch.setattr(sys, "argv", [module_name, *flags])
+    return wrap()(keep)()
+
+
+def test_the_parsers_read_every_command_for_a_real_robot(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    from lerobot.policies.factory import make_policy_config
+    from lerobot.utils.import_utils import register_third_party_plugins
+
+    register_third_party_plugins()
+    monkeypatch.chdir(tmp_path)
+    for name, policy_type in {"so101_vla0": "vla0_smol", "so101_fdvla": "fdvla"}.items():
+        folder = tmp_path / "outputs" / name / "checkpoints" / "last" / "pretrained_model"
+        folder.mkdir(parents=True)
+        make_policy_config(policy_type).save_pretrained(folder)
+    configs: dict[str, list[Any]] = {}
+    for command, *flags in commands(REAL_ROBOT):
+        if command == "lerobot-bomb":
+            module = importlib.import_module(cli.COMMANDS[flags[0]][1])
+            monkeypatch.setattr(module, f"run_{flags[0].replace('-', '_')}", lambda args: 0)
+            assert cli.main(flags) == 0
+        elif command == "python":
+            configs.setdefault(flags[1], []).append(parsed(flags[1], flags[2:], monkeypatch))
+        elif command not in NOT_LEROBOTS:
+            module_name = f"lerobot.scripts.{command.replace('-', '_')}"
+            if command in WITHOUT_CONFIG:
+                importlib.import_module(module_name)
+            else:
+                configs.setdefault(command, []).append(parsed(module_name, flags, monkeypatch))
+    # values that a shell or a parser could have read as something else
+    (recording,), (client,) = configs["lerobot-record"], configs["lerobot.async_inference.robot_client"]
+    assert recording.dataset.no_stamp and recording.robot.cameras["wrist"].width == 640
+    assert client.robot.max_relative_target == 5.0 and client.policy_type == "vla0_smol"
+    careful, chunking = configs["lerobot-rollout"]
+    assert careful.policy.type == "vla0_smol" and careful.fps == 5
+    assert chunking.policy.type == "fdvla" and chunking.inference.queue_threshold == 8
+    assert configs["lerobot-train"][0].policy.relative_exclude_joints == ["gripper"]
+    assert {config.fps for config in (recording.dataset, client, chunking)} == {15}

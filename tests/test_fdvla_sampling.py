@@ -162,6 +162,11 @@ def test_a_new_chunk_goes_on_from_what_is_left() -> None:
     assert (following - left).abs().mean() < 0.1 * (free - left).abs().mean()
     partly = policy.predict_action_chunk(batch, noise, inference_delay=1, prev_chunk_left_over=left[0, :2])
     assert (partly - left)[:, 0].abs().mean() < 0.2 * (free - left)[:, 0].abs().mean()
+    # lerobot-rollout fills up with zeros, here beyond the chunk, and also where nothing is left
+    for kept, expected in ((2, partly), (0, free)):
+        filled = torch.cat([left[0, :kept], torch.zeros(10 - kept, 4)])
+        got = policy.predict_action_chunk(batch, noise, inference_delay=1, prev_chunk_left_over=filled)
+        assert torch.equal(got, expected)
 
 
 @pytest.mark.parametrize("refine_alpha", [0.3, 1.0])

@@ -11,10 +11,20 @@ from torch import Tensor
 from lerobot_bomb.flow.samplers import Heads
 
 
+def without_padding(leftover_KD: Tensor) -> Tensor:
+    """The actions before the zeros that lerobot-rollout puts behind them up to its execution horizon.
+
+    A chunk guided by those would lead to the mean action, and a horizon beyond the chunk is an error.
+    """
+    is_action_K = leftover_KD.any(dim=-1).reshape(-1, leftover_KD.shape[-2]).any(dim=0)
+    num_actions = int(is_action_K.nonzero().max()) + 1 if is_action_K.any() else 0
+    return leftover_KD[..., :num_actions, :]
+
+
 def guided(
     heads: Heads,
     processor: RTCProcessor,
-    leftover_KD: Tensor | None,
+    leftover_KD: Tensor,
     inference_delay: int,
     execution_horizon: int | None = None,
 ) -> Heads:
@@ -23,6 +33,9 @@ def guided(
     The noise goes with it, so that the heads disagree as before: `residual` would take part of the guidance
     back. None left: nothing is changed.
     """
+    leftover_KD = without_padding(leftover_KD)
+    if leftover_KD.shape[-2] == 0:
+        return heads
 
     def guided_heads(actions_BKD: Tensor, tau_B: Tensor) -> tuple[Tensor | None, Tensor | None]:
         predicted: list[tuple[Tensor | None, Tensor | None]] = []
