@@ -1,7 +1,7 @@
 # `make` finds a Python >= 3.12 by itself; name one with `make PYTHON=/path/to/python3.12 ...`.
 SHELL := /bin/bash
 .DEFAULT_GOAL := help
-.PHONY: help setup demo test test-long test-cuda judges check clean
+.PHONY: help setup demo test test-long test-cuda judges check build clean
 
 BIN := .venv/bin
 STAMP := .venv/.installed
@@ -15,6 +15,7 @@ help:
 	@echo "make test-cuda  checks that need a CUDA device"
 	@echo "make judges     LeRobot's own tests on our types: LEROBOT_SRC=checkout of its tag"
 	@echo "make check      ruff, format, pyright"
+	@echo "make build      sdist and wheel into dist/, tried in an environment of their own"
 	@echo "make setup      only set up .venv"
 
 setup: $(STAMP)
@@ -49,6 +50,10 @@ check: $(STAMP)
 	@$(BIN)/ruff check .
 	@$(BIN)/ruff format --check .
 	@$(BIN)/pyright
+
+build: setup
+	@$(BIN)/pytest tests/test_packaging.py
+	@$(BIN)/python tests/outside/check_build.py
 
 clean:
 	rm -rf .venv

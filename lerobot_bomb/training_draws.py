@@ -8,7 +8,8 @@ from typing import Protocol
 
 import numpy as np
 import torch
-from torch import distributed
+
+from lerobot_bomb.processes import process_number
 
 
 class CountsBatches(Protocol):
@@ -19,9 +20,7 @@ class CountsBatches(Protocol):
 
 def begin_batch(config: CountsBatches, generator: torch.Generator) -> None:
     """Seed ``generator`` for the next batch of a training, and count it."""
-    is_distributed = distributed.is_available() and distributed.is_initialized()
-    process = distributed.get_rank() if is_distributed else 0
     # a resumed training's seed is that of the first one: it is part of the generator's state
-    words = np.random.SeedSequence([torch.initial_seed(), process, config.trained_batches])
+    words = np.random.SeedSequence([torch.initial_seed(), process_number(), config.trained_batches])
     generator.manual_seed(int(words.generate_state(1, np.uint64)[0]))
     config.trained_batches += 1

@@ -1,23 +1,102 @@
+import re
 import subprocess
 import sys
+import tarfile
+import tomllib
 import zipfile
 from pathlib import Path
 
+import pytest
+import yaml
+
+from lerobot_bomb import __version__
+from lerobot_bomb.doctor import DISTRIBUTION
+
 ROOT = Path(__file__).parents[1]
+SOURCE_ROOTS = [ROOT, ROOT / "envs", ROOT / "policies"]
 
 
-def test_the_wheel_holds_every_module_and_the_model_file(tmp_path: Path) -> None:
-    command = [sys.executable, "-m", "hatchling", "build", "-t", "wheel", "-d", str(tmp_path)]
-    subprocess.run(command, cwd=ROOT, check=True, capture_output=True)
-    (wheel,) = tmp_path.glob("*.whl")
+def build(target: str, source: Path, folder: Path) -> Path:
+    command = [sys.executable, "-m", "hatchling", "build", "-t", target, "-d", str(folder)]
+    subprocess.run(command, cwd=source, check=True, capture_output=True)
+    (built,) = folder.iterdir()
+    return built
+
+
+def files(wheel: Path) -> dict[str, bytes]:
     with zipfile.ZipFile(wheel) as archive:
-        packed = {name for name in archive.namelist() if ".dist-info/" not in name}
-    roots = [ROOT, ROOT / "envs", ROOT / "policies"]
+        return {name: archive.read(name) for name in archive.namelist()}
+
+
+@pytest.fixture(scope="module")
+def wheel(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return build("wheel", ROOT, tmp_path_factory.mktemp("wheel"))
+
+
+@pytest.fixture(scope="module")
+def unpacked(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The sdist's only folder."""
+    with tarfile.open(build("sdist", ROOT, tmp_path_factory.mktemp("sdist"))) as archive:
+        archive.extractall(folder := tmp_path_factory.mktemp("unpacked"), filter="data")
+    (unpacked,) = folder.iterdir()
+    return unpacked
+
+
+def test_the_wheel_holds_every_module_and_the_model_file(wheel: Path) -> None:
+    packed = {name for name in files(wheel) if ".dist-info/" not in name}
     expected = {
         str(path.relative_to(root))
-        for root in roots
+        for root in SOURCE_ROOTS
         for pattern in ("lerobot_*/**/*.py", "lerobot_*/**/py.typed", "lerobot_*/**/*.xml")
         for path in root.glob(pattern)
     }
     assert packed == expected
     assert "lerobot_env_bomb/scene.xml" in packed
+    assert {f"{name.split('/')[0]}/py.typed" for name in packed} <= packed  # every package is typed
+
+
+def test_the_sdist_builds_the_same_wheel(wheel: Path, unpacked: Path, tmp_path: Path) -> None:
+    again = build("wheel", unpacked, tmp_path / "wheel")
+    assert again.name == wheel.name
+    assert files(again) == files(wheel)
+
+
+def test_the_sdist_holds_what_is_under_version_control_without_pictures(unpacked: Path) -> None:
+    packed = {str(path.relative_to(unpacked)) for path in unpacked.rglob("*") if path.is_file()}
+    stray = [
+        name
+        for name in packed
+        if re.search(r"(^|/)(\.venv|outputs|dist|__pycache__)/|\.(mp4|rrd|safetensors)$", name)
+    ]
+    assert stray == [] and not (unpacked / "docs" / "media").exists()
+    assert {
+        "LICENSE",
+        "README.md",
+        "CHANGELOG.md",
+        "constraints.txt",
+        "configs/eval_bomb_place.yaml",
+    } <= packed
+
+
+def test_versions_agree(wheel: Path) -> None:
+    assert wheel.name == f"{DISTRIBUTION}-{__version__}-py3-none-any.whl"
+    assert yaml.safe_load((ROOT / "CITATION.cff").read_text())["version"] == __version__
+    assert f"\n## {__version__}" in (ROOT / "CHANGELOG.md").read_text()
+
+
+def test_the_page_on_versions_says_what_is_declared_and_pinned() -> None:
+    project = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
+    declared = {"python": project["requires-python"]}
+    for requirement in project["dependencies"]:
+        name, _, bounds = re.split(r"((?:\[.*\])?)(?=[<>=]|$)", requirement, maxsplit=1)
+        declared[name] = bounds
+    pinned = dict(
+        line.split("==") for line in (ROOT / "constraints.txt").read_text().splitlines() if "==" in line
+    )
+    rows = re.findall(
+        r"^\| `([\w-]+)` \| (.*?) \| (.*?) \|", (ROOT / "docs" / "releases.md").read_text(), re.M
+    )
+    assert [name for name, *_ in rows] == list(declared)
+    for name, bounds, pin in rows:
+        assert bounds.strip("`") == (declared[name] or "any"), name
+        assert pin == ("3.12" if name == "python" else pinned[name]), name

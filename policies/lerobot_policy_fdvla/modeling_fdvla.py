@@ -32,6 +32,7 @@ from lerobot_bomb.flow.real_time import guided
 from lerobot_bomb.flow.samplers import SAMPLERS, Heads, sample
 from lerobot_bomb.hub.card import WithModelCard
 from lerobot_bomb.policy_flags import check_as_trained, check_weights_fit, trained_with
+from lerobot_bomb.processes import SavesTiedWeightsOnce, weighed
 from lerobot_bomb.training_draws import begin_batch
 from lerobot_bomb.vlm.cached_text import check_positions
 from lerobot_bomb.vlm.graphs import RecordedModel
@@ -71,7 +72,7 @@ class Context:
         return cls(Prefix.of(tensors[1:]), tensors[0])
 
 
-class FdvlaPolicy(WithModelCard, PreTrainedPolicy):
+class FdvlaPolicy(WithModelCard, SavesTiedWeightsOnce, PreTrainedPolicy):
     """A Qwen2.5-VL that reads noisy actions; two heads predict where they go and what noise is in them."""
 
     config_class = FdvlaConfig  # pyright: ignore[reportAssignmentType]  LeRobot annotates it as None
@@ -94,14 +95,10 @@ class FdvlaPolicy(WithModelCard, PreTrainedPolicy):
         self.segment = ActionSegment(config.chunk_size, self._action_dim, hidden_size)
         self.state_embedding = self._make_state_embedding(hidden_size)
         make_head = partial(Head, hidden_size, config.head_dim, self._action_dim)
-        self.flow_head = (
-            make_head(config.dualmod_dim if config.dualmod_flow else None) if config.use_flow_head else None
-        )
-        self.denoise_head = (
-            make_head(config.dualmod_dim if config.dualmod_denoise else None)
-            if config.use_denoise_head
-            else None
-        )
+        modulated = config.dualmod_flow, config.dualmod_denoise
+        flow_dim, denoise_dim = (config.dualmod_dim if of_head else None for of_head in modulated)
+        self.flow_head = make_head(flow_dim) if config.use_flow_head else None
+        self.denoise_head = make_head(denoise_dim) if config.use_denoise_head else None
         # physical size of 1 in normalised actions, known while training: (D,)
         self.register_buffer("action_unit", torch.ones(self._action_dim), persistent=False)
         self._take_units(dataset_meta)
@@ -194,7 +191,10 @@ class FdvlaPolicy(WithModelCard, PreTrainedPolicy):
                 consistency_detach=self.config.consistency_detach,
                 reduction=reduction,
             )
-        loss = loss.unflatten(0, (-1, draws)).mean(dim=1) if reduction == "none" else loss
+        if reduction == "none":
+            loss = loss.unflatten(0, (-1, draws)).mean(dim=1)
+        elif self.training:
+            loss = weighed(loss, kept_BK)
         return loss, self._metrics(terms, velocity_BKD, noise_BKD, point, actions_BKD, kept_BK)
 
     def _actions(self, batch: dict[str, Tensor]) -> Tensor:

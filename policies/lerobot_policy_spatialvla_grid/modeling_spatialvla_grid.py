@@ -35,6 +35,7 @@ from lerobot_bomb.decoding.decoder import Prompt
 from lerobot_bomb.decoding.slots import SlotWriter
 from lerobot_bomb.hub.card import WithModelCard
 from lerobot_bomb.policy_flags import check_as_trained, trained_with
+from lerobot_bomb.processes import SavesTiedWeightsOnce, weighed
 from lerobot_bomb.training_draws import begin_batch
 from lerobot_bomb.vlm.depth import (
     lattice_points,
@@ -68,7 +69,7 @@ logger = logging.getLogger(__name__)
 NEW_PARTS = ("cell_embedding", "cell_head", "ego3d")
 
 
-class SpatialvlaGridPolicy(WithModelCard, PreTrainedPolicy):
+class SpatialvlaGridPolicy(WithModelCard, SavesTiedWeightsOnce, PreTrainedPolicy):
     """A PaliGemma 2 that chooses the next ``chunk_size`` actions, one cell of each grid a step."""
 
     config_class = SpatialvlaGridConfig  # pyright: ignore[reportAssignmentType]  LeRobot annotates it as None
@@ -214,7 +215,8 @@ class SpatialvlaGridPolicy(WithModelCard, PreTrainedPolicy):
         if reduction == "none":
             losses_B, counts_B = losses_BTG.sum(dim=(1, 2)), kept_BTG.sum(dim=(1, 2))
             return losses_B / counts_B.clamp(min=1), metrics
-        return losses_BTG.sum() / kept_BTG.sum().clamp(min=1), metrics
+        loss = losses_BTG.sum() / kept_BTG.sum().clamp(min=1)
+        return weighed(loss, kept_BTG) if self.training else loss, metrics
 
     def _hidden(self, batch: dict[str, Tensor], cells_BTG: Tensor) -> Tensor:
         """(B, T, G, H) teacher-forced states that predict the cells."""

@@ -39,6 +39,7 @@ from lerobot_bomb.decoding.grammar import NumberGrammar
 from lerobot_bomb.decoding.writer import NumberWriter
 from lerobot_bomb.hub.card import WithModelCard
 from lerobot_bomb.policy_flags import check_as_trained, trained_with
+from lerobot_bomb.processes import SavesTiedWeightsOnce, weighed
 from lerobot_bomb.training_draws import begin_batch
 from lerobot_bomb.vlm.backbone import (
     SmolVLMBackbone,
@@ -56,7 +57,7 @@ from lerobot_policy_vla0_smol.card_vla0_smol import METHOD
 from lerobot_policy_vla0_smol.configuration_vla0_smol import AS_TRAINED, Vla0SmolConfig
 
 
-class Vla0SmolPolicy(WithModelCard, PreTrainedPolicy):
+class Vla0SmolPolicy(WithModelCard, SavesTiedWeightsOnce, PreTrainedPolicy):
     """A stock SmolVLM that writes the next ``chunk_size`` actions as integers."""
 
     config_class = Vla0SmolConfig  # pyright: ignore[reportAssignmentType]  LeRobot annotates it as None
@@ -192,7 +193,8 @@ class Vla0SmolPolicy(WithModelCard, PreTrainedPolicy):
         metrics = self._metrics(logits_BAV.detach(), answer, numbers, bins_BN)
         if reduction == "none":
             return losses_BA.sum(dim=1) / kept_BA.sum(dim=1).clamp(min=1), metrics
-        return losses_BA.sum() / kept_BA.sum().clamp(min=1), metrics
+        loss = losses_BA.sum() / kept_BA.sum().clamp(min=1)
+        return weighed(loss, kept_BA) if self.training else loss, metrics
 
     @torch.no_grad()
     def _metrics(

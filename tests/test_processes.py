@@ -1,0 +1,152 @@
+"""Two processes train what one does on their batches together; layers that FSDP shards one by one."""
+
+from collections.abc import Callable
+from pathlib import Path
+
+import fdvla_cases
+import numpy as np
+import pytest
+import spatialvla_grid_cases
+import torch
+import vla0_smol_cases
+from lerobot.datasets import LeRobotDataset
+from lerobot.policies.factory import get_policy_class
+from recipes import POLICY_TYPES, recipe_path
+from training_processes import NUM_PROCESSES, Seen, Training, draws_by_sample, in_processes, seen_losses
+
+REPO_ID = "overfit/bomb_place"  # the recipes'
+BATCH_SIZE, NUM_EPISODES, EPISODE_LENGTH = 2, 3, 4
+STEPS, SAVE_FREQ = 4, 2  # an epoch is 3 steps long
+CASES = {
+    "fdvla": fdvla_cases,
+    "spatialvla_grid": spatialvla_grid_cases,
+    "vla0_smol": vla0_smol_cases,
+}
+# nothing is drawn but what `draws_by_sample` makes a function of the sample
+FIXED = {
+    "fdvla": ["--policy.draws_per_chunk=1"],
+    "spatialvla_grid": [],
+    "vla0_smol": ["--policy.mask_max_fraction=0"],
+}
+
+
+@pytest.fixture(scope="module")
+def dataset(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Episodes that are shorter than a chunk, so that batches are padded differently."""
+    root = tmp_path_factory.mktemp("short") / "dataset"
+    number = {"dtype": "float32", "shape": (4,), "names": ["x", "y", "z", "finger_opening"]}
+    picture = {"dtype": "image", "shape": (64, 64, 3), "names": ["height", "width", "channels"]}
+    features = {"observation.state": number, "action": number, "observation.images.workspace": picture}
+    made = LeRobotDataset.create(REPO_ID, fps=10, features=features, root=root, use_videos=False)
+    generator = np.random.default_rng(0)
+    for episode in range(NUM_EPISODES):
+        for _ in range(EPISODE_LENGTH):
+            numbers = {name: generator.uniform(-1, 1, 4).astype(np.float32) for name in list(features)[:2]}
+            pixels = generator.integers(0, 256, (64, 64, 3), dtype=np.uint8)
+            task = "put the stone " + "far " * episode + "away"
+            made.add_frame({**numbers, "observation.images.workspace": pixels, "task": task})
+        made.save_episode()
+    made.finalize()
+    return root
+
+
+def flags(policy_type: str, dataset: Path, batch_size: int, output_dir: str) -> list[str]:
+    return [
+        f"--config_path={recipe_path(policy_type)}",
+        f"--dataset.root={dataset}",
+        f"--output_dir={output_dir}",
+        f"--batch_size={batch_size}",
+        f"--steps={STEPS}",
+        f"--save_freq={SAVE_FREQ}",
+        "--num_workers=0",
+        "--policy.crop_fraction=1",
+        "--policy.drop_n_last_frames=0",
+        *FIXED[policy_type],
+    ]
+
+
+def weights(policy_type: str, output_dir: Path) -> dict[str, torch.Tensor]:
+    """Of the last checkpoint, loaded; FSDP's file holds tied weights twice."""
+    checkpoint = output_dir / "checkpoints" / "last" / "pretrained_model"
+    return get_policy_class(policy_type).from_pretrained(checkpoint).state_dict()
+
+
+def check_trained_as_one(
+    policy_type: str, losses: list[float], of: Path, stock_cli: Callable[..., None], dataset: Path
+) -> None:
+    """Losses and weights agree with those of one process and a batch as large as theirs together."""
+    with seen_losses() as in_one, draws_by_sample():
+        together = BATCH_SIZE * NUM_PROCESSES
+        stock_cli("lerobot-train", *flags(policy_type, dataset, together, f"{of}/one"))
+    torch.testing.assert_close(losses, in_one, rtol=1e-5, atol=0)
+    ours, theirs = (weights(policy_type, of / name) for name in ("process0", "one"))
+    # steps of Adam went 1e-3 each; it makes some of the sign of a gradient that is nearly 0
+    assert max(float((ours[name] - theirs[name]).abs().mean()) for name in ours) < 1e-5
+
+
+@pytest.fixture(scope="module")
+def two(dataset: Path, tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Seen]:
+    """Every policy in two processes, and once more from its first checkpoint on: where, what they saw."""
+    folder = tmp_path_factory.mktemp("two")
+    trainings = []
+    for policy_type in POLICY_TYPES:
+        of = folder / policy_type
+        checkpoint = of / "process0" / "checkpoints" / f"{SAVE_FREQ:06d}" / "pretrained_model"
+        resumed = [f"--config_path={checkpoint}/train_config.json", "--resume=true"]
+        trainings += [
+            Training(flags(policy_type, dataset, BATCH_SIZE, f"{of}/process{{rank}}")),
+            Training([*resumed, f"--output_dir={of}/resumed{{rank}}"]),
+        ]
+    return folder, in_processes(trainings, folder)
+
+
+def test_two_processes_train_what_one_does(
+    policy_type: str, two: tuple[Path, Seen], stock_cli: Callable[..., None], dataset: Path
+) -> None:
+    folder, seen = two
+    training = 2 * POLICY_TYPES.index(policy_type)
+    check_trained_as_one(policy_type, seen.mean_losses(training), folder / policy_type, stock_cli, dataset)
+    theirs, others = (losses[training] for losses in seen.losses)
+    assert all(abs(a - b) > 1e-3 for a, b in zip(theirs, others, strict=True))  # of different samples
+
+
+def test_going_on_is_exact_and_only_the_first_process_writes(
+    policy_type: str, two: tuple[Path, Seen]
+) -> None:
+    folder, seen = two
+    training = 2 * POLICY_TYPES.index(policy_type)
+    for losses in seen.losses:
+        assert losses[training + 1] == losses[training][SAVE_FREQ:]
+    of = folder / policy_type
+    resumed, whole = (weights(policy_type, of / name) for name in ("resumed0", "process0"))
+    torch.testing.assert_close(resumed, whole, rtol=0, atol=0)
+    assert not (of / "process1").exists() and not (of / "resumed1").exists()
+
+
+def test_a_log_line_comes_from_one_process(two: tuple[Path, Seen]) -> None:
+    assert two[1].text.count("fdvla: {'backbone'") == 2  # in a training and in its resumption
+    assert two[1].text.count(f"{REPO_ID}: ") == 2
+
+
+@pytest.mark.long
+def test_sharded_by_fsdp_they_train_the_same(
+    policy_type: str, stock_cli: Callable[..., None], dataset: Path, tmp_path: Path
+) -> None:
+    output_dir = str(tmp_path / "process{rank}")
+    sharded = Training(flags(policy_type, dataset, BATCH_SIZE, output_dir), is_sharded=True)
+    seen = in_processes([sharded], tmp_path)
+    check_trained_as_one(policy_type, seen.mean_losses(0), tmp_path, stock_cli, dataset)
+
+
+def test_fsdp_shards_every_layer_by_itself(policy_type: str) -> None:
+    """Named are the repeated blocks of the text and the vision model, and nothing else is repeated."""
+    policy = CASES[policy_type].make_policy()
+    named = set(policy._no_split_modules)
+    assert policy._fsdp_wrap_modules == policy._no_split_modules
+    stacks = {
+        type(block).__name__
+        for module in policy.backbone.modules()
+        if isinstance(module, torch.nn.ModuleList)
+        for block in module
+    }
+    assert named == stacks
