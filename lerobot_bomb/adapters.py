@@ -5,9 +5,11 @@ from pathlib import Path
 from typing import Any
 
 import torch
-from huggingface_hub import constants, try_to_load_from_cache
+from huggingface_hub import constants, hf_hub_download, try_to_load_from_cache
+from huggingface_hub.errors import RemoteEntryNotFoundError
 from torch import Tensor, nn
 
+from lerobot_bomb.hub.checks import ADAPTERS, tensor_shapes
 from lerobot_bomb.hub.names import TO_PUBLISH, is_hub_id
 
 PROJECTIONS = "q|k|v|o|gate|up|down"  # of a layer's attention and MLP
@@ -48,6 +50,25 @@ def check_base(base: str) -> None:
     """Raise a ValueError unless others can get the checkpoint that adapters are of: its name on the Hub."""
     if not is_hub_id(base):
         raise ValueError(f"the base of these adapters, {base}, is on this machine only; {TO_PUBLISH}")
+
+
+def check_adapters(path: str, revision: str | None) -> None:
+    """Adapters, in a folder or on the Hub, are whole safetensors; in their place `peft` would read a pickle.
+
+    Raises:
+        FileNotFoundError: there are none.
+        ValueError: they are truncated.
+    """
+    name = ADAPTERS[1]
+    if not Path(path).is_dir():
+        try:
+            tensor_shapes(Path(hf_hub_download(path, name, revision=revision)))
+        except RemoteEntryNotFoundError as error:
+            raise FileNotFoundError(f"{name} not found on the HuggingFace Hub in {path}") from error
+    elif (Path(path) / name).is_file():
+        tensor_shapes(Path(path) / name)
+    else:
+        raise FileNotFoundError(f"{path} holds no {name}, so it is no whole checkpoint")
 
 
 def base_commit(base: str, revision: str | None) -> str | None:

@@ -58,8 +58,11 @@ def read_json(path: Path) -> dict[str, Any]:
     """A JSON object from a file.
 
     Raises:
+        FileNotFoundError: there is none.
         ValueError: it is something else, or truncated.
     """
+    if not path.is_file():
+        raise FileNotFoundError(f"{path.parent} has no {path.name}")
     try:
         values = json.loads(path.read_text())
     except ValueError as error:

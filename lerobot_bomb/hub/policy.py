@@ -9,7 +9,7 @@ from lerobot.configs.train import TrainPipelineConfig
 from lerobot.utils.constants import CHECKPOINTS_DIR, LAST_CHECKPOINT_LINK, PRETRAINED_MODEL_DIR
 from torch import Tensor
 
-from lerobot_bomb.adapters import base_commit, check_base
+from lerobot_bomb.adapters import base_commit, check_adapters, check_base
 from lerobot_bomb.hub.card import Checkpoint
 from lerobot_bomb.hub.checks import PROCESSORS, check_tensors, processor_files
 from lerobot_bomb.hub.dataset import INFO_FILE, DatasetFacts
@@ -48,6 +48,9 @@ class HubPolicy:
         for name in PROCESSORS:  # a policy that was saved alone has none
             if (folder / name).is_file():
                 processor_files(folder, name)
+        config = kwargs.get("config")
+        if config is not None and config.use_peft:  # this is their base
+            check_adapters(str(config.pretrained_path), config.pretrained_revision)
         return _next(super()).from_pretrained(pretrained_name_or_path, **kwargs)
 
     @classmethod

@@ -124,11 +124,8 @@ class _Handler(BaseHTTPRequestHandler):
         self.body = self.rfile.read(int(self.headers.get("Content-Length") or 0))
         method = "GET" if self.command == "HEAD" else self.command
         self.hub.requests.append(f"{self.command} {path}")
-        told = [
-            self.path,
-            *(value for name, value in self.headers.items() if name.lower() != "authorization"),
-        ]
-        if TOKEN.encode() in self.body or any(TOKEN in each for each in told):
+        others = [value for name, value in self.headers.items() if name.lower() != "authorization"]
+        if TOKEN.encode() in self.body or TOKEN in f"{self.path} {others}":
             self.hub.betrayals.append(path)
         try:
             if self.hub.before is not None:

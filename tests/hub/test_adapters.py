@@ -5,16 +5,20 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+import torch
 import yaml
 from lerobot.configs.default import DatasetConfig, PeftConfig
 from lerobot.configs.train import TrainPipelineConfig
 from lerobot.envs import make_env_config
 from lerobot.policies import get_policy_class, make_policy, make_pre_post_processors
+from safetensors.torch import load_file
 from vla0_smol_cases import STATS
 from vla0_smol_cases import make_policy as make_vla0
 
 from hub.damage import write_checkpoint
-from hub.server import LoopbackHub
+from hub.runner import FORGET, run
+from hub.server import TOKEN, LoopbackHub, Repository
+from hub.test_loop import DATASET, SMALL, check_no_secret, evaluate, record, train
 from lerobot_bomb.checkpoint import read_config
 from lerobot_bomb.cli import main
 
@@ -116,3 +120,50 @@ def test_adapters_of_a_folder_are_refused_before_training_and_before_any_request
     with pytest.raises(ValueError, match=r"lerobot-bomb merge"):
         wrapped.push_model_to_hub(cfg, peft_model=wrapped)
     assert online.requests == []
+
+
+def test_a_pickle_does_not_take_the_place_of_adapters(online: LoopbackHub, tmp_path: Path) -> None:
+    push_base(tmp_path / "base")
+    folder = save(adapters(BASE), tmp_path / "adapters")
+    weights = load_file(folder / "adapter_model.safetensors")
+    (folder / "adapter_model.safetensors").unlink()
+    torch.save(weights, folder / "adapter_model.bin")
+    repository = online.repositories.setdefault(f"models/{REPO_ID}", Repository())
+    repository.commit({path.name: path.read_bytes() for path in folder.iterdir()}, "with a pickle")
+    config = read_config(folder, "cpu")
+    for path, message in (
+        (folder, "holds no adapter_model"),
+        (REPO_ID, "safetensors not found"),
+    ):
+        config.pretrained_path = Path(path)
+        with pytest.raises(FileNotFoundError, match=message):
+            make_policy(config, env_cfg=make_env_config("bomb", image_size=64))
+    assert main(["merge", f"--policy.path={folder}", f"--output={tmp_path / 'merged'}"]) == 1
+
+
+@pytest.mark.long
+def test_train_push_forget_and_evaluate_adapters(policy_type: str, hub: LoopbackHub, tmp_path: Path) -> None:
+    """By commands alone, on a base that `lerobot-bomb init` wrote."""
+    data = [f"--dataset.repo_id={DATASET}", f"--dataset.root={tmp_path / 'dataset'}"]
+    own = [f"--policy.type={policy_type}", "--policy.vlm_model_name=nano", "--policy.device=cpu"]
+    output = f"--output={tmp_path / 'base'}"
+    ended = run(
+        [
+            record(tmp_path / "dataset"),
+            ["lerobot-bomb", "init", *own, *SMALL[policy_type].split(), *data, output],
+            ["lerobot-bomb", "push", str(tmp_path / "base"), f"--repo_id={BASE}"],
+            train(
+                *(tmp_path, "lora", f"--policy.path={BASE}", f"--policy.repo_id={REPO_ID}", data[1]),
+                *("--peft.method_type=LORA", "--peft.r=4"),
+            ),
+            FORGET,
+            evaluate(REPO_ID, tmp_path / "eval"),
+        ],
+        hub.endpoint,
+        tmp_path / "home",
+        TOKEN,
+    )
+    assert ended.code == 0, ended.text
+    check_published(hub)
+    assert (tmp_path / "eval" / "eval_info.json").is_file()
+    check_no_secret(hub, ended, tmp_path)
