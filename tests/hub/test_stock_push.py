@@ -110,6 +110,7 @@ def test_a_push_that_is_cut_off_leaves_the_old_one_or_the_new_one(
     assert whole in left  # LeRobot's own commits of the processors have nothing to add
 
 
+@pytest.mark.long
 def test_without_a_checkpoint_a_cut_leaves_no_processors_of_an_older_push(
     online: LoopbackHub, tmp_path: Path
 ) -> None:
