@@ -6,6 +6,7 @@ from pathlib import Path
 from typing import Any
 
 import torch
+from draccus.utils import DecodingError
 from lerobot.configs import PreTrainedConfig
 from lerobot.policies import PreTrainedPolicy, make_pre_post_processors
 from lerobot.processor import PolicyAction, PolicyProcessorPipeline
@@ -36,10 +37,22 @@ def read_config(path: Path, device: str | None) -> PreTrainedConfig:
     if device is not None and not is_torch_device_available(device):
         raise ValueError(f"the device {device} is not available on this machine; cpu is")
     register_third_party_plugins()
-    overrides = [] if device is None else [f"--device={device}"]
-    config = PreTrainedConfig.from_pretrained(path, cli_overrides=overrides)
+    config = parse_config(path, device)
     config.pretrained_path = path
     return config
+
+
+def parse_config(path: Path, device: str | None) -> PreTrainedConfig:
+    """The config in a folder, of a plugin that is registered.
+
+    Raises:
+        ValueError: it is truncated, of a newer version or of an unknown type.
+    """
+    overrides = [] if device is None else [f"--device={device}"]
+    try:
+        return PreTrainedConfig.from_pretrained(path, cli_overrides=overrides)
+    except DecodingError as error:
+        raise ValueError(f"{path / FILES[0]}: {error}") from None
 
 
 def load_processors(config: PreTrainedConfig) -> tuple[Preprocessor, Postprocessor]:

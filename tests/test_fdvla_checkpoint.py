@@ -54,10 +54,10 @@ def test_a_missing_or_unexpected_tensor_is_an_error(tmp_path: Path) -> None:
     weights = load_file(tmp_path / "model.safetensors")
     marks = weights.pop("segment.marks")
     save_file(weights, tmp_path / "model.safetensors")
-    with pytest.raises(RuntimeError, match=r"segment\.marks"):
+    with pytest.raises(ValueError, match=r"lacks segment\.marks"):
         FdvlaPolicy.from_pretrained(tmp_path)
     save_file(weights | {"segment.marks": marks, "extra": marks.clone()}, tmp_path / "model.safetensors")
-    with pytest.raises(RuntimeError, match="extra"):
+    with pytest.raises(ValueError, match="has extra"):
         FdvlaPolicy.from_pretrained(tmp_path)
 
 

@@ -104,10 +104,10 @@ def test_a_missing_or_unexpected_tensor_is_an_error(tmp_path: Path) -> None:
     weights = load_file(tmp_path / "model.safetensors")
     head = weights.pop("cell_head.weight")
     save_file(weights, tmp_path / "model.safetensors")
-    with pytest.raises(RuntimeError, match=r"cell_head\.weight"):
+    with pytest.raises(ValueError, match=r"lacks cell_head\.weight"):
         SpatialvlaGridPolicy.from_pretrained(tmp_path)
     save_file(weights | {"cell_head.weight": head, "extra": head.clone()}, tmp_path / "model.safetensors")
-    with pytest.raises(RuntimeError, match="extra"):
+    with pytest.raises(ValueError, match="has extra"):
         SpatialvlaGridPolicy.from_pretrained(tmp_path)
 
 

@@ -2,8 +2,6 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field
-from pathlib import Path
-from typing import TYPE_CHECKING, Any, ClassVar
 
 from huggingface_hub import ModelCard, ModelCardData, constants
 from huggingface_hub.utils import get_session, hf_raise_for_status
@@ -13,16 +11,13 @@ from lerobot.configs.train import TrainPipelineConfig
 
 from lerobot_bomb import __version__
 from lerobot_bomb.evaluation.results import by_condition, common_settings, summarise
-from lerobot_bomb.hub.dataset import INFO_FILE, DatasetFacts, Row, eval_flags_of, protocol_version
+from lerobot_bomb.hub.dataset import DatasetFacts, Row, eval_flags_of, protocol_version
 from lerobot_bomb.hub.markdown import command, fenced
 from lerobot_bomb.hub.method import Method
 from lerobot_bomb.hub.names import is_hub_id
-from lerobot_bomb.hub.training import train_command
+from lerobot_bomb.hub.training import peft_flags, train_command
 from lerobot_bomb.stats import wilson_interval
 from lerobot_bomb.vlm.tokenizer import NANO
-
-if TYPE_CHECKING:
-    from lerobot.datasets import LeRobotDatasetMetadata
 
 NO_REPO_ID = "USER/NAME"
 BAD_REQUEST = 400
@@ -60,14 +55,15 @@ class Checkpoint:
     results: Sequence[list[Row]] = ()  # of each results file
     license: str | None = None
     tags: list[str] = field(default_factory=list)
+    adapters_of: str | None = None  # Hub id of the checkpoint that these are adapters of; None: it is whole
 
     def card(self) -> PolicyCard:
         """The card, not validated."""
         return PolicyCard(f"---\n{self._metadata().to_yaml()}\n---\n\n{self._text()}")
 
     @property
-    def base_model(self) -> str | None:
-        """The backbone's Hub id; None: it has none, or not one that is known."""
+    def backbone(self) -> str | None:
+        """Its Hub id; None: it has none, or not one that is known."""
         name = getattr(self.config, "vlm_model_name", None)
         return name if name and is_hub_id(name) else None
 
@@ -81,14 +77,15 @@ class Checkpoint:
             tags=sorted({*self.tags, "robotics", "lerobot", "lerobot_bomb", self.config.type}),
             model_name=self.config.type,
             datasets=self.dataset_id,
-            base_model=self.base_model,
+            base_model=self.adapters_of or self.backbone,
+            base_model_relation="adapter" if self.adapters_of else None,
         )
 
     def _license(self) -> tuple[str | None, str | None]:
         """What was asked for, or what the backbone's weights have; none where that is not known."""
         if self.license is not None:
             return self.license, None
-        if self.base_model == self.method.backbone:
+        if self.backbone == self.method.backbone:
             return self.method.backbone_license, self.method.backbone_license_name
         is_nano = getattr(self.config, "vlm_model_name", None) == NANO
         return ("apache-2.0" if is_nano else None), None
@@ -111,20 +108,25 @@ class Checkpoint:
         benchmark = f" Benchmark: BOMB, protocol version {protocol}." if protocol else ""
         return (
             f"{self.method.summary}\n\nA checkpoint of LeRobot's policy type `{self.config.type}`, which the "
-            f"plugin `lerobot_policy_bomb` adds. Backbone: {self._backbone()}; the checkpoint holds all "
-            f"weights and the tokenizer, so nothing else is downloaded.{benchmark}"
+            f"plugin `lerobot_policy_bomb` adds. Backbone: {self._backbone()}; {self._contents()}{benchmark}"
         )
 
+    def _contents(self) -> str:
+        if self.adapters_of:
+            return f"these are adapters, loaded on the checkpoint `{self.adapters_of}`."
+        return "the checkpoint holds all weights and the tokenizer, so nothing else is downloaded."
+
     def _backbone(self) -> str:
-        if self.base_model is not None:
-            return f"`{self.base_model}`"
+        if self.backbone is not None:
+            return f"`{self.backbone}`"
         name = getattr(self.config, "vlm_model_name", None)
         return "a small one with random weights" if name == NANO else "a local one"
 
     def _install(self) -> str:
+        package = "'.[lora]'" if self.adapters_of else "."
         return (
             f"The plugin, {__version__} or newer (with LeRobot {lerobot_version}), in a checkout of "
-            "lerobot_bomb:\n\n" + fenced("pip install .\nlerobot-bomb doctor")
+            "lerobot_bomb:\n\n" + fenced(f"pip install {package}\nlerobot-bomb doctor")
         )
 
     def _evaluate(self) -> str:
@@ -163,6 +165,7 @@ class Checkpoint:
             "--policy.repo_id=USER/NEW_NAME",
             "--policy.push_to_hub=true",
             f"--dataset.repo_id={dataset_id}",
+            *peft_flags(self.training),
             f"--output_dir=outputs/{self.config.type}",
         )
         return "\n\n".join(
@@ -176,11 +179,21 @@ class Checkpoint:
         )
 
     def _python(self) -> str:
+        load = f'policy = get_policy_class("{self.config.type}").from_pretrained("{self.repo_id}")\n'
+        imported = ""
+        if self.adapters_of:
+            imported = "from peft import PeftConfig, PeftModel\n"
+            load = (
+                f'base = PeftConfig.from_pretrained("{self.repo_id}")\n'
+                f'policy = get_policy_class("{self.config.type}").from_pretrained(\n'
+                "    base.base_model_name_or_path, revision=base.revision\n"
+                ")\n"
+                f'policy = PeftModel.from_pretrained(policy, "{self.repo_id}")\n'
+            )
         return fenced(
             "from lerobot.policies.factory import get_policy_class, make_pre_post_processors\n"
-            "from lerobot.utils.import_utils import register_third_party_plugins\n\n"
-            "register_third_party_plugins()\n"
-            f'policy = get_policy_class("{self.config.type}").from_pretrained("{self.repo_id}")\n'
+            f"from lerobot.utils.import_utils import register_third_party_plugins\n{imported}\n"
+            f"register_third_party_plugins()\n{load}"
             'device = {"device_processor": {"device": policy.config.device}}\n'
             "preprocess, postprocess = make_pre_post_processors(\n"
             f'    policy.config, "{self.repo_id}", preprocessor_overrides=device\n'
@@ -222,36 +235,3 @@ def results_table(rows: list[Row]) -> str:
             f"| {name} | {n} | {successes} | {100 * successes / n:.1f} % | {low:.1f} to {high:.1f} % |"
         )
     return "\n".join(lines)
-
-
-class WithModelCard:
-    """A policy whose `generate_model_card` is right for it; stands before LeRobot's `PreTrainedPolicy`."""
-
-    method: ClassVar[Method]
-    config: Any
-
-    def generate_model_card(
-        self,
-        dataset_repo_id: str,
-        model_type: str,
-        license: str | None,
-        tags: list[str] | None,
-        cfg: TrainPipelineConfig | None = None,
-        dataset_meta: "LeRobotDatasetMetadata | None" = None,
-    ) -> ModelCard:
-        """The card that `lerobot-train --policy.push_to_hub=true` publishes."""
-        assert model_type == self.config.type
-        root = Path(dataset_meta.root) if dataset_meta is not None else None
-        has_dataset = root is not None and (root / INFO_FILE).is_file()
-        card = Checkpoint(
-            config=self.config,
-            method=self.method,
-            repo_id=self.config.repo_id or NO_REPO_ID,
-            dataset_id=dataset_repo_id,
-            training=cfg,
-            dataset=DatasetFacts.read(root) if root is not None and has_dataset else None,
-            license=license,
-            tags=tags or [],
-        ).card()
-        card.validate()
-        return card

@@ -11,7 +11,8 @@ from lerobot.policies.factory import get_policy_class
 from lerobot.utils.constants import POLICY_POSTPROCESSOR_DEFAULT_NAME, POLICY_PREPROCESSOR_DEFAULT_NAME
 from safetensors import SafetensorError, safe_open
 
-CONFIG, WEIGHTS = "config.json", "model.safetensors"
+CONFIG, TRAIN_CONFIG, WEIGHTS = "config.json", "train_config.json", "model.safetensors"
+ADAPTERS = ("adapter_config.json", "adapter_model.safetensors")
 PROCESSORS = (f"{POLICY_PREPROCESSOR_DEFAULT_NAME}.json", f"{POLICY_POSTPROCESSOR_DEFAULT_NAME}.json")
 
 type Shapes = dict[str, tuple[int, ...]]
@@ -25,33 +26,43 @@ def checkpoint_files(folder: Path) -> list[str]:
     """
     if not folder.is_dir():
         raise ValueError(f"{folder} is no folder; give the one that lerobot-train names pretrained_model")
-    names = [CONFIG, *PROCESSORS, WEIGHTS]
-    for name in names:
+    has_adapters = (folder / CONFIG).is_file() and read_json(folder / CONFIG).get("use_peft")
+    weights = ADAPTERS if has_adapters else (WEIGHTS,)
+    for name in (CONFIG, *PROCESSORS, *weights):
         if not (folder / name).is_file():
             raise ValueError(
                 f"{folder} holds no {name}, so it is no checkpoint of a policy; give the folder that "
                 "lerobot-train names pretrained_model"
             )
-    read_json(folder / CONFIG)
-    for processor in PROCESSORS:
-        steps = read_json(folder / processor).get("steps", [])
-        states = [step["state_file"] for step in steps if step.get("state_file")]
-        missing = [name for name in states if not (folder / name).is_file()]
-        if missing:
-            raise ValueError(f"{folder} holds no {missing[0]}, which its {processor} needs")
-        names += states
-    for name in names:
-        if name.endswith(".safetensors"):
-            tensor_shapes(folder / name)
-    return list(dict.fromkeys(names))
+    tensor_shapes(folder / weights[-1])
+    before, after = (processor_files(folder, processor) for processor in PROCESSORS)
+    return [CONFIG, *weights, *before, *after]
+
+
+def processor_files(folder: Path, processor: str) -> list[str]:
+    """Names of the files that make up one of `PROCESSORS`, each whole.
+
+    Raises:
+        ValueError: one is missing, truncated or of another format.
+    """
+    steps = read_json(folder / processor).get("steps", [])
+    states = [step["state_file"] for step in steps if step.get("state_file")]
+    for name in states:
+        if not (folder / name).is_file():
+            raise ValueError(f"{folder} holds no {name}, which its {processor} needs")
+        tensor_shapes(folder / name)
+    return [processor, *states]
 
 
 def read_json(path: Path) -> dict[str, Any]:
     """A JSON object from a file.
 
     Raises:
+        FileNotFoundError: there is none.
         ValueError: it is something else, or truncated.
     """
+    if not path.is_file():
+        raise FileNotFoundError(f"{path.parent} has no {path.name}")
     try:
         values = json.loads(path.read_text())
     except ValueError as error:
@@ -112,9 +123,18 @@ def check_weights(folder: Path, config: PreTrainedConfig, policy_type: type[PreT
     """
     with init_empty_weights():
         policy = policy_type(config)
+    check_tensors(folder / WEIGHTS, policy)
+
+
+def check_tensors(path: Path, policy: PreTrainedPolicy) -> None:
+    """A file's weights are a policy's, by their names and shapes.
+
+    Raises:
+        ValueError: it is truncated, or names the first tensor that is missing, unknown or of another shape.
+    """
     expected = {name: tuple(tensor.shape) for name, tensor in policy.state_dict().items()}
-    saved = tensor_shapes(folder / WEIGHTS)
-    start = f"{folder / WEIGHTS} is not of the {config.type} that {CONFIG} describes: "
+    saved = tensor_shapes(path)
+    start = f"{path} is not of the {policy.config.type} that {CONFIG} describes: "
     missing = sorted(expected.keys() - saved.keys() - _tied(policy, set(saved)))
     if missing:
         raise ValueError(f"{start}it lacks {missing[0]} ({len(missing)} in all)")

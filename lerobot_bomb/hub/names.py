@@ -4,6 +4,12 @@ import re
 from pathlib import Path
 from typing import Any
 
+# what to do with adapters whose base is on one machine only
+TO_PUBLISH = (
+    "publish that first (lerobot-bomb push) and train with --policy.path of its name, or publish both as one "
+    "checkpoint (lerobot-bomb merge)"
+)
+
 
 def is_hub_id(name: object) -> bool:
     """Whether it has the form USER/NAME and is no folder here."""

@@ -2,15 +2,17 @@
 
 import argparse
 import json
+from collections.abc import Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from lerobot_bomb.data.growing import check_repo_id, switch
 from lerobot_bomb.evaluation.results import read_results
 from lerobot_bomb.hub.dataset import INFO_FILE, DatasetFacts, Row
-from lerobot_bomb.hub.names import is_local_path
+from lerobot_bomb.hub.names import TO_PUBLISH, is_local_path
 
 if TYPE_CHECKING:
+    from huggingface_hub import CommitInfo
     from lerobot.configs.train import TrainPipelineConfig
 
     from lerobot_bomb.hub.card import Checkpoint
@@ -49,35 +51,65 @@ def run_push(args: argparse.Namespace) -> int:
     check_repo_id(args.repo_id)
     results = [read_results(path) for path in args.results]
     from lerobot_bomb.hub.checks import checkpoint_files  # imports torch: seconds
-    from lerobot_bomb.hub.upload import check_token, hub_errors, upload
+    from lerobot_bomb.hub.upload import check_token
 
     check_token()
-    names = checkpoint_files(args.checkpoint)
+    files = {name: args.checkpoint / name for name in checkpoint_files(args.checkpoint)}
+    if (args.checkpoint / TRAIN_CONFIG).is_file():
+        files[TRAIN_CONFIG] = args.checkpoint / TRAIN_CONFIG
     checkpoint = _read_checkpoint(args.checkpoint, args.repo_id, args.dataset_root, results)
-    card = checkpoint.card()
-    with hub_errors(args.repo_id):
-        card.validate()
-    files = {**_files(args.checkpoint, names), CARD: str(card).encode()}
-    message = f"{checkpoint.config.type}: weights, processors, configs and card"
-    print(upload(args.repo_id, "model", files, message, private=args.private or None))
+    print(publish(checkpoint, files, args.private or None).commit_url)
     return 0
+
+
+def publish(checkpoint: "Checkpoint", files: Mapping[str, Path], private: bool | None) -> "CommitInfo":
+    """A checkpoint's files and its card in one commit, which takes the place of another checkpoint's.
+
+    Raises:
+        RuntimeError: the Hub cannot be reached or does not take them, or has no base of these adapters.
+    """
+    from huggingface_hub import HfApi
+
+    from lerobot_bomb.hub.upload import hub_errors, upload
+
+    card, base = checkpoint.card(), checkpoint.adapters_of
+    with hub_errors(checkpoint.repo_id):
+        if base is not None and not HfApi().file_exists(base, CONFIG):
+            raise RuntimeError(f"the base of these adapters, {base}, is not on the Hub; {TO_PUBLISH}")
+        card.validate()
+    contents: dict[str, Path | bytes] = {**files, CARD: str(card).encode()}
+    for name in {CONFIG, TRAIN_CONFIG} & files.keys():
+        contents[name] = json.dumps(portable(json.loads(files[name].read_text())), indent=4).encode()
+    message = f"{checkpoint.config.type}: weights, processors, configs and card"
+    return upload(checkpoint.repo_id, "model", contents, _is_of_checkpoint, message, private)
+
+
+def _is_of_checkpoint(path: str) -> bool:
+    """Not in a folder: there LeRobot keeps what `--save_checkpoint_to_hub` pushed."""
+    return "/" not in path and path.endswith((".json", ".safetensors"))
 
 
 def _read_checkpoint(
     folder: Path, repo_id: str, dataset_root: Path | None, results: list[list[Row]]
 ) -> "Checkpoint":
     """What its card is made of, after all checks."""
-    from lerobot.configs import PreTrainedConfig
     from lerobot.utils.import_utils import register_third_party_plugins
 
+    from lerobot_bomb.adapters import check_base
+    from lerobot_bomb.checkpoint import parse_config
     from lerobot_bomb.hub.card import Checkpoint
-    from lerobot_bomb.hub.checks import check_config, check_weights, policy_class
+    from lerobot_bomb.hub.checks import ADAPTERS, check_config, check_weights, policy_class, read_json
 
     register_third_party_plugins()
     policy_type: Any = policy_class(folder)
-    config = PreTrainedConfig.from_pretrained(folder, cli_overrides=["--device=cpu"])
+    config = parse_config(folder, "cpu")
     check_config(folder, config)
-    check_weights(folder, config, policy_type)
+    base = None
+    if config.use_peft:
+        base = str(read_json(folder / ADAPTERS[0]).get("base_model_name_or_path"))
+        check_base(base)
+    else:
+        check_weights(folder, config, policy_type)
     training = _read_training(folder)
     return Checkpoint(
         config=config,
@@ -89,15 +121,8 @@ def _read_checkpoint(
         results=results,
         license=config.license,
         tags=config.tags or [],
+        adapters_of=base,
     )
-
-
-def _files(folder: Path, names: list[str]) -> dict[str, Path | bytes]:
-    files: dict[str, Path | bytes] = {name: folder / name for name in names}
-    for name in (CONFIG, TRAIN_CONFIG):
-        if (folder / name).is_file():
-            files[name] = json.dumps(portable(json.loads((folder / name).read_text())), indent=4).encode()
-    return files
 
 
 def portable(value: Any, key: str = "") -> Any:

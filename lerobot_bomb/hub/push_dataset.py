@@ -43,11 +43,16 @@ def run_push_dataset(args: argparse.Namespace) -> int:
     }
     files[CARD] = dataset_card(args.repo_id, facts).encode()
     message = f"{facts.info['total_episodes']} episodes and card"
-    url = upload(args.repo_id, "dataset", files, message, private=args.private or None)
+    commit = upload(args.repo_id, "dataset", files, _is_data, message, private=args.private or None)
     with hub_errors(args.repo_id):
         _tag(args.repo_id, facts.info["codebase_version"])
-    print(url)
+    print(commit.commit_url)
     return 0
+
+
+def _is_data(path: str) -> bool:
+    """LeRobot reads every such file, so none may be left of a longer recording."""
+    return path.split("/")[0] in FOLDERS
 
 
 def check_frames(root: Path, facts: DatasetFacts) -> None:

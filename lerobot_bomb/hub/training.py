@@ -20,6 +20,9 @@ NOT_FLAGS = {
     "prompt_tokens",
     "grid_params",
     "trained_with",
+    "trained_batches",
+    "use_peft",
+    "package_version",
     "action_feature_names",
     "device",
     "repo_id",
@@ -37,22 +40,31 @@ def train_command(config: PreTrainedConfig, training: TrainPipelineConfig | None
     start = f"--policy.type={config.type}"
     if config.pretrained_path and is_hub_id(config.pretrained_path):
         start = f"--policy.path={config.pretrained_path}"
-    flags = [start, *_policy_flags(config), f"--dataset.repo_id={dataset_id}"]
+    flags = [start, *_flags_of(config, "policy"), f"--dataset.repo_id={dataset_id}"]
     if training is not None:
         if training.dataset.episodes is not None:
             flags.append(f"--dataset.episodes={_text(training.dataset.episodes)}")
         flags += [f"--{name}={getattr(training, name)}" for name in ("batch_size", "steps", "seed")]
+        flags += peft_flags(training)
     return command("lerobot-train", *flags, f"--output_dir=outputs/{config.type}")
 
 
-def _policy_flags(config: PreTrainedConfig) -> list[str]:
-    """Those that differ from the type's defaults."""
+def peft_flags(training: TrainPipelineConfig | None) -> list[str]:
+    """Of a training of adapters; of another none."""
+    if training is None or training.peft is None:
+        return []
+    method = f"--peft.method_type={training.peft.method_type}"
+    return list(dict.fromkeys([method, *_flags_of(training.peft, "peft")]))
+
+
+def _flags_of(config: Any, group: str) -> list[str]:
+    """Those that differ from the defaults."""
     flags = []
     for each in fields(config):
         value = draccus.encode(getattr(config, each.name))
         if each.name in NOT_FLAGS or not each.init or value == _default(each) or has_local_path(value):
             continue
-        flags.append(f"--policy.{each.name}={_text(value)}")
+        flags.append(f"--{group}.{each.name}={_text(value)}")
     return flags
 
 

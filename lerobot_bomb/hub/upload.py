@@ -1,11 +1,11 @@
 """Files to a repository in one commit: before it there is nothing, after it everything."""
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
 
 import httpx
-from huggingface_hub import CommitOperationAdd, HfApi, constants, get_token
+from huggingface_hub import CommitInfo, CommitOperationAdd, CommitOperationDelete, HfApi, constants, get_token
 from huggingface_hub.errors import HfHubHTTPError, OfflineModeIsEnabled
 
 
@@ -16,10 +16,16 @@ def check_token() -> None:
 
 
 def upload(
-    repo_id: str, repo_type: str, files: Mapping[str, Path | bytes], message: str, private: bool | None
-) -> str:
-    """Make the repository unless it exists, add all files in one commit and return the commit's URL.
+    repo_id: str,
+    repo_type: str,
+    files: Mapping[str, Path | bytes],
+    replaces: Callable[[str], bool],
+    message: str,
+    private: bool | None,
+) -> CommitInfo:
+    """Make the repository unless it exists; in one commit add all files and delete others like them.
 
+    ``replaces`` says which paths are like them: an older push's, which would be read beside these.
     `HfApi.upload_folder` would make several commits where Xet is installed.
 
     Raises:
@@ -28,10 +34,12 @@ def upload(
     api = HfApi()
     with hub_errors(repo_id):
         repo_id = api.create_repo(repo_id, repo_type=repo_type, private=private, exist_ok=True).repo_id
+        there = api.list_repo_files(repo_id, repo_type=repo_type)
         operations = [
-            CommitOperationAdd(path_in_repo=name, path_or_fileobj=content) for name, content in files.items()
+            *(CommitOperationAdd(name, content) for name, content in files.items()),
+            *(CommitOperationDelete(name) for name in there if replaces(name) and name not in files),
         ]
-        return api.create_commit(repo_id, operations, commit_message=message, repo_type=repo_type).commit_url
+        return api.create_commit(repo_id, operations, commit_message=message, repo_type=repo_type)
 
 
 @contextmanager
@@ -43,8 +51,6 @@ def hub_errors(repo_id: str) -> Iterator[None]:
         raise RuntimeError("HF_HUB_OFFLINE is set, so nothing can be pushed") from None
     except HfHubHTTPError as error:
         reason = error.server_message or f"{error.response.status_code} {error.response.reason_phrase}"
-        raise RuntimeError(f"--repo_id={repo_id}: the Hub answers: {' '.join(reason.split())}") from None
+        raise RuntimeError(f"{repo_id}: the Hub answers: {' '.join(reason.split())}") from None
     except httpx.HTTPError as error:
-        raise RuntimeError(
-            f"--repo_id={repo_id}: the Hub at {constants.ENDPOINT} cannot be reached: {error}"
-        ) from None
+        raise RuntimeError(f"{repo_id}: the Hub at {constants.ENDPOINT} cannot be reached: {error}") from None

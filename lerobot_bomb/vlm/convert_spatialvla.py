@@ -18,6 +18,7 @@ from torch import Tensor
 
 from lerobot_bomb.actions.grids import ActionGrids
 from lerobot_bomb.checkpoint import write_checkpoint
+from lerobot_bomb.hub.checks import read_json
 from lerobot_bomb.viewing.unfinished import check_new_folder
 from lerobot_bomb.vlm.paligemma import PaliGemmaPrompt
 from lerobot_bomb.vlm.tokenizer import load_tokenizer
@@ -52,12 +53,12 @@ def add_convert_spatialvla_arguments(parser: argparse.ArgumentParser) -> None:
 def run_convert_spatialvla(args: argparse.Namespace) -> int:
     """Write the checkpoint."""
     check_new_folder("--output", args.output)
-    original = _read_json(args.folder, "config.json")
+    original = read_json(args.folder / "config.json")
     if original.get("model_type") != "spatialvla":
         raise ValueError(
             f"{args.folder}: config.json is of a {original.get('model_type')!r}, not of a SpatialVLA"
         )
-    processor = _read_json(args.folder, "processor_config.json")
+    processor = read_json(args.folder / "processor_config.json")
     scales = _action_scales(processor["statistics"], args.statistics)
     grids = ActionGrids.from_published(json.loads(args.grid.read_text()), args.min_sigma, args.decode_point)
     if grids.num_tokens != original["spatial_token_num"]:
@@ -73,13 +74,6 @@ def run_convert_spatialvla(args: argparse.Namespace) -> int:
     write_checkpoint(args.output, policy, pipelines)
     print(f"written to {args.output}: --policy.path={args.output}")
     return 0
-
-
-def _read_json(folder: Path, name: str) -> dict[str, Any]:
-    path = folder / name
-    if not path.is_file():
-        raise FileNotFoundError(f"{folder} has no {name}")
-    return json.loads(path.read_text())
 
 
 def _action_scales(statistics: dict[str, Any], name: str) -> dict[str, Tensor]:

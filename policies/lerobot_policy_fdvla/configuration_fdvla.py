@@ -9,6 +9,7 @@ from lerobot.configs import NormalizationMode, PreTrainedConfig
 from lerobot.optim import AdamWConfig, CosineDecayWithWarmupSchedulerConfig
 from lerobot.policies.rtc import RTCConfig
 
+from lerobot_bomb.checkpoint_config import INSTALLED, PackageVersion
 from lerobot_bomb.flags import flag_errors, one_of
 from lerobot_bomb.flow.losses import check_learning, check_objective
 from lerobot_bomb.flow.path import TIME_SAMPLINGS
@@ -135,6 +136,8 @@ class FdvlaConfig(PreTrainedConfig):
     trained_with: dict[str, Any] | None = None
     # batches trained on so far; what is random in the next ones follows from it
     trained_batches: int = 0
+    # of lerobot_bomb, which wrote the checkpoint
+    package_version: PackageVersion = INSTALLED
 
     optimizer_lr: float = 2e-5
     optimizer_betas: tuple[float, float] = (0.9, 0.95)

@@ -30,7 +30,7 @@ from lerobot_bomb.flow.losses import joint_loss, second_derivatives
 from lerobot_bomb.flow.path import PathPoint, draw_noise, draw_tau, path_point
 from lerobot_bomb.flow.real_time import guided
 from lerobot_bomb.flow.samplers import SAMPLERS, Heads, sample
-from lerobot_bomb.hub.card import WithModelCard
+from lerobot_bomb.hub.policy import HubPolicy
 from lerobot_bomb.policy_flags import check_as_trained, check_weights_fit, trained_with
 from lerobot_bomb.processes import SavesTiedWeightsOnce, weighed
 from lerobot_bomb.training_draws import begin_batch
@@ -72,7 +72,7 @@ class Context:
         return cls(Prefix.of(tensors[1:]), tensors[0])
 
 
-class FdvlaPolicy(WithModelCard, SavesTiedWeightsOnce, PreTrainedPolicy):
+class FdvlaPolicy(HubPolicy, SavesTiedWeightsOnce, PreTrainedPolicy):
     """A Qwen2.5-VL that reads noisy actions; two heads predict where they go and what noise is in them."""
 
     config_class = FdvlaConfig  # pyright: ignore[reportAssignmentType]  LeRobot annotates it as None

@@ -9,6 +9,7 @@ from lerobot.utils.constants import OBS_IMAGES
 
 from lerobot_bomb.actions.ensemble import WEIGHTINGS
 from lerobot_bomb.actions.grid_settings import ActionGroup, GridSettings, check_groups, default_groups
+from lerobot_bomb.checkpoint_config import INSTALLED, PackageVersion
 from lerobot_bomb.flags import flag_errors, one_of
 from lerobot_bomb.policy_flags import (
     adamw,
@@ -137,6 +138,8 @@ class SpatialvlaGridConfig(PreTrainedConfig):
     trained_with: dict[str, Any] | None = None
     # batches trained on so far; what is random in the next ones follows from it
     trained_batches: int = 0
+    # of lerobot_bomb, which wrote the checkpoint
+    package_version: PackageVersion = INSTALLED
 
     optimizer_lr: float = 2e-5
     optimizer_betas: tuple[float, float] = (0.9, 0.999)

@@ -33,7 +33,7 @@ from lerobot_bomb.adapters import check_buffers_are_the_bases, frozen_buffers, p
 from lerobot_bomb.data.columns import dim_names
 from lerobot_bomb.decoding.decoder import Prompt
 from lerobot_bomb.decoding.slots import SlotWriter
-from lerobot_bomb.hub.card import WithModelCard
+from lerobot_bomb.hub.policy import HubPolicy
 from lerobot_bomb.policy_flags import check_as_trained, trained_with
 from lerobot_bomb.processes import SavesTiedWeightsOnce, weighed
 from lerobot_bomb.training_draws import begin_batch
@@ -69,7 +69,7 @@ logger = logging.getLogger(__name__)
 NEW_PARTS = ("cell_embedding", "cell_head", "ego3d")
 
 
-class SpatialvlaGridPolicy(WithModelCard, SavesTiedWeightsOnce, PreTrainedPolicy):
+class SpatialvlaGridPolicy(HubPolicy, SavesTiedWeightsOnce, PreTrainedPolicy):
     """A PaliGemma 2 that chooses the next ``chunk_size`` actions, one cell of each grid a step."""
 
     config_class = SpatialvlaGridConfig  # pyright: ignore[reportAssignmentType]  LeRobot annotates it as None

@@ -10,6 +10,7 @@ from lerobot_bomb.actions.bins import BIN_MODES
 from lerobot_bomb.actions.ensemble import WEIGHTINGS
 from lerobot_bomb.actions.relative import named_dims
 from lerobot_bomb.actions.text import MASK_LEVELS, MAX_DIGITS, digits_needed
+from lerobot_bomb.checkpoint_config import INSTALLED, PackageVersion
 from lerobot_bomb.flags import flag_errors, one_of
 from lerobot_bomb.policy_flags import (
     adamw,
@@ -123,6 +124,8 @@ class Vla0SmolConfig(PreTrainedConfig):
     trained_with: dict[str, Any] | None = None
     # batches trained on so far; what is random in the next ones follows from it
     trained_batches: int = 0
+    # of lerobot_bomb, which wrote the checkpoint
+    package_version: PackageVersion = INSTALLED
 
     optimizer_lr: float = 5e-5
     optimizer_betas: tuple[float, float] = (0.9, 0.95)

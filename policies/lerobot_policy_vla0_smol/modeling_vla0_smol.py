@@ -37,7 +37,7 @@ from lerobot_bomb.decoding.decoder import Prompt
 from lerobot_bomb.decoding.draft import KnownSymbols, LinearDraft
 from lerobot_bomb.decoding.grammar import NumberGrammar
 from lerobot_bomb.decoding.writer import NumberWriter
-from lerobot_bomb.hub.card import WithModelCard
+from lerobot_bomb.hub.policy import HubPolicy
 from lerobot_bomb.policy_flags import check_as_trained, trained_with
 from lerobot_bomb.processes import SavesTiedWeightsOnce, weighed
 from lerobot_bomb.training_draws import begin_batch
@@ -57,7 +57,7 @@ from lerobot_policy_vla0_smol.card_vla0_smol import METHOD
 from lerobot_policy_vla0_smol.configuration_vla0_smol import AS_TRAINED, Vla0SmolConfig
 
 
-class Vla0SmolPolicy(WithModelCard, SavesTiedWeightsOnce, PreTrainedPolicy):
+class Vla0SmolPolicy(HubPolicy, SavesTiedWeightsOnce, PreTrainedPolicy):
     """A stock SmolVLM that writes the next ``chunk_size`` actions as integers."""
 
     config_class = Vla0SmolConfig  # pyright: ignore[reportAssignmentType]  LeRobot annotates it as None
@@ -120,8 +120,8 @@ class Vla0SmolPolicy(WithModelCard, SavesTiedWeightsOnce, PreTrainedPolicy):
             check_as_trained(config)
         try:
             policy = super().from_pretrained(*args, config=config, **{**kwargs, "strict": True})
-        except RuntimeError as error:
-            if "relative.scale" in str(error):
+        except ValueError as error:
+            if " relative." in str(error):
                 raise ValueError(
                     "--policy.relative_actions is not what this checkpoint was trained with, "
                     "and cannot be changed"

@@ -1,9 +1,11 @@
 """The Hub on this machine, and commands that see no other."""
 
 from collections.abc import Iterator
+from pathlib import Path
 
 import pytest
 
+from hub.damage import write_checkpoint
 from hub.server import TOKEN, LoopbackHub
 
 
@@ -14,13 +16,26 @@ def hub() -> Iterator[LoopbackHub]:
 
 
 @pytest.fixture
-def online(hub: LoopbackHub, monkeypatch: pytest.MonkeyPatch) -> LoopbackHub:
-    """This process, too, sees the Hub on this machine alone."""
-    from huggingface_hub import constants
+def online(
+    hub: LoopbackHub, monkeypatch: pytest.MonkeyPatch, tmp_path_factory: pytest.TempPathFactory
+) -> LoopbackHub:
+    """This process, too, sees the Hub on this machine alone, with an empty cache."""
+    from huggingface_hub import constants, hf_api
 
+    files = f"{hub.endpoint}/{{repo_id}}/resolve/{{revision}}/{{filename}}"
     monkeypatch.setattr(constants, "ENDPOINT", hub.endpoint)
+    monkeypatch.setattr(hf_api.api, "endpoint", hub.endpoint)
+    monkeypatch.setattr(constants, "HUGGINGFACE_CO_URL_TEMPLATE", files)
+    monkeypatch.setattr(constants, "HF_HUB_CACHE", str(tmp_path_factory.mktemp("cache")))
     monkeypatch.setattr(constants, "HF_HUB_OFFLINE", False)
     monkeypatch.setattr(constants, "HF_HUB_DISABLE_XET", True)
     monkeypatch.setattr("huggingface_hub.utils._http.time.sleep", lambda _: None)  # between retries
     monkeypatch.setenv("HF_TOKEN", TOKEN)
     return hub
+
+
+@pytest.fixture
+def checkpoint(tmp_path: Path) -> Path:
+    folder = tmp_path / "pretrained_model"
+    write_checkpoint(folder)
+    return folder

@@ -57,6 +57,7 @@ class LoopbackHub:
         self.blobs: dict[str, bytes] = {}
         self.requests: list[str] = []  # "GET /path"
         self.cards: list[str] = []  # that were validated
+        self.betrayals: list[str] = []  # requests that hold the token elsewhere than in their Authorization
         self.before: Callable[[str], None] | None = None  # what happens just before a request is answered
         self.endpoint = ""
 
@@ -91,12 +92,16 @@ def git_oid(content: bytes) -> str:
     return hashlib.sha1(b"blob %d\0" % len(content) + content).hexdigest()
 
 
+def content_id(path: str, content: bytes) -> str:
+    """What a file's content is known by; a client does not send the same again."""
+    return hashlib.sha256(content).hexdigest() if path.endswith(LFS_ENDINGS) else git_oid(content)
+
+
 def described(path: str, content: bytes) -> dict:
     """A file as the tree names it."""
     entry = {"type": "file", "path": path, "size": len(content), "oid": git_oid(content)}
     if path.endswith(LFS_ENDINGS):
-        oid = hashlib.sha256(content).hexdigest()
-        entry["lfs"] = {"oid": oid, "size": len(content), "pointerSize": 130}
+        entry["lfs"] = {"oid": content_id(path, content), "size": len(content), "pointerSize": 130}
     return entry
 
 
@@ -119,6 +124,9 @@ class _Handler(BaseHTTPRequestHandler):
         self.body = self.rfile.read(int(self.headers.get("Content-Length") or 0))
         method = "GET" if self.command == "HEAD" else self.command
         self.hub.requests.append(f"{self.command} {path}")
+        others = [value for name, value in self.headers.items() if name.lower() != "authorization"]
+        if TOKEN.encode() in self.body or TOKEN in f"{self.path} {others}":
+            self.hub.betrayals.append(path)
         try:
             if self.hub.before is not None:
                 self.hub.before(f"{self.command} {path}")
@@ -168,14 +176,15 @@ class _Handler(BaseHTTPRequestHandler):
         self._json({"errors": [], "warnings": []})
 
     def preupload(self, key: str, revision: str) -> None:
-        self.hub.find(key).sha(revision)
+        there = self.hub.find(key).files(revision)
         files = [
             {
-                "path": each["path"],
-                "uploadMode": "lfs" if each["path"].endswith(LFS_ENDINGS) else "regular",
+                "path": path,
+                "uploadMode": "lfs" if path.endswith(LFS_ENDINGS) else "regular",
                 "shouldIgnore": False,
+                "oid": content_id(path, there[path]) if path in there else None,
             }
-            for each in json.loads(self.body)["files"]
+            for path in (each["path"] for each in json.loads(self.body)["files"])
         ]
         self._json({"files": files})
 
@@ -238,19 +247,9 @@ class _Handler(BaseHTTPRequestHandler):
     def info(self, key: str, revision: str | None = None) -> None:
         repository = self.hub.find(key)
         sha = repository.sha(revision or "main")
+        named = {"id": key.split("/", 1)[1], "sha": sha, "private": repository.is_private}
         siblings = [{"rfilename": path} for path in repository.commits[sha]]
-        repo_id = key.split("/", 1)[1]
-        self._json(
-            {
-                "id": repo_id,
-                "sha": sha,
-                "siblings": siblings,
-                "private": repository.is_private,
-                "tags": [],
-                "downloads": 0,
-                "likes": 0,
-            }
-        )
+        self._json({**named, "siblings": siblings, "tags": [], "downloads": 0, "likes": 0})
 
     def refs(self, key: str) -> None:
         repository = self.hub.find(key)

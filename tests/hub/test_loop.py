@@ -47,13 +47,14 @@ def evaluate(repo_id: str, output_dir: Path, *flags: str) -> list[str]:
 
 
 def check_no_secret(hub: LoopbackHub, ended: Ended, folder: Path) -> None:
-    """Neither what was printed nor what was published nor a card's text tells the token or a path here."""
+    """Nothing that was printed, published or written tells the token; no path of here is published."""
     assert TOKEN not in ended.text
     for repository in hub.repositories.values():
         for files in repository.commits.values():
-            assert not any(TOKEN.encode() in content for content in files.values())
-            assert str(folder).encode() not in files.get("README.md", b"")
-    assert not any(TOKEN in path.read_text(errors="ignore") for path in folder.rglob("*.json"))
+            for private in (TOKEN, str(folder)):
+                assert not any(private.encode() in content for content in files.values())
+    assert hub.betrayals == []
+    assert not any(TOKEN.encode() in path.read_bytes() for path in folder.rglob("*") if path.is_file())
 
 
 def loop(hub: LoopbackHub, folder: Path, policy_type: str) -> str:
@@ -80,6 +81,7 @@ def loop(hub: LoopbackHub, folder: Path, policy_type: str) -> str:
     # of all files LeRobot 0.6.1's evaluation takes these alone from a revision
     assert f"HEAD /{FIRST}/resolve/{TAG}/model.safetensors" in hub.requests
     for repo_id in (FIRST, SECOND):
+        assert len(hub.model(repo_id).messages) == 1
         endings = {Path(path).suffix for path in hub.model(repo_id).files()}
         assert endings == {".json", ".safetensors", ".md"}
     assert not any("Instruct" in request or "paligemma" in request for request in hub.requests)

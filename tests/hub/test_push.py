@@ -1,24 +1,28 @@
 """`lerobot-bomb push`: what is published, what is refused, and what a push that is cut off leaves."""
 
-import json
-from collections.abc import Callable
 from pathlib import Path
 
 import pytest
 import torch
 import yaml
-from fdvla_cases import make_policy as make_fdvla
-from safetensors.torch import load_file, save_file
-from vla0_smol_cases import STATS, make_batch, make_policy
+from vla0_smol_cases import make_batch, make_policy
 
+from hub.damage import (
+    LOCAL,
+    TOKENIZER,
+    WEIGHTS,
+    change_config,
+    remove,
+    take_other_shape,
+    take_other_weights,
+    truncate,
+)
 from hub.server import TOKEN, LoopbackHub
 from lerobot_bomb.cli import main
 from lerobot_bomb.schema import EpisodeResult, EpisodeSpec
-from lerobot_policy_vla0_smol import make_vla0_smol_pre_post_processors
 from lerobot_policy_vla0_smol.modeling_vla0_smol import Vla0SmolPolicy
 
 REPO_ID = "me/x"
-LOCAL = "/data/models/SmolVLM2-500M-Video-Instruct"
 
 
 def result(seed: int, is_success: bool) -> str:
@@ -36,19 +40,6 @@ def result(seed: int, is_success: bool) -> str:
         nearest_intersection=(0, 1),
         collateral_mm=0.0,
     ).to_json()
-
-
-@pytest.fixture
-def checkpoint(tmp_path: Path) -> Path:
-    """As lerobot-train leaves it, of a backbone from a folder."""
-    folder = tmp_path / "pretrained_model"
-    policy = make_policy()
-    for processor in make_vla0_smol_pre_post_processors(policy.config, STATS):
-        processor.save_pretrained(folder)
-    policy.config.vlm_model_name = LOCAL
-    policy.save_pretrained(folder)
-    (folder / "optimizer.pkl").write_bytes(b"not for others")
-    return folder
 
 
 def push(checkpoint: Path, *flags: str) -> int:
@@ -84,52 +75,16 @@ def test_one_commit_holds_all_that_is_needed_and_nothing_of_this_machine(
     assert torch.equal(ours.predict_action_chunk(batch), theirs.predict_action_chunk(batch))
 
 
-def remove_weights(folder: Path) -> None:
-    (folder / "model.safetensors").unlink()
-
-
-def truncate_weights(folder: Path) -> None:
-    path = folder / "model.safetensors"
-    path.write_bytes(path.read_bytes()[:-10])
-
-
-def remove_processor_state(folder: Path) -> None:
-    next(folder.glob("policy_preprocessor_*.safetensors")).unlink()
-
-
-def truncate_config(folder: Path) -> None:
-    path = folder / "config.json"
-    path.write_text(path.read_text()[:-10])
-
-
-def take_other_weights(folder: Path) -> None:
-    make_fdvla().save_pretrained(folder / "other")
-    (folder / "other" / "model.safetensors").rename(folder / "model.safetensors")
-
-
-def take_other_shape(folder: Path) -> None:
-    weights = load_file(folder / "model.safetensors")
-    name = min(weights)
-    save_file({**weights, name: torch.zeros(1)}, folder / "model.safetensors")
-
-
-def change_config(**values: object) -> Callable[[Path], None]:
-    def change(folder: Path) -> None:
-        path = folder / "config.json"
-        path.write_text(json.dumps(json.loads(path.read_text()) | values))
-
-    return change
-
-
 BROKEN = {
-    "holds no model.safetensors, so it is no checkpoint": remove_weights,
-    "model.safetensors is truncated or no safetensors file": truncate_weights,
-    "which its policy_preprocessor.json needs": remove_processor_state,
-    "config.json is not JSON, or truncated": truncate_config,
+    "holds no model.safetensors, so it is no checkpoint": remove(WEIGHTS),
+    "model.safetensors is truncated or no safetensors file": truncate(WEIGHTS),
+    "which its policy_preprocessor.json needs": remove(TOKENIZER),
+    "config.json is not JSON, or truncated": truncate("config.json"),
     "is not of the vla0_smol that config.json describes: it lacks backbone.": take_other_weights,
     "has shape (1,), not (": take_other_shape,
     f"would need the base model {LOCAL}": change_config(vlm_config=None),
     "the type 'act' is not one that lerobot-bomb pushes": change_config(type="act"),
+    "written by lerobot_bomb 99.0, newer than": change_config(package_version="99.0", new_flag=1),
 }
 
 
@@ -174,7 +129,7 @@ def test_a_push_that_is_cut_off_anywhere_leaves_nothing_or_everything(
 ) -> None:
     assert push(checkpoint) == 0
     whole, num_requests = online.model(REPO_ID).files(), len(online.requests)
-    assert num_requests >= 6
+    assert num_requests >= 7
     seen = set()
     for last in range(num_requests):
         online.repositories.clear()

@@ -59,6 +59,19 @@ def test_one_commit_tagged_for_lerobot_with_a_card(
     assert repository.refs["v3.0"] == repository.refs["main"]
 
 
+def test_nothing_of_a_longer_recording_is_left(
+    online: LoopbackHub, recorded: Callable[[Path], Path], tmp_path: Path
+) -> None:
+    """LeRobot would read its frames too."""
+    root = recorded(tmp_path)
+    assert push(root) == 0
+    repository = online.dataset(REPO_ID)
+    longer = {"data/chunk-000/file-001.parquet": b"", "notes.txt": b"mine"}
+    repository.commit({**repository.files(), **longer}, "longer")
+    assert push(root) == 0
+    assert longer.keys() & repository.files().keys() == {"notes.txt"}
+
+
 def truncate_data(root: Path) -> None:
     path = next((root / "data").rglob("*.parquet"))
     path.write_bytes(path.read_bytes()[:-10])

@@ -1,0 +1,64 @@
+"""A checkpoint's config.json that cannot be read here: which version wrote it, and one line that says why."""
+
+from collections.abc import Sequence
+from functools import wraps
+from pathlib import Path
+from typing import Any
+
+import draccus
+from draccus.utils import DecodingError
+from lerobot.configs import PreTrainedConfig
+from packaging.version import Version
+
+from lerobot_bomb import __version__
+
+
+class PackageVersion(str):
+    """A config's field of this type is the installed version; reading a newer one is an error."""
+
+
+INSTALLED = PackageVersion(__version__)
+
+
+@draccus.decode.register(PackageVersion)
+def _decode(written_by: str, path: Sequence[str]) -> PackageVersion:
+    """The installed version, as that is what writes the config the next time.
+
+    Raises:
+        DecodingError: the checkpoint is newer; its fields and weights may mean what nobody here knows.
+    """
+    if Version(written_by) > Version(__version__):
+        raise DecodingError(
+            path,
+            f"this checkpoint was written by lerobot_bomb {written_by}, newer than the installed "
+            f"{__version__}: update lerobot_bomb",
+        )
+    return INSTALLED
+
+
+draccus.encode.register(PackageVersion, str)
+
+
+class UnreadableConfigError(DecodingError, ValueError):
+    """A config.json that cannot be read; LeRobot's parsers print a DecodingError as a line."""
+
+
+def tell_config_errors() -> None:
+    """Let LeRobot's commands say in one line why they cannot read a checkpoint's config.
+
+    Their parser prints DecodingErrors, and turns others into `Couldn't instantiate class EvalPipelineConfig`.
+    Who catches ValueErrors still does.
+    """
+    usual: Any = PreTrainedConfig.from_pretrained
+
+    @wraps(usual)
+    def from_pretrained(
+        cls: type[PreTrainedConfig], pretrained_name_or_path: str | Path, **options: Any
+    ) -> PreTrainedConfig:
+        try:
+            return usual.__func__(cls, pretrained_name_or_path, **options)
+        except (ValueError, TypeError) as error:
+            start = f"{pretrained_name_or_path}: its config.json cannot be read: "
+            raise UnreadableConfigError((), start + str(error)) from error
+
+    PreTrainedConfig.from_pretrained = classmethod(from_pretrained)  # pyright: ignore[reportAttributeAccessIssue]

@@ -1,0 +1,118 @@
+"""What our policies do with the Hub and checkpoints: one commit with a card out, clear errors in."""
+
+import logging
+from pathlib import Path
+from tempfile import TemporaryDirectory
+from typing import TYPE_CHECKING, Any, ClassVar
+
+from lerobot.configs.train import TrainPipelineConfig
+from lerobot.utils.constants import CHECKPOINTS_DIR, LAST_CHECKPOINT_LINK, PRETRAINED_MODEL_DIR
+from torch import Tensor
+
+from lerobot_bomb.adapters import base_commit, check_adapters, check_base
+from lerobot_bomb.hub.card import Checkpoint
+from lerobot_bomb.hub.checks import PROCESSORS, check_tensors, processor_files
+from lerobot_bomb.hub.dataset import INFO_FILE, DatasetFacts
+from lerobot_bomb.hub.method import Method
+from lerobot_bomb.hub.push import publish
+
+if TYPE_CHECKING:
+    from lerobot.datasets import LeRobotDatasetMetadata
+
+
+class HubPolicy:
+    """Stands before LeRobot's `PreTrainedPolicy` and overrides what it does with checkpoints."""
+
+    method: ClassVar[Method]
+    config_class: Any
+    name: Any
+    config: Any
+
+    def __init__(self, config: Any, *args: Any, **kwargs: Any):
+        if not isinstance(config, self.config_class):
+            raise ValueError(
+                f"this is a {config.type}, not a {self.name}: load it with "
+                f"get_policy_class({config.type!r}).from_pretrained"
+            )
+        _next(super()).__init__(config, *args, **kwargs)
+
+    @classmethod
+    def from_pretrained(cls, pretrained_name_or_path: str | Path, **kwargs: Any) -> Any:
+        """As LeRobot's, but files are checked first; errors are a line that names the file.
+
+        Raises:
+            ValueError: one is truncated, or weights or config are of another policy.
+            OSError: one is missing, or the Hub cannot be reached.
+        """
+        folder = Path(pretrained_name_or_path)
+        for name in PROCESSORS:  # a policy that was saved alone has none
+            if (folder / name).is_file():
+                processor_files(folder, name)
+        config = kwargs.get("config")
+        if config is not None and config.use_peft:  # this is their base
+            check_adapters(str(config.pretrained_path), config.pretrained_revision)
+        return _next(super()).from_pretrained(pretrained_name_or_path, **kwargs)
+
+    @classmethod
+    def _load_as_safetensor(cls, model: Any, model_file: str, map_location: str, strict: bool) -> Any:
+        path = Path(model_file)
+        if not path.is_file():
+            raise FileNotFoundError(f"{path.parent} holds no {path.name}, so it is no whole checkpoint")
+        check_tensors(path, model)
+        return _next(super())._load_as_safetensor(model, model_file, map_location, strict)
+
+    def _validate_peft_config(self, peft_config: Any) -> None:
+        """Adapters that will be published have a base that others can get; its commit is written down."""
+        _next(super())._validate_peft_config(peft_config)
+        base = str(self.config.pretrained_path)
+        if self.config.push_to_hub:
+            check_base(base)
+        peft_config.revision = base_commit(base, self.config.pretrained_revision)
+
+    def push_model_to_hub(
+        self,
+        cfg: TrainPipelineConfig,
+        peft_model: Any = None,
+        state_dict: dict[str, Tensor] | None = None,
+        dataset_meta: "LeRobotDatasetMetadata | None" = None,
+    ) -> None:
+        """What `lerobot-train --policy.push_to_hub=true` publishes at its end, in one commit.
+
+        LeRobot pushes the processors after it, and a kill in between would leave new weights with none or
+        with an older push's. The last checkpoint's are the same, so LeRobot then finds nothing to change.
+        """
+        base = None if peft_model is None else str(peft_model.active_peft_config.base_model_name_or_path)
+        if base is not None:
+            check_base(base)
+        root = None if dataset_meta is None else Path(dataset_meta.root)
+        card = Checkpoint(
+            config=self.config,
+            method=self.method,
+            repo_id=self.config.repo_id,
+            dataset_id=cfg.dataset.repo_id,
+            training=cfg,
+            dataset=DatasetFacts.read(root) if root is not None and (root / INFO_FILE).is_file() else None,
+            license=self.config.license,
+            tags=self.config.tags or [],
+            adapters_of=base,
+        )
+        assert cfg.output_dir is not None
+        last = Path(cfg.output_dir) / CHECKPOINTS_DIR / LAST_CHECKPOINT_LINK / PRETRAINED_MODEL_DIR
+        with TemporaryDirectory() as temporary:
+            folder = Path(temporary)
+            model: Any = self if peft_model is None else peft_model
+            model.save_pretrained(folder, state_dict=state_dict)
+            self.config.save_pretrained(folder)
+            cfg.save_pretrained(folder)
+            files = {path.name: path for path in folder.iterdir() if path.suffix != ".md"}
+            for name in PROCESSORS:
+                if (last / name).is_file():
+                    files |= {each: last / each for each in processor_files(last, name)}
+            commit = publish(card, files, self.config.private)
+        # LeRobot's remote jobs wait for this line
+        logging.info(f"Model pushed to {commit.repo_url.url}")
+
+
+def _next(policy: Any) -> Any:
+    """LeRobot's class, of which a type checker does not know here."""
+    return policy
