@@ -39,15 +39,10 @@ def _decode(written_by: str, path: Sequence[str]) -> PackageVersion:
 draccus.encode.register(PackageVersion, str)
 
 
-class UnreadableConfigError(DecodingError, ValueError):
-    """A config.json that cannot be read; LeRobot's parsers print a DecodingError as a line."""
-
-
 def tell_config_errors() -> None:
     """Let LeRobot's commands say in one line why they cannot read a checkpoint's config.
 
     Their parser prints DecodingErrors, and turns others into `Couldn't instantiate class EvalPipelineConfig`.
-    Who catches ValueErrors still does.
     """
     usual: Any = PreTrainedConfig.from_pretrained
 
@@ -59,6 +54,6 @@ def tell_config_errors() -> None:
             return usual.__func__(cls, pretrained_name_or_path, **options)
         except (ValueError, TypeError) as error:
             start = f"{pretrained_name_or_path}: its config.json cannot be read: "
-            raise UnreadableConfigError((), start + str(error)) from error
+            raise DecodingError((), start + str(error)) from error
 
     PreTrainedConfig.from_pretrained = classmethod(from_pretrained)  # pyright: ignore[reportAttributeAccessIssue]
