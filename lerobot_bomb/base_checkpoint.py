@@ -4,7 +4,9 @@ LeRobot trains adapters on a checkpoint only: `lerobot-train --policy.path=DIR -
 """
 
 import argparse
+import io
 from collections.abc import Sequence
+from contextlib import redirect_stderr
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, cast
@@ -54,6 +56,8 @@ def run_init(args: argparse.Namespace) -> int:
     meta = read_meta(args.repo_id, args.root)
     set_seed(args.seed)
     policy = make_policy(config, ds_meta=meta)
+    if not any(True for _ in policy.parameters()):
+        raise ValueError(f"--policy.type={config.type} has nothing to train")
     pipelines = make_pre_post_processors(config, dataset_stats=cast("Any", meta.stats))
     write_checkpoint(args.output, policy, pipelines)
     print(f"written to {args.output}: train it with lerobot-train --policy.path={args.output}")
@@ -68,8 +72,12 @@ def parse_policy(flags: Sequence[str]) -> PreTrainedConfig:
     if not any(flag.split("=")[0] == f"{PREFIX}type" for flag in flags):
         types = ", ".join(sorted(PreTrainedConfig.get_known_choices()))
         raise ValueError(f"{PREFIX}type is missing; choose one of: {types}")
+    usage = io.StringIO()  # of argparse: some 400 lines, and the error at their end
     try:
-        return draccus.parse(_Flags, args=list(flags)).policy
+        with redirect_stderr(usage):
+            return draccus.parse(_Flags, args=list(flags)).policy
+    except SystemExit:
+        raise ValueError(usage.getvalue().strip().splitlines()[-1].partition("error: ")[2]) from None
     except DecodingError as error:
         cause = error.__cause__
         raise ValueError(str(cause if isinstance(cause, FlagError) else error)) from None

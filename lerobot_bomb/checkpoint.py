@@ -14,9 +14,10 @@ from lerobot.utils.constants import POLICY_PREPROCESSOR_DEFAULT_NAME
 from lerobot.utils.device_utils import get_safe_torch_device, is_torch_device_available
 from lerobot.utils.import_utils import register_third_party_plugins
 
+from lerobot_bomb.hub.names import CONFIG
 from lerobot_bomb.viewing.unfinished import written_whole
 
-FILES = ("config.json", f"{POLICY_PREPROCESSOR_DEFAULT_NAME}.json")
+FILES = (CONFIG, f"{POLICY_PREPROCESSOR_DEFAULT_NAME}.json")
 
 Preprocessor = PolicyProcessorPipeline[dict[str, Any], dict[str, Any]]
 Postprocessor = PolicyProcessorPipeline[PolicyAction, PolicyAction]

@@ -8,6 +8,7 @@ from lerobot.policies import PreTrainedPolicy, get_policy_class
 
 from lerobot_bomb.adapters import check_adapters
 from lerobot_bomb.checkpoint import load_processors, read_config, write_checkpoint
+from lerobot_bomb.hub.checks import ADAPTERS
 from lerobot_bomb.viewing.unfinished import check_new_folder
 
 
@@ -47,7 +48,7 @@ def merged(config: PreTrainedConfig, adapters: Path) -> PreTrainedPolicy:
         )
     except (OSError, ValueError) as error:
         raise ValueError(
-            f"--policy.path={adapters} holds adapters of {base}, which cannot be loaded: "
-            f"{str(error).splitlines()[0]}"
+            f"--policy.path={adapters} holds adapters of {base}, as {ADAPTERS[0]} says, which cannot be "
+            f"loaded: {str(error).splitlines()[0]}"
         ) from error
     return peft.PeftModel.from_pretrained(policy, str(adapters)).merge_and_unload()

@@ -4,6 +4,7 @@ The robot's machine runs LeRobot's own client: ``python -m lerobot.async_inferen
 """
 
 import argparse
+import socket
 from dataclasses import fields
 from typing import cast
 
@@ -36,6 +37,18 @@ def run_serve(args: argparse.Namespace) -> int:
     """Serve until Ctrl-C; a client names the checkpoint."""
     if args.fps < 1:
         raise ValueError(f"--fps={args.fps} must be at least 1")
-    flags = {field.name: getattr(args, field.name) for field in fields(PolicyServerConfig)}
-    serve_registered_policies(PolicyServerConfig(**flags))
+    config = PolicyServerConfig(
+        **{field.name: getattr(args, field.name) for field in fields(PolicyServerConfig)}
+    )
+    _check_port(config.host, config.port)
+    serve_registered_policies(config)
     return 0
+
+
+def _check_port(host: str, port: int) -> None:
+    """Raise a ValueError unless it is free: grpc would share it, and clients would reach either server."""
+    try:
+        with socket.create_server((host, port)):
+            pass
+    except OSError as error:
+        raise ValueError(f"--host={host} --port={port}: {str(error.strerror).partition(' (')[0]}") from None

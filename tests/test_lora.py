@@ -85,6 +85,17 @@ def test_decoders_see_adapters_as_merged_weights(policy_type: str) -> None:
     torch.testing.assert_close(merged.predict_action_chunk(batch), actions, atol=1e-4, rtol=0)
 
 
+def test_adapters_name_a_folder_that_stays_whatever_the_working_directory(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    (tmp_path / "base").mkdir()
+    monkeypatch.chdir(tmp_path)
+    policy = CASES["vla0_smol"].make_policy()
+    policy.config.pretrained_path = Path("base")
+    wrapped = policy.wrap_with_peft(peft_cli_overrides={"method_type": "LORA", "r": 4})
+    assert wrapped.active_peft_config.base_model_name_or_path == str(tmp_path / "base")
+
+
 # The stock commands
 
 
@@ -165,7 +176,8 @@ def test_what_cannot_be_merged_is_told(
         shutil.copy(state, tmp_path / "adapters")
     assert main(["merge", f"--policy.path={tmp_path / 'adapters'}", f"--output={tmp_path / 'merged'}"]) == 1
     error = capsys.readouterr().err
-    assert "elsewhere, which cannot be loaded: " in error and error.count("\n") == 1
+    assert "elsewhere, as adapter_config.json says, which cannot be loaded: there is no folder" in error
+    assert error.count("\n") == 1
     assert not (tmp_path / "merged").exists()
 
 

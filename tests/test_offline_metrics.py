@@ -237,7 +237,7 @@ def edited(checkpoint: Path, folder: Path, edit: Callable[[dict[str, Any]], None
             ),
             "the policy needs 'observation.images.top', which dataset test/offline has not",
         ),
-        (lambda config: config.update(use_peft=True), "the checkpoint is a PEFT adapter"),
+        (lambda config: config.update(use_peft=True), "the checkpoint holds adapters; lerobot-bomb merge"),
     ],
 )
 def test_a_policy_that_does_not_fit_is_refused(

@@ -50,7 +50,14 @@ def port(tmp_path_factory: pytest.TempPathFactory) -> Iterator[int]:
     command = [sys.executable, "-m", "lerobot_bomb.cli", "serve", f"--port={number}", "--inference_latency=0"]
     log = tmp_path_factory.mktemp("server") / "log"
     with log.open("w") as output:
-        server = subprocess.Popen(command, cwd=log.parent, stdout=output, stderr=subprocess.STDOUT)
+        server = subprocess.Popen(
+            command,
+            cwd=log.parent,
+            stdout=output,
+            stderr=subprocess.STDOUT,
+            # a job in the background starts ignoring it
+            preexec_fn=lambda: signal.signal(signal.SIGINT, signal.SIG_DFL),
+        )
         yield number
         server.send_signal(signal.SIGINT)
         assert server.wait(TIMEOUT_S) == CTRL_C, log.read_text()
@@ -134,10 +141,19 @@ def wait_until(happened: Callable[[], bool]) -> None:
     [
         ("--port=99999", "Port must be between 1 and 65535, got 99999"),
         ("--fps=0", "--fps=0 must be at least 1"),
+        ("--host=nowhere.invalid", "--host=nowhere.invalid --port=8080: "),
     ],
 )
 def test_a_wrong_flag_is_named(flag: str, message: str, capsys: pytest.CaptureFixture[str]) -> None:
     assert cli.main(["serve", flag]) == 1
+    assert capsys.readouterr().err.startswith(f"lerobot-bomb serve: {message}")
+
+
+def test_a_port_in_use_is_told(capsys: pytest.CaptureFixture[str]) -> None:
+    with socket.create_server(("127.0.0.1", 0), reuse_port=True) as other:  # as grpc's
+        port = other.getsockname()[1]
+        assert cli.main(["serve", f"--port={port}"]) == 1
+    message = f"--host=127.0.0.1 --port={port}: Address already in use"
     assert capsys.readouterr().err == f"lerobot-bomb serve: {message}\n"
 
 

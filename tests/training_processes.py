@@ -19,7 +19,7 @@ import torch
 from torch import Tensor, distributed
 
 NUM_PROCESSES = 2
-TIMEOUT_S = 280
+TIMEOUT_S = 600  # against hangs
 
 
 @dataclass(frozen=True)

@@ -59,7 +59,9 @@ def check_policy(config: PreTrainedConfig, meta: LeRobotDatasetMetadata, rename_
             f"{config.observation_delta_indices})"
         )
     if config.use_peft:
-        raise ValueError("the checkpoint is a PEFT adapter; merge it into its base model first")
+        raise ValueError(
+            "the checkpoint holds adapters; lerobot-bomb merge makes a whole one of them and their base"
+        )
 
 
 def load_policy(config: PreTrainedConfig) -> PreTrainedPolicy:

@@ -10,7 +10,7 @@ from typing import Any
 from lerobot.datasets import LeRobotDatasetMetadata
 from lerobot.utils.constants import HF_LEROBOT_HOME
 
-TRAIN_CONFIG = "train_config.json"
+from lerobot_bomb.hub.names import TRAIN_CONFIG
 
 
 @dataclass(frozen=True)

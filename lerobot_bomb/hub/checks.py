@@ -11,7 +11,8 @@ from lerobot.policies.factory import get_policy_class
 from lerobot.utils.constants import POLICY_POSTPROCESSOR_DEFAULT_NAME, POLICY_PREPROCESSOR_DEFAULT_NAME
 from safetensors import SafetensorError, safe_open
 
-CONFIG, TRAIN_CONFIG, WEIGHTS = "config.json", "train_config.json", "model.safetensors"
+from lerobot_bomb.hub.names import CONFIG, WEIGHTS
+
 ADAPTERS = ("adapter_config.json", "adapter_model.safetensors")
 PROCESSORS = (f"{POLICY_PREPROCESSOR_DEFAULT_NAME}.json", f"{POLICY_POSTPROCESSOR_DEFAULT_NAME}.json")
 

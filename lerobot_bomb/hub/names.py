@@ -1,8 +1,10 @@
-"""What is a name on the Hub, and what is a path that nobody else has."""
+"""Names: of files of a checkpoint, on the Hub, and paths that nobody else has."""
 
 import re
 from pathlib import Path
 from typing import Any
+
+CONFIG, TRAIN_CONFIG, WEIGHTS = "config.json", "train_config.json", "model.safetensors"
 
 # what to do with adapters whose base is on one machine only
 TO_PUBLISH = (

@@ -14,6 +14,7 @@ from lerobot_bomb.hub.card import Checkpoint
 from lerobot_bomb.hub.checks import PROCESSORS, check_tensors, processor_files
 from lerobot_bomb.hub.dataset import INFO_FILE, DatasetFacts
 from lerobot_bomb.hub.method import Method
+from lerobot_bomb.hub.names import is_hub_id
 from lerobot_bomb.hub.push import publish
 
 if TYPE_CHECKING:
@@ -45,6 +46,8 @@ class HubPolicy:
             OSError: one is missing, or the Hub cannot be reached.
         """
         folder = Path(pretrained_name_or_path)
+        if not folder.is_dir() and not is_hub_id(folder):
+            raise FileNotFoundError(f"there is no folder {folder}, and it is no name on the Hub")
         for name in PROCESSORS:  # a policy that was saved alone has none
             if (folder / name).is_file():
                 processor_files(folder, name)
@@ -62,12 +65,17 @@ class HubPolicy:
         return _next(super())._load_as_safetensor(model, model_file, map_location, strict)
 
     def _validate_peft_config(self, peft_config: Any) -> None:
-        """Adapters that will be published have a base that others can get; its commit is written down."""
+        """Where the base is, is written down: its commit, or a folder whatever the working directory.
+
+        Adapters that will be published have a base that others can get.
+        """
         _next(super())._validate_peft_config(peft_config)
         base = str(self.config.pretrained_path)
         if self.config.push_to_hub:
             check_base(base)
         peft_config.revision = base_commit(base, self.config.pretrained_revision)
+        if not is_hub_id(base):
+            self.config.pretrained_path = Path(base).resolve()
 
     def push_model_to_hub(
         self,

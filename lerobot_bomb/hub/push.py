@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 from lerobot_bomb.data.growing import check_repo_id, switch
 from lerobot_bomb.evaluation.results import read_results
 from lerobot_bomb.hub.dataset import INFO_FILE, DatasetFacts, Row
-from lerobot_bomb.hub.names import TO_PUBLISH, is_local_path
+from lerobot_bomb.hub.names import CONFIG, TO_PUBLISH, TRAIN_CONFIG, is_local_path
 
 if TYPE_CHECKING:
     from huggingface_hub import CommitInfo
@@ -17,7 +17,7 @@ if TYPE_CHECKING:
 
     from lerobot_bomb.hub.card import Checkpoint
 
-CONFIG, TRAIN_CONFIG, CARD = "config.json", "train_config.json", "README.md"
+CARD = "README.md"
 # what means nothing on another machine; of other paths the last part stays, as a name
 LEFT_OUT = {"pretrained_path", "root", "output_dir", "checkpoint_path"}
 
@@ -53,10 +53,10 @@ def run_push(args: argparse.Namespace) -> int:
     from lerobot_bomb.hub.checks import checkpoint_files  # imports torch: seconds
     from lerobot_bomb.hub.upload import check_token
 
-    check_token()
     files = {name: args.checkpoint / name for name in checkpoint_files(args.checkpoint)}
     if (args.checkpoint / TRAIN_CONFIG).is_file():
         files[TRAIN_CONFIG] = args.checkpoint / TRAIN_CONFIG
+    check_token()
     checkpoint = _read_checkpoint(args.checkpoint, args.repo_id, args.dataset_root, results)
     print(publish(checkpoint, files, args.private or None).commit_url)
     return 0

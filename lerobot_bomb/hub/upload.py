@@ -8,9 +8,13 @@ import httpx
 from huggingface_hub import CommitInfo, CommitOperationAdd, CommitOperationDelete, HfApi, constants, get_token
 from huggingface_hub.errors import HfHubHTTPError, OfflineModeIsEnabled
 
+OFFLINE = "HF_HUB_OFFLINE is set, so nothing can be pushed"
+
 
 def check_token() -> None:
-    """Raise unless the Hub can know who pushes."""
+    """Raise unless the Hub may be asked, and can know who pushes."""
+    if constants.HF_HUB_OFFLINE:
+        raise ValueError(OFFLINE)
     if get_token() is None:
         raise ValueError("the Hub asks who you are: run `hf auth login`, or set HF_TOKEN")
 
@@ -48,7 +52,7 @@ def hub_errors(repo_id: str) -> Iterator[None]:
     try:
         yield
     except OfflineModeIsEnabled:
-        raise RuntimeError("HF_HUB_OFFLINE is set, so nothing can be pushed") from None
+        raise RuntimeError(OFFLINE) from None
     except HfHubHTTPError as error:
         reason = error.server_message or f"{error.response.status_code} {error.response.reason_phrase}"
         raise RuntimeError(f"{repo_id}: the Hub answers: {' '.join(reason.split())}") from None
