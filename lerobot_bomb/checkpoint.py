@@ -1,5 +1,6 @@
 """A checkpoint's folder, read as LeRobot's commands read it, and written."""
 
+import argparse
 from collections.abc import Iterable
 from contextlib import AbstractContextManager, nullcontext
 from pathlib import Path
@@ -63,6 +64,13 @@ def load_processors(config: PreTrainedConfig) -> tuple[Preprocessor, Postprocess
         pretrained_path=str(config.pretrained_path),
         preprocessor_overrides={"device_processor": {"device": str(config.device)}},
     )
+
+
+def add_folder_arguments(parser: argparse.ArgumentParser, checkpoint: str, output: str) -> None:
+    """Declare --policy.path, a checkpoint's folder, and --output, a new one."""
+    path = f"folder of {checkpoint} that lerobot-train names pretrained_model"
+    parser.add_argument("--policy.path", dest="policy_path", type=Path, required=True, help=path)
+    parser.add_argument("--output", type=Path, required=True, help=output)
 
 
 def write_checkpoint(

@@ -7,16 +7,14 @@ from lerobot.configs import PreTrainedConfig
 from lerobot.policies import PreTrainedPolicy, get_policy_class
 
 from lerobot_bomb.adapters import check_adapters
-from lerobot_bomb.checkpoint import load_processors, read_config, write_checkpoint
+from lerobot_bomb.checkpoint import add_folder_arguments, load_processors, read_config, write_checkpoint
 from lerobot_bomb.hub.checks import ADAPTERS
 from lerobot_bomb.viewing.unfinished import check_new_folder
 
 
 def add_merge_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the arguments of ``lerobot-bomb merge``."""
-    path = "folder of the adapters' checkpoint that lerobot-train names pretrained_model"
-    parser.add_argument("--policy.path", dest="policy_path", type=Path, required=True, help=path)
-    parser.add_argument("--output", type=Path, required=True, help="new folder for the checkpoint")
+    add_folder_arguments(parser, "the adapters' checkpoint", "new folder for the checkpoint")
 
 
 def run_merge(args: argparse.Namespace) -> int:

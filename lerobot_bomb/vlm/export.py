@@ -5,12 +5,11 @@ A policy of any type that reads the same family of models can start from it:
 """
 
 import argparse
-from pathlib import Path
 
 from lerobot.policies import PreTrainedPolicy, get_policy_class
 from tokenizers import Tokenizer
 
-from lerobot_bomb.checkpoint import Preprocessor, load_processors, read_config
+from lerobot_bomb.checkpoint import Preprocessor, add_folder_arguments, load_processors, read_config
 from lerobot_bomb.viewing.unfinished import check_new_folder, written_whole
 from lerobot_bomb.vlm.backbone import SmolVLMBackbone
 from lerobot_bomb.vlm.paligemma import PaliGemmaBackbone
@@ -19,9 +18,7 @@ from lerobot_bomb.vlm.qwen import QwenBackbone
 
 def add_export_backbone_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the arguments of ``lerobot-bomb export-backbone``."""
-    path = "folder of the checkpoint that lerobot-train names pretrained_model"
-    parser.add_argument("--policy.path", dest="policy_path", type=Path, required=True, help=path)
-    parser.add_argument("--output", type=Path, required=True, help="new folder")
+    add_folder_arguments(parser, "the checkpoint", "new folder")
 
 
 def run_export_backbone(args: argparse.Namespace) -> int:
