@@ -224,25 +224,45 @@ def test_on_a_copy_it_writes_what_the_model_writes_now(backbone: SmolVLMBackbone
     assert answers[0] != ours(changing, prompts(changing, 0, LENGTHS), SYMBOL_IDS, drafted=True)
 
 
-@pytest.mark.long
-@pytest.mark.parametrize("name", ["smolvlm", "paligemma"])
-@torch.no_grad()
-def test_compiled_layers_compute_the_same(name: str) -> None:
+@pytest.fixture(params=["smolvlm", "paligemma"])
+def text_model(request: pytest.FixtureRequest) -> Any:
     nano = load_tokenizer(NANO)
-    vlm = (
-        build_backbone(nano_config(nano))
-        if name == "smolvlm"
-        else build_paligemma(nano_paligemma_config(nano))
-    ).vlm
-    model: Any = vlm.model.text_model if name == "smolvlm" else vlm.model.language_model
-    embeds_BKH = torch.randn(3, 6, model.config.hidden_size, generator=torch.Generator().manual_seed(0))
-    columns_BK = torch.arange(6).expand(3, 6)
-    states = []
-    for compiled in False, True:
-        text = CachedText(TextLayers(model, compiled=compiled), 3, 20)
-        prompt = text(embeds_BKH[:, :5], columns_BK[:, :5])
-        states.append(torch.cat([prompt, text(embeds_BKH[:, 5:], columns_BK[:, 5:])], dim=1))
-    torch.testing.assert_close(states[1], states[0], rtol=0, atol=1e-4)
+    if request.param == "smolvlm":
+        return build_backbone(nano_config(nano)).vlm.model.text_model
+    return build_paligemma(nano_paligemma_config(nano)).vlm.model.language_model
+
+
+@torch.no_grad()
+def states_of_nine_tokens(model: Any, *, compiled: bool = False) -> Tensor:
+    """Five as a prompt, two as a pass, two singly."""
+    embeds_BKH = torch.randn(3, 9, model.config.hidden_size, generator=torch.Generator().manual_seed(0))
+    columns_BK = torch.arange(9).expand(3, 9)
+    text = CachedText(TextLayers(model, compiled=compiled), 3, 20)
+    states = [text(embeds_BKH[:, part], columns_BK[:, part]) for part in (slice(5), slice(5, 7))]
+    passes = zip(embeds_BKH[:, 7:].split(1, dim=1), text.singly(columns_BK[:, 7:]), strict=True)
+    states += [text.read(embeds_B1H, columns) for embeds_B1H, columns in passes]
+    return torch.cat(states, dim=1)
+
+
+def test_singly_and_with_projections_that_are_not_plain_states_are_the_same(text_model: Any) -> None:
+    """As with adapters; such heads are turned another way."""
+    states = states_of_nine_tokens(text_model)
+    together = CachedText(TextLayers(text_model), 3, 20)
+    embeds_BKH = torch.randn(3, 9, text_model.config.hidden_size, generator=torch.Generator().manual_seed(0))
+    with torch.no_grad():
+        torch.testing.assert_close(
+            together(embeds_BKH, torch.arange(9).expand(3, 9)), states, rtol=0, atol=1e-4
+        )
+    seen = []
+    text_model.layers[1].self_attn.k_proj.register_forward_hook(lambda *_: seen.append(1))
+    torch.testing.assert_close(states_of_nine_tokens(text_model), states, rtol=0, atol=1e-4)
+    assert len(seen) == 4
+
+
+@pytest.mark.long
+def test_compiled_layers_compute_the_same(text_model: Any) -> None:
+    compiled = states_of_nine_tokens(text_model, compiled=True)
+    torch.testing.assert_close(compiled, states_of_nine_tokens(text_model), rtol=0, atol=1e-4)
 
 
 @torch.no_grad()

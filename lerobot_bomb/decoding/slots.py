@@ -109,12 +109,12 @@ def choose(
     columns_BL = text.columns_of(prompt.written)
     reach_BL = last_B1.expand_as(columns_BL) if prompt_reads_all else columns_BL
     hidden_BKH = text(prompt.embeds, columns_BL, reach_BL)
-    choices = []
-    for column, slot in enumerate(slots, 1):
-        choices.append(linear(hidden_BKH[:, -1], head_CH[slot]).argmax(dim=-1))
-        if column < len(slots):
-            embeds_BH = embedding(choices[-1] + slot.start, embeds_CH)
-            hidden_BKH = text(embeds_BH[:, None], last_B1 + column)
+    choices = [linear(hidden_BKH[:, -1], head_CH[slots[0]]).argmax(dim=-1)]
+    passes = text.singly(last_B1 + torch.arange(1, len(slots), device=last_B1.device))
+    for columns, before, slot in zip(passes, slots[:-1], slots[1:], strict=True):
+        embeds_BH = embedding(choices[-1], embeds_CH[before])
+        hidden_BKH = text.read(embeds_BH[:, None], columns)
+        choices.append(linear(hidden_BKH[:, 0], head_CH[slot]).argmax(dim=-1))
     return torch.stack(choices, dim=1)
 
 

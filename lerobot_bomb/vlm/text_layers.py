@@ -11,12 +11,15 @@ import copy
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import partial
-from typing import Any, TypeGuard
+from typing import Any
 
 import torch
 from torch import Tensor, nn
 from torch.nn.functional import rms_norm, scaled_dot_product_attention
 from transformers.models.gemma2.modeling_gemma2 import Gemma2DecoderLayer, Gemma2RMSNorm
+
+from lerobot_bomb.vlm.products import cast, make_product, make_products
+from lerobot_bomb.vlm.text_heads import Heads, TurnedHalves, TurnedNeighbours, softcap_of
 
 # sizes of passes that may be compiled in a process; torch's own limit is 8
 MAX_COMPILED = 64
@@ -28,8 +31,7 @@ class Columns:
 
     shape: tuple[int, int, int, int, int]  # B, K, V, G, E
     slots: Tensor  # (N, 2 * V) int64 rows of a layer's flat cache, keys' before values'
-    cos: Tensor  # (N, 1, E)
-    sin: Tensor  # (N, 1, E), negative in the first half
+    turns: Tensor  # (N, 1, ...) rotary positions, as `TextLayers.turns`
     penalty: Tensor  # (B, 1, X, C): 0 for those that a query reads, else -inf
 
 
@@ -52,7 +54,14 @@ class TextLayers:
                 self._copied += _same_parameters(copied, source)
             modules = copies
         *layers, norm = modules
-        self._layers = [_Layer(layer, is_copy=copy_dtype is not None) for layer in layers]
+        is_copy = copy_dtype is not None
+        # torch does not compile operations on complex numbers
+        by_neighbours = not (is_copy or compiled) and all(
+            TurnedNeighbours.can(layer.self_attn) for layer in layers
+        )
+        self._turns = TurnedNeighbours.turns if by_neighbours else TurnedHalves.turns
+        make_heads = TurnedNeighbours if by_neighbours else partial(TurnedHalves, is_copy=is_copy)
+        self._layers = [_Layer(layer, make_heads, is_copy=is_copy) for layer in layers]
         self._norm = _RMSNorm(norm)
         self._run = _compile_layer() if compiled else _Layer.__call__
 
@@ -69,6 +78,11 @@ class TextLayers:
         for layer, cache_Z2CE in zip(self._layers, caches, strict=True):
             x_NH = self._run(layer, x_NH, columns, cache_Z2CE)
         return self._norm(x_NH).view(x_BKH.shape)
+
+    def turns(self, position_C: Tensor) -> Tensor:
+        """(C, 1, ...) rotary positions, as the layers want them."""
+        cos_1CE, sin_1CE = self.rotary_emb(self.embedding, position_C[None])
+        return self._turns(cos_1CE[0], sin_1CE[0])
 
     @torch.no_grad()
     def refresh(self) -> None:
@@ -100,15 +114,12 @@ def _same_parameters(copied: nn.Module, source: nn.Module) -> list[tuple[Tensor,
 class _Layer:
     """A layer, its modules looked up once."""
 
-    def __init__(self, layer: Any, *, is_copy: bool):
+    def __init__(self, layer: Any, make_heads: Callable[[Any], Heads], *, is_copy: bool):
         attention, mlp = layer.self_attn, layer.mlp
-        qkv, gate_up = [attention.q_proj, attention.k_proj, attention.v_proj], [mlp.gate_proj, mlp.up_proj]
-        # those of a model are small beside its others: joining them anew costs less than it brings
-        self._qkv = _joined_products(qkv, are_copies=is_copy)
-        self._gate_up = _joined_products(gate_up, are_copies=True) if is_copy else _products(gate_up)
-        self._out, self._down = _product(attention.o_proj), _product(mlp.down_proj)
-        self._softcap: float | None = getattr(attention, "attn_logit_softcapping", None)
-        self._scale: float = attention.scaling * (1 if self._softcap is None else 2 / self._softcap)
+        self._heads = make_heads(attention)
+        self._gate_up = make_products([mlp.gate_proj, mlp.up_proj], are_copies=is_copy)
+        self._out, self._down = make_product(attention.o_proj), make_product(mlp.down_proj)
+        self._softcap = softcap_of(attention)
         self._activate: Callable[[Tensor], Tensor] = mlp.act_fn.forward
         self._before_attention = _RMSNorm(layer.input_layernorm)
         is_gemma = isinstance(layer, Gemma2DecoderLayer)
@@ -130,37 +141,34 @@ class _Layer:
         return _add(x_NH, self._mix(self._before_mlp(x_NH)), self._after_mlp)
 
     def _attend(self, x_NH: Tensor, columns: Columns, cache_Z2CE: Tensor) -> Tensor:
-        batch_size, num_tokens, num_keys, _, size = columns.shape
+        query, new = self._heads(x_NH, columns.turns)
         dtype = cache_Z2CE.dtype
-        parts = self._qkv(x_NH)
-        joined = parts[0] if len(parts) == 1 else torch.cat(parts, dim=-1)
-        heads = _cast(joined, columns.cos.dtype).view(batch_size * num_tokens, -1, size)
-        _rotate_(heads[:, :-num_keys], columns)
-        cache_Z2CE.view(-1, size).index_put_((columns.slots,), _cast(heads[:, -2 * num_keys :], dtype))
-        query = _cast(heads[:, : -2 * num_keys] * self._scale, dtype)
+        cache_Z2CE.view(-1, new.shape[-1]).index_put_((columns.slots,), cast(new, dtype))
         # the queries that share a key stand beside each other: one product a key-value head
-        query_BVKGE = query.view(columns.shape).transpose(1, 2)
-        query_BVXE = query_BVKGE.reshape(batch_size, num_keys, -1, size)
+        query_BVKGE = cast(query, dtype).view(columns.shape).transpose(1, 2)
         keys_ZCE, values_ZCE = cache_Z2CE.narrow(2, 0, columns.penalty.shape[-1]).unbind(dim=1)
-        read_BVXE = self._read(query_BVXE, keys_ZCE, values_ZCE, columns.penalty)
-        read_BKVGE = read_BVXE.view(query_BVKGE.shape).transpose(1, 2)
-        return self._out(read_BKVGE.reshape(batch_size * num_tokens, -1))
+        read = self._read(query_BVKGE, keys_ZCE, values_ZCE, columns.penalty)
+        return self._out(read.view(query_BVKGE.shape).transpose(1, 2).reshape(len(x_NH), -1))
 
-    def _read(self, query_BVXE: Tensor, keys_ZCE: Tensor, values_ZCE: Tensor, penalty_B1XC: Tensor) -> Tensor:
-        """(B, V, X, E) what queries read."""
+    def _read(
+        self, query_BVKGE: Tensor, keys_ZCE: Tensor, values_ZCE: Tensor, penalty_B1XC: Tensor
+    ) -> Tensor:
+        """What queries read, of as many numbers."""
+        batch_size, num_keys, *_, size = query_BVKGE.shape
         if self._softcap is None:
-            shape = *query_BVXE.shape[:2], -1, query_BVXE.shape[-1]
-            keys_BVCE, values_BVCE = keys_ZCE.view(shape), values_ZCE.view(shape)
+            keys_BVCE = keys_ZCE.view(batch_size, num_keys, -1, size)
+            values_BVCE = values_ZCE.view(keys_BVCE.shape)
             return scaled_dot_product_attention(
-                query_BVXE, keys_BVCE, values_BVCE, attn_mask=penalty_B1XC, scale=1.0
+                query_BVKGE.flatten(2, 3), keys_BVCE, values_BVCE, attn_mask=penalty_B1XC, scale=1.0
             )
         # of p = 2 * product / softcap, softcap * tanh(p / 2) is 2 * softcap * sigmoid(p) but for a constant,
         # which softmax does not see; the sigmoid is faster
-        products_ZXC = torch.bmm(query_BVXE.flatten(0, 1), keys_ZCE.transpose(1, 2))
-        likeness_BVXC = _cast(products_ZXC, torch.float32).sigmoid_().view(*query_BVXE.shape[:3], -1)
+        products_ZXC = torch.bmm(query_BVKGE.reshape(len(keys_ZCE), -1, size), keys_ZCE.transpose(1, 2))
+        likeness_ZXC = cast(products_ZXC, torch.float32).sigmoid_()
+        likeness_BVXC = likeness_ZXC.view(batch_size, num_keys, *likeness_ZXC.shape[1:])
         scores_BVXC = torch.add(penalty_B1XC, likeness_BVXC, alpha=2 * self._softcap)
-        weights_BVXC = _cast(scores_BVXC.softmax(dim=-1), query_BVXE.dtype)
-        return torch.bmm(weights_BVXC.flatten(0, 1), values_ZCE).view(query_BVXE.shape)
+        weights_BVXC = cast(scores_BVXC.softmax(dim=-1), values_ZCE.dtype)
+        return torch.bmm(weights_BVXC.flatten(0, 1), values_ZCE)
 
     def _mix(self, x_NH: Tensor) -> Tensor:
         parts = self._gate_up(x_NH)
@@ -174,44 +182,6 @@ def _compile_layer() -> Callable[[_Layer, Tensor, Columns, Tensor], Tensor]:
     return torch.compile(_Layer.__call__, dynamic=False)
 
 
-_Products = Callable[[Tensor], list[Tensor]]
-
-
-def _products(modules: list[nn.Module]) -> _Products:
-    """Projections of the same input."""
-    products = [_product(module) for module in modules]
-    return lambda x: [product(x) for product in products]
-
-
-def _joined_products(modules: list[nn.Module], *, are_copies: bool) -> _Products:
-    """The same as a single one, where they are plain; the weights of copies move beside each other."""
-    linears = [module for module in modules if _is_plain(module)]
-    if len(linears) < len(modules):
-        return _products(modules)
-    joined = []
-    for parts in zip(*(linear.parameters() for linear in linears), strict=True):
-        joined.append(torch.cat([part.detach() for part in parts]))
-        if are_copies:
-            for part, own in zip(parts, joined[-1].split([len(part) for part in parts]), strict=True):
-                part.data = own
-    product = _multiply(*joined)
-    return lambda x: [product(x)]
-
-
-def _product(module: nn.Module) -> Callable[[Tensor], Tensor]:
-    """A projection; a plain one without `Module.__call__`, which is half of a small product's time."""
-    return _multiply(*module.parameters()) if _is_plain(module) else module
-
-
-def _multiply(weight: Tensor, bias: Tensor | None = None) -> Callable[[Tensor], Tensor]:
-    transposed = weight.detach().t()
-    return partial(torch.mm, mat2=transposed) if bias is None else partial(torch.addmm, bias, mat2=transposed)
-
-
-def _is_plain(module: nn.Module) -> TypeGuard[nn.Linear]:
-    return type(module) is nn.Linear and not (module._forward_hooks or module._forward_pre_hooks)
-
-
 class _RMSNorm:
     """A model's norm; what its weight alone decides is computed once.
 
@@ -222,6 +192,7 @@ class _RMSNorm:
         self._is_gemma = isinstance(norm, Gemma2RMSNorm)
         self._eps = norm.eps if self._is_gemma else norm.variance_epsilon
         self._source: Tensor = norm.weight
+        self.is_on_host = norm.weight.device.type == "cpu"
         self._weight = 1 + norm.weight.float() if self._is_gemma else norm.weight
         width = len(norm.weight)
         self.scale, self._least_length = self._weight * width**0.5, torch.tensor((width * self._eps) ** 0.5)
@@ -233,7 +204,7 @@ class _RMSNorm:
 
     def __call__(self, x: Tensor) -> Tensor:
         """(..., H) -> (..., H)."""
-        if _in_float32_on_host(x):
+        if self.is_on_host and x.dtype == torch.float32:
             return self.unscaled(x).mul_(self.scale)
         if self._is_gemma:
             return rms_norm(x.float(), x.shape[-1:], self._weight, self._eps).type_as(x)
@@ -248,21 +219,6 @@ def _add(x: Tensor, new: Tensor, norm: _RMSNorm | None) -> Tensor:
     """Of the same shape: x and what a part of a layer adds to it."""
     if norm is None:
         return x + new
-    if _in_float32_on_host(x) and _in_float32_on_host(new):
+    if norm.is_on_host and x.dtype == new.dtype == torch.float32:
         return torch.addcmul(x, norm.unscaled(new), norm.scale)
     return x + norm(new)
-
-
-def _cast(x: Tensor, dtype: torch.dtype) -> Tensor:
-    # `Tensor.to` takes as long as a small product even where there is nothing to do
-    return x if x.dtype == dtype else x.to(dtype)
-
-
-def _in_float32_on_host(x: Tensor) -> bool:
-    return x.dtype == torch.float32 and x.device.type == "cpu"
-
-
-def _rotate_(heads: Tensor, columns: Columns) -> None:
-    """(N, heads, E) get their rotary positions in place."""
-    half_turned = heads.roll(heads.shape[-1] // 2, dims=-1)
-    heads.mul_(columns.cos).addcmul_(half_turned, columns.sin)
