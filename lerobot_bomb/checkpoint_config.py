@@ -14,7 +14,10 @@ from lerobot_bomb import __version__
 
 
 class PackageVersion(str):
-    """A config's field of this type is the installed version; reading a newer one is an error."""
+    """A config's field of this type is the installed version; reading one of a newer release is an error.
+
+    Releases that differ in the third number only read each other's checkpoints.
+    """
 
 
 INSTALLED = PackageVersion(__version__)
@@ -27,7 +30,7 @@ def _decode(written_by: str, path: Sequence[str]) -> PackageVersion:
     Raises:
         DecodingError: the checkpoint is newer; its fields and weights may mean what nobody here knows.
     """
-    if Version(written_by) > Version(__version__):
+    if Version(written_by).release[:2] > Version(__version__).release[:2]:
         raise DecodingError(
             path,
             f"this checkpoint was written by lerobot_bomb {written_by}, newer than the installed "

@@ -37,6 +37,11 @@ class DatasetFacts:
         except json.JSONDecodeError as error:
             raise ValueError(f"{root / 'meta'} holds a file that is not JSON: {error}") from error
 
+    @classmethod
+    def find(cls, root: Path | str | None) -> "DatasetFacts | None":
+        """Of a folder where a dataset was, if one still is there."""
+        return cls.read(Path(root)) if root and (Path(root) / INFO_FILE).is_file() else None
+
     @property
     def recording(self) -> dict[str, Any]:
         """Parameters of `lerobot-bomb record`, or {}."""

@@ -12,7 +12,7 @@ from torch import Tensor
 from lerobot_bomb.adapters import base_commit, check_adapters, check_base
 from lerobot_bomb.hub.card import Checkpoint
 from lerobot_bomb.hub.checks import PROCESSORS, check_tensors, processor_files
-from lerobot_bomb.hub.dataset import INFO_FILE, DatasetFacts
+from lerobot_bomb.hub.dataset import DatasetFacts
 from lerobot_bomb.hub.method import Method
 from lerobot_bomb.hub.names import is_hub_id
 from lerobot_bomb.hub.push import publish
@@ -92,14 +92,13 @@ class HubPolicy:
         base = None if peft_model is None else str(peft_model.active_peft_config.base_model_name_or_path)
         if base is not None:
             check_base(base)
-        root = None if dataset_meta is None else Path(dataset_meta.root)
         card = Checkpoint(
             config=self.config,
             method=self.method,
             repo_id=self.config.repo_id,
             dataset_id=cfg.dataset.repo_id,
             training=cfg,
-            dataset=DatasetFacts.read(root) if root is not None and (root / INFO_FILE).is_file() else None,
+            dataset=None if dataset_meta is None else DatasetFacts.find(dataset_meta.root),
             license=self.config.license,
             tags=self.config.tags or [],
             adapters_of=base,

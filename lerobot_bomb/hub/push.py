@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 from lerobot_bomb.data.growing import check_repo_id, switch
 from lerobot_bomb.evaluation.results import read_results
-from lerobot_bomb.hub.dataset import INFO_FILE, DatasetFacts, Row
+from lerobot_bomb.hub.dataset import DatasetFacts, Row
 from lerobot_bomb.hub.names import CONFIG, TO_PUBLISH, TRAIN_CONFIG, is_local_path
 
 if TYPE_CHECKING:
@@ -148,5 +148,4 @@ def _read_dataset(training: "TrainPipelineConfig | None", given: Path | None) ->
     """Of the folder given, or of that of the training if it still is there."""
     if given is not None:
         return DatasetFacts.read(given)
-    root = training.dataset.root if training is not None else None
-    return DatasetFacts.read(Path(root)) if root and (Path(root) / INFO_FILE).is_file() else None
+    return None if training is None else DatasetFacts.find(training.dataset.root)

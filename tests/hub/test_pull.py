@@ -28,6 +28,7 @@ from hub.damage import (
     write,
 )
 from hub.server import LoopbackHub, Repository
+from lerobot_bomb import __version__
 
 Run = Callable[..., None]
 REPO_ID = "me/x"
@@ -172,6 +173,14 @@ def test_the_other_class_and_a_newer_version_of_each_type(
     NEWER(tmp_path)
     text = told(lambda: get_policy_class(policy_type).from_pretrained(tmp_path), capsys)
     assert "written by lerobot_bomb 99.0" in text
+
+
+@pytest.mark.parametrize("version", ["0.0.9", "0.1.9"])
+def test_an_older_version_and_a_later_one_of_the_same_release_are_read(version: str, tmp_path: Path) -> None:
+    vla0_smol_cases.make_policy().save_pretrained(tmp_path)
+    change_config(package_version=version)(tmp_path)
+    config: Any = get_policy_class("vla0_smol").from_pretrained(tmp_path).config
+    assert config.package_version == __version__
 
 
 def test_nothing_is_unpickled_and_no_code_of_a_checkpoint_runs(
