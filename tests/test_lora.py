@@ -5,17 +5,14 @@ import json
 import shutil
 from collections.abc import Callable
 from pathlib import Path
-from types import ModuleType
 from typing import Any
 
-import fdvla_cases
 import pytest
-import spatialvla_grid_cases
 import torch
-import vla0_smol_cases
 from lerobot.datasets import LeRobotDatasetMetadata
 from lerobot.envs import make_env_config
 from lerobot.policies import get_policy_class, make_policy
+from policy_cases import CASES
 from safetensors.torch import load_file
 
 from lerobot_bomb.checkpoint import read_config
@@ -27,11 +24,6 @@ peft = pytest.importorskip("peft")
 
 Run = Callable[..., None]
 REPO_ID = "test/lora"
-CASES: dict[str, ModuleType] = {
-    "fdvla": fdvla_cases,
-    "spatialvla_grid": spatialvla_grid_cases,
-    "vla0_smol": vla0_smol_cases,
-}
 NEW_PARTS = {
     "fdvla": {"segment", "state_embedding", "flow_head", "denoise_head"},
     "spatialvla_grid": {"cell_embedding", "cell_head", "ego3d"},

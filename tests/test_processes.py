@@ -3,25 +3,18 @@
 from collections.abc import Callable
 from pathlib import Path
 
-import fdvla_cases
 import numpy as np
 import pytest
-import spatialvla_grid_cases
 import torch
-import vla0_smol_cases
 from lerobot.datasets import LeRobotDataset
 from lerobot.policies.factory import get_policy_class
+from policy_cases import CASES
 from recipes import POLICY_TYPES, recipe_path
 from training_processes import NUM_PROCESSES, Seen, Training, draws_by_sample, in_processes, seen_losses
 
 REPO_ID = "overfit/bomb_place"  # the recipes'
 BATCH_SIZE, NUM_EPISODES, EPISODE_LENGTH = 2, 3, 4
 STEPS, SAVE_FREQ = 4, 2  # an epoch is 3 steps long
-CASES = {
-    "fdvla": fdvla_cases,
-    "spatialvla_grid": spatialvla_grid_cases,
-    "vla0_smol": vla0_smol_cases,
-}
 # nothing is drawn but what `draws_by_sample` makes a function of the sample
 FIXED = {
     "fdvla": ["--policy.draws_per_chunk=1"],

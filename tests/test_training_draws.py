@@ -1,23 +1,15 @@
 """What is random in training follows from the seed, the process and the number of batches before."""
 
 from collections.abc import Callable
-from types import ModuleType
 from typing import Any
 
-import fdvla_cases
 import pytest
-import spatialvla_grid_cases
 import torch
-import vla0_smol_cases
+from policy_cases import CASES
 from torch import Tensor, distributed
 
 from lerobot_bomb.training_draws import begin_batch
 
-CASES: dict[str, ModuleType] = {
-    "fdvla": fdvla_cases,
-    "spatialvla_grid": spatialvla_grid_cases,
-    "vla0_smol": vla0_smol_cases,
-}
 CROPPED = {"crop_fraction": 0.7}
 
 

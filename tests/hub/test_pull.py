@@ -5,14 +5,12 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-import fdvla_cases
 import pytest
-import spatialvla_grid_cases
 import torch
 import transformers.dynamic_module_utils
-import vla0_smol_cases
 from lerobot.policies import get_policy_class, make_pre_post_processors
 from lerobot.scripts import lerobot_eval
+from policy_cases import CASES
 
 from hub.damage import (
     POSTPROCESSOR,
@@ -32,11 +30,6 @@ from lerobot_bomb import __version__
 
 Run = Callable[..., None]
 REPO_ID = "me/x"
-CASES: dict[str, Any] = {
-    "fdvla": fdvla_cases,
-    "spatialvla_grid": spatialvla_grid_cases,
-    "vla0_smol": vla0_smol_cases,
-}
 
 
 class LoadedError(Exception):
@@ -177,7 +170,7 @@ def test_the_other_class_and_a_newer_version_of_each_type(
 
 @pytest.mark.parametrize("version", ["0.0.9", "0.1.9"])
 def test_an_older_version_and_a_later_one_of_the_same_release_are_read(version: str, tmp_path: Path) -> None:
-    vla0_smol_cases.make_policy().save_pretrained(tmp_path)
+    CASES["vla0_smol"].make_policy().save_pretrained(tmp_path)
     change_config(package_version=version)(tmp_path)
     config: Any = get_policy_class("vla0_smol").from_pretrained(tmp_path).config
     assert config.package_version == __version__

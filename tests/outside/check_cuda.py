@@ -10,6 +10,7 @@ import pytest
 import spatialvla_grid_cases
 import torch
 import vla0_smol_cases
+from policy_cases import CASES
 from torch import Tensor
 
 WRITERS = {
@@ -48,12 +49,7 @@ def exact() -> Iterator[None]:
 
 
 def batch_for(policy: Any, batch_size: int, seed: int = 0) -> dict[str, Any]:
-    cases: Any = {
-        "vla0_smol": vla0_smol_cases,
-        "spatialvla_grid": spatialvla_grid_cases,
-        "fdvla": fdvla_cases,
-    }
-    return cases[policy.name].make_batch(policy, batch_size, seed)
+    return CASES[policy.name].make_batch(policy, batch_size, seed)
 
 
 def on(device: str, batch: dict[str, Any]) -> dict[str, Any]:
