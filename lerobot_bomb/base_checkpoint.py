@@ -35,7 +35,6 @@ class _Flags:
 
 def add_init_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the arguments of ``lerobot-bomb init``; the policy's flags are LeRobot's parser's."""
-    parser.allow_abbrev = False
     parser.set_defaults(rest=[])
     parser.usage = (
         "lerobot-bomb init --policy.type=TYPE --dataset.repo_id=ID --output=DIR (all flags --policy.*)"

@@ -7,6 +7,7 @@ from typing import Any
 
 import draccus
 from draccus.utils import DecodingError
+from huggingface_hub.errors import LocalEntryNotFoundError
 from lerobot.configs import PreTrainedConfig
 from packaging.version import Version
 
@@ -55,6 +56,8 @@ def tell_config_errors() -> None:
     ) -> PreTrainedConfig:
         try:
             return usual.__func__(cls, pretrained_name_or_path, **options)
+        except LocalEntryNotFoundError as error:
+            raise DecodingError((), f"there is no folder {pretrained_name_or_path} here. {error}") from error
         except (ValueError, TypeError) as error:
             start = f"{pretrained_name_or_path}: its config.json cannot be read: "
             raise DecodingError((), start + str(error)) from error

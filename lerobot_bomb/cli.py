@@ -71,7 +71,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     modules = {}
     try:
         for name, (summary, module) in COMMANDS.items():
-            command = commands.add_parser(name, help=summary, description=summary)
+            command = commands.add_parser(name, help=summary, description=summary, allow_abbrev=False)
             if name in argv[:1]:
                 modules[name] = importlib.import_module(module)
                 getattr(modules[name], f"add_{_function(name)}_arguments")(command)

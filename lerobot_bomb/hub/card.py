@@ -106,9 +106,12 @@ class Checkpoint:
     def _introduction(self) -> str:
         protocol = protocol_version(self.dataset, bool(self.results))
         benchmark = f" Benchmark: BOMB, protocol version {protocol}." if protocol else ""
+        is_trained = self.adapters_of or getattr(self.config, "trained_batches") > 0  # noqa: B009  our types'
+        start = "" if is_trained else " LeRobot has not trained it: it is a start, or was converted."
         return (
-            f"{self.method.summary}\n\nA checkpoint of LeRobot's policy type `{self.config.type}`, which the "
-            f"plugin `lerobot_policy_bomb` adds. Backbone: {self._backbone()}; {self._contents()}{benchmark}"
+            f"A checkpoint of LeRobot's policy type `{self.config.type}`, which the plugin "
+            f"`lerobot_policy_bomb` adds.{start} Backbone: {self._backbone()}; {self._contents()}{benchmark}"
+            f"\n\nThe policy type: {self.method.summary}"
         )
 
     def _contents(self) -> str:
@@ -120,7 +123,7 @@ class Checkpoint:
         if self.backbone is not None:
             return f"`{self.backbone}`"
         name = getattr(self.config, "vlm_model_name", None)
-        return "a small one with random weights" if name == NANO else "a local one"
+        return "a small one, trained from random weights" if name == NANO else "a local one"
 
     def _install(self) -> str:
         package = "'.[lora]'" if self.adapters_of else "."
@@ -150,8 +153,9 @@ class Checkpoint:
     def _train(self) -> str:
         notes = []
         start = self.config.pretrained_path
+        as_was = "As this checkpoint was"
         if start and not is_hub_id(start):
-            notes.append("It started from a checkpoint that has no name on the Hub.")
+            as_was += ", but for its start, a checkpoint that has no name on the Hub"
         if self._backbone() == "a local one":
             notes.append(
                 "Its backbone came from a folder; the command starts from the type's usual one."
@@ -170,7 +174,7 @@ class Checkpoint:
         )
         return "\n\n".join(
             [
-                "As this checkpoint was; `train_config.json` has all values:",
+                f"{as_was}; `train_config.json` has all values:",
                 fenced(train_command(self.config, self.training, dataset_id)),
                 *notes,
                 "From this checkpoint on:",

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 from lerobot_bomb.data.growing import check_repo_id, switch
 from lerobot_bomb.evaluation.results import read_results
 from lerobot_bomb.hub.dataset import DatasetFacts, Row
-from lerobot_bomb.hub.names import CONFIG, TO_PUBLISH, TRAIN_CONFIG, is_local_path
+from lerobot_bomb.hub.names import CONFIG, DRY_RUN, TO_PUBLISH, TRAIN_CONFIG, is_local_path
 
 if TYPE_CHECKING:
     from huggingface_hub import CommitInfo
@@ -44,20 +44,26 @@ def add_push_arguments(parser: argparse.ArgumentParser) -> None:
         "it shows",
     )
     add("--private", **switch(), help="make a new repository that only you see")
+    add("--dry_run", **switch(), help=DRY_RUN)
 
 
 def run_push(args: argparse.Namespace) -> int:
     """Check the checkpoint, then publish all of it in one commit; prints where."""
     check_repo_id(args.repo_id)
     results = [read_results(path) for path in args.results]
+    dataset = None if args.dataset_root is None else DatasetFacts.read(args.dataset_root)
     from lerobot_bomb.hub.checks import checkpoint_files  # imports torch: seconds
     from lerobot_bomb.hub.upload import check_token
 
     files = {name: args.checkpoint / name for name in checkpoint_files(args.checkpoint)}
     if (args.checkpoint / TRAIN_CONFIG).is_file():
         files[TRAIN_CONFIG] = args.checkpoint / TRAIN_CONFIG
-    check_token()
-    checkpoint = _read_checkpoint(args.checkpoint, args.repo_id, args.dataset_root, results)
+    if not args.dry_run:
+        check_token()
+    checkpoint = _read_checkpoint(args.checkpoint, args.repo_id, dataset, results)
+    if args.dry_run:
+        print(checkpoint.card(), *sorted(files), sep="\n")
+        return 0
     print(publish(checkpoint, files, args.private or None).commit_url)
     return 0
 
@@ -90,7 +96,7 @@ def _is_of_checkpoint(path: str) -> bool:
 
 
 def _read_checkpoint(
-    folder: Path, repo_id: str, dataset_root: Path | None, results: list[list[Row]]
+    folder: Path, repo_id: str, dataset: DatasetFacts | None, results: list[list[Row]]
 ) -> "Checkpoint":
     """What its card is made of, after all checks."""
     from lerobot.utils.import_utils import register_third_party_plugins
@@ -111,13 +117,15 @@ def _read_checkpoint(
     else:
         check_weights(folder, config, policy_type)
     training = _read_training(folder)
+    if dataset is None and training is not None:  # it may still be where the training found it
+        dataset = DatasetFacts.find(training.dataset.root)
     return Checkpoint(
         config=config,
         method=policy_type.method,
         repo_id=repo_id,
         dataset_id=training.dataset.repo_id if training is not None else None,
         training=training,
-        dataset=_read_dataset(training, dataset_root),
+        dataset=dataset,
         results=results,
         license=config.license,
         tags=config.tags or [],
@@ -142,10 +150,3 @@ def _read_training(folder: Path) -> "TrainPipelineConfig | None":
     if not (folder / TRAIN_CONFIG).is_file():
         return None
     return TrainPipelineConfig.from_pretrained(folder)
-
-
-def _read_dataset(training: "TrainPipelineConfig | None", given: Path | None) -> DatasetFacts | None:
-    """Of the folder given, or of that of the training if it still is there."""
-    if given is not None:
-        return DatasetFacts.read(given)
-    return None if training is None else DatasetFacts.find(training.dataset.root)

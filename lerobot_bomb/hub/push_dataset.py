@@ -10,6 +10,7 @@ from huggingface_hub.errors import RevisionNotFoundError
 from lerobot_bomb.data.growing import METADATA_FILE, check_repo_id, switch
 from lerobot_bomb.hub.dataset import DatasetFacts
 from lerobot_bomb.hub.markdown import command, fenced
+from lerobot_bomb.hub.names import DRY_RUN
 from lerobot_bomb.hub.upload import check_token, hub_errors, upload
 
 CARD = "README.md"
@@ -22,6 +23,7 @@ def add_push_dataset_arguments(parser: argparse.ArgumentParser) -> None:
     add("root", type=Path, metavar="ROOT", help="folder that lerobot-bomb record or convert wrote")
     add("--repo_id", required=True, help="name of the dataset on the Hub, USER/NAME")
     add("--private", **switch(), help="make a new repository that only you see")
+    add("--dry_run", **switch(), help=DRY_RUN)
 
 
 def run_push_dataset(args: argparse.Namespace) -> int:
@@ -34,14 +36,19 @@ def run_push_dataset(args: argparse.Namespace) -> int:
             "LeRobotDataset.push_to_hub publishes other datasets"
         )
     check_frames(args.root, facts)
-    check_token()
+    if not args.dry_run:
+        check_token()
     files: dict[str, Path | bytes] = {
         path.relative_to(args.root).as_posix(): path
         for folder in FOLDERS
         for path in sorted((args.root / folder).rglob("*"))
         if path.is_file()
     }
-    files[CARD] = dataset_card(args.repo_id, facts).encode()
+    card = dataset_card(args.repo_id, facts)
+    if args.dry_run:
+        print(card, *files, sep="\n")
+        return 0
+    files[CARD] = card.encode()
     message = f"{facts.info['total_episodes']} episodes and card"
     commit = upload(args.repo_id, "dataset", files, _is_data, message, private=args.private or None)
     with hub_errors(args.repo_id):

@@ -57,4 +57,5 @@ def hub_errors(repo_id: str) -> Iterator[None]:
         reason = error.server_message or f"{error.response.status_code} {error.response.reason_phrase}"
         raise RuntimeError(f"{repo_id}: the Hub answers: {' '.join(reason.split())}") from None
     except httpx.HTTPError as error:
-        raise RuntimeError(f"{repo_id}: the Hub at {constants.ENDPOINT} cannot be reached: {error}") from None
+        reason = f"the Hub at {constants.ENDPOINT} cannot be reached: {error}"
+        raise RuntimeError(f"{repo_id}: {reason}; push again: all is published at once, or nothing") from None

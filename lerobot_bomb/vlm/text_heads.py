@@ -89,7 +89,7 @@ class TurnedNeighbours:
 
 
 def scale_of_queries(attention: Any) -> float:
-    """The model's own and, where likeness is limited, the limit: p of `2 * likeness / softcap`."""
+    """The model's own; where likeness has a limit, times 2 / softcap, as text_layers.py computes it."""
     softcap = softcap_of(attention)
     return attention.scaling * (1 if softcap is None else 2 / softcap)
 

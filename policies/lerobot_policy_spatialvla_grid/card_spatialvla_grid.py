@@ -3,7 +3,7 @@
 from lerobot_bomb.hub.method import Method, Paper
 
 METHOD = Method(
-    summary="A PaliGemma 2 that chooses, for each step of a chunk, one cell of every adaptive action grid: "
+    summary="a PaliGemma 2 chooses, for each step of a chunk, one cell of every adaptive action grid: "
     "SpatialVLA, rebuilt on transformers' own classes.",
     backbone="google/paligemma2-3b-pt-224",
     backbone_license="gemma",

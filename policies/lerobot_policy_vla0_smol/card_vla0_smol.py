@@ -3,7 +3,7 @@
 from lerobot_bomb.hub.method import Method, Paper
 
 METHOD = Method(
-    summary="A stock SmolVLM2 fine-tuned to write the next actions as decimal integers, without any new "
+    summary="a stock SmolVLM2 is fine-tuned to write the next actions as decimal integers, without any new "
     "head: the recipe of VLA-0 and VLA-0-Smol.",
     backbone="HuggingFaceTB/SmolVLM2-500M-Video-Instruct",
     backbone_license="apache-2.0",

@@ -93,6 +93,13 @@ def test_commands_are_those_of_the_training_and_of_what_the_dataset_shows(tmp_pa
     assert str(tmp_path) not in text
 
 
+def test_only_what_was_not_trained_is_said_to_be_a_start() -> None:
+    text = "LeRobot has not trained it"
+    assert text in str(checkpoint().card())
+    assert text not in str(checkpoint(trained_batches=1).card())
+    assert text not in str(replace(checkpoint(), adapters_of="me/base").card())
+
+
 def test_pusht_and_datasets_of_others() -> None:
     pusht = DatasetFacts(INFO, {"conversion": {"source": "pusht-zarr 0123"}})
     assert "--env.type=pusht" in str(replace(checkpoint(), dataset=pusht).card())

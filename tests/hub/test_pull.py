@@ -152,6 +152,7 @@ def test_no_hub_and_no_such_folder(
     files = "http://127.0.0.1:9/{repo_id}/resolve/{revision}/{filename}"
     monkeypatch.setattr(constants, "HUGGINGFACE_CO_URL_TEMPLATE", files)
     text = told(lambda: evaluate(REPO_ID), capsys)
+    assert f"there is no folder {REPO_ID} here. " in text
     assert "Please check your connection" in text
     assert len(text.splitlines()) == 1
 

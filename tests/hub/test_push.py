@@ -75,6 +75,23 @@ def test_one_commit_holds_all_that_is_needed_and_nothing_of_this_machine(
     assert torch.equal(ours.predict_action_chunk(batch), theirs.predict_action_chunk(batch))
 
 
+def test_a_dry_run_prints_the_card_and_the_files_and_asks_nobody(
+    online: LoopbackHub, checkpoint: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert push(checkpoint) == 0
+    published = online.model(REPO_ID).files()
+    online.requests.clear()
+    capsys.readouterr()
+    monkeypatch.setattr("lerobot_bomb.hub.upload.get_token", lambda: None)
+    assert push(checkpoint, "--dry_run") == 0
+    card = published.pop("README.md").decode()
+    assert capsys.readouterr().out == "\n".join([card, *sorted(published), ""])
+    assert online.requests == []
+    with pytest.raises(SystemExit):
+        push(checkpoint, "--dry")
+    assert "unrecognized arguments: --dry" in capsys.readouterr().err
+
+
 BROKEN = {
     "holds no model.safetensors, so it is no checkpoint": remove(WEIGHTS),
     "model.safetensors is truncated or no safetensors file": truncate(WEIGHTS),

@@ -29,14 +29,20 @@ def copy(root: Path, folder: Path) -> Path:
     return folder
 
 
-def push(root: Path) -> int:
-    return main(["push-dataset", str(root), f"--repo_id={REPO_ID}"])
+def push(root: Path, *flags: str) -> int:
+    return main(["push-dataset", str(root), f"--repo_id={REPO_ID}", *flags])
 
 
 def test_one_commit_tagged_for_lerobot_with_a_card(
-    online: LoopbackHub, recorded: Callable[[Path], Path], tmp_path: Path
+    online: LoopbackHub,
+    recorded: Callable[[Path], Path],
+    tmp_path: Path,
+    capsys: pytest.CaptureFixture[str],
 ) -> None:
     root = recorded(tmp_path)
+    assert push(root, "--dry_run") == 0
+    foreseen = capsys.readouterr().out
+    assert online.requests == []
     assert push(root) == 0
     repository = online.dataset(REPO_ID)
     assert len(repository.messages) == 1
@@ -45,6 +51,8 @@ def test_one_commit_tagged_for_lerobot_with_a_card(
     for path in root.rglob("*.*"):
         assert files[path.relative_to(root).as_posix()] == path.read_bytes()
     card = files["README.md"].decode()
+    assert foreseen.startswith(card)
+    assert set(foreseen[len(card) :].split()) == files.keys() - {"README.md"}
     assert yaml.safe_load(card.split("---\n")[1])["task_categories"] == ["robotics"]
     for part in (
         "suite `place`",
