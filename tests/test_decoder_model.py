@@ -232,11 +232,16 @@ def text_model(request: pytest.FixtureRequest) -> Any:
     return build_paligemma(nano_paligemma_config(nano)).vlm.model.language_model
 
 
+def nine_tokens(model: Any) -> tuple[Tensor, Tensor]:
+    """Their embeddings and columns, of three rows."""
+    generator = torch.Generator().manual_seed(0)
+    return torch.randn(3, 9, model.config.hidden_size, generator=generator), torch.arange(9).expand(3, 9)
+
+
 @torch.no_grad()
 def states_of_nine_tokens(model: Any, *, compiled: bool = False) -> Tensor:
     """Five as a prompt, two as a pass, two singly."""
-    embeds_BKH = torch.randn(3, 9, model.config.hidden_size, generator=torch.Generator().manual_seed(0))
-    columns_BK = torch.arange(9).expand(3, 9)
+    embeds_BKH, columns_BK = nine_tokens(model)
     text = CachedText(TextLayers(model, compiled=compiled), 3, 20)
     states = [text(embeds_BKH[:, part], columns_BK[:, part]) for part in (slice(5), slice(5, 7))]
     passes = zip(embeds_BKH[:, 7:].split(1, dim=1), text.singly(columns_BK[:, 7:]), strict=True)
@@ -248,11 +253,8 @@ def test_singly_and_with_projections_that_are_not_plain_states_are_the_same(text
     """As with adapters; such heads are turned another way."""
     states = states_of_nine_tokens(text_model)
     together = CachedText(TextLayers(text_model), 3, 20)
-    embeds_BKH = torch.randn(3, 9, text_model.config.hidden_size, generator=torch.Generator().manual_seed(0))
     with torch.no_grad():
-        torch.testing.assert_close(
-            together(embeds_BKH, torch.arange(9).expand(3, 9)), states, rtol=0, atol=1e-4
-        )
+        torch.testing.assert_close(together(*nine_tokens(text_model)), states, rtol=0, atol=1e-4)
     seen = []
     text_model.layers[1].self_attn.k_proj.register_forward_hook(lambda *_: seen.append(1))
     torch.testing.assert_close(states_of_nine_tokens(text_model), states, rtol=0, atol=1e-4)

@@ -6,8 +6,6 @@ from typing import Any
 
 CONFIG, TRAIN_CONFIG, WEIGHTS = "config.json", "train_config.json", "model.safetensors"
 
-DRY_RUN = "print the card, and the names of the files instead of publishing them; no Hub is asked"
-
 # what to do with adapters whose base is on one machine only
 TO_PUBLISH = (
     "publish that first (lerobot-bomb push) and train with --policy.path of its name, or publish both as one "

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 from lerobot_bomb.data.growing import check_repo_id, switch
 from lerobot_bomb.evaluation.results import read_results
 from lerobot_bomb.hub.dataset import DatasetFacts, Row
-from lerobot_bomb.hub.names import CONFIG, DRY_RUN, TO_PUBLISH, TRAIN_CONFIG, is_local_path
+from lerobot_bomb.hub.names import CONFIG, TO_PUBLISH, TRAIN_CONFIG, is_local_path
 
 if TYPE_CHECKING:
     from huggingface_hub import CommitInfo
@@ -22,12 +22,24 @@ CARD = "README.md"
 LEFT_OUT = {"pretrained_path", "root", "output_dir", "checkpoint_path"}
 
 
+def add_hub_arguments(parser: argparse.ArgumentParser, kind: str) -> None:
+    """Declare where and how a model or a dataset is published."""
+    add = parser.add_argument
+    add("--repo_id", required=True, help=f"name of the {kind} on the Hub, USER/NAME")
+    add("--private", **switch(), help="make a new repository that only you see")
+    add(
+        "--dry_run",
+        **switch(),
+        help="print the card, and the names of the files instead of publishing them; no Hub is asked",
+    )
+
+
 def add_push_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the arguments of ``lerobot-bomb push``."""
     add = parser.add_argument
     folder = "the folder that lerobot-train names pretrained_model"
     add("checkpoint", type=Path, metavar="CHECKPOINT", help=folder)
-    add("--repo_id", required=True, help="name of the model on the Hub, USER/NAME")
+    add_hub_arguments(parser, "model")
     add(
         "--results",
         nargs="+",
@@ -43,8 +55,6 @@ def add_push_arguments(parser: argparse.ArgumentParser) -> None:
         help="folder of the dataset, if it is no longer where the training found it; the card states what "
         "it shows",
     )
-    add("--private", **switch(), help="make a new repository that only you see")
-    add("--dry_run", **switch(), help=DRY_RUN)
 
 
 def run_push(args: argparse.Namespace) -> int:

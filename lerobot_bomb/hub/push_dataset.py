@@ -7,23 +7,20 @@ from pathlib import Path
 from huggingface_hub import DatasetCardData, HfApi
 from huggingface_hub.errors import RevisionNotFoundError
 
-from lerobot_bomb.data.growing import METADATA_FILE, check_repo_id, switch
+from lerobot_bomb.data.growing import METADATA_FILE, check_repo_id
 from lerobot_bomb.hub.dataset import DatasetFacts
 from lerobot_bomb.hub.markdown import command, fenced
-from lerobot_bomb.hub.names import DRY_RUN
+from lerobot_bomb.hub.push import CARD, add_hub_arguments
 from lerobot_bomb.hub.upload import check_token, hub_errors, upload
 
-CARD = "README.md"
 FOLDERS = ("meta", "data", "videos")
 
 
 def add_push_dataset_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the arguments of ``lerobot-bomb push-dataset``."""
-    add = parser.add_argument
-    add("root", type=Path, metavar="ROOT", help="folder that lerobot-bomb record or convert wrote")
-    add("--repo_id", required=True, help="name of the dataset on the Hub, USER/NAME")
-    add("--private", **switch(), help="make a new repository that only you see")
-    add("--dry_run", **switch(), help=DRY_RUN)
+    help = "folder that lerobot-bomb record or convert wrote"
+    parser.add_argument("root", type=Path, metavar="ROOT", help=help)
+    add_hub_arguments(parser, "dataset")
 
 
 def run_push_dataset(args: argparse.Namespace) -> int:

@@ -64,7 +64,8 @@ class CachedText:
 
         A token reads the columns up to ``reach_BK``; without it, up to its own.
         """
-        columns = self._locate(columns_BK, columns_BK if reach_BK is None else reach_BK)
+        num_read = max(self._counts_of_columns(columns_BK))
+        columns = self._locate(columns_BK, columns_BK if reach_BK is None else reach_BK, num_read)
         return self.read(embeds_BKH, columns)
 
     def read(self, embeds_BKH: Tensor, columns: Columns) -> Tensor:
@@ -73,8 +74,8 @@ class CachedText:
 
     def singly(self, columns_BK: Tensor) -> list[Columns]:
         """Of K passes, each of a token a row which reads up to its own column; faster than one by one."""
-        together = self._locate(columns_BK, columns_BK)
         counts = self._counts_of_columns(columns_BK)
+        together = self._locate(columns_BK, columns_BK, max(counts, default=0))
         parts = zip(
             together.slots.unflatten(0, columns_BK.shape).unbind(dim=1),
             together.turns.unflatten(0, columns_BK.shape).unbind(dim=1),
@@ -102,10 +103,8 @@ class CachedText:
         self._cache = cache
         self._layer_caches = cache.flatten(1, 2).unbind()
 
-    def _locate(self, columns_BK: Tensor, reach_BK: Tensor) -> Columns:
-        unread_BKC = (
-            self._columns_C[: max(self._counts_of_columns(columns_BK), default=0)] > reach_BK[..., None]
-        )
+    def _locate(self, columns_BK: Tensor, reach_BK: Tensor, num_read: int) -> Columns:
+        unread_BKC = self._columns_C[:num_read] > reach_BK[..., None]
         penalty_BKC = torch.where(unread_BKC, self._barred, self._open)
         (batch_size, num_tokens), size = columns_BK.shape, self._cache.shape[-1]
         return Columns(

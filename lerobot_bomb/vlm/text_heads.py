@@ -22,7 +22,7 @@ class TurnedHalves:
 
     def __init__(self, attention: Any, *, is_copy: bool):
         self._products = make_products(_projections(attention), are_copies=is_copy)
-        self._scale, self._size = scale_of_queries(attention), attention.head_dim
+        self._scale, self._size = _scale_of_queries(attention), attention.head_dim
         self._num_keys = attention.config.num_key_value_heads
 
     def __call__(self, x_NH: Tensor, turns_N12E: Tensor) -> tuple[Tensor, Tensor]:
@@ -53,7 +53,7 @@ class TurnedNeighbours:
     def __init__(self, attention: Any):
         # small beside a model's other weights: copying them costs less than it brings
         self._size, self._num_keys = attention.head_dim, attention.config.num_key_value_heads
-        scale = scale_of_queries(attention)
+        scale = _scale_of_queries(attention)
         queries, keys, values = ([*part.parameters()] for part in _projections(attention))
         self._query = multiply(*(self._beside(part) * scale for part in queries))
         keys_values = zip(keys, values, strict=True)
@@ -88,7 +88,7 @@ class TurnedNeighbours:
         )
 
 
-def scale_of_queries(attention: Any) -> float:
+def _scale_of_queries(attention: Any) -> float:
     """The model's own; where likeness has a limit, times 2 / softcap, as text_layers.py computes it."""
     softcap = softcap_of(attention)
     return attention.scaling * (1 if softcap is None else 2 / softcap)
