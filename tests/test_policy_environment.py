@@ -140,7 +140,7 @@ def test_stock_policies_know_it_by_the_dataset_of_their_training(
     train += ["--num_workers=0", "--policy.device=cpu", *ACT.split(), f"--output_dir={tmp_path / 'train'}"]
     with pytest.raises(ValueError, match=rf"^this act .*{TO_ABSOLUTE}--env\.ignore_checkpoint=true"):
         stock_cli("lerobot-train", *train, "--env.type=bomb", "--env.image_size=64")
-    shutil.rmtree(tmp_path / "train")
+    assert not (tmp_path / "train").exists()
     stock_cli("lerobot-train", *train)
 
     path = tmp_path / "train" / "checkpoints" / "last" / "pretrained_model"
@@ -179,4 +179,4 @@ def test_policies_without_training_act_anywhere(untrained: str, caplog: pytest.L
     policy = make_policy(make_policy_config(untrained, device="cpu"), env_cfg=env)
     with caplog.at_level(logging.WARNING):
         act_in(policy, control_mode="absolute", fps=20)
-    assert not [record for record in caplog.records if "environment" in record.getMessage()]
+    assert not [record for record in caplog.records if "does not know" in record.getMessage()]
