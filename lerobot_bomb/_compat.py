@@ -4,16 +4,23 @@ import shutil
 import sys
 from collections.abc import Callable, Collection, Iterator, Sequence
 from contextlib import contextmanager
-from functools import partial
+from functools import partial, wraps
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
+from weakref import ref
 
 import numpy as np
 from datasets import config
 from lerobot.datasets import LeRobotDataset, aggregate, compute_stats, dataset_writer
 from lerobot.datasets.feature_utils import get_hf_features_from_features
 from lerobot.datasets.io_utils import to_parquet_with_hf_images
+from lerobot.policies import PreTrainedPolicy
 from lerobot.utils.constants import DEFAULT_FEATURES
+
+if TYPE_CHECKING:
+    from lerobot.datasets import LeRobotDatasetMetadata
+
+_BUILT: list[ref[PreTrainedPolicy]] = []  # by `remember_policies`
 
 STATISTICS_SIZE = 128  # pixels
 
@@ -117,3 +124,32 @@ def serve_registered_policies(config: Any) -> None:
     register_third_party_plugins()
     policy_server.SUPPORTED_POLICIES[:] = sorted(PreTrainedConfig.get_known_choices())
     policy_server.serve(config)
+
+
+def remember_policies() -> None:
+    """Let `built_policies` know every policy that this process builds, LeRobot's own types too.
+
+    LeRobot tells an environment nothing of the policy that will act in it. `lerobot-eval` and `lerobot-train`
+    build it before the first reset of an environment.
+    """
+    usual = PreTrainedPolicy.__init__
+
+    @wraps(usual)
+    def remembered(self: PreTrainedPolicy, *args: Any, **kwargs: Any) -> None:
+        usual(self, *args, **kwargs)
+        _BUILT.append(ref(self))
+
+    PreTrainedPolicy.__init__ = remembered
+
+
+def built_policies() -> list[PreTrainedPolicy]:
+    """The policies that this process built and still holds, in that order.
+
+    `config.pretrained_path` and `config.pretrained_revision` say where one was loaded from.
+    """
+    return [policy for built in _BUILT if (policy := built()) is not None]
+
+
+def training_data(policy: PreTrainedPolicy) -> "LeRobotDatasetMetadata | None":
+    """The dataset that this process trains a policy on; None: it acts as it was loaded."""
+    return getattr(policy.config, "_runtime_dataset_meta", None)

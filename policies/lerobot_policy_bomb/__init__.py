@@ -7,6 +7,8 @@ import lerobot_policy_bomb_random  # noqa: F401
 import lerobot_policy_fdvla  # noqa: F401
 import lerobot_policy_spatialvla_grid  # noqa: F401
 import lerobot_policy_vla0_smol  # noqa: F401
+from lerobot_bomb._compat import remember_policies
 from lerobot_bomb.checkpoint_config import tell_config_errors
 
 tell_config_errors()
+remember_policies()
