@@ -11,6 +11,7 @@ from lerobot.utils.constants import ACTION, OBS_IMAGES, OBS_PREFIX, OBS_STATE
 
 from lerobot_bomb.camera_geometry import geometry_shapes
 from lerobot_bomb.flags import flag_errors
+from lerobot_bomb.json_lines import check_appendable
 from lerobot_bomb.perturbations import NONE, Condition
 from lerobot_bomb.schema import ACTION_DIM, CAMERAS, DEFAULT_FPS, STATE_DIM, EpisodeSpec, RenderOptions
 from lerobot_env_bomb.fetch_files import check_robot
@@ -123,6 +124,7 @@ class BombEnvConfig(EnvConfig):
             "spec": next(iter(self.specs.values())),
             "render_options": self.render_options,
             "results_path": self.results_path,
+            "task_ids": None if self.task_ids is None else tuple(self.task_ids),
         }
 
     @property
@@ -146,6 +148,7 @@ class BombEnvConfig(EnvConfig):
                     [partial(BombEnv, **(kwargs | {"spec": replace(spec, perturbations=condition)}))]
                     * n_envs,
                     use_async=use_async_envs and n_envs > 1,
+                    known_late=self._policy_of_results,
                 )
                 for task_id, spec in self.specs.items()
             }
@@ -155,9 +158,15 @@ class BombEnvConfig(EnvConfig):
     def _prepare_results_path(self) -> None:
         if self.results_path is None:
             return
-        path = Path(self.results_path)
         try:
-            path.parent.mkdir(parents=True, exist_ok=True)
-            path.open("a").close()
+            check_appendable(Path(self.results_path))
         except OSError as error:
-            raise ValueError(f"--env.results_path={path} cannot be written: {error}") from error
+            raise ValueError(f"--env.results_path={self.results_path} cannot be written: {error}") from error
+
+    def _policy_of_results(self) -> dict[str, Any]:
+        """Argument of `BombEnv`: the policy that LeRobot built after this config's environments."""
+        if self.results_path is None:
+            return {}
+        from lerobot_bomb.policy_identity import acting_policy
+
+        return {"policy": acting_policy()}

@@ -13,7 +13,7 @@ from lerobot_bomb.perturbations import NONE
 from lerobot_bomb.schema import (
     DEFAULT_FPS,
     DEFAULT_IMAGE_SIZE,
-    PROTOCOL_VERSION,
+    TASK_VERSION,
     EpisodeSpec,
     RenderOptions,
 )
@@ -42,7 +42,7 @@ class Recording:
     images: bool = False
     depth: bool = False
     noise: float = 0.0
-    protocol_version: str = PROTOCOL_VERSION
+    protocol_version: str = TASK_VERSION  # the name that recordings of 1.0 have
     package_version: str = __version__
 
     def __post_init__(self) -> None:

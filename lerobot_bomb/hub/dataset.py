@@ -6,7 +6,7 @@ from pathlib import Path
 from typing import Any
 
 from lerobot_bomb.data.growing import METADATA_FILE
-from lerobot_bomb.schema import PROTOCOL_VERSION
+from lerobot_bomb.schema import TASK_VERSION
 
 INFO_FILE = Path("meta") / "info.json"
 PUSHT_SOURCE = "pusht-zarr"
@@ -100,4 +100,4 @@ def eval_flags_of(row: Row) -> list[str]:
 def protocol_version(dataset: DatasetFacts | None, has_results: bool) -> str | None:
     """Of the benchmark that a checkpoint was trained or evaluated on; None: of no known one."""
     of_dataset = dataset.protocol_version if dataset is not None else None
-    return of_dataset or (PROTOCOL_VERSION if has_results else None)
+    return of_dataset or (TASK_VERSION if has_results else None)

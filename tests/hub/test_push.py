@@ -19,7 +19,8 @@ from hub.damage import (
 )
 from hub.server import TOKEN, LoopbackHub
 from lerobot_bomb.cli import main
-from lerobot_bomb.schema import EpisodeResult, EpisodeSpec
+from lerobot_bomb.episode_result import EpisodeResult
+from lerobot_bomb.schema import EpisodeSpec
 from lerobot_policy_vla0_smol.modeling_vla0_smol import Vla0SmolPolicy
 
 REPO_ID = "me/x"
@@ -35,7 +36,7 @@ def result(seed: int, is_success: bool) -> str:
         is_success=is_success,
         is_success_bomb_v0=is_success,
         failure=None if is_success else "dropped",
-        stage="released",
+        stage="placed",
         placement_error_mm=1.0,
         nearest_intersection=(0, 1),
         collateral_mm=0.0,
