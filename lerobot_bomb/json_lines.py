@@ -1,6 +1,7 @@
 """Files to which processes append lines."""
 
 import os
+from contextlib import suppress
 from fcntl import LOCK_EX, flock
 from pathlib import Path
 
@@ -21,7 +22,8 @@ def append_line(path: Path | str, line: str) -> None:
         try:
             _write_all(file, f"{'\n' if is_cut_off else ''}{line}\n".encode())
         except OSError:
-            os.ftruncate(file, size)
+            with suppress(OSError):  # a device cannot be cut
+                os.ftruncate(file, size)
             raise
     finally:
         os.close(file)

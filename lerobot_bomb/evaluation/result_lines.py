@@ -180,8 +180,8 @@ def _check_spec(spec: dict[str, Any]) -> None:
     unknown = spec.keys() - SPEC_CHECKS.keys()
     if unknown:
         raise ValueError(f"spec has {', '.join(sorted(unknown))}, of which this package knows nothing")
-    target = spec["target"] and tuple(spec["target"])
-    EpisodeSpec(**(spec | {"target": target}))
+    values: dict[str, Any] = spec | {"target": spec["target"] and tuple(spec["target"])}
+    EpisodeSpec(**values)
 
 
 def _check(values: dict[str, Any], checks: dict[str, Check], prefix: str = "") -> None:
