@@ -23,7 +23,7 @@ class Environment:
     # width and height of each camera in pixels
     image_size: int
     cameras: tuple[str, ...]
-    protocol_version: str
+    task_version: str
     task: str = "place"
     depth: bool = False
     # numbered tasks; none = target and colour are drawn per episode
@@ -49,7 +49,7 @@ class Environment:
             fps=int(info["fps"]),
             image_size=int(sizes.pop()),
             cameras=tuple(cameras),
-            protocol_version=robot[2],
+            task_version=robot[2],
             task=recording.get("task", cls.task),
             depth=any(key.startswith(DEPTH) for key in features),
             task_ids=tuple(recording.get("task_ids", ())),
@@ -70,7 +70,7 @@ class Environment:
         if not set(self.cameras) <= set(other.cameras):
             names.append("cameras")
         if self._generation != other._generation:
-            names.append("protocol_version")
+            names.append("task_version")
         return names
 
     def check_same(self, other: "Environment", who: str, insist: str) -> None:
@@ -94,14 +94,14 @@ class Environment:
 
     @property
     def _generation(self) -> str:
-        """Of the protocol: what comes after its first number changes neither observations nor actions."""
-        return self.protocol_version.split(".")[0]
+        """Of the task: what comes after its first number changes neither observations nor actions."""
+        return self.task_version.split(".")[0]
 
     def __str__(self) -> str:
         depth = " with depth" if self.depth else ""
         tasks = f", tasks {list(self.task_ids)}" if self.task_ids else ""
         return (
-            f"BOMB protocol {self.protocol_version}, suite `{self.task}`{tasks}, robot `{self.robot}`, "
+            f"BOMB {self.task_version}, suite `{self.task}`{tasks}, robot `{self.robot}`, "
             f"control `{self.control_mode}` at {self.fps} Hz, cameras `{', '.join(self.cameras)}` of "
             f"{self.image_size} px{depth}"
         )

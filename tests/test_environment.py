@@ -25,7 +25,7 @@ ABSOLUTE = Environment(
     fps=20,
     image_size=64,
     cameras=("workspace", "wrist"),
-    protocol_version="1.0",
+    task_version="1.0",
     task="place",
     depth=True,
     task_ids=(7, 12),
@@ -70,8 +70,8 @@ def test_flags_of_an_evaluation() -> None:
             "with cameras=workspace+wrist; this one has cameras=workspace: insist",
         ),
         (
-            {"protocol_version": "2.0"},
-            "with protocol_version=1.0; this one has protocol_version=2.0: insist",
+            {"task_version": "2.0"},
+            "with task_version=1.0; this one has task_version=2.0: insist",
         ),
     ],
 )
@@ -86,7 +86,7 @@ def test_another_environment_is_an_error_that_names_the_flags(change: dict[str, 
         {},
         {"depth": False},
         {"task_ids": (0,)},
-        {"protocol_version": "1.1"},
+        {"task_version": "1.1"},
         {"cameras": ("workspace", "wrist", "top")},
     ],
 )

@@ -14,7 +14,7 @@ from lerobot_bomb.perturbations import NONE
 from lerobot_bomb.schema import (
     DEFAULT_FPS,
     DEFAULT_IMAGE_SIZE,
-    PROTOCOL_VERSION,
+    TASK_VERSION,
     EpisodeSpec,
     RenderOptions,
 )
@@ -44,7 +44,7 @@ class Recording:
     images: bool = False
     depth: bool = False
     noise: float = 0.0
-    protocol_version: str = PROTOCOL_VERSION
+    protocol_version: str = TASK_VERSION  # the name that recordings of 1.0 have
     package_version: str = __version__
     mujoco_version: str = MUJOCO_VERSION  # another one plays other bits
 

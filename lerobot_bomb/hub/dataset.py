@@ -7,7 +7,7 @@ from typing import Any
 
 from lerobot_bomb.data.growing import METADATA_FILE
 from lerobot_bomb.environment import Environment
-from lerobot_bomb.schema import CAMERAS, PROTOCOL_VERSION, task_id
+from lerobot_bomb.schema import CAMERAS, TASK_VERSION, task_id
 
 INFO_FILE = Path("meta") / "info.json"
 PUSHT_SOURCE = "pusht-zarr"
@@ -94,7 +94,7 @@ def environment_of_episode(row: Row) -> Environment:
         **{name: spec[name] for name in ("robot", "control_mode", "fps")},
         image_size=row["image_size"],
         cameras=CAMERAS,
-        protocol_version=row["protocol_version"],
+        task_version=row.get("task_version", TASK_VERSION),
         task=spec["suite"],
     )
 
@@ -127,8 +127,8 @@ def check_results(path: Path, rows: list[Row], trained_for: Environment | None) 
             )
 
 
-def protocol_version(trained_for: Environment | None, has_results: bool) -> str | None:
+def task_version(trained_for: Environment | None, has_results: bool) -> str | None:
     """Of the benchmark that a checkpoint was trained or evaluated on; None: of no known one."""
     if trained_for is not None:
-        return trained_for.protocol_version
-    return PROTOCOL_VERSION if has_results else None
+        return trained_for.task_version
+    return TASK_VERSION if has_results else None

@@ -100,7 +100,7 @@ def test_commands_are_those_of_the_training_and_of_what_the_dataset_shows(tmp_pa
         "--env.control_mode=absolute --env.fps=10 --env.image_size=128 --env.depth=true"
     ) in text
     assert "seeds 5..6; failed episodes that were left out: 1" in text  # 4 tried, 2 a seed
-    assert "protocol version 1.0" in text
+    assert "task version 1.0" in text
     assert str(tmp_path) not in text
 
 

@@ -94,7 +94,7 @@ def check_card(card: str, policy_type: str) -> None:
     assert metadata["datasets"] == DATASET
     assert policy_type in metadata["tags"]
     assert "base_model" not in metadata  # nano is none
-    for part in (*CARD_PARTS, "--env.control_mode=relative", "--env.image_size=64", "protocol version 1.0"):
+    for part in (*CARD_PARTS, "--env.control_mode=relative", "--env.image_size=64", "task version 1.0"):
         assert part in card
 
 
