@@ -3,13 +3,14 @@
 import logging
 from pathlib import Path
 from tempfile import TemporaryDirectory
-from typing import TYPE_CHECKING, Any, ClassVar
+from typing import TYPE_CHECKING, Any, ClassVar, cast
 
 from lerobot.configs.train import TrainPipelineConfig
 from lerobot.utils.constants import CHECKPOINTS_DIR, LAST_CHECKPOINT_LINK, PRETRAINED_MODEL_DIR
 from torch import Tensor
 
 from lerobot_bomb.adapters import base_commit, check_adapters, check_base
+from lerobot_bomb.finite import require_finite_statistics
 from lerobot_bomb.hub.card import Checkpoint
 from lerobot_bomb.hub.checks import PROCESSORS, check_finite, check_tensors, processor_files
 from lerobot_bomb.hub.dataset import DatasetFacts
@@ -29,22 +30,31 @@ class HubPolicy:
     name: Any
     config: Any
 
-    def __init__(self, config: Any, *args: Any, **kwargs: Any):
+    def __init__(self, config: Any, dataset_meta: "LeRobotDatasetMetadata | None" = None):
+        """``dataset_meta``: of the dataset that is trained on, whose statistics must be finite."""
         if not isinstance(config, self.config_class):
             raise ValueError(
                 f"this is a {config.type}, not a {self.name}: load it with "
                 f"get_policy_class({config.type!r}).from_pretrained"
             )
-        _next(super()).__init__(config, *args, **kwargs)
+        _require_finite_statistics_of(dataset_meta)
+        _next(super()).__init__(config)
 
     @classmethod
-    def from_pretrained(cls, pretrained_name_or_path: str | Path, **kwargs: Any) -> Any:
+    def from_pretrained(
+        cls,
+        pretrained_name_or_path: str | Path,
+        *,
+        dataset_meta: "LeRobotDatasetMetadata | None" = None,
+        **kwargs: Any,
+    ) -> Any:
         """As LeRobot's, but files are checked first; errors are a line that names the file.
 
         Raises:
             ValueError: one is truncated or not finite, or weights or config are of another policy.
             OSError: one is missing, or the Hub cannot be reached.
         """
+        _require_finite_statistics_of(dataset_meta)
         folder = Path(pretrained_name_or_path)
         if not folder.is_dir() and not is_hub_id(folder):
             raise FileNotFoundError(f"there is no folder {folder}, and it is no name on the Hub")
@@ -119,6 +129,11 @@ class HubPolicy:
             commit = publish(card, files, self.config.private)
         # LeRobot's remote jobs wait for this line
         logging.info(f"Model pushed to {commit.repo_url.url}")
+
+
+def _require_finite_statistics_of(meta: "LeRobotDatasetMetadata | None") -> None:
+    if meta is not None:
+        require_finite_statistics(cast("Any", meta.stats))
 
 
 def _next(policy: Any) -> Any:
