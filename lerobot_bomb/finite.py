@@ -113,20 +113,18 @@ def require_finite_batch(values: Mapping[str, Tensor], frames: Mapping[str, Tens
         if bool(bad.any()):
             row, *place = bad.nonzero()[0].tolist()
             ahead = place[0] if key == ACTION and len(place) == 2 else 0
+            where, advice = _frame(frames, row, ahead)
             raise ValueError(
-                f"{key!r} is not finite{_frame(frames, row, ahead)} in row {row} of the batch: "
-                f"{int(bad[row].sum())} of {bad[row].numel()} values there are NaN or infinite, the first at "
-                f"{place}"
+                f"{key!r} is not finite in {where}row {row} of the batch: {int(bad[row].sum())} of "
+                f"{bad[row].numel()} values there are NaN or infinite, the first at {place}{advice}"
             )
 
 
-def _frame(frames: Mapping[str, Tensor], row: int, ahead: int) -> str:
-    """Where in its dataset a row's frame is, or the one so many after it."""
-    places = [frames[key].reshape(-1)[row] for key in ("episode_index", "index") if key in frames]
-    if len(places) < 2:
-        return ""
-    episode, index = (int(place) for place in places)
-    return (
-        f" in frame {index + ahead} of the dataset (its column 'index'), of episode {episode}, which "
-        "lerobot-edit-dataset --operation.type=delete_episodes or --dataset.episodes can leave out:"
-    )
+def _frame(frames: Mapping[str, Tensor], row: int, ahead: int) -> tuple[str, str]:
+    """Where in its dataset a row's frame is, or the one so many after it, and what to do."""
+    if not {"episode_index", "index"} <= frames.keys():
+        return "", ""
+    episode, index = (int(frames[key].reshape(-1)[row]) for key in ("episode_index", "index"))
+    where = f"frame {index + ahead} of the dataset (its column 'index'), of episode {episode}, "
+    advice = "leave the episode out: lerobot-edit-dataset --operation.type=delete_episodes"
+    return where, f"; {advice} --operation.episode_indices=[{episode}]"

@@ -101,7 +101,7 @@ def test_an_action_is_found_in_the_frame_that_it_belongs_to() -> None:
     actions = torch.zeros(3, 4, 2)
     actions[1, 2, 1] = torch.nan
     frames = {"episode_index": torch.tensor([7, 8, 9]), "index": torch.tensor([70, 81, 92])}
-    with pytest.raises(ValueError, match=r"'action' .* frame 83 of the dataset .* episode 8.* in row 1 of"):
+    with pytest.raises(ValueError, match=r"'action' .* frame 83 of the dataset .* episode 8, row 1 of"):
         require_finite_batch({"action": actions}, frames)
     with pytest.raises(ValueError, match=r"^'action' is not finite in row 1 of the batch: 1 of 8 values"):
         require_finite_batch({"action": actions}, {})
