@@ -1,3 +1,5 @@
+import math
+
 import pytest
 import torch
 from torch import Tensor
@@ -60,7 +62,14 @@ def test_means_are_zero_where_nothing_counts() -> None:
     values = torch.tensor([1.0, 2.0, 6.0])
     none = torch.zeros(3, dtype=torch.bool)
     counted = torch.tensor([True, False, True])
-    assert means({"a": (values, counted), "b": (values, none)}) == {"a": 3.5, "b": 0.0}
+    assert means({"a": (values, counted), "b": (values, none)}, values, 0) == {"a": 3.5, "b": 0.0}
+
+
+@pytest.mark.parametrize("bad", [math.nan, math.inf])
+def test_a_training_that_diverged_says_so(bad: float) -> None:
+    counted = torch.ones(2, dtype=torch.bool)
+    with pytest.raises(ValueError, match=r"loss is not finite .* after 7 batches of training"):
+        means({"a": (torch.ones(2), counted)}, torch.tensor([1.0, bad]), 7)
 
 
 def told(

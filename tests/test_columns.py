@@ -1,6 +1,9 @@
+import shutil
 from pathlib import Path
 
 import numpy as np
+import pyarrow as pa
+import pyarrow.parquet as pq
 import pytest
 from lerobot.datasets import LeRobotDataset, LeRobotDatasetMetadata
 
@@ -43,6 +46,29 @@ def test_episodes_that_do_not_exist_are_named(dataset: LeRobotDataset) -> None:
         read_columns(dataset.meta, KEYS, episodes=[1, 3])
     with pytest.raises(ValueError, match="none at all"):
         read_columns(dataset.meta, KEYS, episodes=[])
+
+
+@pytest.mark.parametrize("bad", [float("nan"), float("inf")])
+def test_frames_that_are_not_finite_are_counted_and_named(
+    dataset: LeRobotDataset, tmp_path: Path, bad: float
+) -> None:
+    """By their place in the dataset, whichever episodes are read."""
+    copied = tmp_path / "copied"
+    shutil.copytree(dataset.root, copied)
+    (file,) = (copied / "data").rglob("*.parquet")
+    table = pq.read_table(file)
+    column = table.schema.get_field_index("action")
+    rows = table["action"].to_pylist()
+    starts = [table["episode_index"].to_pylist().index(episode) for episode in range(3)]
+    for frame in (starts[2] + 1, starts[2] + 3):
+        rows[frame][1] = bad
+    values = pa.chunked_array([pa.array(rows, type=table.schema.field("action").type)])
+    pq.write_table(table.set_column(column, table.schema.field("action"), values), file)
+    meta = LeRobotDatasetMetadata("test/columns", root=copied)
+    read_columns(meta, KEYS, episodes=[0, 1])
+    message = rf"'action' .* in 2 of {len(rows) - starts[2]} frames, the first of them frame {starts[2] + 1} "
+    with pytest.raises(ValueError, match=rf"{message}.* of episode 2: .*episode_indices=\[2\]"):
+        read_columns(meta, KEYS, episodes=[2])
 
 
 @pytest.mark.parametrize("key", ["observation.images.wrist", "observation.velocity"])

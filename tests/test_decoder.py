@@ -16,7 +16,6 @@ from lerobot_bomb.decoding.decoder import (
     Guess,
     Progress,
     decode_numbers,
-    pick,
     write,
 )
 from lerobot_bomb.decoding.draft import KnownSymbols, LinearDraft
@@ -156,11 +155,66 @@ def test_malformed_wishes_become_legal_numbers() -> None:
     assert numbers.tolist() == [[0, 7, 60]]
 
 
-@pytest.mark.parametrize("bad", [float("nan"), float("inf"), -float("inf")])
-def test_only_a_choice_is_picked_even_from_broken_logits(bad: float) -> None:
-    penalty = torch.full((1, NUM_SYMBOLS), -torch.inf)
-    penalty[0, SPACE] = 0
-    assert pick(torch.full((1, NUM_SYMBOLS), bad), penalty).tolist() == [SPACE]
+class Broken(Speaker):
+    """What it wants to say, until one row's logits after a column are all ``bad``."""
+
+    def __init__(self, bad: float, column: int, row: int, *texts: str):
+        super().__init__(*texts)
+        self.bad, self.column, self.rows, self.row = bad, column, list(range(len(texts))), row
+
+    def __call__(self, symbol_BK: Tensor, first_B: Tensor) -> Tensor:
+        logits_BKS = super().__call__(symbol_BK, first_B)
+        if self.row in self.rows:
+            at = self.rows.index(self.row)
+            logits_BKS[at, first_B[at] + torch.arange(logits_BKS.shape[1]) >= self.column] = self.bad
+        return logits_BKS
+
+    def keep(self, row_B: Tensor) -> None:
+        super().keep(row_B)
+        self.rows = [self.rows[row] for row in row_B]
+
+
+BROKEN = [(bad, column) for bad in (float("nan"), float("inf"), -float("inf")) for column in (0, 3, 6)]
+
+
+@pytest.mark.parametrize(("bad", "column"), BROKEN)
+@pytest.mark.parametrize("drafted", [False, True])
+def test_nothing_is_read_from_logits_that_are_not_finite(bad: float, column: int, drafted: bool) -> None:
+    """Whether rows leave the batch when they are done or go on until all are."""
+    grammar = NumberGrammar(512, 3)
+    guess = LinearDraft(grammar, 1) if drafted else KnownSymbols(grammar)
+    texts = " 1 2 3#", " 400 500 300#", " 9 311 77#"
+    with pytest.raises(ValueError, match=r"NaN or infinite numbers for the rows \[1\] of the batch"):
+        decode(Broken(bad, column, 1, *texts), grammar, 3, guess=guess)
+    with pytest.raises(ValueError, match=r"NaN or infinite numbers for the rows \[1\] of the batch"):
+        decode_ahead(passes(Broken(bad, column, 1, *texts), grammar, guess, 3), grammar, 3)
+
+
+def test_one_logit_of_nan_is_enough() -> None:
+    class OneNan(Speaker):
+        def __call__(self, symbol_BK: Tensor, first_B: Tensor) -> Tensor:
+            logits_BKS = super().__call__(symbol_BK, first_B)
+            logits_BKS[..., 3] = torch.nan
+            return logits_BKS
+
+    with pytest.raises(ValueError, match=r"the rows \[0\]"):
+        decode(OneNan(" 1 2#"), NumberGrammar(512, 2), 1)
+
+
+def test_logits_after_a_wrong_guess_may_be_anything() -> None:
+    """Nothing of them is written."""
+    grammar = NumberGrammar(512, 2)
+
+    class Shaky(Speaker):
+        def __call__(self, symbol_BK: Tensor, first_B: Tensor) -> Tensor:
+            logits_BKS = super().__call__(symbol_BK, first_B)
+            logits_BKS[:, 1:] = torch.nan
+            return logits_BKS
+
+    def wrong(_: Tensor, place: Place) -> Tensor:
+        return torch.full((len(place.number), MAX_GUESSES), 9)
+
+    assert decode(Shaky(" 12 34#"), grammar, 1, guess=wrong).numbers.tolist() == [[12, 34]]
 
 
 def test_symbols_that_cannot_be_otherwise_take_no_pass() -> None:

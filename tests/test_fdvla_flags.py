@@ -98,7 +98,7 @@ def test_actions_that_are_not_finite_are_told(value: float) -> None:
     policy = make_policy()
     batch = make_batch(policy, 3)
     batch["action"][1, 2, 0] = value
-    with pytest.raises(ValueError, match=r"batch\['action'\] is not finite in the rows \[1\]"):
+    with pytest.raises(ValueError, match=r"'action' is not finite in row 1 of the batch"):
         policy(batch)
 
 

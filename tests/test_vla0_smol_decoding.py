@@ -7,7 +7,7 @@ from torch import Tensor
 from vla0_smol_cases import WORKSPACE, make_batch, make_policy, numbers_of
 
 from lerobot_bomb.actions.text import IGNORED
-from lerobot_bomb.decoding.decoder import Decoded, decode_numbers, pick
+from lerobot_bomb.decoding.decoder import Decoded, decode_numbers, likeliest
 from lerobot_policy_vla0_smol.modeling_vla0_smol import Vla0SmolPolicy
 
 
@@ -58,7 +58,7 @@ def test_decoding_follows_the_teacher_forced_argmax(overfit: tuple[Vla0SmolPolic
         place = policy.grammar.start(1)
         # every answer begins with a space
         for step_logits, label in zip(row_logits[1:], row_labels[row_labels != IGNORED][1:], strict=False):
-            symbol = pick(step_logits[None], policy.grammar.penalties(place))
+            symbol, _ = likeliest(step_logits[None] + policy.grammar.penalties(place))
             assert policy.symbol_ids[symbol] == label
             place = policy.grammar.advance(place, symbol)
         assert place.prefix == policy.grammar.DONE

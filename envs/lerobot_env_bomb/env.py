@@ -284,4 +284,3 @@ class BombEnv(gymnasium.Env[Observation, np.ndarray]):
             "collateral_mm": judge.collateral_mm,
             "seed": self._run.episode.spec.seed,
         }
-

@@ -3,6 +3,7 @@
 Shapes as in `lerobot_bomb.actions.text`; `M` = N * C + 1 columns, those of all numbers and the end token.
 """
 
+import math
 from collections.abc import Mapping
 
 import torch
@@ -32,11 +33,24 @@ def read_numbers(numbers: NumberTokens, digits_BM: Tensor) -> Tensor:
     return (digits_BNW * place_values_W).sum(dim=-1)
 
 
-def means(parts: Mapping[str, tuple[Tensor, Tensor]]) -> dict[str, float]:
+def means(
+    parts: Mapping[str, tuple[Tensor, Tensor]], losses: Tensor, trained_batches: int
+) -> dict[str, float]:
     """{name: (values, which count)} -> {name: mean}, in one transfer from the device.
 
     0 where nothing counts: LeRobot averages over processes by the names' order, so none may come and go.
+
+    Raises:
+        ValueError: ``losses`` are not finite, after so many batches of training; they take the same transfer.
     """
     sums = [torch.where(counted, values, 0).float().sum() for values, counted in parts.values()]
     counts = [counted.sum().clamp(min=1) for _, counted in parts.values()]
-    return dict(zip(parts, (torch.stack(sums) / torch.stack(counts)).tolist(), strict=True))
+    ratios = torch.stack(sums) / torch.stack(counts)
+    *values, loss = torch.cat([ratios, losses.detach().float().sum()[None]]).tolist()
+    if not math.isfinite(loss):
+        raise ValueError(
+            f"the loss is not finite (NaN or infinite) after {trained_batches} batches of training: it has "
+            "diverged. Go on from an earlier checkpoint or start again, with a smaller --policy.optimizer_lr "
+            "or --policy.dtype=float32"
+        )
+    return dict(zip(parts, values, strict=True))

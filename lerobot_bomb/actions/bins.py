@@ -3,6 +3,8 @@
 import torch
 from torch import Tensor, nn
 
+from lerobot_bomb.finite import require_finite_on_cpu
+
 BIN_MODES = ("centers", "levels")
 
 # Widens the outermost bins so that values within float32 rounding of the ends stay inside.
@@ -28,7 +30,12 @@ class Bins(nn.Module):
         self.register_buffer("edges", torch.linspace(-end, end, num_bins + 1), persistent=False)
 
     def encode(self, values: Tensor) -> Tensor:
-        """Values of any shape -> int64 indices in 0..num_bins - 1; values beyond [-1, 1] saturate."""
+        """Values of any shape -> int64 indices in 0..num_bins - 1; values beyond [-1, 1] saturate.
+
+        Raises:
+            ValueError: values on the CPU are not finite; on CUDA the host would wait.
+        """
+        require_finite_on_cpu(values, "what is written as a number")
         values = values.float().clamp(-1, 1)
         if self.mode == "levels":
             return ((values + 1) / 2 * (self.num_bins - 1) + 0.5).floor().long()

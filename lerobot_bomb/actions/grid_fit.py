@@ -11,6 +11,7 @@ from torch import Tensor
 
 from lerobot_bomb.actions.grid_edges import Cut, circular_mean, cut, to_polar, unrolled
 from lerobot_bomb.actions.grid_settings import ActionGroup, GridSettings
+from lerobot_bomb.finite import require_finite_rows
 
 MIN_RHO = 1e-3  # a shorter motion has no direction to fit, where there is no bin for "no motion"
 EQUAL_BOUNDS = 1e-8  # LeRobot's width of a dimension whose bounds are equal
@@ -37,13 +38,7 @@ def check_actions(actions_ND: np.ndarray | Tensor) -> Tensor:
     actions_ND = torch.as_tensor(actions_ND).detach().to("cpu", torch.float64)
     if actions_ND.ndim != 2 or not len(actions_ND):
         raise ValueError(f"a grid is fitted on actions (N, D), not on shape {tuple(actions_ND.shape)}")
-    bad_N = ~actions_ND.isfinite().all(dim=1)
-    if bad_N.any():
-        first = int(bad_N.nonzero()[0, 0])
-        raise ValueError(
-            f"a grid cannot be fitted: {int(bad_N.sum())} of {len(bad_N)} actions are not finite, the first "
-            f"at index {first}: {actions_ND[first].tolist()}"
-        )
+    require_finite_rows(actions_ND, "a grid cannot be fitted", "actions")
     return actions_ND
 
 

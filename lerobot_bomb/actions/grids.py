@@ -17,6 +17,7 @@ from torch import Tensor, nn
 from lerobot_bomb.actions.grid_edges import Cut, from_polar, gaussian_cut, to_polar, unrolled
 from lerobot_bomb.actions.grid_fit import check_actions, fit_cuts
 from lerobot_bomb.actions.grid_settings import ActionGroup, GridSettings, check_groups, default_groups
+from lerobot_bomb.finite import require_finite, require_finite_on_cpu
 
 PUBLISHED_KEYS = ("theta", "phi", "r", "roll", "pitch", "yaw")
 
@@ -71,7 +72,12 @@ class ActionGrids(nn.Module):
     # Actions and cells
 
     def encode(self, actions: Tensor) -> Tensor:
-        """(..., D) -> (..., G) int64, within each group; actions beyond [-1, 1] are clipped."""
+        """(..., D) -> (..., G) int64, within each group; actions beyond [-1, 1] are clipped.
+
+        Raises:
+            ValueError: they have other dims or, on the CPU, are not finite; on CUDA the host would wait.
+        """
+        require_finite_on_cpu(actions, "an action that is put into a grid")
         self._check_dims(actions.shape[-1])
         values_CN = self.coordinates(actions.to(self.edges.dtype).clamp(-1, 1)).reshape(-1, len(self.bins)).T
         # bins are closed on the left: the number of edges up to the value, but for the first
@@ -216,16 +222,20 @@ class ActionGrids(nn.Module):
         if grids.decode_point == "centroid":
             for cell, values in parameters["centroids"].items():
                 grids.centroids[int(cell)] = torch.tensor(values)
+            require_finite(grids.centroids, "a grid's centroids")
         return grids
 
     def _set(self, cuts: Sequence[Cut], rest_D: np.ndarray) -> None:
         """Take edges as they are in float32, and what follows from them."""
+        require_finite(torch.as_tensor(rest_D), "the action of a grid that means no motion")
         self.rest.copy_(torch.from_numpy(rest_D))
         for i, (of, bins) in enumerate(zip(cuts, self.bins, strict=True)):
             if of.edges.shape != (bins + 1,) or not (of.edges.diff() > 0).all():
                 raise ValueError(
                     f"coordinate {i} of the grid needs {bins + 1} increasing edges: {of.edges.tolist()}"
                 )
+            fitted = torch.cat([of.edges, of.means, torch.tensor([of.mean, of.std])])
+            require_finite(fitted, f"coordinate {i} of the grid (edges, means, mean, standard deviation)")
             self.edges[i, : bins + 1] = of.edges
             self.means[i, :bins] = of.means
             self.gaussians[i] = torch.tensor([of.mean, of.std])

@@ -11,6 +11,8 @@ import torch
 from lerobot.configs import NormalizationMode
 from torch import Tensor, nn
 
+from lerobot_bomb.finite import require_finite, require_finite_rows
+
 if TYPE_CHECKING:  # configs import this module: LeRobot's datasets would slow their start
     from lerobot.datasets import LeRobotDatasetMetadata
 
@@ -31,7 +33,7 @@ def bounds(
     """(D,) values that become -1 and (D,) values that become 1 when LeRobot normalises.
 
     Raises:
-        ValueError: the dataset has no such statistics.
+        ValueError: the dataset has no such statistics, or they are not finite.
     """
     if mode is NormalizationMode.IDENTITY:
         return -np.ones(num_dims), np.ones(num_dims)
@@ -43,6 +45,8 @@ def bounds(
             f"lerobot.scripts.augment_dataset_quantile_stats adds them"
         )
     low, high = (np.asarray(statistics[name], dtype=np.float64) for name in names)
+    for name, values in zip(names, (low, high), strict=True):
+        require_finite(torch.from_numpy(values), f"the dataset's statistic {name}")
     return (low - high, low + high) if names is CENTRE_AND_DISTANCE else (low, high)
 
 
@@ -124,8 +128,11 @@ class RelativeActions(nn.Module):
         never changes stays absolute.
 
         Raises:
-            ValueError: the state of a dimension does not track its action.
+            ValueError: actions or states are not finite, or the state of a dimension does not track its
+                action.
         """
+        require_finite_rows(actions_ND, "relative actions cannot be fitted", "actions")
+        require_finite_rows(states_NS, "relative actions cannot be fitted", "states")
         for dim, state_dim in self.state_of_dim.items():
             low, high = action_bounds[0][dim], action_bounds[1][dim]
             if high == low:

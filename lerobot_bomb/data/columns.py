@@ -36,7 +36,7 @@ def read_columns(
     Reads the data files under ``meta.root``; ``LeRobotDataset`` downloads them if they are not there.
 
     Raises:
-        ValueError: a key is no column of numbers, or an episode does not exist.
+        ValueError: a key is no column of numbers, an episode does not exist, or values are not finite.
         FileNotFoundError: a data file is absent.
     """
     columns = list(dict.fromkeys([*keys, EPISODE_INDEX]))
@@ -54,7 +54,10 @@ def read_columns(
     tables = [pq.read_table(meta.root / file, columns=read, filters=rows) for file in files]
     table = pa.concat_tables(tables).sort_by("index")
     shapes = {key: () if key in DEFAULT_FEATURES else meta.features[key]["shape"] for key in columns}
-    return {key: _to_array(table[key]).reshape(len(table), *shapes[key]) for key in columns}
+    arrays = {key: _to_array(table[key]).reshape(len(table), *shapes[key]) for key in columns}
+    for key in columns:
+        _require_finite(meta, key, arrays[key], arrays[EPISODE_INDEX], _to_array(table["index"]))
+    return arrays
 
 
 def dim_names(feature: dict[str, Any]) -> list[str]:
@@ -80,6 +83,25 @@ def _check_columns(meta: LeRobotDatasetMetadata, columns: list[str]) -> None:
     unknown = [key for key in columns if key not in numeric]
     if unknown:
         raise ValueError(f"dataset {meta.repo_id} has no columns {unknown}; it has {sorted(numeric)}")
+
+
+def _require_finite(
+    meta: LeRobotDatasetMetadata,
+    key: str,
+    values_NX: np.ndarray,
+    episode_index_N: np.ndarray,
+    index_N: np.ndarray,
+) -> None:
+    bad_N = ~np.isfinite(values_NX.reshape(len(values_NX), -1)).all(axis=1)
+    if bad_N.any():
+        first = int(bad_N.argmax())
+        episode = int(episode_index_N[first])
+        raise ValueError(
+            f"dataset {meta.repo_id}: {key!r} is not finite (NaN or infinite) in {int(bad_N.sum())} of "
+            f"{len(bad_N)} frames, the first of them frame {int(index_N[first])} (its column 'index'), of "
+            f"episode {episode}: {values_NX[first].tolist()}. Leave such episodes out: "
+            f"lerobot-edit-dataset --operation.type=delete_episodes --operation.episode_indices=[{episode}]"
+        )
 
 
 def _to_array(column: pa.ChunkedArray) -> np.ndarray:

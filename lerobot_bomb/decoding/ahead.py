@@ -18,6 +18,7 @@ from lerobot_bomb.decoding.decoder import (
     write,
 )
 from lerobot_bomb.decoding.grammar import NumberGrammar
+from lerobot_bomb.finite import require_finite_answers
 from lerobot_bomb.vlm.cached_text import CachedText
 from lerobot_bomb.vlm.graphs import Recorded
 
@@ -69,25 +70,29 @@ class RecordedAnswers:
 
 
 def decode_ahead(passes: Iterator[Progress], grammar: NumberGrammar, stop_after: int) -> Decoded:
-    """As `decode_numbers`; the host hears that all rows are done while the next pass runs."""
-    was_done = None
+    """As `decode_numbers`; while a pass runs, the host hears of the last: are all rows done, and finite?"""
+    hear = None
     for num_passes, progress in enumerate(passes, 1):
-        if was_done is not None and was_done():
-            return Decoded(progress.answer(grammar)[:, :stop_after], num_passes)
-        was_done = _fetch(progress.is_done(grammar, stop_after).all())
+        if hear is not None:
+            is_done, is_finite = hear()
+            if not is_finite:
+                require_finite_answers(progress.finite)
+            if is_done:
+                return Decoded(progress.answer(grammar)[:, :stop_after], num_passes)
+        hear = _fetch(torch.stack([progress.is_done(grammar, stop_after).all(), progress.finite.all()]))
     raise AssertionError("an answer has an end")
 
 
-def _fetch(flag: Tensor) -> Callable[[], bool]:
-    """Ask a device for a value; the answer is waited for when it is called."""
-    copied = flag.to("cpu", non_blocking=True)
-    if not flag.is_cuda:
-        return lambda: bool(copied)
+def _fetch(flags: Tensor) -> Callable[[], list[bool]]:
+    """Ask a device for values; the answer is waited for when it is called."""
+    copied = flags.to("cpu", non_blocking=True)
+    if not flags.is_cuda:
+        return copied.tolist
     event = torch.cuda.Event()
     event.record()
 
-    def wait() -> bool:
+    def wait() -> list[bool]:
         event.synchronize()
-        return bool(copied)
+        return copied.tolist()
 
     return wait

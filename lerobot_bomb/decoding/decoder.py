@@ -18,6 +18,7 @@ from torch import Tensor
 
 from lerobot_bomb.actions.text import SPACE
 from lerobot_bomb.decoding.grammar import NumberGrammar, Place
+from lerobot_bomb.finite import require_finite_answers
 from lerobot_bomb.vlm.cached_text import CachedText
 
 # (B, N) numbers that are complete, and where each row stands -> (B, G) guesses of what comes next, at most
@@ -87,6 +88,7 @@ class Progress(NamedTuple):
     num_symbols: Tensor  # (B,) int64
     prefix: Tensor  # (B,) int64, of a `Place`
     number: Tensor  # (B,) int64, of a `Place`
+    finite: Tensor  # (B,) bool, whether all that is written is from finite logits
 
     @classmethod
     def start(cls, grammar: NumberGrammar, batch_size: int) -> "Progress":
@@ -94,7 +96,7 @@ class Progress(NamedTuple):
         place = grammar.start(batch_size)
         numbers_BN = place.prefix.new_zeros(batch_size, grammar.num_numbers)
         ones_B = torch.ones_like(place.prefix)
-        return cls(numbers_BN, SPACE * ones_B, ones_B, place.prefix, place.number)
+        return cls(numbers_BN, SPACE * ones_B, ones_B, place.prefix, place.number, ones_B.bool())
 
     @property
     def place(self) -> Place:
@@ -122,10 +124,10 @@ class Decoded:
     num_passes: int
 
 
-def pick(logits: Tensor, penalty: Tensor) -> Tensor:
-    """(..., S) -> (...) the likeliest allowed symbol; one is taken even from logits of -inf or NaN."""
-    finite = logits.float().nan_to_num(neginf=torch.finfo(torch.float32).min)
-    return (finite + penalty).argmax(dim=-1)
+def likeliest(logits: Tensor) -> tuple[Tensor, Tensor]:
+    """(..., S) -> (...) which is largest, and its logit: NaN if any of them is, else inf if any is."""
+    choice = logits.argmax(dim=-1)
+    return choice, logits.gather(-1, choice[..., None])[..., 0]
 
 
 def write(
@@ -136,18 +138,20 @@ def write(
     guess_BG = guess(progress.numbers, place)[:, :num_guesses]
     logits_BKS = model(torch.cat([progress.last[:, None], guess_BG], dim=1), progress.num_symbols - 1)
     places_BK = grammar.walk(place, guess_BG)
-    picks_BK = pick(logits_BKS, grammar.penalties(places_BK))
+    picks_BK, logits_BK = likeliest(logits_BKS.float() + grammar.penalties(places_BK))
     num_right_B = (picks_BK[:, :-1] == guess_BG).cumprod(dim=1).sum(dim=1)
     column_K = torch.arange(picks_BK.shape[1], device=picks_BK.device)
     # what follows a wrong guess is not written
-    completes_BK = (picks_BK >= SPACE) & (column_K <= num_right_B[:, None])
+    written_BK = column_K <= num_right_B[:, None]
+    completes_BK = (picks_BK >= SPACE) & written_BK
     index_BK = places_BK.number.clamp(max=grammar.num_numbers - 1)
     numbers_BN = progress.numbers.scatter_add(1, index_BK, grammar.value[places_BK.prefix] * completes_BK)
     last_B = picks_BK.gather(1, num_right_B[:, None])[:, 0]
     place = grammar.advance(places_BK.at(num_right_B), last_B)
     max_symbols = grammar.max_symbols(grammar.num_numbers)
     num_symbols_B = (progress.num_symbols + num_right_B + 1).clamp(max=max_symbols)
-    return Progress(numbers_BN, last_B, num_symbols_B, place.prefix, place.number), num_right_B
+    finite_B = progress.finite & (logits_BK.isfinite() | ~written_BK).all(dim=1)
+    return Progress(numbers_BN, last_B, num_symbols_B, place.prefix, place.number, finite_B), num_right_B
 
 
 @torch.no_grad()
@@ -158,6 +162,9 @@ def decode_numbers(
 
     Only what the grammar allows is ever chosen, so every row is well-formed by construction. What a row
     writes after it is done is ignored.
+
+    Raises:
+        ValueError: a row was written from logits that are not finite.
     """
     progress = Progress.start(grammar, batch_size)
     row_B = torch.arange(batch_size, device=progress.number.device)
@@ -173,6 +180,7 @@ def decode_numbers(
         kept_B = (~progress.is_done(grammar, stop_after)).nonzero()[:, 0]
         if len(kept_B) == len(row_B):
             continue
+        require_finite_answers(progress.finite, row_B)
         numbers[row_B] = progress.answer(grammar)[:, :stop_after]
         if not len(kept_B):
             return Decoded(numbers, num_passes)

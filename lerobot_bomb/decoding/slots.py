@@ -16,7 +16,8 @@ import torch
 from torch import Tensor
 from torch.nn.functional import embedding, linear
 
-from lerobot_bomb.decoding.decoder import MAX_GUESSES, Prompt
+from lerobot_bomb.decoding.decoder import MAX_GUESSES, Prompt, likeliest
+from lerobot_bomb.finite import require_finite_answers
 from lerobot_bomb.vlm.cached_text import CachedText
 from lerobot_bomb.vlm.graphs import Recorded
 from lerobot_bomb.vlm.recordings import Recordings
@@ -52,13 +53,18 @@ class SlotWriter:
 
         ``slots``: of a step, which of the choices come into question, counted from the first of them;
         ``embeds_CH`` and ``head_CH``: the choices' rows of the embedding and of the output head.
+
+        Raises:
+            ValueError: a row's logits are not finite. On CUDA the host waits for the answers to learn of it.
         """
         num_slots = num_steps * len(slots)
         if prompt.embeds.is_cuda:
             with torch.inference_mode(False), torch.no_grad():
                 make = partial(RecordedChoices, num_steps * slots, self._reads_all, embeds_CH, head_CH)
                 recorded = self._recordings.find(prompt.embeds, num_slots, make)
-                return recorded(prompt, embeds_CH, head_CH)
+                choices_BS, finite_B = recorded(prompt, embeds_CH, head_CH)
+            require_finite_answers(finite_B)
+            return choices_BS
         batch_size, num_columns, _ = prompt.embeds.shape
         layers = TextLayers(self._text_model)
         text = CachedText(layers, batch_size, num_columns + num_slots, self._first_position)
@@ -66,7 +72,8 @@ class SlotWriter:
         # rows that agree on how far guesses are right are rare
         is_drafted = self.drafted and batch_size == 1
         singly = slots if is_drafted else num_steps * slots
-        choices_BS = choose(text, prompt, singly, *tables, prompt_reads_all=self._reads_all)
+        choices_BS, finite_B = choose(text, prompt, singly, *tables, prompt_reads_all=self._reads_all)
+        require_finite_answers(finite_B)
         if not is_drafted:
             return choices_BS
         return repeat(text, int(prompt.written.sum()), slots, num_slots, choices_BS, *tables)
@@ -82,17 +89,18 @@ class RecordedChoices:
         self._embeds_CH, self._head_CH = embeds_CH.clone(), head_CH.clone()
         self._choose = Recorded(self._choose_all)
 
-    def __call__(self, prompt: Prompt, embeds_CH: Tensor, head_CH: Tensor) -> Tensor:
-        """As `choose`."""
+    def __call__(self, prompt: Prompt, embeds_CH: Tensor, head_CH: Tensor) -> tuple[Tensor, Tensor]:
+        """As `choose`; the second is written over by the next call."""
         self._embeds_CH.copy_(embeds_CH)
         self._head_CH.copy_(head_CH)
-        return self._choose(*prompt)[0].clone()
+        choices_BS, finite_B = self._choose(*prompt)
+        return choices_BS.clone(), finite_B
 
-    def _choose_all(self, embeds_BLH: Tensor, written_BL: Tensor) -> tuple[Tensor]:
+    def _choose_all(self, embeds_BLH: Tensor, written_BL: Tensor) -> tuple[Tensor, Tensor]:
         self._text.clear()
         prompt = Prompt(embeds_BLH, written_BL)
         tables = self._embeds_CH, self._head_CH
-        return (choose(self._text, prompt, self._slots, *tables, prompt_reads_all=self._reads_all),)
+        return choose(self._text, prompt, self._slots, *tables, prompt_reads_all=self._reads_all)
 
 
 def choose(
@@ -103,19 +111,20 @@ def choose(
     head_CH: Tensor,
     *,
     prompt_reads_all: bool,
-) -> Tensor:
-    """As `SlotWriter`, on an empty cache."""
+) -> tuple[Tensor, Tensor]:
+    """As `SlotWriter`, on an empty cache; and (B,) bool, whether all choices are from finite logits."""
     last_B1 = prompt.written.sum(dim=1, keepdim=True) - 1
     columns_BL = text.columns_of(prompt.written)
     reach_BL = last_B1.expand_as(columns_BL) if prompt_reads_all else columns_BL
     hidden_BKH = text(prompt.embeds, columns_BL, reach_BL)
-    choices = [linear(hidden_BKH[:, -1], head_CH[slots[0]]).argmax(dim=-1)]
+    chosen = [likeliest(linear(hidden_BKH[:, -1], head_CH[slots[0]]))]
     passes = text.singly(last_B1 + torch.arange(1, len(slots), device=last_B1.device))
     for columns, before, slot in zip(passes, slots[:-1], slots[1:], strict=True):
-        embeds_BH = embedding(choices[-1], embeds_CH[before])
+        embeds_BH = embedding(chosen[-1][0], embeds_CH[before])
         hidden_BKH = text.read(embeds_BH[:, None], columns)
-        choices.append(linear(hidden_BKH[:, 0], head_CH[slot]).argmax(dim=-1))
-    return torch.stack(choices, dim=1)
+        chosen.append(likeliest(linear(hidden_BKH[:, 0], head_CH[slot])))
+    choices_BS, logits_BS = (torch.stack(of_slots, dim=1) for of_slots in zip(*chosen, strict=True))
+    return choices_BS, logits_BS.isfinite().all(dim=1)
 
 
 def repeat(
@@ -143,7 +152,9 @@ def repeat(
         column_K = torch.arange(num_tokens, device=step_1G.device) + length + len(chosen) - 1
         (hidden_KH,) = text(embeds_CH[read][None], column_K[None])
         heads = [head_CH[slots[kind]] for kind in kinds]
-        picks = [int((head @ hidden).argmax()) for head, hidden in zip(heads, hidden_KH, strict=True)]
+        logits = [head @ hidden for head, hidden in zip(heads, hidden_KH, strict=True)]
+        require_finite_answers(torch.cat(logits).isfinite().all()[None])
+        picks = [int(of_slot.argmax()) for of_slot in logits]
         # one that was not read may be right, too: it says how many to read in the next pass
         num_right = sum(accumulate(map(eq, picks, guesses), and_))
         chosen += picks[: num_right + 1]

@@ -3,15 +3,16 @@
 import logging
 from pathlib import Path
 from tempfile import TemporaryDirectory
-from typing import TYPE_CHECKING, Any, ClassVar
+from typing import TYPE_CHECKING, Any, ClassVar, cast
 
 from lerobot.configs.train import TrainPipelineConfig
 from lerobot.utils.constants import CHECKPOINTS_DIR, LAST_CHECKPOINT_LINK, PRETRAINED_MODEL_DIR
 from torch import Tensor
 
 from lerobot_bomb.adapters import base_commit, check_adapters, check_base
+from lerobot_bomb.finite import require_finite_statistics
 from lerobot_bomb.hub.card import Checkpoint
-from lerobot_bomb.hub.checks import PROCESSORS, check_tensors, processor_files
+from lerobot_bomb.hub.checks import PROCESSORS, check_finite, check_tensors, processor_files
 from lerobot_bomb.hub.dataset import DatasetFacts
 from lerobot_bomb.hub.method import Method
 from lerobot_bomb.hub.names import is_hub_id
@@ -31,11 +32,13 @@ class HubPolicy:
     config: Any
 
     def __init__(self, config: Any, dataset_meta: "LeRobotDatasetMetadata | None" = None):
+        """``dataset_meta``: of the dataset that is trained on, whose statistics must be finite."""
         if not isinstance(config, self.config_class):
             raise ValueError(
                 f"this is a {config.type}, not a {self.name}: load it with "
                 f"get_policy_class({config.type!r}).from_pretrained"
             )
+        _require_finite_statistics_of(dataset_meta)
         _next(super()).__init__(config)
         self._take_environment(dataset_meta)
 
@@ -43,17 +46,19 @@ class HubPolicy:
     def from_pretrained(
         cls,
         pretrained_name_or_path: str | Path,
-        trained_on: "LeRobotDatasetMetadata | None" = None,
+        *,
+        dataset_meta: "LeRobotDatasetMetadata | None" = None,
         **kwargs: Any,
     ) -> Any:
         """As LeRobot's, but files are checked first; errors are a line that names the file.
 
-        A policy that goes on to be `trained_on` a dataset is of that one's environment.
+        A policy that goes on to be trained on a dataset (`dataset_meta`) is of that one's environment.
 
         Raises:
-            ValueError: one is truncated, or weights or config are of another policy.
+            ValueError: one is truncated or not finite, or weights or config are of another policy.
             OSError: one is missing, or the Hub cannot be reached.
         """
+        _require_finite_statistics_of(dataset_meta)
         folder = Path(pretrained_name_or_path)
         if not folder.is_dir() and not is_hub_id(folder):
             raise FileNotFoundError(f"there is no folder {folder}, and it is no name on the Hub")
@@ -64,12 +69,12 @@ class HubPolicy:
         if config is not None and config.use_peft:  # this is their base
             check_adapters(str(config.pretrained_path), config.pretrained_revision)
         policy = _next(super()).from_pretrained(pretrained_name_or_path, **kwargs)
-        policy._take_environment(trained_on)
+        policy._take_environment(dataset_meta)
         return policy
 
-    def _take_environment(self, trained_on: "LeRobotDatasetMetadata | None") -> None:
-        if trained_on is not None:
-            self.config.environment = environment_of_dataset(trained_on.root)
+    def _take_environment(self, dataset_meta: "LeRobotDatasetMetadata | None") -> None:
+        if dataset_meta is not None:
+            self.config.environment = environment_of_dataset(dataset_meta.root)
 
     @classmethod
     def _load_as_safetensor(cls, model: Any, model_file: str, map_location: str, strict: bool) -> Any:
@@ -77,6 +82,7 @@ class HubPolicy:
         if not path.is_file():
             raise FileNotFoundError(f"{path.parent} holds no {path.name}, so it is no whole checkpoint")
         check_tensors(path, model)
+        check_finite(path)
         return _next(super())._load_as_safetensor(model, model_file, map_location, strict)
 
     def _validate_peft_config(self, peft_config: Any) -> None:
@@ -133,6 +139,11 @@ class HubPolicy:
             commit = publish(card, files, self.config.private)
         # LeRobot's remote jobs wait for this line
         logging.info(f"Model pushed to {commit.repo_url.url}")
+
+
+def _require_finite_statistics_of(meta: "LeRobotDatasetMetadata | None") -> None:
+    if meta is not None:
+        require_finite_statistics(cast("Any", meta.stats))
 
 
 def _next(policy: Any) -> Any:

@@ -21,6 +21,7 @@ from transformers import (
     SmolVLMVisionConfig,
 )
 
+from lerobot_bomb.finite import require_finite_weights
 from lerobot_bomb.vlm.presets import INITIALIZER_RANGE, nano_config
 from lerobot_bomb.vlm.tokenizer import NANO, hub_file, load_tokenizer
 
@@ -78,7 +79,7 @@ def load_backbone(vlm_model_name: str) -> SmolVLMBackbone:
 
     Raises:
         OSError: config or weights cannot be had; the message names the ways out.
-        ValueError: as `check_family`.
+        ValueError: as `check_family`, or weights are not finite.
     """
     if vlm_model_name == NANO:
         backbone = build_backbone(nano_config(load_tokenizer(NANO)))
@@ -86,11 +87,11 @@ def load_backbone(vlm_model_name: str) -> SmolVLMBackbone:
         return backbone
     config = read_vlm_config(vlm_model_name, "vla0_smol")
     with weights_errors(vlm_model_name):
-        return SmolVLMBackbone(
-            SmolVLMForConditionalGeneration.from_pretrained(
-                vlm_model_name, config=config, dtype=torch.float32
-            )
+        vlm = SmolVLMForConditionalGeneration.from_pretrained(
+            vlm_model_name, config=config, dtype=torch.float32
         )
+    require_finite_weights(vlm, f"--policy.vlm_model_name={vlm_model_name}")
+    return SmolVLMBackbone(vlm)
 
 
 def check_family(vlm_model_name: str, policy: str) -> None:

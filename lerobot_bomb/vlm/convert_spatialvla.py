@@ -18,7 +18,7 @@ from torch import Tensor
 
 from lerobot_bomb.actions.grids import ActionGrids
 from lerobot_bomb.checkpoint import write_checkpoint
-from lerobot_bomb.hub.checks import read_json
+from lerobot_bomb.hub.checks import check_finite, read_json
 from lerobot_bomb.viewing.unfinished import check_new_folder
 from lerobot_bomb.vlm.paligemma import PaliGemmaPrompt
 from lerobot_bomb.vlm.tokenizer import load_tokenizer
@@ -130,9 +130,11 @@ def _weights(folder: Path, original: dict[str, Any], ours: dict[str, Tensor]) ->
     """The folder's tensors under our names, float32; what only we have stays as it is.
 
     Raises:
-        ValueError: there are none, or one is missing.
+        ValueError: there are none, or one is missing or not finite.
     """
     files = sorted(folder.glob("*.safetensors"))
+    for path in files:
+        check_finite(path)
     tensors = {name: tensor for path in files for name, tensor in load_file(path).items()}
     if missing := [name for name in (WORDS, WORD_HEAD, CELLS) if name not in tensors]:
         raise ValueError(f"{folder}: its {len(files)} *.safetensors have no {', '.join(missing)}")

@@ -11,6 +11,7 @@ import torch
 from torch import Tensor, nn
 from torch.nn.functional import interpolate, pad
 
+from lerobot_bomb.finite import require_finite_weights
 from lerobot_bomb.vlm.intrinsics import back_project, from_pixel_centers, resize_intrinsics
 
 if TYPE_CHECKING:
@@ -154,9 +155,11 @@ def load_zoedepth(depth_model_name: str) -> ZoeDepth:
     from transformers import ZoeDepthForDepthEstimation  # only who asks for it pays for it
 
     try:
-        return ZoeDepth(ZoeDepthForDepthEstimation.from_pretrained(depth_model_name, dtype=torch.float32))
+        model = ZoeDepthForDepthEstimation.from_pretrained(depth_model_name, dtype=torch.float32)
     except OSError as error:
         raise OSError(
             f"--policy.depth_model_name={depth_model_name}: no model found. Without network, give the local "
             f"folder of a ZoeDepth model, or choose --policy.depth_source=observation or none"
         ) from error
+    require_finite_weights(model, f"--policy.depth_model_name={depth_model_name}")
+    return ZoeDepth(model)

@@ -5,17 +5,23 @@ from lerobot.utils.constants import OBS_LANGUAGE_ATTENTION_MASK, OBS_LANGUAGE_TO
 from torch import Tensor
 
 from lerobot_bomb.actions.text import TokenRows
+from lerobot_bomb.finite import require_finite_batch
 
 # on CUDA, sentences of any length up to a multiple share what is recorded
 TEXT_COLUMNS = 16
 
 
 def read_tensor(batch: dict[str, Tensor], key: str, policy_type: str, device: torch.device) -> Tensor:
-    """The batch's value; an error if it is absent or on another device."""
+    """The batch's value; an error if it is absent, on another device or, on the CPU, not finite.
+
+    On CUDA the host would have to wait; `TaskTokenizerStep` looks at a batch before.
+    """
     if key not in batch:
         raise KeyError(f"{policy_type} needs {key!r}; the batch has {sorted(batch)}")
     if batch[key].device != device:
         raise ValueError(f"batch[{key!r}] is on {batch[key].device}, the policy on {device}")
+    if device.type == "cpu":
+        require_finite_batch({key: batch[key]}, batch)
     return batch[key]
 
 

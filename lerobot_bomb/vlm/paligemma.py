@@ -14,6 +14,7 @@ from torch import Tensor, nn
 from transformers import PaliGemmaConfig, PaliGemmaForConditionalGeneration
 
 from lerobot_bomb.actions.text import END, SYMBOL_TEXTS
+from lerobot_bomb.finite import require_finite_weights
 from lerobot_bomb.vlm.backbone import read_vlm_config, set_float32, spread_pictures, weights_errors
 from lerobot_bomb.vlm.presets import nano_paligemma_config
 from lerobot_bomb.vlm.tokenizer import IMAGE_TOKEN, NANO, load_tokenizer, single_id, token_ids
@@ -131,14 +132,14 @@ def load_paligemma(vlm_model_name: str) -> PaliGemmaBackbone:
             f"model; spatialvla_grid needs 'gemma2' (PaliGemma 2)"
         )
     with weights_errors(vlm_model_name):
-        return PaliGemmaBackbone(
-            PaliGemmaForConditionalGeneration.from_pretrained(
-                vlm_model_name,
-                config=config,
-                dtype=torch.float32,
-                attn_implementation=_attention(config.text_config),
-            )
+        vlm = PaliGemmaForConditionalGeneration.from_pretrained(
+            vlm_model_name,
+            config=config,
+            dtype=torch.float32,
+            attn_implementation=_attention(config.text_config),
         )
+    require_finite_weights(vlm, f"--policy.vlm_model_name={vlm_model_name}")
+    return PaliGemmaBackbone(vlm)
 
 
 def build_paligemma(vlm_config: dict[str, Any]) -> PaliGemmaBackbone:

@@ -19,6 +19,7 @@ from torch.utils.checkpoint import checkpoint
 from transformers import Qwen2_5_VLConfig, Qwen2_5_VLForConditionalGeneration
 from transformers.utils.constants import OPENAI_CLIP_MEAN, OPENAI_CLIP_STD
 
+from lerobot_bomb.finite import require_finite_weights
 from lerobot_bomb.vlm.backbone import read_vlm_config, set_float32, spread_filters, weights_errors
 from lerobot_bomb.vlm.presets import nano_qwen_config
 from lerobot_bomb.vlm.tokenizer import (
@@ -254,6 +255,7 @@ def load_qwen(vlm_model_name: str, image_size: int) -> QwenBackbone:
         vlm = Qwen2_5_VLForConditionalGeneration.from_pretrained(
             vlm_model_name, config=config, dtype=torch.float32, attn_implementation="sdpa"
         )
+    require_finite_weights(vlm, f"--policy.vlm_model_name={vlm_model_name}")
     return QwenBackbone(vlm, image_size)
 
 

@@ -1,9 +1,10 @@
 """The processor step that turns an instruction into tokens, and the pipelines around it.
 
-It reads only the task; everything else of a prompt depends on a policy's config and is put together inside
-the policy.
+It turns only the task into tokens; everything else of a prompt depends on a policy's config and is put
+together inside the policy.
 """
 
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -18,10 +19,17 @@ from lerobot.processor import (
     make_default_policy_processor_steps,
     make_policy_processor_pipelines,
 )
-from lerobot.utils.constants import OBS_LANGUAGE_ATTENTION_MASK, OBS_LANGUAGE_TOKENS
+from lerobot.utils.constants import (
+    ACTION,
+    OBS_IMAGE,
+    OBS_LANGUAGE_ATTENTION_MASK,
+    OBS_LANGUAGE_TOKENS,
+    OBS_STATE,
+)
 from tokenizers import Tokenizer
 from torch import Tensor
 
+from lerobot_bomb.finite import require_finite_batch, require_finite_statistics
 from lerobot_bomb.vlm.prompt import task_ids
 from lerobot_bomb.vlm.tokenizer import tokenizer_from_tensor, tokenizer_to_tensor
 
@@ -33,6 +41,9 @@ MAX_KEPT_TASKS = 4096
 class TaskTokenizerStep(ObservationProcessorStep):
     """``task`` (B texts) -> ``observation.language.tokens`` (B, L) and their attention mask (B, L) bool.
 
+    As it is in the pipelines of all our checkpoints, before anything is normalised, it also refuses a batch
+    whose pictures, state or actions are not finite. On CUDA that makes the host wait once, before the pass.
+
     ``template`` is what is written, with ``{}`` for the task. The tokenizer is the step's state, so a
     checkpoint carries it whole. Rows are padded at the end. A dataset has few tasks, so their ids are kept:
     the tokenizer does not run again.
@@ -43,7 +54,10 @@ class TaskTokenizerStep(ObservationProcessorStep):
     _ids: dict[str, Tensor] = field(default_factory=dict, init=False, repr=False)
 
     def observation(self, observation: dict[str, Any]) -> dict[str, Any]:
-        tasks = (self.transition.get(TransitionKey.COMPLEMENTARY_DATA) or {}).get("task")
+        frames = self.transition.get(TransitionKey.COMPLEMENTARY_DATA) or {}
+        actions = self.transition.get(TransitionKey.ACTION)
+        require_finite_batch(_read_by_policies(observation, actions), frames)
+        tasks = frames.get("task")
         tasks = [tasks] if isinstance(tasks, str) else tasks
         if not tasks or not all(isinstance(task, str) for task in tasks):
             raise ValueError(f"the policy needs the instruction under the key 'task' as text; got {tasks!r}")
@@ -81,6 +95,15 @@ class TaskTokenizerStep(ObservationProcessorStep):
         return features
 
 
+def _read_by_policies(observation: Mapping[str, Any], actions: Any) -> dict[str, Tensor]:
+    """Pictures, state and actions; depth is not finite where there is none."""
+    return {
+        key: values
+        for key, values in {**observation, ACTION: actions}.items()
+        if isinstance(values, Tensor) and (key in (ACTION, OBS_STATE) or key.startswith(OBS_IMAGE))
+    }
+
+
 def make_task_processors(
     config: PreTrainedConfig,
     dataset_stats: dict[str, dict[str, Tensor]] | None,
@@ -89,7 +112,12 @@ def make_task_processors(
     PolicyProcessorPipeline[dict[str, Any], dict[str, Any]],
     PolicyProcessorPipeline[PolicyAction, PolicyAction],
 ]:
-    """Rename, batch, ``task_step`` (which reads the task), device, normalise; and unnormalise, to CPU."""
+    """Rename, batch, ``task_step`` (which reads the task), device, normalise; and unnormalise, to CPU.
+
+    Raises:
+        ValueError: the statistics are not finite.
+    """
+    require_finite_statistics(dataset_stats)
     steps = make_default_policy_processor_steps(config, dataset_stats)
     return make_policy_processor_pipelines(
         input_steps=[

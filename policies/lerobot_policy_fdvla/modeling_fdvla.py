@@ -25,6 +25,7 @@ from lerobot_bomb.actions.relative import bounds
 from lerobot_bomb.actions.text import TokenRows
 from lerobot_bomb.adapters import peft_targets
 from lerobot_bomb.data.columns import dim_names
+from lerobot_bomb.finite import require_finite_answers
 from lerobot_bomb.flow.dual_mod import masked_mean_pool
 from lerobot_bomb.flow.losses import joint_loss, second_derivatives
 from lerobot_bomb.flow.path import PathPoint, draw_noise, draw_tau, path_point
@@ -125,7 +126,7 @@ class FdvlaPolicy(HubPolicy, SavesTiedWeightsOnce, PreTrainedPolicy):
             else:
                 check_weights_fit(config, SHAPES)
         policy = super().from_pretrained(
-            *args, config=config, trained_on=dataset_meta, **{**kwargs, "strict": True}
+            *args, config=config, dataset_meta=dataset_meta, **{**kwargs, "strict": True}
         )
         policy._take_units(dataset_meta)
         return policy
@@ -197,16 +198,13 @@ class FdvlaPolicy(HubPolicy, SavesTiedWeightsOnce, PreTrainedPolicy):
             loss = loss.unflatten(0, (-1, draws)).mean(dim=1)
         elif self.training:
             loss = weighed(loss, kept_BK)
-        return loss, self._metrics(terms, velocity_BKD, noise_BKD, point, actions_BKD, kept_BK)
+        return loss, self._metrics(loss, terms, velocity_BKD, noise_BKD, point, actions_BKD, kept_BK)
 
     def _actions(self, batch: dict[str, Tensor]) -> Tensor:
         """(B, K, D) normalised."""
         shape = self.config.chunk_size, self._action_dim
-        actions_BKD = read_actions(batch, ACTION, self.config.type, self.action_unit.device, shape)
-        if not actions_BKD.isfinite().all():
-            rows = (~actions_BKD.isfinite()).any(dim=2).any(dim=1).nonzero()[:, 0].tolist()
-            raise ValueError(f"batch['action'] is not finite in the rows {rows} (NaN or infinite)")
-        return actions_BKD.float()
+        device = self.action_unit.device
+        return read_actions(batch, ACTION, self.config.type, device, shape).float()
 
     def _kept(self, batch: dict[str, Tensor]) -> Tensor:
         """(B, K) bool: which actions are read by others and trained on."""
@@ -222,6 +220,7 @@ class FdvlaPolicy(HubPolicy, SavesTiedWeightsOnce, PreTrainedPolicy):
     @torch.no_grad()
     def _metrics(
         self,
+        loss: Tensor,
         terms: dict[str, Tensor],
         velocity_BKD: Tensor | None,
         noise_BKD: Tensor | None,
@@ -241,7 +240,7 @@ class FdvlaPolicy(HubPolicy, SavesTiedWeightsOnce, PreTrainedPolicy):
             parts["l1"] = errors_BKD, kept_BKD
             for dim, name in enumerate(self._action_names):
                 parts[f"l1_{name}"] = errors_BKD[..., dim], kept_BKD[..., dim]
-        return means(parts)
+        return means(parts, loss, self.config.trained_batches)
 
     def _implied_actions(
         self, velocity_BKD: Tensor | None, noise_BKD: Tensor | None, point: PathPoint
@@ -296,6 +295,7 @@ class FdvlaPolicy(HubPolicy, SavesTiedWeightsOnce, PreTrainedPolicy):
                 actions_BKD = self._sample(*noises, *context.tensors())[0]
         # casts of weights cached under inference mode cannot be used by a later training step
         torch.clear_autocast_cache()
+        require_finite_answers(actions_BKD.isfinite().flatten(1).all(dim=1))
         return actions_BKD
 
     def _sample(self, noise_BKD: Tensor, step_noise: Tensor, *context: Tensor) -> tuple[Tensor]:

@@ -136,7 +136,7 @@ class SpatialvlaGridPolicy(HubPolicy, SavesTiedWeightsOnce, PreTrainedPolicy):
                 check_as_trained(config)
             config.check_grid_as_trained(is_refitted=dataset_meta is not None and config.adapt_embeddings)
         policy = super().from_pretrained(
-            *args, config=config, trained_on=dataset_meta, **{**kwargs, "strict": True}
+            *args, config=config, dataset_meta=dataset_meta, **{**kwargs, "strict": True}
         )
         if dataset_meta is not None:
             policy._base_buffers = frozen_buffers(policy)
@@ -212,8 +212,8 @@ class SpatialvlaGridPolicy(HubPolicy, SavesTiedWeightsOnce, PreTrainedPolicy):
             hidden_BTGH = self._hidden(batch, cells_BTG)
             losses_BTG, chosen_BTG = self._losses(hidden_BTGH, cells_BTG)
         kept_BTG = self._kept(batch)[..., None].expand_as(losses_BTG)
-        metrics = self._metrics(chosen_BTG, cells_BTG, kept_BTG)
         losses_BTG = losses_BTG * kept_BTG
+        metrics = self._metrics(chosen_BTG, cells_BTG, kept_BTG, losses_BTG)
         if reduction == "none":
             losses_B, counts_B = losses_BTG.sum(dim=(1, 2)), kept_BTG.sum(dim=(1, 2))
             return losses_B / counts_B.clamp(min=1), metrics
@@ -261,7 +261,9 @@ class SpatialvlaGridPolicy(HubPolicy, SavesTiedWeightsOnce, PreTrainedPolicy):
         return torch.ones_like(batch[ACTION][..., 0], dtype=torch.bool)
 
     @torch.no_grad()
-    def _metrics(self, chosen_BTG: Tensor, cells_BTG: Tensor, kept_BTG: Tensor) -> dict[str, float]:
+    def _metrics(
+        self, chosen_BTG: Tensor, cells_BTG: Tensor, kept_BTG: Tensor, losses_BTG: Tensor
+    ) -> dict[str, float]:
         """Share of right cells, mean absolute errors of what cells decode to in the data's units.
 
         Teacher-forced: every cell is predicted from the true ones before it. Padded actions do not count.
@@ -275,7 +277,7 @@ class SpatialvlaGridPolicy(HubPolicy, SavesTiedWeightsOnce, PreTrainedPolicy):
             parts["l1"] = errors_BTD, kept_BTD
             for dim, name in enumerate(self._action_names):
                 parts[f"l1_{name}"] = errors_BTD[..., dim], kept_BTD[..., dim]
-        return means(parts)
+        return means(parts, losses_BTG, self.config.trained_batches)
 
     # Inference
 

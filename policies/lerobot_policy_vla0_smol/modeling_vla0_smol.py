@@ -120,7 +120,7 @@ class Vla0SmolPolicy(HubPolicy, SavesTiedWeightsOnce, PreTrainedPolicy):
             check_as_trained(config)
         try:
             policy = super().from_pretrained(
-                *args, config=config, trained_on=dataset_meta, **{**kwargs, "strict": True}
+                *args, config=config, dataset_meta=dataset_meta, **{**kwargs, "strict": True}
             )
         except ValueError as error:
             if " relative." in str(error):
@@ -192,7 +192,7 @@ class Vla0SmolPolicy(HubPolicy, SavesTiedWeightsOnce, PreTrainedPolicy):
         losses_BA = cross_entropy(
             logits_BAV.float().flatten(0, 1), answer.labels.flatten(), ignore_index=IGNORED, reduction="none"
         ).view_as(answer.labels)
-        metrics = self._metrics(logits_BAV.detach(), answer, numbers, bins_BN)
+        metrics = self._metrics(logits_BAV.detach(), answer, numbers, bins_BN, losses_BA)
         if reduction == "none":
             return losses_BA.sum(dim=1) / kept_BA.sum(dim=1).clamp(min=1), metrics
         loss = losses_BA.sum() / kept_BA.sum().clamp(min=1)
@@ -200,7 +200,7 @@ class Vla0SmolPolicy(HubPolicy, SavesTiedWeightsOnce, PreTrainedPolicy):
 
     @torch.no_grad()
     def _metrics(
-        self, logits_BAV: Tensor, answer: Answer, numbers: NumberTokens, bins_BN: Tensor
+        self, logits_BAV: Tensor, answer: Answer, numbers: NumberTokens, bins_BN: Tensor, losses_BA: Tensor
     ) -> dict[str, float]:
         """Shares of right tokens and of exact numbers, mean absolute errors in the data's units.
 
@@ -222,7 +222,7 @@ class Vla0SmolPolicy(HubPolicy, SavesTiedWeightsOnce, PreTrainedPolicy):
             parts["l1"] = errors_BTD, counted_BTD
             for dim, name in enumerate(self.config.action_names):
                 parts[f"l1_{name}"] = errors_BTD[..., dim], counted_BTD[..., dim]
-        return means(parts)
+        return means(parts, losses_BA, self.config.trained_batches)
 
     def _answer_logits(self, batch: dict[str, Tensor], prompt: TokenRows, answer: TokenRows) -> Tensor:
         """Teacher-forced logits of every answer token: (B, A, V)."""

@@ -13,6 +13,8 @@ import vla0_smol_cases
 from policy_cases import CASES
 from torch import Tensor
 
+from lerobot_bomb.finite import require_finite_batch
+
 WRITERS = {
     "vla0_smol, drafts": lambda **options: vla0_smol_cases.make_policy(**options),
     "vla0_smol, no drafts": lambda **options: vla0_smol_cases.make_policy(draft="none", **options),
@@ -105,6 +107,31 @@ def test_recordings_follow_weights_and_devices(make: Callable[..., Any]) -> None
     assert same(second, predict(host, batch)) and not same(second, first)
     for moved in (device.cpu().cuda(), copy.deepcopy(device), pickle.loads(pickle.dumps(device))):
         assert torch.equal(predict(moved, batch), second)
+
+
+def test_what_a_model_gives_that_is_not_finite_is_no_action(make: Callable[..., Any]) -> None:
+    """Of one row, and of another call of the same recording."""
+    device = make().cuda()
+    batch = on("cuda", batch_for(device, 3))
+    device.predict_action_chunk(batch)
+    key = next(key for key in batch if key.startswith("observation.images"))
+    spoiled = {**batch, key: batch[key].index_fill(0, torch.tensor([1], device="cuda"), torch.nan)}
+    with pytest.raises(ValueError, match=r"NaN or infinite numbers for the rows \[1\] of the batch"):
+        device.predict_action_chunk(spoiled)
+    device.predict_action_chunk(batch)
+    for parameter in device.parameters():
+        torch.nn.init.constant_(parameter, torch.nan)
+    with pytest.raises(ValueError, match=r"NaN or infinite numbers for the rows \[0, 1, 2\] of the batch"):
+        device.predict_action_chunk(batch)
+
+
+def test_a_batch_on_the_device_is_checked_where_it_lies() -> None:
+    values = {"a": torch.zeros(2, 3, device="cuda"), "b": torch.zeros(2, 5, device="cuda")}
+    frames = {"index": torch.tensor([5, 6]), "episode_index": torch.tensor([0, 1], device="cuda")}
+    require_finite_batch(values, frames)
+    values["b"][1, 4] = torch.inf
+    with pytest.raises(ValueError, match=r"'b' is not finite in frame 6 .* of episode 1, row 1"):
+        require_finite_batch(values, frames)
 
 
 def test_training_goes_on_after_a_prediction(make: Callable[..., Any]) -> None:

@@ -1,0 +1,130 @@
+"""Numbers that are NaN or infinite are an error that says where they are; one definition for all of us."""
+
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+import torch
+from lerobot.utils.constants import ACTION, OBS_PREFIX
+from torch import Tensor, nn
+
+
+def is_finite(values: Tensor) -> bool:
+    """Whether no value is NaN or infinite; for a tensor on CUDA the host waits.
+
+    A sum of values that are not finite never is, so the values are looked at one by one, which takes 30
+    times as long, only where the sum overflows or something is wrong.
+    """
+    return bool(_readable(values).sum().isfinite()) or not bool(_bad(values).any())
+
+
+def require_finite(values: Tensor, name: str, advice: str = "") -> None:
+    """Raise a ValueError with count and first index, unless all values are finite."""
+    if is_finite(values):
+        return
+    bad = _bad(values)
+    first = f" the first at {bad.nonzero()[0].tolist()}" if bad.ndim else " the only one"
+    raise ValueError(
+        f"{name} is not finite: {int(bad.sum())} of {bad.numel()} values are NaN or infinite,{first}{advice}"
+    )
+
+
+def _bad(values: Tensor) -> Tensor:
+    """Which are NaN or infinite."""
+    return ~_readable(values).isfinite()
+
+
+def _readable(values: Tensor) -> Tensor:
+    """Torch computes nothing with 8 bit floats."""
+    return values.float() if values.is_floating_point() and values.element_size() == 1 else values
+
+
+def require_finite_on_cpu(values: Tensor, name: str) -> None:
+    """The same where that costs no wait."""
+    if values.device.type == "cpu":
+        require_finite(values, name)
+
+
+def require_finite_weights(model: nn.Module, name: str) -> None:
+    """The same of a model's weights and buffers."""
+    for key, values in model.state_dict().items():
+        require_finite(values, f"{name}: {key}")
+
+
+def require_finite_statistics(statistics: Mapping[str, Mapping[str, Any]] | None) -> None:
+    """The same of a dataset's statistics of actions and observations, by which values are normalised."""
+    for key, of_key in (statistics or {}).items():
+        if key == ACTION or key.startswith(OBS_PREFIX):
+            for statistic, values in of_key.items():
+                require_finite(
+                    torch.as_tensor(values),
+                    f"the dataset's statistics (meta/stats.json): {statistic} of {key!r}",
+                    "; once its frames are finite, lerobot-edit-dataset --operation.type=recompute_stats "
+                    "makes them anew",
+                )
+
+
+def require_finite_rows(values_NX: np.ndarray | Tensor, failure: str, name: str) -> None:
+    """Raise a ValueError with the number of rows that are not finite and the first one's index and values.
+
+    ``failure``: what cannot be done; ``name``: of the rows.
+    """
+    values_NX = torch.as_tensor(values_NX)
+    if is_finite(values_NX):
+        return
+    bad_N = _bad(values_NX).flatten(1).any(dim=1)
+    first = int(bad_N.nonzero()[0])
+    raise ValueError(
+        f"{failure}: {int(bad_N.sum())} of {len(bad_N)} {name} are not finite, the first at index {first}: "
+        f"{values_NX[first].tolist()}"
+    )
+
+
+def require_finite_answers(finite_B: Tensor, rows_B: Tensor | None = None) -> None:
+    """Raise a ValueError with the rows of a batch for which a model gave numbers that are not finite.
+
+    ``rows_B``: which rows they are. On CUDA the host waits for the device.
+    """
+    if bool(finite_B.all()):
+        return
+    rows = (~finite_B).nonzero()[:, 0] if rows_B is None else rows_B[~finite_B]
+    raise ValueError(
+        f"the policy's model gives NaN or infinite numbers for the rows {rows.tolist()} of the batch, so "
+        "there is no action. If its weights and inputs are finite, numbers grew too large inside it: it has "
+        "diverged, or needs --policy.dtype=float32"
+    )
+
+
+def require_finite_batch(values: Mapping[str, Tensor], frames: Mapping[str, Tensor]) -> None:
+    """Raise a ValueError with key, row and frame unless the values (B, ...) of a batch are finite.
+
+    On CUDA the host waits for the device once. ``frames``: each row's `episode_index` and `index` in the
+    dataset, if it has any; actions (B, T, D) are those of the row's frame and the following ones.
+    """
+    values = {key: of_key for key, of_key in values.items() if of_key.is_floating_point()}
+    if not values:
+        return
+    device = next(iter(values.values())).device
+    sums = torch.stack([of_key.sum().to(device, torch.float32) for of_key in values.values()])
+    if bool(sums.isfinite().all()):
+        return
+    for key, of_key in values.items():
+        bad = _bad(of_key)
+        if bool(bad.any()):
+            row, *place = bad.nonzero()[0].tolist()
+            ahead = place[0] if key == ACTION and len(place) == 2 else 0
+            where, advice = _frame(frames, row, ahead)
+            raise ValueError(
+                f"{key!r} is not finite in {where}row {row} of the batch: {int(bad[row].sum())} of "
+                f"{bad[row].numel()} values there are NaN or infinite, the first at {place}{advice}"
+            )
+
+
+def _frame(frames: Mapping[str, Tensor], row: int, ahead: int) -> tuple[str, str]:
+    """Where in its dataset a row's frame is, or the one so many after it, and what to do."""
+    if not {"episode_index", "index"} <= frames.keys():
+        return "", ""
+    episode, index = (int(frames[key].reshape(-1)[row]) for key in ("episode_index", "index"))
+    where = f"frame {index + ahead} of the dataset (its column 'index'), of episode {episode}, "
+    advice = "leave the episode out: lerobot-edit-dataset --operation.type=delete_episodes"
+    return where, f"; {advice} --operation.episode_indices=[{episode}]"
