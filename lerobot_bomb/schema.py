@@ -4,6 +4,7 @@ numpy only: simulator workers import this module and must start in under a secon
 """
 
 import dataclasses
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from enum import StrEnum
 
@@ -258,6 +259,12 @@ class PrivilegedState:
             stone_is_white=stones[:, 3] > 0.5,
             stone_in_play=stones[:, 4] > 0.5,
         )
+
+
+def task_id(target: Sequence[int], color: str) -> int:
+    """The number of a task by its (row, column) and colour; the inverse of `EpisodeSpec.for_task`."""
+    row, column = target
+    return BOARD.num_lines**2 * COLORS.index(color) + BOARD.num_lines * row + column
 
 
 def action_bounds(control_mode: str) -> tuple[np.ndarray, np.ndarray]:

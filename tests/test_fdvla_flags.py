@@ -20,6 +20,7 @@ from fdvla_cases import (
 )
 
 from lerobot_bomb.flags import FlagError
+from lerobot_bomb.policy_environment import ConfigWithEnvironment
 from lerobot_policy_fdvla.configuration_fdvla import FdvlaConfig
 
 
@@ -156,6 +157,6 @@ def test_the_policys_page_has_every_flag_in_its_table() -> None:
     flags = {
         re.sub("^(optimizer|scheduler)_.*", r"\1_*", field.name)
         for field in fields(FdvlaConfig)
-        if field.name in vars(FdvlaConfig)["__annotations__"]
+        if any(field.name in vars(of)["__annotations__"] for of in (ConfigWithEnvironment, FdvlaConfig))
     }
     assert listed == flags

@@ -3,6 +3,7 @@
 import errno
 import json
 from dataclasses import replace
+from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
@@ -233,6 +234,14 @@ def test_a_recording_of_another_protocol_version_is_not_gone_on_with(
     old = replace(IMAGES, protocol_version="0.0")
     with pytest.raises(ValueError, match=rf"differs in protocol_version='0.0' \(it has {TASK_VERSION!r}\)"):
         record(old, datasets["images"], resume=True)
+
+
+def test_a_recording_names_its_simulator_and_goes_on_under_no_other(datasets: dict[str, Path]) -> None:
+    recorded = json.loads((datasets["images"] / METADATA_FILE).read_text())["recording"]
+    assert recorded["mujoco_version"] == version("mujoco")
+    other = replace(IMAGES, mujoco_version="3.8.0")
+    with pytest.raises(ValueError, match=rf"mujoco_version='3\.8\.0' \(it has '{version('mujoco')}'\)"):
+        record(other, datasets["images"], resume=True)
 
 
 def test_failures_are_described_by_class_and_seed() -> None:

@@ -260,7 +260,7 @@ def test_a_heading_says_what_was_asked(path: Path, capsys: pytest.CaptureFixture
     assert (
         f"protocol {PROTOCOL_VERSION}, suite=place, robot=fetch, split=all, control_mode=relative, " in output
     )
-    assert "perturbations=camera:3, seeds 4..7" in output
+    assert "perturbations=camera:3, seeds 4, 7" in output
     assert "256 px, render_preset fast, OpenGL Mesa, llvmpipe, MuJoCo 3.8.1, lerobot_bomb " in output
     assert "1 lines count no more, a later one is of the same episode" in output
     assert 'no unperturbed ones to compare with; add "none" to --env.perturbations' in output

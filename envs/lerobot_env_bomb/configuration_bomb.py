@@ -7,13 +7,24 @@ from typing import Any, cast
 
 from lerobot.configs import FeatureType, PolicyFeature
 from lerobot.envs import EnvConfig
+from lerobot.processor import PolicyProcessorPipeline
 from lerobot.utils.constants import ACTION, OBS_IMAGES, OBS_PREFIX, OBS_STATE
 
 from lerobot_bomb.camera_geometry import geometry_shapes
+from lerobot_bomb.environment import Environment
 from lerobot_bomb.flags import flag_errors
 from lerobot_bomb.json_lines import check_appendable
 from lerobot_bomb.perturbations import NONE, Condition
-from lerobot_bomb.schema import ACTION_DIM, CAMERAS, DEFAULT_FPS, STATE_DIM, EpisodeSpec, RenderOptions
+from lerobot_bomb.policy_environment import check_acting_policy
+from lerobot_bomb.schema import (
+    ACTION_DIM,
+    CAMERAS,
+    DEFAULT_FPS,
+    STATE_DIM,
+    TASK_VERSION,
+    EpisodeSpec,
+    RenderOptions,
+)
 from lerobot_env_bomb.fetch_files import check_robot
 from lerobot_env_bomb.vector import LazyVectorEnv
 
@@ -53,6 +64,8 @@ class BombEnvConfig(EnvConfig):
     success_tolerance_mm: float = 10.0
     # file that gets one JSON line per finished episode: seed, target, error, failure class
     results_path: str | None = None
+    # let a checkpoint act that was trained for another environment
+    ignore_checkpoint: bool = False
     features: dict[str, PolicyFeature] = field(default_factory=dict)
     features_map: dict[str, str] = field(default_factory=dict)
 
@@ -130,6 +143,31 @@ class BombEnvConfig(EnvConfig):
     @property
     def render_options(self) -> RenderOptions:
         return RenderOptions(image_size=self.image_size, preset=self.render_preset, depth=self.depth)
+
+    @property
+    def environment(self) -> Environment:
+        """What a policy must have been trained for to act here."""
+        return Environment(
+            robot=self.robot,
+            control_mode=self.control_mode,
+            fps=self.fps,
+            image_size=self.image_size,
+            cameras=CAMERAS,
+            protocol_version=TASK_VERSION,
+            task=str(self.task),
+            depth=self.depth,
+            task_ids=tuple(self.task_ids or ()),
+        )
+
+    def get_env_processors(self) -> tuple[PolicyProcessorPipeline, PolicyProcessorPipeline]:
+        """None; every command asks for them once, when its policy is built and nothing has been played.
+
+        Raises:
+            ValueError: that policy was trained for another environment.
+        """
+        if not self.ignore_checkpoint:
+            check_acting_policy(self.environment)
+        return super().get_env_processors()
 
     def create_envs(self, n_envs: int, use_async_envs: bool = False) -> dict[str, dict[int, LazyVectorEnv]]:
         """{suite and condition: {task id: vector env of n_envs}}; no worker starts before a first reset.

@@ -5,6 +5,7 @@ import json
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import asdict, dataclass, replace
+from importlib.metadata import version
 from typing import Any, ClassVar
 
 from lerobot_bomb import __version__
@@ -18,6 +19,7 @@ from lerobot_bomb.schema import (
     RenderOptions,
 )
 
+MUJOCO_VERSION = version("mujoco")  # not imported: that takes a backend of OpenGL
 MAX_NOISE = 1.0  # beyond it the noise exceeds the largest action
 
 
@@ -44,6 +46,7 @@ class Recording:
     noise: float = 0.0
     protocol_version: str = TASK_VERSION  # the name that recordings of 1.0 have
     package_version: str = __version__
+    mujoco_version: str = MUJOCO_VERSION  # another one plays other bits
 
     def __post_init__(self) -> None:
         check_repo_id(self.repo_id)

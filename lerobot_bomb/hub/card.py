@@ -10,6 +10,7 @@ from lerobot.configs import PreTrainedConfig
 from lerobot.configs.train import TrainPipelineConfig
 
 from lerobot_bomb import __version__
+from lerobot_bomb.environment import Environment
 from lerobot_bomb.evaluation.result_groups import Group, by_condition, describe_tasks, groups_of
 from lerobot_bomb.evaluation.results import summarise
 from lerobot_bomb.hub.dataset import DatasetFacts, Row, eval_flags_of, protocol_version
@@ -63,6 +64,12 @@ class Checkpoint:
         return PolicyCard(f"---\n{self._metadata().to_yaml()}\n---\n\n{self._text()}")
 
     @property
+    def environment(self) -> Environment | None:
+        """That it was trained for, by its config, or by the dataset if the config is an older one's."""
+        of_dataset = None if self.dataset is None else self.dataset.environment
+        return getattr(self.config, "environment", None) or of_dataset
+
+    @property
     def backbone(self) -> str | None:
         """Its Hub id; None: it has none, or not one that is known."""
         name = getattr(self.config, "vlm_model_name", None)
@@ -105,7 +112,7 @@ class Checkpoint:
         return start + "".join(f"\n## {title}\n\n{text}\n" for title, text in sections.items())
 
     def _introduction(self) -> str:
-        protocol = protocol_version(self.dataset, bool(self.results))
+        protocol = protocol_version(self.environment, bool(self.results))
         benchmark = f" Benchmark: BOMB, protocol version {protocol}." if protocol else ""
         is_trained = self.adapters_of or getattr(self.config, "trained_batches") > 0  # noqa: B009  our types'
         start = "" if is_trained else " LeRobot has not trained it: it is a start, or was converted."
@@ -134,9 +141,7 @@ class Checkpoint:
         )
 
     def _evaluate(self) -> str:
-        flags = self.dataset.eval_flags() if self.dataset is not None else None
-        if flags is None and self.results:
-            flags = eval_flags_of(self.results[0][0])
+        flags = self._eval_flags()
         is_bomb = flags is not None and "--env.type=bomb" in flags
         results = ["--env.results_path=results.jsonl"] if is_bomb else []
         line = command(
@@ -150,6 +155,14 @@ class Checkpoint:
         if flags is None:
             return f"{fenced(line)}\n\n`ENV` is an environment with the dataset's cameras, state and action."
         return fenced(f"{line}\nlerobot-bomb results results.jsonl" if is_bomb else line)
+
+    def _eval_flags(self) -> list[str] | None:
+        """Of the environment that it was trained for, or that it was evaluated in; None: not known."""
+        if self.environment is not None:
+            return self.environment.eval_flags()
+        if self.dataset is not None and (flags := self.dataset.eval_flags()) is not None:
+            return flags
+        return eval_flags_of(self.results[0]) if self.results else None
 
     def _train(self) -> str:
         notes = []
@@ -208,7 +221,8 @@ class Checkpoint:
         )
 
     def _data(self) -> str:
-        lines = [f"- dataset: `{self.dataset_id}`"] if self.dataset_id else []
+        lines = [f"- environment: {self.environment}"] if self.environment is not None else []
+        lines += [f"- dataset: `{self.dataset_id}`"] if self.dataset_id else []
         lines += self.dataset.lines() if self.dataset is not None else []
         features = {**(self.config.input_features or {}), **(self.config.output_features or {})}
         rows = [f"| `{name}` | {each.type.value} | {tuple(each.shape)} |" for name, each in features.items()]

@@ -6,7 +6,8 @@ from pathlib import Path
 from typing import Any
 
 from lerobot_bomb.data.growing import METADATA_FILE
-from lerobot_bomb.schema import TASK_VERSION
+from lerobot_bomb.environment import Environment
+from lerobot_bomb.schema import CAMERAS, TASK_VERSION, task_id
 
 INFO_FILE = Path("meta") / "info.json"
 PUSHT_SOURCE = "pusht-zarr"
@@ -47,15 +48,16 @@ class DatasetFacts:
         """Parameters of `lerobot-bomb record`, or {}."""
         return self.bomb.get("recording", {})
 
+    @property
+    def environment(self) -> Environment | None:
+        """That of the benchmark, which the dataset shows; None: another."""
+        return Environment.of_dataset(self.info, self.recording)
+
     def eval_flags(self) -> list[str] | None:
         """Of lerobot-eval, for the environment that the dataset shows; None: not known."""
         if self.bomb.get("conversion", {}).get("source", "").startswith(PUSHT_SOURCE):
             return ["--env.type=pusht", "--eval.use_async_envs=false"]
-        if not self.recording:
-            return None
-        names = ("task", "robot", "control_mode", "fps", "image_size")
-        flags = [f"--env.{name}={self.recording[name]}" for name in names]
-        return ["--env.type=bomb", *flags, *(["--env.depth=true"] if self.recording["depth"] else [])]
+        return None if self.environment is None else self.environment.eval_flags()
 
     def lines(self) -> list[str]:
         """As Markdown's list."""
@@ -80,24 +82,53 @@ class DatasetFacts:
             f"- perturbation axes: `{', '.join(recording['perturbations'])}`; noise on actions: "
             f"{recording['noise']:g}; tasks: {tasks}",
             f"- seeds {first}..{last}; failed episodes that were left out: {num_failed}",
-            f"- recorded with lerobot_bomb {recording['package_version']}",
+            f"- recorded with lerobot_bomb {recording['package_version']}, MuJoCo "
+            f"{recording.get('mujoco_version', 'of an unknown version')}",
         ]
 
-    @property
-    def protocol_version(self) -> str | None:
-        """Of the benchmark that the dataset is of, if it is."""
-        return self.recording.get("protocol_version")
 
-
-def eval_flags_of(row: Row) -> list[str]:
-    """Of lerobot-eval, for the environment that an evaluation was of."""
+def environment_of_episode(row: Row) -> Environment:
+    """That an episode was played in; of its depth and tasks nothing is said."""
     spec = row["spec"]
-    flags = {"task": spec["suite"], **{name: spec[name] for name in ("robot", "control_mode", "fps")}}
-    flags["image_size"] = row["image_size"]
-    return ["--env.type=bomb", *(f"--env.{name}={value}" for name, value in flags.items())]
+    return Environment(
+        **{name: spec[name] for name in ("robot", "control_mode", "fps")},
+        image_size=row["image_size"],
+        cameras=CAMERAS,
+        protocol_version=row.get("task_version", row["protocol_version"]),
+        task=spec["suite"],
+    )
 
 
-def protocol_version(dataset: DatasetFacts | None, has_results: bool) -> str | None:
+def eval_flags_of(rows: list[Row]) -> list[str]:
+    """Of lerobot-eval, for the environment and the tasks that an evaluation was of."""
+    return [*environment_of_episode(rows[0]).eval_flags(), *_task_flags([row["spec"] for row in rows])]
+
+
+def _task_flags(specs: list[dict[str, Any]]) -> list[str]:
+    if all(spec["target"] and spec["color"] for spec in specs):
+        ids = {task_id(spec["target"], spec["color"]) for spec in specs}
+        return [f"--env.task_ids={sorted(ids)}".replace(" ", "")]
+    shared = {name: specs[0][name] for name in ("target", "color") if specs[0][name] is not None}
+    return [f"--env.{name}={value}".replace(" ", "") for name, value in shared.items()]
+
+
+def check_results(path: Path, rows: list[Row], trained_for: Environment | None) -> None:
+    """Raise a ValueError if episodes were played in another environment than a checkpoint was trained for."""
+    if trained_for is None:
+        return
+    for row in rows:
+        played_in = environment_of_episode(row)
+        names = trained_for.differences(played_in)
+        if names:
+            raise ValueError(
+                f"--results={path} has an episode with {played_in.text(names)} (seed {row['spec']['seed']}); "
+                f"this checkpoint was trained for {trained_for.text(names)}: a card states no rate of "
+                "another setting"
+            )
+
+
+def protocol_version(trained_for: Environment | None, has_results: bool) -> str | None:
     """Of the benchmark that a checkpoint was trained or evaluated on; None: of no known one."""
-    of_dataset = dataset.protocol_version if dataset is not None else None
-    return of_dataset or (TASK_VERSION if has_results else None)
+    if trained_for is not None:
+        return trained_for.protocol_version
+    return TASK_VERSION if has_results else None

@@ -16,6 +16,7 @@ from lerobot_bomb.hub.dataset import DatasetFacts
 from lerobot_bomb.hub.method import Method
 from lerobot_bomb.hub.names import is_hub_id
 from lerobot_bomb.hub.push import publish
+from lerobot_bomb.policy_environment import environment_of_dataset
 
 if TYPE_CHECKING:
     from lerobot.datasets import LeRobotDatasetMetadata
@@ -29,17 +30,25 @@ class HubPolicy:
     name: Any
     config: Any
 
-    def __init__(self, config: Any, *args: Any, **kwargs: Any):
+    def __init__(self, config: Any, dataset_meta: "LeRobotDatasetMetadata | None" = None):
         if not isinstance(config, self.config_class):
             raise ValueError(
                 f"this is a {config.type}, not a {self.name}: load it with "
                 f"get_policy_class({config.type!r}).from_pretrained"
             )
-        _next(super()).__init__(config, *args, **kwargs)
+        _next(super()).__init__(config)
+        self._take_environment(dataset_meta)
 
     @classmethod
-    def from_pretrained(cls, pretrained_name_or_path: str | Path, **kwargs: Any) -> Any:
+    def from_pretrained(
+        cls,
+        pretrained_name_or_path: str | Path,
+        trained_on: "LeRobotDatasetMetadata | None" = None,
+        **kwargs: Any,
+    ) -> Any:
         """As LeRobot's, but files are checked first; errors are a line that names the file.
+
+        A policy that goes on to be `trained_on` a dataset is of that one's environment.
 
         Raises:
             ValueError: one is truncated, or weights or config are of another policy.
@@ -54,7 +63,13 @@ class HubPolicy:
         config = kwargs.get("config")
         if config is not None and config.use_peft:  # this is their base
             check_adapters(str(config.pretrained_path), config.pretrained_revision)
-        return _next(super()).from_pretrained(pretrained_name_or_path, **kwargs)
+        policy = _next(super()).from_pretrained(pretrained_name_or_path, **kwargs)
+        policy._take_environment(trained_on)
+        return policy
+
+    def _take_environment(self, trained_on: "LeRobotDatasetMetadata | None") -> None:
+        if trained_on is not None:
+            self.config.environment = environment_of_dataset(trained_on.root)
 
     @classmethod
     def _load_as_safetensor(cls, model: Any, model_file: str, map_location: str, strict: bool) -> Any:

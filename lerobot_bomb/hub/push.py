@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 from lerobot_bomb.data.growing import check_repo_id, switch
 from lerobot_bomb.evaluation.results import read_results
-from lerobot_bomb.hub.dataset import DatasetFacts, Row
+from lerobot_bomb.hub.dataset import DatasetFacts, Row, check_results
 from lerobot_bomb.hub.evaluated import check_weights_of
 from lerobot_bomb.hub.names import CONFIG, TO_PUBLISH, TRAIN_CONFIG, is_local_path
 
@@ -74,6 +74,8 @@ def run_push(args: argparse.Namespace) -> int:
     if not args.dry_run:
         check_token()
     checkpoint = _read_checkpoint(args.checkpoint, args.repo_id, dataset, results)
+    for path, rows in zip(args.results, results, strict=True):
+        check_results(path, rows, checkpoint.environment)
     if args.dry_run:
         print(checkpoint.card(), *sorted(files), sep="\n")
         return 0

@@ -21,6 +21,8 @@ NOT_FLAGS = {
     "grid_params",
     "trained_with",
     "trained_batches",
+    "environment",
+    "ignore_environment",
     "use_peft",
     "package_version",
     "action_feature_names",

@@ -18,14 +18,21 @@ from lerobot_bomb.viewing.episode import Agent
 ENV_TYPE = "bomb"
 
 
-def checkpoint_agent(path: Path, device: str | None, spec: EpisodeSpec, options: RenderOptions) -> Agent:
+def checkpoint_agent(
+    path: Path,
+    device: str | None,
+    spec: EpisodeSpec,
+    options: RenderOptions,
+    ignore_environment: bool = False,
+) -> Agent:
     """Load the folder `pretrained_model` of a checkpoint; `device` None means the checkpoint's own.
 
     Raises:
-        ValueError: the folder holds no checkpoint, or one whose action or state is not BOMB's.
+        ValueError: the folder holds no checkpoint, one whose action or state is not BOMB's, or one that was
+            trained for another environment.
     """
     config = _read_config(path, device)
-    env_config = _env_config(spec, options)
+    env_config = _env_config(spec, options, ignore_environment)
     set_seed(spec.seed)
     policy = make_policy(cfg=config, env_cfg=env_config)
     policy.eval()
@@ -54,7 +61,7 @@ def _read_config(path: Path, device: str | None) -> PreTrainedConfig:
     return config
 
 
-def _env_config(spec: EpisodeSpec, options: RenderOptions) -> EnvConfig:
+def _env_config(spec: EpisodeSpec, options: RenderOptions, ignore_environment: bool) -> EnvConfig:
     """LeRobot's view of the environment: what its factories ask about features."""
     return EnvConfig.get_choice_class(ENV_TYPE)(
         task=spec.suite,
@@ -62,6 +69,7 @@ def _env_config(spec: EpisodeSpec, options: RenderOptions) -> EnvConfig:
         control_mode=spec.control_mode,
         fps=spec.fps,
         image_size=options.image_size,
+        ignore_checkpoint=ignore_environment,
     )
 
 

@@ -1,12 +1,15 @@
 """``lerobot-bomb view``: one episode as a recording for Rerun's viewer and as a video."""
 
 import argparse
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import cast
 
 import gymnasium
 import numpy as np
 
+from lerobot_bomb.data.growing import switch
 from lerobot_bomb.data.record import add_episode_arguments, parse_conditions, parse_numbers
 from lerobot_bomb.data.rollout import make_env
 from lerobot_bomb.episode_result import EpisodeResult
@@ -26,6 +29,13 @@ def add_view_arguments(parser: argparse.ArgumentParser) -> None:
     add("--policy", help=f"who acts: {' or '.join(POLICIES)} (default: expert)")
     add("--policy.path", dest="policy_path", type=Path, help="who acts: the checkpoint in this folder")
     add("--policy.device", dest="policy_device", help="cpu, cuda, ... (default: as the checkpoint says)")
+    add(
+        "--policy.ignore_environment",
+        "--ignore_checkpoint",
+        dest="ignore_environment",
+        **switch(),
+        help="let a checkpoint act that was trained for another environment",
+    )
     add("--seed", type=int, default=0, help="seed of the episode (default: 0)")
     add_episode_arguments(parser)
     add(
@@ -49,15 +59,14 @@ def add_view_arguments(parser: argparse.ArgumentParser) -> None:
 def run_view(args: argparse.Namespace) -> int:
     """Play, write both files, print the instruction, the outcome and the paths."""
     policy = _policy(args)
-    try:
+    with flags_without_group():
         spec = _spec(args)
         options = RenderOptions(image_size=args.image_size)
         paths = _output_paths(args.output, _name(spec, policy))
         env = make_env(spec, options)
-    except ValueError as error:  # LeRobot's commands call the flags --env.*
-        raise ValueError(str(error).replace("--env.", "--")) from None
     try:
-        agent = _agent(args, policy, env, spec, options)
+        with flags_without_group():
+            agent = _agent(args, policy, env, spec, options)
         result = write_episode(env, spec, agent, policy, *paths)
     finally:
         env.close()
@@ -65,6 +74,15 @@ def run_view(args: argparse.Namespace) -> int:
 
     print(result.instruction, describe_result(result), *paths, sep="\n")
     return 0
+
+
+@contextmanager
+def flags_without_group() -> Iterator[None]:
+    """Name flags in error messages as this command does; LeRobot's commands call them --env.*."""
+    try:
+        yield
+    except ValueError as error:
+        raise ValueError(str(error).replace("--env.", "--")) from None
 
 
 def write_episode(
@@ -130,7 +148,7 @@ def _agent(
         return random_agent(env, spec)
     from lerobot_bomb.viewing.checkpoint import checkpoint_agent  # LeRobot and torch: seconds
 
-    return checkpoint_agent(args.policy_path, args.policy_device, spec, options)
+    return checkpoint_agent(args.policy_path, args.policy_device, spec, options, args.ignore_environment)
 
 
 def _name(spec: EpisodeSpec, policy: str) -> str:

@@ -14,6 +14,7 @@ from lerobot_bomb.flags import flag_errors, one_of
 from lerobot_bomb.flow.losses import check_learning, check_objective
 from lerobot_bomb.flow.path import TIME_SAMPLINGS
 from lerobot_bomb.flow.samplers import check_heads, check_sampling
+from lerobot_bomb.policy_environment import ConfigWithEnvironment
 from lerobot_bomb.policy_flags import (
     adamw,
     check_cameras_and_action,
@@ -49,7 +50,7 @@ AS_TRAINED = (*SHAPES, "image_size", "segment_attention", "reasoning_pool")
 
 @PreTrainedConfig.register_subclass("fdvla")
 @dataclass
-class FdvlaConfig(PreTrainedConfig):
+class FdvlaConfig(ConfigWithEnvironment):
     """A Qwen2.5-VL reads noisy actions beside pictures and text; two heads take them to clean ones."""
 
     # Hub id, path of a local folder, or "nano": a small model with random weights, built in code

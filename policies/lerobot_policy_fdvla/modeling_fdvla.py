@@ -85,7 +85,7 @@ class FdvlaPolicy(HubPolicy, SavesTiedWeightsOnce, PreTrainedPolicy):
     _no_split_modules = _fsdp_wrap_modules
 
     def __init__(self, config: FdvlaConfig, dataset_meta: LeRobotDatasetMetadata | None = None, **_: object):
-        super().__init__(config)
+        super().__init__(config, dataset_meta)
         config.validate_features()
         config.trained_with = trained_with(config, AS_TRAINED)
         self.tokens, self.backbone = build_model(config)
@@ -124,7 +124,9 @@ class FdvlaPolicy(HubPolicy, SavesTiedWeightsOnce, PreTrainedPolicy):
                 check_as_trained(config)
             else:
                 check_weights_fit(config, SHAPES)
-        policy = super().from_pretrained(*args, config=config, **{**kwargs, "strict": True})
+        policy = super().from_pretrained(
+            *args, config=config, trained_on=dataset_meta, **{**kwargs, "strict": True}
+        )
         policy._take_units(dataset_meta)
         return policy
 

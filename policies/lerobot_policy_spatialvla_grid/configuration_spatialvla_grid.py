@@ -11,6 +11,7 @@ from lerobot_bomb.actions.ensemble import WEIGHTINGS
 from lerobot_bomb.actions.grid_settings import ActionGroup, GridSettings, check_groups, default_groups
 from lerobot_bomb.checkpoint_config import INSTALLED, PackageVersion
 from lerobot_bomb.flags import flag_errors, one_of
+from lerobot_bomb.policy_environment import ConfigWithEnvironment
 from lerobot_bomb.policy_flags import (
     adamw,
     check_cameras_and_action,
@@ -43,7 +44,7 @@ AS_TRAINED = ("chunk_size", "use_state", "prefix_attention")
 
 @PreTrainedConfig.register_subclass("spatialvla_grid")
 @dataclass
-class SpatialvlaGridConfig(PreTrainedConfig):
+class SpatialvlaGridConfig(ConfigWithEnvironment):
     """A PaliGemma 2 chooses one grid cell for each group of action dimensions and step."""
 
     # Hub id, path of a local folder, or "nano": a small model with random weights, built in code

@@ -86,7 +86,7 @@ class SpatialvlaGridPolicy(HubPolicy, SavesTiedWeightsOnce, PreTrainedPolicy):
     def __init__(
         self, config: SpatialvlaGridConfig, dataset_meta: LeRobotDatasetMetadata | None = None, **_: object
     ):
-        super().__init__(config)
+        super().__init__(config, dataset_meta)
         config.validate_features()
         config.trained_with = trained_with(config, AS_TRAINED)
         self.tokens, self.backbone = build_model(config)
@@ -135,7 +135,9 @@ class SpatialvlaGridPolicy(HubPolicy, SavesTiedWeightsOnce, PreTrainedPolicy):
             if dataset_meta is None:
                 check_as_trained(config)
             config.check_grid_as_trained(is_refitted=dataset_meta is not None and config.adapt_embeddings)
-        policy = super().from_pretrained(*args, config=config, **{**kwargs, "strict": True})
+        policy = super().from_pretrained(
+            *args, config=config, trained_on=dataset_meta, **{**kwargs, "strict": True}
+        )
         if dataset_meta is not None:
             policy._base_buffers = frozen_buffers(policy)
             if policy.config.adapt_embeddings:

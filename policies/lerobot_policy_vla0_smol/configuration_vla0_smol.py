@@ -12,6 +12,7 @@ from lerobot_bomb.actions.relative import named_dims
 from lerobot_bomb.actions.text import MASK_LEVELS, MAX_DIGITS, digits_needed
 from lerobot_bomb.checkpoint_config import INSTALLED, PackageVersion
 from lerobot_bomb.flags import flag_errors, one_of
+from lerobot_bomb.policy_environment import ConfigWithEnvironment
 from lerobot_bomb.policy_flags import (
     adamw,
     check_cameras_and_action,
@@ -39,7 +40,7 @@ AS_TRAINED = ("chunk_size", "n_action_bins", "n_state_bins", "bin_mode", "number
 
 @PreTrainedConfig.register_subclass("vla0_smol")
 @dataclass
-class Vla0SmolConfig(PreTrainedConfig):
+class Vla0SmolConfig(ConfigWithEnvironment):
     """A SmolVLM writes ``chunk_size`` actions as integers; ``n_action_steps`` of them are executed."""
 
     # Hub id, path of a local folder, or "nano": a small model with random weights, built in code

@@ -73,7 +73,7 @@ class Vla0SmolPolicy(HubPolicy, SavesTiedWeightsOnce, PreTrainedPolicy):
     def __init__(
         self, config: Vla0SmolConfig, dataset_meta: LeRobotDatasetMetadata | None = None, **_: object
     ):
-        super().__init__(config)
+        super().__init__(config, dataset_meta)
         config.validate_features()
         _take_action_names(config, dataset_meta)
         config.trained_with = trained_with(config, AS_TRAINED)
@@ -119,7 +119,9 @@ class Vla0SmolPolicy(HubPolicy, SavesTiedWeightsOnce, PreTrainedPolicy):
         if config is not None and dataset_meta is None:
             check_as_trained(config)
         try:
-            policy = super().from_pretrained(*args, config=config, **{**kwargs, "strict": True})
+            policy = super().from_pretrained(
+                *args, config=config, trained_on=dataset_meta, **{**kwargs, "strict": True}
+            )
         except ValueError as error:
             if " relative." in str(error):
                 raise ValueError(

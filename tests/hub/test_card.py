@@ -11,14 +11,25 @@ from lerobot.configs.train import TrainPipelineConfig
 from vla0_smol_cases import make_config
 
 from hub.server import LoopbackHub
+from lerobot_bomb.environment import Environment
 from lerobot_bomb.hub.card import Checkpoint, PolicyCard
-from lerobot_bomb.hub.dataset import DatasetFacts
+from lerobot_bomb.hub.dataset import DatasetFacts, eval_flags_of
 from lerobot_policy_fdvla.card_fdvla import METHOD as FDVLA
 from lerobot_policy_spatialvla_grid.card_spatialvla_grid import METHOD as GRID
 from lerobot_policy_vla0_smol.card_vla0_smol import METHOD as VLA0
 
 HUB_NAME = "HuggingFaceTB/SmolVLM2-500M-Video-Instruct"
 INFO = {"total_episodes": 3, "total_frames": 60, "fps": 10}
+BOMB_INFO = {
+    **INFO,
+    "robot_type": "bomb_fetch_v1.0",
+    "features": {
+        "observation.images.workspace": {"shape": [128, 128, 3]},
+        "observation.images.wrist": {"shape": [128, 128, 3]},
+        "observation.depth.wrist": {"shape": [128, 128]},
+        "action": {"shape": [4], "names": ["x", "y", "z", "gripper"]},
+    },
+}
 RECORDING: dict[str, Any] = {
     "task": "place",
     "robot": "fetch",
@@ -34,7 +45,7 @@ RECORDING: dict[str, Any] = {
     "protocol_version": "1.0",
     "package_version": "0.1.0",
 }
-BOMB = DatasetFacts(INFO, {"recording": RECORDING, "num_episodes": 3, "failures": [{"seed": 6}]})
+BOMB = DatasetFacts(BOMB_INFO, {"recording": RECORDING, "num_episodes": 3, "failures": [{"seed": 6}]})
 
 
 def checkpoint(name: str = HUB_NAME, **options: Any) -> Checkpoint:
@@ -91,6 +102,37 @@ def test_commands_are_those_of_the_training_and_of_what_the_dataset_shows(tmp_pa
     assert "seeds 5..6; failed episodes that were left out: 1" in text  # 4 tried, 2 a seed
     assert "protocol version 1.0" in text
     assert str(tmp_path) not in text
+
+
+def test_a_checkpoint_tells_its_environment_wherever_its_dataset_is() -> None:
+    cameras = ("workspace", "wrist")
+    environment = Environment("fetch", "absolute", 20, 64, cameras, "1.0", task_ids=(7, 12))
+    text = str(checkpoint(environment=environment).card()).replace(" \\\n    ", " ")
+    assert (
+        "--env.robot=fetch --env.control_mode=absolute --env.fps=20 --env.image_size=64 "
+        "'--env.task_ids=[7,12]' "
+    ) in text
+    assert (
+        "- environment: BOMB protocol 1.0, suite `place`, tasks [7, 12], robot `fetch`, control `absolute` "
+        "at 20 Hz, cameras `workspace, wrist` of 64 px\n"
+    ) in text
+    assert "--policy.environment" not in text
+
+
+@pytest.mark.parametrize(
+    ("asked", "flag"),
+    [
+        ([{"target": [0, 1], "color": "black"}, {"target": [2, 3], "color": "white"}], "task_ids=[1,38]"),
+        ([{"target": [0, 1], "color": None}], "target=[0,1]"),
+        ([{"target": None, "color": "white"}], "color=white"),
+        ([{"target": None, "color": None}], ""),
+    ],
+)
+def test_an_evaluation_is_repeated_on_the_tasks_that_it_was_of(asked: list[dict], flag: str) -> None:
+    spec = {"suite": "place", "robot": "scara", "control_mode": "relative", "fps": 10}
+    rows = [{"spec": spec | each, "image_size": 64, "protocol_version": "1.0"} for each in asked]
+    expected = ["--env.image_size=64", *([f"--env.{flag}"] if flag else [])]
+    assert eval_flags_of(rows)[5:] == expected
 
 
 def test_only_what_was_not_trained_is_said_to_be_a_start() -> None:

@@ -1,6 +1,7 @@
 """`lerobot-bomb push`: what is published, what is refused, and what a push that is cut off leaves."""
 
 import hashlib
+from dataclasses import asdict
 from pathlib import Path
 
 import pytest
@@ -20,6 +21,7 @@ from hub.damage import (
 )
 from hub.server import TOKEN, LoopbackHub
 from lerobot_bomb.cli import main
+from lerobot_bomb.environment import Environment
 from lerobot_bomb.episode_result import EpisodeResult, PolicyIdentity
 from lerobot_bomb.schema import EpisodeSpec
 from lerobot_policy_vla0_smol.modeling_vla0_smol import Vla0SmolPolicy
@@ -142,6 +144,20 @@ def test_a_broken_checkpoint_is_refused_in_one_line_before_anything_is_sent(
     assert message in error
     assert len(error.splitlines()) == 1
     assert online.requests == []
+
+
+def test_a_card_states_no_rate_of_another_environment(
+    checkpoint: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    environment = Environment("scara", "absolute", 10, 256, ("workspace", "wrist"), "1.0")
+    change_config(environment=asdict(environment))(checkpoint)
+    results = tmp_path / "results.jsonl"
+    results.write_text(result(1000, is_success=True))
+    assert push(checkpoint, "--dry_run", "--results", str(results)) == 1
+    assert (
+        f"--results={results} has an episode with control_mode=relative (seed 1000); this checkpoint was "
+        "trained for control_mode=absolute"
+    ) in capsys.readouterr().err
 
 
 def test_no_token_a_wrong_one_and_no_hub(
