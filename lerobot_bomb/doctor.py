@@ -12,6 +12,8 @@ import traceback
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 
+from packaging.requirements import Requirement
+
 import lerobot_bomb
 
 DISTRIBUTION = "lerobot_policy_bomb"
@@ -28,6 +30,8 @@ DEPENDENCIES = (
     "rerun-sdk",
     "numpy",
 )
+# what it means that a version lies outside the declared range
+OUTSIDE = {"mujoco": ": episodes and pictures are not those of the protocol, and results do not compare"}
 HUB_TIMEOUT_S = 5
 
 
@@ -45,10 +49,26 @@ def check_versions() -> Iterator[Finding]:
     yield Finding("python", platform.python_version())
     for name in (DISTRIBUTION, *DEPENDENCIES):
         try:
-            yield Finding(name, importlib.metadata.version(name))
+            version = importlib.metadata.version(name)
+            outside = _outside(name, version)
+            yield Finding(name, version + outside, broken=bool(outside))
         except importlib.metadata.PackageNotFoundError:
             hint = "LeRobot finds plugins by this name; pip install it" if name == DISTRIBUTION else ""
             yield Finding(name, f"not installed. {hint}", broken=True)
+
+
+def _outside(name: str, version: str) -> str:
+    """What is wrong with an installed version that lies outside the range that this package declares."""
+    try:
+        declared = [Requirement(text) for text in importlib.metadata.requires(DISTRIBUTION) or []]
+    except importlib.metadata.PackageNotFoundError:  # reported as a finding of its own
+        return ""
+    for requirement in declared:
+        if requirement.name == name and not requirement.specifier.contains(version, prereleases=True):
+            needed = f"{name}{requirement.specifier}"
+            consequence = OUTSIDE.get(name, "")
+            return f" lies outside {requirement.specifier}{consequence}; pip install '{needed}'"
+    return ""
 
 
 def check_rendering() -> Iterator[Finding]:

@@ -1,5 +1,7 @@
+import copy
 import hashlib
 import json
+import pickle
 import subprocess
 import sys
 import warnings
@@ -74,6 +76,30 @@ def test_an_ended_env_keeps_returning_its_last_transition(env: BombEnv) -> None:
     assert digest(first[0]) == digest(second[0])
     env.reset(seed=SEED)
     assert env.step(STILL)[2] is False
+
+
+def test_changing_a_final_observation_changes_no_later_one(env: BombEnv) -> None:
+    env.reset(seed=SEED)
+    ended = False
+    while not ended:
+        observation, _, terminated, truncated, _ = env.step(expert_action(env.privileged_state()))
+        ended = terminated or truncated
+        expected = digest(observation)
+    for _ in range(2):
+        for array in (*observation["pixels"].values(), observation["agent_pos"]):
+            array[:] = 0
+        observation = env.step(STILL)[0]
+        assert digest(observation) == expected
+
+
+def test_an_env_is_pickled_and_copied_before_its_first_reset_alone(env: BombEnv) -> None:
+    fresh = BombEnv(EpisodeSpec(seed=5, fps=20), SMALL)
+    for copied in (copy.copy(fresh), copy.deepcopy(fresh), pickle.loads(pickle.dumps(fresh))):
+        assert copied.metadata["render_fps"] == 20
+    env.reset(seed=SEED)
+    for make_copy in (copy.copy, copy.deepcopy, pickle.dumps):
+        with pytest.raises(TypeError, match="has been reset cannot be pickled or copied"):
+            make_copy(env)
 
 
 @pytest.mark.parametrize(("fps", "limit"), [(10, 100), (20, 200), (8, 80)])
@@ -194,7 +220,12 @@ def test_info_is_flat(env: BombEnv) -> None:
 def test_the_picture_for_people_is_captioned_and_no_observation(env: BombEnv) -> None:
     env.reset(seed=SEED)
     picture = env.render()
-    assert picture.dtype == np.uint8 and picture.shape[1] == 768 and picture.shape[0] > 384
+    assert (
+        picture is not None
+        and picture.dtype == np.uint8
+        and picture.shape[1] == 768
+        and picture.shape[0] > 384
+    )
     assert (picture[390:] > 200).any()  # letters
     assert "stone" in env.task_description and env.task == "place"
 
@@ -224,14 +255,24 @@ def test_a_result_that_cannot_be_written_is_an_error_that_names_the_flag() -> No
     env.close()
 
 
+@pytest.mark.parametrize("render_mode", ["rgb_array", None])
 @pytest.mark.parametrize("gym_id", sorted(lerobot_env_bomb.GYM_IDS))
-def test_gymnasiums_checker_has_nothing_to_say(gym_id: str) -> None:
-    env = gymnasium.make(gym_id, render_options=SMALL).unwrapped
+def test_gymnasiums_checker_has_nothing_to_say(gym_id: str, render_mode: str | None) -> None:
+    env = gymnasium.make(gym_id, render_options=SMALL, render_mode=render_mode).unwrapped
+    assert env.render_mode == render_mode
     with warnings.catch_warnings():
         warnings.simplefilter("error")
         # advice on how to scale actions: absolute ones are metres by definition
         warnings.filterwarnings("ignore", message=".*recommend using a symmetric and normalized space.*")
         check_env(env)
+    env.close()
+
+
+def test_without_a_render_mode_render_draws_nothing_and_says_so() -> None:
+    env = BombEnv(EpisodeSpec(seed=0), SMALL, render_mode=None)
+    env.reset()
+    with pytest.warns(UserWarning, match="make the environment with render_mode='rgb_array'"):
+        assert env.render() is None
     env.close()
 
 

@@ -87,6 +87,18 @@ def test_a_used_and_a_fresh_environment_give_the_same_bits(env: BombEnv) -> None
     fresh.close()
 
 
+def test_an_observation_lies_in_its_space_when_the_pads_scrape_over_the_board() -> None:
+    env = BombEnv(EpisodeSpec(seed=3, robot="fetch", control_mode="absolute"), SMALL)
+    corners, openings_m = np.random.default_rng(3).random((30, 4)) < 0.5, []
+    env.reset()
+    for corner in corners:
+        observation, *_ = env.step(np.where(corner, env.action_space.low, env.action_space.high))
+        assert env.observation_space.contains(observation)
+        openings_m.append(observation["agent_pos"][3])
+    env.close()
+    assert max(openings_m) > 0.06  # a finger was dragged far past its stop, or this shows nothing
+
+
 def test_the_arm_starts_upright_within_its_joints_and_above_the_board(scene: Scene) -> None:
     for xyz in GRID:
         put_gripper(scene, xyz)

@@ -64,6 +64,19 @@ def test_an_ended_episode_stays_frozen_through_autoreset() -> None:
     envs.close()
 
 
+def test_changing_a_frozen_observation_changes_no_later_one() -> None:
+    env = FreezeAfterEnd(make_one(fps=1))
+    env.reset(seed=1)
+    ended = False
+    while not ended:
+        *_, terminated, truncated, _ = env.step(STILL[0])
+        ended = terminated or truncated
+    expected = env.reset()[0]["agent_pos"].copy()
+    env.reset()[0]["agent_pos"][:] = 0
+    np.testing.assert_array_equal(env.reset()[0]["agent_pos"], expected)
+    env.close()
+
+
 def test_freezing_uses_lerobots_option_name() -> None:
     from lerobot.envs.utils import NEW_ROLLOUT_OPTION as LEROBOTS
 

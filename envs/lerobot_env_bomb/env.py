@@ -1,42 +1,36 @@
 """BOMB as a Gymnasium environment."""
 
+from copy import deepcopy
 from dataclasses import dataclass, replace
 from typing import Any
 
 import gymnasium
 import numpy as np
-from gymnasium import spaces
 from gymnasium.error import ResetNeeded
 
-from lerobot_bomb.camera_geometry import geometry_shapes
 from lerobot_bomb.episode_result import EpisodeResult, PolicyIdentity, write_result
 from lerobot_bomb.schema import (
     ACTION_DIM,
     CAMERAS,
     DEFAULT_FPS,
     MAX_EPISODE_STEPS,
-    NUM_STONES,
     PHYSICS_HZ,
     EpisodeSpec,
     PrivilegedState,
     RenderOptions,
-    Stage,
-    action_bounds,
 )
 from lerobot_env_bomb.actuator import Actuator
 from lerobot_env_bomb.fetch_files import check_robot
 from lerobot_env_bomb.judge import Judge
 from lerobot_env_bomb.render import CameraRenderer, compose_caption, extrinsics, intrinsics
-from lerobot_env_bomb.robots import ROBOTS
 from lerobot_env_bomb.scene import Scene
+from lerobot_env_bomb.spaces import action_space, observation_space
 from lerobot_env_bomb.task import STONE, Episode, check_target, sample_episode
 
 Observation = dict[str, Any]
 DEFAULT_SPEC = EpisodeSpec(seed=0)
 DEFAULT_RENDER_OPTIONS = RenderOptions()
 PERSON_IMAGE_SIZE = 384  # pixels, either half of render()'s picture
-# Bounds of what the simulator can report, metres. Stones can be flung off the board, so they are wide.
-POSITION_LIMIT_M = 100.0
 
 
 @dataclass(frozen=True)
@@ -68,14 +62,14 @@ class BombEnv(gymnasium.Env[Observation, np.ndarray]):
         spec: EpisodeSpec = DEFAULT_SPEC,
         render_options: RenderOptions = DEFAULT_RENDER_OPTIONS,
         results_path: str | None = None,
-        render_mode: str = "rgb_array",
+        render_mode: str | None = "rgb_array",
         task_ids: tuple[int, ...] | None = None,
         policy: PolicyIdentity | None = None,
     ):
         check_target(spec)
         check_robot(spec)
-        if render_mode not in self.metadata["render_modes"]:
-            raise ValueError(f"render_mode={render_mode!r} is unknown; choose one of: rgb_array")
+        if render_mode not in (None, *self.metadata["render_modes"]):
+            raise ValueError(f"render_mode={render_mode!r} is unknown; choose rgb_array or None")
         self._num_substeps = PHYSICS_HZ // spec.fps
         self.metadata = {"render_modes": ["rgb_array"], "render_fps": spec.fps}
         self.render_mode = render_mode
@@ -126,7 +120,7 @@ class BombEnv(gymnasium.Env[Observation, np.ndarray]):
         run = self._run
         action = self._check(action)
         if self._last_transition is not None:
-            return self._last_transition
+            return deepcopy(self._last_transition)
         target_xyz, open_fingers = run.actuator.command(action, run.scene.gripper_xyz)
         run.scene.move(target_xyz, open_fingers, self._num_substeps)
         self._steps += 1
@@ -136,14 +130,20 @@ class BombEnv(gymnasium.Env[Observation, np.ndarray]):
             run.judge.time_out()
         transition = (self._observe(), float(run.judge.is_success), terminated, truncated, self._info())
         if terminated or truncated:
-            self._last_transition = (transition[0], 0.0, *transition[2:])
+            self._last_transition = deepcopy((transition[0], 0.0, *transition[2:]))
             if self._results_path is not None:
                 write_result(self._results_path, self.episode_result())
         return transition
 
-    def render(self) -> np.ndarray:
-        """(H, W, 3) uint8 picture for people: both cameras, the instruction, how the episode stands."""
+    def render(self) -> np.ndarray | None:
+        """(H, W, 3) uint8 picture for people: both cameras, the instruction, how the episode stands.
+
+        None, and a warning, in an environment that was made with render_mode=None.
+        """
         run = self._run
+        if self.render_mode is None:
+            gymnasium.logger.warn("render() draws nothing: make the environment with render_mode='rgb_array'")
+            return None
         pictures = [self._draw(camera, PERSON_IMAGE_SIZE) for camera in CAMERAS]
         row, column = run.episode.target
         error_mm = run.judge.placement_error_mm
@@ -205,6 +205,15 @@ class BombEnv(gymnasium.Env[Observation, np.ndarray]):
             pending_motion_m=run.actuator.pending_motion_m(now.gripper_xyz),
             pending_gripper=run.actuator.pending_gripper,
         )
+
+    def __getstate__(self) -> dict[str, Any]:
+        if self._current_run is not None:
+            raise TypeError(
+                "a BombEnv that has been reset cannot be pickled or copied: its simulator and its OpenGL "
+                "context stay in this process. Pickle one before its first reset, or a factory, as "
+                "functools.partial(BombEnv, spec); the same seed replays the episode"
+            )
+        return self.__dict__.copy()
 
     @property
     def _run(self) -> _Run:
@@ -275,29 +284,3 @@ class BombEnv(gymnasium.Env[Observation, np.ndarray]):
             "collateral_mm": judge.collateral_mm,
             "seed": self._run.episode.spec.seed,
         }
-
-
-def action_space(control_mode: str) -> spaces.Box:
-    """float32 (4,): relative in units of MAX_STEP_M, or absolute in metres; gripper in [-1, 1]."""
-    low, high = action_bounds(control_mode)
-    return spaces.Box(low, high, dtype=np.float32)
-
-
-def observation_space(options: RenderOptions) -> spaces.Dict:
-    """Pictures of both cameras, (4,) state of the gripper, the privileged state for oracles, geometry."""
-    shape = (options.image_size, options.image_size, 3)
-    # opening fingers overshoot their stops a little
-    widest_m = max(robot.max_half_opening_m for robot in ROBOTS.values())
-    reach_m = np.array([1.0, 1.0, 1.0, 2.5 * widest_m], dtype=np.float32)
-    limit = max(POSITION_LIMIT_M, NUM_STONES, len(Stage), PHYSICS_HZ)
-    return spaces.Dict(
-        {
-            "pixels": spaces.Dict({camera: spaces.Box(0, 255, shape, np.uint8) for camera in CAMERAS}),
-            "agent_pos": spaces.Box(-reach_m, reach_m, dtype=np.float32),
-            "environment_state": spaces.Box(-limit, limit, (PrivilegedState.DIM,), np.float32),
-            **{
-                key: spaces.Box(-np.inf, np.inf, shape, np.float32)
-                for key, shape in geometry_shapes(options).items()
-            },
-        }
-    )

@@ -3,6 +3,8 @@
 
 import atexit
 import ctypes
+import os
+import threading
 import weakref
 
 import numpy as np
@@ -19,6 +21,38 @@ SHADOW_MAP_SIZE = 512  # pixels
 CAPTION_LINE_PX = 26
 CAPTION_BACKGROUND = 40  # grey level
 
+_drawing_process: int | None = None  # the one that made the first OpenGL context; forks inherit the number
+
+
+def check_process() -> None:
+    """Raise a RuntimeError in a process that was forked after OpenGL had been used: it would hang."""
+    if _drawing_process not in (None, os.getpid()):
+        raise RuntimeError(
+            f"process {os.getpid()} was forked after process {_drawing_process} had rendered; OpenGL does "
+            "not survive a fork and would hang. Start worker processes with the method forkserver or spawn: "
+            "gymnasium.vector.AsyncVectorEnv(..., context='forkserver')"
+        )
+
+
+class _Owner:
+    """The process and the thread to which an OpenGL context belongs."""
+
+    def __init__(self) -> None:
+        self._process, self._thread = os.getpid(), threading.current_thread()
+
+    def is_here(self) -> bool:
+        return self._process == os.getpid() and self._thread is threading.current_thread()
+
+    def check(self) -> None:
+        """Raise a RuntimeError in another process or thread."""
+        check_process()
+        if not self.is_here():
+            raise RuntimeError(
+                f"this environment draws in thread {self._thread.name!r}, where it was first reset, and "
+                f"cannot be stepped, rendered or closed in {threading.current_thread().name!r}: OpenGL binds "
+                "it to one thread. Use it there alone, or give each thread an environment of its own"
+            )
+
 
 class CameraRenderer:
     """One OpenGL context that draws a model's fixed cameras at any size up to `max_size` pixels."""
@@ -31,6 +65,10 @@ class CameraRenderer:
         quality.shadowsize = SHADOW_MAP_SIZE if shadows else 0
         quality.numslices, quality.numstacks, quality.numquads = (28, 16, 4) if shadows else (14, 8, 2)
         model.vis.global_.offwidth = model.vis.global_.offheight = max_size
+        check_process()
+        global _drawing_process
+        _drawing_process = os.getpid()
+        self._owner = _Owner()
         self._gl = mujoco.GLContext(max_size, max_size)
         self._gl.make_current()
         self.opengl_vendor = _opengl_string(GL_1_0.GL_VENDOR)
@@ -46,7 +84,7 @@ class CameraRenderer:
         self._option = mujoco.MjvOption()
         self._camera = mujoco.MjvCamera()
         self._camera.type = mujoco.mjtCamera.mjCAMERA_FIXED
-        self._free = weakref.finalize(self, _free, self._gl, self._context)
+        self._free = weakref.finalize(self, _free, self._gl, self._context, self._owner)
         # At exit too, and before mujoco's own exit handler shuts OpenGL down: handlers run last in, first
         # out, but weakref registers its one handler early.
         self._free.atexit = False
@@ -72,6 +110,7 @@ class CameraRenderer:
         return rgb[::-1].copy(), depth_m[::-1].astype(np.float32)
 
     def _render(self, data: mujoco.MjData, camera: str, size: int) -> mujoco.MjrRect:
+        self._owner.check()
         self._gl.make_current()
         self._camera.fixedcamid = self._model.camera(camera).id
         mujoco.mjv_updateScene(
@@ -82,12 +121,17 @@ class CameraRenderer:
         return viewport
 
     def close(self) -> None:
-        """Free the OpenGL context."""
+        """Free the OpenGL context; only the thread that made it can."""
+        self._owner.check()
         self._free()
         atexit.unregister(self._free)
 
 
-def _free(gl: mujoco.GLContext, context: mujoco.MjrContext) -> None:
+def _free(gl: mujoco.GLContext, context: mujoco.MjrContext, owner: _Owner) -> None:
+    if not owner.is_here():
+        for kept in (gl, context):  # for ever: here even their destructors would fail or hang
+            ctypes.pythonapi.Py_IncRef(ctypes.py_object(kept))
+        return
     gl.make_current()
     context.free()
     gl.free()

@@ -3,6 +3,7 @@
 import sys
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
+from copy import deepcopy
 from functools import partial
 from typing import Any
 
@@ -28,7 +29,7 @@ class FreezeAfterEnd(gym.Wrapper):
 
     def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Any, dict]:
         if self._last is not None and seed is None and NEW_ROLLOUT_OPTION not in (options or {}):
-            return self._last
+            return deepcopy(self._last)
         self._last = None
         return self.env.reset(seed=seed, options=options)
 

@@ -1,0 +1,213 @@
+"""Under which MuJoCo versions are episodes the same, bit for bit?
+
+    python benchmarks/simulator_versions.py --work_dir simulators --json simulator_versions.json
+
+makes a virtual environment per published version from 3.8.0 on, without torch and LeRobot, lets the
+scripted expert play the same seeds in each, and compares with the reference. `--here` measures the Python
+that runs it, and prints JSON.
+
+States: joint positions and velocities after every control step, float64. Pictures: both cameras in every
+observation. They depend on the OpenGL library too, which the table names. The processor may matter as well:
+MuJoCo and NumPy choose their instructions by it.
+"""
+
+import argparse
+import hashlib
+import importlib.metadata
+import json
+import os
+import re
+import subprocess
+import sys
+from collections.abc import Iterable
+from dataclasses import asdict, dataclass
+from itertools import product
+from pathlib import Path
+
+ROOT = Path(__file__).resolve().parents[1]
+SOURCE_ROOTS = (ROOT, ROOT / "envs")
+OLDEST = (3, 8, 0)
+REFERENCE = "3.8.1"
+# what the simulator imports, in the versions that the tests run with
+PACKAGES = ("numpy", "gymnasium", "gymnasium-robotics", "opencv-python-headless")
+ROBOTS = ("scara", "fetch")
+CONDITIONS = ("none", "dynamics:5", "all:5")
+FIRST_SEED, NUM_SEEDS = 1000, 10
+IMAGE_SIZE = 256  # pixels
+HASH_DIGITS = 8  # shown of a hash
+
+
+@dataclass(frozen=True)
+class Outcome:
+    """The expert's episodes of one robot under one condition."""
+
+    states: str  # SHA-256
+    pictures: str  # SHA-256
+    successes: int
+    episodes: int
+    worst_error_mm: float
+
+
+@dataclass(frozen=True)
+class Measured:
+    """What one MuJoCo version makes of all episodes."""
+
+    mujoco: str
+    renderer: str
+    outcomes: dict[str, Outcome | str]  # by "robot condition"; text: why there are none
+
+
+def measure_here(conditions: Iterable[str], seeds: range) -> Measured:
+    """Play all robots under all conditions in this process."""
+    outcomes: dict[str, Outcome | str] = {}
+    for robot, condition in product(ROBOTS, conditions):
+        try:
+            outcomes[f"{robot} {condition}"] = play(robot, condition, seeds)
+        except ValueError as error:  # a robot whose model this version cannot read
+            outcomes[f"{robot} {condition}"] = str(error)
+    return Measured(importlib.metadata.version("mujoco"), renderer_name(), outcomes)
+
+
+def play(robot: str, condition: str, seeds: range) -> Outcome:
+    """The expert's episodes of these seeds."""
+    from lerobot_bomb.expert import expert_action
+    from lerobot_bomb.schema import EpisodeSpec, PrivilegedState, RenderOptions
+    from lerobot_env_bomb.env import BombEnv
+
+    states, pictures, results = hashlib.sha256(), hashlib.sha256(), []
+    env = BombEnv(
+        EpisodeSpec(seed=0, robot=robot, perturbations=condition), RenderOptions(image_size=IMAGE_SIZE)
+    )
+    for seed in seeds:
+        observation, _ = env.reset(seed=seed)
+        ended = False
+        while True:
+            data = env._run.scene.data
+            states.update(data.qpos.tobytes() + data.qvel.tobytes())
+            for picture in observation["pixels"].values():
+                pictures.update(picture.tobytes())
+            if ended:
+                break
+            action = expert_action(PrivilegedState.from_vector(observation["environment_state"]))
+            observation, _, terminated, truncated, _ = env.step(action)
+            ended = terminated or truncated
+        results.append(env.episode_result())
+    env.close()
+    return Outcome(
+        states=states.hexdigest(),
+        pictures=pictures.hexdigest(),
+        successes=sum(result.is_success for result in results),
+        episodes=len(results),
+        worst_error_mm=max(result.placement_error_mm for result in results),
+    )
+
+
+def renderer_name() -> str:
+    """What OpenGL says it draws with."""
+    from lerobot_env_bomb.backend import ensure_gl_backend
+
+    ensure_gl_backend()
+    import mujoco
+    from OpenGL import GL
+
+    context = mujoco.GLContext(16, 16)
+    context.make_current()
+    name = GL.glGetString(GL.GL_RENDERER).decode()
+    context.free()
+    return name
+
+
+def published_versions() -> list[str]:
+    """Versions of MuJoCo from OLDEST on that pip finds, oldest first."""
+    command = [sys.executable, "-m", "pip", "index", "versions", "mujoco"]
+    listed = subprocess.run(command, check=True, capture_output=True, text=True).stdout
+    versions = re.findall(r"\d+\.\d+\.\d+", listed.split("Available versions:")[1])
+    return [name for name in reversed(versions) if tuple(map(int, name.split("."))) >= OLDEST]
+
+
+def measure(version: str, work_dir: Path, conditions: list[str], num_seeds: int) -> Measured:
+    """Play everything under one MuJoCo version, in a virtual environment of its own."""
+    folder = (work_dir / version).resolve()
+    python = folder / "bin" / "python"
+    if not python.exists():
+        subprocess.run(["uv", "venv", "-q", "-p", sys.executable, str(folder)], check=True)
+    pins = [f"{name}=={importlib.metadata.version(name)}" for name in PACKAGES]
+    subprocess.run(["uv", "pip", "install", "-q", "-p", str(python), f"mujoco=={version}", *pins], check=True)
+    env = os.environ | {"PYTHONPATH": os.pathsep.join(map(str, SOURCE_ROOTS))}
+    command = [str(python), __file__, "--here", f"--seeds={num_seeds}", "--conditions", *conditions]
+    # MuJoCo writes its log where it is started
+    run = subprocess.run(command, cwd=folder, env=env, check=True, stdout=subprocess.PIPE, text=True)
+    return from_dict(json.loads(run.stdout))
+
+
+def from_dict(figures: dict) -> Measured:
+    """Inverse of `asdict`."""
+    outcomes = {
+        case: Outcome(**outcome) if isinstance(outcome, dict) else outcome
+        for case, outcome in figures["outcomes"].items()
+    }
+    return Measured(figures["mujoco"], figures["renderer"], outcomes)
+
+
+def table(measured: Iterable[Measured], reference: Measured) -> list[str]:
+    """Markdown: a row per version and robot; hashes over all conditions, `=` where the reference's."""
+    conditions = list(dict.fromkeys(case.split()[1] for case in reference.outcomes))
+    lines = [
+        f"| MuJoCo | robot | states | pictures | {' | '.join(conditions)} |",
+        "|---|---|---|---|" + "---|" * len(conditions),
+    ]
+    for one in measured:
+        for robot in ROBOTS:
+            outcomes = [one.outcomes[f"{robot} {condition}"] for condition in conditions]
+            expected = [reference.outcomes[f"{robot} {condition}"] for condition in conditions]
+            hashes = [_hash(outcomes, kind, expected) for kind in ("states", "pictures")]
+            lines.append(f"| {' | '.join([one.mujoco, robot, *hashes, *map(_played, outcomes)])} |")
+    return lines
+
+
+def _hash(outcomes: list[Outcome | str], kind: str, expected: list[Outcome | str]) -> str:
+    digests, wanted = ([getattr(one, kind, "") for one in some] for some in (outcomes, expected))
+    if not any(digests):
+        return ""
+    short = hashlib.sha256("".join(digests).encode()).hexdigest()[:HASH_DIGITS]
+    return f"{short} =" if digests == wanted else short
+
+
+def _played(outcome: Outcome | str) -> str:
+    if isinstance(outcome, str):
+        return "cannot run"
+    return f"{outcome.successes}/{outcome.episodes}, {outcome.worst_error_mm:.1f} mm"
+
+
+def main() -> None:
+    """Run the benchmark from the command line."""
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument("--versions", nargs="+", help="of MuJoCo; default: all that are published")
+    parser.add_argument("--reference", default=REFERENCE, help="the version to compare with")
+    parser.add_argument("--seeds", type=int, default=NUM_SEEDS, help=f"episodes a case, from {FIRST_SEED} on")
+    parser.add_argument("--conditions", nargs="+", default=CONDITIONS, help="as none dynamics:5")
+    parser.add_argument("--work_dir", type=Path, default=Path("simulators"), help="for the environments")
+    parser.add_argument("--here", action="store_true", help="measure this Python alone and print JSON")
+    parser.add_argument("--json", type=Path, help="write everything here")
+    args = parser.parse_args()
+    if args.here:
+        figures = measure_here(args.conditions, range(FIRST_SEED, FIRST_SEED + args.seeds))
+        print(json.dumps(asdict(figures)))
+        return
+    versions = args.versions or published_versions()
+    measured = {}
+    for version in dict.fromkeys([args.reference, *versions]):
+        print(f"playing under MuJoCo {version}", file=sys.stderr)
+        measured[version] = measure(version, args.work_dir, args.conditions, args.seeds)
+        if args.json:
+            figures = [asdict(one) for one in measured.values()]
+            args.json.write_text(json.dumps(figures, indent=1) + "\n")
+    reference = measured[args.reference]
+    print("\n".join(table([measured[version] for version in versions], reference)))
+    print(f"drawn by {reference.renderer}")
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,45 @@
+"""What an environment of BOMB takes and delivers, as Gymnasium spaces."""
+
+import numpy as np
+from gymnasium import spaces
+
+from lerobot_bomb.camera_geometry import geometry_shapes
+from lerobot_bomb.schema import (
+    CAMERAS,
+    NUM_STONES,
+    PHYSICS_HZ,
+    STATE_DIM,
+    PrivilegedState,
+    RenderOptions,
+    Stage,
+    action_bounds,
+)
+
+# Bounds of what the simulator can report, metres. Stones can be flung off the board, so they are wide.
+POSITION_LIMIT_M = 100.0
+# Pads that scrape over the board at metres per second drag fingers past their soft stops: openings from -0.04
+# to 0.13 m were seen.
+GRIPPER_LIMIT_M = 1.0
+
+
+def action_space(control_mode: str) -> spaces.Box:
+    """float32 (4,): relative in units of MAX_STEP_M, or absolute in metres; gripper in [-1, 1]."""
+    low, high = action_bounds(control_mode)
+    return spaces.Box(low, high, dtype=np.float32)
+
+
+def observation_space(options: RenderOptions) -> spaces.Dict:
+    """Pictures of both cameras, (4,) state of the gripper, the privileged state for oracles, geometry."""
+    shape = (options.image_size, options.image_size, 3)
+    limit = max(POSITION_LIMIT_M, NUM_STONES, len(Stage), PHYSICS_HZ)
+    return spaces.Dict(
+        {
+            "pixels": spaces.Dict({camera: spaces.Box(0, 255, shape, np.uint8) for camera in CAMERAS}),
+            "agent_pos": spaces.Box(-GRIPPER_LIMIT_M, GRIPPER_LIMIT_M, (STATE_DIM,), np.float32),
+            "environment_state": spaces.Box(-limit, limit, (PrivilegedState.DIM,), np.float32),
+            **{
+                key: spaces.Box(-np.inf, np.inf, shape, np.float32)
+                for key, shape in geometry_shapes(options).items()
+            },
+        }
+    )
