@@ -128,7 +128,7 @@ def test_a_damaged_line_is_named_and_the_others_count(
     assert f"{path}:2: not an episode result: " in error
     assert message in error
     assert error.count("\n") == 1
-    assert "1 damaged lines are not counted" in out
+    assert "damaged lines, which are not counted: 1" in out
     assert "2 episodes" in out
     assert main(["results", str(path), "--strict"]) == 1
     assert message in capsys.readouterr().err
@@ -200,7 +200,7 @@ def test_what_does_not_compare_is_neither_pooled_nor_paired_and_named(
     )
     assert f"{path}: 2 episodes" in output
     assert f"{path}: 3 episodes" in output
-    assert "3 perturbed episodes have no unperturbed ones to compare with" in output
+    assert "perturbed episodes without an unperturbed one to compare with: 3" in output
     assert "pairs," not in output
     if "spec" not in OTHER[name]:  # then the episodes are the same
         assert f"those of this file differ in {name}" in output
@@ -260,10 +260,10 @@ def test_a_heading_says_what_was_asked(path: Path, capsys: pytest.CaptureFixture
     assert (
         f"protocol {PROTOCOL_VERSION}, suite=place, robot=fetch, split=all, control_mode=relative, " in output
     )
-    assert "perturbations=camera:3, seeds 4..7" in output
+    assert "perturbations=camera:3, seeds 4, 7" in output
     assert "256 px, render_preset fast, OpenGL Mesa, llvmpipe, MuJoCo 3.8.1, lerobot_bomb " in output
     assert "1 lines count no more, a later one is of the same episode" in output
-    assert 'no unperturbed ones to compare with; add "none" to --env.perturbations' in output
+    assert 'without an unperturbed one to compare with: 2; add "none" to --env.perturbations' in output
 
 
 def test_lines_of_1_0_are_read_and_said_to_be_incomplete(
@@ -290,5 +290,5 @@ def test_a_perturbed_arm_is_compared_with_the_same_episodes_unperturbed(
     output = printed(path, "".join(lines), capsys)
     assert "camera:3: 7 pairs, 5 lost, 1 won, p = 0.22" in output
     assert "all:5: 2 pairs, 0 lost, 0 won, p = 1 " in output
-    assert "1 perturbed episodes have no unperturbed ones" in output
+    assert "without an unperturbed one to compare with: 1; add" in output
     assert f"{path} (perturbations=none): 7 episodes" in output

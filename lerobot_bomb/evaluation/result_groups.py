@@ -1,17 +1,19 @@
 """Episodes that compare: which lines of a results file may be pooled and paired, and what they are of."""
 
 import json
+from collections.abc import Iterable
 from dataclasses import dataclass
 from typing import Any
 
 from lerobot_bomb.evaluation.result_lines import NEW_CHECKS, OLD_VERSION, Row
 from lerobot_bomb.perturbations import NONE
-from lerobot_bomb.schema import BOARD, COLORS
+from lerobot_bomb.schema import task_id
 
 # what may differ between episodes that are pooled; perturbations between those that are paired
 DRAWN = ("seed", "target", "color", "perturbations")
 NOT_RECORDED = "not recorded"
 SHOWN_DIGITS = 12  # of a SHA-256
+MAX_RUNS = 10  # of numbers, in a heading
 SOFTWARE = {"lerobot_bomb": "package_version", "LeRobot": "lerobot_version", "torch": "torch_version"}
 
 
@@ -33,11 +35,11 @@ class Group:
         asked = [f"{name}={spec[name]}" for name in spec if name not in DRAWN]
         conditions = {row["spec"]["perturbations"] for row in self.rows}
         asked += [f"perturbations={conditions.pop()}"] if len(conditions) == 1 else []
-        seeds = [row["spec"]["seed"] for row in self.rows]
+        seeds = _ranges(row["spec"]["seed"] for row in self.rows)
         pictures = f"{first['image_size']} px, render_preset {self.settings['render_preset']}"
         return [
             f"policy {describe_policy(first)}; {describe_tasks(self.rows)}",
-            f"protocol {first['protocol_version']}, {', '.join(asked)}, seeds {min(seeds)}..{max(seeds)}",
+            f"protocol {first['protocol_version']}, {', '.join(asked)}, seeds {seeds}",
             f"{pictures}, OpenGL {self.settings['OpenGL']}, MuJoCo {self.settings['MuJoCo']}, "
             + ", ".join(f"{name} {self._versions(key)}" for name, key in SOFTWARE.items()),
         ]
@@ -128,7 +130,7 @@ def describe_tasks(rows: list[Row]) -> str:
         return f"tasks {_ranges(first['task_ids'])}"
     target, color = (first["spec"][name] for name in ("target", "color"))
     if target and color:
-        return f"tasks {_ranges({_task_id(row) for row in rows})}"
+        return f"tasks {_ranges({task_id(row['target'], row['color']) for row in rows})}"
     target = "drawn" if target is None else f"row {target[0]}, column {target[1]}"
     return f"target {target}; colour {color or 'drawn'}"
 
@@ -153,20 +155,16 @@ def _tasks_key(row: Row) -> str:
     return json.dumps([target, color])
 
 
-def _task_id(row: Row) -> int:
-    """The inverse of `EpisodeSpec.for_task`."""
-    line, column = row["target"]
-    return BOARD.num_lines**2 * COLORS.index(row["color"]) + BOARD.num_lines * line + column
-
-
-def _ranges(numbers: Any) -> str:
-    """{0, 1, 2, 7} -> '0..2, 7'."""
+def _ranges(numbers: Iterable[int]) -> str:
+    """{0, 1, 2, 7} -> '0..2, 7'; of many runs, the first and the last number."""
     runs: list[list[int]] = []
     for number in sorted(set(numbers)):
         if runs and number == runs[-1][-1] + 1:
             runs[-1].append(number)
         else:
             runs.append([number])
+    if len(runs) > MAX_RUNS:
+        return f"{runs[0][0]}..{runs[-1][-1]}, with gaps"
     return ", ".join(str(run[0]) if len(run) == 1 else f"{run[0]}..{run[-1]}" for run in runs)
 
 

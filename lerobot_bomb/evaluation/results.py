@@ -83,14 +83,19 @@ def _pair_lines(group: Group, groups: list[Group]) -> list[str]:
     perturbed = [row for row in group.rows if row["spec"]["perturbations"] != NONE]
     pairs = pair_with_nominal(group.rows)
     lines = [_pair_line(condition, of) for condition, of in pairs.items()]
-    num_left = len(perturbed) - sum(map(len, pairs.values()))
-    if not num_left:
+    paired = {id(row) for of in pairs.values() for _, row in of}
+    left = [row for row in perturbed if id(row) not in paired]
+    if not left:
         return lines
     advice = 'add "none" to --env.perturbations'
-    others = [other for other in groups if other is not group and pair_with_nominal(other.rows + perturbed)]
+    others = [
+        other
+        for other in groups
+        if pair_with_nominal([row for row in other.rows if row["spec"]["perturbations"] == NONE] + left)
+    ]
     if others:
         advice = f"those of this file differ in {', '.join(differing([group, others[0]]))}"
-    return [*lines, f"  {num_left} perturbed episodes have no unperturbed ones to compare with; {advice}"]
+    return [*lines, f"  perturbed episodes without an unperturbed one to compare with: {len(left)}; {advice}"]
 
 
 def add_results_arguments(parser: argparse.ArgumentParser) -> None:
@@ -115,7 +120,7 @@ def run_results(args: argparse.Namespace) -> int:
 
 def _print_file(path: Path, groups: list[Group], num_damaged: int) -> None:
     if num_damaged:
-        print(f"{path}: {num_damaged} damaged lines are not counted")
+        print(f"{path}: damaged lines, which are not counted: {num_damaged}")
     if len(groups) > 1:
         print(
             f"{path}: {len(groups)} groups of episodes, neither pooled nor paired with each other; they "
