@@ -22,7 +22,8 @@ from lerobot_bomb.actions.grid_settings import ActionGroup, GridSettings, defaul
 from lerobot_bomb.actions.grids import ActionGrids
 from lerobot_bomb.data.columns import read_columns, read_meta
 from lerobot_bomb.data.rollout import make_env
-from lerobot_bomb.schema import EpisodeResult, EpisodeSpec, RenderOptions
+from lerobot_bomb.episode_result import EpisodeResult
+from lerobot_bomb.schema import EpisodeSpec, RenderOptions
 from lerobot_bomb.tables import print_table
 
 PAIRS = (ActionGroup((0, 1), "identity", (64, 64)), ActionGroup((2, 3), "identity", (64, 16)))

@@ -4,19 +4,20 @@ numpy only: simulator workers import this module and must start in under a secon
 """
 
 import dataclasses
-import json
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from enum import StrEnum
 
 import numpy as np
 
-from lerobot_bomb import __version__
 from lerobot_bomb.flags import one_of
 from lerobot_bomb.perturbations import NONE, Condition
 
-# Version of task, physics, observation and success rule. Results of different versions do not compare.
-PROTOCOL_VERSION = "1.0"
+# Version of task, physics, observation and success rule: what a recording is of, and its robot type says.
+TASK_VERSION = "1.0"
+# Version of how a policy is measured and what a line of results says. 1.1 is the task of 1.0 with lines that
+# name simulator, policy and tasks.
+PROTOCOL_VERSION = "1.1"
 
 SUITES = ("place",)
 ROBOTS = ("scara", "fetch")
@@ -190,32 +191,6 @@ class RenderOptions:
             raise ValueError(
                 f"--env.image_size={self.image_size} must lie in {MIN_IMAGE_SIZE}..{MAX_IMAGE_SIZE} pixels"
             )
-
-
-@dataclass(frozen=True)
-class EpisodeResult:
-    """Outcome of one episode; one JSON line in a results file."""
-
-    spec: EpisodeSpec
-    instruction: str
-    target: tuple[int, int]
-    color: str
-    steps: int
-    is_success: bool
-    is_success_bomb_v0: bool
-    failure: str | None
-    stage: str
-    placement_error_mm: float
-    nearest_intersection: tuple[int, int]
-    collateral_mm: float
-    levels: dict[str, int] = field(default_factory=dict)  # of the perturbation axes that were on
-    image_size: int = DEFAULT_IMAGE_SIZE
-    package_version: str = __version__
-    protocol_version: str = PROTOCOL_VERSION
-
-    def to_json(self) -> str:
-        """One line of JSON, keys in the order of the fields."""
-        return json.dumps(dataclasses.asdict(self))
 
 
 @dataclass(frozen=True)

@@ -7,6 +7,7 @@ from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import gymnasium
+import mujoco
 import numpy as np
 import pytest
 from gymnasium.error import ResetNeeded
@@ -210,7 +211,18 @@ def test_each_finished_episode_appends_one_line(tmp_path: Path) -> None:
     assert [line["is_success"] for line in lines] == [True, False]
     assert [line["spec"]["seed"] for line in lines] == [SEED, SEED + 1]
     assert lines[1]["failure"] == "never_reached" and lines[1]["steps"] == 100
-    assert lines[0]["protocol_version"] == PROTOCOL_VERSION
+    assert lines[0]["protocol_version"] == PROTOCOL_VERSION == "1.1"
+    assert lines[0]["policy"] is None
+    assert lines[0]["mujoco_version"] == mujoco.__version__
+    assert lines[0]["opengl_vendor"] and lines[0]["opengl_renderer"]
+
+
+def test_a_result_that_cannot_be_written_is_an_error_that_names_the_flag() -> None:
+    env = BombEnv(EpisodeSpec(seed=0, fps=1), SMALL, results_path="/dev/full")
+    message = r"--env\.results_path=/dev/full: the result of seed 4 could not .*No space left on device"
+    with pytest.raises(OSError, match=message):
+        rollout(env, stands_still, seed=SEED)
+    env.close()
 
 
 @pytest.mark.parametrize("gym_id", sorted(lerobot_env_bomb.GYM_IDS))

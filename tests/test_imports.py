@@ -65,7 +65,16 @@ def test_the_simulator_imports_nothing_heavy(path: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    "name", ["schema.py", "stats.py", "expert.py", "data/rollout.py", "data/recording.py"]
+    "name",
+    [
+        "schema.py",
+        "episode_result.py",
+        "json_lines.py",
+        "stats.py",
+        "expert.py",
+        "data/rollout.py",
+        "data/recording.py",
+    ],
 )
 def test_what_simulator_workers_import_from_the_core_is_light(name: str) -> None:
     assert not imported(ROOT / "lerobot_bomb" / name) & HEAVY

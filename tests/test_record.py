@@ -19,7 +19,7 @@ from lerobot_bomb.data.recording import Recording
 from lerobot_bomb.data.rollout import RolloutSettings, make_env, play
 from lerobot_bomb.expert import expert_action
 from lerobot_bomb.perturbations import NUISANCES
-from lerobot_bomb.schema import CAMERAS, PROTOCOL_VERSION, EpisodeSpec, PrivilegedState, RenderOptions
+from lerobot_bomb.schema import CAMERAS, TASK_VERSION, EpisodeSpec, PrivilegedState, RenderOptions
 
 SIZE = 64
 SMALL = RenderOptions(image_size=SIZE)
@@ -81,7 +81,7 @@ def test_a_dataset_reads_back_through_lerobot(recording: Recording, datasets: di
     assert dataset.features["observation.state"]["names"] == ["x", "y", "z", "finger_opening"]
     first = "x" if recording.control_mode == "absolute" else "dx"
     assert dataset.features["action"]["names"][0] == first
-    assert (dataset.fps, dataset.meta.robot_type) == (10, f"bomb_scara_v{PROTOCOL_VERSION}")
+    assert (dataset.fps, dataset.meta.robot_type) == (10, f"bomb_scara_v{TASK_VERSION}")
     assert dataset.num_episodes == recording.episodes
     progress = read_progress(root / METADATA_FILE)
     assert len(dataset) == progress.num_frames
@@ -127,7 +127,7 @@ def test_recorded_actions_replay_to_the_same_success(recording: Recording, datas
 def test_episodes_carry_what_determines_them(datasets: dict[str, Path]) -> None:
     rows = episode_rows(datasets["video"])
     assert [row["bomb/seed"] for row in rows] == [3, 4, 5, 6, 7]
-    assert {row["bomb/protocol_version"] for row in rows} == {PROTOCOL_VERSION}
+    assert {row["bomb/protocol_version"] for row in rows} == {TASK_VERSION}
     assert {row["bomb/package_version"] for row in rows} == {__version__}
     assert json.loads(rows[0]["bomb/spec"]) == EpisodeSpec(seed=3).to_dict()
     (instruction,) = rows[0]["tasks"]
@@ -136,7 +136,7 @@ def test_episodes_carry_what_determines_them(datasets: dict[str, Path]) -> None:
     assert str(column) in instruction
     assert rows[0]["bomb/color"] in instruction
     written = json.loads((datasets["video"] / METADATA_FILE).read_text())["recording"]
-    versions = {"protocol_version": PROTOCOL_VERSION, "package_version": __version__}
+    versions = {"protocol_version": TASK_VERSION, "package_version": __version__}
     assert written == {**VIDEO.to_dict(), **versions}
 
 
@@ -221,10 +221,10 @@ def test_lerobot_refuses_to_merge_datasets_of_different_protocol_versions(
 
     from lerobot_bomb.data import rollout_dataset
 
-    monkeypatch.setattr(rollout_dataset, "PROTOCOL_VERSION", "0.0")
+    monkeypatch.setattr(rollout_dataset, "TASK_VERSION", "0.0")
     record(IMAGES, tmp_path / "old")
     roots = [datasets["images"], tmp_path / "old"]
-    with pytest.raises(ValueError, match=f"bomb_scara_v{PROTOCOL_VERSION}"):
+    with pytest.raises(ValueError, match=f"bomb_scara_v{TASK_VERSION}"):
         aggregate_datasets(["test/images"] * 2, "test/merged", roots=roots, aggr_root=tmp_path / "merged")
 
 
@@ -232,9 +232,7 @@ def test_a_recording_of_another_protocol_version_is_not_gone_on_with(
     datasets: dict[str, Path], tmp_path: Path
 ) -> None:
     old = replace(IMAGES, protocol_version="0.0")
-    with pytest.raises(
-        ValueError, match=rf"differs in protocol_version='0.0' \(it has {PROTOCOL_VERSION!r}\)"
-    ):
+    with pytest.raises(ValueError, match=rf"differs in protocol_version='0.0' \(it has {TASK_VERSION!r}\)"):
         record(old, datasets["images"], resume=True)
 
 

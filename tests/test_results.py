@@ -1,26 +1,69 @@
 import json
+from dataclasses import asdict, fields
 from pathlib import Path
+from typing import Any
 
 import pytest
 
 from lerobot_bomb.cli import main
+from lerobot_bomb.episode_result import EpisodeResult, PolicyIdentity
+from lerobot_bomb.evaluation.result_lines import NEW_CHECKS, POLICY_CHECKS, SPEC_CHECKS, parse_line
 from lerobot_bomb.evaluation.results import read_results, summarise
-from lerobot_bomb.schema import PROTOCOL_VERSION
+from lerobot_bomb.schema import COLORS, PROTOCOL_VERSION, EpisodeSpec
+
+ACT = PolicyIdentity("act", "outputs/act", None, "a" * 64, "b" * 64)
+FDVLA = PolicyIdentity("fdvla", "me/fdvla", "0123456789ab", "c" * 64, "d" * 64)
 
 
-def row(seed: int, failure: str | None = None, error: float = 1.0, **other: object) -> str:
-    values = {
-        "spec": {"seed": seed, "perturbations": "none"},
-        "is_success": failure is None,
-        "failure": failure,
-        "placement_error_mm": error,
-        "protocol_version": PROTOCOL_VERSION,
-    }
-    return json.dumps(values | other) + "\n"
+def values(seed: int, failure: str | None = None, error: float = 1.0, **other: Any) -> dict[str, Any]:
+    """The fields of a line; those of the spec are given as `spec`."""
+    spec = {"seed": seed} | other.pop("spec", {})
+    result = EpisodeResult(
+        spec=EpisodeSpec(**spec),
+        instruction="Put it there.",
+        target=spec.get("target") or (2, 2),
+        color=spec.get("color") or "black",
+        steps=20,
+        is_success=failure is None,
+        is_success_bomb_v0=failure is None,
+        failure=failure,
+        stage="placed",
+        placement_error_mm=error,
+        nearest_intersection=(2, 2),
+        collateral_mm=0.0,
+        opengl_vendor="Mesa",
+        opengl_renderer="llvmpipe",
+        mujoco_version="3.8.1",
+    )
+    policy = other.pop("policy", ACT)
+    return asdict(result) | {"policy": policy and asdict(policy)} | other
 
 
-def test_summary_counts_successes_errors_and_failures(tmp_path: Path) -> None:
-    path = tmp_path / "results.jsonl"
+def row(seed: int, failure: str | None = None, error: float = 1.0, **other: Any) -> str:
+    return json.dumps(values(seed, failure, error, **other)) + "\n"
+
+
+def old_row(seed: int, **other: Any) -> str:
+    """As protocol 1.0 wrote it."""
+    new = values(seed, **other)
+    return json.dumps(
+        {name: new[name] for name in new if name not in NEW_CHECKS} | {"protocol_version": "1.0"}
+    )
+
+
+def printed(path: Path, text: str, capsys: pytest.CaptureFixture[str]) -> str:
+    """What `lerobot-bomb results` says of a file."""
+    path.write_text(text)
+    assert main(["results", str(path)]) == 0
+    return capsys.readouterr().out
+
+
+@pytest.fixture
+def path(tmp_path: Path) -> Path:
+    return tmp_path / "results.jsonl"
+
+
+def test_summary_counts_successes_errors_and_failures(path: Path) -> None:
     lines = [row(0), row(1, error=3.0), row(2, "imprecise", 14.0), row(3, "never_reached", 200.0)]
     lines += [row(4, "dropped", 99.0), row(5, "wrong_intersection", 45.0), row(6, "disturbed_others", 2.0)]
     path.write_text("".join(lines))
@@ -36,33 +79,88 @@ def test_summary_counts_successes_errors_and_failures(tmp_path: Path) -> None:
     }
 
 
-def test_an_episode_that_was_run_again_counts_once(tmp_path: Path) -> None:
-    path = tmp_path / "results.jsonl"
+def test_an_episode_that_was_run_again_counts_once(path: Path) -> None:
     path.write_text(row(0, "dropped") + row(1) + row(0))
     assert summarise(read_results(path)).num_successes == 2
 
 
-@pytest.mark.parametrize(
-    ("text", "message"),
-    [
-        ("", "no finished episode"),
-        ("not json\n", "results.jsonl:1: not an episode result"),
-        (row(0) + "{}\n", "results.jsonl:2: not an episode result"),
-        (row(0, protocol_version="0.0"), f"protocol_version '0.0', this package has '{PROTOCOL_VERSION}'"),
-    ],
-)
-def test_bad_files_are_named_with_the_line(tmp_path: Path, text: str, message: str) -> None:
-    path = tmp_path / "results.jsonl"
-    path.write_text(text)
-    with pytest.raises(ValueError, match=message):
+def test_all_fields_are_checked() -> None:
+    assert SPEC_CHECKS.keys() == {field.name for field in fields(EpisodeSpec)}
+    assert POLICY_CHECKS.keys() == {field.name for field in fields(PolicyIdentity)}
+    for name in values(0):
+        with pytest.raises(ValueError, match=f"{name}" if name != "protocol_version" else "None"):
+            parse_line(json.dumps({key: value for key, value in values(0).items() if key != name}).encode())
+
+
+DAMAGED: dict[str, Any] = {
+    "is_success=-5 is impossible": {"is_success": -5},
+    "placement_error_mm=NaN is impossible": {"placement_error_mm": float("nan")},
+    "collateral_mm=-1.0 is impossible": {"collateral_mm": -1.0},
+    'failure="bored" is impossible': {"failure": "bored"},
+    "is_success=True with failure='dropped'": {"failure": "dropped", "is_success": True},
+    "steps=0 is impossible": {"steps": 0},
+    "steps=true is impossible": {"steps": True},
+    'stage="released" is impossible': {"stage": "released"},
+    "target=[2, 5] is impossible": {"target": [2, 5]},
+    'color="red" is impossible': {"color": "red"},
+    "image_size=0 is impossible": {"image_size": 0},
+    "task_ids=[50] is impossible": {"task_ids": [50]},
+    "policy=[] is impossible": {"policy": []},
+    'policy.weights_sha256="a" is impossible': {"policy": asdict(ACT) | {"weights_sha256": "a"}},
+    "spec.seed=-1 is impossible": {"spec": asdict(EpisodeSpec(0)) | {"seed": -1}},
+    "seed=4294967296 must lie in 0..4294967295": {"spec": asdict(EpisodeSpec(0)) | {"seed": 2**32}},
+    "fps=3 does not divide": {"spec": asdict(EpisodeSpec(0)) | {"fps": 3}},
+    "perturbations": {"spec": asdict(EpisodeSpec(0)) | {"perturbations": "camera:9"}},
+    "it lacks spec.robot": {"spec": {k: v for k, v in asdict(EpisodeSpec(0)).items() if k != "robot"}},
+    "spec has wind, of which": {"spec": asdict(EpisodeSpec(0)) | {"wind": 3}},
+    "target=[2, 2], but spec.target=[1, 1]": {"spec": asdict(EpisodeSpec(0, target=(1, 1)))},
+    "protocol_version '0.0'; this package reads 1.0 and 1.1": {"protocol_version": "0.0"},
+}
+
+
+@pytest.mark.parametrize("message", DAMAGED)
+def test_a_damaged_line_is_named_and_the_others_count(
+    message: str, path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    path.write_text(row(0) + json.dumps(values(1) | DAMAGED[message]) + "\n" + row(2))
+    assert main(["results", str(path)]) == 0
+    out, error = capsys.readouterr()
+    assert f"{path}:2: not an episode result: " in error
+    assert message in error
+    assert error.count("\n") == 1
+    assert "1 damaged lines are not counted" in out
+    assert "2 episodes" in out
+    assert main(["results", str(path), "--strict"]) == 1
+    assert message in capsys.readouterr().err
+    with pytest.raises(ValueError, match=r"results\.jsonl:2: not an episode result"):
         read_results(path)
 
 
-def test_the_command_prints_a_summary(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    path = tmp_path / "results.jsonl"
-    path.write_text(row(0) + row(1, "dropped"))
+@pytest.mark.parametrize(
+    "line", [b"not json", b"[1]", b"{}", b"\xff\xfe", b"[" * 9999, (row(1)[:300] + row(2)).strip().encode()]
+)
+def test_a_line_that_is_no_result_does_not_take_the_others_along(
+    line: bytes, path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    path.write_bytes(row(0).encode() + line + b"\n\n" + row(3).encode().strip())
     assert main(["results", str(path)]) == 0
-    output = capsys.readouterr().out
+    out, error = capsys.readouterr()
+    assert f"{path}:2: not an episode result" in error
+    assert error.count("\n") == 1
+    assert "2 episodes" in out
+
+
+@pytest.mark.parametrize("text", ["", "\n", "not json\n"])
+def test_a_file_without_an_episode_is_an_error(
+    text: str, path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    path.write_text(text)
+    assert main(["results", str(path)]) == 1
+    assert "no finished episode" in capsys.readouterr().err
+
+
+def test_the_command_prints_a_summary(path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    output = printed(path, row(0) + row(1, "dropped"), capsys)
     assert "1/2 = 50.0 %" in output
     assert "dropped 1" in output
 
@@ -74,43 +172,123 @@ def test_the_command_fails_in_one_line(tmp_path: Path, capsys: pytest.CaptureFix
     assert error.count("\n") == 1
 
 
-def test_conditions_are_not_mixed(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    path = tmp_path / "results.jsonl"
-    specs = [{"seed": 0, "fps": 10}, {"seed": 1, "fps": 10}, {"seed": 0, "fps": 20}]
-    path.write_text("".join(row(0, spec=spec | {"perturbations": "none"}) for spec in specs))
-    assert main(["results", str(path)]) == 0
-    output = capsys.readouterr().out
-    assert "results.jsonl (fps=10): 2 episodes" in output
-    assert "results.jsonl (fps=20): 1 episodes" in output
+OTHER: dict[str, dict[str, Any]] = {
+    "policy": {"policy": FDVLA},
+    "protocol": {"protocol_version": "1.0"},
+    "MuJoCo": {"mujoco_version": "3.9.0"},
+    "OpenGL": {"opengl_renderer": "NVIDIA H200/PCIe/SSE2"},
+    "image_size": {"image_size": 64},
+    "render_preset": {"render_preset": "shadows"},
+    "tasks": {"task_ids": [12]},
+    "fps": {"spec": {"fps": 20}},
+    "split": {"spec": {"split": "train"}},
+    "robot": {"spec": {"robot": "fetch"}},
+    "control_mode": {"spec": {"control_mode": "absolute"}},
+    "success_tolerance_mm": {"spec": {"success_tolerance_mm": 5.0}},
+}
+
+
+@pytest.mark.parametrize("name", OTHER)
+def test_what_does_not_compare_is_neither_pooled_nor_paired_and_named(
+    name: str, path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    spec = OTHER[name].get("spec", {}) | {"perturbations": "camera:3"}
+    perturbed = [row(seed, "dropped", **(OTHER[name] | {"spec": spec})) for seed in (0, 1, 2)]
+    output = printed(path, row(0) + row(1) + "".join(perturbed), capsys)
+    assert (
+        f"2 groups of episodes, neither pooled nor paired with each other; they differ in {name}\n" in output
+    )
+    assert f"{path}: 2 episodes" in output
+    assert f"{path}: 3 episodes" in output
+    assert "3 perturbed episodes have no unperturbed ones to compare with" in output
+    assert "pairs," not in output
+    if "spec" not in OTHER[name]:  # then the episodes are the same
+        assert f"those of this file differ in {name}" in output
+
+
+def test_two_policies_are_two_groups_with_pairs_of_their_own(
+    path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    retrained = PolicyIdentity("act", "outputs/act", None, "e" * 64, "b" * 64)
+    moved = PolicyIdentity("act", "elsewhere", None, "a" * 64, "b" * 64)
+    text = "".join(
+        row(seed, failure, spec={"perturbations": condition}, policy=policy)
+        for seed in (0, 1)
+        for policy, failure in ((ACT, None), (retrained, "dropped"))
+        for condition in ("none", "all:5")
+    )
+    output = printed(path, text + row(2, policy=moved), capsys)
+    headings = [f"policy act outputs/act (weights {sha * 12}, settings bbbbbbbbbbbb)" for sha in "ae"]
+    first, second = (output.index(heading) for heading in headings)
+    assert "3/3 = 100.0 %" in output[first:second]
+    assert "0/2 = 0.0 %" in output[second:]
+    assert output[first:second].count("all:5: 2 pairs") == output[second:].count("all:5: 2 pairs") == 1
+    assert "count no more" not in output
+
+
+def test_one_target_and_all_targets_are_not_six_episodes(
+    path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    one = [row(seed, spec={"target": (2, 2), "color": "black"}, task_ids=[12]) for seed in range(3)]
+    every = [row(seed, "dropped", policy=FDVLA) for seed in range(3)]
+    output = printed(path, "".join(one + every), capsys)
+    assert "6 episodes" not in output
+    assert "they differ in policy, tasks" in output
+    assert "policy act outputs/act (weights aaaaaaaaaaaa, settings bbbbbbbbbbbb); tasks 12\n" in output
+    assert (
+        "policy fdvla me/fdvla@0123456789ab (weights cccccccccccc, settings dddddddddddd); target drawn; "
+        in output
+    )
+
+
+@pytest.mark.parametrize("line", [row, old_row])
+def test_numbered_tasks_are_one_set(line: Any, path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    specs = [{"target": divmod(i % 25, 5), "color": COLORS[i // 25]} for i in range(50)]
+    task_ids = {"task_ids": list(range(50))} if line is row else {}
+    lines = [line(7, spec=spec, **task_ids).strip() for spec in specs]
+    output = printed(path, "\n".join(lines), capsys)
+    assert "tasks 0..49\n" in output
+    assert ": 50 episodes" in output
+    assert "groups" not in output
+
+
+def test_a_heading_says_what_was_asked(path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    spec = {"target": (1, 3), "robot": "fetch", "perturbations": "camera:3"}
+    text = "".join(row(0, spec=spec | {"seed": seed}, color="white") for seed in (4, 7, 4))
+    output = printed(path, text, capsys)
+    assert "target row 1, column 3; colour drawn" in output
+    assert (
+        f"protocol {PROTOCOL_VERSION}, suite=place, robot=fetch, split=all, control_mode=relative, " in output
+    )
+    assert "perturbations=camera:3, seeds 4..7" in output
+    assert "256 px, render_preset fast, OpenGL Mesa, llvmpipe, MuJoCo 3.8.1, lerobot_bomb " in output
+    assert "1 lines count no more, a later one is of the same episode" in output
+    assert 'no unperturbed ones to compare with; add "none" to --env.perturbations' in output
+
+
+def test_lines_of_1_0_are_read_and_said_to_be_incomplete(
+    path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    output = printed(path, "\n".join(old_row(seed) for seed in range(3)), capsys)
+    assert ": 3 episodes" in output
+    assert "protocol 1.0, suite=place" in output
+    assert "lines of protocol 1.0 are incomplete: they lack policy, mujoco_version, opengl_vendor, " in output
+    assert "policy not recorded" in output
+    assert main(["results", str(path), "--strict"]) == 0
 
 
 def test_a_perturbed_arm_is_compared_with_the_same_episodes_unperturbed(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+    path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    path = tmp_path / "results.jsonl"
     outcomes = {"none": "++++++-", "camera:3": "-----++", "all:5": "++"}  # by seed
     lines = [
-        row(seed, None if outcome == "+" else "dropped", spec={"seed": seed, "perturbations": condition})
+        row(seed, None if outcome == "+" else "dropped", spec={"perturbations": condition})
         for condition, of in outcomes.items()
         for seed, outcome in enumerate(of)
     ]
-    lines.append(row(99, spec={"seed": 99, "perturbations": "all:5"}))  # has no pair
-    path.write_text("".join(lines))
-    assert main(["results", str(path)]) == 0
-    printed = capsys.readouterr().out
-    assert "camera:3: 7 pairs, 5 lost, 1 won, p = 0.22" in printed
-    assert "all:5: 2 pairs, 0 lost, 0 won, p = 1 " in printed
-    assert f"{path} (perturbations=none): 7 episodes" in printed
-
-
-def test_what_a_file_holds_is_said_even_where_nothing_differs(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    path = tmp_path / "results.jsonl"
-    specs = [{"seed": seed, "robot": "fetch", "perturbations": "camera:3"} for seed in (4, 7, 4)]
-    path.write_text("".join(row(0, spec=spec) for spec in specs))
-    assert main(["results", str(path)]) == 0
-    printed = capsys.readouterr().out
-    assert f"protocol {PROTOCOL_VERSION}, robot=fetch, perturbations=camera:3, seeds 4..7" in printed
-    assert "1 lines count no more, a later one is of the same episode" in printed
-    assert 'no unperturbed episodes to compare with; add "none" to --env.perturbations' in printed
+    lines.append(row(99, spec={"perturbations": "all:5"}))  # has no pair
+    output = printed(path, "".join(lines), capsys)
+    assert "camera:3: 7 pairs, 5 lost, 1 won, p = 0.22" in output
+    assert "all:5: 2 pairs, 0 lost, 0 won, p = 1 " in output
+    assert "1 perturbed episodes have no unperturbed ones" in output
+    assert f"{path} (perturbations=none): 7 episodes" in output

@@ -5,10 +5,10 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from lerobot_bomb.episode_result import EpisodeResult
 from lerobot_bomb.schema import (
     BOARD,
     NUM_STONES,
-    EpisodeResult,
     EpisodeSpec,
     PrivilegedState,
     RenderOptions,

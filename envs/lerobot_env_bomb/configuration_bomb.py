@@ -13,14 +13,15 @@ from lerobot.utils.constants import ACTION, OBS_IMAGES, OBS_PREFIX, OBS_STATE
 from lerobot_bomb.camera_geometry import geometry_shapes
 from lerobot_bomb.environment import Environment
 from lerobot_bomb.flags import flag_errors
+from lerobot_bomb.json_lines import check_appendable
 from lerobot_bomb.perturbations import NONE, Condition
 from lerobot_bomb.policy_environment import check_acting_policy
 from lerobot_bomb.schema import (
     ACTION_DIM,
     CAMERAS,
     DEFAULT_FPS,
-    PROTOCOL_VERSION,
     STATE_DIM,
+    TASK_VERSION,
     EpisodeSpec,
     RenderOptions,
 )
@@ -136,6 +137,7 @@ class BombEnvConfig(EnvConfig):
             "spec": next(iter(self.specs.values())),
             "render_options": self.render_options,
             "results_path": self.results_path,
+            "task_ids": None if self.task_ids is None else tuple(self.task_ids),
         }
 
     @property
@@ -151,7 +153,7 @@ class BombEnvConfig(EnvConfig):
             fps=self.fps,
             image_size=self.image_size,
             cameras=CAMERAS,
-            protocol_version=PROTOCOL_VERSION,
+            protocol_version=TASK_VERSION,
             task=str(self.task),
             depth=self.depth,
             task_ids=tuple(self.task_ids or ()),
@@ -184,6 +186,7 @@ class BombEnvConfig(EnvConfig):
                     [partial(BombEnv, **(kwargs | {"spec": replace(spec, perturbations=condition)}))]
                     * n_envs,
                     use_async=use_async_envs and n_envs > 1,
+                    known_late=self._policy_of_results,
                 )
                 for task_id, spec in self.specs.items()
             }
@@ -193,9 +196,15 @@ class BombEnvConfig(EnvConfig):
     def _prepare_results_path(self) -> None:
         if self.results_path is None:
             return
-        path = Path(self.results_path)
         try:
-            path.parent.mkdir(parents=True, exist_ok=True)
-            path.open("a").close()
+            check_appendable(Path(self.results_path))
         except OSError as error:
-            raise ValueError(f"--env.results_path={path} cannot be written: {error}") from error
+            raise ValueError(f"--env.results_path={self.results_path} cannot be written: {error}") from error
+
+    def _policy_of_results(self) -> dict[str, Any]:
+        """Argument of `BombEnv`: the policy that LeRobot built after this config's environments."""
+        if self.results_path is None:
+            return {}
+        from lerobot_bomb.policy_identity import acting_policy
+
+        return {"policy": acting_policy()}

@@ -1,6 +1,5 @@
 """BOMB as a Gymnasium environment."""
 
-import os
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -10,6 +9,7 @@ from gymnasium import spaces
 from gymnasium.error import ResetNeeded
 
 from lerobot_bomb.camera_geometry import geometry_shapes
+from lerobot_bomb.episode_result import EpisodeResult, PolicyIdentity, write_result
 from lerobot_bomb.schema import (
     ACTION_DIM,
     CAMERAS,
@@ -17,7 +17,6 @@ from lerobot_bomb.schema import (
     MAX_EPISODE_STEPS,
     NUM_STONES,
     PHYSICS_HZ,
-    EpisodeResult,
     EpisodeSpec,
     PrivilegedState,
     RenderOptions,
@@ -70,6 +69,8 @@ class BombEnv(gymnasium.Env[Observation, np.ndarray]):
         render_options: RenderOptions = DEFAULT_RENDER_OPTIONS,
         results_path: str | None = None,
         render_mode: str = "rgb_array",
+        task_ids: tuple[int, ...] | None = None,
+        policy: PolicyIdentity | None = None,
     ):
         check_target(spec)
         check_robot(spec)
@@ -84,6 +85,7 @@ class BombEnv(gymnasium.Env[Observation, np.ndarray]):
         self._spec = spec
         self._render_options = render_options
         self._results_path = results_path
+        self._task_ids, self._policy = task_ids, policy
         self.action_space = action_space(spec.control_mode)
         self._action_low, self._action_high = self.action_space.low, self.action_space.high
         self.observation_space = observation_space(render_options)
@@ -135,7 +137,8 @@ class BombEnv(gymnasium.Env[Observation, np.ndarray]):
         transition = (self._observe(), float(run.judge.is_success), terminated, truncated, self._info())
         if terminated or truncated:
             self._last_transition = (transition[0], 0.0, *transition[2:])
-            self._write_result()
+            if self._results_path is not None:
+                write_result(self._results_path, self.episode_result())
         return transition
 
     def render(self) -> np.ndarray:
@@ -169,6 +172,11 @@ class BombEnv(gymnasium.Env[Observation, np.ndarray]):
             collateral_mm=judge.collateral_mm,
             levels=episode.perturbation.levels,
             image_size=self._render_options.image_size,
+            render_preset=self._render_options.preset,
+            task_ids=self._task_ids,
+            policy=self._policy,
+            opengl_vendor=self._renderer and self._renderer.opengl_vendor,
+            opengl_renderer=self._renderer and self._renderer.opengl_renderer,
         )
 
     def close(self) -> None:
@@ -267,17 +275,6 @@ class BombEnv(gymnasium.Env[Observation, np.ndarray]):
             "collateral_mm": judge.collateral_mm,
             "seed": self._run.episode.spec.seed,
         }
-
-    def _write_result(self) -> None:
-        if self._results_path is None:
-            return
-        line = self.episode_result().to_json() + "\n"
-        # one write to a file opened for appending: lines of several workers do not mix
-        file = os.open(self._results_path, os.O_WRONLY | os.O_CREAT | os.O_APPEND, 0o644)
-        try:
-            os.write(file, line.encode())
-        finally:
-            os.close(file)
 
 
 def action_space(control_mode: str) -> spaces.Box:

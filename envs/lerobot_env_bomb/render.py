@@ -2,6 +2,7 @@
 """Pictures of BOMB's scene, fast enough for training data without a GPU."""
 
 import atexit
+import ctypes
 import weakref
 
 import numpy as np
@@ -12,6 +13,7 @@ from lerobot_env_bomb.backend import ensure_gl_backend
 ensure_gl_backend()
 
 import mujoco  # noqa: E402  (its names live in C modules that pyright cannot read)
+from OpenGL.raw.GL.VERSION import GL_1_0  # noqa: E402  (MuJoCo's own choice of OpenGL)
 
 SHADOW_MAP_SIZE = 512  # pixels
 CAPTION_LINE_PX = 26
@@ -31,6 +33,8 @@ class CameraRenderer:
         model.vis.global_.offwidth = model.vis.global_.offheight = max_size
         self._gl = mujoco.GLContext(max_size, max_size)
         self._gl.make_current()
+        self.opengl_vendor = _opengl_string(GL_1_0.GL_VENDOR)
+        self.opengl_renderer = _opengl_string(GL_1_0.GL_RENDERER)
         self._context = mujoco.MjrContext(model, mujoco.mjtFontScale.mjFONTSCALE_100)
         mujoco.mjr_setBuffer(mujoco.mjtFramebuffer.mjFB_OFFSCREEN, self._context)
         # far things are close to 0, where floats are dense: noise of 0.3 um at 1.7 m instead of 5 um near 1
@@ -87,6 +91,12 @@ def _free(gl: mujoco.GLContext, context: mujoco.MjrContext) -> None:
     gl.make_current()
     context.free()
     gl.free()
+
+
+def _opengl_string(name: int) -> str | None:
+    """What the current context says of itself."""
+    text = ctypes.cast(GL_1_0.glGetString(name), ctypes.c_char_p).value
+    return None if text is None else text.decode()
 
 
 def intrinsics(model: mujoco.MjModel, camera: str, size: int) -> np.ndarray:

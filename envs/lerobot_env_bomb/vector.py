@@ -70,10 +70,15 @@ class LazyVectorEnv(VectorEnv):
         make_ones: one picklable factory per env, of torch-free modules.
         use_async: a worker process per env (`AsyncVectorEnv`); else all in this process.
         context: multiprocessing start method of the workers.
+        known_late: gives keyword arguments of the factories that are known only when the envs start.
     """
 
     def __init__(
-        self, make_ones: Sequence[Callable[[], gym.Env]], use_async: bool, context: str = "forkserver"
+        self,
+        make_ones: Sequence[Callable[..., gym.Env]],
+        use_async: bool,
+        context: str = "forkserver",
+        known_late: Callable[[], dict[str, Any]] = dict,
     ) -> None:
         probe = make_ones[0]()
         self.num_envs = len(make_ones)
@@ -86,12 +91,14 @@ class LazyVectorEnv(VectorEnv):
         self._make_ones = make_ones
         self._use_async = use_async
         self._context = context
+        self._known_late = known_late
         self._envs: SyncVectorEnv | AsyncVectorEnv | None = None
 
     def _ensure(self) -> SyncVectorEnv | AsyncVectorEnv:
         """Start the envs unless they run; LeRobot calls this by name to prefetch the next condition."""
         if self._envs is None:
-            factories = [partial(_make_frozen, make_one) for make_one in self._make_ones]
+            late = self._known_late()
+            factories = [partial(_make_frozen, partial(make_one, **late)) for make_one in self._make_ones]
             if self._use_async:
                 with light_children():
                     self._envs = AsyncVectorEnv(

@@ -18,11 +18,11 @@ import gymnasium
 import numpy as np
 
 from lerobot_bomb.camera_geometry import geometry_shapes
+from lerobot_bomb.episode_result import EpisodeResult
 from lerobot_bomb.expert import expert_action
 from lerobot_bomb.schema import (
     CAMERAS,
     MAX_STEP_M,
-    EpisodeResult,
     EpisodeSpec,
     PrivilegedState,
     RenderOptions,

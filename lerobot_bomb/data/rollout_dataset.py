@@ -10,7 +10,8 @@ from lerobot_bomb.camera_geometry import geometry_shapes
 from lerobot_bomb.data.blocks import DatasetLayout, Episode
 from lerobot_bomb.data.recording import Recording
 from lerobot_bomb.data.rollout import Rollout
-from lerobot_bomb.schema import ACTION_NAMES, CAMERAS, PROTOCOL_VERSION, STATE_NAMES, EpisodeResult
+from lerobot_bomb.episode_result import EpisodeResult
+from lerobot_bomb.schema import ACTION_NAMES, CAMERAS, STATE_NAMES, TASK_VERSION
 
 
 def rollout_layout(recording: Recording) -> DatasetLayout:
@@ -31,7 +32,7 @@ def rollout_layout(recording: Recording) -> DatasetLayout:
         **geometry,
     }
     # with the protocol's version, so that LeRobot refuses to merge datasets of different ones
-    robot_type = f"bomb_{recording.robot}_v{PROTOCOL_VERSION}"
+    robot_type = f"bomb_{recording.robot}_v{TASK_VERSION}"
     return DatasetLayout(
         recording.repo_id, recording.fps, robot_type, features, not recording.images, tuple(geometry)
     )
@@ -60,6 +61,6 @@ def _columns(result: EpisodeResult) -> dict[str, Any]:
         "bomb/color": result.color,
         "bomb/levels": json.dumps(result.levels),
         "bomb/spec": json.dumps(result.spec.to_dict()),
-        "bomb/protocol_version": result.protocol_version,
+        "bomb/protocol_version": TASK_VERSION,
         "bomb/package_version": __version__,
     }

@@ -4,7 +4,6 @@ Shapes: `T` actions of an episode, `D` action dims.
 """
 
 import json
-import os
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -13,6 +12,7 @@ from lerobot.datasets import LeRobotDatasetMetadata
 from lerobot.utils.constants import ACTION
 
 from lerobot_bomb.data.columns import EPISODE_INDEX, read_columns, read_meta
+from lerobot_bomb.json_lines import append_line
 
 
 @dataclass(frozen=True)
@@ -70,12 +70,7 @@ def append_episode(
 ) -> None:
     """Add an episode's line; the first four tell it apart from others and how fast it was."""
     row = {"group": group, "task_id": task_id, "seed": seed, "fps": fps, "actions": actions_TD.tolist()}
-    # one write to a file opened for appending: lines of tasks that run at once do not mix
-    file = os.open(path, os.O_WRONLY | os.O_CREAT | os.O_APPEND, 0o644)
-    try:
-        os.write(file, (json.dumps(row) + "\n").encode())
-    finally:
-        os.close(file)
+    append_line(path, json.dumps(row))
 
 
 def read_action_log(path: Path) -> Executed:

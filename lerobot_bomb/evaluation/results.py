@@ -1,24 +1,27 @@
 """Reads the episode results that ``--env.results_path`` collects and summarises them."""
 
 import argparse
-import json
+import sys
 from collections import Counter
 from dataclasses import dataclass
 from pathlib import Path
 from statistics import median
-from typing import Any
 
+from lerobot_bomb.evaluation.result_groups import (
+    Group,
+    by_condition,
+    differing,
+    groups_of,
+    pair_with_nominal,
+    what_old_lines_lack,
+)
+from lerobot_bomb.evaluation.result_lines import OLD_VERSION, Row, read_lines
 from lerobot_bomb.perturbations import NONE
-from lerobot_bomb.schema import PROTOCOL_VERSION, Failure
+from lerobot_bomb.schema import Failure
 from lerobot_bomb.stats import format_rate, mcnemar_p_value
 
 # outcomes of an episode in which the stone was carried and put down somewhere on the board
 PUT_DOWN = (None, Failure.WRONG_INTERSECTION, Failure.IMPRECISE, Failure.DISTURBED_OTHERS)
-
-# what differs between episodes of one condition
-DRAWN = ("seed", "target", "color")
-
-Row = dict[str, Any]  # the fields of EpisodeResult
 
 
 @dataclass(frozen=True)
@@ -42,54 +45,17 @@ class Summary:
 
 
 def read_results(path: Path) -> list[Row]:
-    """The rows of a JSON-lines results file; of an episode that was run again, the last one.
+    """The rows of a results file; of an episode that was run again, the last one.
 
     Raises:
-        ValueError: the file is missing, empty, not JSON lines, or of another protocol version.
+        ValueError: the file is missing or empty, or a line is damaged.
     """
-    if not path.is_file():
-        raise ValueError(
-            f"{path}: no such results file; lerobot-eval writes it with --env.results_path={path}"
-        )
-    rows: dict[str, Row] = {}
-    for number, line in enumerate(path.read_text().splitlines(), start=1):
-        try:
-            row = json.loads(line)
-            version = row["protocol_version"]
-            rows[json.dumps(row["spec"])] = row
-        except (json.JSONDecodeError, KeyError, TypeError) as error:
-            raise ValueError(f"{path}:{number}: not an episode result ({error!r})") from error
-        if version != PROTOCOL_VERSION:
-            raise ValueError(
-                f"{path}:{number}: protocol_version {version!r}, this package has {PROTOCOL_VERSION!r}; "
-                "results of different versions do not compare"
-            )
+    rows, damages = read_lines(path)
+    if damages:
+        raise ValueError(damages[0])
     if not rows:
         raise ValueError(f"{path}: no finished episode")
-    return list(rows.values())
-
-
-def common_settings(rows: list[Row]) -> str:
-    """What the spec of every row says, and the range of seeds."""
-    first = rows[0]["spec"]
-    common = [
-        f"{name}={value}"
-        for name, value in first.items()
-        if name not in DRAWN and all(row["spec"].get(name) == value for row in rows)
-    ]
-    seeds = [row["spec"]["seed"] for row in rows]
-    return f"protocol {PROTOCOL_VERSION}, {', '.join(common)}, seeds {min(seeds)}..{max(seeds)}"
-
-
-def by_condition(rows: list[Row]) -> dict[str, list[Row]]:
-    """Rows apart that do not compare: {"" or " (what differs)": rows}."""
-    specs = [{name: row["spec"][name] for name in row["spec"] if name not in DRAWN} for row in rows]
-    differing = [name for name in specs[0] if any(spec.get(name) != specs[0][name] for spec in specs)]
-    conditions: dict[str, list[Row]] = {}
-    for row, spec in zip(rows, specs, strict=True):
-        label = ", ".join(f"{name}={spec.get(name)}" for name in differing)
-        conditions.setdefault(f" ({label})" if label else "", []).append(row)
-    return conditions
+    return [row for group in groups_of(rows) for row in group.rows]
 
 
 def summarise(rows: list[Row]) -> Summary:
@@ -103,22 +69,6 @@ def summarise(rows: list[Row]) -> Summary:
     )
 
 
-def pair_with_nominal(rows: list[Row]) -> dict[str, list[tuple[Row, Row]]]:
-    """{condition: (unperturbed, perturbed) rows of the same episode}, for the conditions that have both."""
-    nominal = {_episode(row): row for row in rows if row["spec"]["perturbations"] == NONE}
-    pairs: dict[str, list[tuple[Row, Row]]] = {}
-    for row in rows:
-        condition = row["spec"]["perturbations"]
-        if condition != NONE and _episode(row) in nominal:
-            pairs.setdefault(condition, []).append((nominal[_episode(row)], row))
-    return pairs
-
-
-def _episode(row: Row) -> str:
-    """What a row's spec is but for its perturbations."""
-    return json.dumps({name: value for name, value in row["spec"].items() if name != "perturbations"})
-
-
 def _pair_line(condition: str, pairs: list[tuple[Row, Row]]) -> str:
     lost = sum(nominal["is_success"] and not row["is_success"] for nominal, row in pairs)
     won = sum(row["is_success"] and not nominal["is_success"] for nominal, row in pairs)
@@ -128,29 +78,62 @@ def _pair_line(condition: str, pairs: list[tuple[Row, Row]]) -> str:
     )
 
 
+def _pair_lines(group: Group, groups: list[Group]) -> list[str]:
+    """What perturbations took away and brought in a group; or why there is nothing to compare with."""
+    perturbed = [row for row in group.rows if row["spec"]["perturbations"] != NONE]
+    pairs = pair_with_nominal(group.rows)
+    lines = [_pair_line(condition, of) for condition, of in pairs.items()]
+    num_left = len(perturbed) - sum(map(len, pairs.values()))
+    if not num_left:
+        return lines
+    advice = 'add "none" to --env.perturbations'
+    others = [other for other in groups if other is not group and pair_with_nominal(other.rows + perturbed)]
+    if others:
+        advice = f"those of this file differ in {', '.join(differing([group, others[0]]))}"
+    return [*lines, f"  {num_left} perturbed episodes have no unperturbed ones to compare with; {advice}"]
+
+
 def add_results_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the arguments of ``lerobot-bomb results``."""
     parser.add_argument("paths", nargs="+", type=Path, metavar="FILE", help="files of --env.results_path")
+    parser.add_argument("--strict", action="store_true", help="a damaged line is an error, not a message")
 
 
 def run_results(args: argparse.Namespace) -> int:
-    """Print a summary of each condition of each file, and what perturbations changed in paired episodes."""
+    """Print, of each file, what compares: rates by condition, and what perturbations changed in pairs."""
     for path in args.paths:
-        all_rows = read_results(path)
-        print(f"{path}: {common_settings(all_rows)}")
-        num_replaced = sum(map(bool, path.read_text().splitlines())) - len(all_rows)
-        if num_replaced:
-            print(f"{path}: {num_replaced} lines count no more, a later one is of the same episode")
-        for condition, rows in by_condition(all_rows).items():
-            summary = summarise(rows)
-            print(f"{path}{condition}: {summary.num_episodes} episodes")
-            for line in summary.lines():
-                print(f"  {line}")
-        pairs = pair_with_nominal(all_rows)
-        if pairs:
-            print(f"{path}: against the same episodes unperturbed")
-        elif any(row["spec"]["perturbations"] != NONE for row in all_rows):
-            print(f'{path}: no unperturbed episodes to compare with; add "none" to --env.perturbations')
-        for condition, of in pairs.items():
-            print(_pair_line(condition, of))
+        rows, damages = read_lines(path)
+        if args.strict and damages:
+            raise ValueError(damages[0])
+        for damage in damages:
+            print(f"{damage}; not counted", file=sys.stderr)
+        if not rows:
+            raise ValueError(f"{path}: no finished episode")
+        _print_file(path, groups_of(rows), len(damages))
     return 0
+
+
+def _print_file(path: Path, groups: list[Group], num_damaged: int) -> None:
+    if num_damaged:
+        print(f"{path}: {num_damaged} damaged lines are not counted")
+    if len(groups) > 1:
+        print(
+            f"{path}: {len(groups)} groups of episodes, neither pooled nor paired with each other; they "
+            f"differ in {', '.join(differing(groups))}"
+        )
+    for group in groups:
+        print(*(f"{path}: {line}" for line in group.lines()), sep="\n")
+        if group.is_of_old_version:
+            print(
+                f"{path}: lines of protocol {OLD_VERSION} are incomplete: they lack {what_old_lines_lack()}"
+            )
+        if group.num_replaced:
+            print(f"{path}: {group.num_replaced} lines count no more, a later one is of the same episode")
+        conditions = by_condition(group.rows)
+        for condition, rows in conditions.items():
+            label = f" (perturbations={condition})" if len(conditions) > 1 else ""
+            print(f"{path}{label}: {len(rows)} episodes")
+            print(*(f"  {line}" for line in summarise(rows).lines()), sep="\n")
+        against = _pair_lines(group, groups)
+        if against:
+            print(f"{path}: against the same episodes unperturbed", *against, sep="\n")

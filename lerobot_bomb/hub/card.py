@@ -11,7 +11,8 @@ from lerobot.configs.train import TrainPipelineConfig
 
 from lerobot_bomb import __version__
 from lerobot_bomb.environment import Environment
-from lerobot_bomb.evaluation.results import by_condition, common_settings, summarise
+from lerobot_bomb.evaluation.result_groups import Group, by_condition, describe_tasks, groups_of
+from lerobot_bomb.evaluation.results import summarise
 from lerobot_bomb.hub.dataset import DatasetFacts, Row, eval_flags_of, protocol_version
 from lerobot_bomb.hub.markdown import command, fenced
 from lerobot_bomb.hub.method import Method
@@ -230,26 +231,28 @@ class Checkpoint:
     def _results(self) -> str:
         if not self.results:
             return "No evaluation is attached to this checkpoint."
-        return "\n\n".join(map(results_table, self.results))
+        groups = [group for rows in self.results for group in groups_of(rows)]
+        return "\n\n".join(map(results_table, groups))
 
     def _citation(self) -> str:
         return fenced("\n\n".join(paper.bibtex() for paper in self.method.papers), "bibtex")
 
 
-def results_table(rows: list[Row]) -> str:
-    """Markdown: a row for each condition of a results file."""
+def results_table(group: Group) -> str:
+    """Markdown: what was evaluated, and a row for each condition."""
+    _, *settings = group.lines()  # the policy is the checkpoint
     lines = [
-        f"{common_settings(rows)}:",
+        f"{describe_tasks(group.rows)}; {'; '.join(settings)}:",
         "",
         "| condition | n | successes | success rate | 95 % Wilson interval |",
         "|---|---|---|---|---|",
     ]
-    for condition, of in by_condition(rows).items():
-        summary = summarise(of)
+    for condition, rows in by_condition(group.rows).items():
+        summary = summarise(rows)
         n, successes = summary.num_episodes, summary.num_successes
         low, high = (100 * bound for bound in wilson_interval(successes, n))
-        name = condition.strip(" ()") or f"perturbations={of[0]['spec']['perturbations']}"
         lines.append(
-            f"| {name} | {n} | {successes} | {100 * successes / n:.1f} % | {low:.1f} to {high:.1f} % |"
+            f"| perturbations={condition} | {n} | {successes} | {100 * successes / n:.1f} % | {low:.1f} to "
+            f"{high:.1f} % |"
         )
     return "\n".join(lines)

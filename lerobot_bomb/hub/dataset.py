@@ -1,13 +1,13 @@
 """What a dataset's folder says of itself, and how to evaluate on what it shows."""
 
 import json
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
 from lerobot_bomb.data.growing import METADATA_FILE
 from lerobot_bomb.environment import Environment
-from lerobot_bomb.schema import CAMERAS, PROTOCOL_VERSION, task_id
+from lerobot_bomb.schema import CAMERAS, TASK_VERSION, task_id
 
 INFO_FILE = Path("meta") / "info.json"
 PUSHT_SOURCE = "pusht-zarr"
@@ -94,22 +94,23 @@ def environment_of_episode(row: Row) -> Environment:
         **{name: spec[name] for name in ("robot", "control_mode", "fps")},
         image_size=row["image_size"],
         cameras=CAMERAS,
-        protocol_version=row["protocol_version"],
+        protocol_version=row.get("task_version", row["protocol_version"]),
         task=spec["suite"],
     )
 
 
 def eval_flags_of(rows: list[Row]) -> list[str]:
     """Of lerobot-eval, for the environment and the tasks that an evaluation was of."""
-    return [*environment_of_episode(rows[0]).eval_flags(), *_task_flags([row["spec"] for row in rows])]
-
-
-def _task_flags(specs: list[dict[str, Any]]) -> list[str]:
-    if all(spec["target"] and spec["color"] for spec in specs):
-        ids = {task_id(spec["target"], spec["color"]) for spec in specs}
-        return [f"--env.task_ids={sorted(ids)}".replace(" ", "")]
-    shared = {name: specs[0][name] for name in ("target", "color") if specs[0][name] is not None}
-    return [f"--env.{name}={value}".replace(" ", "") for name, value in shared.items()]
+    specs = [row["spec"] for row in rows]
+    task_ids = rows[0].get("task_ids") or ()  # lines of protocol 1.0 do not say
+    if not task_ids and all(spec["target"] and spec["color"] for spec in specs):
+        task_ids = sorted({task_id(spec["target"], spec["color"]) for spec in specs})
+    environment = replace(environment_of_episode(rows[0]), task_ids=tuple(task_ids))
+    asked = {} if task_ids else {name: specs[0][name] for name in ("target", "color") if specs[0][name]}
+    return [
+        *environment.eval_flags(),
+        *(f"--env.{name}={value}".replace(" ", "") for name, value in asked.items()),
+    ]
 
 
 def check_results(path: Path, rows: list[Row], trained_for: Environment | None) -> None:
@@ -131,4 +132,4 @@ def protocol_version(trained_for: Environment | None, has_results: bool) -> str 
     """Of the benchmark that a checkpoint was trained or evaluated on; None: of no known one."""
     if trained_for is not None:
         return trained_for.protocol_version
-    return PROTOCOL_VERSION if has_results else None
+    return TASK_VERSION if has_results else None

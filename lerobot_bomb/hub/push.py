@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any
 from lerobot_bomb.data.growing import check_repo_id, switch
 from lerobot_bomb.evaluation.results import read_results
 from lerobot_bomb.hub.dataset import DatasetFacts, Row, check_results
+from lerobot_bomb.hub.evaluated import check_weights_of
 from lerobot_bomb.hub.names import CONFIG, TO_PUBLISH, TRAIN_CONFIG, is_local_path
 
 if TYPE_CHECKING:
@@ -66,6 +67,8 @@ def run_push(args: argparse.Namespace) -> int:
     from lerobot_bomb.hub.upload import check_token
 
     files = {name: args.checkpoint / name for name in checkpoint_files(args.checkpoint)}
+    for path, rows in zip(args.results, results, strict=True):
+        check_weights_of(path, rows, args.checkpoint)
     if (args.checkpoint / TRAIN_CONFIG).is_file():
         files[TRAIN_CONFIG] = args.checkpoint / TRAIN_CONFIG
     if not args.dry_run:

@@ -8,13 +8,13 @@ import numpy as np
 import rerun as rr
 import rerun.blueprint as rrb
 
+from lerobot_bomb.episode_result import EpisodeResult
 from lerobot_bomb.schema import (
     ACTION_NAMES,
     BOARD,
     CAMERAS,
     COLORS,
     STATE_NAMES,
-    EpisodeResult,
     EpisodeSpec,
     PrivilegedState,
     Stage,

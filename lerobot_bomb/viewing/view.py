@@ -12,8 +12,9 @@ import numpy as np
 from lerobot_bomb.data.growing import switch
 from lerobot_bomb.data.record import add_episode_arguments, parse_conditions, parse_numbers
 from lerobot_bomb.data.rollout import make_env
+from lerobot_bomb.episode_result import EpisodeResult
 from lerobot_bomb.perturbations import NONE, Condition
-from lerobot_bomb.schema import BOARD, COLORS, EpisodeResult, EpisodeSpec, RenderOptions
+from lerobot_bomb.schema import BOARD, COLORS, EpisodeSpec, RenderOptions
 from lerobot_bomb.viewing.episode import Agent, expert_agent, play, random_agent
 from lerobot_bomb.viewing.unfinished import written_whole
 

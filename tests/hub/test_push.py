@@ -1,5 +1,6 @@
 """`lerobot-bomb push`: what is published, what is refused, and what a push that is cut off leaves."""
 
+import hashlib
 from dataclasses import asdict
 from pathlib import Path
 
@@ -21,13 +22,14 @@ from hub.damage import (
 from hub.server import TOKEN, LoopbackHub
 from lerobot_bomb.cli import main
 from lerobot_bomb.environment import Environment
-from lerobot_bomb.schema import EpisodeResult, EpisodeSpec
+from lerobot_bomb.episode_result import EpisodeResult, PolicyIdentity
+from lerobot_bomb.schema import EpisodeSpec
 from lerobot_policy_vla0_smol.modeling_vla0_smol import Vla0SmolPolicy
 
 REPO_ID = "me/x"
 
 
-def result(seed: int, is_success: bool) -> str:
+def result(seed: int, is_success: bool, policy: PolicyIdentity | None = None) -> str:
     return EpisodeResult(
         spec=EpisodeSpec(seed=seed),
         instruction="Place a black stone on the Go board at row 0, column 1.",
@@ -37,10 +39,11 @@ def result(seed: int, is_success: bool) -> str:
         is_success=is_success,
         is_success_bomb_v0=is_success,
         failure=None if is_success else "dropped",
-        stage="released",
+        stage="placed",
         placement_error_mm=1.0,
         nearest_intersection=(0, 1),
         collateral_mm=0.0,
+        policy=policy,
     ).to_json()
 
 
@@ -92,6 +95,30 @@ def test_a_dry_run_prints_the_card_and_the_files_and_asks_nobody(
     with pytest.raises(SystemExit):
         push(checkpoint, "--dry")
     assert "unrecognized arguments: --dry" in capsys.readouterr().err
+
+
+def test_results_of_other_weights_are_refused(
+    online: LoopbackHub, checkpoint: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    ours = hashlib.sha256((checkpoint / WEIGHTS).read_bytes()).hexdigest()
+    results = tmp_path / "results.jsonl"
+    in_training = PolicyIdentity("vla0_smol", is_in_training=True)
+    for policy in (PolicyIdentity("vla0_smol", "elsewhere", None, "a" * 64, "b" * 64), in_training):
+        results.write_text(result(0, is_success=True, policy=policy))
+        assert push(checkpoint, "--results", str(results)) == 1
+        error = capsys.readouterr().err
+        assert f"--results={results} is of vla0_smol " in error
+        assert f"whose weights have the SHA-256 {ours}" in error
+        assert error.count("\n") == 1
+    assert online.requests == []
+    results.write_text(
+        result(0, is_success=True, policy=PolicyIdentity("vla0_smol", str(tmp_path), None, ours, "b" * 64))
+    )
+    assert push(checkpoint, "--dry_run", "--results", str(results)) == 0
+    card = capsys.readouterr().out
+    assert "| perturbations=none | 1 | 1 | 100.0 % |" in card
+    assert "target drawn; colour drawn; protocol 1.1, suite=place" in card
+    assert str(tmp_path) not in card
 
 
 BROKEN = {

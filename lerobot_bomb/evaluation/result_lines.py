@@ -1,0 +1,196 @@
+"""Lines of a results file: what each must say, whichever version of the protocol wrote it."""
+
+import json
+import math
+import re
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+from lerobot_bomb.schema import (
+    BOARD,
+    COLORS,
+    MAX_IMAGE_SIZE,
+    MIN_IMAGE_SIZE,
+    PROTOCOL_VERSION,
+    RENDER_PRESETS,
+    TASK_VERSION,
+    EpisodeSpec,
+    Failure,
+    Stage,
+)
+
+OLD_VERSION = "1.0"  # whose lines say less
+VERSIONS = (OLD_VERSION, PROTOCOL_VERSION)
+SHOWN_CHARACTERS = 80  # of a wrong value
+NUM_TASKS = len(COLORS) * BOARD.num_lines**2
+
+type Row = dict[str, Any]  # the fields of EpisodeResult
+type Check = Callable[[Any], bool]
+
+
+def is_int(low: int, high: float = math.inf) -> Check:
+    """Whether a value is a whole number in low..high; true and false are none."""
+    return lambda value: type(value) is int and low <= value <= high
+
+
+def is_bool(value: Any) -> bool:
+    """Whether a value is true or false."""
+    return type(value) is bool
+
+
+def is_text(value: Any) -> bool:
+    """Whether a value is a text."""
+    return isinstance(value, str)
+
+
+def is_length_mm(value: Any) -> bool:
+    """Whether a value is a finite number, not negative."""
+    return type(value) in (int, float) and math.isfinite(value) and value >= 0
+
+
+def is_intersection(value: Any) -> bool:
+    """Whether a value is [row, column] on the board."""
+    return isinstance(value, list) and len(value) == 2 and all(map(is_int(0, BOARD.num_lines - 1), value))
+
+
+def or_none(check: Check) -> Check:
+    """Whether a value is null or passes."""
+    return lambda value: value is None or check(value)
+
+
+def is_list_of(check: Check) -> Check:
+    """Whether a value is a list, not empty, of values that pass."""
+    return lambda value: isinstance(value, list) and bool(value) and all(map(check, value))
+
+
+def is_table_of(check: Check) -> Check:
+    """Whether a value is an object whose values pass."""
+    return lambda value: isinstance(value, dict) and all(map(check, value.values()))
+
+
+def is_one_of(values: Any) -> Check:
+    """Whether a value is one of these texts."""
+    return lambda value: isinstance(value, str) and value in list(values)
+
+
+def is_sha256(value: Any) -> bool:
+    """Whether a value is 64 hexadecimal digits."""
+    return isinstance(value, str) and re.fullmatch("[0-9a-f]{64}", value) is not None
+
+
+SPEC_CHECKS: dict[str, Check] = {  # the rest is EpisodeSpec's own
+    "seed": is_int(0),
+    "suite": is_text,
+    "robot": is_text,
+    "split": is_text,
+    "control_mode": is_text,
+    "fps": is_int(1),
+    "target": or_none(is_intersection),
+    "color": or_none(is_text),
+    "success_tolerance_mm": is_length_mm,
+    "perturbations": is_text,
+}
+CHECKS: dict[str, Check] = {
+    "spec": lambda value: isinstance(value, dict),
+    "instruction": is_text,
+    "target": is_intersection,
+    "color": is_one_of(COLORS),
+    "steps": is_int(1),
+    "is_success": is_bool,
+    "is_success_bomb_v0": is_bool,
+    "failure": or_none(is_one_of(Failure)),
+    "stage": is_one_of(Stage),
+    "placement_error_mm": is_length_mm,
+    "nearest_intersection": is_intersection,
+    "collateral_mm": is_length_mm,
+    "levels": is_table_of(is_int(0)),
+    "image_size": is_int(MIN_IMAGE_SIZE, MAX_IMAGE_SIZE),
+    "package_version": is_text,
+}
+NEW_CHECKS: dict[str, Check] = {  # of what protocol 1.1 added
+    "policy": or_none(lambda value: isinstance(value, dict)),
+    "mujoco_version": or_none(is_text),
+    "opengl_vendor": or_none(is_text),
+    "opengl_renderer": or_none(is_text),
+    "render_preset": is_one_of(RENDER_PRESETS),
+    "task_ids": or_none(is_list_of(is_int(0, NUM_TASKS - 1))),
+    "lerobot_version": or_none(is_text),
+    "torch_version": or_none(is_text),
+    "task_version": is_one_of((TASK_VERSION,)),
+}
+POLICY_CHECKS: dict[str, Check] = {
+    "type": is_text,
+    "path": or_none(is_text),
+    "revision": or_none(is_text),
+    "weights_sha256": or_none(is_sha256),
+    "settings_sha256": or_none(is_sha256),
+    "base": or_none(is_text),
+    "is_in_training": is_bool,
+}
+
+
+def read_lines(path: Path) -> tuple[list[Row], list[str]]:
+    """The episodes of a results file in its order, and what is wrong with its other lines.
+
+    Raises:
+        ValueError: there is no such file.
+    """
+    if not path.is_file():
+        raise ValueError(
+            f"{path}: no such results file; lerobot-eval writes it with --env.results_path={path}"
+        )
+    rows, damages = [], []
+    for number, line in enumerate(path.read_bytes().split(b"\n"), start=1):
+        if not line.strip():
+            continue
+        try:
+            rows.append(parse_line(line))
+        except (ValueError, RecursionError) as error:
+            damages.append(f"{path}:{number}: not an episode result: {error}")
+    return rows, damages
+
+
+def parse_line(line: bytes) -> Row:
+    """An episode's fields.
+
+    Raises:
+        ValueError: the line is not JSON, or a field is missing, mistyped or impossible.
+    """
+    row = json.loads(line)
+    if not isinstance(row, dict):
+        raise ValueError("no JSON object")
+    version = row.get("protocol_version")
+    if version not in VERSIONS:
+        raise ValueError(f"protocol_version {version!r}; this package reads {' and '.join(VERSIONS)}")
+    _check(row, CHECKS if version == OLD_VERSION else CHECKS | NEW_CHECKS)
+    _check_spec(row["spec"])
+    if row.get("policy") is not None:
+        _check(row["policy"], POLICY_CHECKS, "policy.")
+    if row["is_success"] != (row["failure"] is None):
+        raise ValueError(f"is_success={row['is_success']} with failure={row['failure']!r}")
+    for name in ("target", "color"):
+        if row["spec"][name] not in (None, row[name]):
+            raise ValueError(f"{name}={row[name]}, but spec.{name}={row['spec'][name]}")
+    return row
+
+
+def _check_spec(spec: dict[str, Any]) -> None:
+    _check(spec, SPEC_CHECKS, "spec.")
+    unknown = spec.keys() - SPEC_CHECKS.keys()
+    if unknown:
+        raise ValueError(f"spec has {', '.join(sorted(unknown))}, of which this package knows nothing")
+    values: dict[str, Any] = spec | {"target": spec["target"] and tuple(spec["target"])}
+    EpisodeSpec(**values)
+
+
+def _check(values: dict[str, Any], checks: dict[str, Check], prefix: str = "") -> None:
+    missing = [f"{prefix}{name}" for name in checks if name not in values]
+    if missing:
+        raise ValueError(f"it lacks {', '.join(missing)}")
+    for name, is_possible in checks.items():
+        if not is_possible(values[name]):
+            shown = json.dumps(values[name])
+            if len(shown) > SHOWN_CHARACTERS:
+                shown = f"{shown[:SHOWN_CHARACTERS]}..."
+            raise ValueError(f"{prefix}{name}={shown} is impossible")

@@ -1,0 +1,144 @@
+"""Which policy a result line names: that which this process built, or none."""
+
+import gc
+import hashlib
+import json
+import logging
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+import pytest
+from huggingface_hub import constants
+from lerobot.policies import PreTrainedPolicy, make_policy
+from lerobot.policies.act.configuration_act import ACTConfig
+
+import lerobot_policy_bomb  # noqa: F401  the plugin
+from lerobot_bomb import _compat
+from lerobot_bomb.episode_result import PolicyIdentity
+from lerobot_bomb.evaluation.results import read_results
+from lerobot_bomb.policy_identity import _of_checkpoint, acting_policy
+from lerobot_env_bomb.configuration_bomb import BombEnvConfig
+from lerobot_policy_bomb_expert.configuration_bomb_expert import BombExpertConfig
+
+ENV = BombEnvConfig(image_size=32, fps=1)
+
+
+@pytest.fixture(autouse=True)
+def no_policy_of_other_tests(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(_compat, "_BUILT", [])
+
+
+def act_config(**flags: Any) -> ACTConfig:
+    small: dict[str, Any] = {"dim_model": 8, "n_heads": 1, "dim_feedforward": 8, "chunk_size": 4}
+    small |= {"n_action_steps": 4, "device": "cpu", "pretrained_backbone_weights": None, "use_vae": False}
+    return ACTConfig(**(small | flags))
+
+
+@pytest.fixture(scope="module")
+def checkpoint(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("act") / "pretrained_model"
+    make_policy(act_config(), env_cfg=ENV).save_pretrained(folder)
+    (folder / "policy_preprocessor.json").write_text("{}")
+    gc.collect()
+    return folder
+
+
+def loaded(checkpoint: Path, **flags: Any) -> PreTrainedPolicy:
+    config = act_config(**flags)
+    config.pretrained_path = checkpoint
+    return make_policy(config, env_cfg=ENV)
+
+
+def identity(of: PreTrainedPolicy) -> PolicyIdentity:
+    """What a line says while this policy, which the process holds, acts."""
+    known = acting_policy()
+    assert known is not None and known.type == of.config.type
+    return known
+
+
+def sha256(path: Path) -> str:
+    return hashlib.sha256(path.read_bytes()).hexdigest()
+
+
+@pytest.mark.parametrize("use_async", [False, True])
+def test_a_line_names_the_checkpoint_that_was_loaded_after_the_environments(
+    use_async: bool, checkpoint: Path, tmp_path: Path
+) -> None:
+    results = tmp_path / "results.jsonl"
+    config = BombEnvConfig(image_size=32, fps=1, task_ids=[12, 3], results_path=str(results))
+    envs = config.create_envs(2, use_async)["place"][12]
+    policy = loaded(checkpoint)
+    envs.reset(seed=[0, 1])
+    while not (ends := envs.step(np.zeros((2, 4), dtype=np.float32)))[2].all() and not ends[3].all():
+        pass
+    envs.close()
+    rows = read_results(results)
+    assert len(rows) == 2
+    for row in rows:
+        assert row["policy"]["type"] == policy.config.type == "act"
+        assert row["policy"]["path"] == str(checkpoint)
+        assert row["policy"]["weights_sha256"] == sha256(checkpoint / "model.safetensors")
+        assert row["task_ids"] == [12, 3]
+        assert row["opengl_renderer"] and row["opengl_vendor"] and row["mujoco_version"]
+        assert row["torch_version"] and row["lerobot_version"]
+
+
+def test_flags_and_processors_are_part_of_who_acts_and_a_place_is_not(checkpoint: Path) -> None:
+    seen = []
+    for flags in ({}, {}, {"n_action_steps": 2}, {"push_to_hub": False, "repo_id": "me/x"}):
+        seen.append(identity(loaded(checkpoint, **flags)))
+        gc.collect()
+    (checkpoint / "policy_preprocessor.json").write_text('{"steps": []}')
+    seen.append(identity(loaded(checkpoint)))
+    first, again, other_flag, other_place, other_processor = (who.settings_sha256 for who in seen)
+    assert first == again == other_place
+    assert len({first, other_flag, other_processor}) == 3
+    assert len({who.weights_sha256 for who in seen}) == 1
+
+
+def test_a_policy_in_training_does_not_claim_the_weights_it_started_from(checkpoint: Path) -> None:
+    policy = loaded(checkpoint)
+    meta = SimpleNamespace()
+    setattr(policy.config, "_runtime_dataset_meta", meta)  # noqa: B010  as make_policy does for a dataset
+    assert identity(policy) == PolicyIdentity("act", is_in_training=True)
+
+
+def test_scripted_and_untrained_policies_have_a_type_only() -> None:
+    assert identity(make_policy(BombExpertConfig(), env_cfg=ENV)) == PolicyIdentity("bomb_expert")
+    gc.collect()
+    assert identity(make_policy(act_config(), env_cfg=ENV)) == PolicyIdentity("act")
+
+
+def test_of_two_policies_none_is_named(checkpoint: Path, caplog: pytest.LogCaptureFixture) -> None:
+    assert acting_policy() is None
+    both = loaded(checkpoint), loaded(checkpoint)
+    with caplog.at_level(logging.WARNING):
+        assert acting_policy() is None
+    assert "this process holds 2 of them (act, act)" in caplog.text
+    del both
+
+
+def test_adapters_name_their_file_and_their_base(tmp_path: Path) -> None:
+    (tmp_path / "adapter_model.safetensors").write_bytes(b"adapters")
+    adapters = {"base_model_name_or_path": "me/base", "revision": "0123"}
+    (tmp_path / "adapter_config.json").write_text(json.dumps(adapters))
+    config = act_config(use_peft=True)
+    config.pretrained_path = tmp_path
+    who = _of_checkpoint(config)
+    assert (who.base, who.weights_sha256) == ("me/base@0123", hashlib.sha256(b"adapters").hexdigest())
+
+
+def test_a_checkpoint_on_the_hub_has_its_commit(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(constants, "HF_HUB_CACHE", str(tmp_path))
+    repository, commit = tmp_path / "models--me--x", "0123456789" * 4
+    (repository / "snapshots" / commit).mkdir(parents=True)
+    (repository / "refs").mkdir()
+    (repository / "refs" / "main").write_text(commit)
+    (repository / "snapshots" / commit / "model.safetensors").write_bytes(b"weights")
+    config = act_config()
+    config.pretrained_path = Path("me/x")
+    who = _of_checkpoint(config)
+    assert (who.path, who.revision) == ("me/x", commit)
+    assert who.weights_sha256 == hashlib.sha256(b"weights").hexdigest()
