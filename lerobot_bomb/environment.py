@@ -69,7 +69,7 @@ class Environment:
         names = [name for name in COMPARED if getattr(self, name) != getattr(other, name)]
         if not set(self.cameras) <= set(other.cameras):
             names.append("cameras")
-        if self._generation != other._generation:
+        if self.task_version != other.task_version:
             names.append("task_version")
         return names
 
@@ -91,11 +91,6 @@ class Environment:
         if "cameras" in values:
             values["cameras"] = "+".join(self.cameras)
         return ", ".join(f"{name}={value}" for name, value in values.items())
-
-    @property
-    def _generation(self) -> str:
-        """Of the task: what comes after its first number changes neither observations nor actions."""
-        return self.task_version.split(".")[0]
 
     def __str__(self) -> str:
         depth = " with depth" if self.depth else ""
