@@ -1,6 +1,5 @@
 """The only place that reaches into names of LeRobot and `datasets` that are not their public interface."""
 
-import json
 import re
 import shutil
 import sys
@@ -13,6 +12,7 @@ from typing import Any
 import numpy as np
 from datasets import config
 from huggingface_hub import hf_hub_download
+from huggingface_hub.constants import CONFIG_NAME
 from lerobot.datasets import LeRobotDataset, aggregate, compute_stats, dataset_writer
 from lerobot.datasets.feature_utils import get_hf_features_from_features
 from lerobot.datasets.io_utils import to_parquet_with_hf_images
@@ -123,13 +123,13 @@ def serve_registered_policies(config: Any) -> None:
 
 
 def check_processors_before_use(
-    check: Callable[[dict[str, Any], str, object], Any],
-    check_loaded: Callable[[Sequence[Any], str, object], None],
+    check: Callable[[dict[str, Any], str, Path], Any],
+    check_loaded: Callable[[Sequence[Any], str, Path], None],
 ) -> None:
-    """Let LeRobot's loader build no step of a saved processor before `check(its JSON, where, type)`.
+    """Let LeRobot's loader build no step of a saved processor before `check(its JSON, where, config.json)`.
 
-    Here what is checked is what will be built; `type` is the checkpoint's. Then `check_loaded(steps, where,
-    type)`. From the Hub, states are of the commit that the JSON is of.
+    Here what is checked is what will be built. Then `check_loaded(steps, where, config.json)`. From the Hub,
+    states and config.json, which there may not be, are of the commit that the JSON is of.
     """
     from lerobot.processor import DataProcessorPipeline
 
@@ -147,25 +147,16 @@ def check_processors_before_use(
         commits = [part for part in base_path.parts if re.fullmatch("[0-9a-f]{40}", part)]
         if commits and not is_local_source:
             hub_download_kwargs = hub_download_kwargs | {"revision": commits[-1]}
-        policy_type = _policy_type(model_id, base_path, hub_download_kwargs, is_local_source)
+        config_file = base_path / CONFIG_NAME
+        if not is_local_source and not config_file.is_file():
+            with suppress(OSError):
+                config_file = Path(hf_hub_download(model_id, CONFIG_NAME, **hub_download_kwargs))
         where = f"{model_id}, {loaded_config.get('name')}"
-        check(loaded_config, where, policy_type)
+        check(loaded_config, where, config_file)
         steps, unused = usual.__func__(
             cls, loaded_config, overrides, model_id, base_path, hub_download_kwargs, is_local_source
         )
-        check_loaded(steps, where, policy_type)
+        check_loaded(steps, where, config_file)
         return steps, unused
 
     DataProcessorPipeline._build_steps_with_overrides = classmethod(build)  # pyright: ignore[reportAttributeAccessIssue]
-
-
-def _policy_type(model_id: str, folder: Path, download: dict[str, Any], is_local: bool) -> object:
-    """What the config.json beside a processor says; None without one."""
-    path = folder / "config.json"
-    if not path.is_file() and not is_local:
-        with suppress(OSError):
-            path = Path(hf_hub_download(model_id, path.name, **download))
-    try:
-        return json.loads(path.read_text()).get("type")
-    except (OSError, ValueError, AttributeError):
-        return None

@@ -3,12 +3,13 @@
 LeRobot imports and calls whatever `class` a step names, before it looks at what came out.
 """
 
+import json
 import sys
 from collections.abc import Mapping, Sequence
 from importlib import import_module
+from pathlib import Path
 from typing import Any
 
-import torch
 from lerobot.configs import FeatureType, NormalizationMode, PreTrainedConfig
 from lerobot.processor import (
     NormalizerProcessorStep,
@@ -19,6 +20,7 @@ from lerobot.processor import (
 from lerobot.utils.constants import POLICY_POSTPROCESSOR_DEFAULT_NAME, POLICY_PREPROCESSOR_DEFAULT_NAME
 
 from lerobot_bomb._compat import check_processors_before_use
+from lerobot_bomb.finite import require_finite
 from lerobot_bomb.vlm.task_tokenizer import TaskTokenizerStep
 
 STATE_SUFFIX = ".safetensors"
@@ -48,6 +50,14 @@ STATISTICS = {
     NormalizationMode.QUANTILES: ("q01", "q99"),
     NormalizationMode.QUANTILE10: ("q10", "q90"),
 }
+
+
+def saved_type(config_file: Path) -> object:
+    """What a checkpoint's config.json says it is; None: whoever reads the config will say why not."""
+    try:
+        return json.loads(config_file.read_text()).get("type")
+    except (OSError, ValueError, AttributeError):
+        return None
 
 
 def is_ours(policy_type: object) -> bool:
@@ -126,7 +136,8 @@ def _check_state_file(name: object, where: str) -> None:
 def check_saved_processors() -> None:
     """From now on, whoever loads a processor in this process has it checked: LeRobot's commands too."""
     check_processors_before_use(
-        state_files, lambda steps, where, policy_type: check_states(steps, where, is_ours(policy_type))
+        lambda content, where, config: state_files(content, where, saved_type(config)),
+        lambda steps, where, config: check_states(steps, where, is_ours(saved_type(config))),
     )
 
 
@@ -160,9 +171,9 @@ def _check_statistics(
                 # pictures and arrays without statistics are left as they are
                 if complete and (len(feature.shape) == 1 or any(f.startswith(f"{key}.") for f in held)):
                     raise ValueError(f"{where}: its statistics lack {key}.{name}, which {mode.value} needs")
-            elif not torch.isfinite(tensor).all():
-                raise ValueError(f"{where}: its statistic {key}.{name} is not finite: {tensor.tolist()}")
-            elif complete and len(feature.shape) == 1 and tuple(tensor.shape) != tuple(feature.shape):
+                continue
+            require_finite(tensor, f"{where}: {key}.{name}")
+            if complete and len(feature.shape) == 1 and tuple(tensor.shape) != tuple(feature.shape):
                 raise ValueError(
-                    f"{where}: its {key}.{name} has shape {tuple(tensor.shape)}, not {tuple(feature.shape)}"
+                    f"{where}: {key}.{name} has shape {tuple(tensor.shape)}, not {tuple(feature.shape)}"
                 )
