@@ -139,7 +139,14 @@ def policy_class(folder: Path) -> type[PreTrainedPolicy]:
 
 
 def check_config(folder: Path, config: Any) -> None:
-    """A checkpoint needs nothing but its own files."""
+    """A checkpoint needs nothing but its own files, and no code.
+
+    Raises:
+        ValueError: names what it needs.
+    """
+    for field in ("vlm_config", "depth_config"):
+        if _names_code(getattr(config, field, None)):
+            raise ValueError(f"{folder / CONFIG}: its {field} names code to run, which no checkpoint needs")
     if config.vlm_config is None or config.prompt_tokens is None:
         raise ValueError(
             f"{folder / CONFIG} does not hold the architecture (vlm_config and prompt_tokens), so loading it "
@@ -150,6 +157,17 @@ def check_config(folder: Path, config: Any) -> None:
             f"{folder / CONFIG} does not hold depth_config, so loading it elsewhere would need "
             f"{config.depth_model_name}"
         )
+
+
+def _names_code(values: Any, key: str = "") -> bool:
+    """Whether a config of transformers asks for remote code, or for a kernel of the Hub, at any depth."""
+    if isinstance(values, dict):
+        return any(_names_code(each, name) for name, each in values.items())
+    if isinstance(values, list):
+        return any(_names_code(each, key) for each in values)
+    if key in ("attn_implementation", "_attn_implementation"):
+        return "/" in str(values)
+    return key == "trust_remote_code" and bool(values)
 
 
 def check_weights(folder: Path, config: PreTrainedConfig, policy_type: type[PreTrainedPolicy]) -> None:

@@ -165,7 +165,7 @@ def _check_statistics(
         if chosen is not None and key not in chosen and feature.type is not FeatureType.ACTION:
             continue
         mode = step.norm_map.get(feature.type, NormalizationMode.IDENTITY)
-        for name in STATISTICS[mode]:
+        for name in STATISTICS.get(mode, ()):
             tensor = held.get(f"{key}.{name}")
             if tensor is None:
                 # pictures and arrays without statistics are left as they are
