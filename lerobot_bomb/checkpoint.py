@@ -32,6 +32,7 @@ def read_config(path: Path, device: str | None) -> PreTrainedConfig:
 
     Raises:
         ValueError: the folder holds no checkpoint or unsafe adapters, or this machine has no such device.
+        FileNotFoundError: it holds no adapters, though its config says so.
     """
     missing = [name for name in FILES if not (path / name).is_file()]
     if missing:

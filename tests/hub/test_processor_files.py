@@ -137,14 +137,14 @@ def test_the_hub_s_processors_are_checked_and_of_one_commit(
     commit()
     usual = processor_files.state_files
 
-    def commit_after_check(*args: Any) -> list[str]:
-        checked = usual(*args)
-        change_state(UNNORMALIZER, action__max=torch.full((4,), 7.0))(folder)
-        commit()
-        return checked
+    def commit_meanwhile(*args: Any) -> list[str]:
+        if args[0]["name"] == "policy_postprocessor":
+            change_state(UNNORMALIZER, action__max=torch.full((4,), 7.0))(folder)
+            commit()
+        return usual(*args)
 
     with monkeypatch.context() as patch:
-        patch.setattr(processor_files, "state_files", commit_after_check)
+        patch.setattr(processor_files, "state_files", commit_meanwhile)
         before = stock_load("me/x")[1].steps[0].stats["action"]["max"]
     assert (before != 7).all()
     assert (stock_load("me/x")[1].steps[0].stats["action"]["max"] == 7).all()
