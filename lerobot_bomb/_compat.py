@@ -1,9 +1,10 @@
 """The only place that reaches into names of LeRobot and `datasets` that are not their public interface."""
 
+import re
 import shutil
 import sys
 from collections.abc import Callable, Collection, Iterator, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from functools import partial, wraps
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -11,6 +12,8 @@ from weakref import ref
 
 import numpy as np
 from datasets import config
+from huggingface_hub import hf_hub_download
+from huggingface_hub.constants import CONFIG_NAME
 from lerobot.datasets import LeRobotDataset, aggregate, compute_stats, dataset_writer
 from lerobot.datasets.feature_utils import get_hf_features_from_features
 from lerobot.datasets.io_utils import to_parquet_with_hf_images
@@ -153,3 +156,43 @@ def built_policies() -> list[PreTrainedPolicy]:
 def training_data(policy: PreTrainedPolicy) -> "LeRobotDatasetMetadata | None":
     """The dataset that this process trains a policy on; None: it acts as it was loaded."""
     return getattr(policy.config, "_runtime_dataset_meta", None)
+
+
+def check_processors_before_use(
+    check: Callable[[dict[str, Any], str, Path], Any],
+    check_loaded: Callable[[Sequence[Any], str, Path], None],
+) -> None:
+    """Let LeRobot's loader build no step of a saved processor before `check(its JSON, where, config.json)`.
+
+    Here what is checked is what will be built. Then `check_loaded(steps, where, config.json)`. From the Hub,
+    states and config.json, which there may not be, are of the commit that the JSON is of.
+    """
+    from lerobot.processor import DataProcessorPipeline
+
+    usual: Any = DataProcessorPipeline._build_steps_with_overrides
+
+    def build(
+        cls: type,
+        loaded_config: dict[str, Any],
+        overrides: dict[str, Any],
+        model_id: str,
+        base_path: Path,
+        hub_download_kwargs: dict[str, Any],
+        is_local_source: bool = False,
+    ) -> Any:
+        commits = [part for part in base_path.parts if re.fullmatch("[0-9a-f]{40}", part)]
+        if commits and not is_local_source:
+            hub_download_kwargs = hub_download_kwargs | {"revision": commits[-1]}
+        config_file = base_path / CONFIG_NAME
+        if not is_local_source and not config_file.is_file():
+            with suppress(OSError):
+                config_file = Path(hf_hub_download(model_id, CONFIG_NAME, **hub_download_kwargs))
+        where = f"{model_id}, {loaded_config.get('name')}"
+        check(loaded_config, where, config_file)
+        steps, unused = usual.__func__(
+            cls, loaded_config, overrides, model_id, base_path, hub_download_kwargs, is_local_source
+        )
+        check_loaded(steps, where, config_file)
+        return steps, unused
+
+    DataProcessorPipeline._build_steps_with_overrides = classmethod(build)  # pyright: ignore[reportAttributeAccessIssue]

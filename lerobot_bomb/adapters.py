@@ -9,9 +9,19 @@ from huggingface_hub import constants, hf_hub_download, try_to_load_from_cache
 from huggingface_hub.errors import RemoteEntryNotFoundError
 from torch import Tensor, nn
 
-from lerobot_bomb.hub.checks import ADAPTERS, check_finite
+from lerobot_bomb.hub.checks import ADAPTERS, check_finite, read_json
 from lerobot_bomb.hub.names import TO_PUBLISH, is_hub_id
 
+# fields of peft's configs that name files to read or modules to import
+NAME_OTHERS = {
+    "adapters",
+    "cache_file",
+    "covariance_file",
+    "megatron_config",
+    "prompt_tuning_init_state_dict_path",
+    "tokenizer_kwargs",
+    "tokenizer_name_or_path",
+}
 PROJECTIONS = "q|k|v|o|gate|up|down"  # of a layer's attention and MLP
 
 
@@ -53,24 +63,44 @@ def check_base(base: str) -> None:
 
 
 def check_adapters(path: str, revision: str | None) -> None:
-    """Adapters, in a folder or on the Hub, are whole and finite.
+    """Adapters, in a folder or on the Hub, are whole, finite and all that `peft` will read.
 
     They are safetensors; in their place `peft` would read a pickle.
 
     Raises:
         FileNotFoundError: there are none.
-        ValueError: they are truncated or not finite.
+        ValueError: they are truncated or not finite, or their config names other files or code.
     """
-    name = ADAPTERS[1]
+    config, weights = ADAPTERS
+    check_finite(_file(path, weights, revision))
+    named = sorted(_named(read_json(_file(path, config, revision))))
+    if named:
+        raise ValueError(
+            f"{path}: {config} sets {named[0]}, by which peft reads other files or imports code; no policy's "
+            "adapters need it"
+        )
+
+
+def _file(path: str, name: str, revision: str | None) -> Path:
+    """One of a folder or of a repository, which is downloaded if need be."""
     if not Path(path).is_dir():
         try:
-            check_finite(Path(hf_hub_download(path, name, revision=revision)))
+            return Path(hf_hub_download(path, name, revision=revision))
         except RemoteEntryNotFoundError as error:
             raise FileNotFoundError(f"{name} not found on the HuggingFace Hub in {path}") from error
-    elif (Path(path) / name).is_file():
-        check_finite(Path(path) / name)
-    else:
+    if not (Path(path) / name).is_file():
         raise FileNotFoundError(f"{path} holds no {name}, so it is no whole checkpoint")
+    return Path(path) / name
+
+
+def _named(values: Any) -> set[str]:
+    """Which fields of `NAME_OTHERS` are set, at any depth."""
+    if isinstance(values, list):
+        return {name for each in values for name in _named(each)}
+    if not isinstance(values, dict):
+        return set()
+    deeper = {name for each in values.values() for name in _named(each)}
+    return deeper | {name for name in NAME_OTHERS & values.keys() if values[name]}
 
 
 def base_commit(base: str, revision: str | None) -> str | None:

@@ -10,11 +10,13 @@ from lerobot.configs import PreTrainedConfig
 from lerobot.policies import PreTrainedPolicy
 from lerobot.policies.factory import get_policy_class
 from lerobot.utils.constants import POLICY_POSTPROCESSOR_DEFAULT_NAME, POLICY_PREPROCESSOR_DEFAULT_NAME
+from lerobot.utils.import_utils import register_third_party_plugins
 from safetensors import SafetensorError, safe_open
 from torch import Tensor
 
 from lerobot_bomb.finite import is_finite, require_finite
 from lerobot_bomb.hub.names import CONFIG, WEIGHTS
+from lerobot_bomb.hub.processor_files import saved_type, state_files
 
 ADAPTERS = ("adapter_config.json", "adapter_model.safetensors")
 PROCESSORS = (f"{POLICY_PREPROCESSOR_DEFAULT_NAME}.json", f"{POLICY_POSTPROCESSOR_DEFAULT_NAME}.json")
@@ -47,13 +49,15 @@ def checkpoint_files(folder: Path) -> list[str]:
 
 
 def processor_files(folder: Path, processor: str) -> list[str]:
-    """Names of the files that make up one of `PROCESSORS`, each whole.
+    """Names of the files that make up one of `PROCESSORS`, each whole and data only; none is loaded.
 
     Raises:
-        ValueError: one is missing, truncated or of another format, or holds statistics that are not finite.
+        ValueError: one is missing, truncated or of another format, a step is no registered one, or statistics
+            are not finite.
     """
-    steps = read_json(folder / processor).get("steps", [])
-    states = [step["state_file"] for step in steps if step.get("state_file")]
+    register_third_party_plugins()  # their steps
+    content = read_json(folder / processor)
+    states = state_files(content, str(folder / processor), saved_type(folder / CONFIG))
     for name in states:
         if not (folder / name).is_file():
             raise ValueError(f"{folder} holds no {name}, which its {processor} needs")
@@ -135,7 +139,14 @@ def policy_class(folder: Path) -> type[PreTrainedPolicy]:
 
 
 def check_config(folder: Path, config: Any) -> None:
-    """A checkpoint needs nothing but its own files."""
+    """A checkpoint needs nothing but its own files, and no code.
+
+    Raises:
+        ValueError: names what it needs.
+    """
+    for field in ("vlm_config", "depth_config"):
+        if _names_code(getattr(config, field, None)):
+            raise ValueError(f"{folder / CONFIG}: its {field} names code to run, which no checkpoint needs")
     if config.vlm_config is None or config.prompt_tokens is None:
         raise ValueError(
             f"{folder / CONFIG} does not hold the architecture (vlm_config and prompt_tokens), so loading it "
@@ -146,6 +157,17 @@ def check_config(folder: Path, config: Any) -> None:
             f"{folder / CONFIG} does not hold depth_config, so loading it elsewhere would need "
             f"{config.depth_model_name}"
         )
+
+
+def _names_code(values: Any, key: str = "") -> bool:
+    """Whether a config of transformers asks for remote code, or for a kernel of the Hub, at any depth."""
+    if isinstance(values, dict):
+        return any(_names_code(each, name) for name, each in values.items())
+    if isinstance(values, list):
+        return any(_names_code(each, key) for each in values)
+    if key in ("attn_implementation", "_attn_implementation"):
+        return "/" in str(values)
+    return key == "trust_remote_code" and bool(values)
 
 
 def check_weights(folder: Path, config: PreTrainedConfig, policy_type: type[PreTrainedPolicy]) -> None:

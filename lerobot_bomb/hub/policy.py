@@ -5,6 +5,7 @@ from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import TYPE_CHECKING, Any, ClassVar, cast
 
+from lerobot.configs import PreTrainedConfig
 from lerobot.configs.train import TrainPipelineConfig
 from lerobot.utils.constants import CHECKPOINTS_DIR, LAST_CHECKPOINT_LINK, PRETRAINED_MODEL_DIR
 from torch import Tensor
@@ -12,12 +13,23 @@ from torch import Tensor
 from lerobot_bomb.adapters import base_commit, check_adapters, check_base
 from lerobot_bomb.finite import require_finite_statistics
 from lerobot_bomb.hub.card import Checkpoint
-from lerobot_bomb.hub.checks import PROCESSORS, check_finite, check_tensors, processor_files
+from lerobot_bomb.hub.checks import PROCESSORS, check_config, check_finite, check_tensors, processor_files
 from lerobot_bomb.hub.dataset import DatasetFacts
 from lerobot_bomb.hub.method import Method
 from lerobot_bomb.hub.names import is_hub_id
 from lerobot_bomb.hub.push import publish
 from lerobot_bomb.policy_environment import environment_of_dataset
+
+# arguments that say how a file of the Hub is had
+DOWNLOAD = {
+    "cache_dir",
+    "force_download",
+    "local_files_only",
+    "proxies",
+    "resume_download",
+    "revision",
+    "token",
+}
 
 if TYPE_CHECKING:
     from lerobot.datasets import LeRobotDatasetMetadata
@@ -65,10 +77,15 @@ class HubPolicy:
         for name in PROCESSORS:  # a policy that was saved alone has none
             if (folder / name).is_file():
                 processor_files(folder, name)
-        config = kwargs.get("config")
-        if config is not None and config.use_peft:  # this is their base
+        config = kwargs.pop("config", None)
+        if config is None:
+            download = {name: kwargs[name] for name in DOWNLOAD & kwargs.keys()}
+            config = PreTrainedConfig.from_pretrained(pretrained_name_or_path, **download)
+        elif config.use_peft:  # this is their base
             check_adapters(str(config.pretrained_path), config.pretrained_revision)
-        policy = _next(super()).from_pretrained(pretrained_name_or_path, **kwargs)
+        if isinstance(config, cls.config_class):
+            check_config(folder, config)
+        policy = _next(super()).from_pretrained(pretrained_name_or_path, config=config, **kwargs)
         policy._take_environment(dataset_meta)
         return policy
 

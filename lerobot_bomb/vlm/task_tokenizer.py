@@ -4,6 +4,7 @@ It turns only the task into tokens; everything else of a prompt depends on a pol
 together inside the policy.
 """
 
+import re
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Any
@@ -34,6 +35,7 @@ from lerobot_bomb.vlm.prompt import task_ids
 from lerobot_bomb.vlm.tokenizer import tokenizer_from_tensor, tokenizer_to_tensor
 
 MAX_KEPT_TASKS = 4096
+TOKENIZER_KEY = "tokenizer_json"
 
 
 @ProcessorStepRegistry.register("bomb_task_tokenizer")
@@ -52,6 +54,16 @@ class TaskTokenizerStep(ObservationProcessorStep):
     tokenizer: Tokenizer | None = field(default=None, repr=False)
     template: str = "{}"
     _ids: dict[str, Tensor] = field(default_factory=dict, init=False, repr=False)
+
+    def __post_init__(self) -> None:
+        if not isinstance(self.template, str) or re.findall(r"[{}]+", self.template) != ["{}"]:
+            raise ValueError(
+                f"template={self.template!r} must hold {{}} once, for the task, and no other brace"
+            )
+        if not isinstance(self.tokenizer, Tokenizer | None):
+            raise ValueError(
+                f"tokenizer={self.tokenizer!r} must be a Tokenizer; a checkpoint has it as state"
+            )
 
     def observation(self, observation: dict[str, Any]) -> dict[str, Any]:
         frames = self.transition.get(TransitionKey.COMPLEMENTARY_DATA) or {}
@@ -83,10 +95,14 @@ class TaskTokenizerStep(ObservationProcessorStep):
         return {"template": self.template}
 
     def state_dict(self) -> dict[str, Tensor]:
-        return {} if self.tokenizer is None else {"tokenizer_json": tokenizer_to_tensor(self.tokenizer)}
+        return {} if self.tokenizer is None else {TOKENIZER_KEY: tokenizer_to_tensor(self.tokenizer)}
 
     def load_state_dict(self, state: dict[str, Tensor]) -> None:
-        self.tokenizer = tokenizer_from_tensor(state["tokenizer_json"])
+        if state.keys() != {TOKENIZER_KEY}:
+            raise ValueError(
+                f"the state of bomb_task_tokenizer must be {TOKENIZER_KEY!r} alone; it is {sorted(state)}"
+            )
+        self.tokenizer = tokenizer_from_tensor(state[TOKENIZER_KEY])
         self._ids.clear()
 
     def transform_features(

@@ -61,6 +61,50 @@ def change_config(**values: Any) -> Damage:
     return damage
 
 
+def insert_step(name: str, step: dict[str, Any]) -> Damage:
+    def damage(folder: Path) -> None:
+        content = json.loads((folder / name).read_text())
+        content["steps"].insert(0, step)
+        (folder / name).write_text(json.dumps(content))
+
+    return damage
+
+
+def insert_code(name: str) -> Damage:
+    """A step that makes the folder `ran` beside the checkpoint, without another process to wait for."""
+
+    def damage(folder: Path) -> None:
+        insert_step(name, {"class": "os.mkdir", "config": {"path": str(folder.parent / "ran")}})(folder)
+
+    return damage
+
+
+def change_step(name: str, registry_name: str, **values: Any) -> Damage:
+    """None removes a value."""
+
+    def damage(folder: Path) -> None:
+        content = json.loads((folder / name).read_text())
+        [step] = [each for each in content["steps"] if each["registry_name"] == registry_name]
+        step |= values
+        for key in [key for key, value in step.items() if value is None]:
+            del step[key]
+        (folder / name).write_text(json.dumps(content))
+
+    return damage
+
+
+def change_state(name: str, **values: torch.Tensor | None) -> Damage:
+    """None removes a tensor; `__` stands for a dot."""
+
+    def damage(folder: Path) -> None:
+        state: dict[str, Any] = load_file(folder / name) | {
+            key.replace("__", "."): value for key, value in values.items()
+        }
+        save_file({key: value for key, value in state.items() if value is not None}, folder / name)
+
+    return damage
+
+
 def take_other_weights(folder: Path) -> None:
     make_fdvla().save_pretrained(folder / "other")
     (folder / "other" / WEIGHTS).rename(folder / WEIGHTS)

@@ -19,6 +19,8 @@ from hub.damage import (
     WEIGHTS,
     Damage,
     change_config,
+    change_step,
+    insert_code,
     remove,
     take_other_shape,
     take_other_weights,
@@ -85,6 +87,12 @@ POLICY: dict[str, Damage] = {
     "policy_preprocessor.json is not JSON, or truncated": truncate(PREPROCESSOR),
     f"holds no {TOKENIZER}, which its policy_preprocessor.json needs": remove(TOKENIZER),
     f"{TOKENIZER} is truncated or no safetensors file": truncate(TOKENIZER),
+    "policy_preprocessor.json: its step 'os.mkdir' is named by the path of a class": insert_code(
+        PREPROCESSOR
+    ),
+    "state_file='../../x.safetensors' is no name": change_step(
+        PREPROCESSOR, "bomb_task_tokenizer", state_file="../../x.safetensors"
+    ),
 }
 # a policy can be loaded alone, so only what loads the processors can miss them; LeRobot's own words
 PROCESSORS: dict[str, Damage] = {
@@ -103,6 +111,7 @@ def test_a_broken_folder_is_told_in_a_line(
         text = told(lambda load=load: load(str(checkpoint)), capsys)
         assert message in text
         assert len(text.splitlines()) == 1
+    assert not (checkpoint.parent / "ran").exists()
 
 
 @pytest.mark.parametrize("message", PROCESSORS)
@@ -121,6 +130,7 @@ ON_THE_HUB: dict[str, Damage] = {
     "it lacks backbone.": take_other_weights,
     "Config file 'policy_preprocessor.json' not found on the Hugging Face Hub": remove(PREPROCESSOR),
     f"{TOKENIZER}.": remove(TOKENIZER),
+    "its step 'os.mkdir' is named by the path of a class": insert_code(PREPROCESSOR),
 }
 
 
@@ -131,6 +141,7 @@ def test_a_broken_repository_is_told(
     ON_THE_HUB[message](checkpoint)
     put(online, checkpoint)
     assert message in told(lambda: evaluate(REPO_ID), capsys).splitlines()[-1]
+    assert not (checkpoint.parent / "ran").exists()
 
 
 def test_a_whole_checkpoint_loads_from_both(online: LoopbackHub, checkpoint: Path, evaluate: Run) -> None:
