@@ -10,11 +10,13 @@ from lerobot.configs import PreTrainedConfig
 from lerobot.policies import PreTrainedPolicy
 from lerobot.policies.factory import get_policy_class
 from lerobot.utils.constants import POLICY_POSTPROCESSOR_DEFAULT_NAME, POLICY_PREPROCESSOR_DEFAULT_NAME
+from lerobot.utils.import_utils import register_third_party_plugins
 from safetensors import SafetensorError, safe_open
 from torch import Tensor
 
 from lerobot_bomb.finite import is_finite, require_finite
 from lerobot_bomb.hub.names import CONFIG, WEIGHTS
+from lerobot_bomb.hub.processor_files import state_files
 
 ADAPTERS = ("adapter_config.json", "adapter_model.safetensors")
 PROCESSORS = (f"{POLICY_PREPROCESSOR_DEFAULT_NAME}.json", f"{POLICY_POSTPROCESSOR_DEFAULT_NAME}.json")
@@ -47,13 +49,16 @@ def checkpoint_files(folder: Path) -> list[str]:
 
 
 def processor_files(folder: Path, processor: str) -> list[str]:
-    """Names of the files that make up one of `PROCESSORS`, each whole.
+    """Names of the files that make up one of `PROCESSORS`, each whole and data only; none is loaded.
 
     Raises:
-        ValueError: one is missing, truncated or of another format, or holds statistics that are not finite.
+        ValueError: one is missing, truncated or of another format, a step is no registered one, or a tensor is
+            not finite.
     """
-    steps = read_json(folder / processor).get("steps", [])
-    states = [step["state_file"] for step in steps if step.get("state_file")]
+    register_third_party_plugins()  # their steps
+    content = read_json(folder / processor)
+    policy_type = read_json(folder / CONFIG).get("type") if (folder / CONFIG).is_file() else None
+    states = state_files(content, str(folder / processor), policy_type)
     for name in states:
         if not (folder / name).is_file():
             raise ValueError(f"{folder} holds no {name}, which its {processor} needs")
