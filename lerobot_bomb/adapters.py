@@ -5,11 +5,12 @@ from pathlib import Path
 from typing import Any
 
 import torch
+from accelerate import init_empty_weights
 from huggingface_hub import constants, hf_hub_download, try_to_load_from_cache
 from huggingface_hub.errors import RemoteEntryNotFoundError
 from torch import Tensor, nn
 
-from lerobot_bomb.hub.checks import ADAPTERS, check_finite
+from lerobot_bomb.hub.checks import ADAPTERS, check_finite, tensor_shapes
 from lerobot_bomb.hub.names import TO_PUBLISH, is_hub_id
 
 PROJECTIONS = "q|k|v|o|gate|up|down"  # of a layer's attention and MLP
@@ -52,8 +53,8 @@ def check_base(base: str) -> None:
         raise ValueError(f"the base of these adapters, {base}, is on this machine only; {TO_PUBLISH}")
 
 
-def check_adapters(path: str, revision: str | None) -> None:
-    """Adapters, in a folder or on the Hub, are whole and finite.
+def check_adapters(path: str, revision: str | None) -> Path:
+    """The file of adapters in a folder or on the Hub, which is whole and finite.
 
     They are safetensors; in their place `peft` would read a pickle.
 
@@ -64,13 +65,43 @@ def check_adapters(path: str, revision: str | None) -> None:
     name = ADAPTERS[1]
     if not Path(path).is_dir():
         try:
-            check_finite(Path(hf_hub_download(path, name, revision=revision)))
+            file = Path(hf_hub_download(path, name, revision=revision))
         except RemoteEntryNotFoundError as error:
             raise FileNotFoundError(f"{name} not found on the HuggingFace Hub in {path}") from error
-    elif (Path(path) / name).is_file():
-        check_finite(Path(path) / name)
     else:
-        raise FileNotFoundError(f"{path} holds no {name}, so it is no whole checkpoint")
+        file = Path(path) / name
+        if not file.is_file():
+            raise FileNotFoundError(f"{path} holds no {name}, so it is no whole checkpoint")
+    check_finite(file)
+    return file
+
+
+def check_adapters_fit(policy_type: Any, config: Any, path: str, revision: str | None) -> None:
+    """Adapters, as above, are all that their config puts on a policy; `peft` would only warn.
+
+    Raises:
+        ValueError: they are another policy's, or only a part of them is there.
+    """
+    try:
+        import peft  # pyright: ignore[reportMissingImports]
+    except ImportError as error:
+        raise ValueError("adapters need the package peft: pip install 'lerobot_policy_bomb[lora]'") from error
+    file = check_adapters(path, revision)
+    with init_empty_weights():  # which takes no memory
+        policy = policy_type(config)
+    of_adapters = peft.PeftConfig.from_pretrained(path, revision=revision)
+    try:
+        adapted = peft.get_peft_model(policy, of_adapters, low_cpu_mem_usage=True)
+    except ValueError as error:
+        raise ValueError(f"{file} is of no {config.type} as config.json describes it: {error}") from None
+    expected = peft.get_peft_model_state_dict(adapted, save_embedding_layers=False)
+    saved = tensor_shapes(file)
+    wrong = sorted(name for name, tensor in expected.items() if saved.get(name) != tuple(tensor.shape))
+    if wrong:
+        raise ValueError(
+            f"{file} is not whole: it lacks {wrong[0]}, or has it in another shape ({len(wrong)} of "
+            f"{len(expected)} in all); take it from where it was trained, or train again"
+        )
 
 
 def base_commit(base: str, revision: str | None) -> str | None:

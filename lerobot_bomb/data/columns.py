@@ -11,6 +11,7 @@ from lerobot.utils.constants import DEFAULT_FEATURES, HF_LEROBOT_HOME
 
 from lerobot_bomb.data.dataset_files import flat_numbers, read_parquet
 from lerobot_bomb.data.growing import check_repo_id
+from lerobot_bomb.hub.token import refuse_unsendable_tokens
 
 EPISODE_INDEX = "episode_index"
 
@@ -19,6 +20,7 @@ def read_meta(repo_id: str, root: Path | None) -> LeRobotDatasetMetadata:
     """A dataset's metadata; a folder that is named must exist, LeRobot's own may be filled from the Hub."""
     if root is None:  # else it is but a label
         check_repo_id(repo_id, "--dataset.repo_id")
+        refuse_unsendable_tokens()
     if root is not None and not (root / "meta" / "info.json").is_file():
         raise ValueError(f"--dataset.root={root} holds no meta/info.json, so it is no LeRobotDataset")
     try:
