@@ -9,9 +9,9 @@ import pyarrow as pa
 from lerobot.datasets import LeRobotDatasetMetadata
 from lerobot.utils.constants import DEFAULT_FEATURES, HF_LEROBOT_HOME
 
-from lerobot_bomb.data.dataset_files import flat_numbers, read_parquet
+from lerobot_bomb.data.dataset_files import INFO_FILE, check_dataset, flat_numbers, read_parquet
 from lerobot_bomb.data.growing import check_repo_id
-from lerobot_bomb.hub.token import refuse_unsendable_tokens
+from lerobot_bomb.hub_token import TokenError, refuse_unsendable_tokens
 
 EPISODE_INDEX = "episode_index"
 
@@ -21,11 +21,16 @@ def read_meta(repo_id: str, root: Path | None) -> LeRobotDatasetMetadata:
     if root is None:  # else it is but a label
         check_repo_id(repo_id, "--dataset.repo_id")
         refuse_unsendable_tokens()
-    if root is not None and not (root / "meta" / "info.json").is_file():
-        raise ValueError(f"--dataset.root={root} holds no meta/info.json, so it is no LeRobotDataset")
+    if root is not None and not (root / INFO_FILE).is_file():
+        raise ValueError(f"--dataset.root={root} holds no {INFO_FILE}, so it is no LeRobotDataset")
     try:
         return LeRobotDatasetMetadata(repo_id, root=root)
+    except TokenError:
+        raise
     except (OSError, ValueError) as error:
+        folder = root or HF_LEROBOT_HOME / repo_id
+        if (folder / INFO_FILE).is_file():
+            check_dataset(folder)  # which names the file
         if root is not None:
             raise
         raise ValueError(

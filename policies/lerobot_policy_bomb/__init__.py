@@ -9,7 +9,7 @@ import lerobot_policy_spatialvla_grid  # noqa: F401
 import lerobot_policy_vla0_smol  # noqa: F401
 from lerobot_bomb.checkpoint_config import tell_config_errors
 from lerobot_bomb.hub.processor_files import check_saved_processors
-from lerobot_bomb.hub.token import refuse_unsendable_tokens
+from lerobot_bomb.hub_token import refuse_unsendable_tokens
 
 tell_config_errors()
 refuse_unsendable_tokens()

@@ -8,8 +8,12 @@ VARIABLES = ("HF_TOKEN", "HUGGING_FACE_HUB_TOKEN")
 LOG_IN = "run `hf auth login`, or set HF_TOKEN"
 
 
+class TokenError(ValueError):
+    """What is wrong with a token, without the token."""
+
+
 def check_token_characters(token: str) -> None:
-    """Raise a ValueError, which does not hold the token, unless all its characters can be sent.
+    """Raise a TokenError unless all characters of the token can be sent.
 
     Of a variable also those that huggingface_hub takes out, as what is left is another token.
     """
@@ -18,7 +22,7 @@ def check_token_characters(token: str) -> None:
         bad = [index for index, each in enumerate(text) if not ("!" <= each <= "~")]
         if bad:
             kind = "a space" if text[bad[0]] == " " else "a control character or one that is not ASCII"
-            raise ValueError(
+            raise TokenError(
                 f"{source} contains {kind}, after {bad[0]} of its {len(text)} characters, so it is no token "
                 f"of the Hub: {LOG_IN} to the token alone"
             )
