@@ -1,12 +1,16 @@
-"""The only place that reaches into names of LeRobot and `datasets` that are not their public interface."""
+"""The only place that reaches into names of LeRobot, `datasets` and huggingface_hub that are not public."""
 
+import os
+import pickle
 import re
 import shutil
 import sys
 from collections.abc import Callable, Collection, Iterator, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager, suppress
 from functools import partial, wraps
 from pathlib import Path
+from types import SimpleNamespace
 from typing import TYPE_CHECKING, Any
 from weakref import ref
 
@@ -115,18 +119,55 @@ def lerobot_eval_with(flags: Sequence[str], wrap: Callable[[Any, Any], Any]) -> 
         lerobot_eval.make_env, sys.argv = usual, argv
 
 
-def serve_registered_policies(config: Any) -> None:
-    """Run LeRobot's policy server, a PolicyServerConfig's, for every registered policy type until Ctrl-C.
+def serve_registered_policies(
+    config: Any, address: str, loads: Callable[[bytes], Any], interceptor: Any, workers: int
+) -> Any:
+    """Start LeRobot's policy server, a PolicyServerConfig's, for every registered policy type.
 
-    It knows a list of LeRobot's own types, and imports no plugins.
+    Its own knows a list of LeRobot's types, imports no plugins, unpickles whatever it receives, and four
+    requests that never end stop it. Returns gRPC's server.
+
+    Raises:
+        ValueError: the address cannot be had.
     """
+    import grpc
     from lerobot.async_inference import policy_server
     from lerobot.configs import PreTrainedConfig
+    from lerobot.transport import services_pb2_grpc
     from lerobot.utils.import_utils import register_third_party_plugins
 
     register_third_party_plugins()
     policy_server.SUPPORTED_POLICIES[:] = sorted(PreTrainedConfig.get_known_choices())
-    policy_server.serve(config)
+    policy_server.pickle = SimpleNamespace(loads=loads, dumps=pickle.dumps)  # pyright: ignore
+    server = grpc.server(
+        ThreadPoolExecutor(workers), interceptors=[interceptor], options=[("grpc.so_reuseport", 0)]
+    )
+    services_pb2_grpc.add_AsyncInferenceServicer_to_server(policy_server.PolicyServer(config), server)
+    usual = os.umask(0o177)  # a Unix socket lets in its owner only
+    try:
+        server.add_insecure_port(address)
+    except RuntimeError:
+        raise ValueError(f"{address} cannot be listened on") from None
+    finally:
+        os.umask(usual)
+    server.start()
+    return server
+
+
+def check_tokens_before_use(check: Callable[[str], None]) -> None:
+    """Let huggingface_hub send no token before `check(token)`; doing it again changes nothing."""
+    from huggingface_hub.utils import _headers
+
+    usual: Any = getattr(_headers.get_token_to_send, "__wrapped__", _headers.get_token_to_send)
+
+    @wraps(usual)
+    def get_token_to_send(token: bool | str | None) -> str | None:
+        found = usual(token)
+        if found is not None:
+            check(found)
+        return found
+
+    _headers.get_token_to_send = get_token_to_send
 
 
 def remember_policies() -> None:

@@ -5,12 +5,14 @@ from pathlib import Path
 from typing import Any
 
 import torch
+from accelerate import init_empty_weights
 from huggingface_hub import constants, hf_hub_download, try_to_load_from_cache
 from huggingface_hub.errors import RemoteEntryNotFoundError
 from torch import Tensor, nn
 
-from lerobot_bomb.hub.checks import ADAPTERS, check_finite, read_json
+from lerobot_bomb.hub.checks import ADAPTERS, check_finite, tensor_shapes
 from lerobot_bomb.hub.names import TO_PUBLISH, is_hub_id
+from lerobot_bomb.json_files import read_json
 
 # fields of peft's configs that name files to read or modules to import
 NAME_OTHERS = {
@@ -62,8 +64,8 @@ def check_base(base: str) -> None:
         raise ValueError(f"the base of these adapters, {base}, is on this machine only; {TO_PUBLISH}")
 
 
-def check_adapters(path: str, revision: str | None) -> None:
-    """Adapters, in a folder or on the Hub, are whole, finite and all that `peft` will read.
+def check_adapters(path: str, revision: str | None) -> Path:
+    """The file of adapters in a folder or on the Hub, which is whole, finite and all that `peft` will read.
 
     They are safetensors; in their place `peft` would read a pickle.
 
@@ -72,13 +74,15 @@ def check_adapters(path: str, revision: str | None) -> None:
         ValueError: they are truncated or not finite, or their config names other files or code.
     """
     config, weights = ADAPTERS
-    check_finite(_file(path, weights, revision))
+    file = _file(path, weights, revision)
+    check_finite(file)
     named = sorted(_named(read_json(_file(path, config, revision))))
     if named:
         raise ValueError(
             f"{path}: {config} sets {named[0]}, by which peft reads other files or imports code; no policy's "
             "adapters need it"
         )
+    return file
 
 
 def _file(path: str, name: str, revision: str | None) -> Path:
@@ -101,6 +105,34 @@ def _named(values: Any) -> set[str]:
         return set()
     deeper = {name for each in values.values() for name in _named(each)}
     return deeper | {name for name in NAME_OTHERS & values.keys() if values[name]}
+
+
+def check_adapters_fit(policy_type: Any, config: Any, path: str, revision: str | None) -> None:
+    """Adapters, as above, are all that their config puts on a policy; `peft` would only warn.
+
+    Raises:
+        ValueError: they are another policy's, or only a part of them is there.
+    """
+    try:
+        import peft  # pyright: ignore[reportMissingImports]
+    except ImportError as error:
+        raise ValueError("adapters need the package peft: pip install 'lerobot_policy_bomb[lora]'") from error
+    file = check_adapters(path, revision)
+    with init_empty_weights():  # which takes no memory
+        policy = policy_type(config)
+    of_adapters = peft.PeftConfig.from_pretrained(path, revision=revision)
+    try:
+        adapted = peft.get_peft_model(policy, of_adapters, low_cpu_mem_usage=True)
+    except ValueError as error:
+        raise ValueError(f"{file} is of no {config.type} as config.json describes it: {error}") from None
+    expected = peft.get_peft_model_state_dict(adapted, save_embedding_layers=False)
+    saved = tensor_shapes(file)
+    wrong = sorted(name for name, tensor in expected.items() if saved.get(name) != tuple(tensor.shape))
+    if wrong:
+        raise ValueError(
+            f"{file} is not whole: it lacks {wrong[0]}, or has it in another shape ({len(wrong)} of "
+            f"{len(expected)} in all); take it from where it was trained, or train again"
+        )
 
 
 def base_commit(base: str, revision: str | None) -> str | None:

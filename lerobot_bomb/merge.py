@@ -6,6 +6,7 @@ from pathlib import Path
 from lerobot.configs import PreTrainedConfig
 from lerobot.policies import PreTrainedPolicy, get_policy_class
 
+from lerobot_bomb.adapters import check_adapters_fit
 from lerobot_bomb.checkpoint import add_folder_arguments, load_processors, read_config, write_checkpoint
 from lerobot_bomb.hub.checks import ADAPTERS
 from lerobot_bomb.viewing.unfinished import check_new_folder
@@ -31,10 +32,9 @@ def run_merge(args: argparse.Namespace) -> int:
 
 def merged(config: PreTrainedConfig, adapters: Path) -> PreTrainedPolicy:
     """The policy whose weights are those of the base and its adapters; the config is of a whole one then."""
-    try:
-        import peft  # pyright: ignore[reportMissingImports]
-    except ImportError as error:
-        raise ValueError("adapters need the package peft: pip install 'lerobot_policy_bomb[lora]'") from error
+    check_adapters_fit(get_policy_class(config.type), config, str(adapters), None)
+    import peft  # pyright: ignore[reportMissingImports]
+
     of_adapters = peft.PeftConfig.from_pretrained(str(adapters))
     base = str(of_adapters.base_model_name_or_path)
     config.use_peft, config.pretrained_path = False, None

@@ -142,6 +142,8 @@ def wait_until(happened: Callable[[], bool]) -> None:
         ("--port=99999", "Port must be between 1 and 65535, got 99999"),
         ("--fps=0", "--fps=0 must be at least 1"),
         ("--host=nowhere.invalid", "--host=nowhere.invalid --port=8080: "),
+        ("--host=0.0.0.0", "--host=0.0.0.0 lets other machines in, who need no password"),
+        ("--socket=/nowhere/x", "--socket=/nowhere/x is in no folder that exists"),
     ],
 )
 def test_a_wrong_flag_is_named(flag: str, message: str, capsys: pytest.CaptureFixture[str]) -> None:
@@ -161,7 +163,8 @@ def test_help_names_the_danger_and_the_host(capsys: pytest.CaptureFixture[str]) 
     with pytest.raises(SystemExit):
         cli.main(["serve", "--help"])
     text = " ".join(capsys.readouterr().out.split())
-    assert "can run any code on this machine" in text
+    assert "The server trusts its network" in text
+    assert "unpickles whatever a server sends" in text
     assert "Host address to bind the server to (default: 127.0.0.1)" in text
 
 

@@ -6,20 +6,31 @@ from typing import Any
 
 import numpy as np
 import pyarrow as pa
-import pyarrow.parquet as pq
 from lerobot.datasets import LeRobotDatasetMetadata
 from lerobot.utils.constants import DEFAULT_FEATURES, HF_LEROBOT_HOME
+
+from lerobot_bomb.data.dataset_files import INFO_FILE, check_dataset, flat_numbers, read_parquet
+from lerobot_bomb.data.growing import check_repo_id
+from lerobot_bomb.hub_token import TokenError, refuse_unsendable_tokens
 
 EPISODE_INDEX = "episode_index"
 
 
 def read_meta(repo_id: str, root: Path | None) -> LeRobotDatasetMetadata:
     """A dataset's metadata; a folder that is named must exist, LeRobot's own may be filled from the Hub."""
-    if root is not None and not (root / "meta" / "info.json").is_file():
-        raise ValueError(f"--dataset.root={root} holds no meta/info.json, so it is no LeRobotDataset")
+    if root is None:  # else it is but a label
+        check_repo_id(repo_id, "--dataset.repo_id")
+        refuse_unsendable_tokens()
+    if root is not None and not (root / INFO_FILE).is_file():
+        raise ValueError(f"--dataset.root={root} holds no {INFO_FILE}, so it is no LeRobotDataset")
     try:
         return LeRobotDatasetMetadata(repo_id, root=root)
+    except TokenError:
+        raise
     except (OSError, ValueError) as error:
+        folder = root or HF_LEROBOT_HOME / repo_id
+        if (folder / INFO_FILE).is_file():
+            check_dataset(folder)  # which names the file
         if root is not None:
             raise
         raise ValueError(
@@ -36,7 +47,8 @@ def read_columns(
     Reads the data files under ``meta.root``; ``LeRobotDataset`` downloads them if they are not there.
 
     Raises:
-        ValueError: a key is no column of numbers, an episode does not exist, or values are not finite.
+        ValueError: a key is no column of numbers, an episode does not exist, values are not finite, or a data
+            file is truncated.
         FileNotFoundError: a data file is absent.
     """
     columns = list(dict.fromkeys([*keys, EPISODE_INDEX]))
@@ -51,12 +63,12 @@ def read_columns(
     files = dict.fromkeys(meta.get_data_file_path(episode) for episode in wanted)
     rows = [(EPISODE_INDEX, "in", wanted)]
     read = list({*columns, "index"})
-    tables = [pq.read_table(meta.root / file, columns=read, filters=rows) for file in files]
+    tables = [read_parquet(meta.root / file, read, rows) for file in files]
     table = pa.concat_tables(tables).sort_by("index")
     shapes = {key: () if key in DEFAULT_FEATURES else meta.features[key]["shape"] for key in columns}
-    arrays = {key: _to_array(table[key]).reshape(len(table), *shapes[key]) for key in columns}
+    arrays = {key: flat_numbers(table[key]).reshape(len(table), *shapes[key]) for key in columns}
     for key in columns:
-        _require_finite(meta, key, arrays[key], arrays[EPISODE_INDEX], _to_array(table["index"]))
+        _require_finite(meta, key, arrays[key], arrays[EPISODE_INDEX], flat_numbers(table["index"]))
     return arrays
 
 
@@ -102,13 +114,3 @@ def _require_finite(
             f"episode {episode}: {values_NX[first].tolist()}. Leave such episodes out: "
             f"lerobot-edit-dataset --operation.type=delete_episodes --operation.episode_indices=[{episode}]"
         )
-
-
-def _to_array(column: pa.ChunkedArray) -> np.ndarray:
-    """All numbers of a column of scalars or (nested) lists, in one row."""
-    array = column.combine_chunks()
-    while isinstance(array, pa.ExtensionArray):
-        array = array.storage
-    while pa.types.is_nested(array.type):
-        array = array.flatten()
-    return array.to_numpy(zero_copy_only=False)

@@ -1,6 +1,5 @@
 """Whether a checkpoint's folder is whole and works on another machine."""
 
-import json
 from pathlib import Path
 from typing import Any
 
@@ -17,6 +16,7 @@ from torch import Tensor
 from lerobot_bomb.finite import is_finite, require_finite
 from lerobot_bomb.hub.names import CONFIG, WEIGHTS
 from lerobot_bomb.hub.processor_files import saved_type, state_files
+from lerobot_bomb.json_files import read_json
 
 ADAPTERS = ("adapter_config.json", "adapter_model.safetensors")
 PROCESSORS = (f"{POLICY_PREPROCESSOR_DEFAULT_NAME}.json", f"{POLICY_POSTPROCESSOR_DEFAULT_NAME}.json")
@@ -52,8 +52,7 @@ def processor_files(folder: Path, processor: str) -> list[str]:
     """Names of the files that make up one of `PROCESSORS`, each whole and data only; none is loaded.
 
     Raises:
-        ValueError: one is missing, truncated or of another format, a step is no registered one, or statistics
-            are not finite.
+        ValueError: one is missing, truncated, not finite or of another format, or a step is not registered.
     """
     register_third_party_plugins()  # their steps
     content = read_json(folder / processor)
@@ -63,24 +62,6 @@ def processor_files(folder: Path, processor: str) -> list[str]:
             raise ValueError(f"{folder} holds no {name}, which its {processor} needs")
         check_finite(folder / name)
     return [processor, *states]
-
-
-def read_json(path: Path) -> dict[str, Any]:
-    """A JSON object from a file.
-
-    Raises:
-        FileNotFoundError: there is none.
-        ValueError: it is something else, or truncated.
-    """
-    if not path.is_file():
-        raise FileNotFoundError(f"{path.parent} has no {path.name}")
-    try:
-        values = json.loads(path.read_text())
-    except ValueError as error:
-        raise ValueError(f"{path} is not JSON, or truncated: {error}") from None
-    if not isinstance(values, dict):
-        raise ValueError(f"{path} is not a JSON object")
-    return values
 
 
 def tensor_shapes(path: Path) -> Shapes:

@@ -10,13 +10,20 @@ from lerobot.configs.train import TrainPipelineConfig
 from lerobot.utils.constants import CHECKPOINTS_DIR, LAST_CHECKPOINT_LINK, PRETRAINED_MODEL_DIR
 from torch import Tensor
 
-from lerobot_bomb.adapters import base_commit, check_adapters, check_base
+from lerobot_bomb.adapters import base_commit, check_adapters_fit, check_base
 from lerobot_bomb.finite import require_finite_statistics
 from lerobot_bomb.hub.card import Checkpoint
-from lerobot_bomb.hub.checks import PROCESSORS, check_config, check_finite, check_tensors, processor_files
+from lerobot_bomb.hub.checks import (
+    ADAPTERS,
+    PROCESSORS,
+    check_config,
+    check_finite,
+    check_tensors,
+    processor_files,
+)
 from lerobot_bomb.hub.dataset import DatasetFacts
 from lerobot_bomb.hub.method import Method
-from lerobot_bomb.hub.names import is_hub_id
+from lerobot_bomb.hub.names import WEIGHTS, is_hub_id
 from lerobot_bomb.hub.push import publish
 from lerobot_bomb.policy_environment import environment_of_dataset
 
@@ -82,7 +89,7 @@ class HubPolicy:
             download = {name: kwargs[name] for name in DOWNLOAD & kwargs.keys()}
             config = PreTrainedConfig.from_pretrained(pretrained_name_or_path, **download)
         elif config.use_peft:  # this is their base
-            check_adapters(str(config.pretrained_path), config.pretrained_revision)
+            check_adapters_fit(cls, config, str(config.pretrained_path), config.pretrained_revision)
         if isinstance(config, cls.config_class):
             check_config(folder, config)
         policy = _next(super()).from_pretrained(pretrained_name_or_path, config=config, **kwargs)
@@ -153,6 +160,7 @@ class HubPolicy:
             for name in PROCESSORS:
                 if (last / name).is_file():
                     files |= {each: last / each for each in processor_files(last, name)}
+            check_finite(next(files[name] for name in (ADAPTERS[1], WEIGHTS) if name in files))
             commit = publish(card, files, self.config.private)
         # LeRobot's remote jobs wait for this line
         logging.info(f"Model pushed to {commit.repo_url.url}")

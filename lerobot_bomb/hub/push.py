@@ -3,6 +3,7 @@
 import argparse
 import json
 from collections.abc import Mapping
+from copy import copy
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -10,10 +11,11 @@ from lerobot_bomb.data.growing import check_repo_id, switch
 from lerobot_bomb.evaluation.results import read_results
 from lerobot_bomb.hub.dataset import DatasetFacts, Row, check_results
 from lerobot_bomb.hub.evaluated import check_weights_of
-from lerobot_bomb.hub.names import CONFIG, TO_PUBLISH, TRAIN_CONFIG, is_local_path
+from lerobot_bomb.hub.names import CONFIG, TO_PUBLISH, TRAIN_CONFIG, WEIGHTS, is_local_path
 
 if TYPE_CHECKING:
     from huggingface_hub import CommitInfo
+    from lerobot.configs import PreTrainedConfig
     from lerobot.configs.train import TrainPipelineConfig
 
     from lerobot_bomb.hub.card import Checkpoint
@@ -116,21 +118,25 @@ def _read_checkpoint(
     """What its card is made of, after all checks."""
     from lerobot.utils.import_utils import register_third_party_plugins
 
-    from lerobot_bomb.adapters import check_base
+    from lerobot_bomb.adapters import check_adapters_fit, check_base
     from lerobot_bomb.checkpoint import parse_config
     from lerobot_bomb.hub.card import Checkpoint
-    from lerobot_bomb.hub.checks import ADAPTERS, check_config, check_weights, policy_class, read_json
+    from lerobot_bomb.hub.checks import ADAPTERS, check_config, check_finite, check_weights, policy_class
+    from lerobot_bomb.json_files import read_json
 
     register_third_party_plugins()
     policy_type: Any = policy_class(folder)
     config = parse_config(folder, "cpu")
     check_config(folder, config)
+    _check_processors(folder, config)
     base = None
     if config.use_peft:
         base = str(read_json(folder / ADAPTERS[0]).get("base_model_name_or_path"))
         check_base(base)
+        check_adapters_fit(policy_type, config, str(folder), None)
     else:
         check_weights(folder, config, policy_type)
+        check_finite(folder / WEIGHTS)
     training = _read_training(folder)
     if dataset is None and training is not None:  # it may still be where the training found it
         dataset = DatasetFacts.find(training.dataset.root)
@@ -146,6 +152,19 @@ def _read_checkpoint(
         tags=config.tags or [],
         adapters_of=base,
     )
+
+
+def _check_processors(folder: Path, config: "PreTrainedConfig") -> None:
+    """They load, from the folder alone."""
+    from lerobot_bomb.checkpoint import load_processors
+
+    of_folder = copy(config)
+    of_folder.pretrained_path = folder
+    try:
+        load_processors(of_folder)
+    except (KeyError, TypeError, ValueError) as error:
+        start = f"the processors of {folder} cannot be loaded"
+        raise ValueError(f"{start}: {error}; take a checkpoint from before, or train again") from error
 
 
 def portable(value: Any, key: str = "") -> Any:

@@ -8,6 +8,8 @@ import httpx
 from huggingface_hub import CommitInfo, CommitOperationAdd, CommitOperationDelete, HfApi, constants, get_token
 from huggingface_hub.errors import HfHubHTTPError, OfflineModeIsEnabled
 
+from lerobot_bomb.hub_token import LOG_IN, check_token_characters
+
 OFFLINE = "HF_HUB_OFFLINE is set, so nothing can be pushed"
 
 
@@ -15,8 +17,10 @@ def check_token() -> None:
     """Raise unless the Hub may be asked, and can know who pushes."""
     if constants.HF_HUB_OFFLINE:
         raise ValueError(OFFLINE)
-    if get_token() is None:
-        raise ValueError("the Hub asks who you are: run `hf auth login`, or set HF_TOKEN")
+    token = get_token()
+    if token is None:
+        raise ValueError(f"the Hub asks who you are: {LOG_IN}")
+    check_token_characters(token)
 
 
 def upload(

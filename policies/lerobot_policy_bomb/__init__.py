@@ -10,7 +10,9 @@ import lerobot_policy_vla0_smol  # noqa: F401
 from lerobot_bomb._compat import remember_policies
 from lerobot_bomb.checkpoint_config import tell_config_errors
 from lerobot_bomb.hub.processor_files import check_saved_processors
+from lerobot_bomb.hub_token import refuse_unsendable_tokens
 
 tell_config_errors()
 remember_policies()
+refuse_unsendable_tokens()
 check_saved_processors()

@@ -13,10 +13,12 @@ from vla0_smol_cases import STATS, make_policy
 from lerobot_policy_vla0_smol import make_vla0_smol_pre_post_processors
 
 type Damage = Callable[[Path], None]
+type Tensors = dict[str, torch.Tensor]
 
 LOCAL = "/data/models/SmolVLM2-500M-Video-Instruct"
 WEIGHTS = "model.safetensors"
 TOKENIZER = "policy_preprocessor_step_2_bomb_task_tokenizer.safetensors"
+NORMALIZER = "policy_preprocessor_step_4_normalizer_processor.safetensors"
 PREPROCESSOR, POSTPROCESSOR = "policy_preprocessor.json", "policy_postprocessor.json"
 
 
@@ -113,3 +115,40 @@ def take_other_weights(folder: Path) -> None:
 def take_other_shape(folder: Path) -> None:
     weights = load_file(folder / WEIGHTS)
     save_file({**weights, min(weights): torch.zeros(1)}, folder / WEIGHTS)
+
+
+def change_tensors(name: str, change: Callable[[Tensors], Tensors]) -> Damage:
+    def damage(folder: Path) -> None:
+        save_file(change(load_file(folder / name)), folder / name)
+
+    return damage
+
+
+def one_nan(tensors: Tensors) -> Tensors:
+    """Of the first tensor of floats that is neither a scalar nor a picture's."""
+    name = min(name for name, tensor in tensors.items() if tensor.is_floating_point() and tensor.ndim)
+    tensors[name].view(-1)[1] = torch.nan
+    return tensors
+
+
+def half_of_each(tensors: Tensors) -> Tensors:
+    return {name: tensor[: len(tensor) // 2].clone() for name, tensor in tensors.items()}
+
+
+def renamed(tensors: Tensors) -> Tensors:
+    return {f"other_{name}": tensor for name, tensor in tensors.items()}
+
+
+def without_state(tensors: Tensors) -> Tensors:
+    return {name: tensor for name, tensor in tensors.items() if not name.startswith("observation.state")}
+
+
+def every_other(tensors: Tensors) -> Tensors:
+    return {name: tensors[name] for name in sorted(tensors)[::2]}
+
+
+def name_other_step(folder: Path) -> None:
+    path = folder / PREPROCESSOR
+    values = json.loads(path.read_text())
+    values["steps"][0]["registry_name"] = "bomb_unknown"
+    path.write_text(json.dumps(values))

@@ -11,11 +11,11 @@ from lerobot.configs.default import DatasetConfig, PeftConfig
 from lerobot.configs.train import TrainPipelineConfig
 from lerobot.envs import make_env_config
 from lerobot.policies import get_policy_class, make_policy, make_pre_post_processors
-from safetensors.torch import load_file
+from safetensors.torch import load_file, save_file
 from vla0_smol_cases import STATS
 from vla0_smol_cases import make_policy as make_vla0
 
-from hub.damage import write_checkpoint
+from hub.damage import change_tensors, every_other, one_nan, write_checkpoint
 from hub.runner import FORGET, run
 from hub.server import TOKEN, LoopbackHub, Repository
 from hub.test_loop import DATASET, SMALL, check_no_secret, evaluate, record, train
@@ -24,6 +24,7 @@ from lerobot_bomb.cli import main
 
 peft = pytest.importorskip("peft")
 
+ADAPTERS = "adapter_model.safetensors"
 BASE, REPO_ID = "me/base", "me/adapters"
 LORA = {"method_type": "LORA", "r": 4}
 
@@ -53,6 +54,33 @@ def save(wrapped: Any, folder: Path) -> Path:
 
 def push(folder: Path) -> int:
     return main(["push", str(folder), f"--repo_id={REPO_ID}"])
+
+
+def test_adapters_of_which_a_part_is_missing_are_refused(
+    online: LoopbackHub, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """`peft` loads what there is, with a warning."""
+    push_base(tmp_path / "base")
+    folder = save(adapters(BASE), tmp_path / "adapters")
+    whole = load_file(folder / ADAPTERS)
+    for change in (every_other, one_nan):
+        save_file(whole, folder / ADAPTERS)
+        change_tensors(ADAPTERS, change)(folder)
+        online.requests.clear()
+        capsys.readouterr()
+        assert push(folder) == 1
+        pushed = capsys.readouterr().err
+        assert online.requests == []
+        assert main(["merge", f"--policy.path={folder}", f"--output={tmp_path / 'merged'}"]) == 1
+        merged = capsys.readouterr().err
+        config = read_config(folder, "cpu")
+        with pytest.raises(ValueError, match=ADAPTERS) as raised:
+            make_policy(config, env_cfg=make_env_config("bomb", image_size=64))
+        for text in (pushed.strip(), merged.strip(), str(raised.value)):
+            assert (
+                f"{folder / ADAPTERS} is not whole: it lacks base_model." in text or "is not finite" in text
+            )
+            assert len(text.splitlines()) == 1
 
 
 def check_published(hub: LoopbackHub) -> None:

@@ -11,13 +11,20 @@ from vla0_smol_cases import make_batch, make_policy
 
 from hub.damage import (
     LOCAL,
+    NORMALIZER,
     TOKENIZER,
     WEIGHTS,
     change_config,
+    change_tensors,
+    half_of_each,
+    name_other_step,
+    one_nan,
     remove,
+    renamed,
     take_other_shape,
     take_other_weights,
     truncate,
+    without_state,
 )
 from hub.server import TOKEN, LoopbackHub
 from lerobot_bomb.cli import main
@@ -130,6 +137,12 @@ BROKEN = {
     "has shape (1,), not (": take_other_shape,
     f"would need the base model {LOCAL}": change_config(vlm_config=None),
     "the type 'act' is not one that lerobot-bomb pushes": change_config(type="act"),
+    f"{WEIGHTS}: backbone.": change_tensors(WEIGHTS, one_nan),
+    f"{NORMALIZER}: action.max": change_tensors(NORMALIZER, one_nan),
+    "its statistics lack observation.state.": change_tensors(NORMALIZER, without_state),
+    "no step 'bomb_unknown' is registered here": name_other_step,
+    "the saved tokenizer cannot be read": change_tensors(TOKENIZER, half_of_each),
+    "the state of bomb_task_tokenizer must be": change_tensors(TOKENIZER, renamed),
     "written by lerobot_bomb 99.0, newer than": change_config(package_version="99.0", new_flag=1),
 }
 
@@ -207,3 +220,35 @@ def test_a_push_that_is_cut_off_anywhere_leaves_nothing_or_everything(
         assert files in ({}, whole)
         seen.add(bool(files))
     assert False in seen
+
+
+@pytest.mark.parametrize("token", ["hf_abc\nsecret", "hf_abc\x01secret", "hf_abc secret", "hf_äbcsecret"])
+def test_a_token_that_no_header_can_hold_is_never_shown(
+    token: str,
+    online: LoopbackHub,
+    checkpoint: Path,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    """By our push, and by what LeRobot's commands ask the Hub."""
+    from huggingface_hub import hf_hub_download
+
+    monkeypatch.setenv("HF_TOKEN", token)
+    assert push(checkpoint) == 1
+    flags = ["--policy.type=vla0_smol", "--dataset.repo_id=me/elsewhere", f"--output={tmp_path / 'new'}"]
+    assert main(["init", *flags]) == 1
+    errors = capsys.readouterr().err.strip().splitlines()
+    with pytest.raises(ValueError) as raised:
+        hf_hub_download("me/x", "config.json")
+    chain, seen = raised.value, []
+    while chain is not None:
+        seen.append(str(chain))
+        chain = chain.__context__
+    for text in (*errors, *seen):
+        assert "secret" not in text
+    assert len(errors) == 2
+    for text in (*errors, seen[0]):
+        assert "contains a" in text
+        assert "hf auth login" in text
+    assert online.requests == []

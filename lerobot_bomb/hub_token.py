@@ -1,0 +1,33 @@
+"""A token that no header can hold: said before the HTTP library quotes it in an error."""
+
+import os
+
+from lerobot_bomb._compat import check_tokens_before_use
+
+VARIABLES = ("HF_TOKEN", "HUGGING_FACE_HUB_TOKEN")
+LOG_IN = "run `hf auth login`, or set HF_TOKEN"
+
+
+class TokenError(ValueError):
+    """What is wrong with a token, without the token."""
+
+
+def check_token_characters(token: str) -> None:
+    """Raise a TokenError unless all characters of the token can be sent.
+
+    Of a variable also those that huggingface_hub takes out, as what is left is another token.
+    """
+    given = {name: os.environ.get(name, "").strip() for name in VARIABLES}
+    for source, text in {"your token": token, **given}.items():
+        bad = [index for index, each in enumerate(text) if not ("!" <= each <= "~")]
+        if bad:
+            kind = "a space" if text[bad[0]] == " " else "a control character or one that is not ASCII"
+            raise TokenError(
+                f"{source} contains {kind}, after {bad[0]} of its {len(text)} characters, so it is no token "
+                f"of the Hub: {LOG_IN} to the token alone"
+            )
+
+
+def refuse_unsendable_tokens() -> None:
+    """From now on, whatever asks the Hub in this process checks its token so: LeRobot's commands too."""
+    check_tokens_before_use(check_token_characters)
