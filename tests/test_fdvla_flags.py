@@ -19,7 +19,7 @@ from fdvla_cases import (
     make_policy,
 )
 
-from lerobot_bomb.flags import FlagError
+from lerobot_bomb.flag_errors import FlagError
 from lerobot_policy_fdvla.configuration_fdvla import FdvlaConfig
 
 

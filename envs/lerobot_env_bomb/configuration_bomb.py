@@ -10,7 +10,7 @@ from lerobot.envs import EnvConfig
 from lerobot.utils.constants import ACTION, OBS_IMAGES, OBS_PREFIX, OBS_STATE
 
 from lerobot_bomb.camera_geometry import geometry_shapes
-from lerobot_bomb.flags import flag_errors
+from lerobot_bomb.flag_errors import flag_errors
 from lerobot_bomb.perturbations import NONE, Condition
 from lerobot_bomb.schema import ACTION_DIM, CAMERAS, DEFAULT_FPS, STATE_DIM, EpisodeSpec, RenderOptions
 from lerobot_env_bomb.fetch_files import check_robot

@@ -8,6 +8,7 @@ from pathlib import Path
 from statistics import median
 from typing import Any
 
+from lerobot_bomb.flags import path_flag
 from lerobot_bomb.perturbations import NONE
 from lerobot_bomb.schema import PROTOCOL_VERSION, Failure
 from lerobot_bomb.stats import format_rate, mcnemar_p_value
@@ -130,7 +131,9 @@ def _pair_line(condition: str, pairs: list[tuple[Row, Row]]) -> str:
 
 def add_results_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the arguments of ``lerobot-bomb results``."""
-    parser.add_argument("paths", nargs="+", type=Path, metavar="FILE", help="files of --env.results_path")
+    parser.add_argument(
+        "paths", nargs="+", type=path_flag, metavar="FILE", help="files of --env.results_path"
+    )
 
 
 def run_results(args: argparse.Namespace) -> int:
