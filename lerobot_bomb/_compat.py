@@ -1,15 +1,18 @@
 """The only place that reaches into names of LeRobot and `datasets` that are not their public interface."""
 
+import json
+import re
 import shutil
 import sys
 from collections.abc import Callable, Collection, Iterator, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from functools import partial
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from datasets import config
+from huggingface_hub import hf_hub_download
 from lerobot.datasets import LeRobotDataset, aggregate, compute_stats, dataset_writer
 from lerobot.datasets.feature_utils import get_hf_features_from_features
 from lerobot.datasets.io_utils import to_parquet_with_hf_images
@@ -117,3 +120,52 @@ def serve_registered_policies(config: Any) -> None:
     register_third_party_plugins()
     policy_server.SUPPORTED_POLICIES[:] = sorted(PreTrainedConfig.get_known_choices())
     policy_server.serve(config)
+
+
+def check_processors_before_use(
+    check: Callable[[dict[str, Any], str, object], Any],
+    check_loaded: Callable[[Sequence[Any], str, object], None],
+) -> None:
+    """Let LeRobot's loader build no step of a saved processor before `check(its JSON, where, type)`.
+
+    Here what is checked is what will be built; `type` is the checkpoint's. Then `check_loaded(steps, where,
+    type)`. From the Hub, states are of the commit that the JSON is of.
+    """
+    from lerobot.processor import DataProcessorPipeline
+
+    usual: Any = DataProcessorPipeline._build_steps_with_overrides
+
+    def build(
+        cls: type,
+        loaded_config: dict[str, Any],
+        overrides: dict[str, Any],
+        model_id: str,
+        base_path: Path,
+        hub_download_kwargs: dict[str, Any],
+        is_local_source: bool = False,
+    ) -> Any:
+        commits = [part for part in base_path.parts if re.fullmatch("[0-9a-f]{40}", part)]
+        if commits and not is_local_source:
+            hub_download_kwargs = hub_download_kwargs | {"revision": commits[-1]}
+        policy_type = _policy_type(model_id, base_path, hub_download_kwargs, is_local_source)
+        where = f"{model_id}, {loaded_config.get('name')}"
+        check(loaded_config, where, policy_type)
+        steps, unused = usual.__func__(
+            cls, loaded_config, overrides, model_id, base_path, hub_download_kwargs, is_local_source
+        )
+        check_loaded(steps, where, policy_type)
+        return steps, unused
+
+    DataProcessorPipeline._build_steps_with_overrides = classmethod(build)  # pyright: ignore[reportAttributeAccessIssue]
+
+
+def _policy_type(model_id: str, folder: Path, download: dict[str, Any], is_local: bool) -> object:
+    """What the config.json beside a processor says; None without one."""
+    path = folder / "config.json"
+    if not path.is_file() and not is_local:
+        with suppress(OSError):
+            path = Path(hf_hub_download(model_id, path.name, **download))
+    try:
+        return json.loads(path.read_text()).get("type")
+    except (OSError, ValueError, AttributeError):
+        return None

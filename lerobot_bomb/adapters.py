@@ -9,7 +9,7 @@ from huggingface_hub import constants, hf_hub_download, try_to_load_from_cache
 from huggingface_hub.errors import RemoteEntryNotFoundError
 from torch import Tensor, nn
 
-from lerobot_bomb.hub.checks import ADAPTERS, tensor_shapes
+from lerobot_bomb.hub.checks import ADAPTERS, check_finite
 from lerobot_bomb.hub.names import TO_PUBLISH, is_hub_id
 
 PROJECTIONS = "q|k|v|o|gate|up|down"  # of a layer's attention and MLP
@@ -53,20 +53,22 @@ def check_base(base: str) -> None:
 
 
 def check_adapters(path: str, revision: str | None) -> None:
-    """Adapters, in a folder or on the Hub, are whole safetensors; in their place `peft` would read a pickle.
+    """Adapters, in a folder or on the Hub, are whole and finite.
+
+    They are safetensors; in their place `peft` would read a pickle.
 
     Raises:
         FileNotFoundError: there are none.
-        ValueError: they are truncated.
+        ValueError: they are truncated or not finite.
     """
     name = ADAPTERS[1]
     if not Path(path).is_dir():
         try:
-            tensor_shapes(Path(hf_hub_download(path, name, revision=revision)))
+            check_finite(Path(hf_hub_download(path, name, revision=revision)))
         except RemoteEntryNotFoundError as error:
             raise FileNotFoundError(f"{name} not found on the HuggingFace Hub in {path}") from error
     elif (Path(path) / name).is_file():
-        tensor_shapes(Path(path) / name)
+        check_finite(Path(path) / name)
     else:
         raise FileNotFoundError(f"{path} holds no {name}, so it is no whole checkpoint")
 

@@ -16,7 +16,9 @@ from lerobot.utils.device_utils import get_safe_torch_device, is_torch_device_av
 from lerobot.utils.import_utils import register_third_party_plugins
 
 from lerobot_bomb.flags import path_flag
+from lerobot_bomb.hub.checks import PROCESSORS, processor_files
 from lerobot_bomb.hub.names import CONFIG
+from lerobot_bomb.hub.processor_files import check_states
 from lerobot_bomb.viewing.unfinished import written_whole
 
 FILES = (CONFIG, f"{POLICY_PREPROCESSOR_DEFAULT_NAME}.json")
@@ -59,12 +61,22 @@ def parse_config(path: Path, device: str | None) -> PreTrainedConfig:
 
 
 def load_processors(config: PreTrainedConfig) -> tuple[Preprocessor, Postprocessor]:
-    """The processors saved with a checkpoint, on the config's device."""
-    return make_pre_post_processors(
+    """The processors saved with a checkpoint, on the config's device.
+
+    Raises:
+        ValueError: they are not whole, or not data only (`lerobot_bomb.hub.processor_files`).
+    """
+    folder = Path(str(config.pretrained_path))
+    for name in PROCESSORS:
+        processor_files(folder, name)
+    processors = make_pre_post_processors(
         policy_cfg=config,
-        pretrained_path=str(config.pretrained_path),
+        pretrained_path=str(folder),
         preprocessor_overrides={"device_processor": {"device": str(config.device)}},
     )
+    for name, processor in zip(PROCESSORS, processors, strict=True):
+        check_states(processor.steps, str(folder / name), complete=True)
+    return processors
 
 
 def add_folder_arguments(parser: argparse.ArgumentParser, checkpoint: str, output: str) -> None:

@@ -6,15 +6,19 @@ from typing import Any
 
 import numpy as np
 import pyarrow as pa
-import pyarrow.parquet as pq
 from lerobot.datasets import LeRobotDatasetMetadata
 from lerobot.utils.constants import DEFAULT_FEATURES, HF_LEROBOT_HOME
+
+from lerobot_bomb.data.dataset_files import flat_numbers, read_parquet
+from lerobot_bomb.data.growing import check_repo_id
 
 EPISODE_INDEX = "episode_index"
 
 
 def read_meta(repo_id: str, root: Path | None) -> LeRobotDatasetMetadata:
     """A dataset's metadata; a folder that is named must exist, LeRobot's own may be filled from the Hub."""
+    if root is None:  # else it is but a label
+        check_repo_id(repo_id, "--dataset.repo_id")
     if root is not None and not (root / "meta" / "info.json").is_file():
         raise ValueError(f"--dataset.root={root} holds no meta/info.json, so it is no LeRobotDataset")
     try:
@@ -36,7 +40,7 @@ def read_columns(
     Reads the data files under ``meta.root``; ``LeRobotDataset`` downloads them if they are not there.
 
     Raises:
-        ValueError: a key is no column of numbers, or an episode does not exist.
+        ValueError: a key is no column of numbers, an episode does not exist, or a data file is truncated.
         FileNotFoundError: a data file is absent.
     """
     columns = list(dict.fromkeys([*keys, EPISODE_INDEX]))
@@ -51,10 +55,10 @@ def read_columns(
     files = dict.fromkeys(meta.get_data_file_path(episode) for episode in wanted)
     rows = [(EPISODE_INDEX, "in", wanted)]
     read = list({*columns, "index"})
-    tables = [pq.read_table(meta.root / file, columns=read, filters=rows) for file in files]
+    tables = [read_parquet(meta.root / file, read, rows) for file in files]
     table = pa.concat_tables(tables).sort_by("index")
     shapes = {key: () if key in DEFAULT_FEATURES else meta.features[key]["shape"] for key in columns}
-    return {key: _to_array(table[key]).reshape(len(table), *shapes[key]) for key in columns}
+    return {key: flat_numbers(table[key]).reshape(len(table), *shapes[key]) for key in columns}
 
 
 def dim_names(feature: dict[str, Any]) -> list[str]:
@@ -80,13 +84,3 @@ def _check_columns(meta: LeRobotDatasetMetadata, columns: list[str]) -> None:
     unknown = [key for key in columns if key not in numeric]
     if unknown:
         raise ValueError(f"dataset {meta.repo_id} has no columns {unknown}; it has {sorted(numeric)}")
-
-
-def _to_array(column: pa.ChunkedArray) -> np.ndarray:
-    """All numbers of a column of scalars or (nested) lists, in one row."""
-    array = column.combine_chunks()
-    while isinstance(array, pa.ExtensionArray):
-        array = array.storage
-    while pa.types.is_nested(array.type):
-        array = array.flatten()
-    return array.to_numpy(zero_copy_only=False)

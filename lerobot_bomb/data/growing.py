@@ -11,7 +11,6 @@ import argparse
 import errno
 import json
 import os
-import re
 import signal
 import sys
 from collections.abc import Callable, Iterator
@@ -134,10 +133,18 @@ def terminated_in_order() -> Iterator[None]:
         signal.signal(signal.SIGTERM, usual)
 
 
-def check_repo_id(repo_id: str) -> None:
-    """Raise a ValueError unless it is USER/NAME."""
-    if not re.fullmatch(r"[\w.-]+/[\w.-]+", repo_id):
-        raise ValueError(f"--repo_id={repo_id!r} must have the form USER/NAME")
+def check_repo_id(repo_id: str, flag: str = "--repo_id") -> None:
+    """Raise a ValueError unless it is USER/NAME as the Hub takes them."""
+    from huggingface_hub.errors import HFValidationError  # half a second, which no worker has
+    from huggingface_hub.utils import validate_repo_id
+
+    reason = "" if repo_id.count("/") == 1 else "one slash"
+    try:
+        validate_repo_id(repo_id)
+    except HFValidationError as error:
+        reason = reason or str(error).partition(f": '{repo_id}'")[0]
+    if reason:
+        raise ValueError(f"{flag}={repo_id!r} must have the form USER/NAME: {reason}")
 
 
 def switch() -> dict[str, Any]:

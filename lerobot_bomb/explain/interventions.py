@@ -78,6 +78,12 @@ def intervene(checkpoint: Path | str, steps: Sequence[ProcessorStep], output: Pa
     checkpoint, output = Path(checkpoint), Path(output)
     if not steps or not all(isinstance(step, ProcessorStep) for step in steps):
         raise ValueError(f"steps={steps!r} must be a list of processor steps, as [BlankImages()]")
+    unknown = [type(step).__name__ for step in steps if not hasattr(type(step), "_registry_name")]
+    if unknown:
+        raise ValueError(
+            f"{unknown[0]} is not registered, so no command could load it: give it a name with "
+            "ProcessorStepRegistry.register, in a plugin that LeRobot imports"
+        )
     if not (checkpoint / PREPROCESSOR_FILE).is_file():
         raise ValueError(f"{checkpoint} holds no {PREPROCESSOR_FILE}, so it is no checkpoint of a policy")
     if output.exists():

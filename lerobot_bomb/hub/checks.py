@@ -1,20 +1,28 @@
 """Whether a checkpoint's folder is whole and works on another machine."""
 
-import json
 from pathlib import Path
 from typing import Any
 
+import torch
 from accelerate import init_empty_weights
 from lerobot.configs import PreTrainedConfig
 from lerobot.policies import PreTrainedPolicy
 from lerobot.policies.factory import get_policy_class
 from lerobot.utils.constants import POLICY_POSTPROCESSOR_DEFAULT_NAME, POLICY_PREPROCESSOR_DEFAULT_NAME
+from lerobot.utils.import_utils import register_third_party_plugins
 from safetensors import SafetensorError, safe_open
+from torch import Tensor
 
+from lerobot_bomb.finite import is_finite, require_finite
 from lerobot_bomb.hub.names import CONFIG, WEIGHTS
+from lerobot_bomb.hub.processor_files import state_files
+from lerobot_bomb.json_files import read_json
 
 ADAPTERS = ("adapter_config.json", "adapter_model.safetensors")
 PROCESSORS = (f"{POLICY_PREPROCESSOR_DEFAULT_NAME}.json", f"{POLICY_POSTPROCESSOR_DEFAULT_NAME}.json")
+
+# of a grid: rows of fewer bins than the finest coordinate's end with inf
+FILLED_WITH_INF = "grids.edges"
 
 type Shapes = dict[str, tuple[int, ...]]
 
@@ -41,36 +49,20 @@ def checkpoint_files(folder: Path) -> list[str]:
 
 
 def processor_files(folder: Path, processor: str) -> list[str]:
-    """Names of the files that make up one of `PROCESSORS`, each whole.
+    """Names of the files that make up one of `PROCESSORS`, each whole and data only; none is loaded.
 
     Raises:
-        ValueError: one is missing, truncated or of another format.
+        ValueError: one is missing, truncated, not finite or of another format, or a step is not registered.
     """
-    steps = read_json(folder / processor).get("steps", [])
-    states = [step["state_file"] for step in steps if step.get("state_file")]
+    register_third_party_plugins()  # their steps
+    content = read_json(folder / processor)
+    policy_type = read_json(folder / CONFIG).get("type") if (folder / CONFIG).is_file() else None
+    states = state_files(content, str(folder / processor), policy_type)
     for name in states:
         if not (folder / name).is_file():
             raise ValueError(f"{folder} holds no {name}, which its {processor} needs")
-        tensor_shapes(folder / name)
+        check_finite(folder / name)
     return [processor, *states]
-
-
-def read_json(path: Path) -> dict[str, Any]:
-    """A JSON object from a file.
-
-    Raises:
-        FileNotFoundError: there is none.
-        ValueError: it is something else, or truncated.
-    """
-    if not path.is_file():
-        raise FileNotFoundError(f"{path.parent} has no {path.name}")
-    try:
-        values = json.loads(path.read_text())
-    except ValueError as error:
-        raise ValueError(f"{path} is not JSON, or truncated: {error}") from None
-    if not isinstance(values, dict):
-        raise ValueError(f"{path} is not a JSON object")
-    return values
 
 
 def tensor_shapes(path: Path) -> Shapes:
@@ -84,6 +76,32 @@ def tensor_shapes(path: Path) -> Shapes:
             return {name: tuple(tensors.get_slice(name).get_shape()) for name in tensors.keys()}  # noqa: SIM118
     except SafetensorError as error:
         raise ValueError(f"{path} is truncated or no safetensors file: {error}") from None
+
+
+def check_finite(path: Path) -> None:
+    """No tensor of a safetensors file holds NaN or infinite values; one at a time is in memory.
+
+    Raises:
+        ValueError: names the file, the first such tensor, how many of its values are and where; or the file
+            is truncated or of another format.
+    """
+    advice = "; take a checkpoint from before, or train again"
+    try:
+        with safe_open(path, "pt") as tensors:
+            for name in tensors.keys():  # noqa: SIM118
+                values = tensors.get_tensor(name)
+                if not is_finite(values):
+                    values = _without_filling(values) if name.endswith(FILLED_WITH_INF) else values
+                    require_finite(values, f"{path}: {name}", advice)
+    except SafetensorError as error:
+        raise ValueError(f"{path} is truncated or no safetensors file: {error}") from None
+
+
+def _without_filling(edges: Tensor) -> Tensor:
+    """(C, E) -> the same with 0 for what ends a row as inf, after at least two edges."""
+    is_filling = (edges == torch.inf).flip(1).cumprod(dim=1).flip(1).bool()
+    is_filling[:, :2] = False
+    return edges.masked_fill(is_filling, 0)
 
 
 def policy_class(folder: Path) -> type[PreTrainedPolicy]:

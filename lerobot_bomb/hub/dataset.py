@@ -1,14 +1,14 @@
 """What a dataset's folder says of itself, and how to evaluate on what it shows."""
 
-import json
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from lerobot_bomb.data.dataset_files import INFO_FILE
 from lerobot_bomb.data.growing import METADATA_FILE
+from lerobot_bomb.json_files import read_json
 from lerobot_bomb.schema import PROTOCOL_VERSION
 
-INFO_FILE = Path("meta") / "info.json"
 PUSHT_SOURCE = "pusht-zarr"
 
 Row = dict[str, Any]  # the fields of EpisodeResult
@@ -26,16 +26,12 @@ class DatasetFacts:
         """Of a dataset's folder.
 
         Raises:
-            ValueError: it holds no LeRobotDataset.
+            ValueError: it holds no LeRobotDataset, or a file that is not JSON.
         """
         if not (root / INFO_FILE).is_file():
             raise ValueError(f"{root} holds no {INFO_FILE}, so it is no LeRobotDataset")
         path = root / METADATA_FILE
-        try:
-            bomb = json.loads(path.read_text()) if path.is_file() else {}
-            return cls(json.loads((root / INFO_FILE).read_text()), bomb)
-        except json.JSONDecodeError as error:
-            raise ValueError(f"{root / 'meta'} holds a file that is not JSON: {error}") from error
+        return cls(read_json(root / INFO_FILE), read_json(path) if path.is_file() else {})
 
     @classmethod
     def find(cls, root: Path | str | None) -> "DatasetFacts | None":

@@ -11,7 +11,7 @@ from torch import Tensor
 
 from lerobot_bomb.adapters import base_commit, check_adapters, check_base
 from lerobot_bomb.hub.card import Checkpoint
-from lerobot_bomb.hub.checks import PROCESSORS, check_tensors, processor_files
+from lerobot_bomb.hub.checks import PROCESSORS, check_finite, check_tensors, processor_files
 from lerobot_bomb.hub.dataset import DatasetFacts
 from lerobot_bomb.hub.method import Method
 from lerobot_bomb.hub.names import is_hub_id
@@ -42,7 +42,7 @@ class HubPolicy:
         """As LeRobot's, but files are checked first; errors are a line that names the file.
 
         Raises:
-            ValueError: one is truncated, or weights or config are of another policy.
+            ValueError: one is truncated or not finite, or weights or config are of another policy.
             OSError: one is missing, or the Hub cannot be reached.
         """
         folder = Path(pretrained_name_or_path)
@@ -62,6 +62,7 @@ class HubPolicy:
         if not path.is_file():
             raise FileNotFoundError(f"{path.parent} holds no {path.name}, so it is no whole checkpoint")
         check_tensors(path, model)
+        check_finite(path)
         return _next(super())._load_as_safetensor(model, model_file, map_location, strict)
 
     def _validate_peft_config(self, peft_config: Any) -> None:

@@ -115,7 +115,8 @@ def _read_checkpoint(
     from lerobot_bomb.adapters import check_base
     from lerobot_bomb.checkpoint import parse_config
     from lerobot_bomb.hub.card import Checkpoint
-    from lerobot_bomb.hub.checks import ADAPTERS, check_config, check_weights, policy_class, read_json
+    from lerobot_bomb.hub.checks import ADAPTERS, check_config, check_weights, policy_class
+    from lerobot_bomb.json_files import read_json
 
     register_third_party_plugins()
     policy_type: Any = policy_class(folder)

@@ -7,6 +7,7 @@ from pathlib import Path
 from huggingface_hub import DatasetCardData, HfApi
 from huggingface_hub.errors import RevisionNotFoundError
 
+from lerobot_bomb.data.dataset_files import check_dataset
 from lerobot_bomb.data.growing import METADATA_FILE, check_repo_id
 from lerobot_bomb.flags import path_flag
 from lerobot_bomb.hub.dataset import DatasetFacts
@@ -33,7 +34,7 @@ def run_push_dataset(args: argparse.Namespace) -> int:
             f"{args.root} holds no {METADATA_FILE}, so lerobot-bomb did not write it; "
             "LeRobotDataset.push_to_hub publishes other datasets"
         )
-    check_frames(args.root, facts)
+    check_dataset(args.root)
     if not args.dry_run:
         check_token()
     files: dict[str, Path | bytes] = {
@@ -58,28 +59,6 @@ def run_push_dataset(args: argparse.Namespace) -> int:
 def _is_data(path: str) -> bool:
     """LeRobot reads every such file, so none may be left of a longer recording."""
     return path.split("/")[0] in FOLDERS
-
-
-def check_frames(root: Path, facts: DatasetFacts) -> None:
-    """The data's files are whole and hold the frames, and every camera has its videos.
-
-    Raises:
-        ValueError: names the file, or says how many frames there are.
-    """
-    from pyarrow import ArrowInvalid
-    from pyarrow.parquet import read_metadata
-
-    num_frames = 0
-    for path in sorted((root / "data").rglob("*.parquet")):
-        try:
-            num_frames += read_metadata(path).num_rows
-        except ArrowInvalid as error:
-            raise ValueError(f"{path} is truncated or no parquet file: {error}") from None
-    if num_frames != facts.info["total_frames"]:
-        raise ValueError(f"{root / 'data'} holds {num_frames} frames, not {facts.info['total_frames']}")
-    for name, feature in facts.info["features"].items():
-        if feature["dtype"] == "video" and not any((root / "videos" / name).rglob("*.mp4")):
-            raise ValueError(f"{root / 'videos' / name} holds no video")
 
 
 def dataset_card(repo_id: str, facts: DatasetFacts) -> str:

@@ -19,7 +19,7 @@ from torch import Tensor
 from lerobot_bomb.actions.grids import ActionGrids
 from lerobot_bomb.checkpoint import write_checkpoint
 from lerobot_bomb.flags import path_flag
-from lerobot_bomb.hub.checks import read_json
+from lerobot_bomb.json_files import read_json
 from lerobot_bomb.viewing.unfinished import check_new_folder
 from lerobot_bomb.vlm.paligemma import PaliGemmaPrompt
 from lerobot_bomb.vlm.tokenizer import load_tokenizer

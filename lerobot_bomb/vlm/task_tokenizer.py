@@ -4,6 +4,7 @@ It reads only the task; everything else of a prompt depends on a policy's config
 the policy.
 """
 
+import re
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -26,6 +27,7 @@ from lerobot_bomb.vlm.prompt import task_ids
 from lerobot_bomb.vlm.tokenizer import tokenizer_from_tensor, tokenizer_to_tensor
 
 MAX_KEPT_TASKS = 4096
+TOKENIZER_KEY = "tokenizer_json"
 
 
 @ProcessorStepRegistry.register("bomb_task_tokenizer")
@@ -41,6 +43,16 @@ class TaskTokenizerStep(ObservationProcessorStep):
     tokenizer: Tokenizer | None = field(default=None, repr=False)
     template: str = "{}"
     _ids: dict[str, Tensor] = field(default_factory=dict, init=False, repr=False)
+
+    def __post_init__(self) -> None:
+        if not isinstance(self.template, str) or re.findall(r"[{}]+", self.template) != ["{}"]:
+            raise ValueError(
+                f"template={self.template!r} must hold {{}} once, for the task, and no other brace"
+            )
+        if not isinstance(self.tokenizer, Tokenizer | None):
+            raise ValueError(
+                f"tokenizer={self.tokenizer!r} must be a Tokenizer; a checkpoint has it as state"
+            )
 
     def observation(self, observation: dict[str, Any]) -> dict[str, Any]:
         tasks = (self.transition.get(TransitionKey.COMPLEMENTARY_DATA) or {}).get("task")
@@ -69,10 +81,14 @@ class TaskTokenizerStep(ObservationProcessorStep):
         return {"template": self.template}
 
     def state_dict(self) -> dict[str, Tensor]:
-        return {} if self.tokenizer is None else {"tokenizer_json": tokenizer_to_tensor(self.tokenizer)}
+        return {} if self.tokenizer is None else {TOKENIZER_KEY: tokenizer_to_tensor(self.tokenizer)}
 
     def load_state_dict(self, state: dict[str, Tensor]) -> None:
-        self.tokenizer = tokenizer_from_tensor(state["tokenizer_json"])
+        if state.keys() != {TOKENIZER_KEY}:
+            raise ValueError(
+                f"the state of bomb_task_tokenizer must be {TOKENIZER_KEY!r} alone; it is {sorted(state)}"
+            )
+        self.tokenizer = tokenizer_from_tensor(state[TOKENIZER_KEY])
         self._ids.clear()
 
     def transform_features(

@@ -98,8 +98,17 @@ def tokenizer_to_tensor(tokenizer: Tokenizer) -> Tensor:
 
 
 def tokenizer_from_tensor(json_bytes: Tensor) -> Tokenizer:
-    """Inverse of `tokenizer_to_tensor`."""
-    return Tokenizer.from_str(json_bytes.cpu().numpy().tobytes().decode())
+    """Inverse of `tokenizer_to_tensor`.
+
+    Raises:
+        ValueError: it is no tokenizer, or not whole.
+    """
+    if json_bytes.dtype != torch.uint8 or json_bytes.ndim != 1:
+        raise ValueError(f"a tokenizer is uint8 (bytes,), not {json_bytes.dtype} {tuple(json_bytes.shape)}")
+    try:
+        return Tokenizer.from_str(json_bytes.cpu().numpy().tobytes().decode())
+    except Exception as error:  # of Rust, which has no class of its own
+        raise ValueError(f"the saved tokenizer cannot be read: {error}") from error
 
 
 def nano_tokenizer() -> Tokenizer:

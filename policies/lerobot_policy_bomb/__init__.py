@@ -8,5 +8,7 @@ import lerobot_policy_fdvla  # noqa: F401
 import lerobot_policy_spatialvla_grid  # noqa: F401
 import lerobot_policy_vla0_smol  # noqa: F401
 from lerobot_bomb.checkpoint_config import tell_config_errors
+from lerobot_bomb.hub.processor_files import check_saved_processors
 
 tell_config_errors()
+check_saved_processors()

@@ -6,6 +6,7 @@ from pathlib import Path
 import pytest
 import yaml
 
+from hub.dataset_damage import DATASET_DAMAGES
 from hub.server import TOKEN, LoopbackHub
 from lerobot_bomb.cli import main
 
@@ -80,44 +81,46 @@ def test_nothing_of_a_longer_recording_is_left(
     assert longer.keys() & repository.files().keys() == {"notes.txt"}
 
 
-def truncate_data(root: Path) -> None:
-    path = next((root / "data").rglob("*.parquet"))
-    path.write_bytes(path.read_bytes()[:-10])
+@pytest.fixture(scope="module")
+def filmed(tmp_path_factory: pytest.TempPathFactory) -> Callable[[Path], Path]:
+    """With videos in place of pictures, as most are."""
+    root = tmp_path_factory.mktemp("filmed") / "dataset"
+    flags = ["--episodes=2", "--seed=7", "--image_size=32"]
+    assert main(["record", f"--repo_id={REPO_ID}", f"--root={root}", *flags]) == 0
+    return lambda folder: copy(root, folder / "dataset")
 
 
-def remove_data(root: Path) -> None:
-    next((root / "data").rglob("*.parquet")).unlink()
-
-
-def remove_metadata(root: Path) -> None:
-    (root / "meta" / "bomb.json").unlink()
-
-
-def remove_info(root: Path) -> None:
-    (root / "meta" / "info.json").unlink()
-
-
-BROKEN = {
-    "is truncated or no parquet file": truncate_data,
-    "holds 0 frames, not": remove_data,
-    "so lerobot-bomb did not write it": remove_metadata,
-    "so it is no LeRobotDataset": remove_info,
-}
-
-
-@pytest.mark.parametrize("message", BROKEN)
+@pytest.mark.parametrize("message", DATASET_DAMAGES)
 def test_a_broken_dataset_is_refused_in_one_line_before_anything_is_sent(
     message: str,
     online: LoopbackHub,
-    recorded: Callable[[Path], Path],
+    filmed: Callable[[Path], Path],
     tmp_path: Path,
     capsys: pytest.CaptureFixture[str],
 ) -> None:
-    root = recorded(tmp_path)
-    BROKEN[message](root)
+    root = filmed(tmp_path)
+    DATASET_DAMAGES[message](root)
     assert push(root) == 1
     error = capsys.readouterr().err.strip()
     assert message in error
+    assert str(root) in error
     assert len(error.splitlines()) == 1
     assert TOKEN not in error
+    assert online.requests == []
+
+
+@pytest.mark.parametrize("name", ["", "../..", "a/b/c", "-x/y", "x", "a/b.git", "a/b--c", "mé/x", "me/x/"])
+def test_what_is_no_name_on_the_hub_is_refused_by_every_flag_that_takes_one(
+    name: str, online: LoopbackHub, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    for command in (
+        ["push", str(tmp_path)],
+        ["push-dataset", str(tmp_path)],
+        ["record", f"--root={tmp_path / 'new'}"],
+        ["convert", "pusht-zarr", str(tmp_path), f"--root={tmp_path / 'new'}"],
+    ):
+        assert main([*command, f"--repo_id={name}"]) == 1
+        error = capsys.readouterr().err.strip()
+        assert f"--repo_id={name!r} must have the form USER/NAME" in error, command
+        assert len(error.splitlines()) == 1
     assert online.requests == []
