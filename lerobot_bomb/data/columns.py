@@ -9,7 +9,7 @@ import pyarrow as pa
 from lerobot.datasets import LeRobotDatasetMetadata
 from lerobot.utils.constants import DEFAULT_FEATURES, HF_LEROBOT_HOME
 
-from lerobot_bomb.data.dataset_files import flat_numbers, read_parquet
+from lerobot_bomb.data.dataset_files import check_metadata, flat_numbers, read_parquet
 from lerobot_bomb.data.growing import check_repo_id
 
 EPISODE_INDEX = "episode_index"
@@ -21,6 +21,7 @@ def read_meta(repo_id: str, root: Path | None) -> LeRobotDatasetMetadata:
         check_repo_id(repo_id, "--dataset.repo_id")
     if root is not None and not (root / "meta" / "info.json").is_file():
         raise ValueError(f"--dataset.root={root} holds no meta/info.json, so it is no LeRobotDataset")
+    check_metadata(root or HF_LEROBOT_HOME / repo_id)
     try:
         return LeRobotDatasetMetadata(repo_id, root=root)
     except (OSError, ValueError) as error:

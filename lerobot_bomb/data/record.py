@@ -105,8 +105,8 @@ def run_record(args: argparse.Namespace) -> int:
     """Record as told; prints which episodes failed and where the dataset is."""
     flags = vars(args)
     recording = Recording(**{f.name: flags[f.name] for f in fields(Recording) if f.name in flags})
-    if args.workers < 1:
-        raise ValueError(f"--workers={args.workers} must be at least 1")
+    if not 1 <= args.workers <= recording.episodes:
+        raise ValueError(f"--workers={args.workers} must lie in 1..{recording.episodes} (--episodes)")
     root = args.root or default_root(recording.repo_id)
     with terminated_in_order():
         progress = record(recording, root, num_workers=args.workers, resume=args.resume)

@@ -17,6 +17,7 @@ from lerobot.utils.constants import ACTION
 
 from lerobot_bomb.checkpoint import read_config
 from lerobot_bomb.data.columns import dim_names, read_meta
+from lerobot_bomb.data.dataset_files import check_readable
 from lerobot_bomb.evaluation.measures import L1, Measure, measure, measure_l1
 from lerobot_bomb.evaluation.predictions import check_policy, load_dataset, load_policy, predict
 from lerobot_bomb.evaluation.splits import (
@@ -69,6 +70,7 @@ def run_offline_metrics(args: argparse.Namespace) -> int:
     _check_flags(args)
     config = read_config(args.policy_path, args.device)
     meta = read_meta(args.repo_id, args.root)
+    check_readable(meta.root)
     train_config = read_train_config(args.policy_path)
     check_policy(config, meta, train_config.get("rename_map") or {})
     split = _split(args, meta, train_config)
@@ -105,7 +107,7 @@ def _split(args: argparse.Namespace, meta: LeRobotDatasetMetadata, train_config:
             "trained on; name those to judge it by with --val_episodes"
         )
     train, validation = (
-        None if text is None else parse_episodes(flag, text)
+        None if text is None else parse_episodes(flag, text, meta.total_episodes)
         for flag, text in (("--train_episodes", args.train_episodes), ("--val_episodes", args.val_episodes))
     )
     split = make_split(meta.total_episodes, trained_episodes(train_config, meta), train, validation)
