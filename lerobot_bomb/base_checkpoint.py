@@ -8,7 +8,6 @@ import io
 from collections.abc import Sequence
 from contextlib import redirect_stderr
 from dataclasses import dataclass
-from pathlib import Path
 from typing import Any, cast
 
 import draccus
@@ -20,7 +19,7 @@ from lerobot.utils.random_utils import set_seed
 
 from lerobot_bomb.checkpoint import write_checkpoint
 from lerobot_bomb.data.columns import read_meta
-from lerobot_bomb.flags import FlagError
+from lerobot_bomb.flags import path_flag
 from lerobot_bomb.viewing.unfinished import check_new_folder
 
 PREFIX = "--policy."
@@ -42,8 +41,8 @@ def add_init_arguments(parser: argparse.ArgumentParser) -> None:
     add = parser.add_argument
     add("--dataset.repo_id", dest="repo_id", required=True, help="name of the dataset")
     root = "folder of the dataset (default: LeRobot's, $HF_LEROBOT_HOME/REPO_ID)"
-    add("--dataset.root", dest="root", type=Path, help=root)
-    add("--output", type=Path, required=True, help="new folder for the checkpoint")
+    add("--dataset.root", dest="root", type=path_flag, help=root)
+    add("--output", type=path_flag, required=True, help="new folder for the checkpoint")
     add("--seed", type=int, default=1000, help="of what has random weights (default: 1000, lerobot-train's)")
 
 
@@ -78,5 +77,4 @@ def parse_policy(flags: Sequence[str]) -> PreTrainedConfig:
     except SystemExit:
         raise ValueError(usage.getvalue().strip().splitlines()[-1].partition("error: ")[2]) from None
     except DecodingError as error:
-        cause = error.__cause__
-        raise ValueError(str(cause if isinstance(cause, FlagError) else error)) from None
+        raise ValueError(str(error)) from None

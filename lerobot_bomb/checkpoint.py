@@ -16,6 +16,7 @@ from lerobot.utils.device_utils import get_safe_torch_device, is_torch_device_av
 from lerobot.utils.import_utils import register_third_party_plugins
 
 from lerobot_bomb.adapters import check_adapters
+from lerobot_bomb.flags import path_flag
 from lerobot_bomb.hub.checks import PROCESSORS, processor_files
 from lerobot_bomb.hub.names import CONFIG
 from lerobot_bomb.hub.processor_files import check_states
@@ -85,8 +86,8 @@ def load_processors(config: PreTrainedConfig) -> tuple[Preprocessor, Postprocess
 def add_folder_arguments(parser: argparse.ArgumentParser, checkpoint: str, output: str) -> None:
     """Declare --policy.path, a checkpoint's folder, and --output, a new one."""
     path = f"folder of {checkpoint} that lerobot-train names pretrained_model"
-    parser.add_argument("--policy.path", dest="policy_path", type=Path, required=True, help=path)
-    parser.add_argument("--output", type=Path, required=True, help=output)
+    parser.add_argument("--policy.path", dest="policy_path", type=path_flag, required=True, help=path)
+    parser.add_argument("--output", type=path_flag, required=True, help=output)
 
 
 def write_checkpoint(

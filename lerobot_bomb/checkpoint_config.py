@@ -1,8 +1,10 @@
 """A checkpoint's config.json that cannot be read here: which version wrote it, and one line that says why."""
 
+import sys
 from collections.abc import Sequence
 from functools import wraps
 from pathlib import Path
+from types import TracebackType
 from typing import Any
 
 import draccus
@@ -44,9 +46,10 @@ draccus.encode.register(PackageVersion, str)
 
 
 def tell_config_errors() -> None:
-    """Let LeRobot's commands say in one line why they cannot read a checkpoint's config.
+    """Let LeRobot's commands say in one line why they cannot read a config.
 
     Their parser prints DecodingErrors, and turns others into `Couldn't instantiate class EvalPipelineConfig`.
+    lerobot-train reads a checkpoint's config only after it: Python then shows what nobody catches.
     """
     usual: Any = PreTrainedConfig.from_pretrained
 
@@ -62,4 +65,13 @@ def tell_config_errors() -> None:
             start = f"{pretrained_name_or_path}: its config.json cannot be read: "
             raise DecodingError((), start + str(error)) from error
 
+    show: Any = sys.excepthook
+
+    def show_uncaught(kind: type[BaseException], error: BaseException, trace: TracebackType | None) -> None:
+        if isinstance(error, DecodingError):
+            print(f"error: {error}", file=sys.stderr)
+        else:
+            show(kind, error, trace)
+
+    sys.excepthook = show_uncaught
     PreTrainedConfig.from_pretrained = classmethod(from_pretrained)  # pyright: ignore[reportAttributeAccessIssue]

@@ -5,6 +5,8 @@ import importlib
 import sys
 from collections.abc import Sequence
 
+from draccus.utils import DecodingError
+
 from lerobot_bomb import __version__
 
 DESCRIPTION = "What lerobot-train and lerobot-eval do not do for BOMB: record, summarise, check."
@@ -62,7 +64,7 @@ def _function(command: str) -> str:
 
 
 def main(argv: Sequence[str] | None = None) -> int:
-    """Run one command; a ValueError, OSError or RuntimeError becomes one line on stderr and exit code 1."""
+    """Run one command; what is wrong with its flags or files becomes one line on stderr and exit code 1."""
     argv = sys.argv[1:] if argv is None else list(argv)
     argv = argv or ["--help"]
     parser = argparse.ArgumentParser(prog="lerobot-bomb", description=DESCRIPTION)
@@ -81,7 +83,7 @@ def main(argv: Sequence[str] | None = None) -> int:
         elif unknown:
             commands.choices[args.command].error(f"unrecognized arguments: {' '.join(unknown)}")
         return getattr(modules[args.command], f"run_{_function(args.command)}")(args)
-    except (ValueError, OSError, RuntimeError) as error:
+    except (ValueError, OSError, RuntimeError, DecodingError) as error:
         print(f"lerobot-bomb {argv[0]}: {error}", file=sys.stderr)
         return 1
     except KeyboardInterrupt:

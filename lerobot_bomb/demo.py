@@ -8,6 +8,7 @@ from pathlib import Path
 
 from lerobot_bomb.commands import run_command
 from lerobot_bomb.evaluation.results import read_results, summarise
+from lerobot_bomb.flags import path_flag
 
 REPO_ID = "demo/bomb_place"
 MAX_EVAL_BATCH = 10
@@ -41,7 +42,7 @@ The pages about libtorchcodec above are LeRobot's: without FFmpeg it reads video
 
 def add_demo_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the arguments of ``lerobot-bomb demo``."""
-    parser.add_argument("--output_dir", type=Path, help="new folder (default: outputs/demo/DATE_TIME)")
+    parser.add_argument("--output_dir", type=path_flag, help="new folder (default: outputs/demo/DATE_TIME)")
     parser.add_argument("--episodes", type=int, default=100, help="demonstrations to record (default: 100)")
     parser.add_argument("--steps", type=int, default=800, help="training steps (default: 800)")
     parser.add_argument("--eval_episodes", type=int, default=20, help="evaluation episodes (default: 20)")

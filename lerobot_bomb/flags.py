@@ -1,23 +1,31 @@
-"""What is wrong with a flag, said so that LeRobot's parser passes it on."""
+"""What is wrong with a flag: reads paths and choices; light, as the simulator's processes import it."""
 
-from collections.abc import Collection, Iterator
-from contextlib import contextmanager
+import argparse
+from collections.abc import Collection
+from pathlib import Path
 
 
-class FlagError(Exception):
-    """A config's flag has a value that is not allowed.
+def path_flag(text: str) -> Path:
+    """The path that a flag gives, for argparse; ~ is the home folder wherever it stands: --root=~/x.
 
-    Not a ValueError: LeRobot's parser replaces the text of a ValueError that a config raises.
+    Raises:
+        argparse.ArgumentTypeError: it is empty, of an unknown user, or not UTF-8.
     """
-
-
-@contextmanager
-def flag_errors() -> Iterator[None]:
-    """Raise the ValueErrors of a config's checks as FlagError."""
+    if not text:
+        raise argparse.ArgumentTypeError("a path must not be empty")
     try:
-        yield
-    except ValueError as error:
-        raise FlagError(str(error)) from None
+        text.encode()
+        return Path(text).expanduser()
+    except UnicodeEncodeError:
+        raise argparse.ArgumentTypeError(f"{text!a} is not UTF-8") from None
+    except RuntimeError:
+        raise argparse.ArgumentTypeError(f"{text}: this user has no home folder here") from None
+
+
+def check_link(flag: str, path: Path) -> None:
+    """Raise a ValueError if what a flag names as new is a link that leads nowhere."""
+    if path.is_symlink() and not path.exists():
+        raise ValueError(f"{flag}={path} is a link to {path.readlink()}, which does not exist; remove it")
 
 
 def one_of(flag: str, value: object, allowed: Collection) -> None:

@@ -10,9 +10,12 @@ from typing import Any
 
 from lerobot.optim import AdamWConfig, CosineDecayWithWarmupSchedulerConfig
 
+MAX_CHUNK_SIZE = 128_000  # positions of Qwen2.5-VL; LeRobot lists a chunk's frames before it builds a policy
+
 
 def check_model_name_and_precision(config: Any) -> None:
     """A backbone is named, and precision is left to ``dtype``."""
+    check_architecture(config)
     if not config.vlm_model_name:
         raise ValueError(
             "--policy.vlm_model_name is empty; give a Hub id, the path of a local folder, or nano"
@@ -24,12 +27,27 @@ def check_model_name_and_precision(config: Any) -> None:
         )
 
 
+def check_architecture(config: Any) -> None:
+    """What describes a checkpoint's backbone is whole: fields that no command line gives."""
+    if config.vlm_config is not None and not (config.vlm_config and config.prompt_tokens):
+        raise ValueError(
+            f"--policy.vlm_config={config.vlm_config}, --policy.prompt_tokens={config.prompt_tokens}: they "
+            "come together, with a checkpoint (--policy.path=FOLDER); leave them out to start from "
+            "--policy.vlm_model_name"
+        )
+
+
 def check_chunk(config: Any) -> None:
     """One observation step, and of a chunk's actions some are executed."""
     if config.n_obs_steps != 1:
         raise ValueError(f"--policy.n_obs_steps={config.n_obs_steps}: {config.type} reads 1 observation step")
     if config.chunk_size < 1:
         raise ValueError(f"--policy.chunk_size={config.chunk_size} must be at least 1")
+    if config.chunk_size > MAX_CHUNK_SIZE:
+        raise ValueError(
+            f"--policy.chunk_size={config.chunk_size} must be at most {MAX_CHUNK_SIZE}: no base model has "
+            "more positions, and an action takes at least one"
+        )
     if not 1 <= config.n_action_steps <= config.chunk_size:
         raise ValueError(
             f"--policy.n_action_steps={config.n_action_steps} must lie in 1..{config.chunk_size} "

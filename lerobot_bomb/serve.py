@@ -10,11 +10,11 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import fields
 from ipaddress import ip_address
-from pathlib import Path
 from typing import cast
 
 from lerobot_bomb._compat import serve_registered_policies
 from lerobot_bomb.data.growing import switch
+from lerobot_bomb.flags import path_flag
 
 try:
     from lerobot.async_inference.configs import PolicyServerConfig
@@ -44,7 +44,7 @@ def add_serve_arguments(parser: argparse.ArgumentParser) -> None:
     about = "allow a --host that other machines reach: they can use this server as you can"
     parser.add_argument("--allow_network", **switch(), help=about)
     about = "listen on this Unix socket, which only you can open, in place of a port"
-    parser.add_argument("--socket", type=Path, default=None, metavar="PATH", help=about)
+    parser.add_argument("--socket", type=path_flag, default=None, metavar="PATH", help=about)
 
 
 def run_serve(args: argparse.Namespace) -> int:

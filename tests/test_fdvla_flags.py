@@ -19,7 +19,7 @@ from fdvla_cases import (
     make_policy,
 )
 
-from lerobot_bomb.flags import FlagError
+from lerobot_bomb.flag_errors import FlagError
 from lerobot_bomb.policy_environment import ConfigWithEnvironment
 from lerobot_policy_fdvla.configuration_fdvla import FdvlaConfig
 
@@ -72,6 +72,8 @@ from lerobot_policy_fdvla.configuration_fdvla import FdvlaConfig
         ({"crop_fraction": 0.0}, r"--policy.crop_fraction=0.0 must lie in \(0, 1\]"),
         ({"use_amp": True}, "--policy.dtype=bfloat16 instead"),
         ({"n_obs_steps": 2}, "--policy.n_obs_steps=2"),
+        ({"vlm_config": {}}, "--policy.vlm_config={}, --policy.prompt_tokens=None: they come together"),
+        ({"chunk_size": 10**9}, "--policy.chunk_size=1000000000 must be at most 128000"),
     ],
 )
 def test_wrong_flags_are_told(options: dict[str, Any], message: str) -> None:
@@ -85,7 +87,6 @@ def test_wrong_flags_are_told(options: dict[str, Any], message: str) -> None:
         ({"chunk_size": 4096}, "and the model has 4096 positions; give a smaller --policy.chunk_size"),
         ({"has_state": False}, "--policy.use_state=true needs the feature 'observation.state'"),
         ({"cameras": ()}, "fdvla needs at least one camera"),
-        ({"vlm_config": {}}, "--policy.vlm_config is set, but not --policy.prompt_tokens"),
     ],
 )
 def test_what_cannot_be_built_is_told(options: dict[str, Any], message: str) -> None:

@@ -13,7 +13,7 @@ import pytest
 from lerobot_bomb import doctor
 from lerobot_bomb.evaluation.results import read_results
 from lerobot_bomb.expert import expert_action
-from lerobot_bomb.flags import FlagError
+from lerobot_bomb.flag_errors import FlagError
 from lerobot_bomb.schema import BOARD, EpisodeSpec, PrivilegedState, RenderOptions
 from lerobot_env_bomb import fetch_files
 from lerobot_env_bomb.configuration_bomb import BombEnvConfig

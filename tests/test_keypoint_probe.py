@@ -11,7 +11,7 @@ from lerobot_policy_keypoint_probe.modeling_keypoint_probe import KeypointEncode
 from lerobot_policy_keypoint_probe.processor_keypoint_probe import NUM_WORD_IDS, word_ids
 from torch import Tensor, nn
 
-from lerobot_bomb.flags import FlagError
+from lerobot_bomb.flag_errors import FlagError
 
 CAMERAS = ("observation.images.workspace", "observation.images.wrist")
 SIZE = 32  # pixels

@@ -33,7 +33,8 @@ CAP_DAC_OVERRIDE, CAP_DAC_READ_SEARCH = 1, 2
     [
         ("--episodes=0", "at least 1"),
         ("--episodes=-3", "at least 1"),
-        ("--workers=0", "at least 1"),
+        ("--workers=0", "must lie in 1.."),
+        ("--workers=1000000000", "must lie in 1.."),
         ("--repo_id=nobody", "USER/NAME"),
         ("--task=chess", "place"),
         ("--robot=ur5", "scara"),

@@ -10,7 +10,7 @@ from spatialvla_grid_cases import SIZE, WORKSPACE, WRIST, make_batch, make_confi
 from torch import Tensor, nn
 from torch.nn.functional import cross_entropy
 
-from lerobot_bomb.flags import FlagError
+from lerobot_bomb.flag_errors import FlagError
 from lerobot_policy_spatialvla_grid.modeling_spatialvla_grid import SpatialvlaGridPolicy
 
 PLAIN: dict[str, Any] = {"crop_fraction": 1.0}

@@ -27,13 +27,21 @@ def meta(tmp_path_factory: pytest.TempPathFactory) -> LeRobotDatasetMetadata:
     [("[180,181]", [180, 181]), ("8-11", [8, 9, 10, 11]), ("[5, 0-2]", [0, 1, 2, 5]), ("7", [7])],
 )
 def test_spellings_of_episodes(text: str, episodes: list[int]) -> None:
-    assert parse_episodes("--val_episodes", text) == episodes
+    assert parse_episodes("--val_episodes", text, num_episodes=200) == episodes
 
 
 @pytest.mark.parametrize("text", ["", "[]", "3-1", "a", "1..4", "-3", "[1,]"])
 def test_other_spellings_are_refused(text: str) -> None:
     with pytest.raises(ValueError, match="give numbers and ranges"):
-        parse_episodes("--val_episodes", text)
+        parse_episodes("--val_episodes", text, num_episodes=200)
+
+
+@pytest.mark.parametrize(("text", "last"), [("[2,4]", "4"), ("[0-99999999999]", "99999999999")])
+def test_episodes_that_do_not_exist_are_refused_before_a_range_fills_the_memory(text: str, last: str) -> None:
+    with pytest.raises(
+        ValueError, match=rf"--val_episodes=.*: the dataset has the episodes 0\.\.3, not {last}"
+    ):
+        parse_episodes("--val_episodes", text, num_episodes=4)
 
 
 @pytest.mark.parametrize(
@@ -57,8 +65,6 @@ def test_defaults_of_the_split(
     [
         (None, None, "none is held out; name some with --val_episodes"),
         ([0, 1], [1, 2], r"both name the episodes \[1\]"),
-        (None, [2, 4], r"--val_episodes: the dataset has the episodes 0\.\.3, not 4"),
-        ([9], None, r"--train_episodes: the dataset has the episodes 0\.\.3, not 9"),
     ],
 )
 def test_splits_that_are_refused(train: list[int] | None, validation: list[int] | None, message: str) -> None:

@@ -18,7 +18,7 @@ from tokenizers import Tokenizer
 from torch import Tensor
 from vla0_smol_cases import STATS, WRIST, make_batch, make_config, make_policy, raw_batch
 
-from lerobot_bomb.flags import FlagError
+from lerobot_bomb.flag_errors import FlagError
 from lerobot_bomb.vlm import task_tokenizer
 from lerobot_bomb.vlm.prompt import task_ids
 from lerobot_policy_vla0_smol import make_vla0_smol_pre_post_processors

@@ -5,7 +5,7 @@ from dataclasses import dataclass, field
 from lerobot.configs import NormalizationMode, PreTrainedConfig
 from lerobot.optim import AdamWConfig, CosineDecayWithWarmupSchedulerConfig
 
-from lerobot_bomb.flags import flag_errors
+from lerobot_bomb.flag_errors import flag_errors
 
 GROUP_CHANNELS = 8  # of the group normalisation
 

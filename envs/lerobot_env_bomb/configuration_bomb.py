@@ -12,7 +12,7 @@ from lerobot.utils.constants import ACTION, OBS_IMAGES, OBS_PREFIX, OBS_STATE
 
 from lerobot_bomb.camera_geometry import geometry_shapes
 from lerobot_bomb.environment import Environment
-from lerobot_bomb.flags import flag_errors
+from lerobot_bomb.flag_errors import flag_errors
 from lerobot_bomb.json_lines import check_appendable
 from lerobot_bomb.perturbations import NONE, Condition
 from lerobot_bomb.policy_environment import check_acting_policy

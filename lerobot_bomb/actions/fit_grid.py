@@ -7,7 +7,6 @@ import argparse
 import json
 from collections.abc import Callable
 from dataclasses import replace
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -23,7 +22,7 @@ from lerobot_bomb.actions.grid_settings import DECODE_POINTS, ActionGroup, GridS
 from lerobot_bomb.actions.grids import ActionGrids
 from lerobot_bomb.actions.relative import BOUND_STATISTICS, bounds
 from lerobot_bomb.data.columns import dim_names, read_columns, read_meta
-from lerobot_bomb.flags import one_of
+from lerobot_bomb.flags import one_of, path_flag
 from lerobot_bomb.tables import print_table
 from lerobot_bomb.viewing.grid_picture import Row, draw_rows
 from lerobot_bomb.viewing.unfinished import check_writable, written_whole
@@ -36,7 +35,7 @@ def add_fit_grid_arguments(parser: argparse.ArgumentParser) -> None:
     add, default = parser.add_argument, GridSettings(())
     add("--dataset.repo_id", dest="repo_id", required=True, help="name of the dataset")
     root = "folder of the dataset (default: LeRobot's, $HF_LEROBOT_HOME/REPO_ID)"
-    add("--dataset.root", dest="root", type=Path, help=root)
+    add("--dataset.root", dest="root", type=path_flag, help=root)
     groups = (
         """as JSON: '[{"dims": [0, 1], "transform": "identity", "bins": [64, 64]}, ...]' (default: by size)"""
     )
@@ -51,7 +50,7 @@ def add_fit_grid_arguments(parser: argparse.ArgumentParser) -> None:
     add("--policy.phi_fit", dest="phi_fit", default=default.phi_fit, help=phi_fit)
     mapping = """as JSON, of which ACTION is read: '{"ACTION": "QUANTILES"}' (default: MIN_MAX)"""
     add("--policy.normalization_mapping", dest="mapping", type=json_of(dict), default={}, help=mapping)
-    add("--picture", type=Path, help="also draw histograms with the edges into this file, as PNG")
+    add("--picture", type=path_flag, help="also draw histograms with the edges into this file, as PNG")
 
 
 def json_of(kind: type) -> Callable[[str], Any]:

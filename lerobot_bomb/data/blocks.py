@@ -7,6 +7,7 @@ written is lost. Blocks bound that loss to the episodes of one block, which are 
 import json
 import logging
 import os
+import shutil
 import tempfile
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager, nullcontext
@@ -83,7 +84,7 @@ def write_block(layout: DatasetLayout, root: Path, episodes: Iterable[Episode]) 
     """
     with (
         _quiet_libraries(),
-        _temporary_files_in(root.parent),
+        _temporary_files_beside(root),
         sampled_image_statistics(),
         without_statistics(layout.arrays),
         _logged_errors(),
@@ -108,7 +109,7 @@ def merge_blocks(layout: DatasetLayout, blocks: list[Path], root: Path) -> None:
     repo_ids = [layout.repo_id] * len(blocks)
     cache = datasets_cache(root.with_name(f"{root.name}.cache"))
     arrays = mergeable_arrays(layout.features) if layout.arrays else nullcontext()
-    with _quiet_libraries(), _temporary_files_in(root.parent), cache, arrays:
+    with _quiet_libraries(), _temporary_files_beside(root), cache, arrays:
         try:
             aggregate_datasets(
                 repo_ids,
@@ -137,14 +138,17 @@ def _quiet_libraries() -> Iterator[None]:
 
 
 @contextmanager
-def _temporary_files_in(folder: Path) -> Iterator[None]:
-    """Let LeRobot join videos here, not in the system's folder, where a kill would leave them."""
+def _temporary_files_beside(root: Path) -> Iterator[None]:
+    """Let LeRobot join videos beside a dataset, not in the system's folder, where a kill would leave them."""
     usual = tempfile.tempdir
+    folder = root.with_name(f"{root.name}.files")
+    folder.mkdir()
     tempfile.tempdir = str(folder)
     try:
         yield
     finally:
         tempfile.tempdir = usual
+        shutil.rmtree(folder, ignore_errors=True)
 
 
 @contextmanager

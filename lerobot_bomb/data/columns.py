@@ -9,7 +9,12 @@ import pyarrow as pa
 from lerobot.datasets import LeRobotDatasetMetadata
 from lerobot.utils.constants import DEFAULT_FEATURES, HF_LEROBOT_HOME
 
-from lerobot_bomb.data.dataset_files import INFO_FILE, check_dataset, flat_numbers, read_parquet
+from lerobot_bomb.data.dataset_files import (
+    INFO_FILE,
+    check_metadata,
+    flat_numbers,
+    read_parquet,
+)
 from lerobot_bomb.data.growing import check_repo_id
 from lerobot_bomb.hub_token import TokenError, refuse_unsendable_tokens
 
@@ -23,14 +28,12 @@ def read_meta(repo_id: str, root: Path | None) -> LeRobotDatasetMetadata:
         refuse_unsendable_tokens()
     if root is not None and not (root / INFO_FILE).is_file():
         raise ValueError(f"--dataset.root={root} holds no {INFO_FILE}, so it is no LeRobotDataset")
+    check_metadata(root or HF_LEROBOT_HOME / repo_id)
     try:
         return LeRobotDatasetMetadata(repo_id, root=root)
     except TokenError:
         raise
     except (OSError, ValueError) as error:
-        folder = root or HF_LEROBOT_HOME / repo_id
-        if (folder / INFO_FILE).is_file():
-            check_dataset(folder)  # which names the file
         if root is not None:
             raise
         raise ValueError(

@@ -6,6 +6,7 @@ Like a recording, the dataset grows in a folder beside its final place (see ``gr
 import argparse
 from collections.abc import Iterator
 from dataclasses import asdict, dataclass
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, ClassVar
 
@@ -13,18 +14,19 @@ from tqdm import tqdm
 
 from lerobot_bomb.data.growing import (
     BLOCK_EPISODES,
-    Progress,
     check_folders,
     check_repo_id,
     default_root,
     grow,
-    reached,
+    missing_blocks,
     switch,
     terminated_in_order,
     unfinished_folder,
     write_blocks,
 )
+from lerobot_bomb.data.kept_blocks import Progress, reached
 from lerobot_bomb.data.pusht_zarr import IMAGE_SIZE, PushtZarr
+from lerobot_bomb.flags import path_flag
 
 if TYPE_CHECKING:
     from lerobot_bomb.data.blocks import DatasetLayout, Episode
@@ -54,9 +56,13 @@ def add_convert_arguments(parser: argparse.ArgumentParser) -> None:
     sources = parser.add_subparsers(dest="source", required=True, metavar="SOURCE")
     summary = "the PushT demonstrations of Diffusion Policy, pusht_cchi_v7_replay.zarr"
     add = sources.add_parser("pusht-zarr", help=summary, description=f"Convert {summary}.").add_argument
-    add("path", type=Path, help="the folder of the zarr")
+    add("path", type=path_flag, help="the folder of the zarr")
     add("--repo_id", required=True, help="name of the dataset on the Hub, USER/NAME")
-    add("--root", type=Path, help="new folder of the dataset (default: LeRobot's, $HF_LEROBOT_HOME/REPO_ID)")
+    add(
+        "--root",
+        type=path_flag,
+        help="new folder of the dataset (default: LeRobot's, $HF_LEROBOT_HOME/REPO_ID)",
+    )
     add(
         "--task",
         default="",
@@ -102,16 +108,13 @@ def convert_pusht(path: Path, repo_id: str, root: Path, task: str = "", resume: 
 
 def _write_pusht(source: PushtZarr, conversion: Conversion, folder: Path) -> Progress:
     """Write the blocks that are missing."""
-    progress = reached(folder)
-    with tqdm(total=source.num_episodes, initial=progress.num_episodes, unit="episode") as bar:
-        write_blocks(
-            folder,
-            _pusht_layout(conversion.repo_id),
-            progress,
-            source.num_episodes,
-            lambda number: _pusht_episodes(source, conversion.task, number, progress, bar),
-        )
-    return progress
+    gaps = missing_blocks(folder, source.num_episodes)
+    num_kept = source.num_episodes - sum(gap.num_missing for gap in gaps)
+    with tqdm(total=source.num_episodes, initial=num_kept, unit="episode") as bar:
+        for gap in gaps:
+            episodes = partial(_pusht_episodes, source, conversion.task, bar)
+            write_blocks(folder, _pusht_layout(conversion.repo_id), gap, episodes)
+    return reached(folder)
 
 
 def _pusht_layout(repo_id: str) -> "DatasetLayout":
@@ -130,7 +133,7 @@ def _pusht_layout(repo_id: str) -> "DatasetLayout":
 
 
 def _pusht_episodes(
-    source: PushtZarr, task: str, number: int, progress: Progress, bar: tqdm
+    source: PushtZarr, task: str, bar: tqdm, progress: Progress, number: int
 ) -> "Iterator[Episode]":
     """Yield the next `number` episodes."""
     from lerobot.utils.constants import ACTION, OBS_IMAGE, OBS_STATE

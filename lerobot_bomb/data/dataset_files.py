@@ -1,6 +1,7 @@
 """Whether the files of a LeRobotDataset v3 are whole and agree with its metadata; imports no torch."""
 
 from collections.abc import Sequence
+from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
@@ -41,6 +42,33 @@ def check_dataset(root: Path) -> None:
         check_videos(root, info, episodes)
     except (OSError, ValueError) as error:
         raise ValueError(f"{error}; {WAY_OUT}") from error
+
+
+def check_metadata(root: Path) -> None:
+    """The files under meta/ can be read, whoever wrote them; of others' datasets no more can be expected.
+
+    Raises:
+        ValueError: names the one that is truncated.
+    """
+    for path in (root / INFO_FILE, root / STATISTICS_FILE):
+        if path.is_file():
+            read_json(path)
+    for path in (root / TASKS_FILE, *sorted((root / EPISODES_FOLDER).rglob("*.parquet"))):
+        if path.is_file():
+            read_parquet(path)
+
+
+def check_readable(root: Path) -> None:
+    """The tables of data and the videos that are here are whole; LeRobot downloads what is not.
+
+    Raises:
+        ValueError: names the file that is truncated.
+    """
+    for path in sorted((root / "data").rglob("*.parquet")):
+        read_parquet(path, ["index"])
+    info = read_info(root)
+    with suppress(FileNotFoundError):
+        check_videos(root, info, read_episodes(root, info))
 
 
 def read_info(root: Path) -> Info:

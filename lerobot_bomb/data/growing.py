@@ -3,24 +3,40 @@
 While it grows it is a folder, for a recording as follows:
     NAME.recording/recording.json   the parameters
     NAME.recording/block-00000/     a finished LeRobotDataset, and block.json: the progress up to its end
-The merged dataset appears under its name at once, complete.
+The merged dataset appears under its name at once, complete. What was lost or damaged in the meantime is
+made again (see ``kept_blocks.py``).
 """
 
 import argparse
 import errno
 import json
 import os
-import shutil
 import signal
 import sys
 from collections.abc import Callable, Iterator
 from contextlib import AbstractContextManager, contextmanager, suppress
-from dataclasses import asdict, dataclass, field, fields
+from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, ClassVar, Protocol
 
 from filelock import FileLock, Timeout
 from tqdm import tqdm
+
+from lerobot_bomb.data.kept_blocks import (
+    UNFINISHED,
+    Gap,
+    Progress,
+    block_path,
+    damaged_blocks,
+    find_gaps,
+    finish_block,
+    finished_blocks,
+    reached,
+    read_progress,
+    remove,
+    write_json,
+)
+from lerobot_bomb.flags import check_link
 
 if TYPE_CHECKING:
     from lerobot_bomb.data.blocks import DatasetLayout, Episode
@@ -28,7 +44,6 @@ if TYPE_CHECKING:
 BLOCK_EPISODES = 20  # what a kill can cost: they are played or written again on --resume
 LOCK_FILE = "lock"  # in the growing folder; a killed process releases it
 LOCK_TIMEOUT_S = 0.5  # a process that is refused holds the lock for a moment
-BLOCK_FILE = "block.json"  # in each block
 METADATA_FILE = Path("meta") / "bomb.json"  # in the dataset
 
 
@@ -40,19 +55,6 @@ class Parameters(Protocol):
     def to_dict(self) -> dict[str, Any]:
         """What its JSON reads back as; the keys are flags."""
         ...
-
-
-@dataclass
-class Progress:
-    """How far a dataset has grown."""
-
-    num_episodes: int = 0
-    num_frames: int = 0
-    failures: list[dict[str, Any]] = field(default_factory=list)  # [{"seed": ..., "failure": ...}]
-
-    @property
-    def num_tried(self) -> int:
-        return self.num_episodes + len(self.failures)
 
 
 def grow(
@@ -72,8 +74,8 @@ def grow(
     try:
         check_folders(parameters, root, folder, resume)
         if root.exists():
-            shutil.rmtree(folder, ignore_errors=True)  # left by a kill just after the last rename
-            return read_progress(root / METADATA_FILE)
+            remove_folder(folder)  # left by a kill just after the last rename
+            return _read_whole(root)
         lock = lock_folder(folder)
     except OSError as error:
         raise ValueError(f"--root={root} cannot be written: {error}") from error
@@ -91,33 +93,34 @@ def grow(
         except (KeyboardInterrupt, SystemExit):
             tqdm.write(f"--root={root}: stopped; {_keep_finished(folder)}", file=sys.stderr)
             raise
-        shutil.rmtree(folder, ignore_errors=True)  # the dataset is complete, whatever stays of this
+        remove_folder(folder)
     return progress
+
+
+def missing_blocks(folder: Path, num_episodes: int) -> list[Gap]:
+    """What a dataset of so many episodes still lacks; damaged blocks are deleted and named."""
+    for block, damage in damaged_blocks(folder, num_episodes, BLOCK_EPISODES).items():
+        tqdm.write(f"{block} {damage}; its episodes are made again", file=sys.stderr)
+        remove([block])
+    return find_gaps(folder, num_episodes, BLOCK_EPISODES)
 
 
 def write_blocks(
     folder: Path,
     layout: "DatasetLayout",
-    progress: Progress,
-    num_episodes: int,
-    next_episodes: Callable[[int], Iterator["Episode"]],
+    gap: Gap,
+    next_episodes: Callable[[Progress, int], Iterator["Episode"]],
 ) -> None:
-    """Write the missing blocks; `next_episodes` yields so many and counts them in `progress`."""
+    """Write the blocks of a gap; `next_episodes` yields so many and counts them in the progress."""
     from lerobot_bomb.data.blocks import write_block
 
-    while progress.num_episodes < num_episodes:
-        block = folder / f"block-{progress.num_episodes // BLOCK_EPISODES:05d}"
+    progress = gap.progress
+    while gap.num_missing:
+        block = block_path(folder, progress.num_episodes // BLOCK_EPISODES)
         unfinished = block.with_suffix(".tmp")
-        size = min(BLOCK_EPISODES, num_episodes - progress.num_episodes)
-        progress.num_frames += write_block(layout, unfinished, next_episodes(size))
-        write_json(unfinished / BLOCK_FILE, asdict(progress))
-        unfinished.rename(block)
-
-
-def reached(folder: Path) -> Progress:
-    """Progress up to the end of the last finished block."""
-    blocks = finished_blocks(folder)
-    return read_progress(blocks[-1] / BLOCK_FILE) if blocks else Progress()
+        size = min(BLOCK_EPISODES, gap.num_missing)
+        progress.num_frames += write_block(layout, unfinished, next_episodes(progress, size))
+        finish_block(unfinished, block, progress)
 
 
 @contextmanager
@@ -181,6 +184,7 @@ def check_folders(parameters: Parameters, root: Path, folder: Path, resume: bool
         OSError: the folder cannot be written.
     """
     kind = parameters.kind
+    check_link("--root", root)
     if not resume:
         if root.exists():
             raise ValueError(f"--root={root} exists already; name a folder that does not exist yet")
@@ -235,31 +239,22 @@ def lock_folder(folder: Path) -> AbstractContextManager[object]:
 
 
 def remove_unfinished(folder: Path) -> None:
-    """Leave only finished blocks, the parameters and the lock."""
-    kept = {folder / LOCK_FILE, parameters_file(folder), *finished_blocks(folder)}
-    for path in set(folder.iterdir()) - kept:
-        if path.is_dir():
-            shutil.rmtree(path, ignore_errors=True)
-        else:
-            path.unlink(missing_ok=True)
+    """Leave the finished blocks, the parameters, the lock, and files that are not ours."""
+    ours = [path for path in folder.iterdir() if UNFINISHED.fullmatch(path.name)]
+    remove([*ours, parameters_file(folder).with_suffix(".tmp")])
 
 
-def finished_blocks(folder: Path) -> list[Path]:
-    """Folders of the blocks that --resume keeps, in order."""
-    return sorted(path for path in folder.glob("block-*") if path.suffix != ".tmp")
-
-
-def read_progress(path: Path) -> Progress:
-    """Progress from a file of either kind."""
-    values = json.loads(path.read_text())
-    return Progress(**{f.name: values[f.name] for f in fields(Progress)})
-
-
-def write_json(path: Path, values: dict[str, Any]) -> None:
-    """Write a file that is complete whenever it exists."""
-    unfinished = path.with_suffix(".tmp")
-    unfinished.write_text(json.dumps(values, indent=1))
-    unfinished.replace(path)
+def remove_folder(folder: Path) -> None:
+    """Delete all that is ours in a folder, and the folder unless it then holds something."""
+    if not folder.exists():
+        return
+    remove_unfinished(folder)
+    remove([*finished_blocks(folder), parameters_file(folder), folder / LOCK_FILE])
+    try:
+        folder.rmdir()
+    except OSError:
+        left = ", ".join(sorted(path.name for path in folder.iterdir()))
+        tqdm.write(f"{folder} stays: it holds {left}", file=sys.stderr)
 
 
 def _publish(
@@ -271,14 +266,38 @@ def _publish(
     dataset = folder / "dataset"
     merge_blocks(layout, finished_blocks(folder), dataset)
     write_json(dataset / METADATA_FILE, {parameters.kind: parameters.to_dict(), **asdict(progress)})
+    _read_whole(dataset)
     dataset.rename(root)
+
+
+def _read_whole(dataset: Path) -> Progress:
+    """What was made, which all of a dataset's files hold.
+
+    Raises:
+        RuntimeError: names the file that is damaged, or what differs.
+    """
+    from lerobot_bomb.data.dataset_files import check_dataset, read_info
+
+    progress = read_progress(dataset / METADATA_FILE)
+    try:
+        check_dataset(dataset)
+        info = read_info(dataset)
+    except ValueError as error:
+        raise RuntimeError(str(error)) from error
+    for name in ("episodes", "frames"):
+        made, found = getattr(progress, f"num_{name}"), info[f"total_{name}"]
+        if made != found:
+            raise RuntimeError(f"{dataset} holds {found} {name}, but {made} were made")
+    return progress
 
 
 def _keep_finished(folder: Path) -> str:
     """Delete what is unfinished, which gives a full disk its space back; return what is kept."""
     remove_unfinished(folder)
-    num_episodes = reached(folder).num_episodes
-    if not num_episodes:
-        shutil.rmtree(folder, ignore_errors=True)
+    blocks = finished_blocks(folder)
+    if not blocks:
+        remove_folder(folder)
         return "no block of episodes was finished, so nothing is kept"
-    return f"{num_episodes} episodes are kept in {folder}, go on with --resume"
+    num_episodes = reached(folder).num_episodes
+    num_missing = sum(gap.num_missing for gap in find_gaps(folder, num_episodes, BLOCK_EPISODES))
+    return f"{num_episodes - num_missing} episodes are kept in {folder}, go on with --resume"

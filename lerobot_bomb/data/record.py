@@ -8,6 +8,7 @@ import argparse
 import re
 from collections.abc import Iterable, Iterator
 from dataclasses import fields
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -15,17 +16,18 @@ from tqdm import tqdm
 
 from lerobot_bomb.data.growing import (
     BLOCK_EPISODES,
-    Progress,
     default_root,
     grow,
-    reached,
+    missing_blocks,
     switch,
     terminated_in_order,
     write_blocks,
 )
+from lerobot_bomb.data.kept_blocks import Progress, reached
 from lerobot_bomb.data.recording import Recording, recorder_flags
 from lerobot_bomb.data.rollout import Expert, Rollout, RolloutPool, RolloutSettings, make_env
 from lerobot_bomb.expert import expert_action
+from lerobot_bomb.flags import path_flag
 from lerobot_bomb.perturbations import NONE
 from lerobot_bomb.schema import (
     CONTROL_MODES,
@@ -48,7 +50,11 @@ def add_record_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the arguments of ``lerobot-bomb record``."""
     add = parser.add_argument
     add("--repo_id", required=True, help="name of the dataset on the Hub, USER/NAME")
-    add("--root", type=Path, help="new folder of the dataset (default: LeRobot's, $HF_LEROBOT_HOME/REPO_ID)")
+    add(
+        "--root",
+        type=path_flag,
+        help="new folder of the dataset (default: LeRobot's, $HF_LEROBOT_HOME/REPO_ID)",
+    )
     add("--episodes", type=int, required=True, help="successful episodes to record")
     add("--seed", type=int, default=0, help="seed of the first episode; the others count up (default: 0)")
     add_episode_arguments(parser)
@@ -99,8 +105,8 @@ def run_record(args: argparse.Namespace) -> int:
     """Record as told; prints which episodes failed and where the dataset is."""
     flags = vars(args)
     recording = Recording(**{f.name: flags[f.name] for f in fields(Recording) if f.name in flags})
-    if args.workers < 1:
-        raise ValueError(f"--workers={args.workers} must be at least 1")
+    if not 1 <= args.workers <= recording.episodes:
+        raise ValueError(f"--workers={args.workers} must lie in 1..{recording.episodes} (--episodes)")
     root = args.root or default_root(recording.repo_id)
     with terminated_in_order():
         progress = record(recording, root, num_workers=args.workers, resume=args.resume)
@@ -150,28 +156,24 @@ def describe_failures(failures: list[dict[str, Any]]) -> str:
 
 def _record_blocks(recording: Recording, folder: Path, num_workers: int, expert: Expert) -> Progress:
     """Write the blocks that are missing."""
-    progress = reached(folder)
-    if progress.num_episodes == recording.episodes:
-        return progress
+    gaps = missing_blocks(folder, recording.episodes)
+    if not gaps:
+        return reached(folder)
     # MuJoCo's backend is chosen here, or its absence reported; the workers inherit the choice
     with recorder_flags():
         for spec in recording.conditions:
             make_env(spec, recording.render_options).close()
     settings = RolloutSettings(recording.render_options, recording.noise, expert)
-    with RolloutPool(settings, recording.specs(progress.num_tried), num_workers) as pool:
-        layout = _layout(recording)  # takes seconds, in which the workers play
-        with tqdm(total=recording.episodes, initial=progress.num_episodes, unit="episode") as bar:
-            write_blocks(
-                folder,
-                layout,
-                progress,
-                recording.episodes,
-                lambda number: _successes(pool, number, progress, bar),
-            )
-    return progress
+    num_kept = recording.episodes - sum(gap.num_missing for gap in gaps)
+    with tqdm(total=recording.episodes, initial=num_kept, unit="episode") as bar:
+        for gap in gaps:
+            with RolloutPool(settings, recording.specs(gap.progress.num_tried), num_workers) as pool:
+                layout = _layout(recording)  # takes seconds, in which the workers play
+                write_blocks(folder, layout, gap, partial(_successes, pool, bar))
+    return reached(folder)
 
 
-def _successes(pool: Iterable[Rollout], number: int, progress: Progress, bar: tqdm) -> "Iterator[Episode]":
+def _successes(pool: Iterable[Rollout], bar: tqdm, progress: Progress, number: int) -> "Iterator[Episode]":
     """Yield so many successful rollouts; note the failed ones on the way."""
     from lerobot_bomb.data.rollout_dataset import rollout_episode
 

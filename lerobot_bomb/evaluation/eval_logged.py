@@ -12,11 +12,13 @@ from pathlib import Path
 from typing import Any, cast
 
 import numpy as np
+from draccus.utils import DecodingError
 from gymnasium.vector import VectorEnv
 from lerobot.envs import EnvConfig
 
 from lerobot_bomb._compat import lerobot_eval_with
 from lerobot_bomb.evaluation.executed import append_episode
+from lerobot_bomb.flags import path_flag
 from lerobot_bomb.viewing.unfinished import check_writable
 
 type Envs = dict[str, dict[int, VectorEnv]]  # {group: {task id: vector env}}, as LeRobot has them
@@ -64,7 +66,9 @@ class LoggedVectorEnv:
 def add_eval_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the arguments of ``lerobot-bomb eval``."""
     parser.usage = "lerobot-bomb eval FILE --policy.path=... --env.type=... (all flags of lerobot-eval)"
-    parser.add_argument("path", type=Path, metavar="FILE", help="new file: a JSON line per finished episode")
+    parser.add_argument(
+        "path", type=path_flag, metavar="FILE", help="new file: a JSON line per finished episode"
+    )
     flags = "flags of lerobot-eval"
     rest = parser.add_argument("flags", nargs=argparse.REMAINDER, metavar="FLAG", help=flags)
     rest.required = False  # without FILE, argparse would ask for both
@@ -77,6 +81,8 @@ def run_eval(args: argparse.Namespace) -> int:
     check_writable("FILE", args.path)
     try:
         lerobot_eval_with(args.flags, partial(logged, args.path))
+    except DecodingError:
+        raise  # one line
     except Exception:
         traceback.print_exc()
         return 1

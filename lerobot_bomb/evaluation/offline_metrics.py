@@ -7,7 +7,6 @@ import argparse
 import json
 import sys
 from dataclasses import asdict, dataclass
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -18,6 +17,7 @@ from lerobot.utils.constants import ACTION
 
 from lerobot_bomb.checkpoint import read_config
 from lerobot_bomb.data.columns import dim_names, read_meta
+from lerobot_bomb.data.dataset_files import check_readable
 from lerobot_bomb.evaluation.measures import L1, Measure, measure, measure_l1
 from lerobot_bomb.evaluation.predictions import check_policy, load_dataset, load_policy, predict
 from lerobot_bomb.evaluation.splits import (
@@ -28,6 +28,7 @@ from lerobot_bomb.evaluation.splits import (
     trained_episodes,
 )
 from lerobot_bomb.evaluation.trivial import Demonstrations
+from lerobot_bomb.flags import path_flag
 from lerobot_bomb.tables import print_table
 from lerobot_bomb.viewing.unfinished import check_writable, written_whole
 
@@ -50,18 +51,18 @@ def add_offline_metrics_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the arguments of ``lerobot-bomb offline-metrics``."""
     add = parser.add_argument
     path = "folder of the checkpoint that lerobot-train names pretrained_model"
-    add("--policy.path", dest="policy_path", type=Path, required=True, help=path)
+    add("--policy.path", dest="policy_path", type=path_flag, required=True, help=path)
     add("--device", "--policy.device", help="cpu, cuda, ... (default: as the checkpoint says)")
     add("--dataset.repo_id", dest="repo_id", required=True, help="name of the dataset")
     root = "folder of the dataset (default: LeRobot's, $HF_LEROBOT_HOME/REPO_ID)"
-    add("--dataset.root", dest="root", type=Path, help=root)
+    add("--dataset.root", dest="root", type=path_flag, help=root)
     spelling = "episodes as [180,181], 180-205 or [0-9,20]"
     add("--train_episodes", help=f"{spelling} (default: what the checkpoint was trained on)")
     add("--val_episodes", help=f"{spelling} (default: all others)")
     frames = "frames of each split, evenly spaced; 0 = all of them (default: 500)"
     add("--max_frames", type=int, default=500, help=frames)
     add("--batch_size", type=int, default=16, help="frames that are decoded at once (default: 16)")
-    add("--json", type=Path, help="also write all figures to this file, those of every step too")
+    add("--json", type=path_flag, help="also write all figures to this file, those of every step too")
 
 
 def run_offline_metrics(args: argparse.Namespace) -> int:
@@ -69,6 +70,7 @@ def run_offline_metrics(args: argparse.Namespace) -> int:
     _check_flags(args)
     config = read_config(args.policy_path, args.device)
     meta = read_meta(args.repo_id, args.root)
+    check_readable(meta.root)
     train_config = read_train_config(args.policy_path)
     check_policy(config, meta, train_config.get("rename_map") or {})
     split = _split(args, meta, train_config)
@@ -105,7 +107,7 @@ def _split(args: argparse.Namespace, meta: LeRobotDatasetMetadata, train_config:
             "trained on; name those to judge it by with --val_episodes"
         )
     train, validation = (
-        None if text is None else parse_episodes(flag, text)
+        None if text is None else parse_episodes(flag, text, meta.total_episodes)
         for flag, text in (("--train_episodes", args.train_episodes), ("--val_episodes", args.val_episodes))
     )
     split = make_split(meta.total_episodes, trained_episodes(train_config, meta), train, validation)

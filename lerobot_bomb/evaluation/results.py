@@ -16,6 +16,7 @@ from lerobot_bomb.evaluation.result_groups import (
     what_old_lines_lack,
 )
 from lerobot_bomb.evaluation.result_lines import OLD_VERSION, Row, read_lines
+from lerobot_bomb.flags import path_flag
 from lerobot_bomb.perturbations import NONE
 from lerobot_bomb.schema import Failure
 from lerobot_bomb.stats import format_rate, mcnemar_p_value
@@ -100,7 +101,9 @@ def _pair_lines(group: Group, groups: list[Group]) -> list[str]:
 
 def add_results_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the arguments of ``lerobot-bomb results``."""
-    parser.add_argument("paths", nargs="+", type=Path, metavar="FILE", help="files of --env.results_path")
+    parser.add_argument(
+        "paths", nargs="+", type=path_flag, metavar="FILE", help="files of --env.results_path"
+    )
     parser.add_argument("--strict", action="store_true", help="a damaged line is an error, not a message")
 
 

@@ -8,7 +8,6 @@ import json
 import math
 import sys
 from dataclasses import asdict, dataclass, replace
-from pathlib import Path
 
 import numpy as np
 from lerobot.utils.constants import ACTION
@@ -16,6 +15,7 @@ from lerobot.utils.constants import ACTION
 from lerobot_bomb.data.columns import dim_names, read_meta
 from lerobot_bomb.evaluation.executed import Executed, executed_in_dataset, read_executed
 from lerobot_bomb.evaluation.measures import Measure
+from lerobot_bomb.flags import path_flag
 from lerobot_bomb.flow.smoothness import smoothness
 from lerobot_bomb.stats import paired_bootstrap_interval
 from lerobot_bomb.tables import print_table
@@ -62,14 +62,14 @@ def add_smoothness_arguments(parser: argparse.ArgumentParser) -> None:
     add = parser.add_argument
     add("--dataset.repo_id", dest="repo_id", required=True, help="name of the dataset, whose units count")
     root = "folder of the dataset (default: LeRobot's, $HF_LEROBOT_HOME/REPO_ID)"
-    add("--dataset.root", dest="root", type=Path, help=root)
+    add("--dataset.root", dest="root", type=path_flag, help=root)
     paths = "to compare with it: files of `lerobot-bomb eval`, folders of LeRobotDatasets"
-    add("paths", nargs="*", type=Path, metavar="PATH", help=paths)
+    add("paths", nargs="*", type=path_flag, metavar="PATH", help=paths)
     exclude = f"action dims that do not count, as x,y; empty: all count (default: all named {GRIPPER!r})"
     add("--exclude", type=lambda text: [name for name in text.split(",") if name], help=exclude)
     add("--per_second", action="store_true", help="differences per s^2 and s^3 instead of per step")
     add("--fps", type=float, help="actions a second (default: as each dataset and file says)")
-    add("--json", type=Path, help="also write all figures to this new file, those of every episode too")
+    add("--json", type=path_flag, help="also write all figures to this new file, those of every episode too")
 
 
 def run_smoothness(args: argparse.Namespace) -> int:

@@ -22,11 +22,11 @@ class Split:
     seen: list[int]
 
 
-def parse_episodes(flag: str, text: str) -> list[int]:
-    """'[180,181]', '180-205' or '[0-9,20]' -> sorted episode numbers, each once.
+def parse_episodes(flag: str, text: str, num_episodes: int) -> list[int]:
+    """'[180,181]', '180-205' or '[0-9,20]' -> sorted numbers of a dataset's episodes, each once.
 
     Raises:
-        ValueError: it is spelled otherwise.
+        ValueError: it is spelled otherwise, or an episode does not exist.
     """
     parts = [part.strip() for part in text.strip().removeprefix("[").removesuffix("]").split(",")]
     episodes: set[int] = set()
@@ -35,6 +35,8 @@ def parse_episodes(flag: str, text: str) -> list[int]:
         first, last = (int(match[1]), int(match[2] or match[1])) if match else (1, 0)
         if first > last:
             raise ValueError(f"{flag}={text}: give numbers and ranges, as [180,181], 180-205 or [0-9,20]")
+        if last >= num_episodes:  # before a range fills the memory
+            raise ValueError(f"{flag}={text}: the dataset has the episodes 0..{num_episodes - 1}, not {last}")
         episodes.update(range(first, last + 1))
     return sorted(episodes)
 
@@ -81,12 +83,8 @@ def make_split(
     """Default what was not asked for: train on what was trained on, validate on all that is left.
 
     Raises:
-        ValueError: an episode does not exist or is asked for in both, or no episode is held out.
+        ValueError: an episode is asked for in both, or no episode is held out.
     """
-    for flag, episodes in {"--train_episodes": train, "--val_episodes": validation}.items():
-        absent = [episode for episode in episodes or [] if episode >= num_episodes]
-        if absent:
-            raise ValueError(f"{flag}: the dataset has the episodes 0..{num_episodes - 1}, not {absent[0]}")
     known = set(trained or [])
     if train is None:
         train = sorted(known - set(validation or []))

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any
 
 from lerobot_bomb.data.growing import check_repo_id, switch
 from lerobot_bomb.evaluation.results import read_results
+from lerobot_bomb.flags import path_flag
 from lerobot_bomb.hub.dataset import DatasetFacts, Row, check_results
 from lerobot_bomb.hub.evaluated import check_weights_of
 from lerobot_bomb.hub.names import CONFIG, TO_PUBLISH, TRAIN_CONFIG, WEIGHTS, is_local_path
@@ -41,12 +42,12 @@ def add_push_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the arguments of ``lerobot-bomb push``."""
     add = parser.add_argument
     folder = "the folder that lerobot-train names pretrained_model"
-    add("checkpoint", type=Path, metavar="CHECKPOINT", help=folder)
+    add("checkpoint", type=path_flag, metavar="CHECKPOINT", help=folder)
     add_hub_arguments(parser, "model")
     add(
         "--results",
         nargs="+",
-        type=Path,
+        type=path_flag,
         default=[],
         metavar="RESULTS.jsonl",
         help="files that --env.results_path wrote for this checkpoint; the card states their rates",
@@ -54,7 +55,7 @@ def add_push_arguments(parser: argparse.ArgumentParser) -> None:
     add(
         "--dataset.root",
         dest="dataset_root",
-        type=Path,
+        type=path_flag,
         help="folder of the dataset, if it is no longer where the training found it; the card states what "
         "it shows",
     )

@@ -9,6 +9,7 @@ from huggingface_hub.errors import RevisionNotFoundError
 
 from lerobot_bomb.data.dataset_files import check_dataset
 from lerobot_bomb.data.growing import METADATA_FILE, check_repo_id
+from lerobot_bomb.flags import path_flag
 from lerobot_bomb.hub.dataset import DatasetFacts
 from lerobot_bomb.hub.markdown import command, fenced
 from lerobot_bomb.hub.push import CARD, add_hub_arguments
@@ -20,7 +21,7 @@ FOLDERS = ("meta", "data", "videos")
 def add_push_dataset_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the arguments of ``lerobot-bomb push-dataset``."""
     help = "folder that lerobot-bomb record or convert wrote"
-    parser.add_argument("root", type=Path, metavar="ROOT", help=help)
+    parser.add_argument("root", type=path_flag, metavar="ROOT", help=help)
     add_hub_arguments(parser, "dataset")
 
 

@@ -11,7 +11,7 @@ from tqdm import tqdm
 
 from lerobot_bomb.data.record import parse_numbers
 from lerobot_bomb.data.rollout import make_env
-from lerobot_bomb.flags import one_of
+from lerobot_bomb.flags import one_of, path_flag
 from lerobot_bomb.perturbations import ALL, AXES, MAX_LEVEL, NONE, NUISANCES
 from lerobot_bomb.schema import BOARD, CAMERAS, WORKSPACE_HIGH_M, WORKSPACE_LOW_M, EpisodeSpec, RenderOptions
 from lerobot_bomb.viewing.episode import expert_agent, play
@@ -37,11 +37,11 @@ def add_gallery_arguments(parser: argparse.ArgumentParser) -> None:
     add("--image_size", type=int, default=DEFAULT_TILE_SIZE, help="pixels of a tile (default: %(default)s)")
     add(
         "--output",
-        type=Path,
+        type=path_flag,
         default=DEFAULT_FOLDER,
         help="folder of the sheets, AXIS.jpg; those of the same names are replaced (default: %(default)s)",
     )
-    add("--doc", type=Path, help="also write the page that explains the axes, with their sheets")
+    add("--doc", type=path_flag, help="also write the page that explains the axes, with their sheets")
 
 
 def run_gallery(args: argparse.Namespace) -> int:

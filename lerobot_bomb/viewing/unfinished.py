@@ -6,15 +6,19 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
+from lerobot_bomb.flags import check_link
+
 
 def check_writable(flag: str, path: Path) -> None:
     """Raise a ValueError unless a file can be made at the path that a flag gives."""
+    check_link(flag, path)
     if path.is_dir() or not os.access(path.parent, os.W_OK):
         raise ValueError(f"{flag}={path} cannot be written; give a file in a folder that exists")
 
 
 def check_new_folder(flag: str, path: Path) -> None:
     """Raise a ValueError if there is something at the path that a flag gives."""
+    check_link(flag, path)
     if path.exists():
         raise ValueError(f"{flag}={path} exists already; name a new folder or delete it")
 

@@ -13,6 +13,7 @@ from lerobot_bomb.data.growing import switch
 from lerobot_bomb.data.record import add_episode_arguments, parse_conditions, parse_numbers
 from lerobot_bomb.data.rollout import make_env
 from lerobot_bomb.episode_result import EpisodeResult
+from lerobot_bomb.flags import path_flag
 from lerobot_bomb.perturbations import NONE, Condition
 from lerobot_bomb.schema import BOARD, COLORS, EpisodeSpec, RenderOptions
 from lerobot_bomb.viewing.episode import Agent, expert_agent, play, random_agent
@@ -27,7 +28,7 @@ def add_view_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the arguments of ``lerobot-bomb view``."""
     add = parser.add_argument
     add("--policy", help=f"who acts: {' or '.join(POLICIES)} (default: expert)")
-    add("--policy.path", dest="policy_path", type=Path, help="who acts: the checkpoint in this folder")
+    add("--policy.path", dest="policy_path", type=path_flag, help="who acts: the checkpoint in this folder")
     add("--policy.device", dest="policy_device", help="cpu, cuda, ... (default: as the checkpoint says)")
     add(
         "--policy.ignore_environment",
@@ -50,7 +51,7 @@ def add_view_arguments(parser: argparse.ArgumentParser) -> None:
     add("--color", help=f"{' or '.join(COLORS)} (default: drawn)")
     add(
         "--output",
-        type=Path,
+        type=path_flag,
         help="the files' path without .rrd and .mp4, or a folder that exists (default: in "
         f"{DEFAULT_FOLDER}, named after episode and policy)",
     )

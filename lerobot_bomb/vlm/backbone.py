@@ -22,6 +22,7 @@ from transformers import (
 )
 
 from lerobot_bomb.finite import require_finite_weights
+from lerobot_bomb.vlm.memory import check_memory
 from lerobot_bomb.vlm.presets import INITIALIZER_RANGE, nano_config
 from lerobot_bomb.vlm.tokenizer import NANO, hub_file, load_tokenizer
 
@@ -167,6 +168,7 @@ def spread_filters(filters: Tensor) -> None:
 
 def build_backbone(vlm_config: dict[str, Any]) -> SmolVLMBackbone:
     """Backbone of the given architecture with random weights in float32."""
+    check_memory(vlm_config, lambda: SmolVLMForConditionalGeneration(SmolVLMConfig(**vlm_config)))
     config = SmolVLMConfig(**vlm_config)
     set_float32(config, config.text_config, config.vision_config)
     return SmolVLMBackbone(SmolVLMForConditionalGeneration(config))

@@ -18,6 +18,7 @@ from torch import Tensor
 
 from lerobot_bomb.actions.grids import ActionGrids
 from lerobot_bomb.checkpoint import write_checkpoint
+from lerobot_bomb.flags import path_flag
 from lerobot_bomb.hub.checks import check_finite
 from lerobot_bomb.json_files import read_json
 from lerobot_bomb.viewing.unfinished import check_new_folder
@@ -40,9 +41,13 @@ RENAMED = {
 def add_convert_spatialvla_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the arguments of ``lerobot-bomb convert-spatialvla``."""
     add = parser.add_argument
-    add("folder", type=Path, help="folder with config.json, processor_config.json, tokenizer.json, weights")
-    add("--output", type=Path, required=True, help="new folder for the checkpoint")
-    add("--grid", type=Path, required=True, help="the grid's gs_*.json")
+    add(
+        "folder",
+        type=path_flag,
+        help="folder with config.json, processor_config.json, tokenizer.json, weights",
+    )
+    add("--output", type=path_flag, required=True, help="new folder for the checkpoint")
+    add("--grid", type=path_flag, required=True, help="the grid's gs_*.json")
     min_sigma = "least sigma that the grid was made with (default: 0.5, as in the published pretraining)"
     add("--min_sigma", type=float, default=0.5, help=min_sigma)
     add("--statistics", required=True, help="which of the folder's data sets says how actions are scaled")

@@ -16,6 +16,7 @@ from transformers import PaliGemmaConfig, PaliGemmaForConditionalGeneration
 from lerobot_bomb.actions.text import END, SYMBOL_TEXTS
 from lerobot_bomb.finite import require_finite_weights
 from lerobot_bomb.vlm.backbone import read_vlm_config, set_float32, spread_pictures, weights_errors
+from lerobot_bomb.vlm.memory import check_memory
 from lerobot_bomb.vlm.presets import nano_paligemma_config
 from lerobot_bomb.vlm.tokenizer import IMAGE_TOKEN, NANO, load_tokenizer, single_id, token_ids
 
@@ -144,10 +145,11 @@ def load_paligemma(vlm_model_name: str) -> PaliGemmaBackbone:
 
 def build_paligemma(vlm_config: dict[str, Any]) -> PaliGemmaBackbone:
     """Backbone of the given architecture with random weights in float32."""
+    model: Any = PaliGemmaForConditionalGeneration
+    check_memory(vlm_config, lambda: model(PaliGemmaConfig(**vlm_config)))
     config = PaliGemmaConfig(**vlm_config)
     text_config: Any = config.text_config
     set_float32(config, text_config, config.vision_config)
-    model: Any = PaliGemmaForConditionalGeneration
     return PaliGemmaBackbone(model._from_config(config, attn_implementation=_attention(text_config)))
 
 

@@ -21,6 +21,7 @@ from transformers.utils.constants import OPENAI_CLIP_MEAN, OPENAI_CLIP_STD
 
 from lerobot_bomb.finite import require_finite_weights
 from lerobot_bomb.vlm.backbone import read_vlm_config, set_float32, spread_filters, weights_errors
+from lerobot_bomb.vlm.memory import check_memory
 from lerobot_bomb.vlm.presets import nano_qwen_config
 from lerobot_bomb.vlm.tokenizer import (
     IMAGE_EDGE_TOKEN,
@@ -261,7 +262,8 @@ def load_qwen(vlm_model_name: str, image_size: int) -> QwenBackbone:
 
 def build_qwen(vlm_config: dict[str, Any], image_size: int) -> QwenBackbone:
     """Backbone of the given architecture with random weights in float32."""
+    model: Any = Qwen2_5_VLForConditionalGeneration
+    check_memory(vlm_config, lambda: model(Qwen2_5_VLConfig(**vlm_config)))
     config = Qwen2_5_VLConfig(**vlm_config)
     set_float32(config, config.text_config, config.vision_config)
-    model: Any = Qwen2_5_VLForConditionalGeneration
     return QwenBackbone(model._from_config(config, attn_implementation="sdpa"), image_size)

@@ -10,7 +10,8 @@ from lerobot.optim import AdamWConfig, CosineDecayWithWarmupSchedulerConfig
 from lerobot.policies.rtc import RTCConfig
 
 from lerobot_bomb.checkpoint_config import INSTALLED, PackageVersion
-from lerobot_bomb.flags import flag_errors, one_of
+from lerobot_bomb.flag_errors import flag_errors
+from lerobot_bomb.flags import one_of
 from lerobot_bomb.flow.losses import check_learning, check_objective
 from lerobot_bomb.flow.path import TIME_SAMPLINGS
 from lerobot_bomb.flow.samplers import check_heads, check_sampling

@@ -10,7 +10,8 @@ from lerobot.utils.constants import OBS_IMAGES
 from lerobot_bomb.actions.ensemble import WEIGHTINGS
 from lerobot_bomb.actions.grid_settings import ActionGroup, GridSettings, check_groups, default_groups
 from lerobot_bomb.checkpoint_config import INSTALLED, PackageVersion
-from lerobot_bomb.flags import flag_errors, one_of
+from lerobot_bomb.flag_errors import flag_errors
+from lerobot_bomb.flags import one_of
 from lerobot_bomb.policy_environment import ConfigWithEnvironment
 from lerobot_bomb.policy_flags import (
     adamw,

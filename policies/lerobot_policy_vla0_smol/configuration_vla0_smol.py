@@ -11,7 +11,8 @@ from lerobot_bomb.actions.ensemble import WEIGHTINGS
 from lerobot_bomb.actions.relative import named_dims
 from lerobot_bomb.actions.text import MASK_LEVELS, MAX_DIGITS, digits_needed
 from lerobot_bomb.checkpoint_config import INSTALLED, PackageVersion
-from lerobot_bomb.flags import flag_errors, one_of
+from lerobot_bomb.flag_errors import flag_errors
+from lerobot_bomb.flags import one_of
 from lerobot_bomb.policy_environment import ConfigWithEnvironment
 from lerobot_bomb.policy_flags import (
     adamw,

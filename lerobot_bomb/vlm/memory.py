@@ -1,0 +1,39 @@
+"""Whether a checkpoint's architecture fits into this machine's memory, asked before it is filled."""
+
+import os
+from collections.abc import Callable
+from typing import Any
+
+import torch
+from torch import nn
+
+GIB = 2**30
+
+
+def check_memory(vlm_config: dict[str, Any], build: Callable[[], nn.Module]) -> None:
+    """The model that `build` makes of a `vlm_config` has room in this machine's memory.
+
+    Raises:
+        ValueError: it has not, or there is no such model.
+    """
+    memory = os.sysconf("SC_PHYS_PAGES") * os.sysconf("SC_PAGE_SIZE")
+    try:
+        # layers are objects even on the device `meta`, so they are counted first
+        size = sum(_layers_size(vlm_config.get(part) or {}) for part in ("text_config", "vision_config"))
+        if size <= memory:
+            with torch.device("meta"), torch.random.fork_rng(devices=[]):
+                size = sum(weight.numel() * weight.element_size() for weight in build().parameters())
+    except Exception as error:
+        reason = " ".join(str(error).split())
+        raise ValueError(f"--policy.vlm_config describes no model: {reason}") from error
+    if size > memory:
+        raise ValueError(
+            f"--policy.vlm_config describes a model of at least {size / GIB:.0f} GiB, and this machine has "
+            f"{memory / GIB:.1f} GiB of memory"
+        )
+
+
+def _layers_size(config: dict[str, Any]) -> int:
+    """Bytes that the layers take at least, in float32: two projections each."""
+    num_layers = config.get("num_hidden_layers") or config.get("depth") or 0
+    return 4 * num_layers * 2 * config.get("hidden_size", 1) * config.get("intermediate_size", 1)

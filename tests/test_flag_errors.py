@@ -1,0 +1,82 @@
+"""What is wrong with a config is one line, wherever it was written."""
+
+import json
+import sys
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import pytest
+from draccus.utils import DecodingError
+from lerobot.utils.import_utils import register_third_party_plugins
+
+from lerobot_bomb import cli
+from lerobot_bomb.vlm.backbone import build_backbone
+from lerobot_bomb.vlm.paligemma import build_paligemma
+from lerobot_bomb.vlm.presets import nano_config, nano_paligemma_config, nano_qwen_config
+from lerobot_bomb.vlm.qwen import build_qwen
+from lerobot_bomb.vlm.tokenizer import NANO, load_tokenizer
+
+CONFIGS = {
+    "lerobot-eval": {"env": {"type": "bomb", "image_size": -3}},
+    "lerobot-train": {
+        "dataset": {"repo_id": "test/x"},
+        "policy": {"type": "vla0_smol", "chunk_size": 0, "device": "cpu"},
+    },
+}
+MESSAGES = {
+    "lerobot-eval": "--env.image_size=-3 must lie in 32..1024 pixels",
+    "lerobot-train": "--policy.chunk_size=0 must be at least 1",
+}
+
+
+@pytest.mark.parametrize("command", CONFIGS)
+def test_a_wrong_flag_in_a_config_file_is_one_line(
+    command: str, stock_cli: Callable[..., None], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    path = tmp_path / "config.json"
+    path.write_text(json.dumps(CONFIGS[command]))
+    with pytest.raises(SystemExit, match="1"):
+        stock_cli(command, f"--config_path={path}")
+    assert capsys.readouterr().err.strip().splitlines()[-1] == f"error: {MESSAGES[command]}"
+    if command == "lerobot-eval":
+        with pytest.raises(SystemExit, match="1"):
+            cli.main(["eval", str(tmp_path / "actions.jsonl"), f"--config_path={path}"])
+        assert capsys.readouterr().err.strip().splitlines()[-1] == f"error: {MESSAGES[command]}"
+
+
+def test_what_lerobots_parser_does_not_catch_is_one_line_too(capsys: pytest.CaptureFixture[str]) -> None:
+    """lerobot-train reads a checkpoint's config after its parser."""
+    register_third_party_plugins()
+    error = DecodingError((), "--policy.chunk_size=0 must be at least 1")
+    sys.excepthook(DecodingError, error, None)
+    assert capsys.readouterr().err == f"error: {error}\n"
+    sys.excepthook(KeyError, KeyError("other errors keep their traceback"), None)
+    assert "KeyError" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(
+    ("part", "name", "value", "message"),
+    [
+        ("text_config", "hidden_size", 10**9, "GiB, and this machine has"),
+        ("text_config", "num_hidden_layers", 10**9, "GiB, and this machine has"),
+        ("text_config", "vocab_size", 10**13, "GiB, and this machine has"),
+        ("text_config", "hidden_size", "wide", "describes no model"),
+    ],
+)
+@pytest.mark.parametrize(
+    ("config", "build"),
+    [
+        (nano_config, build_backbone),
+        (nano_paligemma_config, build_paligemma),
+        (nano_qwen_config, lambda vlm_config: build_qwen(vlm_config, 56)),
+    ],
+    ids=["smolvlm", "paligemma", "qwen"],
+)
+def test_a_model_that_no_machine_holds_is_refused_before_it_is_built(
+    part: str, name: str, value: Any, message: str, config: Callable, build: Callable
+) -> None:
+    vlm_config = json.loads(json.dumps(config(load_tokenizer(NANO))))
+    vlm_config[part][name] = value
+    with pytest.raises(ValueError, match=f"--policy.vlm_config describes .*{message}"):
+        build(vlm_config)

@@ -1,0 +1,134 @@
+"""Blocks of a growing dataset that were lost or damaged before --resume.
+
+Simulator workers import this file's head, so LeRobot is imported inside tests.
+"""
+
+import shutil
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+
+from lerobot_bomb import cli
+from lerobot_bomb.data import growing
+from lerobot_bomb.data.growing import METADATA_FILE, unfinished_folder
+from lerobot_bomb.data.record import record
+from lerobot_bomb.data.recording import Recording
+
+RECORDING = Recording("test/blocks", episodes=5, seed=3, image_size=32)
+FLAGS = ("--repo_id=test/blocks", "--episodes=5", "--seed=3", "--image_size=32")
+VIDEO = "videos/observation.images.wrist/chunk-000/file-000.mp4"
+
+
+@pytest.fixture(autouse=True)
+def small_blocks(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Blocks of 2 episodes, so that 5 take three."""
+    monkeypatch.setattr(growing, "BLOCK_EPISODES", 2)
+
+
+@pytest.fixture(scope="module")
+def recorded(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A folder with an uninterrupted recording, x, and what there was before its merge, x.recording."""
+    from lerobot_bomb.data import blocks
+
+    folder = tmp_path_factory.mktemp("blocks")
+    root = folder / "x"
+    merge = blocks.merge_blocks
+
+    def copy_and_merge(*args) -> None:
+        shutil.copytree(unfinished_folder(root), folder / "copy")
+        merge(*args)
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(growing, "BLOCK_EPISODES", 2)
+        patch.setattr(blocks, "merge_blocks", copy_and_merge)
+        record(RECORDING, root)
+    (folder / "copy").rename(unfinished_folder(root))
+    return folder
+
+
+def contents(root: Path) -> dict[str, bytes]:
+    return {str(path.relative_to(root)): path.read_bytes() for path in root.rglob("*") if path.is_file()}
+
+
+def halve(path: Path) -> None:
+    path.write_bytes(path.read_bytes()[: path.stat().st_size // 2])
+
+
+def test_lost_and_damaged_blocks_are_recorded_again_to_the_same_bytes(
+    recorded: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    root, folder = tmp_path / "x", tmp_path / "x.recording"
+    shutil.copytree(recorded / "x.recording", folder)
+    halve(folder / "block-00000" / VIDEO)
+    kept = (folder / "block-00001" / VIDEO).stat().st_mtime_ns
+    halve(folder / "block-00002" / "block.json")
+    (folder / "notes.txt").write_text("mine")
+    (folder / "block-by-hand").mkdir()
+    assert cli.main(["record", f"--root={root}", *FLAGS, "--resume"]) == 0
+    errors = capsys.readouterr().err
+    assert f"{folder}/block-00000 holds a damaged {VIDEO}; its episodes are made again" in errors
+    assert f"{folder}/block-00002 holds no block.json that can be read; its episodes are made again" in errors
+    assert "block-00001" not in errors
+    assert kept
+    assert contents(root) == contents(recorded / "x")
+    assert f"{folder} stays: it holds block-by-hand, notes.txt" in errors
+    assert sorted(path.name for path in folder.iterdir()) == ["block-by-hand", "notes.txt"]
+    assert (folder / "notes.txt").read_text() == "mine"
+
+
+def test_a_lost_block_between_others_is_missed(recorded: Path, tmp_path: Path) -> None:
+    folder = tmp_path / "x.recording"
+    shutil.copytree(recorded / "x.recording", folder)
+    (folder / "block-00001").rename(tmp_path / "lost")
+    assert growing.damaged_blocks(folder, 5, 2) == {folder / "block-00001": "is missing"}
+    (gap,) = growing.find_gaps(folder, 5, 2)
+    assert (gap.progress.num_episodes, gap.end, gap.num_missing) == (2, 4, 2)
+    shutil.copytree(folder / "block-00000", folder / "block-00001")
+    damage = {folder / "block-00001": "ends with episode 2 instead of 4"}
+    assert growing.damaged_blocks(folder, 5, 2) == damage
+
+
+def test_a_merge_that_loses_episodes_is_an_error_and_the_blocks_stay(
+    recorded: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    from lerobot_bomb.data import blocks
+
+    merge: Callable = blocks.merge_blocks
+    shutil.copytree(recorded / "x.recording", tmp_path / "x.recording")
+    monkeypatch.setattr(blocks, "merge_blocks", lambda layout, of, root: merge(layout, of[:-1], root))
+    with pytest.raises(RuntimeError, match=r"holds 4 episodes, but 5 were made; 5 episodes are kept"):
+        record(RECORDING, tmp_path / "x", resume=True)
+    assert not (tmp_path / "x").exists()
+
+
+@pytest.mark.parametrize("name", [VIDEO, "data/chunk-000/file-000.parquet", "meta/tasks.parquet"])
+def test_a_complete_recording_with_a_truncated_file_is_no_success(
+    name: str, recorded: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    root = tmp_path / "x"
+    shutil.copytree(recorded / "x", root)
+    halve(root / name)
+    assert cli.main(["record", f"--root={root}", *FLAGS, "--resume"]) == 1
+    (line,) = capsys.readouterr().err.strip().splitlines()
+    assert line.startswith(f"lerobot-bomb record: {root / name} is truncated")
+    assert (root / METADATA_FILE).exists()
+
+
+def test_a_link_that_leads_nowhere_is_refused_before_recording(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    (tmp_path / "x").symlink_to(tmp_path / "nowhere")
+    for resume in ([], ["--resume"]):
+        assert cli.main(["record", f"--root={tmp_path / 'x'}", *FLAGS, *resume]) == 1
+        assert f"--root={tmp_path / 'x'} is a link to {tmp_path}/nowhere" in capsys.readouterr().err
+    assert [path.name for path in tmp_path.iterdir()] == ["x"]
+
+
+def test_a_tilde_in_a_path_is_the_home_folder(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setenv("HOME", str(tmp_path))
+    (tmp_path / "x").mkdir()
+    assert cli.main(["record", "--root=~/x", *FLAGS]) == 1
+    assert f"--root={tmp_path}/x exists already" in capsys.readouterr().err
