@@ -149,7 +149,10 @@ def no_files(monkeypatch: pytest.MonkeyPatch) -> None:
 @pytest.mark.parametrize(
     ("lack", "message"),
     [
-        (mujoco_4, r"--env\.robot=fetch cannot .* MuJoCo 4\.0\.1: .* pip install 'mujoco<4'"),
+        (
+            mujoco_4,
+            r"--env\.robot=fetch cannot .* MuJoCo 4\.0\.1: .* below 4; .* `lerobot-bomb doctor` names",
+        ),
         (
             no_package,
             r"--env\.robot=fetch .* gymnasium-robotics, which is not installed .*MuJoCo [0-9.]+ .*pip",
