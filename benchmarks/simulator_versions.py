@@ -23,6 +23,7 @@ from collections.abc import Iterable
 from dataclasses import asdict, dataclass
 from itertools import product
 from pathlib import Path
+from typing import cast
 
 ROOT = Path(__file__).resolve().parents[1]
 SOURCE_ROOTS = (ROOT, ROOT / "envs")
@@ -112,7 +113,7 @@ def renderer_name() -> str:
 
     context = mujoco.GLContext(16, 16)
     context.make_current()
-    name = GL.glGetString(GL.GL_RENDERER).decode()
+    name = cast("bytes", GL.glGetString(GL.GL_RENDERER)).decode()
     context.free()
     return name
 

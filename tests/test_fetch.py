@@ -14,7 +14,7 @@ from lerobot_bomb import doctor
 from lerobot_bomb.evaluation.results import read_results
 from lerobot_bomb.expert import expert_action
 from lerobot_bomb.flag_errors import FlagError
-from lerobot_bomb.schema import BOARD, EpisodeSpec, PrivilegedState, RenderOptions
+from lerobot_bomb.schema import BOARD, EpisodeSpec, PrivilegedState, RenderOptions, action_bounds
 from lerobot_env_bomb import fetch_files
 from lerobot_env_bomb.configuration_bomb import BombEnvConfig
 from lerobot_env_bomb.env import BombEnv
@@ -89,10 +89,11 @@ def test_a_used_and_a_fresh_environment_give_the_same_bits(env: BombEnv) -> None
 
 def test_an_observation_lies_in_its_space_when_the_pads_scrape_over_the_board() -> None:
     env = BombEnv(EpisodeSpec(seed=3, robot="fetch", control_mode="absolute"), SMALL)
+    low, high = action_bounds("absolute")
     corners, openings_m = np.random.default_rng(3).random((30, 4)) < 0.5, []
     env.reset()
     for corner in corners:
-        observation, *_ = env.step(np.where(corner, env.action_space.low, env.action_space.high))
+        observation, *_ = env.step(np.where(corner, low, high))
         assert env.observation_space.contains(observation)
         openings_m.append(observation["agent_pos"][3])
     env.close()
@@ -148,7 +149,10 @@ def no_files(monkeypatch: pytest.MonkeyPatch) -> None:
 @pytest.mark.parametrize(
     ("lack", "message"),
     [
-        (mujoco_4, r"--env\.robot=fetch cannot .* MuJoCo 4\.0\.1: .* pip install 'mujoco<4'"),
+        (
+            mujoco_4,
+            r"--env\.robot=fetch cannot .* MuJoCo 4\.0\.1: .* below 4; .* `lerobot-bomb doctor` names",
+        ),
         (
             no_package,
             r"--env\.robot=fetch .* gymnasium-robotics, which is not installed .*MuJoCo [0-9.]+ .*pip",

@@ -81,7 +81,8 @@ print("status", status)
 
 def test_a_process_exits_silently_after_the_thread_that_drew() -> None:
     finished = run("""
-threading.Thread(target=make().reset).start()
+other = make()
+threading.Thread(target=other.reset).start()
 """)
     assert (finished.returncode, finished.stderr) == (0, "")
 

@@ -26,8 +26,8 @@ def fetch_xml() -> Path:
     if int(mujoco_version.split(".")[0]) >= FIRST_MUJOCO_WITHOUT_FETCH:
         raise ValueError(
             f"--env.robot=fetch cannot run with the installed MuJoCo {mujoco_version}: gymnasium-robotics' "
-            f"Fetch model needs MuJoCo 3; pip install 'mujoco<{FIRST_MUJOCO_WITHOUT_FETCH}' or choose "
-            "--env.robot=scara"
+            f"Fetch model needs a MuJoCo below {FIRST_MUJOCO_WITHOUT_FETCH}; install the one that "
+            "`lerobot-bomb doctor` names, or choose --env.robot=scara"
         )
     package = importlib.util.find_spec(PACKAGE)
     if package is None or package.origin is None:
