@@ -106,6 +106,7 @@ def test_a_policy_that_goes_on_with_other_data_is_of_their_environment(
 ) -> None:
     write(tmp_path, new_policy(policy_type, absolute))
     tuned = get_policy_class(policy_type).from_pretrained(tmp_path, dataset_meta=relative)
+    assert isinstance(tuned.config, ConfigWithEnvironment)
     assert tuned.config.environment == Environment("scara", "relative", 20, 64, CAMERAS, "1.0")
 
 
