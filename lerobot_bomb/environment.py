@@ -23,6 +23,7 @@ class Environment:
     # width and height of each camera in pixels
     image_size: int
     cameras: tuple[str, ...]
+    # TASK_VERSION, under the name that recordings have for it
     protocol_version: str
     task: str = "place"
     depth: bool = False
@@ -69,7 +70,7 @@ class Environment:
         names = [name for name in COMPARED if getattr(self, name) != getattr(other, name)]
         if not set(self.cameras) <= set(other.cameras):
             names.append("cameras")
-        if self._generation != other._generation:
+        if self.protocol_version != other.protocol_version:
             names.append("protocol_version")
         return names
 
@@ -91,11 +92,6 @@ class Environment:
         if "cameras" in values:
             values["cameras"] = "+".join(self.cameras)
         return ", ".join(f"{name}={value}" for name, value in values.items())
-
-    @property
-    def _generation(self) -> str:
-        """Of the protocol: what comes after its first number changes neither observations nor actions."""
-        return self.protocol_version.split(".")[0]
 
     def __str__(self) -> str:
         depth = " with depth" if self.depth else ""

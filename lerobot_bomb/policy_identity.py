@@ -20,8 +20,8 @@ from lerobot_bomb.hub.names import WEIGHTS
 PROCESSORS = ("policy_preprocessor*", "policy_postprocessor*")
 # in a config, but not of what the policy does
 NOT_ITS_SETTINGS = {
-    "device", "pretrained_path", "pretrained_revision", "package_version", "use_peft", "ignore_environment",
-    "push_to_hub", "repo_id", "private", "tags", "license",
+    "device", "pretrained_path", "pretrained_revision", "package_version", "use_peft",
+    "push_to_hub", "repo_id", "private", "tags", "license", "ignore_environment",
 }  # fmt: skip
 
 

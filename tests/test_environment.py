@@ -86,7 +86,6 @@ def test_another_environment_is_an_error_that_names_the_flags(change: dict[str, 
         {},
         {"depth": False},
         {"task_ids": (0,)},
-        {"protocol_version": "1.1"},
         {"cameras": ("workspace", "wrist", "top")},
     ],
 )

@@ -30,7 +30,8 @@ def commands(monkeypatch: pytest.MonkeyPatch, stock_cli: Callable[..., None]) ->
             assert "--policy.num_channels=8" in flags
             stock_cli(command, *flags)
         else:
-            stock_cli(command, *flags, "--env.fps=2", "--eval.batch_size=1")
+            short = ["--env.fps=2", "--env.ignore_checkpoint=true"]
+            stock_cli(command, *flags, *short, "--eval.batch_size=1")
 
     tiny = gate.Rung((), demonstrations=1, steps=2, bar=0.5)
     for name, value in {"run_command": run, "RUNGS": {"tiny": tiny}, "IMAGE_SIZE": SIZE}.items():

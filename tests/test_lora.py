@@ -15,10 +15,11 @@ from lerobot.policies import get_policy_class, make_policy
 from policy_cases import CASES
 from safetensors.torch import load_file
 
-from lerobot_bomb.checkpoint import read_config
+from lerobot_bomb.checkpoint import parse_config, read_config
 from lerobot_bomb.cli import main
 from lerobot_bomb.data.record import record
 from lerobot_bomb.data.recording import Recording
+from lerobot_bomb.hub.dataset import DatasetFacts
 
 peft = pytest.importorskip("peft")
 
@@ -131,10 +132,15 @@ def test_adapters_are_trained_resumed_and_evaluated_by_stock_commands(
     assert all(torch.equal(weights[1][name], tensor) for name, tensor in weights[0].items())
     assert json.loads((second / "config.json").read_text())["trained_batches"] == 2
     flags = f"--policy.path={second} --env.type=bomb --env.task=place --env.image_size=64 --env.fps=2"
-    flags += " --eval.n_episodes=1 --eval.batch_size=1 --eval.use_async_envs=false"
+    flags += (
+        " --env.ignore_checkpoint=true --eval.n_episodes=1 --eval.batch_size=1 --eval.use_async_envs=false"
+    )
     stock_cli("lerobot-eval", *flags.split(), f"--output_dir={tmp_path / 'eval'}")
     assert json.loads((tmp_path / "eval" / "eval_info.json").read_text())["overall"]["n_episodes"] == 1
     check_merged(second, tmp_path / "merged")
+    of_recording = DatasetFacts.read(dataset).environment
+    for folder in (tmp_path / "moved", second, tmp_path / "merged"):
+        assert getattr(parse_config(folder, "cpu"), "environment") == of_recording is not None  # noqa: B009
 
 
 def check_merged(adapters: Path, output: Path) -> None:

@@ -12,6 +12,7 @@ from lerobot_bomb.evaluation.results import read_results
 
 Run = Callable[..., None]
 REPO_ID = "test/bomb_place"
+SHORT = "--env.fps=2 --env.ignore_checkpoint=true"  # episodes of 20 steps, on recordings at 10 Hz
 
 
 @pytest.fixture(scope="module")
@@ -95,7 +96,7 @@ def test_random_actions_fail(stock_cli: Run, tmp_path: Path) -> None:
 def test_vla0_smol_trains_and_its_checkpoint_acts(stock_cli: Run, dataset: Path, tmp_path: Path) -> None:
     flags = "--policy.type=vla0_smol --policy.vlm_model_name=nano --steps=2"
     checkpoint = train(stock_cli, dataset, tmp_path / "train", flags)
-    flags = f"--policy.path={checkpoint} --env.fps=2 --eval.n_episodes=1 --eval.batch_size=1"
+    flags = f"--policy.path={checkpoint} {SHORT} --eval.n_episodes=1 --eval.batch_size=1"
     assert evaluate(stock_cli, tmp_path, flags)["overall"]["n_episodes"] == 1
     (row,) = read_results(tmp_path / "results.jsonl")
     assert row["is_success"] or row["failure"]
@@ -111,7 +112,7 @@ def test_a_trained_policy_cannot_see_the_true_state(stock_cli: Run, dataset: Pat
         "observation.images.wrist",
         "observation.state",
     ]
-    flags = f"--policy.path={checkpoint} --env.fps=2 --eval.n_episodes=1 --eval.batch_size=1"
+    flags = f"--policy.path={checkpoint} {SHORT} --eval.n_episodes=1 --eval.batch_size=1"
     assert evaluate(stock_cli, tmp_path, flags)["overall"]["n_episodes"] == 1
 
 

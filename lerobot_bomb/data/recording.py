@@ -4,12 +4,13 @@ import itertools
 import json
 from collections.abc import Iterator
 from contextlib import contextmanager
-from dataclasses import asdict, dataclass, replace
-from importlib.metadata import version
+from dataclasses import asdict, dataclass, field, replace
+from functools import partial
 from typing import Any, ClassVar
 
 from lerobot_bomb import __version__
 from lerobot_bomb.data.growing import check_repo_id
+from lerobot_bomb.episode_result import installed_version
 from lerobot_bomb.perturbations import NONE
 from lerobot_bomb.schema import (
     DEFAULT_FPS,
@@ -19,7 +20,6 @@ from lerobot_bomb.schema import (
     RenderOptions,
 )
 
-MUJOCO_VERSION = version("mujoco")  # not imported: that takes a backend of OpenGL
 MAX_NOISE = 1.0  # beyond it the noise exceeds the largest action
 
 
@@ -46,7 +46,8 @@ class Recording:
     noise: float = 0.0
     protocol_version: str = TASK_VERSION  # the name that recordings of 1.0 have
     package_version: str = __version__
-    mujoco_version: str = MUJOCO_VERSION  # another one plays other bits
+    # another one plays other bits
+    mujoco_version: str | None = field(default_factory=partial(installed_version, "mujoco"))
 
     def __post_init__(self) -> None:
         check_repo_id(self.repo_id)

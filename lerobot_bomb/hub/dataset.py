@@ -1,7 +1,7 @@
 """What a dataset's folder says of itself, and how to evaluate on what it shows."""
 
 import json
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -101,15 +101,16 @@ def environment_of_episode(row: Row) -> Environment:
 
 def eval_flags_of(rows: list[Row]) -> list[str]:
     """Of lerobot-eval, for the environment and the tasks that an evaluation was of."""
-    return [*environment_of_episode(rows[0]).eval_flags(), *_task_flags([row["spec"] for row in rows])]
-
-
-def _task_flags(specs: list[dict[str, Any]]) -> list[str]:
-    if all(spec["target"] and spec["color"] for spec in specs):
-        ids = {task_id(spec["target"], spec["color"]) for spec in specs}
-        return [f"--env.task_ids={sorted(ids)}".replace(" ", "")]
-    shared = {name: specs[0][name] for name in ("target", "color") if specs[0][name] is not None}
-    return [f"--env.{name}={value}".replace(" ", "") for name, value in shared.items()]
+    specs = [row["spec"] for row in rows]
+    task_ids = rows[0].get("task_ids") or ()  # lines of protocol 1.0 do not say
+    if not task_ids and all(spec["target"] and spec["color"] for spec in specs):
+        task_ids = sorted({task_id(spec["target"], spec["color"]) for spec in specs})
+    environment = replace(environment_of_episode(rows[0]), task_ids=tuple(task_ids))
+    asked = {} if task_ids else {name: specs[0][name] for name in ("target", "color") if specs[0][name]}
+    return [
+        *environment.eval_flags(),
+        *(f"--env.{name}={value}".replace(" ", "") for name, value in asked.items()),
+    ]
 
 
 def check_results(path: Path, rows: list[Row], trained_for: Environment | None) -> None:

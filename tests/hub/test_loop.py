@@ -42,6 +42,7 @@ def train(folder: Path, name: str, *flags: str) -> list[str]:
 
 def evaluate(repo_id: str, output_dir: Path, *flags: str) -> list[str]:
     own = "--env.type=bomb --env.task=place --env.image_size=64 --env.fps=2 --policy.device=cpu"
+    own += " --env.ignore_checkpoint=true"  # of the recording at 10 Hz
     own += " --eval.n_episodes=1 --eval.batch_size=1 --eval.use_async_envs=false"
     return ["lerobot-eval", f"--policy.path={repo_id}", f"--output_dir={output_dir}", *own.split(), *flags]
 
