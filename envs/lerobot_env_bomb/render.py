@@ -6,6 +6,7 @@ import ctypes
 import os
 import threading
 import weakref
+from typing import Any
 
 import numpy as np
 
@@ -139,8 +140,8 @@ def _free(gl: mujoco.GLContext, context: mujoco.MjrContext, owner: _Owner) -> No
 
 def _opengl_string(name: int) -> str | None:
     """What the current context says of itself."""
-    pointer = GL_1_0.glGetString(name)
-    text = ctypes.cast(pointer, ctypes.c_char_p).value  # pyright: ignore[reportArgumentType]  made at import
+    pointer: Any = GL_1_0.glGetString(name)
+    text = ctypes.cast(pointer, ctypes.c_char_p).value
     return None if text is None else text.decode()
 
 
