@@ -20,7 +20,7 @@ from lerobot.utils.import_utils import register_third_party_plugins
 
 from lerobot_bomb.finite import require_finite_batch
 
-BATCH, SIZE, DIMS, REPEATS = 8, 256, 4, 9
+BATCH, SIZE, DIMS, REPEATS = 8, 256, 4, 5
 CAMERAS = "observation.images.workspace", "observation.images.wrist"
 STATE, ACTION = "observation.state", "action"
 

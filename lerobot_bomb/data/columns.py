@@ -110,10 +110,10 @@ def _require_finite(
     bad_N = ~np.isfinite(values_NX.reshape(len(values_NX), -1)).all(axis=1)
     if bad_N.any():
         first = int(bad_N.argmax())
-        episode = int(episode_index_N[first])
+        episode, index = int(episode_index_N[first]), int(index_N[first])
         raise ValueError(
             f"dataset {meta.repo_id}: {key!r} is not finite (NaN or infinite) in {int(bad_N.sum())} of "
-            f"{len(bad_N)} frames, the first of them frame {int(index_N[first])} (its column 'index'), of "
+            f"{len(values_NX)} frames, the first of them frame {index} (its column 'index'), of "
             f"episode {episode}: {values_NX[first].tolist()}. Leave such episodes out: "
             f"lerobot-edit-dataset --operation.type=delete_episodes --operation.episode_indices=[{episode}]"
         )
