@@ -9,6 +9,7 @@ from pathlib import Path
 from lerobot_bomb.commands import run_command
 from lerobot_bomb.evaluation.results import read_results, summarise
 from lerobot_bomb.flags import path_flag
+from lerobot_bomb.viewing.unfinished import check_new_folder
 
 REPO_ID = "demo/bomb_place"
 MAX_EVAL_BATCH = 10
@@ -54,8 +55,7 @@ def run_demo(args: argparse.Namespace) -> int:
         if getattr(args, name) < 1:
             raise ValueError(f"--{name}={getattr(args, name)} must be at least 1")
     output_dir = args.output_dir or Path("outputs/demo") / f"{datetime.now():%Y-%m-%d_%H-%M-%S}"
-    if output_dir.exists():
-        raise ValueError(f"--output_dir={output_dir} exists already; name a new folder")
+    check_new_folder("--output_dir", output_dir)
     started = time.monotonic()
     dataset, train = output_dir / "dataset", output_dir / "train"
     checkpoint = train / "checkpoints" / "last" / "pretrained_model"
@@ -67,7 +67,7 @@ def run_demo(args: argparse.Namespace) -> int:
         f"--repo_id={REPO_ID}",
         f"--root={dataset}",
         f"--episodes={args.episodes}",
-        f"--workers={os.cpu_count() or 1}",
+        f"--workers={min(os.cpu_count() or 1, args.episodes)}",
     )
     _say(f"2/4  Train vla0_smol on the nano backbone for {args.steps} steps")
     run_command(

@@ -10,7 +10,7 @@ from typing import Any
 
 from lerobot.optim import AdamWConfig, CosineDecayWithWarmupSchedulerConfig
 
-MAX_CHUNK_SIZE = 128_000  # positions of Qwen2.5-VL; LeRobot lists a chunk's frames before it builds a policy
+MAX_POSITIONS = 128_000  # of Qwen2.5-VL; LeRobot lists a chunk's frames before it builds a policy
 
 
 def check_model_name_and_precision(config: Any) -> None:
@@ -43,9 +43,9 @@ def check_chunk(config: Any) -> None:
         raise ValueError(f"--policy.n_obs_steps={config.n_obs_steps}: {config.type} reads 1 observation step")
     if config.chunk_size < 1:
         raise ValueError(f"--policy.chunk_size={config.chunk_size} must be at least 1")
-    if config.chunk_size > MAX_CHUNK_SIZE:
+    if config.chunk_size > MAX_POSITIONS:
         raise ValueError(
-            f"--policy.chunk_size={config.chunk_size} must be at most {MAX_CHUNK_SIZE}: no base model has "
+            f"--policy.chunk_size={config.chunk_size} must be at most {MAX_POSITIONS}: no base model has "
             "more positions, and an action takes at least one"
         )
     if not 1 <= config.n_action_steps <= config.chunk_size:

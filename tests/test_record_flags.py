@@ -4,16 +4,15 @@ import ctypes
 import os
 import subprocess
 import sys
-from dataclasses import asdict
 from pathlib import Path
 
 import pytest
 
 from lerobot_bomb import cli
 from lerobot_bomb.data.growing import (
-    BLOCK_FILE,
     METADATA_FILE,
     Progress,
+    finish_block,
     lock_folder,
     parameters_file,
     unfinished_folder,
@@ -152,10 +151,11 @@ def test_a_folder_without_write_permission_is_named(tmp_path: Path) -> None:
 @pytest.mark.parametrize("read_only", [".", "x.recording", "x.recording/lock"])
 def test_an_unfinished_recording_without_write_permission_is_kept(read_only: str, tmp_path: Path) -> None:
     root = tmp_path / "x"
-    (tmp_path / "x.recording" / "block-00000").mkdir(parents=True)
+    unfinished = tmp_path / "x.recording" / "block-00000.tmp"
+    unfinished.mkdir(parents=True)
     (tmp_path / "x.recording" / "lock").touch()
     write_json(parameters_file(tmp_path / "x.recording"), {"recording": RECORDING.to_dict()})
-    write_json(tmp_path / "x.recording" / "block-00000" / BLOCK_FILE, asdict(Progress(1, 20)))
+    finish_block(unfinished, unfinished.with_suffix(""), Progress(1, 20))
     before = sorted(tmp_path.rglob("*"))
     (tmp_path / read_only).chmod(0o555 if (tmp_path / read_only).is_dir() else 0o444)
     message = record_without_privileges(root, "--resume")

@@ -74,6 +74,8 @@ class BombEnvConfig(EnvConfig):
             # an invalid flag raises here, before anything is built
             _ = self.conditions
             check_robot(self.gym_kwargs["spec"])
+        if self.results_path is not None:
+            self.results_path = str(Path(self.results_path).expanduser())
         image = PolicyFeature(type=FeatureType.VISUAL, shape=(self.image_size, self.image_size, 3))
         cameras = [f"{OBS_IMAGES}.{camera}" for camera in CAMERAS]
         self.features = {

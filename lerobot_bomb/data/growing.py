@@ -9,7 +9,6 @@ made again (see ``kept_blocks.py``).
 
 import argparse
 import errno
-import json
 import os
 import signal
 import sys
@@ -37,6 +36,7 @@ from lerobot_bomb.data.kept_blocks import (
     write_json,
 )
 from lerobot_bomb.flags import check_link
+from lerobot_bomb.json_files import read_json
 
 if TYPE_CHECKING:
     from lerobot_bomb.data.blocks import DatasetLayout, Episode
@@ -206,7 +206,7 @@ def _check_same(parameters: Parameters, path: Path) -> None:
         if {other.name for other in path.parent.iterdir()} - {LOCK_FILE, path.with_suffix(".tmp").name}:
             raise ValueError(f"--resume: {path.parent} holds no {path.name}, so it is no {kind}")
         return  # killed before anything was written
-    existing = json.loads(path.read_text()).get(kind)
+    existing = read_json(path).get(kind)
     if existing is None:
         raise ValueError(f"--resume: {path} is not of a {kind}")
     differences = [

@@ -13,6 +13,8 @@ from dataclasses import asdict, dataclass, field, fields, replace
 from pathlib import Path
 from typing import Any
 
+from lerobot_bomb.json_files import read_json
+
 BLOCK_FILE = "block.json"  # in each block: the progress up to its end, and the SHA-256 of its other files
 DIGESTS = "sha256"
 BLOCK = re.compile(r"block-\d{5,}")
@@ -97,9 +99,9 @@ def _damage(block: Path, end: int) -> str | None:
     if not block.exists():
         return "is missing"
     try:
-        values = json.loads((block / BLOCK_FILE).read_text())
+        values = read_json(block / BLOCK_FILE)
         num_episodes, expected = Progress(**_of_progress(values)).num_episodes, dict(values[DIGESTS])
-    except (FileNotFoundError, NotADirectoryError, ValueError, KeyError, TypeError):
+    except (FileNotFoundError, ValueError, KeyError, TypeError):
         return f"holds no {BLOCK_FILE} that can be read"
     if num_episodes != end:
         return f"ends with episode {num_episodes} instead of {end}"
@@ -121,8 +123,15 @@ def _digests(block: Path) -> dict[str, str]:
 
 
 def read_progress(path: Path) -> Progress:
-    """Progress from a block's or a dataset's file."""
-    return Progress(**_of_progress(json.loads(path.read_text())))
+    """Progress from a block's or a dataset's file.
+
+    Raises:
+        ValueError: it holds none.
+    """
+    try:
+        return Progress(**_of_progress(read_json(path)))
+    except KeyError as error:
+        raise ValueError(f"{path} has no {error}") from None
 
 
 def _of_progress(values: dict[str, Any]) -> dict[str, Any]:

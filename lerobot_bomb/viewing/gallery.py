@@ -48,6 +48,8 @@ def run_gallery(args: argparse.Namespace) -> int:
     """Draw the sheets and print their paths."""
     for axis in args.axes:
         one_of("--axes", axis, SHEETS)
+    if args.output.exists() and not args.output.is_dir():
+        raise ValueError(f"--output={args.output} is no folder; name another")
     try:
         options = RenderOptions(image_size=args.image_size)
         for seed in args.seeds:

@@ -17,6 +17,7 @@ from lerobot_bomb.flow.path import TIME_SAMPLINGS
 from lerobot_bomb.flow.samplers import check_heads, check_sampling
 from lerobot_bomb.policy_environment import ConfigWithEnvironment
 from lerobot_bomb.policy_flags import (
+    MAX_POSITIONS,
     adamw,
     check_cameras_and_action,
     check_chunk,
@@ -164,6 +165,11 @@ class FdvlaConfig(ConfigWithEnvironment):
             if self.image_size % PIXELS_PER_TOKEN:
                 raise ValueError(
                     f"--policy.image_size={self.image_size} must be a multiple of {PIXELS_PER_TOKEN} pixels"
+                )
+            if (num_tokens := (self.image_size // PIXELS_PER_TOKEN) ** 2) > MAX_POSITIONS:
+                raise ValueError(
+                    f"--policy.image_size={self.image_size} makes {num_tokens} tokens of a picture; the "
+                    f"model has {MAX_POSITIONS} positions"
                 )
             check_training(self)
 
