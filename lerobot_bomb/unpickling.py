@@ -14,6 +14,7 @@ from typing import Any
 import numpy as np
 import torch
 from lerobot.async_inference.helpers import RemotePolicyConfig, TimedObservation
+from numpy._core import multiarray
 from torch._utils import _rebuild_tensor_v2  # what a pickled tensor names
 
 
@@ -59,8 +60,8 @@ ALLOWED: dict[str, Callable[[], Any]] = {
     "lerobot.async_inference.helpers.TimedObservation": partial(_a_class_of_its_own, TimedObservation),
     "numpy.ndarray": lambda: np.ndarray,
     "numpy.dtype": lambda: np.dtype,
-    "numpy._core.multiarray._reconstruct": lambda: partial(np._core.multiarray._reconstruct),
-    "numpy._core.multiarray.scalar": lambda: partial(np._core.multiarray.scalar),
+    "numpy._core.multiarray._reconstruct": lambda: partial(multiarray._reconstruct),
+    "numpy._core.multiarray.scalar": lambda: partial(multiarray.scalar),
     "numpy._core.numeric._frombuffer": lambda: partial(_array),
     "collections.OrderedDict": lambda: OrderedDict,
     "torch._utils._rebuild_tensor_v2": lambda: partial(_rebuild_tensor_v2),

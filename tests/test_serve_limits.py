@@ -130,7 +130,7 @@ def test_a_pickle_that_names_a_function_is_refused_before_it_runs(served: Callab
 
 @pytest.mark.parametrize("protocol", range(3, pickle.HIGHEST_PROTOCOL + 1))
 def test_what_lerobots_client_sends_is_read_as_pickle_reads_it(protocol: int) -> None:
-    features = {"observation.state": {"dtype": "float32", "shape": (2,), "names": ["a.pos", "b.pos"]}}
+    features: Any = {"observation.state": {"dtype": "float32", "shape": (2,), "names": ["a.pos", "b.pos"]}}
     policy = RemotePolicyConfig("act", "me/x", features, 10, "cpu", {"a": "b"})
     assert vars(loads(pickle.dumps(policy, protocol))) == vars(policy)
     picture = np.arange(24, dtype=np.uint8).reshape(2, 4, 3)

@@ -44,7 +44,7 @@ def with_nan(table: pa.Table) -> pa.Table:
     actions = table["action"].to_pylist()
     actions[3][1] = math.nan
     field = table.schema.field("action")
-    return table.set_column(table.schema.get_field_index("action"), field, [actions])
+    return table.set_column(table.schema.get_field_index("action"), field, pa.array(actions, field.type))
 
 
 def with_other_index(table: pa.Table) -> pa.Table:

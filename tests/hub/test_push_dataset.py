@@ -116,7 +116,7 @@ def test_what_is_no_name_on_the_hub_is_refused_by_every_flag_that_takes_one(
     for command in (
         ["push", str(tmp_path)],
         ["push-dataset", str(tmp_path)],
-        ["record", f"--root={tmp_path / 'new'}"],
+        ["record", "--episodes=1", f"--root={tmp_path / 'new'}"],
         ["convert", "pusht-zarr", str(tmp_path), f"--root={tmp_path / 'new'}"],
     ):
         assert main([*command, f"--repo_id={name}"]) == 1
