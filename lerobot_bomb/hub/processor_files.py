@@ -141,7 +141,7 @@ def check_saved_processors() -> None:
     )
 
 
-def check_states(steps: Sequence[ProcessorStep], where: str, complete: bool) -> None:
+def check_states(steps: Sequence[Any], where: str, complete: bool) -> None:
     """The steps' loaded states are finite where they are used; `complete`: and they hold all that is used.
 
     Raises:
@@ -156,9 +156,7 @@ def check_states(steps: Sequence[ProcessorStep], where: str, complete: bool) -> 
             )
 
 
-def _check_statistics(
-    step: NormalizerProcessorStep | UnnormalizerProcessorStep, where: str, complete: bool
-) -> None:
+def _check_statistics(step: Any, where: str, complete: bool) -> None:
     held = step.state_dict()
     for key, feature in step.features.items():
         chosen = step.normalize_observation_keys

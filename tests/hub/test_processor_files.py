@@ -32,6 +32,7 @@ from lerobot_bomb.adapters import check_adapters
 from lerobot_bomb.checkpoint import load_processors, read_config
 from lerobot_bomb.explain.interventions import intervene
 from lerobot_bomb.hub import processor_files
+from lerobot_policy_vla0_smol import Vla0SmolConfig
 
 UNNORMALIZER = "policy_postprocessor_step_0_unnormalizer_processor.safetensors"
 NAN = torch.tensor([float("nan"), 1.0, 1.0, 1.0])
@@ -53,9 +54,7 @@ def folder(whole: Path, tmp_path: Path) -> Path:
 
 def stock_load(folder: Path | str) -> Any:
     """As LeRobot's commands load processors."""
-    config = get_policy_class("vla0_smol").config_class()
-    config.device = "cpu"
-    return make_pre_post_processors(config, str(folder))
+    return make_pre_post_processors(Vla0SmolConfig(device="cpu"), str(folder))
 
 
 def act_checkpoint(folder: Path) -> ACTConfig:
@@ -193,9 +192,9 @@ UNSAFE: dict[str, dict[str, Any]] = {
 @pytest.mark.parametrize("message", UNSAFE)
 def test_a_config_that_reads_other_models_or_code_is_refused(message: str, folder: Path) -> None:
     change_config(**UNSAFE[message])(folder)
-    for options in ({}, {"config": read_config(folder, "cpu")}):
+    for config in (None, read_config(folder, "cpu")):
         with pytest.raises(ValueError, match=message):
-            get_policy_class("vla0_smol").from_pretrained(folder, **options)
+            get_policy_class("vla0_smol").from_pretrained(folder, config=config)
 
 
 @pytest.mark.parametrize(
