@@ -10,7 +10,12 @@ import torch
 from lerobot.configs import FeatureType, PolicyFeature
 from lerobot.policies import get_policy_class, make_pre_post_processors
 from lerobot.policies.act.configuration_act import ACTConfig
-from lerobot.processor import DataProcessorPipeline, IdentityProcessorStep, ProcessorStep
+from lerobot.processor import (
+    ActionTokenizerProcessorStep,
+    DataProcessorPipeline,
+    IdentityProcessorStep,
+    ProcessorStep,
+)
 from lerobot.utils.import_utils import register_third_party_plugins
 from policy_cases import CASES
 
@@ -162,6 +167,12 @@ def test_stock_types_load_and_run_no_code(tmp_path: Path) -> None:
     assert len(before.steps) == 4
     insert_step(POSTPROCESSOR, {"class": f"{IdentityProcessorStep.__module__}.IdentityProcessorStep"})(folder)
     assert len(make_pre_post_processors(config, str(folder))[1].steps) == len(after.steps) + 1
+    saved = (folder / PREPROCESSOR).read_text()
+    path = f"{ActionTokenizerProcessorStep.__module__}.{ActionTokenizerProcessorStep.__name__}"
+    insert_step(PREPROCESSOR, {"class": path, "config": {"action_tokenizer_name": "evil/x"}})(folder)
+    with pytest.raises(ValueError, match=r"'action_tokenizer_processor' runs code of what its config names"):
+        make_pre_post_processors(config, str(folder))
+    (folder / PREPROCESSOR).write_text(saved)
     insert_code(PREPROCESSOR)(folder)
     with pytest.raises(ValueError, match=r"its step 'os\.mkdir' is named"):
         make_pre_post_processors(config, str(folder))
