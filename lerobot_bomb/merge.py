@@ -6,6 +6,7 @@ from pathlib import Path
 from lerobot.configs import PreTrainedConfig
 from lerobot.policies import PreTrainedPolicy, get_policy_class
 
+from lerobot_bomb.adapters import check_adapters
 from lerobot_bomb.checkpoint import add_folder_arguments, load_processors, read_config, write_checkpoint
 from lerobot_bomb.hub.checks import ADAPTERS
 from lerobot_bomb.viewing.unfinished import check_new_folder
@@ -35,6 +36,7 @@ def merged(config: PreTrainedConfig, adapters: Path) -> PreTrainedPolicy:
         import peft  # pyright: ignore[reportMissingImports]
     except ImportError as error:
         raise ValueError("adapters need the package peft: pip install 'lerobot_policy_bomb[lora]'") from error
+    check_adapters(str(adapters), None)
     of_adapters = peft.PeftConfig.from_pretrained(str(adapters))
     base = str(of_adapters.base_model_name_or_path)
     config.use_peft, config.pretrained_path = False, None

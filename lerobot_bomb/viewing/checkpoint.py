@@ -11,6 +11,7 @@ from lerobot.policies import make_policy
 from lerobot.utils.constants import ACTION, OBS_STATE
 from lerobot.utils.random_utils import set_seed
 
+from lerobot_bomb.adapters import check_adapters
 from lerobot_bomb.checkpoint import autocast, load_processors, read_config
 from lerobot_bomb.schema import ACTION_DIM, STATE_DIM, EpisodeSpec, RenderOptions
 from lerobot_bomb.viewing.episode import Agent
@@ -25,6 +26,8 @@ def checkpoint_agent(path: Path, device: str | None, spec: EpisodeSpec, options:
         ValueError: the folder holds no checkpoint, or one whose action or state is not BOMB's.
     """
     config = _read_config(path, device)
+    if config.use_peft:
+        check_adapters(str(path), None)
     env_config = _env_config(spec, options)
     set_seed(spec.seed)
     policy = make_policy(cfg=config, env_cfg=env_config)
