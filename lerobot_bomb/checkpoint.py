@@ -15,7 +15,6 @@ from lerobot.utils.constants import POLICY_PREPROCESSOR_DEFAULT_NAME
 from lerobot.utils.device_utils import get_safe_torch_device, is_torch_device_available
 from lerobot.utils.import_utils import register_third_party_plugins
 
-from lerobot_bomb.adapters import check_adapters
 from lerobot_bomb.flags import path_flag
 from lerobot_bomb.hub.checks import PROCESSORS, processor_files
 from lerobot_bomb.hub.names import CONFIG
@@ -32,8 +31,7 @@ def read_config(path: Path, device: str | None) -> PreTrainedConfig:
     """The config in the folder `pretrained_model`; `device` None means the checkpoint's own.
 
     Raises:
-        ValueError: the folder holds no checkpoint or unsafe adapters, or this machine has no such device.
-        FileNotFoundError: it holds no adapters, though its config says so.
+        ValueError: the folder holds no checkpoint, or this machine has no such device.
     """
     missing = [name for name in FILES if not (path / name).is_file()]
     if missing:
@@ -46,8 +44,6 @@ def read_config(path: Path, device: str | None) -> PreTrainedConfig:
     register_third_party_plugins()
     config = parse_config(path, device)
     config.pretrained_path = path
-    if config.use_peft:
-        check_adapters(str(path), None)
     return config
 
 

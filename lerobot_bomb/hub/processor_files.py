@@ -92,12 +92,9 @@ def state_files(content: Mapping[str, Any], where: str, policy_type: object) -> 
 def _check_step(step: Mapping[str, Any], where: str, policy_type: object) -> None:
     name = step.get("registry_name")
     if "registry_name" not in step:
-        _check_class(step.get("class"), where, policy_type)
+        name = _name_of_class(step.get("class"), where, policy_type)
     elif not isinstance(name, str) or name not in ProcessorStepRegistry.list():
-        raise ValueError(
-            f"{where}: no step {name!r} is registered here; install the plugin that has it, or take the file "
-            "from whom you trust"
-        )
+        raise ValueError(f"{where}: no step {name!r} is registered here; install the plugin that has it")
     if name in RUN_CODE and policy_type not in RUN_CODE[name]:
         raise ValueError(
             f"{where}: the step {name!r} runs code of what its config names ({step.get('config')}), which no "
@@ -111,15 +108,19 @@ def _check_step(step: Mapping[str, Any], where: str, policy_type: object) -> Non
         _check_state_file(step["state_file"], where)
 
 
-def _check_class(path: object, where: str, policy_type: object) -> None:
-    """Raise unless it is a step whose module is loaded already; all steps of our types are registered."""
+def _name_of_class(path: object, where: str, policy_type: object) -> str | None:
+    """The registered name, if any, of a step that is named by its path; its module is loaded already.
+
+    Raises:
+        ValueError: it is no such step, or the checkpoint is of our types, whose steps are all registered.
+    """
     if isinstance(path, str) and not is_ours(policy_type):
         module, _, name = path.rpartition(".")
         if path == SARM_STEP:
             import_module(module)
         found = getattr(sys.modules.get(module), name, None)
         if isinstance(found, type) and issubclass(found, ProcessorStep):
-            return
+            return getattr(found, "_registry_name", None)
     raise ValueError(
         f"{where}: its step {path!r} is named by the path of a class, which may be any code; a step is "
         "registered by its plugin (ProcessorStepRegistry.register) and named by registry_name"
@@ -141,7 +142,7 @@ def check_saved_processors() -> None:
     )
 
 
-def check_states(steps: Sequence[ProcessorStep], where: str, complete: bool) -> None:
+def check_states(steps: Sequence[Any], where: str, complete: bool) -> None:
     """The steps' loaded states are finite where they are used; `complete`: and they hold all that is used.
 
     Raises:
@@ -156,9 +157,7 @@ def check_states(steps: Sequence[ProcessorStep], where: str, complete: bool) -> 
             )
 
 
-def _check_statistics(
-    step: NormalizerProcessorStep | UnnormalizerProcessorStep, where: str, complete: bool
-) -> None:
+def _check_statistics(step: Any, where: str, complete: bool) -> None:
     held = step.state_dict()
     for key, feature in step.features.items():
         chosen = step.normalize_observation_keys

@@ -11,6 +11,7 @@ from lerobot.policies import make_policy
 from lerobot.utils.constants import ACTION, OBS_STATE
 from lerobot.utils.random_utils import set_seed
 
+from lerobot_bomb.adapters import check_adapters
 from lerobot_bomb.checkpoint import autocast, load_processors, read_config
 from lerobot_bomb.schema import ACTION_DIM, STATE_DIM, EpisodeSpec, RenderOptions
 from lerobot_bomb.viewing.episode import Agent
@@ -32,6 +33,8 @@ def checkpoint_agent(
             trained for another environment.
     """
     config = _read_config(path, device)
+    if config.use_peft:
+        check_adapters(str(path), None)
     env_config = _env_config(spec, options, ignore_environment)
     set_seed(spec.seed)
     policy = make_policy(cfg=config, env_cfg=env_config)
