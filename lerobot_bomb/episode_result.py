@@ -5,6 +5,7 @@ Simulator workers import this module, so it imports neither torch nor LeRobot.
 
 import dataclasses
 import json
+import platform
 from dataclasses import dataclass, field
 from functools import cache, partial
 from importlib.metadata import PackageNotFoundError, version
@@ -22,6 +23,19 @@ def installed_version(distribution: str) -> str | None:
         return version(distribution)
     except PackageNotFoundError:
         return None
+
+
+@cache
+def machine_name() -> str:
+    """Processor and C library of this machine: "x86_64, AMD EPYC, glibc 2.36".
+
+    Sine and cosine are the library's, in the variant for the processor; their last bits are in every state.
+    """
+    cpus = Path("/proc/cpuinfo")  # of Linux
+    lines = cpus.read_text().splitlines() if cpus.is_file() else []
+    models = [line.partition(":")[2].strip() for line in lines if line.startswith("model name")]
+    parts = (platform.machine(), *models[:1], " ".join(platform.libc_ver()))
+    return ", ".join(part for part in parts if part.strip())
 
 
 @dataclass(frozen=True)
@@ -64,6 +78,7 @@ class EpisodeResult:
     # of the context that drew the observations; None: nothing was drawn
     opengl_vendor: str | None = None
     opengl_renderer: str | None = None
+    machine: str = field(default_factory=machine_name)
     mujoco_version: str | None = field(default_factory=partial(installed_version, "mujoco"))
     lerobot_version: str | None = field(default_factory=partial(installed_version, "lerobot"))
     torch_version: str | None = field(default_factory=partial(installed_version, "torch"))

@@ -2,6 +2,7 @@ import copy
 import hashlib
 import json
 import pickle
+import platform
 import subprocess
 import sys
 import warnings
@@ -244,6 +245,7 @@ def test_each_finished_episode_appends_one_line(tmp_path: Path) -> None:
     assert lines[0]["protocol_version"] == PROTOCOL_VERSION == "1.1"
     assert lines[0]["policy"] is None
     assert lines[0]["mujoco_version"] == sys.modules["mujoco"].__version__
+    assert lines[0]["machine"].startswith(platform.machine())
     assert lines[0]["opengl_vendor"] and lines[0]["opengl_renderer"]
 
 

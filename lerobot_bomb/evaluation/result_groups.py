@@ -14,7 +14,13 @@ DRAWN = ("seed", "target", "color", "perturbations")
 NOT_RECORDED = "not recorded"
 SHOWN_DIGITS = 12  # of a SHA-256
 MAX_RUNS = 10  # of numbers, in a heading
-SOFTWARE = {"lerobot_bomb": "package_version", "LeRobot": "lerobot_version", "torch": "torch_version"}
+# what does not keep episodes apart
+LISTED = {
+    "lerobot_bomb": "package_version",
+    "LeRobot": "lerobot_version",
+    "torch": "torch_version",
+    "machine": "machine",
+}
 
 
 @dataclass(frozen=True)
@@ -41,10 +47,10 @@ class Group:
             f"policy {describe_policy(first)}; {describe_tasks(self.rows)}",
             f"protocol {first['protocol_version']}, {', '.join(asked)}, seeds {seeds}",
             f"{pictures}, OpenGL {self.settings['OpenGL']}, MuJoCo {self.settings['MuJoCo']}, "
-            + ", ".join(f"{name} {self._versions(key)}" for name, key in SOFTWARE.items()),
+            + ", ".join(f"{name} {self._values(key)}" for name, key in LISTED.items()),
         ]
 
-    def _versions(self, key: str) -> str:
+    def _values(self, key: str) -> str:
         return " and ".join(sorted({row.get(key) or NOT_RECORDED for row in self.rows}))
 
 

@@ -113,6 +113,7 @@ NEW_CHECKS: dict[str, Check] = {  # of what protocol 1.1 added
     "mujoco_version": or_none(is_text),
     "opengl_vendor": or_none(is_text),
     "opengl_renderer": or_none(is_text),
+    "machine": is_text,
     "render_preset": is_one_of(RENDER_PRESETS),
     "task_ids": or_none(is_list_of(is_int(0, NUM_TASKS - 1))),
     "lerobot_version": or_none(is_text),
