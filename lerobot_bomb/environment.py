@@ -96,7 +96,7 @@ class Environment:
         depth = " with depth" if self.depth else ""
         tasks = f", tasks {list(self.task_ids)}" if self.task_ids else ""
         return (
-            f"BOMB {self.task_version}, suite `{self.task}`{tasks}, robot `{self.robot}`, "
+            f"BOMB, task version {self.task_version}, suite `{self.task}`{tasks}, robot `{self.robot}`, "
             f"control `{self.control_mode}` at {self.fps} Hz, cameras `{', '.join(self.cameras)}` of "
             f"{self.image_size} px{depth}"
         )

@@ -69,7 +69,7 @@ def require_finite_rows(values_NX: np.ndarray | Tensor, failure: str, name: str)
 
     ``failure``: what cannot be done; ``name``: of the rows.
     """
-    values_NX = torch.as_tensor(values_NX)
+    values_NX = values_NX if isinstance(values_NX, Tensor) else torch.from_numpy(values_NX.copy())
     if is_finite(values_NX):
         return
     bad_N = _bad(values_NX).flatten(1).any(dim=1)

@@ -7,6 +7,7 @@ from collections.abc import Callable
 from pathlib import Path
 
 import pytest
+import torch
 from lerobot.datasets import LeRobotDatasetMetadata
 from lerobot.envs import make_env_config, make_env_pre_post_processors
 from lerobot.policies import (
@@ -16,6 +17,7 @@ from lerobot.policies import (
     make_policy_config,
     make_pre_post_processors,
 )
+from lerobot.utils.constants import ACTION, OBS_STATE
 from policy_cases import CASES
 
 import lerobot_policy_bomb  # noqa: F401  the plugin
@@ -66,7 +68,9 @@ def new_policy(policy_type: str, dataset: Path) -> PreTrainedPolicy:
 
 
 def write(folder: Path, policy: PreTrainedPolicy) -> Path:
-    write_checkpoint(folder, policy, make_pre_post_processors(policy.config))
+    ones = torch.ones(4)
+    stats = {key: {"min": -ones, "max": ones, "mean": 0 * ones, "std": ones} for key in (ACTION, OBS_STATE)}
+    write_checkpoint(folder, policy, make_pre_post_processors(policy.config, dataset_stats=stats))
     return folder
 
 

@@ -52,8 +52,8 @@ def block_path(folder: Path, number: int) -> Path:
 
 
 def finished_blocks(folder: Path) -> list[Path]:
-    """Folders of the finished blocks, in order."""
-    return sorted(path for path in folder.iterdir() if BLOCK.fullmatch(path.name))
+    """Folders of the finished blocks, in order; none where the folder itself is missing."""
+    return sorted(path for path in folder.glob("block-*") if BLOCK.fullmatch(path.name))
 
 
 def reached(folder: Path) -> Progress:

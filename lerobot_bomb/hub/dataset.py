@@ -72,7 +72,7 @@ class DatasetFacts:
         last = first + (num_tried - 1) // num_conditions
         tasks = recording["task_ids"] or "drawn per episode"
         return [
-            f"- BOMB protocol {recording['protocol_version']}, suite `{recording['task']}`, robot "
+            f"- BOMB, task version {recording['protocol_version']}, suite `{recording['task']}`, robot "
             f"`{recording['robot']}`, control `{recording['control_mode']}`, split `{recording['split']}`, "
             f"{recording['image_size']} px",
             f"- perturbation axes: `{', '.join(recording['perturbations'])}`; noise on actions: "

@@ -113,8 +113,8 @@ def test_a_checkpoint_tells_its_environment_wherever_its_dataset_is() -> None:
         "'--env.task_ids=[7,12]' "
     ) in text
     assert (
-        "- environment: BOMB protocol 1.0, suite `place`, tasks [7, 12], robot `fetch`, control `absolute` "
-        "at 20 Hz, cameras `workspace, wrist` of 64 px\n"
+        "- environment: BOMB, task version 1.0, suite `place`, tasks [7, 12], robot `fetch`, control "
+        "`absolute` at 20 Hz, cameras `workspace, wrist` of 64 px\n"
     ) in text
     assert "--policy.environment" not in text
 
