@@ -173,8 +173,8 @@ def test_lerobots_act_has_columns_too(train: Callable[..., Path], root: Path) ->
     [
         ("--policy.path=nowhere", "--policy.path=nowhere holds no config.json"),
         ("--dataset.root=nowhere", "--dataset.root=nowhere holds no meta/info.json"),
-        ("--dataset.root=", "--dataset.root=. holds no meta/info.json"),
-        ("--val_episodes=2-9", "--val_episodes: the dataset has the episodes 0..4, not 5"),
+        ("--dataset.root=.", "--dataset.root=. holds no meta/info.json"),
+        ("--val_episodes=2-9", "--val_episodes=2-9: the dataset has the episodes 0..4, not 9"),
         ("--val_episodes=two", "--val_episodes=two: give numbers and ranges"),
         ("--val_episodes=2 --train_episodes=0-2", "both name the episodes [2]"),
         ("--train_episodes=0-4", "none is held out; name some with --val_episodes"),
