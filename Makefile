@@ -7,6 +7,8 @@ BIN := .venv/bin
 STAMP := .venv/.installed
 # two torch threads beside another job are many times slower than one
 export OMP_NUM_THREADS ?= 1
+# tests of a file share what is recorded and trained for them, so a file is run by one process
+PYTEST := $(BIN)/pytest -n auto --maxprocesses=4 --dist=loadfile
 
 help:
 	@echo "make demo       set up, record, train, evaluate; about 10 minutes on 2 cores"
@@ -36,10 +38,10 @@ demo: setup
 	@$(BIN)/lerobot-bomb demo
 
 test: setup
-	@$(BIN)/pytest -m "not long"
+	@$(PYTEST) -m "not long"
 
 test-long: setup
-	@$(BIN)/pytest
+	@$(PYTEST)
 
 test-cuda: setup
 	@$(BIN)/pytest tests/outside/check_cuda.py
