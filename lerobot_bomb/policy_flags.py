@@ -10,12 +10,19 @@ from typing import Any
 
 from lerobot.optim import AdamWConfig, CosineDecayWithWarmupSchedulerConfig
 
+from lerobot_bomb.vlm.tokenizer import NANO
+
 
 def check_model_name_and_precision(config: Any) -> None:
-    """A backbone is named, and precision is left to ``dtype``."""
+    """A backbone is named, nano alone is changed, and precision is left to ``dtype``."""
     if not config.vlm_model_name:
         raise ValueError(
             "--policy.vlm_model_name is empty; give a Hub id, the path of a local folder, or nano"
+        )
+    if config.nano_config and config.vlm_model_name != NANO:
+        raise ValueError(
+            f"--policy.nano_config={config.nano_config} changes --policy.vlm_model_name={NANO}, not "
+            f"{config.vlm_model_name}"
         )
     if config.use_amp:
         raise ValueError(

@@ -34,6 +34,7 @@ CONSISTENCY_LOSS_WEIGHT = 0.1
 PIXELS_PER_TOKEN = 28  # of a side: 2 patches of 14
 # flags that say which weights there are, and their shapes
 SHAPES = (
+    "nano_config",
     "chunk_size",
     "use_state",
     "use_flow_head",
@@ -54,6 +55,8 @@ class FdvlaConfig(PreTrainedConfig):
 
     # Hub id, path of a local folder, or "nano": a small model with random weights, built in code
     vlm_model_name: str = "Qwen/Qwen2.5-VL-3B-Instruct"
+    # changes of nano's architecture, nested as it is, as {"vision_config": {"num_hidden_layers": 2}}
+    nano_config: dict[str, Any] | None = None
     # architecture; filled in when the base model is loaded. Set = build this and download nothing:
     # the weights then come from a checkpoint
     vlm_config: dict[str, Any] | None = None

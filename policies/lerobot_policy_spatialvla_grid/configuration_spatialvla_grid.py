@@ -37,8 +37,10 @@ PREFIX_ATTENTIONS = ("bidirectional", "causal")
 LOSS_VOCABULARIES = ("slot", "full")
 DRAFTS = ("none", "repeat")
 NUM_STATE_BINS = 256
-# flags that say what the model reads and writes, beside the grids' own
-AS_TRAINED = ("chunk_size", "use_state", "prefix_attention")
+# flags that say what shapes the weights have, beside the grids' own
+SHAPES = ("nano_config",)
+# the same, and flags that say what the model reads and writes
+AS_TRAINED = ("chunk_size", "use_state", "prefix_attention", *SHAPES)
 
 
 @PreTrainedConfig.register_subclass("spatialvla_grid")
@@ -48,6 +50,8 @@ class SpatialvlaGridConfig(PreTrainedConfig):
 
     # Hub id, path of a local folder, or "nano": a small model with random weights, built in code
     vlm_model_name: str = "google/paligemma2-3b-pt-224"
+    # changes of nano's architecture, nested as it is, as {"vision_config": {"num_hidden_layers": 2}}
+    nano_config: dict[str, Any] | None = None
     # architecture; filled in when the base model is loaded. Set = build this and download nothing:
     # the weights then come from a checkpoint
     vlm_config: dict[str, Any] | None = None

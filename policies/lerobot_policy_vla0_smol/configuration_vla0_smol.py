@@ -33,8 +33,13 @@ BOUNDED_MODES = (
     NormalizationMode.IDENTITY,
 )
 MAX_BINS = 10**MAX_DIGITS
-# flags that say what the model's tokens mean
-AS_TRAINED = ("chunk_size", "n_action_bins", "n_state_bins", "bin_mode", "number_width", "use_state")
+# flags that say what shapes the weights have
+SHAPES = ("nano_config",)
+# the same, and flags that say what the model's tokens mean
+AS_TRAINED = (
+    *("chunk_size", "n_action_bins", "n_state_bins", "bin_mode", "number_width", "use_state"),
+    *SHAPES,
+)
 
 
 @PreTrainedConfig.register_subclass("vla0_smol")
@@ -44,6 +49,8 @@ class Vla0SmolConfig(PreTrainedConfig):
 
     # Hub id, path of a local folder, or "nano": a small model with random weights, built in code
     vlm_model_name: str = "HuggingFaceTB/SmolVLM2-500M-Video-Instruct"
+    # changes of nano's architecture, nested as it is, as {"vision_config": {"num_hidden_layers": 2}}
+    nano_config: dict[str, Any] | None = None
     # architecture; filled in when the base model is loaded. Set = build this and download nothing:
     # the weights then come from a checkpoint
     vlm_config: dict[str, Any] | None = None
