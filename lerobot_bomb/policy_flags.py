@@ -155,6 +155,14 @@ def check_weights_fit(config: Any, flags: Iterable[str]) -> None:
             )
 
 
+def action_deltas(config: Any) -> list[int] | None:
+    """Steps of the actions that a sample has, from its frame on.
+
+    None for a chunk of one, which is the frame's own action: LeRobot reads that in a third of the time.
+    """
+    return None if config.chunk_size == 1 else list(range(config.chunk_size))
+
+
 def adamw(config: Any) -> AdamWConfig:
     """Of the fields optimizer_*."""
     return AdamWConfig(

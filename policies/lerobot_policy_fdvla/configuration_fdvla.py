@@ -15,6 +15,7 @@ from lerobot_bomb.flow.losses import check_learning, check_objective
 from lerobot_bomb.flow.path import TIME_SAMPLINGS
 from lerobot_bomb.flow.samplers import check_heads, check_sampling
 from lerobot_bomb.policy_flags import (
+    action_deltas,
     adamw,
     check_cameras_and_action,
     check_chunk,
@@ -261,8 +262,8 @@ class FdvlaConfig(PreTrainedConfig):
         return None
 
     @property
-    def action_delta_indices(self) -> list[int]:
-        return list(range(self.chunk_size))
+    def action_delta_indices(self) -> list[int] | None:
+        return action_deltas(self)
 
     @property
     def reward_delta_indices(self) -> None:

@@ -12,6 +12,7 @@ from lerobot_bomb.actions.grid_settings import ActionGroup, GridSettings, check_
 from lerobot_bomb.checkpoint_config import INSTALLED, PackageVersion
 from lerobot_bomb.flags import flag_errors, one_of
 from lerobot_bomb.policy_flags import (
+    action_deltas,
     adamw,
     check_cameras_and_action,
     check_chunk,
@@ -255,8 +256,8 @@ class SpatialvlaGridConfig(PreTrainedConfig):
         return None
 
     @property
-    def action_delta_indices(self) -> list[int]:
-        return list(range(self.chunk_size))
+    def action_delta_indices(self) -> list[int] | None:
+        return action_deltas(self)
 
     @property
     def reward_delta_indices(self) -> None:

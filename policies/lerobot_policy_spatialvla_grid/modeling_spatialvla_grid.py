@@ -259,7 +259,8 @@ class SpatialvlaGridPolicy(HubPolicy, SavesTiedWeightsOnce, PreTrainedPolicy):
         """(B, T) bool: which actions are trained on."""
         if f"{ACTION}_is_pad" in batch and not self.config.loss_on_padded_actions:
             return ~batch[f"{ACTION}_is_pad"].bool()
-        return torch.ones_like(batch[ACTION][..., 0], dtype=torch.bool)
+        actions = batch[ACTION]
+        return actions.new_ones(len(actions), self.config.chunk_size, dtype=torch.bool)
 
     @torch.no_grad()
     def _metrics(self, chosen_BTG: Tensor, cells_BTG: Tensor, kept_BTG: Tensor) -> dict[str, float]:

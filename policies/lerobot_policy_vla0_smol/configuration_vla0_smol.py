@@ -13,6 +13,7 @@ from lerobot_bomb.actions.text import MASK_LEVELS, MAX_DIGITS, digits_needed
 from lerobot_bomb.checkpoint_config import INSTALLED, PackageVersion
 from lerobot_bomb.flags import flag_errors, one_of
 from lerobot_bomb.policy_flags import (
+    action_deltas,
     adamw,
     check_cameras_and_action,
     check_chunk,
@@ -235,8 +236,8 @@ class Vla0SmolConfig(PreTrainedConfig):
         return None
 
     @property
-    def action_delta_indices(self) -> list[int]:
-        return list(range(self.chunk_size))
+    def action_delta_indices(self) -> list[int] | None:
+        return action_deltas(self)
 
     @property
     def reward_delta_indices(self) -> None:
