@@ -55,7 +55,7 @@ def test_a_policy_is_built_and_kept_so(policy_type: str, tmp_path: Path) -> None
     batch = cases.make_batch(policy, 2)
     torch.testing.assert_close(loaded.predict_action_chunk(batch), policy.predict_action_chunk(batch))
 
-    config = PreTrainedConfig.from_pretrained(tmp_path)
+    config: Any = PreTrainedConfig.from_pretrained(tmp_path)
     config.nano_config = None
     with pytest.raises(ValueError, match=r"--policy.nano_config=None: this checkpoint was trained with"):
         type(policy).from_pretrained(tmp_path, config=config)
