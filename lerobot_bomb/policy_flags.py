@@ -10,15 +10,22 @@ from typing import Any
 
 from lerobot.optim import AdamWConfig, CosineDecayWithWarmupSchedulerConfig
 
+from lerobot_bomb.vlm.tokenizer import NANO
+
 MAX_POSITIONS = 128_000  # of Qwen2.5-VL; LeRobot lists a chunk's frames before it builds a policy
 
 
 def check_model_name_and_precision(config: Any) -> None:
-    """A backbone is named, and precision is left to ``dtype``."""
+    """A backbone is named, nano alone is changed, and precision is left to ``dtype``."""
     check_architecture(config)
     if not config.vlm_model_name:
         raise ValueError(
             "--policy.vlm_model_name is empty; give a Hub id, the path of a local folder, or nano"
+        )
+    if config.nano_config and config.vlm_model_name != NANO:
+        raise ValueError(
+            f"--policy.nano_config={config.nano_config} changes --policy.vlm_model_name={NANO}, not "
+            f"{config.vlm_model_name}"
         )
     if config.use_amp:
         raise ValueError(
@@ -164,6 +171,14 @@ def check_weights_fit(config: Any, flags: Iterable[str]) -> None:
                 f"--policy.{flag}={value!r}: the weights of this checkpoint are made for {then[flag]!r}; "
                 f"only a training without --policy.path can change it"
             )
+
+
+def action_deltas(config: Any) -> list[int] | None:
+    """Steps of the actions that a sample has, from its frame on.
+
+    None for a chunk of one, which is the frame's own action: LeRobot reads that in a third of the time.
+    """
+    return None if config.chunk_size == 1 else list(range(config.chunk_size))
 
 
 def adamw(config: Any) -> AdamWConfig:

@@ -48,6 +48,8 @@ def check_policy(config: PreTrainedConfig, meta: LeRobotDatasetMetadata, rename_
                 f"the policy has {key!r} of shape {tuple(wanted.shape)}; dataset {meta.repo_id} has {has}"
             )
     indices = config.action_delta_indices
+    if indices is None and getattr(config, "chunk_size", None) == 1:
+        indices = [0]  # see `action_deltas`
     if (
         not indices
         or indices != list(range(len(indices)))

@@ -4,7 +4,7 @@ Shapes: `B` batch, `L` tokens, `H` hidden size of the text model, `V` vocabulary
 """
 
 import json
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
@@ -23,7 +23,7 @@ from transformers import (
 
 from lerobot_bomb.finite import require_finite_weights
 from lerobot_bomb.vlm.memory import check_memory
-from lerobot_bomb.vlm.presets import INITIALIZER_RANGE, nano_config
+from lerobot_bomb.vlm.presets import INITIALIZER_RANGE, changed, nano_config
 from lerobot_bomb.vlm.tokenizer import NANO, hub_file, load_tokenizer
 
 FAMILIES = {"vla0_smol": "smolvlm", "spatialvla_grid": "paligemma", "fdvla": "qwen2_5_vl"}  # of base models
@@ -75,15 +75,17 @@ class SmolVLMBackbone(nn.Module):
         return self.vlm.lm_head(hidden_BLH)
 
 
-def load_backbone(vlm_model_name: str) -> SmolVLMBackbone:
+def load_backbone(vlm_model_name: str, changes: Mapping[str, Any] | None = None) -> SmolVLMBackbone:
     """Backbone with pretrained weights of a Hub id or a local folder, or ``nano`` with random ones.
+
+    ``changes``: of nano's architecture.
 
     Raises:
         OSError: config or weights cannot be had; the message names the ways out.
-        ValueError: as `check_family`, or weights are not finite.
+        ValueError: as `check_family` and `changed`, or weights are not finite.
     """
     if vlm_model_name == NANO:
-        backbone = build_backbone(nano_config(load_tokenizer(NANO)))
+        backbone = build_backbone(changed(nano_config(load_tokenizer(NANO)), changes))
         spread_pictures(backbone.vlm.model.vision_model)
         return backbone
     config = read_vlm_config(vlm_model_name, "vla0_smol")

@@ -49,8 +49,10 @@ def read_task(batch: dict[str, Tensor], policy_type: str, device: torch.device) 
 def read_actions(
     batch: dict[str, Tensor], key: str, policy_type: str, device: torch.device, shape: tuple[int, int]
 ) -> Tensor:
-    """(B, T, D) of the given ``shape`` (T, D)."""
+    """(B, T, D) of the given ``shape`` (T, D); a chunk of one action may come as (B, D)."""
     actions_BTD = read_tensor(batch, key, policy_type, device)
+    if actions_BTD.ndim == 2 and shape[0] == 1:
+        actions_BTD = actions_BTD[:, None]
     if actions_BTD.ndim != 3 or actions_BTD.shape[1:] != shape:
         raise ValueError(
             f"batch[{key!r}] has shape {tuple(actions_BTD.shape)}; expected (batch, {shape[0]}, {shape[1]}) "

@@ -4,6 +4,7 @@ Shapes: `B` batch, `L` tokens, `H` hidden size of the text model, `E` of the vis
 tokens of an image.
 """
 
+from collections.abc import Mapping
 from dataclasses import asdict, dataclass
 from functools import partial
 from typing import Any
@@ -17,7 +18,7 @@ from lerobot_bomb.actions.text import END, SYMBOL_TEXTS
 from lerobot_bomb.finite import require_finite_weights
 from lerobot_bomb.vlm.backbone import read_vlm_config, set_float32, spread_pictures, weights_errors
 from lerobot_bomb.vlm.memory import check_memory
-from lerobot_bomb.vlm.presets import nano_paligemma_config
+from lerobot_bomb.vlm.presets import changed, nano_paligemma_config
 from lerobot_bomb.vlm.tokenizer import IMAGE_TOKEN, NANO, load_tokenizer, single_id, token_ids
 
 # PaliGemma counts positions from 1
@@ -115,15 +116,17 @@ class PaliGemmaBackbone(nn.Module):
         return logits if self.softcap is None else self.softcap * torch.tanh(logits / self.softcap)
 
 
-def load_paligemma(vlm_model_name: str) -> PaliGemmaBackbone:
+def load_paligemma(vlm_model_name: str, changes: Mapping[str, Any] | None = None) -> PaliGemmaBackbone:
     """Backbone with pretrained weights of a Hub id or a local folder, or ``nano`` with random ones.
+
+    ``changes``: of nano's architecture.
 
     Raises:
         OSError: config or weights cannot be had; the message names the ways out.
-        ValueError: the model is not a PaliGemma 2, or as `check_family`.
+        ValueError: the model is not a PaliGemma 2, or as `check_family` and `changed`.
     """
     if vlm_model_name == NANO:
-        backbone = build_paligemma(nano_paligemma_config(load_tokenizer(NANO)))
+        backbone = build_paligemma(changed(nano_paligemma_config(load_tokenizer(NANO)), changes))
         spread_pictures(backbone.vlm.model.vision_tower)
         return backbone
     config = read_vlm_config(vlm_model_name, "spatialvla_grid")

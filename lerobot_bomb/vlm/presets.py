@@ -1,5 +1,6 @@
 """Small backbones that are built in code: no network, trained on a laptop's CPU."""
 
+from collections.abc import Mapping
 from typing import Any
 
 from tokenizers import Tokenizer
@@ -26,6 +27,33 @@ NANO_TEXT = {
     "max_position_embeddings": 4096,
     "initializer_range": INITIALIZER_RANGE,
 }
+
+
+# what tokens are numbered by belongs to the tokenizer, and the family to the policy
+FIXED = ("model_type", "vocab_size")
+
+
+def changed(
+    config: dict[str, Any], changes: Mapping[str, Any] | None, flag: str = "--policy.nano_config"
+) -> dict[str, Any]:
+    """A preset with other values where ``changes``, nested as the preset is, has some.
+
+    Raises:
+        ValueError: the preset has no such value to change.
+    """
+    changes = changes or {}
+    free = [name for name in config if name not in FIXED and "token" not in name]
+    for name, value in changes.items():
+        if name not in free:
+            raise ValueError(f"{flag}: {name!r} cannot be changed; choose {', '.join(free)}")
+        if isinstance(value, Mapping) != isinstance(config[name], dict):
+            raise ValueError(f"{flag}: {name}={value!r} must be as in the preset, {config[name]!r}")
+    return {
+        name: changed(value, changes.get(name), f"{flag}, {name}")
+        if isinstance(value, dict)
+        else changes.get(name, value)
+        for name, value in config.items()
+    }
 
 
 def nano_config(tokenizer: Tokenizer) -> dict[str, Any]:

@@ -7,7 +7,7 @@ Shapes: `B` batch, `L` tokens of a prefix, `T` of a segment, `H` hidden size, `P
 of an image in pixels, `V` key-value heads, `E` size of a head.
 """
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass
 from functools import partial
 from typing import Any
@@ -22,7 +22,7 @@ from transformers.utils.constants import OPENAI_CLIP_MEAN, OPENAI_CLIP_STD
 from lerobot_bomb.finite import require_finite_weights
 from lerobot_bomb.vlm.backbone import read_vlm_config, set_float32, spread_filters, weights_errors
 from lerobot_bomb.vlm.memory import check_memory
-from lerobot_bomb.vlm.presets import nano_qwen_config
+from lerobot_bomb.vlm.presets import changed, nano_qwen_config
 from lerobot_bomb.vlm.tokenizer import (
     IMAGE_EDGE_TOKEN,
     IMAGE_TOKEN,
@@ -240,15 +240,17 @@ def _read_layer(
     return x_BTH, reader.new
 
 
-def load_qwen(vlm_model_name: str, image_size: int) -> QwenBackbone:
+def load_qwen(vlm_model_name: str, image_size: int, changes: Mapping[str, Any] | None = None) -> QwenBackbone:
     """Backbone with pretrained weights of a Hub id or a local folder, or ``nano`` with random ones.
+
+    ``changes``: of nano's architecture.
 
     Raises:
         OSError: config or weights cannot be had; the message names the ways out.
-        ValueError: as `check_family` and `QwenBackbone`.
+        ValueError: as `check_family`, `changed` and `QwenBackbone`.
     """
     if vlm_model_name == NANO:
-        backbone = build_qwen(nano_qwen_config(load_tokenizer(NANO)), image_size)
+        backbone = build_qwen(changed(nano_qwen_config(load_tokenizer(NANO)), changes), image_size)
         spread_filters(backbone.vlm.model.visual.patch_embed.proj.weight)
         return backbone
     config = read_vlm_config(vlm_model_name, "fdvla")

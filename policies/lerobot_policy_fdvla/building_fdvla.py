@@ -12,7 +12,7 @@ def build_model(config: FdvlaConfig) -> tuple[QwenPrompt, QwenBackbone]:
         name = config.vlm_model_name
         check_family(name, config.type)
         tokens = QwenPrompt.from_tokenizer(load_tokenizer(name), name)
-        backbone = load_qwen(name, config.image_size)
+        backbone = load_qwen(name, config.image_size, config.nano_config)
         config.vlm_config, config.prompt_tokens = config_dict(backbone.vlm), tokens.to_dict()
     elif config.prompt_tokens is None:
         raise ValueError("--policy.vlm_config is set, but not --policy.prompt_tokens, which belongs to it")

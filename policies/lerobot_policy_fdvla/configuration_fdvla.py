@@ -18,6 +18,7 @@ from lerobot_bomb.flow.samplers import check_heads, check_sampling
 from lerobot_bomb.policy_environment import ConfigWithEnvironment
 from lerobot_bomb.policy_flags import (
     MAX_POSITIONS,
+    action_deltas,
     adamw,
     check_cameras_and_action,
     check_chunk,
@@ -37,6 +38,7 @@ CONSISTENCY_LOSS_WEIGHT = 0.1
 PIXELS_PER_TOKEN = 28  # of a side: 2 patches of 14
 # flags that say which weights there are, and their shapes
 SHAPES = (
+    "nano_config",
     "chunk_size",
     "use_state",
     "use_flow_head",
@@ -57,6 +59,8 @@ class FdvlaConfig(ConfigWithEnvironment):
 
     # Hub id, path of a local folder, or "nano": a small model with random weights, built in code
     vlm_model_name: str = "Qwen/Qwen2.5-VL-3B-Instruct"
+    # changes of nano's architecture, nested as it is, as {"vision_config": {"num_hidden_layers": 2}}
+    nano_config: dict[str, Any] | None = None
     # architecture; filled in when the base model is loaded. Set = build this and download nothing:
     # the weights then come from a checkpoint
     vlm_config: dict[str, Any] | None = None
@@ -266,8 +270,8 @@ class FdvlaConfig(ConfigWithEnvironment):
         return None
 
     @property
-    def action_delta_indices(self) -> list[int]:
-        return list(range(self.chunk_size))
+    def action_delta_indices(self) -> list[int] | None:
+        return action_deltas(self)
 
     @property
     def reward_delta_indices(self) -> None:

@@ -210,7 +210,8 @@ class FdvlaPolicy(HubPolicy, SavesTiedWeightsOnce, PreTrainedPolicy):
         """(B, K) bool: which actions are read by others and trained on."""
         if f"{ACTION}_is_pad" in batch and not self.config.loss_on_padded_actions:
             return ~self._of_batch(batch, f"{ACTION}_is_pad").bool()
-        return torch.ones_like(batch[ACTION][..., 0], dtype=torch.bool)
+        actions = batch[ACTION]
+        return actions.new_ones(len(actions), self.config.chunk_size, dtype=torch.bool)
 
     def _draw_point(self, actions_BKD: Tensor) -> PathPoint:
         tau_B = draw_tau(self.config.time_sampling, len(actions_BKD), self.generator)

@@ -14,6 +14,7 @@ from lerobot_bomb.flag_errors import flag_errors
 from lerobot_bomb.flags import one_of
 from lerobot_bomb.policy_environment import ConfigWithEnvironment
 from lerobot_bomb.policy_flags import (
+    action_deltas,
     adamw,
     check_cameras_and_action,
     check_chunk,
@@ -39,8 +40,10 @@ PREFIX_ATTENTIONS = ("bidirectional", "causal")
 LOSS_VOCABULARIES = ("slot", "full")
 DRAFTS = ("none", "repeat")
 NUM_STATE_BINS = 256
-# flags that say what the model reads and writes, beside the grids' own
-AS_TRAINED = ("chunk_size", "use_state", "prefix_attention")
+# flags that say what shapes the weights have, beside the grids' own
+SHAPES = ("nano_config",)
+# the same, and flags that say what the model reads and writes
+AS_TRAINED = ("chunk_size", "use_state", "prefix_attention", *SHAPES)
 
 
 @PreTrainedConfig.register_subclass("spatialvla_grid")
@@ -50,6 +53,8 @@ class SpatialvlaGridConfig(ConfigWithEnvironment):
 
     # Hub id, path of a local folder, or "nano": a small model with random weights, built in code
     vlm_model_name: str = "google/paligemma2-3b-pt-224"
+    # changes of nano's architecture, nested as it is, as {"vision_config": {"num_hidden_layers": 2}}
+    nano_config: dict[str, Any] | None = None
     # architecture; filled in when the base model is loaded. Set = build this and download nothing:
     # the weights then come from a checkpoint
     vlm_config: dict[str, Any] | None = None
@@ -253,8 +258,8 @@ class SpatialvlaGridConfig(ConfigWithEnvironment):
         return None
 
     @property
-    def action_delta_indices(self) -> list[int]:
-        return list(range(self.chunk_size))
+    def action_delta_indices(self) -> list[int] | None:
+        return action_deltas(self)
 
     @property
     def reward_delta_indices(self) -> None:

@@ -34,7 +34,7 @@ from lerobot_bomb.data.columns import dim_names
 from lerobot_bomb.decoding.decoder import Prompt
 from lerobot_bomb.decoding.slots import SlotWriter
 from lerobot_bomb.hub.policy import HubPolicy
-from lerobot_bomb.policy_flags import check_as_trained, trained_with
+from lerobot_bomb.policy_flags import check_as_trained, check_weights_fit, trained_with
 from lerobot_bomb.processes import SavesTiedWeightsOnce, weighed
 from lerobot_bomb.training_draws import begin_batch
 from lerobot_bomb.vlm.depth import (
@@ -60,6 +60,7 @@ from lerobot_policy_spatialvla_grid.card_spatialvla_grid import METHOD
 from lerobot_policy_spatialvla_grid.configuration_spatialvla_grid import (
     AS_TRAINED,
     NUM_STATE_BINS,
+    SHAPES,
     SpatialvlaGridConfig,
 )
 
@@ -134,6 +135,8 @@ class SpatialvlaGridPolicy(HubPolicy, SavesTiedWeightsOnce, PreTrainedPolicy):
         if config is not None:
             if dataset_meta is None:
                 check_as_trained(config)
+            else:
+                check_weights_fit(config, SHAPES)
             config.check_grid_as_trained(is_refitted=dataset_meta is not None and config.adapt_embeddings)
         policy = super().from_pretrained(
             *args, config=config, dataset_meta=dataset_meta, **{**kwargs, "strict": True}
@@ -258,7 +261,8 @@ class SpatialvlaGridPolicy(HubPolicy, SavesTiedWeightsOnce, PreTrainedPolicy):
         """(B, T) bool: which actions are trained on."""
         if f"{ACTION}_is_pad" in batch and not self.config.loss_on_padded_actions:
             return ~batch[f"{ACTION}_is_pad"].bool()
-        return torch.ones_like(batch[ACTION][..., 0], dtype=torch.bool)
+        actions = batch[ACTION]
+        return actions.new_ones(len(actions), self.config.chunk_size, dtype=torch.bool)
 
     @torch.no_grad()
     def _metrics(

@@ -15,6 +15,7 @@ from lerobot_bomb.flag_errors import flag_errors
 from lerobot_bomb.flags import one_of
 from lerobot_bomb.policy_environment import ConfigWithEnvironment
 from lerobot_bomb.policy_flags import (
+    action_deltas,
     adamw,
     check_cameras_and_action,
     check_chunk,
@@ -35,8 +36,13 @@ BOUNDED_MODES = (
     NormalizationMode.IDENTITY,
 )
 MAX_BINS = 10**MAX_DIGITS
-# flags that say what the model's tokens mean
-AS_TRAINED = ("chunk_size", "n_action_bins", "n_state_bins", "bin_mode", "number_width", "use_state")
+# flags that say what shapes the weights have
+SHAPES = ("nano_config",)
+# the same, and flags that say what the model's tokens mean
+AS_TRAINED = (
+    *("chunk_size", "n_action_bins", "n_state_bins", "bin_mode", "number_width", "use_state"),
+    *SHAPES,
+)
 
 
 @PreTrainedConfig.register_subclass("vla0_smol")
@@ -46,6 +52,8 @@ class Vla0SmolConfig(ConfigWithEnvironment):
 
     # Hub id, path of a local folder, or "nano": a small model with random weights, built in code
     vlm_model_name: str = "HuggingFaceTB/SmolVLM2-500M-Video-Instruct"
+    # changes of nano's architecture, nested as it is, as {"vision_config": {"num_hidden_layers": 2}}
+    nano_config: dict[str, Any] | None = None
     # architecture; filled in when the base model is loaded. Set = build this and download nothing:
     # the weights then come from a checkpoint
     vlm_config: dict[str, Any] | None = None
@@ -230,8 +238,8 @@ class Vla0SmolConfig(ConfigWithEnvironment):
         return None
 
     @property
-    def action_delta_indices(self) -> list[int]:
-        return list(range(self.chunk_size))
+    def action_delta_indices(self) -> list[int] | None:
+        return action_deltas(self)
 
     @property
     def reward_delta_indices(self) -> None:

@@ -38,7 +38,7 @@ from lerobot_bomb.decoding.draft import KnownSymbols, LinearDraft
 from lerobot_bomb.decoding.grammar import NumberGrammar
 from lerobot_bomb.decoding.writer import NumberWriter
 from lerobot_bomb.hub.policy import HubPolicy
-from lerobot_bomb.policy_flags import check_as_trained, trained_with
+from lerobot_bomb.policy_flags import check_as_trained, check_weights_fit, trained_with
 from lerobot_bomb.processes import SavesTiedWeightsOnce, weighed
 from lerobot_bomb.training_draws import begin_batch
 from lerobot_bomb.vlm.backbone import (
@@ -54,7 +54,7 @@ from lerobot_bomb.vlm.inputs import read_actions, read_image, read_task, read_te
 from lerobot_bomb.vlm.prompt import PromptTokens
 from lerobot_bomb.vlm.tokenizer import load_tokenizer
 from lerobot_policy_vla0_smol.card_vla0_smol import METHOD
-from lerobot_policy_vla0_smol.configuration_vla0_smol import AS_TRAINED, Vla0SmolConfig
+from lerobot_policy_vla0_smol.configuration_vla0_smol import AS_TRAINED, SHAPES, Vla0SmolConfig
 
 
 class Vla0SmolPolicy(HubPolicy, SavesTiedWeightsOnce, PreTrainedPolicy):
@@ -116,8 +116,11 @@ class Vla0SmolPolicy(HubPolicy, SavesTiedWeightsOnce, PreTrainedPolicy):
     ) -> "Vla0SmolPolicy":
         """As LeRobot's, but a missing or unexpected tensor is an error; relative actions fit the new data."""
         _take_action_names(config, dataset_meta)
-        if config is not None and dataset_meta is None:
-            check_as_trained(config)
+        if config is not None:
+            if dataset_meta is None:
+                check_as_trained(config)
+            else:
+                check_weights_fit(config, SHAPES)
         try:
             policy = super().from_pretrained(
                 *args, config=config, dataset_meta=dataset_meta, **{**kwargs, "strict": True}
@@ -407,7 +410,7 @@ def _build(config: Vla0SmolConfig) -> tuple[PromptTokens, SmolVLMBackbone]:
         name = config.vlm_model_name
         check_family(name, config.type)
         tokens = PromptTokens.from_tokenizer(load_tokenizer(name), name, config.system_prompt)
-        backbone = load_backbone(name)
+        backbone = load_backbone(name, config.nano_config)
         config.vlm_config, config.prompt_tokens = config_dict(backbone.vlm), tokens.to_dict()
     elif config.prompt_tokens is None:
         raise ValueError("--policy.vlm_config is set, but not --policy.prompt_tokens, which belongs to it")
