@@ -10,7 +10,7 @@ import torch
 from lerobot.configs import PreTrainedConfig
 from policy_cases import CASES
 
-from lerobot_bomb.flags import FlagError
+from lerobot_bomb.flag_errors import FlagError
 from lerobot_bomb.policy_flags import check_as_trained, check_weights_fit
 from lerobot_bomb.vlm.presets import changed
 
