@@ -158,7 +158,10 @@ def parse_line(line: bytes) -> Row:
     Raises:
         ValueError: the line is not JSON, or a field is missing, mistyped or impossible.
     """
-    row = json.loads(line)
+    try:
+        row = json.loads(line)
+    except json.JSONDecodeError as error:
+        raise ValueError(f"{error.msg} at column {error.colno}") from None
     if not isinstance(row, dict):
         raise ValueError("no JSON object")
     version = row.get("protocol_version")
