@@ -17,7 +17,7 @@ from lerobot.processor import (
     ProcessorStep,
 )
 from lerobot.utils.import_utils import register_third_party_plugins
-from policy_cases import CASES
+from policy_cases import save_checkpoint
 
 from hub.damage import (
     POSTPROCESSOR,
@@ -183,12 +183,7 @@ def test_stock_types_load_and_run_no_code(tmp_path: Path) -> None:
 
 def test_whole_checkpoints_of_all_types_load(policy_type: str, tmp_path: Path) -> None:
     register_third_party_plugins()
-    cases = CASES[policy_type]
-    policy = cases.make_policy()
-    policy.save_pretrained(tmp_path)
-    stats = cases.STATS if policy_type == "vla0_smol" else cases.stats()
-    for processor in make_pre_post_processors(policy.config, dataset_stats=stats):
-        processor.save_pretrained(tmp_path)
+    save_checkpoint(policy_type, tmp_path)
     before, after = load_processors(read_config(tmp_path, "cpu"))
     assert (len(before.steps), len(after.steps)) == (5, 2)
 

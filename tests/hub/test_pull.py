@@ -10,7 +10,7 @@ import torch
 import transformers.dynamic_module_utils
 from lerobot.policies import get_policy_class, make_pre_post_processors
 from lerobot.scripts import lerobot_eval
-from policy_cases import CASES
+from policy_cases import CASES, save_checkpoint
 
 from hub.damage import (
     POSTPROCESSOR,
@@ -191,12 +191,7 @@ def test_an_older_version_and_a_later_one_of_the_same_release_are_read(version: 
 def test_nothing_is_unpickled_and_no_code_of_a_checkpoint_runs(
     policy_type: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    cases = CASES[policy_type]
-    policy = cases.make_policy()
-    policy.save_pretrained(tmp_path)
-    stats = cases.STATS if policy_type == "vla0_smol" else cases.stats()
-    for processor in make_pre_post_processors(policy.config, dataset_stats=stats):
-        processor.save_pretrained(tmp_path)
+    policy = save_checkpoint(policy_type, tmp_path)
     for name in ("pytorch_model.bin", "model.bin", "optimizer.pkl"):
         (tmp_path / name).write_bytes(pickle.dumps("read"))
     (tmp_path / "modeling_remote.py").write_text("raise SystemExit('remote code runs')")
