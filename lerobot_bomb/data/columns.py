@@ -9,12 +9,7 @@ import pyarrow as pa
 from lerobot.datasets import LeRobotDatasetMetadata
 from lerobot.utils.constants import DEFAULT_FEATURES, HF_LEROBOT_HOME
 
-from lerobot_bomb.data.dataset_files import (
-    INFO_FILE,
-    check_metadata,
-    flat_numbers,
-    read_parquet,
-)
+from lerobot_bomb.data.dataset_files import INFO_FILE, check_metadata, flat_numbers, read_parquet
 from lerobot_bomb.data.growing import check_repo_id
 from lerobot_bomb.hub_token import TokenError, refuse_unsendable_tokens
 
@@ -70,8 +65,9 @@ def read_columns(
     table = pa.concat_tables(tables).sort_by("index")
     shapes = {key: () if key in DEFAULT_FEATURES else meta.features[key]["shape"] for key in columns}
     arrays = {key: flat_numbers(table[key]).reshape(len(table), *shapes[key]) for key in columns}
+    index_N = flat_numbers(table["index"])
     for key in columns:
-        _require_finite(meta, key, arrays[key], arrays[EPISODE_INDEX], flat_numbers(table["index"]))
+        _require_finite(meta, key, arrays[key], arrays[EPISODE_INDEX], index_N)
     return arrays
 
 

@@ -203,8 +203,7 @@ class FdvlaPolicy(HubPolicy, SavesTiedWeightsOnce, PreTrainedPolicy):
     def _actions(self, batch: dict[str, Tensor]) -> Tensor:
         """(B, K, D) normalised."""
         shape = self.config.chunk_size, self._action_dim
-        device = self.action_unit.device
-        return read_actions(batch, ACTION, self.config.type, device, shape).float()
+        return read_actions(batch, ACTION, self.config.type, self.action_unit.device, shape).float()
 
     def _kept(self, batch: dict[str, Tensor]) -> Tensor:
         """(B, K) bool: which actions are read by others and trained on."""
