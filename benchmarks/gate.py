@@ -1,13 +1,15 @@
-"""Can BOMB's demonstrations be learnt at all? The gate that opens before a big model is trained.
+"""Do policies that start from nothing learn to place stones that they have never seen, on one CPU core?
 
-A small image policy (lerobot_policy_keypoint_probe/) is trained by the stock `lerobot-train` on
-demonstrations of the scripted expert, and its checkpoints are evaluated by the stock `lerobot-eval` on seeds
-that it has not seen; the last one twice more: with black images, and told the sentence of another episode.
+A policy is trained by the stock `lerobot-train` on demonstrations of the scripted expert, and its checkpoints
+are evaluated by the stock `lerobot-eval` on seeds that it has not seen; the last one twice more: with black
+images, and told the sentence of another episode. The policy is a small probe made for this task
+(lerobot_policy_keypoint_probe/: can it be learnt at all?) or one of ours, by configs/RUNG_TYPE.yaml.
 
-    OMP_NUM_THREADS=1 python benchmarks/gate.py one_target --output_dir gate
+    OMP_NUM_THREADS=1 python benchmarks/gate.py one_target --policy.type=vla0_smol --output_dir gate
 
 What is finished stays in the output folder and is not done again: the dataset, the training, each evaluation.
-A training that was killed starts anew. Flags --policy.NAME=VALUE go to `lerobot-train`.
+A training that was killed starts anew. Flags --policy.NAME=VALUE go to `lerobot-train`. Recipes are chosen on
+other seeds than those that are reported: --first_seed=50000.
 """
 
 import argparse
@@ -23,35 +25,68 @@ from typing import Any
 
 from learning_curve import Point, as_figures, count, draw, print_points
 from machine import add_machine_arguments, positive, require_idle_machine, write_figures
+from recipes import POLICY_TYPES, read_recipe, recipe_path
 
 from lerobot_bomb.commands import run_command
 from lerobot_bomb.evaluation.results import PUT_DOWN, Row, read_results
 
-PLUGIN = "lerobot_policy_keypoint_probe"  # not installed: LeRobot finds it by --*.discover_packages_path
+PROBE = "keypoint_probe"
+PLUGIN = f"lerobot_policy_{PROBE}"  # not installed: LeRobot finds it by --*.discover_packages_path
 REPO_ID = "gate/bomb_place"
 IMAGE_SIZE = 64  # pixels
 NOISE = 0.05  # on the executed actions, so that recoveries are in the data
 BATCH_SIZE = 64
-FIRST_SEED = 1000  # of the demonstrations
+FIRST_SEED = 200_000  # of the demonstrations; LeRobot evaluates from 1000 on
 FIRST_UNSEEN_SEED = 100_000
-EVAL_EPISODES = 100
 NUM_CHECKPOINTS = 6
+CURVE_EPISODES = 50  # of every checkpoint but the last
 NO_IMAGES, OTHER_SENTENCE = "blank images", "another episode's sentence"
 
 
 @dataclass(frozen=True)
+class Bar:
+    """What the last checkpoint must reach."""
+
+    success: float  # rate
+    cpu_minutes: float  # of the training
+
+
+@dataclass(frozen=True)
+class Lesson:
+    """What one policy type gets to learn a rung."""
+
+    demonstrations: int
+    bar: Bar | None  # None: it is only measured
+    steps: int | None = None  # None: its recipe's
+
+
+@dataclass(frozen=True)
 class Rung:
-    """A step of difficulty: which tasks, how many demonstrations, how long a training."""
+    """A step of difficulty: which tasks, and what each policy type gets to learn them."""
 
     task_ids: tuple[int, ...]  # empty: target and colour are drawn for each episode
-    demonstrations: int
-    steps: int
-    bar: float | None  # success rate that the last checkpoint must reach; None: it is only measured
+    episodes: int  # of each evaluation
+    lessons: dict[str, Lesson]
 
 
 RUNGS = {
-    "one_target": Rung((12,), demonstrations=200, steps=3000, bar=0.90),
-    "all_targets": Rung((), demonstrations=400, steps=6000, bar=None),
+    "one_target": Rung(
+        (12,),
+        episodes=100,
+        lessons={
+            PROBE: Lesson(200, Bar(0.90, 120), steps=3000),
+            **{name: Lesson(600, Bar(0.95, 20)) for name in POLICY_TYPES},
+        },
+    ),
+    "all_targets": Rung(
+        (),
+        episodes=200,
+        lessons={
+            PROBE: Lesson(400, None, steps=6000),
+            **{name: Lesson(1600, Bar(0.90, 180)) for name in POLICY_TYPES},
+            "vla0_smol": Lesson(1600, Bar(0.97, 90)),
+        },
+    ),
 }
 
 
@@ -59,9 +94,15 @@ def main() -> None:
     """Record, train, evaluate every checkpoint, print the curve; exit code 1 where the bar is missed."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawTextHelpFormatter)
     parser.add_argument("rung", choices=RUNGS)
+    types = [PROBE, *POLICY_TYPES]
+    parser.add_argument("--policy.type", dest="policy_type", choices=types, default=PROBE)
     parser.add_argument("--output_dir", type=Path, required=True, help="folder to keep, or to go on with")
     parser.add_argument("--demonstrations", type=positive, help="default: the rung's")
-    parser.add_argument("--steps", type=positive, help="training steps (default: the rung's)")
+    parser.add_argument("--steps", type=positive, help="training steps (default: the recipe's)")
+    points = f"points of the curve (default: {NUM_CHECKPOINTS})"
+    parser.add_argument("--checkpoints", type=positive, default=NUM_CHECKPOINTS, help=points)
+    seeds = f"of the evaluations (default: {FIRST_UNSEEN_SEED})"
+    parser.add_argument("--first_seed", type=positive, default=FIRST_UNSEEN_SEED, help=seeds)
     parser.add_argument("--picture", type=Path, help="write the learning curve to this PNG")
     add_machine_arguments(parser)
     args, args.policy_flags = parser.parse_known_args()
@@ -81,35 +122,47 @@ def main() -> None:
 def climb(args: argparse.Namespace) -> int:
     """The whole rung in args.output_dir; 0 if the bar was reached."""
     rung, folder = RUNGS[args.rung], args.output_dir
-    demonstrations, steps = args.demonstrations or rung.demonstrations, args.steps or rung.steps
-    run = {"rung": args.rung, "demonstrations": demonstrations, "steps": steps, "flags": args.policy_flags}
+    lesson = rung.lessons[args.policy_type]
+    demonstrations = args.demonstrations or lesson.demonstrations
+    run = {
+        "rung": args.rung,
+        "policy": args.policy_type,
+        "demonstrations": demonstrations,
+        "steps": args.steps or lesson.steps or read_recipe(args.rung, args.policy_type)["steps"],
+        "checkpoints": args.checkpoints,
+        "first_seed": args.first_seed,
+        "flags": args.policy_flags,
+    }
     claim(folder, run)
     record(rung, demonstrations, folder / "dataset")
-    minutes = train(folder, steps, args.policy_flags)
+    minutes = train(folder, run)
 
-    results = evaluate_checkpoints(rung, folder)
-    told = other_sentences(results[steps])
-    controls = evaluate_controls(rung, folder, told)
-    minutes_per_step = minutes["cpu_minutes"] / steps
+    results = evaluate_checkpoints(rung, folder, args.first_seed, run["steps"])
+    told = other_sentences(results[run["steps"]])
+    controls = evaluate_controls(rung, folder, args.first_seed, told)
+    minutes_per_step = minutes["cpu_minutes"] / run["steps"]
     points = {f"step {step}": count(rows, step, step * minutes_per_step) for step, rows in results.items()}
-    points |= {name: count(rows, steps, minutes["cpu_minutes"]) for name, rows in controls.items()}
+    points |= {name: count(rows, run["steps"], minutes["cpu_minutes"]) for name, rows in controls.items()}
 
     num_named = count_named(controls[OTHER_SENTENCE], told)
     print_points(points)
-    print(f"{OTHER_SENTENCE}: {num_named}/{EVAL_EPISODES} stones put down on the intersection that it names")
+    print(f"{OTHER_SENTENCE}: {num_named}/{rung.episodes} stones put down on the intersection that it names")
     if args.picture is not None:
-        title = f"{args.rung}: {demonstrations} demonstrations, {EVAL_EPISODES} unseen seeds"
+        title = f"{args.policy_type}, {args.rung}: {demonstrations} demonstrations, {rung.episodes} new seeds"
         draw([points[f"step {step}"] for step in results], title, args.picture)
     write_figures(
         args.json, {**run, "training": minutes, "points": as_figures(points), "on_named": num_named}
     )
-    return 0 if rung.bar is None else verdict(points[f"step {steps}"], rung.bar)
+    return 0 if lesson.bar is None else verdict(points[f"step {run['steps']}"], lesson.bar)
 
 
-def verdict(last: Point, bar: float) -> int:
+def verdict(last: Point, bar: Bar) -> int:
     """Say whether the last checkpoint reaches the bar; 0 if it does."""
-    is_open = last.num_successes >= bar * last.num_episodes
-    print(f"bar {100 * bar:.0f} %: {'reached' if is_open else 'MISSED'}")
+    is_open = last.num_successes >= bar.success * last.num_episodes and last.cpu_minutes <= bar.cpu_minutes
+    print(
+        f"bar {100 * bar.success:.0f} % within {bar.cpu_minutes:.0f} CPU minutes: "
+        f"{'reached' if is_open else 'MISSED'}"
+    )
     return 0 if is_open else 1
 
 
@@ -145,26 +198,24 @@ def record(rung: Rung, demonstrations: int, dataset: Path) -> None:
     )
 
 
-def train(folder: Path, steps: int, policy_flags: list[str]) -> dict[str, float]:
-    """Stock `lerobot-train` with NUM_CHECKPOINTS checkpoints; {"minutes", "cpu_minutes"} that it took."""
+def train(folder: Path, run: dict[str, Any]) -> dict[str, float]:
+    """Stock `lerobot-train` of a run; {"minutes", "cpu_minutes"} that it took."""
     times = folder / "training.json"
     if times.exists():
         return json.loads(times.read_text())
     shutil.rmtree(folder / "train", ignore_errors=True)
     started, cpu_started = time.monotonic(), _children_cpu_s()
+    recipe = [f"--config_path={recipe_path(run['rung'], run['policy'])}"]
     run_command(
         "lerobot-train",
-        f"--policy.discover_packages_path={PLUGIN}",
-        "--policy.type=keypoint_probe",
-        "--policy.device=cpu",
+        *(probe_recipe() if run["policy"] == PROBE else recipe),
         f"--dataset.repo_id={REPO_ID}",
         f"--dataset.root={folder / 'dataset'}",
         f"--output_dir={folder / 'train'}",
-        f"--batch_size={BATCH_SIZE}",
-        f"--steps={steps}",
-        f"--save_freq={-(-steps // NUM_CHECKPOINTS)}",
+        f"--steps={run['steps']}",
+        f"--save_freq={-(-run['steps'] // run['checkpoints'])}",
         "--num_workers=0",  # a second process would use a second core
-        *policy_flags,
+        *run["flags"],
     )
     minutes = {
         "minutes": (time.monotonic() - started) / 60,
@@ -174,15 +225,33 @@ def train(folder: Path, steps: int, policy_flags: list[str]) -> dict[str, float]
     return minutes
 
 
-def evaluate_checkpoints(rung: Rung, folder: Path) -> dict[int, list[Row]]:
-    """{training step: results}."""
+def probe_recipe() -> list[str]:
+    """Flags of `lerobot-train` with which the probe learns."""
+    return [
+        f"--policy.discover_packages_path={PLUGIN}",
+        f"--policy.type={PROBE}",
+        "--policy.device=cpu",
+        f"--batch_size={BATCH_SIZE}",
+    ]
+
+
+def evaluate_checkpoints(rung: Rung, folder: Path, first_seed: int, last: int) -> dict[int, list[Row]]:
+    """{training step: results}; all but the last are only the curve."""
     return {
-        int(path.name): evaluate(rung, path / "pretrained_model", folder / f"eval_{path.name}")
+        int(path.name): evaluate(
+            rung,
+            path / "pretrained_model",
+            folder / f"eval_{path.name}",
+            first_seed,
+            rung.episodes if int(path.name) == last else min(CURVE_EPISODES, rung.episodes),
+        )
         for path in sorted((folder / "train" / "checkpoints").glob("[0-9]*"))
     }
 
 
-def evaluate_controls(rung: Rung, folder: Path, told: dict[str, str]) -> dict[str, list[Row]]:
+def evaluate_controls(
+    rung: Rung, folder: Path, first_seed: int, told: dict[str, str]
+) -> dict[str, list[Row]]:
     """{control: results} of the last checkpoint with black cameras, and told other sentences."""
     import lerobot_policy_keypoint_probe  # noqa: F401  its processor step must be known when it is loaded
 
@@ -196,12 +265,13 @@ def evaluate_controls(rung: Rung, folder: Path, told: dict[str, str]) -> dict[st
     ):
         shutil.rmtree(checkpoint.with_name(changed), ignore_errors=True)
         intervene(checkpoint, [step], checkpoint.with_name(changed))
-        results[name] = evaluate(rung, checkpoint.with_name(changed), folder / f"eval_{changed}")
+        output_dir = folder / f"eval_{changed}"
+        results[name] = evaluate(rung, checkpoint.with_name(changed), output_dir, first_seed, rung.episodes)
     return results
 
 
-def evaluate(rung: Rung, checkpoint: Path, output_dir: Path) -> list[Row]:
-    """Stock `lerobot-eval` on EVAL_EPISODES unseen seeds; their results."""
+def evaluate(rung: Rung, checkpoint: Path, output_dir: Path, first_seed: int, episodes: int) -> list[Row]:
+    """Stock `lerobot-eval` on unseen seeds; their results."""
     results = output_dir / "results.jsonl"
     finished = output_dir / "finished"  # an evaluation that was killed leaves results of some episodes
     if not finished.exists():
@@ -216,9 +286,9 @@ def evaluate(rung: Rung, checkpoint: Path, output_dir: Path) -> list[Row]:
             f"--env.image_size={IMAGE_SIZE}",
             f"--env.results_path={results}",
             *tasks,
-            f"--seed={FIRST_UNSEEN_SEED}",
-            f"--eval.n_episodes={EVAL_EPISODES}",
-            "--eval.batch_size=10",
+            f"--seed={first_seed}",
+            f"--eval.n_episodes={episodes}",
+            f"--eval.batch_size={min(10, episodes)}",
             "--eval.use_async_envs=false",
             f"--output_dir={output_dir / 'eval'}",
         )
@@ -227,10 +297,17 @@ def evaluate(rung: Rung, checkpoint: Path, output_dir: Path) -> list[Row]:
 
 
 def other_sentences(rows: list[Row]) -> dict[str, str]:
-    """{instruction: that of another episode}; where all episodes have one target, in other words only."""
-    sentences = sorted({row["instruction"] for row in rows})
-    half = len(sentences) // 2
-    return dict(zip(sentences, sentences[half:] + sentences[:half], strict=True))
+    """{instruction: that of another target}; where all episodes have one target, in other words only."""
+    targets = {row["instruction"]: row["target"] for row in rows}
+    sentences = sorted(targets)
+
+    def shifted(places: int) -> dict[str, str]:
+        return dict(zip(sentences, sentences[places:] + sentences[:places], strict=True))
+
+    def num_others(told: dict[str, str]) -> int:
+        return sum(targets[sentence] != targets[other] for sentence, other in told.items())
+
+    return max(map(shifted, range(1, max(2, len(sentences)))), key=num_others)
 
 
 def count_named(rows: list[Row], told: dict[str, str]) -> int:

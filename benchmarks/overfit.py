@@ -142,7 +142,7 @@ def train(args: argparse.Namespace, folder: Path) -> Path:
     override = [f"--steps={args.steps}"] if args.steps else []
     run_command(
         "lerobot-train",
-        f"--config_path={recipe_path(args.policy_type)}",
+        f"--config_path={recipe_path('overfit', args.policy_type)}",
         f"--dataset.root={folder / 'dataset'}",
         f"--output_dir={folder / 'train'}",
         "--save_checkpoint=true",
@@ -234,7 +234,7 @@ def report(
         "policy": args.policy_type,
         "flags": args.policy_flags,
         "seed": SEED,
-        "steps": args.steps or read_recipe(args.policy_type)["steps"],
+        "steps": args.steps or read_recipe("overfit", args.policy_type)["steps"],
         "episodes": len(TASK_IDS),
         **{condition.name: count for condition, count in counts.items()},
         "minutes": minutes,

@@ -29,7 +29,7 @@ from typing import Any
 
 from machine import positive, write_figures
 from pusht_report import Seed, print_report
-from recipes import PUSHT_TYPES, pusht_recipe_path
+from recipes import PUSHT_TYPES, recipe_path
 
 from lerobot_bomb.commands import run_command
 
@@ -187,7 +187,7 @@ def train(run: Run, policy_type: str, dataset: Path, flags: list[str]) -> None:
     cpu_s = run_logged(
         run.folder / "train.log",
         "lerobot-train",
-        f"--config_path={pusht_recipe_path(policy_type)}",
+        f"--config_path={recipe_path('pusht', policy_type)}",
         f"--dataset.repo_id={REPO_ID}",
         f"--dataset.root={dataset}",
         f"--dataset.episodes={list(range(NUM_TRAIN_EPISODES))}",

@@ -12,16 +12,11 @@ POLICY_TYPES = sorted(path.stem.removeprefix("overfit_") for path in FOLDER.glob
 PUSHT_TYPES = sorted(path.stem.removeprefix("pusht_") for path in FOLDER.glob("pusht_*.yaml"))
 
 
-def recipe_path(policy_type: str) -> Path:
-    """A config for `lerobot-train --config_path`."""
-    return FOLDER / f"overfit_{policy_type}.yaml"
+def recipe_path(task: str, policy_type: str) -> Path:
+    """A config for `lerobot-train --config_path`; task: overfit, one_target, all_targets or pusht."""
+    return FOLDER / f"{task}_{policy_type}.yaml"
 
 
-def read_recipe(policy_type: str) -> dict[str, Any]:
+def read_recipe(task: str, policy_type: str) -> dict[str, Any]:
     """The recipe's values."""
-    return yaml.safe_load(recipe_path(policy_type).read_text())
-
-
-def pusht_recipe_path(policy_type: str) -> Path:
-    """A config for `lerobot-train --config_path` on the PushT demonstrations, without dataset."""
-    return FOLDER / f"pusht_{policy_type}.yaml"
+    return yaml.safe_load(recipe_path(task, policy_type).read_text())

@@ -82,7 +82,7 @@ def main() -> None:
 
 def recipe(policy_type: str, dataset: Path) -> TrainPipelineConfig:
     """The training config of configs/overfit_TYPE.yaml for this dataset, as `lerobot-train` reads it."""
-    values = read_recipe(policy_type)
+    values = read_recipe("overfit", policy_type)
     values["dataset"] |= {"root": str(dataset), "video_backend": "pyav"}
     return draccus.decode(TrainPipelineConfig, values)
 

@@ -98,6 +98,6 @@ def policy_flags() -> Callable[[str], dict[str, Any]]:
     """policy_flags("vla0_smol"): what configs/overfit_vla0_smol.yaml sets under `policy`."""
 
     def read(policy_type: str) -> dict[str, Any]:
-        return read_recipe(policy_type)["policy"]
+        return read_recipe("overfit", policy_type)["policy"]
 
     return read

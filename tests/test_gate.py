@@ -33,11 +33,11 @@ def commands(monkeypatch: pytest.MonkeyPatch, stock_cli: Callable[..., None]) ->
             short = ["--env.fps=2", "--env.ignore_checkpoint=true"]
             stock_cli(command, *flags, *short, "--eval.batch_size=1")
 
-    tiny = gate.Rung((), demonstrations=1, steps=2, bar=0.5)
+    lesson = gate.Lesson(demonstrations=1, bar=gate.Bar(0.5, cpu_minutes=5), steps=2)
+    tiny = gate.Rung((), episodes=1, lessons={gate.PROBE: lesson})
     for name, value in {"run_command": run, "RUNGS": {"tiny": tiny}, "IMAGE_SIZE": SIZE}.items():
         monkeypatch.setattr(gate, name, value)
-    for name, value in {"EVAL_EPISODES": 1, "NUM_CHECKPOINTS": 2, "BATCH_SIZE": 2}.items():
-        monkeypatch.setattr(gate, name, value)
+    monkeypatch.setattr(gate, "BATCH_SIZE", 2)
     cpu_s = iter((100.0, 220.0))  # before and after the training
     monkeypatch.setattr(gate, "_children_cpu_s", lambda: next(cpu_s))
     return ran
@@ -49,6 +49,9 @@ def test_a_rung_is_climbed_by_stock_commands_and_goes_on_where_it_stopped(
     folder = tmp_path / "rung"
     args = Namespace(
         rung="tiny",
+        policy_type=gate.PROBE,
+        checkpoints=2,
+        first_seed=100_000,
         output_dir=folder,
         demonstrations=None,
         steps=None,
@@ -68,7 +71,7 @@ def test_a_rung_is_climbed_by_stock_commands_and_goes_on_where_it_stopped(
     assert figures["training"]["cpu_minutes"] == 2.0
     assert figures["points"]["step 1"]["cpu_minutes"] == 1.0
     assert all(point["num_episodes"] == 1 for point in figures["points"].values())
-    assert "bar 50 %: MISSED" in capsys.readouterr().out
+    assert "bar 50 % within 5 CPU minutes: MISSED" in capsys.readouterr().out
 
     commands.clear()
     (folder / "eval_000002" / "finished").unlink()
@@ -92,6 +95,28 @@ def test_a_stone_counts_where_the_told_sentence_says() -> None:
     assert told == {"a": "b", "b": "a"}
     assert gate.count_named(rows, told) == 1
     assert gate.count_named(rows, {"a": "a", "b": "b"}) == 2
+
+
+def test_the_other_sentence_names_another_target() -> None:
+    targets = {"black 1": [0, 0], "black 2": [0, 1], "white 1": [0, 0], "white 2": [0, 1]}
+    told = gate.other_sentences([row(None, 1.0, instruction=name, target=at) for name, at in targets.items()])
+    assert all(targets[sentence] != targets[other] for sentence, other in told.items())
+    assert gate.other_sentences([row(None, 1.0, instruction="only")]) == {"only": "only"}
+
+
+def test_every_policy_type_has_a_recipe_for_every_rung() -> None:
+    for name, rung in gate.RUNGS.items():
+        for policy_type in rung.lessons.keys() - {gate.PROBE}:
+            recipe = gate.read_recipe(name, policy_type)
+            assert recipe["policy"]["type"] == policy_type
+            assert recipe["policy"]["scheduler_decay_steps"] == recipe["steps"]
+
+
+def test_a_bar_is_of_success_and_of_time() -> None:
+    point = count([row(None, 1.0)] * 9 + [row("dropped", 1.0)], step=1, cpu_minutes=4.0)
+    assert gate.verdict(point, gate.Bar(0.9, cpu_minutes=4)) == 0
+    assert gate.verdict(point, gate.Bar(0.91, cpu_minutes=4)) == 1
+    assert gate.verdict(point, gate.Bar(0.9, cpu_minutes=3.9)) == 1
 
 
 # The curve

@@ -43,7 +43,7 @@ def test_two_targets_learned_by_heart_through_the_stock_commands(
     recording = ["--repo_id=overfit/two", f"--root={dataset}", "--episodes=2", f"--seed={seed}", "--images"]
     assert main(["record", *recording, f"--task_ids={tasks}", f"--image_size={SIZE}"]) == 0
     data = ["--dataset.repo_id=overfit/two", f"--dataset.root={dataset}", f"--output_dir={train}"]
-    flags = f"--config_path={recipe_path(policy_type)} --steps=500 --num_workers=0"
+    flags = f"--config_path={recipe_path('overfit', policy_type)} --steps=500 --num_workers=0"
     stock_cli("lerobot-train", *flags.split(), *data, *as_flags(options))
     checkpoint = train / "checkpoints" / "last" / "pretrained_model"
     flags = f"--policy.path={checkpoint} --env.type=bomb --env.image_size={SIZE} --seed={seed}"

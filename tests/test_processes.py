@@ -45,7 +45,7 @@ def dataset(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 def flags(policy_type: str, dataset: Path, batch_size: int, output_dir: str) -> list[str]:
     return [
-        f"--config_path={recipe_path(policy_type)}",
+        f"--config_path={recipe_path('overfit', policy_type)}",
         f"--dataset.root={dataset}",
         f"--output_dir={output_dir}",
         f"--batch_size={batch_size}",

@@ -46,7 +46,7 @@ def routes(shared_data: Path, tmp_path_factory: pytest.TempPathFactory) -> Route
     folder = tmp_path_factory.mktemp("pusht")
     bounds = [0, *demonstrations.ends]
     recorded = Recorded(convert(demonstrations, folder), demonstrations.actions, bounds, "absolute")
-    options = read_recipe("vla0_smol")["policy"] | {"relative_actions": True}
+    options = read_recipe("overfit", "vla0_smol")["policy"] | {"relative_actions": True}
     flags = cli_flags("vla0_smol", options, use_state=True)
 
     def finish(policy: PreTrainedPolicy, batches: dict[int, Batch]) -> None:

@@ -57,7 +57,7 @@ def test_a_resumed_training_is_the_uninterrupted_one(
     whole, second = tmp_path / "whole", tmp_path / "second"
     stock_cli(
         "lerobot-train",
-        f"--config_path={recipe_path(policy_type)}",
+        f"--config_path={recipe_path('overfit', policy_type)}",
         *flags.split(),
         f"--output_dir={whole}",
     )
