@@ -1,7 +1,7 @@
 # `make` finds a Python >= 3.12 by itself; name one with `make PYTHON=/path/to/python3.12 ...`.
 SHELL := /bin/bash
 .DEFAULT_GOAL := help
-.PHONY: help setup demo test test-long test-cuda judges check build clean
+.PHONY: help setup demo demo-train test test-long test-cuda judges check build clean
 
 BIN := .venv/bin
 STAMP := .venv/.installed
@@ -11,7 +11,8 @@ export OMP_NUM_THREADS ?= 1
 PYTEST := $(BIN)/pytest -n auto --maxprocesses=4 --dist=loadfile
 
 help:
-	@echo "make demo       set up, record, train, evaluate; about 10 minutes on 2 cores"
+	@echo "make demo       set up; a trained policy plays, and its rates and pictures"
+	@echo "make demo-train set up, record, train a policy that places stones, evaluate it"
 	@echo "make test       set up and run the tests"
 	@echo "make test-long  the heavy tests as well"
 	@echo "make test-cuda  checks that need a CUDA device"
@@ -36,6 +37,11 @@ $(STAMP): pyproject.toml constraints.txt lerobot_bomb/__init__.py
 
 demo: setup
 	@$(BIN)/lerobot-bomb demo
+
+# a folder that is kept: what was finished when it was stopped is not done again
+demo-train: setup
+	@$(BIN)/python benchmarks/gate.py one_target --policy.type=vla0_smol --checkpoints=2 --force \
+		--output_dir=outputs/demo_train --picture=outputs/demo_train/learning_curve.png
 
 test: setup
 	@$(PYTEST) -m "not long"

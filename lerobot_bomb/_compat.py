@@ -170,6 +170,26 @@ def check_tokens_before_use(check: Callable[[str], None]) -> None:
     _headers.get_token_to_send = get_token_to_send
 
 
+def resolve_checkpoints(resolve: Callable[[str], str]) -> None:
+    """Let `--policy.path` of LeRobot's commands, and of their config files, be what `resolve` makes of it.
+
+    A ValueError of it ends the command in one line.
+    """
+    from lerobot.configs import parser
+
+    usual = parser.get_path_arg
+
+    @wraps(usual)
+    def get_path_arg(field_name: str, args: Sequence[str] | None = None) -> str | None:
+        path = usual(field_name, args)
+        try:
+            return path if path is None else resolve(path)
+        except ValueError as error:
+            sys.exit(f"--{field_name}.path={path}: {error}")
+
+    parser.get_path_arg = get_path_arg
+
+
 def remember_policies() -> None:
     """Let `built_policies` know every policy that this process builds, LeRobot's own types too.
 

@@ -19,6 +19,7 @@ from lerobot_bomb.flags import path_flag
 from lerobot_bomb.hub.checks import PROCESSORS, processor_files
 from lerobot_bomb.hub.names import CONFIG
 from lerobot_bomb.hub.processor_files import check_states
+from lerobot_bomb.shipped import checkpoint_flag
 from lerobot_bomb.viewing.unfinished import written_whole
 
 FILES = (CONFIG, f"{POLICY_PREPROCESSOR_DEFAULT_NAME}.json")
@@ -82,7 +83,7 @@ def load_processors(config: PreTrainedConfig) -> tuple[Preprocessor, Postprocess
 def add_folder_arguments(parser: argparse.ArgumentParser, checkpoint: str, output: str) -> None:
     """Declare --policy.path, a checkpoint's folder, and --output, a new one."""
     path = f"folder of {checkpoint} that lerobot-train names pretrained_model"
-    parser.add_argument("--policy.path", dest="policy_path", type=path_flag, required=True, help=path)
+    parser.add_argument("--policy.path", dest="policy_path", type=checkpoint_flag, required=True, help=path)
     parser.add_argument("--output", type=path_flag, required=True, help=output)
 
 

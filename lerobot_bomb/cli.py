@@ -54,6 +54,7 @@ COMMANDS = {
     "push-dataset": ("a recorded dataset to the Hub, with a card", "lerobot_bomb.hub.push_dataset"),
     "view": ("play one episode into a recording for Rerun and a video", "lerobot_bomb.viewing.view"),
     "gallery": ("draw what every perturbation axis changes", "lerobot_bomb.viewing.gallery"),
+    "checkpoint": ("the folder of a checkpoint that comes with this package", "lerobot_bomb.shipped"),
     "demo": ("record, train and evaluate on this machine in minutes", "lerobot_bomb.demo"),
     "doctor": ("check this installation", "lerobot_bomb.doctor"),
 }

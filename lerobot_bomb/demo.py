@@ -1,118 +1,172 @@
-"""``lerobot-bomb demo``: the whole road in minutes, with LeRobot's own commands."""
+"""``lerobot-bomb demo``: a policy that comes with the package plays, on LeRobot's own commands."""
 
 import argparse
-import os
 import time
+from dataclasses import dataclass
 from datetime import datetime
 from pathlib import Path
 
+import numpy as np
+
 from lerobot_bomb.commands import run_command
-from lerobot_bomb.evaluation.results import read_results, summarise
+from lerobot_bomb.evaluation.result_lines import Row
+from lerobot_bomb.evaluation.results import read_results
 from lerobot_bomb.flags import path_flag
+from lerobot_bomb.perturbations import NONE, Condition
+from lerobot_bomb.shipped import PREFIX
+from lerobot_bomb.stats import format_rate
+from lerobot_bomb.tables import print_table
 from lerobot_bomb.viewing.unfinished import check_new_folder
 
-REPO_ID = "demo/bomb_place"
+POLICY = "vla0_smol"
+# one that its training prepares it for, and one that it does not
+CONDITIONS = (NONE, "stones:3", "light:3")
+SUITE = "place"
+
+
+@dataclass(frozen=True)
+class Player:
+    """Who acts, and under which conditions."""
+
+    policy_flag: str
+    conditions: tuple[str, ...] = CONDITIONS
+
+
+PLAYERS = {
+    POLICY: Player(f"--policy.path={PREFIX}{POLICY}"),
+    "expert": Player("--policy.type=bomb_expert"),
+    "random": Player("--policy.type=bomb_random", (NONE,)),
+}
+IMAGE_SIZE = 64  # pixels, as it was trained with
+SEED = 1000  # LeRobot's default; no demonstration had it
+SHOWN_EPISODES = 4  # of a condition
 MAX_EVAL_BATCH = 10
-TRAIN_FLAGS = (
-    "--policy.type=vla0_smol",
-    "--policy.vlm_model_name=nano",
-    "--policy.device=cpu",
-    # random weights learn faster from short chunks, coarse bins and a high rate than SmolVLM2's recipe
-    "--policy.chunk_size=5",
-    "--policy.n_action_bins=101",
-    "--policy.n_state_bins=101",
-    "--policy.bin_mode=levels",
-    "--policy.crop_fraction=0.95",
-    "--policy.optimizer_lr=2e-3",
-    "--policy.scheduler_decay_lr=4e-5",
-    "--batch_size=16",
-    "--num_workers=0",
-    "--log_freq=50",
-    "--wandb.enable=false",
-)
+FRAME_WIDTH = 384  # pixels, of a tile
+SUCCESS_RGB, FAILURE_RGB = (40, 140, 40), (190, 40, 40)  # of an edge above a tile
+EDGE = 6  # pixels, its height
 CLOSING = """\
-So short a training of so small a model rarely places a stone: it shows that the road is open, not how
-far it leads. For a real run:
-  1. more demonstrations: lerobot-bomb record --repo_id=me/bomb_place --episodes=900 --noise=0.05
-  2. a real backbone on a GPU: drop --policy.vlm_model_name=nano (SmolVLM2-500M is the default) and
-     set --policy.device=cuda --policy.dtype=bfloat16
-  3. longer: lerobot-train --steps=30000 --batch_size=32
-  4. an honest number: docs/benchmark.md
-The pages about libtorchcodec above are LeRobot's: without FFmpeg it reads videos with PyAV."""
+{policy} is a small model that learnt from nothing on one CPU core; docs/results.md says what it can do.
+Next:
+  train one yourself, in minutes   make demo-train
+  your own checkpoint              lerobot-eval --policy.path=FOLDER --env.type=bomb ... (docs/benchmark.md)
+  every perturbation               docs/perturbations.md"""
 
 
 def add_demo_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the arguments of ``lerobot-bomb demo``."""
     parser.add_argument("--output_dir", type=path_flag, help="new folder (default: outputs/demo/DATE_TIME)")
-    parser.add_argument("--episodes", type=int, default=100, help="demonstrations to record (default: 100)")
-    parser.add_argument("--steps", type=int, default=800, help="training steps (default: 800)")
-    parser.add_argument("--eval_episodes", type=int, default=20, help="evaluation episodes (default: 20)")
+    parser.add_argument("--episodes", type=int, default=20, help="of each condition (default: 20)")
 
 
 def run_demo(args: argparse.Namespace) -> int:
-    """Record, train, evaluate; print rates, errors, failure classes and where everything lies."""
-    for name in ("episodes", "steps", "eval_episodes"):
-        if getattr(args, name) < 1:
-            raise ValueError(f"--{name}={getattr(args, name)} must be at least 1")
+    """Evaluate, replay a failure, print rates; the last line is the contact sheet's path."""
+    if args.episodes < 1:
+        raise ValueError(f"--episodes={args.episodes} must be at least 1")
     output_dir = args.output_dir or Path("outputs/demo") / f"{datetime.now():%Y-%m-%d_%H-%M-%S}"
     check_new_folder("--output_dir", output_dir)
     started = time.monotonic()
-    dataset, train = output_dir / "dataset", output_dir / "train"
-    checkpoint = train / "checkpoints" / "last" / "pretrained_model"
-
-    _say(f"1/4  Record {args.episodes} demonstrations of the scripted expert")
-    run_command(
-        "lerobot-bomb",
-        "record",
-        f"--repo_id={REPO_ID}",
-        f"--root={dataset}",
-        f"--episodes={args.episodes}",
-        f"--workers={min(os.cpu_count() or 1, args.episodes)}",
-    )
-    _say(f"2/4  Train vla0_smol on the nano backbone for {args.steps} steps")
-    run_command(
-        "lerobot-train",
-        f"--dataset.repo_id={REPO_ID}",
-        f"--dataset.root={dataset}",
-        *TRAIN_FLAGS,
-        f"--output_dir={train}",
-        f"--steps={args.steps}",
-        f"--save_freq={args.steps}",
-    )
-    _say("3/4  Evaluate the checkpoint")
-    _evaluate(output_dir, "vla0_smol", f"--policy.path={checkpoint}", args.eval_episodes)
-    _say("4/4  The ceiling and the floor: the expert and random actions on the same episodes")
-    _evaluate(output_dir, "bomb_expert", "--policy.type=bomb_expert", args.eval_episodes)
-    _evaluate(output_dir, "bomb_random", "--policy.type=bomb_random", args.eval_episodes)
-    _report(output_dir, time.monotonic() - started)
+    rows = {}
+    for number, (name, player) in enumerate(PLAYERS.items(), start=1):
+        conditions = ", ".join(player.conditions)
+        _say(f"{number}/{len(PLAYERS) + 1}  {name} plays {args.episodes} episodes each of: {conditions}")
+        rows[name] = _evaluate(output_dir, name, player, args.episodes)
+    shown = next((row for row in rows[POLICY] if not row["is_success"]), rows[POLICY][-1])
+    outcome = shown["failure"] or "success"
+    _say(f"{len(PLAYERS) + 1}/{len(PLAYERS) + 1}  Replay an episode of {POLICY}: {outcome}")
+    _replay(output_dir, shown)
+    _report(output_dir, rows, time.monotonic() - started)
     return 0
 
 
-def _evaluate(output_dir: Path, name: str, policy_flag: str, num_episodes: int) -> None:
+def _evaluate(output_dir: Path, name: str, player: Player, num_episodes: int) -> list[Row]:
+    results = output_dir / f"{name}.jsonl"
     # a divisor, so that LeRobot plays no more episodes than asked
     batch_size = max(size for size in range(1, MAX_EVAL_BATCH + 1) if num_episodes % size == 0)
+    conditions = ",".join(f'"{condition}"' for condition in player.conditions)
     run_command(
         "lerobot-eval",
-        policy_flag,
+        player.policy_flag,
         "--policy.device=cpu",
         "--env.type=bomb",
-        "--env.task=place",
-        f"--env.results_path={output_dir / name}.jsonl",
+        f"--env.task={SUITE}",
+        f"--env.image_size={IMAGE_SIZE}",
+        f"--env.perturbations=[{conditions}]",
+        f"--env.results_path={results}",
+        f"--seed={SEED}",
         f"--eval.n_episodes={num_episodes}",
         f"--eval.batch_size={batch_size}",
         "--eval.use_async_envs=false",
         f"--output_dir={output_dir / 'eval' / name}",
     )
+    return read_results(results)
 
 
-def _report(output_dir: Path, seconds: float) -> None:
-    _say(f"Done in {seconds / 60:.1f} minutes")
-    for name in ("vla0_smol", "bomb_expert", "bomb_random"):
-        print(name)
-        for line in summarise(read_results(output_dir / f"{name}.jsonl")).lines():
-            print(f"  {line}")
-    print(f"\nvideos     {output_dir}/eval/*/videos\ndataset    {output_dir}/dataset")
-    print(f"checkpoint {output_dir}/train/checkpoints/last/pretrained_model\n\n{CLOSING}")
+def _replay(output_dir: Path, row: Row) -> None:
+    run_command(
+        "lerobot-bomb",
+        "view",
+        PLAYERS[POLICY].policy_flag,
+        f"--image_size={IMAGE_SIZE}",
+        f"--seed={row['spec']['seed']}",
+        f"--perturbations={row['spec']['perturbations']}",
+        f"--output={output_dir / 'replay'}",
+    )
+
+
+def _report(output_dir: Path, rows: dict[str, list[Row]], seconds: float) -> None:
+    _say(f"Done in {seconds / 60:.1f} minutes: successes, with 95 % Wilson intervals")
+    cells = []
+    for name, played in rows.items():
+        cells.append([name, *(_rate(_of_condition(played, condition)) for condition in CONDITIONS)])
+    print_table(["", *CONDITIONS], cells)
+    print(f"\n{CLOSING.format(policy=POLICY)}\n")
+    print(f"results        {output_dir}/*.jsonl  (lerobot-bomb results FILE)")
+    print(f"videos         {output_dir}/eval/*/videos")
+    print(f"replay         {output_dir}/replay.mp4, and .rrd for Rerun")
+    print(f"contact sheet  {_write_sheet(output_dir, rows[POLICY])}")
+
+
+def _of_condition(rows: list[Row], condition: str) -> list[Row]:
+    """In the order of their seeds, as they were played."""
+    chosen = [row for row in rows if row["spec"]["perturbations"] == condition]
+    return sorted(chosen, key=lambda row: row["spec"]["seed"])
+
+
+def _rate(rows: list[Row]) -> str:
+    return format_rate(sum(row["is_success"] for row in rows), len(rows)) if rows else "-"
+
+
+def _write_sheet(output_dir: Path, rows: list[Row]) -> Path:
+    """The last frames of some episodes of each condition."""
+    from PIL import Image
+
+    from lerobot_bomb.viewing.sheet import Sheet
+
+    tiles: dict[str, list[np.ndarray]] = {}
+    for condition in CONDITIONS:
+        played = _of_condition(rows, condition)
+        group = f"{SUITE}.{Condition.parse(condition).key}_0"  # of LeRobot's videos
+        folder = output_dir / "eval" / POLICY / "videos" / group
+        tiles[condition] = [
+            _tile(folder / f"eval_episode_{number}.mp4", row["is_success"])
+            for number, row in enumerate(played[:SHOWN_EPISODES])
+        ]
+    columns = [f"seed {SEED + number}" for number in range(len(tiles[NONE]))]
+    path = output_dir / f"{POLICY}.png"
+    title = f"{POLICY}: the last frame of each episode; green edge: success"
+    Image.fromarray(Sheet(title, columns, pictures=tiles).draw()).save(path)
+    return path
+
+
+def _tile(video: Path, is_success: bool) -> np.ndarray:
+    from PIL import Image
+
+    from lerobot_bomb.viewing.video import last_frame
+
+    frame = Image.fromarray(last_frame(video))
+    tile = np.array(frame.resize((FRAME_WIDTH, frame.height * FRAME_WIDTH // frame.width)))
+    tile[:EDGE] = SUCCESS_RGB if is_success else FAILURE_RGB
+    return tile
 
 
 def _say(text: str) -> None:

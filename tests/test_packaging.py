@@ -42,12 +42,17 @@ def unpacked(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return unpacked
 
 
-def test_the_wheel_holds_every_module_and_the_model_file(wheel: Path) -> None:
+def test_the_wheel_holds_every_module_the_scene_and_the_checkpoints(wheel: Path) -> None:
     packed = {name for name in files(wheel) if ".dist-info/" not in name}
     expected = {
         str(path.relative_to(root))
         for root in SOURCE_ROOTS
-        for pattern in ("lerobot_*/**/*.py", "lerobot_*/**/py.typed", "lerobot_*/**/*.xml")
+        for pattern in (
+            "lerobot_*/**/*.py",
+            "lerobot_*/**/py.typed",
+            "lerobot_*/**/*.xml",
+            "lerobot_*/checkpoints/*/*",
+        )
         for path in root.glob(pattern)
     }
     assert packed == expected
@@ -67,6 +72,7 @@ def test_the_sdist_holds_what_is_under_version_control_without_pictures(unpacked
         name
         for name in packed
         if re.search(r"(^|/)(\.venv|outputs|dist|__pycache__)/|\.(mp4|rrd|safetensors)$", name)
+        and not name.startswith("lerobot_bomb/checkpoints/")
     ]
     assert stray == [] and not (unpacked / "docs" / "media").exists()
     assert {

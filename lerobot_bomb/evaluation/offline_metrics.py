@@ -29,6 +29,7 @@ from lerobot_bomb.evaluation.splits import (
 )
 from lerobot_bomb.evaluation.trivial import Demonstrations
 from lerobot_bomb.flags import path_flag
+from lerobot_bomb.shipped import checkpoint_flag
 from lerobot_bomb.tables import print_table
 from lerobot_bomb.viewing.unfinished import check_writable, written_whole
 
@@ -51,7 +52,7 @@ def add_offline_metrics_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the arguments of ``lerobot-bomb offline-metrics``."""
     add = parser.add_argument
     path = "folder of the checkpoint that lerobot-train names pretrained_model"
-    add("--policy.path", dest="policy_path", type=path_flag, required=True, help=path)
+    add("--policy.path", dest="policy_path", type=checkpoint_flag, required=True, help=path)
     add("--device", "--policy.device", help="cpu, cuda, ... (default: as the checkpoint says)")
     add("--dataset.repo_id", dest="repo_id", required=True, help="name of the dataset")
     root = "folder of the dataset (default: LeRobot's, $HF_LEROBOT_HOME/REPO_ID)"

@@ -21,13 +21,13 @@ class Sheet:
     title: str
     columns: list[str]
     texts: dict[str, list[str]] = field(default_factory=dict)  # row label -> words under each column
-    pictures: dict[str, list[np.ndarray]] = field(default_factory=dict)  # -> (S, S, 3) uint8 tiles
+    pictures: dict[str, list[np.ndarray]] = field(default_factory=dict)  # -> (H, W, 3) uint8 tiles, all alike
 
     def draw(self) -> np.ndarray:
         """(H, W, 3) uint8; the tiles are in it as they are, at `tile_origin`."""
-        size = self._tile_size
-        width = LABEL_WIDTH + len(self.columns) * (size + GAP)
-        height = self._top + len(self.pictures) * (size + GAP)
+        tile_height, tile_width = self._tile_shape
+        width = LABEL_WIDTH + len(self.columns) * (tile_width + GAP)
+        height = self._top + len(self.pictures) * (tile_height + GAP)
         sheet = Image.new("RGB", (width, height), PAPER)
         pen = ImageDraw.Draw(sheet)
         pen.text((GAP, GAP), self.title, INK, font(TITLE_SIZE))
@@ -35,7 +35,7 @@ class Sheet:
             y = TITLE_HEIGHT + row * LINE_HEIGHT
             pen.text((GAP, y), label, INK, font(FONT_SIZE))
             for column, word in enumerate(words):
-                pen.text((LABEL_WIDTH + column * (size + GAP) + GAP, y), word, INK, font(FONT_SIZE))
+                pen.text((LABEL_WIDTH + column * (tile_width + GAP) + GAP, y), word, INK, font(FONT_SIZE))
         for row, (label, tiles) in enumerate(self.pictures.items()):
             pen.text((GAP, self.tile_origin(row, 0)[0] + GAP), label, INK, font(FONT_SIZE))
             for column, tile in enumerate(tiles):
@@ -45,12 +45,13 @@ class Sheet:
 
     def tile_origin(self, row: int, column: int) -> tuple[int, int]:
         """(y, x) in pixels of a tile's upper left corner."""
-        step = self._tile_size + GAP
-        return self._top + row * step, LABEL_WIDTH + column * step
+        height, width = self._tile_shape
+        return self._top + row * (height + GAP), LABEL_WIDTH + column * (width + GAP)
 
     @property
-    def _tile_size(self) -> int:
-        return next(iter(self.pictures.values()))[0].shape[0]
+    def _tile_shape(self) -> tuple[int, int]:
+        """(height, width) in pixels."""
+        return next(iter(self.pictures.values()))[0].shape[:2]
 
     @property
     def _top(self) -> int:

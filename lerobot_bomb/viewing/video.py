@@ -39,3 +39,10 @@ class VideoFile:
         if self._stream is not None:
             self._file.mux(self._stream.encode())
         self._file.close()
+
+
+def last_frame(path: Path) -> np.ndarray:
+    """(H, W, 3) uint8 of a video."""
+    with av.open(str(path)) as file:
+        *_, frame = file.decode(video=0)
+    return frame.to_ndarray(format="rgb24")

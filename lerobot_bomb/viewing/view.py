@@ -16,6 +16,7 @@ from lerobot_bomb.episode_result import EpisodeResult
 from lerobot_bomb.flags import path_flag
 from lerobot_bomb.perturbations import NONE, Condition
 from lerobot_bomb.schema import BOARD, COLORS, EpisodeSpec, RenderOptions
+from lerobot_bomb.shipped import checkpoint_flag
 from lerobot_bomb.viewing.episode import Agent, expert_agent, play, random_agent
 from lerobot_bomb.viewing.unfinished import written_whole
 
@@ -28,7 +29,12 @@ def add_view_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the arguments of ``lerobot-bomb view``."""
     add = parser.add_argument
     add("--policy", help=f"who acts: {' or '.join(POLICIES)} (default: expert)")
-    add("--policy.path", dest="policy_path", type=path_flag, help="who acts: the checkpoint in this folder")
+    add(
+        "--policy.path",
+        dest="policy_path",
+        type=checkpoint_flag,
+        help="who acts: the checkpoint in this folder",
+    )
     add("--policy.device", dest="policy_device", help="cpu, cuda, ... (default: as the checkpoint says)")
     add(
         "--policy.ignore_environment",

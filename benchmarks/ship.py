@@ -1,0 +1,39 @@
+"""Put a policy that benchmarks/gate.py trained into the package, where `--policy.path=bomb:TYPE` finds it.
+
+    python benchmarks/ship.py GATE_FOLDER
+
+The weights are the training's own, bit for bit; the configs lose the paths of the machine.
+"""
+
+import argparse
+import json
+import shutil
+from pathlib import Path
+
+from lerobot_bomb.hub.names import CONFIG, TRAIN_CONFIG, WEIGHTS
+from lerobot_bomb.hub.push import portable
+from lerobot_bomb.json_files import read_json
+from lerobot_bomb.policy_identity import sha256_of
+from lerobot_bomb.shipped import FOLDER
+
+
+def main() -> None:
+    """Copy the last checkpoint in place of the one that is there; print its hash and size."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawTextHelpFormatter)
+    parser.add_argument("folder", type=Path, metavar="GATE_FOLDER", help="--output_dir of gate.py")
+    args = parser.parse_args()
+    checkpoint = args.folder / "train" / "checkpoints" / "last" / "pretrained_model"
+    configs = {name: portable(read_json(checkpoint / name)) for name in (CONFIG, TRAIN_CONFIG)}
+    target = FOLDER / configs[CONFIG]["type"]
+    shutil.rmtree(target, ignore_errors=True)
+    shutil.copytree(checkpoint, target)
+    for name, values in configs.items():
+        (target / name).write_text(json.dumps(values, indent=4) + "\n")
+    for path in target.iterdir():
+        path.chmod(0o644)
+    size_mb = sum(path.stat().st_size for path in target.iterdir()) / 1e6
+    print(f"{target}: {size_mb:.1f} MB, {WEIGHTS} {sha256_of(target / WEIGHTS)}")
+
+
+if __name__ == "__main__":
+    main()

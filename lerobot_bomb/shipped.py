@@ -1,0 +1,67 @@
+"""Checkpoints that come with the package: small policies that place stones, trained from nothing.
+
+Wherever LeRobot's commands and ours take a checkpoint, `bomb:NAME` is one of these.
+"""
+
+import argparse
+from pathlib import Path
+
+from lerobot_bomb.flags import path_flag
+from lerobot_bomb.hub.names import CONFIG
+
+FOLDER = Path(__file__).parent / "checkpoints"
+PREFIX = "bomb:"
+
+
+def shipped_names() -> list[str]:
+    """What can stand behind `bomb:`."""
+    return sorted(path.parent.name for path in FOLDER.glob(f"*/{CONFIG}"))
+
+
+def shipped_checkpoint(name: str) -> Path:
+    """The folder of one, as lerobot-train's `pretrained_model`; it is not to be written to.
+
+    Raises:
+        ValueError: there is none of this name.
+    """
+    if name not in shipped_names():
+        raise ValueError(
+            f"no checkpoint {name!r} comes with this package; choose one of: {', '.join(shipped_names())}"
+        )
+    return FOLDER / name
+
+
+def checkpoint_path(text: str) -> str:
+    """The path of a checkpoint that someone gave: the folder that `bomb:NAME` means, all else as it is.
+
+    Raises:
+        ValueError: no checkpoint of this name comes with the package.
+    """
+    return str(shipped_checkpoint(text.removeprefix(PREFIX))) if text.startswith(PREFIX) else text
+
+
+def checkpoint_flag(text: str) -> Path:
+    """The same, for argparse.
+
+    Raises:
+        argparse.ArgumentTypeError: of these, or no path.
+    """
+    try:
+        return path_flag(checkpoint_path(text))
+    except ValueError as error:
+        raise argparse.ArgumentTypeError(str(error)) from None
+
+
+def add_checkpoint_arguments(parser: argparse.ArgumentParser) -> None:
+    """Declare the argument of ``lerobot-bomb checkpoint``."""
+    parser.add_argument("name", nargs="?", metavar="NAME", help="print only the folder of this one")
+
+
+def run_checkpoint(args: argparse.Namespace) -> int:
+    """Print the folder of one, or name and folder of all."""
+    if args.name is not None:
+        print(shipped_checkpoint(args.name.removeprefix(PREFIX)))
+        return 0
+    for name in shipped_names():
+        print(f"{PREFIX}{name}  {FOLDER / name}")
+    return 0

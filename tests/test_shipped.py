@@ -1,0 +1,138 @@
+"""The checkpoints that come with the package: what they are called, and that they place stones."""
+
+import json
+import re
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+from lerobot.configs import PreTrainedConfig, parser
+from lerobot.utils.import_utils import register_third_party_plugins
+
+from lerobot_bomb import demo
+from lerobot_bomb.cli import main
+from lerobot_bomb.evaluation.results import read_results
+from lerobot_bomb.hub.names import CONFIG, TRAIN_CONFIG, WEIGHTS, has_local_path
+from lerobot_bomb.policy_identity import sha256_of
+from lerobot_bomb.shipped import FOLDER, checkpoint_path, shipped_names
+
+Run = Callable[..., None]
+NAMES = shipped_names()
+MAX_MB = 16
+RESULTS = Path(__file__).parents[1] / "docs" / "results.md"
+
+
+@pytest.fixture(scope="module", autouse=True)
+def plugin() -> None:
+    register_third_party_plugins()
+
+
+def test_they_are_small_whole_and_of_this_machine_only_by_name() -> None:
+    assert demo.POLICY in NAMES
+    assert sum(path.stat().st_size for path in FOLDER.rglob("*") if path.is_file()) < MAX_MB * 1e6
+    for name in NAMES:
+        found = {path.name for path in (FOLDER / name).iterdir()}
+        assert {CONFIG, TRAIN_CONFIG, WEIGHTS} <= found
+        assert {Path(file).suffix for file in found} == {".json", ".safetensors"}
+        for file in (CONFIG, TRAIN_CONFIG):
+            assert not has_local_path(json.loads((FOLDER / name / file).read_text()))
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_its_type_is_its_name_and_the_page_of_results_has_its_hash(name: str) -> None:
+    assert PreTrainedConfig.from_pretrained(FOLDER / name).type == name
+    assert f"`{sha256_of(FOLDER / name / WEIGHTS)}`" in RESULTS.read_text()
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_lerobot_eval_takes_the_name_and_it_places_stones(name: str, stock_cli: Run, tmp_path: Path) -> None:
+    results = tmp_path / "results.jsonl"
+    stock_cli(
+        "lerobot-eval",
+        f"--policy.path=bomb:{name}",
+        "--policy.device=cpu",
+        "--env.type=bomb",
+        "--env.image_size=64",
+        f"--env.results_path={results}",
+        "--eval.n_episodes=6",
+        "--eval.batch_size=6",
+        "--eval.use_async_envs=false",
+        f"--output_dir={tmp_path / 'eval'}",
+    )
+    rows = read_results(results)
+    assert sum(row["is_success"] for row in rows) >= 5
+    assert rows[0]["policy"]["weights_sha256"] == sha256_of(FOLDER / name / WEIGHTS)
+
+
+def test_another_environment_is_refused_with_the_flag_to_give(stock_cli: Run, tmp_path: Path) -> None:
+    flags = "--env.type=bomb --eval.n_episodes=1 --eval.batch_size=1 --eval.use_async_envs=false"
+    with pytest.raises(ValueError, match=r"--env\.image_size=64"):
+        stock_cli(
+            "lerobot-eval", f"--policy.path=bomb:{demo.POLICY}", *flags.split(), f"--output_dir={tmp_path}"
+        )
+
+
+def test_lerobot_train_goes_on_from_it_by_a_config_file(
+    stock_cli: Run, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    for read_before in ("_config_path_args", "_config_yaml_overrides"):  # LeRobot keeps them in the process
+        monkeypatch.setattr(parser, read_before, {})
+    root = tmp_path / "dataset"
+    record = f"record --repo_id=test/more --root={root} --episodes=1 --image_size=64 --images"
+    assert main(record.split()) == 0
+    config = tmp_path / "more.yaml"
+    config.write_text(f"policy: {{path: 'bomb:{demo.POLICY}', device: cpu}}\n")
+    stock_cli(
+        "lerobot-train",
+        f"--config_path={config}",
+        "--dataset.repo_id=test/more",
+        f"--dataset.root={root}",
+        "--steps=1",
+        "--batch_size=2",
+        "--num_workers=0",
+        f"--output_dir={tmp_path / 'train'}",
+    )
+    trained = tmp_path / "train" / "checkpoints" / "last" / "pretrained_model"
+    assert sha256_of(trained / WEIGHTS) != sha256_of(FOLDER / demo.POLICY / WEIGHTS)
+
+
+def test_an_unknown_name_is_one_line_with_the_names(
+    stock_cli: Run, capsys: pytest.CaptureFixture[str]
+) -> None:
+    with pytest.raises(SystemExit, match=rf"--policy\.path=bomb:nobody: no .*: .*{demo.POLICY}"):
+        stock_cli("lerobot-eval", "--policy.path=bomb:nobody", "--env.type=bomb")
+    assert main(["checkpoint", "nobody"]) == 1
+    assert demo.POLICY in capsys.readouterr().err
+    with pytest.raises(SystemExit):
+        main(["view", "--policy.path=bomb:nobody"])
+    assert demo.POLICY in capsys.readouterr().err
+
+
+def test_the_command_prints_a_folder_or_all(capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["checkpoint", demo.POLICY]) == 0
+    assert Path(capsys.readouterr().out.strip()) == FOLDER / demo.POLICY
+    assert main(["checkpoint"]) == 0
+    assert capsys.readouterr().out.split()[::2] == [f"bomb:{name}" for name in NAMES]
+    assert checkpoint_path("some/folder") == "some/folder"
+
+
+def test_the_demo_ends_with_rates_and_a_contact_sheet(
+    stock_cli: Run, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    def run(command: str, *flags: str) -> None:
+        if command == "lerobot-bomb":
+            assert main(flags) == 0
+        else:
+            stock_cli(command, *flags)
+
+    monkeypatch.setattr(demo, "run_command", run)
+    monkeypatch.setattr(demo, "SHOWN_EPISODES", 1)
+    assert main(["demo", "--episodes=1", f"--output_dir={tmp_path / 'demo'}"]) == 0
+    *_, last = capsys.readouterr().out.splitlines()
+    match = re.fullmatch(r"contact sheet  (.*)", last)
+    assert match is not None and Path(match[1]).stat().st_size > 10_000
+    assert (tmp_path / "demo" / "replay.mp4").stat().st_size > 1000
+    rows = read_results(tmp_path / "demo" / "expert.jsonl")
+    assert {row["spec"]["perturbations"] for row in rows} == set(demo.CONDITIONS)
+    assert all(row["is_success"] for row in rows)
+    assert main(["demo", f"--output_dir={tmp_path / 'demo'}"]) == 1
