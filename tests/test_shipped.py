@@ -59,9 +59,7 @@ def test_lerobot_eval_takes_the_name_and_it_places_stones(name: str, stock_cli: 
         "--eval.use_async_envs=false",
         f"--output_dir={tmp_path / 'eval'}",
     )
-    rows = read_results(results)
-    assert sum(row["is_success"] for row in rows) >= 5
-    assert rows[0]["policy"]["weights_sha256"] == sha256_of(FOLDER / name / WEIGHTS)
+    assert sum(row["is_success"] for row in read_results(results)) >= 5
 
 
 def test_another_environment_is_refused_with_the_flag_to_give(stock_cli: Run, tmp_path: Path) -> None:
