@@ -70,7 +70,7 @@ def test_decoders_see_adapters_as_merged_weights(policy_type: str) -> None:
     assert not torch.allclose(actions, plain, atol=1e-3)
     wrapped.reset()
     with wrapped.disable_adapter():
-        # rounding: layers that may have adapters are not joined, and some CPUs add up joined ones in another order
+        # not to the bit: layers that may have adapters are not joined, and CPUs differ in how they add up
         torch.testing.assert_close(wrapped.predict_action_chunk(batch), plain, atol=1e-6, rtol=0)
     wrapped.reset()
     merged = wrapped.merge_and_unload()
