@@ -22,8 +22,8 @@ import torch
 from decode_speed_compare import Timed, compare, finish, print_rows
 from decode_speed_peer import OneTokenText
 from decode_speed_works import (
+    DecodeRequest,
     Episodes,
-    Work,
     add_episode_arguments,
     margin_at_difference,
     num_symbols,
@@ -163,13 +163,13 @@ def no_guess(_: Tensor, place: Place) -> Tensor:
     return place.number.new_empty(len(place.number), 0)
 
 
-def plain_short_head(work: Work) -> Timed:
+def plain_short_head(work: DecodeRequest) -> Timed:
     """Ours on transformers' layers and growing cache."""
     with patch("lerobot_bomb.decoding.writer.CachedText", OneTokenText):
         return ours(work)
 
 
-def plain(work: Work) -> Timed:
+def plain(work: DecodeRequest) -> Timed:
     """The same, and logits of the whole vocabulary."""
 
     def whole_head(backbone: SmolVLMBackbone, token_ids: Tensor) -> Callable[[Tensor], Tensor]:
@@ -186,9 +186,11 @@ def time_256m(bars: dict[str, bool]) -> dict[str, Any]:
     backbone = build_backbone(config).eval()
     grammar = NumberGrammar(512, 40)
     prompt = torch.randn(1, 190, SHAPE_256M["hidden_size"])
-    written = torch.ones(1, 190, dtype=torch.bool)
+    mask = torch.ones(1, 190, dtype=torch.bool)
     works = [
-        Work(backbone, Prompt(prompt + i, written), torch.arange(30, 42), grammar, 40, KnownSymbols(grammar))
+        DecodeRequest(
+            backbone, Prompt(prompt + i, mask), torch.arange(30, 42), grammar, 40, KnownSymbols(grammar)
+        )
         for i in range(3)
     ]
     figures = compare(

@@ -26,12 +26,12 @@ from lerobot.policies import make_pre_post_processors
 from machine import add_machine_arguments, positive, require_cuda, require_idle_machine
 from torch import Tensor
 
+from lerobot_bomb.cuda_graphs import GraphedFunction
 from lerobot_bomb.decoding.decoder import Guess, Prompt
 from lerobot_bomb.decoding.draft import KnownSymbols, LinearDraft
 from lerobot_bomb.decoding.grammar import NumberGrammar
 from lerobot_bomb.decoding.writer import NumberWriter
 from lerobot_bomb.vlm.backbone import SmolVLMBackbone, build_backbone
-from lerobot_bomb.vlm.graphs import Recorded
 from lerobot_bomb.vlm.presets import nano_config
 from lerobot_bomb.vlm.prompt import PromptTokens
 from lerobot_bomb.vlm.tokenizer import NANO, load_tokenizer
@@ -168,8 +168,8 @@ class Peer:
 
     def __call__(self, prompt: Prompt) -> Timed:
         embeds = prompt.embeds.to(self._dtype)
-        _, prefill_s = wait_and_time(lambda: self._generate(embeds, prompt.written, max_symbols=1))
-        (numbers, num_passes), whole_s = wait_and_time(lambda: self._generate(embeds, prompt.written))
+        _, prefill_s = wait_and_time(lambda: self._generate(embeds, prompt.mask, max_symbols=1))
+        (numbers, num_passes), whole_s = wait_and_time(lambda: self._generate(embeds, prompt.mask))
         return Timed(numbers, prefill_s, whole_s - prefill_s, num_passes)
 
 
@@ -198,7 +198,7 @@ class Ours:
 def ends_of_passes() -> Iterator[list[torch.cuda.Event]]:
     """When the device was done with each recorded pass."""
     ends: list[torch.cuda.Event] = []
-    replay: Callable[..., Any] = Recorded.__call__
+    replay: Callable[..., Any] = GraphedFunction.__call__
 
     def timed(*args: Any) -> Any:
         returned = replay(*args)
@@ -206,7 +206,7 @@ def ends_of_passes() -> Iterator[list[torch.cuda.Event]]:
         ends[-1].record()
         return returned
 
-    with patch.object(Recorded, "__call__", timed):
+    with patch.object(GraphedFunction, "__call__", timed):
         yield ends
 
 

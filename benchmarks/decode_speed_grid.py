@@ -30,7 +30,7 @@ from machine import add_machine_arguments, positive, require_idle_machine
 from torch import Tensor, nn
 from transformers import LogitsProcessor
 
-from lerobot_bomb.vlm.cached_text import CachedText
+from lerobot_bomb.decoding.kv_cache import CachedText
 from lerobot_bomb.vlm.images import crop_and_resize
 from lerobot_policy_spatialvla_grid import SpatialvlaGridConfig
 from lerobot_policy_spatialvla_grid.configuration_spatialvla_grid import DRAFTS
@@ -168,7 +168,7 @@ class StockGenerate:
         """The policy's prompt, padded on the left, and pictures, as the stock model reads them."""
         policy, prompt = self._policy, self._policy._prompt(batch)
         ids, written = torch.zeros_like(prompt.ids), torch.zeros_like(prompt.ids)
-        for row, kept in enumerate(prompt.written):
+        for row, kept in enumerate(prompt.mask):
             ids[row, -int(kept.sum()) :], written[row, -int(kept.sum()) :] = prompt.ids[row, kept], 1
         size, fraction = policy.backbone.image_size, policy.config.crop_fraction
         pixels = [crop_and_resize(batch[key], fraction, size, None) for key in policy._cameras]

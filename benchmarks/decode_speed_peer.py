@@ -12,10 +12,10 @@ from transformers.cache_utils import DynamicCache
 from xgrammar.contrib.hf import LogitsProcessor
 
 from lerobot_bomb.actions.text import END, SPACE, SYMBOL_TEXTS
+from lerobot_bomb.decoding.decoder_layers import TextLayers
 from lerobot_bomb.decoding.grammar import NumberGrammar
+from lerobot_bomb.decoding.kv_cache import CachedText
 from lerobot_bomb.vlm.backbone import SmolVLMBackbone
-from lerobot_bomb.vlm.cached_text import CachedText
-from lerobot_bomb.vlm.text_layers import TextLayers
 
 
 class XgrammarGenerate:
@@ -36,10 +36,10 @@ class XgrammarGenerate:
         self._grammar_of_peer = xgrammar.GrammarCompiler(tokenizer).compile_grammar(rules)
 
     def __call__(
-        self, embeds_BLH: Tensor, written_BL: Tensor, max_symbols: int | None = None
+        self, embeds_BLH: Tensor, mask_BL: Tensor, max_symbols: int | None = None
     ) -> tuple[Tensor, int]:
         """(B, N) numbers and the passes they took."""
-        embeds_BLH, mask_BL = _padded_left(embeds_BLH, written_BL)
+        embeds_BLH, mask_BL = _padded_left(embeds_BLH, mask_BL)
         model: Any = self._backbone.vlm
         ids_BA = model.generate(
             inputs_embeds=embeds_BLH,
@@ -65,11 +65,11 @@ def read_answer(symbol_BA: Tensor, num_numbers: int) -> Tensor:
     return sums_BN[:, :num_numbers]
 
 
-def _padded_left(embeds_BLH: Tensor, written_BL: Tensor) -> tuple[Tensor, Tensor]:
-    order_BL = written_BL.to(torch.uint8).argsort(dim=1, stable=True)
+def _padded_left(embeds_BLH: Tensor, mask_BL: Tensor) -> tuple[Tensor, Tensor]:
+    order_BL = mask_BL.to(torch.uint8).argsort(dim=1, stable=True)
     return (
         embeds_BLH.gather(1, order_BL[..., None].expand_as(embeds_BLH)),
-        written_BL.gather(1, order_BL),
+        mask_BL.gather(1, order_BL),
     )
 
 

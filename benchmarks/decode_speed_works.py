@@ -33,7 +33,7 @@ from lerobot_bomb.vlm.backbone import SmolVLMBackbone
 
 
 @dataclass(frozen=True)
-class Work:
+class DecodeRequest:
     """A batch of prompts, and what is to be written after each."""
 
     backbone: SmolVLMBackbone
@@ -60,10 +60,10 @@ class Episodes:
         self.config: Any = PreTrainedConfig.from_pretrained(self._path)
         self._dataset = LeRobotDataset(args.repo_id, root=args.root)
 
-    def works(self, batch_size: int, num_predictions: int, **options: Any) -> list[Work]:
+    def works(self, batch_size: int, num_predictions: int, **options: Any) -> list[DecodeRequest]:
         """What the policy asks of the decoder, one row an episode, one prediction every `n_action_steps`."""
         policy, batches = self.batches(batch_size, num_predictions, **options)
-        works: list[Work] = []
+        works: list[DecodeRequest] = []
         for batch in batches:
             policy.reset()
             with _captured(works):
@@ -79,10 +79,10 @@ class Episodes:
         ]
         return policy, [preprocessor(default_collate(rows)) for rows in frames]
 
-    def planned(self, num_predictions: int, num_steps: int) -> list[Work]:
+    def planned(self, num_predictions: int, num_steps: int) -> list[DecodeRequest]:
         """The same, batch of 1, with guesses from what the last chunk left unexecuted; held at its end."""
         policy, preprocessor = self._load(n_action_steps=num_steps)
-        works: list[Work] = []
+        works: list[DecodeRequest] = []
         plan_BTD = None
         for prediction in range(num_predictions + 1):
             batch = preprocessor(default_collate([self._frame(0, prediction * num_steps)]))
@@ -126,11 +126,13 @@ class PlanDraft(LinearDraft):
 
 
 @contextmanager
-def _captured(works: list[Work]) -> Iterator[None]:
+def _captured(works: list[DecodeRequest]) -> Iterator[None]:
     write = NumberWriter.__call__
 
     def captured(writer: NumberWriter, prompt: Prompt, symbol_ids: Tensor, stop_after: int) -> Decoded:
-        works.append(Work(writer._backbone, prompt, symbol_ids, writer._grammar, stop_after, writer._guess))
+        works.append(
+            DecodeRequest(writer._backbone, prompt, symbol_ids, writer._grammar, stop_after, writer._guess)
+        )
         return write(writer, prompt, symbol_ids, stop_after)
 
     with patch.object(NumberWriter, "__call__", captured):
@@ -151,13 +153,13 @@ class Timer(Continuation):
         return logits
 
 
-def begin(work: Work) -> CachedContinuation:
+def begin(work: DecodeRequest) -> CachedContinuation:
     """The model that goes on with the prompts."""
     max_symbols = work.grammar.max_symbols(work.stop_after)
     return continue_prompt(work.backbone, work.prompt, work.symbol_ids, max_symbols)
 
 
-def ours(work: Work) -> Timed:
+def ours(work: DecodeRequest) -> Timed:
     """The decoder; the first pass reads the prompt."""
     started = time.perf_counter()
     model = Timer(begin(work))
@@ -172,7 +174,7 @@ def ours(work: Work) -> Timed:
     )
 
 
-def peer(work: Work) -> Timed:
+def peer(work: DecodeRequest) -> Timed:
     """The whole answer by `generate`, and one symbol by it: what it takes to read the prompt."""
     generate = XgrammarGenerate(work.backbone, work.symbol_ids, work.grammar)
     generate(*work.prompt, max_symbols=1)
@@ -190,7 +192,7 @@ def num_symbols(grammar: NumberGrammar, number_BN: Tensor) -> int:
     return num_digits + number_BN.numel() + len(number_BN)
 
 
-def margin_at_difference(work: Work, written_N: Tensor, theirs_N: Tensor) -> float:
+def margin_at_difference(work: DecodeRequest, written_N: Tensor, theirs_N: Tensor) -> float:
     """Difference of the two largest allowed logits at the first symbol that differs."""
     ours_A, theirs_A = (spell(work.grammar, numbers) for numbers in (written_N, theirs_N))
     at = int((ours_A[: len(theirs_A)] != theirs_A[: len(ours_A)]).nonzero()[0])
@@ -199,7 +201,7 @@ def margin_at_difference(work: Work, written_N: Tensor, theirs_N: Tensor) -> flo
     place = work.grammar.start(1)
     for symbol in ours_A[1:at]:
         place = work.grammar.advance(place, symbol[None])
-    first, second = (logits + work.grammar.penalties(place)[0]).topk(2).values
+    first, second = (logits + work.grammar.logit_bias(place)[0]).topk(2).values
     return float(first - second)
 
 

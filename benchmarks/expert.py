@@ -18,21 +18,12 @@ from pathlib import Path
 import numpy as np
 from tqdm import tqdm
 
+from lerobot_bomb.bomb.board import BOARD
+from lerobot_bomb.bomb.episode import CONTROL_MODES, DEFAULT_FPS, ROBOTS, SPLITS, EpisodeSpec
+from lerobot_bomb.bomb.expert import expert_action
+from lerobot_bomb.bomb.observation import MAX_STEP_M, MIN_IMAGE_SIZE, PrivilegedState, RenderOptions
+from lerobot_bomb.bomb.perturbations import NONE
 from lerobot_bomb.data.rollout import perturb
-from lerobot_bomb.expert import expert_action
-from lerobot_bomb.perturbations import NONE
-from lerobot_bomb.schema import (
-    BOARD,
-    CONTROL_MODES,
-    DEFAULT_FPS,
-    MAX_STEP_M,
-    MIN_IMAGE_SIZE,
-    ROBOTS,
-    SPLITS,
-    EpisodeSpec,
-    PrivilegedState,
-    RenderOptions,
-)
 from lerobot_bomb.stats import format_rate
 from lerobot_env_bomb.env import BombEnv
 

@@ -27,7 +27,7 @@ from learning_curve import Point, as_figures, count, draw, print_points
 from machine import add_machine_arguments, positive, require_idle_machine, write_figures
 from recipes import POLICY_TYPES, read_recipe, recipe_path
 
-from lerobot_bomb.commands import run_command
+from lerobot_bomb.commands.run import run_command
 from lerobot_bomb.evaluation.results import PUT_DOWN, Row, read_results
 
 PROBE = "keypoint_probe"
@@ -84,7 +84,7 @@ RUNGS = {
         lessons={
             PROBE: Lesson(400, None, steps=6000),
             **{name: Lesson(1600, Bar(0.90, 180)) for name in POLICY_TYPES},
-            "vla0_smol": Lesson(1600, Bar(0.97, 90)),
+            "vla0_smol": Lesson(3200, Bar(0.97, 90)),
         },
     ),
 }

@@ -8,8 +8,8 @@ from typing import Any
 import cv2
 import numpy as np
 
+from lerobot_bomb.bomb.episode import Failure, Stage
 from lerobot_bomb.evaluation.results import PUT_DOWN, Row
-from lerobot_bomb.schema import Failure, Stage
 from lerobot_bomb.stats import format_rate, wilson_interval
 from lerobot_bomb.tables import print_table
 

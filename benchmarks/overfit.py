@@ -29,9 +29,9 @@ from typing import Any
 from machine import add_machine_arguments, positive, require_idle_machine, write_figures
 from recipes import POLICY_TYPES, read_recipe, recipe_path
 
-from lerobot_bomb.commands import run_command
+from lerobot_bomb.bomb.episode import EpisodeSpec, Failure
+from lerobot_bomb.commands.run import run_command
 from lerobot_bomb.evaluation.results import Row, read_results
-from lerobot_bomb.schema import EpisodeSpec, Failure
 from lerobot_bomb.tables import print_table
 
 SEED = 1007  # its board is empty, so nothing but the sentence tells the target

@@ -14,8 +14,9 @@ from statistics import median
 import numpy as np
 from machine import add_machine_arguments, positive, require_idle_machine, write_figures
 
-from lerobot_bomb.perturbations import AXES, MAX_LEVEL
-from lerobot_bomb.schema import EpisodeSpec, RenderOptions
+from lerobot_bomb.bomb.episode import EpisodeSpec
+from lerobot_bomb.bomb.observation import RenderOptions
+from lerobot_bomb.bomb.perturbations import AXES, MAX_LEVEL
 from lerobot_bomb.tables import print_table
 from lerobot_env_bomb.env import BombEnv
 

@@ -31,7 +31,7 @@ from machine import positive, write_figures
 from pusht_report import Seed, print_report
 from recipes import PUSHT_TYPES, recipe_path
 
-from lerobot_bomb.commands import run_command
+from lerobot_bomb.commands.run import run_command
 
 REPO_ID = "lerobot_bomb/pusht"
 NUM_TRAIN_EPISODES = 180

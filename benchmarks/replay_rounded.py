@@ -16,14 +16,15 @@ from lerobot.configs import NormalizationMode
 from machine import write_figures
 from overfit import REPO_ID, SEED, TASK_IDS, record
 
-from lerobot_bomb.actions.fit_grid import action_bounds
 from lerobot_bomb.actions.grid_fit import normalised, normalised_rest
 from lerobot_bomb.actions.grid_settings import ActionGroup, GridSettings, default_groups
 from lerobot_bomb.actions.grids import ActionGrids
+from lerobot_bomb.bomb.episode import EpisodeSpec
+from lerobot_bomb.bomb.observation import RenderOptions
+from lerobot_bomb.commands.fit_grid import action_bounds
 from lerobot_bomb.data.columns import read_columns, read_meta
 from lerobot_bomb.data.rollout import make_env
-from lerobot_bomb.episode_result import EpisodeResult
-from lerobot_bomb.schema import EpisodeSpec, RenderOptions
+from lerobot_bomb.envs.results import EpisodeResult
 from lerobot_bomb.tables import print_table
 
 PAIRS = (ActionGroup((0, 1), "identity", (64, 64)), ActionGroup((2, 3), "identity", (64, 16)))

@@ -6,15 +6,14 @@ The weights are the training's own, bit for bit; the configs lose the paths of t
 """
 
 import argparse
-import json
 import shutil
 from pathlib import Path
 
-from lerobot_bomb.hub.names import CONFIG, TRAIN_CONFIG, WEIGHTS
-from lerobot_bomb.hub.push import portable
-from lerobot_bomb.json_files import read_json
-from lerobot_bomb.policy_identity import sha256_of
-from lerobot_bomb.shipped import FOLDER
+from lerobot_bomb.checkpoints.identity import sha256_of
+from lerobot_bomb.checkpoints.names import CONFIG, TRAIN_CONFIG, WEIGHTS
+from lerobot_bomb.checkpoints.shipped import FOLDER
+from lerobot_bomb.files import read_json
+from lerobot_bomb.hub.push import portable_json
 
 
 def main() -> None:
@@ -23,12 +22,11 @@ def main() -> None:
     parser.add_argument("folder", type=Path, metavar="GATE_FOLDER", help="--output_dir of gate.py")
     args = parser.parse_args()
     checkpoint = args.folder / "train" / "checkpoints" / "last" / "pretrained_model"
-    configs = {name: portable(read_json(checkpoint / name)) for name in (CONFIG, TRAIN_CONFIG)}
-    target = FOLDER / configs[CONFIG]["type"]
+    target = FOLDER / read_json(checkpoint / CONFIG)["type"]
     shutil.rmtree(target, ignore_errors=True)
     shutil.copytree(checkpoint, target)
-    for name, values in configs.items():
-        (target / name).write_text(json.dumps(values, indent=4) + "\n")
+    for name in (CONFIG, TRAIN_CONFIG):
+        (target / name).write_text(portable_json(checkpoint / name) + "\n")
     for path in target.iterdir():
         path.chmod(0o644)
     size_mb = sum(path.stat().st_size for path in target.iterdir()) / 1e6

@@ -23,7 +23,6 @@ from collections.abc import Iterable
 from dataclasses import asdict, dataclass
 from itertools import product
 from pathlib import Path
-from typing import cast
 
 ROOT = Path(__file__).resolve().parents[1]
 SOURCE_ROOTS = (ROOT, ROOT / "envs")
@@ -71,8 +70,9 @@ def measure_here(conditions: Iterable[str], seeds: range) -> Measured:
 
 def play(robot: str, condition: str, seeds: range) -> Outcome:
     """The expert's episodes of these seeds."""
-    from lerobot_bomb.expert import expert_action
-    from lerobot_bomb.schema import EpisodeSpec, PrivilegedState, RenderOptions
+    from lerobot_bomb.bomb.episode import EpisodeSpec
+    from lerobot_bomb.bomb.expert import expert_action
+    from lerobot_bomb.bomb.observation import PrivilegedState, RenderOptions
     from lerobot_env_bomb.env import BombEnv
 
     states, pictures, results = hashlib.sha256(), hashlib.sha256(), []
@@ -105,17 +105,14 @@ def play(robot: str, condition: str, seeds: range) -> Outcome:
 
 def renderer_name() -> str:
     """What OpenGL says it draws with."""
-    from lerobot_env_bomb.backend import ensure_gl_backend
+    from lerobot_env_bomb.env import BombEnv
 
-    ensure_gl_backend()
-    import mujoco
-    from OpenGL import GL
-
-    context = mujoco.GLContext(16, 16)
-    context.make_current()
-    name = cast("bytes", GL.glGetString(GL.GL_RENDERER)).decode()
-    context.free()
-    return name
+    env = BombEnv()
+    env.reset(seed=0)
+    assert env._renderer is not None
+    name = env._renderer.opengl_renderer
+    env.close()
+    return str(name)
 
 
 def published_versions() -> list[str]:

@@ -1,5 +1,9 @@
-"""Intervals and tests for success rates, and intervals for means over episodes."""
+"""Intervals and tests for success rates, and intervals for means over episodes.
 
+Shapes: `R` frames, `E` episodes.
+"""
+
+from dataclasses import dataclass
 from math import comb, sqrt
 from statistics import NormalDist
 
@@ -58,6 +62,32 @@ def paired_bootstrap_interval(
     if len(first[0]) < 2:
         return None
     return _percentiles(_resampled_means(*second) - _resampled_means(*first))
+
+
+@dataclass(frozen=True)
+class Measure:
+    """A mean over frames and its 95 % bootstrap interval over episodes; no interval of one episode."""
+
+    mean: float
+    low: float | None
+    high: float | None
+
+    def __str__(self) -> str:
+        interval = "" if self.low is None else f" [{self.low:.4g}, {self.high:.4g}]"
+        return f"{self.mean:.4g}{interval}"
+
+
+def measure(values_RX: np.ndarray, episode_R: np.ndarray) -> Measure:
+    """Mean of all finite numbers (R, ...); every one counts the same."""
+    values_RX = values_RX.reshape(len(episode_R), -1)
+    counts_RX = np.isfinite(values_RX)
+    episodes_E, place_R = np.unique(episode_R, return_inverse=True)
+    sums_E, counts_E = np.zeros(len(episodes_E)), np.zeros(len(episodes_E))
+    np.add.at(sums_E, place_R, np.where(counts_RX, values_RX, 0.0).sum(axis=1))
+    np.add.at(counts_E, place_R, counts_RX.sum(axis=1))
+    counted = counts_E > 0
+    low, high = bootstrap_interval(sums_E[counted], counts_E[counted]) or (None, None)
+    return Measure(float(sums_E.sum() / counts_E.sum()), low, high)
 
 
 def _resampled_means(sums_E: np.ndarray, counts_E: np.ndarray) -> np.ndarray:

@@ -1,9 +1,10 @@
 """Fixtures that several test modules use."""
 
 import importlib
+import logging
 import os
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -48,16 +49,26 @@ def pusht_dataset(pusht_zarr: Path, tmp_path_factory: pytest.TempPathFactory) ->
     """They as a LeRobotDataset, through the command line."""
     from pusht_cases import REPO_ID
 
-    from lerobot_bomb import cli
-    from lerobot_bomb.data import growing
+    from lerobot_bomb.commands import main as cli
+    from lerobot_bomb.data import resumable
 
     root = tmp_path_factory.mktemp("converted") / "pusht"
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(growing, "BLOCK_EPISODES", 2)
+        patch.setattr(resumable, "BLOCK_EPISODES", 2)
         command = ["convert", "pusht-zarr", str(pusht_zarr), f"--repo_id={REPO_ID}", f"--root={root}"]
         assert cli.main(command) == 0
     assert list(root.parent.iterdir()) == [root]
     return root
+
+
+@pytest.fixture(autouse=True)
+def restored_logging() -> Iterator[None]:
+    """LeRobot's commands log to this test's standard error, which pytest closes after it."""
+    root = logging.getLogger()
+    handlers, level = list(root.handlers), root.level
+    yield
+    root.handlers[:] = handlers
+    root.setLevel(level)
 
 
 @pytest.fixture

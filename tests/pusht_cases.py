@@ -62,7 +62,7 @@ def starting_at(state: np.ndarray) -> Iterator[None]:
 
 def convert(demonstrations: Demonstrations, folder: Path) -> Path:
     """They as a LeRobotDataset in a new folder in `folder`, through the command line."""
-    from lerobot_bomb import cli
+    from lerobot_bomb.commands import main as cli
 
     demonstrations.write(folder / "source.zarr")
     flags = [f"--repo_id={REPO_ID}", f"--root={folder / 'pusht'}"]

@@ -168,7 +168,7 @@ def hook(moment: Moment | None, watched: str, operations: int) -> Callable[[str,
 
 def run(job: dict) -> None:
     """Be the recorder that the job describes, and end."""
-    from lerobot_bomb import cli
+    from lerobot_bomb.commands import main as cli
 
     signal.signal(signal.SIGCHLD, signal.SIG_DFL)
     signal.signal(signal.SIGINT, signal.default_int_handler)  # a job in the background starts ignoring it
@@ -193,11 +193,12 @@ def run(job: dict) -> None:
 def serve() -> None:
     """Fork a recorder for each line of stdin and print its process id."""
     # the seconds that recorders save
-    from lerobot_bomb.data import blocks, growing, record  # noqa: F401
+    from lerobot_bomb.commands import record  # noqa: F401
+    from lerobot_bomb.data import blocks, resumable  # noqa: F401
     from lerobot_env_bomb.backend import ensure_gl_backend
 
     ensure_gl_backend()
-    growing.BLOCK_EPISODES = 2
+    resumable.BLOCK_EPISODES = 2
     signal.signal(signal.SIGCHLD, signal.SIG_IGN)  # ended recorders leave no zombies
     for line in sys.stdin:
         pid = os.fork()

@@ -16,8 +16,9 @@ from lerobot.robots import Robot, RobotConfig
 from lerobot.teleoperators import Teleoperator, TeleoperatorConfig
 from torch import Tensor
 
-from lerobot_bomb.checkpoint import Postprocessor, Preprocessor, load_processors, read_config
-from lerobot_bomb.schema import ACTION_NAMES, CAMERAS, STATE_NAMES, EpisodeSpec, RenderOptions
+from lerobot_bomb.bomb.episode import EpisodeSpec
+from lerobot_bomb.bomb.observation import ACTION_NAMES, CAMERAS, STATE_NAMES, RenderOptions
+from lerobot_bomb.checkpoints.folder import Postprocessor, Preprocessor, load_processors, read_config
 from lerobot_env_bomb.env import BombEnv
 
 MOTORS = ("shoulder_pan", "shoulder_lift", "elbow_flex", "wrist_flex", "wrist_roll", "gripper")

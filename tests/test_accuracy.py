@@ -51,9 +51,9 @@ def test_numbers_from_predicted_symbols(changes: dict[str, int], exact: list[boo
 def test_hidden_and_padded_numbers_do_not_count() -> None:
     hidden = NUMBERS.hide_numbers(torch.tensor([[True, False]]), hidden_id=99)
     assert counted_numbers(hidden).tolist() == [[False, True]]
-    padded = NumberTokens(NUMBERS.ids, NUMBERS.written, torch.zeros_like(NUMBERS.written))
+    padded = NumberTokens(NUMBERS.ids, NUMBERS.mask, torch.zeros_like(NUMBERS.mask))
     assert counted_numbers(padded).tolist() == [[False, False]]
-    one_digit = torch.zeros_like(NUMBERS.written)
+    one_digit = torch.zeros_like(NUMBERS.mask)
     one_digit[0, 0, 2] = True
     assert counted_numbers(NUMBERS.hide_characters(one_digit, 99)).tolist() == [[False, True]]
 
@@ -89,7 +89,7 @@ def test_metrics_of_a_policy(monkeypatch: pytest.MonkeyPatch, off_by: int, exact
         n_action_bins=101, bin_mode="levels", number_width=3, action_feature_names=["x", "y", "z", "grip"]
     )
     policy.action_unit.copy_(torch.tensor([1.0, 10.0, 100.0, 0.5]))
-    policy._knows_units = True
+    policy._action_names = policy.config.action_names
     batch = make_batch(policy, 4)
     batch["action"] = batch["action"] * 0.9  # one bin more stays in range
     metrics = told(policy, batch, monkeypatch, off_by)
@@ -103,7 +103,7 @@ def test_metrics_of_a_policy(monkeypatch: pytest.MonkeyPatch, off_by: int, exact
 
 def test_padded_steps_do_not_enter_the_metrics(monkeypatch: pytest.MonkeyPatch) -> None:
     policy = make_policy(n_action_bins=101, bin_mode="levels", number_width=3)
-    policy._knows_units = True
+    policy._action_names = policy.config.action_names
     batch = make_batch(policy, 1)
     right = policy._bins(batch)
     batch["action_is_pad"][0, 1:] = True

@@ -1,6 +1,7 @@
 # pyright: reportAttributeAccessIssue=false
 """What the perturbation axes do to an episode, and what they leave alone."""
 
+import itertools
 from dataclasses import fields
 from typing import Any
 
@@ -9,17 +10,27 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from lerobot_bomb.perturbations import AXES, MAX_LEVEL, NUISANCES
-from lerobot_bomb.schema import BOARD, CAMERAS, EpisodeSpec
-from lerobot_env_bomb.axes import GREY, TABLE_RGB
-from lerobot_env_bomb.go import is_legal_move, is_legal_position
-from lerobot_env_bomb.model import BOARD_HALF_SIZE_M, TRAY_CENTER_XY, TRAY_HALF_SIZE_XY, build_model
-from lerobot_env_bomb.perturb import Perturbation
-from lerobot_env_bomb.photometric import Photometric
+from lerobot_bomb.bomb.board import BOARD, TRAY_CENTER_XY, TRAY_HALF_SIZE_XY
+from lerobot_bomb.bomb.episode import EpisodeSpec
+from lerobot_bomb.bomb.go import is_legal_move, is_legal_position
+from lerobot_bomb.bomb.layout import Layout
+from lerobot_bomb.bomb.observation import CAMERAS
+from lerobot_bomb.bomb.perturbations import AXES, MAX_LEVEL, NUISANCES
+from lerobot_bomb.bomb.suites.place import STONE
+from lerobot_bomb.envs.photometric import Photometric
+from lerobot_env_bomb.axes import TRANSFORMS
+from lerobot_env_bomb.axes.dynamics import Dynamics
+from lerobot_env_bomb.axes.language import FORMS, Wording
+from lerobot_env_bomb.axes.light import Light
+from lerobot_env_bomb.axes.object import GREY, StoneLook
+from lerobot_env_bomb.axes.stones import Stones
+from lerobot_env_bomb.axes.table import TABLE_RGB, Table
+from lerobot_env_bomb.axes.transform import Transform
+from lerobot_env_bomb.model import BOARD_HALF_SIZE_M, build_model
+from lerobot_env_bomb.perturb import PerturbedEpisode as Episode
+from lerobot_env_bomb.perturb import sample_episode
 from lerobot_env_bomb.robots import ROBOTS
-from lerobot_env_bomb.scene import WORKSPACE_HIGH, WORKSPACE_LOW, Layout, Scene
-from lerobot_env_bomb.task import STONE, Episode, sample_episode
-from lerobot_env_bomb.wording import FORMS, Wording
+from lerobot_env_bomb.scene import WORKSPACE_HIGH, WORKSPACE_LOW, Scene
 
 SEEDS = st.integers(0, 2**31)
 AXIS = st.sampled_from(list(AXES))
@@ -34,6 +45,12 @@ def scene() -> Scene:
 
 def episode(seed: int, condition: str = "none", **spec) -> Episode:
     return sample_episode(EpisodeSpec(seed=seed, perturbations=condition, **spec))
+
+
+def drawn_of[T: Transform](kind: type[T], seed: int, condition: str, **spec) -> T:
+    transform = episode(seed, condition, **spec).perturbation.of(kind)
+    assert transform is not None
+    return transform
 
 
 def arranged(scene: Scene, seed: int, condition: str) -> Episode:
@@ -61,7 +78,7 @@ def test_an_axis_draws_the_same_whatever_the_others_do(
 ) -> None:
     condition = "+".join(f"{name}:{at}" for name, at in ({**others, axis: level}).items())
     together, alone = episode(seed, condition), episode(seed, f"{axis}:{level}")
-    assert getattr(together.perturbation, axis) == getattr(alone.perturbation, axis)
+    assert together.perturbation.transforms[axis] == alone.perturbation.transforms[axis]
     assert together.perturbation.levels == {**others, axis: level}
     assert episode(seed, condition).perturbation == together.perturbation
 
@@ -117,11 +134,11 @@ def test_a_nominal_reset_undoes_every_edit(scene: Scene) -> None:
 
 
 def test_magnitudes_reach_the_floors_at_level_5(scene: Scene) -> None:
-    all_5 = [episode(seed, "all:5").perturbation for seed in range(100)]
-    light = {p.light.factor for p in all_5 if p.light}
-    assert max(light) / min(light) >= 4 - 1e-9
-    assert {p.dynamics.mass_factor for p in all_5 if p.dynamics} == {0.5, 2.0}
-    assert all(p.dynamics and p.dynamics.latency >= 1 for p in all_5)
+    lights = [drawn_of(Light, seed, "all:5").factor for seed in range(100)]
+    assert max(lights) / min(lights) >= 4 - 1e-9
+    dynamics = [drawn_of(Dynamics, seed, "all:5") for seed in range(100)]
+    assert {drawn.mass_factor for drawn in dynamics} == {0.5, 2.0}
+    assert all(drawn.latency >= 1 for drawn in dynamics)
     nominal = scene.model.camera(CAMERAS[0]).fovy[0]
     fovs = set()
     for seed in SOME_SEEDS:
@@ -195,8 +212,8 @@ def test_a_perturbed_start_is_on_the_tray_and_in_the_workspace(seed: int, level:
 @given(SEEDS, LEVEL)
 def test_more_stones_keep_the_opening_and_the_move_legal(seed: int, level: int) -> None:
     nominal, drawn = episode(seed), episode(seed, f"stones:{level}")
-    stones = drawn.perturbation.stones
-    assert stones is not None and len(stones.extra) == (1, 1, 2, 2, 3)[level - 1]
+    stones = drawn_of(Stones, seed, f"stones:{level}")
+    assert len(stones.extra) == (1, 1, 2, 2, 3)[level - 1]
     before, after = nominal.layout, drawn.layout
     assert after.stone_in_play.sum() == before.stone_in_play.sum() + len(stones.extra)
     on_board = np.flatnonzero(after.stone_in_play)[1:]
@@ -228,7 +245,7 @@ def test_mass_and_friction_change_as_if_compiled_so(scene: Scene) -> None:
     stone = nominal.body("stone_3").id
     factors = set()
     for seed in range(20):
-        dynamics = arranged(scene, seed, "dynamics:5").perturbation.dynamics
+        dynamics = arranged(scene, seed, "dynamics:5").perturbation.of(Dynamics)
         assert dynamics is not None
         model = scene.model
         factors.add((dynamics.mass_factor, round(dynamics.friction_factor, 3)))
@@ -250,17 +267,16 @@ def test_mass_and_friction_change_as_if_compiled_so(scene: Scene) -> None:
 def test_the_colours_of_the_table_are_split_and_black_and_white_keep_their_sides() -> None:
     assert len(TABLE_RGB) == 8
     drawn = {
-        split: {episode(seed, "table:5", split=split).perturbation.table for seed in range(200)}
+        split: {drawn_of(Table, seed, "table:5", split=split).table_rgb for seed in range(200)}
         for split in ("train", "heldout")
     }
-    train, heldout = ({table.table_rgb for table in tables if table} for tables in drawn.values())
+    train, heldout = drawn.values()
     assert train == set(TABLE_RGB) and len(heldout) == 2 and not train & heldout
-    look = episode(0, "object:5").perturbation.object
+    look = drawn_of(StoneLook, 0, "object:5")
     model = build_model(ROBOTS["scara"])
     model.geom("stone_0_visual").rgba[:3] = 0.06
     model.geom("stone_1_visual").rgba[:3] = 0.96
-    assert look is not None
-    look(model)
+    look.edit_model(model)
     black, white = (model.geom(f"stone_{i}_visual").rgba[0] for i in (0, 1))
     assert 0.06 < black < GREY < white < 0.96 and white - black > 0.4
 
@@ -313,11 +329,13 @@ def test_sentences_mean_the_target_in_the_convention_they_state(form: int, which
 
 
 def test_every_form_occurs_and_never_names_the_target_as_the_other_place() -> None:
-    wordings = [episode(seed, f"language:{form}") for seed in range(60) for form in range(1, 6)]
-    used = {drawn.perturbation.language.template for drawn in wordings if drawn.perturbation.language}
+    used = set()
+    for seed, form in itertools.product(range(60), range(1, 6)):
+        wording = drawn_of(Wording, seed, f"language:{form}")
+        used.add(wording.template)
+        assert wording.other != episode(seed).target
     assert used == {template for form in FORMS for template in form}
-    assert all(d.perturbation.language.other != d.target for d in wordings if d.perturbation.language)
 
 
 def test_every_axis_has_its_transform() -> None:
-    assert {field.name for field in fields(Perturbation)} - {"levels"} == set(AXES)
+    assert list(TRANSFORMS) == list(AXES)

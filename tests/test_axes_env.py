@@ -5,12 +5,14 @@ from collections.abc import Callable, Iterator
 import numpy as np
 import pytest
 
-from lerobot_bomb.expert import expert_action
-from lerobot_bomb.perturbations import AXES, NUISANCES
-from lerobot_bomb.schema import CAMERAS, MAX_STEP_M, EpisodeSpec, PrivilegedState, RenderOptions
+from lerobot_bomb.bomb.episode import EpisodeSpec
+from lerobot_bomb.bomb.expert import expert_action
+from lerobot_bomb.bomb.observation import CAMERAS, MAX_STEP_M, PrivilegedState, RenderOptions
+from lerobot_bomb.bomb.perturbations import AXES, NUISANCES
+from lerobot_bomb.bomb.suites.place import targets_of
 from lerobot_env_bomb.env import BombEnv
+from lerobot_env_bomb.perturb import sample_episode
 from lerobot_env_bomb.scene import HIDDEN_RGBA
-from lerobot_env_bomb.task import sample_episode, targets_of
 
 SIZE = 64
 VISUAL = [axis for axis in AXES if "images" in AXES[axis].changes]

@@ -5,10 +5,10 @@ import pytest
 import yaml
 from lerobot.envs import env_to_policy_features, make_env, make_env_config
 
+from lerobot_bomb.bomb.perturbations import NUISANCES
+from lerobot_bomb.envs.vector import LazyVectorEnv
 from lerobot_bomb.flag_errors import FlagError
-from lerobot_bomb.perturbations import NUISANCES
 from lerobot_env_bomb.configuration_bomb import BombEnvConfig
-from lerobot_env_bomb.vector import LazyVectorEnv
 
 
 def test_policy_side_features() -> None:

@@ -11,9 +11,9 @@ import pytest
 from lerobot.datasets import LeRobotDataset
 from pusht_cases import NUM_EPISODES, REPO_ID, ZARR, Demonstrations
 
-from lerobot_bomb.data import blocks, growing
-from lerobot_bomb.data.convert import convert_pusht
-from lerobot_bomb.data.growing import finished_blocks
+from lerobot_bomb.commands.convert import convert_pusht
+from lerobot_bomb.data import blocks, resumable
+from lerobot_bomb.data.resumable import finished_blocks
 
 CHUNK_SIZE = 10  # actions
 
@@ -110,7 +110,7 @@ def convert_and_die(source: Path, root: Path, name: str, call: int) -> None:
 def test_a_killed_conversion_resumes_to_the_same_bytes(
     pusht_zarr: Path, pusht_dataset: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(growing, "BLOCK_EPISODES", 2)  # as in the dataset
+    monkeypatch.setattr(resumable, "BLOCK_EPISODES", 2)  # as in the dataset
     root, folder = tmp_path / "x", tmp_path / "x.conversion"
     for name, call, kept in (
         ("_write_episode", 1, []),  # while it writes the first block

@@ -10,9 +10,9 @@ import numpy as np
 import pytest
 from pusht_cases import REPO_ID, Demonstrations, write_zarr
 
-from lerobot_bomb import cli
-from lerobot_bomb.data.convert import convert_pusht
-from lerobot_bomb.data.growing import lock_folder
+from lerobot_bomb.commands import main as cli
+from lerobot_bomb.commands.convert import convert_pusht
+from lerobot_bomb.data.resumable import lock_folder
 
 
 def overwrite(path: Path, name: str, change: Callable[[np.ndarray], np.ndarray]) -> None:

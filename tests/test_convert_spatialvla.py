@@ -12,7 +12,7 @@ from spatialvla_grid_cases import make_batch, make_policy
 from torch import Tensor
 
 from lerobot_bomb.actions.grids import ActionGrids
-from lerobot_bomb.cli import main
+from lerobot_bomb.commands.main import main
 from lerobot_bomb.vlm.tokenizer import nano_tokenizer
 from lerobot_policy_spatialvla_grid.modeling_spatialvla_grid import SpatialvlaGridPolicy
 

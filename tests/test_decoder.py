@@ -7,7 +7,6 @@ from hypothesis import strategies as st
 from torch import Tensor
 
 from lerobot_bomb.actions.text import END, NUM_SYMBOLS, SPACE, SYMBOL_TEXTS
-from lerobot_bomb.decoding.ahead import decode_ahead
 from lerobot_bomb.decoding.decoder import (
     FIRST_GUESSES,
     MAX_GUESSES,
@@ -20,6 +19,7 @@ from lerobot_bomb.decoding.decoder import (
 )
 from lerobot_bomb.decoding.draft import KnownSymbols, LinearDraft
 from lerobot_bomb.decoding.grammar import NumberGrammar, Place
+from lerobot_bomb.decoding.graph_decoder import decode_ahead
 
 
 class Speaker(Continuation):
@@ -72,7 +72,7 @@ def one_by_one(model: Continuation, grammar: NumberGrammar, batch_size: int) -> 
         while text[-1] != END:
             rows = torch.full((batch_size, 1), text[-1])
             logits = model(rows, torch.full((batch_size,), len(text) - 1))[row]
-            symbol = (logits + grammar.penalties(place)).argmax(dim=-1)
+            symbol = (logits + grammar.logit_bias(place)).argmax(dim=-1)
             place = grammar.advance(place, symbol)
             text.append(int(symbol))
         answers.append([int(part) for part in "".join(SYMBOL_TEXTS[s] for s in text[:-1]).split()])

@@ -10,17 +10,17 @@ from torch import Tensor
 from transformers import AutoTokenizer, LogitsProcessor
 
 from lerobot_bomb.actions.text import END, NUM_SYMBOLS, SPACE, SYMBOL_TEXTS, TokenRows
-from lerobot_bomb.decoding.ahead import RecordedAnswers
 from lerobot_bomb.decoding.decoder import CachedContinuation, Prompt, decode_numbers
+from lerobot_bomb.decoding.decoder_layers import TextLayers
 from lerobot_bomb.decoding.draft import KnownSymbols, LinearDraft
 from lerobot_bomb.decoding.grammar import NumberGrammar
+from lerobot_bomb.decoding.graph_cache import GraphCache
+from lerobot_bomb.decoding.graph_decoder import GraphDecoder
+from lerobot_bomb.decoding.kv_cache import CachedText
 from lerobot_bomb.decoding.writer import continue_prompt
 from lerobot_bomb.vlm.backbone import SmolVLMBackbone, build_backbone, load_backbone
-from lerobot_bomb.vlm.cached_text import CachedText
 from lerobot_bomb.vlm.paligemma import build_paligemma
 from lerobot_bomb.vlm.presets import nano_config, nano_paligemma_config
-from lerobot_bomb.vlm.recordings import Recordings
-from lerobot_bomb.vlm.text_layers import TextLayers
 from lerobot_bomb.vlm.tokenizer import NANO, load_tokenizer
 
 SYMBOL_IDS = torch.arange(20, 20 + NUM_SYMBOLS)
@@ -41,7 +41,7 @@ def prompts(backbone: SmolVLMBackbone, seed: int, lengths: list[int]) -> TokenRo
 def continuation(
     backbone: SmolVLMBackbone, rows: TokenRows, max_symbols: int, symbol_ids: Tensor = SYMBOL_IDS
 ) -> CachedContinuation:
-    prompt = Prompt(backbone.embed_tokens(rows.ids), rows.written)
+    prompt = Prompt(backbone.embed_tokens(rows.ids), rows.mask)
     return continue_prompt(backbone, prompt, symbol_ids, max_symbols)
 
 
@@ -144,7 +144,7 @@ class GrammarProcessor(LogitsProcessor):
 
 def generated(backbone: SmolVLMBackbone, rows: TokenRows, symbol_ids: Tensor) -> list[list[int]]:
     """What transformers' own greedy search writes with its own cache, left-padded: 12 numbers below 512."""
-    lengths = rows.written.sum(dim=1).tolist()
+    lengths = rows.mask.sum(dim=1).tolist()
     longest = max(lengths) + 1
     ids = torch.zeros(len(lengths), longest, dtype=torch.long)
     mask = torch.zeros_like(ids)
@@ -200,20 +200,20 @@ def test_it_does_so_in_real_vocabularies(shared_data: Path, name: str) -> None:
 
 @torch.no_grad()
 def test_on_a_copy_it_writes_what_the_model_writes_now(backbone: SmolVLMBackbone) -> None:
-    """The way that is recorded on CUDA, step by step; prompts have gaps there."""
+    """The way that is recorded on CUDA, step by step; prompts have padding there."""
     grammar, changing = NumberGrammar(512, 12), copy.deepcopy(backbone)
     guess = LinearDraft(grammar, 3)
     layers = TextLayers(changing.vlm.model.text_model, copy_dtype=torch.float32)
     head, max_symbols = changing.vlm.lm_head, grammar.max_symbols(12)
     embeds_SH, head_SH = changing.embed_tokens(SYMBOL_IDS), head.weight[SYMBOL_IDS]
     text = CachedText(layers, len(LENGTHS), max(LENGTHS) + 3 + max_symbols)
-    recorded = RecordedAnswers(grammar, guess, embeds_SH, head_SH, text)
+    recorded = GraphDecoder(grammar, guess, embeds_SH, head_SH, text)
     answers = []
     for seed in range(3):
         rows = prompts(changing, seed, LENGTHS)
         gap = torch.zeros(len(LENGTHS), 3, dtype=torch.long)
         gapped = TokenRows.join([TokenRows(gap, gap.bool()), rows])
-        prompt = Prompt(changing.embed_tokens(gapped.ids), gapped.written)
+        prompt = Prompt(changing.embed_tokens(gapped.ids), gapped.mask)
         written = recorded(prompt, embeds_SH, head_SH, 12).numbers.tolist()
         assert written == ours(changing, rows, SYMBOL_IDS, drafted=True)
         answers.append(written)
@@ -271,7 +271,7 @@ def test_compiled_layers_compute_the_same(text_model: Any) -> None:
 def test_what_was_recorded_is_forgotten_when_the_model_gets_other_modules(backbone: SmolVLMBackbone) -> None:
     changing = copy.deepcopy(backbone)
     model: Any = changing.vlm.model.text_model
-    recordings = Recordings[CachedText](model)
+    recordings = GraphCache[CachedText](model)
     prompt_BLH = torch.zeros(1, 8, model.config.hidden_size)
     first = recordings.find(prompt_BLH, 4, lambda text: text)
     assert recordings.find(prompt_BLH, 4, lambda text: text) is first

@@ -7,10 +7,12 @@ from typing import Any
 import numpy as np
 import pytest
 
-from lerobot_bomb.expert import expert_action
-from lerobot_bomb.schema import BOARD, CAMERAS, NUM_STONES, EpisodeSpec, RenderOptions
+from lerobot_bomb.bomb.board import BOARD, NUM_STONES
+from lerobot_bomb.bomb.episode import EpisodeSpec
+from lerobot_bomb.bomb.expert import expert_action
+from lerobot_bomb.bomb.observation import CAMERAS, RenderOptions
+from lerobot_bomb.envs.vector import LazyVectorEnv
 from lerobot_env_bomb.env import BombEnv
-from lerobot_env_bomb.vector import LazyVectorEnv
 
 import mujoco  # isort: skip  (after the env, which chooses an OpenGL backend)
 

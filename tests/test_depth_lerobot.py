@@ -8,12 +8,13 @@ from typing import Any
 import numpy as np
 import pytest
 
-from lerobot_bomb.cli import main
-from lerobot_bomb.data import growing
+from lerobot_bomb.bomb.episode import EpisodeSpec
+from lerobot_bomb.bomb.observation import CAMERAS, RenderOptions
+from lerobot_bomb.commands.main import main
+from lerobot_bomb.data import resumable
 from lerobot_bomb.data.record import record
 from lerobot_bomb.data.recording import Recording
 from lerobot_bomb.data.rollout import Rollout, RolloutSettings, make_env, play
-from lerobot_bomb.schema import CAMERAS, EpisodeSpec, RenderOptions
 
 SIZE, SEED, EPISODES = 64, 3, 3
 OPTIONS = RenderOptions(image_size=SIZE, depth=True)
@@ -43,7 +44,7 @@ def dataset(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFac
     root = tmp_path_factory.mktemp("recorded") / "dataset"
     flags = [f"--repo_id={REPO_ID}", f"--root={root}", f"--episodes={EPISODES}", f"--seed={SEED}"]
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(growing, "BLOCK_EPISODES", 2)
+        patch.setattr(resumable, "BLOCK_EPISODES", 2)
         assert main(["record", *flags, f"--image_size={SIZE}", "--depth", request.param]) == 0
     return root
 
@@ -91,7 +92,7 @@ def test_an_interrupted_recording_resumes_to_the_same_bytes(
 ) -> None:
     from lerobot_bomb.data import blocks
 
-    monkeypatch.setattr(growing, "BLOCK_EPISODES", 1)
+    monkeypatch.setattr(resumable, "BLOCK_EPISODES", 1)
     recording = Recording(REPO_ID, episodes=2, seed=SEED, image_size=SIZE, depth=True)
     record(recording, tmp_path / "whole")
     write, started = blocks._write_episode, iter(range(9))

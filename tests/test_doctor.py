@@ -2,8 +2,8 @@ import importlib.metadata
 
 import pytest
 
-from lerobot_bomb import doctor
-from lerobot_bomb.cli import main
+from lerobot_bomb.commands import doctor
+from lerobot_bomb.commands.main import main
 
 
 def test_a_sound_installation_passes(capsys: pytest.CaptureFixture[str]) -> None:

@@ -8,8 +8,10 @@ import pytest
 import torch
 from torch import Tensor, nn
 
-from lerobot_bomb.expert import expert_action
-from lerobot_bomb.schema import BOARD, CAMERAS, NUM_STONES, EpisodeSpec, RenderOptions
+from lerobot_bomb.bomb.board import BOARD, NUM_STONES
+from lerobot_bomb.bomb.episode import EpisodeSpec
+from lerobot_bomb.bomb.expert import expert_action
+from lerobot_bomb.bomb.observation import CAMERAS, RenderOptions
 from lerobot_bomb.vlm.depth import lattice_points, observed_depth, observed_intrinsics
 from lerobot_bomb.vlm.ego3d import Ego3D, encode_points
 from lerobot_bomb.vlm.images import CropWindows, draw_windows

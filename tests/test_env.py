@@ -16,8 +16,9 @@ from gymnasium.error import ResetNeeded
 from gymnasium.utils.env_checker import check_env
 
 import lerobot_env_bomb
-from lerobot_bomb.expert import expert_action
-from lerobot_bomb.schema import PROTOCOL_VERSION, EpisodeSpec, PrivilegedState, RenderOptions
+from lerobot_bomb.bomb.episode import PROTOCOL_VERSION, EpisodeSpec
+from lerobot_bomb.bomb.expert import expert_action
+from lerobot_bomb.bomb.observation import PrivilegedState, RenderOptions
 from lerobot_env_bomb.env import BombEnv
 
 SMALL = RenderOptions(image_size=32)

@@ -6,7 +6,7 @@ from typing import Any
 
 import pytest
 
-from lerobot_bomb.environment import Environment
+from lerobot_bomb.data.environment import Environment
 
 IMAGE = {"dtype": "video", "shape": [64, 64, 3], "names": ["height", "width", "channels"]}
 INFO: dict[str, Any] = {

@@ -3,17 +3,10 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from lerobot_bomb.expert import FLOOR_M, expert_action
-from lerobot_bomb.schema import (
-    BOARD,
-    MAX_STEP_M,
-    NUM_STONES,
-    WORKSPACE_LOW_M,
-    EpisodeSpec,
-    PrivilegedState,
-    RenderOptions,
-    Stage,
-)
+from lerobot_bomb.bomb.board import BOARD, NUM_STONES
+from lerobot_bomb.bomb.episode import EpisodeSpec, Stage
+from lerobot_bomb.bomb.expert import FLOOR_M, expert_action
+from lerobot_bomb.bomb.observation import MAX_STEP_M, WORKSPACE_LOW_M, PrivilegedState, RenderOptions
 from lerobot_env_bomb.env import BombEnv
 from lerobot_env_bomb.scene import WORKSPACE_HIGH, WORKSPACE_LOW
 

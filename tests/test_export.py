@@ -6,7 +6,7 @@ import torch
 from lerobot.policies.factory import make_pre_post_processors
 from vla0_smol_cases import STATS, make_policy, raw_batch
 
-from lerobot_bomb.cli import main
+from lerobot_bomb.commands.main import main
 from lerobot_policy_spatialvla_grid.modeling_spatialvla_grid import SpatialvlaGridPolicy
 from lerobot_policy_vla0_smol import make_vla0_smol_pre_post_processors
 

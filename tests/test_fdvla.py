@@ -268,7 +268,7 @@ def test_what_is_pooled(pool: str) -> None:
     context = policy._read(batch)
     hidden = context.prefix.hidden
     for row in range(3):
-        kept = rows_BL.written[row]
+        kept = rows_BL.mask[row]
         if pool == "text" and is_task_BL[row].any():
             kept = is_task_BL[row]
         expected = hidden[row, -1] if pool == "last" else hidden[row, kept].mean(dim=0)
@@ -276,7 +276,7 @@ def test_what_is_pooled(pool: str) -> None:
     lengths = is_task_BL.sum(dim=1)
     assert lengths[0] > lengths[1] > lengths[2] == 0
     end = len(policy._tail_ids)
-    assert rows_BL.written[:, -end:].all() and not is_task_BL[:, -end:].any()
+    assert rows_BL.mask[:, -end:].all() and not is_task_BL[:, -end:].any()
 
 
 @torch.no_grad()

@@ -15,7 +15,7 @@ from lerobot.policies.factory import make_pre_post_processors
 from safetensors.torch import load_file, save_file
 
 from lerobot_bomb.actions.relative import bounds
-from lerobot_bomb.cli import main
+from lerobot_bomb.commands.main import main
 from lerobot_bomb.data.record import record
 from lerobot_bomb.data.recording import Recording
 from lerobot_policy_fdvla.modeling_fdvla import FdvlaPolicy

@@ -19,8 +19,9 @@ from fdvla_cases import (
     make_policy,
 )
 
+from lerobot_bomb.checkpoints.environment import ConfigWithEnvironment
 from lerobot_bomb.flag_errors import FlagError
-from lerobot_bomb.policy_environment import ConfigWithEnvironment
+from lerobot_bomb.policies.config import VlaConfig
 from lerobot_policy_fdvla.configuration_fdvla import FdvlaConfig
 
 
@@ -150,6 +151,9 @@ def test_an_environment_may_name_no_task(tasks: tuple[str, ...]) -> None:
     assert policy.predict_action_chunk(batch).isfinite().all()
 
 
+OURS = (ConfigWithEnvironment, VlaConfig, FdvlaConfig)
+
+
 def test_the_policys_page_has_every_flag_in_its_table() -> None:
     page = (Path(__file__).parents[1] / "docs" / "fdvla.md").read_text()
     table = page.split("## Flags")[1].split("\n## ")[0]
@@ -159,6 +163,6 @@ def test_the_policys_page_has_every_flag_in_its_table() -> None:
     flags = {
         re.sub("^(optimizer|scheduler)_.*", r"\1_*", field.name)
         for field in fields(FdvlaConfig)
-        if any(field.name in vars(of)["__annotations__"] for of in (ConfigWithEnvironment, FdvlaConfig))
+        if any(field.name in vars(of)["__annotations__"] for of in OURS)
     }
     assert listed == flags

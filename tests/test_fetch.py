@@ -10,17 +10,20 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from lerobot_bomb import doctor
+from lerobot_bomb.bomb.board import BOARD
+from lerobot_bomb.bomb.episode import EpisodeSpec
+from lerobot_bomb.bomb.expert import expert_action
+from lerobot_bomb.bomb.layout import Layout
+from lerobot_bomb.bomb.observation import PrivilegedState, RenderOptions, action_bounds
+from lerobot_bomb.commands import doctor
 from lerobot_bomb.evaluation.results import read_results
-from lerobot_bomb.expert import expert_action
 from lerobot_bomb.flag_errors import FlagError
-from lerobot_bomb.schema import BOARD, EpisodeSpec, PrivilegedState, RenderOptions, action_bounds
 from lerobot_env_bomb import fetch_files
 from lerobot_env_bomb.configuration_bomb import BombEnvConfig
 from lerobot_env_bomb.env import BombEnv
 from lerobot_env_bomb.fetch import PREFIX, fetch_joints
-from lerobot_env_bomb.scene import WORKSPACE_HIGH, WORKSPACE_LOW, Layout, Scene
-from lerobot_env_bomb.task import sample_episode
+from lerobot_env_bomb.perturb import sample_episode
+from lerobot_env_bomb.scene import WORKSPACE_HIGH, WORKSPACE_LOW, Scene
 
 SMALL = RenderOptions(image_size=32)
 SPEC = EpisodeSpec(seed=0, robot="fetch")

@@ -11,6 +11,7 @@ from torch import Tensor, nn
 from lerobot_bomb.actions.bins import BIN_MODES, Bins
 from lerobot_bomb.actions.grid_settings import GridSettings, default_groups
 from lerobot_bomb.actions.grids import ActionGrids
+from lerobot_bomb.checkpoints.checks import check_finite
 from lerobot_bomb.finite import (
     is_finite,
     require_finite,
@@ -20,7 +21,6 @@ from lerobot_bomb.finite import (
     require_finite_statistics,
     require_finite_weights,
 )
-from lerobot_bomb.hub.checks import check_finite
 
 TYPES = [torch.float64, torch.float32, torch.bfloat16, torch.float16, torch.float8_e4m3fn]
 

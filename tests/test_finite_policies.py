@@ -14,8 +14,8 @@ from safetensors.torch import load_file, save_file
 from torch import Tensor
 
 from lerobot_bomb.actions.relative import RelativeActions, bounds
+from lerobot_bomb.decoding.kv_cache import CachedText
 from lerobot_bomb.vlm.backbone import load_backbone
-from lerobot_bomb.vlm.cached_text import CachedText
 from lerobot_policy_vla0_smol.modeling_vla0_smol import Vla0SmolPolicy
 
 STATE, WRIST, ACTION = "observation.state", "observation.images.wrist", "action"

@@ -14,11 +14,11 @@ from lerobot.utils.constants import ACTION
 from PIL import Image
 from pusht_cases import REPO_ID as PUSHT
 
-from lerobot_bomb.actions.fit_grid import CLIPPING, UNIFORM, action_bounds, quantisation_errors
 from lerobot_bomb.actions.grid_fit import normalised, normalised_rest
 from lerobot_bomb.actions.grid_settings import GridSettings, default_groups
 from lerobot_bomb.actions.grids import ActionGrids
-from lerobot_bomb.cli import main
+from lerobot_bomb.commands.fit_grid import CLIPPING, UNIFORM, action_bounds, quantisation_errors
+from lerobot_bomb.commands.main import main
 from lerobot_bomb.data.columns import read_columns
 from lerobot_bomb.data.record import record
 from lerobot_bomb.data.recording import Recording

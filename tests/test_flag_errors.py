@@ -10,7 +10,7 @@ import pytest
 from draccus.utils import DecodingError
 from lerobot.utils.import_utils import register_third_party_plugins
 
-from lerobot_bomb import cli
+from lerobot_bomb.commands import main as cli
 from lerobot_bomb.vlm.backbone import build_backbone
 from lerobot_bomb.vlm.paligemma import build_paligemma
 from lerobot_bomb.vlm.presets import nano_config, nano_paligemma_config, nano_qwen_config

@@ -5,7 +5,7 @@ from pathlib import Path
 
 import pytest
 
-from lerobot_bomb.flags import path_flag
+from lerobot_bomb.commands.arguments import path_flag
 
 
 def test_a_path_may_start_in_the_home_folder(monkeypatch: pytest.MonkeyPatch) -> None:

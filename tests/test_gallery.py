@@ -7,11 +7,13 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from lerobot_bomb import cli
+from lerobot_bomb.bomb.board import BOARD
+from lerobot_bomb.bomb.episode import EpisodeSpec
+from lerobot_bomb.bomb.observation import RenderOptions
+from lerobot_bomb.bomb.perturbations import ALL, AXES
+from lerobot_bomb.commands import main as cli
+from lerobot_bomb.commands.gallery import COLUMNS, PATH_RGB, SHEETS, axis_sheet, path_tile
 from lerobot_bomb.data.rollout import make_env
-from lerobot_bomb.perturbations import ALL, AXES
-from lerobot_bomb.schema import BOARD, EpisodeSpec, RenderOptions
-from lerobot_bomb.viewing.gallery import COLUMNS, PATH_RGB, SHEETS, axis_sheet, path_tile
 from lerobot_bomb.viewing.perturbations_page import example_sentences, page
 from lerobot_bomb.viewing.sheet import PAPER, Sheet, text_tile
 

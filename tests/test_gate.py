@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from learning_curve import SUCCESS_BGR, count, draw
 
-from lerobot_bomb.cli import main as lerobot_bomb
+from lerobot_bomb.commands.main import main as lerobot_bomb
 
 SIZE = 32  # pixels
 

@@ -20,13 +20,15 @@ def after(grammar: NumberGrammar, text: str) -> str:
     assert text[0] == " "
     place = grammar.start(1)
     for character in text[1:]:
-        assert grammar.penalties(place)[0, SYMBOL_OF[character]] == 0, f"{character!r} is refused in {text!r}"
+        assert grammar.logit_bias(place)[0, SYMBOL_OF[character]] == 0, (
+            f"{character!r} is refused in {text!r}"
+        )
         place = grammar.advance(place, torch.tensor([SYMBOL_OF[character]]))
     return allowed(grammar, place)
 
 
 def allowed(grammar: NumberGrammar, place: Place) -> str:
-    symbols = (grammar.penalties(place)[0] == 0).nonzero().flatten().tolist()
+    symbols = (grammar.logit_bias(place)[0] == 0).nonzero().flatten().tolist()
     return "".join("#" if i == END else SYMBOL_TEXTS[i] for i in symbols)
 
 
@@ -128,7 +130,7 @@ def test_its_choices_are_those_of_xgrammar(form: tuple[int, int], num_numbers: i
     while not matcher.is_terminated():
         matcher.fill_next_token_bitmask(mask)
         choices = torch.tensor([[bool(mask[0, 0] >> symbol & 1) for symbol in range(NUM_SYMBOLS)]])
-        assert torch.equal(grammar.penalties(place) == 0, choices)
+        assert torch.equal(grammar.logit_bias(place) == 0, choices)
         symbol = torch.multinomial(choices.float(), 1, generator=generator)[0]
         assert matcher.accept_token(int(symbol))
         place = grammar.advance(place, symbol)

@@ -5,7 +5,7 @@ import copy
 import torch
 from torch import Tensor, nn
 
-from lerobot_bomb.vlm.graphs import Recorded, RecordedModel
+from lerobot_bomb.cuda_graphs import GraphedFunction, GraphedModel
 
 
 def test_other_devices_call_the_function() -> None:
@@ -15,7 +15,7 @@ def test_other_devices_call_the_function() -> None:
         calls.append(x)
         return (2 * x,)
 
-    recorded = Recorded(double)
+    recorded = GraphedFunction(double)
     assert recorded(torch.ones(2))[0].tolist() == [2, 2] and recorded(torch.ones(3))[0].tolist() == [2, 2, 2]
     assert len(calls) == 2
 
@@ -26,7 +26,7 @@ class Doubled(nn.Module):
     def __init__(self) -> None:
         super().__init__()
         self.linear = nn.Linear(2, 2, bias=False)
-        self.recorded = RecordedModel(self.run, [self.linear])
+        self.recorded = GraphedModel(self.run, [self.linear])
 
     def run(self, x: Tensor) -> tuple[Tensor]:
         return (2 * self.linear(x),)

@@ -11,19 +11,31 @@ PACKAGES = {
 }
 ENTRY = "lerobot_policy_bomb"
 HEAVY = {"torch", "lerobot", "transformers", "rerun", "cv2"}
+CORE = "lerobot_bomb"
+# a folder or module of the core imports from those above it in this list
+ORDER = [
+    "__init__", "_compat", "finite", "flag_errors", "flags", "stats", "tables", "files", "cuda_graphs",
+    "bomb", "envs", "actions", "flow", "vlm", "decoding", "training", "data", "checkpoints",
+    "evaluation", "viewing", "explain", "hub", "policies", "serving", "commands",
+]  # fmt: skip
 
 
-def imported(path: Path, top_level_only: bool = False) -> set[str]:
-    """Top-level names of the modules a file imports."""
+def imported_modules(path: Path, top_level_only: bool = False) -> set[str]:
+    """What a file imports, modules and what it takes from them: {"lerobot_bomb.flags.one_of"}."""
     tree = ast.parse(path.read_text())
     nodes = tree.body if top_level_only else ast.walk(tree)
     names = set()
     for node in nodes:
         if isinstance(node, ast.Import):
-            names |= {alias.name.split(".")[0] for alias in node.names}
+            names |= {alias.name for alias in node.names}
         elif isinstance(node, ast.ImportFrom) and node.module:
-            names.add(node.module.split(".")[0])
+            names |= {f"{node.module}.{alias.name}" for alias in node.names}
     return names
+
+
+def imported(path: Path, top_level_only: bool = False) -> set[str]:
+    """The top-level packages of the modules that a file imports."""
+    return {name.split(".")[0] for name in imported_modules(path, top_level_only)}
 
 
 def files(*folders: str) -> list[Path]:
@@ -35,6 +47,28 @@ def files(*folders: str) -> list[Path]:
 @pytest.mark.parametrize("path", files("lerobot_bomb"), ids=lambda path: str(path.relative_to(ROOT)))
 def test_core_imports_no_env_and_no_policy(path: Path) -> None:
     assert not imported(path) & PACKAGES
+
+
+def test_the_order_of_the_core_is_complete() -> None:
+    there = {
+        path.stem
+        for path in (ROOT / CORE).iterdir()
+        if path.suffix == ".py" or (path / "__init__.py").is_file()
+    }
+    assert there == set(ORDER) and len(ORDER) == len(there)
+
+
+@pytest.mark.parametrize("path", files(CORE), ids=lambda path: str(path.relative_to(ROOT)))
+def test_the_core_imports_downwards(path: Path) -> None:
+    part = path.relative_to(ROOT / CORE).parts[0].removesuffix(".py")
+    parts = {name.split(".")[1] for name in imported_modules(path) if name.startswith(f"{CORE}.")}
+    allowed = set(ORDER[: ORDER.index(part) + 1])
+    assert parts & set(ORDER) <= allowed
+
+
+def test_only_commands_read_a_command_line() -> None:
+    readers = {path.parent.name for path in files(CORE) if "argparse" in imported(path)}
+    assert readers == {"commands"}
 
 
 @pytest.mark.parametrize("path", files("envs"), ids=lambda path: str(path.relative_to(ROOT)))
@@ -67,11 +101,14 @@ def test_the_simulator_imports_nothing_heavy(path: Path) -> None:
 @pytest.mark.parametrize(
     "name",
     [
-        "schema.py",
-        "episode_result.py",
-        "json_lines.py",
+        "bomb/board.py",
+        "bomb/episode.py",
+        "bomb/observation.py",
+        "bomb/expert.py",
+        "envs/results.py",
+        "envs/vector.py",
+        "files.py",
         "stats.py",
-        "expert.py",
         "data/rollout.py",
         "data/recording.py",
     ],
@@ -81,4 +118,5 @@ def test_what_simulator_workers_import_from_the_core_is_light(name: str) -> None
 
 
 def test_the_recorder_checks_its_flags_before_it_imports_anything_heavy() -> None:
-    assert not imported(ROOT / "lerobot_bomb" / "data" / "record.py", top_level_only=True) & HEAVY
+    for name in ("commands/record.py", "data/record.py"):
+        assert not imported(ROOT / "lerobot_bomb" / name, top_level_only=True) & HEAVY

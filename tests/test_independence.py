@@ -14,11 +14,12 @@ from typing import Any
 import numpy as np
 import pytest
 
+from lerobot_bomb.bomb.episode import EpisodeSpec
+from lerobot_bomb.bomb.expert import expert_action
+from lerobot_bomb.bomb.observation import RenderOptions
+from lerobot_bomb.envs.vector import NEW_ROLLOUT_OPTION, LazyVectorEnv
 from lerobot_bomb.evaluation.results import read_results
-from lerobot_bomb.expert import expert_action
-from lerobot_bomb.schema import EpisodeSpec, RenderOptions
 from lerobot_env_bomb.env import BombEnv
-from lerobot_env_bomb.vector import NEW_ROLLOUT_OPTION, LazyVectorEnv
 
 SMALL = RenderOptions(image_size=32)
 SEEDS = (9, 10)

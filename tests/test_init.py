@@ -7,8 +7,8 @@ import pytest
 import torch
 from lerobot.datasets import LeRobotDatasetMetadata
 
-from lerobot_bomb.checkpoint import load_processors, read_config
-from lerobot_bomb.cli import main
+from lerobot_bomb.checkpoints.folder import load_processors, read_config
+from lerobot_bomb.commands.main import main
 from lerobot_bomb.data.record import record
 from lerobot_bomb.data.recording import Recording
 

@@ -10,7 +10,7 @@ from pathlib import Path
 
 import pytest
 
-from lerobot_bomb.json_lines import append_line
+from lerobot_bomb.files import append_line
 
 LINE = json.dumps({"number": 1, "text": "x" * 200})
 
@@ -55,7 +55,7 @@ def test_a_full_device_is_an_error() -> None:
 
 def test_lines_of_several_processes_do_not_mix(path: Path) -> None:
     path.write_text(LINE[:50])
-    code = "import sys; from lerobot_bomb.json_lines import append_line\n"
+    code = "import sys; from lerobot_bomb.files import append_line\n"
     code += "for _ in range(100): append_line(sys.argv[1], sys.argv[2])"
     processes = [subprocess.Popen([sys.executable, "-c", code, path, LINE * 30]) for _ in range(3)]
     assert [process.wait() for process in processes] == [0, 0, 0]

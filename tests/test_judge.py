@@ -4,8 +4,10 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from lerobot_bomb.expert import expert_action
-from lerobot_bomb.schema import BOARD, EpisodeSpec, PrivilegedState, RenderOptions
+from lerobot_bomb.bomb.board import BOARD
+from lerobot_bomb.bomb.episode import EpisodeSpec
+from lerobot_bomb.bomb.expert import expert_action
+from lerobot_bomb.bomb.observation import PrivilegedState, RenderOptions
 from lerobot_env_bomb.env import BombEnv
 
 SMALL = RenderOptions(image_size=32)

@@ -9,11 +9,11 @@ from pathlib import Path
 
 import pytest
 
-from lerobot_bomb import cli
-from lerobot_bomb.data import growing
-from lerobot_bomb.data.growing import METADATA_FILE, unfinished_folder
+from lerobot_bomb.commands import main as cli
+from lerobot_bomb.data import resumable
 from lerobot_bomb.data.record import record
 from lerobot_bomb.data.recording import Recording
+from lerobot_bomb.data.resumable import METADATA_FILE, unfinished_folder
 
 RECORDING = Recording("test/blocks", episodes=5, seed=3, image_size=32)
 FLAGS = ("--repo_id=test/blocks", "--episodes=5", "--seed=3", "--image_size=32")
@@ -23,7 +23,7 @@ VIDEO = "videos/observation.images.wrist/chunk-000/file-000.mp4"
 @pytest.fixture(autouse=True)
 def small_blocks(monkeypatch: pytest.MonkeyPatch) -> None:
     """Blocks of 2 episodes, so that 5 take three."""
-    monkeypatch.setattr(growing, "BLOCK_EPISODES", 2)
+    monkeypatch.setattr(resumable, "BLOCK_EPISODES", 2)
 
 
 @pytest.fixture(scope="module")
@@ -40,7 +40,7 @@ def recorded(tmp_path_factory: pytest.TempPathFactory) -> Path:
         merge(*args)
 
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(growing, "BLOCK_EPISODES", 2)
+        patch.setattr(resumable, "BLOCK_EPISODES", 2)
         patch.setattr(blocks, "merge_blocks", copy_and_merge)
         record(RECORDING, root)
     (folder / "copy").rename(unfinished_folder(root))
@@ -81,12 +81,12 @@ def test_a_lost_block_between_others_is_missed(recorded: Path, tmp_path: Path) -
     folder = tmp_path / "x.recording"
     shutil.copytree(recorded / "x.recording", folder)
     (folder / "block-00001").rename(tmp_path / "lost")
-    assert growing.damaged_blocks(folder, 5, 2) == {folder / "block-00001": "is missing"}
-    (gap,) = growing.find_gaps(folder, 5, 2)
+    assert resumable.damaged_blocks(folder, 5, 2) == {folder / "block-00001": "is missing"}
+    (gap,) = resumable.find_gaps(folder, 5, 2)
     assert (gap.progress.num_episodes, gap.end, gap.num_missing) == (2, 4, 2)
     shutil.copytree(folder / "block-00000", folder / "block-00001")
     damage = {folder / "block-00001": "ends with episode 2 instead of 4"}
-    assert growing.damaged_blocks(folder, 5, 2) == damage
+    assert resumable.damaged_blocks(folder, 5, 2) == damage
 
 
 def test_a_merge_that_loses_episodes_is_an_error_and_the_blocks_stay(

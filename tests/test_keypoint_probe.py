@@ -128,7 +128,7 @@ def test_the_loss_is_the_mean_absolute_error() -> None:
 
 
 def test_every_sentence_of_the_benchmark_is_another_bag_of_words() -> None:
-    from lerobot_env_bomb.task import TEMPLATES
+    from lerobot_bomb.bomb.suites.place import TEMPLATES
 
     bags = {
         tuple(sorted(word_ids(template.format(color=color, row=row, column=column))))

@@ -9,7 +9,7 @@ import pytest
 from recipes import recipe_path
 from variants import as_flags
 
-from lerobot_bomb.cli import main
+from lerobot_bomb.commands.main import main
 from lerobot_bomb.evaluation.results import read_results, summarise
 
 pytestmark = pytest.mark.long

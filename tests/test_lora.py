@@ -15,11 +15,11 @@ from lerobot.policies import get_policy_class, make_policy
 from policy_cases import CASES
 from safetensors.torch import load_file
 
-from lerobot_bomb.checkpoint import parse_config, read_config
-from lerobot_bomb.cli import main
+from lerobot_bomb.checkpoints.folder import parse_config, read_config
+from lerobot_bomb.commands.main import main
+from lerobot_bomb.data.facts import DatasetFacts
 from lerobot_bomb.data.record import record
 from lerobot_bomb.data.recording import Recording
-from lerobot_bomb.hub.dataset import DatasetFacts
 
 peft = pytest.importorskip("peft")
 

@@ -11,7 +11,7 @@ from lerobot.configs import PreTrainedConfig
 from policy_cases import CASES
 
 from lerobot_bomb.flag_errors import FlagError
-from lerobot_bomb.policy_flags import check_as_trained, check_weights_fit
+from lerobot_bomb.training.policy_flags import check_as_trained, check_weights_fit
 from lerobot_bomb.vlm.presets import changed
 
 PRESET: dict[str, Any] = {"scale_factor": 2, "image_token_id": 7, "text_config": {"layers": 4, "width": 128}}

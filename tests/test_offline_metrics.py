@@ -11,8 +11,8 @@ import torch
 from lerobot.datasets import LeRobotDatasetMetadata, dataset_metadata
 from lerobot.scripts import lerobot_train
 
-from lerobot_bomb.checkpoint import load_processors, read_config
-from lerobot_bomb.cli import main
+from lerobot_bomb.checkpoints.folder import load_processors, read_config
+from lerobot_bomb.commands.main import main
 from lerobot_bomb.data.record import record
 from lerobot_bomb.data.recording import Recording
 from lerobot_bomb.evaluation.offline_metrics import evenly_spaced, measure_columns

@@ -10,7 +10,7 @@ import pytest
 import yaml
 
 from lerobot_bomb import __version__
-from lerobot_bomb.doctor import DISTRIBUTION
+from lerobot_bomb.commands.doctor import DISTRIBUTION
 
 ROOT = Path(__file__).parents[1]
 SOURCE_ROOTS = [ROOT, ROOT / "envs", ROOT / "policies"]
@@ -51,7 +51,7 @@ def test_the_wheel_holds_every_module_the_scene_and_the_checkpoints(wheel: Path)
             "lerobot_*/**/*.py",
             "lerobot_*/**/py.typed",
             "lerobot_*/**/*.xml",
-            "lerobot_*/checkpoints/*/*",
+            "lerobot_*/checkpoints/weights/*/*",
         )
         for path in root.glob(pattern)
     }
@@ -72,7 +72,7 @@ def test_the_sdist_holds_what_is_under_version_control_without_pictures(unpacked
         name
         for name in packed
         if re.search(r"(^|/)(\.venv|outputs|dist|__pycache__)/|\.(mp4|rrd|safetensors)$", name)
-        and not name.startswith("lerobot_bomb/checkpoints/")
+        and not name.startswith("lerobot_bomb/checkpoints/weights/")
     ]
     assert stray == [] and not (unpacked / "docs" / "media").exists()
     assert {

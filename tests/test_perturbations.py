@@ -6,8 +6,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from lerobot_bomb.perturbations import AXES, NUISANCES, Condition
-from lerobot_bomb.schema import EpisodeSpec
+from lerobot_bomb.bomb.episode import EpisodeSpec
+from lerobot_bomb.bomb.perturbations import AXES, NUISANCES, Condition
 
 RANGES = st.tuples(st.integers(0, 5), st.integers(0, 5)).map(sorted)
 

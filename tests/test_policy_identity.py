@@ -16,9 +16,9 @@ from lerobot.policies.act.configuration_act import ACTConfig
 
 import lerobot_policy_bomb  # noqa: F401  the plugin
 from lerobot_bomb import _compat
-from lerobot_bomb.episode_result import PolicyIdentity
+from lerobot_bomb.checkpoints.identity import _of_checkpoint, acting_policy
+from lerobot_bomb.envs.results import PolicyIdentity
 from lerobot_bomb.evaluation.results import read_results
-from lerobot_bomb.policy_identity import _of_checkpoint, acting_policy
 from lerobot_env_bomb.configuration_bomb import BombEnvConfig
 from lerobot_policy_bomb_expert.configuration_bomb_expert import BombExpertConfig
 

@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 from pusht_cases import REPO_ID, ZARR, Demonstrations, convert
 
-from lerobot_bomb.cli import main
+from lerobot_bomb.commands.main import main
 
 pytestmark = pytest.mark.long
 

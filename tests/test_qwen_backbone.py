@@ -37,7 +37,7 @@ def prompt_rows(
 
 
 def padded(rows: list[list[int]]) -> tuple[Tensor, Tensor]:
-    """Ids (B, L) and which are written, gaps at the ends."""
+    """Ids (B, L) and which are written, padding at the ends."""
     length = max(map(len, rows))
     ids = torch.tensor([row + [0] * (length - len(row)) for row in rows])
     return ids, torch.arange(length) < torch.tensor([[len(row)] for row in rows])
@@ -92,7 +92,7 @@ def test_a_prefix_is_what_the_stock_model_makes_of_it(size: int) -> None:
 
 
 @torch.no_grad()
-def test_gaps_change_nothing_wherever_they_are(nano: QwenBackbone) -> None:
+def test_padding_changes_nothing_wherever_it_is(nano: QwenBackbone) -> None:
     (row,) = prompt_rows(nano, TASKS[:1])
     pixels = as_pixels(draw_images(2))
     ids = torch.tensor([row])
@@ -135,7 +135,7 @@ def test_what_is_kept_of_a_prefix_never_changes(nano: QwenBackbone) -> None:
 
 
 @torch.no_grad()
-def test_segments_read_their_own_prefix_without_its_gaps(nano: QwenBackbone) -> None:
+def test_segments_read_their_own_prefix_without_its_padding(nano: QwenBackbone) -> None:
     ids, written = padded(prompt_rows(nano))
     segment, everything = torch.randn(2, 3, 128), torch.ones(2, 3, 3, dtype=torch.bool)
     pixels = as_pixels(draw_images(4))

@@ -16,7 +16,7 @@ from lerobot.policies import get_policy_class
 from robot_cases import KEYS, Loaded, ScriptedArm, command_at, position_at
 from torch import Tensor
 
-from lerobot_bomb.cli import main
+from lerobot_bomb.commands.main import main
 
 Run = Callable[..., None]
 REPO_ID, TASK = "test/arm", "Pick up the stone."

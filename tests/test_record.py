@@ -11,15 +11,16 @@ import numpy as np
 import pytest
 
 from lerobot_bomb import __version__
-from lerobot_bomb.data import growing
+from lerobot_bomb.bomb.episode import TASK_VERSION, EpisodeSpec
+from lerobot_bomb.bomb.expert import expert_action
+from lerobot_bomb.bomb.observation import CAMERAS, PrivilegedState, RenderOptions
+from lerobot_bomb.bomb.perturbations import NUISANCES
 from lerobot_bomb.data import record as record_module
-from lerobot_bomb.data.growing import METADATA_FILE, Progress, read_progress, unfinished_folder
+from lerobot_bomb.data import resumable
 from lerobot_bomb.data.record import describe_failures, record
 from lerobot_bomb.data.recording import Recording
+from lerobot_bomb.data.resumable import METADATA_FILE, Progress, read_progress, unfinished_folder
 from lerobot_bomb.data.rollout import RolloutSettings, make_env, play
-from lerobot_bomb.expert import expert_action
-from lerobot_bomb.perturbations import NUISANCES
-from lerobot_bomb.schema import CAMERAS, TASK_VERSION, EpisodeSpec, PrivilegedState, RenderOptions
 
 SIZE = 64
 SMALL = RenderOptions(image_size=SIZE)
@@ -31,7 +32,7 @@ FEATURES = {"observation.images.workspace", "observation.images.wrist", "observa
 @pytest.fixture(autouse=True)
 def small_blocks(monkeypatch: pytest.MonkeyPatch) -> None:
     """Blocks of 2 episodes, so that a short recording is merged from several."""
-    monkeypatch.setattr(growing, "BLOCK_EPISODES", 2)
+    monkeypatch.setattr(resumable, "BLOCK_EPISODES", 2)
 
 
 @pytest.fixture(scope="module")
@@ -39,7 +40,7 @@ def datasets(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
     """Two uninterrupted recordings."""
     roots = {name: tmp_path_factory.mktemp("recorded") / name for name in ("video", "images")}
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(growing, "BLOCK_EPISODES", 2)
+        patch.setattr(resumable, "BLOCK_EPISODES", 2)
         record(VIDEO, roots["video"])
         record(IMAGES, roots["images"])
     return roots

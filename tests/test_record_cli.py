@@ -13,7 +13,7 @@ from pathlib import Path
 import pytest
 from recorder_server import MARK, TIMEOUT_S, marked_processes, wait_for_end
 
-from lerobot_bomb.data.growing import finished_blocks, unfinished_folder
+from lerobot_bomb.data.resumable import finished_blocks, unfinished_folder
 
 pytestmark = [
     pytest.mark.long,

@@ -8,8 +8,9 @@ from pathlib import Path
 
 import pytest
 
-from lerobot_bomb import cli
-from lerobot_bomb.data.growing import (
+from lerobot_bomb.commands import main as cli
+from lerobot_bomb.data.recording import Recording
+from lerobot_bomb.data.resumable import (
     METADATA_FILE,
     Progress,
     finish_block,
@@ -18,7 +19,6 @@ from lerobot_bomb.data.growing import (
     unfinished_folder,
     write_json,
 )
-from lerobot_bomb.data.recording import Recording
 
 FLAGS = ["record", "--repo_id=test/x", "--episodes=1"]
 RECORDING = Recording("test/x", episodes=1)
@@ -115,7 +115,7 @@ def test_resume_refuses_other_parameters(
 def record_without_privileges(root: Path, *flags: str) -> str:
     """Record as one whom permissions bind; return what it says on stderr. LeRobot must not be imported."""
     script = (
-        "import sys; from lerobot_bomb import cli; code = cli.main(sys.argv[1:])\n"
+        "import sys; from lerobot_bomb.commands.main import main; code = main(sys.argv[1:])\n"
         "assert not {'torch', 'lerobot', 'mujoco'} & set(sys.modules); sys.exit(code)"
     )
     command = [sys.executable, "-c", script, *FLAGS, f"--root={root}", *flags]

@@ -14,8 +14,8 @@ from pathlib import Path
 import pytest
 from recorder_server import TIMEOUT_S, Moment, RecorderServer
 
-from lerobot_bomb import cli
-from lerobot_bomb.data.growing import METADATA_FILE, finished_blocks, unfinished_folder
+from lerobot_bomb.commands import main as cli
+from lerobot_bomb.data.resumable import METADATA_FILE, finished_blocks, unfinished_folder
 
 pytestmark = pytest.mark.skipif(platform.system() != "Linux", reason="processes are watched through /proc")
 

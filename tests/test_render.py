@@ -9,7 +9,8 @@ import threading
 import numpy as np
 import pytest
 
-from lerobot_bomb.schema import EpisodeSpec, RenderOptions
+from lerobot_bomb.bomb.episode import EpisodeSpec
+from lerobot_bomb.bomb.observation import RenderOptions
 from lerobot_env_bomb.env import BombEnv
 
 SMALL = RenderOptions(image_size=32)
@@ -19,7 +20,8 @@ HANGS_AFTER_S = 60
 AFTER_RENDERING = """
 import functools, gc, os, sys, threading
 import gymnasium
-from lerobot_bomb.schema import EpisodeSpec, RenderOptions
+from lerobot_bomb.bomb.episode import EpisodeSpec
+from lerobot_bomb.bomb.observation import RenderOptions
 from lerobot_env_bomb.env import BombEnv
 
 make = functools.partial(BombEnv, EpisodeSpec(seed=0), RenderOptions(image_size=32))

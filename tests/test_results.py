@@ -5,11 +5,12 @@ from typing import Any
 
 import pytest
 
-from lerobot_bomb.cli import main
-from lerobot_bomb.episode_result import EpisodeResult, PolicyIdentity
+from lerobot_bomb.bomb.board import COLORS
+from lerobot_bomb.bomb.episode import PROTOCOL_VERSION, EpisodeSpec
+from lerobot_bomb.commands.main import main
+from lerobot_bomb.envs.results import EpisodeResult, PolicyIdentity
 from lerobot_bomb.evaluation.result_lines import NEW_CHECKS, POLICY_CHECKS, SPEC_CHECKS, parse_line
 from lerobot_bomb.evaluation.results import read_results, summarise
-from lerobot_bomb.schema import COLORS, PROTOCOL_VERSION, EpisodeSpec
 
 ACT = PolicyIdentity("act", "outputs/act", None, "a" * 64, "b" * 64)
 FDVLA = PolicyIdentity("fdvla", "me/fdvla", "0123456789ab", "c" * 64, "d" * 64)

@@ -5,15 +5,17 @@ import multiprocessing
 import subprocess
 import sys
 import time
+from collections.abc import Iterator
 from dataclasses import replace
 
 import gymnasium
 import numpy as np
 import pytest
 
+from lerobot_bomb.bomb.episode import EpisodeSpec
+from lerobot_bomb.bomb.expert import expert_action
+from lerobot_bomb.bomb.observation import PrivilegedState, RenderOptions
 from lerobot_bomb.data.rollout import RolloutPool, RolloutSettings, make_env, perturb, play
-from lerobot_bomb.expert import expert_action
-from lerobot_bomb.schema import EpisodeSpec, PrivilegedState, RenderOptions
 
 SMALL = RenderOptions(image_size=64)
 
@@ -70,10 +72,25 @@ def test_a_pool_yields_in_the_order_of_the_specs() -> None:
     assert rollouts[0].frames["workspace"].shape == (rollouts[0].result.steps, 64, 64, 3)
 
 
+def test_a_pool_that_is_iterated_block_by_block_goes_on_and_plays_no_further_ahead() -> None:
+    drawn = []
+
+    def specs() -> Iterator[EpisodeSpec]:
+        for seed in itertools.count():
+            drawn.append(seed)
+            yield EpisodeSpec(seed=seed)
+
+    with RolloutPool(RolloutSettings(SMALL), specs(), num_workers=2) as pool:
+        seeds = [rollout.result.spec.seed for _ in range(3) for rollout in itertools.islice(pool, 1)]
+    assert seeds == [0, 1, 2]
+    assert len(drawn) == 2 * 2 + 3  # two per worker under way
+
+
 def test_workers_start_without_torch_and_lerobot() -> None:
     script = (
         "import sys, lerobot_bomb.data.record, lerobot_bomb.data.rollout as rollout\n"
-        "from lerobot_bomb.schema import EpisodeSpec, RenderOptions\n"
+        "from lerobot_bomb.bomb.episode import EpisodeSpec\n"
+        "from lerobot_bomb.bomb.observation import RenderOptions\n"
         "rollout.make_env(EpisodeSpec(seed=0), RenderOptions()).reset()\n"
         "assert not {'torch', 'lerobot'} & set(sys.modules)\n"
     )
@@ -83,13 +100,12 @@ def test_workers_start_without_torch_and_lerobot() -> None:
 def test_a_worker_that_ends_is_reported_and_the_others_are_ended() -> None:
     specs = (EpisodeSpec(seed=seed) for seed in itertools.count())
     with RolloutPool(RolloutSettings(RenderOptions(image_size=256)), specs, num_workers=2) as pool:
-        rollouts = iter(pool)
-        next(rollouts)
+        next(pool)
         processes = multiprocessing.active_children()
         time.sleep(0.5)  # more than a pipe holds: both are sending their next episode
         processes[0].terminate()
         with pytest.raises(RuntimeError, match="a simulator process ended with exit code -15"):
-            list(rollouts)
+            list(pool)
     assert [process.is_alive() for process in processes] == [False, False]
 
 
@@ -99,7 +115,7 @@ def test_an_error_in_a_worker_is_raised() -> None:
         RolloutPool(settings, iter([EpisodeSpec(seed=0)] * 9), num_workers=1) as pool,
         pytest.raises(ValueError, match=r"\(3,\)"),
     ):
-        next(iter(pool))
+        next(pool)
 
 
 def forgets_the_gripper(state: PrivilegedState, control_mode: str, fps: int) -> np.ndarray:

@@ -1,16 +1,15 @@
 import numpy as np
 import pytest
 
-from lerobot_bomb.schema import BOARD, CAMERAS, NUM_STONES, PHYSICS_HZ, ROBOTS, EpisodeSpec, RenderOptions
-from lerobot_env_bomb.model import (
-    BOARD_HALF_SIZE_M,
-    TRAY_CENTER_XY,
-    TRAY_HALF_SIZE_XY,
-    parked_xyz,
-)
+from lerobot_bomb.bomb.board import BOARD, NUM_STONES, TRAY_CENTER_XY, TRAY_HALF_SIZE_XY
+from lerobot_bomb.bomb.episode import PHYSICS_HZ, ROBOTS, EpisodeSpec
+from lerobot_bomb.bomb.layout import Layout
+from lerobot_bomb.bomb.observation import CAMERAS, RenderOptions
+from lerobot_bomb.bomb.suites.place import STONE
+from lerobot_env_bomb.model import BOARD_HALF_SIZE_M, parked_xyz
+from lerobot_env_bomb.perturb import sample_episode
 from lerobot_env_bomb.render import CameraRenderer
-from lerobot_env_bomb.scene import WORKSPACE_HIGH, WORKSPACE_LOW, Layout, Scene
-from lerobot_env_bomb.task import STONE, sample_episode
+from lerobot_env_bomb.scene import WORKSPACE_HIGH, WORKSPACE_LOW, Scene
 
 NUM_SUBSTEPS = 20
 BLACK_CELL, WHITE_CELL = (1, 1), (3, 3)

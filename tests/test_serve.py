@@ -13,7 +13,7 @@ import pytest
 import torch
 from robot_cases import BombArm, Loaded
 
-from lerobot_bomb import cli
+from lerobot_bomb.commands import main as cli
 from lerobot_bomb.data.record import record
 from lerobot_bomb.data.recording import Recording
 
@@ -47,7 +47,14 @@ def answers(port: int) -> bool:
 def port(tmp_path_factory: pytest.TempPathFactory) -> Iterator[int]:
     """Of a server in a process of its own, which Ctrl-C ends."""
     number = free_port()
-    command = [sys.executable, "-m", "lerobot_bomb.cli", "serve", f"--port={number}", "--inference_latency=0"]
+    command = [
+        sys.executable,
+        "-m",
+        "lerobot_bomb.commands.main",
+        "serve",
+        f"--port={number}",
+        "--inference_latency=0",
+    ]
     log = tmp_path_factory.mktemp("server") / "log"
     with log.open("w") as output:
         server = subprocess.Popen(
@@ -171,7 +178,7 @@ def test_help_names_the_danger_and_the_host(capsys: pytest.CaptureFixture[str]) 
 def test_the_extra_is_named_where_grpc_is_missing(
     monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    monkeypatch.delitem(sys.modules, "lerobot_bomb.serve", raising=False)
+    monkeypatch.delitem(sys.modules, "lerobot_bomb.commands.serve", raising=False)
     monkeypatch.setitem(sys.modules, "lerobot.async_inference.configs", None)
     assert cli.main(["serve"]) == 1
     message = "the server needs grpc: pip install 'lerobot_policy_bomb[async]'"

@@ -15,9 +15,10 @@ import torch
 from lerobot.async_inference.helpers import RemotePolicyConfig, TimedObservation
 from lerobot.transport import services_pb2, services_pb2_grpc
 
-from lerobot_bomb import cli, serve
-from lerobot_bomb.open_streams import MAX_OPEN, OpenStreams
-from lerobot_bomb.unpickling import loads
+from lerobot_bomb.commands import main as cli
+from lerobot_bomb.commands import serve
+from lerobot_bomb.serving.open_streams import MAX_OPEN, OpenStreams
+from lerobot_bomb.serving.unpickling import loads
 
 CTRL_C = 130
 TIMEOUT_S = 60  # against hangs

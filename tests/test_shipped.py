@@ -9,12 +9,12 @@ import pytest
 from lerobot.configs import PreTrainedConfig, parser
 from lerobot.utils.import_utils import register_third_party_plugins
 
-from lerobot_bomb import demo
-from lerobot_bomb.cli import main
+from lerobot_bomb.checkpoints.identity import sha256_of
+from lerobot_bomb.checkpoints.names import CONFIG, TRAIN_CONFIG, WEIGHTS, has_local_path
+from lerobot_bomb.checkpoints.shipped import FOLDER, checkpoint_path, shipped_names
+from lerobot_bomb.commands import demo
+from lerobot_bomb.commands.main import main
 from lerobot_bomb.evaluation.results import read_results
-from lerobot_bomb.hub.names import CONFIG, TRAIN_CONFIG, WEIGHTS, has_local_path
-from lerobot_bomb.policy_identity import sha256_of
-from lerobot_bomb.shipped import FOLDER, checkpoint_path, shipped_names
 
 Run = Callable[..., None]
 NAMES = shipped_names()

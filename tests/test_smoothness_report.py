@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from pusht_cases import REPO_ID, Demonstrations
 
-from lerobot_bomb.cli import main
+from lerobot_bomb.commands.main import main
 from lerobot_bomb.evaluation.executed import Executed, append_episode
 from lerobot_bomb.evaluation.smoothness_report import (
     ORDERS,

@@ -8,7 +8,7 @@ from decode_speed_grid import StockGenerate
 from spatialvla_grid_cases import make_batch, make_policy, rows
 from torch import Tensor
 
-from lerobot_bomb.vlm.cached_text import CachedText
+from lerobot_bomb.decoding.kv_cache import CachedText
 
 
 @torch.no_grad()

@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 from huggingface_hub.utils import validate_repo_id
 
-from lerobot_bomb.cli import main
+from lerobot_bomb.commands.main import main
 from lerobot_bomb.evaluation.results import read_results
 
 Run = Callable[..., None]

@@ -3,20 +3,21 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from lerobot_bomb.schema import BOARD, COLORS, EpisodeSpec
-from lerobot_env_bomb.go import is_legal_move, is_legal_position
-from lerobot_env_bomb.model import BOARD_HALF_SIZE_M, TRAY_CENTER_XY, TRAY_HALF_SIZE_XY
-from lerobot_env_bomb.scene import WORKSPACE_HIGH, WORKSPACE_LOW
-from lerobot_env_bomb.task import (
+from lerobot_bomb.bomb.board import BOARD, COLORS, TRAY_CENTER_XY, TRAY_HALF_SIZE_XY
+from lerobot_bomb.bomb.episode import EpisodeSpec
+from lerobot_bomb.bomb.go import is_legal_move, is_legal_position
+from lerobot_bomb.bomb.suites.place import (
     HELDOUT_TARGETS,
     HELDOUT_TEMPLATES,
     STONE,
     TEMPLATES,
-    Episode,
-    sample_episode,
     targets_of,
     templates_of,
 )
+from lerobot_env_bomb.model import BOARD_HALF_SIZE_M
+from lerobot_env_bomb.perturb import PerturbedEpisode as Episode
+from lerobot_env_bomb.perturb import sample_episode
+from lerobot_env_bomb.scene import WORKSPACE_HIGH, WORKSPACE_LOW
 
 SEEDS = st.integers(0, 2**31)
 CORNER_CAPTURE = {(0, 1): "white", (1, 0): "white"}  # black in the corner would have no liberty

@@ -39,7 +39,7 @@ def test_length_of_an_answer_of_fixed_width(num_numbers: int, tokens: int) -> No
     assert int(written.sum()) + 1 == tokens  # and the end
 
 
-def test_compact_closes_gaps_and_cuts_what_no_row_needs() -> None:
+def test_compact_takes_padding_out_and_cuts_what_no_row_needs() -> None:
     written = torch.tensor([[1, 0, 0, 1, 0], [0, 1, 1, 0, 1]], dtype=torch.bool)
     ids = torch.tensor([[1, 2, 3, 4, 5], [6, 7, 8, 9, 10]])
     written, ids = compact(written, ids)
@@ -55,7 +55,7 @@ def tokens_of(number: int) -> NumberTokens:
 @pytest.mark.parametrize("number", [7, 85, 425])
 def test_a_hidden_number_is_one_token_whatever_its_digits(number: int) -> None:
     hidden = tokens_of(number).hide_numbers(torch.tensor([[True, False]]), hidden_id=77)
-    assert hidden.ids[hidden.written].tolist() == [10, 77, 10, 4, 2]
+    assert hidden.ids[hidden.mask].tolist() == [10, 77, 10, 4, 2]
     assert hidden.ids[hidden.trained].tolist() == [10, 10, 4, 2]
 
 
@@ -63,7 +63,7 @@ def test_a_hidden_character_keeps_its_place() -> None:
     columns = torch.zeros(1, 2, 4, dtype=torch.bool)
     columns[0, 0, 2] = columns[0, 1, 0] = True
     hidden = tokens_of(425).hide_characters(columns, hidden_id=77)
-    assert hidden.ids[hidden.written].tolist() == [10, 4, 77, 5, 77, 4, 2]
+    assert hidden.ids[hidden.mask].tolist() == [10, 4, 77, 5, 77, 4, 2]
     assert hidden.ids[hidden.trained].tolist() == [10, 4, 5, 4, 2]
 
 
@@ -108,9 +108,9 @@ def test_the_same_seed_hides_the_same() -> None:
     assert not torch.equal(draws[0], draws[2])
 
 
-def test_rows_are_rounded_up_with_gaps() -> None:
+def test_rows_are_rounded_up_with_padding() -> None:
     rows = TokenRows(torch.tensor([[4, 5, 6]]), torch.tensor([[True, False, True]]))
     rounded = rows.rounded(4)
-    assert rounded.ids.shape == (1, 4) and rounded.written.tolist() == [[True, False, True, False]]
-    assert rounded.without_gaps().ids.tolist() == [[4, 6]]
+    assert rounded.ids.shape == (1, 4) and rounded.mask.tolist() == [[True, False, True, False]]
+    assert rounded.without_padding().ids.tolist() == [[4, 6]]
     assert rounded.rounded(4).ids.shape == (1, 4)

@@ -8,7 +8,7 @@ import torch
 from policy_cases import CASES
 from torch import Tensor, distributed
 
-from lerobot_bomb.training_draws import begin_batch
+from lerobot_bomb.training.randomness import begin_batch
 
 CROPPED = {"crop_fraction": 0.7}
 

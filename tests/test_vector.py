@@ -3,9 +3,10 @@ from functools import partial
 
 import numpy as np
 
-from lerobot_bomb.schema import EpisodeSpec, RenderOptions
+from lerobot_bomb.bomb.episode import EpisodeSpec
+from lerobot_bomb.bomb.observation import RenderOptions
+from lerobot_bomb.envs.vector import NEW_ROLLOUT_OPTION, FreezeAfterEnd, LazyVectorEnv
 from lerobot_env_bomb.env import BombEnv
-from lerobot_env_bomb.vector import NEW_ROLLOUT_OPTION, FreezeAfterEnd, LazyVectorEnv
 
 SMALL = RenderOptions(image_size=32)
 SEEDS = [11, 12]
@@ -14,6 +15,17 @@ STILL = np.zeros((2, 4), dtype=np.float32)
 
 def make_one(**spec: object) -> BombEnv:
     return BombEnv(spec=EpisodeSpec(**{"seed": 0, **spec}), render_options=SMALL)  # pyright: ignore[reportArgumentType]
+
+
+def played_out() -> FreezeAfterEnd:
+    """An environment whose episode of seed 1 has ended."""
+    env = FreezeAfterEnd(make_one(fps=1))
+    env.reset(seed=1)
+    ended = False
+    while not ended:
+        *_, terminated, truncated, _ = env.step(STILL[0])
+        ended = terminated or truncated
+    return env
 
 
 def test_workers_import_neither_torch_nor_lerobot() -> None:
@@ -65,12 +77,7 @@ def test_an_ended_episode_stays_frozen_through_autoreset() -> None:
 
 
 def test_changing_a_frozen_observation_changes_no_later_one() -> None:
-    env = FreezeAfterEnd(make_one(fps=1))
-    env.reset(seed=1)
-    ended = False
-    while not ended:
-        *_, terminated, truncated, _ = env.step(STILL[0])
-        ended = terminated or truncated
+    env = played_out()
     expected = env.reset()[0]["agent_pos"].copy()
     env.reset()[0]["agent_pos"][:] = 0
     np.testing.assert_array_equal(env.reset()[0]["agent_pos"], expected)
@@ -84,12 +91,7 @@ def test_freezing_uses_lerobots_option_name() -> None:
 
 
 def test_a_seed_or_the_option_starts_a_new_episode() -> None:
-    env = FreezeAfterEnd(make_one(fps=1))
-    env.reset(seed=1)
-    ended = False
-    while not ended:
-        *_, terminated, truncated, _ = env.step(STILL[0])
-        ended = terminated or truncated
+    env = played_out()
     assert env.reset()[1]["seed"] == 1
     assert env.reset(seed=2)[1]["seed"] == 2
     assert env.reset(options={NEW_ROLLOUT_OPTION: True})[1]["seed"] != 1

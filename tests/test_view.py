@@ -15,12 +15,14 @@ import cv2
 import numpy as np
 import pytest
 
-from lerobot_bomb import cli
+from lerobot_bomb.bomb.board import BOARD
+from lerobot_bomb.bomb.episode import EpisodeSpec
+from lerobot_bomb.bomb.expert import expert_action
+from lerobot_bomb.bomb.observation import ACTION_NAMES, STATE_NAMES, PrivilegedState, RenderOptions
+from lerobot_bomb.commands import main as cli
+from lerobot_bomb.commands.view import write_episode
 from lerobot_bomb.data.rollout import make_env
-from lerobot_bomb.expert import expert_action
-from lerobot_bomb.schema import ACTION_NAMES, BOARD, STATE_NAMES, EpisodeSpec, PrivilegedState, RenderOptions
 from lerobot_bomb.viewing.episode import expert_agent, play
-from lerobot_bomb.viewing.view import write_episode
 from lerobot_env_bomb.env import BombEnv
 
 SPEC = EpisodeSpec(seed=4, target=(3, 2), color="white", fps=5)
@@ -341,7 +343,7 @@ def test_an_error_half_way_leaves_no_file(tmp_path: Path) -> None:
 
 
 def test_a_kill_half_way_leaves_no_file_under_the_final_names(tmp_path: Path) -> None:
-    command = [sys.executable, "-m", "lerobot_bomb.cli", "view", "--policy=random", "--fps=200"]
+    command = [sys.executable, "-m", "lerobot_bomb.commands.main", "view", "--policy=random", "--fps=200"]
     process = subprocess.Popen([*command, "--image_size=32", f"--output={tmp_path / 'x'}"])
     while not any(path.stat().st_size for path in tmp_path.glob(".unfinished-*/x.rrd")):
         assert process.poll() is None

@@ -36,7 +36,7 @@ def sequence(policy: Vla0SmolPolicy, batch: dict[str, Any]) -> list[list[int]]:
     """Token ids of every row, prompt and answer."""
     prompt = policy._prompt(batch)
     answer = policy._answer(numbers_of(policy, batch)).rows
-    pairs = zip(prompt.ids, prompt.written, answer.ids, answer.written, strict=True)
+    pairs = zip(prompt.ids, prompt.mask, answer.ids, answer.mask, strict=True)
     return [[*ids[keep].tolist(), *said[kept].tolist()] for ids, keep, said, kept in pairs]
 
 
@@ -177,7 +177,7 @@ def test_a_row_with_everything_hidden_gives_loss_zero(monkeypatch: pytest.Monkey
     policy = make_policy(mask_level="char")
     batch = make_batch(policy, 2)
     numbers = numbers_of(policy, batch)
-    numbers = numbers.hide_characters(torch.ones_like(numbers.written), policy.tokens.hidden)
+    numbers = numbers.hide_characters(torch.ones_like(numbers.mask), policy.tokens.hidden)
     answer = policy._answer(numbers)
     assert (answer.labels != IGNORED).sum(dim=1).tolist() == [1, 1]  # the end
     monkeypatch.setattr(

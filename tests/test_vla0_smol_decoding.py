@@ -58,7 +58,7 @@ def test_decoding_follows_the_teacher_forced_argmax(overfit: tuple[Vla0SmolPolic
         place = policy.grammar.start(1)
         # every answer begins with a space
         for step_logits, label in zip(row_logits[1:], row_labels[row_labels != IGNORED][1:], strict=False):
-            symbol, _ = likeliest(step_logits[None] + policy.grammar.penalties(place))
+            symbol, _ = likeliest(step_logits[None] + policy.grammar.logit_bias(place))
             assert policy.symbol_ids[symbol] == label
             place = policy.grammar.advance(place, symbol)
         assert place.prefix == policy.grammar.DONE

@@ -5,7 +5,7 @@ from pathlib import Path
 import imageio.v3 as iio
 import numpy as np
 
-from lerobot_bomb.schema import EpisodeSpec
+from lerobot_bomb.bomb.episode import EpisodeSpec
 from lerobot_bomb.viewing.episode import expert_agent, play
 from lerobot_env_bomb.env import BombEnv
 

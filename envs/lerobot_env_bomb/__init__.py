@@ -6,7 +6,8 @@ Imports neither torch nor lerobot, so that an environment's worker process start
 
 import gymnasium
 
-from lerobot_bomb.schema import CONTROL_MODES, SUITES, EpisodeSpec
+from lerobot_bomb.bomb.episode import CONTROL_MODES, EpisodeSpec
+from lerobot_bomb.bomb.suites import SUITES
 
 # Gymnasium id -> what an episode of it is: bomb/place-v0 (relative control), bomb/place-absolute-v0
 GYM_IDS = {

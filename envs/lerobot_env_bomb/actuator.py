@@ -4,8 +4,8 @@ from collections import deque
 
 import numpy as np
 
-from lerobot_bomb.schema import MAX_STEP_M
-from lerobot_env_bomb.axes import Dynamics
+from lerobot_bomb.bomb.observation import MAX_STEP_M
+from lerobot_env_bomb.axes.dynamics import Dynamics
 
 NOISE_STREAM = 300  # of random numbers, apart from those that an episode is drawn from
 

@@ -10,23 +10,15 @@ from lerobot.envs import EnvConfig
 from lerobot.processor import PolicyProcessorPipeline
 from lerobot.utils.constants import ACTION, OBS_IMAGES, OBS_PREFIX, OBS_STATE
 
-from lerobot_bomb.camera_geometry import geometry_shapes
-from lerobot_bomb.environment import Environment
+from lerobot_bomb.bomb.episode import DEFAULT_FPS, TASK_VERSION, EpisodeSpec
+from lerobot_bomb.bomb.observation import ACTION_DIM, CAMERAS, STATE_DIM, RenderOptions, geometry_shapes
+from lerobot_bomb.bomb.perturbations import NONE, Condition
+from lerobot_bomb.checkpoints.environment import check_acting_policy
+from lerobot_bomb.data.environment import Environment
+from lerobot_bomb.envs.vector import LazyVectorEnv
+from lerobot_bomb.files import check_appendable
 from lerobot_bomb.flag_errors import flag_errors
-from lerobot_bomb.json_lines import check_appendable
-from lerobot_bomb.perturbations import NONE, Condition
-from lerobot_bomb.policy_environment import check_acting_policy
-from lerobot_bomb.schema import (
-    ACTION_DIM,
-    CAMERAS,
-    DEFAULT_FPS,
-    STATE_DIM,
-    TASK_VERSION,
-    EpisodeSpec,
-    RenderOptions,
-)
 from lerobot_env_bomb.fetch_files import check_robot
-from lerobot_env_bomb.vector import LazyVectorEnv
 
 AGENT_POS = "agent_pos"
 
@@ -207,6 +199,6 @@ class BombEnvConfig(EnvConfig):
         """Argument of `BombEnv`: the policy that LeRobot built after this config's environments."""
         if self.results_path is None:
             return {}
-        from lerobot_bomb.policy_identity import acting_policy
+        from lerobot_bomb.checkpoints.identity import acting_policy
 
         return {"policy": acting_policy()}

@@ -8,24 +8,19 @@ import gymnasium
 import numpy as np
 from gymnasium.error import ResetNeeded
 
-from lerobot_bomb.episode_result import EpisodeResult, PolicyIdentity, write_result
-from lerobot_bomb.schema import (
-    ACTION_DIM,
-    CAMERAS,
-    DEFAULT_FPS,
-    MAX_EPISODE_STEPS,
-    PHYSICS_HZ,
-    EpisodeSpec,
-    PrivilegedState,
-    RenderOptions,
-)
+from lerobot_bomb.bomb.episode import DEFAULT_FPS, PHYSICS_HZ, EpisodeSpec
+from lerobot_bomb.bomb.judge import Judge
+from lerobot_bomb.bomb.observation import ACTION_DIM, CAMERAS, PrivilegedState, RenderOptions
+from lerobot_bomb.bomb.suites import find_suite
+from lerobot_bomb.envs.results import EpisodeResult, PolicyIdentity, write_result
 from lerobot_env_bomb.actuator import Actuator
+from lerobot_env_bomb.axes.dynamics import Dynamics
+from lerobot_env_bomb.axes.photometric import Sensor
 from lerobot_env_bomb.fetch_files import check_robot
-from lerobot_env_bomb.judge import Judge
+from lerobot_env_bomb.perturb import PerturbedEpisode, sample_episode
 from lerobot_env_bomb.render import CameraRenderer, compose_caption, extrinsics, intrinsics
 from lerobot_env_bomb.scene import Scene
 from lerobot_env_bomb.spaces import action_space, observation_space
-from lerobot_env_bomb.task import STONE, Episode, check_target, sample_episode
 
 Observation = dict[str, Any]
 DEFAULT_SPEC = EpisodeSpec(seed=0)
@@ -38,7 +33,7 @@ class _Run:
     """What exists once an episode has been started."""
 
     scene: Scene
-    episode: Episode
+    episode: PerturbedEpisode
     judge: Judge
     actuator: Actuator
 
@@ -66,7 +61,8 @@ class BombEnv(gymnasium.Env[Observation, np.ndarray]):
         task_ids: tuple[int, ...] | None = None,
         policy: PolicyIdentity | None = None,
     ):
-        check_target(spec)
+        suite = find_suite(spec.suite)
+        suite.check(spec)
         check_robot(spec)
         if render_mode not in (None, *self.metadata["render_modes"]):
             raise ValueError(f"render_mode={render_mode!r} is unknown; choose rgb_array or None")
@@ -75,7 +71,7 @@ class BombEnv(gymnasium.Env[Observation, np.ndarray]):
         self.render_mode = render_mode
         self.task = spec.suite
         self.task_description = ""
-        self._max_episode_steps = round(MAX_EPISODE_STEPS[spec.suite] * spec.fps / DEFAULT_FPS)
+        self._max_episode_steps = round(suite.max_steps * spec.fps / DEFAULT_FPS)
         self._spec = spec
         self._render_options = render_options
         self._results_path = results_path
@@ -103,7 +99,7 @@ class BombEnv(gymnasium.Env[Observation, np.ndarray]):
         episode = sample_episode(replace(self._spec, seed=int(seed)))
         scene = self._current_run.scene if self._current_run is not None else Scene(self._spec.robot)
         scene.reset(episode.layout, episode.perturbation.model_edits)
-        start, dynamics = scene.measure(), episode.perturbation.dynamics
+        start, dynamics = scene.measure(), episode.perturbation.of(Dynamics)
         self._current_run = _Run(
             scene=scene,
             episode=episode,
@@ -170,7 +166,7 @@ class BombEnv(gymnasium.Env[Observation, np.ndarray]):
             placement_error_mm=judge.placement_error_mm,
             nearest_intersection=judge.nearest_intersection,
             collateral_mm=judge.collateral_mm,
-            levels=episode.perturbation.levels,
+            levels=dict(episode.perturbation.levels),
             image_size=self._render_options.image_size,
             render_preset=self._render_options.preset,
             task_ids=self._task_ids,
@@ -193,7 +189,7 @@ class BombEnv(gymnasium.Env[Observation, np.ndarray]):
             gripper_xyz=now.gripper_xyz,
             finger_opening=now.finger_opening,
             target_xyz=run.episode.target_xyz,
-            stone=STONE,
+            stone=run.episode.stone,
             stone_xyz=now.stone_xyz,
             stone_is_white=run.episode.layout.stone_is_white,
             stone_in_play=run.episode.layout.stone_in_play,
@@ -258,10 +254,10 @@ class BombEnv(gymnasium.Env[Observation, np.ndarray]):
 
     def _sense(self, picture: np.ndarray, camera: str) -> np.ndarray:
         """The picture as the camera's sensor takes it in this step."""
-        photometric = self._run.episode.perturbation.photometric
-        if photometric is None:
+        sensor = self._run.episode.perturbation.of(Sensor)
+        if sensor is None:
             return picture
-        return photometric(picture, len(CAMERAS) * self._steps + CAMERAS.index(camera))
+        return sensor.photometric(picture, len(CAMERAS) * self._steps + CAMERAS.index(camera))
 
     @property
     def _camera_renderer(self) -> CameraRenderer:

@@ -9,12 +9,8 @@ from pathlib import Path
 
 import numpy as np
 
-from lerobot_env_bomb.backend import ensure_gl_backend
 from lerobot_env_bomb.fetch_files import fetch_xml
-
-ensure_gl_backend()
-
-import mujoco  # noqa: E402  (its names live in C modules that pyright cannot read)
+from lerobot_env_bomb.mujoco_gl import mujoco
 
 SCENE_XML = Path(__file__).with_name("scene.xml")
 

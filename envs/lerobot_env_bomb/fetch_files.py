@@ -7,7 +7,7 @@ import importlib.metadata
 import importlib.util
 from pathlib import Path
 
-from lerobot_bomb.schema import EpisodeSpec
+from lerobot_bomb.bomb.episode import EpisodeSpec
 
 PACKAGE = "gymnasium_robotics"
 MODEL_FILE = Path("envs", "assets", "fetch", "reach.xml")  # inside the package

@@ -1,19 +1,13 @@
 # pyright: reportAttributeAccessIssue=false, reportInvalidTypeForm=false
-"""Builds BOMB's one MjModel: a robot's scene plus board and stones in the sizes of the schema."""
+"""Builds BOMB's one MjModel: a robot's scene plus board and stones in the sizes of `BOARD`."""
 
 import numpy as np
 
-from lerobot_bomb.perturbations import MAX_LEVEL, magnitude
-from lerobot_bomb.schema import BOARD, NUM_STONES
-from lerobot_env_bomb.backend import ensure_gl_backend
+from lerobot_bomb.bomb.board import BOARD, NUM_STONES, TRAY_CENTER_XY, TRAY_HALF_SIZE_XY
+from lerobot_bomb.bomb.perturbations import MAX_LEVEL, magnitude
+from lerobot_env_bomb.mujoco_gl import mujoco
 from lerobot_env_bomb.robots import Robot
 
-ensure_gl_backend()
-
-import mujoco  # noqa: E402  (its names live in C modules that pyright cannot read)
-
-TRAY_CENTER_XY = (0.170, 0.0)  # metres; the tray beside the board from which stones are taken
-TRAY_HALF_SIZE_XY = (0.045, 0.125)  # metres; it touches the board
 BOARD_HALF_SIZE_M = BOARD.half_size_m
 
 # How deep board and tray reach into the table: a stone that is pressed into them comes out at the top.

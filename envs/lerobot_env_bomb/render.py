@@ -9,14 +9,10 @@ import weakref
 from typing import Any
 
 import numpy as np
+from OpenGL.raw.GL.VERSION import GL_1_0
 
-from lerobot_bomb.schema import RenderOptions
-from lerobot_env_bomb.backend import ensure_gl_backend
-
-ensure_gl_backend()
-
-import mujoco  # noqa: E402  (its names live in C modules that pyright cannot read)
-from OpenGL.raw.GL.VERSION import GL_1_0  # noqa: E402  (MuJoCo's own choice of OpenGL)
+from lerobot_bomb.bomb.observation import RenderOptions
+from lerobot_env_bomb.mujoco_gl import mujoco
 
 SHADOW_MAP_SIZE = 512  # pixels
 CAPTION_LINE_PX = 26

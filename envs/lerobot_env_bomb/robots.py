@@ -7,12 +7,8 @@ from pathlib import Path
 
 import numpy as np
 
-from lerobot_env_bomb.backend import ensure_gl_backend
 from lerobot_env_bomb.fetch import MAX_HALF_OPENING_M, fetch_joints, load_fetch
-
-ensure_gl_backend()
-
-import mujoco  # noqa: E402  (its names live in C modules that pyright cannot read)
+from lerobot_env_bomb.mujoco_gl import mujoco
 
 SCARA_XML = Path(__file__).with_name("scara.xml")
 BASE_XY = np.array([0.0, 0.30])  # metres, SCARA's shoulder; as in scara.xml

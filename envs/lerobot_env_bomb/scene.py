@@ -2,24 +2,15 @@
 """Runs BOMB's model: put an episode's layout on the table, move the gripper, measure."""
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
 
 import numpy as np
 
-from lerobot_bomb.schema import BOARD, NUM_STONES, WORKSPACE_HIGH_M, WORKSPACE_LOW_M
-from lerobot_env_bomb.backend import ensure_gl_backend
-from lerobot_env_bomb.model import (
-    NUM_FEET,
-    build_model,
-    foot_name,
-    parked_xyz,
-    stone_name,
-)
+from lerobot_bomb.bomb.board import NUM_STONES
+from lerobot_bomb.bomb.layout import Layout, Snapshot
+from lerobot_bomb.bomb.observation import WORKSPACE_HIGH_M, WORKSPACE_LOW_M
+from lerobot_env_bomb.model import NUM_FEET, build_model, foot_name, parked_xyz, stone_name
+from lerobot_env_bomb.mujoco_gl import mujoco
 from lerobot_env_bomb.robots import ROBOTS
-
-ensure_gl_backend()
-
-import mujoco  # noqa: E402  (its names live in C modules that pyright cannot read)
 
 WORKSPACE_LOW = np.array(WORKSPACE_LOW_M)
 WORKSPACE_HIGH = np.array(WORKSPACE_HIGH_M)
@@ -37,33 +28,6 @@ EDITABLE = (
     *("geom_rgba", "geom_size", "geom_type", "light_diffuse", "light_dir", "light_specular", "mat_rgba"),
     *("mat_shininess", "mat_specular"),
 )
-
-
-@dataclass(frozen=True)
-class Layout:
-    """Where everything is when an episode starts. Stones rest flat; those not in play are parked."""
-
-    gripper_xyz: np.ndarray  # (3,) metres
-    stone_xy: np.ndarray  # (NUM_STONES, 2) metres
-    stone_is_white: np.ndarray  # (NUM_STONES,) bool
-    stone_in_play: np.ndarray  # (NUM_STONES,) bool
-    stone_radius_m: float = BOARD.stone_radius_m
-    stone_height_m: float = BOARD.stone_height_m
-
-    @property
-    def rest_height_m(self) -> float:
-        """Height of the centre of a stone that rests; board and tray are equally high."""
-        return BOARD.thickness_m + self.stone_height_m / 2
-
-
-@dataclass(frozen=True)
-class Snapshot:
-    """What the simulator measures after a control step."""
-
-    gripper_xyz: np.ndarray  # (3,) metres, point between the pads' lower ends
-    finger_opening: float  # metres between the pads
-    stone_xyz: np.ndarray  # (NUM_STONES, 3) metres, centres
-    stone_touched: np.ndarray  # (NUM_STONES, 2) bool: by the left and the right pad
 
 
 class Scene:

@@ -3,16 +3,15 @@
 import numpy as np
 from gymnasium import spaces
 
-from lerobot_bomb.camera_geometry import geometry_shapes
-from lerobot_bomb.schema import (
+from lerobot_bomb.bomb.board import NUM_STONES
+from lerobot_bomb.bomb.episode import PHYSICS_HZ, Stage
+from lerobot_bomb.bomb.observation import (
     CAMERAS,
-    NUM_STONES,
-    PHYSICS_HZ,
     STATE_DIM,
     PrivilegedState,
     RenderOptions,
-    Stage,
     action_bounds,
+    geometry_shapes,
 )
 
 # Bounds of what the simulator can report, metres. Stones can be flung off the board, so they are wide.

@@ -14,21 +14,21 @@ from lerobot_bomb.actions.text import NumberTokens
 
 def counted_numbers(numbers: NumberTokens) -> Tensor:
     """(B, N) bool: the loss counts every digit, so the number is neither hidden nor padding."""
-    return (numbers.trained | ~numbers.written)[..., 1:].all(dim=-1)
+    return (numbers.trained | ~numbers.mask)[..., 1:].all(dim=-1)
 
 
 def exact_numbers(numbers: NumberTokens, right_BM: Tensor) -> Tensor:
     """(B, M) bool, the right token was predicted -> (B, N) bool, all of the number was, and that it ends."""
-    right_BNC = right_BM[:, :-1].view_as(numbers.written)
+    right_BNC = right_BM[:, :-1].view_as(numbers.mask)
     # a column after the number there is the next one's space or the end; where untrained, it cannot be wrong
     trained_BN = torch.cat([numbers.trained[:, 1:, 0], torch.ones_like(numbers.trained[:, :1, 0])], dim=1)
-    ends_BN = right_BM[:, numbers.written.shape[2] :: numbers.written.shape[2]] | ~trained_BN
-    return (right_BNC | ~numbers.written)[..., 1:].all(dim=-1) & ends_BN
+    ends_BN = right_BM[:, numbers.mask.shape[2] :: numbers.mask.shape[2]] | ~trained_BN
+    return (right_BNC | ~numbers.mask)[..., 1:].all(dim=-1) & ends_BN
 
 
 def read_numbers(numbers: NumberTokens, digits_BM: Tensor) -> Tensor:
     """(B, M) predicted digits -> (B, N) the numbers that they form, with as many digits as the true ones."""
-    digits_BNW = digits_BM[:, :-1].view_as(numbers.written)[..., 1:] * numbers.written[..., 1:]
+    digits_BNW = digits_BM[:, :-1].view_as(numbers.mask)[..., 1:] * numbers.mask[..., 1:]
     place_values_W = 10 ** torch.arange(digits_BNW.shape[-1] - 1, -1, -1, device=digits_BM.device)
     return (digits_BNW * place_values_W).sum(dim=-1)
 

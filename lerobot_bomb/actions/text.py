@@ -37,10 +37,10 @@ def number_symbols(numbers_BN: Tensor, width: int, *, zero_padded: bool) -> tupl
     """
     place_values_W = 10 ** torch.arange(width - 1, -1, -1, device=numbers_BN.device)
     digits_BNW = numbers_BN[..., None] // place_values_W % 10
-    written_BNW = (numbers_BN[..., None] >= place_values_W) | (place_values_W == 1) | zero_padded
+    mask_BNW = (numbers_BN[..., None] >= place_values_W) | (place_values_W == 1) | zero_padded
     space_BN1 = torch.full_like(digits_BNW[..., :1], SPACE)
     symbols_BNC = torch.cat([space_BN1, digits_BNW], dim=-1)
-    return symbols_BNC, torch.cat([torch.ones_like(space_BN1, dtype=torch.bool), written_BNW], dim=-1)
+    return symbols_BNC, torch.cat([torch.ones_like(space_BN1, dtype=torch.bool), mask_BNW], dim=-1)
 
 
 @dataclass(frozen=True)
@@ -48,21 +48,21 @@ class NumberTokens:
     """Numbers as tokens; all (B, N, C)."""
 
     ids: Tensor  # int64
-    written: Tensor  # bool, whether the column holds a token
+    mask: Tensor  # bool, whether the column holds a token
     trained: Tensor  # bool, whether the loss counts it
 
     def hide_numbers(self, hidden_BN: Tensor, hidden_id: int) -> "NumberTokens":
         """One ``hidden_id`` in place of all digits of a number; its space stays and is trained on."""
-        ids_BNC, written_BNC, trained_BNC = self.ids.clone(), self.written.clone(), self.trained.clone()
-        written_BNC[..., 1:-1] &= ~hidden_BN[..., None]
+        ids_BNC, mask_BNC, trained_BNC = self.ids.clone(), self.mask.clone(), self.trained.clone()
+        mask_BNC[..., 1:-1] &= ~hidden_BN[..., None]
         trained_BNC[..., 1:] &= ~hidden_BN[..., None]
         ids_BNC[..., -1] = ids_BNC[..., -1].masked_fill(hidden_BN, hidden_id)
-        return NumberTokens(ids_BNC, written_BNC, trained_BNC)
+        return NumberTokens(ids_BNC, mask_BNC, trained_BNC)
 
     def hide_characters(self, hidden_BNC: Tensor, hidden_id: int) -> "NumberTokens":
         """``hidden_id`` in place of single digits and spaces."""
         ids_BNC = self.ids.masked_fill(hidden_BNC, hidden_id)
-        return NumberTokens(ids_BNC, self.written, self.trained & ~hidden_BNC)
+        return NumberTokens(ids_BNC, self.mask, self.trained & ~hidden_BNC)
 
 
 def draw_hidden(
@@ -83,22 +83,22 @@ def draw_hidden(
     return rank_BN < num_hidden_B[:, None]
 
 
-def compact(written_BL: Tensor, *columns_BL: Tensor) -> tuple[Tensor, ...]:
+def compact(mask_BL: Tensor, *columns_BL: Tensor) -> tuple[Tensor, ...]:
     """Move the written columns of every row to the front, order kept; cut columns no row needs.
 
-    Returns ``written_BL`` and each of ``columns_BL`` rearranged, (B, longest row).
+    Returns ``mask_BL`` and each of ``columns_BL`` rearranged, (B, longest row).
     """
-    longest = int(written_BL.sum(dim=1).max())
-    order_BL = written_BL.logical_not().to(torch.uint8).argsort(dim=1, stable=True)[:, :longest]
-    return tuple(column.gather(1, order_BL) for column in (written_BL, *columns_BL))
+    longest = int(mask_BL.sum(dim=1).max())
+    order_BL = mask_BL.logical_not().to(torch.uint8).argsort(dim=1, stable=True)[:, :longest]
+    return tuple(column.gather(1, order_BL) for column in (mask_BL, *columns_BL))
 
 
 @dataclass(frozen=True)
 class TokenRows:
-    """Rows of tokens with gaps: ids (B, L) int64 and which columns hold a token (B, L) bool."""
+    """Rows of tokens with padding: ids (B, L) int64 and which columns hold a token (B, L) bool."""
 
     ids: Tensor
-    written: Tensor
+    mask: Tensor
 
     @classmethod
     def constant(cls, ids: list[int], like_BL: Tensor) -> "TokenRows":
@@ -108,44 +108,44 @@ class TokenRows:
 
     @classmethod
     def join(cls, parts: "list[TokenRows]") -> "TokenRows":
-        return cls(torch.cat([part.ids for part in parts], 1), torch.cat([part.written for part in parts], 1))
+        return cls(torch.cat([part.ids for part in parts], 1), torch.cat([part.mask for part in parts], 1))
 
     def rounded(self, multiple: int) -> "TokenRows":
         """With gaps at the end, up to a multiple of so many columns."""
         width = -self.ids.shape[1] % multiple
-        return TokenRows(nn.functional.pad(self.ids, (0, width)), nn.functional.pad(self.written, (0, width)))
+        return TokenRows(nn.functional.pad(self.ids, (0, width)), nn.functional.pad(self.mask, (0, width)))
 
-    def without_gaps(self) -> "TokenRows":
+    def without_padding(self) -> "TokenRows":
         """Rows that start with their tokens."""
-        written_BL, ids_BL = compact(self.written, self.ids)
-        return TokenRows(ids_BL, written_BL)
+        mask_BL, ids_BL = compact(self.mask, self.ids)
+        return TokenRows(ids_BL, mask_BL)
 
 
 @dataclass(frozen=True)
 class Answer:
-    """Numbers and the end token as rows without gaps; all (B, A), A the tokens of the longest."""
+    """Numbers and the end token as rows without padding; all (B, A), A the tokens of the longest."""
 
     rows: TokenRows
     labels: Tensor  # int64 token ids, IGNORED where the loss does not count them
-    columns: Tensor  # int64, which of the M = N * C + 1 columns with gaps a token comes from
+    columns: Tensor  # int64, which of the M = N * C + 1 columns with padding a token comes from
 
     @classmethod
     def of(cls, numbers: NumberTokens, end_id: Tensor) -> "Answer":
-        """Close the gaps, and label what is trained."""
+        """Take the padding out, and label what is trained."""
         end_B1 = end_id.expand(len(numbers.ids), 1)
         true_B1 = torch.ones_like(end_B1, dtype=torch.bool)
-        ids_BM, written_BM, trained_BM = (
+        ids_BM, mask_BM, trained_BM = (
             torch.cat([columns.flatten(1), last], dim=1)
             for columns, last in zip(
-                (numbers.ids, numbers.written, numbers.trained), (end_B1, true_B1, true_B1), strict=True
+                (numbers.ids, numbers.mask, numbers.trained), (end_B1, true_B1, true_B1), strict=True
             )
         )
-        labels_BM = ids_BM.masked_fill(~(trained_BM & written_BM), IGNORED)
+        labels_BM = ids_BM.masked_fill(~(trained_BM & mask_BM), IGNORED)
         columns_BM = torch.arange(ids_BM.shape[1], device=ids_BM.device).expand_as(ids_BM)
-        written_BA, ids_BA, labels_BA, columns_BA = compact(written_BM, ids_BM, labels_BM, columns_BM)
-        return cls(TokenRows(ids_BA, written_BA), labels_BA, columns_BA)
+        mask_BA, ids_BA, labels_BA, columns_BA = compact(mask_BM, ids_BM, labels_BM, columns_BM)
+        return cls(TokenRows(ids_BA, mask_BA), labels_BA, columns_BA)
 
-    def with_gaps(self, values_BA: Tensor, numbers: NumberTokens) -> Tensor:
-        """Values of the tokens back at their columns, (B, M); 0 or False in gaps."""
-        values_BM = values_BA.new_zeros(len(values_BA), numbers.written[0].numel() + 1)
+    def with_padding(self, values_BA: Tensor, numbers: NumberTokens) -> Tensor:
+        """Values of the tokens back at their columns, (B, M); 0 or False in padding."""
+        values_BM = values_BA.new_zeros(len(values_BA), numbers.mask[0].numel() + 1)
         return values_BM.scatter(1, self.columns, values_BA)

@@ -10,8 +10,8 @@ from lerobot.datasets import LeRobotDatasetMetadata
 from lerobot.utils.constants import DEFAULT_FEATURES, HF_LEROBOT_HOME
 
 from lerobot_bomb.data.dataset_files import INFO_FILE, check_metadata, flat_numbers, read_parquet
-from lerobot_bomb.data.growing import check_repo_id
-from lerobot_bomb.hub_token import TokenError, refuse_unsendable_tokens
+from lerobot_bomb.data.hub_token import TokenError, refuse_unsendable_tokens
+from lerobot_bomb.data.resumable import check_repo_id
 
 EPISODE_INDEX = "episode_index"
 

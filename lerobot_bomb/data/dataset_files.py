@@ -11,7 +11,7 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 from av.error import FFmpegError
 
-from lerobot_bomb.json_files import read_json
+from lerobot_bomb.files import read_json
 
 INFO_FILE = Path("meta") / "info.json"
 STATISTICS_FILE = Path("meta") / "stats.json"

@@ -13,7 +13,7 @@ from dataclasses import asdict, dataclass, field, fields, replace
 from pathlib import Path
 from typing import Any
 
-from lerobot_bomb.json_files import read_json
+from lerobot_bomb.files import read_json
 
 BLOCK_FILE = "block.json"  # in each block: the progress up to its end, and the SHA-256 of its other files
 DIGESTS = "sha256"

@@ -3,22 +3,18 @@
 import itertools
 import json
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import AbstractContextManager
 from dataclasses import asdict, dataclass, field, replace
 from functools import partial
 from typing import Any, ClassVar
 
 from lerobot_bomb import __version__
-from lerobot_bomb.data.growing import check_repo_id
-from lerobot_bomb.episode_result import installed_version
-from lerobot_bomb.perturbations import NONE
-from lerobot_bomb.schema import (
-    DEFAULT_FPS,
-    DEFAULT_IMAGE_SIZE,
-    TASK_VERSION,
-    EpisodeSpec,
-    RenderOptions,
-)
+from lerobot_bomb.bomb.episode import DEFAULT_FPS, TASK_VERSION, EpisodeSpec
+from lerobot_bomb.bomb.observation import DEFAULT_IMAGE_SIZE, RenderOptions
+from lerobot_bomb.bomb.perturbations import NONE
+from lerobot_bomb.data.resumable import check_repo_id
+from lerobot_bomb.envs.results import installed_version
+from lerobot_bomb.flags import flags_without_group
 
 MAX_NOISE = 1.0  # beyond it the noise exceeds the largest action
 
@@ -100,11 +96,6 @@ class Recording:
         return RenderOptions(image_size=self.image_size, depth=self.depth)
 
 
-@contextmanager
-def recorder_flags() -> Iterator[None]:
-    """Name flags in error messages as the recorder does; LeRobot's commands call them --env.*."""
-    try:
-        yield
-    except ValueError as error:
-        message = str(error).replace("--env.target=", "the target ").replace("--env.", "--")
-        raise ValueError(message) from None
+def recorder_flags() -> AbstractContextManager[None]:
+    """Name flags in error messages as the recorder does, which has none for the target."""
+    return flags_without_group({"--env.target=": "the target "})

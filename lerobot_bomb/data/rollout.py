@@ -17,17 +17,17 @@ from typing import Self
 import gymnasium
 import numpy as np
 
-from lerobot_bomb.camera_geometry import geometry_shapes
-from lerobot_bomb.episode_result import EpisodeResult
-from lerobot_bomb.expert import expert_action
-from lerobot_bomb.schema import (
+from lerobot_bomb.bomb.episode import EpisodeSpec
+from lerobot_bomb.bomb.expert import expert_action
+from lerobot_bomb.bomb.observation import (
     CAMERAS,
     MAX_STEP_M,
-    EpisodeSpec,
     PrivilegedState,
     RenderOptions,
     action_bounds,
+    geometry_shapes,
 )
+from lerobot_bomb.envs.results import EpisodeResult
 
 # Importing the part before the colon registers the id; no module of the core imports an environment.
 ENV_ID = "lerobot_env_bomb:bomb/{suite}-v0"
@@ -54,7 +54,7 @@ class Rollout:
     states: np.ndarray  # (T, 4) float32, metres
     actions: np.ndarray  # (T, 4) float32, the expert's clean actions
     frames: dict[str, np.ndarray]  # camera -> (T, H, W, 3) uint8
-    geometry: dict[str, np.ndarray]  # key of camera_geometry.py -> (T, ...) float32; {} without depth
+    geometry: dict[str, np.ndarray]  # key of `geometry_shapes` -> (T, ...) float32; {} without depth
 
 
 def make_env(spec: EpisodeSpec, render_options: RenderOptions) -> gymnasium.Env:
@@ -113,7 +113,7 @@ def perturb(action: np.ndarray, noise: float, control_mode: str, rng: np.random.
 class RolloutPool:
     """Worker processes that play an endless stream of episodes ahead of the writer.
 
-    Iterating yields the rollouts in the order of the specs, whatever the number of workers: they take
+    An iterator over the rollouts in the order of the specs, whatever the number of workers: they take
     turns. Each has a pipe of its own and no thread or lock is shared, so none can hang another.
 
     Raises:
@@ -139,6 +139,9 @@ class RolloutPool:
                 self._pipes.append(pipe)
         finally:
             signal.pthread_sigmask(signal.SIG_SETMASK, usual)
+        self._turns = itertools.cycle(zip(self._processes, self._pipes, strict=True))
+        for pipe in (*self._pipes, *self._pipes):  # an episode to play and one to go on with
+            self._submit(pipe)
 
     def __enter__(self) -> Self:
         return self
@@ -149,19 +152,20 @@ class RolloutPool:
         for process in self._processes:
             process.join()
 
-    def __iter__(self) -> Iterator[Rollout]:
-        for pipe in (*self._pipes, *self._pipes):  # an episode to play and one to go on with
-            self._submit(pipe)
-        for process, pipe in itertools.cycle(zip(self._processes, self._pipes, strict=True)):
-            try:
-                rollout = pipe.recv()
-            except (EOFError, ConnectionError):
-                process.join()
-                raise RuntimeError(f"a simulator process ended with exit code {process.exitcode}") from None
-            if isinstance(rollout, Exception):
-                raise rollout
-            self._submit(pipe)
-            yield rollout
+    def __iter__(self) -> Self:
+        return self
+
+    def __next__(self) -> Rollout:
+        process, pipe = next(self._turns)
+        try:
+            rollout = pipe.recv()
+        except (EOFError, ConnectionError):
+            process.join()
+            raise RuntimeError(f"a simulator process ended with exit code {process.exitcode}") from None
+        if isinstance(rollout, Exception):
+            raise rollout
+        self._submit(pipe)
+        return rollout
 
     def _submit(self, pipe: Connection) -> None:
         with suppress(ConnectionError):  # the worker has ended; receiving from it says so

@@ -6,12 +6,12 @@ from typing import Any
 from lerobot.utils.constants import ACTION, OBS_IMAGES, OBS_PREFIX, OBS_STATE
 
 from lerobot_bomb import __version__
-from lerobot_bomb.camera_geometry import geometry_shapes
+from lerobot_bomb.bomb.episode import TASK_VERSION
+from lerobot_bomb.bomb.observation import ACTION_NAMES, CAMERAS, STATE_NAMES, geometry_shapes
 from lerobot_bomb.data.blocks import DatasetLayout, Episode
 from lerobot_bomb.data.recording import Recording
 from lerobot_bomb.data.rollout import Rollout
-from lerobot_bomb.episode_result import EpisodeResult
-from lerobot_bomb.schema import ACTION_NAMES, CAMERAS, STATE_NAMES, TASK_VERSION
+from lerobot_bomb.envs.results import EpisodeResult
 
 
 def rollout_layout(recording: Recording) -> DatasetLayout:

@@ -18,8 +18,8 @@ from torch import Tensor
 
 from lerobot_bomb.actions.text import SPACE
 from lerobot_bomb.decoding.grammar import NumberGrammar, Place
+from lerobot_bomb.decoding.kv_cache import CachedText
 from lerobot_bomb.finite import require_finite_answers
-from lerobot_bomb.vlm.cached_text import CachedText
 
 # (B, N) numbers that are complete, and where each row stands -> (B, G) guesses of what comes next, at most
 # MAX_GUESSES
@@ -43,10 +43,10 @@ class Continuation(Protocol):
 
 
 class Prompt(NamedTuple):
-    """Rows of embeddings with gaps."""
+    """Rows of embeddings with padding."""
 
     embeds: Tensor  # (B, L, H)
-    written: Tensor  # (B, L) bool, which columns hold a token
+    mask: Tensor  # (B, L) bool, which columns hold a token
 
 
 class CachedContinuation(Continuation):
@@ -71,7 +71,7 @@ class CachedContinuation(Continuation):
         columns = columns.clamp(max=self._text.unread_column)
         if self._prompt is not None:
             embeds = torch.cat([self._prompt.embeds, embeds], dim=1)
-            columns = torch.cat([self._text.columns_of(self._prompt.written), columns], dim=1)
+            columns = torch.cat([self._text.columns_of(self._prompt.mask), columns], dim=1)
             self._prompt = None
         return self._head(self._text(embeds, columns)[:, -num_symbols:])
 
@@ -138,19 +138,19 @@ def write(
     guess_BG = guess(progress.numbers, place)[:, :num_guesses]
     logits_BKS = model(torch.cat([progress.last[:, None], guess_BG], dim=1), progress.num_symbols - 1)
     places_BK = grammar.walk(place, guess_BG)
-    picks_BK, logits_BK = likeliest(logits_BKS.float() + grammar.penalties(places_BK))
+    picks_BK, logits_BK = likeliest(logits_BKS.float() + grammar.logit_bias(places_BK))
     num_right_B = (picks_BK[:, :-1] == guess_BG).cumprod(dim=1).sum(dim=1)
     column_K = torch.arange(picks_BK.shape[1], device=picks_BK.device)
     # what follows a wrong guess is not written
-    written_BK = column_K <= num_right_B[:, None]
-    completes_BK = (picks_BK >= SPACE) & written_BK
+    mask_BK = column_K <= num_right_B[:, None]
+    completes_BK = (picks_BK >= SPACE) & mask_BK
     index_BK = places_BK.number.clamp(max=grammar.num_numbers - 1)
     numbers_BN = progress.numbers.scatter_add(1, index_BK, grammar.value[places_BK.prefix] * completes_BK)
     last_B = picks_BK.gather(1, num_right_B[:, None])[:, 0]
     place = grammar.advance(places_BK.at(num_right_B), last_B)
     max_symbols = grammar.max_symbols(grammar.num_numbers)
     num_symbols_B = (progress.num_symbols + num_right_B + 1).clamp(max=max_symbols)
-    finite_B = progress.finite & (logits_BK.isfinite() | ~written_BK).all(dim=1)
+    finite_B = progress.finite & (logits_BK.isfinite() | ~mask_BK).all(dim=1)
     return Progress(numbers_BN, last_B, num_symbols_B, place.prefix, place.number, finite_B), num_right_B
 
 

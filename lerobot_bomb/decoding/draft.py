@@ -41,17 +41,17 @@ class LinearDraft:
         ahead_W = torch.arange(MAX_GUESSES // 2, device=number_BN.device)
         next_BW = self._expect(known_BN, first_B1 + 1 + ahead_W % self._num_dims, ahead_W // self._num_dims)
         numbers = torch.cat([begun_B1, next_BW], dim=1)
-        written_BWC = grammar.is_spelled[numbers]
-        written_BWC[:, 1:] &= (first_B1 + 1 + ahead_W < grammar.num_numbers)[..., None]
+        mask_BWC = grammar.is_spelled[numbers]
+        mask_BWC[:, 1:] &= (first_B1 + 1 + ahead_W < grammar.num_numbers)[..., None]
         # the space and the digits that stand are no guesses
         start_B1 = 1 + grammar.num_digits[place.prefix][:, None]
         columns_BG = start_B1 + torch.arange(MAX_GUESSES, device=number_BN.device)
-        return self._spell(grammar.spelling[numbers].flatten(1), written_BWC.flatten(1)).gather(1, columns_BG)
+        return self._spell(grammar.spelling[numbers].flatten(1), mask_BWC.flatten(1)).gather(1, columns_BG)
 
-    def _spell(self, symbol_BM: Tensor, written_BM: Tensor) -> Tensor:
-        """Written symbols without the gaps between them, then ends; no row's length has to be known."""
+    def _spell(self, symbol_BM: Tensor, mask_BM: Tensor) -> Tensor:
+        """Written symbols without the padding between them, then ends; no row's length has to be known."""
         num_columns = symbol_BM.shape[1] + MAX_GUESSES + 1
-        column_BM = (written_BM.cumsum(dim=1) - 1).masked_fill(~written_BM, num_columns)
+        column_BM = (mask_BM.cumsum(dim=1) - 1).masked_fill(~mask_BM, num_columns)
         spelled = symbol_BM.new_full((len(symbol_BM), num_columns + 1), END)
         return spelled.scatter(1, column_BM, symbol_BM)
 

@@ -36,7 +36,7 @@ class NumberGrammar(nn.Module):
         ValueError: there is no number to write, or no value that it can take, or the width is too small.
     """
 
-    penalty: Tensor  # (2, states, S) float32: 0 where a symbol may follow, else -inf; [1]: the last number
+    bias: Tensor  # (2, states, S) float32: 0 where a symbol may follow, else -inf; [1]: the last number
     next_state: Tensor  # (states, S) int64
     must_end: Tensor  # (states,) bool: a number that no digit may follow
     num_digits: Tensor  # (states,) int64
@@ -68,11 +68,11 @@ class NumberGrammar(nn.Module):
         allowed[1, :, SPACE] = False
         allowed[1, :, END] = is_number
         allowed[:, self.DONE, END] = True  # rows that are done go on saying so
-        penalty = torch.zeros(allowed.shape).masked_fill(~allowed, -torch.inf)
+        bias = torch.zeros(allowed.shape).masked_fill(~allowed, -torch.inf)
         values_V1 = torch.arange(num_values)[:, None]
         spelling, is_spelled = number_symbols(values_V1, self.width, zero_padded=fixed_width > 0)
         for name, table in {
-            "penalty": penalty,
+            "bias": bias,
             "next_state": next_state,
             "must_end": is_number & (next_state[:, :SPACE] == self.DONE).all(dim=1),
             "num_digits": torch.tensor([0, *map(len, prefixes)]),
@@ -121,6 +121,6 @@ class NumberGrammar(nn.Module):
         """Whether the number is the answer's last, which the end follows instead of a space."""
         return place.number == self.num_numbers - 1
 
-    def penalties(self, place: Place) -> Tensor:
+    def logit_bias(self, place: Place) -> Tensor:
         """(..., S): 0 for what may follow, -inf for what may not."""
-        return self.penalty[self.is_last(place).long(), place.prefix]
+        return self.bias[self.is_last(place).long(), place.prefix]

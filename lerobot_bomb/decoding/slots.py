@@ -16,18 +16,18 @@ import torch
 from torch import Tensor
 from torch.nn.functional import embedding, linear
 
+from lerobot_bomb.cuda_graphs import GraphedFunction
 from lerobot_bomb.decoding.decoder import MAX_GUESSES, Prompt, likeliest
+from lerobot_bomb.decoding.decoder_layers import TextLayers
+from lerobot_bomb.decoding.graph_cache import GraphCache
+from lerobot_bomb.decoding.kv_cache import CachedText
 from lerobot_bomb.finite import require_finite_answers
-from lerobot_bomb.vlm.cached_text import CachedText
-from lerobot_bomb.vlm.graphs import Recorded
-from lerobot_bomb.vlm.recordings import Recordings
-from lerobot_bomb.vlm.text_layers import TextLayers
 
 
 class SlotWriter:
     """Choices after prompts; on CUDA recorded whole for every shape of prompts that it has met.
 
-    The prompt may have gaps, but its last column is written. ``prompt_reads_all``: every token of the prompt
+    The prompt may have padding, but not in its last column. ``prompt_reads_all``: every token of the prompt
     reads all of it, not only what stands before.
     """
 
@@ -43,7 +43,7 @@ class SlotWriter:
         """``drafted``: guess that a step is as the one before, on a CPU and in a batch of 1."""
         self._text_model, self._first_position = text_model, first_position
         self._reads_all, self.drafted = prompt_reads_all, drafted
-        self._recordings = Recordings[RecordedChoices](text_model, first_position, compiled=compiled)
+        self._recordings = GraphCache[GraphSlots](text_model, first_position, compiled=compiled)
 
     @torch.no_grad()
     def __call__(
@@ -60,7 +60,7 @@ class SlotWriter:
         num_slots = num_steps * len(slots)
         if prompt.embeds.is_cuda:
             with torch.inference_mode(False), torch.no_grad():
-                make = partial(RecordedChoices, num_steps * slots, self._reads_all, embeds_CH, head_CH)
+                make = partial(GraphSlots, num_steps * slots, self._reads_all, embeds_CH, head_CH)
                 recorded = self._recordings.find(prompt.embeds, num_slots, make)
                 choices_BS, finite_B = recorded(prompt, embeds_CH, head_CH)
             require_finite_answers(finite_B)
@@ -76,10 +76,10 @@ class SlotWriter:
         require_finite_answers(finite_B)
         if not is_drafted:
             return choices_BS
-        return repeat(text, int(prompt.written.sum()), slots, num_slots, choices_BS, *tables)
+        return repeat(text, int(prompt.mask.sum()), slots, num_slots, choices_BS, *tables)
 
 
-class RecordedChoices:
+class GraphSlots:
     """Choices after prompts of one shape."""
 
     def __init__(
@@ -87,7 +87,7 @@ class RecordedChoices:
     ):
         self._text, self._slots, self._reads_all = text, slots, reads_all
         self._embeds_CH, self._head_CH = embeds_CH.clone(), head_CH.clone()
-        self._choose = Recorded(self._choose_all)
+        self._choose = GraphedFunction(self._choose_all)
 
     def __call__(self, prompt: Prompt, embeds_CH: Tensor, head_CH: Tensor) -> tuple[Tensor, Tensor]:
         """As `choose`; the second is written over by the next call."""
@@ -96,9 +96,9 @@ class RecordedChoices:
         choices_BS, finite_B = self._choose(*prompt)
         return choices_BS.clone(), finite_B
 
-    def _choose_all(self, embeds_BLH: Tensor, written_BL: Tensor) -> tuple[Tensor, Tensor]:
+    def _choose_all(self, embeds_BLH: Tensor, mask_BL: Tensor) -> tuple[Tensor, Tensor]:
         self._text.clear()
-        prompt = Prompt(embeds_BLH, written_BL)
+        prompt = Prompt(embeds_BLH, mask_BL)
         tables = self._embeds_CH, self._head_CH
         return choose(self._text, prompt, self._slots, *tables, prompt_reads_all=self._reads_all)
 
@@ -113,8 +113,8 @@ def choose(
     prompt_reads_all: bool,
 ) -> tuple[Tensor, Tensor]:
     """As `SlotWriter`, on an empty cache; and (B,) bool, whether all choices are from finite logits."""
-    last_B1 = prompt.written.sum(dim=1, keepdim=True) - 1
-    columns_BL = text.columns_of(prompt.written)
+    last_B1 = prompt.mask.sum(dim=1, keepdim=True) - 1
+    columns_BL = text.columns_of(prompt.mask)
     reach_BL = last_B1.expand_as(columns_BL) if prompt_reads_all else columns_BL
     hidden_BKH = text(prompt.embeds, columns_BL, reach_BL)
     chosen = [likeliest(linear(hidden_BKH[:, -1], head_CH[slots[0]]))]

@@ -8,13 +8,13 @@ from functools import partial
 import torch
 from torch import Tensor, nn
 
-from lerobot_bomb.decoding.ahead import RecordedAnswers
 from lerobot_bomb.decoding.decoder import CachedContinuation, Decoded, Guess, Prompt, decode_numbers
+from lerobot_bomb.decoding.decoder_layers import TextLayers
 from lerobot_bomb.decoding.grammar import NumberGrammar
+from lerobot_bomb.decoding.graph_cache import GraphCache
+from lerobot_bomb.decoding.graph_decoder import GraphDecoder
+from lerobot_bomb.decoding.kv_cache import CachedText
 from lerobot_bomb.vlm.backbone import SmolVLMBackbone
-from lerobot_bomb.vlm.cached_text import CachedText
-from lerobot_bomb.vlm.recordings import Recordings
-from lerobot_bomb.vlm.text_layers import TextLayers
 
 
 class NumberWriter:
@@ -24,7 +24,7 @@ class NumberWriter:
         self, backbone: SmolVLMBackbone, grammar: NumberGrammar, guess: Guess, *, compiled: bool = False
     ):
         self._backbone, self._grammar, self._guess = backbone, grammar, guess
-        self._recordings = Recordings[RecordedAnswers](backbone.vlm.model.text_model, compiled=compiled)
+        self._recordings = GraphCache[GraphDecoder](backbone.vlm.model.text_model, compiled=compiled)
 
     @torch.no_grad()
     def __call__(self, prompt: Prompt, symbol_ids: Tensor, stop_after: int) -> Decoded:
@@ -34,7 +34,7 @@ class NumberWriter:
         if prompt.embeds.is_cuda and type(head) is nn.Linear:
             with torch.inference_mode(False), torch.no_grad():
                 rows = self._backbone.embed_tokens(symbol_ids), head.weight[symbol_ids]
-                make = partial(RecordedAnswers, self._grammar, self._guess, *rows)
+                make = partial(GraphDecoder, self._grammar, self._guess, *rows)
                 recorded = self._recordings.find(prompt.embeds, max_symbols, make)
                 return recorded(prompt, *rows, stop_after)
         model = continue_prompt(self._backbone, prompt, symbol_ids, max_symbols)
@@ -52,6 +52,6 @@ def continue_prompt(
         CachedText(layers, len(prompt.embeds), prompt.embeds.shape[1] + max_symbols),
         lambda symbols: backbone.embed_tokens(symbol_ids[symbols]),
         backbone.head(symbol_ids),
-        prompt.written.sum(dim=1),
+        prompt.mask.sum(dim=1),
         prompt,
     )

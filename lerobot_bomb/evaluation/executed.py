@@ -12,7 +12,7 @@ from lerobot.datasets import LeRobotDatasetMetadata
 from lerobot.utils.constants import ACTION
 
 from lerobot_bomb.data.columns import EPISODE_INDEX, read_columns, read_meta
-from lerobot_bomb.json_lines import append_line
+from lerobot_bomb.files import append_line
 
 
 @dataclass(frozen=True)

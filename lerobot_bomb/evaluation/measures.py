@@ -1,4 +1,4 @@
-"""Means over recorded frames with intervals over their episodes.
+"""L1 of predicted chunks on recorded frames, with intervals over their episodes.
 
 Shapes: `R` frames, `T` actions of a chunk, `D` action dims, `E` episodes.
 """
@@ -7,20 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from lerobot_bomb.stats import bootstrap_interval
-
-
-@dataclass(frozen=True)
-class Measure:
-    """A mean over frames and its 95 % bootstrap interval over episodes; no interval of one episode."""
-
-    mean: float
-    low: float | None
-    high: float | None
-
-    def __str__(self) -> str:
-        interval = "" if self.low is None else f" [{self.low:.4g}, {self.high:.4g}]"
-        return f"{self.mean:.4g}{interval}"
+from lerobot_bomb.stats import Measure, measure
 
 
 @dataclass(frozen=True)
@@ -30,19 +17,6 @@ class L1:
     all: Measure
     dims: dict[str, Measure]
     steps: list[Measure]
-
-
-def measure(values_RX: np.ndarray, episode_R: np.ndarray) -> Measure:
-    """Mean of all finite numbers (R, ...); every one counts the same."""
-    values_RX = values_RX.reshape(len(episode_R), -1)
-    counts_RX = np.isfinite(values_RX)
-    episodes_E, place_R = np.unique(episode_R, return_inverse=True)
-    sums_E, counts_E = np.zeros(len(episodes_E)), np.zeros(len(episodes_E))
-    np.add.at(sums_E, place_R, np.where(counts_RX, values_RX, 0.0).sum(axis=1))
-    np.add.at(counts_E, place_R, counts_RX.sum(axis=1))
-    counted = counts_E > 0
-    low, high = bootstrap_interval(sums_E[counted], counts_E[counted]) or (None, None)
-    return Measure(float(sums_E.sum() / counts_E.sum()), low, high)
 
 
 def measure_l1(

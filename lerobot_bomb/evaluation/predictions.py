@@ -18,7 +18,7 @@ from torch import Tensor
 from torch.utils.data import DataLoader, Subset
 from tqdm import tqdm
 
-from lerobot_bomb.checkpoint import Postprocessor, Preprocessor, autocast, load_processors
+from lerobot_bomb.checkpoints.folder import Postprocessor, Preprocessor, autocast, load_processors
 
 LOSS = "loss"
 

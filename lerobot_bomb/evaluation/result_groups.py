@@ -5,9 +5,9 @@ from collections.abc import Iterable
 from dataclasses import dataclass
 from typing import Any
 
+from lerobot_bomb.bomb.board import task_id
+from lerobot_bomb.bomb.perturbations import NONE
 from lerobot_bomb.evaluation.result_lines import NEW_CHECKS, OLD_VERSION, Row
-from lerobot_bomb.perturbations import NONE
-from lerobot_bomb.schema import task_id
 
 # what may differ between episodes that are pooled; perturbations between those that are paired
 DRAWN = ("seed", "target", "color", "perturbations")

@@ -7,18 +7,9 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-from lerobot_bomb.schema import (
-    BOARD,
-    COLORS,
-    MAX_IMAGE_SIZE,
-    MIN_IMAGE_SIZE,
-    PROTOCOL_VERSION,
-    RENDER_PRESETS,
-    TASK_VERSION,
-    EpisodeSpec,
-    Failure,
-    Stage,
-)
+from lerobot_bomb.bomb.board import BOARD, COLORS
+from lerobot_bomb.bomb.episode import PROTOCOL_VERSION, TASK_VERSION, EpisodeSpec, Failure, Stage
+from lerobot_bomb.bomb.observation import MAX_IMAGE_SIZE, MIN_IMAGE_SIZE, RENDER_PRESETS
 
 OLD_VERSION = "1.0"  # whose lines say less
 VERSIONS = (OLD_VERSION, PROTOCOL_VERSION)

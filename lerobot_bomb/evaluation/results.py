@@ -1,24 +1,19 @@
-"""Reads the episode results that ``--env.results_path`` collects and summarises them."""
+"""The episode results that ``--env.results_path`` collects, read and summarised."""
 
-import argparse
-import sys
 from collections import Counter
 from dataclasses import dataclass
 from pathlib import Path
 from statistics import median
 
+from lerobot_bomb.bomb.episode import Failure
+from lerobot_bomb.bomb.perturbations import NONE
 from lerobot_bomb.evaluation.result_groups import (
     Group,
-    by_condition,
     differing,
     groups_of,
     pair_with_nominal,
-    what_old_lines_lack,
 )
-from lerobot_bomb.evaluation.result_lines import OLD_VERSION, Row, read_lines
-from lerobot_bomb.flags import path_flag
-from lerobot_bomb.perturbations import NONE
-from lerobot_bomb.schema import Failure
+from lerobot_bomb.evaluation.result_lines import Row, read_lines
 from lerobot_bomb.stats import format_rate, mcnemar_p_value
 
 # outcomes of an episode in which the stone was carried and put down somewhere on the board
@@ -79,7 +74,7 @@ def _pair_line(condition: str, pairs: list[tuple[Row, Row]]) -> str:
     )
 
 
-def _pair_lines(group: Group, groups: list[Group]) -> list[str]:
+def pair_lines(group: Group, groups: list[Group]) -> list[str]:
     """What perturbations took away and brought in a group; or why there is nothing to compare with."""
     perturbed = [row for row in group.rows if row["spec"]["perturbations"] != NONE]
     pairs = pair_with_nominal(group.rows)
@@ -97,51 +92,3 @@ def _pair_lines(group: Group, groups: list[Group]) -> list[str]:
     if others:
         advice = f"those of this file differ in {', '.join(differing([group, others[0]]))}"
     return [*lines, f"  perturbed episodes without an unperturbed one to compare with: {len(left)}; {advice}"]
-
-
-def add_results_arguments(parser: argparse.ArgumentParser) -> None:
-    """Declare the arguments of ``lerobot-bomb results``."""
-    parser.add_argument(
-        "paths", nargs="+", type=path_flag, metavar="FILE", help="files of --env.results_path"
-    )
-    parser.add_argument("--strict", action="store_true", help="a damaged line is an error, not a message")
-
-
-def run_results(args: argparse.Namespace) -> int:
-    """Print, of each file, what compares: rates by condition, and what perturbations changed in pairs."""
-    for path in args.paths:
-        rows, damages = read_lines(path)
-        if args.strict and damages:
-            raise ValueError(damages[0])
-        for damage in damages:
-            print(f"{damage}; not counted", file=sys.stderr)
-        if not rows:
-            raise ValueError(f"{path}: no finished episode")
-        _print_file(path, groups_of(rows), len(damages))
-    return 0
-
-
-def _print_file(path: Path, groups: list[Group], num_damaged: int) -> None:
-    if num_damaged:
-        print(f"{path}: damaged lines, which are not counted: {num_damaged}")
-    if len(groups) > 1:
-        print(
-            f"{path}: {len(groups)} groups of episodes, neither pooled nor paired with each other; they "
-            f"differ in {', '.join(differing(groups))}"
-        )
-    for group in groups:
-        print(*(f"{path}: {line}" for line in group.lines()), sep="\n")
-        if group.is_of_old_version:
-            print(
-                f"{path}: lines of protocol {OLD_VERSION} are incomplete: they lack {what_old_lines_lack()}"
-            )
-        if group.num_replaced:
-            print(f"{path}: {group.num_replaced} lines count no more, a later one is of the same episode")
-        conditions = by_condition(group.rows)
-        for condition, rows in conditions.items():
-            label = f" (perturbations={condition})" if len(conditions) > 1 else ""
-            print(f"{path}{label}: {len(rows)} episodes")
-            print(*(f"  {line}" for line in summarise(rows).lines()), sep="\n")
-        against = _pair_lines(group, groups)
-        if against:
-            print(f"{path}: against the same episodes unperturbed", *against, sep="\n")

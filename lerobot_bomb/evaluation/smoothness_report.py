@@ -1,32 +1,21 @@
-"""``lerobot-bomb smoothness``: how smoothly people and policies moved, side by side.
+"""How smoothly people and policies moved, side by side.
 
 Shapes: `R` executed actions of all episodes, `D` action dims, `E` episodes.
 """
 
-import argparse
-import json
-import math
 import sys
-from dataclasses import asdict, dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
-from lerobot.utils.constants import ACTION
 
-from lerobot_bomb.data.columns import dim_names, read_meta
-from lerobot_bomb.evaluation.executed import Executed, executed_in_dataset, read_executed
-from lerobot_bomb.evaluation.measures import Measure
-from lerobot_bomb.flags import path_flag
+from lerobot_bomb.evaluation.executed import Executed
 from lerobot_bomb.flow.smoothness import smoothness
-from lerobot_bomb.stats import paired_bootstrap_interval
+from lerobot_bomb.stats import Measure, paired_bootstrap_interval
 from lerobot_bomb.tables import print_table
-from lerobot_bomb.viewing.unfinished import check_writable, written_whole
 
 MIN_ACTIONS = 4  # that a third difference takes
 GRIPPER = "gripper"  # in the names of dims that do not count
 ORDERS = {"J2": 2, "J3": 3, "J2, normalised": 2, "J3, normalised": 3}  # of the differences
-LEGEND = """
-Mean length of second (J2) and third (J3) differences {per}; in the dataset's units, and normalised by the
-standard deviations in {dataset} [95 % bootstrap interval over episodes]"""
 
 
 @dataclass(frozen=True)
@@ -57,65 +46,6 @@ class Difference:
     measures: dict[str, Measure]
 
 
-def add_smoothness_arguments(parser: argparse.ArgumentParser) -> None:
-    """Declare the arguments of ``lerobot-bomb smoothness``."""
-    add = parser.add_argument
-    add("--dataset.repo_id", dest="repo_id", required=True, help="name of the dataset, whose units count")
-    root = "folder of the dataset (default: LeRobot's, $HF_LEROBOT_HOME/REPO_ID)"
-    add("--dataset.root", dest="root", type=path_flag, help=root)
-    paths = "to compare with it: files of `lerobot-bomb eval`, folders of LeRobotDatasets"
-    add("paths", nargs="*", type=path_flag, metavar="PATH", help=paths)
-    exclude = f"action dims that do not count, as x,y; empty: all count (default: all named {GRIPPER!r})"
-    add("--exclude", type=lambda text: [name for name in text.split(",") if name], help=exclude)
-    add("--per_second", action="store_true", help="differences per s^2 and s^3 instead of per step")
-    add("--fps", type=float, help="actions a second (default: as each dataset and file says)")
-    add("--json", type=path_flag, help="also write all figures to this new file, those of every episode too")
-
-
-def run_smoothness(args: argparse.Namespace) -> int:
-    """Measure, print the tables, write the JSON file."""
-    _check_flags(args)
-    meta = read_meta(args.repo_id, args.root)
-    dataset = executed_in_dataset(meta, args.repo_id)
-    names = dim_names(meta.features[ACTION])
-    units = make_units(dataset, names, args.exclude, args.per_second)
-    compared = [dataset, *map(read_executed, args.paths)]
-    if args.fps is not None:
-        compared = [replace(executed, fps=args.fps) for executed in compared]
-    _check_comparable(compared, args.per_second)
-    rows = {executed.name: measure_row(executed, units) for executed in compared}
-    first, *others = [executed.name for executed in compared if executed.is_seeded] or [""]
-    differences = {name: measure_difference(first, name, rows) for name in others}
-    excluded = [names[dim] for dim in units.exclude]
-    print(f"action dims {', '.join(names)}; left out: {', '.join(excluded) or 'none'}")
-    print_rows(rows)
-    if differences:
-        print_differences(first, differences)
-    per = "per s^2 and s^3" if units.per_second else "per step"
-    print(LEGEND.format(per=per, dataset=args.repo_id))
-    if args.json is not None:
-        figures = {
-            "dims": names,
-            "excluded": excluded,
-            "std": units.std.tolist(),
-            "per_second": units.per_second,
-            "rows": {name: asdict(row) for name, row in rows.items()},
-            "differences": {name: {"from": first, **asdict(of)} for name, of in differences.items()},
-        }
-        with written_whole(args.json) as (path,):
-            path.write_text(json.dumps(figures, indent=1, allow_nan=False) + "\n")
-    return 0
-
-
-def _check_flags(args: argparse.Namespace) -> None:
-    if args.json is not None:
-        if args.json.exists():
-            raise ValueError(f"--json={args.json} exists already; name a new file or delete it")
-        check_writable("--json", args.json)
-    if args.fps is not None and not 0 < args.fps < math.inf:
-        raise ValueError(f"--fps={args.fps:g} must be a positive number of actions a second")
-
-
 def make_units(dataset: Executed, names: list[str], exclude: list[str] | None, per_second: bool) -> Units:
     """Those of a dataset.
 
@@ -138,7 +68,8 @@ def make_units(dataset: Executed, names: list[str], exclude: list[str] | None, p
     return Units([names.index(name) for name in exclude], std_D, per_second)
 
 
-def _check_comparable(compared: list[Executed], per_second: bool) -> None:
+def check_comparable(compared: list[Executed], per_second: bool) -> None:
+    """Raise a ValueError unless all are named once and of one size; warn where their rates differ."""
     dataset, *others = compared
     names = [executed.name for executed in compared]
     if doubled := [name for name in names if names.count(name) > 1]:

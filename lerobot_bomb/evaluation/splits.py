@@ -10,7 +10,7 @@ from typing import Any
 from lerobot.datasets import LeRobotDatasetMetadata
 from lerobot.utils.constants import HF_LEROBOT_HOME
 
-from lerobot_bomb.hub.names import TRAIN_CONFIG
+from lerobot_bomb.checkpoints.names import TRAIN_CONFIG
 
 
 @dataclass(frozen=True)

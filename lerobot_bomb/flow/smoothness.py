@@ -9,7 +9,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from lerobot_bomb.evaluation.measures import Measure, measure
+from lerobot_bomb.stats import Measure, measure
 
 
 @dataclass(frozen=True)

@@ -10,13 +10,13 @@ from lerobot.configs import PreTrainedConfig
 from lerobot.configs.train import TrainPipelineConfig
 
 from lerobot_bomb import __version__
-from lerobot_bomb.environment import Environment
+from lerobot_bomb.checkpoints.names import is_hub_id
+from lerobot_bomb.data.environment import Environment
+from lerobot_bomb.data.facts import DatasetFacts, Row, eval_flags_of, task_version
 from lerobot_bomb.evaluation.result_groups import Group, by_condition, describe_tasks, groups_of
 from lerobot_bomb.evaluation.results import summarise
-from lerobot_bomb.hub.dataset import DatasetFacts, Row, eval_flags_of, task_version
 from lerobot_bomb.hub.markdown import command, fenced
 from lerobot_bomb.hub.method import Method
-from lerobot_bomb.hub.names import is_hub_id
 from lerobot_bomb.hub.training import peft_flags, train_command
 from lerobot_bomb.stats import wilson_interval
 from lerobot_bomb.vlm.tokenizer import NANO

@@ -11,8 +11,8 @@ def check_weights_of(path: Path, rows: list[Row], checkpoint: Path) -> None:
 
     Rows that name no policy, as those of protocol 1.0, may be of any.
     """
-    from lerobot_bomb.hub.checks import ADAPTERS  # imports LeRobot: seconds
-    from lerobot_bomb.policy_identity import sha256_of, weights_file
+    from lerobot_bomb.checkpoints.checks import ADAPTERS  # imports LeRobot: seconds
+    from lerobot_bomb.checkpoints.identity import sha256_of, weights_file
 
     of_rows = {row["policy"]["weights_sha256"]: row for row in rows if row.get("policy") is not None}
     has_adapters = (checkpoint / ADAPTERS[1]).is_file()

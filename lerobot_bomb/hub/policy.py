@@ -10,10 +10,8 @@ from lerobot.configs.train import TrainPipelineConfig
 from lerobot.utils.constants import CHECKPOINTS_DIR, LAST_CHECKPOINT_LINK, PRETRAINED_MODEL_DIR
 from torch import Tensor
 
-from lerobot_bomb.adapters import base_commit, check_adapters_fit, check_base
-from lerobot_bomb.finite import require_finite_statistics
-from lerobot_bomb.hub.card import Checkpoint
-from lerobot_bomb.hub.checks import (
+from lerobot_bomb.checkpoints.adapters import base_commit, check_adapters_fit, check_base
+from lerobot_bomb.checkpoints.checks import (
     ADAPTERS,
     PROCESSORS,
     check_config,
@@ -21,11 +19,13 @@ from lerobot_bomb.hub.checks import (
     check_tensors,
     processor_files,
 )
-from lerobot_bomb.hub.dataset import DatasetFacts
+from lerobot_bomb.checkpoints.environment import environment_of_dataset
+from lerobot_bomb.checkpoints.names import WEIGHTS, is_hub_id
+from lerobot_bomb.data.facts import DatasetFacts
+from lerobot_bomb.finite import require_finite_statistics
+from lerobot_bomb.hub.card import Checkpoint
 from lerobot_bomb.hub.method import Method
-from lerobot_bomb.hub.names import WEIGHTS, is_hub_id
 from lerobot_bomb.hub.push import publish
-from lerobot_bomb.policy_environment import environment_of_dataset
 
 # arguments that say how a file of the Hub is had
 DOWNLOAD = {

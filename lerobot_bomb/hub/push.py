@@ -1,18 +1,14 @@
-"""``lerobot-bomb push``: a checkpoint that was trained earlier, with its card, to the Hub."""
+"""A checkpoint that was trained earlier, with its card, to the Hub."""
 
-import argparse
 import json
 from collections.abc import Mapping
 from copy import copy
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from lerobot_bomb.data.growing import check_repo_id, switch
-from lerobot_bomb.evaluation.results import read_results
-from lerobot_bomb.flags import path_flag
-from lerobot_bomb.hub.dataset import DatasetFacts, Row, check_results
-from lerobot_bomb.hub.evaluated import check_weights_of
-from lerobot_bomb.hub.names import CONFIG, TO_PUBLISH, TRAIN_CONFIG, WEIGHTS, is_local_path
+from lerobot_bomb.checkpoints.names import CONFIG, TO_PUBLISH, TRAIN_CONFIG, WEIGHTS, is_local_path
+from lerobot_bomb.data.facts import DatasetFacts, Row
+from lerobot_bomb.files import read_json
 
 if TYPE_CHECKING:
     from huggingface_hub import CommitInfo
@@ -24,66 +20,6 @@ if TYPE_CHECKING:
 CARD = "README.md"
 # what means nothing on another machine; of other paths the last part stays, as a name
 LEFT_OUT = {"pretrained_path", "root", "output_dir", "checkpoint_path"}
-
-
-def add_hub_arguments(parser: argparse.ArgumentParser, kind: str) -> None:
-    """Declare where and how a model or a dataset is published."""
-    add = parser.add_argument
-    add("--repo_id", required=True, help=f"name of the {kind} on the Hub, USER/NAME")
-    add("--private", **switch(), help="make a new repository that only you see")
-    add(
-        "--dry_run",
-        **switch(),
-        help="print the card, and the names of the files instead of publishing them; no Hub is asked",
-    )
-
-
-def add_push_arguments(parser: argparse.ArgumentParser) -> None:
-    """Declare the arguments of ``lerobot-bomb push``."""
-    add = parser.add_argument
-    folder = "the folder that lerobot-train names pretrained_model"
-    add("checkpoint", type=path_flag, metavar="CHECKPOINT", help=folder)
-    add_hub_arguments(parser, "model")
-    add(
-        "--results",
-        nargs="+",
-        type=path_flag,
-        default=[],
-        metavar="RESULTS.jsonl",
-        help="files that --env.results_path wrote for this checkpoint; the card states their rates",
-    )
-    add(
-        "--dataset.root",
-        dest="dataset_root",
-        type=path_flag,
-        help="folder of the dataset, if it is no longer where the training found it; the card states what "
-        "it shows",
-    )
-
-
-def run_push(args: argparse.Namespace) -> int:
-    """Check the checkpoint, then publish all of it in one commit; prints where."""
-    check_repo_id(args.repo_id)
-    results = [read_results(path) for path in args.results]
-    dataset = None if args.dataset_root is None else DatasetFacts.read(args.dataset_root)
-    from lerobot_bomb.hub.checks import checkpoint_files  # imports torch: seconds
-    from lerobot_bomb.hub.upload import check_token
-
-    files = {name: args.checkpoint / name for name in checkpoint_files(args.checkpoint)}
-    for path, rows in zip(args.results, results, strict=True):
-        check_weights_of(path, rows, args.checkpoint)
-    if (args.checkpoint / TRAIN_CONFIG).is_file():
-        files[TRAIN_CONFIG] = args.checkpoint / TRAIN_CONFIG
-    if not args.dry_run:
-        check_token()
-    checkpoint = _read_checkpoint(args.checkpoint, args.repo_id, dataset, results)
-    for path, rows in zip(args.results, results, strict=True):
-        check_results(path, rows, checkpoint.environment)
-    if args.dry_run:
-        print(checkpoint.card(), *sorted(files), sep="\n")
-        return 0
-    print(publish(checkpoint, files, args.private or None).commit_url)
-    return 0
 
 
 def publish(checkpoint: "Checkpoint", files: Mapping[str, Path], private: bool | None) -> "CommitInfo":
@@ -103,7 +39,7 @@ def publish(checkpoint: "Checkpoint", files: Mapping[str, Path], private: bool |
         card.validate()
     contents: dict[str, Path | bytes] = {**files, CARD: str(card).encode()}
     for name in {CONFIG, TRAIN_CONFIG} & files.keys():
-        contents[name] = json.dumps(portable(json.loads(files[name].read_text())), indent=4).encode()
+        contents[name] = portable_json(files[name]).encode()
     message = f"{checkpoint.config.type}: weights, processors, configs and card"
     return upload(checkpoint.repo_id, "model", contents, _is_of_checkpoint, message, private)
 
@@ -113,17 +49,22 @@ def _is_of_checkpoint(path: str) -> bool:
     return "/" not in path and path.endswith((".json", ".safetensors"))
 
 
-def _read_checkpoint(
+def read_checkpoint(
     folder: Path, repo_id: str, dataset: DatasetFacts | None, results: list[list[Row]]
 ) -> "Checkpoint":
     """What its card is made of, after all checks."""
     from lerobot.utils.import_utils import register_third_party_plugins
 
-    from lerobot_bomb.adapters import check_adapters_fit, check_base
-    from lerobot_bomb.checkpoint import parse_config
+    from lerobot_bomb.checkpoints.adapters import check_adapters_fit, check_base
+    from lerobot_bomb.checkpoints.checks import (
+        ADAPTERS,
+        check_config,
+        check_finite,
+        check_weights,
+        policy_class,
+    )
+    from lerobot_bomb.checkpoints.folder import parse_config
     from lerobot_bomb.hub.card import Checkpoint
-    from lerobot_bomb.hub.checks import ADAPTERS, check_config, check_finite, check_weights, policy_class
-    from lerobot_bomb.json_files import read_json
 
     register_third_party_plugins()
     policy_type: Any = policy_class(folder)
@@ -157,7 +98,7 @@ def _read_checkpoint(
 
 def _check_processors(folder: Path, config: "PreTrainedConfig") -> None:
     """They load, from the folder alone."""
-    from lerobot_bomb.checkpoint import load_processors
+    from lerobot_bomb.checkpoints.folder import load_processors
 
     of_folder = copy(config)
     of_folder.pretrained_path = folder
@@ -168,8 +109,13 @@ def _check_processors(folder: Path, config: "PreTrainedConfig") -> None:
         raise ValueError(f"{start}: {error}; take a checkpoint from before, or train again") from error
 
 
-def portable(value: Any, key: str = "") -> Any:
+def portable_json(path: Path) -> str:
     """A config's JSON without paths of this machine."""
+    return json.dumps(portable(read_json(path)), indent=4)
+
+
+def portable(value: Any, key: str = "") -> Any:
+    """The same of what it holds."""
     if isinstance(value, dict):
         return {name: portable(each, name) for name, each in value.items()}
     if isinstance(value, list):

@@ -8,8 +8,8 @@ import draccus
 from lerobot.configs import PreTrainedConfig
 from lerobot.configs.train import TrainPipelineConfig
 
+from lerobot_bomb.checkpoints.names import has_local_path, is_hub_id
 from lerobot_bomb.hub.markdown import command
-from lerobot_bomb.hub.names import has_local_path, is_hub_id
 
 # a policy's fields that are filled in, or that say where it runs and goes
 NOT_FLAGS = {

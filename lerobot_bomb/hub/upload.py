@@ -8,7 +8,7 @@ import httpx
 from huggingface_hub import CommitInfo, CommitOperationAdd, CommitOperationDelete, HfApi, constants, get_token
 from huggingface_hub.errors import HfHubHTTPError, OfflineModeIsEnabled
 
-from lerobot_bomb.hub_token import LOG_IN, check_token_characters
+from lerobot_bomb.data.hub_token import LOG_IN, check_token_characters
 
 OFFLINE = "HF_HUB_OFFLINE is set, so nothing can be pushed"
 

@@ -11,9 +11,10 @@ from lerobot.policies import make_policy
 from lerobot.utils.constants import ACTION, OBS_STATE
 from lerobot.utils.random_utils import set_seed
 
-from lerobot_bomb.adapters import check_adapters
-from lerobot_bomb.checkpoint import autocast, load_processors, read_config
-from lerobot_bomb.schema import ACTION_DIM, STATE_DIM, EpisodeSpec, RenderOptions
+from lerobot_bomb.bomb.episode import EpisodeSpec
+from lerobot_bomb.bomb.observation import ACTION_DIM, STATE_DIM, RenderOptions
+from lerobot_bomb.checkpoints.adapters import check_adapters
+from lerobot_bomb.checkpoints.folder import autocast, load_processors, read_config
 from lerobot_bomb.viewing.episode import Agent
 
 ENV_TYPE = "bomb"

@@ -7,8 +7,9 @@ from typing import Any
 import gymnasium
 import numpy as np
 
-from lerobot_bomb.expert import expert_action
-from lerobot_bomb.schema import EpisodeSpec, PrivilegedState
+from lerobot_bomb.bomb.episode import EpisodeSpec
+from lerobot_bomb.bomb.expert import expert_action
+from lerobot_bomb.bomb.observation import PrivilegedState
 
 # (observation of the environment, instruction) -> (4,) action
 type Agent = Callable[[dict[str, Any], str], np.ndarray]

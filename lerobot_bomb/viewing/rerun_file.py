@@ -8,17 +8,10 @@ import numpy as np
 import rerun as rr
 import rerun.blueprint as rrb
 
-from lerobot_bomb.episode_result import EpisodeResult
-from lerobot_bomb.schema import (
-    ACTION_NAMES,
-    BOARD,
-    CAMERAS,
-    COLORS,
-    STATE_NAMES,
-    EpisodeSpec,
-    PrivilegedState,
-    Stage,
-)
+from lerobot_bomb.bomb.board import BOARD, COLORS
+from lerobot_bomb.bomb.episode import EpisodeSpec, Stage
+from lerobot_bomb.bomb.observation import ACTION_NAMES, CAMERAS, STATE_NAMES, PrivilegedState
+from lerobot_bomb.envs.results import EpisodeResult
 from lerobot_bomb.viewing.episode import Moment
 
 APPLICATION = "lerobot_bomb"

@@ -37,7 +37,7 @@ def read_image(batch: dict[str, Tensor], key: str, policy_type: str, device: tor
 
 
 def read_task(batch: dict[str, Tensor], policy_type: str, device: torch.device) -> TokenRows:
-    """The sentences' tokens, with gaps."""
+    """The sentences' tokens, with padding."""
     ids_BL, mask_BL = (
         read_tensor(batch, key, policy_type, device)
         for key in (OBS_LANGUAGE_TOKENS, OBS_LANGUAGE_ATTENTION_MASK)

@@ -23,7 +23,7 @@ def default_intrinsics(height: int, width: int) -> Tensor:
 
 
 def from_pixel_centers(K_B33: Tensor, name: str) -> Tensor:
-    """K as calibrations and `camera_geometry` have it, (0, 0) the centre of the top left pixel -> ours.
+    """K as calibrations and `bomb/observation.py` have it, (0, 0) the centre of the top left pixel -> ours.
 
     Raises:
         ValueError: it is not a pinhole camera's; the message calls it ``name``.

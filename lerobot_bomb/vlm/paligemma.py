@@ -102,8 +102,8 @@ class PaliGemmaBackbone(nn.Module):
 
         ``columns_BL``: places in the sequence, from 0; ``reads_BLL``: whether a token (row) reads another.
         """
-        penalty_BLL = torch.where(reads_BLL, 0.0, torch.finfo(embeds_BLH.dtype).min).to(embeds_BLH.dtype)
-        mask = penalty_BLL[:, None]
+        bias_BLL = torch.where(reads_BLL, 0.0, torch.finfo(embeds_BLH.dtype).min).to(embeds_BLH.dtype)
+        mask = bias_BLL[:, None]
         return self.text_model(
             inputs_embeds=embeds_BLH,
             attention_mask={"full_attention": mask, "sliding_attention": mask},

@@ -77,7 +77,7 @@ class Prefix:
     """What the model keeps of pictures and text that it has read."""
 
     hidden: Tensor  # (B, L, H) after the last layer
-    written: Tensor  # (B, L) bool, others are gaps
+    mask: Tensor  # (B, L) bool, False: padding
     next_position: Tensor  # (B, 1) int64, of what follows
     layers: list[KeysValues]
 
@@ -85,7 +85,7 @@ class Prefix:
         """All of it, as `of` takes it."""
         return [
             self.hidden,
-            self.written,
+            self.mask,
             self.next_position,
             *(part for layer in self.layers for part in layer),
         ]
@@ -100,7 +100,7 @@ class Prefix:
         """Every row so many times, beside each other."""
         repeat = partial(torch.repeat_interleave, repeats=times, dim=0)
         layers = [(repeat(keys), repeat(values)) for keys, values in self.layers]
-        return Prefix(repeat(self.hidden), repeat(self.written), repeat(self.next_position), layers)
+        return Prefix(repeat(self.hidden), repeat(self.mask), repeat(self.next_position), layers)
 
 
 class _Reader:
@@ -177,12 +177,12 @@ class QwenBackbone(nn.Module):
         """(B, L) token ids -> (B, L, H)."""
         return self.vlm.get_input_embeddings()(tokens_BL)
 
-    def read_prefix(self, embeds_BLH: Tensor, is_image_BL: Tensor, written_BL: Tensor) -> Prefix:
+    def read_prefix(self, embeds_BLH: Tensor, is_image_BL: Tensor, mask_BL: Tensor) -> Prefix:
         """Read rows whose first column is written; ``is_image_BL``: which tokens are parts of pictures."""
-        positions_3BL, next_B1 = self._positions(is_image_BL, written_BL)
-        causal_LL = torch.ones_like(written_BL[0]).expand(written_BL.shape[1], -1).tril()
-        hidden_BLH, layers = self._read(embeds_BLH, positions_3BL, causal_LL & written_BL[:, None])
-        return Prefix(hidden_BLH, written_BL, next_B1, layers)
+        positions_3BL, next_B1 = self._positions(is_image_BL, mask_BL)
+        causal_LL = torch.ones_like(mask_BL[0]).expand(mask_BL.shape[1], -1).tril()
+        hidden_BLH, layers = self._read(embeds_BLH, positions_3BL, causal_LL & mask_BL[:, None])
+        return Prefix(hidden_BLH, mask_BL, next_B1, layers)
 
     def read_segment(self, prefix: Prefix, embeds_BTH: Tensor, reads_BTT: Tensor) -> Tensor:
         """(B, T, H) states after the last layer of tokens that follow a prefix and read all of it.
@@ -190,7 +190,7 @@ class QwenBackbone(nn.Module):
         ``reads_BTT``: whether a token of the segment (row) reads another.
         """
         positions_BT = prefix.next_position + torch.arange(embeds_BTH.shape[1], device=embeds_BTH.device)
-        prefix_BTL = prefix.written[:, None].expand(-1, embeds_BTH.shape[1], -1)
+        prefix_BTL = prefix.mask[:, None].expand(-1, embeds_BTH.shape[1], -1)
         reads_BTX = torch.cat([prefix_BTL, reads_BTT], dim=2)
         return self._read(embeds_BTH, positions_BT.expand(3, -1, -1), reads_BTX, prefix.layers)[0]
 
@@ -212,7 +212,7 @@ class QwenBackbone(nn.Module):
             layers.append(new)
         return self.text_model.norm(x_BTH), layers
 
-    def _positions(self, is_image_BL: Tensor, written_BL: Tensor) -> tuple[Tensor, Tensor]:
+    def _positions(self, is_image_BL: Tensor, mask_BL: Tensor) -> tuple[Tensor, Tensor]:
         """(3, B, L) time, line and column that the model takes a token to be at, and (B, 1) what follows.
 
         Text moves all three on by one. A picture stands still in time, its lines and columns count from
@@ -221,7 +221,7 @@ class QwenBackbone(nn.Module):
         side = self.tokens_per_side
         place_BL = (is_image_BL.cumsum(dim=1) - 1) % side**2
         is_last_BL = place_BL == side**2 - 1
-        steps_BL = torch.where(is_image_BL, side * is_last_BL, written_BL.long())
+        steps_BL = torch.where(is_image_BL, side * is_last_BL, mask_BL.long())
         ends_BL = steps_BL.cumsum(dim=1)
         starts_BL = ends_BL - steps_BL
         lines_BL, columns_BL = place_BL // side * is_image_BL, place_BL % side * is_image_BL

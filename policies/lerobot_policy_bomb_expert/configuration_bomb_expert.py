@@ -4,7 +4,7 @@ from dataclasses import dataclass
 
 from lerobot.configs import PreTrainedConfig
 
-from lerobot_bomb.scripted import ScriptedConfig
+from lerobot_bomb.bomb.scripted_policy import ScriptedConfig
 
 
 @PreTrainedConfig.register_subclass("bomb_expert")

@@ -2,9 +2,9 @@
 
 import numpy as np
 
-from lerobot_bomb.expert import expert_action
-from lerobot_bomb.schema import PrivilegedState
-from lerobot_bomb.scripted import ScriptedPolicy
+from lerobot_bomb.bomb.expert import expert_action
+from lerobot_bomb.bomb.observation import PrivilegedState
+from lerobot_bomb.bomb.scripted_policy import ScriptedPolicy
 from lerobot_policy_bomb_expert.configuration_bomb_expert import BombExpertConfig
 
 

@@ -7,7 +7,6 @@ Shapes: `B` batch, `K` actions of a chunk, `D` action dims, `L` tokens of a prom
 """
 
 import logging
-from collections import deque
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import partial
@@ -15,30 +14,26 @@ from typing import Any, ClassVar
 
 import torch
 from lerobot.datasets import LeRobotDatasetMetadata
-from lerobot.policies import PreTrainedPolicy
 from lerobot.policies.rtc import RTCProcessor
 from lerobot.utils.constants import ACTION, OBS_STATE
 from torch import Tensor, nn
 
 from lerobot_bomb.actions.accuracy import means
-from lerobot_bomb.actions.relative import bounds
 from lerobot_bomb.actions.text import TokenRows
-from lerobot_bomb.adapters import peft_targets
-from lerobot_bomb.data.columns import dim_names
+from lerobot_bomb.checkpoints.adapters import peft_targets
+from lerobot_bomb.cuda_graphs import GraphedModel
+from lerobot_bomb.decoding.kv_cache import check_positions
 from lerobot_bomb.finite import require_finite_answers
 from lerobot_bomb.flow.dual_mod import masked_mean_pool
 from lerobot_bomb.flow.losses import joint_loss, second_derivatives
 from lerobot_bomb.flow.path import PathPoint, draw_noise, draw_tau, path_point
 from lerobot_bomb.flow.real_time import guided
 from lerobot_bomb.flow.samplers import SAMPLERS, Heads, sample
-from lerobot_bomb.hub.policy import HubPolicy
-from lerobot_bomb.policy_flags import check_as_trained, check_weights_fit, trained_with
-from lerobot_bomb.processes import SavesTiedWeightsOnce, weighed
-from lerobot_bomb.training_draws import begin_batch
-from lerobot_bomb.vlm.cached_text import check_positions
-from lerobot_bomb.vlm.graphs import RecordedModel
+from lerobot_bomb.policies.policy import VlaPolicy
+from lerobot_bomb.training.distributed import weighed
+from lerobot_bomb.training.randomness import begin_batch
 from lerobot_bomb.vlm.images import draw_windows, resize
-from lerobot_bomb.vlm.inputs import read_actions, read_image, read_task, read_tensor
+from lerobot_bomb.vlm.inputs import read_actions, read_image, read_task
 from lerobot_bomb.vlm.qwen import Prefix
 from lerobot_policy_fdvla.building_fdvla import build_model
 from lerobot_policy_fdvla.card_fdvla import METHOD
@@ -73,22 +68,20 @@ class Context:
         return cls(Prefix.of(tensors[1:]), tensors[0])
 
 
-class FdvlaPolicy(HubPolicy, SavesTiedWeightsOnce, PreTrainedPolicy):
+class FdvlaPolicy(VlaPolicy):
     """A Qwen2.5-VL that reads noisy actions; two heads predict where they go and what noise is in them."""
 
     config_class = FdvlaConfig  # pyright: ignore[reportAssignmentType]  LeRobot annotates it as None
     name = "fdvla"  # pyright: ignore[reportAssignmentType]
     method = METHOD
     config: FdvlaConfig
-    action_unit: Tensor
+    shapes, as_trained = SHAPES, AS_TRAINED
     # modules that FSDP shards one by one; accelerate reads the second name
     _fsdp_wrap_modules: ClassVar[list[str]] = ["Qwen2_5_VLDecoderLayer", "Qwen2_5_VLVisionBlock"]
     _no_split_modules = _fsdp_wrap_modules
 
     def __init__(self, config: FdvlaConfig, dataset_meta: LeRobotDatasetMetadata | None = None, **_: object):
         super().__init__(config, dataset_meta)
-        config.validate_features()
-        config.trained_with = trained_with(config, AS_TRAINED)
         self.tokens, self.backbone = build_model(config)
         num_fixed = len(self._head_ids) + len(self._tail_ids) + config.chunk_size + NUM_MARKS
         check_positions(self.backbone.text_config, num_fixed)
@@ -100,47 +93,11 @@ class FdvlaPolicy(HubPolicy, SavesTiedWeightsOnce, PreTrainedPolicy):
         flow_dim, denoise_dim = (config.dualmod_dim if of_head else None for of_head in modulated)
         self.flow_head = make_head(flow_dim) if config.use_flow_head else None
         self.denoise_head = make_head(denoise_dim) if config.use_denoise_head else None
-        # physical size of 1 in normalised actions, known while training: (D,)
-        self.register_buffer("action_unit", torch.ones(self._action_dim), persistent=False)
-        self._take_units(dataset_meta)
-        # of all that is random in training: the crop, the time, the noise
-        self.generator = torch.Generator().manual_seed(torch.initial_seed())
         logger.info("fdvla: %s", self.parameter_counts)
         heads = [head for head in (self.flow_head, self.denoise_head) if head is not None]
-        self._recorded = RecordedModel(self._sample, [self.backbone.text_model, self.segment, *heads])
+        self._recorded = GraphedModel(self._sample, [self.backbone.text_model, self.segment, *heads])
         self.init_rtc_processor()
         self.reset()
-
-    @classmethod
-    def from_pretrained(
-        cls,
-        *args,
-        config: FdvlaConfig | None = None,
-        dataset_meta: LeRobotDatasetMetadata | None = None,
-        **kwargs,
-    ) -> "FdvlaPolicy":
-        """As LeRobot's, but a missing or unexpected tensor is an error."""
-        if config is not None:
-            if dataset_meta is None:
-                check_as_trained(config)
-            else:
-                check_weights_fit(config, SHAPES)
-        policy = super().from_pretrained(
-            *args, config=config, dataset_meta=dataset_meta, **{**kwargs, "strict": True}
-        )
-        policy._take_units(dataset_meta)
-        return policy
-
-    @torch.no_grad()
-    def _take_units(self, meta: LeRobotDatasetMetadata | None) -> None:
-        self._action_names = None
-        if meta is None:
-            return
-        assert meta.stats is not None
-        mode = self.config.normalization_mapping["ACTION"]
-        low, high = bounds(meta.stats[ACTION], mode, self._action_dim)
-        self.action_unit.copy_(torch.from_numpy(high - low) / 2)
-        self._action_names = dim_names(meta.features[ACTION])
 
     def _make_state_embedding(self, hidden_size: int) -> nn.Linear | None:
         if not self.config.use_state:
@@ -154,14 +111,11 @@ class FdvlaPolicy(HubPolicy, SavesTiedWeightsOnce, PreTrainedPolicy):
         counts = {name: sum(p.numel() for p in part.parameters()) for name, part in self.named_children()}
         return {**counts, "trained": sum(p.numel() for p in self.get_optim_params())}
 
-    def get_optim_params(self) -> list[nn.Parameter]:
-        return [parameter for parameter in self.parameters() if parameter.requires_grad]
-
     def _get_default_peft_targets(self) -> dict[str, Any]:
         return peft_targets(self, "language_model", NEW_PARTS)
 
     def reset(self) -> None:
-        self._queue: deque[Tensor] = deque(maxlen=self.config.n_action_steps)
+        super().reset()
         self._sampling_generator = torch.Generator().manual_seed(SAMPLING_SEED)
 
     # Training
@@ -203,14 +157,7 @@ class FdvlaPolicy(HubPolicy, SavesTiedWeightsOnce, PreTrainedPolicy):
     def _actions(self, batch: dict[str, Tensor]) -> Tensor:
         """(B, K, D) normalised."""
         shape = self.config.chunk_size, self._action_dim
-        return read_actions(batch, ACTION, self.config.type, self.action_unit.device, shape).float()
-
-    def _kept(self, batch: dict[str, Tensor]) -> Tensor:
-        """(B, K) bool: which actions are read by others and trained on."""
-        if f"{ACTION}_is_pad" in batch and not self.config.loss_on_padded_actions:
-            return ~self._of_batch(batch, f"{ACTION}_is_pad").bool()
-        actions = batch[ACTION]
-        return actions.new_ones(len(actions), self.config.chunk_size, dtype=torch.bool)
+        return read_actions(batch, ACTION, self.config.type, self._device, shape).float()
 
     def _draw_point(self, actions_BKD: Tensor) -> PathPoint:
         tau_B = draw_tau(self.config.time_sampling, len(actions_BKD), self.generator)
@@ -233,13 +180,9 @@ class FdvlaPolicy(HubPolicy, SavesTiedWeightsOnce, PreTrainedPolicy):
         Errors are known where a dataset was given, that is while training. Padded actions do not count.
         """
         parts = {name: (term, torch.ones_like(term, dtype=torch.bool)) for name, term in terms.items()}
-        if self._action_names is not None:
-            errors_BKD = self._implied_actions(velocity_BKD, noise_BKD, point) - actions_BKD
-            errors_BKD = errors_BKD.abs() * self.action_unit
-            kept_BKD = kept_BK[..., None].expand_as(errors_BKD)
-            parts["l1"] = errors_BKD, kept_BKD
-            for dim, name in enumerate(self._action_names):
-                parts[f"l1_{name}"] = errors_BKD[..., dim], kept_BKD[..., dim]
+        errors_BKD = self._implied_actions(velocity_BKD, noise_BKD, point) - actions_BKD
+        errors_BKD = errors_BKD.abs() * self.action_unit
+        parts |= self._l1_parts(errors_BKD, kept_BK[..., None].expand_as(errors_BKD))
         return means(parts, loss, self.config.trained_batches)
 
     def _implied_actions(
@@ -311,7 +254,7 @@ class FdvlaPolicy(HubPolicy, SavesTiedWeightsOnce, PreTrainedPolicy):
             return self._draw(shape[0], shape[1:])
         if given.shape != shape:
             raise ValueError(f"noise has shape {tuple(given.shape)}; expected {shape} (batch, chunk, dims)")
-        return given.to(self.action_unit.device)
+        return given.to(self._device)
 
     def _step_noise(self, shape: tuple[int, int, int]) -> Tensor:
         """(B, N, K, D) for ``sde``, none of it for others."""
@@ -319,7 +262,7 @@ class FdvlaPolicy(HubPolicy, SavesTiedWeightsOnce, PreTrainedPolicy):
         return self._draw(shape[0], (num_steps, *shape[1:]))
 
     def _draw(self, batch_size: int, shape: tuple[int, ...]) -> Tensor:
-        return draw_noise(self._sampling_generator, batch_size, shape).to(self.action_unit.device)
+        return draw_noise(self._sampling_generator, batch_size, shape).to(self._device)
 
     def supports_rtc(self) -> bool:
         """Whether the sampler follows a velocity, which real-time chunking guides."""
@@ -368,28 +311,28 @@ class FdvlaPolicy(HubPolicy, SavesTiedWeightsOnce, PreTrainedPolicy):
         """The prompt, once for all sampling steps."""
         rows, is_task_BL = self._prompt(batch)
         prefix = self.backbone.read_prefix(
-            self._embeds(batch, rows.ids), rows.ids == self.tokens.image, rows.written
+            self._embeds(batch, rows.ids), rows.ids == self.tokens.image, rows.mask
         )
-        return Context(prefix, masked_mean_pool(prefix.hidden, self._pooled(rows.written, is_task_BL)))
+        return Context(prefix, masked_mean_pool(prefix.hidden, self._pooled(rows.mask, is_task_BL)))
 
-    def _pooled(self, written_BL: Tensor, is_task_BL: Tensor) -> Tensor:
+    def _pooled(self, mask_BL: Tensor, is_task_BL: Tensor) -> Tensor:
         """(B, L) bool: the tokens that are pooled; all of them where there is no instruction."""
         if self.config.reasoning_pool == "text":
-            return torch.where(is_task_BL.any(dim=1, keepdim=True), is_task_BL, written_BL)
+            return torch.where(is_task_BL.any(dim=1, keepdim=True), is_task_BL, mask_BL)
         if self.config.reasoning_pool == "all_prefix":
-            return written_BL
-        index_L = torch.arange(written_BL.shape[1], device=written_BL.device)
-        return (index_L == written_BL.shape[1] - 1).expand_as(written_BL)
+            return mask_BL
+        index_L = torch.arange(mask_BL.shape[1], device=mask_BL.device)
+        return (index_L == mask_BL.shape[1] - 1).expand_as(mask_BL)
 
-    # Prompt: start, images, task (with gaps), a place for the state, end
+    # Prompt: start, images, task (with padding), a place for the state, end
 
     def _prompt(self, batch: dict[str, Tensor]) -> tuple[TokenRows, Tensor]:
         """Its tokens, and which of them (B, L) are the task's."""
-        task = read_task(batch, self.config.type, self.action_unit.device)
+        task = read_task(batch, self.config.type, self._device)
         head = TokenRows.constant(self._head_ids, task.ids)
         tail = TokenRows.constant(self._tail_ids, task.ids)
-        nowhere = [torch.zeros_like(part.written) for part in (head, tail)]
-        is_task_BL = torch.cat([nowhere[0], task.written, nowhere[1]], dim=1)
+        nowhere = [torch.zeros_like(part.mask) for part in (head, tail)]
+        is_task_BL = torch.cat([nowhere[0], task.mask, nowhere[1]], dim=1)
         return TokenRows.join([head, task, tail]), is_task_BL
 
     def _embeds(self, batch: dict[str, Tensor], ids_BL: Tensor) -> Tensor:
@@ -431,20 +374,3 @@ class FdvlaPolicy(HubPolicy, SavesTiedWeightsOnce, PreTrainedPolicy):
         # the state's embedding takes the place of a token
         place = [self.tokens.image_end] if self.config.use_state else []
         return [*place, *self.tokens.end]
-
-    def _of_batch(self, batch: dict[str, Tensor], key: str) -> Tensor:
-        return read_tensor(batch, key, self.config.type, self.action_unit.device)
-
-    @property
-    def _cameras(self) -> list[str]:
-        return sorted(self.config.image_features)
-
-    @property
-    def _action_dim(self) -> int:
-        assert self.config.action_feature is not None
-        return self.config.action_feature.shape[0]
-
-    def _autocast(self) -> torch.autocast:
-        """The precision of ``config.dtype``, whoever calls: training, evaluation or a user's own loop."""
-        bfloat16 = self.config.dtype == "bfloat16"
-        return torch.autocast(self.action_unit.device.type, dtype=torch.bfloat16, enabled=bfloat16)

@@ -1,16 +1,13 @@
 """The parts of a ``spatialvla_grid``, from its config, a checkpoint's or a dataset."""
 
 import logging
-from collections.abc import Sequence
 
 import numpy as np
 from lerobot.datasets import LeRobotDatasetMetadata
 from lerobot.utils.constants import ACTION
 
-from lerobot_bomb.actions.ensemble import TemporalEnsemble
 from lerobot_bomb.actions.grid_fit import normalised, normalised_rest
 from lerobot_bomb.actions.grid_report import clipping_text
-from lerobot_bomb.actions.grid_settings import ActionGroup
 from lerobot_bomb.actions.grids import ActionGrids
 from lerobot_bomb.actions.relative import bounds, present_episodes
 from lerobot_bomb.data.columns import dim_names, read_columns
@@ -58,18 +55,6 @@ def fit_to_data(grids: ActionGrids, config: SpatialvlaGridConfig, meta: LeRobotD
     grids.fit(actions_ND, normalised_rest(low_D, high_D))
     text, is_much = clipping_text(actions_ND, dim_names(meta.features[ACTION]))
     logger.log(logging.WARNING if is_much else logging.INFO, "%s: %s", meta.repo_id, text)
-
-
-def make_ensemble(config: SpatialvlaGridConfig, groups: Sequence[ActionGroup]) -> TemporalEnsemble | None:
-    """None: a queue instead."""
-    if not config.temporal_ensemble_size:
-        return None
-    return TemporalEnsemble(
-        config.temporal_ensemble_size,
-        config.temporal_ensemble_weighting,
-        config.temporal_ensemble_coefficient,
-        [dim for group in groups if group.transform == "binary" for dim in group.dims],
-    )
 
 
 def build_model(config: SpatialvlaGridConfig) -> tuple[PaliGemmaPrompt, PaliGemmaBackbone]:

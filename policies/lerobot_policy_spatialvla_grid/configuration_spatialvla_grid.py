@@ -1,40 +1,18 @@
 """Config of ``spatialvla_grid``."""
 
 from dataclasses import dataclass, field
-from typing import Any
+from typing import Any, ClassVar
 
-from lerobot.configs import NormalizationMode, PreTrainedConfig
-from lerobot.optim import AdamWConfig, CosineDecayWithWarmupSchedulerConfig
+from lerobot.configs import PreTrainedConfig
 from lerobot.utils.constants import OBS_IMAGES
 
-from lerobot_bomb.actions.ensemble import WEIGHTINGS
 from lerobot_bomb.actions.grid_settings import ActionGroup, GridSettings, check_groups, default_groups
-from lerobot_bomb.checkpoint_config import INSTALLED, PackageVersion
-from lerobot_bomb.flag_errors import flag_errors
-from lerobot_bomb.flags import one_of
-from lerobot_bomb.policy_environment import ConfigWithEnvironment
-from lerobot_bomb.policy_flags import (
-    action_deltas,
-    adamw,
-    check_cameras_and_action,
-    check_chunk,
-    check_ensemble,
-    check_model_name_and_precision,
+from lerobot_bomb.policies.config import TokenVlaConfig
+from lerobot_bomb.training.policy_flags import (
     check_not_negative,
     check_positive,
-    check_state,
-    check_training,
-    cosine_decay,
 )
 
-DTYPES = ("float32", "bfloat16")
-# modes that map the data into [-1, 1], where the grids are
-BOUNDED_MODES = (
-    NormalizationMode.QUANTILES,
-    NormalizationMode.QUANTILE10,
-    NormalizationMode.MIN_MAX,
-    NormalizationMode.IDENTITY,
-)
 DEPTH_SOURCES = ("none", "observation", "zoedepth")
 PREFIX_ATTENTIONS = ("bidirectional", "causal")
 LOSS_VOCABULARIES = ("slot", "full")
@@ -48,33 +26,24 @@ AS_TRAINED = ("chunk_size", "use_state", "prefix_attention", *SHAPES)
 
 @PreTrainedConfig.register_subclass("spatialvla_grid")
 @dataclass
-class SpatialvlaGridConfig(ConfigWithEnvironment):
+class SpatialvlaGridConfig(TokenVlaConfig):
     """A PaliGemma 2 chooses one grid cell for each group of action dimensions and step."""
+
+    CHOICES: ClassVar[dict[str, tuple]] = {
+        **TokenVlaConfig.CHOICES,
+        "depth_source": DEPTH_SOURCES,
+        "prefix_attention": PREFIX_ATTENTIONS,
+        "loss_vocab": LOSS_VOCABULARIES,
+        "draft": DRAFTS,
+    }
 
     # Hub id, path of a local folder, or "nano": a small model with random weights, built in code
     vlm_model_name: str = "google/paligemma2-3b-pt-224"
-    # changes of nano's architecture, nested as it is, as {"vision_config": {"num_hidden_layers": 2}}
-    nano_config: dict[str, Any] | None = None
-    # architecture; filled in when the base model is loaded. Set = build this and download nothing:
-    # the weights then come from a checkpoint
-    vlm_config: dict[str, Any] | None = None
-    # token ids of the fixed parts of the prompt; filled in together with vlm_config
-    prompt_tokens: dict[str, Any] | None = None
 
-    n_obs_steps: int = 1
     # actions of a chunk
     chunk_size: int = 4
     # actions executed before the next prediction
     n_action_steps: int = 4
-    # statistics to [-1, 1] for what becomes cells; images stay in [0, 1]. Not QUANTILES, which LeRobot
-    # averages over episodes: far more than 2 % of a dataset's actions may lie beyond, and are clipped
-    normalization_mapping: dict[str, NormalizationMode] = field(
-        default_factory=lambda: {
-            "VISUAL": NormalizationMode.IDENTITY,
-            "STATE": NormalizationMode.MIN_MAX,
-            "ACTION": NormalizationMode.MIN_MAX,
-        }
-    )
     # whether the robot's state, in 256 bins, is in the prompt
     use_state: bool = False
 
@@ -115,17 +84,6 @@ class SpatialvlaGridConfig(ConfigWithEnvironment):
     prefix_attention: str = "bidirectional"
     # what a cell competes with in the loss: the cells of its "slot", or the "full" vocabulary
     loss_vocab: str = "slot"
-    # whether actions beyond an episode's end (repeats of the last one) are trained on
-    loss_on_padded_actions: bool = False
-    # frames at an episode's end that no sample starts at
-    drop_n_last_frames: int = 1
-
-    # chunks that an executed action is the mean of, one predicted every step; 0 = a queue instead
-    temporal_ensemble_size: int = 0
-    # "uniform", "exponential" (exp(coefficient * age)) or "nvlabs" (1 for the newest, 0.5 for others)
-    temporal_ensemble_weighting: str = "uniform"
-    # positive favours old chunks
-    temporal_ensemble_coefficient: float = 0.01
 
     # what a pass guesses beside the next cell: "none", or that a step is as the one before ("repeat"); the
     # cells are the same, up to ties within rounding. Not on CUDA
@@ -133,66 +91,22 @@ class SpatialvlaGridConfig(ConfigWithEnvironment):
 
     # side of the crop as a fraction of the image: random place while training, centre otherwise
     crop_fraction: float = 0.9
-    freeze_vision_encoder: bool = False
     # the words' embeddings; those of the cells are always trained
     freeze_llm_embeddings: bool = True
-    # "bfloat16" = autocast over float32 weights, in training and in evaluation
-    dtype: str = "float32"
-    gradient_checkpointing: bool = False
-    # answers on CUDA by `torch.compile`: some ten seconds for every size of batch, then faster
-    compile_model: bool = False
-    # values of AS_TRAINED; filled in for checkpoints
-    trained_with: dict[str, Any] | None = None
-    # batches trained on so far; what is random in the next ones follows from it
-    trained_batches: int = 0
-    # of lerobot_bomb, which wrote the checkpoint
-    package_version: PackageVersion = INSTALLED
 
-    optimizer_lr: float = 2e-5
     optimizer_betas: tuple[float, float] = (0.9, 0.999)
-    optimizer_eps: float = 1e-8
-    optimizer_weight_decay: float = 0.0
-    optimizer_grad_clip_norm: float = 1.0
     scheduler_warmup_steps: int = 500
-    scheduler_decay_steps: int = 30_000
-    scheduler_decay_lr: float = 0.0
 
-    push_to_hub: bool = False
-
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        with flag_errors():
-            self._check_choices()
-            check_chunk(self)
-            check_ensemble(self)
-            if self.action_feature is not None:
-                self.grid_settings()
-            check_training(self)
-            check_not_negative(self, ("grid_min_sigma",))
-            check_positive(self, ("ego3d_patch_reso", "ego3d_n_freqs"))
-
-    def _check_choices(self) -> None:
-        for flag, allowed in {
-            "depth_source": DEPTH_SOURCES,
-            "prefix_attention": PREFIX_ATTENTIONS,
-            "loss_vocab": LOSS_VOCABULARIES,
-            "draft": DRAFTS,
-            "dtype": DTYPES,
-            "temporal_ensemble_weighting": WEIGHTINGS,
-        }.items():
-            one_of(f"--policy.{flag}", getattr(self, flag), allowed)
-        check_model_name_and_precision(self)
-        for kind, allowed in {
-            "VISUAL": (NormalizationMode.IDENTITY,),
-            "STATE": BOUNDED_MODES,
-            "ACTION": BOUNDED_MODES,
-        }.items():
-            one_of(f"--policy.normalization_mapping[{kind}]", self.normalization_mapping.get(kind), allowed)
+    def check_flags(self) -> None:
+        super().check_flags()
+        if self.action_feature is not None:
+            self.grid_settings()
+        check_not_negative(self, ("grid_min_sigma",))
+        check_positive(self, ("ego3d_patch_reso", "ego3d_n_freqs"))
 
     def validate_features(self) -> None:
         """Raise unless the dataset (or environment) has what the policy reads and writes."""
-        check_cameras_and_action(self)
-        check_state(self, ("use_state",))
+        super().validate_features()
         if self.depth_source == "observation":
             self._check_depth()
 
@@ -246,21 +160,3 @@ class SpatialvlaGridConfig(ConfigWithEnvironment):
                     f"--policy.{flag}={value!r}: this checkpoint's grids have {then[flag]!r}, which only a "
                     f"training with --policy.adapt_embeddings=true can change"
                 )
-
-    def get_optimizer_preset(self) -> AdamWConfig:
-        return adamw(self)
-
-    def get_scheduler_preset(self) -> CosineDecayWithWarmupSchedulerConfig:
-        return cosine_decay(self)
-
-    @property
-    def observation_delta_indices(self) -> None:
-        return None
-
-    @property
-    def action_delta_indices(self) -> list[int] | None:
-        return action_deltas(self)
-
-    @property
-    def reward_delta_indices(self) -> None:
-        return None

@@ -8,12 +8,10 @@ cells of a group.
 """
 
 import logging
-from collections import deque
 from typing import Any, ClassVar
 
 import torch
 from lerobot.datasets import LeRobotDatasetMetadata
-from lerobot.policies import PreTrainedPolicy
 from lerobot.utils.constants import (
     ACTION,
     OBS_IMAGES,
@@ -27,16 +25,14 @@ from lerobot_bomb.actions.bins import Bins
 from lerobot_bomb.actions.grid_report import edges_text
 from lerobot_bomb.actions.grid_rows import interpolate_rows
 from lerobot_bomb.actions.grids import ActionGrids
-from lerobot_bomb.actions.relative import bounds
 from lerobot_bomb.actions.text import TokenRows, digits_needed, number_symbols
-from lerobot_bomb.adapters import check_buffers_are_the_bases, frozen_buffers, peft_targets
+from lerobot_bomb.checkpoints.adapters import check_buffers_are_the_bases, peft_targets
 from lerobot_bomb.data.columns import dim_names
 from lerobot_bomb.decoding.decoder import Prompt
 from lerobot_bomb.decoding.slots import SlotWriter
-from lerobot_bomb.hub.policy import HubPolicy
-from lerobot_bomb.policy_flags import check_as_trained, check_weights_fit, trained_with
-from lerobot_bomb.processes import SavesTiedWeightsOnce, weighed
-from lerobot_bomb.training_draws import begin_batch
+from lerobot_bomb.policies.policy import TokenVlaPolicy
+from lerobot_bomb.training.distributed import weighed
+from lerobot_bomb.training.randomness import begin_batch
 from lerobot_bomb.vlm.depth import (
     lattice_points,
     observed_depth,
@@ -44,7 +40,7 @@ from lerobot_bomb.vlm.depth import (
 )
 from lerobot_bomb.vlm.ego3d import Ego3D
 from lerobot_bomb.vlm.images import CropWindows, draw_windows, resized_pixels
-from lerobot_bomb.vlm.inputs import read_actions, read_image, read_task, read_tensor
+from lerobot_bomb.vlm.inputs import read_actions, read_image, read_task
 from lerobot_bomb.vlm.intrinsics import crop_intrinsics, default_intrinsics, resize_intrinsics
 from lerobot_bomb.vlm.paligemma import (
     FIRST_POSITION,
@@ -53,7 +49,6 @@ from lerobot_policy_spatialvla_grid.building_spatialvla_grid import (
     build_depth,
     build_model,
     fit_to_data,
-    make_ensemble,
     make_grids,
 )
 from lerobot_policy_spatialvla_grid.card_spatialvla_grid import METHOD
@@ -70,15 +65,15 @@ logger = logging.getLogger(__name__)
 NEW_PARTS = ("cell_embedding", "cell_head", "ego3d")
 
 
-class SpatialvlaGridPolicy(HubPolicy, SavesTiedWeightsOnce, PreTrainedPolicy):
+class SpatialvlaGridPolicy(TokenVlaPolicy):
     """A PaliGemma 2 that chooses the next ``chunk_size`` actions, one cell of each grid a step."""
 
     config_class = SpatialvlaGridConfig  # pyright: ignore[reportAssignmentType]  LeRobot annotates it as None
     name = "spatialvla_grid"  # pyright: ignore[reportAssignmentType]
     method = METHOD
     config: SpatialvlaGridConfig
+    shapes, as_trained = SHAPES, AS_TRAINED
     symbol_ids: Tensor
-    action_unit: Tensor
     first_cells: Tensor  # (G,) int64, of each group among all cells
     # modules that FSDP shards one by one; accelerate reads the second name
     _fsdp_wrap_modules: ClassVar[list[str]] = ["Gemma2DecoderLayer", "SiglipEncoderLayer"]
@@ -88,8 +83,6 @@ class SpatialvlaGridPolicy(HubPolicy, SavesTiedWeightsOnce, PreTrainedPolicy):
         self, config: SpatialvlaGridConfig, dataset_meta: LeRobotDatasetMetadata | None = None, **_: object
     ):
         super().__init__(config, dataset_meta)
-        config.validate_features()
-        config.trained_with = trained_with(config, AS_TRAINED)
         self.tokens, self.backbone = build_model(config)
         self.register_buffer("symbol_ids", torch.tensor(self.tokens.symbols), persistent=False)
         self.zoedepth = build_depth(config)
@@ -114,13 +107,7 @@ class SpatialvlaGridPolicy(HubPolicy, SavesTiedWeightsOnce, PreTrainedPolicy):
             compiled=config.compile_model,
         )
         self.state_bins = Bins(NUM_STATE_BINS, "centers")
-        # physical size of 1 in normalised actions, known while training: (D,)
-        self.register_buffer("action_unit", torch.ones(self._action_dim), persistent=False)
-        self._take_units(dataset_meta)
-        # of all that is random in training: the crop
-        self.generator = torch.Generator().manual_seed(torch.initial_seed())
-        self._ensemble = make_ensemble(config, self.grids.groups)
-        self._base_buffers: dict[str, Tensor] | None = None  # of the checkpoint, before it was fitted to data
+        self._ensemble = self._make_ensemble()
         self.reset()
 
     @classmethod
@@ -133,20 +120,13 @@ class SpatialvlaGridPolicy(HubPolicy, SavesTiedWeightsOnce, PreTrainedPolicy):
     ) -> "SpatialvlaGridPolicy":
         """As LeRobot's, but a missing or unexpected tensor is an error; the grids adapt to the new data."""
         if config is not None:
-            if dataset_meta is None:
-                check_as_trained(config)
-            else:
-                check_weights_fit(config, SHAPES)
             config.check_grid_as_trained(is_refitted=dataset_meta is not None and config.adapt_embeddings)
-        policy = super().from_pretrained(
-            *args, config=config, dataset_meta=dataset_meta, **{**kwargs, "strict": True}
-        )
-        if dataset_meta is not None:
-            policy._base_buffers = frozen_buffers(policy)
-            if policy.config.adapt_embeddings:
-                policy._adapt(dataset_meta)
-            policy._take_units(dataset_meta)
-        return policy
+        return super().from_pretrained(*args, config=config, dataset_meta=dataset_meta, **kwargs)
+
+    def _fit(self, meta: LeRobotDatasetMetadata) -> None:
+        if self.config.adapt_embeddings:
+            self._adapt(meta)
+        super()._fit(meta)
 
     @torch.no_grad()
     def _init_cells(self) -> None:
@@ -170,23 +150,12 @@ class SpatialvlaGridPolicy(HubPolicy, SavesTiedWeightsOnce, PreTrainedPolicy):
         names = dim_names(meta.features[ACTION])
         edges = edges_text(old, names), edges_text(new, names)
         logger.info("Action grids adapted.\nOld edges\n%s\nNew edges\n%s", *edges)
-        self.grids = new.to(self.symbol_ids.device)
-        self.first_cells = torch.tensor(new.offsets, device=self.symbol_ids.device)
+        self.grids = new.to(self._device)
+        self.first_cells = torch.tensor(new.offsets, device=self._device)
         self.config.grid_params = new.to_dict()
 
-    @torch.no_grad()
-    def _take_units(self, meta: LeRobotDatasetMetadata | None) -> None:
-        self._action_names = None
-        if meta is None:
-            return
-        assert meta.stats is not None
-        mode = self.config.normalization_mapping["ACTION"]
-        low, high = bounds(meta.stats[ACTION], mode, self._action_dim)
-        self.action_unit.copy_(torch.from_numpy(high - low) / 2)
-        self._action_names = dim_names(meta.features[ACTION])
-
-    def get_optim_params(self) -> list[nn.Parameter]:
-        return [parameter for parameter in self.parameters() if parameter.requires_grad]
+    def _newest_only(self) -> list[int]:
+        return [dim for group in self.grids.groups if group.transform == "binary" for dim in group.dims]
 
     def _get_default_peft_targets(self) -> dict[str, Any]:
         return peft_targets(self, "language_model", NEW_PARTS)
@@ -194,11 +163,6 @@ class SpatialvlaGridPolicy(HubPolicy, SavesTiedWeightsOnce, PreTrainedPolicy):
     def _validate_peft_config(self, peft_config: Any) -> None:
         super()._validate_peft_config(peft_config)
         check_buffers_are_the_bases(self, self._base_buffers, "give --policy.adapt_embeddings=false")
-
-    def reset(self) -> None:
-        self._queue: deque[Tensor] = deque(maxlen=self.config.n_action_steps)
-        if self._ensemble is not None:
-            self._ensemble.reset()
 
     # Training
 
@@ -209,7 +173,7 @@ class SpatialvlaGridPolicy(HubPolicy, SavesTiedWeightsOnce, PreTrainedPolicy):
         if self.training:
             begin_batch(self.config, self.generator)
         shape = self.config.chunk_size, self._action_dim
-        actions_BTD = read_actions(batch, ACTION, self.config.type, self.symbol_ids.device, shape)
+        actions_BTD = read_actions(batch, ACTION, self.config.type, self._device, shape)
         cells_BTG = self.grids.encode(actions_BTD)
         with self._autocast():
             hidden_BTGH = self._hidden(batch, cells_BTG)
@@ -228,15 +192,15 @@ class SpatialvlaGridPolicy(HubPolicy, SavesTiedWeightsOnce, PreTrainedPolicy):
         prompt = self._prompt(batch)
         cells_BS = (cells_BTG + self.first_cells).flatten(1)
         embeds_BXH = torch.cat([self._embeds(batch, prompt.ids), self._embed_cells(cells_BS[:, :-1])], dim=1)
-        written_BX = torch.cat([prompt.written, torch.ones_like(cells_BS[:, 1:], dtype=torch.bool)], dim=1)
-        index_X = torch.arange(written_BX.shape[1], device=written_BX.device)
+        mask_BX = torch.cat([prompt.mask, torch.ones_like(cells_BS[:, 1:], dtype=torch.bool)], dim=1)
+        index_X = torch.arange(mask_BX.shape[1], device=mask_BX.device)
         reads_XX = index_X <= index_X[:, None]
         if self._prompt_reads_all:
             reads_XX |= (index_X < prompt.ids.shape[1]) & (index_X[:, None] < prompt.ids.shape[1])
         hidden_BXH = self.backbone.hidden_states(
             embeds_BXH,
-            (written_BX.cumsum(dim=1) - 1).clamp(min=0),
-            reads_XX & written_BX[:, None],
+            (mask_BX.cumsum(dim=1) - 1).clamp(min=0),
+            reads_XX & mask_BX[:, None],
         )
         return hidden_BXH[:, -cells_BS.shape[1] :].unflatten(1, cells_BTG.shape[1:])
 
@@ -257,13 +221,6 @@ class SpatialvlaGridPolicy(HubPolicy, SavesTiedWeightsOnce, PreTrainedPolicy):
         logits = [self.cell_head(hidden_BTH), self.backbone.vlm.lm_head(hidden_BTH)]
         return self.backbone.cap(torch.cat(logits, dim=-1).float())
 
-    def _kept(self, batch: dict[str, Tensor]) -> Tensor:
-        """(B, T) bool: which actions are trained on."""
-        if f"{ACTION}_is_pad" in batch and not self.config.loss_on_padded_actions:
-            return ~batch[f"{ACTION}_is_pad"].bool()
-        actions = batch[ACTION]
-        return actions.new_ones(len(actions), self.config.chunk_size, dtype=torch.bool)
-
     @torch.no_grad()
     def _metrics(
         self, chosen_BTG: Tensor, cells_BTG: Tensor, kept_BTG: Tensor, losses_BTG: Tensor
@@ -274,31 +231,11 @@ class SpatialvlaGridPolicy(HubPolicy, SavesTiedWeightsOnce, PreTrainedPolicy):
         Errors are known where a dataset was given, that is while training.
         """
         parts = {"token_accuracy": (chosen_BTG == cells_BTG, kept_BTG)}
-        if self._action_names is not None:
-            errors_BTD = (self.grids.decode(chosen_BTG) - self.grids.decode(cells_BTG)).abs()
-            errors_BTD = errors_BTD * self.action_unit
-            kept_BTD = kept_BTG[..., :1].expand_as(errors_BTD)
-            parts["l1"] = errors_BTD, kept_BTD
-            for dim, name in enumerate(self._action_names):
-                parts[f"l1_{name}"] = errors_BTD[..., dim], kept_BTD[..., dim]
+        errors_BTD = (self.grids.decode(chosen_BTG) - self.grids.decode(cells_BTG)).abs() * self.action_unit
+        parts |= self._l1_parts(errors_BTD, kept_BTG[..., :1].expand_as(errors_BTD))
         return means(parts, losses_BTG, self.config.trained_batches)
 
     # Inference
-
-    def select_action(self, batch: dict[str, Tensor], **_: object) -> Tensor:
-        """(B, D) next normalised action.
-
-        With a temporal ensemble every call predicts; else when the queue of ``n_action_steps`` is empty.
-        """
-        if self._ensemble is not None:
-            return self._ensemble(self._predict(batch, self.config.temporal_ensemble_size))
-        if not self._queue:
-            self._queue.extend(self._predict(batch, self.config.n_action_steps).unbind(dim=1))
-        return self._queue.popleft()
-
-    def predict_action_chunk(self, batch: dict[str, Tensor], **_: object) -> Tensor:
-        """(B, T, D) normalised actions."""
-        return self._predict(batch, self.config.chunk_size)
 
     def _predict(self, batch: dict[str, Tensor], num_steps: int) -> Tensor:
         """The first ``num_steps`` actions of the chunk; the model need not choose the rest."""
@@ -314,7 +251,7 @@ class SpatialvlaGridPolicy(HubPolicy, SavesTiedWeightsOnce, PreTrainedPolicy):
             embeds_BLH = self._embeds(batch, prompt.ids)
             # the cap on logits keeps their order
             cells_BS = self._writer(
-                Prompt(embeds_BLH, prompt.written),
+                Prompt(embeds_BLH, prompt.mask),
                 self._group_rows,
                 num_steps,
                 self.cell_embedding.weight * self.backbone.embed_scale,
@@ -343,17 +280,17 @@ class SpatialvlaGridPolicy(HubPolicy, SavesTiedWeightsOnce, PreTrainedPolicy):
     # Prompt
 
     def _prompt(self, batch: dict[str, Tensor]) -> TokenRows:
-        """Everything before the answer, with gaps; its last column has none."""
+        """Everything before the answer, with padding; its last column has none."""
         tokens = self.tokens
-        task = read_task(batch, self.config.type, self.symbol_ids.device)
+        task = read_task(batch, self.config.type, self._device)
         images = len(self._cameras) * self.backbone.tokens_per_image * [tokens.image]
         parts = [TokenRows.constant([*images, *tokens.start], task.ids), task]
         if self.config.use_state:
-            numbers_BN = self.state_bins.encode(self._read(batch, OBS_STATE))
-            symbols_BNC, written_BNC = number_symbols(
+            numbers_BN = self.state_bins.encode(self._of_batch(batch, OBS_STATE))
+            symbols_BNC, mask_BNC = number_symbols(
                 numbers_BN, digits_needed(NUM_STATE_BINS), zero_padded=False
             )
-            state = TokenRows(self.symbol_ids[symbols_BNC].flatten(1), written_BNC.flatten(1))
+            state = TokenRows(self.symbol_ids[symbols_BNC].flatten(1), mask_BNC.flatten(1))
             parts += [TokenRows.constant(tokens.state_start, task.ids), state]
         return TokenRows.join([*parts, TokenRows.constant(tokens.task_end, task.ids)])
 
@@ -366,7 +303,7 @@ class SpatialvlaGridPolicy(HubPolicy, SavesTiedWeightsOnce, PreTrainedPolicy):
 
     def _see(self, batch: dict[str, Tensor], key: str) -> Tensor:
         """Features of a camera's patches, which know where they are: (B, P, vision model's hidden size)."""
-        image = read_image(batch, key, self.config.type, self.symbol_ids.device)
+        image = read_image(batch, key, self.config.type, self._device)
         windows = draw_windows(image, self.config.crop_fraction, self.generator if self.training else None)
         pixels = resized_pixels(windows.cut(image), self.backbone.image_size)
         points = self._points(batch, key.removeprefix(f"{OBS_IMAGES}."), windows, pixels)
@@ -388,23 +325,6 @@ class SpatialvlaGridPolicy(HubPolicy, SavesTiedWeightsOnce, PreTrainedPolicy):
         intrinsics = resize_intrinsics(intrinsics, (windows.height, windows.width), depth_size)
         return lattice_points(depth, intrinsics, size)
 
-    def _read(self, batch: dict[str, Tensor], key: str) -> Tensor:
-        return read_tensor(batch, key, self.config.type, self.symbol_ids.device)
-
-    @property
-    def _cameras(self) -> list[str]:
-        return sorted(self.config.image_features)
-
-    @property
-    def _action_dim(self) -> int:
-        assert self.config.action_feature is not None
-        return self.config.action_feature.shape[0]
-
     @property
     def _prompt_reads_all(self) -> bool:
         return self.config.prefix_attention == "bidirectional"
-
-    def _autocast(self) -> torch.autocast:
-        """The precision of ``config.dtype``, whoever calls: training, evaluation or a user's own loop."""
-        bfloat16 = self.config.dtype == "bfloat16"
-        return torch.autocast(self.symbol_ids.device.type, dtype=torch.bfloat16, enabled=bfloat16)

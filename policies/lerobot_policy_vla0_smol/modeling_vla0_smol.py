@@ -6,19 +6,16 @@ Shapes: `B` batch, `T` actions of a chunk, `D` action dims, `N` = T * D numbers,
 takes, `L` tokens of a sequence, `A` tokens of an answer, `H` hidden size, `P` tokens of an image.
 """
 
-from collections import deque
 from typing import Any, ClassVar
 
 import torch
 from lerobot.datasets import LeRobotDatasetMetadata
-from lerobot.policies import PreTrainedPolicy
 from lerobot.utils.constants import ACTION, OBS_STATE
 from torch import Tensor
 from torch.nn.functional import cross_entropy
 
 from lerobot_bomb.actions.accuracy import counted_numbers, exact_numbers, means, read_numbers
 from lerobot_bomb.actions.bins import Bins
-from lerobot_bomb.actions.ensemble import TemporalEnsemble
 from lerobot_bomb.actions.relative import RelativeActions, bounds, named_dims, present_episodes
 from lerobot_bomb.actions.text import (
     END,
@@ -31,16 +28,16 @@ from lerobot_bomb.actions.text import (
     draw_hidden,
     number_symbols,
 )
-from lerobot_bomb.adapters import check_buffers_are_the_bases, frozen_buffers, peft_targets
+from lerobot_bomb.checkpoints.adapters import check_buffers_are_the_bases, peft_targets
 from lerobot_bomb.data.columns import dim_names, episode_bounds, read_columns
 from lerobot_bomb.decoding.decoder import Prompt
 from lerobot_bomb.decoding.draft import KnownSymbols, LinearDraft
 from lerobot_bomb.decoding.grammar import NumberGrammar
+from lerobot_bomb.decoding.kv_cache import check_positions
 from lerobot_bomb.decoding.writer import NumberWriter
-from lerobot_bomb.hub.policy import HubPolicy
-from lerobot_bomb.policy_flags import check_as_trained, check_weights_fit, trained_with
-from lerobot_bomb.processes import SavesTiedWeightsOnce, weighed
-from lerobot_bomb.training_draws import begin_batch
+from lerobot_bomb.policies.policy import TokenVlaPolicy
+from lerobot_bomb.training.distributed import weighed
+from lerobot_bomb.training.randomness import begin_batch
 from lerobot_bomb.vlm.backbone import (
     SmolVLMBackbone,
     build_backbone,
@@ -48,24 +45,23 @@ from lerobot_bomb.vlm.backbone import (
     config_dict,
     load_backbone,
 )
-from lerobot_bomb.vlm.cached_text import check_positions
 from lerobot_bomb.vlm.images import crop_and_resize
-from lerobot_bomb.vlm.inputs import read_actions, read_image, read_task, read_tensor
+from lerobot_bomb.vlm.inputs import read_actions, read_image, read_task
 from lerobot_bomb.vlm.prompt import PromptTokens
 from lerobot_bomb.vlm.tokenizer import load_tokenizer
 from lerobot_policy_vla0_smol.card_vla0_smol import METHOD
 from lerobot_policy_vla0_smol.configuration_vla0_smol import AS_TRAINED, SHAPES, Vla0SmolConfig
 
 
-class Vla0SmolPolicy(HubPolicy, SavesTiedWeightsOnce, PreTrainedPolicy):
+class Vla0SmolPolicy(TokenVlaPolicy):
     """A stock SmolVLM that writes the next ``chunk_size`` actions as integers."""
 
     config_class = Vla0SmolConfig  # pyright: ignore[reportAssignmentType]  LeRobot annotates it as None
     name = "vla0_smol"  # pyright: ignore[reportAssignmentType]
     method = METHOD
     config: Vla0SmolConfig
+    shapes, as_trained = SHAPES, AS_TRAINED
     symbol_ids: Tensor
-    action_unit: Tensor
     # modules that FSDP shards one by one; accelerate reads the second name
     _fsdp_wrap_modules: ClassVar[list[str]] = ["LlamaDecoderLayer", "SmolVLMEncoderLayer"]
     _no_split_modules = _fsdp_wrap_modules
@@ -74,9 +70,7 @@ class Vla0SmolPolicy(HubPolicy, SavesTiedWeightsOnce, PreTrainedPolicy):
         self, config: Vla0SmolConfig, dataset_meta: LeRobotDatasetMetadata | None = None, **_: object
     ):
         super().__init__(config, dataset_meta)
-        config.validate_features()
         _take_action_names(config, dataset_meta)
-        config.trained_with = trained_with(config, AS_TRAINED)
         self.tokens, self.backbone = _build(config)
         self.register_buffer("symbol_ids", torch.tensor(self.tokens.symbols), persistent=False)
         self.action_bins = Bins(config.n_action_bins, config.bin_mode)
@@ -95,15 +89,9 @@ class Vla0SmolPolicy(HubPolicy, SavesTiedWeightsOnce, PreTrainedPolicy):
         self.relative = (
             RelativeActions(self._action_dim, config.relative_dims()) if config.relative_actions else None
         )
-        # physical size of 1 in normalised actions, known while training: (D,)
-        self.register_buffer("action_unit", torch.ones(self._action_dim), persistent=False)
-        self._knows_units = False
-        # of all that is random in training: the crop and the hidden numbers
-        self.generator = torch.Generator().manual_seed(torch.initial_seed())
-        self._ensemble = _make_ensemble(config)
-        self._base_buffers: dict[str, Tensor] | None = None  # of the checkpoint, before it was fitted to data
+        self._ensemble = self._make_ensemble()
         if dataset_meta is not None:
-            self._fit(dataset_meta)
+            self._fit_relative(dataset_meta)
         self.reset()
 
     @classmethod
@@ -116,15 +104,8 @@ class Vla0SmolPolicy(HubPolicy, SavesTiedWeightsOnce, PreTrainedPolicy):
     ) -> "Vla0SmolPolicy":
         """As LeRobot's, but a missing or unexpected tensor is an error; relative actions fit the new data."""
         _take_action_names(config, dataset_meta)
-        if config is not None:
-            if dataset_meta is None:
-                check_as_trained(config)
-            else:
-                check_weights_fit(config, SHAPES)
         try:
-            policy = super().from_pretrained(
-                *args, config=config, dataset_meta=dataset_meta, **{**kwargs, "strict": True}
-            )
+            return super().from_pretrained(*args, config=config, dataset_meta=dataset_meta, **kwargs)
         except ValueError as error:
             if " relative." in str(error):
                 raise ValueError(
@@ -132,36 +113,36 @@ class Vla0SmolPolicy(HubPolicy, SavesTiedWeightsOnce, PreTrainedPolicy):
                     "and cannot be changed"
                 ) from error
             raise
-        if dataset_meta is not None:
-            policy._base_buffers = frozen_buffers(policy)
-            policy._fit(dataset_meta)
-        return policy
+
+    def _fit(self, meta: LeRobotDatasetMetadata) -> None:
+        super()._fit(meta)
+        self._fit_relative(meta)
 
     @torch.no_grad()
-    def _fit(self, meta: LeRobotDatasetMetadata) -> None:
-        """Take from a dataset what its normalisers do and how far its actions are from the state."""
-        config = self.config
-        assert meta.stats is not None
-        action_mode, state_mode = (config.normalization_mapping[kind] for kind in ("ACTION", "STATE"))
-        action_bounds = bounds(meta.stats[ACTION], action_mode, self._action_dim)
-        self.action_unit.copy_(torch.from_numpy(action_bounds[1] - action_bounds[0]) / 2)
-        self._knows_units = True
+    def _fit_relative(self, meta: LeRobotDatasetMetadata) -> None:
+        """Take from a dataset how far its actions are from the state, where they are relative to it."""
         if self.relative is None:
             return
+        config = self.config
+        assert meta.stats is not None
         if OBS_STATE not in meta.features:
             raise ValueError(
                 f"--policy.relative_actions=true needs {OBS_STATE!r} under this name in the dataset; it has "
                 f"{sorted(meta.features)}"
             )
         columns = read_columns(meta, (ACTION, OBS_STATE), present_episodes(meta))
-        state_bounds = bounds(meta.stats[OBS_STATE], state_mode, columns[OBS_STATE].shape[1])
+        action_bounds, state_bounds = (
+            bounds(meta.stats[key], config.normalization_mapping[kind], columns[key].shape[1])
+            for key, kind in ((ACTION, "ACTION"), (OBS_STATE, "STATE"))
+        )
         _, ends = episode_bounds(columns["episode_index"])
         self.relative.fit(
             columns[ACTION], columns[OBS_STATE], ends, config.chunk_size, action_bounds, state_bounds
         )
 
-    def get_optim_params(self) -> list[torch.nn.Parameter]:
-        return [parameter for parameter in self.parameters() if parameter.requires_grad]
+    def _newest_only(self) -> list[int]:
+        config, flag = self.config, "--policy.temporal_ensemble_exclude_joints"
+        return named_dims(config.action_names, config.temporal_ensemble_exclude_joints, flag)
 
     def _get_default_peft_targets(self) -> dict[str, Any]:
         return peft_targets(self, "text_model", ())
@@ -171,11 +152,6 @@ class Vla0SmolPolicy(HubPolicy, SavesTiedWeightsOnce, PreTrainedPolicy):
         check_buffers_are_the_bases(
             self, self._base_buffers, "start from one that lerobot-bomb init writes for this dataset"
         )
-
-    def reset(self) -> None:
-        self._queue: deque[Tensor] = deque(maxlen=self.config.n_action_steps)
-        if self._ensemble is not None:
-            self._ensemble.reset()
 
     # Training
 
@@ -213,27 +189,24 @@ class Vla0SmolPolicy(HubPolicy, SavesTiedWeightsOnce, PreTrainedPolicy):
         kept_BA = answer.labels != IGNORED
         right_BA = logits_BAV.argmax(dim=-1) == answer.labels
         digits_BA = logits_BAV[..., self.symbol_ids[:SPACE]].argmax(dim=-1)
-        read_BN = read_numbers(numbers, answer.with_gaps(digits_BA, numbers))
-        exact_BN = exact_numbers(numbers, answer.with_gaps(right_BA, numbers))
+        read_BN = read_numbers(numbers, answer.with_padding(digits_BA, numbers))
+        exact_BN = exact_numbers(numbers, answer.with_padding(right_BA, numbers))
         counted_BN = counted_numbers(numbers)
         bins = self.action_bins
         errors_BN = (bins.decode(read_BN.clamp(max=bins.num_bins - 1)) - bins.decode(bins_BN)).abs()
         errors_BTD = errors_BN.unflatten(1, (-1, self._action_dim)) * self._unit
         counted_BTD = counted_BN.view_as(errors_BTD)
         parts = {"token_accuracy": (right_BA, kept_BA), "value_accuracy": (exact_BN, counted_BN)}
-        if self._knows_units:
-            parts["l1"] = errors_BTD, counted_BTD
-            for dim, name in enumerate(self.config.action_names):
-                parts[f"l1_{name}"] = errors_BTD[..., dim], counted_BTD[..., dim]
+        parts |= self._l1_parts(errors_BTD, counted_BTD)
         return means(parts, losses_BA, self.config.trained_batches)
 
     def _answer_logits(self, batch: dict[str, Tensor], prompt: TokenRows, answer: TokenRows) -> Tensor:
         """Teacher-forced logits of every answer token: (B, A, V)."""
-        ids_BL = TokenRows.join([prompt, answer]).without_gaps().ids
+        ids_BL = TokenRows.join([prompt, answer]).without_padding().ids
         hidden_BLH = self.backbone.hidden_states(self._embeds(batch, ids_BL))
         offsets_A = torch.arange(answer.ids.shape[1], device=ids_BL.device)
         # a token is predicted one column earlier; columns beyond a short row carry no label
-        columns_BA = prompt.written.sum(dim=1, keepdim=True) - 1 + offsets_A
+        columns_BA = prompt.mask.sum(dim=1, keepdim=True) - 1 + offsets_A
         columns_BA = columns_BA.clamp(max=ids_BL.shape[1] - 1)
         index_BAH = columns_BA[..., None].expand(-1, -1, hidden_BLH.shape[-1])
         return self.backbone.logits(hidden_BLH.gather(1, index_BAH))
@@ -241,31 +214,30 @@ class Vla0SmolPolicy(HubPolicy, SavesTiedWeightsOnce, PreTrainedPolicy):
     def _bins(self, batch: dict[str, Tensor]) -> Tensor:
         """Actions (B, T, D) in [-1, 1] -> bins of what is written, step by step: (B, N) int64."""
         shape = self.config.chunk_size, self._action_dim
-        actions_BTD = read_actions(batch, ACTION, "vla0_smol", self.symbol_ids.device, shape)
+        actions_BTD = read_actions(batch, ACTION, self.config.type, self._device, shape)
         if self.relative is not None:
-            actions_BTD = self.relative.encode(actions_BTD, self._read(batch, OBS_STATE))
+            actions_BTD = self.relative.encode(actions_BTD, self._of_batch(batch, OBS_STATE))
         return self.action_bins.encode(actions_BTD).flatten(1)
 
     def _numbers(self, batch: dict[str, Tensor], bins_BN: Tensor) -> NumberTokens:
         """Bins -> their tokens, some of them hidden while training."""
         numbers = self._to_tokens(bins_BN, self.config.n_action_bins)
-        if f"{ACTION}_is_pad" in batch and not self.config.loss_on_padded_actions:
-            kept_BN = ~batch[f"{ACTION}_is_pad"].bool().repeat_interleave(self._action_dim, dim=1)
-            numbers = NumberTokens(numbers.ids, numbers.written, numbers.trained & kept_BN[..., None])
+        kept_BN = self._kept(batch).repeat_interleave(self._action_dim, dim=1)
+        numbers = NumberTokens(numbers.ids, numbers.mask, numbers.trained & kept_BN[..., None])
         return self._hide(numbers) if self.training else numbers
 
     def _hide(self, numbers: NumberTokens) -> NumberTokens:
         """Hide random numbers, steps or characters from the model."""
         level = self.config.mask_level
-        written_BNC = numbers.written
+        mask_BNC = numbers.mask
         if level == "char":
-            hidden_BM = self._draw_hidden(written_BNC.flatten(1))
-            return numbers.hide_characters(hidden_BM.view_as(written_BNC), self.tokens.hidden)
+            hidden_BM = self._draw_hidden(mask_BNC.flatten(1))
+            return numbers.hide_characters(hidden_BM.view_as(mask_BNC), self.tokens.hidden)
         if level == "step":
-            hidden_BT = self._draw_hidden(written_BNC[:, :: self._action_dim, 0])
+            hidden_BT = self._draw_hidden(mask_BNC[:, :: self._action_dim, 0])
             hidden_BN = hidden_BT.repeat_interleave(self._action_dim, dim=1)
         else:
-            hidden_BN = self._draw_hidden(written_BNC[..., 0])
+            hidden_BN = self._draw_hidden(mask_BNC[..., 0])
         return numbers.hide_numbers(hidden_BN, self.tokens.hidden)
 
     def _draw_hidden(self, eligible_BM: Tensor) -> Tensor:
@@ -277,21 +249,6 @@ class Vla0SmolPolicy(HubPolicy, SavesTiedWeightsOnce, PreTrainedPolicy):
 
     # Inference
 
-    def select_action(self, batch: dict[str, Tensor], **_: object) -> Tensor:
-        """(B, D) next normalised action.
-
-        With a temporal ensemble every call predicts; else when the queue of ``n_action_steps`` is empty.
-        """
-        if self._ensemble is not None:
-            return self._ensemble(self._predict(batch, self.config.temporal_ensemble_size))
-        if not self._queue:
-            self._queue.extend(self._predict(batch, self.config.n_action_steps).unbind(dim=1))
-        return self._queue.popleft()
-
-    def predict_action_chunk(self, batch: dict[str, Tensor], **_: object) -> Tensor:
-        """(B, T, D) normalised actions."""
-        return self._predict(batch, self.config.chunk_size)
-
     @torch.no_grad()
     def _predict(self, batch: dict[str, Tensor], num_steps: int) -> Tensor:
         """The first ``num_steps`` actions of the chunk, absolute; the model need not write the rest."""
@@ -299,49 +256,49 @@ class Vla0SmolPolicy(HubPolicy, SavesTiedWeightsOnce, PreTrainedPolicy):
         with self._autocast():
             prompt = self._prompt(batch)
             if not prompt.ids.is_cuda:  # prompts of other lengths would be recorded anew there
-                prompt = prompt.without_gaps()
+                prompt = prompt.without_padding()
             embeds_BLH = self._embeds(batch, prompt.ids)
             decoded = self._writer(
-                Prompt(embeds_BLH, prompt.written), self.symbol_ids, num_steps * self._action_dim
+                Prompt(embeds_BLH, prompt.mask), self.symbol_ids, num_steps * self._action_dim
             )
         # casts of weights cached under inference mode cannot be used by a later training step
         torch.clear_autocast_cache()
         actions_BTD = self.action_bins.decode(decoded.numbers).view(-1, num_steps, self._action_dim)
         if self.relative is None:
             return actions_BTD
-        return self.relative.decode(actions_BTD, self._read(batch, OBS_STATE)).clamp(-1, 1)
+        return self.relative.decode(actions_BTD, self._of_batch(batch, OBS_STATE)).clamp(-1, 1)
 
     # Prompt
 
     def _prompt(self, batch: dict[str, Tensor]) -> TokenRows:
-        """Everything up to ``Assistant:``, with gaps."""
+        """Everything up to ``Assistant:``, with padding."""
         tokens = self.tokens
-        task = read_task(batch, self.config.type, self.symbol_ids.device)
+        task = read_task(batch, self.config.type, self._device)
         images = len(self._cameras) * [*tokens.image_start, *self._image_span, *tokens.image_end]
         parts = [TokenRows.constant([*tokens.start, *images], task.ids), task]
         if self.config.use_state:
             state = self._to_tokens(
-                self.state_bins.encode(self._read(batch, OBS_STATE)), self.config.n_state_bins
+                self.state_bins.encode(self._of_batch(batch, OBS_STATE)), self.config.n_state_bins
             )
             parts += [
                 TokenRows.constant(tokens.state_start, task.ids),
-                TokenRows(state.ids.flatten(1), state.written.flatten(1)),
+                TokenRows(state.ids.flatten(1), state.mask.flatten(1)),
                 TokenRows.constant(tokens.state_end, task.ids),
             ]
         return TokenRows.join([*parts, TokenRows.constant(tokens.answer_start, task.ids)])
 
     def _to_tokens(self, numbers_BN: Tensor, num_values: int) -> NumberTokens:
         fixed_width = self.config.number_width
-        symbols_BNC, written_BNC = number_symbols(
+        symbols_BNC, mask_BNC = number_symbols(
             numbers_BN, fixed_width or digits_needed(num_values), zero_padded=fixed_width > 0
         )
-        return NumberTokens(self.symbol_ids[symbols_BNC], written_BNC, written_BNC)
+        return NumberTokens(self.symbol_ids[symbols_BNC], mask_BNC, mask_BNC)
 
     def _embeds(self, batch: dict[str, Tensor], ids_BL: Tensor) -> Tensor:
         """Embeddings (B, L, H) of a sequence that starts with a prompt, image features in place."""
         generator = self.generator if self.training else None
         fraction, size = self.config.crop_fraction, self.backbone.image_size
-        images = [read_image(batch, key, "vla0_smol", ids_BL.device) for key in self._cameras]
+        images = [read_image(batch, key, self.config.type, ids_BL.device) for key in self._cameras]
         pixels = [crop_and_resize(image, fraction, size, generator) for image in images]
         features_BPH = self.backbone.embed_images(torch.stack(pixels, dim=1).flatten(0, 1))
         embeds_BLH = self.backbone.embed_tokens(ids_BL)
@@ -356,52 +313,20 @@ class Vla0SmolPolicy(HubPolicy, SavesTiedWeightsOnce, PreTrainedPolicy):
         starts = first + period * torch.arange(len(self._cameras), device=device)
         return (starts[:, None] + torch.arange(len(self._image_span), device=device)).flatten()
 
-    def _read(self, batch: dict[str, Tensor], key: str) -> Tensor:
-        return read_tensor(batch, key, "vla0_smol", self.symbol_ids.device)
-
-    @property
-    def _cameras(self) -> list[str]:
-        return sorted(self.config.image_features)
-
     @property
     def _image_span(self) -> list[int]:
         return [self.tokens.image] * self.backbone.tokens_per_image
-
-    @property
-    def _action_dim(self) -> int:
-        assert self.config.action_feature is not None
-        return self.config.action_feature.shape[0]
 
     @property
     def _unit(self) -> Tensor:
         """(D,) physical size of 1 in what is written."""
         return self.action_unit if self.relative is None else self.action_unit * self.relative.scale
 
-    def _autocast(self) -> torch.autocast:
-        """The precision of ``config.dtype``, whoever calls: training, evaluation or a user's own loop."""
-        bfloat16 = self.config.dtype == "bfloat16"
-        return torch.autocast(self.symbol_ids.device.type, dtype=torch.bfloat16, enabled=bfloat16)
-
 
 def _take_action_names(config: Vla0SmolConfig | None, meta: LeRobotDatasetMetadata | None) -> None:
     """The dataset's names in one row; LeRobot keeps only those of groups where a dataset groups them."""
     if config is not None and meta is not None:
         config.action_feature_names = dim_names(meta.features[ACTION])
-
-
-def _make_ensemble(config: Vla0SmolConfig) -> TemporalEnsemble | None:
-    if not config.temporal_ensemble_size:
-        return None
-    return TemporalEnsemble(
-        config.temporal_ensemble_size,
-        config.temporal_ensemble_weighting,
-        config.temporal_ensemble_coefficient,
-        named_dims(
-            config.action_names,
-            config.temporal_ensemble_exclude_joints,
-            "--policy.temporal_ensemble_exclude_joints",
-        ),
-    )
 
 
 def _build(config: Vla0SmolConfig) -> tuple[PromptTokens, SmolVLMBackbone]:

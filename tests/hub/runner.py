@@ -69,7 +69,7 @@ def main() -> None:
         if [name] == FORGET:
             shutil.rmtree(os.environ["HF_HOME"], ignore_errors=True)
         elif name == "lerobot-bomb":
-            from lerobot_bomb.cli import main as bomb
+            from lerobot_bomb.commands.main import main as bomb
 
             code = bomb(flags)
             if code:

@@ -19,8 +19,8 @@ from hub.damage import change_tensors, every_other, one_nan, write_checkpoint
 from hub.runner import FORGET, run
 from hub.server import TOKEN, LoopbackHub, Repository
 from hub.test_loop import DATASET, SMALL, check_no_secret, evaluate, record, train
-from lerobot_bomb.checkpoint import read_config
-from lerobot_bomb.cli import main
+from lerobot_bomb.checkpoints.folder import read_config
+from lerobot_bomb.commands.main import main
 
 peft = pytest.importorskip("peft")
 

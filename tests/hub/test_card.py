@@ -11,9 +11,9 @@ from lerobot.configs.train import TrainPipelineConfig
 from vla0_smol_cases import make_config
 
 from hub.server import LoopbackHub
-from lerobot_bomb.environment import Environment
+from lerobot_bomb.data.environment import Environment
+from lerobot_bomb.data.facts import DatasetFacts, eval_flags_of
 from lerobot_bomb.hub.card import Checkpoint, PolicyCard
-from lerobot_bomb.hub.dataset import DatasetFacts, eval_flags_of
 from lerobot_policy_fdvla.card_fdvla import METHOD as FDVLA
 from lerobot_policy_spatialvla_grid.card_spatialvla_grid import METHOD as GRID
 from lerobot_policy_vla0_smol.card_vla0_smol import METHOD as VLA0

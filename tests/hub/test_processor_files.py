@@ -33,10 +33,10 @@ from hub.damage import (
     write_checkpoint,
 )
 from hub.server import LoopbackHub, Repository
-from lerobot_bomb.adapters import check_adapters
-from lerobot_bomb.checkpoint import load_processors, read_config
+from lerobot_bomb.checkpoints import processor_files
+from lerobot_bomb.checkpoints.adapters import check_adapters
+from lerobot_bomb.checkpoints.folder import load_processors, read_config
 from lerobot_bomb.explain.interventions import intervene
-from lerobot_bomb.hub import processor_files
 from lerobot_policy_vla0_smol import Vla0SmolConfig
 
 UNNORMALIZER = "policy_postprocessor_step_0_unnormalizer_processor.safetensors"

@@ -46,7 +46,6 @@ def evaluate(stock_cli: Run, monkeypatch: pytest.MonkeyPatch, tmp_path: Path) ->
         raise LoadedError
 
     monkeypatch.setattr(lerobot_eval, "eval_policy_all", stop)
-    monkeypatch.setattr(lerobot_eval, "init_logging", lambda: None)  # to what pytest closes after a test
     own = "--policy.device=cpu --env.type=bomb --env.task=place --env.image_size=64"
     own += " --eval.n_episodes=1 --eval.batch_size=1 --eval.use_async_envs=false"
     output = f"--output_dir={tmp_path / 'eval'}"

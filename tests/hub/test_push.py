@@ -27,10 +27,10 @@ from hub.damage import (
     without_state,
 )
 from hub.server import TOKEN, LoopbackHub
-from lerobot_bomb.cli import main
-from lerobot_bomb.environment import Environment
-from lerobot_bomb.episode_result import EpisodeResult, PolicyIdentity
-from lerobot_bomb.schema import EpisodeSpec
+from lerobot_bomb.bomb.episode import EpisodeSpec
+from lerobot_bomb.commands.main import main
+from lerobot_bomb.data.environment import Environment
+from lerobot_bomb.envs.results import EpisodeResult, PolicyIdentity
 from lerobot_policy_vla0_smol.modeling_vla0_smol import Vla0SmolPolicy
 
 REPO_ID = "me/x"

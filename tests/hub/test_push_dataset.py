@@ -8,7 +8,7 @@ import yaml
 
 from hub.dataset_damage import DATASET_DAMAGES
 from hub.server import TOKEN, LoopbackHub
-from lerobot_bomb.cli import main
+from lerobot_bomb.commands.main import main
 
 REPO_ID = "me/d"
 

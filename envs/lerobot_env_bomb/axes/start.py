@@ -1,0 +1,35 @@
+"""Perturbation axis `start`: where stone and gripper are at the start."""
+
+from dataclasses import dataclass, replace
+from typing import Self
+
+import numpy as np
+
+from lerobot_bomb.bomb.layout import Layout
+from lerobot_bomb.bomb.perturbations import magnitude
+from lerobot_bomb.bomb.suite import Episode
+from lerobot_env_bomb.axes.transform import Transform
+
+
+@dataclass(frozen=True)
+class Start(Transform):
+    """The stone to be moved and the gripper start elsewhere."""
+
+    stone_offset_m: tuple[float, float]  # x, y
+    gripper_offset_m: tuple[float, float]
+
+    @classmethod
+    def draw(cls, level: int, rng: np.random.Generator, nominal: Episode) -> Self:
+        side = float(rng.choice((-1.0, 1.0)))
+        # Towards the board, for beyond the tray is no workspace, and along with the stone, which the arm
+        # would else hide from a camera that has swung.
+        angle_rad = side * rng.uniform(0.5 * np.pi, 0.75 * np.pi)
+        stone_m, gripper_m = (1e-3 * magnitude("start", what, level) for what in ("stone", "gripper"))
+        gripper_offset = gripper_m * np.cos(angle_rad), gripper_m * np.sin(angle_rad)
+        return cls((0.0, side * stone_m), (float(gripper_offset[0]), float(gripper_offset[1])))
+
+    def arrange(self, layout: Layout, stone: int) -> Layout:
+        stone_xy = layout.stone_xy.copy()
+        stone_xy[stone] += self.stone_offset_m
+        gripper_xyz = layout.gripper_xyz + np.array([*self.gripper_offset_m, 0.0])
+        return replace(layout, stone_xy=stone_xy, gripper_xyz=gripper_xyz)

@@ -1,0 +1,1 @@
+"""The benchmark: board, episodes, observations, perturbations, the expert."""

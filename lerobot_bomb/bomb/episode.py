@@ -1,0 +1,111 @@
+"""An episode: what determines it, how far it got, why it failed."""
+
+import dataclasses
+from dataclasses import dataclass
+from enum import StrEnum
+
+from lerobot_bomb.bomb.board import BOARD, COLORS
+from lerobot_bomb.bomb.perturbations import NONE, Condition
+from lerobot_bomb.bomb.suites import SUITES
+from lerobot_bomb.flags import one_of
+
+# Version of task, physics, observation and success rule: what a recording is of, and its robot type says.
+TASK_VERSION = "1.0"
+# Version of how a policy is measured and what a line of results says. 1.1 is the task of 1.0 with lines that
+# name simulator, policy and tasks.
+PROTOCOL_VERSION = "1.1"
+
+ROBOTS = ("scara", "fetch")
+CONTROL_MODES = ("relative", "absolute")
+SPLITS = ("all", "train", "heldout")
+
+DEFAULT_FPS = 10  # control steps per second
+PHYSICS_HZ = 200  # physics steps per second; a multiple of the control rate
+MAX_SEED = 2**32 - 1  # what LeRobot seeds NumPy with
+
+
+class Stage(StrEnum):
+    """How far an episode got; each stage includes the ones before it."""
+
+    START = "start"
+    REACHED = "reached"
+    GRASPED = "grasped"
+    LIFTED = "lifted"
+    PLACED = "placed"
+
+
+class Failure(StrEnum):
+    """Why an episode failed; exactly one per failed episode."""
+
+    NEVER_REACHED = "never_reached"
+    MISSED_GRASP = "missed_grasp"
+    DROPPED = "dropped"
+    WRONG_STONE = "wrong_stone"
+    WRONG_INTERSECTION = "wrong_intersection"
+    IMPRECISE = "imprecise"
+    DISTURBED_OTHERS = "disturbed_others"
+    TIMEOUT_HOLDING = "timeout_holding"
+
+
+@dataclass(frozen=True)
+class EpisodeSpec:
+    """Everything that, with the code's version, determines an episode bit for bit."""
+
+    seed: int
+    suite: str = "place"
+    robot: str = "scara"
+    split: str = "all"
+    control_mode: str = "relative"
+    fps: int = DEFAULT_FPS
+    # (row, column) and colour; None draws them from the seed
+    target: tuple[int, int] | None = None
+    color: str | None = None
+    success_tolerance_mm: float = 10.0
+    perturbations: str = NONE  # a condition such as "camera:2+light:3"; see `Condition`
+
+    def __post_init__(self) -> None:
+        # one spelling, so that equal conditions compare equal
+        object.__setattr__(self, "perturbations", str(Condition.parse(self.perturbations)))
+        one_of("--env.task", self.suite, SUITES)
+        one_of("--env.robot", self.robot, ROBOTS)
+        one_of("--env.split", self.split, SPLITS)
+        one_of("--env.control_mode", self.control_mode, CONTROL_MODES)
+        if not 0 <= self.seed <= MAX_SEED:
+            raise ValueError(f"--seed={self.seed} must lie in 0..{MAX_SEED}")
+        if not (0 < self.fps <= PHYSICS_HZ and PHYSICS_HZ % self.fps == 0):
+            divisors = [n for n in range(1, PHYSICS_HZ + 1) if PHYSICS_HZ % n == 0]
+            raise ValueError(
+                f"--env.fps={self.fps} does not divide the physics rate of {PHYSICS_HZ} Hz; "
+                f"choose one of: {', '.join(map(str, divisors))}"
+            )
+        if self.target is not None:
+            self._check_target(self.target)
+        if self.color is not None:
+            one_of("--env.color", self.color, COLORS)
+        if not 0 < self.success_tolerance_mm <= 1000 * BOARD.pitch_m / 2:
+            raise ValueError(
+                f"--env.success_tolerance_mm={self.success_tolerance_mm} must lie between 0 and half the "
+                f"pitch, {1000 * BOARD.pitch_m / 2} mm: beyond it a stone would be on two intersections"
+            )
+
+    @staticmethod
+    def _check_target(target: tuple[int, int]) -> None:
+        if len(target) != 2 or not all(0 <= line < BOARD.num_lines for line in target):
+            raise ValueError(
+                f"--env.target={list(target)} is off the board; "
+                f"give [row, column], each in 0..{BOARD.num_lines - 1}"
+            )
+
+    def for_task(self, task_id: int) -> "EpisodeSpec":
+        """This spec with target and colour of a numbered task: 25 x colour + 5 x row + column."""
+        num_targets = BOARD.num_lines**2
+        num_tasks = num_targets * len(COLORS)
+        if not 0 <= task_id < num_tasks:
+            raise ValueError(f"--env.task_ids has {task_id}; {self.suite!r} has tasks 0..{num_tasks - 1}")
+        color, point = divmod(task_id, num_targets)
+        target = divmod(point, BOARD.num_lines)
+        return dataclasses.replace(self, target=target, color=COLORS[color])
+
+    def to_dict(self) -> dict[str, object]:
+        """JSON-ready dict."""
+        return dataclasses.asdict(self)

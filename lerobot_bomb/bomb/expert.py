@@ -1,0 +1,180 @@
+"""A scripted expert for suite `place`: memoryless and free of pauses, so that it can be imitated.
+
+Its action is a continuous function of what an observation shows: gripper, measured finger opening,
+stones, target. It keeps no phase and no counter, and never reads `PrivilegedState.stage`.
+"""
+
+from dataclasses import replace
+
+import numpy as np
+
+from lerobot_bomb.bomb.episode import CONTROL_MODES, DEFAULT_FPS
+from lerobot_bomb.bomb.observation import MAX_STEP_M, WORKSPACE_HIGH_M, WORKSPACE_LOW_M, PrivilegedState
+from lerobot_bomb.flags import one_of
+
+SPEED_M_S = 0.30  # at most, along each of the horizontal plane and the vertical
+GAIN = 0.75  # share of the remaining way that a step of 0.1 s covers near its goal
+
+GRASP_DEPTH_M = 0.0028  # of the pads' lower ends below the stone's centre
+GRASP_SLACK_M = 0.004  # that a held stone may sit too high between the pads
+FLOOR_M = WORKSPACE_LOW_M[2] + 0.0007  # lowest height asked of the gripper
+PRESS_M = 0.0015  # below its goal: where a descent aims, lest its last millimetre take for ever
+RETREAT_HEIGHT_M = 0.11  # of the gripper after the release
+
+# Finger openings.
+SQUEEZE_M = 0.001  # that a held stone measures less than its diameter
+EMPTY_M = (-0.008, -0.005)  # from the diameter: closed on nothing .. a stone may be between the pads
+# in shares of the way from the stone's diameter to open fingers
+HELD_SHARE = (0.045, 0.220)  # holds a stone .. does not yet
+OPEN_SHARE = (0.330, 0.720)  # still touches a stone .. is clear of it
+
+# Approach: over the stone, down a funnel, close.
+HOVER_M = 0.040  # pads above their grasping height while the gripper is off to the side
+FUNNEL_SLOPE = 4.0  # metres of height per metre of lateral error
+FUNNEL_MOUTH_M = 0.003  # lateral error at which the funnel reaches the ground
+CLOSE_LATERAL_M = 0.0060  # lateral error below which the fingers close
+CLOSE_HEIGHT_M = 0.0040  # height above the grasp below which the fingers close
+
+# Carrying: up, across, down a funnel, release.
+CARRY_M = 0.028  # stone above its resting height; clears stones on the board by more than their height
+CARRY_SLOPE = 3.0
+CARRY_MOUTH_M = 0.0020
+CLEARANCE_M = (0.006, 0.013)  # stone's height: creep sideways .. full speed
+CREEP_M = 0.004  # per step of 0.1 s
+RELEASE_LATERAL_M = (0.0040, 0.0070)  # a stone this near is in place: in closed .. in open fingers
+RELEASE_HEIGHT_M = (0.0025, 0.0040)
+
+
+def expert_action(
+    state: PrivilegedState, control_mode: str = "relative", fps: int = DEFAULT_FPS
+) -> np.ndarray:
+    """(4,) float32 action that brings the stone to the target.
+
+    Relative: units of `MAX_STEP_M`, within [-1, 1]; absolute: metres within the workspace.
+    """
+    one_of("--env.control_mode", control_mode, CONTROL_MODES)
+    state = _anticipate(state)
+    motion_m, gripper = _plan(state, DEFAULT_FPS / fps)
+    if control_mode == "absolute":
+        xyz = np.clip(state.gripper_xyz + motion_m, WORKSPACE_LOW_M, WORKSPACE_HIGH_M)
+    else:
+        xyz = np.clip(motion_m / MAX_STEP_M, -1, 1)
+    return np.array([*xyz, gripper], dtype=np.float32)
+
+
+def _anticipate(state: PrivilegedState) -> PrivilegedState:
+    """The state after what the gripper has been told and, for latency, has not done yet."""
+    stone_xyz = state.stone_xyz.copy()
+    stone_xyz[state.stone] += _held(state, stone_xyz[state.stone]) * state.pending_motion_m
+    state = replace(state, gripper_xyz=state.gripper_xyz + state.pending_motion_m, stone_xyz=stone_xyz)
+    if state.pending_gripper == 0:
+        return state
+    closed_m = _enclosed(state, stone_xyz[state.stone]) * (2 * state.stone_radius_m - SQUEEZE_M)
+    opening_m = state.max_opening_m if state.pending_gripper > 0 else min(closed_m, state.finger_opening)
+    return replace(state, finger_opening=opening_m)
+
+
+def _plan(state: PrivilegedState, tempo: float) -> tuple[np.ndarray, float]:
+    """Displacement (3,) in metres and gripper command in [-1, 1] for a step of `tempo` x 0.1 s."""
+    stone_xyz = state.stone_xyz[state.stone]
+    is_placed = _placed(state, stone_xyz)
+    is_held = _held(state, stone_xyz)
+    approach_m, approach_gripper = _approach(state, stone_xyz, tempo)
+    carry_m = _carry(state, stone_xyz, tempo)
+    retreat_m = _retreat(state, tempo)
+    motion_m = is_placed * retreat_m + (1 - is_placed) * (is_held * carry_m + (1 - is_held) * approach_m)
+    gripper = is_placed + (1 - is_placed) * ((1 - is_held) * approach_gripper - is_held)
+    return motion_m, gripper
+
+
+def _placed(state: PrivilegedState, stone_xyz: np.ndarray) -> float:
+    """How far the stone lies on the target, in [0, 1]; judged more mildly the wider the fingers are.
+
+    A release moves the stone a little, and must not make the expert want it back.
+    """
+    openness = _openness(state, (HELD_SHARE[0], OPEN_SHARE[0]))
+    lateral_m = float(np.linalg.norm((state.target_xyz - stone_xyz)[:2]))
+    height_m = float(stone_xyz[2] - state.target_xyz[2])
+    # fingers that are as low as they go cannot lower a stone that they hold too high
+    height_m = max(min(height_m, state.gripper_xyz[2] - FLOOR_M), height_m - GRASP_SLACK_M)
+    inside = min(
+        1 - lateral_m / _between(openness, RELEASE_LATERAL_M),
+        1 - height_m / _between(openness, RELEASE_HEIGHT_M),
+    )
+    return _ramp(inside, 0.0, 0.3)
+
+
+def _held(state: PrivilegedState, stone_xyz: np.ndarray) -> float:
+    """How far the fingers hold the stone, in [0, 1]."""
+    play_m = state.finger_opening - 2 * state.stone_radius_m
+    return _enclosed(state, stone_xyz) * (1 - _openness(state, HELD_SHARE)) * _ramp(play_m, *EMPTY_M)
+
+
+def _openness(state: PrivilegedState, shares: tuple[float, float]) -> float:
+    """How far the fingers are open, in [0, 1], between two shares of their play around a stone."""
+    diameter_m = 2 * state.stone_radius_m
+    return _ramp((state.finger_opening - diameter_m) / (state.max_opening_m - diameter_m), *shares)
+
+
+def _enclosed(state: PrivilegedState, stone_xyz: np.ndarray) -> float:
+    """How far the stone is between the pads, in [0, 1]."""
+    offset = stone_xyz - state.gripper_xyz
+    beside = 1 - _ramp(float(np.linalg.norm(offset[:2])), 0.008, 0.012)
+    return beside * _ramp(offset[2], -0.004, -0.002) * (1 - _ramp(offset[2], 0.020, 0.030))
+
+
+def _approach(state: PrivilegedState, stone_xyz: np.ndarray, tempo: float) -> tuple[np.ndarray, float]:
+    """Displacement and gripper command that bring open fingers around the stone and close them."""
+    grasp_z = max(stone_xyz[2] - GRASP_DEPTH_M, FLOOR_M)
+    offset_xy = (stone_xyz - state.gripper_xyz)[:2]
+    lateral_m = float(np.linalg.norm(offset_xy))
+    above_m = state.gripper_xyz[2] - grasp_z
+    enclosed = _enclosed(state, stone_xyz)
+    funnel_m = np.clip((lateral_m - FUNNEL_MOUTH_M) * FUNNEL_SLOPE, 0, HOVER_M)
+    # closed fingers would come down on the stone
+    shut_m = HOVER_M * (1 - _openness(state, OPEN_SHARE)) * (1 - enclosed)
+    rise_m = max(funnel_m, shut_m) - PRESS_M - above_m
+    # away from the stone, low fingers would sweep others off the board: first up, then across
+    freedom = max(_ramp(above_m, 0.006, 0.016), 1 - _ramp(lateral_m, 0.005, 0.009))
+    motion_m = _step(offset_xy, rise_m, freedom, tempo)
+    inside = min(
+        1 - lateral_m / CLOSE_LATERAL_M,
+        1 - above_m / CLOSE_HEIGHT_M,
+        (state.finger_opening - 2 * state.stone_radius_m - EMPTY_M[0]) / CLOSE_HEIGHT_M,
+    )
+    return motion_m, float(np.clip(-4 * inside, -1, 1))
+
+
+def _carry(state: PrivilegedState, stone_xyz: np.ndarray, tempo: float) -> np.ndarray:
+    """Displacement (3,) that brings the held stone over the target and down."""
+    offset_xy = (state.target_xyz - stone_xyz)[:2]
+    height_m = float(stone_xyz[2] - state.target_xyz[2])
+    lateral_m = float(np.linalg.norm(offset_xy))
+    funnel_m = float(np.clip((lateral_m - CARRY_MOUTH_M) * CARRY_SLOPE, 0, CARRY_M))
+    freedom = max(_ramp(height_m, *CLEARANCE_M), CREEP_M / (SPEED_M_S / DEFAULT_FPS))
+    return _step(offset_xy, funnel_m - PRESS_M - height_m, freedom, tempo)
+
+
+def _retreat(state: PrivilegedState, tempo: float) -> np.ndarray:
+    """Displacement (3,) straight up, as soon as the fingers are clear of the stone."""
+    rise_m = max(0.0, RETREAT_HEIGHT_M - state.gripper_xyz[2]) * _openness(state, OPEN_SHARE)
+    return _step(np.zeros(2), rise_m, 1.0, tempo)
+
+
+def _step(offset_xy: np.ndarray, rise_m: float, freedom: float, tempo: float) -> np.ndarray:
+    """(3,) metres: the share of a way that one step covers. `freedom` in [0, 1] slows it sideways."""
+    limit_m = SPEED_M_S / DEFAULT_FPS * tempo
+    gain = 1 - (1 - GAIN) ** tempo
+    wanted_xy = gain * offset_xy
+    length_m = float(np.linalg.norm(wanted_xy))
+    wanted_xy = wanted_xy * min(1.0, freedom * limit_m / length_m) if length_m > 0 else wanted_xy
+    return np.array([*wanted_xy, np.clip(gain * rise_m, -limit_m, limit_m)])
+
+
+def _ramp(value: float, low: float, high: float) -> float:
+    """0 up to `low`, 1 from `high`, a straight line between."""
+    return float(np.clip((value - low) / (high - low), 0, 1))
+
+
+def _between(share: float, ends: tuple[float, float]) -> float:
+    return ends[0] + share * (ends[1] - ends[0])

@@ -1,0 +1,34 @@
+"""Where everything is: at the start of an episode, and as the simulator measures it."""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from lerobot_bomb.bomb.board import BOARD
+
+
+@dataclass(frozen=True)
+class Layout:
+    """Where everything is when an episode starts. Stones rest flat; those not in play are parked."""
+
+    gripper_xyz: np.ndarray  # (3,) metres
+    stone_xy: np.ndarray  # (NUM_STONES, 2) metres
+    stone_is_white: np.ndarray  # (NUM_STONES,) bool
+    stone_in_play: np.ndarray  # (NUM_STONES,) bool
+    stone_radius_m: float = BOARD.stone_radius_m
+    stone_height_m: float = BOARD.stone_height_m
+
+    @property
+    def rest_height_m(self) -> float:
+        """Height of the centre of a stone that rests; board and tray are equally high."""
+        return BOARD.thickness_m + self.stone_height_m / 2
+
+
+@dataclass(frozen=True)
+class Snapshot:
+    """What the simulator measures after a control step."""
+
+    gripper_xyz: np.ndarray  # (3,) metres, point between the pads' lower ends
+    finger_opening: float  # metres between the pads
+    stone_xyz: np.ndarray  # (NUM_STONES, 3) metres, centres
+    stone_touched: np.ndarray  # (NUM_STONES, 2) bool: by the left and the right pad

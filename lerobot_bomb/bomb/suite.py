@@ -1,0 +1,40 @@
+"""What a suite is: a kind of episode. Each has a file in `suites/`."""
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+
+import numpy as np
+
+from lerobot_bomb.bomb.board import BOARD, Cell
+from lerobot_bomb.bomb.episode import EpisodeSpec
+from lerobot_bomb.bomb.layout import Layout
+
+
+@dataclass(frozen=True)
+class Episode:
+    """What an EpisodeSpec stands for."""
+
+    spec: EpisodeSpec
+    target: Cell
+    color: str
+    instruction: str
+    opening: Mapping[Cell, str]  # colours of the stones that stand on the board
+    layout: Layout
+    stone: int  # index of the stone to be moved
+
+    @property
+    def target_xyz(self) -> np.ndarray:
+        """(3,) metres, centre of a stone that rests on the target."""
+        return np.array([*BOARD.intersection_xy(*self.target), self.layout.rest_height_m])
+
+
+@dataclass(frozen=True)
+class Suite:
+    """How its episodes are drawn and how long they may last.
+
+    ``check`` raises a ValueError that names the flag for a spec of which no episode can be drawn.
+    """
+
+    sample: Callable[[EpisodeSpec], Episode]  # the same spec, the same episode, without perturbations
+    check: Callable[[EpisodeSpec], None]
+    max_steps: int  # at DEFAULT_FPS; scaled with fps

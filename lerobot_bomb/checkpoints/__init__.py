@@ -1,0 +1,1 @@
+"""A checkpoint's folder: its names, checks, config, processors, adapters and identity."""

@@ -1,0 +1,193 @@
+"""Whether a checkpoint's folder is whole and works on another machine."""
+
+from pathlib import Path
+from typing import Any
+
+import torch
+from accelerate import init_empty_weights
+from lerobot.configs import PreTrainedConfig
+from lerobot.policies import PreTrainedPolicy
+from lerobot.policies.factory import get_policy_class
+from lerobot.utils.constants import POLICY_POSTPROCESSOR_DEFAULT_NAME, POLICY_PREPROCESSOR_DEFAULT_NAME
+from lerobot.utils.import_utils import register_third_party_plugins
+from safetensors import SafetensorError, safe_open
+from torch import Tensor
+
+from lerobot_bomb.checkpoints.names import CONFIG, WEIGHTS
+from lerobot_bomb.checkpoints.processor_files import saved_type, state_files
+from lerobot_bomb.files import read_json
+from lerobot_bomb.finite import is_finite, require_finite
+
+ADAPTERS = ("adapter_config.json", "adapter_model.safetensors")
+PROCESSORS = (f"{POLICY_PREPROCESSOR_DEFAULT_NAME}.json", f"{POLICY_POSTPROCESSOR_DEFAULT_NAME}.json")
+
+# of a grid: rows of fewer bins than the finest coordinate's end with inf
+FILLED_WITH_INF = "grids.edges"
+
+type Shapes = dict[str, tuple[int, ...]]
+
+
+def checkpoint_files(folder: Path) -> list[str]:
+    """Names of the files that make up a checkpoint, each whole.
+
+    Raises:
+        ValueError: one is missing, truncated or of another format.
+    """
+    if not folder.is_dir():
+        raise ValueError(f"{folder} is no folder; give the one that lerobot-train names pretrained_model")
+    has_adapters = (folder / CONFIG).is_file() and read_json(folder / CONFIG).get("use_peft")
+    weights = ADAPTERS if has_adapters else (WEIGHTS,)
+    for name in (CONFIG, *PROCESSORS, *weights):
+        if not (folder / name).is_file():
+            raise ValueError(
+                f"{folder} holds no {name}, so it is no checkpoint of a policy; give the folder that "
+                "lerobot-train names pretrained_model"
+            )
+    tensor_shapes(folder / weights[-1])
+    before, after = (processor_files(folder, processor) for processor in PROCESSORS)
+    return [CONFIG, *weights, *before, *after]
+
+
+def processor_files(folder: Path, processor: str) -> list[str]:
+    """Names of the files that make up one of `PROCESSORS`, each whole and data only; none is loaded.
+
+    Raises:
+        ValueError: one is missing, truncated, not finite or of another format, or a step is not registered.
+    """
+    register_third_party_plugins()  # their steps
+    content = read_json(folder / processor)
+    states = state_files(content, str(folder / processor), saved_type(folder / CONFIG))
+    for name in states:
+        if not (folder / name).is_file():
+            raise ValueError(f"{folder} holds no {name}, which its {processor} needs")
+        check_finite(folder / name)
+    return [processor, *states]
+
+
+def tensor_shapes(path: Path) -> Shapes:
+    """Of all tensors in a file, from its header.
+
+    Raises:
+        ValueError: the file is truncated or of another format.
+    """
+    try:
+        with safe_open(path, "pt") as tensors:
+            return {name: tuple(tensors.get_slice(name).get_shape()) for name in tensors.keys()}  # noqa: SIM118
+    except SafetensorError as error:
+        raise ValueError(f"{path} is truncated or no safetensors file: {error}") from None
+
+
+def check_finite(path: Path) -> None:
+    """No tensor of a safetensors file holds NaN or infinite values; one at a time is in memory.
+
+    Raises:
+        ValueError: names the file, the first such tensor, how many of its values are and where; or the file
+            is truncated or of another format.
+    """
+    advice = "; take a checkpoint from before, or train again"
+    try:
+        with safe_open(path, "pt") as tensors:
+            for name in tensors.keys():  # noqa: SIM118
+                values = tensors.get_tensor(name)
+                if not is_finite(values):
+                    values = _without_filling(values) if name.endswith(FILLED_WITH_INF) else values
+                    require_finite(values, f"{path}: {name}", advice)
+    except SafetensorError as error:
+        raise ValueError(f"{path} is truncated or no safetensors file: {error}") from None
+
+
+def _without_filling(edges: Tensor) -> Tensor:
+    """(C, E) -> the same with 0 for what ends a row as inf, after at least two edges."""
+    is_filling = (edges == torch.inf).flip(1).cumprod(dim=1).flip(1).bool()
+    is_filling[:, :2] = False
+    return edges.masked_fill(is_filling, 0)
+
+
+def policy_class(folder: Path) -> type[PreTrainedPolicy]:
+    """The class of a checkpoint's type, which has a card of its own.
+
+    Raises:
+        ValueError: the type is not one of ours.
+    """
+    name = read_json(folder / CONFIG).get("type")
+    found = get_policy_class(name) if name in PreTrainedConfig.get_known_choices() else None
+    if found is None or not hasattr(found, "method"):
+        raise ValueError(
+            f"{folder / CONFIG}: the type {name!r} is not one that lerobot-bomb pushes; "
+            "lerobot-train --policy.push_to_hub=true pushes LeRobot's own"
+        )
+    return found
+
+
+def check_config(folder: Path, config: Any) -> None:
+    """A checkpoint needs nothing but its own files, and no code.
+
+    Raises:
+        ValueError: names what it needs.
+    """
+    for field in ("vlm_config", "depth_config"):
+        if _names_code(getattr(config, field, None)):
+            raise ValueError(f"{folder / CONFIG}: its {field} names code to run, which no checkpoint needs")
+    if config.vlm_config is None or config.prompt_tokens is None:
+        raise ValueError(
+            f"{folder / CONFIG} does not hold the architecture (vlm_config and prompt_tokens), so loading it "
+            f"elsewhere would need the base model {config.vlm_model_name}"
+        )
+    if getattr(config, "depth_source", None) == "zoedepth" and config.depth_config is None:
+        raise ValueError(
+            f"{folder / CONFIG} does not hold depth_config, so loading it elsewhere would need "
+            f"{config.depth_model_name}"
+        )
+
+
+def _names_code(values: Any, key: str = "") -> bool:
+    """Whether a config of transformers asks for remote code, or for a kernel of the Hub, at any depth."""
+    if isinstance(values, dict):
+        return any(_names_code(each, name) for name, each in values.items())
+    if isinstance(values, list):
+        return any(_names_code(each, key) for each in values)
+    if key in ("attn_implementation", "_attn_implementation"):
+        return "/" in str(values)
+    return key == "trust_remote_code" and bool(values)
+
+
+def check_weights(folder: Path, config: PreTrainedConfig, policy_type: type[PreTrainedPolicy]) -> None:
+    """The weights are those of the config's policy, by their names and shapes; no memory is taken.
+
+    Raises:
+        ValueError: names the first tensor that is missing, not known, or of another shape.
+    """
+    with init_empty_weights():
+        policy = policy_type(config)
+    check_tensors(folder / WEIGHTS, policy)
+
+
+def check_tensors(path: Path, policy: PreTrainedPolicy) -> None:
+    """A file's weights are a policy's, by their names and shapes.
+
+    Raises:
+        ValueError: it is truncated, or names the first tensor that is missing, unknown or of another shape.
+    """
+    expected = {name: tuple(tensor.shape) for name, tensor in policy.state_dict().items()}
+    saved = tensor_shapes(path)
+    start = f"{path} is not of the {policy.config.type} that {CONFIG} describes: "
+    missing = sorted(expected.keys() - saved.keys() - _tied(policy, set(saved)))
+    if missing:
+        raise ValueError(f"{start}it lacks {missing[0]} ({len(missing)} in all)")
+    unknown = sorted(saved.keys() - expected.keys())
+    if unknown:
+        raise ValueError(f"{start}it has {unknown[0]} ({len(unknown)} in all)")
+    for name, shape in saved.items():
+        if shape != expected[name]:
+            raise ValueError(f"{start}{name} has shape {shape}, not {expected[name]}")
+
+
+def _tied(policy: PreTrainedPolicy, saved: set[str]) -> set[str]:
+    """Tensors that are the same as a saved one, under another name."""
+    found = set()
+    for prefix, module in policy.named_modules():
+        for pair in (getattr(module, "all_tied_weights_keys", None) or {}).items():
+            names = {f"{prefix}.{name}" for name in pair}
+            if names & saved:
+                found |= names
+    return found

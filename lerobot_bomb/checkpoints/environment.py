@@ -1,0 +1,101 @@
+"""Which environment a policy was trained for, and whether it is the one that it is about to act in."""
+
+import copy
+import logging
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from lerobot.configs import PreTrainedConfig
+from lerobot.policies import PreTrainedPolicy
+
+from lerobot_bomb._compat import built_policies, training_data
+from lerobot_bomb.checkpoints.names import TRAIN_CONFIG
+from lerobot_bomb.data.environment import IMAGES, Environment
+from lerobot_bomb.data.facts import DatasetFacts
+from lerobot_bomb.data.resumable import default_root
+from lerobot_bomb.files import read_json
+
+logger = logging.getLogger(__name__)
+
+
+@dataclass
+class ConfigWithEnvironment(PreTrainedConfig):
+    """What the configs of all our policies have in common."""
+
+    # that of the recording it was trained on; filled in
+    environment: Environment | None = None
+    # whether it acts in another one all the same; no checkpoint keeps this
+    ignore_environment: bool = False
+
+    def _save_pretrained(self, save_directory: Path) -> None:
+        saved = copy.copy(self)
+        saved.ignore_environment = False
+        PreTrainedConfig._save_pretrained(saved, save_directory)
+
+
+def check_acting_policy(here: Environment) -> None:
+    """The policy that this process built last was trained for this environment, as far as anyone can know.
+
+    Raises:
+        ValueError: it was trained for another one; the message names the flags to change.
+    """
+    policies = built_policies()
+    if policies and not getattr(policies[-1].config, "ignore_environment", False):
+        _check(policies[-1], here)
+
+
+def trained_environment(policy: PreTrainedPolicy) -> Environment | None:
+    """By the dataset it is being trained on, by its config, or by the dataset that its training names."""
+    meta = training_data(policy)
+    if meta is not None:
+        return environment_of_dataset(meta.root)
+    environment = getattr(policy.config, "environment", None)
+    path = policy.config.pretrained_path
+    return environment if environment is not None or path is None else _of_training(Path(path))
+
+
+def environment_of_dataset(root: Path | str | None) -> Environment | None:
+    """None: the folder is gone, or holds no recording of BOMB."""
+    facts = DatasetFacts.find(root)
+    return None if facts is None else facts.environment
+
+
+def _of_training(checkpoint: Path) -> Environment | None:
+    path = checkpoint / TRAIN_CONFIG
+    if not path.is_file():
+        return None
+    dataset: dict[str, Any] = read_json(path)["dataset"]
+    return environment_of_dataset(dataset.get("root") or default_root(dataset["repo_id"]))
+
+
+def _check(policy: PreTrainedPolicy, here: Environment) -> None:
+    config = policy.config
+    is_ours = isinstance(config, ConfigWithEnvironment)
+    flag = "--policy.ignore_environment" if is_ours else "--env.ignore_checkpoint"
+    insist = f"insist with {flag}=true"
+    who = f"the checkpoint {config.pretrained_path}" if config.pretrained_path else f"this {config.type}"
+    environment = trained_environment(policy)
+    if environment is not None:
+        environment.check_same(here, who, insist)
+        return
+    _check_image_size(config, here, who, insist)
+    if config.pretrained_path:
+        logger.warning(
+            "%s does not know the environment that it was trained for; only the size of its images could be "
+            "compared. --env.control_mode, --env.fps and --env.robot must be those of its training",
+            who,
+        )
+
+
+def _check_image_size(config: PreTrainedConfig, here: Environment, who: str, insist: str) -> None:
+    """By the config's inputs, of the cameras that are here: features of (3, H, W)."""
+    for camera in here.cameras:
+        feature = (config.input_features or {}).get(f"{IMAGES}{camera}")
+        if feature is None or tuple(feature.shape[1:]) == (here.image_size,) * 2:
+            continue
+        height, width = feature.shape[1:]
+        raise ValueError(
+            f"{who} reads images of {width}x{height} pixels from the camera {camera}; this environment has "
+            f"--env.image_size={here.image_size}: evaluate with --env.image_size={width}, or {insist}"
+        )

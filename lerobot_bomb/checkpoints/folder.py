@@ -1,0 +1,92 @@
+"""A checkpoint's folder, read as LeRobot's commands read it, and written."""
+
+from collections.abc import Iterable
+from contextlib import AbstractContextManager, nullcontext
+from pathlib import Path
+from typing import Any
+
+import torch
+from draccus.utils import DecodingError
+from lerobot.configs import PreTrainedConfig
+from lerobot.policies import PreTrainedPolicy, make_pre_post_processors
+from lerobot.processor import PolicyAction, PolicyProcessorPipeline
+from lerobot.utils.constants import POLICY_PREPROCESSOR_DEFAULT_NAME
+from lerobot.utils.device_utils import get_safe_torch_device, is_torch_device_available
+from lerobot.utils.import_utils import register_third_party_plugins
+
+from lerobot_bomb.checkpoints.checks import PROCESSORS, processor_files
+from lerobot_bomb.checkpoints.names import CONFIG
+from lerobot_bomb.checkpoints.processor_files import check_states
+from lerobot_bomb.files import written_whole
+
+FILES = (CONFIG, f"{POLICY_PREPROCESSOR_DEFAULT_NAME}.json")
+
+Preprocessor = PolicyProcessorPipeline[dict[str, Any], dict[str, Any]]
+Postprocessor = PolicyProcessorPipeline[PolicyAction, PolicyAction]
+
+
+def read_config(path: Path, device: str | None) -> PreTrainedConfig:
+    """The config in the folder `pretrained_model`; `device` None means the checkpoint's own.
+
+    Raises:
+        ValueError: the folder holds no checkpoint, or this machine has no such device.
+    """
+    missing = [name for name in FILES if not (path / name).is_file()]
+    if missing:
+        raise ValueError(
+            f"--policy.path={path} holds no {missing[0]}, so it is no checkpoint of a policy; "
+            "give the folder that lerobot-train names pretrained_model"
+        )
+    if device is not None and not is_torch_device_available(device):
+        raise ValueError(f"the device {device} is not available on this machine; cpu is")
+    register_third_party_plugins()
+    config = parse_config(path, device)
+    config.pretrained_path = path
+    return config
+
+
+def parse_config(path: Path, device: str | None) -> PreTrainedConfig:
+    """The config in a folder, of a plugin that is registered.
+
+    Raises:
+        ValueError: it is truncated, of a newer version or of an unknown type.
+    """
+    overrides = [] if device is None else [f"--device={device}"]
+    try:
+        return PreTrainedConfig.from_pretrained(path, cli_overrides=overrides)
+    except DecodingError as error:
+        raise ValueError(f"{path / FILES[0]}: {error}") from None
+
+
+def load_processors(config: PreTrainedConfig) -> tuple[Preprocessor, Postprocessor]:
+    """The processors saved with a checkpoint, on the config's device.
+
+    Raises:
+        ValueError: they are not whole, or not data only (`lerobot_bomb.checkpoints.processor_files`).
+    """
+    folder = Path(str(config.pretrained_path))
+    for name in PROCESSORS:
+        processor_files(folder, name)
+    processors = make_pre_post_processors(
+        policy_cfg=config,
+        pretrained_path=str(folder),
+        preprocessor_overrides={"device_processor": {"device": str(config.device)}},
+    )
+    for name, processor in zip(PROCESSORS, processors, strict=True):
+        check_states(processor.steps, str(folder / name), complete=True)
+    return processors
+
+
+def write_checkpoint(
+    path: Path, policy: PreTrainedPolicy, processors: Iterable[PolicyProcessorPipeline[Any, Any]]
+) -> None:
+    """Config, weights and processors in a new folder, which appears complete."""
+    with written_whole(path) as (folder,):
+        policy.save_pretrained(folder)
+        for processor in processors:
+            processor.save_pretrained(folder)
+
+
+def autocast(config: PreTrainedConfig) -> AbstractContextManager:
+    """The precision in which LeRobot's commands call the policy."""
+    return torch.autocast(get_safe_torch_device(str(config.device)).type) if config.use_amp else nullcontext()

@@ -1,0 +1,103 @@
+"""Which policy this process built: LeRobot tells an environment nothing of it."""
+
+import gc
+import hashlib
+import json
+import logging
+from functools import cache
+from pathlib import Path
+from typing import Any
+
+import draccus
+from huggingface_hub import try_to_load_from_cache
+from lerobot.configs import PreTrainedConfig
+
+from lerobot_bomb._compat import built_policies, training_data
+from lerobot_bomb.checkpoints.checks import ADAPTERS
+from lerobot_bomb.checkpoints.names import WEIGHTS
+from lerobot_bomb.envs.results import PolicyIdentity
+from lerobot_bomb.files import read_json
+
+PROCESSORS = ("policy_preprocessor*", "policy_postprocessor*")
+# in a config, but not of what the policy does
+NOT_ITS_SETTINGS = {
+    "device", "pretrained_path", "pretrained_revision", "package_version", "use_peft", "ignore_environment",
+    "push_to_hub", "repo_id", "private", "tags", "license",
+}  # fmt: skip
+
+
+def acting_policy() -> PolicyIdentity | None:
+    """The one policy that this process built and holds; None: there is none, or it may be any of several."""
+    policies = built_policies()
+    if len(policies) > 1:
+        gc.collect()  # those that nothing refers to any more
+        policies = built_policies()
+    if len(policies) != 1:
+        if policies:
+            names = ", ".join(policy.config.type for policy in policies)
+            logging.warning(
+                f"results will name no policy: this process holds {len(policies)} of them ({names}); "
+                "drop the others before the environment's first reset"
+            )
+        return None
+    config = policies[0].config
+    if training_data(policies[0]) is not None:
+        return PolicyIdentity(config.type, is_in_training=True)
+    return PolicyIdentity(config.type) if config.pretrained_path is None else _of_checkpoint(config)
+
+
+def weights_file(checkpoint: Path | str, revision: str | None, has_adapters: bool) -> Path | None:
+    """Of a folder, or of a repository on the Hub as it was downloaded; None: it has none of this name."""
+    return _local_file(checkpoint, revision, ADAPTERS[1] if has_adapters else WEIGHTS)
+
+
+def sha256_of(path: Path) -> str:
+    """Of a file's bytes, as 64 hexadecimal digits; read once as long as the file does not change."""
+    status = path.stat()
+    return _sha256(path.resolve(), status.st_mtime_ns, status.st_size)
+
+
+@cache
+def _sha256(path: Path, *_: int) -> str:
+    with path.open("rb") as file:
+        return hashlib.file_digest(file, "sha256").hexdigest()
+
+
+def _of_checkpoint(config: PreTrainedConfig) -> PolicyIdentity:
+    path, revision = str(config.pretrained_path), config.pretrained_revision
+    weights = weights_file(path, revision, config.use_peft)
+    is_folder = Path(path).is_dir()
+    return PolicyIdentity(
+        type=config.type,
+        path=path,
+        revision=revision if is_folder or weights is None else weights.parent.name,
+        weights_sha256=None if weights is None else sha256_of(weights),
+        settings_sha256=None if weights is None else _settings_sha256(config, weights.parent),
+        base=_base(path, revision) if config.use_peft else None,
+    )
+
+
+def _local_file(checkpoint: Path | str, revision: str | None, name: str) -> Path | None:
+    if Path(checkpoint).is_dir():
+        path = Path(checkpoint) / name
+        return path if path.is_file() else None
+    cached = try_to_load_from_cache(str(checkpoint), name, revision=revision)
+    return Path(cached) if isinstance(cached, str) else None
+
+
+def _settings_sha256(config: PreTrainedConfig, folder: Path) -> str:
+    """Of what the same weights may differ in: flags of this evaluation, and processors."""
+    settings: Any = draccus.encode(config)
+    settings = {name: value for name, value in settings.items() if name not in NOT_ITS_SETTINGS}
+    digest = hashlib.sha256(json.dumps(settings, sort_keys=True, default=str).encode())
+    for path in sorted(path for pattern in PROCESSORS for path in folder.glob(pattern) if path.is_file()):
+        digest.update(f"{path.name} {sha256_of(path)}".encode())
+    return digest.hexdigest()
+
+
+def _base(path: str, revision: str | None) -> str | None:
+    """Name of what adapters are loaded on; with its revision, where that is fixed."""
+    file = _local_file(path, revision, ADAPTERS[0])
+    adapters = {} if file is None else read_json(file)
+    base, of_base = adapters.get("base_model_name_or_path"), adapters.get("revision")
+    return f"{base}@{of_base}" if base and of_base else base

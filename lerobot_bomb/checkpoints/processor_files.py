@@ -1,0 +1,174 @@
+"""Whether a checkpoint's processors are data: which steps they may name, and that those have all they need.
+
+LeRobot imports and calls whatever `class` a step names, before it looks at what came out.
+"""
+
+import sys
+from collections.abc import Mapping, Sequence
+from importlib import import_module
+from pathlib import Path
+from typing import Any
+
+from lerobot.configs import FeatureType, NormalizationMode, PreTrainedConfig
+from lerobot.processor import (
+    NormalizerProcessorStep,
+    ProcessorStep,
+    ProcessorStepRegistry,
+    UnnormalizerProcessorStep,
+)
+from lerobot.utils.constants import POLICY_POSTPROCESSOR_DEFAULT_NAME, POLICY_PREPROCESSOR_DEFAULT_NAME
+
+from lerobot_bomb._compat import check_processors_before_use
+from lerobot_bomb.actions.relative import BOUND_STATISTICS, CENTRE_AND_DISTANCE
+from lerobot_bomb.files import read_json
+from lerobot_bomb.finite import require_finite
+from lerobot_bomb.vlm.task_tokenizer import TaskTokenizerStep
+
+STATE_SUFFIX = ".safetensors"
+
+# steps of LeRobot that run code of the repository or folder that their config names -> the types that need
+# them, whose own models run such code too
+RUN_CODE = {
+    "action_tokenizer_processor": ("pi0_fast",),
+    "groot_n1_7_vlm_encode_v1": ("groot",),
+    "reward_classifier_processor": (),
+    "robometer_encoder": ("robometer",),
+    "topreward_encoder": ("topreward",),
+}
+# the only one that LeRobot saves by its class and has not loaded before
+SARM_STEP = "lerobot.rewards.sarm.processor_sarm.SARMEncodingProcessorStep"
+# steps of LeRobot that read files of the repository or folder that their config names
+READ_OTHERS = {"tokenizer_processor", "eo1_qwen_processor", "molmoact2_pack_inputs"}
+# name of a processor of our types -> the steps that it has, at least
+NEEDED = {
+    POLICY_PREPROCESSOR_DEFAULT_NAME: {"bomb_task_tokenizer", "normalizer_processor"},
+    POLICY_POSTPROCESSOR_DEFAULT_NAME: {"unnormalizer_processor"},
+}
+# of which values are normalised; none by the identity
+STATISTICS = {**BOUND_STATISTICS, NormalizationMode.MEAN_STD: CENTRE_AND_DISTANCE}
+
+
+def saved_type(config_file: Path) -> object:
+    """What a checkpoint's config.json says it is; None: whoever reads the config will say why not."""
+    try:
+        return read_json(config_file).get("type")
+    except (OSError, ValueError):
+        return None
+
+
+def is_ours(policy_type: object) -> bool:
+    """Whether checkpoints of this type, as config.json names it, hold all that they need."""
+    known = PreTrainedConfig.get_known_choices()
+    return isinstance(policy_type, str) and hasattr(known.get(policy_type), "package_version")
+
+
+def state_files(content: Mapping[str, Any], where: str, policy_type: object) -> list[str]:
+    """Names of the state files of a processor's JSON, which is checked; no step is built.
+
+    All plugins are registered. `where` is the file, for errors; `policy_type` is the checkpoint's.
+
+    Raises:
+        ValueError: a step is not registered, would run code, or its state lies elsewhere.
+    """
+    steps = content.get("steps")
+    if not isinstance(steps, list) or not all(isinstance(step, dict) for step in steps):
+        raise ValueError(f"{where} holds no list of steps")
+    name = content.get("name", "")
+    if not isinstance(name, str) or (is_ours(policy_type) and name not in NEEDED):
+        raise ValueError(f"{where}: its name {name!r} is none of {sorted(NEEDED)}")
+    for step in steps:
+        _check_step(step, where, policy_type)
+    if is_ours(policy_type):
+        missing = sorted(NEEDED[name] - {step["registry_name"] for step in steps})
+        if missing:
+            raise ValueError(f"{where} lacks the step {missing[0]!r} of a {policy_type}")
+    return [step["state_file"] for step in steps if "state_file" in step]
+
+
+def _check_step(step: Mapping[str, Any], where: str, policy_type: object) -> None:
+    name = step.get("registry_name")
+    if "registry_name" not in step:
+        name = _name_of_class(step.get("class"), where, policy_type)
+    elif not isinstance(name, str) or name not in ProcessorStepRegistry.list():
+        raise ValueError(f"{where}: no step {name!r} is registered here; install the plugin that has it")
+    if name in RUN_CODE and policy_type not in RUN_CODE[name]:
+        raise ValueError(
+            f"{where}: the step {name!r} runs code of what its config names ({step.get('config')}), which no "
+            f"{policy_type or 'checkpoint'} needs"
+        )
+    if name in READ_OTHERS and is_ours(policy_type):
+        raise ValueError(f"{where}: the step {name!r} reads other files, which no {policy_type} needs")
+    if not isinstance(step.get("config", {}), dict):
+        raise ValueError(f"{where}: the config of its step {name!r} is no JSON object")
+    if "state_file" in step:
+        _check_state_file(step["state_file"], where)
+
+
+def _name_of_class(path: object, where: str, policy_type: object) -> str | None:
+    """The registered name, if any, of a step that is named by its path; its module is loaded already.
+
+    Raises:
+        ValueError: it is no such step, or the checkpoint is of our types, whose steps are all registered.
+    """
+    if isinstance(path, str) and not is_ours(policy_type):
+        module, _, name = path.rpartition(".")
+        if path == SARM_STEP:
+            import_module(module)
+        found = getattr(sys.modules.get(module), name, None)
+        if isinstance(found, type) and issubclass(found, ProcessorStep):
+            return getattr(found, "_registry_name", None)
+    raise ValueError(
+        f"{where}: its step {path!r} is named by the path of a class, which may be any code; a step is "
+        "registered by its plugin (ProcessorStepRegistry.register) and named by registry_name"
+    )
+
+
+def _check_state_file(name: object, where: str) -> None:
+    if not isinstance(name, str) or not name.endswith(STATE_SUFFIX) or {"/", "\\", "\0"} & set(name):
+        raise ValueError(
+            f"{where}: state_file={name!r} is no name of a {STATE_SUFFIX} file in the checkpoint's folder"
+        )
+
+
+def check_saved_processors() -> None:
+    """From now on, whoever loads a processor in this process has it checked: LeRobot's commands too."""
+    check_processors_before_use(
+        lambda content, where, config: state_files(content, where, saved_type(config)),
+        lambda steps, where, config: check_states(steps, where, is_ours(saved_type(config))),
+    )
+
+
+def check_states(steps: Sequence[Any], where: str, complete: bool) -> None:
+    """The steps' loaded states are finite where they are used; `complete`: and they hold all that is used.
+
+    Raises:
+        ValueError: names the statistic that is missing, of another shape or not finite.
+    """
+    for step in steps:
+        if isinstance(step, NormalizerProcessorStep | UnnormalizerProcessorStep):
+            _check_statistics(step, where, complete)
+        elif isinstance(step, TaskTokenizerStep) and step.tokenizer is None:
+            raise ValueError(
+                f"{where}: its step bomb_task_tokenizer names no state_file, so it has no tokenizer"
+            )
+
+
+def _check_statistics(step: Any, where: str, complete: bool) -> None:
+    held = step.state_dict()
+    for key, feature in step.features.items():
+        chosen = step.normalize_observation_keys
+        if chosen is not None and key not in chosen and feature.type is not FeatureType.ACTION:
+            continue
+        mode = step.norm_map.get(feature.type, NormalizationMode.IDENTITY)
+        for name in STATISTICS.get(mode, ()):
+            tensor = held.get(f"{key}.{name}")
+            if tensor is None:
+                # pictures and arrays without statistics are left as they are
+                if complete and (len(feature.shape) == 1 or any(f.startswith(f"{key}.") for f in held)):
+                    raise ValueError(f"{where}: its statistics lack {key}.{name}, which {mode.value} needs")
+                continue
+            require_finite(tensor, f"{where}: {key}.{name}")
+            if complete and len(feature.shape) == 1 and tuple(tensor.shape) != tuple(feature.shape):
+                raise ValueError(
+                    f"{where}: {key}.{name} has shape {tuple(tensor.shape)}, not {tuple(feature.shape)}"
+                )

@@ -1,0 +1,38 @@
+"""Checkpoints that come with the package: small policies that place stones, trained from nothing.
+
+Wherever LeRobot's commands and ours take a checkpoint, `bomb:NAME` is one of these.
+"""
+
+from pathlib import Path
+
+from lerobot_bomb.checkpoints.names import CONFIG
+
+FOLDER = Path(__file__).parent / "weights"
+PREFIX = "bomb:"
+
+
+def shipped_names() -> list[str]:
+    """What can stand behind `bomb:`."""
+    return sorted(path.parent.name for path in FOLDER.glob(f"*/{CONFIG}"))
+
+
+def shipped_checkpoint(name: str) -> Path:
+    """The folder of one, as lerobot-train's `pretrained_model`; it is not to be written to.
+
+    Raises:
+        ValueError: there is none of this name.
+    """
+    if name not in shipped_names():
+        raise ValueError(
+            f"no checkpoint {name!r} comes with this package; choose one of: {', '.join(shipped_names())}"
+        )
+    return FOLDER / name
+
+
+def checkpoint_path(text: str) -> str:
+    """The path of a checkpoint that someone gave: the folder that `bomb:NAME` means, all else as it is.
+
+    Raises:
+        ValueError: no checkpoint of this name comes with the package.
+    """
+    return str(shipped_checkpoint(text.removeprefix(PREFIX))) if text.startswith(PREFIX) else text

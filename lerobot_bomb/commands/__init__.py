@@ -1,0 +1,1 @@
+"""``lerobot-bomb``: a file for each command."""

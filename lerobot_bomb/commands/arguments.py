@@ -1,0 +1,100 @@
+"""Arguments that several commands share, and how their text is read."""
+
+import argparse
+import re
+from pathlib import Path
+from typing import Any
+
+from lerobot_bomb.bomb.episode import CONTROL_MODES, DEFAULT_FPS, ROBOTS, SPLITS
+from lerobot_bomb.bomb.observation import DEFAULT_IMAGE_SIZE
+from lerobot_bomb.bomb.suites import SUITES
+from lerobot_bomb.checkpoints.shipped import checkpoint_path
+
+
+def path_flag(text: str) -> Path:
+    """The path that a flag gives, for argparse; ~ is the home folder wherever it stands: --root=~/x.
+
+    Raises:
+        argparse.ArgumentTypeError: it is empty, of an unknown user, or not UTF-8.
+    """
+    if not text:
+        raise argparse.ArgumentTypeError("a path must not be empty")
+    try:
+        text.encode()
+        return Path(text).expanduser()
+    except UnicodeEncodeError:
+        raise argparse.ArgumentTypeError(f"{text!a} is not UTF-8") from None
+    except RuntimeError:
+        raise argparse.ArgumentTypeError(f"{text}: this user has no home folder here") from None
+
+
+def checkpoint_flag(text: str) -> Path:
+    """The folder of a checkpoint that a flag gives, for argparse; `bomb:NAME` is one of the package's.
+
+    Raises:
+        argparse.ArgumentTypeError: no checkpoint of this name comes with the package, or it is no path.
+    """
+    try:
+        return path_flag(checkpoint_path(text))
+    except ValueError as error:
+        raise argparse.ArgumentTypeError(str(error)) from None
+
+
+def switch() -> dict[str, Any]:
+    """Arguments of a flag that works alone and as LeRobot writes it: --resume, --resume=true."""
+    return {"nargs": "?", "const": True, "default": False, "type": _parse_bool}
+
+
+def _parse_bool(text: str) -> bool:
+    if text.lower() not in ("true", "false"):
+        raise argparse.ArgumentTypeError(f"{text!r} must be true or false")
+    return text.lower() == "true"
+
+
+def parse_numbers(text: str) -> tuple[int, ...]:
+    """Read a list of whole numbers: (0, 7) from "[0,7]", as LeRobot writes lists, and from "0,7"."""
+    if not re.fullmatch(r"\d+(,\d+)*|\[\d+(,\d+)*\]", text.replace(" ", "")):
+        raise argparse.ArgumentTypeError(f"{text!r} must be a list of whole numbers, as [0,7]")
+    return tuple(int(number) for number in re.findall(r"\d+", text))
+
+
+def parse_conditions(text: str) -> tuple[str, ...]:
+    """Read a list of conditions: ("none", "all:1-5") from '["none","all:1-5"]' and from "none,all:1-5"."""
+    return tuple(part.strip(" \"'") for part in text.strip("[] ").split(",") if part.strip())
+
+
+def add_new_dataset_arguments(parser: argparse.ArgumentParser) -> None:
+    """Declare what a dataset that is written is called, and where it lies."""
+    parser.add_argument("--repo_id", required=True, help="name of the dataset on the Hub, USER/NAME")
+    root = "new folder of the dataset (default: LeRobot's, $HF_LEROBOT_HOME/REPO_ID)"
+    parser.add_argument("--root", type=path_flag, help=root)
+
+
+def add_episode_arguments(parser: argparse.ArgumentParser) -> None:
+    """Declare what every command that plays episodes is told about them, but for seeds and targets."""
+    add = parser.add_argument
+    add("--task", default="place", help=f"suite: {', '.join(SUITES)} (default: place)")
+    add("--robot", default="scara", help=f"{', '.join(ROBOTS)} (default: scara)")
+    add("--control_mode", default="relative", help=f"{' or '.join(CONTROL_MODES)} (default: relative)")
+    add("--fps", type=int, default=DEFAULT_FPS, help=f"control steps a second (default: {DEFAULT_FPS})")
+    add("--image_size", type=int, default=DEFAULT_IMAGE_SIZE, help="pixels (default: %(default)s)")
+    add("--split", default="all", help=f"draw from {', '.join(SPLITS)} (default: all)")
+
+
+def add_folder_arguments(parser: argparse.ArgumentParser, checkpoint: str, output: str) -> None:
+    """Declare --policy.path, a checkpoint's folder, and --output, a new one."""
+    path = f"folder of {checkpoint} that lerobot-train names pretrained_model"
+    parser.add_argument("--policy.path", dest="policy_path", type=checkpoint_flag, required=True, help=path)
+    parser.add_argument("--output", type=path_flag, required=True, help=output)
+
+
+def add_hub_arguments(parser: argparse.ArgumentParser, kind: str) -> None:
+    """Declare where and how a model or a dataset is published."""
+    add = parser.add_argument
+    add("--repo_id", required=True, help=f"name of the {kind} on the Hub, USER/NAME")
+    add("--private", **switch(), help="make a new repository that only you see")
+    add(
+        "--dry_run",
+        **switch(),
+        help="print the card, and the names of the files instead of publishing them; no Hub is asked",
+    )

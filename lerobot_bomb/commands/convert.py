@@ -1,0 +1,145 @@
+"""``lerobot-bomb convert``: published demonstrations as a LeRobotDataset, frame for frame.
+
+Like a recording, the dataset grows in a folder beside its final place (see ``data/resumable.py``).
+"""
+
+import argparse
+from collections.abc import Iterator
+from dataclasses import asdict, dataclass
+from functools import partial
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, ClassVar
+
+from tqdm import tqdm
+
+from lerobot_bomb.commands.arguments import add_new_dataset_arguments, path_flag, switch
+from lerobot_bomb.data.kept_blocks import Progress, reached
+from lerobot_bomb.data.pusht_zarr import IMAGE_SIZE, PushtZarr
+from lerobot_bomb.data.resumable import (
+    BLOCK_EPISODES,
+    check_folders,
+    check_repo_id,
+    default_root,
+    grow,
+    missing_blocks,
+    terminated_in_order,
+    unfinished_folder,
+    write_blocks,
+)
+
+if TYPE_CHECKING:
+    from lerobot_bomb.data.blocks import DatasetLayout, Episode
+
+FPS = 10  # of the demonstrations and of LeRobot's environment `pusht`
+
+
+@dataclass(frozen=True)
+class Conversion:
+    """What determines a converted dataset."""
+
+    kind: ClassVar[str] = "conversion"
+
+    repo_id: str
+    task: str  # the instruction of every frame
+    source: str  # its kind and its SHA-256
+
+    def __post_init__(self) -> None:
+        check_repo_id(self.repo_id)
+
+    def to_dict(self) -> dict[str, Any]:
+        return asdict(self)
+
+
+def add_convert_arguments(parser: argparse.ArgumentParser) -> None:
+    """Declare the arguments of ``lerobot-bomb convert``."""
+    sources = parser.add_subparsers(dest="source", required=True, metavar="SOURCE")
+    summary = "the PushT demonstrations of Diffusion Policy, pusht_cchi_v7_replay.zarr"
+    pusht = sources.add_parser("pusht-zarr", help=summary, description=f"Convert {summary}.")
+    add = pusht.add_argument
+    add("path", type=path_flag, help="the folder of the zarr")
+    add_new_dataset_arguments(pusht)
+    add(
+        "--task",
+        default="",
+        help="instruction of every frame (default: none, which is what lerobot-eval gives a policy on "
+        "--env.type=pusht)",
+    )
+    add(
+        "--resume",
+        **switch(),
+        help=f"continue a conversion that was interrupted; its blocks of {BLOCK_EPISODES} episodes are kept",
+    )
+
+
+def run_convert(args: argparse.Namespace) -> int:
+    """Convert as told; prints where the dataset is."""
+    check_repo_id(args.repo_id)
+    root = args.root or default_root(args.repo_id)
+    with terminated_in_order():
+        progress = convert_pusht(args.path, args.repo_id, root, args.task, args.resume)
+    print(f"{progress.num_episodes} episodes, {progress.num_frames} frames: {root}")
+    return 0
+
+
+def convert_pusht(path: Path, repo_id: str, root: Path, task: str = "", resume: bool = False) -> Progress:
+    """Convert the zarr at `path` into `root`, which must not exist unless `resume` finds the same one there.
+
+    Raises:
+        ValueError: the source is not PushT or broken; `root` is in the way or holds something else.
+        RuntimeError: zarr is not installed, or the disk is full.
+    """
+    source = PushtZarr(path)
+    conversion = Conversion(repo_id, task, f"pusht-zarr {source.sha256}")
+    check_folders(conversion, root, unfinished_folder(root, conversion.kind), resume)
+    source.check()
+    return grow(
+        conversion,
+        root,
+        resume,
+        write=lambda folder: _write_pusht(source, conversion, folder),
+        layout=lambda: _pusht_layout(repo_id),
+    )
+
+
+def _write_pusht(source: PushtZarr, conversion: Conversion, folder: Path) -> Progress:
+    """Write the blocks that are missing."""
+    gaps = missing_blocks(folder, source.num_episodes)
+    num_kept = source.num_episodes - sum(gap.num_missing for gap in gaps)
+    with tqdm(total=source.num_episodes, initial=num_kept, unit="episode") as bar:
+        for gap in gaps:
+            episodes = partial(_pusht_episodes, source, conversion.task, bar)
+            write_blocks(folder, _pusht_layout(conversion.repo_id), gap, episodes)
+    return reached(folder)
+
+
+def _pusht_layout(repo_id: str) -> "DatasetLayout":
+    """The keys under which a policy sees LeRobot's environment `pusht`; images, since video is not exact."""
+    from lerobot.utils.constants import ACTION, OBS_IMAGE, OBS_STATE
+
+    from lerobot_bomb.data.blocks import DatasetLayout
+
+    image_shape = (IMAGE_SIZE, IMAGE_SIZE, 3)
+    features = {
+        OBS_IMAGE: {"dtype": "image", "shape": image_shape, "names": ["height", "width", "channels"]},
+        OBS_STATE: {"dtype": "float32", "shape": (2,), "names": ["agent_x", "agent_y"]},
+        ACTION: {"dtype": "float32", "shape": (2,), "names": ["target_x", "target_y"]},
+    }
+    return DatasetLayout(repo_id, FPS, "pusht", features, use_videos=False)
+
+
+def _pusht_episodes(
+    source: PushtZarr, task: str, bar: tqdm, progress: Progress, number: int
+) -> "Iterator[Episode]":
+    """Yield the next `number` episodes."""
+    from lerobot.utils.constants import ACTION, OBS_IMAGE, OBS_STATE
+
+    from lerobot_bomb.data.blocks import Episode
+
+    for index in range(progress.num_episodes, progress.num_episodes + number):
+        frames = (
+            {OBS_IMAGE: image, OBS_STATE: position, ACTION: action, "task": task}
+            for image, position, action in zip(*source.episode(index), strict=True)
+        )
+        progress.num_episodes += 1
+        yield Episode(frames)
+        bar.update()

@@ -1,0 +1,169 @@
+"""``lerobot-bomb demo``: a policy that comes with the package plays, on LeRobot's own commands."""
+
+import argparse
+import time
+from dataclasses import dataclass
+from datetime import datetime
+from pathlib import Path
+
+import numpy as np
+
+from lerobot_bomb.bomb.perturbations import NONE, Condition
+from lerobot_bomb.checkpoints.shipped import PREFIX
+from lerobot_bomb.commands.arguments import path_flag
+from lerobot_bomb.commands.run import run_command
+from lerobot_bomb.evaluation.result_groups import by_condition
+from lerobot_bomb.evaluation.result_lines import Row
+from lerobot_bomb.evaluation.results import read_results
+from lerobot_bomb.files import check_new_folder
+from lerobot_bomb.stats import format_rate
+from lerobot_bomb.tables import print_table
+
+POLICY = "vla0_smol"
+# one that its training prepares it for, and one that it does not
+CONDITIONS = (NONE, "stones:3", "light:3")
+SUITE = "place"
+
+
+@dataclass(frozen=True)
+class Player:
+    """Who acts, and under which conditions."""
+
+    policy_flag: str
+    conditions: tuple[str, ...] = CONDITIONS
+
+
+PLAYERS = {
+    POLICY: Player(f"--policy.path={PREFIX}{POLICY}"),
+    "expert": Player("--policy.type=bomb_expert"),
+    "random": Player("--policy.type=bomb_random", (NONE,)),
+}
+IMAGE_SIZE = 64  # pixels, as it was trained with
+SEED = 1000  # LeRobot's default; no demonstration had it
+SHOWN_EPISODES = 4  # of a condition
+MAX_EVAL_BATCH = 10
+FRAME_WIDTH = 384  # pixels, of a tile
+SUCCESS_RGB, FAILURE_RGB = (40, 140, 40), (190, 40, 40)  # of an edge above a tile
+EDGE = 6  # pixels, its height
+CLOSING = """\
+{policy} is a small model that learnt from nothing on one CPU core; docs/results.md says what it can do.
+Next:
+  train one yourself, in minutes   make demo-train
+  your own checkpoint              lerobot-eval --policy.path=FOLDER --env.type=bomb ... (docs/benchmark.md)
+  every perturbation               docs/perturbations.md"""
+
+
+def add_demo_arguments(parser: argparse.ArgumentParser) -> None:
+    """Declare the arguments of ``lerobot-bomb demo``."""
+    parser.add_argument("--output_dir", type=path_flag, help="new folder (default: outputs/demo/DATE_TIME)")
+    parser.add_argument("--episodes", type=int, default=20, help="of each condition (default: 20)")
+
+
+def run_demo(args: argparse.Namespace) -> int:
+    """Evaluate, replay a failure, print rates; the last line is the contact sheet's path."""
+    if args.episodes < 1:
+        raise ValueError(f"--episodes={args.episodes} must be at least 1")
+    output_dir = args.output_dir or Path("outputs/demo") / f"{datetime.now():%Y-%m-%d_%H-%M-%S}"
+    check_new_folder("--output_dir", output_dir)
+    started = time.monotonic()
+    rows = {}
+    for number, (name, player) in enumerate(PLAYERS.items(), start=1):
+        conditions = ", ".join(player.conditions)
+        _say(f"{number}/{len(PLAYERS) + 1}  {name} plays {args.episodes} episodes each of: {conditions}")
+        rows[name] = _evaluate(output_dir, name, player, args.episodes)
+    shown = next((row for row in rows[POLICY] if not row["is_success"]), rows[POLICY][-1])
+    outcome = shown["failure"] or "success"
+    _say(f"{len(PLAYERS) + 1}/{len(PLAYERS) + 1}  Replay an episode of {POLICY}: {outcome}")
+    _replay(output_dir, shown)
+    _report(output_dir, rows, time.monotonic() - started)
+    return 0
+
+
+def _evaluate(output_dir: Path, name: str, player: Player, num_episodes: int) -> list[Row]:
+    results = output_dir / f"{name}.jsonl"
+    # a divisor, so that LeRobot plays no more episodes than asked
+    batch_size = max(size for size in range(1, MAX_EVAL_BATCH + 1) if num_episodes % size == 0)
+    conditions = ",".join(f'"{condition}"' for condition in player.conditions)
+    run_command(
+        "lerobot-eval",
+        player.policy_flag,
+        "--policy.device=cpu",
+        "--env.type=bomb",
+        f"--env.task={SUITE}",
+        f"--env.image_size={IMAGE_SIZE}",
+        f"--env.perturbations=[{conditions}]",
+        f"--env.results_path={results}",
+        f"--seed={SEED}",
+        f"--eval.n_episodes={num_episodes}",
+        f"--eval.batch_size={batch_size}",
+        "--eval.use_async_envs=false",
+        f"--output_dir={output_dir / 'eval' / name}",
+    )
+    return read_results(results)
+
+
+def _replay(output_dir: Path, row: Row) -> None:
+    run_command(
+        "lerobot-bomb",
+        "view",
+        PLAYERS[POLICY].policy_flag,
+        f"--image_size={IMAGE_SIZE}",
+        f"--seed={row['spec']['seed']}",
+        f"--perturbations={row['spec']['perturbations']}",
+        f"--output={output_dir / 'replay'}",
+    )
+
+
+def _report(output_dir: Path, rows: dict[str, list[Row]], seconds: float) -> None:
+    _say(f"Done in {seconds / 60:.1f} minutes: successes, with 95 % Wilson intervals")
+    cells = []
+    for name, played in rows.items():
+        by = by_condition(played)
+        cells.append([name, *(_rate(by.get(condition, [])) for condition in CONDITIONS)])
+    print_table(["", *CONDITIONS], cells)
+    print(f"\n{CLOSING.format(policy=POLICY)}\n")
+    print(f"results        {output_dir}/*.jsonl  (lerobot-bomb results FILE)")
+    print(f"videos         {output_dir}/eval/*/videos")
+    print(f"replay         {output_dir}/replay.mp4, and .rrd for Rerun")
+    print(f"contact sheet  {_write_sheet(output_dir, rows[POLICY])}")
+
+
+def _rate(rows: list[Row]) -> str:
+    return format_rate(sum(row["is_success"] for row in rows), len(rows)) if rows else "-"
+
+
+def _write_sheet(output_dir: Path, rows: list[Row]) -> Path:
+    """The last frames of some episodes of each condition."""
+    from PIL import Image
+
+    from lerobot_bomb.viewing.sheet import Sheet
+
+    tiles: dict[str, list[np.ndarray]] = {}
+    as_played = sorted(rows, key=lambda row: row["spec"]["seed"])
+    for condition, played in by_condition(as_played).items():
+        group = f"{SUITE}.{Condition.parse(condition).key}_0"  # of LeRobot's videos
+        folder = output_dir / "eval" / POLICY / "videos" / group
+        tiles[condition] = [
+            _tile(folder / f"eval_episode_{number}.mp4", row["is_success"])
+            for number, row in enumerate(played[:SHOWN_EPISODES])
+        ]
+    columns = [f"seed {SEED + number}" for number in range(len(tiles[NONE]))]
+    path = output_dir / f"{POLICY}.png"
+    title = f"{POLICY}: the last frame of each episode; green edge: success"
+    Image.fromarray(Sheet(title, columns, pictures=tiles).draw()).save(path)
+    return path
+
+
+def _tile(video: Path, is_success: bool) -> np.ndarray:
+    from PIL import Image
+
+    from lerobot_bomb.viewing.video import last_frame
+
+    frame = Image.fromarray(last_frame(video))
+    tile = np.array(frame.resize((FRAME_WIDTH, frame.height * FRAME_WIDTH // frame.width)))
+    tile[:EDGE] = SUCCESS_RGB if is_success else FAILURE_RGB
+    return tile
+
+
+def _say(text: str) -> None:
+    print(f"\n=== {text}", flush=True)

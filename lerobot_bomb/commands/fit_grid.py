@@ -1,0 +1,175 @@
+"""``lerobot-bomb fit-grid``: the action grid that a policy would fit on a dataset, and what it rounds off.
+
+Shapes: `N` actions, `D` action dims.
+"""
+
+import argparse
+import json
+from collections.abc import Callable
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+import torch
+from lerobot.configs import NormalizationMode
+from lerobot.datasets import LeRobotDatasetMetadata
+from lerobot.utils.constants import ACTION
+from PIL import Image
+
+from lerobot_bomb.actions.grid_fit import normalised, normalised_rest
+from lerobot_bomb.actions.grid_report import clipping_text, coordinate_edges, coordinate_names, edges_text
+from lerobot_bomb.actions.grid_settings import DECODE_POINTS, ActionGroup, GridSettings, default_groups
+from lerobot_bomb.actions.grids import ActionGrids
+from lerobot_bomb.actions.relative import BOUND_STATISTICS, bounds
+from lerobot_bomb.commands.arguments import path_flag
+from lerobot_bomb.data.columns import dim_names, read_columns, read_meta
+from lerobot_bomb.files import check_writable, written_whole
+from lerobot_bomb.flags import one_of
+from lerobot_bomb.tables import print_table
+from lerobot_bomb.viewing.grid_picture import Row, draw_rows
+
+UNIFORM, CLIPPING = "uniform mid", "clipping alone"
+
+
+def add_fit_grid_arguments(parser: argparse.ArgumentParser) -> None:
+    """Declare the arguments of ``lerobot-bomb fit-grid``."""
+    add, default = parser.add_argument, GridSettings(())
+    add("--dataset.repo_id", dest="repo_id", required=True, help="name of the dataset")
+    root = "folder of the dataset (default: LeRobot's, $HF_LEROBOT_HOME/REPO_ID)"
+    add("--dataset.root", dest="root", type=path_flag, help=root)
+    groups = (
+        """as JSON: '[{"dims": [0, 1], "transform": "identity", "bins": [64, 64]}, ...]' (default: by size)"""
+    )
+    add("--policy.action_groups", dest="groups", type=json_of(list), help=groups)
+    distribution = "of the edges: gaussian, uniform or quantile (default: gaussian)"
+    add("--policy.grid_distribution", dest="distribution", default=default.distribution, help=distribution)
+    sigma = "least standard deviation of a coordinate, in its unit (default: 0)"
+    add("--policy.grid_min_sigma", dest="min_sigma", type=float, default=default.min_sigma, help=sigma)
+    rho_dead = f"length below which there is no motion (default: {default.rho_dead})"
+    add("--policy.rho_dead", dest="rho_dead", type=float, default=default.rho_dead, help=rho_dead)
+    phi_fit = "where the angle phi is cut: wrapped or linear (default: wrapped)"
+    add("--policy.phi_fit", dest="phi_fit", default=default.phi_fit, help=phi_fit)
+    mapping = """as JSON, of which ACTION is read: '{"ACTION": "QUANTILES"}' (default: MIN_MAX)"""
+    add("--policy.normalization_mapping", dest="mapping", type=json_of(dict), default={}, help=mapping)
+    add("--picture", type=path_flag, help="also draw histograms with the edges into this file, as PNG")
+
+
+def json_of(kind: type) -> Callable[[str], Any]:
+    """A reader of flags that are JSON of this type."""
+
+    def read(text: str) -> Any:
+        value = json.loads(text)
+        if not isinstance(value, kind):
+            raise ValueError
+        return value
+
+    read.__name__ = f"JSON {kind.__name__}"  # what argparse calls it
+    return read
+
+
+def run_fit_grid(args: argparse.Namespace) -> int:
+    """Fit, print the tables, draw the picture."""
+    if args.picture is not None:
+        check_writable("--picture", args.picture)
+    mode = args.mapping.get("ACTION", NormalizationMode.MIN_MAX)
+    one_of("--policy.normalization_mapping[ACTION]", mode, [of.value for of in BOUND_STATISTICS])
+    mode = NormalizationMode(mode)
+    meta = read_meta(args.repo_id, args.root)
+    low_D, high_D = action_bounds(meta, mode)
+    num_dims = len(low_D)
+    groups = (
+        default_groups(num_dims) if args.groups is None else tuple(map(ActionGroup.from_dict, args.groups))
+    )
+    options = {name: getattr(args, name) for name in ("distribution", "min_sigma", "rho_dead", "phi_fit")}
+    grids = ActionGrids(GridSettings(groups, **options), num_dims)
+    actions_ND = normalised(read_columns(meta, (ACTION,))[ACTION], low_D, high_D)
+    grids.fit(actions_ND, normalised_rest(low_D, high_D))
+    names = dim_names(meta.features[ACTION])
+    print(f"{meta.repo_id}: {len(actions_ND)} actions, -1 and 1 at {' and '.join(BOUND_STATISTICS[mode])}")
+    print(clipping_text(actions_ND, names)[0])
+    print_fit(grids, names)
+    errors = quantisation_errors(grids, actions_ND)
+    print_errors("in normalised units", errors, names)
+    physical = {name: error_D * (high_D - low_D) / 2 for name, error_D in errors.items()}
+    print_errors("in the dataset's units", physical, names)
+    if args.picture is not None:
+        title = (
+            f"{meta.repo_id}: {len(actions_ND)} actions and the {grids.settings.distribution} bins of a grid"
+        )
+        picture = draw_rows(title, picture_rows(grids, actions_ND.clip(-1, 1), names))
+        with written_whole(args.picture) as (path,):
+            Image.fromarray(picture).save(path, format="PNG")
+        print(f"\n{args.picture}")
+    return 0
+
+
+def action_bounds(meta: LeRobotDatasetMetadata, mode: NormalizationMode) -> tuple[np.ndarray, np.ndarray]:
+    """(D,) actions that become -1 and (D,) actions that become 1.
+
+    Raises:
+        ValueError: the dataset has no actions, or no such statistics of them.
+    """
+    if ACTION not in meta.features:
+        raise ValueError(f"dataset {meta.repo_id} has no {ACTION!r}; it has {sorted(meta.features)}")
+    (num_dims,) = meta.features[ACTION]["shape"]
+    return bounds((meta.stats or {}).get(ACTION, {}), mode, num_dims)
+
+
+def quantisation_errors(grids: ActionGrids, actions_ND: np.ndarray) -> dict[str, np.ndarray]:
+    """Mean absolute errors (D,) of normalised actions, clipping included.
+
+    Of each decode point, of uniform edges with midpoints, and of clipping alone.
+    """
+    uniform = ActionGrids(replace(grids.settings, distribution="uniform", decode_point="mid"), grids.num_dims)
+    uniform.fit(actions_ND, grids.rest.numpy())
+    of_point = {point: _mean_error(grids, actions_ND, point) for point in DECODE_POINTS}
+    return {
+        **of_point,
+        UNIFORM: _mean_error(uniform, actions_ND, "mid"),
+        CLIPPING: np.abs(actions_ND.clip(-1, 1) - actions_ND).mean(axis=0),
+    }
+
+
+def _mean_error(grids: ActionGrids, actions_ND: np.ndarray, point: str) -> np.ndarray:
+    """(D,) mean absolute error."""
+    decoded_ND = grids.decode(grids.encode(torch.from_numpy(actions_ND)), point).numpy()
+    return np.abs(decoded_ND - actions_ND).mean(axis=0)
+
+
+def print_fit(grids: ActionGrids, names: list[str]) -> None:
+    """Print every coordinate's Gaussian and its edges."""
+    labels, edges = coordinate_names(grids, names), coordinate_edges(grids)
+    print("\nCoordinates, theta and phi in radians")
+    print_table(
+        ["", "mean", "deviation", "bins"],
+        [
+            [label, f"{mean:.4g}", f"{std:.4g}", str(len(of) - 1)]
+            for label, of, (mean, std) in zip(labels, edges, grids.gaussians.tolist(), strict=True)
+        ],
+    )
+    print(f"\nEdges\n{edges_text(grids, names)}")
+
+
+def print_errors(unit: str, errors: dict[str, np.ndarray], names: list[str]) -> None:
+    """Print a row per dim and a column per way of decoding."""
+    print(f"\nMean absolute error of an action that was encoded and decoded, {unit}")
+    print_table(
+        ["", *errors],
+        [[name, *(f"{error_D[i]:.4g}" for error_D in errors.values())] for i, name in enumerate(names)],
+    )
+
+
+def picture_rows(grids: ActionGrids, actions_ND: np.ndarray, names: list[str]) -> list[Row]:
+    """What a picture shows of every coordinate."""
+    values_CN = grids.coordinates(torch.from_numpy(actions_ND).float()).T.numpy()
+    rows = zip(
+        coordinate_names(grids, names),
+        grids.gaussians.tolist(),
+        values_CN,
+        coordinate_edges(grids),
+        strict=True,
+    )
+    return [
+        Row([label, f"mean {mean:.3g}", f"deviation {std:.3g}"], values_N, edges)
+        for label, (mean, std), values_N, edges in rows
+    ]

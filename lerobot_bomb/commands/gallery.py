@@ -1,0 +1,151 @@
+"""``lerobot-bomb gallery``: what each perturbation axis does, as one contact sheet per axis."""
+
+import argparse
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from PIL import Image, ImageDraw
+from tqdm import tqdm
+
+from lerobot_bomb.bomb.board import BOARD
+from lerobot_bomb.bomb.episode import EpisodeSpec
+from lerobot_bomb.bomb.observation import CAMERAS, WORKSPACE_HIGH_M, WORKSPACE_LOW_M, RenderOptions
+from lerobot_bomb.bomb.perturbations import ALL, AXES, MAX_LEVEL, NONE, NUISANCES
+from lerobot_bomb.commands.arguments import parse_numbers, path_flag
+from lerobot_bomb.data.rollout import make_env
+from lerobot_bomb.files import written_whole
+from lerobot_bomb.flags import flags_without_group, one_of
+from lerobot_bomb.viewing.episode import expert_agent, play
+from lerobot_bomb.viewing.perturbations_page import write_page
+from lerobot_bomb.viewing.sheet import FONT_SIZE, GAP, INK, TILE_PAPER, Sheet, font, text_tile
+
+SHEETS = (*AXES, ALL)
+LEVELS = range(MAX_LEVEL + 1)
+COLUMNS = ["nominal", *(f"level {level}" for level in LEVELS[1:])]
+DEFAULT_SEEDS = (2, 3)
+DEFAULT_TILE_SIZE = 144  # pixels
+DEFAULT_FOLDER = Path("outputs/gallery")
+JPEG_QUALITY = 88
+GRID_RGB, NOMINAL_RGB, PATH_RGB = (200, 185, 160), (165, 165, 165), (210, 40, 30)
+
+
+def add_gallery_arguments(parser: argparse.ArgumentParser) -> None:
+    """Declare the arguments of ``lerobot-bomb gallery``."""
+    add = parser.add_argument
+    add("--axes", type=_parse_names, default=SHEETS, help=f"as camera,light (default: {','.join(SHEETS)})")
+    add("--seeds", type=parse_numbers, default=DEFAULT_SEEDS, help="episodes (default: 2,3)")
+    add("--image_size", type=int, default=DEFAULT_TILE_SIZE, help="pixels of a tile (default: %(default)s)")
+    add(
+        "--output",
+        type=path_flag,
+        default=DEFAULT_FOLDER,
+        help="folder of the sheets, AXIS.jpg; those of the same names are replaced (default: %(default)s)",
+    )
+    add("--doc", type=path_flag, help="also write the page that explains the axes, with their sheets")
+
+
+def run_gallery(args: argparse.Namespace) -> int:
+    """Draw the sheets and print their paths."""
+    for axis in args.axes:
+        one_of("--axes", axis, SHEETS)
+    if args.output.exists() and not args.output.is_dir():
+        raise ValueError(f"--output={args.output} is no folder; name another")
+    with flags_without_group({"--seed=": "--seeds: "}):
+        options = RenderOptions(image_size=args.image_size)
+        for seed in args.seeds:
+            EpisodeSpec(seed)
+    for axis in tqdm(args.axes, unit="sheet"):
+        path = args.output / f"{axis}.jpg"
+        picture = axis_sheet(axis, args.seeds, options).draw()
+        with written_whole(path) as (unfinished,):
+            Image.fromarray(picture).save(unfinished, quality=JPEG_QUALITY)
+        tqdm.write(str(path))
+    if args.doc is not None:
+        write_page(args.doc, args.output)
+        print(args.doc)
+    return 0
+
+
+@dataclass(frozen=True)
+class Look:
+    """How an episode looks under one condition."""
+
+    images: dict[str, np.ndarray]  # camera -> (S, S, 3) uint8, at the start
+    instruction: str
+    path_xy: np.ndarray  # (T + 1, 2) metres, of the gripper; (1, 2) when it was not played
+
+
+def axis_sheet(axis: str, seeds: Sequence[int], options: RenderOptions) -> Sheet:
+    """A column for every level of an axis, or of all of them, and rows for what it changes, per seed."""
+    axes = NUISANCES if axis == ALL else (axis,)
+    changes = {change for name in axes for change in AXES[name].changes}
+    summary = f"every axis but {', '.join(sorted(AXES.keys() - axes))}" if axis == ALL else AXES[axis].summary
+    if "images" not in changes:
+        summary += "; the images stay as they are"
+    looks = [
+        look_at(f"{axis}:{level}" if level else NONE, seeds, options, "dynamics" in changes)
+        for level in LEVELS
+    ]
+    pictures: dict[str, list[np.ndarray]] = {}
+    for seed, of_seed in zip(seeds, zip(*looks, strict=True), strict=True):
+        for camera in CAMERAS if "images" in changes else ():
+            pictures[f"{camera}, seed {seed}"] = [look.images[camera] for look in of_seed]
+        if "instruction" in changes:
+            tiles = [text_tile(look.instruction, options.image_size) for look in of_seed]
+            pictures[f"instruction, seed {seed}"] = tiles
+        if "dynamics" in changes:
+            paths = [look.path_xy for look in of_seed]
+            pictures[f"expert's path, seed {seed}"] = [
+                path_tile(path, paths[0], options.image_size) for path in paths
+            ]
+    return Sheet(f"{axis}: {summary}", COLUMNS, {} if axis == ALL else magnitude_rows(axis), pictures)
+
+
+def look_at(condition: str, seeds: Sequence[int], options: RenderOptions, played: bool) -> list[Look]:
+    """Each seed's episode under a condition; `played` by the expert to its end, or only begun."""
+    env = make_env(EpisodeSpec(seeds[0], perturbations=condition), options)
+    looks = []
+    for seed in seeds:
+        spec = EpisodeSpec(seed, perturbations=condition)
+        moments = play(env, spec, expert_agent(spec))
+        first = next(moments)
+        path = [moment.state.gripper_xyz[:2] for moment in (first, *(moments if played else ()))]
+        looks.append(Look(first.observation["pixels"], first.instruction, np.array(path)))
+    env.close()
+    return looks
+
+
+def magnitude_rows(axis: str) -> dict[str, list[str]]:
+    """What the table says of an axis, as rows of words under the columns."""
+    return {
+        f"{name}, {magnitude.unit}": ["", *(f"{value:g}" for value in magnitude.levels)]
+        for name, magnitude in AXES[axis].magnitudes.items()
+    }
+
+
+def path_tile(path_xy: np.ndarray, nominal_xy: np.ndarray, size: int) -> np.ndarray:
+    """(size, size, 3) uint8: the board from above, the nominal path in grey and another in red."""
+    low, high = np.array(WORKSPACE_LOW_M[:2]), np.array(WORKSPACE_HIGH_M[:2])
+    pixels_per_m = size / (high - low).max()
+
+    def pixels(points_xy: np.ndarray) -> list[tuple[float, float]]:
+        x, y = ((points_xy - (low + high) / 2) * pixels_per_m).T
+        return [*zip((size / 2 + x).tolist(), (size / 2 - y).tolist(), strict=True)]
+
+    tile = Image.new("RGB", (size, size), TILE_PAPER)
+    pen = ImageDraw.Draw(tile)
+    last = BOARD.num_lines - 1
+    for line in range(BOARD.num_lines):
+        for ends in (((line, 0), (line, last)), ((0, line), (last, line))):
+            pen.line(pixels(np.array([BOARD.intersection_xy(*end) for end in ends])), GRID_RGB)
+    pen.line(pixels(nominal_xy), NOMINAL_RGB, 3)
+    pen.line(pixels(path_xy), PATH_RGB, 1)
+    pen.text((GAP, size - FONT_SIZE - GAP), f"{len(path_xy) - 1} steps", INK, font(FONT_SIZE))
+    return np.asarray(tile)
+
+
+def _parse_names(text: str) -> tuple[str, ...]:
+    """Read a list of axes: ("camera", "light") from "camera,light" and from "[camera,light]"."""
+    return tuple(name.strip() for name in text.strip("[]").split(","))

@@ -1,0 +1,73 @@
+"""``lerobot-bomb``: what LeRobot's own commands do not do."""
+
+import argparse
+import importlib
+import sys
+from collections.abc import Sequence
+from typing import Any
+
+from draccus.utils import DecodingError
+
+from lerobot_bomb import __version__
+
+DESCRIPTION = "What lerobot-train and lerobot-eval do not do for BOMB: record, summarise, check."
+
+# command -> help; NAME stands in commands/NAME.py, a hyphen as an underscore, with add_NAME_arguments and
+# run_NAME, and is imported only when called
+COMMANDS = {
+    "record": "record the scripted expert as a LeRobotDataset",
+    "convert": "published demonstrations as a LeRobotDataset",
+    "results": "summarise files written by --env.results_path",
+    "eval": "lerobot-eval, which also writes the executed actions to a file",
+    "smoothness": "second and third differences of executed actions, of demonstrations and evaluations",
+    "offline-metrics": "loss, accuracy and L1 of a checkpoint on recorded frames, beside trivial predictors",
+    "fit-grid": "an action grid on a dataset: its fit, its edges and what it rounds off",
+    "init": "a policy before its training, as a checkpoint that adapters can be trained on",
+    "merge": "adapters and their base as one checkpoint",
+    "convert-spatialvla": "a published SpatialVLA folder as a checkpoint of spatialvla_grid",
+    "export-backbone": "a checkpoint's vision-language model as a folder that other policies can start from",
+    "serve": "LeRobot's server of action chunks for a robot elsewhere, for every policy type",
+    "push": "a checkpoint to the Hub, with a card and its evaluation",
+    "push-dataset": "a recorded dataset to the Hub, with a card",
+    "view": "play one episode into a recording for Rerun and a video",
+    "gallery": "draw what every perturbation axis changes",
+    "checkpoint": "the folder of a checkpoint that comes with this package",
+    "demo": "a policy that comes with this package plays, beside expert and random",
+    "doctor": "check this installation",
+}
+
+
+def _function(command: str) -> str:
+    return command.replace("-", "_")
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """Run one command; what is wrong with its flags or files becomes one line on stderr and exit code 1."""
+    argv = sys.argv[1:] if argv is None else list(argv)
+    argv = argv or ["--help"]
+    parser = argparse.ArgumentParser(prog="lerobot-bomb", description=DESCRIPTION)
+    parser.add_argument("--version", action="version", version=f"lerobot-bomb {__version__}")
+    commands = parser.add_subparsers(dest="command", required=True, metavar="COMMAND")
+    module: Any = None
+    try:
+        for name, summary in COMMANDS.items():
+            command = commands.add_parser(name, help=summary, description=summary, allow_abbrev=False)
+            if name in argv[:1]:
+                module = importlib.import_module(f"lerobot_bomb.commands.{_function(name)}")
+                getattr(module, f"add_{_function(name)}_arguments")(command)
+        args, unknown = parser.parse_known_args(argv)
+        if "rest" in args:  # of a command that has LeRobot's parser read them
+            args.rest = unknown
+        elif unknown:
+            commands.choices[args.command].error(f"unrecognized arguments: {' '.join(unknown)}")
+        return getattr(module, f"run_{_function(args.command)}")(args)
+    except (ValueError, OSError, RuntimeError, DecodingError) as error:
+        print(f"lerobot-bomb {argv[0]}: {error}", file=sys.stderr)
+        return 1
+    except KeyboardInterrupt:
+        print(f"lerobot-bomb {argv[0]}: interrupted", file=sys.stderr)
+        return 130
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,51 @@
+"""``lerobot-bomb merge``: adapters and their base as one checkpoint, which needs neither nor `peft`."""
+
+import argparse
+from pathlib import Path
+
+from lerobot.configs import PreTrainedConfig
+from lerobot.policies import PreTrainedPolicy, get_policy_class
+
+from lerobot_bomb.checkpoints.adapters import check_adapters_fit
+from lerobot_bomb.checkpoints.checks import ADAPTERS
+from lerobot_bomb.checkpoints.folder import load_processors, read_config, write_checkpoint
+from lerobot_bomb.commands.arguments import add_folder_arguments
+from lerobot_bomb.files import check_new_folder
+
+
+def add_merge_arguments(parser: argparse.ArgumentParser) -> None:
+    """Declare the arguments of ``lerobot-bomb merge``."""
+    add_folder_arguments(parser, "the adapters' checkpoint", "new folder for the checkpoint")
+
+
+def run_merge(args: argparse.Namespace) -> int:
+    """Write config, merged weights and processors."""
+    check_new_folder("--output", args.output)
+    config = read_config(args.policy_path, "cpu")
+    if not config.use_peft:
+        raise ValueError(f"--policy.path={args.policy_path} is a whole checkpoint: there is nothing to merge")
+    pipelines = load_processors(config)
+    policy = merged(config, args.policy_path)
+    write_checkpoint(args.output, policy, pipelines)
+    print(f"written to {args.output}: --policy.path={args.output}")
+    return 0
+
+
+def merged(config: PreTrainedConfig, adapters: Path) -> PreTrainedPolicy:
+    """The policy whose weights are those of the base and its adapters; the config is of a whole one then."""
+    check_adapters_fit(get_policy_class(config.type), config, str(adapters), None)
+    import peft  # pyright: ignore[reportMissingImports]
+
+    of_adapters = peft.PeftConfig.from_pretrained(str(adapters))
+    base = str(of_adapters.base_model_name_or_path)
+    config.use_peft, config.pretrained_path = False, None
+    try:
+        policy = get_policy_class(config.type).from_pretrained(
+            base, config=config, revision=of_adapters.revision
+        )
+    except (OSError, ValueError) as error:
+        raise ValueError(
+            f"--policy.path={adapters} holds adapters of {base}, as {ADAPTERS[0]} says, which cannot be "
+            f"loaded: {str(error).splitlines()[0]}"
+        ) from error
+    return peft.PeftModel.from_pretrained(policy, str(adapters)).merge_and_unload()

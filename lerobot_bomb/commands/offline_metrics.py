@@ -1,0 +1,96 @@
+"""``lerobot-bomb offline-metrics``: a checkpoint's loss, accuracy and L1 on recorded frames."""
+
+import argparse
+import json
+import sys
+from dataclasses import asdict
+from typing import Any
+
+from lerobot.datasets import LeRobotDatasetMetadata
+
+from lerobot_bomb.checkpoints.folder import read_config
+from lerobot_bomb.commands.arguments import checkpoint_flag, path_flag
+from lerobot_bomb.data.columns import read_meta
+from lerobot_bomb.data.dataset_files import check_readable
+from lerobot_bomb.evaluation.offline_metrics import measure_columns, print_columns
+from lerobot_bomb.evaluation.predictions import check_policy
+from lerobot_bomb.evaluation.splits import (
+    Split,
+    make_split,
+    parse_episodes,
+    read_train_config,
+    trained_episodes,
+)
+from lerobot_bomb.files import check_writable, written_whole
+
+
+def add_offline_metrics_arguments(parser: argparse.ArgumentParser) -> None:
+    """Declare the arguments of ``lerobot-bomb offline-metrics``."""
+    add = parser.add_argument
+    path = "folder of the checkpoint that lerobot-train names pretrained_model"
+    add("--policy.path", dest="policy_path", type=checkpoint_flag, required=True, help=path)
+    add("--device", "--policy.device", help="cpu, cuda, ... (default: as the checkpoint says)")
+    add("--dataset.repo_id", dest="repo_id", required=True, help="name of the dataset")
+    root = "folder of the dataset (default: LeRobot's, $HF_LEROBOT_HOME/REPO_ID)"
+    add("--dataset.root", dest="root", type=path_flag, help=root)
+    spelling = "episodes as [180,181], 180-205 or [0-9,20]"
+    add("--train_episodes", help=f"{spelling} (default: what the checkpoint was trained on)")
+    add("--val_episodes", help=f"{spelling} (default: all others)")
+    frames = "frames of each split, evenly spaced; 0 = all of them (default: 500)"
+    add("--max_frames", type=int, default=500, help=frames)
+    add("--batch_size", type=int, default=16, help="frames that are decoded at once (default: 16)")
+    add("--json", type=path_flag, help="also write all figures to this file, those of every step too")
+
+
+def run_offline_metrics(args: argparse.Namespace) -> int:
+    """Measure, print the tables, write the JSON file."""
+    _check_flags(args)
+    config = read_config(args.policy_path, args.device)
+    meta = read_meta(args.repo_id, args.root)
+    check_readable(meta.root)
+    train_config = read_train_config(args.policy_path)
+    check_policy(config, meta, train_config.get("rename_map") or {})
+    split = _split(args, meta, train_config)
+    columns = measure_columns(config, meta, split, args.max_frames, args.batch_size)
+    print(f"{args.policy_path} ({config.type}) on {meta.repo_id}")
+    print_columns(columns)
+    if args.json is not None:
+        figures = {
+            "policy_path": str(args.policy_path),
+            "policy_type": config.type,
+            "device": str(config.device),
+            "batch_size": args.batch_size,
+            "dataset": meta.repo_id,
+            "validation_episodes_trained_on": split.seen,
+            "columns": {name: asdict(column) for name, column in columns.items()},
+        }
+        with written_whole(args.json) as (path,):
+            path.write_text(json.dumps(figures, indent=1, allow_nan=False) + "\n")
+    return 0
+
+
+def _check_flags(args: argparse.Namespace) -> None:
+    for flag, lowest in {"max_frames": 0, "batch_size": 1}.items():
+        if getattr(args, flag) < lowest:
+            raise ValueError(f"--{flag}={getattr(args, flag)} must be at least {lowest}")
+    if args.json is not None:
+        check_writable("--json", args.json)
+
+
+def _split(args: argparse.Namespace, meta: LeRobotDatasetMetadata, train_config: dict[str, Any]) -> Split:
+    if not train_config and args.val_episodes is None:
+        raise ValueError(
+            f"--policy.path={args.policy_path} has no train_config.json to tell which episodes it was "
+            "trained on; name those to judge it by with --val_episodes"
+        )
+    train, validation = (
+        None if text is None else parse_episodes(flag, text, meta.total_episodes)
+        for flag, text in (("--train_episodes", args.train_episodes), ("--val_episodes", args.val_episodes))
+    )
+    split = make_split(meta.total_episodes, trained_episodes(train_config, meta), train, validation)
+    if split.seen:
+        print(
+            f"warning: {len(split.seen)} of the {len(split.validation)} validation episodes were trained on",
+            file=sys.stderr,
+        )
+    return split

@@ -1,0 +1,77 @@
+"""``lerobot-bomb record``: the scripted expert's episodes as a LeRobotDataset."""
+
+import argparse
+from dataclasses import fields
+
+from lerobot_bomb.bomb.perturbations import NONE
+from lerobot_bomb.commands.arguments import (
+    add_episode_arguments,
+    add_new_dataset_arguments,
+    parse_conditions,
+    parse_numbers,
+    switch,
+)
+from lerobot_bomb.data.record import describe_failures, record
+from lerobot_bomb.data.recording import Recording
+from lerobot_bomb.data.resumable import (
+    BLOCK_EPISODES,
+    default_root,
+    terminated_in_order,
+)
+
+
+def add_record_arguments(parser: argparse.ArgumentParser) -> None:
+    """Declare the arguments of ``lerobot-bomb record``."""
+    add_new_dataset_arguments(parser)
+    add = parser.add_argument
+    add("--episodes", type=int, required=True, help="successful episodes to record")
+    add("--seed", type=int, default=0, help="seed of the first episode; the others count up (default: 0)")
+    add_episode_arguments(parser)
+    add(
+        "--task_ids",
+        type=parse_numbers,
+        default=(),
+        help="numbered tasks, as [0,7,12]: every seed is played with each (25 x colour + 5 x row + column; "
+        "black = 0, white = 1; default: target and colour are drawn per episode)",
+    )
+    add(
+        "--perturbations",
+        "--env.perturbations",
+        type=parse_conditions,
+        default=(NONE,),
+        help='conditions, as ["all:1-5"]: every seed is played with each; a range such as all:1-5 or '
+        "camera:0-3 draws a level per episode and axis (default: none)",
+    )
+    add("--images", **switch(), help="store images (lossless) instead of videos")
+    add("--depth", **switch(), help="store each camera's depth (metres, lossless), intrinsics and pose too")
+    add("--workers", type=int, default=1, help="simulator processes; one keeps two cores busy (default: 1)")
+    add(
+        "--noise",
+        type=float,
+        default=0.0,
+        help="standard deviation of noise on the executed action, in units of the largest step, 40 mm; the "
+        "stored action is clean, so recoveries are in the data; the expert bears 0.05 (default: 0)",
+    )
+    add(
+        "--resume",
+        **switch(),
+        help=f"continue a recording that was interrupted; its blocks of {BLOCK_EPISODES} episodes are kept",
+    )
+
+
+def run_record(args: argparse.Namespace) -> int:
+    """Record as told; prints which episodes failed and where the dataset is."""
+    flags = vars(args)
+    recording = Recording(**{f.name: flags[f.name] for f in fields(Recording) if f.name in flags})
+    if not 1 <= args.workers <= recording.episodes:
+        raise ValueError(f"--workers={args.workers} must lie in 1..{recording.episodes} (--episodes)")
+    root = args.root or default_root(recording.repo_id)
+    with terminated_in_order():
+        progress = record(recording, root, num_workers=args.workers, resume=args.resume)
+    last_seed = recording.seed + (progress.num_tried - 1) // len(recording.conditions)
+    seeds = f"{recording.seed}..{last_seed}"
+    print(
+        f"{progress.num_episodes} episodes, {progress.num_frames} frames, of the seeds {seeds}: {root}\n"
+        f"{describe_failures(progress.failures)}"
+    )
+    return 0

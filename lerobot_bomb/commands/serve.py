@@ -1,0 +1,98 @@
+"""``lerobot-bomb serve``: LeRobot's server of action chunks, which knows the policy types of plugins too.
+
+The robot's machine runs LeRobot's own client: ``python -m lerobot.async_inference.robot_client``.
+"""
+
+import argparse
+import socket
+import sys
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import fields
+from ipaddress import ip_address
+from typing import cast
+
+from lerobot_bomb._compat import serve_registered_policies
+from lerobot_bomb.commands.arguments import path_flag, switch
+
+try:
+    from lerobot.async_inference.configs import PolicyServerConfig
+
+    from lerobot_bomb.serving.open_streams import WORKERS, OpenStreams
+    from lerobot_bomb.serving.unpickling import loads
+except ImportError as error:  # LeRobot's own extra, which few need
+    raise RuntimeError("the server needs grpc: pip install 'lerobot_policy_bomb[async]'") from error
+
+LOOPBACK = "127.0.0.1"
+WARNING = (
+    "The server trusts its network: there is no password and no encryption, and whoever reaches it can have "
+    "it load any checkpoint, and reads the actions. It unpickles what it receives: LeRobot's messages, "
+    "arrays, tensors; it refuses the rest. LeRobot's client unpickles whatever a server sends. By default "
+    f"only this machine reaches it; let another in through a tunnel (ssh -L 8080:{LOOPBACK}:8080 MACHINE)."
+)
+
+
+def add_serve_arguments(parser: argparse.ArgumentParser) -> None:
+    """Declare the arguments of ``lerobot-bomb serve``: those of LeRobot's policy_server, and who may come."""
+    parser.description = f"{parser.description}. {WARNING}"
+    for field in fields(PolicyServerConfig):
+        default = LOOPBACK if field.name == "host" else field.default
+        value_type = cast("type", field.type)
+        about = f"{field.metadata['help']} (default: {default})"
+        parser.add_argument(f"--{field.name}", type=value_type, default=default, help=about)
+    about = "allow a --host that other machines reach: they can use this server as you can"
+    parser.add_argument("--allow_network", **switch(), help=about)
+    about = "listen on this Unix socket, which only you can open, in place of a port"
+    parser.add_argument("--socket", type=path_flag, default=None, metavar="PATH", help=about)
+
+
+def run_serve(args: argparse.Namespace) -> int:
+    """Serve until Ctrl-C; a client names the checkpoint."""
+    if args.fps < 1:
+        raise ValueError(f"--fps={args.fps} must be at least 1")
+    config = PolicyServerConfig(
+        **{field.name: getattr(args, field.name) for field in fields(PolicyServerConfig)}
+    )
+    with _address(args) as address:
+        server = serve_registered_policies(config, address, loads, OpenStreams(), WORKERS)
+        print(f"Serving on {address}. {WARNING}", file=sys.stderr, flush=True)
+        try:
+            server.wait_for_termination()
+        finally:
+            server.stop(grace=None)
+    return 0
+
+
+@contextmanager
+def _address(args: argparse.Namespace) -> Iterator[str]:
+    """Where to listen, as gRPC names it; a socket is gone afterwards.
+
+    Raises:
+        ValueError: it is in use, or other machines would reach it.
+    """
+    if args.socket is None:
+        _check_port(args.host, args.port, args.allow_network)
+        yield f"{args.host}:{args.port}"
+        return
+    path = args.socket.absolute()
+    if path.exists() or not path.parent.is_dir():
+        state = "exists already" if path.exists() else "is in no folder that exists"
+        raise ValueError(f"--socket={args.socket} {state}; name a new file in an existing folder")
+    try:
+        yield f"unix:{path}"
+    finally:
+        path.unlink(missing_ok=True)
+
+
+def _check_port(host: str, port: int, allow_network: bool) -> None:
+    """Raise a ValueError unless it is free, and on this machine or allowed."""
+    try:
+        with socket.create_server((host, port)) as listener:
+            address = ip_address(listener.getsockname()[0])
+    except OSError as error:
+        raise ValueError(f"--host={host} --port={port}: {str(error.strerror).partition(' (')[0]}") from None
+    if not (address.is_loopback or allow_network):
+        raise ValueError(
+            f"--host={host} lets other machines in, who need no password: leave it out and use a tunnel "
+            f"(ssh -L {port}:{LOOPBACK}:{port} MACHINE), or add --allow_network"
+        )

@@ -1,0 +1,132 @@
+"""What a dataset's folder says of itself, and how to evaluate on what it shows."""
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from lerobot_bomb.bomb.board import task_id
+from lerobot_bomb.bomb.episode import TASK_VERSION
+from lerobot_bomb.bomb.observation import CAMERAS
+from lerobot_bomb.data.dataset_files import INFO_FILE
+from lerobot_bomb.data.environment import Environment
+from lerobot_bomb.data.resumable import METADATA_FILE
+from lerobot_bomb.files import read_json
+
+PUSHT_SOURCE = "pusht-zarr"
+
+Row = dict[str, Any]  # the fields of EpisodeResult
+
+
+@dataclass(frozen=True)
+class DatasetFacts:
+    """LeRobot's info.json and, of datasets that this package wrote, bomb.json."""
+
+    info: dict[str, Any]
+    bomb: dict[str, Any]  # {} = written by others
+
+    @classmethod
+    def read(cls, root: Path) -> "DatasetFacts":
+        """Of a dataset's folder.
+
+        Raises:
+            ValueError: it holds no LeRobotDataset, or a file that is not JSON.
+        """
+        if not (root / INFO_FILE).is_file():
+            raise ValueError(f"{root} holds no {INFO_FILE}, so it is no LeRobotDataset")
+        path = root / METADATA_FILE
+        return cls(read_json(root / INFO_FILE), read_json(path) if path.is_file() else {})
+
+    @classmethod
+    def find(cls, root: Path | str | None) -> "DatasetFacts | None":
+        """Of a folder where a dataset was, if one still is there."""
+        return cls.read(Path(root)) if root and (Path(root) / INFO_FILE).is_file() else None
+
+    @property
+    def recording(self) -> dict[str, Any]:
+        """Parameters of `lerobot-bomb record`, or {}."""
+        return self.bomb.get("recording", {})
+
+    @property
+    def environment(self) -> Environment | None:
+        """That of the benchmark, which the dataset shows; None: another."""
+        return Environment.of_dataset(self.info, self.recording)
+
+    def eval_flags(self) -> list[str] | None:
+        """Of lerobot-eval, for the environment that the dataset shows; None: not known."""
+        if self.bomb.get("conversion", {}).get("source", "").startswith(PUSHT_SOURCE):
+            return ["--env.type=pusht", "--eval.use_async_envs=false"]
+        return None if self.environment is None else self.environment.eval_flags()
+
+    def lines(self) -> list[str]:
+        """As Markdown's list."""
+        info = self.info
+        count = f"{info['total_episodes']} episodes, {info['total_frames']} frames at {info['fps']} Hz"
+        return [f"- {count}", *self._recording_lines()]
+
+    def _recording_lines(self) -> list[str]:
+        recording = self.recording
+        if not recording:
+            return []
+        num_failed = len(self.bomb["failures"])
+        num_conditions = len(recording["perturbations"]) * max(1, len(recording["task_ids"]))
+        num_tried = self.bomb["num_episodes"] + num_failed
+        first = recording["seed"]
+        last = first + (num_tried - 1) // num_conditions
+        tasks = recording["task_ids"] or "drawn per episode"
+        return [
+            f"- BOMB, task version {recording['protocol_version']}, suite `{recording['task']}`, robot "
+            f"`{recording['robot']}`, control `{recording['control_mode']}`, split `{recording['split']}`, "
+            f"{recording['image_size']} px",
+            f"- perturbation axes: `{', '.join(recording['perturbations'])}`; noise on actions: "
+            f"{recording['noise']:g}; tasks: {tasks}",
+            f"- seeds {first}..{last}; failed episodes that were left out: {num_failed}",
+            f"- recorded with lerobot_bomb {recording['package_version']}, MuJoCo "
+            f"{recording.get('mujoco_version', 'of an unknown version')}",
+        ]
+
+
+def environment_of_episode(row: Row) -> Environment:
+    """That an episode was played in; of its depth and tasks nothing is said."""
+    spec = row["spec"]
+    return Environment(
+        **{name: spec[name] for name in ("robot", "control_mode", "fps")},
+        image_size=row["image_size"],
+        cameras=CAMERAS,
+        task_version=row.get("task_version", TASK_VERSION),
+        task=spec["suite"],
+    )
+
+
+def eval_flags_of(rows: list[Row]) -> list[str]:
+    """Of lerobot-eval, for the environment and the tasks that an evaluation was of."""
+    return [*environment_of_episode(rows[0]).eval_flags(), *_task_flags([row["spec"] for row in rows])]
+
+
+def _task_flags(specs: list[dict[str, Any]]) -> list[str]:
+    if all(spec["target"] and spec["color"] for spec in specs):
+        ids = {task_id(spec["target"], spec["color"]) for spec in specs}
+        return [f"--env.task_ids={sorted(ids)}".replace(" ", "")]
+    shared = {name: specs[0][name] for name in ("target", "color") if specs[0][name] is not None}
+    return [f"--env.{name}={value}".replace(" ", "") for name, value in shared.items()]
+
+
+def check_results(path: Path, rows: list[Row], trained_for: Environment | None) -> None:
+    """Raise a ValueError if episodes were played in another environment than a checkpoint was trained for."""
+    if trained_for is None:
+        return
+    for row in rows:
+        played_in = environment_of_episode(row)
+        names = trained_for.differences(played_in)
+        if names:
+            raise ValueError(
+                f"--results={path} has an episode with {played_in.text(names)} (seed {row['spec']['seed']}); "
+                f"this checkpoint was trained for {trained_for.text(names)}: a card states no rate of "
+                "another setting"
+            )
+
+
+def task_version(trained_for: Environment | None, has_results: bool) -> str | None:
+    """Of the benchmark that a checkpoint was trained or evaluated on; None: of no known one."""
+    if trained_for is not None:
+        return trained_for.task_version
+    return TASK_VERSION if has_results else None

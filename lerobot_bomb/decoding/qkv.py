@@ -1,0 +1,103 @@
+"""What the tokens of a pass ask for and what they can be asked for: queries, keys and values of a layer.
+
+Shapes: `N` tokens of a pass, `C` columns of a cache, `H` hidden size, `V` key-value heads, `G` query heads
+for each, `E` size of a head.
+"""
+
+from collections.abc import Callable
+from typing import Any
+
+import torch
+from torch import Tensor, nn
+
+from lerobot_bomb.decoding.linear import cast, is_plain, make_linears, multiply
+
+# states (N, H) and rotary positions (N, 1, ...) -> rotated and scaled queries (N, V * G, E); rotated keys,
+# then values (N, 2 * V, E)
+Heads = Callable[[Tensor, Tensor], tuple[Tensor, Tensor]]
+
+
+class RopeHalves:
+    """Of any projections; rotary positions rotate the first half of a head against the second."""
+
+    def __init__(self, attention: Any, *, is_copy: bool):
+        self._linears = make_linears(_projections(attention), are_copies=is_copy)
+        self._scale, self._size = _scale_of_queries(attention), attention.head_dim
+        self._num_keys = attention.config.num_key_value_heads
+
+    def __call__(self, x_NH: Tensor, rope_N12E: Tensor) -> tuple[Tensor, Tensor]:
+        """As `Heads`; cosines stand before sines, which are negative in the first half."""
+        parts = self._linears(x_NH)
+        joined = parts[0] if len(parts) == 1 else torch.cat(parts, dim=-1)
+        heads = cast(joined, rope_N12E.dtype).view(len(x_NH), -1, self._size)
+        cos_N1E, sin_N1E = rope_N12E.chunk(2, dim=-1)
+        rotated = heads[:, : -self._num_keys]
+        half_rotated = rotated.roll(self._size // 2, dims=-1)
+        rotated.mul_(cos_N1E).addcmul_(half_rotated, sin_N1E)
+        return heads[:, : -2 * self._num_keys] * self._scale, heads[:, -2 * self._num_keys :]
+
+    @staticmethod
+    def rope(cos_CE: Tensor, sin_CE: Tensor) -> Tensor:
+        """(C, 1, 2 * E) rotary positions from the model's own."""
+        first_half, second_half = sin_CE.chunk(2, dim=-1)
+        return torch.cat([cos_CE, -first_half, second_half], dim=-1)[:, None]
+
+
+class RopePairs:
+    """Of plain projections on a CPU, where this is faster.
+
+    Weights are copied and scaled, their rows stand so that numbers which are rotated together are neighbours:
+    the parts of a complex one. Attention logits do not depend on their order.
+    """
+
+    def __init__(self, attention: Any):
+        # small beside a model's other weights: copying them costs less than it brings
+        self._size, self._num_keys = attention.head_dim, attention.config.num_key_value_heads
+        scale = _scale_of_queries(attention)
+        queries, keys, values = ([*part.parameters()] for part in _projections(attention))
+        self._query = multiply(*(self._beside(part) * scale for part in queries))
+        keys_values = zip(keys, values, strict=True)
+        self._new = multiply(*(torch.cat([self._beside(key), value.detach()]) for key, value in keys_values))
+
+    def _beside(self, part: Tensor) -> Tensor:
+        """Rows of weights or biases, those of a head's first half beside those of the second."""
+        return part.detach().unflatten(0, (-1, 2, self._size // 2)).transpose(1, 2).flatten(0, 2)
+
+    def __call__(self, x_NH: Tensor, rope_N1E: Tensor) -> tuple[Tensor, Tensor]:
+        """As `Heads`, of complex rotary positions."""
+        shape = len(x_NH), -1, self._size // 2, 2
+        query = cast(self._query(x_NH), torch.float32).view(shape)
+        new = cast(self._new(x_NH), torch.float32).view(shape)
+        torch.view_as_complex(query).mul_(rope_N1E)
+        torch.view_as_complex(new).narrow(1, 0, self._num_keys).mul_(rope_N1E)
+        return query.flatten(2), new.flatten(2)
+
+    @staticmethod
+    def rope(cos_CE: Tensor, sin_CE: Tensor) -> Tensor:
+        """(C, 1, E / 2) complex rotary positions from the model's own, whose halves are the same."""
+        half = cos_CE.shape[-1] // 2
+        return torch.complex(cos_CE[:, None, :half].float(), sin_CE[:, None, :half].float())
+
+    @staticmethod
+    def can(attention: Any) -> bool:
+        """Its projections are plain, in float32 on a CPU."""
+        parts = _projections(attention)
+        return all(
+            is_plain(part) and part.weight.dtype == torch.float32 and part.weight.device.type == "cpu"
+            for part in parts
+        )
+
+
+def _scale_of_queries(attention: Any) -> float:
+    """The model's own; where attention logits have a limit, times 2 / softcap: see decoder_layers.py."""
+    softcap = softcap_of(attention)
+    return attention.scaling * (1 if softcap is None else 2 / softcap)
+
+
+def softcap_of(attention: Any) -> float | None:
+    """Limit of the attention logits, of families that have one."""
+    return getattr(attention, "attn_logit_softcapping", None)
+
+
+def _projections(attention: Any) -> list[nn.Module]:
+    return [attention.q_proj, attention.k_proj, attention.v_proj]

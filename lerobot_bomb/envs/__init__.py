@@ -1,0 +1,1 @@
+"""What every environment of ours shares; light, as simulator processes import it."""

@@ -1,0 +1,113 @@
+"""What became of an episode and where that comes from: a line of a results file.
+
+Simulator workers import this module, so it imports neither torch nor LeRobot.
+"""
+
+import dataclasses
+import json
+import platform
+from dataclasses import dataclass, field
+from functools import cache, partial
+from importlib.metadata import PackageNotFoundError, version
+from pathlib import Path
+
+from lerobot_bomb import __version__
+from lerobot_bomb.bomb.episode import PROTOCOL_VERSION, TASK_VERSION, EpisodeSpec
+from lerobot_bomb.bomb.observation import DEFAULT_IMAGE_SIZE, RenderOptions
+from lerobot_bomb.files import append_line
+
+
+@cache
+def installed_version(distribution: str) -> str | None:
+    """Of a Python package; None where it has no metadata."""
+    try:
+        return version(distribution)
+    except PackageNotFoundError:
+        return None
+
+
+@cache
+def machine_name() -> str:
+    """Processor and C library of this machine: "x86_64, AMD EPYC, glibc 2.36".
+
+    Sine and cosine are the library's, in the variant for the processor; their last bits are in every state.
+    """
+    cpus = Path("/proc/cpuinfo")  # of Linux
+    lines = cpus.read_text().splitlines() if cpus.is_file() else []
+    models = [line.partition(":")[2].strip() for line in lines if line.startswith("model name")]
+    parts = (platform.machine(), *models[:1], " ".join(platform.libc_ver()))
+    return ", ".join(part for part in parts if part.strip())
+
+
+@dataclass(frozen=True)
+class PolicyIdentity:
+    """Which policy acted. One without weights, or built from its config alone, has a type only."""
+
+    type: str
+    path: str | None = None  # the checkpoint's folder as it was given, or USER/NAME on the Hub
+    revision: str | None = None  # commit on the Hub
+    weights_sha256: str | None = None  # of the file of weights; of adapters, of theirs
+    settings_sha256: str | None = None  # of the config that it acted with and of the processors' files
+    base: str | None = None  # what adapters are loaded on: a folder or USER/NAME@REVISION
+    is_in_training: bool = False  # its weights are in no file
+
+
+@dataclass(frozen=True)
+class EpisodeResult:
+    """Outcome of one episode; one JSON line in a results file.
+
+    `target`, `color` are the episode's; what was asked for is in `spec`, where None means drawn.
+    """
+
+    spec: EpisodeSpec
+    instruction: str
+    target: tuple[int, int]
+    color: str
+    steps: int
+    is_success: bool
+    is_success_bomb_v0: bool
+    failure: str | None
+    stage: str
+    placement_error_mm: float
+    nearest_intersection: tuple[int, int]
+    collateral_mm: float
+    levels: dict[str, int] = field(default_factory=dict)  # of the perturbation axes that were on
+    image_size: int = DEFAULT_IMAGE_SIZE
+    render_preset: str = RenderOptions.preset
+    task_ids: tuple[int, ...] | None = None  # of the whole evaluation; None: not asked for by number
+    policy: PolicyIdentity | None = None  # None: not known
+    # of the context that drew the observations; None: nothing was drawn
+    opengl_vendor: str | None = None
+    opengl_renderer: str | None = None
+    machine: str = field(default_factory=machine_name)
+    mujoco_version: str | None = field(default_factory=partial(installed_version, "mujoco"))
+    lerobot_version: str | None = field(default_factory=partial(installed_version, "lerobot"))
+    torch_version: str | None = field(default_factory=partial(installed_version, "torch"))
+    package_version: str = __version__
+    task_version: str = TASK_VERSION
+    protocol_version: str = PROTOCOL_VERSION
+
+    def to_json(self) -> str:
+        """One line of JSON, keys in the order of the fields.
+
+        Raises:
+            ValueError: a number is not finite.
+        """
+        return json.dumps(dataclasses.asdict(self), allow_nan=False)
+
+
+def write_result(path: Path | str, result: EpisodeResult) -> None:
+    """Append a result to the file of `--env.results_path`.
+
+    Raises:
+        OSError: it could not be written; the file still holds whole lines.
+    """
+    try:
+        append_line(path, result.to_json())
+    except OSError as error:
+        raise OSError(
+            error.errno,
+            f"--env.results_path={path}: the result of seed {result.spec.seed} could not be written "
+            f"({error.strerror}); the file holds those before it. Make room or name another file, and "
+            "evaluate again: an episode that is run again counts once",
+        ) from error

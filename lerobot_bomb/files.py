@@ -1,0 +1,99 @@
+"""Files that may be damaged, that appear complete, and to which several processes append."""
+
+import json
+import os
+import tempfile
+from collections.abc import Iterator
+from contextlib import contextmanager, suppress
+from fcntl import LOCK_EX, flock
+from pathlib import Path
+from typing import Any
+
+from lerobot_bomb.flags import check_link
+
+
+def read_json(path: Path) -> dict[str, Any]:
+    """A JSON object from a file.
+
+    Raises:
+        FileNotFoundError: there is none.
+        ValueError: it is something else, or truncated.
+    """
+    if not path.is_file():
+        raise FileNotFoundError(f"{path.parent} has no {path.name}")
+    try:
+        values = json.loads(path.read_bytes())
+    except ValueError as error:
+        raise ValueError(f"{path} is not JSON, or truncated: {error}") from None
+    if not isinstance(values, dict):
+        raise ValueError(f"{path} is not a JSON object")
+    return values
+
+
+def check_writable(flag: str, path: Path) -> None:
+    """Raise a ValueError unless a file can be made at the path that a flag gives."""
+    check_link(flag, path)
+    if path.is_dir() or not os.access(path.parent, os.W_OK):
+        raise ValueError(f"{flag}={path} cannot be written; give a file in a folder that exists")
+
+
+def check_new_folder(flag: str, path: Path) -> None:
+    """Raise a ValueError if there is something at the path that a flag gives."""
+    check_link(flag, path)
+    if path.exists():
+        raise ValueError(f"{flag}={path} exists already; name a new folder or delete it")
+
+
+@contextmanager
+def written_whole(*paths: Path) -> Iterator[list[Path]]:
+    """Give paths to write to; when nothing was raised, what lies there gets the names `paths`.
+
+    All lie in one folder, which is made. What a kill leaves is in a hidden folder there.
+    """
+    folder = paths[0].parent
+    folder.mkdir(parents=True, exist_ok=True)
+    with tempfile.TemporaryDirectory(prefix=".unfinished-", dir=folder) as temporary:
+        unfinished = [Path(temporary) / path.name for path in paths]
+        yield unfinished
+        for source, path in zip(unfinished, paths, strict=True):
+            source.replace(path)
+
+
+def append_line(path: Path | str, line: str) -> None:
+    r"""Add a line, all of it or nothing, to a file that other processes append to as well.
+
+    It starts on a line of its own, even where something left the last one without its "\n".
+
+    Raises:
+        OSError: the disk is full, or the file cannot be written; it holds whole lines then.
+    """
+    file = os.open(path, os.O_RDWR | os.O_CREAT | os.O_APPEND, 0o644)
+    try:
+        flock(file, LOCK_EX)
+        size = os.fstat(file).st_size
+        is_cut_off = size > 0 and os.pread(file, 1, size - 1) != b"\n"
+        try:
+            _write_all(file, f"{'\n' if is_cut_off else ''}{line}\n".encode())
+        except OSError:
+            with suppress(OSError):  # a device cannot be cut
+                os.ftruncate(file, size)
+            raise
+    finally:
+        os.close(file)
+
+
+def check_appendable(path: Path) -> None:
+    """Make the file and its folder, unless they exist.
+
+    Raises:
+        OSError: `append_line` could not write it.
+    """
+    path.parent.mkdir(parents=True, exist_ok=True)
+    with path.open("a+b") as file:
+        flock(file, LOCK_EX)
+
+
+def _write_all(file: int, data: bytes) -> None:
+    """As os.write, which on a full disk writes a part and says so in its result only."""
+    while data:
+        data = data[os.write(file, data) :]

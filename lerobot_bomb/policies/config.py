@@ -1,0 +1,162 @@
+"""The base of our policies' configs."""
+
+from dataclasses import dataclass, field
+from typing import Any, ClassVar
+
+from lerobot.configs import NormalizationMode
+from lerobot.optim import AdamWConfig, CosineDecayWithWarmupSchedulerConfig
+
+from lerobot_bomb.actions.ensemble import WEIGHTINGS
+from lerobot_bomb.checkpoints.config import INSTALLED, PackageVersion
+from lerobot_bomb.checkpoints.environment import ConfigWithEnvironment
+from lerobot_bomb.flag_errors import flag_errors
+from lerobot_bomb.flags import one_of
+from lerobot_bomb.training.policy_flags import (
+    action_deltas,
+    adamw,
+    check_cameras_and_action,
+    check_chunk,
+    check_ensemble,
+    check_model_name_and_precision,
+    check_state,
+    check_training,
+    cosine_decay,
+)
+
+DTYPES = ("float32", "bfloat16")
+# modes that map the data into [-1, 1], where bins and grids are
+BOUNDED_MODES = (
+    NormalizationMode.MIN_MAX,
+    NormalizationMode.QUANTILES,
+    NormalizationMode.QUANTILE10,
+    NormalizationMode.IDENTITY,
+)
+
+
+@dataclass
+class VlaConfig(ConfigWithEnvironment):
+    """Backbone, chunk, inputs, precision and training; a policy overrides the defaults that its paper has."""
+
+    # allowed values of flags
+    CHOICES: ClassVar[dict[str, tuple]] = {"dtype": DTYPES}
+    # how state and action may be normalised
+    MODES: ClassVar[tuple[NormalizationMode, ...]] = tuple(NormalizationMode)
+    # flags that need the robot's state
+    NEEDS_STATE: ClassVar[tuple[str, ...]] = ("use_state",)
+
+    # Hub id, path of a local folder, or "nano": a small model with random weights, built in code
+    vlm_model_name: str = ""
+    # changes of nano's architecture, nested as it is, as {"vision_config": {"num_hidden_layers": 2}}
+    nano_config: dict[str, Any] | None = None
+    # architecture; filled in when the base model is loaded. Set = build this and download nothing:
+    # the weights then come from a checkpoint
+    vlm_config: dict[str, Any] | None = None
+    # token ids of the fixed parts of the prompt; filled in together with vlm_config
+    prompt_tokens: dict[str, Any] | None = None
+
+    n_obs_steps: int = 1
+    # actions of a chunk
+    chunk_size: int = 1
+    # actions executed before the next prediction
+    n_action_steps: int = 1
+    # images stay in [0, 1]
+    normalization_mapping: dict[str, NormalizationMode] = field(
+        default_factory=lambda: {
+            "VISUAL": NormalizationMode.IDENTITY,
+            "STATE": NormalizationMode.MIN_MAX,
+            "ACTION": NormalizationMode.MIN_MAX,
+        }
+    )
+    # side of the crop as a fraction of the image: random place while training, centre otherwise
+    crop_fraction: float = 1.0
+    # whether the robot's state is in the prompt
+    use_state: bool = True
+
+    # whether actions beyond an episode's end (repeats of the last one) are trained on
+    loss_on_padded_actions: bool = False
+    # frames at an episode's end that no sample starts at
+    drop_n_last_frames: int = 1
+    freeze_vision_encoder: bool = False
+    # "bfloat16" = autocast over float32 weights, in training and in evaluation
+    dtype: str = "float32"
+    gradient_checkpointing: bool = False
+    # values that the checkpoint was trained with; filled in
+    trained_with: dict[str, Any] | None = None
+    # batches trained on so far; what is random in the next ones follows from it
+    trained_batches: int = 0
+    # of lerobot_bomb, which wrote the checkpoint
+    package_version: PackageVersion = INSTALLED
+
+    optimizer_lr: float = 2e-5
+    optimizer_betas: tuple[float, float] = (0.9, 0.95)
+    optimizer_eps: float = 1e-8
+    optimizer_weight_decay: float = 0.0
+    optimizer_grad_clip_norm: float = 1.0
+    scheduler_warmup_steps: int = 1_000
+    scheduler_decay_steps: int = 30_000
+    scheduler_decay_lr: float = 0.0
+
+    push_to_hub: bool = False
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        with flag_errors():
+            self.check_flags()
+
+    def check_flags(self) -> None:
+        """Raise a ValueError that names the flag unless all values go together."""
+        for flag, allowed in self.CHOICES.items():
+            one_of(f"--policy.{flag}", getattr(self, flag), allowed)
+        check_model_name_and_precision(self)
+        for kind, allowed in {
+            "VISUAL": (NormalizationMode.IDENTITY,),
+            "STATE": self.MODES,
+            "ACTION": self.MODES,
+        }.items():
+            one_of(f"--policy.normalization_mapping[{kind}]", self.normalization_mapping.get(kind), allowed)
+        check_chunk(self)
+        check_training(self)
+
+    def validate_features(self) -> None:
+        """Raise unless the dataset (or environment) has what the policy reads and writes."""
+        check_cameras_and_action(self)
+        check_state(self, self.NEEDS_STATE)
+
+    def get_optimizer_preset(self) -> AdamWConfig:
+        return adamw(self)
+
+    def get_scheduler_preset(self) -> CosineDecayWithWarmupSchedulerConfig:
+        return cosine_decay(self)
+
+    @property
+    def observation_delta_indices(self) -> None:
+        return None
+
+    @property
+    def action_delta_indices(self) -> list[int] | None:
+        return action_deltas(self)
+
+    @property
+    def reward_delta_indices(self) -> None:
+        return None
+
+
+@dataclass
+class TokenVlaConfig(VlaConfig):
+    """Of a policy whose actions are tokens: an ensemble of its chunks, and answers by `torch.compile`."""
+
+    CHOICES: ClassVar[dict[str, tuple]] = {**VlaConfig.CHOICES, "temporal_ensemble_weighting": WEIGHTINGS}
+    MODES: ClassVar[tuple[NormalizationMode, ...]] = BOUNDED_MODES
+
+    # chunks that an executed action is the mean of, one predicted every step; 0 = a queue instead
+    temporal_ensemble_size: int = 0
+    # "uniform", "exponential" (exp(coefficient * age)) or "nvlabs" (1 for the newest, 0.5 for others)
+    temporal_ensemble_weighting: str = "uniform"
+    # positive favours old chunks
+    temporal_ensemble_coefficient: float = 0.01
+    # answers on CUDA by `torch.compile`: some ten seconds for every size of batch, then faster
+    compile_model: bool = False
+
+    def check_flags(self) -> None:
+        super().check_flags()
+        check_ensemble(self)

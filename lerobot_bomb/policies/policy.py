@@ -1,0 +1,175 @@
+"""The base of our policies."""
+
+from abc import abstractmethod
+from collections import deque
+from collections.abc import Sequence
+from typing import Any, ClassVar, Self
+
+import torch
+from lerobot.datasets import LeRobotDatasetMetadata
+from lerobot.policies import PreTrainedPolicy
+from lerobot.utils.constants import ACTION
+from torch import Tensor, nn
+
+from lerobot_bomb.actions.ensemble import TemporalEnsemble
+from lerobot_bomb.actions.relative import bounds
+from lerobot_bomb.checkpoints.adapters import frozen_buffers
+from lerobot_bomb.data.columns import dim_names
+from lerobot_bomb.hub.policy import HubPolicy
+from lerobot_bomb.policies.config import TokenVlaConfig, VlaConfig
+from lerobot_bomb.training.distributed import SavesTiedWeightsOnce
+from lerobot_bomb.training.policy_flags import check_as_trained, check_weights_fit, trained_with
+from lerobot_bomb.vlm.inputs import read_tensor
+
+
+class VlaPolicy(HubPolicy, SavesTiedWeightsOnce, PreTrainedPolicy):
+    """What a policy has that predicts chunks of actions: queue, units, precision, checkpoints.
+
+    Shapes: `B` batch, `T` actions of a chunk, `D` action dims.
+    """
+
+    # LeRobot asks every class for them; a policy has its own
+    config_class = VlaConfig  # pyright: ignore[reportAssignmentType]  LeRobot annotates it as None
+    name = "vla"  # pyright: ignore[reportAssignmentType]
+    config: VlaConfig
+    action_unit: Tensor
+    # flags that say what shapes the weights have
+    shapes: ClassVar[tuple[str, ...]]
+    # the same, and flags that say what the model's inputs and answers mean
+    as_trained: ClassVar[tuple[str, ...]]
+
+    def __init__(self, config: Any, dataset_meta: LeRobotDatasetMetadata | None = None, **_: object):
+        super().__init__(config, dataset_meta)
+        config.validate_features()
+        config.trained_with = trained_with(config, self.as_trained)
+        # physical size of 1 in normalised actions, and their names; known while training: (D,)
+        self.register_buffer("action_unit", torch.ones(self._action_dim), persistent=False)
+        self._action_names: list[str] | None = None
+        if dataset_meta is not None:
+            self._take_units(dataset_meta)
+        # of all that is random in training
+        self.generator = torch.Generator().manual_seed(torch.initial_seed())
+        self._base_buffers: dict[str, Tensor] | None = None  # of the checkpoint, before it was fitted to data
+
+    @classmethod
+    def from_pretrained(
+        cls, *args, config: Any = None, dataset_meta: LeRobotDatasetMetadata | None = None, **kwargs
+    ) -> Self:
+        """As LeRobot's, but a missing or unexpected tensor is an error; fits the data that it is given."""
+        if config is not None:
+            if dataset_meta is None:
+                check_as_trained(config)
+            else:
+                check_weights_fit(config, cls.shapes)
+        policy = super().from_pretrained(
+            *args, config=config, dataset_meta=dataset_meta, **{**kwargs, "strict": True}
+        )
+        if dataset_meta is not None:
+            policy._base_buffers = frozen_buffers(policy)
+            policy._fit(dataset_meta)
+        return policy
+
+    def _fit(self, meta: LeRobotDatasetMetadata) -> None:
+        """Take from a dataset what a checkpoint that is trained on needs to know of it."""
+        self._take_units(meta)
+
+    @torch.no_grad()
+    def _take_units(self, meta: LeRobotDatasetMetadata) -> None:
+        assert meta.stats is not None
+        mode = self.config.normalization_mapping["ACTION"]
+        low, high = bounds(meta.stats[ACTION], mode, self._action_dim)
+        self.action_unit.copy_(torch.from_numpy(high - low) / 2)
+        self._action_names = dim_names(meta.features[ACTION])
+
+    def get_optim_params(self) -> list[nn.Parameter]:
+        return [parameter for parameter in self.parameters() if parameter.requires_grad]
+
+    def reset(self) -> None:
+        self._queue: deque[Tensor] = deque(maxlen=self.config.n_action_steps)
+
+    def _kept(self, batch: dict[str, Tensor]) -> Tensor:
+        """(B, T) bool: which actions are trained on."""
+        if f"{ACTION}_is_pad" in batch and not self.config.loss_on_padded_actions:
+            return ~self._of_batch(batch, f"{ACTION}_is_pad").bool()
+        shape = len(batch[ACTION]), self.config.chunk_size
+        return torch.ones(shape, dtype=torch.bool, device=self._device)
+
+    def _l1_parts(self, errors_BTD: Tensor, counted_BTD: Tensor) -> dict[str, tuple[Tensor, Tensor]]:
+        """Absolute errors as `means` takes them, in all and by dimension; none where units are not known."""
+        if self._action_names is None:
+            return {}
+        dims = {
+            f"l1_{name}": (errors_BTD[..., dim], counted_BTD[..., dim])
+            for dim, name in enumerate(self._action_names)
+        }
+        return {"l1": (errors_BTD, counted_BTD), **dims}
+
+    def _of_batch(self, batch: dict[str, Tensor], key: str) -> Tensor:
+        return read_tensor(batch, key, self.config.type, self._device)
+
+    @property
+    def _cameras(self) -> list[str]:
+        return sorted(self.config.image_features)
+
+    @property
+    def _action_dim(self) -> int:
+        assert self.config.action_feature is not None
+        return self.config.action_feature.shape[0]
+
+    @property
+    def _device(self) -> torch.device:
+        return self.action_unit.device
+
+    def _autocast(self) -> torch.autocast:
+        """The precision of ``config.dtype``, whoever calls: training, evaluation or a user's own loop."""
+        bfloat16 = self.config.dtype == "bfloat16"
+        return torch.autocast(self._device.type, dtype=torch.bfloat16, enabled=bfloat16)
+
+
+class TokenVlaPolicy(VlaPolicy):
+    """One whose actions are tokens, which it need not write beyond those that are executed."""
+
+    config_class = TokenVlaConfig  # pyright: ignore[reportAssignmentType]
+    name = "token_vla"  # pyright: ignore[reportAssignmentType]
+    config: TokenVlaConfig
+    _ensemble: TemporalEnsemble | None
+
+    def _make_ensemble(self) -> TemporalEnsemble | None:
+        """None: a queue instead."""
+        config = self.config
+        if not config.temporal_ensemble_size:
+            return None
+        return TemporalEnsemble(
+            config.temporal_ensemble_size,
+            config.temporal_ensemble_weighting,
+            config.temporal_ensemble_coefficient,
+            self._newest_only(),
+        )
+
+    @abstractmethod
+    def _newest_only(self) -> Sequence[int]:
+        """Action dims that an ensemble does not average, such as a gripper that is open or closed."""
+
+    def reset(self) -> None:
+        super().reset()
+        if self._ensemble is not None:
+            self._ensemble.reset()
+
+    def select_action(self, batch: dict[str, Tensor], **_: object) -> Tensor:
+        """(B, D) next normalised action.
+
+        With a temporal ensemble every call predicts; else when the queue of ``n_action_steps`` is empty.
+        """
+        if self._ensemble is not None:
+            return self._ensemble(self._predict(batch, self.config.temporal_ensemble_size))
+        if not self._queue:
+            self._queue.extend(self._predict(batch, self.config.n_action_steps).unbind(dim=1))
+        return self._queue.popleft()
+
+    def predict_action_chunk(self, batch: dict[str, Tensor], **_: object) -> Tensor:
+        """(B, T, D) normalised actions."""
+        return self._predict(batch, self.config.chunk_size)
+
+    @abstractmethod
+    def _predict(self, batch: dict[str, Tensor], num_steps: int) -> Tensor:
+        """The first ``num_steps`` normalised actions of the chunk."""

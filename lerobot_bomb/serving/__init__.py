@@ -1,0 +1,1 @@
+"""What LeRobot's policy server may receive."""

@@ -1,0 +1,1 @@
+"""What trainings share: flags, several processes, randomness."""
