@@ -13,6 +13,7 @@ from collections import defaultdict
 from collections.abc import Iterable
 from dataclasses import dataclass, replace
 from functools import partial
+from itertools import pairwise
 from pathlib import Path
 
 import numpy as np
@@ -20,17 +21,17 @@ from tqdm import tqdm
 
 from lerobot_bomb.bomb.board import BOARD
 from lerobot_bomb.bomb.episode import CONTROL_MODES, DEFAULT_FPS, ROBOTS, SPLITS, EpisodeSpec
-from lerobot_bomb.bomb.expert import expert_action
-from lerobot_bomb.bomb.observation import MAX_STEP_M, MIN_IMAGE_SIZE, PrivilegedState, RenderOptions
+from lerobot_bomb.bomb.observation import MAX_STEP_M, MIN_IMAGE_SIZE, RenderOptions
 from lerobot_bomb.bomb.perturbations import NONE
-from lerobot_bomb.data.rollout import perturb
+from lerobot_bomb.bomb.privileged_state import PrivilegedState
+from lerobot_bomb.bomb.streams import Stream, generator
+from lerobot_bomb.envs.rollout import Moment, add_noise, expert_agent, play
 from lerobot_bomb.stats import format_rate
 from lerobot_env_bomb.env import BombEnv
 
 PRECISE_MM = 5.0
 IDLE_TRANSLATION_M = 0.0005  # commanded by a step; less counts as none
 IDLE_FINGERS_M = 0.0002  # change of the opening over a step; less counts as none
-NOISE_STREAM = 1000  # apart from the streams that an episode is drawn from
 
 
 @dataclass(frozen=True)
@@ -50,20 +51,9 @@ class Outcome:
 def run_episode(spec: EpisodeSpec, noise: float) -> Outcome:
     """Let the expert play one episode; `noise` is the standard deviation added to x, y, z, 1 = 40 mm."""
     env = BombEnv(spec, RenderOptions(image_size=MIN_IMAGE_SIZE))
-    rng = np.random.default_rng([spec.seed, NOISE_STREAM])
-    observation, _ = env.reset()
-    idle, ended, step = [], False, 0
-    while not ended:
-        before = PrivilegedState.from_vector(observation["environment_state"])
-        action = expert_action(before, spec.control_mode, spec.fps)
-        executed = perturb(action, noise, spec.control_mode, rng)
-        observation, _, terminated, truncated, _ = env.step(executed)
-        after = PrivilegedState.from_vector(observation["environment_state"])
-        if is_idle(action, before, after, spec.control_mode) and not is_done(
-            before, spec.success_tolerance_mm
-        ):
-            idle.append(step)
-        ended, step = terminated or truncated, step + 1
+    rng = generator(spec.seed, Stream.EXPERT_NOISE)
+    moments = play(env, spec, expert_agent(spec), lambda a: add_noise(a, noise, spec.control_mode, rng))
+    idle = [now.step for now, then in pairwise(moments) if is_idle(now, then, spec)]
     result = env.episode_result()
     env.close()
     return Outcome(
@@ -78,17 +68,22 @@ def run_episode(spec: EpisodeSpec, noise: float) -> Outcome:
     )
 
 
-def is_idle(action: np.ndarray, before: PrivilegedState, after: PrivilegedState, control_mode: str) -> bool:
-    """Whether a step neither commands a translation nor moves the fingers."""
-    commanded_m = action[:3] * MAX_STEP_M if control_mode == "relative" else action[:3] - before.gripper_xyz
+def is_idle(now: Moment, then: Moment, spec: EpisodeSpec) -> bool:
+    """Whether a step, before all is done, neither commands a translation nor moves the fingers."""
+    assert now.action is not None
+    before, after = now.state, then.state
+    xyz = now.action[:3]
+    commanded_m = xyz * MAX_STEP_M if spec.control_mode == "relative" else xyz - before.gripper_xyz
     fingers_m = abs(after.finger_opening - before.finger_opening)
-    return bool(np.linalg.norm(commanded_m) < IDLE_TRANSLATION_M and fingers_m < IDLE_FINGERS_M)
+    is_still = np.linalg.norm(commanded_m) < IDLE_TRANSLATION_M and fingers_m < IDLE_FINGERS_M
+    return bool(is_still and not is_done(before, spec.success_tolerance_mm))
 
 
 def is_done(state: PrivilegedState, tolerance_mm: float) -> bool:
     """Whether the stone lies on the target and the fingers, open, have left it."""
-    stone_xyz = state.stone_xyz[state.stone]
-    error_mm = 1e3 * np.linalg.norm((stone_xyz - state.target_xyz)[:2])
+    goal = state.goals[0]
+    stone_xyz = state.stone_xyz[goal.stone]
+    error_mm = 1e3 * np.linalg.norm((stone_xyz - goal.xyz)[:2])
     is_clear = state.gripper_xyz[2] > stone_xyz[2] + BOARD.stone_height_m
     is_open = state.finger_opening > 2 * state.stone_radius_m
     return bool(error_mm <= tolerance_mm and is_clear and is_open)

@@ -18,7 +18,8 @@ from machine import add_machine_arguments, require_idle_machine, write_figures
 
 from lerobot_bomb.data.record import record
 from lerobot_bomb.data.recording import Recording
-from lerobot_bomb.data.rollout import Rollout, RolloutSettings, make_env, play
+from lerobot_bomb.data.rollout_pool import Rollout, RolloutSettings, collect
+from lerobot_bomb.envs.rollout import make_env
 from lerobot_bomb.tables import print_table
 
 TARGET = 0.8  # of the peer's frames per second
@@ -43,7 +44,7 @@ def main() -> None:
     importlib.import_module("datasets").disable_progress_bars()  # one bar per episode of the peer
 
     recording = Recording("benchmark/bomb", args.episodes)
-    rollouts = collect(recording)
+    rollouts = successes(recording)
     num_frames = sum(rollout.result.steps for rollout in rollouts)
     seconds: dict[str, list[float]] = {name: [] for name in (RECORDER, PEER, ONE_THREAD, H264)}
     for _ in range(args.repeats):
@@ -68,14 +69,14 @@ def main() -> None:
     )
 
 
-def collect(recording: Recording) -> list[Rollout]:
+def successes(recording: Recording) -> list[Rollout]:
     """The successful rollouts that the recording will hold."""
     env = make_env(recording.spec, recording.render_options)
     settings = RolloutSettings(recording.render_options)
     rollouts: list[Rollout] = []
     specs = recording.specs(num_tried=0)
     while len(rollouts) < recording.episodes:
-        rollout = play(env, next(specs), settings)
+        rollout = collect(env, next(specs), settings)
         if rollout.result.is_success:
             rollouts.append(rollout)
     env.close()

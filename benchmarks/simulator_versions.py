@@ -72,7 +72,8 @@ def play(robot: str, condition: str, seeds: range) -> Outcome:
     """The expert's episodes of these seeds."""
     from lerobot_bomb.bomb.episode import EpisodeSpec
     from lerobot_bomb.bomb.expert import expert_action
-    from lerobot_bomb.bomb.observation import PrivilegedState, RenderOptions
+    from lerobot_bomb.bomb.observation import RenderOptions
+    from lerobot_bomb.bomb.privileged_state import PrivilegedState
     from lerobot_env_bomb.env import BombEnv
 
     states, pictures, results = hashlib.sha256(), hashlib.sha256(), []

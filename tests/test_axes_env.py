@@ -7,8 +7,9 @@ import pytest
 
 from lerobot_bomb.bomb.episode import EpisodeSpec
 from lerobot_bomb.bomb.expert import expert_action
-from lerobot_bomb.bomb.observation import CAMERAS, MAX_STEP_M, PrivilegedState, RenderOptions
+from lerobot_bomb.bomb.observation import CAMERAS, MAX_STEP_M, RenderOptions
 from lerobot_bomb.bomb.perturbations import AXES, NUISANCES
+from lerobot_bomb.bomb.privileged_state import PrivilegedState
 from lerobot_bomb.bomb.suites.place import targets_of
 from lerobot_env_bomb.env import BombEnv
 from lerobot_env_bomb.perturb import sample_episode

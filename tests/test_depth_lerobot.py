@@ -14,7 +14,8 @@ from lerobot_bomb.commands.main import main
 from lerobot_bomb.data import resumable
 from lerobot_bomb.data.record import record
 from lerobot_bomb.data.recording import Recording
-from lerobot_bomb.data.rollout import Rollout, RolloutSettings, make_env, play
+from lerobot_bomb.data.rollout_pool import Rollout, RolloutSettings, collect
+from lerobot_bomb.envs.rollout import make_env
 
 SIZE, SEED, EPISODES = 64, 3, 3
 OPTIONS = RenderOptions(image_size=SIZE, depth=True)
@@ -31,7 +32,8 @@ def rollouts() -> list[Rollout]:
     spec = EpisodeSpec(seed=SEED)
     env = make_env(spec, OPTIONS)
     played = [
-        play(env, EpisodeSpec(seed=seed), RolloutSettings(OPTIONS)) for seed in range(SEED, SEED + EPISODES)
+        collect(env, EpisodeSpec(seed=seed), RolloutSettings(OPTIONS))
+        for seed in range(SEED, SEED + EPISODES)
     ]
     env.close()
     assert all(rollout.result.is_success and rollout.geometry.keys() == KEYS for rollout in played)

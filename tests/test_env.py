@@ -18,7 +18,8 @@ from gymnasium.utils.env_checker import check_env
 import lerobot_env_bomb
 from lerobot_bomb.bomb.episode import PROTOCOL_VERSION, EpisodeSpec
 from lerobot_bomb.bomb.expert import expert_action
-from lerobot_bomb.bomb.observation import PrivilegedState, RenderOptions
+from lerobot_bomb.bomb.observation import RenderOptions
+from lerobot_bomb.bomb.privileged_state import PrivilegedState
 from lerobot_env_bomb.env import BombEnv
 
 SMALL = RenderOptions(image_size=32)

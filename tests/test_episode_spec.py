@@ -7,7 +7,8 @@ from hypothesis import strategies as st
 
 from lerobot_bomb.bomb.board import BOARD, NUM_STONES
 from lerobot_bomb.bomb.episode import EpisodeSpec, Stage
-from lerobot_bomb.bomb.observation import PrivilegedState, RenderOptions
+from lerobot_bomb.bomb.observation import RenderOptions
+from lerobot_bomb.bomb.privileged_state import Goal, PrivilegedState
 from lerobot_bomb.envs.results import EpisodeResult
 
 
@@ -77,13 +78,13 @@ def test_unknown_render_presets_are_refused() -> None:
         RenderOptions(preset="raytraced")
 
 
-def test_privileged_state_survives_the_observation() -> None:
+@pytest.mark.parametrize("stones", [(3,), (3, 0)])
+def test_privileged_state_survives_the_observation(stones: tuple[int, ...]) -> None:
     rng = np.random.default_rng(0)
     state = PrivilegedState(
         gripper_xyz=np.array([0.01, -0.02, 0.1]),
         finger_opening=0.026,
-        target_xyz=np.array([0.045, 0.09, 0.0045]),
-        stone=3,
+        goals=tuple(Goal(rng.normal(size=3), stone) for stone in stones),
         stone_xyz=rng.normal(size=(NUM_STONES, 3)),
         stone_is_white=rng.random(NUM_STONES) > 0.5,
         stone_in_play=rng.random(NUM_STONES) > 0.5,
@@ -94,9 +95,11 @@ def test_privileged_state_survives_the_observation() -> None:
         pending_gripper=-1.0,
     )
     vector = state.to_vector()
-    assert vector.shape == (PrivilegedState.DIM,)
+    assert vector.shape == (PrivilegedState.dim(len(stones)),)
     back = PrivilegedState.from_vector(vector)
-    assert (back.stone, back.stage) == (3, Stage.GRASPED)
+    assert (tuple(goal.stone for goal in back.goals), back.stage) == (stones, Stage.GRASPED)
+    for goal, before in zip(back.goals, state.goals, strict=True):
+        np.testing.assert_allclose(goal.xyz, before.xyz, rtol=1e-6)
     np.testing.assert_allclose(back.stone_xyz, state.stone_xyz, rtol=1e-6)
     np.testing.assert_array_equal(back.stone_is_white, state.stone_is_white)
     np.testing.assert_array_equal(back.stone_in_play, state.stone_in_play)

@@ -11,7 +11,7 @@ from lerobot_bomb.bomb.episode import EpisodeSpec
 from lerobot_bomb.bomb.observation import RenderOptions
 from lerobot_bomb.commands.eval import LoggedVectorEnv
 from lerobot_bomb.commands.main import main
-from lerobot_bomb.data.rollout import make_env
+from lerobot_bomb.envs.rollout import make_env
 from lerobot_bomb.evaluation.executed import append_episode, read_executed
 from lerobot_bomb.evaluation.results import read_results
 

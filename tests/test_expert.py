@@ -6,7 +6,8 @@ import pytest
 from lerobot_bomb.bomb.board import BOARD, NUM_STONES
 from lerobot_bomb.bomb.episode import EpisodeSpec, Stage
 from lerobot_bomb.bomb.expert import FLOOR_M, expert_action
-from lerobot_bomb.bomb.observation import MAX_STEP_M, WORKSPACE_LOW_M, PrivilegedState, RenderOptions
+from lerobot_bomb.bomb.observation import MAX_STEP_M, WORKSPACE_LOW_M, RenderOptions
+from lerobot_bomb.bomb.privileged_state import Goal, PrivilegedState
 from lerobot_env_bomb.env import BombEnv
 from lerobot_env_bomb.scene import WORKSPACE_HIGH, WORKSPACE_LOW
 
@@ -20,8 +21,7 @@ def state_of(gripper_xyz: list[float], opening: float, stone_xyz: np.ndarray = S
     return PrivilegedState(
         gripper_xyz=np.array(gripper_xyz),
         finger_opening=opening,
-        target_xyz=TARGET_XYZ,
-        stone=0,
+        goals=(Goal(TARGET_XYZ, stone=0),),
         stone_xyz=np.concatenate([[stone_xyz], np.ones((NUM_STONES - 1, 3))]),
         stone_is_white=np.zeros(NUM_STONES, dtype=bool),
         stone_in_play=np.arange(NUM_STONES) == 0,
@@ -164,7 +164,7 @@ def test_it_does_not_read_the_stage_nor_other_stones(episodes: list) -> None:
     for states, actions, _ in episodes:
         others_xyz = states[0].stone_xyz + 0.01
         for state, action in zip(states[:-1], actions, strict=True):
-            others_xyz[state.stone] = state.stone_xyz[state.stone]
+            others_xyz[state.goals[0].stone] = state.stone_xyz[state.goals[0].stone]
             changed = replace(state, stage=Stage.PLACED, stone_xyz=others_xyz)
             np.testing.assert_array_equal(expert_action(changed), action)
 

@@ -14,7 +14,8 @@ from lerobot_bomb.bomb.board import BOARD
 from lerobot_bomb.bomb.episode import EpisodeSpec
 from lerobot_bomb.bomb.expert import expert_action
 from lerobot_bomb.bomb.layout import Layout
-from lerobot_bomb.bomb.observation import PrivilegedState, RenderOptions, action_bounds
+from lerobot_bomb.bomb.observation import RenderOptions, action_bounds
+from lerobot_bomb.bomb.privileged_state import PrivilegedState
 from lerobot_bomb.commands import doctor
 from lerobot_bomb.evaluation.results import read_results
 from lerobot_bomb.flag_errors import FlagError
@@ -71,7 +72,7 @@ def test_a_policy_meets_the_same_spaces_and_episodes(env: BombEnv) -> None:
     states = [PrivilegedState.from_vector(observation["environment_state"]) for observation in observations]
     np.testing.assert_allclose(states[0].gripper_xyz, states[1].gripper_xyz, atol=1e-6)
     np.testing.assert_array_equal(states[0].stone_xyz, states[1].stone_xyz)
-    np.testing.assert_array_equal(states[0].target_xyz, states[1].target_xyz)
+    np.testing.assert_array_equal(states[0].goals[0].xyz, states[1].goals[0].xyz)
     assert (states[0].max_opening_m, states[1].max_opening_m) == pytest.approx((0.033, 0.044))
     assert states[0].finger_opening == pytest.approx(0.033)
 

@@ -13,7 +13,7 @@ from lerobot_bomb.bomb.observation import RenderOptions
 from lerobot_bomb.bomb.perturbations import ALL, AXES
 from lerobot_bomb.commands import main as cli
 from lerobot_bomb.commands.gallery import COLUMNS, PATH_RGB, SHEETS, axis_sheet, path_tile
-from lerobot_bomb.data.rollout import make_env
+from lerobot_bomb.envs.rollout import make_env
 from lerobot_bomb.viewing.perturbations_page import example_sentences, page
 from lerobot_bomb.viewing.sheet import PAPER, Sheet, text_tile
 

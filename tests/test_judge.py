@@ -7,7 +7,8 @@ import pytest
 from lerobot_bomb.bomb.board import BOARD
 from lerobot_bomb.bomb.episode import EpisodeSpec
 from lerobot_bomb.bomb.expert import expert_action
-from lerobot_bomb.bomb.observation import PrivilegedState, RenderOptions
+from lerobot_bomb.bomb.observation import RenderOptions
+from lerobot_bomb.bomb.privileged_state import PrivilegedState
 from lerobot_env_bomb.env import BombEnv
 
 SMALL = RenderOptions(image_size=32)
@@ -61,16 +62,20 @@ def holds_without_lifting(state: PrivilegedState, step: int) -> np.ndarray:
 
 
 def takes_a_stone_of_the_board(state: PrivilegedState, step: int) -> np.ndarray:
-    return expert_action(replace(state, stone=1))
+    return expert_action(replace(state, goals=(replace(state.goals[0], stone=1),)))
+
+
+def aiming_at(state: PrivilegedState, xyz: np.ndarray) -> PrivilegedState:
+    return replace(state, goals=(replace(state.goals[0], xyz=xyz),))
 
 
 def aims_at(offset_xy_m: tuple[float, float]) -> Policy:
     offset = np.array([*offset_xy_m, 0.0])
-    return lambda state, step: expert_action(replace(state, target_xyz=state.target_xyz + offset))
+    return lambda state, step: expert_action(aiming_at(state, state.goals[0].xyz + offset))
 
 
 def aims_at_the_tray(state: PrivilegedState, step: int) -> np.ndarray:
-    return expert_action(replace(state, target_xyz=np.array([0.17, 0.09, 0.0095])))
+    return expert_action(aiming_at(state, np.array([0.17, 0.09, 0.0095])))
 
 
 def brushes_a_stone_aside(state: PrivilegedState, step: int) -> np.ndarray:

@@ -13,14 +13,16 @@ import pytest
 from lerobot_bomb import __version__
 from lerobot_bomb.bomb.episode import TASK_VERSION, EpisodeSpec
 from lerobot_bomb.bomb.expert import expert_action
-from lerobot_bomb.bomb.observation import CAMERAS, PrivilegedState, RenderOptions
+from lerobot_bomb.bomb.observation import CAMERAS, RenderOptions
 from lerobot_bomb.bomb.perturbations import NUISANCES
+from lerobot_bomb.bomb.privileged_state import PrivilegedState
 from lerobot_bomb.data import record as record_module
 from lerobot_bomb.data import resumable
 from lerobot_bomb.data.record import describe_failures, record
 from lerobot_bomb.data.recording import Recording
 from lerobot_bomb.data.resumable import METADATA_FILE, Progress, read_progress, unfinished_folder
-from lerobot_bomb.data.rollout import RolloutSettings, make_env, play
+from lerobot_bomb.data.rollout_pool import RolloutSettings, collect
+from lerobot_bomb.envs.rollout import make_env
 
 SIZE = 64
 SMALL = RenderOptions(image_size=SIZE)
@@ -62,7 +64,7 @@ def stand_still(state: PrivilegedState, control_mode: str, fps: int) -> np.ndarr
 
 
 def stand_still_for_white(state: PrivilegedState, control_mode: str, fps: int) -> np.ndarray:
-    act = stand_still if state.stone_is_white[state.stone] else expert_action
+    act = stand_still if state.stone_is_white[state.goals[0].stone] else expert_action
     return act(state, control_mode, fps)
 
 
@@ -156,7 +158,7 @@ def test_image_statistics_are_sampled_and_right(tmp_path: Path) -> None:
     record(recording, tmp_path / "full")
     statistics = json.loads((tmp_path / "full" / "meta" / "stats.json").read_text())
     env = make_env(recording.spec, recording.render_options)
-    rollout = play(env, recording.spec, RolloutSettings(recording.render_options))
+    rollout = collect(env, recording.spec, RolloutSettings(recording.render_options))
     env.close()
     for camera, frames in rollout.frames.items():
         found = statistics[f"observation.images.{camera}"]

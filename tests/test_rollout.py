@@ -14,8 +14,10 @@ import pytest
 
 from lerobot_bomb.bomb.episode import EpisodeSpec
 from lerobot_bomb.bomb.expert import expert_action
-from lerobot_bomb.bomb.observation import PrivilegedState, RenderOptions
-from lerobot_bomb.data.rollout import RolloutPool, RolloutSettings, make_env, perturb, play
+from lerobot_bomb.bomb.observation import RenderOptions
+from lerobot_bomb.bomb.privileged_state import PrivilegedState
+from lerobot_bomb.data.rollout_pool import RolloutPool, RolloutSettings, collect
+from lerobot_bomb.envs.rollout import add_noise, make_env
 
 SMALL = RenderOptions(image_size=64)
 
@@ -37,7 +39,7 @@ class ExecutedActions(gymnasium.Wrapper):
 def test_noise_is_executed_but_not_stored() -> None:
     spec, settings = EpisodeSpec(seed=0), RolloutSettings(SMALL, noise=0.1)
     env = ExecutedActions(make_env(spec, SMALL))
-    rollout = play(env, spec, settings)
+    rollout = collect(env, spec, settings)
     assert rollout.result.is_success
     clean = np.stack([expert_action(PrivilegedState.from_vector(s.to_vector())) for s in env.states])
     executed = np.stack(env.actions)
@@ -45,8 +47,8 @@ def test_noise_is_executed_but_not_stored() -> None:
     assert np.array_equal(executed[:, 3], clean[:, 3])
     assert 0.05 < np.std(executed[:, :3] - clean[:, :3]) < 0.15
 
-    again = play(env, spec, settings)
-    other = play(env, replace(spec, seed=1), settings)
+    again = collect(env, spec, settings)
+    other = collect(env, replace(spec, seed=1), settings)
     env.close()
     assert np.array_equal(again.actions, rollout.actions)
     assert np.array_equal(again.frames["wrist"], rollout.frames["wrist"])
@@ -57,10 +59,10 @@ def test_noise_is_executed_but_not_stored() -> None:
 def test_noise_has_the_same_size_in_both_control_modes(control_mode: str, step: float) -> None:
     action = np.array([0, 0, 0.1, -1], dtype=np.float32)
     rng = np.random.default_rng(0)
-    draws = np.stack([perturb(action, 0.05, control_mode, rng) for _ in range(500)])
+    draws = np.stack([add_noise(action, 0.05, control_mode, rng) for _ in range(500)])
     assert np.std(draws[:, :3], axis=0) == pytest.approx([0.05 * step] * 3, rel=0.15)
     assert (draws[:, 3] == -1).all()
-    assert np.array_equal(perturb(action, 0.0, control_mode, rng), action)
+    assert np.array_equal(add_noise(action, 0.0, control_mode, rng), action)
 
 
 def test_a_pool_yields_in_the_order_of_the_specs() -> None:
@@ -88,7 +90,7 @@ def test_a_pool_that_is_iterated_block_by_block_goes_on_and_plays_no_further_ahe
 
 def test_workers_start_without_torch_and_lerobot() -> None:
     script = (
-        "import sys, lerobot_bomb.data.record, lerobot_bomb.data.rollout as rollout\n"
+        "import sys, lerobot_bomb.data.record, lerobot_bomb.envs.rollout as rollout\n"
         "from lerobot_bomb.bomb.episode import EpisodeSpec\n"
         "from lerobot_bomb.bomb.observation import RenderOptions\n"
         "rollout.make_env(EpisodeSpec(seed=0), RenderOptions()).reset()\n"

@@ -7,7 +7,8 @@ from lerobot.policies.factory import make_policy_config
 
 from lerobot_bomb.bomb.episode import EpisodeSpec
 from lerobot_bomb.bomb.expert import expert_action
-from lerobot_bomb.bomb.observation import PrivilegedState, RenderOptions, action_bounds
+from lerobot_bomb.bomb.observation import RenderOptions, action_bounds
+from lerobot_bomb.bomb.privileged_state import PrivilegedState
 from lerobot_env_bomb.configuration_bomb import BombEnvConfig
 from lerobot_env_bomb.env import BombEnv
 from lerobot_policy_bomb_expert.configuration_bomb_expert import BombExpertConfig

@@ -18,11 +18,11 @@ import pytest
 from lerobot_bomb.bomb.board import BOARD
 from lerobot_bomb.bomb.episode import EpisodeSpec
 from lerobot_bomb.bomb.expert import expert_action
-from lerobot_bomb.bomb.observation import ACTION_NAMES, STATE_NAMES, PrivilegedState, RenderOptions
+from lerobot_bomb.bomb.observation import ACTION_NAMES, STATE_NAMES, RenderOptions
+from lerobot_bomb.bomb.privileged_state import PrivilegedState
 from lerobot_bomb.commands import main as cli
 from lerobot_bomb.commands.view import write_episode
-from lerobot_bomb.data.rollout import make_env
-from lerobot_bomb.viewing.episode import expert_agent, play
+from lerobot_bomb.envs.rollout import expert_agent, make_env, play
 from lerobot_env_bomb.env import BombEnv
 
 SPEC = EpisodeSpec(seed=4, target=(3, 2), color="white", fps=5)

@@ -6,7 +6,7 @@ import imageio.v3 as iio
 import numpy as np
 
 from lerobot_bomb.bomb.episode import EpisodeSpec
-from lerobot_bomb.viewing.episode import expert_agent, play
+from lerobot_bomb.envs.rollout import expert_agent, play
 from lerobot_env_bomb.env import BombEnv
 
 SEED = 9  # many stones on the board

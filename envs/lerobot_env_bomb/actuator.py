@@ -5,9 +5,8 @@ from collections import deque
 import numpy as np
 
 from lerobot_bomb.bomb.observation import MAX_STEP_M
+from lerobot_bomb.bomb.streams import Stream, generator
 from lerobot_env_bomb.axes.dynamics import Dynamics
-
-NOISE_STREAM = 300  # of random numbers, apart from those that an episode is drawn from
 
 
 class Actuator:
@@ -16,7 +15,7 @@ class Actuator:
     def __init__(self, control_mode: str, gripper_xyz: np.ndarray, dynamics: Dynamics | None, seed: int):
         self._is_absolute = control_mode == "absolute"
         self._noise_m = 0.0 if dynamics is None else MAX_STEP_M * dynamics.noise
-        self._rng = np.random.default_rng([seed, NOISE_STREAM])
+        self._rng = generator(seed, Stream.ACTUATOR_NOISE)
         # until the first action arrives: stay, with open fingers
         rest = np.array([*(gripper_xyz if self._is_absolute else np.zeros(3)), 1.0])
         self._pending = deque([rest] * (0 if dynamics is None else dynamics.latency))

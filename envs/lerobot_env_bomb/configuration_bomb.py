@@ -11,7 +11,14 @@ from lerobot.processor import PolicyProcessorPipeline
 from lerobot.utils.constants import ACTION, OBS_IMAGES, OBS_PREFIX, OBS_STATE
 
 from lerobot_bomb.bomb.episode import DEFAULT_FPS, TASK_VERSION, EpisodeSpec
-from lerobot_bomb.bomb.observation import ACTION_DIM, CAMERAS, STATE_DIM, RenderOptions, geometry_shapes
+from lerobot_bomb.bomb.observation import (
+    ACTION_DIM,
+    AGENT_POS,
+    CAMERAS,
+    STATE_DIM,
+    RenderOptions,
+    geometry_shapes,
+)
 from lerobot_bomb.bomb.perturbations import NONE, Condition
 from lerobot_bomb.checkpoints.environment import check_acting_policy
 from lerobot_bomb.data.environment import Environment
@@ -19,8 +26,6 @@ from lerobot_bomb.envs.vector import LazyVectorEnv
 from lerobot_bomb.files import check_appendable
 from lerobot_bomb.flag_errors import flag_errors
 from lerobot_env_bomb.fetch_files import check_robot
-
-AGENT_POS = "agent_pos"
 
 
 @EnvConfig.register_subclass("bomb")

@@ -10,7 +10,16 @@ from gymnasium.error import ResetNeeded
 
 from lerobot_bomb.bomb.episode import DEFAULT_FPS, PHYSICS_HZ, EpisodeSpec
 from lerobot_bomb.bomb.judge import Judge
-from lerobot_bomb.bomb.observation import ACTION_DIM, CAMERAS, PrivilegedState, RenderOptions
+from lerobot_bomb.bomb.layout import Snapshot
+from lerobot_bomb.bomb.observation import (
+    ACTION_DIM,
+    AGENT_POS,
+    CAMERAS,
+    ENVIRONMENT_STATE,
+    PIXELS,
+    RenderOptions,
+)
+from lerobot_bomb.bomb.privileged_state import PrivilegedState
 from lerobot_bomb.bomb.suites import find_suite
 from lerobot_bomb.envs.results import EpisodeResult, PolicyIdentity, write_result
 from lerobot_env_bomb.actuator import Actuator
@@ -78,8 +87,9 @@ class BombEnv(gymnasium.Env[Observation, np.ndarray]):
         self._task_ids, self._policy = task_ids, policy
         self.action_space = action_space(spec.control_mode)
         self._action_low, self._action_high = self.action_space.low, self.action_space.high
-        self.observation_space = observation_space(render_options)
+        self.observation_space = observation_space(render_options, suite.num_goals)
         self._current_run: _Run | None = None
+        self._now: Snapshot  # measured after the last control step
         self._renderer: CameraRenderer | None = None
         self._steps = 0
         self._last_transition: tuple | None = None
@@ -99,7 +109,8 @@ class BombEnv(gymnasium.Env[Observation, np.ndarray]):
         episode = sample_episode(replace(self._spec, seed=int(seed)))
         scene = self._current_run.scene if self._current_run is not None else Scene(self._spec.robot)
         scene.reset(episode.layout, episode.perturbation.model_edits)
-        start, dynamics = scene.measure(), episode.perturbation.of(Dynamics)
+        self._now = start = scene.measure()
+        dynamics = episode.perturbation.of(Dynamics)
         self._current_run = _Run(
             scene=scene,
             episode=episode,
@@ -117,10 +128,11 @@ class BombEnv(gymnasium.Env[Observation, np.ndarray]):
         action = self._check(action)
         if self._last_transition is not None:
             return deepcopy(self._last_transition)
-        target_xyz, open_fingers = run.actuator.command(action, run.scene.gripper_xyz)
+        target_xyz, open_fingers = run.actuator.command(action, self._now.gripper_xyz)
         run.scene.move(target_xyz, open_fingers, self._num_substeps)
+        self._now = run.scene.measure()
         self._steps += 1
-        terminated = run.judge.update(run.scene.measure())
+        terminated = run.judge.update(self._now)
         truncated = not terminated and self._steps >= self._max_episode_steps
         if truncated:
             run.judge.time_out()
@@ -183,13 +195,11 @@ class BombEnv(gymnasium.Env[Observation, np.ndarray]):
 
     def privileged_state(self) -> PrivilegedState:
         """The simulator's true state."""
-        run = self._run
-        now = run.scene.measure()
+        run, now = self._run, self._now
         return PrivilegedState(
             gripper_xyz=now.gripper_xyz,
             finger_opening=now.finger_opening,
-            target_xyz=run.episode.target_xyz,
-            stone=run.episode.stone,
+            goals=run.episode.goals,
             stone_xyz=now.stone_xyz,
             stone_is_white=run.episode.layout.stone_is_white,
             stone_in_play=run.episode.layout.stone_in_play,
@@ -230,9 +240,9 @@ class BombEnv(gymnasium.Env[Observation, np.ndarray]):
         state = self.privileged_state()
         views = {camera: self._view(camera) for camera in CAMERAS}
         return {
-            "pixels": {camera: picture for camera, (picture, _) in views.items()},
-            "agent_pos": np.array([*state.gripper_xyz, state.finger_opening], dtype=np.float32),
-            "environment_state": state.to_vector(),
+            PIXELS: {camera: picture for camera, (picture, _) in views.items()},
+            AGENT_POS: np.array([*state.gripper_xyz, state.finger_opening], dtype=np.float32),
+            ENVIRONMENT_STATE: state.to_vector(),
             **{key: value for _, geometry in views.values() for key, value in geometry.items()},
         }
 

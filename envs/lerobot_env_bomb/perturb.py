@@ -8,16 +8,13 @@ import numpy as np
 from lerobot_bomb.bomb.episode import EpisodeSpec
 from lerobot_bomb.bomb.layout import Layout
 from lerobot_bomb.bomb.perturbations import AXES, Condition
+from lerobot_bomb.bomb.streams import Stream, generator
 from lerobot_bomb.bomb.suite import Episode
 from lerobot_bomb.bomb.suites import find_suite
 from lerobot_env_bomb.axes import TRANSFORMS
 from lerobot_env_bomb.axes.language import Wording
 from lerobot_env_bomb.axes.transform import Transform
 from lerobot_env_bomb.scene import ModelEdit
-
-# Streams of random numbers, beside those of the layout; their numbers are part of the protocol.
-LEVEL_STREAM = 100  # plus the axis' place in AXES: the level, where the condition gives a range
-AXIS_STREAM = 200  # plus the axis' place: everything else that the axis draws
 
 
 @dataclass(frozen=True)
@@ -66,15 +63,15 @@ def draw_perturbation(nominal: Episode) -> Perturbation:
     """The axes of the episode's condition, each drawn from a generator of its own."""
     spec, levels = nominal.spec, {}
     for axis, low, high in Condition.parse(spec.perturbations).ranges:
-        level = int(_rng(spec, LEVEL_STREAM, axis).integers(low, high + 1))
+        level = int(_rng(spec, Stream.LEVEL, axis).integers(low, high + 1))
         if level > 0:
             levels[axis] = level
     drawn = {
-        axis: TRANSFORMS[axis].draw(level, _rng(spec, AXIS_STREAM, axis), nominal)
+        axis: TRANSFORMS[axis].draw(level, _rng(spec, Stream.AXIS, axis), nominal)
         for axis, level in levels.items()
     }
     return Perturbation(levels, drawn)
 
 
-def _rng(spec: EpisodeSpec, stream: int, axis: str) -> np.random.Generator:
-    return np.random.default_rng([spec.seed, stream + list(AXES).index(axis)])
+def _rng(spec: EpisodeSpec, stream: Stream, axis: str) -> np.random.Generator:
+    return generator(spec.seed, stream + list(AXES).index(axis))

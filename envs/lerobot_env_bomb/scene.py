@@ -86,11 +86,6 @@ class Scene:
         # poses and contacts of the state that the last substep ended in
         mujoco.mj_forward(self.model, self.data)
 
-    @property
-    def gripper_xyz(self) -> np.ndarray:
-        """(3,) metres, point between the pads' lower ends."""
-        return self.data.site_xpos[self._grip].copy()
-
     def measure(self) -> Snapshot:
         """Poses and contacts now."""
         touched = np.zeros((NUM_STONES, 2), dtype=bool)
@@ -100,7 +95,7 @@ class Scene:
                 if pad in self._pads and geom in stone_of_geom:
                     touched[stone_of_geom[geom], self._pads.index(pad)] = True
         return Snapshot(
-            gripper_xyz=self.gripper_xyz,
+            gripper_xyz=self.data.site_xpos[self._grip].copy(),
             finger_opening=float(self.data.qpos[self._fingers].sum()),
             stone_xyz=self.data.xpos[self._stone_bodies].copy(),
             stone_touched=touched,

@@ -6,13 +6,16 @@ from gymnasium import spaces
 from lerobot_bomb.bomb.board import NUM_STONES
 from lerobot_bomb.bomb.episode import PHYSICS_HZ, Stage
 from lerobot_bomb.bomb.observation import (
+    AGENT_POS,
     CAMERAS,
+    ENVIRONMENT_STATE,
+    PIXELS,
     STATE_DIM,
-    PrivilegedState,
     RenderOptions,
     action_bounds,
     geometry_shapes,
 )
+from lerobot_bomb.bomb.privileged_state import PrivilegedState
 
 # Bounds of what the simulator can report, metres. Stones can be flung off the board, so they are wide.
 POSITION_LIMIT_M = 100.0
@@ -27,15 +30,15 @@ def action_space(control_mode: str) -> spaces.Box:
     return spaces.Box(low, high, dtype=np.float32)
 
 
-def observation_space(options: RenderOptions) -> spaces.Dict:
-    """Pictures of both cameras, (4,) state of the gripper, the privileged state for oracles, geometry."""
+def observation_space(options: RenderOptions, num_goals: int) -> spaces.Dict:
+    """Images of both cameras, (4,) state of the gripper, the privileged state for oracles, geometry."""
     shape = (options.image_size, options.image_size, 3)
     limit = max(POSITION_LIMIT_M, NUM_STONES, len(Stage), PHYSICS_HZ)
     return spaces.Dict(
         {
-            "pixels": spaces.Dict({camera: spaces.Box(0, 255, shape, np.uint8) for camera in CAMERAS}),
-            "agent_pos": spaces.Box(-GRIPPER_LIMIT_M, GRIPPER_LIMIT_M, (STATE_DIM,), np.float32),
-            "environment_state": spaces.Box(-limit, limit, (PrivilegedState.DIM,), np.float32),
+            PIXELS: spaces.Dict({camera: spaces.Box(0, 255, shape, np.uint8) for camera in CAMERAS}),
+            AGENT_POS: spaces.Box(-GRIPPER_LIMIT_M, GRIPPER_LIMIT_M, (STATE_DIM,), np.float32),
+            ENVIRONMENT_STATE: spaces.Box(-limit, limit, (PrivilegedState.dim(num_goals),), np.float32),
             **{
                 key: spaces.Box(-np.inf, np.inf, shape, np.float32)
                 for key, shape in geometry_shapes(options).items()

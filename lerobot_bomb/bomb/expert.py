@@ -9,7 +9,8 @@ from dataclasses import replace
 import numpy as np
 
 from lerobot_bomb.bomb.episode import CONTROL_MODES, DEFAULT_FPS
-from lerobot_bomb.bomb.observation import MAX_STEP_M, WORKSPACE_HIGH_M, WORKSPACE_LOW_M, PrivilegedState
+from lerobot_bomb.bomb.observation import MAX_STEP_M, WORKSPACE_HIGH_M, WORKSPACE_LOW_M
+from lerobot_bomb.bomb.privileged_state import PrivilegedState
 from lerobot_bomb.flags import one_of
 
 SPEED_M_S = 0.30  # at most, along each of the horizontal plane and the vertical
@@ -63,20 +64,20 @@ def expert_action(
 
 
 def _anticipate(state: PrivilegedState) -> PrivilegedState:
-    """The state after what the gripper has been told and, for latency, has not done yet."""
-    stone_xyz = state.stone_xyz.copy()
-    stone_xyz[state.stone] += _held(state, stone_xyz[state.stone]) * state.pending_motion_m
+    """The state after what the gripper has been given and, for latency, has not done yet."""
+    stone, stone_xyz = state.goals[0].stone, state.stone_xyz.copy()
+    stone_xyz[stone] += _held(state, stone_xyz[stone]) * state.pending_motion_m
     state = replace(state, gripper_xyz=state.gripper_xyz + state.pending_motion_m, stone_xyz=stone_xyz)
     if state.pending_gripper == 0:
         return state
-    closed_m = _enclosed(state, stone_xyz[state.stone]) * (2 * state.stone_radius_m - SQUEEZE_M)
+    closed_m = _enclosed(state, stone_xyz[stone]) * (2 * state.stone_radius_m - SQUEEZE_M)
     opening_m = state.max_opening_m if state.pending_gripper > 0 else min(closed_m, state.finger_opening)
     return replace(state, finger_opening=opening_m)
 
 
 def _plan(state: PrivilegedState, tempo: float) -> tuple[np.ndarray, float]:
     """Displacement (3,) in metres and gripper command in [-1, 1] for a step of `tempo` x 0.1 s."""
-    stone_xyz = state.stone_xyz[state.stone]
+    stone_xyz = state.stone_xyz[state.goals[0].stone]
     is_placed = _placed(state, stone_xyz)
     is_held = _held(state, stone_xyz)
     approach_m, approach_gripper = _approach(state, stone_xyz, tempo)
@@ -93,8 +94,8 @@ def _placed(state: PrivilegedState, stone_xyz: np.ndarray) -> float:
     A release moves the stone a little, and must not make the expert want it back.
     """
     openness = _openness(state, (HELD_SHARE[0], OPEN_SHARE[0]))
-    lateral_m = float(np.linalg.norm((state.target_xyz - stone_xyz)[:2]))
-    height_m = float(stone_xyz[2] - state.target_xyz[2])
+    lateral_m = float(np.linalg.norm((state.goals[0].xyz - stone_xyz)[:2]))
+    height_m = float(stone_xyz[2] - state.goals[0].xyz[2])
     # fingers that are as low as they go cannot lower a stone that they hold too high
     height_m = max(min(height_m, state.gripper_xyz[2] - FLOOR_M), height_m - GRASP_SLACK_M)
     inside = min(
@@ -147,8 +148,8 @@ def _approach(state: PrivilegedState, stone_xyz: np.ndarray, tempo: float) -> tu
 
 def _carry(state: PrivilegedState, stone_xyz: np.ndarray, tempo: float) -> np.ndarray:
     """Displacement (3,) that brings the held stone over the target and down."""
-    offset_xy = (state.target_xyz - stone_xyz)[:2]
-    height_m = float(stone_xyz[2] - state.target_xyz[2])
+    offset_xy = (state.goals[0].xyz - stone_xyz)[:2]
+    height_m = float(stone_xyz[2] - state.goals[0].xyz[2])
     lateral_m = float(np.linalg.norm(offset_xy))
     funnel_m = float(np.clip((lateral_m - CARRY_MOUTH_M) * CARRY_SLOPE, 0, CARRY_M))
     freedom = max(_ramp(height_m, *CLEARANCE_M), CREEP_M / (SPEED_M_S / DEFAULT_FPS))

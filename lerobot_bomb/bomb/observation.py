@@ -1,12 +1,15 @@
-"""What goes into a policy and comes out of it: names, shapes, units; and the true state."""
+"""What goes into a policy and comes out of it: names, shapes, units."""
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 
 import numpy as np
 
-from lerobot_bomb.bomb.board import BOARD, NUM_STONES
-from lerobot_bomb.bomb.episode import CONTROL_MODES, DEFAULT_FPS, Stage
 from lerobot_bomb.flags import one_of
+
+# Keys of the environment's observation, as LeRobot's environments name them.
+PIXELS = "pixels"  # {camera: (H, W, 3) uint8}
+AGENT_POS = "agent_pos"  # (STATE_DIM,) float32
+ENVIRONMENT_STATE = "environment_state"  # PrivilegedState.to_vector()
 
 CAMERAS = ("workspace", "wrist")
 RENDER_PRESETS = ("fast", "shadows")
@@ -41,74 +44,6 @@ class RenderOptions:
             raise ValueError(
                 f"--env.image_size={self.image_size} must lie in {MIN_IMAGE_SIZE}..{MAX_IMAGE_SIZE} pixels"
             )
-
-
-@dataclass(frozen=True)
-class PrivilegedState:
-    """The simulator's true state, which the expert reads and no trained policy sees."""
-
-    gripper_xyz: np.ndarray  # (3,) metres, point between the pads' lower ends
-    finger_opening: float  # metres between the pads
-    target_xyz: np.ndarray  # (3,) metres, centre of a stone that rests on the target
-    stone: int  # index of the stone to be moved
-    stone_xyz: np.ndarray = field(repr=False)  # (NUM_STONES, 3) metres, centres
-    stone_is_white: np.ndarray = field(repr=False)  # (NUM_STONES,) bool
-    stone_in_play: np.ndarray = field(repr=False)  # (NUM_STONES,) bool; False: parked out of sight
-    stage: Stage = Stage.START
-    # how the environment reads actions
-    control_mode: str = "relative"
-    fps: int = DEFAULT_FPS
-    stone_radius_m: float = BOARD.stone_radius_m
-    max_opening_m: float = 0.044  # between the pads of open fingers
-    # what the gripper has been told and, for latency, has not done yet: (3,) metres, and its command or 0
-    pending_motion_m: np.ndarray = field(default_factory=lambda: np.zeros(3))
-    pending_gripper: float = 0.0
-
-    DIM = 3 + 1 + 3 + 4 + 2 + 4 + 5 * NUM_STONES
-
-    def to_vector(self) -> np.ndarray:
-        """(DIM,) float32, the observation ``environment_state``."""
-        stones = np.concatenate(
-            [self.stone_xyz, self.stone_is_white[:, None], self.stone_in_play[:, None]], axis=1
-        )
-        head = [
-            *self.gripper_xyz,
-            self.finger_opening,
-            *self.target_xyz,
-            self.stone,
-            list(Stage).index(self.stage),
-            CONTROL_MODES.index(self.control_mode),
-            self.fps,
-            self.stone_radius_m,
-            self.max_opening_m,
-            *self.pending_motion_m,
-            self.pending_gripper,
-        ]
-        return np.concatenate([head, stones.ravel()]).astype(np.float32)
-
-    @classmethod
-    def from_vector(cls, vector: np.ndarray) -> "PrivilegedState":
-        """Inverse of `to_vector`, in float64."""
-        vector = np.asarray(vector, dtype=np.float64)
-        if vector.shape != (cls.DIM,):
-            raise ValueError(f"environment_state has shape {vector.shape}, expected ({cls.DIM},)")
-        stones = vector[17:].reshape(NUM_STONES, 5)
-        return cls(
-            gripper_xyz=vector[0:3],
-            finger_opening=float(vector[3]),
-            target_xyz=vector[4:7],
-            stone=int(vector[7]),
-            stage=list(Stage)[int(vector[8])],
-            control_mode=CONTROL_MODES[int(vector[9])],
-            fps=int(vector[10]),
-            stone_radius_m=float(vector[11]),
-            max_opening_m=float(vector[12]),
-            pending_motion_m=vector[13:16],
-            pending_gripper=float(vector[16]),
-            stone_xyz=stones[:, 0:3],
-            stone_is_white=stones[:, 3] > 0.5,
-            stone_in_play=stones[:, 4] > 0.5,
-        )
 
 
 def action_bounds(control_mode: str) -> tuple[np.ndarray, np.ndarray]:

@@ -12,7 +12,8 @@ from lerobot.policies import PreTrainedPolicy
 from lerobot.utils.constants import OBS_ENV_STATE
 from torch import Tensor
 
-from lerobot_bomb.bomb.observation import ACTION_DIM, PrivilegedState
+from lerobot_bomb.bomb.observation import ACTION_DIM
+from lerobot_bomb.bomb.privileged_state import PrivilegedState
 
 
 @dataclass
@@ -81,7 +82,7 @@ class ScriptedPolicy(PreTrainedPolicy):
         """(D,) action in the environment's units, in the step-th step of an episode."""
 
     def select_action(self, batch: dict[str, Tensor], **_: object) -> Tensor:
-        """Observation ``environment_state`` (B, PrivilegedState.DIM) -> (B, D) actions in env units."""
+        """Observation ``environment_state`` (B, PrivilegedState.dim(G)) -> (B, D) actions in env units."""
         if OBS_ENV_STATE not in batch:
             raise ValueError(
                 f"--policy.type={self.name} needs the observation {OBS_ENV_STATE!r}, which only "

@@ -8,6 +8,7 @@ import numpy as np
 from lerobot_bomb.bomb.board import BOARD, Cell
 from lerobot_bomb.bomb.episode import EpisodeSpec
 from lerobot_bomb.bomb.layout import Layout
+from lerobot_bomb.bomb.privileged_state import Goal
 
 
 @dataclass(frozen=True)
@@ -21,6 +22,11 @@ class Episode:
     opening: Mapping[Cell, str]  # colours of the stones that stand on the board
     layout: Layout
     stone: int  # index of the stone to be moved
+
+    @property
+    def goals(self) -> tuple[Goal, ...]:
+        """What the expert aims at."""
+        return (Goal(self.target_xyz, self.stone),)
 
     @property
     def target_xyz(self) -> np.ndarray:
@@ -38,3 +44,4 @@ class Suite:
     sample: Callable[[EpisodeSpec], Episode]  # the same spec, the same episode, without perturbations
     check: Callable[[EpisodeSpec], None]
     max_steps: int  # at DEFAULT_FPS; scaled with fps
+    num_goals: int = 1  # of each of its episodes

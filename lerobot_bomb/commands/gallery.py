@@ -11,13 +11,12 @@ from tqdm import tqdm
 
 from lerobot_bomb.bomb.board import BOARD
 from lerobot_bomb.bomb.episode import EpisodeSpec
-from lerobot_bomb.bomb.observation import CAMERAS, WORKSPACE_HIGH_M, WORKSPACE_LOW_M, RenderOptions
+from lerobot_bomb.bomb.observation import CAMERAS, PIXELS, WORKSPACE_HIGH_M, WORKSPACE_LOW_M, RenderOptions
 from lerobot_bomb.bomb.perturbations import ALL, AXES, MAX_LEVEL, NONE, NUISANCES
 from lerobot_bomb.commands.arguments import parse_numbers, path_flag
-from lerobot_bomb.data.rollout import make_env
+from lerobot_bomb.envs.rollout import expert_agent, make_env, play
 from lerobot_bomb.files import written_whole
 from lerobot_bomb.flags import flags_without_group, one_of
-from lerobot_bomb.viewing.episode import expert_agent, play
 from lerobot_bomb.viewing.perturbations_page import write_page
 from lerobot_bomb.viewing.sheet import FONT_SIZE, GAP, INK, TILE_PAPER, Sheet, font, text_tile
 
@@ -112,7 +111,7 @@ def look_at(condition: str, seeds: Sequence[int], options: RenderOptions, played
         moments = play(env, spec, expert_agent(spec))
         first = next(moments)
         path = [moment.state.gripper_xyz[:2] for moment in (first, *(moments if played else ()))]
-        looks.append(Look(first.observation["pixels"], first.instruction, np.array(path)))
+        looks.append(Look(first.observation[PIXELS], first.instruction, np.array(path)))
     env.close()
     return looks
 

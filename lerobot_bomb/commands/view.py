@@ -19,11 +19,10 @@ from lerobot_bomb.commands.arguments import (
     path_flag,
     switch,
 )
-from lerobot_bomb.data.rollout import make_env
 from lerobot_bomb.envs.results import EpisodeResult
+from lerobot_bomb.envs.rollout import Agent, expert_agent, make_env, play, random_agent
 from lerobot_bomb.files import written_whole
 from lerobot_bomb.flags import flags_without_group
-from lerobot_bomb.viewing.episode import Agent, expert_agent, play, random_agent
 
 POLICIES = ("expert", "random")
 DEFAULT_FOLDER = Path("outputs/view")

@@ -15,7 +15,8 @@ from lerobot_bomb.bomb.expert import expert_action
 from lerobot_bomb.data.kept_blocks import Progress, reached
 from lerobot_bomb.data.recording import Recording, recorder_flags
 from lerobot_bomb.data.resumable import grow, missing_blocks, write_blocks
-from lerobot_bomb.data.rollout import Expert, Rollout, RolloutPool, RolloutSettings, make_env
+from lerobot_bomb.data.rollout_pool import Rollout, RolloutPool, RolloutSettings
+from lerobot_bomb.envs.rollout import Expert, make_env
 
 if TYPE_CHECKING:
     from lerobot_bomb.data.blocks import DatasetLayout, Episode

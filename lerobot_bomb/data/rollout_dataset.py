@@ -10,7 +10,7 @@ from lerobot_bomb.bomb.episode import TASK_VERSION
 from lerobot_bomb.bomb.observation import ACTION_NAMES, CAMERAS, STATE_NAMES, geometry_shapes
 from lerobot_bomb.data.blocks import DatasetLayout, Episode
 from lerobot_bomb.data.recording import Recording
-from lerobot_bomb.data.rollout import Rollout
+from lerobot_bomb.data.rollout_pool import Rollout
 from lerobot_bomb.envs.results import EpisodeResult
 
 

@@ -15,7 +15,7 @@ from lerobot_bomb.bomb.episode import EpisodeSpec
 from lerobot_bomb.bomb.observation import ACTION_DIM, STATE_DIM, RenderOptions
 from lerobot_bomb.checkpoints.adapters import check_adapters
 from lerobot_bomb.checkpoints.folder import autocast, load_processors, read_config
-from lerobot_bomb.viewing.episode import Agent
+from lerobot_bomb.envs.rollout import Agent
 
 ENV_TYPE = "bomb"
 

@@ -6,7 +6,7 @@ from pathlib import Path
 from lerobot_bomb.bomb.episode import EpisodeSpec
 from lerobot_bomb.bomb.observation import RenderOptions
 from lerobot_bomb.bomb.perturbations import ALL, AXES, MAX_LEVEL, Axis, magnitude
-from lerobot_bomb.data.rollout import make_env
+from lerobot_bomb.envs.rollout import make_env
 from lerobot_bomb.files import written_whole
 
 # the episode whose sentences the page quotes

@@ -10,9 +10,10 @@ import rerun.blueprint as rrb
 
 from lerobot_bomb.bomb.board import BOARD, COLORS
 from lerobot_bomb.bomb.episode import EpisodeSpec, Stage
-from lerobot_bomb.bomb.observation import ACTION_NAMES, CAMERAS, STATE_NAMES, PrivilegedState
+from lerobot_bomb.bomb.observation import ACTION_NAMES, AGENT_POS, CAMERAS, PIXELS, STATE_NAMES
+from lerobot_bomb.bomb.privileged_state import PrivilegedState
 from lerobot_bomb.envs.results import EpisodeResult
-from lerobot_bomb.viewing.episode import Moment
+from lerobot_bomb.envs.rollout import Moment
 
 APPLICATION = "lerobot_bomb"
 STEP, TIME = "step", "time"  # the timelines: control steps, seconds
@@ -50,9 +51,9 @@ class RerunFile:
             self._log_target(state)
         self._set_step(moment.step)
         for camera in CAMERAS:
-            self._log(f"camera/{camera}", _png(moment.observation["pixels"][camera]))
+            self._log(f"camera/{camera}", _png(moment.observation[PIXELS][camera]))
         self._log_scene(state)
-        self._log_values("state", STATE_NAMES, moment.observation["agent_pos"])
+        self._log_values("state", STATE_NAMES, moment.observation[AGENT_POS])
         if moment.action is not None:
             self._log_values("action", ACTION_NAMES[self._spec.control_mode], moment.action)
         self._log("placement_error_mm", rr.Scalars(float(moment.info["placement_error_mm"])))
@@ -105,8 +106,8 @@ class RerunFile:
     def _log_target(self, state: PrivilegedState) -> None:
         angles_rad = np.linspace(0, 2 * np.pi, 49)
         ring = np.stack([np.cos(angles_rad), np.sin(angles_rad), np.zeros_like(angles_rad)], axis=1)
-        center = np.array([*state.target_xyz[:2], BOARD.thickness_m + LINE_RADIUS_M])
-        row, column = BOARD.nearest_intersection(state.target_xyz[:2])
+        center = np.array([*state.goals[0].xyz[:2], BOARD.thickness_m + LINE_RADIUS_M])
+        row, column = BOARD.nearest_intersection(state.goals[0].xyz[:2])
         self._log(
             "scene/target",
             rr.LineStrips3D(

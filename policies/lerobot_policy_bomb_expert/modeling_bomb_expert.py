@@ -3,7 +3,7 @@
 import numpy as np
 
 from lerobot_bomb.bomb.expert import expert_action
-from lerobot_bomb.bomb.observation import PrivilegedState
+from lerobot_bomb.bomb.privileged_state import PrivilegedState
 from lerobot_bomb.bomb.scripted_policy import ScriptedPolicy
 from lerobot_policy_bomb_expert.configuration_bomb_expert import BombExpertConfig
 

@@ -2,7 +2,8 @@
 
 import numpy as np
 
-from lerobot_bomb.bomb.observation import PrivilegedState, action_bounds
+from lerobot_bomb.bomb.observation import action_bounds
+from lerobot_bomb.bomb.privileged_state import PrivilegedState
 from lerobot_bomb.bomb.scripted_policy import ScriptedPolicy
 from lerobot_policy_bomb_random.configuration_bomb_random import BombRandomConfig
 

@@ -1,10 +1,4 @@
-"""Suite `place`: one stone onto the intersection that the instruction names.
-
-Every random quantity has a generator of its own, so that drawing one differently (a perturbation, an
-explicit target) leaves the others as they were.
-"""
-
-from enum import IntEnum
+"""Suite `place`: one stone onto the intersection that the instruction names."""
 
 import numpy as np
 
@@ -12,6 +6,7 @@ from lerobot_bomb.bomb.board import BOARD, COLORS, NUM_STONES, TRAY_CENTER_XY, C
 from lerobot_bomb.bomb.episode import EpisodeSpec
 from lerobot_bomb.bomb.go import is_legal_move, is_legal_position
 from lerobot_bomb.bomb.layout import Layout
+from lerobot_bomb.bomb.streams import Stream, generator
 from lerobot_bomb.bomb.suite import Episode, Suite
 
 STONE = 0  # index of the stone to be moved; stones 1.. stand on the board
@@ -31,17 +26,6 @@ TEMPLATES = (
 HELDOUT_TEMPLATES = TEMPLATES[3:]
 
 
-class _Stream(IntEnum):
-    """One random generator per quantity; append only, for the numbers are part of the protocol."""
-
-    TARGET = 0
-    COLOR = 1
-    TEMPLATE = 2
-    OPENING = 3
-    GRIPPER = 4
-    START = 5
-
-
 def targets_of(split: str) -> tuple[Cell, ...]:
     """Intersections (row, column) that a split draws from."""
     cells = tuple((row, column) for row in range(BOARD.num_lines) for column in range(BOARD.num_lines))
@@ -51,7 +35,7 @@ def targets_of(split: str) -> tuple[Cell, ...]:
 
 
 def templates_of(split: str) -> tuple[str, ...]:
-    """Sentence templates that a split draws from."""
+    """Instruction templates that a split draws from."""
     if split == "heldout":
         return HELDOUT_TEMPLATES
     return TEMPLATES if split == "all" else tuple(t for t in TEMPLATES if t not in HELDOUT_TEMPLATES)
@@ -69,32 +53,32 @@ def check_target(spec: EpisodeSpec) -> None:
 def sample_episode(spec: EpisodeSpec) -> Episode:
     """Draw target, colour, instruction, opening and start; the same spec, the same episode."""
     check_target(spec)
-    rng = {stream: np.random.default_rng([spec.seed, stream]) for stream in _Stream}
     targets, templates = targets_of(spec.split), templates_of(spec.split)
-    drawn_target = targets[rng[_Stream.TARGET].integers(len(targets))]
-    drawn_color = COLORS[rng[_Stream.COLOR].integers(len(COLORS))]
+    drawn_target = targets[generator(spec.seed, Stream.TARGET).integers(len(targets))]
+    drawn_color = COLORS[generator(spec.seed, Stream.COLOR).integers(len(COLORS))]
     target = (spec.target[0], spec.target[1]) if spec.target is not None else drawn_target
     color = spec.color if spec.color is not None else drawn_color
-    template = templates[rng[_Stream.TEMPLATE].integers(len(templates))]
-    opening = _sample_opening(rng[_Stream.OPENING], target, color)
+    template = templates[generator(spec.seed, Stream.TEMPLATE).integers(len(templates))]
+    opening = _sample_opening(generator(spec.seed, Stream.OPENING), target, color)
     return Episode(
         spec=spec,
         target=target,
         color=color,
         instruction=template.format(color=color, row=target[0], column=target[1]),
         opening=opening,
-        layout=_sample_layout(rng, opening, color),
+        layout=_sample_layout(spec.seed, opening, color),
         stone=STONE,
     )
 
 
-def _sample_layout(rng: dict, opening: dict[Cell, str], color: str) -> Layout:
+def _sample_layout(seed: int, opening: dict[Cell, str], color: str) -> Layout:
+    gripper, start = generator(seed, Stream.GRIPPER), generator(seed, Stream.START)
     gripper_xyz = np.array([*TRAY_CENTER_XY, 0.0])
-    gripper_xyz[:2] += rng[_Stream.GRIPPER].uniform(-GRIPPER_START_SPREAD_M, GRIPPER_START_SPREAD_M, 2)
-    gripper_xyz[2] = rng[_Stream.GRIPPER].uniform(*GRIPPER_START_HEIGHT_M)
+    gripper_xyz[:2] += gripper.uniform(-GRIPPER_START_SPREAD_M, GRIPPER_START_SPREAD_M, 2)
+    gripper_xyz[2] = gripper.uniform(*GRIPPER_START_HEIGHT_M)
     # the square root makes the disc uniform
-    distance_m = MAX_START_DISTANCE_M * np.sqrt(rng[_Stream.START].uniform())
-    angle_rad = rng[_Stream.START].uniform(-np.pi, np.pi)
+    distance_m = MAX_START_DISTANCE_M * np.sqrt(start.uniform())
+    angle_rad = start.uniform(-np.pi, np.pi)
 
     stone_xy = np.zeros((NUM_STONES, 2))
     stone_is_white = np.zeros(NUM_STONES, dtype=bool)

@@ -6,7 +6,7 @@ The workers import this module, so it imports neither torch nor LeRobot.
 import itertools
 import multiprocessing
 import signal
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from contextlib import suppress
 from dataclasses import dataclass, replace
 from multiprocessing import resource_tracker
@@ -19,22 +19,10 @@ import numpy as np
 
 from lerobot_bomb.bomb.episode import EpisodeSpec
 from lerobot_bomb.bomb.expert import expert_action
-from lerobot_bomb.bomb.observation import (
-    CAMERAS,
-    MAX_STEP_M,
-    PrivilegedState,
-    RenderOptions,
-    action_bounds,
-    geometry_shapes,
-)
+from lerobot_bomb.bomb.observation import AGENT_POS, CAMERAS, PIXELS, RenderOptions, geometry_shapes
+from lerobot_bomb.bomb.streams import recorder_noise
 from lerobot_bomb.envs.results import EpisodeResult
-
-# Importing the part before the colon registers the id; no module of the core imports an environment.
-ENV_ID = "lerobot_env_bomb:bomb/{suite}-v0"
-NOISE_STREAM = 0xDA57  # keeps the noise independent of what the environment draws from the same seed
-
-# (privileged state, control mode, fps) -> (4,) action
-type Expert = Callable[[PrivilegedState, str, int], np.ndarray]
+from lerobot_bomb.envs.rollout import Expert, add_noise, expert_agent, make_env, play
 
 
 @dataclass(frozen=True)
@@ -57,57 +45,33 @@ class Rollout:
     geometry: dict[str, np.ndarray]  # key of `geometry_shapes` -> (T, ...) float32; {} without depth
 
 
-def make_env(spec: EpisodeSpec, render_options: RenderOptions) -> gymnasium.Env:
-    """BOMB from Gymnasium's registry; it starts MuJoCo and OpenGL on its first reset."""
-    return gymnasium.make(
-        ENV_ID.format(suite=spec.suite),
-        disable_env_checker=True,
-        spec=spec,
-        render_options=render_options,
-    )
-
-
-def play(env: gymnasium.Env, spec: EpisodeSpec, settings: RolloutSettings) -> Rollout:
+def collect(env: gymnasium.Env, spec: EpisodeSpec, settings: RolloutSettings) -> Rollout:
     """Play a spec's episode in an `env` of that spec, whatever the seed that the `env` was made with.
 
     The stored actions are clean, the executed ones carry the noise.
     """
-    noise_rng = np.random.default_rng((NOISE_STREAM, spec.seed))
-    observation, _ = env.reset(seed=spec.seed)
-    observations, actions = [], []
-    ended = False
-    while not ended:
-        state = PrivilegedState.from_vector(observation["environment_state"])
-        action = settings.expert(state, spec.control_mode, spec.fps)
-        observations.append(observation)
-        actions.append(action)
-        executed = perturb(action, settings.noise, spec.control_mode, noise_rng)
-        observation, _, terminated, truncated, _ = env.step(executed)
-        ended = terminated or truncated
+    rng = recorder_noise(spec.seed)
+    moments = list(
+        play(
+            env,
+            spec,
+            expert_agent(spec, settings.expert),
+            disturb=lambda action: add_noise(action, settings.noise, spec.control_mode, rng),
+        )
+    )
     result = env.get_wrapper_attr("episode_result")()
     if not result.is_success:
         return Rollout(result, np.empty((0, 4), np.float32), np.empty((0, 4), np.float32), {}, {})
+    observations = [moment.observation for moment in moments[:-1]]
     return Rollout(
         result=result,
-        states=np.stack([observation["agent_pos"] for observation in observations]),
-        actions=np.stack(actions),
-        frames={camera: np.stack([o["pixels"][camera] for o in observations]) for camera in CAMERAS},
+        states=np.stack([observation[AGENT_POS] for observation in observations]),
+        actions=np.stack([moment.action for moment in moments if moment.action is not None]),
+        frames={camera: np.stack([o[PIXELS][camera] for o in observations]) for camera in CAMERAS},
         geometry={
             key: np.stack([o[key] for o in observations]) for key in geometry_shapes(settings.render_options)
         },
     )
-
-
-def perturb(action: np.ndarray, noise: float, control_mode: str, rng: np.random.Generator) -> np.ndarray:
-    """(4,) action -> (4,) float32 within its bounds, with Gaussian noise on x, y and z.
-
-    The gripper's command is left alone: its sign opens or closes, so noise on it would drop the stone
-    and not merely push the arm off its path.
-    """
-    scale = noise * (MAX_STEP_M if control_mode == "absolute" else 1.0)
-    offset = np.append(scale * rng.standard_normal(3), 0.0)
-    low, high = action_bounds(control_mode)
-    return np.clip(action + offset, low, high).astype(np.float32)
 
 
 class RolloutPool:
@@ -196,7 +160,7 @@ class _Worker:
                 self.close()
                 self._env = make_env(spec, self._settings.render_options)
                 self._condition = condition
-            return play(self._env, spec, self._settings)
+            return collect(self._env, spec, self._settings)
         except Exception as error:
             return error
 

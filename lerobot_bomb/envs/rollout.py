@@ -1,0 +1,96 @@
+"""One episode, step by step, played by whatever acts. It imports neither torch nor LeRobot."""
+
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from typing import Any
+
+import gymnasium
+import numpy as np
+
+from lerobot_bomb.bomb.episode import EpisodeSpec
+from lerobot_bomb.bomb.expert import expert_action
+from lerobot_bomb.bomb.observation import ENVIRONMENT_STATE, MAX_STEP_M, RenderOptions, action_bounds
+from lerobot_bomb.bomb.privileged_state import PrivilegedState
+
+# Importing the part before the colon registers the id; no module of the core imports an environment.
+ENV_ID = "lerobot_env_bomb:bomb/{suite}-v0"
+
+# (observation of the environment, instruction) -> (4,) action
+type Agent = Callable[[dict[str, Any], str], np.ndarray]
+# (privileged state, control mode, fps) -> (4,) action
+type Expert = Callable[[PrivilegedState, str, int], np.ndarray]
+
+
+@dataclass(frozen=True)
+class Moment:
+    """What is seen before a step, and what is then done; an episode of T steps has T + 1 moments."""
+
+    step: int
+    instruction: str
+    observation: dict[str, Any]
+    info: dict[str, Any]
+    action: np.ndarray | None  # (4,) the agent's, in the environment's units; None in the last moment
+
+    @property
+    def state(self) -> PrivilegedState:
+        """The simulator's true state."""
+        return PrivilegedState.from_vector(self.observation[ENVIRONMENT_STATE])
+
+
+def make_env(spec: EpisodeSpec, render_options: RenderOptions) -> gymnasium.Env:
+    """BOMB from Gymnasium's registry; it starts MuJoCo and OpenGL on its first reset."""
+    return gymnasium.make(
+        ENV_ID.format(suite=spec.suite),
+        disable_env_checker=True,
+        spec=spec,
+        render_options=render_options,
+    )
+
+
+def play(
+    env: gymnasium.Env,
+    spec: EpisodeSpec,
+    agent: Agent,
+    disturb: Callable[[np.ndarray], np.ndarray] | None = None,
+) -> Iterator[Moment]:
+    """Play a spec's episode in an `env` of that spec; while a moment is looked at, `env` is in it.
+
+    What is executed is the agent's action as `disturb` changes it. The last moment is what the last action
+    led to, which lerobot-eval's videos cut off.
+    """
+    observation, info = env.reset(seed=spec.seed)
+    instruction = env.get_wrapper_attr("task_description")
+    step, ended = 0, False
+    while not ended:
+        action = agent(observation, instruction)
+        yield Moment(step, instruction, observation, info, action)
+        executed = action if disturb is None else disturb(action)
+        observation, _, terminated, truncated, info = env.step(executed)
+        step, ended = step + 1, terminated or truncated
+    yield Moment(step, instruction, observation, info, None)
+
+
+def expert_agent(spec: EpisodeSpec, expert: Expert = expert_action) -> Agent:
+    """The scripted expert, which acts on the simulator's true state."""
+    return lambda observation, _: expert(
+        PrivilegedState.from_vector(observation[ENVIRONMENT_STATE]), spec.control_mode, spec.fps
+    )
+
+
+def random_agent(env: gymnasium.Env, spec: EpisodeSpec) -> Agent:
+    """Actions drawn uniformly from the action space, the same for the same seed."""
+    env.action_space.seed(spec.seed)
+    return lambda *_: env.action_space.sample()
+
+
+def add_noise(action: np.ndarray, noise: float, control_mode: str, rng: np.random.Generator) -> np.ndarray:
+    """(4,) action -> (4,) float32 within its bounds, with Gaussian noise on x, y and z.
+
+    `noise` is its standard deviation in units of the largest relative step. The gripper's command is left
+    alone: its sign opens or closes, so noise on it would drop the stone and not merely push the arm off its
+    path.
+    """
+    scale = noise * (MAX_STEP_M if control_mode == "absolute" else 1.0)
+    offset = np.append(scale * rng.standard_normal(3), 0.0)
+    low, high = action_bounds(control_mode)
+    return np.clip(action + offset, low, high).astype(np.float32)
