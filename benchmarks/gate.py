@@ -19,6 +19,7 @@ import resource
 import shutil
 import sys
 import time
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -27,6 +28,7 @@ from learning_curve import Point, as_figures, count, draw, print_points
 from machine import add_machine_arguments, positive, require_idle_machine, write_figures
 from recipes import POLICY_TYPES, read_recipe, recipe_path
 
+from lerobot_bomb.bomb.perturbations import ALL, NONE, NUISANCES
 from lerobot_bomb.commands.run import run_command
 from lerobot_bomb.evaluation.results import PUT_DOWN, Row, read_results
 
@@ -67,6 +69,8 @@ class Rung:
     task_ids: tuple[int, ...]  # empty: target and colour are drawn for each episode
     episodes: int  # of each evaluation
     lessons: dict[str, Lesson]
+    perturbations: str = NONE  # of the demonstrations
+    conditions: tuple[str, ...] = ()  # that the last checkpoint is evaluated under, beside the nominal one
 
 
 RUNGS = {
@@ -86,6 +90,13 @@ RUNGS = {
             **{name: Lesson(1600, Bar(0.90, 180)) for name in POLICY_TYPES},
             "vla0_smol": Lesson(3200, Bar(0.97, 90)),
         },
+    ),
+    "robust": Rung(
+        (),
+        episodes=200,
+        lessons={"fdvla": Lesson(3600, None)},
+        perturbations=f"{ALL}:0-4",
+        conditions=(*(f"{axis}:3" for axis in NUISANCES), f"{ALL}:1", f"{ALL}:3", f"{ALL}:5"),
     ),
 }
 
@@ -122,6 +133,8 @@ def main() -> None:
 def climb(args: argparse.Namespace) -> int:
     """The whole rung in args.output_dir; 0 if the bar was reached."""
     rung, folder = RUNGS[args.rung], args.output_dir
+    if args.policy_type not in rung.lessons:
+        raise RuntimeError(f"{args.rung} is for --policy.type={' or '.join(rung.lessons)}")
     lesson = rung.lessons[args.policy_type]
     demonstrations = args.demonstrations or lesson.demonstrations
     run = {
@@ -147,11 +160,19 @@ def climb(args: argparse.Namespace) -> int:
     num_named = count_named(controls[OTHER_SENTENCE], told)
     print_points(points)
     print(f"{OTHER_SENTENCE}: {num_named}/{rung.episodes} stones put down on the intersection that it names")
+    conditions = evaluate_conditions(rung, folder, args.first_seed)
     if args.picture is not None:
         title = f"{args.policy_type}, {args.rung}: {demonstrations} demonstrations, {rung.episodes} new seeds"
         draw([points[f"step {step}"] for step in results], title, args.picture)
     write_figures(
-        args.json, {**run, "training": minutes, "points": as_figures(points), "on_named": num_named}
+        args.json,
+        {
+            **run,
+            "training": minutes,
+            "points": as_figures(points),
+            "on_named": num_named,
+            "conditions": conditions,
+        },
     )
     return 0 if lesson.bar is None else verdict(points[f"step {run['steps']}"], lesson.bar)
 
@@ -191,6 +212,7 @@ def record(rung: Rung, demonstrations: int, dataset: Path) -> None:
         f"--episodes={demonstrations}",
         f"--seed={FIRST_SEED}",
         f"--noise={NOISE}",
+        f"--perturbations={rung.perturbations}",
         "--images",
         f"--image_size={IMAGE_SIZE}",
         *tasks,
@@ -270,8 +292,30 @@ def evaluate_controls(
     return results
 
 
-def evaluate(rung: Rung, checkpoint: Path, output_dir: Path, first_seed: int, episodes: int) -> list[Row]:
-    """Stock `lerobot-eval` on unseen seeds; their results."""
+def evaluate_conditions(rung: Rung, folder: Path, first_seed: int) -> dict[str, int]:
+    """{condition: successes} of the last checkpoint in CURVE_EPISODES episodes each; prints the table."""
+    if not rung.conditions:
+        return {}
+    checkpoint, output_dir = folder / "train" / "checkpoints" / "last", folder / "eval_conditions"
+    rows = evaluate(
+        rung, checkpoint / "pretrained_model", output_dir, first_seed, CURVE_EPISODES, rung.conditions
+    )
+    run_command("lerobot-bomb", "results", f"{output_dir / 'results.jsonl'}")
+    successes = dict.fromkeys(rung.conditions, 0)
+    for row in rows:
+        successes[row["spec"]["perturbations"]] += row["is_success"]
+    return successes
+
+
+def evaluate(
+    rung: Rung,
+    checkpoint: Path,
+    output_dir: Path,
+    first_seed: int,
+    episodes: int,
+    conditions: Sequence[str] = (NONE,),
+) -> list[Row]:
+    """Stock `lerobot-eval` on unseen seeds, so many under each condition; their results."""
     results = output_dir / "results.jsonl"
     finished = output_dir / "finished"  # an evaluation that was killed leaves results of some episodes
     if not finished.exists():
@@ -286,6 +330,7 @@ def evaluate(rung: Rung, checkpoint: Path, output_dir: Path, first_seed: int, ep
             f"--env.image_size={IMAGE_SIZE}",
             f"--env.results_path={results}",
             *tasks,
+            f"--env.perturbations={json.dumps(conditions)}",
             f"--seed={first_seed}",
             f"--eval.n_episodes={episodes}",
             f"--eval.batch_size={min(10, episodes)}",

@@ -108,7 +108,9 @@ def test_every_policy_type_has_a_recipe_for_every_rung() -> None:
     for name, rung in gate.RUNGS.items():
         for policy_type in rung.lessons.keys() - {gate.PROBE}:
             recipe = gate.read_recipe(name, policy_type)
-            assert recipe["policy"]["type"] == policy_type
+            assert (
+                recipe["policy"].get("path", f"bomb:{recipe['policy'].get('type')}") == f"bomb:{policy_type}"
+            )
             assert recipe["policy"]["scheduler_decay_steps"] == recipe["steps"]
 
 
