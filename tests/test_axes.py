@@ -325,7 +325,8 @@ def test_a_sensor_scales_colours_and_adds_noise_that_differs_from_picture_to_pic
     ],
 )
 def test_sentences_mean_the_target_in_the_convention_they_state(form: int, which: int, sentence: str) -> None:
-    assert Wording(FORMS[form - 1][which], other=(4, 0))((1, 3), "white") == sentence
+    meant = episode(0, target=(1, 3), color="white")
+    assert Wording(FORMS[form - 1][which], other=(4, 0)).reword(meant.instruction, meant) == sentence
 
 
 def test_every_form_occurs_and_never_names_the_target_as_the_other_place() -> None:

@@ -24,7 +24,6 @@ from lerobot_bomb.bomb.suites import find_suite
 from lerobot_bomb.envs.results import EpisodeResult, PolicyIdentity, write_result
 from lerobot_env_bomb.actuator import Actuator
 from lerobot_env_bomb.axes.dynamics import Dynamics
-from lerobot_env_bomb.axes.photometric import Sensor
 from lerobot_env_bomb.fetch_files import check_robot
 from lerobot_env_bomb.perturb import PerturbedEpisode, sample_episode
 from lerobot_env_bomb.render import CameraRenderer, compose_caption, extrinsics, intrinsics
@@ -263,11 +262,9 @@ class BombEnv(gymnasium.Env[Observation, np.ndarray]):
         return self._sense(self._camera_renderer.draw(self._run.scene.data, camera, size), camera)
 
     def _sense(self, picture: np.ndarray, camera: str) -> np.ndarray:
-        """The picture as the camera's sensor takes it in this step."""
-        sensor = self._run.episode.perturbation.of(Sensor)
-        if sensor is None:
-            return picture
-        return sensor.photometric(picture, len(CAMERAS) * self._steps + CAMERAS.index(camera))
+        """The image as the camera's sensor takes it in this step."""
+        number = len(CAMERAS) * self._steps + CAMERAS.index(camera)
+        return self._run.episode.perturbation.sense(picture, number)
 
     @property
     def _camera_renderer(self) -> CameraRenderer:

@@ -12,7 +12,6 @@ from lerobot_bomb.bomb.streams import Stream, generator
 from lerobot_bomb.bomb.suite import Episode
 from lerobot_bomb.bomb.suites import find_suite
 from lerobot_env_bomb.axes import TRANSFORMS
-from lerobot_env_bomb.axes.language import Wording
 from lerobot_env_bomb.axes.transform import Transform
 from lerobot_env_bomb.scene import ModelEdit
 
@@ -39,6 +38,19 @@ class Perturbation:
             layout = each.arrange(layout, stone)
         return layout
 
+    def reword(self, nominal: Episode) -> str:
+        """The instruction after all changes."""
+        instruction = nominal.instruction
+        for each in self.transforms.values():
+            instruction = each.reword(instruction, nominal)
+        return instruction
+
+    def sense(self, rgb: np.ndarray, number: int) -> np.ndarray:
+        """(H, W, 3) uint8 -> the same, the `number`-th image of the episode after all changes."""
+        for each in self.transforms.values():
+            rgb = each.sense(rgb, number)
+        return rgb
+
 
 @dataclass(frozen=True)
 class PerturbedEpisode(Episode):
@@ -51,9 +63,8 @@ def sample_episode(spec: EpisodeSpec) -> PerturbedEpisode:
     """Draw the suite's episode, then its perturbation; the same spec, the same episode."""
     nominal = find_suite(spec.suite).sample(spec)
     perturbation = draw_perturbation(nominal)
-    wording = perturbation.of(Wording)
     changed = {
-        "instruction": nominal.instruction if wording is None else wording(nominal.target, nominal.color),
+        "instruction": perturbation.reword(nominal),
         "layout": perturbation.arrange(nominal.layout, nominal.stone),
     }
     return PerturbedEpisode(**{**vars(nominal), **changed}, perturbation=perturbation)

@@ -48,10 +48,10 @@ FORMS = (
 
 @dataclass(frozen=True)
 class Wording(Transform):
-    """A sentence in place of the episode's template."""
+    """Another template in place of the episode's."""
 
     template: str
-    other: tuple[int, int]  # row, column that the sentence may name but does not mean
+    other: tuple[int, int]  # row, column that the instruction may name but does not mean
 
     @classmethod
     def draw(cls, level: int, rng: np.random.Generator, nominal: Episode) -> Self:
@@ -63,10 +63,9 @@ class Wording(Transform):
         row, column = divmod(int(other), BOARD.num_lines)
         return cls(template, (row, column))
 
-    def __call__(self, target: tuple[int, int], color: str) -> str:
-        """The sentence that means `target`, (row, column) from 0."""
+    def reword(self, instruction: str, nominal: Episode) -> str:
         return self.template.format(
-            color=color, **_coordinates("", *target), **_coordinates("other_", *self.other)
+            color=nominal.color, **_coordinates("", *nominal.target), **_coordinates("other_", *self.other)
         )
 
 

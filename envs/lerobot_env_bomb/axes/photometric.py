@@ -12,10 +12,13 @@ from lerobot_env_bomb.axes.transform import Transform
 
 @dataclass(frozen=True)
 class Sensor(Transform):
-    """Colour balance, brightness and noise of the cameras' sensor, which the env applies to its images."""
+    """Colour balance, brightness and noise of the cameras' sensor."""
 
     photometric: Photometric
 
     @classmethod
     def draw(cls, level: int, rng: np.random.Generator, nominal: Episode) -> Self:
         return cls(Photometric.draw(level, rng))
+
+    def sense(self, rgb: np.ndarray, number: int) -> np.ndarray:
+        return self.photometric(rgb, number)

@@ -29,3 +29,11 @@ class Transform(ABC):
     def arrange(self, layout: Layout, stone: int) -> Layout:
         """The layout after the change; `stone` is to be moved."""
         return layout
+
+    def reword(self, instruction: str, nominal: Episode) -> str:
+        """The instruction after the change; it means the same."""
+        return instruction
+
+    def sense(self, rgb: np.ndarray, number: int) -> np.ndarray:
+        """(H, W, 3) uint8 -> the same, the `number`-th image of the episode after the change."""
+        return rgb
