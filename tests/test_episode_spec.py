@@ -9,6 +9,7 @@ from lerobot_bomb.bomb.board import BOARD, NUM_STONES
 from lerobot_bomb.bomb.episode import EpisodeSpec, Stage
 from lerobot_bomb.bomb.observation import RenderOptions
 from lerobot_bomb.bomb.privileged_state import Goal, PrivilegedState
+from lerobot_bomb.bomb.suites import SUITES
 from lerobot_bomb.envs.results import EpisodeResult
 
 
@@ -37,7 +38,7 @@ def test_numbered_tasks_are_25_intersections_in_2_colours() -> None:
 @pytest.mark.parametrize(
     ("field", "value", "message"),
     [
-        ("suite", "plce", "--env.task='plce' is unknown; choose one of: place"),
+        ("suite", "plce", f"--env.task='plce' is unknown; choose one of: {', '.join(SUITES)}"),
         ("robot", "panda", "--env.robot='panda' is unknown; choose one of: scara"),
         ("control_mode", "joint", "--env.control_mode='joint' is unknown; choose one of: relative, absolute"),
         ("split", "test", "--env.split='test' is unknown; choose one of: all, train, heldout"),
