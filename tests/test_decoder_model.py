@@ -17,6 +17,7 @@ from lerobot_bomb.decoding.grammar import NumberGrammar
 from lerobot_bomb.decoding.graph_cache import GraphCache
 from lerobot_bomb.decoding.graph_decoder import GraphDecoder
 from lerobot_bomb.decoding.kv_cache import CachedText
+from lerobot_bomb.decoding.plain_layers import hidden_states
 from lerobot_bomb.decoding.writer import continue_prompt
 from lerobot_bomb.vlm.backbone import SmolVLMBackbone, build_backbone, load_backbone
 from lerobot_bomb.vlm.paligemma import build_paligemma
@@ -247,6 +248,20 @@ def states_of_nine_tokens(model: Any, *, compiled: bool = False) -> Tensor:
     passes = zip(embeds_BKH[:, 7:].split(1, dim=1), text.singly(columns_BK[:, 7:]), strict=True)
     states += [text.read(embeds_B1H, columns) for embeds_B1H, columns in passes]
     return torch.cat(states, dim=1)
+
+
+@torch.no_grad()
+def test_fast_layers_compute_what_the_plain_ones_do_and_those_what_the_model_does(text_model: Any) -> None:
+    """Copied weights that stand joined are rotated by halves, plain ones on a CPU by pairs."""
+    for parameter in text_model.parameters():  # norms and biases that are not ones and zeros
+        parameter += 0.1 * torch.randn(parameter.shape, generator=torch.Generator().manual_seed(1))
+    embeds_BKH, columns_BK = nine_tokens(text_model)
+    plain = hidden_states(text_model, embeds_BKH)
+    own = text_model(inputs_embeds=embeds_BKH).last_hidden_state
+    torch.testing.assert_close(plain, own, rtol=0, atol=1e-4)
+    for layers in (TextLayers(text_model), TextLayers(text_model, copy_dtype=torch.float32)):
+        states = CachedText(layers, 3, 20)(embeds_BKH, columns_BK)
+        torch.testing.assert_close(states, plain, rtol=0, atol=1e-4)
 
 
 def test_singly_and_with_projections_that_are_not_plain_states_are_the_same(text_model: Any) -> None:
