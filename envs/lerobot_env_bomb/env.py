@@ -20,7 +20,7 @@ from lerobot_bomb.bomb.observation import (
     RenderOptions,
 )
 from lerobot_bomb.bomb.privileged_state import PrivilegedState
-from lerobot_bomb.bomb.suites import find_suite
+from lerobot_bomb.bomb.suite import find_suite
 from lerobot_bomb.envs.results import EpisodeResult, PolicyIdentity, write_result
 from lerobot_env_bomb.actuator import Actuator
 from lerobot_env_bomb.axes.dynamics import Dynamics

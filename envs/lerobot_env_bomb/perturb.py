@@ -9,8 +9,7 @@ from lerobot_bomb.bomb.episode import EpisodeSpec
 from lerobot_bomb.bomb.layout import Layout
 from lerobot_bomb.bomb.perturbations import AXES, Condition
 from lerobot_bomb.bomb.streams import Stream, generator
-from lerobot_bomb.bomb.suite import Episode
-from lerobot_bomb.bomb.suites import find_suite
+from lerobot_bomb.bomb.suite import Episode, find_suite
 from lerobot_env_bomb.axes import TRANSFORMS
 from lerobot_env_bomb.axes.transform import Transform
 from lerobot_env_bomb.scene import ModelEdit

@@ -2,6 +2,7 @@
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
+from importlib import import_module
 
 import numpy as np
 
@@ -45,3 +46,8 @@ class Suite:
     check: Callable[[EpisodeSpec], None]
     max_steps: int  # at DEFAULT_FPS; scaled with fps
     num_goals: int = 1  # of each of its episodes
+
+
+def find_suite(name: str) -> Suite:
+    """The suite of a name in SUITES."""
+    return import_module(f"lerobot_bomb.bomb.suites.{name}").SUITE
