@@ -214,7 +214,7 @@ def test_a_folder_without_weights_is_refused(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("config", "message"),
     [
-        ({"model_type": "gpt2"}, "is a 'gpt2' model; vla0_smol needs a 'smolvlm' one"),
+        ({"model_type": "gpt2"}, "is a 'gpt2' model; this policy needs a 'smolvlm' one"),
         (
             {"type": "act"},
             "is a checkpoint of the policy 'act'; `lerobot-bomb export-backbone --policy.path=",
@@ -237,7 +237,7 @@ def test_another_family_is_told_before_its_tokenizer_is_missed(config: Any, tmp_
     with pytest.raises(FileNotFoundError, match=r"the folder has no config.json"):
         get_policy_class(config.type)(config)
     (tmp_path / "config.json").write_text('{"model_type": "gpt2"}')
-    with pytest.raises(ValueError, match=f"is a 'gpt2' model; {config.type} needs"):
+    with pytest.raises(ValueError, match="is a 'gpt2' model; this policy needs a"):
         get_policy_class(config.type)(config)
 
 

@@ -1,4 +1,6 @@
 import importlib.metadata
+import sys
+from types import ModuleType
 
 import pytest
 
@@ -10,7 +12,9 @@ def test_a_sound_installation_passes(capsys: pytest.CaptureFixture[str]) -> None
     assert main(["doctor"]) == 0
     output = capsys.readouterr().out
     assert "everything works" in output
-    for name in ("--env.type=bomb", "--policy.type=vla0_smol", "--policy.type=bomb_expert", "mujoco", "gpu"):
+    policies = ("vla0_smol", "spatialvla_grid", "fdvla", "bomb_expert", "bomb_random")
+    types = ("--env.type=bomb", *(f"--policy.type={name}" for name in policies))
+    for name in (*types, "mujoco", "gpu"):
         assert f"ok  {name}: " in output
 
 
@@ -26,6 +30,29 @@ def test_a_broken_part_is_shown_with_its_cause(
     assert "ImportError: libEGL.so.1 is missing" in output
     assert "ok  gpu" in output  # the other checks still run
     assert "1 broken" in output
+
+
+def test_a_policy_that_cannot_be_imported_is_shown_with_its_cause(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.delitem(sys.modules, doctor.DISTRIBUTION)
+    monkeypatch.setitem(sys.modules, "lerobot_policy_fdvla", None)
+    monkeypatch.setattr(doctor, "CHECKS", (doctor.check_types,))
+    assert main(["doctor"]) == 1
+    output = capsys.readouterr().out
+    assert "BROKEN  types:" in output
+    assert "import of lerobot_policy_fdvla halted" in output
+
+
+def test_a_package_that_registers_no_type_of_its_name_is_broken(monkeypatch: pytest.MonkeyPatch) -> None:
+    plugin = importlib.import_module(doctor.DISTRIBUTION)
+    for name in ("lerobot_policy_nothing", "lerobot_env_nothing"):
+        monkeypatch.setattr(plugin, name, ModuleType(name), raising=False)
+    broken = [finding for finding in doctor.check_types() if finding.broken]
+    assert [(finding.name, finding.detail) for finding in broken] == [
+        ("--env.type=nothing", "not registered"),
+        ("--policy.type=nothing", "not registered"),
+    ]
 
 
 @pytest.mark.parametrize("version", ["3.8.0", "3.10.0", "4.0.0"])

@@ -1,6 +1,7 @@
 """Who may import whom; see docs/architecture.md."""
 
 import ast
+import re
 from pathlib import Path
 
 import pytest
@@ -10,6 +11,15 @@ PACKAGES = {
     path.name for folder in ("envs", "policies") for path in (ROOT / folder).iterdir() if path.is_dir()
 }
 ENTRY = "lerobot_policy_bomb"
+POLICY_PREFIX = "lerobot_policy_"
+POLICY_TYPES = {name.removeprefix(POLICY_PREFIX) for name in PACKAGES if name.startswith(POLICY_PREFIX)} - {
+    ENTRY.removeprefix(POLICY_PREFIX)
+}
+# commands that are about certain policies
+NAMES_POLICIES = {
+    "convert_spatialvla.py": {"spatialvla_grid"},  # whose format it writes
+    "demo.py": {"vla0_smol", "bomb_expert", "bomb_random"},  # who plays
+}
 HEAVY = {"torch", "lerobot", "transformers", "rerun", "cv2"}
 CORE = "lerobot_bomb"
 # a folder or module of the core imports from those above it in this list
@@ -49,6 +59,13 @@ def test_core_imports_no_env_and_no_policy(path: Path) -> None:
     assert not imported(path) & PACKAGES
 
 
+@pytest.mark.parametrize("path", files(CORE), ids=lambda path: str(path.relative_to(ROOT)))
+def test_the_core_names_no_policy(path: Path) -> None:
+    named = set(re.findall(rf"\b({'|'.join(POLICY_TYPES)})\b", path.read_text()))
+    allowed = NAMES_POLICIES.get(path.name, set()) if path.parent.name == "commands" else set()
+    assert named == allowed
+
+
 def test_the_order_of_the_core_is_complete() -> None:
     there = {
         path.stem
@@ -82,6 +99,11 @@ def test_a_policy_imports_no_env_and_no_other_policy(path: Path) -> None:
     own = path.relative_to(ROOT / "policies").parts[0]
     if own != ENTRY:
         assert not imported(path) & (PACKAGES - {own})
+
+
+def test_the_entry_module_imports_every_env_and_policy() -> None:
+    registered = imported(ROOT / "policies" / ENTRY / "__init__.py") & PACKAGES
+    assert registered == PACKAGES - {ENTRY}
 
 
 def test_nothing_imports_the_entry_module() -> None:

@@ -227,7 +227,7 @@ def test_a_folder_without_weights_is_refused(tmp_path: Path) -> None:
 @pytest.mark.parametrize("family", ["qwen2_vl", "gpt2"])
 def test_another_kind_of_model_is_refused(family: str, tmp_path: Path) -> None:
     (tmp_path / "config.json").write_text(json.dumps({"model_type": family}))
-    with pytest.raises(ValueError, match=f"is a '{family}' model; fdvla needs a 'qwen2_5_vl' one"):
+    with pytest.raises(ValueError, match=f"is a '{family}' model; this policy needs a 'qwen2_5_vl' one"):
         load_qwen(str(tmp_path), 224)
 
 

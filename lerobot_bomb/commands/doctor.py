@@ -11,14 +11,15 @@ import platform
 import traceback
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
+from types import ModuleType
 
 from packaging.requirements import Requirement
 
 import lerobot_bomb
 
 DISTRIBUTION = "lerobot_policy_bomb"
-ENV_TYPES = ("bomb",)
-POLICY_TYPES = ("vla0_smol", "spatialvla_grid", "fdvla", "bomb_expert", "bomb_random")
+# what the names of packages begin with that register a type each
+ENV_PREFIX, POLICY_PREFIX = "lerobot_env_", "lerobot_policy_"
 DEPENDENCIES = (
     "lerobot",
     "torch",
@@ -96,19 +97,24 @@ def check_fetch() -> Iterator[Finding]:
 
 
 def check_types() -> Iterator[Finding]:
-    """Env and policy types that LeRobot knows after the plugin's import, with their classes."""
-    importlib.import_module(DISTRIBUTION)
+    """The env and policy types whose packages the plugin imports, as LeRobot knows them, with their classes."""
+    plugin = importlib.import_module(DISTRIBUTION)
     from lerobot.configs import PreTrainedConfig
     from lerobot.envs import EnvConfig
     from lerobot.policies.factory import get_policy_class
 
-    for name in ENV_TYPES:
+    for name in _imported_types(plugin, ENV_PREFIX):
         known = name in EnvConfig.get_known_choices()
         yield Finding(f"--env.type={name}", "registered" if known else "not registered", broken=not known)
-    for name in POLICY_TYPES:
+    for name in _imported_types(plugin, POLICY_PREFIX):
         known = name in PreTrainedConfig.get_known_choices()
         detail = get_policy_class(name).__name__ if known else "not registered"
         yield Finding(f"--policy.type={name}", detail, broken=not known)
+
+
+def _imported_types(plugin: ModuleType, prefix: str) -> list[str]:
+    """The type of each package with this prefix that a module imports: lerobot_policy_act's is act."""
+    return [name.removeprefix(prefix) for name in vars(plugin) if name.startswith(prefix)]
 
 
 def check_gpu() -> Iterator[Finding]:

@@ -24,7 +24,7 @@ COMMANDS = {
     "fit-grid": "an action grid on a dataset: its fit, its edges and what it rounds off",
     "init": "a policy before its training, as a checkpoint that adapters can be trained on",
     "merge": "adapters and their base as one checkpoint",
-    "convert-spatialvla": "a published SpatialVLA folder as a checkpoint of spatialvla_grid",
+    "convert-spatialvla": "a published SpatialVLA folder as a checkpoint for LeRobot",
     "export-backbone": "a checkpoint's vision-language model as a folder that other policies can start from",
     "serve": "LeRobot's server of action chunks for a robot elsewhere, for every policy type",
     "push": "a checkpoint to the Hub, with a card and its evaluation",

@@ -76,13 +76,13 @@ def dataset_card(repo_id: str, facts: DatasetFacts) -> str:
     train = command(
         "lerobot-train",
         f"--dataset.repo_id={repo_id}",
-        "--policy.type=vla0_smol",
+        "--policy.type=TYPE",
         "--policy.push_to_hub=false",
-        "--output_dir=outputs/vla0_smol",
+        "--output_dir=outputs/train",
     )
     flags = facts.eval_flags() or []
     evaluate = command(
-        "lerobot-eval", "--policy.path=outputs/vla0_smol/checkpoints/last/pretrained_model", *flags
+        "lerobot-eval", "--policy.path=outputs/train/checkpoints/last/pretrained_model", *flags
     )
     lines = [
         f"# {repo_id.split('/')[-1]}",
@@ -93,7 +93,8 @@ def dataset_card(repo_id: str, facts: DatasetFacts) -> str:
         "",
         "## Use",
         "",
-        "`pip install .` in a checkout of lerobot_bomb adds the policy types and the environment to LeRobot.",
+        "`pip install .` in a checkout of lerobot_bomb adds its environment and its policy types to LeRobot; "
+        "TYPE is one of these, or of LeRobot's own.",
         "",
         fenced(f"{train}\n{evaluate}"),
         "",

@@ -113,7 +113,7 @@ def what_old_lines_lack() -> str:
 
 
 def describe_policy(row: Row) -> str:
-    """'act outputs/act (weights 0123456789ab, settings 0123456789ab)', 'bomb_expert', 'not recorded'."""
+    """'act outputs/act (weights 0123456789ab, settings 0123456789ab)', 'act', 'not recorded'."""
     policy = row.get("policy")
     if policy is None:
         return NOT_RECORDED

@@ -26,11 +26,12 @@ from lerobot_bomb.vlm.memory import check_memory
 from lerobot_bomb.vlm.presets import INITIALIZER_RANGE, changed, nano_config
 from lerobot_bomb.vlm.tokenizer import NANO, hub_file, load_tokenizer
 
-FAMILIES = {"vla0_smol": "smolvlm", "spatialvla_grid": "paligemma", "fdvla": "qwen2_5_vl"}  # of base models
-
 
 class SmolVLMBackbone(nn.Module):
     """A stock ``SmolVLMForConditionalGeneration``, called in parts: images, tokens, text model, head."""
+
+    # the family of its base models, as their config.json names it
+    family = SmolVLMConfig.model_type
 
     def __init__(self, vlm: SmolVLMForConditionalGeneration):
         super().__init__()
@@ -88,7 +89,7 @@ def load_backbone(vlm_model_name: str, changes: Mapping[str, Any] | None = None)
         backbone = build_backbone(changed(nano_config(load_tokenizer(NANO)), changes))
         spread_pictures(backbone.vlm.model.vision_model)
         return backbone
-    config = read_vlm_config(vlm_model_name, "vla0_smol")
+    config = read_vlm_config(vlm_model_name, SmolVLMBackbone.family)
     with weights_errors(vlm_model_name):
         vlm = SmolVLMForConditionalGeneration.from_pretrained(
             vlm_model_name, config=config, dtype=torch.float32
@@ -97,8 +98,8 @@ def load_backbone(vlm_model_name: str, changes: Mapping[str, Any] | None = None)
     return SmolVLMBackbone(vlm)
 
 
-def check_family(vlm_model_name: str, policy: str) -> None:
-    """The base model of a policy is of the family that it reads, as ``nano`` always is.
+def check_family(vlm_model_name: str, needed: str) -> None:
+    """The base model of a policy is of the family that its backbone is made for, as ``nano`` always is.
 
     Raises:
         OSError: there is no config; the message names the ways out.
@@ -119,16 +120,16 @@ def check_family(vlm_model_name: str, policy: str) -> None:
             f"`lerobot-bomb export-backbone --policy.path={vlm_model_name} --output=FOLDER` makes a folder "
             f"to start from. (To train on: --policy.path={vlm_model_name})"
         )
-    if family != FAMILIES[policy]:
+    if family != needed:
         raise ValueError(
             f"--policy.vlm_model_name={vlm_model_name} is a {family!r} model; "
-            f"{policy} needs a {FAMILIES[policy]!r} one"
+            f"this policy needs a {needed!r} one"
         )
 
 
-def read_vlm_config(vlm_model_name: str, policy: str) -> Any:
-    """Config of a Hub id or a local folder, for a policy; raises as `check_family`."""
-    check_family(vlm_model_name, policy)
+def read_vlm_config(vlm_model_name: str, family: str) -> Any:
+    """Config of a Hub id or a local folder; raises as `check_family`."""
+    check_family(vlm_model_name, family)
     return AutoConfig.from_pretrained(vlm_model_name)
 
 

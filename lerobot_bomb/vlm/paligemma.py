@@ -65,6 +65,9 @@ class PaliGemmaBackbone(nn.Module):
     features are not divided by it. What else becomes the text model's input is to be of that scale.
     """
 
+    # the family of its base models, as their config.json names it
+    family = PaliGemmaConfig.model_type
+
     def __init__(self, vlm: PaliGemmaForConditionalGeneration):
         super().__init__()
         self.vlm = vlm
@@ -129,11 +132,11 @@ def load_paligemma(vlm_model_name: str, changes: Mapping[str, Any] | None = None
         backbone = build_paligemma(changed(nano_paligemma_config(load_tokenizer(NANO)), changes))
         spread_pictures(backbone.vlm.model.vision_tower)
         return backbone
-    config = read_vlm_config(vlm_model_name, "spatialvla_grid")
+    config = read_vlm_config(vlm_model_name, PaliGemmaBackbone.family)
     if config.text_config.model_type != "gemma2":
         raise ValueError(
             f"--policy.vlm_model_name={vlm_model_name} has {config.text_config.model_type!r} as its text "
-            f"model; spatialvla_grid needs 'gemma2' (PaliGemma 2)"
+            f"model; this policy needs 'gemma2' (PaliGemma 2)"
         )
     with weights_errors(vlm_model_name):
         vlm = PaliGemmaForConditionalGeneration.from_pretrained(

@@ -123,6 +123,8 @@ class QwenBackbone(nn.Module):
         ValueError: ``image_size`` does not consist of whole tokens.
     """
 
+    # the family of its base models, as their config.json names it
+    family = Qwen2_5_VLConfig.model_type
     pixel_mean: Tensor  # (3, 1, 1)
     pixel_std: Tensor
 
@@ -253,7 +255,7 @@ def load_qwen(vlm_model_name: str, image_size: int, changes: Mapping[str, Any] |
         backbone = build_qwen(changed(nano_qwen_config(load_tokenizer(NANO)), changes), image_size)
         spread_filters(backbone.vlm.model.visual.patch_embed.proj.weight)
         return backbone
-    config = read_vlm_config(vlm_model_name, "fdvla")
+    config = read_vlm_config(vlm_model_name, QwenBackbone.family)
     with weights_errors(vlm_model_name):
         vlm = Qwen2_5_VLForConditionalGeneration.from_pretrained(
             vlm_model_name, config=config, dtype=torch.float32, attn_implementation="sdpa"

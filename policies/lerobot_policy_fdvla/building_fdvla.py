@@ -10,7 +10,7 @@ def build_model(config: FdvlaConfig) -> tuple[QwenPrompt, QwenBackbone]:
     """Base model, or the architecture of a checkpoint; fills in what a checkpoint's config must hold."""
     if config.vlm_config is None:
         name = config.vlm_model_name
-        check_family(name, config.type)
+        check_family(name, QwenBackbone.family)
         tokens = QwenPrompt.from_tokenizer(load_tokenizer(name), name)
         backbone = load_qwen(name, config.image_size, config.nano_config)
         config.vlm_config, config.prompt_tokens = config_dict(backbone.vlm), tokens.to_dict()

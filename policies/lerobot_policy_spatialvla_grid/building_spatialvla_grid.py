@@ -61,7 +61,7 @@ def build_model(config: SpatialvlaGridConfig) -> tuple[PaliGemmaPrompt, PaliGemm
     """Base model, or the architecture of a checkpoint; fills in what a checkpoint's config must hold."""
     if config.vlm_config is None:
         name = config.vlm_model_name
-        check_family(name, config.type)
+        check_family(name, PaliGemmaBackbone.family)
         tokens = PaliGemmaPrompt.from_tokenizer(load_tokenizer(name), name)
         backbone = load_paligemma(name, config.nano_config)
         config.vlm_config, config.prompt_tokens = config_dict(backbone.vlm), tokens.to_dict()

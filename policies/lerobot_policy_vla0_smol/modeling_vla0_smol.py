@@ -333,7 +333,7 @@ def _build(config: Vla0SmolConfig) -> tuple[PromptTokens, SmolVLMBackbone]:
     """Base model, or the architecture of a checkpoint; fills in what a checkpoint's config must hold."""
     if config.vlm_config is None:
         name = config.vlm_model_name
-        check_family(name, config.type)
+        check_family(name, SmolVLMBackbone.family)
         tokens = PromptTokens.from_tokenizer(load_tokenizer(name), name, config.system_prompt)
         backbone = load_backbone(name, config.nano_config)
         config.vlm_config, config.prompt_tokens = config_dict(backbone.vlm), tokens.to_dict()
