@@ -1,5 +1,6 @@
 """The only place that reaches into names of LeRobot, `datasets` and huggingface_hub that are not public."""
 
+import logging
 import os
 import pickle
 import re
@@ -22,6 +23,7 @@ from lerobot.datasets import LeRobotDataset, aggregate, compute_stats, dataset_w
 from lerobot.datasets.feature_utils import get_hf_features_from_features
 from lerobot.datasets.io_utils import to_parquet_with_hf_images
 from lerobot.policies import PreTrainedPolicy
+from lerobot.utils import import_utils
 from lerobot.utils.constants import DEFAULT_FEATURES
 
 if TYPE_CHECKING:
@@ -30,6 +32,12 @@ if TYPE_CHECKING:
 _BUILT: list[ref[PreTrainedPolicy]] = []  # by `remember_policies`
 
 STATISTICS_SIZE = 128  # pixels
+# what LeRobot's warning ends in, below a hundred lines of torchcodec's own
+NO_TORCHCODEC = "'torchcodec' is installed but cannot be loaded"
+NO_TORCHCODEC_IN_SHORT = (
+    "torchcodec cannot be loaded, usually because FFmpeg's libraries are missing; videos are read with PyAV "
+    "(the cause: python -c 'import torchcodec')"
+)
 
 
 def sample_pixels(image: np.ndarray) -> np.ndarray:
@@ -168,6 +176,17 @@ def check_tokens_before_use(check: Callable[[str], None]) -> None:
         return found
 
     _headers.get_token_to_send = get_token_to_send
+
+
+def shorten_torchcodec_warning() -> None:
+    """Let LeRobot say in one line that it reads videos with PyAV; doing it again changes nothing."""
+    logging.getLogger(import_utils.__name__).addFilter(_shorten_torchcodec_warning)
+
+
+def _shorten_torchcodec_warning(record: logging.LogRecord) -> bool:
+    if NO_TORCHCODEC in record.getMessage():
+        record.msg, record.args = NO_TORCHCODEC_IN_SHORT, None
+    return True
 
 
 def resolve_checkpoints(resolve: Callable[[str], str]) -> None:
