@@ -16,8 +16,10 @@ from lerobot_bomb.bomb.expert import expert_action
 from lerobot_bomb.bomb.observation import CAMERAS, RenderOptions
 from lerobot_bomb.bomb.perturbations import NUISANCES
 from lerobot_bomb.bomb.privileged_state import PrivilegedState
+from lerobot_bomb.commands.main import main
 from lerobot_bomb.data import record as record_module
 from lerobot_bomb.data import resumable
+from lerobot_bomb.data.facts import DatasetFacts
 from lerobot_bomb.data.record import describe_failures, record
 from lerobot_bomb.data.recording import Recording
 from lerobot_bomb.data.resumable import METADATA_FILE, Progress, read_progress, unfinished_folder
@@ -198,6 +200,24 @@ def test_every_seed_is_played_with_every_task(tmp_path: Path) -> None:
     spec = json.loads(rows[1]["bomb/spec"])
     assert (spec["seed"], spec["target"], spec["color"]) == (6, [1, 4], "white")
     assert record(recording, tmp_path / "tasks", resume=True).num_episodes == 3
+
+
+def test_a_given_target_and_colour_are_played_from_every_seed(tmp_path: Path) -> None:
+    root = tmp_path / "x"
+    flags = f"--repo_id=test/x --root={root} --episodes=2 --seed=3 --image_size=32 --images"
+    of_all = ["--target=[1,2]", "--color=white", "--success_tolerance_mm=9.5"]
+    assert main(["record", *flags.split(), *of_all]) == 0
+    rows = episode_rows(root)
+    spec = EpisodeSpec(3, target=(1, 2), color="white", success_tolerance_mm=9.5)
+    assert [json.loads(row["bomb/spec"]) for row in rows] == [
+        {**spec.to_dict(), "target": [1, 2], "seed": seed} for seed in (3, 4)
+    ]
+    assert [(row["bomb/target"], row["bomb/color"]) for row in rows] == 2 * [([1, 2], "white")]
+    assert all("white" in row["tasks"][0] for row in rows)
+    facts = DatasetFacts.read(root)
+    assert (facts.recording["target"], facts.recording["color"]) == ([1, 2], "white")
+    assert any("tasks: target [1, 2], color white" in line for line in facts.lines())
+    assert "--env.task_ids=[32]" in (facts.eval_flags() or ())
 
 
 def test_every_seed_is_played_under_every_condition_at_the_levels_it_draws(tmp_path: Path) -> None:

@@ -1,24 +1,31 @@
 """Flags and folders of `lerobot-bomb record`: what is refused, before long work, and how."""
 
+import argparse
 import ctypes
+import importlib
 import os
 import subprocess
 import sys
+from dataclasses import fields
 from pathlib import Path
 
 import pytest
+from lerobot.envs import EnvConfig
 
+from lerobot_bomb.bomb.perturbations import NONE
 from lerobot_bomb.commands import main as cli
 from lerobot_bomb.data.recording import Recording
 from lerobot_bomb.data.resumable import (
     METADATA_FILE,
     Progress,
+    check_folders,
     finish_block,
     lock_folder,
     parameters_file,
     unfinished_folder,
     write_json,
 )
+from lerobot_env_bomb.configuration_bomb import BombEnvConfig
 
 FLAGS = ["record", "--repo_id=test/x", "--episodes=1"]
 RECORDING = Recording("test/x", episodes=1)
@@ -50,6 +57,11 @@ CAP_DAC_OVERRIDE, CAP_DAC_READ_SEARCH = 1, 2
         ("--perturbations=[]", "none"),
         ("--perturbations=haze:1", "table, reflectance, stones"),
         ("--perturbations=camera:1,camera:1-1", "a condition twice"),
+        ("--target=[1,5]", "[row, column], each in 0..4"),
+        ("--target=[1]", "[row, column], each in 0..4"),
+        ("--color=green", "black, white"),
+        ("--render_preset=bright", "fast, shadows"),
+        ("--success_tolerance_mm=30.0", "between 0 and half the pitch"),
         ("--seed=-1", "0..4294967295"),
         ("--seed=99999999999999999999", "0..4294967295"),
     ],
@@ -61,8 +73,9 @@ def test_a_bad_flag_is_named_with_what_is_allowed(
     name, value = flag.split("=")
     message = capsys.readouterr().err
     assert f" {name}=" in message
-    assert value in message
+    assert value in message.replace(", ", ",")
     assert allowed in message
+    assert message.count("\n") == 1
     assert list(tmp_path.iterdir()) == []
 
 
@@ -223,6 +236,59 @@ def test_a_task_outside_the_split_is_refused(tmp_path: Path, capsys: pytest.Capt
     assert cli.main([*FLAGS, f"--root={tmp_path / 'x'}", "--task_ids=0,3", "--split=train"]) == 1
     assert "the target [0, 3] is not in --split=train" in capsys.readouterr().err
     assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.parametrize("flag", ["--target=[1,2]", "--color=white"])
+def test_numbered_tasks_and_a_target_exclude_each_other(
+    flag: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    for command in ([*FLAGS, f"--root={tmp_path / 'x'}"], ["view", f"--output={tmp_path / 'x'}"]):
+        assert cli.main([*command, "--task_ids=[7]", flag]) == 1
+        message = (
+            f"lerobot-bomb {command[0]}: --task_ids fixes targets and colours; drop --target and --color\n"
+        )
+        assert capsys.readouterr().err == message
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_a_target_outside_the_split_is_refused(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert cli.main([*FLAGS, f"--root={tmp_path / 'x'}", "--target=[0,3]", "--split=train"]) == 1
+    assert "--target=[0, 3] is not in --split=train" in capsys.readouterr().err
+    assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.parametrize("command", ["record", "view"])
+def test_an_episode_has_the_flags_of_the_environment(command: str) -> None:
+    """Both commands and --env.type=bomb: one set of names, with the same defaults."""
+    parser = argparse.ArgumentParser()
+    module = importlib.import_module(f"lerobot_bomb.commands.{command}")
+    getattr(module, f"add_{command}_arguments")(parser)
+    ours = {action.dest: action.default for action in parser._actions}
+    env = BombEnvConfig()
+    of_lerobot = {field.name for field in fields(EnvConfig)} - {"task", "fps"}
+    names = {field.name for field in fields(env)} - of_lerobot - {"results_path", "ignore_checkpoint"}
+    assert names <= ours.keys()
+    assert names <= {field.name for field in fields(Recording)}
+    several = {"task_ids": (), "perturbations": (NONE,)}  # None: one episode of the environment
+    assert {name: ours[name] for name in names} == {name: getattr(env, name) for name in names} | several
+
+
+def test_a_recording_of_before_the_target_had_a_flag_goes_on(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    path = parameters_file(unfinished_folder(tmp_path / "x"))
+    path.parent.mkdir()
+    before = RECORDING.to_dict()
+    for name in ("target", "color", "render_preset", "success_tolerance_mm"):
+        del before[name]
+    write_json(path, {"recording": before})
+    check_folders(RECORDING, tmp_path / "x", path.parent, resume=True)
+    assert cli.main([*FLAGS, f"--root={tmp_path / 'x'}", "--resume", "--target=[1,2]"]) == 1
+    assert "differs in target=[1, 2] (it has None)" in capsys.readouterr().err
+    del before["mujoco_version"]  # not known, so perhaps another
+    write_json(path, {"recording": before})
+    with pytest.raises(ValueError, match=r"differs in mujoco_version='.*' \(it has None\)"):
+        check_folders(RECORDING, tmp_path / "x", path.parent, resume=True)
 
 
 def test_lerobots_folder_is_the_default(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -1,4 +1,4 @@
-"""LeRobot's warning of a torchcodec that cannot be loaded: one line where the plugin is, all else as it was."""
+"""LeRobot's warning of a torchcodec that cannot be loaded: one line, and all others as they were."""
 
 import importlib
 import logging

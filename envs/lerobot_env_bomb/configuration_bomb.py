@@ -112,8 +112,6 @@ class BombEnvConfig(EnvConfig):
         """The unperturbed spec of each task id; {0: spec} where target and colour are drawn per episode."""
         if self.task_ids == []:
             raise ValueError("--env.task_ids=[] selects no task; leave it out to draw one per episode")
-        if self.task_ids and (self.target or self.color):
-            raise ValueError("--env.task_ids fixes targets and colours; drop --env.target and --env.color")
         spec = EpisodeSpec(
             seed=0,
             suite=str(self.task),
@@ -125,9 +123,8 @@ class BombEnvConfig(EnvConfig):
             color=self.color,
             success_tolerance_mm=self.success_tolerance_mm,
         )
-        if self.task_ids is None:
-            return {0: spec}
-        return {task_id: spec.for_task(task_id) for task_id in self.task_ids}
+        task_ids = self.task_ids or []
+        return dict(zip(task_ids or [0], spec.for_tasks(task_ids), strict=True))
 
     @property
     def gym_kwargs(self) -> dict[str, Any]:

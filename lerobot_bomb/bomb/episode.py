@@ -1,6 +1,7 @@
 """An episode: what determines it, how far it got, why it failed."""
 
 import dataclasses
+from collections.abc import Sequence
 from dataclasses import dataclass
 from enum import StrEnum
 
@@ -105,6 +106,12 @@ class EpisodeSpec:
         color, point = divmod(task_id, num_targets)
         target = divmod(point, BOARD.num_lines)
         return dataclasses.replace(self, target=target, color=COLORS[color])
+
+    def for_tasks(self, task_ids: Sequence[int]) -> list["EpisodeSpec"]:
+        """This spec for each of these numbered tasks; as it is where there are none."""
+        if task_ids and (self.target is not None or self.color is not None):
+            raise ValueError("--env.task_ids fixes targets and colours; drop --env.target and --env.color")
+        return [self.for_task(task_id) for task_id in task_ids] or [self]
 
     def to_dict(self) -> dict[str, object]:
         """JSON-ready dict."""

@@ -5,8 +5,10 @@ import re
 from pathlib import Path
 from typing import Any
 
-from lerobot_bomb.bomb.episode import CONTROL_MODES, DEFAULT_FPS, ROBOTS, SPLITS
-from lerobot_bomb.bomb.observation import DEFAULT_IMAGE_SIZE
+from lerobot_bomb.bomb.board import BOARD, COLORS
+from lerobot_bomb.bomb.episode import CONTROL_MODES, DEFAULT_FPS, ROBOTS, SPLITS, EpisodeSpec
+from lerobot_bomb.bomb.observation import DEFAULT_IMAGE_SIZE, RENDER_PRESETS
+from lerobot_bomb.bomb.perturbations import NONE
 from lerobot_bomb.bomb.suites import SUITES
 from lerobot_bomb.checkpoints.shipped import checkpoint_path
 
@@ -71,14 +73,41 @@ def add_new_dataset_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def add_episode_arguments(parser: argparse.ArgumentParser) -> None:
-    """Declare what every command that plays episodes is told about them, but for seeds and targets."""
+    """Declare what a command that plays episodes is told of them beside the seed, as --env.type=bomb is."""
     add = parser.add_argument
+    lines = f"0..{BOARD.num_lines - 1}"
+    tolerance = EpisodeSpec.success_tolerance_mm
     add("--task", default="place", help=f"suite: {', '.join(SUITES)} (default: place)")
     add("--robot", default="scara", help=f"{', '.join(ROBOTS)} (default: scara)")
     add("--control_mode", default="relative", help=f"{' or '.join(CONTROL_MODES)} (default: relative)")
     add("--fps", type=int, default=DEFAULT_FPS, help=f"control steps a second (default: {DEFAULT_FPS})")
     add("--image_size", type=int, default=DEFAULT_IMAGE_SIZE, help="pixels (default: %(default)s)")
+    add("--render_preset", default="fast", help=f"{' or '.join(RENDER_PRESETS)} (default: fast)")
+    add("--depth", **switch(), help="observe each camera's depth (metres), intrinsics and pose too")
     add("--split", default="all", help=f"draw from {', '.join(SPLITS)} (default: all)")
+    add("--target", type=parse_numbers, help=f"[row, column], each in {lines} (default: drawn)")
+    add("--color", help=f"of the stone to be moved: {' or '.join(COLORS)} (default: drawn)")
+    add(
+        "--task_ids",
+        type=parse_numbers,
+        default=(),
+        help="numbered tasks, as [0,7,12], each played from every seed (25 x colour + 5 x row + column; "
+        "black = 0, white = 1; default: target and colour as above)",
+    )
+    add(
+        "--perturbations",
+        "--env.perturbations",
+        type=parse_conditions,
+        default=(NONE,),
+        help='conditions, as ["camera:3","camera:2+light:3"], each played from every seed; a range such as '
+        "all:1-5 or camera:0-3 draws a level per episode and axis (default: none)",
+    )
+    add(
+        "--success_tolerance_mm",
+        type=float,
+        default=tolerance,
+        help=f"distance from the intersection within which a placement counts (default: {tolerance:g})",
+    )
 
 
 def add_folder_arguments(parser: argparse.ArgumentParser, checkpoint: str, output: str) -> None:

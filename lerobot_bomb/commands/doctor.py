@@ -97,7 +97,7 @@ def check_fetch() -> Iterator[Finding]:
 
 
 def check_types() -> Iterator[Finding]:
-    """The env and policy types whose packages the plugin imports, as LeRobot knows them, with their classes."""
+    """Env and policy types whose packages the plugin imports: whether LeRobot knows them, and classes."""
     plugin = importlib.import_module(DISTRIBUTION)
     from lerobot.configs import PreTrainedConfig
     from lerobot.envs import EnvConfig

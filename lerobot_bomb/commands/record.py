@@ -3,12 +3,9 @@
 import argparse
 from dataclasses import fields
 
-from lerobot_bomb.bomb.perturbations import NONE
 from lerobot_bomb.commands.arguments import (
     add_episode_arguments,
     add_new_dataset_arguments,
-    parse_conditions,
-    parse_numbers,
     switch,
 )
 from lerobot_bomb.data.record import describe_failures, record
@@ -27,23 +24,7 @@ def add_record_arguments(parser: argparse.ArgumentParser) -> None:
     add("--episodes", type=int, required=True, help="successful episodes to record")
     add("--seed", type=int, default=0, help="seed of the first episode; the others count up (default: 0)")
     add_episode_arguments(parser)
-    add(
-        "--task_ids",
-        type=parse_numbers,
-        default=(),
-        help="numbered tasks, as [0,7,12]: every seed is played with each (25 x colour + 5 x row + column; "
-        "black = 0, white = 1; default: target and colour are drawn per episode)",
-    )
-    add(
-        "--perturbations",
-        "--env.perturbations",
-        type=parse_conditions,
-        default=(NONE,),
-        help='conditions, as ["all:1-5"]: every seed is played with each; a range such as all:1-5 or '
-        "camera:0-3 draws a level per episode and axis (default: none)",
-    )
     add("--images", **switch(), help="store images (lossless) instead of videos")
-    add("--depth", **switch(), help="store each camera's depth (metres, lossless), intrinsics and pose too")
     add("--workers", type=int, default=1, help="simulator processes; one keeps two cores busy (default: 1)")
     add(
         "--noise",

@@ -7,15 +7,12 @@ from typing import cast
 import gymnasium
 import numpy as np
 
-from lerobot_bomb.bomb.board import BOARD, COLORS
 from lerobot_bomb.bomb.episode import EpisodeSpec
 from lerobot_bomb.bomb.observation import RenderOptions
-from lerobot_bomb.bomb.perturbations import NONE, Condition
+from lerobot_bomb.bomb.perturbations import Condition
 from lerobot_bomb.commands.arguments import (
     add_episode_arguments,
     checkpoint_flag,
-    parse_conditions,
-    parse_numbers,
     path_flag,
     switch,
 )
@@ -50,16 +47,6 @@ def add_view_arguments(parser: argparse.ArgumentParser) -> None:
     add("--seed", type=int, default=0, help="seed of the episode (default: 0)")
     add_episode_arguments(parser)
     add(
-        "--perturbations",
-        "--env.perturbations",
-        type=parse_conditions,
-        default=(NONE,),
-        help="one condition, as camera:3, camera:2+light:3 or all:5 (default: none)",
-    )
-    lines = f"0..{BOARD.num_lines - 1}"
-    add("--target", type=parse_numbers, help=f"[row, column], each in {lines} (default: drawn)")
-    add("--color", help=f"{' or '.join(COLORS)} (default: drawn)")
-    add(
         "--output",
         type=path_flag,
         help="the files' path without .rrd and .mp4, or a folder that exists (default: in "
@@ -72,7 +59,7 @@ def run_view(args: argparse.Namespace) -> int:
     policy = _policy(args)
     with flags_without_group():
         spec = _spec(args)
-        options = RenderOptions(image_size=args.image_size)
+        options = RenderOptions(args.image_size, args.render_preset, args.depth)
         paths = _output_paths(args.output, _name(spec, policy))
         env = make_env(spec, options)
     try:
@@ -126,9 +113,11 @@ def _policy(args: argparse.Namespace) -> str:
 def _spec(args: argparse.Namespace) -> EpisodeSpec:
     if len(args.perturbations) != 1:
         raise ValueError(
-            f"--perturbations={','.join(args.perturbations)} must be one condition: one is played"
+            f"--perturbations={','.join(args.perturbations)} must be one condition: one episode is played"
         )
-    return EpisodeSpec(
+    if len(args.task_ids) > 1:
+        raise ValueError(f"--task_ids={list(args.task_ids)} must be one task: one episode is played")
+    spec = EpisodeSpec(
         seed=args.seed,
         suite=args.task,
         robot=args.robot,
@@ -137,8 +126,10 @@ def _spec(args: argparse.Namespace) -> EpisodeSpec:
         fps=args.fps,
         target=args.target,
         color=args.color,
+        success_tolerance_mm=args.success_tolerance_mm,
         perturbations=args.perturbations[0],
     )
+    return spec.for_tasks(args.task_ids)[0]
 
 
 def _agent(

@@ -5,6 +5,7 @@ from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from typing import Any
 
+from lerobot_bomb.bomb.board import task_id
 from lerobot_bomb.bomb.observation import ACTION_NAMES
 
 IMAGES, DEPTH = "observation.images.", "observation.depth."
@@ -52,7 +53,7 @@ class Environment:
             task_version=robot[2],
             task=recording.get("task", cls.task),
             depth=any(key.startswith(DEPTH) for key in features),
-            task_ids=tuple(recording.get("task_ids", ())),
+            task_ids=_task_ids(recording),
         )
 
     def eval_flags(self) -> list[str]:
@@ -100,3 +101,11 @@ class Environment:
             f"control `{self.control_mode}` at {self.fps} Hz, cameras `{', '.join(self.cameras)}` of "
             f"{self.image_size} px{depth}"
         )
+
+
+def _task_ids(recording: Mapping[str, Any]) -> tuple[int, ...]:
+    """Of a recording whose tasks were given by number, or by a target and a colour."""
+    target, color = recording.get("target"), recording.get("color")
+    if target and color:
+        return (task_id(target, color),)
+    return tuple(recording.get("task_ids", ()))

@@ -72,7 +72,8 @@ class DatasetFacts:
         num_tried = self.bomb["num_episodes"] + num_failed
         first = recording["seed"]
         last = first + (num_tried - 1) // num_conditions
-        tasks = recording["task_ids"] or "drawn per episode"
+        given = [f"{name} {recording[name]}" for name in ("target", "color") if recording.get(name)]
+        tasks = recording["task_ids"] or ", ".join(given) or "drawn per episode"
         return [
             f"- BOMB, task version {recording['protocol_version']}, suite `{recording['task']}`, robot "
             f"`{recording['robot']}`, control `{recording['control_mode']}`, split `{recording['split']}`, "

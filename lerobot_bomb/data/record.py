@@ -13,7 +13,7 @@ from tqdm import tqdm
 
 from lerobot_bomb.bomb.expert import expert_action
 from lerobot_bomb.data.kept_blocks import Progress, reached
-from lerobot_bomb.data.recording import Recording, recorder_flags
+from lerobot_bomb.data.recording import Recording
 from lerobot_bomb.data.resumable import grow, missing_blocks, write_blocks
 from lerobot_bomb.data.rollout_pool import Rollout, RolloutPool, RolloutSettings
 from lerobot_bomb.envs.rollout import Expert, make_env
@@ -67,7 +67,7 @@ def _record_blocks(recording: Recording, folder: Path, num_workers: int, expert:
     if not gaps:
         return reached(folder)
     # MuJoCo's backend is chosen here, or its absence reported; the workers inherit the choice
-    with recorder_flags():
+    with recording.flag_names():
         for spec in recording.conditions:
             make_env(spec, recording.render_options).close()
     settings = RolloutSettings(recording.render_options, recording.noise, expert)

@@ -34,11 +34,16 @@ class Recording:
     fps: int = DEFAULT_FPS
     image_size: int = DEFAULT_IMAGE_SIZE
     split: str = "all"
-    # numbered tasks, each played from every seed; empty = target and colour are drawn per episode
+    # (row, column) and colour; None = drawn per episode
+    target: tuple[int, int] | None = None
+    color: str | None = None
+    # numbered tasks, each played from every seed; empty = target and colour as above
     task_ids: tuple[int, ...] = ()
     perturbations: tuple[str, ...] = (NONE,)  # conditions, each played from every seed, with every task
     images: bool = False
+    render_preset: str = "fast"
     depth: bool = False
+    success_tolerance_mm: float = EpisodeSpec.success_tolerance_mm
     noise: float = 0.0
     protocol_version: str = TASK_VERSION  # the name that recordings of 1.0 have
     package_version: str = __version__
@@ -58,7 +63,7 @@ class Recording:
                 f"--noise={self.noise} must lie in 0..{MAX_NOISE:g}; "
                 "it is a standard deviation in units of the largest step, 40 mm"
             )
-        with recorder_flags():
+        with self.flag_names():
             conditions, _ = self.conditions, self.render_options  # they check the remaining flags
         if len(set(conditions)) < len(conditions):
             raise ValueError(f"--perturbations={','.join(self.perturbations)} has a condition twice")
@@ -73,6 +78,9 @@ class Recording:
             split=self.split,
             control_mode=self.control_mode,
             fps=self.fps,
+            target=self.target,
+            color=self.color,
+            success_tolerance_mm=self.success_tolerance_mm,
         )
 
     def to_dict(self) -> dict[str, Any]:
@@ -82,7 +90,7 @@ class Recording:
     @property
     def conditions(self) -> list[EpisodeSpec]:
         """The specs that every seed is played with, with the first seed."""
-        tasks = [self.spec.for_task(task_id) for task_id in self.task_ids] or [self.spec]
+        tasks = self.spec.for_tasks(self.task_ids)
         return [replace(task, perturbations=text) for task in tasks for text in self.perturbations]
 
     def specs(self, num_tried: int) -> Iterator[EpisodeSpec]:
@@ -93,9 +101,8 @@ class Recording:
 
     @property
     def render_options(self) -> RenderOptions:
-        return RenderOptions(image_size=self.image_size, depth=self.depth)
+        return RenderOptions(self.image_size, self.render_preset, self.depth)
 
-
-def recorder_flags() -> AbstractContextManager[None]:
-    """Name flags in error messages as the recorder does, which has none for the target."""
-    return flags_without_group({"--env.target=": "the target "})
+    def flag_names(self) -> AbstractContextManager[None]:
+        """Name flags in errors as they were given: a target by --target, or by the number of a task."""
+        return flags_without_group({"--env.target=": "the target "} if self.task_ids else None)

@@ -197,10 +197,14 @@ def _check_same(parameters: Parameters, path: Path) -> None:
     existing = read_json(path).get(kind)
     if existing is None:
         raise ValueError(f"--resume: {path} is not of a {kind}")
+    # an earlier version wrote nothing of a flag that it had not: its default
+    of_existing = {
+        name: existing.get(name, getattr(type(parameters), name, None)) for name in parameters.to_dict()
+    }
     differences = [
-        f"{name}={value!r} (it has {existing.get(name)!r})"
+        f"{name}={value!r} (it has {of_existing[name]!r})"
         for name, value in parameters.to_dict().items()
-        if value != existing.get(name)
+        if value != of_existing[name]
     ]
     if differences:
         raise ValueError(f"--resume: the {kind} in {path.parent} differs in {', '.join(differences)}")

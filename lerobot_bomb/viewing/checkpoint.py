@@ -73,6 +73,7 @@ def _env_config(spec: EpisodeSpec, options: RenderOptions, ignore_environment: b
         control_mode=spec.control_mode,
         fps=spec.fps,
         image_size=options.image_size,
+        depth=options.depth,
         ignore_checkpoint=ignore_environment,
     )
 
