@@ -1,6 +1,7 @@
 """LeRobot's warning of a torchcodec that cannot be loaded: one line, and all others as they were."""
 
 import importlib
+import importlib.util
 import logging
 
 import pytest
