@@ -13,8 +13,9 @@ from lerobot.policies.factory import get_policy_class
 from lerobot.utils.import_utils import register_third_party_plugins
 from recipes import FOLDER
 
-# all that lerobot-train reads; the evaluation's configs name an environment and no policy
-TRAINING = sorted(path for path in FOLDER.rglob("*.yaml") if "policy:" in path.read_text())
+# what lerobot-train starts from; the evaluation's configs name an environment and no policy, and test_shipped.py
+# reads the one that goes on from a checkpoint
+TRAINING = sorted(path for path in FOLDER.rglob("*.yaml") if "policy:\n  type:" in path.read_text())
 RECIPE = FOLDER / "train_vla0_smol_pusht.yaml"
 ABLATIONS = sorted((FOLDER / "ablations").glob("vla0_smol_*.yaml"))
 GRID_RECIPE = FOLDER / "train_spatialvla_grid_bomb.yaml"

@@ -8,6 +8,7 @@ from pathlib import Path
 import pytest
 from lerobot.configs import PreTrainedConfig, parser
 from lerobot.utils.import_utils import register_third_party_plugins
+from recipes import recipe_path
 
 from lerobot_bomb.checkpoints.identity import sha256_of
 from lerobot_bomb.checkpoints.names import CONFIG, TRAIN_CONFIG, WEIGHTS, has_local_path
@@ -78,11 +79,9 @@ def test_lerobot_train_goes_on_from_it_by_a_config_file(
     root = tmp_path / "dataset"
     record = f"record --repo_id=test/more --root={root} --episodes=1 --image_size=64 --images"
     assert main(record.split()) == 0
-    config = tmp_path / "more.yaml"
-    config.write_text(f"policy: {{path: 'bomb:{demo.POLICY}', device: cpu}}\n")
     stock_cli(
         "lerobot-train",
-        f"--config_path={config}",
+        f"--config_path={recipe_path('robust', 'fdvla')}",
         "--dataset.repo_id=test/more",
         f"--dataset.root={root}",
         "--steps=1",
@@ -91,7 +90,7 @@ def test_lerobot_train_goes_on_from_it_by_a_config_file(
         f"--output_dir={tmp_path / 'train'}",
     )
     trained = tmp_path / "train" / "checkpoints" / "last" / "pretrained_model"
-    assert sha256_of(trained / WEIGHTS) != sha256_of(FOLDER / demo.POLICY / WEIGHTS)
+    assert sha256_of(trained / WEIGHTS) != sha256_of(FOLDER / "fdvla" / WEIGHTS)
 
 
 def test_an_unknown_name_is_one_line_with_the_names(
