@@ -13,8 +13,8 @@ from lerobot.policies.factory import get_policy_class
 from lerobot.utils.import_utils import register_third_party_plugins
 from recipes import FOLDER
 
-# what lerobot-train starts from; the evaluation's configs name an environment and no policy, and test_shipped.py
-# reads the one that goes on from a checkpoint
+# what lerobot-train starts from: the evaluation's configs name an environment and no policy, and what goes on
+# from a checkpoint is read in test_shipped.py
 TRAINING = sorted(path for path in FOLDER.rglob("*.yaml") if "policy:\n  type:" in path.read_text())
 RECIPE = FOLDER / "train_vla0_smol_pusht.yaml"
 ABLATIONS = sorted((FOLDER / "ablations").glob("vla0_smol_*.yaml"))
