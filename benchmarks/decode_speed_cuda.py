@@ -5,7 +5,7 @@
 A model of SmolVLM2-500M's shape with random weights and random prompts: nothing it writes can be guessed. In
 bfloat16 the peer's weights are bfloat16 and ours are float32, cast once an answer; in float32 both must write
 the same numbers. Reading the prompt (prefill) is reported apart; bars are on the rest (decode). Then a policy
-of this shape, from pictures to actions.
+of this shape, from images to actions.
 """
 
 import argparse
@@ -211,7 +211,7 @@ def ends_of_passes() -> Iterator[list[torch.cuda.Event]]:
 
 
 def time_policy(repeats: int) -> dict[str, dict[str, float]]:
-    """Pictures, sentence and state to a chunk of actions, without what LeRobot does around it."""
+    """Images, instruction and state to a chunk of actions, without what LeRobot does around it."""
     figures = {}
     for compiled in (False, True):
         policy = make_policy(compiled)
@@ -233,7 +233,7 @@ def time_policy(repeats: int) -> dict[str, dict[str, float]]:
 
 def make_policy(compiled: bool) -> Vla0SmolPolicy:
     """Of this shape, with random weights."""
-    picture = PolicyFeature(FeatureType.VISUAL, (3, 256, 256))
+    image = PolicyFeature(FeatureType.VISUAL, (3, 256, 256))
     config = Vla0SmolConfig(
         vlm_config=config_500m(),
         prompt_tokens=PromptTokens.from_tokenizer(load_tokenizer(NANO), NANO).to_dict(),
@@ -242,7 +242,7 @@ def make_policy(compiled: bool) -> Vla0SmolPolicy:
         device="cuda",
         chunk_size=NUM_STEPS,
         n_action_steps=NUM_STEPS,
-        input_features=dict.fromkeys(CAMERAS, picture)
+        input_features=dict.fromkeys(CAMERAS, image)
         | {"observation.state": PolicyFeature(FeatureType.STATE, (NUM_DIMS,))},
         output_features={"action": PolicyFeature(FeatureType.ACTION, (NUM_DIMS,))},
     )

@@ -5,9 +5,9 @@
 
 The peer is the stock PaliGemma of the same weights whose words end with the cells; a logits processor lets
 only the slot's cells through. Both see the same and must choose the same cells: a trained nano policy, frames
-of held-out episodes; one of random weights, random pictures and sentences, where a draft has little to go by.
+of held-out episodes; one of random weights, random images and instructions, where a draft has little to use.
 Seeing and reading the prompt (prefill) is reported apart; bars are on the rest (decode). Of the peer's
-prefill, cutting the pictures and putting the prompt together is left out.
+prefill, cutting the images and putting the prompt together is left out.
 """
 
 import argparse
@@ -41,7 +41,7 @@ BATCH_SIZES = 1, 16
 ACTION_DIMS = 7, 4  # of the original, and BOMB's
 CAMERAS = "observation.images.workspace", "observation.images.wrist"
 IMAGE_SIZE = 128
-SENTENCES = "put the black stone on the center", "go", "push the white stone to the left edge"
+INSTRUCTIONS = "put the black stone on the center", "go", "push the white stone to the left edge"
 
 
 def main() -> None:
@@ -77,18 +77,18 @@ def main() -> None:
 def make_policy(num_dims: int) -> SpatialvlaGridPolicy:
     """Nano, random weights, the default groups of so many action dimensions."""
     torch.manual_seed(0)
-    picture = PolicyFeature(FeatureType.VISUAL, (3, IMAGE_SIZE, IMAGE_SIZE))
+    image = PolicyFeature(FeatureType.VISUAL, (3, IMAGE_SIZE, IMAGE_SIZE))
     config = SpatialvlaGridConfig(
         vlm_model_name="nano",
         device="cpu",
-        input_features=dict.fromkeys(CAMERAS, picture),
+        input_features=dict.fromkeys(CAMERAS, image),
         output_features={"action": PolicyFeature(FeatureType.ACTION, (num_dims,))},
     )
     return SpatialvlaGridPolicy(config).eval()
 
 
 def make_batches(policy: SpatialvlaGridPolicy, batch_size: int, num_batches: int) -> list[dict[str, Any]]:
-    """Preprocessed, the sentences of different lengths."""
+    """Preprocessed, the instructions of different lengths."""
     bounds = torch.ones(policy.grids.num_dims)
     preprocessor, _ = make_pre_post_processors(
         policy.config, dataset_stats={"action": {"min": -bounds, "max": bounds}}
@@ -98,7 +98,7 @@ def make_batches(policy: SpatialvlaGridPolicy, batch_size: int, num_batches: int
     return [
         preprocessor(
             {key: torch.rand(shape, generator=generator) for key in CAMERAS}
-            | {"task": [SENTENCES[(first + row) % len(SENTENCES)] for row in range(batch_size)]}
+            | {"task": [INSTRUCTIONS[(first + row) % len(INSTRUCTIONS)] for row in range(batch_size)]}
         )
         for first in range(num_batches)
     ]
@@ -165,7 +165,7 @@ class StockGenerate:
         self._vlm.config.text_config.vocab_size = self._vlm.model.vocab_size = len(words.weight)
 
     def inputs(self, batch: dict[str, Any]) -> dict[str, Tensor]:
-        """The policy's prompt, padded on the left, and pictures, as the stock model reads them."""
+        """The policy's prompt, padded on the left, and images, as the stock model reads them."""
         policy, prompt = self._policy, self._policy._prompt(batch)
         ids, written = torch.zeros_like(prompt.ids), torch.zeros_like(prompt.ids)
         for row, kept in enumerate(prompt.mask):

@@ -3,9 +3,9 @@
     OMP_NUM_THREADS=1 python benchmarks/fdvla_speed.py --json fdvla_speed.json
     python benchmarks/fdvla_speed.py --device=cuda --json fdvla_speed_cuda.json
 
-All are the same policy with the same weights, see the same random pictures and start from the same noise;
+All are the same policy with the same weights, see the same random images and start from the same noise;
 their actions must agree. Weights are random: nano, and the shape of Qwen2.5-0.5B with a vision model of 3
-layers. The bar is over reading the whole prompt, pictures included, in every step; where only the language
+layers. The bar is over reading the whole prompt, images included, in every step; where only the language
 model reads it anew stands beside. On CUDA a query's sampling steps are one CUDA graph; a row is without it.
 """
 
@@ -37,7 +37,7 @@ TOLERANCES = {"float32": 1e-3, "bfloat16": 0.2}  # of actions of unit spread, af
 BATCH_SIZES = {"nano": (1, 8), "0.5B": (1,)}
 CAMERAS = "observation.images.workspace", "observation.images.wrist"
 IMAGE_SIZE, NUM_DIMS = 224, 7
-SENTENCES = "put the black stone on the center", "go", "push the white stone to the left edge"
+INSTRUCTIONS = "put the black stone on the center", "go", "push the white stone to the left edge"
 # the text model of Qwen2.5-0.5B
 TEXT_05B = {
     "hidden_size": 896,
@@ -108,7 +108,7 @@ def make_policy(model: str, device: str, dtype: str) -> FdvlaPolicy:
 
 
 def make_batches(policy: FdvlaPolicy, batch_size: int, num_batches: int) -> list[dict[str, Any]]:
-    """Preprocessed, the sentences of different lengths."""
+    """Preprocessed, the instructions of different lengths."""
     units = {"mean": torch.zeros(NUM_DIMS), "std": torch.ones(NUM_DIMS)}
     preprocessor, _ = make_pre_post_processors(
         policy.config, dataset_stats={"action": units, "observation.state": units}
@@ -119,7 +119,7 @@ def make_batches(policy: FdvlaPolicy, batch_size: int, num_batches: int) -> list
         preprocessor(
             {key: torch.rand(shape, generator=generator) for key in CAMERAS}
             | {"observation.state": torch.randn(batch_size, NUM_DIMS, generator=generator)}
-            | {"task": [SENTENCES[(first + row) % len(SENTENCES)] for row in range(batch_size)]}
+            | {"task": [INSTRUCTIONS[(first + row) % len(INSTRUCTIONS)] for row in range(batch_size)]}
         )
         for first in range(num_batches)
     ]
@@ -129,7 +129,7 @@ def time_queries(policy: FdvlaPolicy, batches: list[dict[str, Any]]) -> dict[str
     """Every way on every batch, in turn; the first one's actions are what the others must give."""
     ways: dict[str, Callable[[dict[str, Any]], Tensor]] = {
         EVERY_STEP: partial(read_in_every_step, policy, sees_once=False),
-        "the same, pictures seen once": partial(read_in_every_step, policy, sees_once=True),
+        "the same, images seen once": partial(read_in_every_step, policy, sees_once=True),
         ONCE: policy.predict_action_chunk,
     }
     if policy.config.device == "cuda":

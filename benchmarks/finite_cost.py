@@ -2,7 +2,7 @@
 
     python benchmarks/finite_cost.py
 
-Nano models on pictures of 256x256 pixels, as recordings have; a real model's step takes longer and its checks
+Nano models on images of 256x256 pixels, as recordings have; a real model's step takes longer and its checks
 do not. The checks of a batch are timed alone, twice: on a CPU the policy's readers look again at what the
 processor step has seen.
 """

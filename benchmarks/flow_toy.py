@@ -5,7 +5,7 @@ segment, loss and samplers are the policy's. One transformer layer takes the pla
 model, and a word reaches the heads through DualMod alone, as the control without it shows.
 Leaves with exit code 1 if a bar is missed.
 
-    python benchmarks/flow_toy.py --json flow_toy.json --picture docs/media/flow_toy.png
+    python benchmarks/flow_toy.py --json flow_toy.json --plot docs/media/flow_toy.png
 
 Shapes: `B` points of a batch, each a chunk of K = 1 action with D = 2 dims, `N` samples, `M` = 2 modes,
 `H` width.
@@ -17,7 +17,7 @@ from dataclasses import asdict, dataclass
 from functools import partial
 
 import torch
-from flow_toy_picture import draw_picture, near_modes, picture
+from flow_toy_plot import draw_plot, near_modes, plot
 from machine import positive, writable, write_figures
 from torch import Tensor, nn
 from torch.optim.lr_scheduler import CosineAnnealingLR
@@ -111,7 +111,7 @@ def main() -> None:
     parser.add_argument("--samples", type=positive, default=1000, help="of each word")
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--json", type=writable, help="also write the figures to this file")
-    parser.add_argument("--picture", type=picture, help="draw the samples into this file")
+    parser.add_argument("--plot", type=plot, help="draw the samples into this file")
     args = parser.parse_args()
     if args.samples < MIN_SAMPLES:
         parser.error(f"--samples={args.samples} is too few to measure clouds; at least {MIN_SAMPLES}")
@@ -129,11 +129,11 @@ def main() -> None:
     print_rows(rows, seconds)
     settings = {"steps": args.steps, "samples": args.samples, "seed": args.seed}
     write_figures(args.json, {**settings, "cpu_s": seconds, "rows": [asdict(row) for row in rows]})
-    if args.picture is not None:
+    if args.plot is not None:
         generator = torch.Generator().manual_seed(args.seed)
         words = {word: torch.full((args.samples,), i) for i, word in enumerate(WORDS)}
         data = {word: draw_points(words_N, generator)[:, 0] for word, words_N in words.items()}
-        draw_picture(args.picture, {"data": data, **samples}, MODES_MD, NEAR)
+        draw_plot(args.plot, {"data": data, **samples}, MODES_MD, NEAR)
     if not all(row.passes for row in rows):
         raise SystemExit(1)
 

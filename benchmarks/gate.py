@@ -2,7 +2,7 @@
 
 A policy is trained by the stock `lerobot-train` on demonstrations of the scripted expert, and its checkpoints
 are evaluated by the stock `lerobot-eval` on seeds that it has not seen; the last one twice more: with black
-images, and told the sentence of another episode. The policy is a small probe made for this task
+images, and given the instruction of another episode. The policy is a small probe made for this task
 (lerobot_policy_keypoint_probe/: can it be learnt at all?) or one of ours, by configs/RUNG_TYPE.yaml.
 
     OMP_NUM_THREADS=1 python benchmarks/gate.py one_target --policy.type=vla0_smol --output_dir gate
@@ -42,7 +42,7 @@ FIRST_SEED = 200_000  # of the demonstrations; LeRobot evaluates from 1000 on
 FIRST_UNSEEN_SEED = 100_000
 NUM_CHECKPOINTS = 6
 CURVE_EPISODES = 50  # of every checkpoint but the last
-NO_IMAGES, OTHER_SENTENCE = "blank images", "another episode's sentence"
+NO_IMAGES, OTHER_INSTRUCTION = "blank images", "another episode's instruction"
 
 
 @dataclass(frozen=True)
@@ -114,7 +114,7 @@ def main() -> None:
     parser.add_argument("--checkpoints", type=positive, default=NUM_CHECKPOINTS, help=points)
     seeds = f"of the evaluations (default: {FIRST_UNSEEN_SEED})"
     parser.add_argument("--first_seed", type=positive, default=FIRST_UNSEEN_SEED, help=seeds)
-    parser.add_argument("--picture", type=Path, help="write the learning curve to this PNG")
+    parser.add_argument("--plot", type=Path, help="write the learning curve to this PNG")
     add_machine_arguments(parser)
     args, args.policy_flags = parser.parse_known_args()
     unknown = [flag for flag in args.policy_flags if not flag.startswith("--policy.")]
@@ -151,19 +151,21 @@ def climb(args: argparse.Namespace) -> int:
     minutes = train(folder, run)
 
     results = evaluate_checkpoints(rung, folder, args.first_seed, run["steps"])
-    told = other_sentences(results[run["steps"]])
-    controls = evaluate_controls(rung, folder, args.first_seed, told)
+    given = other_instructions(results[run["steps"]])
+    controls = evaluate_controls(rung, folder, args.first_seed, given)
     minutes_per_step = minutes["cpu_minutes"] / run["steps"]
     points = {f"step {step}": count(rows, step, step * minutes_per_step) for step, rows in results.items()}
     points |= {name: count(rows, run["steps"], minutes["cpu_minutes"]) for name, rows in controls.items()}
 
-    num_named = count_named(controls[OTHER_SENTENCE], told)
+    num_named = count_named(controls[OTHER_INSTRUCTION], given)
     print_points(points)
-    print(f"{OTHER_SENTENCE}: {num_named}/{rung.episodes} stones put down on the intersection that it names")
+    print(
+        f"{OTHER_INSTRUCTION}: {num_named}/{rung.episodes} stones put down on the intersection that it names"
+    )
     conditions = evaluate_conditions(rung, folder, args.first_seed)
-    if args.picture is not None:
+    if args.plot is not None:
         title = f"{args.policy_type}, {args.rung}: {demonstrations} demonstrations, {rung.episodes} new seeds"
-        draw([points[f"step {step}"] for step in results], title, args.picture)
+        draw([points[f"step {step}"] for step in results], title, args.plot)
     write_figures(
         args.json,
         {
@@ -272,9 +274,9 @@ def evaluate_checkpoints(rung: Rung, folder: Path, first_seed: int, last: int) -
 
 
 def evaluate_controls(
-    rung: Rung, folder: Path, first_seed: int, told: dict[str, str]
+    rung: Rung, folder: Path, first_seed: int, given: dict[str, str]
 ) -> dict[str, list[Row]]:
-    """{control: results} of the last checkpoint with black cameras, and told other sentences."""
+    """{control: results} of the last checkpoint with black cameras, and given other instructions."""
     import lerobot_policy_keypoint_probe  # noqa: F401  its processor step must be known when it is loaded
 
     from lerobot_bomb.explain.interventions import BlankImages, ReplaceTasks, intervene
@@ -283,7 +285,7 @@ def evaluate_controls(
     results = {}
     for name, step, changed in (
         (NO_IMAGES, BlankImages(), "blank_images"),
-        (OTHER_SENTENCE, ReplaceTasks(told), "other_sentence"),
+        (OTHER_INSTRUCTION, ReplaceTasks(given), "other_instruction"),
     ):
         shutil.rmtree(checkpoint.with_name(changed), ignore_errors=True)
         intervene(checkpoint, [step], checkpoint.with_name(changed))
@@ -341,25 +343,25 @@ def evaluate(
     return read_results(results)
 
 
-def other_sentences(rows: list[Row]) -> dict[str, str]:
+def other_instructions(rows: list[Row]) -> dict[str, str]:
     """{instruction: that of another target}; where all episodes have one target, in other words only."""
     targets = {row["instruction"]: row["target"] for row in rows}
-    sentences = sorted(targets)
+    instructions = sorted(targets)
 
     def shifted(places: int) -> dict[str, str]:
-        return dict(zip(sentences, sentences[places:] + sentences[:places], strict=True))
+        return dict(zip(instructions, instructions[places:] + instructions[:places], strict=True))
 
-    def num_others(told: dict[str, str]) -> int:
-        return sum(targets[sentence] != targets[other] for sentence, other in told.items())
+    def num_others(given: dict[str, str]) -> int:
+        return sum(targets[instruction] != targets[other] for instruction, other in given.items())
 
-    return max(map(shifted, range(1, max(2, len(sentences)))), key=num_others)
+    return max(map(shifted, range(1, max(2, len(instructions)))), key=num_others)
 
 
-def count_named(rows: list[Row], told: dict[str, str]) -> int:
-    """Stones put down nearest to the intersection that the policy was told."""
+def count_named(rows: list[Row], given: dict[str, str]) -> int:
+    """Stones put down nearest to the intersection that the policy was given."""
     targets = {row["instruction"]: row["target"] for row in rows}
     return sum(
-        row["failure"] in PUT_DOWN and row["nearest_intersection"] == targets[told[row["instruction"]]]
+        row["failure"] in PUT_DOWN and row["nearest_intersection"] == targets[given[row["instruction"]]]
         for row in rows
     )
 

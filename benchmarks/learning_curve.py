@@ -1,4 +1,4 @@
-"""What a policy could do at each of its checkpoints, from their results files; as a table and a picture."""
+"""What a policy could do at each of its checkpoints, from their results files; as a table and a plot."""
 
 from dataclasses import asdict, dataclass
 from pathlib import Path
@@ -70,15 +70,13 @@ def as_figures(points: dict[str, Point]) -> dict[str, Any]:
 
 def draw(points: list[Point], title: str, path: Path) -> None:
     """Write a PNG: rates over CPU minutes of training, the success rate with its interval."""
-    picture = np.full(
-        (PANEL_PX[1] + 2 * MARGIN_PX[1], PANEL_PX[0] + 2 * MARGIN_PX[0], 3), 255, dtype=np.uint8
-    )
+    plot = np.full((PANEL_PX[1] + 2 * MARGIN_PX[1], PANEL_PX[0] + 2 * MARGIN_PX[0], 3), 255, dtype=np.uint8)
     end = max(point.cpu_minutes for point in points)
-    _draw_axes(picture, title, end)
+    _draw_axes(plot, title, end)
     for point in points:
         low, high = wilson_interval(point.num_successes, point.num_episodes)
         across = point.cpu_minutes / end
-        cv2.line(picture, _place(across, low), _place(across, high), BAND, 7)
+        cv2.line(plot, _place(across, low), _place(across, high), BAND, 7)
     curves = {
         "lifted": ([p.num_lifted / p.num_episodes for p in points], LIFTED_BGR),
         "right intersection": ([p.num_grounded / p.num_episodes for p in points], GROUNDED_BGR),
@@ -86,17 +84,17 @@ def draw(points: list[Point], title: str, path: Path) -> None:
     }
     for number, (name, (shares, color)) in enumerate(curves.items()):
         places = [_place(p.cpu_minutes / end, share) for p, share in zip(points, shares, strict=True)]
-        cv2.polylines(picture, [np.array(places)], False, color, 2, cv2.LINE_AA)
+        cv2.polylines(plot, [np.array(places)], False, color, 2, cv2.LINE_AA)
         for place in places:
-            cv2.circle(picture, place, 4, color, -1, cv2.LINE_AA)
+            cv2.circle(plot, place, 4, color, -1, cv2.LINE_AA)
         _write(
-            picture,
+            plot,
             name,
             (MARGIN_PX[0] + PANEL_PX[0] - 230, MARGIN_PX[1] + PANEL_PX[1] - 70 + 24 * number),
             color,
         )
     path.parent.mkdir(parents=True, exist_ok=True)
-    if not cv2.imwrite(str(path), picture):
+    if not cv2.imwrite(str(path), plot):
         raise OSError(f"{path} cannot be written")
 
 
@@ -118,17 +116,17 @@ def _place(across: float, up: float) -> tuple[int, int]:
     return round(MARGIN_PX[0] + across * PANEL_PX[0]), round(MARGIN_PX[1] + (1 - up) * PANEL_PX[1])
 
 
-def _draw_axes(picture: np.ndarray, title: str, end_minutes: float) -> None:
+def _draw_axes(plot: np.ndarray, title: str, end_minutes: float) -> None:
     for tenths in range(0, 11, 2):
         up, across = tenths / 10, tenths / 10
-        cv2.line(picture, _place(0, up), _place(1, up), GRID, 1)
-        _write(picture, f"{10 * tenths} %", (MARGIN_PX[0] - 58, _place(0, up)[1] + 5), INK)
+        cv2.line(plot, _place(0, up), _place(1, up), GRID, 1)
+        _write(plot, f"{10 * tenths} %", (MARGIN_PX[0] - 58, _place(0, up)[1] + 5), INK)
         x = _place(across, 0)[0]
-        _write(picture, f"{across * end_minutes:.1f}", (x - 14, MARGIN_PX[1] + PANEL_PX[1] + 20), INK)
-    cv2.rectangle(picture, _place(0, 0), _place(1, 1), INK, 1)
-    _write(picture, title, (MARGIN_PX[0], MARGIN_PX[1] - 18), INK)
-    _write(picture, "CPU minutes of training", (_place(0.35, 0)[0], picture.shape[0] - 8), INK)
+        _write(plot, f"{across * end_minutes:.1f}", (x - 14, MARGIN_PX[1] + PANEL_PX[1] + 20), INK)
+    cv2.rectangle(plot, _place(0, 0), _place(1, 1), INK, 1)
+    _write(plot, title, (MARGIN_PX[0], MARGIN_PX[1] - 18), INK)
+    _write(plot, "CPU minutes of training", (_place(0.35, 0)[0], plot.shape[0] - 8), INK)
 
 
-def _write(picture: np.ndarray, text: str, place: tuple[int, int], color: tuple[int, int, int]) -> None:
-    cv2.putText(picture, text, place, cv2.FONT_HERSHEY_SIMPLEX, 0.48, color, 1, cv2.LINE_AA)
+def _write(plot: np.ndarray, text: str, place: tuple[int, int], color: tuple[int, int, int]) -> None:
+    cv2.putText(plot, text, place, cv2.FONT_HERSHEY_SIMPLEX, 0.48, color, 1, cv2.LINE_AA)

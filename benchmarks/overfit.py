@@ -1,11 +1,11 @@
 """Can a policy learn a few episodes by heart, and does it do so by looking and reading?
 
-Eight episodes start alike, to the last pixel, and only the sentence says which intersection is meant. A
+Eight episodes start alike, to the last pixel, and only the instruction says which intersection is meant. A
 policy is trained on them without the robot's state, and evaluated on the same episodes, by LeRobot's own
 commands. Two controls change what the trained policy is shown:
 
-    permuted instructions   each episode is told the sentence of another: the stone must go to the square
-                            that is named, so the sentence decides, not the episode
+    permuted instructions   each episode is given the instruction of another: the stone must go to the square
+                            that is named, so the instruction decides, not the episode
     blank images            the cameras show black: the policy must fail, so it uses what it sees
 
     python benchmarks/overfit.py --policy.type=vla0_smol --json overfit.json
@@ -34,10 +34,10 @@ from lerobot_bomb.commands.run import run_command
 from lerobot_bomb.evaluation.results import Row, read_results
 from lerobot_bomb.tables import print_table
 
-SEED = 1007  # its board is empty, so nothing but the sentence tells the target
+SEED = 1007  # its board is empty, so nothing but the instruction tells the target
 TASK_IDS = (0, 4, 7, 11, 13, 15, 22, 24)  # all black
 TARGETS: dict[int, Any] = {task: EpisodeSpec(SEED).for_task(task).target for task in TASK_IDS}
-SHIFT = 3  # an episode is told the sentence of the task so many places further on
+SHIFT = 3  # an episode is given the instruction of the task so many places further on
 IMAGE_SIZE = 128
 PICTURES = (f"image_size={IMAGE_SIZE}",)
 DEPTH_PICTURES = ("image_size=64", "depth=true")  # LeRobot takes 85 ms to read a sample with larger depth
@@ -90,18 +90,20 @@ def main() -> None:
 def prove(args: argparse.Namespace, folder: Path) -> int:
     """The whole proof in `folder`; 0 if every bar was reached."""
     started = time.monotonic()
-    pictures = DEPTH_PICTURES if args.depth else PICTURES
-    record(folder / "dataset", pictures)
-    sentences = read_sentences(folder / "dataset")
+    images = DEPTH_PICTURES if args.depth else PICTURES
+    record(folder / "dataset", images)
+    instructions = read_instructions(folder / "dataset")
     checkpoint = train(args, folder)
     trained_s = time.monotonic() - started
-    told = {task: TASK_IDS[(i + SHIFT) % len(TASK_IDS)] for i, task in enumerate(TASK_IDS)}
-    shown = change_what_is_shown(checkpoint, {sentences[task]: sentences[told[task]] for task in TASK_IDS})
+    given = {task: TASK_IDS[(i + SHIFT) % len(TASK_IDS)] for i, task in enumerate(TASK_IDS)}
+    shown = change_what_is_shown(
+        checkpoint, {instructions[task]: instructions[given[task]] for task in TASK_IDS}
+    )
     counts = {}
     for condition, path in ((LEARNT, checkpoint), (PERMUTED, shown[PERMUTED]), (BLANK, shown[BLANK])):
-        rows = evaluate(path, folder / condition.name.replace(" ", "_"), pictures)
+        rows = evaluate(path, folder / condition.name.replace(" ", "_"), images)
         counts[condition] = sum(
-            is_on(row, told[task]) if condition is PERMUTED else row["is_success"]
+            is_on(row, given[task]) if condition is PERMUTED else row["is_success"]
             for task, row in rows.items()
         )
         print_episodes(condition, rows)
@@ -109,8 +111,8 @@ def prove(args: argparse.Namespace, folder: Path) -> int:
     return report(args, counts, minutes, trained_s / 60)
 
 
-def record(dataset: Path, pictures: Iterable[str] = PICTURES) -> None:
-    """The expert's episodes: one seed, eight targets; ``pictures``: flags, without their dashes."""
+def record(dataset: Path, images: Iterable[str] = PICTURES) -> None:
+    """The expert's episodes: one seed, eight targets; ``images``: flags, without their dashes."""
     run_command(
         "lerobot-bomb",
         "record",
@@ -120,11 +122,11 @@ def record(dataset: Path, pictures: Iterable[str] = PICTURES) -> None:
         f"--seed={SEED}",
         f"--task_ids={list(TASK_IDS)}",
         "--images",
-        *(f"--{flag}" for flag in pictures),
+        *(f"--{flag}" for flag in images),
     )
 
 
-def read_sentences(dataset: Path) -> dict[int, str]:
+def read_instructions(dataset: Path) -> dict[int, str]:
     """{task id: instruction}; leaves with exit code 1 unless all episodes begin with the same frame."""
     from lerobot.datasets import LeRobotDataset
 
@@ -164,14 +166,14 @@ def change_what_is_shown(checkpoint: Path, replacements: dict[str, str]) -> dict
     return folders
 
 
-def evaluate(checkpoint: Path, output_dir: Path, pictures: Iterable[str]) -> dict[int, Row]:
+def evaluate(checkpoint: Path, output_dir: Path, images: Iterable[str]) -> dict[int, Row]:
     """Stock `lerobot-eval` on the recorded seed, one episode a task; {task id: result}."""
     run_command(
         "lerobot-eval",
         f"--policy.path={checkpoint}",
         "--env.type=bomb",
         f"--env.task_ids={list(TASK_IDS)}",
-        *(f"--env.{flag}" for flag in pictures),
+        *(f"--env.{flag}" for flag in images),
         f"--env.results_path={output_dir / 'results.jsonl'}",
         f"--seed={SEED}",
         "--eval.n_episodes=1",

@@ -2,11 +2,11 @@ r"""Does a policy learn from real data? PushT's human demonstrations, held-out e
 
 The recipe configs/pusht_TYPE.yaml and its variants, each with several seeds, are trained by the stock
 `lerobot-train` on episodes 0-179; `lerobot-bomb offline-metrics` measures the decoded actions on episodes
-180-205, beside predictors that look at no picture. With --eval_episodes the recipe's checkpoints also play in
+180-205, beside predictors that look at no image. With --eval_episodes the recipe's checkpoints also play in
 LeRobot's environment `pusht`.
 
 All start from one small backbone that has learned to see before, on the same episodes: from random weights, a
-model that may read the state does not look at the picture for a long time (docs/pusht.md).
+model that may read the state does not look at the image for a long time (docs/pusht.md).
 
     python benchmarks/pusht_offline.py --policy.type=vla0_smol --source pusht_cchi_v7_replay.zarr \
         --output_dir pusht
@@ -37,7 +37,7 @@ REPO_ID = "lerobot_bomb/pusht"
 NUM_TRAIN_EPISODES = 180
 MAX_COVERAGE_REWARD = 0.95  # coverage from which gym-pusht's reward is 1
 
-# absolute positions that no state tells must be found in the picture; the near ones are found first
+# absolute positions that no state tells must be found in the image; the near ones are found first
 LOOK_FLAGS = ["--policy.use_state=false", "--policy.optimizer_lr=1.0e-3"]
 NEAR_FLAGS = [
     "--policy.chunk_size=4",

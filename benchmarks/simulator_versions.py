@@ -6,7 +6,7 @@ makes a virtual environment per published version from 3.8.0 on, without torch a
 scripted expert play the same seeds in each, and compares with the reference. `--here` measures the Python
 that runs it, and prints JSON.
 
-States: joint positions and velocities after every control step, float64. Pictures: both cameras in every
+States: joint positions and velocities after every control step, float64. Images: both cameras in every
 observation. They depend on the OpenGL library too, which the table names. The processor may matter as well:
 MuJoCo and NumPy choose their instructions by it.
 """
@@ -42,7 +42,7 @@ class Outcome:
     """The expert's episodes of one robot under one condition."""
 
     states: str  # SHA-256
-    pictures: str  # SHA-256
+    images: str  # SHA-256
     successes: int
     episodes: int
     worst_error_mm: float
@@ -76,7 +76,7 @@ def play(robot: str, condition: str, seeds: range) -> Outcome:
     from lerobot_bomb.bomb.privileged_state import PrivilegedState
     from lerobot_env_bomb.env import BombEnv
 
-    states, pictures, results = hashlib.sha256(), hashlib.sha256(), []
+    states, images, results = hashlib.sha256(), hashlib.sha256(), []
     env = BombEnv(
         EpisodeSpec(seed=0, robot=robot, perturbations=condition), RenderOptions(image_size=IMAGE_SIZE)
     )
@@ -86,8 +86,8 @@ def play(robot: str, condition: str, seeds: range) -> Outcome:
         while True:
             data = env._run.scene.data
             states.update(data.qpos.tobytes() + data.qvel.tobytes())
-            for picture in observation["pixels"].values():
-                pictures.update(picture.tobytes())
+            for image in observation["pixels"].values():
+                images.update(image.tobytes())
             if ended:
                 break
             action = expert_action(PrivilegedState.from_vector(observation["environment_state"]))
@@ -97,7 +97,7 @@ def play(robot: str, condition: str, seeds: range) -> Outcome:
     env.close()
     return Outcome(
         states=states.hexdigest(),
-        pictures=pictures.hexdigest(),
+        images=images.hexdigest(),
         successes=sum(result.is_success for result in results),
         episodes=len(results),
         worst_error_mm=max(result.placement_error_mm for result in results),
@@ -152,14 +152,14 @@ def table(measured: Iterable[Measured], reference: Measured) -> list[str]:
     """Markdown: a row per version and robot; hashes over all conditions, `=` where the reference's."""
     conditions = list(dict.fromkeys(case.split()[1] for case in reference.outcomes))
     lines = [
-        f"| MuJoCo | robot | states | pictures | {' | '.join(conditions)} |",
+        f"| MuJoCo | robot | states | images | {' | '.join(conditions)} |",
         "|---|---|---|---|" + "---|" * len(conditions),
     ]
     for one in measured:
         for robot in ROBOTS:
             outcomes = [one.outcomes[f"{robot} {condition}"] for condition in conditions]
             expected = [reference.outcomes[f"{robot} {condition}"] for condition in conditions]
-            hashes = [_hash(outcomes, kind, expected) for kind in ("states", "pictures")]
+            hashes = [_hash(outcomes, kind, expected) for kind in ("states", "images")]
             lines.append(f"| {' | '.join([one.mujoco, robot, *hashes, *map(_played, outcomes)])} |")
     return lines
 

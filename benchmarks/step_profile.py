@@ -152,7 +152,7 @@ def profile_evaluation(
             action = postprocessor(action).numpy()
         with stages("environment: physics, two cameras"):
             observation, *_ = env.step(action)
-        with stages("picture for the video (first 10 episodes only)"):
+        with stages("image for the video (first 10 episodes only)"):
             env.call("render")
     medians = stages.medians_ms()
     print_stages(medians, num_steps)

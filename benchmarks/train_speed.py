@@ -4,9 +4,9 @@
 
 Both read the same frames, weights and optimiser. The peer is the usual way to fine-tune a SmolVLM: every
 sample's numbers are joined to a text, a chat template puts the prompt together, ``SmolVLMProcessor`` (Pillow,
-no tiling) resizes the pictures and tokenizes, labels are found by searching for the answer, and the stock
+no tiling) resizes the images and tokenizes, labels are found by searching for the answer, and the stock
 ``SmolVLMForConditionalGeneration`` computes the loss. It runs twice: with `do_resize=False`, which gives the
-pixels of ours, and as the processor is shipped, which enlarges pictures to four times the model's size first.
+pixels of ours, and as the processor is shipped, which enlarges images to four times the model's size first.
 Before anything is timed, the first must have the loss of ours. Needs `num2words`, as that processor does.
 """
 

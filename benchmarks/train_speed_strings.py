@@ -1,4 +1,4 @@
-"""The peer of train_speed.py: a SmolVLM trained on texts and pictures, as its processor takes them."""
+"""The peer of train_speed.py: a SmolVLM trained on texts and images, as its processor takes them."""
 
 from collections.abc import Callable
 from typing import Any
@@ -38,7 +38,7 @@ class StringPath:
         texts = self.texts(batch)
         inputs = self.processor(
             text=texts,
-            images=self.pictures(batch),
+            images=self.images(batch),
             do_resize=self.do_resize,
             do_image_splitting=False,
             padding=True,
@@ -64,8 +64,8 @@ class StringPath:
             {"role": "assistant", "content": [{"type": "text", "text": " ".join(map(str, numbers))}]},
         ]
 
-    def pictures(self, batch: dict[str, Any]) -> list[list[Image.Image]]:
-        """Cropped pictures of every sample, one a camera."""
+    def images(self, batch: dict[str, Any]) -> list[list[Image.Image]]:
+        """Cropped images of every sample, one a camera."""
         cameras = [batch[key] for key in sorted(self.policy.config.image_features)]
         return [[self.crop(image) for image in images] for images in zip(*cameras, strict=True)]
 

@@ -64,7 +64,7 @@ def sampled_image_statistics() -> Iterator[None]:
 def without_statistics(keys: Collection[str]) -> Iterator[None]:
     """Let LeRobot write no statistics of these features, and so normalise none of them.
 
-    It would take them of every pixel apart: gigabytes of histograms for one depth picture.
+    It would take them of every pixel apart: gigabytes of histograms for one depth image.
     """
     usual = dataset_writer.compute_episode_stats
 

@@ -53,7 +53,7 @@ def stats(num_dims: int = 4) -> dict[str, dict[str, Tensor]]:
 def make_batch(
     policy: FdvlaPolicy, batch_size: int, seed: int = 0, tasks: tuple[str, ...] = TASKS
 ) -> dict[str, Any]:
-    """Preprocessed, the sentences of different lengths."""
+    """Preprocessed, the instructions of different lengths."""
     generator = torch.Generator().manual_seed(seed)
     num_dims = policy._action_dim
     shape = batch_size, policy.config.chunk_size, num_dims

@@ -67,7 +67,7 @@ class Device:
 
 
 class ScriptedArm(Device, Robot):  # pyright: ignore[reportIncompatibleMethodOverride]
-    """Shows one picture and moves on with every reading; keeps what it showed and what it was told."""
+    """Shows one image and moves on with every reading; keeps what it showed and what it was told."""
 
     config_class = ScriptedArmConfig
     name = "scripted_arm"
@@ -92,8 +92,8 @@ class ScriptedArm(Device, Robot):  # pyright: ignore[reportIncompatibleMethodOve
 
     def get_observation(self) -> dict[str, Any]:
         assert self.is_connected
-        picture = np.random.default_rng(0).integers(0, 256, IMAGE_SHAPE, dtype=np.uint8)
-        self.shown.append({**position_at(self.config.start + len(self.shown)), CAMERA: picture})
+        image = np.random.default_rng(0).integers(0, 256, IMAGE_SHAPE, dtype=np.uint8)
+        self.shown.append({**position_at(self.config.start + len(self.shown)), CAMERA: image})
         return dict(self.shown[-1])
 
     def send_action(self, action: dict[str, float]) -> dict[str, float]:
@@ -194,10 +194,10 @@ class Loaded:
     def batch(self, seen: dict[str, Any], task: str) -> dict[str, Any]:
         """What the policy reads of a robot's observation."""
         numbers = [value for value in seen.values() if isinstance(value, float)]
-        pictures = {
+        images = {
             f"observation.images.{name}": value for name, value in seen.items() if hasattr(value, "shape")
         }
-        observation = {"observation.state": np.array(numbers, dtype=np.float32), **pictures}
+        observation = {"observation.state": np.array(numbers, dtype=np.float32), **images}
         return self.preprocessor(prepare_observation_for_inference(observation, torch.device("cpu"), task))
 
     def physical(self, chunk_1KD: Tensor) -> Tensor:

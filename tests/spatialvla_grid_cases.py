@@ -46,7 +46,7 @@ def stats(num_dims: int = 4) -> dict[str, dict[str, Tensor]]:
 
 
 def make_batch(policy: SpatialvlaGridPolicy, batch_size: int, seed: int = 0) -> dict[str, Any]:
-    """Preprocessed, the sentences of different lengths."""
+    """Preprocessed, the instructions of different lengths."""
     generator = torch.Generator().manual_seed(seed)
     num_dims = policy.grids.num_dims
     shape = batch_size, policy.config.chunk_size, num_dims

@@ -156,7 +156,7 @@ def test_magnitudes_reach_the_floors_at_level_5(scene: Scene) -> None:
 
 @settings(max_examples=60, deadline=None)
 @given(SEEDS, LEVEL)
-def test_board_tray_and_stone_stay_in_the_picture(scene: Scene, seed: int, level: int) -> None:
+def test_board_tray_and_stone_stay_in_the_image(scene: Scene, seed: int, level: int) -> None:
     drawn = arranged(scene, seed, f"camera:{level}+start:{level}")
     camera = scene.data.camera(CAMERAS[0])
     signs = np.array([(x, y) for x in (-1, 1) for y in (-1, 1)])
@@ -281,14 +281,14 @@ def test_the_colours_of_the_table_are_split_and_black_and_white_keep_their_sides
     assert 0.06 < black < GREY < white < 0.96 and white - black > 0.4
 
 
-def test_a_sensor_scales_colours_and_adds_noise_that_differs_from_picture_to_picture() -> None:
+def test_a_sensor_scales_colours_and_adds_noise_that_differs_from_image_to_image() -> None:
     grey = np.full((64, 64, 3), 100, np.uint8)
     sensor = Photometric(gains=(1.2, 1.0, 0.5), noise=4.0, first=7)
     first, second = sensor(grey, 0).astype(float), sensor(grey, 1).astype(float)
     np.testing.assert_allclose(first.mean((0, 1)), [120, 100, 50], atol=1)
     np.testing.assert_allclose(first.std((0, 1)), 4, rtol=0.1)
     assert abs(np.corrcoef(first.ravel(), second.ravel())[0, 1]) > 0.9  # the colours
-    noise = [(picture - picture.mean((0, 1))).ravel() for picture in (first, second)]
+    noise = [(image - image.mean((0, 1))).ravel() for image in (first, second)]
     assert abs(np.corrcoef(*noise)[0, 1]) < 0.05
     np.testing.assert_array_equal(sensor(grey, 1), second)
     bright = Photometric(gains=(1.4, 1.4, 1.4), noise=0.0, first=0)(np.full((2, 2, 3), 255, np.uint8), 0)
@@ -297,7 +297,7 @@ def test_a_sensor_scales_colours_and_adds_noise_that_differs_from_picture_to_pic
 
 
 @pytest.mark.parametrize(
-    ("form", "which", "sentence"),
+    ("form", "which", "instruction"),
     [
         (1, 0, "Please place a white stone on the Go board at row 1, column 3."),
         (2, 0, "In column 3, row 1 of the grid: one white stone, please."),
@@ -324,9 +324,11 @@ def test_a_sensor_scales_colours_and_adds_noise_that_differs_from_picture_to_pic
         ),
     ],
 )
-def test_sentences_mean_the_target_in_the_convention_they_state(form: int, which: int, sentence: str) -> None:
+def test_instructions_mean_the_target_in_the_convention_they_state(
+    form: int, which: int, instruction: str
+) -> None:
     meant = episode(0, target=(1, 3), color="white")
-    assert Wording(FORMS[form - 1][which], other=(4, 0)).reword(meant.instruction, meant) == sentence
+    assert Wording(FORMS[form - 1][which], other=(4, 0)).reword(meant.instruction, meant) == instruction
 
 
 def test_every_form_occurs_and_never_names_the_target_as_the_other_place() -> None:

@@ -1,4 +1,4 @@
-"""Perturbed episodes as a policy meets them: pictures, motion, and what must not show."""
+"""Perturbed episodes as a policy meets them: images, motion, and what must not show."""
 
 from collections.abc import Callable, Iterator
 
@@ -37,14 +37,14 @@ def make_env() -> Iterator[MakeEnv]:
         env.close()
 
 
-def pictures(env: BombEnv, seed: int) -> np.ndarray:
+def images(env: BombEnv, seed: int) -> np.ndarray:
     """(2, SIZE, SIZE, 3) of both cameras at the start, as int."""
     observation, _ = env.reset(seed=seed)
     return np.stack([observation["pixels"][camera] for camera in CAMERAS]).astype(int)
 
 
 def episode_of(env: BombEnv, seed: int) -> tuple[np.ndarray, np.ndarray]:
-    """States and pictures of the same few motions."""
+    """States and images of the same few motions."""
     observation, _ = env.reset(seed=seed)
     observations = [observation, *(env.step(motion)[0] for motion in MOTIONS)]
     states = np.stack([o["environment_state"] for o in observations])
@@ -52,18 +52,18 @@ def episode_of(env: BombEnv, seed: int) -> tuple[np.ndarray, np.ndarray]:
 
 
 @pytest.mark.parametrize("axis", [*VISUAL, "all"])
-def test_each_level_changes_the_pictures_more_than_the_one_below(make_env: MakeEnv, axis: str) -> None:
+def test_each_level_changes_the_images_more_than_the_one_below(make_env: MakeEnv, axis: str) -> None:
     envs = [make_env(f"{axis}:{level}") for level in range(6)]
     changes = []
     for seed in range(8):
-        nominal, *perturbed = (pictures(env, seed) for env in envs)
-        changes.append([abs(picture - nominal).mean() for picture in perturbed])
+        nominal, *perturbed = (images(env, seed) for env in envs)
+        changes.append([abs(image - nominal).mean() for image in perturbed])
     mean = np.mean(changes, axis=0)
     assert mean[0] > 0 and (np.diff(mean) > 0).all(), mean
 
 
 @pytest.mark.parametrize("axis", list(AXES))
-def test_an_axis_changes_pictures_motion_and_sentence_only_as_it_says(make_env: MakeEnv, axis: str) -> None:
+def test_an_axis_changes_images_motion_and_instruction_only_as_it_says(make_env: MakeEnv, axis: str) -> None:
     nominal, perturbed = make_env(), make_env(f"{axis}:5")
     states, images = episode_of(nominal, 3)
     perturbed_states, perturbed_images = episode_of(perturbed, 3)
@@ -76,7 +76,7 @@ def test_an_axis_changes_pictures_motion_and_sentence_only_as_it_says(make_env: 
 
 
 @pytest.mark.parametrize("condition", ["none", *(f"{axis}:5" for axis in AXES), "all:3", "all:5"])
-def test_no_picture_tells_the_target_before_a_stone_is_moved(make_env: MakeEnv, condition: str) -> None:
+def test_no_image_tells_the_target_before_a_stone_is_moved(make_env: MakeEnv, condition: str) -> None:
     """Targets that are free and legal on the same board look the same, but where a marker shows them."""
     seed = 3
     boards: dict[bytes, list[tuple[int, int]]] = {}
@@ -97,10 +97,10 @@ def test_no_picture_tells_the_target_before_a_stone_is_moved(make_env: MakeEnv, 
 
 @pytest.mark.parametrize("condition", ["none", *(f"{axis}:5" for axis in NUISANCES), "all:5"])
 def test_the_stone_to_be_moved_can_be_seen(make_env: MakeEnv, condition: str) -> None:
-    """Pictures with and without it differ in grey levels, by the clearest dozen pixels."""
+    """Images with and without it differ in grey levels, by the clearest dozen pixels."""
     env = make_env(condition)
     for seed in range(6):
-        shown = pictures(env, seed)
+        shown = images(env, seed)
         scene = env._run.scene
         scene.model.geom("stone_0_visual").rgba = HIDDEN_RGBA
         hidden = np.stack([env._draw(camera, SIZE) for camera in CAMERAS]).astype(int)

@@ -242,7 +242,7 @@ def test_another_family_is_told_before_its_tokenizer_is_missed(config: Any, tmp_
 
 
 @torch.no_grad()
-def test_fresh_nano_features_tell_pictures_apart() -> None:
+def test_fresh_nano_features_tell_images_apart() -> None:
     """Even patches vanish, and a small spot is drowned neither by the background nor by training."""
     torch.manual_seed(0)
     backbone = load_backbone("nano")

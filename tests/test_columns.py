@@ -72,7 +72,7 @@ def test_frames_that_are_not_finite_are_counted_and_named(
 
 
 @pytest.mark.parametrize("key", ["observation.images.wrist", "observation.velocity"])
-def test_pictures_and_unknown_keys_are_refused(dataset: LeRobotDataset, key: str) -> None:
+def test_images_and_unknown_keys_are_refused(dataset: LeRobotDataset, key: str) -> None:
     with pytest.raises(ValueError, match=rf"no columns \['{key}'\]; it has \['action', 'episode_index'"):
         read_columns(dataset.meta, ["action", key])
 

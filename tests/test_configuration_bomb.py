@@ -47,15 +47,15 @@ def test_each_condition_is_a_group_with_all_tasks() -> None:
     envs = make_env(config, n_envs=1)
     assert list(envs) == ["place.none", "place.camera-2.light-3", "place.all-1to5"]
     assert all(list(group) == [0, 38] for group in envs.values())
-    instructions, pictures = [], []
+    instructions, images = [], []
     for key in ("place.none", "place.camera-2.light-3"):
         vector = envs[key][38]
         assert isinstance(vector, LazyVectorEnv)
-        pictures.append(vector.reset(seed=[3])[0]["pixels"]["workspace"])
+        images.append(vector.reset(seed=[3])[0]["pixels"]["workspace"])
         instructions.append(vector.call("task_description"))
         vector.close()
     assert instructions[0] == instructions[1]
-    assert not np.array_equal(*pictures)
+    assert not np.array_equal(*images)
 
 
 def test_the_protocol_s_file_names_every_axis() -> None:

@@ -123,7 +123,7 @@ def test_the_camera_axes_are_those_that_are_said() -> None:
     np.testing.assert_allclose(intrinsics, [[289.852, 0, 31.5], [0, 289.852, 31.5], [0, 0, 1]], rtol=1e-5)
 
 
-def test_pictures_do_not_depend_on_depth() -> None:
+def test_images_do_not_depend_on_depth() -> None:
     plain, deep = make_env(depth=False), make_env()
     pairs = [(plain.reset(seed=3)[0], deep.reset(seed=3)[0])]
     pairs += [(act(plain), act(deep)) for _ in range(3)]

@@ -23,7 +23,7 @@ WITHOUT_CONFIG = {"lerobot-find-port", "lerobot-find-cameras"}  # read no flags,
 
 
 @pytest.mark.parametrize("page", PAGES, ids=lambda page: page.name)
-def test_links_and_pictures_exist_and_no_place_is_left_open(page: Path) -> None:
+def test_links_and_images_exist_and_no_place_is_left_open(page: Path) -> None:
     text = page.read_text()
     links = re.findall(r"\]\(([^)#\s]+)(?:#[^)]*)?\)", text)
     missing = [link for link in links if "://" not in link and not (page.parent / link).exists()]

@@ -181,7 +181,7 @@ def world_points(
 
 @pytest.mark.parametrize("name", CAMERAS)
 def test_stone_centres_are_found_at_their_pixels(name: str) -> None:
-    """Where a stone's top is seen in a cropped and resized picture, the point is its top, within 2 mm."""
+    """Where a stone's top is seen in a cropped and resized image, the point is its top, within 2 mm."""
     errors_mm = []
     top_m = np.array([0, 0, BOARD.stone_height_m / 2])
     for seed, (observation, stone_xyz, labels) in enumerate(frames(256, name)):

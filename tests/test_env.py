@@ -220,16 +220,11 @@ def test_info_is_flat(env: BombEnv) -> None:
     assert info["seed"] == SEED and info["stage"] == "start" and info["failure"] == ""
 
 
-def test_the_picture_for_people_is_captioned_and_no_observation(env: BombEnv) -> None:
+def test_the_image_for_people_is_captioned_and_no_observation(env: BombEnv) -> None:
     env.reset(seed=SEED)
-    picture = env.render()
-    assert (
-        picture is not None
-        and picture.dtype == np.uint8
-        and picture.shape[1] == 768
-        and picture.shape[0] > 384
-    )
-    assert (picture[390:] > 200).any()  # letters
+    image = env.render()
+    assert image is not None and image.dtype == np.uint8 and image.shape[1] == 768 and image.shape[0] > 384
+    assert (image[390:] > 200).any()  # letters
     assert "stone" in env.task_description and env.task == "place"
 
 

@@ -280,7 +280,7 @@ def test_what_is_pooled(pool: str) -> None:
 
 
 @torch.no_grad()
-def test_pictures_sentence_state_and_time_matter() -> None:
+def test_images_instruction_state_and_time_matter() -> None:
     policy = wake_dualmod(make_policy(crop_fraction=0.9))
     batch = make_batch(policy, 1)
     noise = torch.zeros(1, 4, 4)

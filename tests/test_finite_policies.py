@@ -62,7 +62,7 @@ def test_a_batch_is_checked_before_it_is_normalised(
     raw = raw_batch(config.chunk_size)
     preprocessor(raw)
     for key in (STATE, WRIST, ACTION):
-        # the last action of the chunk, the frame's own picture and state
+        # the last action of the chunk, the frame's own image and state
         frame = 51 + (config.chunk_size - 1 if key == ACTION else 0)
         with pytest.raises(ValueError, match=rf"'{key}' is not finite in frame {frame} .* episode 4"):
             preprocessor({**raw, key: spoil(raw[key], 1, bad)})

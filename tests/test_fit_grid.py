@@ -22,7 +22,7 @@ from lerobot_bomb.commands.main import main
 from lerobot_bomb.data.columns import read_columns
 from lerobot_bomb.data.record import record
 from lerobot_bomb.data.recording import Recording
-from lerobot_bomb.viewing.grid_picture import (
+from lerobot_bomb.viewing.grid_plot import (
     BAR_RGB,
     EDGE_RGB,
     ROW_HEIGHT,
@@ -137,21 +137,21 @@ def test_groups_and_coordinates_are_as_asked_for(root: Path, capsys: pytest.Capt
     assert "dx: -1.0000 -0.6000 -0.2000 0.2000 0.6000 1.0000\n" in text
 
 
-def test_the_picture_has_the_edges_where_the_grid_has_them(root: Path, tmp_path: Path) -> None:
-    assert fit_grid(root, f"--picture={tmp_path / 'grid.png'}") == 0
+def test_the_plot_has_the_edges_where_the_grid_has_them(root: Path, tmp_path: Path) -> None:
+    assert fit_grid(root, f"--plot={tmp_path / 'grid.png'}") == 0
     assert [path.name for path in tmp_path.iterdir()] == ["grid.png"]
-    picture = np.asarray(Image.open(tmp_path / "grid.png"))
+    plot = np.asarray(Image.open(tmp_path / "grid.png"))
     grids, _, _ = fitted(LeRobotDatasetMetadata(REPO_ID, root=root))
     edges = [of.numpy() for i in range(2) for of in grids.group_edges(i)]
     for row, of in enumerate(edges):
-        line = picture[TITLE_HEIGHT + row * ROW_HEIGHT + 10]
+        line = plot[TITLE_HEIGHT + row * ROW_HEIGHT + 10]
         assert np.flatnonzero((line == EDGE_RGB).all(axis=1)).tolist() == sorted({*edge_x(of).tolist()})
 
 
 def test_bars_of_a_histogram_are_where_the_values_are() -> None:
     values = np.repeat([0.25, 0.75], [100, 25])
-    picture = draw_rows("", [Row(["label"], values, np.array([0.0, 0.5, 1.0]))])
-    heights = (picture[TITLE_HEIGHT:] == BAR_RGB).all(axis=2).sum(axis=0)
+    plot = draw_rows("", [Row(["label"], values, np.array([0.0, 0.5, 1.0]))])
+    heights = (plot[TITLE_HEIGHT:] == BAR_RGB).all(axis=2).sum(axis=0)
     first, second = (int(edge_x(np.array([0, value, 1]))[1]) for value in (0.25, 0.75))
     assert heights[first - 2 : first + 6].max() == pytest.approx(
         2 * heights[second - 2 : second + 6].max(), abs=2
@@ -176,7 +176,7 @@ def test_bars_of_a_histogram_are_where_the_values_are() -> None:
             '--policy.normalization_mapping={"ACTION": "MEAN_STD"}',
             "--policy.normalization_mapping[ACTION]='MEAN_STD' is unknown; choose one of: MIN_MAX",
         ),
-        ("--picture=nowhere/grid.png", "--picture=nowhere/grid.png cannot be written"),
+        ("--plot=nowhere/grid.png", "--plot=nowhere/grid.png cannot be written"),
     ],
 )
 def test_bad_flags_are_one_line(

@@ -16,8 +16,8 @@ VARIANT = "both heads"
 def test_a_short_training_hears_words_through_dualmod_only(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    figures_path, picture_path = tmp_path / "toy.json", tmp_path / "toy.png"
-    flags = f"flow_toy.py --steps=150 --samples=200 --json={figures_path} --picture={picture_path}"
+    figures_path, plot_path = tmp_path / "toy.json", tmp_path / "toy.png"
+    flags = f"flow_toy.py --steps=150 --samples=200 --json={figures_path} --plot={plot_path}"
     monkeypatch.setattr("sys.argv", flags.split())
     monkeypatch.setattr(flow_toy, "SAMPLING_STEPS", 20)
     with pytest.raises(SystemExit, match="1"):  # so little training misses bars
@@ -31,15 +31,15 @@ def test_a_short_training_hears_words_through_dualmod_only(
         else:
             assert left == right
         assert 0.3 < shares[name, "any"][0] < 0.7
-    assert iio.imread(picture_path).std() > 10
+    assert iio.imread(plot_path).std() > 10
 
 
 @pytest.mark.parametrize(
     ("flag", "message"),
     [
         ("--samples=10", "--samples=10 is too few to measure clouds; at least 100"),
-        ("--picture=toy.txt", "'toy.txt' must end in .png or .jpg"),
-        ("--picture=absent/toy.png", "'absent/toy.png' cannot be written"),
+        ("--plot=toy.txt", "'toy.txt' must end in .png or .jpg"),
+        ("--plot=absent/toy.png", "'absent/toy.png' cannot be written"),
         ("--json=absent/toy.json", "'absent/toy.json' cannot be written"),
     ],
 )

@@ -14,7 +14,7 @@ from lerobot_bomb.bomb.perturbations import ALL, AXES
 from lerobot_bomb.commands import main as cli
 from lerobot_bomb.commands.gallery import COLUMNS, PATH_RGB, SHEETS, axis_sheet, path_tile
 from lerobot_bomb.envs.rollout import make_env
-from lerobot_bomb.viewing.perturbations_page import example_sentences, page
+from lerobot_bomb.viewing.perturbations_page import example_instructions, page
 from lerobot_bomb.viewing.sheet import PAPER, Sheet, text_tile
 
 SIZE = 48
@@ -28,7 +28,7 @@ def tile(sheet: Sheet, drawn: np.ndarray, row: int, column: int) -> np.ndarray:
 
 
 def start(axis: str, level: int, seed: int) -> tuple[dict[str, np.ndarray], str]:
-    """Both cameras' pictures at the start of an episode, and its instruction."""
+    """Both cameras' images at the start of an episode, and its instruction."""
     env = make_env(EpisodeSpec(seed, perturbations=f"{axis}:{level}"), OPTIONS)
     observation, _ = env.reset(seed=seed)
     instruction = env.get_wrapper_attr("task_description")
@@ -36,17 +36,17 @@ def start(axis: str, level: int, seed: int) -> tuple[dict[str, np.ndarray], str]
     return observation["pixels"], instruction
 
 
-def test_tiles_are_the_environments_own_pictures() -> None:
+def test_tiles_are_the_environments_own_images() -> None:
     sheet = axis_sheet("camera", (3, 9), OPTIONS)
     drawn = sheet.draw()
-    assert list(sheet.pictures) == [
+    assert list(sheet.images) == [
         f"{camera}, seed {seed}" for seed in (3, 9) for camera in ("workspace", "wrist")
     ]
     for column in range(6):
         for i, seed in enumerate((3, 9)):
-            pictures, _ = start("camera", column, seed)
-            assert np.array_equal(tile(sheet, drawn, 2 * i, column), pictures["workspace"])
-            assert np.array_equal(tile(sheet, drawn, 2 * i + 1, column), pictures["wrist"])
+            images, _ = start("camera", column, seed)
+            assert np.array_equal(tile(sheet, drawn, 2 * i, column), images["workspace"])
+            assert np.array_equal(tile(sheet, drawn, 2 * i + 1, column), images["wrist"])
     assert not np.array_equal(tile(sheet, drawn, 0, 0), tile(sheet, drawn, 2, 0))
 
 
@@ -75,22 +75,22 @@ def test_captions_are_the_table() -> None:
     assert sheet.texts["latency, control steps"] == ["", "0", "0", "0", "1", "1"]
     assert sheet.title.startswith("dynamics: mass and friction of the stones")
     assert sheet.title.endswith("the images stay as they are")
-    ((label, paths),) = sheet.pictures.items()
+    ((label, paths),) = sheet.images.items()
     assert label == "expert's path, seed 3"
     assert all((path == PATH_RGB).all(axis=2).sum() > SIZE / 2 for path in paths), "the whole way"
     assert not np.array_equal(paths[5], paths[0])
 
 
-def test_language_shows_sentences() -> None:
+def test_language_shows_instructions() -> None:
     sheet = axis_sheet("language", (3,), OPTIONS)
-    assert list(sheet.pictures) == ["instruction, seed 3"]
-    for level, shown in enumerate(sheet.pictures["instruction, seed 3"]):
+    assert list(sheet.images) == ["instruction, seed 3"]
+    for level, shown in enumerate(sheet.images["instruction, seed 3"]):
         _, instruction = start("language", level, 3)
         assert np.array_equal(shown, text_tile(instruction, SIZE))
     assert not np.array_equal(text_tile("row 1", SIZE), text_tile("row 2", SIZE))
 
 
-def test_a_sentence_is_broken_into_lines_that_fit() -> None:
+def test_a_instruction_is_broken_into_lines_that_fit() -> None:
     text = "Place a black stone on the board at row 1, please."
     inked = (text_tile(text, 200) != text_tile("", 200)).any(axis=2)
     assert inked[:18].any()
@@ -101,7 +101,7 @@ def test_a_sentence_is_broken_into_lines_that_fit() -> None:
 def test_all_shows_everything_that_changes() -> None:
     sheet = axis_sheet(ALL, (3,), OPTIONS)
     rows = ["workspace", "wrist", "instruction", "expert's path"]
-    assert list(sheet.pictures) == [f"{row}, seed 3" for row in rows]
+    assert list(sheet.images) == [f"{row}, seed 3" for row in rows]
     assert sheet.title == "all: every axis but goal_marker"
 
 
@@ -145,7 +145,7 @@ def test_a_bad_flag_is_named_and_nothing_is_written(
 
 
 def test_the_committed_page_is_the_generated_one() -> None:
-    assert (DOCS / "perturbations.md").read_text() == page(example_sentences(), "media/perturbations")
+    assert (DOCS / "perturbations.md").read_text() == page(example_instructions(), "media/perturbations")
 
 
 def test_the_page_has_every_axis_with_its_magnitudes_and_its_sheet() -> None:

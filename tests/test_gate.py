@@ -55,7 +55,7 @@ def test_a_rung_is_climbed_by_stock_commands_and_goes_on_where_it_stopped(
         output_dir=folder,
         demonstrations=None,
         steps=None,
-        picture=tmp_path / "curve.png",
+        plot=tmp_path / "curve.png",
         json=tmp_path / "gate.json",
         policy_flags=["--policy.num_channels=8"],
     )
@@ -66,7 +66,7 @@ def test_a_rung_is_climbed_by_stock_commands_and_goes_on_where_it_stopped(
         ("step 1", 1),
         ("step 2", 2),
         (gate.NO_IMAGES, 2),
-        (gate.OTHER_SENTENCE, 2),
+        (gate.OTHER_INSTRUCTION, 2),
     ]
     assert figures["training"]["cpu_minutes"] == 2.0
     assert figures["points"]["step 1"]["cpu_minutes"] == 1.0
@@ -84,24 +84,26 @@ def test_a_rung_is_climbed_by_stock_commands_and_goes_on_where_it_stopped(
         gate.climb(args)
 
 
-def test_a_stone_counts_where_the_told_sentence_says() -> None:
+def test_a_stone_counts_where_the_told_instruction_says() -> None:
     rows = [
         row(None, 1.0, instruction="a"),
         row("wrong_intersection", 45.0, (2, 3), instruction="a"),
         row("dropped", 45.0, (2, 3), instruction="a"),
         row(None, 1.0, (2, 3), instruction="b", target=[2, 3]),
     ]
-    told = gate.other_sentences(rows)
-    assert told == {"a": "b", "b": "a"}
-    assert gate.count_named(rows, told) == 1
+    given = gate.other_instructions(rows)
+    assert given == {"a": "b", "b": "a"}
+    assert gate.count_named(rows, given) == 1
     assert gate.count_named(rows, {"a": "a", "b": "b"}) == 2
 
 
-def test_the_other_sentence_names_another_target() -> None:
+def test_the_other_instruction_names_another_target() -> None:
     targets = {"black 1": [0, 0], "black 2": [0, 1], "white 1": [0, 0], "white 2": [0, 1]}
-    told = gate.other_sentences([row(None, 1.0, instruction=name, target=at) for name, at in targets.items()])
-    assert all(targets[sentence] != targets[other] for sentence, other in told.items())
-    assert gate.other_sentences([row(None, 1.0, instruction="only")]) == {"only": "only"}
+    given = gate.other_instructions(
+        [row(None, 1.0, instruction=name, target=at) for name, at in targets.items()]
+    )
+    assert all(targets[instruction] != targets[other] for instruction, other in given.items())
+    assert gate.other_instructions([row(None, 1.0, instruction="only")]) == {"only": "only"}
 
 
 def test_every_policy_type_has_a_recipe_for_every_rung() -> None:
@@ -149,15 +151,15 @@ def test_a_point_counts_grounding_and_precision_apart() -> None:
     assert count([row("dropped", 5.0)], 1, 1.0).median_error_mm is None
 
 
-def test_the_picture_shows_a_curve_that_rises(tmp_path: Path) -> None:
+def test_the_plot_shows_a_curve_that_rises(tmp_path: Path) -> None:
     points = [
         count([row("imprecise", 12.0)] * 10, 1, 1.0),
         count([row(None, 1.0)] * 10, 2, 2.0),
     ]
     draw(points, "title", tmp_path / "new" / "curve.png")
-    picture = cv2.imread(str(tmp_path / "new" / "curve.png"))
-    assert picture is not None
-    lines, columns = np.nonzero((picture == SUCCESS_BGR).all(axis=2))
+    plot = cv2.imread(str(tmp_path / "new" / "curve.png"))
+    assert plot is not None
+    lines, columns = np.nonzero((plot == SUCCESS_BGR).all(axis=2))
     first, last = columns.argmin(), columns.argmax()
-    assert columns[last] - columns[first] > picture.shape[1] / 3
-    assert lines[first] - lines[last] > picture.shape[0] / 2
+    assert columns[last] - columns[first] > plot.shape[1] / 3
+    assert lines[first] - lines[last] > plot.shape[0] / 2

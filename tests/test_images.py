@@ -24,7 +24,7 @@ SIZES = [
 LEVEL = 1 / 255
 
 
-def pictures(height: int, width: int) -> dict[str, np.ndarray]:
+def images(height: int, width: int) -> dict[str, np.ndarray]:
     """(height, width, 3) uint8: noise, noise of black and white (most overshoot), and gradients."""
     random = np.random.default_rng(0)
     x, y = np.meshgrid(np.linspace(0, 255, width), np.linspace(0, 255, height))
@@ -35,14 +35,14 @@ def pictures(height: int, width: int) -> dict[str, np.ndarray]:
     }
 
 
-def to_tensor(picture: np.ndarray) -> Tensor:
+def to_tensor(image: np.ndarray) -> Tensor:
     """What a dataset delivers: (1, 3, H, W) in [0, 1]."""
-    return torch.from_numpy(picture).permute(2, 0, 1)[None] / 255
+    return torch.from_numpy(image).permute(2, 0, 1)[None] / 255
 
 
-def processed(processor: Any, picture: np.ndarray) -> Tensor:
+def processed(processor: Any, image: np.ndarray) -> Tensor:
     """(1, 3, 512, 512) in [-1, 1] of the real processor, without tiling."""
-    images = [Image.fromarray(picture)]
+    images = [Image.fromarray(image)]
     pixels = processor(images, do_resize=False, do_image_splitting=False, return_tensors="pt")["pixel_values"]
     return pixels[0]
 
@@ -62,9 +62,9 @@ def processor(shared_data: Path) -> Any:
 
 @pytest.mark.parametrize(("height", "width"), SIZES)
 def test_pixels_are_the_real_processors(processor: Any, height: int, width: int) -> None:
-    for picture in pictures(height, width).values():
-        ours = crop_and_resize(to_tensor(picture), 1.0, 512, None)
-        assert_equal_pixels(ours, processed(processor, picture))
+    for image in images(height, width).values():
+        ours = crop_and_resize(to_tensor(image), 1.0, 512, None)
+        assert_equal_pixels(ours, processed(processor, image))
 
 
 def test_cropped_pusht_frames_are_the_real_processors(processor: Any, shared_data: Path) -> None:
@@ -79,9 +79,9 @@ def test_cropped_pusht_frames_are_the_real_processors(processor: Any, shared_dat
 @pytest.mark.parametrize("size", [40, 96, 128])
 def test_resizing_is_pillows(size: int) -> None:
     """Needs no data: smaller, equal and larger."""
-    for picture in pictures(96, 60).values():
-        expected = Image.fromarray(picture).resize((size, size), Image.Resampling.LANCZOS)
-        assert_equal_pixels(resize(to_tensor(picture), size) * 2, to_tensor(np.array(expected)) * 2)
+    for image in images(96, 60).values():
+        expected = Image.fromarray(image).resize((size, size), Image.Resampling.LANCZOS)
+        assert_equal_pixels(resize(to_tensor(image), size) * 2, to_tensor(np.array(expected)) * 2)
 
 
 def test_precision_does_not_depend_on_autocast_or_inference_mode() -> None:

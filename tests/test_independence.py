@@ -25,7 +25,7 @@ SMALL = RenderOptions(image_size=32)
 SEEDS = (9, 10)
 # of a network's actions: a matrix product of another batch size may round otherwise; bins are 100 times wider
 BINS_TOLERANCE = 1e-4
-# where actions are no bins, the next picture shows what was rounded otherwise
+# where actions are no bins, the next image shows what was rounded otherwise
 TOLERANCES = {"fdvla": 2e-3}
 CONDITIONS = ("none", "all:1-5")
 
@@ -183,7 +183,7 @@ def evaluate(
     actions: dict[int, np.ndarray] = {}
 
     def note(*, seeds: list[int], render_callback: object, **others: Any) -> dict:
-        data = rollout(seeds=seeds, **others)  # without a picture of every step
+        data = rollout(seeds=seeds, **others)  # without a image of every step
         for i, seed in enumerate(seeds):
             num_steps = int(data["done"][i].int().argmax()) + 1
             actions[seed] = data["action"][i, :num_steps].numpy()

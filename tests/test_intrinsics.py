@@ -1,4 +1,4 @@
-"""Cameras that follow cropped and resized pictures."""
+"""Cameras that follow cropped and resized images."""
 
 import json
 from pathlib import Path
@@ -31,7 +31,7 @@ def test_the_default_camera_is_the_published_one(shared_data: Path) -> None:
     assert torch.allclose(default_intrinsics(*size)[0], torch.tensor(published["intrinsic"]), rtol=1e-6)
 
 
-def test_the_default_camera_is_stretched_to_the_picture() -> None:
+def test_the_default_camera_is_stretched_to_the_image() -> None:
     expected = camera(218.2558, 291.0077, 111.8254, 111.7877)
     assert torch.allclose(default_intrinsics(224, 224), expected, rtol=0, atol=1e-4)
 
@@ -69,7 +69,7 @@ def test_a_camera_projects_to_where_crop_and_resize_move_the_pixel(
     assert (projected[:2] / projected[2]).tolist() == pytest.approx(moved, rel=1e-4, abs=1e-2)
 
 
-def test_a_camera_projects_to_where_a_spot_of_the_picture_is_seen() -> None:
+def test_a_camera_projects_to_where_a_spot_of_the_image_is_seen() -> None:
     """Through the very pixels of random crops: spot and camera must agree to a tenth of a pixel."""
     K = camera(90, 80, 45, 33).repeat(8, 1, 1)
     point = torch.tensor([0.1, 0.05, 1.2])

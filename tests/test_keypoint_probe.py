@@ -39,17 +39,17 @@ def make_policy() -> KeypointProbePolicy:
     return KeypointProbePolicy(make_config()).eval()
 
 
-def raw_batch(*sentences: str) -> dict[str, Any]:
+def raw_batch(*instructions: str) -> dict[str, Any]:
     """What the environment gives, true state included."""
     generator = torch.Generator().manual_seed(1)
     shapes = dict.fromkeys(CAMERAS, (3, SIZE, SIZE))
     shapes |= {OBS_STATE: (4,), "observation.environment_state": (96,)}
-    batch = {key: torch.rand(len(sentences), *shape, generator=generator) for key, shape in shapes.items()}
-    return {**batch, "task": list(sentences)}
+    batch = {key: torch.rand(len(instructions), *shape, generator=generator) for key, shape in shapes.items()}
+    return {**batch, "task": list(instructions)}
 
 
-def make_batch(*sentences: str) -> dict[str, Tensor]:
-    return make_keypoint_probe_pre_post_processors(make_config(), STATS)[0](raw_batch(*sentences))
+def make_batch(*instructions: str) -> dict[str, Tensor]:
+    return make_keypoint_probe_pre_post_processors(make_config(), STATS)[0](raw_batch(*instructions))
 
 
 # The policy
@@ -70,13 +70,13 @@ def test_a_keypoint_is_where_the_heat_is(column: int, line: int, x: float, y: fl
 
 
 def test_keypoints_follow_what_moves() -> None:
-    """By a multiple of the strides, far from the edges, the picture and its heat maps move alike."""
+    """By a multiple of the strides, far from the edges, the image and its heat maps move alike."""
     torch.manual_seed(0)
     encoder = KeypointEncoder(num_keypoints=4, num_channels=8, initial_sharpness=5.0)
     image = torch.full((1, 3, 96, 96), 0.5)
     image[:, :, 40:52, 36:48] = torch.rand(3, 12, 12)
     moved = image.roll(shifts=(8, 12), dims=(2, 3))
-    before, after = (encoder.layers(2 * picture - 1)[..., 4:-4, 4:-4] for picture in (image, moved))
+    before, after = (encoder.layers(2 * image - 1)[..., 4:-4, 4:-4] for image in (image, moved))
     assert before.std() > 0.01
     torch.testing.assert_close(after[..., 2:, 3:], before[..., :-2, :-3], atol=1e-4, rtol=1e-4)
 
@@ -93,7 +93,7 @@ class Spy(dict):
         return super().__getitem__(key)
 
 
-def test_only_images_state_and_sentence_are_read() -> None:
+def test_only_images_state_and_instruction_are_read() -> None:
     batch = Spy(make_batch("Set a white stone at (1, 2)."))
     assert "observation.environment_state" in batch
     make_policy().select_action(batch)  # pyright: ignore[reportArgumentType]
@@ -124,10 +124,10 @@ def test_the_loss_is_the_mean_absolute_error() -> None:
     torch.testing.assert_close(policy.forward(batch, reduction="none")[0], torch.tensor([1.0, 1.0]))
 
 
-# The sentence
+# The instruction
 
 
-def test_every_sentence_of_the_benchmark_is_another_bag_of_words() -> None:
+def test_every_instruction_of_the_benchmark_is_another_bag_of_words() -> None:
     from lerobot_bomb.bomb.suites.place import TEMPLATES
 
     bags = {
@@ -141,7 +141,7 @@ def test_every_sentence_of_the_benchmark_is_another_bag_of_words() -> None:
     assert all(0 < word < NUM_WORD_IDS for bag in bags for word in bag)
 
 
-def test_sentences_become_rows_of_numbers() -> None:
+def test_instructions_become_rows_of_numbers() -> None:
     tokens = make_batch("Place a stone.", "Place a")["observation.language.tokens"]
     assert tokens.tolist() == [word_ids("Place a stone."), [*word_ids("Place a"), 0]]
 
@@ -157,15 +157,15 @@ def test_without_an_instruction_there_is_no_guess(task: Any) -> None:
 
 
 def test_a_saved_policy_acts_the_same(tmp_path: Path) -> None:
-    policy, sentence = make_policy(), "Set a white stone at (1, 2)."
+    policy, instruction = make_policy(), "Set a white stone at (1, 2)."
     policy.save_pretrained(tmp_path)
     for pipeline in make_keypoint_probe_pre_post_processors(policy.config, STATS):
         pipeline.save_pretrained(tmp_path)
     loaded = KeypointProbePolicy.from_pretrained(tmp_path)
     preprocessor, postprocessor = make_pre_post_processors(loaded.config, str(tmp_path))
-    batch = preprocessor(raw_batch(sentence))
-    torch.testing.assert_close(batch[OBS_STATE], (raw_batch(sentence)[OBS_STATE] - 0.5) / 2.0)
-    assert torch.equal(loaded.select_action(batch), policy.select_action(make_batch(sentence)))
+    batch = preprocessor(raw_batch(instruction))
+    torch.testing.assert_close(batch[OBS_STATE], (raw_batch(instruction)[OBS_STATE] - 0.5) / 2.0)
+    assert torch.equal(loaded.select_action(batch), policy.select_action(make_batch(instruction)))
     torch.testing.assert_close(postprocessor(torch.ones(1, 4)), torch.full((1, 4), 4.25))
 
 

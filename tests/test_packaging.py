@@ -66,7 +66,7 @@ def test_the_sdist_builds_the_same_wheel(wheel: Path, unpacked: Path, tmp_path: 
     assert files(again) == files(wheel)
 
 
-def test_the_sdist_holds_what_is_under_version_control_without_pictures(unpacked: Path) -> None:
+def test_the_sdist_holds_what_is_under_version_control_without_images(unpacked: Path) -> None:
     packed = {str(path.relative_to(unpacked)) for path in unpacked.rglob("*") if path.is_file()}
     stray = [
         name

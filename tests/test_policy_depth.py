@@ -130,14 +130,14 @@ def model() -> ZoeDepthForDepthEstimation:
     return ZoeDepthForDepthEstimation(ZoeDepthConfig(**config))
 
 
-def pictures(size: int) -> Tensor:
+def images(size: int) -> Tensor:
     """(2, 3, size, size) in [-1, 1]."""
     return torch.rand(2, 3, size, size, generator=torch.Generator().manual_seed(0)) * 2 - 1
 
 
 @pytest.mark.parametrize("size", [112, 224])
 def test_zoedepth_reads_what_its_own_processor_makes(size: int) -> None:
-    levels = ((pictures(size) + 1) * 127.5).byte()
+    levels = ((images(size) + 1) * 127.5).byte()
     processor = ZoeDepthImageProcessor(
         size={"height": 384, "width": 384},
         keep_aspect_ratio=False,
@@ -157,14 +157,14 @@ def test_estimated_depth_lies_on_the_pixels_that_it_belongs_to() -> None:
 
     copy: Any = Copy()
     rows, columns = torch.meshgrid(torch.arange(224) / 40, torch.arange(224) / 50, indexing="ij")
-    picture = (rows.sin() * columns.cos()).expand(1, 3, 224, 224)
+    image = (rows.sin() * columns.cos()).expand(1, 3, 224, 224)
     inside = (..., slice(4, -4), slice(4, -4))  # at the border, the mirror makes a crease
-    assert torch.allclose(ZoeDepth(copy)(picture)[inside], picture[:, 0][inside], atol=1e-3)
+    assert torch.allclose(ZoeDepth(copy)(image)[inside], image[:, 0][inside], atol=1e-3)
 
 
 def test_zoedepth_is_frozen_and_does_not_depend_on_the_batch(model: ZoeDepthForDepthEstimation) -> None:
     policy = nn.Sequential(ZoeDepth(model)).train()
-    pixels = pictures(112).requires_grad_()
+    pixels = images(112).requires_grad_()
     depth = policy(pixels)
     assert depth.shape == (2, 112, 112) and depth.std() > 0 and not depth.requires_grad
     assert policy(pixels).equal(depth)  # no layer is dropped
@@ -174,7 +174,7 @@ def test_zoedepth_is_frozen_and_does_not_depend_on_the_batch(model: ZoeDepthForD
 
 def test_zoedepth_is_loaded_from_a_folder(model: ZoeDepthForDepthEstimation, tmp_path: Path) -> None:
     model.save_pretrained(tmp_path)
-    assert load_zoedepth(str(tmp_path))(pictures(64)).equal(ZoeDepth(model)(pictures(64)))
+    assert load_zoedepth(str(tmp_path))(images(64)).equal(ZoeDepth(model)(images(64)))
     with pytest.raises(OSError, match=r"--policy\.depth_model_name=.*no model found"):
         load_zoedepth(str(tmp_path / "absent"))
 

@@ -28,8 +28,8 @@ def dataset(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Episodes that are shorter than a chunk, so that batches are padded differently."""
     root = tmp_path_factory.mktemp("short") / "dataset"
     number = {"dtype": "float32", "shape": (4,), "names": ["x", "y", "z", "finger_opening"]}
-    picture = {"dtype": "image", "shape": (64, 64, 3), "names": ["height", "width", "channels"]}
-    features = {"observation.state": number, "action": number, "observation.images.workspace": picture}
+    image = {"dtype": "image", "shape": (64, 64, 3), "names": ["height", "width", "channels"]}
+    features = {"observation.state": number, "action": number, "observation.images.workspace": image}
     made = LeRobotDataset.create(REPO_ID, fps=10, features=features, root=root, use_videos=False)
     generator = np.random.default_rng(0)
     for episode in range(NUM_EPISODES):

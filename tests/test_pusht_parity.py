@@ -34,7 +34,7 @@ from torch import Tensor
 pytest.importorskip("gym_pusht")
 
 EPISODES = range(98, 100)  # short ones, which the recorded actions lead through again to the last pixel
-MIN_PSNR_DB = 35.0  # docs/pusht.md: 38 to 53; the next step's picture has 32, BGR for RGB 29
+MIN_PSNR_DB = 35.0  # docs/pusht.md: 38 to 53; the next step's image has 32, BGR for RGB 29
 MAX_DRIFT = 1e-3  # pixels of the board
 LEARNED = (5, 20, 40, 90)  # frames
 

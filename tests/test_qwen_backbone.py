@@ -53,7 +53,7 @@ def as_pixels(images: np.ndarray) -> Tensor:
 
 
 def embed(backbone: QwenBackbone, ids: Tensor, pixels: Tensor) -> tuple[Tensor, Tensor]:
-    """Embeddings with the pictures in place, and which tokens are theirs."""
+    """Embeddings with the images in place, and which tokens are theirs."""
     is_image = ids == backbone.vlm.config.image_token_id
     features = backbone.embed_images(pixels).flatten(0, 1)
     return backbone.embed_tokens(ids).masked_scatter(is_image[..., None], features), is_image
@@ -183,7 +183,7 @@ def test_a_backbone_can_be_built_again_from_its_config(nano: QwenBackbone) -> No
 
 
 @torch.no_grad()
-def test_fresh_nano_features_tell_pictures_apart() -> None:
+def test_fresh_nano_features_tell_images_apart() -> None:
     """Even patches vanish, and a small spot is drowned neither by the background nor by training."""
     torch.manual_seed(0)
     backbone = load_qwen("nano", SIZE)
@@ -237,7 +237,7 @@ def test_a_hub_id_without_network_names_both_ways_out() -> None:
 
 
 def test_a_tokenizer_of_another_family_is_refused() -> None:
-    text = nano_tokenizer().to_str().replace("<image>", "<picture>")
+    text = nano_tokenizer().to_str().replace("<image>", "<image>")
     with pytest.raises(ValueError, match=r"has no single token for '<\|image_pad\|>' or '<image>'"):
         QwenPrompt.from_tokenizer(Tokenizer.from_str(text), "some/model")
 

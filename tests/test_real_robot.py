@@ -128,7 +128,7 @@ def test_the_arm_is_told_the_policys_own_chunks(
 def test_a_relative_chunk_counts_from_where_the_arm_was_when_it_began(
     checkpoint: Callable[..., Path], rollout: Callable[..., ScriptedArm]
 ) -> None:
-    """One picture, and no state in the prompt: chunks differ by how far the arm had gone, and in nothing."""
+    """One image, and no state in the prompt: chunks differ by how far the arm had gone, and in nothing."""
     path = checkpoint("vla0_smol", "--policy.relative_actions=true", "--policy.use_state=false")
     arm = rollout(path, 3 * EXECUTED, "--fps=200")
     torch.testing.assert_close(told(arm), foreseen(arm, path), rtol=0, atol=1e-3)

@@ -40,7 +40,7 @@ def layout() -> Layout:
 
 
 def pixel_of(scene: Scene, camera: str, xyz: list[float], size: int) -> tuple[int, int]:
-    """(row, column) of a world point in a camera's picture."""
+    """(row, column) of a world point in a camera's image."""
     camera_id = scene.model.camera(camera).id
     camera_from_world = scene.data.cam_xmat[camera_id].reshape(3, 3).T
     x, y, z = camera_from_world @ (np.array(xyz) - scene.data.cam_xpos[camera_id])
@@ -149,17 +149,17 @@ def test_the_workspace_camera_sees_board_tray_stones_and_gripper(
     scene: Scene, layout: Layout, renderer: CameraRenderer, size: int
 ) -> None:
     scene.reset(layout)
-    picture = renderer.draw(scene.data, "workspace", size)
-    assert picture.shape == (size, size, 3) and picture.dtype == np.uint8
+    image = renderer.draw(scene.data, "workspace", size)
+    assert image.shape == (size, size, 3) and image.dtype == np.uint8
     edge = np.array([[-1, -1], [-1, 1], [1, -1], [1, 1]])
     corners = [*(BOARD_HALF_SIZE_M * edge), *(np.array(TRAY_CENTER_XY) + np.array(TRAY_HALF_SIZE_XY) * edge)]
     points = [[*corner, BOARD.thickness_m] for corner in corners] + [list(layout.gripper_xyz)]
     for point in points:
         assert all(0 <= p < size for p in pixel_of(scene, "workspace", point, size)), point
-    black = picture[pixel_of(scene, "workspace", [*layout.stone_xy[1], BOARD.thickness_m + 0.009], size)]
-    white = picture[pixel_of(scene, "workspace", [*layout.stone_xy[2], BOARD.thickness_m + 0.009], size)]
+    black = image[pixel_of(scene, "workspace", [*layout.stone_xy[1], BOARD.thickness_m + 0.009], size)]
+    white = image[pixel_of(scene, "workspace", [*layout.stone_xy[2], BOARD.thickness_m + 0.009], size)]
     assert black.max() < 80 and white.min() > 170
-    red, green, blue = (int(c) for c in picture[pixel_of(scene, "workspace", [0.11, -0.11, 0.005], size)])
+    red, green, blue = (int(c) for c in image[pixel_of(scene, "workspace", [0.11, -0.11, 0.005], size)])
     assert red > green > blue  # wood
 
 
@@ -171,27 +171,27 @@ def test_the_wrist_camera_sees_the_stone_at_the_start(
         stone_xy = layout.stone_xy.copy()
         stone_xy[STONE] += offset
         scene.reset(Layout(layout.gripper_xyz, stone_xy, layout.stone_is_white, layout.stone_in_play))
-        picture = renderer.draw(scene.data, "wrist", 256)
-        assert picture[pixel_of(scene, "wrist", [*stone_xy[STONE], 0.014], 256)].min() > 170
+        image = renderer.draw(scene.data, "wrist", 256)
+        assert image[pixel_of(scene, "wrist", [*stone_xy[STONE], 0.014], 256)].min() > 170
 
 
-def test_pictures_of_the_same_state_are_the_same(
+def test_images_of_the_same_state_are_the_same(
     scene: Scene, layout: Layout, renderer: CameraRenderer
 ) -> None:
     scene.reset(layout)
     first = [renderer.draw(scene.data, camera, 128) for camera in CAMERAS]
     renderer.draw(scene.data, "wrist", 256)
-    for camera, picture in zip(CAMERAS, first, strict=True):
-        np.testing.assert_array_equal(renderer.draw(scene.data, camera, 128), picture)
+    for camera, image in zip(CAMERAS, first, strict=True):
+        np.testing.assert_array_equal(renderer.draw(scene.data, camera, 128), image)
 
 
 def test_shadows_darken_the_board() -> None:
     layout = sample_episode(EpisodeSpec(seed=0)).layout
-    pictures = []
+    images = []
     for preset in ("fast", "shadows"):
         scene = Scene()
         scene.reset(layout)
         renderer = CameraRenderer(scene.model, RenderOptions(preset=preset), max_size=256)
-        pictures.append(renderer.draw(scene.data, "workspace", 256).astype(int))
+        images.append(renderer.draw(scene.data, "workspace", 256).astype(int))
         renderer.close()
-    assert ((pictures[0] - pictures[1]).sum(axis=-1) > 60).mean() > 0.005
+    assert ((images[0] - images[1]).sum(axis=-1) > 60).mean() > 0.005

@@ -134,12 +134,12 @@ def test_what_lerobots_client_sends_is_read_as_pickle_reads_it(protocol: int) ->
     features: Any = {"observation.state": {"dtype": "float32", "shape": (2,), "names": ["a.pos", "b.pos"]}}
     policy = RemotePolicyConfig("act", "me/x", features, 10, "cpu", {"a": "b"})
     assert vars(loads(pickle.dumps(policy, protocol))) == vars(policy)
-    picture = np.arange(24, dtype=np.uint8).reshape(2, 4, 3)
+    image = np.arange(24, dtype=np.uint8).reshape(2, 4, 3)
     sent = {
         "a.pos": 1.5,
         "b.pos": np.float32(2.5),
-        "front": picture,
-        "wrist": picture[:, ::2],
+        "front": image,
+        "wrist": image[:, ::2],
         "depth": torch.arange(6.0).reshape(2, 3),
         "task": "Place it.",
     }

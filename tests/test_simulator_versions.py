@@ -1,8 +1,8 @@
 from simulator_versions import Measured, Outcome, from_dict, table
 
 
-def outcome(states: str, pictures: str, error_mm: float = 0.31) -> Outcome:
-    return Outcome(states, pictures, successes=9, episodes=10, worst_error_mm=error_mm)
+def outcome(states: str, images: str, error_mm: float = 0.31) -> Outcome:
+    return Outcome(states, images, successes=9, episodes=10, worst_error_mm=error_mm)
 
 
 def test_the_table_marks_what_equals_the_reference() -> None:
@@ -20,7 +20,7 @@ def test_the_table_marks_what_equals_the_reference() -> None:
         }
     )
     head, _, *rows = table([reference, other], reference)
-    assert head == "| MuJoCo | robot | states | pictures | none |"
+    assert head == "| MuJoCo | robot | states | images | none |"
     assert [row.strip("| ").split(" | ") for row in rows] == [
         ["3.8.1", "scara", "ca978112 =", "3e23e816 =", "9/10, 0.3 mm"],
         ["3.8.1", "fetch", "2e7d2c03 =", "18ac3e73 =", "9/10, 0.3 mm"],

@@ -187,7 +187,7 @@ def test_depth_follows_the_crop(monkeypatch: pytest.MonkeyPatch) -> None:
     policy(batch)
     points = seen[0][0]
     depth, width = points[..., 2], SIZE / 2 / policy.ego3d.lattice_size
-    # the depth says which line and column of the whole picture a point was read from
+    # the depth says which line and column of the whole image a point was read from
     lines, columns = depth.long() - 1, ((depth % 1) * 100).round()
     assert torch.equal(lines[1:, 0] - lines[:-1, 0], torch.full((15,), int(2 * width / 2)))
     x_of_pixel = (columns - 31.5) / 80 * depth

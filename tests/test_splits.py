@@ -74,7 +74,7 @@ def test_splits_that_are_refused(train: list[int] | None, validation: list[int] 
 
 @pytest.mark.parametrize(
     ("episodes", "eval_split", "expected"),
-    # sentences of the five episodes: a b a c b; of each the last ceil(half) are held out
+    # instructions of the five episodes: a b a c b; of each the last ceil(half) are held out
     [(None, 0.0, [0, 1, 2, 3, 4]), ([0, 2, 3], 0.0, [0, 2, 3]), (None, 0.5, [0, 1]), ([0, 2, 3], 0.4, [0])],
 )
 def test_trained_episodes_are_those_that_lerobot_trains_on(

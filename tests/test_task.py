@@ -109,11 +109,11 @@ def test_the_board_tells_only_that_the_target_is_free_and_legal(
         assert for_one == for_other
 
 
-def test_the_sentence_names_colour_row_and_column() -> None:
+def test_the_instruction_names_colour_row_and_column() -> None:
     episode = sample_episode(EpisodeSpec(seed=0, target=(3, 4), color="black"))
-    sentences = {t.format(color="black", row=3, column=4) for t in TEMPLATES}
-    assert "Place a black stone on the Go board at row 3, column 4." in sentences
-    assert episode.instruction in sentences
+    instructions = {t.format(color="black", row=3, column=4) for t in TEMPLATES}
+    assert "Place a black stone on the Go board at row 3, column 4." in instructions
+    assert episode.instruction in instructions
 
 
 def test_the_target_is_where_its_row_and_column_say() -> None:
@@ -121,7 +121,7 @@ def test_the_target_is_where_its_row_and_column_say() -> None:
     np.testing.assert_allclose(corner, [0.09, 0.09, 0.0095], atol=1e-12)
 
 
-def test_splits_share_no_intersection_and_no_sentence() -> None:
+def test_splits_share_no_intersection_and_no_instruction() -> None:
     assert len(targets_of("train")) == 20 and len(HELDOUT_TARGETS) == 5
     assert set(targets_of("train")) | set(HELDOUT_TARGETS) == set(targets_of("all"))
     # training still shows every row and every column

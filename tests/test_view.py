@@ -40,7 +40,7 @@ class Played(NamedTuple):
     states: list[PrivilegedState]
     actions: list[np.ndarray]
     infos: list[dict[str, Any]]
-    pictures: list[Any]
+    images: list[Any]
 
 
 @pytest.fixture(scope="module")
@@ -48,7 +48,7 @@ def played() -> Played:
     env = make_env(SPEC, OPTIONS)
     observation, info = env.reset(seed=SPEC.seed)
     instruction = env.get_wrapper_attr("task_description")
-    observations, infos, actions, pictures = [observation], [info], [], [env.render()]
+    observations, infos, actions, images = [observation], [info], [], [env.render()]
     ended = False
     while not ended:
         state = PrivilegedState.from_vector(observation["environment_state"])
@@ -56,11 +56,11 @@ def played() -> Played:
         observation, _, terminated, truncated, info = env.step(actions[-1])
         observations.append(observation)
         infos.append(info)
-        pictures.append(env.render())
+        images.append(env.render())
         ended = terminated or truncated
     env.close()
     states = [PrivilegedState.from_vector(o["environment_state"]) for o in observations]
-    return Played(instruction, observations, states, actions, infos, pictures)
+    return Played(instruction, observations, states, actions, infos, images)
 
 
 @pytest.fixture(scope="module")
@@ -178,9 +178,9 @@ def test_the_video_shows_every_moment(viewed: Path, played: Played) -> None:
         assert (stream.codec_context.name, stream.pix_fmt, stream.average_rate) == ("h264", "yuv420p", 5)
         frames = [frame.to_ndarray(format="rgb24") for frame in video.decode(stream)]
     assert len(frames) == len(played.actions) + 1
-    for frame, picture in zip(frames, played.pictures, strict=True):
-        assert psnr(frame, picture) > 30
-    assert psnr(frames[-2], played.pictures[-1]) < psnr(frames[-1], played.pictures[-1]) - 3
+    for frame, image in zip(frames, played.images, strict=True):
+        assert psnr(frame, image) > 30
+    assert psnr(frames[-2], played.images[-1]) < psnr(frames[-1], played.images[-1]) - 3
 
 
 def psnr(one: np.ndarray, other: np.ndarray) -> float:

@@ -13,7 +13,7 @@ GROUP_CHANNELS = 8  # of the group normalisation
 @PreTrainedConfig.register_subclass("keypoint_probe")
 @dataclass
 class KeypointProbeConfig(PreTrainedConfig):
-    """Keypoints of every camera, the robot's state and the sentence's words -> the next action."""
+    """Keypoints of every camera, the robot's state and the instruction's words -> the next action."""
 
     n_obs_steps: int = 1
     normalization_mapping: dict[str, NormalizationMode] = field(
@@ -32,7 +32,7 @@ class KeypointProbeConfig(PreTrainedConfig):
     initial_sharpness: float = 5.0
     # sines and cosines of each state number: with them a small network resolves millimetres sooner
     num_state_octaves: int = 2
-    # size of the sentence's embedding
+    # size of the instruction's embedding
     word_dim: int = 32
     # units of each hidden layer
     hidden_dim: int = 256

@@ -1,10 +1,10 @@
-"""``keypoint_probe``: where things are in the images, what the arm feels, what the sentence says.
+"""``keypoint_probe``: where things are in the images, what the arm feels, what the instruction says.
 
 Source of the keypoints: the spatial softmax of Finn et al. (2016), "Deep spatial autoencoders for
 visuomotor learning".
 
 Shapes: `B` batch, `K` keypoints of a camera, `H` and `W` of its heat maps, `S` state dims, `D` action dims,
-`L` words of a sentence.
+`L` words of a instruction.
 """
 
 import torch
@@ -99,8 +99,8 @@ class KeypointProbePolicy(PreTrainedPolicy):
         state_BS = batch[OBS_STATE]
         octaves = 2.0 ** torch.arange(self.config.num_state_octaves, device=state_BS.device)
         phases = (torch.pi / 2 * state_BS[..., None] * octaves).flatten(1)
-        sentence = self.words(batch[OBS_LANGUAGE_TOKENS])
-        return self.head(torch.cat([*keypoints, state_BS, phases.sin(), phases.cos(), sentence], dim=1))
+        instruction = self.words(batch[OBS_LANGUAGE_TOKENS])
+        return self.head(torch.cat([*keypoints, state_BS, phases.sin(), phases.cos(), instruction], dim=1))
 
 
 def _convolution(channels_in: int, channels_out: int, kernel: int, stride: int) -> list[nn.Module]:

@@ -1,4 +1,4 @@
-"""Processors of ``keypoint_probe``: LeRobot's default pipelines plus the numbers of the sentence's words."""
+"""Processors of ``keypoint_probe``: LeRobot's default pipelines plus the numbers of the instruction words."""
 
 import zlib
 from dataclasses import dataclass
@@ -19,16 +19,16 @@ from torch import Tensor
 from lerobot_bomb.vlm.task_tokenizer import make_task_processors
 from lerobot_policy_keypoint_probe.configuration_keypoint_probe import KeypointProbeConfig
 
-NO_WORD = 0  # fills up short sentences
+NO_WORD = 0  # fills up short instructions
 NUM_WORD_IDS = 4096
 
 
-def word_ids(sentence: str) -> list[int]:
+def word_ids(instruction: str) -> list[int]:
     """Numbers in 1..NUM_WORD_IDS - 1 of what stands between spaces, punctuation included.
 
     No vocabulary and no parsing: "(2," and "2)." are words like any other.
     """
-    return [1 + zlib.crc32(word.encode()) % (NUM_WORD_IDS - 1) for word in sentence.split()]
+    return [1 + zlib.crc32(word.encode()) % (NUM_WORD_IDS - 1) for word in instruction.split()]
 
 
 @ProcessorStepRegistry.register("keypoint_probe_words")

@@ -1,4 +1,4 @@
-"""Draws the README's pictures: `python docs/media/render.py`."""
+"""Draws the README's images: `python docs/media/render.py`."""
 
 from pathlib import Path
 
@@ -10,18 +10,18 @@ from lerobot_bomb.envs.rollout import expert_agent, play
 from lerobot_env_bomb.env import BombEnv
 
 SEED = 9  # many stones on the board
-GIF_PAUSE = 8  # frames that the last picture stays
+GIF_PAUSE = 8  # frames that the last image stays
 
 
 def main() -> None:
-    """Play one episode of the expert; write its first picture and all of them as an animation."""
+    """Play one episode of the expert; write its first image and all of them as an animation."""
     folder = Path(__file__).parent
     spec = EpisodeSpec(seed=SEED)
     env = BombEnv(spec)
-    pictures = [env.render() for _ in play(env, spec, expert_agent(spec))]
+    images = [env.render() for _ in play(env, spec, expert_agent(spec))]
     env.close()
-    iio.imwrite(folder / "scene.png", pictures[0])
-    frames = np.stack([*pictures, *[pictures[-1]] * GIF_PAUSE])
+    iio.imwrite(folder / "scene.png", images[0])
+    frames = np.stack([*images, *[images[-1]] * GIF_PAUSE])
     iio.imwrite(folder / "episode.gif", frames[:, ::2, ::2], duration=100, loop=0)
 
 

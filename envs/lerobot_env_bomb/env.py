@@ -33,7 +33,7 @@ from lerobot_env_bomb.spaces import action_space, observation_space
 Observation = dict[str, Any]
 DEFAULT_SPEC = EpisodeSpec(seed=0)
 DEFAULT_RENDER_OPTIONS = RenderOptions()
-PERSON_IMAGE_SIZE = 384  # pixels, either half of render()'s picture
+PERSON_IMAGE_SIZE = 384  # pixels, either half of render()'s image
 
 
 @dataclass(frozen=True)
@@ -47,9 +47,9 @@ class _Run:
 
 
 class BombEnv(gymnasium.Env[Observation, np.ndarray]):
-    """Task: place a Go stone on the intersection that a sentence names by row and column.
+    """Task: place a Go stone on the intersection that a instruction names by row and column.
 
-    Randomizations: target (always free and legal), colour, sentence, 0-8 stones on the board, gripper
+    Randomizations: target (always free and legal), colour, instruction, 0-8 stones on the board, gripper
     and stone at the start.
     Success: see `Judge`. Reward is 1 on the step that ends in success, else 0.
 
@@ -143,7 +143,7 @@ class BombEnv(gymnasium.Env[Observation, np.ndarray]):
         return transition
 
     def render(self) -> np.ndarray | None:
-        """(H, W, 3) uint8 picture for people: both cameras, the instruction, how the episode stands.
+        """(H, W, 3) uint8 image for people: both cameras, the instruction, how the episode stands.
 
         None, and a warning, in an environment that was made with render_mode=None.
         """
@@ -151,13 +151,13 @@ class BombEnv(gymnasium.Env[Observation, np.ndarray]):
         if self.render_mode is None:
             gymnasium.logger.warn("render() draws nothing: make the environment with render_mode='rgb_array'")
             return None
-        pictures = [self._draw(camera, PERSON_IMAGE_SIZE) for camera in CAMERAS]
+        images = [self._draw(camera, PERSON_IMAGE_SIZE) for camera in CAMERAS]
         row, column = run.episode.target
         error_mm = run.judge.placement_error_mm
         outcome = f"failed: {run.judge.failure}" if run.judge.failure else f"stage: {run.judge.stage}"
         outcome = "success" if run.judge.is_success else outcome
         status = f"target row {row}, column {column}   error {error_mm:.0f} mm   {outcome}"
-        return compose_caption(pictures, [run.episode.instruction, status])
+        return compose_caption(images, [run.episode.instruction, status])
 
     def episode_result(self) -> EpisodeResult:
         """What became of the episode that has just ended."""
@@ -239,32 +239,32 @@ class BombEnv(gymnasium.Env[Observation, np.ndarray]):
         state = self.privileged_state()
         views = {camera: self._view(camera) for camera in CAMERAS}
         return {
-            PIXELS: {camera: picture for camera, (picture, _) in views.items()},
+            PIXELS: {camera: image for camera, (image, _) in views.items()},
             AGENT_POS: np.array([*state.gripper_xyz, state.finger_opening], dtype=np.float32),
             ENVIRONMENT_STATE: state.to_vector(),
             **{key: value for _, geometry in views.values() for key, value in geometry.items()},
         }
 
     def _view(self, camera: str) -> tuple[np.ndarray, dict[str, np.ndarray]]:
-        """(H, W, 3) uint8 picture; depth, intrinsics and extrinsics by key, if they are asked for."""
+        """(H, W, 3) uint8 image; depth, intrinsics and extrinsics by key, if they are asked for."""
         scene, size = self._run.scene, self._render_options.image_size
         if not self._render_options.depth:
             return self._draw(camera, size), {}
-        picture, depth_m = self._camera_renderer.draw_depth(scene.data, camera, size)
-        return self._sense(picture, camera), {
+        image, depth_m = self._camera_renderer.draw_depth(scene.data, camera, size)
+        return self._sense(image, camera), {
             f"depth.{camera}": depth_m,
             f"intrinsics.{camera}": intrinsics(scene.model, camera, size),
             f"extrinsics.{camera}": extrinsics(scene.data, camera),
         }
 
     def _draw(self, camera: str, size: int) -> np.ndarray:
-        """(size, size, 3) uint8 picture."""
+        """(size, size, 3) uint8 image."""
         return self._sense(self._camera_renderer.draw(self._run.scene.data, camera, size), camera)
 
-    def _sense(self, picture: np.ndarray, camera: str) -> np.ndarray:
+    def _sense(self, image: np.ndarray, camera: str) -> np.ndarray:
         """The image as the camera's sensor takes it in this step."""
         number = len(CAMERAS) * self._steps + CAMERAS.index(camera)
-        return self._run.episode.perturbation.sense(picture, number)
+        return self._run.episode.perturbation.sense(image, number)
 
     @property
     def _camera_renderer(self) -> CameraRenderer:

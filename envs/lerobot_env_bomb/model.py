@@ -55,9 +55,9 @@ def build_model(robot: Robot) -> mujoco.MjModel:
     return model
 
 
-def _paint(model: mujoco.MjModel, texture: str, picture: np.ndarray) -> None:
+def _paint(model: mujoco.MjModel, texture: str, image: np.ndarray) -> None:
     start = model.texture(texture).adr[0]
-    model.tex_data[start : start + picture.size] = picture.ravel()
+    model.tex_data[start : start + image.size] = image.ravel()
 
 
 def stone_name(index: int) -> str:
@@ -86,7 +86,7 @@ def parked_xyz(index: int) -> np.ndarray:
 
 
 def board_texture() -> np.ndarray:
-    """(TEXTURE_SIZE, TEXTURE_SIZE, 3) uint8 picture of the board: wood, grid lines, star point."""
+    """(TEXTURE_SIZE, TEXTURE_SIZE, 3) uint8 image of the board: wood, grid lines, star point."""
     metres = (np.arange(TEXTURE_SIZE) + 0.5) / TEXTURE_SIZE * 2 * BOARD_HALF_SIZE_M - BOARD_HALF_SIZE_M
     x, y = np.meshgrid(metres, metres)
     grain = 0.5 * np.sin(300 * y + 1.5 * np.sin(25 * x) + 6 * np.sin(17 * y)) + 0.5 * np.sin(

@@ -1,5 +1,5 @@
 # pyright: reportAttributeAccessIssue=false, reportInvalidTypeForm=false
-"""Pictures of BOMB's scene, fast enough for training data without a GPU."""
+"""Images of BOMB's scene, fast enough for training data without a GPU."""
 
 import atexit
 import ctypes
@@ -88,14 +88,14 @@ class CameraRenderer:
         atexit.register(self._free)
 
     def draw(self, data: mujoco.MjData, camera: str, size: int) -> np.ndarray:
-        """(size, size, 3) uint8 picture of a named camera."""
+        """(size, size, 3) uint8 image of a named camera."""
         viewport = self._render(data, camera, size)
         rgb = np.empty((size, size, 3), dtype=np.uint8)
         mujoco.mjr_readPixels(rgb, None, viewport, self._context)
         return rgb[::-1].copy()
 
     def draw_depth(self, data: mujoco.MjData, camera: str, size: int) -> tuple[np.ndarray, np.ndarray]:
-        """The same picture, and (size, size) float32 metres along the optical axis to what it shows."""
+        """The same image, and (size, size) float32 metres along the optical axis to what it shows."""
         viewport = self._render(data, camera, size)
         rgb = np.empty((size, size, 3), dtype=np.uint8)
         buffer = np.empty((size, size), dtype=np.float32)
@@ -157,11 +157,11 @@ def extrinsics(data: mujoco.MjData, camera: str) -> np.ndarray:
     return world_from_camera
 
 
-def compose_caption(pictures: list[np.ndarray], lines: list[str]) -> np.ndarray:
-    """(H, W, 3) uint8: pictures of equal size side by side over a bar of text lines."""
-    import cv2  # only people's pictures need it, and it is slow to import
+def compose_caption(images: list[np.ndarray], lines: list[str]) -> np.ndarray:
+    """(H, W, 3) uint8: images of equal size side by side over a bar of text lines."""
+    import cv2  # only people's images need it, and it is slow to import
 
-    row = np.concatenate(pictures, axis=1)
+    row = np.concatenate(images, axis=1)
     bar = np.full((CAPTION_LINE_PX * len(lines) + 8, row.shape[1], 3), CAPTION_BACKGROUND, dtype=np.uint8)
     for i, line in enumerate(lines):
         origin = (10, CAPTION_LINE_PX * (i + 1) - 4)

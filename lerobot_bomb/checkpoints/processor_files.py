@@ -163,7 +163,7 @@ def _check_statistics(step: Any, where: str, complete: bool) -> None:
         for name in STATISTICS.get(mode, ()):
             tensor = held.get(f"{key}.{name}")
             if tensor is None:
-                # pictures and arrays without statistics are left as they are
+                # images and arrays without statistics are left as they are
                 if complete and (len(feature.shape) == 1 or any(f.startswith(f"{key}.") for f in held)):
                     raise ValueError(f"{where}: its statistics lack {key}.{name}, which {mode.value} needs")
                 continue

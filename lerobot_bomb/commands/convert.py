@@ -72,7 +72,7 @@ def add_convert_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run_convert(args: argparse.Namespace) -> int:
-    """Convert as told; prints where the dataset is."""
+    """Convert; prints where the dataset is."""
     check_repo_id(args.repo_id)
     root = args.root or default_root(args.repo_id)
     with terminated_in_order():

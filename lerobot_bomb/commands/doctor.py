@@ -32,7 +32,7 @@ DEPENDENCIES = (
     "numpy",
 )
 # what it means that a version lies outside the declared range
-OUTSIDE = {"mujoco": ": episodes and pictures are not those of the protocol, and results do not compare"}
+OUTSIDE = {"mujoco": ": episodes and images are not those of the protocol, and results do not compare"}
 HUB_TIMEOUT_S = 5
 
 

@@ -26,7 +26,7 @@ from lerobot_bomb.data.columns import dim_names, read_columns, read_meta
 from lerobot_bomb.files import check_writable, written_whole
 from lerobot_bomb.flags import one_of
 from lerobot_bomb.tables import print_table
-from lerobot_bomb.viewing.grid_picture import Row, draw_rows
+from lerobot_bomb.viewing.grid_plot import Row, draw_rows
 
 UNIFORM, CLIPPING = "uniform mid", "clipping alone"
 
@@ -51,7 +51,7 @@ def add_fit_grid_arguments(parser: argparse.ArgumentParser) -> None:
     add("--policy.phi_fit", dest="phi_fit", default=default.phi_fit, help=phi_fit)
     mapping = """as JSON, of which ACTION is read: '{"ACTION": "QUANTILES"}' (default: MIN_MAX)"""
     add("--policy.normalization_mapping", dest="mapping", type=json_of(dict), default={}, help=mapping)
-    add("--picture", type=path_flag, help="also draw histograms with the edges into this file, as PNG")
+    add("--plot", type=path_flag, help="also draw histograms with the edges into this file, as PNG")
 
 
 def json_of(kind: type) -> Callable[[str], Any]:
@@ -68,9 +68,9 @@ def json_of(kind: type) -> Callable[[str], Any]:
 
 
 def run_fit_grid(args: argparse.Namespace) -> int:
-    """Fit, print the tables, draw the picture."""
-    if args.picture is not None:
-        check_writable("--picture", args.picture)
+    """Fit, print the tables, draw the plot."""
+    if args.plot is not None:
+        check_writable("--plot", args.plot)
     mode = args.mapping.get("ACTION", NormalizationMode.MIN_MAX)
     one_of("--policy.normalization_mapping[ACTION]", mode, [of.value for of in BOUND_STATISTICS])
     mode = NormalizationMode(mode)
@@ -92,14 +92,14 @@ def run_fit_grid(args: argparse.Namespace) -> int:
     print_errors("in normalised units", errors, names)
     physical = {name: error_D * (high_D - low_D) / 2 for name, error_D in errors.items()}
     print_errors("in the dataset's units", physical, names)
-    if args.picture is not None:
+    if args.plot is not None:
         title = (
             f"{meta.repo_id}: {len(actions_ND)} actions and the {grids.settings.distribution} bins of a grid"
         )
-        picture = draw_rows(title, picture_rows(grids, actions_ND.clip(-1, 1), names))
-        with written_whole(args.picture) as (path,):
-            Image.fromarray(picture).save(path, format="PNG")
-        print(f"\n{args.picture}")
+        plot = draw_rows(title, plot_rows(grids, actions_ND.clip(-1, 1), names))
+        with written_whole(args.plot) as (path,):
+            Image.fromarray(plot).save(path, format="PNG")
+        print(f"\n{args.plot}")
     return 0
 
 
@@ -159,8 +159,8 @@ def print_errors(unit: str, errors: dict[str, np.ndarray], names: list[str]) -> 
     )
 
 
-def picture_rows(grids: ActionGrids, actions_ND: np.ndarray, names: list[str]) -> list[Row]:
-    """What a picture shows of every coordinate."""
+def plot_rows(grids: ActionGrids, actions_ND: np.ndarray, names: list[str]) -> list[Row]:
+    """What a plot shows of every coordinate."""
     values_CN = grids.coordinates(torch.from_numpy(actions_ND).float()).T.numpy()
     rows = zip(
         coordinate_names(grids, names),

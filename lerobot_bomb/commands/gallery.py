@@ -57,9 +57,9 @@ def run_gallery(args: argparse.Namespace) -> int:
             EpisodeSpec(seed)
     for axis in tqdm(args.axes, unit="sheet"):
         path = args.output / f"{axis}.jpg"
-        picture = axis_sheet(axis, args.seeds, options).draw()
+        image = axis_sheet(axis, args.seeds, options).draw()
         with written_whole(path) as (unfinished,):
-            Image.fromarray(picture).save(unfinished, quality=JPEG_QUALITY)
+            Image.fromarray(image).save(unfinished, quality=JPEG_QUALITY)
         tqdm.write(str(path))
     if args.doc is not None:
         write_page(args.doc, args.output)
@@ -87,19 +87,19 @@ def axis_sheet(axis: str, seeds: Sequence[int], options: RenderOptions) -> Sheet
         look_at(f"{axis}:{level}" if level else NONE, seeds, options, "dynamics" in changes)
         for level in LEVELS
     ]
-    pictures: dict[str, list[np.ndarray]] = {}
+    images: dict[str, list[np.ndarray]] = {}
     for seed, of_seed in zip(seeds, zip(*looks, strict=True), strict=True):
         for camera in CAMERAS if "images" in changes else ():
-            pictures[f"{camera}, seed {seed}"] = [look.images[camera] for look in of_seed]
+            images[f"{camera}, seed {seed}"] = [look.images[camera] for look in of_seed]
         if "instruction" in changes:
             tiles = [text_tile(look.instruction, options.image_size) for look in of_seed]
-            pictures[f"instruction, seed {seed}"] = tiles
+            images[f"instruction, seed {seed}"] = tiles
         if "dynamics" in changes:
             paths = [look.path_xy for look in of_seed]
-            pictures[f"expert's path, seed {seed}"] = [
+            images[f"expert's path, seed {seed}"] = [
                 path_tile(path, paths[0], options.image_size) for path in paths
             ]
-    return Sheet(f"{axis}: {summary}", COLUMNS, {} if axis == ALL else magnitude_rows(axis), pictures)
+    return Sheet(f"{axis}: {summary}", COLUMNS, {} if axis == ALL else magnitude_rows(axis), images)
 
 
 def look_at(condition: str, seeds: Sequence[int], options: RenderOptions, played: bool) -> list[Look]:

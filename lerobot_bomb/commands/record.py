@@ -41,7 +41,7 @@ def add_record_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run_record(args: argparse.Namespace) -> int:
-    """Record as told; prints which episodes failed and where the dataset is."""
+    """Record; prints which episodes failed and where the dataset is."""
     flags = vars(args)
     recording = Recording(**{f.name: flags[f.name] for f in fields(Recording) if f.name in flags})
     if not 1 <= args.workers <= recording.episodes:

@@ -1,4 +1,4 @@
-"""Columns of a dataset, read without its pictures."""
+"""Columns of a dataset, read without its images."""
 
 from collections.abc import Iterable, Sequence
 from pathlib import Path
@@ -89,8 +89,8 @@ def episode_bounds(episode_index_N: np.ndarray) -> tuple[np.ndarray, np.ndarray]
 
 
 def _check_columns(meta: LeRobotDatasetMetadata, columns: list[str]) -> None:
-    pictures_and_texts = ("image", "video", "string", "language")
-    numeric = [key for key, feature in meta.features.items() if feature["dtype"] not in pictures_and_texts]
+    images_and_texts = ("image", "video", "string", "language")
+    numeric = [key for key, feature in meta.features.items() if feature["dtype"] not in images_and_texts]
     unknown = [key for key in columns if key not in numeric]
     if unknown:
         raise ValueError(f"dataset {meta.repo_id} has no columns {unknown}; it has {sorted(numeric)}")

@@ -221,7 +221,7 @@ def _check_tasks(root: Path, info: Info) -> None:
 
 
 def _check_statistics(root: Path, info: Info) -> None:
-    """Of every picture, number and vector; no policy normalises arrays."""
+    """Of every image, number and vector; no policy normalises arrays."""
     path = root / STATISTICS_FILE
     statistics = read_json(path)
     for name, feature in info["features"].items():

@@ -1,4 +1,4 @@
-"""Perturbation axis `photometric`: what a camera's sensor does to a picture."""
+"""Perturbation axis `photometric`: what a camera's sensor does to a image."""
 
 from dataclasses import dataclass
 from functools import lru_cache
@@ -8,8 +8,8 @@ import numpy as np
 
 from lerobot_bomb.bomb.perturbations import magnitude
 
-NOISE_SPAN = 1 << 16  # positions in the bank of noise at which a picture's noise may begin
-NOISE_STRIDE = 7919  # from one picture to the next; a prime
+NOISE_SPAN = 1 << 16  # positions in the bank of noise at which a image's noise may begin
+NOISE_STRIDE = 7919  # from one image to the next; a prime
 GAIN_BITS = 7  # of a gain's fraction
 
 
@@ -19,7 +19,7 @@ class Photometric:
 
     gains: tuple[float, float, float]
     noise: float  # standard deviation in grey levels
-    first: int  # where in the bank of noise the first picture's begins
+    first: int  # where in the bank of noise the first image's begins
 
     @classmethod
     def draw(cls, level: int, rng: np.random.Generator) -> Self:
@@ -29,9 +29,9 @@ class Photometric:
         noise = magnitude("photometric", "noise", level)
         return cls((red, green, blue), noise, int(rng.integers(NOISE_SPAN)))
 
-    def __call__(self, rgb: np.ndarray, picture: int) -> np.ndarray:
-        """(H, W, 3) uint8 -> the same, of the `picture`-th picture of an episode."""
-        start = (self.first + picture * NOISE_STRIDE) % NOISE_SPAN
+    def __call__(self, rgb: np.ndarray, image: int) -> np.ndarray:
+        """(H, W, 3) uint8 -> the same, of the `image`-th image of an episode."""
+        start = (self.first + image * NOISE_STRIDE) % NOISE_SPAN
         noise = _noise_bank(rgb.size, self.noise)[start : start + rgb.size].reshape(rgb.shape)
         values = rgb * _gain_table(self.gains, rgb.shape)
         values >>= GAIN_BITS
@@ -42,11 +42,11 @@ class Photometric:
 
 @lru_cache(maxsize=8)
 def _noise_bank(size: int, std: float) -> np.ndarray:
-    """(size + NOISE_SPAN,) int16 normal noise, the same in every process; drawing it per picture is slow."""
+    """(size + NOISE_SPAN,) int16 normal noise, the same in every process; drawing it per image is slow."""
     return np.rint(std * np.random.default_rng(0).standard_normal(size + NOISE_SPAN)).astype(np.int16)
 
 
 @lru_cache(maxsize=8)
 def _gain_table(gains: tuple[float, float, float], shape: tuple[int, int, int]) -> np.ndarray:
-    """Gain of every value of a picture, in fixed point: multiplying by it whole is fast."""
+    """Gain of every value of a image, in fixed point: multiplying by it whole is fast."""
     return np.broadcast_to(np.rint(np.array(gains) * (1 << GAIN_BITS)).astype(np.uint16), shape).copy()

@@ -42,11 +42,11 @@ class Group:
         conditions = {row["spec"]["perturbations"] for row in self.rows}
         asked += [f"perturbations={conditions.pop()}"] if len(conditions) == 1 else []
         seeds = _ranges(row["spec"]["seed"] for row in self.rows)
-        pictures = f"{first['image_size']} px, render_preset {self.settings['render_preset']}"
+        images = f"{first['image_size']} px, render_preset {self.settings['render_preset']}"
         return [
             f"policy {describe_policy(first)}; {describe_tasks(self.rows)}",
             f"protocol {first['protocol_version']}, {', '.join(asked)}, seeds {seeds}",
-            f"{pictures}, OpenGL {self.settings['OpenGL']}, MuJoCo {self.settings['MuJoCo']}, "
+            f"{images}, OpenGL {self.settings['OpenGL']}, MuJoCo {self.settings['MuJoCo']}, "
             + ", ".join(f"{name} {self._values(key)}" for name, key in LISTED.items()),
         ]
 

@@ -42,7 +42,7 @@ def parse_episodes(flag: str, text: str, num_episodes: int) -> list[int]:
 
 
 def read_train_config(checkpoint: Path) -> dict[str, Any]:
-    """What lerobot-train was told; empty if the checkpoint does not say."""
+    """What lerobot-train was given; empty if the checkpoint does not say."""
     path = checkpoint / TRAIN_CONFIG
     return json.loads(path.read_text()) if path.is_file() else {}
 

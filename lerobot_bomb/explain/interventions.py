@@ -45,9 +45,9 @@ class BlankImages(ObservationProcessorStep):
 @ProcessorStepRegistry.register("bomb_replace_tasks")
 @dataclass
 class ReplaceTasks(ComplementaryDataProcessorStep):
-    """The policy is told another instruction; one that has no replacement is an error."""
+    """The policy is given another instruction; one that has no replacement is an error."""
 
-    replacements: dict[str, str]  # instruction -> what the policy is told instead
+    replacements: dict[str, str]  # instruction -> what the policy is given instead
 
     def __post_init__(self) -> None:
         if not isinstance(self.replacements, dict) or not self.replacements:

@@ -1,4 +1,4 @@
-"""``docs/perturbations.md``, generated: the table of the code, its sheets, and sentences of its episodes."""
+"""``docs/perturbations.md``, generated: the table of the code, its sheets, and example instructions."""
 
 import os
 from pathlib import Path
@@ -9,7 +9,7 @@ from lerobot_bomb.bomb.perturbations import ALL, AXES, MAX_LEVEL, Axis, magnitud
 from lerobot_bomb.envs.rollout import make_env
 from lerobot_bomb.files import written_whole
 
-# the episode whose sentences the page quotes
+# the episode whose instructions the page quotes
 SEED, TARGET, COLOR = 0, (3, 4), "black"
 LEVELS = range(1, MAX_LEVEL + 1)
 
@@ -53,28 +53,28 @@ def write_page(path: Path, sheets: Path) -> None:
     """Write the page; it links the sheets in the folder `sheets`."""
     link = Path(os.path.relpath(sheets, path.parent)).as_posix()
     with written_whole(path) as (unfinished,):
-        unfinished.write_text(page(example_sentences(), link))
+        unfinished.write_text(page(example_instructions(), link))
 
 
-def page(sentences: list[str], sheets: str) -> str:
+def page(instructions: list[str], sheets: str) -> str:
     """The Markdown text, with an instruction per level of `language` from 0 on and a link to the sheets."""
     sections = [_section(name, axis, sheets) for name, axis in AXES.items()]
     position = list(AXES).index("language")
-    sections[position] += _forms(sentences)
-    everything = f"## {ALL}\n\nEvery nuisance axis at the same level.\n\n{_picture(ALL, sheets)}"
+    sections[position] += _forms(instructions)
+    everything = f"## {ALL}\n\nEvery nuisance axis at the same level.\n\n{_image(ALL, sheets)}"
     return "\n".join([INTRODUCTION, _floors(), *sections, everything])
 
 
-def example_sentences() -> list[str]:
+def example_instructions() -> list[str]:
     """The instruction of one episode at the levels 0..5 of `language`."""
-    sentences = []
+    instructions = []
     for level in (0, *LEVELS):
         spec = EpisodeSpec(SEED, target=TARGET, color=COLOR, perturbations=f"language:{level}")
         env = make_env(spec, RenderOptions(image_size=32))
         env.reset(seed=spec.seed)
-        sentences.append(env.get_wrapper_attr("task_description"))
+        instructions.append(env.get_wrapper_attr("task_description"))
         env.close()
-    return sentences
+    return instructions
 
 
 def _section(name: str, axis: Axis, sheets: str) -> str:
@@ -89,18 +89,18 @@ def _section(name: str, axis: Axis, sheets: str) -> str:
     for quantity, size in axis.magnitudes.items():
         values = " | ".join(f"{value:g}" for value in size.levels)
         lines.append(f"| {quantity} | {values} | {size.unit} | {size.what} |")
-    return "\n".join([*lines, "", _picture(name, sheets)])
+    return "\n".join([*lines, "", _image(name, sheets)])
 
 
-def _picture(name: str, sheets: str) -> str:
+def _image(name: str, sheets: str) -> str:
     return f"![{name} at its levels]({sheets}/{name}.jpg)\n"
 
 
-def _forms(sentences: list[str]) -> str:
+def _forms(instructions: list[str]) -> str:
     """The same goal, said in the form of each level."""
-    rows = [f"| {level} | {sentence} |" for level, sentence in enumerate(sentences)]
+    rows = [f"| {level} | {instruction} |" for level, instruction in enumerate(instructions)]
     head = f"One goal, a {COLOR} stone on row {TARGET[0]}, column {TARGET[1]}, in the form of each level:"
-    return "\n".join(["", head, "", "| level | sentence |", "|---|---|", *rows, ""])
+    return "\n".join(["", head, "", "| level | instruction |", "|---|---|", *rows, ""])
 
 
 def _floors() -> str:

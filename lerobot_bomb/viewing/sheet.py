@@ -1,4 +1,4 @@
-"""Contact sheets: rows of small pictures and of numbers under columns that have names."""
+"""Contact sheets: rows of small images and of numbers under columns that have names."""
 
 from dataclasses import dataclass, field
 from functools import cache
@@ -21,13 +21,13 @@ class Sheet:
     title: str
     columns: list[str]
     texts: dict[str, list[str]] = field(default_factory=dict)  # row label -> words under each column
-    pictures: dict[str, list[np.ndarray]] = field(default_factory=dict)  # -> (H, W, 3) uint8 tiles, all alike
+    images: dict[str, list[np.ndarray]] = field(default_factory=dict)  # -> (H, W, 3) uint8 tiles, all alike
 
     def draw(self) -> np.ndarray:
         """(H, W, 3) uint8; the tiles are in it as they are, at `tile_origin`."""
         tile_height, tile_width = self._tile_shape
         width = LABEL_WIDTH + len(self.columns) * (tile_width + GAP)
-        height = self._top + len(self.pictures) * (tile_height + GAP)
+        height = self._top + len(self.images) * (tile_height + GAP)
         sheet = Image.new("RGB", (width, height), PAPER)
         pen = ImageDraw.Draw(sheet)
         pen.text((GAP, GAP), self.title, INK, font(TITLE_SIZE))
@@ -36,7 +36,7 @@ class Sheet:
             pen.text((GAP, y), label, INK, font(FONT_SIZE))
             for column, word in enumerate(words):
                 pen.text((LABEL_WIDTH + column * (tile_width + GAP) + GAP, y), word, INK, font(FONT_SIZE))
-        for row, (label, tiles) in enumerate(self.pictures.items()):
+        for row, (label, tiles) in enumerate(self.images.items()):
             pen.text((GAP, self.tile_origin(row, 0)[0] + GAP), label, INK, font(FONT_SIZE))
             for column, tile in enumerate(tiles):
                 y, x = self.tile_origin(row, column)
@@ -51,7 +51,7 @@ class Sheet:
     @property
     def _tile_shape(self) -> tuple[int, int]:
         """(height, width) in pixels."""
-        return next(iter(self.pictures.values()))[0].shape[:2]
+        return next(iter(self.images.values()))[0].shape[:2]
 
     @property
     def _top(self) -> int:
@@ -59,7 +59,7 @@ class Sheet:
 
 
 def text_tile(text: str, size: int) -> np.ndarray:
-    """(size, size, 3) uint8: a sentence, broken into lines; what does not fit is cut off."""
+    """(size, size, 3) uint8: a instruction, broken into lines; what does not fit is cut off."""
     tile = Image.new("RGB", (size, size), TILE_PAPER)
     face = font(FONT_SIZE)
     lines = [""]

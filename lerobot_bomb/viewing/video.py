@@ -1,4 +1,4 @@
-"""Pictures as an MP4 that browsers play."""
+"""Images as an MP4 that browsers play."""
 
 from fractions import Fraction
 from pathlib import Path
@@ -9,12 +9,12 @@ import numpy as np
 from av.video.stream import VideoStream
 
 CODEC = "libx264"
-QUALITY = "18"  # constant rate factor: hardly to be told from the pictures
+QUALITY = "18"  # constant rate factor: hardly to be told from the images
 PIXEL_FORMAT = "yuv420p"  # the one that all browsers play; width and height must be even
 
 
 class VideoFile:
-    """H.264 in an MP4, written picture by picture."""
+    """H.264 in an MP4, written image by image."""
 
     def __init__(self, path: Path, fps: int) -> None:
         # the index first, so that a browser starts before it has the whole file
@@ -22,10 +22,10 @@ class VideoFile:
         self._fps = fps
         self._stream: VideoStream | None = None
 
-    def add(self, picture: np.ndarray) -> None:
-        """Append (H, W, 3) uint8; all pictures have the size of the first."""
-        height, width = picture.shape[:2]
-        even = np.pad(picture, ((0, height % 2), (0, width % 2), (0, 0)), mode="edge")
+    def add(self, image: np.ndarray) -> None:
+        """Append (H, W, 3) uint8; all images have the size of the first."""
+        height, width = image.shape[:2]
+        even = np.pad(image, ((0, height % 2), (0, width % 2), (0, 0)), mode="edge")
         if self._stream is None:
             self._stream = self._file.add_stream(CODEC, rate=Fraction(self._fps), options={"crf": QUALITY})
             self._stream.height, self._stream.width = even.shape[:2]

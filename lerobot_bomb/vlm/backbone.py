@@ -87,7 +87,7 @@ def load_backbone(vlm_model_name: str, changes: Mapping[str, Any] | None = None)
     """
     if vlm_model_name == NANO:
         backbone = build_backbone(changed(nano_config(load_tokenizer(NANO)), changes))
-        spread_pictures(backbone.vlm.model.vision_model)
+        spread_images(backbone.vlm.model.vision_model)
         return backbone
     config = read_vlm_config(vlm_model_name, SmolVLMBackbone.family)
     with weights_errors(vlm_model_name):
@@ -147,12 +147,12 @@ def weights_errors(vlm_model_name: str) -> Iterator[None]:
 
 
 @torch.no_grad()
-def spread_pictures(vision_model: nn.Module) -> None:
-    """Let random weights tell different pictures apart, and go on doing so while they are trained.
+def spread_images(vision_model: nn.Module) -> None:
+    """Let random weights tell different images apart, and go on doing so while they are trained.
 
-    Most of a robot's picture is even and never changes: filters of zero mean turn an even patch into nothing.
+    Most of a robot's image is even and never changes: filters of zero mean turn an even patch into nothing.
     Patch and position embeddings start at unit scale: at that of the other weights, what Adam's first hundred
-    steps add to the vision model's biases is larger, and every picture's features become the same.
+    steps add to the vision model's biases is larger, and every image's features become the same.
     """
     embeddings = next(module for name, module in vision_model.named_modules() if name.endswith("embeddings"))
     filters = embeddings.get_submodule("patch_embedding").weight
@@ -164,7 +164,7 @@ def spread_pictures(vision_model: nn.Module) -> None:
 
 @torch.no_grad()
 def spread_filters(filters: Tensor) -> None:
-    """What `spread_pictures` does to the filters that embed patches, (channels, ...)."""
+    """What `spread_images` does to the filters that embed patches, (channels, ...)."""
     filters -= filters.flatten(1).mean(dim=1).view(-1, *[1] * (filters.ndim - 1))
     filters /= INITIALIZER_RANGE
 

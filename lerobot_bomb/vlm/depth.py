@@ -1,6 +1,6 @@
-"""Depth of a policy's pictures: observed or estimated, at the points where a position encoding wants it.
+"""Depth of a policy's images: observed or estimated, at the points where a position encoding wants it.
 
-Shapes: `B` batch, `H` and `W` sides of a picture, `S` of a square one, `R` of the lattice of points.
+Shapes: `B` batch, `H` and `W` sides of a image, `S` of a square one, `R` of the lattice of points.
 Depth is in metres along the optical axis; what is not finite or not positive is no depth.
 """
 
@@ -24,11 +24,11 @@ ZOEDEPTH_MARGIN = 3  # the margin is this many times sqrt(size / 2), as the mode
 
 
 def observed_depth(batch: Mapping[str, Tensor], camera: str, image_size: tuple[int, int]) -> Tensor:
-    """(B, H, W) metres of a camera's whole pictures, NaN where there is none. It may come as (B, 1, H, W).
+    """(B, H, W) metres of a camera's whole images, NaN where there is none. It may come as (B, 1, H, W).
 
     Raises:
         KeyError: it is missing.
-        ValueError: it is not that of pictures of ``image_size`` (height, width), or not in metres.
+        ValueError: it is not that of images of ``image_size`` (height, width), or not in metres.
     """
     key = f"observation.depth.{camera}"
     if key not in batch:
@@ -41,7 +41,7 @@ def observed_depth(batch: Mapping[str, Tensor], camera: str, image_size: tuple[i
     if depth_BHW.ndim != 3 or depth_BHW.shape[1:] != image_size or not depth.is_floating_point():
         raise ValueError(
             f"batch[{key!r}] is {depth.dtype} of shape {tuple(depth.shape)}; expected float metres of shape "
-            f"(batch, {image_size[0]}, {image_size[1]}): those of the pixels of the camera's picture"
+            f"(batch, {image_size[0]}, {image_size[1]}): those of the pixels of the camera's image"
         )
     depth_BHW = _without_invalid(depth_BHW.float())
     medians_B = depth_BHW[:, ::CHECK_STRIDE, ::CHECK_STRIDE].flatten(1).nanmedian(dim=1).values
@@ -59,7 +59,7 @@ def observed_intrinsics(
     camera_intrinsics: Mapping[str, list[list[float]]],
     default_K_133: Tensor | None = None,
 ) -> Tensor:
-    """K, (B, 3, 3) or (1, 3, 3), of a camera's whole pictures, counted from their edges.
+    """K, (B, 3, 3) or (1, 3, 3), of a camera's whole images, counted from their edges.
 
     What the configuration says in ``camera_intrinsics`` goes before the observation's, and that before
     ``default_K_133``. The former two count from the centre of the top left pixel.
@@ -85,7 +85,7 @@ def observed_intrinsics(
 
 
 def lattice_points(depth_BHW: Tensor, K_B33: Tensor, size: int) -> Tensor:
-    """Depth and K of the same pictures -> (B, R, R, 3) metres at the centres of R = ``size`` cells a side.
+    """Depth and K of the same images -> (B, R, R, 3) metres at the centres of R = ``size`` cells a side.
 
     NaN where there is no depth. Each point takes the depth of the pixel that it lies in. The original
     pools, which blends near and far at edges: that puts 7 % of BOMB's points more than 10 mm off, this 0.6 %.
@@ -108,7 +108,7 @@ def _without_invalid(depth: Tensor) -> Tensor:
 
 
 class ZoeDepth(nn.Module):
-    """Pictures (B, 3, S, S) in [-1, 1] -> (B, S, S) metres, by a frozen ``ZoeDepthForDepthEstimation``."""
+    """Images (B, 3, S, S) in [-1, 1] -> (B, S, S) metres, by a frozen ``ZoeDepthForDepthEstimation``."""
 
     def __init__(self, model: "ZoeDepthForDepthEstimation"):
         super().__init__()

@@ -1,6 +1,6 @@
 """Ego3D position encoding: tells each image patch where in the camera's frame it lies.
 
-SpatialVLA (Qu et al. 2025). Shapes: `B` batch, `P` patches of a picture, `R` side of the lattice of points,
+SpatialVLA (Qu et al. 2025). Shapes: `B` batch, `P` patches of a image, `R` side of the lattice of points,
 `E` numbers that encode a point or a patch's points, `H` hidden size of the vision model.
 """
 
@@ -26,9 +26,9 @@ def encode_points(points: Tensor, num_freqs: int) -> Tensor:
 class Ego3D(nn.Module):
     """(B, R, R, 3) points of the camera's frame, metres, NaN without depth -> (B, P, H) to add to features.
 
-    R = patches_per_side * patch_reso. Points lie at the centres of R x R cells of the picture, as
+    R = patches_per_side * patch_reso. Points lie at the centres of R x R cells of the image, as
     `lattice_points` gives them. Where there is no depth, a learned vector stands for a point's encoding; so a
-    picture without depth is NaN everywhere. With ``zero_init`` the result is exactly zero before training.
+    image without depth is NaN everywhere. With ``zero_init`` the result is exactly zero before training.
     """
 
     def __init__(

@@ -14,15 +14,15 @@ LANCZOS_LOBES = 3
 
 @dataclass(frozen=True)
 class CropWindows:
-    """Where each picture of a batch is cut, in its pixels; all windows are equally large."""
+    """Where each image of a batch is cut, in its pixels; all windows are equally large."""
 
     offsets: Tensor  # (B, 2) integers: first line and first column of each window
     height: int
     width: int
-    image_size: tuple[int, int]  # height, width of the whole pictures
+    image_size: tuple[int, int]  # height, width of the whole images
 
     def cut(self, images_BxHW: Tensor) -> Tensor:
-        """(B, ..., H, W) -> (B, ..., height, width): pictures, or what lies on the same pixels, as depth."""
+        """(B, ..., H, W) -> (B, ..., height, width): images, or what lies on the same pixels, as depth."""
         offsets = self.offsets.tolist()
         return torch.stack(
             [
@@ -33,7 +33,7 @@ class CropWindows:
 
 
 def draw_windows(images_BxHW: Tensor, crop_fraction: float, generator: torch.Generator | None) -> CropWindows:
-    """Windows of ``crop_fraction`` of either side of (B, ..., H, W) pictures.
+    """Windows of ``crop_fraction`` of either side of (B, ..., H, W) images.
 
     Each at a place of its own drawn from ``generator``, or at the centre where that is None.
     """
@@ -68,7 +68,7 @@ def resize(images_B3HW: Tensor, size: int) -> Tensor:
 
     That is what ``AutoProcessor`` uses for SmolVLM. Lines first, then columns, each the product with a
     fixed matrix; like Pillow's, both results are 8 bit levels, so overshoot at edges is cut off in between.
-    Pictures that are not square are stretched. Equal to Pillow's but for a level where rounding is a tie.
+    Images that are not square are stretched. Equal to Pillow's but for a level where rounding is a tie.
     """
     return _resized_levels(images_B3HW, size).div_(255)
 

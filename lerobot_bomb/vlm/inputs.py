@@ -7,7 +7,7 @@ from torch import Tensor
 from lerobot_bomb.actions.text import TokenRows
 from lerobot_bomb.finite import require_finite_batch
 
-# on CUDA, sentences of any length up to a multiple share what is recorded
+# on CUDA, instructions of any length up to a multiple share what is recorded
 TEXT_COLUMNS = 16
 
 
@@ -37,7 +37,7 @@ def read_image(batch: dict[str, Tensor], key: str, policy_type: str, device: tor
 
 
 def read_task(batch: dict[str, Tensor], policy_type: str, device: torch.device) -> TokenRows:
-    """The sentences' tokens, with padding."""
+    """The instructions' tokens, with padding."""
     ids_BL, mask_BL = (
         read_tensor(batch, key, policy_type, device)
         for key in (OBS_LANGUAGE_TOKENS, OBS_LANGUAGE_ATTENTION_MASK)

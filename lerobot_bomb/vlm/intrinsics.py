@@ -1,7 +1,7 @@
-"""Pinhole cameras, and how they follow a picture that is cropped and resized. All in float32.
+"""Pinhole cameras, and how they follow a image that is cropped and resized. All in float32.
 
-Shapes: `B` batch, `R` side of a square picture, pixels.
-K (B, 3, 3) has focal lengths and principal point in pixels *counted from the picture's edge*: the centre of
+Shapes: `B` batch, `R` side of a square image, pixels.
+K (B, 3, 3) has focal lengths and principal point in pixels *counted from the image's edge*: the centre of
 the top left pixel is (0.5, 0.5). So resizing only scales K, as it does in SpatialVLA.
 """
 
@@ -10,13 +10,13 @@ from torch import Tensor
 
 from lerobot_bomb.vlm.images import CropWindows
 
-# What SpatialVLA assumes of every camera: focal length and principal point, pixels of a picture of this size
+# What SpatialVLA assumes of every camera: focal length and principal point, pixels of a image of this size
 DEFAULT_FOCAL_PX, DEFAULT_CENTER_PX = 623.588, (319.501, 239.545)
 DEFAULT_HEIGHT_PX, DEFAULT_WIDTH_PX = 480, 640
 
 
 def default_intrinsics(height: int, width: int) -> Tensor:
-    """(1, 3, 3) K of a camera that nothing is known of; its pictures are stretched to height x width."""
+    """(1, 3, 3) K of a camera that nothing is known of; its images are stretched to height x width."""
     center_x, center_y = DEFAULT_CENTER_PX
     K = torch.tensor([[[DEFAULT_FOCAL_PX, 0, center_x], [0, DEFAULT_FOCAL_PX, center_y], [0, 0, 1]]])
     return resize_intrinsics(K, (DEFAULT_HEIGHT_PX, DEFAULT_WIDTH_PX), (height, width))
@@ -40,14 +40,14 @@ def from_pixel_centers(K_B33: Tensor, name: str) -> Tensor:
     if not pinhole_B33.equal(K_B33) or (K_B33[:, [0, 1], [0, 1]] <= 0).any():
         raise ValueError(
             f"{name} is not [[fx, 0, cx], [0, fy, cy], [0, 0, 1]] in pixels with fx, fy > 0; rectify its "
-            f"pictures, and of turned or mirrored ones give the K of the picture as it is delivered"
+            f"images, and of turned or mirrored ones give the K of the image as it is delivered"
         )
     pinhole_B33[:, :2, 2] += 0.5
     return pinhole_B33
 
 
 def crop_intrinsics(K_B33: Tensor, windows: CropWindows) -> Tensor:
-    """K (B, 3, 3) of whole pictures -> that of their windows."""
+    """K (B, 3, 3) of whole images -> that of their windows."""
     offsets_B2 = windows.offsets.flip(1).to(K_B33)
     K_B33 = K_B33.expand(len(offsets_B2), 3, 3).clone()
     K_B33[:, :2, 2] -= offsets_B2
@@ -55,7 +55,7 @@ def crop_intrinsics(K_B33: Tensor, windows: CropWindows) -> Tensor:
 
 
 def resize_intrinsics(K_B33: Tensor, old_size: tuple[int, int], new_size: tuple[int, int]) -> Tensor:
-    """K (B, 3, 3) of pictures of ``old_size`` (height, width) -> of the same stretched to ``new_size``."""
+    """K (B, 3, 3) of images of ``old_size`` (height, width) -> of the same stretched to ``new_size``."""
     (old_height, old_width), (new_height, new_width) = old_size, new_size
     return K_B33 * K_B33.new_tensor([[new_width / old_width], [new_height / old_height], [1]])
 

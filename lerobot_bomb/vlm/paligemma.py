@@ -16,7 +16,7 @@ from transformers import PaliGemmaConfig, PaliGemmaForConditionalGeneration
 
 from lerobot_bomb.actions.text import END, SYMBOL_TEXTS
 from lerobot_bomb.finite import require_finite_weights
-from lerobot_bomb.vlm.backbone import read_vlm_config, set_float32, spread_pictures, weights_errors
+from lerobot_bomb.vlm.backbone import read_vlm_config, set_float32, spread_images, weights_errors
 from lerobot_bomb.vlm.memory import check_memory
 from lerobot_bomb.vlm.presets import changed, nano_paligemma_config
 from lerobot_bomb.vlm.tokenizer import IMAGE_TOKEN, NANO, load_tokenizer, single_id, token_ids
@@ -130,7 +130,7 @@ def load_paligemma(vlm_model_name: str, changes: Mapping[str, Any] | None = None
     """
     if vlm_model_name == NANO:
         backbone = build_paligemma(changed(nano_paligemma_config(load_tokenizer(NANO)), changes))
-        spread_pictures(backbone.vlm.model.vision_tower)
+        spread_images(backbone.vlm.model.vision_tower)
         return backbone
     config = read_vlm_config(vlm_model_name, PaliGemmaBackbone.family)
     if config.text_config.model_type != "gemma2":

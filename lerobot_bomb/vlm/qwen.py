@@ -1,6 +1,6 @@
 """Qwen2.5-VL behind the few operations a policy needs.
 
-A prefix (pictures and text) is read once; short segments of embeddings then go on from it, as often as
+A prefix (images and text) is read once; short segments of embeddings then go on from it, as often as
 wanted, and change nothing of what is kept.
 
 Shapes: `B` batch, `L` tokens of a prefix, `T` of a segment, `H` hidden size, `P` tokens of an image, `S` side
@@ -74,7 +74,7 @@ class QwenPrompt:
 
 @dataclass(frozen=True)
 class Prefix:
-    """What the model keeps of pictures and text that it has read."""
+    """What the model keeps of images and text that it has read."""
 
     hidden: Tensor  # (B, L, H) after the last layer
     mask: Tensor  # (B, L) bool, False: padding
@@ -180,7 +180,7 @@ class QwenBackbone(nn.Module):
         return self.vlm.get_input_embeddings()(tokens_BL)
 
     def read_prefix(self, embeds_BLH: Tensor, is_image_BL: Tensor, mask_BL: Tensor) -> Prefix:
-        """Read rows whose first column is written; ``is_image_BL``: which tokens are parts of pictures."""
+        """Read rows whose first column is written; ``is_image_BL``: which tokens are parts of images."""
         positions_3BL, next_B1 = self._positions(is_image_BL, mask_BL)
         causal_LL = torch.ones_like(mask_BL[0]).expand(mask_BL.shape[1], -1).tril()
         hidden_BLH, layers = self._read(embeds_BLH, positions_3BL, causal_LL & mask_BL[:, None])
@@ -217,7 +217,7 @@ class QwenBackbone(nn.Module):
     def _positions(self, is_image_BL: Tensor, mask_BL: Tensor) -> tuple[Tensor, Tensor]:
         """(3, B, L) time, line and column that the model takes a token to be at, and (B, 1) what follows.
 
-        Text moves all three on by one. A picture stands still in time, its lines and columns count from
+        Text moves all three on by one. A image stands still in time, its lines and columns count from
         there, and what follows it is at the first place beyond.
         """
         side = self.tokens_per_side

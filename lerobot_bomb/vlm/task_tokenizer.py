@@ -44,7 +44,7 @@ class TaskTokenizerStep(ObservationProcessorStep):
     """``task`` (B texts) -> ``observation.language.tokens`` (B, L) and their attention mask (B, L) bool.
 
     As it is in the pipelines of all our checkpoints, before anything is normalised, it also refuses a batch
-    whose pictures, state or actions are not finite. On CUDA that makes the host wait once, before the pass.
+    whose images, state or actions are not finite. On CUDA that makes the host wait once, before the pass.
 
     ``template`` is what is written, with ``{}`` for the task. The tokenizer is the step's state, so a
     checkpoint carries it whole. Rows are padded at the end. A dataset has few tasks, so their ids are kept:
@@ -112,7 +112,7 @@ class TaskTokenizerStep(ObservationProcessorStep):
 
 
 def _read_by_policies(observation: Mapping[str, Any], actions: Any) -> dict[str, Tensor]:
-    """Pictures, state and actions; depth is not finite where there is none."""
+    """Images, state and actions; depth is not finite where there is none."""
     return {
         key: values
         for key, values in {**observation, ACTION: actions}.items()

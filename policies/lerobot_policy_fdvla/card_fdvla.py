@@ -3,7 +3,7 @@
 from lerobot_bomb.hub.method import Method, Paper
 
 METHOD = Method(
-    summary="a Qwen2.5-VL reads noisy actions beside pictures, sentence and state; a flow head and a "
+    summary="a Qwen2.5-VL reads noisy actions beside images, instruction and state; a flow head and a "
     "denoising head take them to clean ones in a few steps. A reconstruction of FDVLA, not a reproduction.",
     backbone="Qwen/Qwen2.5-VL-3B-Instruct",
     backbone_license="other",

@@ -42,7 +42,7 @@ AS_TRAINED = (*SHAPES, "image_size", "segment_attention", "reasoning_pool")
 @PreTrainedConfig.register_subclass("fdvla")
 @dataclass
 class FdvlaConfig(VlaConfig):
-    """A Qwen2.5-VL reads noisy actions beside pictures and text; two heads take them to clean ones."""
+    """A Qwen2.5-VL reads noisy actions beside images and text; two heads take them to clean ones."""
 
     CHOICES: ClassVar[dict[str, tuple]] = {
         **VlaConfig.CHOICES,
@@ -141,7 +141,7 @@ class FdvlaConfig(VlaConfig):
             )
         if (num_tokens := (self.image_size // PIXELS_PER_TOKEN) ** 2) > MAX_POSITIONS:
             raise ValueError(
-                f"--policy.image_size={self.image_size} makes {num_tokens} tokens of a picture; the "
+                f"--policy.image_size={self.image_size} makes {num_tokens} tokens of a image; the "
                 f"model has {MAX_POSITIONS} positions"
             )
 

@@ -72,7 +72,7 @@ class SpatialvlaGridConfig(TokenVlaConfig):
     depth_model_name: str = "Intel/zoedepth-nyu-kitti"
     # architecture of that model; filled in when it is loaded, for checkpoints
     depth_config: dict[str, Any] | None = None
-    # {camera: 3x3 matrix in pixels of its picture}, where the batch has no observation.intrinsics.CAMERA
+    # {camera: 3x3 matrix in pixels of its image}, where the batch has no observation.intrinsics.CAMERA
     camera_intrinsics: dict[str, list[list[float]]] = field(default_factory=dict)
     # 3-D points of a patch, per side
     ego3d_patch_reso: int = 2

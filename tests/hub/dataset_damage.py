@@ -62,8 +62,8 @@ def take_a_shorter_video(root: Path) -> None:
         stream = video.add_stream("mpeg4", rate=10)
         stream.width, stream.height, stream.pix_fmt = 32, 32, "yuv420p"
         for _ in range(5):
-            picture = av.VideoFrame.from_ndarray(np.zeros((32, 32, 3), np.uint8), "rgb24")
-            video.mux(stream.encode(picture))
+            image = av.VideoFrame.from_ndarray(np.zeros((32, 32, 3), np.uint8), "rgb24")
+            video.mux(stream.encode(image))
         video.mux(stream.encode())
 
 

@@ -68,8 +68,8 @@ def act_checkpoint(folder: Path) -> ACTConfig:
     action = {"action": PolicyFeature(FeatureType.ACTION, (2,))}
     config = ACTConfig(device="cpu", input_features=features, output_features=action)
     numbers = {"mean": torch.zeros(2), "std": torch.ones(2)}
-    pictures = {"mean": torch.zeros(3, 1, 1), "std": torch.ones(3, 1, 1)}
-    stats = {"observation.state": numbers, "action": numbers, "observation.images.front": pictures}
+    images = {"mean": torch.zeros(3, 1, 1), "std": torch.ones(3, 1, 1)}
+    stats = {"observation.state": numbers, "action": numbers, "observation.images.front": images}
     for processor in make_pre_post_processors(config, dataset_stats=stats):  # pyright: ignore[reportArgumentType]
         processor.save_pretrained(folder)
     config.save_pretrained(folder)

@@ -15,7 +15,7 @@ from lerobot_env_bomb.axes.transform import Transform
 from lerobot_env_bomb.model import BOARD_HALF_SIZE_M
 from lerobot_env_bomb.mujoco_gl import mujoco
 
-FRAME_MARGIN = 0.015  # of half the picture, that what must stay in view keeps from its edge
+FRAME_MARGIN = 0.015  # of half the image, that what must stay in view keeps from its edge
 START_HEIGHT_M = 0.115  # of the gripper over the tray, which must be in view too
 
 
@@ -25,7 +25,7 @@ class Camera(Transform):
 
     angle_rad: float
     wrist_angle_rad: float
-    direction_rad: float  # in the picture, that the cameras swing to
+    direction_rad: float  # in the image, that the cameras swing to
     fov_factor: float
     distance_factor: float
 
@@ -63,7 +63,7 @@ class Camera(Transform):
 
 
 def _least_distance(camera_from_world: np.ndarray, pivot: np.ndarray, fovy_deg: float) -> float:
-    """Metres from the pivot at which a square picture shows board, tray and the gripper over the tray."""
+    """Metres from the pivot at which a square image shows board, tray and the gripper over the tray."""
     signs = np.array([(x, y) for x in (-1, 1) for y in (-1, 1)])
     board = _at_height(signs * BOARD_HALF_SIZE_M, BOARD.thickness_m)
     tray = _at_height(TRAY_CENTER_XY + signs * TRAY_HALF_SIZE_XY, BOARD.thickness_m)

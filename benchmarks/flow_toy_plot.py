@@ -22,8 +22,8 @@ DATA_RGB, SAMPLE_RGB, RING_RGB = (95, 100, 110), (30, 90, 190), (215, 60, 40)
 Clouds = dict[str, Tensor]  # word -> (N, 2)
 
 
-def picture(text: str) -> Path:
-    """A file that a picture can be written to."""
+def plot(text: str) -> Path:
+    """A file that a plot can be written to."""
     path = writable(text)
     if path.suffix.lower() not in SUFFIXES:
         raise argparse.ArgumentTypeError(f"{text!r} must end in {' or '.join(SUFFIXES)}")
@@ -35,20 +35,20 @@ def near_modes(points_N2: Tensor, modes_M2: Tensor, radius: float) -> Tensor:
     return torch.cdist(modes_M2, points_N2) < radius
 
 
-def draw_picture(path: Path, columns: dict[str, Clouds], modes_M2: Tensor, radius: float) -> None:
-    """Write a picture: rings with ``radius`` around the modes, and what share of the points each holds.
+def draw_plot(path: Path, columns: dict[str, Clouds], modes_M2: Tensor, radius: float) -> None:
+    """Write a plot: rings with ``radius`` around the modes, and what share of the points each holds.
 
     Columns have the same words; the first is the data.
     """
     title = f"By the word (rows) and what was trained; rings and shares: points within {radius:g} of a mode"
-    pictures = {
+    plots = {
         f'"{word}"': [
             _tile(clouds[word], modes_M2, radius, SAMPLE_RGB if column else DATA_RGB)
             for column, clouds in enumerate(columns.values())
         ]
         for word in next(iter(columns.values()))
     }
-    iio.imwrite(path, Sheet(title, [*columns], pictures=pictures).draw())
+    iio.imwrite(path, Sheet(title, [*columns], images=plots).draw())
 
 
 def _tile(points_N2: Tensor, modes_M2: Tensor, radius: float, rgb: tuple[int, int, int]) -> np.ndarray:

@@ -1,4 +1,4 @@
-"""A picture of a grid: how often each coordinate takes which value, and where it is cut."""
+"""A plot of a grid: how often each coordinate takes which value, and where it is cut."""
 
 from dataclasses import dataclass
 
@@ -16,7 +16,7 @@ BAR_RGB, EDGE_RGB = (150, 160, 175), (210, 40, 30)
 
 @dataclass(frozen=True)
 class Row:
-    """What the picture shows of one coordinate."""
+    """What the plot shows of one coordinate."""
 
     label: list[str]  # lines
     values: np.ndarray  # (N,)
@@ -26,8 +26,8 @@ class Row:
 def draw_rows(title: str, rows: list[Row]) -> np.ndarray:
     """(H, W, 3) uint8: histograms with edges, one above the other, under a title and a legend."""
     size = (LABEL_WIDTH + PLOT_WIDTH + 2 * GAP, TITLE_HEIGHT + len(rows) * ROW_HEIGHT + GAP)
-    picture = Image.new("RGB", size, PAPER)
-    pen = ImageDraw.Draw(picture)
+    plot = Image.new("RGB", size, PAPER)
+    pen = ImageDraw.Draw(plot)
     pen.text((GAP, GAP), title, INK, font(FONT_SIZE))
     x = GAP
     for rgb, text in ((BAR_RGB, "square root of how many actions"), (EDGE_RGB, "edges of the bins")):
@@ -37,11 +37,11 @@ def draw_rows(title: str, rows: list[Row]) -> np.ndarray:
         x += FONT_SIZE + 4 * GAP + round(pen.textlength(text, font(FONT_SIZE)))
     for i, row in enumerate(rows):
         _draw_row(pen, row, TITLE_HEIGHT + i * ROW_HEIGHT)
-    return np.asarray(picture)
+    return np.asarray(plot)
 
 
 def edge_x(edges: np.ndarray) -> np.ndarray:
-    """(E + 1,) columns of the picture, in pixels, where a coordinate's edges are drawn."""
+    """(E + 1,) columns of the plot, in pixels, where a coordinate's edges are drawn."""
     low, high = edges[0], edges[-1]
     return LABEL_WIDTH + np.round((edges - low) / (high - low) * (PLOT_WIDTH - 1)).astype(int)
 
