@@ -1,7 +1,7 @@
 # `make` finds a Python >= 3.12 by itself; name one with `make PYTHON=/path/to/python3.12 ...`.
 SHELL := /bin/bash
 .DEFAULT_GOAL := help
-.PHONY: help setup demo demo-train test test-long test-cuda judges check build clean
+.PHONY: help setup demo demo-train test test-long test-cuda judges check build docs clean
 
 BIN := .venv/bin
 STAMP := .venv/.installed
@@ -19,6 +19,7 @@ help:
 	@echo "make judges     LeRobot's own tests on our types: LEROBOT_SRC=checkout of its tag"
 	@echo "make check      ruff, format, pyright"
 	@echo "make build      sdist and wheel into dist/, tried in an environment of their own"
+	@echo "make docs       the documentation as a site, into site/"
 	@echo "make setup      only set up .venv"
 
 setup: $(STAMP)
@@ -63,6 +64,12 @@ check: $(STAMP)
 build: setup
 	@$(BIN)/pytest tests/test_packaging.py
 	@$(BIN)/python tests/outside/check_build.py
+
+# built strictly: a link to no page or to no heading is an error
+docs: $(STAMP)
+	@$(BIN)/uv pip install -q -p $(BIN)/python -c constraints.txt --group docs
+	@NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build --strict
+	@echo "Built: site/index.html"
 
 clean:
 	rm -rf .venv

@@ -12,6 +12,7 @@ from typing import Any
 
 import draccus
 import pytest
+import yaml
 
 from lerobot_bomb.commands import main as cli
 
@@ -29,6 +30,19 @@ def test_links_and_images_exist_and_no_place_is_left_open(page: Path) -> None:
     missing = [link for link in links if "://" not in link and not (page.parent / link).exists()]
     assert missing == []
     assert re.findall(r"\{[A-Z_]{3,}\}|TODO|FIXME", text) == []
+
+
+def test_the_sites_navigation_is_the_map_of_the_documentation() -> None:
+    nav = yaml.safe_load((ROOT / "mkdocs.yml").read_text())["nav"]
+    sections = {name: pages for entry in nav for name, pages in entry.items() if isinstance(pages, list)}
+    _, *texts = re.split(r"^## ", (ROOT / "docs" / "README.md").read_text(), flags=re.MULTILINE)
+    mapped = {
+        text.partition("\n")[0]: [
+            {title: link} for title, link in re.findall(r"^- \[(.*?)\]\((.*?)\)", text, re.M)
+        ]
+        for text in texts
+    }
+    assert list(sections.items()) == list(mapped.items())
 
 
 def commands(page: Path) -> list[list[str]]:
