@@ -3,7 +3,7 @@
 import argparse
 import importlib
 import sys
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from typing import Any
 
 from draccus.utils import DecodingError
@@ -34,6 +34,7 @@ COMMANDS = {
     "checkpoint": "the folder of a checkpoint that comes with this package",
     "demo": "a policy that comes with this package plays, beside expert and random",
     "doctor": "check this installation",
+    "completion": "a script with which bash or zsh completes these commands and their flags",
 }
 
 
@@ -41,26 +42,36 @@ def _function(command: str) -> str:
     return command.replace("-", "_")
 
 
+def _module(command: str) -> Any:
+    return importlib.import_module(f"lerobot_bomb.commands.{_function(command)}")
+
+
+def build_parser(
+    imported: Collection[str],
+) -> tuple[argparse.ArgumentParser, dict[str, argparse.ArgumentParser]]:
+    """The parser of all commands, and each command's; those that are ``imported`` have their arguments."""
+    parser = argparse.ArgumentParser(prog="lerobot-bomb", description=DESCRIPTION)
+    parser.add_argument("--version", action="version", version=f"lerobot-bomb {__version__}")
+    commands = parser.add_subparsers(dest="command", required=True, metavar="COMMAND")
+    for name, summary in COMMANDS.items():
+        command = commands.add_parser(name, help=summary, description=summary, allow_abbrev=False)
+        if name in imported:
+            getattr(_module(name), f"add_{_function(name)}_arguments")(command)
+    return parser, commands.choices
+
+
 def main(argv: Sequence[str] | None = None) -> int:
     """Run one command; what is wrong with its flags or files becomes one line on stderr and exit code 1."""
     argv = sys.argv[1:] if argv is None else list(argv)
     argv = argv or ["--help"]
-    parser = argparse.ArgumentParser(prog="lerobot-bomb", description=DESCRIPTION)
-    parser.add_argument("--version", action="version", version=f"lerobot-bomb {__version__}")
-    commands = parser.add_subparsers(dest="command", required=True, metavar="COMMAND")
-    module: Any = None
     try:
-        for name, summary in COMMANDS.items():
-            command = commands.add_parser(name, help=summary, description=summary, allow_abbrev=False)
-            if name in argv[:1]:
-                module = importlib.import_module(f"lerobot_bomb.commands.{_function(name)}")
-                getattr(module, f"add_{_function(name)}_arguments")(command)
+        parser, commands = build_parser(argv[:1])
         args, unknown = parser.parse_known_args(argv)
         if "rest" in args:  # of a command that has LeRobot's parser read them
             args.rest = unknown
         elif unknown:
-            commands.choices[args.command].error(f"unrecognized arguments: {' '.join(unknown)}")
-        return getattr(module, f"run_{_function(args.command)}")(args)
+            commands[args.command].error(f"unrecognized arguments: {' '.join(unknown)}")
+        return getattr(_module(args.command), f"run_{_function(args.command)}")(args)
     except (ValueError, OSError, RuntimeError, DecodingError) as error:
         print(f"lerobot-bomb {argv[0]}: {error}", file=sys.stderr)
         return 1
