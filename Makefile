@@ -41,7 +41,7 @@ demo: setup
 
 # a folder that is kept: what was finished when it was stopped is not done again
 demo-train: setup
-	@$(BIN)/python benchmarks/gate.py one_target --policy.type=vla0_smol --checkpoints=2 --force \
+	@$(BIN)/python benchmarks/learn.py one_target --policy.type=vla0_smol --checkpoints=2 --force \
 		--output_dir=outputs/demo_train --plot=outputs/demo_train/learning_curve.png
 
 test: setup

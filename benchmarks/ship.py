@@ -1,6 +1,6 @@
-"""Put a policy that benchmarks/gate.py trained into the package, where `--policy.path=bomb:TYPE` finds it.
+"""Put a policy that benchmarks/learn.py trained into the package, where `--policy.path=bomb:TYPE` finds it.
 
-    python benchmarks/ship.py GATE_FOLDER
+    python benchmarks/ship.py FOLDER
 
 The weights are the training's own, bit for bit; the configs lose the paths of the machine.
 """
@@ -19,7 +19,7 @@ from lerobot_bomb.hub.push import portable_json
 def main() -> None:
     """Copy the last checkpoint in place of the one that is there; print its hash and size."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawTextHelpFormatter)
-    parser.add_argument("folder", type=Path, metavar="GATE_FOLDER", help="--output_dir of gate.py")
+    parser.add_argument("folder", type=Path, metavar="FOLDER", help="--output_dir of learn.py")
     args = parser.parse_args()
     checkpoint = args.folder / "train" / "checkpoints" / "last" / "pretrained_model"
     target = FOLDER / read_json(checkpoint / CONFIG)["type"]

@@ -3,9 +3,9 @@
 A policy is trained by the stock `lerobot-train` on demonstrations of the scripted expert, and its checkpoints
 are evaluated by the stock `lerobot-eval` on seeds that it has not seen; the last one twice more: with black
 images, and given the instruction of another episode. The policy is a small probe made for this task
-(lerobot_policy_keypoint_probe/: can it be learnt at all?) or one of ours, by configs/RUNG_TYPE.yaml.
+(lerobot_policy_keypoint_probe/: can it be learnt at all?) or one of ours, by configs/TASK_TYPE.yaml.
 
-    OMP_NUM_THREADS=1 python benchmarks/gate.py one_target --policy.type=vla0_smol --output_dir gate
+    OMP_NUM_THREADS=1 python benchmarks/learn.py one_target --policy.type=vla0_smol --output_dir learn
 
 What is finished stays in the output folder and is not done again: the dataset, the training, each evaluation.
 A training that was killed starts anew. Flags --policy.NAME=VALUE go to `lerobot-train`. Recipes are chosen on
@@ -34,7 +34,7 @@ from lerobot_bomb.evaluation.results import PUT_DOWN, Row, read_results
 
 PROBE = "keypoint_probe"
 PLUGIN = f"lerobot_policy_{PROBE}"  # not installed: LeRobot finds it by --*.discover_packages_path
-REPO_ID = "gate/bomb_place"
+REPO_ID = "learn/bomb_place"
 IMAGE_SIZE = 64  # pixels
 NOISE = 0.05  # on the executed actions, so that recoveries are in the data
 BATCH_SIZE = 64
@@ -54,8 +54,8 @@ class Bar:
 
 
 @dataclass(frozen=True)
-class Lesson:
-    """What one policy type gets to learn a rung."""
+class Training:
+    """What one policy type gets to learn a task."""
 
     demonstrations: int
     bar: Bar | None  # None: it is only measured
@@ -63,38 +63,38 @@ class Lesson:
 
 
 @dataclass(frozen=True)
-class Rung:
-    """A step of difficulty: which tasks, and what each policy type gets to learn them."""
+class Task:
+    """What is to be learnt: which of the tasks, under which perturbations, and what each type gets for it."""
 
     task_ids: tuple[int, ...]  # empty: target and colour are drawn for each episode
     episodes: int  # of each evaluation
-    lessons: dict[str, Lesson]
+    trainings: dict[str, Training]
     perturbations: str = NONE  # of the demonstrations
     conditions: tuple[str, ...] = ()  # that the last checkpoint is evaluated under, beside the nominal one
 
 
-RUNGS = {
-    "one_target": Rung(
+TASKS = {
+    "one_target": Task(
         (12,),
         episodes=100,
-        lessons={
-            PROBE: Lesson(200, Bar(0.90, 120), steps=3000),
-            **{name: Lesson(600, Bar(0.95, 20)) for name in POLICY_TYPES},
+        trainings={
+            PROBE: Training(200, Bar(0.90, 120), steps=3000),
+            **{name: Training(600, Bar(0.95, 20)) for name in POLICY_TYPES},
         },
     ),
-    "all_targets": Rung(
+    "all_targets": Task(
         (),
         episodes=200,
-        lessons={
-            PROBE: Lesson(400, None, steps=6000),
-            **{name: Lesson(1600, Bar(0.90, 180)) for name in POLICY_TYPES},
-            "vla0_smol": Lesson(3200, Bar(0.97, 90)),
+        trainings={
+            PROBE: Training(400, None, steps=6000),
+            **{name: Training(1600, Bar(0.90, 180)) for name in POLICY_TYPES},
+            "vla0_smol": Training(3200, Bar(0.97, 90)),
         },
     ),
-    "robust": Rung(
+    "robust": Task(
         (),
         episodes=200,
-        lessons={"fdvla": Lesson(3600, None)},
+        trainings={"fdvla": Training(3600, None)},
         perturbations=f"{ALL}:0-4",
         conditions=(*(f"{axis}:3" for axis in NUISANCES), f"{ALL}:1", f"{ALL}:3", f"{ALL}:5"),
     ),
@@ -104,11 +104,11 @@ RUNGS = {
 def main() -> None:
     """Record, train, evaluate every checkpoint, print the curve; exit code 1 where the bar is missed."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawTextHelpFormatter)
-    parser.add_argument("rung", choices=RUNGS)
+    parser.add_argument("task", choices=TASKS)
     types = [PROBE, *POLICY_TYPES]
     parser.add_argument("--policy.type", dest="policy_type", choices=types, default=PROBE)
     parser.add_argument("--output_dir", type=Path, required=True, help="folder to keep, or to go on with")
-    parser.add_argument("--demonstrations", type=positive, help="default: the rung's")
+    parser.add_argument("--demonstrations", type=positive, help="default: the task's")
     parser.add_argument("--steps", type=positive, help="training steps (default: the recipe's)")
     points = f"points of the curve (default: {NUM_CHECKPOINTS})"
     parser.add_argument("--checkpoints", type=positive, default=NUM_CHECKPOINTS, help=points)
@@ -125,34 +125,34 @@ def main() -> None:
     here = str(Path(__file__).parent)
     os.environ["PYTHONPATH"] = os.pathsep.join(filter(None, [here, os.environ.get("PYTHONPATH")]))
     try:
-        sys.exit(climb(args))
+        sys.exit(run_task(args))
     except RuntimeError as error:
-        sys.exit(f"gate.py: {error}")
+        sys.exit(f"learn.py: {error}")
 
 
-def climb(args: argparse.Namespace) -> int:
-    """The whole rung in args.output_dir; 0 if the bar was reached."""
-    rung, folder = RUNGS[args.rung], args.output_dir
-    if args.policy_type not in rung.lessons:
-        raise RuntimeError(f"{args.rung} is for --policy.type={' or '.join(rung.lessons)}")
-    lesson = rung.lessons[args.policy_type]
-    demonstrations = args.demonstrations or lesson.demonstrations
+def run_task(args: argparse.Namespace) -> int:
+    """The whole task in args.output_dir; 0 if the bar was reached."""
+    task, folder = TASKS[args.task], args.output_dir
+    if args.policy_type not in task.trainings:
+        raise RuntimeError(f"{args.task} is for --policy.type={' or '.join(task.trainings)}")
+    training = task.trainings[args.policy_type]
+    demonstrations = args.demonstrations or training.demonstrations
     run = {
-        "rung": args.rung,
+        "task": args.task,
         "policy": args.policy_type,
         "demonstrations": demonstrations,
-        "steps": args.steps or lesson.steps or read_recipe(args.rung, args.policy_type)["steps"],
+        "steps": args.steps or training.steps or read_recipe(args.task, args.policy_type)["steps"],
         "checkpoints": args.checkpoints,
         "first_seed": args.first_seed,
         "flags": args.policy_flags,
     }
     claim(folder, run)
-    record(rung, demonstrations, folder / "dataset")
+    record(task, demonstrations, folder / "dataset")
     minutes = train(folder, run)
 
-    results = evaluate_checkpoints(rung, folder, args.first_seed, run["steps"])
+    results = evaluate_checkpoints(task, folder, args.first_seed, run["steps"])
     given = other_instructions(results[run["steps"]])
-    controls = evaluate_controls(rung, folder, args.first_seed, given)
+    controls = evaluate_controls(task, folder, args.first_seed, given)
     minutes_per_step = minutes["cpu_minutes"] / run["steps"]
     points = {f"step {step}": count(rows, step, step * minutes_per_step) for step, rows in results.items()}
     points |= {name: count(rows, run["steps"], minutes["cpu_minutes"]) for name, rows in controls.items()}
@@ -160,11 +160,11 @@ def climb(args: argparse.Namespace) -> int:
     num_named = count_named(controls[OTHER_INSTRUCTION], given)
     print_points(points)
     print(
-        f"{OTHER_INSTRUCTION}: {num_named}/{rung.episodes} stones put down on the intersection that it names"
+        f"{OTHER_INSTRUCTION}: {num_named}/{task.episodes} stones put down on the intersection that it names"
     )
-    conditions = evaluate_conditions(rung, folder, args.first_seed)
+    conditions = evaluate_conditions(task, folder, args.first_seed)
     if args.plot is not None:
-        title = f"{args.policy_type}, {args.rung}: {demonstrations} demonstrations, {rung.episodes} new seeds"
+        title = f"{args.policy_type}, {args.task}: {demonstrations} demonstrations, {task.episodes} new seeds"
         draw([points[f"step {step}"] for step in results], title, args.plot)
     write_figures(
         args.json,
@@ -176,17 +176,17 @@ def climb(args: argparse.Namespace) -> int:
             "conditions": conditions,
         },
     )
-    return 0 if lesson.bar is None else verdict(points[f"step {run['steps']}"], lesson.bar)
+    return 0 if training.bar is None else verdict(points[f"step {run['steps']}"], training.bar)
 
 
 def verdict(last: Point, bar: Bar) -> int:
     """Say whether the last checkpoint reaches the bar; 0 if it does."""
-    is_open = last.num_successes >= bar.success * last.num_episodes and last.cpu_minutes <= bar.cpu_minutes
+    is_reached = last.num_successes >= bar.success * last.num_episodes and last.cpu_minutes <= bar.cpu_minutes
     print(
         f"bar {100 * bar.success:.0f} % within {bar.cpu_minutes:.0f} CPU minutes: "
-        f"{'reached' if is_open else 'MISSED'}"
+        f"{'reached' if is_reached else 'MISSED'}"
     )
-    return 0 if is_open else 1
+    return 0 if is_reached else 1
 
 
 def claim(folder: Path, run: dict[str, Any]) -> None:
@@ -200,11 +200,11 @@ def claim(folder: Path, run: dict[str, Any]) -> None:
     path.write_text(json.dumps(run) + "\n")
 
 
-def record(rung: Rung, demonstrations: int, dataset: Path) -> None:
+def record(task: Task, demonstrations: int, dataset: Path) -> None:
     """The expert's episodes."""
     if dataset.exists():
         return
-    tasks = [f"--task_ids={list(rung.task_ids)}"] if rung.task_ids else []
+    task_flags = [f"--task_ids={list(task.task_ids)}"] if task.task_ids else []
     resume = ["--resume"] if dataset.with_name(f"{dataset.name}.recording").exists() else []
     run_command(
         "lerobot-bomb",
@@ -214,10 +214,10 @@ def record(rung: Rung, demonstrations: int, dataset: Path) -> None:
         f"--episodes={demonstrations}",
         f"--seed={FIRST_SEED}",
         f"--noise={NOISE}",
-        f"--perturbations={rung.perturbations}",
+        f"--perturbations={task.perturbations}",
         "--images",
         f"--image_size={IMAGE_SIZE}",
-        *tasks,
+        *task_flags,
         *resume,
     )
 
@@ -229,7 +229,7 @@ def train(folder: Path, run: dict[str, Any]) -> dict[str, float]:
         return json.loads(times.read_text())
     shutil.rmtree(folder / "train", ignore_errors=True)
     started, cpu_started = time.monotonic(), _children_cpu_s()
-    recipe = [f"--config_path={recipe_path(run['rung'], run['policy'])}"]
+    recipe = [f"--config_path={recipe_path(run['task'], run['policy'])}"]
     run_command(
         "lerobot-train",
         *(probe_recipe() if run["policy"] == PROBE else recipe),
@@ -259,22 +259,22 @@ def probe_recipe() -> list[str]:
     ]
 
 
-def evaluate_checkpoints(rung: Rung, folder: Path, first_seed: int, last: int) -> dict[int, list[Row]]:
+def evaluate_checkpoints(task: Task, folder: Path, first_seed: int, last: int) -> dict[int, list[Row]]:
     """{training step: results}; all but the last are only the curve."""
     return {
         int(path.name): evaluate(
-            rung,
+            task,
             path / "pretrained_model",
             folder / f"eval_{path.name}",
             first_seed,
-            rung.episodes if int(path.name) == last else min(CURVE_EPISODES, rung.episodes),
+            task.episodes if int(path.name) == last else min(CURVE_EPISODES, task.episodes),
         )
         for path in sorted((folder / "train" / "checkpoints").glob("[0-9]*"))
     }
 
 
 def evaluate_controls(
-    rung: Rung, folder: Path, first_seed: int, given: dict[str, str]
+    task: Task, folder: Path, first_seed: int, given: dict[str, str]
 ) -> dict[str, list[Row]]:
     """{control: results} of the last checkpoint with black cameras, and given other instructions."""
     import lerobot_policy_keypoint_probe  # noqa: F401  its processor step must be known when it is loaded
@@ -290,27 +290,27 @@ def evaluate_controls(
         shutil.rmtree(checkpoint.with_name(changed), ignore_errors=True)
         intervene(checkpoint, [step], checkpoint.with_name(changed))
         output_dir = folder / f"eval_{changed}"
-        results[name] = evaluate(rung, checkpoint.with_name(changed), output_dir, first_seed, rung.episodes)
+        results[name] = evaluate(task, checkpoint.with_name(changed), output_dir, first_seed, task.episodes)
     return results
 
 
-def evaluate_conditions(rung: Rung, folder: Path, first_seed: int) -> dict[str, int]:
+def evaluate_conditions(task: Task, folder: Path, first_seed: int) -> dict[str, int]:
     """{condition: successes} of the last checkpoint in CURVE_EPISODES episodes each; prints the table."""
-    if not rung.conditions:
+    if not task.conditions:
         return {}
     checkpoint, output_dir = folder / "train" / "checkpoints" / "last", folder / "eval_conditions"
     rows = evaluate(
-        rung, checkpoint / "pretrained_model", output_dir, first_seed, CURVE_EPISODES, rung.conditions
+        task, checkpoint / "pretrained_model", output_dir, first_seed, CURVE_EPISODES, task.conditions
     )
     run_command("lerobot-bomb", "results", f"{output_dir / 'results.jsonl'}")
-    successes = dict.fromkeys(rung.conditions, 0)
+    successes = dict.fromkeys(task.conditions, 0)
     for row in rows:
         successes[row["spec"]["perturbations"]] += row["is_success"]
     return successes
 
 
 def evaluate(
-    rung: Rung,
+    task: Task,
     checkpoint: Path,
     output_dir: Path,
     first_seed: int,
@@ -322,7 +322,7 @@ def evaluate(
     finished = output_dir / "finished"  # an evaluation that was killed leaves results of some episodes
     if not finished.exists():
         shutil.rmtree(output_dir, ignore_errors=True)
-        tasks = [f"--env.task_ids={list(rung.task_ids)}"] if rung.task_ids else []
+        task_flags = [f"--env.task_ids={list(task.task_ids)}"] if task.task_ids else []
         run_command(
             "lerobot-eval",
             # not --policy.*, which would become an override of the checkpoint's config
@@ -331,7 +331,7 @@ def evaluate(
             "--env.type=bomb",
             f"--env.image_size={IMAGE_SIZE}",
             f"--env.results_path={results}",
-            *tasks,
+            *task_flags,
             f"--env.perturbations={json.dumps(conditions)}",
             f"--seed={first_seed}",
             f"--eval.n_episodes={episodes}",

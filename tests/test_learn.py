@@ -5,7 +5,7 @@ from pathlib import Path
 from typing import Any
 
 import cv2
-import gate
+import learn
 import numpy as np
 import pytest
 from learning_curve import SUCCESS_BGR, count, draw
@@ -14,12 +14,12 @@ from lerobot_bomb.commands.main import main as lerobot_bomb
 
 SIZE = 32  # pixels
 
-# The rung as a whole
+# The task as a whole
 
 
 @pytest.fixture
 def commands(monkeypatch: pytest.MonkeyPatch, stock_cli: Callable[..., None]) -> list[str]:
-    """A tiny rung whose commands run in this process; the list of those that ran."""
+    """A tiny task whose commands run in this process; the list of those that ran."""
     ran = []
 
     def run(command: str, *flags: str) -> None:
@@ -33,40 +33,40 @@ def commands(monkeypatch: pytest.MonkeyPatch, stock_cli: Callable[..., None]) ->
             short = ["--env.fps=2", "--env.ignore_checkpoint=true"]
             stock_cli(command, *flags, *short, "--eval.batch_size=1")
 
-    lesson = gate.Lesson(demonstrations=1, bar=gate.Bar(0.5, cpu_minutes=5), steps=2)
-    tiny = gate.Rung((), episodes=1, lessons={gate.PROBE: lesson})
-    for name, value in {"run_command": run, "RUNGS": {"tiny": tiny}, "IMAGE_SIZE": SIZE}.items():
-        monkeypatch.setattr(gate, name, value)
-    monkeypatch.setattr(gate, "BATCH_SIZE", 2)
+    training = learn.Training(demonstrations=1, bar=learn.Bar(0.5, cpu_minutes=5), steps=2)
+    tiny = learn.Task((), episodes=1, trainings={learn.PROBE: training})
+    for name, value in {"run_command": run, "TASKS": {"tiny": tiny}, "IMAGE_SIZE": SIZE}.items():
+        monkeypatch.setattr(learn, name, value)
+    monkeypatch.setattr(learn, "BATCH_SIZE", 2)
     cpu_s = iter((100.0, 220.0))  # before and after the training
-    monkeypatch.setattr(gate, "_children_cpu_s", lambda: next(cpu_s))
+    monkeypatch.setattr(learn, "_children_cpu_s", lambda: next(cpu_s))
     return ran
 
 
 def test_a_rung_is_climbed_by_stock_commands_and_goes_on_where_it_stopped(
     commands: list[str], tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    folder = tmp_path / "rung"
+    folder = tmp_path / "task"
     args = Namespace(
-        rung="tiny",
-        policy_type=gate.PROBE,
+        task="tiny",
+        policy_type=learn.PROBE,
         checkpoints=2,
         first_seed=100_000,
         output_dir=folder,
         demonstrations=None,
         steps=None,
         plot=tmp_path / "curve.png",
-        json=tmp_path / "gate.json",
+        json=tmp_path / "learn.json",
         policy_flags=["--policy.num_channels=8"],
     )
-    assert gate.climb(args) == 1  # two steps of training teach nothing
+    assert learn.run_task(args) == 1  # two steps of training teach nothing
     assert commands == ["lerobot-bomb", "lerobot-train", *["lerobot-eval"] * 4]
     figures = json.loads(args.json.read_text())
     assert [(name, point["step"]) for name, point in figures["points"].items()] == [
         ("step 1", 1),
         ("step 2", 2),
-        (gate.NO_IMAGES, 2),
-        (gate.OTHER_INSTRUCTION, 2),
+        (learn.NO_IMAGES, 2),
+        (learn.OTHER_INSTRUCTION, 2),
     ]
     assert figures["training"]["cpu_minutes"] == 2.0
     assert figures["points"]["step 1"]["cpu_minutes"] == 1.0
@@ -75,13 +75,13 @@ def test_a_rung_is_climbed_by_stock_commands_and_goes_on_where_it_stopped(
 
     commands.clear()
     (folder / "eval_000002" / "finished").unlink()
-    assert gate.climb(args) == 1
+    assert learn.run_task(args) == 1
     assert commands == ["lerobot-eval"]
     assert len((folder / "eval_000002" / "results.jsonl").read_text().splitlines()) == 1
 
     args.steps = 4
     with pytest.raises(RuntimeError, match=r'holds a run of .*"steps": 2.*; name another folder'):
-        gate.climb(args)
+        learn.run_task(args)
 
 
 def test_a_stone_counts_where_the_told_instruction_says() -> None:
@@ -91,25 +91,25 @@ def test_a_stone_counts_where_the_told_instruction_says() -> None:
         row("dropped", 45.0, (2, 3), instruction="a"),
         row(None, 1.0, (2, 3), instruction="b", target=[2, 3]),
     ]
-    given = gate.other_instructions(rows)
+    given = learn.other_instructions(rows)
     assert given == {"a": "b", "b": "a"}
-    assert gate.count_named(rows, given) == 1
-    assert gate.count_named(rows, {"a": "a", "b": "b"}) == 2
+    assert learn.count_named(rows, given) == 1
+    assert learn.count_named(rows, {"a": "a", "b": "b"}) == 2
 
 
 def test_the_other_instruction_names_another_target() -> None:
     targets = {"black 1": [0, 0], "black 2": [0, 1], "white 1": [0, 0], "white 2": [0, 1]}
-    given = gate.other_instructions(
+    given = learn.other_instructions(
         [row(None, 1.0, instruction=name, target=at) for name, at in targets.items()]
     )
     assert all(targets[instruction] != targets[other] for instruction, other in given.items())
-    assert gate.other_instructions([row(None, 1.0, instruction="only")]) == {"only": "only"}
+    assert learn.other_instructions([row(None, 1.0, instruction="only")]) == {"only": "only"}
 
 
 def test_every_policy_type_has_a_recipe_for_every_rung() -> None:
-    for name, rung in gate.RUNGS.items():
-        for policy_type in rung.lessons.keys() - {gate.PROBE}:
-            recipe = gate.read_recipe(name, policy_type)
+    for name, task in learn.TASKS.items():
+        for policy_type in task.trainings.keys() - {learn.PROBE}:
+            recipe = learn.read_recipe(name, policy_type)
             assert (
                 recipe["policy"].get("path", f"bomb:{recipe['policy'].get('type')}") == f"bomb:{policy_type}"
             )
@@ -118,9 +118,9 @@ def test_every_policy_type_has_a_recipe_for_every_rung() -> None:
 
 def test_a_bar_is_of_success_and_of_time() -> None:
     point = count([row(None, 1.0)] * 9 + [row("dropped", 1.0)], step=1, cpu_minutes=4.0)
-    assert gate.verdict(point, gate.Bar(0.9, cpu_minutes=4)) == 0
-    assert gate.verdict(point, gate.Bar(0.91, cpu_minutes=4)) == 1
-    assert gate.verdict(point, gate.Bar(0.9, cpu_minutes=3.9)) == 1
+    assert learn.verdict(point, learn.Bar(0.9, cpu_minutes=4)) == 0
+    assert learn.verdict(point, learn.Bar(0.91, cpu_minutes=4)) == 1
+    assert learn.verdict(point, learn.Bar(0.9, cpu_minutes=3.9)) == 1
 
 
 # The curve
