@@ -46,7 +46,7 @@ MAX_MINUTES = 25
 
 
 @dataclass(frozen=True)
-class Condition:
+class Control:
     """One evaluation of the trained policy and how many of its episodes should do what is counted."""
 
     name: str
@@ -55,9 +55,9 @@ class Condition:
     at_most: int
 
 
-LEARNT = Condition("as recorded", "successes", at_least=8, at_most=8)
-PERMUTED = Condition("permuted instructions", "stones on the named square", at_least=6, at_most=8)
-BLANK = Condition("blank images", "successes", at_least=0, at_most=2)
+LEARNT = Control("as recorded", "successes", at_least=8, at_most=8)
+PERMUTED = Control("permuted instructions", "stones on the named square", at_least=6, at_most=8)
+BLANK = Control("blank images", "successes", at_least=0, at_most=2)
 
 
 def main() -> None:
@@ -154,7 +154,7 @@ def train(args: argparse.Namespace, folder: Path) -> Path:
     return folder / "train" / "checkpoints" / "last" / "pretrained_model"
 
 
-def change_what_is_shown(checkpoint: Path, replacements: dict[str, str]) -> dict[Condition, Path]:
+def change_what_is_shown(checkpoint: Path, replacements: dict[str, str]) -> dict[Control, Path]:
     """The controls' checkpoints: the trained weights behind a preprocessor that intervenes."""
     from lerobot_bomb.explain.interventions import BlankImages, ReplaceTasks, intervene
 
@@ -195,7 +195,7 @@ def is_on(row: Row, task_id: int) -> bool:
     return is_there and row["failure"] == Failure.WRONG_INTERSECTION
 
 
-def print_episodes(condition: Condition, rows: dict[int, Row]) -> None:
+def print_episodes(condition: Control, rows: dict[int, Row]) -> None:
     """What became of each episode."""
     print(f"\n{condition.name}")
     header = ["target", "stone ends nearest to", "error, mm", "steps", "outcome"]
@@ -214,7 +214,7 @@ def print_episodes(condition: Condition, rows: dict[int, Row]) -> None:
 
 
 def report(
-    args: argparse.Namespace, counts: dict[Condition, int], minutes: float, minutes_to_checkpoint: float
+    args: argparse.Namespace, counts: dict[Control, int], minutes: float, minutes_to_checkpoint: float
 ) -> int:
     """Print what was counted against its bar; 0 if every bar was kept."""
     rows, missed = [], []

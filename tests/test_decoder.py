@@ -10,10 +10,10 @@ from lerobot_bomb.actions.text import END, NUM_SYMBOLS, SPACE, SYMBOL_TEXTS
 from lerobot_bomb.decoding.decoder import (
     FIRST_GUESSES,
     MAX_GUESSES,
+    Answers,
     Continuation,
     Decoded,
     Guess,
-    Progress,
     decode_numbers,
     write,
 )
@@ -286,8 +286,8 @@ def test_no_guess_changes_what_is_written(wrong: int, seed: int) -> None:
     assert decode(RandomModel(seed, 3), grammar, 3, guess=random_guess).numbers.tolist() == greedy
 
 
-def passes(model: Continuation, grammar: NumberGrammar, guess: Guess, batch_size: int) -> Iterator[Progress]:
-    progress = Progress.start(grammar, batch_size)
+def passes(model: Continuation, grammar: NumberGrammar, guess: Guess, batch_size: int) -> Iterator[Answers]:
+    progress = Answers.start(grammar, batch_size)
     while True:
         progress, _ = write(model, grammar, guess, progress, MAX_GUESSES)
         yield progress

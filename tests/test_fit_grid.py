@@ -27,7 +27,7 @@ from lerobot_bomb.viewing.grid_plot import (
     EDGE_RGB,
     ROW_HEIGHT,
     TITLE_HEIGHT,
-    Row,
+    PlotRow,
     draw_rows,
     edge_x,
 )
@@ -150,7 +150,7 @@ def test_the_plot_has_the_edges_where_the_grid_has_them(root: Path, tmp_path: Pa
 
 def test_bars_of_a_histogram_are_where_the_values_are() -> None:
     values = np.repeat([0.25, 0.75], [100, 25])
-    plot = draw_rows("", [Row(["label"], values, np.array([0.0, 0.5, 1.0]))])
+    plot = draw_rows("", [PlotRow(["label"], values, np.array([0.0, 0.5, 1.0]))])
     heights = (plot[TITLE_HEIGHT:] == BAR_RGB).all(axis=2).sum(axis=0)
     first, second = (int(edge_x(np.array([0, value, 1]))[1]) for value in (0.25, 0.75))
     assert heights[first - 2 : first + 6].max() == pytest.approx(

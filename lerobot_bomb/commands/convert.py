@@ -28,7 +28,7 @@ from lerobot_bomb.data.resumable import (
 )
 
 if TYPE_CHECKING:
-    from lerobot_bomb.data.blocks import DatasetLayout, Episode
+    from lerobot_bomb.data.blocks import DatasetLayout, RecordedEpisode
 
 FPS = 10  # of the demonstrations and of LeRobot's environment `pusht`
 
@@ -129,11 +129,11 @@ def _pusht_layout(repo_id: str) -> "DatasetLayout":
 
 def _pusht_episodes(
     source: PushtZarr, task: str, bar: tqdm, progress: Progress, number: int
-) -> "Iterator[Episode]":
+) -> "Iterator[RecordedEpisode]":
     """Yield the next `number` episodes."""
     from lerobot.utils.constants import ACTION, OBS_IMAGE, OBS_STATE
 
-    from lerobot_bomb.data.blocks import Episode
+    from lerobot_bomb.data.blocks import RecordedEpisode
 
     for index in range(progress.num_episodes, progress.num_episodes + number):
         frames = (
@@ -141,5 +141,5 @@ def _pusht_episodes(
             for image, position, action in zip(*source.episode(index), strict=True)
         )
         progress.num_episodes += 1
-        yield Episode(frames)
+        yield RecordedEpisode(frames)
         bar.update()

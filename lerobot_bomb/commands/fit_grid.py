@@ -26,7 +26,7 @@ from lerobot_bomb.data.columns import dim_names, read_columns, read_meta
 from lerobot_bomb.files import check_writable, written_whole
 from lerobot_bomb.flags import one_of
 from lerobot_bomb.tables import print_table
-from lerobot_bomb.viewing.grid_plot import Row, draw_rows
+from lerobot_bomb.viewing.grid_plot import PlotRow, draw_rows
 
 UNIFORM, CLIPPING = "uniform mid", "clipping alone"
 
@@ -159,7 +159,7 @@ def print_errors(unit: str, errors: dict[str, np.ndarray], names: list[str]) -> 
     )
 
 
-def plot_rows(grids: ActionGrids, actions_ND: np.ndarray, names: list[str]) -> list[Row]:
+def plot_rows(grids: ActionGrids, actions_ND: np.ndarray, names: list[str]) -> list[PlotRow]:
     """What a plot shows of every coordinate."""
     values_CN = grids.coordinates(torch.from_numpy(actions_ND).float()).T.numpy()
     rows = zip(
@@ -170,6 +170,6 @@ def plot_rows(grids: ActionGrids, actions_ND: np.ndarray, names: list[str]) -> l
         strict=True,
     )
     return [
-        Row([label, f"mean {mean:.3g}", f"deviation {std:.3g}"], values_N, edges)
+        PlotRow([label, f"mean {mean:.3g}", f"deviation {std:.3g}"], values_N, edges)
         for label, (mean, std), values_N, edges in rows
     ]

@@ -68,14 +68,14 @@ class DatasetLayout:
 
 
 @dataclass(frozen=True)
-class Episode:
+class RecordedEpisode:
     """What a block is made of."""
 
     frames: Iterable[dict[str, Any]]  # as LeRobot's add_frame takes them
     columns: dict[str, Any] = field(default_factory=dict)  # of its row in LeRobot's table of episodes
 
 
-def write_block(layout: DatasetLayout, root: Path, episodes: Iterable[Episode]) -> int:
+def write_block(layout: DatasetLayout, root: Path, episodes: Iterable[RecordedEpisode]) -> int:
     """Write episodes as a finished LeRobotDataset and return its number of frames.
 
     Raises:
@@ -188,7 +188,7 @@ class _ErrorCollector(logging.Handler):
             logging.getLogger().handle(record)
 
 
-def _write_episodes(dataset: LeRobotDataset, episodes: Iterable[Episode]) -> list[dict[str, Any]]:
+def _write_episodes(dataset: LeRobotDataset, episodes: Iterable[RecordedEpisode]) -> list[dict[str, Any]]:
     """Write them all and return their columns."""
     rows = []
     try:
@@ -202,7 +202,7 @@ def _write_episodes(dataset: LeRobotDataset, episodes: Iterable[Episode]) -> lis
     return rows
 
 
-def _write_episode(dataset: LeRobotDataset, episode: Episode) -> None:
+def _write_episode(dataset: LeRobotDataset, episode: RecordedEpisode) -> None:
     for frame in episode.frames:
         dataset.add_frame(frame)
     dataset.save_episode()

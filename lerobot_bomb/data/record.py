@@ -19,7 +19,7 @@ from lerobot_bomb.data.rollout_pool import Rollout, RolloutPool, RolloutSettings
 from lerobot_bomb.envs.rollout import Expert, make_env
 
 if TYPE_CHECKING:
-    from lerobot_bomb.data.blocks import DatasetLayout, Episode
+    from lerobot_bomb.data.blocks import DatasetLayout, RecordedEpisode
 
 # the expert counts as broken when, after so many seeds, fewer succeed
 MIN_TRIED = 20
@@ -80,7 +80,9 @@ def _record_blocks(recording: Recording, folder: Path, num_workers: int, expert:
     return reached(folder)
 
 
-def _successes(pool: Iterable[Rollout], bar: tqdm, progress: Progress, number: int) -> "Iterator[Episode]":
+def _successes(
+    pool: Iterable[Rollout], bar: tqdm, progress: Progress, number: int
+) -> "Iterator[RecordedEpisode]":
     """Yield so many successful rollouts; note the failed ones on the way."""
     from lerobot_bomb.data.rollout_dataset import rollout_episode
 

@@ -38,7 +38,7 @@ from lerobot_bomb.files import read_json
 from lerobot_bomb.flags import check_link
 
 if TYPE_CHECKING:
-    from lerobot_bomb.data.blocks import DatasetLayout, Episode
+    from lerobot_bomb.data.blocks import DatasetLayout, RecordedEpisode
 
 BLOCK_EPISODES = 20  # what a kill can cost: they are played or written again on --resume
 LOCK_FILE = "lock"  # in the growing folder; a killed process releases it
@@ -108,7 +108,7 @@ def write_blocks(
     folder: Path,
     layout: "DatasetLayout",
     gap: Gap,
-    next_episodes: Callable[[Progress, int], Iterator["Episode"]],
+    next_episodes: Callable[[Progress, int], Iterator["RecordedEpisode"]],
 ) -> None:
     """Write the blocks of a gap; `next_episodes` yields so many and counts them in the progress."""
     from lerobot_bomb.data.blocks import write_block

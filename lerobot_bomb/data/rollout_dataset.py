@@ -8,7 +8,7 @@ from lerobot.utils.constants import ACTION, OBS_IMAGES, OBS_PREFIX, OBS_STATE
 from lerobot_bomb import __version__
 from lerobot_bomb.bomb.episode import TASK_VERSION
 from lerobot_bomb.bomb.observation import ACTION_NAMES, CAMERAS, STATE_NAMES, geometry_shapes
-from lerobot_bomb.data.blocks import DatasetLayout, Episode
+from lerobot_bomb.data.blocks import DatasetLayout, RecordedEpisode
 from lerobot_bomb.data.recording import Recording
 from lerobot_bomb.data.rollout_pool import Rollout
 from lerobot_bomb.envs.results import EpisodeResult
@@ -38,10 +38,10 @@ def rollout_layout(recording: Recording) -> DatasetLayout:
     )
 
 
-def rollout_episode(rollout: Rollout) -> Episode:
+def rollout_episode(rollout: Rollout) -> RecordedEpisode:
     """What the dataset stores of one rollout."""
     frames = (_frame(rollout, step) for step in range(rollout.result.steps))
-    return Episode(frames, _columns(rollout.result))
+    return RecordedEpisode(frames, _columns(rollout.result))
 
 
 def _frame(rollout: Rollout, step: int) -> dict[str, Any]:

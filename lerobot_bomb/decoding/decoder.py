@@ -80,7 +80,7 @@ class CachedContinuation(Continuation):
         self._text.keep(row_B)
 
 
-class Progress(NamedTuple):
+class Answers(NamedTuple):
     """How far rows of symbols are written."""
 
     numbers: Tensor  # (B, N) int64 those that are complete, else 0
@@ -91,7 +91,7 @@ class Progress(NamedTuple):
     finite: Tensor  # (B,) bool, whether all that is written is from finite logits
 
     @classmethod
-    def start(cls, grammar: NumberGrammar, batch_size: int) -> "Progress":
+    def start(cls, grammar: NumberGrammar, batch_size: int) -> "Answers":
         """The space that every answer begins with is written."""
         place = grammar.start(batch_size)
         numbers_BN = place.prefix.new_zeros(batch_size, grammar.num_numbers)
@@ -111,9 +111,9 @@ class Progress(NamedTuple):
         """(B, N) the numbers, with the one that stands where rows are."""
         return self.numbers.scatter_add(1, self.number[:, None], grammar.value[self.prefix][:, None])
 
-    def keep(self, row_B: Tensor) -> "Progress":
+    def keep(self, row_B: Tensor) -> "Answers":
         """Those of these rows."""
-        return Progress(*(tensor[row_B] for tensor in self))
+        return Answers(*(tensor[row_B] for tensor in self))
 
 
 @dataclass(frozen=True)
@@ -131,12 +131,12 @@ def likeliest(logits: Tensor) -> tuple[Tensor, Tensor]:
 
 
 def write(
-    model: Continuation, grammar: NumberGrammar, guess: Guess, progress: Progress, num_guesses: int
-) -> tuple[Progress, Tensor]:
-    """One pass: further progress, and (B,) how many guesses were right."""
-    place = progress.place
-    guess_BG = guess(progress.numbers, place)[:, :num_guesses]
-    logits_BKS = model(torch.cat([progress.last[:, None], guess_BG], dim=1), progress.num_symbols - 1)
+    model: Continuation, grammar: NumberGrammar, guess: Guess, answers: Answers, num_guesses: int
+) -> tuple[Answers, Tensor]:
+    """One pass: further answers, and (B,) how many guesses were right."""
+    place = answers.place
+    guess_BG = guess(answers.numbers, place)[:, :num_guesses]
+    logits_BKS = model(torch.cat([answers.last[:, None], guess_BG], dim=1), answers.num_symbols - 1)
     places_BK = grammar.walk(place, guess_BG)
     picks_BK, logits_BK = likeliest(logits_BKS.float() + grammar.logit_bias(places_BK))
     num_right_B = (picks_BK[:, :-1] == guess_BG).cumprod(dim=1).sum(dim=1)
@@ -145,13 +145,13 @@ def write(
     mask_BK = column_K <= num_right_B[:, None]
     completes_BK = (picks_BK >= SPACE) & mask_BK
     index_BK = places_BK.number.clamp(max=grammar.num_numbers - 1)
-    numbers_BN = progress.numbers.scatter_add(1, index_BK, grammar.value[places_BK.prefix] * completes_BK)
+    numbers_BN = answers.numbers.scatter_add(1, index_BK, grammar.value[places_BK.prefix] * completes_BK)
     last_B = picks_BK.gather(1, num_right_B[:, None])[:, 0]
     place = grammar.advance(places_BK.at(num_right_B), last_B)
     max_symbols = grammar.max_symbols(grammar.num_numbers)
-    num_symbols_B = (progress.num_symbols + num_right_B + 1).clamp(max=max_symbols)
-    finite_B = progress.finite & (logits_BK.isfinite() | ~mask_BK).all(dim=1)
-    return Progress(numbers_BN, last_B, num_symbols_B, place.prefix, place.number, finite_B), num_right_B
+    num_symbols_B = (answers.num_symbols + num_right_B + 1).clamp(max=max_symbols)
+    finite_B = answers.finite & (logits_BK.isfinite() | ~mask_BK).all(dim=1)
+    return Answers(numbers_BN, last_B, num_symbols_B, place.prefix, place.number, finite_B), num_right_B
 
 
 @torch.no_grad()
@@ -166,23 +166,23 @@ def decode_numbers(
     Raises:
         ValueError: a row was written from logits that are not finite.
     """
-    progress = Progress.start(grammar, batch_size)
-    row_B = torch.arange(batch_size, device=progress.number.device)
-    numbers = progress.number.new_empty(batch_size, stop_after)
+    answers = Answers.start(grammar, batch_size)
+    row_B = torch.arange(batch_size, device=answers.number.device)
+    numbers = answers.number.new_empty(batch_size, stop_after)
     max_symbols = grammar.max_symbols(stop_after)
     num_passes, num_guesses = 0, FIRST_GUESSES
     while True:
-        num_left = max(1, max_symbols - int(progress.num_symbols.min()))
-        progress, num_right_B = write(model, grammar, guess, progress, min(num_guesses, num_left - 1))
+        num_left = max(1, max_symbols - int(answers.num_symbols.min()))
+        answers, num_right_B = write(model, grammar, guess, answers, min(num_guesses, num_left - 1))
         num_passes += 1
         # twice as many as were right, and one
         num_guesses = min(MAX_GUESSES, 1 + round(2 * float(num_right_B.float().mean())))
-        kept_B = (~progress.is_done(grammar, stop_after)).nonzero()[:, 0]
+        kept_B = (~answers.is_done(grammar, stop_after)).nonzero()[:, 0]
         if len(kept_B) == len(row_B):
             continue
-        require_finite_answers(progress.finite, row_B)
-        numbers[row_B] = progress.answer(grammar)[:, :stop_after]
+        require_finite_answers(answers.finite, row_B)
+        numbers[row_B] = answers.answer(grammar)[:, :stop_after]
         if not len(kept_B):
             return Decoded(numbers, num_passes)
         model.keep(kept_B)
-        row_B, progress = row_B[kept_B], progress.keep(kept_B)
+        row_B, answers = row_B[kept_B], answers.keep(kept_B)

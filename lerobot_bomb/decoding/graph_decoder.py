@@ -11,10 +11,10 @@ from torch.nn.functional import embedding, linear
 
 from lerobot_bomb.cuda_graphs import GraphedFunction
 from lerobot_bomb.decoding.decoder import (
+    Answers,
     CachedContinuation,
     Decoded,
     Guess,
-    Progress,
     Prompt,
     write,
 )
@@ -47,20 +47,20 @@ class GraphDecoder:
         self._head_SH.copy_(head_SH)
         return decode_ahead(self._passes(prompt), self._grammar, stop_after)
 
-    def _passes(self, prompt: Prompt) -> Iterator[Progress]:
+    def _passes(self, prompt: Prompt) -> Iterator[Answers]:
         length_B = prompt.mask.sum(dim=1)
-        progress = self._first(*prompt, length_B, *Progress.start(self._grammar, len(length_B)))
+        answers = self._first(*prompt, length_B, *Answers.start(self._grammar, len(length_B)))
         while True:
-            yield Progress(*progress)
-            progress = self._next(length_B, *progress)
+            yield Answers(*answers)
+            answers = self._next(length_B, *answers)
 
     def _write_first(self, embeds_BLH: Tensor, mask_BL: Tensor, *state: Tensor) -> tuple[Tensor, ...]:
         self._text.clear()
         return self._write(*state, prompt=Prompt(embeds_BLH, mask_BL))
 
-    def _write(self, length_B: Tensor, *progress: Tensor, prompt: Prompt | None = None) -> tuple[Tensor, ...]:
+    def _write(self, length_B: Tensor, *answers: Tensor, prompt: Prompt | None = None) -> tuple[Tensor, ...]:
         model = CachedContinuation(self._text, self._embed, self._head, length_B, prompt)
-        return tuple(write(model, self._grammar, self._guess, Progress(*progress), NUM_GUESSES)[0])
+        return tuple(write(model, self._grammar, self._guess, Answers(*answers), NUM_GUESSES)[0])
 
     def _embed(self, symbols: Tensor) -> Tensor:
         return embedding(symbols, self._embeds_SH)
@@ -69,17 +69,17 @@ class GraphDecoder:
         return linear(hidden, self._head_SH)
 
 
-def decode_ahead(passes: Iterator[Progress], grammar: NumberGrammar, stop_after: int) -> Decoded:
+def decode_ahead(passes: Iterator[Answers], grammar: NumberGrammar, stop_after: int) -> Decoded:
     """As `decode_numbers`; while a pass runs, the host hears of the last: are all rows done, and finite?"""
     hear = None
-    for num_passes, progress in enumerate(passes, 1):
+    for num_passes, answers in enumerate(passes, 1):
         if hear is not None:
             is_done, is_finite = hear()
             if not is_finite:
-                require_finite_answers(progress.finite)
+                require_finite_answers(answers.finite)
             if is_done:
-                return Decoded(progress.answer(grammar)[:, :stop_after], num_passes)
-        hear = _fetch(torch.stack([progress.is_done(grammar, stop_after).all(), progress.finite.all()]))
+                return Decoded(answers.answer(grammar)[:, :stop_after], num_passes)
+        hear = _fetch(torch.stack([answers.is_done(grammar, stop_after).all(), answers.finite.all()]))
     raise AssertionError("an answer has an end")
 
 

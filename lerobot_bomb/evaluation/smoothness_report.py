@@ -28,7 +28,7 @@ class Units:
 
 
 @dataclass(frozen=True)
-class Row:
+class SmoothnessRow:
     """The smoothness of a dataset or an evaluation; every dict has the keys of ORDERS."""
 
     fps: float
@@ -88,7 +88,7 @@ def check_comparable(compared: list[Executed], per_second: bool) -> None:
             )
 
 
-def measure_row(executed: Executed, units: Units) -> Row:
+def measure_row(executed: Executed, units: Units) -> SmoothnessRow:
     """Every difference within an episode counts the same.
 
     Raises:
@@ -101,7 +101,7 @@ def measure_row(executed: Executed, units: Units) -> Row:
     actions_RD = np.concatenate(list(episodes.values()))
     episode_R = np.repeat(np.arange(len(episodes)), list(num_actions.values()))
     dt_s = 1 / executed.fps if units.per_second else None
-    return Row(
+    return SmoothnessRow(
         executed.fps,
         len(executed.episodes) - len(episodes),
         num_actions,
@@ -123,7 +123,7 @@ def _measures(
     return dict(zip(ORDERS, (raw.j2, raw.j3, normalised.j2, normalised.j3), strict=True))
 
 
-def measure_difference(first: str, second: str, rows: dict[str, Row]) -> Difference:
+def measure_difference(first: str, second: str, rows: dict[str, SmoothnessRow]) -> Difference:
     """The second one's means minus the first one's, episodes drawn as pairs.
 
     Raises:
@@ -144,7 +144,7 @@ def measure_difference(first: str, second: str, rows: dict[str, Row]) -> Differe
     return Difference(len(pairs), measures)
 
 
-def print_rows(rows: dict[str, Row]) -> None:
+def print_rows(rows: dict[str, SmoothnessRow]) -> None:
     """Print a row per dataset or evaluation."""
     cells = [
         [name, str(len(row.episodes)), str(sum(row.num_actions.values())), *map(str, row.measures.values())]

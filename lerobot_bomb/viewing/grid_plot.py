@@ -15,7 +15,7 @@ BAR_RGB, EDGE_RGB = (150, 160, 175), (210, 40, 30)
 
 
 @dataclass(frozen=True)
-class Row:
+class PlotRow:
     """What the plot shows of one coordinate."""
 
     label: list[str]  # lines
@@ -23,7 +23,7 @@ class Row:
     edges: np.ndarray  # (E + 1,) of its bins
 
 
-def draw_rows(title: str, rows: list[Row]) -> np.ndarray:
+def draw_rows(title: str, rows: list[PlotRow]) -> np.ndarray:
     """(H, W, 3) uint8: histograms with edges, one above the other, under a title and a legend."""
     size = (LABEL_WIDTH + PLOT_WIDTH + 2 * GAP, TITLE_HEIGHT + len(rows) * ROW_HEIGHT + GAP)
     plot = Image.new("RGB", size, PAPER)
@@ -46,7 +46,7 @@ def edge_x(edges: np.ndarray) -> np.ndarray:
     return LABEL_WIDTH + np.round((edges - low) / (high - low) * (PLOT_WIDTH - 1)).astype(int)
 
 
-def _draw_row(pen: ImageDraw.ImageDraw, row: Row, top: int) -> None:
+def _draw_row(pen: ImageDraw.ImageDraw, row: PlotRow, top: int) -> None:
     low, high = float(row.edges[0]), float(row.edges[-1])
     bottom = top + PLOT_HEIGHT
     pen.multiline_text((GAP, top), "\n".join(row.label), INK, font(FONT_SIZE))
