@@ -237,7 +237,7 @@ def test_a_hub_id_without_network_names_both_ways_out() -> None:
 
 
 def test_a_tokenizer_of_another_family_is_refused() -> None:
-    text = nano_tokenizer().to_str().replace("<image>", "<image>")
+    text = nano_tokenizer().to_str().replace("<image>", "<photo>")
     with pytest.raises(ValueError, match=r"has no single token for '<\|image_pad\|>' or '<image>'"):
         QwenPrompt.from_tokenizer(Tokenizer.from_str(text), "some/model")
 

@@ -22,7 +22,7 @@ pytestmark = pytest.mark.skipif(platform.system() != "Linux", reason="processes 
 FLAGS = ("--repo_id=test/killed", "--episodes=3", "--seed=3", "--image_size=64")
 MODES = {"video": FLAGS, "images": (*FLAGS, "--images", "--workers=2")}
 SEED = 0  # of the random moments
-NOTHING = "no block of episodes was finished, so nothing is kept"
+NOTHING = "no block of 2 episodes was finished, so nothing is kept"
 
 # the recorder's own last steps of each stage: what a kill just before them leaves is the most delicate
 STEPS = (

@@ -289,7 +289,7 @@ def _keep_finished(folder: Path) -> str:
     blocks = finished_blocks(folder)
     if not blocks:
         remove_folder(folder)
-        return "no block of episodes was finished, so nothing is kept"
+        return f"no block of {BLOCK_EPISODES} episodes was finished, so nothing is kept"
     num_episodes = reached(folder).num_episodes
     num_missing = sum(gap.num_missing for gap in find_gaps(folder, num_episodes, BLOCK_EPISODES))
     return f"{num_episodes - num_missing} episodes are kept in {folder}, go on with --resume"

@@ -22,6 +22,8 @@ from lerobot.processor import (
 from lerobot.utils.constants import OBS_IMAGE, POLICY_PREPROCESSOR_DEFAULT_NAME
 from lerobot.utils.import_utils import register_third_party_plugins
 
+from lerobot_bomb.checkpoints.shipped import checkpoint_path
+
 PREPROCESSOR_FILE = f"{POLICY_PREPROCESSOR_DEFAULT_NAME}.json"
 
 type Features = dict[PipelineFeatureType, dict[str, PolicyFeature]]
@@ -70,12 +72,12 @@ class ReplaceTasks(ComplementaryDataProcessorStep):
 
 
 def intervene(checkpoint: Path | str, steps: Sequence[ProcessorStep], output: Path | str) -> None:
-    """Write `output`, a copy of a checkpoint whose preprocessor begins with `steps`.
+    """Write `output`, a copy of a checkpoint, a folder or `bomb:NAME`, with `steps` before its preprocessor.
 
     Raises:
         ValueError: `checkpoint` is no checkpoint, `output` exists, or there are no steps.
     """
-    checkpoint, output = Path(checkpoint), Path(output)
+    checkpoint, output = Path(checkpoint_path(str(checkpoint))), Path(output)
     if not steps or not all(isinstance(step, ProcessorStep) for step in steps):
         raise ValueError(f"steps={steps!r} must be a list of processor steps, as [BlankImages()]")
     unknown = [type(step).__name__ for step in steps if not hasattr(type(step), "_registry_name")]
