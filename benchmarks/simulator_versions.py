@@ -20,7 +20,7 @@ import re
 import subprocess
 import sys
 from collections.abc import Iterable
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from itertools import product
 from pathlib import Path
 
@@ -62,37 +62,28 @@ def measure_here(conditions: Iterable[str], seeds: range) -> Measured:
     outcomes: dict[str, Outcome | str] = {}
     for robot, condition in product(ROBOTS, conditions):
         try:
-            outcomes[f"{robot} {condition}"] = play(robot, condition, seeds)
+            outcomes[f"{robot} {condition}"] = outcome_of(robot, condition, seeds)
         except ValueError as error:  # a robot whose model this version cannot read
             outcomes[f"{robot} {condition}"] = str(error)
     return Measured(importlib.metadata.version("mujoco"), renderer_name(), outcomes)
 
 
-def play(robot: str, condition: str, seeds: range) -> Outcome:
+def outcome_of(robot: str, condition: str, seeds: range) -> Outcome:
     """The expert's episodes of these seeds."""
     from lerobot_bomb.bomb.episode import EpisodeSpec
-    from lerobot_bomb.bomb.expert import expert_action
-    from lerobot_bomb.bomb.observation import RenderOptions
-    from lerobot_bomb.bomb.privileged_state import PrivilegedState
+    from lerobot_bomb.bomb.observation import PIXELS, RenderOptions
+    from lerobot_bomb.envs.rollout import expert_agent, play
     from lerobot_env_bomb.env import BombEnv
 
     states, images, results = hashlib.sha256(), hashlib.sha256(), []
-    env = BombEnv(
-        EpisodeSpec(seed=0, robot=robot, perturbations=condition), RenderOptions(image_size=IMAGE_SIZE)
-    )
+    spec = EpisodeSpec(seed=0, robot=robot, perturbations=condition)
+    env = BombEnv(spec, RenderOptions(image_size=IMAGE_SIZE))
     for seed in seeds:
-        observation, _ = env.reset(seed=seed)
-        ended = False
-        while True:
+        for moment in play(env, replace(spec, seed=seed), expert_agent(spec)):
             data = env._run.scene.data
             states.update(data.qpos.tobytes() + data.qvel.tobytes())
-            for image in observation["pixels"].values():
+            for image in moment.observation[PIXELS].values():
                 images.update(image.tobytes())
-            if ended:
-                break
-            action = expert_action(PrivilegedState.from_vector(observation["environment_state"]))
-            observation, _, terminated, truncated, _ = env.step(action)
-            ended = terminated or truncated
         results.append(env.episode_result())
     env.close()
     return Outcome(

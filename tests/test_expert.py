@@ -8,6 +8,7 @@ from lerobot_bomb.bomb.episode import EpisodeSpec, Stage
 from lerobot_bomb.bomb.expert import FLOOR_M, expert_action
 from lerobot_bomb.bomb.observation import MAX_STEP_M, WORKSPACE_LOW_M, RenderOptions
 from lerobot_bomb.bomb.privileged_state import Goal, PrivilegedState
+from lerobot_bomb.envs.rollout import expert_agent, play
 from lerobot_env_bomb.env import BombEnv
 from lerobot_env_bomb.scene import WORKSPACE_HIGH, WORKSPACE_LOW
 
@@ -28,19 +29,16 @@ def state_of(gripper_xyz: list[float], opening: float, stone_xyz: np.ndarray = S
     )
 
 
-def play(env: BombEnv, seed: int, noise: float = 0.0) -> tuple[list[PrivilegedState], list[np.ndarray], dict]:
+def expert_episode(
+    env: BombEnv, seed: int, noise: float = 0.0
+) -> tuple[list[PrivilegedState], list[np.ndarray], dict]:
     """States before each action and after the last, the expert's actions, the last info."""
-    rng = np.random.default_rng(seed)
-    observation, info = env.reset(seed=seed)
-    states, actions, ended = [], [], False
-    while not ended:
-        states.append(PrivilegedState.from_vector(observation["environment_state"]))
-        actions.append(expert_action(states[-1]))
-        executed = actions[-1] + noise * np.array([*rng.standard_normal(3), 0])
-        observation, _, terminated, truncated, info = env.step(executed)
-        ended = terminated or truncated
-    states.append(PrivilegedState.from_vector(observation["environment_state"]))
-    return states, actions, info
+    rng, spec = np.random.default_rng(seed), EpisodeSpec(seed)
+    moments = list(
+        play(env, spec, expert_agent(spec), lambda a: a + noise * np.array([*rng.standard_normal(3), 0]))
+    )
+    actions = [moment.action for moment in moments if moment.action is not None]
+    return [moment.state for moment in moments], actions, moments[-1].info
 
 
 @pytest.fixture(scope="module")
@@ -52,7 +50,7 @@ def env():
 
 @pytest.fixture(scope="module")
 def episodes(env: BombEnv) -> list[tuple[list[PrivilegedState], list[np.ndarray], dict]]:
-    return [play(env, seed) for seed in range(10)]
+    return [expert_episode(env, seed) for seed in range(10)]
 
 
 def test_above_the_stone_it_descends_with_open_fingers() -> None:
@@ -200,7 +198,7 @@ def test_it_succeeds_in_other_control_modes_and_rates(mode: str, fps: int) -> No
 
 
 def test_it_recovers_from_noise_on_its_actions(env: BombEnv) -> None:
-    infos = [play(env, seed, noise=0.05)[2] for seed in range(20, 30)]
+    infos = [expert_episode(env, seed, noise=0.05)[2] for seed in range(20, 30)]
     assert all(info["is_success"] for info in infos), infos
 
 

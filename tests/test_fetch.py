@@ -5,6 +5,7 @@ import importlib.metadata
 import importlib.util
 import itertools
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -12,11 +13,11 @@ import pytest
 
 from lerobot_bomb.bomb.board import BOARD
 from lerobot_bomb.bomb.episode import EpisodeSpec
-from lerobot_bomb.bomb.expert import expert_action
 from lerobot_bomb.bomb.layout import Layout
 from lerobot_bomb.bomb.observation import RenderOptions, action_bounds
 from lerobot_bomb.bomb.privileged_state import PrivilegedState
 from lerobot_bomb.commands import doctor
+from lerobot_bomb.envs.rollout import expert_agent, play
 from lerobot_bomb.evaluation.results import read_results
 from lerobot_bomb.flag_errors import FlagError
 from lerobot_env_bomb import fetch_files
@@ -43,18 +44,16 @@ def scene() -> Scene:
     return Scene("fetch")
 
 
-def play(env: BombEnv, seed: int) -> tuple[str, dict]:
+def expert_episode(env: BombEnv, seed: int) -> tuple[str, dict]:
     """Digest of all observations and actions of the expert's episode, its last info."""
-    observation, info = env.reset(seed=seed)
-    everything, ended = hashlib.sha256(), False
-    while not ended:
-        action = expert_action(PrivilegedState.from_vector(observation["environment_state"]))
-        pixels = observation["pixels"].values()
-        for array in (action, *pixels, observation["agent_pos"], observation["environment_state"]):
-            everything.update(array.tobytes())
-        observation, _, terminated, truncated, info = env.step(action)
-        ended = terminated or truncated
-    return everything.hexdigest(), info
+    spec = replace(SPEC, seed=seed)
+    *moments, last = play(env, spec, expert_agent(spec))
+    everything = hashlib.sha256()
+    for moment in moments:
+        seen = moment.observation
+        arrays = (moment.action, *seen["pixels"].values(), seen["agent_pos"], seen["environment_state"])
+        everything.update(b"".join(array.tobytes() for array in arrays if array is not None))
+    return everything.hexdigest(), last.info
 
 
 def put_gripper(scene: Scene, xyz: tuple[float, ...]) -> None:
@@ -79,15 +78,15 @@ def test_a_policy_meets_the_same_spaces_and_episodes(env: BombEnv) -> None:
 
 def test_the_expert_places_stones_and_moves_no_other(env: BombEnv) -> None:
     for seed in range(5):
-        info = play(env, seed)[1]
+        info = expert_episode(env, seed)[1]
         assert info["is_success"] and info["placement_error_mm"] < 2 and info["collateral_mm"] < 0.5
 
 
 def test_a_used_and_a_fresh_environment_give_the_same_bits(env: BombEnv) -> None:
-    play(env, 8)
-    again = play(env, 7)[0]
+    expert_episode(env, 8)
+    again = expert_episode(env, 7)[0]
     fresh = BombEnv(SPEC, SMALL)
-    assert play(fresh, 7)[0] == again
+    assert expert_episode(fresh, 7)[0] == again
     fresh.close()
 
 

@@ -43,7 +43,7 @@ def commands(monkeypatch: pytest.MonkeyPatch, stock_cli: Callable[..., None]) ->
     return ran
 
 
-def test_a_rung_is_climbed_by_stock_commands_and_goes_on_where_it_stopped(
+def test_a_task_is_learnt_by_stock_commands_and_goes_on_where_it_stopped(
     commands: list[str], tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     folder = tmp_path / "task"
@@ -84,7 +84,7 @@ def test_a_rung_is_climbed_by_stock_commands_and_goes_on_where_it_stopped(
         learn.run_task(args)
 
 
-def test_a_stone_counts_where_the_told_instruction_says() -> None:
+def test_a_stone_counts_where_the_given_instruction_says() -> None:
     rows = [
         row(None, 1.0, instruction="a"),
         row("wrong_intersection", 45.0, (2, 3), instruction="a"),
@@ -106,7 +106,7 @@ def test_the_other_instruction_names_another_target() -> None:
     assert learn.other_instructions([row(None, 1.0, instruction="only")]) == {"only": "only"}
 
 
-def test_every_policy_type_has_a_recipe_for_every_rung() -> None:
+def test_every_policy_type_has_a_recipe_for_every_task() -> None:
     for name, task in learn.TASKS.items():
         for policy_type in task.trainings.keys() - {learn.PROBE}:
             recipe = learn.read_recipe(name, policy_type)

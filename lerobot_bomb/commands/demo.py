@@ -1,6 +1,7 @@
 """``lerobot-bomb demo``: a policy that comes with the package plays, on LeRobot's own commands."""
 
 import argparse
+import json
 import time
 from dataclasses import dataclass
 from datetime import datetime
@@ -83,7 +84,6 @@ def _evaluate(output_dir: Path, name: str, player: Player, num_episodes: int) ->
     results = output_dir / f"{name}.jsonl"
     # a divisor, so that LeRobot plays no more episodes than asked
     batch_size = max(size for size in range(1, MAX_EVAL_BATCH + 1) if num_episodes % size == 0)
-    conditions = ",".join(f'"{condition}"' for condition in player.conditions)
     run_command(
         "lerobot-eval",
         player.policy_flag,
@@ -91,7 +91,7 @@ def _evaluate(output_dir: Path, name: str, player: Player, num_episodes: int) ->
         "--env.type=bomb",
         f"--env.task={SUITE}",
         f"--env.image_size={IMAGE_SIZE}",
-        f"--env.perturbations=[{conditions}]",
+        f"--env.perturbations={json.dumps(player.conditions)}",
         f"--env.results_path={results}",
         f"--seed={SEED}",
         f"--eval.n_episodes={num_episodes}",

@@ -79,10 +79,12 @@ def check_rendering() -> Iterator[Finding]:
     except (RuntimeError, ValueError) as error:
         yield Finding("opengl", str(error), broken=True)
         return
+    from lerobot_bomb.bomb.observation import PIXELS
+
     env = importlib.import_module("lerobot_env_bomb.env").BombEnv()
     observation, _ = env.reset(seed=0)
     env.close()
-    contrast = max(int(image.max()) - int(image.min()) for image in observation["pixels"].values())
+    contrast = max(int(image.max()) - int(image.min()) for image in observation[PIXELS].values())
     detail = f"{backend} renders"
     yield Finding("opengl", detail if contrast else f"{backend} renders black frames", broken=not contrast)
 

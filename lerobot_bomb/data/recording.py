@@ -95,9 +95,10 @@ class Recording:
 
     def specs(self, num_tried: int) -> Iterator[EpisodeSpec]:
         """The episodes to try after the first `num_tried`: seeds count up, each with all conditions."""
+        conditions = self.conditions
         for tried in itertools.count(num_tried):
-            seeds_done, condition = divmod(tried, len(self.conditions))
-            yield replace(self.conditions[condition], seed=self.seed + seeds_done)
+            seeds_done, condition = divmod(tried, len(conditions))
+            yield replace(conditions[condition], seed=self.seed + seeds_done)
 
     @property
     def render_options(self) -> RenderOptions:

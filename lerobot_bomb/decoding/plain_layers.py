@@ -13,6 +13,8 @@ import torch
 from torch import Tensor
 from transformers.models.gemma2.modeling_gemma2 import Gemma2DecoderLayer, Gemma2RMSNorm
 
+from lerobot_bomb.decoding.qkv import softcap_of
+
 
 def hidden_states(model: Any, x_BLH: Tensor) -> Tensor:
     """(B, L, H) embeddings of a prompt -> (B, L, H) states after the last layer and its norm."""
@@ -63,7 +65,7 @@ def rope(x: Tensor, cos_1LE: Tensor, sin_1LE: Tensor) -> Tensor:
 
 def softcap(attention: Any, logits: Tensor) -> Tensor:
     """Attention logits, in Gemma 2 within a limit (arXiv:2408.00118, section 2)."""
-    limit = getattr(attention, "attn_logit_softcapping", None)
+    limit = softcap_of(attention)
     return logits if limit is None else limit * torch.tanh(logits / limit)
 
 
