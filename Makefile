@@ -7,6 +7,8 @@ BIN := .venv/bin
 STAMP := .venv/.installed
 # two torch threads beside another job are many times slower than one
 export OMP_NUM_THREADS ?= 1
+# LeRobot imports 4000 files; where this is set, as in many images, every process compiles them anew
+unexport PYTHONDONTWRITEBYTECODE
 # tests of a file share what is recorded and trained for them, so a file is run by one process
 PYTEST := $(BIN)/pytest -n auto --maxprocesses=4 --dist=loadfile
 
