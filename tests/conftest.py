@@ -6,10 +6,10 @@ import os
 import sys
 from collections.abc import Callable, Iterator
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import pytest
-from recipes import POLICY_TYPES, read_recipe
+from recipes import POLICY_TYPES
 from variants import variants_of
 
 if TYPE_CHECKING:
@@ -102,13 +102,3 @@ def pytest_generate_tests(metafunc: pytest.Metafunc) -> None:
         metafunc.parametrize(("policy_type", "options"), variants)
     else:
         metafunc.parametrize("policy_type", types)
-
-
-@pytest.fixture
-def policy_flags() -> Callable[[str], dict[str, Any]]:
-    """policy_flags("vla0_smol"): what configs/overfit_vla0_smol.yaml sets under `policy`."""
-
-    def read(policy_type: str) -> dict[str, Any]:
-        return read_recipe("overfit", policy_type)["policy"]
-
-    return read

@@ -234,14 +234,15 @@ def test_scripted_results_do_not_depend_on_batch_or_workers(
 
 
 @pytest.fixture
-def checkpoint(tmp_path: Path, policy_type: str, policy_flags: Callable[[str], dict[str, Any]]) -> Path:
+def checkpoint(tmp_path: Path, policy_type: str) -> Path:
     """Of lerobot-train without an update: every input tells in the actions of random weights."""
     from lerobot.utils.import_utils import register_third_party_plugins
     from parity_routes import Recorded, cli_flags, run_train
+    from variants import small_policy
 
     register_third_party_plugins()
     recorded = Recorded.make(tmp_path / "dataset", images=True)
-    flags = cli_flags(policy_type, policy_flags(policy_type), use_state=True)
+    flags = cli_flags(policy_type, small_policy(policy_type), use_state=True)
     run_train(recorded, tmp_path / "train", flags, finish=None)
     return tmp_path / "train" / "checkpoints" / "last" / "pretrained_model"
 

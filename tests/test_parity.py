@@ -3,7 +3,6 @@
 import functools
 from collections.abc import Callable, Iterator
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
@@ -23,7 +22,7 @@ from parity_routes import (
     run_routes,
     tolerance,
 )
-from variants import DENOISE_ONLY, Options
+from variants import DENOISE_ONLY, Options, small_policy
 
 # Least PSNR of a camera's pixels, as the network gets them, between a frame out of a video and the drawn one.
 # Measured: AV1 at 64x64 gives at least 26.8 dB; swapped cameras gave 10.7, BGR for RGB 8.7, a video that is
@@ -52,7 +51,6 @@ def cache() -> dict[tuple, Routes]:
 @pytest.fixture
 def routes(
     policy_type: str,
-    policy_flags: Callable[[str], dict[str, Any]],
     recorded: Callable[[bool, str], Recorded],
     cache: dict[tuple, Routes],
     tmp_path: Path,
@@ -68,7 +66,7 @@ def routes(
         key = (policy_type, str(options or {}), images, use_state, control_mode)
         if key not in cache:
             register_third_party_plugins()
-            own = policy_flags(policy_type) | (options or {})
+            own = small_policy(policy_type) | (options or {})
             flags = cli_flags(policy_type, own, use_state=use_state)
             data = recorded(images, control_mode)
             learns = images and use_state

@@ -11,6 +11,7 @@ from lerobot.policies.factory import get_policy_class
 from policy_cases import CASES
 from recipes import POLICY_TYPES, recipe_path
 from training_processes import NUM_PROCESSES, Seen, Training, draws_by_sample, in_processes, seen_losses
+from variants import as_flags, small_policy
 
 REPO_ID = "overfit/bomb_place"  # the recipes'
 BATCH_SIZE, NUM_EPISODES, EPISODE_LENGTH = 2, 3, 4
@@ -46,6 +47,7 @@ def dataset(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def flags(policy_type: str, dataset: Path, batch_size: int, output_dir: str) -> list[str]:
     return [
         f"--config_path={recipe_path('overfit', policy_type)}",
+        *as_flags(small_policy(policy_type)),
         f"--dataset.root={dataset}",
         f"--output_dir={output_dir}",
         f"--batch_size={batch_size}",
