@@ -12,6 +12,7 @@ from lerobot_policy_keypoint_probe.processor_keypoint_probe import NUM_WORD_IDS,
 from torch import Tensor, nn
 
 from lerobot_bomb.flag_errors import FlagError
+from lerobot_bomb.hub.card import Checkpoint
 
 CAMERAS = ("observation.images.workspace", "observation.images.wrist")
 SIZE = 32  # pixels
@@ -173,8 +174,15 @@ def test_a_checkpoint_without_one_of_the_tensors_is_refused(tmp_path: Path) -> N
     policy = make_policy()
     tensors = {name: value for name, value in policy.state_dict().items() if name != "words.weight"}
     policy.save_pretrained(tmp_path, state_dict=tensors)
-    with pytest.raises(RuntimeError, match=r"Missing key.*words\.weight"):
+    with pytest.raises(ValueError, match=r"words\.weight"):
         KeypointProbePolicy.from_pretrained(tmp_path)
+
+
+def test_a_card_of_what_has_no_backbone_names_none() -> None:
+    card = Checkpoint(make_config(), KeypointProbePolicy.method, "me/x", "me/d").card()
+    assert "Backbone" not in card.text and "Deep spatial autoencoders" in card.text
+    data = card.data.to_dict()
+    assert data["license"] == "apache-2.0" and "base_model" not in data
 
 
 @pytest.mark.parametrize(

@@ -1,21 +1,23 @@
 """Config of ``keypoint_probe``."""
 
 from dataclasses import dataclass, field
+from typing import ClassVar
 
 from lerobot.configs import NormalizationMode, PreTrainedConfig
-from lerobot.optim import AdamWConfig, CosineDecayWithWarmupSchedulerConfig
 
-from lerobot_bomb.flag_errors import flag_errors
+from lerobot_bomb.policies.config import ChunkConfig
+from lerobot_bomb.training.policy_flags import check_not_negative, check_positive
 
 GROUP_CHANNELS = 8  # of the group normalisation
 
 
 @PreTrainedConfig.register_subclass("keypoint_probe")
 @dataclass
-class KeypointProbeConfig(PreTrainedConfig):
+class KeypointProbeConfig(ChunkConfig):
     """Keypoints of every camera, the robot's state and the instruction's words -> the next action."""
 
-    n_obs_steps: int = 1
+    TASK_STEP: ClassVar[str] = "keypoint_probe_words"
+
     normalization_mapping: dict[str, NormalizationMode] = field(
         default_factory=lambda: {
             "VISUAL": NormalizationMode.IDENTITY,
@@ -37,69 +39,31 @@ class KeypointProbeConfig(PreTrainedConfig):
     # units of each hidden layer
     hidden_dim: int = 256
 
+    drop_n_last_frames: int = 0
     optimizer_lr: float = 4e-3
+    optimizer_betas: tuple[float, float] = (0.9, 0.999)
     optimizer_weight_decay: float = 1e-4
-    optimizer_grad_clip_norm: float = 1.0
     # shares of a schedule that LeRobot shortens to --steps
     scheduler_warmup_steps: int = 10_000
     scheduler_decay_steps: int = 1_000_000
     scheduler_decay_lr: float = 2e-5
 
-    push_to_hub: bool = False
-
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        with flag_errors():
-            self._check()
-
-    def _check(self) -> None:
-        if self.n_obs_steps != 1:
-            raise ValueError(
-                f"--policy.n_obs_steps={self.n_obs_steps}: keypoint_probe reads 1 observation step"
-            )
-        for flag in ("num_keypoints", "word_dim", "hidden_dim", "scheduler_decay_steps"):
-            if getattr(self, flag) < 1:
-                raise ValueError(f"--policy.{flag}={getattr(self, flag)} must be at least 1")
-        if self.num_channels < 1 or self.num_channels % GROUP_CHANNELS:
+    def check_flags(self) -> None:
+        super().check_flags()
+        check_positive(self, ("num_keypoints", "num_channels", "word_dim", "hidden_dim"))
+        check_not_negative(self, ("num_state_octaves",))
+        if self.num_channels % GROUP_CHANNELS:
             raise ValueError(
                 f"--policy.num_channels={self.num_channels} must be a multiple of {GROUP_CHANNELS}"
             )
-        if self.num_state_octaves < 0:
-            raise ValueError(f"--policy.num_state_octaves={self.num_state_octaves} must not be negative")
+        if self.chunk_size != 1:
+            raise ValueError(f"--policy.chunk_size={self.chunk_size}: keypoint_probe predicts 1 action")
 
     def validate_features(self) -> None:
         """Raise unless the dataset (or environment) has what the policy reads and writes."""
-        inputs = sorted(self.input_features or {})
-        if not self.image_features:
-            raise ValueError(f"keypoint_probe needs at least one camera; the dataset has the inputs {inputs}")
+        super().validate_features()
         if self.robot_state_feature is None:
-            raise ValueError(f"keypoint_probe needs 'observation.state'; the dataset has the inputs {inputs}")
-        if self.action_feature is None:
-            raise ValueError(f"keypoint_probe needs the feature 'action'; got {self.output_features}")
-
-    def get_optimizer_preset(self) -> AdamWConfig:
-        return AdamWConfig(
-            lr=self.optimizer_lr,
-            weight_decay=self.optimizer_weight_decay,
-            grad_clip_norm=self.optimizer_grad_clip_norm,
-        )
-
-    def get_scheduler_preset(self) -> CosineDecayWithWarmupSchedulerConfig:
-        return CosineDecayWithWarmupSchedulerConfig(
-            num_warmup_steps=self.scheduler_warmup_steps,
-            num_decay_steps=self.scheduler_decay_steps,
-            peak_lr=self.optimizer_lr,
-            decay_lr=self.scheduler_decay_lr,
-        )
-
-    @property
-    def observation_delta_indices(self) -> None:
-        return None
-
-    @property
-    def action_delta_indices(self) -> None:
-        return None
-
-    @property
-    def reward_delta_indices(self) -> None:
-        return None
+            raise ValueError(
+                "keypoint_probe needs 'observation.state'; the dataset has the inputs "
+                f"{sorted(self.input_features or {})}"
+            )

@@ -4,14 +4,17 @@ Source of the keypoints: the spatial softmax of Finn et al. (2016), "Deep spatia
 visuomotor learning".
 
 Shapes: `B` batch, `K` keypoints of a camera, `H` and `W` of its heat maps, `S` state dims, `D` action dims,
-`L` words of a instruction.
+`L` words of an instruction.
 """
 
+from typing import Any
+
 import torch
-from lerobot.policies import PreTrainedPolicy
 from lerobot.utils.constants import ACTION, OBS_LANGUAGE_TOKENS, OBS_STATE
 from torch import Tensor, nn
 
+from lerobot_bomb.hub.method import Method, Paper
+from lerobot_bomb.policies.policy import ChunkPolicy
 from lerobot_policy_keypoint_probe.configuration_keypoint_probe import GROUP_CHANNELS, KeypointProbeConfig
 from lerobot_policy_keypoint_probe.processor_keypoint_probe import NO_WORD, NUM_WORD_IDS
 
@@ -37,24 +40,40 @@ class KeypointEncoder(nn.Module):
         return torch.cat([_mean_place(share_BKHW.sum(2)), _mean_place(share_BKHW.sum(3)), clarity_BK], dim=1)
 
 
-class KeypointProbePolicy(PreTrainedPolicy):
+SHAPES = ("num_keypoints", "num_channels", "num_state_octaves", "word_dim", "hidden_dim")
+
+
+class KeypointProbePolicy(ChunkPolicy):
     """Predicts one action per observation; keeps nothing between steps."""
 
+    method = Method(
+        "keypoints of every camera, the robot's state and a bag of the instruction's words, through two "
+        "hidden layers: a probe that asks what demonstrations teach.",
+        papers=(
+            Paper(
+                "finn2016deep",
+                "Deep spatial autoencoders for visuomotor learning",
+                "Finn, Chelsea and others",
+                2016,
+                "1509.06113",
+            ),
+        ),
+    )
+    shapes = SHAPES
+    as_trained = (*SHAPES, "normalization_mapping")
     config_class = KeypointProbeConfig  # pyright: ignore[reportAssignmentType]  LeRobot annotates it as None
     name = "keypoint_probe"  # pyright: ignore[reportAssignmentType]
     config: KeypointProbeConfig
 
-    def __init__(self, config: KeypointProbeConfig, **_: object):
-        super().__init__(config)
-        config.validate_features()
-        assert config.robot_state_feature is not None and config.action_feature is not None
-        self.cameras = sorted(config.image_features)
+    def __init__(self, config: KeypointProbeConfig, dataset_meta: Any = None, **_: object):
+        super().__init__(config, dataset_meta)
+        assert config.robot_state_feature is not None
         self.encoders = nn.ModuleList(
             KeypointEncoder(config.num_keypoints, config.num_channels, config.initial_sharpness)
-            for _ in self.cameras
+            for _ in self._cameras
         )
         self.words = nn.EmbeddingBag(NUM_WORD_IDS, config.word_dim, mode="sum", padding_idx=NO_WORD)
-        num_inputs = 3 * config.num_keypoints * len(self.cameras) + config.word_dim
+        num_inputs = 3 * config.num_keypoints * len(self._cameras) + config.word_dim
         num_inputs += config.robot_state_feature.shape[0] * (1 + 2 * config.num_state_octaves)
         hidden = config.hidden_dim
         self.head = nn.Sequential(
@@ -62,19 +81,8 @@ class KeypointProbePolicy(PreTrainedPolicy):
             nn.ReLU(),
             nn.Linear(hidden, hidden),
             nn.ReLU(),
-            nn.Linear(hidden, config.action_feature.shape[0]),
+            nn.Linear(hidden, self._action_dim),
         )
-
-    @classmethod
-    def from_pretrained(cls, *args, **kwargs) -> "KeypointProbePolicy":
-        """As LeRobot's, but a missing or unexpected tensor is an error."""
-        return super().from_pretrained(*args, **{**kwargs, "strict": True})
-
-    def get_optim_params(self) -> list[nn.Parameter]:
-        return list(self.parameters())
-
-    def reset(self) -> None:
-        """Nothing to forget."""
 
     def forward(self, batch: dict[str, Tensor], reduction: str = "mean") -> tuple[Tensor, dict[str, float]]:
         """Mean absolute error of the normalised actions; ``reduction="none"`` gives (B,)."""
@@ -94,7 +102,7 @@ class KeypointProbePolicy(PreTrainedPolicy):
     def _act(self, batch: dict[str, Tensor]) -> Tensor:
         """(B, D) normalised action."""
         keypoints = [
-            encoder(batch[camera]) for camera, encoder in zip(self.cameras, self.encoders, strict=True)
+            encoder(batch[camera]) for camera, encoder in zip(self._cameras, self.encoders, strict=True)
         ]
         state_BS = batch[OBS_STATE]
         octaves = 2.0 ** torch.arange(self.config.num_state_octaves, device=state_BS.device)

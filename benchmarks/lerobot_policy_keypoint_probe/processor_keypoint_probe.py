@@ -31,7 +31,7 @@ def word_ids(instruction: str) -> list[int]:
     return [1 + zlib.crc32(word.encode()) % (NUM_WORD_IDS - 1) for word in instruction.split()]
 
 
-@ProcessorStepRegistry.register("keypoint_probe_words")
+@ProcessorStepRegistry.register(KeypointProbeConfig.TASK_STEP)
 @dataclass
 class WordsStep(ObservationProcessorStep):
     """``task`` (B texts) -> ``observation.language.tokens`` (B, L) int64, rows filled up with NO_WORD."""

@@ -13,6 +13,7 @@ from lerobot.utils.import_utils import register_third_party_plugins
 from safetensors import SafetensorError, safe_open
 from torch import Tensor
 
+from lerobot_bomb.checkpoints.environment import ConfigWithEnvironment
 from lerobot_bomb.checkpoints.names import CONFIG, WEIGHTS
 from lerobot_bomb.checkpoints.processor_files import saved_type, state_files
 from lerobot_bomb.files import read_json
@@ -119,25 +120,18 @@ def policy_class(folder: Path) -> type[PreTrainedPolicy]:
     return found
 
 
-def check_config(folder: Path, config: Any) -> None:
+def check_config(folder: Path, config: PreTrainedConfig) -> None:
     """A checkpoint needs nothing but its own files, and no code.
 
     Raises:
         ValueError: names what it needs.
     """
-    for field in ("vlm_config", "depth_config"):
-        if _names_code(getattr(config, field, None)):
+    for field, value in vars(config).items():
+        if field.endswith("_config") and _names_code(value):
             raise ValueError(f"{folder / CONFIG}: its {field} names code to run, which no checkpoint needs")
-    if config.vlm_config is None or config.prompt_tokens is None:
-        raise ValueError(
-            f"{folder / CONFIG} does not hold the architecture (vlm_config and prompt_tokens), so loading it "
-            f"elsewhere would need the base model {config.vlm_model_name}"
-        )
-    if getattr(config, "depth_source", None) == "zoedepth" and config.depth_config is None:
-        raise ValueError(
-            f"{folder / CONFIG} does not hold depth_config, so loading it elsewhere would need "
-            f"{config.depth_model_name}"
-        )
+    missing = config.missing_parts() if isinstance(config, ConfigWithEnvironment) else None
+    if missing is not None:
+        raise ValueError(f"{folder / CONFIG} does not hold {missing}")
 
 
 def _names_code(values: Any, key: str = "") -> bool:

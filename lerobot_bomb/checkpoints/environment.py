@@ -28,6 +28,10 @@ class ConfigWithEnvironment(PreTrainedConfig):
     # whether it acts in another one all the same; no checkpoint keeps this
     ignore_environment: bool = False
 
+    def missing_parts(self) -> str | None:
+        """What a checkpoint with this config lacks and what it would need instead; None: nothing."""
+        return None
+
     def _save_pretrained(self, save_directory: Path) -> None:
         saved = copy.copy(self)
         saved.ignore_environment = False

@@ -39,9 +39,9 @@ RUN_CODE = {
 SARM_STEP = "lerobot.rewards.sarm.processor_sarm.SARMEncodingProcessorStep"
 # steps of LeRobot that read files of the repository or folder that their config names
 READ_OTHERS = {"tokenizer_processor", "eo1_qwen_processor", "molmoact2_pack_inputs"}
-# name of a processor of our types -> the steps that it has, at least
+# name of a processor of our types -> the steps that it has, at least, beside the one that reads the task
 NEEDED = {
-    POLICY_PREPROCESSOR_DEFAULT_NAME: {"bomb_task_tokenizer", "normalizer_processor"},
+    POLICY_PREPROCESSOR_DEFAULT_NAME: {"normalizer_processor"},
     POLICY_POSTPROCESSOR_DEFAULT_NAME: {"unnormalizer_processor"},
 }
 # of which values are normalised; none by the identity
@@ -79,10 +79,17 @@ def state_files(content: Mapping[str, Any], where: str, policy_type: object) -> 
     for step in steps:
         _check_step(step, where, policy_type)
     if is_ours(policy_type):
-        missing = sorted(NEEDED[name] - {step["registry_name"] for step in steps})
+        missing = sorted(_needed(name, policy_type) - {step["registry_name"] for step in steps})
         if missing:
             raise ValueError(f"{where} lacks the step {missing[0]!r} of a {policy_type}")
     return [step["state_file"] for step in steps if "state_file" in step]
+
+
+def _needed(processor: str, policy_type: object) -> set[str]:
+    if processor != POLICY_PREPROCESSOR_DEFAULT_NAME:
+        return NEEDED[processor]
+    config: Any = PreTrainedConfig.get_known_choices()[str(policy_type)]
+    return NEEDED[processor] | {config.TASK_STEP}
 
 
 def _check_step(step: Mapping[str, Any], where: str, policy_type: object) -> None:

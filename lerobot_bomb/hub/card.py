@@ -118,14 +118,18 @@ class Checkpoint:
         start = "" if is_trained else " LeRobot has not trained it: it is a start, or was converted."
         return (
             f"A checkpoint of LeRobot's policy type `{self.config.type}`, which the plugin "
-            f"`lerobot_policy_bomb` adds.{start} Backbone: {self._backbone()}; {self._contents()}{benchmark}"
+            f"`lerobot_policy_bomb` adds.{start} {self._weights()}{benchmark}"
             f"\n\nThe policy type: {self.method.summary}"
         )
 
-    def _contents(self) -> str:
+    def _weights(self) -> str:
         if self.adapters_of:
-            return f"these are adapters, loaded on the checkpoint `{self.adapters_of}`."
-        return "the checkpoint holds all weights and the tokenizer, so nothing else is downloaded."
+            contents = f"these are adapters, loaded on the checkpoint `{self.adapters_of}`."
+        else:
+            contents = "the checkpoint holds all that it needs, so nothing else is downloaded."
+        if self.method.backbone is None:
+            return contents[0].upper() + contents[1:]
+        return f"Backbone: {self._backbone()}; {contents}"
 
     def _backbone(self) -> str:
         if self.backbone is not None:

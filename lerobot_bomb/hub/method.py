@@ -26,10 +26,10 @@ class Paper:
 
 @dataclass(frozen=True)
 class Method:
-    """A policy type in words, the backbone it starts from unless told otherwise, and its sources."""
+    """A policy type in words, its sources, and the backbone that it starts from unless told otherwise."""
 
     summary: str
-    backbone: str  # Hub id
-    backbone_license: str  # as a card's metadata names it
     papers: tuple[Paper, ...]
+    backbone: str | None = None  # Hub id; None: it has none
+    backbone_license: str = "apache-2.0"  # as a card's metadata names it; without a backbone, of our weights
     backbone_license_name: str | None = None  # where the former is "other"

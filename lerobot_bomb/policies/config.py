@@ -16,6 +16,7 @@ from lerobot_bomb.training.policy_flags import (
     adamw,
     check_cameras_and_action,
     check_chunk,
+    check_crop,
     check_ensemble,
     check_model_name_and_precision,
     check_state,
@@ -34,25 +35,15 @@ BOUNDED_MODES = (
 
 
 @dataclass
-class VlaConfig(ConfigWithEnvironment):
-    """Backbone, chunk, inputs, precision and training; a policy overrides the defaults that its paper has."""
+class ChunkConfig(ConfigWithEnvironment):
+    """Chunk, normalisation and training; a policy overrides the defaults that its paper has."""
 
     # allowed values of flags
-    CHOICES: ClassVar[dict[str, tuple]] = {"dtype": DTYPES}
+    CHOICES: ClassVar[dict[str, tuple]] = {}
     # how state and action may be normalised
     MODES: ClassVar[tuple[NormalizationMode, ...]] = tuple(NormalizationMode)
-    # flags that need the robot's state
-    NEEDS_STATE: ClassVar[tuple[str, ...]] = ("use_state",)
-
-    # Hub id, path of a local folder, or "nano": a small model with random weights, built in code
-    vlm_model_name: str = ""
-    # changes of nano's architecture, nested as it is, as {"vision_config": {"num_hidden_layers": 2}}
-    nano_config: dict[str, Any] | None = None
-    # architecture; filled in when the base model is loaded. Set = build this and download nothing:
-    # the weights then come from a checkpoint
-    vlm_config: dict[str, Any] | None = None
-    # token ids of the fixed parts of the prompt; filled in together with vlm_config
-    prompt_tokens: dict[str, Any] | None = None
+    # registered name of the processor step that reads the task, which every checkpoint has
+    TASK_STEP: ClassVar[str]
 
     n_obs_steps: int = 1
     # actions of a chunk
@@ -67,19 +58,10 @@ class VlaConfig(ConfigWithEnvironment):
             "ACTION": NormalizationMode.MIN_MAX,
         }
     )
-    # side of the crop as a fraction of the image: random place while training, centre otherwise
-    crop_fraction: float = 1.0
-    # whether the robot's state is in the prompt
-    use_state: bool = True
-
     # whether actions beyond an episode's end (repeats of the last one) are trained on
     loss_on_padded_actions: bool = False
     # frames at an episode's end that no sample starts at
     drop_n_last_frames: int = 1
-    freeze_vision_encoder: bool = False
-    # "bfloat16" = autocast over float32 weights, in training and in evaluation
-    dtype: str = "float32"
-    gradient_checkpointing: bool = False
     # values that the checkpoint was trained with; filled in
     trained_with: dict[str, Any] | None = None
     # batches trained on so far; what is random in the next ones follows from it
@@ -107,7 +89,6 @@ class VlaConfig(ConfigWithEnvironment):
         """Raise a ValueError that names the flag unless all values go together."""
         for flag, allowed in self.CHOICES.items():
             one_of(f"--policy.{flag}", getattr(self, flag), allowed)
-        check_model_name_and_precision(self)
         for kind, allowed in {
             "VISUAL": (NormalizationMode.IDENTITY,),
             "STATE": self.MODES,
@@ -120,7 +101,6 @@ class VlaConfig(ConfigWithEnvironment):
     def validate_features(self) -> None:
         """Raise unless the dataset (or environment) has what the policy reads and writes."""
         check_cameras_and_action(self)
-        check_state(self, self.NEEDS_STATE)
 
     def get_optimizer_preset(self) -> AdamWConfig:
         return adamw(self)
@@ -139,6 +119,52 @@ class VlaConfig(ConfigWithEnvironment):
     @property
     def reward_delta_indices(self) -> None:
         return None
+
+
+@dataclass
+class VlaConfig(ChunkConfig):
+    """Of a policy with a vision-language model: which one, in which precision, what of it is trained."""
+
+    CHOICES: ClassVar[dict[str, tuple]] = {**ChunkConfig.CHOICES, "dtype": DTYPES}
+    TASK_STEP: ClassVar[str] = "bomb_task_tokenizer"
+    # flags that need the robot's state
+    NEEDS_STATE: ClassVar[tuple[str, ...]] = ("use_state",)
+
+    # Hub id, path of a local folder, or "nano": a small model with random weights, built in code
+    vlm_model_name: str = ""
+    # changes of nano's architecture, nested as it is, as {"vision_config": {"num_hidden_layers": 2}}
+    nano_config: dict[str, Any] | None = None
+    # architecture; filled in when the base model is loaded. Set = build this and download nothing:
+    # the weights then come from a checkpoint
+    vlm_config: dict[str, Any] | None = None
+    # token ids of the fixed parts of the prompt; filled in together with vlm_config
+    prompt_tokens: dict[str, Any] | None = None
+
+    # side of the crop as a fraction of the image: random place while training, centre otherwise
+    crop_fraction: float = 1.0
+    # whether the robot's state is in the prompt
+    use_state: bool = True
+    freeze_vision_encoder: bool = False
+    # "bfloat16" = autocast over float32 weights, in training and in evaluation
+    dtype: str = "float32"
+    gradient_checkpointing: bool = False
+
+    def check_flags(self) -> None:
+        super().check_flags()
+        check_model_name_and_precision(self)
+        check_crop(self)
+
+    def validate_features(self) -> None:
+        super().validate_features()
+        check_state(self, self.NEEDS_STATE)
+
+    def missing_parts(self) -> str | None:
+        if self.vlm_config is None or self.prompt_tokens is None:
+            return (
+                "the architecture (vlm_config and prompt_tokens), so loading it elsewhere would need the "
+                f"base model {self.vlm_model_name}"
+            )
+        return super().missing_parts()
 
 
 @dataclass

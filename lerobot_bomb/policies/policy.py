@@ -16,22 +16,22 @@ from lerobot_bomb.actions.relative import bounds
 from lerobot_bomb.checkpoints.adapters import frozen_buffers
 from lerobot_bomb.data.columns import dim_names
 from lerobot_bomb.hub.policy import HubPolicy
-from lerobot_bomb.policies.config import TokenVlaConfig, VlaConfig
+from lerobot_bomb.policies.config import ChunkConfig, TokenVlaConfig, VlaConfig
 from lerobot_bomb.training.distributed import SavesTiedWeightsOnce
 from lerobot_bomb.training.policy_flags import check_as_trained, check_weights_fit, trained_with
 from lerobot_bomb.vlm.inputs import read_tensor
 
 
-class VlaPolicy(HubPolicy, SavesTiedWeightsOnce, PreTrainedPolicy):
-    """What a policy has that predicts chunks of actions: queue, units, precision, checkpoints.
+class ChunkPolicy(HubPolicy, SavesTiedWeightsOnce, PreTrainedPolicy):
+    """What a policy has that predicts chunks of actions: queue, units, checkpoints.
 
     Shapes: `B` batch, `T` actions of a chunk, `D` action dims.
     """
 
     # LeRobot asks every class for them; a policy has its own
-    config_class = VlaConfig  # pyright: ignore[reportAssignmentType]  LeRobot annotates it as None
-    name = "vla"  # pyright: ignore[reportAssignmentType]
-    config: VlaConfig
+    config_class = ChunkConfig  # pyright: ignore[reportAssignmentType]  LeRobot annotates it as None
+    name = "chunk"  # pyright: ignore[reportAssignmentType]
+    config: ChunkConfig
     action_unit: Tensor
     # flags that say what shapes the weights have
     shapes: ClassVar[tuple[str, ...]]
@@ -119,6 +119,14 @@ class VlaPolicy(HubPolicy, SavesTiedWeightsOnce, PreTrainedPolicy):
     @property
     def _device(self) -> torch.device:
         return self.action_unit.device
+
+
+class VlaPolicy(ChunkPolicy):
+    """One with a vision-language model."""
+
+    config_class = VlaConfig  # pyright: ignore[reportAssignmentType]
+    name = "vla"  # pyright: ignore[reportAssignmentType]
+    config: VlaConfig
 
     def _autocast(self) -> torch.autocast:
         """The precision of ``config.dtype``, whoever calls: training, evaluation or a user's own loop."""

@@ -81,10 +81,14 @@ def check_ensemble(config: Any) -> None:
         )
 
 
-def check_training(config: Any) -> None:
-    """Crop, optimiser and schedule."""
+def check_crop(config: Any) -> None:
+    """A part of the image, or all of it."""
     if not 0 < config.crop_fraction <= 1:
         raise ValueError(f"--policy.crop_fraction={config.crop_fraction} must lie in (0, 1]")
+
+
+def check_training(config: Any) -> None:
+    """Samples, optimiser and schedule."""
     check_not_negative(
         config,
         (

@@ -110,6 +110,11 @@ class SpatialvlaGridConfig(TokenVlaConfig):
         if self.depth_source == "observation":
             self._check_depth()
 
+    def missing_parts(self) -> str | None:
+        if self.depth_source == "zoedepth" and self.depth_config is None:
+            return f"depth_config, so loading it elsewhere would need {self.depth_model_name}"
+        return super().missing_parts()
+
     def _check_depth(self) -> None:
         cameras = [key.removeprefix(f"{OBS_IMAGES}.") for key in self.image_features]
         given = set(self.input_features or {})

@@ -77,8 +77,8 @@ def test_a_backbone_without_a_name_is_no_base_model(name: str, license: str | No
 
 
 def test_weights_keep_the_license_of_their_backbone() -> None:
-    grid = replace(checkpoint(GRID.backbone), method=GRID)
-    fdvla = replace(checkpoint(FDVLA.backbone), method=FDVLA)
+    grid = replace(checkpoint(str(GRID.backbone)), method=GRID)
+    fdvla = replace(checkpoint(str(FDVLA.backbone)), method=FDVLA)
     assert metadata(grid)["license"] == "gemma"
     assert (metadata(fdvla)["license"], metadata(fdvla)["license_name"]) == ("other", "qwen-research")
     assert metadata(replace(checkpoint(), license="mit"))["license"] == "mit"
