@@ -20,6 +20,7 @@ from datasets import config
 from huggingface_hub import hf_hub_download
 from huggingface_hub.constants import CONFIG_NAME
 from lerobot.datasets import LeRobotDataset, aggregate, compute_stats, dataset_writer
+from lerobot.datasets.dataset_reader import DatasetReader
 from lerobot.datasets.feature_utils import get_hf_features_from_features
 from lerobot.datasets.io_utils import to_parquet_with_hf_images
 from lerobot.policies import PreTrainedPolicy
@@ -223,6 +224,31 @@ def remember_policies() -> None:
         _BUILT.append(ref(self))
 
     PreTrainedPolicy.__init__ = remembered
+
+
+def read_asked_columns() -> None:
+    """Let LeRobot read of the other frames of a sample only what was asked of them, not their images too.
+
+    A chunk of 16 actions decodes the images of all its 16 frames otherwise, and throws them away.
+    """
+    usual = DatasetReader._query_hf_dataset
+
+    @wraps(usual)
+    def query(self: Any, query_indices: dict[str, list[int]]) -> dict[str, Any]:
+        whole = self.hf_dataset
+        columns = vars(self).setdefault("_columns", {})
+        result: dict[str, Any] = {}
+        try:
+            for key, indices in query_indices.items():
+                if key in whole.column_names and columns.get(key, (None,))[0] is not whole:
+                    columns[key] = whole, whole.select_columns(key)
+                self.hf_dataset = columns[key][1] if key in columns else whole
+                result |= usual(self, {key: indices})
+        finally:
+            self.hf_dataset = whole
+        return result
+
+    DatasetReader._query_hf_dataset = query
 
 
 def built_policies() -> list[PreTrainedPolicy]:

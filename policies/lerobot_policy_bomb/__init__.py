@@ -7,7 +7,12 @@ import lerobot_policy_bomb_random  # noqa: F401
 import lerobot_policy_fdvla  # noqa: F401
 import lerobot_policy_spatialvla_grid  # noqa: F401
 import lerobot_policy_vla0_smol  # noqa: F401
-from lerobot_bomb._compat import remember_policies, resolve_checkpoints, shorten_torchcodec_warning
+from lerobot_bomb._compat import (
+    read_asked_columns,
+    remember_policies,
+    resolve_checkpoints,
+    shorten_torchcodec_warning,
+)
 from lerobot_bomb.checkpoints.config import tell_config_errors
 from lerobot_bomb.checkpoints.processor_files import check_saved_processors
 from lerobot_bomb.checkpoints.shipped import checkpoint_path
@@ -16,6 +21,7 @@ from lerobot_bomb.data.hub_token import refuse_unsendable_tokens
 shorten_torchcodec_warning()
 tell_config_errors()
 remember_policies()
+read_asked_columns()
 refuse_unsendable_tokens()
 check_saved_processors()
 resolve_checkpoints(checkpoint_path)
