@@ -106,10 +106,15 @@ def test_a_checkpoint_acts_in_its_own_environment_only(
 
 
 def test_a_policy_that_goes_on_with_other_data_is_of_their_environment(
-    policy_type: str, absolute: Path, relative: LeRobotDatasetMetadata, tmp_path: Path
+    policy_type: str,
+    absolute: Path,
+    relative: LeRobotDatasetMetadata,
+    tmp_path: Path,
+    caplog: pytest.LogCaptureFixture,
 ) -> None:
     write(tmp_path, new_policy(policy_type, absolute))
     tuned = get_policy_class(policy_type).from_pretrained(tmp_path, dataset_meta=relative)
+    assert "was trained for control_mode=absolute, fps=10; this dataset shows control_mode=rel" in caplog.text
     assert isinstance(tuned.config, ConfigWithEnvironment)
     assert tuned.config.environment == Environment("scara", "relative", 20, 64, CAMERAS, "1.0")
 

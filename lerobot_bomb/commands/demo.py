@@ -149,7 +149,7 @@ def _write_sheet(output_dir: Path, rows: list[Row]) -> Path:
         ]
     columns = [f"seed {SEED + number}" for number in range(len(tiles[NONE]))]
     path = output_dir / f"{POLICY}.png"
-    title = f"{POLICY}: the last frame of each episode; green edge: success"
+    title = f"{POLICY}: the last frame of each video, a step before the end; green edge: success"
     Image.fromarray(Sheet(title, columns, images=tiles).draw()).save(path)
     return path
 

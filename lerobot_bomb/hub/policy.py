@@ -38,6 +38,8 @@ DOWNLOAD = {
     "token",
 }
 
+logger = logging.getLogger(__name__)
+
 if TYPE_CHECKING:
     from lerobot.datasets import LeRobotDatasetMetadata
 
@@ -97,8 +99,18 @@ class HubPolicy:
         return policy
 
     def _take_environment(self, dataset_meta: "LeRobotDatasetMetadata | None") -> None:
-        if dataset_meta is not None:
-            self.config.environment = environment_of_dataset(dataset_meta.root)
+        if dataset_meta is None:
+            return
+        before, now = self.config.environment, environment_of_dataset(dataset_meta.root)
+        if before is not None and now is not None and (names := before.differences(now)):
+            logger.warning(
+                "%s was trained for %s; this dataset shows %s, and so will the environment have to that the "
+                "policy then acts in",
+                self.config.pretrained_path or "the checkpoint",
+                before.text(names),
+                now.text(names),
+            )
+        self.config.environment = now
 
     @classmethod
     def _load_as_safetensor(cls, model: Any, model_file: str, map_location: str, strict: bool) -> Any:
