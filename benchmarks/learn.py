@@ -3,7 +3,8 @@
 A policy is trained by the stock `lerobot-train` on demonstrations of the scripted expert, and its checkpoints
 are evaluated by the stock `lerobot-eval` on seeds that it has not seen; the last one twice more: with black
 images, and given the instruction of another episode. The policy is a small probe made for this task
-(lerobot_policy_keypoint_probe/: can it be learnt at all?) or one of ours, by configs/TASK_TYPE.yaml.
+(lerobot_policy_keypoint_probe/: can it be learnt at all?), or by configs/TASK_TYPE.yaml one of ours, or
+LeRobot's `act` or `diffusion` (pip install 'lerobot[diffusion]') with about as many CPU minutes.
 
     OMP_NUM_THREADS=1 python benchmarks/learn.py one_target --policy.type=vla0_smol --output_dir learn
 
@@ -33,6 +34,7 @@ from lerobot_bomb.commands.run import run_command
 from lerobot_bomb.evaluation.results import PUT_DOWN, Row, read_results
 
 PROBE = "keypoint_probe"
+RIVALS = ("act", "diffusion")  # LeRobot's; they read no instruction
 PLUGIN = f"lerobot_policy_{PROBE}"  # not installed: LeRobot finds it by --*.discover_packages_path
 REPO_ID = "learn/bomb_place"
 IMAGE_SIZE = 64  # pixels
@@ -80,6 +82,7 @@ TASKS = {
         trainings={
             PROBE: Training(200, Bar(0.90, 120), steps=3000),
             **{name: Training(600, Bar(0.95, 20)) for name in POLICY_TYPES},
+            **{name: Training(600, None) for name in RIVALS},
         },
     ),
     "all_targets": Task(
@@ -105,7 +108,7 @@ def main() -> None:
     """Record, train, evaluate every checkpoint, print the curve; exit code 1 where the bar is missed."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawTextHelpFormatter)
     parser.add_argument("task", choices=TASKS)
-    types = [PROBE, *POLICY_TYPES]
+    types = [PROBE, *POLICY_TYPES, *RIVALS]
     parser.add_argument("--policy.type", dest="policy_type", choices=types, default=PROBE)
     parser.add_argument("--output_dir", type=Path, required=True, help="folder to keep, or to go on with")
     parser.add_argument("--demonstrations", type=positive, help="default: the task's")

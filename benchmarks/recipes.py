@@ -13,7 +13,7 @@ PUSHT_TYPES = sorted(path.stem.removeprefix("pusht_") for path in FOLDER.glob("p
 
 
 def recipe_path(task: str, policy_type: str) -> Path:
-    """A config for `lerobot-train --config_path`; task: overfit, one_target, all_targets, robust or pusht."""
+    """A config for `lerobot-train --config_path`; task: overfit, one_target, all_targets, pusht and so on."""
     return FOLDER / f"{task}_{policy_type}.yaml"
 
 

@@ -1,0 +1,171 @@
+r"""Who pushes the T best? Our policies and LeRobot's `act` and `diffusion`, trained for equal minutes.
+
+Each starts from random weights and is trained by the stock `lerobot-train` on the 206 human demonstrations;
+the stock `lerobot-eval --env.type=pusht` plays it on new seeds. Two short trainings find what a step takes,
+so that the learning rate ends its decay when the minutes do: of CPU on a CPU, by the clock on a GPU.
+
+    python benchmarks/play_pusht.py --source pusht_cchi_v7_replay.zarr --output_dir play --minutes 60
+    python benchmarks/play_pusht.py --source ... --output_dir play --minutes 15 --device cuda --jobs 7
+
+What is finished stays in the output folder and is not done again: the dataset, each training, each
+evaluation. Every process uses one thread.
+"""
+
+import argparse
+import json
+import os
+import shutil
+import sys
+import time
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from statistics import fmean
+
+from machine import add_machine_arguments, positive, require_idle_machine, write_figures
+from pusht_offline import MAX_COVERAGE_REWARD, convert, run_logged
+from pusht_report import over_episodes
+from recipes import FOLDER, read_recipe, recipe_path
+
+from lerobot_bomb.tables import print_table
+
+FIRST_UNSEEN_SEED = 100_000
+CALIBRATION_STEPS = {"cpu": (5, 35), "cuda": (100, 400)}
+# of a batch that fills a GPU, read by processes of their own
+ON = {"cpu": ["--num_workers=0"], "cuda": ["--num_workers=2", "--batch_size=128"]}
+POLICIES = sorted(path.stem.removeprefix("play_pusht_") for path in FOLDER.glob("play_pusht_*.yaml"))
+
+
+@dataclass(frozen=True)
+class Seconds:
+    """What a training took by the clock, and of CPU."""
+
+    clock: float
+    cpu: float
+
+    def on(self, device: str) -> float:
+        """What is made equal."""
+        return self.cpu if device == "cpu" else self.clock
+
+
+@dataclass(frozen=True)
+class Contender:
+    """What one policy was trained with, and how it plays."""
+
+    name: str
+    steps: int
+    minutes: float
+    cpu_minutes: float
+    max_coverages: list[float]  # of each episode
+    num_successes: int
+
+
+def main() -> None:
+    """Convert, train all, play all, print the table."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawTextHelpFormatter)
+    parser.add_argument("--source", type=Path, help="the zarr; not needed once it is converted")
+    parser.add_argument("--output_dir", type=Path, required=True, help="folder to keep, or to go on with")
+    parser.add_argument("--minutes", type=float, required=True, help="of each training")
+    parser.add_argument("--device", choices=ON, default="cpu")
+    parser.add_argument("--policies", nargs="+", choices=POLICIES, default=POLICIES)
+    parser.add_argument("--jobs", type=positive, default=1, help="trainings at once (default: 1)")
+    parser.add_argument("--episodes", type=positive, default=100, help="of each evaluation (default: 100)")
+    add_machine_arguments(parser)
+    args = parser.parse_args()
+    require_idle_machine(args.force)
+    os.environ["OMP_NUM_THREADS"] = "1"
+    try:
+        dataset = convert(args.source, args.output_dir / "dataset")
+        with ThreadPoolExecutor(args.jobs) as pool:
+            contenders = list(pool.map(lambda name: compete(args, name, dataset), args.policies))
+    except RuntimeError as error:
+        sys.exit(f"play_pusht.py: {error}")
+    print_contenders(contenders)
+    write_figures(args.json, {"device": args.device, "contenders": [asdict(each) for each in contenders]})
+
+
+def compete(args: argparse.Namespace, name: str, dataset: Path) -> Contender:
+    """Train and play one policy."""
+    folder, times_path = args.output_dir / name, args.output_dir / name / "training.json"
+    flags = [f"--config_path={recipe_path('play_pusht', name)}", f"--dataset.root={dataset}"]
+    flags += [f"--policy.device={args.device}", *ON[args.device]]
+    if not times_path.exists():
+        shutil.rmtree(folder, ignore_errors=True)
+        steps = max(1, int(60 * args.minutes / step_s(folder, flags, args.device)))
+        seconds = train(folder / "train", [*flags, *decay(name, steps)], steps)
+        minutes = {"minutes": seconds.clock / 60, "cpu_minutes": seconds.cpu / 60}
+        times_path.write_text(json.dumps({"steps": steps, **minutes}) + "\n")
+    coverages, num_successes = play(folder, args.episodes)
+    return Contender(
+        name, max_coverages=coverages, num_successes=num_successes, **json.loads(times_path.read_text())
+    )
+
+
+def decay(name: str, steps: int) -> list[str]:
+    """The learning rate's, over the whole training, where the policy's config says how long it is."""
+    flag = "scheduler_decay_steps"
+    return [f"--policy.{flag}={steps}"] if flag in read_recipe("play_pusht", name)["policy"] else []
+
+
+def step_s(folder: Path, flags: list[str], device: str) -> float:
+    """Seconds of a training step, of CPU where it trains on a CPU: what a longer training takes more."""
+    few, more = CALIBRATION_STEPS[device]
+    shorter, longer = (train(folder / f"calibration_{steps}", flags, steps) for steps in (few, more))
+    return (longer.on(device) - shorter.on(device)) / (more - few)
+
+
+def train(output_dir: Path, flags: list[str], steps: int) -> Seconds:
+    """Stock `lerobot-train`."""
+    started = time.monotonic()
+    cpu = run_logged(
+        output_dir.with_suffix(".log"),
+        "lerobot-train",
+        *flags,
+        f"--output_dir={output_dir}",
+        f"--steps={steps}",
+        f"--save_freq={-(-steps // 3)}",
+    )
+    return Seconds(time.monotonic() - started, cpu)
+
+
+def play(folder: Path, episodes: int) -> tuple[list[float], int]:
+    """Maximal coverage of each episode of the stock `lerobot-eval --env.type=pusht`, and the successes."""
+    info = folder / f"eval_{episodes}" / "eval_info.json"
+    if not info.exists():
+        shutil.rmtree(info.parent, ignore_errors=True)
+        run_logged(
+            folder / "eval.log",
+            "lerobot-eval",
+            f"--policy.path={folder / 'train' / 'checkpoints' / 'last' / 'pretrained_model'}",
+            "--env.type=pusht",
+            f"--seed={FIRST_UNSEEN_SEED}",
+            f"--eval.n_episodes={episodes}",
+            f"--eval.batch_size={min(50, episodes)}",
+            "--eval.use_async_envs=false",
+            f"--output_dir={info.parent}",
+        )
+    metrics = [task["metrics"] for task in json.loads(info.read_text())["per_task"]]
+    coverages = [MAX_COVERAGE_REWARD * reward for each in metrics for reward in each["max_rewards"]]
+    return coverages, sum(sum(each["successes"]) for each in metrics)
+
+
+def print_contenders(contenders: list[Contender]) -> None:
+    """One line each, the best first."""
+    print_table(
+        ["policy", "mean maximal coverage", "successes", "steps", "minutes", "CPU min"],
+        [
+            [
+                each.name,
+                over_episodes(each.max_coverages),
+                str(each.num_successes),
+                str(each.steps),
+                f"{each.minutes:.1f}",
+                f"{each.cpu_minutes:.1f}",
+            ]
+            for each in sorted(contenders, key=lambda each: -fmean(each.max_coverages))
+        ],
+    )
+
+
+if __name__ == "__main__":
+    main()
