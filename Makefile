@@ -9,8 +9,9 @@ STAMP := .venv/.installed
 export OMP_NUM_THREADS ?= 1
 # LeRobot imports 4000 files; where this is set, as in many images, every process compiles them anew
 unexport PYTHONDONTWRITEBYTECODE
-# tests of a file share what is recorded and trained for them, so a file is run by one process
-PYTEST := $(BIN)/pytest -n auto --maxprocesses=4 --dist=loadfile
+# tests of a file share what is recorded and trained for them, so a file is run by one process;
+# tests/conftest.py says which files are begun first
+PYTEST := $(BIN)/pytest -n auto --maxprocesses=4 --dist=loadfile --no-loadscope-reorder
 
 help:
 	@echo "make demo       set up; a trained policy plays, and its rates and pictures"

@@ -1,5 +1,6 @@
 """Fixtures that several test modules use."""
 
+import functools
 import importlib
 import logging
 import os
@@ -14,6 +15,22 @@ from variants import variants_of
 
 if TYPE_CHECKING:
     from pusht_cases import Demonstrations
+
+# by CPU time; begun first, none of them is what a run waits for in the end
+SLOWEST_FILES = (
+    "test_parity",
+    "test_record_kill",
+    "test_independence",
+    "test_shipped",
+    "test_axes_env",
+    "test_processes",
+    "test_record",
+    "test_fdvla",
+    "test_lora",
+    "test_spatialvla_grid",
+    "test_depth_lerobot",
+    "test_offline_metrics",
+)
 
 os.environ.setdefault("OMP_NUM_THREADS", "1")
 os.environ["HF_HUB_OFFLINE"] = "1"  # no test may need the network
@@ -61,6 +78,17 @@ def pusht_dataset(pusht_zarr: Path, tmp_path_factory: pytest.TempPathFactory) ->
     return root
 
 
+@pytest.fixture(scope="session", autouse=True)
+def kept_help() -> Iterator[None]:
+    """LeRobot's parser takes half a second to find all flags' help in sources, anew for each command."""
+    from draccus.wrappers import docstring
+
+    kept = functools.cache(docstring.get_attribute_docstring)
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(docstring, "get_attribute_docstring", kept)
+        yield
+
+
 @pytest.fixture(autouse=True)
 def restored_logging() -> Iterator[None]:
     """LeRobot's commands log to this test's standard error, which pytest closes after it."""
@@ -85,6 +113,12 @@ def stock_cli(monkeypatch: pytest.MonkeyPatch) -> Callable[..., None]:
 
 def pytest_addoption(parser: pytest.Parser) -> None:
     parser.addoption("--policy.type", dest="policy_type", choices=POLICY_TYPES, help="prove this one only")
+
+
+def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    """The slowest files first, the others as they are."""
+    places = {name: place for place, name in enumerate(SLOWEST_FILES)}
+    items.sort(key=lambda item: places.get(item.path.stem, len(places)))
 
 
 def pytest_generate_tests(metafunc: pytest.Metafunc) -> None:

@@ -6,6 +6,7 @@ import torch
 from lerobot.configs import FeatureType, PolicyFeature
 from lerobot.policies.factory import make_pre_post_processors
 from torch import Tensor
+from variants import layers_of
 
 from lerobot_policy_fdvla import FdvlaConfig
 from lerobot_policy_fdvla.modeling_fdvla import FdvlaPolicy
@@ -36,7 +37,8 @@ def make_config(
     if has_state:
         inputs["observation.state"] = PolicyFeature(FeatureType.STATE, (STATE_DIMS,))
     outputs = {"action": PolicyFeature(FeatureType.ACTION, (num_dims,))}
-    return FdvlaConfig(input_features=inputs, output_features=outputs, **(SMALL | options))
+    chosen = SMALL | layers_of(options) | options
+    return FdvlaConfig(input_features=inputs, output_features=outputs, **chosen)
 
 
 def make_policy(seed: int = 0, num_dims: int = 4, **options: Any) -> FdvlaPolicy:

@@ -127,7 +127,7 @@ def learn_by_heart(policy: PreTrainedPolicy, batches: list[Batch], bar: float | 
     """Train on a few frames, as evaluation shows them, until their chunks are reproduced within the bar."""
     batch = joined(batches)
     policy.eval()  # neither crops nor masks at random
-    optimizer = torch.optim.AdamW(policy.get_optim_params(), lr=2e-3, weight_decay=0.0)
+    optimizer = torch.optim.AdamW(policy.get_optim_params(), lr=2e-3, weight_decay=0.0, fused=True)
     # what is trained on random noise settles at a falling rate only
     scheduler = LambdaLR(optimizer, lambda step: min(1.0, 2 * (1 - step / MAX_LEARNING_STEPS)))
     for step in range(1, MAX_LEARNING_STEPS + 1):

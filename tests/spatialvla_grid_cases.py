@@ -6,6 +6,7 @@ import torch
 from lerobot.configs import FeatureType, PolicyFeature
 from lerobot.policies.factory import make_pre_post_processors
 from torch import Tensor
+from variants import layers_of
 
 from lerobot_policy_spatialvla_grid import SpatialvlaGridConfig
 from lerobot_policy_spatialvla_grid.modeling_spatialvla_grid import SpatialvlaGridPolicy
@@ -23,14 +24,13 @@ def make_config(num_dims: int = 4, *, has_depth: bool = True, **options: Any) ->
         for kind, shape in shapes.items()
         for camera in ("workspace", "wrist")
     }
-    config = SpatialvlaGridConfig(
+    return SpatialvlaGridConfig(
         vlm_model_name="nano",
         device="cpu",
         input_features={WORKSPACE: visual, WRIST: visual, "observation.state": state, **geometry},
         output_features={"action": PolicyFeature(FeatureType.ACTION, (num_dims,))},
-        **options,
+        **(layers_of(options) | options),
     )
-    return config
 
 
 def make_policy(seed: int = 0, num_dims: int = 4, **options: Any) -> SpatialvlaGridPolicy:

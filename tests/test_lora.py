@@ -14,6 +14,7 @@ from lerobot.envs import make_env_config
 from lerobot.policies import get_policy_class, make_policy
 from policy_cases import CASES
 from safetensors.torch import load_file
+from variants import TWO_LAYERS, as_flags
 
 from lerobot_bomb.checkpoints.folder import parse_config, read_config
 from lerobot_bomb.commands.main import main
@@ -105,7 +106,7 @@ def make_base(policy_type: str, dataset: Path, folder: Path) -> Path:
     own = f"--policy.type={policy_type} --policy.vlm_model_name=nano --policy.device=cpu"
     own += f" --policy.chunk_size=3 --policy.n_action_steps=3 {SMALL[policy_type]}"
     data = f"--dataset.repo_id={REPO_ID} --dataset.root={dataset}"
-    assert main(["init", *own.split(), *data.split(), f"--output={folder}"]) == 0
+    assert main(["init", *own.split(), *as_flags(TWO_LAYERS), *data.split(), f"--output={folder}"]) == 0
     return folder
 
 

@@ -19,7 +19,7 @@ from lerobot_bomb.data.resumable import METADATA_FILE, finished_blocks, unfinish
 
 pytestmark = pytest.mark.skipif(platform.system() != "Linux", reason="processes are watched through /proc")
 
-FLAGS = ("--repo_id=test/killed", "--episodes=3", "--seed=3", "--image_size=64")
+FLAGS = ("--repo_id=test/killed", "--episodes=3", "--seed=3", "--image_size=32", "--fps=5")
 MODES = {"video": FLAGS, "images": (*FLAGS, "--images", "--workers=2")}
 SEED = 0  # of the random moments
 NOTHING = "no block of 2 episodes was finished, so nothing is kept"

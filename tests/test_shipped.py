@@ -121,7 +121,7 @@ def test_the_demo_ends_with_rates_and_a_contact_sheet(
         if command == "lerobot-bomb":
             assert main(flags) == 0
         else:
-            stock_cli(command, *flags)
+            stock_cli(command, *flags, "--env.fps=5", "--env.ignore_checkpoint=true")  # shorter episodes
 
     monkeypatch.setattr(demo, "run_command", run)
     monkeypatch.setattr(demo, "SHOWN_EPISODES", 1)

@@ -56,7 +56,7 @@ def passes(monkeypatch: pytest.MonkeyPatch) -> list[int]:
 
 
 def test_a_draft_saves_passes_and_changes_no_cell(passes: list[int]) -> None:
-    policy = make_policy(2, 7)
+    policy = make_policy(2, 7, nano_config=None)
     batch = make_batch(policy, 1, 2)
     drafted = policy._choose(batch, 4)
     # cells of the same group follow each other here, but not always

@@ -55,7 +55,7 @@ def test_the_expert_places_stones_through_lerobot_eval(stock_cli: Run, tmp_path:
 
 
 def test_numbered_tasks_and_absolute_control(stock_cli: Run, tmp_path: Path) -> None:
-    flags = "--env.control_mode=absolute --env.task_ids=[0,38]"
+    flags = "--env.control_mode=absolute --env.task_ids=[0,38] --env.fps=5"
     flags += " --policy.type=bomb_expert --eval.n_episodes=1 --eval.batch_size=1"
     info = evaluate(stock_cli, tmp_path, flags)
     assert [task["task_id"] for task in info["per_task"]] == [0, 38]
@@ -64,7 +64,7 @@ def test_numbered_tasks_and_absolute_control(stock_cli: Run, tmp_path: Path) -> 
 
 def test_each_condition_has_a_rate_and_a_recording(stock_cli: Run, tmp_path: Path) -> None:
     flags = '--env.perturbations=["none","camera:3","all:5"] --policy.type=bomb_expert --eval.recording=true'
-    flags += " --eval.n_episodes=2 --eval.batch_size=2 --eval.use_async_envs=false"
+    flags += " --eval.n_episodes=2 --eval.batch_size=2 --eval.use_async_envs=false --env.fps=5"
     info = evaluate(stock_cli, tmp_path, flags)
     keys = ["place.none", "place.camera-3", "place.all-5"]
     assert {key: info["per_group"][key]["pc_success"] for key in keys} == dict.fromkeys(keys, 100.0)
@@ -89,7 +89,7 @@ def test_each_condition_has_a_rate_and_a_recording(stock_cli: Run, tmp_path: Pat
 
 def test_random_actions_fail(stock_cli: Run, tmp_path: Path) -> None:
     flags = "--policy.type=bomb_random --eval.n_episodes=2 --eval.batch_size=2 --eval.use_async_envs=false"
-    assert evaluate(stock_cli, tmp_path, flags)["overall"]["pc_success"] == 0.0
+    assert evaluate(stock_cli, tmp_path, f"{flags} --env.fps=2")["overall"]["pc_success"] == 0.0
     assert all(row["failure"] for row in read_results(tmp_path / "results.jsonl"))
 
 

@@ -20,6 +20,7 @@ CAUSAL_SEGMENT: Options = {"segment_attention": "causal"}
 POOL_ALL: Options = {"reasoning_pool": "all_prefix"}
 FULL_LOSS: Options = {"loss_vocab": "full"}
 
+TWO_LAYERS: Options = {"nano_config": {"text_config": {"num_hidden_layers": 2}}}
 SHORT_CHUNKS: Options = {"chunk_size": 3, "n_action_steps": 3}
 # by policy type
 SINGLE: dict[str, dict[str, Options]] = {
@@ -67,6 +68,11 @@ def small_policy(policy_type: str) -> Options:
     network = read_recipe("one_target", policy_type)["policy"]
     shape = {name: network[name] for name in ("nano_config", "image_size") if name in network}
     return read_recipe("overfit", policy_type)["policy"] | shape | SHORT_CHUNKS
+
+
+def layers_of(options: Options) -> Options:
+    """Nano with two layers, one to write what the other reads, unless the options choose another model."""
+    return {} if "vlm_model_name" in options else TWO_LAYERS
 
 
 def variants_of(policy_type: str, *, is_long: bool) -> list[Any]:

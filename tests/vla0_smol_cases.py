@@ -4,6 +4,7 @@ from typing import Any
 
 import torch
 from lerobot.configs import FeatureType, PolicyFeature
+from variants import layers_of
 
 from lerobot_bomb.actions.text import NumberTokens
 from lerobot_policy_vla0_smol import Vla0SmolConfig, make_vla0_smol_pre_post_processors
@@ -29,6 +30,7 @@ def make_config(cameras: tuple[str, ...] = (WORKSPACE, WRIST), **options: Any) -
             "n_action_steps": 2,
             "input_features": inputs,
             "output_features": {"action": PolicyFeature(FeatureType.ACTION, (4,))},
+            **layers_of(options),
             **options,
         }
     )

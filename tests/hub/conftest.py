@@ -1,5 +1,6 @@
 """The Hub on this machine, and commands that see no other."""
 
+import shutil
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -34,8 +35,14 @@ def online(
     return hub
 
 
-@pytest.fixture
-def checkpoint(tmp_path: Path) -> Path:
-    folder = tmp_path / "pretrained_model"
+@pytest.fixture(scope="session")
+def whole(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("whole") / "pretrained_model"
     write_checkpoint(folder)
     return folder
+
+
+@pytest.fixture
+def checkpoint(whole: Path, tmp_path: Path) -> Path:
+    """A copy, which may be damaged."""
+    return shutil.copytree(whole, tmp_path / "pretrained_model")

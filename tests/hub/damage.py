@@ -24,7 +24,7 @@ PREPROCESSOR, POSTPROCESSOR = "policy_preprocessor.json", "policy_postprocessor.
 
 def write_checkpoint(folder: Path) -> None:
     """Of a `vla0_smol` whose backbone came from a folder, with what belongs to the training beside it."""
-    policy = make_policy()
+    policy = make_policy(nano_config=None)  # another model has its own layers
     for processor in make_vla0_smol_pre_post_processors(policy.config, STATS):
         processor.save_pretrained(folder)
     policy.config.vlm_model_name = LOCAL

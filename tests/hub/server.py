@@ -16,6 +16,7 @@ import yaml
 TOKEN = "hf_loopbackDummyTokenForTests0123456"
 LFS_ENDINGS = (".safetensors", ".parquet", ".mp4", ".png")
 FIRST = "0" * 40
+POLL_S = 0.01  # how soon the server notices that it is to end
 
 
 class HubError(Exception):
@@ -78,7 +79,7 @@ class LoopbackHub:
         server = ThreadingHTTPServer(("127.0.0.1", 0), handler)
         server.daemon_threads = True
         self.endpoint = f"http://127.0.0.1:{server.server_port}"
-        thread = threading.Thread(target=server.serve_forever, daemon=True)
+        thread = threading.Thread(target=server.serve_forever, args=(POLL_S,), daemon=True)
         thread.start()
         try:
             yield self
