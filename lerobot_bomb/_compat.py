@@ -12,23 +12,27 @@ from contextlib import contextmanager, suppress
 from functools import partial, wraps
 from pathlib import Path
 from types import SimpleNamespace
-from typing import TYPE_CHECKING, Any
+from typing import Any
 from weakref import ref
 
 import numpy as np
 from datasets import config
 from huggingface_hub import hf_hub_download
 from huggingface_hub.constants import CONFIG_NAME
-from lerobot.datasets import LeRobotDataset, aggregate, compute_stats, dataset_writer
+from lerobot.datasets import (
+    LeRobotDataset,
+    LeRobotDatasetMetadata,
+    aggregate,
+    compute_stats,
+    dataset_writer,
+)
 from lerobot.datasets.dataset_reader import DatasetReader
 from lerobot.datasets.feature_utils import get_hf_features_from_features
 from lerobot.datasets.io_utils import to_parquet_with_hf_images
+from lerobot.datasets.utils import INFO_PATH
 from lerobot.policies import PreTrainedPolicy
 from lerobot.utils import import_utils
 from lerobot.utils.constants import DEFAULT_FEATURES
-
-if TYPE_CHECKING:
-    from lerobot.datasets import LeRobotDatasetMetadata
 
 _BUILT: list[ref[PreTrainedPolicy]] = []  # by `remember_policies`
 
@@ -251,6 +255,26 @@ def read_asked_columns() -> None:
     DatasetReader._query_hf_dataset = query
 
 
+def explain_missing_datasets(explain: Callable[[str, Path, Exception], str]) -> None:
+    """Let a dataset that is neither here nor on the Hub be an error with `explain(repo_id, root, error)`.
+
+    LeRobot asks the Hub for whatever it does not find, and ends in a hundred lines of the HTTP library.
+    """
+    usual = LeRobotDatasetMetadata.__init__
+
+    @wraps(usual)
+    def load(self: LeRobotDatasetMetadata, repo_id: str, *args: Any, **kwargs: Any) -> None:
+        try:
+            usual(self, repo_id, *args, **kwargs)
+        except Exception as error:
+            root = getattr(self, "root", None)
+            if root is None or (root / INFO_PATH).is_file():
+                raise
+            raise FileNotFoundError(explain(repo_id, root, error)) from None
+
+    LeRobotDatasetMetadata.__init__ = load
+
+
 def built_policies() -> list[PreTrainedPolicy]:
     """The policies that this process built and still holds, in that order.
 
@@ -259,7 +283,7 @@ def built_policies() -> list[PreTrainedPolicy]:
     return [policy for built in _BUILT if (policy := built()) is not None]
 
 
-def training_data(policy: PreTrainedPolicy) -> "LeRobotDatasetMetadata | None":
+def training_data(policy: PreTrainedPolicy) -> LeRobotDatasetMetadata | None:
     """The dataset that this process trains a policy on; None: it acts as it was loaded."""
     return getattr(policy.config, "_runtime_dataset_meta", None)
 

@@ -17,11 +17,13 @@ from lerobot_bomb.checkpoints.config import tell_config_errors
 from lerobot_bomb.checkpoints.processor_files import check_saved_processors
 from lerobot_bomb.checkpoints.shipped import checkpoint_path
 from lerobot_bomb.data.hub_token import refuse_unsendable_tokens
+from lerobot_bomb.data.missing import tell_missing_datasets
 
 shorten_torchcodec_warning()
 tell_config_errors()
 remember_policies()
 read_asked_columns()
 refuse_unsendable_tokens()
+tell_missing_datasets()
 check_saved_processors()
 resolve_checkpoints(checkpoint_path)

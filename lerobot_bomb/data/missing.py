@@ -1,0 +1,29 @@
+"""A dataset that is neither on this machine nor on the Hub: said in a line, with what may be meant."""
+
+from pathlib import Path
+
+from lerobot_bomb._compat import explain_missing_datasets
+from lerobot_bomb.data.resumable import parameters_file, unfinished_folder
+
+RESUMED_BY = {
+    "recording": "lerobot-bomb record",
+    "conversion": "lerobot-bomb convert",
+}
+
+
+def explain(repo_id: str, root: Path, error: Exception) -> str:
+    """What is missing, and an unfinished dataset of that name if there is one."""
+    for kind, command in RESUMED_BY.items():
+        folder = unfinished_folder(root, kind)
+        if parameters_file(folder).is_file():
+            return f"the {kind} {root} is not finished ({folder}): go on with `{command} ... --resume`"
+    reason = str(error).strip().splitlines() or [""]
+    return (
+        f"{root} holds no dataset (meta/info.json), and {repo_id} cannot be had from the Hub "
+        f"({type(error).__name__}: {reason[0]}); is --dataset.root, or --dataset.repo_id, misspelt?"
+    )
+
+
+def tell_missing_datasets() -> None:
+    """From now on in this process, in LeRobot's commands too."""
+    explain_missing_datasets(explain)
