@@ -21,7 +21,7 @@ import shutil
 import sys
 import time
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -45,6 +45,7 @@ FIRST_UNSEEN_SEED = 100_000
 NUM_CHECKPOINTS = 6
 CURVE_EPISODES = 50  # of every checkpoint but the last
 NO_IMAGES, OTHER_INSTRUCTION = "blank images", "another episode's instruction"
+LEFT_OUT = "targets and wording left out"
 
 
 @dataclass(frozen=True)
@@ -73,6 +74,9 @@ class Task:
     trainings: dict[str, Training]
     perturbations: str = NONE  # of the demonstrations
     conditions: tuple[str, ...] = ()  # that the last checkpoint is evaluated under, beside the nominal one
+    split: str = "all"  # of the demonstrations and the evaluations
+    left_out: str | None = None  # the split that the last checkpoint is also evaluated on
+    recipe: str | None = None  # the task whose recipes it is learnt by; None: its own
 
 
 TASKS = {
@@ -100,6 +104,14 @@ TASKS = {
         trainings={"fdvla": Training(3600, None)},
         perturbations=f"{ALL}:0-4",
         conditions=(*(f"{axis}:3" for axis in NUISANCES), f"{ALL}:1", f"{ALL}:3", f"{ALL}:5"),
+    ),
+    "left_out": Task(
+        (),
+        episodes=200,
+        trainings={name: Training(1600, None) for name in POLICY_TYPES},
+        split="train",
+        left_out="heldout",
+        recipe="all_targets",
     ),
 }
 
@@ -144,7 +156,9 @@ def run_task(args: argparse.Namespace) -> int:
         "task": args.task,
         "policy": args.policy_type,
         "demonstrations": demonstrations,
-        "steps": args.steps or training.steps or read_recipe(args.task, args.policy_type)["steps"],
+        "steps": args.steps
+        or training.steps
+        or read_recipe(recipe_task(args.task), args.policy_type)["steps"],
         "checkpoints": args.checkpoints,
         "first_seed": args.first_seed,
         "flags": args.policy_flags,
@@ -158,7 +172,8 @@ def run_task(args: argparse.Namespace) -> int:
     controls = evaluate_controls(task, folder, args.first_seed, given)
     minutes_per_step = minutes["cpu_minutes"] / run["steps"]
     points = {f"step {step}": count(rows, step, step * minutes_per_step) for step, rows in results.items()}
-    points |= {name: count(rows, run["steps"], minutes["cpu_minutes"]) for name, rows in controls.items()}
+    others = controls | evaluate_left_out(task, folder, args.first_seed)
+    points |= {name: count(rows, run["steps"], minutes["cpu_minutes"]) for name, rows in others.items()}
 
     num_named = count_named(controls[OTHER_INSTRUCTION], given)
     print_points(points)
@@ -180,6 +195,11 @@ def run_task(args: argparse.Namespace) -> int:
         },
     )
     return 0 if training.bar is None else verdict(points[f"step {run['steps']}"], training.bar)
+
+
+def recipe_task(task: str) -> str:
+    """The task that names the recipes' files."""
+    return TASKS[task].recipe or task
 
 
 def verdict(last: Point, bar: Bar) -> int:
@@ -218,6 +238,7 @@ def record(task: Task, demonstrations: int, dataset: Path) -> None:
         f"--seed={FIRST_SEED}",
         f"--noise={NOISE}",
         f"--perturbations={task.perturbations}",
+        f"--split={task.split}",
         "--images",
         f"--image_size={IMAGE_SIZE}",
         *task_flags,
@@ -232,7 +253,7 @@ def train(folder: Path, run: dict[str, Any]) -> dict[str, float]:
         return json.loads(times.read_text())
     shutil.rmtree(folder / "train", ignore_errors=True)
     started, cpu_started = time.monotonic(), _children_cpu_s()
-    recipe = [f"--config_path={recipe_path(run['task'], run['policy'])}"]
+    recipe = [f"--config_path={recipe_path(recipe_task(run['task']), run['policy'])}"]
     run_command(
         "lerobot-train",
         *(probe_recipe() if run["policy"] == PROBE else recipe),
@@ -297,6 +318,15 @@ def evaluate_controls(
     return results
 
 
+def evaluate_left_out(task: Task, folder: Path, first_seed: int) -> dict[str, list[Row]]:
+    """{LEFT_OUT: results} of the last checkpoint on what no demonstration showed."""
+    if task.left_out is None:
+        return {}
+    checkpoint = folder / "train" / "checkpoints" / "last" / "pretrained_model"
+    task = replace(task, split=task.left_out)
+    return {LEFT_OUT: evaluate(task, checkpoint, folder / "eval_left_out", first_seed, task.episodes)}
+
+
 def evaluate_conditions(task: Task, folder: Path, first_seed: int) -> dict[str, int]:
     """{condition: successes} of the last checkpoint in CURVE_EPISODES episodes each; prints the table."""
     if not task.conditions:
@@ -336,6 +366,7 @@ def evaluate(
             f"--env.results_path={results}",
             *task_flags,
             f"--env.perturbations={json.dumps(conditions)}",
+            f"--env.split={task.split}",
             f"--seed={first_seed}",
             f"--eval.n_episodes={episodes}",
             f"--eval.batch_size={min(10, episodes)}",

@@ -34,7 +34,7 @@ def commands(monkeypatch: pytest.MonkeyPatch, stock_cli: Callable[..., None]) ->
             stock_cli(command, *flags, *short, "--eval.batch_size=1")
 
     training = learn.Training(demonstrations=1, bar=learn.Bar(0.5, cpu_minutes=5), steps=2)
-    tiny = learn.Task((), episodes=1, trainings={learn.PROBE: training})
+    tiny = learn.Task((), episodes=1, trainings={learn.PROBE: training}, split="train", left_out="heldout")
     for name, value in {"run_command": run, "TASKS": {"tiny": tiny}, "IMAGE_SIZE": SIZE}.items():
         monkeypatch.setattr(learn, name, value)
     monkeypatch.setattr(learn, "BATCH_SIZE", 2)
@@ -60,14 +60,20 @@ def test_a_task_is_learnt_by_stock_commands_and_goes_on_where_it_stopped(
         policy_flags=["--policy.num_channels=8"],
     )
     assert learn.run_task(args) == 1  # two steps of training teach nothing
-    assert commands == ["lerobot-bomb", "lerobot-train", *["lerobot-eval"] * 4]
+    assert commands == ["lerobot-bomb", "lerobot-train", *["lerobot-eval"] * 5]
     figures = json.loads(args.json.read_text())
     assert [(name, point["step"]) for name, point in figures["points"].items()] == [
         ("step 1", 1),
         ("step 2", 2),
         (learn.NO_IMAGES, 2),
         (learn.OTHER_INSTRUCTION, 2),
+        (learn.LEFT_OUT, 2),
     ]
+    splits = {
+        path.parent.name: json.loads(path.read_text())["spec"]["split"]
+        for path in folder.rglob("results.jsonl")
+    }
+    assert splits == dict.fromkeys(splits, "train") | {"eval_left_out": "heldout"}
     assert figures["training"]["cpu_minutes"] == 2.0
     assert figures["points"]["step 1"]["cpu_minutes"] == 1.0
     assert all(point["num_episodes"] == 1 for point in figures["points"].values())
@@ -109,7 +115,7 @@ def test_the_other_instruction_names_another_target() -> None:
 def test_every_policy_type_has_a_recipe_for_every_task() -> None:
     for name, task in learn.TASKS.items():
         for policy_type in task.trainings.keys() - {learn.PROBE}:
-            recipe = learn.read_recipe(name, policy_type)
+            recipe = learn.read_recipe(learn.recipe_task(name), policy_type)
             assert (
                 recipe["policy"].get("path", f"bomb:{recipe['policy'].get('type')}") == f"bomb:{policy_type}"
             )
