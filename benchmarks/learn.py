@@ -95,6 +95,7 @@ TASKS = {
         trainings={
             PROBE: Training(400, None, steps=6000),
             **{name: Training(1600, Bar(0.90, 180)) for name in POLICY_TYPES},
+            "spatialvla_grid": Training(3200, Bar(0.90, 180)),
             "vla0_smol": Training(3200, Bar(0.97, 90)),
         },
     ),
