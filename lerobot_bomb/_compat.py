@@ -260,12 +260,14 @@ def explain_missing_datasets(explain: Callable[[str, Path, Exception], str]) -> 
 
     LeRobot asks the Hub for whatever it does not find, and ends in a hundred lines of the HTTP library.
     """
-    usual = LeRobotDatasetMetadata.__init__
+    usual = getattr(LeRobotDatasetMetadata.__init__, "__wrapped__", LeRobotDatasetMetadata.__init__)
 
     @wraps(usual)
     def load(self: LeRobotDatasetMetadata, repo_id: str, *args: Any, **kwargs: Any) -> None:
         try:
             usual(self, repo_id, *args, **kwargs)
+        except ValueError:  # of what was given
+            raise
         except Exception as error:
             root = getattr(self, "root", None)
             if root is None or (root / INFO_PATH).is_file():

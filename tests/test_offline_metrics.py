@@ -219,7 +219,8 @@ def test_an_absent_dataset_is_one_line(
     flags = [f"--policy.path={checkpoint}", "--dataset.repo_id=test/absent"]
     assert main(["offline-metrics", *flags]) == 1
     error = capsys.readouterr().err
-    assert error.startswith("lerobot-bomb offline-metrics: --dataset.repo_id=test/absent is neither in ")
+    assert error.startswith(f"lerobot-bomb offline-metrics: {tmp_path}/test/absent holds no dataset ")
+    assert "test/absent cannot be had from the Hub (" in error
     assert error.count("\n") == 1
 
 

@@ -117,7 +117,7 @@ torch.save(postprocessor(policy.select_action(preprocessor(batch))), sys.argv[3]
 
 def test_a_checkpoint_needs_nothing_but_itself(tmp_path: Path) -> None:
     """Another process, no network, empty Hub cache, and a base model that does not exist any more."""
-    policy = make_policy()
+    policy = make_policy(nano_config=None)  # which changes nano alone
     batch = make_batch(policy, 4)
     save(policy, tmp_path / "model")
     config_file = tmp_path / "model" / "config.json"

@@ -10,7 +10,8 @@ from lerobot.datasets import LeRobotDatasetMetadata
 from lerobot.utils.constants import DEFAULT_FEATURES, HF_LEROBOT_HOME
 
 from lerobot_bomb.data.dataset_files import INFO_FILE, check_metadata, flat_numbers, read_parquet
-from lerobot_bomb.data.hub_token import TokenError, refuse_unsendable_tokens
+from lerobot_bomb.data.hub_token import refuse_unsendable_tokens
+from lerobot_bomb.data.missing import tell_missing_datasets
 from lerobot_bomb.data.resumable import check_repo_id
 
 EPISODE_INDEX = "episode_index"
@@ -21,20 +22,11 @@ def read_meta(repo_id: str, root: Path | None) -> LeRobotDatasetMetadata:
     if root is None:  # else it is but a label
         check_repo_id(repo_id, "--dataset.repo_id")
         refuse_unsendable_tokens()
+        tell_missing_datasets()
     if root is not None and not (root / INFO_FILE).is_file():
         raise ValueError(f"--dataset.root={root} holds no {INFO_FILE}, so it is no LeRobotDataset")
     check_metadata(root or HF_LEROBOT_HOME / repo_id)
-    try:
-        return LeRobotDatasetMetadata(repo_id, root=root)
-    except TokenError:
-        raise
-    except (OSError, ValueError) as error:
-        if root is not None:
-            raise
-        raise ValueError(
-            f"--dataset.repo_id={repo_id} is neither in {HF_LEROBOT_HOME} nor could it be had from the Hub "
-            f"({type(error).__name__}); name its folder with --dataset.root"
-        ) from error
+    return LeRobotDatasetMetadata(repo_id, root=root)
 
 
 def read_columns(
