@@ -298,6 +298,11 @@ def evaluate_checkpoints(task: Task, folder: Path, first_seed: int, last: int) -
     }
 
 
+def last_checkpoint(folder: Path) -> Path:
+    """The one that is the result."""
+    return folder / "train" / "checkpoints" / "last" / "pretrained_model"
+
+
 def evaluate_controls(
     task: Task, folder: Path, first_seed: int, given: dict[str, str]
 ) -> dict[str, list[Row]]:
@@ -306,7 +311,7 @@ def evaluate_controls(
 
     from lerobot_bomb.explain.interventions import BlankImages, ReplaceTasks, intervene
 
-    checkpoint = folder / "train" / "checkpoints" / "last" / "pretrained_model"
+    checkpoint = last_checkpoint(folder)
     results = {}
     for name, step, changed in (
         (NO_IMAGES, BlankImages(), "blank_images"),
@@ -323,7 +328,7 @@ def evaluate_left_out(task: Task, folder: Path, first_seed: int) -> dict[str, li
     """{LEFT_OUT: results} of the last checkpoint on what no demonstration showed."""
     if task.left_out is None:
         return {}
-    checkpoint = folder / "train" / "checkpoints" / "last" / "pretrained_model"
+    checkpoint = last_checkpoint(folder)
     task = replace(task, split=task.left_out)
     return {LEFT_OUT: evaluate(task, checkpoint, folder / "eval_left_out", first_seed, task.episodes)}
 
@@ -332,10 +337,8 @@ def evaluate_conditions(task: Task, folder: Path, first_seed: int) -> dict[str, 
     """{condition: successes} of the last checkpoint in CURVE_EPISODES episodes each; prints the table."""
     if not task.conditions:
         return {}
-    checkpoint, output_dir = folder / "train" / "checkpoints" / "last", folder / "eval_conditions"
-    rows = evaluate(
-        task, checkpoint / "pretrained_model", output_dir, first_seed, CURVE_EPISODES, task.conditions
-    )
+    checkpoint, output_dir = last_checkpoint(folder), folder / "eval_conditions"
+    rows = evaluate(task, checkpoint, output_dir, first_seed, CURVE_EPISODES, task.conditions)
     run_command("lerobot-bomb", "results", f"{output_dir / 'results.jsonl'}")
     successes = dict.fromkeys(task.conditions, 0)
     for row in rows:

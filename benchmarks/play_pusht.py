@@ -23,7 +23,7 @@ from pathlib import Path
 from statistics import fmean
 
 from machine import add_machine_arguments, positive, require_idle_machine, write_figures
-from pusht_offline import MAX_COVERAGE_REWARD, convert, run_logged
+from pusht_offline import convert, evaluate, max_coverages, run_logged
 from pusht_report import over_episodes
 from recipes import FOLDER, read_recipe, recipe_path
 
@@ -129,24 +129,12 @@ def train(output_dir: Path, flags: list[str], steps: int) -> Seconds:
 
 
 def play(folder: Path, episodes: int) -> tuple[list[float], int]:
-    """Maximal coverage of each episode of the stock `lerobot-eval --env.type=pusht`, and the successes."""
-    info = folder / f"eval_{episodes}" / "eval_info.json"
-    if not info.exists():
-        shutil.rmtree(info.parent, ignore_errors=True)
-        run_logged(
-            folder / "eval.log",
-            "lerobot-eval",
-            f"--policy.path={folder / 'train' / 'checkpoints' / 'last' / 'pretrained_model'}",
-            "--env.type=pusht",
-            f"--seed={FIRST_UNSEEN_SEED}",
-            f"--eval.n_episodes={episodes}",
-            f"--eval.batch_size={min(50, episodes)}",
-            "--eval.use_async_envs=false",
-            f"--output_dir={info.parent}",
-        )
-    metrics = [task["metrics"] for task in json.loads(info.read_text())["per_task"]]
-    coverages = [MAX_COVERAGE_REWARD * reward for each in metrics for reward in each["max_rewards"]]
-    return coverages, sum(sum(each["successes"]) for each in metrics)
+    """Maximal coverage of each episode, and the successes."""
+    checkpoint = folder / "train" / "checkpoints" / "last" / "pretrained_model"
+    flags = [f"--seed={FIRST_UNSEEN_SEED}", f"--eval.n_episodes={episodes}"]
+    flags.append(f"--eval.batch_size={min(50, episodes)}")
+    metrics = evaluate(checkpoint, folder / f"eval_{episodes}", flags)
+    return max_coverages(metrics), sum(sum(each["successes"]) for each in metrics)
 
 
 def print_contenders(contenders: list[Contender]) -> None:

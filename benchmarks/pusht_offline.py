@@ -218,23 +218,31 @@ def measure(run: Run, dataset: Path, num_frames: int) -> dict[str, Any]:
 
 
 def play(run: Run, num_episodes: int) -> list[float]:
-    """Maximal coverage of each episode of the stock `lerobot-eval --env.type=pusht`."""
-    folder = run.folder / f"eval_{num_episodes}"
-    info = folder / "eval_info.json"
+    """Maximal coverage of each episode."""
+    flags = [f"--eval.n_episodes={num_episodes}", "--eval.batch_size=10"]
+    return max_coverages(evaluate(run.checkpoint, run.folder / f"eval_{num_episodes}", flags))
+
+
+def evaluate(checkpoint: Path, output_dir: Path, flags: list[str]) -> list[dict[str, Any]]:
+    """Stock `lerobot-eval --env.type=pusht`; its metrics of each task."""
+    info = output_dir / "eval_info.json"
     if not info.exists():
-        shutil.rmtree(folder, ignore_errors=True)
+        shutil.rmtree(output_dir, ignore_errors=True)
         run_logged(
-            run.folder / "eval.log",
+            output_dir.with_name("eval.log"),
             "lerobot-eval",
-            f"--policy.path={run.checkpoint}",
+            f"--policy.path={checkpoint}",
             "--env.type=pusht",
-            f"--eval.n_episodes={num_episodes}",
-            "--eval.batch_size=10",
+            *flags,
             "--eval.use_async_envs=false",
-            f"--output_dir={folder}",
+            f"--output_dir={output_dir}",
         )
-    per_task = json.loads(info.read_text())["per_task"]
-    return [MAX_COVERAGE_REWARD * reward for task in per_task for reward in task["metrics"]["max_rewards"]]
+    return [task["metrics"] for task in json.loads(info.read_text())["per_task"]]
+
+
+def max_coverages(metrics: list[dict[str, Any]]) -> list[float]:
+    """Of each episode, from gym-pusht's rewards."""
+    return [MAX_COVERAGE_REWARD * reward for each in metrics for reward in each["max_rewards"]]
 
 
 def run_logged(log: Path, command: str, *flags: str) -> float:
