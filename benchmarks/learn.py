@@ -21,7 +21,7 @@ import shutil
 import sys
 import time
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -29,7 +29,9 @@ from learning_curve import Point, as_figures, count, draw, print_points
 from machine import add_machine_arguments, positive, require_idle_machine, write_figures
 from recipes import POLICY_TYPES, read_recipe, recipe_path
 
+from lerobot_bomb.bomb.board import COLORS, task_id
 from lerobot_bomb.bomb.perturbations import ALL, NONE, NUISANCES
+from lerobot_bomb.bomb.suites.place import targets_of, templates_of
 from lerobot_bomb.commands.run import run_command
 from lerobot_bomb.evaluation.results import PUT_DOWN, Row, read_results
 
@@ -44,8 +46,14 @@ FIRST_SEED = 200_000  # of the demonstrations; LeRobot evaluates from 1000 on
 FIRST_UNSEEN_SEED = 100_000
 NUM_CHECKPOINTS = 6
 CURVE_EPISODES = 50  # of every checkpoint but the last
+MAX_CONTROL_EPISODES = 200
 NO_IMAGES, OTHER_INSTRUCTION = "blank images", "another episode's instruction"
-LEFT_OUT = "targets and wording left out"
+SHOWN, SEVERAL = "as in the demonstrations", "several left out"
+# of the targets that the split 'train' has, those that get no stone of a colour: one per row and column
+LEFT_OUT_PAIRS = {
+    "black": ((0, 0), (1, 2), (2, 1), (3, 4), (4, 3)),
+    "white": ((0, 1), (1, 4), (2, 0), (3, 3), (4, 2)),
+}
 
 
 @dataclass(frozen=True)
@@ -74,8 +82,7 @@ class Task:
     trainings: dict[str, Training]
     perturbations: str = NONE  # of the demonstrations
     conditions: tuple[str, ...] = ()  # that the last checkpoint is evaluated under, beside the nominal one
-    split: str = "all"  # of the demonstrations and the evaluations
-    left_out: str | None = None  # the split that the last checkpoint is also evaluated on
+    is_partial: bool = False  # whether demonstrations leave out what the evaluations ask for as well
     recipe: str | None = None  # the task whose recipes it is learnt by; None: its own
 
 
@@ -108,10 +115,9 @@ TASKS = {
     ),
     "left_out": Task(
         (),
-        episodes=200,
+        episodes=400,
         trainings={name: Training(1600, None) for name in POLICY_TYPES},
-        split="train",
-        left_out="heldout",
+        is_partial=True,
         recipe="all_targets",
     ),
 }
@@ -173,14 +179,12 @@ def run_task(args: argparse.Namespace) -> int:
     controls = evaluate_controls(task, folder, args.first_seed, given)
     minutes_per_step = minutes["cpu_minutes"] / run["steps"]
     points = {f"step {step}": count(rows, step, step * minutes_per_step) for step, rows in results.items()}
-    others = controls | evaluate_left_out(task, folder, args.first_seed)
+    others = controls | (by_what_is_left_out(results[run["steps"]]) if task.is_partial else {})
     points |= {name: count(rows, run["steps"], minutes["cpu_minutes"]) for name, rows in others.items()}
 
-    num_named = count_named(controls[OTHER_INSTRUCTION], given)
+    num_named, num_given = count_named(controls[OTHER_INSTRUCTION], given), len(controls[OTHER_INSTRUCTION])
     print_points(points)
-    print(
-        f"{OTHER_INSTRUCTION}: {num_named}/{task.episodes} stones put down on the intersection that it names"
-    )
+    print(f"{OTHER_INSTRUCTION}: {num_named}/{num_given} stones put down on the intersection that it names")
     conditions = evaluate_conditions(task, folder, args.first_seed)
     if args.plot is not None:
         title = f"{args.policy_type}, {args.task}: {demonstrations} demonstrations, {task.episodes} new seeds"
@@ -228,7 +232,8 @@ def record(task: Task, demonstrations: int, dataset: Path) -> None:
     """The expert's episodes."""
     if dataset.exists():
         return
-    task_flags = [f"--task_ids={list(task.task_ids)}"] if task.task_ids else []
+    task_ids = shown_pairs() if task.is_partial else task.task_ids
+    task_flags = [f"--task_ids={list(task_ids)}"] if task_ids else []
     resume = ["--resume"] if dataset.with_name(f"{dataset.name}.recording").exists() else []
     run_command(
         "lerobot-bomb",
@@ -239,7 +244,7 @@ def record(task: Task, demonstrations: int, dataset: Path) -> None:
         f"--seed={FIRST_SEED}",
         f"--noise={NOISE}",
         f"--perturbations={task.perturbations}",
-        f"--split={task.split}",
+        f"--split={'train' if task.is_partial else 'all'}",
         "--images",
         f"--image_size={IMAGE_SIZE}",
         *task_flags,
@@ -320,17 +325,38 @@ def evaluate_controls(
         shutil.rmtree(checkpoint.with_name(changed), ignore_errors=True)
         intervene(checkpoint, [step], checkpoint.with_name(changed))
         output_dir = folder / f"eval_{changed}"
-        results[name] = evaluate(task, checkpoint.with_name(changed), output_dir, first_seed, task.episodes)
+        episodes = min(task.episodes, MAX_CONTROL_EPISODES)
+        results[name] = evaluate(task, checkpoint.with_name(changed), output_dir, first_seed, episodes)
     return results
 
 
-def evaluate_left_out(task: Task, folder: Path, first_seed: int) -> dict[str, list[Row]]:
-    """{LEFT_OUT: results} of the last checkpoint on what no demonstration showed."""
-    if task.left_out is None:
-        return {}
-    checkpoint = last_checkpoint(folder)
-    task = replace(task, split=task.left_out)
-    return {LEFT_OUT: evaluate(task, checkpoint, folder / "eval_left_out", first_seed, task.episodes)}
+def shown_pairs() -> list[int]:
+    """Task ids of the split 'train' without those of LEFT_OUT_PAIRS."""
+    return [
+        task_id(target, color)
+        for color in COLORS
+        for target in targets_of("train")
+        if target not in LEFT_OUT_PAIRS[color]
+    ]
+
+
+def by_what_is_left_out(rows: list[Row]) -> dict[str, list[Row]]:
+    """{what of an episode no demonstration showed: its rows}."""
+    groups: dict[str, list[Row]] = {}
+    for row in rows:
+        target, color = tuple(row["target"]), row["color"]
+        wordings = [
+            template.format(color=color, row=target[0], column=target[1])
+            for template in templates_of("heldout")
+        ]
+        left_out = {
+            "target left out": target in targets_of("heldout"),
+            "wording left out": row["instruction"] in wordings,
+            "colour for this target left out": target in LEFT_OUT_PAIRS[color],
+        }
+        names = [name for name, is_left_out in left_out.items() if is_left_out] or [SHOWN]
+        groups.setdefault(names[0] if len(names) == 1 else SEVERAL, []).append(row)
+    return dict(sorted(groups.items()))
 
 
 def evaluate_conditions(task: Task, folder: Path, first_seed: int) -> dict[str, int]:
@@ -370,7 +396,6 @@ def evaluate(
             f"--env.results_path={results}",
             *task_flags,
             f"--env.perturbations={json.dumps(conditions)}",
-            f"--env.split={task.split}",
             f"--seed={first_seed}",
             f"--eval.n_episodes={episodes}",
             f"--eval.batch_size={min(10, episodes)}",

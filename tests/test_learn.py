@@ -10,6 +10,9 @@ import numpy as np
 import pytest
 from learning_curve import SUCCESS_BGR, count, draw
 
+from lerobot_bomb.bomb.board import COLORS
+from lerobot_bomb.bomb.episode import EpisodeSpec
+from lerobot_bomb.bomb.suites.place import targets_of, templates_of
 from lerobot_bomb.commands.main import main as lerobot_bomb
 
 SIZE = 32  # pixels
@@ -34,7 +37,7 @@ def commands(monkeypatch: pytest.MonkeyPatch, stock_cli: Callable[..., None]) ->
             stock_cli(command, *flags, *short, "--eval.batch_size=1")
 
     training = learn.Training(demonstrations=1, bar=learn.Bar(0.5, cpu_minutes=5), steps=2)
-    tiny = learn.Task((), episodes=1, trainings={learn.PROBE: training}, split="train", left_out="heldout")
+    tiny = learn.Task((), episodes=1, trainings={learn.PROBE: training}, is_partial=True)
     for name, value in {"run_command": run, "TASKS": {"tiny": tiny}, "IMAGE_SIZE": SIZE}.items():
         monkeypatch.setattr(learn, name, value)
     monkeypatch.setattr(learn, "BATCH_SIZE", 2)
@@ -60,20 +63,17 @@ def test_a_task_is_learnt_by_stock_commands_and_goes_on_where_it_stopped(
         policy_flags=["--policy.num_channels=8"],
     )
     assert learn.run_task(args) == 1  # two steps of training teach nothing
-    assert commands == ["lerobot-bomb", "lerobot-train", *["lerobot-eval"] * 5]
+    assert commands == ["lerobot-bomb", "lerobot-train", *["lerobot-eval"] * 4]
     figures = json.loads(args.json.read_text())
     assert [(name, point["step"]) for name, point in figures["points"].items()] == [
         ("step 1", 1),
         ("step 2", 2),
         (learn.NO_IMAGES, 2),
         (learn.OTHER_INSTRUCTION, 2),
-        (learn.LEFT_OUT, 2),
+        ("target left out", 2),
     ]
-    splits = {
-        path.parent.name: json.loads(path.read_text())["spec"]["split"]
-        for path in folder.rglob("results.jsonl")
-    }
-    assert splits == dict.fromkeys(splits, "train") | {"eval_left_out": "heldout"}
+    recorded = json.loads((folder / "dataset" / "meta" / "bomb.json").read_text())["recording"]
+    assert recorded["task_ids"] == learn.shown_pairs()
     assert figures["training"]["cpu_minutes"] == 2.0
     assert figures["points"]["step 1"]["cpu_minutes"] == 1.0
     assert all(point["num_episodes"] == 1 for point in figures["points"].values())
@@ -121,6 +121,39 @@ def test_every_policy_type_has_a_recipe_for_every_task() -> None:
             )
             if policy_type not in learn.RIVALS:
                 assert recipe["policy"]["scheduler_decay_steps"] == recipe["steps"]
+
+
+def test_demonstrations_leave_out_targets_wording_and_colours() -> None:
+    shown = [EpisodeSpec(seed=0).for_task(task_id) for task_id in learn.shown_pairs()]
+    # every target of the split, and beside it each row and column in each colour
+    assert {spec.target for spec in shown} == set(targets_of("train"))
+    for color in COLORS:
+        targets = [spec.target for spec in shown if spec.color == color and spec.target is not None]
+        assert len(targets) == 15
+        assert {row for row, _ in targets} == {column for _, column in targets} == set(range(5))
+
+    def asked(target: tuple[int, int], color: str, template: str) -> dict[str, Any]:
+        instruction = template.format(color=color, row=target[0], column=target[1])
+        return row(None, 1.0, target=list(target), color=color, instruction=instruction)
+
+    wordings = [templates_of(split)[0] for split in ("train", "heldout")]
+    groups = {
+        (target, color, wording): next(iter(learn.by_what_is_left_out([asked(target, color, wording)])))
+        for target, color, wording in (
+            ((0, 0), "white", wordings[0]),
+            ((0, 0), "black", wordings[0]),
+            ((0, 0), "white", wordings[1]),
+            ((0, 3), "white", wordings[0]),
+            ((0, 3), "white", wordings[1]),
+        )
+    }
+    assert list(groups.values()) == [
+        learn.SHOWN,
+        "colour for this target left out",
+        "wording left out",
+        "target left out",
+        learn.SEVERAL,
+    ]
 
 
 def test_a_bar_is_of_success_and_of_time() -> None:
