@@ -32,6 +32,7 @@ from recipes import POLICY_TYPES, read_recipe
 from torch.profiler import ProfilerActivity, profile
 from torch.utils.data import default_collate
 
+from lerobot_bomb.policies.config import DTYPES
 from lerobot_bomb.tables import print_table
 
 NUM_OPERATORS = 8
@@ -58,6 +59,9 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawTextHelpFormatter)
     parser.add_argument("--policy.type", dest="policy_type", required=True, choices=POLICY_TYPES)
     parser.add_argument(
+        "--policy.dtype", dest="dtype", choices=DTYPES, default="float32", help="default: float32"
+    )
+    parser.add_argument(
         "--repeats", type=positive, default=20, help="training steps and predictions (default: 20)"
     )
     add_machine_arguments(parser)
@@ -66,7 +70,7 @@ def main() -> None:
     register_third_party_plugins()
     with tempfile.TemporaryDirectory() as folder:
         record(Path(folder) / "dataset")
-        cfg = recipe(args.policy_type, Path(folder) / "dataset")
+        cfg = recipe(args.policy_type, args.dtype, Path(folder) / "dataset")
         dataset: Any = make_dataset(cfg)
     assert cfg.policy is not None
     torch.manual_seed(0)
@@ -77,12 +81,14 @@ def main() -> None:
     train = profile_training(cfg, policy, processors[0], dataset, args.repeats)
     print("\nevaluation step, batch of 1")
     evaluation = profile_evaluation(cfg, policy, processors, args.repeats)
-    write_figures(args.json, {"policy": args.policy_type, "training_ms": train, "evaluation_ms": evaluation})
+    names = {"policy": args.policy_type, "dtype": args.dtype}
+    write_figures(args.json, {**names, "training_ms": train, "evaluation_ms": evaluation})
 
 
-def recipe(policy_type: str, dataset: Path) -> TrainPipelineConfig:
+def recipe(policy_type: str, dtype: str, dataset: Path) -> TrainPipelineConfig:
     """The training config of configs/overfit_TYPE.yaml for this dataset, as `lerobot-train` reads it."""
     values = read_recipe("overfit", policy_type)
+    values["policy"]["dtype"] = dtype
     values["dataset"] |= {"root": str(dataset), "video_backend": "pyav"}
     return draccus.decode(TrainPipelineConfig, values)
 
