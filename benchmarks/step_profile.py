@@ -70,7 +70,7 @@ def main() -> None:
     register_third_party_plugins()
     with tempfile.TemporaryDirectory() as folder:
         record(Path(folder) / "dataset")
-        cfg = recipe(args.policy_type, args.dtype, Path(folder) / "dataset")
+        cfg = recipe(args.policy_type, Path(folder) / "dataset", args.dtype)
         dataset: Any = make_dataset(cfg)
     assert cfg.policy is not None
     torch.manual_seed(0)
@@ -85,7 +85,7 @@ def main() -> None:
     write_figures(args.json, {**names, "training_ms": train, "evaluation_ms": evaluation})
 
 
-def recipe(policy_type: str, dtype: str, dataset: Path) -> TrainPipelineConfig:
+def recipe(policy_type: str, dataset: Path, dtype: str = "float32") -> TrainPipelineConfig:
     """The training config of configs/overfit_TYPE.yaml for this dataset, as `lerobot-train` reads it."""
     values = read_recipe("overfit", policy_type)
     values["policy"]["dtype"] = dtype
