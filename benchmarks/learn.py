@@ -194,6 +194,8 @@ def run_task(args: argparse.Namespace) -> int:
         {
             **run,
             "training": minutes,
+            # two trainings that end in other bits part between two of these
+            "weights_sha256": {step: rows[0]["policy"]["weights_sha256"] for step, rows in results.items()},
             "points": as_figures(points),
             "on_named": num_named,
             "conditions": conditions,

@@ -13,6 +13,7 @@ from learning_curve import SUCCESS_BGR, count, draw
 from lerobot_bomb.bomb.board import COLORS
 from lerobot_bomb.bomb.episode import EpisodeSpec
 from lerobot_bomb.bomb.suites.place import targets_of, templates_of
+from lerobot_bomb.checkpoints.identity import sha256_of
 from lerobot_bomb.commands.main import main as lerobot_bomb
 
 SIZE = 32  # pixels
@@ -74,6 +75,11 @@ def test_a_task_is_learnt_by_stock_commands_and_goes_on_where_it_stopped(
     ]
     recorded = json.loads((folder / "dataset" / "meta" / "bomb.json").read_text())["recording"]
     assert recorded["task_ids"] == learn.shown_pairs()
+    weights = {
+        str(int(path.name)): sha256_of(path / "pretrained_model" / "model.safetensors")
+        for path in (folder / "train" / "checkpoints").glob("0*")
+    }
+    assert figures["weights_sha256"] == weights
     assert figures["training"]["cpu_minutes"] == 2.0
     assert figures["points"]["step 1"]["cpu_minutes"] == 1.0
     assert all(point["num_episodes"] == 1 for point in figures["points"].values())
