@@ -6,6 +6,7 @@ from typing import Any
 
 import cv2
 import learn
+import learning_tasks
 import numpy as np
 import pytest
 from learning_curve import SUCCESS_BGR, count, draw
@@ -37,7 +38,7 @@ def commands(monkeypatch: pytest.MonkeyPatch, stock_cli: Callable[..., None]) ->
             short = ["--env.fps=2", "--env.ignore_checkpoint=true"]
             stock_cli(command, *flags, *short, "--eval.batch_size=1")
 
-    training = learn.Training(demonstrations=1, bar=learn.Bar(0.5, cpu_minutes=5), steps=2)
+    training = learning_tasks.Training(demonstrations=1, bar=learn.Bar(0.5, cpu_minutes=5), steps=2)
     tiny = learn.Task((), episodes=1, trainings={learn.PROBE: training}, is_partial=True)
     for name, value in {"run_command": run, "TASKS": {"tiny": tiny}, "IMAGE_SIZE": SIZE}.items():
         monkeypatch.setattr(learn, name, value)
@@ -74,7 +75,7 @@ def test_a_task_is_learnt_by_stock_commands_and_goes_on_where_it_stopped(
         ("target left out", 2),
     ]
     recorded = json.loads((folder / "dataset" / "meta" / "bomb.json").read_text())["recording"]
-    assert recorded["task_ids"] == learn.shown_pairs()
+    assert recorded["task_ids"] == learning_tasks.shown_pairs()
     weights = {
         str(int(path.name)): sha256_of(path / "pretrained_model" / "model.safetensors")
         for path in (folder / "train" / "checkpoints").glob("0*")
@@ -125,12 +126,12 @@ def test_every_policy_type_has_a_recipe_for_every_task() -> None:
             assert (
                 recipe["policy"].get("path", f"bomb:{recipe['policy'].get('type')}") == f"bomb:{policy_type}"
             )
-            if policy_type not in learn.RIVALS:
+            if policy_type not in learning_tasks.RIVALS:
                 assert recipe["policy"]["scheduler_decay_steps"] == recipe["steps"]
 
 
 def test_demonstrations_leave_out_targets_wording_and_colours() -> None:
-    shown = [EpisodeSpec(seed=0).for_task(task_id) for task_id in learn.shown_pairs()]
+    shown = [EpisodeSpec(seed=0).for_task(task_id) for task_id in learning_tasks.shown_pairs()]
     # every target of the split, and beside it each row and column in each colour
     assert {spec.target for spec in shown} == set(targets_of("train"))
     for color in COLORS:
@@ -144,7 +145,9 @@ def test_demonstrations_leave_out_targets_wording_and_colours() -> None:
 
     wordings = [templates_of(split)[0] for split in ("train", "heldout")]
     groups = {
-        (target, color, wording): next(iter(learn.by_what_is_left_out([asked(target, color, wording)])))
+        (target, color, wording): next(
+            iter(learning_tasks.by_what_is_left_out([asked(target, color, wording)]))
+        )
         for target, color, wording in (
             ((0, 0), "white", wordings[0]),
             ((0, 0), "black", wordings[0]),
@@ -154,11 +157,11 @@ def test_demonstrations_leave_out_targets_wording_and_colours() -> None:
         )
     }
     assert list(groups.values()) == [
-        learn.SHOWN,
+        learning_tasks.SHOWN,
         "colour for this target left out",
         "wording left out",
         "target left out",
-        learn.SEVERAL,
+        learning_tasks.SEVERAL,
     ]
 
 

@@ -1,0 +1,115 @@
+"""What is to be learnt on one CPU core, and what each policy type gets for it: the tasks of learn.py."""
+
+from dataclasses import dataclass
+
+from recipes import POLICY_TYPES
+
+from lerobot_bomb.bomb.board import COLORS, task_id
+from lerobot_bomb.bomb.perturbations import ALL, NONE, NUISANCES
+from lerobot_bomb.bomb.suites.place import targets_of, templates_of
+from lerobot_bomb.evaluation.results import Row
+
+PROBE = "keypoint_probe"
+RIVALS = ("act", "diffusion")  # LeRobot's; they read no instruction
+SHOWN, SEVERAL = "as in the demonstrations", "several left out"
+# of the targets that the split 'train' has, those that get no stone of a colour: one per row and column
+LEFT_OUT_PAIRS = {
+    "black": ((0, 0), (1, 2), (2, 1), (3, 4), (4, 3)),
+    "white": ((0, 1), (1, 4), (2, 0), (3, 3), (4, 2)),
+}
+
+
+@dataclass(frozen=True)
+class Bar:
+    """What the last checkpoint must reach."""
+
+    success: float  # rate
+    cpu_minutes: float  # of the training
+
+
+@dataclass(frozen=True)
+class Training:
+    """What one policy type gets to learn a task."""
+
+    demonstrations: int
+    bar: Bar | None  # None: it is only measured
+    steps: int | None = None  # None: its recipe's
+
+
+@dataclass(frozen=True)
+class Task:
+    """What is to be learnt: which of the tasks, under which perturbations, and what each type gets for it."""
+
+    task_ids: tuple[int, ...]  # empty: target and colour are drawn for each episode
+    episodes: int  # of each evaluation
+    trainings: dict[str, Training]
+    perturbations: str = NONE  # of the demonstrations
+    conditions: tuple[str, ...] = ()  # that the last checkpoint is evaluated under, beside the nominal one
+    is_partial: bool = False  # whether demonstrations leave out what the evaluations ask for as well
+    recipe: str | None = None  # the task whose recipes it is learnt by; None: its own
+
+
+TASKS = {
+    "one_target": Task(
+        (12,),
+        episodes=100,
+        trainings={
+            PROBE: Training(200, Bar(0.90, 120), steps=3000),
+            **{name: Training(600, Bar(0.95, 20)) for name in POLICY_TYPES},
+            **{name: Training(600, None) for name in RIVALS},
+        },
+    ),
+    "all_targets": Task(
+        (),
+        episodes=200,
+        trainings={
+            PROBE: Training(400, None, steps=6000),
+            **{name: Training(1600, Bar(0.90, 180)) for name in POLICY_TYPES},
+            "spatialvla_grid": Training(3200, Bar(0.90, 180)),
+            "vla0_smol": Training(3200, Bar(0.97, 90)),
+        },
+    ),
+    "robust": Task(
+        (),
+        episodes=200,
+        trainings={"fdvla": Training(3600, None)},
+        perturbations=f"{ALL}:0-4",
+        conditions=(*(f"{axis}:3" for axis in NUISANCES), f"{ALL}:1", f"{ALL}:3", f"{ALL}:5"),
+    ),
+    "left_out": Task(
+        (),
+        episodes=400,
+        trainings={name: Training(1600, None) for name in POLICY_TYPES},
+        is_partial=True,
+        recipe="all_targets",
+    ),
+}
+
+
+def shown_pairs() -> list[int]:
+    """Task ids of the split 'train' without those of LEFT_OUT_PAIRS."""
+    return [
+        task_id(target, color)
+        for color in COLORS
+        for target in targets_of("train")
+        if target not in LEFT_OUT_PAIRS[color]
+    ]
+
+
+def by_what_is_left_out(rows: list[Row]) -> dict[str, list[Row]]:
+    """{what of an episode no demonstration showed: its rows}."""
+    groups: dict[str, list[Row]] = {}
+    for row in rows:
+        target, color = tuple(row["target"]), row["color"]
+        wordings = [
+            template.format(color=color, row=target[0], column=target[1])
+            for template in templates_of("heldout")
+        ]
+        left_out = {
+            "target left out": target in targets_of("heldout"),
+            "wording left out": row["instruction"] in wordings,
+            "colour for this target left out": target in LEFT_OUT_PAIRS[color],
+        }
+        names = [name for name, is_left_out in left_out.items() if is_left_out] or [SHOWN]
+        groups.setdefault(names[0] if len(names) == 1 else SEVERAL, []).append(row)
+    return dict(sorted(groups.items()))
