@@ -30,6 +30,8 @@ from machine import add_machine_arguments, positive, require_idle_machine, write
 from recipes import POLICY_TYPES, read_recipe, recipe_path
 
 from lerobot_bomb.bomb.perturbations import NONE
+from lerobot_bomb.checkpoints.identity import sha256_of
+from lerobot_bomb.checkpoints.names import WEIGHTS
 from lerobot_bomb.commands.run import run_command
 from lerobot_bomb.evaluation.results import PUT_DOWN, Row, read_results
 
@@ -118,7 +120,7 @@ def run_task(args: argparse.Namespace) -> int:
             **run,
             "training": minutes,
             # two trainings that end in other bits part between two of these
-            "weights_sha256": {step: rows[0]["policy"]["weights_sha256"] for step, rows in results.items()},
+            "weights_sha256": {step: sha256_of(path / WEIGHTS) for step, path in checkpoints(folder).items()},
             "points": as_figures(points),
             "on_named": num_named,
             "conditions": conditions,
@@ -214,17 +216,23 @@ def probe_recipe() -> list[str]:
     ]
 
 
+def checkpoints(folder: Path) -> dict[int, Path]:
+    """{training step: folder}."""
+    paths = sorted((folder / "train" / "checkpoints").glob("[0-9]*"))
+    return {int(path.name): path / "pretrained_model" for path in paths}
+
+
 def evaluate_checkpoints(task: Task, folder: Path, first_seed: int, last: int) -> dict[int, list[Row]]:
     """{training step: results}; all but the last are only the curve."""
     return {
-        int(path.name): evaluate(
+        step: evaluate(
             task,
-            path / "pretrained_model",
-            folder / f"eval_{path.name}",
+            checkpoint,
+            folder / f"eval_{step:06d}",
             first_seed,
-            task.episodes if int(path.name) == last else min(CURVE_EPISODES, task.episodes),
+            task.episodes if step == last else min(CURVE_EPISODES, task.episodes),
         )
-        for path in sorted((folder / "train" / "checkpoints").glob("[0-9]*"))
+        for step, checkpoint in checkpoints(folder).items()
     }
 
 

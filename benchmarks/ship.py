@@ -1,6 +1,6 @@
-"""Put a policy that benchmarks/learn.py trained into the package, where `--policy.path=bomb:NAME` finds it.
+"""Put a policy that benchmarks/learn.py trained into the package, where `--policy.path=bomb:TYPE` finds it.
 
-    python benchmarks/ship.py FOLDER [--name=TYPE_KIND]
+    python benchmarks/ship.py FOLDER
 
 The weights are the training's own, bit for bit; the configs lose the paths of the machine.
 """
@@ -20,10 +20,9 @@ def main() -> None:
     """Copy the last checkpoint in place of the one that is there; print its hash and size."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawTextHelpFormatter)
     parser.add_argument("folder", type=Path, metavar="FOLDER", help="--output_dir of learn.py")
-    parser.add_argument("--name", help="its name (default: the policy's type, with which every name begins)")
     args = parser.parse_args()
     checkpoint = args.folder / "train" / "checkpoints" / "last" / "pretrained_model"
-    target = FOLDER / (args.name or read_json(checkpoint / CONFIG)["type"])
+    target = FOLDER / read_json(checkpoint / CONFIG)["type"]
     shutil.rmtree(target, ignore_errors=True)
     shutil.copytree(checkpoint, target)
     for name in (CONFIG, TRAIN_CONFIG):

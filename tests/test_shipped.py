@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 from lerobot.configs import PreTrainedConfig, parser
 from lerobot.utils.import_utils import register_third_party_plugins
-from recipes import recipe_path
+from recipes import read_recipe, recipe_path
 
 from lerobot_bomb.checkpoints.identity import sha256_of
 from lerobot_bomb.checkpoints.names import CONFIG, TRAIN_CONFIG, WEIGHTS, has_local_path
@@ -40,9 +40,8 @@ def test_they_are_small_whole_and_of_this_machine_only_by_name() -> None:
 
 
 @pytest.mark.parametrize("name", NAMES)
-def test_its_name_begins_with_its_type_and_the_page_of_results_has_its_hash(name: str) -> None:
-    policy_type = PreTrainedConfig.from_pretrained(FOLDER / name).type
-    assert name == policy_type or name.startswith(f"{policy_type}_")
+def test_its_name_is_its_type_and_the_page_of_results_has_its_hash(name: str) -> None:
+    assert name == PreTrainedConfig.from_pretrained(FOLDER / name).type
     assert f"`{sha256_of(FOLDER / name / WEIGHTS)}`" in RESULTS.read_text()
 
 
@@ -80,9 +79,12 @@ def test_lerobot_train_goes_on_from_it_by_a_config_file(
     root = tmp_path / "dataset"
     record = f"record --repo_id=test/more --root={root} --episodes=1 --image_size=64 --images"
     assert main(record.split()) == 0
+    recipe, config = recipe_path("robust", "fdvla"), tmp_path / "further.yaml"
+    start = read_recipe("robust", "fdvla")["policy"]["path"]
+    config.write_text(recipe.read_text().replace(start, "bomb:fdvla"))
     stock_cli(
         "lerobot-train",
-        f"--config_path={recipe_path('robust', 'fdvla')}",
+        f"--config_path={config}",
         "--dataset.repo_id=test/more",
         f"--dataset.root={root}",
         "--steps=1",
