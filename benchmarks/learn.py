@@ -107,7 +107,8 @@ def run_task(args: argparse.Namespace) -> int:
     others = controls | (by_what_is_left_out(results[run["steps"]]) if task.is_partial else {})
     points |= {name: count(rows, run["steps"], minutes["cpu_minutes"]) for name, rows in others.items()}
 
-    num_named, num_given = count_named(controls[OTHER_INSTRUCTION], given), len(controls[OTHER_INSTRUCTION])
+    num_given = len(controls[OTHER_INSTRUCTION])
+    num_named = count_named(controls[OTHER_INSTRUCTION], given, named_targets(results[run["steps"]]))
     print_points(points)
     print(f"{OTHER_INSTRUCTION}: {num_named}/{num_given} stones put down on the intersection that it names")
     conditions = evaluate_conditions(task, folder, args.first_seed)
@@ -312,7 +313,7 @@ def evaluate(
 
 def other_instructions(rows: list[Row]) -> dict[str, str]:
     """{instruction: that of another target}; where all episodes have one target, in other words only."""
-    targets = {row["instruction"]: row["target"] for row in rows}
+    targets = named_targets(rows)
     instructions = sorted(targets)
 
     def shifted(places: int) -> dict[str, str]:
@@ -324,9 +325,13 @@ def other_instructions(rows: list[Row]) -> dict[str, str]:
     return max(map(shifted, range(1, max(2, len(instructions)))), key=num_others)
 
 
-def count_named(rows: list[Row], given: dict[str, str]) -> int:
+def named_targets(rows: list[Row]) -> dict[str, list[int]]:
+    """{instruction: the intersection that it names}."""
+    return {row["instruction"]: row["target"] for row in rows}
+
+
+def count_named(rows: list[Row], given: dict[str, str], targets: dict[str, list[int]]) -> int:
     """Stones put down nearest to the intersection that the policy was given."""
-    targets = {row["instruction"]: row["target"] for row in rows}
     return sum(
         row["failure"] in PUT_DOWN and row["nearest_intersection"] == targets[given[row["instruction"]]]
         for row in rows

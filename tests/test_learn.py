@@ -106,8 +106,10 @@ def test_a_stone_counts_where_the_given_instruction_says() -> None:
     ]
     given = learn.other_instructions(rows)
     assert given == {"a": "b", "b": "a"}
-    assert learn.count_named(rows, given) == 1
-    assert learn.count_named(rows, {"a": "a", "b": "b"}) == 2
+    # of the first three, what the fourth names
+    targets = learn.named_targets(rows)
+    assert learn.count_named(rows, given, targets) == learn.count_named(rows[:3], given, targets) == 1
+    assert learn.count_named(rows, {"a": "a", "b": "b"}, targets) == 2
 
 
 def test_the_other_instruction_names_another_target() -> None:
