@@ -302,7 +302,7 @@ def test_images_instruction_state_and_time_matter() -> None:
 
 @pytest.mark.parametrize("dtype", ["float32", "bfloat16"])
 def test_attention_in_bfloat16_has_plain_gradients_on_a_cpu(dtype: str) -> None:
-    """Those of torch's fused attention take three to ten times as long there."""
+    """Those of torch's fused attention take four to ten times as long there."""
     query = torch.ones(1, 1, 2, 8, requires_grad=True)
     with make_policy(dtype=dtype)._autocast():
         attended = scaled_dot_product_attention(query, query, query)

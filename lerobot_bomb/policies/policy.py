@@ -134,7 +134,7 @@ class VlaPolicy(ChunkPolicy):
     def _autocast(self) -> Iterator[None]:
         """The precision of ``config.dtype``, whoever calls: training, evaluation or a user's own loop."""
         device, bfloat16 = self._device.type, self.config.dtype == "bfloat16"
-        # gradients of torch's fused attention in bfloat16 take three to ten times as long on a CPU
+        # gradients of torch's fused attention in bfloat16 take four to ten times as long on a CPU
         plain = sdpa_kernel(SDPBackend.MATH) if bfloat16 and device == "cpu" else nullcontext()
         with torch.autocast(device, dtype=torch.bfloat16, enabled=bfloat16), plain:
             yield
