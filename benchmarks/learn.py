@@ -27,7 +27,7 @@ from typing import Any
 from learning_curve import Point, as_figures, count, draw, print_points
 from learning_tasks import PROBE, RIVALS, TASKS, Bar, Task, by_what_is_left_out, shown_pairs
 from machine import add_machine_arguments, positive, require_idle_machine, write_figures
-from recipes import POLICY_TYPES, read_recipe, recipe_path
+from recipes import POLICY_TYPES, last_checkpoint, read_recipe, recipe_path
 
 from lerobot_bomb.bomb.perturbations import NONE
 from lerobot_bomb.checkpoints.identity import sha256_of
@@ -237,11 +237,6 @@ def evaluate_checkpoints(task: Task, folder: Path, first_seed: int, last: int) -
     }
 
 
-def last_checkpoint(folder: Path) -> Path:
-    """The one that is the result."""
-    return folder / "train" / "checkpoints" / "last" / "pretrained_model"
-
-
 def evaluate_controls(
     task: Task, folder: Path, first_seed: int, given: dict[str, str]
 ) -> dict[str, list[Row]]:
@@ -250,7 +245,7 @@ def evaluate_controls(
 
     from lerobot_bomb.explain.interventions import BlankImages, ReplaceTasks, intervene
 
-    checkpoint = last_checkpoint(folder)
+    checkpoint = last_checkpoint(folder / "train")
     results = {}
     for name, step, changed in (
         (NO_IMAGES, BlankImages(), "blank_images"),
@@ -268,7 +263,7 @@ def evaluate_conditions(task: Task, folder: Path, first_seed: int) -> dict[str, 
     """{condition: successes} of the last checkpoint in CURVE_EPISODES episodes each; prints the table."""
     if not task.conditions:
         return {}
-    checkpoint, output_dir = last_checkpoint(folder), folder / "eval_conditions"
+    checkpoint, output_dir = last_checkpoint(folder / "train"), folder / "eval_conditions"
     rows = evaluate(task, checkpoint, output_dir, first_seed, CURVE_EPISODES, task.conditions)
     run_command("lerobot-bomb", "results", f"{output_dir / 'results.jsonl'}")
     successes = dict.fromkeys(task.conditions, 0)

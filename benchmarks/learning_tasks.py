@@ -72,7 +72,7 @@ TASKS = {
     "robust": Task(
         (),
         episodes=200,
-        trainings={"fdvla": Training(3600, None)},
+        trainings={name: Training(3600, None) for name in POLICY_TYPES},
         perturbations=f"{ALL}:0-4",
         conditions=(*(f"{axis}:3" for axis in NUISANCES), f"{ALL}:1", f"{ALL}:3", f"{ALL}:5"),
     ),

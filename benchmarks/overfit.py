@@ -27,7 +27,7 @@ from pathlib import Path
 from typing import Any
 
 from machine import add_machine_arguments, positive, require_idle_machine, write_figures
-from recipes import POLICY_TYPES, read_recipe, recipe_path
+from recipes import POLICY_TYPES, last_checkpoint, read_recipe, recipe_path
 
 from lerobot_bomb.bomb.episode import EpisodeSpec, Failure
 from lerobot_bomb.commands.run import run_command
@@ -151,7 +151,7 @@ def train(args: argparse.Namespace, folder: Path) -> Path:
         *override,
         *args.policy_flags,
     )
-    return folder / "train" / "checkpoints" / "last" / "pretrained_model"
+    return last_checkpoint(folder / "train")
 
 
 def change_what_is_shown(checkpoint: Path, replacements: dict[str, str]) -> dict[Control, Path]:

@@ -25,7 +25,7 @@ from statistics import fmean
 from machine import add_machine_arguments, positive, require_idle_machine, write_figures
 from pusht_offline import convert, evaluate, max_coverages, run_logged
 from pusht_report import over_episodes
-from recipes import FOLDER, read_recipe, recipe_path
+from recipes import FOLDER, last_checkpoint, read_recipe, recipe_path
 
 from lerobot_bomb.tables import print_table
 
@@ -130,7 +130,7 @@ def train(output_dir: Path, flags: list[str], steps: int) -> Seconds:
 
 def play(folder: Path, episodes: int) -> tuple[list[float], int]:
     """Maximal coverage of each episode, and the successes."""
-    checkpoint = folder / "train" / "checkpoints" / "last" / "pretrained_model"
+    checkpoint = last_checkpoint(folder / "train")
     flags = [f"--seed={FIRST_UNSEEN_SEED}", f"--eval.n_episodes={episodes}"]
     flags.append(f"--eval.batch_size={min(50, episodes)}")
     metrics = evaluate(checkpoint, folder / f"eval_{episodes}", flags)

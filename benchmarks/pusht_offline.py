@@ -29,7 +29,7 @@ from typing import Any
 
 from machine import positive, write_figures
 from pusht_report import Seed, print_report
-from recipes import PUSHT_TYPES, recipe_path
+from recipes import PUSHT_TYPES, last_checkpoint, recipe_path
 
 from lerobot_bomb.commands.run import run_command
 
@@ -85,7 +85,7 @@ class Run:
 
     @property
     def checkpoint(self) -> Path:
-        return self.train_dir / "checkpoints" / "last" / "pretrained_model"
+        return last_checkpoint(self.train_dir)
 
     @property
     def times_path(self) -> Path:

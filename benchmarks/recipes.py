@@ -20,3 +20,8 @@ def recipe_path(task: str, policy_type: str) -> Path:
 def read_recipe(task: str, policy_type: str) -> dict[str, Any]:
     """The recipe's values."""
     return yaml.safe_load(recipe_path(task, policy_type).read_text())
+
+
+def last_checkpoint(train_dir: Path) -> Path:
+    """What `lerobot-train --output_dir=train_dir` leaves as its result."""
+    return train_dir / "checkpoints" / "last" / "pretrained_model"

@@ -9,6 +9,8 @@ import argparse
 import shutil
 from pathlib import Path
 
+from recipes import last_checkpoint
+
 from lerobot_bomb.checkpoints.identity import sha256_of
 from lerobot_bomb.checkpoints.names import CONFIG, TRAIN_CONFIG, WEIGHTS
 from lerobot_bomb.checkpoints.shipped import FOLDER
@@ -21,7 +23,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawTextHelpFormatter)
     parser.add_argument("folder", type=Path, metavar="FOLDER", help="--output_dir of learn.py")
     args = parser.parse_args()
-    checkpoint = args.folder / "train" / "checkpoints" / "last" / "pretrained_model"
+    checkpoint = last_checkpoint(args.folder / "train")
     target = FOLDER / read_json(checkpoint / CONFIG)["type"]
     shutil.rmtree(target, ignore_errors=True)
     shutil.copytree(checkpoint, target)

@@ -95,6 +95,26 @@ def test_noise_is_drawn_anew_until_an_episode_ends() -> None:
     assert torch.equal(policy.predict_action_chunk(batch), second)
 
 
+def test_an_episode_has_its_own_noise_if_asked_for() -> None:
+    policy = make_policy(noise_per_episode=True)
+    batch = rows(make_batch(policy, 1), [0, 0])
+    policy.reset()
+    together = policy.predict_action_chunk(batch)
+    assert not torch.allclose(together[0], together[1], atol=1e-3)
+    again = make_policy(noise_per_episode=True)
+    again.load_state_dict(policy.state_dict())
+    for row in range(2):  # one by one they are the same episodes
+        again.reset()
+        torch.testing.assert_close(
+            again.predict_action_chunk(rows(batch, [row])), together[row : row + 1], rtol=0, atol=1e-5
+        )
+    other = make_policy(noise_seed=1)
+    other.load_state_dict(policy.state_dict())
+    one = make_policy()
+    one.load_state_dict(policy.state_dict())
+    assert not torch.allclose(other.predict_action_chunk(batch), one.predict_action_chunk(batch), atol=1e-3)
+
+
 def test_noise_of_another_shape_is_refused() -> None:
     policy = make_policy()
     with pytest.raises(ValueError, match=r"noise has shape \(4, 4\); expected \(2, 4, 4\)"):

@@ -12,7 +12,7 @@ import torch
 from flow_cases import gaussian_heads
 from torch import Tensor
 
-from lerobot_bomb.flow.path import draw_noise
+from lerobot_bomb.flow.noise import SamplingNoise
 from lerobot_bomb.flow.samplers import sample
 
 MEAN, STD = 1.0, 0.5
@@ -121,7 +121,7 @@ def test_heuns_error_is_of_second_order(sampler: str) -> None:
 )
 def test_a_point_mass_is_hit(options: dict[str, Any], num_steps: int) -> None:
     target = torch.linspace(-2, 2, 6).view(3, 2)
-    noise = draw_noise(torch.Generator().manual_seed(0), 2, (3, 2))
+    noise = SamplingNoise(0, is_per_episode=False).draw(2, (3, 2))
     actions = sample(gaussian_heads(target, 0.0), noise, num_inference_steps=num_steps, **options)
     torch.testing.assert_close(actions, target.expand(2, 3, 2), rtol=0, atol=1e-5)
 

@@ -1,7 +1,7 @@
 import pytest
 import torch
 
-from lerobot_bomb.flow.path import draw_noise, draw_tau, path_point
+from lerobot_bomb.flow.path import draw_tau, path_point
 
 CLEAN, NOISE = torch.tensor([[[1.0, -0.5]]]), torch.tensor([[[0.2, 0.4]]])
 
@@ -61,19 +61,3 @@ def test_tau_follows_from_the_seed(time_sampling: str) -> None:
 def test_unknown_time_sampling() -> None:
     with pytest.raises(ValueError, match="time_sampling='gaussian' is unknown; choose one of: uniform, beta"):
         draw_tau("gaussian", 2, seeded())
-
-
-def test_noise_is_the_same_in_every_row_and_for_every_size_of_the_batch() -> None:
-    one, three, other = (draw_noise(seeded(seed), size, (16, 7)) for seed, size in ((1, 1), (1, 3), (2, 1)))
-    assert three.shape == (3, 16, 7)
-    for row in three:
-        assert row.equal(one[0])
-    assert not one.equal(other)
-
-
-def test_noise_is_standard_normal_and_goes_on() -> None:
-    generator = seeded()
-    first, second = (draw_noise(generator, 1, (100, 100)) for _ in range(2))
-    assert not first.equal(second)
-    assert first.mean().item() == pytest.approx(0, abs=0.03)
-    assert first.std().item() == pytest.approx(1, abs=0.03)

@@ -8,7 +8,7 @@ import torch
 from flow_cases import gaussian_heads
 from torch import Tensor
 
-from lerobot_bomb.flow.path import draw_noise
+from lerobot_bomb.flow.noise import SamplingNoise
 from lerobot_bomb.flow.samplers import SAMPLERS, Heads, check_heads, check_sampling, ddim_step, sample, slope
 
 NOISE = torch.tensor([0.0, 1.0]).view(2, 1, 1)
@@ -118,9 +118,9 @@ def test_the_state_is_float32_between_bfloat16_heads_and_noise() -> None:
 def test_a_row_does_not_depend_on_the_batch(sampler: str) -> None:
     results = []
     for batch_size in (1, 4):
-        generator = torch.Generator().manual_seed(5)
-        noise = draw_noise(generator, batch_size, (3, 2))
-        step_noise = draw_noise(generator, batch_size, (10, 3, 2)) if sampler == "sde" else None
+        shared = SamplingNoise(5, is_per_episode=False)
+        noise = shared.draw(batch_size, (3, 2))
+        step_noise = shared.draw(batch_size, (10, 3, 2)) if sampler == "sde" else None
         results.append(sample(gaussian_heads(1, 0.5), noise, sampler=sampler, step_noise_BNKD=step_noise))
     assert results[1].shape == (4, 3, 2)
     for row in results[1]:

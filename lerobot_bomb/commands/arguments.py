@@ -62,7 +62,7 @@ def parse_numbers(text: str) -> tuple[int, ...]:
 
 def parse_conditions(text: str) -> tuple[str, ...]:
     """Read a list of conditions: ("none", "all:1-5") from '["none","all:1-5"]' and from "none,all:1-5"."""
-    return tuple(part.strip(" \"'") for part in text.strip("[] ").split(",") if part.strip())
+    return tuple(part.strip().strip("\"'") for part in text.strip().strip("[]").split(",") if part.strip())
 
 
 def add_new_dataset_arguments(parser: argparse.ArgumentParser) -> None:

@@ -10,11 +10,12 @@ from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, ClassVar
 
+import numpy as np
 from tqdm import tqdm
 
 from lerobot_bomb.commands.arguments import add_new_dataset_arguments, path_flag, switch
 from lerobot_bomb.data.kept_blocks import Progress, reached
-from lerobot_bomb.data.pusht_zarr import IMAGE_SIZE, PushtZarr
+from lerobot_bomb.data.pusht_zarr import BOARD_SIZE, IMAGE_SIZE, PushtZarr
 from lerobot_bomb.data.resumable import (
     BLOCK_EPISODES,
     check_folders,
@@ -26,6 +27,7 @@ from lerobot_bomb.data.resumable import (
     unfinished_folder,
     write_blocks,
 )
+from lerobot_bomb.data.rigid_copies import RigidMotion
 
 if TYPE_CHECKING:
     from lerobot_bomb.data.blocks import DatasetLayout, RecordedEpisode
@@ -42,9 +44,12 @@ class Conversion:
     repo_id: str
     task: str  # the instruction of every frame
     source: str  # its kind and its SHA-256
+    copies: int = 0  # of each demonstration, as seen from elsewhere
 
     def __post_init__(self) -> None:
         check_repo_id(self.repo_id)
+        if self.copies < 0:
+            raise ValueError(f"--copies={self.copies} must not be negative")
 
     def to_dict(self) -> dict[str, Any]:
         return asdict(self)
@@ -65,6 +70,13 @@ def add_convert_arguments(parser: argparse.ArgumentParser) -> None:
         "--env.type=pusht)",
     )
     add(
+        "--copies",
+        type=int,
+        default=0,
+        help="so many copies of each demonstration beside it: turned by any angle, half of them mirrored, "
+        "shifted, the goal with the rest (default: 0)",
+    )
+    add(
         "--resume",
         **switch(),
         help=f"continue a conversion that was interrupted; its blocks of {BLOCK_EPISODES} episodes are kept",
@@ -76,12 +88,14 @@ def run_convert(args: argparse.Namespace) -> int:
     check_repo_id(args.repo_id)
     root = args.root or default_root(args.repo_id)
     with terminated_in_order():
-        progress = convert_pusht(args.path, args.repo_id, root, args.task, args.resume)
+        progress = convert_pusht(args.path, args.repo_id, root, args.task, args.resume, args.copies)
     print(f"{progress.num_episodes} episodes, {progress.num_frames} frames: {root}")
     return 0
 
 
-def convert_pusht(path: Path, repo_id: str, root: Path, task: str = "", resume: bool = False) -> Progress:
+def convert_pusht(
+    path: Path, repo_id: str, root: Path, task: str = "", resume: bool = False, copies: int = 0
+) -> Progress:
     """Convert the zarr at `path` into `root`, which must not exist unless `resume` finds the same one there.
 
     Raises:
@@ -89,7 +103,7 @@ def convert_pusht(path: Path, repo_id: str, root: Path, task: str = "", resume: 
         RuntimeError: zarr is not installed, or the disk is full.
     """
     source = PushtZarr(path)
-    conversion = Conversion(repo_id, task, f"pusht-zarr {source.sha256}")
+    conversion = Conversion(repo_id, task, f"pusht-zarr {source.sha256}", copies)
     check_folders(conversion, root, unfinished_folder(root, conversion.kind), resume)
     source.check()
     return grow(
@@ -103,9 +117,10 @@ def convert_pusht(path: Path, repo_id: str, root: Path, task: str = "", resume: 
 
 def _write_pusht(source: PushtZarr, conversion: Conversion, folder: Path) -> Progress:
     """Write the blocks that are missing."""
-    gaps = missing_blocks(folder, source.num_episodes)
-    num_kept = source.num_episodes - sum(gap.num_missing for gap in gaps)
-    with tqdm(total=source.num_episodes, initial=num_kept, unit="episode") as bar:
+    num_episodes = source.num_episodes * (1 + conversion.copies)
+    gaps = missing_blocks(folder, num_episodes)
+    num_kept = num_episodes - sum(gap.num_missing for gap in gaps)
+    with tqdm(total=num_episodes, initial=num_kept, unit="episode") as bar:
         for gap in gaps:
             episodes = partial(_pusht_episodes, source, conversion.task, bar)
             write_blocks(folder, _pusht_layout(conversion.repo_id), gap, episodes)
@@ -130,15 +145,20 @@ def _pusht_layout(repo_id: str) -> "DatasetLayout":
 def _pusht_episodes(
     source: PushtZarr, task: str, bar: tqdm, progress: Progress, number: int
 ) -> "Iterator[RecordedEpisode]":
-    """Yield the next `number` episodes."""
+    """Yield the next `number` episodes: all demonstrations, then a copy of each, and so on."""
     from lerobot.utils.constants import ACTION, OBS_IMAGE, OBS_STATE
 
     from lerobot_bomb.data.blocks import RecordedEpisode
 
     for index in range(progress.num_episodes, progress.num_episodes + number):
+        images, positions, actions = source.episode(index % source.num_episodes)
+        if index >= source.num_episodes:
+            motion = RigidMotion.drawn(np.random.default_rng(index), BOARD_SIZE)
+            images = motion.images(images, BOARD_SIZE)
+            positions, actions = motion.points(positions), motion.points(actions)
         frames = (
             {OBS_IMAGE: image, OBS_STATE: position, ACTION: action, "task": task}
-            for image, position, action in zip(*source.episode(index), strict=True)
+            for image, position, action in zip(images, positions, actions, strict=True)
         )
         progress.num_episodes += 1
         yield RecordedEpisode(frames)

@@ -45,13 +45,3 @@ def draw_tau(time_sampling: str, batch_size: int, generator: torch.Generator) ->
     if time_sampling == "uniform":
         return uniform_B
     return BETA_END * (1 - uniform_B ** (1 / BETA_SHAPE))  # u^a is the distribution function of Beta(a, 1)
-
-
-def draw_noise(generator: torch.Generator, batch_size: int, shape: tuple[int, ...]) -> Tensor:
-    """(B, *shape) float32 of N(0, I) on the generator's device, for sampling.
-
-    Drawn once and the same for every row, so what a row becomes depends on neither the size of the batch nor
-    its place in it. The rows share memory: not to be written to.
-    """
-    noise = torch.randn(shape, generator=generator, device=generator.device)
-    return noise.expand(batch_size, *shape)

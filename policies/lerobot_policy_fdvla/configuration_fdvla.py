@@ -109,6 +109,10 @@ class FdvlaConfig(VlaConfig):
     denoise_tau_min: float = 0.02
     # bound of the actions that ddim infers, in normalised units
     clip_sample_range: float = 5.0
+    # of the noise that actions are sampled from
+    noise_seed: int = 0
+    # an episode's own noise, or the same in all episodes
+    noise_per_episode: bool = False
     # LeRobot's real-time chunking; set by lerobot-rollout --inference.type=rtc
     rtc_config: RTCConfig | None = None
 
@@ -129,7 +133,7 @@ class FdvlaConfig(VlaConfig):
             raise ValueError(
                 "--policy.freeze_vision_encoder=false needs --policy.train_vlm=full: frozen freezes both"
             )
-        check_not_negative(self, ("flow_loss_weight", "denoise_loss_weight"))
+        check_not_negative(self, ("flow_loss_weight", "denoise_loss_weight", "noise_seed"))
         if self.consistency_loss_weight is not None:
             check_not_negative(self, ("consistency_loss_weight",))
         with _policy_flags():

@@ -26,7 +26,8 @@ from lerobot_bomb.decoding.kv_cache import check_positions
 from lerobot_bomb.finite import require_finite_answers
 from lerobot_bomb.flow.dual_mod import masked_mean_pool
 from lerobot_bomb.flow.losses import joint_loss, second_derivatives
-from lerobot_bomb.flow.path import PathPoint, draw_noise, draw_tau, path_point
+from lerobot_bomb.flow.noise import SamplingNoise
+from lerobot_bomb.flow.path import PathPoint, draw_tau, path_point
 from lerobot_bomb.flow.real_time import guided
 from lerobot_bomb.flow.samplers import SAMPLERS, Heads, sample
 from lerobot_bomb.policies.policy import VlaPolicy
@@ -42,7 +43,6 @@ from lerobot_policy_fdvla.networks_fdvla import NUM_MARKS, ActionSegment, Head
 
 logger = logging.getLogger(__name__)
 
-SAMPLING_SEED = 0
 # not of the base model: trained whole beside its adapters
 NEW_PARTS = ("segment", "state_embedding", "flow_head", "denoise_head")
 
@@ -97,6 +97,7 @@ class FdvlaPolicy(VlaPolicy):
         heads = [head for head in (self.flow_head, self.denoise_head) if head is not None]
         self._recorded = GraphedModel(self._sample, [self.backbone.text_model, self.segment, *heads])
         self.init_rtc_processor()
+        self._sampling_noise = SamplingNoise(config.noise_seed, config.noise_per_episode)
         self.reset()
 
     def _make_state_embedding(self, hidden_size: int) -> nn.Linear | None:
@@ -116,7 +117,7 @@ class FdvlaPolicy(VlaPolicy):
 
     def reset(self) -> None:
         super().reset()
-        self._sampling_generator = torch.Generator().manual_seed(SAMPLING_SEED)
+        self._sampling_noise.begin()
 
     # Training
 
@@ -262,7 +263,7 @@ class FdvlaPolicy(VlaPolicy):
         return self._draw(shape[0], (num_steps, *shape[1:]))
 
     def _draw(self, batch_size: int, shape: tuple[int, ...]) -> Tensor:
-        return draw_noise(self._sampling_generator, batch_size, shape).to(self._device)
+        return self._sampling_noise.draw(batch_size, shape).to(self._device)
 
     def supports_rtc(self) -> bool:
         """Whether the sampler follows a velocity, which real-time chunking guides."""

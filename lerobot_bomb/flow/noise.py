@@ -1,0 +1,42 @@
+"""The noise that actions are sampled from: one sequence for all episodes, or an episode's own."""
+
+import numpy as np
+import torch
+from torch import Tensor
+
+
+class SamplingNoise:
+    """N(0, I), drawn again and again between one ``begin`` of episodes and the next.
+
+    Args:
+        seed: of the sequence that all episodes share, and with an episode's number of its own.
+        is_per_episode: whether each episode has a sequence of its own. Its number counts the rows of all
+            batches before it, so in an evaluation it depends on neither the size of the batch nor the row.
+    """
+
+    def __init__(self, seed: int, is_per_episode: bool) -> None:
+        self._seed, self._is_per_episode = seed, is_per_episode
+        self._first_episode = 0
+        self._generators: list[torch.Generator] = []  # of each row; of all, if they share one
+
+    def begin(self) -> None:
+        """The rows of the next batch are new episodes."""
+        self._first_episode += len(self._generators)
+        self._generators = []
+
+    def draw(self, batch_size: int, shape: tuple[int, ...]) -> Tensor:
+        """(B, *shape) float32 on the CPU. Rows may share memory: not to be written to."""
+        if not self._is_per_episode:
+            return self._draw(0, shape).expand(batch_size, *shape)
+        return torch.stack([self._draw(row, shape) for row in range(batch_size)])
+
+    def _draw(self, row: int, shape: tuple[int, ...]) -> Tensor:
+        while len(self._generators) <= row:
+            self._generators.append(torch.Generator().manual_seed(self._next_seed()))
+        return torch.randn(shape, generator=self._generators[row])
+
+    def _next_seed(self) -> int:
+        if not self._is_per_episode:
+            return self._seed
+        number = self._first_episode + len(self._generators)
+        return int(np.random.SeedSequence((self._seed, number)).generate_state(1, np.uint64)[0])
