@@ -1,8 +1,9 @@
 r"""Who pushes the T best? Our policies and LeRobot's `act` and `diffusion`, trained for equal minutes.
 
-Each starts from random weights and is trained by the stock `lerobot-train` on the 206 human demonstrations;
-the stock `lerobot-eval --env.type=pusht` plays it on new seeds. Two short trainings find what a step takes,
-so that the learning rate ends its decay when the minutes do: of CPU on a CPU, by the clock on a GPU.
+Each starts from random weights and is trained by the stock `lerobot-train` on the 206 human demonstrations
+and copies of them that are turned, mirrored and shifted; the stock `lerobot-eval --env.type=pusht` plays it
+on new seeds. Two short trainings find what a step takes, so that the learning rate ends its decay when the
+minutes do: of CPU on a CPU, by the clock on a GPU.
 
     python benchmarks/play_pusht.py --source pusht_cchi_v7_replay.zarr --output_dir play --minutes 60
     python benchmarks/play_pusht.py --source ... --output_dir play --minutes 15 --device cuda --jobs 7
@@ -30,6 +31,7 @@ from recipes import FOLDER, last_checkpoint, read_recipe, recipe_path
 from lerobot_bomb.tables import print_table
 
 FIRST_UNSEEN_SEED = 100_000
+COPIES = 7
 CALIBRATION_STEPS = {"cpu": (5, 35), "cuda": (100, 400)}
 # of a batch that fills a GPU, read by processes of their own
 ON = {"cpu": ["--num_workers=0"], "cuda": ["--num_workers=2", "--batch_size=128"]}
@@ -69,13 +71,15 @@ def main() -> None:
     parser.add_argument("--device", choices=ON, default="cpu")
     parser.add_argument("--policies", nargs="+", choices=POLICIES, default=POLICIES)
     parser.add_argument("--jobs", type=positive, default=1, help="trainings at once (default: 1)")
+    copies = f"of each demonstration, turned, mirrored and shifted (default: {COPIES})"
+    parser.add_argument("--copies", type=int, default=COPIES, help=copies)
     parser.add_argument("--episodes", type=positive, default=100, help="of each evaluation (default: 100)")
     add_machine_arguments(parser)
     args = parser.parse_args()
     require_idle_machine(args.force)
     os.environ["OMP_NUM_THREADS"] = "1"
     try:
-        dataset = convert(args.source, args.output_dir / "dataset")
+        dataset = convert(args.source, args.output_dir / "dataset", args.copies)
         with ThreadPoolExecutor(args.jobs) as pool:
             contenders = list(pool.map(lambda name: compete(args, name, dataset), args.policies))
     except RuntimeError as error:

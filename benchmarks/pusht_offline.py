@@ -153,13 +153,13 @@ def as_figures(variants: dict[str, list[Seed]]) -> dict[str, list[dict[str, Any]
     return {name: [asdict(seed) for seed in seeds] for name, seeds in variants.items()}
 
 
-def convert(source: Path | None, dataset: Path) -> Path:
-    """The demonstrations as a LeRobotDataset."""
+def convert(source: Path | None, dataset: Path, copies: int = 0) -> Path:
+    """The demonstrations as a LeRobotDataset, and so many rigid copies of each."""
     if not dataset.exists():
         if source is None:
             raise RuntimeError(f"{dataset} does not exist yet; name the demonstrations with --source")
         resume = ["--resume"] if dataset.with_name(f"{dataset.name}.conversion").exists() else []
-        flags = [f"--repo_id={REPO_ID}", f"--root={dataset}", *resume]
+        flags = [f"--repo_id={REPO_ID}", f"--root={dataset}", f"--copies={copies}", *resume]
         run_command("lerobot-bomb", "convert", "pusht-zarr", str(source), *flags)
     return dataset
 

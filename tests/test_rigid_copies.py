@@ -51,7 +51,7 @@ def test_images_move_as_positions_do(pusht_demonstrations: Demonstrations) -> No
     for image, position in zip(images, positions, strict=True):
         np.testing.assert_allclose(agent_in(image), position, atol=3)
     for motion in motions(10):
-        moved = motion.images(images, BOARD_SIZE)
+        moved = motion.images(images)
         for image, position in zip(moved, motion.points(positions), strict=True):
             np.testing.assert_allclose(agent_in(image), position, atol=3)
 

@@ -32,6 +32,7 @@ from lerobot_bomb.data.rigid_copies import RigidMotion
 if TYPE_CHECKING:
     from lerobot_bomb.data.blocks import DatasetLayout, RecordedEpisode
 
+COPIES_SEED = 0
 FPS = 10  # of the demonstrations and of LeRobot's environment `pusht`
 
 
@@ -153,8 +154,8 @@ def _pusht_episodes(
     for index in range(progress.num_episodes, progress.num_episodes + number):
         images, positions, actions = source.episode(index % source.num_episodes)
         if index >= source.num_episodes:
-            motion = RigidMotion.drawn(np.random.default_rng(index), BOARD_SIZE)
-            images = motion.images(images, BOARD_SIZE)
+            motion = RigidMotion.drawn(np.random.default_rng((COPIES_SEED, index)), BOARD_SIZE)
+            images = motion.images(images)
             positions, actions = motion.points(positions), motion.points(actions)
         frames = (
             {OBS_IMAGE: image, OBS_STATE: position, ACTION: action, "task": task}

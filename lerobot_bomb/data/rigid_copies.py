@@ -13,34 +13,42 @@ MAX_SHIFT = 40.0  # of the board's centre along x and y; its unit is that of pos
 BACKGROUND = (255, 255, 255)  # of what lies outside of the image that is copied
 
 
+MIRROR = np.array([[0.0, -1.0], [-1.0, 0.0]])  # across a diagonal
+
+
 @dataclass(frozen=True)
 class RigidMotion:
-    """Takes the point x of the plane to `linear @ x + offset`; `linear` (2, 2) is orthogonal."""
+    """Takes a point x of a square board of `board_size` to `centre + shift + linear @ (x - centre)`."""
 
-    linear: np.ndarray
-    offset: np.ndarray
+    board_size: float
+    linear: np.ndarray  # (2, 2), orthogonal
+    shift: np.ndarray  # (2,)
 
     @classmethod
     def drawn(cls, generator: np.random.Generator, board_size: float) -> "RigidMotion":
-        """Any angle, mirrored or not, and a shift of the board's centre by MAX_SHIFT at most."""
-        angle_rad = generator.uniform(-np.pi, np.pi)
-        mirror = generator.choice([-1, 1])
+        """Any angle, mirrored or not, and a shift by MAX_SHIFT at most along x and along y."""
+        angle_rad = np.radians(generator.uniform(-180, 180))
+        is_mirrored = generator.random() < 0.5
         shift = generator.uniform(-MAX_SHIFT, MAX_SHIFT, 2)
         sin, cos = np.sin(angle_rad), np.cos(angle_rad)
-        linear = np.array([[cos, -sin * mirror], [sin, cos * mirror]])
-        centre = np.full(2, board_size / 2)
-        return cls(linear, centre + shift - linear @ centre)
+        linear = np.array([[cos, -sin], [sin, cos]])
+        return cls(board_size, linear @ MIRROR if is_mirrored else linear, shift)
 
     def points(self, positions: np.ndarray) -> np.ndarray:
         """Positions (T, 2), moved; float32."""
-        return (positions @ self.linear.T + self.offset).astype(np.float32)
+        moved = (positions - self._centre) @ self.linear.T + self._centre + self.shift
+        return moved.astype(np.float32)
 
-    def images(self, images: np.ndarray, board_size: float) -> np.ndarray:
+    def images(self, images: np.ndarray) -> np.ndarray:
         """Square images (T, S, S, 3) uint8 of the whole board, moved."""
-        pixels = images.shape[1] / board_size
+        pixels = images.shape[1] / self.board_size
         half = np.full(2, 0.5)  # the middle of the first pixel is half a pixel from the board's edge
-        offset = self.linear @ half + pixels * self.offset - half
+        offset = (self._centre + self.shift - self.linear @ self._centre) * pixels + self.linear @ half - half
         matrix = np.concatenate([self.linear, offset[:, None]], axis=1)
         size = images.shape[1:3]
         options = {"flags": cv2.INTER_CUBIC, "borderMode": cv2.BORDER_CONSTANT, "borderValue": BACKGROUND}
         return np.stack([cv2.warpAffine(image, matrix, size, **options) for image in images])
+
+    @property
+    def _centre(self) -> np.ndarray:
+        return np.full(2, self.board_size / 2)
