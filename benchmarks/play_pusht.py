@@ -31,7 +31,7 @@ from recipes import FOLDER, last_checkpoint, read_recipe, recipe_path
 from lerobot_bomb.tables import print_table
 
 FIRST_UNSEEN_SEED = 100_000
-COPIES = 7
+COPIES = 7  # of each demonstration
 CALIBRATION_STEPS = {"cpu": (5, 35), "cuda": (100, 400)}
 # of a batch that fills a GPU, read by processes of their own
 ON = {"cpu": ["--num_workers=0"], "cuda": ["--num_workers=2", "--batch_size=128"]}
@@ -71,15 +71,13 @@ def main() -> None:
     parser.add_argument("--device", choices=ON, default="cpu")
     parser.add_argument("--policies", nargs="+", choices=POLICIES, default=POLICIES)
     parser.add_argument("--jobs", type=positive, default=1, help="trainings at once (default: 1)")
-    copies = f"of each demonstration, turned, mirrored and shifted (default: {COPIES})"
-    parser.add_argument("--copies", type=int, default=COPIES, help=copies)
     parser.add_argument("--episodes", type=positive, default=100, help="of each evaluation (default: 100)")
     add_machine_arguments(parser)
     args = parser.parse_args()
     require_idle_machine(args.force)
     os.environ["OMP_NUM_THREADS"] = "1"
     try:
-        dataset = convert(args.source, args.output_dir / "dataset", args.copies)
+        dataset = convert(args.source, args.output_dir / "dataset", COPIES)
         with ThreadPoolExecutor(args.jobs) as pool:
             contenders = list(pool.map(lambda name: compete(args, name, dataset), args.policies))
     except RuntimeError as error:

@@ -14,6 +14,7 @@ from lerobot.envs import EnvConfig
 
 from lerobot_bomb.bomb.perturbations import NONE
 from lerobot_bomb.commands import main as cli
+from lerobot_bomb.commands.arguments import parse_conditions
 from lerobot_bomb.data.recording import Recording
 from lerobot_bomb.data.resumable import (
     METADATA_FILE,
@@ -295,3 +296,8 @@ def test_lerobots_folder_is_the_default(tmp_path: Path, monkeypatch: pytest.Monk
     monkeypatch.setattr("lerobot.utils.constants.HF_LEROBOT_HOME", tmp_path)
     assert cli.main(["record", "--repo_id=test/home", "--episodes=1", "--image_size=64"]) == 0
     assert (tmp_path / "test" / "home" / "meta" / "info.json").exists()
+
+
+@pytest.mark.parametrize("text", ["none,all:1-5", '["none", "all:1-5"]', '[\n    "none",\n    "all:1-5"\n]'])
+def test_conditions_are_read_from_a_list_on_one_line_or_several(text: str) -> None:
+    assert parse_conditions(text) == ("none", "all:1-5")

@@ -12,8 +12,6 @@ from lerobot_bomb.commands.convert import convert_pusht
 from lerobot_bomb.data.pusht_zarr import BOARD_SIZE, IMAGE_SIZE
 from lerobot_bomb.data.rigid_copies import MAX_SHIFT, RigidMotion
 
-gym_pusht = pytest.importorskip("gym_pusht")
-
 AGENT_RGB = (65, 105, 225)
 COPIES = 2
 
@@ -58,21 +56,19 @@ def test_images_move_as_positions_do(pusht_demonstrations: Demonstrations) -> No
 
 def test_the_simulator_agrees(pusht_demonstrations: Demonstrations) -> None:
     """Moved actions lead a moved agent and a moved block where the demonstration went, moved."""
-    from gym_pusht.envs.pusht import PushTEnv
-
+    simulator = pytest.importorskip("gym_pusht.envs.pusht")
     states, actions = pusht_demonstrations.states, pusht_demonstrations.actions
     for motion in motions(6):
-        sin_cos = motion.linear @ [1, 0]
-        mirror = np.linalg.det(motion.linear) < 0
         # the T is its own mirror image about its y axis
         angles = states[:, 4]
         axis = motion.linear @ np.stack([-np.sin(angles), np.cos(angles)])
         turned = np.arctan2(-axis[0], axis[1])
-        assert mirror or np.isclose(np.cos(turned[0] - angles[0]), sin_cos[0])
+        is_mirrored = np.linalg.det(motion.linear) < 0
+        assert is_mirrored or np.isclose(np.cos(turned[0] - angles[0]), motion.linear[0, 0])
         start = np.concatenate(
             [motion.points(states[:1, :2])[0], motion.points(states[:1, 2:4])[0], turned[:1]]
         )
-        pusht: Any = PushTEnv()
+        pusht: Any = simulator.PushTEnv()
         pusht.reset(seed=0)
         put(pusht, start)
         for step in range(pusht_demonstrations.ends[0] - 1):

@@ -96,11 +96,7 @@ AXES = {
         ("images",),
         {
             "dim": Magnitude("factor", (0.88, 0.77, 0.67, 0.58, 0.5), "of all light, if it is dimmed"),
-            "bright": Magnitude(
-                "factor",
-                (1.15, 1.32, 1.52, 1.75, 2.0),
-                "of all light, if it is brightened",
-            ),
+            "bright": Magnitude("factor", (1.15, 1.32, 1.52, 1.75, 2.0), "of all light, if it is brightened"),
             "tilt": Magnitude("degrees", (7, 14, 21, 28, 35), "of the lamp, in a drawn direction"),
         },
     ),

@@ -1,7 +1,7 @@
 """Demonstrations on a plane, copied: turned, mirrored and shifted, the goal with the rest.
 
 Pushing does not depend on where north is, so a copy is as good a demonstration as what it is made from, for a
-policy that sees the goal (as in Zeng et al., Transporter Networks, arXiv 2010.14406, section 4).
+policy that sees the goal (as in Zeng et al., Transporter Networks, arXiv 2010.14406).
 """
 
 from dataclasses import dataclass
@@ -11,8 +11,6 @@ import numpy as np
 
 MAX_SHIFT = 40.0  # of the board's centre along x and y; its unit is that of positions
 BACKGROUND = (255, 255, 255)  # of what lies outside of the image that is copied
-
-
 MIRROR = np.array([[0.0, -1.0], [-1.0, 0.0]])  # across a diagonal
 
 

@@ -26,17 +26,14 @@ class SamplingNoise:
 
     def draw(self, batch_size: int, shape: tuple[int, ...]) -> Tensor:
         """(B, *shape) float32 on the CPU. Rows may share memory: not to be written to."""
-        if not self._is_per_episode:
-            return self._draw(0, shape).expand(batch_size, *shape)
-        return torch.stack([self._draw(row, shape) for row in range(batch_size)])
+        num_sequences = batch_size if self._is_per_episode else 1
+        for row in range(len(self._generators), num_sequences):
+            self._generators.append(torch.Generator().manual_seed(self._seed_of(row)))
+        noises = [torch.randn(shape, generator=generator) for generator in self._generators[:num_sequences]]
+        return torch.stack(noises).expand(batch_size, *shape)
 
-    def _draw(self, row: int, shape: tuple[int, ...]) -> Tensor:
-        while len(self._generators) <= row:
-            self._generators.append(torch.Generator().manual_seed(self._next_seed()))
-        return torch.randn(shape, generator=self._generators[row])
-
-    def _next_seed(self) -> int:
+    def _seed_of(self, row: int) -> int:
         if not self._is_per_episode:
             return self._seed
-        number = self._first_episode + len(self._generators)
-        return int(np.random.SeedSequence((self._seed, number)).generate_state(1, np.uint64)[0])
+        words = np.random.SeedSequence((self._seed, self._first_episode + row))
+        return int(words.generate_state(1, np.uint64)[0])
