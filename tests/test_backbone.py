@@ -13,7 +13,7 @@ from tokenizers import Tokenizer
 
 from lerobot_bomb.vlm.backbone import SmolVLMBackbone, build_backbone, config_dict, load_backbone
 from lerobot_bomb.vlm.presets import nano_config
-from lerobot_bomb.vlm.prompt import PromptTokens, normalize_task, task_ids
+from lerobot_bomb.vlm.prompt import PromptTokens, normalize_task, task_ids, text_ids
 from lerobot_bomb.vlm.tokenizer import (
     SPECIAL_TOKENS,
     load_tokenizer,
@@ -112,6 +112,7 @@ def test_prompt_tokens_survive_as_json() -> None:
         ("Ġ6", "(' 6' in '3 4 5 6 7 8 ')"),
         ("6Ġ", "('6 ' in ' 4 5 6 7 8 9')"),
         ("9,", "('9,' in '8 9999,')"),
+        ("5,", "('5,' in 'ate: 5,')"),
         (":Ġ", "(': ' in 'State: 0 1 2')"),
     ],
 )
@@ -124,6 +125,40 @@ def test_a_tokenizer_that_merges_digits_is_refused(merge: str, where: str) -> No
     message = f"--policy.vlm_model_name=some/model: its tokenizer merges digits or spaces {where}"
     with pytest.raises(ValueError, match=re.escape(message)):
         PromptTokens.from_tokenizer(Tokenizer.from_str(json.dumps(stored)), "some/model")
+
+
+def test_digits_that_a_tokenizer_does_not_know_are_refused() -> None:
+    stored = json.loads(nano_tokenizer().to_str())
+    known = {text: token for text, token in stored["model"]["vocab"].items() if text not in "37"}
+    stored["model"] |= {"vocab": known | {"<unk>": stored["model"]["vocab"]["3"]}, "unk_token": "<unk>"}
+    message = "writes '3' and '7' as the same token; the policy needs one of its own for every digit"
+    with pytest.raises(ValueError, match=message):
+        PromptTokens.from_tokenizer(Tokenizer.from_str(json.dumps(stored)), "some/model")
+
+
+def test_a_tokenizer_that_cuts_and_pads_does_neither_here(tmp_path: Path) -> None:
+    tokenizer = nano_tokenizer()
+    tokenizer.enable_truncation(8)
+    tokenizer.enable_padding(length=16)
+    tokenizer.save(str(tmp_path / "tokenizer.json"))
+    loaded = load_tokenizer(str(tmp_path)), tokenizer_from_tensor(tokenizer_to_tensor(tokenizer))
+    for whole in loaded:
+        expected = PromptTokens.from_tokenizer(nano_tokenizer(), "nano")
+        assert PromptTokens.from_tokenizer(whole, "some/model") == expected
+
+
+def test_a_tokenizer_that_drops_the_end_is_refused() -> None:
+    stored = json.loads(nano_tokenizer().to_str())
+    stored["normalizer"] = {"type": "Replace", "pattern": {"Regex": "9,$"}, "content": "9"}
+    with pytest.raises(ValueError, match="its tokenizer merges digits or spaces"):
+        PromptTokens.from_tokenizer(Tokenizer.from_str(json.dumps(stored)), "some/model")
+
+
+def test_a_text_that_cannot_be_tokenized_changes_nothing_for_the_next() -> None:
+    tokenizer = nano_tokenizer()
+    with pytest.raises(TypeError):
+        text_ids(tokenizer, None)  # pyright: ignore[reportArgumentType]
+    assert not tokenizer.encode_special_tokens
 
 
 def test_a_tokenizer_without_the_special_tokens_is_refused() -> None:

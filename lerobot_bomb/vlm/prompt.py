@@ -13,6 +13,7 @@ tokens in a row are the tokens of the whole string.
 
 import re
 from dataclasses import asdict, dataclass
+from itertools import takewhile
 
 from tokenizers import Tokenizer
 
@@ -44,7 +45,8 @@ class PromptTokens:
         """Look everything up.
 
         Raises:
-            ValueError: a digit, the space or a special token is not exactly one token, or not everywhere.
+            ValueError: a digit, the space or a special token is not exactly one token of its own, or not
+                everywhere.
         """
 
         def one(text: str) -> int:
@@ -60,6 +62,7 @@ class PromptTokens:
             return tokenizer.encode(text).ids
 
         symbols = [one(text) for text in SYMBOL_TEXTS]
+        _check_distinct(symbols, vlm_model_name)
         _check_numbers(tokenizer, symbols, vlm_model_name)
         end = one(SYMBOL_TEXTS[-1])
         system = []
@@ -83,6 +86,18 @@ class PromptTokens:
         return asdict(self)
 
 
+def _check_distinct(symbol_ids: list[int], vlm_model_name: str) -> None:
+    """Raise if two symbols are the same token, as all that a tokenizer does not know are."""
+    texts: dict[int, str] = {}
+    for text, token in zip(SYMBOL_TEXTS, symbol_ids, strict=True):
+        if token in texts:
+            raise ValueError(
+                f"--policy.vlm_model_name={vlm_model_name}: its tokenizer writes {texts[token]!r} and {text!r} "
+                f"as the same token; the policy needs one of its own for every digit and for a lone space"
+            )
+        texts[token] = text
+
+
 def _check_numbers(tokenizer: Tokenizer, symbol_ids: list[int], vlm_model_name: str) -> None:
     """Raise unless every number of up to MAX_DIGITS digits is a space and one token a digit, where it stands.
 
@@ -90,23 +105,22 @@ def _check_numbers(tokenizer: Tokenizer, symbol_ids: list[int], vlm_model_name: 
     """
     ids: dict[str, int] = dict(zip(SYMBOL_TEXTS, symbol_ids, strict=True))
     numbers = [f" {number:0{width}}" for width in range(1, MAX_DIGITS + 1) for number in range(10**width)]
-    answer = "".join(numbers)
+    # all of them one after the other, and every digit as the last
+    answers = ["".join(numbers), *numbers[:10]]
     for before, after in ((" State:", ","), ("Assistant:", SYMBOL_TEXTS[END])):
-        text = f"{before}{answer}{after}"
-        written = tokenizer.encode(text)
-        expected = [
-            *tokenizer.encode(before).ids,
-            *(ids[symbol] for symbol in answer),
-            *tokenizer.encode(after).ids,
-        ]
-        if written.ids != expected:
-            pairs = enumerate(zip(written.ids, expected, strict=False))
-            first, last = written.offsets[next(i for i, (one, other) in pairs if one != other)]
-            raise ValueError(
-                f"--policy.vlm_model_name={vlm_model_name}: its tokenizer merges digits or spaces "
-                f"({text[first:last]!r} in {text[max(0, first - 5) : last + 5]!r}); the policy needs one "
-                f"token a digit and one for a lone space"
-            )
+        start, end = tokenizer.encode(before).ids, tokenizer.encode(after).ids
+        for answer in answers:
+            text = f"{before}{answer}{after}"
+            written = tokenizer.encode(text)
+            expected = [*start, *(ids[symbol] for symbol in answer), *end]
+            if written.ids != expected:
+                same = takewhile(lambda pair: pair[0] == pair[1], zip(written.ids, expected, strict=False))
+                first, last = written.offsets[min(len(list(same)), len(written.ids) - 1)]
+                raise ValueError(
+                    f"--policy.vlm_model_name={vlm_model_name}: its tokenizer merges digits or spaces "
+                    f"({text[first:last]!r} in {text[max(0, first - 5) : last + 5]!r}); the policy needs one "
+                    f"token a digit and one for a lone space"
+                )
 
 
 def normalize_task(task: str) -> str:
@@ -122,6 +136,7 @@ def task_ids(tokenizer: Tokenizer, task: str, template: str = TASK_TEMPLATE) -> 
 def text_ids(tokenizer: Tokenizer, text: str) -> list[int]:
     """Tokens of a user's text; what looks like a special token stays text."""
     tokenizer.encode_special_tokens = True
-    ids = tokenizer.encode(text, add_special_tokens=False).ids
-    tokenizer.encode_special_tokens = False
-    return ids
+    try:
+        return tokenizer.encode(text, add_special_tokens=False).ids
+    finally:
+        tokenizer.encode_special_tokens = False

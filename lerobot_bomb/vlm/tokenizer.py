@@ -54,8 +54,15 @@ def load_tokenizer(vlm_model_name: str) -> Tokenizer:
             raise FileNotFoundError(
                 f"--policy.vlm_model_name={vlm_model_name}: the folder has no tokenizer.json"
             )
-        return Tokenizer.from_file(str(path))
-    return Tokenizer.from_file(hub_file(vlm_model_name, "tokenizer.json"))
+        return _whole(Tokenizer.from_file(str(path)))
+    return _whole(Tokenizer.from_file(hub_file(vlm_model_name, "tokenizer.json")))
+
+
+def _whole(tokenizer: Tokenizer) -> Tokenizer:
+    """One that neither cuts texts nor pads them, as its file may say it should."""
+    tokenizer.no_truncation()
+    tokenizer.no_padding()
+    return tokenizer
 
 
 def hub_file(vlm_model_name: str, filename: str) -> str:
@@ -106,7 +113,7 @@ def tokenizer_from_tensor(json_bytes: Tensor) -> Tokenizer:
     if json_bytes.dtype != torch.uint8 or json_bytes.ndim != 1:
         raise ValueError(f"a tokenizer is uint8 (bytes,), not {json_bytes.dtype} {tuple(json_bytes.shape)}")
     try:
-        return Tokenizer.from_str(json_bytes.cpu().numpy().tobytes().decode())
+        return _whole(Tokenizer.from_str(json_bytes.cpu().numpy().tobytes().decode()))
     except Exception as error:  # of Rust, which has no class of its own
         raise ValueError(f"the saved tokenizer cannot be read: {error}") from error
 
