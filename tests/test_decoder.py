@@ -1,4 +1,5 @@
 from collections.abc import Iterator
+from typing import Any
 
 import pytest
 import torch
@@ -20,6 +21,7 @@ from lerobot_bomb.decoding.decoder import (
 from lerobot_bomb.decoding.draft import KnownSymbols, LinearDraft
 from lerobot_bomb.decoding.grammar import NumberGrammar, Place
 from lerobot_bomb.decoding.graph_decoder import decode_ahead
+from lerobot_bomb.flow.noise import gumbel
 
 
 class Speaker(Continuation):
@@ -94,6 +96,68 @@ def decode(
         batch_size=batch_size,
         stop_after=stop_after or grammar.num_numbers,
     )
+
+
+class Dice(Continuation):
+    """Always the same logits, whatever was said: those of a table (S,)."""
+
+    def __init__(self, logits_S: Tensor):
+        self.logits_S = logits_S
+
+    def __call__(self, symbol_BK: Tensor, first_B: Tensor) -> Tensor:
+        return self.logits_S.expand(*symbol_BK.shape, -1)
+
+    def keep(self, row_B: Tensor) -> None:
+        pass
+
+
+def sample(seed: int, batch_size: int, grammar: NumberGrammar, **options: Any) -> Decoded:
+    generator = torch.Generator().manual_seed(seed)
+    logits_S = torch.randn(NUM_SYMBOLS, generator=generator)
+    shape = batch_size, grammar.max_symbols(grammar.num_numbers), NUM_SYMBOLS
+    return decode_numbers(
+        Dice(logits_S),
+        grammar,
+        options.pop("guess", KnownSymbols(grammar)),
+        batch_size=batch_size,
+        stop_after=grammar.num_numbers,
+        noise=options.pop("temperature", 1.0) * gumbel(shape, generator=generator),
+    )
+
+
+def test_samples_are_as_frequent_as_the_softmax_over_what_may_follow_says() -> None:
+    """Numbers 00 to 34: the second digit has other choices after a 3."""
+    grammar, num_rows, temperature = NumberGrammar(35, 2, fixed_width=2), 40_000, 0.7
+    numbers = sample(3, num_rows, grammar, temperature=temperature).numbers
+    logits_S = torch.randn(NUM_SYMBOLS, generator=torch.Generator().manual_seed(3)) / temperature
+    tens = logits_S[:4].softmax(dim=0)
+    ones = [logits_S[: 5 if ten == 3 else 10].softmax(dim=0) for ten in range(4)]
+    expected = torch.cat([tens[ten] * ones[ten] for ten in range(4)])
+    for number_B in numbers.unbind(dim=1):
+        seen = torch.bincount(number_B, minlength=35)
+        chi_squared = ((seen - num_rows * expected) ** 2 / (num_rows * expected)).sum()
+        assert chi_squared < 66  # 34 degrees of freedom: p = 0.0008
+    # the numbers of an answer are drawn apart from each other
+    both = torch.bincount(35 * numbers[:, 0] + numbers[:, 1], minlength=35 * 35) / num_rows
+    assert (both - torch.outer(expected, expected).flatten()).abs().max() < 0.005
+
+
+def test_guesses_change_no_sample() -> None:
+    grammar = NumberGrammar(100, 8, fixed_width=2)
+    plain = sample(5, 64, grammar).numbers
+
+    def guess(numbers_BN: Tensor, place: Place) -> Tensor:
+        generator = torch.Generator().manual_seed(int(place.number.sum()))
+        return torch.randint(0, 10, (len(place.number), 6), generator=generator)
+
+    assert torch.equal(sample(5, 64, grammar, guess=guess).numbers, plain)
+    assert not torch.equal(sample(6, 64, grammar).numbers, plain)
+
+
+def test_noise_of_temperature_zero_changes_no_choice() -> None:
+    grammar = NumberGrammar(512, 5)
+    greedy = decode(Dice(torch.randn(NUM_SYMBOLS, generator=torch.Generator().manual_seed(7))), grammar, 3)
+    assert torch.equal(sample(7, 3, grammar, temperature=0.0).numbers, greedy.numbers)
 
 
 def test_what_the_model_says_is_read() -> None:

@@ -84,7 +84,7 @@ def test_the_cache_in_bfloat16_is_as_exact_as_a_full_pass(backbone: SmolVLMBackb
         cached = torch.cat([model(said[:, :2], torch.tensor([0])), model(said[:, 2:], torch.tensor([2]))], 1)[
             0
         ]
-    assert cached.dtype == torch.bfloat16
+    assert cached.dtype == torch.float32  # of the head; the cache is in bfloat16
     error, error_of_whole = ((logits.float() - exact).abs().max() for logits in (cached, whole))
     assert 0 < error < 2 * error_of_whole
 
@@ -301,7 +301,7 @@ def test_what_was_recorded_is_forgotten_when_the_model_gets_other_modules(backbo
 def test_an_answer_longer_than_the_models_positions_is_refused(backbone: SmolVLMBackbone) -> None:
     rows = prompts(backbone, 0, [30])
     with pytest.raises(
-        ValueError, match=r"take 4097 tokens, and the model has 4096 positions; give a smaller"
+        ValueError, match=r"take 4097 tokens, and the model has 4096 positions; .* give a smaller"
     ):
         continuation(backbone, rows, 4067)
     continuation(backbone, rows, 4066)

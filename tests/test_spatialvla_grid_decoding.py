@@ -9,6 +9,7 @@ from spatialvla_grid_cases import make_batch, make_policy, rows
 from torch import Tensor
 
 from lerobot_bomb.decoding.kv_cache import CachedText
+from lerobot_bomb.decoding.slots import SlotHead
 
 
 @torch.no_grad()
@@ -76,3 +77,36 @@ def test_only_what_is_executed_is_decoded_with_one_pass_a_cell(passes: list[int]
     assert torch.equal(policy.select_action(batch), chunk[:, 0])
     assert torch.equal(policy.select_action(batch), chunk[:, 1])
     assert len(passes) == 2 * 3 and passes[1:] == [1] * 5
+
+
+@torch.no_grad()
+def test_samples_are_as_frequent_as_the_capped_softmax_of_a_slot() -> None:
+    groups = [
+        {"dims": [0, 1], "transform": "identity", "bins": [4, 4]},
+        {"dims": [2, 3], "transform": "identity", "bins": [4, 2]},
+    ]
+    policy = make_policy(0, 4, chunk_size=1, n_action_steps=1, temperature=0.8, action_groups=groups)
+    policy.cell_head.weight *= 3  # into the cap
+    policy.backbone.softcap = 1.5
+    num_rows = 20_000
+    batch = make_batch(policy, 1)
+    noise = policy._choice_noise(num_rows, (1, policy.grids.num_tokens))
+    assert noise is not None
+    hidden_BH = policy._hidden(batch, policy._choose(batch, 1))[:, 0, 0].expand(num_rows, -1)
+    slot = policy._group_rows[0]
+    head = SlotHead(policy.cell_head.weight, noise, policy.backbone.cap)
+    seen = torch.bincount(head.logits(hidden_BH, 0, slot).argmax(dim=1), minlength=slot.stop)
+    logits = policy.backbone.cap(hidden_BH[0] @ policy.cell_head.weight[slot].T)
+    expected = num_rows * (logits / 0.8).softmax(dim=0)
+    assert expected.max() > 2 * expected.min() > 10
+    assert ((seen - expected).square() / expected).sum() < 37.7  # 15 degrees of freedom: p = 0.001
+
+
+def test_a_draft_changes_no_sample_and_an_episode_has_its_own() -> None:
+    cells = []
+    for draft, noise_seed in (("repeat", 0), ("none", 0), ("none", 1)):
+        policy = make_policy(2, 7, nano_config=None, temperature=0.5, noise_seed=noise_seed, draft=draft)
+        batch = make_batch(policy, 1, 2)
+        cells.append(torch.stack([policy._choose(batch, 4) for _ in range(2)]))
+    assert torch.equal(cells[0], cells[1])
+    assert not torch.equal(cells[1], cells[2]) and not torch.equal(cells[1][0], cells[1][1])

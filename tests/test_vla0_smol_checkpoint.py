@@ -7,22 +7,39 @@ import sys
 from pathlib import Path
 from typing import Any
 
+import pandas
 import pytest
 import torch
 from accelerate import FullyShardedDataParallelPlugin
 from lerobot.configs import FeatureType, NormalizationMode, PolicyFeature, PreTrainedConfig
+from lerobot.datasets import LeRobotDatasetMetadata
 from lerobot.policies.factory import make_pre_post_processors
-from lerobot.utils.constants import OBS_LANGUAGE_TOKENS
+from lerobot.utils.constants import OBS_LANGUAGE_ATTENTION_MASK, OBS_LANGUAGE_TOKENS
 from safetensors.torch import load_file, save_file
 from tokenizers import Tokenizer
 from torch import Tensor
-from vla0_smol_cases import STATS, WRIST, make_batch, make_config, make_policy, raw_batch
+from vla0_smol_cases import (
+    STATS,
+    WRIST,
+    make_batch,
+    make_config,
+    make_dataset,
+    make_policy,
+    raw_batch,
+)
 
 from lerobot_bomb.flag_errors import FlagError
 from lerobot_bomb.vlm import task_tokenizer
 from lerobot_bomb.vlm.prompt import task_ids
 from lerobot_policy_vla0_smol import make_vla0_smol_pre_post_processors
 from lerobot_policy_vla0_smol.modeling_vla0_smol import Vla0SmolPolicy
+
+
+@pytest.fixture(scope="module")
+def meta(tmp_path_factory: pytest.TempPathFactory) -> LeRobotDatasetMetadata:
+    """Of a dataset that a policy is made for."""
+    return make_dataset(tmp_path_factory.mktemp("data") / "small", 0.1)
+
 
 # Checkpoints
 
@@ -243,6 +260,67 @@ def test_an_observation_without_a_task_is_an_error(task: Any) -> None:
 def test_bad_options_are_refused(options: dict[str, Any], message: str) -> None:
     with pytest.raises(FlagError, match=message):
         make_config(**options)
+
+
+@pytest.mark.parametrize(
+    ("options", "way_out"),
+    [
+        ({"mask_level": "step"}, r"of the 3 that --policy.mask_level=step may .* more than 1/3 = 0.333"),
+        ({"chunk_size": 1, "n_action_steps": 1}, r"of the 4 that --policy.mask_level=value .* 1/4 = 0.25"),
+        (
+            {"mask_max_fraction": 0.05},
+            r"mask_max_fraction=0.05: of the 12 .* 1/12 = 0.0833, or 0 to hide nothing",
+        ),
+        (
+            {"mask_level": "step", "chunk_size": 1, "n_action_steps": 1, "mask_max_fraction": 1.0},
+            r"give --policy.mask_level=value, or 0",
+        ),
+    ],
+)
+def test_masking_that_never_hides_anything_is_refused_before_training(
+    options: dict[str, Any], way_out: str, meta: LeRobotDatasetMetadata
+) -> None:
+    with pytest.raises(ValueError, match=way_out):
+        Vla0SmolPolicy(make_config(**options), meta)
+    # a checkpoint that was trained so still acts
+    Vla0SmolPolicy(make_config(**options))
+
+
+@pytest.mark.parametrize(
+    "options",
+    [{"mask_level": "step", "mask_max_fraction": 0.34}, {"mask_max_fraction": 0.0}, {"mask_skip_prob": 1.0}],
+)
+def test_masking_that_may_hide_something_or_nothing_on_purpose_is_taken(options: dict[str, Any]) -> None:
+    config = make_config(**options)
+    config.check_masking()
+    kept = Vla0SmolPolicy(config)._draw_hidden(torch.ones(500, 3, dtype=torch.bool)).any()
+    assert kept == (options == {"mask_level": "step", "mask_max_fraction": 0.34})
+
+
+@pytest.mark.parametrize(("num_words", "is_refused"), [(700, False), (2000, True), (500_000, True)])
+def test_an_instruction_beyond_the_positions_is_refused_before_training(
+    num_words: int, is_refused: bool, meta: LeRobotDatasetMetadata
+) -> None:
+    """The words are 8 bytes and 2 tokens: 700 of them have more bytes than there are positions."""
+    long = copy.copy(meta)
+    long.tasks = pandas.DataFrame({"task_index": [0]}, index=pandas.Index(["put the " * num_words]))
+    if not is_refused:
+        Vla0SmolPolicy(make_config(), long)
+        return
+    with pytest.raises(
+        ValueError, match=r"model has 4096 positions; shorten the dataset's instruction 'put the"
+    ):
+        Vla0SmolPolicy(make_config(), long)
+
+
+def test_an_instruction_beyond_the_positions_is_not_trained_on() -> None:
+    """Where nobody looked before, as without the dataset."""
+    policy = make_policy().train()
+    batch = make_batch(policy, 2)
+    batch[OBS_LANGUAGE_TOKENS] = torch.zeros(2, 4100, dtype=torch.int64)
+    batch[OBS_LANGUAGE_ATTENTION_MASK] = torch.ones(2, 4100, dtype=torch.bool)
+    with pytest.raises(ValueError, match="4096 positions; shorten the instruction or give a smaller"):
+        policy(batch)
 
 
 STATE_FEATURE = {"observation.state": PolicyFeature(FeatureType.STATE, (4,))}

@@ -1,5 +1,6 @@
 import copy
 from typing import Any
+from unittest.mock import patch
 
 import pytest
 import torch
@@ -8,6 +9,7 @@ from vla0_smol_cases import WORKSPACE, make_batch, make_policy, numbers_of
 
 from lerobot_bomb.actions.text import IGNORED
 from lerobot_bomb.decoding.decoder import Decoded, decode_numbers, likeliest
+from lerobot_bomb.flow.noise import SamplingNoise, gumbel
 from lerobot_policy_vla0_smol.modeling_vla0_smol import Vla0SmolPolicy
 
 
@@ -133,7 +135,74 @@ def test_actions_are_queued_and_forgotten_on_reset(overfit: tuple[Vla0SmolPolicy
     policy.reset()
 
 
+def test_a_sample_depends_on_seed_and_episode_alone() -> None:
+    policy = make_policy(temperature=1.0)
+    batch = make_batch(policy, 3)
+    together = [policy.select_action(batch) for _ in range(4)]  # two chunks
+    assert not torch.equal(together[0], together[2])
+    alone = copy.deepcopy(policy)
+    alone._sampling_noise = SamplingNoise(0, is_per_episode=True, draw=gumbel)
+    for row in range(3):
+        alone.reset()
+        for action_BD in together:
+            assert torch.equal(alone.select_action(rows(batch, slice(row, row + 1)))[0], action_BD[row])
+    other = make_policy(temperature=1.0, noise_seed=1)
+    assert not torch.equal(other.select_action(batch), together[0])
+
+
+def test_a_low_temperature_is_greedy_and_a_draft_changes_no_sample() -> None:
+    batch = make_batch(make_policy(), 2)
+    greedy, cold = (make_policy(temperature=t).predict_action_chunk(batch) for t in (0.0, 1e-6))
+    assert torch.equal(greedy, cold)
+    drafted, plain = (
+        make_policy(temperature=0.5, draft=draft).predict_action_chunk(batch) for draft in ("linear", "none")
+    )
+    assert torch.equal(drafted, plain) and not torch.equal(plain, greedy)
+
+
+def test_what_lerobots_callers_pass_is_taken_and_the_rest_refused_by_name() -> None:
+    policy = make_policy()
+    batch = make_batch(policy, 2)
+    left_over = torch.zeros(2, 2, 4)
+    chunk = policy.predict_action_chunk(batch, inference_delay=1, prev_chunk_left_over=left_over)
+    assert torch.equal(chunk, policy.predict_action_chunk(batch))
+    with pytest.raises(TypeError, match="'noise'"):
+        policy.predict_action_chunk(batch, noise=left_over)  # pyright: ignore[reportCallIssue]
+    with pytest.raises(TypeError, match="'temperature'"):
+        policy.select_action(batch, temperature=1.0)  # pyright: ignore[reportCallIssue]
+
+
+@pytest.mark.parametrize("options", [{}, {"temporal_ensemble_size": 2, "n_action_steps": 1}])
+def test_another_size_of_batch_needs_a_reset(options: dict[str, Any]) -> None:
+    policy = make_policy(**options)
+    policy.select_action(make_batch(policy, 3))
+    message = (
+        r"a batch of 2 observations follows one of 3, whose episodes are under way; call policy.reset\(\)"
+    )
+    with pytest.raises(ValueError, match=message):
+        policy.select_action(make_batch(policy, 2))
+    policy.reset()
+    assert len(policy.select_action(make_batch(policy, 2))) == 2
+
+
 # Precision
+
+
+def test_in_bfloat16_no_two_digits_are_equally_likely() -> None:
+    """In bfloat16's own head a digit in a dozen is, and argmax takes the lower."""
+    policy = make_policy(dtype="bfloat16", chunk_size=40)
+    seen: list[Tensor] = []
+
+    def record(logits: Tensor) -> tuple[Tensor, Tensor]:
+        seen.append(logits.flatten(0, -2).topk(2, dim=-1).values)
+        return likeliest(logits)
+
+    with patch("lerobot_bomb.decoding.decoder.likeliest", record):
+        policy.predict_action_chunk(make_batch(policy, 8))
+    best_N2 = torch.cat(seen)
+    open_N2 = best_N2[best_N2.isfinite().all(dim=1)]
+    assert len(open_N2) > 1000
+    assert (open_N2[:, 0] > open_N2[:, 1]).float().mean() > 0.999
 
 
 def test_bfloat16_is_the_same_for_training_and_decoding() -> None:
@@ -173,13 +242,14 @@ def test_a_batch_on_another_device_is_refused() -> None:
 
 
 def test_an_answer_that_does_not_fit_the_model_is_refused() -> None:
-    policy = make_policy(chunk_size=253, n_action_steps=253)
+    policy = make_policy(chunk_size=251, n_action_steps=251)
     with pytest.raises(
-        ValueError, match=r"and the model has 4096 positions; give a smaller --policy.chunk_size"
+        ValueError,
+        match=r"model has 4096 positions; shorten the instruction or give a smaller --policy.chunk_size",
     ):
         policy.predict_action_chunk(make_batch(policy, 1))
 
 
 def test_an_answer_that_can_never_fit_the_model_is_refused_before_training() -> None:
-    with pytest.raises(ValueError, match=r"prompt and answer take 4833 tokens, and the model has 4096"):
+    with pytest.raises(ValueError, match=r"prompt and answer take 4868 tokens, and the model has 4096"):
         make_policy(chunk_size=300, n_action_steps=300)

@@ -1,9 +1,12 @@
-"""Greedy decoding of numbers, several symbols a pass where they can be guessed.
+"""Decoding of numbers, several symbols a pass where they can be guessed.
 
-A pass reads the symbol chosen last and some that are guessed to follow it, and gives the greedy choice after
-each. As far as the guesses are these choices they are right, and so is the first choice that differs from its
-guess: what is written is what one symbol a pass would write (speculative decoding, arXiv 2211.17192, for
-greedy choices). Rows get on differently far in a pass, and leave the batch when they are done.
+A pass reads the symbol chosen last and some that are guessed to follow it, and gives the likeliest choice
+after each. As far as the guesses are these choices they are right, and so is the first choice that differs
+from its guess: what is written is what one symbol a pass would write (speculative decoding, arXiv 2211.17192,
+for greedy choices). Rows get on differently far in a pass, and leave the batch when they are done.
+
+A sample is the likeliest choice after Gumbel noise was added to the logits (arXiv 1611.01144, section 2.1).
+The noise is that of a symbol's place in the answer, so guesses change no sample either.
 
 Shapes: `B` batch, `S` symbols, `N` numbers, `L` tokens of a prompt, `H` hidden size, `G` guesses,
 `K` = 1 + G.
@@ -16,7 +19,7 @@ from typing import NamedTuple, Protocol
 import torch
 from torch import Tensor
 
-from lerobot_bomb.actions.text import SPACE
+from lerobot_bomb.actions.text import NUM_SYMBOLS, SPACE
 from lerobot_bomb.decoding.grammar import NumberGrammar, Place
 from lerobot_bomb.decoding.kv_cache import CachedText
 from lerobot_bomb.finite import require_finite_answers
@@ -89,14 +92,23 @@ class Answers(NamedTuple):
     prefix: Tensor  # (B,) int64, of a `Place`
     number: Tensor  # (B,) int64, of a `Place`
     finite: Tensor  # (B,) bool, whether all that is written is from finite logits
+    noise: Tensor  # (B, A, S) of the A symbols of an answer, added to their logits; A = 0: none is
 
     @classmethod
-    def start(cls, grammar: NumberGrammar, batch_size: int) -> "Answers":
+    def start(cls, grammar: NumberGrammar, batch_size: int, noise: Tensor | None = None) -> "Answers":
         """The space that every answer begins with is written."""
         place = grammar.start(batch_size)
         numbers_BN = place.prefix.new_zeros(batch_size, grammar.num_numbers)
         ones_B = torch.ones_like(place.prefix)
-        return cls(numbers_BN, SPACE * ones_B, ones_B, place.prefix, place.number, ones_B.bool())
+        if noise is None:
+            noise = torch.empty(batch_size, 0, NUM_SYMBOLS, device=ones_B.device)
+        return cls(numbers_BN, SPACE * ones_B, ones_B, place.prefix, place.number, ones_B.bool(), noise)
+
+    def noise_of(self, num_choices: int) -> Tensor:
+        """(B, K, S) the noise of the next K choices."""
+        column_K = torch.arange(num_choices, device=self.noise.device)
+        index_BK = (self.num_symbols[:, None] + column_K).clamp(max=self.noise.shape[1] - 1)
+        return self.noise.gather(1, index_BK[..., None].expand(-1, -1, self.noise.shape[2]))
 
     @property
     def place(self) -> Place:
@@ -138,7 +150,10 @@ def write(
     guess_BG = guess(answers.numbers, place)[:, :num_guesses]
     logits_BKS = model(torch.cat([answers.last[:, None], guess_BG], dim=1), answers.num_symbols - 1)
     places_BK = grammar.walk(place, guess_BG)
-    picks_BK, logits_BK = likeliest(logits_BKS.float() + grammar.logit_bias(places_BK))
+    logits_BKS = logits_BKS.float() + grammar.logit_bias(places_BK)
+    if answers.noise.shape[1]:
+        logits_BKS = logits_BKS + answers.noise_of(logits_BKS.shape[1])
+    picks_BK, logits_BK = likeliest(logits_BKS)
     num_right_B = (picks_BK[:, :-1] == guess_BG).cumprod(dim=1).sum(dim=1)
     column_K = torch.arange(picks_BK.shape[1], device=picks_BK.device)
     # what follows a wrong guess is not written
@@ -151,14 +166,21 @@ def write(
     max_symbols = grammar.max_symbols(grammar.num_numbers)
     num_symbols_B = (answers.num_symbols + num_right_B + 1).clamp(max=max_symbols)
     finite_B = answers.finite & (logits_BK.isfinite() | ~mask_BK).all(dim=1)
-    return Answers(numbers_BN, last_B, num_symbols_B, place.prefix, place.number, finite_B), num_right_B
+    state = last_B, num_symbols_B, place.prefix, place.number, finite_B
+    return Answers(numbers_BN, *state, answers.noise), num_right_B
 
 
 @torch.no_grad()
 def decode_numbers(
-    model: Continuation, grammar: NumberGrammar, guess: Guess, *, batch_size: int, stop_after: int
+    model: Continuation,
+    grammar: NumberGrammar,
+    guess: Guess,
+    *,
+    batch_size: int,
+    stop_after: int,
+    noise: Tensor | None = None,
 ) -> Decoded:
-    """The first ``stop_after`` greedily written numbers of each row.
+    """The first ``stop_after`` numbers of each row: the likeliest, or with ``noise`` (B, A, S) sampled ones.
 
     Only what the grammar allows is ever chosen, so every row is well-formed by construction. What a row
     writes after it is done is ignored.
@@ -166,7 +188,7 @@ def decode_numbers(
     Raises:
         ValueError: a row was written from logits that are not finite.
     """
-    answers = Answers.start(grammar, batch_size)
+    answers = Answers.start(grammar, batch_size, noise)
     row_B = torch.arange(batch_size, device=answers.number.device)
     numbers = answers.number.new_empty(batch_size, stop_after)
     max_symbols = grammar.max_symbols(stop_after)

@@ -7,7 +7,7 @@ from collections.abc import Callable, Iterator
 
 import torch
 from torch import Tensor
-from torch.nn.functional import embedding, linear
+from torch.nn.functional import embedding
 
 from lerobot_bomb.cuda_graphs import GraphedFunction
 from lerobot_bomb.decoding.decoder import (
@@ -21,6 +21,7 @@ from lerobot_bomb.decoding.decoder import (
 from lerobot_bomb.decoding.grammar import NumberGrammar
 from lerobot_bomb.decoding.kv_cache import CachedText
 from lerobot_bomb.finite import require_finite_answers
+from lerobot_bomb.vlm.backbone import exact_linear
 
 NUM_GUESSES = 16  # of every pass
 
@@ -41,15 +42,22 @@ class GraphDecoder:
         self._tables = list(grammar.buffers())
         self._first, self._next = GraphedFunction(self._write_first), GraphedFunction(self._write)
 
-    def __call__(self, prompt: Prompt, embeds_SH: Tensor, head_SH: Tensor, stop_after: int) -> Decoded:
+    def __call__(
+        self,
+        prompt: Prompt,
+        embeds_SH: Tensor,
+        head_SH: Tensor,
+        stop_after: int,
+        noise: Tensor | None = None,
+    ) -> Decoded:
         """As `decode_numbers`, with the rows as they are now."""
         self._embeds_SH.copy_(embeds_SH)
         self._head_SH.copy_(head_SH)
-        return decode_ahead(self._passes(prompt), self._grammar, stop_after)
+        return decode_ahead(self._passes(prompt, noise), self._grammar, stop_after)
 
-    def _passes(self, prompt: Prompt) -> Iterator[Answers]:
+    def _passes(self, prompt: Prompt, noise: Tensor | None) -> Iterator[Answers]:
         length_B = prompt.mask.sum(dim=1)
-        answers = self._first(*prompt, length_B, *Answers.start(self._grammar, len(length_B)))
+        answers = self._first(*prompt, length_B, *Answers.start(self._grammar, len(length_B), noise))
         while True:
             yield Answers(*answers)
             answers = self._next(length_B, *answers)
@@ -66,7 +74,7 @@ class GraphDecoder:
         return embedding(symbols, self._embeds_SH)
 
     def _head(self, hidden: Tensor) -> Tensor:
-        return linear(hidden, self._head_SH)
+        return exact_linear(hidden, self._head_SH)
 
 
 def decode_ahead(passes: Iterator[Answers], grammar: NumberGrammar, stop_after: int) -> Decoded:

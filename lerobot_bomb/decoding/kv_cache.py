@@ -13,7 +13,11 @@ from torch import Tensor
 from lerobot_bomb.decoding.decoder_layers import Columns, TextLayers
 
 
-def check_positions(config: Any, num_tokens: int) -> None:
+def check_positions(
+    config: Any,
+    num_tokens: int,
+    way_out: str = "shorten the instruction or give a smaller --policy.chunk_size",
+) -> None:
     """A text model of this config can read so many tokens.
 
     Raises:
@@ -24,7 +28,7 @@ def check_positions(config: Any, num_tokens: int) -> None:
     if num_tokens > num_positions:
         raise ValueError(
             f"prompt and answer take {num_tokens} tokens, and the model has {num_positions} positions; "
-            f"give a smaller --policy.chunk_size"
+            f"{way_out}"
         )
 
 

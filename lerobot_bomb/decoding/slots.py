@@ -1,12 +1,14 @@
-"""Greedy decoding of answers with one choice a slot, one pass of the model each, or less.
+"""Decoding of answers with one choice a slot, one pass of the model each, or less.
 
 An answer has steps of the same slots. What may stand in a slot does not depend on what stands before it, so
 the language needs no automaton: the output head has only the slot's rows.
 
-Shapes: `B` batch, `L` tokens of a prompt, `H` hidden size, `G` slots of a step, `S` of an answer, `C` choices
-of all kinds of slots, `K` tokens of a pass.
+Shapes: `B` batch, `L` tokens of a prompt, `H` hidden size, `T` steps of an answer, `G` slots of a step, `S`
+of an answer, `C` choices of all kinds of slots, `K` tokens of a pass.
 """
 
+from collections.abc import Callable
+from dataclasses import dataclass
 from functools import partial
 from itertools import accumulate
 from operator import and_, eq
@@ -14,7 +16,7 @@ from typing import Any
 
 import torch
 from torch import Tensor
-from torch.nn.functional import embedding, linear
+from torch.nn.functional import embedding
 
 from lerobot_bomb.cuda_graphs import GraphedFunction
 from lerobot_bomb.decoding.decoder import MAX_GUESSES, Prompt, likeliest
@@ -22,6 +24,7 @@ from lerobot_bomb.decoding.decoder_layers import TextLayers
 from lerobot_bomb.decoding.graph_cache import GraphCache
 from lerobot_bomb.decoding.kv_cache import CachedText
 from lerobot_bomb.finite import require_finite_answers
+from lerobot_bomb.vlm.backbone import exact_linear
 
 
 class SlotWriter:
@@ -37,78 +40,119 @@ class SlotWriter:
         first_position: int,
         *,
         prompt_reads_all: bool,
+        cap: Callable[[Tensor], Tensor],
         drafted: bool = False,
         compiled: bool = False,
     ):
-        """``drafted``: guess that a step is as the one before, on a CPU and in a batch of 1."""
-        self._text_model, self._first_position = text_model, first_position
+        """``cap``: of logits; ``drafted``: guess that a step is as the one before, on a CPU, one row."""
+        self._text_model, self._first_position, self._cap = text_model, first_position, cap
         self._reads_all, self.drafted = prompt_reads_all, drafted
         self._recordings = GraphCache[GraphSlots](text_model, first_position, compiled=compiled)
 
     @torch.no_grad()
     def __call__(
-        self, prompt: Prompt, slots: list[slice], num_steps: int, embeds_CH: Tensor, head_CH: Tensor
+        self,
+        prompt: Prompt,
+        slots: list[slice],
+        num_steps: int,
+        embeds_CH: Tensor,
+        head_CH: Tensor,
+        noise: Tensor | None = None,
     ) -> Tensor:
-        """(B, S) the likeliest choice in every slot, given those before it.
+        """(B, S) the likeliest choice in every slot, given those before it, or with ``noise`` a sampled one.
 
         ``slots``: of a step, which of the choices come into question, counted from the first of them;
-        ``embeds_CH`` and ``head_CH``: the choices' rows of the embedding and of the output head.
+        ``embeds_CH`` and ``head_CH``: the choices' rows of the embedding and of the output head; ``noise``
+        (B, T, C): added to the choices' logits.
 
         Raises:
             ValueError: a row's logits are not finite. On CUDA the host waits for the answers to learn of it.
         """
         num_slots = num_steps * len(slots)
+        if noise is None:
+            noise = prompt.embeds.new_empty(len(prompt.embeds), 0, len(head_CH))
         if prompt.embeds.is_cuda:
             with torch.inference_mode(False), torch.no_grad():
-                make = partial(GraphSlots, num_steps * slots, self._reads_all, embeds_CH, head_CH)
+                settings = slots, num_steps, self._reads_all, self._cap
+                make = partial(GraphSlots, *settings, embeds_CH, head_CH)
                 recorded = self._recordings.find(prompt.embeds, num_slots, make)
-                choices_BS, finite_B = recorded(prompt, embeds_CH, head_CH)
+                choices_BS, finite_B = recorded(prompt, embeds_CH, head_CH, noise)
             require_finite_answers(finite_B)
             return choices_BS
         batch_size, num_columns, _ = prompt.embeds.shape
         layers = TextLayers(self._text_model)
         text = CachedText(layers, batch_size, num_columns + num_slots, self._first_position)
-        tables = embeds_CH, head_CH
+        head = SlotHead(head_CH, noise, self._cap)
         # rows that agree on how far guesses are right are rare
         is_drafted = self.drafted and batch_size == 1
-        singly = slots if is_drafted else num_steps * slots
-        choices_BS, finite_B = choose(text, prompt, singly, *tables, prompt_reads_all=self._reads_all)
+        singly = 1 if is_drafted else num_steps
+        choices_BS, finite_B = choose(
+            text, prompt, slots, singly, embeds_CH, head, prompt_reads_all=self._reads_all
+        )
         require_finite_answers(finite_B)
         if not is_drafted:
             return choices_BS
-        return repeat(text, int(prompt.mask.sum()), slots, num_slots, choices_BS, *tables)
+        return repeat(text, int(prompt.mask.sum()), slots, num_slots, choices_BS, embeds_CH, head)
+
+
+@dataclass(frozen=True)
+class SlotHead:
+    """Where the logits of choices come from: rows of the output head and, for samples, noise."""
+
+    rows: Tensor  # (C, H)
+    noise: Tensor  # (B, T, C), added to the logits; T = 0: the likeliest is chosen
+    cap: Callable[[Tensor], Tensor]  # of the logits, which keeps their order
+
+    def logits(self, hidden_BH: Tensor, step: int, slot: slice) -> Tensor:
+        """(B, H) -> (B, choices of the slot) float32."""
+        logits = exact_linear(hidden_BH, self.rows[slot])
+        if not self.noise.shape[1]:
+            return logits
+        return self.cap(logits) + self.noise[:, step, slot]
 
 
 class GraphSlots:
     """Choices after prompts of one shape."""
 
     def __init__(
-        self, slots: list[slice], reads_all: bool, embeds_CH: Tensor, head_CH: Tensor, text: CachedText
+        self,
+        slots: list[slice],
+        num_steps: int,
+        reads_all: bool,
+        cap: Callable[[Tensor], Tensor],
+        embeds_CH: Tensor,
+        head_CH: Tensor,
+        text: CachedText,
     ):
-        self._text, self._slots, self._reads_all = text, slots, reads_all
+        self._text, self._slots, self._num_steps = text, slots, num_steps
+        self._reads_all, self._cap = reads_all, cap
         self._embeds_CH, self._head_CH = embeds_CH.clone(), head_CH.clone()
         self._choose = GraphedFunction(self._choose_all)
 
-    def __call__(self, prompt: Prompt, embeds_CH: Tensor, head_CH: Tensor) -> tuple[Tensor, Tensor]:
+    def __call__(
+        self, prompt: Prompt, embeds_CH: Tensor, head_CH: Tensor, noise_BTC: Tensor
+    ) -> tuple[Tensor, Tensor]:
         """As `choose`; the second is written over by the next call."""
         self._embeds_CH.copy_(embeds_CH)
         self._head_CH.copy_(head_CH)
-        choices_BS, finite_B = self._choose(*prompt)
+        choices_BS, finite_B = self._choose(*prompt, noise_BTC)
         return choices_BS.clone(), finite_B
 
-    def _choose_all(self, embeds_BLH: Tensor, mask_BL: Tensor) -> tuple[Tensor, Tensor]:
+    def _choose_all(self, embeds_BLH: Tensor, mask_BL: Tensor, noise_BTC: Tensor) -> tuple[Tensor, Tensor]:
         self._text.clear()
         prompt = Prompt(embeds_BLH, mask_BL)
-        tables = self._embeds_CH, self._head_CH
-        return choose(self._text, prompt, self._slots, *tables, prompt_reads_all=self._reads_all)
+        head = SlotHead(self._head_CH, noise_BTC, self._cap)
+        answer = self._slots, self._num_steps, self._embeds_CH, head
+        return choose(self._text, prompt, *answer, prompt_reads_all=self._reads_all)
 
 
 def choose(
     text: CachedText,
     prompt: Prompt,
     slots: list[slice],
+    num_steps: int,
     embeds_CH: Tensor,
-    head_CH: Tensor,
+    head: SlotHead,
     *,
     prompt_reads_all: bool,
 ) -> tuple[Tensor, Tensor]:
@@ -116,13 +160,14 @@ def choose(
     last_B1 = prompt.mask.sum(dim=1, keepdim=True) - 1
     columns_BL = text.columns_of(prompt.mask)
     reach_BL = last_B1.expand_as(columns_BL) if prompt_reads_all else columns_BL
-    hidden_BKH = text(prompt.embeds, columns_BL, reach_BL)
-    chosen = [likeliest(linear(hidden_BKH[:, -1], head_CH[slots[0]]))]
-    passes = text.singly(last_B1 + torch.arange(1, len(slots), device=last_B1.device))
-    for columns, before, slot in zip(passes, slots[:-1], slots[1:], strict=True):
+    hidden_BH = text(prompt.embeds, columns_BL, reach_BL)[:, -1]
+    steps = [(step, slot) for step in range(num_steps) for slot in slots]
+    chosen = [likeliest(head.logits(hidden_BH, *steps[0]))]
+    passes = text.singly(last_B1 + torch.arange(1, len(steps), device=last_B1.device))
+    for columns, (_, before), place in zip(passes, steps[:-1], steps[1:], strict=True):
         embeds_BH = embedding(chosen[-1][0], embeds_CH[before])
-        hidden_BKH = text.read(embeds_BH[:, None], columns)
-        chosen.append(likeliest(linear(hidden_BKH[:, 0], head_CH[slot])))
+        hidden_BH = text.read(embeds_BH[:, None], columns)[:, 0]
+        chosen.append(likeliest(head.logits(hidden_BH, *place)))
     choices_BS, logits_BS = (torch.stack(of_slots, dim=1) for of_slots in zip(*chosen, strict=True))
     return choices_BS, logits_BS.isfinite().all(dim=1)
 
@@ -134,7 +179,7 @@ def repeat(
     num_slots: int,
     step_1G: Tensor,
     embeds_CH: Tensor,
-    head_CH: Tensor,
+    head: SlotHead,
 ) -> Tensor:
     """(1, S) the same as one choice a pass, after a prompt of this length and the first step.
 
@@ -145,14 +190,18 @@ def repeat(
     chosen: list[int] = step_1G[0].tolist()
     num_tokens = 1
     while len(chosen) < num_slots:
-        kinds = [(len(chosen) + ahead) % num_kinds for ahead in range(num_tokens)]
+        steps, kinds = zip(
+            *(divmod(len(chosen) + ahead, num_kinds) for ahead in range(num_tokens)), strict=True
+        )
         guesses = [chosen[ahead % num_kinds - num_kinds] for ahead in range(num_tokens)]
         read = [chosen[-1] + slots[kinds[0] - 1].start]
         read += [guess + slots[kind].start for guess, kind in zip(guesses[:-1], kinds, strict=False)]
         column_K = torch.arange(num_tokens, device=step_1G.device) + length + len(chosen) - 1
         (hidden_KH,) = text(embeds_CH[read][None], column_K[None])
-        heads = [head_CH[slots[kind]] for kind in kinds]
-        logits = [head @ hidden for head, hidden in zip(heads, hidden_KH, strict=True)]
+        logits = [
+            head.logits(hidden_1H, step, slots[kind])[0]
+            for hidden_1H, step, kind in zip(hidden_KH[:, None], steps, kinds, strict=True)
+        ]
         require_finite_answers(torch.cat(logits).isfinite().all()[None])
         picks = [int(of_slot.argmax()) for of_slot in logits]
         # one that was not read may be right, too: it says how many to read in the next pass

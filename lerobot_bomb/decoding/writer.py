@@ -27,8 +27,10 @@ class NumberWriter:
         self._recordings = GraphCache[GraphDecoder](backbone.vlm.model.text_model, compiled=compiled)
 
     @torch.no_grad()
-    def __call__(self, prompt: Prompt, symbol_ids: Tensor, stop_after: int) -> Decoded:
-        """The first ``stop_after`` numbers of each row."""
+    def __call__(
+        self, prompt: Prompt, symbol_ids: Tensor, stop_after: int, noise: Tensor | None = None
+    ) -> Decoded:
+        """The first ``stop_after`` numbers of each row; ``noise`` as `decode_numbers` takes it."""
         max_symbols = self._grammar.max_symbols(stop_after)
         head = self._backbone.vlm.lm_head
         if prompt.embeds.is_cuda and type(head) is nn.Linear:
@@ -36,10 +38,15 @@ class NumberWriter:
                 rows = self._backbone.embed_tokens(symbol_ids), head.weight[symbol_ids]
                 make = partial(GraphDecoder, self._grammar, self._guess, *rows)
                 recorded = self._recordings.find(prompt.embeds, max_symbols, make)
-                return recorded(prompt, *rows, stop_after)
+                return recorded(prompt, *rows, stop_after, noise)
         model = continue_prompt(self._backbone, prompt, symbol_ids, max_symbols)
         return decode_numbers(
-            model, self._grammar, self._guess, batch_size=len(prompt.embeds), stop_after=stop_after
+            model,
+            self._grammar,
+            self._guess,
+            batch_size=len(prompt.embeds),
+            stop_after=stop_after,
+            noise=noise,
         )
 
 

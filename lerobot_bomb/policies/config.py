@@ -19,6 +19,7 @@ from lerobot_bomb.training.policy_flags import (
     check_crop,
     check_ensemble,
     check_model_name_and_precision,
+    check_not_negative,
     check_state,
     check_training,
     cosine_decay,
@@ -169,7 +170,7 @@ class VlaConfig(ChunkConfig):
 
 @dataclass
 class TokenVlaConfig(VlaConfig):
-    """Of a policy whose actions are tokens: an ensemble of its chunks, and answers by `torch.compile`."""
+    """Of a policy whose actions are tokens: how they are chosen, compiled, and averaged over chunks."""
 
     CHOICES: ClassVar[dict[str, tuple]] = {**VlaConfig.CHOICES, "temporal_ensemble_weighting": WEIGHTINGS}
     MODES: ClassVar[tuple[NormalizationMode, ...]] = BOUNDED_MODES
@@ -182,7 +183,12 @@ class TokenVlaConfig(VlaConfig):
     temporal_ensemble_coefficient: float = 0.01
     # answers on CUDA by `torch.compile`: some ten seconds for every size of batch, then faster
     compile_model: bool = False
+    # what is chosen: the likeliest token (0), or a sample of softmax(logits / temperature)
+    temperature: float = 0.0
+    # of the samples; every episode has its own
+    noise_seed: int = 0
 
     def check_flags(self) -> None:
         super().check_flags()
         check_ensemble(self)
+        check_not_negative(self, ("temperature", "noise_seed"))

@@ -3,7 +3,7 @@
 from abc import abstractmethod
 from collections import deque
 from collections.abc import Iterator, Sequence
-from contextlib import contextmanager, nullcontext
+from contextlib import contextmanager, nullcontext, suppress
 from typing import Any, ClassVar, Self
 
 import torch
@@ -17,11 +17,15 @@ from lerobot_bomb.actions.ensemble import TemporalEnsemble
 from lerobot_bomb.actions.relative import bounds
 from lerobot_bomb.checkpoints.adapters import frozen_buffers
 from lerobot_bomb.data.columns import dim_names
+from lerobot_bomb.decoding.kv_cache import check_positions
+from lerobot_bomb.flow.noise import SamplingNoise, gumbel
 from lerobot_bomb.hub.policy import HubPolicy
 from lerobot_bomb.policies.config import ChunkConfig, TokenVlaConfig, VlaConfig
 from lerobot_bomb.training.distributed import SavesTiedWeightsOnce
 from lerobot_bomb.training.policy_flags import check_as_trained, check_weights_fit, trained_with
 from lerobot_bomb.vlm.inputs import read_tensor
+from lerobot_bomb.vlm.prompt import task_ids, task_text
+from lerobot_bomb.vlm.tokenizer import load_tokenizer
 
 
 class ChunkPolicy(HubPolicy, SavesTiedWeightsOnce, PreTrainedPolicy):
@@ -88,6 +92,17 @@ class ChunkPolicy(HubPolicy, SavesTiedWeightsOnce, PreTrainedPolicy):
 
     def reset(self) -> None:
         self._queue: deque[Tensor] = deque(maxlen=self.config.n_action_steps)
+        self._batch_size: int | None = None  # of the episodes that are under way
+
+    def _check_batch_size(self, batch: dict[str, Tensor]) -> None:
+        """Raise unless a batch has as many rows as the one before it since `reset`."""
+        batch_size = len(batch[self._cameras[0]])
+        if self._batch_size not in (None, batch_size):
+            raise ValueError(
+                f"a batch of {batch_size} observations follows one of {self._batch_size}, whose episodes are "
+                f"under way; call policy.reset() where episodes begin"
+            )
+        self._batch_size = batch_size
 
     def _kept(self, batch: dict[str, Tensor]) -> Tensor:
         """(B, T) bool: which actions are trained on."""
@@ -130,6 +145,29 @@ class VlaPolicy(ChunkPolicy):
     name = "vla"  # pyright: ignore[reportAssignmentType]
     config: VlaConfig
 
+    def _check_instructions(
+        self, meta: LeRobotDatasetMetadata, text_config: Any, template: str, num_others: int
+    ) -> None:
+        """Raise unless a dataset's instructions fit into the model's positions beside so many other tokens.
+
+        A token is at least a byte of text, so the tokenizer is asked only if there are too many of these.
+        Where it cannot be had, as in a training further without the base model, the first batch will tell.
+
+        Raises:
+            ValueError: the longest does not fit.
+        """
+        texts = {task: task_text(task, template) for task in (() if meta.tasks is None else meta.tasks.index)}
+        longest = max(texts, key=lambda task: len(texts[task].encode()), default="")
+        num_tokens = len(texts.get(longest, "").encode())
+        way_out = f"shorten the dataset's instruction {longest[:40]!r}..."
+        try:
+            check_positions(text_config, num_others + num_tokens, way_out)
+        except ValueError:
+            with suppress(OSError):
+                tokenizer = load_tokenizer(self.config.vlm_model_name)
+                num_tokens = max(len(task_ids(tokenizer, task, template)) for task in texts)
+                check_positions(text_config, num_others + num_tokens, way_out)
+
     @contextmanager
     def _autocast(self) -> Iterator[None]:
         """The precision of ``config.dtype``, whoever calls: training, evaluation or a user's own loop."""
@@ -147,6 +185,17 @@ class TokenVlaPolicy(VlaPolicy):
     name = "token_vla"  # pyright: ignore[reportAssignmentType]
     config: TokenVlaConfig
     _ensemble: TemporalEnsemble | None
+
+    def __init__(self, config: Any, dataset_meta: LeRobotDatasetMetadata | None = None, **_: object):
+        super().__init__(config, dataset_meta)
+        self._sampling_noise = SamplingNoise(config.noise_seed, is_per_episode=True, draw=gumbel)
+
+    def _choice_noise(self, batch_size: int, shape: tuple[int, ...]) -> Tensor | None:
+        """(B, *shape) to be added to logits, so that the likeliest choice is a sample; None: it is greedy."""
+        if not self.config.temperature:
+            return None
+        noise = self._sampling_noise.draw(batch_size, shape)
+        return self.config.temperature * noise.to(self._device)
 
     def _make_ensemble(self) -> TemporalEnsemble | None:
         """None: a queue instead."""
@@ -166,22 +215,36 @@ class TokenVlaPolicy(VlaPolicy):
 
     def reset(self) -> None:
         super().reset()
+        self._sampling_noise.begin()
         if self._ensemble is not None:
             self._ensemble.reset()
 
-    def select_action(self, batch: dict[str, Tensor], **_: object) -> Tensor:
+    def select_action(self, batch: dict[str, Tensor]) -> Tensor:
         """(B, D) next normalised action.
 
         With a temporal ensemble every call predicts; else when the queue of ``n_action_steps`` is empty.
+
+        Raises:
+            ValueError: the batch has another size than the one before, and `reset` was not called in between.
         """
+        self._check_batch_size(batch)
         if self._ensemble is not None:
             return self._ensemble(self._predict(batch, self.config.temporal_ensemble_size))
         if not self._queue:
             self._queue.extend(self._predict(batch, self.config.n_action_steps).unbind(dim=1))
         return self._queue.popleft()
 
-    def predict_action_chunk(self, batch: dict[str, Tensor], **_: object) -> Tensor:
-        """(B, T, D) normalised actions."""
+    def predict_action_chunk(
+        self,
+        batch: dict[str, Tensor],
+        *,
+        inference_delay: int | None = None,
+        prev_chunk_left_over: Tensor | None = None,
+    ) -> Tensor:
+        """(B, T, D) normalised actions.
+
+        The others are what LeRobot's real-time chunking passes; a chunk of tokens is not guided by them.
+        """
         return self._predict(batch, self.config.chunk_size)
 
     @abstractmethod

@@ -6,6 +6,7 @@ Shapes: `B` batch, `L` tokens, `H` hidden size of the text model, `V` vocabulary
 import json
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -64,16 +65,29 @@ class SmolVLMBackbone(nn.Module):
         return self.vlm.model.text_model(inputs_embeds=embeds_BLH, use_cache=False).last_hidden_state
 
     def head(self, token_ids: Tensor) -> Callable[[Tensor], Tensor]:
-        """The output head of a few tokens: (..., H) -> (..., len(token_ids))."""
+        """The output head of a few tokens, in float32: (..., H) -> (..., len(token_ids)).
+
+        In bfloat16 the likeliest of ten digits is often one of several, of which argmax takes the lowest.
+        """
         head = self.vlm.lm_head
         if type(head) is not nn.Linear:  # such as one with an adapter
-            return lambda hidden: head(hidden)[..., token_ids]
-        rows = head.weight[token_ids]
-        return lambda hidden: linear(hidden, rows)
+            return lambda hidden: in_float32(head, hidden)[..., token_ids]
+        return partial(exact_linear, weight=head.weight[token_ids])
 
     def logits(self, hidden_BLH: Tensor) -> Tensor:
         """(..., H) -> (..., V)."""
         return self.vlm.lm_head(hidden_BLH)
+
+
+def in_float32(module: Callable[[Tensor], Tensor], hidden: Tensor) -> Tensor:
+    """What a module of float32 weights makes of (..., H), whatever autocast says."""
+    with torch.autocast(hidden.device.type, enabled=False):
+        return module(hidden.float())
+
+
+def exact_linear(hidden: Tensor, weight: Tensor) -> Tensor:
+    """(..., H), (O, H) -> (..., O) float32."""
+    return in_float32(partial(linear, weight=weight.float()), hidden)
 
 
 def load_backbone(vlm_model_name: str, changes: Mapping[str, Any] | None = None) -> SmolVLMBackbone:

@@ -92,8 +92,9 @@ def _check_distinct(symbol_ids: list[int], vlm_model_name: str) -> None:
     for text, token in zip(SYMBOL_TEXTS, symbol_ids, strict=True):
         if token in texts:
             raise ValueError(
-                f"--policy.vlm_model_name={vlm_model_name}: its tokenizer writes {texts[token]!r} and {text!r} "
-                f"as the same token; the policy needs one of its own for every digit and for a lone space"
+                f"--policy.vlm_model_name={vlm_model_name}: its tokenizer writes {texts[token]!r} and "
+                f"{text!r} as the same token; the policy needs one of its own for every digit and for a "
+                f"lone space"
             )
         texts[token] = text
 
@@ -128,9 +129,14 @@ def normalize_task(task: str) -> str:
     return re.sub(r"[_\r\n]", " ", task.lower()).strip()
 
 
+def task_text(task: str, template: str = TASK_TEMPLATE) -> str:
+    """The prompt's task part; ``{}`` in the template stands for the task."""
+    return template.format(normalize_task(task))
+
+
 def task_ids(tokenizer: Tokenizer, task: str, template: str = TASK_TEMPLATE) -> list[int]:
-    """Tokens of the prompt's task part; ``{}`` in the template stands for the task."""
-    return text_ids(tokenizer, template.format(normalize_task(task)))
+    """Tokens of the prompt's task part."""
+    return text_ids(tokenizer, task_text(task, template))
 
 
 def text_ids(tokenizer: Tokenizer, text: str) -> list[int]:

@@ -103,6 +103,7 @@ class SpatialvlaGridPolicy(TokenVlaPolicy):
             self.backbone.text_model,
             FIRST_POSITION,
             prompt_reads_all=self._prompt_reads_all,
+            cap=self.backbone.cap,
             drafted=config.draft != "none",
             compiled=config.compile_model,
         )
@@ -249,13 +250,13 @@ class SpatialvlaGridPolicy(TokenVlaPolicy):
         with self._autocast():
             prompt = self._prompt(batch)
             embeds_BLH = self._embeds(batch, prompt.ids)
-            # the cap on logits keeps their order
             cells_BS = self._writer(
                 Prompt(embeds_BLH, prompt.mask),
                 self._group_rows,
                 num_steps,
                 self.cell_embedding.weight * self.backbone.embed_scale,
                 self.cell_head.weight,
+                self._choice_noise(len(embeds_BLH), (num_steps, self.grids.num_tokens)),
             )
         # casts of weights cached under inference mode cannot be used by a later training step
         torch.clear_autocast_cache()

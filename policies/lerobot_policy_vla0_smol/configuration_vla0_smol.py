@@ -98,6 +98,33 @@ class Vla0SmolConfig(TokenVlaConfig):
             if not 0 <= getattr(self, flag) <= 1:
                 raise ValueError(f"--policy.{flag}={getattr(self, flag)} must lie in 0..1")
 
+    def check_masking(self) -> None:
+        """Raise unless training can hide what it is told to hide.
+
+        Of n units of a chunk a fraction below ``mask_max_fraction`` is hidden, rounded down.
+
+        Raises:
+            ValueError: that is none of them.
+        """
+        if self.mask_max_fraction == 0 or self.mask_skip_prob == 1:
+            return
+        num_numbers = self.chunk_size * len(self.action_names)
+        num_units = {
+            "step": self.chunk_size,
+            "value": num_numbers,
+            "char": num_numbers * (1 + (self.number_width or 1)),  # at least
+        }[self.mask_level]
+        if num_units * self.mask_max_fraction > 1:
+            return
+        more = (
+            f"more than 1/{num_units} = {1 / num_units:.3g}" if num_units > 1 else "--policy.mask_level=value"
+        )
+        raise ValueError(
+            f"--policy.mask_max_fraction={self.mask_max_fraction}: of the {num_units} that "
+            f"--policy.mask_level={self.mask_level} may hide in a chunk it hides none; "
+            f"give {more}, or 0 to hide nothing"
+        )
+
     @property
     def action_names(self) -> list[str]:
         """A name for every action dimension: the dataset's, or its number."""

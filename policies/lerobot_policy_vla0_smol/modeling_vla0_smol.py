@@ -20,6 +20,7 @@ from lerobot_bomb.actions.relative import RelativeActions, bounds, named_dims, p
 from lerobot_bomb.actions.text import (
     END,
     IGNORED,
+    NUM_SYMBOLS,
     SPACE,
     Answer,
     NumberTokens,
@@ -47,7 +48,7 @@ from lerobot_bomb.vlm.backbone import (
 )
 from lerobot_bomb.vlm.images import crop_and_resize
 from lerobot_bomb.vlm.inputs import read_actions, read_image, read_task
-from lerobot_bomb.vlm.prompt import PromptTokens
+from lerobot_bomb.vlm.prompt import TASK_TEMPLATE, PromptTokens
 from lerobot_bomb.vlm.tokenizer import load_tokenizer
 from lerobot_policy_vla0_smol.card_vla0_smol import METHOD
 from lerobot_policy_vla0_smol.configuration_vla0_smol import AS_TRAINED, SHAPES, Vla0SmolConfig
@@ -71,6 +72,8 @@ class Vla0SmolPolicy(TokenVlaPolicy):
     ):
         super().__init__(config, dataset_meta)
         _take_action_names(config, dataset_meta)
+        if dataset_meta is not None:
+            config.check_masking()
         self.tokens, self.backbone = _build(config)
         self.register_buffer("symbol_ids", torch.tensor(self.tokens.symbols), persistent=False)
         self.action_bins = Bins(config.n_action_bins, config.bin_mode)
@@ -78,8 +81,8 @@ class Vla0SmolPolicy(TokenVlaPolicy):
         self.grammar = NumberGrammar(
             config.n_action_bins, config.chunk_size * self._action_dim, fixed_width=config.number_width
         )
-        num_answer = self.grammar.max_symbols(self.grammar.num_numbers)
-        check_positions(self.backbone.text_config, len(self._cameras) * len(self._image_span) + num_answer)
+        num_fixed = self._num_fixed_tokens()
+        check_positions(self.backbone.text_config, num_fixed, "give a smaller --policy.chunk_size")
         guess = (
             KnownSymbols(self.grammar)
             if config.draft == "none"
@@ -91,6 +94,7 @@ class Vla0SmolPolicy(TokenVlaPolicy):
         )
         self._ensemble = self._make_ensemble()
         if dataset_meta is not None:
+            self._check_instructions(dataset_meta, self.backbone.text_config, TASK_TEMPLATE, num_fixed)
             self._fit_relative(dataset_meta)
         self.reset()
 
@@ -203,6 +207,7 @@ class Vla0SmolPolicy(TokenVlaPolicy):
     def _answer_logits(self, batch: dict[str, Tensor], prompt: TokenRows, answer: TokenRows) -> Tensor:
         """Teacher-forced logits of every answer token: (B, A, V)."""
         ids_BL = TokenRows.join([prompt, answer]).without_padding().ids
+        check_positions(self.backbone.text_config, ids_BL.shape[1])
         hidden_BLH = self.backbone.hidden_states(self._embeds(batch, ids_BL))
         offsets_A = torch.arange(answer.ids.shape[1], device=ids_BL.device)
         # a token is predicted one column earlier; columns beyond a short row carry no label
@@ -258,8 +263,13 @@ class Vla0SmolPolicy(TokenVlaPolicy):
             if not prompt.ids.is_cuda:  # prompts of other lengths would be recorded anew there
                 prompt = prompt.without_padding()
             embeds_BLH = self._embeds(batch, prompt.ids)
+            num_numbers = num_steps * self._action_dim
+            noise_shape = self.grammar.max_symbols(num_numbers), NUM_SYMBOLS
             decoded = self._writer(
-                Prompt(embeds_BLH, prompt.mask), self.symbol_ids, num_steps * self._action_dim
+                Prompt(embeds_BLH, prompt.mask),
+                self.symbol_ids,
+                num_numbers,
+                self._choice_noise(len(embeds_BLH), noise_shape),
             )
         # casts of weights cached under inference mode cannot be used by a later training step
         torch.clear_autocast_cache()
@@ -286,6 +296,18 @@ class Vla0SmolPolicy(TokenVlaPolicy):
                 TokenRows.constant(tokens.state_end, task.ids),
             ]
         return TokenRows.join([*parts, TokenRows.constant(tokens.answer_start, task.ids)])
+
+    def _num_fixed_tokens(self) -> int:
+        """Of the longest prompt and answer, without the task."""
+        tokens, config = self.tokens, self.config
+        num_tokens = len(tokens.start) + len(tokens.answer_start)
+        num_tokens += len(self._cameras) * len([*tokens.image_start, *self._image_span, *tokens.image_end])
+        if config.use_state:
+            assert config.robot_state_feature is not None
+            width = 1 + (config.number_width or digits_needed(config.n_state_bins))
+            num_tokens += len(tokens.state_start) + len(tokens.state_end)
+            num_tokens += config.robot_state_feature.shape[0] * width
+        return num_tokens + self.grammar.max_symbols(self.grammar.num_numbers)
 
     def _to_tokens(self, numbers_BN: Tensor, num_values: int) -> NumberTokens:
         fixed_width = self.config.number_width
