@@ -9,8 +9,9 @@ LeRobot's `act` or `diffusion` (pip install 'lerobot[diffusion]') with about as 
     OMP_NUM_THREADS=1 python benchmarks/learn.py one_target --policy.type=vla0_smol --output_dir learn
 
 What is finished stays in the output folder and is not done again: the dataset, the training, each evaluation.
-A training that was killed starts anew. Flags --policy.NAME=VALUE go to `lerobot-train`. Recipes are chosen on
-other seeds than those that are reported: --first_seed=50000.
+A training that was killed starts anew. Flags --policy.NAME=VALUE go to `lerobot-train`; `robust` trains on
+from --policy.path=CHECKPOINT, or else from where its recipe says. Recipes are chosen on other seeds than are
+reported: --first_seed=50000.
 """
 
 import argparse
@@ -75,6 +76,11 @@ def main() -> None:
         sys.exit(run_task(args))
     except RuntimeError as error:
         sys.exit(f"learn.py: {error}")
+    except KeyboardInterrupt:
+        sys.exit(
+            "learn.py: interrupted; the same command goes on with what is finished (a training that was "
+            "stopped starts anew)"
+        )
 
 
 def run_task(args: argparse.Namespace) -> int:
@@ -107,10 +113,13 @@ def run_task(args: argparse.Namespace) -> int:
     others = controls | (by_what_is_left_out(results[run["steps"]]) if task.is_partial else {})
     points |= {name: count(rows, run["steps"], minutes["cpu_minutes"]) for name, rows in others.items()}
 
-    num_given = len(controls[OTHER_INSTRUCTION])
-    num_named = count_named(controls[OTHER_INSTRUCTION], given, named_targets(results[run["steps"]]))
     print_points(points)
-    print(f"{OTHER_INSTRUCTION}: {num_named}/{num_given} stones put down on the intersection that it names")
+    num_named = None
+    if (rows := controls.get(OTHER_INSTRUCTION)) is not None:
+        num_named = count_named(rows, given, named_targets(results[run["steps"]]))
+        print(
+            f"{OTHER_INSTRUCTION}: {num_named}/{len(rows)} stones put down on the intersection that it names"
+        )
     conditions = evaluate_conditions(task, folder, args.first_seed)
     if args.plot is not None:
         title = f"{args.policy_type}, {args.task}: {demonstrations} demonstrations, {task.episodes} new seeds"
@@ -127,6 +136,10 @@ def run_task(args: argparse.Namespace) -> int:
             "conditions": conditions,
         },
     )
+    checkpoint = last_checkpoint(folder / "train")
+    task_flag = f" --task_ids={list(task.task_ids)}".replace(" ", "") if task.task_ids else ""
+    watch = f"lerobot-bomb view --policy.path={checkpoint} --image_size={IMAGE_SIZE} --seed={args.first_seed}"
+    print(f"The policy: {checkpoint}\nAn episode of it as a video: {watch} {task_flag}".rstrip())
     return 0 if training.bar is None else verdict(points[f"step {run['steps']}"], training.bar)
 
 
@@ -139,7 +152,7 @@ def verdict(last: Point, bar: Bar) -> int:
     """Say whether the last checkpoint reaches the bar; 0 if it does."""
     is_reached = last.num_successes >= bar.success * last.num_episodes and last.cpu_minutes <= bar.cpu_minutes
     print(
-        f"bar {100 * bar.success:.0f} % within {bar.cpu_minutes:.0f} CPU minutes: "
+        f"To be reached: {100 * bar.success:.0f} % within {bar.cpu_minutes:.0f} CPU minutes: "
         f"{'reached' if is_reached else 'MISSED'}"
     )
     return 0 if is_reached else 1
@@ -240,17 +253,20 @@ def evaluate_checkpoints(task: Task, folder: Path, first_seed: int, last: int) -
 def evaluate_controls(
     task: Task, folder: Path, first_seed: int, given: dict[str, str]
 ) -> dict[str, list[Row]]:
-    """{control: results} of the last checkpoint with black cameras, and given other instructions."""
+    """{control: results} of the last checkpoint with black cameras, and given other instructions.
+
+    Where all episodes have one target there are none.
+    """
     import lerobot_policy_keypoint_probe  # noqa: F401  its processor step must be known when it is loaded
 
     from lerobot_bomb.explain.interventions import BlankImages, ReplaceTasks, intervene
 
     checkpoint = last_checkpoint(folder / "train")
+    controls = [(NO_IMAGES, BlankImages(), "blank_images")]
+    if given:
+        controls.append((OTHER_INSTRUCTION, ReplaceTasks(given), "other_instruction"))
     results = {}
-    for name, step, changed in (
-        (NO_IMAGES, BlankImages(), "blank_images"),
-        (OTHER_INSTRUCTION, ReplaceTasks(given), "other_instruction"),
-    ):
+    for name, step, changed in controls:
         shutil.rmtree(checkpoint.with_name(changed), ignore_errors=True)
         intervene(checkpoint, [step], checkpoint.with_name(changed))
         output_dir = folder / f"eval_{changed}"
@@ -307,8 +323,10 @@ def evaluate(
 
 
 def other_instructions(rows: list[Row]) -> dict[str, str]:
-    """{instruction: that of another target}; where all episodes have one target, in other words only."""
+    """{instruction: that of another target}; {} where all episodes have one."""
     targets = named_targets(rows)
+    if len(set(map(tuple, targets.values()))) == 1:
+        return {}
     instructions = sorted(targets)
 
     def shifted(places: int) -> dict[str, str]:
@@ -317,7 +335,7 @@ def other_instructions(rows: list[Row]) -> dict[str, str]:
     def num_others(given: dict[str, str]) -> int:
         return sum(targets[instruction] != targets[other] for instruction, other in given.items())
 
-    return max(map(shifted, range(1, max(2, len(instructions)))), key=num_others)
+    return max(map(shifted, range(1, len(instructions))), key=num_others)
 
 
 def named_targets(rows: list[Row]) -> dict[str, list[int]]:

@@ -39,7 +39,7 @@ def commands(monkeypatch: pytest.MonkeyPatch, stock_cli: Callable[..., None]) ->
             stock_cli(command, *flags, *short, "--eval.batch_size=1")
 
     training = learning_tasks.Training(demonstrations=1, bar=learn.Bar(0.5, cpu_minutes=5), steps=2)
-    tiny = learn.Task((), episodes=1, trainings={learn.PROBE: training}, is_partial=True)
+    tiny = learn.Task((), episodes=2, trainings={learn.PROBE: training}, is_partial=True)
     for name, value in {"run_command": run, "TASKS": {"tiny": tiny}, "IMAGE_SIZE": SIZE}.items():
         monkeypatch.setattr(learn, name, value)
     monkeypatch.setattr(learn, "BATCH_SIZE", 2)
@@ -72,6 +72,7 @@ def test_a_task_is_learnt_by_stock_commands_and_goes_on_where_it_stopped(
         ("step 2", 2),
         (learn.NO_IMAGES, 2),
         (learn.OTHER_INSTRUCTION, 2),
+        ("colour for this target left out", 2),
         ("target left out", 2),
     ]
     recorded = json.loads((folder / "dataset" / "meta" / "bomb.json").read_text())["recording"]
@@ -83,14 +84,16 @@ def test_a_task_is_learnt_by_stock_commands_and_goes_on_where_it_stopped(
     assert figures["weights_sha256"] == weights
     assert figures["training"]["cpu_minutes"] == 2.0
     assert figures["points"]["step 1"]["cpu_minutes"] == 1.0
-    assert all(point["num_episodes"] == 1 for point in figures["points"].values())
-    assert "bar 50 % within 5 CPU minutes: MISSED" in capsys.readouterr().out
+    assert all(point["num_episodes"] == 2 for name, point in figures["points"].items() if "step" in name)
+    printed = capsys.readouterr().out
+    assert "To be reached: 50 % within 5 CPU minutes: MISSED" in printed
+    assert f"lerobot-bomb view --policy.path={folder / 'train' / 'checkpoints' / 'last'}" in printed
 
     commands.clear()
     (folder / "eval_000002" / "finished").unlink()
     assert learn.run_task(args) == 1
     assert commands == ["lerobot-eval"]
-    assert len((folder / "eval_000002" / "results.jsonl").read_text().splitlines()) == 1
+    assert len((folder / "eval_000002" / "results.jsonl").read_text().splitlines()) == 2
 
     args.steps = 4
     with pytest.raises(RuntimeError, match=r'holds a run of .*"steps": 2.*; name another folder'):
@@ -118,7 +121,7 @@ def test_the_other_instruction_names_another_target() -> None:
         [row(None, 1.0, instruction=name, target=at) for name, at in targets.items()]
     )
     assert all(targets[instruction] != targets[other] for instruction, other in given.items())
-    assert learn.other_instructions([row(None, 1.0, instruction="only")]) == {"only": "only"}
+    assert learn.other_instructions([row(None, 1.0, instruction="only")]) == {}
 
 
 def test_every_policy_type_has_a_recipe_for_every_task() -> None:

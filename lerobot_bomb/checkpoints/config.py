@@ -14,6 +14,7 @@ from lerobot.configs import PreTrainedConfig
 from packaging.version import Version
 
 from lerobot_bomb import __version__
+from lerobot_bomb.checkpoints.names import is_hub_id
 
 
 class PackageVersion(str):
@@ -57,6 +58,9 @@ def tell_config_errors() -> None:
     def from_pretrained(
         cls: type[PreTrainedConfig], pretrained_name_or_path: str | Path, **options: Any
     ) -> PreTrainedConfig:
+        if not Path(pretrained_name_or_path).exists() and not is_hub_id(pretrained_name_or_path):
+            text = f"there is no folder {pretrained_name_or_path} here, and it is no name on the Hub"
+            raise DecodingError((), text)
         try:
             return usual.__func__(cls, pretrained_name_or_path, **options)
         except LocalEntryNotFoundError as error:

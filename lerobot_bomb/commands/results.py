@@ -15,6 +15,8 @@ from lerobot_bomb.evaluation.result_groups import (
 from lerobot_bomb.evaluation.result_lines import OLD_VERSION, read_lines
 from lerobot_bomb.evaluation.results import pair_lines, summarise
 
+MAX_SHOWN_DAMAGES = 10
+
 
 def add_results_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the arguments of ``lerobot-bomb results``."""
@@ -30,8 +32,10 @@ def run_results(args: argparse.Namespace) -> int:
         rows, damages = read_lines(path)
         if args.strict and damages:
             raise ValueError(damages[0])
-        for damage in damages:
+        for damage in damages[:MAX_SHOWN_DAMAGES]:
             print(f"{damage}; not counted", file=sys.stderr)
+        if len(damages) > MAX_SHOWN_DAMAGES:
+            print(f"{path}: ... and {len(damages) - MAX_SHOWN_DAMAGES} more such lines", file=sys.stderr)
         if not rows:
             raise ValueError(f"{path}: no finished episode")
         _print_file(path, groups_of(rows), len(damages))
@@ -57,7 +61,7 @@ def _print_file(path: Path, groups: list[Group], num_damaged: int) -> None:
         conditions = by_condition(group.rows)
         for condition, rows in conditions.items():
             label = f" (perturbations={condition})" if len(conditions) > 1 else ""
-            print(f"{path}{label}: {len(rows)} episodes")
+            print(f"{path}{label}: {len(rows)} episode{'s' * (len(rows) != 1)}")
             print(*(f"  {line}" for line in summarise(rows).lines()), sep="\n")
         against = pair_lines(group, groups)
         if against:

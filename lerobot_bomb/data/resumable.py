@@ -207,7 +207,10 @@ def _check_same(parameters: Parameters, path: Path) -> None:
         if value != of_existing[name]
     ]
     if differences:
-        raise ValueError(f"--resume: the {kind} in {path.parent} differs in {', '.join(differences)}")
+        raise ValueError(
+            f"--resume: the {kind} in {path.parent} differs in {', '.join(differences)}; give the flags that "
+            f"it was begun with, or another --root"
+        )
 
 
 def lock_folder(folder: Path) -> AbstractContextManager[object]:

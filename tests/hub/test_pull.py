@@ -75,7 +75,7 @@ NEWER = change_config(package_version="99.0", new_flag=1)
 # of the policy: evaluation and Python alike
 POLICY: dict[str, Damage] = {
     "config.json not found in": remove("config.json"),
-    "config.json cannot be read: Unterminated string": truncate("config.json"),
+    "config.json cannot be read: Unterminated string": write("config.json", '{"type": "vla0'),
     "config.json cannot be read: pop expected": write("config.json", "[]"),
     "config.json cannot be read: Policy type 'vla9' (from config.json of": change_config(type="vla9"),
     "written by lerobot_bomb 99.0, newer than the installed 0.1.0: update lerobot_bomb": NEWER,
@@ -156,9 +156,8 @@ def test_no_hub_and_no_such_folder(
     from huggingface_hub import constants
 
     misspelt = "outputs/misspelt/pretrained_model"
-    assert f"{misspelt}: its config.json cannot be read: Repo id must" in told(
-        lambda: evaluate(misspelt), capsys
-    )
+    text = told(lambda: evaluate(misspelt), capsys)
+    assert f"there is no folder {misspelt} here, and it is no name on the Hub" in text
     files = "http://127.0.0.1:9/{repo_id}/resolve/{revision}/{filename}"
     monkeypatch.setattr(constants, "HUGGINGFACE_CO_URL_TEMPLATE", files)
     text = told(lambda: evaluate(REPO_ID), capsys)
