@@ -83,6 +83,7 @@ def make_policy(num_dims: int) -> SpatialvlaGridPolicy:
         device="cpu",
         input_features=dict.fromkeys(CAMERAS, image),
         output_features={"action": PolicyFeature(FeatureType.ACTION, (num_dims,))},
+        action_layout="pose" if num_dims == 7 else None,
     )
     return SpatialvlaGridPolicy(config).eval()
 

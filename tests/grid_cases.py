@@ -11,9 +11,10 @@ from lerobot_bomb.actions.grids import ActionGrids
 
 
 def fitted(actions: Tensor | np.ndarray, rest: Any = None, **changes: Any) -> ActionGrids:
-    """On normalised actions (N, D), with the default groups unless others are given."""
+    """On normalised actions (N, D), with the default groups (7 dims: of a pose) unless others are given."""
     num_dims = actions.shape[1]
-    grids = ActionGrids(GridSettings(**{"groups": default_groups(num_dims), **changes}), num_dims)
+    groups = default_groups(num_dims, layout="pose" if num_dims == 7 else None)
+    grids = ActionGrids(GridSettings(**{"groups": groups, **changes}), num_dims)
     grids.fit(actions, rest)
     return grids
 

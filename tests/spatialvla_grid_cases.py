@@ -24,12 +24,13 @@ def make_config(num_dims: int = 4, *, has_depth: bool = True, **options: Any) ->
         for kind, shape in shapes.items()
         for camera in ("workspace", "wrist")
     }
+    layout: dict[str, Any] = {"action_layout": "pose"} if num_dims == 7 else {}
     return SpatialvlaGridConfig(
         vlm_model_name="nano",
         device="cpu",
         input_features={WORKSPACE: visual, WRIST: visual, "observation.state": state, **geometry},
         output_features={"action": PolicyFeature(FeatureType.ACTION, (num_dims,))},
-        **(layers_of(options) | options),
+        **(layers_of(options) | layout | options),
     )
 
 

@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+import torch
 from lerobot.configs import NormalizationMode
 from lerobot.datasets import LeRobotDatasetMetadata
 from lerobot.utils.constants import ACTION
@@ -137,6 +138,27 @@ def test_groups_and_coordinates_are_as_asked_for(root: Path, capsys: pytest.Capt
     assert "dx: -1.0000 -0.6000 -0.2000 0.2000 0.6000 1.0000\n" in text
 
 
+def test_joints_have_a_token_each(root: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert fit_grid(root, "--policy.action_layout=joints") == 0
+    text = capsys.readouterr().out
+    fit = table(text, "Coordinates, theta and phi in radians")
+    assert {row["bins"] for row in fit.values()} == {256} and "decoded to no motion" not in text
+
+
+def test_the_share_of_actions_that_rest_is_shown(root: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    shares = {}
+    for length in (None, 0.5):
+        assert fit_grid(root, *([] if length is None else [f"--policy.rho_dead={length}"])) == 0
+        text = capsys.readouterr().out
+        found = re.search(r"dx, dy, dz: ([\d.]+)% of the actions are decoded to no motion", text)
+        assert found is not None
+        shares[length] = float(found[1]) / 100
+    grids, actions, _ = fitted(LeRobotDatasetMetadata(REPO_ID, root=root))
+    is_still = grids.encode(torch.from_numpy(actions))[:, 0] == 0
+    assert shares[None] == pytest.approx(is_still.float().mean().item(), abs=6e-4)
+    assert shares[0.5] > shares[None] + 0.1
+
+
 def test_the_plot_has_the_edges_where_the_grid_has_them(root: Path, tmp_path: Path) -> None:
     assert fit_grid(root, f"--plot={tmp_path / 'grid.png'}") == 0
     assert [path.name for path in tmp_path.iterdir()] == ["grid.png"]
@@ -171,6 +193,10 @@ def test_bars_of_a_histogram_are_where_the_values_are() -> None:
             "--policy.grid_distribution='cauchy' is unknown; choose one of",
         ),
         ("--policy.grid_min_sigma=-1", "--policy.grid_min_sigma=-1.0 must be a number of at least 0"),
+        (
+            "--policy.action_layout=arm",
+            "--policy.action_layout='arm' is unknown; choose one of: pose, joints",
+        ),
         ("--policy.rho_dead=2", "--policy.rho_dead=2.0 must be in"),
         (
             '--policy.normalization_mapping={"ACTION": "MEAN_STD"}',

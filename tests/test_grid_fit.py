@@ -1,6 +1,7 @@
 """Action grids that are fitted: on which samples, where exactly, and on what not."""
 
 import math
+import re
 from pathlib import Path
 from typing import Any
 
@@ -16,7 +17,7 @@ from torch import Tensor
 
 from lerobot_bomb.actions.grid_edges import MIN_WIDTH, cut, gaussian_cut, to_polar
 from lerobot_bomb.actions.grid_fit import normalised, normalised_rest
-from lerobot_bomb.actions.grid_report import clipping_text
+from lerobot_bomb.actions.grid_report import clipping_text, rest_text
 from lerobot_bomb.actions.grid_settings import ActionGroup, GridSettings, default_groups
 from lerobot_bomb.actions.grids import ActionGrids
 
@@ -78,7 +79,7 @@ def test_a_dimension_that_never_changes_comes_back() -> None:
 
 
 def test_no_motion_is_exact() -> None:
-    grids = fitted(normal_actions(5000, 7))
+    grids = fitted(normal_actions(5000, 7), rho_dead=0.02)
     still = torch.zeros(1, 7)
     assert grids.encode(still)[0, 0] == 0
     assert grids.decode(grids.encode(still))[0, :3].tolist() == [0, 0, 0]
@@ -229,22 +230,150 @@ def test_groups_that_do_not_fit(groups: list[tuple], message: str) -> None:
 )
 def test_settings_that_do_not_exist(changes: dict[str, Any], message: str) -> None:
     with pytest.raises(ValueError, match=message):
-        GridSettings(default_groups(7), **changes)
+        GridSettings(default_groups(7, layout="pose"), **changes)
+
+
+# What an action is
+
+
+POSE = ["x", "y", "z", "roll", "pitch", "yaw", "gripper"]
+ARM = ["waist", "shoulder", "elbow", "forearm_roll", "wrist_angle", "wrist_rotate", "gripper"]
 
 
 @pytest.mark.parametrize(
-    ("num_dims", "dims"),
+    ("names", "layout", "num_dims"),
     [
-        (2, [(0, 1)]),
-        (4, [(0, 1, 2), (3,)]),
-        (5, [(0, 1, 2), (3, 4)]),
-        (7, [(0, 1, 2), (3, 4, 5), (6,)]),
-        (14, [(0, 1, 2), (3, 4, 5), (6,), (7, 8, 9), (10, 11, 12), (13,)]),
+        (POSE, None, 7),
+        (["dx", "dy", "dz", "droll", "dpitch", "dyaw", "open_gripper"], None, 7),
+        (["eef_pos_x", "eef_pos_y", "eef_pos_z", "a", "b", "c", "gripper.pos"], None, 7),
+        (ARM, "pose", 7),
+        (None, "pose", 7),
+        (["dx", "dy", "dz", "gripper"], None, 4),
+        (None, None, 4),
     ],
 )
-def test_default_groups(num_dims: int, dims: list[tuple[int, ...]]) -> None:
-    groups = default_groups(num_dims)
-    assert [group.dims for group in groups] == dims
-    is_pose = num_dims in (4, 7)
-    assert [group.transform == "polar" for group in groups] == [is_pose, *[False] * (len(dims) - 1)]
-    assert ActionGrids(GridSettings(groups), num_dims).num_dims == num_dims
+def test_a_pose_has_a_direction_a_length_and_a_gripper(
+    names: list[str] | None, layout: str | None, num_dims: int
+) -> None:
+    groups = default_groups(num_dims, names, layout)
+    assert (groups[0].dims, groups[0].transform) == ((0, 1, 2), "polar")
+    assert [of.transform for of in groups[1:]] == (["identity", "binary"] if num_dims == 7 else ["identity"])
+
+
+@pytest.mark.parametrize(
+    ("names", "layout", "num_dims"),
+    [
+        ([f"joint_{i}" for i in range(7)], None, 7),
+        (ARM, None, 7),
+        (POSE, "joints", 7),
+        (["base", "shoulder", "elbow", "gripper"], None, 4),
+        (None, None, 6),
+        (None, None, 14),
+    ],
+)
+def test_no_joint_is_binary_and_each_comes_back_to_a_hundredth_of_its_range(
+    names: list[str] | None, layout: str | None, num_dims: int
+) -> None:
+    groups = default_groups(num_dims, names, layout)
+    assert [of.dims for of in groups] == [(dim,) for dim in range(num_dims)]
+    errors = joint_errors(groups, num_dims)
+    assert errors.mean() < 0.0025 and errors.quantile(0.99) < 0.01  # of a range of 2
+
+
+def test_three_joints_in_a_token_would_be_off_by_degrees() -> None:
+    groups = [(0, 1, 2), (3, 4, 5), (6,)]
+    errors = joint_errors(tuple(ActionGroup(of, "identity", (16,) * len(of)) for of in groups), 7)
+    assert errors.mean() == pytest.approx(0.04, abs=5e-4)
+
+
+def joint_errors(groups: tuple[ActionGroup, ...], num_dims: int) -> Tensor:
+    """Of joints that swing, each at a pace of its own: (N, D)."""
+    seconds = torch.linspace(0, 20, 2000, dtype=torch.float64)[:, None]
+    actions = (seconds * (0.5 + 0.1 * torch.arange(num_dims))).sin()
+    grids = fitted(actions, groups=groups)
+    return (grids.decode(grids.encode(actions)) - actions).abs()
+
+
+@pytest.mark.parametrize(
+    "names", [None, ["0", "1", "2", "3", "4", "5", "6"], [f"motor_{i}" for i in range(7)], [*POSE[:6], "w"]]
+)
+def test_seven_dims_that_nothing_tells_of_are_an_error_that_names_both_ways_out(
+    names: list[str] | None,
+) -> None:
+    with pytest.raises(ValueError, match=r"action_layout is not given.*action_layout=pose.*=joints"):
+        default_groups(7, names)
+
+
+def test_a_pose_has_four_or_seven_dims() -> None:
+    with pytest.raises(ValueError, match=r"--policy.action_layout=pose is x, y, z, .* has 6 dims"):
+        default_groups(6, layout="pose")
+
+
+def test_two_dims_share_a_token() -> None:
+    assert default_groups(2) == (ActionGroup((0, 1), "identity", (64, 64)),)
+
+
+# Frames that are not like the others
+
+
+def with_glitches(size: float, num_frames: int = 400) -> np.ndarray:
+    """Motions of about 16 mm, but for two frames; in metres."""
+    actions = np.random.default_rng(0).normal(0, 0.01, (num_frames, 4))
+    if size:
+        actions[100, :3], actions[300, :3] = size, -size
+    return actions
+
+
+def fit_of(actions: np.ndarray, **changes: Any) -> tuple[ActionGrids, np.ndarray, float]:
+    """A grid, what it is fitted on, and its mean error as a share of the mean motion, without glitches."""
+    low, high = actions.min(axis=0), actions.max(axis=0)
+    values = normalised(actions, low, high)
+    grids = fitted(values, normalised_rest(low, high), **changes)
+    decoded = grids.decode(grids.encode(torch.from_numpy(values))).numpy()
+    errors = np.linalg.norm(((decoded - values) * (high - low) / 2)[:, :3], axis=1)
+    others = np.delete(np.arange(len(actions)), [100, 300])
+    return grids, values, errors[others].mean() / np.linalg.norm(actions[others, :3], axis=1).mean()
+
+
+def test_two_glitches_in_400_frames_do_not_stop_the_others() -> None:
+    clean = fit_of(with_glitches(0))[2]
+    grids, values, error = fit_of(with_glitches(1.0))
+    cells = grids.encode(torch.from_numpy(values))
+    assert (cells[:, 0] == 0).sum() == 0
+    assert clean < 0.12 and error < 0.31
+    stopped, _, error = fit_of(with_glitches(1.0), rho_dead=0.02)
+    assert (stopped.encode(torch.from_numpy(values))[:, 0] == 0).float().mean() > 0.7 and error > 0.6
+
+
+def test_what_rests_is_still_rest_beside_motions_of_any_size() -> None:
+    actions = with_glitches(1.0)
+    actions[::2, :3] = 0
+    actions[1::20, :3] = 1e-5  # a thousandth of a motion: noise
+    grids, values, _ = fit_of(actions)
+    is_still = grids.encode(torch.from_numpy(values))[:, 0] == 0
+    assert is_still[::2].all() and is_still[1::20].all()
+    assert is_still.float().mean() < 0.56
+
+
+def test_frames_so_far_off_that_no_bin_holds_the_others_are_named() -> None:
+    message = (
+        r"95% of the dataset's motions are shorter than 1/\d+ of the longest.* actions (100, 300|300, 100),"
+    )
+    with pytest.raises(ValueError, match=message):
+        fit_of(with_glitches(10.0))
+
+
+def test_the_report_says_what_is_decoded_to_rest() -> None:
+    names = ["dx", "dy", "dz", "gripper"]
+    clean, values, _ = fit_of(with_glitches(0))
+    text, needs_remedy = rest_text(clean, values, names)
+    assert text.startswith("dx, dy, dz: 0.0% of the actions are decoded to no motion (shorter than 0.0")
+    assert text.endswith("0.0% of those that move") and not needs_remedy
+    grids, values, _ = fit_of(with_glitches(1.0))
+    text, needs_remedy = rest_text(grids, values, names)
+    assert needs_remedy and "times as long as 95% of them" in text and "grid_distribution=quantile" in text
+    old, values, _ = fit_of(with_glitches(1.0), rho_dead=0.02)
+    text, needs_remedy = rest_text(old, values, names)
+    assert needs_remedy and re.search(r"7\d.\d% of those that move. --policy.rho_dead=null", text)
+    shipped, values, _ = fit_of(with_glitches(0), zero_radius_bin=False)
+    assert rest_text(shipped, values, names) == ("", False)

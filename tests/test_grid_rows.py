@@ -36,7 +36,8 @@ def rows_of(grids: ActionGrids, seed: int = 0) -> Tensor:
 
 def fitted(actions: Tensor, **changes: Any) -> ActionGrids:
     num_dims = actions.shape[1]
-    grids = ActionGrids(GridSettings(**{"groups": default_groups(num_dims), **changes}), num_dims)
+    groups = default_groups(num_dims, layout="pose" if num_dims == 7 else None)
+    grids = ActionGrids(GridSettings(**{"groups": groups, **changes}), num_dims)
     grids.fit(actions.clamp(-1, 1))
     return grids
 

@@ -180,7 +180,7 @@ def test_json_and_state_dict_hold_the_whole_grid(point: str) -> None:
 def test_a_checkpoint_can_be_decoded_otherwise() -> None:
     actions = normal_actions(3000, 7)
     grids = fitted(actions)
-    other = ActionGrids(GridSettings(default_groups(7), decode_point="centroid"), 7)
+    other = ActionGrids(GridSettings(default_groups(7, layout="pose"), decode_point="centroid"), 7)
     other.load_state_dict(grids.state_dict())
     grids.decode_point = "centroid"
     assert torch.equal(other.decode(other.encode(actions)), grids.decode(grids.encode(actions)))

@@ -1,5 +1,6 @@
 """Saving, loading and adapting `spatialvla_grid`."""
 
+import copy
 import json
 import logging
 import os
@@ -14,6 +15,7 @@ import torch
 from lerobot.configs import PreTrainedConfig
 from lerobot.datasets import LeRobotDatasetMetadata
 from lerobot.policies.factory import make_pre_post_processors
+from lerobot.utils.constants import ACTION
 from safetensors.torch import load_file, save_file
 from spatialvla_grid_cases import make_batch, make_config, make_policy, stats
 
@@ -177,7 +179,7 @@ def test_a_checkpoint_may_decode_to_another_point(meta: LeRobotDatasetMetadata, 
             {"grid_distribution": "uniform"},
             "grid_distribution='uniform': this checkpoint's grids have 'gauss",
         ),
-        ({"rho_dead": 0.1}, "rho_dead=0.1: this checkpoint's grids have 0.02, which only a training"),
+        ({"rho_dead": 0.1}, "rho_dead=0.1: this checkpoint's grids have None, which only a training"),
         ({"decode_point": "centroid"}, "decode_point='centroid': this checkpoint's grids have 'cond_mean'"),
         ({"chunk_size": 8}, "chunk_size=8: this checkpoint was trained with 4"),
         (
@@ -192,6 +194,36 @@ def test_what_a_checkpoint_was_trained_with_cannot_be_changed_in_evaluation(
     make_policy().save_pretrained(tmp_path)
     with pytest.raises(ValueError, match=rf"--policy\.{message}"):
         SpatialvlaGridPolicy.from_pretrained(tmp_path, config=changed(tmp_path, options))
+
+
+def test_what_seven_dims_are_is_told_by_names_or_a_flag_and_kept_in_the_checkpoint(tmp_path: Path) -> None:
+    with pytest.raises(ValueError, match=r"--policy\.action_layout is not given"):
+        make_policy(num_dims=7, action_layout=None)
+    for layout, num_groups in (("pose", 3), ("joints", 7)):
+        policy = make_policy(num_dims=7, action_layout=layout)
+        assert [len(policy.grids.groups), policy._newest_only()] == [num_groups, [6] * (layout == "pose")]
+        policy.save_pretrained(tmp_path / layout)
+        loaded = SpatialvlaGridPolicy.from_pretrained(tmp_path / layout)
+        assert loaded.grids.to_dict() == policy.grids.to_dict()
+    # of before there was a flag: what its grids say
+    config = json.loads((tmp_path / "pose" / "config.json").read_text())
+    del config["action_layout"]
+    (tmp_path / "pose" / "config.json").write_text(json.dumps(config))
+    assert len(SpatialvlaGridPolicy.from_pretrained(tmp_path / "pose").grids.groups) == 3
+    with pytest.raises(ValueError, match=r"--policy\.action_groups=.*: this checkpoint's grids have"):
+        wrong = changed(tmp_path / "pose", {"action_layout": "joints"})
+        SpatialvlaGridPolicy.from_pretrained(tmp_path / "pose", config=wrong)
+
+
+def test_a_datasets_names_make_the_groups(meta: LeRobotDatasetMetadata) -> None:
+    renamed = copy.deepcopy(meta)
+    renamed.info.features[ACTION]["names"] = ["base", "shoulder", "elbow", "gripper"]
+    assert [len(of.dims) for of in SpatialvlaGridPolicy(make_config(), dataset_meta=meta).grids.groups] == [
+        3,
+        1,
+    ]
+    policy = SpatialvlaGridPolicy(make_config(), dataset_meta=renamed)
+    assert [len(of.dims) for of in policy.grids.groups] == [1] * 4
 
 
 def test_fine_tuning_may_keep_the_grids(meta: LeRobotDatasetMetadata, tmp_path: Path) -> None:

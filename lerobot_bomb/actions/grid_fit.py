@@ -9,11 +9,13 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from lerobot_bomb.actions.grid_edges import Cut, circular_mean, cut, to_polar, unrolled
+from lerobot_bomb.actions.grid_edges import MIN_WIDTH, Cut, circular_mean, cut, to_polar, unrolled
 from lerobot_bomb.actions.grid_settings import ActionGroup, GridSettings
 from lerobot_bomb.finite import require_finite_rows
 
 MIN_RHO = 1e-3  # a shorter motion has no direction to fit, where there is no bin for "no motion"
+REST_SHARE = 0.02  # of the long motions: what is shorter is "no motion", where no length is given
+LONG_MOTION = 0.95  # quantile of the motions' lengths
 EQUAL_BOUNDS = 1e-8  # LeRobot's width of a dimension whose bounds are equal
 
 
@@ -65,14 +67,15 @@ def _polar_cuts(xyz_N3: Tensor, rest: Tensor, group: ActionGroup, settings: Grid
     options = (settings.distribution, settings.min_sigma)
     theta_bins, phi_bins, rho_bins = group.bins
     theta, phi, rho = to_polar(xyz_N3 - rest).unbind(dim=-1)
-    moving = rho >= (settings.rho_dead if settings.zero_radius_bin else MIN_RHO)
+    shortest = _shortest_motion(rho, settings)
+    moving = rho >= shortest
     theta, phi = theta[moving], phi[moving]
     middle = circular_mean(phi) if settings.phi_fit == "wrapped" else 0.0
     low, high = middle - math.pi, middle + math.pi
     highest = float((1 + rest.abs()).norm())  # the corner of [-1, 1] that is farthest from rest
     if settings.zero_radius_bin:
-        above = cut(rho[moving], settings.rho_dead, highest, rho_bins - 1, *options)
-        first = above.edges.new_tensor([0.0, settings.rho_dead / 2])
+        above = cut(rho[moving], shortest, highest, rho_bins - 1, *options)
+        first = above.edges.new_tensor([0.0, shortest / 2])
         edges, means = torch.cat([first[:1], above.edges]), torch.cat([first[1:], above.means])
         of_rho = Cut(edges, means, above.mean, above.std)
     else:
@@ -82,3 +85,34 @@ def _polar_cuts(xyz_N3: Tensor, rest: Tensor, group: ActionGroup, settings: Grid
         cut(unrolled(phi, low, high), low, high, phi_bins, *options),
         of_rho,
     ]
+
+
+def _shortest_motion(rho_N: Tensor, settings: GridSettings) -> float:
+    """What is shorter is no motion, or has no direction to fit."""
+    if not settings.zero_radius_bin:
+        return MIN_RHO
+    return dead_radius(rho_N) if settings.rho_dead is None else settings.rho_dead
+
+
+def dead_radius(rho_N: Tensor) -> float:
+    """REST_SHARE of the data's long motions, in normalised units.
+
+    A share of the range would be one of the longest motion, and single frames would decide what rests.
+
+    Raises:
+        ValueError: so few frames set the range that no bin is narrow enough for this.
+    """
+    moving = rho_N[rho_N > 0]
+    if not len(moving):
+        return REST_SHARE
+    long = float(moving.sort().values[math.ceil(LONG_MOTION * len(moving)) - 1])
+    if REST_SHARE * long < MIN_WIDTH:
+        farthest = rho_N.argsort(descending=True)[:3].tolist()
+        raise ValueError(
+            f"{LONG_MOTION:.0%} of the dataset's motions are shorter than 1/{float(moving.max()) / long:.0f} "
+            f"of the longest, so single frames set the range of the normalised actions; the farthest are the "
+            f"actions {', '.join(map(str, farthest))}. Leave out their episodes (lerobot-edit-dataset "
+            f"--operation.type=delete_episodes), or give --policy.normalization_mapping with ACTION: "
+            f"QUANTILES, or the length of no motion, --policy.rho_dead"
+        )
+    return REST_SHARE * long

@@ -7,13 +7,17 @@ import textwrap
 from collections.abc import Sequence
 
 import numpy as np
+import torch
 
+from lerobot_bomb.actions.grid_fit import LONG_MOTION
 from lerobot_bomb.actions.grids import ActionGrids
 
 CLIP_TOLERANCE = 1e-3  # LeRobot estimates quantiles: an extreme that many actions have may lie a hair beyond
 LINE_WIDTH = 110  # characters
 # of a dim's actions: what lies beyond the 1 % and 99 % quantiles, twice
 MUCH_CLIPPED = 0.04
+MUCH_STOPPED = 0.5  # of the actions that move
+FEW_SET_RANGE = 10  # times the long motions that the longest is
 
 
 def coordinate_names(grids: ActionGrids, dim_names: Sequence[str]) -> list[str]:
@@ -60,3 +64,47 @@ def clipping_text(actions_ND: np.ndarray, dim_names: Sequence[str]) -> tuple[str
             "--policy.normalization_mapping with ACTION: MIN_MAX clips nothing"
         )
     return text, is_much
+
+
+def rest_text(grids: ActionGrids, actions_ND: np.ndarray, dim_names: Sequence[str]) -> tuple[str, bool]:
+    """How many normalised actions a cell of no motion takes, and whether that needs a remedy.
+
+    Empty where there is no such cell.
+    """
+    actions = torch.from_numpy(actions_ND)
+    cells_NG, coordinates_NC = grids.encode(actions), grids.coordinates(actions.float().clamp(-1, 1))
+    texts, needs_remedy, num_coordinates = [], False, 0
+    for i, group in enumerate(grids.groups):
+        num_coordinates += len(group.bins)
+        if group.transform != "polar" or not grids.settings.zero_radius_bin:
+            continue
+        names = ", ".join(dim_names[dim] for dim in group.dims)
+        rho_N = coordinates_NC[:, num_coordinates - 1].double().numpy()
+        dead = float(grids.group_edges(i)[2][1])
+        text, is_bad = _group_rest_text(rho_N, (cells_NG[:, i] == 0).numpy(), dead)
+        texts.append(f"{names}: {text}")
+        needs_remedy |= is_bad
+    return "\n".join(texts), needs_remedy
+
+
+def _group_rest_text(rho_N: np.ndarray, is_still_N: np.ndarray, dead: float) -> tuple[str, bool]:
+    moves_N = rho_N > 0
+    stopped = (is_still_N & moves_N).sum() / max(moves_N.sum(), 1)
+    text = (
+        f"{is_still_N.mean():.1%} of the actions are decoded to no motion (shorter than {dead:.2g}), "
+        f"{stopped:.1%} of those that move"
+    )
+    is_much = bool(stopped > MUCH_STOPPED)
+    if is_much:
+        text += ". --policy.rho_dead=null makes it a share of the data's long motions"
+    if not moves_N.any():
+        return text, False
+    ratio = rho_N.max() / np.quantile(rho_N[moves_N], LONG_MOTION)
+    if ratio <= FEW_SET_RANGE:
+        return text, is_much
+    return (
+        f"{text}. The longest motion is {ratio:.0f} times as long as {LONG_MOTION:.0%} of them, so that "
+        f"cells are coarse there: leave such frames' episodes out, or give "
+        f"--policy.grid_distribution=quantile, or "
+        f"--policy.normalization_mapping with ACTION: QUANTILES"
+    ), True

@@ -2,6 +2,7 @@
 
 import json
 import math
+import re
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass
 from typing import Any
@@ -15,8 +16,11 @@ TRANSFORMS = ("polar", "identity", "binary")
 POLAR_COORDINATES = ("theta", "phi", "rho")
 POLAR_BINS = (16, 32, 8)
 LINEAR_BINS = 16
+JOINT_BINS = 256
 MAX_BINS = 4096  # of a coordinate
+LAYOUTS = ("pose", "joints")
 FLAG = "--policy.action_groups"
+LAYOUT_FLAG = "--policy.action_layout"
 # flags of the policy that are called otherwise than the field of `GridSettings`
 FLAG_NAMES = {"groups": "action_groups", "distribution": "grid_distribution", "min_sigma": "grid_min_sigma"}
 
@@ -63,17 +67,60 @@ class ActionGroup:
         return [*POLAR_COORDINATES] if self.transform == "polar" else [dim_names[dim] for dim in self.dims]
 
 
-def default_groups(num_dims: int) -> tuple[ActionGroup, ...]:
-    """Groups for actions of 7 dims (pose, gripper), 4 (position, gripper), 14 (two arms) or any other."""
-    if num_dims == 7:
-        gripper = ActionGroup((6,), "binary", (2,))
-        return (ActionGroup((0, 1, 2), "polar", POLAR_BINS), _linear(3, 4, 5), gripper)
-    if num_dims == 4:
-        return (ActionGroup((0, 1, 2), "polar", POLAR_BINS), _linear(3))
+def default_groups(
+    num_dims: int, names: Sequence[str] | None = None, layout: str | None = None
+) -> tuple[ActionGroup, ...]:
+    """Groups for actions of these dims.
+
+    A pose has SpatialVLA's: direction and length of x, y, z, then three angles and a binary gripper (7 dims)
+    or a gripper in `LINEAR_BINS` (4). Two dims share a token; of all others each is one of `JOINT_BINS`.
+
+    Args:
+        num_dims: of the action.
+        names: of its dims, which tell whether it is a pose; numbers alone tell nothing.
+        layout: of `LAYOUTS`, whatever the names are.
+
+    Raises:
+        ValueError: there is no such pose, or 7 dims may be a pose or seven joints.
+    """
+    layout = layout or _named_layout(num_dims, list(names or []))
+    if layout == "pose":
+        if num_dims not in (4, 7):
+            raise ValueError(
+                f"{LAYOUT_FLAG}=pose is x, y, z, gripper or x, y, z, three angles, gripper; the action has "
+                f"{num_dims} dims. Give {LAYOUT_FLAG}=joints or {FLAG}"
+            )
+        position = ActionGroup((0, 1, 2), "polar", POLAR_BINS)
+        if num_dims == 4:
+            return (position, _linear(3))
+        return (position, _linear(3, 4, 5), ActionGroup((6,), "binary", (2,)))
     if num_dims == 2:
         return (ActionGroup((0, 1), "identity", (64, 64)),)
-    arms = (range(7), range(7, 14)) if num_dims == 14 else (range(num_dims),)
-    return tuple(_linear(*arm[first : first + 3]) for arm in arms for first in range(0, len(arm), 3))
+    return tuple(ActionGroup((dim,), "identity", (JOINT_BINS,)) for dim in range(num_dims))
+
+
+def _named_layout(num_dims: int, names: list[str]) -> str:
+    """What the names say; without any, four dims are a pose, in which no dim becomes binary."""
+    if num_dims not in (4, 7):
+        return "joints"
+    words = [re.findall("[a-z]+", name.lower()) for name in names]
+    is_position = len(words) == num_dims and all(
+        not {axis, f"d{axis}", f"delta{axis}"}.isdisjoint(of)
+        for axis, of in zip("xyz", words[:3], strict=True)
+    )
+    if is_position and "grip" in names[-1].lower():
+        return "pose"
+    # "motor_0" to "motor_6" may be anything
+    tells = not is_position and (len({*map(tuple, words)}) > 1 or "joint" in "".join(names).lower())
+    if tells:
+        return "joints"
+    if num_dims == 4:
+        return "pose"
+    raise ValueError(
+        f"{LAYOUT_FLAG} is not given, and the names of the 7 action dims ({', '.join(names) or 'none'}) do "
+        f"not say what they are. Give {LAYOUT_FLAG}=pose for x, y, z, three angles and a gripper that is "
+        f"open or closed, {LAYOUT_FLAG}=joints for seven joints, or {FLAG}"
+    )
 
 
 def _linear(*dims: int) -> ActionGroup:
@@ -103,8 +150,8 @@ class GridSettings:
     decode_point: str = "cond_mean"
     # whether the polar groups' first bin of rho means "no motion" exactly
     zero_radius_bin: bool = True
-    # rho, in normalised units, below which that is so
-    rho_dead: float = 0.02
+    # rho, in normalised units, below which that is so; None = REST_SHARE of the samples' long motions
+    rho_dead: float | None = None
     # whether phi is cut opposite the samples' mean direction, or at pi
     phi_fit: str = "wrapped"
 
@@ -114,8 +161,10 @@ class GridSettings:
         one_of("--policy.phi_fit", self.phi_fit, PHI_FITS)
         if not 0 <= self.min_sigma < math.inf:
             raise ValueError(f"--policy.grid_min_sigma={self.min_sigma} must be a number of at least 0")
-        if not 1e-3 <= self.rho_dead <= 0.5:
-            raise ValueError(f"--policy.rho_dead={self.rho_dead} must be in [0.001, 0.5]")
+        if self.rho_dead is not None and not 1e-3 <= self.rho_dead <= 0.5:
+            raise ValueError(
+                f"--policy.rho_dead={self.rho_dead} must be in [0.001, 0.5], or null to follow the data"
+            )
 
     @classmethod
     def from_dict(cls, settings: dict[str, Any]) -> "GridSettings":

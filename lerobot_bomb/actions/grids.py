@@ -177,7 +177,7 @@ class ActionGrids(nn.Module):
         """
         if missing := [key for key in PUBLISHED_KEYS if key not in parameters]:
             raise ValueError(f"the published grid lacks {', '.join(missing)}; it has {', '.join(parameters)}")
-        groups = default_groups(7) if groups is None else groups
+        groups = default_groups(7, layout="pose") if groups is None else groups
         settings = GridSettings(groups, "gaussian", min_sigma, decode_point, False, phi_fit="linear")
         grids = cls(settings, 7)
         lows, highs = [0, -math.pi, 0, -1, -1, -1], [math.pi, math.pi, math.sqrt(3), 1, 1, 1]

@@ -17,8 +17,21 @@ from lerobot.utils.constants import ACTION
 from PIL import Image
 
 from lerobot_bomb.actions.grid_fit import normalised, normalised_rest
-from lerobot_bomb.actions.grid_report import clipping_text, coordinate_edges, coordinate_names, edges_text
-from lerobot_bomb.actions.grid_settings import DECODE_POINTS, ActionGroup, GridSettings, default_groups
+from lerobot_bomb.actions.grid_report import (
+    clipping_text,
+    coordinate_edges,
+    coordinate_names,
+    edges_text,
+    rest_text,
+)
+from lerobot_bomb.actions.grid_settings import (
+    DECODE_POINTS,
+    LAYOUT_FLAG,
+    LAYOUTS,
+    ActionGroup,
+    GridSettings,
+    default_groups,
+)
 from lerobot_bomb.actions.grids import ActionGrids
 from lerobot_bomb.actions.relative import BOUND_STATISTICS, bounds
 from lerobot_bomb.commands.arguments import path_flag
@@ -37,15 +50,15 @@ def add_fit_grid_arguments(parser: argparse.ArgumentParser) -> None:
     add("--dataset.repo_id", dest="repo_id", required=True, help="name of the dataset")
     root = "folder of the dataset (default: LeRobot's, $HF_LEROBOT_HOME/REPO_ID)"
     add("--dataset.root", dest="root", type=path_flag, help=root)
-    groups = (
-        """as JSON: '[{"dims": [0, 1], "transform": "identity", "bins": [64, 64]}, ...]' (default: by size)"""
-    )
+    groups = """as JSON: '[{"dims": [0, 1], "transform": "identity", "bins": [64, 64]}, ...]'"""
     add("--policy.action_groups", dest="groups", type=json_of(list), help=groups)
+    layout = f"what the action is: {' or '.join(LAYOUTS)} (default: what the dimensions' names say)"
+    add(LAYOUT_FLAG, dest="layout", help=layout)
     distribution = "of the edges: gaussian, uniform or quantile (default: gaussian)"
     add("--policy.grid_distribution", dest="distribution", default=default.distribution, help=distribution)
     sigma = "least standard deviation of a coordinate, in its unit (default: 0)"
     add("--policy.grid_min_sigma", dest="min_sigma", type=float, default=default.min_sigma, help=sigma)
-    rho_dead = f"length below which there is no motion (default: {default.rho_dead})"
+    rho_dead = "length below which there is no motion (default: a fiftieth of the data's long motions)"
     add("--policy.rho_dead", dest="rho_dead", type=float, default=default.rho_dead, help=rho_dead)
     phi_fit = "where the angle phi is cut: wrapped or linear (default: wrapped)"
     add("--policy.phi_fit", dest="phi_fit", default=default.phi_fit, help=phi_fit)
@@ -76,17 +89,22 @@ def run_fit_grid(args: argparse.Namespace) -> int:
     mode = NormalizationMode(mode)
     meta = read_meta(args.repo_id, args.root)
     low_D, high_D = action_bounds(meta, mode)
-    num_dims = len(low_D)
+    num_dims, names = len(low_D), dim_names(meta.features[ACTION])
+    if args.layout is not None:
+        one_of(LAYOUT_FLAG, args.layout, LAYOUTS)
     groups = (
-        default_groups(num_dims) if args.groups is None else tuple(map(ActionGroup.from_dict, args.groups))
+        default_groups(num_dims, names, args.layout)
+        if args.groups is None
+        else tuple(map(ActionGroup.from_dict, args.groups))
     )
     options = {name: getattr(args, name) for name in ("distribution", "min_sigma", "rho_dead", "phi_fit")}
     grids = ActionGrids(GridSettings(groups, **options), num_dims)
     actions_ND = normalised(read_columns(meta, (ACTION,))[ACTION], low_D, high_D)
     grids.fit(actions_ND, normalised_rest(low_D, high_D))
-    names = dim_names(meta.features[ACTION])
     print(f"{meta.repo_id}: {len(actions_ND)} actions, -1 and 1 at {' and '.join(BOUND_STATISTICS[mode])}")
     print(clipping_text(actions_ND, names)[0])
+    if rest := rest_text(grids, actions_ND, names)[0]:
+        print(rest)
     print_fit(grids, names)
     errors = quantisation_errors(grids, actions_ND)
     print_errors("in normalised units", errors, names)

@@ -7,7 +7,7 @@ from lerobot.datasets import LeRobotDatasetMetadata
 from lerobot.utils.constants import ACTION
 
 from lerobot_bomb.actions.grid_fit import normalised, normalised_rest
-from lerobot_bomb.actions.grid_report import clipping_text
+from lerobot_bomb.actions.grid_report import clipping_text, rest_text
 from lerobot_bomb.actions.grids import ActionGrids
 from lerobot_bomb.actions.relative import bounds, present_episodes
 from lerobot_bomb.data.columns import dim_names, read_columns
@@ -39,7 +39,8 @@ def make_grids(config: SpatialvlaGridConfig, meta: LeRobotDatasetMetadata | None
         grids = ActionGrids.from_dict(config.grid_params, num_dims)
         grids.decode_point = config.decode_point
         return grids
-    grids = ActionGrids(config.grid_settings(), num_dims)
+    names = None if meta is None else dim_names(meta.features[ACTION])
+    grids = ActionGrids(config.grid_settings(names), num_dims)
     if meta is not None:
         fit_to_data(grids, config, meta)
     config.grid_params = grids.to_dict()
@@ -53,8 +54,10 @@ def fit_to_data(grids: ActionGrids, config: SpatialvlaGridConfig, meta: LeRobotD
     low_D, high_D = bounds(meta.stats[ACTION], config.normalization_mapping["ACTION"], actions_ND.shape[1])
     actions_ND = normalised(actions_ND, low_D, high_D)
     grids.fit(actions_ND, normalised_rest(low_D, high_D))
-    text, is_much = clipping_text(actions_ND, dim_names(meta.features[ACTION]))
-    logger.log(logging.WARNING if is_much else logging.INFO, "%s: %s", meta.repo_id, text)
+    names = dim_names(meta.features[ACTION])
+    for text, needs_remedy in (clipping_text(actions_ND, names), rest_text(grids, actions_ND, names)):
+        if text:
+            logger.log(logging.WARNING if needs_remedy else logging.INFO, "%s: %s", meta.repo_id, text)
 
 
 def build_model(config: SpatialvlaGridConfig) -> tuple[PaliGemmaPrompt, PaliGemmaBackbone]:

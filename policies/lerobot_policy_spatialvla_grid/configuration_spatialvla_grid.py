@@ -1,12 +1,21 @@
 """Config of ``spatialvla_grid``."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from typing import Any, ClassVar
 
 from lerobot.configs import PreTrainedConfig
 from lerobot.utils.constants import OBS_IMAGES
 
-from lerobot_bomb.actions.grid_settings import ActionGroup, GridSettings, check_groups, default_groups
+from lerobot_bomb.actions.grid_settings import (
+    LAYOUT_FLAG,
+    LAYOUTS,
+    ActionGroup,
+    GridSettings,
+    check_groups,
+    default_groups,
+)
+from lerobot_bomb.flags import one_of
 from lerobot_bomb.policies.config import TokenVlaConfig
 from lerobot_bomb.training.policy_flags import (
     check_not_negative,
@@ -48,8 +57,11 @@ class SpatialvlaGridConfig(TokenVlaConfig):
     use_state: bool = False
 
     # [{"dims": [0, 1, 2], "transform": "polar", "bins": [16, 32, 8]}, ...]: one token each a step; None = by
-    # the number of action dimensions
+    # `action_layout`
     action_groups: list[dict[str, Any]] | None = None
+    # what the action is: a "pose" (x, y, z, gripper; of 7 with three angles before the gripper) or "joints";
+    # None = what its dimensions' names say
+    action_layout: str | None = None
     # how edges are placed: by the Gaussian or by the quantiles of the data, or evenly
     grid_distribution: str = "gaussian"
     # lower limit of the fitted standard deviations, in normalised units
@@ -57,9 +69,10 @@ class SpatialvlaGridConfig(TokenVlaConfig):
     # what a cell decodes to: "mid" (bin's middle), "cond_mean" (mean of the fitted Gaussian within the bin)
     # or "centroid" (mean of the data within the cell)
     decode_point: str = "cond_mean"
-    # whether a polar group's smallest radius means "no motion" exactly, and up to which it does
+    # whether a polar group's smallest radius means "no motion" exactly, and up to which it does; None = a
+    # fiftieth of the data's long motions
     zero_radius_bin: bool = True
-    rho_dead: float = 0.02
+    rho_dead: float | None = None
     # whether the angle phi is cut opposite the data's mean direction ("wrapped") or at pi ("linear")
     phi_fit: str = "wrapped"
     # edges and all else of the grids; filled in from the training data
@@ -99,8 +112,10 @@ class SpatialvlaGridConfig(TokenVlaConfig):
 
     def check_flags(self) -> None:
         super().check_flags()
+        if self.action_layout is not None:
+            one_of(LAYOUT_FLAG, self.action_layout, LAYOUTS)
         if self.action_feature is not None:
-            self.grid_settings()
+            self._grid_settings(self._given_groups() or ())
         check_not_negative(self, ("grid_min_sigma",))
         check_positive(self, ("ego3d_patch_reso", "ego3d_n_freqs"))
 
@@ -130,18 +145,34 @@ class SpatialvlaGridConfig(TokenVlaConfig):
                 f"--policy.depth_source=none; --policy.camera_intrinsics stands in for intrinsics"
             )
 
-    def grid_settings(self) -> GridSettings:
-        """How new grids are made for the dataset's actions.
+    def grid_settings(self, names: Sequence[str] | None = None) -> GridSettings:
+        """How grids are made for the dataset's actions, whose dimensions have these names.
 
         Raises:
-            ValueError: a flag of it is wrong, or the groups do not have every action dimension once.
+            ValueError: a flag of it is wrong, the groups do not have every action dimension once, or nothing
+                says what the dimensions are.
         """
+        groups = self._given_groups()
+        if groups is None:
+            assert self.action_feature is not None
+            groups = default_groups(self.action_feature.shape[0], names)
+        return self._grid_settings(groups)
+
+    def _given_groups(self) -> tuple[ActionGroup, ...] | None:
+        """Those of a flag or of the checkpoint; None: names must tell."""
         assert self.action_feature is not None
         (num_dims,) = self.action_feature.shape
-        groups = default_groups(num_dims)
         if self.action_groups is not None:
             groups = tuple(ActionGroup.from_dict(group) for group in self.action_groups)
             check_groups(groups, num_dims)
+            return groups
+        if self.action_layout is not None:
+            return default_groups(num_dims, layout=self.action_layout)
+        if self.grid_params is not None:
+            return GridSettings.from_dict(self.grid_params["settings"]).groups
+        return None
+
+    def _grid_settings(self, groups: tuple[ActionGroup, ...]) -> GridSettings:
         return GridSettings(
             groups,
             distribution=self.grid_distribution,
