@@ -15,6 +15,7 @@ from lerobot.configs import FeatureType, NormalizationMode, PolicyFeature, PreTr
 from lerobot.datasets import LeRobotDatasetMetadata
 from lerobot.policies.factory import make_pre_post_processors
 from lerobot.utils.constants import OBS_LANGUAGE_ATTENTION_MASK, OBS_LANGUAGE_TOKENS
+from relative_cases import make_dataset
 from safetensors.torch import load_file, save_file
 from tokenizers import Tokenizer
 from torch import Tensor
@@ -23,7 +24,6 @@ from vla0_smol_cases import (
     WRIST,
     make_batch,
     make_config,
-    make_dataset,
     make_policy,
     raw_batch,
 )

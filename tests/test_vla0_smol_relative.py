@@ -9,7 +9,8 @@ import torch
 from lerobot.configs import PreTrainedConfig
 from lerobot.datasets import LeRobotDatasetMetadata
 from lerobot.policies import factory
-from vla0_smol_cases import NAMES, make_batch, make_config, make_dataset, make_policy
+from relative_cases import NAMES, make_dataset
+from vla0_smol_cases import make_batch, make_config, make_policy
 
 from lerobot_bomb.decoding.decoder import Decoded
 from lerobot_policy_vla0_smol.modeling_vla0_smol import Vla0SmolPolicy

@@ -1,12 +1,9 @@
 """Small policies and batches of ``vla0_smol`` that several test modules use."""
 
-from pathlib import Path
 from typing import Any
 
-import numpy as np
 import torch
 from lerobot.configs import FeatureType, PolicyFeature
-from lerobot.datasets import LeRobotDataset, LeRobotDatasetMetadata
 from variants import layers_of
 
 from lerobot_bomb.actions.text import NumberTokens
@@ -14,7 +11,6 @@ from lerobot_policy_vla0_smol import Vla0SmolConfig, make_vla0_smol_pre_post_pro
 from lerobot_policy_vla0_smol.modeling_vla0_smol import Vla0SmolPolicy
 
 WORKSPACE, WRIST = "observation.images.workspace", "observation.images.wrist"
-NAMES = ["x", "y", "z", "grip"]
 TASK = "Place a black stone on the Go board at row {}, column 1."
 # literal statistics: state and action in [-1, 1] stay as they are
 STATS = {
@@ -66,24 +62,3 @@ def make_batch(policy: Vla0SmolPolicy, batch_size: int, seed: int = 0) -> dict[s
 def numbers_of(policy: Vla0SmolPolicy, batch: dict[str, Any]) -> NumberTokens:
     """The actions of a batch as the policy writes them."""
     return policy._numbers(batch, policy._bins(batch))
-
-
-def make_dataset(
-    root: Path, reach: float, *, delta: bool = False, names: Any = NAMES
-) -> LeRobotDatasetMetadata:
-    """Two episodes of 30 frames; the action is the state and up to `reach` more, or the state's change."""
-    features = {
-        key: {"dtype": "float32", "shape": (4,), "names": names} for key in ("observation.state", "action")
-    }
-    dataset = LeRobotDataset.create("test/relative", fps=10, features=features, root=root, use_videos=False)
-    generator = np.random.default_rng(0)
-    for _ in range(2):
-        states = np.cumsum(generator.uniform(-1, 1, size=(30, 4)), axis=0)
-        offsets = generator.uniform(-reach, reach, size=(30, 4))
-        actions = np.diff(states, axis=0, append=states[-1:]) if delta else states + offsets
-        for state, action in zip(states, actions, strict=True):
-            frame = {"observation.state": state.astype(np.float32), "action": action.astype(np.float32)}
-            dataset.add_frame({**frame, "task": "push"})
-        dataset.save_episode()
-    dataset.finalize()
-    return LeRobotDatasetMetadata("test/relative", root=root)

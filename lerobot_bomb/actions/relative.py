@@ -23,7 +23,7 @@ BOUND_STATISTICS = {
     NormalizationMode.QUANTILE10: ("q10", "q90"),
 }
 CENTRE_AND_DISTANCE = ("mean", "std")
-QUANTILE = 0.999  # of the residuals' sizes; what lies beyond saturates
+QUANTILE = 0.999  # of the residuals' sizes; where normalised values are bounded, what lies beyond saturates
 MAX_RESIDUALS = 20_000_000  # a dimension; of more, evenly spaced frames are taken
 
 
@@ -121,11 +121,13 @@ class RelativeActions(nn.Module):
         chunk_size: int,
         action_bounds: tuple[np.ndarray, np.ndarray],
         state_bounds: tuple[np.ndarray, np.ndarray],
+        mode: NormalizationMode = NormalizationMode.MIN_MAX,
     ) -> None:
         """Take gain and bias from the normalisers' bounds, scale from the data's own residuals.
 
-        ``episode_ends_N``: for each frame the index after its episode's last one. A dimension whose action
-        never changes stays absolute.
+        Residuals are as large as actions that are normalised by ``mode``: of root mean square 1 for MEAN_STD,
+        else within [-1, 1]. ``episode_ends_N``: for each frame the index after its episode's last one. A
+        dimension whose action never changes stays absolute.
 
         Raises:
             ValueError: actions or states are not finite, or the state of a dimension does not track its
@@ -144,7 +146,7 @@ class RelativeActions(nn.Module):
             self.gain[dim] = float((state_high - state_low) / (high - low))
             self.bias[dim] = float((state_high + state_low - high - low) / (high - low))
             residuals = _residuals(actions_N, states_N, episode_ends_N, chunk_size)
-            self.scale[dim] = float(np.quantile(np.abs(residuals), QUANTILE) * 2 / (high - low)) or 1.0
+            self.scale[dim] = float(_size(residuals, mode) * 2 / (high - low)) or 1.0
 
 
 def _require_tracking(
@@ -162,6 +164,13 @@ def _require_tracking(
             f"--policy.relative_actions=false, or name such dimensions in --policy.relative_exclude_joints, "
             f"or the right state dimensions in --policy.relative_state_indices"
         )
+
+
+def _size(residuals_N: np.ndarray, mode: NormalizationMode) -> float:
+    """What becomes 1."""
+    if mode is NormalizationMode.MEAN_STD:
+        return float(np.sqrt(np.square(residuals_N).mean()))
+    return float(np.quantile(np.abs(residuals_N), QUANTILE))
 
 
 def _residuals(

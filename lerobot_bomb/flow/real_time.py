@@ -33,7 +33,6 @@ def guided(
     The noise goes with it, so that the heads disagree as before: `residual` would take part of the guidance
     back. None left: nothing is changed.
     """
-    leftover_KD = without_padding(leftover_KD)
     if leftover_KD.shape[-2] == 0:
         return heads
 

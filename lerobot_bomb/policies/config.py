@@ -7,6 +7,7 @@ from lerobot.configs import NormalizationMode
 from lerobot.optim import AdamWConfig, CosineDecayWithWarmupSchedulerConfig
 
 from lerobot_bomb.actions.ensemble import WEIGHTINGS
+from lerobot_bomb.actions.relative import named_dims
 from lerobot_bomb.checkpoints.config import INSTALLED, PackageVersion
 from lerobot_bomb.checkpoints.environment import ConfigWithEnvironment
 from lerobot_bomb.flag_errors import flag_errors
@@ -124,9 +125,16 @@ class ChunkConfig(ConfigWithEnvironment):
 
 @dataclass
 class VlaConfig(ChunkConfig):
-    """Of a policy with a vision-language model: which one, in which precision, what of it is trained."""
+    """Of a policy with a vision-language model: which one, in which precision, what of it is trained.
 
-    CHOICES: ClassVar[dict[str, tuple]] = {**ChunkConfig.CHOICES, "dtype": DTYPES}
+    Its chunks may be executed as an ensemble.
+    """
+
+    CHOICES: ClassVar[dict[str, tuple]] = {
+        **ChunkConfig.CHOICES,
+        "dtype": DTYPES,
+        "temporal_ensemble_weighting": WEIGHTINGS,
+    }
     TASK_STEP: ClassVar[str] = "bomb_task_tokenizer"
     # flags that need the robot's state
     NEEDS_STATE: ClassVar[tuple[str, ...]] = ("use_state",)
@@ -150,10 +158,31 @@ class VlaConfig(ChunkConfig):
     dtype: str = "float32"
     gradient_checkpointing: bool = False
 
+    # chunks that an executed action is the mean of, one predicted every step; 0 = a queue instead
+    temporal_ensemble_size: int = 0
+    # "uniform", "exponential" (exp(coefficient * age)), "nvlabs" (1 for the newest, 0.5 for others) or
+    # "adaptive" (exp(coefficient * cosine with the newest action))
+    temporal_ensemble_weighting: str = "uniform"
+    # "exponential": positive favours old chunks
+    temporal_ensemble_coefficient: float = 0.01
+    # action dimensions that are not averaged, by (part of) their names
+    temporal_ensemble_exclude_joints: list[str] = field(default_factory=list)
+    # filled in from the dataset
+    action_feature_names: list[str] | None = None
+
     def check_flags(self) -> None:
         super().check_flags()
         check_model_name_and_precision(self)
         check_crop(self)
+        check_ensemble(self)
+
+    @property
+    def action_names(self) -> list[str]:
+        """A name for every action dimension: the dataset's, or its number."""
+        assert self.action_feature is not None
+        num_dims = self.action_feature.shape[0]
+        names = self.action_feature_names or []
+        return list(names) if len(names) == num_dims else [str(dim) for dim in range(num_dims)]
 
     def validate_features(self) -> None:
         super().validate_features()
@@ -169,18 +198,53 @@ class VlaConfig(ChunkConfig):
 
 
 @dataclass
-class TokenVlaConfig(VlaConfig):
-    """Of a policy whose actions are tokens: how they are chosen, compiled, and averaged over chunks."""
+class RelativeVlaConfig(VlaConfig):
+    """Of a policy whose actions may be differences to the state that a chunk starts from."""
 
-    CHOICES: ClassVar[dict[str, tuple]] = {**VlaConfig.CHOICES, "temporal_ensemble_weighting": WEIGHTINGS}
+    NEEDS_STATE: ClassVar[tuple[str, ...]] = (*VlaConfig.NEEDS_STATE, "relative_actions")
+
+    # actions as such differences, converted inside the policy. LeRobot's name for it, use_relative_actions,
+    # makes its fine-tuning look for processor steps of its own
+    relative_actions: bool = False
+    # action dimensions that stay absolute, by (part of) their names
+    relative_exclude_joints: list[str] = field(default_factory=list)
+    # the state dimension of each relative action dimension; None = the same number
+    relative_state_indices: list[int] | None = None
+
+    def relative_dims(self) -> dict[int, int]:
+        """{action dimension that is relative: its state dimension}.
+
+        Raises:
+            ValueError: an excluded name or a state dimension does not exist, or their numbers differ.
+        """
+        assert self.robot_state_feature is not None
+        num_states = self.robot_state_feature.shape[0]
+        flag = "--policy.relative_exclude_joints"
+        excluded = named_dims(self.action_names, self.relative_exclude_joints, flag)
+        dims = [dim for dim in range(len(self.action_names)) if dim not in excluded]
+        indices = self.relative_state_indices
+        if indices is None and num_states == len(self.action_names):
+            indices = dims
+        if indices is None or len(indices) != len(dims):
+            raise ValueError(
+                f"--policy.relative_actions=true: {len(dims)} of {len(self.action_names)} action dimensions "
+                f"are relative and the state has {num_states}; give --policy.relative_state_indices with "
+                f"{len(dims)} of them, in order"
+            )
+        if not all(0 <= index < num_states for index in indices):
+            raise ValueError(
+                f"--policy.relative_state_indices={indices} must lie in 0..{num_states - 1} "
+                f"(dimensions of observation.state)"
+            )
+        return dict(zip(dims, indices, strict=True))
+
+
+@dataclass
+class TokenVlaConfig(VlaConfig):
+    """Of a policy whose actions are tokens: how they are chosen, and compiled."""
+
     MODES: ClassVar[tuple[NormalizationMode, ...]] = BOUNDED_MODES
 
-    # chunks that an executed action is the mean of, one predicted every step; 0 = a queue instead
-    temporal_ensemble_size: int = 0
-    # "uniform", "exponential" (exp(coefficient * age)) or "nvlabs" (1 for the newest, 0.5 for others)
-    temporal_ensemble_weighting: str = "uniform"
-    # positive favours old chunks
-    temporal_ensemble_coefficient: float = 0.01
     # answers on CUDA by `torch.compile`: some ten seconds for every size of batch, then faster
     compile_model: bool = False
     # what is chosen: the likeliest token (0), or a sample of softmax(logits / temperature)
@@ -190,5 +254,4 @@ class TokenVlaConfig(VlaConfig):
 
     def check_flags(self) -> None:
         super().check_flags()
-        check_ensemble(self)
         check_not_negative(self, ("temperature", "noise_seed"))

@@ -2,25 +2,25 @@
 
 from abc import abstractmethod
 from collections import deque
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from contextlib import contextmanager, nullcontext, suppress
 from typing import Any, ClassVar, Self
 
 import torch
 from lerobot.datasets import LeRobotDatasetMetadata
 from lerobot.policies import PreTrainedPolicy
-from lerobot.utils.constants import ACTION
+from lerobot.utils.constants import ACTION, OBS_STATE
 from torch import Tensor, nn
 from torch.nn.attention import SDPBackend, sdpa_kernel
 
 from lerobot_bomb.actions.ensemble import TemporalEnsemble
-from lerobot_bomb.actions.relative import bounds
-from lerobot_bomb.checkpoints.adapters import frozen_buffers
-from lerobot_bomb.data.columns import dim_names
+from lerobot_bomb.actions.relative import RelativeActions, bounds, named_dims, present_episodes
+from lerobot_bomb.checkpoints.adapters import check_buffers_are_the_bases, frozen_buffers
+from lerobot_bomb.data.columns import dim_names, episode_bounds, read_columns
 from lerobot_bomb.decoding.kv_cache import check_positions
 from lerobot_bomb.flow.noise import SamplingNoise, gumbel
 from lerobot_bomb.hub.policy import HubPolicy
-from lerobot_bomb.policies.config import ChunkConfig, TokenVlaConfig, VlaConfig
+from lerobot_bomb.policies.config import ChunkConfig, RelativeVlaConfig, TokenVlaConfig, VlaConfig
 from lerobot_bomb.training.distributed import SavesTiedWeightsOnce
 from lerobot_bomb.training.policy_flags import check_as_trained, check_weights_fit, trained_with
 from lerobot_bomb.vlm.inputs import read_tensor
@@ -139,11 +139,24 @@ class ChunkPolicy(HubPolicy, SavesTiedWeightsOnce, PreTrainedPolicy):
 
 
 class VlaPolicy(ChunkPolicy):
-    """One with a vision-language model."""
+    """One with a vision-language model, whose chunks are executed from a queue or as an ensemble."""
 
     config_class = VlaConfig  # pyright: ignore[reportAssignmentType]
     name = "vla"  # pyright: ignore[reportAssignmentType]
     config: VlaConfig
+    _ensemble: TemporalEnsemble | None
+
+    def __init__(self, config: Any, dataset_meta: LeRobotDatasetMetadata | None = None, **_: object):
+        _take_action_names(config, dataset_meta)
+        super().__init__(config, dataset_meta)
+
+    @classmethod
+    def from_pretrained(
+        cls, *args, config: Any = None, dataset_meta: LeRobotDatasetMetadata | None = None, **kwargs
+    ) -> Self:
+        """As `ChunkPolicy`'s; takes the names of the data's action dimensions."""
+        _take_action_names(config, dataset_meta)
+        return super().from_pretrained(*args, config=config, dataset_meta=dataset_meta, **kwargs)
 
     def _check_instructions(
         self, meta: LeRobotDatasetMetadata, text_config: Any, template: str, num_others: int
@@ -177,26 +190,6 @@ class VlaPolicy(ChunkPolicy):
         with torch.autocast(device, dtype=torch.bfloat16, enabled=bfloat16), plain:
             yield
 
-
-class TokenVlaPolicy(VlaPolicy):
-    """One whose actions are tokens, which it need not write beyond those that are executed."""
-
-    config_class = TokenVlaConfig  # pyright: ignore[reportAssignmentType]
-    name = "token_vla"  # pyright: ignore[reportAssignmentType]
-    config: TokenVlaConfig
-    _ensemble: TemporalEnsemble | None
-
-    def __init__(self, config: Any, dataset_meta: LeRobotDatasetMetadata | None = None, **_: object):
-        super().__init__(config, dataset_meta)
-        self._sampling_noise = SamplingNoise(config.noise_seed, is_per_episode=True, draw=gumbel)
-
-    def _choice_noise(self, batch_size: int, shape: tuple[int, ...]) -> Tensor | None:
-        """(B, *shape) to be added to logits, so that the likeliest choice is a sample; None: it is greedy."""
-        if not self.config.temperature:
-            return None
-        noise = self._sampling_noise.draw(batch_size, shape)
-        return self.config.temperature * noise.to(self._device)
-
     def _make_ensemble(self) -> TemporalEnsemble | None:
         """None: a queue instead."""
         config = self.config
@@ -209,18 +202,18 @@ class TokenVlaPolicy(VlaPolicy):
             self._newest_only(),
         )
 
-    @abstractmethod
-    def _newest_only(self) -> Sequence[int]:
+    def _newest_only(self) -> list[int]:
         """Action dims that an ensemble does not average, such as a gripper that is open or closed."""
+        config, flag = self.config, "--policy.temporal_ensemble_exclude_joints"
+        return named_dims(config.action_names, config.temporal_ensemble_exclude_joints, flag)
 
     def reset(self) -> None:
         super().reset()
-        self._sampling_noise.begin()
         if self._ensemble is not None:
             self._ensemble.reset()
 
-    def select_action(self, batch: dict[str, Tensor]) -> Tensor:
-        """(B, D) next normalised action.
+    def select_action(self, batch: dict[str, Tensor], **options: Any) -> Tensor:
+        """(B, D) next normalised action; ``options`` as `predict_action_chunk` takes them.
 
         With a temporal ensemble every call predicts; else when the queue of ``n_action_steps`` is empty.
 
@@ -229,10 +222,124 @@ class TokenVlaPolicy(VlaPolicy):
         """
         self._check_batch_size(batch)
         if self._ensemble is not None:
-            return self._ensemble(self._predict(batch, self.config.temporal_ensemble_size))
+            return self._ensemble(self._predict(batch, self.config.temporal_ensemble_size, **options))
         if not self._queue:
-            self._queue.extend(self._predict(batch, self.config.n_action_steps).unbind(dim=1))
+            chunk_BTD = self._predict(batch, self.config.n_action_steps, **options)
+            self._queue.extend(chunk_BTD.unbind(dim=1))
         return self._queue.popleft()
+
+    def predict_action_chunk(self, batch: dict[str, Tensor], **options: Any) -> Tensor:
+        """(B, T, D) normalised actions."""
+        return self._predict(batch, self.config.chunk_size, **options)
+
+    @abstractmethod
+    def _predict(self, batch: dict[str, Tensor], num_steps: int, **options: Any) -> Tensor:
+        """The first ``num_steps`` normalised actions of the chunk."""
+
+
+class RelativeVlaPolicy(VlaPolicy):
+    """One whose actions may be differences to the state that a chunk starts from.
+
+    What it is trained on and predicts is relative; what comes out, queue and ensemble are absolute.
+    """
+
+    config_class = RelativeVlaConfig  # pyright: ignore[reportAssignmentType]
+    name = "relative_vla"  # pyright: ignore[reportAssignmentType]
+    config: RelativeVlaConfig
+
+    def __init__(self, config: Any, dataset_meta: LeRobotDatasetMetadata | None = None, **_: object):
+        super().__init__(config, dataset_meta)
+        self.relative = (
+            RelativeActions(self._action_dim, config.relative_dims()) if config.relative_actions else None
+        )
+        if dataset_meta is not None:
+            self._fit_relative(dataset_meta)
+
+    @classmethod
+    def from_pretrained(
+        cls, *args, config: Any = None, dataset_meta: LeRobotDatasetMetadata | None = None, **kwargs
+    ) -> Self:
+        """As `VlaPolicy`'s; relative actions fit the new data."""
+        try:
+            return super().from_pretrained(*args, config=config, dataset_meta=dataset_meta, **kwargs)
+        except ValueError as error:
+            if " relative." in str(error):
+                raise ValueError(
+                    "--policy.relative_actions is not what this checkpoint was trained with, "
+                    "and cannot be changed"
+                ) from error
+            raise
+
+    def _fit(self, meta: LeRobotDatasetMetadata) -> None:
+        super()._fit(meta)
+        self._fit_relative(meta)
+
+    @torch.no_grad()
+    def _fit_relative(self, meta: LeRobotDatasetMetadata) -> None:
+        """Take from a dataset how far its actions are from the state, where they are relative to it."""
+        if self.relative is None:
+            return
+        config = self.config
+        assert meta.stats is not None
+        if OBS_STATE not in meta.features:
+            raise ValueError(
+                f"--policy.relative_actions=true needs {OBS_STATE!r} under this name in the dataset; it has "
+                f"{sorted(meta.features)}"
+            )
+        columns = read_columns(meta, (ACTION, OBS_STATE), present_episodes(meta))
+        action_bounds, state_bounds = (
+            bounds(meta.stats[key], config.normalization_mapping[kind], columns[key].shape[1])
+            for key, kind in ((ACTION, "ACTION"), (OBS_STATE, "STATE"))
+        )
+        _, ends = episode_bounds(columns["episode_index"])
+        self.relative.fit(
+            columns[ACTION],
+            columns[OBS_STATE],
+            ends,
+            config.chunk_size,
+            action_bounds,
+            state_bounds,
+            config.normalization_mapping["ACTION"],
+        )
+
+    def _validate_peft_config(self, peft_config: Any) -> None:
+        super()._validate_peft_config(peft_config)
+        check_buffers_are_the_bases(
+            self, self._base_buffers, "start from one that lerobot-bomb init writes for this dataset"
+        )
+
+    def _to_relative(self, actions_BTD: Tensor, batch: dict[str, Tensor]) -> Tensor:
+        """Normalised actions -> what is trained on and predicted, (B, T, D) both."""
+        if self.relative is None:
+            return actions_BTD
+        return self.relative.encode(actions_BTD, self._of_batch(batch, OBS_STATE))
+
+    def _to_absolute(self, predicted_BTD: Tensor, batch: dict[str, Tensor]) -> Tensor:
+        """The inverse of `_to_relative`."""
+        if self.relative is None:
+            return predicted_BTD
+        return self.relative.decode(predicted_BTD, self._of_batch(batch, OBS_STATE))
+
+    @property
+    def _unit(self) -> Tensor:
+        """(D,) physical size of 1 in what is predicted."""
+        return self.action_unit if self.relative is None else self.action_unit * self.relative.scale
+
+
+class TokenVlaPolicy(VlaPolicy):
+    """One whose actions are tokens, which it need not write beyond those that are executed."""
+
+    config_class = TokenVlaConfig  # pyright: ignore[reportAssignmentType]
+    name = "token_vla"  # pyright: ignore[reportAssignmentType]
+    config: TokenVlaConfig
+
+    def __init__(self, config: Any, dataset_meta: LeRobotDatasetMetadata | None = None, **_: object):
+        super().__init__(config, dataset_meta)
+        self._sampling_noise = SamplingNoise(config.noise_seed, is_per_episode=True, draw=gumbel)
+
+    def reset(self) -> None:
+        super().reset()
+        self._sampling_noise.begin()
 
     def predict_action_chunk(
         self,
@@ -245,8 +352,17 @@ class TokenVlaPolicy(VlaPolicy):
 
         The others are what LeRobot's real-time chunking passes; a chunk of tokens is not guided by them.
         """
-        return self._predict(batch, self.config.chunk_size)
+        return super().predict_action_chunk(batch)
 
-    @abstractmethod
-    def _predict(self, batch: dict[str, Tensor], num_steps: int) -> Tensor:
-        """The first ``num_steps`` normalised actions of the chunk."""
+    def _choice_noise(self, batch_size: int, shape: tuple[int, ...]) -> Tensor | None:
+        """(B, *shape) to be added to logits, so that the likeliest choice is a sample; None: it is greedy."""
+        if not self.config.temperature:
+            return None
+        noise = self._sampling_noise.draw(batch_size, shape)
+        return self.config.temperature * noise.to(self._device)
+
+
+def _take_action_names(config: Any, meta: LeRobotDatasetMetadata | None) -> None:
+    """The dataset's names in one row; LeRobot keeps only those of groups where a dataset groups them."""
+    if config is not None and meta is not None:
+        config.action_feature_names = dim_names(meta.features[ACTION])

@@ -11,7 +11,7 @@ from lerobot.policies.rtc import RTCConfig
 from lerobot_bomb.flow.losses import check_learning, check_objective
 from lerobot_bomb.flow.path import TIME_SAMPLINGS
 from lerobot_bomb.flow.samplers import check_heads, check_sampling
-from lerobot_bomb.policies.config import VlaConfig
+from lerobot_bomb.policies.config import RelativeVlaConfig
 from lerobot_bomb.training.policy_flags import (
     MAX_POSITIONS,
     check_not_negative,
@@ -36,16 +36,20 @@ SHAPES = (
     "dualmod_dim",
 )
 # the same, and flags that say what the model's tokens mean
-AS_TRAINED = (*SHAPES, "image_size", "segment_attention", "reasoning_pool")
+AS_TRAINED = (
+    *SHAPES,
+    *("image_size", "segment_attention", "reasoning_pool"),
+    *("relative_actions", "relative_exclude_joints", "relative_state_indices"),
+)
 
 
 @PreTrainedConfig.register_subclass("fdvla")
 @dataclass
-class FdvlaConfig(VlaConfig):
+class FdvlaConfig(RelativeVlaConfig):
     """A Qwen2.5-VL reads noisy actions beside images and text; two heads take them to clean ones."""
 
     CHOICES: ClassVar[dict[str, tuple]] = {
-        **VlaConfig.CHOICES,
+        **RelativeVlaConfig.CHOICES,
         "reasoning_pool": REASONING_POOLS,
         "segment_attention": SEGMENT_ATTENTIONS,
         "time_sampling": TIME_SAMPLINGS,
@@ -109,6 +113,8 @@ class FdvlaConfig(VlaConfig):
     denoise_tau_min: float = 0.02
     # bound of the actions that ddim infers, in normalised units
     clip_sample_range: float = 5.0
+    # as in ACT
+    temporal_ensemble_weighting: str = "exponential"
     # of the noise that actions are sampled from
     noise_seed: int = 0
     # an episode's own noise, or the same in all episodes

@@ -28,9 +28,9 @@ from lerobot_bomb.flow.dual_mod import masked_mean_pool
 from lerobot_bomb.flow.losses import joint_loss, second_derivatives
 from lerobot_bomb.flow.noise import SamplingNoise
 from lerobot_bomb.flow.path import PathPoint, draw_tau, path_point
-from lerobot_bomb.flow.real_time import guided
+from lerobot_bomb.flow.real_time import guided, without_padding
 from lerobot_bomb.flow.samplers import SAMPLERS, Heads, sample
-from lerobot_bomb.policies.policy import VlaPolicy
+from lerobot_bomb.policies.policy import RelativeVlaPolicy
 from lerobot_bomb.training.distributed import weighed
 from lerobot_bomb.training.randomness import begin_batch
 from lerobot_bomb.vlm.images import draw_windows, resize
@@ -68,7 +68,7 @@ class Context:
         return cls(Prefix.of(tensors[1:]), tensors[0])
 
 
-class FdvlaPolicy(VlaPolicy):
+class FdvlaPolicy(RelativeVlaPolicy):
     """A Qwen2.5-VL that reads noisy actions; two heads predict where they go and what noise is in them."""
 
     config_class = FdvlaConfig  # pyright: ignore[reportAssignmentType]  LeRobot annotates it as None
@@ -98,6 +98,7 @@ class FdvlaPolicy(VlaPolicy):
         self._recorded = GraphedModel(self._sample, [self.backbone.text_model, self.segment, *heads])
         self.init_rtc_processor()
         self._sampling_noise = SamplingNoise(config.noise_seed, config.noise_per_episode)
+        self._ensemble = self._make_ensemble()
         self.reset()
 
     def _make_state_embedding(self, hidden_size: int) -> nn.Linear | None:
@@ -156,9 +157,10 @@ class FdvlaPolicy(VlaPolicy):
         return loss, self._metrics(loss, terms, velocity_BKD, noise_BKD, point, actions_BKD, kept_BK)
 
     def _actions(self, batch: dict[str, Tensor]) -> Tensor:
-        """(B, K, D) normalised."""
+        """(B, K, D) as the heads predict them: normalised, and relative where they are."""
         shape = self.config.chunk_size, self._action_dim
-        return read_actions(batch, ACTION, self.config.type, self._device, shape).float()
+        actions_BKD = read_actions(batch, ACTION, self.config.type, self._device, shape).float()
+        return self._to_relative(actions_BKD, batch)
 
     def _draw_point(self, actions_BKD: Tensor) -> PathPoint:
         tau_B = draw_tau(self.config.time_sampling, len(actions_BKD), self.generator)
@@ -182,7 +184,7 @@ class FdvlaPolicy(VlaPolicy):
         """
         parts = {name: (term, torch.ones_like(term, dtype=torch.bool)) for name, term in terms.items()}
         errors_BKD = self._implied_actions(velocity_BKD, noise_BKD, point) - actions_BKD
-        errors_BKD = errors_BKD.abs() * self.action_unit
+        errors_BKD = errors_BKD.abs() * self._unit
         parts |= self._l1_parts(errors_BKD, kept_BK[..., None].expand_as(errors_BKD))
         return means(parts, loss, self.config.trained_batches)
 
@@ -200,12 +202,9 @@ class FdvlaPolicy(VlaPolicy):
 
     # Inference
 
-    def select_action(self, batch: dict[str, Tensor], noise: Tensor | None = None, **_: object) -> Tensor:
-        """(B, D) next normalised action, of a new chunk where the queue of ``n_action_steps`` is empty."""
-        if not self._queue:
-            chunk_BKD = self.predict_action_chunk(batch, noise)
-            self._queue.extend(chunk_BKD[:, : self.config.n_action_steps].unbind(dim=1))
-        return self._queue.popleft()
+    def _predict(self, batch: dict[str, Tensor], num_steps: int, noise: Tensor | None = None) -> Tensor:
+        """The first ``num_steps`` normalised actions of the chunk, which is sampled as a whole."""
+        return self.predict_action_chunk(batch, noise)[:, :num_steps]
 
     def predict_action_chunk(
         self,
@@ -215,7 +214,6 @@ class FdvlaPolicy(VlaPolicy):
         inference_delay: int | None = None,
         prev_chunk_left_over: Tensor | None = None,
         execution_horizon: int | None = None,
-        **_: object,
     ) -> Tensor:
         """(B, K, D) normalised actions, from ``noise`` (B, K, D) or else the next of this episode.
 
@@ -230,17 +228,23 @@ class FdvlaPolicy(VlaPolicy):
             noises = self._noise(noise, shape), self._step_noise(shape)
             if self.rtc_processor is not None and prev_chunk_left_over is not None:
                 delay, heads = inference_delay or 0, self._heads(context)
-                heads = guided(heads, self.rtc_processor, prev_chunk_left_over, delay, execution_horizon)
+                left_over_BKD = self._left_over(prev_chunk_left_over, batch)
+                heads = guided(heads, self.rtc_processor, left_over_BKD, delay, execution_horizon)
                 actions_BKD = self._denoise(heads, *noises)
             elif self.action_unit.is_cuda:
                 recorded = self._recorded(self.config.sampling(), *noises, *context.tensors())
                 actions_BKD = recorded[0].clone()
             else:
                 actions_BKD = self._sample(*noises, *context.tensors())[0]
+            actions_BKD = self._to_absolute(actions_BKD, batch)
         # casts of weights cached under inference mode cannot be used by a later training step
         torch.clear_autocast_cache()
         require_finite_answers(actions_BKD.isfinite().flatten(1).all(dim=1))
         return actions_BKD
+
+    def _left_over(self, actions_KD: Tensor, batch: dict[str, Tensor]) -> Tensor:
+        """Normalised actions (K, D) or (B, K, D) of the last chunk, as this one's heads predict them."""
+        return self._to_relative(without_padding(actions_KD).to(self._device), batch)
 
     def _sample(self, noise_BKD: Tensor, step_noise: Tensor, *context: Tensor) -> tuple[Tensor]:
         """All sampling steps, as a function of tensors."""

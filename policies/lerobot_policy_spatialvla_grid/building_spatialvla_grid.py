@@ -39,8 +39,7 @@ def make_grids(config: SpatialvlaGridConfig, meta: LeRobotDatasetMetadata | None
         grids = ActionGrids.from_dict(config.grid_params, num_dims)
         grids.decode_point = config.decode_point
         return grids
-    names = None if meta is None else dim_names(meta.features[ACTION])
-    grids = ActionGrids(config.grid_settings(names), num_dims)
+    grids = ActionGrids(config.grid_settings(), num_dims)
     if meta is not None:
         fit_to_data(grids, config, meta)
     config.grid_params = grids.to_dict()

@@ -1,6 +1,5 @@
 """Config of ``spatialvla_grid``."""
 
-from collections.abc import Sequence
 from dataclasses import dataclass, field
 from typing import Any, ClassVar
 
@@ -145,8 +144,8 @@ class SpatialvlaGridConfig(TokenVlaConfig):
                 f"--policy.depth_source=none; --policy.camera_intrinsics stands in for intrinsics"
             )
 
-    def grid_settings(self, names: Sequence[str] | None = None) -> GridSettings:
-        """How grids are made for the dataset's actions, whose dimensions have these names.
+    def grid_settings(self) -> GridSettings:
+        """How grids are made for the dataset's actions.
 
         Raises:
             ValueError: a flag of it is wrong, the groups do not have every action dimension once, or nothing
@@ -155,7 +154,7 @@ class SpatialvlaGridConfig(TokenVlaConfig):
         groups = self._given_groups()
         if groups is None:
             assert self.action_feature is not None
-            groups = default_groups(self.action_feature.shape[0], names)
+            groups = default_groups(self.action_feature.shape[0], self.action_feature_names)
         return self._grid_settings(groups)
 
     def _given_groups(self) -> tuple[ActionGroup, ...] | None:

@@ -156,7 +156,8 @@ class SpatialvlaGridPolicy(TokenVlaPolicy):
         self.config.grid_params = new.to_dict()
 
     def _newest_only(self) -> list[int]:
-        return [dim for group in self.grids.groups if group.transform == "binary" for dim in group.dims]
+        binary = [dim for group in self.grids.groups if group.transform == "binary" for dim in group.dims]
+        return sorted({*binary, *super()._newest_only()})
 
     def _get_default_peft_targets(self) -> dict[str, Any]:
         return peft_targets(self, "language_model", NEW_PARTS)

@@ -1,14 +1,13 @@
 """Config of ``vla0_smol``."""
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from typing import ClassVar
 
 from lerobot.configs import PreTrainedConfig
 
 from lerobot_bomb.actions.bins import BIN_MODES
-from lerobot_bomb.actions.relative import named_dims
 from lerobot_bomb.actions.text import MASK_LEVELS, MAX_DIGITS, digits_needed
-from lerobot_bomb.policies.config import TokenVlaConfig
+from lerobot_bomb.policies.config import RelativeVlaConfig, TokenVlaConfig
 
 DRAFTS = ("none", "linear")
 MAX_BINS = 10**MAX_DIGITS
@@ -23,7 +22,7 @@ AS_TRAINED = (
 
 @PreTrainedConfig.register_subclass("vla0_smol")
 @dataclass
-class Vla0SmolConfig(TokenVlaConfig):
+class Vla0SmolConfig(RelativeVlaConfig, TokenVlaConfig):
     """A SmolVLM writes ``chunk_size`` actions as integers; ``n_action_steps`` of them are executed."""
 
     CHOICES: ClassVar[dict[str, tuple]] = {
@@ -32,7 +31,6 @@ class Vla0SmolConfig(TokenVlaConfig):
         "mask_level": MASK_LEVELS,
         "draft": DRAFTS,
     }
-    NEEDS_STATE: ClassVar[tuple[str, ...]] = ("use_state", "relative_actions")
 
     # Hub id, path of a local folder, or "nano": a small model with random weights, built in code
     vlm_model_name: str = "HuggingFaceTB/SmolVLM2-500M-Video-Instruct"
@@ -52,19 +50,6 @@ class Vla0SmolConfig(TokenVlaConfig):
     number_width: int = 0
     # text of a system message before the prompt
     system_prompt: str | None = None
-
-    # actions as differences to the state that a chunk starts from, converted inside the policy. LeRobot's
-    # name for it, use_relative_actions, makes its fine-tuning look for processor steps of its own
-    relative_actions: bool = False
-    # action dimensions that stay absolute, by (part of) their names
-    relative_exclude_joints: list[str] = field(default_factory=list)
-    # the state dimension of each relative action dimension; None = the same number
-    relative_state_indices: list[int] | None = None
-    # filled in by LeRobot from the dataset
-    action_feature_names: list[str] | None = None
-
-    # action dimensions that are not averaged, by (part of) their names
-    temporal_ensemble_exclude_joints: list[str] = field(default_factory=list)
 
     # what a pass of the model guesses and checks beside the next token: "linear" (actions go on as in the
     # answer's last two steps) or "none". Same actions, fewer passes
@@ -124,38 +109,3 @@ class Vla0SmolConfig(TokenVlaConfig):
             f"--policy.mask_level={self.mask_level} may hide in a chunk it hides none; "
             f"give {more}, or 0 to hide nothing"
         )
-
-    @property
-    def action_names(self) -> list[str]:
-        """A name for every action dimension: the dataset's, or its number."""
-        assert self.action_feature is not None
-        num_dims = self.action_feature.shape[0]
-        names = self.action_feature_names or []
-        return list(names) if len(names) == num_dims else [str(dim) for dim in range(num_dims)]
-
-    def relative_dims(self) -> dict[int, int]:
-        """{action dimension that is relative: its state dimension}.
-
-        Raises:
-            ValueError: an excluded name or a state dimension does not exist, or their numbers differ.
-        """
-        assert self.robot_state_feature is not None
-        num_states = self.robot_state_feature.shape[0]
-        flag = "--policy.relative_exclude_joints"
-        excluded = named_dims(self.action_names, self.relative_exclude_joints, flag)
-        dims = [dim for dim in range(len(self.action_names)) if dim not in excluded]
-        indices = self.relative_state_indices
-        if indices is None and num_states == len(self.action_names):
-            indices = dims
-        if indices is None or len(indices) != len(dims):
-            raise ValueError(
-                f"--policy.relative_actions=true: {len(dims)} of {len(self.action_names)} action dimensions "
-                f"are relative and the state has {num_states}; give --policy.relative_state_indices with "
-                f"{len(dims)} of them, in order"
-            )
-        if not all(0 <= index < num_states for index in indices):
-            raise ValueError(
-                f"--policy.relative_state_indices={indices} must lie in 0..{num_states - 1} "
-                f"(dimensions of observation.state)"
-            )
-        return dict(zip(dims, indices, strict=True))

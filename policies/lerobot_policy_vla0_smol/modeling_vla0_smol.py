@@ -16,7 +16,6 @@ from torch.nn.functional import cross_entropy
 
 from lerobot_bomb.actions.accuracy import counted_numbers, exact_numbers, means, read_numbers
 from lerobot_bomb.actions.bins import Bins
-from lerobot_bomb.actions.relative import RelativeActions, bounds, named_dims, present_episodes
 from lerobot_bomb.actions.text import (
     END,
     IGNORED,
@@ -29,14 +28,13 @@ from lerobot_bomb.actions.text import (
     draw_hidden,
     number_symbols,
 )
-from lerobot_bomb.checkpoints.adapters import check_buffers_are_the_bases, peft_targets
-from lerobot_bomb.data.columns import dim_names, episode_bounds, read_columns
+from lerobot_bomb.checkpoints.adapters import peft_targets
 from lerobot_bomb.decoding.decoder import Prompt
 from lerobot_bomb.decoding.draft import KnownSymbols, LinearDraft
 from lerobot_bomb.decoding.grammar import NumberGrammar
 from lerobot_bomb.decoding.kv_cache import check_positions
 from lerobot_bomb.decoding.writer import NumberWriter
-from lerobot_bomb.policies.policy import TokenVlaPolicy
+from lerobot_bomb.policies.policy import RelativeVlaPolicy, TokenVlaPolicy
 from lerobot_bomb.training.distributed import weighed
 from lerobot_bomb.training.randomness import begin_batch
 from lerobot_bomb.vlm.backbone import (
@@ -54,7 +52,7 @@ from lerobot_policy_vla0_smol.card_vla0_smol import METHOD
 from lerobot_policy_vla0_smol.configuration_vla0_smol import AS_TRAINED, SHAPES, Vla0SmolConfig
 
 
-class Vla0SmolPolicy(TokenVlaPolicy):
+class Vla0SmolPolicy(RelativeVlaPolicy, TokenVlaPolicy):
     """A stock SmolVLM that writes the next ``chunk_size`` actions as integers."""
 
     config_class = Vla0SmolConfig  # pyright: ignore[reportAssignmentType]  LeRobot annotates it as None
@@ -71,7 +69,6 @@ class Vla0SmolPolicy(TokenVlaPolicy):
         self, config: Vla0SmolConfig, dataset_meta: LeRobotDatasetMetadata | None = None, **_: object
     ):
         super().__init__(config, dataset_meta)
-        _take_action_names(config, dataset_meta)
         if dataset_meta is not None:
             config.check_masking()
         self.tokens, self.backbone = _build(config)
@@ -89,73 +86,13 @@ class Vla0SmolPolicy(TokenVlaPolicy):
             else LinearDraft(self.grammar, self._action_dim)
         )
         self._writer = NumberWriter(self.backbone, self.grammar, guess, compiled=config.compile_model)
-        self.relative = (
-            RelativeActions(self._action_dim, config.relative_dims()) if config.relative_actions else None
-        )
         self._ensemble = self._make_ensemble()
         if dataset_meta is not None:
             self._check_instructions(dataset_meta, self.backbone.text_config, TASK_TEMPLATE, num_fixed)
-            self._fit_relative(dataset_meta)
         self.reset()
-
-    @classmethod
-    def from_pretrained(
-        cls,
-        *args,
-        config: Vla0SmolConfig | None = None,
-        dataset_meta: LeRobotDatasetMetadata | None = None,
-        **kwargs,
-    ) -> "Vla0SmolPolicy":
-        """As LeRobot's, but a missing or unexpected tensor is an error; relative actions fit the new data."""
-        _take_action_names(config, dataset_meta)
-        try:
-            return super().from_pretrained(*args, config=config, dataset_meta=dataset_meta, **kwargs)
-        except ValueError as error:
-            if " relative." in str(error):
-                raise ValueError(
-                    "--policy.relative_actions is not what this checkpoint was trained with, "
-                    "and cannot be changed"
-                ) from error
-            raise
-
-    def _fit(self, meta: LeRobotDatasetMetadata) -> None:
-        super()._fit(meta)
-        self._fit_relative(meta)
-
-    @torch.no_grad()
-    def _fit_relative(self, meta: LeRobotDatasetMetadata) -> None:
-        """Take from a dataset how far its actions are from the state, where they are relative to it."""
-        if self.relative is None:
-            return
-        config = self.config
-        assert meta.stats is not None
-        if OBS_STATE not in meta.features:
-            raise ValueError(
-                f"--policy.relative_actions=true needs {OBS_STATE!r} under this name in the dataset; it has "
-                f"{sorted(meta.features)}"
-            )
-        columns = read_columns(meta, (ACTION, OBS_STATE), present_episodes(meta))
-        action_bounds, state_bounds = (
-            bounds(meta.stats[key], config.normalization_mapping[kind], columns[key].shape[1])
-            for key, kind in ((ACTION, "ACTION"), (OBS_STATE, "STATE"))
-        )
-        _, ends = episode_bounds(columns["episode_index"])
-        self.relative.fit(
-            columns[ACTION], columns[OBS_STATE], ends, config.chunk_size, action_bounds, state_bounds
-        )
-
-    def _newest_only(self) -> list[int]:
-        config, flag = self.config, "--policy.temporal_ensemble_exclude_joints"
-        return named_dims(config.action_names, config.temporal_ensemble_exclude_joints, flag)
 
     def _get_default_peft_targets(self) -> dict[str, Any]:
         return peft_targets(self, "text_model", ())
-
-    def _validate_peft_config(self, peft_config: Any) -> None:
-        super()._validate_peft_config(peft_config)
-        check_buffers_are_the_bases(
-            self, self._base_buffers, "start from one that lerobot-bomb init writes for this dataset"
-        )
 
     # Training
 
@@ -220,9 +157,7 @@ class Vla0SmolPolicy(TokenVlaPolicy):
         """Actions (B, T, D) in [-1, 1] -> bins of what is written, step by step: (B, N) int64."""
         shape = self.config.chunk_size, self._action_dim
         actions_BTD = read_actions(batch, ACTION, self.config.type, self._device, shape)
-        if self.relative is not None:
-            actions_BTD = self.relative.encode(actions_BTD, self._of_batch(batch, OBS_STATE))
-        return self.action_bins.encode(actions_BTD).flatten(1)
+        return self.action_bins.encode(self._to_relative(actions_BTD, batch)).flatten(1)
 
     def _numbers(self, batch: dict[str, Tensor], bins_BN: Tensor) -> NumberTokens:
         """Bins -> their tokens, some of them hidden while training."""
@@ -274,9 +209,7 @@ class Vla0SmolPolicy(TokenVlaPolicy):
         # casts of weights cached under inference mode cannot be used by a later training step
         torch.clear_autocast_cache()
         actions_BTD = self.action_bins.decode(decoded.numbers).view(-1, num_steps, self._action_dim)
-        if self.relative is None:
-            return actions_BTD
-        return self.relative.decode(actions_BTD, self._of_batch(batch, OBS_STATE)).clamp(-1, 1)
+        return self._to_absolute(actions_BTD, batch).clamp(-1, 1)
 
     # Prompt
 
@@ -338,17 +271,6 @@ class Vla0SmolPolicy(TokenVlaPolicy):
     @property
     def _image_span(self) -> list[int]:
         return [self.tokens.image] * self.backbone.tokens_per_image
-
-    @property
-    def _unit(self) -> Tensor:
-        """(D,) physical size of 1 in what is written."""
-        return self.action_unit if self.relative is None else self.action_unit * self.relative.scale
-
-
-def _take_action_names(config: Vla0SmolConfig | None, meta: LeRobotDatasetMetadata | None) -> None:
-    """The dataset's names in one row; LeRobot keeps only those of groups where a dataset groups them."""
-    if config is not None and meta is not None:
-        config.action_feature_names = dim_names(meta.features[ACTION])
 
 
 def _build(config: Vla0SmolConfig) -> tuple[PromptTokens, SmolVLMBackbone]:
