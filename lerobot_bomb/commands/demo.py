@@ -21,8 +21,8 @@ from lerobot_bomb.stats import format_rate
 from lerobot_bomb.tables import print_table
 
 POLICY = "vla0_smol"
-# one that its training prepares it for, and one that it does not
-CONDITIONS = (NONE, "stones:3", "light:3")
+# one axis, and all ten at once: its training shows both, and the second is where it fails
+CONDITIONS = (NONE, "light:3", "all:3")
 SUITE = "place"
 
 
@@ -47,7 +47,7 @@ FRAME_WIDTH = 384  # pixels, of a tile
 SUCCESS_RGB, FAILURE_RGB = (40, 140, 40), (190, 40, 40)  # of an edge above a tile
 EDGE = 6  # pixels, its height
 CLOSING = """\
-{policy} is a small model that learnt from nothing on one CPU core; docs/results.md says what it can do.
+{policy} is a small model, trained from scratch on one CPU core; docs/results.md says what it can do.
 Next:
   train one yourself, in minutes   make demo-train
   your own checkpoint              lerobot-eval --policy.path=FOLDER --env.type=bomb ... (docs/benchmark.md)
