@@ -1,19 +1,22 @@
 """The policy `spatialvla_grid` on the nano backbone."""
 
 import copy
+from pathlib import Path
 from typing import Any
 
 import pytest
 import torch
+from lerobot.configs import PreTrainedConfig
 from lerobot.policies.factory import make_pre_post_processors
 from spatialvla_grid_cases import SIZE, WORKSPACE, WRIST, make_batch, make_config, make_policy, stats
 from torch import Tensor, nn
-from torch.nn.functional import cross_entropy
+from torch.nn.functional import cosine_similarity, cross_entropy
 
 from lerobot_bomb.flag_errors import FlagError
 from lerobot_policy_spatialvla_grid.modeling_spatialvla_grid import SpatialvlaGridPolicy
 
 PLAIN: dict[str, Any] = {"crop_fraction": 1.0}
+BEFORE = Path(__file__).parent / "fixtures" / "before_layout" / "spatialvla_grid"
 
 
 def learn(policy: SpatialvlaGridPolicy, batch: dict[str, Any], max_steps: int = 200) -> None:
@@ -209,7 +212,8 @@ def test_actions_are_queued_and_forgotten_on_reset() -> None:
     assert torch.equal(policy.select_action(first), chunks[0][:, 0])
 
 
-def test_an_ensemble_averages_but_for_the_gripper() -> None:
+def test_an_ensemble_weighs_by_agreement_but_for_the_gripper() -> None:
+    """As the original's evaluations: exp(0.1 times the cosine with the newest action)."""
     options: dict[str, Any] = {"n_action_steps": 1, "temporal_ensemble_size": 2}
     policy = make_policy(num_dims=7, **options)
     first, second = make_batch(policy, 1, seed=1), make_batch(policy, 1, seed=2)
@@ -217,8 +221,28 @@ def test_an_ensemble_averages_but_for_the_gripper() -> None:
     policy.reset()
     policy.select_action(first)
     action = policy.select_action(second)
-    torch.testing.assert_close(action[:, :6], (chunks[0][:, 1, :6] + chunks[1][:, 0, :6]) / 2)
-    assert torch.equal(action[:, 6], chunks[1][:, 0, 6])
+    newest, older = chunks[1][:, 0], chunks[0][:, 1]
+    weights = torch.tensor([0.1, 0.1 * cosine_similarity(newest, older).item()]).softmax(dim=0)
+    torch.testing.assert_close(action[:, :6], (weights[0] * newest + weights[1] * older)[:, :6])
+    assert torch.equal(action[:, 6], newest[:, 6])
+
+
+def test_a_checkpoint_of_before_keeps_the_weights_of_its_ensemble() -> None:
+    overrides = ["--temporal_ensemble_size=2", "--n_action_steps=1"]
+    config: Any = PreTrainedConfig.from_pretrained(BEFORE, cli_overrides=overrides)
+    assert (config.temporal_ensemble_weighting, config.temporal_ensemble_coefficient) == ("uniform", 0.01)
+    ensemble = SpatialvlaGridPolicy.from_pretrained(BEFORE, config=config)._ensemble
+    assert ensemble is not None
+    ensemble(torch.tensor([[[9.0] * 4, [1.0] * 4]]))
+    # its gripper is open or closed
+    assert ensemble(torch.tensor([[[-0.5] * 4, [9.0] * 4]])).tolist() == [[0.25, 0.25, 0.25, -0.5]]
+
+
+def test_dimensions_that_are_named_are_not_averaged() -> None:
+    names = ["x", "y", "z", "gripper"]
+    options = {"n_action_steps": 1, "temporal_ensemble_size": 2, "action_feature_names": names}
+    policy = make_policy(temporal_ensemble_exclude_joints=["gripper", "y"], **options)
+    assert policy._newest_only() == [1, 3]
 
 
 def test_training_goes_on_after_evaluation_inside_one_autocast() -> None:

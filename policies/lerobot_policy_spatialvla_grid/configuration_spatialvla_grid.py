@@ -101,6 +101,10 @@ class SpatialvlaGridConfig(TokenVlaConfig):
     # cells are the same, up to ties within rounding. Not on CUDA
     draft: str = "repeat"
 
+    # as the original's evaluations on LIBERO, which take 4 chunks
+    temporal_ensemble_weighting: str = "adaptive"
+    temporal_ensemble_coefficient: float = 0.1
+
     # side of the crop as a fraction of the image: random place while training, centre otherwise
     crop_fraction: float = 0.9
     # the words' embeddings; those of the cells are always trained
