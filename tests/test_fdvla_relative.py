@@ -1,11 +1,13 @@
 """`fdvla` with relative actions, and its temporal ensemble."""
 
+import copy
 import json
 import math
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+import pandas
 import pytest
 import torch
 from fdvla_cases import make_batch, make_config, make_policy
@@ -235,3 +237,12 @@ def test_an_ensemble_is_the_mean_of_what_chunks_foresaw_as_in_act(is_relative: b
 def test_ensembles_that_do_not_fit(options: dict[str, Any], message: str) -> None:
     with pytest.raises(FlagError, match=message):
         make_config(**options)
+
+
+def test_an_instruction_beyond_the_positions_is_refused_before_training(meta: LeRobotDatasetMetadata) -> None:
+    long = copy.copy(meta)
+    long.tasks = pandas.DataFrame({"task_index": [0]}, index=pandas.Index(["put the " * 2100]))
+    with pytest.raises(
+        ValueError, match=r"model has 4096 positions; shorten the dataset's instruction 'put the"
+    ):
+        build(long)

@@ -158,28 +158,37 @@ class VlaPolicy(ChunkPolicy):
         _take_action_names(config, dataset_meta)
         return super().from_pretrained(*args, config=config, dataset_meta=dataset_meta, **kwargs)
 
-    def _check_instructions(
-        self, meta: LeRobotDatasetMetadata, text_config: Any, template: str, num_others: int
+    def _check_length(
+        self, text_config: Any, num_fixed: int, template: str, meta: LeRobotDatasetMetadata | None
     ) -> None:
-        """Raise unless a dataset's instructions fit into the model's positions beside so many other tokens.
+        """Raise unless the longest prompt and answer fit into the model's positions.
 
         A token is at least a byte of text, so the tokenizer is asked only if there are too many of these.
         Where it cannot be had, as in a training further without the base model, the first batch will tell.
 
+        Args:
+            text_config: of the text model.
+            num_fixed: tokens of everything but the instruction.
+            template: how the instruction stands in the prompt.
+            meta: of the dataset that is to be trained on, which has the instructions.
+
         Raises:
-            ValueError: the longest does not fit.
+            ValueError: they do not.
         """
-        texts = {task: task_text(task, template) for task in (() if meta.tasks is None else meta.tasks.index)}
+        check_positions(text_config, num_fixed, "give a smaller --policy.chunk_size")
+        if meta is None:
+            return
+        texts = {task: task_text(task, template) for task in ([] if meta.tasks is None else meta.tasks.index)}
         longest = max(texts, key=lambda task: len(texts[task].encode()), default="")
         num_tokens = len(texts.get(longest, "").encode())
         way_out = f"shorten the dataset's instruction {longest[:40]!r}..."
         try:
-            check_positions(text_config, num_others + num_tokens, way_out)
+            check_positions(text_config, num_fixed + num_tokens, way_out)
         except ValueError:
             with suppress(OSError):
                 tokenizer = load_tokenizer(self.config.vlm_model_name)
                 num_tokens = max(len(task_ids(tokenizer, task, template)) for task in texts)
-                check_positions(text_config, num_others + num_tokens, way_out)
+                check_positions(text_config, num_fixed + num_tokens, way_out)
 
     @contextmanager
     def _autocast(self) -> Iterator[None]:

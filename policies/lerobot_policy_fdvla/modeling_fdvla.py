@@ -22,7 +22,6 @@ from lerobot_bomb.actions.accuracy import means
 from lerobot_bomb.actions.text import TokenRows
 from lerobot_bomb.checkpoints.adapters import peft_targets
 from lerobot_bomb.cuda_graphs import GraphedModel
-from lerobot_bomb.decoding.kv_cache import check_positions
 from lerobot_bomb.finite import require_finite_answers
 from lerobot_bomb.flow.dual_mod import masked_mean_pool
 from lerobot_bomb.flow.losses import joint_loss, second_derivatives
@@ -84,7 +83,7 @@ class FdvlaPolicy(RelativeVlaPolicy):
         super().__init__(config, dataset_meta)
         self.tokens, self.backbone = build_model(config)
         num_fixed = len(self._head_ids) + len(self._tail_ids) + config.chunk_size + NUM_MARKS
-        check_positions(self.backbone.text_config, num_fixed)
+        self._check_length(self.backbone.text_config, num_fixed, "{}", dataset_meta)
         hidden_size = self.backbone.text_config.hidden_size
         self.segment = ActionSegment(config.chunk_size, self._action_dim, hidden_size)
         self.state_embedding = self._make_state_embedding(hidden_size)

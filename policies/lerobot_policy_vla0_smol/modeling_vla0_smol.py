@@ -79,7 +79,7 @@ class Vla0SmolPolicy(RelativeVlaPolicy, TokenVlaPolicy):
             config.n_action_bins, config.chunk_size * self._action_dim, fixed_width=config.number_width
         )
         num_fixed = self._num_fixed_tokens()
-        check_positions(self.backbone.text_config, num_fixed, "give a smaller --policy.chunk_size")
+        self._check_length(self.backbone.text_config, num_fixed, TASK_TEMPLATE, dataset_meta)
         guess = (
             KnownSymbols(self.grammar)
             if config.draft == "none"
@@ -87,8 +87,6 @@ class Vla0SmolPolicy(RelativeVlaPolicy, TokenVlaPolicy):
         )
         self._writer = NumberWriter(self.backbone, self.grammar, guess, compiled=config.compile_model)
         self._ensemble = self._make_ensemble()
-        if dataset_meta is not None:
-            self._check_instructions(dataset_meta, self.backbone.text_config, TASK_TEMPLATE, num_fixed)
         self.reset()
 
     def _get_default_peft_targets(self) -> dict[str, Any]:
