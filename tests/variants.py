@@ -8,7 +8,11 @@ from recipes import read_recipe
 
 type Options = dict[str, Any]
 
-ENSEMBLE: Options = {"temporal_ensemble_size": 3, "n_action_steps": 1}
+ENSEMBLE: Options = {
+    "temporal_ensemble_size": 3,
+    "temporal_ensemble_weighting": "uniform",  # what is proven is a mean
+    "n_action_steps": 1,
+}
 NO_MASKING: Options = {"mask_max_fraction": 0.0}
 CENTERS: Options = {"bin_mode": "centers"}
 FIXED_WIDTH: Options = {"number_width": 4}  # a digit more than the bins need
