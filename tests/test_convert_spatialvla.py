@@ -1,121 +1,264 @@
-"""A folder of tiny tensors with the names and files of the published SpatialVLA."""
+"""Published SpatialVLA folders as checkpoints: one that the authors' classes wrote, and small ones alike."""
 
 import json
+import re
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 import torch
-from lerobot.policies.factory import make_pre_post_processors
-from safetensors.torch import save_file
-from spatialvla_grid_cases import make_batch, make_policy
-from torch import Tensor
+from published_spatialvla import (
+    ACTION,
+    ASSUMED,
+    CAMERA,
+    DATA_SET,
+    TASK,
+    cells_of,
+    convert,
+    converted,
+    gaussians,
+    load,
+    make_original,
+    observations,
+    published_config,
+    published_tensors,
+    write_published,
+)
+from safetensors import safe_open
+from safetensors.torch import load_file, save_file
 
-from lerobot_bomb.actions.grids import ActionGrids
-from lerobot_bomb.commands.main import main
-from lerobot_bomb.vlm.tokenizer import nano_tokenizer
+from lerobot_bomb.actions.grid_settings import ActionGroup
 from lerobot_policy_spatialvla_grid.modeling_spatialvla_grid import SpatialvlaGridPolicy
 
-CAMERA = "observation.images.workspace"
-Q01, Q99 = [-0.02, -0.04, -0.05, -0.1, -0.1, -0.2, 0.0], [0.03, 0.05, 0.06, 0.1, 0.2, 0.2, 1.0]
-Folder = tuple[Path, SpatialvlaGridPolicy]
+
+@pytest.fixture(scope="module")
+def original() -> SpatialvlaGridPolicy:
+    return make_original(0)
 
 
-@pytest.fixture
-def published(tmp_path: Path, shared_data: Path) -> Folder:
-    """As the original's code saves itself: weights in two files, and a policy of ours that acts alike."""
-    grid = json.loads((shared_data / "spatialvla" / "gs_bridge.json").read_text())
-    params = ActionGrids.from_published(grid, 0.5, "mid").to_dict()
-    policy = make_policy(3, 7, grid_params=params, decode_point="mid", ego3d_zero_init=False)
-    state = policy.state_dict()
-    vlm = policy.config.vlm_config
-    assert vlm is not None
-    num_words = vlm["text_config"]["vocab_size"]
+@pytest.fixture(scope="module")
+def folder(original: SpatialvlaGridPolicy, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return write_published(original, tmp_path_factory.mktemp("published") / "tiny")
 
-    def part(ours: str, theirs: str) -> dict[str, Tensor]:
-        return {
-            theirs + name.removeprefix(ours): x.clone() for name, x in state.items() if name.startswith(ours)
-        }
 
-    model = "backbone.vlm.model."
-    unused = torch.zeros(8194, 128)  # the original's rows of cells in the table of words
-    language = part(f"{model}language_model.", "language_model.model.")
-    words = "language_model.model.embed_tokens.weight"
-    language[words] = torch.cat([language[words], unused])
-    language["language_model.lm_head.weight"] = torch.cat(
-        [state["backbone.vlm.lm_head.weight"], state["cell_head.weight"]]
-    )
-    rest = {
-        **part(f"{model}vision_tower.", "vision_tower."),
-        **part(f"{model}multi_modal_projector.", "multi_modal_projector."),
-        **part("ego3d.layers.", "position_embedding_3d.position_embedding_head."),
-        "spatial_embed_tokens.weight": state["cell_embedding.weight"],
-        "vision_zoe_model.backbone.embeddings.cls_token": torch.zeros(1, 1, 4),
-    }
-    folder = tmp_path / "published"
-    folder.mkdir()
-    save_file(language, folder / "model-00001-of-00002.safetensors")
-    save_file(rest, folder / "model-00002-of-00002.safetensors")
-    nano_tokenizer().save(str(folder / "tokenizer.json"))
-    config = {
-        "model_type": "spatialvla",
-        "image_token_index": vlm["image_token_index"],
-        "projection_dim": 128,
-        "action_token_begin_idx": num_words,
-        "spatial_token_num": 8194,
-        "ego3d_patch_reso": 2,
-        "n_freqs": 8,
-        "text_config": {**vlm["text_config"], "vocab_size": num_words + 8194},
-        "vision_config": vlm["vision_config"],
-    }
+@pytest.fixture(scope="module")
+def authors(shared_data: Path, tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Path]:
+    """A folder that the authors' own classes wrote, and a checkpoint of it."""
+    folder = shared_data / "spatialvla" / "tiny_original"
+    if not folder.is_dir():
+        pytest.skip(f"{folder} is absent; set SHARED_DATA to the folder of real inputs")
+    return folder, converted(folder, tmp_path_factory.mktemp("converted") / "checkpoint")
+
+
+# The authors' own
+
+
+@pytest.mark.parametrize(
+    ("flags", "expected"), [({}, "cells_with_zoedepth"), ({"depth_source": "none"}, "cells_without_depth")]
+)
+def test_a_converted_checkpoint_chooses_the_cells_of_the_authors_classes(
+    flags: dict[str, str], expected: str, authors: tuple[Path, Path]
+) -> None:
+    folder, checkpoint = authors
+    policy, preprocessor, _ = load(checkpoint, **flags)
+    with np.load(folder / "expected.npz") as arrays:
+        images = torch.from_numpy(arrays["images"]).permute(0, 3, 1, 2) / 255
+        batch = preprocessor({CAMERA: images, "task": [TASK] * len(images)})
+        np.testing.assert_array_equal(policy._prompt(batch).ids, arrays["prompt_ids"])
+        np.testing.assert_array_equal(cells_of(policy, batch), arrays[expected])
+        if not flags:
+            first = policy._hidden(batch, torch.zeros(len(images), 4, 3, dtype=torch.long))[:, 0, 0]
+            logits = policy._cell_logits(0, first).detach()
+            np.testing.assert_allclose(logits, arrays["first_logits_with_zoedepth"], rtol=0, atol=2e-5)
+
+
+def test_small_folders_have_the_layout_of_the_authors(
+    authors: tuple[Path, Path], folder: Path, original: SpatialvlaGridPolicy
+) -> None:
+    def layout(values: Any) -> Any:
+        """Keys and kinds of values; of names, the data sets' are free."""
+        if isinstance(values, dict):
+            return {key: layout(value) for key, value in values.items()}
+        return type(values)
+
+    ours = [json.loads((folder / name).read_text()) for name in ("config.json", "processor_config.json")]
+    theirs = [
+        json.loads((authors[0] / path.name).read_text())
+        for path in map(Path, ("config.json", "processor_config.json"))
+    ]
+    # a single kind of scene needs none of these numbers, and transformers 5 drops them
+    unused = {key: None for key in theirs[0]["vision_zoe_config"] if "patch_transformer" in key}
+    theirs[0]["vision_zoe_config"] |= unused
+    assert layout(ours) == layout(theirs)
+    with safe_open(authors[0] / "model.safetensors", "pt") as tensors:
+        names = {re.sub(r"\d+", "#", name) for name in tensors.keys()}  # noqa: SIM118
+    assert {re.sub(r"\d+", "#", name) for name in published_tensors(original)} == names
+
+
+# Small ones
+
+
+def actions_as_the_original_decodes(
+    cells: np.ndarray, processor: dict[str, Any], data_set: str
+) -> np.ndarray:
+    """(B, 12) cells -> (B, 4, 7): middles of bins, scaled where the data set's mask says so."""
+    tokens, edges = cells.reshape(len(cells), -1, 3), processor["bin_policy"]
+    first = 0
+    parts = []
+    for group, kind in enumerate(("translation", "rotation")):
+        of = [np.array(each) for each in edges[kind].values()]
+        sizes = [len(each) - 1 for each in of]
+        bins = np.unravel_index(tokens[..., group] - first, sizes)
+        parts += [(each[i] + each[i + 1]) / 2 for each, i in zip(of, bins, strict=True)]
+        first += np.prod(sizes)
+    theta, phi, rho, *angles = parts
+    xyz = rho * np.sin(theta) * np.cos(phi), rho * np.sin(theta) * np.sin(phi), rho * np.cos(theta)
+    actions = np.stack([*np.clip(xyz, -1, 1), *angles, tokens[..., 2] - first], axis=-1)
+    action = processor["statistics"][data_set]["action"]
+    low, high = np.array(action["q01"]), np.array(action["q99"])
+    return np.where(action.get("mask", [True] * 7), (actions + 1) / 2 * (high - low) + low, actions)
+
+
+OTHER = {"q01": [-1, -2, -3, -1, -1, -1, -0.5], "q99": [3, 2, 1, 1, 2, 1, 1.0]}
+
+
+@pytest.mark.parametrize(
+    ("seed", "min_sigma", "bins", "action"),
+    [
+        (0, 0.0, [(16, 32, 8), (16, 16, 16)], ACTION),
+        (1, 0.5, [(8, 16, 4), (8, 8, 8)], OTHER),
+        (2, 0.4, [(16, 32, 8), (4, 16, 8)], OTHER | {"mask": [True, False] * 3 + [True]}),
+    ],
+)
+def test_other_weights_edges_and_statistics_act_as_the_original(
+    seed: int, min_sigma: float, bins: list[tuple[int, ...]], action: dict[str, Any], tmp_path: Path
+) -> None:
+    groups = ActionGroup((0, 1, 2), "polar", bins[0]), ActionGroup((3, 4, 5), "identity", bins[1])
+    original = make_original(seed, min_sigma, (*groups, ActionGroup((6,), "binary", (2,))))
+    statistics = {"other": {"action": ACTION}, "wanted": {"action": action}}
+    folder = write_published(original, tmp_path / "published", statistics, min_sigma=min_sigma)
+    checkpoint = converted(folder, tmp_path / "checkpoint", statistics="wanted")
+    policy, preprocessor, postprocessor = load(checkpoint)
+    assert policy.config.grid_min_sigma == min_sigma
+    batch = preprocessor(observations(3, seed))
+    cells = cells_of(policy, batch)
+    assert torch.equal(cells, cells_of(original, batch)) and len(cells.unique()) > 6
+    blind, _, _ = load(checkpoint, depth_source="none")
+    assert not torch.equal(cells_of(blind, batch), cells)
+    processor = json.loads((folder / "processor_config.json").read_text())
+    expected = actions_as_the_original_decodes(cells.numpy(), processor, "wanted")
+    actions = [postprocessor(of).numpy() for of in policy.predict_action_chunk(batch).unbind(dim=1)]
+    np.testing.assert_allclose(np.stack(actions, axis=1), expected, rtol=0, atol=1e-6)
+
+
+def test_weights_may_be_in_several_files(
+    folder: Path, tmp_path: Path, original: SpatialvlaGridPolicy
+) -> None:
+    several = write_published(original, tmp_path / "several")
+    (several / "model.safetensors").unlink()
+    tensors = [*published_tensors(original).items()]
+    for part in range(2):
+        save_file(dict(tensors[part::2]), several / f"model-0000{part + 1}-of-00002.safetensors")
+    weights = [
+        load_file(converted(each, tmp_path / f"of_{each.name}") / "model.safetensors")
+        for each in (folder, several)
+    ]
+    assert weights[0].keys() == weights[1].keys()
+    assert all(torch.equal(tensor, weights[1][name]) for name, tensor in weights[0].items())
+
+
+def test_what_nothing_reads_is_dropped(original: SpatialvlaGridPolicy, tmp_path: Path) -> None:
+    folder = write_published(original, tmp_path / "published")
+    head = {"vision_tower.vision_model.head.probe": torch.zeros(1, 1, 48)}
+    save_file(published_tensors(original) | head, folder / "model.safetensors")
+    config = published_config(original)
+    del config["vision_config"]["vision_use_head"]
     (folder / "config.json").write_text(json.dumps(config))
-    action = {"q01": Q01, "q99": Q99, "mask": [True] * 6 + [False]}
-    processor = {"statistics": {"bridge_orig/1.0.0": {"action": action}}, "action_chunk_size": 4}
-    (folder / "processor_config.json").write_text(json.dumps(processor))
-    (folder / "grid.json").write_text(json.dumps(grid))
-    return folder, policy
+    weights = load_file(converted(folder, tmp_path / "checkpoint") / "model.safetensors")
+    assert not any("head.probe" in name for name in weights)
 
 
-def convert(folder: Path, output: Path, **options: str) -> int:
-    options = {"statistics": "bridge_orig/1.0.0", "camera": "workspace", "decode_point": "mid", **options}
-    flags = [f"--{name}={value}" for name, value in options.items()]
-    return main(
-        ["convert-spatialvla", str(folder), f"--output={output}", f"--grid={folder}/grid.json", *flags]
-    )
+def test_a_folder_without_zoedepth_has_no_depth(tmp_path: Path) -> None:
+    original = make_original(0, depth_source="none", depth_config=None)
+    folder = write_published(original, tmp_path / "published")
+    tensors = load_file(folder / "model.safetensors")
+    kept = {name: tensor for name, tensor in tensors.items() if "position_embedding_3d" not in name}
+    save_file(kept, folder / "model.safetensors")
+    policy, preprocessor, _ = load(converted(folder, tmp_path / "checkpoint"))
+    assert policy.config.depth_source == "none"
+    batch = preprocessor(observations(2))
+    assert torch.equal(cells_of(policy, batch), cells_of(original, batch))
 
 
-def test_a_converted_checkpoint_acts_as_its_weights_say(published: Folder, tmp_path: Path) -> None:
-    folder, policy = published
-    assert convert(folder, tmp_path / "checkpoint") == 0
-    converted = SpatialvlaGridPolicy.from_pretrained(tmp_path / "checkpoint").eval()
-    assert list(converted.config.image_features) == [CAMERA]
-    policy.config.input_features = converted.config.input_features
-    batch = make_batch(policy, 2)
-    expected = policy.predict_action_chunk(batch)
-    assert torch.equal(converted.predict_action_chunk(batch), expected)
-    preprocessor, postprocessor = make_pre_post_processors(converted.config, str(tmp_path / "checkpoint"))
-    tasks: Any = preprocessor({CAMERA: batch[CAMERA], "task": batch["task"]})
-    assert torch.equal(converted.predict_action_chunk(tasks), expected)
-    # to the robot's units; the gripper's are 0 closed and 1 open
-    action, low, high = expected[:, 0], torch.tensor(Q01), torch.tensor(Q99)
-    torch.testing.assert_close(postprocessor(action), low + (action + 1) / 2 * (high - low))
-    assert set(postprocessor(action)[:, 6].tolist()) <= {0.0, 1.0}
+# Cameras and grids
 
 
-def test_what_is_wrong_is_told(published: Folder, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    folder, _ = published
+def test_another_camera_of_the_folder_is_taken_over(original: SpatialvlaGridPolicy, tmp_path: Path) -> None:
+    other = {**ASSUMED, "intrinsic": [[400, 0, 320], [0, 500, 240], [0, 0, 1]]}
+    cameras = {"default": ASSUMED, DATA_SET: other}
+    folder = write_published(original, tmp_path / "published", intrinsic_config=cameras)
+    policy, _, _ = load(converted(folder, tmp_path / "checkpoint", camera="front"))
+    assert list(policy.config.input_features or {}) == ["observation.images.front"]
+    # in an image of 224 pixels, from the first pixel's centre
+    K = torch.tensor([[400 * 0.35, 0, 111.5], [0, 500 * 224 / 480, 111.5], [0, 0, 1]])
+    torch.testing.assert_close(torch.tensor(policy.config.camera_intrinsics["front"]), K)
+
+
+def test_a_grid_that_is_given_must_be_the_folders(
+    folder: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    for seed in range(2):
+        (tmp_path / f"gs_{seed}.json").write_text(json.dumps(gaussians(seed)))
+    edges, output = tmp_path / "gs_0.json", tmp_path / "checkpoint"
+    plain, _, _ = load(converted(folder, tmp_path / "plain"))
+    assert plain.config.decode_point == "mid"
+    means, _, _ = load(converted(folder, output, grid=edges, decode_point="cond_mean"))
+    torch.testing.assert_close(means.grids.edges, plain.grids.edges)
+    cells = torch.tensor([[[7, 8, 1]]])
+    assert not torch.allclose(means.grids.decode(cells), plain.grids.decode(cells), atol=1e-3)
+
+    def refused(message: str, **options: object) -> None:
+        assert convert(folder, tmp_path / "refused", **options) == 1
+        assert message in capsys.readouterr().err
+
+    refused("gs_1.json with a least sigma of 0.0 or 0.5", grid=tmp_path / "gs_1.json")
+    refused("with a least sigma of 0.9 (--min_sigma) has other edges", grid=edges, min_sigma=0.9)
+    refused("--decode_point=cond_mean needs --grid", decode_point="cond_mean")
+
+
+def test_the_published_grid_was_made_with_a_least_sigma_that_the_folder_does_not_say(
+    authors: tuple[Path, Path], tmp_path: Path
+) -> None:
+    folder = authors[0]
+    converted(folder, tmp_path / "checkpoint", grid=folder.parent / "gs_spatialvla_plus.json")
+    assert convert(folder, tmp_path / "other", grid=folder.parent / "gs_bridge.json") == 1
+
+
+def test_what_is_wrong_is_told(
+    original: SpatialvlaGridPolicy, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    statistics = {"bridge": {"action": ACTION}, "fractal": {"action": ACTION}}
+    folder = write_published(original, tmp_path / "published", statistics)
+    processor = json.loads((folder / "processor_config.json").read_text())
+    config = json.loads((folder / "config.json").read_text())
 
     def refused(message: str, **options: str) -> None:
         assert convert(folder, tmp_path / "checkpoint", **options) == 1
         assert message in capsys.readouterr().err
         assert not (tmp_path / "checkpoint").exists()
 
-    refused("--statistics=fractal is not in the folder; choose from bridge_orig/1.0.0", statistics="fractal")
-    (folder / "model-00002-of-00002.safetensors").unlink()
-    refused("have no spatial_embed_tokens.weight")
-    config = json.loads((folder / "config.json").read_text())
+    refused("--statistics is missing; choose from bridge, fractal")
+    refused("--statistics=other is not in the folder; choose from bridge, fractal", statistics="other")
     (folder / "config.json").write_text(json.dumps({**config, "spatial_token_num": 1026}))
-    refused("has 1026 cells, the published grid 8194")
+    refused("has 1026 cells, but processor_config.json describes 8194", statistics="bridge")
+    (folder / "config.json").write_text(json.dumps(config))
+    (folder / "processor_config.json").write_text(json.dumps({**processor, "bin_policy": None}))
+    refused("processor_config.json has no bin_policy", statistics="bridge")
+    (folder / "processor_config.json").write_text(json.dumps(processor))
+    tensors = published_tensors(original)
+    save_file({n: t for n, t in tensors.items() if "spatial" not in n}, folder / "model.safetensors")
+    refused("have no spatial_embed_tokens.weight", statistics="bridge")
     (folder / "config.json").write_text(json.dumps({**config, "model_type": "paligemma"}))
     refused("config.json is of a 'paligemma', not of a SpatialVLA")
     (folder / "processor_config.json").unlink()

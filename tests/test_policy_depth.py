@@ -8,10 +8,11 @@ from typing import Any
 import pytest
 import torch
 from torch import Tensor, nn
-from transformers import ZoeDepthConfig, ZoeDepthForDepthEstimation
+from transformers import ZoeDepthForDepthEstimation
 from transformers.image_utils import PILImageResampling
 from transformers.models.zoedepth.image_processing_zoedepth import ZoeDepthImageProcessor
 from transformers.models.zoedepth.modeling_zoedepth import ZoeDepthDepthEstimatorOutput
+from zoedepth_cases import make_zoedepth
 
 from lerobot_bomb.vlm.depth import (
     ZoeDepth,
@@ -101,33 +102,7 @@ def test_configured_intrinsics_go_before_observed_and_these_before_the_default()
 
 @pytest.fixture(scope="module")
 def model() -> ZoeDepthForDepthEstimation:
-    torch.manual_seed(0)
-    backbone: dict[str, Any] = {
-        "model_type": "beit",
-        "hidden_size": 16,
-        "num_hidden_layers": 4,
-        "num_attention_heads": 2,
-        "intermediate_size": 16,
-        "image_size": 384,
-        "patch_size": 32,
-        "drop_path_rate": 0.9,
-        "layer_scale_init_value": 1.0,
-        "initializer_range": 0.3,
-        "reshape_hidden_states": False,
-        "out_features": ["stage1", "stage2", "stage3", "stage4"],
-    }
-    config: dict[str, Any] = {
-        "initializer_range": 0.1,
-        "backbone_config": backbone,
-        "neck_hidden_sizes": [8, 8, 8, 8],
-        "fusion_hidden_size": 8,
-        "bottleneck_features": 8,
-        "num_relative_features": 8,
-        "bin_embedding_dim": 8,
-        "num_attractors": [4, 2, 1, 1],
-        "bin_configurations": [{"n_bins": 8, "min_depth": 0.001, "max_depth": 10.0}],
-    }
-    return ZoeDepthForDepthEstimation(ZoeDepthConfig(**config))
+    return make_zoedepth()
 
 
 def images(size: int) -> Tensor:

@@ -26,7 +26,8 @@ class ActionGrids(nn.Module):
     """Actions in [-1, 1] (..., D) <-> a cell per group (..., G).
 
     Polar coordinates are taken around `rest`, the normalised action that means "no motion". Until `fit`, bins
-    are of about equal width around 0. Buffers stay float32, to whatever type the module is cast.
+    are of about equal width around 0. Buffers stay float32, to whatever type the module is cast; they are in
+    no `state_dict`, but in `to_dict`, which a checkpoint's config holds.
     """
 
     edges: Tensor  # (C, E + 1) of the bins, increasing; rows of fewer bins end with inf
@@ -52,16 +53,19 @@ class ActionGrids(nn.Module):
         self._rows = _slices(len(group.bins) for group in self.groups)
         self._columns = _slices(len(group.dims) for group in self.groups)
         num_coordinates, finest = len(self.bins), max(self.bins)
-        self.register_buffer("edges", torch.full((num_coordinates, finest + 1), math.inf))
-        self.register_buffer("gaussians", torch.zeros(num_coordinates, 2))
-        self.register_buffer("means", torch.zeros(num_coordinates, finest))
         widest = max(len(group.dims) for group in self.groups)
-        self.register_buffer("centroids", torch.zeros(self.num_tokens, widest))
-        self.register_buffer("rest", torch.zeros(num_dims))
         dims = torch.tensor([dim for group in self.groups for dim in group.dims])
-        self.register_buffer("_dims", dims, persistent=False)
-        self.register_buffer("_order", dims.argsort(), persistent=False)
-        self.register_buffer("_last_bin", torch.tensor(self.bins)[:, None] - 1, persistent=False)
+        for name, values in {
+            "edges": torch.full((num_coordinates, finest + 1), math.inf),
+            "gaussians": torch.zeros(num_coordinates, 2),
+            "means": torch.zeros(num_coordinates, finest),
+            "centroids": torch.zeros(self.num_tokens, widest),
+            "rest": torch.zeros(num_dims),
+            "_dims": dims,
+            "_order": dims.argsort(),
+            "_last_bin": torch.tensor(self.bins)[:, None] - 1,
+        }.items():
+            self.register_buffer(name, values, persistent=False)
         rest_D = np.zeros(num_dims)
         self._set(fit_cuts(torch.zeros(0, num_dims, dtype=torch.float64), rest_D, settings), rest_D)
 
@@ -188,6 +192,17 @@ class ActionGrids(nn.Module):
             )
         ]
         grids._set([*cuts, gaussian_cut(0.0, 1.0, -1, 1, 2)], np.zeros(7))
+        return grids
+
+    @classmethod
+    def from_edges(cls, edges: Sequence[Tensor], settings: GridSettings, num_dims: int) -> Self:
+        """Bins (E + 1,) for each coordinate, of which nothing else is known: means are the bins' middles."""
+        cuts = []
+        for of in edges:
+            low, high = float(of[0]), float(of[-1])
+            cuts.append(Cut(of.double(), (of[:-1] + of[1:]).double() / 2, (low + high) / 2, high - low))
+        grids = cls(settings, num_dims)
+        grids._set(cuts, np.zeros(num_dims))
         return grids
 
     def group_edges(self, index: int) -> list[Tensor]:

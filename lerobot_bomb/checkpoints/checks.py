@@ -1,5 +1,6 @@
 """Whether a checkpoint's folder is whole and works on another machine."""
 
+from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
 
@@ -156,14 +157,21 @@ def check_weights(folder: Path, config: PreTrainedConfig, policy_type: type[PreT
     check_tensors(folder / WEIGHTS, policy)
 
 
-def check_tensors(path: Path, policy: PreTrainedPolicy) -> None:
-    """A file's weights are a policy's, by their names and shapes.
+def check_tensors(path: Path, policy: PreTrainedPolicy) -> list[str]:
+    """A file's weights are a policy's, by their names and shapes; the names of those that it needs.
+
+    A policy may do without parts of a file (``may_skip``) and have parts of its own that the file lacks as a
+    whole (``may_lack``): names of modules.
 
     Raises:
         ValueError: it is truncated, or names the first tensor that is missing, unknown or of another shape.
     """
-    expected = {name: tuple(tensor.shape) for name, tensor in policy.state_dict().items()}
-    saved = tensor_shapes(path)
+    may_skip, may_lack = getattr(policy, "may_skip", ()), getattr(policy, "may_lack", ())
+    saved = {name: shape for name, shape in tensor_shapes(path).items() if not _is_of(name, may_skip)}
+    brought = [part for part in may_lack if not holds_module(path, part)]
+    expected = {
+        name: tuple(tensor.shape) for name, tensor in policy.state_dict().items() if not _is_of(name, brought)
+    }
     start = f"{path} is not of the {policy.config.type} that {CONFIG} describes: "
     missing = sorted(expected.keys() - saved.keys() - _tied(policy, set(saved)))
     if missing:
@@ -174,6 +182,17 @@ def check_tensors(path: Path, policy: PreTrainedPolicy) -> None:
     for name, shape in saved.items():
         if shape != expected[name]:
             raise ValueError(f"{start}{name} has shape {shape}, not {expected[name]}")
+    return [*saved]
+
+
+def holds_module(path: Path, module: str) -> bool:
+    """Whether a file of weights, if there is one, has tensors of a module."""
+    return path.is_file() and any(_is_of(name, [module]) for name in tensor_shapes(path))
+
+
+def _is_of(name: str, modules: Iterable[str]) -> bool:
+    """Whether a tensor is of one of the modules, by its name."""
+    return any(name.startswith(f"{module}.") for module in modules)
 
 
 def _tied(policy: PreTrainedPolicy, saved: set[str]) -> set[str]:

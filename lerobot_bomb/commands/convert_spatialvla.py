@@ -1,10 +1,11 @@
 """``lerobot-bomb convert-spatialvla``: a published SpatialVLA folder as a checkpoint of ``spatialvla_grid``.
 
-What the folder's ZoeDepth holds is left out: it is the public one, and depth that is observed is better.
+The folder is what the original's ``save_pretrained`` writes; values that its config.json leaves out are the
+defaults of transformers' classes.
 """
 
 import argparse
-import json
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -16,25 +17,35 @@ from lerobot.utils.import_utils import register_third_party_plugins
 from safetensors.torch import load_file
 from torch import Tensor
 
+from lerobot_bomb.actions.grid_settings import ActionGroup, GridSettings
 from lerobot_bomb.actions.grids import ActionGrids
 from lerobot_bomb.checkpoints.checks import check_finite
 from lerobot_bomb.checkpoints.folder import write_checkpoint
 from lerobot_bomb.commands.arguments import path_flag
 from lerobot_bomb.files import check_new_folder, read_json
+from lerobot_bomb.vlm.backbone import config_dict
+from lerobot_bomb.vlm.intrinsics import default_intrinsics, resize_intrinsics
 from lerobot_bomb.vlm.paligemma import PaliGemmaPrompt
 from lerobot_bomb.vlm.tokenizer import load_tokenizer
 
 WORDS, WORD_HEAD = "language_model.model.embed_tokens.weight", "language_model.lm_head.weight"
 CELLS = "spatial_embed_tokens.weight"
-LEFT_OUT = "vision_zoe_model."
+# nothing reads it: PaliGemma takes the patches' features
+POOLING_HEAD = "vision_tower.vision_model.head."
 # beginnings of the original's names -> of ours
 RENAMED = {
     "vision_tower.": "backbone.vlm.model.vision_tower.",
     "multi_modal_projector.": "backbone.vlm.model.multi_modal_projector.",
     "language_model.model.": "backbone.vlm.model.language_model.",
     "position_embedding_3d.position_embedding_head.": "ego3d.layers.",
+    "vision_zoe_model.": "zoedepth.model.",
     CELLS: "cell_embedding.weight",
 }
+TRANSLATION, ROTATION = ("theta_bins", "phi_bins", "r_bins"), ("roll_bins", "pitch_bins", "yaw_bins")
+GRIPPER = 6  # of the action's dims
+# least sigma of the published grid, which no file of its folder says
+PUBLISHED_MIN_SIGMA = 0.5
+EDGE_TOLERANCE = 1e-6
 
 
 def add_convert_spatialvla_arguments(parser: argparse.ArgumentParser) -> None:
@@ -46,13 +57,15 @@ def add_convert_spatialvla_arguments(parser: argparse.ArgumentParser) -> None:
         help="folder with config.json, processor_config.json, tokenizer.json, weights",
     )
     add("--output", type=path_flag, required=True, help="new folder for the checkpoint")
-    add("--grid", type=path_flag, required=True, help="the grid's gs_*.json")
-    min_sigma = "least sigma that the grid was made with (default: 0.5, as in the published pretraining)"
-    add("--min_sigma", type=float, default=0.5, help=min_sigma)
-    add("--statistics", required=True, help="which of the folder's data sets says how actions are scaled")
+    statistics = "which of the folder's data sets says how actions are scaled, if it has several"
+    add("--statistics", help=statistics)
     add("--camera", default="image", help="name of the camera, observation.images.NAME (default: image)")
-    point = "what cells decode to: mid, as in the original, or cond_mean (default)"
-    add("--decode_point", default="cond_mean", choices=("mid", "cond_mean"), help=point)
+    grid = "gs_*.json that the folder's edges were made of: for --decode_point=cond_mean"
+    add("--grid", type=path_flag, help=grid)
+    min_sigma = f"least sigma of --grid (default: the folder's, or the published {PUBLISHED_MIN_SIGMA})"
+    add("--min_sigma", type=float, help=min_sigma)
+    point = "what cells decode to: mid, as in the original (default), or cond_mean, the mean by --grid"
+    add("--decode_point", default="mid", choices=("mid", "cond_mean"), help=point)
 
 
 def run_convert_spatialvla(args: argparse.Namespace) -> int:
@@ -64,16 +77,22 @@ def run_convert_spatialvla(args: argparse.Namespace) -> int:
             f"{args.folder}: config.json is of a {original.get('model_type')!r}, not of a SpatialVLA"
         )
     processor = read_json(args.folder / "processor_config.json")
-    scales = _action_scales(processor["statistics"], args.statistics)
-    grids = ActionGrids.from_published(json.loads(args.grid.read_text()), args.min_sigma, args.decode_point)
+    name = _chosen_statistics(processor["statistics"], args.statistics)
+    grids = _grids(args, processor)
     if grids.num_tokens != original["spatial_token_num"]:
         raise ValueError(
-            f"{args.folder} has {original['spatial_token_num']} cells, the published grid {grids.num_tokens}"
+            f"{args.folder} has {original['spatial_token_num']} cells, but processor_config.json describes "
+            f"{grids.num_tokens}"
         )
     register_third_party_plugins()
-    config = _config(args, original, int(processor["action_chunk_size"]), grids)
-    policy = get_policy_class(config.type)(config)
+    config = _config(args, original, processor, name, grids)
+    policy: Any = get_policy_class(config.type)(config)
     policy.load_state_dict(_weights(args.folder, original, policy.state_dict()), strict=True)
+    # whole, whatever the defaults of later transformers are
+    config.vlm_config = config_dict(policy.backbone.vlm)
+    if policy.zoedepth is not None:
+        config.depth_config = config_dict(policy.zoedepth.model)
+    scales = _action_scales(processor["statistics"][name][ACTION])
     pipelines = make_pre_post_processors(config, dataset_stats={ACTION: scales})
     config.vlm_model_name = args.folder.resolve().name  # nothing is read there any more
     write_checkpoint(args.output, policy, pipelines)
@@ -81,39 +100,99 @@ def run_convert_spatialvla(args: argparse.Namespace) -> int:
     return 0
 
 
-def _action_scales(statistics: dict[str, Any], name: str) -> dict[str, Tensor]:
-    """q01 and q99 of an action; of a gripper, 0 and 1, which the original does not scale."""
+def _chosen_statistics(statistics: dict[str, Any], name: str | None) -> str:
+    """The data set of that name, or the only one."""
+    if name is None and len(statistics) == 1:
+        return next(iter(statistics))
     if name not in statistics:
-        raise ValueError(f"--statistics={name} is not in the folder; choose from {', '.join(statistics)}")
-    action = statistics[name][ACTION]
-    q01, q99 = (torch.tensor(action[key], dtype=torch.float32) for key in ("q01", "q99"))
-    scaled = torch.tensor(action.get("mask", [True] * 6 + [False]))
-    return {"q01": q01.where(scaled, 0.0), "q99": q99.where(scaled, 1.0)}
+        start = "--statistics is missing" if name is None else f"--statistics={name} is not in the folder"
+        raise ValueError(f"{start}; choose from {', '.join(statistics)}")
+    return name
 
 
-def _config(args: argparse.Namespace, original: dict[str, Any], chunk_size: int, grids: ActionGrids) -> Any:
+def _action_scales(action: dict[str, Any]) -> dict[str, Tensor]:
+    """What the normalised actions -1 and 1 stand for, where the original scales by q01 and q99.
+
+    It does so where ``mask`` says so; and its gripper is 0 or 1 before, where ours is -1 or 1.
+    """
+    low, high = (torch.tensor(action[key], dtype=torch.float32) for key in ("q01", "q99"))
+    scaled = torch.tensor(action.get("mask", [True] * len(low)))
+    low, high = low.where(scaled, -1.0), high.where(scaled, 1.0)
+    low[GRIPPER] = (low[GRIPPER] + high[GRIPPER]) / 2
+    return {"q01": low, "q99": high}
+
+
+def _grids(args: argparse.Namespace, processor: dict[str, Any]) -> ActionGrids:
+    """Of the folder's own edges, and the Gaussians of --grid, which must be those that they were made of."""
+    counts, policy = processor["action_config"]["num_bins"], processor.get("bin_policy")
+    if policy is None:
+        raise ValueError(f"{args.folder}: processor_config.json has no bin_policy, the edges of its cells")
+    edges, bins = [], []
+    for kind, keys in (("translation", TRANSLATION), ("rotation", ROTATION)):
+        bins.append(tuple(counts[kind][key] for key in keys))
+        edges += [torch.tensor(policy[kind][key], dtype=torch.float64) for key in keys]
+    transform = "polar" if processor["action_config"]["use_spherical"] else "identity"
+    groups = (
+        ActionGroup((0, 1, 2), transform, bins[0]),
+        ActionGroup((3, 4, 5), "identity", bins[1]),
+        ActionGroup((GRIPPER,), "binary", (counts["gripper"],)),
+    )
+    min_sigma = processor.get("min_sigma", 0.0)
+    settings = GridSettings(
+        groups, "gaussian", min_sigma, args.decode_point, zero_radius_bin=False, phi_fit="linear"
+    )
+    edges.append(torch.tensor([-1.0, 0.0, 1.0]))
+    grids = ActionGrids.from_edges(edges, settings, GRIPPER + 1)
+    if args.grid is None:
+        if args.decode_point == "cond_mean":
+            raise ValueError("--decode_point=cond_mean needs --grid: the folder says edges, not Gaussians")
+        return grids
+    least = (min_sigma, PUBLISHED_MIN_SIGMA) if args.min_sigma is None else (args.min_sigma,)
+    for sigma in least:
+        given = ActionGrids.from_published(read_json(args.grid), sigma, args.decode_point, groups)
+        if torch.allclose(given.edges, grids.edges, rtol=0, atol=EDGE_TOLERANCE):
+            given.settings = settings
+            return given
+    raise ValueError(
+        f"--grid={args.grid} with a least sigma of {' or '.join(map(str, least))} (--min_sigma) has other "
+        "edges than the folder's bin_policy, which its weights were trained with; leave --grid out"
+    )
+
+
+def _config(
+    args: argparse.Namespace,
+    original: dict[str, Any],
+    processor: dict[str, Any],
+    statistics: str,
+    grids: ActionGrids,
+) -> Any:
+    from transformers import SiglipVisionConfig
+
     text_config = {
         **original["text_config"],
         "model_type": "gemma2",
         "vocab_size": original["action_token_begin_idx"],
         "tie_word_embeddings": False,
     }
-    vision_config = {"model_type": "siglip_vision_model", **original["vision_config"]}
-    side = vision_config["image_size"]
+    vision_config = {
+        **original["vision_config"],
+        "model_type": "siglip_vision_model",
+        "vision_use_head": False,
+    }
+    side: Any = SiglipVisionConfig(**vision_config).image_size
+    tokenizer, chunk_size = load_tokenizer(str(args.folder)), processor["action_chunk_size"]
     return PreTrainedConfig.get_choice_class("spatialvla_grid")(
         vlm_model_name=str(args.folder),
         vlm_config={
             "model_type": "paligemma",
             "image_token_index": original["image_token_index"],
             "projection_dim": original["projection_dim"],
-            "hidden_size": text_config["hidden_size"],
+            "hidden_size": original["hidden_size"],
             "tie_word_embeddings": False,
             "text_config": text_config,
             "vision_config": vision_config,
         },
-        prompt_tokens=PaliGemmaPrompt.from_tokenizer(
-            load_tokenizer(str(args.folder)), str(args.folder)
-        ).to_dict(),
+        prompt_tokens=PaliGemmaPrompt.from_tokenizer(tokenizer, str(args.folder)).to_dict(),
         chunk_size=chunk_size,
         n_action_steps=chunk_size,
         normalization_mapping={
@@ -123,16 +202,35 @@ def _config(args: argparse.Namespace, original: dict[str, Any], chunk_size: int,
         },
         **grids.settings.flags(),
         grid_params=grids.to_dict(),
+        depth_source="zoedepth" if original["use_vision_zoe"] else "none",
+        depth_config=original["vision_zoe_config"] if original["use_vision_zoe"] else None,
+        camera_intrinsics=_intrinsics(processor["intrinsic_config"], statistics, args.camera, side),
         ego3d_patch_reso=original["ego3d_patch_reso"],
         ego3d_n_freqs=original["n_freqs"],
+        ego3d_no_depth_vector=False,
+        crop_fraction=1.0,
         input_features={f"{OBS_IMAGES}.{args.camera}": PolicyFeature(FeatureType.VISUAL, (3, side, side))},
         output_features={ACTION: PolicyFeature(FeatureType.ACTION, (grids.num_dims,))},
         device="cpu",
     )
 
 
+def _intrinsics(
+    cameras: dict[str, Any], statistics: str, camera: str, side: int
+) -> dict[str, list[list[float]]]:
+    """What the folder says of the data set's camera, for images of ``side``; {}: what is assumed of any."""
+    of = cameras.get(statistics, cameras["default"])
+    # the original counts from the image's edge, the flag from the first pixel's centre
+    K = torch.tensor([of["intrinsic"]], dtype=torch.float32)
+    K = resize_intrinsics(K, (of["height"], of["width"]), (side, side))
+    if torch.allclose(K, default_intrinsics(side, side)):
+        return {}
+    K[:, :2, 2] -= 0.5
+    return {camera: K[0].tolist()}
+
+
 def _weights(folder: Path, original: dict[str, Any], ours: dict[str, Tensor]) -> dict[str, Tensor]:
-    """The folder's tensors under our names, float32; what only we have stays as it is.
+    """The folder's tensors under our names, float32; of Ego3D, where the folder has none, ours.
 
     Raises:
         ValueError: there are none, or one is missing or not finite.
@@ -145,17 +243,16 @@ def _weights(folder: Path, original: dict[str, Any], ours: dict[str, Tensor]) ->
         raise ValueError(f"{folder}: its {len(files)} *.safetensors have no {', '.join(missing)}")
     first, end = original["action_token_begin_idx"], original["action_token_begin_idx"] + len(tensors[CELLS])
     head = tensors.pop(WORD_HEAD)
-    converted = {"backbone.vlm.lm_head.weight": head[:first], "cell_head.weight": head[first:end]}
     tensors[WORDS] = tensors[WORDS][:first]
-    for name, tensor in tensors.items():
-        if not name.startswith(LEFT_OUT):
-            converted[_renamed(name)] = tensor
-    own = {name: ours[name] for name in ours if name.startswith("grids.") or name == "ego3d.no_depth"}
+    converted = dict(_renamed(tensors))
+    converted |= {"backbone.vlm.lm_head.weight": head[:first], "cell_head.weight": head[first:end]}
+    own = {} if original["use_vision_zoe"] else {n: t for n, t in ours.items() if n.startswith("ego3d.")}
     return own | {name: tensor.float().contiguous() for name, tensor in converted.items()}
 
 
-def _renamed(name: str) -> str:
-    for begins, ours in RENAMED.items():
-        if name.startswith(begins):
-            return ours + name.removeprefix(begins)
-    return name  # loading strictly names it
+def _renamed(tensors: dict[str, Tensor]) -> Iterator[tuple[str, Tensor]]:
+    """Those that the policy has, under its names; of another, loading strictly tells the name."""
+    for name, tensor in tensors.items():
+        if not name.startswith(POOLING_HEAD):
+            begins = next((begins for begins in RENAMED if name.startswith(begins)), "")
+            yield RENAMED.get(begins, "") + name.removeprefix(begins), tensor

@@ -4,7 +4,9 @@ Shapes: `B` batch, `H` and `W` sides of a image, `S` of a square one, `R` of the
 Depth is in metres along the optical axis; what is not finite or not positive is no depth.
 """
 
-from collections.abc import Mapping
+import json
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
 from typing import TYPE_CHECKING, Any
 
 import torch
@@ -154,12 +156,27 @@ def load_zoedepth(depth_model_name: str) -> ZoeDepth:
     """
     from transformers import ZoeDepthForDepthEstimation  # only who asks for it pays for it
 
-    try:
+    with _ways_out(depth_model_name):
         model = ZoeDepthForDepthEstimation.from_pretrained(depth_model_name, dtype=torch.float32)
+    require_finite_weights(model, f"--policy.depth_model_name={depth_model_name}")
+    return ZoeDepth(model)
+
+
+def read_zoedepth_config(depth_model_name: str) -> dict[str, Any]:
+    """The architecture of a Hub id or a local folder, for `build_zoedepth`; raises as `load_zoedepth`."""
+    from transformers import ZoeDepthConfig
+
+    with _ways_out(depth_model_name):
+        config = ZoeDepthConfig.from_pretrained(depth_model_name)
+    return json.loads(config.to_json_string(use_diff=False))
+
+
+@contextmanager
+def _ways_out(depth_model_name: str) -> Iterator[None]:
+    try:
+        yield
     except OSError as error:
         raise OSError(
             f"--policy.depth_model_name={depth_model_name}: no model found. Without network, give the local "
             f"folder of a ZoeDepth model, or choose --policy.depth_source=observation or none"
         ) from error
-    require_finite_weights(model, f"--policy.depth_model_name={depth_model_name}")
-    return ZoeDepth(model)

@@ -4,6 +4,8 @@ SpatialVLA (Qu et al. 2025). Shapes: `B` batch, `P` patches of a image, `R` side
 `E` numbers that encode a point or a patch's points, `H` hidden size of the vision model.
 """
 
+from typing import Any
+
 import torch
 from torch import Tensor, nn
 from torch.nn.init import xavier_uniform_, zeros_
@@ -28,7 +30,8 @@ class Ego3D(nn.Module):
 
     R = patches_per_side * patch_reso. Points lie at the centres of R x R cells of the image, as
     `lattice_points` gives them. Where there is no depth, a learned vector stands for a point's encoding; so a
-    image without depth is NaN everywhere. With ``zero_init`` the result is exactly zero before training.
+    image without depth is NaN everywhere. Without that vector (``no_depth_vector``), as in the original, a
+    patch that has such a point gets zeros. With ``zero_init`` the result is exactly zero before training.
     """
 
     def __init__(
@@ -38,6 +41,7 @@ class Ego3D(nn.Module):
         patch_reso: int = 2,
         num_freqs: int = 8,
         zero_init: bool = True,
+        no_depth_vector: bool = True,
     ):
         super().__init__()
         self.patches_per_side, self.patch_reso, self.num_freqs = patches_per_side, patch_reso, num_freqs
@@ -50,7 +54,7 @@ class Ego3D(nn.Module):
             xavier_uniform_(first.weight, PUBLISHED_GAIN)
             xavier_uniform_(last.weight, PUBLISHED_GAIN)
         self.layers = nn.Sequential(first, nn.LayerNorm(hidden_size), nn.ReLU(), last)
-        self.no_depth = nn.Parameter(torch.zeros(point_size))
+        self.no_depth: Any = nn.Parameter(torch.zeros(point_size)) if no_depth_vector else None
 
     @property
     def lattice_size(self) -> int:
@@ -62,8 +66,16 @@ class Ego3D(nn.Module):
         # along the ray: the point stays in its pixel
         points_BRR3 = points_BRR3 * (depth_BRR1.clamp(MIN_DEPTH_M, MAX_DEPTH_M) / depth_BRR1)
         encoded_BRRE = encode_points(points_BRR3, self.num_freqs)
-        encoded_BRRE = torch.where(depth_BRR1.isnan(), self.no_depth.float(), encoded_BRRE)
+        stand_in = 0.0 if self.no_depth is None else self.no_depth.float()
+        encoded_BRRE = torch.where(depth_BRR1.isnan(), stand_in, encoded_BRRE)
+        positions_BPH = self.layers(self._by_patch(encoded_BRRE).to(next(self.parameters()).dtype))
+        if self.no_depth is not None:
+            return positions_BPH
+        lacks_depth_BP1 = self._by_patch(depth_BRR1).isnan().any(dim=-1, keepdim=True)
+        return positions_BPH.masked_fill(lacks_depth_BP1, 0.0)
+
+    def _by_patch(self, values_BRRE: Tensor) -> Tensor:
+        """(B, R, R, E) of points -> (B, P, E of all points of a patch)."""
         side = self.patches_per_side
-        patches_BSrScE = encoded_BRRE.unflatten(2, (side, -1)).unflatten(1, (side, -1))
-        patches_BPE = patches_BSrScE.transpose(2, 3).flatten(3).flatten(1, 2)
-        return self.layers(patches_BPE.to(self.no_depth.dtype))
+        values_BSrScE = values_BRRE.unflatten(2, (side, -1)).unflatten(1, (side, -1))
+        return values_BSrScE.transpose(2, 3).flatten(3).flatten(1, 2)

@@ -85,6 +85,11 @@ class PaliGemmaBackbone(nn.Module):
         return self.patches_per_side**2
 
     @property
+    def has_tied_head(self) -> bool:
+        """Whether words are written by the table that they are read by."""
+        return self.vlm.lm_head.weight is self.vlm.get_input_embeddings().weight
+
+    @property
     def text_model(self) -> Any:
         return self.vlm.model.language_model
 

@@ -12,7 +12,7 @@ from lerobot_bomb.actions.grids import ActionGrids
 from lerobot_bomb.actions.relative import bounds, present_episodes
 from lerobot_bomb.data.columns import dim_names, read_columns
 from lerobot_bomb.vlm.backbone import check_family, config_dict
-from lerobot_bomb.vlm.depth import ZoeDepth, build_zoedepth, load_zoedepth
+from lerobot_bomb.vlm.depth import ZoeDepth, build_zoedepth, load_zoedepth, read_zoedepth_config
 from lerobot_bomb.vlm.paligemma import PaliGemmaBackbone, PaliGemmaPrompt, build_paligemma, load_paligemma
 from lerobot_bomb.vlm.tokenizer import load_tokenizer
 from lerobot_policy_spatialvla_grid.configuration_spatialvla_grid import SpatialvlaGridConfig
@@ -21,7 +21,7 @@ logger = logging.getLogger(__name__)
 
 
 def build_depth(config: SpatialvlaGridConfig) -> ZoeDepth | None:
-    """As `build_model`: a checkpoint brings its own."""
+    """As `build_model`: a checkpoint's architecture, else the weights of ``depth_model_name``."""
     if config.depth_source != "zoedepth":
         return None
     if config.depth_config is not None:
@@ -29,6 +29,16 @@ def build_depth(config: SpatialvlaGridConfig) -> ZoeDepth | None:
     zoedepth = load_zoedepth(config.depth_model_name)
     config.depth_config = config_dict(zoedepth.model)
     return zoedepth
+
+
+def complete_depth(config: SpatialvlaGridConfig, meta: LeRobotDatasetMetadata | None) -> None:
+    """Let a checkpoint's config have what its ``depth_source`` needs, if it was trained with another.
+
+    What the dataset ``meta`` lacks is told later; without one, the first batch tells.
+    """
+    config.read_depth_of(None if meta is None else meta.features)
+    if config.depth_source == "zoedepth" and config.depth_config is None:
+        config.depth_config = read_zoedepth_config(config.depth_model_name)
 
 
 def make_grids(config: SpatialvlaGridConfig, meta: LeRobotDatasetMetadata | None) -> ActionGrids:
@@ -75,6 +85,8 @@ def build_model(config: SpatialvlaGridConfig) -> tuple[PaliGemmaPrompt, PaliGemm
         backbone.vlm.model.vision_tower.requires_grad_(False)
     if config.freeze_llm_embeddings:
         backbone.vlm.get_input_embeddings().requires_grad_(False)
+    if config.loss_vocab == "slot" and not backbone.has_tied_head:
+        backbone.vlm.lm_head.requires_grad_(False)  # no word is written
     if config.gradient_checkpointing:
         backbone.vlm.gradient_checkpointing_enable({"use_reentrant": False})
     return tokens, backbone

@@ -1,9 +1,10 @@
 """Config of ``spatialvla_grid``."""
 
+from collections.abc import Collection
 from dataclasses import dataclass, field
 from typing import Any, ClassVar
 
-from lerobot.configs import PreTrainedConfig
+from lerobot.configs import FeatureType, PolicyFeature, PreTrainedConfig
 from lerobot.utils.constants import OBS_IMAGES
 
 from lerobot_bomb.actions.grid_settings import (
@@ -27,7 +28,7 @@ LOSS_VOCABULARIES = ("slot", "full")
 DRAFTS = ("none", "repeat")
 NUM_STATE_BINS = 256
 # flags that say what shapes the weights have, beside the grids' own
-SHAPES = ("nano_config",)
+SHAPES = ("nano_config", "ego3d_no_depth_vector")
 # the same, and flags that say what the model reads and writes
 AS_TRAINED = ("chunk_size", "use_state", "prefix_attention", *SHAPES)
 
@@ -91,6 +92,9 @@ class SpatialvlaGridConfig(TokenVlaConfig):
     ego3d_n_freqs: int = 8
     # whether the 3-D points change nothing before training
     ego3d_zero_init: bool = True
+    # whether a learned vector stands for points without depth; false, as in the original: a patch with such a
+    # point gets no 3-D position
+    ego3d_no_depth_vector: bool = True
 
     # "bidirectional": every token of the prompt reads all of it; "causal": what stands before it
     prefix_attention: str = "bidirectional"
@@ -133,14 +137,37 @@ class SpatialvlaGridConfig(TokenVlaConfig):
             return f"depth_config, so loading it elsewhere would need {self.depth_model_name}"
         return super().missing_parts()
 
+    @property
+    def has_positions(self) -> bool:
+        """Whether patches get anything of Ego3D."""
+        return self.depth_source != "none" or self.ego3d_no_depth_vector
+
+    def read_depth_of(self, given: Collection[str] | None) -> None:
+        """Let a checkpoint that was trained without observed depth read what observations give.
+
+        ``given``: their keys; None: they are not known yet, and a batch will say what is missing.
+        """
+        if self.depth_source == "observation":
+            read = {
+                key: PolicyFeature(FeatureType.STATE, shape)
+                for key, shape in self._depth_shapes().items()
+                if given is None or key in given
+            }
+            self.input_features = read | (self.input_features or {})
+
+    def _depth_shapes(self) -> dict[str, tuple[int, ...]]:
+        """Of what observed depth consists of; LeRobot takes it for states."""
+        shapes: dict[str, tuple[int, ...]] = {}
+        for key, feature in self.image_features.items():
+            camera = key.removeprefix(f"{OBS_IMAGES}.")
+            shapes[f"observation.depth.{camera}"] = tuple(feature.shape[1:])
+            if camera not in self.camera_intrinsics:
+                shapes[f"observation.intrinsics.{camera}"] = (3, 3)
+        return shapes
+
     def _check_depth(self) -> None:
-        cameras = [key.removeprefix(f"{OBS_IMAGES}.") for key in self.image_features]
         given = set(self.input_features or {})
-        wanted = [f"observation.depth.{camera}" for camera in cameras]
-        wanted += [
-            f"observation.intrinsics.{camera}" for camera in cameras if camera not in self.camera_intrinsics
-        ]
-        missing = [key for key in wanted if key not in given]
+        missing = [key for key in self._depth_shapes() if key not in given]
         if missing:
             raise ValueError(
                 f"--policy.depth_source=observation needs {', '.join(missing)}; the inputs are "

@@ -8,6 +8,7 @@ cells of a group.
 """
 
 import logging
+from pathlib import Path
 from typing import Any, ClassVar
 
 import torch
@@ -26,7 +27,8 @@ from lerobot_bomb.actions.grid_report import edges_text
 from lerobot_bomb.actions.grid_rows import interpolate_rows
 from lerobot_bomb.actions.grids import ActionGrids
 from lerobot_bomb.actions.text import TokenRows, digits_needed, number_symbols
-from lerobot_bomb.checkpoints.adapters import check_buffers_are_the_bases, peft_targets
+from lerobot_bomb.checkpoints.adapters import peft_targets
+from lerobot_bomb.checkpoints.checks import holds_module
 from lerobot_bomb.data.columns import dim_names
 from lerobot_bomb.decoding.decoder import Prompt
 from lerobot_bomb.decoding.slots import SlotWriter
@@ -35,6 +37,7 @@ from lerobot_bomb.training.distributed import weighed
 from lerobot_bomb.training.randomness import begin_batch
 from lerobot_bomb.vlm.depth import (
     lattice_points,
+    load_zoedepth,
     observed_depth,
     observed_intrinsics,
 )
@@ -48,6 +51,7 @@ from lerobot_bomb.vlm.paligemma import (
 from lerobot_policy_spatialvla_grid.building_spatialvla_grid import (
     build_depth,
     build_model,
+    complete_depth,
     fit_to_data,
     make_grids,
 )
@@ -62,7 +66,8 @@ from lerobot_policy_spatialvla_grid.configuration_spatialvla_grid import (
 logger = logging.getLogger(__name__)
 
 # not of the base model: trained whole beside its adapters
-NEW_PARTS = ("cell_embedding", "cell_head", "ego3d")
+CELL_TABLES = ("cell_embedding", "cell_head")
+NEW_PARTS = (*CELL_TABLES, "ego3d")
 
 
 class SpatialvlaGridPolicy(TokenVlaPolicy):
@@ -86,14 +91,18 @@ class SpatialvlaGridPolicy(TokenVlaPolicy):
         self.tokens, self.backbone = build_model(config)
         self.register_buffer("symbol_ids", torch.tensor(self.tokens.symbols), persistent=False)
         self.zoedepth = build_depth(config)
+        # grids: of checkpoints from before only their config held them
+        self.may_skip = ("grids",) if self.zoedepth is not None else ("grids", "zoedepth")
         self.ego3d = Ego3D(
             self.backbone.vision_hidden_size,
             self.backbone.patches_per_side,
             config.ego3d_patch_reso,
             config.ego3d_n_freqs,
             config.ego3d_zero_init,
-        )
+            config.ego3d_no_depth_vector,
+        ).requires_grad_(config.has_positions)
         self.grids = make_grids(config, dataset_meta)
+        self._num_cells_of_base: list[int] | None = None  # if the grids are other than the checkpoint's
         self.register_buffer("first_cells", torch.tensor(self.grids.offsets), persistent=False)
         hidden_size = self.backbone.text_config.hidden_size
         self.cell_embedding = nn.Embedding(self.grids.num_tokens, hidden_size)
@@ -121,8 +130,19 @@ class SpatialvlaGridPolicy(TokenVlaPolicy):
     ) -> "SpatialvlaGridPolicy":
         """As LeRobot's, but a missing or unexpected tensor is an error; the grids adapt to the new data."""
         if config is not None:
+            complete_depth(config, dataset_meta)
             config.check_grid_as_trained(is_refitted=dataset_meta is not None and config.adapt_embeddings)
         return super().from_pretrained(*args, config=config, dataset_meta=dataset_meta, **kwargs)
+
+    @classmethod
+    def _load_as_safetensor(
+        cls, model: "SpatialvlaGridPolicy", model_file: str, map_location: str, strict: bool
+    ) -> "SpatialvlaGridPolicy":
+        """As the others', and with the ZoeDepth of ``depth_model_name`` where the checkpoint has none."""
+        if model.zoedepth is not None and not holds_module(Path(model_file), "zoedepth"):
+            model.zoedepth = load_zoedepth(model.config.depth_model_name)
+            model.may_lack = ("zoedepth",)
+        return super()._load_as_safetensor(model, model_file, map_location, strict)
 
     def _fit(self, meta: LeRobotDatasetMetadata) -> None:
         if self.config.adapt_embeddings:
@@ -145,12 +165,18 @@ class SpatialvlaGridPolicy(TokenVlaPolicy):
         fit_to_data(new, self.config, meta)
         if new.to_dict() == old.to_dict():  # a training that is resumed
             return
+        if self.config.use_peft:
+            raise ValueError(
+                f"{self.config.pretrained_path} holds adapters and cells of other grids than this dataset's; "
+                "train on what lerobot-bomb merge makes of them, or give --policy.adapt_embeddings=false"
+            )
         for table in (self.cell_embedding, self.cell_head):
             table.weight = nn.Parameter(interpolate_rows(old, new, table.weight))
         self.cell_embedding.num_embeddings = self.cell_head.out_features = new.num_tokens
         names = dim_names(meta.features[ACTION])
         edges = edges_text(old, names), edges_text(new, names)
         logger.info("Action grids adapted.\nOld edges\n%s\nNew edges\n%s", *edges)
+        self._num_cells_of_base = old.num_cells
         self.grids = new.to(self._device)
         self.first_cells = torch.tensor(new.offsets, device=self._device)
         self.config.grid_params = new.to_dict()
@@ -163,8 +189,23 @@ class SpatialvlaGridPolicy(TokenVlaPolicy):
         return peft_targets(self, "language_model", NEW_PARTS)
 
     def _validate_peft_config(self, peft_config: Any) -> None:
+        """Grids that were adapted are in the adapters' config, so the adapters must hold their cells."""
         super()._validate_peft_config(peft_config)
-        check_buffers_are_the_bases(self, self._base_buffers, "give --policy.adapt_embeddings=false")
+        if self._num_cells_of_base is None:
+            return
+        trained_whole = peft_config.modules_to_save or []
+        if not {*CELL_TABLES} <= {*trained_whole}:
+            raise ValueError(
+                f"--peft.full_training_modules={trained_whole} leaves out the cells, which were adapted to "
+                f"this dataset; have {' and '.join(CELL_TABLES)} in it, or give "
+                "--policy.adapt_embeddings=false"
+            )
+        if self._num_cells_of_base != self.grids.num_cells:
+            raise ValueError(
+                f"--policy.action_groups: adapters cannot be trained on grids of {self.grids.num_cells} "
+                f"cells, as those of {self.config.pretrained_path} have {self._num_cells_of_base}; leave it "
+                "as it is"
+            )
 
     # Training
 
