@@ -4,10 +4,12 @@ import copy
 from pathlib import Path
 from typing import Any
 
+import pandas
 import pytest
 import torch
 from lerobot.configs import PreTrainedConfig
 from lerobot.policies.factory import make_pre_post_processors
+from relative_cases import make_dataset
 from spatialvla_grid_cases import SIZE, WORKSPACE, WRIST, make_batch, make_config, make_policy, stats
 from torch import Tensor, nn
 from torch.nn.functional import cosine_similarity, cross_entropy
@@ -332,3 +334,11 @@ def test_an_environment_may_name_no_task(tasks: list[str]) -> None:
     assert (num_tokens > num_tokens.min()).tolist() == [False, tasks[1] == "go"]
     assert policy(batch)[0].isfinite()
     assert policy.predict_action_chunk(batch).shape == (2, 4, 4)
+
+
+def test_an_instruction_beyond_the_positions_is_refused_before_training(tmp_path: Path) -> None:
+    meta = make_dataset(tmp_path / "data", 0.1)
+    SpatialvlaGridPolicy(make_config(), meta)
+    meta.tasks = pandas.DataFrame({"task_index": [0]}, index=pandas.Index(["put the " * 2100]))
+    with pytest.raises(ValueError, match="model has 4096 positions; shorten the dataset's instruction 'put"):
+        SpatialvlaGridPolicy(make_config(), meta)

@@ -102,6 +102,7 @@ class SpatialvlaGridPolicy(TokenVlaPolicy):
             config.ego3d_no_depth_vector,
         ).requires_grad_(config.has_positions)
         self.grids = make_grids(config, dataset_meta)
+        self._check_length(self.backbone.text_config, self._num_fixed_tokens(), "{}", dataset_meta)
         self._num_cells_of_base: list[int] | None = None  # if the grids are other than the checkpoint's
         self.register_buffer("first_cells", torch.tensor(self.grids.offsets), persistent=False)
         hidden_size = self.backbone.text_config.hidden_size
@@ -336,6 +337,17 @@ class SpatialvlaGridPolicy(TokenVlaPolicy):
             state = TokenRows(self.symbol_ids[symbols_BNC].flatten(1), mask_BNC.flatten(1))
             parts += [TokenRows.constant(tokens.state_start, task.ids), state]
         return TokenRows.join([*parts, TokenRows.constant(tokens.task_end, task.ids)])
+
+    def _num_fixed_tokens(self) -> int:
+        """Of the longest prompt and answer, without the task."""
+        tokens, config = self.tokens, self.config
+        num_tokens = len(self._cameras) * self.backbone.tokens_per_image
+        num_tokens += len(tokens.start) + len(tokens.task_end) + config.chunk_size * len(self.grids.groups)
+        if config.use_state:
+            assert config.robot_state_feature is not None
+            width = 1 + digits_needed(NUM_STATE_BINS)
+            num_tokens += len(tokens.state_start) + width * config.robot_state_feature.shape[0]
+        return num_tokens
 
     def _embeds(self, batch: dict[str, Tensor], ids_BL: Tensor) -> Tensor:
         """Embeddings (B, L, H) of a prompt, image features in place."""
