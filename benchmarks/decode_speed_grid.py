@@ -31,7 +31,7 @@ from torch import Tensor, nn
 from transformers import LogitsProcessor
 
 from lerobot_bomb.decoding.kv_cache import CachedText
-from lerobot_bomb.vlm.images import crop_and_resize
+from lerobot_bomb.vlm.images import crop, resized_pixels
 from lerobot_policy_spatialvla_grid import SpatialvlaGridConfig
 from lerobot_policy_spatialvla_grid.configuration_spatialvla_grid import DRAFTS
 from lerobot_policy_spatialvla_grid.modeling_spatialvla_grid import SpatialvlaGridPolicy
@@ -172,7 +172,7 @@ class StockGenerate:
         for row, kept in enumerate(prompt.mask):
             ids[row, -int(kept.sum()) :], written[row, -int(kept.sum()) :] = prompt.ids[row, kept], 1
         size, fraction = policy.backbone.image_size, policy.config.crop_fraction
-        pixels = [crop_and_resize(batch[key], fraction, size, None) for key in policy._cameras]
+        pixels = [resized_pixels(crop(batch[key], fraction, None), size) for key in policy._cameras]
         return {
             "input_ids": ids,
             "attention_mask": written,

@@ -15,19 +15,19 @@ from lerobot_bomb.actions.text import END, SPACE, SYMBOL_TEXTS
 from lerobot_bomb.decoding.decoder_layers import TextLayers
 from lerobot_bomb.decoding.grammar import NumberGrammar
 from lerobot_bomb.decoding.kv_cache import CachedText
-from lerobot_bomb.vlm.backbone import SmolVLMBackbone
+from lerobot_bomb.vlm.backbone import Backbone
 
 
 class XgrammarGenerate:
     """Greedy search after given prompt embeddings; the language is ours, told to xgrammar."""
 
-    def __init__(self, backbone: SmolVLMBackbone, symbol_ids: Tensor, grammar: NumberGrammar):
+    def __init__(self, backbone: Backbone, symbol_ids: Tensor, grammar: NumberGrammar):
         self._backbone, self._symbol_ids, self._grammar = backbone, symbol_ids, grammar
         width = grammar.fixed_width
         values = " | ".join(f'"{str(value).zfill(width)}"' for value in range(grammar.num_values))
         rules = f'root ::= {" ".join(["value"] * grammar.num_numbers)}\nvalue ::= " " ({values})\n'
         vocabulary = [f"<{token}>" for token in range(backbone.vlm.lm_head.out_features)]
-        for token, text in zip(symbol_ids.tolist(), SYMBOL_TEXTS, strict=True):
+        for token, text in zip(symbol_ids[:END].tolist(), SYMBOL_TEXTS, strict=True):
             vocabulary[token] = text
         self._end_id = int(symbol_ids[END])
         tokenizer = xgrammar.TokenizerInfo(

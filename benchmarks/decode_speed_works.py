@@ -29,14 +29,14 @@ from lerobot_bomb.decoding.decoder import (
 from lerobot_bomb.decoding.draft import LinearDraft
 from lerobot_bomb.decoding.grammar import NumberGrammar
 from lerobot_bomb.decoding.writer import NumberWriter, continue_prompt
-from lerobot_bomb.vlm.backbone import SmolVLMBackbone
+from lerobot_bomb.vlm.backbone import Backbone
 
 
 @dataclass(frozen=True)
 class DecodeRequest:
     """A batch of prompts, and what is to be written after each."""
 
-    backbone: SmolVLMBackbone
+    backbone: Backbone
     prompt: Prompt
     symbol_ids: Tensor
     grammar: NumberGrammar

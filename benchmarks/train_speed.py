@@ -35,14 +35,15 @@ from torch.utils.data import default_collate
 from train_speed_strings import StringPath
 
 from lerobot_bomb.tables import print_table
-from lerobot_bomb.vlm.images import crop_and_resize
+from lerobot_bomb.vlm.images import crop, resized_pixels
 
 MIN_RATIO = 1.5
 MAX_PREPROCESSING = 0.05  # of a step
 MAX_LOSS_DIFFERENCE = 1e-3
 OUR_PIXELS = "strings, do_resize=False"
 AS_SHIPPED = "strings, processor as shipped"
-CROP = "lerobot_policy_vla0_smol.modeling_vla0_smol.crop_and_resize"
+CROP = "lerobot_policy_vla0_smol.modeling_vla0_smol.crop"
+RESIZE = "lerobot_bomb.vlm.backbone.resized_pixels"
 PREPROCESSING = ("collate", "tokenize, normalise", "crop and resize", "prompt and numbers")
 
 
@@ -176,7 +177,8 @@ def profile_stages(policy: Any, preprocessor: Callable, batches: list[list[dict]
         return run
 
     with ExitStack() as stack:
-        stack.enter_context(patch(CROP, timed("crop and resize", crop_and_resize)))
+        stack.enter_context(patch(CROP, timed("crop and resize", crop)))
+        stack.enter_context(patch(RESIZE, timed("crop and resize", resized_pixels)))
         for method in ("_prompt", "_numbers", "_answer"):
             call = timed("prompt and numbers", getattr(policy, method))
             stack.enter_context(patch.object(policy, method, call))

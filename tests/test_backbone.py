@@ -163,7 +163,7 @@ def test_a_text_that_cannot_be_tokenized_changes_nothing_for_the_next() -> None:
 
 def test_a_tokenizer_without_the_special_tokens_is_refused() -> None:
     tokenizer = Tokenizer.from_str(nano_tokenizer().to_str().replace("<end_of_utterance>", "<end_of_turn>"))
-    with pytest.raises(ValueError, match=r"writes '<end_of_utterance>' as .* tokens"):
+    with pytest.raises(ValueError, match=r"no single token for '<end_of_utterance>'; .* a SmolVLM tokenizer"):
         PromptTokens.from_tokenizer(tokenizer, "some/model")
 
 
@@ -249,7 +249,7 @@ def test_a_folder_without_weights_is_refused(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("config", "message"),
     [
-        ({"model_type": "gpt2"}, "is a 'gpt2' model; this policy needs a 'smolvlm' one"),
+        ({"model_type": "gpt2"}, "is a 'gpt2' model; this policy needs a 'smolvlm' or 'idefics3' one"),
         (
             {"type": "act"},
             "is a checkpoint of the policy 'act'; `lerobot-bomb export-backbone --policy.path=",

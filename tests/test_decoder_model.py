@@ -6,8 +6,9 @@ from typing import Any
 
 import pytest
 import torch
+from grammar_processor import GrammarProcessor
 from torch import Tensor
-from transformers import AutoTokenizer, LogitsProcessor
+from transformers import AutoTokenizer
 
 from lerobot_bomb.actions.text import END, NUM_SYMBOLS, SPACE, SYMBOL_TEXTS, TokenRows
 from lerobot_bomb.decoding.decoder import CachedContinuation, Prompt, decode_numbers
@@ -16,12 +17,13 @@ from lerobot_bomb.decoding.draft import KnownSymbols, LinearDraft
 from lerobot_bomb.decoding.grammar import NumberGrammar
 from lerobot_bomb.decoding.graph_cache import GraphCache
 from lerobot_bomb.decoding.graph_decoder import GraphDecoder
-from lerobot_bomb.decoding.kv_cache import CachedText
+from lerobot_bomb.decoding.kv_cache import CachedText, Positions, same_positions
 from lerobot_bomb.decoding.plain_layers import hidden_states
 from lerobot_bomb.decoding.writer import continue_prompt
 from lerobot_bomb.vlm.backbone import SmolVLMBackbone, build_backbone, load_backbone
 from lerobot_bomb.vlm.paligemma import build_paligemma
-from lerobot_bomb.vlm.presets import nano_config, nano_paligemma_config
+from lerobot_bomb.vlm.presets import nano_config, nano_paligemma_config, nano_qwen_config
+from lerobot_bomb.vlm.qwen import build_qwen
 from lerobot_bomb.vlm.tokenizer import NANO, load_tokenizer
 
 SYMBOL_IDS = torch.arange(20, 20 + NUM_SYMBOLS)
@@ -49,7 +51,7 @@ def continuation(
 def vocabulary(shared_data: Path, name: str) -> tuple[SmolVLMBackbone, Tensor]:
     """A nano backbone with the vocabulary of a real tokenizer, and the ids of the symbols in it."""
     tokenizer: Any = AutoTokenizer.from_pretrained(str(shared_data / name))
-    ids = [tokenizer.convert_tokens_to_ids(tokenizer.tokenize(text)) for text in SYMBOL_TEXTS[:END]]
+    ids = [tokenizer.convert_tokens_to_ids(tokenizer.tokenize(text)) for text in SYMBOL_TEXTS]
     symbol_ids = torch.tensor([*ids, [tokenizer.eos_token_id]])[:, 0]
     config = nano_config(load_tokenizer(NANO))
     config["text_config"]["vocab_size"] = len(tokenizer)
@@ -114,35 +116,6 @@ def test_adapters_count(backbone: SmolVLMBackbone) -> None:
     assert not torch.allclose(cached, continuation(backbone, rows, 9)(said, torch.tensor([0]))[0])
 
 
-def spelled(symbols: list[int]) -> str:
-    return "".join("#" if symbol == END else SYMBOL_TEXTS[symbol] for symbol in symbols)
-
-
-class GrammarProcessor(LogitsProcessor):
-    """The grammar for transformers' `generate`, told by a regular expression's worth of Python."""
-
-    def __init__(self, num_values: int, num_numbers: int, prompt_length: int, symbol_ids: Tensor):
-        self.num_values, self.num_numbers, self.prompt_length = num_values, num_numbers, prompt_length
-        self.ids = symbol_ids.tolist()
-
-    def __call__(self, input_ids: Tensor, scores: Tensor) -> Tensor:  # pyright: ignore[reportIncompatibleMethodOverride]
-        masked = torch.full_like(scores, -torch.inf)
-        for row, ids in enumerate(input_ids[:, self.prompt_length :].tolist()):
-            text = spelled([self.ids.index(token) for token in ids])
-            for symbol in self.choices(text):
-                masked[row, self.ids[symbol]] = scores[row, self.ids[symbol]]
-        return masked
-
-    def choices(self, text: str) -> list[int]:
-        if "#" in text or not text:
-            return [END] if text else list(range(10))
-        *_, number = text.split(" ")
-        more = [digit for digit in range(10) if number != "0" and int(f"{number}{digit}") < self.num_values]
-        if not number:
-            return more
-        return [*more, SPACE if text.count(" ") + 1 < self.num_numbers else END]
-
-
 def generated(backbone: SmolVLMBackbone, rows: TokenRows, symbol_ids: Tensor) -> list[list[int]]:
     """What transformers' own greedy search writes with its own cache, left-padded: 12 numbers below 512."""
     lengths = rows.mask.sum(dim=1).tolist()
@@ -154,18 +127,17 @@ def generated(backbone: SmolVLMBackbone, rows: TokenRows, symbol_ids: Tensor) ->
         mask[row, -length - 1 :] = 1
     model: Any = backbone.vlm
     end_id = int(symbol_ids[END])
+    processor = GrammarProcessor(512, 12, longest, symbol_ids)
     written = model.generate(
         input_ids=ids,
         attention_mask=mask,
         max_new_tokens=12 * 4,
         do_sample=False,
-        logits_processor=[GrammarProcessor(512, 12, longest, symbol_ids)],
+        logits_processor=[processor],
         eos_token_id=end_id,
         pad_token_id=end_id,
     )
-    symbols_BA = (written[:, longest:, None] == symbol_ids).long().argmax(dim=-1)
-    texts = [spelled(symbols).rstrip("#") for symbols in symbols_BA.tolist()]
-    return [[int(part) for part in text.split()] for text in texts]
+    return processor.read(written)
 
 
 def ours(backbone: SmolVLMBackbone, rows: TokenRows, symbol_ids: Tensor, *, drafted: bool) -> list[list[int]]:
@@ -225,12 +197,21 @@ def test_on_a_copy_it_writes_what_the_model_writes_now(backbone: SmolVLMBackbone
     assert answers[0] != ours(changing, prompts(changing, 0, LENGTHS), SYMBOL_IDS, drafted=True)
 
 
-@pytest.fixture(params=["smolvlm", "paligemma"])
-def text_model(request: pytest.FixtureRequest) -> Any:
+# columns of a 2 x 2 image in nine tokens
+IMAGE_COLUMNS = torch.arange(2, 6)
+
+
+@pytest.fixture(params=["smolvlm", "paligemma", "qwen"])
+def text(request: pytest.FixtureRequest) -> tuple[Any, Positions]:
+    """A text model, and the positions that its family takes columns for."""
     nano = load_tokenizer(NANO)
+    if request.param == "qwen":
+        qwen = build_qwen(nano_qwen_config(nano), 56)
+        return qwen.text_model, lambda column_C: qwen.positions(column_C, IMAGE_COLUMNS)
     if request.param == "smolvlm":
-        return build_backbone(nano_config(nano)).vlm.model.text_model
-    return build_paligemma(nano_paligemma_config(nano)).vlm.model.language_model
+        return build_backbone(nano_config(nano)).text_model, same_positions
+    paligemma = build_paligemma(nano_paligemma_config(nano))
+    return paligemma.text_model, paligemma.positions
 
 
 def nine_tokens(model: Any) -> tuple[Tensor, Tensor]:
@@ -240,10 +221,10 @@ def nine_tokens(model: Any) -> tuple[Tensor, Tensor]:
 
 
 @torch.no_grad()
-def states_of_nine_tokens(model: Any, *, compiled: bool = False) -> Tensor:
+def states_of_nine_tokens(model: Any, positions: Positions, *, compiled: bool = False) -> Tensor:
     """Five as a prompt, two as a pass, two singly."""
     embeds_BKH, columns_BK = nine_tokens(model)
-    text = CachedText(TextLayers(model, compiled=compiled), 3, 20)
+    text = CachedText(TextLayers(model, compiled=compiled), 3, 20, positions)
     states = [text(embeds_BKH[:, part], columns_BK[:, part]) for part in (slice(5), slice(5, 7))]
     passes = zip(embeds_BKH[:, 7:].split(1, dim=1), text.singly(columns_BK[:, 7:]), strict=True)
     states += [text.read(embeds_B1H, columns) for embeds_B1H, columns in passes]
@@ -251,35 +232,43 @@ def states_of_nine_tokens(model: Any, *, compiled: bool = False) -> Tensor:
 
 
 @torch.no_grad()
-def test_fast_layers_compute_what_the_plain_ones_do_and_those_what_the_model_does(text_model: Any) -> None:
+def test_fast_layers_compute_what_the_plain_ones_do_and_those_what_the_model_does(
+    text: tuple[Any, Positions],
+) -> None:
     """Copied weights that stand joined are rotated by halves, plain ones on a CPU by pairs."""
-    for parameter in text_model.parameters():  # norms and biases that are not ones and zeros
+    model, positions = text
+    for parameter in model.parameters():  # norms and biases that are not ones and zeros
         parameter += 0.1 * torch.randn(parameter.shape, generator=torch.Generator().manual_seed(1))
-    embeds_BKH, columns_BK = nine_tokens(text_model)
-    plain = hidden_states(text_model, embeds_BKH)
-    own = text_model(inputs_embeds=embeds_BKH).last_hidden_state
-    torch.testing.assert_close(plain, own, rtol=0, atol=1e-4)
-    for layers in (TextLayers(text_model), TextLayers(text_model, copy_dtype=torch.float32)):
-        states = CachedText(layers, 3, 20)(embeds_BKH, columns_BK)
+    embeds_BKH, columns_BK = nine_tokens(model)
+    position_L = positions(torch.arange(9))
+    plain = hidden_states(model, embeds_BKH, position_L)
+    # (B, L), or (3, B, L) of Qwen2.5-VL
+    own = model(inputs_embeds=embeds_BKH, position_ids=torch.stack(3 * [position_L], dim=-2))
+    torch.testing.assert_close(plain, own.last_hidden_state, rtol=0, atol=1e-4)
+    for layers in (TextLayers(model), TextLayers(model, copy_dtype=torch.float32)):
+        states = CachedText(layers, 3, 20, positions)(embeds_BKH, columns_BK)
         torch.testing.assert_close(states, plain, rtol=0, atol=1e-4)
 
 
-def test_singly_and_with_projections_that_are_not_plain_states_are_the_same(text_model: Any) -> None:
+def test_singly_and_with_projections_that_are_not_plain_states_are_the_same(
+    text: tuple[Any, Positions],
+) -> None:
     """As with adapters; such heads are turned another way."""
-    states = states_of_nine_tokens(text_model)
-    together = CachedText(TextLayers(text_model), 3, 20)
+    model, positions = text
+    states = states_of_nine_tokens(model, positions)
+    together = CachedText(TextLayers(model), 3, 20, positions)
     with torch.no_grad():
-        torch.testing.assert_close(together(*nine_tokens(text_model)), states, rtol=0, atol=1e-4)
+        torch.testing.assert_close(together(*nine_tokens(model)), states, rtol=0, atol=1e-4)
     seen = []
-    text_model.layers[1].self_attn.k_proj.register_forward_hook(lambda *_: seen.append(1))
-    torch.testing.assert_close(states_of_nine_tokens(text_model), states, rtol=0, atol=1e-4)
+    model.layers[1].self_attn.k_proj.register_forward_hook(lambda *_: seen.append(1))
+    torch.testing.assert_close(states_of_nine_tokens(model, positions), states, rtol=0, atol=1e-4)
     assert len(seen) == 4
 
 
 @pytest.mark.long
-def test_compiled_layers_compute_the_same(text_model: Any) -> None:
-    compiled = states_of_nine_tokens(text_model, compiled=True)
-    torch.testing.assert_close(compiled, states_of_nine_tokens(text_model), rtol=0, atol=1e-4)
+def test_compiled_layers_compute_the_same(text: tuple[Any, Positions]) -> None:
+    compiled = states_of_nine_tokens(*text, compiled=True)
+    torch.testing.assert_close(compiled, states_of_nine_tokens(*text), rtol=0, atol=1e-4)
 
 
 @torch.no_grad()

@@ -8,7 +8,7 @@ from PIL import Image
 from torch import Tensor
 from transformers import AutoImageProcessor
 
-from lerobot_bomb.vlm.images import crop_and_resize, lanczos_weights, resize
+from lerobot_bomb.vlm.images import crop, lanczos_weights, resize, resized_pixels
 
 SIZES = [
     (84, 84),
@@ -40,6 +40,11 @@ def to_tensor(image: np.ndarray) -> Tensor:
     return torch.from_numpy(image).permute(2, 0, 1)[None] / 255
 
 
+def seen_pixels(images: Tensor, crop_fraction: float, size: int, generator: torch.Generator | None) -> Tensor:
+    """(B, 3, H, W) in [0, 1] -> (B, 3, size, size) in [-1, 1], as a SmolVLM sees it."""
+    return resized_pixels(crop(images, crop_fraction, generator), size)
+
+
 def processed(processor: Any, image: np.ndarray) -> Tensor:
     """(1, 3, 512, 512) in [-1, 1] of the real processor, without tiling."""
     images = [Image.fromarray(image)]
@@ -63,7 +68,7 @@ def processor(shared_data: Path) -> Any:
 @pytest.mark.parametrize(("height", "width"), SIZES)
 def test_pixels_are_the_real_processors(processor: Any, height: int, width: int) -> None:
     for image in images(height, width).values():
-        ours = crop_and_resize(to_tensor(image), 1.0, 512, None)
+        ours = seen_pixels(to_tensor(image), 1.0, 512, None)
         assert_equal_pixels(ours, processed(processor, image))
 
 
@@ -72,7 +77,7 @@ def test_cropped_pusht_frames_are_the_real_processors(processor: Any, shared_dat
     replay = zarr.open(store=str(shared_data / "pusht" / "pusht_cchi_v7_replay.zarr"), mode="r")
     for index in (0, 1000, 25_000):
         frame = np.asarray(replay["data/img"][index]).astype(np.uint8)
-        ours = crop_and_resize(to_tensor(frame), 0.875, 512, None)
+        ours = seen_pixels(to_tensor(frame), 0.875, 512, None)
         assert_equal_pixels(ours, processed(processor, frame[6:90, 6:90].copy()))
 
 
@@ -86,19 +91,19 @@ def test_resizing_is_pillows(size: int) -> None:
 
 def test_precision_does_not_depend_on_autocast_or_inference_mode() -> None:
     images = torch.rand(2, 3, 50, 70, generator=torch.Generator().manual_seed(0))
-    expected = crop_and_resize(images, 0.9, 64, None)
+    expected = seen_pixels(images, 0.9, 64, None)
     lanczos_weights.cache_clear()
     with torch.autocast("cpu", dtype=torch.bfloat16), torch.inference_mode():
-        pixels = crop_and_resize(images, 0.9, 64, None)
+        pixels = seen_pixels(images, 0.9, 64, None)
     assert pixels.dtype == torch.float32
     assert torch.equal(pixels, expected)
-    assert torch.equal(crop_and_resize(images, 0.9, 64, None), expected)
+    assert torch.equal(seen_pixels(images, 0.9, 64, None), expected)
 
 
 def test_the_callers_images_stay_as_they_are() -> None:
     images = torch.rand(1, 3, 16, 16)
     before = images.clone()
-    crop_and_resize(images, 1.0, 16, None)
+    seen_pixels(images, 1.0, 16, None)
     assert torch.equal(images, before)
 
 
@@ -108,13 +113,13 @@ def test_the_callers_images_stay_as_they_are() -> None:
 def test_the_centre_is_cropped_without_a_generator() -> None:
     image = torch.zeros(1, 3, 8, 8)
     image[..., 2:6, 2:6] = 1.0
-    cropped = crop_and_resize(image, 0.5, 4, None)
+    cropped = seen_pixels(image, 0.5, 4, None)
     assert torch.equal(cropped, torch.ones(1, 3, 4, 4))
 
 
 def test_pixels_are_mapped_to_minus_one_to_one() -> None:
     levels = torch.tensor([0.0, 51 / 255, 1.0]).view(3, 1, 1, 1).expand(3, 3, 5, 7)
-    pixels = crop_and_resize(levels, 1.0, 4, None)
+    pixels = seen_pixels(levels, 1.0, 4, None)
     assert pixels[:, 0, 0, 0].tolist() == pytest.approx([-1.0, -0.6, 1.0], abs=1e-6)
     assert pixels.shape == (3, 3, 4, 4)
 
@@ -122,6 +127,6 @@ def test_pixels_are_mapped_to_minus_one_to_one() -> None:
 def test_random_crops_differ_by_image_and_reach_every_corner() -> None:
     ramp = (torch.arange(10.0)[:, None] * 10 + torch.arange(10.0)) / 99
     images = ramp.expand(200, 3, 10, 10)
-    crops = crop_and_resize(images, 0.8, 8, torch.Generator().manual_seed(0))
+    crops = seen_pixels(images, 0.8, 8, torch.Generator().manual_seed(0))
     corners = ((crops[:, 0, 0, 0] * 0.5 + 0.5) * 99).round().long()
     assert set(corners.tolist()) == {10 * row + column for row in range(3) for column in range(3)}

@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 from torch import Tensor
 
 from lerobot_bomb.vlm.depth import lattice_points
-from lerobot_bomb.vlm.images import crop_and_resize, draw_windows
+from lerobot_bomb.vlm.images import crop, draw_windows, resized_pixels
 from lerobot_bomb.vlm.intrinsics import (
     back_project,
     crop_intrinsics,
@@ -55,7 +55,7 @@ def test_observed_cameras_count_from_a_pixels_centre() -> None:
     fraction=st.floats(0.3, 1),
     seed=st.integers(0, 2**31),
 )
-def test_a_camera_projects_to_where_crop_and_resize_move_the_pixel(
+def test_a_camera_projects_to_where_cropping_and_resizing_move_the_pixel(
     data: Any, focal: float, sides: Any, new_sides: Any, fraction: float, seed: int
 ) -> None:
     x, y, z = (data.draw(st.floats(low, high)) for low, high in ((-2, 2), (-2, 2), (0.1, 9)))
@@ -79,7 +79,8 @@ def test_a_camera_projects_to_where_a_spot_of_the_image_is_seen() -> None:
     images = spot.expand(8, 3, 60, 80)
     windows = draw_windows(images, 0.8, torch.Generator().manual_seed(3))
     assert len(windows.offsets.unique(dim=0)) > 4
-    pixels = crop_and_resize(images, 0.8, 100, torch.Generator().manual_seed(3))[:, 0] / 2 + 0.5
+    cropped = crop(images, 0.8, torch.Generator().manual_seed(3))
+    pixels = resized_pixels(cropped, 100)[:, 0] / 2 + 0.5
     centers = torch.arange(100) + 0.5
     weights = pixels.sum(dim=(1, 2))
     seen = torch.stack([pixels.sum(dim=1) @ centers, pixels.sum(dim=2) @ centers], dim=1) / weights[:, None]

@@ -178,7 +178,7 @@ def test_what_a_checkpoint_was_trained_with_cannot_be_changed_in_evaluation(
 
 
 def test_config_survives_as_json(tmp_path: Path) -> None:
-    policy = make_policy(number_width=4)
+    policy = make_policy(number_width=4, image_size=128)
     policy.config._save_pretrained(tmp_path)
     assert PreTrainedConfig.from_pretrained(tmp_path) == policy.config
 
@@ -239,6 +239,7 @@ def test_an_observation_without_a_task_is_an_error(task: Any) -> None:
         ({"mask_level": "word"}, r"--policy.mask_level='word' is unknown"),
         ({"mask_max_fraction": 1.5}, r"--policy.mask_max_fraction=1.5 must lie in 0..1"),
         ({"mask_skip_prob": -0.1}, r"--policy.mask_skip_prob=-0.1 must lie in 0..1"),
+        ({"image_size": 0}, r"--policy.image_size=0 must be at least 1"),
         ({"crop_fraction": 0.0}, r"--policy.crop_fraction=0.0 must lie in \(0, 1\]"),
         ({"dtype": "float16"}, r"--policy.dtype='float16' is unknown; choose one of: float32, bfloat16"),
         ({"use_amp": True, "dtype": "bfloat16"}, r"--policy.use_amp=true .* --policy.dtype=bfloat16 instead"),

@@ -11,7 +11,7 @@ from torch import Tensor, nn
 
 NUM_SYMBOLS = 12
 SPACE, END = 10, 11
-SYMBOL_TEXTS = (*"0123456789", " ", "<end_of_utterance>")
+SYMBOL_TEXTS = (*"0123456789", " ")  # the end's is the chat format's
 MAX_DIGITS = 4  # of any number that a policy reads or writes
 
 IGNORED = -100  # label of a token that the loss does not count

@@ -1,4 +1,4 @@
-"""Layers of text models of the Llama and Gemma 2 families, for passes of a few tokens.
+"""Layers of text models of the Llama, Qwen 2 and Gemma 2 families, for passes of a few tokens.
 
 The layers' own modules are called in transformers' order, without what surrounds them there (building masks,
 growing caches, recording outputs), which takes most of the time of a small model's pass.
@@ -19,7 +19,7 @@ from torch.nn.functional import rms_norm, scaled_dot_product_attention
 from transformers.models.gemma2.modeling_gemma2 import Gemma2DecoderLayer, Gemma2RMSNorm
 
 from lerobot_bomb.decoding.linear import cast, make_linear, make_linears
-from lerobot_bomb.decoding.qkv import Heads, RopeHalves, RopePairs, softcap_of
+from lerobot_bomb.decoding.qkv import Heads, RopeHalves, RopePairs, rotary_tables, softcap_of
 
 # sizes of passes that may be compiled in a process; torch's own limit is 8
 MAX_COMPILED = 64
@@ -45,7 +45,6 @@ class TextLayers:
         """
         self.model, self.config = model, model.config
         self.embedding: Tensor = model.embed_tokens.weight
-        self.rotary_emb: Callable[..., tuple[Tensor, Tensor]] = model.rotary_emb
         modules = [*model.layers, model.norm]
         self._copied: list[tuple[Tensor, nn.Module, str]] = []
         if copy_dtype is not None:
@@ -66,6 +65,11 @@ class TextLayers:
     def __len__(self) -> int:
         return len(self._layers)
 
+    @property
+    def head_size(self) -> int:
+        config = self.config
+        return getattr(config, "head_dim", None) or config.hidden_size // config.num_attention_heads
+
     def __call__(self, x_BKH: Tensor, columns: Columns, caches: Sequence[Tensor]) -> Tensor:
         """(B, K, H) embeddings -> (B, K, H) states after the last layer.
 
@@ -78,9 +82,8 @@ class TextLayers:
         return self._norm(x_NH).view(x_BKH.shape)
 
     def rope(self, position_C: Tensor) -> Tensor:
-        """(C, 1, ...) rotary positions, as the layers want them."""
-        cos_1CE, sin_1CE = self.rotary_emb(self.embedding, position_C[None])
-        return self._rope(cos_1CE[0], sin_1CE[0])
+        """Positions as `rotary_tables` takes them -> (C, 1, ...) rotary ones as the layers want them."""
+        return self._rope(*rotary_tables(self.model, position_C))
 
     @torch.no_grad()
     def refresh(self) -> None:

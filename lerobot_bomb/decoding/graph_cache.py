@@ -7,7 +7,7 @@ import torch
 from torch import Tensor, nn
 
 from lerobot_bomb.decoding.decoder_layers import TextLayers
-from lerobot_bomb.decoding.kv_cache import CachedText
+from lerobot_bomb.decoding.kv_cache import CachedText, Positions, same_positions
 
 
 class GraphCache[T]:
@@ -16,9 +16,9 @@ class GraphCache[T]:
     There is one copy for a device and a type that is computed in. Copied or pickled, it has none.
     """
 
-    def __init__(self, text_model: Any, first_position: int = 0, *, compiled: bool = False):
+    def __init__(self, text_model: Any, positions: Positions = same_positions, *, compiled: bool = False):
         """``compiled``: layers by `torch.compile`, which fuses what is not a product."""
-        self._text_model, self._first_position, self._compiled = text_model, first_position, compiled
+        self._text_model, self._positions, self._compiled = text_model, positions, compiled
         self._forget()
 
     def __getstate__(self) -> dict[str, Any]:
@@ -46,6 +46,6 @@ class GraphCache[T]:
         batch_size, prompt_length, _ = prompt_BLH.shape
         shape = *place, batch_size, prompt_length, num_new
         if shape not in self._made:
-            text = CachedText(layers, batch_size, prompt_length + num_new, self._first_position)
+            text = CachedText(layers, batch_size, prompt_length + num_new, self._positions)
             self._made[shape] = make(text)
         return self._made[shape]

@@ -5,12 +5,21 @@ size of a head.
 """
 
 import math
+from collections.abc import Callable
 from typing import Any
 
 import torch
 from torch import Tensor
 
 from lerobot_bomb.decoding.decoder_layers import Columns, TextLayers
+
+# (C,) columns, from 0 -> the positions that a model takes them for, as `rotary_tables` takes them
+Positions = Callable[[Tensor], Tensor]
+
+
+def same_positions(column_C: Tensor) -> Tensor:
+    """Of a model that counts as columns are counted."""
+    return column_C
 
 
 def check_positions(
@@ -35,15 +44,21 @@ def check_positions(
 class CachedText:
     """Hidden states of new tokens, which read what was cached before them.
 
-    A token's column in the cache is its position, counted from 0; the model counts from ``first_position``.
-    One at a column that is written already takes its place, so what is no longer wanted is written over. Gaps
-    go to `unread_column`.
+    A token's column in the cache says its position, the same in every row (``positions``). One at a column
+    that is written already takes its place, so what is no longer wanted is written over. Gaps go to
+    `unread_column`.
 
     Raises:
         ValueError: the model has fewer positions than ``num_columns``.
     """
 
-    def __init__(self, layers: TextLayers, batch_size: int, num_columns: int, first_position: int = 0):
+    def __init__(
+        self,
+        layers: TextLayers,
+        batch_size: int,
+        num_columns: int,
+        positions: Positions = same_positions,
+    ):
         config, embedding = layers.config, layers.embedding
         check_positions(config, num_columns)
         self._num_heads = config.num_key_value_heads
@@ -52,12 +67,12 @@ class CachedText:
         # a multiple of 8, which attention on CUDA wants of its masks
         self._columns_C = torch.arange(-(-(num_columns + 1) // 8) * 8, device=embedding.device)
         self.unread_column = len(self._columns_C) - 1
-        self._rope = layers.rope(first_position + self._columns_C)
+        self._rope = layers.rope(positions(self._columns_C))
         device = embedding.device.type
         cast = torch.is_autocast_enabled(device)
         dtype = torch.get_autocast_dtype(device) if cast else embedding.dtype
         self._barred, self._open = torch.tensor([-torch.inf, 0.0], dtype=dtype, device=embedding.device)
-        shape = batch_size, self._num_heads, 2, len(self._columns_C), config.head_dim
+        shape = batch_size, self._num_heads, 2, len(self._columns_C), layers.head_size
         self._take(torch.zeros(len(layers), *shape, dtype=dtype, device=embedding.device))
         blocks_BV2 = torch.arange(math.prod(shape[:3]), device=embedding.device).view(shape[:3])
         # (B, 1, 2 * V), of each row's keys and values

@@ -1,7 +1,7 @@
-"""The layers of the Llama and Gemma 2 families as their equations say them: what `decoder_layers` must equal.
+"""The layers of the Llama, Qwen 2 and Gemma 2 families as their equations say them.
 
-Nothing is cached, joined, copied or computed in place. Slow; tests compare the fast layers with these, and
-these with transformers' own.
+Nothing is cached, joined, copied or computed in place. Slow; tests compare the fast ones, `decoder_layers`,
+with these, and these with transformers' own.
 
 Shapes: `B` batch, `L` tokens, `H` hidden size, `V` key-value heads, `G` query heads for each, `E` size of a
 head.
@@ -13,24 +13,27 @@ import torch
 from torch import Tensor
 from transformers.models.gemma2.modeling_gemma2 import Gemma2DecoderLayer, Gemma2RMSNorm
 
-from lerobot_bomb.decoding.qkv import softcap_of
+from lerobot_bomb.decoding.qkv import rotary_tables, softcap_of
 
 
-def hidden_states(model: Any, x_BLH: Tensor) -> Tensor:
-    """(B, L, H) embeddings of a prompt -> (B, L, H) states after the last layer and its norm."""
-    cos_1LE, sin_1LE = model.rotary_emb(x_BLH, torch.arange(x_BLH.shape[1])[None])
+def hidden_states(model: Any, x_BLH: Tensor, position_L: Tensor) -> Tensor:
+    """(B, L, H) embeddings of a prompt -> (B, L, H) states after the last layer and its norm.
+
+    Positions as `rotary_tables` takes them.
+    """
+    cos_LE, sin_LE = rotary_tables(model, position_L)
     for layer in model.layers:
-        x_BLH = layer_states(layer, x_BLH, cos_1LE, sin_1LE)
+        x_BLH = layer_states(layer, x_BLH, cos_LE, sin_LE)
     return rms_norm(model.norm, x_BLH)
 
 
-def layer_states(layer: Any, x_BLH: Tensor, cos_1LE: Tensor, sin_1LE: Tensor) -> Tensor:
+def layer_states(layer: Any, x_BLH: Tensor, cos_LE: Tensor, sin_LE: Tensor) -> Tensor:
     """One layer: attention, then the MLP, each on normalised states and added to them.
 
     Gemma 2 normalises what is added, too.
     """
     is_gemma = isinstance(layer, Gemma2DecoderLayer)
-    read_BLH = attend(layer.self_attn, rms_norm(layer.input_layernorm, x_BLH), cos_1LE, sin_1LE)
+    read_BLH = attend(layer.self_attn, rms_norm(layer.input_layernorm, x_BLH), cos_LE, sin_LE)
     if is_gemma:
         read_BLH = rms_norm(layer.post_attention_layernorm, read_BLH)
     x_BLH = x_BLH + read_BLH
@@ -41,14 +44,14 @@ def layer_states(layer: Any, x_BLH: Tensor, cos_1LE: Tensor, sin_1LE: Tensor) ->
     return x_BLH + mixed_BLH
 
 
-def attend(attention: Any, x_BLH: Tensor, cos_1LE: Tensor, sin_1LE: Tensor) -> Tensor:
+def attend(attention: Any, x_BLH: Tensor, cos_LE: Tensor, sin_LE: Tensor) -> Tensor:
     """Grouped-query attention: each token reads itself and those before it."""
     num_tokens, size = x_BLH.shape[1], attention.head_dim
     query, key, value = (
         projection(x_BLH).unflatten(-1, (-1, size)).transpose(1, 2)  # (B, heads, L, E)
         for projection in (attention.q_proj, attention.k_proj, attention.v_proj)
     )
-    query, key = rope(query, cos_1LE, sin_1LE), rope(key, cos_1LE, sin_1LE)
+    query, key = rope(query, cos_LE, sin_LE), rope(key, cos_LE, sin_LE)
     num_groups = query.shape[1] // key.shape[1]
     key, value = (heads.repeat_interleave(num_groups, dim=1) for heads in (key, value))
     logits = softcap(attention, query @ key.transpose(-1, -2) * attention.scaling)
@@ -57,10 +60,10 @@ def attend(attention: Any, x_BLH: Tensor, cos_1LE: Tensor, sin_1LE: Tensor) -> T
     return attention.o_proj((weights @ value).transpose(1, 2).flatten(2))
 
 
-def rope(x: Tensor, cos_1LE: Tensor, sin_1LE: Tensor) -> Tensor:
+def rope(x: Tensor, cos_LE: Tensor, sin_LE: Tensor) -> Tensor:
     """(B, heads, L, E) rotated by its position: number e of the first half against that of the second."""
     first, second = x.chunk(2, dim=-1)
-    return x * cos_1LE[:, None] + torch.cat([-second, first], dim=-1) * sin_1LE[:, None]
+    return x * cos_LE + torch.cat([-second, first], dim=-1) * sin_LE
 
 
 def softcap(attention: Any, logits: Tensor) -> Tensor:

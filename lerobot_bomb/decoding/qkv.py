@@ -1,7 +1,7 @@
 """What the tokens of a pass ask for and what they can be asked for: queries, keys and values of a layer.
 
 Shapes: `N` tokens of a pass, `C` columns of a cache, `H` hidden size, `V` key-value heads, `G` query heads
-for each, `E` size of a head.
+for each, `E` size of a head, `A` = 3 axes that a position has in M-RoPE: time, line and column.
 """
 
 from collections.abc import Callable
@@ -15,6 +15,24 @@ from lerobot_bomb.decoding.linear import cast, is_plain, make_linears, multiply
 # states (N, H) and rotary positions (N, 1, ...) -> rotated and scaled queries (N, V * G, E); rotated keys,
 # then values (N, 2 * V, E)
 Heads = Callable[[Tensor, Tensor], tuple[Tensor, Tensor]]
+
+
+def rotary_tables(model: Any, position_C: Tensor) -> tuple[Tensor, Tensor]:
+    """Positions (C,), or (A, C) -> cosines and sines (C, E), as a text model turns its heads.
+
+    Every number of a head turns with one axis (M-RoPE, arXiv 2409.12191, section 2.1); text stands at the
+    same place of all three.
+    """
+    weight = model.embed_tokens.weight
+    sections = model.config.rope_parameters.get("mrope_section")
+    if sections is None:
+        cos_1CE, sin_1CE = model.rotary_emb(weight, position_C[None])
+        return cos_1CE[0], sin_1CE[0]
+    position_A1C = position_C.expand(3, -1)[:, None]
+    axis_E = torch.arange(3).repeat_interleave(torch.tensor(sections)).repeat(2).to(weight.device)
+    index_1CE = axis_E.expand(1, position_A1C.shape[-1], -1)
+    cos_CE, sin_CE = (table[:, 0].gather(0, index_1CE)[0] for table in model.rotary_emb(weight, position_A1C))
+    return cos_CE, sin_CE
 
 
 class RopeHalves:

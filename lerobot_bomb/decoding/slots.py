@@ -22,7 +22,7 @@ from lerobot_bomb.cuda_graphs import GraphedFunction
 from lerobot_bomb.decoding.decoder import MAX_GUESSES, Prompt, likeliest
 from lerobot_bomb.decoding.decoder_layers import TextLayers
 from lerobot_bomb.decoding.graph_cache import GraphCache
-from lerobot_bomb.decoding.kv_cache import CachedText
+from lerobot_bomb.decoding.kv_cache import CachedText, Positions
 from lerobot_bomb.finite import require_finite_answers
 from lerobot_bomb.vlm.backbone import exact_linear
 
@@ -37,7 +37,7 @@ class SlotWriter:
     def __init__(
         self,
         text_model: Any,
-        first_position: int,
+        positions: Positions,
         *,
         prompt_reads_all: bool,
         cap: Callable[[Tensor], Tensor],
@@ -45,9 +45,9 @@ class SlotWriter:
         compiled: bool = False,
     ):
         """``cap``: of logits; ``drafted``: guess that a step is as the one before, on a CPU, one row."""
-        self._text_model, self._first_position, self._cap = text_model, first_position, cap
+        self._text_model, self._positions, self._cap = text_model, positions, cap
         self._reads_all, self.drafted = prompt_reads_all, drafted
-        self._recordings = GraphCache[GraphSlots](text_model, first_position, compiled=compiled)
+        self._recordings = GraphCache[GraphSlots](text_model, positions, compiled=compiled)
 
     @torch.no_grad()
     def __call__(
@@ -81,7 +81,7 @@ class SlotWriter:
             return choices_BS
         batch_size, num_columns, _ = prompt.embeds.shape
         layers = TextLayers(self._text_model)
-        text = CachedText(layers, batch_size, num_columns + num_slots, self._first_position)
+        text = CachedText(layers, batch_size, num_columns + num_slots, self._positions)
         head = SlotHead(head_CH, noise, self._cap)
         # rows that agree on how far guesses are right are rare
         is_drafted = self.drafted and batch_size == 1

@@ -13,18 +13,25 @@ from lerobot_bomb.decoding.decoder_layers import TextLayers
 from lerobot_bomb.decoding.grammar import NumberGrammar
 from lerobot_bomb.decoding.graph_cache import GraphCache
 from lerobot_bomb.decoding.graph_decoder import GraphDecoder
-from lerobot_bomb.decoding.kv_cache import CachedText
-from lerobot_bomb.vlm.backbone import SmolVLMBackbone
+from lerobot_bomb.decoding.kv_cache import CachedText, Positions, same_positions
+from lerobot_bomb.vlm.backbone import Backbone
 
 
 class NumberWriter:
     """Numbers after prompts; on CUDA with the recorded passes of every shape of prompts that it has met."""
 
     def __init__(
-        self, backbone: SmolVLMBackbone, grammar: NumberGrammar, guess: Guess, *, compiled: bool = False
+        self,
+        backbone: Backbone,
+        grammar: NumberGrammar,
+        guess: Guess,
+        positions: Positions = same_positions,
+        *,
+        compiled: bool = False,
     ):
-        self._backbone, self._grammar, self._guess = backbone, grammar, guess
-        self._recordings = GraphCache[GraphDecoder](backbone.vlm.model.text_model, compiled=compiled)
+        """``positions``: of a sequence's columns, the same in every row."""
+        self._backbone, self._grammar, self._guess, self._positions = backbone, grammar, guess, positions
+        self._recordings = GraphCache[GraphDecoder](backbone.text_model, positions, compiled=compiled)
 
     @torch.no_grad()
     def __call__(
@@ -39,7 +46,7 @@ class NumberWriter:
                 make = partial(GraphDecoder, self._grammar, self._guess, *rows)
                 recorded = self._recordings.find(prompt.embeds, max_symbols, make)
                 return recorded(prompt, *rows, stop_after, noise)
-        model = continue_prompt(self._backbone, prompt, symbol_ids, max_symbols)
+        model = continue_prompt(self._backbone, prompt, symbol_ids, max_symbols, self._positions)
         return decode_numbers(
             model,
             self._grammar,
@@ -51,12 +58,16 @@ class NumberWriter:
 
 
 def continue_prompt(
-    backbone: SmolVLMBackbone, prompt: Prompt, symbol_ids: Tensor, max_symbols: int
+    backbone: Backbone,
+    prompt: Prompt,
+    symbol_ids: Tensor,
+    max_symbols: int,
+    positions: Positions = same_positions,
 ) -> CachedContinuation:
     """A continuation by a backbone as it is now."""
-    layers = TextLayers(backbone.vlm.model.text_model)
+    layers = TextLayers(backbone.text_model)
     return CachedContinuation(
-        CachedText(layers, len(prompt.embeds), prompt.embeds.shape[1] + max_symbols),
+        CachedText(layers, len(prompt.embeds), prompt.embeds.shape[1] + max_symbols, positions),
         lambda symbols: backbone.embed_tokens(symbol_ids[symbols]),
         backbone.head(symbol_ids),
         prompt.mask.sum(dim=1),

@@ -1,4 +1,4 @@
-"""SmolVLM behind the few operations a policy needs.
+"""SmolVLM, of both generations, behind the few operations a policy needs, and what other families share.
 
 Shapes: `B` batch, `L` tokens, `H` hidden size of the text model, `V` vocabulary, `P` tokens of an image.
 """
@@ -8,61 +8,45 @@ from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import Any, ClassVar
 
 import torch
 from torch import Tensor, nn
 from torch.nn.functional import linear
 from transformers import (
     AutoConfig,
-    PreTrainedConfig,
+    Idefics3Config,
+    Idefics3ForConditionalGeneration,
     PreTrainedModel,
     SmolVLMConfig,
     SmolVLMForConditionalGeneration,
-    SmolVLMVisionConfig,
 )
 
 from lerobot_bomb.finite import require_finite_weights
+from lerobot_bomb.vlm.images import resized_pixels
 from lerobot_bomb.vlm.memory import check_memory
 from lerobot_bomb.vlm.presets import INITIALIZER_RANGE, changed, nano_config
 from lerobot_bomb.vlm.tokenizer import NANO, hub_file, load_tokenizer
 
 
-class SmolVLMBackbone(nn.Module):
-    """A stock ``SmolVLMForConditionalGeneration``, called in parts: images, tokens, text model, head."""
+class Backbone(nn.Module):
+    """A stock vision-language model, called in parts, and what all families have: words in and out."""
 
-    # the family of its base models, as their config.json names it
-    family = SmolVLMConfig.model_type
+    # the text model's name among the parts of ``vlm.model``
+    text_model_name: ClassVar[str]
 
-    def __init__(self, vlm: SmolVLMForConditionalGeneration):
+    def __init__(self, vlm: PreTrainedModel):
         super().__init__()
-        self.vlm = vlm
-        text_config, vision_config = vlm.config.text_config, vlm.config.vision_config
-        assert isinstance(text_config, PreTrainedConfig) and isinstance(vision_config, SmolVLMVisionConfig)
-        assert isinstance(vision_config.image_size, int)
-        self.text_config = text_config
-        self.image_size = vision_config.image_size  # pixels, square
-        self.tokens_per_image = vlm.model.image_seq_len
+        self.vlm: Any = vlm
+        self.text_config: Any = vlm.config.text_config
 
-    def embed_images(self, pixels_B3SS: Tensor) -> Tensor:
-        """(B, 3, S, S) in [-1, 1] -> (B, P, H).
-
-        Vision model and connector are called directly: ``get_image_features`` takes an image of exactly
-        zeros, that is uniform mid-grey, for padding and drops it.
-        """
-        model = self.vlm.model
-        return model.connector(model.vision_model(pixels_B3SS).last_hidden_state)
+    @property
+    def text_model(self) -> Any:
+        return self.vlm.model.get_submodule(self.text_model_name)
 
     def embed_tokens(self, tokens_BL: Tensor) -> Tensor:
         """(B, L) token ids -> (B, L, H)."""
         return self.vlm.get_input_embeddings()(tokens_BL)
-
-    def hidden_states(self, embeds_BLH: Tensor) -> Tensor:
-        """Embeddings of rows that start with their tokens -> (B, L, H) states after the last layer.
-
-        Attention is causal, so what follows a row's end changes nothing before it.
-        """
-        return self.vlm.model.text_model(inputs_embeds=embeds_BLH, use_cache=False).last_hidden_state
 
     def head(self, token_ids: Tensor) -> Callable[[Tensor], Tensor]:
         """The output head of a few tokens, in float32: (..., H) -> (..., len(token_ids)).
@@ -79,6 +63,59 @@ class SmolVLMBackbone(nn.Module):
         return self.vlm.lm_head(hidden_BLH)
 
 
+class SmolVLMBackbone(Backbone):
+    """A stock SmolVLM; the first generation's class is Idefics 3's, made of the same parts."""
+
+    text_model_name = "text_model"
+    # config and model of each generation, as their config.json names it
+    classes: ClassVar[dict[str, tuple[Any, Any]]] = {
+        SmolVLMConfig.model_type: (SmolVLMConfig, SmolVLMForConditionalGeneration),
+        Idefics3Config.model_type: (Idefics3Config, Idefics3ForConditionalGeneration),
+    }
+
+    def __init__(self, vlm: PreTrainedModel):
+        super().__init__(vlm)
+        self.image_size: int = self.vlm.config.vision_config.image_size  # pixels, square
+        self.tokens_per_image: int = self.vlm.model.image_seq_len
+
+    @property
+    def layers(self) -> list[nn.Module]:
+        """Of the text and the vision model."""
+        return [*self.text_model.layers, *self.vlm.model.vision_model.encoder.layers]
+
+    def freeze_vision(self) -> None:
+        """Train the connector and what follows it only."""
+        self.vlm.model.vision_model.requires_grad_(False)
+
+    def checkpoint_gradients(self) -> None:
+        """Compute what is inside a layer again in the backward pass instead of keeping it."""
+        self.vlm.gradient_checkpointing_enable({"use_reentrant": False})
+
+    def pixels(self, images_B3HW: Tensor) -> Tensor:
+        """(B, 3, H, W) in [0, 1] -> (B, 3, S, S) in [-1, 1]."""
+        return resized_pixels(images_B3HW, self.image_size)
+
+    def embed_images(self, pixels_B3SS: Tensor) -> Tensor:
+        """(B, 3, S, S) in [-1, 1] -> (B, P, H).
+
+        Vision model and connector are called directly: ``get_image_features`` takes an image of exactly
+        zeros, that is uniform mid-grey, for padding and drops it.
+        """
+        model = self.vlm.model
+        return model.connector(model.vision_model(pixels_B3SS).last_hidden_state)
+
+    def positions(self, column_C: Tensor, image_columns: Tensor) -> Tensor:
+        """(C,) columns of a sequence, from 0 -> (C,) positions, whichever of them hold images."""
+        return column_C
+
+    def hidden_states(self, embeds_BLH: Tensor, image_columns: Tensor | None = None) -> Tensor:
+        """Embeddings of rows that start with their tokens -> (B, L, H) states after the last layer.
+
+        Attention is causal, so what follows a row's end changes nothing before it.
+        """
+        return self.text_model(inputs_embeds=embeds_BLH, use_cache=False).last_hidden_state
+
+
 def in_float32(module: Callable[[Tensor], Tensor], hidden: Tensor) -> Tensor:
     """What a module of float32 weights makes of (..., H), whatever autocast says."""
     with torch.autocast(hidden.device.type, enabled=False):
@@ -90,37 +127,48 @@ def exact_linear(hidden: Tensor, weight: Tensor) -> Tensor:
     return in_float32(partial(linear, weight=weight.float()), hidden)
 
 
-def load_backbone(vlm_model_name: str, changes: Mapping[str, Any] | None = None) -> SmolVLMBackbone:
+def load_backbone(
+    vlm_model_name: str, changes: Mapping[str, Any] | None = None, image_size: int | None = None
+) -> SmolVLMBackbone:
     """Backbone with pretrained weights of a Hub id or a local folder, or ``nano`` with random ones.
 
-    ``changes``: of nano's architecture.
+    ``changes``: of nano's architecture; ``image_size``: that the model must have, if any.
 
     Raises:
         OSError: config or weights cannot be had; the message names the ways out.
-        ValueError: as `check_family` and `changed`, or weights are not finite.
+        ValueError: as `check_family` and `changed`, weights are not finite, or images have another size.
     """
     if vlm_model_name == NANO:
-        backbone = build_backbone(changed(nano_config(load_tokenizer(NANO)), changes))
+        vlm_config = changed(nano_config(load_tokenizer(NANO)), changes)
+        backbone = build_backbone(vlm_config, image_size)
         spread_images(backbone.vlm.model.vision_model)
         return backbone
-    config = read_vlm_config(vlm_model_name, SmolVLMBackbone.family)
+    config = read_vlm_config(vlm_model_name, *SmolVLMBackbone.classes)
+    _check_image_size(config.vision_config.image_size, image_size)
+    _, model_class = SmolVLMBackbone.classes[config.model_type]
     with weights_errors(vlm_model_name):
-        vlm = SmolVLMForConditionalGeneration.from_pretrained(
-            vlm_model_name, config=config, dtype=torch.float32
-        )
+        vlm = model_class.from_pretrained(vlm_model_name, config=config, dtype=torch.float32)
     require_finite_weights(vlm, f"--policy.vlm_model_name={vlm_model_name}")
     return SmolVLMBackbone(vlm)
 
 
-def check_family(vlm_model_name: str, needed: str) -> None:
-    """The base model of a policy is of the family that its backbone is made for, as ``nano`` always is.
+def _check_image_size(own: int, asked: int | None) -> None:
+    if asked not in (None, own):
+        raise ValueError(
+            f"--policy.image_size={asked}: this SmolVLM has learned positions for images of {own} pixels and "
+            f"takes no others; leave the flag out"
+        )
+
+
+def check_family(vlm_model_name: str, *families: str) -> str:
+    """The family of a policy's base model, one of those that it has a backbone for; ``nano`` is the first.
 
     Raises:
         OSError: there is no config; the message names the ways out.
         ValueError: it is another family's, or a policy's.
     """
     if vlm_model_name == NANO:
-        return
+        return families[0]
     path = Path(vlm_model_name) / "config.json"
     if not path.parent.is_dir():
         path = Path(hub_file(vlm_model_name, path.name))
@@ -134,16 +182,17 @@ def check_family(vlm_model_name: str, needed: str) -> None:
             f"`lerobot-bomb export-backbone --policy.path={vlm_model_name} --output=FOLDER` makes a folder "
             f"to start from. (To train on: --policy.path={vlm_model_name})"
         )
-    if family != needed:
+    if family not in families:
         raise ValueError(
             f"--policy.vlm_model_name={vlm_model_name} is a {family!r} model; "
-            f"this policy needs a {needed!r} one"
+            f"this policy needs a {' or '.join(map(repr, families))} one"
         )
+    return family
 
 
-def read_vlm_config(vlm_model_name: str, family: str) -> Any:
+def read_vlm_config(vlm_model_name: str, *families: str) -> Any:
     """Config of a Hub id or a local folder; raises as `check_family`."""
-    check_family(vlm_model_name, family)
+    check_family(vlm_model_name, *families)
     return AutoConfig.from_pretrained(vlm_model_name)
 
 
@@ -183,12 +232,19 @@ def spread_filters(filters: Tensor) -> None:
     filters /= INITIALIZER_RANGE
 
 
-def build_backbone(vlm_config: dict[str, Any]) -> SmolVLMBackbone:
-    """Backbone of the given architecture with random weights in float32."""
-    check_memory(vlm_config, lambda: SmolVLMForConditionalGeneration(SmolVLMConfig(**vlm_config)))
-    config = SmolVLMConfig(**vlm_config)
+def build_backbone(vlm_config: dict[str, Any], image_size: int | None = None) -> SmolVLMBackbone:
+    """Backbone of the given architecture with random weights in float32; raises as `load_backbone`."""
+    check_memory(vlm_config, lambda: _random_smolvlm(vlm_config))
+    backbone = SmolVLMBackbone(_random_smolvlm(vlm_config))
+    _check_image_size(backbone.image_size, image_size)
+    return backbone
+
+
+def _random_smolvlm(vlm_config: dict[str, Any]) -> PreTrainedModel:
+    config_class, model_class = SmolVLMBackbone.classes[vlm_config["model_type"]]
+    config = config_class(**vlm_config)
     set_float32(config, config.text_config, config.vision_config)
-    return SmolVLMBackbone(SmolVLMForConditionalGeneration(config))
+    return model_class(config)
 
 
 def set_float32(*configs: Any) -> None:

@@ -47,19 +47,16 @@ def draw_windows(images_BxHW: Tensor, crop_fraction: float, generator: torch.Gen
     return CropWindows(offsets_B2, crop_height, crop_width, (height, width))
 
 
-def crop_and_resize(
-    images_B3HW: Tensor, crop_fraction: float, size: int, generator: torch.Generator | None
-) -> Tensor:
-    """(B, 3, H, W) in [0, 1] -> (B, 3, size, size) in [-1, 1].
-
-    Cuts the windows of `draw_windows`, and resizes them as SmolVLM's own processor does it with
-    ``do_resize=False, do_image_splitting=False``; see `resize`.
-    """
-    return resized_pixels(draw_windows(images_B3HW, crop_fraction, generator).cut(images_B3HW), size)
+def crop(images_BxHW: Tensor, crop_fraction: float, generator: torch.Generator | None) -> Tensor:
+    """What the windows of `draw_windows` show of (B, ..., H, W) images."""
+    return draw_windows(images_BxHW, crop_fraction, generator).cut(images_BxHW)
 
 
 def resized_pixels(images_B3HW: Tensor, size: int) -> Tensor:
-    """(B, 3, H, W) in [0, 1] -> (B, 3, size, size) in [-1, 1]; see `resize`."""
+    """(B, 3, H, W) in [0, 1] -> (B, 3, size, size) in [-1, 1]; see `resize`.
+
+    As SmolVLM's own processor does it with ``do_resize=False, do_image_splitting=False``.
+    """
     return _resized_levels(images_B3HW, size).mul_(2 / 255).sub_(1)
 
 

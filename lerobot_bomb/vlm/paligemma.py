@@ -11,18 +11,15 @@ from typing import Any
 
 import torch
 from tokenizers import Tokenizer
-from torch import Tensor, nn
+from torch import Tensor
 from transformers import PaliGemmaConfig, PaliGemmaForConditionalGeneration
 
-from lerobot_bomb.actions.text import END, SYMBOL_TEXTS
+from lerobot_bomb.actions.text import SYMBOL_TEXTS
 from lerobot_bomb.finite import require_finite_weights
-from lerobot_bomb.vlm.backbone import read_vlm_config, set_float32, spread_images, weights_errors
+from lerobot_bomb.vlm.backbone import Backbone, read_vlm_config, set_float32, spread_images, weights_errors
 from lerobot_bomb.vlm.memory import check_memory
 from lerobot_bomb.vlm.presets import changed, nano_paligemma_config
 from lerobot_bomb.vlm.tokenizer import IMAGE_TOKEN, NANO, load_tokenizer, single_id, token_ids
-
-# PaliGemma counts positions from 1
-FIRST_POSITION = 1
 
 
 @dataclass(frozen=True)
@@ -49,7 +46,7 @@ class PaliGemmaPrompt:
             image=one(IMAGE_TOKEN),
             start=[one("<bos>", "<|im_start|>")],
             state_start=several(" state:"),
-            symbols=[one(text) for text in SYMBOL_TEXTS[:END]],
+            symbols=[one(text) for text in SYMBOL_TEXTS],
             task_end=several("\n"),
         )
 
@@ -58,7 +55,7 @@ class PaliGemmaPrompt:
         return asdict(self)
 
 
-class PaliGemmaBackbone(nn.Module):
+class PaliGemmaBackbone(Backbone):
     """A stock ``PaliGemmaForConditionalGeneration`` with Gemma 2, called in parts.
 
     Gemma 2 multiplies embeddings by sqrt(H); transformers 5 does so inside ``embed_tokens``, and image
@@ -67,13 +64,11 @@ class PaliGemmaBackbone(nn.Module):
 
     # the family of its base models, as their config.json names it
     family = PaliGemmaConfig.model_type
+    text_model_name = "language_model"
 
     def __init__(self, vlm: PaliGemmaForConditionalGeneration):
-        super().__init__()
-        self.vlm = vlm
-        text_config: Any = vlm.config.text_config
-        vision_config: Any = vlm.config.vision_config
-        self.text_config = text_config
+        super().__init__(vlm)
+        text_config, vision_config = self.text_config, self.vlm.config.vision_config
         self.image_size: int = vision_config.image_size  # pixels, square
         self.patches_per_side = vision_config.image_size // vision_config.patch_size
         self.vision_hidden_size: int = vision_config.hidden_size
@@ -89,10 +84,6 @@ class PaliGemmaBackbone(nn.Module):
         """Whether words are written by the table that they are read by."""
         return self.vlm.lm_head.weight is self.vlm.get_input_embeddings().weight
 
-    @property
-    def text_model(self) -> Any:
-        return self.vlm.model.language_model
-
     def see(self, pixels_B3SS: Tensor) -> Tensor:
         """(B, 3, S, S) in [-1, 1] -> (B, P, E) features of the vision model."""
         return self.vlm.model.vision_tower(pixels_B3SS).last_hidden_state
@@ -101,9 +92,10 @@ class PaliGemmaBackbone(nn.Module):
         """(B, P, E) -> (B, P, H)."""
         return self.vlm.model.multi_modal_projector(features_BPE)
 
-    def embed_tokens(self, tokens_BL: Tensor) -> Tensor:
-        """(B, L) token ids -> (B, L, H)."""
-        return self.vlm.get_input_embeddings()(tokens_BL)
+    @staticmethod
+    def positions(columns: Tensor) -> Tensor:
+        """Places in a sequence, from 0 -> positions as PaliGemma counts them, from 1."""
+        return columns + 1
 
     def hidden_states(self, embeds_BLH: Tensor, columns_BL: Tensor, reads_BLL: Tensor) -> Tensor:
         """(B, L, H) states after the last layer.
@@ -115,7 +107,7 @@ class PaliGemmaBackbone(nn.Module):
         return self.text_model(
             inputs_embeds=embeds_BLH,
             attention_mask={"full_attention": mask, "sliding_attention": mask},
-            position_ids=columns_BL + FIRST_POSITION,
+            position_ids=self.positions(columns_BL),
             use_cache=False,
         ).last_hidden_state
 

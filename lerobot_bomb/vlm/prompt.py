@@ -1,33 +1,120 @@
-"""The fixed parts of the prompt as token ids, for any tokenizer of the SmolVLM family.
+"""The fixed parts of the prompt as token ids, in the chat format of a family of models.
 
-The whole sequence is, in SmolVLM2's chat format:
+The whole sequence is, in SmolVLM's:
 
     <|im_start|>User:IMG...IMGTask: {task}, State: s1 ... sS, Actions: <end_of_utterance>
     Assistant: a1 a2 ... an<end_of_utterance>
 
 with IMG = ``<fake_token_around_image><global-img><image>...<image><fake_token_around_image>``. A system
-prompt stands before ``User:`` as ``System: {text}<end_of_utterance>`` and a line break. The sequence is cut
-where the tokenizer cuts anyway (at special tokens, between ``,`` and a space, at digits), so the pieces'
-tokens in a row are the tokens of the whole string.
+prompt stands before ``User:`` as ``System: {text}<end_of_utterance>`` and a line break. In Qwen2.5-VL's:
+
+    <|im_start|>system
+    You are a helpful assistant.<|im_end|>
+    <|im_start|>user
+    IMG...IMGTask: {task}, State: s1 ... sS, Actions: <|im_end|>
+    <|im_start|>assistant
+     a1 a2 ... an<|im_end|>
+
+with IMG = ``<|vision_start|><|image_pad|>...<|image_pad|><|vision_end|>``. The sequence is cut where the
+tokenizer cuts anyway (at special tokens, between ``,`` and a space, at digits), so the pieces' tokens in a
+row are the tokens of the whole string.
 """
 
 import re
 from dataclasses import asdict, dataclass
+from functools import partial
 from itertools import takewhile
 
 from tokenizers import Tokenizer
 
-from lerobot_bomb.actions.text import END, MAX_DIGITS, SYMBOL_TEXTS
-from lerobot_bomb.vlm.tokenizer import GLOBAL_IMAGE_TOKEN, HIDDEN_TOKEN, IMAGE_EDGE_TOKEN, IMAGE_TOKEN
+from lerobot_bomb.actions.text import MAX_DIGITS, SYMBOL_TEXTS
+from lerobot_bomb.vlm.tokenizer import (
+    GLOBAL_IMAGE_TOKEN,
+    HIDDEN_TOKEN,
+    IMAGE_EDGE_TOKEN,
+    IMAGE_TOKEN,
+    single_id,
+    token_ids,
+)
 
 TASK_TEMPLATE = "Task: {},"
+
+
+@dataclass(frozen=True)
+class ChatFormat:
+    """What a family of models puts around a user's texts and its own."""
+
+    family: str  # of its tokenizers, in messages
+    start: str  # of the sequence
+    system: str  # message; {} is its text
+    default_system: str | None  # its text where the user gives none; None: there is no such message
+    end: str  # of every message
+    turn: str  # between that and who speaks next
+    user: str
+    assistant: str
+    # single tokens: the first that a tokenizer has
+    image_start: tuple[str, ...]
+    image: tuple[str, ...]
+    image_end: tuple[str, ...]
+    hidden: tuple[str, ...]  # for a hidden number: in no other use here
+    image_label: str = ""  # after an image's start
+
+    def opening(self, tokenizer: Tokenizer, vlm_model_name: str, system_prompt: str | None) -> list[int]:
+        """Tokens of all that stands before the user's images; raises as `single_id`."""
+        ids = [single_id(tokenizer, vlm_model_name, self.family, self.start)]
+        text = self.default_system if system_prompt is None else system_prompt
+        if text is not None:
+            ids += text_ids(tokenizer, self.system.format(text))
+            ids += self._next(tokenizer, vlm_model_name)
+        return [*ids, *token_ids(tokenizer, self.user)]
+
+    def reply(self, tokenizer: Tokenizer, vlm_model_name: str) -> list[int]:
+        """Tokens between the user's text and the model's; raises as `single_id`."""
+        return [*self._next(tokenizer, vlm_model_name), *token_ids(tokenizer, self.assistant)]
+
+    def _next(self, tokenizer: Tokenizer, vlm_model_name: str) -> list[int]:
+        end = single_id(tokenizer, vlm_model_name, self.family, self.end)
+        return [end, *token_ids(tokenizer, self.turn)]
+
+
+SMOLVLM_CHAT = ChatFormat(
+    family="SmolVLM",
+    start="<|im_start|>",
+    system="System: {}",
+    default_system=None,
+    end="<end_of_utterance>",
+    turn="\n",
+    user="User:",
+    assistant="Assistant:",
+    image_start=(IMAGE_EDGE_TOKEN,),
+    image=(IMAGE_TOKEN,),
+    image_end=(IMAGE_EDGE_TOKEN,),
+    # the second is of SmolLM2, and in the tokenizers of the first 2.2B, which have no tile positions
+    hidden=(HIDDEN_TOKEN, "<empty_output>"),
+    image_label=GLOBAL_IMAGE_TOKEN,
+)
+# the last of several tokens is the nano tokenizer's
+QWEN_CHAT = ChatFormat(
+    family="Qwen2.5-VL",
+    start="<|im_start|>",
+    system="system\n{}",
+    default_system="You are a helpful assistant.",
+    end="<|im_end|>",
+    turn="\n<|im_start|>",
+    user="user\n",
+    assistant="assistant\n",
+    image_start=("<|vision_start|>", IMAGE_EDGE_TOKEN),
+    image=("<|image_pad|>", IMAGE_TOKEN),
+    image_end=("<|vision_end|>", IMAGE_EDGE_TOKEN),
+    hidden=("<|fim_pad|>", HIDDEN_TOKEN),
+)
 
 
 @dataclass(frozen=True)
 class PromptTokens:
     """Token ids of everything in a sequence but the task."""
 
-    symbols: list[int]  # digits 0-9, space, <end_of_utterance>
+    symbols: list[int]  # digits 0-9, space, end of a message
     hidden: int  # stands for a hidden number
     start: list[int]  # before the images, with the system prompt
     image_start: list[int]
@@ -40,7 +127,11 @@ class PromptTokens:
 
     @classmethod
     def from_tokenizer(
-        cls, tokenizer: Tokenizer, vlm_model_name: str, system_prompt: str | None = None
+        cls,
+        tokenizer: Tokenizer,
+        vlm_model_name: str,
+        system_prompt: str | None = None,
+        chat: ChatFormat = SMOLVLM_CHAT,
     ) -> "PromptTokens":
         """Look everything up.
 
@@ -48,36 +139,21 @@ class PromptTokens:
             ValueError: a digit, the space or a special token is not exactly one token of its own, or not
                 everywhere.
         """
-
-        def one(text: str) -> int:
-            ids = tokenizer.encode(text).ids
-            if len(ids) != 1:
-                raise ValueError(
-                    f"--policy.vlm_model_name={vlm_model_name}: its tokenizer writes {text!r} as {len(ids)} "
-                    f"tokens; the policy needs a SmolVLM-family tokenizer, where it is exactly one"
-                )
-            return ids[0]
-
-        def several(text: str) -> list[int]:
-            return tokenizer.encode(text).ids
-
-        symbols = [one(text) for text in SYMBOL_TEXTS]
+        several = partial(token_ids, tokenizer)
+        one = partial(single_id, tokenizer, vlm_model_name, chat.family)
+        symbols = {text: one(text) for text in (*SYMBOL_TEXTS, chat.end)}
         _check_distinct(symbols, vlm_model_name)
-        _check_numbers(tokenizer, symbols, vlm_model_name)
-        end = one(SYMBOL_TEXTS[-1])
-        system = []
-        if system_prompt is not None:
-            system = [*text_ids(tokenizer, f"System: {system_prompt}"), end, *several("\n")]
+        _check_numbers(tokenizer, symbols, chat, vlm_model_name)
         return cls(
-            symbols=symbols,
-            hidden=one(HIDDEN_TOKEN),
-            start=[one("<|im_start|>"), *system, *several("User:")],
-            image_start=[one(IMAGE_EDGE_TOKEN), one(GLOBAL_IMAGE_TOKEN)],
-            image=one(IMAGE_TOKEN),
-            image_end=[one(IMAGE_EDGE_TOKEN)],
+            symbols=list(symbols.values()),
+            hidden=one(*chat.hidden),
+            start=chat.opening(tokenizer, vlm_model_name, system_prompt),
+            image_start=[one(*chat.image_start), *several(chat.image_label)],
+            image=one(*chat.image),
+            image_end=[one(*chat.image_end)],
             state_start=several(" State:"),
             state_end=several(","),
-            answer_start=[*several(" Actions: "), end, *several("\nAssistant:")],
+            answer_start=[*several(" Actions: "), *chat.reply(tokenizer, vlm_model_name)],
             system_prompt=system_prompt,
         )
 
@@ -86,10 +162,10 @@ class PromptTokens:
         return asdict(self)
 
 
-def _check_distinct(symbol_ids: list[int], vlm_model_name: str) -> None:
+def _check_distinct(symbols: dict[str, int], vlm_model_name: str) -> None:
     """Raise if two symbols are the same token, as all that a tokenizer does not know are."""
     texts: dict[int, str] = {}
-    for text, token in zip(SYMBOL_TEXTS, symbol_ids, strict=True):
+    for text, token in symbols.items():
         if token in texts:
             raise ValueError(
                 f"--policy.vlm_model_name={vlm_model_name}: its tokenizer writes {texts[token]!r} and "
@@ -99,21 +175,22 @@ def _check_distinct(symbol_ids: list[int], vlm_model_name: str) -> None:
         texts[token] = text
 
 
-def _check_numbers(tokenizer: Tokenizer, symbol_ids: list[int], vlm_model_name: str) -> None:
+def _check_numbers(
+    tokenizer: Tokenizer, symbols: dict[str, int], chat: ChatFormat, vlm_model_name: str
+) -> None:
     """Raise unless every number of up to MAX_DIGITS digits is a space and one token a digit, where it stands.
 
     The policy turns numbers into tokens by arithmetic and asks no tokenizer: this is its only check. 0.2 s.
     """
-    ids: dict[str, int] = dict(zip(SYMBOL_TEXTS, symbol_ids, strict=True))
     numbers = [f" {number:0{width}}" for width in range(1, MAX_DIGITS + 1) for number in range(10**width)]
     # all of them one after the other, and every digit as the last
     answers = ["".join(numbers), *numbers[:10]]
-    for before, after in ((" State:", ","), ("Assistant:", SYMBOL_TEXTS[END])):
-        start, end = tokenizer.encode(before).ids, tokenizer.encode(after).ids
+    for before, after in ((" State:", ","), (chat.turn + chat.assistant, chat.end)):
+        start, end = token_ids(tokenizer, before), token_ids(tokenizer, after)
         for answer in answers:
             text = f"{before}{answer}{after}"
-            written = tokenizer.encode(text)
-            expected = [*start, *(ids[symbol] for symbol in answer), *end]
+            written = tokenizer.encode(text, add_special_tokens=False)
+            expected = [*start, *(symbols[symbol] for symbol in answer), *end]
             if written.ids != expected:
                 same = takewhile(lambda pair: pair[0] == pair[1], zip(written.ids, expected, strict=False))
                 first, last = written.offsets[min(len(list(same)), len(written.ids) - 1)]

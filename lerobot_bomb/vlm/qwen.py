@@ -20,20 +20,12 @@ from transformers import Qwen2_5_VLConfig, Qwen2_5_VLForConditionalGeneration
 from transformers.utils.constants import OPENAI_CLIP_MEAN, OPENAI_CLIP_STD
 
 from lerobot_bomb.finite import require_finite_weights
-from lerobot_bomb.vlm.backbone import read_vlm_config, set_float32, spread_filters, weights_errors
+from lerobot_bomb.vlm.backbone import Backbone, read_vlm_config, set_float32, spread_filters, weights_errors
+from lerobot_bomb.vlm.images import resize
 from lerobot_bomb.vlm.memory import check_memory
 from lerobot_bomb.vlm.presets import changed, nano_qwen_config
-from lerobot_bomb.vlm.tokenizer import (
-    IMAGE_EDGE_TOKEN,
-    IMAGE_TOKEN,
-    NANO,
-    load_tokenizer,
-    single_id,
-    token_ids,
-)
-
-# of the chat format, where the user gives none
-SYSTEM_TEXT = "system\nYou are a helpful assistant."
+from lerobot_bomb.vlm.prompt import QWEN_CHAT
+from lerobot_bomb.vlm.tokenizer import NANO, load_tokenizer, single_id
 
 type KeysValues = tuple[Tensor, Tensor]  # (B, V, L, E) each
 
@@ -55,16 +47,13 @@ class QwenPrompt:
         Raises:
             ValueError: a special token is not exactly one token.
         """
-        several = partial(token_ids, tokenizer)
-        one = partial(single_id, tokenizer, vlm_model_name, "Qwen2.5-VL")
-        turn, turn_end, line_break = one("<|im_start|>"), one("<|im_end|>"), several("\n")
+        one = partial(single_id, tokenizer, vlm_model_name, QWEN_CHAT.family)
         return cls(
-            start=[turn, *several(SYSTEM_TEXT), turn_end, *line_break, turn, *several("user\n")],
-            # the second of each pair is the nano tokenizer's
-            image_start=one("<|vision_start|>", IMAGE_EDGE_TOKEN),
-            image=one("<|image_pad|>", IMAGE_TOKEN),
-            image_end=one("<|vision_end|>", IMAGE_EDGE_TOKEN),
-            end=[turn_end, *line_break, turn, *several("assistant\n")],
+            start=QWEN_CHAT.opening(tokenizer, vlm_model_name, None),
+            image_start=one(*QWEN_CHAT.image_start),
+            image=one(*QWEN_CHAT.image),
+            image_end=one(*QWEN_CHAT.image_end),
+            end=QWEN_CHAT.reply(tokenizer, vlm_model_name),
         )
 
     def to_dict(self) -> dict[str, int | list[int]]:
@@ -116,7 +105,7 @@ class _Reader:
         return torch.cat([self._kept[0], keys_BVTE], dim=2), torch.cat([self._kept[1], values_BVTE], dim=2)
 
 
-class QwenBackbone(nn.Module):
+class QwenBackbone(Backbone):
     """A stock ``Qwen2_5_VLForConditionalGeneration``, called in parts.
 
     Raises:
@@ -125,23 +114,17 @@ class QwenBackbone(nn.Module):
 
     # the family of its base models, as their config.json names it
     family = Qwen2_5_VLConfig.model_type
+    text_model_name = "language_model"
     pixel_mean: Tensor  # (3, 1, 1)
     pixel_std: Tensor
 
     def __init__(self, vlm: Qwen2_5_VLForConditionalGeneration, image_size: int):
-        super().__init__()
-        self.vlm = vlm
-        self.text_config: Any = vlm.config.text_config
-        vision_config: Any = vlm.config.vision_config
+        super().__init__(vlm)
+        vision_config = self.vlm.config.vision_config
         self._patch, self._merge = vision_config.patch_size, vision_config.spatial_merge_size
         self._frames = vision_config.temporal_patch_size
-        if image_size < 1 or image_size % (self._patch * self._merge):
-            raise ValueError(
-                f"--policy.image_size={image_size} must be a multiple of {self._patch * self._merge} pixels: "
-                f"a token stands for {self._merge} x {self._merge} patches of {self._patch} pixels"
-            )
         self.image_size = image_size  # pixels, square
-        self.tokens_per_side = image_size // (self._patch * self._merge)
+        self.tokens_per_side = _tokens_per_side(vision_config, image_size)
         self._is_checkpointed = False
         for name, values in (("pixel_mean", OPENAI_CLIP_MEAN), ("pixel_std", OPENAI_CLIP_STD)):
             self.register_buffer(name, torch.tensor(values)[:, None, None], persistent=False)
@@ -156,8 +139,18 @@ class QwenBackbone(nn.Module):
         return self.tokens_per_side**2
 
     @property
-    def text_model(self) -> Any:
-        return self.vlm.model.language_model
+    def layers(self) -> list[nn.Module]:
+        """Of the text and the vision model."""
+        return [*self.text_model.layers, *self.vlm.model.visual.blocks]
+
+    def freeze_vision(self) -> None:
+        """Train the connector and what follows it only."""
+        self.vlm.model.visual.requires_grad_(False)
+        self.vlm.model.visual.merger.requires_grad_(True)
+
+    def pixels(self, images_B3HW: Tensor) -> Tensor:
+        """(B, 3, H, W) in [0, 1] -> (B, 3, S, S) in [0, 1]."""
+        return resize(images_B3HW, self.image_size)
 
     def embed_images(self, pixels_B3SS: Tensor) -> Tensor:
         """(B, 3, S, S) in [0, 1] -> (B, P, H)."""
@@ -175,9 +168,20 @@ class QwenBackbone(nn.Module):
         frames = cells[..., None, :, :].expand(*cells.shape[:6], self._frames, *cells.shape[6:])
         return frames.flatten(5).flatten(0, 4)
 
-    def embed_tokens(self, tokens_BL: Tensor) -> Tensor:
-        """(B, L) token ids -> (B, L, H)."""
-        return self.vlm.get_input_embeddings()(tokens_BL)
+    def positions(self, column_C: Tensor, image_columns: Tensor) -> Tensor:
+        """(C,) columns of a sequence, from 0 -> (3, C) time, line and column of what stands there."""
+        is_image_1C = torch.isin(column_C, image_columns.to(column_C.device))[None]
+        return self._positions(is_image_1C, torch.ones_like(is_image_1C))[0][:, 0]
+
+    def hidden_states(self, embeds_BLH: Tensor, image_columns: Tensor) -> Tensor:
+        """Embeddings of rows that start with their tokens -> (B, L, H) states after the last layer.
+
+        ``image_columns``: where the images stand, in every row. Attention is causal, so what follows a row's
+        end changes nothing before it.
+        """
+        column_L = torch.arange(embeds_BLH.shape[1], device=embeds_BLH.device)
+        is_image_BL = torch.isin(column_L, image_columns).expand(len(embeds_BLH), -1)
+        return self.read_prefix(embeds_BLH, is_image_BL, torch.ones_like(is_image_BL)).hidden
 
     def read_prefix(self, embeds_BLH: Tensor, is_image_BL: Tensor, mask_BL: Tensor) -> Prefix:
         """Read rows whose first column is written; ``is_image_BL``: which tokens are parts of images."""
@@ -230,6 +234,21 @@ class QwenBackbone(nn.Module):
         return torch.stack([starts_BL, starts_BL + lines_BL, starts_BL + columns_BL]), ends_BL[:, -1:]
 
 
+def _tokens_per_side(vision_config: Any, image_size: int) -> int:
+    """How many tokens a line of an image is.
+
+    Raises:
+        ValueError: not a whole number.
+    """
+    patch, merge = vision_config.patch_size, vision_config.spatial_merge_size
+    if image_size < 1 or image_size % (patch * merge):
+        raise ValueError(
+            f"--policy.image_size={image_size} must be a multiple of {patch * merge} pixels: "
+            f"a token stands for {merge} x {merge} patches of {patch} pixels"
+        )
+    return image_size // (patch * merge)
+
+
 def _read_layer(
     layer: nn.Module,
     x_BTH: Tensor,
@@ -256,6 +275,7 @@ def load_qwen(vlm_model_name: str, image_size: int, changes: Mapping[str, Any] |
         spread_filters(backbone.vlm.model.visual.patch_embed.proj.weight)
         return backbone
     config = read_vlm_config(vlm_model_name, QwenBackbone.family)
+    _tokens_per_side(config.vision_config, image_size)
     with weights_errors(vlm_model_name):
         vlm = Qwen2_5_VLForConditionalGeneration.from_pretrained(
             vlm_model_name, config=config, dtype=torch.float32, attn_implementation="sdpa"

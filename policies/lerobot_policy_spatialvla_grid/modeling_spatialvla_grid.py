@@ -45,9 +45,6 @@ from lerobot_bomb.vlm.ego3d import Ego3D
 from lerobot_bomb.vlm.images import CropWindows, draw_windows, resized_pixels
 from lerobot_bomb.vlm.inputs import read_actions, read_image, read_task
 from lerobot_bomb.vlm.intrinsics import crop_intrinsics, default_intrinsics, resize_intrinsics
-from lerobot_bomb.vlm.paligemma import (
-    FIRST_POSITION,
-)
 from lerobot_policy_spatialvla_grid.building_spatialvla_grid import (
     build_depth,
     build_model,
@@ -111,7 +108,7 @@ class SpatialvlaGridPolicy(TokenVlaPolicy):
         self._init_cells()
         self._writer = SlotWriter(
             self.backbone.text_model,
-            FIRST_POSITION,
+            self.backbone.positions,
             prompt_reads_all=self._prompt_reads_all,
             cap=self.backbone.cap,
             drafted=config.draft != "none",

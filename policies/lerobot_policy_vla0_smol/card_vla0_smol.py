@@ -3,8 +3,8 @@
 from lerobot_bomb.hub.method import Method, Paper
 
 METHOD = Method(
-    summary="a stock SmolVLM2 is fine-tuned to write the next actions as decimal integers, without any new "
-    "head: the recipe of VLA-0 and VLA-0-Smol.",
+    summary="a stock vision-language model is fine-tuned to write the next actions as decimal integers, "
+    "without any new head: the recipe of VLA-0 and VLA-0-Smol.",
     backbone="HuggingFaceTB/SmolVLM2-500M-Video-Instruct",
     backbone_license="apache-2.0",
     papers=(

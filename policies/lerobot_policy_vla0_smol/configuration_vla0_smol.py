@@ -8,6 +8,7 @@ from lerobot.configs import PreTrainedConfig
 from lerobot_bomb.actions.bins import BIN_MODES
 from lerobot_bomb.actions.text import MASK_LEVELS, MAX_DIGITS, digits_needed
 from lerobot_bomb.policies.config import RelativeVlaConfig, TokenVlaConfig
+from lerobot_bomb.training.policy_flags import check_positive
 
 DRAFTS = ("none", "linear")
 MAX_BINS = 10**MAX_DIGITS
@@ -15,7 +16,7 @@ MAX_BINS = 10**MAX_DIGITS
 SHAPES = ("nano_config",)
 # the same, and flags that say what the model's tokens mean
 AS_TRAINED = (
-    *("chunk_size", "n_action_bins", "n_state_bins", "bin_mode", "number_width", "use_state"),
+    *("chunk_size", "n_action_bins", "n_state_bins", "bin_mode", "number_width", "use_state", "image_size"),
     *SHAPES,
 )
 
@@ -23,7 +24,7 @@ AS_TRAINED = (
 @PreTrainedConfig.register_subclass("vla0_smol")
 @dataclass
 class Vla0SmolConfig(RelativeVlaConfig, TokenVlaConfig):
-    """A SmolVLM writes ``chunk_size`` actions as integers; ``n_action_steps`` of them are executed."""
+    """A model writes ``chunk_size`` actions as integers; ``n_action_steps`` of them are executed."""
 
     CHOICES: ClassVar[dict[str, tuple]] = {
         **TokenVlaConfig.CHOICES,
@@ -34,6 +35,9 @@ class Vla0SmolConfig(RelativeVlaConfig, TokenVlaConfig):
 
     # Hub id, path of a local folder, or "nano": a small model with random weights, built in code
     vlm_model_name: str = "HuggingFaceTB/SmolVLM2-500M-Video-Instruct"
+
+    # side in pixels of what the vision model sees; None = SmolVLM's own, 224 for Qwen2.5-VL
+    image_size: int | None = None
 
     # actions in the text
     chunk_size: int = 10
@@ -48,7 +52,7 @@ class Vla0SmolConfig(RelativeVlaConfig, TokenVlaConfig):
     bin_mode: str = "centers"
     # digits of every number, zero-padded; 0 = as many as the number has
     number_width: int = 0
-    # text of a system message before the prompt
+    # text of a system message before the prompt; None = none, or Qwen2.5-VL's own
     system_prompt: str | None = None
 
     # what a pass of the model guesses and checks beside the next token: "linear" (actions go on as in the
@@ -79,6 +83,8 @@ class Vla0SmolConfig(RelativeVlaConfig, TokenVlaConfig):
                     f"--policy.number_width={self.number_width} must be 0 (no padding) or lie in "
                     f"{digits_needed(bins)}..{MAX_DIGITS} for --policy.{flag}={bins}"
                 )
+        if self.image_size is not None:
+            check_positive(self, ("image_size",))
         for flag in ("mask_max_fraction", "mask_skip_prob"):
             if not 0 <= getattr(self, flag) <= 1:
                 raise ValueError(f"--policy.{flag}={getattr(self, flag)} must lie in 0..1")

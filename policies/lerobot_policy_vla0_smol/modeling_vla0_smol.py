@@ -6,7 +6,8 @@ Shapes: `B` batch, `T` actions of a chunk, `D` action dims, `N` = T * D numbers,
 takes, `L` tokens of a sequence, `A` tokens of an answer, `H` hidden size, `P` tokens of an image.
 """
 
-from typing import Any, ClassVar
+from functools import partial
+from typing import Any
 
 import torch
 from lerobot.datasets import LeRobotDatasetMetadata
@@ -37,23 +38,16 @@ from lerobot_bomb.decoding.writer import NumberWriter
 from lerobot_bomb.policies.policy import RelativeVlaPolicy, TokenVlaPolicy
 from lerobot_bomb.training.distributed import weighed
 from lerobot_bomb.training.randomness import begin_batch
-from lerobot_bomb.vlm.backbone import (
-    SmolVLMBackbone,
-    build_backbone,
-    check_family,
-    config_dict,
-    load_backbone,
-)
-from lerobot_bomb.vlm.images import crop_and_resize
+from lerobot_bomb.vlm.images import crop
 from lerobot_bomb.vlm.inputs import read_actions, read_image, read_task
-from lerobot_bomb.vlm.prompt import TASK_TEMPLATE, PromptTokens
-from lerobot_bomb.vlm.tokenizer import load_tokenizer
+from lerobot_bomb.vlm.prompt import TASK_TEMPLATE
+from lerobot_policy_vla0_smol.building_vla0_smol import build_model
 from lerobot_policy_vla0_smol.card_vla0_smol import METHOD
 from lerobot_policy_vla0_smol.configuration_vla0_smol import AS_TRAINED, SHAPES, Vla0SmolConfig
 
 
 class Vla0SmolPolicy(RelativeVlaPolicy, TokenVlaPolicy):
-    """A stock SmolVLM that writes the next ``chunk_size`` actions as integers."""
+    """A stock SmolVLM or Qwen2.5-VL that writes the next ``chunk_size`` actions as integers."""
 
     config_class = Vla0SmolConfig  # pyright: ignore[reportAssignmentType]  LeRobot annotates it as None
     name = "vla0_smol"  # pyright: ignore[reportAssignmentType]
@@ -61,9 +55,6 @@ class Vla0SmolPolicy(RelativeVlaPolicy, TokenVlaPolicy):
     config: Vla0SmolConfig
     shapes, as_trained = SHAPES, AS_TRAINED
     symbol_ids: Tensor
-    # modules that FSDP shards one by one; accelerate reads the second name
-    _fsdp_wrap_modules: ClassVar[list[str]] = ["LlamaDecoderLayer", "SmolVLMEncoderLayer"]
-    _no_split_modules = _fsdp_wrap_modules
 
     def __init__(
         self, config: Vla0SmolConfig, dataset_meta: LeRobotDatasetMetadata | None = None, **_: object
@@ -71,7 +62,10 @@ class Vla0SmolPolicy(RelativeVlaPolicy, TokenVlaPolicy):
         super().__init__(config, dataset_meta)
         if dataset_meta is not None:
             config.check_masking()
-        self.tokens, self.backbone = _build(config)
+        self.tokens, self.backbone = build_model(config)
+        # modules that FSDP shards one by one; accelerate reads the second name
+        self._fsdp_wrap_modules = sorted({type(layer).__name__ for layer in self.backbone.layers})
+        self._no_split_modules = self._fsdp_wrap_modules
         self.register_buffer("symbol_ids", torch.tensor(self.tokens.symbols), persistent=False)
         self.action_bins = Bins(config.n_action_bins, config.bin_mode)
         self.state_bins = Bins(config.n_state_bins, config.bin_mode)
@@ -85,12 +79,17 @@ class Vla0SmolPolicy(RelativeVlaPolicy, TokenVlaPolicy):
             if config.draft == "none"
             else LinearDraft(self.grammar, self._action_dim)
         )
-        self._writer = NumberWriter(self.backbone, self.grammar, guess, compiled=config.compile_model)
+        columns = self._image_columns(torch.device("cpu"))
+        # of a prompt's and its answer's columns, the same in every row
+        self._positions = partial(self.backbone.positions, image_columns=columns)
+        self._writer = NumberWriter(
+            self.backbone, self.grammar, guess, self._positions, compiled=config.compile_model
+        )
         self._ensemble = self._make_ensemble()
         self.reset()
 
     def _get_default_peft_targets(self) -> dict[str, Any]:
-        return peft_targets(self, "text_model", ())
+        return peft_targets(self, self.backbone.text_model_name, ())
 
     # Training
 
@@ -143,7 +142,9 @@ class Vla0SmolPolicy(RelativeVlaPolicy, TokenVlaPolicy):
         """Teacher-forced logits of every answer token: (B, A, V)."""
         ids_BL = TokenRows.join([prompt, answer]).without_padding().ids
         check_positions(self.backbone.text_config, ids_BL.shape[1])
-        hidden_BLH = self.backbone.hidden_states(self._embeds(batch, ids_BL))
+        hidden_BLH = self.backbone.hidden_states(
+            self._embeds(batch, ids_BL), self._image_columns(ids_BL.device)
+        )
         offsets_A = torch.arange(answer.ids.shape[1], device=ids_BL.device)
         # a token is predicted one column earlier; columns beyond a short row carry no label
         columns_BA = prompt.mask.sum(dim=1, keepdim=True) - 1 + offsets_A
@@ -250,9 +251,9 @@ class Vla0SmolPolicy(RelativeVlaPolicy, TokenVlaPolicy):
     def _embeds(self, batch: dict[str, Tensor], ids_BL: Tensor) -> Tensor:
         """Embeddings (B, L, H) of a sequence that starts with a prompt, image features in place."""
         generator = self.generator if self.training else None
-        fraction, size = self.config.crop_fraction, self.backbone.image_size
         images = [read_image(batch, key, self.config.type, ids_BL.device) for key in self._cameras]
-        pixels = [crop_and_resize(image, fraction, size, generator) for image in images]
+        images = [crop(image, self.config.crop_fraction, generator) for image in images]
+        pixels = [self.backbone.pixels(image) for image in images]
         features_BPH = self.backbone.embed_images(torch.stack(pixels, dim=1).flatten(0, 1))
         embeds_BLH = self.backbone.embed_tokens(ids_BL)
         features_BPH = features_BPH.reshape(len(ids_BL), -1, embeds_BLH.shape[-1]).to(embeds_BLH.dtype)
@@ -269,27 +270,3 @@ class Vla0SmolPolicy(RelativeVlaPolicy, TokenVlaPolicy):
     @property
     def _image_span(self) -> list[int]:
         return [self.tokens.image] * self.backbone.tokens_per_image
-
-
-def _build(config: Vla0SmolConfig) -> tuple[PromptTokens, SmolVLMBackbone]:
-    """Base model, or the architecture of a checkpoint; fills in what a checkpoint's config must hold."""
-    if config.vlm_config is None:
-        name = config.vlm_model_name
-        check_family(name, SmolVLMBackbone.family)
-        tokens = PromptTokens.from_tokenizer(load_tokenizer(name), name, config.system_prompt)
-        backbone = load_backbone(name, config.nano_config)
-        config.vlm_config, config.prompt_tokens = config_dict(backbone.vlm), tokens.to_dict()
-    elif config.prompt_tokens is None:
-        raise ValueError("--policy.vlm_config is set, but not --policy.prompt_tokens, which belongs to it")
-    else:
-        tokens, backbone = PromptTokens(**config.prompt_tokens), build_backbone(config.vlm_config)
-        if tokens.system_prompt != config.system_prompt:
-            raise ValueError(
-                f"--policy.system_prompt={config.system_prompt!r}: this checkpoint was trained with "
-                f"{tokens.system_prompt!r}, which cannot be changed"
-            )
-    if config.freeze_vision_encoder:
-        backbone.vlm.model.vision_model.requires_grad_(False)
-    if config.gradient_checkpointing:
-        backbone.vlm.gradient_checkpointing_enable({"use_reentrant": False})
-    return tokens, backbone

@@ -1,0 +1,57 @@
+"""The vision-language model of a ``vla0_smol``, from its config or a checkpoint's."""
+
+from typing import Any
+
+from lerobot_bomb.vlm.backbone import (
+    SmolVLMBackbone,
+    build_backbone,
+    check_family,
+    config_dict,
+    load_backbone,
+)
+from lerobot_bomb.vlm.prompt import QWEN_CHAT, SMOLVLM_CHAT, PromptTokens
+from lerobot_bomb.vlm.qwen import QwenBackbone, build_qwen, load_qwen
+from lerobot_bomb.vlm.tokenizer import load_tokenizer
+from lerobot_policy_vla0_smol.configuration_vla0_smol import Vla0SmolConfig
+
+# of Qwen2.5-VL, which reads any; as VLA-0 does
+QWEN_IMAGE_SIZE = 224
+
+type TextBackbone = SmolVLMBackbone | QwenBackbone
+
+
+def build_model(config: Vla0SmolConfig) -> tuple[PromptTokens, TextBackbone]:
+    """Base model, or the architecture of a checkpoint; fills in what a checkpoint's config must hold."""
+    if config.vlm_config is None:
+        tokens, backbone = _load(config)
+        config.vlm_config, config.prompt_tokens = config_dict(backbone.vlm), tokens.to_dict()
+    elif config.prompt_tokens is None:
+        raise ValueError("--policy.vlm_config is set, but not --policy.prompt_tokens, which belongs to it")
+    else:
+        tokens, backbone = PromptTokens(**config.prompt_tokens), _build(config.vlm_config, config.image_size)
+        if tokens.system_prompt != config.system_prompt:
+            raise ValueError(
+                f"--policy.system_prompt={config.system_prompt!r}: this checkpoint was trained with "
+                f"{tokens.system_prompt!r}, which cannot be changed"
+            )
+    if config.freeze_vision_encoder:
+        backbone.freeze_vision()
+    if config.gradient_checkpointing:
+        backbone.checkpoint_gradients()
+    return tokens, backbone
+
+
+def _load(config: Vla0SmolConfig) -> tuple[PromptTokens, TextBackbone]:
+    name = config.vlm_model_name
+    is_qwen = check_family(name, *SmolVLMBackbone.classes, QwenBackbone.family) == QwenBackbone.family
+    chat = QWEN_CHAT if is_qwen else SMOLVLM_CHAT
+    tokens = PromptTokens.from_tokenizer(load_tokenizer(name), name, config.system_prompt, chat)
+    if is_qwen:
+        return tokens, load_qwen(name, config.image_size or QWEN_IMAGE_SIZE)
+    return tokens, load_backbone(name, config.nano_config, config.image_size)
+
+
+def _build(vlm_config: dict[str, Any], image_size: int | None) -> TextBackbone:
+    if vlm_config.get("model_type") == QwenBackbone.family:
+        return build_qwen(vlm_config, image_size or QWEN_IMAGE_SIZE)
+    return build_backbone(vlm_config, image_size)
