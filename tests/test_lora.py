@@ -28,8 +28,14 @@ Run = Callable[..., None]
 REPO_ID = "test/lora"
 NEW_PARTS = {
     "fdvla": {"segment", "state_embedding", "flow_head", "denoise_head"},
-    "spatialvla_grid": {"cell_embedding", "cell_head", "ego3d"},
+    "spatialvla_grid": {"cell_embedding", "cell_head"},
     "vla0_smol": set(),
+}
+# with adapters beside the text model's
+OTHER_PARTS = {
+    "fdvla": (),
+    "spatialvla_grid": ("vision_tower", "multi_modal_projector"),
+    "vla0_smol": (),
 }
 SMALL = {
     "fdvla": "--policy.image_size=56 --policy.head_dim=32 --policy.dualmod_dim=16 --policy.dtype=float32",
@@ -57,9 +63,12 @@ def test_text_layers_get_adapters_and_new_parts_are_trained_whole(policy_type: s
     policy, wrapped = adapted(policy_type)
     trained = [name for name, parameter in wrapped.named_parameters() if parameter.requires_grad]
     num_layers = policy.backbone.text_config.num_hidden_layers
-    assert sum("lora_A" in name for name in trained) == LAYERS * num_layers
-    assert all(".layers." in name for name in trained if "lora_" in name)
-    assert not any("visi" in name or "visual" in name for name in trained)
+    adapters = [name for name in trained if "lora_A" in name]
+    others = {part: [name for name in adapters if f".{part}." in name] for part in OTHER_PARTS[policy_type]}
+    assert all(others.values())
+    of_text = [name for name in adapters if not any(name in names for names in others.values())]
+    assert len(of_text) == LAYERS * num_layers and all(".layers." in name for name in of_text)
+    assert not any("visi" in name or "visual" in name for name in of_text)
     whole = {name.split(".modules_to_save")[0].split(".")[-1] for name in trained if "lora_" not in name}
     assert whole == NEW_PARTS[policy_type]
 

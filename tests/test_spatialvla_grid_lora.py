@@ -97,6 +97,31 @@ def test_adapters_hold_the_cells_of_adapted_grids(
         make_policy(read_config(folders[0], "cpu"), ds_meta=make_dataset(tmp_path / "other", 0.6))
 
 
+def test_adapters_are_where_the_original_has_them(base: Path, meta: LeRobotDatasetMetadata) -> None:
+    """On every linear layer that its fine-tuning names, by their names there."""
+    theirs = (
+        "q_proj k_proj v_proj o_proj gate_proj up_proj down_proj fc1 fc2 out_proj linear layers.0 layers.3"
+    )
+
+    def with_adapters(**flags: object) -> set[str]:
+        wrapped: Any = adapted(base, meta, **flags).wrap_with_peft(peft_cli_overrides=LORA)
+        return {*wrapped.targeted_module_names}
+
+    policy = adapted(base, meta)
+    parts = ("backbone.vlm.model.language_model", "backbone.vlm.model.vision_tower")
+    expected = {
+        name
+        for name, module in policy.named_modules()
+        if isinstance(module, torch.nn.Linear)
+        and name.startswith((*parts, "backbone.vlm.model.multi_modal_projector", "ego3d"))
+        and name.endswith(tuple(f".{of}" for of in theirs.split()))
+    }
+    found = with_adapters()
+    assert found == expected and len(expected) == 2 * 7 + 2 * 6 + 1 + 2
+    frozen = with_adapters(freeze_vision_encoder="true", depth_source="none")
+    assert frozen == {name for name in expected if "vision_tower" not in name and "ego3d" not in name}
+
+
 def test_adapters_that_could_not_hold_adapted_cells_are_refused(
     base: Path, meta: LeRobotDatasetMetadata
 ) -> None:

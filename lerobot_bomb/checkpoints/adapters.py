@@ -27,13 +27,16 @@ NAME_OTHERS = {
 PROJECTIONS = "q|k|v|o|gate|up|down"  # of a layer's attention and MLP
 
 
-def peft_targets(policy: nn.Module, text_model: str, new_parts: Iterable[str]) -> dict[str, Any]:
+def peft_targets(
+    policy: nn.Module, text_model: str, new_parts: Iterable[str], others: Iterable[str] = ()
+) -> dict[str, Any]:
     """Adapters on every projection of the text model's layers; parts that are new are trained as they are.
 
-    Of ``new_parts``, those that the policy has.
+    ``others``: patterns of more modules with adapters. Of ``new_parts``, those that the policy has.
     """
+    text = rf"backbone\.vlm\.model\.{text_model}\.layers\..*\.({PROJECTIONS})_proj"
     return {
-        "target_modules": rf"backbone\.vlm\.model\.{text_model}\.layers\..*\.({PROJECTIONS})_proj",
+        "target_modules": "|".join([text, *others]),
         "modules_to_save": [name for name in new_parts if getattr(policy, name, None) is not None],
     }
 

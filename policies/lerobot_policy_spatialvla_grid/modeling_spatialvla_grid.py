@@ -64,7 +64,10 @@ logger = logging.getLogger(__name__)
 
 # not of the base model: trained whole beside its adapters
 CELL_TABLES = ("cell_embedding", "cell_head")
-NEW_PARTS = (*CELL_TABLES, "ego3d")
+# patterns of modules that have adapters beside the text model's
+VISION_LAYERS = r"backbone\.vlm\.model\.vision_tower\..*\.((q|k|v|out)_proj|fc[12])"
+PROJECTOR = r"backbone\.vlm\.model\.multi_modal_projector\.linear"
+EGO3D_LAYERS = r"ego3d\.layers\.[03]"
 
 
 class SpatialvlaGridPolicy(TokenVlaPolicy):
@@ -184,7 +187,13 @@ class SpatialvlaGridPolicy(TokenVlaPolicy):
         return sorted({*binary, *super()._newest_only()})
 
     def _get_default_peft_targets(self) -> dict[str, Any]:
-        return peft_targets(self, "language_model", NEW_PARTS)
+        """The original's: linear layers of text and vision model, projector, Ego3D; and the cells whole."""
+        others = [PROJECTOR]
+        if not self.config.freeze_vision_encoder:
+            others.append(VISION_LAYERS)
+        if self.config.depth_source != "none":
+            others.append(EGO3D_LAYERS)
+        return peft_targets(self, "language_model", CELL_TABLES, others)
 
     def _validate_peft_config(self, peft_config: Any) -> None:
         """Grids that were adapted are in the adapters' config, so the adapters must hold their cells."""
