@@ -54,6 +54,21 @@ def test_a_patch_reads_its_points_line_by_line() -> None:
     assert patches[2].tolist() == [[2, 0], [2, 1], [3, 0], [3, 1]]
 
 
+def test_without_a_vector_for_it_a_patch_that_lacks_depth_gets_nothing() -> None:
+    with_vector, without = (
+        Ego3D(hidden_size=5, patches_per_side=2, zero_init=False, no_depth_vector=has)
+        for has in (True, False)
+    )
+    without.load_state_dict({name: t for name, t in with_vector.state_dict().items() if name != "no_depth"})
+    points = random_points(2, 4)
+    expected = with_vector(points)
+    assert torch.equal(without(points), expected)
+    points[0, 1, 2] = NAN  # of the second patch
+    assert not without(points)[0, 1].any() and with_vector(points)[0, 1].any()
+    kept = torch.tensor([[True, False, True, True], [True] * 4])
+    assert torch.equal(without(points)[kept], expected[kept])
+
+
 def test_the_published_size_of_a_patch() -> None:
     ego3d = Ego3D(hidden_size=5, patches_per_side=16)
     assert ego3d.lattice_size == 32

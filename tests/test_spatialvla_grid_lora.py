@@ -1,4 +1,4 @@
-"""LoRA on a converted SpatialVLA whose grids are adapted to other data, by LeRobot's own commands."""
+"""Training a converted SpatialVLA on other data: LoRA on adapted grids, by LeRobot's own commands."""
 
 import shutil
 from collections.abc import Callable
@@ -120,6 +120,13 @@ def test_adapters_are_where_the_original_has_them(base: Path, meta: LeRobotDatas
     assert found == expected and len(expected) == 2 * 7 + 2 * 6 + 1 + 2
     frozen = with_adapters(freeze_vision_encoder="true", depth_source="none")
     assert frozen == {name for name in expected if "vision_tower" not in name and "ego3d" not in name}
+
+
+def test_data_without_depth_cannot_be_trained_on_with_observed_depth(
+    base: Path, meta: LeRobotDatasetMetadata
+) -> None:
+    with pytest.raises(ValueError, match=r"needs observation\.depth\.image, observation\.intrinsics\.image"):
+        adapted(base, meta, depth_source="observation")
 
 
 def test_adapters_that_could_not_hold_adapted_cells_are_refused(
