@@ -15,6 +15,8 @@ from lerobot_bomb.vlm.prompt import normalize_task
 from lerobot_bomb.vlm.tokenizer import load_tokenizer
 from lerobot_policy_vla0_smol.modeling_vla0_smol import Vla0SmolPolicy
 
+VLA0_JITTER = [0.2, 0.2, 0.2, 0.05]
+
 # Sequence
 
 
@@ -213,7 +215,7 @@ def test_a_hidden_step_hides_all_its_dimensions() -> None:
 
 
 def test_training_draws_do_not_touch_the_global_random_state() -> None:
-    policy = make_policy(mask_max_fraction=0.5).train()
+    policy = make_policy(mask_max_fraction=0.5, color_jitter=VLA0_JITTER).train()
     batch = make_batch(policy, 4)
     torch.manual_seed(5)
     before = torch.get_rng_state()
@@ -234,6 +236,33 @@ def test_the_crop_is_random_in_training_and_the_centre_in_evaluation() -> None:
     assert torch.equal(policy._embeds(border, ids), policy._embeds(batch, ids))
     policy.train()
     assert not torch.equal(policy._embeds(batch, ids), policy._embeds(batch, ids))
+
+
+def test_colours_are_jittered_in_training_only() -> None:
+    plain, jittered = (make_policy(crop_fraction=1.0, color_jitter=reach) for reach in (None, VLA0_JITTER))
+    batch = make_batch(plain, 2)
+    ids = plain._prompt(batch).ids
+    assert torch.equal(jittered._embeds(batch, ids), plain._embeds(batch, ids))
+    plain.train()
+    jittered.train()
+    assert torch.equal(plain._embeds(batch, ids), plain._embeds(batch, ids))
+    seen = [jittered._embeds(batch, ids) for _ in range(2)]
+    assert not torch.equal(*seen)
+    # nothing but the images' tokens
+    same = (seen[0] == seen[1]).all(dim=2).all(dim=0)
+    assert set((~same).nonzero()[:, 0].tolist()) == set(plain._image_columns(ids.device).tolist())
+
+
+def test_a_resumed_training_jitters_as_the_uninterrupted_one() -> None:
+    def losses(trained_batches: int, num_batches: int) -> list[float]:
+        policy = make_policy(mask_max_fraction=0.0, crop_fraction=1.0, color_jitter=VLA0_JITTER).train()
+        policy.config.trained_batches = trained_batches
+        batch = make_batch(policy, 2)
+        return [policy(batch)[0].item() for _ in range(num_batches)]
+
+    whole = losses(0, 4)
+    assert len(set(whole)) == 4
+    assert losses(2, 2) == whole[2:]
 
 
 def test_every_camera_counts_whatever_the_order_of_the_features() -> None:

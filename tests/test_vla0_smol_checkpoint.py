@@ -181,6 +181,9 @@ def test_config_survives_as_json(tmp_path: Path) -> None:
     policy = make_policy(number_width=4, image_size=128)
     policy.config._save_pretrained(tmp_path)
     assert PreTrainedConfig.from_pretrained(tmp_path) == policy.config
+    flag = "--color_jitter=[0.2, 0.2, 0.2, 0.05]"
+    config: Any = PreTrainedConfig.from_pretrained(tmp_path, cli_overrides=[flag])
+    assert config.color_jitter == [0.2, 0.2, 0.2, 0.05]
 
 
 # Processors
@@ -239,6 +242,13 @@ def test_an_observation_without_a_task_is_an_error(task: Any) -> None:
         ({"mask_level": "word"}, r"--policy.mask_level='word' is unknown"),
         ({"mask_max_fraction": 1.5}, r"--policy.mask_max_fraction=1.5 must lie in 0..1"),
         ({"mask_skip_prob": -0.1}, r"--policy.mask_skip_prob=-0.1 must lie in 0..1"),
+        (
+            {"color_jitter": [0.2, 0.2, 0.2]},
+            r"--policy.color_jitter=\[0.2, 0.2, 0.2\] must be four numbers: .* VLA-0's are \[0.2",
+        ),
+        ({"color_jitter": [0.2, 0.2, 0.2, 0.6]}, r"color_jitter=.* hue in 0..0.5"),
+        ({"color_jitter": [-0.1, 0.2, 0.2, 0.0]}, r"color_jitter=.* brightness, .* in 0..1"),
+        ({"color_jitter": [float("nan"), 0.2, 0.2, 0.0]}, r"color_jitter=\[nan"),
         ({"image_size": 0}, r"--policy.image_size=0 must be at least 1"),
         ({"crop_fraction": 0.0}, r"--policy.crop_fraction=0.0 must lie in \(0, 1\]"),
         ({"dtype": "float16"}, r"--policy.dtype='float16' is unknown; choose one of: float32, bfloat16"),

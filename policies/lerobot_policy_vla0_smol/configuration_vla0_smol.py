@@ -12,6 +12,8 @@ from lerobot_bomb.training.policy_flags import check_positive
 
 DRAFTS = ("none", "linear")
 MAX_BINS = 10**MAX_DIGITS
+# of brightness, contrast, saturation and hue
+COLOR_JITTER_MOST = (1.0, 1.0, 1.0, 0.5)
 # flags that say what shapes the weights have
 SHAPES = ("nano_config",)
 # the same, and flags that say what the model's tokens mean
@@ -62,6 +64,10 @@ class Vla0SmolConfig(RelativeVlaConfig, TokenVlaConfig):
     # side of the crop as a fraction of the image: random place while training, centre otherwise
     crop_fraction: float = 0.875
 
+    # how far brightness, contrast, saturation and hue change while training, as torchvision's ColorJitter
+    # does it; None = not at all
+    color_jitter: list[float] | None = None
+
     # what is hidden as one while training: a number, all numbers of a step, or single characters
     mask_level: str = "value"
     # upper end of the fraction of numbers (steps, characters) that are hidden
@@ -85,9 +91,20 @@ class Vla0SmolConfig(RelativeVlaConfig, TokenVlaConfig):
                 )
         if self.image_size is not None:
             check_positive(self, ("image_size",))
+        self._check_color_jitter()
         for flag in ("mask_max_fraction", "mask_skip_prob"):
             if not 0 <= getattr(self, flag) <= 1:
                 raise ValueError(f"--policy.{flag}={getattr(self, flag)} must lie in 0..1")
+
+    def _check_color_jitter(self) -> None:
+        reach, most = self.color_jitter, COLOR_JITTER_MOST
+        if reach is None:
+            return
+        if len(reach) != len(most) or not all(0 <= x <= limit for x, limit in zip(reach, most, strict=True)):
+            raise ValueError(
+                f"--policy.color_jitter={reach} must be four numbers: brightness, contrast and saturation in "
+                f"0..1, hue in 0..0.5; VLA-0's are [0.2, 0.2, 0.2, 0.05]"
+            )
 
     def check_masking(self) -> None:
         """Raise unless training can hide what it is told to hide.

@@ -38,6 +38,7 @@ from lerobot_bomb.decoding.writer import NumberWriter
 from lerobot_bomb.policies.policy import RelativeVlaPolicy, TokenVlaPolicy
 from lerobot_bomb.training.distributed import weighed
 from lerobot_bomb.training.randomness import begin_batch
+from lerobot_bomb.vlm.color_jitter import ColorJitter
 from lerobot_bomb.vlm.images import crop
 from lerobot_bomb.vlm.inputs import read_actions, read_image, read_task
 from lerobot_bomb.vlm.prompt import TASK_TEMPLATE
@@ -85,6 +86,7 @@ class Vla0SmolPolicy(RelativeVlaPolicy, TokenVlaPolicy):
         self._writer = NumberWriter(
             self.backbone, self.grammar, guess, self._positions, compiled=config.compile_model
         )
+        self._color_jitter = None if config.color_jitter is None else ColorJitter(*config.color_jitter)
         self._ensemble = self._make_ensemble()
         self.reset()
 
@@ -253,6 +255,8 @@ class Vla0SmolPolicy(RelativeVlaPolicy, TokenVlaPolicy):
         generator = self.generator if self.training else None
         images = [read_image(batch, key, self.config.type, ids_BL.device) for key in self._cameras]
         images = [crop(image, self.config.crop_fraction, generator) for image in images]
+        if generator is not None and self._color_jitter is not None:
+            images = self._color_jitter(images, generator)
         pixels = [self.backbone.pixels(image) for image in images]
         features_BPH = self.backbone.embed_images(torch.stack(pixels, dim=1).flatten(0, 1))
         embeds_BLH = self.backbone.embed_tokens(ids_BL)
