@@ -120,7 +120,7 @@ def make_bomb():
 def measure_bomb() -> dict[str, float]:
     """Milliseconds of one camera's frame, and of a step with its two cameras."""
     env = make_bomb()
-    draw = env.get_wrapper_attr("_draw")  # render() composes a image for people
+    draw = env.get_wrapper_attr("_draw")  # render() composes an image for people
     lift = [0.0, 0.0, 0.2, 1.0]
     return {
         "frame": median_ms(lambda: draw("workspace", IMAGE_SIZE), NUM_FRAMES),
