@@ -28,6 +28,7 @@ from lerobot_policy_vla0_smol.modeling_vla0_smol import Vla0SmolPolicy
 
 CAMERAS = "observation.images.workspace", "observation.images.wrist"
 NUM_STEPS, NUM_DIMS = 10, 7
+INITIALIZER_RANGE = 0.02  # of the published models'
 
 SIGLIP_BASE = {
     "hidden_size": 768,
@@ -153,7 +154,7 @@ def make_policy(shape: str, text_layers: int | None) -> Vla0SmolPolicy:
     for name, value in published.items():
         vlm_config[name] = {**vlm_config[name], **value} if isinstance(value, dict) else value
     for part in ("vision_config", "text_config"):
-        vlm_config[part]["initializer_range"] = 0.02
+        vlm_config[part]["initializer_range"] = INITIALIZER_RANGE
     if not is_qwen:
         vlm_config["model_type"] = "idefics3"
     if text_layers is not None:

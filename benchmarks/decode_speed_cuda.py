@@ -19,6 +19,7 @@ from typing import Any
 from unittest.mock import patch
 
 import torch
+from backbone_shapes import CAMERAS, INITIALIZER_RANGE, SMOLVLM
 from decode_speed_compare import Timed, compare, finish, print_rows
 from decode_speed_peer import XgrammarGenerate
 from lerobot.configs import FeatureType, PolicyFeature
@@ -42,28 +43,9 @@ MIN_RATIO = 8.0  # in bfloat16, one prompt at a time
 PARTS = "decode", "policy"
 BATCH_SIZES = 1, 16
 PROMPT_LENGTH, NUM_STEPS, NUM_DIMS = 190, 10, 7
-CAMERAS = "observation.images.workspace", "observation.images.wrist"
 # of SmolVLM2-500M-Video-Instruct
-TEXT_500M = {
-    "vocab_size": 49280,
-    "hidden_size": 960,
-    "intermediate_size": 2560,
-    "num_hidden_layers": 32,
-    "num_attention_heads": 15,
-    "num_key_value_heads": 5,
-    "head_dim": 64,
-    "max_position_embeddings": 8192,
-    "initializer_range": 0.02,
-}
-VISION_500M = {
-    "hidden_size": 768,
-    "intermediate_size": 3072,
-    "num_hidden_layers": 12,
-    "num_attention_heads": 12,
-    "image_size": 512,
-    "patch_size": 16,
-    "initializer_range": 0.02,
-}
+TEXT_500M = {**SMOLVLM["smolvlm_500m"]["text_config"], "initializer_range": INITIALIZER_RANGE}
+VISION_500M = {**SMOLVLM["smolvlm_500m"]["vision_config"], "initializer_range": INITIALIZER_RANGE}
 
 
 def main() -> None:

@@ -28,13 +28,9 @@ def original() -> SpatialvlaGridPolicy:
 
 
 @pytest.fixture(scope="module")
-def folder(original: SpatialvlaGridPolicy, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    return write_published(original, tmp_path_factory.mktemp("published") / "tiny")
-
-
-@pytest.fixture(scope="module")
-def checkpoint(folder: Path) -> Path:
-    return converted(folder, folder.parent / "checkpoint")
+def checkpoint(original: SpatialvlaGridPolicy, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    parent = tmp_path_factory.mktemp("published")
+    return converted(write_published(original, parent / "tiny"), parent / "checkpoint")
 
 
 def test_depth_may_be_observed_instead(checkpoint: Path, original: SpatialvlaGridPolicy) -> None:
