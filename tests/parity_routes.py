@@ -28,7 +28,7 @@ from lerobot_bomb.data.recording import Recording
 
 REPO_ID = "test/parity"
 SEED, EPISODES, SIZE = 5, 2, 64
-MAX_LEARNING_STEPS, CHECK_EVERY = 200, 20
+MAX_LEARNING_STEPS, CHECK_EVERY = 400, 20
 
 type Finish = Callable[[PreTrainedPolicy, dict[int, Batch]], None]
 # (rollout of a replay, seed) -> (what the rollout returned, the episode's batches by index in the dataset)
