@@ -2,10 +2,11 @@
 
     python benchmarks/backbone_shapes.py --shape=smolvlm_256m
 
-The published architecture with random weights in float32, one sample of two cameras, 10 actions of 7 numbers:
-that the shape runs, how long that takes and in how much memory, and nothing of what a trained model
-does. A training step is forward and backward pass; the optimiser, whose two states are twice the weights, is
-left out. One shape a process, as the peak of memory is the process's.
+The published architecture with random weights in float32 (``--bfloat16``: those of products in bfloat16), one
+sample of two cameras, 10 actions of 7 numbers: that the shape runs, how long that takes and in how much
+memory, and nothing of what a trained model does. A training step is forward and backward pass; the optimiser,
+whose two states are twice the weights, is left out. One shape a process, as the peak of memory is the
+process's.
 """
 
 import argparse
@@ -116,15 +117,19 @@ def main() -> None:
     parser.add_argument("--shape", choices=[*SMOLVLM, *QWEN], required=True)
     parser.add_argument("--text_layers", type=int, help="of the text model, where not all fit")
     parser.add_argument("--forward_only", action="store_true", help="no gradients")
+    parser.add_argument(
+        "--bfloat16", action="store_true", help="--policy.dtype and --policy.weights_dtype; no gradients"
+    )
     add_machine_arguments(parser)
     args = parser.parse_args()
     require_idle_machine(args.force)
-    policy, build_s = timed(lambda: make_policy(args.shape, args.text_layers))
+    policy, build_s = timed(lambda: make_policy(args.shape, args.text_layers, args.bfloat16))
     batch = make_batch(policy)
     figures = {"build_s": build_s}
-    with torch.set_grad_enabled(not args.forward_only):
+    is_trained = not (args.forward_only or args.bfloat16)
+    with torch.set_grad_enabled(is_trained):
         (loss, _), figures["forward_s"] = timed(lambda: policy.train()(batch))
-        if not args.forward_only:
+        if is_trained:
             _, figures["backward_s"] = timed(loss.backward)
     policy.zero_grad(set_to_none=True)
     actions, figures["action_s"] = timed(lambda: policy.predict_action_chunk(batch))
@@ -136,7 +141,8 @@ def main() -> None:
         "threads": torch.get_num_threads(),
     }
     print_table(["figure", args.shape], [[name, f"{value:.4g}"] for name, value in figures.items()])
-    write_figures(args.json, {"shape": args.shape, "text_layers": args.text_layers, **figures})
+    asked = {"shape": args.shape, "text_layers": args.text_layers, "bfloat16": args.bfloat16}
+    write_figures(args.json, {**asked, **figures})
 
 
 def timed[T](call: Callable[[], T]) -> tuple[T, float]:
@@ -145,7 +151,7 @@ def timed[T](call: Callable[[], T]) -> tuple[T, float]:
     return call(), time.process_time() - started
 
 
-def make_policy(shape: str, text_layers: int | None) -> Vla0SmolPolicy:
+def make_policy(shape: str, text_layers: int | None, in_bfloat16: bool) -> Vla0SmolPolicy:
     """Of random weights, with nano's tokenizer, whose numbers are among the published one's."""
     tokenizer = load_tokenizer(NANO)
     is_qwen = shape in QWEN
@@ -163,8 +169,11 @@ def make_policy(shape: str, text_layers: int | None) -> Vla0SmolPolicy:
     inputs = {key: PolicyFeature(FeatureType.VISUAL, (3, 256, 256)) for key in CAMERAS}
     inputs["observation.state"] = PolicyFeature(FeatureType.STATE, (NUM_DIMS,))
     torch.manual_seed(0)
+    dtype = "bfloat16" if in_bfloat16 else "float32"
     return Vla0SmolPolicy(
         Vla0SmolConfig(
+            dtype=dtype,
+            weights_dtype=dtype,
             vlm_model_name=NANO,
             vlm_config=vlm_config,
             prompt_tokens=tokens.to_dict(),

@@ -98,10 +98,10 @@ class RopePairs:
 
     @staticmethod
     def can(attention: Any) -> bool:
-        """Its projections are plain, in float32 on a CPU."""
+        """Its projections are plain, in float32 or less on a CPU."""
         parts = _projections(attention)
         return all(
-            is_plain(part) and part.weight.dtype == torch.float32 and part.weight.device.type == "cpu"
+            is_plain(part) and part.weight.dtype.itemsize <= 4 and part.weight.device.type == "cpu"
             for part in parts
         )
 

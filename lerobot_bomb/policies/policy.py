@@ -147,6 +147,12 @@ class VlaPolicy(ChunkPolicy):
     _ensemble: TemporalEnsemble | None
 
     def __init__(self, config: Any, dataset_meta: LeRobotDatasetMetadata | None = None, **_: object):
+        is_trained = dataset_meta is not None or config.vlm_config is None
+        if is_trained and config.weights_dtype != "float32":
+            raise ValueError(
+                f"--policy.weights_dtype={config.weights_dtype} is for the evaluation of a checkpoint; give "
+                f"--policy.weights_dtype=float32"
+            )
         _take_action_names(config, dataset_meta)
         super().__init__(config, dataset_meta)
 

@@ -32,6 +32,8 @@ def check_model_name_and_precision(config: Any) -> None:
             f"--policy.use_amp=true is not used by {config.type}, in training or evaluation; "
             f"give --policy.dtype=bfloat16 instead"
         )
+    if config.weights_dtype == "bfloat16" != config.dtype:
+        raise ValueError("--policy.weights_dtype=bfloat16 needs --policy.dtype=bfloat16")
 
 
 def check_architecture(config: Any) -> None:

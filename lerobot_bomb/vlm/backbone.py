@@ -5,13 +5,14 @@ Shapes: `B` batch, `L` tokens, `H` hidden size of the text model, `V` vocabulary
 
 import json
 from collections.abc import Callable, Iterator, Mapping
-from contextlib import contextmanager
+from contextlib import AbstractContextManager, contextmanager, nullcontext
 from functools import partial
 from pathlib import Path
 from typing import Any, ClassVar
 
 import torch
 from torch import Tensor, nn
+from torch.nn.attention import SDPBackend, sdpa_kernel
 from torch.nn.functional import linear
 from transformers import (
     AutoConfig,
@@ -29,6 +30,21 @@ from lerobot_bomb.vlm.presets import INITIALIZER_RANGE, changed, nano_config
 from lerobot_bomb.vlm.tokenizer import NANO, hub_file, load_tokenizer
 
 
+def as_it_was_computed() -> tuple[AbstractContextManager, AbstractContextManager]:
+    """Contexts of a checkpointed layer and of its recomputation, which has the kernels that are allowed now.
+
+    Torch itself sees to autocast and random numbers.
+    """
+    is_restricted = not torch.backends.cuda.flash_sdp_enabled()
+    return nullcontext(), sdpa_kernel(SDPBackend.MATH) if is_restricted else nullcontext()
+
+
+# modules that autocast casts to bfloat16
+PRODUCTS = (nn.Linear, nn.Conv2d, nn.Conv3d)
+# options of `torch.utils.checkpoint`
+CHECKPOINTING: dict[str, Any] = {"use_reentrant": False, "context_fn": as_it_was_computed}
+
+
 class Backbone(nn.Module):
     """A stock vision-language model, called in parts, and what all families have: words in and out."""
 
@@ -43,6 +59,10 @@ class Backbone(nn.Module):
     @property
     def text_model(self) -> Any:
         return self.vlm.model.get_submodule(self.text_model_name)
+
+    def checkpoint_gradients(self) -> None:
+        """Compute what is inside a layer again in the backward pass instead of keeping it."""
+        self.vlm.gradient_checkpointing_enable(CHECKPOINTING)
 
     def embed_tokens(self, tokens_BL: Tensor) -> Tensor:
         """(B, L) token ids -> (B, L, H)."""
@@ -86,10 +106,6 @@ class SmolVLMBackbone(Backbone):
     def freeze_vision(self) -> None:
         """Train the connector and what follows it only."""
         self.vlm.model.vision_model.requires_grad_(False)
-
-    def checkpoint_gradients(self) -> None:
-        """Compute what is inside a layer again in the backward pass instead of keeping it."""
-        self.vlm.gradient_checkpointing_enable({"use_reentrant": False})
 
     def pixels(self, images_B3HW: Tensor) -> Tensor:
         """(B, 3, H, W) in [0, 1] -> (B, 3, S, S) in [-1, 1]."""
@@ -232,25 +248,36 @@ def spread_filters(filters: Tensor) -> None:
     filters /= INITIALIZER_RANGE
 
 
-def build_backbone(vlm_config: dict[str, Any], image_size: int | None = None) -> SmolVLMBackbone:
-    """Backbone of the given architecture with random weights in float32; raises as `load_backbone`."""
-    check_memory(vlm_config, lambda: _random_smolvlm(vlm_config))
-    backbone = SmolVLMBackbone(_random_smolvlm(vlm_config))
+def build_backbone(
+    vlm_config: dict[str, Any], image_size: int | None = None, dtype: torch.dtype = torch.float32
+) -> SmolVLMBackbone:
+    """Backbone of the given architecture, as `random_model`; raises as `load_backbone`."""
+
+    def build() -> PreTrainedModel:
+        config_class, model_class = SmolVLMBackbone.classes[vlm_config["model_type"]]
+        return random_model(model_class, config_class(**vlm_config), dtype)
+
+    check_memory(vlm_config, build, dtype)
+    backbone = SmolVLMBackbone(build())
     _check_image_size(backbone.image_size, image_size)
     return backbone
 
 
-def _random_smolvlm(vlm_config: dict[str, Any]) -> PreTrainedModel:
-    config_class, model_class = SmolVLMBackbone.classes[vlm_config["model_type"]]
-    config = config_class(**vlm_config)
-    set_float32(config, config.text_config, config.vision_config)
-    return model_class(config)
+def random_model(
+    model_class: type[PreTrainedModel], config: Any, dtype: torch.dtype, **options: Any
+) -> PreTrainedModel:
+    """A model with random weights, those of its layers' products in ``dtype`` and all others in float32.
 
-
-def set_float32(*configs: Any) -> None:
-    """Let models that are built of these have weights in float32."""
-    for config in configs:
-        config.dtype = torch.float32
+    Products are what autocast casts at every call, so casting them once and for all changes no answer.
+    """
+    for part in (config, config.text_config, config.vision_config):
+        part.dtype = dtype
+    vlm = model_class._from_config(config, **options)
+    words = vlm.get_input_embeddings(), vlm.get_output_embeddings()
+    for module in vlm.modules() if dtype != torch.float32 else ():
+        if not isinstance(module, PRODUCTS) or any(module is of_words for of_words in words):
+            module._apply(lambda values: values.float() if values.is_floating_point() else values, False)
+    return vlm
 
 
 def config_dict(vlm: PreTrainedModel) -> dict[str, Any]:

@@ -10,8 +10,10 @@ from torch import nn
 GIB = 2**30
 
 
-def check_memory(vlm_config: dict[str, Any], build: Callable[[], nn.Module]) -> None:
+def check_memory(vlm_config: dict[str, Any], build: Callable[[], nn.Module], dtype: torch.dtype) -> None:
     """The model that `build` makes of a `vlm_config` has room in this machine's memory.
+
+    ``dtype``: of most of its weights.
 
     Raises:
         ValueError: it has not, or there is no such model.
@@ -19,7 +21,8 @@ def check_memory(vlm_config: dict[str, Any], build: Callable[[], nn.Module]) -> 
     memory = os.sysconf("SC_PHYS_PAGES") * os.sysconf("SC_PAGE_SIZE")
     try:
         # layers are objects even on the device `meta`, so they are counted first
-        size = sum(_layers_size(vlm_config.get(part) or {}) for part in ("text_config", "vision_config"))
+        parts = (vlm_config.get(part) or {} for part in ("text_config", "vision_config"))
+        size = dtype.itemsize * sum(map(_num_weights, parts))
         if size <= memory:
             with torch.device("meta"), torch.random.fork_rng(devices=[]):
                 size = sum(weight.numel() * weight.element_size() for weight in build().parameters())
@@ -33,7 +36,7 @@ def check_memory(vlm_config: dict[str, Any], build: Callable[[], nn.Module]) -> 
         )
 
 
-def _layers_size(config: dict[str, Any]) -> int:
-    """Bytes that the layers take at least, in float32: two projections each."""
+def _num_weights(config: dict[str, Any]) -> int:
+    """How many the layers have at least: those of two projections each."""
     num_layers = config.get("num_hidden_layers") or config.get("depth") or 0
-    return 4 * num_layers * 2 * config.get("hidden_size", 1) * config.get("intermediate_size", 1)
+    return num_layers * 2 * config.get("hidden_size", 1) * config.get("intermediate_size", 1)

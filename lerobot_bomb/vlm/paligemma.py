@@ -16,7 +16,7 @@ from transformers import PaliGemmaConfig, PaliGemmaForConditionalGeneration
 
 from lerobot_bomb.actions.text import SYMBOL_TEXTS
 from lerobot_bomb.finite import require_finite_weights
-from lerobot_bomb.vlm.backbone import Backbone, read_vlm_config, set_float32, spread_images, weights_errors
+from lerobot_bomb.vlm.backbone import Backbone, random_model, read_vlm_config, spread_images, weights_errors
 from lerobot_bomb.vlm.memory import check_memory
 from lerobot_bomb.vlm.presets import changed, nano_paligemma_config
 from lerobot_bomb.vlm.tokenizer import IMAGE_TOKEN, NANO, load_tokenizer, single_id, token_ids
@@ -146,14 +146,19 @@ def load_paligemma(vlm_model_name: str, changes: Mapping[str, Any] | None = None
     return PaliGemmaBackbone(vlm)
 
 
-def build_paligemma(vlm_config: dict[str, Any]) -> PaliGemmaBackbone:
-    """Backbone of the given architecture with random weights in float32."""
-    model: Any = PaliGemmaForConditionalGeneration
-    check_memory(vlm_config, lambda: model(PaliGemmaConfig(**vlm_config)))
-    config = PaliGemmaConfig(**vlm_config)
-    text_config: Any = config.text_config
-    set_float32(config, text_config, config.vision_config)
-    return PaliGemmaBackbone(model._from_config(config, attn_implementation=_attention(text_config)))
+def build_paligemma(vlm_config: dict[str, Any], dtype: torch.dtype = torch.float32) -> PaliGemmaBackbone:
+    """Backbone of the given architecture, as `random_model`."""
+
+    def build() -> Any:
+        config = PaliGemmaConfig(**vlm_config)
+        attention = _attention(config.text_config)
+        return random_model(PaliGemmaForConditionalGeneration, config, dtype, attn_implementation=attention)
+
+    check_memory(vlm_config, build, dtype)
+    vlm = build()
+    words = vlm.get_input_embeddings()
+    words.embed_scale.fill_(words.scalar_embed_scale)  # was made in ``dtype``
+    return PaliGemmaBackbone(vlm)
 
 
 def _attention(text_config: Any) -> dict[str, str]:

@@ -20,7 +20,14 @@ from transformers import Qwen2_5_VLConfig, Qwen2_5_VLForConditionalGeneration
 from transformers.utils.constants import OPENAI_CLIP_MEAN, OPENAI_CLIP_STD
 
 from lerobot_bomb.finite import require_finite_weights
-from lerobot_bomb.vlm.backbone import Backbone, read_vlm_config, set_float32, spread_filters, weights_errors
+from lerobot_bomb.vlm.backbone import (
+    CHECKPOINTING,
+    Backbone,
+    random_model,
+    read_vlm_config,
+    spread_filters,
+    weights_errors,
+)
 from lerobot_bomb.vlm.images import resize
 from lerobot_bomb.vlm.memory import check_memory
 from lerobot_bomb.vlm.presets import changed, nano_qwen_config
@@ -132,7 +139,7 @@ class QwenBackbone(Backbone):
     def checkpoint_gradients(self) -> None:
         """Compute what is inside a layer again in the backward pass instead of keeping it."""
         self._is_checkpointed = True  # transformers' own kind gives layers no cache
-        self.vlm.model.visual.gradient_checkpointing_enable({"use_reentrant": False})
+        self.vlm.model.visual.gradient_checkpointing_enable(CHECKPOINTING)
 
     @property
     def tokens_per_image(self) -> int:
@@ -211,7 +218,7 @@ class QwenBackbone(Backbone):
         rotation = self.text_model.rotary_emb(x_BTH, positions_3BT)
         read: Any = _read_layer
         if self._is_checkpointed and torch.is_grad_enabled():
-            read = partial(checkpoint, _read_layer, use_reentrant=False)
+            read = partial(checkpoint, _read_layer, **CHECKPOINTING)
         layers = []
         for i, layer in enumerate(self.text_model.layers):
             x_BTH, new = read(layer, x_BTH, reads_BTX[:, None], rotation, kept and kept[i])
@@ -284,10 +291,14 @@ def load_qwen(vlm_model_name: str, image_size: int, changes: Mapping[str, Any] |
     return QwenBackbone(vlm, image_size)
 
 
-def build_qwen(vlm_config: dict[str, Any], image_size: int) -> QwenBackbone:
-    """Backbone of the given architecture with random weights in float32."""
-    model: Any = Qwen2_5_VLForConditionalGeneration
-    check_memory(vlm_config, lambda: model(Qwen2_5_VLConfig(**vlm_config)))
-    config = Qwen2_5_VLConfig(**vlm_config)
-    set_float32(config, config.text_config, config.vision_config)
-    return QwenBackbone(model._from_config(config, attn_implementation="sdpa"), image_size)
+def build_qwen(
+    vlm_config: dict[str, Any], image_size: int, dtype: torch.dtype = torch.float32
+) -> QwenBackbone:
+    """Backbone of the given architecture, as `random_model`."""
+
+    def build() -> Any:
+        config = Qwen2_5_VLConfig(**vlm_config)
+        return random_model(Qwen2_5_VLForConditionalGeneration, config, dtype, attn_implementation="sdpa")
+
+    check_memory(vlm_config, build, dtype)
+    return QwenBackbone(build(), image_size)

@@ -17,10 +17,8 @@ def build_model(config: FdvlaConfig) -> tuple[QwenPrompt, QwenBackbone]:
     elif config.prompt_tokens is None:
         raise ValueError("--policy.vlm_config is set, but not --policy.prompt_tokens, which belongs to it")
     else:
-        tokens, backbone = (
-            QwenPrompt(**config.prompt_tokens),
-            build_qwen(config.vlm_config, config.image_size),
-        )
+        tokens = QwenPrompt(**config.prompt_tokens)
+        backbone = build_qwen(config.vlm_config, config.image_size, config.weights_type)
     _freeze(config, backbone)
     if config.gradient_checkpointing:
         backbone.checkpoint_gradients()

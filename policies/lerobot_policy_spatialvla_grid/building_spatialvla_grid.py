@@ -80,7 +80,8 @@ def build_model(config: SpatialvlaGridConfig) -> tuple[PaliGemmaPrompt, PaliGemm
     elif config.prompt_tokens is None:
         raise ValueError("--policy.vlm_config is set, but not --policy.prompt_tokens, which belongs to it")
     else:
-        tokens, backbone = PaliGemmaPrompt(**config.prompt_tokens), build_paligemma(config.vlm_config)
+        tokens = PaliGemmaPrompt(**config.prompt_tokens)
+        backbone = build_paligemma(config.vlm_config, config.weights_type)
     if config.freeze_vision_encoder:
         backbone.vlm.model.vision_tower.requires_grad_(False)
     if config.freeze_llm_embeddings:
@@ -88,5 +89,5 @@ def build_model(config: SpatialvlaGridConfig) -> tuple[PaliGemmaPrompt, PaliGemm
     if config.loss_vocab == "slot" and not backbone.has_tied_head:
         backbone.vlm.lm_head.requires_grad_(False)  # no word is written
     if config.gradient_checkpointing:
-        backbone.vlm.gradient_checkpointing_enable({"use_reentrant": False})
+        backbone.checkpoint_gradients()
     return tokens, backbone

@@ -28,7 +28,7 @@ def build_model(config: Vla0SmolConfig) -> tuple[PromptTokens, TextBackbone]:
     elif config.prompt_tokens is None:
         raise ValueError("--policy.vlm_config is set, but not --policy.prompt_tokens, which belongs to it")
     else:
-        tokens, backbone = PromptTokens(**config.prompt_tokens), _build(config.vlm_config, config.image_size)
+        tokens, backbone = PromptTokens(**config.prompt_tokens), _build(config, config.vlm_config)
         if tokens.system_prompt != config.system_prompt:
             raise ValueError(
                 f"--policy.system_prompt={config.system_prompt!r}: this checkpoint was trained with "
@@ -51,7 +51,7 @@ def _load(config: Vla0SmolConfig) -> tuple[PromptTokens, TextBackbone]:
     return tokens, load_backbone(name, config.nano_config, config.image_size)
 
 
-def _build(vlm_config: dict[str, Any], image_size: int | None) -> TextBackbone:
+def _build(config: Vla0SmolConfig, vlm_config: dict[str, Any]) -> TextBackbone:
     if vlm_config.get("model_type") == QwenBackbone.family:
-        return build_qwen(vlm_config, image_size or QWEN_IMAGE_SIZE)
-    return build_backbone(vlm_config, image_size)
+        return build_qwen(vlm_config, config.image_size or QWEN_IMAGE_SIZE, config.weights_type)
+    return build_backbone(vlm_config, config.image_size, config.weights_type)

@@ -1,0 +1,79 @@
+"""What --policy.dtype and --policy.weights_dtype change in all policies, and what they do not."""
+
+from pathlib import Path
+from typing import Any
+
+import pytest
+import torch
+from lerobot.configs import PreTrainedConfig
+from lerobot.policies.factory import get_policy_class
+from policy_cases import CASES, save_checkpoint
+from torch import Tensor
+
+from lerobot_bomb.flag_errors import FlagError
+from lerobot_bomb.vlm.backbone import PRODUCTS
+
+BFLOAT16 = {"dtype": "bfloat16", "weights_dtype": "bfloat16"}
+
+
+def gradients(policy_type: str, **options: Any) -> dict[str, Tensor]:
+    cases = CASES[policy_type]
+    policy = cases.make_policy(crop_fraction=1.0, dtype="bfloat16", **options).train()
+    policy.generator.manual_seed(0)
+    policy(cases.make_batch(policy, 2))[0].backward()
+    return {name: of.grad for name, of in policy.named_parameters() if of.grad is not None}
+
+
+def test_checkpointing_in_bfloat16_changes_no_gradient(policy_type: str) -> None:
+    kept, computed_again = (gradients(policy_type, gradient_checkpointing=value) for value in (False, True))
+    assert kept.keys() == computed_again.keys()
+    for name, gradient in kept.items():
+        torch.testing.assert_close(computed_again[name], gradient, msg=name)
+
+
+def load(folder: Path, **options: Any) -> Any:
+    config = PreTrainedConfig.from_pretrained(folder)
+    for name, value in options.items():
+        setattr(config, name, value)
+    return get_policy_class(config.type).from_pretrained(folder, config=config)
+
+
+@torch.no_grad()
+def test_weights_in_bfloat16_change_no_answer(policy_type: str, tmp_path: Path) -> None:
+    save_checkpoint(policy_type, tmp_path)
+    single, half = load(tmp_path, dtype="bfloat16"), load(tmp_path, **BFLOAT16)
+    batch = CASES[policy_type].make_batch(single, 2)
+    for policy in (single, half):
+        policy.generator.manual_seed(0)
+    assert torch.equal(single(batch)[0], half(batch)[0])
+    chunks = [policy.predict_action_chunk(batch) for policy in (single, half)]
+    torch.testing.assert_close(*chunks, rtol=0, atol=0.01 if policy_type == "fdvla" else 0)
+
+
+def test_of_the_backbone_only_products_are_in_bfloat16(policy_type: str, tmp_path: Path) -> None:
+    save_checkpoint(policy_type, tmp_path)
+    policy = load(tmp_path, **BFLOAT16)
+    vlm = policy.backbone.vlm
+    words = vlm.get_input_embeddings(), vlm.get_output_embeddings()
+    products = {
+        id(weight)
+        for module in vlm.modules()
+        if isinstance(module, PRODUCTS) and module not in words
+        for weight in module.parameters()
+    }
+    for name, values in [*policy.named_parameters(), *policy.named_buffers()]:
+        is_half = id(values) in products
+        assert not values.is_floating_point() or (values.dtype == torch.bfloat16) == is_half, name
+    in_float32 = load(tmp_path)
+    for (name, expected), actual in zip(in_float32.named_buffers(), policy.buffers(), strict=True):
+        assert torch.equal(expected, actual), name
+
+
+def test_weights_in_bfloat16_are_not_trained(policy_type: str, tmp_path: Path) -> None:
+    with pytest.raises(ValueError, match=r"--policy.weights_dtype=bfloat16 is for the evaluation"):
+        CASES[policy_type].make_policy(**BFLOAT16)
+
+
+def test_weights_in_bfloat16_need_computation_in_bfloat16(policy_type: str) -> None:
+    with pytest.raises(FlagError, match=r"--policy.weights_dtype=bfloat16 needs --policy.dtype=bfloat16"):
+        CASES[policy_type].make_config(weights_dtype="bfloat16", dtype="float32")
