@@ -129,10 +129,8 @@ def test_every_policy_type_has_a_recipe_for_every_task() -> None:
         for policy_type in task.trainings.keys() - {learn.PROBE}:
             recipe = learn.read_recipe(learn.recipe_task(name), policy_type)
             policy = recipe["policy"]
-            if name == "robust":  # the shipped one, if it was trained on nominal scenes only
-                shipped = policy_type == "spatialvla_grid"
-                of_all_targets = "learn_all/train/checkpoints/last/pretrained_model"
-                assert policy["path"] == (f"bomb:{policy_type}" if shipped else of_all_targets)
+            if name == "robust":
+                assert policy["path"] == "learn_all/train/checkpoints/last/pretrained_model"
             else:
                 assert policy["type"] == policy_type
             if policy_type not in learning_tasks.RIVALS:
