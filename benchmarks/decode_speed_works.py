@@ -17,7 +17,7 @@ from lerobot.policies import make_policy, make_pre_post_processors
 from torch import Tensor
 from torch.utils.data import default_collate
 
-from lerobot_bomb.actions.text import END, digits_of, number_symbols
+from lerobot_bomb.actions.text import END, number_symbols
 from lerobot_bomb.decoding.decoder import (
     CachedContinuation,
     Continuation,
@@ -188,7 +188,9 @@ def peer(work: DecodeRequest) -> Timed:
 
 def num_symbols(grammar: NumberGrammar, number_BN: Tensor) -> int:
     """Tokens of the answers, spaces and ends included."""
-    num_digits = grammar.fixed_width * number_BN.numel() or int(digits_of(number_BN).sum())
+    num_digits = grammar.fixed_width * number_BN.numel() or sum(
+        len(str(number)) for number in number_BN.flatten().tolist()
+    )
     return num_digits + number_BN.numel() + len(number_BN)
 
 

@@ -52,7 +52,7 @@ def run_episode(spec: EpisodeSpec, noise: float) -> Outcome:
     """Let the expert play one episode; `noise` is the standard deviation added to x, y, z, 1 = 40 mm."""
     env = BombEnv(spec, RenderOptions(image_size=MIN_IMAGE_SIZE))
     rng = generator(spec.seed, Stream.EXPERT_NOISE)
-    moments = play(env, spec, expert_agent(spec), lambda a: add_noise(a, noise, spec.control_mode, rng))
+    moments = play(env, spec, expert_agent(), lambda a: add_noise(a, noise, spec.control_mode, rng))
     idle = [now.step for now, then in pairwise(moments) if is_idle(now, then, spec)]
     result = env.episode_result()
     env.close()

@@ -79,7 +79,7 @@ def outcome_of(robot: str, condition: str, seeds: range) -> Outcome:
     spec = EpisodeSpec(seed=0, robot=robot, perturbations=condition)
     env = BombEnv(spec, RenderOptions(image_size=IMAGE_SIZE))
     for seed in seeds:
-        for moment in play(env, replace(spec, seed=seed), expert_agent(spec)):
+        for moment in play(env, replace(spec, seed=seed), expert_agent()):
             data = env._run.scene.data
             states.update(data.qpos.tobytes() + data.qvel.tobytes())
             for image in moment.observation[PIXELS].values():

@@ -12,19 +12,17 @@ import numpy as np
 NUM_RESAMPLES = 2000
 
 
-def wilson_interval(successes: int, n: int, confidence: float = 0.95) -> tuple[float, float]:
-    """(low, high) of a binomial proportion, each in [0, 1].
+def wilson_interval(successes: int, n: int) -> tuple[float, float]:
+    """(low, high) of a binomial proportion at 95 %, each in [0, 1].
 
     Source: Wilson (1927), "Probable inference, the law of succession, and statistical inference".
 
     Raises:
-        ValueError: unless 0 <= successes <= n, n >= 1 and 0 < confidence < 1.
+        ValueError: unless 0 <= successes <= n and n >= 1.
     """
     if n < 1 or not 0 <= successes <= n:
         raise ValueError(f"need 0 <= successes <= n and n >= 1, got successes={successes}, n={n}")
-    if not 0 < confidence < 1:
-        raise ValueError(f"confidence={confidence} must lie between 0 and 1")
-    z = NormalDist().inv_cdf(0.5 + confidence / 2)
+    z = NormalDist().inv_cdf(0.975)
     rate = successes / n
     center = (rate + z**2 / (2 * n)) / (1 + z**2 / n)
     half = z / (1 + z**2 / n) * sqrt(rate * (1 - rate) / n + z**2 / (4 * n**2))

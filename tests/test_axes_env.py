@@ -151,7 +151,7 @@ def test_the_expert_places_stones_under_perturbation(
         ended = False
         while not ended:
             state = PrivilegedState.from_vector(observation["environment_state"])
-            observation, _, terminated, truncated, info = env.step(expert_action(state, control_mode))
+            observation, _, terminated, truncated, info = env.step(expert_action(state))
             ended = terminated or truncated
         assert info["is_success"], (seed, info)
         assert env.episode_result().levels == sample_episode(env.episode_result().spec).perturbation.levels

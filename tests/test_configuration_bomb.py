@@ -85,6 +85,7 @@ def test_the_protocol_s_file_names_every_axis() -> None:
         ({"image_size": -1}, "--env.image_size=-1"),
         ({"render_preset": "rt"}, "--env.render_preset='rt'"),
         ({"task_ids": [50]}, "--env.task_ids has 50"),
+        ({"task_ids": [3, 1, 3]}, r"--env.task_ids=\[3, 1, 3\] has a task twice"),
         ({"task_ids": []}, r"--env.task_ids=\[\]"),
         ({"task_ids": [1], "color": "black"}, "drop --env.target and --env.color"),
     ],

@@ -253,6 +253,8 @@ def test_what_is_wrong_is_told(
     (folder / "config.json").write_text(json.dumps({**config, "spatial_token_num": 1026}))
     refused("has 1026 cells, but processor_config.json describes 8194", statistics="bridge")
     (folder / "config.json").write_text(json.dumps(config))
+    (folder / "processor_config.json").write_text(json.dumps({"bin_policy": None}))
+    refused("processor_config.json has no statistics, action_config, action_chunk_size, intrinsic_config, so")
     (folder / "processor_config.json").write_text(json.dumps({**processor, "bin_policy": None}))
     refused("processor_config.json has no bin_policy", statistics="bridge")
     (folder / "processor_config.json").write_text(json.dumps(processor))

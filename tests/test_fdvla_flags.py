@@ -74,7 +74,7 @@ from lerobot_policy_fdvla.configuration_fdvla import FdvlaConfig
         ({"use_amp": True}, "--policy.dtype=bfloat16 instead"),
         ({"n_obs_steps": 2}, "--policy.n_obs_steps=2"),
         ({"vlm_config": {}}, "--policy.vlm_config={}, --policy.prompt_tokens=None: they come together"),
-        ({"image_size": 28 * 10**6}, "--policy.image_size=28000000 makes 1000000000000 tokens of a image"),
+        ({"image_size": 28 * 10**6}, "--policy.image_size=28000000 makes 1000000000000 tokens of an image"),
         ({"chunk_size": 10**9}, "--policy.chunk_size=1000000000 must be at most 128000"),
     ],
 )

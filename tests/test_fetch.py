@@ -47,7 +47,7 @@ def scene() -> Scene:
 def expert_episode(env: BombEnv, seed: int) -> tuple[str, dict]:
     """Digest of all observations and actions of the expert's episode, its last info."""
     spec = replace(SPEC, seed=seed)
-    *moments, last = play(env, spec, expert_agent(spec))
+    *moments, last = play(env, spec, expert_agent())
     everything = hashlib.sha256()
     for moment in moments:
         seen = moment.observation

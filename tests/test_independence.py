@@ -183,7 +183,7 @@ def evaluate(
     actions: dict[int, np.ndarray] = {}
 
     def note(*, seeds: list[int], render_callback: object, **others: Any) -> dict:
-        data = rollout(seeds=seeds, **others)  # without a image of every step
+        data = rollout(seeds=seeds, **others)  # without an image of every step
         for i, seed in enumerate(seeds):
             num_steps = int(data["done"][i].int().argmax()) + 1
             actions[seed] = data["action"][i, :num_steps].numpy()

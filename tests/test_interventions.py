@@ -59,6 +59,11 @@ def test_replaced_tasks_are_what_the_policy_reads(checkpoint: Path, tmp_path: Pa
     assert torch.equal(swapped, expected["observation.language.tokens"])
 
 
+def test_a_single_task_may_be_a_text() -> None:
+    changed = ReplaceTasks(SWAPPED).complementary_data({"task": "to the left"})
+    assert changed == {"task": "to the right"}
+
+
 def test_a_task_without_a_replacement_is_an_error(checkpoint: Path, tmp_path: Path) -> None:
     intervene(checkpoint, [ReplaceTasks(SWAPPED)], tmp_path / "swapped")
     with pytest.raises(ValueError, match=r"'upwards' has no replacement.*to the left"):

@@ -61,13 +61,13 @@ def episode_rows(root: Path) -> list[Any]:
     return list(LeRobotDatasetMetadata("test/any", root=root).episodes or [])
 
 
-def stand_still(state: PrivilegedState, control_mode: str, fps: int) -> np.ndarray:
+def stand_still(state: PrivilegedState) -> np.ndarray:
     return np.array([0, 0, 0, 1], dtype=np.float32)
 
 
-def stand_still_for_white(state: PrivilegedState, control_mode: str, fps: int) -> np.ndarray:
+def stand_still_for_white(state: PrivilegedState) -> np.ndarray:
     act = stand_still if state.stone_is_white[state.goals[0].stone] else expert_action
-    return act(state, control_mode, fps)
+    return act(state)
 
 
 @pytest.mark.parametrize("recording", [VIDEO, IMAGES], ids=["video", "images"])

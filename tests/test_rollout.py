@@ -120,5 +120,5 @@ def test_an_error_in_a_worker_is_raised() -> None:
         next(pool)
 
 
-def forgets_the_gripper(state: PrivilegedState, control_mode: str, fps: int) -> np.ndarray:
+def forgets_the_gripper(state: PrivilegedState) -> np.ndarray:
     return expert_action(state)[:3]

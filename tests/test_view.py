@@ -52,7 +52,7 @@ def played() -> Played:
     ended = False
     while not ended:
         state = PrivilegedState.from_vector(observation["environment_state"])
-        actions.append(expert_action(state, SPEC.control_mode, SPEC.fps))
+        actions.append(expert_action(state))
         observation, _, terminated, truncated, info = env.step(actions[-1])
         observations.append(observation)
         infos.append(info)
@@ -328,7 +328,7 @@ def test_a_checkpoint_of_another_robot_is_refused(
 
 def test_an_error_half_way_leaves_no_file(tmp_path: Path) -> None:
     env = make_env(SPEC, OPTIONS)
-    expert = expert_agent(SPEC)
+    expert = expert_agent()
     calls = iter(range(100))
 
     def falters(observation: dict[str, Any], instruction: str) -> np.ndarray:
@@ -355,7 +355,7 @@ def test_a_kill_half_way_leaves_no_file_under_the_final_names(tmp_path: Path) ->
 
 def test_a_moment_is_seen_before_its_action_is_done() -> None:
     env = make_env(SPEC, OPTIONS)
-    moments = play(env, SPEC, expert_agent(SPEC))
+    moments = play(env, SPEC, expert_agent())
     for moment, _ in zip(moments, range(3), strict=False):
         now = env.get_wrapper_attr("privileged_state")()
         np.testing.assert_array_equal(moment.observation["environment_state"], now.to_vector())

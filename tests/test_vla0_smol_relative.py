@@ -70,6 +70,14 @@ def test_a_checkpoint_keeps_its_scale_and_new_data_replace_it(tmp_path: Path) ->
     assert not torch.equal(tuned.relative.scale, policy.relative.scale)
 
 
+def test_what_is_relative_cannot_be_changed_in_evaluation(tmp_path: Path) -> None:
+    build(make_dataset(tmp_path / "data", 0.1)).save_pretrained(tmp_path / "checkpoint")
+    flags = ['--relative_exclude_joints=["grip"]']
+    config: Any = PreTrainedConfig.from_pretrained(tmp_path / "checkpoint", cli_overrides=flags)
+    with pytest.raises(ValueError, match=r"--policy\.relative_exclude_joints=\['grip'\]: this checkpoint"):
+        Vla0SmolPolicy.from_pretrained(tmp_path / "checkpoint", config=config)
+
+
 def test_another_training_may_change_what_numbers_mean(tmp_path: Path) -> None:
     policy = build(make_dataset(tmp_path / "data", 0.1))
     policy.save_pretrained(tmp_path / "checkpoint")
@@ -132,7 +140,8 @@ def test_the_scale_is_that_of_the_episodes_that_are_here(
     assert torch.equal(policy.relative.scale, here.scale)
     (meta.root / file).unlink()
     with pytest.raises(
-        ValueError, match=r"relative_actions=true .* no data file of test/relative; .*streaming"
+        ValueError,
+        match=r"is fitted to all frames before training, but .* no data file of test/relative; .*streaming",
     ):
         build(meta)
 

@@ -18,7 +18,7 @@ def main() -> None:
     folder = Path(__file__).parent
     spec = EpisodeSpec(seed=SEED)
     env = BombEnv(spec)
-    images = [env.render() for _ in play(env, spec, expert_agent(spec))]
+    images = [env.render() for _ in play(env, spec, expert_agent())]
     env.close()
     iio.imwrite(folder / "scene.png", images[0])
     frames = np.stack([*images, *[images[-1]] * GIF_PAUSE])

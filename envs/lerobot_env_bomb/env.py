@@ -47,7 +47,7 @@ class _Run:
 
 
 class BombEnv(gymnasium.Env[Observation, np.ndarray]):
-    """Task: place a Go stone on the intersection that a instruction names by row and column.
+    """Task: place a Go stone on the intersection that an instruction names by row and column.
 
     Randomizations: target (always free and legal), colour, instruction, 0-8 stones on the board, gripper
     and stone at the start.
@@ -55,7 +55,7 @@ class BombEnv(gymnasium.Env[Observation, np.ndarray]):
 
     Action: float32 (4,). Relative: x, y, z in units of MAX_STEP_M per control step from where the
     gripper is; absolute: x, y, z in metres. The fourth opens the fingers at >= 0 and closes them below.
-    Once an episode has ended, `step` returns its last transition until `reset`.
+    Once an episode has ended, `step` changes nothing until `reset`, and its reward is 0.
     """
 
     metadata = {"render_modes": ["rgb_array"], "render_fps": DEFAULT_FPS}  # noqa: RUF012

@@ -4,7 +4,6 @@ Shapes: `B` batch, `T` actions of a chunk, `D` action dims, `S` state dims, `N` 
 """
 
 from collections.abc import Iterable, Sequence
-from typing import TYPE_CHECKING
 
 import numpy as np
 import torch
@@ -12,9 +11,6 @@ from lerobot.configs import NormalizationMode
 from torch import Tensor, nn
 
 from lerobot_bomb.finite import require_finite, require_finite_rows
-
-if TYPE_CHECKING:  # configs import this module: LeRobot's datasets would slow their start
-    from lerobot.datasets import LeRobotDatasetMetadata
 
 # statistics that LeRobot's normaliser maps to -1 and 1
 BOUND_STATISTICS = {
@@ -63,18 +59,6 @@ def named_dims(names: Sequence[str], wanted: Iterable[str], flag: str) -> list[i
             raise ValueError(f"{flag}: no action dimension is called {text!r}; there are {', '.join(names)}")
         found |= matches
     return sorted(found)
-
-
-def present_episodes(meta: "LeRobotDatasetMetadata") -> list[int]:
-    """Episodes whose data files are here: LeRobot downloads those of --dataset.episodes only."""
-    present = [i for i in range(meta.total_episodes) if (meta.root / meta.get_data_file_path(i)).is_file()]
-    if not present:
-        raise ValueError(
-            f"--policy.relative_actions=true reads actions and states of all frames before training, but "
-            f"{meta.root} holds no data file of {meta.repo_id}; a dataset that is streamed "
-            f"(--dataset.streaming=true) must be downloaded first"
-        )
-    return present
 
 
 class RelativeActions(nn.Module):

@@ -24,11 +24,6 @@ def digits_needed(num_values: int) -> int:
     return len(str(num_values - 1))
 
 
-def digits_of(numbers: Tensor) -> Tensor:
-    """How many digits each number has; up to `MAX_DIGITS`."""
-    return (numbers[..., None] >= 10 ** torch.arange(1, MAX_DIGITS, device=numbers.device)).sum(dim=-1) + 1
-
-
 def number_symbols(numbers_BN: Tensor, width: int, *, zero_padded: bool) -> tuple[Tensor, Tensor]:
     """Numbers -> symbols (B, N, C) and which of the columns are written (B, N, C).
 
@@ -146,6 +141,6 @@ class Answer:
         return cls(TokenRows(ids_BA, mask_BA), labels_BA, columns_BA)
 
     def with_padding(self, values_BA: Tensor, numbers: NumberTokens) -> Tensor:
-        """Values of the tokens back at their columns, (B, M); 0 or False in padding."""
+        """Values of the tokens back at their columns, (B, M); undefined in padding."""
         values_BM = values_BA.new_zeros(len(values_BA), numbers.mask[0].numel() + 1)
         return values_BM.scatter(1, self.columns, values_BA)

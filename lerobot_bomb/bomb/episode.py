@@ -111,6 +111,8 @@ class EpisodeSpec:
         """This spec for each of these numbered tasks; as it is where there are none."""
         if task_ids and (self.target is not None or self.color is not None):
             raise ValueError("--env.task_ids fixes targets and colours; drop --env.target and --env.color")
+        if len(set(task_ids)) < len(task_ids):
+            raise ValueError(f"--env.task_ids={list(task_ids)} has a task twice")
         return [self.for_task(task_id) for task_id in task_ids] or [self]
 
     def to_dict(self) -> dict[str, object]:

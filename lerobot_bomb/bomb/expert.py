@@ -8,10 +8,9 @@ from dataclasses import replace
 
 import numpy as np
 
-from lerobot_bomb.bomb.episode import CONTROL_MODES, DEFAULT_FPS
+from lerobot_bomb.bomb.episode import DEFAULT_FPS
 from lerobot_bomb.bomb.observation import MAX_STEP_M, WORKSPACE_HIGH_M, WORKSPACE_LOW_M
 from lerobot_bomb.bomb.privileged_state import PrivilegedState
-from lerobot_bomb.flags import one_of
 
 SPEED_M_S = 0.30  # at most, along each of the horizontal plane and the vertical
 GAIN = 0.75  # share of the remaining way that a step of 0.1 s covers near its goal
@@ -46,17 +45,14 @@ RELEASE_LATERAL_M = (0.0040, 0.0070)  # a stone this near is in place: in closed
 RELEASE_HEIGHT_M = (0.0025, 0.0040)
 
 
-def expert_action(
-    state: PrivilegedState, control_mode: str = "relative", fps: int = DEFAULT_FPS
-) -> np.ndarray:
-    """(4,) float32 action that brings the stone to the target.
+def expert_action(state: PrivilegedState) -> np.ndarray:
+    """(4,) float32 action that brings the stone to the target, as the state's environment reads it.
 
     Relative: units of `MAX_STEP_M`, within [-1, 1]; absolute: metres within the workspace.
     """
-    one_of("--env.control_mode", control_mode, CONTROL_MODES)
     state = _anticipate(state)
-    motion_m, gripper = _plan(state, DEFAULT_FPS / fps)
-    if control_mode == "absolute":
+    motion_m, gripper = _plan(state, DEFAULT_FPS / state.fps)
+    if state.control_mode == "absolute":
         xyz = np.clip(state.gripper_xyz + motion_m, WORKSPACE_LOW_M, WORKSPACE_HIGH_M)
     else:
         xyz = np.clip(motion_m / MAX_STEP_M, -1, 1)

@@ -14,6 +14,7 @@ import numpy as np
 from tqdm import tqdm
 
 from lerobot_bomb.commands.arguments import add_new_dataset_arguments, path_flag, switch
+from lerobot_bomb.data.facts import PUSHT_SOURCE
 from lerobot_bomb.data.kept_blocks import Progress, reached
 from lerobot_bomb.data.pusht_zarr import BOARD_SIZE, IMAGE_SIZE, PushtZarr
 from lerobot_bomb.data.resumable import (
@@ -60,7 +61,7 @@ def add_convert_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the arguments of ``lerobot-bomb convert``."""
     sources = parser.add_subparsers(dest="source", required=True, metavar="SOURCE")
     summary = "the PushT demonstrations of Diffusion Policy, pusht_cchi_v7_replay.zarr"
-    pusht = sources.add_parser("pusht-zarr", help=summary, description=f"Convert {summary}.")
+    pusht = sources.add_parser(PUSHT_SOURCE, help=summary, description=f"Convert {summary}.")
     add = pusht.add_argument
     add("path", type=path_flag, help="the folder of the zarr")
     add_new_dataset_arguments(pusht)
@@ -104,7 +105,7 @@ def convert_pusht(
         RuntimeError: zarr is not installed, or the disk is full.
     """
     source = PushtZarr(path)
-    conversion = Conversion(repo_id, task, f"pusht-zarr {source.sha256}", copies)
+    conversion = Conversion(repo_id, task, f"{PUSHT_SOURCE} {source.sha256}", copies)
     check_folders(conversion, root, unfinished_folder(root, conversion.kind), resume)
     source.check()
     return grow(

@@ -42,6 +42,12 @@ RENAMED = {
     CELLS: "cell_embedding.weight",
 }
 TRANSLATION, ROTATION = ("theta_bins", "phi_bins", "r_bins"), ("roll_bins", "pitch_bins", "yaw_bins")
+# of the folder's files; the rest has defaults
+ORIGINAL_KEYS = (
+    *("action_token_begin_idx", "image_token_index", "projection_dim", "hidden_size", "spatial_token_num"),
+    *("text_config", "vision_config", "use_vision_zoe", "ego3d_patch_reso", "n_freqs"),
+)
+PROCESSOR_KEYS = ("statistics", "action_config", "action_chunk_size", "intrinsic_config")
 GRIPPER = 6  # of the action's dims
 # least sigma of the published grid, which no file of its folder says
 PUBLISHED_MIN_SIGMA = 0.5
@@ -77,6 +83,8 @@ def run_convert_spatialvla(args: argparse.Namespace) -> int:
             f"{args.folder}: config.json is of a {original.get('model_type')!r}, not of a SpatialVLA"
         )
     processor = read_json(args.folder / "processor_config.json")
+    _check_keys(args.folder / "config.json", original, ORIGINAL_KEYS)
+    _check_keys(args.folder / "processor_config.json", processor, PROCESSOR_KEYS)
     name = _chosen_statistics(processor["statistics"], args.statistics)
     grids = _grids(args, processor)
     if grids.num_tokens != original["spatial_token_num"]:
@@ -98,6 +106,11 @@ def run_convert_spatialvla(args: argparse.Namespace) -> int:
     write_checkpoint(args.output, policy, pipelines)
     print(f"written to {args.output}: --policy.path={args.output}")
     return 0
+
+
+def _check_keys(path: Path, values: dict[str, Any], keys: tuple[str, ...]) -> None:
+    if missing := [key for key in keys if key not in values]:
+        raise ValueError(f"{path} has no {', '.join(missing)}, so it is not of a SpatialVLA's folder")
 
 
 def _chosen_statistics(statistics: dict[str, Any], name: str | None) -> str:
@@ -219,7 +232,7 @@ def _intrinsics(
     cameras: dict[str, Any], statistics: str, camera: str, side: int
 ) -> dict[str, list[list[float]]]:
     """What the folder says of the data set's camera, for images of ``side``; {}: what is assumed of any."""
-    of = cameras.get(statistics, cameras["default"])
+    of = cameras.get(statistics) or cameras["default"]
     # the original counts from the image's edge, the flag from the first pixel's centre
     K = torch.tensor([of["intrinsic"]], dtype=torch.float32)
     K = resize_intrinsics(K, (of["height"], of["width"]), (side, side))

@@ -108,7 +108,7 @@ def look_at(condition: str, seeds: Sequence[int], options: RenderOptions, played
     looks = []
     for seed in seeds:
         spec = EpisodeSpec(seed, perturbations=condition)
-        moments = play(env, spec, expert_agent(spec))
+        moments = play(env, spec, expert_agent())
         first = next(moments)
         path = [moment.state.gripper_xyz[:2] for moment in (first, *(moments if played else ()))]
         looks.append(Look(first.observation[PIXELS], first.instruction, np.array(path)))

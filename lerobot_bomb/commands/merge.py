@@ -1,4 +1,4 @@
-"""``lerobot-bomb merge``: adapters and their base as one checkpoint, which needs neither nor `peft`."""
+"""``lerobot-bomb merge``: adapters and their base as one checkpoint, which needs neither them nor `peft`."""
 
 import argparse
 from pathlib import Path

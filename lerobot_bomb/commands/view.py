@@ -95,7 +95,7 @@ def write_episode(
 
 
 def _policy(args: argparse.Namespace) -> str:
-    """Who acts, as a word for names: expert, random, or the checkpoint's folder."""
+    """Who acts, as a word for names: expert, random or checkpoint."""
     if args.policy_path is None:
         if args.policy_device is not None:
             raise ValueError(f"--policy.device={args.policy_device} needs a checkpoint, --policy.path=FOLDER")
@@ -136,7 +136,7 @@ def _agent(
     args: argparse.Namespace, policy: str, env: gymnasium.Env, spec: EpisodeSpec, options: RenderOptions
 ) -> Agent:
     if policy == "expert":
-        return expert_agent(spec)
+        return expert_agent()
     if policy == "random":
         return random_agent(env, spec)
     from lerobot_bomb.viewing.checkpoint import checkpoint_agent  # LeRobot and torch: seconds

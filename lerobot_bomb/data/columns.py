@@ -29,6 +29,17 @@ def read_meta(repo_id: str, root: Path | None) -> LeRobotDatasetMetadata:
     return LeRobotDatasetMetadata(repo_id, root=root)
 
 
+def present_episodes(meta: LeRobotDatasetMetadata) -> list[int]:
+    """Episodes whose data files are here: LeRobot downloads those of --dataset.episodes only."""
+    present = [i for i in range(meta.total_episodes) if (meta.root / meta.get_data_file_path(i)).is_file()]
+    if not present:
+        raise ValueError(
+            f"this policy is fitted to all frames before training, but {meta.root} holds no data file of "
+            f"{meta.repo_id}; a dataset that is streamed (--dataset.streaming=true) must be downloaded first"
+        )
+    return present
+
+
 def read_columns(
     meta: LeRobotDatasetMetadata, keys: Iterable[str], episodes: Sequence[int] | None = None
 ) -> dict[str, np.ndarray]:

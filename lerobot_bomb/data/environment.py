@@ -15,7 +15,7 @@ COMPARED = ("task", "robot", "control_mode", "fps", "image_size")
 
 @dataclass(frozen=True)
 class Environment:
-    """Of depth, split and tasks an evaluation may have others; perturbations are none of it."""
+    """A policy may act under another depth, split or task than these; perturbations do not count."""
 
     robot: str
     control_mode: str

@@ -54,8 +54,6 @@ class Recording:
         check_repo_id(self.repo_id)
         if self.episodes < 1:
             raise ValueError(f"--episodes={self.episodes} must be at least 1")
-        if len(set(self.task_ids)) < len(self.task_ids):
-            raise ValueError(f"--task_ids={list(self.task_ids)} has a task twice")
         if not self.perturbations:
             raise ValueError('--perturbations=[] names no condition; leave it out or give ["none"]')
         if not 0 <= self.noise <= MAX_NOISE:

@@ -31,7 +31,7 @@ def rollout_layout(recording: Recording) -> DatasetLayout:
         ACTION: {"dtype": "float32", "shape": (len(action_names),), "names": list(action_names)},
         **geometry,
     }
-    # with the protocol's version, so that LeRobot refuses to merge datasets of different ones
+    # with the task's version, so that LeRobot refuses to merge datasets of different ones
     robot_type = f"bomb_{recording.robot}_v{TASK_VERSION}"
     return DatasetLayout(
         recording.repo_id, recording.fps, robot_type, features, not recording.images, tuple(geometry)

@@ -55,7 +55,7 @@ def collect(env: gymnasium.Env, spec: EpisodeSpec, settings: RolloutSettings) ->
         play(
             env,
             spec,
-            expert_agent(spec, settings.expert),
+            expert_agent(settings.expert),
             disturb=lambda action: add_noise(action, settings.noise, spec.control_mode, rng),
         )
     )

@@ -1,4 +1,4 @@
-"""Perturbation axis `photometric`: what a camera's sensor does to a image."""
+"""Perturbation axis `photometric`: what a camera's sensor does to an image."""
 
 from dataclasses import dataclass
 from functools import lru_cache
@@ -8,7 +8,7 @@ import numpy as np
 
 from lerobot_bomb.bomb.perturbations import magnitude
 
-NOISE_SPAN = 1 << 16  # positions in the bank of noise at which a image's noise may begin
+NOISE_SPAN = 1 << 16  # positions in the bank of noise at which an image's noise may begin
 NOISE_STRIDE = 7919  # from one image to the next; a prime
 GAIN_BITS = 7  # of a gain's fraction
 
@@ -48,5 +48,5 @@ def _noise_bank(size: int, std: float) -> np.ndarray:
 
 @lru_cache(maxsize=8)
 def _gain_table(gains: tuple[float, float, float], shape: tuple[int, int, int]) -> np.ndarray:
-    """Gain of every value of a image, in fixed point: multiplying by it whole is fast."""
+    """Gain of every value of an image, in fixed point: multiplying by it whole is fast."""
     return np.broadcast_to(np.rint(np.array(gains) * (1 << GAIN_BITS)).astype(np.uint16), shape).copy()

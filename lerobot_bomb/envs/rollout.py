@@ -17,8 +17,8 @@ ENV_ID = "lerobot_env_bomb:bomb/{suite}-v0"
 
 # (observation of the environment, instruction) -> (4,) action
 type Agent = Callable[[dict[str, Any], str], np.ndarray]
-# (privileged state, control mode, fps) -> (4,) action
-type Expert = Callable[[PrivilegedState, str, int], np.ndarray]
+# privileged state -> (4,) action
+type Expert = Callable[[PrivilegedState], np.ndarray]
 
 
 @dataclass(frozen=True)
@@ -70,11 +70,9 @@ def play(
     yield Moment(step, instruction, observation, info, None)
 
 
-def expert_agent(spec: EpisodeSpec, expert: Expert = expert_action) -> Agent:
+def expert_agent(expert: Expert = expert_action) -> Agent:
     """The scripted expert, which acts on the simulator's true state."""
-    return lambda observation, _: expert(
-        PrivilegedState.from_vector(observation[ENVIRONMENT_STATE]), spec.control_mode, spec.fps
-    )
+    return lambda observation, _: expert(PrivilegedState.from_vector(observation[ENVIRONMENT_STATE]))
 
 
 def random_agent(env: gymnasium.Env, spec: EpisodeSpec) -> Agent:

@@ -1,6 +1,5 @@
 """Which episodes of a dataset a checkpoint was trained on, and which it is judged by."""
 
-import json
 import math
 import re
 from dataclasses import dataclass
@@ -11,6 +10,7 @@ from lerobot.datasets import LeRobotDatasetMetadata
 from lerobot.utils.constants import HF_LEROBOT_HOME
 
 from lerobot_bomb.checkpoints.names import TRAIN_CONFIG
+from lerobot_bomb.files import read_json
 
 
 @dataclass(frozen=True)
@@ -44,7 +44,7 @@ def parse_episodes(flag: str, text: str, num_episodes: int) -> list[int]:
 def read_train_config(checkpoint: Path) -> dict[str, Any]:
     """What lerobot-train was given; empty if the checkpoint does not say."""
     path = checkpoint / TRAIN_CONFIG
-    return json.loads(path.read_text()) if path.is_file() else {}
+    return read_json(path) if path.is_file() else {}
 
 
 def trained_episodes(train_config: dict[str, Any], meta: LeRobotDatasetMetadata) -> list[int] | None:

@@ -23,6 +23,7 @@ from lerobot.utils.constants import OBS_IMAGE, POLICY_PREPROCESSOR_DEFAULT_NAME
 from lerobot.utils.import_utils import register_third_party_plugins
 
 from lerobot_bomb.checkpoints.shipped import checkpoint_path
+from lerobot_bomb.files import check_new_folder, written_whole
 
 PREPROCESSOR_FILE = f"{POLICY_PREPROCESSOR_DEFAULT_NAME}.json"
 
@@ -56,13 +57,16 @@ class ReplaceTasks(ComplementaryDataProcessorStep):
             raise ValueError(f"replacements={self.replacements!r} must map instructions to instructions")
 
     def complementary_data(self, complementary_data: dict[str, Any]) -> dict[str, Any]:
-        tasks = complementary_data["task"]
-        unknown = sorted(set(tasks) - self.replacements.keys())
-        if unknown:
+        task = complementary_data["task"]
+        replaced = self._replaced(task) if isinstance(task, str) else [*map(self._replaced, task)]
+        return {**complementary_data, "task": replaced}
+
+    def _replaced(self, task: str) -> str:
+        if task not in self.replacements:
             raise ValueError(
-                f"the instruction {unknown[0]!r} has no replacement; there are: {sorted(self.replacements)}"
+                f"the instruction {task!r} has no replacement; there are: {sorted(self.replacements)}"
             )
-        return {**complementary_data, "task": [self.replacements[task] for task in tasks]}
+        return self.replacements[task]
 
     def get_config(self) -> dict[str, Any]:
         return asdict(self)
@@ -88,10 +92,11 @@ def intervene(checkpoint: Path | str, steps: Sequence[ProcessorStep], output: Pa
         )
     if not (checkpoint / PREPROCESSOR_FILE).is_file():
         raise ValueError(f"{checkpoint} holds no {PREPROCESSOR_FILE}, so it is no checkpoint of a policy")
-    if output.exists():
-        raise ValueError(f"{output} exists already; name a new folder")
+    check_new_folder("output", output)
     register_third_party_plugins()  # the checkpoint's own steps
     preprocessor = DataProcessorPipeline.from_pretrained(checkpoint, config_filename=PREPROCESSOR_FILE)
     preprocessor.steps = [*steps, *preprocessor.steps]
-    shutil.copytree(checkpoint, output, ignore=shutil.ignore_patterns(f"{POLICY_PREPROCESSOR_DEFAULT_NAME}*"))
-    preprocessor.save_pretrained(output, config_filename=PREPROCESSOR_FILE)
+    with written_whole(output) as (folder,):
+        others = shutil.ignore_patterns(f"{POLICY_PREPROCESSOR_DEFAULT_NAME}*")
+        shutil.copytree(checkpoint, folder, ignore=others)
+        preprocessor.save_pretrained(folder, config_filename=PREPROCESSOR_FILE)

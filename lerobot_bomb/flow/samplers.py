@@ -103,7 +103,7 @@ def sample(
 ) -> Tensor:
     """Noise of N(0, I) -> normalised actions (B, K, D), float32 whatever the heads compute in.
 
-    A function of its arguments: noise is drawn before, with `draw_noise` from a seeded generator.
+    A function of its arguments: noise is drawn before, by `SamplingNoise`.
 
     Args:
         heads: called once a step.

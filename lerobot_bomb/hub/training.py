@@ -46,7 +46,7 @@ def train_command(config: PreTrainedConfig, training: TrainPipelineConfig | None
     if training is not None:
         if training.dataset.episodes is not None:
             flags.append(f"--dataset.episodes={_text(training.dataset.episodes)}")
-        flags += [f"--{name}={getattr(training, name)}" for name in ("batch_size", "steps", "seed")]
+        flags += [f"--{name}={_text(getattr(training, name))}" for name in ("batch_size", "steps", "seed")]
         flags += peft_flags(training)
     return command("lerobot-train", *flags, f"--output_dir=outputs/{config.type}")
 

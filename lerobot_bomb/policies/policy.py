@@ -14,9 +14,9 @@ from torch import Tensor, nn
 from torch.nn.attention import SDPBackend, sdpa_kernel
 
 from lerobot_bomb.actions.ensemble import TemporalEnsemble
-from lerobot_bomb.actions.relative import RelativeActions, bounds, named_dims, present_episodes
+from lerobot_bomb.actions.relative import RelativeActions, bounds, named_dims
 from lerobot_bomb.checkpoints.adapters import check_buffers_are_the_bases, frozen_buffers
-from lerobot_bomb.data.columns import dim_names, episode_bounds, read_columns
+from lerobot_bomb.data.columns import dim_names, episode_bounds, present_episodes, read_columns
 from lerobot_bomb.decoding.kv_cache import check_positions
 from lerobot_bomb.flow.noise import SamplingNoise, gumbel
 from lerobot_bomb.hub.policy import HubPolicy
@@ -228,7 +228,7 @@ class VlaPolicy(ChunkPolicy):
             self._ensemble.reset()
 
     def select_action(self, batch: dict[str, Tensor], **options: Any) -> Tensor:
-        """(B, D) next normalised action; ``options`` as `predict_action_chunk` takes them.
+        """(B, D) next normalised action; ``options`` as `_predict` takes them.
 
         With a temporal ensemble every call predicts; else when the queue of ``n_action_steps`` is empty.
 

@@ -1,1 +1,1 @@
-"""Seeing BOMB: one episode as a recording and a video, every perturbation axis as a image."""
+"""Seeing BOMB: one episode as a recording and a video, every perturbation axis as an image."""

@@ -122,7 +122,9 @@ class RerunFile:
     def _log_scene(self, state: PrivilegedState) -> None:
         in_play = state.stone_in_play
         colors = [STONE_RGB[COLORS[int(is_white)]] for is_white in state.stone_is_white[in_play]]
-        half_size = (state.stone_radius_m, state.stone_radius_m, BOARD.stone_height_m / 2)
+        # a stone's goal is to lie on the board
+        half_height_m = float(state.goals[0].xyz[2]) - BOARD.thickness_m
+        half_size = (state.stone_radius_m, state.stone_radius_m, half_height_m)
         stones = rr.Ellipsoids3D(
             centers=state.stone_xyz[in_play],
             half_sizes=[half_size] * len(colors),

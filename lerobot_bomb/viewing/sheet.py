@@ -59,7 +59,7 @@ class Sheet:
 
 
 def text_tile(text: str, size: int) -> np.ndarray:
-    """(size, size, 3) uint8: a instruction, broken into lines; what does not fit is cut off."""
+    """(size, size, 3) uint8: an instruction, broken into lines; what does not fit is cut off."""
     tile = Image.new("RGB", (size, size), TILE_PAPER)
     face = font(FONT_SIZE)
     lines = [""]

@@ -23,6 +23,7 @@ from transformers import (
     SmolVLMForConditionalGeneration,
 )
 
+from lerobot_bomb.files import read_json
 from lerobot_bomb.finite import require_finite_weights
 from lerobot_bomb.vlm.images import resized_pixels
 from lerobot_bomb.vlm.memory import check_memory
@@ -190,7 +191,7 @@ def check_family(vlm_model_name: str, *families: str) -> str:
         path = Path(hub_file(vlm_model_name, path.name))
     if not path.is_file():
         raise FileNotFoundError(f"--policy.vlm_model_name={vlm_model_name}: the folder has no config.json")
-    config = json.loads(path.read_text())
+    config = read_json(path)
     family = config.get("model_type")
     if family is None and "type" in config:
         raise ValueError(

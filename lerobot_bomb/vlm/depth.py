@@ -1,6 +1,6 @@
 """Depth of a policy's images: observed or estimated, at the points where a position encoding wants it.
 
-Shapes: `B` batch, `H` and `W` sides of a image, `S` of a square one, `R` of the lattice of points.
+Shapes: `B` batch, `H` and `W` sides of an image, `S` of a square one, `R` of the lattice of points.
 Depth is in metres along the optical axis; what is not finite or not positive is no depth.
 """
 

@@ -1,6 +1,6 @@
 """Ego3D position encoding: tells each image patch where in the camera's frame it lies.
 
-SpatialVLA (Qu et al. 2025). Shapes: `B` batch, `P` patches of a image, `R` side of the lattice of points,
+SpatialVLA (Qu et al. 2025). Shapes: `B` batch, `P` patches of an image, `R` side of the lattice of points,
 `E` numbers that encode a point or a patch's points, `H` hidden size of the vision model.
 """
 

@@ -1,4 +1,4 @@
-"""Pinhole cameras, and how they follow a image that is cropped and resized. All in float32.
+"""Pinhole cameras, and how they follow an image that is cropped and resized. All in float32.
 
 Shapes: `B` batch, `R` side of a square image, pixels.
 K (B, 3, 3) has focal lengths and principal point in pixels *counted from the image's edge*: the centre of
@@ -10,7 +10,7 @@ from torch import Tensor
 
 from lerobot_bomb.vlm.images import CropWindows
 
-# What SpatialVLA assumes of every camera: focal length and principal point, pixels of a image of this size
+# What SpatialVLA assumes of every camera: focal length and principal point, pixels of an image of this size
 DEFAULT_FOCAL_PX, DEFAULT_CENTER_PX = 623.588, (319.501, 239.545)
 DEFAULT_HEIGHT_PX, DEFAULT_WIDTH_PX = 480, 640
 

@@ -228,7 +228,7 @@ class QwenBackbone(Backbone):
     def _positions(self, is_image_BL: Tensor, mask_BL: Tensor) -> tuple[Tensor, Tensor]:
         """(3, B, L) time, line and column that the model takes a token to be at, and (B, 1) what follows.
 
-        Text moves all three on by one. A image stands still in time, its lines and columns count from
+        Text moves all three on by one. An image stands still in time, its lines and columns count from
         there, and what follows it is at the first place beyond.
         """
         side = self.tokens_per_side

@@ -15,4 +15,4 @@ class BombExpertPolicy(ScriptedPolicy):
     name = "bomb_expert"
 
     def act(self, state: PrivilegedState, step: int) -> np.ndarray:
-        return expert_action(state, state.control_mode, state.fps)
+        return expert_action(state)

@@ -14,9 +14,8 @@ def build_model(config: FdvlaConfig) -> tuple[QwenPrompt, QwenBackbone]:
         tokens = QwenPrompt.from_tokenizer(load_tokenizer(name), name)
         backbone = load_qwen(name, config.image_size, config.nano_config)
         config.vlm_config, config.prompt_tokens = config_dict(backbone.vlm), tokens.to_dict()
-    elif config.prompt_tokens is None:
-        raise ValueError("--policy.vlm_config is set, but not --policy.prompt_tokens, which belongs to it")
     else:
+        assert config.prompt_tokens is not None
         tokens = QwenPrompt(**config.prompt_tokens)
         backbone = build_qwen(config.vlm_config, config.image_size, config.weights_type)
     _freeze(config, backbone)

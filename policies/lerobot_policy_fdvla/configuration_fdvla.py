@@ -151,7 +151,7 @@ class FdvlaConfig(RelativeVlaConfig):
             )
         if (num_tokens := (self.image_size // PIXELS_PER_TOKEN) ** 2) > MAX_POSITIONS:
             raise ValueError(
-                f"--policy.image_size={self.image_size} makes {num_tokens} tokens of a image; the "
+                f"--policy.image_size={self.image_size} makes {num_tokens} tokens of an image; the "
                 f"model has {MAX_POSITIONS} positions"
             )
 

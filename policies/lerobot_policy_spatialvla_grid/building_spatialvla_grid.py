@@ -9,8 +9,8 @@ from lerobot.utils.constants import ACTION
 from lerobot_bomb.actions.grid_fit import normalised, normalised_rest
 from lerobot_bomb.actions.grid_report import clipping_text, rest_text
 from lerobot_bomb.actions.grids import ActionGrids
-from lerobot_bomb.actions.relative import bounds, present_episodes
-from lerobot_bomb.data.columns import dim_names, read_columns
+from lerobot_bomb.actions.relative import bounds
+from lerobot_bomb.data.columns import dim_names, present_episodes, read_columns
 from lerobot_bomb.vlm.backbone import check_family, config_dict
 from lerobot_bomb.vlm.depth import ZoeDepth, build_zoedepth, load_zoedepth, read_zoedepth_config
 from lerobot_bomb.vlm.paligemma import PaliGemmaBackbone, PaliGemmaPrompt, build_paligemma, load_paligemma
@@ -77,9 +77,8 @@ def build_model(config: SpatialvlaGridConfig) -> tuple[PaliGemmaPrompt, PaliGemm
         tokens = PaliGemmaPrompt.from_tokenizer(load_tokenizer(name), name)
         backbone = load_paligemma(name, config.nano_config)
         config.vlm_config, config.prompt_tokens = config_dict(backbone.vlm), tokens.to_dict()
-    elif config.prompt_tokens is None:
-        raise ValueError("--policy.vlm_config is set, but not --policy.prompt_tokens, which belongs to it")
     else:
+        assert config.prompt_tokens is not None
         tokens = PaliGemmaPrompt(**config.prompt_tokens)
         backbone = build_paligemma(config.vlm_config, config.weights_type)
     if config.freeze_vision_encoder:

@@ -25,9 +25,8 @@ def build_model(config: Vla0SmolConfig) -> tuple[PromptTokens, TextBackbone]:
     if config.vlm_config is None:
         tokens, backbone = _load(config)
         config.vlm_config, config.prompt_tokens = config_dict(backbone.vlm), tokens.to_dict()
-    elif config.prompt_tokens is None:
-        raise ValueError("--policy.vlm_config is set, but not --policy.prompt_tokens, which belongs to it")
     else:
+        assert config.prompt_tokens is not None
         tokens, backbone = PromptTokens(**config.prompt_tokens), _build(config, config.vlm_config)
         if tokens.system_prompt != config.system_prompt:
             raise ValueError(

@@ -19,6 +19,7 @@ SHAPES = ("nano_config",)
 # the same, and flags that say what the model's tokens mean
 AS_TRAINED = (
     *("chunk_size", "n_action_bins", "n_state_bins", "bin_mode", "number_width", "use_state", "image_size"),
+    *("relative_actions", "relative_exclude_joints", "relative_state_indices"),
     *SHAPES,
 )
 

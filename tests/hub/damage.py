@@ -125,7 +125,7 @@ def change_tensors(name: str, change: Callable[[Tensors], Tensors]) -> Damage:
 
 
 def one_nan(tensors: Tensors) -> Tensors:
-    """Of the first tensor of floats that is neither a scalar nor a image's."""
+    """Of the first tensor of floats that is neither a scalar nor an image's."""
     name = min(name for name, tensor in tensors.items() if tensor.is_floating_point() and tensor.ndim)
     tensors[name].view(-1)[1] = torch.nan
     return tensors

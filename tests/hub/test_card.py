@@ -95,6 +95,8 @@ def test_commands_are_those_of_the_training_and_of_what_the_dataset_shows(tmp_pa
         "--dataset.repo_id=me/d '--dataset.episodes=[0, 1]' --batch_size=4 --steps=7 --seed=3 "
         "--output_dir=outputs/vla0_smol\n"
     ) in text
+    unseeded = replace(of, training=replace(training, seed=None))
+    assert " --seed=null " in str(unseeded.card())
     assert (
         "lerobot-eval --policy.path=me/x --env.type=bomb --env.task=place --env.robot=fetch "
         "--env.control_mode=absolute --env.fps=10 --env.image_size=128 --env.depth=true"
