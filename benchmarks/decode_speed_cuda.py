@@ -178,7 +178,7 @@ class Ours:
 
 @contextmanager
 def ends_of_passes() -> Iterator[list[torch.cuda.Event]]:
-    """When the device was done with each recorded pass."""
+    """When the device was done with each captured pass."""
     ends: list[torch.cuda.Event] = []
     replay: Callable[..., Any] = GraphedFunction.__call__
 

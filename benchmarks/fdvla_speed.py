@@ -133,7 +133,7 @@ def time_queries(policy: FdvlaPolicy, batches: list[dict[str, Any]]) -> dict[str
         ONCE: policy.predict_action_chunk,
     }
     if policy.config.device == "cuda":
-        ways[f"{ONCE}, not recorded"] = partial(unrecorded, policy)
+        ways[f"{ONCE}, not captured"] = partial(uncaptured, policy)
     seconds: dict[str, list[float]] = {name: [] for name in ways}
     for i, batch in enumerate([batches[0], *batches]):
         answers = []
@@ -189,13 +189,13 @@ def read_in_every_step(policy: FdvlaPolicy, batch: dict[str, Any], *, sees_once:
             return policy._denoise(heads, policy._noise(None, shape), policy._step_noise(shape))
 
 
-def unrecorded(policy: FdvlaPolicy, batch: dict[str, Any]) -> Tensor:
+def uncaptured(policy: FdvlaPolicy, batch: dict[str, Any]) -> Tensor:
     """The policy's own way, kernel by kernel."""
 
     def sample(_: object, *tensors: Tensor) -> tuple[Tensor, ...]:
         return policy._sample(*tensors)
 
-    with patch.object(policy, "_recorded", sample):
+    with patch.object(policy, "_captured", sample):
         return policy.predict_action_chunk(batch)
 
 

@@ -1,4 +1,4 @@
-"""CUDA graphs: the kernels of a function, recorded once and started together afterwards."""
+"""CUDA graphs: the kernels of a function, captured once and started together afterwards."""
 
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
@@ -10,45 +10,45 @@ from torch import Tensor, nn
 
 
 @dataclass(frozen=True)
-class _Recording:
+class _Captured:
     graph: torch.cuda.CUDAGraph
     taken: tuple[Tensor, ...]
     returned: tuple[Tensor, ...]
 
 
 class GraphedFunction:
-    """A function of tensors that is recorded once for each set of their shapes and types.
+    """A function of tensors that is captured once for each set of their shapes and types.
 
     It must be the same work every time: no look at a value, no random number, and what it reads besides its
     arguments stays where it is. What is returned is written over by the next call of the same shapes. Tensors
-    on other devices than CUDA are given to the function itself. A copy has recorded nothing.
+    on other devices than CUDA are given to the function itself. A copy has captured nothing.
     """
 
     def __init__(self, function: Callable[..., tuple[Tensor, ...]]):
         self._function = function
-        self._recordings: dict[Any, _Recording] = {}
-        self._pool: Any = None  # memory of all recordings, which take turns
+        self._graphs: dict[Any, _Captured] = {}
+        self._pool: Any = None  # memory of all graphs, which take turns
 
     def __getstate__(self) -> dict[str, Any]:
-        return {"_function": self._function, "_recordings": {}, "_pool": None}
+        return {"_function": self._function, "_graphs": {}, "_pool": None}
 
     def __call__(self, *tensors: Tensor) -> tuple[Tensor, ...]:
         """What the function returns for these; call it outside of inference mode."""
         if not tensors[0].is_cuda:
             return self._function(*tensors)
         shapes = tuple((tensor.shape, tensor.dtype) for tensor in tensors)
-        if shapes not in self._recordings:
+        if shapes not in self._graphs:
             with _without_cached_casts():
-                self._recordings[shapes] = self._record(tensors)
-        recording = self._recordings[shapes]
-        for taken, given in zip(recording.taken, tensors, strict=True):
+                self._graphs[shapes] = self._capture(tensors)
+        captured = self._graphs[shapes]
+        for taken, given in zip(captured.taken, tensors, strict=True):
             taken.copy_(given)
-        recording.graph.replay()
-        return recording.returned
+        captured.graph.replay()
+        return captured.returned
 
-    def _record(self, tensors: tuple[Tensor, ...]) -> _Recording:
+    def _capture(self, tensors: tuple[Tensor, ...]) -> _Captured:
         taken = tuple(tensor.clone() for tensor in tensors)
-        # libraries set themselves up in their first calls, which cannot be recorded
+        # libraries set themselves up in their first calls, which cannot be captured
         stream = torch.cuda.Stream()
         stream.wait_stream(torch.cuda.current_stream())
         with torch.cuda.stream(stream):
@@ -59,28 +59,28 @@ class GraphedFunction:
         with torch.cuda.graph(graph, self._pool, capture_error_mode="thread_local"):
             returned = self._function(*taken)
         self._pool = graph.pool()
-        return _Recording(graph, taken, returned)
+        return _Captured(graph, taken, returned)
 
 
 class GraphedModel:
     """A function of tensors that also reads the weights of modules, where these lie.
 
-    With autocast, products' weights are cast once in its course. It is recorded anew when weights have moved.
+    With autocast, products' weights are cast once in its course. It is captured anew when weights have moved.
     Arguments are as for `GraphedFunction`.
     """
 
     def __init__(self, function: Callable[..., tuple[Tensor, ...]], modules: Iterable[nn.Module]):
         self._call = _Call(function, modules)
         self._state: Any = None
-        self._recorded = GraphedFunction(self._run)
+        self._captured = GraphedFunction(self._run)
 
     def __call__(self, settings: Any, *tensors: Tensor) -> tuple[Tensor, ...]:
         """What the function returns; ``settings``: whatever else it reads."""
         read = [*self._call.parameters(), *self._call.buffers()]
         state = settings, [tensor.data_ptr() for tensor in read]
         if state != self._state:
-            self._state, self._recorded = state, GraphedFunction(self._run)
-        return self._recorded(*tensors)
+            self._state, self._captured = state, GraphedFunction(self._run)
+        return self._captured(*tensors)
 
     def _run(self, *tensors: Tensor) -> tuple[Tensor, ...]:
         weights: dict[str, Tensor] = {}
@@ -107,7 +107,7 @@ class _Call(nn.Module):
 
 @contextmanager
 def _without_cached_casts() -> Iterator[None]:
-    """Autocast's cache holds what is cast in a recording, or was before it, no longer than autocast lasts."""
+    """Autocast's cache holds what is cast in a capture, or was before it, no longer than autocast lasts."""
     was_enabled = torch.is_autocast_cache_enabled()
     torch.clear_autocast_cache()
     torch.set_autocast_cache_enabled(False)

@@ -1,4 +1,4 @@
-"""What is recorded on CUDA, where there is none: `tests/outside/check_cuda.py` is for a GPU."""
+"""What is captured on CUDA, where there is none: `tests/outside/check_cuda.py` is for a GPU."""
 
 import copy
 
@@ -15,30 +15,30 @@ def test_other_devices_call_the_function() -> None:
         calls.append(x)
         return (2 * x,)
 
-    recorded = GraphedFunction(double)
-    assert recorded(torch.ones(2))[0].tolist() == [2, 2] and recorded(torch.ones(3))[0].tolist() == [2, 2, 2]
+    captured = GraphedFunction(double)
+    assert captured(torch.ones(2))[0].tolist() == [2, 2] and captured(torch.ones(3))[0].tolist() == [2, 2, 2]
     assert len(calls) == 2
 
 
 class Doubled(nn.Module):
-    """A model that has its own function recorded, as a policy does."""
+    """A model that has its own function captured, as a policy does."""
 
     def __init__(self) -> None:
         super().__init__()
         self.linear = nn.Linear(2, 2, bias=False)
-        self.recorded = GraphedModel(self.run, [self.linear])
+        self.captured = GraphedModel(self.run, [self.linear])
 
     def run(self, x: Tensor) -> tuple[Tensor]:
         return (2 * self.linear(x),)
 
 
 @torch.no_grad()
-def test_a_recorded_model_has_the_weights_of_now_and_a_copy_its_own() -> None:
+def test_a_captured_model_has_the_weights_of_now_and_a_copy_its_own() -> None:
     model = Doubled()
     model.linear.weight.copy_(torch.eye(2))
     copied = copy.deepcopy(model)
     model.linear.weight.data = 3 * torch.eye(2)
     x = torch.tensor([1.0, 2.0])
-    assert model.recorded("any", x)[0].tolist() == [6, 12]
-    assert copied.recorded("any", x)[0].tolist() == [2, 4]
+    assert model.captured("any", x)[0].tolist() == [6, 12]
+    assert copied.captured("any", x)[0].tolist() == [2, 4]
     assert [name for name, _ in model.named_parameters()] == ["linear.weight"]

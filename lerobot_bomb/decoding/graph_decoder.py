@@ -1,4 +1,4 @@
-"""Decoding on a device that the host runs ahead of: every pass has the same shapes, and is recorded.
+"""Decoding on a device that the host runs ahead of: every pass has the same shapes, and is captured.
 
 Shapes: `B` batch, `S` symbols, `L` tokens of a prompt, `H` hidden size.
 """
@@ -29,7 +29,7 @@ NUM_GUESSES = 16  # of every pass
 class GraphDecoder:
     """Answers to prompts of one shape.
 
-    Rows that are done go on until all are: a smaller batch would have to be recorded, too.
+    Rows that are done go on until all are: a smaller batch would have to be captured, too.
     """
 
     def __init__(
@@ -38,7 +38,7 @@ class GraphDecoder:
         """``embeds_SH``, ``head_SH``: the symbols' rows of the embedding and of the output head."""
         self._text, self._grammar, self._guess = text, grammar, guess
         self._embeds_SH, self._head_SH = embeds_SH.clone(), head_SH.clone()
-        # a model that is moved replaces its tables; recordings read those of their time
+        # a model that is moved replaces its tables; graphs read those of their time
         self._tables = list(grammar.buffers())
         self._first, self._next = GraphedFunction(self._write_first), GraphedFunction(self._write)
 

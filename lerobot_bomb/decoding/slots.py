@@ -28,7 +28,7 @@ from lerobot_bomb.vlm.backbone import exact_linear
 
 
 class SlotWriter:
-    """Choices after prompts; on CUDA recorded whole for every shape of prompts that it has met.
+    """Choices after prompts; on CUDA captured whole for every shape of prompts that it has met.
 
     The prompt may have padding, but not in its last column. ``prompt_reads_all``: every token of the prompt
     reads all of it, not only what stands before.
@@ -47,7 +47,7 @@ class SlotWriter:
         """``cap``: of logits; ``drafted``: guess that a step is as the one before, on a CPU, one row."""
         self._text_model, self._positions, self._cap = text_model, positions, cap
         self._reads_all, self.drafted = prompt_reads_all, drafted
-        self._recordings = GraphCache[GraphSlots](text_model, positions, compiled=compiled)
+        self._graphs = GraphCache[GraphSlots](text_model, positions, compiled=compiled)
 
     @torch.no_grad()
     def __call__(
@@ -75,8 +75,8 @@ class SlotWriter:
             with torch.inference_mode(False), torch.no_grad():
                 settings = slots, num_steps, self._reads_all, self._cap
                 make = partial(GraphSlots, *settings, embeds_CH, head_CH)
-                recorded = self._recordings.find(prompt.embeds, num_slots, make)
-                choices_BS, finite_B = recorded(prompt, embeds_CH, head_CH, noise)
+                captured = self._graphs.find(prompt.embeds, num_slots, make)
+                choices_BS, finite_B = captured(prompt, embeds_CH, head_CH, noise)
             require_finite_answers(finite_B)
             return choices_BS
         batch_size, num_columns, _ = prompt.embeds.shape

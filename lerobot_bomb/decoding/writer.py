@@ -18,7 +18,7 @@ from lerobot_bomb.vlm.backbone import Backbone
 
 
 class NumberWriter:
-    """Numbers after prompts; on CUDA with the recorded passes of every shape of prompts that it has met."""
+    """Numbers after prompts; on CUDA with the captured passes of every shape of prompts that it has met."""
 
     def __init__(
         self,
@@ -31,7 +31,7 @@ class NumberWriter:
     ):
         """``positions``: of a sequence's columns, the same in every row."""
         self._backbone, self._grammar, self._guess, self._positions = backbone, grammar, guess, positions
-        self._recordings = GraphCache[GraphDecoder](backbone.text_model, positions, compiled=compiled)
+        self._graphs = GraphCache[GraphDecoder](backbone.text_model, positions, compiled=compiled)
 
     @torch.no_grad()
     def __call__(
@@ -44,8 +44,8 @@ class NumberWriter:
             with torch.inference_mode(False), torch.no_grad():
                 rows = self._backbone.embed_tokens(symbol_ids), head.weight[symbol_ids]
                 make = partial(GraphDecoder, self._grammar, self._guess, *rows)
-                recorded = self._recordings.find(prompt.embeds, max_symbols, make)
-                return recorded(prompt, *rows, stop_after, noise)
+                captured = self._graphs.find(prompt.embeds, max_symbols, make)
+                return captured(prompt, *rows, stop_after, noise)
         model = continue_prompt(self._backbone, prompt, symbol_ids, max_symbols, self._positions)
         return decode_numbers(
             model,

@@ -94,7 +94,7 @@ class FdvlaPolicy(RelativeVlaPolicy):
         self.denoise_head = make_head(denoise_dim) if config.use_denoise_head else None
         logger.info("fdvla: %s", self.parameter_counts)
         heads = [head for head in (self.flow_head, self.denoise_head) if head is not None]
-        self._recorded = GraphedModel(self._sample, [self.backbone.text_model, self.segment, *heads])
+        self._captured = GraphedModel(self._sample, [self.backbone.text_model, self.segment, *heads])
         self.init_rtc_processor()
         self._sampling_noise = SamplingNoise(config.noise_seed, config.noise_per_episode)
         self._ensemble = self._make_ensemble()
@@ -220,7 +220,7 @@ class FdvlaPolicy(RelativeVlaPolicy):
         the last chunk that are not executed yet, and how many will be when this one arrives.
         """
         self.eval()
-        # real-time chunking takes gradients, and what is recorded is written over
+        # real-time chunking takes gradients, and what is captured is written over
         with torch.inference_mode(False), torch.no_grad(), self._autocast():
             context = self._read(batch)
             shape = len(context.pooled), self.config.chunk_size, self._action_dim
@@ -231,8 +231,8 @@ class FdvlaPolicy(RelativeVlaPolicy):
                 heads = guided(heads, self.rtc_processor, left_over_BKD, delay, execution_horizon)
                 actions_BKD = self._denoise(heads, *noises)
             elif self.action_unit.is_cuda:
-                recorded = self._recorded(self.config.sampling(), *noises, *context.tensors())
-                actions_BKD = recorded[0].clone()
+                captured = self._captured(self.config.sampling(), *noises, *context.tensors())
+                actions_BKD = captured[0].clone()
             else:
                 actions_BKD = self._sample(*noises, *context.tensors())[0]
             actions_BKD = self._to_absolute(actions_BKD, batch)

@@ -1,4 +1,4 @@
-"""Answers that are recorded on a GPU; `make test-cuda` runs this where one is, CI has none."""
+"""Answers that are captured on a GPU; `make test-cuda` runs this where one is, CI has none."""
 
 import copy
 import pickle
@@ -95,7 +95,7 @@ def test_fewer_actions_are_the_first_of_more(make: Callable[..., Any]) -> None:
     assert torch.equal(device.select_action(batch), chunk[:, 1])
 
 
-def test_recordings_follow_weights_and_devices(make: Callable[..., Any]) -> None:
+def test_graphs_follow_weights_and_devices(make: Callable[..., Any]) -> None:
     host = make()
     device, batch = copy.deepcopy(host).cuda(), batch_for(host, 2)
     first = predict(device, batch)
@@ -110,7 +110,7 @@ def test_recordings_follow_weights_and_devices(make: Callable[..., Any]) -> None
 
 
 def test_what_a_model_gives_that_is_not_finite_is_no_action(make: Callable[..., Any]) -> None:
-    """Of one row, and of another call of the same recording."""
+    """Of one row, and of another call of the same graph."""
     device = make().cuda()
     batch = on("cuda", batch_for(device, 3))
     device.predict_action_chunk(batch)
@@ -163,9 +163,9 @@ def test_sampling_in_bfloat16_is_as_near_as_kernel_by_kernel(train_vlm: str) -> 
     host = fdvla_cases.make_policy(0, 7, **options)
     device = fdvla_cases.make_policy(0, 7, dtype="bfloat16", **options).cuda()
     batch = batch_for(host, 4)
-    exact, recorded = predict(host, batch), predict(device, batch)
+    exact, captured = predict(host, batch), predict(device, batch)
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(device, "_recorded", lambda _, *tensors: device._sample(*tensors))
+        patch.setattr(device, "_captured", lambda _, *tensors: device._sample(*tensors))
         eager = predict(device, batch)
-    error, error_of_eager = ((actions - exact).abs().max() for actions in (recorded, eager))
+    error, error_of_eager = ((actions - exact).abs().max() for actions in (captured, eager))
     assert 0 < error < 2 * error_of_eager + 1e-3
