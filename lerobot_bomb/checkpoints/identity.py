@@ -18,7 +18,7 @@ from lerobot_bomb.checkpoints.names import WEIGHTS
 from lerobot_bomb.envs.results import PolicyIdentity
 from lerobot_bomb.files import read_json
 
-PROCESSORS = ("policy_preprocessor*", "policy_postprocessor*")
+PROCESSOR_PATTERNS = ("policy_preprocessor*", "policy_postprocessor*")
 # in a config, but not of what the policy does
 NOT_ITS_SETTINGS = {
     "device", "pretrained_path", "pretrained_revision", "package_version", "use_peft", "ignore_environment",
@@ -90,7 +90,7 @@ def _settings_sha256(config: PreTrainedConfig, folder: Path) -> str:
     settings: Any = draccus.encode(config)
     settings = {name: value for name, value in settings.items() if name not in NOT_ITS_SETTINGS}
     digest = hashlib.sha256(json.dumps(settings, sort_keys=True, default=str).encode())
-    for path in sorted(path for pattern in PROCESSORS for path in folder.glob(pattern) if path.is_file()):
+    for path in sorted(path for pattern in PROCESSOR_PATTERNS for path in folder.glob(pattern) if path.is_file()):
         digest.update(f"{path.name} {sha256_of(path)}".encode())
     return digest.hexdigest()
 
