@@ -22,9 +22,9 @@ from tqdm import tqdm
 from lerobot_bomb.bomb.board import BOARD
 from lerobot_bomb.bomb.episode import CONTROL_MODES, DEFAULT_FPS, ROBOTS, SPLITS, EpisodeSpec
 from lerobot_bomb.bomb.observation import MAX_STEP_M, MIN_IMAGE_SIZE, RenderOptions
-from lerobot_bomb.bomb.perturbations import NONE
 from lerobot_bomb.bomb.privileged_state import PrivilegedState
 from lerobot_bomb.bomb.streams import Stream, generator
+from lerobot_bomb.conditions import NONE
 from lerobot_bomb.envs.rollout import Moment, add_noise, expert_agent, play
 from lerobot_bomb.stats import format_rate
 from lerobot_env_bomb.env import BombEnv

@@ -30,10 +30,10 @@ from learning_tasks import PROBE, RIVALS, TASKS, Bar, Task, by_what_is_left_out,
 from machine import add_machine_arguments, positive, require_idle_machine, write_figures
 from recipes import POLICY_TYPES, last_checkpoint, read_recipe, recipe_path
 
-from lerobot_bomb.bomb.perturbations import NONE
 from lerobot_bomb.checkpoints.identity import sha256_of
 from lerobot_bomb.checkpoints.names import WEIGHTS
 from lerobot_bomb.commands.run import run_command
+from lerobot_bomb.conditions import NONE
 from lerobot_bomb.evaluation.results import PUT_DOWN, Row, read_results
 
 PLUGIN = f"lerobot_policy_{PROBE}"  # not installed: LeRobot finds it by --*.discover_packages_path

@@ -5,8 +5,9 @@ from dataclasses import dataclass
 from recipes import POLICY_TYPES
 
 from lerobot_bomb.bomb.board import COLORS, task_id
-from lerobot_bomb.bomb.perturbations import ALL, NONE, NUISANCES
+from lerobot_bomb.bomb.perturbations import NUISANCES
 from lerobot_bomb.bomb.suites.place import targets_of, templates_of
+from lerobot_bomb.conditions import ALL, NONE
 from lerobot_bomb.evaluation.results import Row
 
 PROBE = "keypoint_probe"

@@ -16,7 +16,8 @@ from machine import add_machine_arguments, positive, require_idle_machine, write
 
 from lerobot_bomb.bomb.episode import EpisodeSpec
 from lerobot_bomb.bomb.observation import RenderOptions
-from lerobot_bomb.bomb.perturbations import AXES, MAX_LEVEL
+from lerobot_bomb.bomb.perturbations import AXES
+from lerobot_bomb.conditions import MAX_LEVEL
 from lerobot_bomb.tables import print_table
 from lerobot_env_bomb.env import BombEnv
 

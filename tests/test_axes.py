@@ -15,8 +15,9 @@ from lerobot_bomb.bomb.episode import EpisodeSpec
 from lerobot_bomb.bomb.go import is_legal_move, is_legal_position
 from lerobot_bomb.bomb.layout import Layout
 from lerobot_bomb.bomb.observation import CAMERAS
-from lerobot_bomb.bomb.perturbations import AXES, MAX_LEVEL, NUISANCES
+from lerobot_bomb.bomb.perturbations import AXES, NUISANCES
 from lerobot_bomb.bomb.suites.place import STONE
+from lerobot_bomb.conditions import MAX_LEVEL
 from lerobot_bomb.envs.photometric import Photometric
 from lerobot_env_bomb.axes import TRANSFORMS
 from lerobot_env_bomb.axes.dynamics import Dynamics

@@ -10,9 +10,10 @@ from PIL import Image
 from lerobot_bomb.bomb.board import BOARD
 from lerobot_bomb.bomb.episode import EpisodeSpec
 from lerobot_bomb.bomb.observation import RenderOptions
-from lerobot_bomb.bomb.perturbations import ALL, AXES
+from lerobot_bomb.bomb.perturbations import AXES
 from lerobot_bomb.commands import main as cli
 from lerobot_bomb.commands.gallery import COLUMNS, PATH_RGB, SHEETS, axis_sheet, path_tile
+from lerobot_bomb.conditions import ALL
 from lerobot_bomb.envs.rollout import make_env
 from lerobot_bomb.viewing.perturbations_page import example_instructions, page
 from lerobot_bomb.viewing.sheet import PAPER, Sheet, text_tile

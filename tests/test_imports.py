@@ -24,7 +24,8 @@ HEAVY = {"torch", "lerobot", "transformers", "rerun", "cv2"}
 CORE = "lerobot_bomb"
 # a folder or module of the core imports from those above it in this list
 ORDER = [
-    "__init__", "_compat", "finite", "flag_errors", "flags", "stats", "tables", "files", "cuda_graphs",
+    "__init__", "_compat", "finite", "flag_errors", "flags", "conditions", "stats", "tables", "files",
+    "cuda_graphs",
     "bomb", "envs", "actions", "flow", "vlm", "decoding", "training", "data", "checkpoints",
     "evaluation", "viewing", "explain", "hub", "policies", "serving", "commands",
 ]  # fmt: skip

@@ -12,9 +12,9 @@ from pathlib import Path
 import pytest
 from lerobot.envs import EnvConfig
 
-from lerobot_bomb.bomb.perturbations import NONE
 from lerobot_bomb.commands import main as cli
 from lerobot_bomb.commands.arguments import parse_conditions
+from lerobot_bomb.conditions import NONE
 from lerobot_bomb.data.recording import Recording
 from lerobot_bomb.data.resumable import (
     METADATA_FILE,

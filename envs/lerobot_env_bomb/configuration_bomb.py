@@ -19,11 +19,12 @@ from lerobot_bomb.bomb.observation import (
     RenderOptions,
     geometry_shapes,
 )
-from lerobot_bomb.bomb.perturbations import NONE, Condition
+from lerobot_bomb.bomb.perturbations import Condition
 from lerobot_bomb.checkpoints.environment import check_acting_policy
+from lerobot_bomb.checkpoints.identity import policy_of_results
 from lerobot_bomb.data.environment import Environment
+from lerobot_bomb.envs.results import check_results_path
 from lerobot_bomb.envs.vector import LazyVectorEnv
-from lerobot_bomb.files import check_appendable
 from lerobot_bomb.flag_errors import flag_errors
 from lerobot_env_bomb.fetch_files import check_robot
 
@@ -93,19 +94,7 @@ class BombEnvConfig(EnvConfig):
     @property
     def conditions(self) -> dict[str, str]:
         """{key of a group of results: its condition}; the suite alone where no condition is named."""
-        if self.perturbations is None:
-            return {str(self.task): NONE}
-        if isinstance(self.perturbations, str):
-            raise ValueError(
-                f"--env.perturbations={self.perturbations} must be a list, with brackets and quotes: "
-                """--env.perturbations='["none","camera:3"]'"""
-            )
-        if not self.perturbations:
-            raise ValueError('--env.perturbations=[] names no condition; leave it out or give ["none"]')
-        conditions = [Condition.parse(text) for text in self.perturbations]
-        if len(set(conditions)) < len(conditions):
-            raise ValueError(f"--env.perturbations={self.perturbations} has a condition twice")
-        return {f"{self.task}.{condition.key}": str(condition) for condition in conditions}
+        return Condition.groups(self.perturbations, str(self.task))
 
     @property
     def specs(self) -> dict[int, EpisodeSpec]:
@@ -174,7 +163,7 @@ class BombEnvConfig(EnvConfig):
         """
         from lerobot_env_bomb.env import BombEnv  # chooses an OpenGL backend, imports MuJoCo
 
-        self._prepare_results_path()
+        check_results_path(self.results_path)
         kwargs = self.gym_kwargs
         return {
             key: {
@@ -182,25 +171,9 @@ class BombEnvConfig(EnvConfig):
                     [partial(BombEnv, **(kwargs | {"spec": replace(spec, perturbations=condition)}))]
                     * n_envs,
                     use_async=use_async_envs and n_envs > 1,
-                    known_late=self._policy_of_results,
+                    known_late=partial(policy_of_results, self.results_path),
                 )
                 for task_id, spec in self.specs.items()
             }
             for key, condition in self.conditions.items()
         }
-
-    def _prepare_results_path(self) -> None:
-        if self.results_path is None:
-            return
-        try:
-            check_appendable(Path(self.results_path))
-        except OSError as error:
-            raise ValueError(f"--env.results_path={self.results_path} cannot be written: {error}") from error
-
-    def _policy_of_results(self) -> dict[str, Any]:
-        """Argument of `BombEnv`: the policy that LeRobot built after this config's environments."""
-        if self.results_path is None:
-            return {}
-        from lerobot_bomb.checkpoints.identity import acting_policy
-
-        return {"policy": acting_policy()}

@@ -139,7 +139,7 @@ class BombEnv(gymnasium.Env[Observation, np.ndarray]):
         if terminated or truncated:
             self._last_transition = deepcopy((transition[0], 0.0, *transition[2:]))
             if self._results_path is not None:
-                write_result(self._results_path, self.episode_result())
+                write_result(self._results_path, self.episode_result(), run.episode.spec.seed)
         return transition
 
     def render(self) -> np.ndarray | None:

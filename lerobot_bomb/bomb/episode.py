@@ -6,8 +6,9 @@ from dataclasses import dataclass
 from enum import StrEnum
 
 from lerobot_bomb.bomb.board import BOARD, COLORS
-from lerobot_bomb.bomb.perturbations import NONE, Condition
+from lerobot_bomb.bomb.perturbations import Condition
 from lerobot_bomb.bomb.suites import SUITES
+from lerobot_bomb.conditions import NONE
 from lerobot_bomb.flags import one_of
 
 # Version of task, physics, observation and success rule: what a recording is of, and its robot type says.

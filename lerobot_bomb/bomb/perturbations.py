@@ -1,34 +1,13 @@
-"""Perturbation axes: their names, levels and magnitudes, and how a condition of several is written.
+"""BOMB's perturbation axes: their names, levels and magnitudes.
 
 The one definition: the simulator applies it, ``docs/perturbations.md`` is generated from it.
 """
 
-import re
+from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Self
+from typing import ClassVar
 
-NONE = "none"
-ALL = "all"
-MAX_LEVEL = 5
-
-
-@dataclass(frozen=True)
-class Magnitude:
-    """How far one quantity of an axis moves at the levels 1..5."""
-
-    unit: str
-    levels: tuple[float, float, float, float, float]
-    what: str
-
-
-@dataclass(frozen=True)
-class Axis:
-    """One way to make the task harder that leaves all others alone."""
-
-    summary: str
-    changes: tuple[str, ...]  # of a paired episode: images, state, instruction, dynamics
-    magnitudes: dict[str, Magnitude]
-
+from lerobot_bomb.conditions import Axis, AxisCondition, Magnitude, nuisances_of
 
 # Append only: an axis' place in this dict numbers its stream of random numbers.
 AXES = {
@@ -127,14 +106,14 @@ AXES = {
             "flat": Magnitude("yes", (0, 0, 1, 1, 1), "discs instead of lenses"),
         },
     ),
-    # a help, not a nuisance: no part of `all`
     "goal_marker": Axis(
         "a blue dot on the target, as the original benchmark drew it",
         ("images",),
         {"radius": Magnitude("mm", (3, 4.5, 6, 8, 10), "of the dot")},
+        is_help=True,
     ),
 }
-NUISANCES = tuple(name for name in AXES if name != "goal_marker")  # what `all` stands for
+NUISANCES = nuisances_of(AXES)  # what `all` stands for
 
 
 def magnitude(axis: str, name: str, level: int) -> float:
@@ -143,58 +122,7 @@ def magnitude(axis: str, name: str, level: int) -> float:
 
 
 @dataclass(frozen=True)
-class Condition:
-    """Which axes are on, each at a level or at one drawn per episode from a range of levels."""
+class Condition(AxisCondition):
+    """Which axes of BOMB are on: "camera:2+light:3"."""
 
-    ranges: tuple[tuple[str, int, int], ...] = ()  # (axis, lowest, highest level), in the order of AXES
-
-    @classmethod
-    def parse(cls, text: str) -> Self:
-        """From "none", "camera:3", "camera:2+light:3" or "all:1-5"; level 0 leaves an axis off.
-
-        Raises:
-            ValueError: names --env.perturbations, what is wrong, and what is allowed.
-        """
-        ranges: dict[str, tuple[int, int]] = {}
-        for part in [] if text == NONE else text.split("+"):
-            axes, low, high = _parse_part(part, text)
-            for axis in axes:
-                if axis in ranges:
-                    reason = f"; {ALL} includes it" if ALL in text else ""
-                    raise ValueError(f"--env.perturbations={text!r} names the axis {axis} twice{reason}")
-                ranges[axis] = low, high
-        return cls(tuple((axis, *ranges[axis]) for axis in AXES if ranges.get(axis, (0, 0)) != (0, 0)))
-
-    def __str__(self) -> str:
-        """As `parse` reads it, the same for all ways to write the same condition."""
-        parts = {axis: f"{low}" if low == high else f"{low}-{high}" for axis, low, high in self.ranges}
-        shared = {parts.get(axis) for axis in NUISANCES}
-        if len(shared) == 1 and shared != {None}:
-            parts = {ALL: parts[NUISANCES[0]], **{a: p for a, p in parts.items() if a not in NUISANCES}}
-        return "+".join(f"{axis}:{levels}" for axis, levels in parts.items()) or NONE
-
-    @property
-    def key(self) -> str:
-        """The condition in lower-case letters, digits, dots and hyphens: "camera-2.light-3", "all-1to5"."""
-        return str(self).replace("-", "to").replace(":", "-").replace("+", ".").replace("_", "-")
-
-
-def _parse_part(part: str, text: str) -> tuple[tuple[str, ...], int, int]:
-    """Axes, lowest and highest level of "camera:1-5" or "all:3"; `text` is the whole condition."""
-    match = re.fullmatch(r"([a-z_]+):(-?\d+)(?:-(\d+))?", part)
-    if match is None:
-        raise ValueError(
-            f"--env.perturbations={text!r}: {part!r} is not a perturbation; write 'none', AXIS:LEVEL or "
-            "AXIS:LOW-HIGH, several joined by +, without spaces, capitals and fractions, as 'camera:3', "
-            "'camera:2+light:3', 'all:1-5'"
-        )
-    axis, low, high = match[1], int(match[2]), int(match[3] or match[2])
-    if axis != ALL and axis not in AXES:
-        raise ValueError(
-            f"--env.perturbations={text!r}: {axis!r} is not an axis; choose one of: {', '.join((*AXES, ALL))}"
-        )
-    if not 0 <= low <= high <= MAX_LEVEL:
-        raise ValueError(
-            f"--env.perturbations={text!r}: the levels of {axis} must lie in 0..{MAX_LEVEL}, lowest first"
-        )
-    return NUISANCES if axis == ALL else (axis,), low, high
+    axes: ClassVar[Mapping[str, Axis]] = AXES

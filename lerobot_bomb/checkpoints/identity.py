@@ -46,6 +46,11 @@ def acting_policy() -> PolicyIdentity | None:
     return PolicyIdentity(config.type) if config.pretrained_path is None else _of_checkpoint(config)
 
 
+def policy_of_results(results_path: str | None) -> dict[str, PolicyIdentity | None]:
+    """Argument of an environment that writes lines of results: the policy, which LeRobot builds after it."""
+    return {} if results_path is None else {"policy": acting_policy()}
+
+
 def weights_file(checkpoint: Path | str, revision: str | None, has_adapters: bool) -> Path | None:
     """Of a folder, or of a repository on the Hub as it was downloaded; None: it has none of this name."""
     return _local_file(checkpoint, revision, ADAPTERS[1] if has_adapters else WEIGHTS)

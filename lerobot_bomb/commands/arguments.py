@@ -8,9 +8,9 @@ from typing import Any
 from lerobot_bomb.bomb.board import BOARD, COLORS
 from lerobot_bomb.bomb.episode import CONTROL_MODES, DEFAULT_FPS, ROBOTS, SPLITS, EpisodeSpec
 from lerobot_bomb.bomb.observation import DEFAULT_IMAGE_SIZE, RENDER_PRESETS
-from lerobot_bomb.bomb.perturbations import NONE
 from lerobot_bomb.bomb.suites import SUITES
 from lerobot_bomb.checkpoints.shipped import checkpoint_path
+from lerobot_bomb.conditions import NONE
 
 
 def path_flag(text: str) -> Path:

@@ -9,10 +9,11 @@ from pathlib import Path
 
 import numpy as np
 
-from lerobot_bomb.bomb.perturbations import NONE, Condition
+from lerobot_bomb.bomb.perturbations import Condition
 from lerobot_bomb.checkpoints.shipped import PREFIX
 from lerobot_bomb.commands.arguments import path_flag
 from lerobot_bomb.commands.run import run_command
+from lerobot_bomb.conditions import NONE
 from lerobot_bomb.evaluation.result_groups import by_condition
 from lerobot_bomb.evaluation.result_lines import Row
 from lerobot_bomb.evaluation.results import read_results

@@ -12,8 +12,9 @@ from tqdm import tqdm
 from lerobot_bomb.bomb.board import BOARD
 from lerobot_bomb.bomb.episode import EpisodeSpec
 from lerobot_bomb.bomb.observation import CAMERAS, PIXELS, WORKSPACE_HIGH_M, WORKSPACE_LOW_M, RenderOptions
-from lerobot_bomb.bomb.perturbations import ALL, AXES, MAX_LEVEL, NONE, NUISANCES
+from lerobot_bomb.bomb.perturbations import AXES, NUISANCES
 from lerobot_bomb.commands.arguments import parse_numbers, path_flag
+from lerobot_bomb.conditions import ALL, MAX_LEVEL, NONE
 from lerobot_bomb.envs.rollout import expert_agent, make_env, play
 from lerobot_bomb.files import written_whole
 from lerobot_bomb.flags import flags_without_group, one_of

@@ -11,7 +11,7 @@ from typing import Any, ClassVar
 from lerobot_bomb import __version__
 from lerobot_bomb.bomb.episode import DEFAULT_FPS, TASK_VERSION, EpisodeSpec
 from lerobot_bomb.bomb.observation import DEFAULT_IMAGE_SIZE, RenderOptions
-from lerobot_bomb.bomb.perturbations import NONE
+from lerobot_bomb.conditions import NONE
 from lerobot_bomb.data.resumable import check_repo_id
 from lerobot_bomb.envs.results import installed_version
 from lerobot_bomb.flags import flags_without_group

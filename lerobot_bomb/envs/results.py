@@ -10,11 +10,12 @@ from dataclasses import dataclass, field
 from functools import cache, partial
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
+from typing import Any, cast
 
 from lerobot_bomb import __version__
 from lerobot_bomb.bomb.episode import PROTOCOL_VERSION, TASK_VERSION, EpisodeSpec
 from lerobot_bomb.bomb.observation import DEFAULT_IMAGE_SIZE, RenderOptions
-from lerobot_bomb.files import append_line
+from lerobot_bomb.files import append_line, check_appendable
 
 
 @cache
@@ -52,8 +53,20 @@ class PolicyIdentity:
     is_in_training: bool = False  # its weights are in no file
 
 
+class ResultLine:
+    """What became of an episode; a dataclass whose fields are the keys of its line."""
+
+    def to_json(self) -> str:
+        """One line of JSON, keys in the order of the fields.
+
+        Raises:
+            ValueError: a number is not finite.
+        """
+        return json.dumps(dataclasses.asdict(cast("Any", self)), allow_nan=False)
+
+
 @dataclass(frozen=True)
-class EpisodeResult:
+class EpisodeResult(ResultLine):
     """Outcome of one episode; one JSON line in a results file.
 
     `target`, `color` are the episode's; what was asked for is in `spec`, where None means drawn.
@@ -87,17 +100,19 @@ class EpisodeResult:
     task_version: str = TASK_VERSION
     protocol_version: str = PROTOCOL_VERSION
 
-    def to_json(self) -> str:
-        """One line of JSON, keys in the order of the fields.
 
-        Raises:
-            ValueError: a number is not finite.
-        """
-        return json.dumps(dataclasses.asdict(self), allow_nan=False)
+def check_results_path(path: str | None) -> None:
+    """Raise a ValueError unless lines can be appended to the file of `--env.results_path`."""
+    if path is None:
+        return
+    try:
+        check_appendable(Path(path))
+    except OSError as error:
+        raise ValueError(f"--env.results_path={path} cannot be written: {error}") from error
 
 
-def write_result(path: Path | str, result: EpisodeResult) -> None:
-    """Append a result to the file of `--env.results_path`.
+def write_result(path: Path | str, result: ResultLine, seed: int) -> None:
+    """Append the result of a seed to the file of `--env.results_path`.
 
     Raises:
         OSError: it could not be written; the file still holds whole lines.
@@ -107,7 +122,7 @@ def write_result(path: Path | str, result: EpisodeResult) -> None:
     except OSError as error:
         raise OSError(
             error.errno,
-            f"--env.results_path={path}: the result of seed {result.spec.seed} could not be written "
+            f"--env.results_path={path}: the result of seed {seed} could not be written "
             f"({error.strerror}); the file holds those before it. Make room or name another file, and "
             "evaluate again: an episode that is run again counts once",
         ) from error

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 from typing import Any
 
 from lerobot_bomb.bomb.board import task_id
-from lerobot_bomb.bomb.perturbations import NONE
+from lerobot_bomb.conditions import NONE
 from lerobot_bomb.evaluation.result_lines import NEW_CHECKS, OLD_VERSION, Row
 
 # what may differ between episodes that are pooled; perturbations between those that are paired

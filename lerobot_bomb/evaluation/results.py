@@ -6,7 +6,7 @@ from pathlib import Path
 from statistics import median
 
 from lerobot_bomb.bomb.episode import Failure
-from lerobot_bomb.bomb.perturbations import NONE
+from lerobot_bomb.conditions import NONE
 from lerobot_bomb.evaluation.result_groups import (
     Group,
     differing,

@@ -5,7 +5,8 @@ from pathlib import Path
 
 from lerobot_bomb.bomb.episode import EpisodeSpec
 from lerobot_bomb.bomb.observation import RenderOptions
-from lerobot_bomb.bomb.perturbations import ALL, AXES, MAX_LEVEL, Axis, magnitude
+from lerobot_bomb.bomb.perturbations import AXES, magnitude
+from lerobot_bomb.conditions import ALL, MAX_LEVEL, Axis
 from lerobot_bomb.envs.rollout import make_env
 from lerobot_bomb.files import written_whole
 

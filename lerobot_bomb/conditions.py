@@ -1,0 +1,123 @@
+"""Perturbation axes of an environment: how they are declared, and how a condition of several is written.
+
+An environment has one table of axes; what an axis does there is the environment's own.
+"""
+
+import re
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import ClassVar, Self
+
+NONE = "none"
+ALL = "all"
+MAX_LEVEL = 5
+
+
+@dataclass(frozen=True)
+class Magnitude:
+    """How far one quantity of an axis moves at the levels 1..5."""
+
+    unit: str
+    levels: tuple[float, float, float, float, float]
+    what: str
+
+
+@dataclass(frozen=True)
+class Axis:
+    """One way to make the task harder that leaves all others alone."""
+
+    summary: str
+    changes: tuple[str, ...]  # of a paired episode: images, state, instruction, goal, dynamics
+    magnitudes: dict[str, Magnitude]
+    is_help: bool = False  # not a nuisance: no part of `all`
+
+
+def nuisances_of(axes: Mapping[str, Axis]) -> tuple[str, ...]:
+    """What `all` stands for."""
+    return tuple(name for name, axis in axes.items() if not axis.is_help)
+
+
+@dataclass(frozen=True)
+class AxisCondition:
+    """Which axes of an environment are on, each at a level or at one drawn per episode from a range.
+
+    A subclass names the environment's table.
+    """
+
+    axes: ClassVar[Mapping[str, Axis]]
+    ranges: tuple[tuple[str, int, int], ...] = ()  # (axis, lowest, highest level), in the order of `axes`
+
+    @classmethod
+    def parse(cls, text: str) -> Self:
+        """From "none", "camera:3", "camera:2+light:3" or "all:1-5"; level 0 leaves an axis off.
+
+        Raises:
+            ValueError: names --env.perturbations, what is wrong, and what is allowed.
+        """
+        ranges: dict[str, tuple[int, int]] = {}
+        for part in [] if text == NONE else text.split("+"):
+            axes, low, high = cls._parse_part(part, text)
+            for axis in axes:
+                if axis in ranges:
+                    reason = f"; {ALL} includes it" if ALL in text else ""
+                    raise ValueError(f"--env.perturbations={text!r} names the axis {axis} twice{reason}")
+                ranges[axis] = low, high
+        return cls(tuple((axis, *ranges[axis]) for axis in cls.axes if ranges.get(axis, (0, 0)) != (0, 0)))
+
+    @classmethod
+    def groups(cls, perturbations: Sequence[str] | str | None, task: str) -> dict[str, str]:
+        """{key of a group of results: its condition} of --env.perturbations; the task alone where it is None.
+
+        Raises:
+            ValueError: it is no list, empty, or names a condition twice.
+        """
+        if perturbations is None:
+            return {task: NONE}
+        if isinstance(perturbations, str):
+            raise ValueError(
+                f"--env.perturbations={perturbations} must be a list, with brackets and quotes: "
+                f"""--env.perturbations='["none","{next(iter(cls.axes))}:3"]'"""
+            )
+        if not perturbations:
+            raise ValueError('--env.perturbations=[] names no condition; leave it out or give ["none"]')
+        conditions = [cls.parse(text) for text in perturbations]
+        if len(set(conditions)) < len(conditions):
+            raise ValueError(f"--env.perturbations={perturbations} has a condition twice")
+        return {f"{task}.{condition.key}": str(condition) for condition in conditions}
+
+    def __str__(self) -> str:
+        """As `parse` reads it, the same for all ways to write the same condition."""
+        parts = {axis: f"{low}" if low == high else f"{low}-{high}" for axis, low, high in self.ranges}
+        nuisances = nuisances_of(self.axes)
+        shared = {parts.get(axis) for axis in nuisances}
+        if len(shared) == 1 and shared != {None}:
+            parts = {ALL: parts[nuisances[0]], **{a: p for a, p in parts.items() if a not in nuisances}}
+        return "+".join(f"{axis}:{levels}" for axis, levels in parts.items()) or NONE
+
+    @property
+    def key(self) -> str:
+        """The condition in lower-case letters, digits, dots and hyphens: "camera-2.light-3", "all-1to5"."""
+        return str(self).replace("-", "to").replace(":", "-").replace("+", ".").replace("_", "-")
+
+    @classmethod
+    def _parse_part(cls, part: str, text: str) -> tuple[tuple[str, ...], int, int]:
+        """Axes, lowest and highest level of "camera:1-5" or "all:3"; `text` is the whole condition."""
+        match = re.fullmatch(r"([a-z_]+):(-?\d+)(?:-(\d+))?", part)
+        if match is None:
+            first, second, *_ = cls.axes
+            raise ValueError(
+                f"--env.perturbations={text!r}: {part!r} is not a perturbation; write 'none', AXIS:LEVEL or "
+                "AXIS:LOW-HIGH, several joined by +, without spaces, capitals and fractions, as "
+                f"'{first}:3', '{first}:2+{second}:3', 'all:1-5'"
+            )
+        axis, low, high = match[1], int(match[2]), int(match[3] or match[2])
+        if axis != ALL and axis not in cls.axes:
+            allowed = ", ".join((*cls.axes, ALL))
+            raise ValueError(
+                f"--env.perturbations={text!r}: {axis!r} is not an axis; choose one of: {allowed}"
+            )
+        if not 0 <= low <= high <= MAX_LEVEL:
+            raise ValueError(
+                f"--env.perturbations={text!r}: the levels of {axis} must lie in 0..{MAX_LEVEL}, lowest first"
+            )
+        return nuisances_of(cls.axes) if axis == ALL else (axis,), low, high

@@ -1,0 +1,88 @@
+"""What an environment's perturbation axes are to an episode: a frozen transform for each that is on."""
+
+from abc import ABC, abstractmethod
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any, Self
+
+import numpy as np
+
+from lerobot_bomb.bomb.streams import Stream, generator
+from lerobot_bomb.conditions import AxisCondition
+from lerobot_bomb.envs.photometric import Photometric
+
+
+class EpisodeTransform(ABC):
+    """What one axis does to an episode; a method that it does not override leaves things as they are.
+
+    The level sets how far it goes, the random generator only where to, so that the same seed at a higher
+    level goes further the same way. An environment's own base adds what its axes change in the simulator.
+    """
+
+    @classmethod
+    @abstractmethod
+    def draw(cls, level: int, rng: np.random.Generator, nominal: Any) -> Self:
+        """At a level of 1..5; `nominal` is the episode without perturbations."""
+
+    def reword(self, instruction: str, nominal: Any) -> str:
+        """The instruction after the change; it means the same."""
+        return instruction
+
+    def sense(self, rgb: np.ndarray, number: int) -> np.ndarray:
+        """(H, W, 3) uint8 -> the same, the `number`-th image of the episode after the change."""
+        return rgb
+
+
+@dataclass(frozen=True)
+class SensorTransform(EpisodeTransform):
+    """Colour balance, brightness and noise of the cameras' sensor."""
+
+    photometric: Photometric
+
+    @classmethod
+    def draw(cls, level: int, rng: np.random.Generator, nominal: Any) -> Self:
+        return cls(Photometric.draw(level, rng))
+
+    def sense(self, rgb: np.ndarray, number: int) -> np.ndarray:
+        return self.photometric(rgb, number)
+
+
+@dataclass(frozen=True)
+class EpisodePerturbation[T: EpisodeTransform]:
+    """An episode's axes that are on, in the order of the environment's table."""
+
+    levels: Mapping[str, int]
+    transforms: Mapping[str, T]
+
+    @classmethod
+    def draw(cls, condition: AxisCondition, seed: int, kinds: Mapping[str, type[T]], nominal: Any) -> Self:
+        """The axes of a condition, each drawn from a generator of its own."""
+
+        def rng(stream: Stream, axis: str) -> np.random.Generator:
+            return generator(seed, stream + list(condition.axes).index(axis))
+
+        levels = {
+            axis: level
+            for axis, low, high in condition.ranges
+            if (level := int(rng(Stream.LEVEL, axis).integers(low, high + 1))) > 0
+        }
+        drawn = {
+            axis: kinds[axis].draw(level, rng(Stream.AXIS, axis), nominal) for axis, level in levels.items()
+        }
+        return cls(levels, drawn)
+
+    def of[K: EpisodeTransform](self, kind: type[K]) -> K | None:
+        """The transform of a kind; None where its axis is off."""
+        return next((each for each in self.transforms.values() if isinstance(each, kind)), None)
+
+    def reword(self, instruction: str, nominal: Any) -> str:
+        """The instruction after all changes."""
+        for each in self.transforms.values():
+            instruction = each.reword(instruction, nominal)
+        return instruction
+
+    def sense(self, rgb: np.ndarray, number: int) -> np.ndarray:
+        """(H, W, 3) uint8 -> the same, the `number`-th image of the episode after all changes."""
+        for each in self.transforms.values():
+            rgb = each.sense(rgb, number)
+        return rgb
