@@ -6,6 +6,7 @@ An environment has one table of axes; what an axis does there is the environment
 import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from functools import lru_cache
 from typing import ClassVar, Self
 
 NONE = "none"
@@ -48,6 +49,7 @@ class AxisCondition:
     ranges: tuple[tuple[str, int, int], ...] = ()  # (axis, lowest, highest level), in the order of `axes`
 
     @classmethod
+    @lru_cache(maxsize=64)  # every reset of an environment asks
     def parse(cls, text: str) -> Self:
         """From "none", "camera:3", "camera:2+light:3" or "all:1-5"; level 0 leaves an axis off.
 

@@ -26,7 +26,7 @@ CORE = "lerobot_bomb"
 ORDER = [
     "__init__", "_compat", "finite", "flag_errors", "flags", "conditions", "stats", "tables", "files",
     "cuda_graphs",
-    "bomb", "envs", "actions", "flow", "vlm", "decoding", "training", "data", "checkpoints",
+    "bomb", "pusht", "envs", "actions", "flow", "vlm", "decoding", "training", "data", "checkpoints",
     "evaluation", "viewing", "explain", "hub", "policies", "serving", "commands",
 ]  # fmt: skip
 

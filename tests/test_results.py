@@ -115,7 +115,7 @@ DAMAGED: dict[str, Any] = {
     "it lacks spec.robot": {"spec": {k: v for k, v in asdict(EpisodeSpec(0)).items() if k != "robot"}},
     "spec has wind, of which": {"spec": asdict(EpisodeSpec(0)) | {"wind": 3}},
     "target=[2, 2], but spec.target=[1, 1]": {"spec": asdict(EpisodeSpec(0, target=(1, 1)))},
-    "protocol_version '0.0'; this package reads 1.0 and 1.1": {"protocol_version": "0.0"},
+    "protocol_version '0.0'; this package reads 1.0, 1.1, pusht-1.0": {"protocol_version": "0.0"},
 }
 
 

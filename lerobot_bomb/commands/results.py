@@ -13,7 +13,7 @@ from lerobot_bomb.evaluation.result_groups import (
     what_old_lines_lack,
 )
 from lerobot_bomb.evaluation.result_lines import OLD_VERSION, read_lines
-from lerobot_bomb.evaluation.results import pair_lines, summarise
+from lerobot_bomb.evaluation.results import pair_lines, summary_lines
 
 MAX_SHOWN_DAMAGES = 10
 
@@ -62,7 +62,7 @@ def _print_file(path: Path, groups: list[Group], num_damaged: int) -> None:
         for condition, rows in conditions.items():
             label = f" (perturbations={condition})" if len(conditions) > 1 else ""
             print(f"{path}{label}: {len(rows)} episode{'s' * (len(rows) != 1)}")
-            print(*(f"  {line}" for line in summarise(rows).lines()), sep="\n")
+            print(*(f"  {line}" for line in summary_lines(rows)), sep="\n")
         against = pair_lines(group, groups)
         if against:
             print(f"{path}: against the same episodes unperturbed", *against, sep="\n")

@@ -64,7 +64,7 @@ class EpisodePerturbation[T: EpisodeTransform]:
         levels = {
             axis: level
             for axis, low, high in condition.ranges
-            if (level := int(rng(Stream.LEVEL, axis).integers(low, high + 1))) > 0
+            if (level := low if low == high else int(rng(Stream.LEVEL, axis).integers(low, high + 1))) > 0
         }
         drawn = {
             axis: kinds[axis].draw(level, rng(Stream.AXIS, axis), nominal) for axis, level in levels.items()

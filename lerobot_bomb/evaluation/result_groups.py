@@ -7,6 +7,7 @@ from typing import Any
 
 from lerobot_bomb.bomb.board import task_id
 from lerobot_bomb.conditions import NONE
+from lerobot_bomb.evaluation.pusht_lines import is_of_pusht, simulator_of
 from lerobot_bomb.evaluation.result_lines import NEW_CHECKS, OLD_VERSION, Row
 
 # what may differ between episodes that are pooled; perturbations between those that are paired
@@ -42,12 +43,17 @@ class Group:
         conditions = {row["spec"]["perturbations"] for row in self.rows}
         asked += [f"perturbations={conditions.pop()}"] if len(conditions) == 1 else []
         seeds = _ranges(row["spec"]["seed"] for row in self.rows)
-        images = f"{first['image_size']} px, render_preset {self.settings['render_preset']}"
+        if is_of_pusht(first):
+            simulator = f"{first['image_size']} px, {self.settings['simulator']}"
+        else:
+            simulator = (
+                f"{first['image_size']} px, render_preset {self.settings['render_preset']}, "
+                f"OpenGL {self.settings['OpenGL']}, MuJoCo {self.settings['MuJoCo']}"
+            )
         return [
             f"policy {describe_policy(first)}; {describe_tasks(self.rows)}",
             f"protocol {first['protocol_version']}, {', '.join(asked)}, seeds {seeds}",
-            f"{images}, OpenGL {self.settings['OpenGL']}, MuJoCo {self.settings['MuJoCo']}, "
-            + ", ".join(f"{name} {self._values(key)}" for name, key in LISTED.items()),
+            f"{simulator}, " + ", ".join(f"{name} {self._values(key)}" for name, key in LISTED.items()),
         ]
 
     def _values(self, key: str) -> str:
@@ -70,22 +76,29 @@ def groups_of(rows: list[Row]) -> list[Group]:
 
 def settings_of(row: Row) -> dict[str, str]:
     """All that must be equal in episodes that are pooled or paired."""
-    opengl = [name for name in (row.get("opengl_vendor"), row.get("opengl_renderer")) if name]
-    return {
+    spec = {name: str(value) for name, value in sorted(row["spec"].items()) if name not in DRAWN}
+    shared = {
         "policy": _policy_key(row),
         "protocol": row["protocol_version"],
+        "image_size": str(row["image_size"]),
+    }
+    if is_of_pusht(row):
+        return {**shared, "simulator": simulator_of(row), **spec}
+    opengl = [name for name in (row.get("opengl_vendor"), row.get("opengl_renderer")) if name]
+    return {
+        **shared,
         "MuJoCo": row.get("mujoco_version") or NOT_RECORDED,
         "OpenGL": ", ".join(opengl) or NOT_RECORDED,
-        "image_size": str(row["image_size"]),
         "render_preset": row.get("render_preset", NOT_RECORDED),
         "tasks": _tasks_key(row),
-        **{name: str(value) for name, value in sorted(row["spec"].items()) if name not in DRAWN},
+        **spec,
     }
 
 
 def differing(groups: list[Group]) -> list[str]:
     """Names of the settings that are not the same in all groups."""
-    return [name for name in groups[0].settings if len({group.settings[name] for group in groups}) > 1]
+    names = {name: None for group in groups for name in group.settings}
+    return [name for name in names if len({group.settings.get(name) for group in groups}) > 1]
 
 
 def by_condition(rows: list[Row]) -> dict[str, list[Row]]:
@@ -132,6 +145,8 @@ def describe_policy(row: Row) -> str:
 def describe_tasks(rows: list[Row]) -> str:
     """What was asked for: 'tasks 0, 12', or target and colour, each fixed or drawn."""
     first = rows[0]
+    if is_of_pusht(first):
+        return "task pusht"
     if first.get("task_ids") is not None:
         return f"tasks {_ranges(first['task_ids'])}"
     target, color = (first["spec"][name] for name in ("target", "color"))

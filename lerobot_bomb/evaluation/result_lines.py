@@ -1,73 +1,39 @@
 """Lines of a results file: what each must say, whichever version of the protocol wrote it."""
 
 import json
-import math
-import re
-from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
 from lerobot_bomb.bomb.board import BOARD, COLORS
 from lerobot_bomb.bomb.episode import PROTOCOL_VERSION, TASK_VERSION, EpisodeSpec, Failure, Stage
 from lerobot_bomb.bomb.observation import MAX_IMAGE_SIZE, MIN_IMAGE_SIZE, RENDER_PRESETS
+from lerobot_bomb.evaluation.line_checks import (
+    Check,
+    check_fields,
+    is_bool,
+    is_int,
+    is_list_of,
+    is_one_of,
+    is_quantity,
+    is_sha256,
+    is_table_of,
+    is_text,
+    or_none,
+    refuse_others,
+)
+from lerobot_bomb.evaluation.pusht_lines import PUSHT_CHECKS, check_pusht_spec
+from lerobot_bomb.pusht.episode import PUSHT_PROTOCOL_VERSION
 
 OLD_VERSION = "1.0"  # whose lines say less
-VERSIONS = (OLD_VERSION, PROTOCOL_VERSION)
-SHOWN_CHARACTERS = 80  # of a wrong value
+VERSIONS = (OLD_VERSION, PROTOCOL_VERSION, PUSHT_PROTOCOL_VERSION)
 NUM_TASKS = len(COLORS) * BOARD.num_lines**2
 
-type Row = dict[str, Any]  # the fields of EpisodeResult
-type Check = Callable[[Any], bool]
-
-
-def is_int(low: int, high: float = math.inf) -> Check:
-    """Whether a value is a whole number in low..high; true and false are none."""
-    return lambda value: type(value) is int and low <= value <= high
-
-
-def is_bool(value: Any) -> bool:
-    """Whether a value is true or false."""
-    return type(value) is bool
-
-
-def is_text(value: Any) -> bool:
-    """Whether a value is a text."""
-    return isinstance(value, str)
-
-
-def is_length_mm(value: Any) -> bool:
-    """Whether a value is a finite number, not negative."""
-    return type(value) in (int, float) and math.isfinite(value) and value >= 0
+type Row = dict[str, Any]  # the fields of EpisodeResult, or of PushTResult
 
 
 def is_intersection(value: Any) -> bool:
     """Whether a value is [row, column] on the board."""
     return isinstance(value, list) and len(value) == 2 and all(map(is_int(0, BOARD.num_lines - 1), value))
-
-
-def or_none(check: Check) -> Check:
-    """Whether a value is null or passes."""
-    return lambda value: value is None or check(value)
-
-
-def is_list_of(check: Check) -> Check:
-    """Whether a value is a list, not empty, of values that pass."""
-    return lambda value: isinstance(value, list) and bool(value) and all(map(check, value))
-
-
-def is_table_of(check: Check) -> Check:
-    """Whether a value is an object whose values pass."""
-    return lambda value: isinstance(value, dict) and all(map(check, value.values()))
-
-
-def is_one_of(values: Any) -> Check:
-    """Whether a value is one of these texts."""
-    return lambda value: isinstance(value, str) and value in list(values)
-
-
-def is_sha256(value: Any) -> bool:
-    """Whether a value is 64 hexadecimal digits."""
-    return isinstance(value, str) and re.fullmatch("[0-9a-f]{64}", value) is not None
 
 
 SPEC_CHECKS: dict[str, Check] = {  # the rest is EpisodeSpec's own
@@ -79,7 +45,7 @@ SPEC_CHECKS: dict[str, Check] = {  # the rest is EpisodeSpec's own
     "fps": is_int(1),
     "target": or_none(is_intersection),
     "color": or_none(is_text),
-    "success_tolerance_mm": is_length_mm,
+    "success_tolerance_mm": is_quantity,
     "perturbations": is_text,
 }
 CHECKS: dict[str, Check] = {
@@ -92,9 +58,9 @@ CHECKS: dict[str, Check] = {
     "is_success_bomb_v0": is_bool,
     "failure": or_none(is_one_of(Failure)),
     "stage": is_one_of(Stage),
-    "placement_error_mm": is_length_mm,
+    "placement_error_mm": is_quantity,
     "nearest_intersection": is_intersection,
-    "collateral_mm": is_length_mm,
+    "collateral_mm": is_quantity,
     "levels": is_table_of(is_int(0)),
     "image_size": is_int(MIN_IMAGE_SIZE, MAX_IMAGE_SIZE),
     "package_version": is_text,
@@ -157,13 +123,17 @@ def parse_line(line: bytes) -> Row:
         raise ValueError("no JSON object")
     version = row.get("protocol_version")
     if version not in VERSIONS:
-        raise ValueError(f"protocol_version {version!r}; this package reads {' and '.join(VERSIONS)}")
-    _check(row, CHECKS if version == OLD_VERSION else CHECKS | NEW_CHECKS)
-    _check_spec(row["spec"])
+        raise ValueError(f"protocol_version {version!r}; this package reads {', '.join(VERSIONS)}")
+    is_pusht = version == PUSHT_PROTOCOL_VERSION
+    check_fields(row, PUSHT_CHECKS if is_pusht else CHECKS if version == OLD_VERSION else CHECKS | NEW_CHECKS)
     if row.get("policy") is not None:
-        _check(row["policy"], POLICY_CHECKS, "policy.")
+        check_fields(row["policy"], POLICY_CHECKS, "policy.")
     if row["is_success"] != (row["failure"] is None):
         raise ValueError(f"is_success={row['is_success']} with failure={row['failure']!r}")
+    if is_pusht:
+        check_pusht_spec(row["spec"])
+        return row
+    _check_spec(row["spec"])
     for name in ("target", "color"):
         if row["spec"][name] not in (None, row[name]):
             raise ValueError(f"{name}={row[name]}, but spec.{name}={row['spec'][name]}")
@@ -171,21 +141,7 @@ def parse_line(line: bytes) -> Row:
 
 
 def _check_spec(spec: dict[str, Any]) -> None:
-    _check(spec, SPEC_CHECKS, "spec.")
-    unknown = spec.keys() - SPEC_CHECKS.keys()
-    if unknown:
-        raise ValueError(f"spec has {', '.join(sorted(unknown))}, of which this package knows nothing")
+    check_fields(spec, SPEC_CHECKS, "spec.")
+    refuse_others(spec, SPEC_CHECKS)
     values: dict[str, Any] = spec | {"target": spec["target"] and tuple(spec["target"])}
     EpisodeSpec(**values)
-
-
-def _check(values: dict[str, Any], checks: dict[str, Check], prefix: str = "") -> None:
-    missing = [f"{prefix}{name}" for name in checks if name not in values]
-    if missing:
-        raise ValueError(f"it lacks {', '.join(missing)}")
-    for name, is_possible in checks.items():
-        if not is_possible(values[name]):
-            shown = json.dumps(values[name])
-            if len(shown) > SHOWN_CHARACTERS:
-                shown = f"{shown[:SHOWN_CHARACTERS]}..."
-            raise ValueError(f"{prefix}{name}={shown} is impossible")

@@ -7,6 +7,7 @@ from statistics import median
 
 from lerobot_bomb.bomb.episode import Failure
 from lerobot_bomb.conditions import NONE
+from lerobot_bomb.evaluation.pusht_lines import coverage_change, is_of_pusht, pusht_summary
 from lerobot_bomb.evaluation.result_groups import (
     Group,
     differing,
@@ -41,16 +42,18 @@ class Summary:
 
 
 def read_results(path: Path) -> list[Row]:
-    """The rows of a results file; of an episode that was run again, the last one.
+    """The rows of a results file of `bomb`; of an episode that was run again, the last one.
 
     Raises:
-        ValueError: the file is missing or empty, or a line is damaged.
+        ValueError: the file is missing or empty, or a line is damaged or of another environment.
     """
     rows, damages = read_lines(path)
     if damages:
         raise ValueError(damages[0])
     if not rows:
         raise ValueError(f"{path}: no finished episode")
+    if any(map(is_of_pusht, rows)):
+        raise ValueError(f"{path} has lines of bomb_pusht, which only `lerobot-bomb results` reads")
     return [row for group in groups_of(rows) for row in group.rows]
 
 
@@ -65,12 +68,19 @@ def summarise(rows: list[Row]) -> Summary:
     )
 
 
+def summary_lines(rows: list[Row]) -> list[str]:
+    """What episodes of one environment come to, a line each."""
+    return pusht_summary(rows) if is_of_pusht(rows[0]) else summarise(rows).lines()
+
+
 def _pair_line(condition: str, pairs: list[tuple[Row, Row]]) -> str:
     lost = sum(nominal["is_success"] and not row["is_success"] for nominal, row in pairs)
     won = sum(row["is_success"] and not nominal["is_success"] for nominal, row in pairs)
     p_value = mcnemar_p_value(lost, won)
+    change = f"; {coverage_change(pairs)}" if is_of_pusht(pairs[0][0]) else ""
     return (
         f"  {condition}: {len(pairs)} pairs, {lost} lost, {won} won, p = {p_value:.2g} (exact McNemar test)"
+        f"{change}"
     )
 
 

@@ -1,0 +1,96 @@
+"""gym-pusht's simulation with what the perturbation axes change of it."""
+
+from collections.abc import Callable, Sequence
+from typing import Any, cast
+
+import numpy as np
+import pygame
+from gym_pusht.envs.pusht import PushTEnv, pymunk_to_shapely
+
+from lerobot_env_bomb_pusht.transform import PushTTransform
+
+BOARD_PX = 512  # the side of the board; positions and actions are in its pixels
+MIDDLE_PX = BOARD_PX / 2
+WHITE, OUTLINE_RGB = (255, 255, 255), (220, 30, 30)
+PERSON_IMAGE_SIZE = 384  # pixels, of LeRobot's videos of `pusht`
+
+
+class Board(PushTEnv):
+    """Without transforms it is gym-pusht, bit for bit: what is overridden only adds to it."""
+
+    def __init__(self, image_size: int):
+        super().__init__(
+            obs_type="pixels_agent_pos",
+            observation_width=image_size,
+            observation_height=image_size,
+            visualization_width=PERSON_IMAGE_SIZE,
+            visualization_height=PERSON_IMAGE_SIZE,
+        )
+        self._transforms: Sequence[PushTTransform] = ()
+        self.background: Callable[[pygame.Surface], None] | None = None  # draws it in place of white
+        self._screen = pygame.Surface((BOARD_PX, BOARD_PX))  # for a board that is not white
+        self.outline_px = 0  # width of a line around the target
+        self.touched = False  # whether the agent has met the block since the start
+
+    def begin(self, seed: int, transforms: Sequence[PushTTransform]) -> tuple[dict[str, Any], dict[str, Any]]:
+        """Start the episode of a seed; nothing of an earlier one is left, the drawn action neither."""
+        self._transforms, self._last_action = transforms, None
+        observation, info = self.reset(seed=seed)
+        self.touched = False
+        return cast("dict[str, Any]", observation), info
+
+    @property
+    def block_pose(self) -> np.ndarray:
+        """(3,) x, y in pixels and angle in radians."""
+        return np.array([*self.block.position, self.block.angle])
+
+    def _setup(self) -> None:
+        super()._setup()
+        self.background, self.outline_px = None, 0
+        for each in self._transforms:
+            each.edit(self)
+
+    def _set_state(self, state: np.ndarray) -> None:
+        for each in self._transforms:
+            state = each.arrange(state)
+        super()._set_state(state)
+
+    def _get_coverage(self) -> float:
+        """gym-pusht's, but of bar and stem in this order: in a set's, last bits differ between processes."""
+        goal = pymunk_to_shapely(self.get_goal_pose_body(self.goal_pose), self._block_shapes)
+        block = pymunk_to_shapely(self.block, self._block_shapes)
+        return goal.intersection(block).area / goal.area
+
+    def _handle_collision(self, arbiter: Any, space: Any, data: Any) -> None:
+        super()._handle_collision(arbiter, space, data)
+        self.touched = self.touched or any(shape.body is self.agent for shape in arbiter.shapes)
+
+    def _draw(self) -> pygame.Surface:
+        screen = super()._draw()
+        if self.background is not None:
+            self.background(self._screen)
+            screen.set_colorkey(WHITE)
+            self._screen.blit(screen, (0, 0))
+            screen = self._screen
+        if self.outline_px:
+            self._draw_outline(screen)
+        return screen
+
+    def _draw_outline(self, screen: pygame.Surface) -> None:
+        """A line around the target."""
+        goal = self.get_goal_pose_body(self.goal_pose)
+        bar, stem = (shape.get_vertices() for shape in self._block_shapes)
+        corners = tee_outline(np.array(bar), np.array(stem))
+        points = [goal.local_to_world(tuple(corner)) for corner in corners.tolist()]
+        pygame.draw.lines(screen, OUTLINE_RGB, True, points, self.outline_px)
+
+
+def tee_outline(bar: np.ndarray, stem: np.ndarray) -> np.ndarray:
+    """(4, 2) corners of bar and stem, which lies below it -> (8, 2) corners of the T, in order."""
+    (left, top), (right, bottom) = bar.min(0), bar.max(0)
+    (stem_left, _), (stem_right, end) = stem.min(0), stem.max(0)
+    outline = [
+        (left, top), (right, top), (right, bottom), (stem_right, bottom),
+        (stem_right, end), (stem_left, end), (stem_left, bottom), (left, bottom),
+    ]  # fmt: skip
+    return np.array(outline)

@@ -1,0 +1,111 @@
+"""LeRobot's env type ``bomb_pusht``. The only module of this package that imports LeRobot."""
+
+from dataclasses import dataclass, field
+from functools import partial
+from importlib.util import find_spec
+from pathlib import Path
+from typing import Any
+
+from lerobot.configs import FeatureType, PolicyFeature
+from lerobot.envs import EnvConfig
+from lerobot.utils.constants import ACTION, OBS_IMAGE, OBS_STATE
+
+from lerobot_bomb.checkpoints.identity import policy_of_results
+from lerobot_bomb.envs.results import check_results_path
+from lerobot_bomb.envs.vector import LazyVectorEnv
+from lerobot_bomb.flag_errors import flag_errors
+from lerobot_bomb.flags import one_of
+from lerobot_bomb.pusht.episode import IMAGE_SIZE, INSTRUCTIONS, MAX_STEPS, PushTSpec, check_image_size
+from lerobot_bomb.pusht.perturbations import PushTCondition
+from lerobot_env_bomb_pusht import GYM_ID
+
+TASKS = ("pusht",)
+FPS = 10  # gym-pusht's
+AGENT_POS, PIXELS = "agent_pos", "pixels"  # what gym-pusht calls them
+
+
+@EnvConfig.register_subclass("bomb_pusht")
+@dataclass
+class BombPushTEnvConfig(EnvConfig):
+    """Flags of ``--env.type=bomb_pusht``; every check happens before an environment is built."""
+
+    # pusht
+    task: str | None = TASKS[0]
+    # control steps per second; gym-pusht has no others
+    fps: int = FPS
+    # templates: a sentence; none: the empty text, as of --env.type=pusht
+    instruction: str = INSTRUCTIONS[0]
+    # control steps after which an episode ends
+    max_steps: int = MAX_STEPS
+    # conditions, each evaluated as a group of its own: ["none","table:3","table:2+goal:3","all:1-5"]
+    perturbations: list[str] | str | None = None
+    # width and height of the image in pixels
+    image_size: int = IMAGE_SIZE
+    # file that gets one JSON line per finished episode: seed, coverage, failure class
+    results_path: str | None = None
+    features: dict[str, PolicyFeature] = field(default_factory=dict)
+    features_map: dict[str, str] = field(default_factory=dict)
+
+    def __post_init__(self) -> None:
+        with flag_errors():
+            # an invalid flag raises here, before anything is built
+            one_of("--env.task", self.task, TASKS)
+            one_of("--env.fps", self.fps, (FPS,))
+            check_image_size(self.image_size)
+            for condition in self.conditions.values():
+                self._spec(condition)
+        if self.results_path is not None:
+            self.results_path = str(Path(self.results_path).expanduser())
+        self.features = {
+            ACTION: PolicyFeature(type=FeatureType.ACTION, shape=(2,)),
+            AGENT_POS: PolicyFeature(type=FeatureType.STATE, shape=(2,)),
+            PIXELS: PolicyFeature(type=FeatureType.VISUAL, shape=(self.image_size, self.image_size, 3)),
+        }
+        self.features_map = {ACTION: ACTION, AGENT_POS: OBS_STATE, PIXELS: OBS_IMAGE}
+
+    @property
+    def gym_id(self) -> str:
+        """Gymnasium id of the same environment."""
+        return GYM_ID
+
+    @property
+    def conditions(self) -> dict[str, str]:
+        """{key of a group of results: its condition}; the task alone where no condition is named."""
+        return PushTCondition.groups(self.perturbations, str(self.task))
+
+    @property
+    def gym_kwargs(self) -> dict[str, Any]:
+        """Arguments of `BombPushTEnv` for the first condition."""
+        condition = next(iter(self.conditions.values()))
+        return {
+            "spec": self._spec(condition),
+            "image_size": self.image_size,
+            "results_path": self.results_path,
+        }
+
+    def create_envs(self, n_envs: int, use_async_envs: bool = False) -> dict[str, dict[int, LazyVectorEnv]]:
+        """{task and condition: {0: vector env of n_envs}}; no worker starts before a first reset.
+
+        Raises:
+            ValueError: gym-pusht is not installed, or --env.results_path cannot be written.
+        """
+        if find_spec("gym_pusht") is None:
+            raise ValueError(
+                "--env.type=bomb_pusht needs gym-pusht: pip install 'lerobot_policy_bomb[pusht]'"
+            )
+        from lerobot_env_bomb_pusht.env import BombPushTEnv  # imports the simulator
+
+        check_results_path(self.results_path)
+        return {
+            key: {
+                0: LazyVectorEnv(
+                    [partial(BombPushTEnv, **(self.gym_kwargs | {"spec": self._spec(condition)}))] * n_envs,
+                    use_async=use_async_envs and n_envs > 1,
+                    known_late=partial(policy_of_results, self.results_path),
+                )
+            }
+            for key, condition in self.conditions.items()
+        }
+
+    def _spec(self, condition: str) -> PushTSpec:
+        return PushTSpec(0, self.instruction, self.max_steps, condition)

@@ -1,0 +1,76 @@
+"""What a field of a results file's line can be."""
+
+import json
+import math
+import re
+from collections.abc import Callable
+from typing import Any
+
+SHOWN_CHARACTERS = 80  # of a wrong value
+
+type Check = Callable[[Any], bool]
+
+
+def is_int(low: int, high: float = math.inf) -> Check:
+    """Whether a value is a whole number in low..high; true and false are none."""
+    return lambda value: type(value) is int and low <= value <= high
+
+
+def is_bool(value: Any) -> bool:
+    """Whether a value is true or false."""
+    return type(value) is bool
+
+
+def is_text(value: Any) -> bool:
+    """Whether a value is a text."""
+    return isinstance(value, str)
+
+
+def is_quantity(value: Any) -> bool:
+    """Whether a value is a finite number, not negative."""
+    return type(value) in (int, float) and math.isfinite(value) and value >= 0
+
+
+def or_none(check: Check) -> Check:
+    """Whether a value is null or passes."""
+    return lambda value: value is None or check(value)
+
+
+def is_list_of(check: Check) -> Check:
+    """Whether a value is a list, not empty, of values that pass."""
+    return lambda value: isinstance(value, list) and bool(value) and all(map(check, value))
+
+
+def is_table_of(check: Check) -> Check:
+    """Whether a value is an object whose values pass."""
+    return lambda value: isinstance(value, dict) and all(map(check, value.values()))
+
+
+def is_one_of(values: Any) -> Check:
+    """Whether a value is one of these texts."""
+    return lambda value: isinstance(value, str) and value in list(values)
+
+
+def is_sha256(value: Any) -> bool:
+    """Whether a value is 64 hexadecimal digits."""
+    return isinstance(value, str) and re.fullmatch("[0-9a-f]{64}", value) is not None
+
+
+def refuse_others(spec: dict[str, Any], checks: dict[str, Check]) -> None:
+    """Raise a ValueError if a spec has a field that no check is for: then it may be of another episode."""
+    unknown = spec.keys() - checks.keys()
+    if unknown:
+        raise ValueError(f"spec has {', '.join(sorted(unknown))}, of which this package knows nothing")
+
+
+def check_fields(values: dict[str, Any], checks: dict[str, Check], prefix: str = "") -> None:
+    """Raise a ValueError that names the fields that are missing, or the first that is impossible."""
+    missing = [f"{prefix}{name}" for name in checks if name not in values]
+    if missing:
+        raise ValueError(f"it lacks {', '.join(missing)}")
+    for name, is_possible in checks.items():
+        if not is_possible(values[name]):
+            shown = json.dumps(values[name])
+            if len(shown) > SHOWN_CHARACTERS:
+                shown = f"{shown[:SHOWN_CHARACTERS]}..."
+            raise ValueError(f"{prefix}{name}={shown} is impossible")

@@ -1,0 +1,88 @@
+"""An episode of PushT: what determines it, and why it failed."""
+
+from dataclasses import dataclass
+from enum import StrEnum
+from math import pi
+
+import numpy as np
+
+from lerobot_bomb.bomb.episode import MAX_SEED
+from lerobot_bomb.conditions import NONE, nuisances_of
+from lerobot_bomb.flags import one_of
+from lerobot_bomb.pusht.perturbations import PUSHT_AXES, PushTCondition
+
+# Of the task, its axes and how a policy is measured; a line of results says it.
+PUSHT_PROTOCOL_VERSION = "pusht-1.0"
+INSTRUCTIONS = ("templates", NONE)
+MAX_STEPS = 300  # gym-pusht's own limit
+MAX_ALLOWED_STEPS = 10_000
+IMAGE_SIZE = 96  # pixels, gym-pusht's own
+MIN_IMAGE_SIZE, MAX_IMAGE_SIZE = 32, 512
+
+CENTRE_PX = 45.0  # of the T, along its stem, from the point whose position is the block's
+ALMOST_COVERAGE = 0.8
+NEAR_PX = 40.0  # between the T's centre and the target's
+TURNED_RAD = pi / 9
+AWAY_PX = 10.0  # further than at the start
+
+
+class PushTFailure(StrEnum):
+    """Why an episode failed, by how it ended; exactly one per failed episode, the first that holds."""
+
+    NEVER_TOUCHED = "never_touched"
+    ALMOST = "almost"  # at least ALMOST_COVERAGE is covered
+    TURNED_WRONG = "turned_wrong"  # the block is where it should be, but not as it should lie
+    PUSHED_AWAY = "pushed_away"  # it is further from the target than it was
+    TIMEOUT = "timeout"
+
+
+@dataclass(frozen=True)
+class PushTSpec:
+    """Everything that, with the code's version, determines an episode bit for bit."""
+
+    seed: int
+    instruction: str = INSTRUCTIONS[0]  # templates, or none: the empty text of LeRobot's `pusht`
+    max_steps: int = MAX_STEPS
+    perturbations: str = NONE  # a condition such as "table:2+goal:3"; see `PushTCondition`
+
+    def __post_init__(self) -> None:
+        condition = PushTCondition.parse(self.perturbations)
+        # one spelling, so that equal conditions compare equal
+        object.__setattr__(self, "perturbations", str(condition))
+        one_of("--env.instruction", self.instruction, INSTRUCTIONS)
+        if not 0 <= self.seed <= MAX_SEED:
+            raise ValueError(f"--seed={self.seed} must lie in 0..{MAX_SEED}")
+        if not 1 <= self.max_steps <= MAX_ALLOWED_STEPS:
+            raise ValueError(f"--env.max_steps={self.max_steps} must lie in 1..{MAX_ALLOWED_STEPS}")
+        on = {axis for axis, _, _ in condition.ranges}
+        if self.instruction == NONE and "language" in on and not on.issuperset(nuisances_of(PUSHT_AXES)):
+            raise ValueError(
+                f"--env.perturbations={self.perturbations!r} rewords the instruction, of which "
+                "--env.instruction=none leaves nothing; drop one of them (all:3 stays allowed)"
+            )
+
+
+def check_image_size(image_size: int) -> None:
+    """Raise a ValueError unless images of this many pixels a side can be drawn."""
+    if not MIN_IMAGE_SIZE <= image_size <= MAX_IMAGE_SIZE:
+        raise ValueError(f"--env.image_size={image_size} must lie in {MIN_IMAGE_SIZE}..{MAX_IMAGE_SIZE}")
+
+
+def failure_of(
+    start: np.ndarray, end: np.ndarray, goal: np.ndarray, coverage: float, touched: bool
+) -> PushTFailure:
+    """Why an episode failed, from (3,) poses x, y in pixels and angle in radians of block and target."""
+    if not touched:
+        return PushTFailure.NEVER_TOUCHED
+    if coverage >= ALMOST_COVERAGE:
+        return PushTFailure.ALMOST
+    before_px, after_px = (float(np.linalg.norm(centre(pose) - centre(goal))) for pose in (start, end))
+    turned_rad = abs((end[2] - goal[2] + pi) % (2 * pi) - pi)
+    if after_px <= NEAR_PX and turned_rad > TURNED_RAD:
+        return PushTFailure.TURNED_WRONG
+    return PushTFailure.PUSHED_AWAY if after_px > before_px + AWAY_PX else PushTFailure.TIMEOUT
+
+
+def centre(pose: np.ndarray) -> np.ndarray:
+    """(3,) pose of a T -> (2,) pixels, the middle of its weight."""
+    return pose[:2] + CENTRE_PX * np.array([-np.sin(pose[2]), np.cos(pose[2])])

@@ -1,0 +1,85 @@
+"""PushT's perturbation axes: their names, levels and magnitudes; the one definition.
+
+A pixel is one of the board's 512x512, the unit of positions and actions.
+"""
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import ClassVar
+
+from lerobot_bomb.bomb.perturbations import AXES as BOMB_AXES
+from lerobot_bomb.conditions import Axis, AxisCondition, Magnitude
+
+# Append only: an axis' place in this dict numbers its stream of random numbers. `language` stands before
+# `goal`, which adds its words to whatever sentence there is.
+PUSHT_AXES = {
+    "table": Axis(
+        "colour and pattern of the board",
+        ("images",),
+        {
+            "color": Magnitude("share", (0.2, 0.4, 0.6, 0.8, 1.0), "of the way from white to a drawn colour"),
+            "pattern": Magnitude(
+                "share", (0.05, 0.09, 0.13, 0.17, 0.21), "darkness of stripes, checks or speckles"
+            ),
+        },
+    ),
+    "start": Axis(
+        "where block and agent are at the start",
+        ("images", "state"),
+        {
+            "block": Magnitude("pixels", (20, 40, 60, 80, 100), "of the block, towards the board's middle"),
+            "turn": Magnitude("degrees", (15, 30, 45, 60, 75), "of the block, to a drawn side"),
+            "agent": Magnitude("pixels", (20, 40, 60, 80, 100), "of the agent, towards the board's middle"),
+        },
+    ),
+    "photometric": BOMB_AXES["photometric"],
+    "language": Axis(
+        "how the instruction is worded; what it means is always stated",
+        ("instruction",),
+        {"form": Magnitude("number", (1, 2, 3, 4, 5), "see below")},
+    ),
+    "dynamics": Axis(
+        "damping and friction of the block, latency and noise of the agent",
+        ("dynamics",),
+        {
+            "glide": Magnitude(
+                "s", (0.02, 0.04, 0.06, 0.08, 0.1), "in which a block let alone loses 63 % of its speed"
+            ),
+            "friction": Magnitude("coefficient", (0.1, 0.2, 0.3, 0.4, 0.5), "between agent and block"),
+            "noise": Magnitude("pixels", (2, 4, 6, 8, 10), "standard deviation on the executed x and y"),
+            "latency": Magnitude("control steps", (0, 0, 1, 1, 2), "before an action is executed"),
+        },
+    ),
+    "object": Axis(
+        "shade of the block",
+        ("images",),
+        {"shade": Magnitude("share", (0.2, 0.4, 0.6, 0.8, 1.0), "of the way to a drawn colour")},
+    ),
+    "goal": Axis(
+        "where the target lies, which the instruction then says",
+        ("images", "instruction", "goal"),
+        {
+            "shift": Magnitude("pixels", (16, 32, 48, 64, 80), "of the target, in a drawn direction"),
+            "turn": Magnitude("degrees", (12, 24, 36, 48, 60), "of the target, to a drawn side"),
+        },
+    ),
+    "goal_marker": Axis(
+        "the target's outline in red over whatever lies on it",
+        ("images",),
+        # even steps in an image of 96 pixels
+        {"width": Magnitude("pixels", (5, 10, 12, 20, 23), "of the line")},
+        is_help=True,
+    ),
+}
+
+
+def pusht_magnitude(axis: str, name: str, level: int) -> float:
+    """How far a quantity of an axis moves at a level of 1..5, in the unit that the table states."""
+    return PUSHT_AXES[axis].magnitudes[name].levels[level - 1]
+
+
+@dataclass(frozen=True)
+class PushTCondition(AxisCondition):
+    """Which axes of PushT are on: "table:2+goal:3"."""
+
+    axes: ClassVar[Mapping[str, Axis]] = PUSHT_AXES
