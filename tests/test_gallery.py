@@ -12,10 +12,20 @@ from lerobot_bomb.bomb.episode import EpisodeSpec
 from lerobot_bomb.bomb.observation import RenderOptions
 from lerobot_bomb.bomb.perturbations import AXES
 from lerobot_bomb.commands import main as cli
-from lerobot_bomb.commands.gallery import COLUMNS, PATH_RGB, SHEETS, axis_sheet, path_tile
+from lerobot_bomb.commands.gallery import (
+    COLUMNS,
+    PATH_RGB,
+    PUSHT_ENV_ID,
+    SHEETS,
+    axis_sheet,
+    path_tile,
+    pusht_sheet,
+)
 from lerobot_bomb.conditions import ALL
 from lerobot_bomb.envs.rollout import make_env
-from lerobot_bomb.viewing.perturbations_page import example_instructions, page
+from lerobot_bomb.pusht.episode import PushTSpec
+from lerobot_bomb.pusht.perturbations import PUSHT_AXES
+from lerobot_bomb.viewing.perturbations_page import axis_section, example_instructions, page
 from lerobot_bomb.viewing.sheet import PAPER, Sheet, text_tile
 
 SIZE = 48
@@ -158,3 +168,41 @@ def test_the_page_has_every_axis_with_its_magnitudes_and_its_sheet() -> None:
     for link in links:
         assert 10_000 < (DOCS / link).stat().st_size < 300_000
         assert Image.open(DOCS / link).width > 500
+
+
+def test_a_sheet_of_pusht_shows_its_environment(tmp_path: Path) -> None:
+    pytest.importorskip("gym_pusht", reason="gym-pusht is not installed: pip install '.[pusht]'")
+    import gymnasium
+
+    sheet = pusht_sheet("goal", (3,), SIZE)
+    assert list(sheet.images) == ["start, seed 3", "instruction, seed 3"]
+    assert sheet.texts["turn, degrees"] == ["", "12", "24", "36", "48", "60"]
+    for level, image in enumerate(sheet.images["start, seed 3"]):
+        spec = PushTSpec(3, perturbations=f"goal:{level}")
+        env = gymnasium.make(PUSHT_ENV_ID, spec=spec, image_size=SIZE)
+        assert np.array_equal(env.reset(seed=3)[0]["pixels"], image)
+    flags = ["gallery", "--env.type=bomb_pusht", f"--image_size={SIZE}", f"--output={tmp_path}"]
+    assert cli.main([*flags, "--axes=dynamics"]) == 0
+    assert [path.name for path in tmp_path.iterdir()] == ["dynamics.jpg"]
+
+
+@pytest.mark.parametrize(
+    ("flags", "message"),
+    [
+        (["--axes=camera"], "--axes='camera' is unknown; choose one of: table, start"),
+        (["--doc=page.md"], "--doc=page.md is written for --env.type=bomb only"),
+        (["--env.type=libero"], "--env.type='libero' is unknown; choose one of: bomb, bomb_pusht"),
+    ],
+)
+def test_a_flag_that_pusht_does_not_have_is_named(
+    flags: list[str], message: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert cli.main(["gallery", "--env.type=bomb_pusht", *flags, f"--output={tmp_path / 'x'}"]) == 1
+    assert message in capsys.readouterr().err
+
+
+def test_the_page_of_pusht_has_every_axis_as_the_table_has_it() -> None:
+    text = (DOCS / "bomb_pusht.md").read_text()
+    for name, axis in PUSHT_AXES.items():
+        assert axis_section(name, axis, "media/bomb_pusht") in text
+        assert 10_000 < (DOCS / "media" / "bomb_pusht" / f"{name}.jpg").stat().st_size < 300_000

@@ -15,7 +15,14 @@ from lerobot_bomb.envs.results import check_results_path
 from lerobot_bomb.envs.vector import LazyVectorEnv
 from lerobot_bomb.flag_errors import flag_errors
 from lerobot_bomb.flags import one_of
-from lerobot_bomb.pusht.episode import IMAGE_SIZE, INSTRUCTIONS, MAX_STEPS, PushTSpec, check_image_size
+from lerobot_bomb.pusht.episode import (
+    IMAGE_SIZE,
+    INSTRUCTIONS,
+    MAX_STEPS,
+    PUSHT_EXTRA,
+    PushTSpec,
+    check_image_size,
+)
 from lerobot_bomb.pusht.perturbations import PushTCondition
 from lerobot_env_bomb_pusht import GYM_ID
 
@@ -90,9 +97,7 @@ class BombPushTEnvConfig(EnvConfig):
             ValueError: gym-pusht is not installed, or --env.results_path cannot be written.
         """
         if find_spec("gym_pusht") is None:
-            raise ValueError(
-                "--env.type=bomb_pusht needs gym-pusht: pip install 'lerobot_policy_bomb[pusht]'"
-            )
+            raise ValueError(f"--env.type=bomb_pusht needs gym-pusht: pip install '{PUSHT_EXTRA}'")
         from lerobot_env_bomb_pusht.env import BombPushTEnv  # imports the simulator
 
         check_results_path(self.results_path)

@@ -3,8 +3,10 @@
 import argparse
 from collections.abc import Sequence
 from dataclasses import dataclass
+from importlib.util import find_spec
 from pathlib import Path
 
+import gymnasium
 import numpy as np
 from PIL import Image, ImageDraw
 from tqdm import tqdm
@@ -14,14 +16,20 @@ from lerobot_bomb.bomb.episode import EpisodeSpec
 from lerobot_bomb.bomb.observation import CAMERAS, PIXELS, WORKSPACE_HIGH_M, WORKSPACE_LOW_M, RenderOptions
 from lerobot_bomb.bomb.perturbations import AXES, NUISANCES
 from lerobot_bomb.commands.arguments import parse_numbers, path_flag
-from lerobot_bomb.conditions import ALL, MAX_LEVEL, NONE
+from lerobot_bomb.conditions import ALL, MAX_LEVEL, NONE, Axis, nuisances_of
 from lerobot_bomb.envs.rollout import expert_agent, make_env, play
 from lerobot_bomb.files import written_whole
 from lerobot_bomb.flags import flags_without_group, one_of
+from lerobot_bomb.pusht.episode import PUSHT_EXTRA, PushTSpec
+from lerobot_bomb.pusht.perturbations import PUSHT_AXES
 from lerobot_bomb.viewing.perturbations_page import write_page
 from lerobot_bomb.viewing.sheet import FONT_SIZE, GAP, INK, TILE_PAPER, Sheet, font, text_tile
 
 SHEETS = (*AXES, ALL)
+PUSHT_SHEETS = (*PUSHT_AXES, ALL)
+SHEETS_OF = {"bomb": SHEETS, "bomb_pusht": PUSHT_SHEETS}  # by --env.type
+PUSHT_ENV_ID = "lerobot_env_bomb_pusht:bomb_pusht/PushT-v0"
+PUSHED_STEPS = 6  # through the block, for what `dynamics` does
 LEVELS = range(MAX_LEVEL + 1)
 COLUMNS = ["nominal", *(f"level {level}" for level in LEVELS[1:])]
 DEFAULT_SEEDS = (2, 3)
@@ -34,7 +42,8 @@ GRID_RGB, NOMINAL_RGB, PATH_RGB = (200, 185, 160), (165, 165, 165), (210, 40, 30
 def add_gallery_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the arguments of ``lerobot-bomb gallery``."""
     add = parser.add_argument
-    add("--axes", type=_parse_names, default=SHEETS, help=f"as camera,light (default: {','.join(SHEETS)})")
+    add("--env.type", dest="env_type", default="bomb", help=f"{' or '.join(SHEETS_OF)} (default: bomb)")
+    add("--axes", type=_parse_names, help="as camera,light (default: every axis and all)")
     add("--seeds", type=parse_numbers, default=DEFAULT_SEEDS, help="episodes (default: 2,3)")
     add("--image_size", type=int, default=DEFAULT_TILE_SIZE, help="pixels of a tile (default: %(default)s)")
     add(
@@ -48,17 +57,28 @@ def add_gallery_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run_gallery(args: argparse.Namespace) -> int:
     """Draw the sheets and print their paths."""
-    for axis in args.axes:
-        one_of("--axes", axis, SHEETS)
+    one_of("--env.type", args.env_type, SHEETS_OF)
+    axes = args.axes or SHEETS_OF[args.env_type]
+    for axis in axes:
+        one_of("--axes", axis, SHEETS_OF[args.env_type])
+    is_pusht = args.env_type == "bomb_pusht"
+    if is_pusht and args.doc is not None:
+        raise ValueError(f"--doc={args.doc} is written for --env.type=bomb only; drop one of them")
+    if is_pusht and find_spec("gym_pusht") is None:
+        raise ValueError(f"--env.type={args.env_type} needs gym-pusht: pip install '{PUSHT_EXTRA}'")
     if args.output.exists() and not args.output.is_dir():
         raise ValueError(f"--output={args.output} is no folder; name another")
     with flags_without_group({"--seed=": "--seeds: "}):
         options = RenderOptions(image_size=args.image_size)
         for seed in args.seeds:
             EpisodeSpec(seed)
-    for axis in tqdm(args.axes, unit="sheet"):
+    for axis in tqdm(axes, unit="sheet"):
         path = args.output / f"{axis}.jpg"
-        image = axis_sheet(axis, args.seeds, options).draw()
+        if is_pusht:
+            sheet = pusht_sheet(axis, args.seeds, args.image_size)
+        else:
+            sheet = axis_sheet(axis, args.seeds, options)
+        image = sheet.draw()
         with written_whole(path) as (unfinished,):
             Image.fromarray(image).save(unfinished, quality=JPEG_QUALITY)
         tqdm.write(str(path))
@@ -100,7 +120,35 @@ def axis_sheet(axis: str, seeds: Sequence[int], options: RenderOptions) -> Sheet
             images[f"expert's path, seed {seed}"] = [
                 path_tile(path, paths[0], options.image_size) for path in paths
             ]
-    return Sheet(f"{axis}: {summary}", COLUMNS, {} if axis == ALL else magnitude_rows(axis), images)
+    return Sheet(f"{axis}: {summary}", COLUMNS, {} if axis == ALL else magnitude_rows(AXES[axis]), images)
+
+
+def pusht_sheet(axis: str, seeds: Sequence[int], image_size: int) -> Sheet:
+    """The same of PushT; what dynamics do is seen after some steps through the block."""
+    axes = nuisances_of(PUSHT_AXES) if axis == ALL else (axis,)
+    changes = {change for name in axes for change in PUSHT_AXES[name].changes}
+    summary = "every axis but goal_marker" if axis == ALL else PUSHT_AXES[axis].summary
+    images: dict[str, list[np.ndarray]] = {}
+    for seed in seeds:
+        for level in LEVELS:
+            spec = PushTSpec(seed, perturbations=f"{axis}:{level}")
+            env = gymnasium.make(PUSHT_ENV_ID, disable_env_checker=True, spec=spec, image_size=image_size)
+            observation, info = env.reset(seed=seed)
+            tiles = {}
+            if "images" in changes:
+                tiles["start"] = observation["pixels"]
+            if "instruction" in changes:
+                tiles["instruction"] = text_tile(env.get_wrapper_attr("task_description"), image_size)
+            if "dynamics" in changes:
+                beyond = np.clip(2 * info["block_pose"][:2] - info["pos_agent"], 40, 470)
+                for _ in range(PUSHED_STEPS):
+                    observation, *_ = env.step(beyond)
+                tiles[f"after {PUSHED_STEPS} steps"] = observation["pixels"]
+            for name, tile in tiles.items():
+                images.setdefault(f"{name}, seed {seed}", []).append(tile)
+            env.close()
+    rows = {} if axis == ALL else magnitude_rows(PUSHT_AXES[axis])
+    return Sheet(f"{axis}: {summary}", COLUMNS, rows, images)
 
 
 def look_at(condition: str, seeds: Sequence[int], options: RenderOptions, played: bool) -> list[Look]:
@@ -117,11 +165,11 @@ def look_at(condition: str, seeds: Sequence[int], options: RenderOptions, played
     return looks
 
 
-def magnitude_rows(axis: str) -> dict[str, list[str]]:
+def magnitude_rows(axis: Axis) -> dict[str, list[str]]:
     """What the table says of an axis, as rows of words under the columns."""
     return {
         f"{name}, {magnitude.unit}": ["", *(f"{value:g}" for value in magnitude.levels)]
-        for name, magnitude in AXES[axis].magnitudes.items()
+        for name, magnitude in axis.magnitudes.items()
     }
 
 

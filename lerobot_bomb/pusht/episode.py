@@ -13,6 +13,7 @@ from lerobot_bomb.pusht.perturbations import PUSHT_AXES, PushTCondition
 
 # Of the task, its axes and how a policy is measured; a line of results says it.
 PUSHT_PROTOCOL_VERSION = "pusht-1.0"
+PUSHT_EXTRA = "lerobot_policy_bomb[pusht]"  # what pip installs gym-pusht with
 INSTRUCTIONS = ("templates", NONE)
 MAX_STEPS = 300  # gym-pusht's own limit
 MAX_ALLOWED_STEPS = 10_000

@@ -60,7 +60,7 @@ def write_page(path: Path, sheets: Path) -> None:
 
 def page(instructions: list[str], sheets: str) -> str:
     """The Markdown text, with an instruction per level of `language` from 0 on and a link to the sheets."""
-    sections = [_section(name, axis, sheets) for name, axis in AXES.items()]
+    sections = [axis_section(name, axis, sheets) for name, axis in AXES.items()]
     position = list(AXES).index("language")
     sections[position] += _forms(instructions)
     everything = f"## {ALL}\n\nEvery nuisance axis at the same level.\n\n{_image(ALL, sheets)}"
@@ -79,7 +79,8 @@ def example_instructions() -> list[str]:
     return instructions
 
 
-def _section(name: str, axis: Axis, sheets: str) -> str:
+def axis_section(name: str, axis: Axis, sheets: str) -> str:
+    """An axis' heading, its magnitudes as a table, and a link to its sheet."""
     lines = [
         f"## {name}",
         "",
