@@ -129,11 +129,13 @@ class PlanDraft(LinearDraft):
 def _captured(works: list[DecodeRequest]) -> Iterator[None]:
     write = NumberWriter.__call__
 
-    def captured(writer: NumberWriter, prompt: Prompt, symbol_ids: Tensor, stop_after: int) -> Decoded:
+    def captured(
+        writer: NumberWriter, prompt: Prompt, symbol_ids: Tensor, stop_after: int, noise: None
+    ) -> Decoded:
         works.append(
             DecodeRequest(writer._backbone, prompt, symbol_ids, writer._grammar, stop_after, writer._guess)
         )
-        return write(writer, prompt, symbol_ids, stop_after)
+        return write(writer, prompt, symbol_ids, stop_after, noise)
 
     with patch.object(NumberWriter, "__call__", captured):
         yield

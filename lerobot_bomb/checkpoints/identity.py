@@ -95,7 +95,8 @@ def _settings_sha256(config: PreTrainedConfig, folder: Path) -> str:
     settings: Any = draccus.encode(config)
     settings = {name: value for name, value in settings.items() if name not in NOT_ITS_SETTINGS}
     digest = hashlib.sha256(json.dumps(settings, sort_keys=True, default=str).encode())
-    for path in sorted(path for pattern in PROCESSOR_PATTERNS for path in folder.glob(pattern) if path.is_file()):
+    found = (path for pattern in PROCESSOR_PATTERNS for path in folder.glob(pattern))
+    for path in sorted(path for path in found if path.is_file()):
         digest.update(f"{path.name} {sha256_of(path)}".encode())
     return digest.hexdigest()
 
