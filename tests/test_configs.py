@@ -1,21 +1,51 @@
 """What configs/ holds is read by LeRobot's own parser, says what it claims, and trains."""
 
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import draccus
 import pytest
 import yaml
-from lerobot.configs import PreTrainedConfig
+from lerobot.configs import PipelineFeatureType, PolicyFeature, PreTrainedConfig
+from lerobot.configs.eval import EvalPipelineConfig
 from lerobot.configs.train import TrainPipelineConfig
+from lerobot.envs import EnvConfig, env_to_policy_features
 from lerobot.policies.factory import get_policy_class
+from lerobot.utils.constants import ACTION, OBS_STATE
 from lerobot.utils.import_utils import register_third_party_plugins
-from recipes import FOLDER
+from recipes import FOLDER, POLICY_TYPES
 
 # what lerobot-train starts from: the evaluation's configs name an environment and no policy, and what goes on
 # from a checkpoint is read in test_shipped.py
 TRAINING = sorted(path for path in FOLDER.rglob("*.yaml") if "policy:\n  type:" in path.read_text())
+EVALUATION = sorted(FOLDER.glob("eval_*.yaml"))
+ENVS = ("aloha", "aloha_insertion", "bomb", "libero", "pusht")
+# what a policy is shown there, and the actions that it takes; PushT's pictures have 96 pixels a side,
+# whatever LeRobot declares (test_pusht_env.py)
+ALOHA = {"observation.images.top": (3, 480, 640), "observation.state": (14,), "action": (14,)}
+SEEN: dict[str, dict[str, tuple[int, ...]]] = {
+    "aloha": ALOHA,
+    "aloha_insertion": ALOHA,
+    "bomb": {
+        "observation.images.workspace": (3, 256, 256),
+        "observation.images.wrist": (3, 256, 256),
+        "observation.state": (4,),
+        "action": (4,),
+    },
+    "libero": {
+        "observation.images.image": (3, 256, 256),
+        "observation.images.image2": (3, 256, 256),
+        "observation.state": (8,),
+        "action": (7,),
+    },
+    "pusht": {"observation.image": (3, 384, 384), "observation.state": (2,), "action": (2,)},
+}
+# tokens that spatialvla_grid writes for a step
+NUM_GROUPS = {"aloha": 14, "aloha_insertion": 14, "bomb": 2, "libero": 3, "pusht": 2}
+# presets with relative actions: {action dimension: the state dimension that is subtracted}; nobody else's are
+SUBTRACTED: dict[str, dict[int, int]] = {"vla0_smol_pusht": {0: 0, 1: 1}}
 RECIPE = FOLDER / "train_vla0_smol_pusht.yaml"
 ABLATIONS = sorted((FOLDER / "ablations").glob("vla0_smol_*.yaml"))
 GRID_RECIPE = FOLDER / "train_spatialvla_grid_bomb.yaml"
@@ -77,6 +107,35 @@ def name_of(path: Path) -> str:
     return path.stem.removeprefix("vla0_smol_pusht_")
 
 
+def evaluation(path: Path) -> EvalPipelineConfig:
+    """As lerobot-eval reads it, but for the checkpoint."""
+    register_third_party_plugins()
+    return draccus.decode(EvalPipelineConfig, yaml.safe_load(path.read_text()))
+
+
+def policy_side(env: EnvConfig) -> dict[str, PolicyFeature]:
+    """What a policy reads and writes there, behind the environment's own processor."""
+    preprocessor, _ = env.get_env_processors()
+    by_kind = preprocessor.transform_features({PipelineFeatureType.OBSERVATION: env_to_policy_features(env)})
+    features = {key: feature for of_kind in by_kind.values() for key, feature in of_kind.items()}
+    # LIBERO's processor makes one state of its parts, and leaves their declarations
+    return {key: feature for key, feature in features.items() if not key.startswith(f"{OBS_STATE}.")}
+
+
+def preset(policy: str, env_name: str) -> Any:
+    """The policy of ``train_<policy>_<env>.yaml``, for the environment that ``eval_<env>.yaml`` names."""
+    env = evaluation(FOLDER / f"eval_{env_name}.yaml").env
+    written = yaml.safe_load((FOLDER / f"train_{policy}_{env_name}.yaml").read_text())
+    config = draccus.decode(TrainPipelineConfig, written).policy
+    assert config is not None
+    if getattr(config, "depth_source", None) == "observation":
+        env = replace(env, depth=True)
+    features = policy_side(env)
+    config.output_features = {ACTION: features.pop(ACTION)}
+    config.input_features = features
+    return config
+
+
 @pytest.mark.parametrize("path", TRAINING, ids=lambda path: path.stem)
 def test_lerobots_parser_reads_it(path: Path) -> None:
     register_third_party_plugins()
@@ -91,6 +150,60 @@ def test_lerobots_parser_reads_it(path: Path) -> None:
     # the first line is the command, with the file's own name
     first_line = path.read_text().splitlines()[0]
     assert "lerobot-train" in first_line and f"--config_path=configs/{path.relative_to(FOLDER)}" in first_line
+
+
+@pytest.mark.parametrize("path", EVALUATION, ids=lambda path: path.stem)
+def test_lerobots_parser_reads_an_evaluation(path: Path) -> None:
+    config, written = evaluation(path), yaml.safe_load(path.read_text())
+    assert config.env.type == written["env"].pop("type") and config.seed == written["seed"]
+    for name, value in written["env"].items():
+        assert getattr(config.env, name) == value, name
+    for name, value in written["eval"].items():
+        assert getattr(config.eval, name) == value, name
+    first_line = path.read_text().splitlines()[0]
+    assert first_line == f"# lerobot-eval --config_path=configs/{path.name} --policy.path=CHECKPOINT"
+
+
+def test_every_policy_has_a_preset_for_every_environment() -> None:
+    assert {path.name for path in FOLDER.glob("train_*.yaml")} == {
+        f"train_{policy}_{env}.yaml" for policy in POLICY_TYPES for env in ENVS
+    }
+    assert {f"eval_{env}.yaml" for env in ENVS} <= {path.name for path in EVALUATION}
+
+
+@pytest.mark.parametrize("env", ENVS)
+def test_what_an_environment_shows_a_policy(env: str) -> None:
+    features = policy_side(evaluation(FOLDER / f"eval_{env}.yaml").env)
+    assert {key: feature.shape for key, feature in features.items()} == SEEN[env]
+
+
+@pytest.mark.parametrize("env", ENVS)
+@pytest.mark.parametrize("policy", POLICY_TYPES)
+def test_a_preset_fits_its_environment(policy: str, env: str) -> None:
+    config = preset(policy, env)
+    config.validate_features()
+    relative = config.relative_dims() if getattr(config, "relative_actions", False) else {}
+    assert relative == SUBTRACTED.get(f"{policy}_{env}", {})
+    if policy == "spatialvla_grid":
+        assert len(config.grid_settings().groups) == NUM_GROUPS[env]
+
+
+def test_actions_of_libero_are_a_pose_because_the_preset_says_so() -> None:
+    config = preset("spatialvla_grid", "libero")
+    config.action_layout = None
+    with pytest.raises(ValueError, match=r"--policy\.action_layout=pose"):
+        config.grid_settings()
+
+
+@pytest.mark.parametrize("command", ["eval", *(f"train_{policy}" for policy in POLICY_TYPES)])
+def test_alohas_two_tasks_differ_in_task_and_demonstrations_alone(command: str) -> None:
+    transfer, insertion = (
+        yaml.safe_load((FOLDER / f"{command}_{env}.yaml").read_text()) for env in ("aloha", "aloha_insertion")
+    )
+    if command == "eval":
+        assert insertion == {**transfer, "env": {**transfer["env"], "task": "AlohaInsertion-v0"}}
+    else:
+        assert insertion == {**transfer, "dataset": {"repo_id": "lerobot/aloha_sim_insertion_human"}}
 
 
 def test_the_table_names_every_ablation() -> None:
