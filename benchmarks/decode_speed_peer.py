@@ -74,11 +74,11 @@ def _padded_left(embeds_BLH: Tensor, mask_BL: Tensor) -> tuple[Tensor, Tensor]:
 
 
 class OneTokenText:
-    """Stands in for `CachedText`: a single row, one token a pass, on transformers' growing cache."""
+    """Stands in for `CachedText` of a SmolVLM: a row, one token a pass, on transformers' growing cache."""
 
     columns_of = CachedText.columns_of
 
-    def __init__(self, layers: TextLayers, batch_size: int, num_columns: int):
+    def __init__(self, layers: TextLayers, batch_size: int, num_columns: int, _: object):
         assert batch_size == 1
         self._model, self.unread_column = layers.model, num_columns
         self._cache = DynamicCache(config=layers.config)
