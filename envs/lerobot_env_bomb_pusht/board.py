@@ -7,12 +7,23 @@ import numpy as np
 import pygame
 from gym_pusht.envs.pusht import PushTEnv, pymunk_to_shapely
 
-from lerobot_env_bomb_pusht.transform import PushTTransform
+from lerobot_bomb.envs.perturbation import EpisodeTransform
 
 BOARD_PX = 512  # the side of the board; positions and actions are in its pixels
 MIDDLE_PX = BOARD_PX / 2
 WHITE, OUTLINE_RGB = (255, 255, 255), (220, 30, 30)
 PERSON_IMAGE_SIZE = 384  # pixels, of LeRobot's videos of `pusht`
+
+
+class PushTTransform(EpisodeTransform):
+    """What one perturbation axis does to an episode of PushT; frozen once drawn."""
+
+    def edit(self, board: "Board") -> None:
+        """Change the board that gym-pusht has just set up, before block and agent are placed."""
+
+    def arrange(self, state: np.ndarray) -> np.ndarray:
+        """(5,) agent's x, y, block's x, y in pixels and angle in radians -> the same after the change."""
+        return state
 
 
 class Board(PushTEnv):

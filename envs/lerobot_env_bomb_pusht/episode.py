@@ -8,7 +8,7 @@ from lerobot_bomb.envs.perturbation import EpisodePerturbation
 from lerobot_bomb.pusht.episode import PushTSpec
 from lerobot_bomb.pusht.perturbations import PushTCondition
 from lerobot_env_bomb_pusht.axes import PUSHT_TRANSFORMS
-from lerobot_env_bomb_pusht.transform import PushTTransform
+from lerobot_env_bomb_pusht.board import PushTTransform
 
 # The first is the task of LeRobot's published dataset; {where} is the axis `goal`'s.
 TEMPLATES = (

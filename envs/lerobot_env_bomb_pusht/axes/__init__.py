@@ -8,7 +8,7 @@ from lerobot_env_bomb_pusht.axes.object import BlockShade
 from lerobot_env_bomb_pusht.axes.photometric import PushTSensor
 from lerobot_env_bomb_pusht.axes.start import PushTStart
 from lerobot_env_bomb_pusht.axes.table import BoardLook
-from lerobot_env_bomb_pusht.transform import PushTTransform
+from lerobot_env_bomb_pusht.board import PushTTransform
 
 PUSHT_TRANSFORMS: dict[str, type[PushTTransform]] = {
     "table": BoardLook,

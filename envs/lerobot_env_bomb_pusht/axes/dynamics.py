@@ -6,8 +6,7 @@ from typing import Self
 import numpy as np
 
 from lerobot_bomb.pusht.perturbations import pusht_magnitude
-from lerobot_env_bomb_pusht.board import Board
-from lerobot_env_bomb_pusht.transform import PushTTransform
+from lerobot_env_bomb_pusht.board import Board, PushTTransform
 
 
 @dataclass(frozen=True)

@@ -6,7 +6,7 @@ from typing import Any, Self
 import numpy as np
 
 from lerobot_bomb.pusht.perturbations import pusht_magnitude
-from lerobot_env_bomb_pusht.transform import PushTTransform
+from lerobot_env_bomb_pusht.board import PushTTransform
 
 # Forms 1 to 5; {where} is what the axis `goal` has to say of the target, else nothing.
 FORMS = (

@@ -7,8 +7,7 @@ import numpy as np
 import pygame
 
 from lerobot_bomb.pusht.perturbations import pusht_magnitude
-from lerobot_env_bomb_pusht.board import Board
-from lerobot_env_bomb_pusht.transform import PushTTransform
+from lerobot_env_bomb_pusht.board import Board, PushTTransform
 
 BLOCK_RGB = np.array(pygame.Color("LightSlateGray")[:3])
 # Darker than any board, and none like the agent's blue or the target's green

@@ -1,7 +1,7 @@
 """Perturbation axis `photometric`: the camera's sensor."""
 
 from lerobot_bomb.envs.perturbation import SensorTransform
-from lerobot_env_bomb_pusht.transform import PushTTransform
+from lerobot_env_bomb_pusht.board import PushTTransform
 
 
 class PushTSensor(SensorTransform, PushTTransform):

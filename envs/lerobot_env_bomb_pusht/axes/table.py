@@ -8,8 +8,7 @@ import numpy as np
 import pygame
 
 from lerobot_bomb.pusht.perturbations import pusht_magnitude
-from lerobot_env_bomb_pusht.board import BOARD_PX, Board
-from lerobot_env_bomb_pusht.transform import PushTTransform
+from lerobot_env_bomb_pusht.board import BOARD_PX, Board, PushTTransform
 
 # None like the target's light green, the block's slate grey or the agent's blue
 BOARD_RGB = (
