@@ -33,6 +33,11 @@ class Axis:
     is_help: bool = False  # not a nuisance: no part of `all`
 
 
+def magnitude_of(axes: Mapping[str, Axis], axis: str, name: str, level: int) -> float:
+    """How far a quantity of an axis moves at a level of 1..5, in the unit that the table states."""
+    return axes[axis].magnitudes[name].levels[level - 1]
+
+
 def nuisances_of(axes: Mapping[str, Axis]) -> tuple[str, ...]:
     """What `all` stands for."""
     return tuple(name for name, axis in axes.items() if not axis.is_help)

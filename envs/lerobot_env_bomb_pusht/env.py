@@ -37,7 +37,7 @@ class BombPushTEnv(gymnasium.Env[dict[str, Any], np.ndarray]):
     of `gym_pusht/PushT-v0` of the same seed, bit for bit.
 
     Action: (2,) x and y in pixels of the board where the agent is to go, 0..512; it is not clipped.
-    Once an episode has ended, `step` returns its last transition until `reset`.
+    Once an episode has ended, `step` changes nothing until `reset`, and its reward is 0.
     """
 
     metadata = {"render_modes": ["rgb_array"], "render_fps": 10}  # noqa: RUF012

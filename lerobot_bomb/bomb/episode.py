@@ -49,6 +49,12 @@ class Failure(StrEnum):
     TIMEOUT_HOLDING = "timeout_holding"
 
 
+def check_seed(seed: int) -> None:
+    """Raise a ValueError unless LeRobot can seed with it."""
+    if not 0 <= seed <= MAX_SEED:
+        raise ValueError(f"--seed={seed} must lie in 0..{MAX_SEED}")
+
+
 @dataclass(frozen=True)
 class EpisodeSpec:
     """Everything that, with the code's version, determines an episode bit for bit."""
@@ -72,8 +78,7 @@ class EpisodeSpec:
         one_of("--env.robot", self.robot, ROBOTS)
         one_of("--env.split", self.split, SPLITS)
         one_of("--env.control_mode", self.control_mode, CONTROL_MODES)
-        if not 0 <= self.seed <= MAX_SEED:
-            raise ValueError(f"--seed={self.seed} must lie in 0..{MAX_SEED}")
+        check_seed(self.seed)
         if not (0 < self.fps <= PHYSICS_HZ and PHYSICS_HZ % self.fps == 0):
             divisors = [n for n in range(1, PHYSICS_HZ + 1) if PHYSICS_HZ % n == 0]
             raise ValueError(

@@ -5,9 +5,10 @@ The one definition: the simulator applies it, ``docs/perturbations.md`` is gener
 
 from collections.abc import Mapping
 from dataclasses import dataclass
+from functools import partial
 from typing import ClassVar
 
-from lerobot_bomb.conditions import Axis, AxisCondition, Magnitude, nuisances_of
+from lerobot_bomb.conditions import Axis, AxisCondition, Magnitude, magnitude_of, nuisances_of
 
 # Append only: an axis' place in this dict numbers its stream of random numbers.
 AXES = {
@@ -114,11 +115,7 @@ AXES = {
     ),
 }
 NUISANCES = nuisances_of(AXES)  # what `all` stands for
-
-
-def magnitude(axis: str, name: str, level: int) -> float:
-    """How far a quantity of an axis moves at a level of 1..5, in the unit that the table states."""
-    return AXES[axis].magnitudes[name].levels[level - 1]
+magnitude = partial(magnitude_of, AXES)  # (axis, name, level)
 
 
 @dataclass(frozen=True)

@@ -207,6 +207,10 @@ class VlaConfig(ChunkConfig):
         return super().missing_parts()
 
 
+# flags that say what the actions of a trained model mean
+RELATIVE_AS_TRAINED = ("relative_actions", "relative_exclude_joints", "relative_state_indices")
+
+
 @dataclass
 class RelativeVlaConfig(VlaConfig):
     """Of a policy whose actions may be differences to the state that a chunk starts from."""

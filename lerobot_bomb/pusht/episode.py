@@ -6,7 +6,7 @@ from math import pi
 
 import numpy as np
 
-from lerobot_bomb.bomb.episode import MAX_SEED
+from lerobot_bomb.bomb.episode import check_seed
 from lerobot_bomb.conditions import NONE, nuisances_of
 from lerobot_bomb.flags import one_of
 from lerobot_bomb.pusht.perturbations import PUSHT_AXES, PushTCondition
@@ -51,8 +51,7 @@ class PushTSpec:
         # one spelling, so that equal conditions compare equal
         object.__setattr__(self, "perturbations", str(condition))
         one_of("--env.instruction", self.instruction, INSTRUCTIONS)
-        if not 0 <= self.seed <= MAX_SEED:
-            raise ValueError(f"--seed={self.seed} must lie in 0..{MAX_SEED}")
+        check_seed(self.seed)
         if not 1 <= self.max_steps <= MAX_ALLOWED_STEPS:
             raise ValueError(f"--env.max_steps={self.max_steps} must lie in 1..{MAX_ALLOWED_STEPS}")
         on = {axis for axis, _, _ in condition.ranges}

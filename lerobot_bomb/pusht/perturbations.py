@@ -5,10 +5,11 @@ A pixel is one of the board's 512x512, the unit of positions and actions.
 
 from collections.abc import Mapping
 from dataclasses import dataclass
+from functools import partial
 from typing import ClassVar
 
 from lerobot_bomb.bomb.perturbations import AXES as BOMB_AXES
-from lerobot_bomb.conditions import Axis, AxisCondition, Magnitude
+from lerobot_bomb.conditions import Axis, AxisCondition, Magnitude, magnitude_of
 
 # Append only: an axis' place in this dict numbers its stream of random numbers. `language` stands before
 # `goal`, which adds its words to whatever sentence there is.
@@ -33,11 +34,7 @@ PUSHT_AXES = {
         },
     ),
     "photometric": BOMB_AXES["photometric"],
-    "language": Axis(
-        "how the instruction is worded; what it means is always stated",
-        ("instruction",),
-        {"form": Magnitude("number", (1, 2, 3, 4, 5), "see below")},
-    ),
+    "language": BOMB_AXES["language"],
     "dynamics": Axis(
         "damping and friction of the block, latency and noise of the agent",
         ("dynamics",),
@@ -71,11 +68,7 @@ PUSHT_AXES = {
         is_help=True,
     ),
 }
-
-
-def pusht_magnitude(axis: str, name: str, level: int) -> float:
-    """How far a quantity of an axis moves at a level of 1..5, in the unit that the table states."""
-    return PUSHT_AXES[axis].magnitudes[name].levels[level - 1]
+pusht_magnitude = partial(magnitude_of, PUSHT_AXES)  # (axis, name, level)
 
 
 @dataclass(frozen=True)

@@ -11,7 +11,7 @@ from lerobot.policies.rtc import RTCConfig
 from lerobot_bomb.flow.losses import check_learning, check_objective
 from lerobot_bomb.flow.path import TIME_SAMPLINGS
 from lerobot_bomb.flow.samplers import check_heads, check_sampling
-from lerobot_bomb.policies.config import RelativeVlaConfig
+from lerobot_bomb.policies.config import RELATIVE_AS_TRAINED, RelativeVlaConfig
 from lerobot_bomb.training.policy_flags import (
     MAX_POSITIONS,
     check_not_negative,
@@ -39,7 +39,7 @@ SHAPES = (
 AS_TRAINED = (
     *SHAPES,
     *("image_size", "segment_attention", "reasoning_pool"),
-    *("relative_actions", "relative_exclude_joints", "relative_state_indices"),
+    *RELATIVE_AS_TRAINED,
 )
 
 

@@ -7,7 +7,7 @@ from lerobot.configs import PreTrainedConfig
 
 from lerobot_bomb.actions.bins import BIN_MODES
 from lerobot_bomb.actions.text import MASK_LEVELS, MAX_DIGITS, digits_needed
-from lerobot_bomb.policies.config import RelativeVlaConfig, TokenVlaConfig
+from lerobot_bomb.policies.config import RELATIVE_AS_TRAINED, RelativeVlaConfig, TokenVlaConfig
 from lerobot_bomb.training.policy_flags import check_positive
 
 DRAFTS = ("none", "linear")
@@ -19,7 +19,7 @@ SHAPES = ("nano_config",)
 # the same, and flags that say what the model's tokens mean
 AS_TRAINED = (
     *("chunk_size", "n_action_bins", "n_state_bins", "bin_mode", "number_width", "use_state", "image_size"),
-    *("relative_actions", "relative_exclude_joints", "relative_state_indices"),
+    *RELATIVE_AS_TRAINED,
     *SHAPES,
 )
 
