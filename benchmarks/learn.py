@@ -34,7 +34,9 @@ from lerobot_bomb.checkpoints.identity import sha256_of
 from lerobot_bomb.checkpoints.names import WEIGHTS
 from lerobot_bomb.commands.run import run_command
 from lerobot_bomb.conditions import NONE
-from lerobot_bomb.evaluation.results import PUT_DOWN, Row, read_results
+from lerobot_bomb.envs.results import Row
+from lerobot_bomb.evaluation.bomb_lines import PUT_DOWN
+from lerobot_bomb.evaluation.results import read_results
 
 PLUGIN = f"lerobot_policy_{PROBE}"  # not installed: LeRobot finds it by --*.discover_packages_path
 REPO_ID = "learn/bomb_place"

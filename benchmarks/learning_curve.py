@@ -9,7 +9,8 @@ import cv2
 import numpy as np
 
 from lerobot_bomb.bomb.episode import Failure, Stage
-from lerobot_bomb.evaluation.results import PUT_DOWN, Row
+from lerobot_bomb.envs.results import Row
+from lerobot_bomb.evaluation.bomb_lines import PUT_DOWN
 from lerobot_bomb.stats import format_rate, wilson_interval
 from lerobot_bomb.tables import print_table
 

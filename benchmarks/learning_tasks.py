@@ -8,7 +8,7 @@ from lerobot_bomb.bomb.board import COLORS, task_id
 from lerobot_bomb.bomb.perturbations import NUISANCES
 from lerobot_bomb.bomb.suites.place import targets_of, templates_of
 from lerobot_bomb.conditions import ALL, NONE
-from lerobot_bomb.evaluation.results import Row
+from lerobot_bomb.envs.results import Row
 
 PROBE = "keypoint_probe"
 RIVALS = ("act", "diffusion")  # LeRobot's; they read no instruction

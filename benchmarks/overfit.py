@@ -31,7 +31,8 @@ from recipes import POLICY_TYPES, last_checkpoint, read_recipe, recipe_path
 
 from lerobot_bomb.bomb.episode import EpisodeSpec, Failure
 from lerobot_bomb.commands.run import run_command
-from lerobot_bomb.evaluation.results import Row, read_results
+from lerobot_bomb.envs.results import Row
+from lerobot_bomb.evaluation.results import read_results
 from lerobot_bomb.tables import print_table
 
 SEED = 1007  # its board is empty, so nothing but the instruction tells the target

@@ -9,7 +9,8 @@ from lerobot_bomb.bomb.board import COLORS
 from lerobot_bomb.bomb.episode import PROTOCOL_VERSION, EpisodeSpec
 from lerobot_bomb.commands.main import main
 from lerobot_bomb.envs.results import EpisodeResult, PolicyIdentity
-from lerobot_bomb.evaluation.result_lines import NEW_CHECKS, POLICY_CHECKS, SPEC_CHECKS, parse_line
+from lerobot_bomb.evaluation.bomb_lines import NEW_CHECKS, SPEC_CHECKS, median_error_mm
+from lerobot_bomb.evaluation.result_lines import KINDS, POLICY_CHECKS, parse_line
 from lerobot_bomb.evaluation.results import read_results, summarise
 
 ACT = PolicyIdentity("act", "outputs/act", None, "a" * 64, "b" * 64)
@@ -68,9 +69,10 @@ def test_summary_counts_successes_errors_and_failures(path: Path) -> None:
     lines = [row(0), row(1, error=3.0), row(2, "imprecise", 14.0), row(3, "never_reached", 200.0)]
     lines += [row(4, "dropped", 99.0), row(5, "wrong_intersection", 45.0), row(6, "disturbed_others", 2.0)]
     path.write_text("".join(lines))
-    summary = summarise(read_results(path))
+    rows = read_results(path)
+    summary = summarise(rows)
     assert (summary.num_episodes, summary.num_successes) == (7, 2)
-    assert summary.median_error_mm == 3.0  # of 1, 2, 3, 14 and 45: only stones that were put down
+    assert median_error_mm(rows) == 3.0  # of 1, 2, 3, 14 and 45: only stones that were put down
     assert summary.failures == {
         "imprecise": 1,
         "never_reached": 1,
@@ -91,6 +93,12 @@ def test_all_fields_are_checked() -> None:
     for name in values(0):
         with pytest.raises(ValueError, match=f"{name}" if name != "protocol_version" else "None"):
             parse_line(json.dumps({key: value for key, value in values(0).items() if key != name}).encode())
+
+
+def test_a_protocol_version_is_of_one_environment() -> None:
+    versions = [version for kind in KINDS for version in kind.fields]
+    assert len(set(versions)) == len(versions)
+    assert len({kind.env_type for kind in KINDS}) == len(KINDS)
 
 
 DAMAGED: dict[str, Any] = {

@@ -14,8 +14,8 @@ from lerobot_bomb.checkpoints.shipped import PREFIX
 from lerobot_bomb.commands.arguments import path_flag
 from lerobot_bomb.commands.run import run_command
 from lerobot_bomb.conditions import NONE
+from lerobot_bomb.envs.results import Row
 from lerobot_bomb.evaluation.result_groups import by_condition
-from lerobot_bomb.evaluation.result_lines import Row
 from lerobot_bomb.evaluation.results import read_results
 from lerobot_bomb.files import check_new_folder
 from lerobot_bomb.stats import format_rate

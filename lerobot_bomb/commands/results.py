@@ -10,10 +10,9 @@ from lerobot_bomb.evaluation.result_groups import (
     by_condition,
     differing,
     groups_of,
-    what_old_lines_lack,
 )
-from lerobot_bomb.evaluation.result_lines import OLD_VERSION, read_lines
-from lerobot_bomb.evaluation.results import pair_lines, summary_lines
+from lerobot_bomb.evaluation.result_lines import read_lines
+from lerobot_bomb.evaluation.results import pair_lines, summarise
 
 MAX_SHOWN_DAMAGES = 10
 
@@ -52,17 +51,17 @@ def _print_file(path: Path, groups: list[Group], num_damaged: int) -> None:
         )
     for group in groups:
         print(*(f"{path}: {line}" for line in group.lines()), sep="\n")
-        if group.is_of_old_version:
-            print(
-                f"{path}: lines of protocol {OLD_VERSION} are incomplete: they lack {what_old_lines_lack()}"
-            )
+        if group.missing_fields:
+            version = group.rows[0]["protocol_version"]
+            lacking = ", ".join(group.missing_fields)
+            print(f"{path}: lines of protocol {version} are incomplete: they lack {lacking}")
         if group.num_replaced:
             print(f"{path}: {group.num_replaced} lines count no more, a later one is of the same episode")
         conditions = by_condition(group.rows)
         for condition, rows in conditions.items():
             label = f" (perturbations={condition})" if len(conditions) > 1 else ""
             print(f"{path}{label}: {len(rows)} episode{'s' * (len(rows) != 1)}")
-            print(*(f"  {line}" for line in summary_lines(rows)), sep="\n")
+            print(*(f"  {line}" for line in summarise(rows).lines()), sep="\n")
         against = pair_lines(group, groups)
         if against:
             print(f"{path}: against the same episodes unperturbed", *against, sep="\n")

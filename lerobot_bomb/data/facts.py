@@ -10,11 +10,10 @@ from lerobot_bomb.bomb.observation import CAMERAS
 from lerobot_bomb.data.dataset_files import INFO_FILE
 from lerobot_bomb.data.environment import Environment
 from lerobot_bomb.data.resumable import METADATA_FILE
+from lerobot_bomb.envs.results import Row
 from lerobot_bomb.files import read_json
 
 PUSHT_SOURCE = "pusht-zarr"
-
-Row = dict[str, Any]  # the fields of EpisodeResult
 
 
 @dataclass(frozen=True)

@@ -53,6 +53,9 @@ class PolicyIdentity:
     is_in_training: bool = False  # its weights are in no file
 
 
+type Row = dict[str, Any]  # a line read back: the fields of a ResultLine
+
+
 class ResultLine:
     """What became of an episode; a dataclass whose fields are the keys of its line."""
 

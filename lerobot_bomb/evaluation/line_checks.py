@@ -3,7 +3,7 @@
 import json
 import math
 import re
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from typing import Any
 
 SHOWN_CHARACTERS = 80  # of a wrong value
@@ -56,14 +56,14 @@ def is_sha256(value: Any) -> bool:
     return isinstance(value, str) and re.fullmatch("[0-9a-f]{64}", value) is not None
 
 
-def refuse_others(spec: dict[str, Any], checks: dict[str, Check]) -> None:
+def refuse_others(spec: dict[str, Any], checks: Mapping[str, Check]) -> None:
     """Raise a ValueError if a spec has a field that no check is for: then it may be of another episode."""
     unknown = spec.keys() - checks.keys()
     if unknown:
         raise ValueError(f"spec has {', '.join(sorted(unknown))}, of which this package knows nothing")
 
 
-def check_fields(values: dict[str, Any], checks: dict[str, Check], prefix: str = "") -> None:
+def check_fields(values: dict[str, Any], checks: Mapping[str, Check], prefix: str = "") -> None:
     """Raise a ValueError that names the fields that are missing, or the first that is impossible."""
     missing = [f"{prefix}{name}" for name in checks if name not in values]
     if missing:

@@ -1,13 +1,13 @@
 """Lines of `bomb_pusht` in a results file: what each must say, and what they say together."""
 
-from collections import Counter
+from functools import partial
 from typing import Any
 
 import numpy as np
 
+from lerobot_bomb.envs.results import Row
 from lerobot_bomb.evaluation.line_checks import (
     Check,
-    check_fields,
     is_bool,
     is_int,
     is_one_of,
@@ -15,8 +15,8 @@ from lerobot_bomb.evaluation.line_checks import (
     is_table_of,
     is_text,
     or_none,
-    refuse_others,
 )
+from lerobot_bomb.evaluation.result_kind import Measure, Pair, ResultKind
 from lerobot_bomb.pusht.episode import (
     MAX_IMAGE_SIZE,
     MIN_IMAGE_SIZE,
@@ -24,7 +24,7 @@ from lerobot_bomb.pusht.episode import (
     PushTFailure,
     PushTSpec,
 )
-from lerobot_bomb.stats import bootstrap_interval, format_rate, paired_bootstrap_interval
+from lerobot_bomb.stats import bootstrap_interval, paired_bootstrap_interval
 
 
 def is_share(value: Any) -> bool:
@@ -62,52 +62,55 @@ PUSHT_CHECKS: dict[str, Check] = {
     "package_version": is_text,
 }
 
-type PushTRow = dict[str, Any]  # the fields of PushTResult
+
+def _check_episode(row: Row) -> None:
+    PushTSpec(**row["spec"])
 
 
-def is_of_pusht(row: PushTRow) -> bool:
-    """Whether a line is of `bomb_pusht`."""
-    return row["protocol_version"] == PUSHT_PROTOCOL_VERSION
-
-
-def check_pusht_spec(spec: dict[str, Any]) -> None:
-    """Raise a ValueError unless there can be such an episode."""
-    check_fields(spec, PUSHT_SPEC_CHECKS, "spec.")
-    refuse_others(spec, PUSHT_SPEC_CHECKS)
-    PushTSpec(**spec)
-
-
-def simulator_of(row: PushTRow) -> str:
+def _settings(row: Row) -> dict[str, str]:
     """'gym-pusht 0.1.8, pymunk 6.11.1, ...': what the bits of an episode depend on."""
-    return ", ".join(f"{name} {version or '?'}" for name, version in row["simulator_versions"].items())
+    versions = row["simulator_versions"].items()
+    return {"simulator": ", ".join(f"{name} {version or '?'}" for name, version in versions)}
 
 
-def pusht_summary(rows: list[PushTRow]) -> list[str]:
-    """Success, coverage and failures as text, a line each."""
-    failures = Counter(row["failure"] for row in rows if not row["is_success"])
-    counts = ", ".join(f"{name} {count}" for name, count in failures.most_common()) or "none"
-    best, final = (np.array([row[name] for row in rows]) for name in ("max_coverage", "coverage"))
-    return [
-        f"success          {format_rate(sum(row['is_success'] for row in rows), len(rows))} "
-        "(95 % Wilson interval)",
-        f"max coverage     {_mean(best)} (mean, 95 % bootstrap interval over episodes)",
-        f"final coverage   {_mean(final)}",
-        f"failures         {counts}",
-    ]
+def _values(rows: list[Row], name: str) -> np.ndarray:
+    return np.array([row[name] for row in rows])
 
 
-def coverage_change(pairs: list[tuple[PushTRow, PushTRow]]) -> str:
+def _mean(rows: list[Row], name: str) -> str:
+    values = _values(rows, name)
+    return f"{values.mean():.3f}{_bounds(bootstrap_interval(values, np.ones(len(values))), '.3f')}"
+
+
+def _coverage_change(pairs: list[Pair]) -> str:
     """'max coverage -0.120 [-0.200, -0.040]': the mean change of (unperturbed, perturbed) pairs."""
-    before, after = np.array([[row["max_coverage"] for row in pair] for pair in pairs]).T
+    before, after = (_values(rows, "max_coverage") for rows in map(list, zip(*pairs, strict=True)))
     ones = np.ones(len(pairs))
     interval = paired_bootstrap_interval((before, ones), (after, ones))
     return f"max coverage {(after - before).mean():+.3f}{_bounds(interval, '+.3f')}"
 
 
-def _mean(values: np.ndarray) -> str:
-    return f"{values.mean():.3f}{_bounds(bootstrap_interval(values, np.ones(len(values))), '.3f')}"
-
-
 def _bounds(interval: tuple[float, float] | None, form: str) -> str:
     """' [low, high]'; nothing for a single episode."""
     return "" if interval is None else f" [{interval[0]:{form}}, {interval[1]:{form}}]"
+
+
+PUSHT_LINES = ResultKind(
+    env_type="bomb_pusht",
+    fields={PUSHT_PROTOCOL_VERSION: PUSHT_CHECKS},
+    spec_fields=PUSHT_SPEC_CHECKS,
+    check_episode=_check_episode,
+    drawn=(),
+    settings=_settings,
+    describe_simulator=lambda settings: settings["simulator"],
+    describe_tasks=lambda rows: "task pusht",
+    measures=[
+        Measure(
+            "max coverage",
+            partial(_mean, name="max_coverage"),
+            "mean, 95 % bootstrap interval over episodes",
+        ),
+        Measure("final coverage", partial(_mean, name="coverage")),
+    ],
+    describe_change=_coverage_change,
+)

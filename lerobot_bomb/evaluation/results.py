@@ -3,42 +3,38 @@
 from collections import Counter
 from dataclasses import dataclass
 from pathlib import Path
-from statistics import median
 
-from lerobot_bomb.bomb.episode import Failure
 from lerobot_bomb.conditions import NONE
-from lerobot_bomb.evaluation.pusht_lines import coverage_change, is_of_pusht, pusht_summary
+from lerobot_bomb.envs.results import Row
+from lerobot_bomb.evaluation.bomb_lines import BOMB_LINES
 from lerobot_bomb.evaluation.result_groups import (
     Group,
     differing,
     groups_of,
     pair_with_nominal,
 )
-from lerobot_bomb.evaluation.result_lines import Row, read_lines
+from lerobot_bomb.evaluation.result_kind import Measure, Pair
+from lerobot_bomb.evaluation.result_lines import kind_of, read_lines
 from lerobot_bomb.stats import format_rate, mcnemar_p_value
-
-# outcomes of an episode in which the stone was carried and put down somewhere on the board
-PUT_DOWN = (None, Failure.WRONG_INTERSECTION, Failure.IMPRECISE, Failure.DISTURBED_OTHERS)
 
 
 @dataclass(frozen=True)
 class Summary:
-    """What a results file says: counts over its episodes and errors of the stones that were released."""
+    """What episodes of one environment come to."""
 
     num_episodes: int
     num_successes: int
-    median_error_mm: float | None  # over the episodes in which the stone was put down on the board
+    measures: dict[Measure, str]  # and their values
     failures: Counter[str]
 
     def lines(self) -> list[str]:
         """The summary as text, a line each."""
-        error = "-" if self.median_error_mm is None else f"{self.median_error_mm:.1f} mm"
+        rate = format_rate(self.num_successes, self.num_episodes)
         failures = ", ".join(f"{name} {count}" for name, count in self.failures.most_common()) or "none"
-        return [
-            f"success          {format_rate(self.num_successes, self.num_episodes)} (95 % Wilson interval)",
-            f"placement error  {error} (median of the stones that were put down)",
-            f"failures         {failures}",
-        ]
+        figures = [("success", rate, "95 % Wilson interval")]
+        figures += [(measure.name, value, measure.note) for measure, value in self.measures.items()]
+        figures += [("failures", failures, "")]
+        return [f"{name:<16} {value}{f' ({note})' if note else ''}" for name, value, note in figures]
 
 
 def read_results(path: Path) -> list[Row]:
@@ -52,32 +48,28 @@ def read_results(path: Path) -> list[Row]:
         raise ValueError(damages[0])
     if not rows:
         raise ValueError(f"{path}: no finished episode")
-    if any(map(is_of_pusht, rows)):
-        raise ValueError(f"{path} has lines of bomb_pusht, which only `lerobot-bomb results` reads")
+    others = [kind.env_type for kind in map(kind_of, rows) if kind is not BOMB_LINES]
+    if others:
+        raise ValueError(f"{path} has lines of {others[0]}, which only `lerobot-bomb results` reads")
     return [row for group in groups_of(rows) for row in group.rows]
 
 
 def summarise(rows: list[Row]) -> Summary:
-    """Counts, rates and the median error of episodes."""
-    errors = [row["placement_error_mm"] for row in rows if row["failure"] in PUT_DOWN]
+    """What episodes of one environment come to."""
     return Summary(
         num_episodes=len(rows),
         num_successes=sum(row["is_success"] for row in rows),
-        median_error_mm=median(errors) if errors else None,
+        measures={measure: measure.value(rows) for measure in kind_of(rows[0]).measures},
         failures=Counter(row["failure"] for row in rows if not row["is_success"]),
     )
 
 
-def summary_lines(rows: list[Row]) -> list[str]:
-    """What episodes of one environment come to, a line each."""
-    return pusht_summary(rows) if is_of_pusht(rows[0]) else summarise(rows).lines()
-
-
-def _pair_line(condition: str, pairs: list[tuple[Row, Row]]) -> str:
+def _pair_line(condition: str, pairs: list[Pair]) -> str:
     lost = sum(nominal["is_success"] and not row["is_success"] for nominal, row in pairs)
     won = sum(row["is_success"] and not nominal["is_success"] for nominal, row in pairs)
     p_value = mcnemar_p_value(lost, won)
-    change = f"; {coverage_change(pairs)}" if is_of_pusht(pairs[0][0]) else ""
+    describe_change = kind_of(pairs[0][0]).describe_change
+    change = f"; {describe_change(pairs)}" if describe_change else ""
     return (
         f"  {condition}: {len(pairs)} pairs, {lost} lost, {won} won, p = {p_value:.2g} (exact McNemar test)"
         f"{change}"

@@ -12,8 +12,9 @@ from lerobot.configs.train import TrainPipelineConfig
 from lerobot_bomb import __version__
 from lerobot_bomb.checkpoints.names import is_hub_id
 from lerobot_bomb.data.environment import Environment
-from lerobot_bomb.data.facts import DatasetFacts, Row, eval_flags_of, task_version
-from lerobot_bomb.evaluation.result_groups import Group, by_condition, describe_tasks, groups_of
+from lerobot_bomb.data.facts import DatasetFacts, eval_flags_of, task_version
+from lerobot_bomb.envs.results import Row
+from lerobot_bomb.evaluation.result_groups import Group, by_condition, groups_of
 from lerobot_bomb.evaluation.results import summarise
 from lerobot_bomb.hub.markdown import command, fenced
 from lerobot_bomb.hub.method import Method
@@ -246,7 +247,7 @@ def results_table(group: Group) -> str:
     """Markdown: what was evaluated, and a row for each condition."""
     _, *settings = group.lines()  # the policy is the checkpoint
     lines = [
-        f"{describe_tasks(group.rows)}; {'; '.join(settings)}:",
+        f"{group.kind.describe_tasks(group.rows)}; {'; '.join(settings)}:",
         "",
         "| condition | n | successes | success rate | 95 % Wilson interval |",
         "|---|---|---|---|---|",

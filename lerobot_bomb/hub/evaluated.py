@@ -2,8 +2,8 @@
 
 from pathlib import Path
 
+from lerobot_bomb.envs.results import Row
 from lerobot_bomb.evaluation.result_groups import describe_policy
-from lerobot_bomb.evaluation.result_lines import Row
 
 
 def check_weights_of(path: Path, rows: list[Row], checkpoint: Path) -> None:

@@ -7,7 +7,8 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from lerobot_bomb.checkpoints.names import CONFIG, TO_PUBLISH, TRAIN_CONFIG, WEIGHTS, is_local_path
-from lerobot_bomb.data.facts import DatasetFacts, Row
+from lerobot_bomb.data.facts import DatasetFacts
+from lerobot_bomb.envs.results import Row
 from lerobot_bomb.files import read_json
 
 if TYPE_CHECKING:

@@ -1,0 +1,146 @@
+"""Lines of `bomb` in a results file: what each must say, whichever protocol wrote it, and what all say."""
+
+import json
+from collections.abc import Mapping
+from statistics import median
+from typing import Any
+
+from lerobot_bomb.bomb.board import BOARD, COLORS, task_id
+from lerobot_bomb.bomb.episode import PROTOCOL_VERSION, TASK_VERSION, EpisodeSpec, Failure, Stage
+from lerobot_bomb.bomb.observation import MAX_IMAGE_SIZE, MIN_IMAGE_SIZE, RENDER_PRESETS
+from lerobot_bomb.envs.results import Row
+from lerobot_bomb.evaluation.line_checks import (
+    Check,
+    is_bool,
+    is_int,
+    is_list_of,
+    is_one_of,
+    is_quantity,
+    is_table_of,
+    is_text,
+    or_none,
+)
+from lerobot_bomb.evaluation.result_kind import NOT_RECORDED, Measure, ResultKind, describe_numbers
+
+OLD_VERSION = "1.0"  # whose lines say less
+NUM_TASKS = len(COLORS) * BOARD.num_lines**2
+# outcomes of an episode in which the stone was carried and put down somewhere on the board
+PUT_DOWN = (None, Failure.WRONG_INTERSECTION, Failure.IMPRECISE, Failure.DISTURBED_OTHERS)
+
+
+def is_intersection(value: Any) -> bool:
+    """Whether a value is [row, column] on the board."""
+    return isinstance(value, list) and len(value) == 2 and all(map(is_int(0, BOARD.num_lines - 1), value))
+
+
+SPEC_CHECKS: dict[str, Check] = {  # the rest is EpisodeSpec's own
+    "seed": is_int(0),
+    "suite": is_text,
+    "robot": is_text,
+    "split": is_text,
+    "control_mode": is_text,
+    "fps": is_int(1),
+    "target": or_none(is_intersection),
+    "color": or_none(is_text),
+    "success_tolerance_mm": is_quantity,
+    "perturbations": is_text,
+}
+CHECKS: dict[str, Check] = {
+    "spec": lambda value: isinstance(value, dict),
+    "instruction": is_text,
+    "target": is_intersection,
+    "color": is_one_of(COLORS),
+    "steps": is_int(1),
+    "is_success": is_bool,
+    "is_success_bomb_v0": is_bool,
+    "failure": or_none(is_one_of(Failure)),
+    "stage": is_one_of(Stage),
+    "placement_error_mm": is_quantity,
+    "nearest_intersection": is_intersection,
+    "collateral_mm": is_quantity,
+    "levels": is_table_of(is_int(0)),
+    "image_size": is_int(MIN_IMAGE_SIZE, MAX_IMAGE_SIZE),
+    "package_version": is_text,
+}
+NEW_CHECKS: dict[str, Check] = {  # of what protocol 1.1 added
+    "policy": or_none(lambda value: isinstance(value, dict)),
+    "mujoco_version": or_none(is_text),
+    "opengl_vendor": or_none(is_text),
+    "opengl_renderer": or_none(is_text),
+    "machine": is_text,
+    "render_preset": is_one_of(RENDER_PRESETS),
+    "task_ids": or_none(is_list_of(is_int(0, NUM_TASKS - 1))),
+    "lerobot_version": or_none(is_text),
+    "torch_version": or_none(is_text),
+    "task_version": is_one_of((TASK_VERSION,)),
+}
+
+
+def median_error_mm(rows: list[Row]) -> float | None:
+    """Of the stones that were put down on the board; None: there are none."""
+    errors = [row["placement_error_mm"] for row in rows if row["failure"] in PUT_DOWN]
+    return median(errors) if errors else None
+
+
+def _placement_error(rows: list[Row]) -> str:
+    error_mm = median_error_mm(rows)
+    return "-" if error_mm is None else f"{error_mm:.1f} mm"
+
+
+def _check_episode(row: Row) -> None:
+    spec = row["spec"]
+    values: dict[str, Any] = spec | {"target": spec["target"] and tuple(spec["target"])}
+    EpisodeSpec(**values)
+    for name in ("target", "color"):
+        if spec[name] not in (None, row[name]):
+            raise ValueError(f"{name}={row[name]}, but spec.{name}={spec[name]}")
+
+
+def _settings(row: Row) -> dict[str, str]:
+    opengl = [name for name in (row.get("opengl_vendor"), row.get("opengl_renderer")) if name]
+    return {
+        "MuJoCo": row.get("mujoco_version") or NOT_RECORDED,
+        "OpenGL": ", ".join(opengl) or NOT_RECORDED,
+        "render_preset": row.get("render_preset", NOT_RECORDED),
+        "tasks": _tasks_key(row),
+    }
+
+
+def _tasks_key(row: Row) -> str:
+    if row.get("task_ids") is not None:
+        return json.dumps(sorted(row["task_ids"]))
+    target, color = (row["spec"][name] for name in ("target", "color"))
+    if row["protocol_version"] == OLD_VERSION and target and color:
+        return "fixed"  # lines of one evaluation of numbered tasks do not tell those of the others
+    return json.dumps([target, color])
+
+
+def _describe_simulator(settings: Mapping[str, str]) -> str:
+    return (
+        f"render_preset {settings['render_preset']}, OpenGL {settings['OpenGL']}, MuJoCo {settings['MuJoCo']}"
+    )
+
+
+def _describe_tasks(rows: list[Row]) -> str:
+    """'tasks 0, 12', or target and colour, each fixed or drawn."""
+    first = rows[0]
+    if first.get("task_ids") is not None:
+        return f"tasks {describe_numbers(first['task_ids'])}"
+    target, color = (first["spec"][name] for name in ("target", "color"))
+    if target and color:
+        return f"tasks {describe_numbers(task_id(row['target'], row['color']) for row in rows)}"
+    target = "drawn" if target is None else f"row {target[0]}, column {target[1]}"
+    return f"target {target}; colour {color or 'drawn'}"
+
+
+BOMB_LINES = ResultKind(
+    env_type="bomb",
+    fields={OLD_VERSION: CHECKS, PROTOCOL_VERSION: CHECKS | NEW_CHECKS},
+    spec_fields=SPEC_CHECKS,
+    check_episode=_check_episode,
+    drawn=("target", "color"),
+    settings=_settings,
+    describe_simulator=_describe_simulator,
+    describe_tasks=_describe_tasks,
+    measures=[Measure("placement error", _placement_error, "median of the stones that were put down")],
+)

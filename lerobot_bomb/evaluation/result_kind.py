@@ -1,0 +1,72 @@
+"""What lines of results of one environment are; how they are read and compared is the same for all."""
+
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import dataclass
+
+from lerobot_bomb.envs.results import Row
+from lerobot_bomb.evaluation.line_checks import Check, check_fields, refuse_others
+
+NOT_RECORDED = "not recorded"
+MAX_RUNS = 10  # of numbers, in a heading
+
+type Pair = tuple[Row, Row]  # the same episode unperturbed and perturbed
+
+
+@dataclass(frozen=True)
+class Measure:
+    """A figure of episodes beside their rate of success."""
+
+    name: str
+    value: Callable[[list[Row]], str]  # with its unit
+    note: str = ""  # what it is of
+
+
+@dataclass(frozen=True)
+class ResultKind:
+    """Lines of one environment: how they are known, what each must say, and what they say together."""
+
+    env_type: str
+    # {protocol version: what its lines must say}, the oldest first; it is how lines are known, so no two
+    # environments share one
+    fields: Mapping[str, Mapping[str, Check]]
+    spec_fields: Mapping[str, Check]
+    # raises a ValueError unless there can be such an episode, whose fields are possible one by one
+    check_episode: Callable[[Row], None]
+    # what of a spec may differ between episodes that are pooled, beside seed and perturbations
+    drawn: tuple[str, ...]
+    # what must be equal in episodes that are pooled, beside spec, policy, protocol and size of images
+    settings: Callable[[Row], dict[str, str]]
+    # of these settings, what simulated and drew
+    describe_simulator: Callable[[Mapping[str, str]], str]
+    describe_tasks: Callable[[list[Row]], str]
+    measures: Sequence[Measure]
+    # what perturbations changed in pairs, beside successes
+    describe_change: Callable[[list[Pair]], str] | None = None
+
+    def check(self, row: Row) -> None:
+        """Raise a ValueError that names a field of a line which is missing or impossible."""
+        check_fields(row, self.fields[row["protocol_version"]])
+
+    def check_spec(self, row: Row) -> None:
+        """Raise a ValueError unless a line is of an episode that there can be."""
+        check_fields(row["spec"], self.spec_fields, "spec.")
+        refuse_others(row["spec"], self.spec_fields)
+        self.check_episode(row)
+
+    def missing_fields(self, version: str) -> list[str]:
+        """Of lines of the newest protocol, what those of another version do not have."""
+        *_, newest = self.fields.values()
+        return [name for name in newest if name not in self.fields[version]]
+
+
+def describe_numbers(numbers: Iterable[int]) -> str:
+    """{0, 1, 2, 7} -> '0..2, 7'; of many runs, the first and the last number."""
+    runs: list[list[int]] = []
+    for number in sorted(set(numbers)):
+        if runs and number == runs[-1][-1] + 1:
+            runs[-1].append(number)
+        else:
+            runs.append([number])
+    if len(runs) > MAX_RUNS:
+        return f"{runs[0][0]}..{runs[-1][-1]}, with gaps"
+    return ", ".join(str(run[0]) if len(run) == 1 else f"{run[0]}..{run[-1]}" for run in runs)
