@@ -129,6 +129,7 @@ def test_the_simulator_imports_nothing_heavy(path: Path) -> None:
         "bomb/observation.py",
         "bomb/expert.py",
         "envs/results.py",
+        "envs/episode_env.py",
         "envs/perturbation.py",
         "envs/pusht_results.py",
         "pusht/episode.py",

@@ -1,12 +1,9 @@
 """BOMB as a Gymnasium environment."""
 
-from copy import deepcopy
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Any
 
-import gymnasium
 import numpy as np
-from gymnasium.error import ResetNeeded
 
 from lerobot_bomb.bomb.episode import DEFAULT_FPS, PHYSICS_HZ, EpisodeSpec
 from lerobot_bomb.bomb.judge import Judge
@@ -21,7 +18,8 @@ from lerobot_bomb.bomb.observation import (
 )
 from lerobot_bomb.bomb.privileged_state import PrivilegedState
 from lerobot_bomb.bomb.suite import find_suite
-from lerobot_bomb.envs.results import EpisodeResult, PolicyIdentity, write_result
+from lerobot_bomb.envs.episode_env import EpisodeEnv, Observation, Transition
+from lerobot_bomb.envs.results import EpisodeResult, PolicyIdentity
 from lerobot_env_bomb.actuator import Actuator
 from lerobot_env_bomb.axes.dynamics import Dynamics
 from lerobot_env_bomb.fetch_files import check_robot
@@ -30,7 +28,6 @@ from lerobot_env_bomb.render import CameraRenderer, compose_caption, extrinsics,
 from lerobot_env_bomb.scene import Scene
 from lerobot_env_bomb.spaces import action_space, observation_space
 
-Observation = dict[str, Any]
 DEFAULT_SPEC = EpisodeSpec(seed=0)
 DEFAULT_RENDER_OPTIONS = RenderOptions()
 PERSON_IMAGE_SIZE = 384  # pixels, either half of render()'s image
@@ -46,7 +43,7 @@ class _Run:
     actuator: Actuator
 
 
-class BombEnv(gymnasium.Env[Observation, np.ndarray]):
+class BombEnv(EpisodeEnv[EpisodeSpec, _Run, EpisodeResult]):
     """Task: place a Go stone on the intersection that an instruction names by row and column.
 
     Randomizations: target (always free and legal), colour, instruction, 0-8 stones on the board, gripper
@@ -55,7 +52,7 @@ class BombEnv(gymnasium.Env[Observation, np.ndarray]):
 
     Action: float32 (4,). Relative: x, y, z in units of MAX_STEP_M per control step from where the
     gripper is; absolute: x, y, z in metres. The fourth opens the fingers at >= 0 and closes them below.
-    Once an episode has ended, `step` changes nothing until `reset`, and its reward is 0.
+    One outside the action space is clipped.
     """
 
     metadata = {"render_modes": ["rgb_array"], "render_fps": DEFAULT_FPS}  # noqa: RUF012
@@ -72,40 +69,20 @@ class BombEnv(gymnasium.Env[Observation, np.ndarray]):
         suite = find_suite(spec.suite)
         suite.check(spec)
         check_robot(spec)
-        if render_mode not in (None, *self.metadata["render_modes"]):
-            raise ValueError(f"render_mode={render_mode!r} is unknown; choose rgb_array or None")
+        super().__init__(spec, spec.suite, results_path, render_mode)
         self._num_substeps = PHYSICS_HZ // spec.fps
         self.metadata = {"render_modes": ["rgb_array"], "render_fps": spec.fps}
-        self.render_mode = render_mode
-        self.task = spec.suite
-        self.task_description = ""
         self._max_episode_steps = round(suite.max_steps * spec.fps / DEFAULT_FPS)
-        self._spec = spec
         self._render_options = render_options
-        self._results_path = results_path
         self._task_ids, self._policy = task_ids, policy
         self.action_space = action_space(spec.control_mode)
         self._action_low, self._action_high = self.action_space.low, self.action_space.high
         self.observation_space = observation_space(render_options, suite.num_goals)
-        self._current_run: _Run | None = None
         self._now: Snapshot  # measured after the last control step
         self._renderer: CameraRenderer | None = None
-        self._steps = 0
-        self._last_transition: tuple | None = None
 
-    def reset(
-        self, *, seed: int | None = None, options: dict[str, Any] | None = None
-    ) -> tuple[Observation, dict[str, Any]]:
-        """Start an episode: of `seed`, else of the spec's seed at first, else of a fresh one.
-
-        `options` has no effect; vector environments pass theirs on.
-        """
-        if seed is None and self._current_run is None:
-            seed = self._spec.seed
-        super().reset(seed=seed)
-        if seed is None:
-            seed = int(self.np_random.integers(2**31))
-        episode = sample_episode(replace(self._spec, seed=int(seed)))
+    def _begin(self, spec: EpisodeSpec) -> tuple[Observation, dict[str, Any]]:
+        episode = sample_episode(spec)
         scene = self._current_run.scene if self._current_run is not None else Scene(self._spec.robot)
         scene.reset(episode.layout, episode.perturbation.model_edits)
         self._now = start = scene.measure()
@@ -117,40 +94,20 @@ class BombEnv(gymnasium.Env[Observation, np.ndarray]):
             actuator=Actuator(self._spec.control_mode, start.gripper_xyz, dynamics, episode.spec.seed),
         )
         self.task_description = episode.instruction
-        self._steps = 0
-        self._last_transition = None
         return self._observe(), self._info()
 
-    def step(self, action: np.ndarray) -> tuple[Observation, float, bool, bool, dict[str, Any]]:
-        """Run one control step. An action outside the action space is clipped."""
-        run = self._run
-        action = self._check(action)
-        if self._last_transition is not None:
-            return deepcopy(self._last_transition)
+    def _advance(self, run: _Run, action: np.ndarray) -> Transition:
         target_xyz, open_fingers = run.actuator.command(action, self._now.gripper_xyz)
         run.scene.move(target_xyz, open_fingers, self._num_substeps)
         self._now = run.scene.measure()
-        self._steps += 1
         terminated = run.judge.update(self._now)
         truncated = not terminated and self._steps >= self._max_episode_steps
         if truncated:
             run.judge.time_out()
-        transition = (self._observe(), float(run.judge.is_success), terminated, truncated, self._info())
-        if terminated or truncated:
-            self._last_transition = deepcopy((transition[0], 0.0, *transition[2:]))
-            if self._results_path is not None:
-                write_result(self._results_path, self.episode_result(), run.episode.spec.seed)
-        return transition
+        return self._observe(), float(run.judge.is_success), terminated, truncated, self._info()
 
-    def render(self) -> np.ndarray | None:
-        """(H, W, 3) uint8 image for people: both cameras, the instruction, how the episode stands.
-
-        None, and a warning, in an environment that was made with render_mode=None.
-        """
-        run = self._run
-        if self.render_mode is None:
-            gymnasium.logger.warn("render() draws nothing: make the environment with render_mode='rgb_array'")
-            return None
+    def _draw_for_people(self, run: _Run) -> np.ndarray:
+        """Both cameras, the instruction, how the episode stands."""
         images = [self._draw(camera, PERSON_IMAGE_SIZE) for camera in CAMERAS]
         row, column = run.episode.target
         error_mm = run.judge.placement_error_mm
@@ -159,11 +116,8 @@ class BombEnv(gymnasium.Env[Observation, np.ndarray]):
         status = f"target row {row}, column {column}   error {error_mm:.0f} mm   {outcome}"
         return compose_caption(images, [run.episode.instruction, status])
 
-    def episode_result(self) -> EpisodeResult:
-        """What became of the episode that has just ended."""
-        if self._last_transition is None:
-            raise ResetNeeded("the episode has not ended yet")
-        episode, judge = self._run.episode, self._run.judge
+    def _result(self, run: _Run) -> EpisodeResult:
+        episode, judge = run.episode, run.judge
         return EpisodeResult(
             spec=episode.spec,
             instruction=episode.instruction,
@@ -219,12 +173,6 @@ class BombEnv(gymnasium.Env[Observation, np.ndarray]):
                 "functools.partial(BombEnv, spec); the same seed replays the episode"
             )
         return self.__dict__.copy()
-
-    @property
-    def _run(self) -> _Run:
-        if self._current_run is None:
-            raise ResetNeeded("call reset before anything else")
-        return self._current_run
 
     def _check(self, action: np.ndarray) -> np.ndarray:
         """(4,) float64 within the action space."""

@@ -1,0 +1,112 @@
+"""What our environments do alike: episodes from seeds, steps after the end, a line of results at the end.
+
+Simulator workers import this module, so it imports neither torch nor LeRobot.
+"""
+
+from abc import ABC, abstractmethod
+from copy import deepcopy
+from dataclasses import replace
+from typing import Any
+
+import gymnasium
+import numpy as np
+from gymnasium.error import ResetNeeded
+
+from lerobot_bomb.envs.results import ResultLine, write_result
+
+type Observation = dict[str, Any]
+type Transition = tuple[Observation, float, bool, bool, dict[str, Any]]
+
+
+class EpisodeEnv[SpecT: Any, RunT, ResultT: ResultLine](gymnasium.Env[Observation, np.ndarray], ABC):
+    """Episodes that a frozen spec with a `seed` determines.
+
+    Once an episode has ended, `step` changes nothing until `reset`, and its reward is 0.
+    """
+
+    metadata = {"render_modes": ["rgb_array"]}  # noqa: RUF012
+
+    def __init__(self, spec: SpecT, task: str, results_path: str | None, render_mode: str | None):
+        if render_mode not in (None, *self.metadata["render_modes"]):
+            raise ValueError(f"render_mode={render_mode!r} is unknown; choose rgb_array or None")
+        self.render_mode = render_mode
+        self.task = task
+        self.task_description = ""
+        self._spec = spec
+        self._results_path = results_path
+        self._current_run: RunT | None = None  # what exists once an episode has been started
+        self._seed: int = spec.seed  # of the episode
+        self._steps = 0
+        self._last_transition: Transition | None = None
+
+    def reset(
+        self, *, seed: int | None = None, options: dict[str, Any] | None = None
+    ) -> tuple[Observation, dict[str, Any]]:
+        """Start an episode: of `seed`, else of the spec's seed at first, else of a fresh one.
+
+        `options` has no effect; vector environments pass theirs on.
+        """
+        if seed is None and self._current_run is None:
+            seed = self._spec.seed
+        super().reset(seed=seed)
+        self._seed = int(self.np_random.integers(2**31) if seed is None else seed)
+        self._steps = 0
+        self._last_transition = None
+        return self._begin(replace(self._spec, seed=self._seed))
+
+    def step(self, action: np.ndarray) -> Transition:
+        """Run one control step."""
+        run = self._run
+        action = self._check(action)
+        if self._last_transition is not None:
+            return deepcopy(self._last_transition)
+        self._steps += 1
+        observation, reward, terminated, truncated, info = self._advance(run, action)
+        if terminated or truncated:
+            self._last_transition = deepcopy((observation, 0.0, terminated, truncated, info))
+            if self._results_path is not None:
+                write_result(self._results_path, self.episode_result(), self._seed)
+        return observation, reward, terminated, truncated, info
+
+    def render(self) -> np.ndarray | None:
+        """(H, W, 3) uint8 image for people.
+
+        None, and a warning, in an environment that was made with render_mode=None.
+        """
+        run = self._run
+        if self.render_mode is None:
+            gymnasium.logger.warn("render() draws nothing: make the environment with render_mode='rgb_array'")
+            return None
+        return self._draw_for_people(run)
+
+    def episode_result(self) -> ResultT:
+        """What became of the episode that has just ended."""
+        if self._last_transition is None:
+            raise ResetNeeded("the episode has not ended yet")
+        return self._result(self._run)
+
+    @property
+    def _run(self) -> RunT:
+        if self._current_run is None:
+            raise ResetNeeded("call reset before anything else")
+        return self._current_run
+
+    @abstractmethod
+    def _begin(self, spec: SpecT) -> tuple[Observation, dict[str, Any]]:
+        """Start the spec's episode as `_current_run`; its first observation and info."""
+
+    @abstractmethod
+    def _check(self, action: np.ndarray) -> np.ndarray:
+        """The action as it is executed; a ValueError if it is none."""
+
+    @abstractmethod
+    def _advance(self, run: RunT, action: np.ndarray) -> Transition:
+        """Simulate a step, the `_steps`-th."""
+
+    @abstractmethod
+    def _draw_for_people(self, run: RunT) -> np.ndarray:
+        """(H, W, 3) uint8."""
+
+    @abstractmethod
+    def _result(self, run: RunT) -> ResultT:
+        """Of an episode that has ended."""
