@@ -26,8 +26,8 @@ CORE = "lerobot_bomb"
 ORDER = [
     "__init__", "_compat", "finite", "flag_errors", "flags", "conditions", "stats", "tables", "files",
     "cuda_graphs",
-    "bomb", "pusht", "envs", "actions", "flow", "vlm", "decoding", "training", "data", "checkpoints",
-    "evaluation", "viewing", "explain", "hub", "policies", "serving", "commands",
+    "bomb", "pusht", "libero", "envs", "actions", "flow", "vlm", "decoding", "training", "data",
+    "checkpoints", "evaluation", "viewing", "explain", "hub", "policies", "serving", "commands",
 ]  # fmt: skip
 
 
@@ -133,6 +133,7 @@ def test_the_simulator_imports_nothing_heavy(path: Path) -> None:
         "envs/perturbation.py",
         "envs/pusht_results.py",
         "pusht/episode.py",
+        "libero/assets.py",
         "envs/vector.py",
         "files.py",
         "stats.py",

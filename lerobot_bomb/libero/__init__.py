@@ -1,0 +1,1 @@
+"""LIBERO: where its files are."""
