@@ -1,7 +1,7 @@
 """``lerobot-bomb gallery``: what each perturbation axis does, as one contact sheet per axis."""
 
 import argparse
-from collections.abc import Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from importlib.util import find_spec
 from pathlib import Path
@@ -20,29 +20,36 @@ from lerobot_bomb.conditions import ALL, MAX_LEVEL, NONE, Axis, nuisances_of
 from lerobot_bomb.envs.rollout import expert_agent, make_env, play
 from lerobot_bomb.files import written_whole
 from lerobot_bomb.flags import flags_without_group, one_of
+from lerobot_bomb.libero.assets import prepare_libero
+from lerobot_bomb.libero.episode import LiberoSpec
+from lerobot_bomb.libero.perturbations import LIBERO_AXES
 from lerobot_bomb.pusht.episode import PUSHT_EXTRA, PushTSpec
 from lerobot_bomb.pusht.perturbations import PUSHT_AXES
 from lerobot_bomb.viewing.perturbations_page import write_page
 from lerobot_bomb.viewing.sheet import FONT_SIZE, GAP, INK, TILE_PAPER, Sheet, font, text_tile
 
 SHEETS = (*AXES, ALL)
-PUSHT_SHEETS = (*PUSHT_AXES, ALL)
-SHEETS_OF = {"bomb": SHEETS, "bomb_pusht": PUSHT_SHEETS}  # by --env.type
+AXES_OF = {"bomb": AXES, "bomb_pusht": PUSHT_AXES, "bomb_libero": LIBERO_AXES}  # by --env.type
 PUSHT_ENV_ID = "lerobot_env_bomb_pusht:bomb_pusht/PushT-v0"
+LIBERO_ENV_ID = "lerobot_env_bomb_libero:bomb_libero/Libero-v0"
 PUSHED_STEPS = 6  # through the block, for what `dynamics` does
+LIBERO_TASK = "libero_spatial"  # whose first task the sheets show
+LIBERO_ACTIONS = [[0.5, 0.0, -0.8, 0.0, 0.0, 0.0, -1.0]] * 12  # forwards and down
 LEVELS = range(MAX_LEVEL + 1)
 COLUMNS = ["nominal", *(f"level {level}" for level in LEVELS[1:])]
 DEFAULT_SEEDS = (2, 3)
 DEFAULT_TILE_SIZE = 144  # pixels
 DEFAULT_FOLDER = Path("outputs/gallery")
 JPEG_QUALITY = 88
+# (condition, seed, pixels of a side, what it changes) -> {name: (S, S, 3) uint8}
+type TilesOf = Callable[[str, int, int, set[str]], dict[str, np.ndarray]]
 GRID_RGB, NOMINAL_RGB, PATH_RGB = (200, 185, 160), (165, 165, 165), (210, 40, 30)
 
 
 def add_gallery_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the arguments of ``lerobot-bomb gallery``."""
     add = parser.add_argument
-    add("--env.type", dest="env_type", default="bomb", help=f"{' or '.join(SHEETS_OF)} (default: bomb)")
+    add("--env.type", dest="env_type", default="bomb", help=f"{', '.join(AXES_OF)} (default: bomb)")
     add("--axes", type=_parse_names, help="as camera,light (default: every axis and all)")
     add("--seeds", type=parse_numbers, default=DEFAULT_SEEDS, help="episodes (default: 2,3)")
     add("--image_size", type=int, default=DEFAULT_TILE_SIZE, help="pixels of a tile (default: %(default)s)")
@@ -57,15 +64,17 @@ def add_gallery_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run_gallery(args: argparse.Namespace) -> int:
     """Draw the sheets and print their paths."""
-    one_of("--env.type", args.env_type, SHEETS_OF)
-    axes = args.axes or SHEETS_OF[args.env_type]
+    one_of("--env.type", args.env_type, AXES_OF)
+    sheets = (*AXES_OF[args.env_type], ALL)
+    axes = args.axes or sheets
     for axis in axes:
-        one_of("--axes", axis, SHEETS_OF[args.env_type])
-    is_pusht = args.env_type == "bomb_pusht"
-    if is_pusht and args.doc is not None:
+        one_of("--axes", axis, sheets)
+    if args.env_type != "bomb" and args.doc is not None:
         raise ValueError(f"--doc={args.doc} is written for --env.type=bomb only; drop one of them")
-    if is_pusht and find_spec("gym_pusht") is None:
+    if args.env_type == "bomb_pusht" and find_spec("gym_pusht") is None:
         raise ValueError(f"--env.type={args.env_type} needs gym-pusht: pip install '{PUSHT_EXTRA}'")
+    if args.env_type == "bomb_libero":
+        prepare_libero([LIBERO_TASK])
     if args.output.exists() and not args.output.is_dir():
         raise ValueError(f"--output={args.output} is no folder; name another")
     with flags_without_group({"--seed=": "--seeds: "}):
@@ -74,10 +83,12 @@ def run_gallery(args: argparse.Namespace) -> int:
             EpisodeSpec(seed)
     for axis in tqdm(axes, unit="sheet"):
         path = args.output / f"{axis}.jpg"
-        if is_pusht:
-            sheet = pusht_sheet(axis, args.seeds, args.image_size)
-        else:
+        if args.env_type == "bomb":
             sheet = axis_sheet(axis, args.seeds, options)
+        else:
+            sheet = tiles_sheet(
+                AXES_OF[args.env_type], TILES_OF[args.env_type], axis, args.seeds, args.image_size
+            )
         image = sheet.draw()
         with written_whole(path) as (unfinished,):
             Image.fromarray(image).save(unfinished, quality=JPEG_QUALITY)
@@ -123,32 +134,66 @@ def axis_sheet(axis: str, seeds: Sequence[int], options: RenderOptions) -> Sheet
     return Sheet(f"{axis}: {summary}", COLUMNS, {} if axis == ALL else magnitude_rows(AXES[axis]), images)
 
 
-def pusht_sheet(axis: str, seeds: Sequence[int], image_size: int) -> Sheet:
-    """The same of PushT; what dynamics do is seen after some steps through the block."""
-    axes = nuisances_of(PUSHT_AXES) if axis == ALL else (axis,)
-    changes = {change for name in axes for change in PUSHT_AXES[name].changes}
-    summary = "every axis but goal_marker" if axis == ALL else PUSHT_AXES[axis].summary
+def tiles_sheet(
+    table: Mapping[str, Axis], tiles_of: TilesOf, axis: str, seeds: Sequence[int], image_size: int
+) -> Sheet:
+    """The same of another environment, whose axes are a table; a row for each kind of tile, per seed."""
+    axes = nuisances_of(table) if axis == ALL else (axis,)
+    helps = ", ".join(sorted(table.keys() - set(nuisances_of(table))))
+    changes = {change for name in axes for change in table[name].changes}
+    summary = f"every axis{f' but {helps}' if helps else ''}" if axis == ALL else table[axis].summary
     images: dict[str, list[np.ndarray]] = {}
     for seed in seeds:
         for level in LEVELS:
-            spec = PushTSpec(seed, perturbations=f"{axis}:{level}")
-            env = gymnasium.make(PUSHT_ENV_ID, disable_env_checker=True, spec=spec, image_size=image_size)
-            observation, info = env.reset(seed=seed)
-            tiles = {}
-            if "images" in changes:
-                tiles["start"] = observation["pixels"]
-            if "instruction" in changes:
-                tiles["instruction"] = text_tile(env.get_wrapper_attr("task_description"), image_size)
-            if "dynamics" in changes:
-                beyond = np.clip(2 * info["block_pose"][:2] - info["pos_agent"], 40, 470)
-                for _ in range(PUSHED_STEPS):
-                    observation, *_ = env.step(beyond)
-                tiles[f"after {PUSHED_STEPS} steps"] = observation["pixels"]
+            tiles = tiles_of(f"{axis}:{level}" if level else NONE, seed, image_size, changes)
             for name, tile in tiles.items():
                 images.setdefault(f"{name}, seed {seed}", []).append(tile)
-            env.close()
-    rows = {} if axis == ALL else magnitude_rows(PUSHT_AXES[axis])
+    rows = {} if axis == ALL else magnitude_rows(table[axis])
     return Sheet(f"{axis}: {summary}", COLUMNS, rows, images)
+
+
+def pusht_tiles(condition: str, seed: int, image_size: int, changes: set[str]) -> dict[str, np.ndarray]:
+    """What dynamics do is seen after some steps through the block."""
+    spec = PushTSpec(seed, perturbations=condition)
+    env = gymnasium.make(PUSHT_ENV_ID, disable_env_checker=True, spec=spec, image_size=image_size)
+    observation, info = env.reset(seed=seed)
+    tiles = {}
+    if "images" in changes:
+        tiles["start"] = observation["pixels"]
+    if "instruction" in changes:
+        tiles["instruction"] = text_tile(env.get_wrapper_attr("task_description"), image_size)
+    if "dynamics" in changes:
+        beyond = np.clip(2 * info["block_pose"][:2] - info["pos_agent"], 40, 470)
+        for _ in range(PUSHED_STEPS):
+            observation, *_ = env.step(beyond)
+        tiles[f"after {PUSHED_STEPS} steps"] = observation["pixels"]
+    env.close()
+    return tiles
+
+
+def libero_tiles(condition: str, seed: int, image_size: int, changes: set[str]) -> dict[str, np.ndarray]:
+    """Both cameras upright; what dynamics do is seen after the same actions."""
+    env = gymnasium.make(
+        LIBERO_ENV_ID,
+        disable_env_checker=True,
+        spec=LiberoSpec(seed, LIBERO_TASK, perturbations=condition),
+        scene={"observation_height": image_size, "observation_width": image_size},
+    )
+    observation, _ = env.reset(seed=seed)
+    tiles = {}
+    if "images" in changes:
+        tiles |= {name: image[::-1, ::-1] for name, image in observation["pixels"].items()}
+    if "instruction" in changes:
+        tiles["instruction"] = text_tile(env.get_wrapper_attr("task_description"), image_size)
+    if "dynamics" in changes:
+        for action in LIBERO_ACTIONS:
+            observation, *_ = env.step(np.array(action, np.float32))
+        tiles[f"after {len(LIBERO_ACTIONS)} steps"] = observation["pixels"]["image"][::-1, ::-1]
+    env.close()
+    return tiles
+
+
+TILES_OF: dict[str, TilesOf] = {"bomb_pusht": pusht_tiles, "bomb_libero": libero_tiles}
 
 
 def look_at(condition: str, seeds: Sequence[int], options: RenderOptions, played: bool) -> list[Look]:

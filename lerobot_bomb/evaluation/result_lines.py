@@ -5,6 +5,7 @@ from pathlib import Path
 
 from lerobot_bomb.envs.results import Row
 from lerobot_bomb.evaluation.bomb_lines import BOMB_LINES
+from lerobot_bomb.evaluation.libero_lines import LIBERO_LINES
 from lerobot_bomb.evaluation.line_checks import (
     Check,
     check_fields,
@@ -16,7 +17,7 @@ from lerobot_bomb.evaluation.line_checks import (
 from lerobot_bomb.evaluation.pusht_lines import PUSHT_LINES
 from lerobot_bomb.evaluation.result_kind import ResultKind
 
-KINDS = (BOMB_LINES, PUSHT_LINES)
+KINDS = (BOMB_LINES, PUSHT_LINES, LIBERO_LINES)
 KIND_OF_VERSION = {version: kind for kind in KINDS for version in kind.fields}
 
 POLICY_CHECKS: dict[str, Check] = {

@@ -1,1 +1,1 @@
-"""LIBERO: where its files are."""
+"""What the env type `bomb_libero` is: its axes, its episodes, why they fail; numpy only, no simulator."""

@@ -2,6 +2,7 @@
 
 import lerobot_bomb.explain.interventions  # noqa: F401
 import lerobot_env_bomb.configuration_bomb  # noqa: F401
+import lerobot_env_bomb_libero.configuration_bomb_libero  # noqa: F401
 import lerobot_env_bomb_pusht.configuration_bomb_pusht  # noqa: F401
 import lerobot_policy_bomb_expert  # noqa: F401
 import lerobot_policy_bomb_random  # noqa: F401

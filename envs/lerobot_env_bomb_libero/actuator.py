@@ -1,0 +1,27 @@
+"""From a policy's action to the arm's: latency and noise."""
+
+from collections import deque
+
+import numpy as np
+from lerobot.envs.libero import get_libero_dummy_action
+
+from lerobot_bomb.bomb.streams import Stream, generator
+from lerobot_bomb.libero.episode import MOTION_DIMS
+from lerobot_env_bomb_libero.axes.dynamics import LiberoDynamics
+
+
+class LiberoActuator:
+    """What executes actions in one episode under `dynamics`; until the first arrives, the arm holds still."""
+
+    def __init__(self, dynamics: LiberoDynamics, seed: int):
+        self._noise = dynamics.noise
+        self._rng = generator(seed, Stream.ACTUATOR_NOISE)
+        self._pending = deque([np.array(get_libero_dummy_action(), np.float32)] * dynamics.latency)
+
+    def command(self, action: np.ndarray) -> np.ndarray:
+        """(7,) action -> (7,) what the arm is told now."""
+        self._pending.append(action)
+        command = self._pending.popleft().astype(np.float32)
+        noise = self._noise * self._rng.standard_normal(MOTION_DIMS)
+        command[:MOTION_DIMS] = np.clip(command[:MOTION_DIMS] + noise, -1, 1)
+        return command

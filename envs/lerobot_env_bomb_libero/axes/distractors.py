@@ -1,0 +1,113 @@
+# pyright: reportAttributeAccessIssue=false
+"""Perturbation axis `distractors`: bodies beside the objects, which nothing is said about."""
+
+from dataclasses import dataclass
+from typing import Any, Self
+from xml.etree import ElementTree
+
+import numpy as np
+
+from lerobot_bomb.conditions import MAX_LEVEL
+from lerobot_bomb.libero.perturbations import libero_magnitude
+from lerobot_env_bomb.axes.rotations import matrix_of
+from lerobot_env_bomb.mujoco_gl import mujoco
+from lerobot_env_bomb_libero.scene import CAMERAS, LiberoScene, LiberoTransform
+
+MAX_COUNT = int(libero_magnitude("distractors", "count", MAX_LEVEL))
+SHAPES = ("box", "cylinder", "sphere")
+HALF_SIZE_M = 0.022
+RGB = ((0.9, 0.5, 0.1), (0.5, 0.2, 0.7), (0.1, 0.6, 0.6), (0.9, 0.3, 0.6), (0.35, 0.6, 0.15))
+CLEARANCE_M = 0.05  # from objects, fixtures and the gripper
+PATH_M = 0.09  # from the straight lines between what the task is about, and to it from the gripper
+REACH_M = 0.34  # from the middle of the table along x and y
+SPACING_M = 0.04  # of the places that are tried
+ABOVE_M = 2.0  # from where a place is looked for downwards
+IN_VIEW = 0.8  # of the image of the scene's camera, in whose middle they are
+
+
+@dataclass(frozen=True)
+class Distractors(LiberoTransform):
+    """Bodies that stand fast; one more at each level, the others where they were."""
+
+    count: int
+    order: tuple[float, ...]  # of the places that are free, a number for each that is tried
+    colors: tuple[int, ...]
+    shapes: tuple[int, ...]
+
+    @classmethod
+    def draw(cls, level: int, rng: np.random.Generator, nominal: Any) -> Self:
+        return cls(
+            count=int(libero_magnitude("distractors", "count", level)),
+            order=tuple(rng.random(len(_places())).tolist()),
+            colors=tuple(rng.permutation(len(RGB)).tolist()),
+            shapes=tuple(rng.integers(len(SHAPES), size=MAX_COUNT).tolist()),
+        )
+
+    @classmethod
+    def add_bodies(cls, worldbody: ElementTree.Element) -> None:
+        for number in range(MAX_COUNT):
+            body = ElementTree.SubElement(worldbody, "body", name=f"distractor{number}", pos="0 0 0.5")
+            for shape in SHAPES:
+                ElementTree.SubElement(
+                    body, "geom", name=f"distractor{number}_{shape}", type=shape,
+                    size=" ".join([str(HALF_SIZE_M)] * {"box": 3, "cylinder": 2, "sphere": 1}[shape]),
+                    rgba="0 0 0 0", group="1", contype="0", conaffinity="0", mass="0",
+                )  # fmt: skip
+
+    def arrange(self, scene: LiberoScene) -> None:
+        model = scene.model
+        mujoco.mj_forward(model, scene.data)
+        free: list[np.ndarray] = []
+        for place in _places()[np.argsort(self.order)]:
+            spot = _spot_on_table(scene, place)
+            if spot is not None and all(np.linalg.norm(spot - other) > 4 * HALF_SIZE_M for other in free):
+                free.append(spot)
+            if len(free) == self.count:
+                break
+        for number, spot in enumerate(free):
+            geom = model.geom(f"distractor{number}_{SHAPES[self.shapes[number]]}")
+            model.body_pos[model.body(f"distractor{number}").id] = spot + np.array([0, 0, HALF_SIZE_M])
+            geom.rgba[:] = *RGB[self.colors[number]], 1
+            geom.contype[:] = geom.conaffinity[:] = 1
+
+
+def _places() -> np.ndarray:
+    """(n, 2) metres, x and y."""
+    line = np.arange(-REACH_M, REACH_M + 1e-9, SPACING_M)
+    return np.stack(np.meshgrid(line, line, indexing="ij"), -1).reshape(-1, 2)
+
+
+def _spot_on_table(scene: LiberoScene, place: np.ndarray) -> np.ndarray | None:
+    """(3,) the point of table or floor there, in view and out of the way; None: there is none."""
+    model, data = scene.model, scene.data
+    geom = np.zeros((1,), np.int32)
+    start = np.array([*place, ABOVE_M])
+    depth_m = mujoco.mj_ray(model, data, start, np.array([0.0, 0.0, -1.0]), None, 1, -1, geom)
+    if depth_m < 0 or scene.owners[model.geom_bodyid[geom[0]]] != 0:
+        return None
+    spot = start - np.array([0, 0, depth_m])
+    surface_m = min(box[0, 2] for box in scene.boxes().values())  # what stands lowest stands on it
+    if abs(spot[2] - surface_m) > CLEARANCE_M or not _is_seen(scene, spot):
+        return None
+    gap = HALF_SIZE_M + CLEARANCE_M
+    for low, high in scene.boxes().values():
+        if (place > low[:2] - gap).all() and (place < high[:2] + gap).all():
+            return None
+    ends = [scene.data.xpos[body][:2] for body in scene.wanted_bodies()] + [scene.gripper_xyz()[:2]]
+    near = (_distance_m(place, one, other) for one in ends for other in ends)
+    return None if any(distance_m < PATH_M for distance_m in near) else spot
+
+
+def _is_seen(scene: LiberoScene, spot: np.ndarray) -> bool:
+    camera = scene.model.camera(CAMERAS[0]).id
+    pose = matrix_of(scene.model.cam_quat[camera])
+    right, up, backward = (spot - scene.model.cam_pos[camera]) @ pose
+    slope = np.tan(np.radians(scene.model.cam_fovy[camera]) / 2) * IN_VIEW
+    return bool(max(abs(right), abs(up)) < -backward * slope)
+
+
+def _distance_m(point: np.ndarray, one: np.ndarray, other: np.ndarray) -> float:
+    """From a point to the line between two, (2,) each."""
+    along = other - one
+    share = np.clip((point - one) @ along / max(float(along @ along), 1e-12), 0, 1)
+    return float(np.linalg.norm(point - one - share * along))

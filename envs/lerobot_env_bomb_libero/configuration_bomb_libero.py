@@ -1,0 +1,109 @@
+"""LeRobot's env type ``bomb_libero``."""
+
+from dataclasses import dataclass
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+from lerobot.envs import EnvConfig
+from lerobot.envs.configs import LiberoEnv
+
+from lerobot_bomb.checkpoints.identity import policy_of_results
+from lerobot_bomb.envs.results import check_results_path
+from lerobot_bomb.envs.vector import LazyVectorEnv
+from lerobot_bomb.flag_errors import flag_errors
+from lerobot_bomb.flags import one_of
+from lerobot_bomb.libero.assets import SUITES, prepare_libero
+from lerobot_bomb.libero.episode import TASKS_PER_SUITE, LiberoSpec
+from lerobot_bomb.libero.perturbations import LiberoCondition
+
+CONTROL_MODES = ("relative", "absolute")
+
+
+@EnvConfig.register_subclass("bomb_libero")
+@dataclass
+class BombLiberoEnvConfig(LiberoEnv):
+    """Flags of ``--env.type=bomb_libero``: LeRobot's of `libero`, conditions and a file of results."""
+
+    # a suite, or several: libero_spatial,libero_goal
+    task: str = SUITES[0]
+    # conditions, each evaluated as a group of its own: ["none","table:3","table:2+light:3","all:1-5"]
+    perturbations: list[str] | str | None = None
+    # file that gets one JSON line per finished episode: seed, success, failure class
+    results_path: str | None = None
+
+    def __post_init__(self) -> None:
+        with flag_errors():
+            # an invalid flag raises here, before anything is built
+            if not self.init_states:
+                raise ValueError(
+                    "--env.init_states=false: episodes start in the task's recorded states; drop it"
+                )
+            if self.is_libero_plus:
+                raise ValueError("--env.is_libero_plus=true: its perturbations are other ones; drop it")
+            one_of("--env.control_mode", self.control_mode, CONTROL_MODES)
+            for suite in self.suites:
+                for task_id in self._task_ids(suite):
+                    for condition in self._conditions(suite).values():
+                        self._spec(suite, task_id, condition)
+        if self.results_path is not None:
+            self.results_path = str(Path(self.results_path).expanduser())
+        super().__post_init__()
+
+    @property
+    def suites(self) -> list[str]:
+        """Names of the suites."""
+        return [name.strip() for name in str(self.task).split(",")]
+
+    def create_envs(self, n_envs: int, use_async_envs: bool = False) -> dict[str, dict[int, LazyVectorEnv]]:
+        """{suite and condition: {task: vector env of n_envs}}; no worker starts before a first reset.
+
+        Raises:
+            ValueError: LIBERO or its assets are not there, or --env.results_path cannot be written.
+        """
+        prepare_libero(self.suites)
+        from lerobot_env_bomb_libero.env import BombLiberoEnv  # imports the simulator
+
+        check_results_path(self.results_path)
+        return {
+            key: {
+                task_id: LazyVectorEnv(
+                    [partial(BombLiberoEnv, self._spec(suite, task_id, condition), **self.gym_kwargs)]
+                    * n_envs,
+                    use_async=use_async_envs and n_envs > 1,
+                    known_late=partial(policy_of_results, self.results_path),
+                )
+                for task_id in self._task_ids(suite)
+            }
+            for suite in self.suites
+            for key, condition in self._conditions(suite).items()
+        }
+
+    @property
+    def gym_kwargs(self) -> dict[str, Any]:
+        """Arguments of `BombLiberoEnv` beside the spec."""
+        scene = {
+            "camera_name": self.camera_name,
+            "camera_name_mapping": self.camera_name_mapping,
+            "control_mode": self.control_mode,
+            "control_freq": self.fps,
+            "obs_type": self.obs_type,
+            "observation_height": self.observation_height,
+            "observation_width": self.observation_width,
+        }
+        return {"scene": scene, "results_path": self.results_path, "render_mode": self.render_mode}
+
+    def _task_ids(self, suite: str) -> list[int]:
+        one_of("--env.task", suite, SUITES)
+        if self.task_ids is None:
+            return list(range(TASKS_PER_SUITE[suite]))
+        if not self.task_ids:
+            raise ValueError("--env.task_ids=[] names no task; leave it out for all")
+        return sorted(set(self.task_ids))
+
+    def _conditions(self, suite: str) -> dict[str, str]:
+        """{key of a group of results: its condition}; the suite alone where no condition is named."""
+        return LiberoCondition.groups(self.perturbations, suite)
+
+    def _spec(self, suite: str, task_id: int, condition: str) -> LiberoSpec:
+        return LiberoSpec(0, suite, task_id, self.episode_length, condition)

@@ -1,0 +1,130 @@
+"""LIBERO with BOMB's perturbation axes, as a Gymnasium environment."""
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from lerobot.envs.libero import ACTION_DIM
+
+from lerobot_bomb.envs.episode_env import EpisodeEnv, Observation, Transition
+from lerobot_bomb.envs.libero_results import LiberoResult
+from lerobot_bomb.envs.results import PolicyIdentity
+from lerobot_bomb.libero.episode import LiberoFailure, LiberoSpec, failure_of, initial_state_of
+from lerobot_bomb.libero.perturbations import LiberoCondition
+from lerobot_env_bomb_libero.actuator import LiberoActuator
+from lerobot_env_bomb_libero.axes import LIBERO_TRANSFORMS
+from lerobot_env_bomb_libero.axes.dynamics import LiberoDynamics
+from lerobot_env_bomb_libero.episode import LiberoEpisode, sample_libero_episode
+from lerobot_env_bomb_libero.scene import LiberoScene
+
+
+@dataclass(frozen=True)
+class _Run:
+    """What exists once an episode has been started."""
+
+    episode: LiberoEpisode
+    actuator: LiberoActuator | None  # None: actions are executed as they are
+    touched: set[str]  # what the gripper has met
+
+
+class BombLiberoEnv(EpisodeEnv[LiberoSpec, _Run, LiberoResult]):
+    """Task: the suite's, as LeRobot's `libero` has it.
+
+    Randomizations: which of the task's recorded initial states, by the seed. Without perturbations an
+    episode is LeRobot's of the same initial state and seed: images, states, rewards and end.
+
+    Action: (7,) -1..1, the arm's relative motion in x, y, z and orientation, and the gripper, 1 to close.
+    """
+
+    metadata = {"render_modes": ["rgb_array"], "render_fps": 80}  # noqa: RUF012
+
+    def __init__(
+        self,
+        spec: LiberoSpec,
+        scene: dict[str, Any],
+        results_path: str | None = None,
+        render_mode: str | None = "rgb_array",
+        policy: PolicyIdentity | None = None,
+    ):
+        """`scene`: arguments of LeRobot's environment beside suite and task."""
+        from libero.libero import benchmark  # slow
+
+        suite = benchmark.get_benchmark_dict()[spec.suite]()
+        on = [LIBERO_TRANSFORMS[axis] for axis, _, _ in LiberoCondition.parse(spec.perturbations).ranges]
+        self._scene = LiberoScene(
+            on,
+            task_suite=suite,
+            task_id=spec.task_id,
+            task_suite_name=spec.suite,
+            episode_length=spec.max_steps,
+            **scene,
+        )
+        super().__init__(spec, self._scene.task, results_path, render_mode)
+        self.task_description = self._instruction = self._scene.task_description
+        self._max_episode_steps = self._scene._max_episode_steps
+        self._policy = policy
+        self._is_success = False
+        self.action_space, self.observation_space = self._scene.action_space, self._scene.observation_space
+
+    def _begin(self, spec: LiberoSpec) -> tuple[Observation, dict[str, Any]]:
+        episode = sample_libero_episode(spec, self._instruction)
+        observation = self._scene.begin(spec.seed, tuple(episode.perturbation.transforms.values()))
+        dynamics = episode.perturbation.of(LiberoDynamics)
+        actuator = None if dynamics is None else LiberoActuator(dynamics, spec.seed)
+        self._current_run = _Run(episode, actuator, set())
+        self._is_success = False
+        self.task_description = episode.instruction
+        return self._sensed(observation), {"is_success": False, "failure": "", "seed": spec.seed}
+
+    def _check(self, action: np.ndarray) -> np.ndarray:
+        action = np.asarray(action)
+        if action.shape != (ACTION_DIM,) or not np.isfinite(action).all():
+            raise ValueError(f"action {action.tolist()} must be {ACTION_DIM} finite numbers in -1..1")
+        return action
+
+    def _advance(self, run: _Run, action: np.ndarray) -> Transition:
+        command = run.actuator.command(action) if run.actuator else action
+        observation, reward, terminated, _, info = self._scene.step(command)
+        self._is_success = bool(info["is_success"])
+        run.touched.update(self._scene.touched())
+        truncated = self._steps >= self._max_episode_steps
+        info |= {
+            "failure": str(self._failure or "") if terminated or truncated else "",
+            "seed": run.episode.spec.seed,
+        }
+        return self._sensed(observation), float(reward), bool(terminated), truncated, info
+
+    def _draw_for_people(self, run: _Run) -> np.ndarray:
+        """(H, W, 3) uint8: the scene's camera, upright."""
+        return run.episode.perturbation.sense(self._scene.render(), self._steps)
+
+    def _result(self, run: _Run) -> LiberoResult:
+        episode, scene = run.episode, self._scene
+        return LiberoResult(
+            spec=episode.spec,
+            instruction=episode.instruction,
+            initial_state=initial_state_of(episode.spec.seed, scene.num_initial_states),
+            steps=self._steps,
+            is_success=self._is_success,
+            failure=self._failure,
+            levels=dict(episode.perturbation.levels),
+            image_size=f"{scene.observation_width}x{scene.observation_height}",
+            control_mode=scene.control_mode,
+            fps=scene.control_freq,
+            policy=self._policy,
+        )
+
+    def close(self) -> None:
+        """Free what robosuite holds."""
+        self._scene.close()
+
+    @property
+    def _failure(self) -> LiberoFailure | None:
+        """Why the episode failed, were it to end now."""
+        return None if self._is_success else failure_of(self._run.touched, self._scene.wanted)
+
+    def _sensed(self, observation: Observation) -> Observation:
+        """LeRobot's observation with its images as the cameras' sensors take them in this step."""
+        sense = self._run.episode.perturbation.sense
+        pixels = {name: sense(image, self._steps) for name, image in observation["pixels"].items()}
+        return observation | {"pixels": pixels}

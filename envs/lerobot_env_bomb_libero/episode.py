@@ -1,0 +1,25 @@
+"""Draws an episode of LIBERO: its instruction, and one frozen transform per axis that is on."""
+
+from dataclasses import dataclass
+
+from lerobot_bomb.envs.perturbation import EpisodePerturbation
+from lerobot_bomb.libero.episode import LiberoSpec
+from lerobot_bomb.libero.perturbations import LiberoCondition
+from lerobot_env_bomb_libero.axes import LIBERO_TRANSFORMS
+from lerobot_env_bomb_libero.scene import LiberoTransform
+
+
+@dataclass(frozen=True)
+class LiberoEpisode:
+    """An episode under its condition."""
+
+    spec: LiberoSpec
+    instruction: str
+    perturbation: EpisodePerturbation[LiberoTransform]
+
+
+def sample_libero_episode(spec: LiberoSpec, instruction: str) -> LiberoEpisode:
+    """The same spec, the same episode; `instruction` is the task's own."""
+    condition = LiberoCondition.parse(spec.perturbations)
+    perturbation = EpisodePerturbation.draw(condition, spec.seed, LIBERO_TRANSFORMS, None)
+    return LiberoEpisode(spec, perturbation.reword(instruction, None), perturbation)

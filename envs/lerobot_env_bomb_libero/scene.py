@@ -1,0 +1,299 @@
+# pyright: reportAttributeAccessIssue=false, reportArgumentType=false
+"""LeRobot's LIBERO environment with what the perturbation axes change of its MuJoCo model."""
+
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
+from functools import cached_property, wraps
+from typing import Any
+from xml.etree import ElementTree
+
+import numpy as np
+from lerobot.envs.libero import LiberoEnv, get_libero_dummy_action
+from robosuite.utils.errors import RandomizationError
+
+from lerobot_bomb.envs.perturbation import EpisodeTransform
+from lerobot_bomb.libero.episode import initial_state_of
+from lerobot_env_bomb.mujoco_gl import mujoco
+
+CAMERAS = ("agentview", "robot0_eye_in_hand")
+ROBOT_PREFIXES = ("robot0_", "gripper0_", "mount0_")
+FINGERS = "gripper0_"
+# of mjModel, what the axes and LIBERO's own reset change
+EDITED = (
+    "body_pos", "body_quat", "body_mass", "body_inertia", "geom_rgba", "geom_friction", "geom_contype",
+    "geom_conaffinity", "geom_size", "mat_rgba", "mat_specular", "mat_shininess", "mat_reflectance",
+    "cam_pos", "cam_quat", "cam_fovy", "light_dir", "light_diffuse", "light_specular", "light_ambient",
+)  # fmt: skip
+HEADLIGHT = ("ambient", "diffuse", "specular")
+
+
+class LiberoTransform(EpisodeTransform):
+    """What one perturbation axis does to an episode of LIBERO; frozen once drawn."""
+
+    @classmethod
+    def add_bodies(cls, worldbody: ElementTree.Element) -> None:
+        """Add to the model what an episode at any level may need, before it is compiled."""
+
+    def edit(self, scene: "LiberoScene") -> None:
+        """Change the model; objects do not stand where the episode starts yet."""
+
+    def arrange(self, scene: "LiberoScene") -> None:
+        """Change where objects and the arm are: `scene.data.qpos`."""
+
+
+class LiberoScene(LiberoEnv):
+    """Without transforms its episodes are LeRobot's, bit for bit; what nobody sees is not drawn."""
+
+    def __init__(self, kinds: Sequence[type[LiberoTransform]], **kwargs: Any):
+        super().__init__(**kwargs)
+        self._kinds = kinds  # of the axes that may be on
+        self._draws = True
+        self._compiled: dict[str, np.ndarray] = {}
+        self._textures: dict[int, np.ndarray] = {}  # of those that were changed, as compiled
+
+    def begin(self, seed: int, transforms: Sequence[LiberoTransform]) -> dict[str, Any]:
+        """Start a seed's episode; its first observation."""
+        self._ensure_env()
+        self._restore()
+        env = self._built
+        env.seed(seed)
+        with self._drawing_off():
+            self._place()
+            for each in transforms:
+                each.edit(self)
+            states: Any = self._init_states
+            env.set_init_state(states[initial_state_of(seed, len(states))])
+            for each in transforms:
+                each.arrange(self)
+            if transforms:
+                mujoco.mj_forward(self.model, self.data)
+            for robot in env.robots:
+                robot.controller.use_delta = True
+            for _ in range(self.num_steps_wait - 1):
+                env.step(get_libero_dummy_action())
+        observation, *_ = env.step(get_libero_dummy_action())
+        for robot in env.robots:
+            robot.controller.use_delta = self.control_mode == "relative"
+        return self._format_raw_obs(observation)
+
+    @property
+    def _built(self) -> Any:
+        """LIBERO's environment, of a library without types."""
+        return self._env
+
+    @property
+    def model(self) -> mujoco.MjModel:
+        return self._built.sim.model._model
+
+    @property
+    def data(self) -> mujoco.MjData:
+        return self._built.sim.data._data
+
+    @property
+    def num_initial_states(self) -> int:
+        states: Any = self._init_states
+        return len(states)
+
+    @cached_property
+    def movable(self) -> dict[str, int]:
+        """{object that stands free: its body}."""
+        return {name: self._body_of(each) for name, each in self._built.env.objects_dict.items()}
+
+    @cached_property
+    def fixtures(self) -> dict[str, int]:
+        """{fixture: its body}; table and floor are none."""
+        fixtures = self._built.env.fixtures_dict.items()
+        return {name: self._body_of(each) for name, each in fixtures if self._is_body(each)}
+
+    @cached_property
+    def wanted(self) -> set[str]:
+        """Objects and fixtures that the task is about."""
+        sites = self._built.env.object_sites_dict
+        names = self._built.env.obj_of_interest
+        return {sites[name].parent_name if name in sites else name for name in names}
+
+    @cached_property
+    def owners(self) -> np.ndarray:
+        """(bodies,) what each is a part of: the body of an object, fixture or robot; else 0, the scene's."""
+        roots = {*self.movable.values(), *self.fixtures.values()}
+        owners = np.zeros(self.model.nbody, int)
+        for body in range(1, self.model.nbody):
+            parent = self.model.body_parentid[body]
+            is_robot = self.model.body(body).name.startswith(ROBOT_PREFIXES)
+            owners[body] = body if body in roots else owners[parent] or (body if is_robot else 0)
+        return owners
+
+    @cached_property
+    def scenery(self) -> np.ndarray:
+        """Geoms that are seen of table, floor and walls, as indices."""
+        return np.flatnonzero((self.owners[self.model.geom_bodyid] == 0) & (self.model.geom_group == 1))
+
+    def geoms_of(self, bodies: Sequence[int]) -> np.ndarray:
+        """All geoms of objects or fixtures, as indices."""
+        return np.flatnonzero(np.isin(self.owners[self.model.geom_bodyid], bodies))
+
+    def surfaces(self) -> dict[int, np.ndarray]:
+        """{material of table or floor: its geoms}; walls are none."""
+        found: dict[int, list[int]] = {}
+        for geom in self.scenery.tolist():
+            material = int(self.model.geom_matid[geom])
+            if material >= 0 and "wall" not in self.model.material(material).name:
+                found.setdefault(material, []).append(geom)
+        return {material: np.array(geoms) for material, geoms in found.items()}
+
+    def replace_texture(self, material: int, change: Callable[[np.ndarray], np.ndarray]) -> None:
+        """(H, W, 3) uint8 of a material's texture -> the same; the same again at the next reset."""
+        texture = int(self.model.mat_texid[material, mujoco.mjtTextureRole.mjTEXROLE_RGB])
+        if texture < 0 or texture in self._textures:
+            return
+        pixels = self._pixels_of(texture)
+        self._textures[texture] = pixels.copy()
+        pixels[:] = change(pixels)
+        self._upload(texture)
+
+    def touched(self) -> set[str]:
+        """Objects and fixtures that the gripper touches now."""
+        contacts = self.data.contact
+        bodies = self.model.geom_bodyid[contacts.geom]  # (n, 2)
+        names = {body: name for name, body in (self.movable | self.fixtures).items()}
+        found = set()
+        for first, second in bodies.tolist():
+            for finger, other in ((first, second), (second, first)):
+                if self.model.body(finger).name.startswith(FINGERS) and self.owners[other] in names:
+                    found.add(names[self.owners[other]])
+        return found
+
+    def boxes(self) -> dict[int, np.ndarray]:
+        """{body of an object or fixture: (2, 3) metres, its lowest and highest corner}, of its geoms."""
+        model, data = self.model, self.data
+        boxes = {}
+        for body in (*self.movable.values(), *self.fixtures.values()):
+            geoms = self.geoms_of([body])
+            pose = data.geom_xmat[geoms].reshape(-1, 3, 3)
+            middle = data.geom_xpos[geoms] + (pose @ model.geom_aabb[geoms, :3, None])[..., 0]
+            half = (abs(pose) @ model.geom_aabb[geoms, 3:, None])[..., 0]
+            boxes[body] = np.stack([(middle - half).min(0), (middle + half).max(0)])
+        return boxes
+
+    def corners(self) -> np.ndarray:
+        """(n, 3) metres: what cannot be done without: corners of what the task is about, and the gripper."""
+        boxes = self.boxes()
+        corners = [
+            [box[x, 0], box[y, 1], box[z, 2]]
+            for box in (boxes[body] for body in self.wanted_bodies())
+            for x in (0, 1)
+            for y in (0, 1)
+            for z in (0, 1)
+        ]
+        return np.array([*corners, self.gripper_xyz()])
+
+    def wanted_bodies(self) -> list[int]:
+        """Bodies of the objects and fixtures that the task is about."""
+        bodies = self.movable | self.fixtures
+        return [bodies[name] for name in sorted(self.wanted) if name in bodies]
+
+    def gripper_xyz(self) -> np.ndarray:
+        """(3,) metres."""
+        return self.data.body("gripper0_eef").xpos.copy()
+
+    def joints_of_robot(self) -> np.ndarray:
+        """(7,) where the arm's joints are in qpos."""
+        return np.array(self._built.robots[0]._ref_joint_pos_indexes)
+
+    def _ensure_env(self) -> None:
+        if self._env is not None:
+            return
+        super()._ensure_env()  # builds the model, and builds it again
+        inner = self._built.env
+        if self._kinds_with_bodies:
+            inner.set_xml_processor(self._with_bodies)
+        initialize = inner._initialize_sim
+
+        def initialize_and_remember(*args: Any, **kwargs: Any) -> None:
+            initialize(*args, **kwargs)
+            self._remember()
+
+        inner._initialize_sim = initialize_and_remember
+        inner.hard_reset = True
+        self._place()
+        # from here on the model stays, and is set back: the same episodes for a fraction of the time
+        inner.hard_reset = False
+        for camera in self.camera_name:
+            observable = inner._observables[camera]
+            observable._sensor = self._drawn_if_on(observable._sensor)
+
+    def _place(self) -> None:
+        """Robosuite's reset; LIBERO's wrapper around it tries again for ever, whatever goes wrong."""
+        while True:
+            try:
+                self._built.env.reset()
+            except RandomizationError:
+                continue
+            return
+
+    @property
+    def _kinds_with_bodies(self) -> list[type[LiberoTransform]]:
+        return [kind for kind in self._kinds if "add_bodies" in kind.__dict__]
+
+    def _with_bodies(self, xml: str) -> str:
+        root = ElementTree.fromstring(xml)
+        worldbody = root.find("worldbody")
+        assert worldbody is not None
+        for kind in self._kinds_with_bodies:
+            kind.add_bodies(worldbody)
+        return ElementTree.tostring(root, encoding="unicode")
+
+    def _drawn_if_on(self, sensor: Callable[[Any], Any]) -> Callable[[Any], Any]:
+        blank = np.zeros((self.observation_height, self.observation_width, 3), np.uint8)
+
+        @wraps(sensor)  # robosuite reads attributes of it
+        def draw(cache: Any) -> Any:
+            return sensor(cache) if self._draws else blank
+
+        return draw
+
+    @contextmanager
+    def _drawing_off(self) -> Iterator[None]:
+        self._draws = False
+        try:
+            yield
+        finally:
+            self._draws = True
+
+    def _remember(self) -> None:
+        """The model as compiled."""
+        model = self.model
+        self._compiled = {name: getattr(model, name).copy() for name in EDITED}
+        headlight = model.vis.headlight
+        self._headlight = {name: getattr(headlight, name).copy() for name in HEADLIGHT}
+        self._textures = {}
+
+    def _restore(self) -> None:
+        """Undo what an earlier episode changed, in the model and in what robosuite keeps."""
+        model = self.model
+        for name, value in self._compiled.items():
+            getattr(model, name)[:] = value
+        for name, value in self._headlight.items():
+            getattr(model.vis.headlight, name)[:] = value
+        for texture, pixels in self._textures.items():
+            self._pixels_of(texture)[:] = pixels
+            self._upload(texture)
+        self._textures = {}
+        for robot in self._built.robots:
+            robot.gripper.current_action = np.zeros_like(robot.gripper.current_action)
+
+    def _pixels_of(self, texture: int) -> np.ndarray:
+        """(H, W, channels) uint8, a view."""
+        model = self.model
+        height, width = int(model.tex_height[texture]), int(model.tex_width[texture])
+        channels, start = int(model.tex_nchannel[texture]), int(model.tex_adr[texture])
+        return model.tex_data[start : start + height * width * channels].reshape(height, width, channels)
+
+    def _upload(self, texture: int) -> None:
+        mujoco.mjr_uploadTexture(self.model, self._built.sim._render_context_offscreen.con, texture)
+
+    def _body_of(self, each: Any) -> int:
+        return int(self.model.body(each.root_body).id)
+
+    def _is_body(self, each: Any) -> bool:
+        return mujoco.mj_name2id(self.model, mujoco.mjtObj.mjOBJ_BODY, each.root_body) > 0

@@ -1,0 +1,77 @@
+"""Lines of `bomb_libero` in a results file: what each must say, and what they say together."""
+
+from lerobot_bomb.envs.results import Row
+from lerobot_bomb.evaluation.line_checks import (
+    Check,
+    is_bool,
+    is_int,
+    is_one_of,
+    is_table_of,
+    is_text,
+    or_none,
+)
+from lerobot_bomb.evaluation.result_kind import ResultKind, describe_numbers
+from lerobot_bomb.libero.episode import LIBERO_PROTOCOL_VERSION, LiberoFailure, LiberoSpec
+
+LIBERO_SPEC_CHECKS: dict[str, Check] = {  # the rest is LiberoSpec's own
+    "seed": is_int(0),
+    "suite": is_text,
+    "task_id": is_int(0),
+    "max_steps": or_none(is_int(1)),
+    "perturbations": is_text,
+}
+LIBERO_CHECKS: dict[str, Check] = {
+    "spec": lambda value: isinstance(value, dict),
+    "instruction": is_text,
+    "initial_state": is_int(0),
+    "steps": is_int(1),
+    "is_success": is_bool,
+    "failure": or_none(is_one_of(LiberoFailure)),
+    "levels": is_table_of(is_int(0)),
+    "image_size": is_text,
+    "control_mode": is_text,
+    "fps": is_int(1),
+    "policy": or_none(lambda value: isinstance(value, dict)),
+    "simulator_versions": is_table_of(or_none(is_text)),
+    "machine": is_text,
+    "lerobot_version": or_none(is_text),
+    "torch_version": or_none(is_text),
+    "package_version": is_text,
+}
+
+
+def _check_episode(row: Row) -> None:
+    LiberoSpec(**row["spec"])
+
+
+def _settings(row: Row) -> dict[str, str]:
+    versions = row["simulator_versions"].items()
+    return {
+        "simulator": ", ".join(f"{name} {version or '?'}" for name, version in versions),
+        "control_mode": row["control_mode"],
+        "fps": str(row["fps"]),
+    }
+
+
+def _describe_tasks(rows: list[Row]) -> str:
+    """'libero_spatial tasks 0..2'."""
+    suites = dict.fromkeys(row["spec"]["suite"] for row in rows)
+    numbers = {
+        suite: {row["spec"]["task_id"] for row in rows if row["spec"]["suite"] == suite} for suite in suites
+    }
+    return ", ".join(f"{suite} tasks {describe_numbers(ids)}" for suite, ids in numbers.items())
+
+
+LIBERO_LINES = ResultKind(
+    env_type="bomb_libero",
+    fields={LIBERO_PROTOCOL_VERSION: LIBERO_CHECKS},
+    spec_fields=LIBERO_SPEC_CHECKS,
+    check_episode=_check_episode,
+    drawn=("task_id",),
+    settings=_settings,
+    describe_simulator=lambda settings: (
+        f"{settings['control_mode']} control, {settings['fps']} Hz, {settings['simulator']}"
+    ),
+    describe_tasks=_describe_tasks,
+    measures=(),
+)

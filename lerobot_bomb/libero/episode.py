@@ -1,0 +1,62 @@
+"""An episode of LIBERO: what determines it, and why it failed."""
+
+from dataclasses import dataclass
+from enum import StrEnum
+
+from lerobot_bomb.bomb.episode import check_seed
+from lerobot_bomb.conditions import NONE
+from lerobot_bomb.flags import one_of
+from lerobot_bomb.libero.assets import SUITES
+from lerobot_bomb.libero.perturbations import LiberoCondition
+
+# Of the axes and how a policy is measured; a line of results says it.
+LIBERO_PROTOCOL_VERSION = "libero-1.0"
+TASKS_PER_SUITE = {suite: 90 if suite == "libero_90" else 10 for suite in SUITES}
+MAX_ALLOWED_STEPS = 10_000
+MOTION_DIMS = 6  # of the 7 of an action: change of x, y, z and of orientation; the last is the gripper
+
+
+class LiberoFailure(StrEnum):
+    """Why an episode failed; exactly one per failed episode, the first that holds."""
+
+    NEVER_TOUCHED = "never_touched"  # the gripper met no object
+    WRONG_OBJECT = "wrong_object"  # it met objects, none of those that the task is about
+    UNFINISHED = "unfinished"
+
+
+@dataclass(frozen=True)
+class LiberoSpec:
+    """Everything that, with the versions of code and simulator, determines an episode."""
+
+    seed: int
+    suite: str = SUITES[0]
+    task_id: int = 0
+    max_steps: int | None = None  # None: LeRobot's limit of the suite
+    perturbations: str = NONE  # a condition such as "table:2+light:3"; see `LiberoCondition`
+
+    def __post_init__(self) -> None:
+        # one spelling, so that equal conditions compare equal
+        object.__setattr__(self, "perturbations", str(LiberoCondition.parse(self.perturbations)))
+        one_of("--env.task", self.suite, SUITES)
+        count = TASKS_PER_SUITE[self.suite]
+        if not 0 <= self.task_id < count:
+            raise ValueError(f"--env.task_ids: {self.suite} has no task {self.task_id}, only 0..{count - 1}")
+        check_seed(self.seed)
+        if self.max_steps is not None and not 1 <= self.max_steps <= MAX_ALLOWED_STEPS:
+            raise ValueError(f"--env.episode_length={self.max_steps} must lie in 1..{MAX_ALLOWED_STEPS}")
+
+
+def initial_state_of(seed: int, count: int) -> int:
+    """Which of a task's recorded initial states an episode starts in.
+
+    `lerobot-eval --env.type=libero` plays them in order, whatever its seed; so episodes are the same here
+    where --seed is a multiple of their number, 50, as its default 1000 is.
+    """
+    return seed % count
+
+
+def failure_of(touched: set[str], wanted: set[str]) -> LiberoFailure:
+    """Of an episode without success: objects that the gripper met, and those that the task is about."""
+    if not touched:
+        return LiberoFailure.NEVER_TOUCHED
+    return LiberoFailure.UNFINISHED if touched & wanted else LiberoFailure.WRONG_OBJECT

@@ -1,0 +1,91 @@
+"""LIBERO's perturbation axes: their names, levels and magnitudes; the one definition."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from functools import partial
+from typing import ClassVar
+
+from lerobot_bomb.bomb.perturbations import AXES as BOMB_AXES
+from lerobot_bomb.conditions import Axis, AxisCondition, Magnitude, magnitude_of
+
+# Append only: an axis' place in this dict numbers its stream of random numbers.
+LIBERO_AXES = {
+    "table": Axis(
+        "colour and pattern of table and floor",
+        ("images",),
+        {
+            "color": Magnitude("share", (0.12, 0.24, 0.36, 0.48, 0.6), "of the way to a drawn colour"),
+            "pattern": Magnitude(
+                "share", (0.06, 0.12, 0.2, 0.3, 0.45), "contrast of stripes, checks or speckles"
+            ),
+        },
+    ),
+    "reflectance": Axis(
+        "gloss of objects, table and floor",
+        ("images",),
+        {
+            "mirror": Magnitude("share", (0.06, 0.12, 0.18, 0.24, 0.3), "of light, by table and floor"),
+            "gloss": Magnitude("share", (0.1, 0.2, 0.3, 0.4, 0.5), "of the way to full specular light"),
+        },
+    ),
+    "distractors": Axis(
+        "boxes, cylinders and balls that stand beside the objects",
+        ("images",),
+        {"count": Magnitude("bodies", (1, 2, 3, 4, 5), "more in the scene")},
+    ),
+    "start": Axis(
+        "where objects and the arm are at the start",
+        ("images", "state"),
+        {
+            "objects": Magnitude(
+                "mm", (10, 20, 30, 40, 50), "of each that stands free, in a drawn direction"
+            ),
+            "arm": Magnitude(
+                "radians", (0.04, 0.08, 0.12, 0.16, 0.2), "of its joints, root of sum of squares"
+            ),
+        },
+    ),
+    "photometric": BOMB_AXES["photometric"],
+    "camera": Axis(
+        "angle, field of view and distance of the cameras; what was in view stays in view",
+        ("images",),
+        {
+            "angle": Magnitude("degrees", (4, 8, 12, 16, 20), "around the table, in a drawn direction"),
+            "wrist_angle": Magnitude("degrees", (1, 2, 3, 4, 5), "around the gripper, in a drawn direction"),
+            "fov": Magnitude("share", (0.04, 0.08, 0.12, 0.16, 0.2), "wider or narrower, of both cameras"),
+            "distance": Magnitude(
+                "share", (0.03, 0.06, 0.09, 0.12, 0.15), "further or nearer, of the scene's camera"
+            ),
+        },
+    ),
+    "light": BOMB_AXES["light"],
+    "language": BOMB_AXES["language"],
+    "dynamics": Axis(
+        "mass and friction of the objects, noise and latency of the arm",
+        ("dynamics",),
+        {
+            "mass": Magnitude("factor", (1.2, 1.4, 1.7, 2.0, 2.5), "times, or divided by"),
+            "friction": Magnitude("factor", (1.1, 1.2, 1.35, 1.5, 1.7), "divided by, or times"),
+            "noise": Magnitude(
+                "share", (0.02, 0.04, 0.06, 0.08, 0.1), "of the range, standard deviation on executed motion"
+            ),
+            "latency": Magnitude("control steps", (0, 0, 1, 1, 2), "before an action is executed"),
+        },
+    ),
+    "object": Axis(
+        "shade of the objects",
+        ("images",),
+        {
+            "shade": Magnitude("factor", (0.87, 0.75, 0.64, 0.55, 0.47), "of their colour"),
+            "tint": Magnitude("share", (0.04, 0.08, 0.12, 0.16, 0.2), "less of a drawn channel"),
+        },
+    ),
+}
+libero_magnitude = partial(magnitude_of, LIBERO_AXES)  # (axis, name, level)
+
+
+@dataclass(frozen=True)
+class LiberoCondition(AxisCondition):
+    """Which axes of LIBERO are on: "camera:2+light:3"."""
+
+    axes: ClassVar[Mapping[str, Axis]] = LIBERO_AXES
