@@ -1,12 +1,11 @@
 """LIBERO with BOMB's perturbation axes, for LeRobot and for Gymnasium.
 
-``configuration_bomb_libero`` registers LeRobot's env type ``bomb_libero``. hf-libero, with robosuite, is the extra
-`libero`.
+``configuration_bomb_libero`` registers LeRobot's env type ``bomb_libero``. hf-libero, with robosuite, is the
+extra `libero`.
 """
 
 import gymnasium
 
 GYM_ID = "bomb_libero/Libero-v0"
 
-if GYM_ID not in gymnasium.registry:  # imported twice under two names, it would warn
-    gymnasium.register(GYM_ID, entry_point="lerobot_env_bomb_libero.env:BombLiberoEnv")
+gymnasium.register(GYM_ID, entry_point="lerobot_env_bomb_libero.env:BombLiberoEnv")

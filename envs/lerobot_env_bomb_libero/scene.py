@@ -176,11 +176,12 @@ class LiberoScene(LiberoEnv):
         return boxes
 
     def corners(self) -> np.ndarray:
-        """(n, 3) metres: what cannot be done without: corners of what the task is about, and the gripper."""
+        """(n, 3) metres: corners of all objects and of what else the task is about, and the gripper."""
         boxes = self.boxes()
+        bodies = {*self.movable.values(), *self.wanted_bodies()}
         corners = [
             [box[x, 0], box[y, 1], box[z, 2]]
-            for box in (boxes[body] for body in self.wanted_bodies())
+            for box in (boxes[body] for body in sorted(bodies))
             for x in (0, 1)
             for y in (0, 1)
             for z in (0, 1)
