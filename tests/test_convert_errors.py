@@ -134,7 +134,8 @@ def test_two_conversions_into_one_folder_are_refused(pusht_zarr: Path, tmp_path:
 @pytest.mark.parametrize(
     ("flags", "expected"),
     [
-        (["libero-hdf5", "x"], "pusht-zarr"),
+        (["aloha-hdf5", "x"], "pusht-zarr"),
+        (["libero-hdf5", "x"], "--repo_id"),
         (["pusht-zarr", "x"], "--repo_id"),
         (["pusht-zarr", "--repo_id=a/b"], "path"),
         ([], "SOURCE"),

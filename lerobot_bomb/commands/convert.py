@@ -4,18 +4,18 @@ Like a recording, the dataset grows in a folder beside its final place (see ``da
 """
 
 import argparse
-from collections.abc import Iterator
 from dataclasses import asdict, dataclass
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, ClassVar
 
 import numpy as np
-from tqdm import tqdm
 
 from lerobot_bomb.commands.arguments import add_new_dataset_arguments, path_flag, switch
-from lerobot_bomb.data.facts import PUSHT_SOURCE
-from lerobot_bomb.data.kept_blocks import Progress, reached
+from lerobot_bomb.data.conversion import write_missing
+from lerobot_bomb.data.facts import LIBERO_SOURCE, PUSHT_SOURCE
+from lerobot_bomb.data.kept_blocks import Progress
+from lerobot_bomb.data.libero_conversion import convert_libero
 from lerobot_bomb.data.pusht_zarr import BOARD_SIZE, IMAGE_SIZE, PushtZarr
 from lerobot_bomb.data.resumable import (
     BLOCK_EPISODES,
@@ -23,10 +23,8 @@ from lerobot_bomb.data.resumable import (
     check_repo_id,
     default_root,
     grow,
-    missing_blocks,
     terminated_in_order,
     unfinished_folder,
-    write_blocks,
 )
 from lerobot_bomb.data.rigid_copies import RigidMotion
 
@@ -61,10 +59,15 @@ def add_convert_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the arguments of ``lerobot-bomb convert``."""
     sources = parser.add_subparsers(dest="source", required=True, metavar="SOURCE")
     summary = "the PushT demonstrations of Diffusion Policy, pusht_cchi_v7_replay.zarr"
-    pusht = sources.add_parser(PUSHT_SOURCE, help=summary, description=f"Convert {summary}.")
-    add = pusht.add_argument
+    _add_pusht_arguments(sources.add_parser(PUSHT_SOURCE, help=summary, description=f"Convert {summary}."))
+    summary = "demonstrations of LIBERO, a file TASK_demo.hdf5 or a folder of them"
+    _add_libero_arguments(sources.add_parser(LIBERO_SOURCE, help=summary, description=f"Convert {summary}."))
+
+
+def _add_pusht_arguments(parser: argparse.ArgumentParser) -> None:
+    add = parser.add_argument
     add("path", type=path_flag, help="the folder of the zarr")
-    add_new_dataset_arguments(pusht)
+    add_new_dataset_arguments(parser)
     add(
         "--task",
         default="",
@@ -78,11 +81,30 @@ def add_convert_arguments(parser: argparse.ArgumentParser) -> None:
         help="so many copies of each demonstration beside it: turned by any angle, half of them mirrored, "
         "shifted, the goal with the rest (default: 0)",
     )
+    _add_resume(parser)
+
+
+def _add_libero_arguments(parser: argparse.ArgumentParser) -> None:
+    add = parser.add_argument
+    add("path", type=path_flag, help="the file, or the folder of a suite's files")
+    add_new_dataset_arguments(parser)
+    add("--images", **switch(), help="store images (lossless) instead of videos")
     add(
-        "--resume",
+        "--skip_noops",
         **switch(),
-        help=f"continue a conversion that was interrupted; its blocks of {BLOCK_EPISODES} episodes are kept",
+        help="leave out frames in which neither arm nor gripper is told to move (default: all are kept)",
     )
+    add(
+        "--image_convention",
+        help="how the files hold images: opengl, upside down; opencv, upright; lerobot, turned already "
+        "(default: what each file says, else opengl)",
+    )
+    _add_resume(parser)
+
+
+def _add_resume(parser: argparse.ArgumentParser) -> None:
+    summary = f"continue a conversion that was interrupted; its blocks of {BLOCK_EPISODES} episodes are kept"
+    parser.add_argument("--resume", **switch(), help=summary)
 
 
 def run_convert(args: argparse.Namespace) -> int:
@@ -90,7 +112,11 @@ def run_convert(args: argparse.Namespace) -> int:
     check_repo_id(args.repo_id)
     root = args.root or default_root(args.repo_id)
     with terminated_in_order():
-        progress = convert_pusht(args.path, args.repo_id, root, args.task, args.resume, args.copies)
+        if args.source == PUSHT_SOURCE:
+            progress = convert_pusht(args.path, args.repo_id, root, args.task, args.resume, args.copies)
+        else:
+            options = (args.resume, args.images, args.skip_noops, args.image_convention)
+            progress = convert_libero(args.path, args.repo_id, root, *options)
     print(f"{progress.num_episodes} episodes, {progress.num_frames} frames: {root}")
     return 0
 
@@ -112,21 +138,14 @@ def convert_pusht(
         conversion,
         root,
         resume,
-        write=lambda folder: _write_pusht(source, conversion, folder),
+        write=lambda folder: write_missing(
+            folder,
+            _pusht_layout(repo_id),
+            source.num_episodes * (1 + copies),
+            partial(_pusht_episode, source, task),
+        ),
         layout=lambda: _pusht_layout(repo_id),
     )
-
-
-def _write_pusht(source: PushtZarr, conversion: Conversion, folder: Path) -> Progress:
-    """Write the blocks that are missing."""
-    num_episodes = source.num_episodes * (1 + conversion.copies)
-    gaps = missing_blocks(folder, num_episodes)
-    num_kept = num_episodes - sum(gap.num_missing for gap in gaps)
-    with tqdm(total=num_episodes, initial=num_kept, unit="episode") as bar:
-        for gap in gaps:
-            episodes = partial(_pusht_episodes, source, conversion.task, bar)
-            write_blocks(folder, _pusht_layout(conversion.repo_id), gap, episodes)
-    return reached(folder)
 
 
 def _pusht_layout(repo_id: str) -> "DatasetLayout":
@@ -144,24 +163,19 @@ def _pusht_layout(repo_id: str) -> "DatasetLayout":
     return DatasetLayout(repo_id, FPS, "pusht", features, use_videos=False)
 
 
-def _pusht_episodes(
-    source: PushtZarr, task: str, bar: tqdm, progress: Progress, number: int
-) -> "Iterator[RecordedEpisode]":
-    """Yield the next `number` episodes: all demonstrations, then a copy of each, and so on."""
+def _pusht_episode(source: PushtZarr, task: str, index: int) -> "RecordedEpisode":
+    """All demonstrations by number, then a copy of each, and so on."""
     from lerobot.utils.constants import ACTION, OBS_IMAGE, OBS_STATE
 
     from lerobot_bomb.data.blocks import RecordedEpisode
 
-    for index in range(progress.num_episodes, progress.num_episodes + number):
-        images, positions, actions = source.episode(index % source.num_episodes)
-        if index >= source.num_episodes:
-            motion = RigidMotion.drawn(np.random.default_rng((COPIES_SEED, index)), BOARD_SIZE)
-            images = motion.images(images)
-            positions, actions = motion.points(positions), motion.points(actions)
-        frames = (
-            {OBS_IMAGE: image, OBS_STATE: position, ACTION: action, "task": task}
-            for image, position, action in zip(images, positions, actions, strict=True)
-        )
-        progress.num_episodes += 1
-        yield RecordedEpisode(frames)
-        bar.update()
+    images, positions, actions = source.episode(index % source.num_episodes)
+    if index >= source.num_episodes:
+        motion = RigidMotion.drawn(np.random.default_rng((COPIES_SEED, index)), BOARD_SIZE)
+        images = motion.images(images)
+        positions, actions = motion.points(positions), motion.points(actions)
+    frames = (
+        {OBS_IMAGE: image, OBS_STATE: position, ACTION: action, "task": task}
+        for image, position, action in zip(images, positions, actions, strict=True)
+    )
+    return RecordedEpisode(frames)

@@ -14,6 +14,7 @@ from lerobot_bomb.envs.results import Row
 from lerobot_bomb.files import read_json
 
 PUSHT_SOURCE = "pusht-zarr"
+LIBERO_SOURCE = "libero-hdf5"
 
 
 @dataclass(frozen=True)
@@ -52,9 +53,18 @@ class DatasetFacts:
 
     def eval_flags(self) -> list[str] | None:
         """Of lerobot-eval, for the environment that the dataset shows; None: not known."""
-        if self.bomb.get("conversion", {}).get("source", "").startswith(PUSHT_SOURCE):
+        conversion = self.bomb.get("conversion", {})
+        if conversion.get("source", "").startswith(PUSHT_SOURCE):
             return ["--env.type=pusht", "--eval.use_async_envs=false"]
+        if conversion.get("source", "").startswith(LIBERO_SOURCE):
+            return self._libero_flags(conversion["suite"])
         return None if self.environment is None else self.environment.eval_flags()
+
+    def _libero_flags(self, suite: str) -> list[str]:
+        """Images as large as the dataset's: LeRobot's default is another size."""
+        height, width, _ = self.info["features"]["observation.images.image"]["shape"]
+        size = [f"--env.observation_height={height}", f"--env.observation_width={width}"]
+        return ["--env.type=libero", *([f"--env.task={suite}"] if suite else []), *size]
 
     def lines(self) -> list[str]:
         """As Markdown's list."""
