@@ -23,6 +23,7 @@ class Played:
     joints: np.ndarray  # (T + 1, 7)
     fingers: np.ndarray  # (T + 1, 2)
     actions: np.ndarray  # (T, 7)
+    simulator: np.ndarray | None = None  # (T + 1, n) states; None: of the time, joints and fingers only
 
     @classmethod
     def drawn(cls, seed: int, num_actions: int = 6) -> "Played":
@@ -45,9 +46,9 @@ class Played:
         """As a demonstration whose rows hold these moments' observations."""
         moments = np.arange(len(self.actions) + 1)[observed]
         group["actions"] = self.actions
-        group["states"] = np.concatenate(
-            [np.arange(len(self.actions))[:, None], self.joints[:-1], self.fingers[:-1]], axis=1
-        )
+        times = np.arange(len(self.actions) + 1)[:, None]
+        drawn = np.concatenate([times, self.joints, self.fingers], axis=1)
+        group["states"] = (drawn if self.simulator is None else self.simulator)[:-1]
         group["rewards"] = group["dones"] = (np.arange(len(self.actions)) == len(self.actions) - 1).astype(
             np.uint8
         )

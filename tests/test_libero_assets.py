@@ -9,6 +9,8 @@ from pathlib import Path
 import pytest
 import yaml
 
+from lerobot_bomb.commands import doctor
+from lerobot_bomb.commands.main import main
 from lerobot_bomb.libero import assets
 from lerobot_bomb.libero.assets import Libero, prepare_libero
 
@@ -183,6 +185,33 @@ def test_a_missing_installation_is_named(monkeypatch: pytest.MonkeyPatch) -> Non
         prepare_libero()
 
 
+def libero_line(capsys: pytest.CaptureFixture[str], patch: pytest.MonkeyPatch) -> str:
+    """What `lerobot-bomb doctor` says of LIBERO."""
+    patch.setattr(doctor, "CHECKS", (doctor.check_libero,))
+    assert main(["doctor"]) == 0  # all else works without it
+    (line,) = [line for line in capsys.readouterr().out.splitlines() if "libero:" in line]
+    return line.strip()
+
+
+def test_the_doctor_says_whether_libero_can_run(
+    libero: Libero, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    assert libero_line(capsys, monkeypatch) == (
+        f"ok  libero: LIBERO has no {libero.config_file}, and asks on the standard input when it is imported; "
+        "to have it written: echo n | python -c 'import libero.libero'"
+    )
+    assert not libero.config_file.exists()
+    libero.write_config()
+    found = f"ok  libero: tasks in {libero.package / 'bddl_files'}, assets in {libero.assets}"
+    assert libero_line(capsys, monkeypatch) == found
+    (libero.assets / "textures").rmdir()
+    (libero.assets / "turbosquid_objects").rmdir()
+    line = libero_line(capsys, monkeypatch)
+    assert "2 missing (textures, turbosquid_objects); hf download lerobot/libero-assets" in line
+    monkeypatch.setattr(Libero, "find", lambda: None)
+    assert libero_line(capsys, monkeypatch).startswith("ok  libero: not installed")
+
+
 @pytest.fixture
 def installed(home: Path) -> Libero:
     """The real one of this Python, with no config file yet."""
@@ -225,6 +254,13 @@ def test_the_real_one_s_assets_suffice_for_one_suite_and_are_partly_missing_for_
         "*/wine_bottle.xml",
         "*/wine_rack.xml",
     ]
+
+
+def test_the_doctor_names_the_suites_that_can_run(
+    with_assets: Libero, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    with_assets.write_config()
+    assert libero_line(capsys, monkeypatch).endswith("; whole for libero_spatial")
 
 
 def test_every_scene_of_the_real_one_is_known(with_assets: Libero) -> None:

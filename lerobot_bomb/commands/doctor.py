@@ -16,6 +16,7 @@ from types import ModuleType
 from packaging.requirements import Requirement
 
 import lerobot_bomb
+from lerobot_bomb.libero.assets import INSTALL, SUITES, Libero, describe_missing
 
 DISTRIBUTION = "lerobot_policy_bomb"
 # what the names of packages begin with that register a type each
@@ -98,6 +99,26 @@ def check_fetch() -> Iterator[Finding]:
         yield Finding("--env.robot=fetch", str(error))
 
 
+def check_libero() -> Iterator[Finding]:
+    """Whether LIBERO is installed and has a config file and assets; nothing else needs it."""
+    libero = Libero.find()
+    if libero is None:
+        yield Finding("libero", f"not installed (for --env.type=libero: {INSTALL})")
+        return
+    try:
+        folders = libero.task_folders()
+        missing = {suite: libero.missing_assets([suite]) for suite in SUITES}
+    except ValueError as error:
+        yield Finding("libero", str(error))
+        return
+    whole = [suite for suite in SUITES if not missing[suite]]
+    found = f"tasks in {folders['bddl_files']}, assets in {libero.assets}"
+    if len(whole) < len(SUITES):
+        found = describe_missing(libero.assets, sorted(set().union(*missing.values())))
+        found += f"; whole for {', '.join(whole)}" if whole else ""
+    yield Finding("libero", found)
+
+
 def check_types() -> Iterator[Finding]:
     """Env and policy types whose packages the plugin imports: whether LeRobot knows them, and classes."""
     plugin = importlib.import_module(DISTRIBUTION)
@@ -147,6 +168,7 @@ CHECKS: tuple[Callable[[], Iterator[Finding]], ...] = (
     check_versions,
     check_rendering,
     check_fetch,
+    check_libero,
     check_types,
     check_gpu,
     check_hub,

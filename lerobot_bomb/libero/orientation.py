@@ -1,0 +1,37 @@
+"""In which of four orientations images of LIBERO are, beside what its environment shows.
+
+Nothing in a dataset or a checkpoint says it: LeRobot's environment turns the simulator's images by 180
+degrees, and a policy that was trained on others fails without an error.
+"""
+
+import numpy as np
+
+SAME = "as the environment shows them"
+# over rows, columns
+ORIENTATIONS = {
+    SAME: (1, 1),
+    "turned by 180 degrees, as the simulator gives them": (-1, -1),
+    "upside down": (-1, 1),
+    "left and right swapped": (1, -1),
+}
+
+
+def orientation(images: np.ndarray, shown: np.ndarray) -> str:
+    """Of `ORIENTATIONS`: that of images, (N, H, W, 3), beside those that an environment shows, (M, H, W, 3).
+
+    Both are of one camera and one task, of whatever moments: their means are compared.
+
+    Raises:
+        ValueError: they are of different sizes.
+    """
+    if images.shape[1:] != shown.shape[1:]:
+        raise ValueError(
+            f"the images are {images.shape[1:]}, the environment's {shown.shape[1:]}; give it the flags "
+            "--env.observation_height and --env.observation_width"
+        )
+    mean, expected = images.mean(axis=0), shown.mean(axis=0)
+    distances = {
+        name: np.abs(mean[::rows, ::columns] - expected).mean()
+        for name, (rows, columns) in ORIENTATIONS.items()
+    }
+    return min(distances, key=lambda name: distances[name])
