@@ -197,8 +197,8 @@ def test_the_doctor_says_whether_libero_can_run(
     libero: Libero, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     assert libero_line(capsys, monkeypatch) == (
-        f"ok  libero: LIBERO has no {libero.config_file}, and asks on the standard input when it is imported; "
-        "to have it written: echo n | python -c 'import libero.libero'"
+        f"ok  libero: LIBERO has no {libero.config_file}, and asks on the standard input when it is "
+        "imported; to have it written: echo n | python -c 'import libero.libero'"
     )
     assert not libero.config_file.exists()
     libero.write_config()
