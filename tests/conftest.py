@@ -16,6 +16,8 @@ from variants import variants_of
 if TYPE_CHECKING:
     from pusht_cases import Demonstrations
 
+    from lerobot_bomb.libero.assets import Libero
+
 # by CPU time; begun first, none of them is what a run waits for in the end
 SLOWEST_FILES = (
     "test_parity",
@@ -43,6 +45,32 @@ def shared_data() -> Path:
     if not path.is_dir():
         pytest.skip(f"{path} is absent; set SHARED_DATA to the folder of real inputs")
     return path.resolve()
+
+
+@pytest.fixture(scope="module")
+def libero(tmp_path_factory: pytest.TempPathFactory) -> "Iterator[Libero]":
+    """The installed one with a config file in a folder of the tests."""
+    from lerobot_bomb.libero.assets import Libero
+
+    home = tmp_path_factory.mktemp("home")
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setenv("HOME", str(home))
+        patch.setenv("LIBERO_CONFIG_PATH", str(home / "libero"))
+        if (found := Libero.find()) is None:
+            pytest.skip("hf-libero is not installed")
+        found.write_config()
+        yield found
+
+
+@pytest.fixture(scope="module")
+def libero_with_assets(libero: "Libero", shared_data: Path) -> "Libero":
+    """The same with the assets of libero_spatial, and of no other suite."""
+    assets = shared_data / "libero" / "assets"
+    if not assets.is_dir():
+        pytest.skip(f"{assets} is absent")
+    libero.assets.parent.mkdir(parents=True)
+    libero.assets.symlink_to(assets)
+    return libero
 
 
 @pytest.fixture(scope="session")

@@ -4,7 +4,6 @@ Needs hf-libero and its assets of one suite; skips without.
 """
 
 import importlib
-from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -40,25 +39,7 @@ class Recording:
 
 
 @pytest.fixture(scope="module")
-def libero(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Libero]:
-    """The installed one with a config file in a folder of the tests."""
-    home = tmp_path_factory.mktemp("home")
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setenv("HOME", str(home))
-        patch.setenv("LIBERO_CONFIG_PATH", str(home / "libero"))
-        if (libero := Libero.find()) is None:
-            pytest.skip("hf-libero is not installed")
-        libero.write_config()
-        yield libero
-
-
-@pytest.fixture(scope="module")
-def recording(libero: Libero, shared_data: Path) -> Recording:
-    assets = shared_data / "libero" / "assets"
-    if not assets.is_dir():
-        pytest.skip(f"{assets} is absent")
-    libero.assets.parent.mkdir(parents=True)
-    libero.assets.symlink_to(assets)
+def recording(libero_with_assets: Libero) -> Recording:
     prepare_libero([SUITE])
     return play()
 

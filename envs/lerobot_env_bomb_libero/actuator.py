@@ -3,11 +3,11 @@
 from collections import deque
 
 import numpy as np
-from lerobot.envs.libero import get_libero_dummy_action
 
 from lerobot_bomb.bomb.streams import Stream, generator
 from lerobot_bomb.libero.episode import MOTION_DIMS
 from lerobot_env_bomb_libero.axes.dynamics import LiberoDynamics
+from lerobot_env_bomb_libero.stock import get_libero_dummy_action
 
 
 class LiberoActuator:

@@ -4,12 +4,11 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from lerobot.envs.libero import ACTION_DIM
 
 from lerobot_bomb.envs.episode_env import EpisodeEnv, Observation, Transition
 from lerobot_bomb.envs.libero_results import LiberoResult
 from lerobot_bomb.envs.results import PolicyIdentity
-from lerobot_bomb.libero.episode import LiberoFailure, LiberoSpec, failure_of, initial_state_of
+from lerobot_bomb.libero.episode import ACTION_DIM, LiberoFailure, LiberoSpec, failure_of, initial_state_of
 from lerobot_bomb.libero.perturbations import LiberoCondition
 from lerobot_env_bomb_libero.actuator import LiberoActuator
 from lerobot_env_bomb_libero.axes import LIBERO_TRANSFORMS

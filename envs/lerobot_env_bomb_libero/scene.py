@@ -8,12 +8,10 @@ from typing import Any
 from xml.etree import ElementTree
 
 import numpy as np
-from lerobot.envs.libero import LiberoEnv, get_libero_dummy_action
-from robosuite.utils.errors import RandomizationError
 
 from lerobot_bomb.envs.perturbation import EpisodeTransform
 from lerobot_bomb.libero.episode import initial_state_of
-from lerobot_env_bomb.mujoco_gl import mujoco
+from lerobot_env_bomb_libero.stock import LiberoEnv, get_libero_dummy_action, mujoco
 
 CAMERAS = ("agentview", "robot0_eye_in_hand")
 ROBOT_PREFIXES = ("robot0_", "gripper0_", "mount0_")
@@ -225,6 +223,8 @@ class LiberoScene(LiberoEnv):
 
     def _place(self) -> None:
         """Robosuite's reset; LIBERO's wrapper around it tries again for ever, whatever goes wrong."""
+        from robosuite.utils.errors import RandomizationError
+
         while True:
             try:
                 self._built.env.reset()

@@ -13,7 +13,8 @@ from lerobot_bomb.libero.perturbations import LiberoCondition
 LIBERO_PROTOCOL_VERSION = "libero-1.0"
 TASKS_PER_SUITE = {suite: 90 if suite == "libero_90" else 10 for suite in SUITES}
 MAX_ALLOWED_STEPS = 10_000
-MOTION_DIMS = 6  # of the 7 of an action: change of x, y, z and of orientation; the last is the gripper
+ACTION_DIM = 7
+MOTION_DIMS = 6  # change of x, y, z and of orientation; the last is the gripper
 
 
 class LiberoFailure(StrEnum):

@@ -7,8 +7,8 @@ from typing import Any, Self
 import numpy as np
 
 from lerobot_bomb.libero.perturbations import libero_magnitude
-from lerobot_env_bomb.mujoco_gl import mujoco
 from lerobot_env_bomb_libero.scene import LiberoScene, LiberoTransform
+from lerobot_env_bomb_libero.stock import mujoco
 
 MAX_OBJECTS = 32  # directions are drawn for so many, so that a level draws what another does
 NUM_JOINTS = 7
