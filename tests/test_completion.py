@@ -37,7 +37,7 @@ def test_bash_reads_the_script(script: Path) -> None:
     [
         ("lerobot-bomb rec", ["record"]),
         ("lerobot-bomb convert", ["convert", "convert-spatialvla"]),
-        ("lerobot-bomb convert ", ["pusht-zarr"]),
+        ("lerobot-bomb convert ", ["pusht-zarr", "libero-hdf5"]),
         ("lerobot-bomb record --repo_id=me/x --epi", ["--episodes"]),
         ("lerobot-bomb view --policy.p", ["--policy.path"]),
         ("lerobot-bomb completion ", ["bash", "zsh"]),

@@ -162,6 +162,16 @@ def test_an_unknown_convention_is_refused(
     assert "--image_convention='vulkan' is unknown; choose one of: opengl, opencv, lerobot" in error
 
 
+def test_a_demonstration_of_noops_is_refused_with_skip_noops(
+    source: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    path = tmp_path / source.name
+    shutil.copy(source, path)
+    replace("demo_1/actions", lambda actions: np.full(actions.shape, [0, 0, 0, 0, 0, 0, -1.0]))(path)
+    error = refusal(path, tmp_path, capsys, "--skip_noops")
+    assert f"{path}: data/demo_1 would have no frame left; leave --skip_noops out" in error
+
+
 def test_an_existing_folder_is_refused(
     source: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

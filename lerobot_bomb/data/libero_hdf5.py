@@ -127,9 +127,12 @@ class LiberoHdf5:
     def _check_file(self, file: Path) -> bool:
         """Check all demonstrations of a file; return whether its observations are of after their actions."""
         with _opened(file) as data:
-            names = [source.name for source in self.sources if source.file == file]
-            demos = (checked_values(f"{file}: data/{name}", data[name], self.image_shape) for name in names)
-            timings = [Timing.of(values) for values in demos]
+            timings = []
+            for name in [source.name for source in self.sources if source.file == file]:
+                values = checked_values(f"{file}: data/{name}", data[name], self.image_shape)
+                if self.skip_noops and noops(values["actions"][1:]).all():
+                    raise ValueError(f"{file}: data/{name} would have no frame left; leave --skip_noops out")
+                timings.append(Timing.of(values))
         return are_after(file, timings)
 
 
