@@ -130,22 +130,20 @@ class LiberoScene(LiberoEnv):
         """All geoms of objects or fixtures, as indices."""
         return np.flatnonzero(np.isin(self.owners[self.model.geom_bodyid], bodies))
 
-    def surfaces(self) -> dict[int, np.ndarray]:
-        """{material of table or floor: its geoms}; walls are none."""
-        found: dict[int, list[int]] = {}
-        for geom in self.scenery.tolist():
-            material = int(self.model.geom_matid[geom])
-            if material >= 0 and "wall" not in self.model.material(material).name:
-                found.setdefault(material, []).append(geom)
-        return {material: np.array(geoms) for material, geoms in found.items()}
+    def surfaces(self) -> dict[int, str]:
+        """{texture of table or floor: a material that has it}; walls are none."""
+        found = {}
+        for material in np.unique(self.model.geom_matid[self.scenery]).tolist():
+            texture = int(self.model.mat_texid[material, mujoco.mjtTextureRole.mjTEXROLE_RGB])
+            name = self.model.material(material).name if material >= 0 else ""
+            if name and texture >= 0 and "wall" not in name:
+                found[texture] = name
+        return found
 
-    def replace_texture(self, material: int, change: Callable[[np.ndarray], np.ndarray]) -> None:
-        """(H, W, 3) uint8 of a material's texture -> the same; the same again at the next reset."""
-        texture = int(self.model.mat_texid[material, mujoco.mjtTextureRole.mjTEXROLE_RGB])
-        if texture < 0 or texture in self._textures:
-            return
+    def change_texture(self, texture: int, change: Callable[[np.ndarray], np.ndarray]) -> None:
+        """(H, W, 3) uint8 of a texture -> the same; undone by the next reset."""
         pixels = self._pixels_of(texture)
-        self._textures[texture] = pixels.copy()
+        self._textures.setdefault(texture, pixels.copy())
         pixels[:] = change(pixels)
         self._upload(texture)
 

@@ -21,10 +21,14 @@ LIBERO_AXES = {
         },
     ),
     "reflectance": Axis(
-        "gloss of objects, table and floor",
+        "gloss of objects; lamps' reflections on table and floor",
         ("images",),
         {
-            "mirror": Magnitude("share", (0.06, 0.12, 0.18, 0.24, 0.3), "of light, by table and floor"),
+            "glare": Magnitude(
+                "share",
+                (0.16, 0.32, 0.48, 0.64, 0.8),
+                "opacity of lamps' reflections, drawn on table and floor",
+            ),
             "gloss": Magnitude("share", (0.1, 0.2, 0.3, 0.4, 0.5), "of the way to full specular light"),
         },
     ),

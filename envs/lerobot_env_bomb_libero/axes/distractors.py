@@ -17,12 +17,14 @@ MAX_COUNT = int(libero_magnitude("distractors", "count", MAX_LEVEL))
 SHAPES = ("box", "cylinder", "sphere")
 HALF_SIZE_M = 0.022
 RGB = ((0.9, 0.5, 0.1), (0.5, 0.2, 0.7), (0.1, 0.6, 0.6), (0.9, 0.3, 0.6), (0.35, 0.6, 0.15))
-CLEARANCE_M = 0.05  # from objects, fixtures and the gripper
-PATH_M = 0.09  # from the straight lines between what the task is about, and to it from the gripper
+CLEARANCE_M = 0.03  # from objects, fixtures and the gripper
+PATH_M = 0.08  # from the straight lines between what the task is about, and to it from the gripper
 REACH_M = 0.34  # from the middle of the table along x and y
-SPACING_M = 0.04  # of the places that are tried
+SPACING_M = 0.03  # of the places that are tried
 ABOVE_M = 2.0  # from where a place is looked for downwards
-IN_VIEW = 0.8  # of the image of the scene's camera, in whose middle they are
+BETWEEN_M = 0.07  # two of them
+STEP_M = 0.05  # from the surface that objects stand on, at most
+IN_VIEW = 0.9  # of the image of the scene's camera, in whose middle they are
 
 
 @dataclass(frozen=True)
@@ -57,10 +59,14 @@ class Distractors(LiberoTransform):
     def arrange(self, scene: LiberoScene) -> None:
         model = scene.model
         mujoco.mj_forward(model, scene.data)
+        boxes = list(scene.boxes().values())
+        ends = [scene.data.xpos[body][:2] for body in scene.wanted_bodies()] + [scene.gripper_xyz()[:2]]
         free: list[np.ndarray] = []
         for place in _places()[np.argsort(self.order)]:
-            spot = _spot_on_table(scene, place)
-            if spot is not None and all(np.linalg.norm(spot - other) > 4 * HALF_SIZE_M for other in free):
+            if not _is_out_of_the_way(place, boxes, ends):
+                continue
+            spot = _spot_on_table(scene, place, surface_m=min(box[0, 2] for box in boxes))
+            if spot is not None and all(np.linalg.norm(spot - other) > BETWEEN_M for other in free):
                 free.append(spot)
             if len(free) == self.count:
                 break
@@ -77,8 +83,16 @@ def _places() -> np.ndarray:
     return np.stack(np.meshgrid(line, line, indexing="ij"), -1).reshape(-1, 2)
 
 
-def _spot_on_table(scene: LiberoScene, place: np.ndarray) -> np.ndarray | None:
-    """(3,) the point of table or floor there, in view and out of the way; None: there is none."""
+def _is_out_of_the_way(place: np.ndarray, boxes: list[np.ndarray], ends: list[np.ndarray]) -> bool:
+    """Whether (2,) is far from (2, 3) boxes, and from the lines between the places where the task happens."""
+    gap = HALF_SIZE_M + CLEARANCE_M
+    if any((place > low[:2] - gap).all() and (place < high[:2] + gap).all() for low, high in boxes):
+        return False
+    return all(_distance_m(place, one, other) >= PATH_M for one in ends for other in ends)
+
+
+def _spot_on_table(scene: LiberoScene, place: np.ndarray, surface_m: float) -> np.ndarray | None:
+    """(3,) the point of table or floor there, if the scene's camera sees it; `surface_m` high or so."""
     model, data = scene.model, scene.data
     geom = np.zeros((1,), np.int32)
     start = np.array([*place, ABOVE_M])
@@ -86,24 +100,23 @@ def _spot_on_table(scene: LiberoScene, place: np.ndarray) -> np.ndarray | None:
     if depth_m < 0 or scene.owners[model.geom_bodyid[geom[0]]] != 0:
         return None
     spot = start - np.array([0, 0, depth_m])
-    surface_m = min(box[0, 2] for box in scene.boxes().values())  # what stands lowest stands on it
-    if abs(spot[2] - surface_m) > CLEARANCE_M or not _is_seen(scene, spot):
+    if abs(spot[2] - surface_m) > STEP_M or not _is_seen(scene, spot):
         return None
-    gap = HALF_SIZE_M + CLEARANCE_M
-    for low, high in scene.boxes().values():
-        if (place > low[:2] - gap).all() and (place < high[:2] + gap).all():
-            return None
-    ends = [scene.data.xpos[body][:2] for body in scene.wanted_bodies()] + [scene.gripper_xyz()[:2]]
-    near = (_distance_m(place, one, other) for one in ends for other in ends)
-    return None if any(distance_m < PATH_M for distance_m in near) else spot
+    return spot
 
 
 def _is_seen(scene: LiberoScene, spot: np.ndarray) -> bool:
-    camera = scene.model.camera(CAMERAS[0]).id
-    pose = matrix_of(scene.model.cam_quat[camera])
-    right, up, backward = (spot - scene.model.cam_pos[camera]) @ pose
-    slope = np.tan(np.radians(scene.model.cam_fovy[camera]) / 2) * IN_VIEW
-    return bool(max(abs(right), abs(up)) < -backward * slope)
+    model = scene.model
+    camera = model.camera(CAMERAS[0]).id
+    eye, middle = model.cam_pos[camera], spot + np.array([0, 0, HALF_SIZE_M])
+    right, up, backward = (middle - eye) @ matrix_of(model.cam_quat[camera])
+    slope = np.tan(np.radians(model.cam_fovy[camera]) / 2) * IN_VIEW
+    if max(abs(right), abs(up)) > -backward * slope:
+        return False
+    distance_m = float(np.linalg.norm(middle - eye))
+    geom = np.zeros((1,), np.int32)
+    depth_m = mujoco.mj_ray(model, scene.data, eye, (middle - eye) / distance_m, None, 1, -1, geom)
+    return depth_m < 0 or depth_m > distance_m
 
 
 def _distance_m(point: np.ndarray, one: np.ndarray, other: np.ndarray) -> float:

@@ -45,10 +45,9 @@ class SurfaceLook(LiberoTransform):
         )
 
     def edit(self, scene: LiberoScene) -> None:
-        for material in scene.surfaces():
-            is_floor = "floor" in scene.model.material(material).name
-            rgb = self.floor_rgb if is_floor else self.table_rgb
-            scene.replace_texture(material, partial(self._changed, rgb=rgb))
+        for texture, material in scene.surfaces().items():
+            rgb = self.floor_rgb if "floor" in material else self.table_rgb
+            scene.change_texture(texture, partial(self._changed, rgb=rgb))
 
     def _changed(self, pixels: np.ndarray, rgb: tuple[int, int, int]) -> np.ndarray:
         """(H, W, 3) uint8 -> the same."""
