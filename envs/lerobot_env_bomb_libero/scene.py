@@ -38,6 +38,9 @@ class LiberoTransform(EpisodeTransform):
     def arrange(self, scene: "LiberoScene") -> None:
         """Change where objects and the arm are: `scene.data.qpos`."""
 
+    def release(self, scene: "LiberoScene") -> None:
+        """Change the model once objects have come to rest and the first images are taken."""
+
 
 class LiberoScene(LiberoEnv):
     """Without transforms its episodes are LeRobot's, bit for bit; what nobody sees is not drawn."""
@@ -70,6 +73,8 @@ class LiberoScene(LiberoEnv):
             for _ in range(self.num_steps_wait - 1):
                 env.step(get_libero_dummy_action())
         observation, *_ = env.step(get_libero_dummy_action())
+        for each in transforms:
+            each.release(self)
         for robot in env.robots:
             robot.controller.use_delta = self.control_mode == "relative"
         return self._format_raw_obs(observation)
@@ -289,7 +294,9 @@ class LiberoScene(LiberoEnv):
         return model.tex_data[start : start + height * width * channels].reshape(height, width, channels)
 
     def _upload(self, texture: int) -> None:
-        mujoco.mjr_uploadTexture(self.model, self._built.sim._render_context_offscreen.con, texture)
+        context = self._built.sim._render_context_offscreen
+        context.gl_ctx.make_current()  # another environment of this process may have drawn last
+        mujoco.mjr_uploadTexture(self.model, context.con, texture)
 
     def _body_of(self, each: Any) -> int:
         return int(self.model.body(each.root_body).id)

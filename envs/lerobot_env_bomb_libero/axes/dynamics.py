@@ -28,7 +28,7 @@ class LiberoDynamics(LiberoTransform):
             latency=int(libero_magnitude("dynamics", "latency", level)),
         )
 
-    def edit(self, scene: LiberoScene) -> None:
+    def release(self, scene: LiberoScene) -> None:
         model, bodies = scene.model, list(scene.movable.values())
         parts = np.flatnonzero(np.isin(scene.owners, bodies))
         model.body_mass[parts] *= self.mass_factor
