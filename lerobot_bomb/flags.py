@@ -1,5 +1,6 @@
 """What is wrong with a flag: reads paths and choices; light, as the simulator's processes import it."""
 
+import re
 from collections.abc import Collection, Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
@@ -19,7 +20,7 @@ def one_of(flag: str, value: object, allowed: Collection) -> None:
 
 @contextmanager
 def flags_without_group(renamed: Mapping[str, str] | None = None) -> Iterator[None]:
-    """Name flags in a ValueError as lerobot-bomb does; LeRobot's commands call them --env.*.
+    """Name flags in a ValueError as lerobot-bomb does; LeRobot's commands call them --env.*, as --env.type.
 
     ``renamed``: other texts, which are replaced first.
     """
@@ -27,6 +28,6 @@ def flags_without_group(renamed: Mapping[str, str] | None = None) -> Iterator[No
         yield
     except ValueError as error:
         message = str(error)
-        for usual, name in {**(renamed or {}), "--env.": "--"}.items():
+        for usual, name in (renamed or {}).items():
             message = message.replace(usual, name)
-        raise ValueError(message) from None
+        raise ValueError(re.sub(r"--env\.(?!type\b)", "--", message)) from None

@@ -289,7 +289,7 @@ def test_a_wrong_flag_is_one_clear_line(flags: dict[str, Any], message: str) -> 
 
 
 def test_without_gym_pusht_the_way_out_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("lerobot_env_bomb_pusht.configuration_bomb_pusht.find_spec", lambda name: None)
+    monkeypatch.setattr("lerobot_bomb.pusht.episode.find_spec", lambda name: None)
     with pytest.raises(ValueError, match=r"needs gym-pusht: pip install 'lerobot_policy_bomb\[pusht\]'"):
         make_env(BombPushTEnvConfig(), n_envs=1)
 

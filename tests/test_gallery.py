@@ -15,14 +15,13 @@ from lerobot_bomb.commands import main as cli
 from lerobot_bomb.commands.gallery import (
     COLUMNS,
     PATH_RGB,
-    PUSHT_ENV_ID,
     SHEETS,
     axis_sheet,
     path_tile,
     pusht_sheet,
 )
 from lerobot_bomb.conditions import ALL
-from lerobot_bomb.envs.rollout import make_env
+from lerobot_bomb.envs.rollout import make_env, make_pusht_env
 from lerobot_bomb.pusht.episode import PushTSpec
 from lerobot_bomb.pusht.perturbations import PUSHT_AXES
 from lerobot_bomb.viewing.perturbations_page import axis_section, example_instructions, page
@@ -172,14 +171,12 @@ def test_the_page_has_every_axis_with_its_magnitudes_and_its_sheet() -> None:
 
 def test_a_sheet_of_pusht_shows_its_environment(tmp_path: Path) -> None:
     pytest.importorskip("gym_pusht", reason="gym-pusht is not installed: pip install '.[pusht]'")
-    import gymnasium
-
     sheet = pusht_sheet("goal", (3,), SIZE)
     assert list(sheet.images) == ["start, seed 3", "instruction, seed 3"]
     assert sheet.texts["turn, degrees"] == ["", "12", "24", "36", "48", "60"]
     for level, image in enumerate(sheet.images["start, seed 3"]):
         spec = PushTSpec(3, perturbations=f"goal:{level}")
-        env = gymnasium.make(PUSHT_ENV_ID, spec=spec, image_size=SIZE)
+        env = make_pusht_env(spec, SIZE)
         assert np.array_equal(env.reset(seed=3)[0]["pixels"], image)
     flags = ["gallery", "--env.type=bomb_pusht", f"--image_size={SIZE}", f"--output={tmp_path}"]
     assert cli.main([*flags, "--axes=dynamics"]) == 0

@@ -5,7 +5,6 @@ import shutil
 import subprocess
 import sys
 import time
-from collections import defaultdict
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -14,6 +13,7 @@ import av
 import cv2
 import numpy as np
 import pytest
+from rrd_files import Logged, read_rrd, scalars
 
 from lerobot_bomb.bomb.board import BOARD
 from lerobot_bomb.bomb.episode import EpisodeSpec
@@ -21,15 +21,13 @@ from lerobot_bomb.bomb.expert import expert_action
 from lerobot_bomb.bomb.observation import ACTION_NAMES, STATE_NAMES, RenderOptions
 from lerobot_bomb.bomb.privileged_state import PrivilegedState
 from lerobot_bomb.commands import main as cli
-from lerobot_bomb.commands.view import write_episode
+from lerobot_bomb.commands.view import bomb_episode, write_episode
 from lerobot_bomb.envs.rollout import expert_agent, make_env, play
 from lerobot_env_bomb.env import BombEnv
 
 SPEC = EpisodeSpec(seed=4, target=(3, 2), color="white", fps=5)
 OPTIONS = RenderOptions(image_size=64)
 FLAGS = ["--seed=4", "--target=[3,2]", "--color=white", "--fps=5", "--image_size=64"]
-
-type Logged = dict[str, dict[int | None, dict[str, Any]]]
 
 
 class Played(NamedTuple):
@@ -71,29 +69,9 @@ def viewed(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return stem
 
 
-def read_rrd(path: Path) -> Logged:
-    """{entity: {step, or None where it is static: {component: values}}}."""
-    from rerun.experimental import RrdReader
-
-    logged: Logged = defaultdict(lambda: defaultdict(dict))
-    for chunk in RrdReader(path).stream():
-        columns = chunk.to_record_batch().to_pydict()
-        steps = columns.get("step", [None] * len(next(iter(columns.values()))))
-        for name, values in columns.items():
-            for step, value in zip(steps, values, strict=True):
-                if value is not None:
-                    logged[chunk.entity_path][step][name] = value
-    return logged
-
-
 @pytest.fixture(scope="module")
 def logged(viewed: Path) -> Logged:
     return read_rrd(Path(f"{viewed}.rrd"))
-
-
-def scalars(logged: Logged, entity: str) -> list[float]:
-    rows = logged[entity]
-    return [rows[step]["Scalars:scalars"][0] for step in range(len(rows.keys() - {None}))]
 
 
 def test_cameras_and_state_are_the_environments_to_the_last_moment(logged: Logged, played: Played) -> None:
@@ -303,8 +281,8 @@ def test_a_bad_flag_is_named_and_nothing_is_written(
 @pytest.mark.parametrize(
     ("kind", "key", "message"),
     [
-        ("output_features", "action", "is a checkpoint whose action has shape (7,); BOMB's has (4,)"),
-        ("input_features", "observation.state", "whose observation.state has shape (7,); BOMB's has (4,)"),
+        ("output_features", "action", "whose action has shape (7,); that of --env.type=bomb has (4,)"),
+        ("input_features", "observation.state", "state has shape (7,); that of --env.type=bomb has (4,)"),
     ],
 )
 def test_a_checkpoint_of_another_robot_is_refused(
@@ -321,7 +299,8 @@ def test_a_checkpoint_of_another_robot_is_refused(
     config[kind][key]["shape"] = [7]
     (other / "config.json").write_text(json.dumps(config))
     assert cli.main(["view", f"--policy.path={other}", f"--output={tmp_path / 'x'}"]) == 1
-    assert f"--policy.path={other} {message}"[:60] in (error := capsys.readouterr().err)
+    error = capsys.readouterr().err
+    assert f"--policy.path={other} is a checkpoint whose {key} has shape" in error
     assert message in error
     assert [path.name for path in tmp_path.iterdir()] == ["other"]
 
@@ -337,7 +316,8 @@ def test_an_error_half_way_leaves_no_file(tmp_path: Path) -> None:
         return expert(observation, instruction)
 
     with pytest.raises(RuntimeError, match="out of order"):
-        write_episode(env, SPEC, falters, "faltering", tmp_path / "x.rrd", tmp_path / "x.mp4")
+        viewed = bomb_episode(SPEC, OPTIONS)
+        write_episode(env, viewed, falters, "faltering", tmp_path / "x.rrd", tmp_path / "x.mp4")
     env.close()
     assert list(tmp_path.iterdir()) == []
 

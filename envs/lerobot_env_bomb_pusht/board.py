@@ -8,8 +8,8 @@ import pygame
 from gym_pusht.envs.pusht import PushTEnv, pymunk_to_shapely
 
 from lerobot_bomb.envs.perturbation import EpisodeTransform
+from lerobot_bomb.pusht.episode import BOARD_PX
 
-BOARD_PX = 512  # the side of the board; positions and actions are in its pixels
 MIDDLE_PX = BOARD_PX / 2
 WHITE, OUTLINE_RGB = (255, 255, 255), (220, 30, 30)
 PERSON_IMAGE_SIZE = 384  # pixels, of LeRobot's videos of `pusht`

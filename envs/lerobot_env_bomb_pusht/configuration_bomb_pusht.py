@@ -2,32 +2,34 @@
 
 from dataclasses import dataclass, field
 from functools import partial
-from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
 
 from lerobot.configs import FeatureType, PolicyFeature
-from lerobot.envs import EnvConfig
+from lerobot.envs import EnvConfig, env_to_policy_features
+from lerobot.processor import PolicyProcessorPipeline
 from lerobot.utils.constants import ACTION, OBS_IMAGE, OBS_STATE
 
 from lerobot_bomb.checkpoints.identity import policy_of_results
+from lerobot_bomb.checkpoints.interface import Interface
 from lerobot_bomb.envs.results import check_results_path
 from lerobot_bomb.envs.vector import LazyVectorEnv
 from lerobot_bomb.flag_errors import flag_errors
 from lerobot_bomb.flags import one_of
 from lerobot_bomb.pusht.episode import (
+    BOARD_PX,
+    FPS,
     IMAGE_SIZE,
     INSTRUCTIONS,
     MAX_STEPS,
-    PUSHT_EXTRA,
     PushTSpec,
     check_image_size,
+    check_installed,
 )
 from lerobot_bomb.pusht.perturbations import PushTCondition
 from lerobot_env_bomb_pusht import GYM_ID
 
 TASKS = ("pusht",)
-FPS = 10  # gym-pusht's
 AGENT_POS, PIXELS = "agent_pos", "pixels"  # what gym-pusht calls them
 
 
@@ -50,6 +52,8 @@ class BombPushTEnvConfig(EnvConfig):
     image_size: int = IMAGE_SIZE
     # file that gets one JSON line per finished episode: seed, coverage, failure class
     results_path: str | None = None
+    # let a checkpoint act that was trained for another environment
+    ignore_checkpoint: bool = False
     features: dict[str, PolicyFeature] = field(default_factory=dict)
     features_map: dict[str, str] = field(default_factory=dict)
 
@@ -90,14 +94,28 @@ class BombPushTEnvConfig(EnvConfig):
             "results_path": self.results_path,
         }
 
+    def get_env_processors(self) -> tuple[PolicyProcessorPipeline, PolicyProcessorPipeline]:
+        """None; every command asks for them once, when its policy is built and nothing has been played.
+
+        Raises:
+            ValueError: that policy was trained for another environment.
+        """
+        if not self.ignore_checkpoint:
+            Interface(
+                str(self.type),
+                env_to_policy_features(self),
+                (0, BOARD_PX),
+                f"pixels of the {BOARD_PX}x{BOARD_PX} board",
+            ).check_acting_policy()
+        return super().get_env_processors()
+
     def create_envs(self, n_envs: int, use_async_envs: bool = False) -> dict[str, dict[int, LazyVectorEnv]]:
         """{task and condition: {0: vector env of n_envs}}; no worker starts before a first reset.
 
         Raises:
             ValueError: gym-pusht is not installed, or --env.results_path cannot be written.
         """
-        if find_spec("gym_pusht") is None:
-            raise ValueError(f"--env.type=bomb_pusht needs gym-pusht: pip install '{PUSHT_EXTRA}'")
+        check_installed()
         from lerobot_env_bomb_pusht.env import BombPushTEnv  # imports the simulator
 
         check_results_path(self.results_path)

@@ -8,7 +8,14 @@ import numpy as np
 from lerobot_bomb.envs.episode_env import EpisodeEnv, Observation, Transition
 from lerobot_bomb.envs.pusht_results import PushTResult
 from lerobot_bomb.envs.results import PolicyIdentity
-from lerobot_bomb.pusht.episode import IMAGE_SIZE, PushTFailure, PushTSpec, check_image_size, failure_of
+from lerobot_bomb.pusht.episode import (
+    FPS,
+    IMAGE_SIZE,
+    PushTFailure,
+    PushTSpec,
+    check_image_size,
+    failure_of,
+)
 from lerobot_env_bomb_pusht.actuator import PushTActuator
 from lerobot_env_bomb_pusht.axes.dynamics import PushTDynamics
 from lerobot_env_bomb_pusht.board import Board
@@ -37,7 +44,7 @@ class BombPushTEnv(EpisodeEnv[PushTSpec, _Run, PushTResult]):
     Action: (2,) x and y in pixels of the board where the agent is to go, 0..512; it is not clipped.
     """
 
-    metadata = {"render_modes": ["rgb_array"], "render_fps": 10}  # noqa: RUF012
+    metadata = {"render_modes": ["rgb_array"], "render_fps": FPS}  # noqa: RUF012
 
     def __init__(
         self,

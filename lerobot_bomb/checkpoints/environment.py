@@ -44,9 +44,24 @@ def check_acting_policy(here: Environment) -> None:
     Raises:
         ValueError: it was trained for another one; the message names the flags to change.
     """
+    asked = asked_policy()
+    if asked is not None:
+        _check(*asked, here)
+
+
+def asked_policy() -> tuple[PreTrainedPolicy, str, str] | None:
+    """The policy that this process built last, its name and how to insist on it; None: nothing to ask."""
     policies = built_policies()
-    if policies and not getattr(policies[-1].config, "ignore_environment", False):
-        _check(policies[-1], here)
+    if not policies or getattr(policies[-1].config, "ignore_environment", False):
+        return None
+    config = policies[-1].config
+    flag = (
+        "--policy.ignore_environment"
+        if isinstance(config, ConfigWithEnvironment)
+        else "--env.ignore_checkpoint"
+    )
+    who = f"the checkpoint {config.pretrained_path}" if config.pretrained_path else f"this {config.type}"
+    return policies[-1], who, f"insist with {flag}=true"
 
 
 def trained_environment(policy: PreTrainedPolicy) -> Environment | None:
@@ -73,12 +88,8 @@ def _of_training(checkpoint: Path) -> Environment | None:
     return environment_of_dataset(dataset.get("root") or default_root(dataset["repo_id"]))
 
 
-def _check(policy: PreTrainedPolicy, here: Environment) -> None:
+def _check(policy: PreTrainedPolicy, who: str, insist: str, here: Environment) -> None:
     config = policy.config
-    is_ours = isinstance(config, ConfigWithEnvironment)
-    flag = "--policy.ignore_environment" if is_ours else "--env.ignore_checkpoint"
-    insist = f"insist with {flag}=true"
-    who = f"the checkpoint {config.pretrained_path}" if config.pretrained_path else f"this {config.type}"
     environment = trained_environment(policy)
     if environment is not None:
         environment.check_same(here, who, insist)

@@ -81,7 +81,7 @@ def add_episode_arguments(parser: argparse.ArgumentParser) -> None:
     add("--robot", default="scara", help=f"{', '.join(ROBOTS)} (default: scara)")
     add("--control_mode", default="relative", help=f"{' or '.join(CONTROL_MODES)} (default: relative)")
     add("--fps", type=int, default=DEFAULT_FPS, help=f"control steps a second (default: {DEFAULT_FPS})")
-    add("--image_size", type=int, default=DEFAULT_IMAGE_SIZE, help="pixels (default: %(default)s)")
+    add("--image_size", type=int, default=DEFAULT_IMAGE_SIZE, help=f"pixels (default: {DEFAULT_IMAGE_SIZE})")
     add("--render_preset", default="fast", help=f"{' or '.join(RENDER_PRESETS)} (default: fast)")
     add("--depth", **switch(), help="observe each camera's depth (metres), intrinsics and pose too")
     add("--split", default="all", help=f"draw from {', '.join(SPLITS)} (default: all)")

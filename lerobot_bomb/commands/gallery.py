@@ -3,10 +3,8 @@
 import argparse
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
-from importlib.util import find_spec
 from pathlib import Path
 
-import gymnasium
 import numpy as np
 from PIL import Image, ImageDraw
 from tqdm import tqdm
@@ -17,21 +15,19 @@ from lerobot_bomb.bomb.observation import CAMERAS, PIXELS, WORKSPACE_HIGH_M, WOR
 from lerobot_bomb.bomb.perturbations import AXES, NUISANCES
 from lerobot_bomb.commands.arguments import parse_numbers, path_flag
 from lerobot_bomb.conditions import ALL, MAX_LEVEL, NONE, Axis, nuisances_of
-from lerobot_bomb.envs.rollout import expert_agent, make_env, play
+from lerobot_bomb.envs.rollout import expert_agent, make_env, make_libero_env, make_pusht_env, play
 from lerobot_bomb.files import written_whole
 from lerobot_bomb.flags import flags_without_group, one_of
 from lerobot_bomb.libero.assets import prepare_libero
 from lerobot_bomb.libero.episode import LiberoSpec
 from lerobot_bomb.libero.perturbations import LIBERO_AXES
-from lerobot_bomb.pusht.episode import PUSHT_EXTRA, PushTSpec
+from lerobot_bomb.pusht.episode import PushTSpec, check_installed
 from lerobot_bomb.pusht.perturbations import PUSHT_AXES
 from lerobot_bomb.viewing.perturbations_page import write_page
 from lerobot_bomb.viewing.sheet import FONT_SIZE, GAP, INK, TILE_PAPER, Sheet, font, text_tile
 
 SHEETS = (*AXES, ALL)
 AXES_OF = {"bomb": AXES, "bomb_pusht": PUSHT_AXES, "bomb_libero": LIBERO_AXES}  # by --env.type
-PUSHT_ENV_ID = "lerobot_env_bomb_pusht:bomb_pusht/PushT-v0"
-LIBERO_ENV_ID = "lerobot_env_bomb_libero:bomb_libero/Libero-v0"
 PUSHED_STEPS = 6  # through the block, for what `dynamics` does
 LIBERO_TASK = "libero_spatial"  # whose first task the sheets show
 LIBERO_ACTIONS = [[0.5, 0.0, -0.8, 0.0, 0.0, 0.0, -1.0]] * 12  # forwards and down
@@ -71,8 +67,8 @@ def run_gallery(args: argparse.Namespace) -> int:
         one_of("--axes", axis, sheets)
     if args.env_type != "bomb" and args.doc is not None:
         raise ValueError(f"--doc={args.doc} is written for --env.type=bomb only; drop one of them")
-    if args.env_type == "bomb_pusht" and find_spec("gym_pusht") is None:
-        raise ValueError(f"--env.type={args.env_type} needs gym-pusht: pip install '{PUSHT_EXTRA}'")
+    if args.env_type == "bomb_pusht":
+        check_installed()
     if args.env_type == "bomb_libero":
         prepare_libero([LIBERO_TASK])
     if args.output.exists() and not args.output.is_dir():
@@ -155,7 +151,7 @@ def tiles_sheet(
 def pusht_tiles(condition: str, seed: int, image_size: int, changes: set[str]) -> dict[str, np.ndarray]:
     """What dynamics do is seen after some steps through the block."""
     spec = PushTSpec(seed, perturbations=condition)
-    env = gymnasium.make(PUSHT_ENV_ID, disable_env_checker=True, spec=spec, image_size=image_size)
+    env = make_pusht_env(spec, image_size)
     observation, info = env.reset(seed=seed)
     tiles = {}
     if "images" in changes:
@@ -173,12 +169,7 @@ def pusht_tiles(condition: str, seed: int, image_size: int, changes: set[str]) -
 
 def libero_tiles(condition: str, seed: int, image_size: int, changes: set[str]) -> dict[str, np.ndarray]:
     """Both cameras upright; what dynamics do is seen after the same actions."""
-    env = gymnasium.make(
-        LIBERO_ENV_ID,
-        disable_env_checker=True,
-        spec=LiberoSpec(seed, LIBERO_TASK, perturbations=condition),
-        scene={"observation_height": image_size, "observation_width": image_size},
-    )
+    env = make_libero_env(LiberoSpec(seed, LIBERO_TASK, perturbations=condition), image_size)
     observation, _ = env.reset(seed=seed)
     tiles = {}
     if "images" in changes:

@@ -15,8 +15,10 @@ from typing import Any
 import numpy as np
 from tqdm import tqdm
 
+from lerobot_bomb.pusht.episode import BOARD_PX
+
 IMAGE_SIZE = 96  # pixels
-BOARD_SIZE = 512.0  # pixels, the unit of state and action
+BOARD_SIZE = float(BOARD_PX)  # the unit of state and action
 
 
 @dataclass(frozen=True)

@@ -11,11 +11,15 @@ from lerobot_bomb.bomb.episode import EpisodeSpec
 from lerobot_bomb.bomb.expert import expert_action
 from lerobot_bomb.bomb.observation import ENVIRONMENT_STATE, MAX_STEP_M, RenderOptions, action_bounds
 from lerobot_bomb.bomb.privileged_state import PrivilegedState
+from lerobot_bomb.libero.episode import LiberoSpec
+from lerobot_bomb.pusht.episode import PushTSpec
 
 # Importing the part before the colon registers the id; no module of the core imports an environment.
 ENV_ID = "lerobot_env_bomb:bomb/{suite}-v0"
+LIBERO_ENV_ID = "lerobot_env_bomb_libero:bomb_libero/Libero-v0"
+PUSHT_ENV_ID = "lerobot_env_bomb_pusht:bomb_pusht/PushT-v0"
 
-# (observation of the environment, instruction) -> (4,) action
+# (observation of the environment, instruction) -> (D,) action
 type Agent = Callable[[dict[str, Any], str], np.ndarray]
 # privileged state -> (4,) action
 type Expert = Callable[[PrivilegedState], np.ndarray]
@@ -29,11 +33,11 @@ class Moment:
     instruction: str
     observation: dict[str, Any]
     info: dict[str, Any]
-    action: np.ndarray | None  # (4,) the agent's, in the environment's units; None in the last moment
+    action: np.ndarray | None  # (D,) the agent's, in the environment's units; None in the last moment
 
     @property
     def state(self) -> PrivilegedState:
-        """The simulator's true state."""
+        """BOMB's simulator's true state."""
         return PrivilegedState.from_vector(self.observation[ENVIRONMENT_STATE])
 
 
@@ -47,9 +51,20 @@ def make_env(spec: EpisodeSpec, render_options: RenderOptions) -> gymnasium.Env:
     )
 
 
+def make_libero_env(spec: LiberoSpec, image_size: int) -> gymnasium.Env:
+    """`bomb_libero` from Gymnasium's registry; LIBERO must be prepared."""
+    scene = {"observation_height": image_size, "observation_width": image_size}
+    return gymnasium.make(LIBERO_ENV_ID, disable_env_checker=True, spec=spec, scene=scene)
+
+
+def make_pusht_env(spec: PushTSpec, image_size: int) -> gymnasium.Env:
+    """`bomb_pusht` from Gymnasium's registry; gym-pusht must be installed."""
+    return gymnasium.make(PUSHT_ENV_ID, disable_env_checker=True, spec=spec, image_size=image_size)
+
+
 def play(
     env: gymnasium.Env,
-    spec: EpisodeSpec,
+    spec: EpisodeSpec | PushTSpec,
     agent: Agent,
     disturb: Callable[[np.ndarray], np.ndarray] | None = None,
 ) -> Iterator[Moment]:
@@ -75,9 +90,9 @@ def expert_agent(expert: Expert = expert_action) -> Agent:
     return lambda observation, _: expert(PrivilegedState.from_vector(observation[ENVIRONMENT_STATE]))
 
 
-def random_agent(env: gymnasium.Env, spec: EpisodeSpec) -> Agent:
+def random_agent(env: gymnasium.Env, seed: int) -> Agent:
     """Actions drawn uniformly from the action space, the same for the same seed."""
-    env.action_space.seed(spec.seed)
+    env.action_space.seed(seed)
     return lambda *_: env.action_space.sample()
 
 

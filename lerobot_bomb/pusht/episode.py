@@ -2,6 +2,7 @@
 
 from dataclasses import dataclass
 from enum import StrEnum
+from importlib.util import find_spec
 from math import pi
 
 import numpy as np
@@ -15,6 +16,8 @@ from lerobot_bomb.pusht.perturbations import PUSHT_AXES, PushTCondition
 PUSHT_PROTOCOL_VERSION = "pusht-1.0"
 PUSHT_EXTRA = "lerobot_policy_bomb[pusht]"  # what pip installs gym-pusht with
 INSTRUCTIONS = ("templates", NONE)
+BOARD_PX = 512  # the side of the board; positions and actions are in its pixels
+FPS = 10  # control steps per second; gym-pusht has no other rate
 MAX_STEPS = 300  # gym-pusht's own limit
 MAX_ALLOWED_STEPS = 10_000
 IMAGE_SIZE = 96  # pixels, gym-pusht's own
@@ -60,6 +63,12 @@ class PushTSpec:
                 f"--env.perturbations={self.perturbations!r} rewords the instruction, of which "
                 "--env.instruction=none leaves nothing; drop one of them (all:3 stays allowed)"
             )
+
+
+def check_installed() -> None:
+    """Raise a ValueError unless gym-pusht is there."""
+    if find_spec("gym_pusht") is None:
+        raise ValueError(f"--env.type=bomb_pusht needs gym-pusht: pip install '{PUSHT_EXTRA}'")
 
 
 def check_image_size(image_size: int) -> None:

@@ -7,8 +7,9 @@ from typing import Self
 import numpy as np
 import pygame
 
+from lerobot_bomb.pusht.episode import BOARD_PX
 from lerobot_bomb.pusht.perturbations import pusht_magnitude
-from lerobot_env_bomb_pusht.board import BOARD_PX, Board, PushTTransform
+from lerobot_env_bomb_pusht.board import Board, PushTTransform
 
 # None like the target's light green, the block's slate grey or the agent's blue
 BOARD_RGB = (

@@ -1,0 +1,104 @@
+"""Whether a policy can act in an environment of which datasets say no more than shapes and statistics."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from lerobot.configs import FeatureType, PolicyFeature, PreTrainedConfig
+from lerobot.policies import PreTrainedPolicy
+from lerobot.utils.constants import ACTION, POLICY_POSTPROCESSOR_DEFAULT_NAME
+from safetensors import safe_open
+
+from lerobot_bomb._compat import training_data
+from lerobot_bomb.checkpoints.environment import asked_policy, trained_environment
+from lerobot_bomb.checkpoints.identity import weights_file
+
+# of where actions may lie; what moves over less of it in all demonstrations is in another unit
+LEAST_SPAN = 0.01
+UNNORMALIZER = f"{POLICY_POSTPROCESSOR_DEFAULT_NAME}_step_*_unnormalizer_processor.safetensors"
+
+
+@dataclass(frozen=True)
+class Interface:
+    """What an environment shows a policy and takes from it."""
+
+    env_type: str
+    features: Mapping[str, PolicyFeature]  # by the policy's names
+    action_range: tuple[float, float]  # where any dimension's values lie
+    action_meaning: str
+
+    def check_acting_policy(self) -> None:
+        """The policy that this process built last was trained for such an environment, for all one knows.
+
+        Raises:
+            ValueError: it was trained for another one; the message says what differs and the way out.
+        """
+        asked = asked_policy()
+        if asked is None:
+            return
+        policy, who, insist = asked
+        trained_for = trained_environment(policy)
+        if trained_for is not None:
+            raise ValueError(
+                f"{who} was trained for {trained_for}; this is --env.type={self.env_type}: evaluate with "
+                f"{' '.join(trained_for.eval_flags())}, or {insist}"
+            )
+        self._check_features(policy.config, who, insist)
+        self._check_actions(policy, who, insist)
+
+    def _check_features(self, config: PreTrainedConfig, who: str, insist: str) -> None:
+        of_policy = {**(config.input_features or {}), **(config.output_features or {})}
+        for name in self.features.keys() & of_policy.keys():
+            here, there = tuple(self.features[name].shape), tuple(of_policy[name].shape)
+            if here == there:
+                continue
+            if self.features[name].type is FeatureType.VISUAL:
+                raise ValueError(
+                    f"{who} reads images of {there[2]}x{there[1]} pixels; this environment has "
+                    f"--env.image_size={here[1]}: evaluate with --env.image_size={there[2]}, or {insist}"
+                )
+            raise ValueError(
+                f"{who} has {name} of shape {there}, and --env.type={self.env_type} of shape {here}: "
+                "evaluate it in the environment that it was trained for"
+            )
+
+    def _check_actions(self, policy: PreTrainedPolicy, who: str, insist: str) -> None:
+        """By the least and the greatest action of its training."""
+        trained = trained_actions(policy)
+        if trained is None:
+            return
+        low, high = trained
+        least, greatest = self.action_range
+        is_inside = (low >= least).all() and (high <= greatest).all()
+        if is_inside and (high - low).max() >= LEAST_SPAN * (greatest - least):
+            return
+        raise ValueError(
+            f"{who} was trained on actions from {_text(low)} to {_text(high)}; those of "
+            f"--env.type={self.env_type} are {self.action_meaning}, {least:g} to {greatest:g}: give a "
+            f"checkpoint of such actions, or {insist}"
+        )
+
+
+def trained_actions(policy: PreTrainedPolicy) -> tuple[np.ndarray, np.ndarray] | None:
+    """(D,) least and (D,) greatest value of each dimension in a policy's training; None: not known."""
+    meta, config = training_data(policy), policy.config
+    if meta is not None:
+        of_action = (meta.stats or {}).get(ACTION, {})
+        return (of_action["min"], of_action["max"]) if {"min", "max"} <= of_action.keys() else None
+    weights = config.pretrained_path and weights_file(
+        str(config.pretrained_path), config.pretrained_revision, config.use_peft
+    )
+    if not weights:
+        return None
+    for path in Path(weights).parent.glob(UNNORMALIZER):
+        with safe_open(path, "np") as tensors:
+            names = [f"{ACTION}.min", f"{ACTION}.max"]
+            if set(names) <= set(tensors.keys()):
+                low, high = map(tensors.get_tensor, names)
+                return low, high
+    return None
+
+
+def _text(values: np.ndarray) -> str:
+    return f"({', '.join(f'{value:.4g}' for value in values.tolist())})"

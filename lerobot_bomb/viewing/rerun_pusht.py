@@ -1,0 +1,53 @@
+"""An episode of `bomb_pusht` as a recording for the viewer of Rerun."""
+
+from pathlib import Path
+
+import numpy as np
+import rerun as rr
+import rerun.blueprint as rrb
+
+from lerobot_bomb.envs.pusht_results import PushTResult
+from lerobot_bomb.envs.rollout import Moment
+from lerobot_bomb.pusht.episode import FPS
+from lerobot_bomb.viewing.rerun_file import RerunFile, curve_views, describe_outcome, png, text_views
+
+# positions in pixels of the board; how far the block is turned from the target
+CURVES = {"action": ("x", "y"), "state": ("x", "y"), "block": ("x", "y"), "turned": ("degrees",)}
+
+
+class PushTRerunFile(RerunFile[PushTResult]):
+    """The policy's image, the agent, the block and its coverage of the target."""
+
+    def __init__(self, path: Path, name: str) -> None:
+        super().__init__(path, name, FPS, layout(), CURVES)
+
+    @staticmethod
+    def describe(result: PushTResult) -> str:
+        outcome = describe_outcome(result.is_success, result.failure, result.steps)
+        covered = f"{result.coverage:.3f} of the target, at its best moment {result.max_coverage:.3f}"
+        return f"{outcome}; the block covers {covered}"
+
+    def _log_still(self, moment: Moment) -> None:
+        pass
+
+    def _log_moment(self, moment: Moment) -> None:
+        block, goal = moment.info["block_pose"], moment.info["goal_pose"]
+        turned_deg = (np.degrees(block[2] - goal[2]) + 180) % 360 - 180
+        self._log("camera", png(moment.observation["pixels"]))
+        self._log_values("state", moment.observation["agent_pos"])
+        self._log_values("block", block[:2])
+        self._log_values("turned", np.array([turned_deg]))
+        if "coverage" in moment.info:  # gym-pusht measures it after a step
+            self._log("coverage", rr.Scalars(float(moment.info["coverage"])))
+
+
+def layout() -> rrb.Horizontal:
+    """The image and the words at the left, curves at the right."""
+    return rrb.Horizontal(
+        rrb.Vertical(
+            rrb.Spatial2DView(origin="camera", name="camera"),
+            rrb.Horizontal(*text_views("instruction", "result")),
+            row_shares=[3, 1],
+        ),
+        rrb.Vertical(*curve_views(*CURVES, "coverage")),
+    )
