@@ -1,9 +1,11 @@
 """What the tests of `bomb_pusht` have in common."""
 
+from dataclasses import asdict
 from typing import Any
 
 import numpy as np
 
+from lerobot_bomb.envs.pusht_results import PushTResult
 from lerobot_bomb.pusht.episode import PushTSpec
 
 
@@ -43,3 +45,19 @@ def seen(observation: dict[str, np.ndarray], info: dict[str, Any], reward: float
         "goal_pose": info["goal_pose"],
         "reward": np.array(reward),
     }
+
+
+def pusht_row(seed: int, condition: str, max_coverage: float, failure: str | None) -> dict[str, Any]:
+    """A line of results, read back."""
+    result = PushTResult(
+        spec=PushTSpec(seed, "none", perturbations=condition),
+        instruction="",
+        goal_pose=(256.0, 256.0, 0.785),
+        steps=300,
+        is_success=failure is None,
+        failure=failure,
+        coverage=max_coverage / 2,
+        max_coverage=max_coverage,
+        simulator_versions={"gym-pusht": "0.1.8"},
+    )
+    return asdict(result)

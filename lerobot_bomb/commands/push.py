@@ -4,10 +4,10 @@ import argparse
 
 from lerobot_bomb.checkpoints.names import TRAIN_CONFIG
 from lerobot_bomb.commands.arguments import add_hub_arguments, path_flag
-from lerobot_bomb.data.facts import DatasetFacts, check_results
+from lerobot_bomb.data.facts import DatasetFacts
 from lerobot_bomb.data.resumable import check_repo_id
 from lerobot_bomb.evaluation.results import read_results
-from lerobot_bomb.hub.evaluated import check_weights_of
+from lerobot_bomb.hub.evaluated import check_environment_of, check_weights_of
 from lerobot_bomb.hub.push import publish, read_checkpoint
 
 
@@ -51,7 +51,7 @@ def run_push(args: argparse.Namespace) -> int:
         check_token()
     checkpoint = read_checkpoint(args.checkpoint, args.repo_id, dataset, results)
     for path, rows in zip(args.results, results, strict=True):
-        check_results(path, rows, checkpoint.environment)
+        check_environment_of(path, rows, checkpoint.environment)
     if args.dry_run:
         print(checkpoint.card(), *sorted(files), sep="\n")
         return 0

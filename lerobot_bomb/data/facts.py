@@ -4,13 +4,9 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from lerobot_bomb.bomb.board import task_id
-from lerobot_bomb.bomb.episode import TASK_VERSION
-from lerobot_bomb.bomb.observation import CAMERAS
 from lerobot_bomb.data.dataset_files import INFO_FILE
 from lerobot_bomb.data.environment import Environment
 from lerobot_bomb.data.resumable import METADATA_FILE
-from lerobot_bomb.envs.results import Row
 from lerobot_bomb.files import read_json
 
 PUSHT_SOURCE = "pusht-zarr"
@@ -93,50 +89,3 @@ class DatasetFacts:
             f"- recorded with lerobot_bomb {recording['package_version']}, MuJoCo "
             f"{recording.get('mujoco_version', 'of an unknown version')}",
         ]
-
-
-def environment_of_episode(row: Row) -> Environment:
-    """That an episode was played in; of its depth and tasks nothing is said."""
-    spec = row["spec"]
-    return Environment(
-        **{name: spec[name] for name in ("robot", "control_mode", "fps")},
-        image_size=row["image_size"],
-        cameras=CAMERAS,
-        task_version=row.get("task_version", TASK_VERSION),
-        task=spec["suite"],
-    )
-
-
-def eval_flags_of(rows: list[Row]) -> list[str]:
-    """Of lerobot-eval, for the environment and the tasks that an evaluation was of."""
-    return [*environment_of_episode(rows[0]).eval_flags(), *_task_flags([row["spec"] for row in rows])]
-
-
-def _task_flags(specs: list[dict[str, Any]]) -> list[str]:
-    if all(spec["target"] and spec["color"] for spec in specs):
-        ids = {task_id(spec["target"], spec["color"]) for spec in specs}
-        return [f"--env.task_ids={sorted(ids)}".replace(" ", "")]
-    shared = {name: specs[0][name] for name in ("target", "color") if specs[0][name] is not None}
-    return [f"--env.{name}={value}".replace(" ", "") for name, value in shared.items()]
-
-
-def check_results(path: Path, rows: list[Row], trained_for: Environment | None) -> None:
-    """Raise a ValueError if episodes were played in another environment than a checkpoint was trained for."""
-    if trained_for is None:
-        return
-    for row in rows:
-        played_in = environment_of_episode(row)
-        names = trained_for.differences(played_in)
-        if names:
-            raise ValueError(
-                f"--results={path} has an episode with {played_in.text(names)} (seed {row['spec']['seed']}); "
-                f"this checkpoint was trained for {trained_for.text(names)}: a card states no rate of "
-                "another setting"
-            )
-
-
-def task_version(trained_for: Environment | None, has_results: bool) -> str | None:
-    """Of the benchmark that a checkpoint was trained or evaluated on; None: of no known one."""
-    if trained_for is not None:
-        return trained_for.task_version
-    return TASK_VERSION if has_results else None

@@ -7,7 +7,8 @@ from typing import Any
 
 from lerobot_bomb.bomb.board import BOARD, COLORS, task_id
 from lerobot_bomb.bomb.episode import PROTOCOL_VERSION, TASK_VERSION, EpisodeSpec, Failure, Stage
-from lerobot_bomb.bomb.observation import MAX_IMAGE_SIZE, MIN_IMAGE_SIZE, RENDER_PRESETS
+from lerobot_bomb.bomb.observation import CAMERAS, MAX_IMAGE_SIZE, MIN_IMAGE_SIZE, RENDER_PRESETS
+from lerobot_bomb.data.environment import Environment
 from lerobot_bomb.envs.results import Row
 from lerobot_bomb.evaluation.line_checks import (
     Check,
@@ -133,6 +134,31 @@ def _describe_tasks(rows: list[Row]) -> str:
     return f"target {target}; colour {color or 'drawn'}"
 
 
+def environment_of_episode(row: Row) -> Environment:
+    """That an episode was played in; of its depth and tasks nothing is said."""
+    spec = row["spec"]
+    return Environment(
+        **{name: spec[name] for name in ("robot", "control_mode", "fps")},
+        image_size=row["image_size"],
+        cameras=CAMERAS,
+        task_version=row.get("task_version", TASK_VERSION),
+        task=spec["suite"],
+    )
+
+
+def eval_flags_of(rows: list[Row]) -> list[str]:
+    """Of lerobot-eval, for the environment and the tasks that an evaluation was of."""
+    return [*environment_of_episode(rows[0]).eval_flags(), *_task_flags([row["spec"] for row in rows])]
+
+
+def _task_flags(specs: list[dict[str, Any]]) -> list[str]:
+    if all(spec["target"] and spec["color"] for spec in specs):
+        ids = {task_id(spec["target"], spec["color"]) for spec in specs}
+        return [f"--env.task_ids={sorted(ids)}".replace(" ", "")]
+    shared = {name: specs[0][name] for name in ("target", "color") if specs[0][name] is not None}
+    return [f"--env.{name}={value}".replace(" ", "") for name, value in shared.items()]
+
+
 BOMB_LINES = ResultKind(
     env_type="bomb",
     fields={OLD_VERSION: CHECKS, PROTOCOL_VERSION: CHECKS | NEW_CHECKS},
@@ -142,5 +168,8 @@ BOMB_LINES = ResultKind(
     settings=_settings,
     describe_simulator=_describe_simulator,
     describe_tasks=_describe_tasks,
+    benchmark=f"BOMB, task version {TASK_VERSION}",
+    environment=environment_of_episode,
+    eval_flags=eval_flags_of,
     measures=[Measure("placement error", _placement_error, "median of the stones that were put down")],
 )

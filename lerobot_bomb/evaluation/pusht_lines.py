@@ -73,6 +73,12 @@ def _settings(row: Row) -> dict[str, str]:
     return {"simulator": ", ".join(f"{name} {version or '?'}" for name, version in versions)}
 
 
+def _eval_flags(rows: list[Row]) -> list[str]:
+    names = ("instruction", "max_steps")
+    flags = {name: rows[0]["spec"][name] for name in names} | {"image_size": rows[0]["image_size"]}
+    return ["--env.type=bomb_pusht", *(f"--env.{name}={value}" for name, value in flags.items())]
+
+
 def _values(rows: list[Row], name: str) -> np.ndarray:
     return np.array([row[name] for row in rows])
 
@@ -104,6 +110,9 @@ PUSHT_LINES = ResultKind(
     settings=_settings,
     describe_simulator=lambda settings: settings["simulator"],
     describe_tasks=lambda rows: "task pusht",
+    benchmark=f"PushT with BOMB's axes, protocol {PUSHT_PROTOCOL_VERSION}",
+    environment=lambda row: None,
+    eval_flags=_eval_flags,
     measures=[
         Measure(
             "max coverage",

@@ -3,6 +3,7 @@
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 
+from lerobot_bomb.data.environment import Environment
 from lerobot_bomb.envs.results import Row
 from lerobot_bomb.evaluation.line_checks import Check, check_fields, refuse_others
 
@@ -39,6 +40,10 @@ class ResultKind:
     # of these settings, what simulated and drew
     describe_simulator: Callable[[Mapping[str, str]], str]
     describe_tasks: Callable[[list[Row]], str]
+    benchmark: str  # for a model card, with its version
+    # that an episode was played in; None: checkpoints of our types know of no such environment
+    environment: Callable[[Row], Environment | None]
+    eval_flags: Callable[[list[Row]], list[str]]  # of lerobot-eval, for the environment and tasks of episodes
     measures: Sequence[Measure]
     # what perturbations changed in pairs, beside successes
     describe_change: Callable[[list[Pair]], str] | None = None

@@ -6,7 +6,6 @@ from pathlib import Path
 
 from lerobot_bomb.conditions import NONE
 from lerobot_bomb.envs.results import Row
-from lerobot_bomb.evaluation.bomb_lines import BOMB_LINES
 from lerobot_bomb.evaluation.result_groups import (
     Group,
     differing,
@@ -27,30 +26,30 @@ class Summary:
     measures: dict[Measure, str]  # and their values
     failures: Counter[str]
 
+    def describe_failures(self) -> str:
+        """'dropped 3, imprecise 1', the most frequent class first."""
+        return ", ".join(f"{name} {count}" for name, count in self.failures.most_common()) or "none"
+
     def lines(self) -> list[str]:
         """The summary as text, a line each."""
         rate = format_rate(self.num_successes, self.num_episodes)
-        failures = ", ".join(f"{name} {count}" for name, count in self.failures.most_common()) or "none"
         figures = [("success", rate, "95 % Wilson interval")]
         figures += [(measure.name, value, measure.note) for measure, value in self.measures.items()]
-        figures += [("failures", failures, "")]
+        figures += [("failures", self.describe_failures(), "")]
         return [f"{name:<16} {value}{f' ({note})' if note else ''}" for name, value, note in figures]
 
 
 def read_results(path: Path) -> list[Row]:
-    """The rows of a results file of `bomb`; of an episode that was run again, the last one.
+    """The rows of a results file; of an episode that was run again, the last one.
 
     Raises:
-        ValueError: the file is missing or empty, or a line is damaged or of another environment.
+        ValueError: the file is missing or empty, or a line is damaged.
     """
     rows, damages = read_lines(path)
     if damages:
         raise ValueError(damages[0])
     if not rows:
         raise ValueError(f"{path}: no finished episode")
-    others = [kind.env_type for kind in map(kind_of, rows) if kind is not BOMB_LINES]
-    if others:
-        raise ValueError(f"{path} has lines of {others[0]}, which only `lerobot-bomb results` reads")
     return [row for group in groups_of(rows) for row in group.rows]
 
 

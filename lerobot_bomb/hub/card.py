@@ -12,9 +12,10 @@ from lerobot.configs.train import TrainPipelineConfig
 from lerobot_bomb import __version__
 from lerobot_bomb.checkpoints.names import is_hub_id
 from lerobot_bomb.data.environment import Environment
-from lerobot_bomb.data.facts import DatasetFacts, eval_flags_of, task_version
+from lerobot_bomb.data.facts import DatasetFacts
 from lerobot_bomb.envs.results import Row
 from lerobot_bomb.evaluation.result_groups import Group, by_condition, groups_of
+from lerobot_bomb.evaluation.result_lines import KINDS, kind_of
 from lerobot_bomb.evaluation.results import summarise
 from lerobot_bomb.hub.markdown import command, fenced
 from lerobot_bomb.hub.method import Method
@@ -113,8 +114,10 @@ class Checkpoint:
         return start + "".join(f"\n## {title}\n\n{text}\n" for title, text in sections.items())
 
     def _introduction(self) -> str:
-        version = task_version(self.environment, bool(self.results))
-        benchmark = f" Benchmark: BOMB, task version {version}." if version else ""
+        benchmarks = {kind_of(row).benchmark: None for rows in self.results for row in rows}
+        if self.environment is not None:
+            benchmarks = {f"BOMB, task version {self.environment.task_version}": None}
+        benchmark = f" Benchmark: {', and '.join(benchmarks)}." if benchmarks else ""
         is_trained = self.adapters_of or getattr(self.config, "trained_batches") > 0  # noqa: B009  our types'
         start = "" if is_trained else " LeRobot has not trained it: it is a start, or was converted."
         return (
@@ -147,27 +150,28 @@ class Checkpoint:
 
     def _evaluate(self) -> str:
         flags = self._eval_flags()
-        is_bomb = flags is not None and "--env.type=bomb" in flags
-        results = ["--env.results_path=results.jsonl"] if is_bomb else []
+        is_ours = flags is not None and any(f"--env.type={kind.env_type}" in flags for kind in KINDS)
+        results = ["--env.results_path=results.jsonl"] if is_ours else []
         line = command(
             "lerobot-eval",
             f"--policy.path={self.repo_id}",
             *(["--env.type=ENV"] if flags is None else flags),
-            "--eval.n_episodes=200" if is_bomb else "--eval.n_episodes=50",
+            "--eval.n_episodes=200" if is_ours else "--eval.n_episodes=50",
             "--eval.batch_size=10",
             *results,
         )
         if flags is None:
             return f"{fenced(line)}\n\n`ENV` is an environment with the dataset's cameras, state and action."
-        return fenced(f"{line}\nlerobot-bomb results results.jsonl" if is_bomb else line)
+        return fenced(f"{line}\nlerobot-bomb results results.jsonl" if is_ours else line)
 
     def _eval_flags(self) -> list[str] | None:
         """Of the environment that it was trained for, or that it was evaluated in; None: not known."""
         if self.environment is not None:
             return self.environment.eval_flags()
-        if self.dataset is not None and (flags := self.dataset.eval_flags()) is not None:
-            return flags
-        return eval_flags_of(self.results[0]) if self.results else None
+        if self.results:
+            kind = kind_of(self.results[0][0])
+            return kind.eval_flags([row for row in self.results[0] if kind_of(row) is kind])
+        return None if self.dataset is None else self.dataset.eval_flags()
 
     def _train(self) -> str:
         notes = []
@@ -246,18 +250,22 @@ class Checkpoint:
 def results_table(group: Group) -> str:
     """Markdown: what was evaluated, and a row for each condition."""
     _, *settings = group.lines()  # the policy is the checkpoint
+    measures = [
+        f"{measure.name} ({measure.note})" if measure.note else measure.name
+        for measure in group.kind.measures
+    ]
+    columns = ["condition", "n", "successes", "success rate", "95 % Wilson interval", *measures, "failures"]
     lines = [
         f"{group.kind.describe_tasks(group.rows)}; {'; '.join(settings)}:",
         "",
-        "| condition | n | successes | success rate | 95 % Wilson interval |",
-        "|---|---|---|---|---|",
+        f"| {' | '.join(columns)} |",
+        "|---" * len(columns) + "|",
     ]
     for condition, rows in by_condition(group.rows).items():
         summary = summarise(rows)
         n, successes = summary.num_episodes, summary.num_successes
         low, high = (100 * bound for bound in wilson_interval(successes, n))
-        lines.append(
-            f"| perturbations={condition} | {n} | {successes} | {100 * successes / n:.1f} % | {low:.1f} to "
-            f"{high:.1f} % |"
-        )
+        rate = f"{100 * successes / n:.1f} % | {low:.1f} to {high:.1f} %"
+        cells = [f"perturbations={condition}", str(n), str(successes), rate, *summary.measures.values()]
+        lines.append(f"| {' | '.join([*cells, summary.describe_failures()])} |")
     return "\n".join(lines)

@@ -6,13 +6,15 @@ from typing import Any
 
 import pytest
 import yaml
+from bomb_pusht_cases import pusht_row
 from lerobot.configs.default import DatasetConfig
 from lerobot.configs.train import TrainPipelineConfig
 from vla0_smol_cases import make_config
 
 from hub.server import LoopbackHub
 from lerobot_bomb.data.environment import Environment
-from lerobot_bomb.data.facts import DatasetFacts, eval_flags_of
+from lerobot_bomb.data.facts import DatasetFacts
+from lerobot_bomb.evaluation.bomb_lines import eval_flags_of
 from lerobot_bomb.hub.card import Checkpoint, PolicyCard
 from lerobot_policy_fdvla.card_fdvla import METHOD as FDVLA
 from lerobot_policy_spatialvla_grid.card_spatialvla_grid import METHOD as GRID
@@ -150,6 +152,28 @@ def test_pusht_and_datasets_of_others() -> None:
     others = str(replace(checkpoint(), dataset=DatasetFacts(INFO, {})).card())
     assert "--env.type=ENV" in others
     assert "protocol" not in others
+
+
+def test_an_evaluation_on_pusht_is_a_table_of_coverage_and_failures() -> None:
+    outcomes = ((0.96, None), (0.5, "timeout"), (0.2, "timeout"), (0.1, "never_touched"))
+    rows = [pusht_row(seed, "none", *outcome) for seed, outcome in enumerate(outcomes)]
+    rows += [pusht_row(seed, "goal:3", 0.3, "turned_wrong") for seed in range(4)]
+    pusht = DatasetFacts(INFO, {"conversion": {"source": "pusht-zarr 0123"}})
+    text = str(replace(checkpoint(), dataset=pusht, results=[rows]).card()).replace(" \\\n    ", " ")
+    assert (
+        "| condition | n | successes | success rate | 95 % Wilson interval | max coverage (mean, 95 % "
+        "bootstrap interval over episodes) | final coverage | failures |\n|---|---|---|---|---|---|---|---|\n"
+        "| perturbations=none | 4 | 1 | 25.0 % | 4.6 to 69.9 % | 0.440 ["
+    ) in text
+    assert " | timeout 2, never_touched 1 |\n| perturbations=goal:3 | 4 | 0 | 0.0 % | " in text
+    assert " | 0.300 [0.300, 0.300] | 0.150 [0.150, 0.150] | turned_wrong 4 |" in text
+    assert "task pusht; protocol pusht-1.0, instruction=none, max_steps=300, seeds 0..3; 96 px, gym-p" in text
+    assert "Benchmark: PushT with BOMB's axes, protocol pusht-1.0." in text
+    assert (
+        "lerobot-eval --policy.path=me/x --env.type=bomb_pusht --env.instruction=none --env.max_steps=300 "
+        "--env.image_size=96 --eval.n_episodes=200 --eval.batch_size=10 --env.results_path=results.jsonl\n"
+        "lerobot-bomb results results.jsonl"
+    ) in text
 
 
 @pytest.mark.parametrize(("method", "source"), [(VLA0, "2510.13054"), (GRID, "2501.15830"), (FDVLA, "FDVLA")])

@@ -1,12 +1,14 @@
 """`lerobot-bomb push`: what is published, what is refused, and what a push that is cut off leaves."""
 
 import hashlib
+import json
 from dataclasses import asdict
 from pathlib import Path
 
 import pytest
 import torch
 import yaml
+from bomb_pusht_cases import pusht_row
 from vla0_smol_cases import make_batch, make_policy
 
 from hub.damage import (
@@ -170,6 +172,31 @@ def test_a_card_states_no_rate_of_another_environment(
     assert (
         f"--results={results} has an episode with control_mode=relative (seed 1000); this checkpoint was "
         "trained for control_mode=absolute"
+    ) in capsys.readouterr().err
+
+
+def test_results_on_pusht_are_for_checkpoints_that_were_not_trained_for_bomb(
+    checkpoint: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    row = pusht_row(7, "none", 0.5, "timeout")
+    results = tmp_path / "results.jsonl"
+    results.write_text(json.dumps(row))
+    push_results = ("--dry_run", "--results", str(results))
+    assert push(checkpoint, *push_results) == 0
+    card = capsys.readouterr().out
+    assert "| perturbations=none | 1 | 0 | 0.0 % | 0.0 to 79.3 % | 0.500 | 0.250 | timeout 1 |" in card
+    assert "--env.type=bomb_pusht" in card
+    other = PolicyIdentity("act", "elsewhere", None, "a" * 64, "b" * 64)
+    results.write_text(json.dumps(row | {"policy": asdict(other)}))
+    assert push(checkpoint, *push_results) == 1
+    assert f"--results={results} is of act elsewhere" in capsys.readouterr().err
+    environment = Environment("scara", "absolute", 10, 256, ("workspace", "wrist"), "1.0")
+    change_config(environment=asdict(environment))(checkpoint)
+    results.write_text(json.dumps(row))
+    assert push(checkpoint, *push_results) == 1
+    assert (
+        f"--results={results} has an episode of --env.type=bomb_pusht (seed 7); this checkpoint was trained "
+        "for BOMB, task version 1.0, suite `place`"
     ) in capsys.readouterr().err
 
 
