@@ -90,6 +90,19 @@ def test_rewards_are_the_stock_ones_to_the_last_bit_where_those_are_the_same_in_
     assert exact > 10
 
 
+@pytest.mark.parametrize("size", [32, 96, 100, 256, 511, 512])
+def test_the_fast_image_is_the_stock_one(size: int) -> None:
+    env = pusht_env(CONDITION, image_size=size)
+    for seed in range(3):
+        env.reset(seed=seed)
+        screen = env._board._draw()
+        for render_action in (False, True):
+            image = env._board._get_img(screen, size, size, render_action)
+            expected = gym_pusht.PushTEnv._get_img(env._board, screen, size, size, render_action)
+            assert image.dtype == expected.dtype
+            np.testing.assert_array_equal(image, expected)
+
+
 def test_the_same_bits_in_one_after_the_other_in_sync_and_async_and_in_another_process() -> None:
     seeds, flags = [3, 4], {"perturbations": [CONDITION]}
     digests = []

@@ -27,7 +27,7 @@ class PushTTransform(EpisodeTransform):
 
 
 class Board(PushTEnv):
-    """Without transforms it is gym-pusht, bit for bit: what is overridden only adds to it."""
+    """Without transforms it is gym-pusht, bit for bit: what is overridden only adds to it, or is faster."""
 
     def __init__(self, image_size: int):
         super().__init__(
@@ -86,6 +86,17 @@ class Board(PushTEnv):
         if self.outline_px:
             self._draw_outline(screen)
         return screen
+
+    def _get_img(
+        self, screen: pygame.Surface, width: int, height: int, render_action: bool = False
+    ) -> np.ndarray:
+        """gym-pusht's image, without the strided copy of the screen that takes nearly half of its reset."""
+        if render_action:
+            return super()._get_img(screen, width, height, render_action)
+        import cv2
+
+        rgb = np.frombuffer(pygame.image.tobytes(screen, "RGB"), np.uint8).reshape(BOARD_PX, BOARD_PX, 3)
+        return cv2.resize(rgb, (width, height))
 
     def _draw_outline(self, screen: pygame.Surface) -> None:
         """A line around the target."""
