@@ -21,6 +21,8 @@ from recipes import FOLDER, POLICY_TYPES
 # from a checkpoint is read in test_shipped.py
 TRAINING = sorted(path for path in FOLDER.rglob("*.yaml") if "policy:\n  type:" in path.read_text())
 EVALUATION = sorted(FOLDER.glob("eval_*.yaml"))
+# LeRobot's own policies, on BOMB alone (test_stock_policies.py)
+STOCK_TYPES = ("act", "diffusion", "pi0", "pi05", "pi0_fast", "smolvla", "xvla")
 ENVS = ("aloha", "aloha_insertion", "bomb", "libero", "pusht")
 # what a policy is shown there, and the actions that it takes; PushT's pictures have 96 pixels a side,
 # whatever LeRobot declares (test_pusht_env.py)
@@ -145,6 +147,7 @@ def test_lerobots_parser_reads_it(path: Path) -> None:
     assert isinstance(config.policy, PreTrainedConfig) and config.policy.type == written["policy"].pop("type")
     for name, value in written["policy"].items():
         read = getattr(config.policy, name)
+        read = str(read) if isinstance(read, Path) else read
         # LeRobot takes another device where the machine has none such, and makes a tuple of a list
         assert name == "device" or (list(read) if isinstance(read, tuple) else read) == value, name
     # the first line is the command, with the file's own name
@@ -167,7 +170,7 @@ def test_lerobots_parser_reads_an_evaluation(path: Path) -> None:
 def test_every_policy_has_a_preset_for_every_environment() -> None:
     assert {path.name for path in FOLDER.glob("train_*.yaml")} == {
         f"train_{policy}_{env}.yaml" for policy in POLICY_TYPES for env in ENVS
-    }
+    } | {f"train_{policy}_bomb.yaml" for policy in STOCK_TYPES}
     assert {f"eval_{env}.yaml" for env in ENVS} <= {path.name for path in EVALUATION}
 
 
