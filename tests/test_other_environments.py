@@ -1,0 +1,82 @@
+"""Our policies on LeRobot's environment types: docs/other_environments.md says which of them were run."""
+
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import pytest
+from lerobot.configs import PipelineFeatureType
+from lerobot.envs import EnvConfig, env_to_policy_features, make_env_config
+from lerobot.policies.factory import make_policy_config
+from lerobot.utils.constants import ACTION, OBS_STATE
+from lerobot.utils.import_utils import register_third_party_plugins
+
+ARENA = {"enable_cameras": True, "camera_keys": "robot_pov_cam_rgb"}
+# what must be said of the environment, what of spatialvla_grid's actions, and what a policy is shown and does
+ENVS: dict[str, tuple[dict[str, Any], str | None, int, int, int]] = {
+    # type: (flags, action layout, cameras, state, action)
+    "isaaclab_arena": (ARENA, None, 1, 54, 36),
+    "libero": ({}, "pose", 2, 8, 7),
+    "libero_plus": ({}, "pose", 2, 8, 7),
+    "metaworld": ({}, None, 1, 4, 4),
+    "robocasa": ({}, None, 3, 16, 12),
+    "robomme": ({}, None, 2, 8, 8),
+    "robotwin": ({}, None, 3, 14, 14),
+    "vlabench": ({}, "pose", 3, 7, 7),
+}
+# test_configs.py and the environments' own tests have these
+SHOWN_ELSEWHERE = {"aloha", "bomb", "bomb_pusht", "pusht"}
+OF_A_ROBOT = {"gym_manipulator"}  # declares no features: they are its dataset's
+
+
+@pytest.fixture(autouse=True)
+def plugins() -> None:
+    register_third_party_plugins()
+
+
+def test_the_list_has_every_type() -> None:
+    assert {*ENVS} | SHOWN_ELSEWHERE | OF_A_ROBOT == set(EnvConfig.get_known_choices())
+
+
+@pytest.mark.parametrize("env_type", ENVS)
+def test_a_policys_config_takes_the_features(policy_type: str, env_type: str) -> None:
+    flags, layout, num_cameras, state_dim, action_dim = ENVS[env_type]
+    env = make_env_config(env_type, **flags)
+    steps, _ = env.get_env_processors()
+    by_kind = steps.transform_features({PipelineFeatureType.OBSERVATION: env_to_policy_features(env)})
+    features = {key: feature for of_kind in by_kind.values() for key, feature in of_kind.items()}
+    own = {"action_layout": layout} if policy_type == "spatialvla_grid" else {}
+    config: Any = make_policy_config(policy_type, vlm_model_name="nano", **own)
+    config.output_features = {ACTION: features.pop(ACTION)}
+    config.input_features = {
+        key: feature for key, feature in features.items() if not key.startswith(f"{OBS_STATE}.")
+    }
+    config.validate_features()
+    assert len(config.image_features) == num_cameras
+    assert config.robot_state_feature.shape == (state_dim,)
+    assert config.action_feature.shape == (action_dim,)
+    if policy_type == "spatialvla_grid":
+        assert config.grid_settings().groups
+
+
+@pytest.mark.long
+def test_metaworld_is_played(
+    policy_type: str, stock_cli: Callable[..., None], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Three steps each of two episodes."""
+    pytest.importorskip("metaworld", reason="Meta-World is not installed: pip install 'lerobot[metaworld]'")
+    from lerobot.envs import metaworld
+
+    from lerobot_env_bomb.backend import ensure_gl_backend
+
+    class Short(metaworld.MetaworldEnv):
+        def __init__(self, **kwargs: Any) -> None:
+            super().__init__(**kwargs)
+            self._max_episode_steps = 3
+
+    monkeypatch.setattr(metaworld, "MetaworldEnv", Short)
+    ensure_gl_backend()
+    flags = f"--policy.type={policy_type} --policy.vlm_model_name=nano --policy.device=cpu"
+    flags += " --env.type=metaworld --env.task=push-v3 --eval.n_episodes=2 --eval.batch_size=1"
+    stock_cli("lerobot-eval", *flags.split(), "--eval.use_async_envs=false", f"--output_dir={tmp_path}")
+    assert len(list((tmp_path / "videos").rglob("*.mp4"))) == 2
