@@ -13,7 +13,7 @@ def choose_backend(preamble: str = "", **environment: str) -> subprocess.Complet
     clean = {key: value for key, value in os.environ.items() if key not in ("MUJOCO_GL", "PYOPENGL_PLATFORM")}
     code = f"""
 import os
-from lerobot_env_bomb import backend
+from lerobot_env_mujoco import backend
 {preamble}
 print(backend.ensure_gl_backend(), os.environ["MUJOCO_GL"], os.environ["PYOPENGL_PLATFORM"])
 """

@@ -82,7 +82,8 @@ def test_level_0_is_lerobots_environment_bit_for_bit(env: Any) -> None:
 
     size = {"observation_height": IMAGE_SIZE, "observation_width": IMAGE_SIZE}
     config = make_env_config("libero", task=SUITE, task_ids=[0], **size)
-    stock: Any = make_env(config, n_envs=1)[SUITE][0].envs[0].unwrapped
+    vector: Any = make_env(config, n_envs=1)[SUITE][0]
+    stock = vector.envs[0].unwrapped
     begin(env, "all:5", 7)  # of which nothing must be left
     stock.init_state_id = 3
     observation, text = begin(env, NONE, 53)
@@ -141,7 +142,8 @@ def test_objects_start_elsewhere_apart_from_each_other_and_on_the_table(env: Any
 
 @pytest.mark.parametrize("seed", range(3))
 def test_what_was_in_view_of_the_scenes_camera_stays_there(env: Any, seed: int) -> None:
-    from lerobot_env_bomb_libero.axes.camera import _is_in_view, matrix_of
+    from lerobot_env_bomb_libero.axes.camera import _is_in_view
+    from lerobot_env_mujoco.rotations import matrix_of
 
     def shown(condition: str) -> np.ndarray:
         begin(env, condition, seed)

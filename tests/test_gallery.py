@@ -18,7 +18,8 @@ from lerobot_bomb.commands.gallery import (
     SHEETS,
     axis_sheet,
     path_tile,
-    pusht_sheet,
+    pusht_tiles,
+    tiles_sheet,
 )
 from lerobot_bomb.conditions import ALL
 from lerobot_bomb.envs.rollout import make_env, make_pusht_env
@@ -171,7 +172,7 @@ def test_the_page_has_every_axis_with_its_magnitudes_and_its_sheet() -> None:
 
 def test_a_sheet_of_pusht_shows_its_environment(tmp_path: Path) -> None:
     pytest.importorskip("gym_pusht", reason="gym-pusht is not installed: pip install '.[pusht]'")
-    sheet = pusht_sheet("goal", (3,), SIZE)
+    sheet = tiles_sheet(PUSHT_AXES, pusht_tiles, "goal", (3,), SIZE)
     assert list(sheet.images) == ["start, seed 3", "instruction, seed 3"]
     assert sheet.texts["turn, degrees"] == ["", "12", "24", "36", "48", "60"]
     for level, image in enumerate(sheet.images["start, seed 3"]):

@@ -67,7 +67,7 @@ def test_metaworld_is_played(
     pytest.importorskip("metaworld", reason="Meta-World is not installed: pip install 'lerobot[metaworld]'")
     from lerobot.envs import metaworld
 
-    from lerobot_env_bomb.backend import ensure_gl_backend
+    from lerobot_env_mujoco.backend import ensure_gl_backend
 
     class Short(metaworld.MetaworldEnv):
         def __init__(self, **kwargs: Any) -> None:

@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 
 from lerobot_env_bomb.fetch_files import fetch_xml
-from lerobot_env_bomb.mujoco_gl import mujoco
+from lerobot_env_mujoco.mujoco_gl import mujoco
 
 SCENE_XML = Path(__file__).with_name("scene.xml")
 

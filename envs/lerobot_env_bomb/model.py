@@ -6,8 +6,8 @@ import numpy as np
 from lerobot_bomb.bomb.board import BOARD, NUM_STONES, TRAY_CENTER_XY, TRAY_HALF_SIZE_XY
 from lerobot_bomb.bomb.perturbations import magnitude
 from lerobot_bomb.conditions import MAX_LEVEL
-from lerobot_env_bomb.mujoco_gl import mujoco
 from lerobot_env_bomb.robots import Robot
+from lerobot_env_mujoco.mujoco_gl import mujoco
 
 BOARD_HALF_SIZE_M = BOARD.half_size_m
 

@@ -12,7 +12,7 @@ import numpy as np
 from OpenGL.raw.GL.VERSION import GL_1_0
 
 from lerobot_bomb.bomb.observation import RenderOptions
-from lerobot_env_bomb.mujoco_gl import mujoco
+from lerobot_env_mujoco.mujoco_gl import mujoco
 
 SHADOW_MAP_SIZE = 512  # pixels
 CAPTION_LINE_PX = 26

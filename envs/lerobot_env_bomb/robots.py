@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 
 from lerobot_env_bomb.fetch import MAX_HALF_OPENING_M, fetch_joints, load_fetch
-from lerobot_env_bomb.mujoco_gl import mujoco
+from lerobot_env_mujoco.mujoco_gl import mujoco
 
 SCARA_XML = Path(__file__).with_name("scara.xml")
 BASE_XY = np.array([0.0, 0.30])  # metres, SCARA's shoulder; as in scara.xml

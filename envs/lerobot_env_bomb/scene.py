@@ -9,8 +9,8 @@ from lerobot_bomb.bomb.board import NUM_STONES
 from lerobot_bomb.bomb.layout import Layout, Snapshot
 from lerobot_bomb.bomb.observation import WORKSPACE_HIGH_M, WORKSPACE_LOW_M
 from lerobot_env_bomb.model import NUM_FEET, build_model, foot_name, parked_xyz, stone_name
-from lerobot_env_bomb.mujoco_gl import mujoco
 from lerobot_env_bomb.robots import ROBOTS
+from lerobot_env_mujoco.mujoco_gl import mujoco
 
 WORKSPACE_LOW = np.array(WORKSPACE_LOW_M)
 WORKSPACE_HIGH = np.array(WORKSPACE_HIGH_M)

@@ -76,7 +76,7 @@ def _outside(name: str, version: str) -> str:
 def check_rendering() -> Iterator[Finding]:
     """Render one frame of the default scene."""
     try:
-        backend = importlib.import_module("lerobot_env_bomb.backend").ensure_gl_backend()
+        backend = importlib.import_module("lerobot_env_mujoco.backend").ensure_gl_backend()
     except (RuntimeError, ValueError) as error:
         yield Finding("opengl", str(error), broken=True)
         return

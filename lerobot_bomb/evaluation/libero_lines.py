@@ -62,6 +62,23 @@ def _describe_tasks(rows: list[Row]) -> str:
     return ", ".join(f"{suite} tasks {describe_numbers(ids)}" for suite, ids in numbers.items())
 
 
+def _eval_flags(rows: list[Row]) -> list[str]:
+    first = rows[0]
+    width, height = first["image_size"].split("x")
+    suites = dict.fromkeys(row["spec"]["suite"] for row in rows)
+    flags = {
+        "task": ",".join(suites),
+        "task_ids": sorted({row["spec"]["task_id"] for row in rows}),
+        "control_mode": first["control_mode"],
+        "fps": first["fps"],
+        "observation_height": height,
+        "observation_width": width,
+    }
+    steps = first["spec"]["max_steps"]
+    flags |= {} if steps is None else {"episode_length": steps}
+    return ["--env.type=bomb_libero", *(f"--env.{name}={value}" for name, value in flags.items())]
+
+
 LIBERO_LINES = ResultKind(
     env_type="bomb_libero",
     fields={LIBERO_PROTOCOL_VERSION: LIBERO_CHECKS},
@@ -73,5 +90,8 @@ LIBERO_LINES = ResultKind(
         f"{settings['control_mode']} control, {settings['fps']} Hz, {settings['simulator']}"
     ),
     describe_tasks=_describe_tasks,
+    benchmark=f"LIBERO with BOMB's axes, protocol {LIBERO_PROTOCOL_VERSION}",
+    environment=lambda row: None,
+    eval_flags=_eval_flags,
     measures=(),
 )

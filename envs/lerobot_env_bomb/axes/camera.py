@@ -10,10 +10,10 @@ from lerobot_bomb.bomb.board import BOARD, TRAY_CENTER_XY, TRAY_HALF_SIZE_XY
 from lerobot_bomb.bomb.observation import CAMERAS
 from lerobot_bomb.bomb.perturbations import magnitude
 from lerobot_bomb.bomb.suite import Episode
-from lerobot_env_bomb.axes.rotations import matrix_of, rotation
 from lerobot_env_bomb.axes.transform import Transform
 from lerobot_env_bomb.model import BOARD_HALF_SIZE_M
-from lerobot_env_bomb.mujoco_gl import mujoco
+from lerobot_env_mujoco.mujoco_gl import mujoco
+from lerobot_env_mujoco.rotations import matrix_of, rotation
 
 FRAME_MARGIN = 0.015  # of half the image, that what must stay in view keeps from its edge
 START_HEIGHT_M = 0.115  # of the gripper over the tray, which must be in view too

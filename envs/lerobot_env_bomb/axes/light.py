@@ -8,9 +8,9 @@ import numpy as np
 
 from lerobot_bomb.bomb.perturbations import magnitude
 from lerobot_bomb.bomb.suite import Episode
-from lerobot_env_bomb.axes.rotations import rotation
 from lerobot_env_bomb.axes.transform import Transform
-from lerobot_env_bomb.mujoco_gl import mujoco
+from lerobot_env_mujoco.mujoco_gl import mujoco
+from lerobot_env_mujoco.rotations import rotation
 
 
 @dataclass(frozen=True)

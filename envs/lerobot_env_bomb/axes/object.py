@@ -12,7 +12,7 @@ from lerobot_bomb.bomb.perturbations import magnitude
 from lerobot_bomb.bomb.suite import Episode
 from lerobot_env_bomb.axes.transform import Transform
 from lerobot_env_bomb.model import NUM_FEET, foot_name, stone_name
-from lerobot_env_bomb.mujoco_gl import mujoco
+from lerobot_env_mujoco.mujoco_gl import mujoco
 
 GREY = 0.5
 

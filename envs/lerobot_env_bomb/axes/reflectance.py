@@ -10,7 +10,7 @@ from lerobot_bomb.bomb.perturbations import magnitude
 from lerobot_bomb.bomb.suite import Episode
 from lerobot_env_bomb.axes.transform import Transform
 from lerobot_env_bomb.model import NUM_GLARE_RINGS, glare_name
-from lerobot_env_bomb.mujoco_gl import mujoco
+from lerobot_env_mujoco.mujoco_gl import mujoco
 
 GLARE_SPREAD_M = 0.08  # of the lamp's reflection around the board's middle, in x and in y
 MAT_SHARE = 0.25  # of the stones' gloss that tray and table get

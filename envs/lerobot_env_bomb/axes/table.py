@@ -10,7 +10,7 @@ from lerobot_bomb.bomb.perturbations import magnitude
 from lerobot_bomb.bomb.suite import Episode
 from lerobot_env_bomb.axes.transform import Transform
 from lerobot_env_bomb.model import TABLE_PATTERNS, table_material
-from lerobot_env_bomb.mujoco_gl import mujoco
+from lerobot_env_mujoco.mujoco_gl import mujoco
 
 # Neither black nor white, so that stones of both colours show on them.
 TABLE_RGB = (

@@ -3,7 +3,7 @@
 
 from lerobot_bomb.bomb.layout import Layout
 from lerobot_bomb.envs.perturbation import EpisodeTransform
-from lerobot_env_bomb.mujoco_gl import mujoco
+from lerobot_env_mujoco.mujoco_gl import mujoco
 
 
 class Transform(EpisodeTransform):

@@ -7,9 +7,9 @@ from typing import Any, Self
 import numpy as np
 
 from lerobot_bomb.libero.perturbations import libero_magnitude
-from lerobot_env_bomb.axes.rotations import matrix_of, rotation
 from lerobot_env_bomb_libero.scene import CAMERAS, LiberoScene, LiberoTransform
 from lerobot_env_bomb_libero.stock import mujoco
+from lerobot_env_mujoco.rotations import matrix_of, rotation
 
 FRAME_MARGIN = 0.02  # of half the image, that what must stay in view keeps from its edge
 GRIPPER_M = 0.1  # before the wrist's camera, what it turns around

@@ -9,9 +9,9 @@ import numpy as np
 
 from lerobot_bomb.conditions import MAX_LEVEL
 from lerobot_bomb.libero.perturbations import libero_magnitude
-from lerobot_env_bomb.axes.rotations import matrix_of
 from lerobot_env_bomb_libero.scene import CAMERAS, LiberoScene, LiberoTransform
 from lerobot_env_bomb_libero.stock import mujoco
+from lerobot_env_mujoco.rotations import matrix_of
 
 MAX_COUNT = int(libero_magnitude("distractors", "count", MAX_LEVEL))
 SHAPES = ("box", "cylinder", "sphere")

@@ -6,8 +6,8 @@ from typing import Any, Self
 import numpy as np
 
 from lerobot_bomb.libero.perturbations import libero_magnitude
-from lerobot_env_bomb.axes.rotations import rotation
 from lerobot_env_bomb_libero.scene import HEADLIGHT, LiberoScene, LiberoTransform
+from lerobot_env_mujoco.rotations import rotation
 
 
 @dataclass(frozen=True)

@@ -3,7 +3,7 @@
 
 import numpy as np
 
-from lerobot_env_bomb.mujoco_gl import mujoco
+from lerobot_env_mujoco.mujoco_gl import mujoco
 
 
 def rotation(axis: np.ndarray, angle_rad: float) -> np.ndarray:

@@ -3,7 +3,7 @@
 Its names live in C modules that pyright cannot read.
 """
 
-from lerobot_env_bomb.backend import ensure_gl_backend
+from lerobot_env_mujoco.backend import ensure_gl_backend
 
 ensure_gl_backend()
 

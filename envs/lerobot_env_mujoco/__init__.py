@@ -1,0 +1,1 @@
+"""What our environments on MuJoCo share: the choice of an OpenGL backend, and rotations."""
