@@ -2,17 +2,21 @@
 
     OMP_NUM_THREADS=1 python benchmarks/perturbed_speed.py --json perturbed_speed.json
     OMP_NUM_THREADS=1 python benchmarks/perturbed_speed.py --env.type=bomb_pusht --episodes=300
+    OMP_NUM_THREADS=1 python benchmarks/perturbed_speed.py --env.type=bomb_libero --episodes=5
 
 Both environments take turns, reset by reset and step by step, with the same seeds and actions. `bomb_pusht`'s
-resets stand beside those of gym-pusht itself, in CPU time.
+resets stand beside those of gym-pusht itself, `bomb_libero`'s resets and steps beside those of LeRobot's
+`libero`, in CPU time.
 """
 
 import argparse
 import time
 from collections.abc import Callable, Iterable
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from statistics import median
+from typing import Any
 
 import gymnasium
 import numpy as np
@@ -23,6 +27,9 @@ from lerobot_bomb.bomb.observation import RenderOptions
 from lerobot_bomb.bomb.perturbations import AXES
 from lerobot_bomb.conditions import MAX_LEVEL, NONE
 from lerobot_bomb.envs.rollout import make_pusht_env
+from lerobot_bomb.libero.assets import prepare_libero
+from lerobot_bomb.libero.episode import LiberoSpec
+from lerobot_bomb.libero.perturbations import LIBERO_AXES
 from lerobot_bomb.pusht.episode import IMAGE_SIZE, PushTSpec
 from lerobot_bomb.pusht.perturbations import PUSHT_AXES
 from lerobot_bomb.tables import print_table
@@ -32,6 +39,10 @@ NUM_STEPS = 8  # of each episode
 MAX_RESET_RATIO = 1.5
 MAX_STEP_RATIO = 1.1
 MAX_PUSHT_RESET_RATIO = 1.3  # of `bomb_pusht` to gym-pusht, under any axis
+ENV_TYPES = ("bomb", "bomb_pusht", "bomb_libero")
+MAX_LIBERO_RESET_RATIO = 1.3  # of `bomb_libero` to `libero`, under any axis
+LIBERO_SUITE, LIBERO_IMAGE_SIZE, STOCK = "libero_spatial", 256, "LeRobot's libero"
+LIBERO_CONDITIONS = (NONE, *(f"{axis}:{MAX_LEVEL}" for axis in LIBERO_AXES), f"all:{MAX_LEVEL}")
 CONDITIONS = (*(f"{axis}:{MAX_LEVEL}" for axis in AXES), f"all:{MAX_LEVEL}")
 PUSHT_CONDITIONS = (NONE, *(f"{axis}:{MAX_LEVEL}" for axis in PUSHT_AXES), f"all:{MAX_LEVEL}")
 
@@ -41,13 +52,18 @@ def main() -> None:
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
-    parser.add_argument("--env.type", dest="env_type", choices=("bomb", "bomb_pusht"), default="bomb")
+    parser.add_argument(
+        "--env.type", dest="env_type", choices=("bomb", "bomb_pusht", "bomb_libero"), default="bomb"
+    )
     parser.add_argument("--episodes", type=positive, default=60, help="of each condition (default: 60)")
     add_machine_arguments(parser)
     args = parser.parse_args()
     require_idle_machine(args.force)
     if args.env_type == "bomb_pusht":
         measure_resets_of_pusht(args.episodes, args.json)
+        return
+    if args.env_type == "bomb_libero":
+        measure_libero(args.episodes, args.json)
         return
     figures = {condition: measure(condition, range(args.episodes)) for condition in CONDITIONS}
     print_table(
@@ -114,6 +130,59 @@ def measure_resets_of_pusht(num_episodes: int, json_path: Path | None) -> None:
         ],
     )
     write_figures(json_path, {"episodes": num_episodes, "stock_ms": stock_ms, "conditions": figures})
+
+
+def measure_libero(num_episodes: int, json_path: Path | None) -> None:
+    """Print, by condition, the median CPU time of a reset and of a step, and ratios to LeRobot's `libero`."""
+    prepare_libero([LIBERO_SUITE])
+    from lerobot.envs.factory import make_env as make_stock
+    from lerobot.envs.factory import make_env_config
+
+    from lerobot_env_bomb_libero.env import BombLiberoEnv
+
+    size = {"observation_height": LIBERO_IMAGE_SIZE, "observation_width": LIBERO_IMAGE_SIZE}
+    config = make_env_config("libero", task=LIBERO_SUITE, task_ids=[0], **size)
+    vector: Any = make_stock(config, n_envs=1)[LIBERO_SUITE][0]
+    stock = vector.envs[0].unwrapped
+    scene = size | {"obs_type": "pixels_agent_pos"}
+    ours = {
+        condition: BombLiberoEnv(LiberoSpec(0, LIBERO_SUITE, perturbations=condition), scene)
+        for condition in (NONE, f"all:{MAX_LEVEL}")
+    }
+    for env in (stock, *ours.values()):
+        env.reset(seed=0)
+    resets: dict[str, list[float]] = {}
+    steps: dict[str, list[float]] = {}
+    for seed in range(num_episodes):
+        for condition in (STOCK, *LIBERO_CONDITIONS):
+            env: Any = stock
+            if condition != STOCK:
+                env = ours[NONE if condition == NONE else f"all:{MAX_LEVEL}"]
+                env._spec = replace(env._spec, perturbations=condition)
+            actions = np.random.default_rng(seed).uniform(-0.3, 0.3, (NUM_STEPS, 7)).astype(np.float32)
+            reset = partial(env.reset, seed=seed)
+            resets.setdefault(condition, []).append(milliseconds(reset, time.process_time))
+            steps.setdefault(condition, []).extend(
+                milliseconds(partial(env.step, action), time.process_time) for action in actions
+            )
+    stock_reset, stock_step = median(resets[STOCK]), median(steps[STOCK])
+    figures = {
+        condition: {
+            "reset_ms": median(resets[condition]),
+            "reset_ratio": median(resets[condition]) / stock_reset,
+            "step_ms": median(steps[condition]),
+            "step_ratio": median(steps[condition]) / stock_step,
+        }
+        for condition in resets
+    }
+    print_table(
+        [
+            f"condition, {num_episodes} episodes", "reset, CPU ms", f"ratio <= {MAX_LIBERO_RESET_RATIO}",
+            "step, CPU ms", "ratio",
+        ],
+        [[name, *(f"{value:.2f}" for value in values.values())] for name, values in figures.items()],
+    )  # fmt: skip
+    write_figures(json_path, {"episodes": num_episodes, "conditions": figures})
 
 
 def milliseconds(call: Callable[[], object], clock: Callable[[], float] = time.perf_counter) -> float:

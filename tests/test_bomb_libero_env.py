@@ -126,6 +126,17 @@ def test_nothing_is_left_of_an_episode_in_the_next(env: Any) -> None:
     np.testing.assert_array_equal(flat(first["robot_state"]), flat(again["robot_state"]))
 
 
+def test_two_environments_of_a_process_draw_each_its_own(env: Any) -> None:
+    nominal = begin(env, NONE, 4)[0]["pixels"]["image"]
+    other = make(NONE)
+    np.testing.assert_array_equal(begin(other, NONE, 4)[0]["pixels"]["image"], nominal)
+    perturbed = begin(env, "table:5", 4)[0]["pixels"]["image"]
+    assert not np.array_equal(perturbed, nominal)
+    np.testing.assert_array_equal(begin(other, NONE, 4)[0]["pixels"]["image"], nominal)
+    other.close()
+    np.testing.assert_array_equal(begin(env, "table:5", 4)[0]["pixels"]["image"], perturbed)
+
+
 @pytest.mark.parametrize("seed", range(3))
 def test_objects_start_elsewhere_apart_from_each_other_and_on_the_table(env: Any, seed: int) -> None:
     def places(condition: str) -> dict[str, np.ndarray]:

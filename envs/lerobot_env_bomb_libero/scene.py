@@ -252,7 +252,12 @@ class LiberoScene(LiberoEnv):
 
         @wraps(sensor)  # robosuite reads attributes of it
         def draw(cache: Any) -> Any:
-            return sensor(cache) if self._draws else blank
+            if not self._draws:
+                return blank
+            # robosuite draws in whichever context is current: with several environments in one process,
+            # in that of the last one that was built
+            self._opengl.gl_ctx.make_current()
+            return sensor(cache)
 
         return draw
 
@@ -294,9 +299,12 @@ class LiberoScene(LiberoEnv):
         return model.tex_data[start : start + height * width * channels].reshape(height, width, channels)
 
     def _upload(self, texture: int) -> None:
-        context = self._built.sim._render_context_offscreen
-        context.gl_ctx.make_current()  # another environment of this process may have drawn last
-        mujoco.mjr_uploadTexture(self.model, context.con, texture)
+        self._opengl.gl_ctx.make_current()
+        mujoco.mjr_uploadTexture(self.model, self._opengl.con, texture)
+
+    @property
+    def _opengl(self) -> Any:
+        return self._built.sim._render_context_offscreen
 
     def _body_of(self, each: Any) -> int:
         return int(self.model.body(each.root_body).id)
