@@ -159,6 +159,8 @@ def measure_libero(num_episodes: int, json_path: Path | None) -> None:
             if condition != STOCK:
                 env = ours[NONE if condition == NONE else f"all:{MAX_LEVEL}"]
                 env._spec = replace(env._spec, perturbations=condition)
+            else:  # robosuite draws and frees in whichever OpenGL context is current
+                stock._env.sim._render_context_offscreen.gl_ctx.make_current()
             actions = np.random.default_rng(seed).uniform(-0.3, 0.3, (NUM_STEPS, 7)).astype(np.float32)
             reset = partial(env.reset, seed=seed)
             resets.setdefault(condition, []).append(milliseconds(reset, time.process_time))

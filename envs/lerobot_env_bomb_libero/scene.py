@@ -79,6 +79,13 @@ class LiberoScene(LiberoEnv):
             robot.controller.use_delta = self.control_mode == "relative"
         return self._format_raw_obs(observation)
 
+    def close(self) -> None:
+        """Free the model and what was drawn with."""
+        if self._env is not None:
+            # robosuite frees textures and buffers by their numbers in whichever context is current
+            self._opengl.gl_ctx.make_current()
+        super().close()
+
     @property
     def _built(self) -> Any:
         """LIBERO's environment, of a library without types."""
