@@ -167,6 +167,10 @@ def measure_libero(num_episodes: int, json_path: Path | None) -> None:
             steps.setdefault(condition, []).extend(
                 milliseconds(partial(env.step, action), time.process_time) for action in actions
             )
+    for env in (*ours.values(), stock):
+        if env is stock:
+            env._env.sim._render_context_offscreen.gl_ctx.make_current()
+        env.close()
     stock_reset, stock_step = median(resets[STOCK]), median(steps[STOCK])
     figures = {
         condition: {

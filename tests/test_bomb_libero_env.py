@@ -208,6 +208,17 @@ def test_dynamics_delay_actions_and_make_objects_heavier_or_lighter(env: Any) ->
     assert np.allclose(factor, 2.5) or np.allclose(factor, 1 / 2.5)
 
 
+def test_what_the_gripper_touches_is_told_by_name(env: Any) -> None:
+    begin(env, NONE, 6)
+    scene = env._scene
+    assert scene.touched() == set() and scene.wanted == {"akita_black_bowl_1", "plate_1"}
+    body = scene.movable["plate_1"]
+    address = scene.model.jnt_qposadr[scene.model.body_jntadr[body]]
+    scene.data.qpos[address : address + 3] = scene.gripper_xyz()
+    importlib.import_module("mujoco").mj_forward(scene.model, scene.data)
+    assert scene.touched() == {"plate_1"}
+
+
 def test_an_episode_ends_after_its_steps_with_a_line_of_results(
     libero_with_assets: Libero, tmp_path: Path
 ) -> None:

@@ -161,15 +161,10 @@ class LiberoScene(LiberoEnv):
 
     def touched(self) -> set[str]:
         """Objects and fixtures that the gripper touches now."""
-        contacts = self.data.contact
-        bodies = self.model.geom_bodyid[contacts.geom]  # (n, 2)
-        names = {body: name for name, body in (self.movable | self.fixtures).items()}
-        found = set()
-        for first, second in bodies.tolist():
-            for finger, other in ((first, second), (second, first)):
-                if self.model.body(finger).name.startswith(FINGERS) and self.owners[other] in names:
-                    found.add(names[self.owners[other]])
-        return found
+        bodies = self.model.geom_bodyid[self.data.contact.geom]  # (n, 2)
+        bodies = np.concatenate([bodies, bodies[:, ::-1]])
+        others = self.owners[bodies[self._is_finger[bodies[:, 0]], 1]]
+        return {self._names[other] for other in others.tolist() if other in self._names}
 
     def boxes(self) -> dict[int, np.ndarray]:
         """{body of an object or fixture: (2, 3) metres, its lowest and highest corner}, of its geoms."""
@@ -204,6 +199,16 @@ class LiberoScene(LiberoEnv):
     def gripper_xyz(self) -> np.ndarray:
         """(3,) metres."""
         return self.data.body("gripper0_eef").xpos.copy()
+
+    @cached_property
+    def _is_finger(self) -> np.ndarray:
+        """(bodies,) whether each is of the gripper."""
+        return np.array([self.model.body(body).name.startswith(FINGERS) for body in range(self.model.nbody)])
+
+    @cached_property
+    def _names(self) -> dict[int, str]:
+        """{body: object or fixture}."""
+        return {body: name for name, body in (self.movable | self.fixtures).items()}
 
     def joints_of_robot(self) -> np.ndarray:
         """(7,) where the arm's joints are in qpos."""
