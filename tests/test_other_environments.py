@@ -25,7 +25,7 @@ ENVS: dict[str, tuple[dict[str, Any], str | None, int, int, int]] = {
     "vlabench": ({}, "pose", 3, 7, 7),
 }
 # test_configs.py and the environments' own tests have these
-SHOWN_ELSEWHERE = {"aloha", "bomb", "bomb_pusht", "pusht"}
+SHOWN_ELSEWHERE = {"aloha", "bomb", "bomb_libero", "bomb_pusht", "pusht"}
 OF_A_ROBOT = {"gym_manipulator"}  # declares no features: they are its dataset's
 
 

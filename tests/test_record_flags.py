@@ -271,6 +271,8 @@ def test_an_episode_has_the_flags_of_the_environment(command: str) -> None:
     assert names <= ours.keys()
     assert names <= {field.name for field in fields(Recording)}
     several = {"task_ids": (), "perturbations": (NONE,)}  # None: one episode of the environment
+    if command == "view":  # of several environments, each with its own default
+        several["image_size"] = None
     assert {name: ours[name] for name in names} == {name: getattr(env, name) for name in names} | several
 
 
