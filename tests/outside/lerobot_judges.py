@@ -22,6 +22,8 @@ from lerobot.utils.import_utils import register_third_party_plugins
 from recipes import POLICY_TYPES
 from run_judges import BUILD, CLASSES, FILES, MAKE_ENV, ROOT, SAVE_AND_LOAD
 
+from lerobot_bomb.libero.assets import SUITES, prepare_libero
+
 MIN_TENSORS = 10
 # for every config that has the field, unless the test gives a value
 DEFAULTS = {"vlm_model_name": "nano", "device": "cpu"}
@@ -62,6 +64,16 @@ def check_config_file(folder: Path, config: PreTrainedConfig) -> None:
     assert PreTrainedConfig.from_pretrained(folder) == config
 
 
+def has_libero() -> bool:
+    """Whether LIBERO and its assets are there; says what is missing."""
+    try:
+        prepare_libero([SUITES[0]])
+    except ValueError as error:
+        print(f"bomb_libero is not judged: {error}")
+        return False
+    return True
+
+
 def pytest_configure(config: pytest.Config) -> None:
     register_third_party_plugins()
     policies, envs = own_types(PreTrainedConfig, "policies"), own_types(EnvConfig, "envs")
@@ -70,6 +82,7 @@ def pytest_configure(config: pytest.Config) -> None:
             f"LeRobot knows of this project the policy types {policies} and the env types {envs}; configs/ "
             f"names {POLICY_TYPES}. `lerobot-bomb doctor` says what does not import"
         )
+    envs = [name for name in envs if name != "bomb_libero" or has_libero()]
     for name in policies:
         set_defaults(PreTrainedConfig.get_choice_class(name))
     config.pluginmanager.register(Judges(POLICY_TYPES, policies, envs))
