@@ -30,11 +30,19 @@ FIELDS = {
     "distractors": {"body_pos", "geom_rgba", "geom_contype", "geom_conaffinity"},
     "camera": {"cam_pos", "cam_quat", "cam_fovy"},
     "light": {"light_dir", "light_diffuse", "light_specular", "headlight"},
-    "dynamics": {"body_mass", "body_inertia", "geom_friction"},
+    "dynamics": {
+        "body_mass",
+        "body_inertia",
+        "body_subtreemass",
+        "body_invweight0",
+        "dof_invweight0",
+        "geom_friction",
+    },
     "object": {"mat_rgba", "geom_rgba"},
 }
 COMPARED = (
-    "body_pos", "body_quat", "body_mass", "body_inertia", "geom_pos", "geom_quat", "geom_size", "geom_rgba",
+    "body_pos", "body_quat", "body_mass", "body_inertia", "body_subtreemass", "body_invweight0",
+    "dof_invweight0", "geom_pos", "geom_quat", "geom_size", "geom_rgba",
     "geom_friction", "geom_contype", "geom_conaffinity", "geom_matid", "mat_rgba", "mat_specular",
     "mat_shininess", "mat_reflectance", "mat_emission", "mat_texid", "cam_pos", "cam_quat", "cam_fovy",
     "light_pos", "light_dir", "light_diffuse", "light_specular", "light_ambient", "dof_damping",

@@ -18,8 +18,9 @@ ROBOT_PREFIXES = ("robot0_", "gripper0_", "mount0_")
 FINGERS = "gripper0_"
 # of mjModel, what the axes and LIBERO's own reset change
 EDITED = (
-    "body_pos", "body_quat", "body_mass", "body_inertia", "geom_rgba", "geom_friction", "geom_contype",
-    "geom_conaffinity", "geom_size", "mat_rgba", "mat_specular", "mat_shininess", "mat_reflectance",
+    "body_pos", "body_quat", "body_mass", "body_inertia", "body_subtreemass", "body_invweight0",
+    "dof_invweight0", "geom_rgba", "geom_friction", "geom_contype", "geom_conaffinity", "mat_rgba",
+    "mat_specular", "mat_shininess",
     "cam_pos", "cam_quat", "cam_fovy", "light_dir", "light_diffuse", "light_specular", "light_ambient",
 )  # fmt: skip
 HEADLIGHT = ("ambient", "diffuse", "specular")

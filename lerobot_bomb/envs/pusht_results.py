@@ -4,16 +4,17 @@ from dataclasses import dataclass, field
 from functools import partial
 
 from lerobot_bomb import __version__
-from lerobot_bomb.envs.results import PolicyIdentity, ResultLine, installed_version, machine_name
+from lerobot_bomb.envs.results import (
+    PolicyIdentity,
+    ResultLine,
+    installed_version,
+    installed_versions,
+    machine_name,
+)
 from lerobot_bomb.pusht.episode import IMAGE_SIZE, PUSHT_PROTOCOL_VERSION, PushTSpec
 
 # what the bits of an episode depend on
 SIMULATOR = ("gym-pusht", "pymunk", "pygame", "opencv-python-headless")
-
-
-def simulator_versions() -> dict[str, str | None]:
-    """{distribution: version} of what simulates and draws; None where one has no metadata."""
-    return {name: installed_version(name) for name in SIMULATOR}
 
 
 @dataclass(frozen=True)
@@ -31,7 +32,7 @@ class PushTResult(ResultLine):
     levels: dict[str, int] = field(default_factory=dict)  # of the perturbation axes that were on
     image_size: int = IMAGE_SIZE
     policy: PolicyIdentity | None = None  # None: not known
-    simulator_versions: dict[str, str | None] = field(default_factory=simulator_versions)
+    simulator_versions: dict[str, str | None] = field(default_factory=partial(installed_versions, SIMULATOR))
     machine: str = field(default_factory=machine_name)
     lerobot_version: str | None = field(default_factory=partial(installed_version, "lerobot"))
     torch_version: str | None = field(default_factory=partial(installed_version, "torch"))

@@ -6,6 +6,7 @@ Simulator workers import this module, so it imports neither torch nor LeRobot.
 import dataclasses
 import json
 import platform
+from collections.abc import Iterable
 from dataclasses import dataclass, field
 from functools import cache, partial
 from importlib.metadata import PackageNotFoundError, version
@@ -25,6 +26,11 @@ def installed_version(distribution: str) -> str | None:
         return version(distribution)
     except PackageNotFoundError:
         return None
+
+
+def installed_versions(distributions: Iterable[str]) -> dict[str, str | None]:
+    """{distribution: version}; None where one has no metadata."""
+    return {name: installed_version(name) for name in distributions}
 
 
 @cache

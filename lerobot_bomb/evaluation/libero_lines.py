@@ -2,6 +2,7 @@
 
 from lerobot_bomb.envs.results import Row
 from lerobot_bomb.evaluation.line_checks import (
+    RUN_CHECKS,
     Check,
     is_bool,
     is_int,
@@ -10,7 +11,7 @@ from lerobot_bomb.evaluation.line_checks import (
     is_text,
     or_none,
 )
-from lerobot_bomb.evaluation.result_kind import ResultKind, describe_numbers
+from lerobot_bomb.evaluation.result_kind import ResultKind, describe_numbers, describe_versions
 from lerobot_bomb.libero.episode import LIBERO_PROTOCOL_VERSION, LiberoFailure, LiberoSpec
 
 LIBERO_SPEC_CHECKS: dict[str, Check] = {  # the rest is LiberoSpec's own
@@ -31,12 +32,7 @@ LIBERO_CHECKS: dict[str, Check] = {
     "image_size": is_text,
     "control_mode": is_text,
     "fps": is_int(1),
-    "policy": or_none(lambda value: isinstance(value, dict)),
-    "simulator_versions": is_table_of(or_none(is_text)),
-    "machine": is_text,
-    "lerobot_version": or_none(is_text),
-    "torch_version": or_none(is_text),
-    "package_version": is_text,
+    **RUN_CHECKS,
 }
 
 
@@ -45,9 +41,8 @@ def _check_episode(row: Row) -> None:
 
 
 def _settings(row: Row) -> dict[str, str]:
-    versions = row["simulator_versions"].items()
     return {
-        "simulator": ", ".join(f"{name} {version or '?'}" for name, version in versions),
+        "simulator": describe_versions(row),
         "control_mode": row["control_mode"],
         "fps": str(row["fps"]),
     }

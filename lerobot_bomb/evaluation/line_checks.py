@@ -56,6 +56,17 @@ def is_sha256(value: Any) -> bool:
     return isinstance(value, str) and re.fullmatch("[0-9a-f]{64}", value) is not None
 
 
+# of who acted, on what and with what, in lines whose simulator is several packages
+RUN_CHECKS: dict[str, Check] = {
+    "policy": or_none(lambda value: isinstance(value, dict)),
+    "simulator_versions": is_table_of(or_none(is_text)),
+    "machine": is_text,
+    "lerobot_version": or_none(is_text),
+    "torch_version": or_none(is_text),
+    "package_version": is_text,
+}
+
+
 def refuse_others(spec: dict[str, Any], checks: Mapping[str, Check]) -> None:
     """Raise a ValueError if a spec has a field that no check is for: then it may be of another episode."""
     unknown = spec.keys() - checks.keys()

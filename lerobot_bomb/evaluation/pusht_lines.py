@@ -7,6 +7,7 @@ import numpy as np
 
 from lerobot_bomb.envs.results import Row
 from lerobot_bomb.evaluation.line_checks import (
+    RUN_CHECKS,
     Check,
     is_bool,
     is_int,
@@ -16,7 +17,7 @@ from lerobot_bomb.evaluation.line_checks import (
     is_text,
     or_none,
 )
-from lerobot_bomb.evaluation.result_kind import Measure, Pair, ResultKind
+from lerobot_bomb.evaluation.result_kind import Measure, Pair, ResultKind, describe_versions
 from lerobot_bomb.pusht.episode import (
     MAX_IMAGE_SIZE,
     MIN_IMAGE_SIZE,
@@ -54,12 +55,7 @@ PUSHT_CHECKS: dict[str, Check] = {
     "max_coverage": is_share,
     "levels": is_table_of(is_int(0)),
     "image_size": is_int(MIN_IMAGE_SIZE, MAX_IMAGE_SIZE),
-    "policy": or_none(lambda value: isinstance(value, dict)),
-    "simulator_versions": is_table_of(or_none(is_text)),
-    "machine": is_text,
-    "lerobot_version": or_none(is_text),
-    "torch_version": or_none(is_text),
-    "package_version": is_text,
+    **RUN_CHECKS,
 }
 
 
@@ -68,9 +64,7 @@ def _check_episode(row: Row) -> None:
 
 
 def _settings(row: Row) -> dict[str, str]:
-    """'gym-pusht 0.1.8, pymunk 6.11.1, ...': what the bits of an episode depend on."""
-    versions = row["simulator_versions"].items()
-    return {"simulator": ", ".join(f"{name} {version or '?'}" for name, version in versions)}
+    return {"simulator": describe_versions(row)}
 
 
 def _eval_flags(rows: list[Row]) -> list[str]:

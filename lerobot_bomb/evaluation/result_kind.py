@@ -64,6 +64,12 @@ class ResultKind:
         return [name for name in newest if name not in self.fields[version]]
 
 
+def describe_versions(row: Row) -> str:
+    """'gym-pusht 0.1.8, pymunk 6.11.1': what the bits of an episode depend on."""
+    versions = row["simulator_versions"].items()
+    return ", ".join(f"{name} {version or '?'}" for name, version in versions)
+
+
 def describe_numbers(numbers: Iterable[int]) -> str:
     """{0, 1, 2, 7} -> '0..2, 7'; of many runs, the first and the last number."""
     runs: list[list[int]] = []

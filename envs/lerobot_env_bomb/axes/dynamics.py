@@ -12,6 +12,7 @@ from lerobot_bomb.bomb.suite import Episode
 from lerobot_env_bomb.axes.transform import Transform
 from lerobot_env_bomb.model import stone_name
 from lerobot_env_mujoco.mujoco_gl import mujoco
+from lerobot_env_mujoco.transforms import scale_mass
 
 
 @dataclass(frozen=True)
@@ -35,10 +36,5 @@ class Dynamics(Transform):
 
     def edit_model(self, model: mujoco.MjModel) -> None:
         bodies = [model.body(stone_name(i)).id for i in range(NUM_STONES)]
-        dofs = np.isin(model.dof_bodyid, bodies)
-        geoms = np.isin(model.geom_bodyid, bodies)
-        for values in (model.body_mass, model.body_inertia, model.body_subtreemass):
-            values[bodies] *= self.mass_factor
-        model.body_invweight0[bodies] /= self.mass_factor
-        model.dof_invweight0[dofs] /= self.mass_factor
-        model.geom_friction[geoms] *= self.friction_factor
+        scale_mass(model, bodies, self.mass_factor)
+        model.geom_friction[np.isin(model.geom_bodyid, bodies)] *= self.friction_factor

@@ -7,6 +7,7 @@ import numpy as np
 
 from lerobot_bomb.libero.perturbations import libero_magnitude
 from lerobot_env_bomb_libero.scene import LiberoScene, LiberoTransform
+from lerobot_env_mujoco.transforms import scale_mass
 
 
 @dataclass(frozen=True)
@@ -30,7 +31,5 @@ class LiberoDynamics(LiberoTransform):
 
     def release(self, scene: LiberoScene) -> None:
         model, bodies = scene.model, list(scene.movable.values())
-        parts = np.flatnonzero(np.isin(scene.owners, bodies))
-        model.body_mass[parts] *= self.mass_factor
-        model.body_inertia[parts] *= self.mass_factor
+        scale_mass(model, bodies, self.mass_factor)
         model.geom_friction[scene.geoms_of(bodies), 0] *= self.friction_factor
