@@ -60,9 +60,15 @@ def make(condition: str, task_id: int = 0, **kwargs: Any) -> Any:
 
 
 @pytest.fixture(scope="module")
-def env(libero_with_assets: Libero) -> Iterator[Any]:
+def results(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return tmp_path_factory.mktemp("results") / "lines.jsonl"
+
+
+@pytest.fixture(scope="module")
+def env(libero_with_assets: Libero, results: Path) -> Iterator[Any]:
     prepare_libero([SUITE])
-    made = make("all:1")  # what any axis adds to the model is there
+    # what any axis adds to the model is there
+    made = make("all:1", max_steps=len(ACTIONS), results_path=str(results))
     yield made
     made.close()
 
@@ -141,6 +147,7 @@ def test_nothing_is_left_of_an_episode_in_the_next(env: Any) -> None:
     np.testing.assert_array_equal(flat(first["robot_state"]), flat(again["robot_state"]))
 
 
+@pytest.mark.long
 def test_two_environments_of_a_process_draw_each_its_own(env: Any) -> None:
     nominal = begin(env, NONE, 4)[0]["pixels"]["image"]
     other = make(NONE)
@@ -227,25 +234,22 @@ def test_what_the_gripper_touches_is_told_by_name(env: Any) -> None:
     assert scene.touched() == {"plate_1"}
 
 
-def test_an_episode_ends_after_its_steps_with_a_line_of_results(
-    libero_with_assets: Libero, tmp_path: Path
-) -> None:
-    path = tmp_path / "lines.jsonl"
-    made = make("light:2", max_steps=2, results_path=str(path))
-    made.reset(seed=1001)
-    assert made._max_episode_steps == 2
-    *_, info = made.step(ACTIONS[0])
-    assert info["failure"] == ""
-    _, reward, terminated, truncated, info = made.step(ACTIONS[1])
+def test_an_episode_ends_after_its_steps_with_a_line_of_results(env: Any, results: Path) -> None:
+    begin(env, "light:2", 1001)
+    assert env._max_episode_steps == len(ACTIONS)
+    for action in ACTIONS[:-1]:
+        *_, info = env.step(action)
+        assert info["failure"] == ""
+    results.unlink(missing_ok=True)  # of other tests' episodes
+    _, reward, terminated, truncated, info = env.step(ACTIONS[-1])
     assert (reward, terminated, truncated, info["failure"]) == (0, False, True, "never_touched")
-    again = made.step(ACTIONS[2])
-    assert again[1:4] == (0, False, True) and made.episode_result().steps == 2
-    (row,), damages = read_lines(path)
+    again = env.step(ACTIONS[0])
+    assert again[1:4] == (0, False, True) and env.episode_result().steps == len(ACTIONS)
+    (row,), damages = read_lines(results)
     assert damages == []
     assert row["spec"]["seed"] == 1001 and row["initial_state"] == 1 and row["levels"] == {"light": 2}
     with pytest.raises(ValueError, match="7 finite numbers"):
-        made.step(np.zeros(6))
-    made.close()
+        env.step(np.zeros(6))
 
 
 @pytest.mark.long

@@ -4,6 +4,8 @@ Needs hf-libero and its assets of one suite; skips without.
 """
 
 import importlib
+import re
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -12,6 +14,7 @@ import numpy as np
 import pytest
 from libero_cases import IMAGE_SIZE, REPO_ID, SUITE, Played, write_file
 
+from lerobot_bomb.commands import main as cli
 from lerobot_bomb.data.libero_conversion import KEYS, convert_libero
 from lerobot_bomb.data.libero_hdf5 import instruction
 from lerobot_bomb.libero.assets import SUITES, Libero, prepare_libero
@@ -140,6 +143,51 @@ def test_images_that_were_not_turned_are_told(recording: Recording) -> None:
     assert orientation(raw[:, ::-1, ::-1], expected) == SAME
     with pytest.raises(ValueError, match=r"--env\.observation_height"):
         orientation(raw[:, ::2, ::2], expected)
+
+
+SMALL_ACT = [
+    "--policy.type=act",
+    *(
+        "--policy.dim_model=8",
+        "--policy.dim_feedforward=8",
+        "--policy.n_heads=1",
+        "--policy.n_encoder_layers=1",
+    ),
+    *("--policy.use_vae=false", "--policy.pretrained_backbone_weights=null", "--policy.push_to_hub=false"),
+    *("--policy.device=cpu", "--batch_size=2", "--num_workers=0", "--steps=1", "--save_freq=1"),
+]
+TURNED = "that are turned by 180 degrees, as the simulator gives them"
+
+
+@pytest.mark.long
+@pytest.mark.parametrize(("convention", "is_told"), [("opengl", False), ("lerobot", True)])
+def test_a_policy_that_was_trained_on_the_other_orientation_is_told(
+    convention: str,
+    is_told: bool,
+    recording: Recording,
+    stock_cli: Callable[..., None],
+    tmp_path: Path,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    """`lerobot` says that the file's images are turned already, which is not so: they stay as they are."""
+    file = write_file(tmp_path / f"{recording.bddl}_demo.hdf5", [recording.played], task=recording.bddl)
+    data, flags = tmp_path / "data", [f"--repo_id={REPO_ID}", f"--image_convention={convention}", "--images"]
+    assert cli.main(["convert", "libero-hdf5", str(file), *flags, f"--root={data}"]) == 0
+    where = [f"--dataset.repo_id={REPO_ID}", f"--dataset.root={data}", f"--output_dir={tmp_path / 'train'}"]
+    stock_cli("lerobot-train", *SMALL_ACT, *where)
+
+    checkpoint = tmp_path / "train" / "checkpoints" / "last" / "pretrained_model"
+    flags = [f"--policy.path={checkpoint}", "--policy.device=cpu", f"--output_dir={tmp_path / 'eval'}"]
+    flags += ["--env.type=bomb_libero", f"--env.task={SUITE}", "--env.task_ids=[0]", "--env.episode_length=2"]
+    flags += ["--eval.n_episodes=1", "--eval.batch_size=1", "--eval.use_async_envs=false"]
+    small = [f"--env.observation_{side}={IMAGE_SIZE}" for side in ("height", "width")]
+    capsys.readouterr()
+    stock_cli("lerobot-eval", *flags, *small)
+    told = f"the checkpoint {checkpoint} was trained on images of {data} {TURNED}"
+    assert capsys.readouterr().err.count(told) == is_told
+    size = f"evaluate with {' '.join(small)}, or insist with --env.ignore_checkpoint=true"
+    with pytest.raises(ValueError, match=f"{re.escape(size)}$"):
+        stock_cli("lerobot-eval", *flags)
 
 
 def test_every_task_is_named_as_hf_libero_names_it(libero: Libero) -> None:

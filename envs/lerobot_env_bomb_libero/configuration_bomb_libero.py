@@ -5,16 +5,21 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
-from lerobot.envs import EnvConfig
+from lerobot.configs import FeatureType, PolicyFeature
+from lerobot.envs import EnvConfig, env_to_policy_features
 from lerobot.envs.configs import LiberoEnv
+from lerobot.processor import PolicyProcessorPipeline
+from lerobot.utils.constants import LIBERO_KEY_PIXELS_AGENTVIEW, OBS_IMAGES, OBS_STATE
 
 from lerobot_bomb.checkpoints.identity import policy_of_results
+from lerobot_bomb.checkpoints.interface import Interface
+from lerobot_bomb.checkpoints.libero_orientation import OrientationCheck
 from lerobot_bomb.envs.results import check_results_path
 from lerobot_bomb.envs.vector import LazyVectorEnv
 from lerobot_bomb.flag_errors import flag_errors
 from lerobot_bomb.flags import one_of
 from lerobot_bomb.libero.assets import SUITES, prepare_libero
-from lerobot_bomb.libero.episode import TASKS_PER_SUITE, LiberoSpec
+from lerobot_bomb.libero.episode import STATE_DIM, TASKS_PER_SUITE, LiberoSpec
 from lerobot_bomb.libero.perturbations import LiberoCondition
 
 CONTROL_MODES = ("relative", "absolute")
@@ -31,6 +36,8 @@ class BombLiberoEnvConfig(LiberoEnv):
     perturbations: list[str] | str | None = None
     # file that gets one JSON line per finished episode: seed, success, failure class
     results_path: str | None = None
+    # let a checkpoint act that was trained for another environment
+    ignore_checkpoint: bool = False
 
     def __post_init__(self) -> None:
         with flag_errors():
@@ -55,6 +62,23 @@ class BombLiberoEnvConfig(LiberoEnv):
         """Names of the suites."""
         return [name.strip() for name in str(self.task).split(",")]
 
+    def get_env_processors(self) -> tuple[PolicyProcessorPipeline, PolicyProcessorPipeline]:
+        """LeRobot's; every command asks for them once, when its policy is built and nothing has been played.
+
+        Raises:
+            ValueError: that policy was trained for another environment.
+        """
+        if not self.ignore_checkpoint:
+            state = PolicyFeature(type=FeatureType.STATE, shape=(STATE_DIM,))
+            Interface(
+                str(self.type),
+                env_to_policy_features(self) | {OBS_STATE: state},
+                (-1, 1) if self.control_mode == "relative" else None,
+                "relative motions",
+                lambda height, width: f"--env.observation_height={height} --env.observation_width={width}",
+            ).check_acting_policy()
+        return super().get_env_processors()
+
     def create_envs(self, n_envs: int, use_async_envs: bool = False) -> dict[str, dict[int, LazyVectorEnv]]:
         """{suite and condition: {task: vector env of n_envs}}; no worker starts before a first reset.
 
@@ -65,6 +89,7 @@ class BombLiberoEnvConfig(LiberoEnv):
         from lerobot_env_bomb_libero.env import BombLiberoEnv  # imports the simulator
 
         check_results_path(self.results_path)
+        check = None if self.ignore_checkpoint else OrientationCheck(self._scene_images)
         return {
             key: {
                 task_id: LazyVectorEnv(
@@ -72,6 +97,7 @@ class BombLiberoEnvConfig(LiberoEnv):
                     * n_envs,
                     use_async=use_async_envs and n_envs > 1,
                     known_late=partial(policy_of_results, self.results_path),
+                    on_first_reset=check and partial(self._compare_images, check, suite, task_id),
                 )
                 for task_id in self._task_ids(suite)
             }
@@ -92,6 +118,21 @@ class BombLiberoEnvConfig(LiberoEnv):
             "observation_width": self.observation_width,
         }
         return {"scene": scene, "results_path": self.results_path, "render_mode": self.render_mode}
+
+    @property
+    def _scene_images(self) -> str:
+        """The feature that holds images of the scene's camera."""
+        return self.features_map[LIBERO_KEY_PIXELS_AGENTVIEW]
+
+    def _compare_images(
+        self, check: OrientationCheck, suite: str, task_id: int, observations: dict[str, Any]
+    ) -> None:
+        from libero.libero import benchmark  # slow
+
+        images = observations["pixels"].get(self._scene_images.removeprefix(f"{OBS_IMAGES}."))
+        if images is not None:
+            images = images[:, ::-1, ::-1]  # as LiberoProcessorStep gives them to a policy
+            check.compare(images, benchmark.get_benchmark_dict()[suite]().get_task(task_id).language)
 
     def _task_ids(self, suite: str) -> list[int]:
         one_of("--env.task", suite, SUITES)

@@ -106,6 +106,7 @@ class BombPushTEnvConfig(EnvConfig):
                 env_to_policy_features(self),
                 (0, BOARD_PX),
                 f"pixels of the {BOARD_PX}x{BOARD_PX} board",
+                lambda height, _: f"--env.image_size={height}",
             ).check_acting_policy()
         return super().get_env_processors()
 

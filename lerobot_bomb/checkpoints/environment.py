@@ -66,12 +66,11 @@ def asked_policy() -> tuple[PreTrainedPolicy, str, str] | None:
 
 def trained_environment(policy: PreTrainedPolicy) -> Environment | None:
     """By the dataset it is being trained on, by its config, or by the dataset that its training names."""
-    meta = training_data(policy)
-    if meta is not None:
-        return environment_of_dataset(meta.root)
-    environment = getattr(policy.config, "environment", None)
-    path = policy.config.pretrained_path
-    return environment if environment is not None or path is None else _of_training(Path(path))
+    if training_data(policy) is None:
+        environment = getattr(policy.config, "environment", None)
+        if environment is not None:
+            return environment
+    return environment_of_dataset(dataset_of_training(policy))
 
 
 def environment_of_dataset(root: Path | str | None) -> Environment | None:
@@ -80,12 +79,19 @@ def environment_of_dataset(root: Path | str | None) -> Environment | None:
     return None if facts is None else facts.environment
 
 
-def _of_training(checkpoint: Path) -> Environment | None:
-    path = checkpoint / TRAIN_CONFIG
-    if not path.is_file():
+def dataset_of_training(policy: PreTrainedPolicy) -> Path | None:
+    """Folder of the dataset that it is being trained on, or that its checkpoint's training names.
+
+    It may be gone. None: not known.
+    """
+    meta, path = training_data(policy), policy.config.pretrained_path
+    if meta is not None:
+        return meta.root
+    config = None if path is None else Path(path) / TRAIN_CONFIG
+    if config is None or not config.is_file():
         return None
-    dataset: dict[str, Any] = read_json(path)["dataset"]
-    return environment_of_dataset(dataset.get("root") or default_root(dataset["repo_id"]))
+    dataset: dict[str, Any] = read_json(config)["dataset"]
+    return Path(dataset.get("root") or default_root(dataset["repo_id"]))
 
 
 def _check(policy: PreTrainedPolicy, who: str, insist: str, here: Environment) -> None:

@@ -1,6 +1,6 @@
 """Whether a policy can act in an environment of which datasets say no more than shapes and statistics."""
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -25,8 +25,9 @@ class Interface:
 
     env_type: str
     features: Mapping[str, PolicyFeature]  # by the policy's names
-    action_range: tuple[float, float]  # where any dimension's values lie
+    action_range: tuple[float, float] | None  # where any dimension's values lie; None: anywhere
     action_meaning: str
+    image_flags: Callable[[int, int], str]  # (height, width) -> the flags of images of this size
 
     def check_acting_policy(self) -> None:
         """The policy that this process built last was trained for such an environment, for all one knows.
@@ -54,9 +55,10 @@ class Interface:
             if here == there:
                 continue
             if self.features[name].type is FeatureType.VISUAL:
+                evaluate = f"evaluate with {self.image_flags(*there[1:])}"
                 raise ValueError(
                     f"{who} reads images of {there[2]}x{there[1]} pixels; this environment has "
-                    f"--env.image_size={here[1]}: evaluate with --env.image_size={there[2]}, or {insist}"
+                    f"{self.image_flags(*here[1:])}: {evaluate}, or {insist}"
                 )
             raise ValueError(
                 f"{who} has {name} of shape {there}, and --env.type={self.env_type} of shape {here}: "
@@ -66,7 +68,7 @@ class Interface:
     def _check_actions(self, policy: PreTrainedPolicy, who: str, insist: str) -> None:
         """By the least and the greatest action of its training."""
         trained = trained_actions(policy)
-        if trained is None:
+        if trained is None or self.action_range is None:
             return
         low, high = trained
         least, greatest = self.action_range

@@ -72,6 +72,7 @@ class LazyVectorEnv(VectorEnv):
         use_async: a worker process per env (`AsyncVectorEnv`); else all in this process.
         context: multiprocessing start method of the workers.
         known_late: gives keyword arguments of the factories that are known only when the envs start.
+        on_first_reset: is given the observations of the first reset, in this process.
     """
 
     def __init__(
@@ -80,6 +81,7 @@ class LazyVectorEnv(VectorEnv):
         use_async: bool,
         context: str = "forkserver",
         known_late: Callable[[], dict[str, Any]] = dict,
+        on_first_reset: Callable[[Any], None] | None = None,
     ) -> None:
         probe = make_ones[0]()
         self.num_envs = len(make_ones)
@@ -93,6 +95,7 @@ class LazyVectorEnv(VectorEnv):
         self._use_async = use_async
         self._context = context
         self._known_late = known_late
+        self._on_first_reset = on_first_reset
         self._envs: SyncVectorEnv | AsyncVectorEnv | None = None
 
     def _ensure(self) -> SyncVectorEnv | AsyncVectorEnv:
@@ -110,7 +113,11 @@ class LazyVectorEnv(VectorEnv):
         return self._envs
 
     def reset(self, *, seed: Any = None, options: dict[str, Any] | None = None) -> tuple[Any, dict[str, Any]]:
-        return self._ensure().reset(seed=seed, options=options)
+        observations, infos = self._ensure().reset(seed=seed, options=options)
+        if self._on_first_reset is not None:
+            self._on_first_reset(observations)
+            self._on_first_reset = None
+        return observations, infos
 
     def step(self, actions: np.ndarray) -> tuple[Any, Any, Any, Any, dict[str, Any]]:
         return self._ensure().step(actions)

@@ -13,6 +13,7 @@ from lerobot_bomb.libero.perturbations import LiberoCondition
 LIBERO_PROTOCOL_VERSION = "libero-1.0"
 TASKS_PER_SUITE = {suite: 90 if suite == "libero_90" else 10 for suite in SUITES}
 MAX_ALLOWED_STEPS = 10_000
+STATE_DIM = 8  # the gripper's position, orientation as axis and angle, and its two fingers
 ACTION_DIM = 7
 MOTION_DIMS = 6  # change of x, y, z and of orientation; the last is the gripper
 
