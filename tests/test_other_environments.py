@@ -64,10 +64,11 @@ def test_metaworld_is_played(
     policy_type: str, stock_cli: Callable[..., None], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Three steps each of two episodes."""
+    from lerobot_env_mujoco.backend import ensure_gl_backend
+
+    ensure_gl_backend()  # before metaworld imports MuJoCo
     pytest.importorskip("metaworld", reason="Meta-World is not installed: pip install 'lerobot[metaworld]'")
     from lerobot.envs import metaworld
-
-    from lerobot_env_mujoco.backend import ensure_gl_backend
 
     class Short(metaworld.MetaworldEnv):
         def __init__(self, **kwargs: Any) -> None:
@@ -75,7 +76,6 @@ def test_metaworld_is_played(
             self._max_episode_steps = 3
 
     monkeypatch.setattr(metaworld, "MetaworldEnv", Short)
-    ensure_gl_backend()
     flags = f"--policy.type={policy_type} --policy.vlm_model_name=nano --policy.device=cpu"
     flags += " --env.type=metaworld --env.task=push-v3 --eval.n_episodes=2 --eval.batch_size=1"
     stock_cli("lerobot-eval", *flags.split(), "--eval.use_async_envs=false", f"--output_dir={tmp_path}")
