@@ -2,6 +2,7 @@
 
 import json
 import os
+import shutil
 import signal
 from dataclasses import replace
 from pathlib import Path
@@ -12,6 +13,7 @@ import pytest
 from lerobot.datasets import LeRobotDataset
 from libero_cases import BEFORE, INSTRUCTION, REPO_ID, SUITE, TASK, Played, write_file
 
+from lerobot_bomb.checkpoints.libero_orientation import images_of_task
 from lerobot_bomb.commands import main as cli
 from lerobot_bomb.data import blocks, resumable
 from lerobot_bomb.data.facts import DatasetFacts
@@ -230,3 +232,18 @@ def test_resume_refuses_another_source_and_other_flags(
     before = contents(converted)
     assert convert_libero(source, REPO_ID, converted, resume=True, images=True).num_frames == 18
     assert contents(converted) == before
+
+
+def test_images_of_a_training_are_read_where_all_of_an_episode_is_here(
+    converted: Path, played: list[Played], tmp_path: Path
+) -> None:
+    """A dataset that was streamed has its metadata here and no frames: then none are fetched."""
+    images = images_of_task(converted, KEYS[0], INSTRUCTION)
+    frames = np.concatenate([episode.images[0][1:-1, ::-1, ::-1] for episode in played])
+    assert images is not None and len(images) <= len(frames)
+    assert all((frames == image).all(axis=(1, 2, 3)).any() for image in images)
+    assert images_of_task(converted, KEYS[0], "another task") is None
+    assert images_of_task(converted, "observation.images.another", INSTRUCTION) is None
+    streamed = tmp_path / "streamed"
+    shutil.copytree(converted, streamed, ignore=shutil.ignore_patterns("data"))
+    assert images_of_task(streamed, KEYS[0], INSTRUCTION) is None

@@ -13,6 +13,7 @@ from typing import Any
 import numpy as np
 import pytest
 from libero_cases import IMAGE_SIZE, REPO_ID, SUITE, Played, write_file
+from stock_policies import flags_of
 
 from lerobot_bomb.commands import main as cli
 from lerobot_bomb.data.libero_conversion import KEYS, convert_libero
@@ -145,17 +146,8 @@ def test_images_that_were_not_turned_are_told(recording: Recording) -> None:
         orientation(raw[:, ::2, ::2], expected)
 
 
-SMALL_ACT = [
-    "--policy.type=act",
-    *(
-        "--policy.dim_model=8",
-        "--policy.dim_feedforward=8",
-        "--policy.n_heads=1",
-        "--policy.n_encoder_layers=1",
-    ),
-    *("--policy.use_vae=false", "--policy.pretrained_backbone_weights=null", "--policy.push_to_hub=false"),
-    *("--policy.device=cpu", "--batch_size=2", "--num_workers=0", "--steps=1", "--save_freq=1"),
-]
+ONE_STEP = ["--policy.type=act", "--policy.push_to_hub=false", "--batch_size=2", "--num_workers=0"]
+ONE_STEP += ["--steps=1", "--save_freq=1"]
 TURNED = "that are turned by 180 degrees, as the simulator gives them"
 
 
@@ -174,7 +166,7 @@ def test_a_policy_that_was_trained_on_the_other_orientation_is_told(
     data, flags = tmp_path / "data", [f"--repo_id={REPO_ID}", f"--image_convention={convention}", "--images"]
     assert cli.main(["convert", "libero-hdf5", str(file), *flags, f"--root={data}"]) == 0
     where = [f"--dataset.repo_id={REPO_ID}", f"--dataset.root={data}", f"--output_dir={tmp_path / 'train'}"]
-    stock_cli("lerobot-train", *SMALL_ACT, *where)
+    stock_cli("lerobot-train", *ONE_STEP, *flags_of("act"), *where)
 
     checkpoint = tmp_path / "train" / "checkpoints" / "last" / "pretrained_model"
     flags = [f"--policy.path={checkpoint}", "--policy.device=cpu", f"--output_dir={tmp_path / 'eval'}"]

@@ -1,6 +1,8 @@
 """Whether a policy was trained on images of LIBERO in the orientation that its environment shows."""
 
 import logging
+from functools import cache
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -33,9 +35,7 @@ class OrientationCheck:
             return
         policy, who, _ = asked
         root = dataset_of_training(policy)
-        if root is None or not (root / INFO_FILE).is_file():
-            return
-        images = _images_of_task(LeRobotDatasetMetadata(root.name, root=root), self._key, task)
+        images = None if root is None else images_of_task(root, self._key, task)
         if images is None or images.shape[1:] != shown.shape[1:]:
             return
         self._is_done = True
@@ -51,13 +51,31 @@ class OrientationCheck:
             )
 
 
-def _images_of_task(meta: LeRobotDatasetMetadata, key: str, task: str) -> np.ndarray | None:
-    """(N, H, W, 3) uint8 of episodes of one task; None: the dataset has none."""
-    episodes: Any = meta.episodes
-    numbers = [number for number, tasks in enumerate(episodes["tasks"]) if task in tasks][:MAX_EPISODES]
-    if key not in meta.camera_keys or not numbers:
+@cache  # each condition of an evaluation asks for the same
+def images_of_task(root: Path, key: str, task: str) -> np.ndarray | None:
+    """(N, H, W, 3) uint8 of episodes of one task; None: none are here, and nothing is downloaded."""
+    if not (root / INFO_FILE).is_file():
         return None
-    dataset: Any = LeRobotDataset(meta.repo_id, root=meta.root, episodes=numbers)
+    meta = LeRobotDatasetMetadata(root.name, root=root)
+    if key not in meta.camera_keys:
+        return None
+    episodes: Any = meta.episodes
+    numbers = [
+        number
+        for number, tasks in enumerate(episodes["tasks"])
+        if task in tasks and all((root / file).is_file() for file in _files_of(meta, number))
+    ][:MAX_EPISODES]
+    if not numbers:
+        return None
+    dataset: Any = LeRobotDataset(meta.repo_id, root=root, episodes=numbers)
     moments = np.unique(np.linspace(0, len(dataset) - 1, MAX_IMAGES).astype(int))
     images = np.stack([dataset[moment][key].numpy() for moment in moments.tolist()])
     return np.round(255 * images.transpose(0, 2, 3, 1)).astype(np.uint8)
+
+
+def _files_of(meta: LeRobotDatasetMetadata, number: int) -> list[Path]:
+    """Of an episode's frames, below the dataset's folder."""
+    return [
+        meta.get_data_file_path(number),
+        *(meta.get_video_file_path(number, key) for key in meta.video_keys),
+    ]

@@ -13,8 +13,9 @@ from typing import Any
 
 import numpy as np
 
+from lerobot_bomb.libero.episode import ACTION_DIM
+
 CAMERAS = ("agentview_rgb", "eye_in_hand_rgb")
-ACTION_DIM = 7
 # of obs, in the order of LeRobot's observation.state
 STATE = {"ee_pos": 3, "ee_ori": 3, "gripper_states": 2}
 JOINTS = "joint_states"
