@@ -124,7 +124,8 @@ class AxisCondition:
                 f"--env.perturbations={text!r}: {axis!r} is not an axis; choose one of: {allowed}"
             )
         if not 0 <= low <= high <= MAX_LEVEL:
+            order = ", lowest first" if match[3] else ""
             raise ValueError(
-                f"--env.perturbations={text!r}: the levels of {axis} must lie in 0..{MAX_LEVEL}, lowest first"
+                f"--env.perturbations={text!r}: the levels of {axis} must lie in 0..{MAX_LEVEL}{order}"
             )
         return nuisances_of(cls.axes) if axis == ALL else (axis,), low, high

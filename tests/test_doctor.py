@@ -14,8 +14,22 @@ def test_a_sound_installation_passes(capsys: pytest.CaptureFixture[str]) -> None
     assert "everything works" in output
     policies = ("vla0_smol", "spatialvla_grid", "fdvla", "bomb_expert", "bomb_random")
     types = ("--env.type=bomb", *(f"--policy.type={name}" for name in policies))
-    for name in (*types, "mujoco", "gpu"):
+    for name in (*types, "mujoco"):
         assert f"ok  {name}: " in output
+
+
+def test_a_part_that_others_do_without_is_named_when_it_is_absent(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    import torch
+
+    monkeypatch.setattr(doctor, "CHECKS", (doctor.check_gpu, doctor.check_hub))
+    monkeypatch.setattr(torch.cuda, "is_available", lambda: False)
+    assert main(["doctor"]) == 0
+    output = capsys.readouterr().out
+    assert "absent  gpu: none" in output
+    assert "absent  hugging face hub: offline by HF_HUB_OFFLINE" in output
+    assert output.splitlines()[-1] == "everything works; absent: gpu, hugging face hub"
 
 
 def test_a_broken_part_is_shown_with_its_cause(
@@ -28,7 +42,7 @@ def test_a_broken_part_is_shown_with_its_cause(
     assert main(["doctor"]) == 1
     output = capsys.readouterr().out
     assert "ImportError: libEGL.so.1 is missing" in output
-    assert "ok  gpu" in output  # the other checks still run
+    assert "  gpu: " in output  # the other checks still run
     assert "1 broken" in output
 
 

@@ -197,7 +197,7 @@ def test_the_doctor_says_whether_libero_can_run(
     libero: Libero, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     assert libero_line(capsys, monkeypatch) == (
-        f"ok  libero: LIBERO has no {libero.config_file}, and asks on the standard input when it is "
+        f"absent  libero: LIBERO has no {libero.config_file}, and asks on the standard input when it is "
         "imported; to have it written: echo n | python -c 'import libero.libero'"
     )
     assert not libero.config_file.exists()
@@ -209,7 +209,7 @@ def test_the_doctor_says_whether_libero_can_run(
     line = libero_line(capsys, monkeypatch)
     assert "2 missing (textures, turbosquid_objects); hf download lerobot/libero-assets" in line
     monkeypatch.setattr(Libero, "find", lambda: None)
-    assert libero_line(capsys, monkeypatch).startswith("ok  libero: not installed")
+    assert libero_line(capsys, monkeypatch).startswith("absent  libero: not installed")
 
 
 @pytest.fixture

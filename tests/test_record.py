@@ -1,7 +1,10 @@
 """`lerobot-bomb record`. Simulator workers import this file's head, so LeRobot is imported inside tests."""
 
 import errno
+import gc
 import json
+import sys
+from collections.abc import Iterator
 from dataclasses import replace
 from importlib.metadata import version
 from pathlib import Path
@@ -303,6 +306,38 @@ def test_an_interrupted_recording_resumes_to_the_same_bytes(
     assert progress.num_episodes == 5
     assert contents(root) == contents(datasets["video"])
     assert list(tmp_path.iterdir()) == [root]
+
+
+def test_a_recording_stopped_while_a_video_is_joined_closes_it_quietly(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    import av
+
+    class Stopped:
+        """A container that is read to its second packet."""
+
+        def __init__(self, container: Any) -> None:
+            self.container = container
+            self.streams = container.streams
+
+        def demux(self) -> Iterator[Any]:
+            yield next(self.container.demux())
+            raise KeyboardInterrupt
+
+    def open_container(*args: Any, **options: Any) -> Any:
+        container = opened(*args, **options)
+        return Stopped(container) if options.get("format") == "concat" else container
+
+    opened = av.open
+    ignored: list[Any] = []
+    with monkeypatch.context() as patch:
+        patch.setattr(sys, "unraisablehook", ignored.append)
+        patch.setattr(av, "open", open_container)
+        with pytest.raises(KeyboardInterrupt):
+            record(VIDEO, tmp_path / "video")
+        gc.collect()
+    assert [str(unraisable.exc_value) for unraisable in ignored] == []
+    assert list(tmp_path.iterdir()) == []
 
 
 def test_an_image_that_is_not_written_is_an_error(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

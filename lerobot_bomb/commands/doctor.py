@@ -44,6 +44,11 @@ class Finding:
     name: str
     detail: str
     broken: bool = False
+    absent: bool = False  # a part that the others do without
+
+    @property
+    def mark(self) -> str:
+        return "BROKEN" if self.broken else "absent" if self.absent else "ok"
 
 
 def check_versions() -> Iterator[Finding]:
@@ -96,27 +101,27 @@ def check_fetch() -> Iterator[Finding]:
         importlib.import_module("lerobot_env_bomb.fetch_files").fetch_xml()
         yield Finding("--env.robot=fetch", "can run")
     except ValueError as error:
-        yield Finding("--env.robot=fetch", str(error))
+        yield Finding("--env.robot=fetch", str(error), absent=True)
 
 
 def check_libero() -> Iterator[Finding]:
     """Whether LIBERO is installed and has a config file and assets; nothing else needs it."""
     libero = Libero.find()
     if libero is None:
-        yield Finding("libero", f"not installed (for --env.type=libero: {INSTALL})")
+        yield Finding("libero", f"not installed (for --env.type=libero: {INSTALL})", absent=True)
         return
     try:
         folders = libero.task_folders()
         missing = {suite: libero.missing_assets([suite]) for suite in SUITES}
     except ValueError as error:
-        yield Finding("libero", str(error))
+        yield Finding("libero", str(error), absent=True)
         return
     whole = [suite for suite in SUITES if not missing[suite]]
     found = f"tasks in {folders['bddl_files']}, assets in {libero.assets}"
     if len(whole) < len(SUITES):
         found = describe_missing(libero.assets, sorted(set().union(*missing.values())))
         found += f"; whole for {', '.join(whole)}" if whole else ""
-    yield Finding("libero", found)
+    yield Finding("libero", found, absent=not whole)
 
 
 def check_types() -> Iterator[Finding]:
@@ -146,22 +151,23 @@ def check_gpu() -> Iterator[Finding]:
     if torch.cuda.is_available():
         yield Finding("gpu", torch.cuda.get_device_name())
     else:
-        yield Finding("gpu", "none (policies run on the CPU; use --policy.vlm_model_name=nano)")
+        detail = "none (policies run on the CPU; use --policy.vlm_model_name=nano)"
+        yield Finding("gpu", detail, absent=True)
 
 
 def check_hub() -> Iterator[Finding]:
     """Whether pretrained backbones can be downloaded; not needed for nano or a local folder."""
     hub = importlib.import_module("huggingface_hub")
     if hub.constants.HF_HUB_OFFLINE:
-        yield Finding("hugging face hub", "offline by HF_HUB_OFFLINE; nano and local folders work")
+        detail = "offline by HF_HUB_OFFLINE; nano and local folders work"
+        yield Finding("hugging face hub", detail, absent=True)
         return
     try:
         hub.get_session().head(hub.constants.ENDPOINT, timeout=HUB_TIMEOUT_S)
         yield Finding("hugging face hub", "reachable")
     except Exception as error:  # the session's own errors differ by transport
-        yield Finding(
-            "hugging face hub", f"not reachable: {type(error).__name__} (nano and local folders work)"
-        )
+        detail = f"not reachable: {type(error).__name__} (nano and local folders work)"
+        yield Finding("hugging face hub", detail, absent=True)
 
 
 CHECKS: tuple[Callable[[], Iterator[Finding]], ...] = (
@@ -182,17 +188,19 @@ def add_doctor_arguments(parser: argparse.ArgumentParser) -> None:
 def run_doctor(args: argparse.Namespace) -> int:
     """Print every finding; exit code 1 and the causes when something is broken."""
     print(f"lerobot_bomb {lerobot_bomb.__version__}, MUJOCO_GL={os.environ.get('MUJOCO_GL', '(unset)')}")
-    num_broken = 0
+    num_broken, absent = 0, []
     for check in CHECKS:
         try:
             for finding in check():
                 num_broken += finding.broken
-                print(
-                    f"{'BROKEN' if finding.broken else 'ok':>6}  {finding.name}: {finding.detail}", flush=True
-                )
+                absent += [finding.name] if finding.absent else []
+                print(f"{finding.mark:>6}  {finding.name}: {finding.detail}", flush=True)
         except Exception:  # any cause must be shown, and the other checks still run
             num_broken += 1
             name = check.__name__.removeprefix("check_")
             print(f"BROKEN  {name}:\n{traceback.format_exc()}", flush=True)
-    print("everything works" if not num_broken else f"{num_broken} broken, see above")
+    if num_broken:
+        print(f"{num_broken} broken, see above")
+    else:
+        print("everything works" + (f"; absent: {', '.join(absent)}" if absent else ""))
     return int(num_broken > 0)

@@ -4,11 +4,13 @@ LeRobot's parquet files can be read only after `finalize`, so a dataset that is 
 written is lost. Blocks bound that loss to the episodes of one block, which are made again.
 """
 
+import gc
 import json
 import logging
 import os
 import shutil
 import tempfile
+import traceback
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager, nullcontext
 from dataclasses import dataclass, field
@@ -84,10 +86,10 @@ def write_block(layout: DatasetLayout, root: Path, episodes: Iterable[RecordedEp
     """
     with (
         _quiet_libraries(),
+        _logged_errors(),
         _temporary_files_beside(root),
         sampled_image_statistics(),
         without_statistics(layout.arrays),
-        _logged_errors(),
     ):
         dataset = layout.create(root)
         rows = _write_episodes(dataset, episodes)
@@ -146,6 +148,12 @@ def _temporary_files_beside(root: Path) -> Iterator[None]:
     tempfile.tempdir = str(folder)
     try:
         yield
+    except BaseException as error:
+        # a video that was being joined is among the locals of its frames; PyAV finishes it when it is
+        # collected, and prints a traceback unless its file is still there
+        traceback.clear_frames(error.__traceback__)
+        gc.collect()
+        raise
     finally:
         tempfile.tempdir = usual
         shutil.rmtree(folder, ignore_errors=True)
