@@ -4,8 +4,10 @@ import argparse
 import ctypes
 import importlib
 import os
+import signal
 import subprocess
 import sys
+import time
 from dataclasses import fields
 from pathlib import Path
 
@@ -23,6 +25,7 @@ from lerobot_bomb.data.resumable import (
     finish_block,
     lock_folder,
     parameters_file,
+    terminated_in_order,
     unfinished_folder,
     write_json,
 )
@@ -208,6 +211,20 @@ def test_ctrl_c_while_a_command_is_imported_is_no_traceback(
     monkeypatch.setattr(cli.importlib, "import_module", interrupted)
     assert cli.main(FLAGS) == 130
     assert capsys.readouterr().err == "lerobot-bomb record: interrupted\n"
+
+
+@pytest.mark.parametrize(
+    ("number", "error"), [(signal.SIGINT, KeyboardInterrupt), (signal.SIGTERM, SystemExit)]
+)
+def test_a_signal_that_a_destructor_swallows_is_not_lost(number: int, error: type[BaseException]) -> None:
+    class Destroyed:
+        def __del__(self) -> None:
+            signal.raise_signal(number)
+
+    with terminated_in_order(), pytest.raises(error):
+        Destroyed()
+        time.sleep(10)
+        pytest.fail("it went on")
 
 
 def test_a_switch_takes_true_or_false(capsys: pytest.CaptureFixture[str]) -> None:

@@ -11,6 +11,7 @@ import errno
 import os
 import signal
 import sys
+import threading
 from collections.abc import Callable, Iterator
 from contextlib import AbstractContextManager, contextmanager, suppress
 from dataclasses import asdict
@@ -38,11 +39,14 @@ from lerobot_bomb.files import read_json
 from lerobot_bomb.flags import check_link
 
 if TYPE_CHECKING:
+    from sys import UnraisableHookArgs
+
     from lerobot_bomb.data.blocks import DatasetLayout, RecordedEpisode
 
 BLOCK_EPISODES = 20  # what a kill can cost: they are played or written again on --resume
 LOCK_FILE = "lock"  # in the growing folder; a killed process releases it
 LOCK_TIMEOUT_S = 0.5  # a process that is refused holds the lock for a moment
+SEND_AGAIN_S = 0.05  # after a destructor has swallowed a signal
 METADATA_FILE = Path("meta") / "bomb.json"  # in the dataset
 
 
@@ -124,11 +128,25 @@ def write_blocks(
 
 @contextmanager
 def terminated_in_order() -> Iterator[None]:
-    """Let SIGTERM end the command as Ctrl-C does, with the exit code that shells give it, 143."""
-    usual = signal.signal(signal.SIGTERM, lambda number, _: sys.exit(128 + number))
+    """Let SIGTERM end the command as Ctrl-C does, with the exit code that shells give it, 143.
+
+    Python ignores what is raised in a destructor, so there either signal would be lost: it is sent again.
+    """
+    usual, usual_hook = signal.getsignal(signal.SIGTERM), sys.unraisablehook
+
+    def send_again(ignored: "UnraisableHookArgs") -> None:
+        number = {KeyboardInterrupt: signal.SIGINT, SystemExit: signal.SIGTERM}.get(ignored.exc_type)
+        if number is None:
+            usual_hook(ignored)
+        else:  # at once, it would be raised in this function, and ignored too
+            threading.Timer(SEND_AGAIN_S, os.kill, (os.getpid(), number)).start()
+
+    signal.signal(signal.SIGTERM, lambda number, _: sys.exit(128 + number))
+    sys.unraisablehook = send_again
     try:
         yield
     finally:
+        sys.unraisablehook = usual_hook
         signal.signal(signal.SIGTERM, usual)
 
 
