@@ -1,6 +1,6 @@
-"""How well the scripted expert does on suite `place`.
+"""How well the scripted expert does on a suite.
 
-    python benchmarks/expert.py --episodes 500 --workers 2 --json expert.json
+    python benchmarks/expert.py --task place --episodes 500 --workers 2 --json expert.json
 
 Prints success with its 95 % Wilson interval, placement error, what happened to the other stones, steps,
 idle steps, and every failure with its seed.
@@ -24,6 +24,7 @@ from lerobot_bomb.bomb.episode import CONTROL_MODES, DEFAULT_FPS, ROBOTS, SPLITS
 from lerobot_bomb.bomb.observation import MAX_STEP_M, MIN_IMAGE_SIZE, RenderOptions
 from lerobot_bomb.bomb.privileged_state import PrivilegedState
 from lerobot_bomb.bomb.streams import Stream, generator
+from lerobot_bomb.bomb.suites import SUITES
 from lerobot_bomb.conditions import NONE
 from lerobot_bomb.envs.rollout import Moment, add_noise, expert_agent, play
 from lerobot_bomb.stats import format_rate
@@ -117,6 +118,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
+    parser.add_argument("--task", choices=SUITES, default="place", help="suite (default: place)")
     parser.add_argument("--episodes", type=int, default=500)
     parser.add_argument("--seed", type=int, default=0, help="of the first episode; the others count up")
     parser.add_argument("--robot", choices=ROBOTS, default="scara")
@@ -133,6 +135,7 @@ def main() -> None:
 
     spec = EpisodeSpec(
         seed=args.seed,
+        suite=args.task,
         robot=args.robot,
         control_mode=args.control_mode,
         fps=args.fps,

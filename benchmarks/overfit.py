@@ -30,6 +30,7 @@ from machine import add_machine_arguments, positive, require_idle_machine, write
 from recipes import POLICY_TYPES, last_checkpoint, read_recipe, recipe_path
 
 from lerobot_bomb.bomb.episode import EpisodeSpec, Failure
+from lerobot_bomb.bomb.suite import specs_of_tasks
 from lerobot_bomb.commands.run import run_command
 from lerobot_bomb.envs.results import Row
 from lerobot_bomb.evaluation.results import read_results
@@ -37,7 +38,7 @@ from lerobot_bomb.tables import print_table
 
 SEED = 1007  # its board is empty, so nothing but the instruction tells the target
 TASK_IDS = (0, 4, 7, 11, 13, 15, 22, 24)  # all black
-TARGETS: dict[int, Any] = {task: EpisodeSpec(SEED).for_task(task).target for task in TASK_IDS}
+TARGETS: dict[int, Any] = {task: specs_of_tasks(EpisodeSpec(SEED), [task])[0].target for task in TASK_IDS}
 SHIFT = 3  # an episode is given the instruction of the task so many places further on
 IMAGE_SIZE = 128
 PICTURES = (f"image_size={IMAGE_SIZE}",)

@@ -21,6 +21,7 @@ from lerobot_bomb.actions.grid_settings import ActionGroup, GridSettings, defaul
 from lerobot_bomb.actions.grids import ActionGrids
 from lerobot_bomb.bomb.episode import EpisodeSpec
 from lerobot_bomb.bomb.observation import RenderOptions
+from lerobot_bomb.bomb.suite import specs_of_tasks
 from lerobot_bomb.commands.fit_grid import action_bounds
 from lerobot_bomb.data.columns import read_columns, read_meta
 from lerobot_bomb.envs.results import EpisodeResult
@@ -83,7 +84,7 @@ def rounded(
 
 def replay(task_id: int, actions_TD: np.ndarray) -> EpisodeResult:
     """The episode of the task under these actions, the last one held until it ends."""
-    env = make_env(EpisodeSpec(SEED).for_task(task_id), RenderOptions(image_size=32))
+    env = make_env(specs_of_tasks(EpisodeSpec(SEED), [task_id])[0], RenderOptions(image_size=32))
     env.reset(seed=SEED)
     step, has_ended = 0, False
     while not has_ended:

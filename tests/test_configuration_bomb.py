@@ -6,6 +6,7 @@ import yaml
 from lerobot.envs import env_to_policy_features, make_env, make_env_config
 
 from lerobot_bomb.bomb.perturbations import NUISANCES
+from lerobot_bomb.bomb.suites import SUITES
 from lerobot_bomb.envs.vector import LazyVectorEnv
 from lerobot_bomb.flag_errors import FlagError
 from lerobot_env_bomb.configuration_bomb import BombEnvConfig
@@ -58,11 +59,25 @@ def test_each_condition_is_a_group_with_all_tasks() -> None:
     assert not np.array_equal(*images)
 
 
+def test_all_is_a_group_for_every_suite_and_condition() -> None:
+    config = make_env_config("bomb", task="all", perturbations=["none", "camera:3"], image_size=32)
+    envs = make_env(config, n_envs=1)
+    assert list(envs) == [f"{suite}.{key}" for suite in SUITES for key in ("none", "camera-3")]
+    for key, group in envs.items():
+        (vector,) = group.values()
+        (env,) = vector.envs
+        suite, _, condition = key.partition(".")
+        assert (env.unwrapped._spec.suite, env.unwrapped._spec.perturbations) == (
+            suite,
+            condition.replace("-", ":"),
+        )
+
+
 def test_the_protocol_s_file_names_every_axis() -> None:
     path = Path(__file__).parents[1] / "configs" / "eval_bomb_place.yaml"
     flags = yaml.safe_load(path.read_text())["env"]
     assert flags.pop("type") == "bomb"
-    conditions = set(BombEnvConfig(**flags).conditions.values())
+    conditions = {spec.perturbations for (spec,) in BombEnvConfig(**flags).groups.values()}
     assert conditions == {"none", "all:1", "all:3", "all:5", *(f"{axis}:3" for axis in NUISANCES)}
 
 

@@ -9,6 +9,7 @@ from lerobot_bomb.bomb.board import BOARD, NUM_STONES
 from lerobot_bomb.bomb.episode import EpisodeSpec, Stage
 from lerobot_bomb.bomb.observation import RenderOptions
 from lerobot_bomb.bomb.privileged_state import Goal, PrivilegedState
+from lerobot_bomb.bomb.suite import specs_of_tasks
 from lerobot_bomb.bomb.suites import SUITES
 from lerobot_bomb.envs.results import EpisodeResult
 
@@ -27,12 +28,11 @@ def test_nearest_intersection_inverts_intersection_xy(row: int, column: int, dx:
 
 
 def test_numbered_tasks_are_25_intersections_in_2_colours() -> None:
-    spec = EpisodeSpec(seed=7)
-    assert (spec.for_task(0).target, spec.for_task(0).color) == ((0, 0), "black")
-    assert (spec.for_task(38).target, spec.for_task(38).color) == ((2, 3), "white")
-    tasks = {(spec.for_task(task).target, spec.for_task(task).color) for task in range(50)}
-    assert len(tasks) == 50
-    assert spec.for_task(38).seed == 7
+    specs = specs_of_tasks(EpisodeSpec(seed=7), range(50))
+    assert (specs[0].target, specs[0].color) == ((0, 0), "black")
+    assert (specs[38].target, specs[38].color) == ((2, 3), "white")
+    assert len({(spec.target, spec.color) for spec in specs}) == 50
+    assert {spec.seed for spec in specs} == {7}
 
 
 @pytest.mark.parametrize(
@@ -65,7 +65,7 @@ def test_a_wrong_spec_names_the_flag_and_what_is_allowed(field: str, value: obje
 @pytest.mark.parametrize("task", [-1, 50])
 def test_unknown_task_numbers_are_refused(task: int) -> None:
     with pytest.raises(ValueError, match=rf"--env.task_ids has {task}; 'place' has tasks 0..49"):
-        EpisodeSpec(seed=0).for_task(task)
+        specs_of_tasks(EpisodeSpec(seed=0), [task])
 
 
 @pytest.mark.parametrize("size", [-256, 0, 31, 1025])

@@ -11,6 +11,7 @@ from lerobot_bomb.bomb.board import BOARD
 from lerobot_bomb.bomb.episode import EpisodeSpec
 from lerobot_bomb.bomb.observation import RenderOptions
 from lerobot_bomb.bomb.perturbations import AXES
+from lerobot_bomb.bomb.suite import find_suite, specs_of_tasks
 from lerobot_bomb.commands import main as cli
 from lerobot_bomb.commands.gallery import (
     COLUMNS,
@@ -19,6 +20,7 @@ from lerobot_bomb.commands.gallery import (
     axis_sheet,
     path_tile,
     pusht_tiles,
+    suite_sheet,
     tiles_sheet,
 )
 from lerobot_bomb.conditions import ALL
@@ -182,6 +184,19 @@ def test_a_sheet_of_pusht_shows_its_environment(tmp_path: Path) -> None:
     flags = ["gallery", "--env.type=bomb_pusht", f"--image_size={SIZE}", f"--output={tmp_path}"]
     assert cli.main([*flags, "--axes=dynamics"]) == 0
     assert [path.name for path in tmp_path.iterdir()] == ["dynamics.jpg"]
+
+
+def test_a_suites_sheet_shows_every_task_and_what_the_expert_leaves() -> None:
+    sheet = suite_sheet("object", (3,), OPTIONS)
+    assert list(sheet.images) == [f"task {number}" for number in range(find_suite("object").num_tasks)]
+    for number, (instruction, before, after) in enumerate(sheet.images.values()):
+        (spec,) = specs_of_tasks(EpisodeSpec(3, "object"), [number])
+        env = make_env(spec, OPTIONS)
+        observation, _ = env.reset(seed=3)
+        assert np.array_equal(before, observation["pixels"]["workspace"])
+        assert np.array_equal(instruction, text_tile(env.get_wrapper_attr("task_description"), SIZE))
+        assert not np.array_equal(before, after)
+        env.close()
 
 
 @pytest.mark.parametrize(

@@ -13,6 +13,7 @@ from learning_curve import SUCCESS_BGR, count, draw
 
 from lerobot_bomb.bomb.board import COLORS
 from lerobot_bomb.bomb.episode import EpisodeSpec
+from lerobot_bomb.bomb.suite import specs_of_tasks
 from lerobot_bomb.bomb.suites.place import targets_of, templates_of
 from lerobot_bomb.checkpoints.identity import sha256_of
 from lerobot_bomb.commands.main import main as lerobot_bomb
@@ -138,7 +139,7 @@ def test_every_policy_type_has_a_recipe_for_every_task() -> None:
 
 
 def test_demonstrations_leave_out_targets_wording_and_colours() -> None:
-    shown = [EpisodeSpec(seed=0).for_task(task_id) for task_id in learning_tasks.shown_pairs()]
+    shown = specs_of_tasks(EpisodeSpec(seed=0), learning_tasks.shown_pairs())
     # every target of the split, and beside it each row and column in each colour
     assert {spec.target for spec in shown} == set(targets_of("train"))
     for color in COLORS:

@@ -1,5 +1,6 @@
 """LeRobot's env type ``bomb``. The only module of this package that imports LeRobot."""
 
+import itertools
 from dataclasses import dataclass, field, replace
 from functools import partial
 from pathlib import Path
@@ -20,8 +21,11 @@ from lerobot_bomb.bomb.observation import (
     geometry_shapes,
 )
 from lerobot_bomb.bomb.perturbations import Condition
+from lerobot_bomb.bomb.suite import find_suite, specs_of_tasks
+from lerobot_bomb.bomb.suites import SUITES
 from lerobot_bomb.checkpoints.environment import check_acting_policy
 from lerobot_bomb.checkpoints.identity import policy_of_results
+from lerobot_bomb.conditions import ALL
 from lerobot_bomb.data.environment import Environment
 from lerobot_bomb.envs.results import check_results_path
 from lerobot_bomb.envs.vector import LazyVectorEnv
@@ -34,9 +38,10 @@ from lerobot_env_bomb.fetch_files import check_robot
 class BombEnvConfig(EnvConfig):
     """Flags of ``--env.type=bomb``; every check happens before an environment is built."""
 
-    # suite: place
+    # suite: place, object, spatial, or all
     task: str | None = "place"
-    # numbered tasks, 25 x colour + 5 x row + column with black = 0, white = 1; unset draws one per episode
+    # numbered tasks of the suite, of place 25 x colour + 5 x row + column with black = 0, white = 1; unset
+    # draws one per episode
     task_ids: list[int] | None = None
     # control steps per second; a divisor of 200
     fps: int = DEFAULT_FPS
@@ -70,8 +75,9 @@ class BombEnvConfig(EnvConfig):
     def __post_init__(self) -> None:
         with flag_errors():
             # an invalid flag raises here, before anything is built
-            _ = self.conditions
-            check_robot(self.gym_kwargs["spec"])
+            for spec in itertools.chain(*self.groups.values()):
+                find_suite(spec.suite).check(spec)
+                check_robot(spec)
         if self.results_path is not None:
             self.results_path = str(Path(self.results_path).expanduser())
         image = PolicyFeature(type=FeatureType.VISUAL, shape=(self.image_size, self.image_size, 3))
@@ -92,18 +98,30 @@ class BombEnvConfig(EnvConfig):
         return f"bomb/{self.task}-v0"
 
     @property
-    def conditions(self) -> dict[str, str]:
-        """{key of a group of results: its condition}; the suite alone where no condition is named."""
-        return Condition.groups(self.perturbations, str(self.task))
+    def suites(self) -> tuple[str, ...]:
+        """Those that are played."""
+        return SUITES if self.task == ALL else (str(self.task),)
 
     @property
-    def specs(self) -> dict[int, EpisodeSpec]:
-        """The unperturbed spec of each task id; {0: spec} where target and colour are drawn per episode."""
+    def groups(self) -> dict[str, list[EpisodeSpec]]:
+        """{key of a group of results: a spec for each of its tasks}; one where they are drawn per episode."""
+        return {
+            key: [replace(spec, perturbations=condition) for spec in self.specs_of(suite)]
+            for suite in self.suites
+            for key, condition in Condition.groups(self.perturbations, suite).items()
+        }
+
+    def specs_of(self, suite: str) -> list[EpisodeSpec]:
+        """The unperturbed spec of each numbered task; one where they are drawn per episode."""
         if self.task_ids == []:
             raise ValueError("--env.task_ids=[] selects no task; leave it out to draw one per episode")
+        if self.task_ids and self.task == ALL:
+            raise ValueError(
+                f"--env.task_ids={self.task_ids} are numbers in a suite; --env.task={ALL} is of all"
+            )
         spec = EpisodeSpec(
             seed=0,
-            suite=str(self.task),
+            suite=suite,
             robot=self.robot,
             split=self.split,
             control_mode=self.control_mode,
@@ -112,14 +130,13 @@ class BombEnvConfig(EnvConfig):
             color=self.color,
             success_tolerance_mm=self.success_tolerance_mm,
         )
-        task_ids = self.task_ids or []
-        return dict(zip(task_ids or [0], spec.for_tasks(task_ids), strict=True))
+        return specs_of_tasks(spec, self.task_ids or [])
 
     @property
     def gym_kwargs(self) -> dict[str, Any]:
         """Arguments of `BombEnv` for the first task."""
         return {
-            "spec": next(iter(self.specs.values())),
+            "spec": next(iter(self.groups.values()))[0],
             "render_options": self.render_options,
             "results_path": self.results_path,
             "task_ids": None if self.task_ids is None else tuple(self.task_ids),
@@ -168,12 +185,11 @@ class BombEnvConfig(EnvConfig):
         return {
             key: {
                 task_id: LazyVectorEnv(
-                    [partial(BombEnv, **(kwargs | {"spec": replace(spec, perturbations=condition)}))]
-                    * n_envs,
+                    [partial(BombEnv, **(kwargs | {"spec": spec}))] * n_envs,
                     use_async=use_async_envs and n_envs > 1,
                     known_late=partial(policy_of_results, self.results_path),
                 )
-                for task_id, spec in self.specs.items()
+                for task_id, spec in zip(self.task_ids or [0], specs, strict=True)
             }
-            for key, condition in self.conditions.items()
+            for key, specs in self.groups.items()
         }

@@ -1,6 +1,6 @@
 """Draws an episode under its condition: one frozen transform per axis that is on."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 from lerobot_bomb.bomb.episode import EpisodeSpec
 from lerobot_bomb.bomb.layout import Layout
@@ -21,10 +21,10 @@ class Perturbation(EpisodePerturbation[Transform]):
         """What is done to the compiled model."""
         return tuple(each.edit_model for each in self.transforms.values())
 
-    def arrange(self, layout: Layout, stone: int) -> Layout:
-        """The layout after all changes; `stone` is to be moved."""
+    def arrange(self, layout: Layout, supply: tuple[int, ...]) -> Layout:
+        """The layout after all changes; `supply`: indices of the stones in the tray."""
         for each in self.transforms.values():
-            layout = each.arrange(layout, stone)
+            layout = each.arrange(layout, supply)
         return layout
 
 
@@ -32,7 +32,7 @@ class Perturbation(EpisodePerturbation[Transform]):
 class PerturbedEpisode(Episode):
     """An episode with its condition's instruction and layout; the model is still to be edited."""
 
-    perturbation: Perturbation
+    perturbation: Perturbation = field(kw_only=True)
 
 
 def sample_episode(spec: EpisodeSpec) -> PerturbedEpisode:
@@ -41,7 +41,7 @@ def sample_episode(spec: EpisodeSpec) -> PerturbedEpisode:
     perturbation = draw_perturbation(nominal)
     changed = {
         "instruction": perturbation.reword(nominal.instruction, nominal),
-        "layout": perturbation.arrange(nominal.layout, nominal.stone),
+        "layout": perturbation.arrange(nominal.layout, nominal.supply),
     }
     return PerturbedEpisode(**{**vars(nominal), **changed}, perturbation=perturbation)
 

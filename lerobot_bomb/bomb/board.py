@@ -50,6 +50,6 @@ BOARD = BoardGeometry()
 
 
 def task_id(target: Sequence[int], color: str) -> int:
-    """The number of a task by its (row, column) and colour; the inverse of `EpisodeSpec.for_task`."""
+    """The number of a task by its (row, column) and colour; of suite `place`."""
     row, column = target
     return BOARD.num_lines**2 * COLORS.index(color) + BOARD.num_lines * row + column

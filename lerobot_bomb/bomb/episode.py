@@ -1,7 +1,6 @@
 """An episode: what determines it, how far it got, why it failed."""
 
 import dataclasses
-from collections.abc import Sequence
 from dataclasses import dataclass
 from enum import StrEnum
 
@@ -68,6 +67,8 @@ class EpisodeSpec:
     # (row, column) and colour; None draws them from the seed
     target: tuple[int, int] | None = None
     color: str | None = None
+    # numbered task of a suite other than place, whose tasks are targets and colours; None draws it
+    task_id: int | None = None
     success_tolerance_mm: float = 10.0
     perturbations: str = NONE  # a condition such as "camera:2+light:3"; see `Condition`
 
@@ -102,24 +103,6 @@ class EpisodeSpec:
                 f"--env.target={list(target)} is off the board; "
                 f"give [row, column], each in 0..{BOARD.num_lines - 1}"
             )
-
-    def for_task(self, task_id: int) -> "EpisodeSpec":
-        """This spec with target and colour of a numbered task: 25 x colour + 5 x row + column."""
-        num_targets = BOARD.num_lines**2
-        num_tasks = num_targets * len(COLORS)
-        if not 0 <= task_id < num_tasks:
-            raise ValueError(f"--env.task_ids has {task_id}; {self.suite!r} has tasks 0..{num_tasks - 1}")
-        color, point = divmod(task_id, num_targets)
-        target = divmod(point, BOARD.num_lines)
-        return dataclasses.replace(self, target=target, color=COLORS[color])
-
-    def for_tasks(self, task_ids: Sequence[int]) -> list["EpisodeSpec"]:
-        """This spec for each of these numbered tasks; as it is where there are none."""
-        if task_ids and (self.target is not None or self.color is not None):
-            raise ValueError("--env.task_ids fixes targets and colours; drop --env.target and --env.color")
-        if len(set(task_ids)) < len(task_ids):
-            raise ValueError(f"--env.task_ids={list(task_ids)} has a task twice")
-        return [self.for_task(task_id) for task_id in task_ids] or [self]
 
     def to_dict(self) -> dict[str, object]:
         """JSON-ready dict."""

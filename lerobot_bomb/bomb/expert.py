@@ -1,4 +1,4 @@
-"""A scripted expert for suite `place`: memoryless and free of pauses, so that it can be imitated.
+"""A scripted expert, which moves one stone: memoryless and free of pauses, so that it can be imitated.
 
 Its action is a continuous function of what an observation shows: gripper, measured finger opening,
 stones, target. It keeps no phase and no counter, and never reads `PrivilegedState.stage`.

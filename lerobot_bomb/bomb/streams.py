@@ -18,6 +18,7 @@ class Stream(IntEnum):
     OPENING = 3
     GRIPPER = 4
     START = 5
+    SUPPLY = 6
     LEVEL = 100  # plus the axis' place in AXES: the level, where the condition gives a range
     AXIS = 200  # plus the axis' place in AXES: everything else that the axis draws
     ACTUATOR_NOISE = 300

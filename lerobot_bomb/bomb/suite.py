@@ -1,13 +1,14 @@
 """What a suite is: a kind of episode. Each has a file in `suites/`."""
 
-from collections.abc import Callable, Mapping
-from dataclasses import dataclass
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field, replace
 from importlib import import_module
 
 import numpy as np
 
-from lerobot_bomb.bomb.board import BOARD, Cell
+from lerobot_bomb.bomb.board import BOARD, COLORS, Cell
 from lerobot_bomb.bomb.episode import EpisodeSpec
+from lerobot_bomb.bomb.go import is_legal_move
 from lerobot_bomb.bomb.layout import Layout
 from lerobot_bomb.bomb.privileged_state import Goal
 
@@ -17,12 +18,26 @@ class Episode:
     """What an EpisodeSpec stands for."""
 
     spec: EpisodeSpec
+    task_id: int  # which of the suite's numbered tasks it is of
     target: Cell
     color: str
     instruction: str
     opening: Mapping[Cell, str]  # colours of the stones that stand on the board
     layout: Layout
     stone: int  # index of the stone to be moved
+    supply: tuple[int, ...]  # indices of the stones that lie in the tray
+    # what stands for the stone and the place in the suite's templates and forms, beside coordinates
+    words: Mapping[str, str] = field(default_factory=dict)
+    # whether the instruction still means this stone and this target with these stones on the board
+    is_clear: Callable[[Mapping[Cell, str]], bool] = lambda stones: True
+    extra_colors: tuple[str, ...] = COLORS  # of stones that may join the opening
+    gripper_is_named: bool = (
+        False  # in the instruction, which must stay true where the gripper starts elsewhere
+    )
+
+    def allows(self, stones: Mapping[Cell, str]) -> bool:
+        """Whether the move is legal, and the instruction clear, with these stones on the board."""
+        return is_legal_move(dict(stones), self.target, self.color) and self.is_clear(stones)
 
     @property
     def goals(self) -> tuple[Goal, ...]:
@@ -45,9 +60,43 @@ class Suite:
     sample: Callable[[EpisodeSpec], Episode]  # the same spec, the same episode, without perturbations
     check: Callable[[EpisodeSpec], None]
     max_steps: int  # at DEFAULT_FPS; scaled with fps
+    # form of the language axis -> its templates, of `Episode.words` and coordinates
+    forms: tuple[tuple[str, ...], ...]
+    num_tasks: int
+    # a numbered task's spec
+    of_task: Callable[[EpisodeSpec, int], EpisodeSpec] = lambda spec, task_id: replace(spec, task_id=task_id)
     num_goals: int = 1  # of each of its episodes
 
 
 def find_suite(name: str) -> Suite:
     """The suite of a name in SUITES."""
     return import_module(f"lerobot_bomb.bomb.suites.{name}").SUITE
+
+
+def of_split[T](split: str, items: Sequence[T], heldout: Sequence[T]) -> tuple[T, ...]:
+    """What a split draws from: those held out, the others, or all."""
+    return tuple(item for item in items if split == "all" or (item in heldout) == (split == "heldout"))
+
+
+def refuse_options(spec: EpisodeSpec, *names: str) -> None:
+    """Raise a ValueError if the spec sets what its suite draws or does not have."""
+    for name in names:
+        if (value := getattr(spec, name)) is not None:
+            raise ValueError(f"--env.{name}={value} is not an option of --env.task={spec.suite}; drop it")
+
+
+def specs_of_tasks(spec: EpisodeSpec, task_ids: Sequence[int]) -> list[EpisodeSpec]:
+    """The spec for each of these numbered tasks of its suite; as it is where there are none.
+
+    Raises:
+        ValueError: the suite has no such task, one is there twice, or the spec fixes what a task fixes.
+    """
+    suite = find_suite(spec.suite)
+    if len(set(task_ids)) < len(task_ids):
+        raise ValueError(f"--env.task_ids={list(task_ids)} has a task twice")
+    for task_id in task_ids:
+        if not 0 <= task_id < suite.num_tasks:
+            raise ValueError(
+                f"--env.task_ids has {task_id}; {spec.suite!r} has tasks 0..{suite.num_tasks - 1}"
+            )
+    return [suite.of_task(spec, task_id) for task_id in task_ids] or [spec]

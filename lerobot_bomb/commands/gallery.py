@@ -1,8 +1,8 @@
-"""``lerobot-bomb gallery``: what each perturbation axis does, as one contact sheet per axis."""
+"""``lerobot-bomb gallery``: contact sheets of what each perturbation axis does, or of a suite's tasks."""
 
 import argparse
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -13,6 +13,8 @@ from lerobot_bomb.bomb.board import BOARD
 from lerobot_bomb.bomb.episode import EpisodeSpec
 from lerobot_bomb.bomb.observation import CAMERAS, PIXELS, WORKSPACE_HIGH_M, WORKSPACE_LOW_M, RenderOptions
 from lerobot_bomb.bomb.perturbations import AXES, NUISANCES
+from lerobot_bomb.bomb.suite import find_suite, specs_of_tasks
+from lerobot_bomb.bomb.suites import SUITES
 from lerobot_bomb.commands.arguments import parse_numbers, path_flag
 from lerobot_bomb.conditions import ALL, MAX_LEVEL, NONE, Axis, nuisances_of
 from lerobot_bomb.envs.rollout import expert_agent, make_env, make_libero_env, make_pusht_env, play
@@ -47,6 +49,7 @@ def add_gallery_arguments(parser: argparse.ArgumentParser) -> None:
     add = parser.add_argument
     add("--env.type", dest="env_type", default="bomb", help=f"{', '.join(AXES_OF)} (default: bomb)")
     add("--axes", type=_parse_names, help="as camera,light (default: every axis and all)")
+    add("--task", help=f"draw a suite's tasks in place of axes: {', '.join(SUITES)}")
     add("--seeds", type=parse_numbers, default=DEFAULT_SEEDS, help="episodes (default: 2,3)")
     add("--image_size", type=int, default=DEFAULT_TILE_SIZE, help="pixels of a tile (default: %(default)s)")
     add(
@@ -65,6 +68,15 @@ def run_gallery(args: argparse.Namespace) -> int:
     axes = args.axes or sheets
     for axis in axes:
         one_of("--axes", axis, sheets)
+    if args.task is not None:
+        one_of("--task", args.task, SUITES)
+        for flag, value in {"axes": args.axes, "doc": args.doc}.items():
+            if value is not None:
+                raise ValueError(f"--{flag} and --task={args.task}: give one of them")
+        if args.env_type != "bomb":
+            raise ValueError(
+                f"--task={args.task} is a suite of --env.type=bomb; drop --env.type={args.env_type}"
+            )
     if args.env_type != "bomb" and args.doc is not None:
         raise ValueError(f"--doc={args.doc} is written for --env.type=bomb only; drop one of them")
     if args.env_type == "bomb_pusht":
@@ -77,9 +89,11 @@ def run_gallery(args: argparse.Namespace) -> int:
         options = RenderOptions(image_size=args.image_size)
         for seed in args.seeds:
             EpisodeSpec(seed)
-    for axis in tqdm(axes, unit="sheet"):
+    for axis in tqdm(axes if args.task is None else [args.task], unit="sheet"):
         path = args.output / f"{axis}.jpg"
-        if args.env_type == "bomb":
+        if args.task is not None:
+            sheet = suite_sheet(args.task, args.seeds, options)
+        elif args.env_type == "bomb":
             sheet = axis_sheet(axis, args.seeds, options)
         else:
             sheet = tiles_sheet(
@@ -128,6 +142,22 @@ def axis_sheet(axis: str, seeds: Sequence[int], options: RenderOptions) -> Sheet
                 path_tile(path, paths[0], options.image_size) for path in paths
             ]
     return Sheet(f"{axis}: {summary}", COLUMNS, {} if axis == ALL else magnitude_rows(AXES[axis]), images)
+
+
+def suite_sheet(suite: str, seeds: Sequence[int], options: RenderOptions) -> Sheet:
+    """A row for every numbered task: each seed's instruction, start, and what the expert leaves."""
+    images: dict[str, list[np.ndarray]] = {}
+    for task_id in range(find_suite(suite).num_tasks):
+        (spec,) = specs_of_tasks(EpisodeSpec(seeds[0], suite), [task_id])
+        env = make_env(spec, options)
+        for seed in seeds:
+            first, *_, last = play(env, replace(spec, seed=seed), expert_agent())
+            shown = [moment.observation[PIXELS][CAMERAS[0]] for moment in (first, last)]
+            row = images.setdefault(f"task {task_id}", [])
+            row += [text_tile(first.instruction, options.image_size), *shown]
+        env.close()
+    columns = [f"{what}, seed {seed}" for seed in seeds for what in ("instruction", "start", "end")]
+    return Sheet(f"{suite}: what the expert does in each task", columns, images=images)
 
 
 def tiles_sheet(

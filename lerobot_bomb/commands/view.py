@@ -13,6 +13,7 @@ import numpy as np
 from lerobot_bomb.bomb.episode import EpisodeSpec
 from lerobot_bomb.bomb.observation import DEFAULT_IMAGE_SIZE, RenderOptions
 from lerobot_bomb.bomb.perturbations import Condition
+from lerobot_bomb.bomb.suite import specs_of_tasks
 from lerobot_bomb.commands.arguments import (
     add_episode_arguments,
     checkpoint_flag,
@@ -198,7 +199,7 @@ def _bomb(args: argparse.Namespace) -> Viewed:
     )
     image_size = DEFAULT_IMAGE_SIZE if args.image_size is None else args.image_size
     options = RenderOptions(image_size, args.render_preset, args.depth)
-    return bomb_episode(spec.for_tasks(args.task_ids)[0], options)
+    return bomb_episode(specs_of_tasks(spec, args.task_ids)[0], options)
 
 
 def _bomb_recording(spec: EpisodeSpec, path: Path, name: str) -> "RerunFile":

@@ -11,6 +11,7 @@ from typing import Any, ClassVar
 from lerobot_bomb import __version__
 from lerobot_bomb.bomb.episode import DEFAULT_FPS, TASK_VERSION, EpisodeSpec
 from lerobot_bomb.bomb.observation import DEFAULT_IMAGE_SIZE, RenderOptions
+from lerobot_bomb.bomb.suite import specs_of_tasks
 from lerobot_bomb.conditions import NONE
 from lerobot_bomb.data.resumable import check_repo_id
 from lerobot_bomb.envs.results import installed_version
@@ -88,7 +89,7 @@ class Recording:
     @property
     def conditions(self) -> list[EpisodeSpec]:
         """The specs that every seed is played with, with the first seed."""
-        tasks = self.spec.for_tasks(self.task_ids)
+        tasks = specs_of_tasks(self.spec, self.task_ids)
         return [replace(task, perturbations=text) for task in tasks for text in self.perturbations]
 
     def specs(self, num_tried: int) -> Iterator[EpisodeSpec]:

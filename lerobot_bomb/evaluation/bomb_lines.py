@@ -152,6 +152,9 @@ def eval_flags_of(rows: list[Row]) -> list[str]:
 
 
 def _task_flags(specs: list[dict[str, Any]]) -> list[str]:
+    if all(spec.get("task_id") is not None for spec in specs):
+        ids = {spec["task_id"] for spec in specs}
+        return [f"--env.task_ids={sorted(ids)}".replace(" ", "")]
     if all(spec["target"] and spec["color"] for spec in specs):
         ids = {task_id(spec["target"], spec["color"]) for spec in specs}
         return [f"--env.task_ids={sorted(ids)}".replace(" ", "")]
@@ -164,7 +167,8 @@ BOMB_LINES = ResultKind(
     fields={OLD_VERSION: CHECKS, PROTOCOL_VERSION: CHECKS | NEW_CHECKS},
     spec_fields=SPEC_CHECKS,
     check_episode=_check_episode,
-    drawn=("target", "color"),
+    added_spec_fields={"task_id": or_none(is_int(0))},
+    drawn=("target", "color", "task_id"),
     settings=_settings,
     describe_simulator=_describe_simulator,
     describe_tasks=_describe_tasks,

@@ -1,7 +1,7 @@
 """What lines of results of one environment are; how they are read and compared is the same for all."""
 
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 from lerobot_bomb.data.environment import Environment
 from lerobot_bomb.envs.results import Row
@@ -30,7 +30,7 @@ class ResultKind:
     # {protocol version: what its lines must say}, the oldest first; it is how lines are known, so no two
     # environments share one
     fields: Mapping[str, Mapping[str, Check]]
-    spec_fields: Mapping[str, Check]
+    spec_fields: dict[str, Check]
     # raises a ValueError unless there can be such an episode, whose fields are possible one by one
     check_episode: Callable[[Row], None]
     # what of a spec may differ between episodes that are pooled, beside seed and perturbations
@@ -47,6 +47,8 @@ class ResultKind:
     measures: Sequence[Measure]
     # what perturbations changed in pairs, beside successes
     describe_change: Callable[[list[Pair]], str] | None = None
+    # of a spec, what lines of earlier releases do not have and then have by default
+    added_spec_fields: Mapping[str, Check] = field(default_factory=dict)
 
     def check(self, row: Row) -> None:
         """Raise a ValueError that names a field of a line which is missing or impossible."""
@@ -54,8 +56,9 @@ class ResultKind:
 
     def check_spec(self, row: Row) -> None:
         """Raise a ValueError unless a line is of an episode that there can be."""
-        check_fields(row["spec"], self.spec_fields, "spec.")
-        refuse_others(row["spec"], self.spec_fields)
+        added = {name: check for name, check in self.added_spec_fields.items() if name in row["spec"]}
+        check_fields(row["spec"], self.spec_fields | added, "spec.")
+        refuse_others(row["spec"], self.spec_fields | added)
         self.check_episode(row)
 
     def missing_fields(self, version: str) -> list[str]:

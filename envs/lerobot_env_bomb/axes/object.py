@@ -59,5 +59,5 @@ class StoneLook(Transform):
                 visual.size[:] = radius, radius, half
             visual.rgba[:3] = (1 - shade) * visual.rgba[:3] + shade * GREY
 
-    def arrange(self, layout: Layout, stone: int) -> Layout:
+    def arrange(self, layout: Layout, supply: tuple[int, ...]) -> Layout:
         return replace(layout, stone_radius_m=self.radius_m, stone_height_m=self.height_m)

@@ -13,7 +13,7 @@ from lerobot_env_bomb.axes.transform import Transform
 
 @dataclass(frozen=True)
 class Start(Transform):
-    """The stone to be moved and the gripper start elsewhere."""
+    """The stones in the tray and the gripper start elsewhere."""
 
     stone_offset_m: tuple[float, float]  # x, y
     gripper_offset_m: tuple[float, float]
@@ -26,10 +26,13 @@ class Start(Transform):
         angle_rad = side * rng.uniform(0.5 * np.pi, 0.75 * np.pi)
         stone_m, gripper_m = (1e-3 * magnitude("start", what, level) for what in ("stone", "gripper"))
         gripper_offset = gripper_m * np.cos(angle_rad), gripper_m * np.sin(angle_rad)
-        return cls((0.0, side * stone_m), (float(gripper_offset[0]), float(gripper_offset[1])))
+        stone_offset = 0.0, side * stone_m
+        if nominal.gripper_is_named:
+            gripper_offset = stone_offset
+        return cls(stone_offset, (float(gripper_offset[0]), float(gripper_offset[1])))
 
-    def arrange(self, layout: Layout, stone: int) -> Layout:
+    def arrange(self, layout: Layout, supply: tuple[int, ...]) -> Layout:
         stone_xy = layout.stone_xy.copy()
-        stone_xy[stone] += self.stone_offset_m
+        stone_xy[list(supply)] += self.stone_offset_m
         gripper_xyz = layout.gripper_xyz + np.array([*self.gripper_offset_m, 0.0])
         return replace(layout, stone_xy=stone_xy, gripper_xyz=gripper_xyz)

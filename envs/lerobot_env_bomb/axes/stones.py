@@ -1,13 +1,13 @@
 """Perturbation axis `stones`: more stones, none exactly in place."""
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Self
 
 import numpy as np
 
 from lerobot_bomb.bomb.board import BOARD, COLORS, Cell
-from lerobot_bomb.bomb.go import is_legal_move, is_legal_position
+from lerobot_bomb.bomb.go import is_legal_position
 from lerobot_bomb.bomb.layout import Layout
 from lerobot_bomb.bomb.perturbations import magnitude
 from lerobot_bomb.bomb.suite import Episode
@@ -30,32 +30,34 @@ class Stones(Transform):
         num_extra = int(magnitude("stones", "extra", level))
         # As for the opening: the candidates do not depend on the move, the first that allows it is taken.
         while True:
-            extra = _grow(opening, num_extra, rng)
-            if len(extra) == num_extra and is_legal_move({**opening, **extra}, nominal.target, nominal.color):
+            extra = _grow(opening, num_extra, nominal.extra_colors, rng)
+            if len(extra) == num_extra and nominal.allows({**opening, **extra}):
                 return cls(extra, tuple(directions_rad.tolist()), shift_m)
 
-    def arrange(self, layout: Layout, stone: int) -> Layout:
+    def arrange(self, layout: Layout, supply: tuple[int, ...]) -> Layout:
         stone_xy, is_white = layout.stone_xy.copy(), layout.stone_is_white.copy()
         in_play = layout.stone_in_play.copy()
         for i, (cell, color) in zip(np.flatnonzero(~in_play), self.extra.items(), strict=False):
             stone_xy[i] = BOARD.intersection_xy(*cell)
             is_white[i] = color == "white"
             in_play[i] = True
-        on_board = np.flatnonzero(in_play & (np.arange(len(in_play)) != stone))
+        on_board = np.setdiff1d(np.flatnonzero(in_play), supply)
         angles_rad = np.array(self.directions_rad[: len(on_board)])
         stone_xy[on_board] += self.shift_m * np.column_stack([np.cos(angles_rad), np.sin(angles_rad)])
         return replace(layout, stone_xy=stone_xy, stone_is_white=is_white, stone_in_play=in_play)
 
 
-def _grow(opening: Mapping[Cell, str], num_extra: int, rng: np.random.Generator) -> dict[Cell, str]:
-    """{(row, column): colour} of stones that can join the opening, alternately black and white."""
+def _grow(
+    opening: Mapping[Cell, str], num_extra: int, colors: Sequence[str], rng: np.random.Generator
+) -> dict[Cell, str]:
+    """{(row, column): colour} of stones that can join the opening, the colours in turn."""
     extra: dict[Cell, str] = {}
     first = int(rng.integers(len(COLORS)))
     for place in rng.permutation(BOARD.num_lines**2):
         row, column = divmod(int(place), BOARD.num_lines)
         if len(extra) == num_extra:
             break
-        grown = {**extra, (row, column): COLORS[(first + len(extra)) % len(COLORS)]}
+        grown = {**extra, (row, column): colors[(first + len(extra)) % len(colors)]}
         if (row, column) not in opening and is_legal_position({**opening, **grown}):
             extra = grown
     return extra

@@ -12,6 +12,6 @@ class Transform(EpisodeTransform):
     def edit_model(self, model: mujoco.MjModel) -> None:
         """Change the compiled model in place."""
 
-    def arrange(self, layout: Layout, stone: int) -> Layout:
-        """The layout after the change; `stone` is to be moved."""
+    def arrange(self, layout: Layout, supply: tuple[int, ...]) -> Layout:
+        """The layout after the change; `supply`: indices of the stones in the tray."""
         return layout
