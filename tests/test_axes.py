@@ -16,12 +16,12 @@ from lerobot_bomb.bomb.go import is_legal_move, is_legal_position
 from lerobot_bomb.bomb.layout import Layout
 from lerobot_bomb.bomb.observation import CAMERAS
 from lerobot_bomb.bomb.perturbations import AXES, NUISANCES
-from lerobot_bomb.bomb.suites.place import STONE
+from lerobot_bomb.bomb.suites.place import FORMS, STONE
 from lerobot_bomb.conditions import MAX_LEVEL
 from lerobot_bomb.envs.photometric import Photometric
 from lerobot_env_bomb.axes import TRANSFORMS
 from lerobot_env_bomb.axes.dynamics import Dynamics
-from lerobot_env_bomb.axes.language import FORMS, Wording
+from lerobot_env_bomb.axes.language import Wording
 from lerobot_env_bomb.axes.light import Light
 from lerobot_env_bomb.axes.object import GREY, StoneLook
 from lerobot_env_bomb.axes.stones import Stones

@@ -84,8 +84,9 @@ def test_a_policy_that_was_trained_for_bomb_is_told_its_environment() -> None:
 def test_a_policy_without_training_acts() -> None:
     env = make_env_config("bomb_pusht")
     config = make_policy_config("act", pretrained_backbone_weights=None, device="cpu")
-    make_policy(config, env_cfg=env)
+    policy = make_policy(config, env_cfg=env)  # kept: else one of another test may be the last that lives
     make_env_pre_post_processors(env, config)
+    assert policy.config.type == "act"
 
 
 def test_lerobot_eval_refuses_before_anything_is_played(

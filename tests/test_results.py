@@ -9,7 +9,7 @@ from lerobot_bomb.bomb.board import COLORS
 from lerobot_bomb.bomb.episode import PROTOCOL_VERSION, EpisodeSpec
 from lerobot_bomb.commands.main import main
 from lerobot_bomb.envs.results import EpisodeResult, PolicyIdentity
-from lerobot_bomb.evaluation.bomb_lines import NEW_CHECKS, SPEC_CHECKS, median_error_mm
+from lerobot_bomb.evaluation.bomb_lines import BOMB_LINES, NEW_CHECKS, SPEC_CHECKS, median_error_mm
 from lerobot_bomb.evaluation.result_lines import KINDS, POLICY_CHECKS, parse_line
 from lerobot_bomb.evaluation.results import read_results, summarise
 
@@ -88,7 +88,8 @@ def test_an_episode_that_was_run_again_counts_once(path: Path) -> None:
 
 
 def test_all_fields_are_checked() -> None:
-    assert SPEC_CHECKS.keys() == {field.name for field in fields(EpisodeSpec)}
+    spec_fields = SPEC_CHECKS.keys() | BOMB_LINES.added_spec_fields.keys()
+    assert spec_fields == {field.name for field in fields(EpisodeSpec)}
     assert POLICY_CHECKS.keys() == {field.name for field in fields(PolicyIdentity)}
     for name in values(0):
         with pytest.raises(ValueError, match=f"{name}" if name != "protocol_version" else "None"):

@@ -78,6 +78,7 @@ class BombEnvConfig(EnvConfig):
             for spec in itertools.chain(*self.groups.values()):
                 find_suite(spec.suite).check(spec)
                 check_robot(spec)
+            _ = self.render_options
         if self.results_path is not None:
             self.results_path = str(Path(self.results_path).expanduser())
         image = PolicyFeature(type=FeatureType.VISUAL, shape=(self.image_size, self.image_size, 3))
