@@ -1,10 +1,11 @@
 """Where everything is: at the start of an episode, and as the simulator measures it."""
 
-from dataclasses import dataclass
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
 
 import numpy as np
 
-from lerobot_bomb.bomb.board import BOARD
+from lerobot_bomb.bomb.board import BOARD, Cell
 
 
 @dataclass(frozen=True)
@@ -22,6 +23,17 @@ class Layout:
     def rest_height_m(self) -> float:
         """Height of the centre of a stone that rests; board and tray are equally high."""
         return BOARD.thickness_m + self.stone_height_m / 2
+
+
+def put_on_board(stones: Mapping[Cell, str], layout: Layout) -> Layout:
+    """The layout with the first stones that are not in play on these intersections."""
+    stone_xy, stone_is_white = layout.stone_xy.copy(), layout.stone_is_white.copy()
+    in_play = layout.stone_in_play.copy()
+    for i, (cell, color) in zip(np.flatnonzero(~in_play), stones.items(), strict=False):
+        stone_xy[i] = BOARD.intersection_xy(*cell)
+        stone_is_white[i] = color == "white"
+        in_play[i] = True
+    return replace(layout, stone_xy=stone_xy, stone_is_white=stone_is_white, stone_in_play=in_play)
 
 
 @dataclass(frozen=True)

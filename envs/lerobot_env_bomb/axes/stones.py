@@ -8,7 +8,7 @@ import numpy as np
 
 from lerobot_bomb.bomb.board import BOARD, COLORS, Cell
 from lerobot_bomb.bomb.go import is_legal_position
-from lerobot_bomb.bomb.layout import Layout
+from lerobot_bomb.bomb.layout import Layout, put_on_board
 from lerobot_bomb.bomb.perturbations import magnitude
 from lerobot_bomb.bomb.suite import Episode
 from lerobot_env_bomb.axes.transform import Transform
@@ -35,16 +35,12 @@ class Stones(Transform):
                 return cls(extra, tuple(directions_rad.tolist()), shift_m)
 
     def arrange(self, layout: Layout, supply: tuple[int, ...]) -> Layout:
-        stone_xy, is_white = layout.stone_xy.copy(), layout.stone_is_white.copy()
-        in_play = layout.stone_in_play.copy()
-        for i, (cell, color) in zip(np.flatnonzero(~in_play), self.extra.items(), strict=False):
-            stone_xy[i] = BOARD.intersection_xy(*cell)
-            is_white[i] = color == "white"
-            in_play[i] = True
-        on_board = np.setdiff1d(np.flatnonzero(in_play), supply)
+        layout = put_on_board(self.extra, layout)
+        stone_xy = layout.stone_xy.copy()
+        on_board = np.setdiff1d(np.flatnonzero(layout.stone_in_play), supply)
         angles_rad = np.array(self.directions_rad[: len(on_board)])
         stone_xy[on_board] += self.shift_m * np.column_stack([np.cos(angles_rad), np.sin(angles_rad)])
-        return replace(layout, stone_xy=stone_xy, stone_is_white=is_white, stone_in_play=in_play)
+        return replace(layout, stone_xy=stone_xy)
 
 
 def _grow(

@@ -8,10 +8,10 @@ import numpy as np
 
 from lerobot_bomb.bomb.board import COLORS, NUM_STONES, TRAY_CENTER_XY, Cell
 from lerobot_bomb.bomb.episode import EpisodeSpec
-from lerobot_bomb.bomb.layout import Layout
+from lerobot_bomb.bomb.layout import Layout, put_on_board
 from lerobot_bomb.bomb.streams import Stream, generator
 from lerobot_bomb.bomb.suite import Episode, Suite, of_split, refuse_options
-from lerobot_bomb.bomb.suites.place import ALL_TARGETS, put_on_board, sample_opening
+from lerobot_bomb.bomb.suites.place import ALL_TARGETS, sample_opening
 
 MAX_OPENING_STONES = 5
 MIN_SUPPLY, MAX_SUPPLY = 2, 4

@@ -1,6 +1,6 @@
 """Suite `place`: one stone onto the intersection that the instruction names."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -8,7 +8,7 @@ import numpy as np
 from lerobot_bomb.bomb.board import BOARD, COLORS, NUM_STONES, TRAY_CENTER_XY, Cell, task_id
 from lerobot_bomb.bomb.episode import EpisodeSpec
 from lerobot_bomb.bomb.go import is_legal_move, is_legal_position
-from lerobot_bomb.bomb.layout import Layout
+from lerobot_bomb.bomb.layout import Layout, put_on_board
 from lerobot_bomb.bomb.streams import Stream, generator
 from lerobot_bomb.bomb.suite import Episode, Suite, of_split
 
@@ -132,17 +132,6 @@ def layout_of_one(seed: int, color: str) -> Layout:
     stone_xy[STONE] = gripper_xyz[:2] + distance_m * np.array([np.cos(angle_rad), np.sin(angle_rad)])
     stone_is_white[STONE] = color == "white"
     return Layout(gripper_xyz, stone_xy, stone_is_white, np.arange(NUM_STONES) == STONE)
-
-
-def put_on_board(opening: Mapping[Cell, str], layout: Layout) -> Layout:
-    """The layout with the first stones that are not in play on these intersections."""
-    stone_xy, stone_is_white = layout.stone_xy.copy(), layout.stone_is_white.copy()
-    in_play = layout.stone_in_play.copy()
-    for i, (cell, color) in zip(np.flatnonzero(~in_play), opening.items(), strict=False):
-        stone_xy[i] = BOARD.intersection_xy(*cell)
-        stone_is_white[i] = color == "white"
-        in_play[i] = True
-    return replace(layout, stone_xy=stone_xy, stone_is_white=stone_is_white, stone_in_play=in_play)
 
 
 def sample_opening(

@@ -10,9 +10,10 @@ import numpy as np
 from lerobot_bomb.bomb.board import BOARD, COLORS, Cell
 from lerobot_bomb.bomb.episode import EpisodeSpec
 from lerobot_bomb.bomb.go import is_legal_move, is_legal_position
+from lerobot_bomb.bomb.layout import put_on_board
 from lerobot_bomb.bomb.streams import Stream, generator
 from lerobot_bomb.bomb.suite import Episode, Suite, of_split, refuse_options
-from lerobot_bomb.bomb.suites.place import ALL_TARGETS, STONE, layout_of_one, put_on_board
+from lerobot_bomb.bomb.suites.place import ALL_TARGETS, STONE, layout_of_one
 
 MAX_OPENING_STONES = 8
 LAST = BOARD.num_lines - 1
