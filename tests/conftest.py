@@ -1,6 +1,7 @@
 """Fixtures that several test modules use."""
 
 import functools
+import gc
 import importlib
 import logging
 import os
@@ -20,6 +21,7 @@ if TYPE_CHECKING:
 
 # by CPU time; begun first, none of them is what a run waits for in the end
 SLOWEST_FILES = (
+    "test_long",
     "test_parity",
     "test_record_kill",
     "test_independence",
@@ -149,10 +151,17 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
     items.sort(key=lambda item: places.get(item.path.stem, len(places)))
 
 
+def pytest_collection_finish() -> None:
+    """What is imported by now stays: no garbage collection need look at it again."""
+    gc.collect()
+    gc.freeze()
+
+
 def pytest_generate_tests(metafunc: pytest.Metafunc) -> None:
     """Run every test that takes a `policy_type` on each policy that learns, or on --policy.type.
 
-    A test that takes `options` too runs on the variants of each.
+    A test that takes `options` too runs on the variants of each. One marked `one_type` is about what the
+    types share, and is long on all but one of them.
     """
     if "policy_type" not in metafunc.fixturenames:
         return
@@ -163,4 +172,8 @@ def pytest_generate_tests(metafunc: pytest.Metafunc) -> None:
         variants = [variant for each in types for variant in variants_of(each, is_long=is_long)]
         metafunc.parametrize(("policy_type", "options"), variants)
     else:
-        metafunc.parametrize("policy_type", types)
+        first = types[-1] if metafunc.definition.get_closest_marker("one_type") else None
+        metafunc.parametrize(
+            "policy_type",
+            [pytest.param(each, marks=() if first in (None, each) else pytest.mark.long) for each in types],
+        )

@@ -13,6 +13,7 @@ from torch import Tensor
 VARIANT = "both heads"
 
 
+@pytest.mark.long
 def test_a_short_training_hears_words_through_dualmod_only(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

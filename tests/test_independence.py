@@ -260,6 +260,7 @@ def tolerance_of(checkpoint: Path) -> float:
     return TOLERANCES.get(policy_type, BINS_TOLERANCE)
 
 
+@pytest.mark.one_type
 def test_a_networks_results_do_not_depend_on_batch_or_workers(
     stock_cli: Run, tmp_path: Path, checkpoint: Path
 ) -> None:

@@ -39,6 +39,7 @@ def weights_after_a_step(run: Run, output_dir: Path, flags: list[str]) -> bytes:
     return (output_dir / "checkpoints" / "last" / "pretrained_model" / "model.safetensors").read_bytes()
 
 
+@pytest.mark.one_type
 def test_a_base_is_what_training_from_scratch_starts_from(
     policy_type: str, flags: list[str], dataset: Path, stock_cli: Run, tmp_path: Path
 ) -> None:

@@ -125,6 +125,7 @@ def train(run: Run, flags: str, output_dir: Path) -> Path:
     return output_dir / "checkpoints" / "last" / "pretrained_model"
 
 
+@pytest.mark.one_type
 def test_adapters_are_trained_resumed_and_evaluated_by_stock_commands(
     policy_type: str, dataset: Path, stock_cli: Run, tmp_path: Path
 ) -> None:

@@ -94,10 +94,12 @@ def test_images_give_exactly_the_same_inputs(routes: MakeRoutes, options: Option
     require_same_inputs(routes(options))
 
 
+@pytest.mark.one_type
 def test_images_give_exactly_the_same_inputs_without_state(routes: MakeRoutes) -> None:
     require_same_inputs(routes(use_state=False))
 
 
+@pytest.mark.one_type
 def test_video_gives_the_same_tokens_and_nearly_the_same_pixels(routes: MakeRoutes) -> None:
     both = routes(images=False)
     psnr_db = []

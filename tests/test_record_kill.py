@@ -21,7 +21,7 @@ pytestmark = pytest.mark.skipif(platform.system() != "Linux", reason="processes 
 
 FLAGS = ("--repo_id=test/killed", "--episodes=3", "--seed=3", "--image_size=32", "--fps=5")
 MODES = {"video": FLAGS, "images": (*FLAGS, "--images", "--workers=2")}
-SEED = 0  # of the random moments
+SEED, NUM_KILLS = 0, 10  # of the random moments
 NOTHING = "no block of 2 episodes was finished, so nothing is kept"
 
 # the recorder's own last steps of each stage: what a kill just before them leaves is the most delicate
@@ -108,25 +108,19 @@ def test_a_recording_killed_before_each_of_its_steps_loses_nothing(
     assert list(tmp_path.iterdir()) == [root]
 
 
-@pytest.mark.parametrize(
-    ("mode", "num_kills"),
-    [
-        ("images", 2),
-        pytest.param("video", 10, marks=pytest.mark.long),
-        pytest.param("images", 10, marks=pytest.mark.long),
-    ],
-)
+@pytest.mark.long
+@pytest.mark.parametrize("mode", ["video", "images"])
 def test_a_recording_killed_at_random_moments_loses_nothing(
-    mode: str, num_kills: int, server: RecorderServer, references: dict[str, Reference], tmp_path: Path
+    mode: str, server: RecorderServer, references: dict[str, Reference], tmp_path: Path
 ) -> None:
     """One recording is killed again and again; when it ends before its kill, another one starts."""
     rng = random.Random(SEED)
     recording, killed = 0, []
     blocks = {}
-    while len(killed) < num_kills or resume_flag(tmp_path / f"{recording}"):
+    while len(killed) < NUM_KILLS or resume_flag(tmp_path / f"{recording}"):
         root = tmp_path / f"{recording}"
         moment = Moment("kill", count=rng.randint(1, references[mode].num_operations))
-        if len(killed) == num_kills:
+        if len(killed) == NUM_KILLS:
             moment = None
         ended = server.record(root, *MODES[mode], *resume_flag(root), moment=moment)
         if ended.exit_code is None:

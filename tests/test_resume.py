@@ -48,6 +48,7 @@ def weights(output_dir: Path, step: int) -> tuple[bytes, bytes]:
     return policy, optimizer
 
 
+@pytest.mark.one_type
 def test_a_resumed_training_is_the_uninterrupted_one(
     policy_type: str, stock_cli: Run, dataset: Path, losses: list[float], tmp_path: Path
 ) -> None:

@@ -78,6 +78,7 @@ def dataset(port: int, tmp_path_factory: pytest.TempPathFactory) -> Path:
     return root
 
 
+@pytest.mark.one_type
 def test_bomb_gets_the_chunks_that_the_policy_foresees_here(
     policy_type: str,
     port: int,

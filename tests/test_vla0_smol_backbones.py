@@ -43,7 +43,11 @@ from lerobot_policy_vla0_smol.modeling_vla0_smol import Vla0SmolPolicy
 Batch = dict[str, Any]
 
 
-@pytest.fixture(scope="module", params=FAMILIES)
+# idefics3 is read as smolvlm is
+LONG_FAMILY = pytest.param("idefics3", marks=pytest.mark.long)
+
+
+@pytest.fixture(scope="module", params=[LONG_FAMILY if name == "idefics3" else name for name in FAMILIES])
 def family(request: pytest.FixtureRequest) -> str:
     return request.param
 

@@ -58,9 +58,6 @@ PAIRS: dict[str, dict[str, Options]] = {
         "causal_quantile": CAUSAL | QUANTILE,
         "full_loss_ensemble": FULL_LOSS | ENSEMBLE | {"temporal_ensemble_size": 2},
     },
-    "fdvla": {
-        "flow_only_pool_all": FLOW_ONLY | POOL_ALL,
-    },
 }
 
 

@@ -99,6 +99,7 @@ def test_a_push_is_one_commit_without_paths_of_this_machine(online: LoopbackHub,
         assert not any(private in content for private in (str(tmp_path).encode(), b"/data/"))
 
 
+@pytest.mark.long
 def test_a_push_that_is_cut_off_leaves_the_old_one_or_the_new_one(
     online: LoopbackHub, tmp_path: Path
 ) -> None:
