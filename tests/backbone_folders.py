@@ -21,7 +21,6 @@ from lerobot_bomb.vlm.prompt import normalize_task
 from lerobot_bomb.vlm.tokenizer import nano_tokenizer
 from lerobot_policy_vla0_smol.modeling_vla0_smol import Vla0SmolPolicy
 
-FAMILIES = ("smolvlm", "idefics3", "qwen2_5_vl")
 QWEN_TOKENS = ("<|vision_start|>", "<|vision_end|>", "<|image_pad|>", "<|video_pad|>", "<|fim_pad|>")
 # images are not whole patches, as those of the first 2.2B: 6 x 6 patches of 14 pixels and 2 left over
 IDEFICS3_VISION = {"image_size": 86, "patch_size": 14, "num_hidden_layers": 2}

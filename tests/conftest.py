@@ -36,6 +36,9 @@ SLOWEST_FILES = (
     "test_offline_metrics",
 )
 
+# runs the tests that are marked one_type in `make test`, too
+FAST_TYPE = "vla0_smol"
+
 os.environ.setdefault("OMP_NUM_THREADS", "1")
 os.environ["HF_HUB_OFFLINE"] = "1"  # no test may need the network
 
@@ -172,8 +175,7 @@ def pytest_generate_tests(metafunc: pytest.Metafunc) -> None:
         variants = [variant for each in types for variant in variants_of(each, is_long=is_long)]
         metafunc.parametrize(("policy_type", "options"), variants)
     else:
-        first = types[-1] if metafunc.definition.get_closest_marker("one_type") else None
-        metafunc.parametrize(
-            "policy_type",
-            [pytest.param(each, marks=() if first in (None, each) else pytest.mark.long) for each in types],
-        )
+        is_one = not chosen and metafunc.definition.get_closest_marker("one_type") is not None
+        slow = [each for each in types if is_one and each != FAST_TYPE]
+        marks = dict.fromkeys(slow, pytest.mark.long)
+        metafunc.parametrize("policy_type", [pytest.param(each, marks=marks.get(each, ())) for each in types])

@@ -78,7 +78,7 @@ class BombEnvConfig(EnvConfig):
             for spec in itertools.chain(*self.groups.values()):
                 find_suite(spec.suite).check(spec)
                 check_robot(spec)
-            _ = self.render_options
+            geometry = geometry_shapes(self.render_options)
         if self.results_path is not None:
             self.results_path = str(Path(self.results_path).expanduser())
         image = PolicyFeature(type=FeatureType.VISUAL, shape=(self.image_size, self.image_size, 3))
@@ -89,7 +89,7 @@ class BombEnvConfig(EnvConfig):
             **dict.fromkeys(cameras, image),
         }
         self.features_map = {ACTION: ACTION, AGENT_POS: OBS_STATE, **{key: key for key in cameras}}
-        for key, shape in geometry_shapes(self.render_options).items():
+        for key, shape in geometry.items():
             self.features[key] = PolicyFeature(type=FeatureType.STATE, shape=shape)
             self.features_map[key] = f"{OBS_PREFIX}{key}"  # where LeRobot puts keys it does not know
 

@@ -99,10 +99,6 @@ def check_card(card: str, policy_type: str) -> None:
         assert part in card
 
 
-def test_train_push_forget_evaluate_and_fine_tune(hub: LoopbackHub, tmp_path: Path) -> None:
-    check_card(loop(hub, tmp_path, "vla0_smol"), "vla0_smol")
-
-
-@pytest.mark.long
-def test_the_same_of_the_other_types(policy_type: str, hub: LoopbackHub, tmp_path: Path) -> None:
+@pytest.mark.one_type
+def test_train_push_forget_evaluate_and_fine_tune(policy_type: str, hub: LoopbackHub, tmp_path: Path) -> None:
     check_card(loop(hub, tmp_path, policy_type), policy_type)
