@@ -31,7 +31,7 @@ does with them is `envs/lerobot_env_bomb/axes/AXIS.py`.
   all that no axis changes. The difference between the two success rates is what the condition costs.
 
 ```
-lerobot-eval --policy.path=CHECKPOINT --env.type=bomb --eval.n_episodes=100 \\
+lerobot-eval --policy.path=CHECKPOINT --env.type=bomb --eval.n_episodes=100 --eval.batch_size=10 \\
     --env.perturbations='["none","camera:3","camera:2+light:3","all:1-5"]'
 lerobot-bomb view --perturbations=camera:3 --seed=7
 lerobot-bomb gallery --axes=camera,light --seeds=2,3 --output=outputs/gallery
