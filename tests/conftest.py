@@ -8,7 +8,7 @@ import os
 import sys
 from collections.abc import Callable, Iterator
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import pytest
 from recipes import POLICY_TYPES
@@ -52,6 +52,14 @@ def shared_data() -> Path:
     return path.resolve()
 
 
+def stop_fork_server() -> None:
+    """Worker processes get its environment variables, which are those of its start."""
+    from multiprocessing import forkserver
+
+    server: Any = forkserver._forkserver
+    server._stop()
+
+
 @pytest.fixture(scope="module")
 def libero(tmp_path_factory: pytest.TempPathFactory) -> "Iterator[Libero]":
     """The installed one with a config file in a folder of the tests."""
@@ -64,7 +72,9 @@ def libero(tmp_path_factory: pytest.TempPathFactory) -> "Iterator[Libero]":
         if (found := Libero.find()) is None:
             pytest.skip("hf-libero is not installed")
         found.write_config()
+        stop_fork_server()
         yield found
+    stop_fork_server()
 
 
 @pytest.fixture(scope="module")

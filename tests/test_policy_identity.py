@@ -16,6 +16,7 @@ from lerobot.policies.act.configuration_act import ACTConfig
 
 import lerobot_policy_bomb  # noqa: F401  the plugin
 from lerobot_bomb import _compat
+from lerobot_bomb._compat import built_policies
 from lerobot_bomb.checkpoints.identity import _of_checkpoint, acting_policy
 from lerobot_bomb.envs.results import PolicyIdentity
 from lerobot_bomb.evaluation.results import read_results
@@ -89,7 +90,6 @@ def test_flags_and_processors_are_part_of_who_acts_and_a_place_is_not(checkpoint
     seen = []
     for flags in ({}, {}, {"n_action_steps": 2}, {"push_to_hub": False, "repo_id": "me/x"}):
         seen.append(identity(loaded(checkpoint, **flags)))
-        gc.collect()
     (checkpoint / "policy_preprocessor.json").write_text('{"steps": []}')
     seen.append(identity(loaded(checkpoint)))
     first, again, other_flag, other_place, other_processor = (who.settings_sha256 for who in seen)
@@ -107,7 +107,6 @@ def test_a_policy_in_training_does_not_claim_the_weights_it_started_from(checkpo
 
 def test_scripted_and_untrained_policies_have_a_type_only() -> None:
     assert identity(make_policy(BombExpertConfig(), env_cfg=ENV)) == PolicyIdentity("bomb_expert")
-    gc.collect()
     assert identity(make_policy(act_config(), env_cfg=ENV)) == PolicyIdentity("act")
 
 
@@ -118,6 +117,20 @@ def test_of_two_policies_none_is_named(checkpoint: Path, caplog: pytest.LogCaptu
         assert acting_policy() is None
     assert "this process holds 2 of them (act, act)" in caplog.text
     del both
+
+
+def test_a_dropped_policy_that_refers_to_itself_is_not_one_of_two(checkpoint: Path) -> None:
+    assert acting_policy() is None
+    gc.disable()
+    try:
+        dropped = loaded(checkpoint)
+        setattr(dropped, "itself", [dropped])  # noqa: B010  a cycle, not a module of it
+        del dropped
+        assert len(built_policies()) == 1
+        policy = loaded(checkpoint)
+        assert identity(policy).path == str(checkpoint)
+    finally:
+        gc.enable()
 
 
 def test_adapters_name_their_file_and_their_base(tmp_path: Path) -> None:

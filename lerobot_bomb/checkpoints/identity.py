@@ -28,10 +28,9 @@ NOT_ITS_SETTINGS = {
 
 def acting_policy() -> PolicyIdentity | None:
     """The one policy that this process built and holds; None: there is none, or it may be any of several."""
+    if len(built_policies()) > 1:
+        gc.collect()  # those that nothing refers to any more; this function must not hold them either
     policies = built_policies()
-    if len(policies) > 1:
-        gc.collect()  # those that nothing refers to any more
-        policies = built_policies()
     if len(policies) != 1:
         if policies:
             names = ", ".join(policy.config.type for policy in policies)
