@@ -7,8 +7,6 @@ import platform
 from pathlib import Path
 from typing import Any
 
-import torch
-
 MAX_LOAD_PER_CORE = 0.5  # one-minute load average
 
 
@@ -46,6 +44,8 @@ def require_idle_machine(force: bool) -> None:
 
 def require_cuda(instead: str) -> None:
     """Leave with exit code 1, and what to do instead, where no CUDA device is."""
+    import torch
+
     if not torch.cuda.is_available():
         raise SystemExit(f"No CUDA device is there; {instead}")
 

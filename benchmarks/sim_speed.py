@@ -23,7 +23,7 @@ from pathlib import Path
 
 from machine import add_machine_arguments, require_idle_machine, write_figures
 
-from lerobot_bomb.tables import print_table
+# robosuite's Python, which runs this file too, has neither torch nor this package
 
 IMAGE_SIZE = 256
 NUM_FRAMES = 100
@@ -92,6 +92,7 @@ def run_in_process(command: list[str], allow_failure: bool = False) -> dict[str,
     if done.returncode == 0:
         return json.loads(done.stdout.splitlines()[-1])
     if allow_failure:
+        print(f"{command[-1]} does not run: {(done.stderr.splitlines() or ['no message'])[-1]}")
         return None
     raise SystemExit(f"{' '.join(command)} failed:\n{done.stderr}")
 
@@ -216,13 +217,15 @@ def ratios(figures: dict) -> dict[str, float | None]:
 
 def report(figures: dict) -> None:
     """Print what was measured, then the ratios beside their targets."""
+    from lerobot_bomb.tables import print_table
+
     rows = []
     for name in MEASURES:
         measured = figures["milliseconds"].get(name, {})
         rows.append([name, *(f"{measured[k]:.2f}" if k in measured else "-" for k in ("frame", "step"))])
     print_table(["milliseconds", "frame", "step + 2 cameras"], rows)
     if "lift" not in figures["milliseconds"]:
-        print("lift is absent: robosuite does not run here; see --help for how to install it")
+        print("lift was not measured; see --help for how to install robosuite")
     print(f"steps/s with two cameras: {figures['steps_per_s']['1']:.0f} in one process, ", end="")
     print(f"{figures['steps_per_s']['2']:.0f} in two")
     print(
