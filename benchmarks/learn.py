@@ -200,7 +200,9 @@ def train(folder: Path, run: dict[str, Any]) -> dict[str, float]:
     times = folder / "training.json"
     if times.exists():
         return json.loads(times.read_text())
-    shutil.rmtree(folder / "train", ignore_errors=True)
+    if (folder / "train").exists():
+        print("A training that was stopped is deleted, and starts anew: its minutes would not be known")
+        shutil.rmtree(folder / "train")
     started, cpu_started = time.monotonic(), _children_cpu_s()
     recipe = [f"--config_path={recipe_path(recipe_task(run['task']), run['policy'])}"]
     run_command(

@@ -23,8 +23,6 @@ from pathlib import Path
 
 from machine import add_machine_arguments, require_idle_machine, write_figures
 
-# robosuite's Python, which runs this file too, has neither torch nor this package
-
 IMAGE_SIZE = 256
 NUM_FRAMES = 100
 NUM_STEPS = 60  # shorter than an episode
@@ -217,7 +215,7 @@ def ratios(figures: dict) -> dict[str, float | None]:
 
 def report(figures: dict) -> None:
     """Print what was measured, then the ratios beside their targets."""
-    from lerobot_bomb.tables import print_table
+    from lerobot_bomb.tables import print_table  # robosuite's Python, which runs this file too, lacks it
 
     rows = []
     for name in MEASURES:

@@ -324,3 +324,17 @@ def test_lerobots_folder_is_the_default(tmp_path: Path, monkeypatch: pytest.Monk
 @pytest.mark.parametrize("text", ["none,all:1-5", '["none", "all:1-5"]', '[\n    "none",\n    "all:1-5"\n]'])
 def test_conditions_are_read_from_a_list_on_one_line_or_several(text: str) -> None:
     assert parse_conditions(text) == ("none", "all:1-5")
+
+
+@pytest.mark.parametrize(
+    ("seed", "episodes", "is_warned"),
+    [(0, 1000, False), (0, 1001, True), (999, 3, True), (1199, 1, True), (1200, 1, False), (500, 5000, True)],
+)
+def test_seeds_that_evaluations_play_are_pointed_out(
+    seed: int, episodes: int, is_warned: bool, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    flags = ["record", "--repo_id=test/x", f"--episodes={episodes}", f"--seed={seed}", f"--root={tmp_path}"]
+    assert cli.main(flags) == 1  # the folder exists
+    last = seed + episodes - 1
+    said = f"the seeds {seed}..{last} have episodes that evaluations play, 1000 to 1199"
+    assert (said in capsys.readouterr().err) == is_warned

@@ -302,3 +302,8 @@ def test_a_perturbed_arm_is_compared_with_the_same_episodes_unperturbed(
     assert "all:5: 2 pairs, 0 lost, 0 won, p = 1 " in output
     assert "without an unperturbed one to compare with: 1; add" in output
     assert f"{path} (perturbations=none): 7 episodes" in output
+
+
+def test_a_folder_is_no_results_file(tmp_path: Path) -> None:
+    with pytest.raises(ValueError, match="is a folder; name a results file in it"):
+        read_results(tmp_path)

@@ -23,6 +23,7 @@ SPLITS = ("all", "train", "heldout")
 DEFAULT_FPS = 10  # control steps per second
 PHYSICS_HZ = 200  # physics steps per second; a multiple of the control rate
 MAX_SEED = 2**32 - 1  # what LeRobot seeds NumPy with
+TEST_SEEDS = range(1000, 1200)  # of evaluations: from LeRobot's default on, as many as the protocol asks for
 
 
 class Stage(StrEnum):

@@ -37,6 +37,8 @@ def read_lines(path: Path) -> tuple[list[Row], list[str]]:
     Raises:
         ValueError: there is no such file.
     """
+    if path.is_dir():
+        raise ValueError(f"{path} is a folder; name a results file in it")
     if not path.is_file():
         raise ValueError(
             f"{path}: no such results file; lerobot-eval writes it with --env.results_path={path}"
@@ -66,7 +68,7 @@ def parse_line(line: bytes) -> Row:
     try:
         row = json.loads(line)
     except json.JSONDecodeError as error:
-        raise ValueError(f"{error.msg} at column {error.colno}") from None
+        raise ValueError(f"{error.msg.removesuffix(' at')} at column {error.colno}") from None
     if not isinstance(row, dict):
         raise ValueError("no JSON object")
     version = row.get("protocol_version")
