@@ -15,13 +15,15 @@ reported: --first_seed=50000.
 """
 
 import argparse
+import fcntl
 import json
 import os
 import resource
 import shutil
 import sys
 import time
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -104,6 +106,14 @@ def run_task(args: argparse.Namespace) -> int:
         "flags": args.policy_flags,
     }
     claim(folder, run)
+    with locked(folder):
+        return run_claimed(args, task, run)
+
+
+def run_claimed(args: argparse.Namespace, task: Task, run: dict[str, Any]) -> int:
+    """The whole task in its folder, which nothing else writes to; 0 if the bar was reached."""
+    folder, training = args.output_dir, task.trainings[args.policy_type]
+    demonstrations = run["demonstrations"]
     record(task, demonstrations, folder / "dataset")
     minutes = train(folder, run)
 
@@ -169,6 +179,25 @@ def claim(folder: Path, run: dict[str, Any]) -> None:
         )
     folder.mkdir(parents=True, exist_ok=True)
     path.write_text(json.dumps(run) + "\n")
+
+
+@contextmanager
+def locked(folder: Path) -> Iterator[None]:
+    """Hold the folder's lock, as do the commands that are run meanwhile, even if this process is killed.
+
+    Raises:
+        RuntimeError: another process holds it.
+    """
+    with (folder / "lock").open("w") as file:
+        try:
+            fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except BlockingIOError:
+            raise RuntimeError(
+                f"--output_dir={folder} is in use: by another run, or by a lerobot-train or lerobot-eval "
+                "that a killed run has left; wait until it ends, or end it"
+            ) from None
+        os.set_inheritable(file.fileno(), True)
+        yield
 
 
 def record(task: Task, demonstrations: int, dataset: Path) -> None:

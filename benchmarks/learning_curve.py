@@ -18,7 +18,7 @@ NEAR_MM = 20.0
 LIFTED = (Stage.LIFTED, Stage.PLACED)
 
 PANEL_PX = (520, 360)  # width, height of the plot's inside
-MARGIN_PX = (70, 46)  # left and right, top and bottom
+MARGIN_PX = (70, 70)  # left and right, top and bottom
 INK, GRID, BAND = (40, 40, 40), (225, 225, 225), (235, 215, 190)  # blue, green, red
 SUCCESS_BGR, GROUNDED_BGR, LIFTED_BGR = (160, 80, 20), (40, 140, 40), (60, 60, 200)
 
@@ -85,15 +85,12 @@ def draw(points: list[Point], title: str, path: Path) -> None:
     }
     for number, (name, (shares, color)) in enumerate(curves.items()):
         places = [_place(p.cpu_minutes / end, share) for p, share in zip(points, shares, strict=True)]
-        cv2.polylines(plot, [np.array(places)], False, color, 2, cv2.LINE_AA)
+        thickness = 2 * (len(curves) - number)  # the later ones are drawn over the others, where they agree
+        cv2.polylines(plot, [np.array(places)], False, color, thickness, cv2.LINE_AA)
         for place in places:
-            cv2.circle(plot, place, 4, color, -1, cv2.LINE_AA)
-        _write(
-            plot,
-            name,
-            (MARGIN_PX[0] + PANEL_PX[0] - 230, MARGIN_PX[1] + PANEL_PX[1] - 70 + 24 * number),
-            color,
-        )
+            cv2.circle(plot, place, 2 + thickness, color, -1, cv2.LINE_AA)
+        legend = (MARGIN_PX[0] + number * PANEL_PX[0] // len(curves), plot.shape[0] - 10)
+        _write(plot, name, legend, color)
     path.parent.mkdir(parents=True, exist_ok=True)
     if not cv2.imwrite(str(path), plot):
         raise OSError(f"{path} cannot be written")
@@ -126,7 +123,7 @@ def _draw_axes(plot: np.ndarray, title: str, end_minutes: float) -> None:
         _write(plot, f"{across * end_minutes:.1f}", (x - 14, MARGIN_PX[1] + PANEL_PX[1] + 20), INK)
     cv2.rectangle(plot, _place(0, 0), _place(1, 1), INK, 1)
     _write(plot, title, (MARGIN_PX[0], MARGIN_PX[1] - 18), INK)
-    _write(plot, "CPU minutes of training", (_place(0.35, 0)[0], plot.shape[0] - 8), INK)
+    _write(plot, "CPU minutes of training", (_place(0.35, 0)[0], plot.shape[0] - 32), INK)
 
 
 def _write(plot: np.ndarray, text: str, place: tuple[int, int], color: tuple[int, int, int]) -> None:

@@ -111,6 +111,13 @@ def test_a_instruction_is_broken_into_lines_that_fit() -> None:
     assert not inked[:, -4:].any()
 
 
+def test_a_long_instruction_is_written_smaller() -> None:
+    text = "Pick up the stone and put it on the board, " * 5
+    inked = (text_tile(text + "please.", 128) != text_tile(text, 128)).any(axis=2)
+    assert inked.any(), "its last word is there"
+    assert not inked[-2:].any()
+
+
 def test_all_shows_everything_that_changes() -> None:
     sheet = axis_sheet(ALL, (3,), OPTIONS)
     rows = ["workspace", "wrist", "instruction", "expert's path"]

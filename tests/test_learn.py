@@ -1,4 +1,6 @@
 import json
+import subprocess
+import sys
 from argparse import Namespace
 from collections.abc import Callable
 from pathlib import Path
@@ -47,6 +49,17 @@ def commands(monkeypatch: pytest.MonkeyPatch, stock_cli: Callable[..., None]) ->
     cpu_s = iter((100.0, 220.0))  # before and after the training
     monkeypatch.setattr(learn, "_children_cpu_s", lambda: next(cpu_s))
     return ran
+
+
+def test_a_folder_is_in_use_until_the_commands_of_a_killed_run_have_ended(tmp_path: Path) -> None:
+    left = [sys.executable, "-c", "import sys; sys.stdin.read()"]
+    with learn.locked(tmp_path):
+        command = subprocess.Popen(left, stdin=subprocess.PIPE, close_fds=False)
+    with pytest.raises(RuntimeError, match="is in use"), learn.locked(tmp_path):
+        pass
+    command.communicate()
+    with learn.locked(tmp_path):
+        pass
 
 
 def test_a_task_is_learnt_by_stock_commands_and_goes_on_where_it_stopped(

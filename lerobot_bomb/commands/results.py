@@ -11,7 +11,7 @@ from lerobot_bomb.evaluation.result_groups import (
     differing,
     groups_of,
 )
-from lerobot_bomb.evaluation.result_lines import read_lines
+from lerobot_bomb.evaluation.result_lines import check_any, read_lines
 from lerobot_bomb.evaluation.results import pair_lines, summarise
 
 MAX_SHOWN_DAMAGES = 10
@@ -35,8 +35,7 @@ def run_results(args: argparse.Namespace) -> int:
             print(f"{damage}; not counted", file=sys.stderr)
         if len(damages) > MAX_SHOWN_DAMAGES:
             print(f"{path}: ... and {len(damages) - MAX_SHOWN_DAMAGES} more such lines", file=sys.stderr)
-        if not rows:
-            raise ValueError(f"{path}: no finished episode")
+        check_any(path, rows)
         _print_file(path, groups_of(rows), len(damages))
     return 0
 

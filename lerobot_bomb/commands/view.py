@@ -14,6 +14,7 @@ from lerobot_bomb.bomb.episode import EpisodeSpec
 from lerobot_bomb.bomb.observation import DEFAULT_IMAGE_SIZE, RenderOptions
 from lerobot_bomb.bomb.perturbations import Condition
 from lerobot_bomb.bomb.suite import specs_of_tasks
+from lerobot_bomb.checkpoints.names import CONFIG
 from lerobot_bomb.commands.arguments import (
     add_episode_arguments,
     checkpoint_flag,
@@ -21,7 +22,7 @@ from lerobot_bomb.commands.arguments import (
     switch,
 )
 from lerobot_bomb.envs.rollout import Agent, expert_agent, make_env, make_pusht_env, play, random_agent
-from lerobot_bomb.files import written_whole
+from lerobot_bomb.files import read_json, written_whole
 from lerobot_bomb.flags import flags_without_group, one_of
 from lerobot_bomb.pusht.episode import (
     FPS,
@@ -146,7 +147,7 @@ def _refuse_flags_of_others(args: argparse.Namespace) -> None:
 
 
 def _policy(args: argparse.Namespace, policies: tuple[str, ...]) -> str:
-    """Who acts, as a word for names: one of the policies, or checkpoint."""
+    """Who acts, as a word for names: one of the policies, or a checkpoint's type."""
     if args.policy_path is None:
         if args.policy_device is not None:
             raise ValueError(f"--policy.device={args.policy_device} needs a checkpoint, --policy.path=FOLDER")
@@ -158,7 +159,10 @@ def _policy(args: argparse.Namespace, policies: tuple[str, ...]) -> str:
         return policy
     if args.policy is not None:
         raise ValueError(f"--policy={args.policy} and --policy.path={args.policy_path}: give one of them")
-    return "checkpoint"
+    try:
+        return str(read_json(args.policy_path / CONFIG)["type"])
+    except (OSError, ValueError, KeyError):
+        return "checkpoint"  # refused when it is loaded
 
 
 def bomb_episode(spec: EpisodeSpec, options: RenderOptions) -> Viewed:

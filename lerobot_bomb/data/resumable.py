@@ -193,7 +193,9 @@ def check_folders(parameters: Parameters, root: Path, folder: Path, resume: bool
     check_link("--root", root)
     if not resume:
         if root.exists():
-            raise ValueError(f"--root={root} exists already; name a folder that does not exist yet")
+            raise ValueError(
+                f"--root={root} exists already; name a folder that does not exist yet, or delete it"
+            )
         if folder.exists():
             with lock_folder(folder):
                 if {path.name for path in folder.iterdir()} - {LOCK_FILE}:

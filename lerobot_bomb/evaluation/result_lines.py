@@ -54,6 +54,15 @@ def read_lines(path: Path) -> tuple[list[Row], list[str]]:
     return rows, damages
 
 
+def check_any(path: Path, rows: list[Row]) -> None:
+    """Raise a ValueError unless there are rows of this file."""
+    if not rows:
+        raise ValueError(
+            f"{path}: no finished episode; lerobot-eval writes a line when one ends: start it (again) with "
+            f"--env.results_path={path}"
+        )
+
+
 def kind_of(row: Row) -> ResultKind:
     """Of which environment a line is."""
     return KIND_OF_VERSION[row["protocol_version"]]

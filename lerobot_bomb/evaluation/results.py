@@ -13,7 +13,7 @@ from lerobot_bomb.evaluation.result_groups import (
     pair_with_nominal,
 )
 from lerobot_bomb.evaluation.result_kind import Measure, Pair
-from lerobot_bomb.evaluation.result_lines import kind_of, read_lines
+from lerobot_bomb.evaluation.result_lines import check_any, kind_of, read_lines
 from lerobot_bomb.stats import format_rate, mcnemar_p_value
 
 
@@ -48,8 +48,7 @@ def read_results(path: Path) -> list[Row]:
     rows, damages = read_lines(path)
     if damages:
         raise ValueError(damages[0])
-    if not rows:
-        raise ValueError(f"{path}: no finished episode")
+    check_any(path, rows)
     return [row for group in groups_of(rows) for row in group.rows]
 
 

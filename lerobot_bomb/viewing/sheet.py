@@ -9,6 +9,7 @@ from PIL import Image, ImageDraw, ImageFont
 LABEL_WIDTH = 150  # pixels, of the column at the left
 GAP = 4  # pixels between tiles
 FONT_SIZE, TITLE_SIZE = 12, 16  # pixels
+MIN_FONT_SIZE = 7  # pixels, of an instruction that is long for its tile
 LINE_HEIGHT, TITLE_HEIGHT = 18, 30  # pixels
 PAPER, INK = (255, 255, 255), (20, 20, 20)
 TILE_PAPER = (244, 244, 240)
@@ -59,15 +60,28 @@ class Sheet:
 
 
 def text_tile(text: str, size: int) -> np.ndarray:
-    """(size, size, 3) uint8: an instruction, broken into lines; what does not fit is cut off."""
+    """(size, size, 3) uint8: an instruction, broken into lines, in type that is smaller where it is long.
+
+    What does not fit at MIN_FONT_SIZE is cut off.
+    """
     tile = Image.new("RGB", (size, size), TILE_PAPER)
-    face = font(FONT_SIZE)
+    pen = ImageDraw.Draw(tile)
+    for font_size in range(FONT_SIZE, MIN_FONT_SIZE - 1, -1):
+        face = font(font_size)
+        lines = _broken(text, face, size - 2 * GAP)
+        if pen.multiline_textbbox((GAP, GAP), lines, face, spacing=2)[3] <= size:
+            break
+    pen.multiline_text((GAP, GAP), lines, INK, face, spacing=2)
+    return np.asarray(tile)
+
+
+def _broken(text: str, face: ImageFont.FreeTypeFont, width: int) -> str:
+    """The text in lines of so many pixels at most."""
     lines = [""]
     for word in text.split():
         longer = f"{lines[-1]} {word}".strip()
-        lines = [*lines[:-1], longer] if face.getlength(longer) <= size - 2 * GAP else [*lines, word]
-    ImageDraw.Draw(tile).multiline_text((GAP, GAP), "\n".join(lines), INK, face, spacing=2)
-    return np.asarray(tile)
+        lines = [*lines[:-1], longer] if face.getlength(longer) <= width else [*lines, word]
+    return "\n".join(lines)
 
 
 @cache
