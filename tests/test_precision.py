@@ -10,6 +10,7 @@ from lerobot.policies.factory import get_policy_class
 from policy_cases import CASES, save_checkpoint
 from torch import Tensor
 
+from lerobot_bomb.decoding.qkv import RopePairs
 from lerobot_bomb.flag_errors import FlagError
 from lerobot_bomb.vlm.backbone import PRODUCTS
 
@@ -48,6 +49,22 @@ def test_weights_in_bfloat16_change_no_answer(policy_type: str, tmp_path: Path) 
     assert torch.equal(single(batch)[0], half(batch)[0])
     chunks = [policy.predict_action_chunk(batch) for policy in (single, half)]
     torch.testing.assert_close(*chunks, rtol=0, atol=0.01 if policy_type == "fdvla" else 0)
+
+
+@torch.no_grad()
+def test_queries_of_weights_in_bfloat16_are_those_of_autocast(tmp_path: Path) -> None:
+    """Their scale, 32 ** -0.5, is no power of two: a product with it would round weights again."""
+    save_checkpoint("vla0_smol", tmp_path)
+    policies = load(tmp_path, dtype="bfloat16"), load(tmp_path, **BFLOAT16)
+    attentions = [policy.backbone.vlm.model.text_model.layers[0].self_attn for policy in policies]
+    generator = torch.Generator().manual_seed(0)
+    hidden, half_head = attentions[0].q_proj.in_features, attentions[0].head_dim // 2
+    states = torch.randn(8, hidden, generator=generator)
+    rope = torch.polar(torch.ones(8, 1, half_head), torch.rand(8, 1, half_head, generator=generator))
+    with torch.autocast("cpu", torch.bfloat16):
+        heads = [RopePairs(attention)(states.bfloat16(), rope) for attention in attentions]
+    for of_single, of_half in zip(*heads, strict=True):
+        assert torch.equal(of_single, of_half)
 
 
 def test_of_the_backbone_only_products_are_in_bfloat16(policy_type: str, tmp_path: Path) -> None:

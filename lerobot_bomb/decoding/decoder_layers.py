@@ -120,7 +120,7 @@ class _Layer:
         self._heads = make_heads(attention)
         self._gate_up = make_linears([mlp.gate_proj, mlp.up_proj], are_copies=is_copy)
         self._out, self._down = make_linear(attention.o_proj), make_linear(mlp.down_proj)
-        self._softcap = softcap_of(attention)
+        self._scale, self._softcap = attention.scaling, softcap_of(attention)
         self._activate: Callable[[Tensor], Tensor] = mlp.act_fn.forward
         self._before_attention = _RMSNorm(layer.input_layernorm)
         is_gemma = isinstance(layer, Gemma2DecoderLayer)
@@ -158,12 +158,12 @@ class _Layer:
             keys_BVCE = keys_ZCE.view(batch_size, num_keys, -1, size)
             values_BVCE = values_ZCE.view(keys_BVCE.shape)
             return scaled_dot_product_attention(
-                query_BVKGE.flatten(2, 3), keys_BVCE, values_BVCE, attn_mask=bias_B1XC, scale=1.0
+                query_BVKGE.flatten(2, 3), keys_BVCE, values_BVCE, attn_mask=bias_B1XC, scale=self._scale
             )
-        # of p = 2 * product / softcap, softcap * tanh(p / 2) is 2 * softcap * sigmoid(p) but for a constant,
-        # which softmax does not see; the sigmoid is faster
+        # of p = 2 * scale * product / softcap, softcap * tanh(p / 2) is 2 * softcap * sigmoid(p) but for a
+        # constant, which softmax does not see; the sigmoid is faster
         products_ZXC = torch.bmm(query_BVKGE.reshape(len(keys_ZCE), -1, size), keys_ZCE.transpose(1, 2))
-        capped_ZXC = cast(products_ZXC, torch.float32).sigmoid_()
+        capped_ZXC = (cast(products_ZXC, torch.float32) * (2 * self._scale / self._softcap)).sigmoid_()
         capped_BVXC = capped_ZXC.view(batch_size, num_keys, *capped_ZXC.shape[1:])
         scores_BVXC = torch.add(bias_B1XC, capped_BVXC, alpha=2 * self._softcap)
         weights_BVXC = cast(scores_BVXC.softmax(dim=-1), values_ZCE.dtype)

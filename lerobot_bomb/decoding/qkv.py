@@ -12,7 +12,7 @@ from torch import Tensor, nn
 
 from lerobot_bomb.decoding.linear import cast, is_plain, make_linears, multiply
 
-# states (N, H) and rotary positions (N, 1, ...) -> rotated and scaled queries (N, V * G, E); rotated keys,
+# states (N, H) and rotary positions (N, 1, ...) -> rotated queries (N, V * G, E); rotated keys,
 # then values (N, 2 * V, E)
 Heads = Callable[[Tensor, Tensor], tuple[Tensor, Tensor]]
 
@@ -40,7 +40,7 @@ class RopeHalves:
 
     def __init__(self, attention: Any, *, is_copy: bool):
         self._linears = make_linears(_projections(attention), are_copies=is_copy)
-        self._scale, self._size = _scale_of_queries(attention), attention.head_dim
+        self._size = attention.head_dim
         self._num_keys = attention.config.num_key_value_heads
 
     def __call__(self, x_NH: Tensor, rope_N12E: Tensor) -> tuple[Tensor, Tensor]:
@@ -52,7 +52,7 @@ class RopeHalves:
         rotated = heads[:, : -self._num_keys]
         half_rotated = rotated.roll(self._size // 2, dims=-1)
         rotated.mul_(cos_N1E).addcmul_(half_rotated, sin_N1E)
-        return heads[:, : -2 * self._num_keys] * self._scale, heads[:, -2 * self._num_keys :]
+        return heads[:, : -2 * self._num_keys], heads[:, -2 * self._num_keys :]
 
     @staticmethod
     def rope(cos_CE: Tensor, sin_CE: Tensor) -> Tensor:
@@ -64,16 +64,15 @@ class RopeHalves:
 class RopePairs:
     """Of plain projections on a CPU, where this is faster.
 
-    Weights are copied and scaled, their rows stand so that numbers which are rotated together are neighbours:
+    Weights are copied, their rows stand so that numbers which are rotated together are neighbours:
     the parts of a complex one. Attention logits do not depend on their order.
     """
 
     def __init__(self, attention: Any):
         # small beside a model's other weights: copying them costs less than it brings
         self._size, self._num_keys = attention.head_dim, attention.config.num_key_value_heads
-        scale = _scale_of_queries(attention)
         queries, keys, values = ([*part.parameters()] for part in _projections(attention))
-        self._query = multiply(*(self._beside(part) * scale for part in queries))
+        self._query = multiply(*(self._beside(part) for part in queries))
         keys_values = zip(keys, values, strict=True)
         self._new = multiply(*(torch.cat([self._beside(key), value.detach()]) for key, value in keys_values))
 
@@ -104,12 +103,6 @@ class RopePairs:
             is_plain(part) and part.weight.dtype.itemsize <= 4 and part.weight.device.type == "cpu"
             for part in parts
         )
-
-
-def _scale_of_queries(attention: Any) -> float:
-    """The model's own; where attention logits have a limit, times 2 / softcap: see decoder_layers.py."""
-    softcap = softcap_of(attention)
-    return attention.scaling * (1 if softcap is None else 2 / softcap)
 
 
 def softcap_of(attention: Any) -> float | None:
