@@ -42,6 +42,7 @@ class Outcome:
     seed: int
     is_success: bool
     is_success_bomb_v0: bool
+    progress: float
     failure: str | None
     error_mm: float
     collateral_mm: float
@@ -61,6 +62,7 @@ def run_episode(spec: EpisodeSpec, noise: float) -> Outcome:
         seed=spec.seed,
         is_success=result.is_success,
         is_success_bomb_v0=result.is_success_bomb_v0,
+        progress=result.progress,
         failure=result.failure,
         error_mm=result.placement_error_mm,
         collateral_mm=result.collateral_mm,
@@ -81,8 +83,8 @@ def is_idle(now: Moment, then: Moment, spec: EpisodeSpec) -> bool:
 
 
 def is_done(state: PrivilegedState, tolerance_mm: float) -> bool:
-    """Whether the stone lies on the target and the fingers, open, have left it."""
-    goal = state.goals[0]
+    """Whether the last stone lies on its target and the fingers, open, have left it."""
+    goal = state.goals[-1]
     stone_xyz = state.stone_xyz[goal.stone]
     error_mm = 1e3 * np.linalg.norm((stone_xyz - goal.xyz)[:2])
     is_clear = state.gripper_xyz[2] > stone_xyz[2] + BOARD.stone_height_m
@@ -104,6 +106,7 @@ def summarize(outcomes: list[Outcome]) -> dict[str, object]:
         "success_within_5_mm": format_rate(
             sum(o.is_success and o.error_mm <= PRECISE_MM for o in outcomes), n
         ),
+        "moves_made": f"{100 * np.mean([o.progress for o in outcomes]):.1f} %",
         "error_mm_median_p95_max": [round(float(np.percentile(error_mm, q)), 3) for q in (50, 95, 100)],
         "collateral_mm_max": round(max(o.collateral_mm for o in outcomes), 3),
         "steps_median_max": [float(np.median([o.steps for o in outcomes])), max(o.steps for o in outcomes)],

@@ -50,6 +50,7 @@ FIRST_UNSEEN_SEED = 100_000
 NUM_CHECKPOINTS = 6
 CURVE_EPISODES = 50  # of every checkpoint but the last
 MAX_CONTROL_EPISODES = 200
+PLACE = "place"
 NO_IMAGES, OTHER_INSTRUCTION = "blank images", "another episode's instruction"
 
 
@@ -118,7 +119,7 @@ def run_claimed(args: argparse.Namespace, task: Task, run: dict[str, Any]) -> in
     minutes = train(folder, run)
 
     results = evaluate_checkpoints(task, folder, args.first_seed, run["steps"])
-    given = other_instructions(results[run["steps"]])
+    given = other_instructions(results[run["steps"]], task.suite) if task.is_said_at_once else {}
     controls = evaluate_controls(task, folder, args.first_seed, given)
     minutes_per_step = minutes["cpu_minutes"] / run["steps"]
     points = {f"step {step}": count(rows, step, step * minutes_per_step) for step, rows in results.items()}
@@ -127,7 +128,8 @@ def run_claimed(args: argparse.Namespace, task: Task, run: dict[str, Any]) -> in
 
     print_points(points)
     num_named = None
-    if (rows := controls.get(OTHER_INSTRUCTION)) is not None:
+    rows = controls.get(OTHER_INSTRUCTION)
+    if rows is not None and task.suite == PLACE:  # of the others, what is meant depends on the board
         num_named = count_named(rows, given, named_targets(results[run["steps"]]))
         print(
             f"{OTHER_INSTRUCTION}: {num_named}/{len(rows)} stones put down on the intersection that it names"
@@ -150,6 +152,7 @@ def run_claimed(args: argparse.Namespace, task: Task, run: dict[str, Any]) -> in
     )
     checkpoint = last_checkpoint(folder / "train")
     task_flag = f" --task_ids={list(task.task_ids)}".replace(" ", "") if task.task_ids else ""
+    task_flag += "" if task.suite == PLACE else f" --task={task.suite}"
     watch = f"lerobot-bomb view --policy.path={checkpoint} --image_size={IMAGE_SIZE} --seed={args.first_seed}"
     print(f"The policy: {checkpoint}\nAn episode of it as a video: {watch} {task_flag}".rstrip())
     return 0 if training.bar is None else verdict(points[f"step {run['steps']}"], training.bar)
@@ -215,6 +218,7 @@ def record(task: Task, demonstrations: int, dataset: Path) -> None:
         f"--episodes={demonstrations}",
         f"--seed={FIRST_SEED}",
         f"--noise={NOISE}",
+        f"--task={task.suite}",
         f"--perturbations={task.perturbations}",
         f"--split={'train' if task.is_partial else 'all'}",
         "--images",
@@ -341,6 +345,7 @@ def evaluate(
             f"--env.discover_packages_path={PLUGIN}",
             f"--policy.path={checkpoint}",
             "--env.type=bomb",
+            f"--env.task={task.suite}",
             f"--env.image_size={IMAGE_SIZE}",
             f"--env.results_path={results}",
             *task_flags,
@@ -355,9 +360,11 @@ def evaluate(
     return read_results(results)
 
 
-def other_instructions(rows: list[Row]) -> dict[str, str]:
-    """{instruction: that of another target}; {} where all episodes have one."""
-    targets = named_targets(rows)
+def other_instructions(rows: list[Row], suite: str = PLACE) -> dict[str, str]:
+    """{instruction: that of another target, in other suites than `place` another}; {} where all have one."""
+    targets: dict[str, Any] = named_targets(rows)
+    if suite != PLACE:
+        targets = {instruction: [instruction] for instruction in targets}
     if len(set(map(tuple, targets.values()))) == 1:
         return {}
     instructions = sorted(targets)

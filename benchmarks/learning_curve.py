@@ -41,7 +41,7 @@ class Point:
 def count(rows: list[Row], step: int, cpu_minutes: float) -> Point:
     """The episodes of one checkpoint."""
     down = [row for row in rows if row["failure"] in PUT_DOWN]
-    grounded = [row for row in down if tuple(row["nearest_intersection"]) == tuple(row["target"])]
+    grounded = [row for row in down if row["nearest_intersection"] == row["target"]]
     return Point(
         step=step,
         cpu_minutes=cpu_minutes,

@@ -6,6 +6,7 @@ from recipes import POLICY_TYPES
 
 from lerobot_bomb.bomb.board import COLORS, task_id
 from lerobot_bomb.bomb.perturbations import NUISANCES
+from lerobot_bomb.bomb.suites import SUITES
 from lerobot_bomb.bomb.suites.place import targets_of, templates_of
 from lerobot_bomb.conditions import ALL, NONE
 from lerobot_bomb.envs.results import Row
@@ -48,6 +49,8 @@ class Task:
     conditions: tuple[str, ...] = ()  # that the last checkpoint is evaluated under, beside the nominal one
     is_partial: bool = False  # whether demonstrations leave out what the evaluations ask for as well
     recipe: str | None = None  # the task whose recipes it is learnt by; None: its own
+    suite: str = "place"
+    is_said_at_once: bool = True  # else the policy is given several instructions, which are not exchanged
 
 
 TASKS = {
@@ -84,6 +87,18 @@ TASKS = {
         is_partial=True,
         recipe="all_targets",
     ),
+    **{
+        suite: Task(
+            (),
+            episodes=100,
+            trainings={name: Training(1600, None) for name in POLICY_TYPES},
+            recipe="all_targets",
+            suite=suite,
+            is_said_at_once=suite != "long",
+        )
+        for suite in SUITES
+        if suite != "place"
+    },
 }
 
 

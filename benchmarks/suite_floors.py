@@ -2,26 +2,30 @@
 
     python benchmarks/suite_floors.py --json suite_floors.json
 
-Each of them is taken to move perfectly what it has chosen; nothing is simulated. `random` sees neither
-instruction nor images: any stone of the tray, any intersection. `most likely place` does too, but knows where
-targets are most frequent. `no instruction` sees which intersections are free and legal. `no colours` reads
-and sees everything but the stones' colours: it takes the answer that the instruction has under colours drawn
-at random, such that it has one.
+Each of them is taken to move perfectly what it has chosen; nothing is simulated. `most likely` neither reads
+nor sees: it does what is right most often. `no instruction` sees the board and takes anything that could be
+asked for there. `no colours` reads and sees everything but the stones' colours: it takes what the instruction
+means under colours drawn at random, such that it means something.
 """
 
 import argparse
 from collections import Counter
-from collections.abc import Mapping
+from collections.abc import Callable, Sequence
+from dataclasses import replace
+from functools import partial
 from pathlib import Path
 
 import numpy as np
 from machine import positive, write_figures
 
 from lerobot_bomb.bomb.board import COLORS, Cell
+from lerobot_bomb.bomb.commands import Case, Drawn, Stones, Task, draw_command
 from lerobot_bomb.bomb.episode import EpisodeSpec
 from lerobot_bomb.bomb.go import is_legal_move
 from lerobot_bomb.bomb.suite import Episode, find_suite
 from lerobot_bomb.bomb.suites import SUITES
+from lerobot_bomb.bomb.suites import goal as goal_suite
+from lerobot_bomb.bomb.suites import long as long_suite
 from lerobot_bomb.bomb.suites import object as object_suite
 from lerobot_bomb.bomb.suites import spatial as spatial_suite
 from lerobot_bomb.bomb.suites.place import ALL_TARGETS
@@ -29,6 +33,11 @@ from lerobot_bomb.tables import print_table
 
 FIRST_SEED = 100_000
 KNOWN_SEEDS = range(5000)  # from which the most likely place is known
+NUM_GUESSES = 60  # drawn for each verb: what it could be about
+MAX_TRIES = 200  # of colours
+COMMANDS = {"goal": goal_suite.TASKS, "long": long_suite.TASKS}
+
+type Floors = dict[str, float]
 
 
 def main() -> None:
@@ -37,7 +46,8 @@ def main() -> None:
     parser.add_argument("--episodes", type=positive, default=2000, help="of each suite (default: 2000)")
     parser.add_argument("--json", type=Path, help="also write the figures to this file")
     args = parser.parse_args()
-    figures = {suite: floors(suite, args.episodes) for suite in SUITES}
+    seeds = range(FIRST_SEED, FIRST_SEED + args.episodes)
+    figures = {suite: floors_of(suite)(seeds) for suite in SUITES}
     names = list(next(iter(figures.values())))
     print_table(
         [f"{args.episodes} episodes, %", *names],
@@ -46,20 +56,24 @@ def main() -> None:
     write_figures(args.json, figures)
 
 
-def floors(suite: str, num_episodes: int) -> dict[str, float]:
-    """{what is missing: success rate}."""
+def floors_of(suite: str) -> Callable[[Sequence[int]], Floors]:
+    """Success rates on a suite's seeds, by what is missing."""
+    if suite in COMMANDS:
+        return partial(floors_of_commands, suite, COMMANDS[suite])
+    return partial(floors_of_places, suite)
+
+
+def floors_of_places(suite: str, seeds: Sequence[int]) -> Floors:
+    """Of a suite whose episodes are one stone to one place."""
     sample = find_suite(suite).sample
     known = Counter(sample(EpisodeSpec(seed, suite)).target for seed in KNOWN_SEEDS)
     ((likely, _),) = known.most_common(1)
     rng = np.random.default_rng(0)
-    chances: dict[str, list[float]] = {
-        "random": [], "most likely place": [], "no instruction": [], "no colours": []
-    }  # fmt: skip
-    for seed in range(FIRST_SEED, FIRST_SEED + num_episodes):
+    chances: dict[str, list[float]] = {"most likely": [], "no instruction": [], "no colours": []}
+    for seed in seeds:
         episode = sample(EpisodeSpec(seed, suite))
         num_stones = len(episode.supply)
-        chances["random"].append(1 / num_stones / len(ALL_TARGETS))
-        chances["most likely place"].append((episode.target == likely) / num_stones)
+        chances["most likely"].append((episode.target == likely) / num_stones)
         chances["no instruction"].append(
             sum(1 / len(legal(episode, stone)) for stone in episode.supply) / num_stones**2
         )
@@ -69,14 +83,53 @@ def floors(suite: str, num_episodes: int) -> dict[str, float]:
     return {name: float(np.mean(values)) for name, values in chances.items()}
 
 
+def floors_of_commands(suite: str, tasks: Sequence[Task], seeds: Sequence[int]) -> Floors:
+    """Of a suite whose instructions are commands."""
+    rng = np.random.default_rng(0)
+    shares, colourless = [], []
+    for seed in seeds:
+        task_id, drawn, case = draw_command(tasks, EpisodeSpec(seed, suite))
+        of_tasks = np.array([share_of_guesses(task, drawn, case, rng) for task in tasks])
+        if np.isnan(of_tasks[task_id]):
+            of_tasks[task_id] = 0.0  # it could be about too many things for one that makes sense to be met
+        shares.append(of_tasks)
+        colourless.append(float(plans_without_colours(tasks[task_id], drawn, rng) == case.plans))
+    each = np.array(shares)  # (episodes, tasks), nan: the verb makes no sense there
+    return {
+        # always the same verb
+        "most likely": float(np.nan_to_num(each).mean(axis=0).max()),
+        "no instruction": float(np.mean([np.mean(row[~np.isnan(row)]) for row in each])),
+        "no colours": float(np.mean(colourless)),
+    }
+
+
+def share_of_guesses(task: Task, drawn: Drawn, case: Case, rng: np.random.Generator) -> float:
+    """How many of the things that a verb could be about there ask for the same; nan: none fits."""
+    abouts = {task.draw(rng).about for _ in range(NUM_GUESSES)}
+    guesses = [task.case(replace(drawn, about=about)) for about in sorted(abouts)]
+    fitting = [guess for guess in guesses if guess is not None]
+    return float(np.mean([guess.plans == case.plans for guess in fitting])) if fitting else float("nan")
+
+
+def plans_without_colours(task: Task, drawn: Drawn, rng: np.random.Generator) -> tuple | None:
+    """What a command asks for where the stones have other colours; None: nothing under those tried."""
+    for _ in range(MAX_TRIES):
+        supply = tuple(COLORS[i] for i in rng.integers(2, size=len(drawn.supply)))
+        pattern = recoloured(drawn.pattern, rng)
+        stones = recoloured(drawn.stones, rng)
+        if case := task.case(replace(drawn, stones=stones, supply=supply, pattern=pattern)):
+            return case.plans
+    return None
+
+
 def legal(episode: Episode, stone: int) -> list[Cell]:
     """Where a stone of the tray may be put."""
     color = COLORS[int(episode.layout.stone_is_white[stone])]
-    cells = [cell for cell in ALL_TARGETS if is_legal_move(dict(episode.opening), cell, color)]
+    cells = [cell for cell in ALL_TARGETS if is_legal_move(episode.opening, cell, color)]
     return cells or list(ALL_TARGETS)
 
 
-def answer_without_colours(episode: Episode, rng: np.random.Generator) -> tuple[int, Cell]:
+def answer_without_colours(episode: Episode, rng: np.random.Generator) -> tuple[int, Cell | None]:
     """(stone, place) that the instruction means where the stones have other colours."""
     suite, layout = episode.spec.suite, episode.layout
     if suite == "object":
@@ -89,15 +142,15 @@ def answer_without_colours(episode: Episode, rng: np.random.Generator) -> tuple[
             )
         return stone, episode.target
     if suite == "spatial":
-        task, anchor = spatial_suite.TASKS[episode.task_id], COLORS[1 - COLORS.index(episode.color)]
+        task, color = spatial_suite.TASKS[episode.task_id], episode.color or COLORS[0]
         place = None
         while place is None:
-            place = task.select(recoloured(episode.opening, rng), anchor)
+            place = task.select(recoloured(episode.opening, rng), COLORS[1 - COLORS.index(color)])
         return episode.stone, place
     return episode.stone, episode.target  # one stone, whose place is named by numbers
 
 
-def recoloured(opening: Mapping[Cell, str], rng: np.random.Generator) -> dict[Cell, str]:
+def recoloured(opening: Stones, rng: np.random.Generator) -> dict[Cell, str]:
     """The stones on the board in colours drawn at random."""
     return {cell: COLORS[rng.integers(2)] for cell in opening}
 

@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 
 from lerobot_bomb.bomb.board import BOARD, TRAY_CENTER_XY, TRAY_HALF_SIZE_XY
 from lerobot_bomb.bomb.episode import EpisodeSpec
-from lerobot_bomb.bomb.go import is_legal_move, is_legal_position
+from lerobot_bomb.bomb.go import is_legal_position
 from lerobot_bomb.bomb.layout import Layout
 from lerobot_bomb.bomb.observation import CAMERAS
 from lerobot_bomb.bomb.perturbations import AXES, NUISANCES
@@ -222,7 +222,7 @@ def test_more_stones_keep_the_opening_and_the_move_legal(seed: int, level: int) 
     colors = ["white" if after.stone_is_white[i] else "black" for i in on_board]
     position = dict(zip(cells, colors, strict=True))
     assert len(position) == len(cells) and is_legal_position(position)
-    assert is_legal_move(position, drawn.target, drawn.color)
+    assert drawn.allows(position)
     offsets = [
         after.stone_xy[i] - BOARD.intersection_xy(*cell) for i, cell in zip(on_board, cells, strict=True)
     ]

@@ -209,6 +209,7 @@ def test_info_is_flat(env: BombEnv) -> None:
     assert set(info) == {
         "is_success",
         "is_success_bomb_v0",
+        "progress",
         "placement_error_mm",
         "nearest_row",
         "nearest_column",

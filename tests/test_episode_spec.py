@@ -119,9 +119,11 @@ def test_a_result_is_one_line_of_json_with_its_seed() -> None:
     result = EpisodeResult(
         spec=EpisodeSpec(seed=5),
         instruction="Put it there.",
+        task_id=0,
         target=(3, 4),
         color="black",
         steps=31,
+        progress=1.0,
         is_success=False,
         is_success_bomb_v0=True,
         failure="imprecise",

@@ -179,7 +179,7 @@ def test_one_action_at_a_time_has_columns_too(train: Callable[..., Path], root: 
 @pytest.mark.parametrize(
     ("flags", "message"),
     [
-        ("--policy.path=nowhere", "--policy.path=nowhere holds no config.json"),
+        ("--policy.path=nowhere", "--policy.path=nowhere: there is no such folder"),
         ("--dataset.root=nowhere", "--dataset.root=nowhere holds no meta/info.json"),
         ("--dataset.root=.", "--dataset.root=. holds no meta/info.json"),
         ("--val_episodes=2-9", "--val_episodes=2-9: the dataset has the episodes 0..4, not 9"),

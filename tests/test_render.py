@@ -12,6 +12,7 @@ import pytest
 from lerobot_bomb.bomb.episode import EpisodeSpec
 from lerobot_bomb.bomb.observation import RenderOptions
 from lerobot_env_bomb.env import BombEnv
+from lerobot_env_bomb.render import CAPTION_BACKGROUND, CAPTION_MARGIN_PX, compose_caption
 
 SMALL = RenderOptions(image_size=32)
 STILL = np.zeros(4, dtype=np.float32)
@@ -113,3 +114,12 @@ def test_another_thread_is_told_which_one_the_environment_belongs_to() -> None:
         assert isinstance(error, RuntimeError) and "'MainThread'" in str(error) and "'helper'" in str(error)
     assert env.reset(seed=1)[1]["seed"] == 1
     env.close()
+
+
+def test_a_long_caption_is_written_smaller_and_none_of_it_is_cut_off() -> None:
+    image = np.zeros((384, 384, 3), dtype=np.uint8)
+    longer = compose_caption([image, image], ["one thing is asked for: " * 6 + "please"])
+    cut = compose_caption([image, image], ["one thing is asked for: " * 6])
+    assert longer.shape == cut.shape == (384 + 26 + 8, 768, 3)
+    assert (longer[384:, -CAPTION_MARGIN_PX:] == CAPTION_BACKGROUND).all(), "the margin at the right"
+    assert (longer != cut).any()

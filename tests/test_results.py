@@ -23,9 +23,11 @@ def values(seed: int, failure: str | None = None, error: float = 1.0, **other: A
     result = EpisodeResult(
         spec=EpisodeSpec(**spec),
         instruction="Put it there.",
+        task_id=0,
         target=spec.get("target") or (2, 2),
         color=spec.get("color") or "black",
         steps=20,
+        progress=1.0,
         is_success=failure is None,
         is_success_bomb_v0=failure is None,
         failure=failure,
@@ -91,9 +93,26 @@ def test_all_fields_are_checked() -> None:
     spec_fields = SPEC_CHECKS.keys() | BOMB_LINES.added_spec_fields.keys()
     assert spec_fields == {field.name for field in fields(EpisodeSpec)}
     assert POLICY_CHECKS.keys() == {field.name for field in fields(PolicyIdentity)}
-    for name in values(0):
+    for name in values(0).keys() - BOMB_LINES.added_fields.keys():
         with pytest.raises(ValueError, match=f"{name}" if name != "protocol_version" else "None"):
             parse_line(json.dumps({key: value for key, value in values(0).items() if key != name}).encode())
+
+
+@pytest.mark.parametrize(("name", "value"), [("progress", 1.5), ("progress", None), ("task_id", -1)])
+def test_fields_that_earlier_releases_did_not_write_are_checked_where_they_are(name: str, value: Any) -> None:
+    line = values(0)
+    with pytest.raises(ValueError, match=name):
+        parse_line(json.dumps(line | {name: value}).encode())
+    parse_line(json.dumps({key: of for key, of in line.items() if key != name}).encode())
+
+
+def test_moves_made_are_shown_of_episodes_with_several(path: Path) -> None:
+    several = {"target": None, "color": None, "spec": {"suite": "long"}}
+    path.write_text(row(0, progress=1.0, **several) + row(1, "dropped", progress=0.5, **several))
+    (line,) = [line for line in summarise(read_results(path)).lines() if line.startswith("moves made")]
+    assert "75.0 %" in line
+    path.write_text(row(0))
+    assert not any(line.startswith("moves made") for line in summarise(read_results(path)).lines())
 
 
 def test_a_protocol_version_is_of_one_environment() -> None:

@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 
 from lerobot_bomb.bomb.board import BOARD, TRAY_CENTER_XY, TRAY_HALF_SIZE_XY, Cell
 from lerobot_bomb.bomb.episode import EpisodeSpec
-from lerobot_bomb.bomb.go import is_legal_move, is_legal_position
+from lerobot_bomb.bomb.go import is_legal_position
 from lerobot_bomb.bomb.observation import RenderOptions
 from lerobot_bomb.bomb.suite import find_suite, specs_of_tasks
 from lerobot_bomb.bomb.suites import object as object_suite
@@ -110,7 +110,7 @@ def test_stones_lie_legally_apart_and_within_reach(suite: str, condition: str, s
     episode = sample_episode(EpisodeSpec(seed, suite, perturbations=condition))
     stones, layout = stones_on_board(episode), episode.layout
     assert is_legal_position(stones)
-    assert is_legal_move(stones, episode.target, episode.color)
+    assert episode.allows(stones)
     xy = layout.stone_xy[layout.stone_in_play]
     distances = np.linalg.norm(xy[:, None] - xy[None], axis=-1)[np.triu_indices(len(xy), k=1)]
     assert (distances > 2 * layout.stone_radius_m).all()

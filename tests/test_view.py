@@ -114,7 +114,7 @@ def test_the_scene_shows_stones_trace_and_target(logged: Logged, played: Played)
 
 
 def test_words_say_instruction_stages_and_result(logged: Logged, played: Played) -> None:
-    assert logged["/instruction"][None]["TextDocument:text"] == [played.instruction]
+    assert logged["/instruction"][0]["TextDocument:text"] == [played.instruction]
     stages = [info["stage"] for info in played.infos]
     changes = {k: stage for k, stage in enumerate(stages) if k == 0 or stage != stages[k - 1]}
     assert {step: row["TextLog:text"][0] for step, row in logged["/stage"].items()} == changes
@@ -255,7 +255,7 @@ def test_a_checkpoint_acts_as_in_lerobot_eval(
         ("--policy=oracle", "--policy='oracle' is unknown; choose expert or random, or --policy.path=FOLDER"),
         ("--policy=expert --policy.path=x", "--policy=expert and --policy.path=x: give one of them"),
         ("--policy.device=cpu", "--policy.device=cpu needs a checkpoint"),
-        ("--policy.path=nowhere", "--policy.path=nowhere holds no config.json, so it is no checkpoint"),
+        ("--policy.path=nowhere", "--policy.path=nowhere: there is no such folder"),
         ("--target=[5,0]", "--target=[5, 0] is off the board"),
         ("--target=[0,3] --split=train", "--target=[0, 3] is not in --split=train"),
         ("--color=red", "--color='red' is unknown; choose one of: black, white"),

@@ -84,7 +84,7 @@ class BombEnv(EpisodeEnv[EpisodeSpec, _Run, EpisodeResult]):
     def _begin(self, spec: EpisodeSpec) -> tuple[Observation, dict[str, Any]]:
         episode = sample_episode(spec)
         scene = self._current_run.scene if self._current_run is not None else Scene(self._spec.robot)
-        scene.reset(episode.layout, episode.perturbation.model_edits)
+        scene.reset(episode.layout, episode.perturbation.model_edits, episode.pattern)
         self._now = start = scene.measure()
         dynamics = episode.perturbation.of(Dynamics)
         self._current_run = _Run(
@@ -101,6 +101,7 @@ class BombEnv(EpisodeEnv[EpisodeSpec, _Run, EpisodeResult]):
         run.scene.move(target_xyz, open_fingers, self._num_substeps)
         self._now = run.scene.measure()
         terminated = run.judge.update(self._now)
+        self.task_description = run.episode.instruction_after(run.judge.num_made)
         truncated = not terminated and self._steps >= self._max_episode_steps
         if truncated:
             run.judge.time_out()
@@ -109,20 +110,27 @@ class BombEnv(EpisodeEnv[EpisodeSpec, _Run, EpisodeResult]):
     def _draw_for_people(self, run: _Run) -> np.ndarray:
         """Both cameras, the instruction, how the episode stands."""
         images = [self._draw(camera, PERSON_IMAGE_SIZE) for camera in CAMERAS]
-        row, column = run.episode.target
+        episode = run.episode
         error_mm = run.judge.placement_error_mm
         outcome = f"failed: {run.judge.failure}" if run.judge.failure else f"stage: {run.judge.stage}"
         outcome = "success" if run.judge.is_success else outcome
-        status = f"target row {row}, column {column}   error {error_mm:.0f} mm   {outcome}"
-        return compose_caption(images, [run.episode.instruction, status])
+        if episode.target is not None:
+            row, column = episode.target
+            aim = f"target row {row}, column {column}"
+        else:
+            aim = f"moves {run.judge.num_made} of {len(episode.plans[0])}"
+        status = f"{aim}   error {error_mm:.0f} mm   {outcome}"
+        return compose_caption(images, [self.task_description, status])
 
     def _result(self, run: _Run) -> EpisodeResult:
         episode, judge = run.episode, run.judge
         return EpisodeResult(
             spec=episode.spec,
             instruction=episode.instruction,
+            task_id=episode.task_id,
             target=episode.target,
             color=episode.color,
+            progress=judge.progress,
             steps=self._steps,
             is_success=judge.is_success,
             is_success_bomb_v0=judge.is_success_bomb_v0,
@@ -227,6 +235,7 @@ class BombEnv(EpisodeEnv[EpisodeSpec, _Run, EpisodeResult]):
         return {
             "is_success": judge.is_success,
             "is_success_bomb_v0": judge.is_success_bomb_v0,
+            "progress": judge.progress,
             "placement_error_mm": judge.placement_error_mm,
             "nearest_row": row,
             "nearest_column": column,

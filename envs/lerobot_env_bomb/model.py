@@ -1,9 +1,20 @@
 # pyright: reportAttributeAccessIssue=false, reportInvalidTypeForm=false
 """Builds BOMB's one MjModel: a robot's scene plus board and stones in the sizes of `BOARD`."""
 
+from collections.abc import Mapping
+
 import numpy as np
 
-from lerobot_bomb.bomb.board import BOARD, NUM_STONES, TRAY_CENTER_XY, TRAY_HALF_SIZE_XY
+from lerobot_bomb.bomb.board import (
+    BOARD,
+    NUM_STONES,
+    PATTERN_CENTER_XY,
+    PATTERN_HALF_SIZE_M,
+    PATTERN_PITCH_M,
+    TRAY_CENTER_XY,
+    TRAY_HALF_SIZE_XY,
+    Cell,
+)
 from lerobot_bomb.bomb.perturbations import magnitude
 from lerobot_bomb.conditions import MAX_LEVEL
 from lerobot_env_bomb.robots import Robot
@@ -35,6 +46,11 @@ NUM_GLARE_RINGS = 2  # transparent discs that make a lamp's reflection on the bo
 GLARE_RADIUS_M = 0.055  # of the largest
 GLARE_HEIGHT_M = 2e-4
 GOAL_MARKER_RGB = (0.10, 0.35, 0.95)
+PATTERN_THICKNESS_M = 0.002
+PATTERN_LINE_WIDTH_M = 0.0010
+PATTERN_STONE_HEIGHT_M = 0.0005
+MAX_PATTERN_STONES = 4
+STONE_RGBA = {True: (0.96, 0.96, 0.93, 1.0), False: (0.06, 0.06, 0.07, 1.0)}  # by "is white"
 HIDDEN = 0.0  # opacity of what only a perturbation shows
 
 
@@ -45,6 +61,7 @@ def build_model(robot: Robot) -> mujoco.MjModel:
     _add_tray(spec)
     _add_table_patterns(spec)
     _add_marks(spec)
+    _add_pattern(spec)
     for index in range(NUM_STONES):
         _add_stone(spec, index)
     model = spec.compile()
@@ -64,6 +81,11 @@ def _paint(model: mujoco.MjModel, texture: str, image: np.ndarray) -> None:
 def stone_name(index: int) -> str:
     """Name of body, joint and rim geom of a stone."""
     return f"stone_{index}"
+
+
+def pattern_stone_name(index: int) -> str:
+    """Name of a stone on the small board."""
+    return f"pattern_stone_{index}"
 
 
 def foot_name(index: int, foot: int) -> str:
@@ -197,6 +219,50 @@ def _add_marks(spec: mujoco.MjSpec) -> None:
         radius_m = GLARE_RADIUS_M * (ring + 1) / NUM_GLARE_RINGS
         _add_disc(spec, glare_name(ring), radius_m, surface_m, (1, 1, 1, HIDDEN))
     _add_disc(spec, "goal_marker", STAR_POINT_RADIUS_M, surface_m, (*GOAL_MARKER_RGB, HIDDEN))
+
+
+def _add_pattern(spec: mujoco.MjSpec) -> None:
+    """The small board in the tray, hidden unless an episode shows a pattern on it."""
+    half, height_m = PATTERN_HALF_SIZE_M, BOARD.thickness_m + PATTERN_THICKNESS_M
+    spec.worldbody.add_geom(
+        spec.find_default("visual"),
+        name="pattern_board",
+        type=mujoco.mjtGeom.mjGEOM_BOX,
+        size=[half, half, PATTERN_THICKNESS_M / 2],
+        pos=[*PATTERN_CENTER_XY, height_m - PATTERN_THICKNESS_M / 2],
+        rgba=[*(np.array(WOOD_RGB) / 255), HIDDEN],
+    )
+    middle = (BOARD.num_lines - 1) / 2
+    reach_m = middle * PATTERN_PITCH_M
+    for line in range(BOARD.num_lines):
+        for axis in range(2):
+            center = np.array(PATTERN_CENTER_XY)
+            center[axis] += (line - middle) * PATTERN_PITCH_M
+            size = [reach_m, reach_m, 1e-4]
+            size[axis] = PATTERN_LINE_WIDTH_M / 2
+            spec.worldbody.add_geom(
+                spec.find_default("visual"),
+                name=f"pattern_line_{axis}_{line}",
+                type=mujoco.mjtGeom.mjGEOM_BOX,
+                size=size,
+                pos=[*center, height_m],
+                rgba=[*(np.array(LINE_RGB) / 255), HIDDEN],
+            )
+    for index in range(MAX_PATTERN_STONES):
+        name, radius_m = pattern_stone_name(index), PATTERN_PITCH_M * BOARD.stone_radius_m / BOARD.pitch_m
+        _add_disc(spec, name, 1.4 * radius_m, height_m + PATTERN_STONE_HEIGHT_M, (0, 0, 0, HIDDEN))
+
+
+def show_pattern(model: mujoco.MjModel, stones: Mapping[Cell, str]) -> None:
+    """Show the small board with these stones on it."""
+    for geom in range(model.ngeom):
+        if model.geom(geom).name.startswith(("pattern_board", "pattern_line")):
+            model.geom_rgba[geom, 3] = 1.0
+    for index, (cell, color) in enumerate(stones.items()):
+        geom = model.geom(pattern_stone_name(index))
+        offset = BOARD.intersection_xy(*cell) * PATTERN_PITCH_M / BOARD.pitch_m
+        geom.pos[:2] = np.array(PATTERN_CENTER_XY) + offset
+        geom.rgba[:] = STONE_RGBA[color == "white"]
 
 
 def _add_disc(spec: mujoco.MjSpec, name: str, radius_m: float, height_m: float, rgba: tuple) -> None:

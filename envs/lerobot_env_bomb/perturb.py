@@ -1,6 +1,6 @@
 """Draws an episode under its condition: one frozen transform per axis that is on."""
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 from lerobot_bomb.bomb.episode import EpisodeSpec
 from lerobot_bomb.bomb.layout import Layout
@@ -40,7 +40,10 @@ def sample_episode(spec: EpisodeSpec) -> PerturbedEpisode:
     nominal = find_suite(spec.suite).sample(spec)
     perturbation = draw_perturbation(nominal)
     changed = {
-        "instruction": perturbation.reword(nominal.instruction, nominal),
+        "turns": tuple(
+            replace(turn, instruction=perturbation.reword(turn.instruction, replace(nominal, turns=(turn,))))
+            for turn in nominal.turns
+        ),
         "layout": perturbation.arrange(nominal.layout, nominal.supply),
     }
     return PerturbedEpisode(**{**vars(nominal), **changed}, perturbation=perturbation)

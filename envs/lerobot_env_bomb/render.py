@@ -15,7 +15,8 @@ from lerobot_bomb.bomb.observation import RenderOptions
 from lerobot_env_mujoco.mujoco_gl import mujoco
 
 SHADOW_MAP_SIZE = 512  # pixels
-CAPTION_LINE_PX = 26
+CAPTION_LINE_PX, CAPTION_MARGIN_PX = 26, 10
+CAPTION_SCALE = 0.55  # of the typeface
 CAPTION_BACKGROUND = 40  # grey level
 
 _drawing_process: int | None = None  # the one that made the first OpenGL context; forks inherit the number
@@ -158,12 +159,15 @@ def extrinsics(data: mujoco.MjData, camera: str) -> np.ndarray:
 
 
 def compose_caption(images: list[np.ndarray], lines: list[str]) -> np.ndarray:
-    """(H, W, 3) uint8: images of equal size side by side over a bar of text lines."""
+    """(H, W, 3) uint8: images of equal size side by side over a bar of text, smaller where a line is long."""
     import cv2  # only people's images need it, and it is slow to import
 
     row = np.concatenate(images, axis=1)
     bar = np.full((CAPTION_LINE_PX * len(lines) + 8, row.shape[1], 3), CAPTION_BACKGROUND, dtype=np.uint8)
     for i, line in enumerate(lines):
-        origin = (10, CAPTION_LINE_PX * (i + 1) - 4)
-        cv2.putText(bar, line, origin, cv2.FONT_HERSHEY_SIMPLEX, 0.55, (255, 255, 255), 1, cv2.LINE_AA)
+        origin = (CAPTION_MARGIN_PX, CAPTION_LINE_PX * (i + 1) - 4)
+        scale, width = CAPTION_SCALE, row.shape[1] - 2 * CAPTION_MARGIN_PX
+        while cv2.getTextSize(line, cv2.FONT_HERSHEY_SIMPLEX, scale, 1)[0][0] > width:
+            scale -= 0.01
+        cv2.putText(bar, line, origin, cv2.FONT_HERSHEY_SIMPLEX, scale, (255, 255, 255), 1, cv2.LINE_AA)
     return np.concatenate([row, bar])

@@ -1,14 +1,22 @@
 # pyright: reportAttributeAccessIssue=false, reportInvalidTypeForm=false
 """Runs BOMB's model: put an episode's layout on the table, move the gripper, measure."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 
 import numpy as np
 
-from lerobot_bomb.bomb.board import NUM_STONES
+from lerobot_bomb.bomb.board import NUM_STONES, Cell
 from lerobot_bomb.bomb.layout import Layout, Snapshot
 from lerobot_bomb.bomb.observation import WORKSPACE_HIGH_M, WORKSPACE_LOW_M
-from lerobot_env_bomb.model import NUM_FEET, build_model, foot_name, parked_xyz, stone_name
+from lerobot_env_bomb.model import (
+    NUM_FEET,
+    STONE_RGBA,
+    build_model,
+    foot_name,
+    parked_xyz,
+    show_pattern,
+    stone_name,
+)
 from lerobot_env_bomb.robots import ROBOTS
 from lerobot_env_mujoco.mujoco_gl import mujoco
 
@@ -17,7 +25,6 @@ WORKSPACE_HIGH = np.array(WORKSPACE_HIGH_M)
 
 TRAVEL_SHARE = 0.7  # of a control step in which the command travels; the rest lets the arm settle
 
-STONE_RGBA = {True: (0.96, 0.96, 0.93, 1.0), False: (0.06, 0.06, 0.07, 1.0)}  # by "is white"
 HIDDEN_RGBA = (0.0, 0.0, 0.0, 0.0)
 
 type ModelEdit = Callable[[mujoco.MjModel], None]
@@ -54,12 +61,19 @@ class Scene:
         arrays = [getattr(self.model, name) for name in EDITABLE] + [headlight.ambient, headlight.diffuse]
         self._nominal = [(array, array.copy()) for array in arrays]
 
-    def reset(self, layout: Layout, edits: Sequence[ModelEdit] = ()) -> None:
-        """Start from the layout, at rest, with the fingers open, in a model with these edits only."""
+    def reset(
+        self, layout: Layout, edits: Sequence[ModelEdit] = (), pattern: Mapping[Cell, str] | None = None
+    ) -> None:
+        """Start from the layout, at rest, with the fingers open, in a model with these edits only.
+
+        `pattern`: what the small board in the tray shows; there is none without.
+        """
         mujoco.mj_resetData(self.model, self.data)
         for array, nominal in self._nominal:
             array[...] = nominal
         self._show_stones(layout)
+        if pattern:
+            show_pattern(self.model, pattern)
         for edit in edits:
             edit(self.model)
         for i, adr in enumerate(self._stone_qpos):

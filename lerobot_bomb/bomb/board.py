@@ -9,6 +9,10 @@ COLORS = ("black", "white")
 Cell = tuple[int, int]  # row, column of an intersection
 TRAY_CENTER_XY = (0.170, 0.0)  # metres; the tray beside the board from which stones are taken
 TRAY_HALF_SIZE_XY = (0.045, 0.125)  # metres; it touches the board
+# the small board that shows a pattern, at the tray's near end, where the arm does not hide it at the start
+PATTERN_CENTER_XY = (0.170, -0.090)  # metres
+PATTERN_PITCH_M = 0.012
+PATTERN_HALF_SIZE_M = 0.032
 NUM_STONES = 12  # stones in the compiled model: on the board, to be moved, or parked out of sight
 
 

@@ -47,6 +47,7 @@ class Failure(StrEnum):
     IMPRECISE = "imprecise"
     DISTURBED_OTHERS = "disturbed_others"
     TIMEOUT_HOLDING = "timeout_holding"
+    LIFTED = "lifted"
 
 
 def check_seed(seed: int) -> None:

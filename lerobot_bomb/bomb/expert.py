@@ -1,16 +1,19 @@
-"""A scripted expert, which moves one stone: memoryless and free of pauses, so that it can be imitated.
+"""A scripted expert, which moves stones one by one: memoryless, free of pauses, so that it can be imitated.
 
 Its action is a continuous function of what an observation shows: gripper, measured finger opening,
 stones, target. It keeps no phase and no counter, and never reads `PrivilegedState.stage`.
 """
 
 from dataclasses import replace
+from functools import reduce
+from itertools import pairwise
+from operator import add
 
 import numpy as np
 
 from lerobot_bomb.bomb.episode import DEFAULT_FPS
 from lerobot_bomb.bomb.observation import MAX_STEP_M, WORKSPACE_HIGH_M, WORKSPACE_LOW_M
-from lerobot_bomb.bomb.privileged_state import PrivilegedState
+from lerobot_bomb.bomb.privileged_state import Goal, PrivilegedState
 
 SPEED_M_S = 0.30  # at most, along each of the horizontal plane and the vertical
 GAIN = 0.75  # share of the remaining way that a step of 0.1 s covers near its goal
@@ -43,20 +46,58 @@ CLEARANCE_M = (0.006, 0.013)  # stone's height: creep sideways .. full speed
 CREEP_M = 0.004  # per step of 0.1 s
 RELEASE_LATERAL_M = (0.0040, 0.0070)  # a stone this near is in place: in closed .. in open fingers
 RELEASE_HEIGHT_M = (0.0025, 0.0040)
+SLIDE_M = 0.006  # per step of 0.1 s, of a stone that stays on the board
+
+# Several stones: one is done with, and the next one's turn, when it lies within these of its place ..
+REACHED_LATERAL_M = (0.006, 0.009)
+REACHED_HEIGHT_M = (0.0030, 0.0050)
+# .. and the fingers are this far above its grasp, or beside it
+OFF_ABOVE_M = (0.008, 0.016)
+OFF_BESIDE_M = (0.022, 0.032)
 
 
 def expert_action(state: PrivilegedState) -> np.ndarray:
-    """(4,) float32 action that brings the stone to the target, as the state's environment reads it.
+    """(4,) float32 action that brings each goal's stone to its place, as the state's environment reads it.
 
     Relative: units of `MAX_STEP_M`, within [-1, 1]; absolute: metres within the workspace.
     """
-    state = _anticipate(state)
-    motion_m, gripper = _plan(state, DEFAULT_FPS / state.fps)
+    tempo = DEFAULT_FPS / state.fps
+    motions_m, grippers = [], []
+    for goal, share in _shares(state):
+        motion_m, gripper = _plan(_anticipate(replace(state, goals=(goal,))), tempo)
+        motions_m.append(share * motion_m)
+        grippers.append(share * gripper)
+    motion_m, gripper = reduce(add, motions_m), reduce(add, grippers)
     if state.control_mode == "absolute":
-        xyz = np.clip(state.gripper_xyz + motion_m, WORKSPACE_LOW_M, WORKSPACE_HIGH_M)
+        gripper_xyz = state.gripper_xyz + state.pending_motion_m
+        xyz = np.clip(gripper_xyz + motion_m, WORKSPACE_LOW_M, WORKSPACE_HIGH_M)
     else:
         xyz = np.clip(motion_m / MAX_STEP_M, -1, 1)
     return np.array([*xyz, gripper], dtype=np.float32)
+
+
+def _shares(state: PrivilegedState) -> list[tuple[Goal, float]]:
+    """The goals that an action is for, with their shares of it: the one after the last that is reached.
+
+    While the fingers leave a stone that they have put down, both it and the next one have a share.
+    """
+    shares, left = [], 1.0
+    for before, goal in reversed(list(pairwise(state.goals))):
+        if (reached := _reached(state, before)) > 0:
+            shares.append((goal, left * reached))
+            left *= 1 - reached
+    return [*shares, (state.goals[0], left)] if left > 0 else shares
+
+
+def _reached(state: PrivilegedState, goal: Goal) -> float:
+    """How far the goal's stone lies on its place and the fingers are off it, in [0, 1]."""
+    stone_xyz = state.stone_xyz[goal.stone]
+    lateral_m = float(np.linalg.norm((goal.xyz - stone_xyz)[:2]))
+    height_m = abs(float(stone_xyz[2] - goal.xyz[2]))
+    lies = (1 - _ramp(lateral_m, *REACHED_LATERAL_M)) * (1 - _ramp(height_m, *REACHED_HEIGHT_M))
+    above_m = float(state.gripper_xyz[2]) - _grasp_z(stone_xyz)
+    beside_m = float(np.linalg.norm((state.gripper_xyz - stone_xyz)[:2]))
+    return lies * max(_ramp(above_m, *OFF_ABOVE_M), _ramp(beside_m, *OFF_BESIDE_M))
 
 
 def _anticipate(state: PrivilegedState) -> PrivilegedState:
@@ -77,7 +118,8 @@ def _plan(state: PrivilegedState, tempo: float) -> tuple[np.ndarray, float]:
     is_placed = _placed(state, stone_xyz)
     is_held = _held(state, stone_xyz)
     approach_m, approach_gripper = _approach(state, stone_xyz, tempo)
-    carry_m = _carry(state, stone_xyz, tempo)
+    carry = _slide if state.goals[0].is_slid else _carry
+    carry_m = carry(state, stone_xyz, tempo)
     retreat_m = _retreat(state, tempo)
     motion_m = is_placed * retreat_m + (1 - is_placed) * (is_held * carry_m + (1 - is_held) * approach_m)
     gripper = is_placed + (1 - is_placed) * ((1 - is_held) * approach_gripper - is_held)
@@ -122,7 +164,7 @@ def _enclosed(state: PrivilegedState, stone_xyz: np.ndarray) -> float:
 
 def _approach(state: PrivilegedState, stone_xyz: np.ndarray, tempo: float) -> tuple[np.ndarray, float]:
     """Displacement and gripper command that bring open fingers around the stone and close them."""
-    grasp_z = max(stone_xyz[2] - GRASP_DEPTH_M, FLOOR_M)
+    grasp_z = _grasp_z(stone_xyz)
     offset_xy = (stone_xyz - state.gripper_xyz)[:2]
     lateral_m = float(np.linalg.norm(offset_xy))
     above_m = state.gripper_xyz[2] - grasp_z
@@ -152,10 +194,21 @@ def _carry(state: PrivilegedState, stone_xyz: np.ndarray, tempo: float) -> np.nd
     return _step(offset_xy, funnel_m - PRESS_M - height_m, freedom, tempo)
 
 
+def _slide(state: PrivilegedState, stone_xyz: np.ndarray, tempo: float) -> np.ndarray:
+    """Displacement (3,) that draws the stone between the pads along the board to the target."""
+    offset = state.goals[0].xyz - stone_xyz
+    return _step(offset[:2], float(offset[2]), SLIDE_M / (SPEED_M_S / DEFAULT_FPS), tempo)
+
+
 def _retreat(state: PrivilegedState, tempo: float) -> np.ndarray:
     """Displacement (3,) straight up, as soon as the fingers are clear of the stone."""
     rise_m = max(0.0, RETREAT_HEIGHT_M - state.gripper_xyz[2]) * _openness(state, OPEN_SHARE)
     return _step(np.zeros(2), rise_m, 1.0, tempo)
+
+
+def _grasp_z(stone_xyz: np.ndarray) -> float:
+    """Height in metres of the gripper that grasps the stone."""
+    return max(float(stone_xyz[2]) - GRASP_DEPTH_M, FLOOR_M)
 
 
 def _step(offset_xy: np.ndarray, rise_m: float, freedom: float, tempo: float) -> np.ndarray:

@@ -1,15 +1,17 @@
-"""Follows an episode and says how it stands and how it ended: one stone onto one intersection."""
+"""Follows an episode and says how it stands and how it ended: stones to the places that a plan names."""
 
 import math
+from collections.abc import Iterator
 
 import numpy as np
 
 from lerobot_bomb.bomb.board import BOARD, NUM_STONES
 from lerobot_bomb.bomb.episode import Failure, Stage
 from lerobot_bomb.bomb.layout import Snapshot
+from lerobot_bomb.bomb.move import TRAY, Move, Place, Plan, distance_m
 from lerobot_bomb.bomb.suite import Episode
 
-REST_S = 0.5  # a stone that was carried and then rests this long ends the episode
+REST_S = 0.5  # a stone that was carried and then rests this long has been put down
 REST_SPEED_M_S = 0.005  # below it a stone rests
 LIFT_M = 0.010  # above its resting height a held stone counts as lifted
 FLAT_TOLERANCE_M = 0.003  # of the height at rest; a stone that leans or lies on another one is higher
@@ -19,11 +21,19 @@ COLLATERAL_TOLERANCE_MM = 10.0
 V0_TOLERANCE_MM = 26.0  # of the original benchmark's rule
 
 
+# moves that have been made: {number in the plan: (stone, place)}
+type Made = dict[int, tuple[int, Place]]
+
+
 class Judge:
     """State of one episode, updated with a snapshot after every control step.
 
-    Success: the commanded stone, no longer touched and at rest for `REST_S`, lies flat on the target
-    intersection within the spec's tolerance, and no other stone was moved by more than 10 mm.
+    A stone that was carried is put down once it is no longer touched and has been at rest for `REST_S`. Then
+    it must lie flat at a place of a move that is open: on an intersection within the spec's tolerance, or
+    anywhere in the tray. Plans that have no such move are given up; the episode fails when none is left.
+
+    Success: all moves of a plan have been made, and no stone but those of open moves was moved by more than
+    10 mm from where it stood or was put down.
     """
 
     def __init__(self, episode: Episode, fps: int, start: Snapshot):
@@ -33,22 +43,35 @@ class Judge:
         self.is_success_bomb_v0 = False
         self.collateral_mm = 0.0
         self._episode = episode
-        self._stone = episode.stone
         self._fps = fps
-        self._start = start
+        self._plans: list[tuple[Plan, Made]] = [(plan, {}) for plan in episode.plans]
+        self._is_complete = False  # the last move has been made, which the plans still lack
+        self._stone = episode.stone  # the one that is moved, or is to be moved next
+        self._movable = self._find_movable()
+        self._left_xyz = start.stone_xyz.copy()  # where each stone stood or was put down
         self._now = start
         self._was_lifted: np.ndarray = np.zeros(NUM_STONES, dtype=bool)
         self._last_touched_z = start.stone_xyz[:, 2].copy()
         self._rest_steps = np.zeros(NUM_STONES, dtype=int)
 
     @property
+    def num_made(self) -> int:
+        """Moves that have been made."""
+        return max(len(made) for _, made in self._plans) + self._is_complete
+
+    @property
+    def progress(self) -> float:
+        """Share of the moves that have been made."""
+        return self.num_made / len(self._plans[0][0])
+
+    @property
     def placement_error_mm(self) -> float:
-        """Horizontal distance of the commanded stone from the target."""
-        return 1e3 * float(np.linalg.norm((self._now.stone_xyz[self._stone] - self._episode.target_xyz)[:2]))
+        """Horizontal distance of the stone that is moved from the nearest of its places."""
+        return 1e3 * min(distance_m(self._now.stone_xyz[self._stone, :2], place) for place in self._places())
 
     @property
     def nearest_intersection(self) -> tuple[int, int]:
-        """(row, column) of the intersection nearest to the commanded stone."""
+        """(row, column) of the intersection nearest to the stone that is moved."""
         return BOARD.nearest_intersection(self._now.stone_xyz[self._stone, :2])
 
     def update(self, now: Snapshot) -> bool:
@@ -62,31 +85,67 @@ class Judge:
         self._was_lifted = self._was_lifted | (held & is_high)
         self._last_touched_z[touched] = now.stone_xyz[touched, 2]
         self._now = now
-        moved_mm = 1e3 * np.linalg.norm(now.stone_xyz - self._start.stone_xyz, axis=1)
-        self.collateral_mm = max(self.collateral_mm, float(np.delete(moved_mm, self._stone).max()))
+        self._follow(touched, held)
+        moved_mm = 1e3 * np.linalg.norm(now.stone_xyz - self._left_xyz, axis=1)
+        others_mm = np.delete(moved_mm, list(self._movable))
+        self.collateral_mm = max(self.collateral_mm, float(others_mm.max(initial=0.0)))
         self._update_stage(bool(held[self._stone]))
 
         carried = self._was_lifted.copy()
-        # a stone that was pushed, not carried, onto the target lies on the target all the same
-        carried[self._stone] |= self._is_on_target()
+        # a stone that was pushed, not carried, to its place lies there all the same
+        for stone in self._movable:
+            carried[stone] |= self._is_flat(stone) and bool(self._fitting(stone))
         ended = carried & (self._rest_steps >= math.ceil(REST_S * self._fps))
-        if ended[self._stone]:
-            self._judge_placement()
-        elif ended.any():
+        for stone in sorted(self._movable):
+            if ended[stone]:
+                return self._judge_placement(stone)
+        if ended.any():
             self.failure = Failure.WRONG_STONE
         return bool(ended.any())
 
     def time_out(self) -> None:
         """Say why the episode, which has not ended by itself, failed."""
         touched = self._now.stone_touched[self._stone]
-        if self._was_lifted.any() and not self._was_lifted[self._stone]:
+        was_lifted = bool(self._was_lifted[self._stone])
+        if self._was_lifted.any() and not was_lifted:
             self.failure = Failure.WRONG_STONE
         elif self.stage is Stage.START:
             self.failure = Failure.NEVER_REACHED
-        elif touched.all() or (self._was_lifted[self._stone] and (touched.any() or self._is_on_target())):
+        elif touched.all() or (was_lifted and (touched.any() or self._is_at_place(self._stone))):
             self.failure = Failure.TIMEOUT_HOLDING
         else:
-            self.failure = Failure.DROPPED if self._was_lifted[self._stone] else Failure.MISSED_GRASP
+            self.failure = Failure.DROPPED if was_lifted else Failure.MISSED_GRASP
+
+    def _open_moves(self, plan: Plan, made: Made) -> Iterator[tuple[int, Move]]:
+        for number, move in enumerate(plan):
+            if number not in made and move.after <= made.keys():
+                yield number, move
+
+    def _find_movable(self) -> set[int]:
+        """Stones of open moves."""
+        return {
+            stone
+            for plan, made in self._plans
+            for _, move in self._open_moves(plan, made)
+            for stone in _stones_left(move, made)
+        }
+
+    def _places(self) -> set[Place]:
+        """To which the followed stone may come."""
+        return {
+            place
+            for plan, made in self._plans
+            for _, move in self._open_moves(plan, made)
+            if self._stone in _stones_left(move, made)
+            for place in _places_left(move, made)
+        }
+
+    def _follow(self, touched: np.ndarray, held: np.ndarray) -> None:
+        """Of several stones that may be moved, the one that is held or touched is."""
+        if len(self._movable) > 1:
+            gripped = sorted(self._movable, key=lambda stone: (not held[stone], not touched[stone]))
+            if touched[gripped[0]] and not touched[self._stone]:
+                self._stone = gripped[0]
 
     def _update_stage(self, is_held: bool) -> None:
         offset = self._now.gripper_xyz - self._now.stone_xyz[self._stone]
@@ -103,31 +162,86 @@ class Judge:
             if is_reached and order.index(stage) > order.index(self.stage):
                 self.stage = stage
 
-    def _is_flat(self) -> bool:
-        return bool(
-            abs(self._now.stone_xyz[self._stone, 2] - self._episode.layout.rest_height_m) < FLAT_TOLERANCE_M
-        )
+    def _is_flat(self, stone: int) -> bool:
+        height_m = self._now.stone_xyz[stone, 2] - self._episode.layout.rest_height_m
+        return bool(abs(height_m) < FLAT_TOLERANCE_M)
 
-    def _is_on_target(self) -> bool:
-        return bool(self._is_flat() and self.placement_error_mm <= self._episode.spec.success_tolerance_mm)
+    def _is_at(self, stone: int, place: Place) -> bool:
+        tolerance_mm = 0.0 if place == TRAY else self._episode.spec.success_tolerance_mm
+        return 1e3 * distance_m(self._now.stone_xyz[stone, :2], place) <= tolerance_mm
 
-    def _judge_placement(self) -> None:
-        is_target = self.nearest_intersection == self._episode.target
+    def _is_at_place(self, stone: int) -> bool:
+        return self._is_flat(stone) and bool(self._fitting(stone))
+
+    def _fitting(self, stone: int) -> list[tuple[Plan, Made]]:
+        """The plans that lack, with where this stone lies, one move less."""
+        fitting = []
+        for plan, made in self._plans:
+            for number, move in self._open_moves(plan, made):
+                if stone in _stones_left(move, made):
+                    there = [place for place in _places_left(move, made) if self._is_at(stone, place)]
+                    if there:
+                        fitting.append((plan, {**made, number: (stone, there[0])}))
+                        break
+        return fitting
+
+    def _judge_placement(self, stone: int) -> bool:
+        """Take in that a stone has been put down; whether the episode has ended."""
+        self._stone = stone
+        is_place = self.nearest_intersection in self._places()
         is_near = self.placement_error_mm <= V0_TOLERANCE_MM
-        self.is_success_bomb_v0 = is_target and self._is_flat() and is_near
-        if self._is_on_target():
+        if self._episode.target is not None:
+            self.is_success_bomb_v0 = is_place and self._is_flat(stone) and is_near
+        if self._was_lifted[stone] and self._must_be_slid(stone):
+            self.failure = Failure.LIFTED
+        elif self._is_at_place(stone):
+            return self._take_move(stone)
+        elif self._was_dropped(stone):
+            self.failure = Failure.DROPPED
+        else:
+            self.failure = Failure.IMPRECISE if is_place else Failure.WRONG_INTERSECTION
+        return True
+
+    def _take_move(self, stone: int) -> bool:
+        """A move has been made; whether it was the last."""
+        fitting = self._fitting(stone)
+        self._is_complete = any(len(made) == len(plan) for plan, made in fitting)
+        if self._is_complete:
             self.stage = Stage.PLACED
             self.is_success = self.collateral_mm <= COLLATERAL_TOLERANCE_MM
             self.failure = None if self.is_success else Failure.DISTURBED_OTHERS
-        elif self._was_dropped():
-            self.failure = Failure.DROPPED
-        else:
-            self.failure = Failure.IMPRECISE if is_target else Failure.WRONG_INTERSECTION
+            return True
+        self._plans = fitting
+        self._was_lifted[stone] = False
+        self._left_xyz[stone] = self._now.stone_xyz[stone]
+        self._rest_steps[stone] = 0
+        self._movable = self._find_movable()
+        if self._stone not in self._movable:
+            self._stone = min(self._movable)
+        return False
 
-    def _was_dropped(self) -> bool:
-        xy = self._now.stone_xyz[self._stone, :2]
-        off_m = np.linalg.norm(xy - BOARD.intersection_xy(*self.nearest_intersection))
+    def _must_be_slid(self, stone: int) -> bool:
+        return all(
+            move.is_slid
+            for plan, made in self._plans
+            for _, move in self._open_moves(plan, made)
+            if stone in _stones_left(move, made)
+        )
+
+    def _was_dropped(self, stone: int) -> bool:
+        xy = self._now.stone_xyz[stone, :2]
+        off_m = np.linalg.norm(xy - BOARD.intersection_xy(*BOARD.nearest_intersection(xy)))
         return bool(
             off_m > OFF_BOARD_M
-            or self._last_touched_z[self._stone] > self._episode.layout.rest_height_m + DROP_HEIGHT_M
+            or self._last_touched_z[stone] > self._episode.layout.rest_height_m + DROP_HEIGHT_M
         )
+
+
+def _stones_left(move: Move, made: Made) -> frozenset[int]:
+    """Those that may make a move."""
+    return move.stones if len(move.stones) == 1 else move.stones - {stone for stone, _ in made.values()}
+
+
+def _places_left(move: Move, made: Made) -> frozenset[Place]:
+    """Those that no move has put a stone on."""
+    return move.places - {place for _, place in made.values() if place != TRAY}

@@ -16,6 +16,7 @@ class Goal:
 
     xyz: np.ndarray  # (3,) metres, centre of the stone at rest there
     stone: int  # its index
+    is_slid: bool = False  # along the board, without being lifted
 
     DIM = 4
 
@@ -96,11 +97,17 @@ def _choice(name: str, choices: tuple[str, ...]) -> _Part:
 
 
 def _encode_goals(state: PrivilegedState) -> list[float]:
-    return [number for goal in state.goals for number in (*goal.xyz, goal.stone)]
+    """Four numbers each: the place, and the stone's index, to which NUM_STONES is added if it is slid."""
+    return [number for goal in state.goals for number in (*goal.xyz, goal.stone + NUM_STONES * goal.is_slid)]
 
 
 def _decode_goals(numbers: np.ndarray) -> dict[str, Any]:
-    return {"goals": tuple(Goal(row[:3], int(row[3])) for row in numbers.reshape(-1, Goal.DIM))}
+    return {
+        "goals": tuple(
+            Goal(row[:3], int(row[3]) % NUM_STONES, row[3] >= NUM_STONES)
+            for row in numbers.reshape(-1, Goal.DIM)
+        )
+    }
 
 
 def _encode_stones(state: PrivilegedState) -> np.ndarray:

@@ -6,11 +6,21 @@ from importlib import import_module
 
 import numpy as np
 
-from lerobot_bomb.bomb.board import BOARD, COLORS, Cell
+from lerobot_bomb.bomb.board import COLORS, Cell
 from lerobot_bomb.bomb.episode import EpisodeSpec
 from lerobot_bomb.bomb.go import is_legal_move
 from lerobot_bomb.bomb.layout import Layout
+from lerobot_bomb.bomb.move import Aim, Plan
 from lerobot_bomb.bomb.privileged_state import Goal
+
+
+@dataclass(frozen=True)
+class Turn:
+    """What is said once so many moves have been made."""
+
+    instruction: str
+    # what stands for the stone, the place or the command in the suite's templates and forms
+    words: Mapping[str, str] = field(default_factory=dict)
 
 
 @dataclass(frozen=True)
@@ -19,35 +29,47 @@ class Episode:
 
     spec: EpisodeSpec
     task_id: int  # which of the suite's numbered tasks it is of
-    target: Cell
-    color: str
-    instruction: str
+    turns: tuple[Turn, ...]  # one, or one for each move
     opening: Mapping[Cell, str]  # colours of the stones that stand on the board
     layout: Layout
-    stone: int  # index of the stone to be moved
     supply: tuple[int, ...]  # indices of the stones that lie in the tray
-    # what stands for the stone and the place in the suite's templates and forms, beside coordinates
-    words: Mapping[str, str] = field(default_factory=dict)
-    # whether the instruction still means this stone and this target with these stones on the board
+    plans: tuple[Plan, ...]  # any one of which fulfils the instruction
+    aims: tuple[Aim, ...]  # of the expert, in its order
+    target: Cell | None = None  # where there is one move to one intersection
+    color: str | None = None  # of the stone, where it is moved from the tray to the target
+    # whether the instruction still means these plans with these stones on the board
     is_clear: Callable[[Mapping[Cell, str]], bool] = lambda stones: True
     extra_colors: tuple[str, ...] = COLORS  # of stones that may join the opening
-    gripper_is_named: bool = (
-        False  # in the instruction, which must stay true where the gripper starts elsewhere
-    )
+    # whether the instruction names the gripper: it must stay true where the gripper starts elsewhere
+    gripper_is_named: bool = False
+    pattern: Mapping[Cell, str] = field(default_factory=dict)  # what the small board in the tray shows
+
+    @property
+    def instruction(self) -> str:
+        """What is said at the start."""
+        return self.turns[0].instruction
+
+    def instruction_after(self, num_moves: int) -> str:
+        """What is said once so many moves have been made."""
+        return self.turns[min(num_moves, len(self.turns) - 1)].instruction
 
     def allows(self, stones: Mapping[Cell, str]) -> bool:
         """Whether the move is legal, and the instruction clear, with these stones on the board."""
-        return is_legal_move(dict(stones), self.target, self.color) and self.is_clear(stones)
+        if self.target is not None and self.color is not None:
+            return is_legal_move(dict(stones), self.target, self.color) and self.is_clear(stones)
+        return self.is_clear(stones)
+
+    @property
+    def stone(self) -> int:
+        """Index of the stone that is moved first."""
+        return self.aims[0].stone
 
     @property
     def goals(self) -> tuple[Goal, ...]:
-        """What the expert aims at."""
-        return (Goal(self.target_xyz, self.stone),)
-
-    @property
-    def target_xyz(self) -> np.ndarray:
-        """(3,) metres, centre of a stone that rests on the target."""
-        return np.array([*BOARD.intersection_xy(*self.target), self.layout.rest_height_m])
+        """What the expert aims at: `Suite.num_goals`, the last one again where there are fewer."""
+        height_m = self.layout.rest_height_m
+        goals = tuple(Goal(np.array([*aim.xy, height_m]), aim.stone, aim.is_slid) for aim in self.aims)
+        return goals + goals[-1:] * (find_suite(self.spec.suite).num_goals - len(goals))
 
 
 @dataclass(frozen=True)
@@ -60,12 +82,12 @@ class Suite:
     sample: Callable[[EpisodeSpec], Episode]  # the same spec, the same episode, without perturbations
     check: Callable[[EpisodeSpec], None]
     max_steps: int  # at DEFAULT_FPS; scaled with fps
-    # form of the language axis -> its templates, of `Episode.words` and coordinates
+    # form of the language axis -> its templates, of `Turn.words` and coordinates
     forms: tuple[tuple[str, ...], ...]
     num_tasks: int
     # a numbered task's spec
     of_task: Callable[[EpisodeSpec, int], EpisodeSpec] = lambda spec, task_id: replace(spec, task_id=task_id)
-    num_goals: int = 1  # of each of its episodes
+    num_goals: int = 1  # of the expert, at most
 
 
 def find_suite(name: str) -> Suite:

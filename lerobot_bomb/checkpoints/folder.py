@@ -31,6 +31,8 @@ def read_config(path: Path, device: str | None) -> PreTrainedConfig:
     Raises:
         ValueError: the folder holds no checkpoint, or this machine has no such device.
     """
+    if not path.is_dir():
+        raise ValueError(f"--policy.path={path}: there is no such folder; give one that holds a checkpoint")
     missing = [name for name in FILES if not (path / name).is_file()]
     if missing:
         raise ValueError(

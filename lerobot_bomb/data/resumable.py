@@ -201,14 +201,18 @@ def check_folders(parameters: Parameters, root: Path, folder: Path, resume: bool
                 if {path.name for path in folder.iterdir()} - {LOCK_FILE}:
                     raise ValueError(f"{folder} holds an unfinished {kind}; go on with --resume or delete it")
     elif not root.exists() and not folder.exists():
-        raise ValueError(f"--resume: there is no {kind} to go on with in --root={root}")
+        raise ValueError(
+            f"--resume: there is no {kind} to go on with in --root={root}; begin it without --resume"
+        )
     elif root.exists() and not (root / METADATA_FILE).exists():
         raise ValueError(f"--resume: --root={root} holds no {METADATA_FILE}, so it is no {kind}")
     else:
-        _check_same(parameters, root / METADATA_FILE if root.exists() else parameters_file(folder))
+        path = root / METADATA_FILE if root.exists() else parameters_file(folder)
+        _check_same(parameters, path, root if root.exists() else folder)
 
 
-def _check_same(parameters: Parameters, path: Path) -> None:
+def _check_same(parameters: Parameters, path: Path, where: Path) -> None:
+    """Refuse to go on `where` the parameters in a file are others."""
     kind = parameters.kind
     if not path.exists():
         if {other.name for other in path.parent.iterdir()} - {LOCK_FILE, path.with_suffix(".tmp").name}:
@@ -228,7 +232,7 @@ def _check_same(parameters: Parameters, path: Path) -> None:
     ]
     if differences:
         raise ValueError(
-            f"--resume: the {kind} in {path.parent} differs in {', '.join(differences)}; give the flags that "
+            f"--resume: the {kind} in {where} differs in {', '.join(differences)}; give the flags that "
             f"it was begun with, or another --root"
         )
 

@@ -50,15 +50,15 @@ def _frame(rollout: Rollout, step: int) -> dict[str, Any]:
         **{f"{OBS_PREFIX}{key}": values[step] for key, values in rollout.geometry.items()},
         OBS_STATE: rollout.states[step],
         ACTION: rollout.actions[step],
-        "task": rollout.result.instruction,
+        "task": rollout.instructions[step],
     }
 
 
 def _columns(result: EpisodeResult) -> dict[str, Any]:
     return {
         "bomb/seed": result.spec.seed,
-        "bomb/target": list(result.target),
-        "bomb/color": result.color,
+        "bomb/target": list(result.target or ()),
+        "bomb/color": result.color or "",
         "bomb/levels": json.dumps(result.levels),
         "bomb/spec": json.dumps(result.spec.to_dict()),
         "bomb/protocol_version": TASK_VERSION,

@@ -41,6 +41,7 @@ class Rollout:
     result: EpisodeResult
     states: np.ndarray  # (T, 4) float32, metres
     actions: np.ndarray  # (T, 4) float32, the expert's clean actions
+    instructions: list[str]  # T, of each step
     frames: dict[str, np.ndarray]  # camera -> (T, H, W, 3) uint8
     geometry: dict[str, np.ndarray]  # key of `geometry_shapes` -> (T, ...) float32; {} without depth
 
@@ -61,12 +62,13 @@ def collect(env: gymnasium.Env, spec: EpisodeSpec, settings: RolloutSettings) ->
     )
     result = env.get_wrapper_attr("episode_result")()
     if not result.is_success:
-        return Rollout(result, np.empty((0, 4), np.float32), np.empty((0, 4), np.float32), {}, {})
+        return Rollout(result, np.empty((0, 4), np.float32), np.empty((0, 4), np.float32), [], {}, {})
     observations = [moment.observation for moment in moments[:-1]]
     return Rollout(
         result=result,
         states=np.stack([observation[AGENT_POS] for observation in observations]),
         actions=np.stack([moment.action for moment in moments if moment.action is not None]),
+        instructions=[moment.instruction for moment in moments[:-1]],
         frames={camera: np.stack([o[PIXELS][camera] for o in observations]) for camera in CAMERAS},
         geometry={
             key: np.stack([o[key] for o in observations]) for key in geometry_shapes(settings.render_options)

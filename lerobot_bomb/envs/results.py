@@ -83,9 +83,11 @@ class EpisodeResult(ResultLine):
 
     spec: EpisodeSpec
     instruction: str
-    target: tuple[int, int]
-    color: str
+    task_id: int
+    target: tuple[int, int] | None  # None: there is not one move to one intersection
+    color: str | None
     steps: int
+    progress: float  # share of the moves that were made
     is_success: bool
     is_success_bomb_v0: bool
     failure: str | None

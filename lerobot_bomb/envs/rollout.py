@@ -74,15 +74,15 @@ def play(
     led to, which lerobot-eval's videos cut off.
     """
     observation, info = env.reset(seed=spec.seed)
-    instruction = env.get_wrapper_attr("task_description")
     step, ended = 0, False
     while not ended:
+        instruction = env.get_wrapper_attr("task_description")  # a later turn has another
         action = agent(observation, instruction)
         yield Moment(step, instruction, observation, info, action)
         executed = action if disturb is None else disturb(action)
         observation, _, terminated, truncated, info = env.step(executed)
         step, ended = step + 1, terminated or truncated
-    yield Moment(step, instruction, observation, info, None)
+    yield Moment(step, env.get_wrapper_attr("task_description"), observation, info, None)
 
 
 def expert_agent(expert: Expert = expert_action) -> Agent:

@@ -2,7 +2,7 @@
 
 import json
 from collections.abc import Mapping
-from statistics import median
+from statistics import mean, median
 from typing import Any
 
 from lerobot_bomb.bomb.board import BOARD, COLORS, task_id
@@ -17,11 +17,18 @@ from lerobot_bomb.evaluation.line_checks import (
     is_list_of,
     is_one_of,
     is_quantity,
+    is_share,
     is_table_of,
     is_text,
     or_none,
 )
-from lerobot_bomb.evaluation.result_kind import NOT_RECORDED, Measure, ResultKind, describe_numbers
+from lerobot_bomb.evaluation.result_kind import (
+    NO_VALUE,
+    NOT_RECORDED,
+    Measure,
+    ResultKind,
+    describe_numbers,
+)
 
 OLD_VERSION = "1.0"  # whose lines say less
 NUM_TASKS = len(COLORS) * BOARD.num_lines**2
@@ -49,8 +56,8 @@ SPEC_CHECKS: dict[str, Check] = {  # the rest is EpisodeSpec's own
 CHECKS: dict[str, Check] = {
     "spec": lambda value: isinstance(value, dict),
     "instruction": is_text,
-    "target": is_intersection,
-    "color": is_one_of(COLORS),
+    "target": or_none(is_intersection),
+    "color": or_none(is_one_of(COLORS)),
     "steps": is_int(1),
     "is_success": is_bool,
     "is_success_bomb_v0": is_bool,
@@ -85,7 +92,13 @@ def median_error_mm(rows: list[Row]) -> float | None:
 
 def _placement_error(rows: list[Row]) -> str:
     error_mm = median_error_mm(rows)
-    return "-" if error_mm is None else f"{error_mm:.1f} mm"
+    return NO_VALUE if error_mm is None else f"{error_mm:.1f} mm"
+
+
+def _progress(rows: list[Row]) -> str:
+    """Of suites whose episodes have several moves."""
+    shares = [row["progress"] for row in rows if row["target"] is None]
+    return f"{100 * mean(shares):.1f} %" if shares else NO_VALUE
 
 
 def _check_episode(row: Row) -> None:
@@ -168,6 +181,7 @@ BOMB_LINES = ResultKind(
     spec_fields=SPEC_CHECKS,
     check_episode=_check_episode,
     added_spec_fields={"task_id": or_none(is_int(0))},
+    added_fields={"task_id": is_int(0), "progress": is_share},
     drawn=("target", "color", "task_id"),
     settings=_settings,
     describe_simulator=_describe_simulator,
@@ -175,5 +189,8 @@ BOMB_LINES = ResultKind(
     benchmark=f"BOMB, task version {TASK_VERSION}",
     environment=environment_of_episode,
     eval_flags=eval_flags_of,
-    measures=[Measure("placement error", _placement_error, "median of the stones that were put down")],
+    measures=[
+        Measure("moves made", _progress, "mean share of an episode's moves"),
+        Measure("placement error", _placement_error, "median of the stones that were put down"),
+    ],
 )

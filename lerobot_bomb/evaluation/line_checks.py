@@ -31,6 +31,11 @@ def is_quantity(value: Any) -> bool:
     return type(value) in (int, float) and math.isfinite(value) and value >= 0
 
 
+def is_share(value: Any) -> bool:
+    """Whether a value is a number in 0..1."""
+    return is_quantity(value) and value <= 1
+
+
 def or_none(check: Check) -> Check:
     """Whether a value is null or passes."""
     return lambda value: value is None or check(value)

@@ -8,6 +8,7 @@ from lerobot_bomb.envs.results import Row
 from lerobot_bomb.evaluation.line_checks import Check, check_fields, refuse_others
 
 NOT_RECORDED = "not recorded"
+NO_VALUE = "-"  # of a measure that these episodes do not have
 MAX_RUNS = 10  # of numbers, in a heading
 
 type Pair = tuple[Row, Row]  # the same episode unperturbed and perturbed
@@ -50,9 +51,13 @@ class ResultKind:
     # of a spec, what lines of earlier releases do not have and then have by default
     added_spec_fields: Mapping[str, Check] = field(default_factory=dict)
 
+    # what lines of earlier releases do not have
+    added_fields: Mapping[str, Check] = field(default_factory=dict)
+
     def check(self, row: Row) -> None:
         """Raise a ValueError that names a field of a line which is missing or impossible."""
-        check_fields(row, self.fields[row["protocol_version"]])
+        added = {name: check for name, check in self.added_fields.items() if name in row}
+        check_fields(row, {**self.fields[row["protocol_version"]], **added})
 
     def check_spec(self, row: Row) -> None:
         """Raise a ValueError unless a line is of an episode that there can be."""

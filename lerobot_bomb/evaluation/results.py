@@ -12,7 +12,7 @@ from lerobot_bomb.evaluation.result_groups import (
     groups_of,
     pair_with_nominal,
 )
-from lerobot_bomb.evaluation.result_kind import Measure, Pair
+from lerobot_bomb.evaluation.result_kind import NO_VALUE, Measure, Pair
 from lerobot_bomb.evaluation.result_lines import check_any, kind_of, read_lines
 from lerobot_bomb.stats import format_rate, mcnemar_p_value
 
@@ -34,7 +34,11 @@ class Summary:
         """The summary as text, a line each."""
         rate = format_rate(self.num_successes, self.num_episodes)
         figures = [("success", rate, "95 % Wilson interval")]
-        figures += [(measure.name, value, measure.note) for measure, value in self.measures.items()]
+        figures += [
+            (measure.name, value, measure.note)
+            for measure, value in self.measures.items()
+            if value != NO_VALUE
+        ]
         figures += [("failures", self.describe_failures(), "")]
         return [f"{name:<16} {value}{f' ({note})' if note else ''}" for name, value, note in figures]
 

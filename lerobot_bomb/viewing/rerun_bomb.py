@@ -8,6 +8,7 @@ import rerun.blueprint as rrb
 
 from lerobot_bomb.bomb.board import BOARD, COLORS
 from lerobot_bomb.bomb.episode import EpisodeSpec, Stage
+from lerobot_bomb.bomb.move import TRAY, distance_m
 from lerobot_bomb.bomb.observation import ACTION_NAMES, AGENT_POS, CAMERAS, PIXELS, STATE_NAMES
 from lerobot_bomb.bomb.privileged_state import PrivilegedState
 from lerobot_bomb.envs.results import EpisodeResult
@@ -39,10 +40,11 @@ class BombRerunFile(RerunFile[EpisodeResult]):
         row, column = result.nearest_intersection
         is_carried = Stage(result.stage) in (Stage.LIFTED, Stage.PLACED)
         place = f"nearest to row {row}, column {column}" if is_carried else "never lifted"
-        return f"{outcome}; the stone is {result.placement_error_mm:.1f} mm from the target, {place}"
+        moves = "" if result.target else f"{result.progress:.0%} of the moves made; "
+        return f"{outcome}; {moves}the stone is {result.placement_error_mm:.1f} mm from the target, {place}"
 
     def _log_still(self, moment: Moment) -> None:
-        self._log_target(moment.state)
+        self._log_targets(moment.state)
 
     def _log_moment(self, moment: Moment) -> None:
         for camera in CAMERAS:
@@ -73,18 +75,18 @@ class BombRerunFile(RerunFile[EpisodeResult]):
         lines = rr.LineStrips3D(strips, radii=LINE_RADIUS_M, colors=[LINE_RGB])
         self._log("scene/board/lines", lines, static=True)
 
-    def _log_target(self, state: PrivilegedState) -> None:
+    def _log_targets(self, state: PrivilegedState) -> None:
         angles_rad = np.linspace(0, 2 * np.pi, 49)
         ring = np.stack([np.cos(angles_rad), np.sin(angles_rad), np.zeros_like(angles_rad)], axis=1)
-        center = np.array([*state.goals[0].xyz[:2], BOARD.thickness_m + LINE_RADIUS_M])
-        row, column = BOARD.nearest_intersection(state.goals[0].xyz[:2])
+        xy = list(dict.fromkeys(tuple(goal.xyz[:2].tolist()) for goal in state.goals))
+        centers = [np.array([*place, BOARD.thickness_m + LINE_RADIUS_M]) for place in xy]
         self._log(
             "scene/target",
             rr.LineStrips3D(
-                [center + TARGET_RADIUS_M * ring],
+                [center + TARGET_RADIUS_M * ring for center in centers],
                 radii=TRACE_RADIUS_M,
-                colors=[TARGET_RGB],
-                labels=[f"target: row {row}, column {column}"],
+                colors=[TARGET_RGB] * len(centers),
+                labels=[describe_place(np.array(place)) for place in xy],
             ),
             static=True,
         )
@@ -107,6 +109,14 @@ class BombRerunFile(RerunFile[EpisodeResult]):
         self._log("scene/gripper", gripper)
         trace = rr.LineStrips3D([np.array(self._trace)], radii=TRACE_RADIUS_M, colors=[TRACE_RGB])
         self._log("scene/trace", trace)
+
+
+def describe_place(xy: np.ndarray) -> str:
+    """'target: row 1, column 3', or the tray."""
+    if distance_m(xy, TRAY) == 0:
+        return "target: the tray"
+    row, column = BOARD.nearest_intersection(xy)
+    return f"target: row {row}, column {column}"
 
 
 def layout() -> rrb.Horizontal:

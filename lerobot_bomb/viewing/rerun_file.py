@@ -31,6 +31,7 @@ class RerunFile[ResultT: ResultLine](ABC):
     ) -> None:
         """`layout` is what the viewer shows at first; `curves`: {entity: names of its values}."""
         self._fps, self._curves = fps, curves
+        self._instruction: str | None = None
         self._recording = rr.RecordingStream(APPLICATION)
         blueprint = rrb.Blueprint(
             layout,
@@ -45,11 +46,13 @@ class RerunFile[ResultT: ResultLine](ABC):
                 self._log(f"{entity}/{of}", rr.SeriesLines(colors=[color], names=[of]), static=True)
 
     def add(self, moment: Moment) -> None:
-        """Log one moment; the instruction and what stays with the first."""
+        """Log one moment; what stays with the first, the instruction when it changes."""
         if moment.step == 0:
-            self._log("instruction", rr.TextDocument(moment.instruction), static=True)
             self._log_still(moment)
         self._set_step(moment.step)
+        if moment.instruction != self._instruction:
+            self._instruction = moment.instruction
+            self._log("instruction", rr.TextDocument(moment.instruction))
         self._log_moment(moment)
         if moment.action is not None:
             self._log_values("action", moment.action)

@@ -42,9 +42,11 @@ def result(seed: int, is_success: bool, policy: PolicyIdentity | None = None) ->
     return EpisodeResult(
         spec=EpisodeSpec(seed=seed),
         instruction="Place a black stone on the Go board at row 0, column 1.",
+        task_id=0,
         target=(0, 1),
         color="black",
         steps=20,
+        progress=1.0,
         is_success=is_success,
         is_success_bomb_v0=is_success,
         failure=None if is_success else "dropped",

@@ -6,7 +6,6 @@ from typing import Self
 
 import numpy as np
 
-from lerobot_bomb.bomb.board import BOARD
 from lerobot_bomb.bomb.perturbations import magnitude
 from lerobot_bomb.bomb.suite import Episode
 from lerobot_env_bomb.axes.transform import Transform
@@ -15,14 +14,14 @@ from lerobot_env_mujoco.mujoco_gl import mujoco
 
 @dataclass(frozen=True)
 class GoalMarker(Transform):
-    """A blue dot on the target."""
+    """A blue dot on the target; of several, the last."""
 
     level: int
     target_xy: tuple[float, float]  # metres
 
     @classmethod
     def draw(cls, level: int, rng: np.random.Generator, nominal: Episode) -> Self:
-        return cls(level, tuple(BOARD.intersection_xy(*nominal.target).tolist()))
+        return cls(level, nominal.aims[-1].xy)
 
     def edit_model(self, model: mujoco.MjModel) -> None:
         geom = model.geom("goal_marker")

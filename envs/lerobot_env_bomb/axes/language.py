@@ -22,16 +22,16 @@ class Wording(Transform):
     def draw(cls, level: int, rng: np.random.Generator, nominal: Episode) -> Self:
         templates = find_suite(nominal.spec.suite).forms[int(magnitude("language", "form", level)) - 1]
         template = templates[rng.integers(len(templates))]
-        target, places = nominal.target, BOARD.num_lines**2
+        target, places = nominal.target or (0, 0), BOARD.num_lines**2
         # another place, whichever the target is
         other = (BOARD.num_lines * target[0] + target[1] + rng.integers(1, places)) % places
         row, column = divmod(int(other), BOARD.num_lines)
         return cls(template, (row, column))
 
     def reword(self, instruction: str, nominal: Episode) -> str:
-        return self.template.format(
-            **nominal.words, **_coordinates("", *nominal.target), **_coordinates("other_", *self.other)
-        )
+        (turn,) = nominal.turns
+        target = {} if nominal.target is None else _coordinates("", *nominal.target)
+        return self.template.format(**turn.words, **target, **_coordinates("other_", *self.other))
 
 
 def _coordinates(prefix: str, row: int, column: int) -> dict[str, int | str]:

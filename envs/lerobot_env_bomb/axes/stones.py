@@ -6,7 +6,7 @@ from typing import Self
 
 import numpy as np
 
-from lerobot_bomb.bomb.board import BOARD, COLORS, Cell
+from lerobot_bomb.bomb.board import BOARD, COLORS, NUM_STONES, Cell
 from lerobot_bomb.bomb.go import is_legal_position
 from lerobot_bomb.bomb.layout import Layout, put_on_board
 from lerobot_bomb.bomb.perturbations import magnitude
@@ -27,7 +27,8 @@ class Stones(Transform):
         opening = nominal.opening
         directions_rad = rng.uniform(-np.pi, np.pi, BOARD.num_lines**2)
         shift_m = 1e-3 * magnitude("stones", "shift", level)
-        num_extra = int(magnitude("stones", "extra", level))
+        num_in_play = int(nominal.layout.stone_in_play.sum())
+        num_extra = min(int(magnitude("stones", "extra", level)), NUM_STONES - num_in_play)
         # As for the opening: the candidates do not depend on the move, the first that allows it is taken.
         while True:
             extra = _grow(opening, num_extra, nominal.extra_colors, rng)

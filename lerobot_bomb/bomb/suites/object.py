@@ -9,8 +9,9 @@ import numpy as np
 from lerobot_bomb.bomb.board import COLORS, NUM_STONES, TRAY_CENTER_XY, Cell
 from lerobot_bomb.bomb.episode import EpisodeSpec
 from lerobot_bomb.bomb.layout import Layout, put_on_board
+from lerobot_bomb.bomb.move import aim_at, one_move
 from lerobot_bomb.bomb.streams import Stream, generator
-from lerobot_bomb.bomb.suite import Episode, Suite, of_split, refuse_options
+from lerobot_bomb.bomb.suite import Episode, Suite, Turn, of_split, refuse_options
 from lerobot_bomb.bomb.suites.place import ALL_TARGETS, sample_opening
 
 MAX_OPENING_STONES = 5
@@ -170,14 +171,16 @@ def sample_episode(spec: EpisodeSpec) -> Episode:
     return Episode(
         spec=spec,
         task_id=task_id,
-        target=target,
-        color=color,
-        instruction=template.format(stone=task.stone, row=target[0], column=target[1]),
+        turns=(
+            Turn(template.format(stone=task.stone, row=target[0], column=target[1]), {"stone": task.stone}),
+        ),
         opening=opening,
         layout=put_on_board(opening, _layout(supply, height_m)),
-        stone=stone,
         supply=tuple(range(len(supply.xy))),
-        words={"stone": task.stone},
+        plans=((one_move(stone, [target]),),),
+        aims=(aim_at(stone, target),),
+        target=target,
+        color=color,
         gripper_is_named=task.gripper_is_named,
     )
 

@@ -9,8 +9,9 @@ from lerobot_bomb.bomb.board import BOARD, COLORS, NUM_STONES, TRAY_CENTER_XY, C
 from lerobot_bomb.bomb.episode import EpisodeSpec
 from lerobot_bomb.bomb.go import is_legal_move, is_legal_position
 from lerobot_bomb.bomb.layout import Layout, put_on_board
+from lerobot_bomb.bomb.move import aim_at, one_move
 from lerobot_bomb.bomb.streams import Stream, generator
-from lerobot_bomb.bomb.suite import Episode, Suite, of_split
+from lerobot_bomb.bomb.suite import Episode, Suite, Turn, of_split
 
 STONE = 0  # index of the stone to be moved; stones 1.. stand on the board
 MAX_OPENING_STONES = 8
@@ -98,14 +99,14 @@ def sample_episode(spec: EpisodeSpec) -> Episode:
     return Episode(
         spec=spec,
         task_id=task_id(target, color),
-        target=target,
-        color=color,
-        instruction=template.format(color=color, row=target[0], column=target[1]),
+        turns=(Turn(template.format(color=color, row=target[0], column=target[1]), {"color": color}),),
         opening=opening,
         layout=put_on_board(opening, layout_of_one(spec.seed, color)),
-        stone=STONE,
         supply=(STONE,),
-        words={"color": color},
+        plans=((one_move(STONE, [target]),),),
+        aims=(aim_at(STONE, target),),
+        target=target,
+        color=color,
     )
 
 

@@ -11,8 +11,9 @@ from lerobot_bomb.bomb.board import BOARD, COLORS, Cell
 from lerobot_bomb.bomb.episode import EpisodeSpec
 from lerobot_bomb.bomb.go import is_legal_move, is_legal_position
 from lerobot_bomb.bomb.layout import put_on_board
+from lerobot_bomb.bomb.move import aim_at, one_move
 from lerobot_bomb.bomb.streams import Stream, generator
-from lerobot_bomb.bomb.suite import Episode, Suite, of_split, refuse_options
+from lerobot_bomb.bomb.suite import Episode, Suite, Turn, of_split, refuse_options
 from lerobot_bomb.bomb.suites.place import ALL_TARGETS, STONE, layout_of_one
 
 MAX_OPENING_STONES = 8
@@ -217,14 +218,14 @@ def sample_episode(spec: EpisodeSpec) -> Episode:
     return Episode(
         spec=spec,
         task_id=task_id,
-        target=target,
-        color=color,
-        instruction=template.format(**words),
+        turns=(Turn(template.format(**words), words),),
         opening=opening,
         layout=put_on_board(opening, layout_of_one(spec.seed, color)),
-        stone=STONE,
         supply=(STONE,),
-        words=words,
+        plans=((one_move(STONE, [target]),),),
+        aims=(aim_at(STONE, target),),
+        target=target,
+        color=color,
         is_clear=partial(_means, task, anchor, target),
         extra_colors=extra_colors,
     )

@@ -1,0 +1,61 @@
+"""What an episode asks for: stones that are moved to places, each by a move of a plan."""
+
+from collections.abc import Collection
+from dataclasses import dataclass
+
+import numpy as np
+
+from lerobot_bomb.bomb.board import BOARD, TRAY_CENTER_XY, TRAY_HALF_SIZE_XY, Cell
+
+TRAY = "tray"
+type Place = Cell | str  # an intersection, or TRAY: anywhere in it
+
+
+@dataclass(frozen=True)
+class Move:
+    """A stone that comes to a place."""
+
+    # any one of these, by index; of several, one that no move has taken before
+    stones: frozenset[int]
+    places: frozenset[Place]  # any one of these on which no move has put a stone
+    after: frozenset[int] = frozenset()  # numbers of the plan's moves that must have been made
+    is_slid: bool = False  # pushed or pulled along the board: lifting the stone is a failure
+
+
+type Plan = tuple[Move, ...]  # all of its moves are to be made, each once those it comes after are
+
+
+@dataclass(frozen=True)
+class Aim:
+    """What the expert does next: one stone to one place."""
+
+    stone: int
+    xy: tuple[float, float]  # metres
+    is_slid: bool = False
+
+
+def aim_at(stone: int, cell: Cell, is_slid: bool = False) -> Aim:
+    """To bring a stone to an intersection."""
+    x, y = BOARD.intersection_xy(*cell)
+    return Aim(stone, (float(x), float(y)), is_slid)
+
+
+def one_move(stone: int, places: Collection[Place]) -> Move:
+    """A move of this stone to any of these places."""
+    return Move(frozenset([stone]), frozenset(places))
+
+
+def in_order(*moves: Move) -> Plan:
+    """A plan whose moves come one after the other."""
+    return tuple(
+        Move(move.stones, move.places, frozenset(range(number)), move.is_slid)
+        for number, move in enumerate(moves)
+    )
+
+
+def distance_m(xy: np.ndarray, place: Place) -> float:
+    """How far a stone at (2,) metres is from a place; 0 anywhere in the tray, if that is the place."""
+    if isinstance(place, str):
+        outside = np.maximum(abs(xy - np.array(TRAY_CENTER_XY)) - np.array(TRAY_HALF_SIZE_XY), 0.0)
+        return float(np.linalg.norm(outside))
+    return float(np.linalg.norm(xy - BOARD.intersection_xy(*place)))

@@ -1,0 +1,198 @@
+"""Suite `goal`: stones stand on the board, and the instruction says what is to be done with them."""
+
+from dataclasses import dataclass
+from itertools import permutations
+
+import numpy as np
+
+from lerobot_bomb.bomb.board import BOARD, COLORS, Cell
+from lerobot_bomb.bomb.commands import (
+    CELLS,
+    TRAY_XY_M,
+    Case,
+    Drawn,
+    Task,
+    command_suite,
+    draw_stones,
+    is_graspable,
+    only,
+    other_color,
+)
+from lerobot_bomb.bomb.move import TRAY, Aim, Move, Plan, aim_at, in_order, one_move
+
+MIN_STONES, MAX_STONES = 2, 6
+MAX_MOVED = 3
+SIDE_COLUMNS = 2  # of the left side, to which stones are gathered
+FAR_COLUMN = 3  # from here on stones are gathered: none of them stands beside a place of the left side
+
+
+def _draw_board(rng: np.random.Generator) -> dict[Cell, str]:
+    return draw_stones(rng, int(rng.integers(MIN_STONES, MAX_STONES + 1)))
+
+
+def _to_tray(drawn: Drawn, cells: list[Cell]) -> tuple[Plan, tuple[Aim, ...]]:
+    """All of them into the tray, in whichever order."""
+    stones = [drawn.stone_on(cell) for cell in cells]
+    plan = tuple(one_move(stone, [TRAY]) for stone in stones)
+    return plan, tuple(Aim(stone, xy) for stone, xy in zip(stones, TRAY_XY_M, strict=False))
+
+
+@dataclass(frozen=True)
+class RemoveColor(Task):
+    """The only stone of a colour goes into the tray."""
+
+    def draw(self, rng: np.random.Generator) -> Drawn:
+        return Drawn((int(rng.integers(len(COLORS))), int(rng.integers(BOARD.num_lines))), _draw_board(rng))
+
+    def case(self, drawn: Drawn) -> Case | None:
+        color, row = COLORS[drawn.about[0]], drawn.about[1]
+        cell = only(drawn.stones, color)
+        if cell is None or cell[0] != row or not is_graspable(drawn.stones, cell):
+            return None
+        plan, aims = _to_tray(drawn, [cell])
+        command = f"take the {color} stone off the board and put it in the tray"
+        return Case((command,), (plan,), aims, (other_color(color),))
+
+
+@dataclass(frozen=True)
+class RemoveAt(Task):
+    """The stone on an intersection goes into the tray."""
+
+    def draw(self, rng: np.random.Generator) -> Drawn:
+        row, column = CELLS[rng.integers(len(CELLS))]
+        return Drawn((row, column), _draw_board(rng))
+
+    def case(self, drawn: Drawn) -> Case | None:
+        row, column = cell = drawn.about[0], drawn.about[1]
+        if cell not in drawn.stones or not is_graspable(drawn.stones, cell):
+            return None
+        plan, aims = _to_tray(drawn, [cell])
+        command = f"take the stone at row {row}, column {column} off the board and put it in the tray"
+        return Case((command,), (plan,), aims)
+
+
+@dataclass(frozen=True)
+class Swap(Task):
+    """Two stones change places, one of them by way of the tray or of a free intersection."""
+
+    def draw(self, rng: np.random.Generator) -> Drawn:
+        stones = _draw_board(rng)
+        (a, b) = [list(stones)[i] for i in rng.permutation(len(stones))[:2]]
+        return Drawn((*a, *b), stones)
+
+    def case(self, drawn: Drawn) -> Case | None:
+        a, b = (drawn.about[0], drawn.about[1]), (drawn.about[2], drawn.about[3])
+        stones = drawn.stones
+        if not {a, b} <= stones.keys() or stones[a] == stones[b]:
+            return None
+        if not is_graspable(stones, a) or not is_graspable(stones, b):
+            return None
+        others = [cell for cell in CELLS if cell not in (a, b)]  # the free ones of them
+        first, second = drawn.stone_on(a), drawn.stone_on(b)
+        plans = tuple(
+            in_order(one_move(one, [TRAY, *others]), one_move(other, [here]), one_move(one, [there]))
+            for one, other, here, there in ((first, second, a, b), (second, first, b, a))
+        )
+        aims = (Aim(first, TRAY_XY_M[0]), aim_at(second, a), aim_at(first, b))
+        command = f"swap the stone at row {a[0]}, column {a[1]} and the stone at row {b[0]}, column {b[1]}"
+        return Case((command,), plans, aims)
+
+
+@dataclass(frozen=True)
+class Push(Task):
+    """The only stone of a colour goes one intersection further, without being lifted."""
+
+    direction: str
+    rows: int
+    columns: int
+
+    def draw(self, rng: np.random.Generator) -> Drawn:
+        return Drawn((int(rng.integers(len(COLORS))), int(rng.integers(BOARD.num_lines))), _draw_board(rng))
+
+    def case(self, drawn: Drawn) -> Case | None:
+        color, row = COLORS[drawn.about[0]], drawn.about[1]
+        cell = only(drawn.stones, color)
+        if cell is None or cell[0] != row:
+            return None
+        place = cell[0] + self.rows, cell[1] + self.columns
+        others = {other: stone for other, stone in drawn.stones.items() if other != cell}
+        if place not in CELLS or place in others:
+            return None
+        if not is_graspable(others, cell) or not is_graspable(others, place):
+            return None
+        stone = drawn.stone_on(cell)
+        plan = (Move(frozenset([stone]), frozenset([place]), is_slid=True),)
+        command = (
+            f"push the {color} stone one intersection {self.direction}, along the board and without lifting "
+            "it"
+        )
+        return Case((command,), (plan,), (aim_at(stone, place, is_slid=True),), (other_color(color),))
+
+
+@dataclass(frozen=True)
+class ClearRow(Task):
+    """All stones of a row go into the tray."""
+
+    def draw(self, rng: np.random.Generator) -> Drawn:
+        row, number = int(rng.integers(BOARD.num_lines)), int(rng.integers(1, MAX_MOVED + 1))
+        return Drawn((row, number), _draw_board(rng))
+
+    def case(self, drawn: Drawn) -> Case | None:
+        row, number = drawn.about
+        cells = sorted(cell for cell in drawn.stones if cell[0] == row)
+        if len(cells) != number or not all(is_graspable(drawn.stones, cell) for cell in cells):
+            return None
+        plan, aims = _to_tray(drawn, cells)
+        return Case((f"clear row {row}: put its stones in the tray",), (plan,), aims)
+
+
+@dataclass(frozen=True)
+class Gather(Task):
+    """All stones of a colour that do not stand on the left go there."""
+
+    def draw(self, rng: np.random.Generator) -> Drawn:
+        return Drawn((int(rng.integers(len(COLORS))), int(rng.integers(BOARD.num_lines))), _draw_board(rng))
+
+    def case(self, drawn: Drawn) -> Case | None:
+        color, row = COLORS[drawn.about[0]], drawn.about[1]
+        cells = sorted(
+            cell for cell, other in drawn.stones.items() if other == color and cell[1] >= SIDE_COLUMNS
+        )
+        if not 1 <= len(cells) <= MAX_MOVED or cells[0][0] != row:
+            return None
+        if not all(column >= FAR_COLUMN and is_graspable(drawn.stones, (r, column)) for r, column in cells):
+            return None
+        side = [cell for cell in CELLS if cell[1] < SIDE_COLUMNS]
+        free = [cell for cell in side if cell not in drawn.stones]
+        if len(free) < len(cells):
+            return None
+        stones = [drawn.stone_on(cell) for cell in cells]
+        plan = tuple(one_move(stone, side) for stone in stones)
+        aims = tuple(aim_at(stone, place) for stone, place in zip(stones, _nearest(cells, free), strict=True))
+        command = f"bring all {color} stones to the left side of the board, into columns 0 and 1"
+        return Case((command,), (plan,), aims, (other_color(color),))
+
+
+def _nearest(cells: list[Cell], places: list[Cell]) -> list[Cell]:
+    """A place of its own for each, row by row as near as can be."""
+
+    def cost(chosen: tuple[Cell, ...]) -> int:
+        return sum(
+            abs(r - row) + abs(c - column) for (row, column), (r, c) in zip(cells, chosen, strict=True)
+        )
+
+    return list(min(permutations(places, len(cells)), key=cost))
+
+
+TASKS: tuple[Task, ...] = (
+    RemoveColor(),
+    RemoveAt(),
+    Swap(),
+    Push("to the left", 0, -1),
+    Push("to the right", 0, 1),
+    Push("towards the far edge", -1, 0),
+    Push("towards the near edge", 1, 0),
+    ClearRow(),
+    Gather(),
+)
+SUITE = command_suite(TASKS, max_steps=170, num_goals=MAX_MOVED)

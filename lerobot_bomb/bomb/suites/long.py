@@ -1,0 +1,217 @@
+"""Suite `long`: two to eight moves, from one instruction or turn by turn."""
+
+from collections import Counter
+from dataclasses import dataclass
+
+import numpy as np
+
+from lerobot_bomb.bomb.board import BOARD, COLORS, NUM_STONES, Cell
+from lerobot_bomb.bomb.commands import (
+    CELLS,
+    TRAY_XY_M,
+    Case,
+    Drawn,
+    Task,
+    command_suite,
+    draw_cells,
+    draw_stones,
+    is_graspable,
+    other_color,
+)
+from lerobot_bomb.bomb.go import group_of, is_legal_move, is_legal_position, liberties_of, near
+from lerobot_bomb.bomb.move import TRAY, Aim, Move, Plan, aim_at, in_order, one_move
+
+MAX_MOVES = 8
+MAX_OTHERS = 3  # stones on the board that an opening has nothing to do with
+MAX_CAPTURED = 2
+MAX_FILLED = 4
+EDGE_COLUMNS = 0, BOARD.num_lines - 1  # of captured stones: fingers go down beside one neighbour at most
+
+
+def _in_turn(first: int, number: int) -> tuple[str, ...]:
+    """So many colours, black and white in turn, from the first of COLORS or the second."""
+    return tuple(COLORS[(first + i) % 2] for i in range(number))
+
+
+def _supply_plan(
+    drawn: Drawn, moves: list[tuple[str, Cell]], is_ordered: bool
+) -> tuple[Plan, tuple[Aim, ...]]:
+    """Stones of these colours from the tray to these intersections; any stone of the colour will do."""
+    of_color = {
+        color: frozenset(i for i, other in enumerate(drawn.supply) if other == color) for color in COLORS
+    }
+    plan = tuple(
+        Move(of_color[color], frozenset([cell]), frozenset(range(number if is_ordered else 0)))
+        for number, (color, cell) in enumerate(moves)
+    )
+    left = {color: sorted(stones) for color, stones in of_color.items()}
+    return plan, tuple(aim_at(left[color].pop(0), cell) for color, cell in moves)
+
+
+@dataclass(frozen=True)
+class Opening(Task):
+    """Stones from the tray are played in turn, from one instruction or one at a time."""
+
+    num_moves: int
+    is_by_turns: bool
+
+    def draw(self, rng: np.random.Generator) -> Drawn:
+        first = int(rng.integers(len(COLORS)))
+        supply = _in_turn(first, self.num_moves)
+        max_others = min(MAX_OTHERS, NUM_STONES - self.num_moves)
+        others = draw_stones(rng, int(rng.integers(max_others + 1)))
+        cells = draw_cells(rng, self.num_moves, [cell for cell in CELLS if cell not in others])
+        return Drawn((first, *(line for cell in cells for line in cell)), others, supply)
+
+    def case(self, drawn: Drawn) -> Case | None:
+        lines = drawn.about[1:]
+        cells = list(zip(lines[::2], lines[1::2], strict=True))
+        colors = _in_turn(drawn.about[0], self.num_moves)
+        if Counter(drawn.supply) != Counter(colors) or drawn.pattern:
+            return None
+        moves = list(zip(colors, cells, strict=True))
+        stones = dict(drawn.stones)
+        for color, cell in moves:
+            if not is_legal_move(stones, cell, color):
+                return None
+            stones[cell] = color
+            if not is_legal_position(stones):
+                return None  # a capture
+        plan, aims = _supply_plan(drawn, moves, is_ordered=True)
+        said = [f"{color} at row {row}, column {column}" for color, (row, column) in moves]
+        if self.is_by_turns:
+            return Case(tuple(f"play {move}" for move in said), (plan,), aims)
+        return Case((f"play these moves one after the other: {'; '.join(said)}",), (plan,), aims)
+
+
+@dataclass(frozen=True)
+class FillRow(Task):
+    """The free intersections of a row get a stone each, the colours in turn from left to right."""
+
+    def draw(self, rng: np.random.Generator) -> Drawn:
+        first, row = int(rng.integers(len(COLORS))), int(rng.integers(BOARD.num_lines))
+        stones = draw_stones(rng, int(rng.integers(2, 6)))
+        free = [cell for cell in CELLS if cell[0] == row and cell not in stones]
+        return Drawn((first, row), stones, _in_turn(first, len(free)))
+
+    def case(self, drawn: Drawn) -> Case | None:
+        first, row = drawn.about
+        cells = [cell for cell in CELLS if cell[0] == row and cell not in drawn.stones]
+        colors = _in_turn(first, len(cells))
+        if Counter(drawn.supply) != Counter(colors) or not 2 <= len(cells) <= MAX_FILLED or drawn.pattern:
+            return None
+        moves = list(zip(colors, cells, strict=True))
+        if not is_legal_position(dict(drawn.stones) | {cell: color for color, cell in moves}):
+            return None
+        plan, aims = _supply_plan(drawn, moves, is_ordered=True)
+        command = (
+            f"fill the free intersections of row {row} from left to right, the colours in turn, "
+            f"{colors[0]} first"
+        )
+        return Case((command,), (plan,), aims)
+
+
+@dataclass(frozen=True)
+class Capture(Task):
+    """The last liberty of a group is taken, and its stones go into the tray."""
+
+    size: int
+
+    def draw(self, rng: np.random.Generator) -> Drawn:
+        color = int(rng.integers(len(COLORS)))
+        row, column = int(rng.integers(BOARD.num_lines)), EDGE_COLUMNS[rng.integers(len(EDGE_COLUMNS))]
+        group = [(row + i, column) for i in range(self.size)]
+        around = [cell for cell in CELLS if cell not in group and any(cell in near(c) for c in group)]
+        liberty = around[rng.integers(len(around))]
+        stones = dict.fromkeys((cell for cell in group if cell in CELLS), COLORS[color])
+        stones |= {cell: other_color(COLORS[color]) for cell in around if cell != liberty}
+        free = [cell for cell in CELLS if cell not in stones and cell != liberty]
+        stones |= draw_stones(rng, int(rng.integers(3)), free)
+        return Drawn((color, *group[0]), stones, (other_color(COLORS[color]),))
+
+    def case(self, drawn: Drawn) -> Case | None:
+        color, stones = COLORS[drawn.about[0]], drawn.stones
+        if drawn.supply != (other_color(color),) or (drawn.about[1], drawn.about[2]) not in stones:
+            return None
+        groups = {frozenset(group_of(dict(stones), cell)) for cell, other in stones.items() if other == color}
+        in_atari = [group for group in groups if len(liberties_of(dict(stones), min(group))) == 1]
+        if len(in_atari) != 1 or len(in_atari[0]) != self.size:
+            return None
+        captured = sorted(in_atari[0])
+        if captured[0] != (drawn.about[1], drawn.about[2]) or not {c for _, c in captured} <= {*EDGE_COLUMNS}:
+            return None
+        (cell,) = liberties_of(dict(stones), captured[0])
+        after = {place: other for place, other in stones.items() if place not in captured}
+        if not is_legal_position(after | {cell: drawn.supply[0]}):
+            return None
+        played, aims = _supply_plan(drawn, [(drawn.supply[0], cell)], is_ordered=True)
+        taken = [drawn.stone_on(place) for place in captured]
+        plan = (*played, *(Move(frozenset([stone]), frozenset([TRAY]), frozenset([0])) for stone in taken))
+        aims += tuple(Aim(stone, xy) for stone, xy in zip(taken, TRAY_XY_M, strict=False))
+        what = f"the {color} stone" if self.size == 1 else f"the {self.size} {color} stones"
+        command = (
+            f"capture {what} with one liberty left: play {drawn.supply[0]} there, then put what is captured "
+            "in the tray"
+        )
+        return Case((command,), (plan,), aims)
+
+
+@dataclass(frozen=True)
+class TakeBack(Task):
+    """The last two moves are undone, the later one first."""
+
+    def draw(self, rng: np.random.Generator) -> Drawn:
+        stones = draw_stones(rng, int(rng.integers(2, 7)))
+        a, b = [list(stones)[i] for i in rng.permutation(len(stones))[:2]]
+        return Drawn((*a, *b), stones)
+
+    def case(self, drawn: Drawn) -> Case | None:
+        a, b = (drawn.about[0], drawn.about[1]), (drawn.about[2], drawn.about[3])
+        stones = drawn.stones
+        if drawn.supply or not {a, b} <= stones.keys() or stones[a] == stones[b]:
+            return None
+        if not is_graspable(stones, a) or not is_graspable(stones, b):
+            return None
+        plan = in_order(*(one_move(drawn.stone_on(cell), [TRAY]) for cell in (b, a)))
+        aims = tuple(Aim(drawn.stone_on(cell), xy) for cell, xy in zip((b, a), TRAY_XY_M, strict=False))
+        command = (
+            f"take back the last two moves, the later one first: {stones[a]} played at row {a[0]}, column "
+            f"{a[1]}, then {stones[b]} at row {b[0]}, column {b[1]}; put both stones in the tray"
+        )
+        return Case((command,), (plan,), aims)
+
+
+@dataclass(frozen=True)
+class CopyPattern(Task):
+    """What the small board in the tray shows is built on the board."""
+
+    num_stones: int
+
+    def draw(self, rng: np.random.Generator) -> Drawn:
+        first = int(rng.integers(len(COLORS)))
+        colors = _in_turn(first, self.num_stones)
+        cells = draw_cells(rng, self.num_stones)
+        pattern = dict(zip(cells, colors, strict=True))
+        return Drawn((first, *cells[0]), {}, colors, pattern)
+
+    def case(self, drawn: Drawn) -> Case | None:
+        if len(drawn.pattern) != self.num_stones or set(drawn.pattern) & set(drawn.stones):
+            return None
+        if Counter(drawn.supply) != Counter(drawn.pattern.values()):
+            return None
+        if not is_legal_position(dict(drawn.stones) | dict(drawn.pattern)):
+            return None
+        moves = [(color, cell) for cell, color in drawn.pattern.items()]
+        plan, aims = _supply_plan(drawn, moves, is_ordered=False)
+        return Case(("copy the pattern of the small board onto the large one",), (plan,), aims)
+
+
+TASKS: tuple[Task, ...] = (
+    *(Opening(number, is_by_turns=False) for number in (2, 3, 4)),
+    *(Opening(number, is_by_turns=True) for number in (2, 4, 8)),
+    FillRow(),
+    *(Capture(size) for size in (1, MAX_CAPTURED)),
+    TakeBack(),
+    *(CopyPattern(number) for number in (2, 3, 4)),
+)
+SUITE = command_suite(TASKS, max_steps=400, num_goals=MAX_MOVES)
