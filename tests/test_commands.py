@@ -1,11 +1,14 @@
 """The suites `goal` and `long`: a command means one thing on its board, and the expert does it."""
 
+import hashlib
 import re
 from collections import Counter
 from collections.abc import Callable, Iterator
 from dataclasses import replace
+from pathlib import Path
 from typing import Any
 
+import gymnasium
 import numpy as np
 import pytest
 from hypothesis import given, settings
@@ -20,9 +23,11 @@ from lerobot_bomb.bomb.move import TRAY, distance_m
 from lerobot_bomb.bomb.observation import RenderOptions
 from lerobot_bomb.bomb.privileged_state import PrivilegedState
 from lerobot_bomb.bomb.suite import Episode, find_suite, specs_of_tasks
+from lerobot_bomb.bomb.suites import SUITES
 from lerobot_bomb.bomb.suites import goal as goal_suite
 from lerobot_bomb.bomb.suites import long as long_suite
 from lerobot_bomb.envs.rollout import Moment, expert_agent, make_env, play
+from lerobot_bomb.evaluation.results import read_results
 from lerobot_env_bomb.perturb import PerturbedEpisode, sample_episode
 
 TASKS = {"goal": goal_suite.TASKS, "long": long_suite.TASKS}
@@ -336,3 +341,60 @@ def test_each_turn_is_said_when_the_move_before_it_has_been_made() -> None:
     for moment in played(spec):
         made = round(moment.info["progress"] * 4)
         assert moment.instruction == said[min(made, 3)]
+
+
+def test_lerobot_eval_gives_a_policy_each_turn_as_it_is_said(
+    stock_cli: Callable[..., None], monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    from lerobot_bomb.bomb.scripted_policy import ScriptedPolicy
+
+    given: list[list[str]] = []
+    select_action = ScriptedPolicy.select_action
+
+    def spy(self: ScriptedPolicy, batch: dict[str, Any], **kwargs: object) -> Any:
+        given.append(list(batch["task"]))
+        return select_action(self, batch, **kwargs)
+
+    monkeypatch.setattr(ScriptedPolicy, "select_action", spy)
+    flags = (
+        "--policy.type=bomb_expert --policy.device=cpu --env.type=bomb --env.task=long --env.image_size=32"
+    )
+    flags += f" --env.task_ids=[{TURNS_OF_4}] --seed=2 --eval.n_episodes=1 --eval.batch_size=1"
+    results = tmp_path / "results.jsonl"
+    stock_cli(
+        "lerobot-eval", *flags.split(), f"--env.results_path={results}", f"--output_dir={tmp_path / 'eval'}"
+    )
+    episode = sample_episode(EpisodeSpec(2, "long", task_id=TURNS_OF_4))
+    assert list(dict.fromkeys(text for (text,) in given)) == [turn.instruction for turn in episode.turns]
+    (row,) = read_results(results)
+    assert (row["is_success"], row["progress"], row["target"], row["task_id"]) == (
+        True,
+        1.0,
+        None,
+        TURNS_OF_4,
+    )
+
+
+# The same bits anywhere
+
+
+@pytest.mark.long
+@pytest.mark.parametrize("suite", SUITES)
+def test_an_episode_does_not_depend_on_earlier_ones(suite: str) -> None:
+    spec = EpisodeSpec(5, suite, perturbations="all:1-5")
+
+    def digest(env: gymnasium.Env) -> str:
+        seen = hashlib.sha256()
+        for moment in play(env, spec, expert_agent()):
+            images = moment.observation["pixels"].values()
+            for array in (*images, moment.observation["agent_pos"], moment.observation["environment_state"]):
+                seen.update(array.tobytes())
+            seen.update(moment.instruction.encode())
+        return seen.hexdigest()
+
+    fresh, used = make_env(spec, SMALL), make_env(spec, SMALL)
+    for _ in play(used, replace(spec, seed=6), expert_agent()):
+        pass
+    assert digest(fresh) == digest(used)
+    fresh.close()
+    used.close()
