@@ -32,7 +32,7 @@ def test_the_files_show_the_environment_to_the_last_moment(
     logged = read_rrd(Path(rrd))
     env = pusht_env(CONDITION, max_steps=STEPS)
     observation, info = env.reset(seed=3)
-    assert instruction == env.task_description == logged["/instruction"][None]["TextDocument:text"][0]
+    assert instruction == env.task_description == logged["/instruction"][0]["TextDocument:text"][0]
     env.action_space.seed(3)
     images = []
     for step in range(STEPS + 1):
