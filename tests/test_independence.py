@@ -17,17 +17,26 @@ import pytest
 from lerobot_bomb.bomb.episode import EpisodeSpec
 from lerobot_bomb.bomb.expert import expert_action
 from lerobot_bomb.bomb.observation import RenderOptions
+from lerobot_bomb.bomb.suites import SUITES
 from lerobot_bomb.envs.vector import NEW_ROLLOUT_OPTION, LazyVectorEnv
 from lerobot_bomb.evaluation.results import read_results
 from lerobot_env_bomb.env import BombEnv
 
 SMALL = RenderOptions(image_size=32)
-SEEDS = (9, 10)
+SEEDS = (10, 11)
 # of a network's actions: a matrix product of another batch size may round otherwise; bins are 100 times wider
 BINS_TOLERANCE = 1e-4
 # where actions are no bins, the next image shows what was rounded otherwise
 TOLERANCES = {"fdvla": 2e-3}
 CONDITIONS = ("none", "all:1-5")
+SPECS = (
+    *(EpisodeSpec(0, perturbations=condition) for condition in CONDITIONS),
+    *(
+        pytest.param(EpisodeSpec(0, suite, perturbations=CONDITIONS[-1]), marks=pytest.mark.long)
+        for suite in SUITES
+        if suite != "place"
+    ),
+)
 
 type Observations = list[dict[str, np.ndarray]]
 type Run = Callable[..., None]
@@ -36,30 +45,31 @@ type Run = Callable[..., None]
 # Observations
 
 
-def make_one(condition: str) -> BombEnv:
-    return BombEnv(EpisodeSpec(seed=0, perturbations=condition), SMALL)
+def make_one(spec: EpisodeSpec) -> BombEnv:
+    return BombEnv(spec, SMALL)
 
 
-@pytest.fixture(scope="module", params=CONDITIONS)
-def condition(request: pytest.FixtureRequest) -> str:
+@pytest.fixture(scope="module", params=SPECS, ids=lambda spec: f"{spec.suite}-{spec.perturbations}")
+def spec(request: pytest.FixtureRequest) -> EpisodeSpec:
     return request.param
 
 
-def flat(observation: dict[str, Any]) -> dict[str, np.ndarray]:
-    """A copy of every key."""
+def flat(observation: dict[str, Any], instruction: str | tuple[str, ...]) -> dict[str, np.ndarray]:
+    """A copy of every key, and what is said."""
     others = {key: observation[key] for key in ("agent_pos", "environment_state")}
     assert {"pixels", *others} == set(observation)
-    return {key: value.copy() for key, value in (others | observation["pixels"]).items()}
+    arrays = {key: value.copy() for key, value in (others | observation["pixels"]).items()}
+    return arrays | {"instruction": np.array(instruction)}
 
 
 def play_expert(env: BombEnv, seed: int) -> tuple[np.ndarray, Observations]:
     """Actions (T, 4) and the T + 1 observations of a whole episode."""
     observation, _ = env.reset(seed=seed)
-    observations, actions, ended = [flat(observation)], [], False
+    observations, actions, ended = [flat(observation, env.task_description)], [], False
     while not ended:
         actions.append(expert_action(env.privileged_state()))
         observation, _, terminated, truncated, _ = env.step(actions[-1])
-        observations.append(flat(observation))
+        observations.append(flat(observation, env.task_description))
         ended = terminated or truncated
     return np.stack(actions), observations
 
@@ -69,7 +79,10 @@ def play_together(envs: LazyVectorEnv, actions: list[np.ndarray]) -> list[Observ
     num_steps = max(map(len, actions))
     actions_TED = np.stack([np.pad(of, ((0, num_steps - len(of)), (0, 0))) for of in actions], axis=1)
     observation, _ = envs.reset(seed=list(SEEDS[: len(actions)]), options={NEW_ROLLOUT_OPTION: True})
-    steps = [flat(observation), *(flat(envs.step(actions_ED)[0]) for actions_ED in actions_TED)]
+    steps = [flat(observation, envs.call("task_description"))]
+    for actions_ED in actions_TED:
+        observation = envs.step(actions_ED)[0]
+        steps.append(flat(observation, envs.call("task_description")))
     return [
         [{key: values[i] for key, values in step.items()} for step in steps[: len(of) + 1]]
         for i, of in enumerate(actions)
@@ -78,6 +91,7 @@ def play_together(envs: LazyVectorEnv, actions: list[np.ndarray]) -> list[Observ
 
 def assert_same(observations: Observations, expected: Observations) -> None:
     for step, (one, other) in enumerate(zip(observations, expected, strict=True)):
+        assert one.keys() == other.keys()
         for key in other:
             np.testing.assert_array_equal(one[key], other[key], err_msg=f"{key} in step {step}")
 
@@ -89,11 +103,11 @@ def digest(observations: Observations) -> str:
 
 
 @pytest.fixture(scope="module")
-def episodes(condition: str) -> list[tuple[np.ndarray, Observations]]:
+def episodes(spec: EpisodeSpec) -> list[tuple[np.ndarray, Observations]]:
     """The expert's episodes of SEEDS, each the first of its env."""
     played = []
     for seed in SEEDS:
-        env = make_one(condition)
+        env = make_one(spec)
         played.append(play_expert(env, seed))
         env.close()
     assert len(played[0][0]) != len(played[1][0])
@@ -101,9 +115,9 @@ def episodes(condition: str) -> list[tuple[np.ndarray, Observations]]:
 
 
 @pytest.fixture
-def used_env(condition: str) -> Iterator[BombEnv]:
+def used_env(spec: EpisodeSpec) -> Iterator[BombEnv]:
     """An env in which an episode was broken off with a stone in the air, and one with the arm astray."""
-    env = make_one(condition)
+    env = make_one(spec)
     env.reset(seed=3)
     for _ in range(15):
         env.step(expert_action(env.privileged_state()))
@@ -119,16 +133,19 @@ def test_earlier_episodes_leave_nothing_behind(
 ) -> None:
     for seed, (actions, expected) in zip((*SEEDS, *SEEDS), (*episodes, *episodes), strict=True):
         observation, _ = used_env.reset(seed=seed)
-        observations = [flat(observation), *(flat(used_env.step(action)[0]) for action in actions)]
+        observations = [flat(observation, used_env.task_description)]
+        for action in actions:
+            observation = used_env.step(action)[0]
+            observations.append(flat(observation, used_env.task_description))
         assert_same(observations, expected)
 
 
 def test_a_fresh_process_gives_the_same_bits(
-    condition: str, episodes: list[tuple[np.ndarray, Observations]]
+    spec: EpisodeSpec, episodes: list[tuple[np.ndarray, Observations]]
 ) -> None:
     script = (
-        "from test_independence import make_one, SEEDS, digest, play_expert\n"
-        f"env = make_one({condition!r})\n"
+        "from test_independence import make_one, EpisodeSpec, SEEDS, digest, play_expert\n"
+        f"env = make_one({spec!r})\n"
         "print([digest(play_expert(env, seed)[1]) for seed in reversed(SEEDS)])\n"
     )
     run = subprocess.run(
@@ -147,13 +164,13 @@ def test_a_fresh_process_gives_the_same_bits(
     [(1, False, "forkserver"), (2, False, "forkserver"), (2, True, "forkserver"), (2, True, "spawn")],
 )
 def test_vector_envs_give_the_same_bits(
-    condition: str,
+    spec: EpisodeSpec,
     episodes: list[tuple[np.ndarray, Observations]],
     num_envs: int,
     use_async: bool,
     context: str,
 ) -> None:
-    envs = LazyVectorEnv([partial(make_one, condition)] * num_envs, use_async=use_async, context=context)
+    envs = LazyVectorEnv([partial(make_one, spec)] * num_envs, use_async=use_async, context=context)
     try:
         played = play_together(envs, [actions for actions, _ in episodes[:num_envs]])
     finally:
