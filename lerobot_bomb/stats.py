@@ -3,13 +3,17 @@
 Shapes: `R` frames, `E` episodes.
 """
 
+from collections.abc import Sequence
 from dataclasses import dataclass
-from math import comb, sqrt
+from math import ceil, comb, sqrt
 from statistics import NormalDist
 
 import numpy as np
 
 NUM_RESAMPLES = 2000
+NUM_BCA_RESAMPLES = 9999
+Z_95 = NormalDist().inv_cdf(0.975)
+POWER = 0.8  # of the numbers of episodes that are asked for
 
 
 def wilson_interval(successes: int, n: int) -> tuple[float, float]:
@@ -22,10 +26,9 @@ def wilson_interval(successes: int, n: int) -> tuple[float, float]:
     """
     if n < 1 or not 0 <= successes <= n:
         raise ValueError(f"need 0 <= successes <= n and n >= 1, got successes={successes}, n={n}")
-    z = NormalDist().inv_cdf(0.975)
     rate = successes / n
-    center = (rate + z**2 / (2 * n)) / (1 + z**2 / n)
-    half = z / (1 + z**2 / n) * sqrt(rate * (1 - rate) / n + z**2 / (4 * n**2))
+    center = (rate + Z_95**2 / (2 * n)) / (1 + Z_95**2 / n)
+    half = Z_95 / (1 + Z_95**2 / n) * sqrt(rate * (1 - rate) / n + Z_95**2 / (4 * n**2))
     return max(0.0, center - half), min(1.0, center + half)
 
 
@@ -45,12 +48,125 @@ def mcnemar_p_value(only_first: int, only_second: int) -> float:
     return min(1.0, 2 * tail / 2**num_discordant)
 
 
+@dataclass(frozen=True)
+class PairedCounts:
+    """How often which arm of paired episodes succeeded."""
+
+    both: int
+    only_first: int
+    only_second: int
+    neither: int
+
+    @classmethod
+    def of(cls, first_E: Sequence[bool], second_E: Sequence[bool]) -> "PairedCounts":
+        """From the successes of the same episodes."""
+        pairs = list(zip(first_E, second_E, strict=True))
+        return cls(
+            *(pairs.count(pair) for pair in ((True, True), (True, False), (False, True), (False, False)))
+        )
+
+    @property
+    def n(self) -> int:
+        return self.both + self.only_first + self.only_second + self.neither
+
+    @property
+    def first(self) -> int:
+        """Successes of the first arm."""
+        return self.both + self.only_first
+
+    @property
+    def second(self) -> int:
+        """Successes of the second arm."""
+        return self.both + self.only_second
+
+    @property
+    def difference(self) -> float:
+        """The second arm's rate minus the first one's."""
+        return (self.only_second - self.only_first) / self.n
+
+    @property
+    def p_value(self) -> float:
+        """Of the exact McNemar test."""
+        return mcnemar_p_value(self.only_first, self.only_second)
+
+
+def paired_difference_interval(counts: PairedCounts) -> tuple[float, float]:
+    """95 % interval of the second rate minus the first, in [-1, 1]; of one episode, too.
+
+    Source: Newcombe (1998), "Improved confidence intervals for the difference between binomial proportions
+    based on paired data", method 10: Wilson's intervals of both rates, joined by their correlation.
+
+    Raises:
+        ValueError: there are no pairs.
+    """
+    n, first, second = counts.n, counts.first, counts.second
+    (low_1, high_1), (low_2, high_2) = wilson_interval(first, n), wilson_interval(second, n)
+    rate_1, rate_2 = first / n, second / n
+    margins = first * second * (n - first) * (n - second)
+    excess = counts.both * counts.neither - counts.only_first * counts.only_second
+    if excess > 0:  # corrected for continuity, not beyond 0
+        excess = max(0.0, excess - n / 2)
+    correlation = excess / sqrt(margins) if margins else 0.0
+
+    def half(a: float, b: float) -> float:
+        return sqrt(max(0.0, a**2 - 2 * correlation * a * b + b**2))
+
+    low = half(rate_2 - low_2, high_1 - rate_1)
+    high = half(high_2 - rate_2, rate_1 - low_1)
+    return counts.difference - low, counts.difference + high
+
+
+def episodes_to_tell_apart(counts: PairedCounts) -> int | None:
+    """Pairs of episodes in which a difference as large as the one that was seen is found significant.
+
+    At a level of 5 %, two-sided, with a power of 80 %; None where no difference was seen.
+    Source: Miettinen (1968), "The matched pairs design in the case of all-or-none responses", large samples.
+    """
+    if counts.difference == 0:
+        return None
+    discordant = (counts.only_first + counts.only_second) / counts.n
+    z_power = NormalDist().inv_cdf(POWER)
+    spread = Z_95 * sqrt(discordant) + z_power * sqrt(discordant - counts.difference**2)
+    return ceil((spread / counts.difference) ** 2)
+
+
+def holm(p_values: Sequence[float]) -> list[float]:
+    """P-values adjusted for as many tests (Holm, 1979): that of a family of which none may err at 5 %."""
+    order = sorted(range(len(p_values)), key=p_values.__getitem__)
+    adjusted, largest = [0.0] * len(p_values), 0.0
+    for place, i in enumerate(order):
+        largest = max(largest, min(1.0, (len(p_values) - place) * p_values[i]))
+        adjusted[i] = largest
+    return adjusted
+
+
+def bca_interval(values_E: np.ndarray) -> tuple[float, float] | None:
+    """95 % bootstrap interval of a mean over E episodes, corrected for bias and skew (BCa, Efron 1987).
+
+    None for fewer than two; the draws are always the same.
+    """
+    if len(values_E) < 2:
+        return None
+    if np.ptp(values_E) == 0:  # the correction for skew is not defined
+        return float(values_E[0]), float(values_E[0])
+    from scipy.stats import bootstrap  # half a second, which the simulators' workers do not need
+
+    rng = np.random.default_rng(0)
+    interval = bootstrap((values_E,), np.mean, n_resamples=NUM_BCA_RESAMPLES, method="BCa", rng=rng)
+    return float(interval.confidence_interval.low), float(interval.confidence_interval.high)
+
+
 def bootstrap_interval(sums_E: np.ndarray, counts_E: np.ndarray) -> tuple[float, float] | None:
     """95 % percentile bootstrap interval of sum / count over E episodes; None for fewer than two.
 
     Episodes are drawn, not frames: the frames of one resemble each other. The draws are always the same.
     """
     return None if len(sums_E) < 2 else _percentiles(_resampled_means(sums_E, counts_E))
+
+
+def format_bounds(interval: tuple[float, float] | None, form: str) -> str:
+    """' [low, high]', each in this form; nothing for a single episode."""
+    return "" if interval is None else f" [{interval[0]:{form}}, {interval[1]:{form}}]"
 
 
 def paired_bootstrap_interval(

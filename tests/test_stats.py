@@ -1,13 +1,26 @@
 import numpy as np
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from statsmodels.stats.contingency_tables import mcnemar
+from statsmodels.stats.multitest import multipletests
+from statsmodels.stats.proportion import proportion_confint
 
 from lerobot_bomb.stats import (
+    PairedCounts,
+    bca_interval,
     bootstrap_interval,
+    episodes_to_tell_apart,
     format_rate,
+    holm,
     mcnemar_p_value,
     paired_bootstrap_interval,
+    paired_difference_interval,
     wilson_interval,
 )
+
+COUNTS = st.integers(0, 60)
+PAIRED = st.builds(PairedCounts, COUNTS, COUNTS, COUNTS, COUNTS).filter(lambda counts: counts.n > 0)
 
 
 @pytest.mark.parametrize(
@@ -44,3 +57,90 @@ def test_a_paired_interval_is_that_of_the_differences() -> None:
     paired = paired_bootstrap_interval((first, counts), (first + differences, counts))
     assert paired == pytest.approx(bootstrap_interval(differences, counts))
     assert paired_bootstrap_interval((first[:1], counts[:1]), (first[:1], counts[:1])) is None
+
+
+# Against statsmodels
+
+
+@given(st.integers(1, 500), st.data())
+def test_wilson_interval_equals_statsmodels(n: int, data: st.DataObject) -> None:
+    successes = data.draw(st.integers(0, n))
+    expected = proportion_confint(successes, n, method="wilson")
+    assert wilson_interval(successes, n) == pytest.approx(expected, abs=1e-12)
+
+
+@given(PAIRED)
+def test_mcnemar_equals_statsmodels(counts: PairedCounts) -> None:
+    table = [[counts.both, counts.only_first], [counts.only_second, counts.neither]]
+    assert counts.p_value == pytest.approx(mcnemar(table, exact=True).pvalue, abs=1e-12)
+
+
+@given(st.lists(st.floats(0, 1), min_size=1, max_size=12))
+def test_holm_equals_statsmodels(p_values: list[float]) -> None:
+    assert holm(p_values) == pytest.approx(multipletests(p_values, method="holm")[1], abs=1e-12)
+
+
+# Intervals of differences
+
+
+@given(PAIRED)
+def test_a_paired_difference_lies_in_its_interval_and_turns_around_with_its_arms(
+    counts: PairedCounts,
+) -> None:
+    low, high = paired_difference_interval(counts)
+    assert -1 <= low <= counts.difference <= high <= 1
+    other = PairedCounts(counts.both, counts.only_second, counts.only_first, counts.neither)
+    assert paired_difference_interval(other) == pytest.approx((-high, -low), abs=1e-12)
+
+
+def drawn(n: int, shares: tuple[float, float, float, float], number: int) -> list[PairedCounts]:
+    """Tables of n pairs."""
+    draws = np.random.default_rng(0).multinomial(n, shares, size=number)
+    return [PairedCounts(*map(int, draw)) for draw in draws]
+
+
+@pytest.mark.parametrize(
+    ("n", "shares"),
+    [(50, (0.5, 0.2, 0.1, 0.2)), (200, (0.9, 0.06, 0.01, 0.03)), (400, (0.3, 0.1, 0.1, 0.5))],
+)
+def test_the_interval_of_a_paired_difference_holds_the_truth_in_95_of_100(
+    n: int, shares: tuple[float, float, float, float]
+) -> None:
+    tables = drawn(n, shares, 4000)
+    truth = shares[2] - shares[1]
+    intervals = [paired_difference_interval(table) for table in tables]
+    # a little wider than need be where few pairs have one of the outcomes
+    assert 0.94 < np.mean([low <= truth <= high for low, high in intervals]) < 0.97
+
+
+@pytest.mark.parametrize(("n", "rate"), [(40, 0.5), (100, 0.9), (300, 0.97)])
+def test_wilsons_interval_holds_the_truth_in_95_of_100_on_average(n: int, rate: float) -> None:
+    # counts are whole numbers, so the coverage swings around 95 % with the rate: an average over rates nearby
+    rng = np.random.default_rng(0)
+    rates = rng.uniform(rate - 0.02, rate + 0.02, 4000)
+    intervals = [wilson_interval(int(successes), n) for successes in rng.binomial(n, rates)]
+    covered = [low <= truth <= high for (low, high), truth in zip(intervals, rates, strict=True)]
+    assert np.mean(covered) == pytest.approx(0.95, abs=0.01)
+
+
+def test_a_bca_interval_of_a_skewed_mean_holds_the_truth_nearly_as_often() -> None:
+    samples = np.random.default_rng(0).exponential(size=(400, 60))
+    intervals = [bca_interval(sample) for sample in samples]
+    assert np.mean([low <= 1.0 <= high for low, high in intervals]) > 0.92
+
+
+def test_a_bca_interval_of_equal_numbers_is_that_number_and_of_one_none() -> None:
+    assert bca_interval(np.full(7, 0.25)) == (0.25, 0.25)
+    assert bca_interval(np.ones(1)) is None
+
+
+# How many
+
+
+def test_as_many_pairs_as_are_asked_for_find_the_difference_in_80_of_100() -> None:
+    shares = (0.6, 0.15, 0.05, 0.2)
+    n = episodes_to_tell_apart(PairedCounts(600, 150, 50, 200))
+    assert n is not None
+    found = [table.p_value < 0.05 for table in drawn(n, shares, 2000)]
+    assert 0.70 < np.mean(found) < 0.85  # the exact test is a little stricter than the formula's
+    assert episodes_to_tell_apart(PairedCounts(5, 3, 3, 1)) is None

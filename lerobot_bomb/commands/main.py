@@ -18,6 +18,7 @@ COMMANDS = {
     "record": "record the scripted expert as a LeRobotDataset",
     "convert": "published demonstrations as a LeRobotDataset",
     "results": "summarise files written by --env.results_path",
+    "compare": "two policies on the same episodes: difference, interval, test",
     "eval": "lerobot-eval, which also writes the executed actions to a file",
     "smoothness": "second and third differences of executed actions, of demonstrations and evaluations",
     "offline-metrics": "loss, accuracy and L1 of a checkpoint on recorded frames, beside trivial predictors",

@@ -5,6 +5,8 @@ from collections.abc import Mapping
 from statistics import mean, median
 from typing import Any
 
+import numpy as np
+
 from lerobot_bomb.bomb.board import BOARD, COLORS, task_id
 from lerobot_bomb.bomb.episode import PROTOCOL_VERSION, TASK_VERSION, EpisodeSpec, Failure, Stage
 from lerobot_bomb.bomb.observation import CAMERAS, MAX_IMAGE_SIZE, MIN_IMAGE_SIZE, RENDER_PRESETS
@@ -26,9 +28,11 @@ from lerobot_bomb.evaluation.result_kind import (
     NO_VALUE,
     NOT_RECORDED,
     Measure,
+    Pair,
     ResultKind,
     describe_numbers,
 )
+from lerobot_bomb.stats import bca_interval, format_bounds
 
 OLD_VERSION = "1.0"  # whose lines say less
 NUM_TASKS = len(COLORS) * BOARD.num_lines**2
@@ -93,6 +97,18 @@ def median_error_mm(rows: list[Row]) -> float | None:
 def _placement_error(rows: list[Row]) -> str:
     error_mm = median_error_mm(rows)
     return NO_VALUE if error_mm is None else f"{error_mm:.1f} mm"
+
+
+def _error_change(pairs: list[Pair]) -> str:
+    """'placement error +1.2 mm [+0.3, +2.0] where both put it down (40 pairs)'; '' where there are none."""
+    both = [pair for pair in pairs if all(row["failure"] in PUT_DOWN for row in pair)]
+    if not both or any(row["target"] is None for pair in both for row in pair):
+        return ""
+    changes_mm = np.array(
+        [after["placement_error_mm"] - before["placement_error_mm"] for before, after in both]
+    )
+    change = f"placement error {changes_mm.mean():+.1f} mm{format_bounds(bca_interval(changes_mm), '+.1f')}"
+    return f"{change} where both put the stone down ({len(both)} pairs)"
 
 
 def _progress(rows: list[Row]) -> str:
@@ -189,6 +205,7 @@ BOMB_LINES = ResultKind(
     benchmark=f"BOMB, task version {TASK_VERSION}",
     environment=environment_of_episode,
     eval_flags=eval_flags_of,
+    describe_change=_error_change,
     measures=[
         Measure("moves made", _progress, "mean share of an episode's moves"),
         Measure("placement error", _placement_error, "median of the stones that were put down"),

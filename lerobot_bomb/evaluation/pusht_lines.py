@@ -25,7 +25,7 @@ from lerobot_bomb.pusht.episode import (
     PushTFailure,
     PushTSpec,
 )
-from lerobot_bomb.stats import bootstrap_interval, paired_bootstrap_interval
+from lerobot_bomb.stats import bca_interval, bootstrap_interval, format_bounds
 
 
 def is_share(value: Any) -> bool:
@@ -79,20 +79,14 @@ def _values(rows: list[Row], name: str) -> np.ndarray:
 
 def _mean(rows: list[Row], name: str) -> str:
     values = _values(rows, name)
-    return f"{values.mean():.3f}{_bounds(bootstrap_interval(values, np.ones(len(values))), '.3f')}"
+    return f"{values.mean():.3f}{format_bounds(bootstrap_interval(values, np.ones(len(values))), '.3f')}"
 
 
 def _coverage_change(pairs: list[Pair]) -> str:
     """'max coverage -0.120 [-0.200, -0.040]': the mean change of (unperturbed, perturbed) pairs."""
     before, after = (_values(rows, "max_coverage") for rows in map(list, zip(*pairs, strict=True)))
-    ones = np.ones(len(pairs))
-    interval = paired_bootstrap_interval((before, ones), (after, ones))
-    return f"max coverage {(after - before).mean():+.3f}{_bounds(interval, '+.3f')}"
-
-
-def _bounds(interval: tuple[float, float] | None, form: str) -> str:
-    """' [low, high]'; nothing for a single episode."""
-    return "" if interval is None else f" [{interval[0]:{form}}, {interval[1]:{form}}]"
+    interval = bca_interval(after - before)
+    return f"max coverage {(after - before).mean():+.3f}{format_bounds(interval, '+.3f')}"
 
 
 PUSHT_LINES = ResultKind(

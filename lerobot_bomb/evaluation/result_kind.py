@@ -11,7 +11,7 @@ NOT_RECORDED = "not recorded"
 NO_VALUE = "-"  # of a measure that these episodes do not have
 MAX_RUNS = 10  # of numbers, in a heading
 
-type Pair = tuple[Row, Row]  # the same episode unperturbed and perturbed
+type Pair = tuple[Row, Row]  # one episode unperturbed and perturbed, or of two policies
 
 
 @dataclass(frozen=True)
@@ -46,7 +46,7 @@ class ResultKind:
     environment: Callable[[Row], Environment | None]
     eval_flags: Callable[[list[Row]], list[str]]  # of lerobot-eval, for the environment and tasks of episodes
     measures: Sequence[Measure]
-    # what perturbations changed in pairs, beside successes
+    # what the second rows of pairs have beside other successes; '' where there is nothing to say
     describe_change: Callable[[list[Pair]], str] | None = None
     # of a spec, what lines of earlier releases do not have and then have by default
     added_spec_fields: Mapping[str, Check] = field(default_factory=dict)

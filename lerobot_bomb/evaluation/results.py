@@ -71,10 +71,10 @@ def _pair_line(condition: str, pairs: list[Pair]) -> str:
     won = sum(row["is_success"] and not nominal["is_success"] for nominal, row in pairs)
     p_value = mcnemar_p_value(lost, won)
     describe_change = kind_of(pairs[0][0]).describe_change
-    change = f"; {describe_change(pairs)}" if describe_change else ""
+    change = describe_change(pairs) if describe_change else ""
     return (
         f"  {condition}: {len(pairs)} pairs, {lost} lost, {won} won, p = {p_value:.2g} (exact McNemar test)"
-        f"{change}"
+        f"{'; ' * bool(change)}{change}"
     )
 
 

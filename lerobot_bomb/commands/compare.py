@@ -1,0 +1,55 @@
+"""``lerobot-bomb compare``: two policies on the same episodes."""
+
+import argparse
+import sys
+from pathlib import Path
+
+from lerobot_bomb.commands.arguments import path_flag
+from lerobot_bomb.evaluation.comparison import compare
+from lerobot_bomb.evaluation.result_lines import check_any, read_lines
+
+MISSED = 2  # exit code where a bar is not reached; 1 is an error
+
+
+def add_compare_arguments(parser: argparse.ArgumentParser) -> None:
+    """Declare the arguments of ``lerobot-bomb compare``."""
+    add = parser.add_argument
+    add("a", type=path_flag, metavar="A", help="file of --env.results_path")
+    add("b", type=path_flag, metavar="B", help="the same of another policy, on the same seeds")
+    unless = f"exit code {MISSED} unless, under every condition and with 95 %% confidence, B's success is"
+    add("--min_difference", type=_points, metavar="POINTS", help=f"{unless} higher by POINTS of 100 or more")
+    add("--non_inferior", type=_points, metavar="POINTS", help=f"{unless} lower by less than POINTS")
+
+
+def _points(text: str) -> float:
+    try:
+        points = float(text)
+    except ValueError:
+        points = -1.0
+    if not 0 <= points <= 100:
+        raise argparse.ArgumentTypeError(f"{text!r} must be points of a success rate, 0..100")
+    return points
+
+
+def run_compare(args: argparse.Namespace) -> int:
+    """Print both rates and their difference, by condition; check what was asked for."""
+    comparisons = compare(_read(args.a), _read(args.b))
+    print(*comparisons.lines(), sep="\n")
+    low = 100 * comparisons.lowest
+    verdicts = []
+    if (bar := args.min_difference) is not None:
+        verdicts.append((f"--min_difference={bar:g}: B is better by {bar:g} points or more", low >= bar))
+    if (bar := args.non_inferior) is not None:
+        verdicts.append((f"--non_inferior={bar:g}: B is worse by less than {bar:g} points", low > -bar))
+    for claim, is_shown in verdicts:
+        print(f"{claim}: {'shown' if is_shown else 'not shown'} (lowest end of an interval {low:+.1f})")
+    return 0 if all(is_shown for _, is_shown in verdicts) else MISSED
+
+
+def _read(path: Path) -> list:
+    rows, damages = read_lines(path)
+    for damage in damages[:1]:
+        more = f" (and {len(damages) - 1} more such lines)" if len(damages) > 1 else ""
+        print(f"{damage}; not counted{more}", file=sys.stderr)
+    check_any(path, rows)
+    return rows

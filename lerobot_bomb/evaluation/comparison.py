@@ -1,0 +1,170 @@
+"""Two policies on the same episodes: which is better, by how much, and is it certain?"""
+
+import json
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+
+from lerobot_bomb.envs.results import Row
+from lerobot_bomb.evaluation.result_groups import describe_policy, groups_of, settings_of
+from lerobot_bomb.evaluation.result_kind import NOT_RECORDED, Pair
+from lerobot_bomb.evaluation.result_lines import kind_of
+from lerobot_bomb.stats import (
+    PairedCounts,
+    episodes_to_tell_apart,
+    format_rate,
+    holm,
+    paired_difference_interval,
+)
+
+POLICY = "policy"  # the one setting that the episodes of a pair may differ in
+
+
+@dataclass(frozen=True)
+class Comparison:
+    """The episodes of one condition that both policies played."""
+
+    condition: str
+    pairs: list[Pair]  # of the first policy and of the second
+    p_value: float  # adjusted for the number of conditions
+
+    @property
+    def counts(self) -> PairedCounts:
+        """How often which of the two succeeded."""
+        first, second = ([row["is_success"] for row in rows] for rows in zip(*self.pairs, strict=True))
+        return PairedCounts.of(first, second)
+
+    @property
+    def interval(self) -> tuple[float, float]:
+        """95 % interval of the second rate minus the first."""
+        return paired_difference_interval(self.counts)
+
+    def lines(self) -> list[str]:
+        """The comparison as text, a line each."""
+        counts, (low, high) = self.counts, self.interval
+        needed = episodes_to_tell_apart(counts)
+        more = f"; {needed} pairs tell such a difference apart" if needed and low <= 0 <= high else ""
+        describe_change = kind_of(self.pairs[0][0]).describe_change
+        change = describe_change(self.pairs) if describe_change else ""
+        return [
+            f"A          {format_rate(counts.first, counts.n)}",
+            f"B          {format_rate(counts.second, counts.n)}",
+            f"B - A      {100 * counts.difference:+.1f} points [{100 * low:+.1f}, {100 * high:+.1f}]; "
+            f"A alone succeeded in {counts.only_first}, B alone in {counts.only_second} of {counts.n} pairs, "
+            f"p = {self.p_value:.2g}{more}",
+            *([f"           {change}"] if change else []),
+        ]
+
+
+@dataclass(frozen=True)
+class Comparisons:
+    """All that two sets of episodes have in common."""
+
+    policies: tuple[str, str]
+    conditions: list[Comparison]
+    num_unpaired: tuple[int, int]  # episodes that the other policy did not play
+
+    @property
+    def lowest(self) -> float:
+        """The lowest end of all intervals: the second policy is better by that much under every condition."""
+        return min(each.interval[0] for each in self.conditions)
+
+    def lines(self) -> list[str]:
+        """The comparisons as text, a line each."""
+        lines = [f"{name}: {policy}" for name, policy in zip("AB", self.policies, strict=True)]
+        for each in self.conditions:
+            lines += [f"{each.condition}: {len(each.pairs)} pairs", *(f"  {line}" for line in each.lines())]
+        if any(self.num_unpaired):
+            a, b = self.num_unpaired
+            lines.append(f"not compared, for the other did not play them: {a} episodes of A, {b} of B")
+        notes = "rates: 95 % Wilson intervals; B - A: Newcombe's for pairs; p: exact McNemar test"
+        adjusted = f", adjusted for {len(self.conditions)} conditions (Holm)"
+        return [*lines, notes + adjusted * (len(self.conditions) > 1)]
+
+
+def compare(first: list[Row], second: list[Row]) -> Comparisons:
+    """Pair the episodes of two policies.
+
+    Raises:
+        ValueError: either are of several policies, or there is no pair; it says what they differ in.
+    """
+    policies = _only_policy("the first", first), _only_policy("the second", second)
+    pairs = list(_pairs(first, second))
+    if not pairs:
+        raise ValueError(f"no episode was played by both: {_why_none(first, second)}")
+    return Comparisons(
+        policies=policies,
+        conditions=_by(pairs, lambda row: _label(row, pairs)),
+        num_unpaired=(len(_episodes(first)) - len(pairs), len(_episodes(second)) - len(pairs)),
+    )
+
+
+def _by(pairs: list[Pair], label: Callable[[Row], str]) -> list[Comparison]:
+    of_label: dict[str, list[Pair]] = {}
+    for pair in pairs:
+        of_label.setdefault(label(pair[0]), []).append(pair)
+    adjusted = holm([_p_value(of) for of in of_label.values()])
+    return [Comparison(name, of, p) for (name, of), p in zip(of_label.items(), adjusted, strict=True)]
+
+
+def _p_value(pairs: list[Pair]) -> float:
+    return Comparison("", pairs, 1.0).counts.p_value
+
+
+def _label(row: Row, pairs: list[Pair]) -> str:
+    """The condition, and the suite where there are several."""
+    suites = {first["spec"].get("suite") for first, _ in pairs}
+    condition = row["spec"]["perturbations"]
+    return f"{row['spec']['suite']}, {condition}" if len(suites) > 1 else condition
+
+
+def _only_policy(name: str, rows: list[Row]) -> str:
+    settings = {settings_of(row)[POLICY] for row in rows}
+    if len(settings) > 1:
+        described = sorted({describe_policy(row) for row in rows})
+        raise ValueError(
+            f"{name} results are of {len(settings)} policies ({'; '.join(described)}): give "
+            "--env.results_path another file for each"
+        )
+    return describe_policy(rows[0])
+
+
+def _pairs(first: list[Row], second: list[Row]) -> Iterator[Pair]:
+    candidates: dict[str, list[Row]] = {}
+    for row in _episodes(second):
+        candidates.setdefault(_spec(row), []).append(row)
+    for row in _episodes(first):
+        of_spec = candidates.get(_spec(row), [])
+        if match := next((other for other in of_spec if not _apart([row], [other])), None):
+            of_spec.remove(match)
+            yield row, match
+
+
+def _episodes(rows: list[Row]) -> list[Row]:
+    """Each once: of an episode that was run again, the last one."""
+    return [row for group in groups_of(rows) for row in group.rows]
+
+
+def _spec(row: Row) -> str:
+    return json.dumps(row["spec"], sort_keys=True)
+
+
+def _apart(first: list[Row], second: list[Row]) -> list[str]:
+    """Names of the settings that none of the first have in common with any of the second.
+
+    What was not recorded keeps no episodes apart: an expert is shown no image, so OpenGL drew none.
+    """
+    a, b = (_values_of([settings_of(row) for row in rows]) for rows in (first, second))
+    names = [name for name in a if name != POLICY]
+    return [
+        name for name in names if not a[name] & b.get(name, set()) and NOT_RECORDED not in a[name] | b[name]
+    ]
+
+
+def _values_of(settings: list[dict[str, str]]) -> dict[str, set[str]]:
+    return {name: {of.get(name, NOT_RECORDED) for of in settings} for name in settings[0]}
+
+
+def _why_none(first: list[Row], second: list[Row]) -> str:
+    if apart := _apart(first, second):
+        return f"they differ in {', '.join(apart)}"
+    return "seeds, conditions or tasks have nothing in common; evaluate both with the same --seed and flags"

@@ -1,0 +1,135 @@
+"""``lerobot-bomb compare``: two policies on the same episodes."""
+
+import json
+from pathlib import Path
+from typing import Any
+
+import pytest
+from test_results import ACT, FDVLA, values
+
+from lerobot_bomb.commands.compare import MISSED
+from lerobot_bomb.commands.main import main
+
+type Printed = pytest.CaptureFixture[str]
+
+
+def write(path: Path, failures: list[str | None], condition: str = "none", **other: Any) -> Path:
+    """A line for each seed from 0 on, appended to the file."""
+    with path.open("a") as file:
+        for seed, failure in enumerate(failures):
+            line = values(seed, failure, spec={"perturbations": condition}, **other)
+            file.write(json.dumps(line) + "\n")
+    return path
+
+
+@pytest.fixture
+def a(tmp_path: Path) -> Path:
+    return tmp_path / "a.jsonl"
+
+
+@pytest.fixture
+def b(tmp_path: Path) -> Path:
+    return tmp_path / "b.jsonl"
+
+
+def compare(*flags: str | Path) -> int:
+    return main(["compare", *map(str, flags)])
+
+
+def test_pairs_are_counted_by_condition(a: Path, b: Path, capsys: Printed) -> None:
+    for condition, lost in (("none", 1), ("camera:3", 8)):
+        write(a, [None] * 12, condition)
+        write(b, ["dropped"] * lost + [None] * (10 - lost), condition, policy=FDVLA)
+    assert compare(a, b) == 0
+    out = capsys.readouterr().out
+    assert "A: act outputs/act" in out and "B: fdvla me/fdvla" in out
+    nominal, perturbed = out.split("camera:3: 10 pairs")
+    assert "none: 10 pairs" in nominal and "B - A      -10.0 points" in nominal
+    assert "A alone succeeded in 8, B alone in 0 of 10 pairs, p = 0.016" in perturbed  # 2 * 2 / 256
+    assert "not compared, for the other did not play them: 4 episodes of A, 0 of B" in out
+    assert "pairs tell such a difference apart" in nominal
+
+
+def test_the_exit_code_says_whether_a_difference_is_shown(a: Path, b: Path, capsys: Printed) -> None:
+    write(a, ["dropped"] * 60 + [None] * 40)
+    write(b, ["dropped"] * 10 + [None] * 90, policy=FDVLA)
+    assert compare(a, b, "--min_difference=35", "--non_inferior=5") == 0  # +50 [+39, +59]
+    assert compare(a, b, "--min_difference=45") == MISSED
+    assert "--min_difference=45: B is better by 45 points or more: not shown" in capsys.readouterr().out
+    assert compare(b, a, "--non_inferior=65") == 0
+    assert compare(b, a, "--non_inferior=55") == MISSED
+
+
+def test_every_condition_must_reach_the_bar(a: Path, b: Path) -> None:
+    write(a, [None] * 100)
+    write(b, [None] * 100, policy=FDVLA)
+    assert compare(a, b, "--non_inferior=5") == 0
+    write(a, [None] * 100, "light:3")
+    write(b, ["dropped"] * 5 + [None] * 95, "light:3", policy=FDVLA)
+    assert compare(a, b, "--non_inferior=5") == MISSED
+
+
+def test_what_is_measured_is_compared_where_both_have_it(a: Path, b: Path, capsys: Printed) -> None:
+    write(a, ["never_reached", *[None] * 4], error=1.0)
+    write(b, [None] * 5, error=3.5, policy=FDVLA)
+    assert compare(a, b) == 0
+    expected = "placement error +2.5 mm [+2.5, +2.5] where both put the stone down (4 pairs)"
+    assert expected in capsys.readouterr().out
+
+
+def test_an_episode_that_was_run_again_counts_once(a: Path, b: Path, capsys: Printed) -> None:
+    write(a, ["dropped"] * 3)
+    write(a, [None] * 3)
+    write(b, [None] * 3, policy=FDVLA)
+    assert compare(a, b) == 0
+    out = capsys.readouterr().out
+    assert "none: 3 pairs" in out and "B - A      +0.0 points" in out
+
+
+def test_an_expert_without_images_compares_with_a_policy_that_sees_some(
+    a: Path, b: Path, capsys: Printed
+) -> None:
+    write(a, [None] * 3, opengl_vendor=None, opengl_renderer=None)
+    write(b, [None] * 3, policy=FDVLA)
+    assert compare(a, b) == 0
+    assert "none: 3 pairs" in capsys.readouterr().out
+
+
+@pytest.mark.parametrize(
+    ("other", "message"),
+    [
+        ({"image_size": 96}, "they differ in image_size"),
+        ({"mujoco_version": "3.9.0", "opengl_renderer": "swrast"}, "they differ in MuJoCo, OpenGL"),
+        ({"condition": "light:3"}, "have nothing in common; evaluate both with the same --seed and flags"),
+    ],
+)
+def test_without_common_episodes_it_says_what_differs(
+    a: Path, b: Path, other: dict[str, Any], message: str, capsys: Printed
+) -> None:
+    write(a, [None] * 3)
+    write(b, [None] * 3, policy=FDVLA, **other)
+    assert compare(a, b) == 1
+    assert message in capsys.readouterr().err
+
+
+def test_several_policies_in_one_file_are_refused(a: Path, b: Path, capsys: Printed) -> None:
+    write(a, [None] * 3)
+    write(a, [None] * 3, policy=FDVLA)
+    write(b, [None] * 3, policy=ACT)
+    assert compare(a, b) == 1
+    assert "the first results are of 2 policies (act outputs/act" in capsys.readouterr().err
+
+
+def test_damaged_lines_are_told_and_not_counted(a: Path, b: Path, capsys: Printed) -> None:
+    write(a, [None] * 3)
+    write(b, [None] * 3, policy=FDVLA)
+    a.write_text(a.read_text() + '{"spec": {"se')
+    assert compare(a, b) == 0
+    assert f"{a}:4: not an episode result" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("points", ["-1", "101", "five", "nan"])
+def test_points_that_cannot_be_are_refused(a: Path, points: str, capsys: Printed) -> None:
+    with pytest.raises(SystemExit):
+        compare(a, a, f"--min_difference={points}")
+    assert "must be points of a success rate, 0..100" in capsys.readouterr().err
