@@ -1,5 +1,6 @@
 """The only place that reaches into names of LeRobot, `datasets` and huggingface_hub that are not public."""
 
+import gc
 import logging
 import os
 import pickle
@@ -123,13 +124,64 @@ def lerobot_eval_with(flags: Sequence[str], wrap: Callable[[Any, Any], Any]) -> 
     """Run lerobot-eval with these flags, on what `wrap(config, environments)` makes of its environments."""
     from lerobot.scripts import lerobot_eval
 
-    usual, argv = lerobot_eval.make_env, sys.argv
-    lerobot_eval.make_env = lambda config, **options: wrap(config, usual(config, **options))
+    make_env = lerobot_eval.make_env
+    _run_lerobot_eval(flags, make_env=lambda config, **options: wrap(config, make_env(config, **options)))
+
+
+class KeptPolicy:
+    """Runs lerobot-eval several times in one process; a policy stays as long as the same one is asked for.
+
+    What is random goes on from where it was when the policy had been built, so that an evaluation gives what
+    it gives in a process of its own.
+    """
+
+    def __init__(self) -> None:
+        self._asked: object = None
+        self._policy: PreTrainedPolicy | None = None
+        self._random_state: dict[str, Any] = {}
+        self.has_begun = False  # whether the last evaluation came as far as to play
+
+    def evaluate(self, flags: Sequence[str], asked: object) -> None:
+        """Run lerobot-eval, which draws no video.
+
+        `asked` is equal where it needs the policy of before, built with the same seed.
+        """
+        from lerobot.scripts import lerobot_eval
+        from lerobot.utils.random_utils import get_rng_state, set_rng_state
+
+        make_policy, evaluate_all = lerobot_eval.make_policy, lerobot_eval.eval_policy_all
+
+        def kept(**options: Any) -> PreTrainedPolicy:
+            if self._policy is None or self._asked != asked:
+                self._policy = None  # the process then holds one at a time
+                gc.collect()
+                self._policy, self._asked = make_policy(**options), asked
+                self._random_state = get_rng_state()
+            set_rng_state(self._random_state)
+            return self._policy
+
+        def without_videos(*args: Any, **options: Any) -> dict[str, Any]:
+            self.has_begun = True
+            return evaluate_all(*args, **options | {"max_episodes_rendered": 0, "videos_dir": None})
+
+        self.has_begun = False
+        _run_lerobot_eval(flags, make_policy=kept, init_logging=lambda: None, eval_policy_all=without_videos)
+
+
+def _run_lerobot_eval(flags: Sequence[str], **replaced: Any) -> None:
+    """In this process, with other functions of these names."""
+    from lerobot.scripts import lerobot_eval
+
+    usual, argv = {name: getattr(lerobot_eval, name) for name in replaced}, sys.argv
     sys.argv = ["lerobot-eval", *flags]  # which LeRobot's parser also reads elsewhere
     try:
+        for name, function in replaced.items():
+            setattr(lerobot_eval, name, function)
         lerobot_eval.main()
     finally:
-        lerobot_eval.make_env, sys.argv = usual, argv
+        sys.argv = argv
+        for name, function in usual.items():
+            setattr(lerobot_eval, name, function)
 
 
 def serve_registered_policies(

@@ -11,6 +11,7 @@ from typing import ClassVar, Self
 
 NONE = "none"
 ALL = "all"
+EACH = "each"
 MAX_LEVEL = 5
 
 
@@ -87,10 +88,33 @@ class AxisCondition:
             )
         if not perturbations:
             raise ValueError('--env.perturbations=[] names no condition; leave it out or give ["none"]')
-        conditions = [cls.parse(text) for text in perturbations]
+        conditions = [cls.parse(text) for text in cls.expand(perturbations)]
         if len(set(conditions)) < len(conditions):
             raise ValueError(f"--env.perturbations={perturbations} has a condition twice")
         return {f"{task}.{condition.key}": str(condition) for condition in conditions}
+
+    @classmethod
+    def expand(cls, perturbations: Sequence[str]) -> list[str]:
+        """Conditions; "each:3" stands for every axis at this level, "each:1-5" for every axis at each.
+
+        Raises:
+            ValueError: the levels are none of 1..MAX_LEVEL.
+        """
+        conditions: list[str] = []
+        for text in perturbations:
+            if not text.startswith(f"{EACH}:"):
+                conditions.append(text)
+                continue
+            match = re.fullmatch(rf"{EACH}:(\d)(?:-(\d))?", text)
+            low, high = (0, 0) if match is None else (int(match[1]), int(match[2] or match[1]))
+            if not 1 <= low <= high <= MAX_LEVEL:
+                raise ValueError(
+                    f"--env.perturbations={text!r}: write {EACH}:LEVEL or {EACH}:LOW-HIGH, levels of "
+                    f"1..{MAX_LEVEL}, lowest first; it stands for every axis at each of them"
+                )
+            levels = range(low, high + 1)
+            conditions += [f"{axis}:{level}" for axis in nuisances_of(cls.axes) for level in levels]
+        return conditions
 
     def __str__(self) -> str:
         """As `parse` reads it, the same for all ways to write the same condition."""

@@ -326,3 +326,11 @@ def test_a_perturbed_arm_is_compared_with_the_same_episodes_unperturbed(
 def test_a_folder_is_no_results_file(tmp_path: Path) -> None:
     with pytest.raises(ValueError, match="is a folder; name a results file in it"):
         read_results(tmp_path)
+
+
+def test_a_file_of_something_else_is_told_from_an_unfinished_one(
+    path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    path.write_text('{"type": "act"}\nnonsense\n')
+    assert main(["results", str(path)]) == 1
+    assert "is no results file; name one that --env.results_path" in capsys.readouterr().err

@@ -38,7 +38,7 @@ from lerobot_env_bomb.fetch_files import check_robot
 class BombEnvConfig(EnvConfig):
     """Flags of ``--env.type=bomb``; every check happens before an environment is built."""
 
-    # suite: place, object, spatial, or all
+    # suite: place, object, spatial, goal, long, or all
     task: str | None = "place"
     # numbered tasks of the suite, of place 25 x colour + 5 x row + column with black = 0, white = 1; unset
     # draws one per episode

@@ -51,5 +51,5 @@ def _read(path: Path) -> list:
     for damage in damages[:1]:
         more = f" (and {len(damages) - 1} more such lines)" if len(damages) > 1 else ""
         print(f"{damage}; not counted{more}", file=sys.stderr)
-    check_any(path, rows)
+    check_any(path, rows, damages)
     return rows

@@ -135,7 +135,7 @@ def _rate(rows: list[Row]) -> str:
 
 
 def _write_sheet(output_dir: Path, rows: list[Row]) -> Path:
-    """The last frames of some episodes of each condition."""
+    """The last frames of some episodes of each condition, and what became of each."""
     from PIL import Image
 
     from lerobot_bomb.viewing.sheet import Sheet
@@ -146,24 +146,29 @@ def _write_sheet(output_dir: Path, rows: list[Row]) -> Path:
         group = f"{SUITE}.{Condition.parse(condition).key}_0"  # of LeRobot's videos
         folder = output_dir / "eval" / POLICY / "videos" / group
         tiles[condition] = [
-            _tile(folder / f"eval_episode_{number}.mp4", row["is_success"])
+            _tile(folder / f"eval_episode_{number}.mp4", row)
             for number, row in enumerate(played[:SHOWN_EPISODES])
         ]
     columns = [f"seed {SEED + number}" for number in range(len(tiles[NONE]))]
     path = output_dir / f"{POLICY}.png"
-    title = f"{POLICY}: the last frame of each video, a step before the end; green edge: success"
+    title = f"{POLICY}: how episodes end (the last frame of each video); green: success, red: failure"
     Image.fromarray(Sheet(title, columns, images=tiles).draw()).save(path)
     return path
 
 
-def _tile(video: Path, is_success: bool) -> np.ndarray:
+def _tile(video: Path, row: Row) -> np.ndarray:
+    """Both cameras without the video's caption, which is of a step before the end."""
     from PIL import Image
 
+    from lerobot_bomb.viewing.sheet import caption
     from lerobot_bomb.viewing.video import last_frame
 
     frame = Image.fromarray(last_frame(video))
-    tile = np.array(frame.resize((FRAME_WIDTH, frame.height * FRAME_WIDTH // frame.width)))
-    tile[:EDGE] = SUCCESS_RGB if is_success else FAILURE_RGB
+    cameras = frame.crop((0, 0, frame.width, frame.width // 2)).resize((FRAME_WIDTH, FRAME_WIDTH // 2))
+    outcome = row["failure"] or "success"
+    lines = [row["instruction"], f"{outcome}, {row['placement_error_mm']:.1f} mm from the intersection"]
+    tile = np.concatenate([np.array(cameras), caption(lines, FRAME_WIDTH)])
+    tile[:EDGE] = SUCCESS_RGB if row["is_success"] else FAILURE_RGB
     return tile
 
 

@@ -18,6 +18,7 @@ COMMANDS = {
     "record": "record the scripted expert as a LeRobotDataset",
     "convert": "published demonstrations as a LeRobotDataset",
     "results": "summarise files written by --env.results_path",
+    "sweep": "evaluate policies x tasks x conditions; goes on after a kill",
     "compare": "two policies on the same episodes: difference, interval, test",
     "eval": "lerobot-eval, which also writes the executed actions to a file",
     "smoothness": "second and third differences of executed actions, of demonstrations and evaluations",

@@ -35,7 +35,7 @@ def run_results(args: argparse.Namespace) -> int:
             print(f"{damage}; not counted", file=sys.stderr)
         if len(damages) > MAX_SHOWN_DAMAGES:
             print(f"{path}: ... and {len(damages) - MAX_SHOWN_DAMAGES} more such lines", file=sys.stderr)
-        check_any(path, rows)
+        check_any(path, rows, damages)
         _print_file(path, groups_of(rows), len(damages))
     return 0
 

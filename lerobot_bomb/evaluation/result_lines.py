@@ -54,8 +54,10 @@ def read_lines(path: Path) -> tuple[list[Row], list[str]]:
     return rows, damages
 
 
-def check_any(path: Path, rows: list[Row]) -> None:
-    """Raise a ValueError unless there are rows of this file."""
+def check_any(path: Path, rows: list[Row], damages: list[str]) -> None:
+    """Raise a ValueError unless there are rows of this file; damages: what is wrong with its other lines."""
+    if not rows and damages:
+        raise ValueError(f"{path} is no results file; name one that --env.results_path of lerobot-eval wrote")
     if not rows:
         raise ValueError(
             f"{path}: no finished episode; lerobot-eval writes a line when one ends: start it (again) with "

@@ -52,7 +52,7 @@ def read_results(path: Path) -> list[Row]:
     rows, damages = read_lines(path)
     if damages:
         raise ValueError(damages[0])
-    check_any(path, rows)
+    check_any(path, rows, damages)
     return [row for group in groups_of(rows) for row in group.rows]
 
 

@@ -75,6 +75,18 @@ def text_tile(text: str, size: int) -> np.ndarray:
     return np.asarray(tile)
 
 
+def caption(lines: list[str], width: int) -> np.ndarray:
+    """(H, width, 3) uint8: lines of text, each smaller where it is long for its line."""
+    bar = Image.new("RGB", (width, GAP + LINE_HEIGHT * len(lines)), TILE_PAPER)
+    pen = ImageDraw.Draw(bar)
+    for number, line in enumerate(lines):
+        sizes = range(FONT_SIZE, MIN_FONT_SIZE, -1)
+        fitting = (size for size in sizes if font(size).getlength(line) <= width - 2 * GAP)
+        face = font(next(fitting, MIN_FONT_SIZE))
+        pen.text((GAP, GAP + number * LINE_HEIGHT), line, INK, face)
+    return np.asarray(bar)
+
+
 def _broken(text: str, face: ImageFont.FreeTypeFont, width: int) -> str:
     """The text in lines of so many pixels at most."""
     lines = [""]

@@ -1,0 +1,166 @@
+"""What a sweep evaluates: cells, each of them one evaluation by LeRobot's command."""
+
+import hashlib
+import json
+import re
+import shlex
+from collections.abc import Sequence
+from dataclasses import dataclass
+from itertools import product
+from pathlib import Path
+from typing import Any
+
+from lerobot_bomb.files import read_json, written_whole
+
+VERSION = 1
+NAME = "manifest.json"
+RESERVED = ("--output_dir", "--env.results_path", "--env.perturbations", "--env.task", "--seed")
+RESERVED_PREFIXES = ("--eval.", "--policy.path", "--policy.type")
+
+
+@dataclass(frozen=True)
+class Cell:
+    """One policy under one condition on consecutive seeds."""
+
+    policy: tuple[str, ...]  # flags of lerobot-eval
+    env: tuple[str, ...]  # the same
+    seed: int  # the first one
+    num_episodes: int
+    batch_size: int
+
+    @property
+    def flags(self) -> list[str]:
+        """Of lerobot-eval; with `--env.results_path` they give the lines of this cell."""
+        own = (f"--seed={self.seed}", f"--eval.n_episodes={self.num_episodes}")
+        batch = (f"--eval.batch_size={self.batch_size}", "--eval.use_async_envs=false")
+        return [*self.policy, *self.env, *own, *batch]
+
+    @property
+    def command(self) -> str:
+        """What a user would type."""
+        return shlex.join(["lerobot-eval", *self.flags])
+
+    @property
+    def key(self) -> str:
+        """The flags in a form for file names; equal for equal cells only."""
+        words = "-".join(flag.partition("=")[2] for flag in (*self.policy[:1], *self.env))
+        readable = re.sub(r"[^a-z0-9_.]+", "-", words.lower()).strip("-")
+        digest = hashlib.sha256(json.dumps(self.flags).encode()).hexdigest()
+        return f"{readable[-60:].strip('-')}-{self.seed}-{digest[:8]}"
+
+    def episode(self, number: int) -> "Cell":
+        """One of its episodes, alone."""
+        return Cell(self.policy, self.env, self.seed + number, 1, 1)
+
+
+@dataclass(frozen=True)
+class Manifest:
+    """All cells of a sweep, in the order of its lines."""
+
+    cells: tuple[Cell, ...]
+
+    @property
+    def num_episodes(self) -> int:
+        return sum(cell.num_episodes for cell in self.cells)
+
+    def write(self, folder: Path) -> None:
+        """As `NAME` in a folder, which is made."""
+        cells = [vars(cell) | {"command": cell.command} for cell in self.cells]
+        with written_whole(folder / NAME) as (path,):
+            path.write_text(json.dumps({"version": VERSION, "cells": cells}, indent=1) + "\n")
+
+    @classmethod
+    def read(cls, folder: Path) -> "Manifest":
+        """The one in a folder.
+
+        Raises:
+            FileNotFoundError: there is none.
+            ValueError: it is damaged, or of another version of this package.
+        """
+        path = folder / NAME
+        values = read_json(path)
+        if values.get("version") != VERSION:
+            raise ValueError(f"{path}: version {values.get('version')!r}; this package reads {VERSION}")
+        try:
+            cells = tuple(_cell(dict(cell)) for cell in values["cells"])
+        except (KeyError, TypeError, ValueError) as error:
+            raise ValueError(f"{path}: a cell is damaged: {error}") from None
+        if len({cell.key for cell in cells}) < len(cells):
+            raise ValueError(f"{path}: a cell is there twice")
+        return cls(cells)
+
+
+def _cell(values: dict[str, Any]) -> Cell:
+    cell = Cell(
+        policy=tuple(map(str, values["policy"])),
+        env=tuple(map(str, values["env"])),
+        seed=_at_least(0, values, "seed"),
+        num_episodes=_at_least(1, values, "num_episodes"),
+        batch_size=_at_least(1, values, "batch_size"),
+    )
+    if values.get("command", cell.command) != cell.command:
+        raise ValueError(f"its command is not that of its flags, {cell.command}; change both, or drop it")
+    return cell
+
+
+def _at_least(lowest: int, values: dict[str, Any], name: str) -> int:
+    if not isinstance(values[name], int) or values[name] < lowest:
+        raise ValueError(f"{name}={values[name]!r} must be a whole number from {lowest} on")
+    return values[name]
+
+
+def plan(
+    policies: Sequence[str],
+    tasks: Sequence[str],
+    conditions: Sequence[str],
+    seed: int,
+    num_episodes: int,
+    batch_size: int,
+    flags: Sequence[str],
+) -> Manifest:
+    """Every policy on every task under every condition.
+
+    Args:
+        policies: checkpoints, or policy types.
+        tasks: values of `--env.task`; none: LeRobot's default.
+        conditions: each of a cell of its own; none: an environment without perturbations.
+        seed: the first one of each cell.
+        num_episodes: of each cell.
+        batch_size: of each cell, at most.
+        flags: of lerobot-eval, for all.
+
+    Raises:
+        ValueError: a flag is one that the plan decides.
+    """
+    for flag in flags:
+        name = flag.partition("=")[0]
+        if name in RESERVED or name.startswith(RESERVED_PREFIXES):
+            raise ValueError(f"{flag}: a sweep sets {name} itself; see `lerobot-bomb sweep --help`")
+    of_policy = [flag for flag in flags if flag.startswith("--policy.")]
+    of_env = [flag for flag in flags if not flag.startswith("--policy.")]
+    cells = [
+        Cell(
+            policy=(policy_flag(policy), *of_policy),
+            env=(*of_env, *([f"--env.task={task}"] if task else []), *_condition_flags(condition)),
+            seed=seed,
+            num_episodes=num_episodes,
+            batch_size=largest_divisor(num_episodes, batch_size),
+        )
+        for policy, task, condition in product(policies, tasks or [""], conditions or [""])
+    ]
+    return Manifest(tuple(cells))
+
+
+def _condition_flags(condition: str) -> list[str]:
+    return [f'--env.perturbations=["{condition}"]'] if condition else []
+
+
+def policy_flag(policy: str) -> str:
+    """'--policy.path=bomb:NAME', '--policy.type=act': a path has a slash or a colon, or exists."""
+    is_path = "/" in policy or ":" in policy or Path(policy).is_dir()
+    return f"--policy.{'path' if is_path else 'type'}={policy}"
+
+
+def largest_divisor(number: int, most: int) -> int:
+    """So that LeRobot, which fills the last batch, plays no more episodes than asked."""
+    return max(size for size in range(1, most + 1) if number % size == 0)

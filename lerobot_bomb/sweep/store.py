@@ -1,0 +1,145 @@
+"""What of a sweep is done: a folder that any number of workers share.
+
+A cell is finished where `cells/KEY.jsonl` is; a worker that plays one holds the lock on `cells/KEY.lock`,
+which the system takes from it if it is killed. What such a worker left is played again.
+"""
+
+import json
+from collections import Counter
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import asdict, dataclass
+from fcntl import LOCK_EX, LOCK_NB, flock
+from pathlib import Path
+
+from lerobot_bomb.files import append_line, written_whole
+from lerobot_bomb.sweep.manifest import Cell, Manifest
+
+MAX_ATTEMPTS = 3
+CELLS, RESULTS, ERRORS = "cells", "results.jsonl", "errors.jsonl"
+
+
+@dataclass(frozen=True)
+class EpisodeError:
+    """An episode that has no result, which is no failure of the task."""
+
+    cell: str
+    seed: int
+    error: str
+    command: str  # plays it again
+
+
+class Store:
+    """The folder of a sweep."""
+
+    def __init__(self, folder: Path, manifest: Manifest) -> None:
+        self.folder, self.manifest = folder, manifest
+        (folder / CELLS).mkdir(parents=True, exist_ok=True)
+
+    def file(self, cell: Cell, ending: str) -> Path:
+        """One of a cell's: lines that are finished (.jsonl) or not (.part), errors, attempts, lock."""
+        return self.folder / CELLS / f"{cell.key}.{ending}"
+
+    def is_finished(self, cell: Cell) -> bool:
+        return self.file(cell, "jsonl").is_file()
+
+    def begin(self, cell: Cell) -> bool:
+        """Count an attempt; give the cell up, and return False, if there were enough that were killed."""
+        path = self.file(cell, "attempts")
+        if path.is_file() and path.read_bytes().count(b"\n") >= MAX_ATTEMPTS:
+            self.give_up(cell, f"{MAX_ATTEMPTS} workers were killed while they played it")
+            return False
+        append_line(path, "")
+        return True
+
+    def fail(self, cell: Cell, reason: str) -> None:
+        """Give the cell up, if the attempt that ended so was the last."""
+        if self.file(cell, "attempts").read_bytes().count(b"\n") >= MAX_ATTEMPTS:
+            self.give_up(cell, f"{reason}; {MAX_ATTEMPTS} attempts")
+
+    def give_up(self, cell: Cell, reason: str) -> None:
+        """No worker plays it any more."""
+        with written_whole(self.file(cell, "given_up")) as (path,):
+            path.write_text(reason)
+
+    def is_over(self, cell: Cell) -> bool:
+        """Whether it is finished or given up."""
+        return self.is_finished(cell) or self.file(cell, "given_up").is_file()
+
+    def begin_again(self) -> None:
+        """Forget what became of cells that were given up or in which episodes had errors."""
+        for cell in self.manifest.cells:
+            if any(self.file(cell, ending).is_file() for ending in ("given_up", "errors")):
+                with self.claimed(cell) as is_mine:
+                    if is_mine:
+                        for ending in ("attempts", "given_up", "errors", "jsonl"):
+                            self.file(cell, ending).unlink(missing_ok=True)
+
+    @contextmanager
+    def claimed(self, cell: Cell) -> Iterator[bool]:
+        """Whether no other worker plays it; none begins to, as long as this lasts."""
+        with self.file(cell, "lock").open("w") as lock:
+            try:
+                flock(lock, LOCK_EX | LOCK_NB)
+            except BlockingIOError:
+                yield False
+                return
+            yield True
+
+    def finish(self, cell: Cell, lines: list[str], errors: list[EpisodeError]) -> None:
+        """Keep a cell's lines, by seed, and what had none."""
+        if errors:
+            with written_whole(self.file(cell, "errors")) as (path,):
+                path.write_text("".join(json.dumps(asdict(error)) + "\n" for error in errors))
+        with written_whole(self.file(cell, "jsonl")) as (path,):
+            path.write_text("".join(f"{line}\n" for line in lines))
+        self.file(cell, "part").unlink(missing_ok=True)
+
+    def num_played(self, cells: Sequence[Cell]) -> int:
+        """Episodes that have a line or an error, those of cells that are being played too."""
+        endings = ("jsonl", "part", "errors")
+        paths = [self.file(cell, ending) for cell in cells for ending in endings]
+        return sum(path.read_bytes().count(b"\n") for path in paths if path.is_file())
+
+    def merge(self) -> None:
+        """Write all finished cells' lines in the order of the manifest, and all errors."""
+        for name, ending in ((RESULTS, "jsonl"), (ERRORS, "errors")):
+            paths = [self.file(cell, ending) for cell in self.manifest.cells]
+            with written_whole(self.folder / name) as (path,):
+                path.write_bytes(b"".join(each.read_bytes() for each in paths if each.is_file()))
+
+    def lines(self) -> list[str]:
+        """What is finished, and what is missing and why, as text."""
+        cells = self.manifest.cells
+        finished = [cell for cell in cells if self.is_finished(cell)]
+        errors = [error for cell in finished for error in self.errors(cell)]
+        episodes = sum(cell.num_episodes for cell in finished) - len(errors)
+        text = [
+            f"{self.folder / RESULTS}: {episodes} of {self.manifest.num_episodes} episodes, "
+            f"{len(finished)} of {len(cells)} cells"
+        ]
+        if errors:
+            text.append(
+                f"{self.folder / ERRORS}: {len(errors)} episodes have no result, an error ended them:"
+            )
+            causes = Counter(error.error for error in errors)
+            text += [f"  {number} x {cause}" for cause, number in causes.most_common()]
+        given_up = [cell for cell in cells if not self.is_finished(cell) and self.is_over(cell)]
+        for cell in given_up:
+            text += [f"given up: {cell.command}", f"  {self.file(cell, 'given_up').read_text()}"]
+        if errors or given_up:
+            text.append(f"to play them again: lerobot-bomb sweep {self.folder} --retry")
+        others = self._of_other_manifests()
+        if others:
+            text.append(f"not counted, for the manifest has changed: {len(others)} cells, as {others[0]}")
+        return text
+
+    def errors(self, cell: Cell) -> list[EpisodeError]:
+        """Of a finished cell."""
+        path = self.file(cell, "errors")
+        lines = path.read_text().splitlines() if path.is_file() else []
+        return [EpisodeError(**json.loads(line)) for line in lines]
+
+    def _of_other_manifests(self) -> list[Path]:
+        known = {cell.key for cell in self.manifest.cells}
+        return [path for path in sorted((self.folder / CELLS).glob("*.jsonl")) if path.stem not in known]

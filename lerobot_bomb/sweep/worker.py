@@ -1,0 +1,123 @@
+"""Plays the cells of a sweep that nobody else plays, one after the other, in one process."""
+
+import json
+import logging
+import shutil
+import signal
+import tempfile
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+
+from lerobot_bomb._compat import KeptPolicy
+from lerobot_bomb.sweep.manifest import Cell
+from lerobot_bomb.sweep.store import EpisodeError, Store
+
+POLL_S = 0.5
+
+
+class RefusedError(Exception):
+    """LeRobot's command ended before it played: no attempt can do better."""
+
+
+FATAL = (RefusedError, TimeoutError, OSError)  # for a cell, whichever episode it was
+
+
+class Worker:
+    """One process.
+
+    Args:
+        store: the sweep.
+        timeout_s: of a cell; None: none.
+    """
+
+    def __init__(self, store: Store, timeout_s: int | None = None) -> None:
+        self._store = store
+        self._timeout_s = timeout_s
+        self._kept = KeptPolicy()
+
+    def run(self, cells: list[Cell]) -> None:
+        """Play until each is finished or given up, by this worker or by others."""
+        while left := [cell for cell in cells if not self._store.is_over(cell)]:
+            for cell in left:
+                with self._store.claimed(cell) as is_mine:
+                    if is_mine and not self._store.is_over(cell) and self._store.begin(cell):
+                        self._attempt(cell)
+            time.sleep(POLL_S)  # others play the rest; what a killed one leaves is for those that remain
+
+    def _attempt(self, cell: Cell) -> None:
+        try:
+            with time_limit(self._timeout_s):
+                try:
+                    lines, errors = self._evaluate(cell, cell), []
+                except FATAL:
+                    raise
+                except Exception as error:
+                    logging.warning("%s: %s; its episodes are played one by one", cell.key, describe(error))
+                    lines, errors = self._one_by_one(cell)
+        except RefusedError as error:
+            self._store.give_up(cell, str(error))
+        except TimeoutError:
+            self._store.fail(cell, f"not finished after {self._timeout_s} s (--timeout)")
+        except OSError as error:
+            self._store.fail(cell, describe(error))
+        else:
+            self._store.finish(cell, lines, errors)
+
+    def _one_by_one(self, cell: Cell) -> tuple[list[str], list[EpisodeError]]:
+        lines, errors = [], []
+        for number in range(cell.num_episodes):
+            episode = cell.episode(number)
+            try:
+                lines += self._evaluate(episode, cell)
+            except FATAL:
+                raise
+            except Exception as error:
+                errors.append(EpisodeError(cell.key, episode.seed, describe(error), episode.command))
+        return lines, errors
+
+    def _evaluate(self, cell: Cell, whole: Cell) -> list[str]:
+        """The lines of a cell, in the order of their seeds; it is a part of `whole`."""
+        part = self._store.file(cell, "part")
+        part.unlink(missing_ok=True)
+        output_dir = tempfile.mkdtemp(prefix=".output-", dir=part.parent)
+        flags = [*cell.flags, f"--env.results_path={part}", f"--output_dir={output_dir}"]
+        try:
+            self._kept.evaluate(flags, (whole.policy, whole.seed))
+            lines = part.read_text().splitlines()
+        except (Exception, SystemExit) as error:
+            if self._kept.has_begun or isinstance(error, TimeoutError | OSError):
+                raise
+            raise RefusedError(describe(error)) from error
+        finally:
+            shutil.rmtree(output_dir, ignore_errors=True)
+            part.unlink(missing_ok=True)
+        by_seed = sorted(lines, key=lambda line: json.loads(line)["spec"]["seed"])
+        if len(by_seed) < cell.num_episodes:
+            raise RuntimeError(f"{len(by_seed)} of {cell.num_episodes} episodes ended")
+        return by_seed
+
+
+def describe(error: BaseException) -> str:
+    """'ValueError: its last line'."""
+    lines = str(error).strip().splitlines()
+    return f"{type(error).__name__}: {lines[-1]}" if lines else type(error).__name__
+
+
+@contextmanager
+def time_limit(seconds: int | None) -> Iterator[None]:
+    """Raise a TimeoutError in the main thread after so many seconds."""
+
+    def stop(*_: object) -> None:
+        raise TimeoutError
+
+    if seconds is None:
+        yield
+        return
+    usual = signal.signal(signal.SIGALRM, stop)
+    signal.alarm(seconds)
+    try:
+        yield
+    finally:
+        signal.alarm(0)
+        signal.signal(signal.SIGALRM, usual)

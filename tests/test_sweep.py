@@ -1,0 +1,254 @@
+"""``lerobot-bomb sweep``: cells are played once, by anybody, and give the lines of lerobot-eval."""
+
+import json
+import os
+import random
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from lerobot_bomb.commands.main import main
+from lerobot_bomb.evaluation.results import read_results
+from lerobot_bomb.sweep.manifest import Cell, Manifest, plan
+from lerobot_bomb.sweep.store import MAX_ATTEMPTS, Store
+
+FLAGS = ("--env.type=bomb", "--env.image_size=32", "--policy.device=cpu")
+NANO = "bomb:vla0_smol"
+
+
+def small(
+    policies: tuple[str, ...] = ("bomb_expert",), conditions: tuple[str, ...] = ("none",), n: int = 3
+) -> Manifest:
+    return plan(policies, ("place",), conditions, seed=7, num_episodes=n, batch_size=10, flags=FLAGS)
+
+
+def sweep(*flags: str | Path) -> int:
+    return main(["sweep", *map(str, flags)])
+
+
+# The manifest
+
+
+def test_a_plan_is_every_policy_on_every_task_under_every_condition() -> None:
+    manifest = plan(("bomb:fdvla", "act"), ("place", "object"), ("none", "light:3"), 5, 20, 8, FLAGS)
+    assert len(manifest.cells) == 8 and manifest.num_episodes == 160
+    first = manifest.cells[0]
+    assert first.flags == [
+        "--policy.path=bomb:fdvla", "--policy.device=cpu", "--env.type=bomb", "--env.image_size=32",
+        "--env.task=place", '--env.perturbations=["none"]', "--seed=5", "--eval.n_episodes=20",
+        "--eval.batch_size=5", "--eval.use_async_envs=false",
+    ]  # fmt: skip
+    assert manifest.cells[-1].policy[0] == "--policy.type=act"
+
+
+def test_a_manifest_is_read_as_it_was_written(tmp_path: Path) -> None:
+    manifest = small(("bomb:fdvla", "bomb_random"), ("none", "all:1-5"))
+    manifest.write(tmp_path)
+    assert Manifest.read(tmp_path) == manifest
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"seed": -1}, "seed=-1 must be a whole number from 0 on"),
+        ({"num_episodes": "many"}, "num_episodes='many' must be a whole number from 1 on"),
+        ({"seed": 8}, "its command is not that of its flags"),
+        ({"env": None}, "a cell is damaged"),
+    ],
+)
+def test_a_manifest_that_was_damaged_is_refused(tmp_path: Path, change: dict[str, Any], message: str) -> None:
+    small().write(tmp_path)
+    path = tmp_path / "manifest.json"
+    values = json.loads(path.read_text())
+    values["cells"][0] |= change
+    path.write_text(json.dumps(values))
+    with pytest.raises(ValueError, match=message):
+        Manifest.read(tmp_path)
+
+
+@pytest.mark.parametrize(
+    "flag", ["--seed=3", "--eval.n_episodes=4", "--policy.path=x", "--env.results_path=y"]
+)
+def test_what_the_sweep_sets_itself_is_refused_as_a_flag(flag: str) -> None:
+    with pytest.raises(ValueError, match="a sweep sets"):
+        plan(("act",), (), (), 0, 1, 1, [flag])
+
+
+def test_dry_run_prints_the_commands(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    flags = ["--policies=bomb_expert", "--perturbations=none,each:2-3", "--episodes=4", "--dry_run", *FLAGS]
+    assert sweep(tmp_path, *flags) == 0
+    commands = capsys.readouterr().out.splitlines()
+    assert len(commands) == 1 + 10 * 2
+    assert all(command.startswith("lerobot-eval --policy.type=bomb_expert") for command in commands)
+    assert "camera:2" in "".join(commands) and "goal_marker" not in "".join(commands)
+
+
+# Who plays what
+
+
+def test_a_cell_is_of_one_worker_at_a_time(tmp_path: Path) -> None:
+    (cell,) = small().cells
+    one, other = Store(tmp_path, small()), Store(tmp_path, small())
+    with one.claimed(cell) as mine, other.claimed(cell) as theirs:
+        assert mine and not theirs
+    with other.claimed(cell) as theirs:
+        assert theirs
+
+
+def test_a_cell_whose_workers_are_killed_is_given_up_and_can_be_retried(tmp_path: Path) -> None:
+    (cell,) = small().cells
+    store = Store(tmp_path, small())
+    assert [store.begin(cell) for _ in range(MAX_ATTEMPTS + 1)] == [True] * MAX_ATTEMPTS + [False]
+    assert store.is_over(cell) and not store.is_finished(cell)
+    assert any("3 workers were killed while they played it" in line for line in store.lines())
+    store.begin_again()
+    assert not store.is_over(cell) and store.begin(cell)
+
+
+def test_a_changed_cell_is_another_cell(tmp_path: Path) -> None:
+    before, after = small(n=3), small(n=4)
+    store = Store(tmp_path, before)
+    store.finish(before.cells[0], ["{}"], [])
+    changed = Store(tmp_path, after)
+    assert not changed.is_finished(after.cells[0])
+    assert any("the manifest has changed: 1 cells" in line for line in changed.lines())
+
+
+# Playing
+
+
+@pytest.fixture
+def play(tmp_path: Path) -> Callable[[Manifest], Store]:
+    """Play all cells of a manifest in this process."""
+    from lerobot_bomb.sweep.worker import Worker
+
+    def play(manifest: Manifest, timeout_s: int | None = None) -> Store:
+        store = Store(tmp_path / "sweep", manifest)
+        Worker(store, timeout_s).run(list(manifest.cells))
+        store.merge()
+        return store
+
+    return play
+
+
+@pytest.mark.parametrize("policy", ["bomb_random", NANO, "bomb:fdvla", "bomb:spatialvla_grid"])
+def test_the_lines_are_those_of_lerobot_eval(
+    policy: str, play: Callable[[Manifest], Store], stock_cli: Callable[..., None], tmp_path: Path
+) -> None:
+    flags = ("--env.type=bomb", "--env.image_size=64", "--policy.device=cpu")
+    conditions = ("none", "light:3", "camera:2")
+    manifest = plan((policy,), ("place",), conditions, seed=7, num_episodes=2, batch_size=2, flags=flags)
+    store = play(manifest)
+    # the last of several that one process played with one policy
+    command = [*manifest.cells[-1].flags, f"--env.results_path={tmp_path / 'stock.jsonl'}"]
+    stock_cli("lerobot-eval", *command, f"--output_dir={tmp_path / 'eval'}")
+    lines = store.file(manifest.cells[-1], "jsonl").read_text().splitlines()
+    assert sorted(lines) == sorted((tmp_path / "stock.jsonl").read_text().splitlines())
+    assert read_results(store.folder / "results.jsonl")
+
+
+def test_an_episode_that_raises_is_an_error_and_no_failure(
+    play: Callable[[Manifest], Store], monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    from lerobot.scripts import lerobot_eval
+
+    rollout = lerobot_eval.rollout
+
+    def raising(*args: Any, seeds: list[int], **options: Any) -> dict:
+        if any(seed % 10 == 9 for seed in seeds):
+            raise ArithmeticError("the answer is not finite")
+        return rollout(*args, seeds=seeds, **options)
+
+    monkeypatch.setattr(lerobot_eval, "rollout", raising)
+    manifest = small(n=5)  # seeds 7..11
+    store = play(manifest)
+    rows = read_results(store.folder / "results.jsonl")
+    assert [row["spec"]["seed"] for row in rows] == [7, 8, 10, 11]
+    (error,) = store.errors(manifest.cells[0])
+    assert (error.seed, error.error) == (9, "ArithmeticError: the answer is not finite")
+    assert "--seed=9 --eval.n_episodes=1" in error.command
+    text = "\n".join(store.lines())
+    assert "4 of 5 episodes" in text and "1 x ArithmeticError: the answer is not finite" in text
+    monkeypatch.undo()
+    store.begin_again()
+    play(manifest)
+    assert len(read_results(store.folder / "results.jsonl")) == 5 and not store.errors(manifest.cells[0])
+
+
+def test_a_cell_that_cannot_begin_is_given_up_at_once(play: Callable[[Manifest], Store]) -> None:
+    flags = ("--env.type=bomb", "--env.image_size=48", "--policy.device=cpu")  # of a policy of 64
+    manifest = plan((NANO, "bomb_expert"), (), ("none",), seed=7, num_episodes=1, batch_size=1, flags=flags)
+    store = play(manifest)
+    assert [store.is_finished(cell) for cell in manifest.cells] == [False, True]
+    assert any("image_size=64" in line for line in store.lines())
+
+
+def test_a_cell_that_takes_too_long_is_given_up(
+    play: Callable[..., Store], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    from lerobot.scripts import lerobot_eval
+
+    monkeypatch.setattr(lerobot_eval, "rollout", lambda *args, **options: time.sleep(60))
+    store = play(small(), timeout_s=1)
+    assert any("not finished after 1 s (--timeout); 3 attempts" in line for line in store.lines())
+
+
+@pytest.mark.parametrize(
+    ("flags", "message"),
+    [
+        ([], "holds no manifest.json: begin a sweep with"),
+        (["--policies=bomb_expert"], "--env.type is missing"),
+        (["--policies=bomb_expert", "--env.type=bomb", "--perturbations=fog:3"], "'fog' is not an axis"),
+        (["--policies=bomb_expert", "--env.type=bomb", "--perturbations=each:0"], "write each:LEVEL"),
+        (
+            ["--policies=bomb_expert", "--env.type=pusht", "--perturbations=light:3"],
+            "--env.type=pusht has none",
+        ),
+        (["--policies=bomb_expert", "--env.type=bomb", "--episodes=0"], "--episodes=0 must be at least 1"),
+        (["--policies=bomb_expert", "--env.type=bomb", "--shard=4/4"], "--shard=4/4 must be PART/PARTS"),
+    ],
+)
+def test_wrong_flags_are_told(
+    flags: list[str], message: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert sweep(tmp_path, *flags) == 1
+    assert message in capsys.readouterr().err
+
+
+def test_a_folder_of_another_sweep_is_left_alone(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    small().write(tmp_path)
+    assert sweep(tmp_path, "--policies=bomb_random", "--dry_run", *FLAGS) == 1
+    assert "is of another sweep" in capsys.readouterr().err
+
+
+@pytest.mark.long
+def test_killed_at_any_moment_the_lines_are_those_of_an_undisturbed_run(tmp_path: Path) -> None:
+    command = [Path(sys.executable).with_name("lerobot-bomb"), "sweep"]
+    flags = ["--policies=bomb_expert,bomb_random", "--perturbations=none,light:3,all:3", "--episodes=10"]
+    flags += ["--workers=2", *FLAGS]
+    subprocess.run([*command, tmp_path / "undisturbed", *flags], check=True, capture_output=True)
+    expected = (tmp_path / "undisturbed" / "results.jsonl").read_text()
+    moments = random.Random(0)
+    for _ in range(20):
+        run = subprocess.Popen(
+            [*command, tmp_path / "killed", *flags], stdout=subprocess.PIPE, start_new_session=True
+        )
+        time.sleep(moments.uniform(1, 20))
+        if moments.random() < 0.5:
+            os.killpg(run.pid, signal.SIGKILL)  # with its workers
+        run.kill()
+        run.wait()
+    subprocess.run([*command, tmp_path / "killed", "--retry", "--workers=2"], check=True, capture_output=True)
+    assert (tmp_path / "killed" / "results.jsonl").read_text() == expected
+
+
+def test_cells_have_names_of_their_own() -> None:
+    cells = small(("bomb_expert", "bomb:fdvla"), ("none", "camera:3", "camera:2+light:3")).cells
+    assert len({cell.key for cell in cells}) == 6
+    assert Cell(("--policy.type=a/b",), ("--env.type=c d",), 0, 1, 1).key.isascii()
