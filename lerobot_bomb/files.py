@@ -83,14 +83,17 @@ def append_line(path: Path | str, line: str) -> None:
 
 
 def check_appendable(path: Path) -> None:
-    """Make the file and its folder, unless they exist.
+    """Make the file's folder, unless it exists.
 
     Raises:
-        OSError: `append_line` could not write it.
+        OSError: `append_line` could not write the file.
     """
     path.parent.mkdir(parents=True, exist_ok=True)
-    with path.open("a+b") as file:
-        flock(file, LOCK_EX)
+    if path.exists() or path.is_symlink():
+        with path.open("a+b") as file:
+            flock(file, LOCK_EX)
+    else:
+        tempfile.TemporaryFile(dir=path.parent).close()
 
 
 def _write_all(file: int, data: bytes) -> None:

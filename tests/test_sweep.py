@@ -111,6 +111,21 @@ def test_a_cell_whose_workers_are_killed_is_given_up_and_can_be_retried(tmp_path
     assert not store.is_over(cell) and store.begin(cell)
 
 
+def test_a_sweep_that_was_stopped_is_no_failed_attempt(tmp_path: Path) -> None:
+    (cell,) = small().cells
+    store = Store(tmp_path, small())
+    for _ in range(MAX_ATTEMPTS):
+        assert store.begin(cell)
+    with Store(tmp_path, small()).claimed(cell):
+        store.forget_attempts()  # somebody plays it
+    assert not store.begin(cell) and store.is_over(cell)
+    store.begin_again()
+    for _ in range(MAX_ATTEMPTS):
+        assert store.begin(cell)
+    store.forget_attempts()
+    assert store.begin(cell)
+
+
 def test_a_changed_cell_is_another_cell(tmp_path: Path) -> None:
     before, after = small(n=3), small(n=4)
     store = Store(tmp_path, before)

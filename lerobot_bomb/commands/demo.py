@@ -46,6 +46,7 @@ SEED = TEST_SEEDS[0]  # LeRobot's default; no demonstration had it
 SHOWN_EPISODES = 4  # of a condition
 MAX_EVAL_BATCH = 10
 FRAME_WIDTH = 384  # pixels, of a tile
+SHEET_LABEL_WIDTH = 60  # pixels
 SUCCESS_RGB, FAILURE_RGB = (40, 140, 40), (190, 40, 40)  # of an edge above a tile
 EDGE = 6  # pixels, its height
 CLOSING = """\
@@ -152,7 +153,7 @@ def _write_sheet(output_dir: Path, rows: list[Row]) -> Path:
     columns = [f"seed {SEED + number}" for number in range(len(tiles[NONE]))]
     path = output_dir / f"{POLICY}.png"
     title = f"{POLICY}: how episodes end (the last frame of each video); green: success, red: failure"
-    Image.fromarray(Sheet(title, columns, images=tiles).draw()).save(path)
+    Image.fromarray(Sheet(title, columns, images=tiles, label_width=SHEET_LABEL_WIDTH).draw()).save(path)
     return path
 
 
@@ -165,9 +166,8 @@ def _tile(video: Path, row: Row) -> np.ndarray:
 
     frame = Image.fromarray(last_frame(video))
     cameras = frame.crop((0, 0, frame.width, frame.width // 2)).resize((FRAME_WIDTH, FRAME_WIDTH // 2))
-    outcome = row["failure"] or "success"
-    lines = [row["instruction"], f"{outcome}, {row['placement_error_mm']:.1f} mm from the intersection"]
-    tile = np.concatenate([np.array(cameras), caption(lines, FRAME_WIDTH)])
+    outcome = f"{row['failure'] or 'success'}, {row['placement_error_mm']:.1f} mm from the intersection"
+    tile = np.concatenate([np.array(cameras), caption(row["instruction"], outcome, FRAME_WIDTH)])
     tile[:EDGE] = SUCCESS_RGB if row["is_success"] else FAILURE_RGB
     return tile
 

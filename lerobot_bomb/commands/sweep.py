@@ -40,7 +40,7 @@ def add_sweep_arguments(parser: argparse.ArgumentParser) -> None:
     add(
         "--policies",
         type=parse_conditions,
-        help="checkpoints and policy types: outputs/act/...,bomb:NAME,TYPE",
+        help="checkpoints and policy types: outputs/act,bomb:NAME,TYPE",
     )
     add("--tasks", type=parse_conditions, default=(), help="values of --env.task: place,object")
     conditions = "none,camera:3,all:1-5; each:1-5 is every axis at every level"
@@ -78,6 +78,7 @@ def run_sweep(args: argparse.Namespace) -> int:
         return 0
     if args.retry:
         store.begin_again()
+    store.forget_attempts()
     try:
         _play(args, store, cells)
     except KeyboardInterrupt:

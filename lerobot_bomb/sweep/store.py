@@ -66,6 +66,14 @@ class Store:
         """Whether it is finished or given up."""
         return self.is_finished(cell) or self.file(cell, "given_up").is_file()
 
+    def forget_attempts(self) -> None:
+        """Of cells that nobody plays and that are not over: a sweep that was stopped is no failed attempt."""
+        for cell in self.manifest.cells:
+            if not self.is_over(cell) and self.file(cell, "attempts").is_file():
+                with self.claimed(cell) as is_mine:
+                    if is_mine:
+                        self.file(cell, "attempts").unlink(missing_ok=True)
+
     def begin_again(self) -> None:
         """Forget what became of cells that were given up or in which episodes had errors."""
         for cell in self.manifest.cells:

@@ -23,11 +23,12 @@ class Sheet:
     columns: list[str]
     texts: dict[str, list[str]] = field(default_factory=dict)  # row label -> words under each column
     images: dict[str, list[np.ndarray]] = field(default_factory=dict)  # -> (H, W, 3) uint8 tiles, all alike
+    label_width: int = LABEL_WIDTH  # pixels
 
     def draw(self) -> np.ndarray:
         """(H, W, 3) uint8; the tiles are in it as they are, at `tile_origin`."""
         tile_height, tile_width = self._tile_shape
-        width = LABEL_WIDTH + len(self.columns) * (tile_width + GAP)
+        width = self.label_width + len(self.columns) * (tile_width + GAP)
         height = self._top + len(self.images) * (tile_height + GAP)
         sheet = Image.new("RGB", (width, height), PAPER)
         pen = ImageDraw.Draw(sheet)
@@ -36,7 +37,9 @@ class Sheet:
             y = TITLE_HEIGHT + row * LINE_HEIGHT
             pen.text((GAP, y), label, INK, font(FONT_SIZE))
             for column, word in enumerate(words):
-                pen.text((LABEL_WIDTH + column * (tile_width + GAP) + GAP, y), word, INK, font(FONT_SIZE))
+                pen.text(
+                    (self.label_width + column * (tile_width + GAP) + GAP, y), word, INK, font(FONT_SIZE)
+                )
         for row, (label, tiles) in enumerate(self.images.items()):
             pen.text((GAP, self.tile_origin(row, 0)[0] + GAP), label, INK, font(FONT_SIZE))
             for column, tile in enumerate(tiles):
@@ -47,7 +50,7 @@ class Sheet:
     def tile_origin(self, row: int, column: int) -> tuple[int, int]:
         """(y, x) in pixels of a tile's upper left corner."""
         height, width = self._tile_shape
-        return self._top + row * (height + GAP), LABEL_WIDTH + column * (width + GAP)
+        return self._top + row * (height + GAP), self.label_width + column * (width + GAP)
 
     @property
     def _tile_shape(self) -> tuple[int, int]:
@@ -75,15 +78,16 @@ def text_tile(text: str, size: int) -> np.ndarray:
     return np.asarray(tile)
 
 
-def caption(lines: list[str], width: int) -> np.ndarray:
-    """(H, width, 3) uint8: lines of text, each smaller where it is long for its line."""
-    bar = Image.new("RGB", (width, GAP + LINE_HEIGHT * len(lines)), TILE_PAPER)
+def caption(text: str, last_line: str, width: int) -> np.ndarray:
+    """(H, width, 3) uint8: a text in two lines at most, smaller where it is long, and a line below."""
+    bar = Image.new("RGB", (width, GAP + 3 * LINE_HEIGHT), TILE_PAPER)
     pen = ImageDraw.Draw(bar)
-    for number, line in enumerate(lines):
-        sizes = range(FONT_SIZE, MIN_FONT_SIZE, -1)
-        fitting = (size for size in sizes if font(size).getlength(line) <= width - 2 * GAP)
-        face = font(next(fitting, MIN_FONT_SIZE))
-        pen.text((GAP, GAP + number * LINE_HEIGHT), line, INK, face)
+    for font_size in range(FONT_SIZE, MIN_FONT_SIZE - 1, -1):
+        lines = _broken(text, font(font_size), width - 2 * GAP)
+        if lines.count("\n") < 2:
+            break
+    pen.multiline_text((GAP, GAP), lines, INK, font(font_size), spacing=2)
+    pen.text((GAP, GAP + 2 * LINE_HEIGHT), last_line, INK, font(FONT_SIZE))
     return np.asarray(bar)
 
 
