@@ -98,4 +98,4 @@ def test_lerobot_eval_refuses_before_anything_is_played(
     flags += ["--policy.device=cpu", "--env.type=bomb_pusht", f"--env.results_path={results}"]
     with pytest.raises(ValueError, match=r"was trained on actions from \(-1, -1\) to \(1, 1\)"):
         stock_cli("lerobot-eval", *flags, "--eval.n_episodes=1", f"--output_dir={tmp_path / 'eval'}")
-    assert not results.read_text()
+    assert not results.exists()
