@@ -18,6 +18,7 @@ COMMANDS = {
     "record": "record the scripted expert as a LeRobotDataset",
     "convert": "published demonstrations as a LeRobotDataset",
     "results": "summarise files written by --env.results_path",
+    "report": "files of results as one page, with tables as JSON and CSV",
     "sweep": "evaluate policies x tasks x conditions; goes on after a kill",
     "compare": "two policies on the same episodes: difference, interval, test",
     "eval": "lerobot-eval, which also writes the executed actions to a file",

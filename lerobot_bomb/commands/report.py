@@ -1,0 +1,57 @@
+"""``lerobot-bomb report``: files of results as one page, and their tables as JSON and CSV."""
+
+import argparse
+import csv
+import io
+import json
+import sys
+from pathlib import Path
+
+from lerobot_bomb.commands.arguments import path_flag
+from lerobot_bomb.evaluation.result_lines import check_any, read_lines
+from lerobot_bomb.files import written_whole
+from lerobot_bomb.report.page import render
+from lerobot_bomb.report.tables import Section, build
+
+TITLE = "Evaluation"
+
+
+def add_report_arguments(parser: argparse.ArgumentParser) -> None:
+    """Declare the arguments of ``lerobot-bomb report``."""
+    parser.add_argument(
+        "paths", nargs="+", type=path_flag, metavar="FILE", help="files of --env.results_path"
+    )
+    parser.add_argument("--output", type=path_flag, default=Path("report.html"), help="default: report.html")
+    parser.add_argument("--title", default=TITLE, help=f"of the page (default: {TITLE})")
+
+
+def run_report(args: argparse.Namespace) -> int:
+    """Write FILE.html, FILE.json and FILE.csv; print their paths."""
+    rows = []
+    for path in args.paths:
+        of_file, damages = read_lines(path)
+        for damage in damages:
+            print(f"{damage}; not counted", file=sys.stderr)
+        check_any(path, of_file, damages)
+        rows += of_file
+    sections = build(rows)
+    page, tables, rates = (args.output.with_suffix(suffix) for suffix in (".html", ".json", ".csv"))
+    with written_whole(page, tables, rates) as (html, as_json, as_csv):
+        html.write_text(render(args.title, sections))
+        as_json.write_text(json.dumps([section.as_json() for section in sections], indent=1) + "\n")
+        as_csv.write_text(_csv(sections))
+    print(page, tables, rates, sep="\n")
+    return 0
+
+
+def _csv(sections: list[Section]) -> str:
+    """The rates by condition, a line each."""
+    text = io.StringIO()
+    writer = csv.writer(text)
+    writer.writerow(["arm", "condition", "successes", "n", "low", "high"])
+    for table in (
+        table for section in sections if section.title == "Success by condition" for table in section.tables
+    ):
+        for condition, success, *_ in table.rows:
+            writer.writerow([table.title, condition.text, *success.value.values()])
+    return text.getvalue()

@@ -1,0 +1,1 @@
+"""What files of results say, as a page for people and as tables for programs."""

@@ -1,0 +1,58 @@
+"""A report as one HTML file: no network, no script, readable on a phone, in light and dark."""
+
+from collections.abc import Sequence
+from html import escape
+
+from lerobot_bomb.report.tables import Cell, Section, Table
+
+# one hue, of which only the strength differs: it reads the same for the colour-blind
+SHADE = "background:rgba(0,114,178,{:.2f})"
+MAX_STRENGTH = 0.55  # text stays readable on it, black or white
+STYLE = """
+:root{color-scheme:light dark}
+body{font:15px/1.5 system-ui,sans-serif;max-width:75rem;margin:0 auto;padding:1rem}
+h1{font-size:1.5rem}h2{font-size:1.2rem;margin-top:2.5rem;border-bottom:1px solid #8888}h3{font-size:1rem}
+.wide{overflow-x:auto}
+table{border-collapse:collapse;font-variant-numeric:tabular-nums}
+th,td{padding:.25rem .6rem;border-bottom:1px solid #8884;text-align:right;white-space:nowrap}
+th:first-child,td:first-child{text-align:left;position:sticky;left:0;background:Canvas}
+p.note{opacity:.75;max-width:60rem;font-size:.9rem}
+pre{white-space:pre-wrap;overflow-wrap:anywhere;font-size:.85rem}
+nav a{margin-right:1rem}
+"""
+
+
+def render(title: str, sections: Sequence[Section]) -> str:
+    """The whole page."""
+    links = "".join(f'<a href="#{_anchor(section)}">{escape(section.title)}</a>' for section in sections)
+    body = "\n".join(_section(section) for section in sections)
+    return (
+        '<!doctype html>\n<html lang="en">\n<head>\n<meta charset="utf-8">\n'
+        '<meta name="viewport" content="width=device-width, initial-scale=1">\n'
+        f"<title>{escape(title)}</title>\n<style>{STYLE}</style>\n</head>\n<body>\n"
+        f"<h1>{escape(title)}</h1>\n<nav>{links}</nav>\n{body}\n</body>\n</html>\n"
+    )
+
+
+def _anchor(section: Section) -> str:
+    return section.title.lower().replace(" ", "-")
+
+
+def _section(section: Section) -> str:
+    parts = [f'<h2 id="{_anchor(section)}">{escape(section.title)}</h2>', *map(_table, section.tables)]
+    parts += [f"<pre>{escape(chr(10).join(section.lines))}</pre>"] if section.lines else []
+    return "\n".join(parts)
+
+
+def _table(table: Table) -> str:
+    title = f"<h3>{escape(table.title)}</h3>\n" if table.title else ""
+    head = "".join(f'<th scope="col">{escape(name)}</th>' for name in table.header)
+    rows = "\n".join(f"<tr>{''.join(map(_cell, row))}</tr>" for row in table.rows)
+    note = f'\n<p class="note">{escape(table.note)}</p>' if table.note else ""
+    grid = f"<table>\n<thead><tr>{head}</tr></thead>\n<tbody>\n{rows}\n</tbody>\n</table>"
+    return f'{title}<div class="wide">{grid}</div>{note}'
+
+
+def _cell(cell: Cell) -> str:
+    style = "" if cell.shade is None else f' style="{SHADE.format(cell.shade * MAX_STRENGTH)}"'
+    return f"<td{style}>{escape(cell.text)}</td>"

@@ -1,0 +1,136 @@
+"""``lerobot-bomb report``: every number equals a recount from the lines."""
+
+import csv
+import json
+from collections import Counter
+from html.parser import HTMLParser
+from pathlib import Path
+from typing import Any
+
+import pytest
+from test_results import FDVLA, values
+
+from lerobot_bomb.commands.main import main
+
+CLASSES = (None, None, None, "imprecise", "wrong_intersection", "dropped")
+type Rows = list[dict[str, Any]]
+
+
+@pytest.fixture
+def rows() -> Rows:
+    """Two policies, three conditions, 12 seeds, outcomes that differ."""
+    made = []
+    for place, policy in enumerate((None, FDVLA)):
+        for number, condition in enumerate(("none", "camera:2", "camera:4")):
+            for seed in range(12):
+                failure = CLASSES[(seed * (number + 1) + place * number) % len(CLASSES)]
+                levels = {} if condition == "none" else {"camera": int(condition[-1])}
+                other = {} if policy is None else {"policy": policy}
+                line = values(seed, failure, 1.0 + seed, spec={"perturbations": condition}, **other)
+                target = [seed % 5, seed % 3]
+                nearest = [0, 4] if failure == "wrong_intersection" else target
+                made.append(line | {"levels": levels, "target": target, "nearest_intersection": nearest})
+    return made
+
+
+@pytest.fixture
+def written(rows: Rows, tmp_path: Path) -> Path:
+    """The folder of a report of these rows, in two files."""
+    for number in range(2):
+        part = [row for row in rows if (row["policy"]["type"] == "fdvla") == number]
+        (tmp_path / f"{number}.jsonl").write_text("".join(json.dumps(row) + "\n" for row in part))
+    files = [str(tmp_path / f"{number}.jsonl") for number in range(2)]
+    assert main(["report", *files, f"--output={tmp_path / 'out' / 'r.html'}", "--title=<A & B>"]) == 0
+    return tmp_path / "out"
+
+
+def tables(folder: Path, section: str) -> list[dict[str, Any]]:
+    found = [each for each in json.loads((folder / "r.json").read_text()) if each["title"] == section]
+    return found[0]["tables"] if found else []
+
+
+def recount(rows: Rows, policy: str, condition: str) -> Rows:
+    return [r for r in rows if r["policy"]["type"] == policy and r["spec"]["perturbations"] == condition]
+
+
+def test_rates_and_costs_are_those_of_the_lines(rows: Rows, written: Path) -> None:
+    found = tables(written, "Success by condition")
+    assert [table["title"].split()[0] for table in found] == ["act", "fdvla"]
+    for table, policy in zip(found, ("act", "fdvla"), strict=True):
+        assert [row[0] for row in table["rows"]] == ["none", "camera:2", "camera:4"]
+        nominal = {row["spec"]["seed"]: row["is_success"] for row in recount(rows, policy, "none")}
+        for condition, success, n, *cost in table["rows"]:
+            of = recount(rows, policy, condition)
+            assert (success["successes"], success["n"], n) == (sum(r["is_success"] for r in of), 12, 12)
+            if condition != "none":
+                lost = sum(nominal[r["spec"]["seed"]] and not r["is_success"] for r in of)
+                won = sum(r["is_success"] and not nominal[r["spec"]["seed"]] for r in of)
+                assert (cost[0]["only_first"], cost[0]["only_second"]) == (lost, won)
+                assert cost[0]["difference"] == pytest.approx((won - lost) / 12)
+    with (written / "r.csv").open() as file:
+        lines = list(csv.DictReader(file))
+    assert len(lines) == 6 and {line["n"] for line in lines} == {"12"}
+    assert sum(int(line["successes"]) for line in lines) == sum(row["is_success"] for row in rows)
+
+
+def test_failures_levels_and_the_board_are_those_of_the_lines(rows: Rows, written: Path) -> None:
+    for table, policy in zip(tables(written, "Why episodes failed"), ("act", "fdvla"), strict=True):
+        names = table["header"][2:-2]
+        for condition, _, *counts, right, there in table["rows"]:
+            of = recount(rows, policy, condition)
+            classes = Counter(row["failure"] for row in of)
+            assert dict(zip(names, counts, strict=True)) == {name: classes[name] for name in names}
+            put_down = [row for row in of if row["failure"] in (None, "imprecise", "wrong_intersection")]
+            grounded = [row for row in put_down if row["nearest_intersection"] == row["target"]]
+            assert (right["successes"], right["n"]) == (len(grounded), len(put_down))
+            assert there["n"] == len(grounded)
+    for table, policy in zip(tables(written, "Axis by level"), ("act", "fdvla"), strict=True):
+        ((axis, *levels),) = table["rows"]
+        assert axis == "camera" and table["header"][1:] == ["0", "2", "4"]
+        expected = [
+            sum(r["is_success"] for r in recount(rows, policy, c)) for c in ("none", "camera:2", "camera:4")
+        ]
+        assert [level["successes"] for level in levels] == expected
+    named, missed, *_ = tables(written, "The board")
+    of_act = [row for row in rows if row["policy"]["type"] == "act"]
+    assert sum(cell["n"] for _, *cells in named["rows"] for cell in cells if cell != "-") == len(of_act)
+    num_missed = sum(row["failure"] == "wrong_intersection" and row["target"] != [0, 4] for row in of_act)
+    assert missed["rows"][0][5] == num_missed
+
+
+def test_two_policies_are_compared_on_their_common_episodes(rows: Rows, written: Path) -> None:
+    (table,) = tables(written, "Two policies on the same episodes")
+    for condition, first, second, difference, _, pairs in table["rows"]:
+        a, b = recount(rows, "act", condition), recount(rows, "fdvla", condition)
+        assert pairs == 12
+        assert first["successes"] == sum(row["is_success"] for row in a)
+        assert second["successes"] == sum(row["is_success"] for row in b)
+        assert difference["both"] == sum(
+            x["is_success"] and y["is_success"] for x, y in zip(a, b, strict=True)
+        )
+
+
+def test_the_page_is_whole_and_asks_nobody_for_anything(written: Path) -> None:
+    text = (written / "r.html").read_text()
+    opened: list[str] = []
+
+    class Reader(HTMLParser):
+        def handle_starttag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
+            opened.append(tag)
+            assert all(name not in ("src", "onclick") for name, _ in attrs)
+
+        def handle_endtag(self, tag: str) -> None:
+            while opened.pop() != tag:
+                pass
+
+    Reader().feed(text)
+    assert opened == ["!doctype"][1:] and "<script" not in text and "http" not in text
+    assert "<title>&lt;A &amp; B&gt;</title>" in text and "prefers" not in text
+    assert "color-scheme:light dark" in text and 'name="viewport"' in text
+
+
+def test_without_an_episode_there_is_no_report(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    (tmp_path / "empty.jsonl").write_text("")
+    assert main(["report", str(tmp_path / "empty.jsonl"), f"--output={tmp_path / 'r.html'}"]) == 1
+    assert "no finished episode" in capsys.readouterr().err
+    assert not (tmp_path / "r.html").exists()
