@@ -72,7 +72,8 @@ def test_wilson_interval_equals_statsmodels(n: int, data: st.DataObject) -> None
 @given(PAIRED)
 def test_mcnemar_equals_statsmodels(counts: PairedCounts) -> None:
     table = [[counts.both, counts.only_first], [counts.only_second, counts.neither]]
-    assert counts.p_value == pytest.approx(mcnemar(table, exact=True).pvalue, abs=1e-12)
+    expected = vars(mcnemar(table, exact=True))["pvalue"]
+    assert counts.p_value == pytest.approx(expected, abs=1e-12)
 
 
 @given(st.lists(st.floats(0, 1), min_size=1, max_size=12))
@@ -125,7 +126,7 @@ def test_wilsons_interval_holds_the_truth_in_95_of_100_on_average(n: int, rate: 
 
 def test_a_bca_interval_of_a_skewed_mean_holds_the_truth_nearly_as_often() -> None:
     samples = np.random.default_rng(0).exponential(size=(400, 60))
-    intervals = [bca_interval(sample) for sample in samples]
+    intervals = [bca_interval(sample) or (np.nan, np.nan) for sample in samples]
     assert np.mean([low <= 1.0 <= high for low, high in intervals]) > 0.92
 
 
