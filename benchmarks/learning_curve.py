@@ -10,7 +10,7 @@ import numpy as np
 
 from lerobot_bomb.bomb.episode import Failure, Stage
 from lerobot_bomb.envs.results import Row
-from lerobot_bomb.evaluation.bomb_lines import PUT_DOWN
+from lerobot_bomb.evaluation.bomb_lines import is_grounded, put_down
 from lerobot_bomb.stats import format_rate, wilson_interval
 from lerobot_bomb.tables import print_table
 
@@ -40,8 +40,8 @@ class Point:
 
 def count(rows: list[Row], step: int, cpu_minutes: float) -> Point:
     """The episodes of one checkpoint."""
-    down = [row for row in rows if row["failure"] in PUT_DOWN]
-    grounded = [row for row in down if row["nearest_intersection"] == row["target"]]
+    down = put_down(rows)
+    grounded = [row for row in down if is_grounded(row)]
     return Point(
         step=step,
         cpu_minutes=cpu_minutes,

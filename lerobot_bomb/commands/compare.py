@@ -1,12 +1,10 @@
 """``lerobot-bomb compare``: two policies on the same episodes."""
 
 import argparse
-import sys
-from pathlib import Path
 
 from lerobot_bomb.commands.arguments import path_flag
+from lerobot_bomb.commands.results_files import read_undamaged
 from lerobot_bomb.evaluation.comparison import compare
-from lerobot_bomb.evaluation.result_lines import check_any, read_lines
 
 MISSED = 2  # exit code where a bar is not reached; 1 is an error
 
@@ -33,7 +31,8 @@ def _points(text: str) -> float:
 
 def run_compare(args: argparse.Namespace) -> int:
     """Print both rates and their difference, by condition; check what was asked for."""
-    comparisons = compare(_read(args.a), _read(args.b))
+    (first, _), (second, _) = map(read_undamaged, (args.a, args.b))
+    comparisons = compare(first, second)
     print(*comparisons.lines(), sep="\n")
     low = 100 * comparisons.lowest
     verdicts = []
@@ -44,12 +43,3 @@ def run_compare(args: argparse.Namespace) -> int:
     for claim, is_shown in verdicts:
         print(f"{claim}: {'shown' if is_shown else 'not shown'} (lowest end of an interval {low:+.1f})")
     return 0 if all(is_shown for _, is_shown in verdicts) else MISSED
-
-
-def _read(path: Path) -> list:
-    rows, damages = read_lines(path)
-    for damage in damages[:1]:
-        more = f" (and {len(damages) - 1} more such lines)" if len(damages) > 1 else ""
-        print(f"{damage}; not counted{more}", file=sys.stderr)
-    check_any(path, rows, damages)
-    return rows

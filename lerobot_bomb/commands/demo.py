@@ -20,6 +20,7 @@ from lerobot_bomb.evaluation.result_groups import by_condition
 from lerobot_bomb.evaluation.results import read_results
 from lerobot_bomb.files import check_new_folder
 from lerobot_bomb.stats import format_rate
+from lerobot_bomb.sweep.manifest import largest_divisor
 from lerobot_bomb.tables import print_table
 
 POLICY = "vla0_smol"
@@ -85,8 +86,6 @@ def run_demo(args: argparse.Namespace) -> int:
 
 def _evaluate(output_dir: Path, name: str, player: Player, num_episodes: int) -> list[Row]:
     results = output_dir / f"{name}.jsonl"
-    # a divisor, so that LeRobot plays no more episodes than asked
-    batch_size = max(size for size in range(1, MAX_EVAL_BATCH + 1) if num_episodes % size == 0)
     run_command(
         "lerobot-eval",
         player.policy_flag,
@@ -98,7 +97,7 @@ def _evaluate(output_dir: Path, name: str, player: Player, num_episodes: int) ->
         f"--env.results_path={results}",
         f"--seed={SEED}",
         f"--eval.n_episodes={num_episodes}",
-        f"--eval.batch_size={batch_size}",
+        f"--eval.batch_size={largest_divisor(num_episodes, MAX_EVAL_BATCH)}",
         "--eval.use_async_envs=false",
         f"--output_dir={output_dir / 'eval' / name}",
     )

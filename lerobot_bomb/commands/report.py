@@ -4,11 +4,10 @@ import argparse
 import csv
 import io
 import json
-import sys
 from pathlib import Path
 
 from lerobot_bomb.commands.arguments import path_flag
-from lerobot_bomb.evaluation.result_lines import check_any, read_lines
+from lerobot_bomb.commands.results_files import read_undamaged
 from lerobot_bomb.files import written_whole
 from lerobot_bomb.report.page import render
 from lerobot_bomb.report.tables import Section, build
@@ -27,14 +26,7 @@ def add_report_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run_report(args: argparse.Namespace) -> int:
     """Write FILE.html, FILE.json and FILE.csv; print their paths."""
-    rows = []
-    for path in args.paths:
-        of_file, damages = read_lines(path)
-        for damage in damages:
-            print(f"{damage}; not counted", file=sys.stderr)
-        check_any(path, of_file, damages)
-        rows += of_file
-    sections = build(rows)
+    sections = build([row for path in args.paths for row in read_undamaged(path)[0]])
     page, tables, rates = (args.output.with_suffix(suffix) for suffix in (".html", ".json", ".csv"))
     with written_whole(page, tables, rates) as (html, as_json, as_csv):
         html.write_text(render(args.title, sections))

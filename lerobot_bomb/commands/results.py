@@ -1,20 +1,17 @@
 """``lerobot-bomb results``: what files of ``--env.results_path`` say."""
 
 import argparse
-import sys
 from pathlib import Path
 
 from lerobot_bomb.commands.arguments import path_flag
+from lerobot_bomb.commands.results_files import read_undamaged
 from lerobot_bomb.evaluation.result_groups import (
     Group,
     by_condition,
     differing,
     groups_of,
 )
-from lerobot_bomb.evaluation.result_lines import check_any, read_lines
 from lerobot_bomb.evaluation.results import pair_lines, summarise
-
-MAX_SHOWN_DAMAGES = 10
 
 
 def add_results_arguments(parser: argparse.ArgumentParser) -> None:
@@ -28,15 +25,10 @@ def add_results_arguments(parser: argparse.ArgumentParser) -> None:
 def run_results(args: argparse.Namespace) -> int:
     """Print, of each file, what compares: rates by condition, and what perturbations changed in pairs."""
     for path in args.paths:
-        rows, damages = read_lines(path)
-        if args.strict and damages:
-            raise ValueError(damages[0])
-        for damage in damages[:MAX_SHOWN_DAMAGES]:
-            print(f"{damage}; not counted", file=sys.stderr)
-        if len(damages) > MAX_SHOWN_DAMAGES:
-            print(f"{path}: ... and {len(damages) - MAX_SHOWN_DAMAGES} more such lines", file=sys.stderr)
-        check_any(path, rows, damages)
-        _print_file(path, groups_of(rows), len(damages))
+        rows, num_damaged = read_undamaged(path)
+        if args.strict and num_damaged:
+            raise ValueError(f"{path}: damaged lines, which --strict refuses: {num_damaged}")
+        _print_file(path, groups_of(rows), num_damaged)
     return 0
 
 

@@ -1,11 +1,9 @@
 """``lerobot-bomb sweep``: policies x tasks x conditions, over several processes, going on after a kill."""
 
 import argparse
-import logging
 import os
 import subprocess
 import sys
-import threading
 import time
 from typing import IO
 
@@ -57,7 +55,6 @@ def add_sweep_arguments(parser: argparse.ArgumentParser) -> None:
         action="store_true",
         help="write the manifest and print its commands only",
     )
-    add("--as_worker", action="store_true", help=argparse.SUPPRESS)
     add("rest", nargs="*", metavar="FLAG", help="flags of lerobot-eval for every cell: --env.image_size=64")
 
 
@@ -66,13 +63,6 @@ def run_sweep(args: argparse.Namespace) -> int:
     manifest = _manifest(args)
     store = Store(args.folder, manifest)
     cells = _shard(args.shard, manifest)
-    if args.as_worker:
-        from lerobot_bomb.sweep.worker import Worker
-
-        logging.basicConfig(level=logging.WARNING)
-        threading.Thread(target=_end_with_parent, daemon=True).start()
-        Worker(store, args.timeout).run(cells)
-        return 0
     if args.dry_run:
         print(*(cell.command for cell in cells), sep="\n")
         return 0
@@ -87,12 +77,6 @@ def run_sweep(args: argparse.Namespace) -> int:
     print(*store.lines(), sep="\n")
     is_whole = all(store.is_finished(cell) and not store.errors(cell) for cell in cells)
     return 0 if is_whole else 1
-
-
-def _end_with_parent() -> None:
-    """The parent holds this process' standard input; when it is gone, however it ended, so is this one."""
-    sys.stdin.buffer.read()
-    os._exit(1)
 
 
 def _manifest(args: argparse.Namespace) -> Manifest:
@@ -127,30 +111,30 @@ def _expanded(perturbations: tuple[str, ...], flags: list[str]) -> list[str]:
     """The conditions, checked for the environment where it has any."""
     env_type = next((flag.partition("=")[2] for flag in flags if flag.startswith("--env.type=")), None)
     if env_type is None:
-        raise ValueError("--env.type is missing: bomb, bomb_pusht, bomb_libero, or one of LeRobot's")
+        raise ValueError(f"--env.type is missing: {', '.join(CONDITIONS)}")
     if env_type not in CONDITIONS:
-        if perturbations:
-            raise ValueError(
-                f"--perturbations: --env.type={env_type} has none; it is of {', '.join(CONDITIONS)}"
-            )
-        return []
+        raise ValueError(
+            f"--env.type={env_type} writes no lines of results, which a sweep is made of; "
+            f"those that do: {', '.join(CONDITIONS)}"
+        )
     of_env = CONDITIONS[env_type]
     return [str(of_env.parse(text)) for text in of_env.expand(perturbations)]
 
 
 def _shard(text: str, manifest: Manifest) -> list[Cell]:
-    first, _, number = text.partition("/")
-    if not (first.isdigit() and number.isdigit() and int(first) < int(number)):
-        raise ValueError(f"--shard={text} must be PART/PARTS, the parts counted from 0: 0/4 to 3/4")
-    return list(manifest.cells[int(first) :: int(number)])
+    try:
+        return manifest.part(text)
+    except ValueError as error:
+        raise ValueError(f"--shard: {error}") from None
 
 
 def _play(args: argparse.Namespace, store: Store, cells: list[Cell]) -> None:
     """Start workers, show how far they are, and start those anew that were killed."""
     threads = max(1, (os.cpu_count() or 1) // args.workers)
     environment = {"OMP_NUM_THREADS": str(threads)} | os.environ
-    command = [sys.argv[0], "sweep", str(args.folder), "--as_worker", f"--shard={args.shard}"]
-    command += [f"--timeout={args.timeout}"] if args.timeout else []
+    # -P: nothing in the folder that the user is in stands for a module of the same name
+    command = [sys.executable, "-P", "-m", "lerobot_bomb.sweep.worker", str(args.folder), args.shard]
+    command += [str(args.timeout)] if args.timeout else []
     log = args.folder / "workers.log"
     total = sum(cell.num_episodes for cell in cells)
 

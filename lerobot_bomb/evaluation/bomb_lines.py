@@ -40,6 +40,16 @@ NUM_TASKS = len(COLORS) * BOARD.num_lines**2
 PUT_DOWN = (None, Failure.WRONG_INTERSECTION, Failure.IMPRECISE, Failure.DISTURBED_OTHERS)
 
 
+def put_down(rows: list[Row]) -> list[Row]:
+    """Those in which the stone was carried and put down on the board."""
+    return [row for row in rows if row["failure"] in PUT_DOWN]
+
+
+def is_grounded(row: Row) -> bool:
+    """Whether the stone, put down on the board, lies nearest to the intersection that was named."""
+    return row["nearest_intersection"] == row["target"]
+
+
 def is_intersection(value: Any) -> bool:
     """Whether a value is [row, column] on the board."""
     return isinstance(value, list) and len(value) == 2 and all(map(is_int(0, BOARD.num_lines - 1), value))

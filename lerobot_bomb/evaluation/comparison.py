@@ -1,13 +1,18 @@
 """Two policies on the same episodes: which is better, by how much, and is it certain?"""
 
 import json
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from dataclasses import dataclass
 
 from lerobot_bomb.envs.results import Row
-from lerobot_bomb.evaluation.result_groups import describe_policy, groups_of, settings_of
+from lerobot_bomb.evaluation.result_groups import (
+    count_pairs,
+    describe_change,
+    describe_policy,
+    groups_of,
+    settings_of,
+)
 from lerobot_bomb.evaluation.result_kind import NOT_RECORDED, Pair
-from lerobot_bomb.evaluation.result_lines import kind_of
 from lerobot_bomb.stats import (
     PairedCounts,
     episodes_to_tell_apart,
@@ -17,6 +22,8 @@ from lerobot_bomb.stats import (
 )
 
 POLICY = "policy"  # the one setting that the episodes of a pair may differ in
+
+type Values = dict[str, set[str]]  # of settings
 
 
 @dataclass(frozen=True)
@@ -30,8 +37,7 @@ class Comparison:
     @property
     def counts(self) -> PairedCounts:
         """How often which of the two succeeded."""
-        first, second = ([row["is_success"] for row in rows] for rows in zip(*self.pairs, strict=True))
-        return PairedCounts.of(first, second)
+        return count_pairs(self.pairs)
 
     @property
     def interval(self) -> tuple[float, float]:
@@ -43,8 +49,7 @@ class Comparison:
         counts, (low, high) = self.counts, self.interval
         needed = episodes_to_tell_apart(counts)
         more = f"; {needed} pairs tell such a difference apart" if needed and low <= 0 <= high else ""
-        describe_change = kind_of(self.pairs[0][0]).describe_change
-        change = describe_change(self.pairs) if describe_change else ""
+        change = describe_change(self.pairs)
         return [
             f"A          {format_rate(counts.first, counts.n)}",
             f"B          {format_rate(counts.second, counts.n)}",
@@ -93,28 +98,21 @@ def compare(first: list[Row], second: list[Row]) -> Comparisons:
         raise ValueError(f"no episode was played by both: {_why_none(first, second)}")
     return Comparisons(
         policies=policies,
-        conditions=_by(pairs, lambda row: _label(row, pairs)),
+        conditions=_by_condition(pairs),
         num_unpaired=(len(_episodes(first)) - len(pairs), len(_episodes(second)) - len(pairs)),
     )
 
 
-def _by(pairs: list[Pair], label: Callable[[Row], str]) -> list[Comparison]:
+def _by_condition(pairs: list[Pair]) -> list[Comparison]:
+    """Apart by suite too, where there are several."""
+    several = len({first["spec"].get("suite") for first, _ in pairs}) > 1
     of_label: dict[str, list[Pair]] = {}
     for pair in pairs:
-        of_label.setdefault(label(pair[0]), []).append(pair)
-    adjusted = holm([_p_value(of) for of in of_label.values()])
-    return [Comparison(name, of, p) for (name, of), p in zip(of_label.items(), adjusted, strict=True)]
-
-
-def _p_value(pairs: list[Pair]) -> float:
-    return Comparison("", pairs, 1.0).counts.p_value
-
-
-def _label(row: Row, pairs: list[Pair]) -> str:
-    """The condition, and the suite where there are several."""
-    suites = {first["spec"].get("suite") for first, _ in pairs}
-    condition = row["spec"]["perturbations"]
-    return f"{row['spec']['suite']}, {condition}" if len(suites) > 1 else condition
+        spec = pair[0]["spec"]
+        label = f"{spec['suite']}, {spec['perturbations']}" if several else spec["perturbations"]
+        of_label.setdefault(label, []).append(pair)
+    adjusted = holm([count_pairs(of).p_value for of in of_label.values()])
+    return [Comparison(label, of, p) for (label, of), p in zip(of_label.items(), adjusted, strict=True)]
 
 
 def _only_policy(name: str, rows: list[Row]) -> str:
@@ -129,14 +127,14 @@ def _only_policy(name: str, rows: list[Row]) -> str:
 
 
 def _pairs(first: list[Row], second: list[Row]) -> Iterator[Pair]:
-    candidates: dict[str, list[Row]] = {}
+    candidates: dict[str, list[tuple[Row, Values]]] = {}
     for row in _episodes(second):
-        candidates.setdefault(_spec(row), []).append(row)
+        candidates.setdefault(_spec(row), []).append((row, _values_of([row])))
     for row in _episodes(first):
-        of_spec = candidates.get(_spec(row), [])
-        if match := next((other for other in of_spec if not _apart([row], [other])), None):
+        of_spec, values = candidates.get(_spec(row), []), _values_of([row])
+        if match := next((other for other in of_spec if not _apart(values, other[1])), None):
             of_spec.remove(match)
-            yield row, match
+            yield row, match[0]
 
 
 def _episodes(rows: list[Row]) -> list[Row]:
@@ -148,23 +146,27 @@ def _spec(row: Row) -> str:
     return json.dumps(row["spec"], sort_keys=True)
 
 
-def _apart(first: list[Row], second: list[Row]) -> list[str]:
-    """Names of the settings that none of the first have in common with any of the second.
-
-    What was not recorded keeps no episodes apart: an expert is shown no image, so OpenGL drew none.
-    """
-    a, b = (_values_of([settings_of(row) for row in rows]) for rows in (first, second))
-    names = [name for name in a if name != POLICY]
-    return [
-        name for name in names if not a[name] & b.get(name, set()) and NOT_RECORDED not in a[name] | b[name]
-    ]
-
-
-def _values_of(settings: list[dict[str, str]]) -> dict[str, set[str]]:
+def _values_of(rows: list[Row]) -> Values:
+    """{setting: its values in these rows}."""
+    settings = [settings_of(row) for row in rows]
     return {name: {of.get(name, NOT_RECORDED) for of in settings} for name in settings[0]}
 
 
+def _apart(first: Values, second: Values) -> list[str]:
+    """Names of the settings of which the two have no value in common.
+
+    What was not recorded keeps no episodes apart: an expert is shown no image, so OpenGL drew none.
+    """
+    return [
+        name
+        for name, values in first.items()
+        if name != POLICY
+        and not values & second.get(name, set())
+        and NOT_RECORDED not in values | second.get(name, set())
+    ]
+
+
 def _why_none(first: list[Row], second: list[Row]) -> str:
-    if apart := _apart(first, second):
+    if apart := _apart(_values_of(first), _values_of(second)):
         return f"they differ in {', '.join(apart)}"
     return "seeds, conditions or tasks have nothing in common; evaluate both with the same --seed and flags"

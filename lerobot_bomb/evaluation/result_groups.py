@@ -8,6 +8,7 @@ from lerobot_bomb.conditions import NONE
 from lerobot_bomb.envs.results import Row
 from lerobot_bomb.evaluation.result_kind import NOT_RECORDED, Pair, ResultKind, describe_numbers
 from lerobot_bomb.evaluation.result_lines import kind_of
+from lerobot_bomb.stats import PairedCounts
 
 # what may differ between episodes that are pooled; perturbations between those that are paired
 DRAWN = ("seed", "perturbations")
@@ -104,6 +105,17 @@ def pair_with_nominal(rows: list[Row]) -> dict[str, list[Pair]]:
         if condition != NONE and _episode(row) in nominal:
             pairs.setdefault(condition, []).append((nominal[_episode(row)], row))
     return pairs
+
+
+def count_pairs(pairs: list[Pair]) -> PairedCounts:
+    """How often which row of the pairs is a success."""
+    return PairedCounts.of([a["is_success"] for a, _ in pairs], [b["is_success"] for _, b in pairs])
+
+
+def describe_change(pairs: list[Pair]) -> str:
+    """What the second rows have beside other successes, as text; '' where there is nothing to say."""
+    describe = kind_of(pairs[0][0]).describe_change
+    return describe(pairs) if describe else ""
 
 
 def describe_policy(row: Row) -> str:

@@ -8,13 +8,15 @@ from lerobot_bomb.conditions import NONE
 from lerobot_bomb.envs.results import Row
 from lerobot_bomb.evaluation.result_groups import (
     Group,
+    count_pairs,
+    describe_change,
     differing,
     groups_of,
     pair_with_nominal,
 )
 from lerobot_bomb.evaluation.result_kind import NO_VALUE, Measure, Pair
 from lerobot_bomb.evaluation.result_lines import check_any, kind_of, read_lines
-from lerobot_bomb.stats import format_rate, mcnemar_p_value
+from lerobot_bomb.stats import format_rate
 
 
 @dataclass(frozen=True)
@@ -67,14 +69,10 @@ def summarise(rows: list[Row]) -> Summary:
 
 
 def _pair_line(condition: str, pairs: list[Pair]) -> str:
-    lost = sum(nominal["is_success"] and not row["is_success"] for nominal, row in pairs)
-    won = sum(row["is_success"] and not nominal["is_success"] for nominal, row in pairs)
-    p_value = mcnemar_p_value(lost, won)
-    describe_change = kind_of(pairs[0][0]).describe_change
-    change = describe_change(pairs) if describe_change else ""
+    counts, change = count_pairs(pairs), describe_change(pairs)
     return (
-        f"  {condition}: {len(pairs)} pairs, {lost} lost, {won} won, p = {p_value:.2g} (exact McNemar test)"
-        f"{'; ' * bool(change)}{change}"
+        f"  {condition}: {counts.n} pairs, {counts.only_first} lost, {counts.only_second} won, "
+        f"p = {counts.p_value:.2g} (exact McNemar test){'; ' * bool(change)}{change}"
     )
 
 

@@ -8,13 +8,18 @@ from typing import Any
 
 from lerobot_bomb.conditions import MAX_LEVEL, NONE
 from lerobot_bomb.envs.results import Row
-from lerobot_bomb.evaluation.bomb_lines import PUT_DOWN
+from lerobot_bomb.evaluation.bomb_lines import is_grounded, put_down
 from lerobot_bomb.evaluation.comparison import POLICY, compare
-from lerobot_bomb.evaluation.result_groups import Group, by_condition, groups_of, pair_with_nominal
+from lerobot_bomb.evaluation.result_groups import (
+    Group,
+    by_condition,
+    count_pairs,
+    groups_of,
+    pair_with_nominal,
+)
 from lerobot_bomb.stats import PairedCounts, holm, paired_difference_interval, wilson_interval
 
 SHOWN_DIGITS = 6  # of a SHA-256, where names are the same otherwise
-MIN_ALIKE = 1  # pairs
 
 
 @dataclass(frozen=True)
@@ -170,10 +175,7 @@ def summary(arms: list[Arm]) -> Table:
 def conditions(arm: Arm) -> Table:
     """Success under each condition, and what it costs against the same episodes unperturbed."""
     pairs = pair_with_nominal(arm.rows)
-    counts = {
-        condition: PairedCounts.of([a["is_success"] for a, _ in of], [b["is_success"] for _, b in of])
-        for condition, of in pairs.items()
-    }
+    counts = {condition: count_pairs(of) for condition, of in pairs.items()}
     adjusted = dict(zip(counts, holm([each.p_value for each in counts.values()]), strict=True))
     table = [
         [
@@ -241,13 +243,11 @@ def failures(arm: Arm) -> Table:
     table = []
     for condition, rows in by_condition(arm.rows).items():
         counted = Counter(row["failure"] for row in rows)
-        put_down = [row for row in rows if row["failure"] in PUT_DOWN]
-        grounded = [row for row in put_down if row.get("nearest_intersection") == row.get("target")]
-        split = [rate(put_down, lambda row: row["nearest_intersection"] == row["target"]), rate(grounded)]
         cells = [_count(counted[name], len(rows)) for name in names]
-        table.append(
-            [Cell(condition), Cell(str(len(rows)), len(rows)), *cells, *(split if is_placed else [])]
-        )
+        if is_placed:
+            down = put_down(rows)
+            cells += [rate(down, is_grounded), rate([row for row in down if is_grounded(row)])]
+        table.append([Cell(condition), Cell(str(len(rows)), len(rows)), *cells])
     split_names = ["right intersection", "success there"] if is_placed else []
     note = (
         "Of the stones that were put down on the board: how many nearest to the intersection that was named; "
@@ -272,9 +272,7 @@ def boards(arm: Arm) -> Iterable[Table]:
     yield board(
         "success by intersection that was named", lambda at: rate([r for r in rows if r["target"] == at])
     )
-    missed = [
-        row for row in rows if row["failure"] in PUT_DOWN and row["nearest_intersection"] != row["target"]
-    ]
+    missed = [row for row in put_down(rows) if not is_grounded(row)]
     if missed:
         most = max(Counter(tuple(row["nearest_intersection"]) for row in missed).values())
         yield board(

@@ -63,6 +63,17 @@ class Manifest:
     def num_episodes(self) -> int:
         return sum(cell.num_episodes for cell in self.cells)
 
+    def part(self, text: str) -> list[Cell]:
+        """Every so many cells: '0/4' are the first, the fifth, ...
+
+        Raises:
+            ValueError: the text is no such part.
+        """
+        first, _, number = text.partition("/")
+        if not (first.isdigit() and number.isdigit() and int(first) < int(number)):
+            raise ValueError(f"{text} must be PART/PARTS, the parts counted from 0: 0/4 to 3/4")
+        return list(self.cells[int(first) :: int(number)])
+
     def write(self, folder: Path) -> None:
         """As `NAME` in a folder, which is made."""
         cells = [vars(cell) | {"command": cell.command} for cell in self.cells]

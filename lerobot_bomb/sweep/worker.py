@@ -1,16 +1,23 @@
-"""Plays the cells of a sweep that nobody else plays, one after the other, in one process."""
+"""Plays the cells of a sweep that nobody else plays, one after the other, in one process.
+
+`python -m lerobot_bomb.sweep.worker FOLDER PART [TIMEOUT_S]`, which ends with its standard input.
+"""
 
 import json
 import logging
+import os
 import shutil
 import signal
+import sys
 import tempfile
+import threading
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager
+from pathlib import Path
 
 from lerobot_bomb._compat import KeptPolicy
-from lerobot_bomb.sweep.manifest import Cell
+from lerobot_bomb.sweep.manifest import Cell, Manifest
 from lerobot_bomb.sweep.store import EpisodeError, Store
 
 POLL_S = 0.5
@@ -121,3 +128,22 @@ def time_limit(seconds: int | None) -> Iterator[None]:
     finally:
         signal.alarm(0)
         signal.signal(signal.SIGALRM, usual)
+
+
+def _end_with_parent() -> None:
+    """The parent holds this process' standard input; when it is gone, however it ended, so is this one."""
+    sys.stdin.buffer.read()
+    os._exit(1)
+
+
+def main(folder: str, part: str, timeout_s: str | None = None) -> None:
+    """Play a part of the sweep in a folder."""
+    logging.basicConfig(level=logging.WARNING)
+    threading.Thread(target=_end_with_parent, daemon=True).start()
+    manifest = Manifest.read(Path(folder))
+    store = Store(Path(folder), manifest)
+    Worker(store, None if timeout_s is None else int(timeout_s)).run(manifest.part(part))
+
+
+if __name__ == "__main__":
+    main(*sys.argv[1:])

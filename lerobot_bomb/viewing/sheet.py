@@ -1,5 +1,6 @@
 """Contact sheets: rows of small images and of numbers under columns that have names."""
 
+from collections.abc import Callable
 from dataclasses import dataclass, field
 from functools import cache
 
@@ -69,11 +70,11 @@ def text_tile(text: str, size: int) -> np.ndarray:
     """
     tile = Image.new("RGB", (size, size), TILE_PAPER)
     pen = ImageDraw.Draw(tile)
-    for font_size in range(FONT_SIZE, MIN_FONT_SIZE - 1, -1):
-        face = font(font_size)
-        lines = _broken(text, face, size - 2 * GAP)
-        if pen.multiline_textbbox((GAP, GAP), lines, face, spacing=2)[3] <= size:
-            break
+    lines, face = _fitted(
+        text,
+        size - 2 * GAP,
+        lambda lines, face: pen.multiline_textbbox((GAP, GAP), lines, face, spacing=2)[3] <= size,
+    )
     pen.multiline_text((GAP, GAP), lines, INK, face, spacing=2)
     return np.asarray(tile)
 
@@ -82,13 +83,22 @@ def caption(text: str, last_line: str, width: int) -> np.ndarray:
     """(H, width, 3) uint8: a text in two lines at most, smaller where it is long, and a line below."""
     bar = Image.new("RGB", (width, GAP + 3 * LINE_HEIGHT), TILE_PAPER)
     pen = ImageDraw.Draw(bar)
-    for font_size in range(FONT_SIZE, MIN_FONT_SIZE - 1, -1):
-        lines = _broken(text, font(font_size), width - 2 * GAP)
-        if lines.count("\n") < 2:
-            break
-    pen.multiline_text((GAP, GAP), lines, INK, font(font_size), spacing=2)
+    lines, face = _fitted(text, width - 2 * GAP, lambda lines, _: lines.count("\n") < 2)
+    pen.multiline_text((GAP, GAP), lines, INK, face, spacing=2)
     pen.text((GAP, GAP + 2 * LINE_HEIGHT), last_line, INK, font(FONT_SIZE))
     return np.asarray(bar)
+
+
+def _fitted(
+    text: str, width: int, fits: Callable[[str, ImageFont.FreeTypeFont], bool]
+) -> tuple[str, ImageFont.FreeTypeFont]:
+    """The text in lines of so many pixels at most, in the largest type that fits, or in the smallest."""
+    for font_size in range(FONT_SIZE, MIN_FONT_SIZE - 1, -1):
+        face = font(font_size)
+        lines = _broken(text, face, width)
+        if fits(lines, face):
+            break
+    return lines, face
 
 
 def _broken(text: str, face: ImageFont.FreeTypeFont, width: int) -> str:
