@@ -91,8 +91,8 @@ def add_episode_arguments(parser: argparse.ArgumentParser) -> None:
         "--task_ids",
         type=parse_numbers,
         default=(),
-        help="numbered tasks, as [0,7,12], each played from every seed (25 x colour + 5 x row + column; "
-        "black = 0, white = 1; default: target and colour as above)",
+        help="numbered tasks of the suite, as [0,7,12], each played from every seed (of place 25 x colour + "
+        "5 x row + column; black = 0, white = 1; default: target and colour as above)",
     )
     add(
         "--perturbations",

@@ -66,8 +66,8 @@ class SpatialvlaGridConfig(TokenVlaConfig):
     grid_distribution: str = "gaussian"
     # lower limit of the fitted standard deviations, in normalised units
     grid_min_sigma: float = 0.0
-    # what a cell decodes to: "mid" (bin's middle), "cond_mean" (mean of the fitted Gaussian within the bin)
-    # or "centroid" (mean of the data within the cell)
+    # what a cell decodes to: "mid" (bin's middle), "cond_mean" (mean of the data within the bin; without any,
+    # of the fitted Gaussian) or "centroid" (mean of the data within the cell)
     decode_point: str = "cond_mean"
     # whether a polar group's smallest radius means "no motion" exactly, and up to which it does; None = a
     # fiftieth of the data's long motions

@@ -91,7 +91,7 @@ class SpatialvlaGridPolicy(TokenVlaPolicy):
         self.tokens, self.backbone = build_model(config)
         self.register_buffer("symbol_ids", torch.tensor(self.tokens.symbols), persistent=False)
         self.zoedepth = build_depth(config)
-        # grids: of checkpoints from before only their config held them
+        # a checkpoint of an earlier release has its grids in its config only
         self.may_skip = ("grids",) if self.zoedepth is not None else ("grids", "zoedepth")
         self.ego3d = Ego3D(
             self.backbone.vision_hidden_size,
