@@ -6,6 +6,7 @@ import subprocess
 import sys
 import time
 from collections.abc import Callable
+from contextlib import nullcontext
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -21,8 +22,8 @@ from lerobot_bomb.bomb.expert import expert_action
 from lerobot_bomb.bomb.observation import ACTION_NAMES, STATE_NAMES, RenderOptions
 from lerobot_bomb.bomb.privileged_state import PrivilegedState
 from lerobot_bomb.commands import main as cli
-from lerobot_bomb.commands.view import bomb_episode, write_episode
 from lerobot_bomb.envs.rollout import expert_agent, make_env, play
+from lerobot_bomb.viewing.episode import Player, bomb_episode, write_episodes
 from lerobot_env_bomb.env import BombEnv
 
 SPEC = EpisodeSpec(seed=4, target=(3, 2), color="white", fps=5)
@@ -306,7 +307,6 @@ def test_a_checkpoint_of_another_robot_is_refused(
 
 
 def test_an_error_half_way_leaves_no_file(tmp_path: Path) -> None:
-    env = make_env(SPEC, OPTIONS)
     expert = expert_agent()
     calls = iter(range(100))
 
@@ -316,9 +316,8 @@ def test_an_error_half_way_leaves_no_file(tmp_path: Path) -> None:
         return expert(observation, instruction)
 
     with pytest.raises(RuntimeError, match="out of order"):
-        viewed = bomb_episode(SPEC, OPTIONS)
-        write_episode(env, viewed, falters, "faltering", tmp_path / "x.rrd", tmp_path / "x.mp4")
-    env.close()
+        player = Player(bomb_episode(SPEC, OPTIONS), lambda env: nullcontext(falters))
+        write_episodes({"faltering": player}, "x", tmp_path / "x.rrd", tmp_path / "x.mp4")
     assert list(tmp_path.iterdir()) == []
 
 

@@ -1,6 +1,6 @@
 """A checkpoint's folder, read as LeRobot's commands read it, and written."""
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from contextlib import AbstractContextManager, nullcontext
 from pathlib import Path
 from typing import Any
@@ -25,8 +25,10 @@ Preprocessor = PolicyProcessorPipeline[dict[str, Any], dict[str, Any]]
 Postprocessor = PolicyProcessorPipeline[PolicyAction, PolicyAction]
 
 
-def read_config(path: Path, device: str | None) -> PreTrainedConfig:
+def read_config(path: Path, device: str | None, overrides: Sequence[str] = ()) -> PreTrainedConfig:
     """The config in the folder `pretrained_model`; `device` None means the checkpoint's own.
+
+    Of `overrides`, each is one of its fields as a flag: --chunk_size=8.
 
     Raises:
         ValueError: the folder holds no checkpoint, or this machine has no such device.
@@ -42,20 +44,20 @@ def read_config(path: Path, device: str | None) -> PreTrainedConfig:
     if device is not None and not is_torch_device_available(device):
         raise ValueError(f"the device {device} is not available on this machine; cpu is")
     register_third_party_plugins()
-    config = parse_config(path, device)
+    config = parse_config(path, device, overrides)
     config.pretrained_path = path
     return config
 
 
-def parse_config(path: Path, device: str | None) -> PreTrainedConfig:
+def parse_config(path: Path, device: str | None, overrides: Sequence[str] = ()) -> PreTrainedConfig:
     """The config in a folder, of a plugin that is registered.
 
     Raises:
         ValueError: it is truncated, of a newer version or of an unknown type.
     """
-    overrides = [] if device is None else [f"--device={device}"]
+    of_device = [] if device is None else [f"--device={device}"]
     try:
-        return PreTrainedConfig.from_pretrained(path, cli_overrides=overrides)
+        return PreTrainedConfig.from_pretrained(path, cli_overrides=[*overrides, *of_device])
     except DecodingError as error:
         raise ValueError(f"{path / FILES[0]}: {error}") from None
 

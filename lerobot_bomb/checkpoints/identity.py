@@ -4,6 +4,7 @@ import gc
 import hashlib
 import json
 import logging
+from dataclasses import replace
 from functools import cache
 from pathlib import Path
 from typing import Any
@@ -11,6 +12,7 @@ from typing import Any
 import draccus
 from huggingface_hub import try_to_load_from_cache
 from lerobot.configs import PreTrainedConfig
+from lerobot.policies import PreTrainedPolicy
 
 from lerobot_bomb._compat import built_policies, training_data
 from lerobot_bomb.checkpoints.checks import ADAPTERS
@@ -39,15 +41,23 @@ def acting_policy() -> PolicyIdentity | None:
                 "drop the others before the environment's first reset"
             )
         return None
-    config = policies[0].config
-    if training_data(policies[0]) is not None:
+    return identity_of(policies[0])
+
+
+def identity_of(policy: PreTrainedPolicy) -> PolicyIdentity:
+    """Which policy this is."""
+    config = policy.config
+    if training_data(policy) is not None:
         return PolicyIdentity(config.type, is_in_training=True)
     return PolicyIdentity(config.type) if config.pretrained_path is None else _of_checkpoint(config)
 
 
-def policy_of_results(results_path: str | None) -> dict[str, PolicyIdentity | None]:
-    """Argument of an environment that writes lines of results: the policy, which LeRobot builds after it."""
-    return {} if results_path is None else {"policy": acting_policy()}
+def policy_of_results(results_path: str | None, num_envs: int) -> list[dict[str, PolicyIdentity]]:
+    """Argument of each environment that writes lines of results: the policy, which LeRobot builds later."""
+    policy = None if results_path is None else acting_policy()
+    if policy is None:
+        return [{}] * num_envs
+    return [{"policy": replace(policy, batch_size=num_envs, batch_row=row)} for row in range(num_envs)]
 
 
 def weights_file(checkpoint: Path | str, revision: str | None, has_adapters: bool) -> Path | None:

@@ -20,6 +20,7 @@ COMMANDS = {
     "results": "summarise files written by --env.results_path",
     "report": "files of results as one page, with tables as JSON and CSV",
     "sweep": "evaluate policies x tasks x conditions; goes on after a kill",
+    "replay": "play an episode of a file of results again, bit for bit or with other perturbations",
     "compare": "two policies on the same episodes: difference, interval, test",
     "eval": "lerobot-eval, which also writes the executed actions to a file",
     "smoothness": "second and third differences of executed actions, of demonstrations and evaluations",

@@ -10,19 +10,12 @@ from typing import IO
 from tqdm import tqdm
 
 from lerobot_bomb.bomb.episode import TEST_SEEDS
-from lerobot_bomb.bomb.perturbations import Condition
 from lerobot_bomb.commands.arguments import parse_conditions, path_flag
-from lerobot_bomb.conditions import AxisCondition
-from lerobot_bomb.libero.perturbations import LiberoCondition
-from lerobot_bomb.pusht.perturbations import PushTCondition
+from lerobot_bomb.evaluation.result_lines import KINDS
 from lerobot_bomb.sweep.manifest import NAME, Cell, Manifest, plan
 from lerobot_bomb.sweep.store import Store
 
-CONDITIONS: dict[str, type[AxisCondition]] = {
-    "bomb": Condition,
-    "bomb_pusht": PushTCondition,
-    "bomb_libero": LiberoCondition,
-}
+CONDITIONS = {kind.env_type: kind.condition for kind in KINDS}
 POLL_S = 0.5
 MAX_BATCH = 10
 MAX_ENDED = 3

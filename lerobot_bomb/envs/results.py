@@ -57,7 +57,17 @@ class PolicyIdentity:
     settings_sha256: str | None = None  # of the config that it acted with and of the processors' files
     base: str | None = None  # what adapters are loaded on: a folder or USER/NAME@REVISION
     is_in_training: bool = False  # its weights are in no file
+    # of episodes that it acted in at once; a policy's arithmetic rounds otherwise in a batch of another size
+    batch_size: int | None = None
+    batch_row: int | None = None  # which of them this one was
 
+
+# of a line: who played, with which tasks beside, and what simulated; the rest is the episode
+ORIGIN = {
+    "policy", "task_ids", "opengl_vendor", "opengl_renderer", "machine", "mujoco_version",
+    "simulator_versions", "lerobot_version", "torch_version", "package_version", "task_version",
+    "protocol_version",
+}  # fmt: skip
 
 type Row = dict[str, Any]  # a line read back: the fields of a ResultLine
 

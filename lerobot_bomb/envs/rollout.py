@@ -1,6 +1,7 @@
 """One episode, step by step, played by whatever acts. It imports neither torch nor LeRobot."""
 
 from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass
 from typing import Any
 
@@ -11,6 +12,7 @@ from lerobot_bomb.bomb.episode import EpisodeSpec
 from lerobot_bomb.bomb.expert import expert_action
 from lerobot_bomb.bomb.observation import ENVIRONMENT_STATE, MAX_STEP_M, RenderOptions, action_bounds
 from lerobot_bomb.bomb.privileged_state import PrivilegedState
+from lerobot_bomb.envs.vector import FreezeAfterEnd
 from lerobot_bomb.libero.episode import LiberoSpec
 from lerobot_bomb.pusht.episode import PushTSpec
 
@@ -21,6 +23,8 @@ PUSHT_ENV_ID = "lerobot_env_bomb_pusht:bomb_pusht/PushT-v0"
 
 # (observation of the environment, instruction) -> (D,) action
 type Agent = Callable[[dict[str, Any], str], np.ndarray]
+# the same of B environments: (B, D) actions
+type BatchAgent = Callable[[list[dict[str, Any]], list[str]], np.ndarray]
 # privileged state -> (4,) action
 type Expert = Callable[[PrivilegedState], np.ndarray]
 
@@ -83,6 +87,33 @@ def play(
         observation, _, terminated, truncated, info = env.step(executed)
         step, ended = step + 1, terminated or truncated
     yield Moment(step, env.get_wrapper_attr("task_description"), observation, info, None)
+
+
+@contextmanager
+def one_of_batch(
+    agent: BatchAgent, make_env: Callable[[], gymnasium.Env], seed: int, row: int, size: int
+) -> Iterator[Agent]:
+    """Who acts in the episode of a seed, and at once in the others of its batch, whose seeds stand around it.
+
+    lerobot-eval plays consecutive seeds as a batch, in which a policy's arithmetic rounds otherwise than
+    alone. The other episodes are played here, unseen.
+    """
+    others = {i: FreezeAfterEnd(make_env()) for i in range(size) if i != row}
+    seen = {i: env.reset(seed=seed - row + i)[0] for i, env in others.items()}
+
+    def act(observation: dict[str, Any], instruction: str) -> np.ndarray:
+        said = {i: env.get_wrapper_attr("task_description") for i, env in others.items()}
+        observations, instructions = seen | {row: observation}, said | {row: instruction}
+        actions = agent([observations[i] for i in range(size)], [instructions[i] for i in range(size)])
+        for i, env in others.items():
+            seen[i] = env.step(actions[i])[0]
+        return actions[row]
+
+    try:
+        yield act
+    finally:
+        for env in others.values():
+            env.close()
 
 
 def expert_agent(expert: Expert = expert_action) -> Agent:

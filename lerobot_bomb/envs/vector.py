@@ -71,7 +71,8 @@ class LazyVectorEnv(VectorEnv):
         make_ones: one picklable factory per env, of torch-free modules.
         use_async: a worker process per env (`AsyncVectorEnv`); else all in this process.
         context: multiprocessing start method of the workers.
-        known_late: gives keyword arguments of the factories that are known only when the envs start.
+        known_late: gives, for so many envs, the keyword arguments of each one's factory that are known only
+            when they start.
         on_first_reset: is given the observations of the first reset, in this process.
     """
 
@@ -80,7 +81,7 @@ class LazyVectorEnv(VectorEnv):
         make_ones: Sequence[Callable[..., gym.Env]],
         use_async: bool,
         context: str = "forkserver",
-        known_late: Callable[[], dict[str, Any]] = dict,
+        known_late: Callable[[int], Sequence[dict[str, Any]]] = lambda num_envs: [{}] * num_envs,
         on_first_reset: Callable[[Any], None] | None = None,
     ) -> None:
         probe = make_ones[0]()
@@ -101,8 +102,11 @@ class LazyVectorEnv(VectorEnv):
     def _ensure(self) -> SyncVectorEnv | AsyncVectorEnv:
         """Start the envs unless they run; LeRobot calls this by name to prefetch the next condition."""
         if self._envs is None:
-            late = self._known_late()
-            factories = [partial(_make_frozen, partial(make_one, **late)) for make_one in self._make_ones]
+            late = self._known_late(self.num_envs)
+            factories = [
+                partial(_make_frozen, partial(make_one, **of_one))
+                for make_one, of_one in zip(self._make_ones, late, strict=True)
+            ]
             if self._use_async:
                 with light_children():
                     self._envs = AsyncVectorEnv(

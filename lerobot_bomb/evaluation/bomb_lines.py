@@ -10,6 +10,7 @@ import numpy as np
 from lerobot_bomb.bomb.board import BOARD, COLORS, task_id
 from lerobot_bomb.bomb.episode import PROTOCOL_VERSION, TASK_VERSION, EpisodeSpec, Failure, Stage
 from lerobot_bomb.bomb.observation import CAMERAS, MAX_IMAGE_SIZE, MIN_IMAGE_SIZE, RENDER_PRESETS
+from lerobot_bomb.bomb.perturbations import Condition
 from lerobot_bomb.data.environment import Environment
 from lerobot_bomb.envs.results import Row
 from lerobot_bomb.evaluation.line_checks import (
@@ -127,10 +128,19 @@ def _progress(rows: list[Row]) -> str:
     return f"{100 * mean(shares):.1f} %" if shares else NO_VALUE
 
 
+def spec_of(row: Row) -> EpisodeSpec:
+    """Of a line's episode.
+
+    Raises:
+        ValueError: there can be no such episode.
+    """
+    target = row["spec"]["target"]
+    return EpisodeSpec(**row["spec"] | {"target": target and tuple(target)})
+
+
 def _check_episode(row: Row) -> None:
+    spec_of(row)
     spec = row["spec"]
-    values: dict[str, Any] = spec | {"target": spec["target"] and tuple(spec["target"])}
-    EpisodeSpec(**values)
     for name in ("target", "color"):
         if spec[name] not in (None, row[name]):
             raise ValueError(f"{name}={row[name]}, but spec.{name}={spec[name]}")
@@ -203,6 +213,7 @@ def _task_flags(specs: list[dict[str, Any]]) -> list[str]:
 
 BOMB_LINES = ResultKind(
     env_type="bomb",
+    condition=Condition,
     fields={OLD_VERSION: CHECKS, PROTOCOL_VERSION: CHECKS | NEW_CHECKS},
     spec_fields=SPEC_CHECKS,
     check_episode=_check_episode,

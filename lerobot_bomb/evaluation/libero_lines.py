@@ -13,6 +13,7 @@ from lerobot_bomb.evaluation.line_checks import (
 )
 from lerobot_bomb.evaluation.result_kind import ResultKind, describe_numbers, describe_versions
 from lerobot_bomb.libero.episode import LIBERO_PROTOCOL_VERSION, LiberoFailure, LiberoSpec
+from lerobot_bomb.libero.perturbations import LiberoCondition
 
 LIBERO_SPEC_CHECKS: dict[str, Check] = {  # the rest is LiberoSpec's own
     "seed": is_int(0),
@@ -76,6 +77,7 @@ def _eval_flags(rows: list[Row]) -> list[str]:
 
 LIBERO_LINES = ResultKind(
     env_type="bomb_libero",
+    condition=LiberoCondition,
     fields={LIBERO_PROTOCOL_VERSION: LIBERO_CHECKS},
     spec_fields=LIBERO_SPEC_CHECKS,
     check_episode=_check_episode,

@@ -25,6 +25,7 @@ from lerobot_bomb.pusht.episode import (
     PushTFailure,
     PushTSpec,
 )
+from lerobot_bomb.pusht.perturbations import PushTCondition
 from lerobot_bomb.stats import bca_interval, bootstrap_interval, format_bounds
 
 
@@ -91,6 +92,7 @@ def _coverage_change(pairs: list[Pair]) -> str:
 
 PUSHT_LINES = ResultKind(
     env_type="bomb_pusht",
+    condition=PushTCondition,
     fields={PUSHT_PROTOCOL_VERSION: PUSHT_CHECKS},
     spec_fields=PUSHT_SPEC_CHECKS,
     check_episode=_check_episode,

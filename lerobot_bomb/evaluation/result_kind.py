@@ -3,6 +3,7 @@
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 
+from lerobot_bomb.conditions import AxisCondition
 from lerobot_bomb.data.environment import Environment
 from lerobot_bomb.envs.results import Row
 from lerobot_bomb.evaluation.line_checks import Check, check_fields, refuse_others
@@ -28,6 +29,7 @@ class ResultKind:
     """Lines of one environment: how they are known, what each must say, and what they say together."""
 
     env_type: str
+    condition: type[AxisCondition]  # its perturbations
     # {protocol version: what its lines must say}, the oldest first; it is how lines are known, so no two
     # environments share one
     fields: Mapping[str, Mapping[str, Check]]

@@ -10,6 +10,7 @@ from lerobot_bomb.evaluation.line_checks import (
     Check,
     check_fields,
     is_bool,
+    is_int,
     is_sha256,
     is_text,
     or_none,
@@ -29,6 +30,8 @@ POLICY_CHECKS: dict[str, Check] = {
     "base": or_none(is_text),
     "is_in_training": is_bool,
 }
+# what lines of earlier releases do not have
+ADDED_POLICY_CHECKS: dict[str, Check] = {"batch_size": or_none(is_int(1)), "batch_row": or_none(is_int(0))}
 
 
 def read_lines(path: Path) -> tuple[list[Row], list[str]]:
@@ -88,7 +91,8 @@ def parse_line(line: bytes) -> Row:
     kind = kind_of(row)
     kind.check(row)
     if row.get("policy") is not None:
-        check_fields(row["policy"], POLICY_CHECKS, "policy.")
+        added = {name: check for name, check in ADDED_POLICY_CHECKS.items() if name in row["policy"]}
+        check_fields(row["policy"], POLICY_CHECKS | added, "policy.")
     if row["is_success"] != (row["failure"] is None):
         raise ValueError(f"is_success={row['is_success']} with failure={row['failure']!r}")
     kind.check_spec(row)

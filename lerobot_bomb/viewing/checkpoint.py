@@ -1,5 +1,6 @@
-"""A checkpoint that acts in one environment, loaded and called as lerobot-eval does it."""
+"""A policy that acts in an environment, loaded and called as lerobot-eval does it."""
 
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -12,41 +13,79 @@ from lerobot.envs import (
     make_env_pre_post_processors,
     preprocess_observation,
 )
-from lerobot.policies import make_policy
+from lerobot.policies import make_policy, make_pre_post_processors
 from lerobot.utils.constants import ACTION, OBS_STATE
+from lerobot.utils.import_utils import register_third_party_plugins
 from lerobot.utils.random_utils import set_seed
 
+from lerobot_bomb.bomb.scripted_policy import ScriptedConfig
 from lerobot_bomb.checkpoints.adapters import check_adapters
-from lerobot_bomb.checkpoints.folder import autocast, load_processors, read_config
-from lerobot_bomb.envs.rollout import Agent
+from lerobot_bomb.checkpoints.folder import (
+    Postprocessor,
+    Preprocessor,
+    autocast,
+    load_processors,
+    read_config,
+)
+from lerobot_bomb.envs.rollout import BatchAgent
 
 
 def checkpoint_agent(
-    path: Path, device: str | None, env_type: str, env_flags: dict[str, Any], seed: int
-) -> Agent:
+    path: Path,
+    device: str | None,
+    env_type: str,
+    env_flags: dict[str, Any],
+    seed: int,
+    overrides: Sequence[str] = (),
+) -> BatchAgent:
     """Load the folder `pretrained_model` of a checkpoint; `device` None means the checkpoint's own.
+
+    Of `overrides`, each is a field of its config as a flag: --chunk_size=8.
 
     Raises:
         ValueError: the folder holds no checkpoint, one whose action or state is not the environment's, or one
             that was trained for another environment.
     """
-    config = read_config(path, device)
+    config = read_config(path, device, overrides)
     env_config: EnvConfig = EnvConfig.get_choice_class(env_type)(**env_flags)
     _check_shapes(path, config, env_config)
     if config.use_peft:
         check_adapters(str(path), None)
+    return _agent(config, env_config, seed, load_processors)
+
+
+def scripted_agent(policy_type: str, env_type: str, env_flags: dict[str, Any], seed: int) -> BatchAgent:
+    """A policy without weights, built from its type.
+
+    Raises:
+        ValueError: the type has weights, which would be random ones.
+    """
+    register_third_party_plugins()
+    config = PreTrainedConfig.get_choice_class(policy_type)()
+    if not isinstance(config, ScriptedConfig):
+        raise ValueError(f"{policy_type} was built with random weights, which are in no file")
+    env_config: EnvConfig = EnvConfig.get_choice_class(env_type)(**env_flags)
+    return _agent(config, env_config, seed, make_pre_post_processors)
+
+
+def _agent(
+    config: PreTrainedConfig,
+    env_config: EnvConfig,
+    seed: int,
+    make_processors: Callable[[PreTrainedConfig], tuple[Preprocessor, Postprocessor]],
+) -> BatchAgent:
     set_seed(seed)
     policy = make_policy(cfg=config, env_cfg=env_config)
     policy.eval()
     policy.reset()
-    preprocess, postprocess = load_processors(config)
+    preprocess, postprocess = make_processors(config)
     env_preprocess, env_postprocess = make_env_pre_post_processors(env_cfg=env_config, policy_cfg=config)
 
-    def act(observation: dict[str, Any], instruction: str) -> np.ndarray:
-        batch = {**preprocess_observation(_batch_of_one(observation)), "task": [instruction]}
+    def act(observations: list[dict[str, Any]], instructions: list[str]) -> np.ndarray:
+        batch = {**preprocess_observation(_stacked(observations)), "task": instructions}
         with torch.inference_mode(), autocast(config):
             action = postprocess(policy.select_action(preprocess(env_preprocess(batch))))
-        return env_postprocess({ACTION: action})[ACTION].to("cpu").numpy()[0]
+        return env_postprocess({ACTION: action})[ACTION].to("cpu").numpy()
 
     return act
 
@@ -62,8 +101,8 @@ def _check_shapes(path: Path, config: PreTrainedConfig, env_config: EnvConfig) -
             )
 
 
-def _batch_of_one(values: Any) -> Any:
-    """Arrays in nested dicts, each with a first axis of one: what a vector environment gives."""
-    if isinstance(values, dict):
-        return {key: _batch_of_one(value) for key, value in values.items()}
-    return np.asarray(values)[None]
+def _stacked(rows: list[Any]) -> Any:
+    """Arrays in nested dicts, stacked along a first axis: what a vector environment gives."""
+    if isinstance(rows[0], dict):
+        return {key: _stacked([row[key] for row in rows]) for key in rows[0]}
+    return np.stack(rows)

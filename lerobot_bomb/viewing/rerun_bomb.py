@@ -1,7 +1,5 @@
 """An episode of BOMB as a recording for the viewer of Rerun: cameras, the scene in 3-D, curves, words."""
 
-from pathlib import Path
-
 import numpy as np
 import rerun as rr
 import rerun.blueprint as rrb
@@ -13,7 +11,7 @@ from lerobot_bomb.bomb.observation import ACTION_NAMES, AGENT_POS, CAMERAS, PIXE
 from lerobot_bomb.bomb.privileged_state import PrivilegedState
 from lerobot_bomb.envs.results import EpisodeResult
 from lerobot_bomb.envs.rollout import Moment
-from lerobot_bomb.viewing.rerun_file import RerunFile, curve_views, describe_outcome, png, text_views
+from lerobot_bomb.viewing.rerun_file import EpisodeLog, curve_views, describe_outcome, png, text_views
 
 STONE_RGB = {"black": (25, 25, 28), "white": (240, 240, 235)}
 BOARD_RGB, LINE_RGB = (216, 168, 104), (46, 30, 16)
@@ -23,12 +21,11 @@ TARGET_RADIUS_M = 1.2 * BOARD.stone_radius_m  # a ring that a stone on the targe
 EYE_M, LOOK_AT_M = (0.05, -0.30, 0.28), (0.05, 0.0, 0.03)  # in front of the board
 
 
-class BombRerunFile(RerunFile[EpisodeResult]):
+class BombLog(EpisodeLog[EpisodeSpec, EpisodeResult]):
     """Both cameras, the scene, what the arm does."""
 
-    def __init__(self, path: Path, spec: EpisodeSpec, name: str) -> None:
-        curves = {"action": ACTION_NAMES[spec.control_mode], "state": STATE_NAMES}
-        super().__init__(path, name, spec.fps, layout(), curves)
+    def __init__(self, recording: rr.RecordingStream, prefix: str, spec: EpisodeSpec) -> None:
+        super().__init__(recording, prefix, spec)
         self._trace: list[np.ndarray] = []
         self._stage = ""
         self._log("scene", rr.ViewCoordinates.RIGHT_HAND_Z_UP, static=True)
@@ -42,6 +39,28 @@ class BombRerunFile(RerunFile[EpisodeResult]):
         place = f"nearest to row {row}, column {column}" if is_carried else "never lifted"
         moves = "" if result.target else f"{result.progress:.0%} of the moves made; "
         return f"{outcome}; {moves}the stone is {result.placement_error_mm:.1f} mm from the target, {place}"
+
+    @staticmethod
+    def layout(prefix: str) -> rrb.Horizontal:
+        """Cameras at the left, the scene over the words, curves at the right."""
+        eye = rrb.EyeControls3D(position=EYE_M, look_target=LOOK_AT_M, eye_up=(0.0, 0.0, 1.0))
+        cameras = [rrb.Spatial2DView(origin=f"{prefix}camera/{camera}", name=camera) for camera in CAMERAS]
+        instruction, result = text_views(prefix, "instruction", "result")
+        words = [instruction, rrb.TextLogView(origin=f"{prefix}stage", name="stage"), result]
+        return rrb.Horizontal(
+            rrb.Vertical(*cameras),
+            rrb.Vertical(
+                rrb.Spatial3DView(origin=f"{prefix}scene", name="scene", eye_controls=eye),
+                rrb.Horizontal(*words),
+                row_shares=[3, 1],
+            ),
+            rrb.Vertical(*curve_views(prefix, "action", "state", "placement_error_mm")),
+            column_shares=[1, 2, 1.3],
+        )
+
+    @staticmethod
+    def _timing_and_curves(spec: EpisodeSpec) -> tuple[int, dict[str, tuple[str, ...]]]:
+        return spec.fps, {"action": ACTION_NAMES[spec.control_mode], "state": STATE_NAMES}
 
     def _log_still(self, moment: Moment) -> None:
         self._log_targets(moment.state)
@@ -117,21 +136,3 @@ def describe_place(xy: np.ndarray) -> str:
         return "target: the tray"
     row, column = BOARD.nearest_intersection(xy)
     return f"target: row {row}, column {column}"
-
-
-def layout() -> rrb.Horizontal:
-    """Cameras at the left, the scene over the words, curves at the right."""
-    eye = rrb.EyeControls3D(position=EYE_M, look_target=LOOK_AT_M, eye_up=(0.0, 0.0, 1.0))
-    cameras = [rrb.Spatial2DView(origin=f"camera/{camera}", name=camera) for camera in CAMERAS]
-    instruction, result = text_views("instruction", "result")
-    words = [instruction, rrb.TextLogView(origin="stage", name="stage"), result]
-    return rrb.Horizontal(
-        rrb.Vertical(*cameras),
-        rrb.Vertical(
-            rrb.Spatial3DView(origin="scene", name="scene", eye_controls=eye),
-            rrb.Horizontal(*words),
-            row_shares=[3, 1],
-        ),
-        rrb.Vertical(*curve_views("action", "state", "placement_error_mm")),
-        column_shares=[1, 2, 1.3],
-    )

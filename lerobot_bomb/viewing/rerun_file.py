@@ -1,9 +1,10 @@
 """An episode as a recording for the viewer of Rerun: images, curves, words; the rest is the environment's."""
 
 from abc import ABC, abstractmethod
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from pathlib import Path
-from typing import Any, Self
+from typing import Any
 
 import cv2
 import numpy as np
@@ -18,30 +19,36 @@ STEP, TIME = "step", "time"  # the timelines: control steps, seconds
 CURVE_RGB = ((230, 75, 60), (70, 180, 90), (80, 140, 240), (240, 180, 50))
 
 
-class RerunFile[ResultT: ResultLine](ABC):
-    """Writes moments of one episode to an .rrd, on the timelines `step` and `time`."""
+@contextmanager
+def open_recording(
+    path: Path, name: str, fps: int, layout: rrb.ContainerLike
+) -> Iterator[rr.RecordingStream]:
+    """An .rrd that is being written; `layout` is what the viewer shows at first."""
+    recording = rr.RecordingStream(APPLICATION)
+    blueprint = rrb.Blueprint(
+        layout,
+        rrb.TimePanel(state="collapsed", timeline=STEP, fps=fps),
+        rrb.BlueprintPanel(state="collapsed"),
+        rrb.SelectionPanel(state="collapsed"),
+    )
+    recording.save(path, default_blueprint=blueprint)
+    recording.send_recording_name(name)
+    try:
+        yield recording
+    finally:
+        recording.flush()
+        recording.disconnect()
 
-    def __init__(
-        self,
-        path: Path,
-        name: str,
-        fps: int,
-        layout: rrb.ContainerLike,
-        curves: Mapping[str, Sequence[str]],
-    ) -> None:
-        """`layout` is what the viewer shows at first; `curves`: {entity: names of its values}."""
-        self._fps, self._curves = fps, curves
+
+class EpisodeLog[SpecT, ResultT: ResultLine](ABC):
+    """Writes moments of one episode to a recording, on the timelines `step` and `time`."""
+
+    def __init__(self, recording: rr.RecordingStream, prefix: str, spec: SpecT) -> None:
+        """`prefix` stands before every entity."""
+        self._recording, self._prefix = recording, prefix
+        self._fps, self._curves = self._timing_and_curves(spec)
         self._instruction: str | None = None
-        self._recording = rr.RecordingStream(APPLICATION)
-        blueprint = rrb.Blueprint(
-            layout,
-            rrb.TimePanel(state="collapsed", timeline=STEP, fps=fps),
-            rrb.BlueprintPanel(state="collapsed"),
-            rrb.SelectionPanel(state="collapsed"),
-        )
-        self._recording.save(path, default_blueprint=blueprint)
-        self._recording.send_recording_name(name)
-        for entity, names in curves.items():
+        for entity, names in self._curves.items():
             for of, color in zip(names, CURVE_RGB, strict=False):
                 self._log(f"{entity}/{of}", rr.SeriesLines(colors=[color], names=[of]), static=True)
 
@@ -65,8 +72,18 @@ class RerunFile[ResultT: ResultLine](ABC):
 
     @staticmethod
     @abstractmethod
+    def layout(prefix: str) -> rrb.Horizontal:
+        """What the viewer shows at first of the entities with this prefix."""
+
+    @staticmethod
+    @abstractmethod
     def describe(result: ResultT) -> str:
         """One line: success or the class of failure, after how many steps, how far from success."""
+
+    @staticmethod
+    @abstractmethod
+    def _timing_and_curves(spec: SpecT) -> tuple[int, Mapping[str, Sequence[str]]]:
+        """Control steps per second; {entity: names of its values}."""
 
     @abstractmethod
     def _log_still(self, moment: Moment) -> None:
@@ -76,15 +93,8 @@ class RerunFile[ResultT: ResultLine](ABC):
     def _log_moment(self, moment: Moment) -> None:
         """Log what is seen; the time is set, and the action is logged."""
 
-    def __enter__(self) -> Self:
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        self._recording.flush()
-        self._recording.disconnect()
-
     def _log(self, entity: str, what: rr.AsComponents, static: bool = False) -> None:
-        self._recording.log(entity, what, static=static, strict=True)
+        self._recording.log(f"{self._prefix}{entity}", what, static=static, strict=True)
 
     def _log_values(self, entity: str, values: np.ndarray) -> None:
         for name, value in zip(self._curves[entity], values, strict=True):
@@ -95,14 +105,14 @@ class RerunFile[ResultT: ResultLine](ABC):
         self._recording.set_time(TIME, duration=step / self._fps)
 
 
-def text_views(*entities: str) -> list[rrb.TextDocumentView]:
+def text_views(prefix: str, *entities: str) -> list[rrb.TextDocumentView]:
     """Each a text that stays until the next."""
-    return [rrb.TextDocumentView(origin=entity, name=entity) for entity in entities]
+    return [rrb.TextDocumentView(origin=f"{prefix}{entity}", name=entity) for entity in entities]
 
 
-def curve_views(*entities: str) -> list[rrb.TimeSeriesView]:
+def curve_views(prefix: str, *entities: str) -> list[rrb.TimeSeriesView]:
     """Each with the curves below an entity."""
-    return [rrb.TimeSeriesView(origin=entity, name=entity) for entity in entities]
+    return [rrb.TimeSeriesView(origin=f"{prefix}{entity}", name=entity) for entity in entities]
 
 
 def describe_outcome(is_success: bool, failure: str | None, steps: int) -> str:

@@ -1,31 +1,47 @@
 """An episode of `bomb_pusht` as a recording for the viewer of Rerun."""
 
-from pathlib import Path
-
 import numpy as np
 import rerun as rr
 import rerun.blueprint as rrb
 
 from lerobot_bomb.envs.pusht_results import PushTResult
 from lerobot_bomb.envs.rollout import Moment
-from lerobot_bomb.pusht.episode import FPS
-from lerobot_bomb.viewing.rerun_file import RerunFile, curve_views, describe_outcome, png, text_views
+from lerobot_bomb.pusht.episode import FPS, PushTSpec
+from lerobot_bomb.viewing.rerun_file import EpisodeLog, curve_views, describe_outcome, png, text_views
 
 # positions in pixels of the board; how far the block is turned from the target
-CURVES = {"action": ("x", "y"), "state": ("x", "y"), "block": ("x", "y"), "turned": ("degrees",)}
+CURVES: dict[str, tuple[str, ...]] = {
+    "action": ("x", "y"),
+    "state": ("x", "y"),
+    "block": ("x", "y"),
+    "turned": ("degrees",),
+}
 
 
-class PushTRerunFile(RerunFile[PushTResult]):
+class PushTLog(EpisodeLog[PushTSpec, PushTResult]):
     """The policy's image, the agent, the block and its coverage of the target."""
-
-    def __init__(self, path: Path, name: str) -> None:
-        super().__init__(path, name, FPS, layout(), CURVES)
 
     @staticmethod
     def describe(result: PushTResult) -> str:
         outcome = describe_outcome(result.is_success, result.failure, result.steps)
         covered = f"{result.coverage:.3f} of the target, at its best moment {result.max_coverage:.3f}"
         return f"{outcome}; the block covers {covered}"
+
+    @staticmethod
+    def layout(prefix: str) -> rrb.Horizontal:
+        """The image and the words at the left, curves at the right."""
+        return rrb.Horizontal(
+            rrb.Vertical(
+                rrb.Spatial2DView(origin=f"{prefix}camera", name="camera"),
+                rrb.Horizontal(*text_views(prefix, "instruction", "result")),
+                row_shares=[3, 1],
+            ),
+            rrb.Vertical(*curve_views(prefix, *CURVES, "coverage")),
+        )
+
+    @staticmethod
+    def _timing_and_curves(spec: PushTSpec) -> tuple[int, dict[str, tuple[str, ...]]]:
+        return FPS, CURVES
 
     def _log_still(self, moment: Moment) -> None:
         pass
@@ -39,15 +55,3 @@ class PushTRerunFile(RerunFile[PushTResult]):
         self._log_values("turned", np.array([turned_deg]))
         if "coverage" in moment.info:  # gym-pusht measures it after a step
             self._log("coverage", rr.Scalars(float(moment.info["coverage"])))
-
-
-def layout() -> rrb.Horizontal:
-    """The image and the words at the left, curves at the right."""
-    return rrb.Horizontal(
-        rrb.Vertical(
-            rrb.Spatial2DView(origin="camera", name="camera"),
-            rrb.Horizontal(*text_views("instruction", "result")),
-            row_shares=[3, 1],
-        ),
-        rrb.Vertical(*curve_views(*CURVES, "coverage")),
-    )

@@ -1,0 +1,167 @@
+"""Episodes played into a recording for Rerun and a video: one, or several side by side."""
+
+from collections.abc import Callable, Mapping
+from contextlib import AbstractContextManager, closing
+from dataclasses import dataclass
+from functools import partial
+from itertools import zip_longest
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, cast
+
+import gymnasium
+import numpy as np
+
+from lerobot_bomb.bomb.episode import EpisodeSpec
+from lerobot_bomb.bomb.observation import RenderOptions
+from lerobot_bomb.bomb.perturbations import Condition
+from lerobot_bomb.envs.results import ResultLine
+from lerobot_bomb.envs.rollout import Agent, make_env, make_pusht_env, play
+from lerobot_bomb.files import written_whole
+from lerobot_bomb.pusht.episode import FPS, PushTSpec, check_image_size, check_installed
+from lerobot_bomb.pusht.perturbations import PushTCondition
+
+if TYPE_CHECKING:
+    import rerun.blueprint as rrb
+
+    from lerobot_bomb.viewing.rerun_file import EpisodeLog
+
+EXPERT, RANDOM = "expert", "random"
+SUFFIXES = (".rrd", ".mp4")
+
+
+@dataclass(frozen=True)
+class Viewed:
+    """An episode of one environment, and how it is played and shown."""
+
+    env_type: str
+    spec: EpisodeSpec | PushTSpec
+    group: str  # "place.camera-3"
+    fps: int
+    policies: tuple[str, ...]  # who can act without a checkpoint; the first does unless another is named
+    env_flags: dict[str, Any]  # of LeRobot's config, for a checkpoint
+    make_env: Callable[[], gymnasium.Env]
+    log: "Callable[[], type[EpisodeLog]]"  # rerun takes a second to import
+
+    def name(self, policy: str) -> str:
+        """Of an episode and of its files: "place.camera-3_expert_seed0"."""
+        return f"{self.group}_{policy}_seed{self.spec.seed}"
+
+
+def bomb_episode(spec: EpisodeSpec, options: RenderOptions) -> Viewed:
+    """An episode of `bomb`."""
+    env_flags = {
+        "task": spec.suite,
+        "robot": spec.robot,
+        "control_mode": spec.control_mode,
+        "fps": spec.fps,
+        "image_size": options.image_size,
+        "depth": options.depth,
+    }
+    return Viewed(
+        env_type="bomb",
+        spec=spec,
+        group=f"{spec.suite}.{Condition.parse(spec.perturbations).key}",
+        fps=spec.fps,
+        policies=(EXPERT, RANDOM),
+        env_flags=env_flags,
+        make_env=partial(make_env, spec, options),
+        log=_bomb_log,
+    )
+
+
+def pusht_episode(spec: PushTSpec, image_size: int) -> Viewed:
+    """An episode of `bomb_pusht`.
+
+    Raises:
+        ValueError: gym-pusht is not installed, or draws no such images.
+    """
+    check_installed()
+    check_image_size(image_size)
+    return Viewed(
+        env_type="bomb_pusht",
+        spec=spec,
+        group=f"pusht.{PushTCondition.parse(spec.perturbations).key}",
+        fps=FPS,
+        policies=(RANDOM,),
+        env_flags={"image_size": image_size, "instruction": spec.instruction, "max_steps": spec.max_steps},
+        make_env=partial(make_pusht_env, spec, image_size),
+        log=_pusht_log,
+    )
+
+
+@dataclass(frozen=True)
+class Player:
+    """Who plays which episode."""
+
+    viewed: Viewed
+    make_agent: Callable[[gymnasium.Env], AbstractContextManager[Agent]]
+
+
+def write_episodes(players: Mapping[str, Player], name: str, rrd: Path, mp4: Path) -> list[ResultLine]:
+    """Play one after the other, write what happened, and return what became of each.
+
+    With one player, its entities stand at the recording's top; of several, each below its name, and the video
+    shows them side by side, the last image of an episode until the others have ended.
+    """
+    from lerobot_bomb.viewing.rerun_file import open_recording
+    from lerobot_bomb.viewing.video import VideoFile, packed, unpacked
+
+    prefixes = {label: f"{label}/" if len(players) > 1 else "" for label in players}
+    fps = next(iter(players.values())).viewed.fps
+    results: list[ResultLine] = []
+    images: list[list[np.ndarray]] = []
+    with (
+        written_whole(rrd, mp4) as (unfinished_rrd, unfinished_mp4),
+        open_recording(unfinished_rrd, name, fps, _layout(players, prefixes)) as recording,
+    ):
+        for label, player in players.items():
+            log = player.viewed.log()(recording, prefixes[label], player.viewed.spec)
+            images.append([])
+            with closing(player.viewed.make_env()) as env, player.make_agent(env) as agent:
+                for moment in play(env, player.viewed.spec, agent):
+                    log.add(moment)
+                    images[-1].append(packed(cast("np.ndarray", env.render())))
+                results.append(env.get_wrapper_attr("episode_result")())
+            log.add_result(results[-1])
+        with VideoFile(unfinished_mp4, fps) as video:
+            for row in zip_longest(*images):
+                shown = [of[-1] if image is None else image for image, of in zip(row, images, strict=True)]
+                video.add(np.hstack([unpacked(image) for image in shown]))
+    return results
+
+
+def new_paths(output: Path | None, folder: Path, name: str) -> list[Path]:
+    """The two files of a user's `output`: their path without .rrd and .mp4, or a folder; None: in `folder`.
+
+    Raises:
+        ValueError: one of them exists.
+    """
+    stem = output or folder / name
+    if stem.is_dir():
+        stem = stem / name
+    if stem.suffix in SUFFIXES:
+        stem = stem.with_suffix("")
+    paths = [Path(f"{stem}{suffix}") for suffix in SUFFIXES]
+    for path in paths:
+        if path.exists():
+            raise ValueError(f"{path} exists already; name other files with --output=PATH, or delete it")
+    return paths
+
+
+def _layout(players: Mapping[str, Player], prefixes: Mapping[str, str]) -> "rrb.ContainerLike":
+    import rerun.blueprint as rrb
+
+    layouts = [player.viewed.log().layout(prefixes[label]) for label, player in players.items()]
+    return layouts[0] if len(layouts) == 1 else rrb.Vertical(*layouts)
+
+
+def _bomb_log() -> "type[EpisodeLog]":
+    from lerobot_bomb.viewing.rerun_bomb import BombLog
+
+    return BombLog
+
+
+def _pusht_log() -> "type[EpisodeLog]":
+    from lerobot_bomb.viewing.rerun_pusht import PushTLog
+
+    return PushTLog

@@ -1,0 +1,180 @@
+"""``lerobot-bomb replay``: a line of results once more, bit for bit; and the same with another axis."""
+
+import json
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import av
+import pytest
+from rrd_files import read_rrd
+
+from lerobot_bomb.commands.main import main
+from lerobot_bomb.commands.replay import DIFFERS
+from lerobot_bomb.conditions import NONE
+from lerobot_bomb.envs.results import ORIGIN, EpisodeResult
+
+SHIPPED = ("bomb:vla0_smol", "bomb:spatialvla_grid", "bomb:fdvla")
+
+
+@pytest.fixture(scope="module")
+def results(tmp_path_factory: pytest.TempPathFactory) -> Callable[..., Path]:
+    """The file of results of an evaluation by lerobot-eval, in which three episodes are a batch."""
+    from lerobot_bomb.sweep.manifest import plan
+    from lerobot_bomb.sweep.store import Store
+    from lerobot_bomb.sweep.worker import Worker
+
+    files: dict[Any, Path] = {}
+
+    def play(policy: str, *flags: str, condition: str = "all:1-5") -> Path:
+        if (policy, flags, condition) not in files:
+            folder = tmp_path_factory.mktemp("sweep")
+            shown = ("--env.type=bomb", "--env.image_size=64", "--policy.device=cpu", *flags)
+            store = Store(folder, plan((policy,), (), (condition,), 7, 3, 3, shown))
+            Worker(store).run(list(store.manifest.cells))
+            store.merge()
+            files[policy, flags, condition] = folder / "results.jsonl"
+        return files[policy, flags, condition]
+
+    return play
+
+
+def rewritten(path: Path, file: Path, **changes: Any) -> Path:
+    """Its first line with other values."""
+    values = json.loads(path.read_text().splitlines()[0])
+    file.write_text(json.dumps(values | changes) + "\n")
+    return file
+
+
+@pytest.mark.parametrize("policy", [*SHIPPED, "bomb_random", "bomb_expert"])
+def test_a_line_is_played_again_bit_for_bit(
+    policy: str, results: Callable[..., Path], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    path = results(policy)
+    sizes = [json.loads(line)["policy"]["batch_row"] for line in path.read_text().splitlines()]
+    assert sizes == [0, 1, 2]
+    for line in (1, 2, 3):
+        assert main(["replay", str(path), f"--line={line}", f"--output={tmp_path / str(line)}"]) == 0
+        assert "as recorded, bit for bit: spec, instruction, " in capsys.readouterr().out
+
+
+def test_flags_of_the_evaluation_are_given_again(
+    results: Callable[..., Path], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    flag = "--policy.num_inference_steps=3"
+    path = results("bomb:fdvla", flag)
+    assert main(["replay", str(path), f"--output={tmp_path / 'x'}"]) == 1
+    assert "other settings; give the flags --policy.NAME=VALUE" in capsys.readouterr().err
+    assert list(tmp_path.iterdir()) == []
+    assert main(["replay", str(path), f"--output={tmp_path / 'x'}", flag]) == 0
+
+
+def test_an_axis_is_changed_side_by_side(
+    results: Callable[..., Path], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    path = results("bomb_expert", condition="camera:4+light:2")
+    assert main(["replay", str(path), f"--output={tmp_path / 'x'}", "--set=camera=0,table=5"]) == 0
+    out = capsys.readouterr().out
+    assert "recorded (camera:4+light:2): " in out and "changed (table:5+light:2): " in out
+    logged = read_rrd(tmp_path / "x.rrd")
+    steps = json.loads(path.read_text().splitlines()[0])["steps"]
+    for label in ("recorded", "changed"):
+        assert len(logged[f"/{label}/camera/workspace"]) == steps + 1
+    recorded, changed = (
+        {entity: logged[f"/{label}/{entity}"][0] for entity in ("camera/workspace", "instruction")}
+        for label in ("recorded", "changed")
+    )
+    blob, text = "EncodedImage:blob", "TextDocument:text"
+    assert recorded["camera/workspace"][blob] != changed["camera/workspace"][blob]
+    assert recorded["instruction"][text] == changed["instruction"][text]  # which no axis of these changes
+    assert main(["replay", str(path), f"--output={tmp_path / 'alone'}"]) == 0
+    sizes = []
+    for name in ("x", "alone"):
+        with av.open(str(tmp_path / f"{name}.mp4")) as file:
+            sizes.append((file.streams.video[0].width, file.streams.video[0].height))
+    assert sizes[0] == (2 * sizes[1][0], sizes[1][1])
+
+
+def test_levels_that_were_drawn_stay_as_they_were(
+    results: Callable[..., Path], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    path = results("bomb_expert")
+    levels = json.loads(path.read_text().splitlines()[0])["levels"]
+    # all of them as they were drawn, by name: the same episode
+    assert main(["replay", str(path), f"--output={tmp_path / 'x'}", f"--set=camera={levels['camera']}"]) == 0
+    lines = capsys.readouterr().out.splitlines()
+    assert lines[1] == lines[3]
+    off = ",".join(f"{axis}=0" for axis in levels)
+    assert main(["replay", str(path), f"--output={tmp_path / 'y'}", f"--set={off}"]) == 0
+    assert f"changed ({NONE}): " in capsys.readouterr().out
+
+
+def test_what_differs_first_is_told(
+    results: Callable[..., Path], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    changes = {"placement_error_mm": 3.5, "collateral_mm": 9.0, "torch_version": "2.0", "machine": "other"}
+    path = rewritten(results("bomb_expert"), tmp_path / "changed.jsonl", **changes)
+    assert main(["replay", str(path), f"--output={tmp_path / 'x'}"]) == DIFFERS
+    out = capsys.readouterr().out
+    assert "not as recorded: placement_error_mm was 3.5 and is " in out
+    assert "torch_version: 2.0 then, " in out and "machine: other then, " in out
+    assert "lerobot_version" not in out
+
+
+def test_other_weights_are_refused(
+    results: Callable[..., Path], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    path = results("bomb:fdvla")
+    policy = json.loads(path.read_text().splitlines()[0])["policy"]
+    other = rewritten(path, tmp_path / "r.jsonl", policy=policy | {"weights_sha256": "0" * 64})
+    assert main(["replay", str(other), f"--output={tmp_path / 'x'}"]) == 1
+    assert "holds other weights than those that played" in capsys.readouterr().err
+    moved = rewritten(path, tmp_path / "m.jsonl", policy=policy | {"path": "gone"})
+    assert main(["replay", str(moved), f"--output={tmp_path / 'x'}"]) == 1
+    assert "--policy.path=gone: there is no such folder" in capsys.readouterr().err
+    assert main(["replay", str(moved), f"--output={tmp_path / 'x'}", "--policy.path=bomb:fdvla"]) == 0
+
+
+@pytest.mark.parametrize(
+    ("flags", "message"),
+    [
+        (["--line=4"], "--line=4 must be in 1..3"),
+        (["--line=0"], "--line=0 must be in 1..3"),
+        (["--set=fog=3"], "--set: 'fog' is not an axis"),
+        (["--set=camera=9"], "--set: the levels of camera must lie in 0..5"),
+        (["--frames=3"], "--frames=3 is unknown"),
+    ],
+)
+def test_wrong_flags_are_told(
+    flags: list[str],
+    message: str,
+    results: Callable[..., Path],
+    tmp_path: Path,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    assert main(["replay", str(results("bomb_expert")), f"--output={tmp_path / 'x'}", *flags]) == 1
+    assert message in capsys.readouterr().err
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_a_policy_that_was_not_recorded_must_be_named(
+    results: Callable[..., Path], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    path = rewritten(results("bomb_expert"), tmp_path / "r.jsonl", policy=None)
+    assert main(["replay", str(path), f"--output={tmp_path / 'x'}"]) == 1
+    assert "does not say who played; name it with --policy.path" in capsys.readouterr().err
+
+
+def test_a_policy_with_random_weights_cannot_be_had_again(
+    results: Callable[..., Path], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    policy = json.loads(results("bomb_expert").read_text().splitlines()[0])["policy"] | {"type": "act"}
+    path = rewritten(results("bomb_expert"), tmp_path / "r.jsonl", policy=policy)
+    assert main(["replay", str(path), f"--output={tmp_path / 'x'}"]) == 1
+    assert "act was built with random weights, which are in no file" in capsys.readouterr().err
+
+
+def test_where_a_line_comes_from_is_named_by_its_fields() -> None:
+    fields = set(EpisodeResult.__dataclass_fields__)
+    assert ORIGIN - fields == {"simulator_versions"}  # of other environments
+    assert {"spec", "steps", "failure", "placement_error_mm"} <= fields - ORIGIN
