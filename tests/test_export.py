@@ -1,55 +1,109 @@
+"""``lerobot-bomb export``: paper, model card and leaderboard say what the lines say."""
+
+import json
+import re
 from pathlib import Path
+from typing import Any
 
 import pytest
-import spatialvla_grid_cases
-import torch
-from lerobot.policies.factory import make_pre_post_processors
-from vla0_smol_cases import STATS, make_policy, raw_batch
+import yaml
+from huggingface_hub import ModelCardData, parse_eval_result_entries
+from huggingface_hub.repocard_data import model_index_to_eval_results
+from test_results import FDVLA, values
 
 from lerobot_bomb.commands.main import main
-from lerobot_policy_spatialvla_grid.modeling_spatialvla_grid import SpatialvlaGridPolicy
-from lerobot_policy_vla0_smol import make_vla0_smol_pre_post_processors
+from lerobot_bomb.evaluation.result_groups import groups_of
+from lerobot_bomb.hub.evaluations import model_index
+from lerobot_bomb.report.latex import SPECIAL
+
+SUCCESSES = {("act", "none"): 8, ("act", "all:1-5"): 3, ("fdvla", "none"): 9, ("fdvla", "all:1-5"): 0}
+N = 10
 
 
-def test_an_exported_backbone_is_where_another_policy_starts(tmp_path: Path) -> None:
-    policy = make_policy()
-    with torch.no_grad():  # as if it had learned: not the weights that a fresh one draws
-        for weight in policy.parameters():
-            weight.add_(0.01)
-    policy.save_pretrained(tmp_path / "checkpoint")
-    for pipeline in make_vla0_smol_pre_post_processors(policy.config, STATS):
-        pipeline.save_pretrained(tmp_path / "checkpoint")
-    base = tmp_path / "base"
-    flags = [f"--policy.path={tmp_path / 'checkpoint'}", f"--output={base}"]
-    assert main(["export-backbone", *flags]) == 0
-    other = make_policy(vlm_model_name=str(base), relative_actions=True, chunk_size=4, use_state=False)
-    weights = other.backbone.state_dict()
-    assert weights and all(torch.equal(weights[k], w) for k, w in policy.backbone.state_dict().items())
-    assert other.tokens == policy.tokens
-    preprocessors = [make_vla0_smol_pre_post_processors(p.config, STATS)[0] for p in (policy, other)]
-    ids = [preprocessor(raw_batch(2))["observation.language.tokens"] for preprocessor in preprocessors]
-    assert torch.equal(*ids)
-    assert main(["export-backbone", *flags]) == 1  # not over an existing folder
+@pytest.fixture
+def rows() -> list[dict[str, Any]]:
+    made = []
+    for (policy, condition), successes in SUCCESSES.items():
+        other = {"policy": FDVLA} if policy == "fdvla" else {}
+        for seed in range(N):
+            failure = None if seed < successes else "imprecise"
+            made.append(values(seed, failure, 1.0, spec={"perturbations": condition}, **other))
+    return made
 
 
-def test_a_paligemma_is_exported_alike(tmp_path: Path) -> None:
-    policy = spatialvla_grid_cases.make_policy(7)
-    policy.save_pretrained(tmp_path / "checkpoint")
-    for pipeline in make_pre_post_processors(policy.config, dataset_stats=spatialvla_grid_cases.stats()):
-        pipeline.save_pretrained(tmp_path / "checkpoint")
-    base = tmp_path / "base"
-    assert main(["export-backbone", f"--policy.path={tmp_path / 'checkpoint'}", f"--output={base}"]) == 0
-    config = spatialvla_grid_cases.make_config(num_dims=2)
-    config.vlm_model_name = str(base)
-    other = SpatialvlaGridPolicy(config)
-    weights = other.backbone.state_dict()
-    assert weights and all(torch.equal(weights[k], w) for k, w in policy.backbone.state_dict().items())
-    assert other.tokens == policy.tokens
+@pytest.fixture
+def exported(rows: list[dict[str, Any]], tmp_path: Path) -> Path:
+    (tmp_path / "r.jsonl").write_text("".join(json.dumps(row) + "\n" for row in rows))
+    folder = tmp_path / "out"
+    assert main(["export", str(tmp_path / "r.jsonl"), f"--output={folder}", "--benchmark_id=me/bomb"]) == 0
+    return folder
 
 
-def test_a_checkpoint_without_such_a_model_is_refused(
+def folder_of(exported: Path, policy: str) -> Path:
+    (folder,) = (path for path in exported.iterdir() if path.is_dir() and path.name.startswith(policy))
+    return folder
+
+
+@pytest.mark.parametrize("policy", ["act", "fdvla"])
+def test_the_hub_s_own_readers_find_the_rates_of_the_lines(exported: Path, policy: str) -> None:
+    folder = folder_of(exported, policy)
+    index = yaml.safe_load((folder / "model-index.yaml").read_text())["model-index"]
+    name, results = model_index_to_eval_results(index)
+    assert name == folder.name
+    rates = {each.dataset_config: each.metric_value for each in results}
+    entries = parse_eval_result_entries(
+        yaml.safe_load((folder / ".eval_results" / "lerobot_bomb.yaml").read_text())
+    )
+    by_task = {each.task_id: each.value for each in entries}
+    for condition, task in (("none", "place.none"), ("all:1-5", "place.all-1to5")):
+        assert rates[condition] == by_task[task] == SUCCESSES[policy, condition] / N
+    assert {each.dataset_id for each in entries} == {"me/bomb"}
+    assert all("95" not in str(each.value) and f"/{N} = " in str(each.notes) for each in entries)
+
+
+def test_a_model_card_takes_the_same(rows: list[dict[str, Any]]) -> None:
+    results = model_index(groups_of([row for row in rows if row["policy"]["type"] == "act"]))
+    card = ModelCardData(model_name="act", eval_results=results)
+    assert [each["metrics"][0]["value"] for each in card.to_dict()["model-index"][0]["results"]] == [0.8, 0.3]
+
+
+def test_the_table_has_a_line_for_each_condition_and_a_column_for_each_policy(exported: Path) -> None:
+    lines = (exported / "table.tex").read_text().splitlines()
+    body = [line.removesuffix(r" \\").split(" & ") for line in lines if line.endswith(r"\\")]
+    header, *conditions = body
+    assert header[0] == "condition" and [name.split()[0] for name in header[1:]] == ["act", "fdvla"]
+    assert [row[0] for row in conditions] == ["none", "all:1-5"]
+    for row in conditions:
+        shares = [int(re.match(r"\d+", cell)[0]) for cell in row[1:]]  # pyright: ignore
+        assert shares == [SUCCESSES[policy, row[0]] * 100 // N for policy in ("act", "fdvla")]
+    special = "".join(cell for row in body for cell in row)
+    assert not re.search(r"(?<!\\)[_%&#$]", special)
+    assert set("_%&#${}~^\\") == set(SPECIAL)
+
+
+def test_without_a_benchmark_of_the_hub_there_is_no_leaderboard_s_file(
+    rows: list[dict[str, Any]], tmp_path: Path
+) -> None:
+    (tmp_path / "r.jsonl").write_text("".join(json.dumps(row) + "\n" for row in rows))
+    assert main(["export", str(tmp_path / "r.jsonl"), f"--output={tmp_path / 'out'}"]) == 0
+    assert sorted(path.name for path in (tmp_path / "out").rglob("*.*") if path.is_file()) == [
+        "model-index.yaml", "model-index.yaml", "table.tex",
+    ]  # fmt: skip
+
+
+def test_two_rates_for_one_condition_are_refused(
+    rows: list[dict[str, Any]], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    others = [row | {"mujoco_version": "3.7.0"} for row in rows]
+    (tmp_path / "r.jsonl").write_text("".join(json.dumps(row) + "\n" for row in [*rows, *others]))
+    assert main(["export", str(tmp_path / "r.jsonl"), f"--output={tmp_path / 'out'}"]) == 1
+    assert "has two rates for place, none: the episodes differ in MuJoCo" in capsys.readouterr().err
+    assert not (tmp_path / "out").exists()
+
+
+def test_a_benchmark_that_is_no_repository_is_refused(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    assert main(["export-backbone", f"--policy.path={tmp_path}", f"--output={tmp_path / 'base'}"]) == 1
-    assert "holds no config.json" in capsys.readouterr().err
-    assert not (tmp_path / "base").exists()
+    with pytest.raises(SystemExit):
+        main(["export", str(tmp_path / "r.jsonl"), "--benchmark_id=bomb"])
+    assert "'bomb' must be USER/NAME" in capsys.readouterr().err

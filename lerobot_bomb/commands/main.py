@@ -19,6 +19,7 @@ COMMANDS = {
     "convert": "published demonstrations as a LeRobotDataset",
     "results": "summarise files written by --env.results_path",
     "report": "files of results as one page, with tables as JSON and CSV",
+    "export": "files of results as a LaTeX table, a model-index and the Hub's .eval_results",
     "sweep": "evaluate policies x tasks x conditions; goes on after a kill",
     "replay": "play an episode of a file of results again, bit for bit or with other perturbations",
     "compare": "two policies on the same episodes: difference, interval, test",

@@ -17,6 +17,7 @@ from lerobot_bomb.envs.results import Row
 from lerobot_bomb.evaluation.result_groups import Group, by_condition, groups_of
 from lerobot_bomb.evaluation.result_lines import KINDS, kind_of
 from lerobot_bomb.evaluation.results import summarise
+from lerobot_bomb.hub.evaluations import model_index
 from lerobot_bomb.hub.markdown import command, fenced
 from lerobot_bomb.hub.method import Method
 from lerobot_bomb.hub.training import peft_flags, train_command
@@ -77,6 +78,10 @@ class Checkpoint:
         name = getattr(self.config, "vlm_model_name", None)
         return name if name and is_hub_id(name) else None
 
+    @property
+    def _groups(self) -> list[Group]:
+        return [group for rows in self.results for group in groups_of(rows)]
+
     def _metadata(self) -> ModelCardData:
         license, license_name = self._license()
         return ModelCardData(
@@ -86,6 +91,7 @@ class Checkpoint:
             pipeline_tag="robotics",
             tags=sorted({*self.tags, "robotics", "lerobot", "lerobot_bomb", self.config.type}),
             model_name=self.config.type,
+            eval_results=model_index(self._groups) or None,
             datasets=self.dataset_id,
             base_model=self.adapters_of or self.backbone,
             base_model_relation="adapter" if self.adapters_of else None,
@@ -240,8 +246,7 @@ class Checkpoint:
     def _results(self) -> str:
         if not self.results:
             return "No evaluation is attached to this checkpoint."
-        groups = [group for rows in self.results for group in groups_of(rows)]
-        return "\n\n".join(map(results_table, groups))
+        return "\n\n".join(map(results_table, self._groups))
 
     def _citation(self) -> str:
         return fenced("\n\n".join(paper.bibtex() for paper in self.method.papers), "bibtex")

@@ -94,12 +94,17 @@ def arms_of(rows: list[Row]) -> list[Arm]:
     return arms
 
 
-def _name(row: Row) -> str:
-    """'TYPE, place'; of a checkpoint with its folder: 'act outputs/act, place'."""
+def policy_name(row: Row) -> str:
+    """'TYPE'; of a checkpoint with its folder: 'act outputs/act'."""
     policy = row.get("policy") or {"type": "policy not recorded", "path": None}
     path = "" if policy["path"] is None else f" {'/'.join(policy['path'].rstrip('/').split('/')[-2:])}"
+    return f"{policy['type']}{path}"
+
+
+def _name(row: Row) -> str:
+    """'act outputs/act, place'."""
     suite = row["spec"].get("suite")
-    return f"{policy['type']}{path}" + (f", {suite}" if suite else "")
+    return policy_name(row) + (f", {suite}" if suite else "")
 
 
 def _weights(row: Row) -> str:

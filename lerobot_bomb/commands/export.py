@@ -1,0 +1,66 @@
+"""``lerobot-bomb export``: files of results for a paper, a model card and the Hub's leaderboards."""
+
+import argparse
+import re
+from pathlib import Path
+
+from lerobot_bomb.commands.arguments import path_flag
+from lerobot_bomb.commands.results_files import read_undamaged
+from lerobot_bomb.evaluation.comparison import POLICY
+from lerobot_bomb.files import written_whole
+from lerobot_bomb.report.latex import table
+from lerobot_bomb.report.tables import Arm, arms_of, policy_name
+
+LATEX, MODEL_INDEX, EVAL_RESULTS = "table.tex", "model-index.yaml", ".eval_results/lerobot_bomb.yaml"
+
+
+def add_export_arguments(parser: argparse.ArgumentParser) -> None:
+    """Declare the arguments of ``lerobot-bomb export``."""
+    add = parser.add_argument
+    add("paths", nargs="+", type=path_flag, metavar="FILE", help="files of --env.results_path")
+    add("--output", type=path_flag, default=Path("outputs/export"), help="folder (default: outputs/export)")
+    add(
+        "--benchmark_id",
+        type=_hub_id,
+        metavar="USER/NAME",
+        help=f"the benchmark's dataset on the Hub, which {EVAL_RESULTS} must name (default: no such file)",
+    )
+
+
+def _hub_id(text: str) -> str:
+    if not re.fullmatch(r"[\w.-]+/[\w.-]+", text):
+        raise argparse.ArgumentTypeError(f"{text!r} must be USER/NAME")
+    return text
+
+
+def run_export(args: argparse.Namespace) -> int:
+    """Write a table for LaTeX, and of each policy what its repository on the Hub takes; print the paths."""
+    # huggingface_hub takes a second
+    from lerobot_bomb.hub.evaluations import check_one_rate_each, eval_results_yaml, model_index_yaml
+
+    arms = arms_of([row for path in args.paths for row in read_undamaged(path)[0]])
+    contents = {args.output / LATEX: table(arms)}
+    for name, of_policy in _by_policy(arms).items():
+        groups = [arm.group for arm in of_policy]
+        check_one_rate_each(groups)
+        contents[args.output / name / MODEL_INDEX] = model_index_yaml(name, groups)
+        if args.benchmark_id is not None:
+            contents[args.output / name / EVAL_RESULTS] = eval_results_yaml(args.benchmark_id, groups)
+    for path, content in contents.items():
+        with written_whole(path) as (unfinished,):
+            unfinished.write_text(content)
+    print(*contents, sep="\n")
+    return 0
+
+
+def _by_policy(arms: list[Arm]) -> dict[str, list[Arm]]:
+    """{name for files: arms of one policy}."""
+    policies: dict[str, list[Arm]] = {}
+    for arm in arms:
+        policies.setdefault(arm.group.settings[POLICY], []).append(arm)
+    names: dict[str, list[Arm]] = {}
+    for of_policy in policies.values():
+        stem = re.sub(r"[^\w.-]+", "-", policy_name(of_policy[0].rows[0])).strip("-")
+        number = sum(name == stem or name.startswith(f"{stem}.") for name in names)
+        names[f"{stem}.{number + 1}" if number else stem] = of_policy
+    return names

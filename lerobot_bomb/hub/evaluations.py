@@ -1,0 +1,85 @@
+"""Evaluations in the Hub's own formats: a model card's `model-index`, and `.eval_results/*.yaml`."""
+
+from collections.abc import Iterator
+from typing import Any
+
+import yaml
+from huggingface_hub import EvalResult, EvalResultEntry, eval_result_entries_to_yaml
+from huggingface_hub.repocard_data import eval_results_to_model_index
+
+from lerobot_bomb.envs.results import Row
+from lerobot_bomb.evaluation.result_groups import Group, by_condition, describe_policy, differing
+from lerobot_bomb.stats import format_rate
+
+METRIC = "success_rate"  # a share, 0..1
+
+
+def model_index(groups: list[Group]) -> list[EvalResult]:
+    """Success rates by condition, for the metadata of a model card."""
+    return [
+        EvalResult(
+            task_type="robotics",
+            task_name=_task(rows[0]),
+            dataset_type=group.kind.env_type,
+            dataset_name=group.kind.benchmark,
+            dataset_config=condition,
+            metric_type=METRIC,
+            metric_name=f"success rate, {_counted(rows)}",
+            metric_value=_share(rows),
+        )
+        for group, condition, rows in _conditions(groups)
+    ]
+
+
+def model_index_yaml(model_name: str, groups: list[Group]) -> str:
+    """The same as the key `model-index` of a model card's metadata."""
+    index = eval_results_to_model_index(model_name, model_index(groups))
+    return _yaml({"model-index": index})
+
+
+def eval_results_yaml(benchmark_id: str, groups: list[Group]) -> str:
+    """The same as a file of `.eval_results`; `benchmark_id` is the benchmark's dataset on the Hub."""
+    entries = [
+        EvalResultEntry(
+            dataset_id=benchmark_id,
+            task_id=f"{_task(rows[0])}.{group.kind.condition.parse(condition).key}",
+            value=_share(rows),
+            notes=f"{_counted(rows)}; {group.lines()[1]}",
+        )
+        for group, condition, rows in _conditions(groups)
+    ]
+    return _yaml(eval_result_entries_to_yaml(entries))
+
+
+def check_one_rate_each(groups: list[Group]) -> None:
+    """Raise a ValueError if a policy has two rates for one condition, of episodes that must not be pooled."""
+    first: dict[tuple[str, str], Group] = {}
+    for group, condition, rows in _conditions(groups):
+        other = first.setdefault((_task(rows[0]), condition), group)
+        if other is not group:
+            raise ValueError(
+                f"{describe_policy(rows[0])} has two rates for {_task(rows[0])}, {condition}: the episodes "
+                f"differ in {', '.join(differing([other, group]))}; export the lines of one"
+            )
+
+
+def _conditions(groups: list[Group]) -> Iterator[tuple[Group, str, list[Row]]]:
+    for group in groups:
+        for condition, rows in by_condition(group.rows).items():
+            yield group, condition, rows
+
+
+def _task(row: Row) -> str:
+    return row["spec"].get("suite", "pusht")
+
+
+def _share(rows: list[Row]) -> float:
+    return sum(row["is_success"] for row in rows) / len(rows)
+
+
+def _counted(rows: list[Row]) -> str:
+    return format_rate(sum(row["is_success"] for row in rows), len(rows))
+
+
+def _yaml(values: Any) -> str:
+    return yaml.safe_dump(values, sort_keys=False, allow_unicode=True, width=1000)
