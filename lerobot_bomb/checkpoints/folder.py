@@ -1,6 +1,6 @@
 """A checkpoint's folder, read as LeRobot's commands read it, and written."""
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from contextlib import AbstractContextManager, nullcontext
 from pathlib import Path
 from typing import Any
@@ -25,8 +25,10 @@ Preprocessor = PolicyProcessorPipeline[dict[str, Any], dict[str, Any]]
 Postprocessor = PolicyProcessorPipeline[PolicyAction, PolicyAction]
 
 
-def read_config(path: Path, device: str | None) -> PreTrainedConfig:
+def read_config(path: Path, device: str | None, flags: Sequence[str] = ()) -> PreTrainedConfig:
     """The config in the folder `pretrained_model`; `device` None means the checkpoint's own.
+
+    `flags` change other values: "--n_action_steps=4".
 
     Raises:
         ValueError: the folder holds no checkpoint, or this machine has no such device.
@@ -42,18 +44,18 @@ def read_config(path: Path, device: str | None) -> PreTrainedConfig:
     if device is not None and not is_torch_device_available(device):
         raise ValueError(f"the device {device} is not available on this machine; cpu is")
     register_third_party_plugins()
-    config = parse_config(path, device)
+    config = parse_config(path, device, flags)
     config.pretrained_path = path
     return config
 
 
-def parse_config(path: Path, device: str | None) -> PreTrainedConfig:
+def parse_config(path: Path, device: str | None, flags: Sequence[str] = ()) -> PreTrainedConfig:
     """The config in a folder, of a plugin that is registered.
 
     Raises:
         ValueError: it is truncated, of a newer version or of an unknown type.
     """
-    overrides = [] if device is None else [f"--device={device}"]
+    overrides = [*flags] if device is None else [*flags, f"--device={device}"]
     try:
         return PreTrainedConfig.from_pretrained(path, cli_overrides=overrides)
     except DecodingError as error:
