@@ -11,24 +11,36 @@ from typing import Any
 
 import numpy as np
 import pytest
+import torch
 import yaml
+from lerobot.configs import FeatureType, PolicyFeature
+from lerobot.policies import get_policy_class, make_policy_config, make_pre_post_processors
+from lerobot.utils.constants import ACTION, OBS_STATE
+from lerobot.utils.import_utils import register_third_party_plugins
+from libero_cases import SUITE
 
 pytest.importorskip("vla_eval", reason="the extra vla-eval is not installed")
 
 from vla_eval import api
-from vla_eval.benchmarks.libero.benchmark import LIBEROBenchmark
 from vla_eval.model_servers import serve
 from vla_eval.model_servers.base import SessionContext
-from vla_eval.orchestrator import _merge_observation_params
 
 from lerobot_bomb.bomb.suites import SUITES
+from lerobot_bomb.checkpoints.folder import write_checkpoint
 from lerobot_bomb.harness import __main__ as command
 from lerobot_bomb.harness.benchmark import BombBenchmark
 from lerobot_bomb.harness.checkpoint_server import CheckpointServer
+from lerobot_bomb.libero.assets import Libero, prepare_libero
 
 CONFIGS = Path(__file__).parents[1] / "configs" / "vla_eval"
 CONDITIONS = ["none", "language:5"]  # the checkpoint masters the first, and hardly the second
 SEEDS = [1000, 1001]
+SEEN_IN_LIBERO = {
+    "observation.images.image": (3, 256, 256),
+    "observation.images.image2": (3, 256, 256),
+    OBS_STATE: (8,),
+    ACTION: (7,),
+}
 SMALL = {"image_size": 64}
 
 
@@ -151,10 +163,48 @@ def test_a_missing_checkpoint_ends_it_in_one_line(
     assert message in str(ended.value.code) and "\n" not in str(ended.value.code)
 
 
-def test_libero_s_file_asks_the_benchmark_for_what_the_policy_reads() -> None:
+def write_libero_policy(folder: Path) -> None:
+    """An untrained one of what LIBERO's demonstrations show."""
+    register_third_party_plugins()
+    shapes = {key: shape for key, shape in SEEN_IN_LIBERO.items() if key != ACTION}
+    kinds = {key: FeatureType.STATE if key == OBS_STATE else FeatureType.VISUAL for key in shapes}
+    config: Any = make_policy_config(
+        "fdvla",
+        device="cpu",
+        vlm_model_name="nano",
+        head_dim=32,
+        dualmod_dim=16,
+        dtype="float32",
+        input_features={key: PolicyFeature(kinds[key], shape) for key, shape in shapes.items()},
+        output_features={ACTION: PolicyFeature(FeatureType.ACTION, SEEN_IN_LIBERO[ACTION])},
+    )
+    stats = {
+        key: {"mean": torch.zeros(shape), "std": torch.ones(shape)}
+        for key, shape in SEEN_IN_LIBERO.items()
+        if key in (OBS_STATE, ACTION)
+    }
+    processors = make_pre_post_processors(config, dataset_stats=stats)
+    write_checkpoint(folder, get_policy_class("fdvla")(config), processors)
+
+
+@pytest.mark.long
+def test_its_libero_plays_with_the_file_for_it(
+    libero_with_assets: Libero, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    prepare_libero([SUITE])
+    monkeypatch.setattr(torch, "load", torch.load)  # which it replaces for good
+    write_libero_policy(tmp_path / "checkpoint")
     args = yaml.safe_load((CONFIGS / "serve_libero.yaml").read_text())["args"]
-    asked = _merge_observation_params(LIBEROBenchmark, {}, args["observation_params"])
-    assert LIBEROBenchmark(**asked).get_observation_spec().keys() >= {*args["cameras"].values(), "state"}
+    server = CheckpointServer(**args | {"checkpoint": str(tmp_path / "checkpoint")})
+    libero = {
+        "benchmark": "vla_eval.benchmarks.libero.benchmark:LIBEROBenchmark",
+        "max_steps": 3,
+        "max_tasks": 1,
+        "params": {"suite": SUITE, "seed": 7},
+    }
+    (result,) = api.evaluate(server, {"benchmarks": [libero]}, output_dir=tmp_path)
+    ((episode,),) = [task["episodes"] for task in result["tasks"]]
+    assert (episode["steps"], episode.get("failure_reason")) == (3, None)
 
 
 def observation(size: int = 64, **changes: Any) -> dict[str, Any]:
@@ -226,11 +276,12 @@ def test_another_session_waits_until_the_episode_has_ended(server: CheckpointSer
     server.predict(observation(), first)
     again = begin(server, "first")  # its episode broke off
     server.predict(observation(), again)
-    end(server, first)
+    end(server, first)  # told late
     server.predict(observation(), again)
     end(server, again)
-    server.predict(observation(), begin(server, "second"))
-    end(server, begin(server, "second"))
+    second = begin(server, "second")
+    server.predict(observation(), second)
+    end(server, second)
 
 
 def test_the_extra_is_named_where_vla_eval_is_missing(monkeypatch: pytest.MonkeyPatch) -> None:
