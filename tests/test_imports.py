@@ -29,8 +29,8 @@ ORDER = [
     "__init__", "_compat", "finite", "flag_errors", "flags", "conditions", "stats", "tables", "files",
     "cuda_graphs",
     "bomb", "pusht", "libero", "envs", "actions", "flow", "vlm", "decoding", "training", "data",
-    "checkpoints", "evaluation", "viewing", "explain", "hub", "policies", "serving", "sweep", "report",
-    "commands",
+    "checkpoints", "evaluation", "viewing", "explain", "hub", "policies", "serving", "harness", "sweep",
+    "report", "commands",
 ]  # fmt: skip
 
 

@@ -25,10 +25,10 @@ Preprocessor = PolicyProcessorPipeline[dict[str, Any], dict[str, Any]]
 Postprocessor = PolicyProcessorPipeline[PolicyAction, PolicyAction]
 
 
-def read_config(path: Path, device: str | None, overrides: Sequence[str] = ()) -> PreTrainedConfig:
+def read_config(path: Path, device: str | None, flags: Sequence[str] = ()) -> PreTrainedConfig:
     """The config in the folder `pretrained_model`; `device` None means the checkpoint's own.
 
-    Of `overrides`, each is one of its fields as a flag: --chunk_size=8.
+    `flags` change other values: "--n_action_steps=4".
 
     Raises:
         ValueError: the folder holds no checkpoint, or this machine has no such device.
@@ -44,20 +44,20 @@ def read_config(path: Path, device: str | None, overrides: Sequence[str] = ()) -
     if device is not None and not is_torch_device_available(device):
         raise ValueError(f"the device {device} is not available on this machine; cpu is")
     register_third_party_plugins()
-    config = parse_config(path, device, overrides)
+    config = parse_config(path, device, flags)
     config.pretrained_path = path
     return config
 
 
-def parse_config(path: Path, device: str | None, overrides: Sequence[str] = ()) -> PreTrainedConfig:
+def parse_config(path: Path, device: str | None, flags: Sequence[str] = ()) -> PreTrainedConfig:
     """The config in a folder, of a plugin that is registered.
 
     Raises:
         ValueError: it is truncated, of a newer version or of an unknown type.
     """
-    of_device = [] if device is None else [f"--device={device}"]
+    overrides = [*flags] if device is None else [*flags, f"--device={device}"]
     try:
-        return PreTrainedConfig.from_pretrained(path, cli_overrides=[*overrides, *of_device])
+        return PreTrainedConfig.from_pretrained(path, cli_overrides=overrides)
     except DecodingError as error:
         raise ValueError(f"{path / FILES[0]}: {error}") from None
 

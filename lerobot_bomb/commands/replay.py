@@ -140,8 +140,8 @@ def _batch_agent(args: argparse.Namespace, row: Row, viewed: Viewed) -> BatchAge
         return scripted_agent(policy["type"], *env)
     if path is None:
         raise ValueError(f"line {args.line} does not say who played; name it with --policy.path=FOLDER")
-    overrides = [f"--{flag.removeprefix('--policy.')}" for flag in args.rest]
-    agent = checkpoint_agent(path, args.policy_device, *env, overrides)
+    policy_flags = [f"--{flag.removeprefix('--policy.')}" for flag in args.rest]
+    agent = checkpoint_agent(path, args.policy_device, *env, policy_flags)
     if viewed.spec.perturbations == row["spec"]["perturbations"]:
         _check_policy(policy, path, identity_of(built_policies()[-1]))
     return agent

@@ -36,17 +36,17 @@ def checkpoint_agent(
     env_type: str,
     env_flags: dict[str, Any],
     seed: int,
-    overrides: Sequence[str] = (),
+    policy_flags: Sequence[str] = (),
 ) -> BatchAgent:
     """Load the folder `pretrained_model` of a checkpoint; `device` None means the checkpoint's own.
 
-    Of `overrides`, each is a field of its config as a flag: --chunk_size=8.
+    `policy_flags` change other values of its config: "--n_action_steps=4".
 
     Raises:
         ValueError: the folder holds no checkpoint, one whose action or state is not the environment's, or one
             that was trained for another environment.
     """
-    config = read_config(path, device, overrides)
+    config = read_config(path, device, policy_flags)
     env_config: EnvConfig = EnvConfig.get_choice_class(env_type)(**env_flags)
     _check_shapes(path, config, env_config)
     if config.use_peft:
