@@ -164,6 +164,58 @@ def bootstrap_interval(sums_E: np.ndarray, counts_E: np.ndarray) -> tuple[float,
     return None if len(sums_E) < 2 else _percentiles(_resampled_means(sums_E, counts_E))
 
 
+@dataclass(frozen=True)
+class Slope:
+    """How much a value changes with a level, by least squares, with its 95 % interval."""
+
+    per_level: float
+    low: float
+    high: float
+
+
+def slope(levels_N: np.ndarray, values_N: np.ndarray, episode_N: np.ndarray) -> Slope | None:
+    """Of N values over their levels; None where all levels are the same.
+
+    `episode_N` says which values are of one episode under several conditions: the percentile bootstrap draws
+    episodes, and the draws are always the same.
+    """
+    if np.ptp(levels_N) == 0:
+        return None
+    episodes, of_N = np.unique(episode_N, return_inverse=True)
+    moments_NM = np.stack(
+        [np.ones(len(levels_N)), levels_N, values_N, levels_N**2, levels_N * values_N], axis=1
+    )
+    sums_EM = np.zeros((len(episodes), moments_NM.shape[1]))
+    np.add.at(sums_EM, of_N, moments_NM)
+    draws = np.random.default_rng(0).integers(len(episodes), size=(NUM_RESAMPLES, len(episodes)))
+    drawn = _least_squares(sums_EM[draws].sum(axis=1))
+    low, high = _percentiles(drawn[np.isfinite(drawn)])
+    return Slope(float(_least_squares(sums_EM.sum(axis=0))), low, high)
+
+
+def _least_squares(moments: np.ndarray) -> np.ndarray:
+    """Slopes from (..., 5) sums of 1, x, y, x^2, xy; not finite where all x are the same."""
+    n, x, y, xx, xy = np.moveaxis(moments, -1, 0)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        return (n * xy - x * y) / (n * xx - x**2)
+
+
+def variance_share(values_N: np.ndarray, levels_N: np.ndarray) -> float | None:
+    """Share of the values' variance that the level alone explains: its first-order sensitivity index.
+
+    Corrected for the number of levels, so that it is 0 on average where the level has no effect, and can be
+    negative. None where it is not defined: all values or all levels are the same.
+    Source: epsilon squared, Kelley (1935), "An unbiased correlation ratio measure".
+    """
+    total = float(((values_N - values_N.mean()) ** 2).sum())
+    groups = [values_N[levels_N == level] for level in np.unique(levels_N)]
+    num_within = len(values_N) - len(groups)
+    if total == 0 or len(groups) < 2 or num_within == 0:
+        return None
+    within = float(sum(((of - of.mean()) ** 2).sum() for of in groups))
+    return 1 - within / num_within / (total / (len(values_N) - 1))
+
+
 def format_bounds(interval: tuple[float, float] | None, form: str) -> str:
     """' [low, high]', each in this form; nothing for a single episode."""
     return "" if interval is None else f" [{interval[0]:{form}}, {interval[1]:{form}}]"

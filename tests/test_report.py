@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+from scipy.stats import linregress
 from test_results import FDVLA, values
 
 from lerobot_bomb.commands.main import main
@@ -134,3 +135,27 @@ def test_without_an_episode_there_is_no_report(tmp_path: Path, capsys: pytest.Ca
     assert main(["report", str(tmp_path / "empty.jsonl"), f"--output={tmp_path / 'r.html'}"]) == 1
     assert "no finished episode" in capsys.readouterr().err
     assert not (tmp_path / "r.html").exists()
+
+
+def test_axes_are_ranked_by_what_a_level_costs(rows: Rows, written: Path) -> None:
+    for table, policy in zip(tables(written, "Sensitivity to an axis"), ("act", "fdvla"), strict=True):
+        ((axis, found, share),) = table["rows"]
+        of = [row for row in rows if row["policy"]["type"] == policy]
+        levels = [row["levels"].get("camera", 0) for row in of]
+        expected = linregress(levels, [float(row["is_success"]) for row in of]).slope
+        assert (axis, share) == ("camera", "") and found["per_level"] == pytest.approx(expected)
+
+
+def test_what_an_axis_explains_is_counted_where_levels_were_drawn(rows: Rows, tmp_path: Path) -> None:
+    drawn = []
+    for seed in range(30):
+        camera, light = 1 + seed % 5, 1 + seed // 5 % 5
+        failure = None if camera < 3 else "imprecise"
+        line = values(seed, failure, 1.0, spec={"perturbations": "camera:1-5+light:1-5"})
+        drawn.append(line | {"levels": {"camera": camera, "light": light}})
+    (tmp_path / "d.jsonl").write_text("".join(json.dumps(row) + "\n" for row in drawn))
+    assert main(["report", str(tmp_path / "d.jsonl"), f"--output={tmp_path / 'r.html'}"]) == 0
+    (table,) = tables(tmp_path, "Sensitivity to an axis")
+    shares = {axis: share for axis, _, share in table["rows"]}
+    assert list(shares) == ["camera", "light"]
+    assert shares["camera"] == pytest.approx(1.0) and shares["light"] < 0.05

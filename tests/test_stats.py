@@ -2,6 +2,7 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from scipy.stats import linregress
 from statsmodels.stats.contingency_tables import mcnemar
 from statsmodels.stats.multitest import multipletests
 from statsmodels.stats.proportion import proportion_confint
@@ -16,6 +17,8 @@ from lerobot_bomb.stats import (
     mcnemar_p_value,
     paired_bootstrap_interval,
     paired_difference_interval,
+    slope,
+    variance_share,
     wilson_interval,
 )
 
@@ -145,3 +148,47 @@ def test_as_many_pairs_as_are_asked_for_find_the_difference_in_80_of_100() -> No
     found = [table.p_value < 0.05 for table in drawn(n, shares, 2000)]
     assert 0.70 < np.mean(found) < 0.85  # the exact test is a little stricter than the formula's
     assert episodes_to_tell_apart(PairedCounts(5, 3, 3, 1)) is None
+
+
+def drawn_levels(rng: np.random.Generator, episodes: int = 60) -> tuple[np.ndarray, np.ndarray]:
+    """(levels, episodes) of each episode under six conditions."""
+    return np.tile(np.arange(6), episodes), np.repeat(np.arange(episodes), 6)
+
+
+def test_a_slope_is_that_of_least_squares() -> None:
+    rng = np.random.default_rng(0)
+    levels, episodes = drawn_levels(rng)
+    values = (rng.random(len(levels)) > levels / 6).astype(float)
+    found = slope(levels, values, episodes)
+    assert found is not None and found.per_level == pytest.approx(linregress(levels, values).slope)
+    assert found.low < found.per_level < found.high
+    assert slope(np.full(4, 3), np.ones(4), np.arange(4)) is None
+
+
+def test_the_interval_of_a_slope_covers_it_with_episodes_that_differ() -> None:
+    rng = np.random.default_rng(1)
+    levels, episodes = drawn_levels(rng)
+    truth, num_covered, n = -0.08, 0, 300
+    for _ in range(n):
+        of_episode = np.repeat(rng.uniform(-0.2, 0.2, 60), 6)
+        values = (rng.random(len(levels)) < 0.7 + truth * levels + of_episode).astype(float)
+        found = slope(levels, values, episodes)
+        num_covered += found is not None and found.low <= truth <= found.high
+    assert 0.91 <= num_covered / n <= 0.98
+
+
+def test_a_level_without_effect_has_no_share_on_average_and_one_that_decides_has_all() -> None:
+    rng = np.random.default_rng(2)
+    shares = []
+    for _ in range(400):
+        levels, values = rng.integers(1, 6, 40), rng.integers(0, 2, 40)
+        if (share := variance_share(values, levels)) is not None:
+            shares.append(share)
+    assert abs(np.mean(shares)) < 0.02
+    levels = rng.integers(1, 6, 200)
+    assert variance_share((levels > 2).astype(float), levels) == pytest.approx(1.0)
+    # half of the variance: the level decides one of two summands that are alike
+    other = rng.integers(1, 6, 20_000)
+    levels = rng.integers(1, 6, 20_000)
+    assert variance_share(levels + other.astype(float), levels) == pytest.approx(0.5, abs=0.02)
+    assert variance_share(np.ones(5), np.arange(5)) is None
