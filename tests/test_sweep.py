@@ -107,7 +107,7 @@ def test_a_cell_whose_workers_are_killed_is_given_up_and_can_be_retried(tmp_path
     assert [store.begin(cell) for _ in range(MAX_ATTEMPTS + 1)] == [True] * MAX_ATTEMPTS + [False]
     assert store.is_over(cell) and not store.is_finished(cell)
     assert any("3 workers were killed while they played it" in line for line in store.lines())
-    store.begin_again()
+    store.begin_again([cell])
     assert not store.is_over(cell) and store.begin(cell)
 
 
@@ -117,12 +117,12 @@ def test_a_sweep_that_was_stopped_is_no_failed_attempt(tmp_path: Path) -> None:
     for _ in range(MAX_ATTEMPTS):
         assert store.begin(cell)
     with Store(tmp_path, small()).claimed(cell):
-        store.forget_attempts()  # somebody plays it
+        store.forget_attempts([cell])  # somebody plays it
     assert not store.begin(cell) and store.is_over(cell)
-    store.begin_again()
+    store.begin_again([cell])
     for _ in range(MAX_ATTEMPTS):
         assert store.begin(cell)
-    store.forget_attempts()
+    store.forget_attempts([cell])
     assert store.begin(cell)
 
 
@@ -191,7 +191,7 @@ def test_an_episode_that_raises_is_an_error_and_no_failure(
     text = "\n".join(store.lines())
     assert "4 of 5 episodes" in text and "1 x ArithmeticError: the answer is not finite" in text
     monkeypatch.undo()
-    store.begin_again()
+    store.begin_again(manifest.cells)
     play(manifest)
     assert len(read_results(store.folder / "results.jsonl")) == 5 and not store.errors(manifest.cells[0])
 

@@ -1,24 +1,33 @@
-"""``lerobot-bomb sweep``: policies x tasks x conditions, over several processes, going on after a kill."""
+"""``lerobot-bomb sweep``: policies x tasks x conditions, over processes or jobs, going on after a kill."""
 
 import argparse
+import json
 import os
+import shlex
 import subprocess
 import sys
 import time
-from typing import IO
+from collections.abc import Iterator
+from pathlib import Path
+from typing import IO, Any
 
 from tqdm import tqdm
 
 from lerobot_bomb.bomb.episode import TEST_SEEDS
 from lerobot_bomb.commands.arguments import parse_conditions, path_flag
 from lerobot_bomb.evaluation.result_lines import KINDS
+from lerobot_bomb.sweep.cluster import sbatch_script, submit
 from lerobot_bomb.sweep.manifest import NAME, Cell, Manifest, plan
+from lerobot_bomb.sweep.processes import num_cores, visible_gpus, worker_environments
 from lerobot_bomb.sweep.store import Store
 
 CONDITIONS = {kind.env_type: kind.condition for kind in KINDS}
+# -P: nothing in the folder that the user is in stands for a module of the same name
+PYTHON = (sys.executable, "-P", "-m")
 POLL_S = 0.5
 MAX_BATCH = 10
 MAX_ENDED = 3
+SCRIPT, SUBMITIT = "sweep.sbatch", "submitit"
 
 
 def add_sweep_arguments(parser: argparse.ArgumentParser) -> None:
@@ -39,8 +48,14 @@ def add_sweep_arguments(parser: argparse.ArgumentParser) -> None:
     add("--episodes", type=int, default=20, help="of each cell (default: 20)")
     add("--seed", type=int, default=TEST_SEEDS[0], help=f"the first one (default: {TEST_SEEDS[0]})")
     add("--batch_size", type=int, default=MAX_BATCH, help=f"at most (default: {MAX_BATCH})")
-    add("--workers", type=int, default=1, help="processes (default: 1)")
-    add("--shard", default="0/1", help="this machine's part of the cells: 0/4 is the first of four")
+    add("--workers", type=int, default=1, help="processes, each on a GPU in turn (default: 1)")
+    where = parser.add_mutually_exclusive_group().add_argument
+    where("--shard", default="0/1", help="this machine's part of the cells: 0/4 is the first of four")
+    where("--slurm", type=int, metavar="N", help=f"write FOLDER/{SCRIPT}, a job array of N parts, only")
+    where("--submitit", type=int, metavar="N", help="submit N parts as jobs through submitit; wait for them")
+    add("--submitit_cluster", help="local or slurm (default: slurm where there is srun, else local)")
+    parameters = 'of its AutoExecutor, as {"gpus_per_node": 1, "slurm_partition": "gpu"}'
+    add("--submitit_parameters", type=_json_object, default={}, metavar="JSON", help=parameters)
     add("--timeout", type=int, help="seconds that a cell may take (default: no limit)")
     add("--retry", action="store_true", help="play again what was given up or ended in errors")
     add(
@@ -53,23 +68,55 @@ def add_sweep_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run_sweep(args: argparse.Namespace) -> int:
     """Play what is missing; exit code 1 where something still is."""
+    _check_numbers(args)
     manifest = _manifest(args)
     store = Store(args.folder, manifest)
     cells = _shard(args.shard, manifest)
+    _check_jobs(args, cells)
     if args.dry_run:
         print(*(cell.command for cell in cells), sep="\n")
         return 0
     if args.retry:
-        store.begin_again()
-    store.forget_attempts()
+        store.begin_again(cells)
+    if args.slurm is not None:
+        return _write_slurm(args)
+    store.forget_attempts(cells)
     try:
-        _play(args, store, cells)
+        if args.submitit is None:
+            _play(args, store, cells)
+        else:
+            _play_by_jobs(args, store)
     except KeyboardInterrupt:
         print(f"interrupted; to go on: lerobot-bomb sweep {args.folder}")
     store.merge()
     print(*store.lines(), sep="\n")
     is_whole = all(store.is_finished(cell) and not store.errors(cell) for cell in cells)
     return 0 if is_whole else 1
+
+
+def _json_object(text: str) -> dict[str, Any]:
+    try:
+        values = json.loads(text)
+    except ValueError:
+        values = None
+    if not isinstance(values, dict):
+        raise argparse.ArgumentTypeError(f"{text!r} must be a JSON object")
+    return values
+
+
+def _check_numbers(args: argparse.Namespace) -> None:
+    for name, lowest in (("episodes", 1), ("batch_size", 1), ("seed", 0), ("workers", 1)):
+        if getattr(args, name) < lowest:
+            raise ValueError(f"--{name}={getattr(args, name)} must be at least {lowest}")
+
+
+def _check_jobs(args: argparse.Namespace, cells: list[Cell]) -> None:
+    for name in ("slurm", "submitit"):
+        number = getattr(args, name)
+        if number is not None and not 1 <= number <= len(cells):
+            raise ValueError(f"--{name}={number} must be from 1 to the number of cells, {len(cells)}")
+    if args.submitit is None and (args.submitit_cluster or args.submitit_parameters):
+        raise ValueError("--submitit_cluster and --submitit_parameters need --submitit=N")
 
 
 def _manifest(args: argparse.Namespace) -> Manifest:
@@ -83,9 +130,6 @@ def _manifest(args: argparse.Namespace) -> Manifest:
         if args.rest or args.tasks or args.perturbations:
             raise ValueError(f"{args.folder / NAME} says what is played; drop {(*args.rest, '--tasks')[0]}")
         return Manifest.read(args.folder)
-    for name, lowest in (("episodes", 1), ("batch_size", 1), ("seed", 0), ("workers", 1)):
-        if getattr(args, name) < lowest:
-            raise ValueError(f"--{name}={getattr(args, name)} must be at least {lowest}")
     conditions = _expanded(args.perturbations, args.rest)
     manifest = plan(
         args.policies, args.tasks, conditions, args.seed, args.episodes, args.batch_size, args.rest
@@ -121,40 +165,82 @@ def _shard(text: str, manifest: Manifest) -> list[Cell]:
         raise ValueError(f"--shard: {error}") from None
 
 
+def _progress(store: Store, cells: list[Cell]) -> Iterator[bool]:
+    """Until all cells are over, show how far they are, and say whether they are further than before."""
+    total = sum(cell.num_episodes for cell in cells)
+    has_played = False
+    with tqdm(total=total, initial=store.num_played(cells), unit=" episodes") as bar:
+        while not all(store.is_over(cell) for cell in cells):
+            yield has_played
+            time.sleep(POLL_S)
+            more = store.num_played(cells) - bar.n
+            if has_played := more != 0:
+                bar.update(more)
+
+
 def _play(args: argparse.Namespace, store: Store, cells: list[Cell]) -> None:
-    """Start workers, show how far they are, and start those anew that were killed."""
-    threads = max(1, (os.cpu_count() or 1) // args.workers)
-    environment = {"OMP_NUM_THREADS": str(threads)} | os.environ
-    # -P: nothing in the folder that the user is in stands for a module of the same name
-    command = [sys.executable, "-P", "-m", "lerobot_bomb.sweep.worker", str(args.folder), args.shard]
+    """Start workers, and start those anew that were killed."""
+    environments = worker_environments(args.workers, os.environ, num_cores(), visible_gpus(os.environ))
+    command = [*PYTHON, "lerobot_bomb.sweep.worker", str(args.folder), args.shard]
     command += [str(args.timeout)] if args.timeout else []
     log = args.folder / "workers.log"
-    total = sum(cell.num_episodes for cell in cells)
 
-    def start(output: IO[bytes]) -> subprocess.Popen:
+    def start(environment: dict[str, str], output: IO[bytes]) -> subprocess.Popen:
         return subprocess.Popen(
             command, env=environment, stdin=subprocess.PIPE, stdout=output, stderr=subprocess.STDOUT
         )
 
     workers: list[subprocess.Popen] = []
     num_ended = 0  # workers that ended by themselves since an episode was played
-    with (
-        log.open("ab") as output,
-        tqdm(total=total, initial=store.num_played(cells), unit=" episodes") as bar,
-    ):
+    with log.open("ab") as output:
         try:
-            while not all(store.is_over(cell) for cell in cells):
-                running = [worker for worker in workers if worker.poll() is None]
-                num_ended += len(workers) - len(running)
+            for has_played in _progress(store, cells):
+                ended = [number for number, worker in enumerate(workers) if worker.poll() is not None]
+                num_ended = len(ended) + (0 if has_played else num_ended)
                 if num_ended > MAX_ENDED * args.workers:
                     raise RuntimeError(f"workers end before they play; {log} says why")
-                workers = running + [start(output) for _ in range(args.workers - len(running))]
-                time.sleep(POLL_S)
-                if (played := store.num_played(cells)) != bar.n:
-                    bar.update(played - bar.n)
-                    num_ended = 0
+                for number in ended:
+                    workers[number] = start(environments[number], output)
+                workers += [start(environment, output) for environment in environments[len(workers) :]]
         finally:
             for worker in workers:
                 worker.terminate()
             for worker in workers:
                 worker.wait()
+
+
+def _job_command(args: argparse.Namespace) -> list[str]:
+    """Plays a part of the folder's cells, with --shard."""
+    command = [*PYTHON, "lerobot_bomb.commands.main", "sweep", str(args.folder.absolute())]
+    command += [f"--workers={args.workers}"]
+    return command + ([f"--timeout={args.timeout}"] if args.timeout else [])
+
+
+def _write_slurm(args: argparse.Namespace) -> int:
+    """Write the script, and print what submits it."""
+    path = args.folder / SCRIPT
+    path.write_text(sbatch_script(_job_command(args), args.slurm, Path.cwd()))
+    print(shlex.join(["sbatch", str(path)]))
+    return 0
+
+
+def _play_by_jobs(args: argparse.Namespace, store: Store) -> None:
+    """Submit a job for every part that is not over, and wait for them; they end with this process' Ctrl-C."""
+    cells = list(store.manifest.cells)
+    parts = [f"{number}/{args.submitit}" for number in range(args.submitit)]
+    left = [part for part in parts if not all(map(store.is_over, store.manifest.part(part)))]
+    logs = args.folder / SUBMITIT
+    commands = [[*_job_command(args), f"--shard={part}"] for part in left]
+    jobs = submit(commands, logs, args.submitit_cluster, args.submitit_parameters) if left else []
+    try:
+        for _ in _progress(store, cells):
+            if all(job.done() for job in jobs):
+                break
+        for job in jobs:
+            job.wait()
+    except KeyboardInterrupt:
+        for job in jobs:
+            job.cancel(check=False)
+        raise
+    if not all(store.is_over(cell) for cell in cells):
+        print(f"jobs ended before they had played everything; {logs} says why")

@@ -66,17 +66,17 @@ class Store:
         """Whether it is finished or given up."""
         return self.is_finished(cell) or self.file(cell, "given_up").is_file()
 
-    def forget_attempts(self) -> None:
+    def forget_attempts(self, cells: Sequence[Cell]) -> None:
         """Of cells that nobody plays and that are not over: a sweep that was stopped is no failed attempt."""
-        for cell in self.manifest.cells:
+        for cell in cells:
             if not self.is_over(cell) and self.file(cell, "attempts").is_file():
                 with self.claimed(cell) as is_mine:
                     if is_mine:
                         self.file(cell, "attempts").unlink(missing_ok=True)
 
-    def begin_again(self) -> None:
-        """Forget what became of cells that were given up or in which episodes had errors."""
-        for cell in self.manifest.cells:
+    def begin_again(self, cells: Sequence[Cell]) -> None:
+        """Forget what became of those that were given up or in which episodes had errors."""
+        for cell in cells:
             if any(self.file(cell, ending).is_file() for ending in ("given_up", "errors")):
                 with self.claimed(cell) as is_mine:
                     if is_mine:
@@ -111,10 +111,12 @@ class Store:
 
     def merge(self) -> None:
         """Write all finished cells' lines in the order of the manifest, and all errors."""
-        for name, ending in ((RESULTS, "jsonl"), (ERRORS, "errors")):
-            paths = [self.file(cell, ending) for cell in self.manifest.cells]
-            with written_whole(self.folder / name) as (path,):
-                path.write_bytes(b"".join(each.read_bytes() for each in paths if each.is_file()))
+        with (self.folder / CELLS / "merge.lock").open("w") as lock:
+            flock(lock, LOCK_EX)  # who writes last has read what all that wrote before had finished
+            for name, ending in ((RESULTS, "jsonl"), (ERRORS, "errors")):
+                paths = [self.file(cell, ending) for cell in self.manifest.cells]
+                with written_whole(self.folder / name) as (path,):
+                    path.write_bytes(b"".join(each.read_bytes() for each in paths if each.is_file()))
 
     def lines(self) -> list[str]:
         """What is finished, and what is missing and why, as text."""

@@ -1,0 +1,31 @@
+"""What each of several workers gets of a machine: threads, and one of its GPUs."""
+
+import os
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+
+GPUS = "CUDA_VISIBLE_DEVICES"
+DRIVER = Path("/proc/driver/nvidia/gpus")  # has a folder for each GPU
+
+
+def num_cores() -> int:
+    """That this process may use: a cluster gives a job some of a machine's."""
+    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+
+
+def visible_gpus(environment: Mapping[str, str], driver: Path = DRIVER) -> list[str]:
+    """As CUDA_VISIBLE_DEVICES names them; where it is not set, the numbers of all that the driver lists."""
+    if GPUS in environment:
+        return [gpu for gpu in environment[GPUS].split(",") if gpu not in ("", "-1")]
+    return [str(number) for number, _ in enumerate(driver.iterdir())] if driver.is_dir() else []
+
+
+def worker_environments(
+    num_workers: int, environment: Mapping[str, str], cores: int, gpus: Sequence[str]
+) -> list[dict[str, str]]:
+    """One a worker: an even share of the cores as threads, unless they are set, and a GPU in turn."""
+    threads = {"OMP_NUM_THREADS": str(max(1, cores // num_workers))}
+    return [
+        threads | dict(environment) | ({GPUS: gpus[worker % len(gpus)]} if gpus else {})
+        for worker in range(num_workers)
+    ]
