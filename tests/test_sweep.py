@@ -76,7 +76,7 @@ def test_a_manifest_that_was_damaged_is_refused(tmp_path: Path, change: dict[str
     "flag", ["--seed=3", "--eval.n_episodes=4", "--policy.path=x", "--env.results_path=y"]
 )
 def test_what_the_sweep_sets_itself_is_refused_as_a_flag(flag: str) -> None:
-    with pytest.raises(ValueError, match="a sweep sets"):
+    with pytest.raises(ValueError, match="is set for every cell"):
         plan(("act",), (), (), 0, 1, 1, [flag])
 
 

@@ -22,6 +22,7 @@ COMMANDS = {
     "export": "files of results as a LaTeX table, a model-index and the Hub's .eval_results",
     "sweep": "evaluate policies x tasks x conditions; goes on after a kill",
     "replay": "play an episode of a file of results again, bit for bit or with other perturbations",
+    "audit": "does a policy read, look, repeat itself: arms and verdicts that a success rate needs",
     "compare": "two policies on the same episodes: difference, interval, test",
     "eval": "lerobot-eval, which also writes the executed actions to a file",
     "smoothness": "second and third differences of executed actions, of demonstrations and evaluations",

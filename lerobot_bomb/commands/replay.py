@@ -18,6 +18,7 @@ from lerobot_bomb.conditions import NONE
 from lerobot_bomb.envs.results import ORIGIN, PolicyIdentity, ResultLine, Row
 from lerobot_bomb.envs.rollout import Agent, BatchAgent, one_of_batch
 from lerobot_bomb.evaluation.bomb_lines import spec_of
+from lerobot_bomb.evaluation.result_groups import different_fields
 from lerobot_bomb.evaluation.result_lines import kind_of
 from lerobot_bomb.pusht.episode import PushTSpec
 from lerobot_bomb.viewing.episode import (
@@ -163,10 +164,9 @@ def _check_policy(played: dict[str, Any], path: Path, loaded: PolicyIdentity) ->
 
 def _compare(row: Row, result: ResultLine) -> int:
     now: Row = json.loads(result.to_json())
-    names = [name for name in row if name not in ORIGIN]
-    different = [name for name in names if row[name] != now.get(name)]
+    different = different_fields(row, now)
     if not different:
-        print(f"as recorded, bit for bit: {', '.join(names)}")
+        print(f"as recorded, bit for bit: {', '.join(name for name in row if name not in ORIGIN)}")
         return 0
     first = different[0]
     print(f"not as recorded: {first} was {row[first]!r} and is {now.get(first)!r}")

@@ -2,31 +2,20 @@
 
 import argparse
 import json
-import os
 import shlex
-import subprocess
-import sys
-import time
-from collections.abc import Iterator
 from pathlib import Path
-from typing import IO, Any
-
-from tqdm import tqdm
+from typing import Any
 
 from lerobot_bomb.bomb.episode import TEST_SEEDS
 from lerobot_bomb.commands.arguments import parse_conditions, path_flag
 from lerobot_bomb.evaluation.result_lines import KINDS
 from lerobot_bomb.sweep.cluster import sbatch_script, submit
+from lerobot_bomb.sweep.local import PYTHON, play, progress
 from lerobot_bomb.sweep.manifest import NAME, Cell, Manifest, plan
-from lerobot_bomb.sweep.processes import num_cores, visible_gpus, worker_environments
 from lerobot_bomb.sweep.store import Store
 
 CONDITIONS = {kind.env_type: kind.condition for kind in KINDS}
-# -P: nothing in the folder that the user is in stands for a module of the same name
-PYTHON = (sys.executable, "-P", "-m")
-POLL_S = 0.5
 MAX_BATCH = 10
-MAX_ENDED = 3
 SCRIPT, SUBMITIT = "sweep.sbatch", "submitit"
 
 
@@ -83,7 +72,7 @@ def run_sweep(args: argparse.Namespace) -> int:
     store.forget_attempts(cells)
     try:
         if args.submitit is None:
-            _play(args, store, cells)
+            play(store, args.shard, args.workers, args.timeout)
         else:
             _play_by_jobs(args, store)
     except KeyboardInterrupt:
@@ -165,50 +154,6 @@ def _shard(text: str, manifest: Manifest) -> list[Cell]:
         raise ValueError(f"--shard: {error}") from None
 
 
-def _progress(store: Store, cells: list[Cell]) -> Iterator[bool]:
-    """Until all cells are over, show how far they are, and say whether they are further than before."""
-    total = sum(cell.num_episodes for cell in cells)
-    has_played = False
-    with tqdm(total=total, initial=store.num_played(cells), unit=" episodes") as bar:
-        while not all(store.is_over(cell) for cell in cells):
-            yield has_played
-            time.sleep(POLL_S)
-            more = store.num_played(cells) - bar.n
-            if has_played := more != 0:
-                bar.update(more)
-
-
-def _play(args: argparse.Namespace, store: Store, cells: list[Cell]) -> None:
-    """Start workers, and start those anew that were killed."""
-    environments = worker_environments(args.workers, os.environ, num_cores(), visible_gpus(os.environ))
-    command = [*PYTHON, "lerobot_bomb.sweep.worker", str(args.folder), args.shard]
-    command += [str(args.timeout)] if args.timeout else []
-    log = args.folder / "workers.log"
-
-    def start(environment: dict[str, str], output: IO[bytes]) -> subprocess.Popen:
-        return subprocess.Popen(
-            command, env=environment, stdin=subprocess.PIPE, stdout=output, stderr=subprocess.STDOUT
-        )
-
-    workers: list[subprocess.Popen] = []
-    num_ended = 0  # workers that ended by themselves since an episode was played
-    with log.open("ab") as output:
-        try:
-            for has_played in _progress(store, cells):
-                ended = [number for number, worker in enumerate(workers) if worker.poll() is not None]
-                num_ended = len(ended) + (0 if has_played else num_ended)
-                if num_ended > MAX_ENDED * args.workers:
-                    raise RuntimeError(f"workers end before they play; {log} says why")
-                for number in ended:
-                    workers[number] = start(environments[number], output)
-                workers += [start(environment, output) for environment in environments[len(workers) :]]
-        finally:
-            for worker in workers:
-                worker.terminate()
-            for worker in workers:
-                worker.wait()
-
-
 def _job_command(args: argparse.Namespace) -> list[str]:
     """Plays a part of the folder's cells, with --shard."""
     command = [*PYTHON, "lerobot_bomb.commands.main", "sweep", str(args.folder.absolute())]
@@ -233,7 +178,7 @@ def _play_by_jobs(args: argparse.Namespace, store: Store) -> None:
     commands = [[*_job_command(args), f"--shard={part}"] for part in left]
     jobs = submit(commands, logs, args.submitit_cluster, args.submitit_parameters) if left else []
     try:
-        for _ in _progress(store, cells):
+        for _ in progress(store, cells):
             if all(job.done() for job in jobs):
                 break
         for job in jobs:

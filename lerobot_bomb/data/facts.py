@@ -68,15 +68,21 @@ class DatasetFacts:
         count = f"{info['total_episodes']} episodes, {info['total_frames']} frames at {info['fps']} Hz"
         return [f"- {count}", *self._recording_lines()]
 
-    def _recording_lines(self) -> list[str]:
+    @property
+    def seeds(self) -> range | None:
+        """Of the episodes that were tried; None: it is no recording of BOMB."""
         recording = self.recording
         if not recording:
-            return []
-        num_failed = len(self.bomb["failures"])
+            return None
         num_conditions = len(recording["perturbations"]) * max(1, len(recording["task_ids"]))
-        num_tried = self.bomb["num_episodes"] + num_failed
-        first = recording["seed"]
-        last = first + (num_tried - 1) // num_conditions
+        num_tried = self.bomb["num_episodes"] + len(self.bomb["failures"])
+        return range(recording["seed"], recording["seed"] + (num_tried - 1) // num_conditions + 1)
+
+    def _recording_lines(self) -> list[str]:
+        recording, seeds = self.recording, self.seeds
+        num_failed = len(self.bomb.get("failures", []))
+        if seeds is None:
+            return []
         given = [f"{name} {recording[name]}" for name in ("target", "color") if recording.get(name)]
         tasks = recording["task_ids"] or ", ".join(given) or "drawn per episode"
         return [
@@ -85,7 +91,7 @@ class DatasetFacts:
             f"{recording['image_size']} px",
             f"- perturbation axes: `{', '.join(recording['perturbations'])}`; noise on actions: "
             f"{recording['noise']:g}; tasks: {tasks}",
-            f"- seeds {first}..{last}; failed episodes that were left out: {num_failed}",
+            f"- seeds {seeds[0]}..{seeds[-1]}; failed episodes that were left out: {num_failed}",
             f"- recorded with lerobot_bomb {recording['package_version']}, MuJoCo "
             f"{recording.get('mujoco_version', 'of an unknown version')}",
         ]

@@ -5,7 +5,7 @@ from dataclasses import dataclass
 from typing import Any
 
 from lerobot_bomb.conditions import NONE
-from lerobot_bomb.envs.results import Row
+from lerobot_bomb.envs.results import ORIGIN, Row
 from lerobot_bomb.evaluation.result_kind import NOT_RECORDED, Pair, ResultKind, describe_numbers
 from lerobot_bomb.evaluation.result_lines import kind_of
 from lerobot_bomb.stats import PairedCounts
@@ -110,6 +110,11 @@ def pair_with_nominal(rows: list[Row]) -> dict[str, list[Pair]]:
 def count_pairs(pairs: list[Pair]) -> PairedCounts:
     """How often which row of the pairs is a success."""
     return PairedCounts.of([a["is_success"] for a, _ in pairs], [b["is_success"] for _, b in pairs])
+
+
+def different_fields(row: Row, other: Row) -> list[str]:
+    """Names of what is not the same of two lines of one episode, but for who played it and where."""
+    return [name for name, value in row.items() if name not in ORIGIN and value != other.get(name)]
 
 
 def describe_change(pairs: list[Pair]) -> str:

@@ -120,6 +120,14 @@ def _at_least(lowest: int, values: dict[str, Any], name: str) -> int:
     return values[name]
 
 
+def check_flags(flags: Sequence[str]) -> None:
+    """Raise a ValueError if a flag of lerobot-eval is one that a cell has of its own."""
+    for flag in flags:
+        name = flag.partition("=")[0]
+        if name in RESERVED or name.startswith(RESERVED_PREFIXES):
+            raise ValueError(f"{flag}: {name} is set for every cell; see --help")
+
+
 def plan(
     policies: Sequence[str],
     tasks: Sequence[str],
@@ -143,10 +151,7 @@ def plan(
     Raises:
         ValueError: a flag is one that the plan decides.
     """
-    for flag in flags:
-        name = flag.partition("=")[0]
-        if name in RESERVED or name.startswith(RESERVED_PREFIXES):
-            raise ValueError(f"{flag}: a sweep sets {name} itself; see `lerobot-bomb sweep --help`")
+    check_flags(flags)
     of_policy = [flag for flag in flags if flag.startswith("--policy.")]
     of_env = [flag for flag in flags if not flag.startswith("--policy.")]
     cells = [

@@ -1,0 +1,149 @@
+"""``lerobot-bomb audit``: does a policy's success rate mean what it seems to?"""
+
+import argparse
+import json
+from pathlib import Path
+
+from lerobot_bomb.bomb.episode import TEST_SEEDS
+from lerobot_bomb.commands.arguments import checkpoint_flag, path_flag
+from lerobot_bomb.data.facts import DatasetFacts
+from lerobot_bomb.envs.results import Row
+from lerobot_bomb.evaluation.results import read_results
+from lerobot_bomb.files import written_whole
+from lerobot_bomb.report import verdicts
+from lerobot_bomb.report.page import render
+from lerobot_bomb.report.tables import Section
+from lerobot_bomb.report.verdicts import (
+    AGAIN,
+    ALONE,
+    BLANK,
+    EXPERT,
+    HELDOUT,
+    OTHER_INSTRUCTION,
+    POLICY,
+    RANDOM,
+    TRAIN,
+    judge,
+)
+from lerobot_bomb.sweep.local import play
+from lerobot_bomb.sweep.manifest import NAME, Cell, Manifest, check_flags, largest_divisor
+from lerobot_bomb.sweep.store import Store
+from lerobot_bomb.tables import print_table
+
+MAX_BATCH = 10
+FLAWED = 2  # exit code where an answer is no
+
+
+def add_audit_arguments(parser: argparse.ArgumentParser) -> None:
+    """Declare the arguments of ``lerobot-bomb audit``."""
+    parser.usage = "lerobot-bomb audit FOLDER --policy.path=CHECKPOINT [--env.NAME=VALUE ...]"
+    add = parser.add_argument
+    add("folder", type=path_flag, metavar="FOLDER", help="new, or of an audit that is to go on")
+    add(
+        "--policy.path", dest="policy_path", type=checkpoint_flag, required=True, help="a checkpoint's folder"
+    )
+    add("--episodes", type=int, default=50, help="of each arm (default: 50)")
+    add("--seed", type=int, default=TEST_SEEDS[0], help=f"the first one (default: {TEST_SEEDS[0]})")
+    add("--workers", type=int, default=1, help="processes (default: 1)")
+    add("rest", nargs="*", metavar="FLAG", help="flags of lerobot-eval, of --env.type=bomb")
+
+
+def run_audit(args: argparse.Namespace) -> int:
+    """Play all arms, write what they show, print the verdicts; exit code 2 where one is no."""
+    for name, lowest in (("episodes", 2), ("seed", 0), ("workers", 1)):
+        if getattr(args, name) < lowest:
+            raise ValueError(f"--{name}={getattr(args, name)} must be at least {lowest}")
+    check_flags(args.rest)
+    arms = _play(args, args.folder / "first", _first_arms(args))
+    arms |= _play(args, args.folder / "second", _second_arms(args, arms[POLICY]))
+    found = judge(arms, _trained_seeds(args.policy_path))
+    section = Section("Audit", verdicts.table(arms, found))
+    html, tables = (args.folder / f"audit{suffix}" for suffix in (".html", ".json"))
+    with written_whole(html, tables) as (page, as_json):
+        page.write_text(render(f"Audit of {args.policy_path}", [section]))
+        as_json.write_text(json.dumps(section.as_json(), indent=1) + "\n")
+    print_table(["", "", ""], [[each.question, each.answer, each.evidence] for each in found])
+    print(html, tables, sep="\n")
+    return FLAWED if any(each.answer == verdicts.NO for each in found) else 0
+
+
+def _first_arms(args: argparse.Namespace) -> dict[str, Cell]:
+    checkpoint = f"--policy.path={args.policy_path}"
+    blank = args.folder / "blank_images"
+    if not blank.is_dir():
+        from lerobot_bomb.explain.interventions import BlankImages, intervene  # LeRobot: seconds
+
+        intervene(args.policy_path, [BlankImages()], blank)
+    arms = {
+        POLICY: _cell(args, checkpoint),
+        ALONE: _cell(args, checkpoint, batch_size=1),
+        BLANK: _cell(args, f"--policy.path={blank}"),
+        RANDOM: _cell(args, "--policy.type=bomb_random"),
+        EXPERT: _cell(args, "--policy.type=bomb_expert"),
+    }
+    if not any(flag.startswith(("--env.split", "--env.task_ids", "--env.target")) for flag in args.rest):
+        arms |= {TRAIN: _cell(args, checkpoint, "train"), HELDOUT: _cell(args, checkpoint, "heldout")}
+    return arms
+
+
+def _second_arms(args: argparse.Namespace, played: list[Row]) -> dict[str, Cell]:
+    """Those that need the instructions of the first."""
+    arms = {AGAIN: _cell(args, f"--policy.path={args.policy_path}")}
+    others = other_instructions([row["instruction"] for row in played])
+    if others:
+        exchanged = args.folder / "other_instruction"
+        if not exchanged.is_dir():
+            from lerobot_bomb.explain.interventions import ReplaceTasks, intervene
+
+            intervene(args.policy_path, [ReplaceTasks(others)], exchanged)
+        arms[OTHER_INSTRUCTION] = _cell(args, f"--policy.path={exchanged}")
+    return arms
+
+
+def other_instructions(instructions: list[str]) -> dict[str, str]:
+    """{instruction: another's}, each the next one's; {} where all are the same."""
+    given = sorted(set(instructions))
+    return dict(zip(given, given[1:] + given[:1], strict=True)) if len(given) > 1 else {}
+
+
+def _cell(args: argparse.Namespace, policy: str, split: str = "", batch_size: int = MAX_BATCH) -> Cell:
+    of_policy = [flag for flag in args.rest if flag.startswith("--policy.")]
+    of_env = [flag for flag in args.rest if not flag.startswith("--policy.")]
+    is_scripted = policy.startswith("--policy.type")
+    return Cell(
+        policy=(policy, *([] if is_scripted else of_policy)),
+        env=("--env.type=bomb", *of_env, *([f"--env.split={split}"] if split else [])),
+        seed=args.seed,
+        num_episodes=args.episodes,
+        batch_size=largest_divisor(args.episodes, batch_size),
+    )
+
+
+def _play(args: argparse.Namespace, folder: Path, cells: dict[str, Cell]) -> dict[str, list[Row]]:
+    """{arm: its lines}.
+
+    Raises:
+        ValueError: the folder is of another audit.
+        RuntimeError: an arm could not be played.
+    """
+    manifest = Manifest(tuple(cells.values()))
+    if not (folder / NAME).is_file():
+        manifest.write(folder)
+    elif Manifest.read(folder) != manifest:
+        raise ValueError(f"{args.folder} is of another audit; name another folder")
+    store = Store(folder, manifest)
+    store.forget_attempts(manifest.cells)
+    play(store, "0/1", args.workers)
+    store.merge()
+    missing = [name for name, cell in cells.items() if not store.is_finished(cell) or store.errors(cell)]
+    if missing:
+        raise RuntimeError("\n".join([f"no lines of: {', '.join(missing)}", *store.lines()]))
+    return {name: read_results(store.file(cell, "jsonl")) for name, cell in cells.items()}
+
+
+def _trained_seeds(checkpoint: Path) -> range | None:
+    from lerobot_bomb.evaluation.splits import read_train_config  # LeRobot
+
+    dataset = read_train_config(checkpoint).get("dataset") or {}
+    facts = DatasetFacts.find(dataset.get("root"))
+    return None if facts is None else facts.seeds

@@ -1,0 +1,129 @@
+"""What can be wrong with a success rate, asked one by one: verdicts over lines of results.
+
+Arms are lists of lines of the same episodes, but for those of the splits.
+"""
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+from lerobot_bomb.envs.results import Row
+from lerobot_bomb.evaluation.result_groups import count_pairs, different_fields
+from lerobot_bomb.evaluation.result_kind import Pair
+from lerobot_bomb.report.tables import Cell, Table, rate
+from lerobot_bomb.stats import format_rate
+
+POLICY, AGAIN, ALONE = "the policy", "again, in another process", "one episode at a time"
+BLANK, OTHER_INSTRUCTION = "with black images", "with another episode's instruction"
+RANDOM, EXPERT = "random actions", "the scripted expert"
+TRAIN, HELDOUT = "what training shows (split train)", "what is held out (split heldout)"
+
+YES, NO, OPEN = "yes", "NO", "not shown"
+SIGNIFICANT = 0.05
+
+
+@dataclass(frozen=True)
+class Verdict:
+    """A question, its answer, and what it rests on."""
+
+    question: str
+    answer: str  # YES, NO, or OPEN: these episodes do not show it
+    evidence: str
+
+
+def table(arms: Mapping[str, list[Row]], verdicts: list[Verdict]) -> list[Table]:
+    """The rates of all arms; the verdicts."""
+    rates = [[Cell(name), rate(rows), Cell(str(len(rows)), len(rows))] for name, rows in arms.items() if rows]
+    answers = [[Cell(each.question), Cell(each.answer), Cell(each.evidence)] for each in verdicts]
+    return [
+        Table("Verdicts", ["question", "answer", "evidence"], answers),
+        Table("Success", ["who acts", "success", "episodes"], rates, "With 95 % Wilson intervals; per cent."),
+    ]
+
+
+def judge(arms: Mapping[str, list[Row]], trained_seeds: range | None) -> list[Verdict]:
+    """Every question that the arms have an answer to."""
+    policy = arms[POLICY]
+    found = [_same_again(_pairs(policy, arms[AGAIN])), _same_alone(_pairs(policy, arms[ALONE]))]
+    for name, question in ((BLANK, "looks at the images"), (OTHER_INSTRUCTION, "reads the instruction")):
+        if arms.get(name):
+            found.append(_depends(question, name, _pairs(policy, arms[name])))
+    if arms.get(RANDOM):
+        found.append(_better_than_random(_pairs(arms[RANDOM], policy)))
+    if arms.get(EXPERT):
+        found.append(_can_be_solved(arms[EXPERT]))
+    if arms.get(HELDOUT):
+        found.append(_generalises(arms[TRAIN], arms[HELDOUT]))
+    return [*found, _new_seeds(policy, trained_seeds)]
+
+
+def _pairs(first: list[Row], second: list[Row]) -> list[Pair]:
+    of_seed = {row["spec"]["seed"]: row for row in second}
+    return [(row, of_seed[row["spec"]["seed"]]) for row in first if row["spec"]["seed"] in of_seed]
+
+
+def _same_again(pairs: list[Pair]) -> Verdict:
+    question = "the same flags give the same episodes"
+    for row, other in pairs:
+        if names := different_fields(row, other):
+            return Verdict(question, NO, f"seed {row['spec']['seed']} differs in {names[0]}")
+    return Verdict(question, YES, f"{len(pairs)} of {len(pairs)}, bit for bit")
+
+
+def _same_alone(pairs: list[Pair]) -> Verdict:
+    counts = count_pairs(pairs)
+    num_other = counts.only_first + counts.only_second
+    num_equal = sum(not different_fields(*pair) for pair in pairs)
+    evidence = f"{num_other} of {counts.n} episodes end otherwise (p = {counts.p_value:.2g}); bit for bit {num_equal}"
+    return Verdict("the size of the batch does not decide", _unless(counts.p_value), evidence)
+
+
+def _unless(p_value: float) -> str:
+    """YES unless the arms differ."""
+    return NO if p_value < SIGNIFICANT else YES
+
+
+def _depends(question: str, name: str, pairs: list[Pair]) -> Verdict:
+    counts = count_pairs(pairs)
+    if not any(different_fields(*pair) for pair in pairs):
+        return Verdict(question, NO, f"{name} all {counts.n} episodes are the same, bit for bit")
+    shown = f"{counts.first} of {counts.n} become {counts.second} {name} (p = {counts.p_value:.2g})"
+    is_worse = counts.p_value < SIGNIFICANT and counts.difference < 0
+    return Verdict(question, YES if is_worse else OPEN, shown)
+
+
+def _better_than_random(pairs: list[Pair]) -> Verdict:
+    counts = count_pairs(pairs)
+    is_better = counts.p_value < SIGNIFICANT and counts.difference > 0
+    shown = f"{counts.second} of {counts.n}, random actions {counts.first} (p = {counts.p_value:.2g})"
+    return Verdict("better than random actions", YES if is_better else OPEN, shown)
+
+
+def _can_be_solved(rows: list[Row]) -> Verdict:
+    successes = sum(row["is_success"] for row in rows)
+    answer = YES if successes == len(rows) else NO
+    return Verdict("every episode can be solved", answer, format_rate(successes, len(rows)))
+
+
+def _generalises(train: list[Row], heldout: list[Row]) -> Verdict:
+    shown, held = (sum(row["is_success"] for row in rows) for rows in (train, heldout))
+    p_value = _fisher(shown, len(train), held, len(heldout))
+    is_worse = p_value < SIGNIFICANT and held / len(heldout) < shown / len(train)
+    evidence = (
+        f"{held} of {len(heldout)} held out, {shown} of {len(train)} others (Fisher's p = {p_value:.2g})"
+    )
+    return Verdict("does as well on what is held out", NO if is_worse else YES, evidence)
+
+
+def _fisher(first: int, of_first: int, second: int, of_second: int) -> float:
+    from scipy.stats import fisher_exact
+
+    return float(fisher_exact([[first, of_first - first], [second, of_second - second]]).pvalue)
+
+
+def _new_seeds(rows: list[Row], trained: range | None) -> Verdict:
+    question = "no episode of the training is evaluated"
+    if trained is None:
+        return Verdict(question, OPEN, "the dataset of the training is not here, or is no recording of BOMB")
+    seen = sorted({row["spec"]["seed"] for row in rows} & set(trained))
+    evidence = f"trained on seeds {trained[0]}..{trained[-1]}"
+    return Verdict(question, NO if seen else YES, f"{evidence}{f', {len(seen)} evaluated' if seen else ''}")

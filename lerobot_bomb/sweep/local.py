@@ -1,0 +1,67 @@
+"""Cells played by worker processes on this machine."""
+
+import os
+import subprocess
+import sys
+import time
+from collections.abc import Iterator, Sequence
+from typing import IO
+
+from tqdm import tqdm
+
+from lerobot_bomb.sweep.manifest import Cell
+from lerobot_bomb.sweep.processes import num_cores, visible_gpus, worker_environments
+from lerobot_bomb.sweep.store import Store
+
+# -P: nothing in the folder that the user is in stands for a module of the same name
+PYTHON = (sys.executable, "-P", "-m")
+POLL_S = 0.5
+MAX_ENDED = 3
+
+
+def progress(store: Store, cells: Sequence[Cell]) -> Iterator[bool]:
+    """Until all cells are over, show how far they are, and say whether they are further than before."""
+    total = sum(cell.num_episodes for cell in cells)
+    has_played = False
+    with tqdm(total=total, initial=store.num_played(cells), unit=" episodes") as bar:
+        while not all(store.is_over(cell) for cell in cells):
+            yield has_played
+            time.sleep(POLL_S)
+            more = store.num_played(cells) - bar.n
+            if has_played := more != 0:
+                bar.update(more)
+
+
+def play(store: Store, part: str, num_workers: int, timeout_s: int | None = None) -> None:
+    """Play a part of the cells: start workers, and start those anew that were killed.
+
+    Raises:
+        RuntimeError: they end before they play.
+    """
+    environments = worker_environments(num_workers, os.environ, num_cores(), visible_gpus(os.environ))
+    command = [*PYTHON, "lerobot_bomb.sweep.worker", str(store.folder), part]
+    command += [str(timeout_s)] if timeout_s else []
+    log = store.folder / "workers.log"
+
+    def start(environment: dict[str, str], output: IO[bytes]) -> subprocess.Popen:
+        return subprocess.Popen(
+            command, env=environment, stdin=subprocess.PIPE, stdout=output, stderr=subprocess.STDOUT
+        )
+
+    workers: list[subprocess.Popen] = []
+    num_ended = 0  # workers that ended by themselves since an episode was played
+    with log.open("ab") as output:
+        try:
+            for has_played in progress(store, store.manifest.part(part)):
+                ended = [number for number, worker in enumerate(workers) if worker.poll() is not None]
+                num_ended = len(ended) + (0 if has_played else num_ended)
+                if num_ended > MAX_ENDED * num_workers:
+                    raise RuntimeError(f"workers end before they play; {log} says why")
+                for number in ended:
+                    workers[number] = start(environments[number], output)
+                workers += [start(environment, output) for environment in environments[len(workers) :]]
+        finally:
+            for worker in workers:
+                worker.terminate()
+            for worker in workers:
+                worker.wait()
