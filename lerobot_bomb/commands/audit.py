@@ -74,9 +74,10 @@ def _first_arms(args: argparse.Namespace) -> dict[str, Cell]:
         from lerobot_bomb.explain.interventions import BlankImages, intervene  # LeRobot: seconds
 
         intervene(args.policy_path, [BlankImages()], blank)
-    arms = {
-        POLICY: _cell(args, checkpoint),
-        ALONE: _cell(args, checkpoint, batch_size=1),
+    arms = {POLICY: _cell(args, checkpoint)}
+    if arms[POLICY].batch_size > 1:
+        arms[ALONE] = _cell(args, checkpoint, batch_size=1)
+    arms |= {
         BLANK: _cell(args, f"--policy.path={blank}"),
         RANDOM: _cell(args, "--policy.type=bomb_random"),
         EXPERT: _cell(args, "--policy.type=bomb_expert"),

@@ -73,13 +73,12 @@ def _same_alone(pairs: list[Pair]) -> Verdict:
     counts = count_pairs(pairs)
     num_other = counts.only_first + counts.only_second
     num_equal = sum(not different_fields(*pair) for pair in pairs)
-    evidence = f"{num_other} of {counts.n} episodes end otherwise (p = {counts.p_value:.2g}); bit for bit {num_equal}"
-    return Verdict("the size of the batch does not decide", _unless(counts.p_value), evidence)
-
-
-def _unless(p_value: float) -> str:
-    """YES unless the arms differ."""
-    return NO if p_value < SIGNIFICANT else YES
+    evidence = (
+        f"{num_other} of {counts.n} episodes end otherwise (p = {counts.p_value:.2g}), "
+        f"{num_equal} are the same bit for bit"
+    )
+    answer = NO if counts.p_value < SIGNIFICANT else YES
+    return Verdict("the size of the batch does not decide", answer, evidence)
 
 
 def _depends(question: str, name: str, pairs: list[Pair]) -> Verdict:
