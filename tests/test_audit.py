@@ -1,0 +1,139 @@
+"""``lerobot-bomb audit``: what was planted in a policy is what it says."""
+
+import json
+from pathlib import Path
+from typing import Any
+
+import pytest
+from test_results import values
+
+from lerobot_bomb.commands.audit import FLAWED, other_instructions
+from lerobot_bomb.commands.main import main
+from lerobot_bomb.report.verdicts import (
+    AGAIN,
+    ALONE,
+    BLANK,
+    EXPERT,
+    HELDOUT,
+    NO,
+    OPEN,
+    OTHER_INSTRUCTION,
+    POLICY,
+    RANDOM,
+    TRAIN,
+    YES,
+    judge,
+)
+
+N = 40
+type Rows = list[dict[str, Any]]
+
+
+def rows(successes: int, shift: float = 0.0, n: int = N, first: int = 0) -> Rows:
+    """Episodes of which the first succeed; another shift is another episode, bit for bit."""
+    return [
+        values(seed, None if seed - first < successes else "imprecise", 1.0 + shift)
+        for seed in range(first, first + n)
+    ]
+
+
+@pytest.fixture
+def arms() -> dict[str, Rows]:
+    """Of a policy that has nothing to hide."""
+    return {
+        POLICY: rows(36),
+        AGAIN: rows(36),
+        ALONE: rows(36, 0.01),
+        BLANK: rows(0, 0.5),
+        OTHER_INSTRUCTION: rows(2, 0.5),
+        RANDOM: rows(0, 0.7),
+        EXPERT: rows(N, 0.2),
+        TRAIN: rows(36),
+        HELDOUT: rows(35),
+    }
+
+
+def answers(arms: dict[str, Rows], trained: range | None = range(1000, 2000)) -> dict[str, str]:
+    return {verdict.question: verdict.answer for verdict in judge(arms, trained)}
+
+
+def test_a_policy_that_has_nothing_to_hide_passes(arms: dict[str, Rows]) -> None:
+    found = answers(arms)
+    assert len(found) == 8 and set(found.values()) == {YES}
+
+
+@pytest.mark.parametrize(
+    ("question", "planted"),
+    [
+        ("reads the instruction", {OTHER_INSTRUCTION: rows(36)}),
+        ("looks at the images", {BLANK: rows(36)}),
+        ("the same flags give the same episodes", {AGAIN: [*rows(36)[:-1], *rows(0, 0.1, 1, N - 1)]}),
+        ("the size of the batch does not decide", {ALONE: rows(20, 0.01)}),
+        ("every episode can be solved", {EXPERT: rows(N - 1)}),
+        ("does as well on what is held out", {HELDOUT: rows(4)}),
+    ],
+)
+def test_what_was_planted_is_told_and_nothing_else(
+    question: str, planted: dict[str, Rows], arms: dict[str, Rows]
+) -> None:
+    found = answers(arms | planted)
+    assert found.pop(question) == NO
+    assert set(found.values()) == {YES}
+
+
+def test_what_these_episodes_do_not_show_is_left_open(arms: dict[str, Rows]) -> None:
+    found = answers(arms | {OTHER_INSTRUCTION: rows(34, 0.1), RANDOM: rows(35, 0.7)}, None)
+    assert [question for question, answer in found.items() if answer == OPEN] == [
+        "reads the instruction", "better than random actions", "no episode of the training is evaluated",
+    ]  # fmt: skip
+
+
+def test_seeds_of_the_training_are_found(arms: dict[str, Rows]) -> None:
+    verdict = judge(arms, range(30, 60))[-1]
+    assert verdict.answer == NO and verdict.evidence == "trained on seeds 30..59, 10 evaluated"
+
+
+def test_every_instruction_gets_another_s() -> None:
+    given = other_instructions(["a", "b", "a", "c"])
+    assert sorted(given) == sorted(given.values()) == ["a", "b", "c"]
+    assert all(instruction != other for instruction, other in given.items())
+    assert other_instructions(["a", "a"]) == {}
+
+
+@pytest.mark.parametrize(
+    ("flags", "message"),
+    [
+        (["--episodes=1"], "--episodes=1 must be at least 2"),
+        (["--eval.n_episodes=3"], "--eval.n_episodes is set for every cell"),
+    ],
+)
+def test_wrong_flags_are_told(
+    flags: list[str], message: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert main(["audit", str(tmp_path), "--policy.path=bomb:fdvla", *flags]) == 1
+    assert message in capsys.readouterr().err
+    assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.long
+def test_the_shipped_policy_and_one_that_is_told_nothing(tmp_path: Path) -> None:
+    from lerobot_bomb.explain.interventions import ReplaceTasks, intervene
+
+    flags = ["--env.image_size=64", "--policy.device=cpu", "--episodes=20", "--workers=2"]
+    assert main(["audit", str(tmp_path / "honest"), "--policy.path=bomb:fdvla", *flags]) == 0
+    answers = read_answers(tmp_path / "honest")
+    assert answers["reads the instruction"] == answers["looks at the images"] == YES
+    # whatever it is told, it is given one and the same instruction
+    lines = (tmp_path / "honest" / "first" / "results.jsonl").read_text().splitlines()
+    told = {json.loads(line)["instruction"] for line in lines}
+    deaf = ReplaceTasks(dict.fromkeys(told, min(told)))
+    intervene("bomb:fdvla", [deaf], tmp_path / "deaf")
+    flags += ["--env.split=all"]  # no other splits, whose instructions it does not know
+    assert main(["audit", str(tmp_path / "audit"), f"--policy.path={tmp_path / 'deaf'}", *flags]) == FLAWED
+    answers = read_answers(tmp_path / "audit")
+    assert answers["reads the instruction"] == NO and answers["looks at the images"] != NO
+
+
+def read_answers(folder: Path) -> dict[str, str]:
+    section = json.loads((folder / "audit.json").read_text())
+    return {question: answer for question, answer, _ in section["tables"][0]["rows"]}
