@@ -7,7 +7,8 @@ from typing import Any
 import pytest
 from test_results import values
 
-from lerobot_bomb.commands.audit import FLAWED, other_instructions
+from lerobot_bomb.commands.arguments import ANSWER_IS_NO
+from lerobot_bomb.commands.audit import other_instructions
 from lerobot_bomb.commands.main import main
 from lerobot_bomb.report.verdicts import (
     AGAIN,
@@ -129,7 +130,8 @@ def test_the_shipped_policy_and_one_that_is_told_nothing(tmp_path: Path) -> None
     deaf = ReplaceTasks(dict.fromkeys(told, min(told)))
     intervene("bomb:fdvla", [deaf], tmp_path / "deaf")
     flags += ["--env.split=all"]  # no other splits, whose instructions it does not know
-    assert main(["audit", str(tmp_path / "audit"), f"--policy.path={tmp_path / 'deaf'}", *flags]) == FLAWED
+    command = ["audit", str(tmp_path / "audit"), f"--policy.path={tmp_path / 'deaf'}", *flags]
+    assert main(command) == ANSWER_IS_NO
     answers = read_answers(tmp_path / "audit")
     assert answers["reads the instruction"] == NO and answers["looks at the images"] != NO
 

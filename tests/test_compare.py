@@ -7,7 +7,7 @@ from typing import Any
 import pytest
 from test_results import ACT, FDVLA, values
 
-from lerobot_bomb.commands.compare import MISSED
+from lerobot_bomb.commands.arguments import ANSWER_IS_NO
 from lerobot_bomb.commands.main import main
 
 type Printed = pytest.CaptureFixture[str]
@@ -54,10 +54,10 @@ def test_the_exit_code_says_whether_a_difference_is_shown(a: Path, b: Path, caps
     write(a, ["dropped"] * 60 + [None] * 40)
     write(b, ["dropped"] * 10 + [None] * 90, policy=FDVLA)
     assert compare(a, b, "--min_difference=35", "--non_inferior=5") == 0  # +50 [+39, +59]
-    assert compare(a, b, "--min_difference=45") == MISSED
+    assert compare(a, b, "--min_difference=45") == ANSWER_IS_NO
     assert "--min_difference=45: B is better by 45 points or more: not shown" in capsys.readouterr().out
     assert compare(b, a, "--non_inferior=65") == 0
-    assert compare(b, a, "--non_inferior=55") == MISSED
+    assert compare(b, a, "--non_inferior=55") == ANSWER_IS_NO
 
 
 def test_every_condition_must_reach_the_bar(a: Path, b: Path) -> None:
@@ -66,7 +66,7 @@ def test_every_condition_must_reach_the_bar(a: Path, b: Path) -> None:
     assert compare(a, b, "--non_inferior=5") == 0
     write(a, [None] * 100, "light:3")
     write(b, ["dropped"] * 5 + [None] * 95, "light:3", policy=FDVLA)
-    assert compare(a, b, "--non_inferior=5") == MISSED
+    assert compare(a, b, "--non_inferior=5") == ANSWER_IS_NO
 
 
 def test_what_is_measured_is_compared_where_both_have_it(a: Path, b: Path, capsys: Printed) -> None:

@@ -9,8 +9,8 @@ import av
 import pytest
 from rrd_files import read_rrd
 
+from lerobot_bomb.commands.arguments import ANSWER_IS_NO
 from lerobot_bomb.commands.main import main
-from lerobot_bomb.commands.replay import DIFFERS
 from lerobot_bomb.conditions import NONE
 from lerobot_bomb.envs.results import ORIGIN, EpisodeResult
 
@@ -114,7 +114,7 @@ def test_what_differs_first_is_told(
 ) -> None:
     changes = {"placement_error_mm": 3.5, "collateral_mm": 9.0, "torch_version": "2.0", "machine": "other"}
     path = rewritten(results("bomb_expert"), tmp_path / "changed.jsonl", **changes)
-    assert main(["replay", str(path), f"--output={tmp_path / 'x'}"]) == DIFFERS
+    assert main(["replay", str(path), f"--output={tmp_path / 'x'}"]) == ANSWER_IS_NO
     out = capsys.readouterr().out
     assert "not as recorded: placement_error_mm was 3.5 and is " in out
     assert "torch_version: 2.0 then, " in out and "machine: other then, " in out

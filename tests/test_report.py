@@ -2,6 +2,7 @@
 
 import csv
 import json
+import shlex
 from collections import Counter
 from html.parser import HTMLParser
 from pathlib import Path
@@ -159,3 +160,40 @@ def test_what_an_axis_explains_is_counted_where_levels_were_drawn(rows: Rows, tm
     shares = {axis: share for axis, _, share in table["rows"]}
     assert list(shares) == ["camera", "light"]
     assert shares["camera"] == pytest.approx(1.0) and shares["light"] < 0.05
+
+
+@pytest.mark.parametrize("name", ["data.json", "data.csv"])
+def test_a_file_of_results_is_never_replaced(
+    name: str, rows: Rows, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    path = tmp_path / name
+    path.write_text("".join(json.dumps(row) + "\n" for row in rows))
+    before = path.read_bytes()
+    assert main(["report", str(path), f"--output={tmp_path / 'data.html'}"]) == 1
+    assert f"{path} is a file of results that is read" in capsys.readouterr().err
+    assert path.read_bytes() == before and [each.name for each in tmp_path.iterdir()] == [name]
+
+
+def test_the_output_is_a_page_or_a_folder(
+    rows: Rows, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    path = tmp_path / "r.jsonl"
+    path.write_text(json.dumps(rows[0]) + "\n")
+    assert main(["report", str(path), f"--output={tmp_path / 'page.txt'}"]) == 1
+    assert "must be the page's path, .html, or a folder" in capsys.readouterr().err
+    (tmp_path / "out").mkdir()
+    assert main(["report", str(path), f"--output={tmp_path / 'out'}"]) == 0
+    assert (tmp_path / "out" / "report.html").is_file()
+
+
+def test_the_command_that_is_given_plays_the_same_again(rows: Rows, written: Path) -> None:
+    (section,) = [
+        each for each in json.loads((written / "r.json").read_text()) if each["title"] == "What was run"
+    ]
+    commands = [line for line in section["lines"] if "lerobot-eval" in line]
+    assert len(commands) == 2
+    for command in commands:
+        flags = dict(flag.split("=", 1) for flag in shlex.split(command)[1:])
+        assert flags["--seed"] == "0" and flags["--eval.n_episodes"] == "12"
+        assert json.loads(flags["--env.perturbations"]) == ["none", "camera:2", "camera:4"]
+        assert any(name in flags for name in ("--policy.path", "--policy.type"))

@@ -223,6 +223,9 @@ def test_a_cell_that_takes_too_long_is_given_up(
         (["--policies=bomb_expert", "--env.type=bomb", "--perturbations=each:0"], "write each:LEVEL"),
         (["--policies=bomb_expert", "--env.type=pusht"], "--env.type=pusht writes no lines of results"),
         (["--policies=bomb_expert", "--env.type=bomb", "--episodes=0"], "--episodes=0 must be at least 1"),
+        (["--policies=/gone", "--env.type=bomb"], "--policies: /gone is no folder"),
+        (["--policies=bomb:fdvl", "--env.type=bomb"], "no checkpoint 'fdvl' comes with this package"),
+        (["--policies=README.md", "--env.type=bomb"], "--policies: README.md is no"),
         (["--policies=bomb_expert", "--env.type=bomb", "--shard=4/4"], "--shard: 4/4 must be PART/PARTS"),
     ],
 )
@@ -231,6 +234,7 @@ def test_wrong_flags_are_told(
 ) -> None:
     assert sweep(tmp_path, *flags) == 1
     assert message in capsys.readouterr().err
+    assert list(tmp_path.iterdir()) == []
 
 
 def test_a_folder_of_another_sweep_is_left_alone(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

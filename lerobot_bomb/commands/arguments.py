@@ -12,6 +12,8 @@ from lerobot_bomb.bomb.suites import SUITES
 from lerobot_bomb.checkpoints.shipped import checkpoint_path
 from lerobot_bomb.conditions import NONE
 
+ANSWER_IS_NO = 3  # exit code of a command that was asked something; 1 is an error, 2 a flag that is unknown
+
 
 def path_flag(text: str) -> Path:
     """The path that a flag gives, for argparse; ~ is the home folder wherever it stands: --root=~/x.

@@ -5,7 +5,7 @@ import json
 from pathlib import Path
 
 from lerobot_bomb.bomb.episode import TEST_SEEDS
-from lerobot_bomb.commands.arguments import checkpoint_flag, path_flag
+from lerobot_bomb.commands.arguments import ANSWER_IS_NO, checkpoint_flag, path_flag
 from lerobot_bomb.data.facts import DatasetFacts
 from lerobot_bomb.envs.results import Row
 from lerobot_bomb.evaluation.results import read_results
@@ -31,7 +31,6 @@ from lerobot_bomb.sweep.store import Store
 from lerobot_bomb.tables import print_table
 
 MAX_BATCH = 10
-FLAWED = 2  # exit code where an answer is no
 
 
 def add_audit_arguments(parser: argparse.ArgumentParser) -> None:
@@ -49,7 +48,7 @@ def add_audit_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run_audit(args: argparse.Namespace) -> int:
-    """Play all arms, write what they show, print the verdicts; exit code 2 where one is no."""
+    """Play all arms, write what they show, print the verdicts; exit code 3 where one is no."""
     for name, lowest in (("episodes", 2), ("seed", 0), ("workers", 1)):
         if getattr(args, name) < lowest:
             raise ValueError(f"--{name}={getattr(args, name)} must be at least {lowest}")
@@ -64,7 +63,7 @@ def run_audit(args: argparse.Namespace) -> int:
         as_json.write_text(json.dumps(section.as_json(), indent=1) + "\n")
     print_table(["", "", ""], [[each.question, each.answer, each.evidence] for each in found])
     print(html, tables, sep="\n")
-    return FLAWED if any(each.answer == verdicts.NO for each in found) else 0
+    return ANSWER_IS_NO if any(each.answer == verdicts.NO for each in found) else 0
 
 
 def _first_arms(args: argparse.Namespace) -> dict[str, Cell]:

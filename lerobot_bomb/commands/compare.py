@@ -2,11 +2,9 @@
 
 import argparse
 
-from lerobot_bomb.commands.arguments import path_flag
+from lerobot_bomb.commands.arguments import ANSWER_IS_NO, path_flag
 from lerobot_bomb.commands.results_files import read_undamaged
 from lerobot_bomb.evaluation.comparison import compare
-
-MISSED = 2  # exit code where a bar is not reached; 1 is an error
 
 
 def add_compare_arguments(parser: argparse.ArgumentParser) -> None:
@@ -14,7 +12,9 @@ def add_compare_arguments(parser: argparse.ArgumentParser) -> None:
     add = parser.add_argument
     add("a", type=path_flag, metavar="A", help="file of --env.results_path")
     add("b", type=path_flag, metavar="B", help="the same of another policy, on the same seeds")
-    unless = f"exit code {MISSED} unless, under every condition and with 95 %% confidence, B's success is"
+    unless = (
+        f"exit code {ANSWER_IS_NO} unless, under every condition and with 95 %% confidence, B's success is"
+    )
     add("--min_difference", type=_points, metavar="POINTS", help=f"{unless} higher by POINTS of 100 or more")
     add("--non_inferior", type=_points, metavar="POINTS", help=f"{unless} lower by less than POINTS")
 
@@ -42,4 +42,4 @@ def run_compare(args: argparse.Namespace) -> int:
         verdicts.append((f"--non_inferior={bar:g}: B is worse by less than {bar:g} points", low > -bar))
     for claim, is_shown in verdicts:
         print(f"{claim}: {'shown' if is_shown else 'not shown'} (lowest end of an interval {low:+.1f})")
-    return 0 if all(is_shown for _, is_shown in verdicts) else MISSED
+    return 0 if all(is_shown for _, is_shown in verdicts) else ANSWER_IS_NO

@@ -5,7 +5,7 @@ import re
 from pathlib import Path
 
 from lerobot_bomb.commands.arguments import path_flag
-from lerobot_bomb.commands.results_files import read_undamaged
+from lerobot_bomb.commands.results_files import check_outputs, read_undamaged
 from lerobot_bomb.evaluation.comparison import POLICY
 from lerobot_bomb.files import written_whole
 from lerobot_bomb.report.latex import table
@@ -46,6 +46,7 @@ def run_export(args: argparse.Namespace) -> int:
         contents[args.output / name / MODEL_INDEX] = model_index_yaml(name, groups)
         if args.benchmark_id is not None:
             contents[args.output / name / EVAL_RESULTS] = eval_results_yaml(args.benchmark_id, groups)
+    check_outputs(args.paths, contents)
     for path, content in contents.items():
         with written_whole(path) as (unfinished,):
             unfinished.write_text(content)

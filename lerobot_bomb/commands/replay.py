@@ -12,7 +12,7 @@ from typing import Any
 import gymnasium
 
 from lerobot_bomb.bomb.observation import RenderOptions
-from lerobot_bomb.commands.arguments import checkpoint_flag, path_flag, switch
+from lerobot_bomb.commands.arguments import ANSWER_IS_NO, checkpoint_flag, path_flag, switch
 from lerobot_bomb.commands.results_files import read_undamaged
 from lerobot_bomb.conditions import NONE
 from lerobot_bomb.envs.results import ORIGIN, PolicyIdentity, ResultLine, Row
@@ -32,7 +32,6 @@ from lerobot_bomb.viewing.episode import (
 
 DEFAULT_FOLDER = Path("outputs/replay")
 RECORDED, CHANGED = "recorded", "changed"
-DIFFERS = 2  # exit code where the episode ended otherwise; 1 is an error
 
 
 def add_replay_arguments(parser: argparse.ArgumentParser) -> None:
@@ -173,4 +172,4 @@ def _compare(row: Row, result: ResultLine) -> int:
     origins = [name for name in row if name in ORIGIN - {"policy", "task_ids"} and row[name] != now.get(name)]
     if origins:
         print(*(f"  {name}: {row[name]} then, {now.get(name)} now" for name in origins), sep="\n")
-    return DIFFERS
+    return ANSWER_IS_NO

@@ -7,12 +7,12 @@ import json
 from pathlib import Path
 
 from lerobot_bomb.commands.arguments import path_flag
-from lerobot_bomb.commands.results_files import read_undamaged
+from lerobot_bomb.commands.results_files import check_outputs, read_undamaged
 from lerobot_bomb.files import written_whole
 from lerobot_bomb.report.page import render
 from lerobot_bomb.report.tables import Section, build
 
-TITLE = "Evaluation"
+TITLE, DEFAULT = "Evaluation", Path("report.html")
 
 
 def add_report_arguments(parser: argparse.ArgumentParser) -> None:
@@ -20,14 +20,18 @@ def add_report_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "paths", nargs="+", type=path_flag, metavar="FILE", help="files of --env.results_path"
     )
-    parser.add_argument("--output", type=path_flag, default=Path("report.html"), help="default: report.html")
+    parser.add_argument("--output", type=path_flag, default=DEFAULT, help=f"default: {DEFAULT}")
     parser.add_argument("--title", default=TITLE, help=f"of the page (default: {TITLE})")
 
 
 def run_report(args: argparse.Namespace) -> int:
     """Write FILE.html, FILE.json and FILE.csv; print their paths."""
+    output = args.output / DEFAULT if args.output.is_dir() else args.output
+    if output.suffix not in ("", ".html"):
+        raise ValueError(f"--output={output} must be the page's path, .html, or a folder")
+    page, tables, rates = (output.with_suffix(suffix) for suffix in (".html", ".json", ".csv"))
+    check_outputs(args.paths, (page, tables, rates))
     sections = build([row for path in args.paths for row in read_undamaged(path)[0]])
-    page, tables, rates = (args.output.with_suffix(suffix) for suffix in (".html", ".json", ".csv"))
     with written_whole(page, tables, rates) as (html, as_json, as_csv):
         html.write_text(render(args.title, sections))
         as_json.write_text(json.dumps([section.as_json() for section in sections], indent=1) + "\n")

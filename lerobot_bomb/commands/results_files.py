@@ -1,12 +1,21 @@
 """Files of results that a command is given."""
 
 import sys
+from collections.abc import Iterable, Sequence
 from pathlib import Path
 
 from lerobot_bomb.envs.results import Row
 from lerobot_bomb.evaluation.result_lines import check_any, read_lines
 
 MAX_SHOWN_DAMAGES = 10
+
+
+def check_outputs(inputs: Sequence[Path], outputs: Iterable[Path]) -> None:
+    """Raise a ValueError if one of the files that are written is one of those that are read."""
+    read = {path.resolve() for path in inputs}
+    for path in outputs:
+        if path.resolve() in read:
+            raise ValueError(f"--output: {path} is a file of results that is read; name another output")
 
 
 def read_undamaged(path: Path) -> tuple[list[Row], int]:

@@ -11,7 +11,7 @@ from lerobot_bomb.commands.arguments import parse_conditions, path_flag
 from lerobot_bomb.evaluation.result_lines import KINDS
 from lerobot_bomb.sweep.cluster import sbatch_script, submit
 from lerobot_bomb.sweep.local import PYTHON, play, progress
-from lerobot_bomb.sweep.manifest import NAME, Cell, Manifest, plan
+from lerobot_bomb.sweep.manifest import NAME, Cell, Manifest, parse_part, plan
 from lerobot_bomb.sweep.store import Store
 
 CONDITIONS = {kind.env_type: kind.condition for kind in KINDS}
@@ -60,7 +60,7 @@ def run_sweep(args: argparse.Namespace) -> int:
     _check_numbers(args)
     manifest = _manifest(args)
     store = Store(args.folder, manifest)
-    cells = _shard(args.shard, manifest)
+    cells = manifest.part(args.shard)
     _check_jobs(args, cells)
     if args.dry_run:
         print(*(cell.command for cell in cells), sep="\n")
@@ -97,6 +97,11 @@ def _check_numbers(args: argparse.Namespace) -> None:
     for name, lowest in (("episodes", 1), ("batch_size", 1), ("seed", 0), ("workers", 1)):
         if getattr(args, name) < lowest:
             raise ValueError(f"--{name}={getattr(args, name)} must be at least {lowest}")
+
+    try:
+        parse_part(args.shard)
+    except ValueError as error:
+        raise ValueError(f"--shard: {error}") from None
 
 
 def _check_jobs(args: argparse.Namespace, cells: list[Cell]) -> None:
@@ -145,13 +150,6 @@ def _expanded(perturbations: tuple[str, ...], flags: list[str]) -> list[str]:
         )
     of_env = CONDITIONS[env_type]
     return [str(of_env.parse(text)) for text in of_env.expand(perturbations)]
-
-
-def _shard(text: str, manifest: Manifest) -> list[Cell]:
-    try:
-        return manifest.part(text)
-    except ValueError as error:
-        raise ValueError(f"--shard: {error}") from None
 
 
 def _job_command(args: argparse.Namespace) -> list[str]:

@@ -76,6 +76,7 @@ class Comparisons:
     def lines(self) -> list[str]:
         """The comparisons as text, a line each."""
         lines = [f"{name}: {policy}" for name, policy in zip("AB", self.policies, strict=True)]
+        lines += ["A and B are the same policy"] if self.policies[0] == self.policies[1] else []
         for each in self.conditions:
             lines += [f"{each.condition}: {len(each.pairs)} pairs", *(f"  {line}" for line in each.lines())]
         if any(self.num_unpaired):

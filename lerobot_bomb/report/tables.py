@@ -1,5 +1,7 @@
 """The tables of a report, counted from lines of results."""
 
+import json
+import shlex
 from collections import Counter
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass, field
@@ -184,7 +186,14 @@ def summary(arms: list[Arm]) -> Table:
                 Cell(str(len(arm.rows)), len(arm.rows)),
             ]
         )
-    header = ["policy, suite", "unperturbed", "perturbed, all conditions", "worst condition", "", "episodes"]
+    header = [
+        "policy, suite",
+        "unperturbed",
+        "perturbed, all conditions",
+        "worst condition",
+        "measures",
+        "episodes",
+    ]
     return Table("", header, table, "Success with 95 % Wilson intervals; per cent.")
 
 
@@ -193,24 +202,18 @@ def conditions(arm: Arm) -> Table:
     pairs = pair_with_nominal(arm.rows)
     counts = {condition: count_pairs(of) for condition, of in pairs.items()}
     adjusted = dict(zip(counts, holm([each.p_value for each in counts.values()]), strict=True))
+    costs = {condition: _points(counts[condition], adjusted[condition]) for condition in counts}
+    blank = [Cell(""), Cell("")] if counts else []
     table = [
-        [
-            Cell(condition),
-            rate(rows),
-            Cell(str(len(rows)), len(rows)),
-            *(
-                _points(counts[condition], adjusted[condition])
-                if condition in counts
-                else [Cell(""), Cell("")]
-            ),
-        ]
+        [Cell(condition), rate(rows), Cell(str(len(rows)), len(rows)), *costs.get(condition, blank)]
         for condition, rows in by_condition(arm.rows).items()
     ]
     note = (
         "Points against the same episodes unperturbed (Newcombe's interval for pairs); p: exact McNemar "
         "test, adjusted for the number of conditions (Holm)."
     )
-    return Table(arm.name, ["condition", "success", "episodes", "points", "p"], table, note if counts else "")
+    header = ["condition", "success", "episodes", *(["points", "p"] if counts else [])]
+    return Table(arm.name, header, table, note if counts else "")
 
 
 def axes(arm: Arm) -> Table | None:
@@ -370,9 +373,10 @@ def boards(arm: Arm) -> Iterable[Table]:
 
 def commands(arm: Arm) -> list[str]:
     """What was evaluated, and the flags that do it again."""
-    flags = " ".join(arm.group.kind.eval_flags(arm.rows))
-    conditions_of = ",".join(f'"{condition}"' for condition in by_condition(arm.rows))
-    return [
-        *(f"  {line}" for line in arm.group.lines()),
-        f"  lerobot-eval {flags} --env.perturbations='[{conditions_of}]'",
-    ]
+    by = by_condition(arm.rows)
+    policy = arm.rows[0].get("policy") or {"type": "TYPE", "path": None}
+    who = f"--policy.type={policy['type']}" if policy["path"] is None else f"--policy.path={policy['path']}"
+    seeds = {row["spec"]["seed"] for row in arm.rows}
+    flags = [who, *arm.group.kind.eval_flags(arm.rows), f"--env.perturbations={json.dumps(list(by))}"]
+    flags += [f"--seed={min(seeds)}", f"--eval.n_episodes={max(map(len, by.values()))}"]
+    return [*(f"  {line}" for line in arm.group.lines()), f"  {shlex.join(['lerobot-eval', *flags])}"]

@@ -10,6 +10,8 @@ from itertools import product
 from pathlib import Path
 from typing import Any
 
+from lerobot_bomb.checkpoints.names import is_hub_id
+from lerobot_bomb.checkpoints.shipped import checkpoint_path
 from lerobot_bomb.files import read_json, written_whole
 
 VERSION = 1
@@ -69,10 +71,8 @@ class Manifest:
         Raises:
             ValueError: the text is no such part.
         """
-        first, _, number = text.partition("/")
-        if not (first.isdigit() and number.isdigit() and int(first) < int(number)):
-            raise ValueError(f"{text} must be PART/PARTS, the parts counted from 0: 0/4 to 3/4")
-        return list(self.cells[int(first) :: int(number)])
+        first, number = parse_part(text)
+        return list(self.cells[first::number])
 
     def write(self, folder: Path) -> None:
         """As `NAME` in a folder, which is made."""
@@ -118,6 +118,18 @@ def _at_least(lowest: int, values: dict[str, Any], name: str) -> int:
     if not isinstance(values[name], int) or values[name] < lowest:
         raise ValueError(f"{name}={values[name]!r} must be a whole number from {lowest} on")
     return values[name]
+
+
+def parse_part(text: str) -> tuple[int, int]:
+    """(0, 4) from '0/4'.
+
+    Raises:
+        ValueError: it is spelled otherwise, or there is no such part.
+    """
+    first, _, number = text.partition("/")
+    if not (first.isdigit() and number.isdigit() and int(first) < int(number)):
+        raise ValueError(f"{text} must be PART/PARTS, the parts counted from 0: 0/4 to 3/4")
+    return int(first), int(number)
 
 
 def check_flags(flags: Sequence[str]) -> None:
@@ -172,8 +184,19 @@ def _condition_flags(condition: str) -> list[str]:
 
 
 def policy_flag(policy: str) -> str:
-    """'--policy.path=bomb:NAME', '--policy.type=act': a path has a slash or a colon, or exists."""
-    is_path = "/" in policy or ":" in policy or Path(policy).is_dir()
+    """'--policy.path=bomb:NAME', '--policy.type=act': a path has a slash or a colon, or exists.
+
+    Raises:
+        ValueError: it can be neither a checkpoint, here or on the Hub, nor a type.
+    """
+    path = checkpoint_path(policy)
+    is_path = "/" in policy or path != policy or Path(policy).exists()
+    if is_path and not Path(path).is_dir() and not is_hub_id(policy):
+        raise ValueError(
+            f"--policies: {policy} is no folder; name a checkpoint's, bomb:NAME, USER/NAME or a type"
+        )
+    if not is_path and not policy.isidentifier():
+        raise ValueError(f"--policies: {policy!r} is no policy type; name one, or a checkpoint's folder")
     return f"--policy.{'path' if is_path else 'type'}={policy}"
 
 
