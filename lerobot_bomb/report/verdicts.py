@@ -116,7 +116,8 @@ def _generalises(train: list[Row], heldout: list[Row]) -> Verdict:
 def _fisher(first: int, of_first: int, second: int, of_second: int) -> float:
     from scipy.stats import fisher_exact
 
-    return float(fisher_exact([[first, of_first - first], [second, of_second - second]]).pvalue)
+    _, p_value = fisher_exact([[first, of_first - first], [second, of_second - second]])
+    return float(p_value)
 
 
 def _new_seeds(rows: list[Row], trained: range | None) -> Verdict:
