@@ -5,6 +5,7 @@ Arms are lists of lines of the same episodes, but for those of the splits.
 
 from collections.abc import Mapping
 from dataclasses import dataclass
+from typing import Any
 
 from lerobot_bomb.envs.results import Row
 from lerobot_bomb.evaluation.result_groups import count_pairs, different_fields
@@ -116,8 +117,8 @@ def _generalises(train: list[Row], heldout: list[Row]) -> Verdict:
 def _fisher(first: int, of_first: int, second: int, of_second: int) -> float:
     from scipy.stats import fisher_exact
 
-    _, p_value = fisher_exact([[first, of_first - first], [second, of_second - second]])
-    return float(p_value)
+    found: Any = fisher_exact([[first, of_first - first], [second, of_second - second]])
+    return float(found.pvalue)
 
 
 def _new_seeds(rows: list[Row], trained: range | None) -> Verdict:
