@@ -28,7 +28,7 @@ help:
 setup: $(STAMP)
 	@$(BIN)/python -c "from lerobot_env_mujoco.backend import ensure_gl_backend; ensure_gl_backend()" \
 		|| { echo "Set-up is done, but rendering does not work, see above." >&2; exit 1; }
-	@echo "Set up: source $(BIN)/activate"
+	@echo "Set up: source $(BIN)/activate, then lerobot-bomb doctor checks it and make demo shows it"
 
 $(STAMP): pyproject.toml constraints.txt lerobot_bomb/__init__.py
 	@python="$$(bash .ci/find-python $(PYTHON))" || exit 1; \

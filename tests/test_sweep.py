@@ -15,6 +15,7 @@ import pytest
 
 from lerobot_bomb.commands.main import main
 from lerobot_bomb.evaluation.results import read_results
+from lerobot_bomb.sweep.local import progress
 from lerobot_bomb.sweep.manifest import Cell, Manifest, plan
 from lerobot_bomb.sweep.store import MAX_ATTEMPTS, Store
 
@@ -268,3 +269,23 @@ def test_cells_have_names_of_their_own() -> None:
     cells = small(("bomb_expert", "bomb:fdvla"), ("none", "camera:3", "camera:2+light:3")).cells
     assert len({cell.key for cell in cells}) == 6
     assert Cell(("--policy.type=a/b",), ("--env.type=c d",), 0, 1, 1).key.isascii()
+
+
+def test_what_a_command_said_before_it_exited_is_the_reason(play: Callable[[Manifest], Store]) -> None:
+    flags = (*FLAGS, "--env.tsak=place")
+    store = play(plan(("bomb_expert",), (), ("none",), 7, 1, 1, flags))
+    (reason,) = [line for line in store.lines() if "tsak" in line and "given up" not in line]
+    assert "unrecognized arguments" in reason
+
+
+def test_lines_of_finished_cells_are_there_before_the_sweep_has_ended(tmp_path: Path) -> None:
+    manifest = small(conditions=("none", "light:3"))
+    first, second = manifest.cells
+    store = Store(tmp_path, manifest)
+    states = progress(store, manifest.cells)
+    next(states)
+    store.finish(first, ["{}"], [])
+    next(states)
+    assert (tmp_path / "results.jsonl").read_text() == "{}\n"
+    store.finish(second, ["{}"], [])
+    assert list(states) == []

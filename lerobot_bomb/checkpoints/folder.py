@@ -33,6 +33,8 @@ def read_config(path: Path, device: str | None, flags: Sequence[str] = ()) -> Pr
     Raises:
         ValueError: the folder holds no checkpoint, or this machine has no such device.
     """
+    if path.is_file():
+        raise ValueError(f"--policy.path={path} is a file; give the folder of a checkpoint")
     if not path.is_dir():
         raise ValueError(f"--policy.path={path}: there is no such folder; give one that holds a checkpoint")
     missing = [name for name in FILES if not (path / name).is_file()]

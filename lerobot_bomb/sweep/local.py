@@ -20,9 +20,12 @@ MAX_ENDED = 3
 
 
 def progress(store: Store, cells: Sequence[Cell]) -> Iterator[bool]:
-    """Until all cells are over, show how far they are, and say whether they are further than before."""
+    """Until all cells are over, show how far they are, and say whether they are further than before.
+
+    The lines of cells that have been finished are merged, whatever ends this process later.
+    """
     total = sum(cell.num_episodes for cell in cells)
-    has_played = False
+    has_played, num_finished = False, 0
     with tqdm(total=total, initial=store.num_played(cells), unit=" episodes") as bar:
         while not all(store.is_over(cell) for cell in cells):
             yield has_played
@@ -30,6 +33,9 @@ def progress(store: Store, cells: Sequence[Cell]) -> Iterator[bool]:
             more = store.num_played(cells) - bar.n
             if has_played := more != 0:
                 bar.update(more)
+            if (finished := sum(map(store.is_finished, cells))) != num_finished:
+                num_finished = finished
+                store.merge()
 
 
 def play(store: Store, part: str, num_workers: int, timeout_s: int | None = None) -> None:

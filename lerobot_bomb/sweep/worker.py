@@ -3,6 +3,7 @@
 `python -m lerobot_bomb.sweep.worker FOLDER PART [TIMEOUT_S]`, which ends with its standard input.
 """
 
+import io
 import json
 import logging
 import os
@@ -13,8 +14,9 @@ import tempfile
 import threading
 import time
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, redirect_stderr
 from pathlib import Path
+from typing import TextIO
 
 from lerobot_bomb._compat import KeptPolicy
 from lerobot_bomb.sweep.manifest import Cell, Manifest
@@ -89,13 +91,16 @@ class Worker:
         part.unlink(missing_ok=True)
         output_dir = tempfile.mkdtemp(prefix=".output-", dir=part.parent)
         flags = [*cell.flags, f"--env.results_path={part}", f"--output_dir={output_dir}"]
+        said = LastLine(sys.stderr)
         try:
-            self._kept.evaluate(flags, (whole.policy, whole.seed))
+            with redirect_stderr(said):
+                self._kept.evaluate(flags, (whole.policy, whole.seed))
             lines = part.read_text().splitlines()
         except (Exception, SystemExit) as error:
             if self._kept.has_begun or isinstance(error, TimeoutError | OSError):
                 raise
-            raise RefusedError(describe(error)) from error
+            is_told = isinstance(error, SystemExit) and isinstance(error.code, int) and said.line
+            raise RefusedError(said.line if is_told else describe(error)) from error
         finally:
             shutil.rmtree(output_dir, ignore_errors=True)
             part.unlink(missing_ok=True)
@@ -103,6 +108,22 @@ class Worker:
         if len(by_seed) < cell.num_episodes:
             raise RuntimeError(f"{len(by_seed)} of {cell.num_episodes} episodes ended")
         return by_seed
+
+
+class LastLine(io.TextIOBase):
+    """Passes text on to a stream, and keeps its last line: a command that exits has said there why."""
+
+    def __init__(self, stream: TextIO) -> None:
+        self._stream = stream
+        self.line = ""
+
+    def write(self, text: str, /) -> int:
+        lines = [line.strip() for line in text.splitlines() if line.strip()]
+        self.line = lines[-1] if lines else self.line
+        return self._stream.write(text)
+
+    def flush(self) -> None:
+        self._stream.flush()
 
 
 def describe(error: BaseException) -> str:
