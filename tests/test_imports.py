@@ -19,6 +19,7 @@ POLICY_TYPES = {name.removeprefix(POLICY_PREFIX) for name in PACKAGES if name.st
 # commands that are about certain policies
 NAMES_POLICIES = {
     "convert_spatialvla.py": {"spatialvla_grid"},  # whose format it writes
+    "audit.py": {"bomb_expert", "bomb_random"},  # ceiling and floor
     "demo.py": {"vla0_smol", "bomb_expert", "bomb_random"},  # who plays
 }
 HEAVY = {"torch", "lerobot", "transformers", "rerun", "cv2"}

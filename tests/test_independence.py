@@ -236,6 +236,9 @@ def assert_alike(actual: Outcome, expected: Outcome, tolerance: float, message: 
     np.testing.assert_allclose(actual.actions, expected.actions, rtol=0, atol=tolerance, err_msg=message)
     assert actual.row.keys() == expected.row.keys()
     for key, value in expected.row.items():
+        if key == "policy":
+            in_batch = {name: actual.row[key][name] for name in ("batch_size", "batch_row")}
+            value = value | in_batch
         # floats are millimetres; 1000 times the tolerance of an action, whose unit is 40 mm
         same = pytest.approx(value, rel=0, abs=1e3 * tolerance) if isinstance(value, float) else value
         assert actual.row[key] == same, f"{key}: {message}"

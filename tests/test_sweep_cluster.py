@@ -11,6 +11,7 @@ import pytest
 
 from lerobot_bomb.commands import sweep as command
 from lerobot_bomb.commands.main import main
+from lerobot_bomb.sweep import local
 from lerobot_bomb.sweep.cluster import sbatch_script
 from lerobot_bomb.sweep.manifest import plan
 from lerobot_bomb.sweep.processes import visible_gpus, worker_environments
@@ -87,7 +88,7 @@ def test_workers_that_end_at_once_are_started_anew_on_their_gpus_and_then_no_mor
 ) -> None:
     monkeypatch.setenv("CUDA_VISIBLE_DEVICES", "4,7")
     ending = (sys.executable, "-c", "import os; print(os.environ['CUDA_VISIBLE_DEVICES'])")
-    monkeypatch.setattr(command, "PYTHON", ending)
+    monkeypatch.setattr(local, "PYTHON", ending)
     assert sweep(tmp_path, "--workers=2", *SWEEP) == 1
     log = (tmp_path / "workers.log").read_text().split()
     assert set(log) == {"4", "7"} and log.count("4") >= 3 and log.count("7") >= 3

@@ -134,7 +134,7 @@ def describe(error: BaseException) -> str:
 
 @contextmanager
 def time_limit(seconds: int | None) -> Iterator[None]:
-    """Raise a TimeoutError in the main thread after so many seconds."""
+    """Raise a TimeoutError in the main thread every so many seconds: one can be lost in a callback."""
 
     def stop(*_: object) -> None:
         raise TimeoutError
@@ -143,11 +143,11 @@ def time_limit(seconds: int | None) -> Iterator[None]:
         yield
         return
     usual = signal.signal(signal.SIGALRM, stop)
-    signal.alarm(seconds)
+    signal.setitimer(signal.ITIMER_REAL, seconds, seconds)
     try:
         yield
     finally:
-        signal.alarm(0)
+        signal.setitimer(signal.ITIMER_REAL, 0)
         signal.signal(signal.SIGALRM, usual)
 
 
