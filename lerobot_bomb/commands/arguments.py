@@ -44,6 +44,30 @@ def checkpoint_flag(text: str) -> Path:
         raise argparse.ArgumentTypeError(str(error)) from None
 
 
+def add_checkpoint_arguments(parser: argparse.ArgumentParser, help: str, required: bool = False) -> None:
+    """Declare which checkpoint acts, and on which device."""
+    add = parser.add_argument
+    add("--policy.path", dest="policy_path", type=checkpoint_flag, required=required, help=help)
+    add("--policy.device", dest="policy_device", help="cpu, cuda, ... (default: as the checkpoint says)")
+
+
+def add_episode_files_argument(parser: argparse.ArgumentParser, folder: Path) -> None:
+    """Declare where an episode's recording and video are written."""
+    parser.add_argument(
+        "--output",
+        type=path_flag,
+        help="the files' path without .rrd and .mp4, or a folder that exists (default: in "
+        f"{folder}, named after episode and policy)",
+    )
+
+
+def check_at_least(args: argparse.Namespace, **lowest: int) -> None:
+    """Raise a ValueError if a flag of this name is smaller."""
+    for name, bound in lowest.items():
+        if getattr(args, name) < bound:
+            raise ValueError(f"--{name}={getattr(args, name)} must be at least {bound}")
+
+
 def switch() -> dict[str, Any]:
     """Arguments of a flag that works alone and as LeRobot writes it: --resume, --resume=true."""
     return {"nargs": "?", "const": True, "default": False, "type": _parse_bool}

@@ -3,9 +3,10 @@
 import argparse
 import json
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from lerobot_bomb.bomb.episode import TEST_SEEDS
-from lerobot_bomb.commands.arguments import ANSWER_IS_NO, checkpoint_flag, path_flag
+from lerobot_bomb.commands.arguments import ANSWER_IS_NO, check_at_least, checkpoint_flag, path_flag
 from lerobot_bomb.data.facts import DatasetFacts
 from lerobot_bomb.envs.results import Row
 from lerobot_bomb.evaluation.results import read_results
@@ -30,6 +31,9 @@ from lerobot_bomb.sweep.manifest import NAME, Cell, Manifest, check_flags, large
 from lerobot_bomb.sweep.store import Store
 from lerobot_bomb.tables import print_table
 
+if TYPE_CHECKING:
+    from lerobot.processor import ProcessorStep
+
 MAX_BATCH = 10
 
 
@@ -49,9 +53,7 @@ def add_audit_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run_audit(args: argparse.Namespace) -> int:
     """Play all arms, write what they show, print the verdicts; exit code 3 where one is no."""
-    for name, lowest in (("episodes", 2), ("seed", 0), ("workers", 1)):
-        if getattr(args, name) < lowest:
-            raise ValueError(f"--{name}={getattr(args, name)} must be at least {lowest}")
+    check_at_least(args, episodes=2, seed=0, workers=1)
     check_flags(args.rest)
     arms = _play(args, args.folder / "first", _first_arms(args))
     arms |= _play(args, args.folder / "second", _second_arms(args, arms[POLICY]))
@@ -68,16 +70,13 @@ def run_audit(args: argparse.Namespace) -> int:
 
 def _first_arms(args: argparse.Namespace) -> dict[str, Cell]:
     checkpoint = f"--policy.path={args.policy_path}"
-    blank = args.folder / "blank_images"
-    if not blank.is_dir():
-        from lerobot_bomb.explain.interventions import BlankImages, intervene  # LeRobot: seconds
+    from lerobot_bomb.explain.interventions import BlankImages  # LeRobot: seconds
 
-        intervene(args.policy_path, [BlankImages()], blank)
     arms = {POLICY: _cell(args, checkpoint)}
     if arms[POLICY].batch_size > 1:
         arms[ALONE] = _cell(args, checkpoint, batch_size=1)
     arms |= {
-        BLANK: _cell(args, f"--policy.path={blank}"),
+        BLANK: _cell(args, _changed(args, "blank_images", BlankImages())),
         RANDOM: _cell(args, "--policy.type=bomb_random"),
         EXPERT: _cell(args, "--policy.type=bomb_expert"),
     }
@@ -91,13 +90,20 @@ def _second_arms(args: argparse.Namespace, played: list[Row]) -> dict[str, Cell]
     arms = {AGAIN: _cell(args, f"--policy.path={args.policy_path}")}
     others = other_instructions([row["instruction"] for row in played])
     if others:
-        exchanged = args.folder / "other_instruction"
-        if not exchanged.is_dir():
-            from lerobot_bomb.explain.interventions import ReplaceTasks, intervene
+        from lerobot_bomb.explain.interventions import ReplaceTasks
 
-            intervene(args.policy_path, [ReplaceTasks(others)], exchanged)
-        arms[OTHER_INSTRUCTION] = _cell(args, f"--policy.path={exchanged}")
+        arms[OTHER_INSTRUCTION] = _cell(args, _changed(args, "other_instruction", ReplaceTasks(others)))
     return arms
+
+
+def _changed(args: argparse.Namespace, name: str, step: "ProcessorStep") -> str:
+    """The flag of the checkpoint with an intervention, which is written unless it is there."""
+    from lerobot_bomb.explain.interventions import intervene
+
+    folder = args.folder / name
+    if not folder.is_dir():
+        intervene(args.policy_path, [step], folder)
+    return f"--policy.path={folder}"
 
 
 def other_instructions(instructions: list[str]) -> dict[str, str]:

@@ -12,7 +12,13 @@ from typing import Any
 import gymnasium
 
 from lerobot_bomb.bomb.observation import RenderOptions
-from lerobot_bomb.commands.arguments import ANSWER_IS_NO, checkpoint_flag, path_flag, switch
+from lerobot_bomb.commands.arguments import (
+    ANSWER_IS_NO,
+    add_checkpoint_arguments,
+    add_episode_files_argument,
+    path_flag,
+    switch,
+)
 from lerobot_bomb.commands.results_files import read_undamaged
 from lerobot_bomb.conditions import NONE
 from lerobot_bomb.envs.results import ORIGIN, PolicyIdentity, ResultLine, Row
@@ -46,20 +52,9 @@ def add_replay_arguments(parser: argparse.ArgumentParser) -> None:
         metavar="AXIS=LEVEL,...",
         help="play it a second time, with these axes changed: camera=0,light=3",
     )
-    add(
-        "--policy.path",
-        dest="policy_path",
-        type=checkpoint_flag,
-        help="the checkpoint's folder, where it lies elsewhere now",
-    )
-    add("--policy.device", dest="policy_device", help="cpu, cuda, ... (default: as the checkpoint says)")
+    add_checkpoint_arguments(parser, "the checkpoint's folder, where it lies elsewhere now")
     add("--depth", **switch(), help="the policy was shown depth")
-    add(
-        "--output",
-        type=path_flag,
-        help="the files' path without .rrd and .mp4, or a folder that exists (default: in "
-        f"{DEFAULT_FOLDER}, named after episode and policy)",
-    )
+    add_episode_files_argument(parser, DEFAULT_FOLDER)
     add("rest", nargs="*", metavar="FLAG", help="flags of the policy in that evaluation: --policy.NAME=VALUE")
 
 

@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Any
 
 from lerobot_bomb.bomb.episode import TEST_SEEDS
-from lerobot_bomb.commands.arguments import parse_conditions, path_flag
+from lerobot_bomb.commands.arguments import check_at_least, parse_conditions, path_flag
 from lerobot_bomb.evaluation.result_lines import KINDS
 from lerobot_bomb.sweep.cluster import sbatch_script, submit
 from lerobot_bomb.sweep.local import PYTHON, play, progress
@@ -94,10 +94,7 @@ def _json_object(text: str) -> dict[str, Any]:
 
 
 def _check_numbers(args: argparse.Namespace) -> None:
-    for name, lowest in (("episodes", 1), ("batch_size", 1), ("seed", 0), ("workers", 1)):
-        if getattr(args, name) < lowest:
-            raise ValueError(f"--{name}={getattr(args, name)} must be at least {lowest}")
-
+    check_at_least(args, episodes=1, batch_size=1, seed=0, workers=1)
     try:
         parse_part(args.shard)
     except ValueError as error:

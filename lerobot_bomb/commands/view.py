@@ -14,9 +14,9 @@ from lerobot_bomb.bomb.observation import DEFAULT_IMAGE_SIZE, RenderOptions
 from lerobot_bomb.bomb.suite import specs_of_tasks
 from lerobot_bomb.checkpoints.names import CONFIG
 from lerobot_bomb.commands.arguments import (
+    add_checkpoint_arguments,
     add_episode_arguments,
-    checkpoint_flag,
-    path_flag,
+    add_episode_files_argument,
     switch,
 )
 from lerobot_bomb.envs.rollout import Agent, expert_agent, one_of_batch, random_agent
@@ -42,13 +42,7 @@ def add_view_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the arguments of ``lerobot-bomb view``."""
     add = parser.add_argument
     add("--policy", help=f"who acts: {EXPERT} or {RANDOM} (default: {EXPERT}; bomb_pusht has {RANDOM} only)")
-    add(
-        "--policy.path",
-        dest="policy_path",
-        type=checkpoint_flag,
-        help="who acts: the checkpoint in this folder",
-    )
-    add("--policy.device", dest="policy_device", help="cpu, cuda, ... (default: as the checkpoint says)")
+    add_checkpoint_arguments(parser, "who acts: the checkpoint in this folder")
     add(
         "--policy.ignore_environment",
         "--ignore_checkpoint",
@@ -74,12 +68,7 @@ def add_view_arguments(parser: argparse.ArgumentParser) -> None:
     )
     add("--max_steps", type=int, help=f"of bomb_pusht: control steps (default: {MAX_STEPS})")
     parser.set_defaults(image_size=None, own_flags={"bomb": of_bomb, "bomb_pusht": PUSHT_FLAGS})
-    add(
-        "--output",
-        type=path_flag,
-        help="the files' path without .rrd and .mp4, or a folder that exists (default: in "
-        f"{DEFAULT_FOLDER}, named after episode and policy)",
-    )
+    add_episode_files_argument(parser, DEFAULT_FOLDER)
 
 
 def run_view(args: argparse.Namespace) -> int:
