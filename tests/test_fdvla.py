@@ -276,7 +276,7 @@ def test_what_is_pooled(pool: str) -> None:
         torch.testing.assert_close(context.pooled[row], expected)
     lengths = is_task_BL.sum(dim=1)
     assert lengths[0] > lengths[1] > lengths[2] == 0
-    end = len(policy._tail_ids)
+    end = len(policy.tokens.end) + policy.config.use_state
     assert rows_BL.mask[:, -end:].all() and not is_task_BL[:, -end:].any()
 
 

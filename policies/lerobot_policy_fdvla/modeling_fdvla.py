@@ -38,6 +38,7 @@ from lerobot_bomb.vlm.qwen import Prefix
 from lerobot_policy_fdvla.building_fdvla import build_model
 from lerobot_policy_fdvla.card_fdvla import METHOD
 from lerobot_policy_fdvla.configuration_fdvla import AS_TRAINED, SHAPES, FdvlaConfig
+from lerobot_policy_fdvla.explained_fdvla import ExplainedFdvla
 from lerobot_policy_fdvla.networks_fdvla import NUM_MARKS, ActionSegment, Head
 
 logger = logging.getLogger(__name__)
@@ -82,8 +83,7 @@ class FdvlaPolicy(RelativeVlaPolicy):
     def __init__(self, config: FdvlaConfig, dataset_meta: LeRobotDatasetMetadata | None = None, **_: object):
         super().__init__(config, dataset_meta)
         self.tokens, self.backbone = build_model(config)
-        num_fixed = len(self._head_ids) + len(self._tail_ids) + config.chunk_size + NUM_MARKS
-        self._check_length(self.backbone.text_config, num_fixed, "{}", dataset_meta)
+        self._check_length(self.backbone.text_config, self._num_fixed_tokens, "{}", dataset_meta)
         hidden_size = self.backbone.text_config.hidden_size
         self.segment = ActionSegment(config.chunk_size, self._action_dim, hidden_size)
         self.state_embedding = self._make_state_embedding(hidden_size)
@@ -111,6 +111,10 @@ class FdvlaPolicy(RelativeVlaPolicy):
         """Of each part, and of those that are trained in all."""
         counts = {name: sum(p.numel() for p in part.parameters()) for name, part in self.named_children()}
         return {**counts, "trained": sum(p.numel() for p in self.get_optim_params())}
+
+    def explained(self) -> ExplainedFdvla:
+        """This policy as `lerobot_bomb.explain` asks it."""
+        return ExplainedFdvla(self)
 
     def _get_default_peft_targets(self) -> dict[str, Any]:
         return peft_targets(self, "language_model", NEW_PARTS)
@@ -314,9 +318,11 @@ class FdvlaPolicy(RelativeVlaPolicy):
     def _read(self, batch: dict[str, Tensor]) -> Context:
         """The prompt, once for all sampling steps."""
         rows, is_task_BL = self._prompt(batch)
-        prefix = self.backbone.read_prefix(
-            self._embeds(batch, rows.ids), rows.ids == self.tokens.image, rows.mask
-        )
+        return self._context(rows, is_task_BL, self._embeds(batch, rows.ids))
+
+    def _context(self, rows: TokenRows, is_task_BL: Tensor, embeds_BLH: Tensor) -> Context:
+        """What `_prompt` and `_embeds` made of a batch, read by the language model."""
+        prefix = self.backbone.read_prefix(embeds_BLH, rows.ids == self.tokens.image, rows.mask)
         return Context(prefix, masked_mean_pool(prefix.hidden, self._pooled(rows.mask, is_task_BL)))
 
     def _pooled(self, mask_BL: Tensor, is_task_BL: Tensor) -> Tensor:
@@ -332,12 +338,19 @@ class FdvlaPolicy(RelativeVlaPolicy):
 
     def _prompt(self, batch: dict[str, Tensor]) -> tuple[TokenRows, Tensor]:
         """Its tokens, and which of them (B, L) are the task's."""
+        parts = self._prompt_parts(batch)
+        is_task = [part.mask & (name == "instruction") for name, part in parts.items()]
+        return TokenRows.join([*parts.values()]), torch.cat(is_task, dim=1)
+
+    def _prompt_parts(self, batch: dict[str, Tensor]) -> dict[str, TokenRows]:
+        """Its tokens by what they are of; an image's by its camera."""
         task = read_task(batch, self.config.type, self._device)
-        head = TokenRows.constant(self._head_ids, task.ids)
-        tail = TokenRows.constant(self._tail_ids, task.ids)
-        nowhere = [torch.zeros_like(part.mask) for part in (head, tail)]
-        is_task_BL = torch.cat([nowhere[0], task.mask, nowhere[1]], dim=1)
-        return TokenRows.join([head, task, tail]), is_task_BL
+        parts = {"start": TokenRows.constant(self.tokens.start, task.ids)}
+        parts |= {camera: TokenRows.constant(self._image_ids, task.ids) for camera in self._cameras}
+        parts["instruction"] = task
+        if self.config.use_state:  # its embedding takes the place of a token
+            parts["state"] = TokenRows.constant([self.tokens.image_end], task.ids)
+        return parts | {"end": TokenRows.constant(self.tokens.end, task.ids)}
 
     def _embeds(self, batch: dict[str, Tensor], ids_BL: Tensor) -> Tensor:
         """Embeddings (B, L, H) of a prompt, image features and state in place."""
@@ -356,7 +369,7 @@ class FdvlaPolicy(RelativeVlaPolicy):
         if self.state_embedding is None:
             return embeds_BLH
         state_BH = self.state_embedding(self._of_batch(batch, OBS_STATE)).to(embeds_BLH.dtype)
-        column = ids_BL.shape[1] - len(self._tail_ids)
+        column = ids_BL.shape[1] - len(self.tokens.end) - 1
         return embeds_BLH.index_copy(1, torch.tensor([column], device=ids_BL.device), state_BH[:, None])
 
     def _image_columns(self, device: torch.device) -> Tensor:
@@ -368,13 +381,13 @@ class FdvlaPolicy(RelativeVlaPolicy):
         return (starts[:, None] + torch.arange(num_tokens, device=device)).flatten()
 
     @property
-    def _head_ids(self) -> list[int]:
+    def _image_ids(self) -> list[int]:
         tokens = self.tokens
-        image = [tokens.image_start, *self.backbone.tokens_per_image * [tokens.image], tokens.image_end]
-        return [*tokens.start, *len(self._cameras) * image]
+        return [tokens.image_start, *self.backbone.tokens_per_image * [tokens.image], tokens.image_end]
 
     @property
-    def _tail_ids(self) -> list[int]:
-        # the state's embedding takes the place of a token
-        place = [self.tokens.image_end] if self.config.use_state else []
-        return [*place, *self.tokens.end]
+    def _num_fixed_tokens(self) -> int:
+        """Of prompt and segment, without the task."""
+        of_prompt = len(self.tokens.start) + len(self._cameras) * len(self._image_ids)
+        of_prompt += self.config.use_state + len(self.tokens.end)
+        return of_prompt + self.config.chunk_size + NUM_MARKS

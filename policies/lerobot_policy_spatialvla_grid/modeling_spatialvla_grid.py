@@ -59,6 +59,7 @@ from lerobot_policy_spatialvla_grid.configuration_spatialvla_grid import (
     SHAPES,
     SpatialvlaGridConfig,
 )
+from lerobot_policy_spatialvla_grid.explained_spatialvla_grid import ExplainedSpatialvlaGrid
 
 logger = logging.getLogger(__name__)
 
@@ -182,6 +183,10 @@ class SpatialvlaGridPolicy(TokenVlaPolicy):
         self.first_cells = torch.tensor(new.offsets, device=self._device)
         self.config.grid_params = new.to_dict()
 
+    def explained(self) -> ExplainedSpatialvlaGrid:
+        """This policy as `lerobot_bomb.explain` asks it."""
+        return ExplainedSpatialvlaGrid(self)
+
     def _newest_only(self) -> list[int]:
         binary = [dim for group in self.grids.groups if group.transform == "binary" for dim in group.dims]
         return sorted({*binary, *super()._newest_only()})
@@ -240,13 +245,18 @@ class SpatialvlaGridPolicy(TokenVlaPolicy):
     def _hidden(self, batch: dict[str, Tensor], cells_BTG: Tensor) -> Tensor:
         """(B, T, G, H) teacher-forced states that predict the cells."""
         prompt = self._prompt(batch)
+        return self._hidden_after(prompt.mask, self._embeds(batch, prompt.ids), cells_BTG)
+
+    def _hidden_after(self, mask_BL: Tensor, embeds_BLH: Tensor, cells_BTG: Tensor) -> Tensor:
+        """The same, after a prompt that was embedded before."""
         cells_BS = (cells_BTG + self.first_cells).flatten(1)
-        embeds_BXH = torch.cat([self._embeds(batch, prompt.ids), self._embed_cells(cells_BS[:, :-1])], dim=1)
-        mask_BX = torch.cat([prompt.mask, torch.ones_like(cells_BS[:, 1:], dtype=torch.bool)], dim=1)
+        embeds_BXH = torch.cat([embeds_BLH, self._embed_cells(cells_BS[:, :-1])], dim=1)
+        mask_BX = torch.cat([mask_BL, torch.ones_like(cells_BS[:, 1:], dtype=torch.bool)], dim=1)
         index_X = torch.arange(mask_BX.shape[1], device=mask_BX.device)
         reads_XX = index_X <= index_X[:, None]
         if self._prompt_reads_all:
-            reads_XX |= (index_X < prompt.ids.shape[1]) & (index_X[:, None] < prompt.ids.shape[1])
+            is_prompt_X = index_X < mask_BL.shape[1]
+            reads_XX |= is_prompt_X & is_prompt_X[:, None]
         hidden_BXH = self.backbone.hidden_states(
             embeds_BXH,
             (mask_BX.cumsum(dim=1) - 1).clamp(min=0),
@@ -331,18 +341,23 @@ class SpatialvlaGridPolicy(TokenVlaPolicy):
 
     def _prompt(self, batch: dict[str, Tensor]) -> TokenRows:
         """Everything before the answer, with padding; its last column has none."""
+        return TokenRows.join([*self._prompt_parts(batch).values()])
+
+    def _prompt_parts(self, batch: dict[str, Tensor]) -> dict[str, TokenRows]:
+        """The same by what it is of; an image's by its camera."""
         tokens = self.tokens
         task = read_task(batch, self.config.type, self._device)
-        images = len(self._cameras) * self.backbone.tokens_per_image * [tokens.image]
-        parts = [TokenRows.constant([*images, *tokens.start], task.ids), task]
+        image = self.backbone.tokens_per_image * [tokens.image]
+        parts = {camera: TokenRows.constant(image, task.ids) for camera in self._cameras}
+        parts |= {"start": TokenRows.constant(tokens.start, task.ids), "instruction": task}
         if self.config.use_state:
             numbers_BN = self.state_bins.encode(self._of_batch(batch, OBS_STATE))
             symbols_BNC, mask_BNC = number_symbols(
                 numbers_BN, digits_needed(NUM_STATE_BINS), zero_padded=False
             )
             state = TokenRows(self.symbol_ids[symbols_BNC].flatten(1), mask_BNC.flatten(1))
-            parts += [TokenRows.constant(tokens.state_start, task.ids), state]
-        return TokenRows.join([*parts, TokenRows.constant(tokens.task_end, task.ids)])
+            parts["state"] = TokenRows.join([TokenRows.constant(tokens.state_start, task.ids), state])
+        return parts | {"end": TokenRows.constant(tokens.task_end, task.ids)}
 
     def _num_fixed_tokens(self) -> int:
         """Of the longest prompt and answer, without the task."""

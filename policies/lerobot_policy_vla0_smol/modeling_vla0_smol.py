@@ -45,6 +45,7 @@ from lerobot_bomb.vlm.prompt import TASK_TEMPLATE
 from lerobot_policy_vla0_smol.building_vla0_smol import build_model
 from lerobot_policy_vla0_smol.card_vla0_smol import METHOD
 from lerobot_policy_vla0_smol.configuration_vla0_smol import AS_TRAINED, SHAPES, Vla0SmolConfig
+from lerobot_policy_vla0_smol.explained_vla0_smol import ExplainedVla0Smol
 
 
 class Vla0SmolPolicy(RelativeVlaPolicy, TokenVlaPolicy):
@@ -89,6 +90,10 @@ class Vla0SmolPolicy(RelativeVlaPolicy, TokenVlaPolicy):
         self._color_jitter = None if config.color_jitter is None else ColorJitter(*config.color_jitter)
         self._ensemble = self._make_ensemble()
         self.reset()
+
+    def explained(self) -> ExplainedVla0Smol:
+        """This policy as `lerobot_bomb.explain` asks it."""
+        return ExplainedVla0Smol(self)
 
     def _get_default_peft_targets(self) -> dict[str, Any]:
         return peft_targets(self, self.backbone.text_model_name, ())
@@ -142,17 +147,21 @@ class Vla0SmolPolicy(RelativeVlaPolicy, TokenVlaPolicy):
 
     def _answer_logits(self, batch: dict[str, Tensor], prompt: TokenRows, answer: TokenRows) -> Tensor:
         """Teacher-forced logits of every answer token: (B, A, V)."""
+        return self.backbone.logits(self._answer_hidden(self._see(batch), prompt, answer))
+
+    def _answer_hidden(self, features_BPH: Tensor, prompt: TokenRows, answer: TokenRows) -> Tensor:
+        """Teacher-forced states that predict every answer token: (B, A, H)."""
         ids_BL = TokenRows.join([prompt, answer]).without_padding().ids
         check_positions(self.backbone.text_config, ids_BL.shape[1])
         hidden_BLH = self.backbone.hidden_states(
-            self._embeds(batch, ids_BL), self._image_columns(ids_BL.device)
+            self._with_images(features_BPH, ids_BL), self._image_columns(ids_BL.device)
         )
         offsets_A = torch.arange(answer.ids.shape[1], device=ids_BL.device)
         # a token is predicted one column earlier; columns beyond a short row carry no label
         columns_BA = prompt.mask.sum(dim=1, keepdim=True) - 1 + offsets_A
         columns_BA = columns_BA.clamp(max=ids_BL.shape[1] - 1)
         index_BAH = columns_BA[..., None].expand(-1, -1, hidden_BLH.shape[-1])
-        return self.backbone.logits(hidden_BLH.gather(1, index_BAH))
+        return hidden_BLH.gather(1, index_BAH)
 
     def _bins(self, batch: dict[str, Tensor]) -> Tensor:
         """Actions (B, T, D) in [-1, 1] -> bins of what is written, step by step: (B, N) int64."""
@@ -190,9 +199,15 @@ class Vla0SmolPolicy(RelativeVlaPolicy, TokenVlaPolicy):
 
     # Inference
 
-    @torch.no_grad()
     def _predict(self, batch: dict[str, Tensor], num_steps: int) -> Tensor:
         """The first ``num_steps`` actions of the chunk, absolute; the model need not write the rest."""
+        numbers_BN = self._write(batch, num_steps)
+        actions_BTD = self.action_bins.decode(numbers_BN).view(-1, num_steps, self._action_dim)
+        return self._to_absolute(actions_BTD, batch).clamp(-1, 1)
+
+    @torch.no_grad()
+    def _write(self, batch: dict[str, Tensor], num_steps: int) -> Tensor:
+        """(B, N) the numbers of so many actions."""
         self.eval()
         with self._autocast():
             prompt = self._prompt(batch)
@@ -209,27 +224,34 @@ class Vla0SmolPolicy(RelativeVlaPolicy, TokenVlaPolicy):
             )
         # casts of weights cached under inference mode cannot be used by a later training step
         torch.clear_autocast_cache()
-        actions_BTD = self.action_bins.decode(decoded.numbers).view(-1, num_steps, self._action_dim)
-        return self._to_absolute(actions_BTD, batch).clamp(-1, 1)
+        return decoded.numbers
 
     # Prompt
 
     def _prompt(self, batch: dict[str, Tensor]) -> TokenRows:
         """Everything up to ``Assistant:``, with padding."""
+        return TokenRows.join([*self._prompt_parts(batch).values()])
+
+    def _prompt_parts(self, batch: dict[str, Tensor]) -> dict[str, TokenRows]:
+        """The same by what it is of; an image's by its camera."""
         tokens = self.tokens
         task = read_task(batch, self.config.type, self._device)
-        images = len(self._cameras) * [*tokens.image_start, *self._image_span, *tokens.image_end]
-        parts = [TokenRows.constant([*tokens.start, *images], task.ids), task]
+        image = [*tokens.image_start, *self._image_span, *tokens.image_end]
+        parts = {"start": TokenRows.constant(tokens.start, task.ids)}
+        parts |= {camera: TokenRows.constant(image, task.ids) for camera in self._cameras}
+        parts["instruction"] = task
         if self.config.use_state:
             state = self._to_tokens(
                 self.state_bins.encode(self._of_batch(batch, OBS_STATE)), self.config.n_state_bins
             )
-            parts += [
-                TokenRows.constant(tokens.state_start, task.ids),
-                TokenRows(state.ids.flatten(1), state.mask.flatten(1)),
-                TokenRows.constant(tokens.state_end, task.ids),
-            ]
-        return TokenRows.join([*parts, TokenRows.constant(tokens.answer_start, task.ids)])
+            parts["state"] = TokenRows.join(
+                [
+                    TokenRows.constant(tokens.state_start, task.ids),
+                    TokenRows(state.ids.flatten(1), state.mask.flatten(1)),
+                    TokenRows.constant(tokens.state_end, task.ids),
+                ]
+            )
+        return parts | {"end": TokenRows.constant(tokens.answer_start, task.ids)}
 
     def _num_fixed_tokens(self) -> int:
         """Of the longest prompt and answer, without the task."""
@@ -250,18 +272,26 @@ class Vla0SmolPolicy(RelativeVlaPolicy, TokenVlaPolicy):
         )
         return NumberTokens(self.symbol_ids[symbols_BNC], mask_BNC, mask_BNC)
 
-    def _embeds(self, batch: dict[str, Tensor], ids_BL: Tensor) -> Tensor:
-        """Embeddings (B, L, H) of a sequence that starts with a prompt, image features in place."""
+    def _see(self, batch: dict[str, Tensor]) -> Tensor:
+        """(B, P of all images, H) image features."""
         generator = self.generator if self.training else None
-        images = [read_image(batch, key, self.config.type, ids_BL.device) for key in self._cameras]
+        images = [read_image(batch, key, self.config.type, self._device) for key in self._cameras]
         images = [crop(image, self.config.crop_fraction, generator) for image in images]
         if generator is not None and self._color_jitter is not None:
             images = self._color_jitter(images, generator)
         pixels = [self.backbone.pixels(image) for image in images]
-        features_BPH = self.backbone.embed_images(torch.stack(pixels, dim=1).flatten(0, 1))
+        features = self.backbone.embed_images(torch.stack(pixels, dim=1).flatten(0, 1))
+        return features.reshape(len(images[0]), -1, features.shape[-1])
+
+    def _embeds(self, batch: dict[str, Tensor], ids_BL: Tensor) -> Tensor:
+        """Embeddings (B, L, H) of a sequence that starts with a prompt, image features in place."""
+        return self._with_images(self._see(batch), ids_BL)
+
+    def _with_images(self, features_BPH: Tensor, ids_BL: Tensor) -> Tensor:
+        """The same, of features that were computed before."""
         embeds_BLH = self.backbone.embed_tokens(ids_BL)
-        features_BPH = features_BPH.reshape(len(ids_BL), -1, embeds_BLH.shape[-1]).to(embeds_BLH.dtype)
-        return embeds_BLH.index_copy(1, self._image_columns(ids_BL.device), features_BPH)
+        columns = self._image_columns(ids_BL.device)
+        return embeds_BLH.index_copy(1, columns, features_BPH.to(embeds_BLH.dtype))
 
     def _image_columns(self, device: torch.device) -> Tensor:
         """Columns of all image tokens; the same in every row, because only the start precedes them."""

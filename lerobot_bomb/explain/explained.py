@@ -1,0 +1,154 @@
+"""A policy as an explanation asks it: how strongly does it hold to its clean answer?
+
+The answer is the one to what the policy really saw, and stays fixed; what is read, or what is computed on the
+way, is changed. A higher score means that the answer is more likely or closer.
+
+Shapes: `B` rows, `S` tokens of an instruction, `K` actions of a chunk, `D` action dims.
+"""
+
+from abc import ABC, abstractmethod
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any, ClassVar
+
+import torch
+from torch import Tensor, nn
+
+from lerobot_bomb.actions.text import TokenRows
+
+type Batch = dict[str, Any]  # what a policy's preprocessor gives
+type Rows = dict[str, Tensor]  # what `Explained.encode` makes of it; (B, ...) each
+# columns of a sequence in each pass through the decoder of one score; None: it has none in this pass
+type Place = tuple[Tensor | slice | None, ...]
+
+INSTRUCTION, ANSWER = "instruction", "answer"
+
+
+@dataclass(frozen=True)
+class DecoderLayer:
+    """A layer of the language model, and its parts."""
+
+    # whose output are the states; None where the policy calls the parts one by one
+    layer: nn.Module | None
+    attention_out: nn.Module  # output projection; its input are the heads' outputs, side by side
+    num_heads: int
+    mlp: nn.Module
+
+
+def decoder_layers(text_model: Any, *, called_whole: bool = True) -> list[DecoderLayer]:
+    """Of a text model whose layers are named as Llama's."""
+    num_heads = text_model.config.num_attention_heads
+    return [
+        DecoderLayer(layer if called_whole else None, layer.self_attn.o_proj, num_heads, layer.mlp)
+        for layer in text_model.layers
+    ]
+
+
+class Explained(ABC):
+    """A policy that scores its own answers.
+
+    Scores of a row do not depend on the others of its batch, but for rounding.
+    """
+
+    unit: ClassVar[str]  # of a score
+    # of the language model; [] where the policy has none, or none that is known
+    layers: Sequence[DecoderLayer] = ()
+
+    @abstractmethod
+    def answer(self, batch: Batch) -> Tensor:
+        """What the policy answers to a batch of one row, (1, ...)."""
+
+    @abstractmethod
+    def encode(self, batch: Batch) -> Rows:
+        """What the decoder reads; images have gone through the vision model."""
+
+    @abstractmethod
+    def score(self, rows: Rows, answer: Tensor) -> Tensor:
+        """(B,) float32 of one answer, (1, ...), given what each row reads."""
+
+    @abstractmethod
+    def hide(self, rows: Rows, hidden_BS: Tensor) -> Rows:
+        """One row -> B rows whose attention mask leaves out these tokens of the instruction.
+
+        Raises:
+            ValueError: the policy reads no instruction.
+        """
+
+    def places(self, rows: Rows) -> dict[str, Place]:
+        """Where in the decoder's sequences a row's images, instruction, state and answer stand.
+
+        ``instruction`` has a column for each of its tokens. {} where it is not known.
+        """
+        return {}
+
+    def removed(self, clean: Rows, rows: Rows) -> Tensor | None:
+        """Columns of the pass over a row that one over it with hidden tokens lacks; None: it lacks none."""
+        return None
+
+
+class PromptExplained(Explained):
+    """One of our policies, whose prompt has parts; rows hold ``mask`` and ``part``, both (B, L)."""
+
+    _names: Sequence[str] = ()  # of the parts
+
+    def prompt(self, parts: Mapping[str, TokenRows]) -> Rows:
+        """``ids``, ``mask``, and as ``part`` the number of the part that a column belongs to."""
+        self._names = [*parts]
+        numbers = [torch.full_like(part.ids, number) for number, part in enumerate(parts.values())]
+        prompt = TokenRows.join([*parts.values()])
+        return {"ids": prompt.ids, "mask": prompt.mask, "part": torch.cat(numbers, dim=1)}
+
+    def of_part(self, rows: Rows, name: str) -> Tensor:
+        """(B, L) bool, which columns belong to a part of the prompt, padding included."""
+        return rows["part"] == self._names.index(name)
+
+    def hide(self, rows: Rows, hidden_BS: Tensor) -> Rows:
+        rows = {key: value.expand(len(hidden_BS), *value.shape[1:]) for key, value in rows.items()}
+        is_hidden_BL = torch.zeros_like(rows["mask"])
+        is_hidden_BL[self.of_part(rows, INSTRUCTION)] = hidden_BS.flatten().to(is_hidden_BL.device)
+        return rows | {"mask": rows["mask"] & ~is_hidden_BL}
+
+    def columns(self, rows: Rows) -> dict[str, Tensor]:
+        """Of one row's prompt, those of each part but start and end."""
+        return {
+            name: self.of_part(rows, name)[0].nonzero()[:, 0]
+            for name in self._names
+            if name not in ("start", "end")
+        }
+
+
+def repeated(values: Batch, times: int) -> Batch:
+    """A batch of one row -> the same row so many times."""
+    return {
+        key: value.expand(times, *value.shape[1:])
+        if isinstance(value, Tensor) and value.ndim and len(value) == 1
+        else times * value
+        if isinstance(value, list)
+        else value
+        for key, value in values.items()
+    }
+
+
+def some(rows: Rows, start: int, stop: int) -> Rows:
+    """The rows from ``start`` up to ``stop``."""
+    return {key: value[start:stop] for key, value in rows.items()}
+
+
+@torch.no_grad()
+def scores_of(explained: Explained, rows: Rows, answer: Tensor, batch_size: int) -> Tensor:
+    """(B,) scores, so many rows at once."""
+    num_rows = len(next(iter(rows.values())))
+    parts = [
+        explained.score(some(rows, start, start + batch_size), answer)
+        for start in range(0, num_rows, batch_size)
+    ]
+    return torch.cat(parts)
+
+
+def check_greedy(temperature: float) -> None:
+    """Raise a ValueError if a policy's answers are samples."""
+    if temperature:
+        raise ValueError(
+            f"--policy.temperature={temperature}: an explanation is of the likeliest answer; give "
+            "--policy.temperature=0"
+        )

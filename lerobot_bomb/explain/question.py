@@ -1,0 +1,74 @@
+"""What a policy sees in one moment, and how far its hold on its answer drops when some of it changes.
+
+The effect of a change is the score of the clean answer before minus after it (seed study of BOMB, E_patch and
+E_text): positive where what was changed spoke for the answer.
+
+Shapes: `M` changes, `S` tokens of an instruction, `H`, `W` of an image in pixels.
+"""
+
+from collections.abc import Callable, Sequence
+
+import torch
+from torch import Tensor
+
+from lerobot_bomb.explain.explained import Batch, Explained, Rows, repeated, scores_of
+from lerobot_bomb.explain.images import occluded
+
+BATCH_SIZE = 64  # rows of a forward pass
+
+
+class Question:
+    """One observation of one episode, asked of a policy.
+
+    What is the same in all rows of a question goes through the vision model once.
+    """
+
+    def __init__(
+        self,
+        explained: Explained,
+        prepare: Callable[[Batch], Batch],
+        observation: Batch,
+        batch_size: int = BATCH_SIZE,
+    ):
+        """``observation``: of one row, images in [0, 1], as ``prepare``, the preprocessor, takes it."""
+        self.explained, self.observation = explained, observation
+        self._prepare, self._batch_size = prepare, batch_size
+        batch = prepare(observation)
+        self.answer = explained.answer(batch)
+        with torch.no_grad():
+            self.rows = explained.encode(batch)
+        self.clean_score = float(scores_of(explained, self.rows, self.answer, batch_size))
+
+    @torch.no_grad()
+    def encode(self, changes: Batch, times: int) -> Rows:
+        """The observation so many times, but for these values, as the decoder reads it."""
+        return self.explained.encode(self._prepare({**repeated(self.observation, times), **changes}))
+
+    def effects(self, rows: Rows) -> Tensor:
+        """(M,) of what each row reads in place of the observation."""
+        return self.clean_score - scores_of(self.explained, rows, self.answer, self._batch_size)
+
+    def effects_of_images(self, changed: dict[str, Tensor]) -> Tensor:
+        """(M,) of other images (M, 3, H, W), by key."""
+        num_changes = len(next(iter(changed.values())))
+        parts = []
+        for start in range(0, num_changes, self._batch_size):
+            some = {key: images[start : start + self._batch_size] for key, images in changed.items()}
+            parts.append(self.effects(self.encode(some, len(next(iter(some.values()))))))
+        return torch.cat(parts)
+
+    def effects_of_masks(self, key: str, masks_MHW: Tensor, filling_3HW: Tensor) -> Tensor:
+        """(M,) of the parts of one camera's image."""
+        (image_3HW,) = self.observation[key]
+        parts = masks_MHW.split(self._batch_size)
+        return torch.cat(
+            [self.effects_of_images({key: occluded(image_3HW, part, filling_3HW)}) for part in parts]
+        )
+
+    def effects_of_hidden(self, hidden_MS: Tensor) -> Tensor:
+        """(M,) of tokens of the instruction that are left out of the attention."""
+        return self.effects(self.explained.hide(self.rows, hidden_MS))
+
+    def effects_of_instructions(self, instructions: Sequence[str]) -> Tensor:
+        """(M,) of other instructions."""
+        return self.effects(self.encode({"task": [*instructions]}, len(instructions)))

@@ -1,0 +1,84 @@
+"""Where in a language model a change of its input tells: clean activations are put back, one at a time.
+
+R(u) = (score with unit u put back - corrupt score) / (clean score - corrupt score), as in the study that BOMB
+comes from: 1 where a unit brings back all of the clean answer's score, 0 where nothing of it.
+
+Put back at all tokens, the output of any one layer gives 1, for all that follows is computed from it. A map
+of layers is therefore by tokens, as in causal tracing (ROME, arXiv 2202.05262).
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from lerobot_bomb.explain.activations import HEADS, MLP, PARTS, Activations, Unit, recording, restoring
+from lerobot_bomb.explain.explained import Rows
+from lerobot_bomb.explain.question import BATCH_SIZE, Question
+
+# a drop of the score below this share of it, or this much of its unit, has no ratio: rounding would decide
+SMALLEST_DROP = 1e-4
+
+
+@dataclass(frozen=True)
+class Restoration:
+    """What putting units back into one corrupt input does."""
+
+    clean_score: float
+    corrupt_score: float
+    scores: Tensor  # (U,) with each of the units put back
+
+    @property
+    def is_defined(self) -> bool:
+        """Whether the corruption lowered the score by more than rounding does."""
+        drop = abs(self.clean_score - self.corrupt_score)
+        return drop > SMALLEST_DROP * max(1.0, abs(self.clean_score))
+
+    @property
+    def ratios(self) -> Tensor:
+        """(U,) R(u); NaN where it is not defined."""
+        if not self.is_defined:
+            return torch.full_like(self.scores, torch.nan)
+        return (self.scores - self.corrupt_score) / (self.clean_score - self.corrupt_score)
+
+
+class Corruption:
+    """A question, and the same with something of its input changed."""
+
+    def __init__(self, question: Question, rows: Rows):
+        """``rows``: one, what is read in place of the observation."""
+        self._question, self.rows = question, rows
+        self._removed = question.explained.removed(question.rows, rows)
+        self._layers = question.explained.layers
+        self.clean = self._record(question.rows)
+        self.score = float(self._score(rows))
+
+    @torch.no_grad()
+    def _score(self, rows: Rows) -> Tensor:
+        return self._question.explained.score(rows, self._question.answer)
+
+    def _record(self, rows: Rows) -> Activations:
+        parts = PARTS if all(layer.layer is not None for layer in self._layers) else (HEADS, MLP)
+        with recording(self._layers, parts) as activations:
+            self._score(rows)
+        return activations
+
+    def restore(self, units_of_rows: Sequence[Sequence[Unit]], batch_size: int = BATCH_SIZE) -> Restoration:
+        """Put what each row names back, so many rows at once; nothing is encoded again."""
+        return self._restore(self.clean, units_of_rows, batch_size)
+
+    def restore_corrupt(self, units_of_rows: Sequence[Sequence[Unit]]) -> Restoration:
+        """The same with the corrupt activations in place of the clean ones: every ratio is 0."""
+        return self._restore(self._record(self.rows), units_of_rows, len(units_of_rows))
+
+    def _restore(
+        self, kept: Activations, units_of_rows: Sequence[Sequence[Unit]], batch_size: int
+    ) -> Restoration:
+        scores = []
+        for start in range(0, len(units_of_rows), batch_size):
+            part = units_of_rows[start : start + batch_size]
+            rows = {key: value.expand(len(part), *value.shape[1:]) for key, value in self.rows.items()}
+            with restoring(self._layers, kept, part, self._removed):
+                scores.append(self._score(rows))
+        return Restoration(self._question.clean_score, self.score, torch.cat(scores))

@@ -1,0 +1,89 @@
+"""Words of an instruction, and which of its tokens they are."""
+
+import re
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import torch
+from lerobot.processor import TokenizerProcessorStep
+from torch import Tensor
+
+from lerobot_bomb.vlm.prompt import normalize_task, task_text
+from lerobot_bomb.vlm.task_tokenizer import TaskTokenizerStep
+
+type Range = tuple[int, int]  # of characters: first, last + 1
+
+
+@dataclass(frozen=True)
+class Span:
+    """Words of an instruction."""
+
+    name: str
+    ranges: tuple[Range, ...]  # of the instruction's characters
+
+    def tokens(self, offsets: Sequence[Range]) -> Tensor:
+        """(S,) bool, which of the tokens of these characters hold any of the words."""
+        return torch.tensor(
+            [any(first < end and start < last for start, end in self.ranges) for first, last in offsets],
+            dtype=torch.bool,
+        )
+
+
+def span_of(words: str, instruction: str) -> Span:
+    """Everywhere that the words stand; neither part of another word nor of another number.
+
+    Raises:
+        ValueError: they are not in the instruction.
+    """
+    before, after = (r"\b" if words[i : i + 1].isalnum() else "" for i in (0, len(words) - 1))
+    pattern = before + re.escape(words.lower()) + after
+    found = [match.span() for match in re.finditer(pattern, instruction.lower())] if words.strip() else []
+    if not found:
+        raise ValueError(f"the words {words!r} are not in the instruction {instruction!r}")
+    return Span(words, tuple(found))
+
+
+def spans_of_words(instruction: str) -> list[Span]:
+    """A span of each word and number; one that stands there twice is told apart: "0", "0 (2)"."""
+    spans: list[Span] = []
+    for match in re.finditer(r"[\w']+", instruction):
+        times = 1 + sum(span.name.split(" (")[0] == match[0] for span in spans)
+        spans.append(Span(match[0] if times == 1 else f"{match[0]} ({times})", (match.span(),)))
+    return spans
+
+
+def difference(name: str, instruction: str, other: str) -> Span | None:
+    """The words that another instruction has others for; None where it does not have as many words.
+
+    "place it at row 1, column 2", "place it at row 3, column 2" -> "1".
+    """
+    mine, others = ([*re.finditer(r"[\w']+|[^\w\s]", text)] for text in (instruction, other))
+    if len(mine) != len(others):
+        return None
+    ranges = [word.span() for word, its in zip(mine, others, strict=True) if word[0] != its[0]]
+    return Span(name, tuple(ranges)) if ranges else None
+
+
+def token_offsets(steps: Iterable[Any], instruction: str) -> list[Range]:
+    """Which of the instruction's characters each token is that a preprocessor's steps make of it.
+
+    Those of a template around it lie before its first or behind its last character.
+
+    Raises:
+        ValueError: no step makes tokens, or its tokenizer does not say of what.
+    """
+    for step in steps:
+        if isinstance(step, TaskTokenizerStep):
+            assert step.tokenizer is not None
+            text = task_text(instruction, step.template)
+            offsets = step.tokenizer.encode(text, add_special_tokens=False).offsets
+            start = step.template.index("{}") - (len(instruction) - len(instruction.lstrip()))
+            assert text[step.template.index("{}") :].startswith(normalize_task(instruction))
+            return [(first - start, last - start) for first, last in offsets]
+        if isinstance(step, TokenizerProcessorStep):
+            tokenizer = step.input_tokenizer
+            if not tokenizer.is_fast:
+                raise ValueError(f"{type(tokenizer).__name__} does not say which characters a token is")
+            return tokenizer(instruction, return_offsets_mapping=True)["offset_mapping"]
+    raise ValueError("this policy reads no instruction: no step of its preprocessor turns one into tokens")

@@ -1,0 +1,86 @@
+"""``fdvla`` as explanations ask it: minus the loss of a chunk, under noise that is the same for all rows.
+
+Shapes as in `modeling_fdvla`; `J` draws of noise and time.
+"""
+
+from typing import TYPE_CHECKING, ClassVar
+
+import torch
+from torch import Tensor
+
+from lerobot_bomb.actions.text import TokenRows
+from lerobot_bomb.explain.explained import (
+    ANSWER,
+    INSTRUCTION,
+    Batch,
+    Place,
+    PromptExplained,
+    Rows,
+    decoder_layers,
+)
+from lerobot_bomb.flow.losses import joint_loss
+from lerobot_bomb.flow.path import path_point
+
+if TYPE_CHECKING:
+    from lerobot_policy_fdvla.modeling_fdvla import FdvlaPolicy
+
+NUM_DRAWS = 8  # of noise and time; times in the middle of as many equal parts of [0, 1]
+SEED = 0
+
+
+class ExplainedFdvla(PromptExplained):
+    """Answers are chunks as the heads predict them, (1, K, D)."""
+
+    unit: ClassVar[str] = "loss"
+
+    def __init__(self, policy: "FdvlaPolicy"):
+        self._policy = policy
+        self.layers = decoder_layers(policy.backbone.text_model)
+
+    def answer(self, batch: Batch) -> Tensor:
+        policy = self._policy
+        with torch.no_grad():
+            return policy._to_relative(policy.predict_action_chunk(batch, self._noise(1)), batch)
+
+    def encode(self, batch: Batch) -> Rows:
+        policy = self._policy.eval()
+        with policy._autocast():
+            rows = self.prompt(policy._prompt_parts(batch))
+            return rows | {"embeds": policy._embeds(batch, rows["ids"])}
+
+    def score(self, rows: Rows, answer: Tensor) -> Tensor:
+        policy, config = self._policy.eval(), self._policy.config
+        num_rows, noise_JKD = len(rows["embeds"]), self._noise(NUM_DRAWS)
+        tau_J = (torch.arange(NUM_DRAWS, device=answer.device) + 0.5) / NUM_DRAWS
+        point = path_point(
+            answer.expand(num_rows * NUM_DRAWS, -1, -1),
+            noise_JKD.repeat(num_rows, 1, 1),
+            tau_J.repeat(num_rows),
+        )
+        is_task_BL = rows["mask"] & self.of_part(rows, INSTRUCTION)
+        with policy._autocast():
+            context = policy._context(TokenRows(rows["ids"], rows["mask"]), is_task_BL, rows["embeds"])
+            predicted = policy._heads(context.repeated(NUM_DRAWS))(point.actions, point.tau)
+        velocity_BKD, noise_BKD = (None if values is None else values.float() for values in predicted)
+        loss_B, _ = joint_loss(
+            velocity_BKD,
+            noise_BKD,
+            point,
+            torch.ones(point.actions.shape[:2], dtype=torch.bool, device=answer.device),
+            flow_loss_weight=config.flow_loss_weight,
+            denoise_loss_weight=config.denoise_loss_weight,
+            consistency="none",
+            reduction="none",
+        )
+        return -loss_B.unflatten(0, (num_rows, NUM_DRAWS)).mean(dim=1)
+
+    def places(self, rows: Rows) -> dict[str, Place]:
+        """In two passes: over the prompt, padding included, and over the noisy actions."""
+        places: dict[str, Place] = {name: (each, None) for name, each in self.columns(rows).items()}
+        return places | {ANSWER: (None, slice(None))}
+
+    def _noise(self, num_draws: int) -> Tensor:
+        """(J, K, D) standard normal, the same in every call."""
+        policy = self._policy
+        shape = num_draws, policy.config.chunk_size, policy._action_dim
+        return torch.randn(shape, generator=torch.Generator().manual_seed(SEED)).to(policy._device)
