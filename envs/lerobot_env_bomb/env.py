@@ -5,6 +5,7 @@ from typing import Any
 
 import numpy as np
 
+from lerobot_bomb.bomb.board import Cell
 from lerobot_bomb.bomb.episode import DEFAULT_FPS, PHYSICS_HZ, EpisodeSpec
 from lerobot_bomb.bomb.judge import Judge
 from lerobot_bomb.bomb.layout import Snapshot
@@ -21,8 +22,10 @@ from lerobot_bomb.bomb.suite import find_suite
 from lerobot_bomb.envs.episode_env import EpisodeEnv, Observation, Transition
 from lerobot_bomb.envs.results import EpisodeResult, PolicyIdentity
 from lerobot_env_bomb.actuator import Actuator
+from lerobot_env_bomb.alternatives import alternatives
 from lerobot_env_bomb.axes.dynamics import Dynamics
 from lerobot_env_bomb.fetch_files import check_robot
+from lerobot_env_bomb.object_masks import object_masks
 from lerobot_env_bomb.perturb import PerturbedEpisode, sample_episode
 from lerobot_env_bomb.render import CameraRenderer, compose_caption, extrinsics, intrinsics
 from lerobot_env_bomb.scene import Scene
@@ -172,6 +175,20 @@ class BombEnv(EpisodeEnv[EpisodeSpec, _Run, EpisodeResult]):
             pending_motion_m=run.actuator.pending_motion_m(now.gripper_xyz),
             pending_gripper=run.actuator.pending_gripper,
         )
+
+    def object_masks(self) -> dict[str, dict[str, np.ndarray]]:
+        """{camera: {what: (H, W) bool}} of the observation's images, by what their pixels show."""
+        run, size = self._run, self._render_options.image_size
+        goals = run.episode.goals
+        goal = goals[min(run.judge.num_made, len(goals) - 1)]
+        return {
+            camera: object_masks(run.scene, self._camera_renderer, camera, size, goal.stone, goal.xyz[:2])
+            for camera in CAMERAS
+        }
+
+    def alternatives(self) -> dict[str, tuple[str, Cell]]:
+        """Other instructions for this episode, as `lerobot_env_bomb.alternatives` gives them."""
+        return alternatives(self._run.episode)
 
     def __getstate__(self) -> dict[str, Any]:
         if self._current_run is not None:

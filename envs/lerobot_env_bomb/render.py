@@ -107,6 +107,26 @@ class CameraRenderer:
         depth_m = near_m * far_m / (near_m + buffer.astype(np.float64) * (far_m - near_m))
         return rgb[::-1].copy(), depth_m[::-1].astype(np.float32)
 
+    def draw_geoms(self, data: mujoco.MjData, camera: str, size: int) -> np.ndarray:
+        """(size, size) int32, the geom that each pixel of the image shows; -1: none."""
+        flags = self._scene.flags
+        numbers = (mujoco.mjtRndFlag.mjRND_SEGMENT, mujoco.mjtRndFlag.mjRND_IDCOLOR)
+        for flag in numbers:
+            flags[flag] = True
+        try:
+            viewport = self._render(data, camera, size)
+        finally:
+            for flag in numbers:
+                flags[flag] = False
+        rgb = np.empty((size, size, 3), dtype=np.uint8)
+        mujoco.mjr_readPixels(rgb, None, viewport, self._context)
+        shown = rgb[::-1].astype(np.int32) @ [1, 1 << 8, 1 << 16]  # numbers of what is drawn, from 1
+        geoms = np.full(self._scene.ngeom + 1, -1, dtype=np.int32)
+        for drawn in self._scene.geoms[: self._scene.ngeom]:
+            if drawn.segid >= 0 and drawn.objtype == mujoco.mjtObj.mjOBJ_GEOM:
+                geoms[drawn.segid + 1] = drawn.objid
+        return geoms[shown]
+
     def _render(self, data: mujoco.MjData, camera: str, size: int) -> mujoco.MjrRect:
         self._owner.check()
         self._gl.make_current()

@@ -19,7 +19,7 @@ SEED = 0
 
 
 def explained(policy: Any, postprocess: Callable[[Tensor], Tensor]) -> Explained:
-    """One of our policies as it explains itself, a flow policy of LeRobot's by its loss, any other by distance.
+    """One of ours as it explains itself, a flow policy of LeRobot's by its loss, any other by distance.
 
     ``postprocess``: (B, D) actions -> the same in physical units.
     """

@@ -30,14 +30,50 @@ from lerobot_bomb.checkpoints.folder import (
 from lerobot_bomb.envs.rollout import BatchAgent
 
 
-def checkpoint_agent(
+class LoadedPolicy:
+    """A policy, and what stands between it and an environment."""
+
+    def __init__(
+        self,
+        config: PreTrainedConfig,
+        env_config: EnvConfig,
+        seed: int,
+        make_processors: Callable[[PreTrainedConfig], tuple[Preprocessor, Postprocessor]],
+    ):
+        set_seed(seed)
+        self.config = config
+        self.policy = make_policy(cfg=config, env_cfg=env_config)
+        self.policy.eval()
+        self.policy.reset()
+        self.prepare, self.postprocess = make_processors(config)
+        self._env_processors = make_env_pre_post_processors(env_cfg=env_config, policy_cfg=config)
+
+    def observe(self, observations: list[dict[str, Any]], instructions: list[str]) -> dict[str, Any]:
+        """What `prepare` takes: images (B, 3, H, W) in [0, 1] by camera, state, task."""
+        batch = {**preprocess_observation(_stacked(observations)), "task": instructions}
+        return self._env_processors[0](batch)
+
+    def act(self, batch: dict[str, Any]) -> np.ndarray:
+        """(B, D) actions of the environment for what `prepare` gave."""
+        with torch.inference_mode(), autocast(self.config):
+            action = self.postprocess(self.policy.select_action(batch))
+        return self._env_processors[1]({ACTION: action})[ACTION].to("cpu").numpy()
+
+    def agent(self, observations: list[dict[str, Any]], instructions: list[str]) -> np.ndarray:
+        """(B, D) actions for B environments, as lerobot-eval asks for them."""
+        with torch.inference_mode():
+            batch = self.prepare(self.observe(observations, instructions))
+        return self.act(batch)
+
+
+def load_policy(
     path: Path,
     device: str | None,
     env_type: str,
     env_flags: dict[str, Any],
     seed: int,
     policy_flags: Sequence[str] = (),
-) -> BatchAgent:
+) -> LoadedPolicy:
     """Load the folder `pretrained_model` of a checkpoint; `device` None means the checkpoint's own.
 
     `policy_flags` change other values of its config: "--n_action_steps=4".
@@ -51,7 +87,19 @@ def checkpoint_agent(
     _check_shapes(path, config, env_config)
     if config.use_peft:
         check_adapters(str(path), None)
-    return _agent(config, env_config, seed, load_processors)
+    return LoadedPolicy(config, env_config, seed, load_processors)
+
+
+def checkpoint_agent(
+    path: Path,
+    device: str | None,
+    env_type: str,
+    env_flags: dict[str, Any],
+    seed: int,
+    policy_flags: Sequence[str] = (),
+) -> BatchAgent:
+    """Who acts as the checkpoint in a folder, as `load_policy` takes it."""
+    return load_policy(path, device, env_type, env_flags, seed, policy_flags).agent
 
 
 def scripted_agent(policy_type: str, env_type: str, env_flags: dict[str, Any], seed: int) -> BatchAgent:
@@ -65,29 +113,7 @@ def scripted_agent(policy_type: str, env_type: str, env_flags: dict[str, Any], s
     if not isinstance(config, ScriptedConfig):
         raise ValueError(f"{policy_type} was built with random weights, which are in no file")
     env_config: EnvConfig = EnvConfig.get_choice_class(env_type)(**env_flags)
-    return _agent(config, env_config, seed, make_pre_post_processors)
-
-
-def _agent(
-    config: PreTrainedConfig,
-    env_config: EnvConfig,
-    seed: int,
-    make_processors: Callable[[PreTrainedConfig], tuple[Preprocessor, Postprocessor]],
-) -> BatchAgent:
-    set_seed(seed)
-    policy = make_policy(cfg=config, env_cfg=env_config)
-    policy.eval()
-    policy.reset()
-    preprocess, postprocess = make_processors(config)
-    env_preprocess, env_postprocess = make_env_pre_post_processors(env_cfg=env_config, policy_cfg=config)
-
-    def act(observations: list[dict[str, Any]], instructions: list[str]) -> np.ndarray:
-        batch = {**preprocess_observation(_stacked(observations)), "task": instructions}
-        with torch.inference_mode(), autocast(config):
-            action = postprocess(policy.select_action(preprocess(env_preprocess(batch))))
-        return env_postprocess({ACTION: action})[ACTION].to("cpu").numpy()
-
-    return act
+    return LoadedPolicy(config, env_config, seed, make_pre_post_processors).agent
 
 
 def _check_shapes(path: Path, config: PreTrainedConfig, env_config: EnvConfig) -> None:
