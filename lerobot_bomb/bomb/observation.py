@@ -55,6 +55,14 @@ def action_bounds(control_mode: str) -> tuple[np.ndarray, np.ndarray]:
     return np.array(low, dtype=np.float32), np.array(high, dtype=np.float32)
 
 
+def reach_m(actions: np.ndarray, control_mode: str) -> np.ndarray:
+    """(T, ACTION_DIM) in the environment's units -> (3,) metres where they lead.
+
+    Relative ones from where the gripper is, absolute ones in the world's frame; limits are left aside.
+    """
+    return actions[-1, :3] if control_mode == "absolute" else MAX_STEP_M * actions[:, :3].sum(axis=0)
+
+
 def geometry_shapes(options: RenderOptions) -> dict[str, tuple[int, int]]:
     """Shape of each float32 array by its key in the environment's observation; {} without depth.
 

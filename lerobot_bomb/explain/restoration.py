@@ -17,8 +17,13 @@ from lerobot_bomb.explain.activations import HEADS, MLP, PARTS, Activations, Uni
 from lerobot_bomb.explain.explained import Rows
 from lerobot_bomb.explain.question import BATCH_SIZE, Question
 
-# a drop of the score below this share of it, or this much of its unit, has no ratio: rounding would decide
+# a drop of the score below this share of it, or this much of its unit where it is less than 1, may be rounding
 SMALLEST_DROP = 1e-4
+
+
+def smallest_drop(clean_score: float) -> float:
+    """What is more than rounding."""
+    return SMALLEST_DROP * max(1.0, abs(clean_score))
 
 
 @dataclass(frozen=True)
@@ -32,8 +37,7 @@ class Restoration:
     @property
     def is_defined(self) -> bool:
         """Whether the corruption lowered the score by more than rounding does."""
-        drop = abs(self.clean_score - self.corrupt_score)
-        return drop > SMALLEST_DROP * max(1.0, abs(self.clean_score))
+        return abs(self.clean_score - self.corrupt_score) > smallest_drop(self.clean_score)
 
     @property
     def ratios(self) -> Tensor:

@@ -16,7 +16,7 @@ from lerobot.envs import (
 from lerobot.policies import make_policy, make_pre_post_processors
 from lerobot.utils.constants import ACTION, OBS_STATE
 from lerobot.utils.import_utils import register_third_party_plugins
-from lerobot.utils.random_utils import set_seed
+from lerobot.utils.random_utils import get_rng_state, set_rng_state, set_seed
 
 from lerobot_bomb.bomb.scripted_policy import ScriptedConfig
 from lerobot_bomb.checkpoints.adapters import check_adapters
@@ -45,8 +45,14 @@ class LoadedPolicy:
         self.policy = make_policy(cfg=config, env_cfg=env_config)
         self.policy.eval()
         self.policy.reset()
+        self._random_state = get_rng_state()
         self.prepare, self.postprocess = make_processors(config)
         self._env_processors = make_env_pre_post_processors(env_cfg=env_config, policy_cfg=config)
+
+    def begin(self) -> None:
+        """Start an episode as the first one: with its random state."""
+        set_rng_state(self._random_state)
+        self.policy.reset()
 
     def observe(self, observations: list[dict[str, Any]], instructions: list[str]) -> dict[str, Any]:
         """What `prepare` takes: images (B, 3, H, W) in [0, 1] by camera, state, task."""

@@ -1,0 +1,109 @@
+"""Whole episodes in which something is hidden from the policy in every step."""
+
+from collections.abc import Callable, Mapping
+from contextlib import closing
+from dataclasses import dataclass
+from typing import Any
+
+import gymnasium
+import numpy as np
+import torch
+from lerobot.utils.constants import OBS_IMAGES, OBS_LANGUAGE_ATTENTION_MASK
+
+from lerobot_bomb.bomb.observation import AGENT_POS
+from lerobot_bomb.envs.results import ResultLine
+from lerobot_bomb.envs.rollout import play
+from lerobot_bomb.explain.explained import Batch
+from lerobot_bomb.explain.images import filling, occluded
+from lerobot_bomb.explain.spans import span_of, token_offsets
+from lerobot_bomb.viewing.checkpoint import LoadedPolicy
+from lerobot_bomb.viewing.episode import Viewed
+
+# what a policy gets in place of an observation in an environment
+type Change = Callable[[Batch, gymnasium.Env], Batch]
+# what its preprocessor makes of that, changed
+type PreparedChange = Callable[[Batch], Batch]
+
+
+def nothing(batch: Batch, env: gymnasium.Env | None = None) -> Batch:
+    """All as it is."""
+    return batch
+
+
+@dataclass(frozen=True)
+class Mask:
+    """What is hidden, before and after the preprocessor."""
+
+    change: Change = nothing
+    change_prepared: PreparedChange = nothing
+
+
+@dataclass(frozen=True)
+class MaskedEpisode:
+    """An episode that was played under a mask."""
+
+    gripper_xyz: np.ndarray  # (T + 1, 3) metres, before each step and at the end
+    result: Any  # the line of its results
+
+
+def without_object(name: str, fill: str, blur_px: float) -> Mask:
+    """One kind of thing, of `object_masks`, taken out of every camera's image."""
+
+    def change(batch: Batch, env: gymnasium.Env) -> Batch:
+        changed = dict(batch)
+        for camera, masks in env.get_wrapper_attr("object_masks")().items():
+            key = f"{OBS_IMAGES}.{camera}"
+            (image,) = batch[key]
+            mask = torch.from_numpy(masks[name])[None].to(image.device)
+            changed[key] = occluded(image, mask, filling(image, fill, blur_px))
+        return changed
+
+    return Mask(change=change)
+
+
+def with_instruction(instruction: str) -> Mask:
+    """Told something else; "" is a null prompt."""
+    return Mask(change=lambda batch, _: {**batch, "task": [instruction]})
+
+
+def without_words(words: str, loaded: LoadedPolicy) -> Mask:
+    """Words of the instruction left out of the attention, wherever it has them.
+
+    Raises:
+        ValueError: the policy reads no instruction, or has no attention mask for it.
+    """
+    told: list[str] = []
+
+    def remember(batch: Batch, _: gymnasium.Env) -> Batch:
+        told[:] = batch["task"]
+        return batch
+
+    def hide(batch: Batch) -> Batch:
+        if OBS_LANGUAGE_ATTENTION_MASK not in batch:
+            raise ValueError(f"{loaded.config.type} reads no instruction, so none of it can be hidden")
+        hidden = span_of(words, told[0]).tokens(token_offsets(loaded.prepare.steps, told[0]))
+        mask = batch[OBS_LANGUAGE_ATTENTION_MASK].clone()
+        mask[:, : len(hidden)] &= ~hidden.to(mask.device)
+        return {**batch, OBS_LANGUAGE_ATTENTION_MASK: mask}
+
+    return Mask(remember, hide)
+
+
+def play_masked(viewed: Viewed, loaded: LoadedPolicy, masks: Mapping[str, Mask]) -> dict[str, MaskedEpisode]:
+    """The same episode under each mask, from the same random state of the policy."""
+    return {name: _play(viewed, loaded, mask) for name, mask in masks.items()}
+
+
+def _play(viewed: Viewed, loaded: LoadedPolicy, mask: Mask) -> MaskedEpisode:
+    loaded.begin()
+    with closing(viewed.make_env()) as env:
+
+        def act(observation: dict[str, Any], instruction: str) -> np.ndarray:
+            batch = mask.change(loaded.observe([observation], [instruction]), env)
+            with torch.inference_mode():
+                prepared = mask.change_prepared(loaded.prepare(batch))
+            return loaded.act(prepared)[0]
+
+        trace = [moment.observation[AGENT_POS][:3] for moment in play(env, viewed.spec, act)]
+        result: ResultLine = env.get_wrapper_attr("episode_result")()
+    return MaskedEpisode(np.stack(trace), result)

@@ -1,0 +1,204 @@
+"""Everything that is asked of a policy about one moment of an episode.
+
+Shapes: `G` cells along a side of the grid over an image, `L` layers.
+"""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from lerobot_bomb.explain.activations import LAYER, Unit, all_heads, all_mlps
+from lerobot_bomb.explain.explained import Rows
+from lerobot_bomb.explain.images import filling, occluded, patch_masks
+from lerobot_bomb.explain.question import Question
+from lerobot_bomb.explain.restoration import Corruption
+from lerobot_bomb.explain.spans import Span
+
+PATCH, WORDS, OTHER_INSTRUCTION = "patch", "words", "other instruction"
+
+
+@dataclass(frozen=True)
+class Asked:
+    """What is taken away or changed."""
+
+    grid: int  # cells along a side of each image
+    fill: str  # of FILLINGS
+    spans: Sequence[Span]  # of the instruction
+    offsets: Sequence[
+        tuple[int, int]
+    ]  # of its tokens, as `token_offsets` gives them; () without an instruction
+    others: Mapping[str, str] = field(default_factory=dict)  # other instructions, by what they change
+    # {key of an image: {what: (H, W) bool}}
+    objects: Mapping[str, Mapping[str, Tensor]] = field(default_factory=dict)
+    other_images: Mapping[str, Tensor] = field(
+        default_factory=dict
+    )  # (3, H, W) by key, where fill is "other"
+
+
+@dataclass(frozen=True)
+class Restored:
+    """R of every unit for one corruption; NaN where it is not defined."""
+
+    corruption: str
+    drop: float  # of the score
+    places: dict[str, list[float]]  # by place in the sequence: (L,) of the layers' states there
+    heads: list[list[float]]  # (L, heads)
+    mlps: list[float]  # (L,)
+
+
+@dataclass(frozen=True)
+class Explanation:
+    """Effects on the score of the clean answer: how far it drops."""
+
+    unit: str
+    clean_score: float
+    patches: dict[str, Tensor]  # (G, G) by key of the image
+    objects: dict[str, dict[str, float]]  # by key of the image, or "all cameras", and object
+    words: dict[str, float]  # of each span left out of the attention
+    others: dict[str, float]  # of each other instruction
+    restored: list[Restored]
+
+    def as_json(self) -> dict[str, Any]:
+        """JSON-ready; not a number becomes None."""
+        values = vars(self) | {
+            "patches": {key: each.tolist() for key, each in self.patches.items()},
+            "restored": [vars(each) for each in self.restored],
+        }
+        return _finite(values)
+
+
+def _finite(value: Any) -> Any:
+    if isinstance(value, dict):
+        return {key: _finite(each) for key, each in value.items()}
+    if isinstance(value, list):
+        return [_finite(each) for each in value]
+    return None if isinstance(value, float) and value != value else value
+
+
+def explain(question: Question, asked: Asked) -> Explanation:
+    """Ask all of it.
+
+    Raises:
+        ValueError: the grid does not divide an image, or as `filling`.
+    """
+    fillings = {key: _filling(question, asked, key) for key in image_keys(question)}
+    patches = {key: _patches(question, asked.grid, key, each) for key, each in fillings.items()}
+    words = _words(question, asked)
+    others = _others(question, asked)
+    corruptions = _corruptions(question, asked, fillings, patches, words, others)
+    return Explanation(
+        unit=question.explained.unit,
+        clean_score=question.clean_score,
+        patches=patches,
+        objects=_objects(question, asked, fillings),
+        words=words,
+        others=others,
+        restored=[_restore(question, name, rows) for name, rows in corruptions],
+    )
+
+
+def image_keys(question: Question) -> list[str]:
+    """Of the images that the policy sees."""
+    config = question.policy_config
+    return [key for key in sorted(question.observation) if key in config.image_features]
+
+
+def _filling(question: Question, asked: Asked, key: str) -> Tensor:
+    (image,) = question.observation[key]
+    blur_px = image.shape[-1] / asked.grid / 2
+    return filling(image, asked.fill, blur_px, asked.other_images.get(key))
+
+
+def _patches(question: Question, grid: int, key: str, filling_3HW: Tensor) -> Tensor:
+    masks = patch_masks(grid, *filling_3HW.shape[1:]).to(filling_3HW.device)
+    return question.effects_of_masks(key, masks, filling_3HW).unflatten(0, (grid, grid)).cpu()
+
+
+def _objects(question: Question, asked: Asked, fillings: Mapping[str, Tensor]) -> dict[str, dict[str, float]]:
+    """In each camera, and in all at once; what no camera shows is left out."""
+    effects: dict[str, dict[str, float]] = {}
+    names = list(dict.fromkeys(name for masks in asked.objects.values() for name in masks))
+    for name in names:
+        changed: dict[str, Tensor] = {}
+        for key, masks in asked.objects.items():
+            if not masks[name].any():
+                continue
+            (image,) = question.observation[key]
+            changed[key] = occluded(image, masks[name][None].to(image.device), fillings[key])
+            effects.setdefault(key, {})[name] = float(question.effects_of_images({key: changed[key]}))
+        if changed:
+            effects.setdefault("all cameras", {})[name] = float(question.effects_of_images(changed))
+    return effects
+
+
+def _words(question: Question, asked: Asked) -> dict[str, float]:
+    if not asked.spans:
+        return {}
+    hidden = torch.stack([span.tokens(asked.offsets) for span in asked.spans])
+    effects = question.effects_of_hidden(hidden).tolist()
+    return {span.name: effect for span, effect in zip(asked.spans, effects, strict=True)}
+
+
+def _others(question: Question, asked: Asked) -> dict[str, float]:
+    if not asked.others:
+        return {}
+    return dict(
+        zip(asked.others, question.effects_of_instructions([*asked.others.values()]).tolist(), strict=True)
+    )
+
+
+def _corruptions(
+    question: Question,
+    asked: Asked,
+    fillings: Mapping[str, Tensor],
+    patches: Mapping[str, Tensor],
+    words: Mapping[str, float],
+    others: Mapping[str, float],
+) -> list[tuple[str, Rows]]:
+    """The strongest patch, the strongest span, the strongest other instruction: name, what is read then."""
+    if not question.explained.layers:
+        return []
+    found = []
+    key = max(patches, key=lambda name: float(patches[name].max()))
+    cell = int(patches[key].argmax())
+    (image,) = question.observation[key]
+    mask = patch_masks(asked.grid, *image.shape[1:])[cell : cell + 1].to(image.device)
+    name = f"{PATCH} (line {cell // asked.grid}, column {cell % asked.grid}) of {key}"
+    found.append((name, question.encode({key: occluded(image, mask, fillings[key])}, 1)))
+    if words:
+        span = max(asked.spans, key=lambda each: words[each.name])
+        rows = question.explained.hide(question.rows, span.tokens(asked.offsets)[None])
+        found.append((f"{WORDS} {span.name!r} hidden", rows))
+    if others:
+        other = max(others, key=lambda each: others[each])
+        rows = question.encode({"task": [asked.others[other]]}, 1)
+        if _has_shape_of(rows, question.rows):
+            found.append((f"{OTHER_INSTRUCTION}: {asked.others[other]!r}", rows))
+    return found
+
+
+def _has_shape_of(rows: Rows, others: Rows) -> bool:
+    """Tokens are put back one by one, so there must be as many."""
+    return all(rows[key].shape == others[key].shape for key in rows)
+
+
+def _restore(question: Question, name: str, rows: Rows) -> Restored:
+    corruption = Corruption(question, rows)
+    layers = question.explained.layers
+    num_layers = len(layers)
+    places = question.explained.places(rows) if all(each.layer is not None for each in layers) else {}
+    of_places = {
+        place: corruption.restore(
+            [[Unit(i, LAYER, place=columns)] for i in range(num_layers)]
+        ).ratios.tolist()
+        for place, columns in places.items()
+    }
+    heads = corruption.restore([[unit] for unit in all_heads(layers)]).ratios.split(
+        [layer.num_heads for layer in layers]
+    )
+    mlps = corruption.restore([[unit] for unit in all_mlps(num_layers)]).ratios
+    drop = question.clean_score - corruption.score
+    return Restored(name, drop, of_places, [each.tolist() for each in heads], mlps.tolist())

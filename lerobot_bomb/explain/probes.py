@@ -1,0 +1,79 @@
+"""What can be read off a layer's states by a linear map: where is the destination known?
+
+A probe is a ridge regression; it is judged on episodes that it was not fitted to, beside the same with
+shuffled labels, which is what a probe of so many features finds in nothing.
+
+Shapes: `N` episodes, `F` features, `C` classes or coordinates.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+HELD_OUT = 0.3  # share of the episodes
+NUM_SHUFFLES = 20
+PENALTY = 1.0  # times the number of episodes that are fitted, on features of unit variance
+
+
+@dataclass(frozen=True)
+class Probe:
+    """How well labels were read, on episodes that were held out."""
+
+    score: float  # share of right classes, or the share of variance that is explained (R squared)
+    floor: float  # the same with shuffled labels, mean of NUM_SHUFFLES
+    num_held_out: int
+    num_right: int | None  # of classes
+
+
+def probe_classes(features_NF: np.ndarray, labels_N: np.ndarray, seed: int = 0) -> Probe:
+    """Whether a number is known, such as the target's row.
+
+    Raises:
+        ValueError: there are fewer than ten episodes.
+    """
+    classes = np.unique(labels_N)
+    one_hot_NC = (labels_N[:, None] == classes).astype(np.float64)
+
+    def num_right(targets_NC: np.ndarray, train: np.ndarray, test: np.ndarray) -> int:
+        predicted = _predict(features_NF, targets_NC, train, test)
+        return int((predicted.argmax(axis=1) == targets_NC[test].argmax(axis=1)).sum())
+
+    train, test = _split(len(labels_N), seed)
+    right = num_right(one_hot_NC, train, test)
+    rng = np.random.default_rng(seed)
+    shuffled = [num_right(rng.permutation(one_hot_NC), train, test) for _ in range(NUM_SHUFFLES)]
+    return Probe(right / len(test), float(np.mean(shuffled)) / len(test), len(test), right)
+
+
+def probe_values(features_NF: np.ndarray, values_NC: np.ndarray, seed: int = 0) -> Probe:
+    """Whether a place is known, such as the stone's; raises as `probe_classes`."""
+
+    def explained(targets_NC: np.ndarray, train: np.ndarray, test: np.ndarray) -> float:
+        errors = _predict(features_NF, targets_NC, train, test) - targets_NC[test]
+        spread = targets_NC[test] - targets_NC[train].mean(axis=0)
+        return 1 - float((errors**2).sum() / (spread**2).sum())
+
+    train, test = _split(len(values_NC), seed)
+    score = explained(values_NC, train, test)
+    rng = np.random.default_rng(seed)
+    shuffled = [explained(rng.permutation(values_NC), train, test) for _ in range(NUM_SHUFFLES)]
+    return Probe(score, float(np.mean(shuffled)), len(test), None)
+
+
+def _split(num_episodes: int, seed: int) -> tuple[np.ndarray, np.ndarray]:
+    if num_episodes < 10:
+        raise ValueError(f"{num_episodes} episodes are too few for a probe; give at least --episodes=10")
+    order = np.random.default_rng(seed).permutation(num_episodes)
+    num_test = round(HELD_OUT * num_episodes)
+    return order[num_test:], order[:num_test]
+
+
+def _predict(
+    features_NF: np.ndarray, targets_NC: np.ndarray, train: np.ndarray, test: np.ndarray
+) -> np.ndarray:
+    """Targets of the episodes ``test`` by a ridge regression on ``train``, solved in its dual form."""
+    mean_F, std_F = features_NF[train].mean(axis=0), features_NF[train].std(axis=0)
+    scaled_NF = (features_NF - mean_F) / np.where(std_F > 0, std_F, 1) / np.sqrt(features_NF.shape[1])
+    known_NF, mean_C = scaled_NF[train], targets_NC[train].mean(axis=0)
+    kernel = known_NF @ known_NF.T + PENALTY * len(train) / features_NF.shape[1] * np.eye(len(train))
+    return scaled_NF[test] @ known_NF.T @ np.linalg.solve(kernel, targets_NC[train] - mean_C) + mean_C
