@@ -8,14 +8,15 @@ from dataclasses import dataclass, field
 from typing import Any
 
 import torch
+from lerobot.utils.constants import OBS_IMAGE
 from torch import Tensor
 
-from lerobot_bomb.explain.activations import LAYER, Unit, all_heads, all_mlps
-from lerobot_bomb.explain.explained import Rows
+from lerobot_bomb.explain.activations import all_heads, all_layers, all_mlps
+from lerobot_bomb.explain.explained import INSTRUCTION, Place, Rows
 from lerobot_bomb.explain.images import filling, occluded, patch_masks
 from lerobot_bomb.explain.question import Question
 from lerobot_bomb.explain.restoration import Corruption
-from lerobot_bomb.explain.spans import Span
+from lerobot_bomb.explain.spans import Range, Span
 
 PATCH, WORDS, OTHER_INSTRUCTION = "patch", "words", "other instruction"
 
@@ -27,15 +28,12 @@ class Asked:
     grid: int  # cells along a side of each image
     fill: str  # of FILLINGS
     spans: Sequence[Span]  # of the instruction
-    offsets: Sequence[
-        tuple[int, int]
-    ]  # of its tokens, as `token_offsets` gives them; () without an instruction
+    offsets: Sequence[Range]  # of its tokens, as `token_offsets` gives them; () without an instruction
     others: Mapping[str, str] = field(default_factory=dict)  # other instructions, by what they change
     # {key of an image: {what: (H, W) bool}}
     objects: Mapping[str, Mapping[str, Tensor]] = field(default_factory=dict)
-    other_images: Mapping[str, Tensor] = field(
-        default_factory=dict
-    )  # (3, H, W) by key, where fill is "other"
+    # (3, H, W) by key, where fill is "other"
+    other_images: Mapping[str, Tensor] = field(default_factory=dict)
 
 
 @dataclass(frozen=True)
@@ -96,14 +94,17 @@ def explain(question: Question, asked: Asked) -> Explanation:
         objects=_objects(question, asked, fillings),
         words=words,
         others=others,
-        restored=[_restore(question, name, rows) for name, rows in corruptions],
+        restored=[_restore(question, asked, name, rows) for name, rows in corruptions],
     )
 
 
 def image_keys(question: Question) -> list[str]:
     """Of the images that the policy sees."""
-    config = question.policy_config
-    return [key for key in sorted(question.observation) if key in config.image_features]
+    return [
+        key
+        for key, value in sorted(question.observation.items())
+        if key.startswith(OBS_IMAGE) and isinstance(value, Tensor) and value.ndim == 4
+    ]
 
 
 def _filling(question: Question, asked: Asked, key: str) -> Tensor:
@@ -185,20 +186,27 @@ def _has_shape_of(rows: Rows, others: Rows) -> bool:
     return all(rows[key].shape == others[key].shape for key in rows)
 
 
-def _restore(question: Question, name: str, rows: Rows) -> Restored:
+def _places(question: Question, asked: Asked, rows: Rows) -> dict[str, Place]:
+    """Those of the sequence, and of the words in it; {} where the layers' states cannot be put back."""
+    explained = question.explained
+    if any(layer.layer is None for layer in explained.layers):
+        return {}
+    places = explained.places(rows)
+    first, *later = places.get(INSTRUCTION, (None,))
+    if not isinstance(first, Tensor) or len(first) != len(asked.offsets):  # some of it is hidden
+        return places
+    words = {span.name: span.tokens(asked.offsets) for span in asked.spans}
+    return places | {f'"{name}"': (first[tokens], *later) for name, tokens in words.items()}
+
+
+def _restore(question: Question, asked: Asked, name: str, rows: Rows) -> Restored:
     corruption = Corruption(question, rows)
     layers = question.explained.layers
-    num_layers = len(layers)
-    places = question.explained.places(rows) if all(each.layer is not None for each in layers) else {}
     of_places = {
-        place: corruption.restore(
-            [[Unit(i, LAYER, place=columns)] for i in range(num_layers)]
-        ).ratios.tolist()
-        for place, columns in places.items()
+        place: corruption.restore_each(all_layers(len(layers), columns)).tolist()
+        for place, columns in _places(question, asked, rows).items()
     }
-    heads = corruption.restore([[unit] for unit in all_heads(layers)]).ratios.split(
-        [layer.num_heads for layer in layers]
-    )
-    mlps = corruption.restore([[unit] for unit in all_mlps(num_layers)]).ratios
+    heads = corruption.restore_each(all_heads(layers)).split([layer.num_heads for layer in layers])
+    mlps = corruption.restore_each(all_mlps(len(layers)))
     drop = question.clean_score - corruption.score
     return Restored(name, drop, of_places, [each.tolist() for each in heads], mlps.tolist())

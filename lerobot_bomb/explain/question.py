@@ -50,20 +50,14 @@ class Question:
 
     def effects_of_images(self, changed: dict[str, Tensor]) -> Tensor:
         """(M,) of other images (M, 3, H, W), by key."""
-        num_changes = len(next(iter(changed.values())))
-        parts = []
-        for start in range(0, num_changes, self._batch_size):
-            some = {key: images[start : start + self._batch_size] for key, images in changed.items()}
-            parts.append(self.effects(self.encode(some, len(next(iter(some.values()))))))
-        return torch.cat(parts)
+        return self.effects(self.encode(changed, len(next(iter(changed.values())))))
 
     def effects_of_masks(self, key: str, masks_MHW: Tensor, filling_3HW: Tensor) -> Tensor:
         """(M,) of the parts of one camera's image."""
         (image_3HW,) = self.observation[key]
         parts = masks_MHW.split(self._batch_size)
-        return torch.cat(
-            [self.effects_of_images({key: occluded(image_3HW, part, filling_3HW)}) for part in parts]
-        )
+        images = (occluded(image_3HW, part, filling_3HW) for part in parts)
+        return torch.cat([self.effects_of_images({key: each}) for each in images])
 
     def effects_of_hidden(self, hidden_MS: Tensor) -> Tensor:
         """(M,) of tokens of the instruction that are left out of the attention."""

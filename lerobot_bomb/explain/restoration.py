@@ -17,7 +17,7 @@ from lerobot_bomb.explain.activations import HEADS, MLP, PARTS, Activations, Uni
 from lerobot_bomb.explain.explained import Rows
 from lerobot_bomb.explain.question import BATCH_SIZE, Question
 
-# a drop of the score below this share of it, or this much of its unit where it is less than 1, may be rounding
+# a drop of the score that is no larger than this share of it, or this in its unit, may be rounding
 SMALLEST_DROP = 1e-4
 
 
@@ -71,6 +71,10 @@ class Corruption:
     def restore(self, units_of_rows: Sequence[Sequence[Unit]], batch_size: int = BATCH_SIZE) -> Restoration:
         """Put what each row names back, so many rows at once; nothing is encoded again."""
         return self._restore(self.clean, units_of_rows, batch_size)
+
+    def restore_each(self, units: Sequence[Unit]) -> Tensor:
+        """(U,) R of each unit."""
+        return self.restore([[unit] for unit in units]).ratios
 
     def restore_corrupt(self, units_of_rows: Sequence[Sequence[Unit]]) -> Restoration:
         """The same with the corrupt activations in place of the clean ones: every ratio is 0."""
