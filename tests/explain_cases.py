@@ -1,0 +1,54 @@
+"""The policies that come with the package, asked about one observation of BOMB."""
+
+from collections.abc import Callable
+from contextlib import closing
+from functools import cache
+from pathlib import Path
+from typing import Any
+
+from lerobot_bomb.bomb.episode import EpisodeSpec
+from lerobot_bomb.bomb.observation import RenderOptions
+from lerobot_bomb.checkpoints.shipped import checkpoint_path, shipped_names
+from lerobot_bomb.envs.rollout import expert_agent, make_env, play
+from lerobot_bomb.explain.explained import Explained
+from lerobot_bomb.explain.other_policies import explained
+from lerobot_bomb.explain.question import Question
+from lerobot_bomb.viewing.checkpoint import LoadedPolicy, load_policy
+
+NAMES = shipped_names()
+SPEC = EpisodeSpec(seed=100_003, target=(1, 3), color="black")
+OPTIONS = RenderOptions(image_size=64)
+STEP = 14  # the stone is in the gripper
+WORKSPACE, WRIST = "observation.images.workspace", "observation.images.wrist"
+
+
+def fresh(name: str) -> LoadedPolicy:
+    """One that a test may change."""
+    return load_policy(Path(checkpoint_path(f"bomb:{name}")), "cpu", "bomb", {"image_size": 64}, seed=0)
+
+
+loaded = cache(fresh)
+
+
+@cache
+def moment() -> tuple[dict[str, Any], str, dict[str, dict[str, Any]], dict[str, Any]]:
+    """An observation, its instruction, the masks of its objects, the other instructions."""
+    with closing(make_env(SPEC, OPTIONS)) as env:
+        for each in play(env, SPEC, expert_agent()):
+            if each.step == STEP:
+                masks = env.get_wrapper_attr("object_masks")()
+                return each.observation, each.instruction, masks, env.get_wrapper_attr("alternatives")()
+    raise AssertionError("the episode is shorter")
+
+
+def ask(
+    policy: LoadedPolicy,
+    prepare: Callable[[dict[str, Any]], dict[str, Any]] | None = None,
+    batch_size: int = 64,
+    of: Explained | None = None,
+) -> Question:
+    """The observation, asked of a policy; ``prepare``: what stands for its preprocessor."""
+    observation, instruction, _, _ = moment()
+    raw = policy.observe([observation], [instruction])
+    asked = of or explained(policy.policy, policy.postprocess)
+    return Question(asked, prepare or policy.prepare, raw, batch_size)

@@ -1,0 +1,104 @@
+"""Policies whose reasons are known, because they were built in: each is told apart, of every type."""
+
+from typing import Any
+
+import pytest
+import torch
+from explain_cases import NAMES, WORKSPACE, WRIST, ask, fresh, moment
+
+from lerobot_bomb.actions.text import TokenRows
+from lerobot_bomb.explain.diagnosis import diagnose
+from lerobot_bomb.explain.explained import INSTRUCTION
+from lerobot_bomb.explain.moment import Asked, Explanation, explain
+from lerobot_bomb.explain.spans import difference, token_offsets
+from lerobot_bomb.viewing.checkpoint import LoadedPolicy
+
+GRID = 4
+HEAD = (1, 2)  # layer, head
+
+
+def asked(policy: LoadedPolicy) -> Asked:
+    _, instruction, _, others = moment()
+    spans = [difference(word, instruction, other) for word, (other, _) in others.items()]
+    return Asked(
+        grid=GRID,
+        fill="mean",
+        spans=[span for span in spans if span is not None],
+        offsets=token_offsets(policy.prepare.steps, instruction),
+        others={word: other for word, (other, _) in others.items()},
+    )
+
+
+def findings(explanation: Explanation) -> dict[str, tuple[str, ...]]:
+    return {each.question: each.names for each in diagnose(explanation)}
+
+
+def hide_words(policy: LoadedPolicy, shown: torch.Tensor | None) -> None:
+    """Let a policy read no token of an instruction but these."""
+    usual = policy.policy._prompt_parts
+
+    def parts(batch: dict[str, Any]) -> dict[str, TokenRows]:
+        found = usual(batch)
+        task = found[INSTRUCTION]
+        mask = torch.zeros_like(task.mask) if shown is None else task.mask & shown
+        return found | {INSTRUCTION: TokenRows(task.ids, mask)}
+
+    policy.policy._prompt_parts = parts
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_one_that_ignores_the_text(name: str) -> None:
+    policy = fresh(name)
+    hide_words(policy, None)
+    found = findings(explain(ask(policy), asked(policy)))
+    assert found["Words that it depends on, hidden:"] == ()
+    assert found["Words that it depends on, changed:"] == ()
+    assert found["Patches that the answer depends on:"]
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_one_that_reads_only_the_column(name: str) -> None:
+    policy = fresh(name)
+    _, instruction, _, others = moment()
+    span = difference("column", instruction, others["column"][0])
+    assert span is not None
+    hide_words(policy, span.tokens(token_offsets(policy.prepare.steps, instruction)))
+    found = findings(explain(ask(policy), asked(policy)))
+    assert found["Words that it depends on, hidden:"] == ("column",)
+    assert found["Words that it depends on, changed:"] == ("column",)
+
+
+@pytest.mark.parametrize("name", NAMES)
+@pytest.mark.parametrize("camera", [WORKSPACE, WRIST])
+def test_one_that_looks_at_one_patch_only(name: str, camera: str) -> None:
+    policy = fresh(name)
+    line, column = 1, 2
+
+    def prepare(batch: dict[str, Any]) -> dict[str, Any]:
+        changed = dict(batch)
+        for key in (WORKSPACE, WRIST):
+            shown = torch.zeros_like(batch[key])
+            side = shown.shape[-1] // GRID
+            window = (..., slice(line * side, (line + 1) * side), slice(column * side, (column + 1) * side))
+            if key == camera:
+                shown[window] = batch[key][window]
+            changed[key] = shown
+        return policy.prepare(changed)
+
+    found = findings(explain(ask(policy, prepare), asked(policy)))
+    assert found["Patches that the answer depends on:"] == (f"{camera} line {line}, column {column}",)
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_one_that_reads_the_target_through_one_head(name: str) -> None:
+    policy = fresh(name)
+    layers = policy.policy.explained().layers
+    for number, layer in enumerate(layers):
+        weight: Any = layer.attention_out.weight
+        size = weight.shape[1] // layer.num_heads
+        for head in range(layer.num_heads):
+            if (number, head) != HEAD:
+                weight.data[:, head * size : (head + 1) * size] = 0
+    found = findings(explain(ask(policy), asked(policy)))
+    named = [names for question, names in found.items() if "other instruction" in question]
+    assert named == [(f"layer {HEAD[0]}, head {HEAD[1]}",)]
