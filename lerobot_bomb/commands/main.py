@@ -35,6 +35,7 @@ COMMANDS = {
     "serve": "LeRobot's server of action chunks for a robot elsewhere, for every policy type",
     "push": "a checkpoint to the Hub, with a card and its evaluation",
     "push-dataset": "a recorded dataset to the Hub, with a card",
+    "explain": "what a policy's actions depend on: patches, objects, words, layers, heads",
     "view": "play one episode into a recording for Rerun and a video",
     "gallery": "draw what every perturbation axis changes",
     "checkpoint": "the folder of a checkpoint that comes with this package",

@@ -51,6 +51,13 @@ def add_view_arguments(parser: argparse.ArgumentParser) -> None:
         help="let a checkpoint act that was trained for another environment",
     )
     add("--seed", type=int, default=0, help="seed of the episode (default: 0)")
+    add_viewed_arguments(parser)
+    add_episode_files_argument(parser, DEFAULT_FOLDER)
+
+
+def add_viewed_arguments(parser: argparse.ArgumentParser) -> None:
+    """Declare which episode of which environment is looked at, beside its seed."""
+    add = parser.add_argument
     env_types = " or ".join(VIEWED)
     add("--env.type", dest="env_type", default="bomb", help=f"{env_types} (default: bomb)")
     others = vars(parser.parse_args([]))
@@ -68,15 +75,11 @@ def add_view_arguments(parser: argparse.ArgumentParser) -> None:
     )
     add("--max_steps", type=int, help=f"of bomb_pusht: control steps (default: {MAX_STEPS})")
     parser.set_defaults(image_size=None, own_flags={"bomb": of_bomb, "bomb_pusht": PUSHT_FLAGS})
-    add_episode_files_argument(parser, DEFAULT_FOLDER)
 
 
 def run_view(args: argparse.Namespace) -> int:
     """Play, write both files, print the instruction, the outcome and the paths."""
-    one_of("--env.type", args.env_type, VIEWED)
-    _refuse_flags_of_others(args)
-    with flags_without_group():
-        viewed = VIEWED[args.env_type](args)
+    viewed = viewed_of(args)
     policy = _policy(args, viewed.policies)
     name = viewed.name(policy)
     paths = new_paths(args.output, DEFAULT_FOLDER, name)
@@ -86,6 +89,14 @@ def run_view(args: argparse.Namespace) -> int:
     values: Any = result
     print(values.instruction, viewed.log().describe(result), *paths, sep="\n")
     return 0
+
+
+def viewed_of(args: argparse.Namespace) -> Viewed:
+    """The episode that `add_viewed_arguments` lets a user name."""
+    one_of("--env.type", args.env_type, VIEWED)
+    _refuse_flags_of_others(args)
+    with flags_without_group():
+        return VIEWED[args.env_type](args)
 
 
 def _refuse_flags_of_others(args: argparse.Namespace) -> None:

@@ -7,6 +7,7 @@ from lerobot_bomb.explain.moment import Explanation, Restored
 from lerobot_bomb.explain.restoration import smallest_drop
 
 SHARE = 0.05  # an effect below this share of the largest of its kind is none
+MAX_NAMES = 6  # that are shown
 RESTORES = 0.5  # what a head alone must bring back to be named
 
 
@@ -17,8 +18,14 @@ class Finding:
     question: str
     names: tuple[str, ...]  # () where there is nothing
 
+    @property
+    def answer(self) -> str:
+        """The names, as many as one reads."""
+        more = len(self.names) - MAX_NAMES
+        return ", ".join(self.names[:MAX_NAMES]) + (f" and {more} more" if more > 0 else "") or "none"
+
     def __str__(self) -> str:
-        return f"{self.question} {', '.join(self.names) or 'nothing'}"
+        return f"{self.question} {self.answer}"
 
 
 def diagnose(explanation: Explanation) -> list[Finding]:

@@ -15,7 +15,8 @@ from lerobot_bomb.envs.results import ResultLine
 from lerobot_bomb.envs.rollout import play
 from lerobot_bomb.explain.explained import Batch
 from lerobot_bomb.explain.images import filling, occluded
-from lerobot_bomb.explain.spans import span_of, token_offsets
+from lerobot_bomb.explain.spans import TOKENIZERS, Span, named_spans, token_offsets
+from lerobot_bomb.explain.watched import Watched
 from lerobot_bomb.viewing.checkpoint import LoadedPolicy
 from lerobot_bomb.viewing.episode import Viewed
 
@@ -23,6 +24,8 @@ from lerobot_bomb.viewing.episode import Viewed
 type Change = Callable[[Batch, gymnasium.Env], Batch]
 # what its preprocessor makes of that, changed
 type PreparedChange = Callable[[Batch], Batch]
+
+BLURS = 16  # of an image's side, a blur's standard deviation
 
 
 def nothing(batch: Batch, env: gymnasium.Env | None = None) -> Batch:
@@ -46,8 +49,12 @@ class MaskedEpisode:
     result: Any  # the line of its results
 
 
-def without_object(name: str, fill: str, blur_px: float) -> Mask:
-    """One kind of thing, of `object_masks`, taken out of every camera's image."""
+def without_object(name: str, fill: str) -> Mask:
+    """One kind of thing, of `object_masks`, taken out of every camera's image.
+
+    Raises:
+        ValueError: ``fill`` needs another episode.
+    """
 
     def change(batch: Batch, env: gymnasium.Env) -> Batch:
         changed = dict(batch)
@@ -55,7 +62,7 @@ def without_object(name: str, fill: str, blur_px: float) -> Mask:
             key = f"{OBS_IMAGES}.{camera}"
             (image,) = batch[key]
             mask = torch.from_numpy(masks[name])[None].to(image.device)
-            changed[key] = occluded(image, mask, filling(image, fill, blur_px))
+            changed[key] = occluded(image, mask, filling(image, fill, image.shape[-1] / BLURS))
         return changed
 
     return Mask(change=change)
@@ -66,27 +73,31 @@ def with_instruction(instruction: str) -> Mask:
     return Mask(change=lambda batch, _: {**batch, "task": [instruction]})
 
 
-def without_words(words: str, loaded: LoadedPolicy) -> Mask:
-    """Words of the instruction left out of the attention, wherever it has them.
+def without_words(span: Span, instruction: str, loaded: LoadedPolicy) -> Mask:
+    """Words of an instruction left out of the attention, as long as that instruction is given."""
+    hidden = span.tokens(token_offsets(loaded.prepare.steps, instruction))
 
-    Raises:
-        ValueError: the policy reads no instruction, or has no attention mask for it.
-    """
-    told: list[str] = []
-
-    def remember(batch: Batch, _: gymnasium.Env) -> Batch:
-        told[:] = batch["task"]
-        return batch
-
-    def hide(batch: Batch) -> Batch:
-        if OBS_LANGUAGE_ATTENTION_MASK not in batch:
-            raise ValueError(f"{loaded.config.type} reads no instruction, so none of it can be hidden")
-        hidden = span_of(words, told[0]).tokens(token_offsets(loaded.prepare.steps, told[0]))
-        mask = batch[OBS_LANGUAGE_ATTENTION_MASK].clone()
+    def hide(prepared: Batch) -> Batch:
+        if prepared.get("task") not in (None, [instruction]):
+            return prepared
+        mask = prepared[OBS_LANGUAGE_ATTENTION_MASK].clone()
         mask[:, : len(hidden)] &= ~hidden.to(mask.device)
-        return {**batch, OBS_LANGUAGE_ATTENTION_MASK: mask}
+        return {**prepared, OBS_LANGUAGE_ATTENTION_MASK: mask}
 
-    return Mask(remember, hide)
+    return Mask(change_prepared=hide)
+
+
+def masks_of(watched: Watched, loaded: LoadedPolicy, fill: str) -> dict[str, Mask]:
+    """Nothing, each kind of object, the words for row, column and colour, the whole instruction."""
+    masks = {"nothing": Mask()}
+    masks |= {
+        f"object: {name}": without_object(name, fill) for name in next(iter(watched.objects.values()), {})
+    }
+    if any(isinstance(step, TOKENIZERS) for step in loaded.prepare.steps):
+        for span in named_spans(watched.instruction, watched.instructions):
+            masks[f"words: {span.name}"] = without_words(span, watched.instruction, loaded)
+        masks["the whole instruction"] = with_instruction("")
+    return masks
 
 
 def play_masked(viewed: Viewed, loaded: LoadedPolicy, masks: Mapping[str, Mask]) -> dict[str, MaskedEpisode]:

@@ -19,6 +19,7 @@ from lerobot_bomb.explain.restoration import Corruption
 from lerobot_bomb.explain.spans import Range, Span
 
 PATCH, WORDS, OTHER_INSTRUCTION = "patch", "words", "other instruction"
+ALL = "all cameras"
 
 
 @dataclass(frozen=True)
@@ -54,7 +55,7 @@ class Explanation:
     unit: str
     clean_score: float
     patches: dict[str, Tensor]  # (G, G) by key of the image
-    objects: dict[str, dict[str, float]]  # by key of the image, or "all cameras", and object
+    objects: dict[str, dict[str, float]]  # by key of the image, or ALL, and object
     words: dict[str, float]  # of each span left out of the attention
     others: dict[str, float]  # of each other instruction
     restored: list[Restored]
@@ -131,7 +132,7 @@ def _objects(question: Question, asked: Asked, fillings: Mapping[str, Tensor]) -
             changed[key] = occluded(image, masks[name][None].to(image.device), fillings[key])
             effects.setdefault(key, {})[name] = float(question.effects_of_images({key: changed[key]}))
         if changed:
-            effects.setdefault("all cameras", {})[name] = float(question.effects_of_images(changed))
+            effects.setdefault(ALL, {})[name] = float(question.effects_of_images(changed))
     return effects
 
 

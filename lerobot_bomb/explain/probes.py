@@ -6,10 +6,12 @@ shuffled labels, which is what a probe of so many features finds in nothing.
 Shapes: `N` episodes, `F` features, `C` classes or coordinates.
 """
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 
 import numpy as np
 
+MIN_EPISODES = 10
 HELD_OUT = 0.3  # share of the episodes
 NUM_SHUFFLES = 20
 PENALTY = 1.0  # times the number of episodes that are fitted, on features of unit variance
@@ -29,7 +31,7 @@ def probe_classes(features_NF: np.ndarray, labels_N: np.ndarray, seed: int = 0) 
     """Whether a number is known, such as the target's row.
 
     Raises:
-        ValueError: there are fewer than ten episodes.
+        ValueError: there are fewer than MIN_EPISODES.
     """
     classes = np.unique(labels_N)
     one_hot_NC = (labels_N[:, None] == classes).astype(np.float64)
@@ -60,9 +62,41 @@ def probe_values(features_NF: np.ndarray, values_NC: np.ndarray, seed: int = 0) 
     return Probe(score, float(np.mean(shuffled)), len(test), None)
 
 
+@dataclass(frozen=True)
+class LayerProbe:
+    """A probe of one layer's states."""
+
+    what: str  # that is read
+    place: str  # of the tokens
+    layer: int
+    probe: Probe
+
+
+def probe_layers(
+    states: Mapping[str, np.ndarray], classes: Mapping[str, np.ndarray], values: Mapping[str, np.ndarray]
+) -> list[LayerProbe]:
+    """Every label by the states of every layer.
+
+    Args:
+        states: {place: (N, layers, F)}.
+        classes: {what: (N,) whole numbers}.
+        values: {what: (N, C)}.
+    """
+    found = []
+    for place, states_NLF in states.items():
+        for layer in range(states_NLF.shape[1]):
+            features_NF = states_NLF[:, layer]
+            probes = {what: probe_classes(features_NF, labels) for what, labels in classes.items()}
+            probes |= {what: probe_values(features_NF, targets) for what, targets in values.items()}
+            found += [LayerProbe(what, place, layer, probe) for what, probe in probes.items()]
+    return sorted(found, key=lambda each: each.what)
+
+
 def _split(num_episodes: int, seed: int) -> tuple[np.ndarray, np.ndarray]:
-    if num_episodes < 10:
-        raise ValueError(f"{num_episodes} episodes are too few for a probe; give at least --episodes=10")
+    if num_episodes < MIN_EPISODES:
+        raise ValueError(
+            f"{num_episodes} episodes are too few for a probe; give at least --episodes={MIN_EPISODES}"
+        )
     order = np.random.default_rng(seed).permutation(num_episodes)
     num_test = round(HELD_OUT * num_episodes)
     return order[num_test:], order[:num_test]

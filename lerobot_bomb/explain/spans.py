@@ -1,7 +1,7 @@
 """Words of an instruction, and which of its tokens they are."""
 
 import re
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -11,6 +11,10 @@ from torch import Tensor
 
 from lerobot_bomb.vlm.prompt import normalize_task, task_text
 from lerobot_bomb.vlm.task_tokenizer import TaskTokenizerStep
+
+PLACE = ("row", "column")  # what names an intersection
+
+TOKENIZERS = (TaskTokenizerStep, TokenizerProcessorStep)  # steps that turn an instruction into tokens
 
 type Range = tuple[int, int]  # of characters: first, last + 1
 
@@ -54,7 +58,7 @@ def spans_of_words(instruction: str) -> list[Span]:
 
 
 def difference(name: str, instruction: str, other: str) -> Span | None:
-    """The words that another instruction has others for; None where it does not have as many words.
+    """The words that another instruction has others for; None where it has another number of words.
 
     "place it at row 1, column 2", "place it at row 3, column 2" -> "1".
     """
@@ -63,6 +67,16 @@ def difference(name: str, instruction: str, other: str) -> Span | None:
         return None
     ranges = [word.span() for word, its in zip(mine, others, strict=True) if word[0] != its[0]]
     return Span(name, tuple(ranges)) if ranges else None
+
+
+def named_spans(instruction: str, others: Mapping[str, str]) -> list[Span]:
+    """What an instruction says of row, column and so on, by other instructions; row and column together."""
+    found = [difference(name, instruction, other) for name, other in others.items()]
+    spans = [span for span in found if span is not None]
+    places = [span for span in spans if span.name in PLACE]
+    if len(places) == len(PLACE):
+        spans.append(Span(" and ".join(PLACE), tuple(each for span in places for each in span.ranges)))
+    return spans
 
 
 def token_offsets(steps: Iterable[Any], instruction: str) -> list[Range]:

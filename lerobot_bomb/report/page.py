@@ -17,6 +17,7 @@ table{border-collapse:collapse;font-variant-numeric:tabular-nums}
 th,td{padding:.25rem .6rem;border-bottom:1px solid #8884;text-align:right;white-space:nowrap}
 th:first-child,td:first-child{text-align:left;position:sticky;left:0;background:Canvas}
 p.note{opacity:.75;max-width:60rem;font-size:.9rem}
+figure{margin:1rem 0}figure img{image-rendering:pixelated;margin-right:.3rem}
 pre{white-space:pre-wrap;overflow-wrap:anywhere;font-size:.85rem}
 nav a{margin-right:1rem}
 """
@@ -39,7 +40,8 @@ def _anchor(section: Section) -> str:
 
 
 def _section(section: Section) -> str:
-    parts = [f'<h2 id="{_anchor(section)}">{escape(section.title)}</h2>', *map(_table, section.tables)]
+    heading = f'<h2 id="{_anchor(section)}">{escape(section.title)}</h2>'
+    parts = [heading, section.figures, *map(_table, section.tables)]
     parts += [f"<pre>{escape(chr(10).join(section.lines))}</pre>"] if section.lines else []
     return "\n".join(parts)
 

@@ -65,6 +65,7 @@ class Section:
     title: str
     tables: list[Table]
     lines: list[str] = field(default_factory=list)  # of text below
+    figures: str = ""  # HTML, above the tables
 
     def as_json(self) -> dict[str, Any]:
         """Its numbers."""

@@ -1,0 +1,180 @@
+"""``lerobot-bomb explain``: why does a policy do what it does? Interventions, moment by moment."""
+
+import argparse
+import json
+import shlex
+import sys
+from collections import defaultdict
+from collections.abc import Sequence
+from dataclasses import asdict
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from tqdm import tqdm
+
+from lerobot_bomb.bomb.episode import TEST_SEEDS
+from lerobot_bomb.checkpoints.names import CONFIG
+from lerobot_bomb.commands.arguments import add_checkpoint_arguments, check_at_least, path_flag
+from lerobot_bomb.commands.view import add_viewed_arguments, viewed_of
+from lerobot_bomb.files import check_new_folder, read_json, written_whole
+from lerobot_bomb.flags import flags_without_group
+from lerobot_bomb.viewing.episode import Viewed
+
+if TYPE_CHECKING:
+    from lerobot_bomb.explain.episode import ExplainedMoment
+    from lerobot_bomb.explain.probes import LayerProbe
+    from lerobot_bomb.report.tables import Section
+    from lerobot_bomb.viewing.checkpoint import LoadedPolicy
+
+DEFAULT_FOLDER = Path("outputs/explain")
+DEFAULT_GRID = 8
+PAGE, NUMBERS, RECORDING = "explanation.html", "explanation.json", "explanation.rrd"
+
+
+def add_explain_arguments(parser: argparse.ArgumentParser) -> None:
+    """Declare the arguments of ``lerobot-bomb explain``."""
+    add = parser.add_argument
+    add_checkpoint_arguments(parser, "the checkpoint that is explained", required=True)
+    add("--seed", type=int, default=TEST_SEEDS[0], help=f"of the episode (default: {TEST_SEEDS[0]})")
+    add(
+        "--episodes", type=int, default=1, help="from this seed on; several give a page of means (default: 1)"
+    )
+    add("--step", type=int, help="the moment before this control step (default: one of each phase)")
+    add("--grid", type=int, default=DEFAULT_GRID, help=f"patches along a side (default: {DEFAULT_GRID})")
+    add("--fill", default="mean", help="in place of what is taken away: mean, blur or other (default: mean)")
+    add(
+        "--words", action="append", default=[], help="other words of the instruction to hide; may be repeated"
+    )
+    add_viewed_arguments(parser)
+    add("--output", type=path_flag, default=DEFAULT_FOLDER, help=f"new folder (default: {DEFAULT_FOLDER})")
+
+
+def run_explain(args: argparse.Namespace) -> int:
+    """Play, ask, write a page, its numbers and, of one episode, a recording; print what was found."""
+    check_at_least(args, episodes=1, grid=1)
+    if args.episodes > 1 and args.step is not None:
+        raise ValueError(f"--step={args.step} is of one episode; drop it or --episodes={args.episodes}")
+    check_new_folder("output", args.output)
+    if args.image_size is None:
+        args.image_size = _image_size(args.policy_path)
+    viewed = _viewed(args, args.seed)
+    loaded = _load(args, viewed)
+    with flags_without_group():
+        return (_explain_one if args.episodes == 1 else _explain_several)(args, viewed, loaded)
+
+
+def _image_size(checkpoint: Path) -> int | None:
+    """The side of the images that a checkpoint was trained on; None where that is not known."""
+    try:
+        features = read_json(checkpoint / CONFIG)["input_features"].values()
+        return next((each["shape"][-1] for each in features if each["type"] == "VISUAL"), None)
+    except (OSError, ValueError, KeyError):
+        return None  # refused when it is loaded
+
+
+def _viewed(args: argparse.Namespace, seed: int) -> Viewed:
+    return viewed_of(argparse.Namespace(**vars(args) | {"seed": seed}))
+
+
+def _load(args: argparse.Namespace, viewed: Viewed) -> "LoadedPolicy":
+    from lerobot_bomb.viewing.checkpoint import load_policy  # LeRobot and torch: seconds
+
+    env = viewed.env_type, viewed.env_flags | {"ignore_checkpoint": False}
+    return load_policy(args.policy_path, args.policy_device, *env, viewed.spec.seed)
+
+
+def _moments(
+    args: argparse.Namespace, viewed: Viewed, loaded: "LoadedPolicy"
+) -> "tuple[list[ExplainedMoment], Any]":
+    """Those of an episode that are asked about, and what became of it."""
+    from lerobot_bomb.explain.episode import Settings, explain_moment
+    from lerobot_bomb.explain.watched import at_step, middle_of_phases, watch
+
+    watched, result = watch(viewed, loaded)
+    chosen = middle_of_phases(watched) if args.step is None else [at_step(watched, args.step)]
+    other = None
+    if args.fill == "other":
+        other = watch(_viewed(args, viewed.spec.seed + 1), loaded)[0][0]
+    settings = Settings(args.grid, args.fill, tuple(args.words))
+    control_mode = getattr(viewed.spec, "control_mode", None)
+    moments = tqdm(chosen, desc="moments", leave=False, disable=args.episodes > 1)
+    return [explain_moment(loaded, each, settings, control_mode, other) for each in moments], result
+
+
+def _explain_one(args: argparse.Namespace, viewed: Viewed, loaded: "LoadedPolicy") -> int:
+    from lerobot_bomb.explain.masked_episodes import masks_of, play_masked
+    from lerobot_bomb.explain.recording import write_recording
+    from lerobot_bomb.report.explanation import moment_sections, overview_section, traces_section
+
+    moments, result = _moments(args, viewed, loaded)
+    episodes = {}
+    if viewed.env_type == "bomb" and args.fill != "other":
+        episodes = play_masked(viewed, loaded, masks_of(moments[0].watched, loaded, args.fill))
+    name = viewed.name(loaded.config.type)
+    sections = [overview_section(viewed.log().describe(result), moments, _command())]
+    sections += [section for each in moments for section in moment_sections(each)]
+    sections += [traces_section(episodes)] if episodes else []
+    numbers = {
+        "result": asdict(result),
+        "moments": [each.as_json() for each in moments],
+        "masked_episodes": {mask: asdict(episode.result) for mask, episode in episodes.items()},
+    }
+    with written_whole(args.output) as (folder,):
+        _write(folder, f"Why: {name}", sections, numbers)
+        write_recording(folder / RECORDING, name, viewed.fps, moments)
+    for each in moments:
+        print(each.title, *(f"  {finding}" for finding in each.findings), sep="\n")
+    print(*(args.output / file for file in (PAGE, NUMBERS, RECORDING)), sep="\n")
+    return 0
+
+
+def _explain_several(args: argparse.Namespace, viewed: Viewed, loaded: "LoadedPolicy") -> int:
+    from lerobot_bomb.report.explanation import aggregate_sections, probes_section
+
+    seeds = range(args.seed, args.seed + args.episodes)
+    episodes = [_moments(args, _viewed(args, seed), loaded) for seed in tqdm(seeds, desc="episodes")]
+    by_phase: dict[str, list[ExplainedMoment]] = defaultdict(list)
+    for moments, _ in episodes:
+        for each in moments:
+            by_phase[each.watched.phase].append(each)
+    sections = aggregate_sections([result for _, result in episodes], by_phase, _command())
+    if probes := _probes([moments[0] for moments, _ in episodes]):
+        sections.append(probes_section(probes))
+    numbers = {
+        "sections": [section.as_json() for section in sections],
+        "episodes": [
+            {"result": asdict(result), "moments": [each.as_json() for each in moments]}
+            for moments, result in episodes
+        ],
+    }
+    with written_whole(args.output) as (folder,):
+        _write(folder, f"Why: {viewed.group}, {args.episodes} episodes", sections, numbers)
+    print(*(args.output / file for file in (PAGE, NUMBERS)), sep="\n")
+    return 0
+
+
+def _probes(moments: "Sequence[ExplainedMoment]") -> "list[LayerProbe]":
+    """Of the destination and the stone, where they and the layers' states are known in enough episodes."""
+    from lerobot_bomb.explain.probes import MIN_EPISODES, probe_layers
+
+    known = [each for each in moments if each.states and each.watched.target is not None]
+    if len(known) < MIN_EPISODES:
+        return []
+    targets = np.array([each.watched.target for each in known])
+    states = {place: np.stack([each.states[place] for each in known]) for place in known[0].states}
+    stones = np.stack([each.watched.stone_xyz for each in known if each.watched.stone_xyz is not None])
+    classes = {"target's row": targets[:, 0], "target's column": targets[:, 1]}
+    return probe_layers(states, classes, {"stone's place on the table": stones[:, :2]})
+
+
+def _command() -> str:
+    return shlex.join(["lerobot-bomb", *sys.argv[1:]])
+
+
+def _write(folder: Path, title: str, sections: "Sequence[Section]", numbers: dict[str, Any]) -> None:
+    from lerobot_bomb.report.page import render
+
+    folder.mkdir()
+    (folder / PAGE).write_text(render(title, sections))
+    (folder / NUMBERS).write_text(json.dumps({"command": _command(), **numbers}, indent=1) + "\n")

@@ -1,0 +1,134 @@
+"""An episode, its moments and what is found out about them."""
+
+from collections.abc import Iterator, Sequence
+from dataclasses import asdict, dataclass
+from typing import Any
+
+import numpy as np
+import torch
+from lerobot.utils.constants import OBS_IMAGES
+
+from lerobot_bomb.checkpoints.folder import autocast
+from lerobot_bomb.explain.activations import LAYER, recording
+from lerobot_bomb.explain.diagnosis import Finding, diagnose
+from lerobot_bomb.explain.explained import ANSWER, INSTRUCTION, Batch
+from lerobot_bomb.explain.following import Following, following
+from lerobot_bomb.explain.moment import Asked, Explanation, explain, image_keys
+from lerobot_bomb.explain.other_policies import explained
+from lerobot_bomb.explain.question import Question
+from lerobot_bomb.explain.spans import Span, named_spans, span_of, spans_of_words, token_offsets
+from lerobot_bomb.explain.watched import Watched
+from lerobot_bomb.viewing.checkpoint import LoadedPolicy
+
+
+@dataclass(frozen=True)
+class Settings:
+    """How moments are asked about."""
+
+    grid: int
+    fill: str
+    words: tuple[str, ...] = ()  # to be hidden, beside those that are found
+
+
+@dataclass(frozen=True)
+class ExplainedMoment:
+    """A moment, what was found out about it, and what a person sees of it."""
+
+    watched: Watched
+    explanation: Explanation
+    findings: list[Finding]
+    followings: dict[str, Following]
+    images: dict[str, np.ndarray]  # (H, W, 3) uint8 by the keys of the explanation's patches
+    states: dict[str, np.ndarray]  # (layers, F) by place, means over its tokens; {}: not to be had
+
+    @property
+    def title(self) -> str:
+        """As "step 12, carry"."""
+        return ", ".join(part for part in (f"step {self.watched.step}", self.watched.phase) if part)
+
+    def as_json(self) -> dict[str, Any]:
+        """JSON-ready, without the images."""
+        return {
+            "step": self.watched.step,
+            "phase": self.watched.phase,
+            "instruction": self.watched.instruction,
+            "findings": {each.question: each.names for each in self.findings},
+            "following": {word: asdict(each) for word, each in self.followings.items()},
+            **self.explanation.as_json(),
+        }
+
+
+def explain_moment(
+    loaded: LoadedPolicy,
+    watched: Watched,
+    settings: Settings,
+    control_mode: str | None,
+    other: Watched | None = None,
+) -> ExplainedMoment:
+    """Ask everything; ``other``: of another episode, where that stands in place of what is taken away.
+
+    ``control_mode``: of BOMB's actions; None elsewhere, where nothing is said of following.
+    """
+    observation = loaded.observe([watched.observation], [watched.instruction])
+    instead = None if other is None else loaded.observe([other.observation], [other.instruction])
+    with torch.no_grad(), autocast(loaded.config):
+        question = Question(explained(loaded.policy, loaded.postprocess), loaded.prepare, observation)
+        explanation = explain(question, _asked(loaded, watched, settings, instead))
+    followings = {}
+    if watched.target is not None and control_mode is not None:
+        followings = following(loaded, observation, watched.others, watched.target, control_mode)
+    images = {
+        key: (255 * observation[key][0].permute(1, 2, 0)).round().to(torch.uint8).cpu().numpy()
+        for key in image_keys(question)
+    }
+    states = mean_states(question)
+    return ExplainedMoment(watched, explanation, diagnose(explanation), followings, images, states)
+
+
+def mean_states(question: Question) -> dict[str, np.ndarray]:
+    """(layers, F) of instruction and answer: each layer's states, means over tokens and draws."""
+    asked = question.explained
+    if not asked.layers or any(layer.layer is None for layer in asked.layers):
+        return {}
+    places = asked.places(question.rows)
+    with torch.no_grad(), recording(asked.layers, [LAYER]) as activations:
+        asked.score(question.rows, question.answer)
+    found = {}
+    for name in (INSTRUCTION, ANSWER):
+        number, columns = next((i, each) for i, each in enumerate(places[name]) if each is not None)
+        states = [activations[layer, LAYER][number][:, columns] for layer in range(len(asked.layers))]
+        found[name] = torch.stack([each.float().mean(dim=(0, 1)) for each in states]).cpu().numpy()
+    return found
+
+
+def _asked(loaded: LoadedPolicy, watched: Watched, settings: Settings, instead: Batch | None) -> Asked:
+    try:
+        offsets = token_offsets(loaded.prepare.steps, watched.instruction)
+    except ValueError:
+        if settings.words:
+            raise
+        offsets = []  # one that reads no instruction
+    objects = {
+        f"{OBS_IMAGES}.{camera}": {what: torch.from_numpy(mask) for what, mask in masks.items()}
+        for camera, masks in watched.objects.items()
+    }
+    return Asked(
+        grid=settings.grid,
+        fill=settings.fill,
+        spans=[*_spans(watched, settings.words)] if offsets else [],
+        offsets=offsets,
+        others=watched.instructions if offsets else {},
+        objects=objects,
+        other_images={
+            key: images[0] for key, images in (instead or {}).items() if key.startswith(OBS_IMAGES)
+        },
+    )
+
+
+def _spans(watched: Watched, words: Sequence[str]) -> Iterator[Span]:
+    """What the instruction says of row, column and colour; each of its words; those asked for."""
+    yield from named_spans(watched.instruction, watched.instructions)
+    for span in spans_of_words(watched.instruction):
+        yield Span(f'"{span.name}"', span.ranges)
+    for each in words:
+        yield span_of(each, watched.instruction)

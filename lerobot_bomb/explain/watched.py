@@ -1,0 +1,103 @@
+"""An episode as a policy plays it, and the moments of it that are worth an explanation."""
+
+from collections.abc import Mapping
+from contextlib import closing
+from dataclasses import dataclass
+from typing import Any
+
+import gymnasium
+import numpy as np
+
+from lerobot_bomb.bomb.board import BOARD, Cell
+from lerobot_bomb.bomb.episode import Stage
+from lerobot_bomb.envs.rollout import Moment, play
+from lerobot_bomb.viewing.checkpoint import LoadedPolicy
+from lerobot_bomb.viewing.episode import Viewed
+
+REACH, GRASP, CARRY, PLACE = "reach", "grasp", "carry", "place"
+PHASES = (REACH, GRASP, CARRY, PLACE)
+NEAR_M = BOARD.pitch_m  # of the stone from where it is to go: it is being placed
+
+
+@dataclass(frozen=True)
+class Watched:
+    """A moment, and what the environment knows of it beside what the policy sees."""
+
+    step: int
+    phase: str  # of PHASES; "" where the environment has none
+    observation: dict[str, Any]
+    instruction: str
+    objects: Mapping[str, Mapping[str, np.ndarray]]  # {camera: {what: (H, W) bool}}; {}: not known
+    others: Mapping[str, tuple[str, Cell]]  # other instructions and what they name, by what they change
+    target: Cell | None
+    stone_xyz: np.ndarray | None  # (3,) metres, of the one that is to be moved
+
+    @property
+    def instructions(self) -> dict[str, str]:
+        """The other instructions, by what they change."""
+        return {word: instruction for word, (instruction, _) in self.others.items()}
+
+
+def watch(viewed: Viewed, loaded: LoadedPolicy) -> tuple[list[Watched], Any]:
+    """Every moment in which the policy acts, and the line of the episode's results."""
+    loaded.begin()
+    with closing(viewed.make_env()) as env:
+
+        def act(observation: dict[str, Any], instruction: str) -> np.ndarray:
+            return loaded.agent([observation], [instruction])[0]
+
+        moments = [
+            _watched(viewed, moment, env)
+            for moment in play(env, viewed.spec, act)
+            if moment.action is not None
+        ]
+        return moments, env.get_wrapper_attr("episode_result")()
+
+
+def _watched(viewed: Viewed, moment: Moment, env: gymnasium.Env) -> Watched:
+    is_bomb = viewed.env_type == "bomb"
+    state = moment.state if is_bomb else None
+    others = env.get_wrapper_attr("alternatives")() if is_bomb else {}
+    goal = None if state is None else state.goals[0]
+    return Watched(
+        step=moment.step,
+        phase=_phase(moment) if is_bomb else "",
+        observation=moment.observation,
+        instruction=moment.instruction,
+        objects=env.get_wrapper_attr("object_masks")() if is_bomb else {},
+        others=others,
+        target=None if goal is None or not others else BOARD.nearest_intersection(goal.xyz[:2]),
+        stone_xyz=None if state is None or goal is None else state.stone_xyz[goal.stone],
+    )
+
+
+def _phase(moment: Moment) -> str:
+    """Of BOMB."""
+    stage, state = Stage(moment.info["stage"]), moment.state
+    if stage is Stage.START:
+        return REACH
+    if stage in (Stage.REACHED, Stage.GRASPED):
+        return GRASP
+    goal = state.goals[0]
+    distance_m = np.linalg.norm(state.stone_xyz[goal.stone][:2] - goal.xyz[:2])
+    return PLACE if distance_m <= NEAR_M else CARRY
+
+
+def middle_of_phases(moments: list[Watched]) -> list[Watched]:
+    """The moment in the middle of each phase that there is; of an episode without any, the middle one."""
+    by_phase = [[each for each in moments if each.phase == phase] for phase in (*PHASES, "")]
+    return [each[len(each) // 2] for each in by_phase if each]
+
+
+def at_step(moments: list[Watched], step: int) -> Watched:
+    """The moment before a control step.
+
+    Raises:
+        ValueError: the episode ended before.
+    """
+    if not 0 <= step < len(moments):
+        raise ValueError(
+            f"--step={step}: the policy acted in steps 0 to {len(moments) - 1} of this episode; name one of "
+            "these"
+        )
+    return moments[step]
