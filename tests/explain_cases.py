@@ -11,6 +11,7 @@ from lerobot_bomb.bomb.observation import RenderOptions
 from lerobot_bomb.checkpoints.shipped import checkpoint_path, shipped_names
 from lerobot_bomb.envs.rollout import expert_agent, make_env, play
 from lerobot_bomb.explain.explained import Explained
+from lerobot_bomb.explain.images import filling
 from lerobot_bomb.explain.other_policies import explained
 from lerobot_bomb.explain.question import Question
 from lerobot_bomb.viewing.checkpoint import LoadedPolicy, load_policy
@@ -52,3 +53,9 @@ def ask(
     raw = policy.observe([observation], [instruction])
     asked = of or explained(policy.policy, policy.postprocess)
     return Question(asked, prepare or policy.prepare, raw, batch_size)
+
+
+def without_image(question: Question, key: str = WORKSPACE) -> dict[str, Any]:
+    """What is read of it where one camera shows its mean colour only."""
+    (image,) = question.observation[key]
+    return question.encode({key: filling(image, "mean", 1.0)[None]}, 1)

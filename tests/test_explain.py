@@ -2,7 +2,7 @@
 
 import pytest
 import torch
-from explain_cases import NAMES, WORKSPACE, WRIST, ask, loaded, moment
+from explain_cases import NAMES, WORKSPACE, WRIST, ask, loaded, moment, without_image
 from torch import Tensor
 
 from lerobot_bomb.explain.activations import LAYER, PARTS, Unit, all_heads, all_layers, all_mlps, recording
@@ -20,7 +20,7 @@ def close(scores: Tensor | float, expected: Tensor | float, question: Question) 
     return bool((difference.abs() <= RTOL * max(1.0, abs(question.clean_score))).all())
 
 
-def blank(question: Question, key: str = WORKSPACE) -> Tensor:
+def blank(question: Question, key: str) -> Tensor:
     """(1, 3, H, W) without anything in it."""
     (image,) = question.observation[key]
     return filling(image, "mean", 1.0)[None]
@@ -96,7 +96,7 @@ def corruptions(name: str) -> list[Corruption]:
     offsets = token_offsets(loaded(name).prepare.steps, moment()[1])
     hidden = span_of("black", moment()[1]).tokens(offsets)[None]
     rows = [
-        question.encode({WORKSPACE: blank(question)}, 1),
+        without_image(question),
         question.encode({"task": [other]}, 1),
         question.explained.hide(question.rows, hidden),
     ]

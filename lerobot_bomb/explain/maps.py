@@ -10,7 +10,7 @@ HEAT_SHARE = 0.6  # of an overlay that is the map
 
 
 def heat(values: np.ndarray) -> np.ndarray:
-    """(H, W) -> (H, W, 3) uint8 RGB, dark at 0 and below, bright at the largest; safe for the colour-blind."""
+    """(H, W) -> (H, W, 3) uint8 RGB, dark at 0 and below, bright at the largest, in Cividis' colours."""
     largest = float(values.max())
     scaled = np.clip(values / largest, 0, 1) if largest > 0 else np.zeros_like(values)
     colors = cv2.applyColorMap((255 * scaled).astype(np.uint8), cv2.COLORMAP_CIVIDIS)

@@ -82,8 +82,8 @@ def aggregate_sections(
 def _mean_tables(moments: Sequence[ExplainedMoment]) -> Iterator[Table]:
     explanations = [each.explanation for each in moments]
     note = (
-        f"Mean drop of the score ({explanations[0].unit}), with its 95 % bootstrap interval over {len(moments)} "
-        "episodes."
+        f"Mean drop of the score ({explanations[0].unit}), with its 95 % bootstrap interval over "
+        f"{len(moments)} episodes."
     )
     # single words differ from one instruction to the next
     words = [{name: each.words[name] for name in each.words if name[0] != '"'} for each in explanations]
@@ -112,8 +112,8 @@ def probes_section(probes: Sequence[LayerProbe]) -> Section:
     ]
     note = (
         "Linear probes of each layer's states, means over tokens, in the first moment that is asked about. "
-        "Row and column: share of held-out episodes that are right; stone: share of variance explained; floor: "
-        "the same with shuffled labels."
+        "Row and column: share of held-out episodes that are right; stone: share of variance explained; "
+        "floor: the same with shuffled labels."
     )
     header = ["what", "states", "held out", "floor", "episodes held out"]
     return Section("Where is the destination known?", [Table("Probes", header, rows, note)])

@@ -1,0 +1,165 @@
+"""What explanations are made of: spans, masks, probes, means, findings."""
+
+import math
+
+import numpy as np
+import pytest
+import torch
+from explain_cases import NAMES, SPEC, loaded, moment
+
+from lerobot_bomb.bomb.board import BOARD
+from lerobot_bomb.explain.aggregate import mean_of, means_of
+from lerobot_bomb.explain.diagnosis import used
+from lerobot_bomb.explain.images import filling, occluded, patch_masks, smoothed
+from lerobot_bomb.explain.moment import Explanation
+from lerobot_bomb.explain.probes import probe_classes, probe_values
+from lerobot_bomb.explain.spans import difference, named_spans, span_of, spans_of_words, token_offsets
+
+TEXT = "Put a black stone at position (1, 1) on the Go board."
+
+
+def words(text: str, ranges: tuple[tuple[int, int], ...]) -> list[str]:
+    return [text[start:end] for start, end in ranges]
+
+
+def test_a_span_is_found_everywhere_but_not_within_other_words() -> None:
+    assert words(TEXT, span_of("1", TEXT).ranges) == ["1", "1"]
+    assert words("row 12, row 2", span_of("2", "row 12, row 2").ranges) == ["2"]
+    assert words(TEXT, span_of("black STONE", TEXT).ranges) == ["black stone"]
+    assert words(TEXT, span_of("(1, 1)", TEXT).ranges) == ["(1, 1)"]
+    with pytest.raises(ValueError, match="'white' are not in the instruction"):
+        span_of("white", TEXT)
+    with pytest.raises(ValueError, match="'' are not in the instruction"):
+        span_of("", TEXT)
+
+
+def test_a_difference_is_of_the_word_that_another_instruction_changes() -> None:
+    column = difference("column", TEXT, TEXT.replace("(1, 1)", "(1, 3)"))
+    assert column is not None and column.ranges == ((TEXT.index("1)"), TEXT.index("1)") + 1),)
+    assert difference("none", TEXT, TEXT) is None
+    assert difference("longer", TEXT, f"Please {TEXT}") is None
+
+
+def test_row_and_column_are_also_hidden_together() -> None:
+    others = {
+        "row": TEXT.replace("(1,", "(3,"),
+        "column": TEXT.replace("1)", "3)"),
+        "color": TEXT.replace("black", "white"),
+    }
+    spans = {span.name: words(TEXT, span.ranges) for span in named_spans(TEXT, others)}
+    assert spans == {"row": ["1"], "column": ["1"], "color": ["black"], "row and column": ["1", "1"]}
+
+
+def test_words_that_stand_there_twice_have_names_of_their_own() -> None:
+    assert [span.name for span in spans_of_words("1, 1 and 1")] == ["1", "1 (2)", "and", "1 (3)"]
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_tokens_of_a_span_spell_it(name: str) -> None:
+    steps = loaded(name).prepare.steps
+    (step,) = (step for step in steps if hasattr(step, "template"))
+    instruction = moment()[1]
+    ids = loaded(name).prepare(loaded(name).observe([moment()[0]], [instruction]))
+    (tokens,) = ids["observation.language.tokens"]
+    offsets = token_offsets(steps, instruction)
+    assert len(offsets) == len(tokens)
+    for span in spans_of_words(instruction):
+        chosen = tokens[span.tokens(offsets)].tolist()
+        assert instruction[slice(*span.ranges[0])].lower() in step.tokenizer.decode(chosen).lower()
+
+
+def test_a_grid_covers_every_pixel_once() -> None:
+    masks = patch_masks(4, 8, 12)
+    assert masks.shape == (16, 8, 12) and masks.sum(dim=0).eq(1).all()
+    assert masks[5].nonzero().min(dim=0).values.tolist() == [2, 3]
+    with pytest.raises(ValueError, match=r"--grid=5 does not divide an image of 8 x 12 pixels"):
+        patch_masks(5, 8, 12)
+
+
+def test_fillings() -> None:
+    image = torch.rand(3, 16, 16)
+    assert filling(image, "mean", 1.0)[:, 0, 0].tolist() == pytest.approx(image.mean(dim=(1, 2)).tolist())
+    blurred = filling(image, "blur", 2.0)
+    assert blurred.shape == image.shape and blurred.std() < image.std() / 2
+    other = torch.rand(3, 16, 16)
+    assert filling(image, "other", 1.0, other) is other
+    with pytest.raises(ValueError, match="--fill=other needs an image of another episode"):
+        filling(image, "other", 1.0)
+    with pytest.raises(ValueError, match="--fill"):
+        filling(image, "black", 1.0)
+    mask = torch.zeros(1, 16, 16, dtype=torch.bool)
+    mask[0, 3, 4] = True
+    (changed,) = occluded(image, mask, other)
+    assert (changed != image).any(dim=0).nonzero().tolist() == [[3, 4]]
+
+
+def test_a_smoothed_map_keeps_its_mean() -> None:
+    assert float(smoothed(torch.ones(2, 2), 8, 8).mean()) == pytest.approx(1)
+
+
+def test_a_probe_finds_what_is_there_and_nothing_in_noise() -> None:
+    rng = np.random.default_rng(0)
+    labels = rng.integers(5, size=200)
+    features = rng.standard_normal((200, 64)) + 3 * rng.standard_normal((5, 64))[labels]
+    found = probe_classes(features, labels)
+    assert found.score == 1 and 0.05 < found.floor < 0.4 and found.num_held_out == 60
+    noise = probe_classes(rng.standard_normal((200, 64)), labels)
+    assert abs(noise.score - noise.floor) < 0.2
+    places = rng.standard_normal((200, 2))
+    known = probe_values(
+        places @ rng.standard_normal((2, 64)) + 0.01 * rng.standard_normal((200, 64)), places
+    )
+    assert known.score > 0.9 > 0.1 > known.floor
+    with pytest.raises(ValueError, match="--episodes=10"):
+        probe_classes(features[:9], labels[:9])
+
+
+def test_means_are_of_what_is_known() -> None:
+    assert mean_of([math.nan]) is None
+    alone = mean_of([2.0])
+    assert alone is not None and alone.value == 2 and alone.interval is None
+    mean = means_of([{"a": 1.0, "b": 2.0}, {"a": 3.0}, {"a": math.nan}])["a"]
+    assert mean.value == 2 and mean.num_episodes == 2
+    assert mean.interval is not None and mean.interval[0] <= 2 <= mean.interval[1]
+
+
+def test_effects_that_are_rounding_or_small_beside_the_largest_are_none() -> None:
+    assert used({"a": 1.0, "b": -0.5, "c": 0.04, "d": 0.0}, -10.0) == ("a", "b")
+    assert used({"a": 1e-6, "b": 0.0}, -10.0) == ()
+    assert used({}, -10.0) == ()
+
+
+def test_json_has_nothing_that_is_no_number() -> None:
+    explanation = Explanation(
+        "nats", -1.0, {"image": torch.tensor([[math.nan]])}, {}, {"a": math.nan}, {}, []
+    )
+    assert explanation.as_json()["patches"] == {"image": [[None]]}
+    assert explanation.as_json()["words"] == {"a": None}
+
+
+def test_every_pixel_shows_one_thing() -> None:
+    for masks in moment()[2].values():
+        assert np.sum([*masks.values()], axis=0).tolist() == np.ones((64, 64)).tolist()
+
+
+def test_masks_show_stone_gripper_and_target_in_both_cameras() -> None:
+    workspace, wrist = moment()[2]["workspace"], moment()[2]["wrist"]
+    for name in ("stone", "target", "gripper", "board"):
+        assert workspace[name].any(), name
+    assert wrist["stone"].any() and wrist["gripper"].any()
+    # the target is a disc around the intersection, not the board
+    assert 0 < workspace["target"].sum() < workspace["board"].sum() / 5
+
+
+def test_other_instructions_differ_in_one_word_and_name_their_intersection() -> None:
+    instruction, others = moment()[1], moment()[3]
+    row, column = SPEC.target or (0, 0)
+    assert set(others) == {"row", "column", "color"}
+    for word, (other, cell) in others.items():
+        span = difference(word, instruction, other)
+        assert span is not None and len(span.ranges) == 1
+        expected = {
+            "row": ((row + 2) % BOARD.num_lines, column),
+            "column": (row, (column + 2) % BOARD.num_lines),
+        }
+        assert cell == expected.get(word, (row, column))
