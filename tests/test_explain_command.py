@@ -1,0 +1,71 @@
+"""``lerobot-bomb explain``: pages of one episode and of several."""
+
+import json
+from pathlib import Path
+
+import pytest
+from explain_cases import NAMES
+
+from lerobot_bomb.commands.main import main
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_one_episode(name: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    output = tmp_path / "why"
+    flags = [f"--policy.path=bomb:{name}", "--seed=100000", "--grid=4", f"--output={output}"]
+    assert main(["explain", *flags]) == 0
+    printed = capsys.readouterr().out
+    assert {path.name for path in output.iterdir()} == {
+        "explanation.html",
+        "explanation.json",
+        "explanation.rrd",
+    }
+    found = json.loads((output / "explanation.json").read_text())
+    phases = [moment["phase"] for moment in found["moments"]]
+    assert phases == ["reach", "grasp", "carry", "place"]
+    assert all(phase in printed for phase in phases)
+    for moment in found["moments"]:
+        assert {len(grid) for grid in moment["patches"].values()} == {4}
+        assert moment["words"]["row and column"] is not None
+        assert {len(each["mlps"]) for each in moment["restored"]} == {2}
+    page = (output / "explanation.html").read_text()
+    assert page.count("<img ") == 3 * 2 * len(phases) and "<script" not in page and "http" not in page
+    masked = found["masked_episodes"]
+    assert masked["nothing"]["is_success"] and not masked["the whole instruction"]["is_success"]
+    assert masked["nothing"] == found["result"]
+
+
+def test_several_episodes(tmp_path: Path) -> None:
+    output = tmp_path / "why"
+    flags = ["--policy.path=bomb:fdvla", "--seed=100000", "--grid=2", "--episodes=10", f"--output={output}"]
+    assert main(["explain", *flags]) == 0
+    assert {path.name for path in output.iterdir()} == {"explanation.html", "explanation.json"}
+    found = json.loads((output / "explanation.json").read_text())
+    titles = [section["title"] for section in found["sections"]]
+    assert titles[:2] == ["In short", "Phase: reach"] and titles[-1] == "Where is the destination known?"
+    assert len(found["episodes"]) == 10
+
+
+@pytest.mark.parametrize(
+    ("flags", "message"),
+    [
+        (["--step=999"], "--step=999: the policy acted in steps 0 to"),
+        (["--grid=5", "--step=0"], "--grid=5 does not divide an image of 64 x 64 pixels"),
+        (["--words=white", "--step=0", "--color=black"], "the words 'white' are not in the instruction"),
+        (["--fill=black", "--step=0"], "--fill"),
+        (["--episodes=2", "--step=0"], "--step=0 is of one episode"),
+        (["--episodes=0"], "--episodes=0 must be at least 1"),
+    ],
+)
+def test_what_cannot_be_asked(
+    flags: list[str], message: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    output = tmp_path / "why"
+    assert main(["explain", "--policy.path=bomb:fdvla", *flags, f"--output={output}"]) == 1
+    assert message in capsys.readouterr().err
+    assert not output.exists()
+
+
+def test_a_folder_that_exists_is_left_alone(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["explain", "--policy.path=bomb:fdvla", f"--output={tmp_path}"]) == 1
+    assert "exists already" in capsys.readouterr().err
