@@ -15,8 +15,8 @@ from learning_curve import SUCCESS_BGR, count, draw
 
 from lerobot_bomb.bomb.board import COLORS
 from lerobot_bomb.bomb.episode import EpisodeSpec
-from lerobot_bomb.bomb.suite import specs_of_tasks
-from lerobot_bomb.bomb.suites.place import targets_of, templates_of
+from lerobot_bomb.bomb.suite import specs_of_tasks, templates_of
+from lerobot_bomb.bomb.suites.place import TEMPLATES, targets_of
 from lerobot_bomb.checkpoints.identity import sha256_of
 from lerobot_bomb.commands.main import main as lerobot_bomb
 
@@ -164,7 +164,7 @@ def test_demonstrations_leave_out_targets_wording_and_colours() -> None:
         instruction = template.format(color=color, row=target[0], column=target[1])
         return row(None, 1.0, target=list(target), color=color, instruction=instruction)
 
-    wordings = [templates_of(split)[0] for split in ("train", "heldout")]
+    wordings = [templates_of(split, TEMPLATES)[0] for split in ("train", "heldout")]
     groups = {
         (target, color, wording): next(
             iter(learning_tasks.by_what_is_left_out([asked(target, color, wording)]))
