@@ -129,15 +129,6 @@ def test_a_stone_counts_where_the_given_instruction_says() -> None:
     assert learn.count_named(rows, {"a": "a", "b": "b"}, targets) == 2
 
 
-def test_the_other_instruction_names_another_target() -> None:
-    targets = {"black 1": [0, 0], "black 2": [0, 1], "white 1": [0, 0], "white 2": [0, 1]}
-    given = learn.other_instructions(
-        [row(None, 1.0, instruction=name, target=at) for name, at in targets.items()]
-    )
-    assert all(targets[instruction] != targets[other] for instruction, other in given.items())
-    assert learn.other_instructions([row(None, 1.0, instruction="only")]) == {}
-
-
 def test_every_policy_type_has_a_recipe_for_every_task() -> None:
     for name, task in learn.TASKS.items():
         for policy_type in task.trainings.keys() - {learn.PROBE}:
@@ -198,8 +189,9 @@ def test_a_bar_is_of_success_and_of_time() -> None:
 
 def row(failure: str | None, error_mm: float, nearest: tuple[int, int] = (2, 2), **other: Any) -> dict:
     values = {"is_success": failure is None, "failure": failure, "placement_error_mm": error_mm}
+    values |= {"spec": {"suite": "place"}, "nearest_intersection": list(nearest)}
     stage = "placed" if failure is None else "lifted"
-    return {**values, "target": [2, 2], "nearest_intersection": list(nearest), "stage": stage, **other}
+    return {**values, "target": [2, 2], "stage": stage, **other}
 
 
 def test_a_point_counts_grounding_and_precision_apart() -> None:

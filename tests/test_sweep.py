@@ -287,5 +287,7 @@ def test_lines_of_finished_cells_are_there_before_the_sweep_has_ended(tmp_path: 
     store.finish(first, ["{}"], [])
     next(states)
     assert (tmp_path / "results.jsonl").read_text() == "{}\n"
+    store.file(first, "jsonl").unlink()
+    assert not next(states), "a cell that is over was counted again"
     store.finish(second, ["{}"], [])
     assert list(states) == []

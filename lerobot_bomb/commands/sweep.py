@@ -112,9 +112,8 @@ def _check_jobs(args: argparse.Namespace, cells: list[Cell]) -> None:
 
 def _manifest(args: argparse.Namespace) -> Manifest:
     """The folder's, or a new one."""
-    exists = (args.folder / NAME).is_file()
     if args.policies is None:
-        if not exists:
+        if not (args.folder / NAME).is_file():
             raise ValueError(
                 f"{args.folder} holds no {NAME}: begin a sweep with --policies=... --env.type=..."
             )
@@ -125,13 +124,11 @@ def _manifest(args: argparse.Namespace) -> Manifest:
     manifest = plan(
         args.policies, args.tasks, conditions, args.seed, args.episodes, args.batch_size, args.rest
     )
-    if exists and Manifest.read(args.folder) != manifest:
+    if not manifest.claim(args.folder):
         raise ValueError(
             f"{args.folder / NAME} is of another sweep; name another folder, or go on with that one by "
             f"`lerobot-bomb sweep {args.folder}`"
         )
-    if not exists:
-        manifest.write(args.folder)
     return manifest
 
 

@@ -51,6 +51,32 @@ def is_grounded(row: Row) -> bool:
     return row["nearest_intersection"] == row["target"]
 
 
+def named_targets(rows: list[Row]) -> dict[str, Any]:
+    """{instruction: what it asks for}: in `place` its intersection; elsewhere that depends on the board."""
+
+    def target(row: Row) -> Any:
+        return row["target"] if row["spec"]["suite"] == "place" else row["instruction"]
+
+    return {row["instruction"]: target(row) for row in rows}
+
+
+def other_instructions(rows: list[Row]) -> dict[str, str]:
+    """{instruction: another, which asks for something else where there is one}; {} where all ask the same."""
+    targets = named_targets(rows)
+    first, *others = targets.values()
+    if all(other == first for other in others):
+        return {}
+    instructions = sorted(targets)
+
+    def shifted(places: int) -> dict[str, str]:
+        return dict(zip(instructions, instructions[places:] + instructions[:places], strict=True))
+
+    def num_others(given: dict[str, str]) -> int:
+        return sum(targets[instruction] != targets[other] for instruction, other in given.items())
+
+    return max(map(shifted, range(1, len(instructions))), key=num_others)
+
+
 def is_intersection(value: Any) -> bool:
     """Whether a value is [row, column] on the board."""
     return isinstance(value, list) and len(value) == 2 and all(map(is_int(0, BOARD.num_lines - 1), value))

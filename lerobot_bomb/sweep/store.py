@@ -16,6 +16,7 @@ from lerobot_bomb.files import append_line, written_whole
 from lerobot_bomb.sweep.manifest import Cell, Manifest
 
 MAX_ATTEMPTS = 3
+POLL_S = 0.5  # between two looks at what other processes have done
 CELLS, RESULTS, ERRORS = "cells", "results.jsonl", "errors.jsonl"
 
 

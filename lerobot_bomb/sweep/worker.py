@@ -20,9 +20,7 @@ from typing import TextIO
 
 from lerobot_bomb._compat import KeptPolicy
 from lerobot_bomb.sweep.manifest import Cell, Manifest
-from lerobot_bomb.sweep.store import EpisodeError, Store
-
-POLL_S = 0.5
+from lerobot_bomb.sweep.store import POLL_S, EpisodeError, Store
 
 
 class RefusedError(Exception):
