@@ -41,7 +41,7 @@ def check_new_folder(flag: str, path: Path) -> None:
     """Raise a ValueError if there is something at the path that a flag gives."""
     check_link(flag, path)
     if path.exists():
-        raise ValueError(f"{flag}={path} exists already; name a new folder or delete it")
+        raise ValueError(f"{flag}={path} exists already; name a new folder")
 
 
 @contextmanager
