@@ -7,13 +7,15 @@ import pickle
 import re
 import shutil
 import sys
+from argparse import ArgumentParser
 from collections.abc import Callable, Collection, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager, suppress
+from dataclasses import fields
 from functools import partial, wraps
 from pathlib import Path
 from types import SimpleNamespace
-from typing import Any
+from typing import Any, NoReturn, get_origin
 from weakref import ref
 
 import numpy as np
@@ -244,6 +246,55 @@ def _shorten_torchcodec_warning(record: logging.LogRecord) -> bool:
     if NO_TORCHCODEC in record.getMessage():
         record.msg, record.args = NO_TORCHCODEC_IN_SHORT, None
     return True
+
+
+def tell_wrong_flags(
+    hint: Callable[[Sequence[str], Collection[str], Sequence[str]], str],
+    refuse_unknown: Callable[[str, Collection[str], Sequence[str]], NoReturn],
+) -> None:
+    """Let LeRobot's commands say in one line which flag is wrong; doing it again changes nothing.
+
+    Their parser prints hundreds of lines of usage first. `hint(words, flags, argv)` follows on what it says;
+    `refuse_unknown(flag, flags, argv)` raises for a flag that only other types than the chosen one have.
+    """
+    from draccus.parsers import decoding
+    from draccus.wrappers.suppressing_argparse import SuppressingArgumentParser
+
+    def error(self: ArgumentParser, message: str) -> NoReturn:
+        words = message.partition("unrecognized arguments: ")[2].split()
+        flags = _flags_of_chosen_types(self._option_string_actions, sys.argv)
+        self.exit(2, f"{self.prog}: error: {message}{hint(words, flags, sys.argv)}\n")
+
+    usual: Any = getattr(decoding.decode_dataclass, "__wrapped__", decoding.decode_dataclass)
+
+    @wraps(usual)
+    def decode(cls: Any, values: dict[str, Any], path: Sequence[str] = ()) -> Any:
+        names = [each.name for each in fields(get_origin(cls) or cls)]
+        unknown = [name for name in values if name not in names]
+        if path and unknown:  # without a path they are those of a checkpoint's file
+            flag, *flags = [f"--{'.'.join((*path, name))}" for name in (unknown[0], *names)]
+            refuse_unknown(flag, flags, sys.argv)
+        return usual(cls, values, path)
+
+    SuppressingArgumentParser.error = error
+    decoding.decode_dataclass = decode
+
+
+def _flags_of_chosen_types(flags: Collection[str], argv: Sequence[str]) -> list[str]:
+    """LeRobot's parser knows those of all types of environments and policies."""
+    from lerobot.configs import PreTrainedConfig, parser
+    from lerobot.envs import EnvConfig
+
+    left = list(flags)
+    registries: dict[str, Any] = {"env": EnvConfig, "policy": PreTrainedConfig}
+    for group, registry in registries.items():
+        chosen = registry.get_known_choices().get(parser.get_type_arg(group, argv))
+        if chosen is not None:
+            names = {each.name for each in fields(chosen)}
+            left = [
+                flag for flag in left if not flag.startswith(f"--{group}.") or flag.split(".")[1] in names
+            ]
+    return left
 
 
 def resolve_checkpoints(resolve: Callable[[str], str]) -> None:

@@ -210,8 +210,8 @@ def _check_new(kind: str, root: Path, folder: Path) -> None:
         if not (root / METADATA_FILE).is_file():
             raise ValueError(f"--root={root} exists already; name a folder that does not exist yet")
         raise ValueError(
-            f"--root={root} exists already, a finished {kind}: --resume checks that it is this one; for another "
-            "name a folder that does not exist yet, or delete it"
+            f"--root={root} exists already, a finished {kind}: --resume checks that it is this one; for "
+            "another name a folder that does not exist yet, or delete it"
         )
     if folder.exists():
         with lock_folder(folder):
