@@ -11,6 +11,8 @@ from lerobot_bomb.bomb.board import BOARD, COLORS, task_id
 from lerobot_bomb.bomb.episode import PROTOCOL_VERSION, TASK_VERSION, EpisodeSpec, Failure, Stage
 from lerobot_bomb.bomb.observation import CAMERAS, MAX_IMAGE_SIZE, MIN_IMAGE_SIZE, RENDER_PRESETS
 from lerobot_bomb.bomb.perturbations import Condition
+from lerobot_bomb.bomb.suites import SUITES
+from lerobot_bomb.conditions import ALL
 from lerobot_bomb.data.environment import Environment
 from lerobot_bomb.envs.results import Row
 from lerobot_bomb.evaluation.line_checks import (
@@ -253,6 +255,7 @@ BOMB_LINES = ResultKind(
     environment=environment_of_episode,
     eval_flags=eval_flags_of,
     describe_change=_error_change,
+    tasks=(*SUITES, ALL),
     measures=[
         Measure("moves made", _progress, "mean share of an episode's moves"),
         Measure("placement error", _placement_error, "median of the stones that were put down"),

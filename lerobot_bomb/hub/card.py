@@ -156,7 +156,8 @@ class Checkpoint:
 
     def _evaluate(self) -> str:
         flags = self._eval_flags()
-        is_ours = flags is not None and any(f"--env.type={kind.env_type}" in flags for kind in KINDS)
+        writing = [kind for kind in KINDS if kind.has_results_path]
+        is_ours = flags is not None and any(f"--env.type={kind.env_type}" in flags for kind in writing)
         results = ["--env.results_path=results.jsonl"] if is_ours else []
         line = command(
             "lerobot-eval",
