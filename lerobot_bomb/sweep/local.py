@@ -5,6 +5,7 @@ import subprocess
 import sys
 import time
 from collections.abc import Iterator, Sequence
+from pathlib import Path
 from typing import IO
 
 from tqdm import tqdm
@@ -40,6 +41,11 @@ def progress(store: Store, cells: Sequence[Cell]) -> Iterator[bool]:
                 store.merge()
 
 
+def _last_line(path: Path) -> str:
+    lines = path.read_text(errors="replace").strip().splitlines()
+    return lines[-1] if lines else "nothing was said, as on a full disk"
+
+
 def _not_over(store: Store, cells: Sequence[Cell]) -> tuple[list[Cell], int]:
     """Those that are to be played, and how many episodes of the others have been."""
     is_over = {cell: store.is_over(cell) for cell in cells}
@@ -71,7 +77,7 @@ def play(store: Store, part: str, num_workers: int, timeout_s: int | None = None
                 ended = [number for number, worker in enumerate(workers) if worker.poll() is not None]
                 num_ended = len(ended) + (0 if has_played else num_ended)
                 if num_ended > MAX_ENDED * num_workers:
-                    raise RuntimeError(f"workers end before they play; {log} says why")
+                    raise RuntimeError(f"workers end before they play: {_last_line(log)}; see {log}")
                 for number in ended:
                     workers[number] = start(environments[number], output)
                 workers += [start(environment, output) for environment in environments[len(workers) :]]

@@ -97,6 +97,7 @@ class Store:
 
     def finish(self, cell: Cell, lines: list[str], errors: list[EpisodeError]) -> None:
         """Keep a cell's lines, by seed, and what had none."""
+        self.file(cell, "errors").unlink(missing_ok=True)  # of an attempt that could not be written
         if errors:
             with written_whole(self.file(cell, "errors")) as (path,):
                 path.write_text("".join(json.dumps(asdict(error)) + "\n" for error in errors))

@@ -69,14 +69,13 @@ class Worker:
                 except Exception as error:
                     logging.warning("%s: %s; its episodes are played one by one", cell.key, describe(error))
                     lines, errors = self._one_by_one(cell)
+            self._store.finish(cell, lines, errors)
         except RefusedError as error:
             self._store.give_up(cell, str(error))
         except TimeoutError:
             self._store.fail(cell, f"not finished after {self._timeout_s} s (--timeout)")
         except OSError as error:
             self._store.fail(cell, describe(error))
-        else:
-            self._store.finish(cell, lines, errors)
 
     def _one_by_one(self, cell: Cell) -> tuple[list[str], list[EpisodeError]]:
         lines, errors = [], []
