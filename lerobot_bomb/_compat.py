@@ -327,10 +327,10 @@ def tell_wrong_flags(
     usual: Any = getattr(decoding.decode_dataclass, "__wrapped__", decoding.decode_dataclass)
 
     @wraps(usual)
-    def decode(cls: Any, values: dict[str, Any], path: Sequence[str] = ()) -> Any:
+    def decode(cls: Any, values: Any, path: Sequence[str] = ()) -> Any:
         names = [each.name for each in fields(get_origin(cls) or cls)]
-        unknown = [name for name in values if name not in names]
-        if path and unknown:  # without a path they are those of a checkpoint's file
+        unknown = [name for name in values if name not in names] if isinstance(values, dict) else []
+        if path and unknown:  # without a path they are of a checkpoint's file
             flag, *flags = [f"--{'.'.join((*path, name))}" for name in (unknown[0], *names)]
             refuse_unknown(flag, flags, sys.argv)
         return usual(cls, values, path)
