@@ -40,11 +40,15 @@ def hint(words: Sequence[str], flags: Collection[str], argv: Sequence[str]) -> s
 def nearest_flags(word: str, flags: Collection[str]) -> list[str]:
     """Those spelled much like `--GROUP.NAME=VALUE`, of its group where there is such a group."""
     flag = word.partition("=")[0]
-    group, _, name = flag.rpartition(".")
-    names = {other.rpartition(".")[2]: other for other in flags if other.rpartition(".")[0] == group}
+    group = flag.rpartition(".")[0]
+    names = {_name(other): other for other in flags if other.rpartition(".")[0] == group}
     if not names:
         return get_close_matches(flag, flags, n=1)
-    return [names[near] for near in get_close_matches(name, names)]
+    return [names[near] for near in get_close_matches(_name(flag), names)]
+
+
+def _name(flag: str) -> str:
+    return flag.rpartition(".")[2].lstrip("-")
 
 
 def refuse_unknown(flag: str, flags: Collection[str], argv: Sequence[str]) -> NoReturn:
