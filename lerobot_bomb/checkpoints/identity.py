@@ -17,6 +17,7 @@ from lerobot.policies import PreTrainedPolicy
 from lerobot_bomb._compat import built_policies, training_data
 from lerobot_bomb.checkpoints.checks import ADAPTERS
 from lerobot_bomb.checkpoints.names import WEIGHTS
+from lerobot_bomb.checkpoints.queries import time_queries
 from lerobot_bomb.envs.results import PolicyIdentity
 from lerobot_bomb.files import read_json
 
@@ -28,7 +29,7 @@ NOT_ITS_SETTINGS = {
 }  # fmt: skip
 
 
-def acting_policy() -> PolicyIdentity | None:
+def acting_policy() -> PreTrainedPolicy | None:
     """The one policy that this process built and holds; None: there is none, or it may be any of several."""
     if len(built_policies()) > 1:
         gc.collect()  # those that nothing refers to any more; this function must not hold them either
@@ -41,7 +42,7 @@ def acting_policy() -> PolicyIdentity | None:
                 "drop the others before the environment's first reset"
             )
         return None
-    return identity_of(policies[0])
+    return policies[0]
 
 
 def identity_of(policy: PreTrainedPolicy) -> PolicyIdentity:
@@ -53,11 +54,16 @@ def identity_of(policy: PreTrainedPolicy) -> PolicyIdentity:
 
 
 def policy_of_results(results_path: str | None, num_envs: int) -> list[dict[str, PolicyIdentity]]:
-    """Argument of each environment that writes lines of results: the policy, which LeRobot builds later."""
+    """Argument of each environment that writes lines of results: the policy, which LeRobot builds later.
+
+    From now on its queries are timed.
+    """
     policy = None if results_path is None else acting_policy()
     if policy is None:
         return [{}] * num_envs
-    return [{"policy": replace(policy, batch_size=num_envs, batch_row=row)} for row in range(num_envs)]
+    time_queries(policy)
+    identity = identity_of(policy)
+    return [{"policy": replace(identity, batch_size=num_envs, batch_row=row)} for row in range(num_envs)]
 
 
 def weights_file(checkpoint: Path | str, revision: str | None, has_adapters: bool) -> Path | None:

@@ -24,7 +24,7 @@ from lerobot_bomb.conditions import NONE
 from lerobot_bomb.envs.results import ORIGIN, PolicyIdentity, ResultLine, Row
 from lerobot_bomb.envs.rollout import Agent, BatchAgent, one_of_batch
 from lerobot_bomb.evaluation.bomb_lines import spec_of
-from lerobot_bomb.evaluation.result_groups import different_fields
+from lerobot_bomb.evaluation.result_groups import different_fields, outcome
 from lerobot_bomb.evaluation.result_lines import kind_of
 from lerobot_bomb.pusht.episode import PushTSpec
 from lerobot_bomb.viewing.episode import (
@@ -160,7 +160,7 @@ def _compare(row: Row, result: ResultLine) -> int:
     now: Row = json.loads(result.to_json())
     different = different_fields(row, now)
     if not different:
-        print(f"as recorded, bit for bit: {', '.join(name for name in row if name not in ORIGIN)}")
+        print(f"as recorded, bit for bit: {', '.join(outcome(row))}")
         return 0
     first = different[0]
     print(f"not as recorded: {first} was {row[first]!r} and is {now.get(first)!r}")
