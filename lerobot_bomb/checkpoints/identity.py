@@ -15,8 +15,8 @@ from lerobot.configs import PreTrainedConfig
 from lerobot.policies import PreTrainedPolicy
 
 from lerobot_bomb._compat import built_policies, training_data
-from lerobot_bomb.checkpoints.checks import ADAPTERS
-from lerobot_bomb.checkpoints.names import WEIGHTS
+from lerobot_bomb.checkpoints.checks import ADAPTERS, PROCESSORS
+from lerobot_bomb.checkpoints.names import BLANK_IMAGES, REPLACE_TASKS, WEIGHTS
 from lerobot_bomb.checkpoints.queries import time_queries
 from lerobot_bomb.envs.results import PolicyIdentity
 from lerobot_bomb.files import read_json
@@ -94,7 +94,15 @@ def _of_checkpoint(config: PreTrainedConfig) -> PolicyIdentity:
         weights_sha256=None if weights is None else sha256_of(weights),
         settings_sha256=None if weights is None else _settings_sha256(config, weights.parent),
         base=_base(path, revision) if config.use_peft else None,
+        interventions=() if weights is None else _interventions(weights.parent),
     )
+
+
+def _interventions(folder: Path) -> tuple[str, ...]:
+    path = folder / PROCESSORS[0]
+    steps = read_json(path).get("steps", []) if path.is_file() else []
+    names = [step.get("registry_name") for step in steps]
+    return tuple(name for name in names if name in (BLANK_IMAGES, REPLACE_TASKS))
 
 
 def _local_file(checkpoint: Path | str, revision: str | None, name: str) -> Path | None:

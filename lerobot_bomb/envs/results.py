@@ -61,6 +61,7 @@ class PolicyIdentity:
     # of episodes that it acted in at once; a policy's arithmetic rounds otherwise in a batch of another size
     batch_size: int | None = None
     batch_row: int | None = None  # which of them this one was
+    interventions: tuple[str, ...] = ()  # steps of its preprocessor that change on purpose what it is shown
 
 
 # of a line: who played, with which tasks beside, and what simulated; the rest is the episode

@@ -8,9 +8,6 @@ import numpy as np
 from lerobot_bomb.envs.results import Row
 from lerobot_bomb.stats import Measure, measure
 
-BINARY_PREFIXES = ("B", "KiB", "MiB", "GiB", "TiB")
-DECIMAL_PREFIXES = ("", "k", "M", "G")
-
 
 @dataclass(frozen=True)
 class Efficiency:
@@ -59,14 +56,6 @@ def lines(rows: list[Row]) -> list[tuple[str, str, str]]:
         value = ", ".join(f"{name} {of}" for name, of in smooth.items())
         found.append(("smoothness", value, "of the executed actions, per step; less is smoother"))
     return found
-
-
-def scaled(number: float, prefixes: tuple[str, ...], base: int) -> str:
-    """(1_234_567, DECIMAL_PREFIXES, 1000) -> '1.23 M'."""
-    place = 0
-    while number >= base and place < len(prefixes) - 1:
-        number, place = number / base, place + 1
-    return f"{number:.3g} {prefixes[place]}".rstrip()
 
 
 def _note(of: Efficiency) -> str:

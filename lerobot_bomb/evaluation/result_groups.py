@@ -141,6 +141,7 @@ def describe_policy(row: Row) -> str:
     ]
     notes = [*sums, *([f"adapters of {policy['base']}"] if policy["base"] else [])]
     notes += ["in training"] if policy["is_in_training"] else []
+    notes += [f"with {name}" for name in policy.get("interventions", ())]
     words = [policy["type"], *([f"{policy['path']}{revision}"] if policy["path"] else [])]
     return " ".join([*words, *([f"({', '.join(notes)})"] if notes else [])])
 
