@@ -3,7 +3,7 @@
 from collections.abc import Sequence
 from html import escape
 
-from lerobot_bomb.report.tables import Cell, Section, Table
+from lerobot_bomb.report.table import Cell, Section, Table
 
 # one hue, of which only the strength differs: it reads the same for the colour-blind
 SHADE = "background:rgba(0,114,178,{:.2f})"
@@ -19,6 +19,7 @@ th:first-child,td:first-child{text-align:left;position:sticky;left:0;background:
 p.note{opacity:.75;max-width:60rem;font-size:.9rem}
 pre{white-space:pre-wrap;overflow-wrap:anywhere;font-size:.85rem}
 nav a{margin-right:1rem}
+video{display:block;width:20rem;max-width:75vw}
 """
 
 
@@ -55,4 +56,7 @@ def _table(table: Table) -> str:
 
 def _cell(cell: Cell) -> str:
     style = "" if cell.shade is None else f' style="{SHADE.format(cell.shade * MAX_STRENGTH)}"'
-    return f"<td{style}>{escape(cell.text)}</td>"
+    video = (
+        "" if cell.video is None else f'<video controls preload="none" src="{escape(cell.video)}"></video>'
+    )
+    return f"<td{style}>{video}{escape(cell.text)}</td>"
