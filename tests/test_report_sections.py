@@ -12,6 +12,7 @@ import av
 import pytest
 from test_results import ACT, FDVLA, values
 
+from lerobot_bomb import _compat
 from lerobot_bomb.checkpoints.names import REPLACE_TASKS
 from lerobot_bomb.commands.main import main
 from lerobot_bomb.commands.report import NUM_SAMPLES
@@ -187,7 +188,7 @@ def test_each_sampled_failure_has_the_command_that_replays_its_line(
             command, replay, path, line = shlex.split(row["play it again"])
             assert (command, replay) == ("lerobot-bomb", "replay")
             named = json.loads(Path(path).read_text().splitlines()[int(line.removeprefix("--line=")) - 1])
-            assert named in rows
+            assert named in json.loads(json.dumps(rows))
             assert (named["failure"], named["spec"]["seed"]) == (row["failure"], row["seed"])
             assert named["spec"]["perturbations"] == row["condition"]
         assert len({row["play it again"] for row in shown}) == len(shown)
@@ -228,28 +229,32 @@ def test_videos_that_cannot_be_had_are_told_and_are_no_error(
     assert Videos(tmp_path / "out" / "r.html").sources == []
 
 
-def test_failures_are_shown_as_videos_beside_the_page(tmp_path: Path) -> None:
+def test_failures_are_shown_as_videos_beside_the_page(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     from lerobot_bomb.sweep.manifest import plan
     from lerobot_bomb.sweep.store import Store
     from lerobot_bomb.sweep.worker import Worker
 
     flags = ("--env.type=bomb", "--env.image_size=32", "--env.fps=2", "--policy.device=cpu")
+    monkeypatch.setattr(_compat, "_BUILT", [])  # the policies of other tests do not act here
     store = Store(tmp_path / "sweep", plan(("bomb_random",), (), ("none",), 7, 2, 2, flags))
     Worker(store).run(list(store.manifest.cells))
     store.merge()
     results, page = store.folder / "results.jsonl", tmp_path / "a b" / "r.html"
     assert main(["report", str(results), f"--output={page}", "--videos=1"]) == 0
     sources = Videos(page).sources
-    (table,) = next(
-        each["tables"]
-        for each in json.loads(page.with_suffix(".json").read_text())
-        if each["title"] == "Failures to look at"
-    )
+    sections = json.loads(page.with_suffix(".json").read_text())
+    (table,) = next(each["tables"] for each in sections if each["title"] == "Failures to look at")
+    shown = [row for row in columns(table) if row["video"]]
+    assert [row["video"] for row in shown] == sources
     assert len(sources) == len({row["failure"] for row in columns(table)}) >= 1
-    for source in sources:
-        assert source.startswith("r_videos/")
-        with av.open(str(page.parent / source)) as file:
-            assert sum(1 for _ in file.decode(video=0)) == 21  # 20 steps
+    rows = [json.loads(line) for line in results.read_text().splitlines()]
+    for row in shown:
+        assert row["video"].startswith("r_videos/")
+        (steps,) = [each["steps"] for each in rows if each["spec"]["seed"] == row["seed"]]
+        with av.open(str(page.parent / row["video"])) as file:
+            assert sum(1 for _ in file.decode(video=0)) == steps + 1
     assert {path.suffix for path in (page.parent / "r_videos").iterdir()} == {".mp4"}
     assert "not as recorded" not in page.read_text()
 

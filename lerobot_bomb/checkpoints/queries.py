@@ -7,7 +7,7 @@ from functools import wraps
 from pathlib import Path
 from time import perf_counter
 from typing import Any
-from weakref import WeakKeyDictionary
+from weakref import WeakKeyDictionary, WeakSet
 
 import torch
 from lerobot.policies import PreTrainedPolicy
@@ -19,7 +19,7 @@ PROCESS = Path("/proc/self")  # of Linux
 RESET_PEAK = "5"  # that a process' peak memory is counted anew
 
 _CLOCKS: "WeakKeyDictionary[PreTrainedPolicy, _Clock]" = WeakKeyDictionary()
-_TIMED: set[type] = set()  # whose select_action asks for a clock
+_TIMED: WeakSet[Callable[..., Tensor]] = WeakSet()  # those select_action that ask for a clock
 
 
 def time_queries(policy: PreTrainedPolicy) -> None:
@@ -28,8 +28,7 @@ def time_queries(policy: PreTrainedPolicy) -> None:
         return
     _CLOCKS[policy] = _Clock(policy)
     owner: Any = next(each for each in type(policy).__mro__ if "select_action" in vars(each))
-    if owner not in _TIMED:
-        _TIMED.add(owner)
+    if owner.select_action not in _TIMED:
         owner.select_action = _timed(owner.select_action)
 
 
@@ -50,6 +49,7 @@ def _timed(select_action: Callable[..., Tensor]) -> Callable[..., Tensor]:
             return select_action(self, *args, **kwargs)
         return clock.time(self, lambda: select_action(self, *args, **kwargs))
 
+    _TIMED.add(timed)
     return timed
 
 
@@ -86,8 +86,8 @@ class _Clock:
     def _query(self, policy: PreTrainedPolicy, seconds: float) -> Query:
         return Query(
             seconds=seconds,
-            passes=getattr(policy, "last_passes", None),
-            tokens=getattr(policy, "last_tokens", None),
+            passes=_told(policy, "last_passes"),
+            tokens=_told(policy, "last_tokens"),
             num_parameters=self._num_parameters,
             peak_memory_bytes=_peak_memory_bytes(self._device),
             device=self._name,
@@ -103,6 +103,12 @@ def _queue_lengths(policy: PreTrainedPolicy) -> dict[tuple[str, ...], int]:
         elif isinstance(value, dict):
             lengths |= {(name, str(key)): len(of) for key, of in value.items() if isinstance(of, deque)}
     return lengths
+
+
+def _told(policy: PreTrainedPolicy, name: str) -> Any:
+    """What a policy says of its last query; None: it says nothing of the kind."""
+    value = getattr(policy, name, None)
+    return value if type(value) in (int, float) else None
 
 
 def _device_name(device: torch.device) -> str:

@@ -63,12 +63,12 @@ class EpisodeEnv[SpecT: Any, RunT, ResultT: ResultLine](gymnasium.Env[Observatio
     def step(self, action: np.ndarray) -> Transition:
         """Run one control step."""
         run = self._run
-        action = self._check(action)
+        checked = self._check(action)
         if self._last_transition is not None:
             return deepcopy(self._last_transition)
         self._steps += 1
-        self._actions.append(np.array(action))
-        observation, reward, terminated, truncated, info = self._advance(run, action)
+        self._actions.append(np.array(action, dtype=np.float64))
+        observation, reward, terminated, truncated, info = self._advance(run, checked)
         if terminated or truncated:
             self._last_transition = deepcopy((observation, 0.0, terminated, truncated, info))
             if self._results_path is not None:

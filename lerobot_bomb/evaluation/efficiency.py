@@ -6,7 +6,7 @@ from statistics import median
 import numpy as np
 
 from lerobot_bomb.envs.results import Row
-from lerobot_bomb.stats import Measure, measure
+from lerobot_bomb.stats import Measure, bootstrap_interval
 
 
 @dataclass(frozen=True)
@@ -36,13 +36,16 @@ def efficiencies(rows: list[Row]) -> list[Efficiency]:
 
 
 def smoothness_of(rows: list[Row]) -> dict[str, Measure]:
-    """{"J2": ..., "J3": ...}: means over episodes; {} where none says it."""
+    """{"J2": ..., "J3": ...}: every difference of every episode counts the same; {} where no row says it."""
     told = [row for row in rows if row.get("action_j2") is not None and row.get("action_j3") is not None]
-    if not told:
-        return {}
-    episode_E = np.arange(len(told))
-    fields = {"J2": "action_j2", "J3": "action_j3"}
-    return {name: measure(np.array([row[key] for row in told]), episode_E) for name, key in fields.items()}
+    return {f"J{order}": _mean_difference(told, order) for order in (2, 3)} if told else {}
+
+
+def _mean_difference(rows: list[Row], order: int) -> Measure:
+    counts_E = np.array([row["steps"] - order for row in rows])
+    sums_E = counts_E * np.array([row[f"action_j{order}"] for row in rows])
+    interval = bootstrap_interval(sums_E, counts_E) or (None, None)
+    return Measure(float(sums_E.sum() / counts_E.sum()), *interval)
 
 
 def lines(rows: list[Row]) -> list[tuple[str, str, str]]:
