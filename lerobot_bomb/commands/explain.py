@@ -24,7 +24,7 @@ from lerobot_bomb.viewing.episode import Viewed
 if TYPE_CHECKING:
     from lerobot_bomb.explain.episode import ExplainedMoment
     from lerobot_bomb.explain.probes import LayerProbe
-    from lerobot_bomb.report.tables import Section
+    from lerobot_bomb.report.table import Section
     from lerobot_bomb.viewing.checkpoint import LoadedPolicy
 
 DEFAULT_FOLDER = Path("outputs/explain")

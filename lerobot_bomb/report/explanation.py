@@ -15,7 +15,7 @@ from lerobot_bomb.explain.maps import cells, overlay, png_bytes
 from lerobot_bomb.explain.masked_episodes import MaskedEpisode
 from lerobot_bomb.explain.moment import ALL, Restored
 from lerobot_bomb.explain.probes import LayerProbe
-from lerobot_bomb.report.tables import Cell, Section, Table
+from lerobot_bomb.report.table import Cell, Section, Table
 from lerobot_bomb.stats import format_rate
 
 QUESTIONS = ["question", "answer"]
