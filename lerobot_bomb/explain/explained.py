@@ -104,14 +104,15 @@ class PromptExplained(Explained):
 
     def hide(self, rows: Rows, hidden_BS: Tensor) -> Rows:
         rows = {key: value.expand(len(hidden_BS), *value.shape[1:]) for key, value in rows.items()}
+        columns = self.of_part(rows, INSTRUCTION)[0].nonzero()[: hidden_BS.shape[1], 0]  # then padding
         is_hidden_BL = torch.zeros_like(rows["mask"])
-        is_hidden_BL[self.of_part(rows, INSTRUCTION)] = hidden_BS.flatten().to(is_hidden_BL.device)
+        is_hidden_BL[:, columns] = hidden_BS.to(is_hidden_BL.device)
         return rows | {"mask": rows["mask"] & ~is_hidden_BL}
 
     def columns(self, rows: Rows) -> dict[str, Tensor]:
-        """Of one row's prompt, those of each part but start and end."""
+        """Of one row's prompt, those of each part but start and end; without padding and what is hidden."""
         return {
-            name: self.of_part(rows, name)[0].nonzero()[:, 0]
+            name: (self.of_part(rows, name)[0] & rows["mask"][0]).nonzero()[:, 0]
             for name in self._names
             if name not in ("start", "end")
         }

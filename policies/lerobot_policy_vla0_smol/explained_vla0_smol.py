@@ -58,10 +58,8 @@ class ExplainedVla0Smol(PromptExplained):
 
     def places(self, rows: Rows) -> dict[str, Place]:
         """In one pass, from which the padding is taken out."""
-        mask_L = rows["mask"][0]
-        index_L = mask_L.cumsum(dim=0) - 1
-        columns = {name: each[mask_L[each]] for name, each in self.columns(rows).items()}
-        places: dict[str, Place] = {name: (index_L[each],) for name, each in columns.items()}
+        index_L = rows["mask"][0].cumsum(dim=0) - 1
+        places: dict[str, Place] = {name: (index_L[each],) for name, each in self.columns(rows).items()}
         # the prompt's last token predicts the answer's first; rows of one answer have no padding
         return places | {ANSWER: (slice(int(index_L[-1]), None),)}
 
