@@ -6,6 +6,8 @@ from functools import cache
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 from lerobot_bomb.bomb.episode import EpisodeSpec
 from lerobot_bomb.bomb.observation import RenderOptions
 from lerobot_bomb.checkpoints.shipped import checkpoint_path, shipped_names
@@ -19,7 +21,7 @@ from lerobot_bomb.viewing.checkpoint import LoadedPolicy, load_policy
 NAMES = shipped_names()
 SPEC = EpisodeSpec(seed=100_003, target=(1, 3), color="black")
 OPTIONS = RenderOptions(image_size=64)
-STEP = 14  # the stone is in the gripper
+FAR_M = 0.05  # the stone is carried, and where it is to go decides what comes next
 WORKSPACE, WRIST = "observation.images.workspace", "observation.images.wrist"
 
 
@@ -36,7 +38,9 @@ def moment() -> tuple[dict[str, Any], str, dict[str, dict[str, Any]], dict[str, 
     """An observation, its instruction, the masks of its objects, the other instructions."""
     with closing(make_env(SPEC, OPTIONS)) as env:
         for each in play(env, SPEC, expert_agent()):
-            if each.step == STEP:
+            goal = each.state.goals[0]
+            distance_m = np.linalg.norm(each.state.stone_xyz[goal.stone][:2] - goal.xyz[:2])
+            if each.info["stage"] == "lifted" and distance_m > FAR_M:
                 masks = env.get_wrapper_attr("object_masks")()
                 return each.observation, each.instruction, masks, env.get_wrapper_attr("alternatives")()
     raise AssertionError("the episode is shorter")

@@ -75,7 +75,7 @@ class Explained(ABC):
         """
 
     def places(self, rows: Rows) -> dict[str, Place]:
-        """Where in the decoder's sequences a row's images, instruction, state and answer stand.
+        """Where in the decoder's sequences a row's images, instruction, state and answer stand; all of it.
 
         ``instruction`` has a column for each of its tokens. {} where it is not known.
         """
@@ -110,12 +110,9 @@ class PromptExplained(Explained):
         return rows | {"mask": rows["mask"] & ~is_hidden_BL}
 
     def columns(self, rows: Rows) -> dict[str, Tensor]:
-        """Of one row's prompt, those of each part but start and end; without padding and what is hidden."""
-        return {
-            name: (self.of_part(rows, name)[0] & rows["mask"][0]).nonzero()[:, 0]
-            for name in self._names
-            if name not in ("start", "end")
-        }
+        """Of one row's prompt, those of each part; without padding and what is hidden."""
+        mask_L = rows["mask"][0]
+        return {name: (self.of_part(rows, name)[0] & mask_L).nonzero()[:, 0] for name in self._names}
 
 
 def repeated(values: Batch, times: int) -> Batch:
