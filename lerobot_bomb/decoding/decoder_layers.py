@@ -162,8 +162,14 @@ class _Layer:
             )
         # of p = 2 * scale * product / softcap, softcap * tanh(p / 2) is 2 * softcap * sigmoid(p) but for a
         # constant, which softmax does not see; the sigmoid is faster
-        products_ZXC = torch.bmm(query_BVKGE.reshape(len(keys_ZCE), -1, size), keys_ZCE.transpose(1, 2))
-        capped_ZXC = (cast(products_ZXC, torch.float32) * (2 * self._scale / self._softcap)).sigmoid_()
+        scaled_ZXC = torch.baddbmm(
+            keys_ZCE.new_empty(1, 1, 1),  # counts for nothing: a product that is scaled without another pass
+            query_BVKGE.reshape(len(keys_ZCE), -1, size),
+            keys_ZCE.transpose(1, 2),
+            beta=0,
+            alpha=2 * self._scale / self._softcap,
+        )
+        capped_ZXC = cast(scaled_ZXC, torch.float32).sigmoid_()
         capped_BVXC = capped_ZXC.view(batch_size, num_keys, *capped_ZXC.shape[1:])
         scores_BVXC = torch.add(bias_B1XC, capped_BVXC, alpha=2 * self._softcap)
         weights_BVXC = cast(scores_BVXC.softmax(dim=-1), values_ZCE.dtype)
