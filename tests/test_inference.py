@@ -3,10 +3,12 @@
 import gc
 import json
 import time
+from collections import deque
 from collections.abc import Iterator
 from dataclasses import fields
 from math import ceil
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 from weakref import ref
 
@@ -81,6 +83,19 @@ def test_each_call_is_a_query_where_there_is_no_queue_or_one_of_one_action() -> 
     for policy in (ensemble, make_act(n_action_steps=1)):
         time_queries(policy)
         assert asked(policy, ACT_BATCH, 3) == [True] * 3
+
+
+def test_queues_are_attributes_or_stand_in_a_dict_of_them() -> None:
+    policy: Any = SimpleNamespace(
+        _action_queue=deque([1, 2]),
+        _queues={"action": deque([1]), "image": deque(maxlen=2)},
+        other={"a": [1]},
+    )
+    assert queries._queue_lengths(policy) == {
+        ("_action_queue",): 2,
+        ("_queues", "action"): 1,
+        ("_queues", "image"): 0,
+    }
 
 
 def test_our_policies_tell_passes_and_tokens(policy_type: str) -> None:

@@ -12,7 +12,6 @@ import av
 import pytest
 from test_results import ACT, FDVLA, values
 
-from lerobot_bomb import _compat
 from lerobot_bomb.checkpoints.names import REPLACE_TASKS
 from lerobot_bomb.commands.main import main
 from lerobot_bomb.commands.report import NUM_SAMPLES
@@ -232,6 +231,7 @@ def test_videos_that_cannot_be_had_are_told_and_are_no_error(
 def test_failures_are_shown_as_videos_beside_the_page(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
+    from lerobot_bomb import _compat
     from lerobot_bomb.sweep.manifest import plan
     from lerobot_bomb.sweep.store import Store
     from lerobot_bomb.sweep.worker import Worker

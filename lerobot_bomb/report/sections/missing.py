@@ -8,8 +8,7 @@ LANGUAGE = (
     "Language use: no line says that its policy was told another instruction than the episode's (lines of "
     "earlier releases never do). lerobot-bomb audit FOLDER --policy.path=CHECKPOINT plays that on bomb; "
     "report on FOLDER/first/results.jsonl and FOLDER/second/results.jsonl together. Elsewhere: evaluate "
-    "CHECKPOINT and a copy of it with ReplaceTasks (lerobot_bomb.explain.interventions), and report on both "
-    "files."
+    "CHECKPOINT and a copy of it with ReplaceTasks (lerobot_bomb.explain.interventions), and report on both."
 )
 EFFICIENCY = (
     "Efficiency: these lines do not say what queries took, nor how smooth actions were; earlier releases did "
