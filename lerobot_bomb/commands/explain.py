@@ -35,7 +35,6 @@ PAGE, NUMBERS, RECORDING = "explanation.html", "explanation.json", "explanation.
 def add_explain_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the arguments of ``lerobot-bomb explain``."""
     add = parser.add_argument
-    add_checkpoint_arguments(parser, "the checkpoint that is explained", required=True)
     add("--seed", type=int, default=TEST_SEEDS[0], help=f"of the episode (default: {TEST_SEEDS[0]})")
     add(
         "--episodes", type=int, default=1, help="from this seed on; several give a page of means (default: 1)"
@@ -47,6 +46,7 @@ def add_explain_arguments(parser: argparse.ArgumentParser) -> None:
         "--words", action="append", default=[], help="other words of the instruction to hide; may be repeated"
     )
     add_viewed_arguments(parser)
+    add_checkpoint_arguments(parser, "the checkpoint that is explained", required=True)
     add("--output", type=path_flag, default=DEFAULT_FOLDER, help=f"new folder (default: {DEFAULT_FOLDER})")
 
 
