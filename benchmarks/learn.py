@@ -37,7 +37,7 @@ from lerobot_bomb.checkpoints.names import WEIGHTS
 from lerobot_bomb.commands.run import run_command
 from lerobot_bomb.conditions import NONE
 from lerobot_bomb.envs.results import Row
-from lerobot_bomb.evaluation.bomb_lines import PUT_DOWN
+from lerobot_bomb.evaluation.bomb_lines import named_targets, other_instructions, put_down
 from lerobot_bomb.evaluation.results import read_results
 
 PLUGIN = f"lerobot_policy_{PROBE}"  # not installed: LeRobot finds it by --*.discover_packages_path
@@ -119,7 +119,7 @@ def run_claimed(args: argparse.Namespace, task: Task, run: dict[str, Any]) -> in
     minutes = train(folder, run)
 
     results = evaluate_checkpoints(task, folder, args.first_seed, run["steps"])
-    given = other_instructions(results[run["steps"]], task.suite) if task.is_said_at_once else {}
+    given = other_instructions(results[run["steps"]]) if task.is_said_at_once else {}
     controls = evaluate_controls(task, folder, args.first_seed, given)
     minutes_per_step = minutes["cpu_minutes"] / run["steps"]
     points = {f"step {step}": count(rows, step, step * minutes_per_step) for step, rows in results.items()}
@@ -360,35 +360,9 @@ def evaluate(
     return read_results(results)
 
 
-def other_instructions(rows: list[Row], suite: str = PLACE) -> dict[str, str]:
-    """{instruction: that of another target, in other suites than `place` another}; {} where all have one."""
-    targets: dict[str, Any] = named_targets(rows)
-    if suite != PLACE:
-        targets = {instruction: [instruction] for instruction in targets}
-    if len(set(map(tuple, targets.values()))) == 1:
-        return {}
-    instructions = sorted(targets)
-
-    def shifted(places: int) -> dict[str, str]:
-        return dict(zip(instructions, instructions[places:] + instructions[:places], strict=True))
-
-    def num_others(given: dict[str, str]) -> int:
-        return sum(targets[instruction] != targets[other] for instruction, other in given.items())
-
-    return max(map(shifted, range(1, len(instructions))), key=num_others)
-
-
-def named_targets(rows: list[Row]) -> dict[str, list[int]]:
-    """{instruction: the intersection that it names}."""
-    return {row["instruction"]: row["target"] for row in rows}
-
-
 def count_named(rows: list[Row], given: dict[str, str], targets: dict[str, list[int]]) -> int:
     """Stones put down nearest to the intersection that the policy was given."""
-    return sum(
-        row["failure"] in PUT_DOWN and row["nearest_intersection"] == targets[given[row["instruction"]]]
-        for row in rows
-    )
+    return sum(row["nearest_intersection"] == targets[given[row["instruction"]]] for row in put_down(rows))
 
 
 def _children_cpu_s() -> float:

@@ -6,8 +6,9 @@ from recipes import POLICY_TYPES
 
 from lerobot_bomb.bomb.board import COLORS, task_id
 from lerobot_bomb.bomb.perturbations import NUISANCES
+from lerobot_bomb.bomb.suite import templates_of
 from lerobot_bomb.bomb.suites import SUITES
-from lerobot_bomb.bomb.suites.place import targets_of, templates_of
+from lerobot_bomb.bomb.suites.place import TEMPLATES, targets_of
 from lerobot_bomb.conditions import ALL, NONE
 from lerobot_bomb.envs.results import Row
 
@@ -119,7 +120,7 @@ def by_what_is_left_out(rows: list[Row]) -> dict[str, list[Row]]:
         target, color = tuple(row["target"]), row["color"]
         wordings = [
             template.format(color=color, row=target[0], column=target[1])
-            for template in templates_of("heldout")
+            for template in templates_of("heldout", TEMPLATES)
         ]
         left_out = {
             "target left out": target in targets_of("heldout"),

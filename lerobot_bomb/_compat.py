@@ -7,13 +7,15 @@ import pickle
 import re
 import shutil
 import sys
+from argparse import ArgumentParser
 from collections.abc import Callable, Collection, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager, suppress
+from dataclasses import fields
 from functools import partial, wraps
 from pathlib import Path
 from types import SimpleNamespace
-from typing import Any
+from typing import Any, NoReturn, get_origin
 from weakref import ref
 
 import numpy as np
@@ -137,51 +139,110 @@ class KeptPolicy:
 
     def __init__(self) -> None:
         self._asked: object = None
-        self._policy: PreTrainedPolicy | None = None
+        self.policy: PreTrainedPolicy | None = None
         self._random_state: dict[str, Any] = {}
+        self.env_config: Any = None  # LeRobot's, of the last evaluation
         self.has_begun = False  # whether the last evaluation came as far as to play
 
-    def evaluate(self, flags: Sequence[str], asked: object) -> None:
+    def evaluate(self, flags: Sequence[str], asked: object, first: int = 0) -> None:
         """Run lerobot-eval, which draws no video.
 
-        `asked` is equal where it needs the policy of before, built with the same seed.
+        `asked` is equal where it needs the policy of before, built with the same seed. `first` is the number
+        of an episode that is played alone out of a longer evaluation.
         """
         from lerobot.scripts import lerobot_eval
         from lerobot.utils.random_utils import get_rng_state, set_rng_state
 
+        make_env = lerobot_eval.make_env
         make_policy, evaluate_all = lerobot_eval.make_policy, lerobot_eval.eval_policy_all
 
+        def begun(config: Any, **options: Any) -> Any:
+            self.env_config = config
+            envs = make_env(config, **options)
+            if not hasattr(config, "results_path"):  # ours check actions themselves
+                for env in (env for of_group in envs.values() for env in of_group.values()):
+                    _refuse_not_finite(env)
+                    _start_with(env, first)
+            return envs
+
         def kept(**options: Any) -> PreTrainedPolicy:
-            if self._policy is None or self._asked != asked:
-                self._policy = None  # the process then holds one at a time
+            if self.policy is None or self._asked != asked:
+                self.policy = None  # the process then holds one at a time
                 gc.collect()
-                self._policy, self._asked = make_policy(**options), asked
+                self.policy, self._asked = make_policy(**options), asked
                 self._random_state = get_rng_state()
             set_rng_state(self._random_state)
-            return self._policy
+            return self.policy
 
         def without_videos(*args: Any, **options: Any) -> dict[str, Any]:
             self.has_begun = True
             return evaluate_all(*args, **options | {"max_episodes_rendered": 0, "videos_dir": None})
 
         self.has_begun = False
-        _run_lerobot_eval(flags, make_policy=kept, init_logging=lambda: None, eval_policy_all=without_videos)
+        replaced = {"make_env": begun, "make_policy": kept, "eval_policy_all": without_videos}
+        _run_lerobot_eval(flags, init_logging=lambda: None, **replaced)
+
+
+def _refuse_not_finite(env: Any) -> None:
+    """Let a vector env raise an ArithmeticError for such an action; LeRobot's own may end the process."""
+    step = env.step
+
+    def checked(actions: np.ndarray) -> Any:
+        if not np.isfinite(actions).all():
+            raise ArithmeticError("an action of the policy is not finite")
+        return step(actions)
+
+    env.step = checked
+
+
+def _start_with(env: Any, number: int) -> None:
+    """Let LeRobot's LIBERO start in the initial state of this number; it takes the first, then the next."""
+    if any(hasattr(each.unwrapped, "init_state_id") for each in getattr(env, "envs", ())):
+        env.set_attr("init_state_id", [number + row for row in range(env.num_envs)])
+
+
+def eval_config(flags: Sequence[str]) -> Any:
+    """LeRobot's EvalPipelineConfig, as lerobot-eval reads it from these flags.
+
+    Raises:
+        SystemExit: the flags are wrong; its parser has said why.
+    """
+    from lerobot.configs import parser
+    from lerobot.configs.eval import EvalPipelineConfig
+    from lerobot.utils.import_utils import register_third_party_plugins
+
+    def read(config: EvalPipelineConfig) -> EvalPipelineConfig:
+        return config
+
+    register_third_party_plugins()
+    with _argv("lerobot-eval", flags):
+        read_flags: Any = parser.wrap()(read)
+        return read_flags()
 
 
 def _run_lerobot_eval(flags: Sequence[str], **replaced: Any) -> None:
     """In this process, with other functions of these names."""
     from lerobot.scripts import lerobot_eval
 
-    usual, argv = {name: getattr(lerobot_eval, name) for name in replaced}, sys.argv
-    sys.argv = ["lerobot-eval", *flags]  # which LeRobot's parser also reads elsewhere
+    usual = {name: getattr(lerobot_eval, name) for name in replaced}
     try:
         for name, function in replaced.items():
             setattr(lerobot_eval, name, function)
-        lerobot_eval.main()
+        with _argv("lerobot-eval", flags):
+            lerobot_eval.main()
     finally:
-        sys.argv = argv
         for name, function in usual.items():
             setattr(lerobot_eval, name, function)
+
+
+@contextmanager
+def _argv(command: str, flags: Sequence[str]) -> Iterator[None]:
+    """LeRobot's parser reads it in several places."""
+    usual, sys.argv = sys.argv, [command, *flags]
+    try:
+        yield
+    finally:
+        sys.argv = usual
 
 
 def serve_registered_policies(
@@ -244,6 +305,55 @@ def _shorten_torchcodec_warning(record: logging.LogRecord) -> bool:
     if NO_TORCHCODEC in record.getMessage():
         record.msg, record.args = NO_TORCHCODEC_IN_SHORT, None
     return True
+
+
+def tell_wrong_flags(
+    hint: Callable[[Sequence[str], Collection[str], Sequence[str]], str],
+    refuse_unknown: Callable[[str, Collection[str], Sequence[str]], NoReturn],
+) -> None:
+    """Let LeRobot's commands say in one line which flag is wrong; doing it again changes nothing.
+
+    Their parser prints hundreds of lines of usage first. `hint(words, flags, argv)` follows on what it says;
+    `refuse_unknown(flag, flags, argv)` raises for a flag that only other types than the chosen one have.
+    """
+    from draccus.parsers import decoding
+    from draccus.wrappers.suppressing_argparse import SuppressingArgumentParser
+
+    def error(self: ArgumentParser, message: str) -> NoReturn:
+        words = message.partition("unrecognized arguments: ")[2].split()
+        flags = _flags_of_chosen_types(self._option_string_actions, sys.argv)
+        self.exit(2, f"{self.prog}: error: {message}{hint(words, flags, sys.argv)}\n")
+
+    usual: Any = getattr(decoding.decode_dataclass, "__wrapped__", decoding.decode_dataclass)
+
+    @wraps(usual)
+    def decode(cls: Any, values: Any, path: Sequence[str] = ()) -> Any:
+        names = [each.name for each in fields(get_origin(cls) or cls)]
+        unknown = [name for name in values if name not in names] if isinstance(values, dict) else []
+        if path and unknown:  # without a path they are of a checkpoint's file
+            flag, *flags = [f"--{'.'.join((*path, name))}" for name in (unknown[0], *names)]
+            refuse_unknown(flag, flags, sys.argv)
+        return usual(cls, values, path)
+
+    SuppressingArgumentParser.error = error
+    decoding.decode_dataclass = decode
+
+
+def _flags_of_chosen_types(flags: Collection[str], argv: Sequence[str]) -> list[str]:
+    """LeRobot's parser knows those of all types of environments and policies."""
+    from lerobot.configs import PreTrainedConfig, parser
+    from lerobot.envs import EnvConfig
+
+    left = list(flags)
+    registries: dict[str, Any] = {"env": EnvConfig, "policy": PreTrainedConfig}
+    for group, registry in registries.items():
+        chosen = registry.get_known_choices().get(parser.get_type_arg(group, argv))
+        if chosen is not None:
+            names = {each.name for each in fields(chosen)}
+            left = [
+                flag for flag in left if not flag.startswith(f"--{group}.") or flag.split(".")[1] in names
+            ]
+    return left
 
 
 def resolve_checkpoints(resolve: Callable[[str], str]) -> None:

@@ -1,5 +1,6 @@
 """Files that may be damaged, that appear complete, and to which several processes append."""
 
+import errno
 import json
 import os
 import tempfile
@@ -10,6 +11,8 @@ from pathlib import Path
 from typing import Any
 
 from lerobot_bomb.flags import check_link
+
+FULL = (errno.ENOSPC, errno.EDQUOT)  # the disk, or this user's share of it
 
 
 def read_json(path: Path) -> dict[str, Any]:
@@ -41,7 +44,7 @@ def check_new_folder(flag: str, path: Path) -> None:
     """Raise a ValueError if there is something at the path that a flag gives."""
     check_link(flag, path)
     if path.exists():
-        raise ValueError(f"{flag}={path} exists already; name a new folder or delete it")
+        raise ValueError(f"{flag}={path} exists already; name a new folder")
 
 
 @contextmanager
@@ -49,14 +52,26 @@ def written_whole(*paths: Path) -> Iterator[list[Path]]:
     """Give paths to write to; when nothing was raised, what lies there gets the names `paths`.
 
     All lie in one folder, which is made. What a kill leaves is in a hidden folder there.
+
+    Raises:
+        OSError: of a full disk, with the way out; what lay at these paths before is still there.
     """
     folder = paths[0].parent
-    folder.mkdir(parents=True, exist_ok=True)
-    with tempfile.TemporaryDirectory(prefix=".unfinished-", dir=folder) as temporary:
-        unfinished = [Path(temporary) / path.name for path in paths]
-        yield unfinished
-        for source, path in zip(unfinished, paths, strict=True):
-            source.replace(path)
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        with tempfile.TemporaryDirectory(prefix=".unfinished-", dir=folder) as temporary:
+            unfinished = [Path(temporary) / path.name for path in paths]
+            yield unfinished
+            for source, path in zip(unfinished, paths, strict=True):
+                source.replace(path)
+    except OSError as error:
+        if error.errno not in FULL:
+            raise
+        raise OSError(
+            error.errno,
+            f"{', '.join(map(str, paths))} could not be written ({error.strerror}); what was there before "
+            "stays. Make room, and give the same command again",
+        ) from error
 
 
 def append_line(path: Path | str, line: str) -> None:

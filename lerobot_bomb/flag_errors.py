@@ -1,7 +1,9 @@
 """What is wrong with a config, said so that LeRobot's parser passes it on."""
 
-from collections.abc import Iterator, Sequence
+import re
+from collections.abc import Collection, Iterator, Sequence
 from contextlib import contextmanager
+from difflib import get_close_matches
 from typing import NoReturn
 
 from draccus.utils import DecodingError
@@ -20,6 +22,38 @@ class FlagError(DecodingError):
     def strip_prefix(self, prefix: Sequence[str]) -> NoReturn:
         """Draccus asks for it to list what is wrong for every type of a union: a flag is told alone."""
         raise self
+
+
+def hint(words: Sequence[str], flags: Collection[str], argv: Sequence[str]) -> str:
+    """What follows on an error: flags that are spelled much like these words, and how to list all.
+
+    Args:
+        words: what is wrong: --env.tsak=place
+        flags: that there are.
+        argv: all that the command was given; where it names types, --help lists their flags.
+    """
+    near = [flag for word in words if word.startswith("--") for flag in nearest_flags(word, flags)]
+    types = [word for word in argv if re.match(r"--\w+\.type=", word)]
+    return f"; nearest: {', '.join(near)}" * bool(near) + f"; {' '.join([*types, '--help'])} lists all flags"
+
+
+def nearest_flags(word: str, flags: Collection[str]) -> list[str]:
+    """Those spelled much like `--GROUP.NAME=VALUE`, of its group where there is such a group."""
+    flag = word.partition("=")[0]
+    group = flag.rpartition(".")[0]
+    names = {_name(other): other for other in flags if other.rpartition(".")[0] == group}
+    if not names:
+        return get_close_matches(flag, flags, n=1)
+    return [names[near] for near in get_close_matches(_name(flag), names)]
+
+
+def _name(flag: str) -> str:
+    return flag.rpartition(".")[2].lstrip("-")
+
+
+def refuse_unknown(flag: str, flags: Collection[str], argv: Sequence[str]) -> NoReturn:
+    """Raise a FlagError: the type that was chosen has other flags."""
+    raise FlagError(f"{flag} is no flag of this type{hint([flag], flags, argv)}")
 
 
 @contextmanager

@@ -8,7 +8,6 @@ import pytest
 from test_results import values
 
 from lerobot_bomb.commands.arguments import ANSWER_IS_NO
-from lerobot_bomb.commands.audit import other_instructions
 from lerobot_bomb.commands.main import main
 from lerobot_bomb.report.verdicts import (
     AGAIN,
@@ -92,13 +91,6 @@ def test_what_these_episodes_do_not_show_is_left_open(arms: dict[str, Rows]) -> 
 def test_seeds_of_the_training_are_found(arms: dict[str, Rows]) -> None:
     verdict = judge(arms, range(30, 60))[-1]
     assert verdict.answer == NO and verdict.evidence == "trained on seeds 30..59, 10 evaluated"
-
-
-def test_every_instruction_gets_another_s() -> None:
-    given = other_instructions(["a", "b", "a", "c"])
-    assert sorted(given) == sorted(given.values()) == ["a", "b", "c"]
-    assert all(instruction != other for instruction, other in given.items())
-    assert other_instructions(["a", "a"]) == {}
 
 
 @pytest.mark.parametrize(

@@ -11,6 +11,7 @@ from draccus.utils import DecodingError
 from lerobot.utils.import_utils import register_third_party_plugins
 
 from lerobot_bomb.commands import main as cli
+from lerobot_bomb.flag_errors import nearest_flags
 from lerobot_bomb.vlm.backbone import build_backbone
 from lerobot_bomb.vlm.paligemma import build_paligemma
 from lerobot_bomb.vlm.presets import nano_config, nano_paligemma_config, nano_qwen_config
@@ -81,3 +82,41 @@ def test_a_model_that_no_machine_holds_is_refused_before_it_is_built(
     vlm_config[part][name] = value
     with pytest.raises(ValueError, match=f"--policy.vlm_config describes .*{message}"):
         build(vlm_config)
+
+
+@pytest.mark.parametrize(
+    ("flags", "message"),
+    [
+        (
+            ("--env.type=bomb", "--env.tsak=place"),
+            "unrecognized arguments: --env.tsak=place; nearest: --env.task",
+        ),
+        # near one of `bomb`, which this type would refuse
+        (("--env.type=bomb_pusht", "--env.render_presets=fast"), "--env.render_presets=fast; --env.type="),
+        (
+            ("--env.type=bomb_pusht", "--env.render_preset=fast"),
+            "--env.render_preset is no flag of this type",
+        ),
+        (("--env.type=bomb_libero", "--env.image_size=64"), "--env.image_size is no flag of this type"),
+        (("--sed=3", "--env.type=bomb"), "unrecognized arguments: --sed=3; nearest: --seed; "),
+        (("--env.type=bmob",), "argument --env.type: invalid choice: 'bmob'"),
+    ],
+)
+def test_an_unknown_flag_is_one_line_with_the_nearest_and_where_all_are(
+    flags: tuple[str, ...], message: str, stock_cli: Callable[..., None], capsys: pytest.CaptureFixture[str]
+) -> None:
+    with pytest.raises(SystemExit):
+        stock_cli("lerobot-eval", "--policy.type=bomb_random", *flags)
+    errors = [line for line in capsys.readouterr().err.splitlines() if "error: " in line or "usage" in line]
+    assert len(errors) == 1 and message in errors[0]
+    (env_type,) = [flag for flag in flags if flag.startswith("--env.type")]
+    types = sorted(["--policy.type=bomb_random", env_type])
+    assert errors[0].endswith(f"; {types[1]} {types[0]} --help lists all flags")
+
+
+def test_a_flag_of_a_group_is_compared_with_those_of_the_group() -> None:
+    flags = ["--env.task", "--env.fps", "--policy.task", "--seed"]
+    assert nearest_flags("--env.tsk=place", flags) == ["--env.task"]
+    assert nearest_flags("--evn.task", flags) == ["--env.task"]
+    assert nearest_flags("--sede=3", flags) == ["--seed"]
+    assert nearest_flags("--env.zzzzzzz", flags) == []

@@ -82,4 +82,4 @@ def test_a_folder_is_not_written_over(
 ) -> None:
     (tmp_path / "base").mkdir()
     assert main(["init", "--policy.type=vla0_smol", *flags]) == 1
-    assert "exists already; name a new folder or delete it" in capsys.readouterr().err
+    assert "exists already; name a new folder" in capsys.readouterr().err

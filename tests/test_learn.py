@@ -15,8 +15,8 @@ from learning_curve import SUCCESS_BGR, count, draw
 
 from lerobot_bomb.bomb.board import COLORS
 from lerobot_bomb.bomb.episode import EpisodeSpec
-from lerobot_bomb.bomb.suite import specs_of_tasks
-from lerobot_bomb.bomb.suites.place import targets_of, templates_of
+from lerobot_bomb.bomb.suite import specs_of_tasks, templates_of
+from lerobot_bomb.bomb.suites.place import TEMPLATES, targets_of
 from lerobot_bomb.checkpoints.identity import sha256_of
 from lerobot_bomb.commands.main import main as lerobot_bomb
 
@@ -129,15 +129,6 @@ def test_a_stone_counts_where_the_given_instruction_says() -> None:
     assert learn.count_named(rows, {"a": "a", "b": "b"}, targets) == 2
 
 
-def test_the_other_instruction_names_another_target() -> None:
-    targets = {"black 1": [0, 0], "black 2": [0, 1], "white 1": [0, 0], "white 2": [0, 1]}
-    given = learn.other_instructions(
-        [row(None, 1.0, instruction=name, target=at) for name, at in targets.items()]
-    )
-    assert all(targets[instruction] != targets[other] for instruction, other in given.items())
-    assert learn.other_instructions([row(None, 1.0, instruction="only")]) == {}
-
-
 def test_every_policy_type_has_a_recipe_for_every_task() -> None:
     for name, task in learn.TASKS.items():
         for policy_type in task.trainings.keys() - {learn.PROBE}:
@@ -164,7 +155,7 @@ def test_demonstrations_leave_out_targets_wording_and_colours() -> None:
         instruction = template.format(color=color, row=target[0], column=target[1])
         return row(None, 1.0, target=list(target), color=color, instruction=instruction)
 
-    wordings = [templates_of(split)[0] for split in ("train", "heldout")]
+    wordings = [templates_of(split, TEMPLATES)[0] for split in ("train", "heldout")]
     groups = {
         (target, color, wording): next(
             iter(learning_tasks.by_what_is_left_out([asked(target, color, wording)]))
@@ -198,8 +189,9 @@ def test_a_bar_is_of_success_and_of_time() -> None:
 
 def row(failure: str | None, error_mm: float, nearest: tuple[int, int] = (2, 2), **other: Any) -> dict:
     values = {"is_success": failure is None, "failure": failure, "placement_error_mm": error_mm}
+    values |= {"spec": {"suite": "place"}, "nearest_intersection": list(nearest)}
     stage = "placed" if failure is None else "lifted"
-    return {**values, "target": [2, 2], "nearest_intersection": list(nearest), "stage": stage, **other}
+    return {**values, "target": [2, 2], "stage": stage, **other}
 
 
 def test_a_point_counts_grounding_and_precision_apart() -> None:

@@ -86,9 +86,22 @@ def test_a_bad_flag_is_named_with_what_is_allowed(
 def test_an_existing_folder_is_not_overwritten(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     (tmp_path / "x").mkdir()
     assert cli.main([*FLAGS, f"--root={tmp_path / 'x'}"]) == 1
-    assert f"--root={tmp_path / 'x'} exists already" in capsys.readouterr().err
+    message = capsys.readouterr().err
+    assert f"--root={tmp_path / 'x'} exists already; name a folder that does not exist yet" in message
+    assert "delete" not in message
     assert cli.main([*FLAGS, f"--root={tmp_path / 'x'}", "--resume"]) == 1
     assert "holds no meta/bomb.json" in capsys.readouterr().err
+
+
+def test_a_finished_recording_is_told_from_other_folders(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    path = tmp_path / "x" / METADATA_FILE
+    path.parent.mkdir(parents=True)
+    write_json(path, {"recording": RECORDING.to_dict()})
+    assert cli.main([*FLAGS, f"--root={tmp_path / 'x'}"]) == 1
+    message = capsys.readouterr().err
+    assert "exists already, a finished recording: --resume checks that it is this one" in message
 
 
 def test_an_unfinished_recording_needs_resume(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
@@ -104,6 +117,8 @@ def test_a_folder_of_something_else_is_left_alone(tmp_path: Path, capsys: pytest
     folder.mkdir()
     (folder / "mine").touch()
     assert cli.main([*FLAGS, f"--root={tmp_path / 'x'}"]) == 1
+    message = capsys.readouterr().err
+    assert "so it is no recording" in message and "delete" not in message
     assert cli.main([*FLAGS, f"--root={tmp_path / 'x'}", "--resume"]) == 1
     assert f"--resume: {folder} holds no recording.json, so it is no recording" in capsys.readouterr().err
     assert (folder / "mine").exists()

@@ -135,7 +135,7 @@ def test_rates_that_differ_are_told(
         (["--fps=0"], "--fps=0 must be a positive number"),
         (["--fps=nan"], "--fps=nan must be a positive number"),
         (["--json=absent/figures.json"], "--json=absent/figures.json cannot be written"),
-        (["--json=short.jsonl"], "--json=short.jsonl exists already; name a new file or delete it"),
+        (["--json=short.jsonl"], "--json=short.jsonl exists already; name a new file"),
         (["absent.jsonl"], "absent.jsonl: no such file or folder; `lerobot-bomb eval absent.jsonl"),
         (["short.jsonl"], "short.jsonl: no episode has 4 actions"),
         (["three.jsonl"], f"three.jsonl: actions have 3 dims, those of {REPO_ID} 2"),

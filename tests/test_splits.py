@@ -7,7 +7,9 @@ from lerobot.configs.train import TrainPipelineConfig
 from lerobot.datasets import LeRobotDatasetMetadata
 from lerobot.datasets.factory import make_train_eval_datasets
 from lerobot.policies.act.configuration_act import ACTConfig
+from lerobot.utils.constants import HF_LEROBOT_HOME
 
+from lerobot_bomb.checkpoints.training import dataset_of
 from lerobot_bomb.data.record import record
 from lerobot_bomb.data.recording import Recording
 from lerobot_bomb.evaluation.splits import Split, make_split, parse_episodes, trained_episodes
@@ -103,3 +105,9 @@ def test_a_dataset_with_fewer_episodes_than_were_trained_on_is_refused(meta: LeR
     told = {"repo_id": REPO_ID, "root": str(meta.root), "episodes": [4, 5, 6]}
     with pytest.raises(ValueError, match=r"trained on the episodes \[5, 6\] of test/splits, .* only 0\.\.4"):
         trained_episodes({"dataset": told}, meta)
+
+
+def test_a_dataset_without_a_folder_of_its_own_lies_where_lerobot_keeps_it() -> None:
+    assert dataset_of({"dataset": {"repo_id": "me/x", "root": None}}) == HF_LEROBOT_HOME / "me" / "x"
+    assert dataset_of({"dataset": {"repo_id": "me/x", "root": "data/x"}}) == Path("data/x")
+    assert dataset_of({}) is None

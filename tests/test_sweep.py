@@ -222,7 +222,15 @@ def test_a_cell_that_takes_too_long_is_given_up(
         (["--policies=bomb_expert"], "--env.type is missing"),
         (["--policies=bomb_expert", "--env.type=bomb", "--perturbations=fog:3"], "'fog' is not an axis"),
         (["--policies=bomb_expert", "--env.type=bomb", "--perturbations=each:0"], "write each:LEVEL"),
-        (["--policies=bomb_expert", "--env.type=pusht"], "--env.type=pusht writes no lines of results"),
+        (["--policies=bomb_expert", "--env.type=aloha"], "--env.type=aloha has no lines of results"),
+        (
+            ["--policies=act", "--env.type=pusht", "--perturbations=camera:3"],
+            "--env.type=pusht is LeRobot's and has none; --env.type=bomb_pusht has",
+        ),
+        (
+            ["--policies=bomb_expert", "--env.type=bomb", "--tasks=place,plaec"],
+            "--tasks='plaec' is unknown; choose one of: goal, long, object, place, spatial, all",
+        ),
         (["--policies=bomb_expert", "--env.type=bomb", "--episodes=0"], "--episodes=0 must be at least 1"),
         (["--policies=/gone", "--env.type=bomb"], "--policies: /gone is no folder"),
         (["--policies=bomb:fdvl", "--env.type=bomb"], "no checkpoint 'fdvl' comes with this package"),
@@ -287,5 +295,7 @@ def test_lines_of_finished_cells_are_there_before_the_sweep_has_ended(tmp_path: 
     store.finish(first, ["{}"], [])
     next(states)
     assert (tmp_path / "results.jsonl").read_text() == "{}\n"
+    store.file(first, "jsonl").unlink()
+    assert not next(states), "a cell that is over was counted again"
     store.finish(second, ["{}"], [])
     assert list(states) == []

@@ -6,13 +6,12 @@ from hypothesis import strategies as st
 from lerobot_bomb.bomb.board import BOARD, COLORS, TRAY_CENTER_XY, TRAY_HALF_SIZE_XY
 from lerobot_bomb.bomb.episode import EpisodeSpec
 from lerobot_bomb.bomb.go import is_legal_move, is_legal_position
+from lerobot_bomb.bomb.suite import templates_of
 from lerobot_bomb.bomb.suites.place import (
     HELDOUT_TARGETS,
-    HELDOUT_TEMPLATES,
     STONE,
     TEMPLATES,
     targets_of,
-    templates_of,
 )
 from lerobot_env_bomb.model import BOARD_HALF_SIZE_M
 from lerobot_env_bomb.perturb import PerturbedEpisode as Episode
@@ -126,7 +125,8 @@ def test_splits_share_no_intersection_and_no_instruction() -> None:
     assert set(targets_of("train")) | set(HELDOUT_TARGETS) == set(targets_of("all"))
     # training still shows every row and every column
     assert sorted(row for row, _ in HELDOUT_TARGETS) == sorted(column for _, column in HELDOUT_TARGETS)
-    assert not set(templates_of("train")) & set(HELDOUT_TEMPLATES)
+    train, heldout = (templates_of(split, TEMPLATES) for split in ("train", "heldout"))
+    assert train + heldout == templates_of("all", TEMPLATES) == TEMPLATES and len(heldout) == 1
 
 
 @pytest.mark.parametrize("split", ["train", "heldout"])
@@ -135,7 +135,10 @@ def test_a_split_draws_only_its_own(split: str) -> None:
     assert {e.target for e in episodes} <= set(targets_of(split))
     assert all(
         e.instruction
-        in {t.format(color=e.color, row=e.target[0], column=e.target[1]) for t in templates_of(split)}
+        in {
+            t.format(color=e.color, row=e.target[0], column=e.target[1])
+            for t in templates_of(split, TEMPLATES)
+        }
         for e in episodes
         if e.target is not None
     )

@@ -14,7 +14,7 @@ from lerobot_bomb.bomb.go import is_legal_position
 from lerobot_bomb.bomb.layout import Layout, put_on_board
 from lerobot_bomb.bomb.move import Aim, Plan
 from lerobot_bomb.bomb.streams import Stream, generator
-from lerobot_bomb.bomb.suite import Episode, Suite, Turn, of_split, refuse_options
+from lerobot_bomb.bomb.suite import Episode, Suite, Turn, draw_template, refuse_options
 
 type Stones = Mapping[Cell, str]  # (row, column) -> colour of what stands on the board, as it was put there
 
@@ -31,7 +31,6 @@ TRAY_XY_M = tuple((TRAY_CENTER_XY[0], y) for y in (0.0, 0.046, -0.046, 0.092, -0
 NUM_PARTS = 5  # one in so many of what a command can be about is held out
 
 TEMPLATES = ("{Command}.", "Please {command}.", "Your task: {command}.", "Now {command}.")
-HELDOUT_TEMPLATES = TEMPLATES[3:]
 FORMS = (
     ("Could you {command}, please?", "I would like you to {command}."),
     ("What I want the arm to do is to {command}.", "The next thing to do: {command}."),
@@ -116,11 +115,6 @@ def draw_stones(
     return {cell: colors[int(rng.integers(len(colors)))] for cell in draw_cells(rng, number, cells)}
 
 
-def templates_of(split: str) -> tuple[str, ...]:
-    """Instruction templates that a split draws from."""
-    return of_split(split, TEMPLATES, HELDOUT_TEMPLATES)
-
-
 def is_heldout(task_id: int, about: tuple[int, ...]) -> bool:
     """Whether a command is held out; each verb, colour, row, ... of it is seen in others."""
     return (task_id + sum(place * number for place, number in zip(count(1), about))) % NUM_PARTS == 0
@@ -155,8 +149,7 @@ def _sample(tasks: Sequence[Task], spec: EpisodeSpec) -> Episode:
     """Draw verb, board, command and start; the same spec, the same episode."""
     refuse_options(spec, "target", "color")
     task_id, drawn, case = draw_command(tasks, spec)
-    templates = templates_of(spec.split)
-    template = templates[generator(spec.seed, Stream.TEMPLATE).integers(len(templates))]
+    template = draw_template(spec, TEMPLATES)
     return Episode(
         spec=spec,
         task_id=task_id,

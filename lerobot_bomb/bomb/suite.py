@@ -12,6 +12,9 @@ from lerobot_bomb.bomb.go import is_legal_move
 from lerobot_bomb.bomb.layout import Layout
 from lerobot_bomb.bomb.move import Aim, Plan
 from lerobot_bomb.bomb.privileged_state import Goal
+from lerobot_bomb.bomb.streams import Stream, generator
+
+NUM_TRAINED_TEMPLATES = 3  # the first ones of a suite; the others are held out
 
 
 @dataclass(frozen=True)
@@ -98,6 +101,17 @@ def find_suite(name: str) -> Suite:
 def of_split[T](split: str, items: Sequence[T], heldout: Sequence[T]) -> tuple[T, ...]:
     """What a split draws from: those held out, the others, or all."""
     return tuple(item for item in items if split == "all" or (item in heldout) == (split == "heldout"))
+
+
+def templates_of(split: str, templates: Sequence[str]) -> tuple[str, ...]:
+    """Those of a suite's instruction templates that a split draws from."""
+    return of_split(split, templates, templates[NUM_TRAINED_TEMPLATES:])
+
+
+def draw_template(spec: EpisodeSpec, templates: Sequence[str]) -> str:
+    """One of those that the spec's split draws from."""
+    of_spec = templates_of(spec.split, templates)
+    return of_spec[generator(spec.seed, Stream.TEMPLATE).integers(len(of_spec))]
 
 
 def refuse_options(spec: EpisodeSpec, *names: str) -> None:

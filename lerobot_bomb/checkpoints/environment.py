@@ -4,17 +4,14 @@ import copy
 import logging
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 from lerobot.configs import PreTrainedConfig
 from lerobot.policies import PreTrainedPolicy
 
 from lerobot_bomb._compat import built_policies, training_data
-from lerobot_bomb.checkpoints.names import TRAIN_CONFIG
+from lerobot_bomb.checkpoints.training import dataset_of, read_train_config
 from lerobot_bomb.data.environment import IMAGES, Environment
 from lerobot_bomb.data.facts import DatasetFacts
-from lerobot_bomb.data.resumable import default_root
-from lerobot_bomb.files import read_json
 
 logger = logging.getLogger(__name__)
 
@@ -87,11 +84,7 @@ def dataset_of_training(policy: PreTrainedPolicy) -> Path | None:
     meta, path = training_data(policy), policy.config.pretrained_path
     if meta is not None:
         return meta.root
-    config = None if path is None else Path(path) / TRAIN_CONFIG
-    if config is None or not config.is_file():
-        return None
-    dataset: dict[str, Any] = read_json(config)["dataset"]
-    return Path(dataset.get("root") or default_root(dataset["repo_id"]))
+    return None if path is None else dataset_of(read_train_config(Path(path)))
 
 
 def _check(policy: PreTrainedPolicy, who: str, insist: str, here: Environment) -> None:

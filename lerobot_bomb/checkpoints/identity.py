@@ -46,9 +46,13 @@ def acting_policy() -> PolicyIdentity | None:
 
 def identity_of(policy: PreTrainedPolicy) -> PolicyIdentity:
     """Which policy this is."""
-    config = policy.config
     if training_data(policy) is not None:
-        return PolicyIdentity(config.type, is_in_training=True)
+        return PolicyIdentity(policy.config.type, is_in_training=True)
+    return identity_of_config(policy.config)
+
+
+def identity_of_config(config: PreTrainedConfig) -> PolicyIdentity:
+    """Which policy is built from this config."""
     return PolicyIdentity(config.type) if config.pretrained_path is None else _of_checkpoint(config)
 
 

@@ -51,6 +51,15 @@ def add_checkpoint_arguments(parser: argparse.ArgumentParser, help: str, require
     add("--policy.device", dest="policy_device", help="cpu, cuda, ... (default: as the checkpoint says)")
 
 
+def add_file_and_eval_flags(parser: argparse.ArgumentParser, name: str, help: str) -> None:
+    """Declare ``FILE FLAG ...``: a file, and the flags of lerobot-eval, which its own parser reads."""
+    parser.usage = f"lerobot-bomb {name} FILE --policy.path=... --env.type=... (all flags of lerobot-eval)"
+    parser.add_argument("path", type=path_flag, metavar="FILE", help=help)
+    flags = "flags of lerobot-eval"
+    rest = parser.add_argument("flags", nargs=argparse.REMAINDER, metavar="FLAG", help=flags)
+    rest.required = False  # without FILE, argparse would ask for both
+
+
 def add_episode_files_argument(parser: argparse.ArgumentParser, folder: Path) -> None:
     """Declare where an episode's recording and video are written."""
     parser.add_argument(

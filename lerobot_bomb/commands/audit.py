@@ -6,9 +6,11 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from lerobot_bomb.bomb.episode import TEST_SEEDS
+from lerobot_bomb.checkpoints.training import dataset_of, read_train_config
 from lerobot_bomb.commands.arguments import ANSWER_IS_NO, check_at_least, checkpoint_flag, path_flag
 from lerobot_bomb.data.facts import DatasetFacts
 from lerobot_bomb.envs.results import Row
+from lerobot_bomb.evaluation.bomb_lines import other_instructions
 from lerobot_bomb.evaluation.results import read_results
 from lerobot_bomb.files import written_whole
 from lerobot_bomb.report import verdicts
@@ -27,7 +29,7 @@ from lerobot_bomb.report.verdicts import (
     judge,
 )
 from lerobot_bomb.sweep.local import play
-from lerobot_bomb.sweep.manifest import NAME, Cell, Manifest, check_flags, largest_divisor
+from lerobot_bomb.sweep.manifest import Cell, Manifest, check_flags, largest_divisor
 from lerobot_bomb.sweep.store import Store
 from lerobot_bomb.tables import print_table
 
@@ -88,7 +90,7 @@ def _first_arms(args: argparse.Namespace) -> dict[str, Cell]:
 def _second_arms(args: argparse.Namespace, played: list[Row]) -> dict[str, Cell]:
     """Those that need the instructions of the first."""
     arms = {AGAIN: _cell(args, f"--policy.path={args.policy_path}")}
-    others = other_instructions([row["instruction"] for row in played])
+    others = other_instructions(played)
     if others:
         from lerobot_bomb.explain.interventions import ReplaceTasks
 
@@ -104,12 +106,6 @@ def _changed(args: argparse.Namespace, name: str, step: "ProcessorStep") -> str:
     if not folder.is_dir():
         intervene(args.policy_path, [step], folder)
     return f"--policy.path={folder}"
-
-
-def other_instructions(instructions: list[str]) -> dict[str, str]:
-    """{instruction: another's}, each the next one's; {} where all are the same."""
-    given = sorted(set(instructions))
-    return dict(zip(given, given[1:] + given[:1], strict=True)) if len(given) > 1 else {}
 
 
 def _cell(args: argparse.Namespace, policy: str, split: str = "", batch_size: int = MAX_BATCH) -> Cell:
@@ -133,9 +129,7 @@ def _play(args: argparse.Namespace, folder: Path, cells: dict[str, Cell]) -> dic
         RuntimeError: an arm could not be played.
     """
     manifest = Manifest(tuple(cells.values()))
-    if not (folder / NAME).is_file():
-        manifest.write(folder)
-    elif Manifest.read(folder) != manifest:
+    if not manifest.claim(folder):
         raise ValueError(f"{args.folder} is of another audit; name another folder")
     store = Store(folder, manifest)
     store.forget_attempts(manifest.cells)
@@ -148,8 +142,5 @@ def _play(args: argparse.Namespace, folder: Path, cells: dict[str, Cell]) -> dic
 
 
 def _trained_seeds(checkpoint: Path) -> range | None:
-    from lerobot_bomb.evaluation.splits import read_train_config  # LeRobot
-
-    dataset = read_train_config(checkpoint).get("dataset") or {}
-    facts = DatasetFacts.find(dataset.get("root"))
+    facts = DatasetFacts.find(dataset_of(read_train_config(checkpoint)))
     return None if facts is None else facts.seeds

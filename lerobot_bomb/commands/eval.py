@@ -17,7 +17,7 @@ from gymnasium.vector import VectorEnv
 from lerobot.envs import EnvConfig
 
 from lerobot_bomb._compat import lerobot_eval_with
-from lerobot_bomb.commands.arguments import path_flag
+from lerobot_bomb.commands.arguments import add_file_and_eval_flags
 from lerobot_bomb.evaluation.executed import append_episode
 from lerobot_bomb.files import check_writable
 
@@ -65,13 +65,7 @@ class LoggedVectorEnv:
 
 def add_eval_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the arguments of ``lerobot-bomb eval``."""
-    parser.usage = "lerobot-bomb eval FILE --policy.path=... --env.type=... (all flags of lerobot-eval)"
-    parser.add_argument(
-        "path", type=path_flag, metavar="FILE", help="new file: a JSON line per finished episode"
-    )
-    flags = "flags of lerobot-eval"
-    rest = parser.add_argument("flags", nargs=argparse.REMAINDER, metavar="FLAG", help=flags)
-    rest.required = False  # without FILE, argparse would ask for both
+    add_file_and_eval_flags(parser, "eval", "new file: a JSON line per finished episode")
 
 
 def run_eval(args: argparse.Namespace) -> int:

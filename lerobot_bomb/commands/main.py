@@ -18,6 +18,7 @@ COMMANDS = {
     "record": "record the scripted expert as a LeRobotDataset",
     "convert": "published demonstrations as a LeRobotDataset",
     "results": "summarise files written by --env.results_path",
+    "lines": "lines of results of LeRobot's own pusht or libero, from what lerobot-eval wrote",
     "report": "files of results as one page, with tables as JSON and CSV",
     "export": "files of results as a LaTeX table, a model-index and the Hub's .eval_results",
     "sweep": "evaluate policies x tasks x conditions; goes on after a kill",

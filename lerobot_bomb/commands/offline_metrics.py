@@ -9,6 +9,7 @@ from typing import Any
 from lerobot.datasets import LeRobotDatasetMetadata
 
 from lerobot_bomb.checkpoints.folder import read_config
+from lerobot_bomb.checkpoints.training import read_train_config
 from lerobot_bomb.commands.arguments import checkpoint_flag, path_flag
 from lerobot_bomb.data.columns import read_meta
 from lerobot_bomb.data.dataset_files import check_readable
@@ -18,7 +19,6 @@ from lerobot_bomb.evaluation.splits import (
     Split,
     make_split,
     parse_episodes,
-    read_train_config,
     trained_episodes,
 )
 from lerobot_bomb.files import check_writable, written_whole

@@ -79,7 +79,7 @@ def run_smoothness(args: argparse.Namespace) -> int:
 def _check_flags(args: argparse.Namespace) -> None:
     if args.json is not None:
         if args.json.exists():
-            raise ValueError(f"--json={args.json} exists already; name a new file or delete it")
+            raise ValueError(f"--json={args.json} exists already; name a new file")
         check_writable("--json", args.json)
     if args.fps is not None and not 0 < args.fps < math.inf:
         raise ValueError(f"--fps={args.fps:g} must be a positive number of actions a second")

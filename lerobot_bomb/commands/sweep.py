@@ -8,13 +8,14 @@ from typing import Any
 
 from lerobot_bomb.bomb.episode import TEST_SEEDS
 from lerobot_bomb.commands.arguments import check_at_least, parse_conditions, path_flag
-from lerobot_bomb.evaluation.result_lines import KINDS
+from lerobot_bomb.evaluation.result_kind import ResultKind
+from lerobot_bomb.evaluation.result_lines import KIND_OF_ENV
+from lerobot_bomb.flags import one_of
 from lerobot_bomb.sweep.cluster import sbatch_script, submit
 from lerobot_bomb.sweep.local import PYTHON, play, progress
-from lerobot_bomb.sweep.manifest import NAME, Cell, Manifest, parse_part, plan
+from lerobot_bomb.sweep.manifest import NAME, Cell, Manifest, flag_value, parse_part, plan
 from lerobot_bomb.sweep.store import Store
 
-CONDITIONS = {kind.env_type: kind.condition for kind in KINDS}
 MAX_BATCH = 10
 SCRIPT, SUBMITIT = "sweep.sbatch", "submitit"
 
@@ -112,41 +113,49 @@ def _check_jobs(args: argparse.Namespace, cells: list[Cell]) -> None:
 
 def _manifest(args: argparse.Namespace) -> Manifest:
     """The folder's, or a new one."""
-    exists = (args.folder / NAME).is_file()
     if args.policies is None:
-        if not exists:
+        if not (args.folder / NAME).is_file():
             raise ValueError(
                 f"{args.folder} holds no {NAME}: begin a sweep with --policies=... --env.type=..."
             )
         if args.rest or args.tasks or args.perturbations:
             raise ValueError(f"{args.folder / NAME} says what is played; drop {(*args.rest, '--tasks')[0]}")
         return Manifest.read(args.folder)
-    conditions = _expanded(args.perturbations, args.rest)
-    manifest = plan(
-        args.policies, args.tasks, conditions, args.seed, args.episodes, args.batch_size, args.rest
-    )
-    if exists and Manifest.read(args.folder) != manifest:
+    kind = _kind(args.rest)
+    for task in args.tasks:
+        one_of("--tasks", task, kind.tasks)
+    conditions = _expanded(args.perturbations, kind)
+    batch_size = 1 if kind.starts_by_number else args.batch_size
+    manifest = plan(args.policies, args.tasks, conditions, args.seed, args.episodes, batch_size, args.rest)
+    if not manifest.claim(args.folder):
         raise ValueError(
             f"{args.folder / NAME} is of another sweep; name another folder, or go on with that one by "
             f"`lerobot-bomb sweep {args.folder}`"
         )
-    if not exists:
-        manifest.write(args.folder)
     return manifest
 
 
-def _expanded(perturbations: tuple[str, ...], flags: list[str]) -> list[str]:
-    """The conditions, checked for the environment where it has any."""
-    env_type = next((flag.partition("=")[2] for flag in flags if flag.startswith("--env.type=")), None)
+def _kind(flags: list[str]) -> ResultKind:
+    """Of the environment that the flags name."""
+    env_type = flag_value(flags, "--env.type")
     if env_type is None:
-        raise ValueError(f"--env.type is missing: {', '.join(CONDITIONS)}")
-    if env_type not in CONDITIONS:
+        raise ValueError(f"--env.type is missing: {', '.join(KIND_OF_ENV)}")
+    if env_type not in KIND_OF_ENV:
         raise ValueError(
-            f"--env.type={env_type} writes no lines of results, which a sweep is made of; "
-            f"those that do: {', '.join(CONDITIONS)}"
+            f"--env.type={env_type} has no lines of results, which a sweep is made of; those that have: "
+            f"{', '.join(KIND_OF_ENV)}"
         )
-    of_env = CONDITIONS[env_type]
-    return [str(of_env.parse(text)) for text in of_env.expand(perturbations)]
+    return KIND_OF_ENV[env_type]
+
+
+def _expanded(perturbations: tuple[str, ...], kind: ResultKind) -> list[str]:
+    """The conditions, checked for the environment."""
+    if perturbations and not kind.condition.axes:
+        raise ValueError(
+            f"--perturbations={','.join(perturbations)}: --env.type={kind.env_type} is LeRobot's and has "
+            f"none; --env.type=bomb_{kind.env_type} has"
+        )
+    return [str(kind.condition.parse(text)) for text in kind.condition.expand(perturbations)]
 
 
 def _job_command(args: argparse.Namespace) -> list[str]:

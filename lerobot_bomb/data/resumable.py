@@ -192,14 +192,7 @@ def check_folders(parameters: Parameters, root: Path, folder: Path, resume: bool
     kind = parameters.kind
     check_link("--root", root)
     if not resume:
-        if root.exists():
-            raise ValueError(
-                f"--root={root} exists already; name a folder that does not exist yet, or delete it"
-            )
-        if folder.exists():
-            with lock_folder(folder):
-                if {path.name for path in folder.iterdir()} - {LOCK_FILE}:
-                    raise ValueError(f"{folder} holds an unfinished {kind}; go on with --resume or delete it")
+        _check_new(kind, root, folder)
     elif not root.exists() and not folder.exists():
         raise ValueError(
             f"--resume: there is no {kind} to go on with in --root={root}; begin it without --resume"
@@ -209,6 +202,28 @@ def check_folders(parameters: Parameters, root: Path, folder: Path, resume: bool
     else:
         path = root / METADATA_FILE if root.exists() else parameters_file(folder)
         _check_same(parameters, path, root if root.exists() else folder)
+
+
+def _check_new(kind: str, root: Path, folder: Path) -> None:
+    """Refuse what is in the way; to delete it is advised only where it is ours."""
+    if root.exists():
+        if not (root / METADATA_FILE).is_file():
+            raise ValueError(f"--root={root} exists already; name a folder that does not exist yet")
+        raise ValueError(
+            f"--root={root} exists already, a finished {kind}: --resume checks that it is this one; for "
+            "another name a folder that does not exist yet, or delete it"
+        )
+    if folder.exists():
+        with lock_folder(folder):
+            there = {path.name for path in folder.iterdir()} - {LOCK_FILE}
+        path = parameters_file(folder)
+        if there & {path.name, path.with_suffix(".tmp").name}:
+            raise ValueError(f"{folder} holds an unfinished {kind}; go on with --resume or delete it")
+        if there:
+            raise ValueError(
+                f"{folder} holds no {path.name}, so it is no {kind}, but it is where one would grow; give "
+                "another --root"
+            )
 
 
 def _check_same(parameters: Parameters, path: Path, where: Path) -> None:

@@ -11,6 +11,8 @@ from lerobot_bomb.bomb.board import BOARD, COLORS, task_id
 from lerobot_bomb.bomb.episode import PROTOCOL_VERSION, TASK_VERSION, EpisodeSpec, Failure, Stage
 from lerobot_bomb.bomb.observation import CAMERAS, MAX_IMAGE_SIZE, MIN_IMAGE_SIZE, RENDER_PRESETS
 from lerobot_bomb.bomb.perturbations import Condition
+from lerobot_bomb.bomb.suites import SUITES
+from lerobot_bomb.conditions import ALL
 from lerobot_bomb.data.environment import Environment
 from lerobot_bomb.envs.results import Row
 from lerobot_bomb.evaluation.line_checks import (
@@ -49,6 +51,32 @@ def put_down(rows: list[Row]) -> list[Row]:
 def is_grounded(row: Row) -> bool:
     """Whether the stone, put down on the board, lies nearest to the intersection that was named."""
     return row["nearest_intersection"] == row["target"]
+
+
+def named_targets(rows: list[Row]) -> dict[str, Any]:
+    """{instruction: what it asks for}: in `place` its intersection; elsewhere that depends on the board."""
+
+    def target(row: Row) -> Any:
+        return row["target"] if row["spec"]["suite"] == "place" else row["instruction"]
+
+    return {row["instruction"]: target(row) for row in rows}
+
+
+def other_instructions(rows: list[Row]) -> dict[str, str]:
+    """{instruction: another, which asks for something else where there is one}; {} where all ask the same."""
+    targets = named_targets(rows)
+    first, *others = targets.values()
+    if all(other == first for other in others):
+        return {}
+    instructions = sorted(targets)
+
+    def shifted(places: int) -> dict[str, str]:
+        return dict(zip(instructions, instructions[places:] + instructions[:places], strict=True))
+
+    def num_others(given: dict[str, str]) -> int:
+        return sum(targets[instruction] != targets[other] for instruction, other in given.items())
+
+    return max(map(shifted, range(1, len(instructions))), key=num_others)
 
 
 def is_intersection(value: Any) -> bool:
@@ -227,6 +255,7 @@ BOMB_LINES = ResultKind(
     environment=environment_of_episode,
     eval_flags=eval_flags_of,
     describe_change=_error_change,
+    tasks=(*SUITES, ALL),
     measures=[
         Measure("moves made", _progress, "mean share of an episode's moves"),
         Measure("placement error", _placement_error, "median of the stones that were put down"),

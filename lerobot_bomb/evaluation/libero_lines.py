@@ -12,6 +12,7 @@ from lerobot_bomb.evaluation.line_checks import (
     or_none,
 )
 from lerobot_bomb.evaluation.result_kind import ResultKind, describe_numbers, describe_versions
+from lerobot_bomb.libero.assets import SUITES
 from lerobot_bomb.libero.episode import LIBERO_PROTOCOL_VERSION, LiberoFailure, LiberoSpec
 from lerobot_bomb.libero.perturbations import LiberoCondition
 
@@ -91,4 +92,5 @@ LIBERO_LINES = ResultKind(
     environment=lambda row: None,
     eval_flags=_eval_flags,
     measures=(),
+    tasks=SUITES,
 )

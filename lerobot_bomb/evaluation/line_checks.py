@@ -26,9 +26,14 @@ def is_text(value: Any) -> bool:
     return isinstance(value, str)
 
 
+def is_number(value: Any) -> bool:
+    """Whether a value is a finite number."""
+    return type(value) in (int, float) and math.isfinite(value)
+
+
 def is_quantity(value: Any) -> bool:
     """Whether a value is a finite number, not negative."""
-    return type(value) in (int, float) and math.isfinite(value) and value >= 0
+    return is_number(value) and value >= 0
 
 
 def is_share(value: Any) -> bool:

@@ -11,13 +11,20 @@ from lerobot_bomb.evaluation.line_checks import (
     Check,
     is_bool,
     is_int,
+    is_number,
     is_one_of,
     is_quantity,
     is_table_of,
     is_text,
     or_none,
 )
-from lerobot_bomb.evaluation.result_kind import Measure, Pair, ResultKind, describe_versions
+from lerobot_bomb.evaluation.result_kind import (
+    Measure,
+    Pair,
+    ResultKind,
+    describe_versions,
+    mean_with_interval,
+)
 from lerobot_bomb.pusht.episode import (
     MAX_IMAGE_SIZE,
     MIN_IMAGE_SIZE,
@@ -26,7 +33,7 @@ from lerobot_bomb.pusht.episode import (
     PushTSpec,
 )
 from lerobot_bomb.pusht.perturbations import PushTCondition
-from lerobot_bomb.stats import bca_interval, bootstrap_interval, format_bounds
+from lerobot_bomb.stats import bca_interval, format_bounds
 
 
 def is_share(value: Any) -> bool:
@@ -36,7 +43,7 @@ def is_share(value: Any) -> bool:
 
 def is_pose(value: Any) -> bool:
     """Whether a value is [x, y, angle]."""
-    return isinstance(value, list) and len(value) == 3 and all(is_quantity(abs(number)) for number in value)
+    return isinstance(value, list) and len(value) == 3 and all(map(is_number, value))
 
 
 PUSHT_SPEC_CHECKS: dict[str, Check] = {  # the rest is PushTSpec's own
@@ -78,11 +85,6 @@ def _values(rows: list[Row], name: str) -> np.ndarray:
     return np.array([row[name] for row in rows])
 
 
-def _mean(rows: list[Row], name: str) -> str:
-    values = _values(rows, name)
-    return f"{values.mean():.3f}{format_bounds(bootstrap_interval(values, np.ones(len(values))), '.3f')}"
-
-
 def _coverage_change(pairs: list[Pair]) -> str:
     """'max coverage -0.120 [-0.200, -0.040]': the mean change of (unperturbed, perturbed) pairs."""
     before, after = (_values(rows, "max_coverage") for rows in map(list, zip(*pairs, strict=True)))
@@ -106,10 +108,11 @@ PUSHT_LINES = ResultKind(
     measures=[
         Measure(
             "max coverage",
-            partial(_mean, name="max_coverage"),
+            partial(mean_with_interval, name="max_coverage"),
             "mean, 95 % bootstrap interval over episodes",
         ),
-        Measure("final coverage", partial(_mean, name="coverage")),
+        Measure("final coverage", partial(mean_with_interval, name="coverage")),
     ],
     describe_change=_coverage_change,
+    tasks=("pusht",),
 )

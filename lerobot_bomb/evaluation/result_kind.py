@@ -3,10 +3,13 @@
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 
+import numpy as np
+
 from lerobot_bomb.conditions import AxisCondition
 from lerobot_bomb.data.environment import Environment
 from lerobot_bomb.envs.results import Row
 from lerobot_bomb.evaluation.line_checks import Check, check_fields, refuse_others
+from lerobot_bomb.stats import bootstrap_interval, format_bounds
 
 NOT_RECORDED = "not recorded"
 NO_VALUE = "-"  # of a measure that these episodes do not have
@@ -55,6 +58,10 @@ class ResultKind:
 
     # what lines of earlier releases do not have
     added_fields: Mapping[str, Check] = field(default_factory=dict)
+    tasks: Sequence[str] = ()  # values of --env.task
+    has_results_path: bool = True  # lerobot-eval writes the lines, with --env.results_path
+    # an episode's number in its evaluation chooses how it starts, not its seed: in batches of one
+    starts_by_number: bool = False
 
     def check(self, row: Row) -> None:
         """Raise a ValueError that names a field of a line which is missing or impossible."""
@@ -72,6 +79,12 @@ class ResultKind:
         """Of lines of the newest protocol, what those of another version do not have."""
         *_, newest = self.fields.values()
         return [name for name in newest if name not in self.fields[version]]
+
+
+def mean_with_interval(rows: list[Row], name: str) -> str:
+    """'0.440 [0.210, 0.670]' of a field: with a 95 % bootstrap interval over episodes."""
+    values = np.array([row[name] for row in rows])
+    return f"{values.mean():.3f}{format_bounds(bootstrap_interval(values, np.ones(len(values))), '.3f')}"
 
 
 def describe_versions(row: Row) -> str:

@@ -17,8 +17,10 @@ from lerobot_bomb.evaluation.line_checks import (
 )
 from lerobot_bomb.evaluation.pusht_lines import PUSHT_LINES
 from lerobot_bomb.evaluation.result_kind import ResultKind
+from lerobot_bomb.evaluation.stock_lines import STOCK_LIBERO_LINES, STOCK_PUSHT_LINES
 
-KINDS = (BOMB_LINES, PUSHT_LINES, LIBERO_LINES)
+KINDS = (BOMB_LINES, PUSHT_LINES, LIBERO_LINES, STOCK_PUSHT_LINES, STOCK_LIBERO_LINES)
+KIND_OF_ENV = {kind.env_type: kind for kind in KINDS}
 KIND_OF_VERSION = {version: kind for kind in KINDS for version in kind.fields}
 
 POLICY_CHECKS: dict[str, Check] = {

@@ -3,14 +3,11 @@
 import math
 import re
 from dataclasses import dataclass
-from pathlib import Path
 from typing import Any
 
 from lerobot.datasets import LeRobotDatasetMetadata
-from lerobot.utils.constants import HF_LEROBOT_HOME
 
-from lerobot_bomb.checkpoints.names import TRAIN_CONFIG
-from lerobot_bomb.files import read_json
+from lerobot_bomb.checkpoints.training import dataset_of
 
 
 @dataclass(frozen=True)
@@ -41,19 +38,14 @@ def parse_episodes(flag: str, text: str, num_episodes: int) -> list[int]:
     return sorted(episodes)
 
 
-def read_train_config(checkpoint: Path) -> dict[str, Any]:
-    """What lerobot-train was given; empty if the checkpoint does not say."""
-    path = checkpoint / TRAIN_CONFIG
-    return read_json(path) if path.is_file() else {}
-
-
 def trained_episodes(train_config: dict[str, Any], meta: LeRobotDatasetMetadata) -> list[int] | None:
     """Episodes of this dataset that lerobot-train trained on; None if it trained on another dataset.
 
     With `dataset.eval_split` LeRobot keeps the last ones of every task for itself.
     """
-    dataset = train_config.get("dataset") or {}
-    root = Path(dataset.get("root") or HF_LEROBOT_HOME / str(dataset.get("repo_id")))
+    dataset, root = train_config.get("dataset") or {}, dataset_of(train_config)
+    if root is None:
+        return None
     moved = not root.is_dir()  # a checkpoint of another machine names that machine's folder
     if dataset.get("repo_id") != meta.repo_id or not (moved or root.resolve() == meta.root.resolve()):
         return None

@@ -27,6 +27,13 @@ from lerobot_bomb.flags import one_of
 # float32 noisy actions (B, K, D) and tau (B,) -> velocity and noise (B, K, D), None for a missing head
 Heads = Callable[[Tensor, Tensor], tuple[Tensor | None, Tensor | None]]
 
+# defaults, of the flags of policies too
+SAMPLER, SOLVER = "residual", "euler"
+NUM_INFERENCE_STEPS = 10
+REFINE_ALPHA = 0.3
+DENOISE_TAU_MIN = 0.02
+CLIP_SAMPLE_RANGE = 5.0
+
 BOTH = ("flow", "denoise")
 # the heads that each reads
 SAMPLERS = {"residual": BOTH, "flow": ("flow",), "ddim": ("denoise",), "sde": BOTH, "paper": BOTH}
@@ -93,12 +100,12 @@ def sample(
     heads: Heads,
     noise_BKD: Tensor,
     *,
-    sampler: str = "residual",
-    solver: str = "euler",
-    num_inference_steps: int = 10,
-    refine_alpha: float = 0.3,
-    denoise_tau_min: float = 0.02,
-    clip_sample_range: float = 5.0,
+    sampler: str = SAMPLER,
+    solver: str = SOLVER,
+    num_inference_steps: int = NUM_INFERENCE_STEPS,
+    refine_alpha: float = REFINE_ALPHA,
+    denoise_tau_min: float = DENOISE_TAU_MIN,
+    clip_sample_range: float = CLIP_SAMPLE_RANGE,
     step_noise_BNKD: Tensor | None = None,
 ) -> Tensor:
     """Noise of N(0, I) -> normalised actions (B, K, D), float32 whatever the heads compute in.

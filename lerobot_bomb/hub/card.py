@@ -21,7 +21,7 @@ from lerobot_bomb.hub.evaluations import model_index
 from lerobot_bomb.hub.markdown import command, fenced
 from lerobot_bomb.hub.method import Method
 from lerobot_bomb.hub.training import peft_flags, train_command
-from lerobot_bomb.stats import wilson_interval
+from lerobot_bomb.stats import format_rate
 from lerobot_bomb.vlm.tokenizer import NANO
 
 NO_REPO_ID = "USER/NAME"
@@ -156,7 +156,8 @@ class Checkpoint:
 
     def _evaluate(self) -> str:
         flags = self._eval_flags()
-        is_ours = flags is not None and any(f"--env.type={kind.env_type}" in flags for kind in KINDS)
+        writing = [kind for kind in KINDS if kind.has_results_path]
+        is_ours = flags is not None and any(f"--env.type={kind.env_type}" in flags for kind in writing)
         results = ["--env.results_path=results.jsonl"] if is_ours else []
         line = command(
             "lerobot-eval",
@@ -259,7 +260,7 @@ def results_table(group: Group) -> str:
         f"{measure.name} ({measure.note})" if measure.note else measure.name
         for measure in group.kind.measures
     ]
-    columns = ["condition", "n", "successes", "success rate", "95 % Wilson interval", *measures, "failures"]
+    columns = ["condition", "success (95 % Wilson interval)", *measures, "failures"]
     lines = [
         f"{group.kind.describe_tasks(group.rows)}; {'; '.join(settings)}:",
         "",
@@ -268,9 +269,7 @@ def results_table(group: Group) -> str:
     ]
     for condition, rows in by_condition(group.rows).items():
         summary = summarise(rows)
-        n, successes = summary.num_episodes, summary.num_successes
-        low, high = (100 * bound for bound in wilson_interval(successes, n))
-        rate = f"{100 * successes / n:.1f} % | {low:.1f} to {high:.1f} %"
-        cells = [f"perturbations={condition}", str(n), str(successes), rate, *summary.measures.values()]
+        rate = format_rate(summary.num_successes, summary.num_episodes)
+        cells = [f"perturbations={condition}", rate, *summary.measures.values()]
         lines.append(f"| {' | '.join([*cells, summary.describe_failures()])} |")
     return "\n".join(lines)

@@ -5,17 +5,17 @@ import subprocess
 import sys
 import time
 from collections.abc import Iterator, Sequence
+from pathlib import Path
 from typing import IO
 
 from tqdm import tqdm
 
 from lerobot_bomb.sweep.manifest import Cell
 from lerobot_bomb.sweep.processes import num_cores, visible_gpus, worker_environments
-from lerobot_bomb.sweep.store import Store
+from lerobot_bomb.sweep.store import POLL_S, Store
 
 # -P: nothing in the folder that the user is in stands for a module of the same name
 PYTHON = (sys.executable, "-P", "-m")
-POLL_S = 0.5
 MAX_ENDED = 3
 
 
@@ -25,17 +25,32 @@ def progress(store: Store, cells: Sequence[Cell]) -> Iterator[bool]:
     The lines of cells that have been finished are merged, whatever ends this process later.
     """
     total = sum(cell.num_episodes for cell in cells)
-    has_played, num_finished = False, 0
-    with tqdm(total=total, initial=store.num_played(cells), unit=" episodes") as bar:
-        while not all(store.is_over(cell) for cell in cells):
+    left, num_before = _not_over(store, cells)  # what is over is not read again
+    has_played, num_unmerged = False, len(cells)
+    with tqdm(total=total, initial=num_before + store.num_played(left), unit=" episodes") as bar:
+        while left:
             yield has_played
             time.sleep(POLL_S)
-            more = store.num_played(cells) - bar.n
+            left, num_more = _not_over(store, left)
+            num_before += num_more
+            more = num_before + store.num_played(left) - bar.n
             if has_played := more != 0:
                 bar.update(more)
-            if (finished := sum(map(store.is_finished, cells))) != num_finished:
-                num_finished = finished
+            if len(left) != num_unmerged:
+                num_unmerged = len(left)
                 store.merge()
+
+
+def _last_line(path: Path) -> str:
+    lines = path.read_text(errors="replace").strip().splitlines()
+    return lines[-1] if lines else "nothing was said, as on a full disk"
+
+
+def _not_over(store: Store, cells: Sequence[Cell]) -> tuple[list[Cell], int]:
+    """Those that are to be played, and how many episodes of the others have been."""
+    is_over = {cell: store.is_over(cell) for cell in cells}
+    over = [cell for cell in cells if is_over[cell]]
+    return [cell for cell in cells if not is_over[cell]], store.num_played(over)
 
 
 def play(store: Store, part: str, num_workers: int, timeout_s: int | None = None) -> None:
@@ -62,7 +77,7 @@ def play(store: Store, part: str, num_workers: int, timeout_s: int | None = None
                 ended = [number for number, worker in enumerate(workers) if worker.poll() is not None]
                 num_ended = len(ended) + (0 if has_played else num_ended)
                 if num_ended > MAX_ENDED * num_workers:
-                    raise RuntimeError(f"workers end before they play; {log} says why")
+                    raise RuntimeError(f"workers end before they play: {_last_line(log)}; see {log}")
                 for number in ended:
                     workers[number] = start(environments[number], output)
                 workers += [start(environment, output) for environment in environments[len(workers) :]]

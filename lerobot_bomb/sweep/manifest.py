@@ -50,6 +50,11 @@ class Cell:
         digest = hashlib.sha256(json.dumps(self.flags).encode()).hexdigest()
         return f"{readable[-60:].strip('-')}-{self.seed}-{digest[:8]}"
 
+    @property
+    def env_type(self) -> str:
+        """Of LeRobot's environments; '' where its flags name none."""
+        return flag_value(self.env, "--env.type") or ""
+
     def episode(self, number: int) -> "Cell":
         """One of its episodes, alone."""
         return Cell(self.policy, self.env, self.seed + number, 1, 1)
@@ -79,6 +84,16 @@ class Manifest:
         cells = [vars(cell) | {"command": cell.command} for cell in self.cells]
         with written_whole(folder / NAME) as (path,):
             path.write_text(json.dumps({"version": VERSION, "cells": cells}, indent=1) + "\n")
+
+    def claim(self, folder: Path) -> bool:
+        """Write it to a folder, unless one is there; whether that of the folder now is this.
+
+        Raises:
+            ValueError: the one that is there is damaged, or of another version of this package.
+        """
+        if not (folder / NAME).is_file():
+            self.write(folder)
+        return Manifest.read(folder) == self
 
     @classmethod
     def read(cls, folder: Path) -> "Manifest":
@@ -130,6 +145,11 @@ def parse_part(text: str) -> tuple[int, int]:
     if not (first.isdigit() and number.isdigit() and int(first) < int(number)):
         raise ValueError(f"{text} must be PART/PARTS, the parts counted from 0: 0/4 to 3/4")
     return int(first), int(number)
+
+
+def flag_value(flags: Sequence[str], name: str) -> str | None:
+    """'bomb' of '--env.type=bomb'; None: it is not among them."""
+    return next((flag.partition("=")[2] for flag in flags if flag.startswith(f"{name}=")), None)
 
 
 def check_flags(flags: Sequence[str]) -> None:

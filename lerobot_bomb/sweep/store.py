@@ -16,6 +16,7 @@ from lerobot_bomb.files import append_line, written_whole
 from lerobot_bomb.sweep.manifest import Cell, Manifest
 
 MAX_ATTEMPTS = 3
+POLL_S = 0.5  # between two looks at what other processes have done
 CELLS, RESULTS, ERRORS = "cells", "results.jsonl", "errors.jsonl"
 
 
@@ -96,6 +97,7 @@ class Store:
 
     def finish(self, cell: Cell, lines: list[str], errors: list[EpisodeError]) -> None:
         """Keep a cell's lines, by seed, and what had none."""
+        self.file(cell, "errors").unlink(missing_ok=True)  # of an attempt that could not be written
         if errors:
             with written_whole(self.file(cell, "errors")) as (path,):
                 path.write_text("".join(json.dumps(asdict(error)) + "\n" for error in errors))

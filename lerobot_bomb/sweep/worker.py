@@ -18,11 +18,16 @@ from contextlib import contextmanager, redirect_stderr
 from pathlib import Path
 from typing import TextIO
 
-from lerobot_bomb._compat import KeptPolicy
-from lerobot_bomb.sweep.manifest import Cell, Manifest
-from lerobot_bomb.sweep.store import EpisodeError, Store
+from lerobot.envs.configs import LiberoEnv
 
-POLL_S = 0.5
+from lerobot_bomb._compat import KeptPolicy
+from lerobot_bomb.checkpoints.identity import identity_of
+from lerobot_bomb.evaluation.eval_info import EVAL_INFO, results_of
+from lerobot_bomb.evaluation.result_lines import KIND_OF_ENV
+from lerobot_bomb.files import read_json
+from lerobot_bomb.libero.assets import prepare_libero
+from lerobot_bomb.sweep.manifest import Cell, Manifest, flag_value
+from lerobot_bomb.sweep.store import POLL_S, EpisodeError, Store
 
 
 class RefusedError(Exception):
@@ -64,14 +69,13 @@ class Worker:
                 except Exception as error:
                     logging.warning("%s: %s; its episodes are played one by one", cell.key, describe(error))
                     lines, errors = self._one_by_one(cell)
+            self._store.finish(cell, lines, errors)
         except RefusedError as error:
             self._store.give_up(cell, str(error))
         except TimeoutError:
             self._store.fail(cell, f"not finished after {self._timeout_s} s (--timeout)")
         except OSError as error:
             self._store.fail(cell, describe(error))
-        else:
-            self._store.finish(cell, lines, errors)
 
     def _one_by_one(self, cell: Cell) -> tuple[list[str], list[EpisodeError]]:
         lines, errors = [], []
@@ -82,20 +86,26 @@ class Worker:
             except FATAL:
                 raise
             except Exception as error:
-                errors.append(EpisodeError(cell.key, episode.seed, describe(error), episode.command))
+                again = cell if starts_by_number(cell) else episode
+                errors.append(EpisodeError(cell.key, episode.seed, describe(error), again.command))
         return lines, errors
 
     def _evaluate(self, cell: Cell, whole: Cell) -> list[str]:
         """The lines of a cell, in the order of their seeds; it is a part of `whole`."""
         part = self._store.file(cell, "part")
         part.unlink(missing_ok=True)
+        check_assets(cell)
         output_dir = tempfile.mkdtemp(prefix=".output-", dir=part.parent)
-        flags = [*cell.flags, f"--env.results_path={part}", f"--output_dir={output_dir}"]
+        flags = [*cell.flags, f"--output_dir={output_dir}"]
+        flags += [f"--env.results_path={part}"] if has_results_path(cell) else []
         said = LastLine(sys.stderr)
         try:
             with redirect_stderr(said):
-                self._kept.evaluate(flags, (whole.policy, whole.seed))
-            lines = part.read_text().splitlines()
+                self._kept.evaluate(flags, (whole.policy, whole.seed), cell.seed - whole.seed)
+            if has_results_path(cell):
+                lines = part.read_text().splitlines()
+            else:
+                lines = self._stock_lines(cell, whole, Path(output_dir))
         except (Exception, SystemExit) as error:
             if self._kept.has_begun or isinstance(error, TimeoutError | OSError):
                 raise
@@ -108,6 +118,39 @@ class Worker:
         if len(by_seed) < cell.num_episodes:
             raise RuntimeError(f"{len(by_seed)} of {cell.num_episodes} episodes ended")
         return by_seed
+
+    def _stock_lines(self, cell: Cell, whole: Cell, output_dir: Path) -> list[str]:
+        """Of an environment of LeRobot's own, which lerobot-eval has just played."""
+        assert self._kept.policy is not None
+        results = results_of(
+            read_json(output_dir / EVAL_INFO),
+            self._kept.env_config,
+            identity_of(self._kept.policy),
+            cell.seed,
+            cell.batch_size,
+            cell.seed - whole.seed,
+        )
+        return [result.to_json() for result in results]
+
+
+def has_results_path(cell: Cell) -> bool:
+    """Whether lerobot-eval writes its lines itself."""
+    return cell.env_type not in KIND_OF_ENV or KIND_OF_ENV[cell.env_type].has_results_path
+
+
+def starts_by_number(cell: Cell) -> bool:
+    """Whether an episode alone starts otherwise than in the cell."""
+    return cell.env_type in KIND_OF_ENV and KIND_OF_ENV[cell.env_type].starts_by_number
+
+
+def check_assets(cell: Cell) -> None:
+    """Raise a RefusedError where LeRobot's `libero` would ask a question, or download, before it plays."""
+    if cell.env_type == "libero":
+        suites = (flag_value(cell.env, "--env.task") or LiberoEnv.task).split(",")
+        try:
+            prepare_libero(suites)
+        except ValueError as error:
+            raise RefusedError(str(error)) from error
 
 
 class LastLine(io.TextIOBase):

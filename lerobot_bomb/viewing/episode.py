@@ -144,7 +144,7 @@ def new_paths(output: Path | None, folder: Path, name: str) -> list[Path]:
     paths = [Path(f"{stem}{suffix}") for suffix in SUFFIXES]
     for path in paths:
         if path.exists():
-            raise ValueError(f"{path} exists already; name other files with --output=PATH, or delete it")
+            raise ValueError(f"{path} exists already; name other files with --output=PATH")
     return paths
 
 

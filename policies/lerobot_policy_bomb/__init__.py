@@ -14,12 +14,14 @@ from lerobot_bomb._compat import (
     remember_policies,
     resolve_checkpoints,
     shorten_torchcodec_warning,
+    tell_wrong_flags,
 )
 from lerobot_bomb.checkpoints.config import tell_config_errors
 from lerobot_bomb.checkpoints.processor_files import check_saved_processors
 from lerobot_bomb.checkpoints.shipped import checkpoint_path
 from lerobot_bomb.data.hub_token import refuse_unsendable_tokens
 from lerobot_bomb.data.missing import tell_missing_datasets
+from lerobot_bomb.flag_errors import hint, refuse_unknown
 
 shorten_torchcodec_warning()
 tell_config_errors()
@@ -29,3 +31,4 @@ refuse_unsendable_tokens()
 tell_missing_datasets()
 check_saved_processors()
 resolve_checkpoints(checkpoint_path)
+tell_wrong_flags(hint, refuse_unknown)

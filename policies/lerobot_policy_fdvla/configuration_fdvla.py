@@ -10,7 +10,16 @@ from lerobot.policies.rtc import RTCConfig
 
 from lerobot_bomb.flow.losses import check_learning, check_objective
 from lerobot_bomb.flow.path import TIME_SAMPLINGS
-from lerobot_bomb.flow.samplers import check_heads, check_sampling
+from lerobot_bomb.flow.samplers import (
+    CLIP_SAMPLE_RANGE,
+    DENOISE_TAU_MIN,
+    NUM_INFERENCE_STEPS,
+    REFINE_ALPHA,
+    SAMPLER,
+    SOLVER,
+    check_heads,
+    check_sampling,
+)
 from lerobot_bomb.policies.config import RELATIVE_AS_TRAINED, RelativeVlaConfig
 from lerobot_bomb.training.policy_flags import (
     MAX_POSITIONS,
@@ -105,14 +114,14 @@ class FdvlaConfig(RelativeVlaConfig):
     # "residual", "flow", "ddim", "sde" or "paper"; None = residual with both heads, else that of the one
     sampler: str | None = None
     # "euler" or "heun"
-    solver: str = "euler"
-    num_inference_steps: int = 10
+    solver: str = SOLVER
+    num_inference_steps: int = NUM_INFERENCE_STEPS
     # how much of the noise head residual, sde and paper take, in 0..1
-    refine_alpha: float = 0.3
+    refine_alpha: float = REFINE_ALPHA
     # where on the way from noise (0) to actions (1) ddim starts
-    denoise_tau_min: float = 0.02
+    denoise_tau_min: float = DENOISE_TAU_MIN
     # bound of the actions that ddim infers, in normalised units
-    clip_sample_range: float = 5.0
+    clip_sample_range: float = CLIP_SAMPLE_RANGE
     # as in ACT
     temporal_ensemble_weighting: str = "exponential"
     # of the noise that actions are sampled from
@@ -196,7 +205,7 @@ class FdvlaConfig(RelativeVlaConfig):
         if self.sampler is not None:
             return self.sampler
         if self.use_flow_head:
-            return "residual" if self.use_denoise_head else "flow"
+            return SAMPLER if self.use_denoise_head else "flow"
         return "ddim"
 
     @property

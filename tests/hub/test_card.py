@@ -161,11 +161,11 @@ def test_an_evaluation_on_pusht_is_a_table_of_coverage_and_failures() -> None:
     pusht = DatasetFacts(INFO, {"conversion": {"source": "pusht-zarr 0123"}})
     text = str(replace(checkpoint(), dataset=pusht, results=[rows]).card()).replace(" \\\n    ", " ")
     assert (
-        "| condition | n | successes | success rate | 95 % Wilson interval | max coverage (mean, 95 % "
-        "bootstrap interval over episodes) | final coverage | failures |\n|---|---|---|---|---|---|---|---|\n"
-        "| perturbations=none | 4 | 1 | 25.0 % | 4.6 to 69.9 % | 0.440 ["
+        "| condition | success (95 % Wilson interval) | max coverage (mean, 95 % bootstrap interval over "
+        "episodes) | final coverage | failures |\n|---|---|---|---|---|\n"
+        "| perturbations=none | 1/4 = 25.0 % [4.6, 69.9] | 0.440 ["
     ) in text
-    assert " | timeout 2, never_touched 1 |\n| perturbations=goal:3 | 4 | 0 | 0.0 % | " in text
+    assert " | timeout 2, never_touched 1 |\n| perturbations=goal:3 | 0/4 = 0.0 % [0.0, " in text
     assert " | 0.300 [0.300, 0.300] | 0.150 [0.150, 0.150] | turned_wrong 4 |" in text
     assert "task pusht; protocol pusht-1.0, instruction=none, max_steps=300, seeds 0..3; 96 px, gym-p" in text
     assert "Benchmark: PushT with BOMB's axes, protocol pusht-1.0." in text

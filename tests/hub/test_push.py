@@ -127,7 +127,7 @@ def test_results_of_other_weights_are_refused(
     )
     assert push(checkpoint, "--dry_run", "--results", str(results)) == 0
     card = capsys.readouterr().out
-    assert "| perturbations=none | 1 | 1 | 100.0 % |" in card
+    assert "| perturbations=none | 1/1 = 100.0 % [20.7, 100.0] |" in card
     assert "target drawn; colour drawn; protocol 1.1, suite=place" in card
     assert str(tmp_path) not in card
 
@@ -186,7 +186,7 @@ def test_results_on_pusht_are_for_checkpoints_that_were_not_trained_for_bomb(
     push_results = ("--dry_run", "--results", str(results))
     assert push(checkpoint, *push_results) == 0
     card = capsys.readouterr().out
-    assert "| perturbations=none | 1 | 0 | 0.0 % | 0.0 to 79.3 % | 0.500 | 0.250 | timeout 1 |" in card
+    assert "| perturbations=none | 0/1 = 0.0 % [0.0, 79.3] | 0.500 | 0.250 | timeout 1 |" in card
     assert "--env.type=bomb_pusht" in card
     other = PolicyIdentity("act", "elsewhere", None, "a" * 64, "b" * 64)
     results.write_text(json.dumps(row | {"policy": asdict(other)}))

@@ -11,7 +11,7 @@ from lerobot_bomb.bomb.episode import EpisodeSpec
 from lerobot_bomb.bomb.layout import Layout, put_on_board
 from lerobot_bomb.bomb.move import aim_at, one_move
 from lerobot_bomb.bomb.streams import Stream, generator
-from lerobot_bomb.bomb.suite import Episode, Suite, Turn, of_split, refuse_options
+from lerobot_bomb.bomb.suite import Episode, Suite, Turn, draw_template, of_split, refuse_options
 from lerobot_bomb.bomb.suites.place import ALL_TARGETS, sample_opening
 
 MAX_OPENING_STONES = 5
@@ -31,7 +31,6 @@ TEMPLATES = (
     "Move {stone} to row {row}, column {column} on the board.",
     "Set {stone} at ({row}, {column}).",
 )
-HELDOUT_TEMPLATES = TEMPLATES[3:]
 FORMS = (
     (
         "Please place {stone} on the Go board at row {row}, column {column}.",
@@ -134,11 +133,6 @@ def pairs_of(split: str) -> tuple[tuple[int, Cell], ...]:
     return of_split(split, pairs, [pair for pair in pairs if is_heldout(*pair)])
 
 
-def templates_of(split: str) -> tuple[str, ...]:
-    """Instruction templates that a split draws from."""
-    return of_split(split, TEMPLATES, HELDOUT_TEMPLATES)
-
-
 def _pairs(spec: EpisodeSpec) -> list[tuple[int, Cell]]:
     """Those that a spec draws from."""
     return [
@@ -161,12 +155,12 @@ def check(spec: EpisodeSpec) -> None:
 def sample_episode(spec: EpisodeSpec) -> Episode:
     """Draw task, target, supply, opening and start; the same spec, the same episode."""
     check(spec)
-    pairs, templates = _pairs(spec), templates_of(spec.split)
+    pairs = _pairs(spec)
     task_id, target = pairs[generator(spec.seed, Stream.TARGET).integers(len(pairs))]
     task = TASKS[task_id]
     supply, stone, height_m = _sample_supply(generator(spec.seed, Stream.SUPPLY), task)
     color = COLORS[int(supply.is_white[stone])]
-    template = templates[generator(spec.seed, Stream.TEMPLATE).integers(len(templates))]
+    template = draw_template(spec, TEMPLATES)
     opening = sample_opening(generator(spec.seed, Stream.OPENING), target, color, MAX_OPENING_STONES)
     return Episode(
         spec=spec,

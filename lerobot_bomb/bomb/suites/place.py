@@ -11,7 +11,7 @@ from lerobot_bomb.bomb.go import is_legal_move, is_legal_position
 from lerobot_bomb.bomb.layout import Layout, put_on_board
 from lerobot_bomb.bomb.move import aim_at, one_move
 from lerobot_bomb.bomb.streams import Stream, generator
-from lerobot_bomb.bomb.suite import Episode, Suite, Turn, of_split
+from lerobot_bomb.bomb.suite import Episode, Suite, Turn, draw_template, of_split
 
 STONE = 0  # index of the stone to be moved; stones 1.. stand on the board
 MAX_OPENING_STONES = 8
@@ -28,7 +28,6 @@ TEMPLATES = (
     "Move the {color} stone to row {row}, column {column} on the board.",
     "Set a {color} stone at ({row}, {column}).",
 )
-HELDOUT_TEMPLATES = TEMPLATES[3:]
 # Forms 1 to 5. `row` and `column` count from 0, row 0 is the far one; `_from_1` counts from 1, `near_`
 # from the near edge; `other_` is a place that is not meant.
 FORMS = (
@@ -70,11 +69,6 @@ def targets_of(split: str) -> tuple[Cell, ...]:
     return of_split(split, ALL_TARGETS, HELDOUT_TARGETS)
 
 
-def templates_of(split: str) -> tuple[str, ...]:
-    """Instruction templates that a split draws from."""
-    return of_split(split, TEMPLATES, HELDOUT_TEMPLATES)
-
-
 def check_target(spec: EpisodeSpec) -> None:
     """Raise a ValueError unless the spec's target, where it names one, belongs to its split."""
     if spec.task_id is not None:
@@ -89,12 +83,12 @@ def check_target(spec: EpisodeSpec) -> None:
 def sample_episode(spec: EpisodeSpec) -> Episode:
     """Draw target, colour, instruction, opening and start; the same spec, the same episode."""
     check_target(spec)
-    targets, templates = targets_of(spec.split), templates_of(spec.split)
+    targets = targets_of(spec.split)
     drawn_target = targets[generator(spec.seed, Stream.TARGET).integers(len(targets))]
     drawn_color = COLORS[generator(spec.seed, Stream.COLOR).integers(len(COLORS))]
     target = (spec.target[0], spec.target[1]) if spec.target is not None else drawn_target
     color = spec.color if spec.color is not None else drawn_color
-    template = templates[generator(spec.seed, Stream.TEMPLATE).integers(len(templates))]
+    template = draw_template(spec, TEMPLATES)
     opening = sample_opening(generator(spec.seed, Stream.OPENING), target, color, MAX_OPENING_STONES)
     return Episode(
         spec=spec,

@@ -13,7 +13,7 @@ from lerobot_bomb.bomb.go import is_legal_move, is_legal_position
 from lerobot_bomb.bomb.layout import put_on_board
 from lerobot_bomb.bomb.move import aim_at, one_move
 from lerobot_bomb.bomb.streams import Stream, generator
-from lerobot_bomb.bomb.suite import Episode, Suite, Turn, of_split, refuse_options
+from lerobot_bomb.bomb.suite import Episode, Suite, Turn, draw_template, of_split, refuse_options
 from lerobot_bomb.bomb.suites.place import ALL_TARGETS, STONE, layout_of_one
 
 MAX_OPENING_STONES = 8
@@ -28,7 +28,6 @@ TEMPLATES = (
     "Move the {color} stone from the tray so that it lies {place}.",
     "Set a {color} stone {place}.",
 )
-HELDOUT_TEMPLATES = TEMPLATES[3:]
 FORMS = (
     (
         "Please place a {color} stone {place} on the board.",
@@ -179,11 +178,6 @@ def cases_of(split: str) -> tuple[tuple[int, Cell, str], ...]:
     return of_split(split, cases, [case for case in cases if is_heldout(*case)])
 
 
-def templates_of(split: str) -> tuple[str, ...]:
-    """Instruction templates that a split draws from."""
-    return of_split(split, TEMPLATES, HELDOUT_TEMPLATES)
-
-
 def _cases(spec: EpisodeSpec) -> dict[int, list[tuple[Cell, str]]]:
     """{task: targets and colours} that a spec draws from."""
     cases: dict[int, list[tuple[Cell, str]]] = {}
@@ -206,7 +200,7 @@ def check(spec: EpisodeSpec) -> None:
 def sample_episode(spec: EpisodeSpec) -> Episode:
     """Draw task, target, colour, opening and start; the same spec, the same episode."""
     check(spec)
-    cases, templates = _cases(spec), templates_of(spec.split)
+    cases = _cases(spec)
     rng = generator(spec.seed, Stream.TARGET)
     task_id = list(cases)[rng.integers(len(cases))]  # first the task, so that each is as frequent
     target, color = cases[task_id][rng.integers(len(cases[task_id]))]
@@ -214,7 +208,7 @@ def sample_episode(spec: EpisodeSpec) -> Episode:
     extra_colors = (color,) if task.has_anchor else COLORS
     opening = _sample_opening(generator(spec.seed, Stream.OPENING), task, target, color, anchor, extra_colors)
     words = {"color": color, "place": task.place.format(anchor=anchor)}
-    template = templates[generator(spec.seed, Stream.TEMPLATE).integers(len(templates))]
+    template = draw_template(spec, TEMPLATES)
     return Episode(
         spec=spec,
         task_id=task_id,

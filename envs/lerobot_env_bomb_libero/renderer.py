@@ -1,0 +1,52 @@
+"""robosuite, imported so that it renders wherever MuJoCo does.
+
+It takes CUDA_VISIBLE_DEVICES for numbers of EGL's devices: it may hold UUIDs, or numbers of a machine whose
+container counts its own devices from 0.
+"""
+
+import os
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from typing import Any
+
+import lerobot_env_mujoco.mujoco_gl  # noqa: F401  chooses MUJOCO_GL
+
+GPUS = "CUDA_VISIBLE_DEVICES"
+
+
+@contextmanager
+def _all_gpus_visible() -> Iterator[None]:
+    """When it is imported, robosuite asserts that MUJOCO_EGL_DEVICE_ID is among those that are."""
+    visible = os.environ.pop(GPUS, None)
+    try:
+        yield
+    finally:
+        if visible is not None:
+            os.environ[GPUS] = visible
+
+
+def or_mujocos(of_robosuite: Callable[[int], Any], of_mujoco: Callable[[], Any]) -> Callable[[int], Any]:
+    """EGL's display on the device that robosuite takes, or where it finds none on the one that MuJoCo takes.
+
+    MuJoCo takes the one of MUJOCO_EGL_DEVICE_ID, else the first that works.
+    """
+
+    def create(device_id: int = 0) -> Any:
+        try:
+            return of_robosuite(device_id)
+        except (ValueError, RuntimeError):  # no number, or one that EGL does not have
+            return of_mujoco()
+
+    return create
+
+
+with _all_gpus_visible():
+    import robosuite.utils.binding_utils  # noqa: F401
+
+if os.environ.get("MUJOCO_GL") == "egl":
+    from mujoco import egl
+    from robosuite.renderers.context import egl_context
+
+    egl_context.create_initialized_egl_device_display = or_mujocos(
+        egl_context.create_initialized_egl_device_display, egl.create_initialized_egl_device_display
+    )

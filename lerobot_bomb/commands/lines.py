@@ -1,0 +1,68 @@
+"""``lerobot-bomb lines``: lines of results of LeRobot's own environments, from its eval_info.json."""
+
+import argparse
+from pathlib import Path
+from typing import Any
+
+from lerobot_bomb._compat import eval_config
+from lerobot_bomb.checkpoints.identity import identity_of_config
+from lerobot_bomb.commands.arguments import add_file_and_eval_flags
+from lerobot_bomb.envs.results import write_result
+from lerobot_bomb.evaluation.eval_info import EVAL_INFO, results_of
+from lerobot_bomb.evaluation.result_lines import KIND_OF_ENV, KINDS
+from lerobot_bomb.files import read_json
+from lerobot_bomb.flags import one_of
+from lerobot_bomb.sweep.manifest import flag_value
+
+
+def add_lines_arguments(parser: argparse.ArgumentParser) -> None:
+    """Declare the arguments of ``lerobot-bomb lines``."""
+    add_file_and_eval_flags(parser, "lines", "of results, which gets a line per episode")
+
+
+def run_lines(args: argparse.Namespace) -> int:
+    """Append the lines of an evaluation; the flags are those of its command."""
+    if not flag_value(args.flags, "--output_dir"):
+        raise ValueError(f"--output_dir=... is missing: the folder that lerobot-eval wrote {EVAL_INFO} to")
+    config = eval_config(args.flags)
+    _check_flags(config)
+    path = config.output_dir / EVAL_INFO
+    info = read_json(path)
+    _check_info(path, info, config.eval.n_episodes)
+    policy = identity_of_config(config.policy)
+    results = list(results_of(info, config.env, policy, config.seed, config.eval.batch_size))
+    for result in results:
+        write_result(args.path, result, result.spec.seed)
+    print(f"{args.path}: {len(results)} episodes of {path}")
+    return 0
+
+
+def _check_flags(config: Any) -> None:
+    """Raise a ValueError unless each episode's result can be told."""
+    kind = KIND_OF_ENV.get(config.env.type)
+    if kind is not None and kind.has_results_path:
+        raise ValueError(
+            f"--env.type={kind.env_type}: lerobot-eval writes its lines itself, with --env.results_path=FILE"
+        )
+    if kind is None:
+        one_of("--env.type", config.env.type, [k.env_type for k in KINDS if not k.has_results_path])
+    if config.policy is None:
+        raise ValueError("--policy.path or --policy.type is missing: who played")
+    if config.seed is None:
+        raise ValueError("--seed=null: episodes without a seed cannot be told apart")
+    if kind is not None and kind.starts_by_number and config.eval.batch_size != 1:
+        raise ValueError(
+            f"--eval.batch_size={config.eval.batch_size}: which initial state an episode of "
+            f"--env.type={kind.env_type} starts in is determined with --eval.batch_size=1 only"
+        )
+
+
+def _check_info(path: Path, info: dict[str, Any], num_episodes: int) -> None:
+    """Raise a ValueError unless a file is of an evaluation of so many episodes of each task."""
+    try:
+        numbers = {len(task["metrics"]["successes"]) for task in info["per_task"]}
+    except (KeyError, TypeError):
+        raise ValueError(f"{path} has no episodes in it; name the folder of an evaluation") from None
+    if numbers != {num_episodes}:
+        found = " and ".join(map(str, sorted(numbers)))
+        raise ValueError(f"{path} has {found} episodes of a task, --eval.n_episodes says {num_episodes}")

@@ -1,0 +1,80 @@
+"""Lines of results of LeRobot's own environments, from the eval_info.json that lerobot-eval writes."""
+
+from collections.abc import Iterator, Mapping
+from dataclasses import replace
+from math import isfinite
+from typing import Any
+
+import draccus
+from lerobot.envs import EnvConfig
+
+from lerobot_bomb.envs import libero_results, pusht_results
+from lerobot_bomb.envs.results import PolicyIdentity, installed_versions
+from lerobot_bomb.envs.stock_results import FAILED, STOCK_PROTOCOLS, StockResult, StockSpec
+from lerobot_bomb.evaluation.result_lines import KIND_OF_ENV
+from lerobot_bomb.pusht.episode import IMAGE_SIZE
+
+EVAL_INFO = "eval_info.json"  # in the folder of --output_dir
+SIMULATORS = {"pusht": pusht_results.SIMULATOR, "libero": libero_results.SIMULATOR}
+# fields of an environment's config that do not decide what an episode is, or that its spec says
+NOT_SETTINGS = {
+    "type", "features", "features_map", "render_mode", "visualization_width", "visualization_height",
+    "disable_env_checker", "max_parallel_tasks", "task_ids",
+}  # fmt: skip
+
+
+def results_of(
+    info: Mapping[str, Any],
+    env: EnvConfig,
+    policy: PolicyIdentity,
+    seed: int,
+    batch_size: int,
+    first: int = 0,
+) -> Iterator[StockResult]:
+    """The result of each episode, in the order of tasks and seeds.
+
+    Args:
+        info: what lerobot-eval wrote.
+        env: the environment's flags.
+        policy: who acted.
+        seed: of the first episode.
+        batch_size: episodes that were played at once.
+        first: number of the first episode, where it was played alone out of a longer evaluation.
+
+    Raises:
+        ValueError: an episode's rewards are not finite: its actions or the simulation were not.
+    """
+    env_type = str(env.type)
+    settings = _settings(env)
+    for task in info["per_task"]:
+        metrics = task["metrics"]
+        episodes = zip(metrics["sum_rewards"], metrics["max_rewards"], metrics["successes"], strict=True)
+        for i, (sum_reward, max_reward, is_success) in enumerate(episodes):
+            if not (isfinite(sum_reward) and isfinite(max_reward)):
+                raise ValueError(f"the rewards of seed {seed + i} are not finite")
+            number = first + i if KIND_OF_ENV[env_type].starts_by_number else None
+            yield StockResult(
+                spec=StockSpec(seed + i, task["task_group"], task["task_id"], number),
+                sum_reward=sum_reward,
+                max_reward=max_reward,
+                is_success=is_success,
+                failure=None if is_success else FAILED,
+                image_size=_image_size(env),
+                flags=settings,
+                simulator_versions=installed_versions(SIMULATORS[env_type]),
+                protocol_version=STOCK_PROTOCOLS[env_type],
+                policy=replace(policy, batch_size=batch_size, batch_row=i % batch_size),
+            )
+
+
+def _settings(env: EnvConfig) -> dict[str, Any]:
+    of_spec = {"task"} if KIND_OF_ENV[str(env.type)].starts_by_number else set()
+    values: Any = draccus.encode(env)
+    return {name: value for name, value in values.items() if name not in NOT_SETTINGS | of_spec}
+
+
+def _image_size(env: Any) -> str:
+    """gym-pusht draws its own size, whatever the flags say."""
+    if env.type == "pusht":
+        return f"{IMAGE_SIZE}x{IMAGE_SIZE}"
+    return f"{env.observation_width}x{env.observation_height}"
