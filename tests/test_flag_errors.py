@@ -92,7 +92,7 @@ def test_a_model_that_no_machine_holds_is_refused_before_it_is_built(
             "unrecognized arguments: --env.tsak=place; nearest: --env.task",
         ),
         # near one of `bomb`, which this type would refuse
-        (("--env.type=bomb_pusht", "--env.render_presets=fast"), "--env.render_presets=fast; --env.type="),
+        (("--env.type=bomb_pusht", "--env.render_presets=fast"), "--env.render_presets=fast; --policy.type="),
         (
             ("--env.type=bomb_pusht", "--env.render_preset=fast"),
             "--env.render_preset is no flag of this type",
