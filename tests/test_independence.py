@@ -18,6 +18,7 @@ from lerobot_bomb.bomb.episode import EpisodeSpec
 from lerobot_bomb.bomb.expert import expert_action
 from lerobot_bomb.bomb.observation import RenderOptions
 from lerobot_bomb.bomb.suites import SUITES
+from lerobot_bomb.envs.results import without_measured
 from lerobot_bomb.envs.vector import NEW_ROLLOUT_OPTION, LazyVectorEnv
 from lerobot_bomb.evaluation.results import read_results
 from lerobot_env_bomb.env import BombEnv
@@ -213,7 +214,7 @@ def evaluate(
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(lerobot_eval, "rollout", note)
         run("lerobot-eval", *own.split(), *flags)
-    rows = {row["spec"]["seed"]: row for row in read_results(folder / "results.jsonl")}
+    rows = {row["spec"]["seed"]: without_measured(row) for row in read_results(folder / "results.jsonl")}
     assert rows.keys() == actions.keys() >= set(range(5, 5 + num_episodes))
     return {seed: Outcome(rows[seed], actions[seed]) for seed in rows}
 

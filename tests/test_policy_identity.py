@@ -17,7 +17,7 @@ from lerobot.policies.act.configuration_act import ACTConfig
 import lerobot_policy_bomb  # noqa: F401  the plugin
 from lerobot_bomb import _compat
 from lerobot_bomb._compat import built_policies
-from lerobot_bomb.checkpoints.identity import _of_checkpoint, acting_policy
+from lerobot_bomb.checkpoints.identity import _of_checkpoint, acting_policy, identity_of
 from lerobot_bomb.envs.results import PolicyIdentity
 from lerobot_bomb.evaluation.results import read_results
 from lerobot_env_bomb.configuration_bomb import BombEnvConfig
@@ -54,9 +54,8 @@ def loaded(checkpoint: Path, **flags: Any) -> PreTrainedPolicy:
 
 def identity(of: PreTrainedPolicy) -> PolicyIdentity:
     """What a line says while this policy, which the process holds, acts."""
-    known = acting_policy()
-    assert known is not None and known.type == of.config.type
-    return known
+    assert acting_policy() is of
+    return identity_of(of)
 
 
 def sha256(path: Path) -> str:

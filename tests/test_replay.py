@@ -53,6 +53,8 @@ def test_a_line_is_played_again_bit_for_bit(
     path = results(policy)
     sizes = [json.loads(line)["policy"]["batch_row"] for line in path.read_text().splitlines()]
     assert sizes == [0, 1, 2]
+    is_timed = [bool(json.loads(line)["inference"]) for line in path.read_text().splitlines()]
+    assert is_timed == [policy in SHIPPED] * 3  # the replay is not, which makes no difference
     for line in (1, 2, 3):
         assert main(["replay", str(path), f"--line={line}", f"--output={tmp_path / str(line)}"]) == 0
         assert "as recorded, bit for bit: spec, instruction, " in capsys.readouterr().out

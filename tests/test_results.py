@@ -8,8 +8,9 @@ import pytest
 from lerobot_bomb.bomb.board import COLORS
 from lerobot_bomb.bomb.episode import PROTOCOL_VERSION, EpisodeSpec
 from lerobot_bomb.commands.main import main
-from lerobot_bomb.envs.results import EpisodeResult, PolicyIdentity
+from lerobot_bomb.envs.results import EpisodeResult, PolicyIdentity, ResultLine
 from lerobot_bomb.evaluation.bomb_lines import BOMB_LINES, NEW_CHECKS, SPEC_CHECKS, median_error_mm
+from lerobot_bomb.evaluation.line_checks import SHARED_CHECKS
 from lerobot_bomb.evaluation.result_lines import ADDED_POLICY_CHECKS, KINDS, POLICY_CHECKS, parse_line
 from lerobot_bomb.evaluation.results import read_results, summarise
 
@@ -90,11 +91,12 @@ def test_an_episode_that_was_run_again_counts_once(path: Path) -> None:
 
 
 def test_all_fields_are_checked() -> None:
+    assert {field.name for field in fields(ResultLine)} == SHARED_CHECKS.keys()
     spec_fields = SPEC_CHECKS.keys() | BOMB_LINES.added_spec_fields.keys()
     assert spec_fields == {field.name for field in fields(EpisodeSpec)}
     policy_fields = POLICY_CHECKS.keys() | ADDED_POLICY_CHECKS.keys()
     assert policy_fields == {field.name for field in fields(PolicyIdentity)}
-    for name in values(0).keys() - BOMB_LINES.added_fields.keys():
+    for name in values(0).keys() - BOMB_LINES.added_fields.keys() - SHARED_CHECKS.keys():
         with pytest.raises(ValueError, match=f"{name}" if name != "protocol_version" else "None"):
             parse_line(json.dumps({key: value for key, value in values(0).items() if key != name}).encode())
 

@@ -1,4 +1,4 @@
-"""``lerobot-bomb smoothness``; tests/test_flow_smoothness.py has the mathematics."""
+"""``lerobot-bomb smoothness``; tests/test_smoothness.py has the mathematics."""
 
 import json
 from pathlib import Path

@@ -62,7 +62,7 @@ def test_a_draft_saves_passes_and_changes_no_cell(passes: list[int]) -> None:
     drafted = policy._choose(batch, 4)
     # cells of the same group follow each other here, but not always
     assert 0.5 < (drafted[:, 1:] == drafted[:, :-1]).float().mean() < 1
-    assert len(passes) < 12
+    assert policy.last_passes == len(passes) < 12
     passes.clear()
     policy._writer.drafted = False
     assert torch.equal(policy._choose(batch, 4), drafted)
@@ -76,7 +76,7 @@ def test_only_what_is_executed_is_decoded_with_one_pass_a_cell(passes: list[int]
     passes.clear()
     assert torch.equal(policy.select_action(batch), chunk[:, 0])
     assert torch.equal(policy.select_action(batch), chunk[:, 1])
-    assert len(passes) == 2 * 3 and passes[1:] == [1] * 5
+    assert policy.last_passes == policy.last_tokens == len(passes) == 2 * 3 and passes[1:] == [1] * 5
 
 
 @torch.no_grad()

@@ -1,6 +1,7 @@
 """LeRobot's own policies on BOMB, through its own commands: docs/your_policy.md."""
 
 from collections.abc import Callable
+from math import ceil
 from pathlib import Path
 from typing import Any
 
@@ -116,6 +117,7 @@ def test_a_stock_policy_is_trained_and_evaluated_by_the_stock_commands(
     check_weights(stock_type, checkpoint, folder)
     (row,) = evaluate(stock_cli, checkpoint, folder)
     assert row["spec"]["perturbations"] == "camera:3"
+    assert row["inference"]["num_queries"] == ceil(row["steps"] / FLAGS[stock_type]["n_action_steps"])
 
 
 def test_xvla_is_evaluated_once_the_processors_of_libero_are_left_out(

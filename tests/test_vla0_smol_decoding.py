@@ -96,6 +96,9 @@ def test_a_draft_changes_no_action_and_saves_passes(monkeypatch: pytest.MonkeyPa
     assert torch.equal(*chunks)
     drafted, plain = (decoded.num_passes for decoded in seen)
     assert drafted < 0.6 * plain
+    assert (policy.last_passes, undrafted.last_passes) == (drafted, plain)
+    numbers = seen[0].numbers.flatten().tolist()
+    assert policy.last_tokens == sum(1 + len(str(number)) for number in numbers) / 2  # rows
 
 
 def test_a_rows_actions_do_not_depend_on_the_batch(overfit: tuple[Vla0SmolPolicy, dict[str, Any]]) -> None:

@@ -27,6 +27,7 @@ from vla_eval.model_servers.base import SessionContext
 
 from lerobot_bomb.bomb.suites import SUITES
 from lerobot_bomb.checkpoints.folder import write_checkpoint
+from lerobot_bomb.envs.results import without_measured
 from lerobot_bomb.harness import __main__ as command
 from lerobot_bomb.harness.benchmark import BombBenchmark
 from lerobot_bomb.harness.checkpoint_server import CheckpointServer
@@ -58,8 +59,9 @@ def run(server: CheckpointServer, output: Path, num_episodes: int, **params: Any
 
 
 def lines_of(path: Path) -> list[dict[str, Any]]:
-    """Lines of results but for the policy, which the harness does not name."""
-    return [json.loads(line) | {"policy": None} for line in path.read_text().splitlines()]
+    """Lines of results but for the policy, which the harness neither names nor times."""
+    rows = map(json.loads, path.read_text().splitlines())
+    return [without_measured(row) | {"policy": None} for row in rows]
 
 
 def test_the_harness_plays_the_episodes_of_lerobot_eval(

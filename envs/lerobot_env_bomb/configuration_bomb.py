@@ -25,6 +25,7 @@ from lerobot_bomb.bomb.suite import find_suite, specs_of_tasks
 from lerobot_bomb.bomb.suites import SUITES
 from lerobot_bomb.checkpoints.environment import check_acting_policy
 from lerobot_bomb.checkpoints.identity import policy_of_results
+from lerobot_bomb.checkpoints.queries import last_query
 from lerobot_bomb.conditions import ALL
 from lerobot_bomb.data.environment import Environment
 from lerobot_bomb.envs.results import check_results_path
@@ -189,6 +190,7 @@ class BombEnvConfig(EnvConfig):
                     [partial(BombEnv, **(kwargs | {"spec": spec}))] * n_envs,
                     use_async=use_async_envs and n_envs > 1,
                     known_late=partial(policy_of_results, self.results_path),
+                    last_query=last_query,
                 )
                 for task_id, spec in zip(self.task_ids or [0], specs, strict=True)
             }

@@ -14,6 +14,7 @@ from lerobot.utils.constants import LIBERO_KEY_PIXELS_AGENTVIEW, OBS_IMAGES, OBS
 from lerobot_bomb.checkpoints.identity import policy_of_results
 from lerobot_bomb.checkpoints.interface import Interface
 from lerobot_bomb.checkpoints.libero_orientation import OrientationCheck
+from lerobot_bomb.checkpoints.queries import last_query
 from lerobot_bomb.envs.results import check_results_path
 from lerobot_bomb.envs.vector import LazyVectorEnv
 from lerobot_bomb.flag_errors import flag_errors
@@ -97,6 +98,7 @@ class BombLiberoEnvConfig(LiberoEnv):
                     * n_envs,
                     use_async=use_async_envs and n_envs > 1,
                     known_late=partial(policy_of_results, self.results_path),
+                    last_query=last_query,
                     on_first_reset=check and partial(self._compare_images, check, suite, task_id),
                 )
                 for task_id in self._task_ids(suite)

@@ -12,6 +12,7 @@ from lerobot.utils.constants import ACTION, OBS_IMAGE, OBS_STATE
 
 from lerobot_bomb.checkpoints.identity import policy_of_results
 from lerobot_bomb.checkpoints.interface import Interface
+from lerobot_bomb.checkpoints.queries import last_query
 from lerobot_bomb.envs.results import check_results_path
 from lerobot_bomb.envs.vector import LazyVectorEnv
 from lerobot_bomb.flag_errors import flag_errors
@@ -126,6 +127,7 @@ class BombPushTEnvConfig(EnvConfig):
                     [partial(BombPushTEnv, **(self.gym_kwargs | {"spec": self._spec(condition)}))] * n_envs,
                     use_async=use_async_envs and n_envs > 1,
                     known_late=partial(policy_of_results, self.results_path),
+                    last_query=last_query,
                 )
             }
             for key, condition in self.conditions.items()

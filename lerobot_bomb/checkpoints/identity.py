@@ -15,8 +15,9 @@ from lerobot.configs import PreTrainedConfig
 from lerobot.policies import PreTrainedPolicy
 
 from lerobot_bomb._compat import built_policies, training_data
-from lerobot_bomb.checkpoints.checks import ADAPTERS
-from lerobot_bomb.checkpoints.names import WEIGHTS
+from lerobot_bomb.checkpoints.checks import ADAPTERS, PROCESSORS
+from lerobot_bomb.checkpoints.names import BLANK_IMAGES, REPLACE_TASKS, WEIGHTS
+from lerobot_bomb.checkpoints.queries import time_queries
 from lerobot_bomb.envs.results import PolicyIdentity
 from lerobot_bomb.files import read_json
 
@@ -28,7 +29,7 @@ NOT_ITS_SETTINGS = {
 }  # fmt: skip
 
 
-def acting_policy() -> PolicyIdentity | None:
+def acting_policy() -> PreTrainedPolicy | None:
     """The one policy that this process built and holds; None: there is none, or it may be any of several."""
     if len(built_policies()) > 1:
         gc.collect()  # those that nothing refers to any more; this function must not hold them either
@@ -41,7 +42,7 @@ def acting_policy() -> PolicyIdentity | None:
                 "drop the others before the environment's first reset"
             )
         return None
-    return identity_of(policies[0])
+    return policies[0]
 
 
 def identity_of(policy: PreTrainedPolicy) -> PolicyIdentity:
@@ -57,11 +58,16 @@ def identity_of_config(config: PreTrainedConfig) -> PolicyIdentity:
 
 
 def policy_of_results(results_path: str | None, num_envs: int) -> list[dict[str, PolicyIdentity]]:
-    """Argument of each environment that writes lines of results: the policy, which LeRobot builds later."""
+    """Argument of each environment that writes lines of results: the policy, which LeRobot builds later.
+
+    From now on its queries are timed.
+    """
     policy = None if results_path is None else acting_policy()
     if policy is None:
         return [{}] * num_envs
-    return [{"policy": replace(policy, batch_size=num_envs, batch_row=row)} for row in range(num_envs)]
+    time_queries(policy)
+    identity = identity_of(policy)
+    return [{"policy": replace(identity, batch_size=num_envs, batch_row=row)} for row in range(num_envs)]
 
 
 def weights_file(checkpoint: Path | str, revision: str | None, has_adapters: bool) -> Path | None:
@@ -92,7 +98,15 @@ def _of_checkpoint(config: PreTrainedConfig) -> PolicyIdentity:
         weights_sha256=None if weights is None else sha256_of(weights),
         settings_sha256=None if weights is None else _settings_sha256(config, weights.parent),
         base=_base(path, revision) if config.use_peft else None,
+        interventions=() if weights is None else _interventions(weights.parent),
     )
+
+
+def _interventions(folder: Path) -> tuple[str, ...]:
+    path = folder / PROCESSORS[0]
+    steps = read_json(path).get("steps", []) if path.is_file() else []
+    names = [step.get("registry_name") for step in steps]
+    return tuple(name for name in names if name in (BLANK_IMAGES, REPLACE_TASKS))
 
 
 def _local_file(checkpoint: Path | str, revision: str | None, name: str) -> Path | None:

@@ -6,6 +6,9 @@ from typing import Any
 
 CONFIG, TRAIN_CONFIG, WEIGHTS = "config.json", "train_config.json", "model.safetensors"
 
+# of the steps that change on purpose what a policy is shown
+BLANK_IMAGES, REPLACE_TASKS = "bomb_blank_images", "bomb_replace_tasks"
+
 # what to do with adapters whose base is on one machine only
 TO_PUBLISH = (
     "publish that first (lerobot-bomb push) and train with --policy.path of its name, or publish both as one "

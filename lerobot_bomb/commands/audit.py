@@ -15,7 +15,7 @@ from lerobot_bomb.evaluation.results import read_results
 from lerobot_bomb.files import written_whole
 from lerobot_bomb.report import verdicts
 from lerobot_bomb.report.page import render
-from lerobot_bomb.report.tables import Section
+from lerobot_bomb.report.table import Section
 from lerobot_bomb.report.verdicts import (
     AGAIN,
     ALONE,

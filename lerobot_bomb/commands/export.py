@@ -9,8 +9,8 @@ from lerobot_bomb.commands.results_files import check_outputs, read_undamaged
 from lerobot_bomb.data.resumable import check_repo_id
 from lerobot_bomb.evaluation.comparison import POLICY
 from lerobot_bomb.files import written_whole
+from lerobot_bomb.report.arms import Arm, arms_of, policy_name
 from lerobot_bomb.report.latex import table
-from lerobot_bomb.report.tables import Arm, arms_of, policy_name
 
 LATEX, MODEL_INDEX, EVAL_RESULTS = "table.tex", "model-index.yaml", ".eval_results/lerobot_bomb.yaml"
 

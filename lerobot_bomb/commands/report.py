@@ -4,15 +4,21 @@ import argparse
 import csv
 import io
 import json
+import sys
 from pathlib import Path
 
-from lerobot_bomb.commands.arguments import path_flag
+from tqdm import tqdm
+
+from lerobot_bomb.commands.arguments import check_at_least, path_flag
 from lerobot_bomb.commands.results_files import check_outputs, read_undamaged
 from lerobot_bomb.files import written_whole
+from lerobot_bomb.report.arms import Report, Sample, arms_of, sample_failures
 from lerobot_bomb.report.page import render
-from lerobot_bomb.report.tables import Section, build
+from lerobot_bomb.report.sections import build, conditions
+from lerobot_bomb.report.table import Section
 
 TITLE, DEFAULT = "Evaluation", Path("report.html")
+NUM_SAMPLES = 3  # of each class of failure, at least
 
 
 def add_report_arguments(parser: argparse.ArgumentParser) -> None:
@@ -22,22 +28,46 @@ def add_report_arguments(parser: argparse.ArgumentParser) -> None:
     )
     parser.add_argument("--output", type=path_flag, default=DEFAULT, help=f"default: {DEFAULT}")
     parser.add_argument("--title", default=TITLE, help=f"of the page (default: {TITLE})")
+    videos = (
+        "play so many failures of each class again and show them, in a folder beside the page (default: 0)"
+    )
+    parser.add_argument("--videos", type=int, metavar="N", default=0, help=videos)
 
 
 def run_report(args: argparse.Namespace) -> int:
-    """Write FILE.html, FILE.json and FILE.csv; print their paths."""
+    """Write FILE.html, FILE.json and FILE.csv, and videos; print their paths."""
+    check_at_least(args, videos=0)
     output = args.output / DEFAULT if args.output.is_dir() else args.output
     if output.suffix not in ("", ".html"):
         raise ValueError(f"--output={output} must be the page's path, .html, or a folder")
     page, tables, rates = (output.with_suffix(suffix) for suffix in (".html", ".json", ".csv"))
     check_outputs(args.paths, (page, tables, rates))
-    sections = build([row for path in args.paths for row in read_undamaged(path)[0]])
+    files = {path: read_undamaged(path)[0] for path in dict.fromkeys(args.paths)}
+    arms = arms_of([row for rows in files.values() for row in rows])
+    samples = list(sample_failures(arms, files, max(NUM_SAMPLES, args.videos)))
+    folder = page.with_name(f"{page.stem}_videos")
+    if args.videos:
+        samples = _play(samples, folder, args.videos)
+    sections = build(Report(arms, samples))
     with written_whole(page, tables, rates) as (html, as_json, as_csv):
         html.write_text(render(args.title, sections))
         as_json.write_text(json.dumps([section.as_json() for section in sections], indent=1) + "\n")
         as_csv.write_text(_csv(sections))
-    print(page, tables, rates, sep="\n")
+    print(page, tables, rates, *([folder] if folder.is_dir() and args.videos else []), sep="\n")
     return 0
+
+
+def _play(samples: list[Sample], folder: Path, num_of_class: int) -> list[Sample]:
+    from lerobot_bomb.report.videos import with_videos  # LeRobot and rerun: seconds
+
+    played = list(tqdm(with_videos(samples, folder, num_of_class), total=len(samples), unit=" failures"))
+    missing = [each for each in played if each.note and not each.video]
+    if missing:
+        print(
+            f"videos that are missing: {len(missing)}, as {missing[0].command}: {missing[0].note}",
+            file=sys.stderr,
+        )
+    return played
 
 
 def _csv(sections: list[Section]) -> str:
@@ -46,7 +76,7 @@ def _csv(sections: list[Section]) -> str:
     writer = csv.writer(text)
     writer.writerow(["arm", "condition", "successes", "n", "low", "high"])
     for table in (
-        table for section in sections if section.title == "Success by condition" for table in section.tables
+        table for section in sections if section.title == conditions.TITLE for table in section.tables
     ):
         for condition, success, *_ in table.rows:
             writer.writerow([table.title, condition.text, *success.value.values()])

@@ -47,6 +47,7 @@ class SlotWriter:
         """``cap``: of logits; ``drafted``: guess that a step is as the one before, on a CPU, one row."""
         self._text_model, self._positions, self._cap = text_model, positions, cap
         self._reads_all, self.drafted = prompt_reads_all, drafted
+        self.num_passes: int | None = None  # of the last answers, the prompt's included
         self._graphs = GraphCache[GraphSlots](text_model, positions, compiled=compiled)
 
     @torch.no_grad()
@@ -68,7 +69,7 @@ class SlotWriter:
         Raises:
             ValueError: a row's logits are not finite. On CUDA the host waits for the answers to learn of it.
         """
-        num_slots = num_steps * len(slots)
+        self.num_passes = num_slots = num_steps * len(slots)
         if noise is None:
             noise = prompt.embeds.new_empty(len(prompt.embeds), 0, len(head_CH))
         if prompt.embeds.is_cuda:
@@ -92,7 +93,10 @@ class SlotWriter:
         require_finite_answers(finite_B)
         if not is_drafted:
             return choices_BS
-        return repeat(text, int(prompt.mask.sum()), slots, num_slots, choices_BS, embeds_CH, head)
+        length = int(prompt.mask.sum())
+        answer_BS, num_more = repeat(text, length, slots, num_slots, choices_BS, embeds_CH, head)
+        self.num_passes = len(slots) + num_more
+        return answer_BS
 
 
 @dataclass(frozen=True)
@@ -180,16 +184,17 @@ def repeat(
     step_1G: Tensor,
     embeds_CH: Tensor,
     head: SlotHead,
-) -> Tensor:
-    """(1, S) the same as one choice a pass, after a prompt of this length and the first step.
+) -> tuple[Tensor, int]:
+    """(1, S) the same as one choice a pass, after a prompt of this length and the first step; and the passes.
 
     A pass reads the choice made last and guesses that go on as the step before. As far as guesses are the
     likeliest choices they are right, and so is the first choice that differs from its guess.
     """
     num_kinds = len(slots)
     chosen: list[int] = step_1G[0].tolist()
-    num_tokens = 1
+    num_tokens, num_passes = 1, 0
     while len(chosen) < num_slots:
+        num_passes += 1
         steps, kinds = zip(
             *(divmod(len(chosen) + ahead, num_kinds) for ahead in range(num_tokens)), strict=True
         )
@@ -208,4 +213,4 @@ def repeat(
         num_right = sum(accumulate(map(eq, picks, guesses), and_))
         chosen += picks[: num_right + 1]
         num_tokens = min(MAX_GUESSES, 1 + 2 * num_right, num_slots - len(chosen))
-    return step_1G.new_tensor([chosen])
+    return step_1G.new_tensor([chosen]), num_passes

@@ -6,13 +6,15 @@ Simulator workers import this module, so it imports neither torch nor LeRobot.
 from abc import ABC, abstractmethod
 from copy import deepcopy
 from dataclasses import replace
-from typing import Any
+from typing import Any, ClassVar
 
 import gymnasium
 import numpy as np
 from gymnasium.error import ResetNeeded
 
+from lerobot_bomb.envs.inference import Inference, Query
 from lerobot_bomb.envs.results import ResultLine, write_result
+from lerobot_bomb.smoothness import MIN_ACTIONS, smoothness
 
 type Observation = dict[str, Any]
 type Transition = tuple[Observation, float, bool, bool, dict[str, Any]]
@@ -25,6 +27,7 @@ class EpisodeEnv[SpecT: Any, RunT, ResultT: ResultLine](gymnasium.Env[Observatio
     """
 
     metadata = {"render_modes": ["rgb_array"]}  # noqa: RUF012
+    gripper_dims: ClassVar[tuple[int, ...]] = ()  # of an action, which do not count in how smooth it is
 
     def __init__(self, spec: SpecT, task: str, results_path: str | None, render_mode: str | None):
         if render_mode not in (None, *self.metadata["render_modes"]):
@@ -38,6 +41,8 @@ class EpisodeEnv[SpecT: Any, RunT, ResultT: ResultLine](gymnasium.Env[Observatio
         self._seed: int = spec.seed  # of the episode
         self._steps = 0
         self._last_transition: Transition | None = None
+        self._actions: list[np.ndarray] = []
+        self._queries: list[Query] = []
 
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
@@ -52,21 +57,28 @@ class EpisodeEnv[SpecT: Any, RunT, ResultT: ResultLine](gymnasium.Env[Observatio
         self._seed = int(self.np_random.integers(2**31) if seed is None else seed)
         self._steps = 0
         self._last_transition = None
+        self._actions, self._queries = [], []
         return self._begin(replace(self._spec, seed=self._seed))
 
     def step(self, action: np.ndarray) -> Transition:
         """Run one control step."""
         run = self._run
-        action = self._check(action)
+        checked = self._check(action)
         if self._last_transition is not None:
             return deepcopy(self._last_transition)
         self._steps += 1
-        observation, reward, terminated, truncated, info = self._advance(run, action)
+        self._actions.append(np.array(action, dtype=np.float64))
+        observation, reward, terminated, truncated, info = self._advance(run, checked)
         if terminated or truncated:
             self._last_transition = deepcopy((observation, 0.0, terminated, truncated, info))
             if self._results_path is not None:
                 write_result(self._results_path, self.episode_result(), self._seed)
         return observation, reward, terminated, truncated, info
+
+    def add_query(self, query: Query) -> None:
+        """Note that the policy was asked for the next action; of no effect once the episode has ended."""
+        if self._last_transition is None:
+            self._queries.append(query)
 
     def render(self) -> np.ndarray | None:
         """(H, W, 3) uint8 image for people.
@@ -83,7 +95,16 @@ class EpisodeEnv[SpecT: Any, RunT, ResultT: ResultLine](gymnasium.Env[Observatio
         """What became of the episode that has just ended."""
         if self._last_transition is None:
             raise ResetNeeded("the episode has not ended yet")
-        return self._result(self._run)
+        j2, j3 = self._smoothness()
+        inference = Inference.of(self._queries)
+        return replace(self._result(self._run), action_j2=j2, action_j3=j3, inference=inference)
+
+    def _smoothness(self) -> tuple[float | None, float | None]:
+        if len(self._actions) < MIN_ACTIONS:
+            return None, None
+        actions_TD = np.stack(self._actions)
+        found = smoothness(actions_TD, np.zeros(len(actions_TD)), exclude=self.gripper_dims)
+        return found.j2.mean, found.j3.mean
 
     @property
     def _run(self) -> RunT:

@@ -11,11 +11,12 @@ from dataclasses import dataclass, field
 from functools import cache, partial
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
-from typing import Any, cast
+from typing import Any
 
 from lerobot_bomb import __version__
 from lerobot_bomb.bomb.episode import PROTOCOL_VERSION, TASK_VERSION, EpisodeSpec
 from lerobot_bomb.bomb.observation import DEFAULT_IMAGE_SIZE, RenderOptions
+from lerobot_bomb.envs.inference import Inference
 from lerobot_bomb.files import append_line, check_appendable
 
 
@@ -60,6 +61,7 @@ class PolicyIdentity:
     # of episodes that it acted in at once; a policy's arithmetic rounds otherwise in a batch of another size
     batch_size: int | None = None
     batch_row: int | None = None  # which of them this one was
+    interventions: tuple[str, ...] = ()  # steps of its preprocessor that change on purpose what it is shown
 
 
 # of a line: who played, with which tasks beside, and what simulated; the rest is the episode
@@ -68,20 +70,30 @@ ORIGIN = {
     "simulator_versions", "lerobot_version", "torch_version", "package_version", "task_version",
     "protocol_version",
 }  # fmt: skip
+# of a line: what an episode that is played again, bit for bit, has otherwise
+MEASURED = {"inference"}
 
 type Row = dict[str, Any]  # a line read back: the fields of a ResultLine
 
 
+@dataclass(frozen=True, kw_only=True)
 class ResultLine:
-    """What became of an episode; a dataclass whose fields are the keys of its line."""
+    """What became of an episode; the fields of its dataclass are the keys of its line."""
+
+    # mean differences of the executed actions, per step and without the gripper; None: fewer than four
+    action_j2: float | None = None
+    action_j3: float | None = None
+    inference: Inference | None = None  # None: no network was asked, or it was not measured
 
     def to_json(self) -> str:
-        """One line of JSON, keys in the order of the fields.
+        """One line of JSON, keys in the order of the fields, those that all environments share at the end.
 
         Raises:
             ValueError: a number is not finite.
         """
-        return json.dumps(dataclasses.asdict(cast("Any", self)), allow_nan=False)
+        values = dataclasses.asdict(self)
+        shared = {each.name: values.pop(each.name) for each in dataclasses.fields(ResultLine)}
+        return json.dumps(values | shared, allow_nan=False)
 
 
 @dataclass(frozen=True)
@@ -120,6 +132,11 @@ class EpisodeResult(ResultLine):
     package_version: str = __version__
     task_version: str = TASK_VERSION
     protocol_version: str = PROTOCOL_VERSION
+
+
+def without_measured(row: Row) -> Row:
+    """What is the same of an episode that is played again."""
+    return {name: value for name, value in row.items() if name not in MEASURED}
 
 
 def check_results_path(path: str | None) -> None:

@@ -11,6 +11,8 @@ import gymnasium as gym
 import numpy as np
 from gymnasium.vector import AsyncVectorEnv, AutoresetMode, SyncVectorEnv, VectorEnv
 
+from lerobot_bomb.envs.inference import Query
+
 # LeRobot's rollout passes this option with the reset that starts a new episode; autoreset passes none.
 NEW_ROLLOUT_OPTION = "lerobot_new_rollout"
 
@@ -74,6 +76,8 @@ class LazyVectorEnv(VectorEnv):
         known_late: gives, for so many envs, the keyword arguments of each one's factory that are known only
             when they start.
         on_first_reset: is given the observations of the first reset, in this process.
+        last_query: gives the query that the policy was asked since it was called last, if any; before a step,
+            each env's `add_query` is given it.
     """
 
     def __init__(
@@ -83,6 +87,7 @@ class LazyVectorEnv(VectorEnv):
         context: str = "forkserver",
         known_late: Callable[[int], Sequence[dict[str, Any]]] = lambda num_envs: [{}] * num_envs,
         on_first_reset: Callable[[Any], None] | None = None,
+        last_query: Callable[[], Query | None] = lambda: None,
     ) -> None:
         probe = make_ones[0]()
         self.num_envs = len(make_ones)
@@ -97,6 +102,7 @@ class LazyVectorEnv(VectorEnv):
         self._context = context
         self._known_late = known_late
         self._on_first_reset = on_first_reset
+        self._last_query = last_query
         self._envs: SyncVectorEnv | AsyncVectorEnv | None = None
 
     def _ensure(self) -> SyncVectorEnv | AsyncVectorEnv:
@@ -121,10 +127,14 @@ class LazyVectorEnv(VectorEnv):
         if self._on_first_reset is not None:
             self._on_first_reset(observations)
             self._on_first_reset = None
+        self._last_query()  # of other episodes
         return observations, infos
 
     def step(self, actions: np.ndarray) -> tuple[Any, Any, Any, Any, dict[str, Any]]:
-        return self._ensure().step(actions)
+        envs = self._ensure()
+        if (query := self._last_query()) is not None:
+            envs.call("add_query", query)
+        return envs.step(actions)
 
     def call(self, name: str, *args: Any, **kwargs: Any) -> Any:
         return self._ensure().call(name, *args, **kwargs)

@@ -36,6 +36,11 @@ def is_quantity(value: Any) -> bool:
     return is_number(value) and value >= 0
 
 
+def is_positive(value: Any) -> bool:
+    """Whether a value is a finite number above 0."""
+    return is_quantity(value) and value > 0
+
+
 def is_share(value: Any) -> bool:
     """Whether a value is a number in 0..1."""
     return is_quantity(value) and value <= 1
@@ -66,6 +71,36 @@ def is_sha256(value: Any) -> bool:
     return isinstance(value, str) and re.fullmatch("[0-9a-f]{64}", value) is not None
 
 
+def is_object_of(checks: Mapping[str, Check]) -> Check:
+    """Whether a value is an object with these keys, of which each passes; others are not looked at."""
+
+    def is_possible(value: Any) -> bool:
+        has_all = isinstance(value, dict) and checks.keys() <= value.keys()
+        return has_all and all(check(value[name]) for name, check in checks.items())
+
+    return is_possible
+
+
+# what lines of all environments have since they are measured, and earlier ones do not
+SHARED_CHECKS: dict[str, Check] = {
+    "action_j2": or_none(is_quantity),
+    "action_j3": or_none(is_quantity),
+    "inference": or_none(
+        is_object_of(
+            {
+                "num_queries": is_int(1),
+                "total_s": is_positive,
+                "latency_p50_ms": is_positive,
+                "latency_p95_ms": is_positive,
+                "passes": or_none(is_quantity),
+                "tokens": or_none(is_quantity),
+                "num_parameters": is_int(1),
+                "peak_memory_bytes": or_none(is_int(1)),
+                "device": is_text,
+            }
+        )
+    ),
+}
 # of who acted, on what and with what, in lines whose simulator is several packages
 RUN_CHECKS: dict[str, Check] = {
     "policy": or_none(lambda value: isinstance(value, dict)),

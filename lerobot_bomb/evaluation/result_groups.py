@@ -5,7 +5,7 @@ from dataclasses import dataclass
 from typing import Any
 
 from lerobot_bomb.conditions import NONE
-from lerobot_bomb.envs.results import ORIGIN, Row
+from lerobot_bomb.envs.results import ORIGIN, Row, without_measured
 from lerobot_bomb.evaluation.result_kind import NOT_RECORDED, Pair, ResultKind, describe_numbers
 from lerobot_bomb.evaluation.result_lines import kind_of
 from lerobot_bomb.stats import PairedCounts
@@ -113,8 +113,13 @@ def count_pairs(pairs: list[Pair]) -> PairedCounts:
 
 
 def different_fields(row: Row, other: Row) -> list[str]:
-    """Names of what is not the same of two lines of one episode, but for who played it and where."""
-    return [name for name, value in row.items() if name not in ORIGIN and value != other.get(name)]
+    """Names of what is not the same of two lines of one episode, of their `outcome`."""
+    return [name for name, value in outcome(row).items() if value != other.get(name)]
+
+
+def outcome(row: Row) -> Row:
+    """What was asked and what became of it: not who played it, where, and how long that took."""
+    return {name: value for name, value in without_measured(row).items() if name not in ORIGIN}
 
 
 def describe_change(pairs: list[Pair]) -> str:
@@ -136,6 +141,7 @@ def describe_policy(row: Row) -> str:
     ]
     notes = [*sums, *([f"adapters of {policy['base']}"] if policy["base"] else [])]
     notes += ["in training"] if policy["is_in_training"] else []
+    notes += [f"with {name}" for name in policy.get("interventions", ())]
     words = [policy["type"], *([f"{policy['path']}{revision}"] if policy["path"] else [])]
     return " ".join([*words, *([f"({', '.join(notes)})"] if notes else [])])
 

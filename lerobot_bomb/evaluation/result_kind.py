@@ -8,7 +8,7 @@ import numpy as np
 from lerobot_bomb.conditions import AxisCondition
 from lerobot_bomb.data.environment import Environment
 from lerobot_bomb.envs.results import Row
-from lerobot_bomb.evaluation.line_checks import Check, check_fields, refuse_others
+from lerobot_bomb.evaluation.line_checks import SHARED_CHECKS, Check, check_fields, refuse_others
 from lerobot_bomb.stats import bootstrap_interval, format_bounds
 
 NOT_RECORDED = "not recorded"
@@ -65,7 +65,8 @@ class ResultKind:
 
     def check(self, row: Row) -> None:
         """Raise a ValueError that names a field of a line which is missing or impossible."""
-        added = {name: check for name, check in self.added_fields.items() if name in row}
+        of_later = {**self.added_fields, **SHARED_CHECKS}
+        added = {name: check for name, check in of_later.items() if name in row}
         check_fields(row, {**self.fields[row["protocol_version"]], **added})
 
     def check_spec(self, row: Row) -> None:

@@ -33,7 +33,11 @@ POLICY_CHECKS: dict[str, Check] = {
     "is_in_training": is_bool,
 }
 # what lines of earlier releases do not have
-ADDED_POLICY_CHECKS: dict[str, Check] = {"batch_size": or_none(is_int(1)), "batch_row": or_none(is_int(0))}
+ADDED_POLICY_CHECKS: dict[str, Check] = {
+    "batch_size": or_none(is_int(1)),
+    "batch_row": or_none(is_int(0)),
+    "interventions": lambda value: isinstance(value, list) and all(map(is_text, value)),
+}
 
 
 def read_lines(path: Path) -> tuple[list[Row], list[str]]:

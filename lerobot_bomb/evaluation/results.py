@@ -6,6 +6,7 @@ from pathlib import Path
 
 from lerobot_bomb.conditions import NONE
 from lerobot_bomb.envs.results import Row
+from lerobot_bomb.evaluation import efficiency
 from lerobot_bomb.evaluation.result_groups import (
     Group,
     count_pairs,
@@ -27,6 +28,7 @@ class Summary:
     num_successes: int
     measures: dict[Measure, str]  # and their values
     failures: Counter[str]
+    efficiency: list[tuple[str, str, str]]  # name, value and note of what was measured
 
     def describe_failures(self) -> str:
         """'dropped 3, imprecise 1', the most frequent class first."""
@@ -41,7 +43,7 @@ class Summary:
             for measure, value in self.measures.items()
             if value != NO_VALUE
         ]
-        figures += [("failures", self.describe_failures(), "")]
+        figures += [("failures", self.describe_failures(), ""), *self.efficiency]
         return [f"{name:<16} {value}{f' ({note})' if note else ''}" for name, value, note in figures]
 
 
@@ -65,6 +67,7 @@ def summarise(rows: list[Row]) -> Summary:
         num_successes=sum(row["is_success"] for row in rows),
         measures={measure: measure.value(rows) for measure in kind_of(rows[0]).measures},
         failures=Counter(row["failure"] for row in rows if not row["is_success"]),
+        efficiency=efficiency.lines(rows),
     )
 
 

@@ -9,11 +9,10 @@ from dataclasses import dataclass
 import numpy as np
 
 from lerobot_bomb.evaluation.executed import Executed
-from lerobot_bomb.flow.smoothness import smoothness
+from lerobot_bomb.smoothness import MIN_ACTIONS, smoothness
 from lerobot_bomb.stats import Measure, paired_bootstrap_interval
 from lerobot_bomb.tables import print_table
 
-MIN_ACTIONS = 4  # that a third difference takes
 GRIPPER = "gripper"  # in the names of dims that do not count
 ORDERS = {"J2": 2, "J3": 3, "J2, normalised": 2, "J3, normalised": 3}  # of the differences
 

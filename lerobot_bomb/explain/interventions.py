@@ -22,6 +22,7 @@ from lerobot.processor import (
 from lerobot.utils.constants import OBS_IMAGE, POLICY_PREPROCESSOR_DEFAULT_NAME
 from lerobot.utils.import_utils import register_third_party_plugins
 
+from lerobot_bomb.checkpoints.names import BLANK_IMAGES, REPLACE_TASKS
 from lerobot_bomb.checkpoints.shipped import checkpoint_path
 from lerobot_bomb.files import check_new_folder, written_whole
 
@@ -30,7 +31,7 @@ PREPROCESSOR_FILE = f"{POLICY_PREPROCESSOR_DEFAULT_NAME}.json"
 type Features = dict[PipelineFeatureType, dict[str, PolicyFeature]]
 
 
-@ProcessorStepRegistry.register("bomb_blank_images")
+@ProcessorStepRegistry.register(BLANK_IMAGES)
 @dataclass
 class BlankImages(ObservationProcessorStep):
     """Every camera shows black."""
@@ -45,7 +46,7 @@ class BlankImages(ObservationProcessorStep):
         return features
 
 
-@ProcessorStepRegistry.register("bomb_replace_tasks")
+@ProcessorStepRegistry.register(REPLACE_TASKS)
 @dataclass
 class ReplaceTasks(ComplementaryDataProcessorStep):
     """The policy is given another instruction; one that has no replacement is an error."""

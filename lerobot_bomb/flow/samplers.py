@@ -64,6 +64,11 @@ def check_sampling(
         raise ValueError(f"clip_sample_range={clip_sample_range} must be positive")
 
 
+def num_evaluations(solver: str, num_inference_steps: int) -> int:
+    """How often `sample` calls the heads."""
+    return 2 * num_inference_steps - 1 if solver == "heun" else num_inference_steps
+
+
 def check_heads(sampler: str, use_flow_head: bool, use_denoise_head: bool) -> None:
     """Raise a ValueError if the sampler reads a head that is off."""
     for head, used in zip(BOTH, (use_flow_head, use_denoise_head), strict=True):

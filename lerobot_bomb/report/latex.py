@@ -3,7 +3,8 @@
 from collections.abc import Sequence
 
 from lerobot_bomb.evaluation.result_groups import by_condition
-from lerobot_bomb.report.tables import Arm, rate
+from lerobot_bomb.report.arms import Arm
+from lerobot_bomb.report.cells import rate
 
 SPECIAL = {
     "\\": r"\textbackslash{}", "~": r"\textasciitilde{}", "^": r"\textasciicircum{}",

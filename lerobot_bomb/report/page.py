@@ -3,7 +3,7 @@
 from collections.abc import Sequence
 from html import escape
 
-from lerobot_bomb.report.tables import Cell, Section, Table
+from lerobot_bomb.report.table import Cell, Section, Table
 
 # one hue, of which only the strength differs: it reads the same for the colour-blind
 SHADE = "background:rgba(0,114,178,{:.2f})"
@@ -16,9 +16,11 @@ h1{font-size:1.5rem}h2{font-size:1.2rem;margin-top:2.5rem;border-bottom:1px soli
 table{border-collapse:collapse;font-variant-numeric:tabular-nums}
 th,td{padding:.25rem .6rem;border-bottom:1px solid #8884;text-align:right;white-space:nowrap}
 th:first-child,td:first-child{text-align:left;position:sticky;left:0;background:Canvas}
+th.text,td.text{text-align:left}
 p.note{opacity:.75;max-width:60rem;font-size:.9rem}
 pre{white-space:pre-wrap;overflow-wrap:anywhere;font-size:.85rem}
 nav a{margin-right:1rem}
+video{display:block;width:20rem;max-width:75vw}
 """
 
 
@@ -46,13 +48,23 @@ def _section(section: Section) -> str:
 
 def _table(table: Table) -> str:
     title = f"<h3>{escape(table.title)}</h3>\n" if table.title else ""
-    head = "".join(f'<th scope="col">{escape(name)}</th>' for name in table.header)
-    rows = "\n".join(f"<tr>{''.join(map(_cell, row))}</tr>" for row in table.rows)
+    kinds = [' class="text"' if _is_text(table, column) else "" for column in range(len(table.header))]
+    names = zip(table.header, kinds, strict=True)
+    head = "".join(f'<th scope="col"{kind}>{escape(name)}</th>' for name, kind in names)
+    rows = "\n".join(f"<tr>{''.join(map(_cell, row, kinds))}</tr>" for row in table.rows)
     note = f'\n<p class="note">{escape(table.note)}</p>' if table.note else ""
     grid = f"<table>\n<thead><tr>{head}</tr></thead>\n<tbody>\n{rows}\n</tbody>\n</table>"
     return f'{title}<div class="wide">{grid}</div>{note}'
 
 
-def _cell(cell: Cell) -> str:
+def _is_text(table: Table, column: int) -> bool:
+    """Whether a column has no numbers."""
+    return not any(isinstance(row[column].value, int | float | dict) for row in table.rows)
+
+
+def _cell(cell: Cell, kind: str) -> str:
     style = "" if cell.shade is None else f' style="{SHADE.format(cell.shade * MAX_STRENGTH)}"'
-    return f"<td{style}>{escape(cell.text)}</td>"
+    video = (
+        "" if cell.video is None else f'<video controls preload="none" src="{escape(cell.video)}"></video>'
+    )
+    return f"<td{kind}{style}>{video}{escape(cell.text)}</td>"

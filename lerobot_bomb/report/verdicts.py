@@ -10,7 +10,8 @@ from typing import Any
 from lerobot_bomb.envs.results import Row
 from lerobot_bomb.evaluation.result_groups import count_pairs, different_fields
 from lerobot_bomb.evaluation.result_kind import Pair
-from lerobot_bomb.report.tables import Cell, Table, rate
+from lerobot_bomb.report.cells import rate
+from lerobot_bomb.report.table import Cell, Table
 from lerobot_bomb.stats import format_rate
 
 POLICY, AGAIN, ALONE = "the policy", "again, in another process", "one episode at a time"

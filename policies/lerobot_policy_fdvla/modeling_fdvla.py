@@ -28,7 +28,7 @@ from lerobot_bomb.flow.losses import joint_loss, second_derivatives
 from lerobot_bomb.flow.noise import SamplingNoise
 from lerobot_bomb.flow.path import PathPoint, draw_tau, path_point
 from lerobot_bomb.flow.real_time import guided, without_padding
-from lerobot_bomb.flow.samplers import SAMPLERS, Heads, sample
+from lerobot_bomb.flow.samplers import SAMPLERS, Heads, num_evaluations, sample
 from lerobot_bomb.policies.policy import RelativeVlaPolicy
 from lerobot_bomb.training.distributed import weighed
 from lerobot_bomb.training.randomness import begin_batch
@@ -240,6 +240,11 @@ class FdvlaPolicy(RelativeVlaPolicy):
         torch.clear_autocast_cache()
         require_finite_answers(actions_BKD.isfinite().flatten(1).all(dim=1))
         return actions_BKD
+
+    @property
+    def last_passes(self) -> int:
+        """Of the text model in a prediction: the prompt's, and those of the sampler's steps."""
+        return 1 + num_evaluations(self.config.solver, self.config.num_inference_steps)
 
     def _left_over(self, actions_KD: Tensor, batch: dict[str, Tensor]) -> Tensor:
         """Normalised actions (K, D) or (B, K, D) of the last chunk, as this one's heads predict them."""

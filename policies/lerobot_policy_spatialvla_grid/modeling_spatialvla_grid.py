@@ -311,6 +311,17 @@ class SpatialvlaGridPolicy(TokenVlaPolicy):
         torch.clear_autocast_cache()
         return cells_BS.unflatten(1, (num_steps, num_groups))
 
+    @property
+    def last_passes(self) -> int | None:
+        """Of the text model in the last prediction, the prompt's included; None: there was none."""
+        return self._writer.num_passes
+
+    @property
+    def last_tokens(self) -> int:
+        """Cells of a prediction that is executed."""
+        num_steps = self.config.temporal_ensemble_size or self.config.n_action_steps
+        return num_steps * len(self.grids.groups)
+
     # Cells
 
     def _embed_cells(self, tokens: Tensor) -> Tensor:

@@ -30,7 +30,7 @@ from lerobot_bomb.actions.text import (
     number_symbols,
 )
 from lerobot_bomb.checkpoints.adapters import peft_targets
-from lerobot_bomb.decoding.decoder import Prompt
+from lerobot_bomb.decoding.decoder import Decoded, Prompt
 from lerobot_bomb.decoding.draft import KnownSymbols, LinearDraft
 from lerobot_bomb.decoding.grammar import NumberGrammar
 from lerobot_bomb.decoding.kv_cache import check_positions
@@ -88,6 +88,7 @@ class Vla0SmolPolicy(RelativeVlaPolicy, TokenVlaPolicy):
         )
         self._color_jitter = None if config.color_jitter is None else ColorJitter(*config.color_jitter)
         self._ensemble = self._make_ensemble()
+        self._decoded: Decoded | None = None  # in the last prediction
         self.reset()
 
     def _get_default_peft_targets(self) -> dict[str, Any]:
@@ -201,7 +202,7 @@ class Vla0SmolPolicy(RelativeVlaPolicy, TokenVlaPolicy):
             embeds_BLH = self._embeds(batch, prompt.ids)
             num_numbers = num_steps * self._action_dim
             noise_shape = self.grammar.max_symbols(num_numbers), NUM_SYMBOLS
-            decoded = self._writer(
+            self._decoded = decoded = self._writer(
                 Prompt(embeds_BLH, prompt.mask),
                 self.symbol_ids,
                 num_numbers,
@@ -211,6 +212,19 @@ class Vla0SmolPolicy(RelativeVlaPolicy, TokenVlaPolicy):
         torch.clear_autocast_cache()
         actions_BTD = self.action_bins.decode(decoded.numbers).view(-1, num_steps, self._action_dim)
         return self._to_absolute(actions_BTD, batch).clamp(-1, 1)
+
+    @property
+    def last_passes(self) -> int | None:
+        """Of the text model in the last prediction, the prompt's included; None: there was none."""
+        return None if self._decoded is None else self._decoded.num_passes
+
+    @property
+    def last_tokens(self) -> float | None:
+        """Spaces and digits of the last prediction, the mean over its rows; None: there was none."""
+        if self._decoded is None:
+            return None
+        written = self._to_tokens(self._decoded.numbers, self.config.n_action_bins).mask
+        return float(written.sum()) / len(written)
 
     # Prompt
 

@@ -11,6 +11,8 @@ import numpy as np
 
 from lerobot_bomb.stats import Measure, measure
 
+MIN_ACTIONS = 4  # that a third difference takes
+
 
 @dataclass(frozen=True)
 class Smoothness:

@@ -3,7 +3,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from lerobot_bomb.flow.smoothness import smoothness
+from lerobot_bomb.smoothness import smoothness
 
 PLANE = np.array([[0, 0], [1, 0], [2, 1], [3, 3], [3, 4]])  # second differences (0, 1), (0, 1), (-1, -1)
 ONE = np.zeros(5, dtype=int)

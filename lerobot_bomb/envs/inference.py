@@ -1,0 +1,61 @@
+"""How long a policy takes to answer: measured in its process, written on the lines of its episodes.
+
+Simulator workers import this module, so it imports neither torch nor LeRobot.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+
+@dataclass(frozen=True)
+class Query:
+    """A call of `select_action` that ran the network, once for all episodes of a batch."""
+
+    seconds: float  # until the actions are there
+    passes: int | None  # of the network, the prompt's included; None: this policy does not tell
+    tokens: float | None  # that were generated for an episode; None: the same, or it generates none
+    num_parameters: int
+    peak_memory_bytes: int | None  # since the policy was first asked; None: this system does not tell
+    device: str
+
+
+@dataclass(frozen=True)
+class Inference:
+    """The queries of an episode, and what they were run on."""
+
+    num_queries: int
+    total_s: float
+    latency_p50_ms: float
+    latency_p95_ms: float
+    passes: float | None  # means per query
+    tokens: float | None
+    num_parameters: int
+    peak_memory_bytes: int | None
+    device: str
+
+    @classmethod
+    def of(cls, queries: Sequence[Query]) -> "Inference | None":
+        """None of no queries: a policy without a network, or one that was not measured."""
+        if not queries:
+            return None
+        seconds = np.array([query.seconds for query in queries])
+        p50_ms, p95_ms = (1000 * np.percentile(seconds, [50, 95])).tolist()
+        last = queries[-1]
+        return cls(
+            num_queries=len(queries),
+            total_s=float(seconds.sum()),
+            latency_p50_ms=p50_ms,
+            latency_p95_ms=p95_ms,
+            passes=_mean([query.passes for query in queries]),
+            tokens=_mean([query.tokens for query in queries]),
+            num_parameters=last.num_parameters,
+            peak_memory_bytes=last.peak_memory_bytes,
+            device=last.device,
+        )
+
+
+def _mean(values: Sequence[float | None]) -> float | None:
+    told = [value for value in values if value is not None]
+    return sum(told) / len(told) if told else None

@@ -1,0 +1,105 @@
+"""What a report is about: arms, the episodes of one policy under one set of settings."""
+
+import shlex
+from collections import Counter
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+from random import Random
+
+from lerobot_bomb.conditions import NONE
+from lerobot_bomb.envs.results import Row
+from lerobot_bomb.evaluation.result_groups import Group, by_condition, groups_of
+
+SHOWN_DIGITS = 6  # of a SHA-256, where names are the same otherwise
+
+
+@dataclass(frozen=True)
+class Arm:
+    """Episodes of one policy under one set of settings, with a short name."""
+
+    name: str
+    group: Group
+
+    @property
+    def rows(self) -> list[Row]:
+        return self.group.rows
+
+    @property
+    def nominal(self) -> list[Row]:
+        """The unperturbed episodes."""
+        return by_condition(self.rows).get(NONE, [])
+
+
+@dataclass(frozen=True)
+class Sample:
+    """A failed episode that is shown."""
+
+    arm: str
+    row: Row
+    path: Path  # of its file
+    line: int  # of the file's episodes, from 1 on
+    video: str | None = None  # link from the page
+    note: str = ""  # why there is none, or what is to be known of it
+
+    @property
+    def command(self) -> str:
+        """Plays it again."""
+        return shlex.join(["lerobot-bomb", "replay", str(self.path), f"--line={self.line}"])
+
+
+@dataclass(frozen=True)
+class Report:
+    """What the sections are counted from."""
+
+    arms: list[Arm]
+    samples: list[Sample] = field(default_factory=list)
+
+
+def sample_failures(arms: list[Arm], files: Mapping[Path, list[Row]], num_of_class: int) -> Iterator[Sample]:
+    """Of each arm and class of failure so many episodes at most, always the same ones of the same files.
+
+    `files` are those that the arms' rows are from.
+    """
+    places = {id(row): (path, line) for path, rows in files.items() for line, row in enumerate(rows, start=1)}
+    for arm in arms:
+        classes = Counter(row["failure"] for row in arm.rows if row["failure"] is not None)
+        for name, number in classes.most_common():
+            failed = [row for row in arm.rows if row["failure"] == name]
+            for row in Random(0).sample(failed, min(num_of_class, number)):
+                yield Sample(arm.name, row, *places[id(row)])
+
+
+def arms_of(rows: list[Row]) -> list[Arm]:
+    """Lines apart that must not be pooled, each with a name that no other has."""
+    groups = groups_of(rows)
+    names = [_name(group.rows[0]) for group in groups]
+    doubled = {name for name, number in Counter(names).items() if number > 1}
+    long = [
+        f"{name} {_weights(group.rows[0])}".strip() if name in doubled else name
+        for name, group in zip(names, groups, strict=True)
+    ]
+    still = {name for name, number in Counter(long).items() if number > 1}
+    numbers = Counter[str]()
+    arms = []
+    for name, group in zip(long, groups, strict=True):
+        numbers[name] += 1
+        arms.append(Arm(f"{name} ({numbers[name]})" if name in still else name, group))
+    return arms
+
+
+def policy_name(row: Row) -> str:
+    """'TYPE'; of a checkpoint with its folder: 'act outputs/act'."""
+    policy = row.get("policy") or {"type": "policy not recorded", "path": None}
+    path = "" if policy["path"] is None else f" {'/'.join(policy['path'].rstrip('/').split('/')[-2:])}"
+    return f"{policy['type']}{path}"
+
+
+def _name(row: Row) -> str:
+    """'act outputs/act, place'."""
+    suite = row["spec"].get("suite")
+    return policy_name(row) + (f", {suite}" if suite else "")
+
+
+def _weights(row: Row) -> str:
+    return ((row.get("policy") or {}).get("weights_sha256") or "")[:SHOWN_DIGITS]

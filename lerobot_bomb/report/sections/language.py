@@ -1,0 +1,60 @@
+"""Whether a policy reads its instruction: the same episodes, told another one."""
+
+from collections.abc import Iterable
+
+from lerobot_bomb.checkpoints.names import REPLACE_TASKS
+from lerobot_bomb.envs.results import Row
+from lerobot_bomb.evaluation.bomb_lines import is_grounded, put_down
+from lerobot_bomb.evaluation.comparison import compare
+from lerobot_bomb.report.arms import Arm, Report
+from lerobot_bomb.report.cells import points, rate
+from lerobot_bomb.report.table import Cell, Section, Table
+
+TITLE = "Language use"
+NOTE = (
+    "The same episodes and weights, but the policy is told other words than the episode's. Both are judged "
+    "by what the episode asked for, so a policy that reads loses its success, and puts the stone elsewhere."
+)
+
+
+def section(report: Report) -> Section:
+    """A table for each arm that was told something else, beside the arm that was not."""
+    tables = [
+        table
+        for own in report.arms
+        if not _interventions(own)
+        for other in report.arms
+        if _interventions(other) == [REPLACE_TASKS] and _weights(own) == _weights(other) != ""
+        for table in _tables(own, other)
+    ]
+    return Section(TITLE, tables)
+
+
+def _tables(own: Arm, other: Arm) -> Iterable[Table]:
+    try:
+        found = compare(own.rows, other.rows)
+    except ValueError:  # no episode in common
+        return
+    rows = [row for each in found.conditions for pair in each.pairs for row in pair]
+    is_placed = all(row.get("target") is not None for row in rows)
+    table = []
+    for each in found.conditions:
+        told, told_other = (list(rows) for rows in zip(*each.pairs, strict=True))
+        cells = [rate(told), rate(told_other), *points(each.counts, each.p_value)]
+        cells += [_grounding(told), _grounding(told_other)] if is_placed else []
+        table.append([Cell(each.condition), *cells, Cell(str(len(each.pairs)), len(each.pairs))])
+    grounding = ["right intersection, its own", "right intersection, another"] if is_placed else []
+    header = ["condition", "its own", "another", "points", "p", *grounding, "pairs"]
+    yield Table(f"{own.name}; told otherwise: {other.name}", header, table, NOTE)
+
+
+def _grounding(rows: list[Row]) -> Cell:
+    return rate(put_down(rows), is_grounded)
+
+
+def _interventions(arm: Arm) -> list[str]:
+    return list((arm.rows[0].get("policy") or {}).get("interventions", ()))
+
+
+def _weights(arm: Arm) -> str:
+    return (arm.rows[0].get("policy") or {}).get("weights_sha256") or ""

@@ -1,0 +1,24 @@
+"""What was run, and the flags that do it again."""
+
+import json
+import shlex
+
+from lerobot_bomb.evaluation.result_groups import by_condition
+from lerobot_bomb.report.arms import Arm, Report
+from lerobot_bomb.report.table import Section
+
+
+def section(report: Report) -> Section:
+    """Lines of each arm."""
+    return Section("What was run", [], [line for arm in report.arms for line in (arm.name, *commands(arm))])
+
+
+def commands(arm: Arm) -> list[str]:
+    """What was evaluated, and the flags that do it again."""
+    by = by_condition(arm.rows)
+    policy = arm.rows[0].get("policy") or {"type": "TYPE", "path": None}
+    who = f"--policy.type={policy['type']}" if policy["path"] is None else f"--policy.path={policy['path']}"
+    seeds = {row["spec"]["seed"] for row in arm.rows}
+    flags = [who, *arm.group.kind.eval_flags(arm.rows), f"--env.perturbations={json.dumps(list(by))}"]
+    flags += [f"--seed={min(seeds)}", f"--eval.n_episodes={max(map(len, by.values()))}"]
+    return [*(f"  {line}" for line in arm.group.lines()), f"  {shlex.join(['lerobot-eval', *flags])}"]

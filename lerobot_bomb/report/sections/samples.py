@@ -1,0 +1,38 @@
+"""Failures to look at."""
+
+from lerobot_bomb.report.arms import Report, Sample
+from lerobot_bomb.report.table import Cell, Section, Table
+
+TITLE = "Failures to look at"
+NOTE = (
+    "A random sample of each class. The command plays the episode again as a video and a recording for "
+    "Rerun; flags --policy.NAME=VALUE of the evaluation are given again."
+)
+
+
+def section(report: Report) -> Section:
+    """A table for each arm that failed."""
+    of_arms: dict[str, list[Sample]] = {}
+    for sample in report.samples:
+        of_arms.setdefault(sample.arm, []).append(sample)
+    return Section(TITLE, [_table(name, samples) for name, samples in of_arms.items()])
+
+
+def _table(name: str, samples: list[Sample]) -> Table:
+    has_videos = any(each.video or each.note for each in samples)
+    header = ["failure", "condition", "seed", "asked for", "play it again"]
+    header += ["video"] if has_videos else []
+    rows = [_row(each)[: len(header)] for each in samples]
+    return Table(name, header, rows, NOTE)
+
+
+def _row(sample: Sample) -> list[Cell]:
+    spec = sample.row["spec"]
+    return [
+        Cell(sample.row["failure"]),
+        Cell(spec["perturbations"]),
+        Cell(str(spec["seed"]), spec["seed"]),
+        Cell(sample.row["instruction"]),
+        Cell(sample.command),
+        Cell(sample.note, sample.video or sample.note, video=sample.video),
+    ]

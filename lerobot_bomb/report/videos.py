@@ -1,0 +1,48 @@
+"""Videos of failures, beside the page that shows them."""
+
+import hashlib
+import json
+from collections import Counter
+from collections.abc import Iterable, Iterator
+from dataclasses import replace
+from pathlib import Path
+from urllib.parse import quote
+
+from lerobot_bomb.envs.results import Row
+from lerobot_bomb.evaluation.result_groups import different_fields
+from lerobot_bomb.report.arms import Sample
+from lerobot_bomb.viewing.episode import write_episodes
+from lerobot_bomb.viewing.replay import Replay, line_of
+
+
+def with_videos(samples: Iterable[Sample], folder: Path, num_of_class: int) -> Iterator[Sample]:
+    """The same samples; the first of each arm's classes with a video in a folder beside the page.
+
+    Where an episode cannot be played again, its note says why.
+    """
+    numbers = Counter[tuple[str, str]]()
+    for sample in samples:
+        of = sample.arm, sample.row["failure"]
+        numbers[of] += 1
+        yield sample if numbers[of] > num_of_class else _with_video(sample, folder)
+
+
+def _with_video(sample: Sample, folder: Path) -> Sample:
+    row = sample.row
+    digest = hashlib.sha256(json.dumps(row, sort_keys=True).encode()).hexdigest()
+    path = folder / f"{row['failure']}-seed{row['spec']['seed']}-{digest[:8]}.mp4"
+    try:
+        different = _play(row, path)
+    except Exception as error:  # whatever it is: the page says it in the video's place
+        lines = str(error).strip().splitlines() or [type(error).__name__]
+        return replace(sample, note=f"no video: {lines[-1]}")
+    note = f"not as recorded: {different[0]} differs" if different else ""
+    return replace(sample, video=quote(f"{folder.name}/{path.name}"), note=note)
+
+
+def _play(row: Row, path: Path) -> list[str]:
+    """Write the video of a line's episode; names of what is not as the line says."""
+    recording = path.with_suffix(".rrd")
+    (result,) = write_episodes({"": Replay(row).player()}, path.stem, recording, path)
+    recording.unlink()
+    return different_fields(row, line_of(result))
