@@ -135,6 +135,9 @@ class SmolVLMBackbone(Backbone):
 
 def in_float32(module: Callable[[Tensor], Tensor], hidden: Tensor) -> Tensor:
     """What a module of float32 weights makes of (..., H), whatever autocast says."""
+    # entering the context takes longer than a small product
+    if not torch.is_autocast_enabled(hidden.device.type):
+        return module(hidden.float())
     with torch.autocast(hidden.device.type, enabled=False):
         return module(hidden.float())
 
