@@ -6,6 +6,7 @@ from pathlib import Path
 
 from lerobot_bomb.commands.arguments import path_flag
 from lerobot_bomb.commands.results_files import check_outputs, read_undamaged
+from lerobot_bomb.data.resumable import check_repo_id
 from lerobot_bomb.evaluation.comparison import POLICY
 from lerobot_bomb.files import written_whole
 from lerobot_bomb.report.arms import Arm, arms_of, policy_name
@@ -28,8 +29,10 @@ def add_export_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def _hub_id(text: str) -> str:
-    if not re.fullmatch(r"[\w.-]+/[\w.-]+", text):
-        raise argparse.ArgumentTypeError(f"{text!r} must be USER/NAME")
+    try:
+        check_repo_id(text)
+    except ValueError:
+        raise argparse.ArgumentTypeError(f"{text!r} must be USER/NAME") from None
     return text
 
 

@@ -53,6 +53,7 @@ class TextLayers:
                 self._copied += _same_parameters(copied, source)
             modules = copies
         *layers, norm = modules
+        self._rope_scale = _rope_scale(layers[0].self_attn)
         is_copy = copy_dtype is not None
         # torch does not compile operations on complex numbers
         by_pairs = not (is_copy or compiled) and all(RopePairs.can(layer.self_attn) for layer in layers)
@@ -83,7 +84,7 @@ class TextLayers:
 
     def rope(self, position_C: Tensor) -> Tensor:
         """Positions as `rotary_tables` takes them -> (C, 1, ...) rotary ones as the layers want them."""
-        return self._rope(*rotary_tables(self.model, position_C))
+        return self._rope(*rotary_tables(self.model, position_C)) * self._rope_scale
 
     @torch.no_grad()
     def refresh(self) -> None:
@@ -93,6 +94,15 @@ class TextLayers:
         torch._foreach_copy_(copies, weights)  # pyright: ignore[reportPrivateImportUsage]
         for norm in [*(norm for layer in self._layers for norm in layer.norms), self._norm]:
             norm.refresh()
+
+
+def _rope_scale(attention: Any) -> float:
+    """Of rotary positions, so that the products of rotated queries and keys are ``p`` of `_Layer._read`.
+
+    A factor of the tables costs nothing, one of the products an operation in every layer and pass.
+    """
+    softcap = softcap_of(attention)
+    return 1.0 if softcap is None else (2 * attention.scaling / softcap) ** 0.5
 
 
 def _copy(module: nn.Module, dtype: torch.dtype) -> nn.Module:
@@ -162,14 +172,8 @@ class _Layer:
             )
         # of p = 2 * scale * product / softcap, softcap * tanh(p / 2) is 2 * softcap * sigmoid(p) but for a
         # constant, which softmax does not see; the sigmoid is faster
-        scaled_ZXC = torch.baddbmm(
-            keys_ZCE.new_empty(1, 1, 1),  # counts for nothing: a product that is scaled without another pass
-            query_BVKGE.reshape(len(keys_ZCE), -1, size),
-            keys_ZCE.transpose(1, 2),
-            beta=0,
-            alpha=2 * self._scale / self._softcap,
-        )
-        capped_ZXC = cast(scaled_ZXC, torch.float32).sigmoid_()
+        products_ZXC = torch.bmm(query_BVKGE.reshape(len(keys_ZCE), -1, size), keys_ZCE.transpose(1, 2))
+        capped_ZXC = cast(products_ZXC, torch.float32).sigmoid_()
         capped_BVXC = capped_ZXC.view(batch_size, num_keys, *capped_ZXC.shape[1:])
         scores_BVXC = torch.add(bias_B1XC, capped_BVXC, alpha=2 * self._softcap)
         weights_BVXC = cast(scores_BVXC.softmax(dim=-1), values_ZCE.dtype)

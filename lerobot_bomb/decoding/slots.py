@@ -24,7 +24,7 @@ from lerobot_bomb.decoding.decoder_layers import TextLayers
 from lerobot_bomb.decoding.graph_cache import GraphCache
 from lerobot_bomb.decoding.kv_cache import CachedText, Positions
 from lerobot_bomb.finite import require_finite_answers
-from lerobot_bomb.vlm.backbone import exact_linear
+from lerobot_bomb.vlm.backbone import exact_linear, in_float32
 
 
 class SlotWriter:
@@ -109,7 +109,21 @@ class SlotHead:
 
     def logits(self, hidden_BH: Tensor, step: int, slot: slice) -> Tensor:
         """(B, H) -> (B, choices of the slot) float32."""
-        logits = exact_linear(hidden_BH, self.rows[slot])
+        return self._finish(exact_linear(hidden_BH, self.rows[slot]), step, slot)
+
+    def logits_of_tokens(self, hidden_KH: Tensor, places: list[tuple[int, slice]]) -> list[Tensor]:
+        """Of a single row's tokens, and the step and slot of each -> its choices' logits, float32 each."""
+        products = in_float32(partial(self._multiply, [slot for _, slot in places]), hidden_KH)
+        return [
+            self._finish(of_token, step, slot)
+            for of_token, (step, slot) in zip(products, places, strict=True)
+        ]
+
+    def _multiply(self, slots: list[slice], hidden_KH: Tensor) -> list[Tensor]:
+        rows_CH = self.rows.float()
+        return [rows_CH[slot] @ hidden_H for slot, hidden_H in zip(slots, hidden_KH, strict=True)]
+
+    def _finish(self, logits: Tensor, step: int, slot: slice) -> Tensor:
         if not self.noise.shape[1]:
             return logits
         return self.cap(logits) + self.noise[:, step, slot]
@@ -195,19 +209,15 @@ def repeat(
     num_tokens, num_passes = 1, 0
     while len(chosen) < num_slots:
         num_passes += 1
-        steps, kinds = zip(
-            *(divmod(len(chosen) + ahead, num_kinds) for ahead in range(num_tokens)), strict=True
-        )
+        indices = range(len(chosen), len(chosen) + num_tokens)
+        places = [(index // num_kinds, slots[index % num_kinds]) for index in indices]
         guesses = [chosen[ahead % num_kinds - num_kinds] for ahead in range(num_tokens)]
-        read = [chosen[-1] + slots[kinds[0] - 1].start]
-        read += [guess + slots[kind].start for guess, kind in zip(guesses[:-1], kinds, strict=False)]
+        read = [chosen[-1] + slots[(len(chosen) - 1) % num_kinds].start]
+        read += [guess + slot.start for guess, (_, slot) in zip(guesses[:-1], places, strict=False)]
         column_K = torch.arange(num_tokens, device=step_1G.device) + length + len(chosen) - 1
         (hidden_KH,) = text(embeds_CH[read][None], column_K[None])
-        logits = [
-            head.logits(hidden_1H, step, slots[kind])[0]
-            for hidden_1H, step, kind in zip(hidden_KH[:, None], steps, kinds, strict=True)
-        ]
-        require_finite_answers(torch.cat(logits).isfinite().all()[None])
+        logits = head.logits_of_tokens(hidden_KH, places)
+        require_finite_answers(torch.cat(logits, dim=-1).isfinite().all()[None])
         picks = [int(of_slot.argmax()) for of_slot in logits]
         # one that was not read may be right, too: it says how many to read in the next pass
         num_right = sum(accumulate(map(eq, picks, guesses), and_))

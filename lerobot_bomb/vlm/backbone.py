@@ -133,8 +133,11 @@ class SmolVLMBackbone(Backbone):
         return self.text_model(inputs_embeds=embeds_BLH, use_cache=False).last_hidden_state
 
 
-def in_float32(module: Callable[[Tensor], Tensor], hidden: Tensor) -> Tensor:
+def in_float32[T](module: Callable[[Tensor], T], hidden: Tensor) -> T:
     """What a module of float32 weights makes of (..., H), whatever autocast says."""
+    # entering the context takes longer than a small product
+    if not torch.is_autocast_enabled(hidden.device.type):
+        return module(hidden.float())
     with torch.autocast(hidden.device.type, enabled=False):
         return module(hidden.float())
 
