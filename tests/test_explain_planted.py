@@ -11,6 +11,7 @@ from lerobot_bomb.explain.diagnosis import diagnose
 from lerobot_bomb.explain.explained import INSTRUCTION
 from lerobot_bomb.explain.moment import Asked, Explanation, explain
 from lerobot_bomb.explain.spans import difference, token_offsets
+from lerobot_bomb.flow.dual_mod import FiLM
 from lerobot_bomb.viewing.checkpoint import LoadedPolicy
 
 GRID = 4
@@ -92,6 +93,9 @@ def test_one_that_looks_at_one_patch_only(name: str, camera: str) -> None:
 @pytest.mark.parametrize("name", NAMES)
 def test_one_that_reads_the_target_through_one_head(name: str) -> None:
     policy = fresh(name)
+    for module in policy.policy.modules():  # what fdvla's heads read of the prompt beside its layers
+        if isinstance(module, FiLM):
+            module.layers[-1].weight.data.zero_()
     layers = policy.policy.explained().layers
     for number, layer in enumerate(layers):
         weight: Any = layer.attention_out.weight
