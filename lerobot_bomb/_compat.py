@@ -7,7 +7,6 @@ import pickle
 import re
 import shutil
 import sys
-from argparse import ArgumentParser
 from collections.abc import Callable, Collection, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager, suppress
@@ -319,10 +318,11 @@ def tell_wrong_flags(
     from draccus.parsers import decoding
     from draccus.wrappers.suppressing_argparse import SuppressingArgumentParser
 
-    def error(self: ArgumentParser, message: str) -> NoReturn:
+    def error(self: Any, message: str) -> NoReturn:
         words = message.partition("unrecognized arguments: ")[2].split()
         flags = _flags_of_chosen_types(self._option_string_actions, sys.argv)
-        self.exit(2, f"{self.prog}: error: {message}{hint(words, flags, sys.argv)}\n")
+        known = [word for word in sys.argv if repr(word.partition("=")[2]) not in message]
+        self.exit(2, f"{self.prog}: error: {message}{hint(words, flags, known)}\n")
 
     usual: Any = getattr(decoding.decode_dataclass, "__wrapped__", decoding.decode_dataclass)
 
