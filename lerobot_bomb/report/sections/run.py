@@ -19,6 +19,7 @@ def commands(arm: Arm) -> list[str]:
     policy = arm.rows[0].get("policy") or {"type": "TYPE", "path": None}
     who = f"--policy.type={policy['type']}" if policy["path"] is None else f"--policy.path={policy['path']}"
     seeds = {row["spec"]["seed"] for row in arm.rows}
-    flags = [who, *arm.group.kind.eval_flags(arm.rows), f"--env.perturbations={json.dumps(list(by))}"]
+    flags = [who, *arm.group.kind.eval_flags(arm.rows)]
+    flags += [f"--env.perturbations={json.dumps(list(by))}"] if arm.group.kind.condition.axes else []
     flags += [f"--seed={min(seeds)}", f"--eval.n_episodes={max(map(len, by.values()))}"]
     return [*(f"  {line}" for line in arm.group.lines()), f"  {shlex.join(['lerobot-eval', *flags])}"]
