@@ -321,7 +321,9 @@ def tell_wrong_flags(
     def error(self: Any, message: str) -> NoReturn:
         words = message.partition("unrecognized arguments: ")[2].split()
         flags = _flags_of_chosen_types(self._option_string_actions, sys.argv)
-        self.exit(2, f"{self.prog}: error: {message}{hint(words, flags, sys.argv)}\n")
+        known = [word for word in sys.argv if repr(word.partition("=")[2]) not in message]
+        print(f"{self.prog}: error: {message}{hint(words, flags, known)}", file=sys.stderr)
+        raise SystemExit(2)
 
     usual: Any = getattr(decoding.decode_dataclass, "__wrapped__", decoding.decode_dataclass)
 

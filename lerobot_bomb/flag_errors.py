@@ -32,9 +32,14 @@ def hint(words: Sequence[str], flags: Collection[str], argv: Sequence[str]) -> s
         flags: that there are.
         argv: all that the command was given; where it names types, --help lists their flags.
     """
-    near = [flag for word in words if word.startswith("--") for flag in nearest_flags(word, flags)]
     types = [word for word in argv if re.match(r"--\w+\.type=", word)]
-    return f"; nearest: {', '.join(near)}" * bool(near) + f"; {' '.join([*types, '--help'])} lists all flags"
+    return f"{nearest(words, flags)}; {' '.join([*types, '--help'])} lists all flags"
+
+
+def nearest(words: Sequence[str], flags: Collection[str]) -> str:
+    """'; nearest: --seed', of the flags that are spelled much like these words; empty: none is."""
+    near = [flag for word in words if word.startswith("--") for flag in nearest_flags(word, flags)]
+    return f"; nearest: {', '.join(near)}" * bool(near)
 
 
 def nearest_flags(word: str, flags: Collection[str]) -> list[str]:

@@ -157,11 +157,14 @@ def bca_interval(values_E: np.ndarray) -> tuple[float, float] | None:
 
 
 def bootstrap_interval(sums_E: np.ndarray, counts_E: np.ndarray) -> tuple[float, float] | None:
-    """95 % percentile bootstrap interval of sum / count over E episodes; None for fewer than two.
+    """95 % percentile bootstrap interval of sum / count over E episodes.
 
-    Episodes are drawn, not frames: the frames of one resemble each other. The draws are always the same.
+    None for fewer than two, and where all are equal: resampling tells nothing of them. Episodes are drawn,
+    not frames: the frames of one resemble each other. The draws are always the same.
     """
-    return None if len(sums_E) < 2 else _percentiles(_resampled_means(sums_E, counts_E))
+    if len(sums_E) < 2 or np.ptp(sums_E / counts_E) == 0:
+        return None
+    return _percentiles(_resampled_means(sums_E, counts_E))
 
 
 @dataclass(frozen=True)

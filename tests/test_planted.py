@@ -106,7 +106,7 @@ def test_a_rate_says_how_many_are_missing(
     assert run("results", results) == 0
     said = capsys.readouterr()
     assert "0/18 = 0.0 %" in said.out
-    assert f"{results}: 2 episodes are missing, an error ended them: {tmp_path / 'errors.jsonl'}" in said.err
+    assert f"episodes are missing; an error ended 2: {tmp_path / 'errors.jsonl'}" in said.err
 
     monkeypatch.setenv("EVERY_TENTH_IS_MENDED", "1")
     assert run("sweep", tmp_path, "--retry") == 0

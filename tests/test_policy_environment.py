@@ -8,6 +8,7 @@ from pathlib import Path
 
 import pytest
 import torch
+from lerobot.configs import PreTrainedConfig
 from lerobot.datasets import LeRobotDatasetMetadata
 from lerobot.envs import make_env_config, make_env_pre_post_processors
 from lerobot.policies import (
@@ -23,6 +24,7 @@ from policy_cases import CASES
 import lerobot_policy_bomb  # noqa: F401  the plugin
 from lerobot_bomb.checkpoints.environment import ConfigWithEnvironment
 from lerobot_bomb.checkpoints.folder import parse_config, write_checkpoint
+from lerobot_bomb.checkpoints.shipped import checkpoint_path
 from lerobot_bomb.commands.main import main
 from lerobot_bomb.data.environment import Environment
 
@@ -190,3 +192,12 @@ def test_policies_without_training_act_anywhere(untrained: str, caplog: pytest.L
     with caplog.at_level(logging.WARNING):
         act_in(policy, control_mode="absolute", fps=20)
     assert not [record for record in caplog.records if "does not know" in record.getMessage()]
+
+
+@pytest.mark.parametrize("name", ["fdvla", "spatialvla_grid"])
+def test_where_an_action_has_another_size_a_checkpoint_says_where_it_was_trained(name: str) -> None:
+    config = PreTrainedConfig.from_pretrained(checkpoint_path(f"bomb:{name}"))
+    config.pretrained_path, config.device = Path(checkpoint_path(f"bomb:{name}")), "cpu"
+    told = r"was trained for --env\.type=bomb, where an action has 4 numbers; here it has 2"
+    with pytest.raises(ValueError, match=told):
+        make_policy(config, env_cfg=make_env_config("bomb_pusht"))

@@ -76,5 +76,5 @@ def test_scripted_policies_refuse_training(config_class: type) -> None:
 
 
 def test_scripted_policies_refuse_other_robots() -> None:
-    with pytest.raises(ValueError, match="acts on BOMB only"):
+    with pytest.raises(ValueError, match=r"acts in --env\.type=bomb only"):
         make_policy(make_policy_config("bomb_random", device="cpu"), env_cfg=make_env_config("pusht"))

@@ -216,6 +216,7 @@ def test_libero_is_played_from_the_initial_states_in_order(
     monkeypatch.setattr(lerobot_eval, "rollout", raising)
     flags = ("--env.type=libero", "--env.task_ids=[0]", "--env.episode_length=2", "--policy.device=cpu")
     flags += ("--env.observation_height=48", "--env.observation_width=48", "--policy.vlm_model_name=nano")
+    flags += ("--policy.use_state=false",)
     policies = ("vla0_smol",)
     store = play(plan(policies, ("libero_spatial",), (), seed=7, num_episodes=3, batch_size=1, flags=flags))
     rows = read_results(store.folder / "results.jsonl")

@@ -14,11 +14,12 @@ from typing import Any
 import pytest
 
 from lerobot_bomb.commands.main import main
+from lerobot_bomb.commands.results_files import missing_of_sweep
 from lerobot_bomb.envs.results import Row, without_measured
 from lerobot_bomb.evaluation.results import read_results
 from lerobot_bomb.sweep.local import progress
 from lerobot_bomb.sweep.manifest import Cell, Manifest, plan
-from lerobot_bomb.sweep.store import MAX_ATTEMPTS, Store
+from lerobot_bomb.sweep.store import MAX_ATTEMPTS, Store, claim
 
 FLAGS = ("--env.type=bomb", "--env.image_size=32", "--policy.device=cpu")
 NANO = "bomb:vla0_smol"
@@ -253,9 +254,38 @@ def test_wrong_flags_are_told(
 
 
 def test_a_folder_of_another_sweep_is_left_alone(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    small().write(tmp_path)
+    manifest = small()
+    manifest.write(tmp_path)
+    Store(tmp_path, manifest).finish(manifest.cells[0], ["{}"], [])
     assert sweep(tmp_path, "--policies=bomb_random", "--dry_run", *FLAGS) == 1
     assert "is of another sweep" in capsys.readouterr().err
+    assert Manifest.read(tmp_path) == manifest
+
+
+def test_a_folder_where_nothing_was_played_takes_another_sweep(tmp_path: Path) -> None:
+    misspelt = small()
+    assert claim(tmp_path, misspelt) and claim(tmp_path, misspelt)
+    store = Store(tmp_path, misspelt)
+    store.give_up(misspelt.cells[0], "no such flag")
+    assert "flags that are right, into this folder" in store.lines()[-1]
+    with store.claimed(misspelt.cells[0]):
+        assert not claim(tmp_path, small(("bomb_random",)))
+    assert claim(tmp_path, small(("bomb_random",)))
+    assert Manifest.read(tmp_path) == small(("bomb_random",))
+
+
+def test_readers_say_what_a_sweep_that_was_stopped_lacks(tmp_path: Path) -> None:
+    manifest = small(conditions=("none", "light:3"))
+    manifest.write(tmp_path)
+    results = tmp_path / "results.jsonl"
+    assert missing_of_sweep(results, 6) == ""
+    assert missing_of_sweep(results, 2) == (
+        f"{results}: 4 of 6 episodes are missing; `lerobot-bomb sweep {tmp_path}` goes on"
+    )
+    (tmp_path / "errors.jsonl").write_text("{}\n{}\n")
+    errors = f"an error ended 2: {tmp_path / 'errors.jsonl'}"
+    assert missing_of_sweep(results, 4) == f"{results}: 2 of 6 episodes are missing; {errors}"
+    assert missing_of_sweep(tmp_path / "other.jsonl", 2) == ""
 
 
 @pytest.mark.long

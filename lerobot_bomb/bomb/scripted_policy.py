@@ -51,8 +51,8 @@ class ScriptedConfig(PreTrainedConfig):
     def validate_features(self) -> None:
         if self.action_feature is None or self.action_feature.shape != (ACTION_DIM,):
             raise ValueError(
-                f"--policy.type={self.type} acts on BOMB only (actions of shape ({ACTION_DIM},)), "
-                f"got output features {self.output_features}"
+                f"--policy.type={self.type} acts in --env.type=bomb only, where an action has {ACTION_DIM} "
+                f"numbers; here the outputs are {self.output_features}"
             )
 
     def refuse_training(self) -> NoReturn:

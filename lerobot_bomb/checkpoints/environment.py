@@ -29,6 +29,16 @@ class ConfigWithEnvironment(PreTrainedConfig):
         """What a checkpoint with this config lacks and what it would need instead; None: nothing."""
         return None
 
+    def check_action_size(self, size: int) -> None:
+        """Raise a ValueError unless an action here has as many numbers as where it was trained."""
+        if self.environment is None or self.environment.action_size == size:
+            return
+        raise ValueError(
+            f"{_name(self)} was trained for --env.type=bomb, where an action has "
+            f"{self.environment.action_size} numbers; here it has {size}. Evaluate it there, or train a "
+            "policy for this environment"
+        )
+
     def _save_pretrained(self, save_directory: Path) -> None:
         saved = copy.copy(self)
         saved.ignore_environment = False
@@ -57,8 +67,11 @@ def asked_policy() -> tuple[PreTrainedPolicy, str, str] | None:
         if isinstance(config, ConfigWithEnvironment)
         else "--env.ignore_checkpoint"
     )
-    who = f"the checkpoint {config.pretrained_path}" if config.pretrained_path else f"this {config.type}"
-    return policies[-1], who, f"insist with {flag}=true"
+    return policies[-1], _name(config), f"insist with {flag}=true"
+
+
+def _name(config: PreTrainedConfig) -> str:
+    return f"the checkpoint {config.pretrained_path}" if config.pretrained_path else f"this {config.type}"
 
 
 def trained_environment(policy: PreTrainedPolicy) -> Environment | None:

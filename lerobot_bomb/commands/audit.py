@@ -30,7 +30,7 @@ from lerobot_bomb.report.verdicts import (
 )
 from lerobot_bomb.sweep.local import play
 from lerobot_bomb.sweep.manifest import Cell, Manifest, check_flags, largest_divisor
-from lerobot_bomb.sweep.store import Store
+from lerobot_bomb.sweep.store import Store, claim
 from lerobot_bomb.tables import print_table
 
 if TYPE_CHECKING:
@@ -129,7 +129,7 @@ def _play(args: argparse.Namespace, folder: Path, cells: dict[str, Cell]) -> dic
         RuntimeError: an arm could not be played.
     """
     manifest = Manifest(tuple(cells.values()))
-    if not manifest.claim(folder):
+    if not claim(folder, manifest):
         raise ValueError(f"{args.folder} is of another audit; name another folder")
     store = Store(folder, manifest)
     store.forget_attempts(manifest.cells)

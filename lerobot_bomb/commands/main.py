@@ -9,6 +9,7 @@ from typing import Any
 from draccus.utils import DecodingError
 
 from lerobot_bomb import __version__
+from lerobot_bomb.flag_errors import nearest
 
 DESCRIPTION = "What lerobot-train and lerobot-eval do not do for BOMB: record, summarise, check."
 
@@ -78,7 +79,9 @@ def main(argv: Sequence[str] | None = None) -> int:
         if "rest" in args:  # of a command that has LeRobot's parser read them
             args.rest = unknown
         elif unknown:
-            commands[args.command].error(f"unrecognized arguments: {' '.join(unknown)}")
+            command = commands[args.command]
+            near = nearest(unknown, command._option_string_actions)
+            command.error(f"unrecognized arguments: {' '.join(unknown)}{near}")
         return getattr(_module(args.command), f"run_{_function(args.command)}")(args)
     except (ValueError, OSError, RuntimeError, DecodingError) as error:
         print(f"lerobot-bomb {argv[0]}: {error}", file=sys.stderr)

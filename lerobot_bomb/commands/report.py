@@ -10,7 +10,7 @@ from pathlib import Path
 from tqdm import tqdm
 
 from lerobot_bomb.commands.arguments import check_at_least, path_flag
-from lerobot_bomb.commands.results_files import check_outputs, read_undamaged
+from lerobot_bomb.commands.results_files import check_outputs, missing_of_sweep, read_undamaged
 from lerobot_bomb.files import written_whole
 from lerobot_bomb.report.arms import Report, Sample, arms_of, sample_failures
 from lerobot_bomb.report.page import render
@@ -48,7 +48,8 @@ def run_report(args: argparse.Namespace) -> int:
     folder = page.with_name(f"{page.stem}_videos")
     if args.videos:
         samples = _play(samples, folder, args.videos)
-    sections = build(Report(arms, samples))
+    missing = [told for path, rows in files.items() if (told := missing_of_sweep(path, len(rows)))]
+    sections = build(Report(arms, samples, missing))
     with written_whole(page, tables, rates) as (html, as_json, as_csv):
         html.write_text(render(args.title, sections))
         as_json.write_text(json.dumps([section.as_json() for section in sections], indent=1) + "\n")

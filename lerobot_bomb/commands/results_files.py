@@ -6,6 +6,7 @@ from pathlib import Path
 
 from lerobot_bomb.envs.results import Row
 from lerobot_bomb.evaluation.result_lines import check_any, read_lines
+from lerobot_bomb.sweep.manifest import NAME, Manifest
 from lerobot_bomb.sweep.store import ERRORS, RESULTS
 
 MAX_SHOWN_DAMAGES = 10
@@ -19,11 +20,16 @@ def check_outputs(inputs: Sequence[Path], outputs: Iterable[Path]) -> None:
             raise ValueError(f"--output: {path} is a file of results that is read; name another output")
 
 
-def _tell_missing(path: Path) -> None:
-    """Of a sweep's file: how many episodes have no line because an error ended them."""
-    errors = path.with_name(ERRORS)
-    if path.name == RESULTS and errors.is_file() and (number := errors.read_bytes().count(b"\n")):
-        print(f"{path}: {number} episodes are missing, an error ended them: {errors}", file=sys.stderr)
+def missing_of_sweep(path: Path, num_rows: int) -> str:
+    """How many episodes a sweep's file, which has so many, lacks, and why; "" if none or of another file."""
+    if path.name != RESULTS or not path.with_name(NAME).is_file():
+        return ""
+    number, errors = Manifest.read(path.parent).num_episodes, path.with_name(ERRORS)
+    missing = number - num_rows
+    num_errors = errors.read_bytes().count(b"\n") if errors.is_file() else 0
+    reasons = [f"an error ended {num_errors}: {errors}"] if num_errors else []
+    reasons += [f"`lerobot-bomb sweep {path.parent}` goes on"] if missing > num_errors else []
+    return f"{path}: {missing} of {number} episodes are missing; {'; '.join(reasons)}" if missing > 0 else ""
 
 
 def read_undamaged(path: Path) -> tuple[list[Row], int]:
@@ -35,10 +41,11 @@ def read_undamaged(path: Path) -> tuple[list[Row], int]:
         ValueError: there is no such file, or no episode in it.
     """
     rows, damages = read_lines(path)
-    _tell_missing(path)
+    check_any(path, rows, damages)
+    if missing := missing_of_sweep(path, len(rows)):
+        print(missing, file=sys.stderr)
     for damage in damages[:MAX_SHOWN_DAMAGES]:
         print(f"{damage}; not counted", file=sys.stderr)
     if len(damages) > MAX_SHOWN_DAMAGES:
         print(f"{path}: ... and {len(damages) - MAX_SHOWN_DAMAGES} more such lines", file=sys.stderr)
-    check_any(path, rows, damages)
     return rows, len(damages)

@@ -14,7 +14,7 @@ from lerobot_bomb.flags import one_of
 from lerobot_bomb.sweep.cluster import sbatch_script, submit
 from lerobot_bomb.sweep.local import PYTHON, play, progress
 from lerobot_bomb.sweep.manifest import NAME, Cell, Manifest, flag_value, parse_part, plan
-from lerobot_bomb.sweep.store import Store
+from lerobot_bomb.sweep.store import Store, claim
 
 MAX_BATCH = 10
 SCRIPT, SUBMITIT = "sweep.sbatch", "submitit"
@@ -77,7 +77,9 @@ def run_sweep(args: argparse.Namespace) -> int:
         else:
             _play_by_jobs(args, store)
     except KeyboardInterrupt:
-        print(f"interrupted; to go on: lerobot-bomb sweep {args.folder}")
+        store.merge()
+        print(*store.lines(), f"to go on: lerobot-bomb sweep {args.folder}", sep="\n")
+        raise
     store.merge()
     print(*store.lines(), sep="\n")
     is_whole = all(store.is_finished(cell) and not store.errors(cell) for cell in cells)
@@ -127,7 +129,7 @@ def _manifest(args: argparse.Namespace) -> Manifest:
     conditions = _expanded(args.perturbations, kind)
     batch_size = 1 if kind.starts_by_number else args.batch_size
     manifest = plan(args.policies, args.tasks, conditions, args.seed, args.episodes, batch_size, args.rest)
-    if not manifest.claim(args.folder):
+    if not claim(args.folder, manifest):
         raise ValueError(
             f"{args.folder / NAME} is of another sweep; name another folder, or go on with that one by "
             f"`lerobot-bomb sweep {args.folder}`"

@@ -56,6 +56,11 @@ class Environment:
             task_ids=_task_ids(recording),
         )
 
+    @property
+    def action_size(self) -> int:
+        """Numbers of an action."""
+        return len(ACTION_NAMES[self.control_mode])
+
     def eval_flags(self) -> list[str]:
         """Of lerobot-eval, for this environment."""
         flags = [f"--env.{name}={getattr(self, name)}" for name in COMPARED]

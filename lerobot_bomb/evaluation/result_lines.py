@@ -47,7 +47,8 @@ def read_lines(path: Path) -> tuple[list[Row], list[str]]:
         ValueError: there is no such file.
     """
     if path.is_dir():
-        raise ValueError(f"{path} is a folder; name a results file in it")
+        files = ", ".join(str(each) for each in sorted(path.glob("*.jsonl")) if each.name != "errors.jsonl")
+        raise ValueError(f"{path} is a folder; name a results file in it{f': {files}' if files else ''}")
     if not path.is_file():
         raise ValueError(
             f"{path}: no such results file; lerobot-eval writes it with --env.results_path={path}"

@@ -45,6 +45,8 @@ class ChunkConfig(ConfigWithEnvironment):
     CHOICES: ClassVar[dict[str, tuple]] = {}
     # how state and action may be normalised
     MODES: ClassVar[tuple[NormalizationMode, ...]] = tuple(NormalizationMode)
+    # whether a checkpoint's weights are of actions of one size; text has any
+    ACTIONS_ARE_OF_WEIGHTS: ClassVar[bool] = True
     # registered name of the processor step that reads the task, which every checkpoint has
     TASK_STEP: ClassVar[str]
 
@@ -90,6 +92,7 @@ class ChunkConfig(ConfigWithEnvironment):
 
     def check_flags(self) -> None:
         """Raise a ValueError that names the flag unless all values go together."""
+        self._check_action_size()
         for flag, allowed in self.CHOICES.items():
             one_of(f"--policy.{flag}", getattr(self, flag), allowed)
         for kind, allowed in {
@@ -104,6 +107,11 @@ class ChunkConfig(ConfigWithEnvironment):
     def validate_features(self) -> None:
         """Raise unless the dataset (or environment) has what the policy reads and writes."""
         check_cameras_and_action(self)
+        self._check_action_size()
+
+    def _check_action_size(self) -> None:
+        if self.ACTIONS_ARE_OF_WEIGHTS and self.action_feature is not None:
+            self.check_action_size(self.action_feature.shape[0])
 
     def get_optimizer_preset(self) -> AdamWConfig:
         return adamw(self)

@@ -85,16 +85,6 @@ class Manifest:
         with written_whole(folder / NAME) as (path,):
             path.write_text(json.dumps({"version": VERSION, "cells": cells}, indent=1) + "\n")
 
-    def claim(self, folder: Path) -> bool:
-        """Write it to a folder, unless one is there; whether that of the folder now is this.
-
-        Raises:
-            ValueError: the one that is there is damaged, or of another version of this package.
-        """
-        if not (folder / NAME).is_file():
-            self.write(folder)
-        return Manifest.read(folder) == self
-
     @classmethod
     def read(cls, folder: Path) -> "Manifest":
         """The one in a folder.

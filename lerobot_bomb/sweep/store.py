@@ -13,7 +13,7 @@ from fcntl import LOCK_EX, LOCK_NB, flock
 from pathlib import Path
 
 from lerobot_bomb.files import append_line, written_whole
-from lerobot_bomb.sweep.manifest import Cell, Manifest
+from lerobot_bomb.sweep.manifest import NAME, Cell, Manifest
 
 MAX_ATTEMPTS = 3
 POLL_S = 0.5  # between two looks at what other processes have done
@@ -30,6 +30,20 @@ class EpisodeError:
     command: str  # plays it again
 
 
+def claim(folder: Path, manifest: Manifest) -> bool:
+    """Whether a folder is this manifest's now; it becomes so unless another's episodes are played there.
+
+    Raises:
+        ValueError: a manifest that is there is damaged, or of another version of this package.
+    """
+    if (folder / NAME).is_file():
+        there = Manifest.read(folder)
+        if there == manifest or not Store(folder, there).is_untouched():
+            return there == manifest
+    manifest.write(folder)
+    return True
+
+
 class Store:
     """The folder of a sweep."""
 
@@ -43,6 +57,17 @@ class Store:
 
     def is_finished(self, cell: Cell) -> bool:
         return self.file(cell, "jsonl").is_file()
+
+    def is_untouched(self) -> bool:
+        """Whether no episode has been played, with a line or with an error, and none is being played."""
+        played = ("jsonl", "part", "errors")
+        return not any(
+            self.file(cell, ending).is_file() for cell in self.manifest.cells for ending in played
+        ) and all(self._is_free(cell) for cell in self.manifest.cells)
+
+    def _is_free(self, cell: Cell) -> bool:
+        with self.claimed(cell) as is_mine:
+            return is_mine
 
     def begin(self, cell: Cell) -> bool:
         """Count an attempt; give the cell up, and return False, if there were enough that were killed."""
@@ -139,7 +164,11 @@ class Store:
         given_up = [cell for cell in cells if not self.is_finished(cell) and self.is_over(cell)]
         for cell in given_up:
             text += [f"given up: {cell.command}", f"  {self.file(cell, 'given_up').read_text()}"]
-        if errors or given_up:
+        if given_up and self.is_untouched():
+            text.append(
+                "nothing was played: type the sweep again with flags that are right, into this folder too"
+            )
+        elif errors or given_up:
             text.append(f"to play them again: lerobot-bomb sweep {self.folder} --retry")
         others = self._of_other_manifests()
         if others:

@@ -35,6 +35,7 @@ class Vla0SmolConfig(RelativeVlaConfig, TokenVlaConfig):
         "mask_level": MASK_LEVELS,
         "draft": DRAFTS,
     }
+    ACTIONS_ARE_OF_WEIGHTS: ClassVar[bool] = False
 
     # Hub id, path of a local folder, or "nano": a small model with random weights, built in code
     vlm_model_name: str = "HuggingFaceTB/SmolVLM2-500M-Video-Instruct"

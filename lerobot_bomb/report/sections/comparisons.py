@@ -8,6 +8,11 @@ from lerobot_bomb.report.arms import Arm, Report
 from lerobot_bomb.report.cells import points, rate
 from lerobot_bomb.report.table import Cell, Section, Table
 
+NOTE = (
+    "Intervals are Newcombe's, an approximation; p is McNemar's exact test, adjusted for the number of "
+    "conditions. Of few pairs they may disagree: then trust p."
+)
+
 
 def section(report: Report) -> Section:
     """A table for each pair of policies."""
@@ -34,4 +39,4 @@ def comparisons(arms: list[Arm]) -> Iterable[Table]:
             for each in found.conditions
         ]
         title = f"A: {first.name}; B: {second.name}"
-        yield Table(title, ["condition", "A", "B", "B - A, points", "p", "pairs"], table)
+        yield Table(title, ["condition", "A", "B", "B - A, points", "p", "pairs"], table, NOTE)

@@ -12,7 +12,8 @@ NOTE = (
     "are medians over episodes of their p50 and p95. Passes of the network and generated tokens are means "
     "per query. Hz: actions that an episode executes, by second of its queries. Memory: the peak, on CUDA of "
     "tensors, on a CPU of the whole process. J2, J3: mean second and third differences of the executed "
-    "actions per step, without the gripper, with 95 % intervals over episodes; less is smoother."
+    "actions per step, in their own units, without the gripper, with 95 % intervals over episodes; less is "
+    "smoother."
 )
 HEADER = [
     "policy, suite", "device", "batch", "p50, ms", "p95, ms", "queries", "passes", "tokens", "Hz",

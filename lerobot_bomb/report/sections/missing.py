@@ -24,4 +24,5 @@ def section(report: Report) -> Section:
         EFFICIENCY: not efficiency.section(report).tables,
         VIDEOS: bool(report.samples) and not any(each.video or each.note for each in report.samples),
     }
-    return Section("Not in these files", [], [line for line, missing in is_missing.items() if missing])
+    lines = [line for line, missing in is_missing.items() if missing]
+    return Section("Not in these files", [], [*report.missing, *lines])

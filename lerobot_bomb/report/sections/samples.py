@@ -1,5 +1,6 @@
 """Failures to look at."""
 
+from lerobot_bomb.evaluation.result_kind import NO_VALUE
 from lerobot_bomb.report.arms import Report, Sample
 from lerobot_bomb.report.table import Cell, Section, Table
 
@@ -32,7 +33,7 @@ def _row(sample: Sample) -> list[Cell]:
         Cell(sample.row["failure"]),
         Cell(spec["perturbations"]),
         Cell(str(spec["seed"]), spec["seed"]),
-        Cell(sample.row["instruction"]),
+        Cell(sample.row.get("instruction", NO_VALUE)),
         Cell(sample.command),
         Cell(sample.note, sample.video or sample.note, video=sample.video),
     ]

@@ -77,7 +77,10 @@ def _shares(arm: Arm) -> dict[str, float]:
 def _slope_cell(found: Slope | None) -> Cell:
     if found is None:
         return Cell("")
-    text = f"{100 * found.per_level:+.1f} [{100 * found.low:+.1f}, {100 * found.high:+.1f}]"
+    interval = (
+        f"[{100 * found.low:+.1f}, {100 * found.high:+.1f}]" if found.low < found.high else "(all alike)"
+    )
+    text = f"{100 * found.per_level:+.1f} {interval}"
     return Cell(text, vars(found))
 
 
