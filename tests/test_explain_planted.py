@@ -1,5 +1,6 @@
 """Policies whose reasons are known, because they were built in: each is told apart, of every type."""
 
+from dataclasses import replace
 from typing import Any
 
 import pytest
@@ -9,7 +10,7 @@ from explain_cases import NAMES, WORKSPACE, WRIST, ask, fresh, moment
 from lerobot_bomb.actions.text import TokenRows
 from lerobot_bomb.explain.diagnosis import diagnose
 from lerobot_bomb.explain.explained import INSTRUCTION
-from lerobot_bomb.explain.moment import Asked, Explanation, explain
+from lerobot_bomb.explain.moment import OTHER_SCENE, Asked, Explanation, camera_name, explain
 from lerobot_bomb.explain.spans import difference, token_offsets
 from lerobot_bomb.flow.dual_mod import FiLM
 from lerobot_bomb.viewing.checkpoint import LoadedPolicy
@@ -87,7 +88,9 @@ def test_one_that_looks_at_one_patch_only(name: str, camera: str) -> None:
         return policy.prepare(changed)
 
     found = findings(explain(ask(policy, prepare), asked(policy)))
-    assert found["Patches that the answer depends on:"] == (f"{camera} line {line}, column {column}",)
+    assert found["Patches that the answer depends on:"] == (
+        f"{camera_name(camera)} line {line}, column {column}",
+    )
 
 
 @pytest.mark.parametrize("name", NAMES)
@@ -106,3 +109,14 @@ def test_one_that_reads_the_target_through_one_head(name: str) -> None:
     found = findings(explain(ask(policy), asked(policy)))
     named = [names for question, names in found.items() if "other instruction" in question]
     assert named == [(f"layer {HEAD[0]}, head {HEAD[1]}",)]
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_the_scene_of_another_episode_is_a_corruption_too(name: str) -> None:
+    policy = fresh(name)
+    question = ask(policy)
+    mirrored = {key: question.observation[key].flip(-1) for key in (WORKSPACE, WRIST)}
+    explanation = explain(question, replace(asked(policy), other_scene=mirrored))
+    (restored,) = [each for each in explanation.restored if each.corruption == OTHER_SCENE]
+    assert restored.drop > 0
+    assert restored.drop == pytest.approx(float(question.effects_of_images(mirrored)), abs=1e-5)

@@ -93,13 +93,15 @@ def _moments(
 
     watched, result = watch(viewed, loaded)
     chosen = middle_of_phases(watched) if args.step is None else [at_step(watched, args.step)]
-    other = None
-    if args.fill == "other":
-        other = watch(_viewed(args, viewed.spec.seed + 1), loaded)[0][0]
+    elsewhere = watch(_viewed(args, viewed.spec.seed + 1), loaded)[0]
+    others = {each.phase: each for each in (elsewhere[0], *middle_of_phases(elsewhere))}
     settings = Settings(args.grid, args.fill, tuple(args.words))
     control_mode = getattr(viewed.spec, "control_mode", None)
     moments = tqdm(chosen, desc="moments", leave=False, disable=args.episodes > 1)
-    return [explain_moment(loaded, each, settings, control_mode, other) for each in moments], result
+    return [
+        explain_moment(loaded, each, settings, control_mode, others.get(each.phase, elsewhere[0]))
+        for each in moments
+    ], result
 
 
 def _explain_one(args: argparse.Namespace, viewed: Viewed, loaded: "LoadedPolicy") -> int:

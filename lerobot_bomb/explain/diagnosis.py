@@ -3,7 +3,7 @@
 from collections.abc import Mapping
 from dataclasses import dataclass
 
-from lerobot_bomb.explain.moment import Explanation, Restored
+from lerobot_bomb.explain.moment import Explanation, Restored, camera_name
 from lerobot_bomb.explain.restoration import smallest_drop
 
 SHARE = 0.05  # an effect below this share of the largest of its kind is none
@@ -32,14 +32,14 @@ def diagnose(explanation: Explanation) -> list[Finding]:
     """What was found, question by question."""
     clean = explanation.clean_score
     patches = {
-        f"{key} line {line}, column {column}": float(map_GG[line, column])
+        f"{camera_name(key)} line {line}, column {column}": float(map_GG[line, column])
         for key, map_GG in explanation.patches.items()
         for line in range(len(map_GG))
         for column in range(len(map_GG))
     }
     findings = [Finding("Patches that the answer depends on:", used(patches, clean))]
     for key, effects in explanation.objects.items():
-        findings.append(Finding(f"Objects that it depends on, {key}:", used(effects, clean)))
+        findings.append(Finding(f"Objects that it depends on, {camera_name(key)}:", used(effects, clean)))
     if explanation.words:
         findings.append(Finding("Words that it depends on, hidden:", used(explanation.words, clean)))
     if explanation.others:

@@ -13,7 +13,7 @@ from lerobot_bomb.explain.activations import LAYER, recording
 from lerobot_bomb.explain.diagnosis import Finding, diagnose
 from lerobot_bomb.explain.explained import ANSWER, INSTRUCTION, Batch
 from lerobot_bomb.explain.following import Following, following
-from lerobot_bomb.explain.moment import Asked, Explanation, explain, image_keys
+from lerobot_bomb.explain.moment import OBSERVATION, Asked, Explanation, explain, image_keys
 from lerobot_bomb.explain.other_policies import explained
 from lerobot_bomb.explain.question import Question
 from lerobot_bomb.explain.spans import Span, named_spans, span_of, spans_of_words, token_offsets
@@ -63,14 +63,14 @@ def explain_moment(
     watched: Watched,
     settings: Settings,
     control_mode: str | None,
-    other: Watched | None = None,
+    other: Watched,
 ) -> ExplainedMoment:
-    """Ask everything; ``other``: of another episode, where that stands in place of what is taken away.
+    """Ask everything; ``other``: a moment of another episode, which may stand in place of this one's scene.
 
     ``control_mode``: of BOMB's actions; None elsewhere, where nothing is said of following.
     """
     observation = loaded.observe([watched.observation], [watched.instruction])
-    instead = None if other is None else loaded.observe([other.observation], [other.instruction])
+    instead = loaded.observe([other.observation], [other.instruction])
     with torch.no_grad(), autocast(loaded.config):
         question = Question(explained(loaded.policy, loaded.postprocess), loaded.prepare, observation)
         explanation = explain(question, _asked(loaded, watched, settings, instead))
@@ -101,7 +101,7 @@ def mean_states(question: Question) -> dict[str, np.ndarray]:
     return found
 
 
-def _asked(loaded: LoadedPolicy, watched: Watched, settings: Settings, instead: Batch | None) -> Asked:
+def _asked(loaded: LoadedPolicy, watched: Watched, settings: Settings, instead: Batch) -> Asked:
     try:
         offsets = token_offsets(loaded.prepare.steps, watched.instruction)
     except ValueError:
@@ -119,9 +119,7 @@ def _asked(loaded: LoadedPolicy, watched: Watched, settings: Settings, instead: 
         offsets=offsets,
         others=watched.instructions if offsets else {},
         objects=objects,
-        other_images={
-            key: images[0] for key, images in (instead or {}).items() if key.startswith(OBS_IMAGES)
-        },
+        other_scene={key: value for key, value in instead.items() if key.startswith(OBSERVATION)},
     )
 
 

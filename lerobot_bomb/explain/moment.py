@@ -8,18 +8,20 @@ from dataclasses import dataclass, field
 from typing import Any
 
 import torch
-from lerobot.utils.constants import OBS_IMAGE
+from lerobot.utils.constants import OBS_IMAGE, OBS_IMAGES
 from torch import Tensor
 
 from lerobot_bomb.explain.activations import all_heads, all_layers, all_mlps
-from lerobot_bomb.explain.explained import INSTRUCTION, Place, Rows
+from lerobot_bomb.explain.explained import INSTRUCTION, Batch, Place, Rows
 from lerobot_bomb.explain.images import filling, occluded, patch_masks
 from lerobot_bomb.explain.question import Question
 from lerobot_bomb.explain.restoration import Corruption
 from lerobot_bomb.explain.spans import Range, Span
 
 PATCH, WORDS, OTHER_INSTRUCTION = "patch", "words", "other instruction"
+OTHER_SCENE = "scene of another episode"  # its images and state, under this one's instruction
 ALL = "all cameras"
+OBSERVATION = "observation"
 
 
 @dataclass(frozen=True)
@@ -33,8 +35,8 @@ class Asked:
     others: Mapping[str, str] = field(default_factory=dict)  # other instructions, by what they change
     # {key of an image: {what: (H, W) bool}}
     objects: Mapping[str, Mapping[str, Tensor]] = field(default_factory=dict)
-    # (3, H, W) by key, where fill is "other"
-    other_images: Mapping[str, Tensor] = field(default_factory=dict)
+    # images (1, 3, H, W) and state of another episode's moment; {}: none is at hand
+    other_scene: Batch = field(default_factory=dict)
 
 
 @dataclass(frozen=True)
@@ -108,10 +110,16 @@ def image_keys(question: Question) -> list[str]:
     ]
 
 
+def camera_name(key: str) -> str:
+    """'workspace' of 'observation.images.workspace'."""
+    return key.removeprefix(f"{OBS_IMAGES}.").removeprefix(f"{OBSERVATION}.")
+
+
 def _filling(question: Question, asked: Asked, key: str) -> Tensor:
     (image,) = question.observation[key]
     blur_px = image.shape[-1] / asked.grid / 2
-    return filling(image, asked.fill, blur_px, asked.other_images.get(key))
+    other = asked.other_scene.get(key)
+    return filling(image, asked.fill, blur_px, None if other is None else other[0])
 
 
 def _patches(question: Question, grid: int, key: str, filling_3HW: Tensor) -> Tensor:
@@ -160,7 +168,7 @@ def _corruptions(
     words: Mapping[str, float],
     others: Mapping[str, float],
 ) -> list[tuple[str, Rows]]:
-    """The strongest patch, the strongest span, the strongest other instruction: name, what is read then."""
+    """The strongest patch, span and other instruction, another episode's scene: name, what is read then."""
     if not question.explained.layers:
         return []
     found = []
@@ -168,7 +176,7 @@ def _corruptions(
     cell = int(patches[key].argmax())
     (image,) = question.observation[key]
     mask = patch_masks(asked.grid, *image.shape[1:])[cell : cell + 1].to(image.device)
-    name = f"{PATCH} (line {cell // asked.grid}, column {cell % asked.grid}) of {key}"
+    name = f"{PATCH} (line {cell // asked.grid}, column {cell % asked.grid}) of {camera_name(key)}"
     found.append((name, question.encode({key: occluded(image, mask, fillings[key])}, 1)))
     if words:
         span = max(asked.spans, key=lambda each: words[each.name])
@@ -179,6 +187,8 @@ def _corruptions(
         rows = question.encode({"task": [asked.others[other]]}, 1)
         if _has_shape_of(rows, question.rows):
             found.append((f"{OTHER_INSTRUCTION}: {asked.others[other]!r}", rows))
+    if asked.other_scene:
+        found.append((OTHER_SCENE, question.encode(asked.other_scene, 1)))
     return found
 
 

@@ -13,7 +13,7 @@ from lerobot_bomb.explain.episode import ExplainedMoment
 from lerobot_bomb.explain.following import Following
 from lerobot_bomb.explain.maps import cells, overlay, png_bytes
 from lerobot_bomb.explain.masked_episodes import MaskedEpisode
-from lerobot_bomb.explain.moment import ALL, Restored
+from lerobot_bomb.explain.moment import ALL, Restored, camera_name
 from lerobot_bomb.explain.probes import LayerProbe
 from lerobot_bomb.report.table import Cell, Section, Table
 from lerobot_bomb.stats import format_rate
@@ -50,7 +50,7 @@ def moment_sections(moment: ExplainedMoment) -> list[Section]:
         f"({explanation.unit}) with nothing changed. Negative: it rises."
     )
     tables = [
-        _effects(f"Objects taken out: {key}", "object", each, note)
+        _effects(f"Objects taken out: {camera_name(key)}", "object", each, note)
         for key, each in explanation.objects.items()
     ]
     if explanation.words:
@@ -257,10 +257,10 @@ def _figure(key: str, image: np.ndarray, map_GG: np.ndarray) -> str:
     }
     size = f'width="{SHOWN_PX}" height="{SHOWN_PX}"'
     tags = "".join(
-        f'<img src="{_data_url(each)}" {size} alt="{escape(f"{key}: {what}")}">'
+        f'<img src="{_data_url(each)}" {size} alt="{escape(f"{camera_name(key)}: {what}")}">'
         for what, each in shown.items()
     )
-    return f"<figure>{tags}<figcaption>{escape(key)}: {'; '.join(shown)}</figcaption></figure>"
+    return f"<figure>{tags}<figcaption>{escape(camera_name(key))}: {'; '.join(shown)}</figcaption></figure>"
 
 
 def _data_url(image: np.ndarray) -> str:
