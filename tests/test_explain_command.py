@@ -1,6 +1,7 @@
 """``lerobot-bomb explain``: pages of one episode and of several."""
 
 import json
+from collections.abc import Callable
 from pathlib import Path
 
 import pytest
@@ -69,3 +70,27 @@ def test_what_cannot_be_asked(
 def test_a_folder_that_exists_is_left_alone(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["explain", "--policy.path=bomb:fdvla", f"--output={tmp_path}"]) == 1
     assert "exists already" in capsys.readouterr().err
+
+
+def test_the_episode_of_a_line(
+    tmp_path: Path, stock_cli: Callable[..., None], capsys: pytest.CaptureFixture[str]
+) -> None:
+    results = tmp_path / "results.jsonl"
+    stock_cli(
+        "lerobot-eval", "--policy.path=bomb:fdvla", "--policy.device=cpu", "--env.type=bomb",
+        "--env.image_size=64", "--env.perturbations=[\"light:3\"]", "--seed=100000", "--eval.n_episodes=1",
+        "--eval.batch_size=1", f"--env.results_path={results}", f"--output_dir={tmp_path / 'eval'}",
+    )  # fmt: skip
+    row = json.loads(results.read_text())
+    output = tmp_path / "why"
+    flags = [f"--results={results}", "--grid=2", "--step=3", f"--output={output}"]
+    assert main(["explain", *flags]) == 0
+    found = json.loads((output / "explanation.json").read_text())
+    assert found["moments"][0]["instruction"] == row["instruction"]
+    assert found["result"]["spec"] == row["spec"]
+    for wrong, message in (
+        ("--line=2", "--line=2 must be in 1..1"),
+        ("--perturbations=camera:3", "--perturbations=camera:3: the line says it; drop the flag"),
+    ):
+        assert main(["explain", *flags[:-1], wrong, f"--output={tmp_path / 'other'}"]) == 1
+        assert message in capsys.readouterr().err

@@ -5,8 +5,8 @@ import json
 import shlex
 import sys
 from collections import defaultdict
-from collections.abc import Sequence
-from dataclasses import asdict
+from collections.abc import Callable, Sequence
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -16,10 +16,13 @@ from tqdm import tqdm
 from lerobot_bomb.bomb.episode import TEST_SEEDS
 from lerobot_bomb.checkpoints.names import CONFIG
 from lerobot_bomb.commands.arguments import add_checkpoint_arguments, check_at_least, path_flag
+from lerobot_bomb.commands.results_files import read_line
 from lerobot_bomb.commands.view import add_viewed_arguments, viewed_of
+from lerobot_bomb.conditions import NONE
 from lerobot_bomb.files import check_new_folder, read_json, written_whole
 from lerobot_bomb.flags import flags_without_group
 from lerobot_bomb.viewing.episode import Viewed
+from lerobot_bomb.viewing.replay import Replay
 
 if TYPE_CHECKING:
     from lerobot_bomb.explain.episode import ExplainedMoment
@@ -35,7 +38,10 @@ PAGE, NUMBERS, RECORDING = "explanation.html", "explanation.json", "explanation.
 def add_explain_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the arguments of ``lerobot-bomb explain``."""
     add = parser.add_argument
-    add("--seed", type=int, default=TEST_SEEDS[0], help=f"of the episode (default: {TEST_SEEDS[0]})")
+    results = "a file of --env.results_path: explain the episode of one of its lines, with who played it"
+    add("--results", type=path_flag, metavar="FILE", help=results)
+    add("--line", type=int, help="of --results, from 1 on (default: 1)")
+    add("--seed", type=int, help=f"of the episode (default: {TEST_SEEDS[0]}, or the line's)")
     add(
         "--episodes", type=int, default=1, help="from this seed on; several give a page of means (default: 1)"
     )
@@ -46,7 +52,7 @@ def add_explain_arguments(parser: argparse.ArgumentParser) -> None:
         "--words", action="append", default=[], help="other words of the instruction to hide; may be repeated"
     )
     add_viewed_arguments(parser)
-    add_checkpoint_arguments(parser, "the checkpoint that is explained", required=True)
+    add_checkpoint_arguments(parser, "the checkpoint that is explained (default: the line's)")
     add("--output", type=path_flag, default=DEFAULT_FOLDER, help=f"new folder (default: {DEFAULT_FOLDER})")
 
 
@@ -56,12 +62,9 @@ def run_explain(args: argparse.Namespace) -> int:
     if args.episodes > 1 and args.step is not None:
         raise ValueError(f"--step={args.step} is of one episode; drop it or --episodes={args.episodes}")
     check_new_folder("output", args.output)
-    if args.image_size is None:
-        args.image_size = _image_size(args.policy_path)
-    viewed = _viewed(args, args.seed)
-    loaded = _load(args, viewed)
+    asked = _of_flags(args) if args.results is None else _of_line(args)
     with flags_without_group():
-        return (_explain_one if args.episodes == 1 else _explain_several)(args, viewed, loaded)
+        return (_explain_one if args.episodes == 1 else _explain_several)(args, asked)
 
 
 def _image_size(checkpoint: Path) -> int | None:
@@ -73,27 +76,61 @@ def _image_size(checkpoint: Path) -> int | None:
         return None  # refused when it is loaded
 
 
-def _viewed(args: argparse.Namespace, seed: int) -> Viewed:
-    return viewed_of(argparse.Namespace(**vars(args) | {"seed": seed}))
+def _of_flags(args: argparse.Namespace) -> "_Asked":
+    if args.policy_path is None:
+        raise ValueError("--policy.path is missing: the checkpoint that is explained; or give --results=FILE")
+    if args.line is not None:
+        raise ValueError(f"--line={args.line} is of --results=FILE; drop it, or name the file")
+    if args.image_size is None:
+        args.image_size = _image_size(args.policy_path)
+
+    def viewed(seed: int) -> Viewed:
+        return viewed_of(argparse.Namespace(**vars(args) | {"seed": seed}))
+
+    seed = TEST_SEEDS[0] if args.seed is None else args.seed
+    return _Asked(viewed, seed, args.policy_path, args.policy_device)
 
 
-def _load(args: argparse.Namespace, viewed: Viewed) -> "LoadedPolicy":
-    from lerobot_bomb.viewing.checkpoint import load_policy  # LeRobot and torch: seconds
+def _of_line(args: argparse.Namespace) -> "_Asked":
+    shared = {"image_size": None, "perturbations": NONE, "env_type": "bomb"}
+    for name, default in (shared | args.own_flags["bomb"] | args.own_flags["bomb_pusht"]).items():
+        if (value := getattr(args, name)) != default:
+            raise ValueError(f"--{name.replace('_type', '.type')}={value}: the line says it; drop the flag")
+    replay = Replay(read_line(args.results, args.line or 1), args.policy_path)
+    if replay.checkpoint is None:
+        raise ValueError("who played has no checkpoint, so there is nothing to explain")
+    seed = replay.row["spec"]["seed"] if args.seed is None else args.seed
+    return _Asked(lambda seed: replay.viewed(seed=seed), seed, replay.checkpoint, args.policy_device)
 
-    env = viewed.env_type, viewed.env_flags | {"ignore_checkpoint": False}
-    return load_policy(args.policy_path, args.policy_device, *env, viewed.spec.seed)
+
+@dataclass(frozen=True)
+class _Asked:
+    """Which episodes of whom."""
+
+    viewed: Callable[[int], Viewed]  # of a seed
+    seed: int
+    checkpoint: Path
+    device: str | None
+
+    def load(self) -> "LoadedPolicy":
+        from lerobot_bomb.viewing.checkpoint import load_policy  # LeRobot and torch: seconds
+
+        viewed = self.viewed(self.seed)
+        env = viewed.env_type, viewed.env_flags | {"ignore_checkpoint": False}
+        return load_policy(self.checkpoint, self.device, *env, self.seed)
 
 
 def _moments(
-    args: argparse.Namespace, viewed: Viewed, loaded: "LoadedPolicy"
+    args: argparse.Namespace, asked: _Asked, seed: int, loaded: "LoadedPolicy"
 ) -> "tuple[list[ExplainedMoment], Any]":
     """Those of an episode that are asked about, and what became of it."""
     from lerobot_bomb.explain.episode import Settings, explain_moment
     from lerobot_bomb.explain.watched import at_step, middle_of_phases, watch
 
+    viewed = asked.viewed(seed)
     watched, result = watch(viewed, loaded)
     chosen = middle_of_phases(watched) if args.step is None else [at_step(watched, args.step)]
-    elsewhere = watch(_viewed(args, viewed.spec.seed + 1), loaded)[0]
+    elsewhere = watch(asked.viewed(seed + 1), loaded)[0]
     others = {each.phase: each for each in (elsewhere[0], *middle_of_phases(elsewhere))}
     settings = Settings(args.grid, args.fill, tuple(args.words))
     control_mode = getattr(viewed.spec, "control_mode", None)
@@ -104,12 +141,13 @@ def _moments(
     ], result
 
 
-def _explain_one(args: argparse.Namespace, viewed: Viewed, loaded: "LoadedPolicy") -> int:
+def _explain_one(args: argparse.Namespace, asked: _Asked) -> int:
     from lerobot_bomb.explain.masked_episodes import masks_of, play_masked
     from lerobot_bomb.explain.recording import write_recording
     from lerobot_bomb.report.explanation import moment_sections, overview_section, traces_section
 
-    moments, result = _moments(args, viewed, loaded)
+    viewed, loaded = asked.viewed(asked.seed), asked.load()
+    moments, result = _moments(args, asked, asked.seed, loaded)
     episodes = {}
     if viewed.env_type == "bomb" and args.fill != "other":
         episodes = play_masked(viewed, loaded, masks_of(moments[0].watched, loaded, args.fill))
@@ -131,11 +169,11 @@ def _explain_one(args: argparse.Namespace, viewed: Viewed, loaded: "LoadedPolicy
     return 0
 
 
-def _explain_several(args: argparse.Namespace, viewed: Viewed, loaded: "LoadedPolicy") -> int:
+def _explain_several(args: argparse.Namespace, asked: _Asked) -> int:
     from lerobot_bomb.report.explanation import aggregate_sections, probes_section
 
-    seeds = range(args.seed, args.seed + args.episodes)
-    episodes = [_moments(args, _viewed(args, seed), loaded) for seed in tqdm(seeds, desc="episodes")]
+    loaded, seeds = asked.load(), range(asked.seed, asked.seed + args.episodes)
+    episodes = [_moments(args, asked, seed, loaded) for seed in tqdm(seeds, desc="episodes")]
     by_phase: dict[str, list[ExplainedMoment]] = defaultdict(list)
     for moments, _ in episodes:
         for each in moments:
@@ -151,7 +189,7 @@ def _explain_several(args: argparse.Namespace, viewed: Viewed, loaded: "LoadedPo
         ],
     }
     with written_whole(args.output) as (folder,):
-        _write(folder, f"Why: {viewed.group}, {args.episodes} episodes", sections, numbers)
+        _write(folder, f"Why: {asked.viewed(asked.seed).group}, {args.episodes} episodes", sections, numbers)
     print(*(args.output / file for file in (PAGE, NUMBERS)), sep="\n")
     return 0
 

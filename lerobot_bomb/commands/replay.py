@@ -11,7 +11,7 @@ from lerobot_bomb.commands.arguments import (
     path_flag,
     switch,
 )
-from lerobot_bomb.commands.results_files import read_undamaged
+from lerobot_bomb.commands.results_files import read_line
 from lerobot_bomb.conditions import NONE
 from lerobot_bomb.envs.results import ORIGIN, ResultLine, Row
 from lerobot_bomb.evaluation.result_groups import different_fields, outcome
@@ -52,10 +52,7 @@ def run_replay(args: argparse.Namespace) -> int:
     """Play, write both files, print what became of it and whether it is what the line says."""
     if unknown := [flag for flag in args.rest if not flag.startswith("--policy.")]:
         raise ValueError(f"{unknown[0]} is unknown; see `lerobot-bomb replay --help`")
-    rows, _ = read_undamaged(args.path)
-    if not 1 <= args.line <= len(rows):
-        raise ValueError(f"--line={args.line} must be in 1..{len(rows)}, the episodes of {args.path}")
-    row = rows[args.line - 1]
+    row = read_line(args.path, args.line)
     policy_flags = [f"--{flag.removeprefix('--policy.')}" for flag in args.rest]
     replay = Replay(row, args.policy_path, args.policy_device, policy_flags, args.depth)
     players = {RECORDED: replay.player()}

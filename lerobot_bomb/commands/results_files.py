@@ -32,6 +32,18 @@ def missing_of_sweep(path: Path, num_rows: int) -> str:
     return f"{path}: {missing} of {number} episodes are missing; {'; '.join(reasons)}" if missing > 0 else ""
 
 
+def read_line(path: Path, line: int) -> Row:
+    """The episode of a line, counted from 1.
+
+    Raises:
+        ValueError: there is no such line, or as `read_undamaged`.
+    """
+    rows, _ = read_undamaged(path)
+    if not 1 <= line <= len(rows):
+        raise ValueError(f"--line={line} must be in 1..{len(rows)}, the episodes of {path}")
+    return rows[line - 1]
+
+
 def read_undamaged(path: Path) -> tuple[list[Row], int]:
     """The episodes of a file, and how many damaged lines it has, of which stderr shows the first.
 

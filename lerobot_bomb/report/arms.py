@@ -47,6 +47,13 @@ class Sample:
         """Plays it again."""
         return shlex.join(["lerobot-bomb", "replay", str(self.path), f"--line={self.line}"])
 
+    @property
+    def explanation(self) -> str:
+        """The command that asks why; '' where no checkpoint played."""
+        if not (self.row.get("policy") or {}).get("path"):
+            return ""
+        return shlex.join(["lerobot-bomb", "explain", f"--results={self.path}", f"--line={self.line}"])
+
 
 @dataclass(frozen=True)
 class Report:

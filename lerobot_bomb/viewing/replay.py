@@ -36,18 +36,33 @@ class Replay:
             ValueError: its environment has no recording for Rerun, or, once it plays, the policy is not that
                 of the line or cannot be had.
         """
-        viewed = self._viewed(perturbations or self.row["spec"]["perturbations"])
+        viewed = self.viewed(perturbations)
         return Player(viewed, partial(self._agent, viewed))
 
-    def _viewed(self, perturbations: str) -> Viewed:
+    @property
+    def checkpoint(self) -> Path | None:
+        """The folder of who played; None: the line names none."""
+        path = (self.row.get("policy") or {}).get("path")
+        return self.policy_path or (Path(path) if path else None)
+
+    def viewed(self, perturbations: str | None = None, seed: int | None = None) -> Viewed:
+        """The line's episode; under other perturbations or of another seed.
+
+        Raises:
+            ValueError: its environment has no recording for Rerun.
+        """
         row = self.row
+        changed = {
+            "perturbations": perturbations or row["spec"]["perturbations"],
+            "seed": row["spec"]["seed"] if seed is None else seed,
+        }
         match kind_of(row).env_type:
             case "bomb":
                 preset = row.get("render_preset", RenderOptions.preset)
                 options = RenderOptions(row["image_size"], preset, self.depth)
-                return bomb_episode(replace(spec_of(row), perturbations=perturbations), options)
+                return bomb_episode(replace(spec_of(row), **changed), options)
             case "bomb_pusht":
-                spec = PushTSpec(**row["spec"] | {"perturbations": perturbations})
+                spec = PushTSpec(**row["spec"] | changed)
                 return pusht_episode(spec, row["image_size"])
             case env_type:
                 flags = " ".join(kind_of(row).eval_flags([row]))
@@ -70,7 +85,7 @@ class Replay:
 
         env = viewed.env_type, viewed.env_flags, viewed.spec.seed
         policy = self.row.get("policy") or {}
-        path = self.policy_path or (Path(policy["path"]) if policy.get("path") else None)
+        path = self.checkpoint
         if path is None and policy:
             return scripted_agent(policy["type"], *env)
         if path is None:

@@ -21,7 +21,7 @@ def section(report: Report) -> Section:
 
 def _table(name: str, samples: list[Sample]) -> Table:
     has_videos = any(each.video or each.note for each in samples)
-    header = ["failure", "condition", "seed", "asked for", "play it again"]
+    header = ["failure", "condition", "seed", "asked for", "play it again", "ask why"]
     header += ["video"] if has_videos else []
     rows = [_row(each)[: len(header)] for each in samples]
     return Table(name, header, rows, NOTE)
@@ -35,5 +35,6 @@ def _row(sample: Sample) -> list[Cell]:
         Cell(str(spec["seed"]), spec["seed"]),
         Cell(sample.row.get("instruction", NO_VALUE)),
         Cell(sample.command),
+        Cell(sample.explanation),
         Cell(sample.note, sample.video or sample.note, video=sample.video),
     ]
