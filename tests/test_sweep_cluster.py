@@ -87,7 +87,8 @@ def test_workers_that_end_at_once_are_started_anew_on_their_gpus_and_then_no_mor
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     monkeypatch.setenv("CUDA_VISIBLE_DEVICES", "4,7")
-    ending = (sys.executable, "-c", "import os; print(os.environ['CUDA_VISIBLE_DEVICES'])")
+    # a line in one write: both workers write to one file
+    ending = (sys.executable, "-c", "import os; os.write(1, os.environb[b'CUDA_VISIBLE_DEVICES'] + b'\\n')")
     monkeypatch.setattr(local, "PYTHON", ending)
     assert sweep(tmp_path, "--workers=2", *SWEEP) == 1
     log = (tmp_path / "workers.log").read_text().split()
