@@ -10,9 +10,10 @@ import pytest
 from draccus.utils import DecodingError
 from lerobot.utils.import_utils import register_third_party_plugins
 
+import lerobot_bomb
 from lerobot_bomb.commands import main as cli
 from lerobot_bomb.commands.main import main
-from lerobot_bomb.flag_errors import nearest_flags
+from lerobot_bomb.flag_errors import nearest_flags, tell_refusals
 from lerobot_bomb.vlm.backbone import build_backbone
 from lerobot_bomb.vlm.paligemma import build_paligemma
 from lerobot_bomb.vlm.presets import nano_config, nano_paligemma_config, nano_qwen_config
@@ -127,3 +128,42 @@ def test_a_flag_of_a_group_is_compared_with_those_of_the_group() -> None:
     assert nearest_flags("--evn.task", flags) == ["--env.task"]
     assert nearest_flags("--sede=3", flags) == ["--seed"]
     assert nearest_flags("--env.zzzzzzz", flags) == []
+
+
+@pytest.mark.parametrize(
+    ("module", "code", "told"),
+    [
+        ("lerobot_bomb.made", "raise ValueError('give --flag')", "lerobot-eval: error: give --flag\n"),
+        ("lerobot_bomb.made", "raise KeyboardInterrupt", "lerobot-eval: interrupted\n"),
+        ("lerobot_bomb.made", "raise AssertionError('a mistake of ours')", ""),
+        ("lerobot_bomb.made", "int('not raised on purpose')", ""),
+        ("lerobot_bomber", "raise ValueError('of others')", ""),
+    ],
+)
+def test_a_refusal_is_told_without_a_traceback_and_a_mistake_with_one(
+    module: str,
+    code: str,
+    told: str,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    passed_on: list[type[BaseException]] = []
+    monkeypatch.setattr(sys, "argv", ["bin/lerobot-eval"])
+    monkeypatch.setattr(sys, "excepthook", lambda kind, error, traceback: passed_on.append(kind))
+    tell_refusals([lerobot_bomb])
+    with pytest.raises(BaseException) as raised:  # any
+        exec(code, {"__name__": module})
+    sys.excepthook(raised.type, raised.value, raised.tb)
+    assert capsys.readouterr().err == told
+    assert passed_on == ([] if told else [raised.type])
+
+
+@pytest.mark.parametrize(("command", "variable"), [("pytest", ""), ("lerobot-eval", "1")])
+def test_elsewhere_and_where_asked_tracebacks_are_as_usual(
+    command: str, variable: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    usual = sys.excepthook
+    monkeypatch.setattr(sys, "argv", [command])
+    monkeypatch.setenv("LEROBOT_BOMB_TRACEBACK", variable)
+    tell_refusals([lerobot_bomb])
+    assert sys.excepthook is usual

@@ -1,14 +1,14 @@
 """Entry point of the plugin: LeRobot imports it by name; it registers env types, policy types, processors."""
 
-import lerobot_bomb.explain.interventions  # noqa: F401
-import lerobot_env_bomb.configuration_bomb  # noqa: F401
-import lerobot_env_bomb_libero.configuration_bomb_libero  # noqa: F401
-import lerobot_env_bomb_pusht.configuration_bomb_pusht  # noqa: F401
-import lerobot_policy_bomb_expert  # noqa: F401
-import lerobot_policy_bomb_random  # noqa: F401
-import lerobot_policy_fdvla  # noqa: F401
-import lerobot_policy_spatialvla_grid  # noqa: F401
-import lerobot_policy_vla0_smol  # noqa: F401
+import lerobot_bomb.explain.interventions
+import lerobot_env_bomb.configuration_bomb
+import lerobot_env_bomb_libero.configuration_bomb_libero
+import lerobot_env_bomb_pusht.configuration_bomb_pusht
+import lerobot_policy_bomb_expert
+import lerobot_policy_bomb_random
+import lerobot_policy_fdvla
+import lerobot_policy_spatialvla_grid
+import lerobot_policy_vla0_smol
 from lerobot_bomb._compat import (
     read_asked_columns,
     remember_policies,
@@ -21,7 +21,7 @@ from lerobot_bomb.checkpoints.processor_files import check_saved_processors
 from lerobot_bomb.checkpoints.shipped import checkpoint_path
 from lerobot_bomb.data.hub_token import refuse_unsendable_tokens
 from lerobot_bomb.data.missing import tell_missing_datasets
-from lerobot_bomb.flag_errors import hint, refuse_unknown
+from lerobot_bomb.flag_errors import hint, refuse_unknown, tell_refusals
 
 shorten_torchcodec_warning()
 tell_config_errors()
@@ -32,3 +32,16 @@ tell_missing_datasets()
 check_saved_processors()
 resolve_checkpoints(checkpoint_path)
 tell_wrong_flags(hint, refuse_unknown)
+tell_refusals(
+    [
+        lerobot_bomb,
+        lerobot_env_bomb,
+        lerobot_env_bomb_libero,
+        lerobot_env_bomb_pusht,
+        lerobot_policy_bomb_expert,
+        lerobot_policy_bomb_random,
+        lerobot_policy_fdvla,
+        lerobot_policy_spatialvla_grid,
+        lerobot_policy_vla0_smol,
+    ]
+)

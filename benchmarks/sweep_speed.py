@@ -1,0 +1,114 @@
+"""Episodes an hour of ``lerobot-bomb sweep`` against stock ``lerobot-eval`` on the same cells, in one run.
+
+The peer plays the manifest's own commands one after the other, and, in a second row, all conditions in one
+command with LeRobot's default of a process an environment. All must give the same lines, or the benchmark
+stops. Times hold everything, the start of Python and the loading of the policy too.
+
+    python benchmarks/sweep_speed.py --json sweep_speed.json
+"""
+
+import argparse
+import json
+import subprocess
+import sys
+import tempfile
+import time
+from collections.abc import Callable, Sequence
+from pathlib import Path
+
+from machine import add_machine_arguments, positive, require_idle_machine, write_figures
+
+from lerobot_bomb.envs.results import Row, without_measured
+from lerobot_bomb.evaluation.results import read_results
+from lerobot_bomb.sweep.manifest import Manifest, plan
+from lerobot_bomb.tables import print_table
+
+FLAGS = ("--env.type=bomb", "--env.image_size=64", "--policy.device=cpu")
+SEED = 1000
+EACH, TOGETHER = "lerobot-eval, a command a cell", "lerobot-eval, all conditions at once"
+ONE, TWO = "sweep, 1 worker", "sweep, 2 workers"
+TARGETS = {ONE: (EACH, 1.5), TWO: (ONE, 1.7)}
+
+
+def main() -> None:
+    """Play the same cells in four ways, print episodes an hour and ratios."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawTextHelpFormatter)
+    add = parser.add_argument
+    add("--policy", default="bomb:vla0_smol", help="checkpoint or type (default: bomb:vla0_smol)")
+    add("--conditions", default="none,camera:3,light:3,table:3,start:3,language:3", help="joined by commas")
+    add("--episodes", type=positive, default=20, help="of each cell (default: 20)")
+    add("--batch_size", type=positive, default=10, help="default: 10")
+    add_machine_arguments(parser)
+    args = parser.parse_args()
+    require_idle_machine(args.force)
+    conditions = args.conditions.split(",")
+    manifest = plan([args.policy], ["place"], conditions, SEED, args.episodes, args.batch_size, FLAGS)
+
+    ways: dict[str, Callable[[Path], Path]] = {
+        EACH: lambda folder: play_each(manifest, folder),
+        TOGETHER: lambda folder: play_together(manifest, conditions, folder),
+        ONE: lambda folder: sweep(manifest, folder, 1),
+        TWO: lambda folder: sweep(manifest, folder, 2),
+    }
+    hourly, played = {}, {}
+    for name, play in ways.items():
+        with tempfile.TemporaryDirectory() as folder:
+            started = time.perf_counter()
+            results = play(Path(folder))
+            hourly[name] = 3600 * manifest.num_episodes / (time.perf_counter() - started)
+            played[name] = comparable(read_results(results))
+        if name != TOGETHER and played[name] != played[EACH]:  # its batches are of another kind
+            raise SystemExit(f"{name} gives other lines than {EACH}")
+
+    title = f"{args.policy}, {len(conditions)} conditions of {args.episodes} episodes"
+    rows = [[name, f"{value:.0f}", f"{value / hourly[EACH]:.2f}"] for name, value in hourly.items()]
+    print_table([title, "episodes an hour", "ratio"], rows)
+    for name, (peer, target) in TARGETS.items():
+        ratio = hourly[name] / hourly[peer]
+        print(f"{name}: {ratio:.2f} times {peer} (target: {target})")
+    write_figures(args.json, {"episodes_an_hour": hourly})
+
+
+def play_each(manifest: Manifest, folder: Path) -> Path:
+    """Run the command of every cell; the file of results."""
+    results = folder / "results.jsonl"
+    for number, cell in enumerate(manifest.cells):
+        run(
+            "lerobot-eval",
+            [*cell.flags, f"--env.results_path={results}", f"--output_dir={folder / str(number)}"],
+        )
+    return results
+
+
+def play_together(manifest: Manifest, conditions: Sequence[str], folder: Path) -> Path:
+    """Run one command with all conditions."""
+    results, cell = folder / "results.jsonl", manifest.cells[0]
+    replaced = ("--env.perturbations=", "--eval.use_async_envs=")
+    flags = [flag for flag in cell.flags if not flag.startswith(replaced)]
+    flags += [f"--env.perturbations={json.dumps(conditions)}", f"--env.results_path={results}"]
+    run("lerobot-eval", [*flags, f"--output_dir={folder / 'eval'}"])
+    return results
+
+
+def sweep(manifest: Manifest, folder: Path, num_workers: int) -> Path:
+    """Sweep the manifest."""
+    manifest.write(folder)
+    run("lerobot-bomb", ["sweep", str(folder), f"--workers={num_workers}"])
+    return folder / "results.jsonl"
+
+
+def run(command: str, flags: Sequence[str]) -> None:
+    """Run a command of this environment; leave with its last words if it fails."""
+    path = Path(sys.executable).with_name(command)
+    done = subprocess.run([path, *flags], capture_output=True, text=True, check=False)
+    if done.returncode:
+        raise SystemExit(f"{command} {' '.join(flags)}:\n{done.stderr[-2000:]}")
+
+
+def comparable(rows: list[Row]) -> list[Row]:
+    """The lines in one order, without what is measured anew each time."""
+    return sorted(map(without_measured, rows), key=lambda row: json.dumps(row["spec"]))
+
+
+if __name__ == "__main__":
+    main()
