@@ -39,7 +39,23 @@ def overview_section(outcome: str, moments: Sequence[ExplainedMoment], command: 
         Table(each.title, QUESTIONS, [[Cell(of.question), Cell(of.answer)] for of in each.findings])
         for each in moments
     ]
-    return Section("In short", found, [moments[0].watched.instruction, outcome, command])
+    lines = [moments[0].watched.instruction, outcome, command, *_not_asked(moments[0])]
+    return Section("In short", found, lines)
+
+
+def _not_asked(moment: ExplainedMoment) -> list[str]:
+    """Which parts are not possible with this policy."""
+    explanation = moment.explanation
+    is_missing = {
+        "Words: none are hidden, for this policy reads no instruction.": not explanation.words,
+        "Layers, heads and MLPs: none are put back, for no language model of this policy is known.": (
+            not explanation.restored
+        ),
+        "Layers by tokens: none are put back, for this policy calls the parts of its layers one by one.": (
+            bool(explanation.restored) and not any(each.places for each in explanation.restored)
+        ),
+    }
+    return [line for line, missing in is_missing.items() if missing]
 
 
 def moment_sections(moment: ExplainedMoment) -> list[Section]:
