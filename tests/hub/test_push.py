@@ -79,7 +79,7 @@ def test_one_commit_holds_all_that_is_needed_and_nothing_of_this_machine(
     metadata = yaml.safe_load(card.split("---\n")[1])
     assert "base_model" not in metadata
     assert "license" not in metadata
-    assert "| 10 | 8 | 80.0 % | 49.0 to 94.3 % |" in card  # Wilson's interval of 8 in 10
+    assert "| 8/10 = 80.0 % [49.0, 94.3] |" in card  # Wilson's interval of 8 in 10
     for flag in (f"--policy.path={REPO_ID}", "--env.robot=scara", "--env.fps=10", "--env.image_size=256"):
         assert flag in card
     pulled = tmp_path / "pulled"
