@@ -154,6 +154,15 @@ def stock_cli(monkeypatch: pytest.MonkeyPatch) -> Callable[..., None]:
     return run
 
 
+@pytest.fixture(scope="module")
+def loaded_policies() -> Iterator[None]:
+    """Those of `explain_cases`; none is left: results name a policy only where a process holds no other."""
+    import explain_cases  # loads LeRobot
+
+    yield
+    explain_cases.loaded.cache_clear()
+
+
 def pytest_addoption(parser: pytest.Parser) -> None:
     parser.addoption("--policy.type", dest="policy_type", choices=POLICY_TYPES, help="prove this one only")
 

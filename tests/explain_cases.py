@@ -33,6 +33,11 @@ def fresh(name: str) -> LoadedPolicy:
 loaded = cache(fresh)
 
 
+def explained_by(policy: LoadedPolicy) -> Explained:
+    """As the policy says how."""
+    return explained(policy.policy, policy.postprocess)
+
+
 @cache
 def moment() -> tuple[dict[str, Any], str, dict[str, dict[str, Any]], dict[str, Any]]:
     """An observation, its instruction, the masks of its objects, the other instructions."""
@@ -55,8 +60,7 @@ def ask(
     """The observation, asked of a policy; ``prepare``: what stands for its preprocessor."""
     observation, instruction, _, _ = moment()
     raw = policy.observe([observation], [instruction])
-    asked = of or explained(policy.policy, policy.postprocess)
-    return Question(asked, prepare or policy.prepare, raw, batch_size)
+    return Question(of or explained_by(policy), prepare or policy.prepare, raw, batch_size)
 
 
 def without_image(question: Question, key: str = WORKSPACE) -> dict[str, Any]:

@@ -1,8 +1,10 @@
 """Explanations of one moment: identities that hold whatever the policy is."""
 
+from typing import Any
+
 import pytest
 import torch
-from explain_cases import NAMES, WORKSPACE, WRIST, ask, loaded, moment, without_image
+from explain_cases import NAMES, WORKSPACE, WRIST, ask, explained_by, loaded, moment, without_image
 from torch import Tensor
 
 from lerobot_bomb.explain.activations import LAYER, PARTS, Unit, all_heads, all_layers, all_mlps, recording
@@ -11,6 +13,8 @@ from lerobot_bomb.explain.images import filling, occluded, patch_masks
 from lerobot_bomb.explain.question import Question
 from lerobot_bomb.explain.restoration import Corruption, Restoration
 from lerobot_bomb.explain.spans import difference, span_of, spans_of_words, token_offsets
+
+pytestmark = pytest.mark.usefixtures("loaded_policies")
 
 RTOL = 1e-5  # of a score
 
@@ -52,8 +56,8 @@ def test_rows_beside_it_change_no_score(name: str) -> None:
     alone, together = ask(loaded(name), batch_size=1), ask(loaded(name))
     (image,) = alone.observation[WORKSPACE]
     masks, filled = patch_masks(4, *image.shape[1:]), filling(image, "mean", 1.0)
-    scores = [each.effects_of_masks(WORKSPACE, masks, filled) for each in (alone, together)]
-    assert close(*scores, together)
+    one_by_one, all_at_once = (each.effects_of_masks(WORKSPACE, masks, filled) for each in (alone, together))
+    assert close(one_by_one, all_at_once, together)
     spans = spans_of_words(moment()[1])
     offsets = token_offsets(loaded(name).prepare.steps, moment()[1])
     hidden = torch.stack([span.tokens(offsets) for span in spans])
@@ -111,7 +115,7 @@ def with_hidden_word(name: str) -> Corruption:
 
 @pytest.mark.parametrize("name", NAMES)
 def test_all_layers_put_back_are_the_clean_score_and_corrupt_ones_the_corrupt_score(name: str) -> None:
-    layers = loaded(name).policy.explained().layers
+    layers = explained_by(loaded(name)).layers
     for corruption in corruptions(name):
         everything = [all_layers(len(layers))]
         restored = corruption.restore(everything)
@@ -126,7 +130,7 @@ def test_all_layers_put_back_are_the_clean_score_and_corrupt_ones_the_corrupt_sc
 @pytest.mark.parametrize("name", NAMES)
 def test_what_the_layers_make_of_the_words_that_are_left_is_put_back_token_by_token(name: str) -> None:
     corruption = with_hidden_word(name)
-    layers = loaded(name).policy.explained().layers
+    layers = explained_by(loaded(name)).layers
     restored = corruption.restore([all_layers(len(layers))])
     assert restored.is_defined
     # what is read off the prompt behind the layers does without the hidden word all the same
@@ -143,7 +147,7 @@ def layers_decide(name: str) -> bool:
 
 @pytest.mark.parametrize("name", NAMES)
 def test_any_one_layer_put_back_at_all_tokens_is_the_clean_score(name: str) -> None:
-    layers = loaded(name).policy.explained().layers
+    layers = explained_by(loaded(name)).layers
     for corruption in corruptions(name):
         assert corruption.restore_each(all_layers(len(layers))).tolist() == pytest.approx(
             [1] * len(layers), abs=1e-3
@@ -153,7 +157,7 @@ def test_any_one_layer_put_back_at_all_tokens_is_the_clean_score(name: str) -> N
 @pytest.mark.parametrize("name", NAMES)
 def test_the_places_are_all_of_the_sequence_but_what_never_changes(name: str) -> None:
     corruption = corruptions(name)[0]
-    explained = loaded(name).policy.explained()
+    explained = explained_by(loaded(name))
     rows = explained.encode(loaded(name).prepare(ask(loaded(name)).observation))
     places = explained.places(rows)
     assert {WORKSPACE, WRIST, "instruction", "answer"} <= places.keys()
@@ -165,7 +169,7 @@ def test_the_places_are_all_of_the_sequence_but_what_never_changes(name: str) ->
 @pytest.mark.parametrize("name", NAMES)
 def test_units_put_back_in_a_batch_give_what_they_give_alone(name: str) -> None:
     corruption = corruptions(name)[1]
-    units = all_heads(loaded(name).policy.explained().layers)
+    units = all_heads(explained_by(loaded(name)).layers)
     alone = torch.cat([corruption.restore([[unit]]).scores for unit in units])
     together = corruption.restore([[unit] for unit in units]).scores
     torch.testing.assert_close(together, alone, rtol=1e-5, atol=1e-5)
@@ -183,7 +187,7 @@ def test_hooks_are_gone_afterwards_also_after_an_error(name: str) -> None:
     before = hooks_of(name)
     corruption = corruptions(name)[0]
     corruption.restore_each(all_mlps(1))
-    layers = loaded(name).policy.explained().layers
+    layers = explained_by(loaded(name)).layers
     with pytest.raises(RuntimeError), recording(layers, PARTS):
         assert hooks_of(name) > before
         raise RuntimeError
@@ -203,7 +207,7 @@ def test_a_batch_of_one_becomes_as_many_as_asked() -> None:
 
 
 def test_samples_are_not_explained() -> None:
-    policy = loaded("vla0_smol").policy
+    policy: Any = loaded("vla0_smol").policy
     policy.config.temperature = 0.5
     try:
         with pytest.raises(ValueError, match=r"--policy\.temperature=0"):

@@ -90,7 +90,7 @@ def test_the_episode_of_a_line(
     assert found["result"]["spec"] == row["spec"]
     for wrong, message in (
         ("--line=2", "--line=2 must be in 1..1"),
-        ("--perturbations=camera:3", "--perturbations=camera:3: the line says it; drop the flag"),
+        ("--perturbations=camera:3", "drop --perturbations: the line of --results says it"),
     ):
         assert main(["explain", *flags[:-1], wrong, f"--output={tmp_path / 'other'}"]) == 1
         assert message in capsys.readouterr().err

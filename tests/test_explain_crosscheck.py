@@ -16,6 +16,8 @@ from lerobot_bomb.explain.activations import all_heads
 from lerobot_bomb.explain.images import filling, patch_masks
 from lerobot_bomb.explain.restoration import Corruption
 
+pytestmark = pytest.mark.usefixtures("loaded_policies")
+
 GRID = 4
 SCRIPT = Path(__file__).with_name("explain_by_nnsight.py")
 

@@ -1,6 +1,7 @@
 """What explanations are made of: spans, masks, probes, means, findings."""
 
 import math
+from typing import Any
 
 import numpy as np
 import pytest
@@ -14,6 +15,8 @@ from lerobot_bomb.explain.images import filling, occluded, patch_masks, smoothed
 from lerobot_bomb.explain.moment import Explanation
 from lerobot_bomb.explain.probes import probe_classes, probe_values
 from lerobot_bomb.explain.spans import difference, named_spans, span_of, spans_of_words, token_offsets
+
+pytestmark = pytest.mark.usefixtures("loaded_policies")
 
 TEXT = "Put a black stone at position (1, 1) on the Go board."
 
@@ -57,6 +60,7 @@ def test_words_that_stand_there_twice_have_names_of_their_own() -> None:
 @pytest.mark.parametrize("name", NAMES)
 def test_tokens_of_a_span_spell_it(name: str) -> None:
     steps = loaded(name).prepare.steps
+    step: Any
     (step,) = (step for step in steps if hasattr(step, "template"))
     instruction = moment()[1]
     ids = loaded(name).prepare(loaded(name).observe([moment()[0]], [instruction]))

@@ -182,8 +182,9 @@ def test_ctrl_c_cancels_the_jobs(
     job = Job(is_done=False)
     monkeypatch.setattr(command, "submit", lambda *args: [job])
     monkeypatch.setattr(time, "sleep", interrupted)
-    assert sweep(tmp_path, "--submitit=1", *SWEEP) == 1
-    assert job.is_cancelled and "interrupted; to go on" in capsys.readouterr().out
+    assert sweep(tmp_path, "--submitit=1", *SWEEP) == 130
+    printed = capsys.readouterr()
+    assert job.is_cancelled and "to go on: " in printed.out and "interrupted" in printed.err
 
 
 @pytest.mark.parametrize(

@@ -92,10 +92,10 @@ def _of_flags(args: argparse.Namespace) -> "_Asked":
 
 
 def _of_line(args: argparse.Namespace) -> "_Asked":
-    shared = {"image_size": None, "perturbations": NONE, "env_type": "bomb"}
+    shared = {"image_size": None, "perturbations": (NONE,), "env_type": "bomb"}
     for name, default in (shared | args.own_flags["bomb"] | args.own_flags["bomb_pusht"]).items():
-        if (value := getattr(args, name)) != default:
-            raise ValueError(f"--{name.replace('_type', '.type')}={value}: the line says it; drop the flag")
+        if getattr(args, name) != default:
+            raise ValueError(f"drop --{name.replace('env_type', 'env.type')}: the line of --results says it")
     replay = Replay(read_line(args.results, args.line or 1), args.policy_path)
     if replay.checkpoint is None:
         raise ValueError("who played has no checkpoint, so there is nothing to explain")
