@@ -14,20 +14,23 @@ from lerobot_bomb.checkpoints.shipped import checkpoint_path, shipped_names
 from lerobot_bomb.envs.rollout import expert_agent, make_env, play
 from lerobot_bomb.explain.explained import Explained
 from lerobot_bomb.explain.images import filling
+from lerobot_bomb.explain.moment import Asked
 from lerobot_bomb.explain.other_policies import explained
 from lerobot_bomb.explain.question import Question
+from lerobot_bomb.explain.spans import difference, token_offsets
 from lerobot_bomb.viewing.checkpoint import LoadedPolicy, load_policy
 
 NAMES = shipped_names()
 SPEC = EpisodeSpec(seed=100_003, target=(1, 3), color="black")
 OPTIONS = RenderOptions(image_size=64)
 FAR_M = 0.05  # the stone is carried, and where it is to go decides what comes next
+GRID = 4
 WORKSPACE, WRIST = "observation.images.workspace", "observation.images.wrist"
 
 
-def fresh(name: str) -> LoadedPolicy:
+def fresh(name: str, device: str = "cpu") -> LoadedPolicy:
     """One that a test may change."""
-    return load_policy(Path(checkpoint_path(f"bomb:{name}")), "cpu", "bomb", {"image_size": 64}, seed=0)
+    return load_policy(Path(checkpoint_path(f"bomb:{name}")), device, "bomb", {"image_size": 64}, seed=0)
 
 
 loaded = cache(fresh)
@@ -61,6 +64,19 @@ def ask(
     observation, instruction, _, _ = moment()
     raw = policy.observe([observation], [instruction])
     return Question(of or explained_by(policy), prepare or policy.prepare, raw, batch_size)
+
+
+def asked(policy: LoadedPolicy) -> Asked:
+    """Patches, the words of the target and of the colour."""
+    _, instruction, _, others = moment()
+    spans = [difference(word, instruction, other) for word, (other, _) in others.items()]
+    return Asked(
+        grid=GRID,
+        fill="mean",
+        spans=[span for span in spans if span is not None],
+        offsets=token_offsets(policy.prepare.steps, instruction),
+        others={word: other for word, (other, _) in others.items()},
+    )
 
 
 def without_image(question: Question, key: str = WORKSPACE) -> dict[str, Any]:

@@ -5,30 +5,17 @@ from typing import Any
 
 import pytest
 import torch
-from explain_cases import NAMES, WORKSPACE, WRIST, ask, explained_by, fresh, moment
+from explain_cases import GRID, NAMES, WORKSPACE, WRIST, ask, asked, explained_by, fresh, moment
 
 from lerobot_bomb.actions.text import TokenRows
 from lerobot_bomb.explain.diagnosis import diagnose
 from lerobot_bomb.explain.explained import INSTRUCTION
-from lerobot_bomb.explain.moment import OTHER_SCENE, Asked, Explanation, camera_name, explain
+from lerobot_bomb.explain.moment import OTHER_SCENE, Explanation, camera_name, explain
 from lerobot_bomb.explain.spans import difference, token_offsets
 from lerobot_bomb.flow.dual_mod import FiLM
 from lerobot_bomb.viewing.checkpoint import LoadedPolicy
 
-GRID = 4
 HEADS = {"vla0_smol": (0, 2), "spatialvla_grid": (0, 3), "fdvla": (0, 2)}  # layer, head that read a target
-
-
-def asked(policy: LoadedPolicy) -> Asked:
-    _, instruction, _, others = moment()
-    spans = [difference(word, instruction, other) for word, (other, _) in others.items()]
-    return Asked(
-        grid=GRID,
-        fill="mean",
-        spans=[span for span in spans if span is not None],
-        offsets=token_offsets(policy.prepare.steps, instruction),
-        others={word: other for word, (other, _) in others.items()},
-    )
 
 
 def findings(explanation: Explanation) -> dict[str, tuple[str, ...]]:

@@ -150,7 +150,7 @@ def numbers(value: Any) -> list[float]:
     """All numbers of nested dicts and lists."""
     if isinstance(value, dict | list):
         return [x for of in (value.values() if isinstance(value, dict) else value) for x in numbers(of)]
-    return [value]
+    return [] if value is None else [value]
 
 
 def test_lerobots_act_has_columns_too(train: Callable[..., Path], root: Path) -> None:

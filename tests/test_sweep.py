@@ -267,7 +267,7 @@ def test_a_folder_where_nothing_was_played_takes_another_sweep(tmp_path: Path) -
     assert claim(tmp_path, misspelt) and claim(tmp_path, misspelt)
     store = Store(tmp_path, misspelt)
     store.give_up(misspelt.cells[0], "no such flag")
-    assert "flags that are right, into this folder" in store.lines()[-1]
+    assert "takes a sweep with other flags" in store.lines()[-1]
     with store.claimed(misspelt.cells[0]):
         assert not claim(tmp_path, small(("bomb_random",)))
     assert claim(tmp_path, small(("bomb_random",)))

@@ -53,11 +53,11 @@ def read_undamaged(path: Path) -> tuple[list[Row], int]:
         ValueError: there is no such file, or no episode in it.
     """
     rows, damages = read_lines(path)
-    check_any(path, rows, damages)
-    if missing := missing_of_sweep(path, len(rows)):
-        print(missing, file=sys.stderr)
     for damage in damages[:MAX_SHOWN_DAMAGES]:
         print(f"{damage}; not counted", file=sys.stderr)
     if len(damages) > MAX_SHOWN_DAMAGES:
         print(f"{path}: ... and {len(damages) - MAX_SHOWN_DAMAGES} more such lines", file=sys.stderr)
+    check_any(path, rows, damages)
+    if missing := missing_of_sweep(path, len(rows)):
+        print(missing, file=sys.stderr)
     return rows, len(damages)

@@ -164,12 +164,10 @@ class Store:
         given_up = [cell for cell in cells if not self.is_finished(cell) and self.is_over(cell)]
         for cell in given_up:
             text += [f"given up: {cell.command}", f"  {self.file(cell, 'given_up').read_text()}"]
-        if given_up and self.is_untouched():
-            text.append(
-                "nothing was played: type the sweep again with flags that are right, into this folder too"
-            )
-        elif errors or given_up:
+        if errors or given_up:
             text.append(f"to play them again: lerobot-bomb sweep {self.folder} --retry")
+        if given_up and self.is_untouched():
+            text.append("nothing was played, so the folder takes a sweep with other flags, too")
         others = self._of_other_manifests()
         if others:
             text.append(f"not counted, for the manifest has changed: {len(others)} cells, as {others[0]}")

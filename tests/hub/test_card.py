@@ -166,7 +166,7 @@ def test_an_evaluation_on_pusht_is_a_table_of_coverage_and_failures() -> None:
         "| perturbations=none | 1/4 = 25.0 % [4.6, 69.9] | 0.440 ["
     ) in text
     assert " | timeout 2, never_touched 1 |\n| perturbations=goal:3 | 0/4 = 0.0 % [0.0, " in text
-    assert " | 0.300 [0.300, 0.300] | 0.150 [0.150, 0.150] | turned_wrong 4 |" in text
+    assert " | 0.300 | 0.150 | turned_wrong 4 |" in text
     assert "task pusht; protocol pusht-1.0, instruction=none, max_steps=300, seeds 0..3; 96 px, gym-p" in text
     assert "Benchmark: PushT with BOMB's axes, protocol pusht-1.0." in text
     assert (

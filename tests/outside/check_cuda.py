@@ -5,6 +5,7 @@ import pickle
 from collections.abc import Callable, Iterator
 from typing import Any
 
+import explain_cases
 import fdvla_cases
 import pytest
 import spatialvla_grid_cases
@@ -13,6 +14,7 @@ import vla0_smol_cases
 from policy_cases import CASES
 from torch import Tensor
 
+from lerobot_bomb.explain.moment import explain
 from lerobot_bomb.finite import require_finite_batch
 
 WRITERS = {
@@ -169,3 +171,22 @@ def test_sampling_in_bfloat16_is_as_near_as_kernel_by_kernel(train_vlm: str) -> 
         eager = predict(device, batch)
     error, error_of_eager = ((actions - exact).abs().max() for actions in (captured, eager))
     assert 0 < error < 2 * error_of_eager + 1e-3
+
+
+@pytest.mark.parametrize("name", explain_cases.NAMES)
+def test_an_explanation_on_a_gpu_is_that_of_a_cpu(name: str) -> None:
+    policies = [explain_cases.fresh(name, device) for device in ("cpu", "cuda")]
+    host, device = (explain(explain_cases.ask(each), explain_cases.asked(each)) for each in policies)
+    scores: dict[str, Any] = {"rel": 1e-3, "abs": 1e-3 * abs(host.clean_score)}
+    assert device.clean_score == pytest.approx(host.clean_score, **scores)
+    for key, map_GG in host.patches.items():
+        assert device.patches[key].flatten().tolist() == pytest.approx(map_GG.flatten().tolist(), **scores)
+    assert device.words == pytest.approx(host.words, **scores)
+    assert device.others == pytest.approx(host.others, **scores)
+    names = [each.corruption for each in host.restored]
+    assert names == [each.corruption for each in device.restored] and names
+    for each, other in zip(host.restored, device.restored, strict=True):
+        if abs(each.drop) > 1e-2 * abs(host.clean_score):  # a smaller one's ratios are of its rounding
+            heads = [ratio for layer in each.heads for ratio in layer]
+            others = [ratio for layer in other.heads for ratio in layer]
+            assert others == pytest.approx(heads, abs=2e-2)
