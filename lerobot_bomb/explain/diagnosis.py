@@ -22,7 +22,7 @@ class Finding:
     def answer(self) -> str:
         """The names, as many as one reads."""
         more = len(self.names) - MAX_NAMES
-        return ", ".join(self.names[:MAX_NAMES]) + (f" and {more} more" if more > 0 else "") or "none"
+        return "; ".join(self.names[:MAX_NAMES]) + (f" and {more} more" if more > 0 else "") or "none"
 
     def __str__(self) -> str:
         return f"{self.question} {self.answer}"
@@ -45,7 +45,9 @@ def diagnose(explanation: Explanation) -> list[Finding]:
     if explanation.others:
         findings.append(Finding("Words that it depends on, changed:", used(explanation.others, clean)))
     for restored in explanation.restored:
-        findings.append(Finding(f"Heads that alone undo a {restored.corruption}:", _heads(restored)))
+        findings.append(
+            Finding(f"Heads that alone restore the answer, {restored.corruption}:", _heads(restored))
+        )
     return findings
 
 

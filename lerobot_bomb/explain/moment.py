@@ -181,7 +181,7 @@ def _corruptions(
     if words:
         span = max(asked.spans, key=lambda each: words[each.name])
         rows = question.explained.hide(question.rows, span.tokens(asked.offsets)[None])
-        found.append((f"{WORDS} {span.name!r} hidden", rows))
+        found.append((f"{WORDS} {span.name} hidden", rows))
     if others:
         other = max(others, key=lambda each: others[each])
         rows = question.encode({"task": [asked.others[other]]}, 1)
@@ -207,7 +207,7 @@ def _places(question: Question, asked: Asked, rows: Rows) -> dict[str, Place]:
     if not isinstance(first, Tensor) or len(first) != len(asked.offsets):  # some of it is hidden
         return places
     words = {span.name: span.tokens(asked.offsets) for span in asked.spans}
-    return places | {f'"{name}"': (first[tokens], *later) for name, tokens in words.items()}
+    return places | {name: (first[tokens], *later) for name, tokens in words.items()}
 
 
 def _restore(question: Question, asked: Asked, name: str, rows: Rows) -> Restored:

@@ -8,6 +8,7 @@ from lerobot_bomb.report.table import Cell, Section, Table
 # one hue, of which only the strength differs: it reads the same for the colour-blind
 SHADE = "background:rgba(0,114,178,{:.2f})"
 MAX_STRENGTH = 0.55  # text stays readable on it, black or white
+MAX_UNBROKEN = 40  # characters of a cell in one line
 STYLE = """
 :root{color-scheme:light dark}
 body{font:15px/1.5 system-ui,sans-serif;max-width:75rem;margin:0 auto;padding:1rem}
@@ -17,6 +18,7 @@ table{border-collapse:collapse;font-variant-numeric:tabular-nums}
 th,td{padding:.25rem .6rem;border-bottom:1px solid #8884;text-align:right;white-space:nowrap}
 th:first-child,td:first-child{text-align:left;position:sticky;left:0;background:Canvas}
 th.text,td.text{text-align:left}
+td.long{white-space:normal;min-width:11rem}
 p.note{opacity:.75;max-width:60rem;font-size:.9rem}
 figure{margin:1rem 0}figure img{image-rendering:pixelated;margin-right:.3rem}
 pre{white-space:pre-wrap;overflow-wrap:anywhere;font-size:.85rem}
@@ -50,9 +52,9 @@ def _section(section: Section) -> str:
 
 def _table(table: Table) -> str:
     title = f"<h3>{escape(table.title)}</h3>\n" if table.title else ""
-    kinds = [' class="text"' if _is_text(table, column) else "" for column in range(len(table.header))]
+    kinds = [["text"] if _is_text(table, column) else [] for column in range(len(table.header))]
     names = zip(table.header, kinds, strict=True)
-    head = "".join(f'<th scope="col"{kind}>{escape(name)}</th>' for name, kind in names)
+    head = "".join(f'<th scope="col"{_class(kind)}>{escape(name)}</th>' for name, kind in names)
     rows = "\n".join(f"<tr>{''.join(map(_cell, row, kinds))}</tr>" for row in table.rows)
     note = f'\n<p class="note">{escape(table.note)}</p>' if table.note else ""
     grid = f"<table>\n<thead><tr>{head}</tr></thead>\n<tbody>\n{rows}\n</tbody>\n</table>"
@@ -64,9 +66,14 @@ def _is_text(table: Table, column: int) -> bool:
     return not any(isinstance(row[column].value, int | float | dict) for row in table.rows)
 
 
-def _cell(cell: Cell, kind: str) -> str:
+def _class(names: list[str]) -> str:
+    return f' class="{" ".join(names)}"' if names else ""
+
+
+def _cell(cell: Cell, kind: list[str]) -> str:
     style = "" if cell.shade is None else f' style="{SHADE.format(cell.shade * MAX_STRENGTH)}"'
     video = (
         "" if cell.video is None else f'<video controls preload="none" src="{escape(cell.video)}"></video>'
     )
-    return f"<td{kind}{style}>{video}{escape(cell.text)}</td>"
+    names = [*kind, "long"] if len(cell.text) > MAX_UNBROKEN else kind
+    return f"<td{_class(names)}{style}>{video}{escape(cell.text)}</td>"
