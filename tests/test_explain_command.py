@@ -45,6 +45,8 @@ def test_several_episodes(tmp_path: Path) -> None:
     titles = [section["title"] for section in found["sections"]]
     assert titles[:2] == ["In short", "Phase: reach"] and titles[-1] == "Where is the destination known?"
     assert len(found["episodes"]) == 10
+    came = found["sections"][0]["tables"][0]["rows"]
+    assert [row[1] for row in came] == [10] * 4 and "failures: none" in found["sections"][0]["lines"]
 
 
 @pytest.mark.parametrize(

@@ -128,9 +128,9 @@ def test_means_are_of_what_is_known() -> None:
 
 
 def test_effects_that_are_rounding_or_small_beside_the_largest_are_none() -> None:
-    assert used({"a": 1.0, "b": -0.5, "c": 0.04, "d": 0.0}, -10.0) == ("a", "b")
-    assert used({"a": 1e-6, "b": 0.0}, -10.0) == ()
-    assert used({}, -10.0) == ()
+    assert used({"a": 1.0, "b": -0.5, "c": 0.04, "d": 0.0}, -10.0) == {"a": 1.0, "b": -0.5}
+    assert used({"a": 1e-6, "b": 0.0}, -10.0) == {}
+    assert used({}, -10.0) == {}
 
 
 def test_json_has_nothing_that_is_no_number() -> None:

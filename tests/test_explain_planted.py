@@ -41,8 +41,8 @@ def test_one_that_ignores_the_text(name: str) -> None:
     policy = fresh(name)
     hide_words(policy, None)
     found = findings(explain(ask(policy), asked(policy)))
-    assert found["Words that it depends on, hidden:"] == ()
-    assert found["Words that it depends on, changed:"] == ()
+    assert found["Hidden words that the answer depends on:"] == ()
+    assert found["Changed words that the answer depends on:"] == ()
     assert found["Patches that the answer depends on:"]
 
 
@@ -54,8 +54,8 @@ def test_one_that_reads_only_the_column(name: str) -> None:
     assert span is not None
     hide_words(policy, span.tokens(token_offsets(policy.prepare.steps, instruction)))
     found = findings(explain(ask(policy), asked(policy)))
-    assert found["Words that it depends on, hidden:"] == ("column",)
-    assert found["Words that it depends on, changed:"] == ("column",)
+    assert found["Hidden words that the answer depends on:"] == ("column",)
+    assert found["Changed words that the answer depends on:"] == ("column",)
 
 
 @pytest.mark.parametrize("name", NAMES)
@@ -76,9 +76,7 @@ def test_one_that_looks_at_one_patch_only(name: str, camera: str) -> None:
         return policy.prepare(changed)
 
     found = findings(explain(ask(policy, prepare), asked(policy)))
-    assert found["Patches that the answer depends on:"] == (
-        f"{camera_name(camera)} line {line}, column {column}",
-    )
+    assert found["Patches that the answer depends on:"] == (f"{camera_name(camera)} patch {line}, {column}",)
 
 
 @pytest.mark.parametrize("name", NAMES)

@@ -7,6 +7,7 @@ import sys
 from collections import defaultdict
 from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -20,7 +21,7 @@ from lerobot_bomb.commands.results_files import read_line
 from lerobot_bomb.commands.view import add_viewed_arguments, viewed_of
 from lerobot_bomb.conditions import NONE
 from lerobot_bomb.files import check_new_folder, read_json, written_whole
-from lerobot_bomb.flags import flags_without_group
+from lerobot_bomb.flags import flags_without_group, one_of
 from lerobot_bomb.viewing.episode import Viewed
 from lerobot_bomb.viewing.replay import Replay
 
@@ -63,8 +64,17 @@ def run_explain(args: argparse.Namespace) -> int:
         raise ValueError(f"--step={args.step} is of one episode; drop it or --episodes={args.episodes}")
     check_new_folder("output", args.output)
     asked = _of_flags(args) if args.results is None else _of_line(args)
+    _check_images(args, asked.viewed(asked.seed).env_flags["image_size"])
     with flags_without_group():
         return (_explain_one if args.episodes == 1 else _explain_several)(args, asked)
+
+
+def _check_images(args: argparse.Namespace, image_size: int) -> None:
+    """Refuse flags of the images before anything is loaded."""
+    from lerobot_bomb.explain.images import FILLINGS, patch_masks  # torch: seconds
+
+    one_of("--fill", args.fill, FILLINGS)
+    patch_masks(args.grid, image_size, image_size)
 
 
 def _image_size(checkpoint: Path) -> int | None:
@@ -100,7 +110,8 @@ def _of_line(args: argparse.Namespace) -> "_Asked":
     if replay.checkpoint is None:
         raise ValueError("who played has no checkpoint, so there is nothing to explain")
     seed = replay.row["spec"]["seed"] if args.seed is None else args.seed
-    return _Asked(lambda seed: replay.viewed(seed=seed), seed, replay.checkpoint, args.policy_device)
+    viewed = partial(replay.viewed, None)
+    return _Asked(viewed, seed, replay.checkpoint, args.policy_device, has_played=True)
 
 
 @dataclass(frozen=True)
@@ -111,12 +122,13 @@ class _Asked:
     seed: int
     checkpoint: Path
     device: str | None
+    has_played: bool = False  # then it is not asked whether it was trained for this environment
 
     def load(self) -> "LoadedPolicy":
         from lerobot_bomb.viewing.checkpoint import load_policy  # LeRobot and torch: seconds
 
         viewed = self.viewed(self.seed)
-        env = viewed.env_type, viewed.env_flags | {"ignore_checkpoint": False}
+        env = viewed.env_type, viewed.env_flags | {"ignore_checkpoint": self.has_played}
         return load_policy(self.checkpoint, self.device, *env, self.seed)
 
 

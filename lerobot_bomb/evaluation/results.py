@@ -30,10 +30,6 @@ class Summary:
     failures: Counter[str]
     efficiency: list[tuple[str, str, str]]  # name, value and note of what was measured
 
-    def describe_failures(self) -> str:
-        """'dropped 3, imprecise 1', the most frequent class first."""
-        return ", ".join(f"{name} {count}" for name, count in self.failures.most_common()) or "none"
-
     def lines(self) -> list[str]:
         """The summary as text, a line each."""
         rate = format_rate(self.num_successes, self.num_episodes)
@@ -43,8 +39,13 @@ class Summary:
             for measure, value in self.measures.items()
             if value != NO_VALUE
         ]
-        figures += [("failures", self.describe_failures(), ""), *self.efficiency]
+        figures += [("failures", named_counts(self.failures), ""), *self.efficiency]
         return [f"{name:<16} {value}{f' ({note})' if note else ''}" for name, value, note in figures]
+
+
+def named_counts(counts: Counter[str]) -> str:
+    """'dropped 3, imprecise 1', the most frequent first."""
+    return ", ".join(f"{name} {count}" for name, count in counts.most_common()) or "none"
 
 
 def read_results(path: Path) -> list[Row]:

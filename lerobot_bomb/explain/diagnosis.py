@@ -3,7 +3,7 @@
 from collections.abc import Mapping
 from dataclasses import dataclass
 
-from lerobot_bomb.explain.moment import Explanation, Restored, camera_name
+from lerobot_bomb.explain.moment import ALL, Explanation, Restored, camera_name
 from lerobot_bomb.explain.restoration import smallest_drop
 
 SHARE = 0.05  # an effect below this share of the largest of its kind is none
@@ -13,16 +13,24 @@ RESTORES = 0.5  # what a head alone must bring back to be named
 
 @dataclass(frozen=True)
 class Finding:
-    """A question and its answer; names in order of their effects, the largest first."""
+    """A question and its answer: effects by name, the largest first; {} where there is none."""
 
     question: str
-    names: tuple[str, ...]  # () where there is nothing
+    effects: Mapping[str, float]
+    is_weak: bool = False  # the largest is below a SHARE of what has the largest effect of all
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """What has an effect."""
+        return tuple(self.effects)
 
     @property
     def answer(self) -> str:
-        """The names, as many as one reads."""
-        more = len(self.names) - MAX_NAMES
-        return "; ".join(self.names[:MAX_NAMES]) + (f" and {more} more" if more > 0 else "") or "none"
+        """The names with their effects, as many as one reads."""
+        shown = [f"{name} ({effect:.2g})" for name, effect in self.effects.items()]
+        more = len(shown) - MAX_NAMES
+        names = "; ".join(shown[:MAX_NAMES]) + (f" and {more} more" if more > 0 else "") or "nothing"
+        return f"weakly, {names}" if self.is_weak and shown else names
 
     def __str__(self) -> str:
         return f"{self.question} {self.answer}"
@@ -30,40 +38,43 @@ class Finding:
 
 def diagnose(explanation: Explanation) -> list[Finding]:
     """What was found, question by question."""
-    clean = explanation.clean_score
     patches = {
-        f"{camera_name(key)} line {line}, column {column}": float(map_GG[line, column])
+        f"{camera_name(key)} patch {line}, {column}": float(map_GG[line, column])
         for key, map_GG in explanation.patches.items()
         for line in range(len(map_GG))
         for column in range(len(map_GG))
     }
-    findings = [Finding("Patches that the answer depends on:", used(patches, clean))]
-    for key, effects in explanation.objects.items():
-        findings.append(Finding(f"Objects that it depends on, {camera_name(key)}:", used(effects, clean)))
+    kinds = {"Patches": patches}
+    if explanation.objects:
+        kinds["Objects"] = explanation.objects[ALL]
     if explanation.words:
-        findings.append(Finding("Words that it depends on, hidden:", used(explanation.words, clean)))
+        kinds["Hidden words"] = explanation.words
     if explanation.others:
-        findings.append(Finding("Words that it depends on, changed:", used(explanation.others, clean)))
+        kinds["Changed words"] = explanation.others
+    largest = {kind: max(map(abs, effects.values()), default=0.0) for kind, effects in kinds.items()}
+    findings = []
+    for kind, effects in kinds.items():
+        found = used(effects, explanation.clean_score)
+        is_weak = largest[kind] < SHARE * max(largest.values())
+        findings.append(Finding(f"{kind} that the answer depends on:", found, is_weak))
     for restored in explanation.restored:
-        findings.append(
-            Finding(f"Heads that alone restore the answer, {restored.corruption}:", _heads(restored))
-        )
+        findings.append(Finding(f"Heads that alone restore it, {restored.corruption}:", _heads(restored)))
     return findings
 
 
-def used(effects: Mapping[str, float], clean_score: float) -> tuple[str, ...]:
-    """Names of effects that are more than rounding and more than a SHARE of the largest."""
-    largest = max((abs(effect) for effect in effects.values()), default=0.0)
+def used(effects: Mapping[str, float], clean_score: float) -> dict[str, float]:
+    """Effects that are more than rounding and more than a SHARE of the largest, the largest first."""
+    largest = max(map(abs, effects.values()), default=0.0)
     smallest = max(smallest_drop(clean_score), SHARE * largest)
-    found = [name for name, effect in effects.items() if abs(effect) > smallest]
-    return tuple(sorted(found, key=lambda name: -abs(effects[name])))
+    found = {name: effect for name, effect in effects.items() if abs(effect) > smallest}
+    return dict(sorted(found.items(), key=lambda pair: -abs(pair[1])))
 
 
-def _heads(restored: Restored) -> tuple[str, ...]:
+def _heads(restored: Restored) -> dict[str, float]:
     ratios = {
         f"layer {layer}, head {head}": ratio
         for layer, of_layer in enumerate(restored.heads)
         for head, ratio in enumerate(of_layer)
     }
-    found = [name for name, ratio in ratios.items() if ratio >= RESTORES]  # NaN is not
-    return tuple(sorted(found, key=lambda name: -ratios[name]))
+    found = {name: ratio for name, ratio in ratios.items() if ratio >= RESTORES}  # NaN is not
+    return dict(sorted(found.items(), key=lambda pair: -pair[1]))

@@ -9,24 +9,23 @@ import numpy as np
 HEAT_SHARE = 0.6  # of an overlay that is the map
 
 
-def heat(values: np.ndarray) -> np.ndarray:
+def heat(values: np.ndarray, largest: float) -> np.ndarray:
     """(H, W) -> (H, W, 3) uint8 RGB, dark at 0 and below, bright at the largest, in Cividis' colours."""
-    largest = float(values.max())
     scaled = np.clip(values / largest, 0, 1) if largest > 0 else np.zeros_like(values)
     colors = cv2.applyColorMap((255 * scaled).astype(np.uint8), cv2.COLORMAP_CIVIDIS)
     return cv2.cvtColor(colors, cv2.COLOR_BGR2RGB)
 
 
-def cells(map_GG: np.ndarray, height: int, width: int) -> np.ndarray:
+def cells(map_GG: np.ndarray, largest: float, height: int, width: int) -> np.ndarray:
     """(H, W, 3) uint8, each cell in one colour."""
-    return cv2.resize(heat(map_GG), (width, height), interpolation=cv2.INTER_NEAREST)
+    return cv2.resize(heat(map_GG, largest), (width, height), interpolation=cv2.INTER_NEAREST)
 
 
-def overlay(map_GG: np.ndarray, image: np.ndarray) -> np.ndarray:
+def overlay(map_GG: np.ndarray, largest: float, image: np.ndarray) -> np.ndarray:
     """(H, W, 3) uint8, the map interpolated over the image."""
     height, width = image.shape[:2]
     smooth = cv2.resize(map_GG.astype(np.float32), (width, height), interpolation=cv2.INTER_CUBIC)
-    return cv2.addWeighted(heat(smooth), HEAT_SHARE, image, 1 - HEAT_SHARE, 0)
+    return cv2.addWeighted(heat(smooth, largest), HEAT_SHARE, image, 1 - HEAT_SHARE, 0)
 
 
 def png_bytes(image: np.ndarray) -> bytes:

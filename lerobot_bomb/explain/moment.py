@@ -176,7 +176,7 @@ def _corruptions(
     cell = int(patches[key].argmax())
     (image,) = question.observation[key]
     mask = patch_masks(asked.grid, *image.shape[1:])[cell : cell + 1].to(image.device)
-    name = f"{PATCH} (line {cell // asked.grid}, column {cell % asked.grid}) of {camera_name(key)}"
+    name = f"{camera_name(key)} {PATCH} {cell // asked.grid}, {cell % asked.grid} taken out"
     found.append((name, question.encode({key: occluded(image, mask, fillings[key])}, 1)))
     if words:
         span = max(asked.spans, key=lambda each: words[each.name])

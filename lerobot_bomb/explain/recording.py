@@ -18,9 +18,11 @@ def write_recording(path: Path, name: str, fps: int, moments: Sequence[Explained
             recording.set_time(STEP, sequence=each.watched.step)
             recording.log("instruction", rr.TextDocument(each.watched.instruction), strict=True)
             recording.log("findings", rr.TextDocument("\n".join(map(str, each.findings))), strict=True)
+            patches = each.explanation.patches
+            largest = max(float(map_GG.max()) for map_GG in patches.values())
             for key, image in each.images.items():
                 recording.log(f"image/{key}", png(image), strict=True)
-                effects = overlay(each.explanation.patches[key].numpy(), image)
+                effects = overlay(patches[key].numpy(), largest, image)
                 recording.log(f"effect/{key}", png(effects), strict=True)
 
 

@@ -16,7 +16,7 @@ from lerobot_bomb.data.facts import DatasetFacts
 from lerobot_bomb.envs.results import Row
 from lerobot_bomb.evaluation.result_groups import Group, by_condition, groups_of
 from lerobot_bomb.evaluation.result_lines import KINDS, kind_of
-from lerobot_bomb.evaluation.results import summarise
+from lerobot_bomb.evaluation.results import named_counts, summarise
 from lerobot_bomb.hub.evaluations import model_index
 from lerobot_bomb.hub.markdown import command, fenced
 from lerobot_bomb.hub.method import Method
@@ -271,5 +271,5 @@ def results_table(group: Group) -> str:
         summary = summarise(rows)
         rate = format_rate(summary.num_successes, summary.num_episodes)
         cells = [f"perturbations={condition}", rate, *summary.measures.values()]
-        lines.append(f"| {' | '.join([*cells, summary.describe_failures()])} |")
+        lines.append(f"| {' | '.join([*cells, named_counts(summary.failures)])} |")
     return "\n".join(lines)

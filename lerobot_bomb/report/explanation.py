@@ -1,6 +1,7 @@
 """Explanations as sections of a page."""
 
 import base64
+from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
 from html import escape
 from typing import Any
@@ -8,6 +9,7 @@ from typing import Any
 import numpy as np
 
 from lerobot_bomb.bomb.board import BOARD
+from lerobot_bomb.evaluation.results import named_counts
 from lerobot_bomb.explain.aggregate import Mean, mean_of, means_of
 from lerobot_bomb.explain.episode import ExplainedMoment
 from lerobot_bomb.explain.following import Following
@@ -39,8 +41,8 @@ def overview_section(outcome: str, moments: Sequence[ExplainedMoment], command: 
         Table(each.title, QUESTIONS, [[Cell(of.question), Cell(of.answer)] for of in each.findings])
         for each in moments
     ]
-    lines = [moments[0].watched.instruction, outcome, command, *_not_asked(moments[0])]
-    return Section("In short", found, lines)
+    told = "\n".join([moments[0].watched.instruction, outcome])
+    return Section("In short", found, [*_not_asked(moments[0]), command], f"<pre>{escape(told)}</pre>")
 
 
 def _not_asked(moment: ExplainedMoment) -> list[str]:
@@ -65,21 +67,26 @@ def moment_sections(moment: ExplainedMoment) -> list[Section]:
         f"By how much the score of the clean answer drops; it is {explanation.clean_score:.4g} "
         f"({explanation.unit}) with nothing changed. Negative: it rises."
     )
+    of_words = (
+        f"{note} In quotes: single words, (2) where one stands for the second time; else what is named."
+    )
     tables = [
         _effects(f"Objects taken out: {camera_name(key)}", "object", each, note)
         for key, each in explanation.objects.items()
     ]
     if explanation.words:
-        tables.append(_effects("Words left out of the attention", "words", explanation.words, note))
+        tables.append(_effects("Words left out of the attention", "words", explanation.words, of_words))
     if explanation.others:
         tables.append(_effects("Words changed", "what is changed", explanation.others, note))
     if moment.followings:
         tables.append(_followings(moment.followings))
     for restored in explanation.restored:
         tables += _restored(restored)
+    largest = max(float(each.max()) for each in explanation.patches.values())
     figures = "".join(
-        _figure(key, image, explanation.patches[key].numpy()) for key, image in moment.images.items()
+        _figure(key, image, explanation.patches[key].numpy(), largest) for key, image in moment.images.items()
     )
+    figures += f'<p class="note">Dark: no effect or a negative one; bright: {largest:.4g}.</p>'
     title = moment.title.capitalize()
     return [Section(title, tables, [moment.watched.instruction], f'<div class="wide">{figures}</div>')]
 
@@ -88,8 +95,12 @@ def aggregate_sections(
     results: Sequence[Any], by_phase: Mapping[str, Sequence[ExplainedMoment]], command: str
 ) -> list[Section]:
     """What matters in which phase, over episodes."""
-    rate = format_rate(sum(result.is_success for result in results), len(results))
-    sections = [Section("In short", [], [f"success: {rate}", command])]
+    num_successes = sum(result.is_success for result in results)
+    failures = Counter(result.failure for result in results if not result.is_success)
+    reached = [[Cell(phase or MIDDLE), Cell(str(len(each)), len(each))] for phase, each in by_phase.items()]
+    lines = [f"success: {format_rate(num_successes, len(results))}", f"failures: {named_counts(failures)}"]
+    tables = [Table("Episodes that came to a phase", ["phase", "episodes"], reached)]
+    sections = [Section("In short", tables, [*lines, command])]
     for phase, moments in by_phase.items():
         sections.append(Section(f"Phase: {phase}" if phase else MIDDLE, [*_mean_tables(moments)]))
     return sections
@@ -264,12 +275,12 @@ def traces_svg(episodes: Mapping[str, MaskedEpisode]) -> str:
     return f'<div class="wide"><svg {size} {label}>{"".join(lines)}{"".join(legend)}</svg></div>'
 
 
-def _figure(key: str, image: np.ndarray, map_GG: np.ndarray) -> str:
+def _figure(key: str, image: np.ndarray, map_GG: np.ndarray, largest: float) -> str:
     """The image, the map cell by cell, the map smoothed over the image."""
     shown = {
         "what is seen": image,
-        "the effect of each patch": cells(map_GG, *image.shape[:2]),
-        "the same, smoothed over the image": overlay(map_GG, image),
+        "the effect of each patch": cells(map_GG, largest, *image.shape[:2]),
+        "the same, smoothed over the image": overlay(map_GG, largest, image),
     }
     size = f'width="{SHOWN_PX}" height="{SHOWN_PX}"'
     tags = "".join(

@@ -83,7 +83,8 @@ class Replay:
         from lerobot_bomb.checkpoints.identity import identity_of
         from lerobot_bomb.viewing.checkpoint import checkpoint_agent, scripted_agent
 
-        env = viewed.env_type, viewed.env_flags, viewed.spec.seed
+        # who played is not asked whether it was trained for this
+        env = viewed.env_type, viewed.env_flags | {"ignore_checkpoint": True}, viewed.spec.seed
         policy = self.row.get("policy") or {}
         path = self.checkpoint
         if path is None and policy:
