@@ -89,7 +89,9 @@ class _Restore:
         clean_NLF = self.clean[self.num_passes]
         if clean_NLF.shape[1] != values_NLF.shape[1]:
             assert self.removed is not None
-            is_left_L = torch.ones(clean_NLF.shape[1], dtype=torch.bool).index_fill(0, self.removed, False)
+            is_left_L = torch.ones(clean_NLF.shape[1], dtype=torch.bool, device=clean_NLF.device).index_fill(
+                0, self.removed, False
+            )
             clean_NLF = clean_NLF[:, is_left_L]
         restored = values_NLF.clone().unflatten(0, (self.num_rows, -1))
         size = values_NLF.shape[2] // self.num_heads
