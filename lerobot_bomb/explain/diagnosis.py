@@ -52,13 +52,23 @@ def diagnose(explanation: Explanation) -> list[Finding]:
     if explanation.others:
         kinds["Changed words"] = explanation.others
     largest = {kind: max(map(abs, effects.values()), default=0.0) for kind, effects in kinds.items()}
-    findings = []
-    for kind, effects in kinds.items():
-        found = used(effects, explanation.clean_score)
-        is_weak = largest[kind] < SHARE * max(largest.values())
-        findings.append(Finding(f"{kind} that the answer depends on:", found, is_weak))
-    for restored in explanation.restored:
-        findings.append(Finding(f"Heads that alone restore it, {restored.corruption}:", _heads(restored)))
+    weak = SHARE * max(largest.values())
+    findings = [
+        Finding(
+            f"{kind} that the answer depends on:",
+            used(effects, explanation.clean_score),
+            is_weak=largest[kind] < weak,
+        )
+        for kind, effects in kinds.items()
+    ]
+    findings += [
+        Finding(
+            f"Heads that alone restore it, {restored.corruption}:",
+            _heads(restored),
+            is_weak=abs(restored.drop) < weak,
+        )
+        for restored in explanation.restored
+    ]
     return findings
 
 
