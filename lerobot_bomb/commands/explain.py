@@ -7,7 +7,6 @@ import sys
 from collections import defaultdict
 from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass
-from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -110,8 +109,9 @@ def _of_line(args: argparse.Namespace) -> "_Asked":
     if replay.checkpoint is None:
         raise ValueError("who played has no checkpoint, so there is nothing to explain")
     seed = replay.row["spec"]["seed"] if args.seed is None else args.seed
-    viewed = partial(replay.viewed, None)
-    return _Asked(viewed, seed, replay.checkpoint, args.policy_device, has_played=True)
+    return _Asked(
+        lambda seed: replay.viewed(seed=seed), seed, replay.checkpoint, args.policy_device, has_played=True
+    )
 
 
 @dataclass(frozen=True)

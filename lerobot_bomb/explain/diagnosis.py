@@ -51,13 +51,12 @@ def diagnose(explanation: Explanation) -> list[Finding]:
         kinds["Hidden words"] = explanation.words
     if explanation.others:
         kinds["Changed words"] = explanation.others
-    largest = {kind: max(map(abs, effects.values()), default=0.0) for kind, effects in kinds.items()}
-    weak = SHARE * max(largest.values())
+    weak = SHARE * max(map(_largest, kinds.values()))
     findings = [
         Finding(
             f"{kind} that the answer depends on:",
             used(effects, explanation.clean_score),
-            is_weak=largest[kind] < weak,
+            is_weak=_largest(effects) < weak,
         )
         for kind, effects in kinds.items()
     ]
@@ -74,10 +73,13 @@ def diagnose(explanation: Explanation) -> list[Finding]:
 
 def used(effects: Mapping[str, float], clean_score: float) -> dict[str, float]:
     """Effects that are more than rounding and more than a SHARE of the largest, the largest first."""
-    largest = max(map(abs, effects.values()), default=0.0)
-    smallest = max(smallest_drop(clean_score), SHARE * largest)
+    smallest = max(smallest_drop(clean_score), SHARE * _largest(effects))
     found = {name: effect for name, effect in effects.items() if abs(effect) > smallest}
     return dict(sorted(found.items(), key=lambda pair: -abs(pair[1])))
+
+
+def _largest(effects: Mapping[str, float]) -> float:
+    return max(map(abs, effects.values()), default=0.0)
 
 
 def _heads(restored: Restored) -> dict[str, float]:

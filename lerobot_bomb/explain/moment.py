@@ -62,6 +62,11 @@ class Explanation:
     others: dict[str, float]  # of each other instruction
     restored: list[Restored]
 
+    @property
+    def largest_patch(self) -> float:
+        """The largest effect of a patch of any image: maps of one moment have one scale."""
+        return max(float(map_GG.max()) for map_GG in self.patches.values())
+
     def as_json(self) -> dict[str, Any]:
         """JSON-ready; not a number becomes None."""
         values = vars(self) | {

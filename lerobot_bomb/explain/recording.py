@@ -18,11 +18,10 @@ def write_recording(path: Path, name: str, fps: int, moments: Sequence[Explained
             recording.set_time(STEP, sequence=each.watched.step)
             recording.log("instruction", rr.TextDocument(each.watched.instruction), strict=True)
             recording.log("findings", rr.TextDocument("\n".join(map(str, each.findings))), strict=True)
-            patches = each.explanation.patches
-            largest = max(float(map_GG.max()) for map_GG in patches.values())
+            found = each.explanation
             for key, image in each.images.items():
                 recording.log(f"image/{key}", png(image), strict=True)
-                effects = overlay(patches[key].numpy(), largest, image)
+                effects = overlay(found.patches[key].numpy(), found.largest_patch, image)
                 recording.log(f"effect/{key}", png(effects), strict=True)
 
 

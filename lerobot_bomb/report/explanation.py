@@ -82,7 +82,7 @@ def moment_sections(moment: ExplainedMoment) -> list[Section]:
         tables.append(_followings(moment.followings))
     for restored in explanation.restored:
         tables += _restored(restored)
-    largest = max(float(each.max()) for each in explanation.patches.values())
+    largest = explanation.largest_patch
     figures = "".join(
         _figure(key, image, explanation.patches[key].numpy(), largest) for key, image in moment.images.items()
     )
