@@ -21,6 +21,7 @@ import numpy as np
 from datasets import config
 from huggingface_hub import hf_hub_download
 from huggingface_hub.constants import CONFIG_NAME
+from lerobot.configs import PreTrainedConfig
 from lerobot.datasets import (
     LeRobotDataset,
     LeRobotDatasetMetadata,
@@ -448,9 +449,9 @@ def built_policies() -> list[PreTrainedPolicy]:
     return [policy for built in _BUILT if (policy := built()) is not None]
 
 
-def training_data(policy: PreTrainedPolicy) -> LeRobotDatasetMetadata | None:
-    """The dataset that this process trains a policy on; None: it acts as it was loaded."""
-    return getattr(policy.config, "_runtime_dataset_meta", None)
+def training_data(config: PreTrainedConfig) -> LeRobotDatasetMetadata | None:
+    """The dataset that this process trains a config's policy on; None: it acts as it was loaded."""
+    return getattr(config, "_runtime_dataset_meta", None)
 
 
 def check_processors_before_use(

@@ -43,7 +43,7 @@ def test_a_stock_policy_is_known_as_long_as_it_lives_from_a_folder_too(
     loaded = make_policy(config, env_cfg=env)
     assert built_policies() == [*before, fresh, loaded]
     assert built_policies()[-1].config.pretrained_path == tmp_path
-    assert training_data(loaded) is None
+    assert training_data(loaded.config) is None
     del fresh, loaded
     gc.collect()
     assert built_policies() == before
@@ -57,4 +57,4 @@ def test_a_policy_that_is_being_trained_has_its_dataset(before: list[PreTrainedP
     policy = make_policy(act_config(), ds_meta=meta)  # pyright: ignore[reportArgumentType]
     assert built_policies() == [*before, policy]
     assert policy.config.output_features == {"action": PolicyFeature(FeatureType.ACTION, (4,))}
-    assert training_data(policy) is meta
+    assert training_data(policy.config) is meta

@@ -1,6 +1,7 @@
 """``lerobot-bomb compare``: two policies on the same episodes."""
 
 import json
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -118,6 +119,37 @@ def test_several_policies_in_one_file_are_refused(a: Path, b: Path, capsys: Prin
     write(b, [None] * 3, policy=ACT)
     assert compare(a, b) == 1
     assert "the first results are of 2 policies (act outputs/act" in capsys.readouterr().err
+
+
+def test_two_policies_of_one_file_are_chosen_by_name(a: Path, capsys: Printed) -> None:
+    write(a, [None] * 3)
+    write(a, ["dropped"] * 3, policy=FDVLA)
+    assert compare(a) == 0
+    assert "B - A      -100.0 points" in capsys.readouterr().out
+    assert compare(a, "--policies=me/fdvla,outputs/act") == 0
+    assert "B - A      +100.0 points" in capsys.readouterr().out
+    write(a, [None] * 3, policy=replace(FDVLA, type="fdvla_two"))
+    assert compare(a, "--policies=act,fdvla") == 0  # the type alone, not what it begins
+    assert capsys.readouterr().out.splitlines()[1].startswith("B: fdvla me/fdvla")
+
+
+@pytest.mark.parametrize(
+    ("flags", "message"),
+    [
+        ((), "two policies are compared, not 3 (act outputs/act"),
+        (("--policies=act",), "two policies are compared, not 1"),
+        (("--policies=act,pi0",), "pi0 must name one policy of the file, not 0: act outputs/act"),
+        (("--policies=act,me/",), "me/ must name one policy of the file, not 2"),
+        (("b.jsonl", "--policies=act,fdvla"), "--policies chooses two of one file"),
+    ],
+)
+def test_what_names_no_two_policies_is_refused(
+    flags: tuple[str, ...], message: str, a: Path, capsys: Printed
+) -> None:
+    for policy in (ACT, FDVLA, replace(FDVLA, type="fdvla_two")):
+        write(a, [None], policy=policy)
+    assert compare(a, *flags) == 1
+    assert message in capsys.readouterr().err
 
 
 def test_damaged_lines_are_told_and_not_counted(a: Path, b: Path, capsys: Printed) -> None:

@@ -116,17 +116,14 @@ def test_a_cell_whose_workers_are_killed_is_given_up_and_can_be_retried(tmp_path
 
 def test_a_sweep_that_was_stopped_is_no_failed_attempt(tmp_path: Path) -> None:
     (cell,) = small().cells
+    stopped = Store(tmp_path, small())
+    for _ in range(MAX_ATTEMPTS):
+        assert stopped.begin(cell)
     store = Store(tmp_path, small())
-    for _ in range(MAX_ATTEMPTS):
-        assert store.begin(cell)
-    with Store(tmp_path, small()).claimed(cell):
-        store.forget_attempts([cell])  # somebody plays it
-    assert not store.begin(cell) and store.is_over(cell)
-    store.begin_again([cell])
-    for _ in range(MAX_ATTEMPTS):
-        assert store.begin(cell)
-    store.forget_attempts([cell])
-    assert store.begin(cell)
+    worker = Store(tmp_path, small(), store.run)
+    for each in (store, worker, store):
+        assert each.begin(cell)
+    assert not worker.begin(cell) and store.is_over(cell)
 
 
 def test_a_changed_cell_is_another_cell(tmp_path: Path) -> None:
@@ -241,6 +238,7 @@ def test_a_cell_that_takes_too_long_is_given_up(
         (["--policies=bomb_expert", "--env.type=bomb", "--episodes=0"], "--episodes=0 must be at least 1"),
         (["--policies=/gone", "--env.type=bomb"], "--policies: /gone is no folder"),
         (["--policies=bomb:fdvl", "--env.type=bomb"], "no checkpoint 'fdvl' comes with this package"),
+        (["--policies=act", "--env.type=pusht", "--seed=-1"], "--seed=-1 must be at least 0"),
         (["--policies=README.md", "--env.type=bomb"], "--policies: README.md is no"),
         (["--policies=bomb_expert", "--env.type=bomb", "--shard=4/4"], "--shard: 4/4 must be PART/PARTS"),
     ],
@@ -251,6 +249,57 @@ def test_wrong_flags_are_told(
     assert sweep(tmp_path, *flags) == 1
     assert message in capsys.readouterr().err
     assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.parametrize(
+    ("flags", "message"),
+    [
+        (["--polices=bomb_expert"], "--polices=bomb_expert; nearest: --policies"),
+        (["--policies=bomb_expert", "--epsiodes=3"], "--epsiodes=3; nearest: --episodes"),
+        (["--policies=bomb_expert", "--task=place"], "--task=place; nearest: --tasks"),
+        (["--policies=bomb_expert", "--env.imgae_size=64"], "nearest: --env.image_size"),
+        (["--policies=bomb_expert,no_such"], "--policy.type: invalid choice: 'no_such'"),
+    ],
+)
+def test_misspelt_flags_are_told_before_anything_is_played(
+    flags: list[str], message: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    with pytest.raises(SystemExit):
+        sweep(tmp_path, *flags, "--env.type=bomb")
+    assert message in capsys.readouterr().err
+    assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.parametrize(
+    ("flags", "message"),
+    [
+        (["--env.type=bomb", "--env.image_size=48"], "evaluate with --env.image_size=64"),
+        (["--env.type=bomb", "--env.image_size=64", "--tasks=place,object"], "this one has task=object"),
+        (["--env.type=bomb_pusht"], "this is --env.type=bomb_pusht"),
+    ],
+)
+def test_a_checkpoint_of_another_environment_is_told_before_anything_is_played(
+    flags: list[str], message: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    policies = f"--policies={'' if 'pusht' in flags[0] else 'bomb_expert,'}{NANO}"
+    assert sweep(tmp_path, policies, *flags, "--policy.device=cpu", "--dry_run") == 1
+    error = capsys.readouterr().err
+    assert message in error and "(--env.ignore_checkpoint=true insists for every policy of a sweep)" in error
+    assert list(tmp_path.iterdir()) == []
+    assert sweep(tmp_path, policies, *flags, "--env.ignore_checkpoint=true", "--dry_run") == 0
+
+
+def test_sigterm_ends_a_sweep_as_ctrl_c_does(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    small().write(tmp_path)
+    monkeypatch.setattr(
+        "lerobot_bomb.commands.sweep.play", lambda *_: os.kill(os.getpid(), signal.SIGTERM) or time.sleep(9)
+    )
+    assert sweep(tmp_path) == 130
+    printed = capsys.readouterr()
+    assert f"to go on: lerobot-bomb sweep {tmp_path}" in printed.out and "interrupted" in printed.err
+    assert (tmp_path / "results.jsonl").read_text() == ""
 
 
 def test_a_folder_of_another_sweep_is_left_alone(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

@@ -2,11 +2,13 @@
 
 import copy
 import logging
+from collections.abc import Iterator
+from contextlib import contextmanager
+from contextvars import ContextVar
 from dataclasses import dataclass
 from pathlib import Path
 
 from lerobot.configs import PreTrainedConfig
-from lerobot.policies import PreTrainedPolicy
 
 from lerobot_bomb._compat import built_policies, training_data
 from lerobot_bomb.checkpoints.training import dataset_of, read_train_config
@@ -14,6 +16,8 @@ from lerobot_bomb.data.environment import IMAGES, Environment
 from lerobot_bomb.data.facts import DatasetFacts
 
 logger = logging.getLogger(__name__)
+
+_to_be_built: ContextVar[PreTrainedConfig | None] = ContextVar("to_be_built", default=None)
 
 
 @dataclass
@@ -51,36 +55,46 @@ def check_acting_policy(here: Environment) -> None:
     Raises:
         ValueError: it was trained for another one; the message names the flags to change.
     """
-    asked = asked_policy()
+    asked = asked_config()
     if asked is not None:
         _check(*asked, here)
 
 
-def asked_policy() -> tuple[PreTrainedPolicy, str, str] | None:
-    """The policy that this process built last, its name and how to insist on it; None: nothing to ask."""
-    policies = built_policies()
-    if not policies or getattr(policies[-1].config, "ignore_environment", False):
+@contextmanager
+def as_if_built(config: PreTrainedConfig) -> Iterator[None]:
+    """Let environments check the policy that this config's would be, which costs no loading of weights."""
+    token = _to_be_built.set(config)
+    try:
+        yield
+    finally:
+        _to_be_built.reset(token)
+
+
+def asked_config() -> tuple[PreTrainedConfig, str, str] | None:
+    """Of the policy that this process built last, its name and how to insist on it; None: nothing to ask."""
+    configs = [policy.config for policy in built_policies()]
+    config = _to_be_built.get() or next(reversed(configs), None)
+    if config is None or getattr(config, "ignore_environment", False):
         return None
-    config = policies[-1].config
     flag = (
         "--policy.ignore_environment"
         if isinstance(config, ConfigWithEnvironment)
         else "--env.ignore_checkpoint"
     )
-    return policies[-1], _name(config), f"insist with {flag}=true"
+    return config, _name(config), f"insist with {flag}=true"
 
 
 def _name(config: PreTrainedConfig) -> str:
     return f"the checkpoint {config.pretrained_path}" if config.pretrained_path else f"this {config.type}"
 
 
-def trained_environment(policy: PreTrainedPolicy) -> Environment | None:
+def trained_environment(config: PreTrainedConfig) -> Environment | None:
     """By the dataset it is being trained on, by its config, or by the dataset that its training names."""
-    if training_data(policy) is None:
-        environment = getattr(policy.config, "environment", None)
+    if training_data(config) is None:
+        environment = getattr(config, "environment", None)
         if environment is not None:
             return environment
-    return environment_of_dataset(dataset_of_training(policy))
+    return environment_of_dataset(dataset_of_training(config))
 
 
 def environment_of_dataset(root: Path | str | None) -> Environment | None:
@@ -89,20 +103,19 @@ def environment_of_dataset(root: Path | str | None) -> Environment | None:
     return None if facts is None else facts.environment
 
 
-def dataset_of_training(policy: PreTrainedPolicy) -> Path | None:
+def dataset_of_training(config: PreTrainedConfig) -> Path | None:
     """Folder of the dataset that it is being trained on, or that its checkpoint's training names.
 
     It may be gone. None: not known.
     """
-    meta, path = training_data(policy), policy.config.pretrained_path
+    meta, path = training_data(config), config.pretrained_path
     if meta is not None:
         return meta.root
     return None if path is None else dataset_of(read_train_config(Path(path)))
 
 
-def _check(policy: PreTrainedPolicy, who: str, insist: str, here: Environment) -> None:
-    config = policy.config
-    environment = trained_environment(policy)
+def _check(config: PreTrainedConfig, who: str, insist: str, here: Environment) -> None:
+    environment = trained_environment(config)
     if environment is not None:
         environment.check_same(here, who, insist)
         return

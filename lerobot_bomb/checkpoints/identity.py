@@ -47,7 +47,7 @@ def acting_policy() -> PreTrainedPolicy | None:
 
 def identity_of(policy: PreTrainedPolicy) -> PolicyIdentity:
     """Which policy this is."""
-    if training_data(policy) is not None:
+    if training_data(policy.config) is not None:
         return PolicyIdentity(policy.config.type, is_in_training=True)
     return identity_of_config(policy.config)
 

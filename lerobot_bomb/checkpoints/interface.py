@@ -6,12 +6,11 @@ from pathlib import Path
 
 import numpy as np
 from lerobot.configs import FeatureType, PolicyFeature, PreTrainedConfig
-from lerobot.policies import PreTrainedPolicy
 from lerobot.utils.constants import ACTION, POLICY_POSTPROCESSOR_DEFAULT_NAME
 from safetensors import safe_open
 
 from lerobot_bomb._compat import training_data
-from lerobot_bomb.checkpoints.environment import asked_policy, trained_environment
+from lerobot_bomb.checkpoints.environment import asked_config, trained_environment
 from lerobot_bomb.checkpoints.identity import weights_file
 
 # of where actions may lie; what moves over less of it in all demonstrations is in another unit
@@ -35,18 +34,18 @@ class Interface:
         Raises:
             ValueError: it was trained for another one; the message says what differs and the way out.
         """
-        asked = asked_policy()
+        asked = asked_config()
         if asked is None:
             return
-        policy, who, insist = asked
-        trained_for = trained_environment(policy)
+        config, who, insist = asked
+        trained_for = trained_environment(config)
         if trained_for is not None:
             raise ValueError(
                 f"{who} was trained for {trained_for}; this is --env.type={self.env_type}: evaluate with "
                 f"{' '.join(trained_for.eval_flags())}, or {insist}"
             )
-        self._check_features(policy.config, who, insist)
-        self._check_actions(policy, who, insist)
+        self._check_features(config, who, insist)
+        self._check_actions(config, who, insist)
 
     def _check_features(self, config: PreTrainedConfig, who: str, insist: str) -> None:
         of_policy = {**(config.input_features or {}), **(config.output_features or {})}
@@ -65,9 +64,9 @@ class Interface:
                 "evaluate it in the environment that it was trained for"
             )
 
-    def _check_actions(self, policy: PreTrainedPolicy, who: str, insist: str) -> None:
+    def _check_actions(self, config: PreTrainedConfig, who: str, insist: str) -> None:
         """By the least and the greatest action of its training."""
-        trained = trained_actions(policy)
+        trained = trained_actions(config)
         if trained is None or self.action_range is None:
             return
         low, high = trained
@@ -82,9 +81,9 @@ class Interface:
         )
 
 
-def trained_actions(policy: PreTrainedPolicy) -> tuple[np.ndarray, np.ndarray] | None:
+def trained_actions(config: PreTrainedConfig) -> tuple[np.ndarray, np.ndarray] | None:
     """(D,) least and (D,) greatest value of each dimension in a policy's training; None: not known."""
-    meta, config = training_data(policy), policy.config
+    meta = training_data(config)
     if meta is not None:
         of_action = (meta.stats or {}).get(ACTION, {})
         return (of_action["min"], of_action["max"]) if {"min", "max"} <= of_action.keys() else None

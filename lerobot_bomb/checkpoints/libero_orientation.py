@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 from lerobot.datasets import LeRobotDataset, LeRobotDatasetMetadata
 
-from lerobot_bomb.checkpoints.environment import asked_policy, dataset_of_training
+from lerobot_bomb.checkpoints.environment import asked_config, dataset_of_training
 from lerobot_bomb.data.dataset_files import INFO_FILE
 from lerobot_bomb.libero.orientation import SAME, orientation
 
@@ -30,11 +30,11 @@ class OrientationCheck:
 
     def compare(self, shown: np.ndarray, task: str) -> None:
         """Images of the environment, (N, H, W, 3) uint8, in episodes of a task of the suite."""
-        asked = None if self._is_done else asked_policy()
+        asked = None if self._is_done else asked_config()
         if asked is None:
             return
-        policy, who, _ = asked
-        root = dataset_of_training(policy)
+        config, who, _ = asked
+        root = dataset_of_training(config)
         images = None if root is None else images_of_task(root, self._key, task)
         if images is None or images.shape[1:] != shown.shape[1:]:
             return

@@ -132,7 +132,6 @@ def _play(args: argparse.Namespace, folder: Path, cells: dict[str, Cell]) -> dic
     if not claim(folder, manifest):
         raise ValueError(f"{args.folder} is of another audit; name another folder")
     store = Store(folder, manifest)
-    store.forget_attempts(manifest.cells)
     play(store, "0/1", args.workers)
     store.merge()
     missing = [name for name, cell in cells.items() if not store.is_finished(cell) or store.errors(cell)]

@@ -2,16 +2,20 @@
 
 import argparse
 
-from lerobot_bomb.commands.arguments import ANSWER_IS_NO, path_flag
+from lerobot_bomb.commands.arguments import ANSWER_IS_NO, parse_conditions, path_flag
 from lerobot_bomb.commands.results_files import read_undamaged
-from lerobot_bomb.evaluation.comparison import compare
+from lerobot_bomb.envs.results import Row
+from lerobot_bomb.evaluation.comparison import compare, of_policies
+from lerobot_bomb.evaluation.result_groups import describe_policy
 
 
 def add_compare_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the arguments of ``lerobot-bomb compare``."""
     add = parser.add_argument
+    two = "without a second file: which two of the first one's policies (default: the two that it has)"
     add("a", type=path_flag, metavar="A", help="file of --env.results_path")
-    add("b", type=path_flag, metavar="B", help="the same of another policy, on the same seeds")
+    add("b", type=path_flag, metavar="B", nargs="?", help="the same of another policy, on the same seeds")
+    add("--policies", type=parse_conditions, default=(), metavar="A,B", help=two)
     unless = (
         f"exit code {ANSWER_IS_NO} unless, under every condition and with 95 %% confidence, B's success is"
     )
@@ -29,10 +33,24 @@ def _points(text: str) -> float:
     return points
 
 
+def _two_policies(args: argparse.Namespace) -> tuple[list[Row], list[Row]]:
+    """Their episodes, of two files or of one."""
+    if args.b is not None:
+        if args.policies:
+            raise ValueError("--policies chooses two of one file; give one, or drop it")
+        (first, _), (second, _) = map(read_undamaged, (args.a, args.b))
+        return first, second
+    rows, _ = read_undamaged(args.a)
+    both = of_policies(rows, args.policies)
+    if len(both) != 2:
+        names = "; ".join(describe_policy(of[0]) for of in both)
+        raise ValueError(f"{args.a}: two policies are compared, not {len(both)} ({names}): --policies=A,B")
+    return both[0], both[1]
+
+
 def run_compare(args: argparse.Namespace) -> int:
     """Print both rates and their difference, by condition; check what was asked for."""
-    (first, _), (second, _) = map(read_undamaged, (args.a, args.b))
-    comparisons = compare(first, second)
+    comparisons = compare(*_two_policies(args))
     print(*comparisons.lines(), sep="\n")
     low = 100 * comparisons.lowest
     verdicts = []

@@ -13,6 +13,9 @@ from lerobot_bomb.flag_errors import nearest
 
 DESCRIPTION = "What lerobot-train and lerobot-eval do not do for BOMB: record, summarise, check."
 
+# of lerobot-eval, those that are of no group as --env.task is
+EVAL_FLAGS = ("--config_path", "--job_name", "--output_dir", "--rename_map", "--seed", "--trust_remote_code")
+
 # command -> help; NAME stands in commands/NAME.py, a hyphen as an underscore, with add_NAME_arguments and
 # run_NAME, and is imported only when called
 COMMANDS = {
@@ -47,6 +50,11 @@ COMMANDS = {
 }
 
 
+def _may_be_of_eval(flag: str) -> bool:
+    name = flag.partition("=")[0]
+    return "." in name or name in EVAL_FLAGS
+
+
 def _function(command: str) -> str:
     return command.replace("-", "_")
 
@@ -78,7 +86,8 @@ def main(argv: Sequence[str] | None = None) -> int:
         args, unknown = parser.parse_known_args(argv)
         if "rest" in args:  # of a command that has LeRobot's parser read them
             args.rest = unknown
-        elif unknown:
+            unknown = [word for word in unknown if word.startswith("--") and not _may_be_of_eval(word)]
+        if unknown:
             command = commands[args.command]
             near = nearest(unknown, command._option_string_actions)
             command.error(f"unrecognized arguments: {' '.join(unknown)}{near}")

@@ -3,6 +3,9 @@
 import argparse
 import json
 import shlex
+import signal
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -14,7 +17,7 @@ from lerobot_bomb.flags import one_of
 from lerobot_bomb.sweep.cluster import sbatch_script, submit
 from lerobot_bomb.sweep.local import PYTHON, play, progress
 from lerobot_bomb.sweep.manifest import NAME, Cell, Manifest, flag_value, parse_part, plan
-from lerobot_bomb.sweep.store import Store, claim
+from lerobot_bomb.sweep.store import Store, claim, is_of
 
 MAX_BATCH = 10
 SCRIPT, SUBMITIT = "sweep.sbatch", "submitit"
@@ -70,12 +73,12 @@ def run_sweep(args: argparse.Namespace) -> int:
         store.begin_again(cells)
     if args.slurm is not None:
         return _write_slurm(args)
-    store.forget_attempts(cells)
     try:
-        if args.submitit is None:
-            play(store, args.shard, args.workers, args.timeout)
-        else:
-            _play_by_jobs(args, store)
+        with interrupted_by_sigterm():
+            if args.submitit is None:
+                play(store, args.shard, args.workers, args.timeout)
+            else:
+                _play_by_jobs(args, store)
     except KeyboardInterrupt:
         store.merge()
         print(*store.lines(), f"to go on: lerobot-bomb sweep {args.folder}", sep="\n")
@@ -84,6 +87,16 @@ def run_sweep(args: argparse.Namespace) -> int:
     print(*store.lines(), sep="\n")
     is_whole = all(store.is_finished(cell) and not store.errors(cell) for cell in cells)
     return 0 if is_whole else 1
+
+
+@contextmanager
+def interrupted_by_sigterm() -> Iterator[None]:
+    """Let a cluster's SIGTERM end this process as Ctrl-C does: with what is finished merged, and said."""
+    usual = signal.signal(signal.SIGTERM, signal.default_int_handler)
+    try:
+        yield
+    finally:
+        signal.signal(signal.SIGTERM, usual)
 
 
 def _json_object(text: str) -> dict[str, Any]:
@@ -129,6 +142,10 @@ def _manifest(args: argparse.Namespace) -> Manifest:
     conditions = _expanded(args.perturbations, kind)
     batch_size = 1 if kind.starts_by_number else args.batch_size
     manifest = plan(args.policies, args.tasks, conditions, args.seed, args.episodes, batch_size, args.rest)
+    if not is_of(args.folder, manifest):
+        from lerobot_bomb.sweep.check import check  # LeRobot and torch: seconds
+
+        check(manifest)
     if not claim(args.folder, manifest):
         raise ValueError(
             f"{args.folder / NAME} is of another sweep; name another folder, or go on with that one by "

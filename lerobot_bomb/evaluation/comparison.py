@@ -1,9 +1,10 @@
 """Two policies on the same episodes: which is better, by how much, and is it certain?"""
 
 import json
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 
+from lerobot_bomb.checkpoints.shipped import checkpoint_path
 from lerobot_bomb.envs.results import Row
 from lerobot_bomb.evaluation.result_groups import (
     count_pairs,
@@ -87,6 +88,32 @@ class Comparisons:
         return [*lines, notes + adjusted * (len(self.conditions) > 1)]
 
 
+def of_policies(rows: list[Row], names: Sequence[str]) -> list[list[Row]]:
+    """Apart by policy, those of each name; no name: of all, in the order of their first lines.
+
+    A policy answers to its type, its path, `bomb:NAME`, or any part of what `results` says of it.
+
+    Raises:
+        ValueError: a name is of no policy, or of several.
+    """
+    of_key: dict[str, list[Row]] = {}
+    for row in rows:
+        of_key.setdefault(settings_of(row)[POLICY], []).append(row)
+    described = {key: describe_policy(of[0]) for key, of in of_key.items()}
+    if not names:
+        return list(of_key.values())
+    chosen = []
+    for name in names:
+        keys = [key for key, text in described.items() if name in text.split()] or [
+            key for key, text in described.items() if checkpoint_path(name) in text
+        ]
+        if len(keys) != 1:
+            texts = "; ".join(described.values())
+            raise ValueError(f"--policies: {name} must name one policy of the file, not {len(keys)}: {texts}")
+        chosen.append(of_key[keys[0]])
+    return chosen
+
+
 def compare(first: list[Row], second: list[Row]) -> Comparisons:
     """Pair the episodes of two policies.
 
@@ -121,8 +148,8 @@ def _only_policy(name: str, rows: list[Row]) -> str:
     if len(settings) > 1:
         described = sorted({describe_policy(row) for row in rows})
         raise ValueError(
-            f"{name} results are of {len(settings)} policies ({'; '.join(described)}): give "
-            "--env.results_path another file for each"
+            f"{name} results are of {len(settings)} policies ({'; '.join(described)}): compare two of one "
+            "file with --policies=A,B"
         )
     return describe_policy(rows[0])
 

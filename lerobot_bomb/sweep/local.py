@@ -60,7 +60,7 @@ def play(store: Store, part: str, num_workers: int, timeout_s: int | None = None
         RuntimeError: they end before they play.
     """
     environments = worker_environments(num_workers, os.environ, num_cores(), visible_gpus(os.environ))
-    command = [*PYTHON, "lerobot_bomb.sweep.worker", str(store.folder), part]
+    command = [*PYTHON, "lerobot_bomb.sweep.worker", str(store.folder), part, store.run]
     command += [str(timeout_s)] if timeout_s else []
     log = store.folder / "workers.log"
 

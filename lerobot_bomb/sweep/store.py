@@ -1,7 +1,8 @@
 """What of a sweep is done: a folder that any number of workers share.
 
 A cell is finished where `cells/KEY.jsonl` is; a worker that plays one holds the lock on `cells/KEY.lock`,
-which the system takes from it if it is killed. What such a worker left is played again.
+which the system takes from it if it is killed. What such a worker left is played again, three times at most
+in one run: a sweep that was stopped, with workers that may outlive it by moments, is no failed attempt.
 """
 
 import json
@@ -11,6 +12,7 @@ from contextlib import contextmanager
 from dataclasses import asdict, dataclass
 from fcntl import LOCK_EX, LOCK_NB, flock
 from pathlib import Path
+from uuid import uuid4
 
 from lerobot_bomb.files import append_line, written_whole
 from lerobot_bomb.sweep.manifest import NAME, Cell, Manifest
@@ -36,19 +38,34 @@ def claim(folder: Path, manifest: Manifest) -> bool:
     Raises:
         ValueError: a manifest that is there is damaged, or of another version of this package.
     """
-    if (folder / NAME).is_file():
-        there = Manifest.read(folder)
-        if there == manifest or not Store(folder, there).is_untouched():
-            return there == manifest
+    if is_of(folder, manifest):
+        return True
+    if (folder / NAME).is_file() and not Store(folder, Manifest.read(folder)).is_untouched():
+        return False
     manifest.write(folder)
     return True
 
 
-class Store:
-    """The folder of a sweep."""
+def is_of(folder: Path, manifest: Manifest) -> bool:
+    """Whether this manifest is the folder's.
 
-    def __init__(self, folder: Path, manifest: Manifest) -> None:
-        self.folder, self.manifest = folder, manifest
+    Raises:
+        ValueError: a manifest that is there is damaged, or of another version of this package.
+    """
+    return (folder / NAME).is_file() and Manifest.read(folder) == manifest
+
+
+class Store:
+    """The folder of a sweep.
+
+    Args:
+        folder: where `manifest` lies.
+        manifest: what is played.
+        run: names the command whose workers' attempts count together; None: a new one.
+    """
+
+    def __init__(self, folder: Path, manifest: Manifest, run: str | None = None) -> None:
+        self.folder, self.manifest, self.run = folder, manifest, run or uuid4().hex
         (folder / CELLS).mkdir(parents=True, exist_ok=True)
 
     def file(self, cell: Cell, ending: str) -> Path:
@@ -71,17 +88,21 @@ class Store:
 
     def begin(self, cell: Cell) -> bool:
         """Count an attempt; give the cell up, and return False, if there were enough that were killed."""
-        path = self.file(cell, "attempts")
-        if path.is_file() and path.read_bytes().count(b"\n") >= MAX_ATTEMPTS:
+        if self._num_attempts(cell) >= MAX_ATTEMPTS:
             self.give_up(cell, f"{MAX_ATTEMPTS} workers were killed while they played it")
             return False
-        append_line(path, "")
+        append_line(self.file(cell, "attempts"), self.run)
         return True
 
     def fail(self, cell: Cell, reason: str) -> None:
         """Give the cell up, if the attempt that ended so was the last."""
-        if self.file(cell, "attempts").read_bytes().count(b"\n") >= MAX_ATTEMPTS:
+        if self._num_attempts(cell) >= MAX_ATTEMPTS:
             self.give_up(cell, f"{reason}; {MAX_ATTEMPTS} attempts")
+
+    def _num_attempts(self, cell: Cell) -> int:
+        """Of this run."""
+        path = self.file(cell, "attempts")
+        return path.read_text().split().count(self.run) if path.is_file() else 0
 
     def give_up(self, cell: Cell, reason: str) -> None:
         """No worker plays it any more."""
@@ -91,14 +112,6 @@ class Store:
     def is_over(self, cell: Cell) -> bool:
         """Whether it is finished or given up."""
         return self.is_finished(cell) or self.file(cell, "given_up").is_file()
-
-    def forget_attempts(self, cells: Sequence[Cell]) -> None:
-        """Of cells that nobody plays and that are not over: a sweep that was stopped is no failed attempt."""
-        for cell in cells:
-            if not self.is_over(cell) and self.file(cell, "attempts").is_file():
-                with self.claimed(cell) as is_mine:
-                    if is_mine:
-                        self.file(cell, "attempts").unlink(missing_ok=True)
 
     def begin_again(self, cells: Sequence[Cell]) -> None:
         """Forget what became of those that were given up or in which episodes had errors."""

@@ -1,6 +1,6 @@
 """Plays the cells of a sweep that nobody else plays, one after the other, in one process.
 
-`python -m lerobot_bomb.sweep.worker FOLDER PART [TIMEOUT_S]`, which ends with its standard input.
+`python -m lerobot_bomb.sweep.worker FOLDER PART RUN [TIMEOUT_S]`, which ends with its standard input.
 """
 
 import io
@@ -200,12 +200,12 @@ def _end_with_parent() -> None:
     os._exit(1)
 
 
-def main(folder: str, part: str, timeout_s: str | None = None) -> None:
+def main(folder: str, part: str, run: str, timeout_s: str | None = None) -> None:
     """Play a part of the sweep in a folder."""
     logging.basicConfig(level=logging.WARNING)
     threading.Thread(target=_end_with_parent, daemon=True).start()
     manifest = Manifest.read(Path(folder))
-    store = Store(Path(folder), manifest)
+    store = Store(Path(folder), manifest, run)
     Worker(store, None if timeout_s is None else int(timeout_s)).run(manifest.part(part))
 
 

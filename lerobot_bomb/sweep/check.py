@@ -1,0 +1,34 @@
+"""What would be refused in the middle of a sweep, found before it begins."""
+
+import logging
+
+from lerobot_bomb._compat import eval_config
+from lerobot_bomb.checkpoints.environment import as_if_built
+from lerobot_bomb.sweep.manifest import Cell, Manifest
+
+INSIST = "--env.ignore_checkpoint=true insists for every policy of a sweep"
+
+
+def check(manifest: Manifest) -> None:
+    """LeRobot reads the flags of every cell, and no policy was trained for another environment.
+
+    Raises:
+        SystemExit: flags are wrong; LeRobot's parser has said which.
+        ValueError: a policy was trained for another environment; the message names the flags to change.
+    """
+    logging.disable(logging.WARNING)  # the workers' log has them
+    try:
+        for cell in {_without_condition(cell): cell for cell in manifest.cells}.values():
+            config = eval_config(cell.flags)
+            with as_if_built(config.policy):
+                try:
+                    config.env.get_env_processors()
+                except ValueError as error:
+                    raise ValueError(f"{error} ({INSIST})") from None
+    finally:
+        logging.disable(logging.NOTSET)
+
+
+def _without_condition(cell: Cell) -> tuple[str, ...]:
+    """Its flags but for perturbations, which were read when the sweep was planned and bind no policy."""
+    return (*cell.policy, *(flag for flag in cell.env if not flag.startswith("--env.perturbations=")))
