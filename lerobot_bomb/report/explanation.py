@@ -29,7 +29,7 @@ FOLLOWING_NOTE = (
 )
 SHOWN_PX = 224  # side of an image on the page
 # told apart by the colour-blind (Okabe and Ito); the first is the episode without a mask
-TRACE_COLORS = ("#000000", "#e69f00", "#56b4e9", "#009e73", "#d55e00", "#0072b2", "#cc79a7", "#999999")
+TRACE_COLORS = ("currentColor", "#e69f00", "#56b4e9", "#009e73", "#d55e00", "#0072b2", "#cc79a7", "#999999")
 TRACE_SIZE = 420  # pixels of the plot's side
 LEGEND_WIDTH = 190  # pixels, beside it
 TRACE_RANGE_M = 0.24  # either way from the board's centre
@@ -259,8 +259,7 @@ def traces_svg(episodes: Mapping[str, MaskedEpisode]) -> str:
             lines.append(f'<polyline points="{ends}" stroke="#8886" fill="none"/>')
     legend = []
     for i, (name, episode) in enumerate(episodes.items()):
-        color = TRACE_COLORS[i % len(TRACE_COLORS)]
-        stroke = "currentColor" if i == 0 else color
+        stroke = TRACE_COLORS[i % len(TRACE_COLORS)]
         dash = ' stroke-dasharray="6 3"' if i >= len(TRACE_COLORS) else ""
         points = " ".join(map(point, episode.gripper_xyz))
         width = 3 if i == 0 else 1.5

@@ -6,6 +6,8 @@ from lerobot_bomb.report.arms import Arm, Report
 from lerobot_bomb.report.cells import rate
 from lerobot_bomb.report.table import Cell, Section, Table
 
+NOTE = "A column for each level of the axis; 0: unperturbed."
+
 
 def section(report: Report) -> Section:
     """A table for each arm in which an axis was on alone."""
@@ -24,4 +26,4 @@ def axes(arm: Arm) -> Table | None:
     levels = [level for level in range(1, MAX_LEVEL + 1) if any(of == level for _, of in cells)]
     zero = [rate(arm.nominal)] if arm.nominal else []
     table = [[Cell(axis), *zero, *(rate(cells.get((axis, level), [])) for level in levels)] for axis in names]
-    return Table(arm.name, ["axis", *(["0"] if zero else []), *map(str, levels)], table)
+    return Table(arm.name, ["axis", *(["0"] if zero else []), *map(str, levels)], table, NOTE)

@@ -9,8 +9,9 @@ from lerobot_bomb.report.cells import points, rate
 from lerobot_bomb.report.table import Cell, Section, Table
 
 NOTE = (
-    "Intervals are Newcombe's, an approximation; p is McNemar's exact test, adjusted for the number of "
-    "conditions. Of few pairs they may disagree: then trust p."
+    "Points: difference in percentage points, with Newcombe's 95 % interval for pairs, an approximation; "
+    "p: exact McNemar test, adjusted for the number of conditions (Holm). With few pairs they may disagree: "
+    "then trust p."
 )
 
 

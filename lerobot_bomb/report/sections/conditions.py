@@ -26,8 +26,8 @@ def conditions(arm: Arm) -> Table:
         for condition, rows in by_condition(arm.rows).items()
     ]
     note = (
-        "Points against the same episodes unperturbed (Newcombe's interval for pairs); p: exact McNemar "
-        "test, adjusted for the number of conditions (Holm)."
+        "Points: difference in percentage points from the same episodes unperturbed, with Newcombe's 95 % "
+        "interval for pairs; p: exact McNemar test, adjusted for the number of conditions (Holm)."
     )
     header = ["condition", "success", "episodes", *(["points", "p"] if counts else [])]
     return Table(arm.name, header, table, note if counts else "")

@@ -1,39 +1,42 @@
 """How fast each policy answers, what that takes, and how smoothly it moves."""
 
 from lerobot_bomb.evaluation.efficiency import Efficiency, efficiencies, smoothness_of
-from lerobot_bomb.report.arms import Arm, Report
+from lerobot_bomb.report.arms import Report
 from lerobot_bomb.report.table import Cell, Section, Table
-from lerobot_bomb.stats import Measure
 
 NONE_CELL = Cell("-")
 PREFIXES = ("", "k", "M", "G")
-NOTE = (
-    "A query is a call of the policy that runs its network, for all episodes of a batch at once; latencies "
-    "are medians over episodes of their p50 and p95. Passes of the network and generated tokens are means "
-    "per query. Hz: actions that an episode executes, by second of its queries. Memory: the peak, on CUDA of "
-    "tensors, on a CPU of the whole process. J2, J3: mean second and third differences of the executed "
-    "actions per step, in their own units, without the gripper, with 95 % intervals over episodes; less is "
-    "smoother."
+QUERIES_NOTE = (
+    "A query is a call of the policy that runs its network, for all episodes of a batch at once; p50 and p95 "
+    "are percentiles of an episode's latencies, and their medians over episodes are shown. Passes of the "
+    "network and generated tokens are means per query. Hz: actions that an episode executes, by second of "
+    "its queries. Memory: the peak, on CUDA of tensors, on a CPU of the whole process."
 )
-HEADER = [
+QUERIES_HEADER = [
     "policy, suite", "device", "batch", "p50, ms", "p95, ms", "queries", "passes", "tokens", "Hz",
-    "parameters", "memory, MiB", "J2", "J3",
+    "parameters", "memory, MiB",
 ]  # fmt: skip
+SMOOTHNESS = ("J2", "J3")
+SMOOTHNESS_NOTE = (
+    "J2, J3: mean second and third differences of the executed actions per step, in their own units, without "
+    "the gripper, with 95 % intervals over episodes; less is smoother."
+)
 
 
 def section(report: Report) -> Section:
-    """A line for each arm, device and size of the batch."""
-    rows = [row for arm in report.arms for row in _rows(arm)]
-    return Section("Efficiency", [Table("", HEADER, rows, NOTE)] if rows else [])
-
-
-def _rows(arm: Arm) -> list[list[Cell]]:
-    smooth = smoothness_of(arm.rows)
-    ends = [_smoothness(smooth.get(name)) for name in ("J2", "J3")]
-    found = [[Cell(arm.name), *_cells(each), *ends] for each in efficiencies(arm.rows)]
-    if found or not smooth:
-        return found
-    return [[Cell(arm.name), *[NONE_CELL] * (len(HEADER) - 1 - len(ends)), *ends]]
+    """Of queries a line for each arm, device and size of the batch; of smoothness one for each arm."""
+    queries = [[Cell(arm.name), *_cells(each)] for arm in report.arms for each in efficiencies(arm.rows)]
+    measures = {arm.name: smoothness_of(arm.rows) for arm in report.arms}
+    smooth = [
+        [Cell(name), *(Cell(str(found[each]), vars(found[each])) for each in SMOOTHNESS)]
+        for name, found in measures.items()
+        if found
+    ]
+    tables = [
+        Table("Queries", QUERIES_HEADER, queries, QUERIES_NOTE),
+        Table("Smoothness", ["policy, suite", *SMOOTHNESS], smooth, SMOOTHNESS_NOTE),
+    ]
+    return Section("Efficiency", [table for table in tables if table.rows])
 
 
 def _cells(of: Efficiency) -> list[Cell]:
@@ -54,10 +57,6 @@ def _cells(of: Efficiency) -> list[Cell]:
 
 def _number(value: float | None, form: str) -> Cell:
     return NONE_CELL if value is None else Cell(f"{value:{form}}", value)
-
-
-def _smoothness(of: Measure | None) -> Cell:
-    return NONE_CELL if of is None else Cell(str(of), vars(of))
 
 
 def _short(number: float) -> str:

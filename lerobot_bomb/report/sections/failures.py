@@ -29,8 +29,9 @@ def failures(arm: Arm) -> Table:
         table.append([Cell(condition), Cell(str(len(rows)), len(rows)), *cells])
     split_names = ["right intersection", "success there"] if is_placed else []
     note = (
-        "Of the stones that were put down on the board: how many nearest to the intersection that was named; "
-        "of those: how many within the tolerance, with no other stone moved."
+        "Right intersection: of the stones that were put down on the board, how many lie nearest to the "
+        "intersection that was named; success there: of those, how many lie within the tolerance, with no "
+        "other stone moved."
     )
     header = ["condition", "episodes", *names, *split_names]
     return Table(arm.name, header, table, note if is_placed else "")

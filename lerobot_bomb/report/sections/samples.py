@@ -6,8 +6,8 @@ from lerobot_bomb.report.table import Cell, Section, Table
 
 TITLE = "Failures to look at"
 NOTE = (
-    "A random sample of each class. The command plays the episode again as a video and a recording for "
-    "Rerun; flags --policy.NAME=VALUE of the evaluation are given again."
+    "A random sample of each class. 'play it again' writes a video and a recording for Rerun; add the flags "
+    "--policy.NAME=VALUE of the evaluation, if it had any. 'ask why' shows what the policy's actions rest on."
 )
 
 
