@@ -33,7 +33,7 @@ def add_replay_arguments(parser: argparse.ArgumentParser) -> None:
         "--set",
         type=_levels,
         metavar="AXIS=LEVEL,...",
-        help="play it a second time, with these axes changed: camera=0,light=3",
+        help="play it a second time, with these axes changed: camera=0,light=3, or camera:0,light:3",
     )
     add_checkpoint_arguments(parser, "the checkpoint's folder, where it lies elsewhere now")
     add("--depth", **switch(), help="the policy was shown depth")
@@ -42,9 +42,11 @@ def add_replay_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def _levels(text: str) -> dict[str, int]:
-    parts = [part.partition("=") for part in text.split(",")]
+    parts = [part.replace(":", "=").partition("=") for part in text.split(",")]
     if not all(name and level.isdigit() for name, _, level in parts):
-        raise argparse.ArgumentTypeError(f"{text!r} must be AXIS=LEVEL, several joined by commas")
+        raise argparse.ArgumentTypeError(
+            f"{text!r} must be AXIS=LEVEL or AXIS:LEVEL, several joined by commas"
+        )
     return {name: int(level) for name, _, level in parts}
 
 
