@@ -16,7 +16,7 @@ from lerobot_bomb.conditions import NONE
 from lerobot_bomb.envs.results import ORIGIN, ResultLine, Row
 from lerobot_bomb.evaluation.result_groups import different_fields, outcome
 from lerobot_bomb.evaluation.result_lines import kind_of
-from lerobot_bomb.viewing.episode import new_paths, write_episodes
+from lerobot_bomb.viewing.episode import check_new, paths_of, write_episodes
 from lerobot_bomb.viewing.replay import Replay, line_of
 
 DEFAULT_FOLDER = Path("outputs/replay")
@@ -63,7 +63,8 @@ def run_replay(args: argparse.Namespace) -> int:
     policy = row["policy"]["type"] if row.get("policy") else "policy"
     name = players[RECORDED].viewed.name(policy)
     name += f"_{players[CHANGED].viewed.group}" if args.set is not None else ""
-    paths = new_paths(args.output, DEFAULT_FOLDER, name)
+    paths = paths_of(args.output, DEFAULT_FOLDER, name)
+    check_new(paths)
     results = write_episodes(players, name, *paths)
     for (label, player), result in zip(players.items(), results, strict=True):
         of, values = player.viewed, cast("Any", result)
