@@ -71,11 +71,12 @@ def test_flags_of_the_evaluation_are_given_again(
     assert main(["replay", str(path), f"--output={tmp_path / 'x'}", flag]) == 0
 
 
+@pytest.mark.parametrize("levels", ["camera=0,table=5", "camera:0,table:5"])
 def test_an_axis_is_changed_side_by_side(
-    results: Callable[..., Path], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+    levels: str, results: Callable[..., Path], tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     path = results("bomb_expert", condition="camera:4+light:2")
-    assert main(["replay", str(path), f"--output={tmp_path / 'x'}", "--set=camera=0,table=5"]) == 0
+    assert main(["replay", str(path), f"--output={tmp_path / 'x'}", f"--set={levels}"]) == 0
     out = capsys.readouterr().out
     assert "recorded (camera:4+light:2): " in out and "changed (table:5+light:2): " in out
     logged = read_rrd(tmp_path / "x.rrd")

@@ -173,7 +173,9 @@ def test_the_command_tells_the_outcome_and_overwrites_nothing(
     lines = capsys.readouterr().out.splitlines()
     assert lines[0] == played.instruction
     assert lines[1].startswith("success after ")
-    assert lines[2:] == [f"{tmp_path}/place.none_expert_seed4{suffix}" for suffix in (".rrd", ".mp4")]
+    assert lines[2:] == [
+        f"{tmp_path}/place.none_row3-column2_white_expert_seed4{suffix}" for suffix in (".rrd", ".mp4")
+    ]
     assert all(Path(line).stat().st_size > 10_000 for line in lines[2:])
     before = {path: path.read_bytes() for path in viewed.parent.iterdir()}
     assert len(before) == 2
@@ -277,6 +279,49 @@ def test_a_bad_flag_is_named_and_nothing_is_written(
     assert error.startswith(f"lerobot-bomb view: {message}")
     assert error.count("\n") == 1
     assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.parametrize(
+    ("flags", "message"),
+    [
+        ("--color=red", "--color='red' is unknown"),
+        ("--target=[0,3] --split=train", "--target=[0, 3] is not in --split=train"),
+        ("--policy.path=nowhere", "--policy.path=nowhere: there is no such folder"),
+        ("", "{path} exists already"),
+    ],
+)
+def test_that_a_file_exists_is_told_last(
+    flags: str, message: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    path = tmp_path / "x.mp4"
+    path.touch()
+    assert cli.main(["view", *flags.split(), f"--output={path}"]) == 1
+    assert capsys.readouterr().err.startswith(f"lerobot-bomb view: {message.format(path=path)}")
+    assert list(tmp_path.iterdir()) == [path]
+
+
+@pytest.mark.parametrize(
+    ("fixed", "name"),
+    [
+        ({}, "place.none_expert_seed4"),
+        ({"target": (3, 2), "color": "white"}, "place.none_row3-column2_white_expert_seed4"),
+        ({"suite": "goal", "task_id": 0}, "goal.none_task0_expert_seed4"),
+    ],
+)
+def test_files_are_named_after_the_task(fixed: dict[str, Any], name: str) -> None:
+    assert bomb_episode(EpisodeSpec(seed=4, **fixed), OPTIONS).name("expert") == name
+
+
+@pytest.mark.parametrize("task_id", [0, 2])  # into the tray; two stones change places
+def test_a_stone_in_the_tray_is_near_no_intersection(
+    task_id: int, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    flags = ["--task=goal", f"--task_ids={task_id}", "--seed=3", "--image_size=32"]
+    assert cli.main(["view", *flags, f"--output={tmp_path / 'x'}"]) == 0
+    outcome = capsys.readouterr().out.splitlines()[1]
+    assert outcome.startswith("success")
+    assert outcome.endswith("from the target, in the tray") == (task_id == 0)
+    assert ("nearest to row" in outcome) == (task_id == 2)
 
 
 @pytest.mark.parametrize(

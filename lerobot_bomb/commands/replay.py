@@ -16,7 +16,7 @@ from lerobot_bomb.conditions import NONE
 from lerobot_bomb.envs.results import ORIGIN, ResultLine, Row
 from lerobot_bomb.evaluation.result_groups import different_fields, outcome
 from lerobot_bomb.evaluation.result_lines import kind_of
-from lerobot_bomb.viewing.episode import new_paths, write_episodes
+from lerobot_bomb.viewing.episode import check_new, paths_of, write_episodes
 from lerobot_bomb.viewing.replay import Replay, line_of
 
 DEFAULT_FOLDER = Path("outputs/replay")
@@ -33,7 +33,7 @@ def add_replay_arguments(parser: argparse.ArgumentParser) -> None:
         "--set",
         type=_levels,
         metavar="AXIS=LEVEL,...",
-        help="play it a second time, with these axes changed: camera=0,light=3",
+        help="play it a second time, with these axes changed: camera=0,light=3, or camera:0,light:3",
     )
     add_checkpoint_arguments(parser, "the checkpoint's folder, where it lies elsewhere now")
     add("--depth", **switch(), help="the policy was shown depth")
@@ -42,9 +42,11 @@ def add_replay_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def _levels(text: str) -> dict[str, int]:
-    parts = [part.partition("=") for part in text.split(",")]
+    parts = [part.replace(":", "=").partition("=") for part in text.split(",")]
     if not all(name and level.isdigit() for name, _, level in parts):
-        raise argparse.ArgumentTypeError(f"{text!r} must be AXIS=LEVEL, several joined by commas")
+        raise argparse.ArgumentTypeError(
+            f"{text!r} must be AXIS=LEVEL or AXIS:LEVEL, several joined by commas"
+        )
     return {name: int(level) for name, _, level in parts}
 
 
@@ -61,7 +63,8 @@ def run_replay(args: argparse.Namespace) -> int:
     policy = row["policy"]["type"] if row.get("policy") else "policy"
     name = players[RECORDED].viewed.name(policy)
     name += f"_{players[CHANGED].viewed.group}" if args.set is not None else ""
-    paths = new_paths(args.output, DEFAULT_FOLDER, name)
+    paths = paths_of(args.output, DEFAULT_FOLDER, name)
+    check_new(paths)
     results = write_episodes(players, name, *paths)
     for (label, player), result in zip(players.items(), results, strict=True):
         of, values = player.viewed, cast("Any", result)

@@ -5,13 +5,11 @@ from pathlib import Path
 
 from lerobot_bomb.commands.arguments import path_flag
 from lerobot_bomb.commands.results_files import read_undamaged
-from lerobot_bomb.evaluation.result_groups import (
-    Group,
-    by_condition,
-    differing,
-    groups_of,
-)
+from lerobot_bomb.evaluation.result_groups import by_condition, differing
 from lerobot_bomb.evaluation.results import pair_lines, summarise
+from lerobot_bomb.report.arms import Arm, arms_of
+from lerobot_bomb.stats import format_rate
+from lerobot_bomb.tables import print_table
 
 
 def add_results_arguments(parser: argparse.ArgumentParser) -> None:
@@ -28,11 +26,12 @@ def run_results(args: argparse.Namespace) -> int:
         rows, num_damaged = read_undamaged(path)
         if args.strict and num_damaged:
             raise ValueError(f"{path}: damaged lines, which --strict refuses: {num_damaged}")
-        _print_file(path, groups_of(rows), num_damaged)
+        _print_file(path, arms_of(rows), num_damaged)
     return 0
 
 
-def _print_file(path: Path, groups: list[Group], num_damaged: int) -> None:
+def _print_file(path: Path, arms: list[Arm], num_damaged: int) -> None:
+    groups = [arm.group for arm in arms]
     if num_damaged:
         print(f"{path}: damaged lines, which are not counted: {num_damaged}")
     if len(groups) > 1:
@@ -40,6 +39,7 @@ def _print_file(path: Path, groups: list[Group], num_damaged: int) -> None:
             f"{path}: {len(groups)} groups of episodes, neither pooled nor paired with each other; they "
             f"differ in {', '.join(differing(groups))}"
         )
+        _print_rates(arms)
     for group in groups:
         print(*(f"{path}: {line}" for line in group.lines()), sep="\n")
         if group.missing_fields:
@@ -56,3 +56,15 @@ def _print_file(path: Path, groups: list[Group], num_damaged: int) -> None:
         against = pair_lines(group, groups)
         if against:
             print(f"{path}: against the same episodes unperturbed", *against, sep="\n")
+
+
+def _print_rates(arms: list[Arm]) -> None:
+    """A line for each group and condition, before what else there is to say of them."""
+    cells = [
+        [arm.name, condition, format_rate(sum(row["is_success"] for row in rows), len(rows))]
+        for arm in arms
+        for condition, rows in by_condition(arm.rows).items()
+    ]
+    print()
+    print_table(["policy, suite", "perturbations", "success, 95 % Wilson interval"], cells)
+    print()

@@ -29,7 +29,8 @@ from lerobot_bomb.viewing.episode import (
     Player,
     Viewed,
     bomb_episode,
-    new_paths,
+    check_new,
+    paths_of,
     pusht_episode,
     write_episodes,
 )
@@ -82,9 +83,9 @@ def run_view(args: argparse.Namespace) -> int:
     viewed = viewed_of(args)
     policy = _policy(args, viewed.policies)
     name = viewed.name(policy)
-    paths = new_paths(args.output, DEFAULT_FOLDER, name)
+    paths = paths_of(args.output, DEFAULT_FOLDER, name)
     with flags_without_group():
-        player = Player(viewed, partial(_agent, args, policy, viewed))
+        player = Player(viewed, partial(_agent, args, policy, viewed, paths))
         (result,) = write_episodes({policy: player}, name, *paths)
     values: Any = result
     print(values.instruction, viewed.log().describe(result), *paths, sep="\n")
@@ -168,7 +169,19 @@ def _condition(args: argparse.Namespace) -> str:
 
 
 @contextmanager
-def _agent(args: argparse.Namespace, policy: str, viewed: Viewed, env: gymnasium.Env) -> Iterator[Agent]:
+def _agent(
+    args: argparse.Namespace, policy: str, viewed: Viewed, paths: list[Path], env: gymnasium.Env
+) -> Iterator[Agent]:
+    """Who acts; whatever else is wrong is told before that the files exist."""
+    with _accepted_agent(args, policy, viewed, env) as agent:
+        check_new(paths)
+        yield agent
+
+
+@contextmanager
+def _accepted_agent(
+    args: argparse.Namespace, policy: str, viewed: Viewed, env: gymnasium.Env
+) -> Iterator[Agent]:
     if policy in (EXPERT, RANDOM):
         yield expert_agent() if policy == EXPERT else random_agent(env, viewed.spec.seed)
         return

@@ -1,6 +1,6 @@
 """Episodes played into a recording for Rerun and a video: one, or several side by side."""
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import AbstractContextManager, closing
 from dataclasses import dataclass
 from functools import partial
@@ -41,10 +41,11 @@ class Viewed:
     env_flags: dict[str, Any]  # of LeRobot's config, for a checkpoint
     make_env: Callable[[], gymnasium.Env]
     log: "Callable[[], type[EpisodeLog]]"  # rerun takes a second to import
+    task: str = ""  # what is fixed of the task: "_task3", "_row3-column2_white"
 
     def name(self, policy: str) -> str:
         """Of an episode and of its files: "place.camera-3_expert_seed0"."""
-        return f"{self.group}_{policy}_seed{self.spec.seed}"
+        return f"{self.group}{self.task}_{policy}_seed{self.spec.seed}"
 
 
 def bomb_episode(spec: EpisodeSpec, options: RenderOptions) -> Viewed:
@@ -66,7 +67,17 @@ def bomb_episode(spec: EpisodeSpec, options: RenderOptions) -> Viewed:
         env_flags=env_flags,
         make_env=partial(make_env, spec, options),
         log=_bomb_log,
+        task="".join(f"_{word}" for word in _fixed_words(spec)),
     )
+
+
+def _fixed_words(spec: EpisodeSpec) -> Iterator[str]:
+    if spec.task_id is not None:
+        yield f"task{spec.task_id}"
+    if spec.target is not None:
+        yield "row{}-column{}".format(*spec.target)
+    if spec.color is not None:
+        yield spec.color
 
 
 def pusht_episode(spec: PushTSpec, image_size: int) -> Viewed:
@@ -130,22 +141,21 @@ def write_episodes(players: Mapping[str, Player], name: str, rrd: Path, mp4: Pat
     return results
 
 
-def new_paths(output: Path | None, folder: Path, name: str) -> list[Path]:
-    """The two files of a user's `output`: their path without .rrd and .mp4, or a folder; None: in `folder`.
-
-    Raises:
-        ValueError: one of them exists.
-    """
+def paths_of(output: Path | None, folder: Path, name: str) -> list[Path]:
+    """Both files of a user's `output`: their path without .rrd and .mp4, or a folder; None: in `folder`."""
     stem = output or folder / name
     if stem.is_dir():
         stem = stem / name
     if stem.suffix in SUFFIXES:
         stem = stem.with_suffix("")
-    paths = [Path(f"{stem}{suffix}") for suffix in SUFFIXES]
+    return [Path(f"{stem}{suffix}") for suffix in SUFFIXES]
+
+
+def check_new(paths: Iterable[Path]) -> None:
+    """Raise a ValueError if one of an episode's files exists."""
     for path in paths:
         if path.exists():
             raise ValueError(f"{path} exists already; name other files with --output=PATH")
-    return paths
 
 
 def _layout(players: Mapping[str, Player], prefixes: Mapping[str, str]) -> "rrb.ContainerLike":

@@ -35,8 +35,13 @@ class BombLog(EpisodeLog[EpisodeSpec, EpisodeResult]):
     def describe(result: EpisodeResult) -> str:
         outcome = describe_outcome(result.is_success, result.failure, result.steps)
         row, column = result.nearest_intersection
-        is_carried = Stage(result.stage) in (Stage.LIFTED, Stage.PLACED)
-        place = f"nearest to row {row}, column {column}" if is_carried else "never lifted"
+        place = f"nearest to row {row}, column {column}"
+        if Stage(result.stage) not in (Stage.LIFTED, Stage.PLACED):
+            place = "never lifted"
+        elif (
+            result.placement_error_mm == 0
+        ):  # only the tray is an area: no stone is exactly on an intersection
+            place = "in the tray"
         moves = "" if result.target else f"{result.progress:.0%} of the moves made; "
         return f"{outcome}; {moves}the stone is {result.placement_error_mm:.1f} mm from the target, {place}"
 

@@ -1,0 +1,26 @@
+"""Commands that a command runs."""
+
+import os
+import signal
+import subprocess
+import sys
+
+CODE = """
+import sys
+from lerobot_bomb.commands.run import run_command
+try:
+    run_command("python", "-c", "import time; print('begun', flush=True); time.sleep(60)")
+except KeyboardInterrupt:
+    sys.exit("interrupted")
+"""
+
+
+def test_ctrl_c_ends_the_command_without_its_traceback() -> None:
+    command = [sys.executable, "-c", CODE]
+    pipes = {"stdout": subprocess.PIPE, "stderr": subprocess.PIPE, "text": True}
+    process = subprocess.Popen(command, start_new_session=True, **pipes)
+    assert process.stdout is not None
+    while process.stdout.readline() != "begun\n":
+        assert process.poll() is None
+    os.killpg(process.pid, signal.SIGINT)  # as a terminal does it
+    assert process.communicate(timeout=30) == ("", "interrupted\n")  # both have closed their ends
