@@ -145,7 +145,7 @@ def test_other_weights_are_refused(
         (["--line=0"], "--line=0 must be in 1..3"),
         (["--set=fog=3"], "--set: 'fog' is not an axis"),
         (["--set=camera=9"], "--set: the levels of camera must lie in 0..5"),
-        (["--frames=3"], "--frames=3 is unknown"),
+        (["--env.image_size=32"], "--env.image_size=32 is unknown"),
     ],
 )
 def test_wrong_flags_are_told(

@@ -219,6 +219,18 @@ def test_a_cell_that_takes_too_long_is_given_up(
     assert any("not finished after 1 s (--timeout); 3 attempts" in line for line in store.lines())
 
 
+def test_what_is_made_of_an_error_after_the_time_limit_is_one_of_time() -> None:
+    from lerobot_bomb.sweep.worker import time_limit
+
+    with pytest.raises(TimeoutError), time_limit(1):
+        try:
+            time.sleep(60)
+        except TimeoutError:
+            raise ValueError("the flags are wrong") from None
+    with pytest.raises(ValueError, match="are wrong"), time_limit(60):
+        raise ValueError("the flags are wrong")
+
+
 @pytest.mark.parametrize(
     ("flags", "message"),
     [
@@ -287,6 +299,25 @@ def test_a_checkpoint_of_another_environment_is_told_before_anything_is_played(
     assert message in error and "(--env.ignore_checkpoint=true insists for every policy of a sweep)" in error
     assert list(tmp_path.iterdir()) == []
     assert sweep(tmp_path, policies, *flags, "--env.ignore_checkpoint=true", "--dry_run") == 0
+
+
+def test_files_that_vanish_while_they_are_counted_do_not_matter(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    manifest = small()
+    (cell,) = manifest.cells
+    store = Store(tmp_path, manifest)
+    store.finish(cell, ["{}"], [])
+    store.file(cell, "part").write_text("{}\n")
+    is_file = Path.is_file
+
+    def then_removed(path: Path) -> bool:
+        found = is_file(path)
+        store.file(cell, "part").unlink(missing_ok=True)
+        return found
+
+    monkeypatch.setattr(Path, "is_file", then_removed)
+    assert store.num_played([cell]) in (1, 2)
 
 
 def test_sigterm_ends_a_sweep_as_ctrl_c_does(

@@ -101,8 +101,7 @@ class Store:
 
     def _num_attempts(self, cell: Cell) -> int:
         """Of this run."""
-        path = self.file(cell, "attempts")
-        return path.read_text().split().count(self.run) if path.is_file() else 0
+        return _read(self.file(cell, "attempts")).split().count(self.run.encode())
 
     def give_up(self, cell: Cell, reason: str) -> None:
         """No worker plays it any more."""
@@ -147,7 +146,7 @@ class Store:
         """Episodes that have a line or an error, those of cells that are being played too."""
         endings = ("jsonl", "part", "errors")
         paths = [self.file(cell, ending) for cell in cells for ending in endings]
-        return sum(path.read_bytes().count(b"\n") for path in paths if path.is_file())
+        return sum(_read(path).count(b"\n") for path in paths)
 
     def merge(self) -> None:
         """Write all finished cells' lines in the order of the manifest, and all errors."""
@@ -156,7 +155,7 @@ class Store:
             for name, ending in ((RESULTS, "jsonl"), (ERRORS, "errors")):
                 paths = [self.file(cell, ending) for cell in self.manifest.cells]
                 with written_whole(self.folder / name) as (path,):
-                    path.write_bytes(b"".join(each.read_bytes() for each in paths if each.is_file()))
+                    path.write_bytes(b"".join(map(_read, paths)))
 
     def lines(self) -> list[str]:
         """What is finished, and what is missing and why, as text."""
@@ -188,10 +187,16 @@ class Store:
 
     def errors(self, cell: Cell) -> list[EpisodeError]:
         """Of a finished cell."""
-        path = self.file(cell, "errors")
-        lines = path.read_text().splitlines() if path.is_file() else []
-        return [EpisodeError(**json.loads(line)) for line in lines]
+        return [EpisodeError(**json.loads(line)) for line in _read(self.file(cell, "errors")).splitlines()]
 
     def _of_other_manifests(self) -> list[Path]:
         known = {cell.key for cell in self.manifest.cells}
         return [path for path in sorted((self.folder / CELLS).glob("*.jsonl")) if path.stem not in known]
+
+
+def _read(path: Path) -> bytes:
+    """Nothing where there is no file: another process may remove it at any moment."""
+    try:
+        return path.read_bytes()
+    except FileNotFoundError:
+        return b""

@@ -177,9 +177,15 @@ def describe(error: BaseException) -> str:
 
 @contextmanager
 def time_limit(seconds: int | None) -> Iterator[None]:
-    """Raise a TimeoutError in the main thread every so many seconds: one can be lost in a callback."""
+    """Raise a TimeoutError in the main thread every so many seconds: one can be lost in a callback.
+
+    Whatever LeRobot's parser made of it on its way is one again.
+    """
+    is_over = False
 
     def stop(*_: object) -> None:
+        nonlocal is_over
+        is_over = True
         raise TimeoutError
 
     if seconds is None:
@@ -189,6 +195,10 @@ def time_limit(seconds: int | None) -> Iterator[None]:
     signal.setitimer(signal.ITIMER_REAL, seconds, seconds)
     try:
         yield
+    except Exception as error:
+        if is_over and not isinstance(error, TimeoutError):
+            raise TimeoutError from error
+        raise
     finally:
         signal.setitimer(signal.ITIMER_REAL, 0)
         signal.signal(signal.SIGALRM, usual)

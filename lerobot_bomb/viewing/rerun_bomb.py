@@ -38,9 +38,7 @@ class BombLog(EpisodeLog[EpisodeSpec, EpisodeResult]):
         place = f"nearest to row {row}, column {column}"
         if Stage(result.stage) not in (Stage.LIFTED, Stage.PLACED):
             place = "never lifted"
-        elif (
-            result.placement_error_mm == 0
-        ):  # only the tray is an area: no stone is exactly on an intersection
+        elif result.placement_error_mm == 0:  # of an area: no stone lies exactly on an intersection
             place = "in the tray"
         moves = "" if result.target else f"{result.progress:.0%} of the moves made; "
         return f"{outcome}; {moves}the stone is {result.placement_error_mm:.1f} mm from the target, {place}"
