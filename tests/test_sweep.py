@@ -269,11 +269,9 @@ def test_wrong_flags_are_told(
         (["--polices=bomb_expert"], "--polices=bomb_expert; nearest: --policies"),
         (["--policies=bomb_expert", "--epsiodes=3"], "--epsiodes=3; nearest: --episodes"),
         (["--policies=bomb_expert", "--task=place"], "--task=place; nearest: --tasks"),
-        (["--policies=bomb_expert", "--env.imgae_size=64"], "nearest: --env.image_size"),
-        (["--policies=bomb_expert,no_such"], "--policy.type: invalid choice: 'no_such'"),
     ],
 )
-def test_misspelt_flags_are_told_before_anything_is_played(
+def test_misspelt_flags_of_its_own_are_told(
     flags: list[str], message: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     with pytest.raises(SystemExit):
@@ -283,22 +281,31 @@ def test_misspelt_flags_are_told_before_anything_is_played(
 
 
 @pytest.mark.parametrize(
-    ("flags", "message"),
+    ("policies", "tasks", "flags", "message"),
     [
-        (["--env.type=bomb", "--env.image_size=48"], "evaluate with --env.image_size=64"),
-        (["--env.type=bomb", "--env.image_size=64", "--tasks=place,object"], "this one has task=object"),
-        (["--env.type=bomb_pusht"], "this is --env.type=bomb_pusht"),
+        (("bomb_expert", NANO), (), ("--env.type=bomb", "--env.image_size=48"), "--env.image_size=64"),
+        ((NANO,), ("place", "object"), ("--env.type=bomb", "--env.image_size=64"), "has task=object"),
+        ((NANO,), (), ("--env.type=bomb_pusht",), "this is --env.type=bomb_pusht"),
     ],
 )
 def test_a_checkpoint_of_another_environment_is_told_before_anything_is_played(
-    flags: list[str], message: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+    policies: tuple[str, ...], tasks: tuple[str, ...], flags: tuple[str, ...], message: str
 ) -> None:
-    policies = f"--policies={'' if 'pusht' in flags[0] else 'bomb_expert,'}{NANO}"
-    assert sweep(tmp_path, policies, *flags, "--policy.device=cpu", "--dry_run") == 1
-    error = capsys.readouterr().err
-    assert message in error and "(--env.ignore_checkpoint=true insists for every policy of a sweep)" in error
-    assert list(tmp_path.iterdir()) == []
-    assert sweep(tmp_path, policies, *flags, "--env.ignore_checkpoint=true", "--dry_run") == 0
+    from lerobot_bomb.sweep.check import INSIST, check
+
+    with pytest.raises(ValueError, match=message) as error:
+        check(plan(policies, tasks, ("none", "all:3"), 7, 1, 1, flags))
+    assert str(error.value).endswith(f"({INSIST})")
+    check(plan(policies, tasks, ("none",), 7, 1, 1, (*flags, "--env.ignore_checkpoint=true")))
+
+
+def test_a_sweep_that_is_refused_says_why_and_leaves_its_folder_free(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    flags = ["--policies=bomb_expert", "--env.type=bomb", "--episodes=1"]
+    assert sweep(tmp_path, *flags, "--env.imgae_size=64", "--workers=2") == 1
+    assert "unrecognized arguments: --env.imgae_size=64; nearest: --env.image_size" in capsys.readouterr().err
+    assert sweep(tmp_path, *flags, "--env.image_size=64") == 0
 
 
 def test_files_that_vanish_while_they_are_counted_do_not_matter(

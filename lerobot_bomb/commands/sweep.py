@@ -17,7 +17,7 @@ from lerobot_bomb.flags import one_of
 from lerobot_bomb.sweep.cluster import sbatch_script, submit
 from lerobot_bomb.sweep.local import PYTHON, play, progress
 from lerobot_bomb.sweep.manifest import NAME, Cell, Manifest, flag_value, parse_part, plan
-from lerobot_bomb.sweep.store import Store, claim, is_of
+from lerobot_bomb.sweep.store import Store, claim
 
 MAX_BATCH = 10
 SCRIPT, SUBMITIT = "sweep.sbatch", "submitit"
@@ -142,10 +142,6 @@ def _manifest(args: argparse.Namespace) -> Manifest:
     conditions = _expanded(args.perturbations, kind)
     batch_size = 1 if kind.starts_by_number else args.batch_size
     manifest = plan(args.policies, args.tasks, conditions, args.seed, args.episodes, batch_size, args.rest)
-    if not is_of(args.folder, manifest):
-        from lerobot_bomb.sweep.check import check  # LeRobot and torch: seconds
-
-        check(manifest)
     if not claim(args.folder, manifest):
         raise ValueError(
             f"{args.folder / NAME} is of another sweep; name another folder, or go on with that one by "

@@ -12,7 +12,7 @@ from tqdm import tqdm
 
 from lerobot_bomb.sweep.manifest import Cell
 from lerobot_bomb.sweep.processes import num_cores, visible_gpus, worker_environments
-from lerobot_bomb.sweep.store import POLL_S, Store
+from lerobot_bomb.sweep.store import POLL_S, REFUSED, Store
 
 # -P: nothing in the folder that the user is in stands for a module of the same name
 PYTHON = (sys.executable, "-P", "-m")
@@ -57,7 +57,7 @@ def play(store: Store, part: str, num_workers: int, timeout_s: int | None = None
     """Play a part of the cells: start workers, and start those anew that were killed.
 
     Raises:
-        RuntimeError: they end before they play.
+        RuntimeError: they end before they play, or refuse to; the message says why.
     """
     environments = worker_environments(num_workers, os.environ, num_cores(), visible_gpus(os.environ))
     command = [*PYTHON, "lerobot_bomb.sweep.worker", str(store.folder), part, store.run]
@@ -75,6 +75,8 @@ def play(store: Store, part: str, num_workers: int, timeout_s: int | None = None
         try:
             for has_played in progress(store, store.manifest.part(part)):
                 ended = [number for number, worker in enumerate(workers) if worker.poll() is not None]
+                if any(workers[number].returncode == REFUSED for number in ended):
+                    raise RuntimeError(_last_line(log))
                 num_ended = len(ended) + (0 if has_played else num_ended)
                 if num_ended > MAX_ENDED * num_workers:
                     raise RuntimeError(f"workers end before they play: {_last_line(log)}; see {log}")

@@ -18,6 +18,7 @@ from lerobot_bomb.files import append_line, written_whole
 from lerobot_bomb.sweep.manifest import NAME, Cell, Manifest
 
 MAX_ATTEMPTS = 3
+REFUSED = 3  # exit code of a worker that plays nothing; the last line of its log says why
 POLL_S = 0.5  # between two looks at what other processes have done
 CELLS, RESULTS, ERRORS = "cells", "results.jsonl", "errors.jsonl"
 
@@ -38,21 +39,12 @@ def claim(folder: Path, manifest: Manifest) -> bool:
     Raises:
         ValueError: a manifest that is there is damaged, or of another version of this package.
     """
-    if is_of(folder, manifest):
-        return True
-    if (folder / NAME).is_file() and not Store(folder, Manifest.read(folder)).is_untouched():
-        return False
+    if (folder / NAME).is_file():
+        there = Manifest.read(folder)
+        if there == manifest or not Store(folder, there).is_untouched():
+            return there == manifest
     manifest.write(folder)
     return True
-
-
-def is_of(folder: Path, manifest: Manifest) -> bool:
-    """Whether this manifest is the folder's.
-
-    Raises:
-        ValueError: a manifest that is there is damaged, or of another version of this package.
-    """
-    return (folder / NAME).is_file() and Manifest.read(folder) == manifest
 
 
 class Store:

@@ -26,8 +26,9 @@ from lerobot_bomb.evaluation.eval_info import EVAL_INFO, results_of
 from lerobot_bomb.evaluation.result_lines import KIND_OF_ENV
 from lerobot_bomb.files import read_json
 from lerobot_bomb.libero.assets import prepare_libero
+from lerobot_bomb.sweep.check import check
 from lerobot_bomb.sweep.manifest import Cell, Manifest, flag_value
-from lerobot_bomb.sweep.store import POLL_S, EpisodeError, Store
+from lerobot_bomb.sweep.store import POLL_S, REFUSED, EpisodeError, Store
 
 
 class RefusedError(Exception):
@@ -206,7 +207,8 @@ def time_limit(seconds: int | None) -> Iterator[None]:
 
 def _end_with_parent() -> None:
     """The parent holds this process' standard input; when it is gone, however it ended, so is this one."""
-    sys.stdin.buffer.read()
+    while os.read(sys.stdin.fileno(), 1):  # sys.stdin.read() would hold a lock that Python's end needs
+        pass
     os._exit(1)
 
 
@@ -216,6 +218,13 @@ def main(folder: str, part: str, run: str, timeout_s: str | None = None) -> None
     threading.Thread(target=_end_with_parent, daemon=True).start()
     manifest = Manifest.read(Path(folder))
     store = Store(Path(folder), manifest, run)
+    if store.is_untouched():
+        try:
+            check(manifest)
+        except (ValueError, SystemExit) as error:
+            if isinstance(error, ValueError):
+                print(error, file=sys.stderr)
+            sys.exit(REFUSED)
     Worker(store, None if timeout_s is None else int(timeout_s)).run(manifest.part(part))
 
 
