@@ -56,7 +56,7 @@ def test_the_hub_s_own_readers_find_the_rates_of_the_lines(exported: Path, polic
     )
     by_task = {each.task_id: each.value for each in entries}
     for condition, task in (("none", "place.none"), ("all:1-5", "place.all-1to5")):
-        assert rates[condition] == by_task[task] == SUCCESSES[policy, condition] / N
+        assert rates[task] == by_task[task] == SUCCESSES[policy, condition] / N
     assert {each.dataset_id for each in entries} == {"me/bomb"}
     assert all("95" not in str(each.value) and f"/{N} = " in str(each.notes) for each in entries)
 

@@ -81,7 +81,8 @@ def run_sweep(args: argparse.Namespace) -> int:
                 _play_by_jobs(args, store)
     except KeyboardInterrupt:
         store.merge()
-        print(*store.lines(), f"to go on: lerobot-bomb sweep {args.folder}", sep="\n")
+        to_go_on = f"to go on: lerobot-bomb sweep {args.folder} (a cell that is not finished: from its start)"
+        print(*store.lines(), to_go_on, sep="\n")
         raise
     store.merge()
     print(*store.lines(), sep="\n")

@@ -83,7 +83,10 @@ class Comparisons:
         if any(self.num_unpaired):
             a, b = self.num_unpaired
             lines.append(f"not compared, for the other did not play them: {a} episodes of A, {b} of B")
-        notes = "rates: 95 % Wilson intervals; B - A: Newcombe's for pairs; p: exact McNemar test"
+        notes = (
+            "rates: 95 % Wilson intervals; B - A: Newcombe's for pairs; p: exact McNemar test, to be trusted "
+            "where the two disagree, as with few pairs"
+        )
         adjusted = f", adjusted for {len(self.conditions)} conditions (Holm)"
         return [*lines, notes + adjusted * (len(self.conditions) > 1)]
 

@@ -22,7 +22,7 @@ def model_index(groups: list[Group]) -> list[EvalResult]:
             task_name=_task(rows[0]),
             dataset_type=group.kind.env_type,
             dataset_name=group.kind.benchmark,
-            dataset_config=condition,
+            dataset_config=_config(group, condition, rows),  # tells results apart, which their task does not
             metric_type=METRIC,
             metric_name=f"success rate, {_counted(rows)}",
             metric_value=_share(rows),
@@ -42,7 +42,7 @@ def eval_results_yaml(benchmark_id: str, groups: list[Group]) -> str:
     entries = [
         EvalResultEntry(
             dataset_id=benchmark_id,
-            task_id=f"{_task(rows[0])}.{group.kind.condition.parse(condition).key}",
+            task_id=_config(group, condition, rows),
             value=_share(rows),
             notes=f"{_counted(rows)}; {group.lines()[1]}",
         )
@@ -67,6 +67,11 @@ def _conditions(groups: list[Group]) -> Iterator[tuple[Group, str, list[Row]]]:
     for group in groups:
         for condition, rows in by_condition(group.rows).items():
             yield group, condition, rows
+
+
+def _config(group: Group, condition: str, rows: list[Row]) -> str:
+    """As `place.camera-3`."""
+    return f"{_task(rows[0])}.{group.kind.condition.parse(condition).key}"
 
 
 def _task(row: Row) -> str:

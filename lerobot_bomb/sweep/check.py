@@ -6,7 +6,8 @@ from lerobot_bomb._compat import eval_config
 from lerobot_bomb.checkpoints.environment import as_if_built
 from lerobot_bomb.sweep.manifest import Cell, Manifest
 
-INSIST = "--env.ignore_checkpoint=true insists for every policy of a sweep"
+# in a sweep the flags that a refusal names are these
+RENAMED = {"--env.task=": "--tasks=", "--policy.ignore_environment=": "--env.ignore_checkpoint="}
 
 
 def check(manifest: Manifest) -> None:
@@ -24,9 +25,16 @@ def check(manifest: Manifest) -> None:
                 try:
                     config.env.get_env_processors()
                 except ValueError as error:
-                    raise ValueError(f"{error} ({INSIST})") from None
+                    raise ValueError(renamed(str(error))) from None
     finally:
         logging.disable(logging.NOTSET)
+
+
+def renamed(message: str) -> str:
+    """With the flags of a sweep, for all of its policies."""
+    for usual, name in RENAMED.items():
+        message = message.replace(usual, name)
+    return message
 
 
 def _without_condition(cell: Cell) -> tuple[str, ...]:

@@ -25,4 +25,4 @@ def section(report: Report) -> Section:
         VIDEOS: bool(report.samples) and not any(each.video or each.note for each in report.samples),
     }
     lines = [line for line, missing in is_missing.items() if missing]
-    return Section("Not in these files", [], [*report.missing, *lines])
+    return Section("Not in these files", [], lines)

@@ -16,7 +16,7 @@ NOTE = "Success in per cent, with 95 % Wilson intervals. Measures: of the unpert
 
 def section(report: Report) -> Section:
     """Of all arms."""
-    return Section("Summary", [summary(report.arms)])
+    return Section("Summary", [summary(report.arms)], report.missing)
 
 
 def summary(arms: list[Arm]) -> Table:
