@@ -13,7 +13,7 @@ from test_results import FDVLA, values
 
 from lerobot_bomb.commands.main import main
 from lerobot_bomb.evaluation.result_groups import groups_of
-from lerobot_bomb.hub.evaluations import model_index
+from lerobot_bomb.hub.evaluations import model_index, model_index_yaml
 from lerobot_bomb.report.latex import SPECIAL
 
 SUCCESSES = {("act", "none"): 8, ("act", "all:1-5"): 3, ("fdvla", "none"): 9, ("fdvla", "all:1-5"): 0}
@@ -107,3 +107,13 @@ def test_a_benchmark_that_is_no_repository_is_refused(
     with pytest.raises(SystemExit):
         main(["export", str(tmp_path / "r.jsonl"), "--benchmark_id=bomb"])
     assert "'bomb' must be USER/NAME" in capsys.readouterr().err
+
+
+def test_rates_of_several_suites_stay_apart() -> None:
+    rows = [
+        values(0, failure, spec={"suite": suite})
+        for suite, failure in (("place", None), ("object", "dropped"))
+    ]
+    index = yaml.safe_load(model_index_yaml("x", groups_of(rows)))["model-index"]
+    _, results = model_index_to_eval_results(index)
+    assert {each.dataset_config: each.metric_value for each in results} == {"place.none": 1, "object.none": 0}
