@@ -63,7 +63,7 @@ def test_a_base_is_what_training_from_scratch_starts_from(
     ("own", "message"),
     [
         ("", "--policy.type is missing; choose one of: "),
-        ("--policy.type=fdvla --steps=3", "unrecognized arguments: --steps=3"),
+        ("--policy.type=fdvla --env.type=bomb", "unrecognized arguments: --env.type=bomb"),
         ("--policy.type=fdvla --policy.head_dim=0", "--policy.head_dim=0 must be at least 1"),
         ("--policy.type=fdvla --policy.head_dims=8", "unrecognized arguments: --policy.head_dims=8"),
         ("--policy.type=bomb_expert", "--policy.type=bomb_expert has nothing to train"),

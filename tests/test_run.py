@@ -4,6 +4,7 @@ import os
 import signal
 import subprocess
 import sys
+from functools import partial
 
 CODE = """
 import sys
@@ -18,7 +19,9 @@ except KeyboardInterrupt:
 def test_ctrl_c_ends_the_command_without_its_traceback() -> None:
     command = [sys.executable, "-c", CODE]
     pipes = {"stdout": subprocess.PIPE, "stderr": subprocess.PIPE, "text": True}
-    process = subprocess.Popen(command, start_new_session=True, **pipes)
+    # a shell starts jobs in the background with SIGINT ignored, which a process passes on
+    heard = partial(signal.signal, signal.SIGINT, signal.SIG_DFL)
+    process = subprocess.Popen(command, start_new_session=True, preexec_fn=heard, **pipes)
     assert process.stdout is not None
     while process.stdout.readline() != "begun\n":
         assert process.poll() is None
