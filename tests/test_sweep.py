@@ -8,12 +8,13 @@ import subprocess
 import sys
 import time
 from collections.abc import Callable
+from dataclasses import fields
 from pathlib import Path
 from typing import Any
 
 import pytest
 
-from lerobot_bomb.commands.main import main
+from lerobot_bomb.commands.main import EVAL_FLAGS, main
 from lerobot_bomb.commands.results_files import missing_of_sweep
 from lerobot_bomb.envs.results import Row, without_measured
 from lerobot_bomb.evaluation.results import read_results
@@ -278,6 +279,13 @@ def test_misspelt_flags_of_its_own_are_told(
         sweep(tmp_path, *flags, "--env.type=bomb")
     assert message in capsys.readouterr().err
     assert list(tmp_path.iterdir()) == []
+
+
+def test_the_flags_that_may_be_lerobots_without_a_group_are_those_that_it_has() -> None:
+    from lerobot.configs.eval import EvalPipelineConfig
+
+    names = {each.name for each in fields(EvalPipelineConfig)} - {"env", "eval", "policy"}
+    assert set(EVAL_FLAGS) == {f"--{name}" for name in names | {"config_path"}}
 
 
 @pytest.mark.parametrize(

@@ -72,8 +72,8 @@ def as_if_built(config: PreTrainedConfig) -> Iterator[None]:
 
 def asked_config() -> tuple[PreTrainedConfig, str, str] | None:
     """Of the policy that this process built last, its name and how to insist on it; None: nothing to ask."""
-    configs = [policy.config for policy in built_policies()]
-    config = _to_be_built.get() or next(reversed(configs), None)
+    policies = built_policies()
+    config = _to_be_built.get() or (policies[-1].config if policies else None)
     if config is None or getattr(config, "ignore_environment", False):
         return None
     flag = (

@@ -69,10 +69,12 @@ class Store:
 
     def is_untouched(self) -> bool:
         """Whether no episode has been played, with a line or with an error, and none is being played."""
-        played = ("jsonl", "part", "errors")
-        return not any(
-            self.file(cell, ending).is_file() for cell in self.manifest.cells for ending in played
-        ) and all(self._is_free(cell) for cell in self.manifest.cells)
+        return not self.has_begun() and all(self._is_free(cell) for cell in self.manifest.cells)
+
+    def has_begun(self) -> bool:
+        """Whether an episode has been played, with a line or with an error, or is being played."""
+        endings = ("jsonl", "part", "errors")
+        return any(self.file(cell, ending).is_file() for cell in self.manifest.cells for ending in endings)
 
     def _is_free(self, cell: Cell) -> bool:
         with self.claimed(cell) as is_mine:
