@@ -12,6 +12,7 @@ from typing import Any
 
 from lerobot_bomb.flags import check_link
 
+MAX_DEPTH = 100  # of lists and objects in one another; what goes deeper ends in a RecursionError somewhere
 FULL = (errno.ENOSPC, errno.EDQUOT)  # the disk, or this user's share of it
 
 
@@ -20,17 +21,30 @@ def read_json(path: Path) -> dict[str, Any]:
 
     Raises:
         FileNotFoundError: there is none.
-        ValueError: it is something else, or truncated.
+        ValueError: it is something else, truncated, or nested too deep.
     """
     if not path.is_file():
         raise FileNotFoundError(f"{path.parent} has no {path.name}")
     try:
         values = json.loads(path.read_bytes())
+        _check_depth(values, MAX_DEPTH)
+    except RecursionError:
+        raise ValueError(f"{path} is nested more than {MAX_DEPTH} levels deep") from None
     except ValueError as error:
         raise ValueError(f"{path} is not JSON, or truncated: {error}") from None
     if not isinstance(values, dict):
         raise ValueError(f"{path} is not a JSON object")
     return values
+
+
+def _check_depth(values: Any, levels: int) -> None:
+    """Raise a RecursionError if lists and objects go deeper."""
+    if not isinstance(values, dict | list):
+        return
+    if levels == 0:
+        raise RecursionError
+    for value in values.values() if isinstance(values, dict) else values:
+        _check_depth(value, levels - 1)
 
 
 def check_writable(flag: str, path: Path) -> None:

@@ -16,7 +16,7 @@ from torch import Tensor
 
 from lerobot_bomb.checkpoints.environment import ConfigWithEnvironment
 from lerobot_bomb.checkpoints.names import CONFIG, WEIGHTS
-from lerobot_bomb.checkpoints.processor_files import saved_type, state_files
+from lerobot_bomb.checkpoints.processor_files import refuse_link_out, saved_type, state_files
 from lerobot_bomb.files import read_json
 from lerobot_bomb.finite import is_finite, require_finite
 
@@ -62,6 +62,7 @@ def processor_files(folder: Path, processor: str) -> list[str]:
     for name in states:
         if not (folder / name).is_file():
             raise ValueError(f"{folder} holds no {name}, which its {processor} needs")
+        refuse_link_out(folder / name)
         check_finite(folder / name)
     return [processor, *states]
 
@@ -112,7 +113,8 @@ def policy_class(folder: Path) -> type[PreTrainedPolicy]:
         ValueError: the type is not one of ours.
     """
     name = read_json(folder / CONFIG).get("type")
-    found = get_policy_class(name) if name in PreTrainedConfig.get_known_choices() else None
+    is_known = isinstance(name, str) and name in PreTrainedConfig.get_known_choices()
+    found = get_policy_class(name) if is_known else None
     if found is None or not hasattr(found, "method"):
         raise ValueError(
             f"{folder / CONFIG}: the type {name!r} is not one that lerobot-bomb pushes; "

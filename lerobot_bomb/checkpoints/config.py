@@ -14,7 +14,10 @@ from lerobot.configs import PreTrainedConfig
 from packaging.version import Version
 
 from lerobot_bomb import __version__
-from lerobot_bomb.checkpoints.names import is_hub_id
+from lerobot_bomb.checkpoints.names import CONFIG, is_hub_id, local_file
+from lerobot_bomb.files import read_json
+
+MAX_SHOWN = 60  # characters
 
 
 class PackageVersion(str):
@@ -46,6 +49,17 @@ def _decode(written_by: str, path: Sequence[str]) -> PackageVersion:
 draccus.encode.register(PackageVersion, str)
 
 
+def _damage(file: Path | None) -> str | None:
+    """Say what keeps a config.json from being any policy's; None: nothing, or there is none."""
+    try:
+        policy_type = None if file is None else read_json(file).get("type")
+    except ValueError as error:
+        return str(error)
+    if policy_type is None or isinstance(policy_type, str):
+        return None
+    return f"its type is {str(policy_type)[:MAX_SHOWN]}, not the name of a policy type"
+
+
 def tell_config_errors() -> None:
     """Let LeRobot's commands say in one line why they cannot read a config.
 
@@ -65,9 +79,12 @@ def tell_config_errors() -> None:
             return usual.__func__(cls, pretrained_name_or_path, **options)
         except LocalEntryNotFoundError as error:
             raise DecodingError((), f"there is no folder {pretrained_name_or_path} here. {error}") from error
-        except (ValueError, TypeError) as error:
+        except (ValueError, TypeError, AttributeError, RecursionError) as error:
+            damage = _damage(local_file(pretrained_name_or_path, options.get("revision"), CONFIG))
+            if damage is None and isinstance(error, AttributeError | RecursionError):
+                raise
             start = f"{pretrained_name_or_path}: its config.json cannot be read: "
-            raise DecodingError((), start + str(error)) from error
+            raise DecodingError((), start + (damage or str(error))) from error
 
     show: Any = sys.excepthook
 

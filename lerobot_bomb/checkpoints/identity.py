@@ -10,13 +10,12 @@ from pathlib import Path
 from typing import Any
 
 import draccus
-from huggingface_hub import try_to_load_from_cache
 from lerobot.configs import PreTrainedConfig
 from lerobot.policies import PreTrainedPolicy
 
 from lerobot_bomb._compat import built_policies, training_data
 from lerobot_bomb.checkpoints.checks import ADAPTERS, PROCESSORS
-from lerobot_bomb.checkpoints.names import BLANK_IMAGES, REPLACE_TASKS, WEIGHTS
+from lerobot_bomb.checkpoints.names import BLANK_IMAGES, REPLACE_TASKS, WEIGHTS, local_file
 from lerobot_bomb.checkpoints.queries import time_queries
 from lerobot_bomb.envs.results import PolicyIdentity
 from lerobot_bomb.files import read_json
@@ -72,7 +71,7 @@ def policy_of_results(results_path: str | None, num_envs: int) -> list[dict[str,
 
 def weights_file(checkpoint: Path | str, revision: str | None, has_adapters: bool) -> Path | None:
     """Of a folder, or of a repository on the Hub as it was downloaded; None: it has none of this name."""
-    return _local_file(checkpoint, revision, ADAPTERS[1] if has_adapters else WEIGHTS)
+    return local_file(checkpoint, revision, ADAPTERS[1] if has_adapters else WEIGHTS)
 
 
 def sha256_of(path: Path) -> str:
@@ -109,14 +108,6 @@ def _interventions(folder: Path) -> tuple[str, ...]:
     return tuple(name for name in names if name in (BLANK_IMAGES, REPLACE_TASKS))
 
 
-def _local_file(checkpoint: Path | str, revision: str | None, name: str) -> Path | None:
-    if Path(checkpoint).is_dir():
-        path = Path(checkpoint) / name
-        return path if path.is_file() else None
-    cached = try_to_load_from_cache(str(checkpoint), name, revision=revision)
-    return Path(cached) if isinstance(cached, str) else None
-
-
 def _settings_sha256(config: PreTrainedConfig, folder: Path) -> str:
     """Of what the same weights may differ in: flags of this evaluation, and processors."""
     settings: Any = draccus.encode(config)
@@ -130,7 +121,7 @@ def _settings_sha256(config: PreTrainedConfig, folder: Path) -> str:
 
 def _base(path: str, revision: str | None) -> str | None:
     """Name of what adapters are loaded on; with its revision, where that is fixed."""
-    file = _local_file(path, revision, ADAPTERS[0])
+    file = local_file(path, revision, ADAPTERS[0])
     adapters = {} if file is None else read_json(file)
     base, of_base = adapters.get("base_model_name_or_path"), adapters.get("revision")
     return f"{base}@{of_base}" if base and of_base else base

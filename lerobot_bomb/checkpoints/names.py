@@ -4,6 +4,8 @@ import re
 from pathlib import Path
 from typing import Any
 
+from huggingface_hub import try_to_load_from_cache
+
 CONFIG, TRAIN_CONFIG, WEIGHTS = "config.json", "train_config.json", "model.safetensors"
 
 # of the steps that change on purpose what a policy is shown
@@ -20,6 +22,15 @@ def is_hub_id(name: object) -> bool:
     """Whether it has the form USER/NAME and is no folder here."""
     text = str(name)
     return re.fullmatch(r"\w[\w.-]*/[\w.-]+", text) is not None and not Path(text).exists()
+
+
+def local_file(checkpoint: Path | str, revision: str | None, name: str) -> Path | None:
+    """Return a file of a folder, or of a repository on the Hub as it was downloaded; None: it has none."""
+    if Path(checkpoint).is_dir():
+        path = Path(checkpoint) / name
+        return path if path.is_file() else None
+    cached = try_to_load_from_cache(str(checkpoint), name, revision=revision)
+    return Path(cached) if isinstance(cached, str) else None
 
 
 def is_local_path(value: object) -> bool:

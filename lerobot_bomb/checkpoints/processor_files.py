@@ -3,6 +3,7 @@
 LeRobot imports and calls whatever `class` a step names, before it looks at what came out.
 """
 
+import os
 import sys
 from collections.abc import Mapping, Sequence
 from importlib import import_module
@@ -137,10 +138,24 @@ def _check_state_file(name: object, where: str) -> None:
         )
 
 
+def refuse_link_out(file: Path) -> None:
+    """Raise a ValueError if a file is a link that leaves its folder, but for the Hub's cache of blobs."""
+    folder = Path(os.path.realpath(file.parent))
+    allowed = [folder, *([folder.parents[1] / "blobs"] if folder.parent.name == "snapshots" else [])]
+    target = Path(os.path.realpath(file))
+    if not any(target.is_relative_to(each) for each in allowed):
+        raise ValueError(f"{file} is a link to {target}, out of the checkpoint's folder: put the file there")
+
+
 def check_saved_processors() -> None:
     """From now on, whoever loads a processor in this process has it checked: LeRobot's commands too."""
+
+    def check(content: dict[str, Any], where: str, config: Path) -> None:
+        for name in state_files(content, where, saved_type(config)):
+            refuse_link_out(config.parent / name)
+
     check_processors_before_use(
-        lambda content, where, config: state_files(content, where, saved_type(config)),
+        check,
         lambda steps, where, config: check_states(steps, where, is_ours(saved_type(config))),
     )
 

@@ -81,7 +81,7 @@ def _image_size(checkpoint: Path) -> int | None:
     try:
         features = read_json(checkpoint / CONFIG)["input_features"].values()
         return next((each["shape"][-1] for each in features if each["type"] == "VISUAL"), None)
-    except (OSError, ValueError, KeyError):
+    except (OSError, ValueError, KeyError, TypeError, AttributeError, IndexError):
         return None  # refused when it is loaded
 
 

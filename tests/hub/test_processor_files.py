@@ -159,6 +159,23 @@ def test_the_hub_s_processors_are_checked_and_of_one_commit(
     assert not (folder.parent / "ran").exists()
 
 
+@pytest.mark.parametrize("name", [TOKENIZER, UNNORMALIZER])
+def test_a_state_that_is_a_link_out_of_the_folder_is_refused(name: str, folder: Path) -> None:
+    elsewhere = folder.parent / "elsewhere.safetensors"
+    (folder / name).rename(elsewhere)
+    (folder / name).symlink_to(elsewhere)
+    told = rf"{folder / name} is a link to {elsewhere}, out of the checkpoint's folder"
+    for load in (stock_load, lambda folder: load_processors(read_config(folder, "cpu"))):
+        with pytest.raises(ValueError, match=told):
+            load(folder)
+    elsewhere.rename(folder / "kept.safetensors")
+    (folder / name).unlink()
+    (folder / name).symlink_to("kept.safetensors")
+    linked = folder.parent / "last"
+    linked.symlink_to(folder)
+    stock_load(linked)
+
+
 def test_stock_types_load_and_run_no_code(tmp_path: Path) -> None:
     register_third_party_plugins()
     folder = tmp_path / "act"

@@ -71,13 +71,23 @@ def put(hub: LoopbackHub, folder: Path) -> None:
     hub.repositories[f"models/{REPO_ID}"] = repository
 
 
+# wherever a checkpoint is
+CONFIGS: dict[str, Damage] = {
+    "config.json is not a JSON object": write("config.json", '"vla0_smol"'),
+    "its config.json cannot be read: ": write("config.json", "[]"),
+    "config.json is nested more than 100 levels deep": write(
+        "config.json", f'{{"type": "vla0_smol", "vlm_config": {1000 * '{"a":'} 0 {1001 * "}"}'
+    ),
+    "its type is ['vla0_smol'], not the name of a policy type": change_config(type=["vla0_smol"]),
+    "its type is {'vla0_smol': 1}, not the name of a policy type": change_config(type={"vla0_smol": 1}),
+}
 NEWER = change_config(package_version="99.0", new_flag=1)
 # of the policy: evaluation and Python alike
 POLICY: dict[str, Damage] = {
     "config.json not found in": remove("config.json"),
-    "config.json cannot be read: Unterminated string": write("config.json", '{"type": "vla0'),
-    "config.json cannot be read: pop expected": write("config.json", "[]"),
-    "config.json cannot be read: Policy type 'vla9' (from config.json of": change_config(type="vla9"),
+    "config.json is not JSON, or truncated: Unterminated string": write("config.json", '{"type": "vla0'),
+    "its config.json cannot be read: Policy type 'vla9' (from config.json of": change_config(type="vla9"),
+    **CONFIGS,
     "written by lerobot_bomb 99.0, newer than the installed 0.1.0: update lerobot_bomb": NEWER,
     "holds no model.safetensors, so it is no whole checkpoint": remove(WEIGHTS),
     "model.safetensors is truncated or no safetensors file": truncate(WEIGHTS),
@@ -130,6 +140,7 @@ ON_THE_HUB: dict[str, Damage] = {
     "Config file 'policy_preprocessor.json' not found on the Hugging Face Hub": remove(PREPROCESSOR),
     f"{TOKENIZER}.": remove(TOKENIZER),
     "its step 'os.mkdir' is named by the path of a class": insert_code(PREPROCESSOR),
+    **CONFIGS,
 }
 
 
