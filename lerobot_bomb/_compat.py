@@ -39,6 +39,8 @@ from lerobot.utils.constants import DEFAULT_FEATURES
 
 _BUILT: list[ref[PreTrainedPolicy]] = []  # by `remember_policies`
 
+_EVALUATIONS: dict[type, Callable[[Any], None]] = {}  # by `check_evaluations`
+
 STATISTICS_SIZE = 128  # pixels
 # what LeRobot's warning ends in, below a hundred lines of torchcodec's own
 NO_TORCHCODEC = "'torchcodec' is installed but cannot be loaded"
@@ -218,6 +220,28 @@ def eval_config(flags: Sequence[str]) -> Any:
     with _argv("lerobot-eval", flags):
         read_flags: Any = parser.wrap()(read)
         return read_flags()
+
+
+def check_evaluations(env_config: type, check: Callable[[Any], None]) -> None:
+    """Let `check` see each EvalPipelineConfig, as it is made, whose environment's config is of this class.
+
+    An environment is told nothing of LeRobot's --eval flags but the number of copies. Doing it again changes
+    nothing.
+    """
+    from lerobot.configs.eval import EvalPipelineConfig  # imports environments and policies
+
+    if not _EVALUATIONS:
+        usual = EvalPipelineConfig.__post_init__
+
+        @wraps(usual)
+        def checked(self: EvalPipelineConfig) -> None:
+            usual(self)
+            for kind, check_one in _EVALUATIONS.items():
+                if isinstance(self.env, kind):
+                    check_one(self)
+
+        EvalPipelineConfig.__post_init__ = checked
+    _EVALUATIONS[env_config] = check
 
 
 def _run_lerobot_eval(flags: Sequence[str], **replaced: Any) -> None:

@@ -9,7 +9,7 @@ from contextlib import contextmanager
 from difflib import get_close_matches
 from pathlib import Path
 from types import ModuleType, TracebackType
-from typing import NoReturn
+from typing import Any, NoReturn
 
 from draccus.utils import DecodingError
 
@@ -75,6 +75,17 @@ def flag_errors() -> Iterator[None]:
         yield
     except ValueError as error:
         raise FlagError(str(error)) from None
+
+
+def refuse_recording_of_several(config: Any) -> None:
+    """Raise a FlagError if LeRobot's EvalPipelineConfig is to record several episodes of an environment."""
+    if config.eval.recording and config.eval.n_episodes > 1:
+        raise FlagError(
+            f"--eval.recording=true with --eval.n_episodes={config.eval.n_episodes}: LeRobot writes one "
+            "instruction for all episodes of a batch, and cannot record a second batch. Give "
+            "--eval.n_episodes=1, and --seed=NUMBER for other episodes; each task of --env.task_ids and "
+            "condition of --env.perturbations is recorded"
+        )
 
 
 def tell_refusals(packages: Collection[ModuleType]) -> None:

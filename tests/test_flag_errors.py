@@ -1,6 +1,7 @@
 """What is wrong with a config is one line, wherever it was written."""
 
 import json
+import re
 import sys
 from collections.abc import Callable
 from pathlib import Path
@@ -8,12 +9,15 @@ from typing import Any
 
 import pytest
 from draccus.utils import DecodingError
+from lerobot.configs.default import EvalConfig
+from lerobot.configs.eval import EvalPipelineConfig
+from lerobot.envs import make_env_config
 from lerobot.utils.import_utils import register_third_party_plugins
 
 import lerobot_bomb
 from lerobot_bomb.commands import main as cli
 from lerobot_bomb.commands.main import main
-from lerobot_bomb.flag_errors import nearest_flags, tell_refusals
+from lerobot_bomb.flag_errors import FlagError, nearest_flags, tell_refusals
 from lerobot_bomb.vlm.backbone import build_backbone
 from lerobot_bomb.vlm.paligemma import build_paligemma
 from lerobot_bomb.vlm.presets import nano_config, nano_paligemma_config, nano_qwen_config
@@ -46,6 +50,28 @@ def test_a_wrong_flag_in_a_config_file_is_one_line(
         with pytest.raises(SystemExit, match="1"):
             cli.main(["eval", str(tmp_path / "actions.jsonl"), f"--config_path={path}"])
         assert capsys.readouterr().err.strip().splitlines()[-1] == f"error: {MESSAGES[command]}"
+
+
+@pytest.mark.parametrize("env_type", ["bomb", "bomb_pusht", "bomb_libero"])
+def test_several_episodes_of_an_environment_are_not_recorded_under_one_instruction(
+    env_type: str, stock_cli: Callable[..., None], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    register_third_party_plugins()
+    told = (
+        r"^--eval\.recording=true with --eval\.n_episodes=3: .* Give --eval\.n_episodes=1, and --seed=NUMBER"
+    )
+    for batch_size in (1, 3):
+        of_eval = EvalConfig(recording=True, n_episodes=3, batch_size=batch_size)
+        with pytest.raises(FlagError, match=told):
+            EvalPipelineConfig(env=make_env_config(env_type), eval=of_eval)
+        EvalPipelineConfig(env=make_env_config("pusht"), eval=of_eval)
+    one = EvalConfig(recording=True, n_episodes=1)
+    assert EvalPipelineConfig(env=make_env_config(env_type), eval=one).eval.recording
+    flags = [f"--env.type={env_type}", "--policy.type=act", "--eval.recording=true", "--eval.n_episodes=3"]
+    with pytest.raises(SystemExit, match="1"):
+        stock_cli("lerobot-eval", *flags, f"--output_dir={tmp_path / 'eval'}")
+    assert re.search(told.replace("^", "^error: "), capsys.readouterr().err.strip().splitlines()[-1])
+    assert not (tmp_path / "eval").exists()
 
 
 def test_what_lerobots_parser_does_not_catch_is_one_line_too(capsys: pytest.CaptureFixture[str]) -> None:

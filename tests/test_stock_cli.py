@@ -4,6 +4,7 @@ import json
 from collections.abc import Callable
 from pathlib import Path
 
+import pyarrow.parquet as pq
 import pytest
 from huggingface_hub.utils import validate_repo_id
 
@@ -64,17 +65,19 @@ def test_numbered_tasks_and_absolute_control(stock_cli: Run, tmp_path: Path) -> 
 
 def test_each_condition_has_a_rate_and_a_recording(stock_cli: Run, tmp_path: Path) -> None:
     flags = '--env.perturbations=["none","camera:3","all:5"] --policy.type=bomb_expert --eval.recording=true'
-    flags += " --eval.n_episodes=2 --eval.batch_size=2 --eval.use_async_envs=false --env.fps=5"
+    flags += " --eval.n_episodes=1 --env.fps=5"
     info = evaluate(stock_cli, tmp_path, flags)
     keys = ["place.none", "place.camera-3", "place.all-5"]
     assert {key: info["per_group"][key]["pc_success"] for key in keys} == dict.fromkeys(keys, 100.0)
-    assert {path.name for path in (tmp_path / "eval" / "recordings").iterdir()} == {
-        f"{key}_0" for key in keys
-    }
-    for key in keys:
-        validate_repo_id(f"me/recorded_{key}_0")  # what --eval.recording_repo_id makes of it
     rows = read_results(tmp_path / "results.jsonl")
-    assert sorted(row["spec"]["perturbations"] for row in rows) == sorted(2 * ["none", "camera:3", "all:5"])
+    instructions = {row["spec"]["perturbations"]: row["instruction"] for row in rows}
+    assert sorted(row["spec"]["perturbations"] for row in rows) == ["all:5", "camera:3", "none"]
+    recordings = tmp_path / "eval" / "recordings"
+    assert {path.name for path in recordings.iterdir()} == {f"{key}_0" for key in keys}
+    for key, condition in zip(keys, ("none", "camera:3", "all:5"), strict=True):
+        validate_repo_id(f"me/recorded_{key}_0")  # what --eval.recording_repo_id makes of it
+        tasks = pq.read_table(recordings / f"{key}_0" / "meta" / "tasks.parquet")
+        assert tasks["task"].to_pylist() == [instructions[condition]]
     # the nominal arm has the same seeds, targets and colours
     episodes = {
         condition: [
