@@ -44,7 +44,7 @@ def test_a_dataset_has_the_same_contents(dataset: LeRobotDataset, expected: dict
 def test_a_dataset_tells_the_same_environment() -> None:
     cameras = ("workspace", "wrist")
     assert DatasetFacts.read(FOLDER / "dataset").environment == Environment(
-        "scara", "relative", 10, 32, cameras, "1.0"
+        "scara", "relative", 10, 32, cameras, "1.0", "place", task_ids=()
     )
 
 

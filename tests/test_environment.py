@@ -1,12 +1,19 @@
 """The environment that a recording shows, and which others a policy of it cannot act in."""
 
+import json
 import re
+from collections.abc import Sequence
 from dataclasses import replace
+from pathlib import Path
 from typing import Any
 
+import pyarrow as pa
+import pyarrow.parquet as pq
 import pytest
 
+from lerobot_bomb.bomb.episode import EpisodeSpec
 from lerobot_bomb.data.environment import Environment
+from lerobot_bomb.data.facts import DatasetFacts
 
 IMAGE = {"dtype": "video", "shape": [64, 64, 3], "names": ["height", "width", "channels"]}
 INFO: dict[str, Any] = {
@@ -32,10 +39,49 @@ ABSOLUTE = Environment(
 )
 
 
-def test_it_is_read_from_the_datasets_own_metadata() -> None:
-    assert Environment.of_dataset(INFO, {"task": "place", "task_ids": [7, 12]}) == ABSOLUTE
-    # a dataset that LeRobot has merged or edited holds no bomb.json
-    assert Environment.of_dataset(INFO, {}) == replace(ABSOLUTE, task_ids=())
+def write_dataset(root: Path, bomb: dict[str, Any] | None, specs: Sequence[str | None] | None) -> Path:
+    """What LeRobot's tools leave of a recording's metadata: two episodes, with or without our columns."""
+    (root / "meta" / "episodes").mkdir(parents=True)
+    (root / "meta" / "info.json").write_text(json.dumps(INFO))
+    if bomb is not None:
+        (root / "meta" / "bomb.json").write_text(json.dumps(bomb))
+    columns = {"length": [9, 9], **({} if specs is None else {"bomb/spec": specs})}
+    pq.write_table(pa.table(columns), root / "meta" / "episodes" / "file-000.parquet")
+    return root
+
+
+def spec(suite: str, seed: int, **given: Any) -> str:
+    return json.dumps(EpisodeSpec(seed, suite, **given).to_dict())
+
+
+NUMBERED = [spec("place", 4, target=(1, 2), color="black"), spec("place", 3, target=(2, 2), color="black")]
+
+
+@pytest.mark.parametrize(
+    ("bomb", "specs", "task", "task_ids", "seeds"),
+    [
+        pytest.param({"task": "goal", "task_ids": [7, 12]}, NUMBERED, "goal", (7, 12), None, id="recorded"),
+        pytest.param({"task": "place"}, None, "place", (), None, id="an old one"),
+        pytest.param(None, NUMBERED, "place", (7, 12), [3, 4], id="bomb.json is lost"),
+        pytest.param(None, [spec("object", 5), spec("object", 5)], "object", (), [5], id="drawn tasks"),
+        pytest.param(None, [NUMBERED[0], spec("place", 4)], "place", (), [4], id="numbered and drawn"),
+        pytest.param(None, [spec("place", 0), spec("goal", 1)], "goal+place", None, [0, 1], id="merged"),
+        pytest.param(None, None, None, None, None, id="columns are lost"),
+        pytest.param(None, [spec("place", 0), None], None, None, None, id="merged with an edited one"),
+    ],
+)
+def test_suite_and_tasks_are_those_of_the_recording_or_of_its_episodes_or_unknown(
+    bomb: dict[str, Any] | None,
+    specs: Sequence[str | None] | None,
+    task: str | None,
+    task_ids: tuple[int, ...] | None,
+    seeds: list[int] | None,
+    tmp_path: Path,
+) -> None:
+    facts = DatasetFacts.read(write_dataset(tmp_path, bomb and {"recording": bomb}, specs))
+    assert facts.environment == replace(ABSOLUTE, task=task, task_ids=task_ids)
+    if bomb is None:
+        assert facts.seeds == seeds
 
 
 @pytest.mark.parametrize(
@@ -49,7 +95,7 @@ def test_it_is_read_from_the_datasets_own_metadata() -> None:
     ],
 )
 def test_of_other_datasets_nothing_is_known(change: dict[str, Any]) -> None:
-    assert Environment.of_dataset(INFO | change, {}) is None
+    assert Environment.of_dataset(INFO | change, "place", ()) is None
 
 
 def test_flags_of_an_evaluation() -> None:
@@ -57,6 +103,47 @@ def test_flags_of_an_evaluation() -> None:
         "--env.type=bomb --env.task=place --env.robot=fetch --env.control_mode=absolute --env.fps=20 "
         "--env.image_size=64 --env.depth=true --env.task_ids=[7,12]"
     )
+
+
+@pytest.mark.parametrize(
+    ("task", "flag", "text"),
+    [
+        (None, "--env.task=SUITE", "an unknown suite, robot"),
+        ("object+place", "--env.task=object", "suite `object+place`, robot"),
+        ("goal+long+object+place+spatial", "--env.task=all", "suite `goal+long+object+place+spatial`, robot"),
+    ],
+)
+def test_what_is_said_of_no_suite_and_of_several(task: str | None, flag: str, text: str) -> None:
+    several = replace(ABSOLUTE, task=task, task_ids=None)
+    assert several.eval_flags()[1] == flag
+    assert not [each for each in several.eval_flags() if "task_ids" in each]
+    assert text in str(several)
+
+
+@pytest.mark.parametrize(
+    ("trained", "here"),
+    [
+        (None, "goal"),
+        ("object", None),
+        ("object+place", "object"),
+        ("object+place", "object+place"),
+        ("goal+long+object+place+spatial", "all"),
+        ("all", "goal"),
+    ],
+)
+def test_suites_in_which_a_policy_can_act(trained: str | None, here: str | None) -> None:
+    assert replace(ABSOLUTE, task=trained).differences(replace(ABSOLUTE, task=here)) == []
+
+
+@pytest.mark.parametrize(
+    ("trained", "here"), [("object", "all"), ("object+place", "goal"), ("goal", "place")]
+)
+def test_a_suite_that_it_was_not_trained_for_is_another_environment(trained: str, here: str) -> None:
+    message = (
+        rf"with task={re.escape(trained)}; this one has task={here}: evaluate with --env\.task=[og]\w+, or"
+    )
+    with pytest.raises(ValueError, match=message):
+        replace(ABSOLUTE, task=trained).check_same(replace(ABSOLUTE, task=here), "this act", "insist")
 
 
 @pytest.mark.parametrize(

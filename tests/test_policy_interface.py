@@ -14,7 +14,7 @@ from vla0_smol_cases import make_config
 
 from lerobot_bomb.data.environment import Environment
 
-BOMB = Environment("scara", "absolute", 10, 64, ("workspace", "wrist"), "1.0")
+BOMB = Environment("scara", "absolute", 10, 64, ("workspace", "wrist"), "1.0", "place")
 INSIST = "or insist with --env.ignore_checkpoint=true"
 
 

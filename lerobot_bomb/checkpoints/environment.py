@@ -118,6 +118,12 @@ def _check(config: PreTrainedConfig, who: str, insist: str, here: Environment) -
     environment = trained_environment(config)
     if environment is not None:
         environment.check_same(here, who, insist)
+        if environment.task is None:
+            logger.warning(
+                "%s does not know the suite that it was trained for, so none was compared: --env.task must "
+                "be that of its training",
+                who,
+            )
         return
     _check_image_size(config, here, who, insist)
     if config.pretrained_path:

@@ -2,6 +2,7 @@
 
 import argparse
 import json
+from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -140,6 +141,6 @@ def _play(args: argparse.Namespace, folder: Path, cells: dict[str, Cell]) -> dic
     return {name: read_results(store.file(cell, "jsonl")) for name, cell in cells.items()}
 
 
-def _trained_seeds(checkpoint: Path) -> range | None:
+def _trained_seeds(checkpoint: Path) -> Sequence[int] | None:
     facts = DatasetFacts.find(dataset_of(read_train_config(checkpoint)))
     return None if facts is None else facts.seeds

@@ -7,7 +7,10 @@ from typing import Any
 
 from lerobot_bomb.bomb.board import task_id
 from lerobot_bomb.bomb.observation import ACTION_NAMES
+from lerobot_bomb.bomb.suites import SUITES
+from lerobot_bomb.conditions import ALL
 
+SUITE = "SUITE"  # in flags: one that is not known, to be filled in
 IMAGES, DEPTH = "observation.images.", "observation.depth."
 # what an observation or an action means depends on; --env.NAME changes it
 COMPARED = ("task", "robot", "control_mode", "fps", "image_size")
@@ -15,7 +18,7 @@ COMPARED = ("task", "robot", "control_mode", "fps", "image_size")
 
 @dataclass(frozen=True)
 class Environment:
-    """A policy may act under another depth, split or task than these; perturbations do not count."""
+    """A policy may act under another depth, split or numbered task than these; perturbations do not count."""
 
     robot: str
     control_mode: str
@@ -25,16 +28,22 @@ class Environment:
     image_size: int
     cameras: tuple[str, ...]
     task_version: str
-    task: str = "place"
+    # suite; several as "object+place"; None: not known
+    task: str | None = None
     depth: bool = False
-    # numbered tasks; none = target and colour are drawn per episode
-    task_ids: tuple[int, ...] = ()
+    # numbered tasks; none = target and colour are drawn per episode; None: not known
+    task_ids: tuple[int, ...] | None = None
 
     @classmethod
-    def of_dataset(cls, info: Mapping[str, Any], recording: Mapping[str, Any]) -> "Environment | None":
-        """From LeRobot's info.json, and what bomb.json says of a recording; None: it is of no such one.
+    def of_dataset(
+        cls, info: Mapping[str, Any], task: str | None, task_ids: tuple[int, ...] | None
+    ) -> "Environment | None":
+        """Return what a dataset shows; None: it shows no such environment.
 
-        What is in info.json stays true when a dataset is merged or edited, which bomb.json does not survive.
+        Args:
+            info: LeRobot's info.json, which stays true when a dataset is merged or edited.
+            task: suite or suites, of which info.json says nothing.
+            task_ids: numbered tasks, of which it says nothing either.
         """
         robot = re.fullmatch(r"bomb_(\w+)_v([\d.]+)", str(info.get("robot_type")))
         features: dict[str, Any] = info.get("features", {})
@@ -51,9 +60,9 @@ class Environment:
             image_size=int(sizes.pop()),
             cameras=tuple(cameras),
             task_version=robot[2],
-            task=recording.get("task", cls.task),
+            task=task,
             depth=any(key.startswith(DEPTH) for key in features),
-            task_ids=_task_ids(recording),
+            task_ids=task_ids,
         )
 
     @property
@@ -61,9 +70,23 @@ class Environment:
         """Numbers of an action."""
         return len(ACTION_NAMES[self.control_mode])
 
+    @property
+    def suites(self) -> frozenset[str] | None:
+        """Every suite that it shows; None: not known."""
+        if self.task is None:
+            return None
+        return frozenset(SUITES if self.task == ALL else self.task.split("+"))
+
+    def _flag(self, name: str) -> str:
+        """A flag of lerobot-eval; of several suites it names the first, unless they are all."""
+        value = getattr(self, name)
+        if name == "task" and self.suites is not None:
+            value = ALL if self.suites == frozenset(SUITES) else min(self.suites)
+        return f"--env.{name}={SUITE if value is None else value}"
+
     def eval_flags(self) -> list[str]:
-        """Of lerobot-eval, for this environment."""
-        flags = [f"--env.{name}={getattr(self, name)}" for name in COMPARED]
+        """Of lerobot-eval, for this environment; a suite that is not known is to be filled in for SUITE."""
+        flags = [self._flag(name) for name in COMPARED]
         if self.depth:
             flags.append("--env.depth=true")
         if self.task_ids:
@@ -71,8 +94,14 @@ class Environment:
         return ["--env.type=bomb", *flags]
 
     def differences(self, other: "Environment") -> list[str]:
-        """Fields in which `other` is one that a policy of this environment cannot act in."""
+        """Fields in which `other` is one that a policy of this environment cannot act in.
+
+        A suite that is not known is compared with nothing.
+        """
         names = [name for name in COMPARED if getattr(self, name) != getattr(other, name)]
+        ours, theirs = self.suites, other.suites
+        if "task" in names and (ours is None or theirs is None or theirs <= ours):
+            names.remove("task")
         if not set(self.cameras) <= set(other.cameras):
             names.append("cameras")
         if self.task_version != other.task_version:
@@ -84,7 +113,7 @@ class Environment:
         names = self.differences(other)
         if not names:
             return
-        flags = [f"--env.{name}={getattr(self, name)}" for name in names if name in COMPARED]
+        flags = [self._flag(name) for name in names if name in COMPARED]
         ways_out = [f"evaluate with {' '.join(flags)}", insist] if flags else [insist]
         raise ValueError(
             f"{who} was trained for an environment with {self.text(names)}; this one has "
@@ -101,16 +130,23 @@ class Environment:
     def __str__(self) -> str:
         depth = " with depth" if self.depth else ""
         tasks = f", tasks {list(self.task_ids)}" if self.task_ids else ""
+        suite = "an unknown suite" if self.task is None else f"suite `{self.task}`"
         return (
-            f"BOMB, task version {self.task_version}, suite `{self.task}`{tasks}, robot `{self.robot}`, "
+            f"BOMB, task version {self.task_version}, {suite}{tasks}, robot `{self.robot}`, "
             f"control `{self.control_mode}` at {self.fps} Hz, cameras `{', '.join(self.cameras)}` of "
             f"{self.image_size} px{depth}"
         )
 
 
-def _task_ids(recording: Mapping[str, Any]) -> tuple[int, ...]:
-    """Of a recording whose tasks were given by number, or by a target and a colour."""
-    target, color = recording.get("target"), recording.get("color")
-    if target and color:
-        return (task_id(target, color),)
-    return tuple(recording.get("task_ids", ()))
+def numbered_tasks(specs: Iterable[Mapping[str, Any]]) -> tuple[int, ...]:
+    """Numbers of the tasks of episodes; none where those of an episode are drawn.
+
+    A spec gives its task by number, or by a target and a colour.
+    """
+    ids = {_task_id(spec) for spec in specs}
+    return tuple(sorted(number for number in ids if number is not None)) if None not in ids else ()
+
+
+def _task_id(spec: Mapping[str, Any]) -> int | None:
+    target, color = spec.get("target"), spec.get("color")
+    return task_id(target, color) if target and color else spec.get("task_id")

@@ -1,24 +1,32 @@
 """What a dataset's folder says of itself, and how to evaluate on what it shows."""
 
+import json
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from lerobot_bomb.data.dataset_files import INFO_FILE
-from lerobot_bomb.data.environment import Environment
+from lerobot_bomb.data.dataset_files import INFO_FILE, episode_column
+from lerobot_bomb.data.environment import Environment, numbered_tasks
 from lerobot_bomb.data.resumable import METADATA_FILE
 from lerobot_bomb.files import read_json
 
 PUSHT_SOURCE = "pusht-zarr"
 LIBERO_SOURCE = "libero-hdf5"
+SPEC_COLUMN = "bomb/spec"  # of LeRobot's table of episodes
 
 
 @dataclass(frozen=True)
 class DatasetFacts:
-    """LeRobot's info.json and, of datasets that this package wrote, bomb.json."""
+    """LeRobot's info.json and, of datasets that this package wrote, bomb.json or its episodes' own columns.
+
+    Of LeRobot's tools for editing, those that write a new dataset lose bomb.json; some keep the columns.
+    """
 
     info: dict[str, Any]
-    bomb: dict[str, Any]  # {} = written by others
+    bomb: dict[str, Any]  # {} = written or edited by others
+    # `EpisodeSpec` of each episode as JSON, read where bomb.json is gone; None: an episode has none
+    specs: Sequence[dict[str, Any]] | None = None
 
     @classmethod
     def read(cls, root: Path) -> "DatasetFacts":
@@ -29,8 +37,11 @@ class DatasetFacts:
         """
         if not (root / INFO_FILE).is_file():
             raise ValueError(f"{root} holds no {INFO_FILE}, so it is no LeRobotDataset")
-        path = root / METADATA_FILE
-        return cls(read_json(root / INFO_FILE), read_json(path) if path.is_file() else {})
+        info, path = read_json(root / INFO_FILE), root / METADATA_FILE
+        if path.is_file():
+            return cls(info, read_json(path))
+        is_bomb = Environment.of_dataset(info, None, None) is not None
+        return cls(info, {}, _read_specs(root) if is_bomb else None)
 
     @classmethod
     def find(cls, root: Path | str | None) -> "DatasetFacts | None":
@@ -45,7 +56,18 @@ class DatasetFacts:
     @property
     def environment(self) -> Environment | None:
         """That of the benchmark, which the dataset shows; None: another."""
-        return Environment.of_dataset(self.info, self.recording)
+        return Environment.of_dataset(self.info, *self._tasks)
+
+    @property
+    def _tasks(self) -> tuple[str | None, tuple[int, ...] | None]:
+        """Return `Environment.task` and `Environment.task_ids`; numbers of several suites tell no tasks."""
+        if self.recording:
+            given = tuple(self.recording.get("task_ids", ()))
+            return self.recording.get("task"), numbered_tasks([self.recording]) or given
+        suites = sorted({spec["suite"] for spec in self.specs or ()})
+        if len(suites) != 1:
+            return "+".join(suites) or None, None
+        return suites[0], numbered_tasks(self.specs or ())
 
     def eval_flags(self) -> list[str] | None:
         """Of lerobot-eval, for the environment that the dataset shows; None: not known."""
@@ -69,20 +91,20 @@ class DatasetFacts:
         return [f"- {count}", *self._recording_lines()]
 
     @property
-    def seeds(self) -> range | None:
-        """Of the episodes that were tried; None: it is no recording of BOMB."""
+    def seeds(self) -> Sequence[int] | None:
+        """Seeds of the episodes that were tried, of an edited recording of those in it; None: not known."""
         recording = self.recording
         if not recording:
-            return None
+            return None if self.specs is None else sorted({spec["seed"] for spec in self.specs})
         num_conditions = len(recording["perturbations"]) * max(1, len(recording["task_ids"]))
         num_tried = self.bomb["num_episodes"] + len(self.bomb["failures"])
         return range(recording["seed"], recording["seed"] + (num_tried - 1) // num_conditions + 1)
 
     def _recording_lines(self) -> list[str]:
         recording, seeds = self.recording, self.seeds
-        num_failed = len(self.bomb.get("failures", []))
-        if seeds is None:
+        if not recording or seeds is None:
             return []
+        num_failed = len(self.bomb.get("failures", []))
         given = [f"{name} {recording[name]}" for name in ("target", "color") if recording.get(name)]
         tasks = recording["task_ids"] or ", ".join(given) or "drawn per episode"
         return [
@@ -95,3 +117,8 @@ class DatasetFacts:
             f"- recorded with lerobot_bomb {recording['package_version']}, MuJoCo "
             f"{recording.get('mujoco_version', 'of an unknown version')}",
         ]
+
+
+def _read_specs(root: Path) -> list[dict[str, Any]] | None:
+    texts = episode_column(root, SPEC_COLUMN)
+    return None if texts is None or None in texts else [json.loads(text) for text in texts]

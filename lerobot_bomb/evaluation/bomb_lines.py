@@ -13,7 +13,7 @@ from lerobot_bomb.bomb.observation import CAMERAS, MAX_IMAGE_SIZE, MIN_IMAGE_SIZ
 from lerobot_bomb.bomb.perturbations import Condition
 from lerobot_bomb.bomb.suites import SUITES
 from lerobot_bomb.conditions import ALL
-from lerobot_bomb.data.environment import Environment
+from lerobot_bomb.data.environment import Environment, numbered_tasks
 from lerobot_bomb.envs.results import Row
 from lerobot_bomb.evaluation.line_checks import (
     Check,
@@ -218,7 +218,7 @@ def environment_of_episode(row: Row) -> Environment:
         **{name: spec[name] for name in ("robot", "control_mode", "fps")},
         image_size=row["image_size"],
         cameras=CAMERAS,
-        task_version=row.get("task_version", TASK_VERSION),
+        task_version=row.get("task_version", OLD_VERSION),
         task=spec["suite"],
     )
 
@@ -229,12 +229,8 @@ def eval_flags_of(rows: list[Row]) -> list[str]:
 
 
 def _task_flags(specs: list[dict[str, Any]]) -> list[str]:
-    if all(spec.get("task_id") is not None for spec in specs):
-        ids = {spec["task_id"] for spec in specs}
-        return [f"--env.task_ids={sorted(ids)}".replace(" ", "")]
-    if all(spec["target"] and spec["color"] for spec in specs):
-        ids = {task_id(spec["target"], spec["color"]) for spec in specs}
-        return [f"--env.task_ids={sorted(ids)}".replace(" ", "")]
+    if ids := numbered_tasks(specs):
+        return [f"--env.task_ids={list(ids)}".replace(" ", "")]
     shared = {name: specs[0][name] for name in ("target", "color") if specs[0][name] is not None}
     return [f"--env.{name}={value}".replace(" ", "") for name, value in shared.items()]
 

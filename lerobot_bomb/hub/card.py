@@ -11,7 +11,7 @@ from lerobot.configs.train import TrainPipelineConfig
 
 from lerobot_bomb import __version__
 from lerobot_bomb.checkpoints.names import is_hub_id
-from lerobot_bomb.data.environment import Environment
+from lerobot_bomb.data.environment import SUITE, Environment
 from lerobot_bomb.data.facts import DatasetFacts
 from lerobot_bomb.envs.results import Row
 from lerobot_bomb.evaluation.result_groups import Group, by_condition, groups_of
@@ -169,11 +169,14 @@ class Checkpoint:
         )
         if flags is None:
             return f"{fenced(line)}\n\n`ENV` is an environment with the dataset's cameras, state and action."
-        return fenced(f"{line}\nlerobot-bomb results results.jsonl" if is_ours else line)
+        text = fenced(f"{line}\nlerobot-bomb results results.jsonl" if is_ours else line)
+        is_open = any(flag.endswith(f"={SUITE}") for flag in flags)
+        return text + f"\n\n`{SUITE}` is that of its training, which the dataset does not say." * is_open
 
     def _eval_flags(self) -> list[str] | None:
         """Of the environment that it was trained for, or that it was evaluated in; None: not known."""
-        if self.environment is not None:
+        knows_suite = self.environment is not None and self.environment.task is not None
+        if self.environment is not None and (knows_suite or not self.results):
             return self.environment.eval_flags()
         if self.results:
             kind = kind_of(self.results[0][0])

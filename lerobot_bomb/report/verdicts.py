@@ -3,7 +3,7 @@
 Arms are lists of lines of the same episodes, but for those of the splits.
 """
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -42,7 +42,7 @@ def table(arms: Mapping[str, list[Row]], verdicts: list[Verdict]) -> list[Table]
     ]
 
 
-def judge(arms: Mapping[str, list[Row]], trained_seeds: range | None) -> list[Verdict]:
+def judge(arms: Mapping[str, list[Row]], trained_seeds: Sequence[int] | None) -> list[Verdict]:
     """Every question that the arms have an answer to."""
     policy = arms[POLICY]
     found = [_same_again(_pairs(policy, arms[AGAIN])), _same_alone(_pairs(policy, arms[ALONE]))]
@@ -122,10 +122,10 @@ def _fisher(first: int, of_first: int, second: int, of_second: int) -> float:
     return float(found.pvalue)
 
 
-def _new_seeds(rows: list[Row], trained: range | None) -> Verdict:
+def _new_seeds(rows: list[Row], trained: Sequence[int] | None) -> Verdict:
     question = "no episode of the training is evaluated"
     if trained is None:
-        return Verdict(question, OPEN, "the dataset of the training is not here, or is no recording of BOMB")
+        return Verdict(question, OPEN, "the dataset of the training is not here, or does not say its seeds")
     seen = sorted({row["spec"]["seed"] for row in rows} & set(trained))
     evidence = f"trained on seeds {trained[0]}..{trained[-1]}"
     return Verdict(question, NO if seen else YES, f"{evidence}{f', {len(seen)} evaluated' if seen else ''}")

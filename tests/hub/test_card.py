@@ -1,5 +1,6 @@
 """What a card says, by the checkpoint."""
 
+import json
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -12,8 +13,10 @@ from lerobot.configs.train import TrainPipelineConfig
 from vla0_smol_cases import make_config
 
 from hub.server import LoopbackHub
+from lerobot_bomb.bomb.episode import EpisodeSpec, Stage
 from lerobot_bomb.data.environment import Environment
 from lerobot_bomb.data.facts import DatasetFacts
+from lerobot_bomb.envs.results import EpisodeResult
 from lerobot_bomb.evaluation.bomb_lines import eval_flags_of
 from lerobot_bomb.hub.card import Checkpoint, PolicyCard
 from lerobot_policy_fdvla.card_fdvla import METHOD as FDVLA
@@ -110,7 +113,7 @@ def test_commands_are_those_of_the_training_and_of_what_the_dataset_shows(tmp_pa
 
 def test_a_checkpoint_tells_its_environment_wherever_its_dataset_is() -> None:
     cameras = ("workspace", "wrist")
-    environment = Environment("fetch", "absolute", 20, 64, cameras, "1.0", task_ids=(7, 12))
+    environment = Environment("fetch", "absolute", 20, 64, cameras, "1.0", "place", task_ids=(7, 12))
     text = str(checkpoint(environment=environment).card()).replace(" \\\n    ", " ")
     assert (
         "--env.robot=fetch --env.control_mode=absolute --env.fps=20 --env.image_size=64 "
@@ -121,6 +124,20 @@ def test_a_checkpoint_tells_its_environment_wherever_its_dataset_is() -> None:
         "`absolute` at 20 Hz, cameras `workspace, wrist` of 64 px\n"
     ) in text
     assert "--policy.environment" not in text
+
+
+def test_a_suite_that_is_not_known_is_not_made_up() -> None:
+    unknown = checkpoint(environment=Environment("scara", "relative", 10, 64, ("wrist",), "1.0"))
+    text = str(unknown.card())
+    assert "--env.task=SUITE" in text and "place" not in text
+    assert "`SUITE` is that of its training, which the dataset does not say." in text
+    assert "- environment: BOMB, task version 1.0, an unknown suite, robot `scara`" in text
+    spec = EpisodeSpec(0, "object")
+    result = EpisodeResult(
+        spec, "Put it there.", 0, (2, 2), "black", 20, 1.0, True, True, None, Stage.PLACED, 1.0, (2, 2), 0.0
+    )
+    played = str(replace(unknown, results=[[json.loads(result.to_json())]]).card())
+    assert "--env.task=object" in played and "SUITE" not in played
 
 
 @pytest.mark.parametrize(

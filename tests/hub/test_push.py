@@ -192,7 +192,7 @@ def test_results_on_pusht_are_for_checkpoints_that_were_not_trained_for_bomb(
     results.write_text(json.dumps(row | {"policy": asdict(other)}))
     assert push(checkpoint, *push_results) == 1
     assert f"--results={results} is of act elsewhere" in capsys.readouterr().err
-    environment = Environment("scara", "absolute", 10, 256, ("workspace", "wrist"), "1.0")
+    environment = Environment("scara", "absolute", 10, 256, ("workspace", "wrist"), "1.0", "place")
     change_config(environment=asdict(environment))(checkpoint)
     results.write_text(json.dumps(row))
     assert push(checkpoint, *push_results) == 1
