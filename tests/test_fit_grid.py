@@ -109,11 +109,17 @@ def test_pusht_has_two_coordinates_in_pixels(pusht_dataset: Path, capsys: pytest
         assert pixels[name]["cond_mean"] < 2.5  # pixels of 512
 
 
-def test_errors_include_what_quantiles_clip(root: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_errors_include_what_quantiles_clip(
+    root: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     """Of a dimension that is far beyond them, clipping is nearly all of the error."""
+    root = edited(root, tmp_path / "averaged", q01="q10", q99="q90")
+    assert fit_grid(root, QUANTILES) == 0
+    text = " ".join(capsys.readouterr().out.split())
+    assert "actions are beyond the grid and are clipped to it" in text and "MIN_MAX clips nothing" in text
+    assert "`lerobot-bomb statistics FOLDER --mend` makes them so" in text
     assert fit_grid(root, QUANTILES) == 0
     text = capsys.readouterr().out
-    assert "actions are beyond the grid and are clipped to it" in text and "MIN_MAX clips nothing" in text
     shown = table(text, "in the dataset's units")
     meta = LeRobotDatasetMetadata(REPO_ID, root=root)
     low, high = action_bounds(meta, NormalizationMode.QUANTILES)
@@ -214,13 +220,15 @@ def test_bad_flags_are_one_line(
     assert error.count("\n") == 1
 
 
-def edited(root: Path, folder: Path, drop: tuple[str, ...]) -> Path:
-    """A copy of the dataset without some statistics of its actions."""
+def edited(root: Path, folder: Path, **names: str | None) -> Path:
+    """A copy of the dataset whose actions have other statistics under these names, or none."""
     shutil.copytree(root, folder)
     path = folder / "meta" / "stats.json"
     statistics: dict[str, Any] = json.loads(path.read_text())
-    for name in drop:
-        del statistics[ACTION][name]
+    before = statistics[ACTION]
+    statistics[ACTION] = {
+        name: before[names.get(name) or name] for name in before if names.get(name, name) is not None
+    }
     path.write_text(json.dumps(statistics))
     return folder
 
@@ -228,9 +236,9 @@ def edited(root: Path, folder: Path, drop: tuple[str, ...]) -> Path:
 def test_quantiles_are_wanted_only_where_they_are_asked_for(
     root: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    folder = edited(root, tmp_path / "old", ("q01", "q99"))
+    folder = edited(root, tmp_path / "old", q01=None, q99=None)
     assert fit_grid(folder) == 0
     assert fit_grid(folder, QUANTILES) == 1
     error = capsys.readouterr().err
     assert "QUANTILES needs the statistics q01, q99, which the dataset lacks" in error
-    assert "lerobot.scripts.augment_dataset_quantile_stats adds them\n" in error
+    assert "`lerobot-bomb statistics FOLDER --mend` adds them\n" in error

@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 import torch
 from lerobot.configs import PreTrainedConfig
-from lerobot.datasets import LeRobotDatasetMetadata
+from lerobot.datasets import LeRobotDataset, LeRobotDatasetMetadata, delete_episodes
 from lerobot.envs import make_env_config, make_env_pre_post_processors
 from lerobot.policies import (
     PreTrainedPolicy,
@@ -31,7 +31,7 @@ from lerobot_bomb.data.environment import Environment
 Run = Callable[..., None]
 REPO_ID = "test/recording"
 CAMERAS = ("workspace", "wrist")
-ABSOLUTE = Environment("scara", "absolute", 10, 64, CAMERAS, "1.0", task_ids=(7, 12))
+ABSOLUTE = Environment("scara", "absolute", 10, 64, CAMERAS, "1.0", task="place", task_ids=(7, 12))
 TO_ABSOLUTE = r"control_mode=absolute; this one has control_mode=relative: evaluate with " + (
     r"--env\.control_mode=absolute, or insist with "
 )
@@ -118,7 +118,8 @@ def test_a_policy_that_goes_on_with_other_data_is_of_their_environment(
     tuned = get_policy_class(policy_type).from_pretrained(tmp_path, dataset_meta=relative)
     assert "was trained for control_mode=absolute, fps=10; this dataset shows control_mode=rel" in caplog.text
     assert isinstance(tuned.config, ConfigWithEnvironment)
-    assert tuned.config.environment == Environment("scara", "relative", 20, 64, CAMERAS, "1.0")
+    expected = Environment("scara", "relative", 20, 64, CAMERAS, "1.0", task="place", task_ids=(7, 12))
+    assert tuned.config.environment == expected
 
 
 def test_commands_refuse_before_anything_is_played(
@@ -201,3 +202,26 @@ def test_where_an_action_has_another_size_a_checkpoint_says_where_it_was_trained
     told = r"was trained for --env\.type=bomb, where an action has 4 numbers; here it has 2"
     with pytest.raises(ValueError, match=told):
         make_policy(config, env_cfg=make_env_config("bomb_pusht"))
+
+
+def test_a_recording_that_lost_its_suite_trains_policies_that_say_so(
+    policy_type: str, absolute: Path, tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    """As of `lerobot-edit-dataset`, which keeps neither bomb.json nor our columns of the kept episodes."""
+    root = tmp_path / "kept"
+    recorded = LeRobotDataset(REPO_ID, root=absolute, video_backend="pyav")
+    delete_episodes(recorded, [0], output_dir=root, repo_id=REPO_ID)
+    policy = new_policy(policy_type, root)
+    assert f"{root} does not say which suite its episodes are of" in caplog.text
+    write(tmp_path / "checkpoint", policy)
+    config = parse_config(tmp_path / "checkpoint", "cpu")
+    assert isinstance(config, ConfigWithEnvironment)
+    assert config.environment == Environment("scara", "absolute", 10, 64, CAMERAS, "1.0")
+    config.pretrained_path = tmp_path / "checkpoint"
+    loaded = make_policy(config, env_cfg=make_env_config("bomb", image_size=64))
+    for suite in ("object", "place"):
+        caplog.clear()
+        act_in(loaded, control_mode="absolute", image_size=64, task=suite)
+        assert "does not know the suite that it was trained for, so none was compared" in caplog.text
+    with pytest.raises(ValueError, match=TO_ABSOLUTE):
+        act_in(loaded, image_size=64, task="object")

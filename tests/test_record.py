@@ -11,6 +11,8 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import pyarrow as pa
+import pyarrow.parquet as pq
 import pytest
 
 from lerobot_bomb import __version__
@@ -156,6 +158,23 @@ def test_episode_columns_survive_a_merge_with_another_dataset(
     roots = [datasets["images"]] * 2
     aggregate_datasets(["test/images"] * 2, "test/merged", roots=roots, aggr_root=tmp_path / "merged")
     assert [row["bomb/seed"] for row in episode_rows(tmp_path / "merged")] == [0, 1, 0, 1]
+
+
+@pytest.mark.parametrize("name", ["video", "images"])
+def test_statistics_of_numbers_are_those_of_all_frames(name: str, datasets: dict[str, Path]) -> None:
+    statistics = json.loads((datasets[name] / "meta" / "stats.json").read_text())
+    table = pa.concat_tables(map(pq.read_table, sorted((datasets[name] / "data").rglob("*.parquet"))))
+    for key in ("action", "observation.state"):
+        frames = np.array(table[key].to_pylist())
+        found = {each: np.array(values) for each, values in statistics[key].items()}
+        quantiles = {q: np.quantile(frames, int(q[1:]) / 100, axis=0) for q in found if q[1:].isdigit()}
+        assert sorted(quantiles) == ["q01", "q10", "q50", "q90", "q99"]
+        bounds = {"min": frames.min(axis=0), "max": frames.max(axis=0)}
+        expected = quantiles | bounds | {"mean": frames.mean(axis=0), "std": frames.std(axis=0)}
+        assert found.pop("count") == [len(frames)]
+        assert found.keys() == expected.keys()
+        for each, values in expected.items():
+            np.testing.assert_allclose(found[each], values, rtol=0, atol=1e-6, err_msg=f"{key} {each}")
 
 
 def test_image_statistics_are_sampled_and_right(tmp_path: Path) -> None:

@@ -60,7 +60,8 @@ def clipping_text(actions_ND: np.ndarray, dim_names: Sequence[str]) -> tuple[str
     is_much = bool((is_clipped_ND.mean(axis=0) > MUCH_CLIPPED).any())
     if is_much:
         text += (
-            ". LeRobot averages quantiles over episodes, so that they are not the data's; "
+            ". LeRobot averages quantiles over episodes, so that they are not the data's: `lerobot-bomb "
+            "statistics FOLDER --mend` makes them so. "
             "--policy.normalization_mapping with ACTION: MIN_MAX clips nothing"
         )
     return text, is_much

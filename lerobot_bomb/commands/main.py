@@ -32,6 +32,7 @@ COMMANDS = {
     "eval": "lerobot-eval, which also writes the executed actions to a file",
     "smoothness": "second and third differences of executed actions, of demonstrations and evaluations",
     "offline-metrics": "loss, accuracy and L1 of a checkpoint on recorded frames, beside trivial predictors",
+    "statistics": "compare a dataset's statistics of numbers with all of its frames, and mend them",
     "fit-grid": "an action grid on a dataset: its fit, its edges and what it rounds off",
     "init": "a policy before its training, as a checkpoint that adapters can be trained on",
     "merge": "adapters and their base as one checkpoint",

@@ -11,6 +11,7 @@ from lerobot_bomb.commands.arguments import add_hub_arguments, path_flag
 from lerobot_bomb.data.dataset_files import check_dataset
 from lerobot_bomb.data.facts import DatasetFacts
 from lerobot_bomb.data.resumable import METADATA_FILE, check_repo_id
+from lerobot_bomb.data.statistics import check_statistics
 from lerobot_bomb.hub.markdown import command, fenced
 from lerobot_bomb.hub.push import CARD
 from lerobot_bomb.hub.upload import check_token, hub_errors, upload
@@ -35,6 +36,7 @@ def run_push_dataset(args: argparse.Namespace) -> int:
             "LeRobotDataset.push_to_hub publishes other datasets"
         )
     check_dataset(args.root)
+    check_statistics(args.root)
     if not args.dry_run:
         check_token()
     files: dict[str, Path | bytes] = {

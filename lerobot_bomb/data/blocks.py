@@ -5,7 +5,6 @@ written is lost. Blocks bound that loss to the episodes of one block, which are 
 """
 
 import gc
-import json
 import logging
 import os
 import shutil
@@ -24,7 +23,7 @@ from av.logging import WARNING, set_libav_level
 from datasets import disable_progress_bars, enable_progress_bars
 from datasets.exceptions import DatasetGenerationError
 from lerobot.datasets import LeRobotDataset, aggregate_datasets
-from lerobot.datasets.utils import DEFAULT_EPISODES_PATH, STATS_PATH
+from lerobot.datasets.utils import DEFAULT_EPISODES_PATH
 
 from lerobot_bomb._compat import (
     abandon,
@@ -33,6 +32,7 @@ from lerobot_bomb._compat import (
     sampled_image_statistics,
     without_statistics,
 )
+from lerobot_bomb.data.statistics import write_statistics
 
 ENCODER_THREADS = 1  # per camera, which keeps two cores busy; see benchmarks/record_speed.py
 IMAGE_WRITER_THREADS = 4
@@ -103,7 +103,8 @@ def merge_blocks(layout: DatasetLayout, blocks: list[Path], root: Path) -> None:
     """Merge finished blocks, in their order, into one dataset.
 
     Videos and tables are joined up to LeRobot's file sizes. Tables that hold images or depth stay one per
-    block: to join them LeRobot would read and write all earlier images again for every block.
+    block: to join them LeRobot would read and write all earlier images again for every block. Statistics of
+    numbers are those of all frames.
 
     Raises:
         OSError: the disk is full.
@@ -122,9 +123,8 @@ def merge_blocks(layout: DatasetLayout, blocks: list[Path], root: Path) -> None:
             )
         except DatasetGenerationError as error:
             raise OSError(f"the blocks could not be read: {error.__cause__}") from error
-    # LeRobot writes the keys in the order of a set, which differs from run to run
-    stats = root / STATS_PATH
-    stats.write_text(json.dumps(json.loads(stats.read_text()), indent=4, sort_keys=True))
+    # LeRobot's are means over the blocks, and its keys in the order of a set, which differs from run to run
+    write_statistics(root)
 
 
 @contextmanager

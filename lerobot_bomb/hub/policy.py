@@ -1,11 +1,12 @@
 """What our policies do with the Hub and checkpoints: one commit with a card out, clear errors in."""
 
 import logging
+from collections.abc import Collection
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import TYPE_CHECKING, Any, ClassVar, cast
 
-from lerobot.configs import PreTrainedConfig
+from lerobot.configs import NormalizationMode, PreTrainedConfig
 from lerobot.configs.train import TrainPipelineConfig
 from lerobot.utils.constants import CHECKPOINTS_DIR, LAST_CHECKPOINT_LINK, PRETRAINED_MODEL_DIR
 from safetensors import safe_open
@@ -23,6 +24,7 @@ from lerobot_bomb.checkpoints.checks import (
 from lerobot_bomb.checkpoints.environment import environment_of_dataset
 from lerobot_bomb.checkpoints.names import WEIGHTS, is_hub_id
 from lerobot_bomb.data.facts import DatasetFacts
+from lerobot_bomb.data.statistics import mending, wrong_statistics
 from lerobot_bomb.finite import require_finite_statistics
 from lerobot_bomb.hub.card import Checkpoint
 from lerobot_bomb.hub.method import Method
@@ -65,7 +67,7 @@ class HubPolicy:
             )
         _require_finite_statistics_of(dataset_meta)
         _next(super()).__init__(config)
-        self._take_environment(dataset_meta)
+        self._take_dataset(dataset_meta)
 
     @classmethod
     def from_pretrained(
@@ -99,12 +101,13 @@ class HubPolicy:
         if isinstance(config, cls.config_class):
             check_config(folder, config)
         policy = _next(super()).from_pretrained(pretrained_name_or_path, config=config, **kwargs)
-        policy._take_environment(dataset_meta)
+        policy._take_dataset(dataset_meta)
         return policy
 
-    def _take_environment(self, dataset_meta: "LeRobotDatasetMetadata | None") -> None:
+    def _take_dataset(self, dataset_meta: "LeRobotDatasetMetadata | None") -> None:
         if dataset_meta is None:
             return
+        _tell_wrong_quantiles(dataset_meta, self.config.normalization_mapping.values())
         before, now = self.config.environment, environment_of_dataset(dataset_meta.root)
         if before is not None and now is not None and (names := before.differences(now)):
             logger.warning(
@@ -113,6 +116,12 @@ class HubPolicy:
                 self.config.pretrained_path or "the checkpoint",
                 before.text(names),
                 now.text(names),
+            )
+        if now is not None and now.task is None:
+            logger.warning(
+                "%s does not say which suite its episodes are of, so the policy will act in any: its columns "
+                "bomb/* are gone, which lerobot-edit-dataset drops when it deletes or splits episodes",
+                dataset_meta.root,
             )
         self.config.environment = now
 
@@ -188,6 +197,18 @@ class HubPolicy:
 def _require_finite_statistics_of(meta: "LeRobotDatasetMetadata | None") -> None:
     if meta is not None:
         require_finite_statistics(cast("Any", meta.stats))
+
+
+def _tell_wrong_quantiles(meta: "LeRobotDatasetMetadata", modes: Collection[NormalizationMode]) -> None:
+    """Warn where a policy is normalised by quantiles that are not those of its frames, if these are here."""
+    if not {NormalizationMode.QUANTILES, NormalizationMode.QUANTILE10} & set(modes):
+        return
+    try:
+        wrong = wrong_statistics(meta.root)
+    except (OSError, ValueError):  # streamed, or damaged: whoever reads it says so
+        return
+    for each in wrong:
+        logger.warning("%s: %s. %s", meta.root, each, mending(meta.root))
 
 
 def _next(policy: Any) -> Any:
