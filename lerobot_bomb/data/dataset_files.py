@@ -172,18 +172,6 @@ def read_episodes(root: Path, info: Info) -> pa.Table:
     return episodes
 
 
-def episode_column(root: Path, name: str) -> list[Any] | None:
-    """A value for each episode, null as None; None: not every table of episodes has such a column.
-
-    Raises:
-        ValueError: a table is truncated.
-    """
-    tables = [read_parquet(path) for path in sorted((root / EPISODES_FOLDER).rglob("*.parquet"))]
-    if not tables or any(name not in table.column_names for table in tables):
-        return None
-    return [value for table in tables for value in table[name].to_pylist()]
-
-
 def check_videos(root: Path, info: Info, episodes: pa.Table) -> None:
     """The videos of all cameras hold the frames of the episodes, one episode after the other.
 

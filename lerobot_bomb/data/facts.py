@@ -6,7 +6,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from lerobot_bomb.data.dataset_files import INFO_FILE, episode_column
+from lerobot_bomb.data.dataset_files import EPISODES_FOLDER, INFO_FILE, read_parquet
 from lerobot_bomb.data.environment import Environment, numbered_tasks
 from lerobot_bomb.data.resumable import METADATA_FILE
 from lerobot_bomb.files import read_json
@@ -120,5 +120,13 @@ class DatasetFacts:
 
 
 def _read_specs(root: Path) -> list[dict[str, Any]] | None:
-    texts = episode_column(root, SPEC_COLUMN)
-    return None if texts is None or None in texts else [json.loads(text) for text in texts]
+    """Return `EpisodeSpec` of each episode as JSON; None: not every episode has one.
+
+    Raises:
+        ValueError: a table of episodes is truncated.
+    """
+    tables = [read_parquet(path) for path in sorted((root / EPISODES_FOLDER).rglob("*.parquet"))]
+    if not tables or any(SPEC_COLUMN not in table.column_names for table in tables):
+        return None
+    texts = [text for table in tables for text in table[SPEC_COLUMN].to_pylist()]
+    return None if None in texts else [json.loads(text) for text in texts]
