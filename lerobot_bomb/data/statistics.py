@@ -44,7 +44,7 @@ class WrongStatistics:
         if np.isnan(self.shares_outside).any():
             return text
         shares = ", ".join(f"{share:.1%}" for share in self.shares_outside)
-        return f"{text}; {shares} of them lie beyond q01..q99 of its dimensions"
+        return f"{text}; of these, by dimension, {shares} lie beyond q01..q99"
 
 
 def exact_statistics(values_ND: np.ndarray) -> Statistics:
