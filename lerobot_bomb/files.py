@@ -3,16 +3,20 @@
 import errno
 import json
 import os
+import re
 import tempfile
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager, suppress
 from fcntl import LOCK_EX, flock
+from itertools import chain, count
 from pathlib import Path
 from typing import Any
 
 from lerobot_bomb.flags import check_link
 
 FULL = (errno.ENOSPC, errno.EDQUOT)  # the disk, or this user's share of it
+
+MAX_NAME = 100  # characters of a file's name that is made of a text
 
 
 def read_json(path: Path) -> dict[str, Any]:
@@ -31,6 +35,20 @@ def read_json(path: Path) -> dict[str, Any]:
     if not isinstance(values, dict):
         raise ValueError(f"{path} is not a JSON object")
     return values
+
+
+def file_names(texts: Sequence[str]) -> list[str]:
+    """A file's name for each text, of letters, digits, '_', '-' and '.'; no two are the same, in any case.
+
+    None begins with a '.', so that none is hidden, or stands for the folder or the one above.
+    """
+    names: list[str] = []
+    for text in texts:
+        readable = re.sub(r"[^\w.-]+", "-", text, flags=re.ASCII)[:MAX_NAME].strip("-.") or "unnamed"
+        numbered = (f"{readable}-{number}" for number in count(2))
+        taken = {name.lower() for name in names}
+        names.append(next(name for name in chain([readable], numbered) if name.lower() not in taken))
+    return names
 
 
 def check_writable(flag: str, path: Path) -> None:

@@ -9,7 +9,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from lerobot_bomb.stats import Measure, measure
+from lerobot_bomb.bootstrap import Measure, measure
 
 MIN_ACTIONS = 4  # that a third difference takes
 

@@ -6,59 +6,14 @@ from dataclasses import dataclass
 
 from lerobot_bomb.checkpoints.shipped import checkpoint_path
 from lerobot_bomb.envs.results import Row
-from lerobot_bomb.evaluation.result_groups import (
-    count_pairs,
-    describe_change,
-    describe_policy,
-    groups_of,
-    settings_of,
-)
+from lerobot_bomb.evaluation.paired import PairedComparison, compare_pairs, describe_test
+from lerobot_bomb.evaluation.result_groups import Group, describe_policy, groups_of, rate_of, settings_of
 from lerobot_bomb.evaluation.result_kind import NOT_RECORDED, Pair
-from lerobot_bomb.stats import (
-    PairedCounts,
-    episodes_to_tell_apart,
-    format_rate,
-    holm,
-    paired_difference_interval,
-)
 
 POLICY = "policy"  # the one setting that the episodes of a pair may differ in
+CONDITION = "perturbations"
 
 type Values = dict[str, set[str]]  # of settings
-
-
-@dataclass(frozen=True)
-class Comparison:
-    """The episodes of one condition that both policies played."""
-
-    condition: str
-    pairs: list[Pair]  # of the first policy and of the second
-    p_value: float  # adjusted for the number of conditions
-
-    @property
-    def counts(self) -> PairedCounts:
-        """How often which of the two succeeded."""
-        return count_pairs(self.pairs)
-
-    @property
-    def interval(self) -> tuple[float, float]:
-        """95 % interval of the second rate minus the first."""
-        return paired_difference_interval(self.counts)
-
-    def lines(self) -> list[str]:
-        """The comparison as text, a line each."""
-        counts, (low, high) = self.counts, self.interval
-        needed = episodes_to_tell_apart(counts)
-        more = f"; {needed} pairs tell such a difference apart" if needed and low <= 0 <= high else ""
-        change = describe_change(self.pairs)
-        return [
-            f"A          {format_rate(counts.first, counts.n)}",
-            f"B          {format_rate(counts.second, counts.n)}",
-            f"B - A      {100 * counts.difference:+.1f} points [{100 * low:+.1f}, {100 * high:+.1f}]; "
-            f"A alone succeeded in {counts.only_first}, B alone in {counts.only_second} of {counts.n} pairs, "
-            f"p = {self.p_value:.2g}{more}",
-            *([f"           {change}"] if change else []),
-        ]
 
 
 @dataclass(frozen=True)
@@ -66,7 +21,7 @@ class Comparisons:
     """All that two sets of episodes have in common."""
 
     policies: tuple[str, str]
-    conditions: list[Comparison]
+    conditions: list[PairedComparison]
     num_unpaired: tuple[int, int]  # episodes that the other policy did not play
 
     @property
@@ -79,16 +34,36 @@ class Comparisons:
         lines = [f"{name}: {policy}" for name, policy in zip("AB", self.policies, strict=True)]
         lines += ["A and B are the same policy"] if self.policies[0] == self.policies[1] else []
         for each in self.conditions:
-            lines += [f"{each.condition}: {len(each.pairs)} pairs", *(f"  {line}" for line in each.lines())]
+            lines += [f"{each.condition}: {_num_pairs(each)}", *(f"  {line}" for line in _lines(each))]
         if any(self.num_unpaired):
             a, b = self.num_unpaired
             lines.append(f"not compared, for the other did not play them: {a} episodes of A, {b} of B")
         notes = (
-            "rates: 95 % Wilson intervals; B - A: Newcombe's for pairs; p: exact McNemar test, to be trusted "
-            "where the two disagree, as with few pairs"
+            "rates: 95 % Wilson intervals, clustered by seed; B - A: Newcombe's for pairs; p: "
+            f"{describe_test(len(self.conditions))}, to be trusted where the two disagree, as with few pairs"
         )
-        adjusted = f", adjusted for {len(self.conditions)} conditions (Holm)"
-        return [*lines, notes + adjusted * (len(self.conditions) > 1)]
+        return [*lines, notes]
+
+
+def _num_pairs(of: PairedComparison) -> str:
+    if of.num_starts == len(of.pairs):
+        return f"{len(of.pairs)} pairs"
+    return f"{len(of.pairs)} pairs of {of.num_starts} seeds, which B - A and p take as independent"
+
+
+def _lines(of: PairedComparison) -> list[str]:
+    """The pairs of a condition as text, a line each."""
+    counts, (low, high), change = of.counts, of.interval, of.describe_change()
+    needed = of.num_needed
+    more = f"; {needed} pairs tell such a difference apart" if needed else ""
+    rates = [rate_of(list(rows)) for rows in zip(*of.pairs, strict=True)]
+    return [
+        *(f"{name}          {rate}" for name, rate in zip("AB", rates, strict=True)),
+        f"B - A      {100 * counts.difference:+.1f} points [{100 * low:+.1f}, {100 * high:+.1f}]; "
+        f"A alone succeeded in {counts.only_first}, B alone in {counts.only_second} of {counts.n} pairs, "
+        f"p = {of.p_value:.2g}{more}",
+        *([f"           {change}"] if change else []),
+    ]
 
 
 def of_policies(rows: list[Row], names: Sequence[str]) -> list[list[Row]]:
@@ -117,6 +92,13 @@ def of_policies(rows: list[Row], names: Sequence[str]) -> list[list[Row]]:
     return chosen
 
 
+def can_compare(first: Group, second: Group) -> bool:
+    """Whether two groups differ in nothing but their policies, as far as their lines say."""
+    return not _apart(
+        *({name: {value} for name, value in group.settings.items()} for group in (first, second))
+    )
+
+
 def compare(first: list[Row], second: list[Row]) -> Comparisons:
     """Pair the episodes of two policies.
 
@@ -129,21 +111,29 @@ def compare(first: list[Row], second: list[Row]) -> Comparisons:
         raise ValueError(f"no episode was played by both: {_why_none(first, second)}")
     return Comparisons(
         policies=policies,
-        conditions=_by_condition(pairs),
+        conditions=compare_pairs(_by_condition(pairs)),
         num_unpaired=(len(_episodes(first)) - len(pairs), len(_episodes(second)) - len(pairs)),
     )
 
 
-def _by_condition(pairs: list[Pair]) -> list[Comparison]:
-    """Apart by suite too, where there are several."""
-    several = len({first["spec"].get("suite") for first, _ in pairs}) > 1
-    of_label: dict[str, list[Pair]] = {}
+def _by_condition(pairs: list[Pair]) -> dict[str, list[Pair]]:
+    """Pairs by condition, and by every setting of which they have several, such as the suite."""
+    groups: dict[str, tuple[dict[str, str], list[Pair]]] = {}
     for pair in pairs:
-        spec = pair[0]["spec"]
-        label = f"{spec['suite']}, {spec['perturbations']}" if several else spec["perturbations"]
-        of_label.setdefault(label, []).append(pair)
-    adjusted = holm([count_pairs(of).p_value for of in of_label.values()])
-    return [Comparison(label, of, p) for (label, of), p in zip(of_label.items(), adjusted, strict=True)]
+        settings = settings_of(pair[0]) | {CONDITION: pair[0]["spec"]["perturbations"]}
+        groups.setdefault(json.dumps(settings), (settings, []))[1].append(pair)
+    all_settings = [settings for settings, _ in groups.values()]
+    several = [name for name in all_settings[0] if len({of.get(name) for of in all_settings}) > 1]
+    shown = [name for name in several if name not in (POLICY, CONDITION)]
+    return {
+        ", ".join([*(_shown(name, of.get(name)) for name in shown), of[CONDITION]]): group
+        for of, group in groups.values()
+    }
+
+
+def _shown(name: str, value: str | None) -> str:
+    """'place' of a suite, 'fps 20' of another setting."""
+    return f"{value}" if name == "suite" else f"{name} {value}"
 
 
 def _only_policy(name: str, rows: list[Row]) -> str:
@@ -160,9 +150,9 @@ def _only_policy(name: str, rows: list[Row]) -> str:
 def _pairs(first: list[Row], second: list[Row]) -> Iterator[Pair]:
     candidates: dict[str, list[tuple[Row, Values]]] = {}
     for row in _episodes(second):
-        candidates.setdefault(_spec(row), []).append((row, _values_of([row])))
+        candidates.setdefault(episode_of(row), []).append((row, _values_of([row])))
     for row in _episodes(first):
-        of_spec, values = candidates.get(_spec(row), []), _values_of([row])
+        of_spec, values = candidates.get(episode_of(row), []), _values_of([row])
         if match := next((other for other in of_spec if not _apart(values, other[1])), None):
             of_spec.remove(match)
             yield row, match[0]
@@ -173,7 +163,8 @@ def _episodes(rows: list[Row]) -> list[Row]:
     return [row for group in groups_of(rows) for row in group.rows]
 
 
-def _spec(row: Row) -> str:
+def episode_of(row: Row) -> str:
+    """Equal for rows of one episode under one condition, whoever acts."""
     return json.dumps(row["spec"], sort_keys=True)
 
 

@@ -8,9 +8,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from lerobot_bomb.bootstrap import Measure, paired_bootstrap_interval
 from lerobot_bomb.evaluation.executed import Executed
 from lerobot_bomb.smoothness import MIN_ACTIONS, smoothness
-from lerobot_bomb.stats import Measure, paired_bootstrap_interval
 from lerobot_bomb.tables import print_table
 
 GRIPPER = "gripper"  # in the names of dims that do not count
