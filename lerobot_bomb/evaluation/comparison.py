@@ -11,7 +11,6 @@ from lerobot_bomb.evaluation.result_groups import Group, describe_policy, groups
 from lerobot_bomb.evaluation.result_kind import NOT_RECORDED, Pair
 
 POLICY = "policy"  # the one setting that the episodes of a pair may differ in
-CONDITION = "perturbations"
 
 type Values = dict[str, set[str]]  # of settings
 
@@ -94,9 +93,12 @@ def of_policies(rows: list[Row], names: Sequence[str]) -> list[list[Row]]:
 
 def can_compare(first: Group, second: Group) -> bool:
     """Whether two groups differ in nothing but their policies, as far as their lines say."""
-    return not _apart(
-        *({name: {value} for name, value in group.settings.items()} for group in (first, second))
-    )
+    return not _apart(_values_of([first]), _values_of([second]))
+
+
+def episode_of(row: Row) -> str:
+    """Equal for rows of one episode under one condition, whoever acts."""
+    return json.dumps(row["spec"], sort_keys=True)
 
 
 def compare(first: list[Row], second: list[Row]) -> Comparisons:
@@ -105,30 +107,29 @@ def compare(first: list[Row], second: list[Row]) -> Comparisons:
     Raises:
         ValueError: either are of several policies, or there is no pair; it says what they differ in.
     """
-    policies = _only_policy("the first", first), _only_policy("the second", second)
-    pairs = list(_pairs(first, second))
+    groups = groups_of(first), groups_of(second)
+    policies = _only_policy("the first", groups[0]), _only_policy("the second", groups[1])
+    pairs = list(_pairs(*groups))
     if not pairs:
-        raise ValueError(f"no episode was played by both: {_why_none(first, second)}")
+        raise ValueError(f"no episode was played by both: {_why_none(*groups)}")
+    num_first, num_second = (sum(len(group.rows) for group in of) for of in groups)
     return Comparisons(
         policies=policies,
         conditions=compare_pairs(_by_condition(pairs)),
-        num_unpaired=(len(_episodes(first)) - len(pairs), len(_episodes(second)) - len(pairs)),
+        num_unpaired=(num_first - len(pairs), num_second - len(pairs)),
     )
 
 
-def _by_condition(pairs: list[Pair]) -> dict[str, list[Pair]]:
+def _by_condition(pairs: list[tuple[Group, Pair]]) -> dict[str, list[Pair]]:
     """Pairs by condition, and by every setting of which they have several, such as the suite."""
-    groups: dict[str, tuple[dict[str, str], list[Pair]]] = {}
-    for pair in pairs:
-        settings = settings_of(pair[0]) | {CONDITION: pair[0]["spec"]["perturbations"]}
-        groups.setdefault(json.dumps(settings), (settings, []))[1].append(pair)
-    all_settings = [settings for settings, _ in groups.values()]
-    several = [name for name in all_settings[0] if len({of.get(name) for of in all_settings}) > 1]
-    shown = [name for name in several if name not in (POLICY, CONDITION)]
-    return {
-        ", ".join([*(_shown(name, of.get(name)) for name in shown), of[CONDITION]]): group
-        for of, group in groups.values()
-    }
+    settings = [dict(of) for of in dict.fromkeys(tuple(group.settings.items()) for group, _ in pairs)]
+    names = dict.fromkeys(name for of in settings for name in of if name != POLICY)
+    several = [name for name in names if len({of.get(name) for of in settings}) > 1]
+    labelled: dict[str, list[Pair]] = {}
+    for group, pair in pairs:
+        shown = (_shown(name, group.settings.get(name)) for name in several)
+        labelled.setdefault(", ".join([*shown, pair[0]["spec"]["perturbations"]]), []).append(pair)
+    return labelled
 
 
 def _shown(name: str, value: str | None) -> str:
@@ -136,42 +137,36 @@ def _shown(name: str, value: str | None) -> str:
     return f"{value}" if name == "suite" else f"{name} {value}"
 
 
-def _only_policy(name: str, rows: list[Row]) -> str:
-    settings = {settings_of(row)[POLICY] for row in rows}
-    if len(settings) > 1:
-        described = sorted({describe_policy(row) for row in rows})
+def _only_policy(name: str, groups: list[Group]) -> str:
+    described = {group.settings[POLICY]: describe_policy(group.rows[0]) for group in groups}
+    if len(described) > 1:
+        texts = "; ".join(sorted(set(described.values())))
         raise ValueError(
-            f"{name} results are of {len(settings)} policies ({'; '.join(described)}): compare two of one "
-            "file with --policies=A,B"
+            f"{name} results are of {len(described)} policies ({texts}): compare two of one file with "
+            "--policies=A,B"
         )
-    return describe_policy(rows[0])
+    return describe_policy(groups[0].rows[0])
 
 
-def _pairs(first: list[Row], second: list[Row]) -> Iterator[Pair]:
-    candidates: dict[str, list[tuple[Row, Values]]] = {}
-    for row in _episodes(second):
-        candidates.setdefault(episode_of(row), []).append((row, _values_of([row])))
-    for row in _episodes(first):
-        of_spec, values = candidates.get(episode_of(row), []), _values_of([row])
-        if match := next((other for other in of_spec if not _apart(values, other[1])), None):
-            of_spec.remove(match)
-            yield row, match[0]
+def _pairs(first: list[Group], second: list[Group]) -> Iterator[tuple[Group, Pair]]:
+    """The group of the first row, and both; of an episode that was run again, the last row."""
+    candidates: dict[str, list[tuple[int, Row]]] = {}
+    for place, group in enumerate(second):
+        for row in group.rows:
+            candidates.setdefault(episode_of(row), []).append((place, row))
+    for group in first:
+        can_pair = [can_compare(group, other) for other in second]
+        for row in group.rows:
+            of_episode = candidates.get(episode_of(row), [])
+            if match := next((each for each in of_episode if can_pair[each[0]]), None):
+                of_episode.remove(match)
+                yield group, (row, match[1])
 
 
-def _episodes(rows: list[Row]) -> list[Row]:
-    """Each once: of an episode that was run again, the last one."""
-    return [row for group in groups_of(rows) for row in group.rows]
-
-
-def episode_of(row: Row) -> str:
-    """Equal for rows of one episode under one condition, whoever acts."""
-    return json.dumps(row["spec"], sort_keys=True)
-
-
-def _values_of(rows: list[Row]) -> Values:
-    """{setting: its values in these rows}."""
-    settings = [settings_of(row) for row in rows]
-    return {name: {of.get(name, NOT_RECORDED) for of in settings} for name in settings[0]}
+def _values_of(groups: list[Group]) -> Values:
+    """{setting: its values in these groups}."""
+    names = groups[0].settings
+    return {name: {group.settings.get(name, NOT_RECORDED) for group in groups} for name in names}
 
 
 def _apart(first: Values, second: Values) -> list[str]:
@@ -188,7 +183,7 @@ def _apart(first: Values, second: Values) -> list[str]:
     ]
 
 
-def _why_none(first: list[Row], second: list[Row]) -> str:
+def _why_none(first: list[Group], second: list[Group]) -> str:
     if apart := _apart(_values_of(first), _values_of(second)):
         return f"they differ in {', '.join(apart)}"
     return "seeds, conditions or tasks have nothing in common; evaluate both with the same --seed and flags"
