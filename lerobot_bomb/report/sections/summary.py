@@ -1,5 +1,7 @@
 """What a reviewer reads in a minute."""
 
+from collections.abc import Iterator
+
 from lerobot_bomb.conditions import NONE
 from lerobot_bomb.envs.results import Row
 from lerobot_bomb.evaluation.comparison import can_compare, episode_of
@@ -23,14 +25,14 @@ NOTE = (
 
 def section(report: Report) -> Section:
     """A line for each arm; below, what is missing, or is no basis for a comparison."""
-    return Section("Summary", [summary(report.arms)], [*report.missing, *_differences(report.arms)])
+    shared = [_shared(arm, _peers(arm, report.arms)) for arm in report.arms]
+    lines = [*report.missing, *_left_out(report.arms, shared), *_other_nominal(report.arms)]
+    return Section("Summary", [_summary(report.arms, shared)], lines)
 
 
-def summary(arms: list[Arm]) -> Table:
-    """A line for each arm: what a reviewer reads in a minute."""
+def _summary(arms: list[Arm], shared_rows: list[list[Row]]) -> Table:
     table, notes = [], dict[str, str]()
-    for arm in arms:
-        shared = _shared(arm, arms)
+    for arm, shared in zip(arms, shared_rows, strict=True):
         measures = _measures(arm)
         notes |= {measure.name: measure.note for measure, _ in measures}
         table.append(
@@ -56,10 +58,10 @@ def _peers(arm: Arm, arms: list[Arm]) -> list[Arm]:
     return [other for other in arms if other is not arm and can_compare(arm.group, other.group)]
 
 
-def _shared(arm: Arm, arms: list[Arm]) -> list[Row]:
+def _shared(arm: Arm, peers: list[Arm]) -> list[Row]:
     """The arm's perturbed rows of the episodes that its peers with such rows have, too."""
     rows = _perturbed(arm)
-    for peer in _peers(arm, arms):
+    for peer in peers:
         episodes = {episode_of(row) for row in _perturbed(peer)}
         rows = [row for row in rows if not episodes or episode_of(row) in episodes]
     return rows
@@ -78,19 +80,20 @@ def _worst(rows: list[Row]) -> list[Cell]:
     return [Cell(names, worst), Cell(f"{100 * share:.0f} %", share, share)]
 
 
-def _differences(arms: list[Arm]) -> list[str]:
-    """What of the table does not compare, a line each."""
-    lines = []
+def _left_out(arms: list[Arm], shared_rows: list[list[Row]]) -> Iterator[str]:
+    """A line for each arm that has perturbed rows which its peers lack."""
+    for arm, shared in zip(arms, shared_rows, strict=True):
+        if num_left := len(_perturbed(arm)) - len(shared):
+            yield f"{arm.name}: {num_left} perturbed episodes are left out, which not all policies have"
+
+
+def _other_nominal(arms: list[Arm]) -> Iterator[str]:
+    """A line for each arm whose unperturbed rows are of other episodes than those of its peers."""
     for arm in arms:
-        num_left = len(_perturbed(arm)) - len(_shared(arm, arms))
-        if num_left:
-            lines.append(
-                f"{arm.name}: {num_left} perturbed episodes are left out, which not all policies have"
-            )
-        own = {episode_of(row) for row in arm.nominal}
-        if any(own != {episode_of(row) for row in peer.nominal} for peer in _peers(arm, arms)):
-            lines.append(f"{arm.name}: other policies have other unperturbed episodes; pairs compare below")
-    return lines
+        if peers := [peer for peer in _peers(arm, arms) if peer.nominal]:
+            own = {episode_of(row) for row in arm.nominal}
+            if own and any(own != {episode_of(row) for row in peer.nominal} for peer in peers):
+                yield f"{arm.name}: other policies have other unperturbed episodes; pairs compare below"
 
 
 def _measures(arm: Arm) -> list[tuple[Measure, str]]:
