@@ -13,6 +13,7 @@ import numpy as np
 
 Z_95 = NormalDist().inv_cdf(0.975)
 SIGNIFICANT = 0.05  # two-sided
+SMALLEST_P = 1e-99  # that is shown
 POWER = 0.8  # of the numbers of episodes that are asked for
 MAX_PAIRS = 2**20  # that are asked for
 
@@ -113,6 +114,11 @@ def mcnemar_p_value(only_first: int, only_second: int) -> float:
     from scipy.special import bdtr
 
     return min(1.0, 2 * float(bdtr(min(only_first, only_second), only_first + only_second, 0.5)))
+
+
+def format_p(p_value: float) -> str:
+    """'p = 0.031', never 'p = 0'."""
+    return f"p = {p_value:.2g}" if p_value >= SMALLEST_P else f"p < {SMALLEST_P:g}"
 
 
 @dataclass(frozen=True)

@@ -12,6 +12,7 @@ from lerobot_bomb.stats import (
     Rate,
     clustered_interval,
     episodes_to_tell_apart,
+    format_p,
     format_rate,
     holm,
     mcnemar_p_value,
@@ -102,6 +103,13 @@ def test_the_interval_of_clusters_holds_the_truth_in_95_of_100() -> None:
 )
 def test_mcnemar_counts_the_tails_of_a_fair_coin(only_first: int, only_second: int, p_value: float) -> None:
     assert mcnemar_p_value(only_first, only_second) == pytest.approx(p_value)
+
+
+@pytest.mark.parametrize(
+    ("p_value", "text"), [(0.0314, "p = 0.031"), (1.0, "p = 1"), (2.0**-400, "p < 1e-99"), (0.0, "p < 1e-99")]
+)
+def test_no_p_value_is_zero(p_value: float, text: str) -> None:
+    assert format_p(p_value) == text
 
 
 # Against statsmodels

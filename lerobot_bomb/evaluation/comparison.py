@@ -9,6 +9,7 @@ from lerobot_bomb.envs.results import Row
 from lerobot_bomb.evaluation.paired import PairedComparison, compare_pairs, describe_test
 from lerobot_bomb.evaluation.result_groups import Group, describe_policy, groups_of, rate_of, settings_of
 from lerobot_bomb.evaluation.result_kind import NOT_RECORDED, Pair
+from lerobot_bomb.stats import format_p
 
 POLICY = "policy"  # the one setting that the episodes of a pair may differ in
 
@@ -60,7 +61,7 @@ def _lines(of: PairedComparison) -> list[str]:
         *(f"{name}          {rate}" for name, rate in zip("AB", rates, strict=True)),
         f"B - A      {100 * counts.difference:+.1f} points [{100 * low:+.1f}, {100 * high:+.1f}]; "
         f"A alone succeeded in {counts.only_first}, B alone in {counts.only_second} of {counts.n} pairs, "
-        f"p = {of.p_value:.2g}{more}",
+        f"{format_p(of.p_value)}{more}",
         *([f"           {change}"] if change else []),
     ]
 

@@ -17,7 +17,7 @@ from lerobot_bomb.evaluation.result_groups import (
 )
 from lerobot_bomb.evaluation.result_kind import NO_VALUE, Measure
 from lerobot_bomb.evaluation.result_lines import check_any, kind_of, read_lines
-from lerobot_bomb.stats import Rate
+from lerobot_bomb.stats import Rate, format_p
 
 
 @dataclass(frozen=True)
@@ -73,7 +73,7 @@ def _pair_line(of: PairedComparison) -> str:
     counts, change = of.counts, of.describe_change()
     return (
         f"  {of.condition}: {counts.n} pairs, {counts.only_first} lost, {counts.only_second} won, "
-        f"p = {of.p_value:.2g} ({describe_test(of.num_conditions)}){'; ' * bool(change)}{change}"
+        f"{format_p(of.p_value)} ({describe_test(of.num_conditions)}){'; ' * bool(change)}{change}"
     )
 
 

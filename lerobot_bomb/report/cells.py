@@ -6,6 +6,7 @@ from lerobot_bomb.envs.results import Row
 from lerobot_bomb.evaluation.paired import PairedComparison
 from lerobot_bomb.evaluation.result_groups import rate_of
 from lerobot_bomb.report.table import Cell
+from lerobot_bomb.stats import format_p
 
 INTERVALS = "95 % Wilson intervals, clustered by seed"  # of `rate`
 
@@ -26,7 +27,7 @@ def points(of: PairedComparison) -> list[Cell]:
     counts, (low, high) = of.counts, of.interval
     value = {"difference": counts.difference, "low": low, "high": high, **vars(counts)}
     text = f"{100 * counts.difference:+.0f} [{100 * low:+.0f}, {100 * high:+.0f}]"
-    return [Cell(text, value), Cell(f"{of.p_value:.2g}", of.p_value)]
+    return [Cell(text, value), Cell(format_p(of.p_value).removeprefix("p = "), of.p_value)]
 
 
 def count(number: int, of: int) -> Cell:

@@ -13,7 +13,7 @@ from lerobot_bomb.evaluation.result_groups import count_pairs, different_fields,
 from lerobot_bomb.evaluation.result_kind import Pair
 from lerobot_bomb.report.cells import INTERVALS, rate
 from lerobot_bomb.report.table import Cell, Table
-from lerobot_bomb.stats import SIGNIFICANT, PairedCounts
+from lerobot_bomb.stats import SIGNIFICANT, PairedCounts, format_p
 
 POLICY, AGAIN, ALONE = "the policy", "again, in another process", "one episode at a time"
 BLANK, OTHER_INSTRUCTION = "with black images", "with another episode's instruction"
@@ -68,7 +68,7 @@ def _pairs(first: list[Row], second: list[Row]) -> list[Pair]:
 
 
 def _p(counts: PairedCounts) -> str:
-    return f"p = {counts.p_value:.2g}, not adjusted"
+    return f"{format_p(counts.p_value)}, not adjusted"
 
 
 def _same_again(pairs: list[Pair]) -> Verdict:
@@ -119,7 +119,7 @@ def _generalises(train: list[Row], heldout: list[Row]) -> Verdict:
     is_worse = p_value < SIGNIFICANT and held / len(heldout) < shown / len(train)
     evidence = (
         f"{held} of {len(heldout)} held out, {shown} of {len(train)} others "
-        f"(Fisher's p = {p_value:.2g}, not adjusted)"
+        f"(Fisher's {format_p(p_value)}, not adjusted)"
     )
     return Verdict("does as well on what is held out", NO if is_worse else YES, evidence)
 
