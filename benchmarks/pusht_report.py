@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from lerobot_bomb.stats import bootstrap_interval
+from lerobot_bomb.bootstrap import bootstrap_interval
 from lerobot_bomb.tables import print_table
 
 T_QUANTILES = {2: 12.706, 3: 4.303, 4: 3.182, 5: 2.776}  # 97.5 % of Student's t, by number of seeds

@@ -3,10 +3,12 @@
 import errno
 import json
 import os
+import re
 import tempfile
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager, suppress
 from fcntl import LOCK_EX, flock
+from itertools import chain, count
 from pathlib import Path
 from typing import Any
 
@@ -14,6 +16,7 @@ from lerobot_bomb.flags import check_link
 
 MAX_DEPTH = 100  # of lists and objects in one another; what goes deeper ends in a RecursionError somewhere
 FULL = (errno.ENOSPC, errno.EDQUOT)  # the disk, or this user's share of it
+MAX_NAME = 100  # characters of a file's name that is made of a text
 
 
 def read_json(path: Path) -> dict[str, Any]:
@@ -45,6 +48,20 @@ def _check_depth(values: Any, levels: int) -> None:
         raise RecursionError
     for value in values.values() if isinstance(values, dict) else values:
         _check_depth(value, levels - 1)
+
+
+def file_names(texts: Sequence[str]) -> list[str]:
+    """A file's name for each text, of letters, digits, '_', '-' and '.'; no two are the same, in any case.
+
+    None begins with a '.', so that none is hidden, or stands for the folder or the one above.
+    """
+    names: list[str] = []
+    for text in texts:
+        readable = re.sub(r"[^\w.-]+", "-", text, flags=re.ASCII)[:MAX_NAME].strip("-.") or "unnamed"
+        numbered = (f"{readable}-{number}" for number in count(2))
+        taken = {name.lower() for name in names}
+        names.append(next(name for name in chain([readable], numbered) if name.lower() not in taken))
+    return names
 
 
 def check_writable(flag: str, path: Path) -> None:

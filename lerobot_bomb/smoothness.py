@@ -9,7 +9,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from lerobot_bomb.stats import Measure, measure
+from lerobot_bomb.bootstrap import Measure, measure
 
 MIN_ACTIONS = 4  # that a third difference takes
 
@@ -26,6 +26,7 @@ def smoothness(
     actions_RD: np.ndarray,
     episode_R: np.ndarray,
     *,
+    start_R: np.ndarray | None = None,
     exclude: Collection[int] = (),
     std_D: np.ndarray | None = None,
     dt_s: float | None = None,
@@ -35,6 +36,7 @@ def smoothness(
     Args:
         actions_RD: in the data's units, in order of time.
         episode_R: the episode of each; actions of one follow each other.
+        start_R: what episodes share that start alike and are drawn together; each is alone by default.
         exclude: dims that do not count, such as a gripper.
         std_D: the data's standard deviation, for normalised units.
         dt_s: seconds between actions, for units per s^2 and per s^3; otherwise per step.
@@ -57,13 +59,16 @@ def smoothness(
             raise ValueError(f"std_D={std_D.tolist()} must be positive in the dims {dims}")
         actions_RD = actions_RD / std_D[dims]
     step = 1.0 if dt_s is None else dt_s
-    return Smoothness(*(_mean_difference(actions_RD, episode_R, order, step) for order in (2, 3)))
+    start_R = episode_R if start_R is None else start_R
+    return Smoothness(*(_mean_difference(actions_RD, episode_R, start_R, order, step) for order in (2, 3)))
 
 
-def _mean_difference(actions_RD: np.ndarray, episode_R: np.ndarray, order: int, step: float) -> Measure:
-    """Over the differences that lie within an episode."""
+def _mean_difference(
+    actions_RD: np.ndarray, episode_R: np.ndarray, start_R: np.ndarray, order: int, step: float
+) -> Measure:
+    """Mean of the differences that lie within an episode."""
     within = episode_R[order:] == episode_R[:-order]
     if not within.any():
         raise ValueError(f"no episode has {order + 1} actions, as a difference of order {order} takes")
     norms = np.linalg.norm(np.diff(actions_RD, n=order, axis=0), axis=1) / step**order
-    return measure(norms[within], episode_R[order:][within])
+    return measure(norms[within], start_R[order:][within])

@@ -1,19 +1,21 @@
-"""Intervals and tests for success rates, and intervals for means over episodes.
+"""Intervals and tests for success rates.
 
-Shapes: `R` frames, `E` episodes.
+Shapes: `N` records, `C` clusters of records that are not independent, as those of one seed.
 """
 
-from collections.abc import Sequence
+from collections import Counter
+from collections.abc import Hashable, Sequence
 from dataclasses import dataclass
-from math import ceil, comb, sqrt
+from math import sqrt
 from statistics import NormalDist
 
 import numpy as np
 
-NUM_RESAMPLES = 2000
-NUM_BCA_RESAMPLES = 9999
 Z_95 = NormalDist().inv_cdf(0.975)
+SIGNIFICANT = 0.05  # two-sided
+SMALLEST_P = 1e-99  # that is shown
 POWER = 0.8  # of the numbers of episodes that are asked for
+MAX_PAIRS = 2**20  # that are asked for
 
 
 def wilson_interval(successes: int, n: int) -> tuple[float, float]:
@@ -26,16 +28,82 @@ def wilson_interval(successes: int, n: int) -> tuple[float, float]:
     """
     if n < 1 or not 0 <= successes <= n:
         raise ValueError(f"need 0 <= successes <= n and n >= 1, got successes={successes}, n={n}")
-    rate = successes / n
-    center = (rate + Z_95**2 / (2 * n)) / (1 + Z_95**2 / n)
-    half = Z_95 / (1 + Z_95**2 / n) * sqrt(rate * (1 - rate) / n + Z_95**2 / (4 * n**2))
+    return _wilson(successes / n, n, Z_95)
+
+
+def _wilson(rate: float, n: float, z: float) -> tuple[float, float]:
+    center = (rate + z**2 / (2 * n)) / (1 + z**2 / n)
+    half = z / (1 + z**2 / n) * sqrt(rate * (1 - rate) / n + z**2 / (4 * n**2))
     return max(0.0, center - half), min(1.0, center + half)
 
 
+def clustered_interval(successes_C: np.ndarray, counts_C: np.ndarray) -> tuple[float, float] | None:
+    """95 % interval of a proportion whose records come in clusters; None for a single cluster of several.
+
+    Wilson's interval of as many independent records as tell as much, with Student's t for the number of
+    clusters; never fewer than there are clusters, never more than there are records. Clusters of one record
+    each: Wilson's interval.
+    Source: Dean and Pagano (2015), "Evaluating confidence interval methods for binomial proportions in
+    clustered surveys".
+    """
+    num_clusters, n = len(counts_C), int(counts_C.sum())
+    if num_clusters == n:
+        return wilson_interval(int(successes_C.sum()), n)
+    if num_clusters == 1:
+        return None
+    from scipy.special import stdtrit
+
+    rate = successes_C.sum() / n
+    spread = ((successes_C - rate * counts_C) ** 2).sum() * num_clusters / (num_clusters - 1)
+    num_effective = n**2 * rate * (1 - rate) / spread if spread > 0 else n
+    if rate in (0, 1):  # nothing tells how alike the records of a cluster are
+        num_effective = num_clusters
+    num_effective = min(max(num_effective, num_clusters), n)
+    return _wilson(float(rate), float(num_effective), float(stdtrit(num_clusters - 1, 0.975)))
+
+
+@dataclass(frozen=True)
+class Rate:
+    """How many of n records are counted, with the 95 % interval of their share."""
+
+    successes: int
+    n: int
+    num_clusters: int  # of records that are not independent; n: all are
+    interval: tuple[float, float] | None
+
+    @classmethod
+    def of(cls, is_counted_N: Sequence[bool], cluster_N: Sequence[Hashable]) -> "Rate":
+        """The rate of at least one record; `cluster_N` says which are not independent."""
+        places: dict[Hashable, int] = {}
+        place_N = [places.setdefault(cluster, len(places)) for cluster in cluster_N]
+        successes_C = np.bincount(place_N, weights=is_counted_N, minlength=len(places))
+        interval = clustered_interval(successes_C, np.bincount(place_N))
+        return cls(int(successes_C.sum()), len(is_counted_N), len(places), interval)
+
+    @property
+    def share(self) -> float:
+        return self.successes / self.n
+
+    @property
+    def method(self) -> str:
+        """Name of the interval, or why there is none."""
+        if self.interval is None:
+            return "no interval: all are of one seed"
+        clusters = f", {self.num_clusters} clusters by seed" if self.num_clusters < self.n else ""
+        return f"95 % Wilson interval{clusters}"
+
+    def __str__(self) -> str:
+        """'48/50 = 96.0 % [86.5, 98.9]'."""
+        bounds = ""
+        if self.interval is not None:
+            low, high = self.interval
+            bounds = f" [{100 * low:.1f}, {100 * high:.1f}]"
+        return f"{self.successes}/{self.n} = {100 * self.share:.1f} %{bounds}"
+
+
 def format_rate(successes: int, n: int) -> str:
-    """'48/50 = 96.0 % [86.5, 98.9]': count, rate and its 95 % Wilson interval."""
-    low, high = wilson_interval(successes, n)
-    return f"{successes}/{n} = {100 * successes / n:.1f} % [{100 * low:.1f}, {100 * high:.1f}]"
+    """'48/50 = 96.0 % [86.5, 98.9]': count, rate and 95 % Wilson interval of independent records."""
+    return str(Rate(successes, n, n, wilson_interval(successes, n)))
 
 
 def mcnemar_p_value(only_first: int, only_second: int) -> float:
@@ -43,9 +111,14 @@ def mcnemar_p_value(only_first: int, only_second: int) -> float:
 
     Given the pairs in which one arm alone succeeded, either is as likely as a coin's side (McNemar, 1947).
     """
-    num_discordant = only_first + only_second
-    tail = sum(comb(num_discordant, k) for k in range(min(only_first, only_second) + 1))
-    return min(1.0, 2 * tail / 2**num_discordant)
+    from scipy.special import bdtr
+
+    return min(1.0, 2 * float(bdtr(min(only_first, only_second), only_first + only_second, 0.5)))
+
+
+def format_p(p_value: float) -> str:
+    """'p = 0.031', never 'p = 0'."""
+    return f"p = {p_value:.2g}" if p_value >= SMALLEST_P else f"p < {SMALLEST_P:g}"
 
 
 @dataclass(frozen=True)
@@ -60,10 +133,8 @@ class PairedCounts:
     @classmethod
     def of(cls, first_E: Sequence[bool], second_E: Sequence[bool]) -> "PairedCounts":
         """From the successes of the same episodes."""
-        pairs = list(zip(first_E, second_E, strict=True))
-        return cls(
-            *(pairs.count(pair) for pair in ((True, True), (True, False), (False, True), (False, False)))
-        )
+        pairs = Counter(zip(first_E, second_E, strict=True))
+        return cls(*(pairs[pair] for pair in ((True, True), (True, False), (False, True), (False, False))))
 
     @property
     def n(self) -> int:
@@ -86,7 +157,7 @@ class PairedCounts:
 
     @property
     def p_value(self) -> float:
-        """Of the exact McNemar test."""
+        """P-value of the exact McNemar test, not adjusted."""
         return mcnemar_p_value(self.only_first, self.only_second)
 
 
@@ -116,18 +187,40 @@ def paired_difference_interval(counts: PairedCounts) -> tuple[float, float]:
     return counts.difference - low, counts.difference + high
 
 
-def episodes_to_tell_apart(counts: PairedCounts) -> int | None:
-    """Pairs of episodes in which a difference as large as the one that was seen is found significant.
+def episodes_to_tell_apart(counts: PairedCounts, level: float = SIGNIFICANT) -> int | None:
+    """Number of pairs in which the exact McNemar test finds a difference as large as the one that was seen.
 
-    At a level of 5 %, two-sided, with a power of 80 %; None where no difference was seen.
-    Source: Miettinen (1968), "The matched pairs design in the case of all-or-none responses", large samples.
+    At this level, with a power of 80 %; None where no difference was seen, or where `MAX_PAIRS` do not do.
     """
-    if counts.difference == 0:
+    if counts.only_first == counts.only_second:
         return None
-    discordant = (counts.only_first + counts.only_second) / counts.n
-    z_power = NormalDist().inv_cdf(POWER)
-    spread = Z_95 * sqrt(discordant) + z_power * sqrt(discordant - counts.difference**2)
-    return ceil((spread / counts.difference) ** 2)
+    enough = 1
+    while _power(enough, counts, level) < POWER:
+        enough *= 2
+        if enough > MAX_PAIRS:
+            return None
+    too_few = enough // 2
+    while enough - too_few > 1:
+        middle = (too_few + enough) // 2
+        if _power(middle, counts, level) < POWER:
+            too_few = middle
+        else:
+            enough = middle
+    return enough
+
+
+def _power(n: int, counts: PairedCounts, level: float) -> float:
+    """Probability that the exact McNemar test of n pairs, drawn with these shares, has p below `level`."""
+    from scipy.stats import binom
+
+    num_discordant = counts.only_first + counts.only_second
+    discordant, second = num_discordant / counts.n, counts.only_second / num_discordant
+    low, high = binom.ppf([1e-12, 1 - 1e-12], n, discordant)  # the other numbers hardly ever come
+    drawn = np.arange(low, high + 1)
+    # the most pairs for the rarer side with which the test rejects; -1: it cannot
+    critical = binom.ppf(level / 2, drawn, 0.5) - 1
+    rejects = binom.cdf(critical, drawn, second) + binom.cdf(critical, drawn, 1 - second)
+    return float((binom.pmf(drawn, n, discordant) * rejects).sum())
 
 
 def holm(p_values: Sequence[float]) -> list[float]:
@@ -138,134 +231,3 @@ def holm(p_values: Sequence[float]) -> list[float]:
         largest = max(largest, min(1.0, (len(p_values) - place) * p_values[i]))
         adjusted[i] = largest
     return adjusted
-
-
-def bca_interval(values_E: np.ndarray) -> tuple[float, float] | None:
-    """95 % bootstrap interval of a mean over E episodes, corrected for bias and skew (BCa, Efron 1987).
-
-    None for fewer than two; the draws are always the same.
-    """
-    if len(values_E) < 2:
-        return None
-    if np.ptp(values_E) == 0:  # the correction for skew is not defined
-        return float(values_E[0]), float(values_E[0])
-    from scipy.stats import bootstrap  # half a second, which the simulators' workers do not need
-
-    rng = np.random.default_rng(0)
-    interval = bootstrap((values_E,), np.mean, n_resamples=NUM_BCA_RESAMPLES, method="BCa", rng=rng)
-    return float(interval.confidence_interval.low), float(interval.confidence_interval.high)
-
-
-def bootstrap_interval(sums_E: np.ndarray, counts_E: np.ndarray) -> tuple[float, float] | None:
-    """95 % percentile bootstrap interval of sum / count over E episodes.
-
-    None for fewer than two, and where all are equal: resampling tells nothing of them. Episodes are drawn,
-    not frames: the frames of one resemble each other. The draws are always the same.
-    """
-    if len(sums_E) < 2 or np.ptp(sums_E / counts_E) == 0:
-        return None
-    return _percentiles(_resampled_means(sums_E, counts_E))
-
-
-@dataclass(frozen=True)
-class Slope:
-    """How much a value changes with a level, by least squares, with its 95 % interval."""
-
-    per_level: float
-    low: float
-    high: float
-
-
-def slope(levels_N: np.ndarray, values_N: np.ndarray, episode_N: np.ndarray) -> Slope | None:
-    """Of N values over their levels; None where all levels are the same.
-
-    `episode_N` says which values are of one episode under several conditions: the percentile bootstrap draws
-    episodes, and the draws are always the same.
-    """
-    if np.ptp(levels_N) == 0:
-        return None
-    episodes, of_N = np.unique(episode_N, return_inverse=True)
-    moments_NM = np.stack(
-        [np.ones(len(levels_N)), levels_N, values_N, levels_N**2, levels_N * values_N], axis=1
-    )
-    sums_EM = np.zeros((len(episodes), moments_NM.shape[1]))
-    np.add.at(sums_EM, of_N, moments_NM)
-    draws = np.random.default_rng(0).integers(len(episodes), size=(NUM_RESAMPLES, len(episodes)))
-    drawn = _least_squares(sums_EM[draws].sum(axis=1))
-    low, high = _percentiles(drawn[np.isfinite(drawn)])
-    return Slope(float(_least_squares(sums_EM.sum(axis=0))), low, high)
-
-
-def _least_squares(moments: np.ndarray) -> np.ndarray:
-    """Slopes from (..., 5) sums of 1, x, y, x^2, xy; not finite where all x are the same."""
-    n, x, y, xx, xy = np.moveaxis(moments, -1, 0)
-    with np.errstate(divide="ignore", invalid="ignore"):
-        return (n * xy - x * y) / (n * xx - x**2)
-
-
-def variance_share(values_N: np.ndarray, levels_N: np.ndarray) -> float | None:
-    """Share of the values' variance that the level alone explains: its first-order sensitivity index.
-
-    Corrected for the number of levels, so that it is 0 on average where the level has no effect, and can be
-    negative. None where it is not defined: all values or all levels are the same.
-    Source: epsilon squared, Kelley (1935), "An unbiased correlation ratio measure".
-    """
-    total = float(((values_N - values_N.mean()) ** 2).sum())
-    groups = [values_N[levels_N == level] for level in np.unique(levels_N)]
-    num_within = len(values_N) - len(groups)
-    if total == 0 or len(groups) < 2 or num_within == 0:
-        return None
-    within = float(sum(((of - of.mean()) ** 2).sum() for of in groups))
-    return 1 - within / num_within / (total / (len(values_N) - 1))
-
-
-def format_bounds(interval: tuple[float, float] | None, form: str) -> str:
-    """' [low, high]', each in this form; nothing for a single episode."""
-    return "" if interval is None else f" [{interval[0]:{form}}, {interval[1]:{form}}]"
-
-
-def paired_bootstrap_interval(
-    first: tuple[np.ndarray, np.ndarray], second: tuple[np.ndarray, np.ndarray]
-) -> tuple[float, float] | None:
-    """The same of the second mean minus the first, (sums_E, counts_E) each, drawn together as pairs."""
-    if len(first[0]) < 2:
-        return None
-    return _percentiles(_resampled_means(*second) - _resampled_means(*first))
-
-
-@dataclass(frozen=True)
-class Measure:
-    """A mean over frames and its 95 % bootstrap interval over episodes; no interval of one episode."""
-
-    mean: float
-    low: float | None
-    high: float | None
-
-    def __str__(self) -> str:
-        interval = "" if self.low is None else f" [{self.low:.4g}, {self.high:.4g}]"
-        return f"{self.mean:.4g}{interval}"
-
-
-def measure(values_RX: np.ndarray, episode_R: np.ndarray) -> Measure:
-    """Mean of all finite numbers (R, ...); every one counts the same."""
-    values_RX = values_RX.reshape(len(episode_R), -1)
-    counts_RX = np.isfinite(values_RX)
-    episodes_E, place_R = np.unique(episode_R, return_inverse=True)
-    sums_E, counts_E = np.zeros(len(episodes_E)), np.zeros(len(episodes_E))
-    np.add.at(sums_E, place_R, np.where(counts_RX, values_RX, 0.0).sum(axis=1))
-    np.add.at(counts_E, place_R, counts_RX.sum(axis=1))
-    counted = counts_E > 0
-    low, high = bootstrap_interval(sums_E[counted], counts_E[counted]) or (None, None)
-    return Measure(float(sums_E.sum() / counts_E.sum()), low, high)
-
-
-def _resampled_means(sums_E: np.ndarray, counts_E: np.ndarray) -> np.ndarray:
-    """(NUM_RESAMPLES,), with the same draws for the same E."""
-    num_episodes = len(sums_E)
-    draws = np.random.default_rng(0).integers(num_episodes, size=(NUM_RESAMPLES, num_episodes))
-    return sums_E[draws].sum(axis=1) / counts_E[draws].sum(axis=1)
-
-
-def _percentiles(means: np.ndarray) -> tuple[float, float]:
-    low, high = np.percentile(means, [2.5, 97.5])
-    return float(low), float(high)

@@ -88,6 +88,24 @@ def test_what_these_episodes_do_not_show_is_left_open(arms: dict[str, Rows]) -> 
     ]  # fmt: skip
 
 
+def test_tasks_that_share_seeds_are_paired_task_by_task() -> None:
+    def tasks(shift: float) -> Rows:
+        spec = {"color": "black"}
+        return [
+            values(
+                seed, None if target == (0, 0) else "imprecise", 1.0 + shift, spec=spec | {"target": target}
+            )
+            for target in ((0, 0), (1, 1))
+            for seed in range(20)
+        ]
+
+    arms = {POLICY: tasks(0.0), AGAIN: tasks(0.0), ALONE: tasks(0.01)}
+    found = {verdict.question: verdict for verdict in judge(arms, None)}
+    assert found["the same flags give the same episodes"].evidence == "40 of 40, bit for bit"
+    alone = found["the size of the batch does not decide"]
+    assert alone.evidence.startswith("0 of 40 episodes end otherwise (p = 1, not adjusted)")
+
+
 def test_seeds_of_the_training_are_found(arms: dict[str, Rows]) -> None:
     verdict = judge(arms, range(30, 60))[-1]
     assert verdict.answer == NO and verdict.evidence == "trained on seeds 30..59, 10 evaluated"

@@ -1,7 +1,7 @@
 """``lerobot-bomb compare``: two policies on the same episodes."""
 
 import json
-from dataclasses import replace
+from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any
 
@@ -51,6 +51,45 @@ def test_pairs_are_counted_by_condition(a: Path, b: Path, capsys: Printed) -> No
     assert "pairs tell such a difference apart" in nominal
 
 
+def test_the_number_of_pairs_is_one_in_which_the_test_that_is_used_finds_the_difference(
+    a: Path, b: Path, capsys: Printed
+) -> None:
+    write(a, [None] * 4)
+    write(b, ["dropped"] * 4, policy=FDVLA)
+    assert compare(a, b) == 0
+    out = capsys.readouterr().out
+    assert "of 4 pairs, p = 0.12; 6 pairs tell such a difference apart" in out
+    assert "p: exact McNemar test of one condition, not adjusted" in out
+    write(a, [None] * 4, "light:3")
+    write(b, [None] * 4, "light:3", policy=FDVLA)
+    assert compare(a, b) == 0  # of two conditions: 2 / 2^7 is the first below 0.05 / 2
+    out = capsys.readouterr().out
+    assert "of 4 pairs, p = 0.25; 7 pairs tell such a difference apart" in out
+    assert "p: exact McNemar test, adjusted for 2 conditions (Holm)" in out
+
+
+def test_what_must_not_be_pooled_is_compared_apart(a: Path, b: Path, capsys: Printed) -> None:
+    for image_size, failure in ((256, None), (64, "dropped")):
+        write(a, [None] * 3, image_size=image_size)
+        write(b, [failure] * 3, image_size=image_size, policy=FDVLA)
+    assert compare(a, b) == 0
+    out = capsys.readouterr().out
+    assert "image_size 256, none: 3 pairs" in out and "image_size 64, none: 3 pairs" in out
+
+
+def test_pairs_that_share_seeds_are_said_to(a: Path, b: Path, capsys: Printed) -> None:
+    for target in ((0, 0), (1, 1)):
+        for path, policy in ((a, ACT), (b, FDVLA)):
+            with path.open("a") as file:
+                lines = [
+                    values(seed, spec={"target": target, "color": "black"}, task_ids=[0, 6])
+                    for seed in (0, 1)
+                ]
+                file.writelines(json.dumps(line | {"policy": asdict(policy)}) + "\n" for line in lines)
+    assert compare(a, b) == 0
+    assert "none: 4 pairs of 2 seeds, which B - A and p take as independent" in capsys.readouterr().out
+
+
 def test_the_exit_code_says_whether_a_difference_is_shown(a: Path, b: Path, capsys: Printed) -> None:
     write(a, ["dropped"] * 60 + [None] * 40)
     write(b, ["dropped"] * 10 + [None] * 90, policy=FDVLA)
@@ -74,7 +113,7 @@ def test_what_is_measured_is_compared_where_both_have_it(a: Path, b: Path, capsy
     write(a, ["never_reached", *[None] * 4], error=1.0)
     write(b, [None] * 5, error=3.5, policy=FDVLA)
     assert compare(a, b) == 0
-    expected = "placement error +2.5 mm [+2.5, +2.5] where both put the stone down (4 pairs)"
+    expected = "placement error +2.5 mm where both put the stone down (4 pairs)"
     assert expected in capsys.readouterr().out
 
 

@@ -12,6 +12,7 @@ from huggingface_hub.repocard_data import model_index_to_eval_results
 from test_results import FDVLA, values
 
 from lerobot_bomb.commands.main import main
+from lerobot_bomb.envs.results import PolicyIdentity
 from lerobot_bomb.evaluation.result_groups import groups_of
 from lerobot_bomb.hub.evaluations import model_index, model_index_yaml
 from lerobot_bomb.report.latex import SPECIAL
@@ -99,6 +100,64 @@ def test_two_rates_for_one_condition_are_refused(
     assert main(["export", str(tmp_path / "r.jsonl"), f"--output={tmp_path / 'out'}"]) == 1
     assert "has two rates for place, none: the episodes differ in MuJoCo" in capsys.readouterr().err
     assert not (tmp_path / "out").exists()
+
+
+def exported_rates(folder: Path) -> dict[str, float]:
+    """{folder: the unperturbed rate} of all that was exported."""
+    rates = {}
+    for path in folder.rglob("model-index.yaml"):
+        name, results = model_index_to_eval_results(yaml.safe_load(path.read_text())["model-index"])
+        assert name == path.parent.name
+        (rates[path.parent.relative_to(folder).as_posix()],) = (each.metric_value for each in results)
+    return rates
+
+
+@pytest.mark.parametrize("turn", [1, -1])
+def test_names_that_resemble_each_other_are_folders_of_their_own(turn: int, tmp_path: Path) -> None:
+    policies = [
+        PolicyIdentity("act", path, None, weights * 64, "b" * 64)
+        for path, weights in (("runs/v1.2", "a"), ("runs/v1", "b"), ("x/runs/v1", "c"), ("RUNS/v1", "d"))
+    ][::turn]
+    rates = {"a": 1.0, "b": 0.75, "c": 0.5, "d": 0.25}
+    rows = [
+        values(seed, None if seed < 4 * rates[policy.weights_sha256[0]] else "dropped", policy=policy)
+        for policy in policies
+        for seed in range(4)
+    ]
+    (tmp_path / "r.jsonl").write_text("".join(json.dumps(row) + "\n" for row in rows))
+    assert main(["export", str(tmp_path / "r.jsonl"), f"--output={tmp_path / 'out'}"]) == 0
+    found = exported_rates(tmp_path / "out")
+    assert {found[name] for name in ("act-runs-v1.2",)} == {1.0}
+    assert {found["act-runs-v1-bbbbbb"], found["act-runs-v1-cccccc"]} == {0.75, 0.5}
+    assert found["act-runs-v1-bbbbbb"] == 0.75
+    assert len({name.lower() for name in found}) == len(found) == 4 and 0.25 in found.values()
+
+
+@pytest.mark.parametrize(
+    ("named", "folder"),
+    [
+        ("..", "unnamed"),
+        (".", "unnamed"),
+        ("../../x", "x"),
+        ("/etc/x", "etc-x"),
+        (".hidden", "hidden"),
+        ("é" * 300, "unnamed"),
+    ],
+)
+def test_no_policy_s_name_leaves_the_folder(named: str, folder: str, tmp_path: Path) -> None:
+    (tmp_path / "r.jsonl").write_text(json.dumps(values(0, policy=PolicyIdentity(named))) + "\n")
+    out = tmp_path / "a" / "b"
+    assert main(["export", str(tmp_path / "r.jsonl"), f"--output={out}"]) == 0
+    assert exported_rates(out) == {folder: 1.0}
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["a", "r.jsonl"]
+    assert [path.name for path in (tmp_path / "a").iterdir()] == ["b"]
+
+
+def test_a_policy_called_as_the_table_does_not_take_its_place(tmp_path: Path) -> None:
+    (tmp_path / "r.jsonl").write_text(json.dumps(values(0, policy=PolicyIdentity("table.tex"))) + "\n")
+    assert main(["export", str(tmp_path / "r.jsonl"), f"--output={tmp_path / 'out'}"]) == 0
+    assert exported_rates(tmp_path / "out") == {"table.tex-2": 1.0}
+    assert (tmp_path / "out" / "table.tex").is_file()
 
 
 def test_a_benchmark_that_is_no_repository_is_refused(

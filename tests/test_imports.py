@@ -27,8 +27,8 @@ STOCK = "stock.py"  # an environment of LeRobot's, which ours is
 CORE = "lerobot_bomb"
 # a folder or module of the core imports from those above it in this list
 ORDER = [
-    "__init__", "_compat", "finite", "flag_errors", "flags", "conditions", "stats", "smoothness",
-    "tables", "files", "cuda_graphs",
+    "__init__", "_compat", "finite", "flag_errors", "flags", "conditions", "stats", "bootstrap",
+    "smoothness", "tables", "files", "cuda_graphs",
     "bomb", "pusht", "libero", "envs", "actions", "flow", "vlm", "decoding", "training", "data",
     "checkpoints", "evaluation", "viewing", "explain", "hub", "policies", "serving", "harness", "sweep",
     "report", "commands",
@@ -142,6 +142,7 @@ def test_the_simulator_imports_nothing_heavy(path: Path) -> None:
         "envs/vector.py",
         "files.py",
         "stats.py",
+        "bootstrap.py",
         "smoothness.py",
         "data/rollout_pool.py",
         "envs/rollout.py",

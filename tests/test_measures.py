@@ -1,8 +1,8 @@
 import numpy as np
 import pytest
 
+from lerobot_bomb.bootstrap import measure
 from lerobot_bomb.evaluation.measures import measure_l1
-from lerobot_bomb.stats import measure
 
 
 def test_padded_steps_do_not_count() -> None:

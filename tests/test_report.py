@@ -112,6 +112,42 @@ def test_two_policies_are_compared_on_their_common_episodes(rows: Rows, written:
         )
 
 
+def test_every_command_has_the_same_p_value_for_the_same_pairs(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    lost = {"none": 0, "camera:3": 6, "light:3": 0}
+    rows = [
+        values(seed, "dropped" if seed < number else None, spec={"perturbations": condition, "suite": suite})
+        for suite in ("place", "object")
+        for condition, number in lost.items()
+        for seed in range(6)
+    ]
+    others = [
+        values(seed, spec={"perturbations": condition, "suite": suite}, policy=FDVLA)
+        for suite in ("place", "object")
+        for condition in lost
+        for seed in range(6)
+    ]
+    path = tmp_path / "all.jsonl"
+    path.write_text("".join(json.dumps(row) + "\n" for row in [*rows, *others]))
+    assert main(["report", str(path), f"--output={tmp_path / 'r.html'}"]) == 0
+    assert main(["results", str(path)]) == 0
+    said = capsys.readouterr().out
+    # 2 / 2^6 of one pair of conditions of two
+    assert said.count("camera:3: 6 pairs, 6 lost, 0 won, p = 0.062 (exact McNemar test, adjusted for 2") == 2
+    act, *_ = tables(tmp_path, "Success by condition")
+    assert {row[0]: row[4] for row in act["rows"]} == {"none": "", "camera:3": 2 * 2 / 2**6, "light:3": 1.0}
+    assert "p: exact McNemar test, adjusted for 2 conditions (Holm)." in act["note"]
+    # two policies: all six conditions of both suites are one family, in `compare` and on the page alike
+    assert main(["compare", str(path)]) == 0
+    said = capsys.readouterr().out
+    assert said.count("B alone in 6 of 6 pairs, p = 0.19;") == 2
+    assert "adjusted for 6 conditions (Holm)" in said
+    (table,) = tables(tmp_path, "Two policies on the same episodes")
+    assert {row[0]: row[4] for row in table["rows"]}["object, camera:3"] == 6 * 2 / 2**6
+    assert "adjusted for 6 conditions (Holm)" in table["note"]
+
+
 def test_the_page_is_whole_and_asks_nobody_for_anything(written: Path) -> None:
     text = (written / "r.html").read_text()
     opened: list[str] = []

@@ -79,11 +79,134 @@ def test_the_summary_has_the_worst_condition_and_its_success(report: Callable[..
     assert (row["worst condition"], row["its success"]) == ("-", "-")
 
 
+def perturbed(failures: dict[str, list[str | None]], policy: PolicyIdentity = ACT) -> Rows:
+    """An episode for each seed from 0 on, under each condition."""
+    return [
+        values(seed, failure, policy=policy, spec={"perturbations": condition})
+        for condition, of in failures.items()
+        for seed, failure in enumerate(of)
+    ]
+
+
+def test_conditions_of_one_seed_are_no_independent_episodes(report: Callable[..., dict[str, Any]]) -> None:
+    # five seeds of ten fail under all of eleven conditions: as ten episodes, with t of 9 degrees of freedom
+    conditions = [f"{axis}:{level}" for axis in ("camera", "light") for level in range(1, 6)] + ["camera:1-5"]
+    (table,) = report(perturbed(dict.fromkeys(conditions, [None, "dropped"] * 5)))["Summary"]["tables"]
+    pooled = columns(table)[0]["perturbed, all conditions"]
+    assert (pooled["successes"], pooled["n"]) == (55, 110)
+    assert (pooled["low"], pooled["high"]) == pytest.approx((0.2091, 0.7909), abs=1e-4)
+    assert "95 % Wilson intervals, clustered by seed" in table["note"]
+    (table,) = report(perturbed({each: ["dropped"] for each in conditions}))["Summary"]["tables"]
+    assert columns(table)[0]["perturbed, all conditions"] == {
+        "successes": 0,
+        "n": 11,
+        "low": None,
+        "high": None,
+    }
+
+
+def test_policies_are_compared_on_the_episodes_that_all_have(report: Callable[..., dict[str, Any]]) -> None:
+    act = perturbed({"none": [None] * 3, "camera:3": [None, None, "dropped"], "all:5": ["dropped"] * 3})
+    fdvla = perturbed({"none": [None] * 3, "camera:3": [None, "dropped"], "light:1": [None]}, FDVLA)
+    alone = perturbed({"none": [None] * 3}, PolicyIdentity("bomb_random"))
+    section = report(act, fdvla, alone)["Summary"]
+    rows = {row["policy, suite"].split()[0]: row for row in columns(section["tables"][0])}
+    shared = {name: row["perturbed, all conditions"] for name, row in rows.items()}
+    assert [shared[name]["successes"] for name in ("act", "fdvla")] == [2, 1]
+    assert [shared[name]["n"] for name in ("act", "fdvla")] == [2, 2]
+    assert shared["bomb_random,"] == "-"
+    assert [row["worst condition"] for row in rows.values()] == ["camera:3", "camera:3", "-"]
+    assert section["lines"] == [
+        "act outputs/act, place: 4 perturbed episodes are left out, which not all policies have",
+        "fdvla me/fdvla, place: 1 perturbed episodes are left out, which not all policies have",
+    ]
+    fewer = perturbed({"none": [None] * 2}, FDVLA)
+    (line, _) = report(act, fewer)["Summary"]["lines"]
+    assert (
+        line == "act outputs/act, place: other policies have other unperturbed episodes; pairs compare below"
+    )
+
+
+def test_other_settings_are_no_peers(report: Callable[..., dict[str, Any]]) -> None:
+    small = [row | {"image_size": 64} for row in perturbed({"light:1": [None]}, FDVLA)]
+    section = report(perturbed({"camera:3": ["dropped"] * 3}), small)["Summary"]
+    assert [row["perturbed, all conditions"]["n"] for row in columns(section["tables"][0])] == [3, 1]
+    assert section["lines"] == []
+
+
+def test_a_tie_has_no_worst_condition(report: Callable[..., dict[str, Any]]) -> None:
+    half, none = [None, "dropped"], [None, None]
+    (row,) = columns(
+        report(perturbed({"camera:3": half, "light:3": none, "all:5": half}))["Summary"]["tables"][0]
+    )
+    assert (row["worst condition"], row["its success"]) == (["camera:3", "all:5"], 0.5)
+    (row,) = columns(report(perturbed({"camera:3": half, "light:3": half}))["Summary"]["tables"][0])
+    assert (row["worst condition"], row["its success"]) == (["camera:3", "light:3"], 0.5)
+
+
 def test_the_summary_says_of_what_its_measures_are(report: Callable[..., dict[str, Any]]) -> None:
     (table,) = report([values(0)])["Summary"]["tables"]
     (row,) = columns(table)
     assert "placement error" in row["measures"] and "moves made" not in row["measures"]
     assert "placement error: median" in table["note"] and "moves made" not in table["note"]
+
+
+# Sensitivity
+
+
+def at_levels(condition: str, levels: dict[str, int], failures: list[str | None]) -> Rows:
+    return [
+        values(seed, failure, spec={"perturbations": condition}, levels=levels)
+        for seed, failure in enumerate(failures)
+    ]
+
+
+def test_a_slope_is_of_the_episodes_in_which_the_axis_alone_was_on(
+    report: Callable[..., dict[str, Any]],
+) -> None:
+    lost, half, won = ["dropped"] * 4, [None, None, "dropped", "dropped"], [None] * 4
+    rows = [
+        *at_levels("none", {}, won),
+        *at_levels("camera:2", {"camera": 2}, half),
+        *at_levels("camera:4", {"camera": 4}, lost),
+        *at_levels("camera:4+light:4", {"camera": 4, "light": 4}, won),
+        *at_levels("object:5", {"object": 5}, won),
+    ]
+    (table,) = report(rows)["Sensitivity to an axis"]["tables"]
+    (camera, other) = columns(table)
+    assert (camera["axis"], other["axis"]) == ("camera", "object")
+    assert camera["points per level"]["per_level"] == pytest.approx(-0.25)  # 1, 1/2, 0 at the levels 0, 2, 4
+    # every seed falls from 1 to 0 over four levels, whatever it has between
+    assert camera["points per level"]["low"] is None
+    assert other["points per level"] == {"per_level": 0.0, "low": None, "high": None}
+    assert {row["share of variance"] for row in (camera, other)} == {""}
+
+
+def test_one_level_of_an_axis_alone_says_nothing_of_it(report: Callable[..., dict[str, Any]]) -> None:
+    one_level = at_levels("camera:2", {"camera": 2}, [None, "dropped"])
+    assert "Sensitivity to an axis" not in report(one_level)
+    one_range = [
+        *at_levels("camera:1-5", {"camera": 1}, [None, None]),
+        *at_levels("camera:1-5+light:3", {"camera": 2, "light": 3}, [None, "dropped"]),
+        *at_levels("camera:1-5+light:3", {"camera": 5, "light": 3}, ["dropped", "dropped"]),
+    ]
+    assert "Sensitivity to an axis" not in report(one_range)
+
+
+def test_shares_are_of_the_episodes_in_which_several_levels_were_drawn(
+    report: Callable[..., dict[str, Any]],
+) -> None:
+    drawn = [
+        row | {"levels": {"camera": 1 + seed % 2, "light": 1 + seed // 2 % 2}}
+        for seed, row in enumerate(
+            at_levels("camera:1-2+light:1-2", {}, [None, "dropped", None, "dropped"] * 2)
+        )
+    ]
+    fixed = at_levels("camera:3+light:3", {"camera": 3, "light": 3}, [None, "dropped"])
+    (table,) = report([*drawn, *fixed])["Sensitivity to an axis"]["tables"]
+    shares = {row["axis"]: row["share of variance"] for row in columns(table)}
+    # total 2 of 8 episodes, 7 degrees of freedom; within the levels of light 2, with 6
+    assert shares == {"camera": pytest.approx(1.0), "light": pytest.approx(1 - (2 / 6) / (2 / 7))}
 
 
 # Efficiency

@@ -74,7 +74,7 @@ def test_summary_counts_successes_errors_and_failures(path: Path) -> None:
     path.write_text("".join(lines))
     rows = read_results(path)
     summary = summarise(rows)
-    assert (summary.num_episodes, summary.num_successes) == (7, 2)
+    assert (summary.rate.n, summary.rate.successes) == (7, 2)
     assert median_error_mm(rows) == 3.0  # of 1, 2, 3, 14 and 45: only stones that were put down
     assert summary.failures == {
         "imprecise": 1,
@@ -87,7 +87,7 @@ def test_summary_counts_successes_errors_and_failures(path: Path) -> None:
 
 def test_an_episode_that_was_run_again_counts_once(path: Path) -> None:
     path.write_text(row(0, "dropped") + row(1) + row(0))
-    assert summarise(read_results(path)).num_successes == 2
+    assert summarise(read_results(path)).rate.successes == 2
 
 
 def test_all_fields_are_checked() -> None:
@@ -264,10 +264,10 @@ def test_of_several_groups_a_line_for_each_group_and_condition_comes_first(
     conditions = [row(0), row(1, "dropped"), row(0, spec={"perturbations": "camera:3"})]
     output = printed(path, "".join([*conditions, row(0, policy=FDVLA)]), capsys)
     assert output.split("\n\n")[1].splitlines() == [
-        "policy, suite           perturbations  success, 95 % Wilson interval",
-        "act outputs/act, place           none       1/2 = 50.0 % [9.5, 90.5]",
-        "act outputs/act, place       camera:3    1/1 = 100.0 % [20.7, 100.0]",
-        "fdvla me/fdvla, place            none    1/1 = 100.0 % [20.7, 100.0]",
+        "policy, suite           perturbations  success, 95 % Wilson interval by seed",
+        "act outputs/act, place           none               1/2 = 50.0 % [9.5, 90.5]",
+        "act outputs/act, place       camera:3            1/1 = 100.0 % [20.7, 100.0]",
+        "fdvla me/fdvla, place            none            1/1 = 100.0 % [20.7, 100.0]",
     ]
     assert "policy, suite" not in printed(path, "".join(conditions), capsys)
 
@@ -334,10 +334,28 @@ def test_a_perturbed_arm_is_compared_with_the_same_episodes_unperturbed(
     ]
     lines.append(row(99, spec={"perturbations": "all:5"}))  # has no pair
     output = printed(path, "".join(lines), capsys)
-    assert "camera:3: 7 pairs, 5 lost, 1 won, p = 0.22" in output
-    assert "all:5: 2 pairs, 0 lost, 0 won, p = 1 " in output
+    test = "(exact McNemar test, adjusted for 2 conditions (Holm))"
+    assert f"camera:3: 7 pairs, 5 lost, 1 won, p = 0.44 {test}" in output  # 2 x 0.21875
+    assert f"all:5: 2 pairs, 0 lost, 0 won, p = 1 {test}" in output
     assert "without an unperturbed one to compare with: 1; add" in output
     assert f"{path} (perturbations=none): 7 episodes" in output
+
+
+def test_numbered_tasks_of_one_seed_are_clusters(path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    specs = [{"target": divmod(task, 5), "color": "black"} for task in range(6)]
+    lines = [
+        row(seed, None if seed % 2 else "dropped", spec=spec, task_ids=list(range(6)))
+        for seed in range(4)
+        for spec in specs
+    ]
+    # as four records, two of them successes, with Student's t for 3 degrees of freedom: 3.182
+    expected = "success          12/24 = 50.0 % [7.7, 92.3] (95 % Wilson interval, 4 clusters by seed)"
+    assert expected in printed(path, "".join(lines), capsys)
+    expected = "success          3/6 = 50.0 % (no interval: all are of one seed)"
+    failures = [None, "dropped"] * 3
+    numbered = {"task_ids": list(range(6))}
+    one = [row(0, failure, spec=spec, **numbered) for failure, spec in zip(failures, specs, strict=True)]
+    assert expected in printed(path, "".join(one), capsys)
 
 
 def test_a_folder_is_no_results_file(tmp_path: Path) -> None:

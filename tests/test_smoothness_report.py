@@ -54,6 +54,23 @@ def test_grippers_are_left_out_by_name() -> None:
     assert measure_row(of, make_units(of, NAMES, None, False)) == expected
 
 
+def test_conditions_of_one_seed_are_drawn_together() -> None:
+    rng = np.random.default_rng(0)
+    rough = [scale * rng.normal(size=(30, 1)) for scale in (1, 5, 20)]
+    alone = Executed("alone", 10, {f"none, task 0, seed {i}": of for i, of in enumerate(rough)}, True)
+    groups = ("none", "light-3", "all-5")
+    thrice = {f"{group}, task 0, seed {i}": of for group in groups for i, of in enumerate(rough)}
+    units = make_units(alone, ["x"], None, False)
+    rows = {of.name: measure_row(of, units) for of in (alone, Executed("thrice", 10, thrice, True))}
+    halved = {name: of / (1 + i % 3) for i, (name, of) in enumerate(thrice.items())}
+    rows["halved"] = measure_row(Executed("halved", 10, halved, True), units)
+    for key in ORDERS:
+        first, second = (rows[name].measures[key] for name in ("alone", "thrice"))
+        assert (second.low, second.high) == pytest.approx((first.low, first.high))
+    one, three = (measure_difference(name, "halved", rows).measures["J2"] for name in ("alone", "thrice"))
+    assert (three.low, three.high) == pytest.approx((one.low, one.high))
+
+
 def test_differences_are_those_of_pairs() -> None:
     rng = np.random.default_rng(0)
     rough = [scale * rng.normal(size=(30, 2)) for scale in (1, 5, 20, 100)]  # episodes that differ much

@@ -16,10 +16,9 @@ from lerobot_bomb.commands.arguments import path_flag
 from lerobot_bomb.commands.run import run_command
 from lerobot_bomb.conditions import NONE
 from lerobot_bomb.envs.results import Row
-from lerobot_bomb.evaluation.result_groups import by_condition
+from lerobot_bomb.evaluation.result_groups import by_condition, rate_of
 from lerobot_bomb.evaluation.results import read_results
 from lerobot_bomb.files import check_new_folder
-from lerobot_bomb.stats import format_rate
 from lerobot_bomb.sweep.manifest import largest_divisor
 from lerobot_bomb.tables import print_table
 
@@ -131,7 +130,7 @@ def _report(output_dir: Path, rows: dict[str, list[Row]], seconds: float) -> Non
 
 
 def _rate(rows: list[Row]) -> str:
-    return format_rate(sum(row["is_success"] for row in rows), len(rows)) if rows else "-"
+    return str(rate_of(rows)) if rows else "-"
 
 
 def _write_sheet(output_dir: Path, rows: list[Row]) -> Path:

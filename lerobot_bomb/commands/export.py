@@ -1,15 +1,13 @@
 """``lerobot-bomb export``: files of results for a paper, a model card and the Hub's leaderboards."""
 
 import argparse
-import re
 from pathlib import Path
 
 from lerobot_bomb.commands.arguments import path_flag
 from lerobot_bomb.commands.results_files import check_outputs, read_undamaged
 from lerobot_bomb.data.resumable import check_repo_id
-from lerobot_bomb.evaluation.comparison import POLICY
-from lerobot_bomb.files import written_whole
-from lerobot_bomb.report.arms import Arm, arms_of, policy_name
+from lerobot_bomb.files import file_names, written_whole
+from lerobot_bomb.report.arms import arms_of, policies_of
 from lerobot_bomb.report.latex import table
 
 LATEX, MODEL_INDEX, EVAL_RESULTS = "table.tex", "model-index.yaml", ".eval_results/lerobot_bomb.yaml"
@@ -43,8 +41,10 @@ def run_export(args: argparse.Namespace) -> int:
 
     arms = arms_of([row for path in args.paths for row in read_undamaged(path)[0]])
     contents = {args.output / LATEX: table(arms)}
-    for name, of_policy in _by_policy(arms).items():
-        groups = [arm.group for arm in of_policy]
+    policies = policies_of(arms)
+    _, *names = file_names([LATEX, *(each.short_name for each in policies)])
+    for name, policy in zip(names, policies, strict=True):
+        groups = [arm.group for arm in policy.arms]
         check_one_rate_each(groups)
         contents[args.output / name / MODEL_INDEX] = model_index_yaml(name, groups)
         if args.benchmark_id is not None:
@@ -55,16 +55,3 @@ def run_export(args: argparse.Namespace) -> int:
             unfinished.write_text(content)
     print(*contents, sep="\n")
     return 0
-
-
-def _by_policy(arms: list[Arm]) -> dict[str, list[Arm]]:
-    """{name for files: arms of one policy}."""
-    policies: dict[str, list[Arm]] = {}
-    for arm in arms:
-        policies.setdefault(arm.group.settings[POLICY], []).append(arm)
-    names: dict[str, list[Arm]] = {}
-    for of_policy in policies.values():
-        stem = re.sub(r"[^\w.-]+", "-", policy_name(of_policy[0].rows[0])).strip("-")
-        number = sum(name == stem or name.startswith(f"{stem}.") for name in names)
-        names[f"{stem}.{number + 1}" if number else stem] = of_policy
-    return names

@@ -5,10 +5,9 @@ from pathlib import Path
 
 from lerobot_bomb.commands.arguments import path_flag
 from lerobot_bomb.commands.results_files import read_undamaged
-from lerobot_bomb.evaluation.result_groups import by_condition, differing
+from lerobot_bomb.evaluation.result_groups import by_condition, differing, rate_of
 from lerobot_bomb.evaluation.results import pair_lines, summarise
 from lerobot_bomb.report.arms import Arm, arms_of
-from lerobot_bomb.stats import format_rate
 from lerobot_bomb.tables import print_table
 
 
@@ -61,10 +60,10 @@ def _print_file(path: Path, arms: list[Arm], num_damaged: int) -> None:
 def _print_rates(arms: list[Arm]) -> None:
     """A line for each group and condition, before what else there is to say of them."""
     cells = [
-        [arm.name, condition, format_rate(sum(row["is_success"] for row in rows), len(rows))]
+        [arm.name, condition, str(rate_of(rows))]
         for arm in arms
         for condition, rows in by_condition(arm.rows).items()
     ]
     print()
-    print_table(["policy, suite", "perturbations", "success, 95 % Wilson interval"], cells)
+    print_table(["policy, suite", "perturbations", "success, 95 % Wilson interval by seed"], cells)
     print()

@@ -12,6 +12,7 @@ from lerobot_bomb.bomb.episode import PROTOCOL_VERSION, TASK_VERSION, EpisodeSpe
 from lerobot_bomb.bomb.observation import CAMERAS, MAX_IMAGE_SIZE, MIN_IMAGE_SIZE, RENDER_PRESETS
 from lerobot_bomb.bomb.perturbations import Condition
 from lerobot_bomb.bomb.suites import SUITES
+from lerobot_bomb.bootstrap import bca_interval, format_bounds, sums_by
 from lerobot_bomb.conditions import ALL
 from lerobot_bomb.data.environment import Environment, numbered_tasks
 from lerobot_bomb.envs.results import Row
@@ -35,7 +36,6 @@ from lerobot_bomb.evaluation.result_kind import (
     ResultKind,
     describe_numbers,
 )
-from lerobot_bomb.stats import bca_interval, format_bounds
 
 OLD_VERSION = "1.0"  # whose lines say less
 NUM_TASKS = len(COLORS) * BOARD.num_lines**2
@@ -146,7 +146,8 @@ def _error_change(pairs: list[Pair]) -> str:
     changes_mm = np.array(
         [after["placement_error_mm"] - before["placement_error_mm"] for before, after in both]
     )
-    change = f"placement error {changes_mm.mean():+.1f} mm{format_bounds(bca_interval(changes_mm), '+.1f')}"
+    interval = bca_interval(*sums_by(changes_mm, [row["spec"]["seed"] for row, _ in both]))
+    change = f"placement error {changes_mm.mean():+.1f} mm{format_bounds(interval, '+.1f')}"
     return f"{change} where both put the stone down ({len(both)} pairs)"
 
 

@@ -6,21 +6,10 @@ from dataclasses import dataclass
 
 from lerobot_bomb.checkpoints.shipped import checkpoint_path
 from lerobot_bomb.envs.results import Row
-from lerobot_bomb.evaluation.result_groups import (
-    count_pairs,
-    describe_change,
-    describe_policy,
-    groups_of,
-    settings_of,
-)
+from lerobot_bomb.evaluation.paired import PairedComparison, compare_pairs, describe_test
+from lerobot_bomb.evaluation.result_groups import Group, describe_policy, groups_of, rate_of, settings_of
 from lerobot_bomb.evaluation.result_kind import NOT_RECORDED, Pair
-from lerobot_bomb.stats import (
-    PairedCounts,
-    episodes_to_tell_apart,
-    format_rate,
-    holm,
-    paired_difference_interval,
-)
+from lerobot_bomb.stats import format_p
 
 POLICY = "policy"  # the one setting that the episodes of a pair may differ in
 
@@ -28,45 +17,11 @@ type Values = dict[str, set[str]]  # of settings
 
 
 @dataclass(frozen=True)
-class Comparison:
-    """The episodes of one condition that both policies played."""
-
-    condition: str
-    pairs: list[Pair]  # of the first policy and of the second
-    p_value: float  # adjusted for the number of conditions
-
-    @property
-    def counts(self) -> PairedCounts:
-        """How often which of the two succeeded."""
-        return count_pairs(self.pairs)
-
-    @property
-    def interval(self) -> tuple[float, float]:
-        """95 % interval of the second rate minus the first."""
-        return paired_difference_interval(self.counts)
-
-    def lines(self) -> list[str]:
-        """The comparison as text, a line each."""
-        counts, (low, high) = self.counts, self.interval
-        needed = episodes_to_tell_apart(counts)
-        more = f"; {needed} pairs tell such a difference apart" if needed and low <= 0 <= high else ""
-        change = describe_change(self.pairs)
-        return [
-            f"A          {format_rate(counts.first, counts.n)}",
-            f"B          {format_rate(counts.second, counts.n)}",
-            f"B - A      {100 * counts.difference:+.1f} points [{100 * low:+.1f}, {100 * high:+.1f}]; "
-            f"A alone succeeded in {counts.only_first}, B alone in {counts.only_second} of {counts.n} pairs, "
-            f"p = {self.p_value:.2g}{more}",
-            *([f"           {change}"] if change else []),
-        ]
-
-
-@dataclass(frozen=True)
 class Comparisons:
     """All that two sets of episodes have in common."""
 
     policies: tuple[str, str]
-    conditions: list[Comparison]
+    conditions: list[PairedComparison]
     num_unpaired: tuple[int, int]  # episodes that the other policy did not play
 
     @property
@@ -79,16 +34,36 @@ class Comparisons:
         lines = [f"{name}: {policy}" for name, policy in zip("AB", self.policies, strict=True)]
         lines += ["A and B are the same policy"] if self.policies[0] == self.policies[1] else []
         for each in self.conditions:
-            lines += [f"{each.condition}: {len(each.pairs)} pairs", *(f"  {line}" for line in each.lines())]
+            lines += [f"{each.condition}: {_num_pairs(each)}", *(f"  {line}" for line in _lines(each))]
         if any(self.num_unpaired):
             a, b = self.num_unpaired
             lines.append(f"not compared, for the other did not play them: {a} episodes of A, {b} of B")
         notes = (
-            "rates: 95 % Wilson intervals; B - A: Newcombe's for pairs; p: exact McNemar test, to be trusted "
-            "where the two disagree, as with few pairs"
+            "rates: 95 % Wilson intervals, clustered by seed; B - A: Newcombe's for pairs; p: "
+            f"{describe_test(len(self.conditions))}, to be trusted where the two disagree, as with few pairs"
         )
-        adjusted = f", adjusted for {len(self.conditions)} conditions (Holm)"
-        return [*lines, notes + adjusted * (len(self.conditions) > 1)]
+        return [*lines, notes]
+
+
+def _num_pairs(of: PairedComparison) -> str:
+    if of.num_starts == len(of.pairs):
+        return f"{len(of.pairs)} pairs"
+    return f"{len(of.pairs)} pairs of {of.num_starts} seeds, which B - A and p take as independent"
+
+
+def _lines(of: PairedComparison) -> list[str]:
+    """The pairs of a condition as text, a line each."""
+    counts, (low, high), change = of.counts, of.interval, of.describe_change()
+    needed = of.num_needed
+    more = f"; {needed} pairs tell such a difference apart" if needed else ""
+    rates = [rate_of(list(rows)) for rows in zip(*of.pairs, strict=True)]
+    return [
+        *(f"{name}          {rate}" for name, rate in zip("AB", rates, strict=True)),
+        f"B - A      {100 * counts.difference:+.1f} points [{100 * low:+.1f}, {100 * high:+.1f}]; "
+        f"A alone succeeded in {counts.only_first}, B alone in {counts.only_second} of {counts.n} pairs, "
+        f"{format_p(of.p_value)}{more}",
+        *([f"           {change}"] if change else []),
+    ]
 
 
 def of_policies(rows: list[Row], names: Sequence[str]) -> list[list[Row]]:
@@ -117,70 +92,82 @@ def of_policies(rows: list[Row], names: Sequence[str]) -> list[list[Row]]:
     return chosen
 
 
+def can_compare(first: Group, second: Group) -> bool:
+    """Whether two groups differ in nothing but their policies, as far as their lines say."""
+    return not _apart(_values_of([first]), _values_of([second]))
+
+
+def episode_of(row: Row) -> str:
+    """Equal for rows of one episode under one condition, whoever acts."""
+    return json.dumps(row["spec"], sort_keys=True)
+
+
 def compare(first: list[Row], second: list[Row]) -> Comparisons:
     """Pair the episodes of two policies.
 
     Raises:
         ValueError: either are of several policies, or there is no pair; it says what they differ in.
     """
-    policies = _only_policy("the first", first), _only_policy("the second", second)
-    pairs = list(_pairs(first, second))
+    groups = groups_of(first), groups_of(second)
+    policies = _only_policy("the first", groups[0]), _only_policy("the second", groups[1])
+    pairs = list(_pairs(*groups))
     if not pairs:
-        raise ValueError(f"no episode was played by both: {_why_none(first, second)}")
+        raise ValueError(f"no episode was played by both: {_why_none(*groups)}")
+    num_first, num_second = (sum(len(group.rows) for group in of) for of in groups)
     return Comparisons(
         policies=policies,
-        conditions=_by_condition(pairs),
-        num_unpaired=(len(_episodes(first)) - len(pairs), len(_episodes(second)) - len(pairs)),
+        conditions=compare_pairs(_by_condition(pairs)),
+        num_unpaired=(num_first - len(pairs), num_second - len(pairs)),
     )
 
 
-def _by_condition(pairs: list[Pair]) -> list[Comparison]:
-    """Apart by suite too, where there are several."""
-    several = len({first["spec"].get("suite") for first, _ in pairs}) > 1
-    of_label: dict[str, list[Pair]] = {}
-    for pair in pairs:
-        spec = pair[0]["spec"]
-        label = f"{spec['suite']}, {spec['perturbations']}" if several else spec["perturbations"]
-        of_label.setdefault(label, []).append(pair)
-    adjusted = holm([count_pairs(of).p_value for of in of_label.values()])
-    return [Comparison(label, of, p) for (label, of), p in zip(of_label.items(), adjusted, strict=True)]
+def _by_condition(pairs: list[tuple[Group, Pair]]) -> dict[str, list[Pair]]:
+    """Pairs by condition, and by every setting of which they have several, such as the suite."""
+    settings = [dict(of) for of in dict.fromkeys(tuple(group.settings.items()) for group, _ in pairs)]
+    names = dict.fromkeys(name for of in settings for name in of if name != POLICY)
+    several = [name for name in names if len({of.get(name) for of in settings}) > 1]
+    labelled: dict[str, list[Pair]] = {}
+    for group, pair in pairs:
+        shown = (_shown(name, group.settings.get(name)) for name in several)
+        labelled.setdefault(", ".join([*shown, pair[0]["spec"]["perturbations"]]), []).append(pair)
+    return labelled
 
 
-def _only_policy(name: str, rows: list[Row]) -> str:
-    settings = {settings_of(row)[POLICY] for row in rows}
-    if len(settings) > 1:
-        described = sorted({describe_policy(row) for row in rows})
+def _shown(name: str, value: str | None) -> str:
+    """'place' of a suite, 'fps 20' of another setting."""
+    return f"{value}" if name == "suite" else f"{name} {value}"
+
+
+def _only_policy(name: str, groups: list[Group]) -> str:
+    described = {group.settings[POLICY]: describe_policy(group.rows[0]) for group in groups}
+    if len(described) > 1:
+        texts = "; ".join(sorted(set(described.values())))
         raise ValueError(
-            f"{name} results are of {len(settings)} policies ({'; '.join(described)}): compare two of one "
-            "file with --policies=A,B"
+            f"{name} results are of {len(described)} policies ({texts}): compare two of one file with "
+            "--policies=A,B"
         )
-    return describe_policy(rows[0])
+    return describe_policy(groups[0].rows[0])
 
 
-def _pairs(first: list[Row], second: list[Row]) -> Iterator[Pair]:
-    candidates: dict[str, list[tuple[Row, Values]]] = {}
-    for row in _episodes(second):
-        candidates.setdefault(_spec(row), []).append((row, _values_of([row])))
-    for row in _episodes(first):
-        of_spec, values = candidates.get(_spec(row), []), _values_of([row])
-        if match := next((other for other in of_spec if not _apart(values, other[1])), None):
-            of_spec.remove(match)
-            yield row, match[0]
+def _pairs(first: list[Group], second: list[Group]) -> Iterator[tuple[Group, Pair]]:
+    """The group of the first row, and both; of an episode that was run again, the last row."""
+    candidates: dict[str, list[tuple[int, Row]]] = {}
+    for place, group in enumerate(second):
+        for row in group.rows:
+            candidates.setdefault(episode_of(row), []).append((place, row))
+    for group in first:
+        can_pair = [can_compare(group, other) for other in second]
+        for row in group.rows:
+            of_episode = candidates.get(episode_of(row), [])
+            if match := next((each for each in of_episode if can_pair[each[0]]), None):
+                of_episode.remove(match)
+                yield group, (row, match[1])
 
 
-def _episodes(rows: list[Row]) -> list[Row]:
-    """Each once: of an episode that was run again, the last one."""
-    return [row for group in groups_of(rows) for row in group.rows]
-
-
-def _spec(row: Row) -> str:
-    return json.dumps(row["spec"], sort_keys=True)
-
-
-def _values_of(rows: list[Row]) -> Values:
-    """{setting: its values in these rows}."""
-    settings = [settings_of(row) for row in rows]
-    return {name: {of.get(name, NOT_RECORDED) for of in settings} for name in settings[0]}
+def _values_of(groups: list[Group]) -> Values:
+    """{setting: its values in these groups}."""
+    names = groups[0].settings
+    return {name: {group.settings.get(name, NOT_RECORDED) for group in groups} for name in names}
 
 
 def _apart(first: Values, second: Values) -> list[str]:
@@ -197,7 +184,7 @@ def _apart(first: Values, second: Values) -> list[str]:
     ]
 
 
-def _why_none(first: list[Row], second: list[Row]) -> str:
+def _why_none(first: list[Group], second: list[Group]) -> str:
     if apart := _apart(_values_of(first), _values_of(second)):
         return f"they differ in {', '.join(apart)}"
     return "seeds, conditions or tasks have nothing in common; evaluate both with the same --seed and flags"

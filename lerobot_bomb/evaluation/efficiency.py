@@ -5,8 +5,9 @@ from statistics import median
 
 import numpy as np
 
+from lerobot_bomb.bootstrap import Measure, bootstrap_interval, sums_by
 from lerobot_bomb.envs.results import Row
-from lerobot_bomb.stats import Measure, bootstrap_interval
+from lerobot_bomb.evaluation.result_groups import starts_of
 
 
 @dataclass(frozen=True)
@@ -42,8 +43,10 @@ def smoothness_of(rows: list[Row]) -> dict[str, Measure]:
 
 
 def _mean_difference(rows: list[Row], order: int) -> Measure:
-    counts_E = np.array([row["steps"] - order for row in rows])
-    sums_E = counts_E * np.array([row[f"action_j{order}"] for row in rows])
+    counts_N = np.array([row["steps"] - order for row in rows])
+    starts = starts_of(rows)
+    sums_E, _ = sums_by(counts_N * np.array([row[f"action_j{order}"] for row in rows]), starts)
+    counts_E, _ = sums_by(counts_N, starts)
     interval = bootstrap_interval(sums_E, counts_E) or (None, None)
     return Measure(float(sums_E.sum() / counts_E.sum()), *interval)
 

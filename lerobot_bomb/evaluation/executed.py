@@ -73,6 +73,11 @@ def append_episode(
     append_line(path, json.dumps(row))
 
 
+def start_of(episode: str) -> str:
+    """Seed of an episode that `read_action_log` named: those of one seed start alike. Else its own name."""
+    return episode.rpartition(", ")[2]
+
+
 def read_action_log(path: Path) -> Executed:
     """The episodes that ``append_episode`` wrote.
 

@@ -83,6 +83,7 @@ LIBERO_LINES = ResultKind(
     spec_fields=LIBERO_SPEC_CHECKS,
     check_episode=_check_episode,
     drawn=("task_id",),
+    start=("seed", "task_id"),  # tasks have scenes of their own
     settings=_settings,
     describe_simulator=lambda settings: (
         f"{settings['control_mode']} control, {settings['fps']} Hz, {settings['simulator']}"

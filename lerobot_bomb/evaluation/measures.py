@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from lerobot_bomb.stats import Measure, measure
+from lerobot_bomb.bootstrap import Measure, measure
 
 
 @dataclass(frozen=True)

@@ -11,6 +11,7 @@ from lerobot.datasets import LeRobotDataset, LeRobotDatasetMetadata
 from lerobot.policies import PreTrainedPolicy
 from lerobot.utils.constants import ACTION
 
+from lerobot_bomb.bootstrap import Measure, measure
 from lerobot_bomb.data.columns import dim_names
 from lerobot_bomb.evaluation.measures import L1, measure_l1
 from lerobot_bomb.evaluation.predictions import load_dataset, load_policy, predict
@@ -18,7 +19,6 @@ from lerobot_bomb.evaluation.splits import (
     Split,
 )
 from lerobot_bomb.evaluation.trivial import Demonstrations
-from lerobot_bomb.stats import Measure, measure
 from lerobot_bomb.tables import print_table
 
 POLICY = "policy"

@@ -5,6 +5,7 @@ from typing import Any
 
 import numpy as np
 
+from lerobot_bomb.bootstrap import bca_interval, format_bounds
 from lerobot_bomb.envs.results import Row
 from lerobot_bomb.evaluation.line_checks import (
     RUN_CHECKS,
@@ -33,7 +34,6 @@ from lerobot_bomb.pusht.episode import (
     PushTSpec,
 )
 from lerobot_bomb.pusht.perturbations import PushTCondition
-from lerobot_bomb.stats import bca_interval, format_bounds
 
 
 def is_share(value: Any) -> bool:
@@ -88,7 +88,7 @@ def _values(rows: list[Row], name: str) -> np.ndarray:
 def _coverage_change(pairs: list[Pair]) -> str:
     """'max coverage -0.120 [-0.200, -0.040]': the mean change of (unperturbed, perturbed) pairs."""
     before, after = (_values(rows, "max_coverage") for rows in map(list, zip(*pairs, strict=True)))
-    interval = bca_interval(after - before)
+    interval = bca_interval(after - before, np.ones(len(pairs)))
     return f"max coverage {(after - before).mean():+.3f}{format_bounds(interval, '+.3f')}"
 
 

@@ -1,6 +1,7 @@
 """Episodes that compare: which lines of a results file may be pooled and paired, and what they are of."""
 
 import json
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
 
@@ -8,7 +9,7 @@ from lerobot_bomb.conditions import NONE
 from lerobot_bomb.envs.results import ORIGIN, Row, without_measured
 from lerobot_bomb.evaluation.result_kind import NOT_RECORDED, Pair, ResultKind, describe_numbers
 from lerobot_bomb.evaluation.result_lines import kind_of
-from lerobot_bomb.stats import PairedCounts
+from lerobot_bomb.stats import PairedCounts, Rate
 
 # what may differ between episodes that are pooled; perturbations between those that are paired
 DRAWN = ("seed", "perturbations")
@@ -107,6 +108,16 @@ def pair_with_nominal(rows: list[Row]) -> dict[str, list[Pair]]:
     return pairs
 
 
+def starts_of(rows: list[Row]) -> list[tuple[Any, ...]]:
+    """Start of each row; those of one start, under several conditions or on several tasks, are alike."""
+    return [kind_of(row).start_of(row) for row in rows]
+
+
+def rate_of(rows: list[Row], is_counted: Callable[[Row], bool] = lambda row: row["is_success"]) -> Rate:
+    """Rate of success of at least one row, or of something else; rows of one start are one cluster."""
+    return Rate.of(list(map(is_counted, rows)), starts_of(rows))
+
+
 def count_pairs(pairs: list[Pair]) -> PairedCounts:
     """How often which row of the pairs is a success."""
     return PairedCounts.of([a["is_success"] for a, _ in pairs], [b["is_success"] for _, b in pairs])
@@ -120,12 +131,6 @@ def different_fields(row: Row, other: Row) -> list[str]:
 def outcome(row: Row) -> Row:
     """What was asked and what became of it: not who played it, where, and how long that took."""
     return {name: value for name, value in without_measured(row).items() if name not in ORIGIN}
-
-
-def describe_change(pairs: list[Pair]) -> str:
-    """What the second rows have beside other successes, as text; '' where there is nothing to say."""
-    describe = kind_of(pairs[0][0]).describe_change
-    return describe(pairs) if describe else ""
 
 
 def describe_policy(row: Row) -> str:

@@ -2,14 +2,15 @@
 
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
+from typing import Any
 
 import numpy as np
 
+from lerobot_bomb.bootstrap import bootstrap_interval, format_bounds, sums_by
 from lerobot_bomb.conditions import AxisCondition
 from lerobot_bomb.data.environment import Environment
 from lerobot_bomb.envs.results import Row
 from lerobot_bomb.evaluation.line_checks import SHARED_CHECKS, Check, check_fields, refuse_others
-from lerobot_bomb.stats import bootstrap_interval, format_bounds
 
 NOT_RECORDED = "not recorded"
 NO_VALUE = "-"  # of a measure that these episodes do not have
@@ -60,6 +61,8 @@ class ResultKind:
     added_fields: Mapping[str, Check] = field(default_factory=dict)
     tasks: Sequence[str] = ()  # values of --env.task
     has_results_path: bool = True  # lerobot-eval writes the lines, with --env.results_path
+    # of a spec, what episodes have in common that start alike: they are not independent
+    start: tuple[str, ...] = ("seed",)
     # an episode's number in its evaluation chooses how it starts, not its seed: in batches of one
     starts_by_number: bool = False
 
@@ -76,16 +79,23 @@ class ResultKind:
         refuse_others(row["spec"], self.spec_fields | added)
         self.check_episode(row)
 
+    def start_of(self, row: Row) -> tuple[Any, ...]:
+        """Equal for rows that are not independent."""
+        return tuple(row["spec"][name] for name in self.start)
+
     def missing_fields(self, version: str) -> list[str]:
         """Of lines of the newest protocol, what those of another version do not have."""
         *_, newest = self.fields.values()
         return [name for name in newest if name not in self.fields[version]]
 
 
-def mean_with_interval(rows: list[Row], name: str) -> str:
-    """'0.440 [0.210, 0.670]' of a field: with a 95 % bootstrap interval over episodes."""
-    values = np.array([row[name] for row in rows])
-    return f"{values.mean():.3f}{format_bounds(bootstrap_interval(values, np.ones(len(values))), '.3f')}"
+def mean_with_interval(rows: list[Row], name: str, start: tuple[str, ...] = ResultKind.start) -> str:
+    """'0.440 [0.210, 0.670]' of a field: with a 95 % bootstrap interval over starts."""
+    sums_E, counts_E = sums_by(
+        np.array([row[name] for row in rows]), [tuple(row["spec"][of] for of in start) for row in rows]
+    )
+    mean = sums_E.sum() / counts_E.sum()
+    return f"{mean:.3f}{format_bounds(bootstrap_interval(sums_E, counts_E), '.3f')}"
 
 
 def describe_versions(row: Row) -> str:

@@ -7,33 +7,31 @@ from pathlib import Path
 from lerobot_bomb.conditions import NONE
 from lerobot_bomb.envs.results import Row
 from lerobot_bomb.evaluation import efficiency
+from lerobot_bomb.evaluation.paired import PairedComparison, compare_pairs, describe_test
 from lerobot_bomb.evaluation.result_groups import (
     Group,
-    count_pairs,
-    describe_change,
     differing,
     groups_of,
     pair_with_nominal,
+    rate_of,
 )
-from lerobot_bomb.evaluation.result_kind import NO_VALUE, Measure, Pair
+from lerobot_bomb.evaluation.result_kind import NO_VALUE, Measure
 from lerobot_bomb.evaluation.result_lines import check_any, kind_of, read_lines
-from lerobot_bomb.stats import format_rate
+from lerobot_bomb.stats import Rate, format_p
 
 
 @dataclass(frozen=True)
 class Summary:
     """What episodes of one environment come to."""
 
-    num_episodes: int
-    num_successes: int
+    rate: Rate
     measures: dict[Measure, str]  # and their values
     failures: Counter[str]
     efficiency: list[tuple[str, str, str]]  # name, value and note of what was measured
 
     def lines(self) -> list[str]:
         """The summary as text, a line each."""
-        rate = format_rate(self.num_successes, self.num_episodes)
-        figures = [("success", rate, "95 % Wilson interval")]
+        figures = [("success", str(self.rate), self.rate.method)]
         figures += [
             (measure.name, value, measure.note)
             for measure, value in self.measures.items()
@@ -64,19 +62,18 @@ def read_results(path: Path) -> list[Row]:
 def summarise(rows: list[Row]) -> Summary:
     """What episodes of one environment come to."""
     return Summary(
-        num_episodes=len(rows),
-        num_successes=sum(row["is_success"] for row in rows),
+        rate=rate_of(rows),
         measures={measure: measure.value(rows) for measure in kind_of(rows[0]).measures},
         failures=Counter(row["failure"] for row in rows if not row["is_success"]),
         efficiency=efficiency.lines(rows),
     )
 
 
-def _pair_line(condition: str, pairs: list[Pair]) -> str:
-    counts, change = count_pairs(pairs), describe_change(pairs)
+def _pair_line(of: PairedComparison) -> str:
+    counts, change = of.counts, of.describe_change()
     return (
-        f"  {condition}: {counts.n} pairs, {counts.only_first} lost, {counts.only_second} won, "
-        f"p = {counts.p_value:.2g} (exact McNemar test){'; ' * bool(change)}{change}"
+        f"  {of.condition}: {counts.n} pairs, {counts.only_first} lost, {counts.only_second} won, "
+        f"{format_p(of.p_value)} ({describe_test(of.num_conditions)}){'; ' * bool(change)}{change}"
     )
 
 
@@ -84,7 +81,7 @@ def pair_lines(group: Group, groups: list[Group]) -> list[str]:
     """What perturbations took away and brought in a group; or why there is nothing to compare with."""
     perturbed = [row for row in group.rows if row["spec"]["perturbations"] != NONE]
     pairs = pair_with_nominal(group.rows)
-    lines = [_pair_line(condition, of) for condition, of in pairs.items()]
+    lines = list(map(_pair_line, compare_pairs(pairs)))
     paired = {id(row) for of in pairs.values() for _, row in of}
     left = [row for row in perturbed if id(row) not in paired]
     if not left:

@@ -8,9 +8,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from lerobot_bomb.evaluation.executed import Executed
+from lerobot_bomb.bootstrap import Measure, paired_bootstrap_interval, sums_by
+from lerobot_bomb.evaluation.executed import Executed, start_of
 from lerobot_bomb.smoothness import MIN_ACTIONS, smoothness
-from lerobot_bomb.stats import Measure, paired_bootstrap_interval
 from lerobot_bomb.tables import print_table
 
 GRIPPER = "gripper"  # in the names of dims that do not count
@@ -99,14 +99,16 @@ def measure_row(executed: Executed, units: Units) -> SmoothnessRow:
     num_actions = {name: len(of) for name, of in episodes.items()}
     actions_RD = np.concatenate(list(episodes.values()))
     episode_R = np.repeat(np.arange(len(episodes)), list(num_actions.values()))
+    places = {start: place for place, start in enumerate(dict.fromkeys(map(start_of, episodes)))}
+    start_R = np.repeat([places[start_of(name)] for name in episodes], list(num_actions.values()))
     dt_s = 1 / executed.fps if units.per_second else None
     return SmoothnessRow(
         executed.fps,
         len(executed.episodes) - len(episodes),
         num_actions,
-        _measures(actions_RD, episode_R, units, dt_s),
+        _measures(actions_RD, episode_R, start_R, units, dt_s),
         {
-            name: {key: of.mean for key, of in _measures(actions_TD, zeros, units, dt_s).items()}
+            name: {key: of.mean for key, of in _measures(actions_TD, zeros, zeros, units, dt_s).items()}
             for name, actions_TD in episodes.items()
             for zeros in [np.zeros(len(actions_TD))]
         },
@@ -114,16 +116,16 @@ def measure_row(executed: Executed, units: Units) -> SmoothnessRow:
 
 
 def _measures(
-    actions_RD: np.ndarray, episode_R: np.ndarray, units: Units, dt_s: float | None
+    actions_RD: np.ndarray, episode_R: np.ndarray, start_R: np.ndarray, units: Units, dt_s: float | None
 ) -> dict[str, Measure]:
-    options = {"exclude": units.exclude, "dt_s": dt_s}
+    options = {"start_R": start_R, "exclude": units.exclude, "dt_s": dt_s}
     raw = smoothness(actions_RD, episode_R, **options)
     normalised = smoothness(actions_RD, episode_R, std_D=units.std, **options)
     return dict(zip(ORDERS, (raw.j2, raw.j3, normalised.j2, normalised.j3), strict=True))
 
 
 def measure_difference(first: str, second: str, rows: dict[str, SmoothnessRow]) -> Difference:
-    """The second one's means minus the first one's, episodes drawn as pairs.
+    """The second one's means minus the first one's, episodes drawn as pairs, those of one seed together.
 
     Raises:
         ValueError: they have no episode in common.
@@ -131,15 +133,17 @@ def measure_difference(first: str, second: str, rows: dict[str, SmoothnessRow]) 
     pairs = [name for name in rows[first].episodes if name in rows[second].episodes]
     if not pairs:
         raise ValueError(f"{first} and {second} have no episode of the same group, task and seed")
+    starts = list(map(start_of, pairs))
     measures = {}
     for key, order in ORDERS.items():
-        sums_E, counts_E = np.empty((2, len(pairs))), np.empty((2, len(pairs)))
-        for i, row in enumerate((rows[first], rows[second])):
-            counts_E[i] = [row.num_actions[name] - order for name in pairs]
-            sums_E[i] = counts_E[i] * [row.episodes[name][key] for name in pairs]
-        means = sums_E.sum(axis=1) / counts_E.sum(axis=1)
-        interval = paired_bootstrap_interval(*zip(sums_E, counts_E, strict=True))
-        measures[key] = Measure(float(means[1] - means[0]), *(interval or (None, None)))
+        both = []
+        for row in (rows[first], rows[second]):
+            counts_N = np.array([row.num_actions[name] - order for name in pairs])
+            sums_E, _ = sums_by(counts_N * [row.episodes[name][key] for name in pairs], starts)
+            both.append((sums_E, sums_by(counts_N, starts)[0]))
+        before, after = (sums_E.sum() / counts_E.sum() for sums_E, counts_E in both)
+        interval = paired_bootstrap_interval(*both)
+        measures[key] = Measure(float(after - before), *(interval or (None, None)))
     return Difference(len(pairs), measures)
 
 

@@ -53,6 +53,7 @@ CHECKS: dict[str, Check] = {
     "levels": is_table_of(is_int(0)),
     **RUN_CHECKS,
 }
+START = ("seed", "task_id")  # tasks have scenes of their own
 
 
 def _settings(row: Row) -> dict[str, str]:
@@ -92,6 +93,7 @@ def _stock_lines(env_type: str, tasks: tuple[str, ...], starts_by_number: bool) 
         spec_fields=SPEC_CHECKS,
         check_episode=lambda row: None,
         drawn=("task_id", "number"),
+        start=START,
         settings=_settings,
         describe_simulator=lambda settings: settings["simulator"],
         describe_tasks=_describe_tasks,
@@ -99,8 +101,8 @@ def _stock_lines(env_type: str, tasks: tuple[str, ...], starts_by_number: bool) 
         environment=lambda row: None,
         eval_flags=partial(_eval_flags, env_type),
         measures=[
-            Measure("max reward", partial(mean_with_interval, name="max_reward"), "mean over episodes"),
-            Measure("sum of rewards", partial(mean_with_interval, name="sum_reward"), "mean over episodes"),
+            Measure(name, partial(mean_with_interval, name=field, start=START), "mean over episodes")
+            for name, field in (("max reward", "max_reward"), ("sum of rewards", "sum_reward"))
         ],
         tasks=tasks,
         has_results_path=False,

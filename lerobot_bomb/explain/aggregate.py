@@ -8,7 +8,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from lerobot_bomb.stats import bootstrap_interval
+from lerobot_bomb.bootstrap import bootstrap_interval
 
 
 @dataclass(frozen=True)

@@ -21,7 +21,6 @@ from lerobot_bomb.hub.evaluations import model_index
 from lerobot_bomb.hub.markdown import command, fenced
 from lerobot_bomb.hub.method import Method
 from lerobot_bomb.hub.training import peft_flags, train_command
-from lerobot_bomb.stats import format_rate
 from lerobot_bomb.vlm.tokenizer import NANO
 
 NO_REPO_ID = "USER/NAME"
@@ -263,16 +262,16 @@ def results_table(group: Group) -> str:
         f"{measure.name} ({measure.note})" if measure.note else measure.name
         for measure in group.kind.measures
     ]
-    columns = ["condition", "success (95 % Wilson interval)", *measures, "failures"]
+    summaries = {condition: summarise(rows) for condition, rows in by_condition(group.rows).items()}
+    intervals = ", ".join(dict.fromkeys(summary.rate.method for summary in summaries.values()))
+    columns = ["condition", f"success ({intervals})", *measures, "failures"]
     lines = [
         f"{group.kind.describe_tasks(group.rows)}; {'; '.join(settings)}:",
         "",
         f"| {' | '.join(columns)} |",
         "|---" * len(columns) + "|",
     ]
-    for condition, rows in by_condition(group.rows).items():
-        summary = summarise(rows)
-        rate = format_rate(summary.num_successes, summary.num_episodes)
-        cells = [f"perturbations={condition}", rate, *summary.measures.values()]
+    for condition, summary in summaries.items():
+        cells = [f"perturbations={condition}", str(summary.rate), *summary.measures.values()]
         lines.append(f"| {' | '.join([*cells, named_counts(summary.failures)])} |")
     return "\n".join(lines)

@@ -8,8 +8,7 @@ from huggingface_hub import EvalResult, EvalResultEntry, eval_result_entries_to_
 from huggingface_hub.repocard_data import eval_results_to_model_index
 
 from lerobot_bomb.envs.results import Row
-from lerobot_bomb.evaluation.result_groups import Group, by_condition, describe_policy, differing
-from lerobot_bomb.stats import format_rate
+from lerobot_bomb.evaluation.result_groups import Group, by_condition, describe_policy, differing, rate_of
 
 METRIC = "success_rate"  # a share, 0..1
 
@@ -79,11 +78,11 @@ def _task(row: Row) -> str:
 
 
 def _share(rows: list[Row]) -> float:
-    return sum(row["is_success"] for row in rows) / len(rows)
+    return rate_of(rows).share
 
 
 def _counted(rows: list[Row]) -> str:
-    return format_rate(sum(row["is_success"] for row in rows), len(rows))
+    return str(rate_of(rows))
 
 
 def _yaml(values: Any) -> str:

@@ -9,6 +9,7 @@ from random import Random
 
 from lerobot_bomb.conditions import NONE
 from lerobot_bomb.envs.results import Row
+from lerobot_bomb.evaluation.comparison import POLICY
 from lerobot_bomb.evaluation.result_groups import Group, by_condition, groups_of
 
 SHOWN_DIGITS = 6  # of a SHA-256, where names are the same otherwise
@@ -29,6 +30,23 @@ class Arm:
     def nominal(self) -> list[Row]:
         """The unperturbed episodes."""
         return by_condition(self.rows).get(NONE, [])
+
+
+@dataclass(frozen=True)
+class Policy:
+    """The arms of one policy, with a short name."""
+
+    short_name: str
+    arms: list[Arm]
+
+    @property
+    def name(self) -> str:
+        """That of its arm, where it has one: it says the suite, too."""
+        return self.arms[0].name if len(self.arms) == 1 else self.short_name
+
+    @property
+    def rows(self) -> list[Row]:
+        return [row for arm in self.arms for row in arm.rows]
 
 
 @dataclass(frozen=True)
@@ -81,19 +99,34 @@ def sample_failures(arms: list[Arm], files: Mapping[Path, list[Row]], num_of_cla
 def arms_of(rows: list[Row]) -> list[Arm]:
     """Lines apart that must not be pooled, each with a name that no other has."""
     groups = groups_of(rows)
-    names = [_name(group.rows[0]) for group in groups]
+    first = [group.rows[0] for group in groups]
+    return list(map(Arm, _told_apart([_name(row) for row in first], first), groups))
+
+
+def policies_of(arms: list[Arm]) -> list[Policy]:
+    """Policies of these arms, each with a name that no other has."""
+    of_key: dict[str, list[Arm]] = {}
+    for arm in arms:
+        of_key.setdefault(arm.group.settings[POLICY], []).append(arm)
+    first = [of[0].rows[0] for of in of_key.values()]
+    names = _told_apart([policy_name(row) for row in first], first)
+    return list(map(Policy, names, of_key.values()))
+
+
+def _told_apart(names: list[str], rows: list[Row]) -> list[str]:
+    """Names with the weights of the rows' policies where they are the same otherwise, then with numbers."""
     doubled = {name for name, number in Counter(names).items() if number > 1}
     long = [
-        f"{name} {_weights(group.rows[0])}".strip() if name in doubled else name
-        for name, group in zip(names, groups, strict=True)
+        f"{name} {_weights(row)}".strip() if name in doubled else name
+        for name, row in zip(names, rows, strict=True)
     ]
     still = {name for name, number in Counter(long).items() if number > 1}
     numbers = Counter[str]()
-    arms = []
-    for name, group in zip(long, groups, strict=True):
+    told = []
+    for name in long:
         numbers[name] += 1
-        arms.append(Arm(f"{name} ({numbers[name]})" if name in still else name, group))
-    return arms
+        told.append(f"{name} ({numbers[name]})" if name in still else name)
+    return told
 
 
 def policy_name(row: Row) -> str:

@@ -3,26 +3,31 @@
 from collections.abc import Callable
 
 from lerobot_bomb.envs.results import Row
+from lerobot_bomb.evaluation.paired import PairedComparison
+from lerobot_bomb.evaluation.result_groups import rate_of
 from lerobot_bomb.report.table import Cell
-from lerobot_bomb.stats import PairedCounts, paired_difference_interval, wilson_interval
+from lerobot_bomb.stats import format_p
+
+INTERVALS = "95 % Wilson intervals, clustered by seed"  # of `rate`
 
 
 def rate(rows: list[Row], is_counted: Callable[[Row], bool] = lambda row: row["is_success"]) -> Cell:
     """'96 % [87, 99]' of rows; '-' of none."""
     if not rows:
         return Cell("-")
-    number = sum(map(is_counted, rows))
-    share, (low, high) = number / len(rows), wilson_interval(number, len(rows))
-    text = f"{100 * share:.0f} % [{100 * low:.0f}, {100 * high:.0f}]"
-    return Cell(text, {"successes": number, "n": len(rows), "low": low, "high": high}, share)
+    found = rate_of(rows, is_counted)
+    low, high = found.interval or (None, None)
+    bounds = "" if low is None or high is None else f" [{100 * low:.0f}, {100 * high:.0f}]"
+    value = {"successes": found.successes, "n": found.n, "low": low, "high": high}
+    return Cell(f"{100 * found.share:.0f} %{bounds}", value, found.share)
 
 
-def points(counts: PairedCounts, p_value: float) -> list[Cell]:
+def points(of: PairedComparison) -> list[Cell]:
     """'-12 [-20, -5]' per cent, the second rate minus the first; and its p-value."""
-    low, high = paired_difference_interval(counts)
+    counts, (low, high) = of.counts, of.interval
     value = {"difference": counts.difference, "low": low, "high": high, **vars(counts)}
     text = f"{100 * counts.difference:+.0f} [{100 * low:+.0f}, {100 * high:+.0f}]"
-    return [Cell(text, value), Cell(f"{p_value:.2g}", p_value)]
+    return [Cell(text, value), Cell(format_p(of.p_value).removeprefix("p = "), of.p_value)]
 
 
 def count(number: int, of: int) -> Cell:

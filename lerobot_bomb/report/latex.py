@@ -4,7 +4,7 @@ from collections.abc import Sequence
 
 from lerobot_bomb.evaluation.result_groups import by_condition
 from lerobot_bomb.report.arms import Arm
-from lerobot_bomb.report.cells import rate
+from lerobot_bomb.report.cells import INTERVALS, rate
 
 SPECIAL = {
     "\\": r"\textbackslash{}", "~": r"\textasciitilde{}", "^": r"\textasciicircum{}",
@@ -27,7 +27,7 @@ def table(arms: Sequence[Arm]) -> str:
         r"\end{tabular}",
     ]
     episodes = " or ".join(map(str, numbers))
-    note = f"% success, with 95 % Wilson intervals; {episodes} episodes each\n"
+    note = f"% success, with {INTERVALS}; {episodes} episodes each\n"
     return note + "\n".join(lines) + "\n"
 
 

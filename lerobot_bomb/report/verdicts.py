@@ -8,11 +8,12 @@ from dataclasses import dataclass
 from typing import Any
 
 from lerobot_bomb.envs.results import Row
-from lerobot_bomb.evaluation.result_groups import count_pairs, different_fields
+from lerobot_bomb.evaluation.comparison import episode_of
+from lerobot_bomb.evaluation.result_groups import count_pairs, different_fields, rate_of
 from lerobot_bomb.evaluation.result_kind import Pair
-from lerobot_bomb.report.cells import rate
+from lerobot_bomb.report.cells import INTERVALS, rate
 from lerobot_bomb.report.table import Cell, Table
-from lerobot_bomb.stats import format_rate
+from lerobot_bomb.stats import SIGNIFICANT, PairedCounts, format_p
 
 POLICY, AGAIN, ALONE = "the policy", "again, in another process", "one episode at a time"
 BLANK, OTHER_INSTRUCTION = "with black images", "with another episode's instruction"
@@ -20,7 +21,10 @@ RANDOM, EXPERT = "random actions", "the scripted expert"
 TRAIN, HELDOUT = "what training shows (split train)", "what is held out (split heldout)"
 
 YES, NO, OPEN = "yes", "NO", "not shown"
-SIGNIFICANT = 0.05
+P_NOTE = (
+    "p: exact McNemar test, or Fisher's where it says so; each question is asked alone, and nothing is "
+    "adjusted for their number."
+)
 
 
 @dataclass(frozen=True)
@@ -37,8 +41,8 @@ def table(arms: Mapping[str, list[Row]], verdicts: list[Verdict]) -> list[Table]
     rates = [[Cell(name), rate(rows), Cell(str(len(rows)), len(rows))] for name, rows in arms.items() if rows]
     answers = [[Cell(each.question), Cell(each.answer), Cell(each.evidence)] for each in verdicts]
     return [
-        Table("Verdicts", ["question", "answer", "evidence"], answers),
-        Table("Success", ["who acts", "success", "episodes"], rates, "With 95 % Wilson intervals; per cent."),
+        Table("Verdicts", ["question", "answer", "evidence"], answers, P_NOTE),
+        Table("Success", ["who acts", "success", "episodes"], rates, f"With {INTERVALS}; per cent."),
     ]
 
 
@@ -59,8 +63,12 @@ def judge(arms: Mapping[str, list[Row]], trained_seeds: Sequence[int] | None) ->
 
 
 def _pairs(first: list[Row], second: list[Row]) -> list[Pair]:
-    of_seed = {row["spec"]["seed"]: row for row in second}
-    return [(row, of_seed[row["spec"]["seed"]]) for row in first if row["spec"]["seed"] in of_seed]
+    of_episode = {episode_of(row): row for row in second}
+    return [(row, of_episode[key]) for row in first if (key := episode_of(row)) in of_episode]
+
+
+def _p(counts: PairedCounts) -> str:
+    return f"{format_p(counts.p_value)}, not adjusted"
 
 
 def _same_again(pairs: list[Pair]) -> Verdict:
@@ -76,7 +84,7 @@ def _same_alone(pairs: list[Pair]) -> Verdict:
     num_other = counts.only_first + counts.only_second
     num_equal = sum(not different_fields(*pair) for pair in pairs)
     evidence = (
-        f"{num_other} of {counts.n} episodes end otherwise (p = {counts.p_value:.2g}), "
+        f"{num_other} of {counts.n} episodes end otherwise ({_p(counts)}), "
         f"{num_equal} are the same bit for bit"
     )
     answer = NO if counts.p_value < SIGNIFICANT else YES
@@ -87,7 +95,7 @@ def _depends(question: str, name: str, pairs: list[Pair]) -> Verdict:
     counts = count_pairs(pairs)
     if not any(different_fields(*pair) for pair in pairs):
         return Verdict(question, NO, f"{name} all {counts.n} episodes are the same, bit for bit")
-    shown = f"{counts.first} of {counts.n} become {counts.second} {name} (p = {counts.p_value:.2g})"
+    shown = f"{counts.first} of {counts.n} become {counts.second} {name} ({_p(counts)})"
     is_worse = counts.p_value < SIGNIFICANT and counts.difference < 0
     return Verdict(question, YES if is_worse else OPEN, shown)
 
@@ -95,14 +103,14 @@ def _depends(question: str, name: str, pairs: list[Pair]) -> Verdict:
 def _better_than_random(pairs: list[Pair]) -> Verdict:
     counts = count_pairs(pairs)
     is_better = counts.p_value < SIGNIFICANT and counts.difference > 0
-    shown = f"{counts.second} of {counts.n}, random actions {counts.first} (p = {counts.p_value:.2g})"
+    shown = f"{counts.second} of {counts.n}, random actions {counts.first} ({_p(counts)})"
     return Verdict("better than random actions", YES if is_better else OPEN, shown)
 
 
 def _can_be_solved(rows: list[Row]) -> Verdict:
-    successes = sum(row["is_success"] for row in rows)
-    answer = YES if successes == len(rows) else NO
-    return Verdict("every episode can be solved", answer, format_rate(successes, len(rows)))
+    rate = rate_of(rows)
+    answer = YES if rate.successes == rate.n else NO
+    return Verdict("every episode can be solved", answer, str(rate))
 
 
 def _generalises(train: list[Row], heldout: list[Row]) -> Verdict:
@@ -110,7 +118,8 @@ def _generalises(train: list[Row], heldout: list[Row]) -> Verdict:
     p_value = _fisher(shown, len(train), held, len(heldout))
     is_worse = p_value < SIGNIFICANT and held / len(heldout) < shown / len(train)
     evidence = (
-        f"{held} of {len(heldout)} held out, {shown} of {len(train)} others (Fisher's p = {p_value:.2g})"
+        f"{held} of {len(heldout)} held out, {shown} of {len(train)} others "
+        f"(Fisher's {format_p(p_value)}, not adjusted)"
     )
     return Verdict("does as well on what is held out", NO if is_worse else YES, evidence)
 

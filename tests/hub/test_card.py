@@ -73,6 +73,14 @@ def test_metadata_of_a_public_backbone() -> None:
     }
 
 
+def test_adapters_name_the_checkpoint_that_they_are_of_and_not_its_backbone() -> None:
+    of = metadata(replace(checkpoint(), adapters_of="me/whole"))
+    assert (of["base_model"], of["base_model_relation"]) == ("me/whole", "adapter")
+    local = metadata(replace(checkpoint("nano"), adapters_of="me/whole"))
+    assert (local["base_model"], local["base_model_relation"]) == ("me/whole", "adapter")
+    assert "base_model_relation" not in metadata(checkpoint())
+
+
 @pytest.mark.parametrize(("name", "license"), [("nano", "apache-2.0"), ("/data/models/SmolVLM", None)])
 def test_a_backbone_without_a_name_is_no_base_model(name: str, license: str | None) -> None:
     of = metadata(checkpoint(name))

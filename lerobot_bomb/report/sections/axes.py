@@ -3,10 +3,10 @@
 from lerobot_bomb.conditions import MAX_LEVEL
 from lerobot_bomb.envs.results import Row
 from lerobot_bomb.report.arms import Arm, Report
-from lerobot_bomb.report.cells import rate
+from lerobot_bomb.report.cells import INTERVALS, rate
 from lerobot_bomb.report.table import Cell, Section, Table
 
-NOTE = "A column for each level of the axis; 0: unperturbed."
+NOTE = f"A column for each level of the axis; 0: unperturbed. With {INTERVALS}."
 
 
 def section(report: Report) -> Section:

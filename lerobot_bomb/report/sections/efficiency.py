@@ -39,6 +39,12 @@ def section(report: Report) -> Section:
     return Section("Efficiency", [table for table in tables if table.rows])
 
 
+def is_measured(report: Report) -> bool:
+    """Whether the section has something to show."""
+    names = ("inference", "action_j2")
+    return any(row.get(name) is not None for arm in report.arms for row in arm.rows for name in names)
+
+
 def _cells(of: Efficiency) -> list[Cell]:
     mebibytes = None if of.peak_memory_bytes is None else of.peak_memory_bytes / 2**20
     return [

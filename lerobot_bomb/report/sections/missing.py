@@ -21,7 +21,7 @@ def section(report: Report) -> Section:
     """A line for each."""
     is_missing = {
         LANGUAGE: not language.section(report).tables,
-        EFFICIENCY: not efficiency.section(report).tables,
+        EFFICIENCY: not efficiency.is_measured(report),
         VIDEOS: bool(report.samples) and not any(each.video or each.note for each in report.samples),
     }
     lines = [line for line, missing in is_missing.items() if missing]

@@ -2,10 +2,10 @@
 
 import numpy as np
 
+from lerobot_bomb.bootstrap import Slope, slope, variance_share
 from lerobot_bomb.envs.results import Row
 from lerobot_bomb.report.arms import Arm, Report
 from lerobot_bomb.report.table import Cell, Section, Table
-from lerobot_bomb.stats import Slope, slope, variance_share
 
 
 def section(report: Report) -> Section:
@@ -78,9 +78,9 @@ def _shares(arm: Arm) -> dict[str, float]:
 def _slope_cell(found: Slope | None) -> Cell:
     if found is None:
         return Cell("")
-    interval = (
-        f"[{100 * found.low:+.1f}, {100 * found.high:+.1f}]" if found.low < found.high else "(all alike)"
-    )
+    interval = "(all alike)"
+    if found.low is not None and found.high is not None:
+        interval = f"[{100 * found.low:+.1f}, {100 * found.high:+.1f}]"
     text = f"{100 * found.per_level:+.1f} {interval}"
     return Cell(text, vars(found))
 
