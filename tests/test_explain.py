@@ -78,9 +78,7 @@ def test_the_fast_way_gives_what_the_slow_one_does(name: str) -> None:
         assert close(effect, question.clean_score - score, question)
     offsets = token_offsets(loaded(name).prepare.steps, moment()[1])
     hidden = span_of("black", moment()[1]).tokens(offsets)[None]
-    batch = loaded(name).prepare(question.observation)
-    key = "observation.language.attention_mask"
-    batch[key] = batch[key] & ~hidden
+    batch = question.explained.hide_in(loaded(name).prepare(question.observation), hidden[0])
     score = question.explained.score(question.explained.encode(batch), question.answer)
     assert close(question.effects_of_hidden(hidden), question.clean_score - score, question)
 
