@@ -5,12 +5,18 @@ from typing import Any
 
 import pytest
 import torch
-from explain_cases import NAMES, ask, fresh, loaded, moment
+from explain_cases import NAMES, ask, explained_by, fresh, loaded, moment
 from torch import Tensor
 
-from lerobot_bomb.explain.masked_episodes import masks_of
+from lerobot_bomb.decoding.decoder import Prompt
+from lerobot_bomb.decoding.decoder_layers import TextLayers
+from lerobot_bomb.decoding.draft import LinearDraft
+from lerobot_bomb.decoding.graph_decoder import GraphDecoder
+from lerobot_bomb.decoding.kv_cache import CachedText
+from lerobot_bomb.decoding.slots import GraphSlots
+from lerobot_bomb.explain.masked_episodes import without_words
 from lerobot_bomb.explain.question import Question
-from lerobot_bomb.explain.spans import span_of, spans_of_words, token_offsets
+from lerobot_bomb.explain.spans import span_of, token_offsets
 from lerobot_bomb.viewing.checkpoint import LoadedPolicy
 from lerobot_bomb.vlm.qwen import Prefix
 
@@ -130,3 +136,66 @@ def test_the_stock_model_agrees_where_nothing_is_hidden(name: str) -> None:
     with torch.no_grad():
         expected = question.explained.score(question.rows, question.answer)
     assert float(expected) == pytest.approx(question.clean_score, rel=1e-5, abs=1e-5)
+
+
+def hidden_batch(policy: LoadedPolicy, word: str) -> dict[str, Any]:
+    """What a whole episode under the mask of a word has in place of this observation."""
+    observation, instruction, _, _ = moment()
+    mask = without_words(policy, {instruction: span_of(word, instruction)}.get)
+    prepared = policy.prepare(policy.observe([observation], [instruction]))
+    assert mask.change_prepared(prepared, "another instruction") is prepared
+    return mask.change_prepared(prepared, instruction)
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_in_whole_episodes_the_same_tokens_are_hidden(name: str) -> None:
+    policy = loaded(name)
+    question = ask(policy)
+    rows = question.explained.encode(hidden_batch(policy, "3"))
+    expected = question.explained.hide(question.rows, hidden_word(policy, "3"))
+    assert torch.equal(rows["hidden"], expected["hidden"]) and torch.equal(rows["mask"], expected["mask"])
+
+
+def written_by_graphs(policy: Any, batch: dict[str, Any]) -> Tensor:
+    """Numbers by the passes that are recorded on CUDA, one after the other."""
+    prompt, grammar, backbone = policy._prompt(batch), policy.grammar, policy.backbone
+    num_numbers = grammar.num_numbers
+    num_columns = prompt.ids.shape[1] + grammar.max_symbols(num_numbers)
+    layers = TextLayers(backbone.text_model, copy_dtype=torch.float32)
+    text = CachedText(layers, 1, num_columns, policy._positions)
+    rows = backbone.embed_tokens(policy.symbol_ids), backbone.vlm.lm_head.weight[policy.symbol_ids]
+    recorded = GraphDecoder(grammar, LinearDraft(grammar, 4), *rows, text)
+    recorded(Prompt(policy._embeds(batch, prompt.ids), prompt.mask), *rows, num_numbers)
+    return recorded(
+        Prompt(policy._embeds(batch, prompt.ids), prompt.mask, prompt.hidden), *rows, num_numbers
+    ).numbers
+
+
+def chosen_by_graphs(policy: Any, batch: dict[str, Any]) -> Tensor:
+    """Cells in the same way."""
+    prompt, backbone, num_steps = policy._prompt(batch), policy.backbone, policy.config.chunk_size
+    num_slots = num_steps * len(policy.grids.groups)
+    layers = TextLayers(backbone.text_model, copy_dtype=torch.float32)
+    text = CachedText(layers, 1, prompt.ids.shape[1] + num_slots, backbone.positions)
+    rows = policy.cell_embedding.weight * backbone.embed_scale, policy.cell_head.weight
+    settings = policy._group_rows, num_steps, policy._prompt_reads_all, backbone.cap
+    recorded = GraphSlots(*settings, *rows, text)
+    noise = torch.zeros(1, 0, len(rows[1]))
+    embeds = policy._embeds(batch, prompt.ids)
+    recorded(Prompt(embeds, prompt.mask), *rows, noise)
+    return recorded(Prompt(embeds, prompt.mask, prompt.hidden), *rows, noise)[0]
+
+
+@torch.no_grad()
+@pytest.mark.parametrize(
+    ("name", "by_graphs"), [("vla0_smol", written_by_graphs), ("spatialvla_grid", chosen_by_graphs)]
+)
+@pytest.mark.parametrize("word", ["3", "row 1, column 3"])
+def test_captured_passes_hide_the_same(name: str, by_graphs: Callable[..., Tensor], word: str) -> None:
+    """After a prompt of which nothing was hidden."""
+    policy = loaded(name)
+    batch = hidden_batch(policy, word)
+    answer = explained_by(policy).answer(batch)
+    assert torch.equal(by_graphs(policy.policy, batch).flatten(), answer.flatten())
+    clean = ask(policy).answer
+    assert word == "3" or not torch.equal(answer, clean)
