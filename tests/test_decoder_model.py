@@ -250,6 +250,42 @@ def test_fast_layers_compute_what_the_plain_ones_do_and_those_what_the_model_doe
         torch.testing.assert_close(states, plain, rtol=0, atol=1e-4)
 
 
+def states_of_stock(model: Any, embeds: Tensor, position_L: Tensor, reads_BLL: Tensor) -> Tensor:
+    """By transformers, with a mask of its own for each row."""
+    mask = torch.zeros(reads_BLL.shape).masked_fill(~reads_BLL, torch.finfo(torch.float32).min)[:, None]
+    is_gemma = model.config.model_type.startswith("gemma2")
+    return model(
+        inputs_embeds=embeds,
+        attention_mask={"full_attention": mask, "sliding_attention": mask} if is_gemma else mask,
+        position_ids=torch.stack(len(embeds) * [position_L], dim=-2),
+        use_cache=False,
+    ).last_hidden_state
+
+
+@torch.no_grad()
+@pytest.mark.parametrize("copy_dtype", [None, torch.float32])
+def test_a_hidden_token_is_read_by_no_other_and_keeps_its_position(
+    text: tuple[Any, Positions], copy_dtype: torch.dtype | None
+) -> None:
+    model, positions = text
+    embeds, columns = nine_tokens(model)
+    hidden = torch.zeros(3, 9, dtype=torch.bool)
+    hidden[0, 3] = hidden[1, 2] = hidden[1, 4] = True
+    causal = torch.ones(3, 9, 9, dtype=torch.bool).tril()
+    expected = states_of_stock(model, embeds, positions(torch.arange(9)), causal & ~hidden[:, None])
+    cached = CachedText(TextLayers(model, copy_dtype=copy_dtype), 3, 20, positions)
+    cached.hide(columns[:, :5], hidden[:, :5])
+    states = [cached(embeds[:, part], columns[:, part]) for part in (slice(5), slice(5, 7))]
+    states.append(cached.read(embeds[:, 7:8], *cached.singly(columns[:, 7:8])))
+    torch.testing.assert_close(torch.cat(states, dim=1), expected[:, :8], rtol=0, atol=1e-4)
+    cached.keep(torch.tensor([1]))
+    last = cached(embeds[1:2, 8:], columns[1:2, 8:])
+    torch.testing.assert_close(last, expected[1:2, 8:], rtol=0, atol=1e-4)
+    cached.clear()
+    plain = states_of_stock(model, embeds, positions(torch.arange(9)), causal)
+    torch.testing.assert_close(cached(embeds[1:2], columns[1:2]), plain[1:2], rtol=0, atol=1e-4)
+
+
 def test_singly_and_with_projections_that_are_not_plain_states_are_the_same(
     text: tuple[Any, Positions],
 ) -> None:

@@ -84,6 +84,17 @@ def test_fingers_closed_on_nothing_open_above_the_stone() -> None:
     assert dz > 0.3 and gripper > 0
 
 
+@pytest.mark.parametrize(("narrower_m", "gripper"), [(0.0115, 1.0), (0.008, 0.0), (0.005, -1.0)])
+def test_fingers_that_close_on_less_than_a_stone_open_around_it(narrower_m: float, gripper: float) -> None:
+    """A grip 8 mm narrower than the stone is empty; from 5 mm on, the stone may be what is held."""
+    state = state_of([0.17, 0.0, 0.007], OPEN)
+    grip = replace(state, finger_opening=2 * state.stone_radius_m - narrower_m)
+    *_, dz, command = expert_action(grip)
+    assert command == pytest.approx(gripper, abs=1e-6)
+    # the stone is lifted as fast as the arm goes, or not at all
+    assert dz > 0.4 if gripper < 0 else dz < 0
+
+
 def test_it_carries_the_stone_across_then_down() -> None:
     across = expert_action(state_of([0.10, 0.0, 0.035], HELD, np.array([0.10, 0.0, 0.0375])))
     down = expert_action(state_of([0.0, 0.0, 0.035], HELD, np.array([0.0, 0.0, 0.0375])))

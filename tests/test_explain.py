@@ -1,15 +1,18 @@
 """Explanations of one moment: identities that hold whatever the policy is."""
 
+from dataclasses import replace
 from typing import Any
 
 import pytest
 import torch
-from explain_cases import NAMES, WORKSPACE, WRIST, ask, explained_by, loaded, moment, without_image
+from explain_cases import NAMES, WORKSPACE, WRIST, ask, asked, explained_by, loaded, moment, without_image
 from torch import Tensor
+from torch.nn.functional import pad
 
 from lerobot_bomb.explain.activations import LAYER, PARTS, Unit, all_heads, all_layers, all_mlps, recording
 from lerobot_bomb.explain.explained import repeated
 from lerobot_bomb.explain.images import filling, occluded, patch_masks
+from lerobot_bomb.explain.moment import OTHER_INSTRUCTION, explain
 from lerobot_bomb.explain.question import Question
 from lerobot_bomb.explain.restoration import Corruption, Restoration
 from lerobot_bomb.explain.spans import difference, span_of, spans_of_words, token_offsets
@@ -78,9 +81,7 @@ def test_the_fast_way_gives_what_the_slow_one_does(name: str) -> None:
         assert close(effect, question.clean_score - score, question)
     offsets = token_offsets(loaded(name).prepare.steps, moment()[1])
     hidden = span_of("black", moment()[1]).tokens(offsets)[None]
-    batch = loaded(name).prepare(question.observation)
-    key = "observation.language.attention_mask"
-    batch[key] = batch[key] & ~hidden
+    batch = question.explained.hide_in(loaded(name).prepare(question.observation), hidden[0])
     score = question.explained.score(question.explained.encode(batch), question.answer)
     assert close(question.effects_of_hidden(hidden), question.clean_score - score, question)
 
@@ -173,6 +174,22 @@ def test_units_put_back_in_a_batch_give_what_they_give_alone(name: str) -> None:
     alone = torch.cat([corruption.restore([[unit]]).scores for unit in units])
     together = corruption.restore([[unit] for unit in units]).scores
     torch.testing.assert_close(together, alone, rtol=1e-5, atol=1e-5)
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_nothing_is_put_back_of_an_instruction_of_more_tokens(name: str) -> None:
+    """Though both have as many columns, as on CUDA, where instructions are padded."""
+    policy, instruction = loaded(name), moment()[1]
+
+    def prepare(batch: dict[str, Any]) -> dict[str, Any]:
+        prepared = policy.prepare(batch)
+        keys = ("observation.language.tokens", "observation.language.attention_mask")
+        return prepared | {key: pad(prepared[key], (0, 32 - prepared[key].shape[1])) for key in keys}
+
+    others = {"longer": f"{instruction} please", "as long": moment()[3]["row"][0]}
+    for other, is_put_back in zip(others.values(), (False, True), strict=True):
+        found = explain(ask(policy, prepare), replace(asked(policy), others={"other": other}))
+        assert any(OTHER_INSTRUCTION in each.corruption for each in found.restored) == is_put_back
 
 
 def hooks_of(name: str) -> int:

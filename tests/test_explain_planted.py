@@ -12,7 +12,7 @@ from lerobot_bomb.explain.diagnosis import diagnose
 from lerobot_bomb.explain.explained import INSTRUCTION
 from lerobot_bomb.explain.moment import OTHER_SCENE, Explanation, camera_name, explain
 from lerobot_bomb.explain.restoration import smallest_drop
-from lerobot_bomb.explain.spans import difference, token_offsets
+from lerobot_bomb.explain.spans import difference, span_of, token_offsets
 from lerobot_bomb.flow.dual_mod import FiLM
 from lerobot_bomb.viewing.checkpoint import LoadedPolicy
 
@@ -31,8 +31,8 @@ def hide_words(policy: LoadedPolicy, shown: torch.Tensor | None) -> None:
     def parts(batch: dict[str, Any]) -> dict[str, TokenRows]:
         found = usual(batch)
         task = found[INSTRUCTION]
-        mask = torch.zeros_like(task.mask) if shown is None else task.mask & shown
-        return found | {INSTRUCTION: TokenRows(task.ids, mask)}
+        hidden = torch.ones_like(task.mask) if shown is None else ~shown.expand_as(task.mask)
+        return found | {INSTRUCTION: TokenRows(task.ids, task.mask, hidden)}
 
     changed._prompt_parts = parts
 
@@ -45,6 +45,20 @@ def test_one_that_ignores_the_text(name: str) -> None:
     assert found["Hidden words that the answer depends on:"] == ()
     assert found["Changed words that the answer depends on:"] == ()
     assert found["Patches that the answer depends on:"]
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_a_word_that_is_never_read_has_no_effect_at_all(name: str) -> None:
+    """It counts where the others stand, all the same: without its token they would be elsewhere."""
+    policy = fresh(name)
+    instruction = moment()[1]
+    word = span_of("black", instruction).tokens(token_offsets(policy.prepare.steps, instruction))
+    hide_words(policy, ~word)
+    question = ask(policy)
+    hidden = question.explained.hide(question.rows, word[None])
+    assert question.effects(hidden).tolist() == [0.0]
+    removed = hidden | {"mask": hidden["mask"] & ~hidden["hidden"]}
+    assert abs(float(question.effects(removed))) > 1e-4
 
 
 @pytest.mark.parametrize("name", NAMES)

@@ -16,7 +16,7 @@ from pusht_cases import ZARR
 from torch import Tensor
 
 from lerobot_bomb.actions.grid_edges import MIN_WIDTH, cut, gaussian_cut, to_polar
-from lerobot_bomb.actions.grid_fit import normalised, normalised_rest
+from lerobot_bomb.actions.grid_fit import dead_radius, fit_cuts, normalised, normalised_rest
 from lerobot_bomb.actions.grid_report import clipping_text, rest_text
 from lerobot_bomb.actions.grid_settings import ActionGroup, GridSettings, default_groups
 from lerobot_bomb.actions.grids import ActionGrids
@@ -353,6 +353,26 @@ def test_what_rests_is_still_rest_beside_motions_of_any_size() -> None:
     is_still = grids.encode(torch.from_numpy(values))[:, 0] == 0
     assert is_still[::2].all() and is_still[1::20].all()
     assert is_still.float().mean() < 0.56
+
+
+def test_still_motions_do_not_count_among_the_long_ones() -> None:
+    lengths = torch.cat([torch.zeros(20), torch.arange(1.0, 21.0)])
+    # 0.02 of the 19th of the 20 that move; of all 40 the 38th is 18
+    assert dead_radius(lengths) == pytest.approx(0.38)
+    assert dead_radius(torch.zeros(5)) == 0.02
+
+
+@pytest.mark.parametrize("zero_radius_bin", [True, False])
+def test_still_motions_have_no_direction(zero_radius_bin: bool) -> None:
+    """Half of the motions go along y, the others rest; theta and phi of nothing would be 0."""
+    actions = torch.zeros(40, 3, dtype=torch.float64)
+    actions[20:, 1] = 0.5
+    group = ActionGroup((0, 1, 2), "polar", (4, 4, 4))
+    settings = GridSettings(groups=(group,), zero_radius_bin=zero_radius_bin, phi_fit="linear")
+    theta, phi, rho = fit_cuts(actions, np.zeros(3), settings)
+    assert (theta.mean, phi.mean) == pytest.approx((PI / 2, PI / 2))
+    # lengths are cut where directions are not: they rest, too, where no bin is for that
+    assert rho.mean == pytest.approx(0.5 if zero_radius_bin else 0.25)
 
 
 def test_frames_so_far_off_that_no_bin_holds_the_others_are_named() -> None:

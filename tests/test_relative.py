@@ -57,6 +57,15 @@ def test_chunks_end_with_their_episode() -> None:
     assert relative.scale.item() == pytest.approx(0.2)
 
 
+def test_one_residual_in_a_thousand_saturates() -> None:
+    residuals = np.arange(1001.0)  # their 0.999 quantile is 999
+    states = 10_000 * residuals[:, None]
+    span = (np.array([-1000.0]), np.array([1000.0]))
+    relative = RelativeActions(1, {0: 0})
+    relative.fit(states + residuals[:, None], states, np.arange(1, 1002), 1, span, span)
+    assert relative.scale.item() == pytest.approx(0.999)
+
+
 def test_raw_residuals_of_state_and_action_normalised_alike() -> None:
     relative = RelativeActions(2, {0: 0, 1: 1})  # no data: the widest range
     action, state = torch.tensor([[[0.9, -0.9]]]), torch.tensor([[-0.4, 0.5]])

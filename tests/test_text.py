@@ -114,3 +114,17 @@ def test_rows_are_rounded_up_with_padding() -> None:
     assert rounded.ids.shape == (1, 4) and rounded.mask.tolist() == [[True, False, True, False]]
     assert rounded.without_padding().ids.tolist() == [[4, 6]]
     assert rounded.rounded(4).ids.shape == (1, 4)
+
+
+def test_hidden_tokens_keep_their_columns() -> None:
+    mask = torch.tensor([[True, False, True]])
+    rows = TokenRows(torch.tensor([[4, 5, 6]]), mask, torch.tensor([[False, False, True]]))
+    joined = TokenRows.join([TokenRows(torch.tensor([[3]]), torch.tensor([[True]])), rows]).rounded(6)
+    assert joined.ids.tolist() == [[3, 4, 5, 6, 0, 0]]
+    assert joined.readable.tolist() == [[True, True, False, False, False, False]]
+    compacted = joined.without_padding()
+    assert compacted.ids.tolist() == [[3, 4, 6]] and compacted.mask.tolist() == [[True, True, True]]
+    assert compacted.hidden is not None and compacted.hidden.tolist() == [[False, False, True]]
+    assert TokenRows.join([rows, rows]).without_padding().readable.tolist() == [[True, False, True, False]]
+    nothing = TokenRows(rows.ids, mask)
+    assert TokenRows.join([nothing]).hidden is None and nothing.readable is mask

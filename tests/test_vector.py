@@ -5,6 +5,7 @@ import numpy as np
 
 from lerobot_bomb.bomb.episode import EpisodeSpec
 from lerobot_bomb.bomb.observation import RenderOptions
+from lerobot_bomb.envs.inference import Query
 from lerobot_bomb.envs.vector import NEW_ROLLOUT_OPTION, FreezeAfterEnd, LazyVectorEnv
 from lerobot_env_bomb.env import BombEnv
 
@@ -55,6 +56,28 @@ def test_nothing_starts_before_the_first_use() -> None:
     assert envs.observation_space["agent_pos"].shape == (2, 4)  # pyright: ignore[reportIndexIssue]
     envs.reset(seed=SEEDS)
     assert len(started) == 3
+    envs.close()
+
+
+class Queried(BombEnv):
+    """Tells of which queries it was told."""
+
+    def queries(self) -> list[Query]:
+        return list(self._queries)
+
+
+def test_a_query_before_a_reset_is_of_no_episode_after_it() -> None:
+    before, after = (Query(seconds, None, None, 1, None, "cpu") for seconds in (1.0, 2.0))
+    asked = [before]
+    make = partial(Queried, EpisodeSpec(seed=0), SMALL)
+    envs = LazyVectorEnv([make] * 2, use_async=False, last_query=lambda: asked.pop() if asked else None)
+    envs.reset(seed=SEEDS)
+    envs.step(STILL)
+    assert envs.call("queries") == ([], [])
+    asked.append(after)
+    envs.step(STILL)
+    envs.step(STILL)
+    assert envs.call("queries") == ([after], [after])
     envs.close()
 
 

@@ -90,10 +90,14 @@ def compact(mask_BL: Tensor, *columns_BL: Tensor) -> tuple[Tensor, ...]:
 
 @dataclass(frozen=True)
 class TokenRows:
-    """Rows of tokens with padding: ids (B, L) int64 and which columns hold a token (B, L) bool."""
+    """Rows of tokens with padding: ids (B, L) int64 and which columns hold a token (B, L) bool.
+
+    A hidden token keeps its position, but no other token reads it.
+    """
 
     ids: Tensor
     mask: Tensor
+    hidden: Tensor | None = None  # (B, L) bool; None: no token is
 
     @classmethod
     def constant(cls, ids: list[int], like_BL: Tensor) -> "TokenRows":
@@ -103,17 +107,30 @@ class TokenRows:
 
     @classmethod
     def join(cls, parts: "list[TokenRows]") -> "TokenRows":
-        return cls(torch.cat([part.ids for part in parts], 1), torch.cat([part.mask for part in parts], 1))
+        if any(part.hidden is not None for part in parts):
+            parts = [cls(part.ids, part.mask, part.mask & ~part.readable) for part in parts]
+        return cls(
+            *(torch.cat(columns, 1) for columns in zip(*(part._columns for part in parts), strict=True))
+        )
+
+    @property
+    def readable(self) -> Tensor:
+        """(B, L) bool, which columns hold a token that others read."""
+        return self.mask if self.hidden is None else self.mask & ~self.hidden
 
     def rounded(self, multiple: int) -> "TokenRows":
         """With gaps at the end, up to a multiple of so many columns."""
         width = -self.ids.shape[1] % multiple
-        return TokenRows(nn.functional.pad(self.ids, (0, width)), nn.functional.pad(self.mask, (0, width)))
+        return TokenRows(*(nn.functional.pad(columns, (0, width)) for columns in self._columns))
 
     def without_padding(self) -> "TokenRows":
         """Rows that start with their tokens."""
-        mask_BL, ids_BL = compact(self.mask, self.ids)
-        return TokenRows(ids_BL, mask_BL)
+        mask_BL, ids_BL, *hidden = compact(self.mask, self.ids, *self._columns[2:])
+        return TokenRows(ids_BL, mask_BL, *hidden)
+
+    @property
+    def _columns(self) -> list[Tensor]:
+        return [self.ids, self.mask] if self.hidden is None else [self.ids, self.mask, self.hidden]
 
 
 @dataclass(frozen=True)

@@ -50,6 +50,12 @@ class Prompt(NamedTuple):
 
     embeds: Tensor  # (B, L, H)
     mask: Tensor  # (B, L) bool, which columns hold a token
+    hidden: Tensor | None = None  # (B, L) bool, tokens that no other reads; None: there are none
+
+    @property
+    def tensors(self) -> tuple[Tensor, Tensor, Tensor]:
+        """The same without a None."""
+        return self.embeds, self.mask, torch.zeros_like(self.mask) if self.hidden is None else self.hidden
 
 
 class CachedContinuation(Continuation):
@@ -74,7 +80,10 @@ class CachedContinuation(Continuation):
         columns = columns.clamp(max=self._text.unread_column)
         if self._prompt is not None:
             embeds = torch.cat([self._prompt.embeds, embeds], dim=1)
-            columns = torch.cat([self._text.columns_of(self._prompt.mask), columns], dim=1)
+            of_prompt = self._text.columns_of(self._prompt.mask)
+            if self._prompt.hidden is not None:
+                self._text.hide(of_prompt, self._prompt.hidden)
+            columns = torch.cat([of_prompt, columns], dim=1)
             self._prompt = None
         return self._head(self._text(embeds, columns)[:, -num_symbols:])
 

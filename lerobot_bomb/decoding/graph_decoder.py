@@ -57,14 +57,16 @@ class GraphDecoder:
 
     def _passes(self, prompt: Prompt, noise: Tensor | None) -> Iterator[Answers]:
         length_B = prompt.mask.sum(dim=1)
-        answers = self._first(*prompt, length_B, *Answers.start(self._grammar, len(length_B), noise))
+        answers = self._first(*prompt.tensors, length_B, *Answers.start(self._grammar, len(length_B), noise))
         while True:
             yield Answers(*answers)
             answers = self._next(length_B, *answers)
 
-    def _write_first(self, embeds_BLH: Tensor, mask_BL: Tensor, *state: Tensor) -> tuple[Tensor, ...]:
+    def _write_first(
+        self, embeds_BLH: Tensor, mask_BL: Tensor, hidden_BL: Tensor, *state: Tensor
+    ) -> tuple[Tensor, ...]:
         self._text.clear()
-        return self._write(*state, prompt=Prompt(embeds_BLH, mask_BL))
+        return self._write(*state, prompt=Prompt(embeds_BLH, mask_BL, hidden_BL))
 
     def _write(self, length_B: Tensor, *answers: Tensor, prompt: Prompt | None = None) -> tuple[Tensor, ...]:
         model = CachedContinuation(self._text, self._embed, self._head, length_B, prompt)

@@ -71,6 +71,10 @@ class CachedText:
         device = embedding.device.type
         cast = torch.is_autocast_enabled(device)
         dtype = torch.get_autocast_dtype(device) if cast else embedding.dtype
+        self._hidden_BC = torch.zeros(
+            batch_size, len(self._columns_C), dtype=torch.bool, device=embedding.device
+        )
+        self._hides = False  # any of these
         self._barred, self._open = torch.tensor([-torch.inf, 0.0], dtype=dtype, device=embedding.device)
         shape = batch_size, self._num_heads, 2, len(self._columns_C), layers.head_size
         self._take(torch.zeros(len(layers), *shape, dtype=dtype, device=embedding.device))
@@ -109,14 +113,21 @@ class CachedText:
         """Which columns of rows hold a token -> (B, L) its column in the cache, padding out of the way."""
         return (mask_BL.cumsum(dim=1) - 1).masked_fill(~mask_BL, self.unread_column)
 
+    def hide(self, columns_BK: Tensor, hidden_BK: Tensor) -> None:
+        """Let no other token read those at these columns that are hidden; gaps cannot be."""
+        self._hides = True
+        self._hidden_BC.scatter_(1, columns_BK, hidden_BK & (columns_BK != self.unread_column))
+
     def keep(self, row_B: Tensor) -> None:
         """Only these rows are gone on with, in this order."""
         self._take(self._cache[:, row_B])
+        self._hidden_BC = self._hidden_BC[row_B]
         self._first_slot = self._first_slot[: len(row_B)]
 
     def clear(self) -> None:
-        """Forget what was cached."""
+        """Forget what was cached, and what was hidden."""
         self._cache.zero_()
+        self._hidden_BC.zero_()
 
     def _take(self, cache: Tensor) -> None:
         self._cache = cache
@@ -124,6 +135,8 @@ class CachedText:
 
     def _locate(self, columns_BK: Tensor, reach_BK: Tensor, num_read: int) -> Columns:
         unread_BKC = self._columns_C[:num_read] > reach_BK[..., None]
+        if self._hides:
+            unread_BKC |= self._hidden_BC[:, None, :num_read]
         bias_BKC = torch.where(unread_BKC, self._barred, self._open)
         (batch_size, num_tokens), size = columns_BK.shape, self._cache.shape[-1]
         return Columns(

@@ -153,12 +153,14 @@ class GraphSlots:
         """As `choose`; the second is written over by the next call."""
         self._embeds_CH.copy_(embeds_CH)
         self._head_CH.copy_(head_CH)
-        choices_BS, finite_B = self._choose(*prompt, noise_BTC)
+        choices_BS, finite_B = self._choose(*prompt.tensors, noise_BTC)
         return choices_BS.clone(), finite_B
 
-    def _choose_all(self, embeds_BLH: Tensor, mask_BL: Tensor, noise_BTC: Tensor) -> tuple[Tensor, Tensor]:
+    def _choose_all(
+        self, embeds_BLH: Tensor, mask_BL: Tensor, hidden_BL: Tensor, noise_BTC: Tensor
+    ) -> tuple[Tensor, Tensor]:
         self._text.clear()
-        prompt = Prompt(embeds_BLH, mask_BL)
+        prompt = Prompt(embeds_BLH, mask_BL, hidden_BL)
         head = SlotHead(self._head_CH, noise_BTC, self._cap)
         answer = self._slots, self._num_steps, self._embeds_CH, head
         return choose(self._text, prompt, *answer, prompt_reads_all=self._reads_all)
@@ -177,6 +179,8 @@ def choose(
     """As `SlotWriter`, on an empty cache; and (B,) bool, whether all choices are from finite logits."""
     last_B1 = prompt.mask.sum(dim=1, keepdim=True) - 1
     columns_BL = text.columns_of(prompt.mask)
+    if prompt.hidden is not None:
+        text.hide(columns_BL, prompt.hidden)
     reach_BL = last_B1.expand_as(columns_BL) if prompt_reads_all else columns_BL
     hidden_BH = text(prompt.embeds, columns_BL, reach_BL)[:, -1]
     steps = [(step, slot) for step in range(num_steps) for slot in slots]

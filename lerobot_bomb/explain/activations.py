@@ -10,7 +10,6 @@ from dataclasses import dataclass
 from functools import partial
 from typing import Any
 
-import torch
 from torch import Tensor, nn
 
 from lerobot_bomb.explain.explained import DecoderLayer, Place
@@ -53,12 +52,10 @@ def restoring(
     layers: Sequence[DecoderLayer],
     clean: Activations,
     units_of_rows: Sequence[Sequence[Unit]],
-    removed: Tensor | None = None,
 ) -> Iterator[None]:
     """In the passes of one score, put units of ``clean`` back into each row.
 
     ``clean`` is of one row. A pass may have several rows for each of the score's, beside each other.
-    ``removed``: columns of a clean pass that this score's do not have.
     """
     restored: dict[tuple[int, str], list[tuple[int, Unit]]] = defaultdict(list)
     for row, units in enumerate(units_of_rows):
@@ -66,7 +63,7 @@ def restoring(
             restored[unit.layer, unit.part].append((row, unit))
     changes: dict[tuple[int, str], Change] = {
         (layer, part): _Restore(
-            clean[layer, part], restored[layer, part], len(units_of_rows), layers[layer].num_heads, removed
+            clean[layer, part], restored[layer, part], len(units_of_rows), layers[layer].num_heads
         )
         for layer, part in restored
     }
@@ -82,17 +79,10 @@ class _Restore:
     units: list[tuple[int, Unit]]  # row of the score, what is put back there
     num_rows: int  # of the score
     num_heads: int
-    removed: Tensor | None  # columns of a clean pass
     num_passes: int = 0  # that there were
 
     def __call__(self, values_NLF: Tensor) -> Tensor:
         clean_NLF = self.clean[self.num_passes]
-        if clean_NLF.shape[1] != values_NLF.shape[1]:
-            assert self.removed is not None
-            is_left_L = torch.ones(clean_NLF.shape[1], dtype=torch.bool, device=clean_NLF.device).index_fill(
-                0, self.removed, False
-            )
-            clean_NLF = clean_NLF[:, is_left_L]
         restored = values_NLF.clone().unflatten(0, (self.num_rows, -1))
         size = values_NLF.shape[2] // self.num_heads
         for row, unit in self.units:

@@ -12,9 +12,12 @@ from dataclasses import dataclass
 from typing import Any, ClassVar
 
 import torch
+from lerobot.utils.constants import OBS_LANGUAGE_ATTENTION_MASK
 from torch import Tensor, nn
+from torch.nn.functional import pad
 
 from lerobot_bomb.actions.text import TokenRows
+from lerobot_bomb.vlm.inputs import OBS_LANGUAGE_HIDDEN
 
 type Batch = dict[str, Any]  # what a policy's preprocessor gives
 type Rows = dict[str, Tensor]  # what `Explained.encode` makes of it; (B, ...) each
@@ -68,7 +71,15 @@ class Explained(ABC):
 
     @abstractmethod
     def hide(self, rows: Rows, hidden_BS: Tensor) -> Rows:
-        """One row -> B rows whose attention mask leaves out these tokens of the instruction.
+        """One row -> B rows in which no other token reads these of the instruction.
+
+        Raises:
+            ValueError: the policy reads no instruction.
+        """
+
+    @abstractmethod
+    def hide_in(self, batch: Batch, hidden_S: Tensor) -> Batch:
+        """A batch of one row, in which the policy answers without these tokens of the instruction.
 
         Raises:
             ValueError: the policy reads no instruction.
@@ -81,22 +92,27 @@ class Explained(ABC):
         """
         return {}
 
-    def removed(self, clean: Rows, rows: Rows) -> Tensor | None:
-        """Columns of the pass over a row that one over it with hidden tokens lacks; None: it lacks none."""
-        return None
-
 
 class PromptExplained(Explained):
-    """One of our policies, whose prompt has parts; rows hold ``mask`` and ``part``, both (B, L)."""
+    """One of our policies, whose prompt has parts.
+
+    Rows hold ``ids``, ``mask`` and ``part``, and ``hidden`` where any token is, (B, L) each.
+    """
 
     _names: Sequence[str] = ()  # of the parts
 
     def prompt(self, parts: Mapping[str, TokenRows]) -> Rows:
-        """``ids``, ``mask``, and as ``part`` the number of the part that a column belongs to."""
+        """What rows hold; ``part`` is the number of the part that a column belongs to."""
         self._names = [*parts]
         numbers = [torch.full_like(part.ids, number) for number, part in enumerate(parts.values())]
         prompt = TokenRows.join([*parts.values()])
-        return {"ids": prompt.ids, "mask": prompt.mask, "part": torch.cat(numbers, dim=1)}
+        rows = {"ids": prompt.ids, "mask": prompt.mask, "part": torch.cat(numbers, dim=1)}
+        return rows if prompt.hidden is None else rows | {"hidden": prompt.hidden}
+
+    @staticmethod
+    def tokens(rows: Rows) -> TokenRows:
+        """The prompt of rows."""
+        return TokenRows(rows["ids"], rows["mask"], rows.get("hidden"))
 
     def of_part(self, rows: Rows, name: str) -> Tensor:
         """(B, L) bool, which columns belong to a part of the prompt, padding included."""
@@ -105,12 +121,17 @@ class PromptExplained(Explained):
     def hide(self, rows: Rows, hidden_BS: Tensor) -> Rows:
         rows = {key: value.expand(len(hidden_BS), *value.shape[1:]) for key, value in rows.items()}
         columns = self.of_part(rows, INSTRUCTION)[0].nonzero()[: hidden_BS.shape[1], 0]  # then padding
-        is_hidden_BL = torch.zeros_like(rows["mask"])
-        is_hidden_BL[:, columns] = hidden_BS.to(is_hidden_BL.device)
-        return rows | {"mask": rows["mask"] & ~is_hidden_BL}
+        hidden_BL = rows["mask"] & ~self.tokens(rows).readable
+        hidden_BL[:, columns] |= hidden_BS.to(hidden_BL.device)
+        return rows | {"hidden": hidden_BL}
+
+    def hide_in(self, batch: Batch, hidden_S: Tensor) -> Batch:
+        mask_1S = batch[OBS_LANGUAGE_ATTENTION_MASK]
+        hidden_1S = pad(hidden_S, (0, mask_1S.shape[1] - len(hidden_S)))[None].to(mask_1S.device)
+        return {**batch, OBS_LANGUAGE_HIDDEN: hidden_1S}
 
     def columns(self, rows: Rows) -> dict[str, Tensor]:
-        """Of one row's prompt, those of each part; without padding and what is hidden."""
+        """Of one row's prompt, those of each part, without padding."""
         mask_L = rows["mask"][0]
         return {name: (self.of_part(rows, name)[0] & mask_L).nonzero()[:, 0] for name in self._names}
 

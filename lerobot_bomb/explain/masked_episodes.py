@@ -8,27 +8,28 @@ from typing import Any
 import gymnasium
 import numpy as np
 import torch
-from lerobot.utils.constants import OBS_IMAGES, OBS_LANGUAGE_ATTENTION_MASK
+from lerobot.utils.constants import OBS_IMAGES
 
 from lerobot_bomb.bomb.observation import AGENT_POS
 from lerobot_bomb.envs.results import ResultLine
 from lerobot_bomb.envs.rollout import play
 from lerobot_bomb.explain.explained import Batch
 from lerobot_bomb.explain.images import filling, occluded
-from lerobot_bomb.explain.spans import TOKENIZERS, Span, named_spans, token_offsets
+from lerobot_bomb.explain.other_policies import explained
+from lerobot_bomb.explain.spans import TOKENIZERS, Span, named_spans, token_offsets, whole
 from lerobot_bomb.explain.watched import Watched
 from lerobot_bomb.viewing.checkpoint import LoadedPolicy
 from lerobot_bomb.viewing.episode import Viewed
 
 # what a policy gets in place of an observation in an environment
 type Change = Callable[[Batch, gymnasium.Env], Batch]
-# what its preprocessor makes of that, changed
-type PreparedChange = Callable[[Batch], Batch]
+# what its preprocessor makes of that, changed; and the instruction
+type PreparedChange = Callable[[Batch, str], Batch]
 
 BLURS = 16  # of an image's side, a blur's standard deviation
 
 
-def nothing(batch: Batch, env: gymnasium.Env | None = None) -> Batch:
+def nothing(batch: Batch, _: gymnasium.Env | str) -> Batch:
     """All as it is."""
     return batch
 
@@ -68,21 +69,15 @@ def without_object(name: str, fill: str) -> Mask:
     return Mask(change=change)
 
 
-def with_instruction(instruction: str) -> Mask:
-    """Told something else; "" is a null prompt."""
-    return Mask(change=lambda batch, _: {**batch, "task": [instruction]})
+def without_words(loaded: LoadedPolicy, words: Callable[[str], Span | None]) -> Mask:
+    """Tokens of an instruction that no other token reads; ``words``: which, None: there are none in it."""
+    policy = explained(loaded.policy, loaded.postprocess)
 
-
-def without_words(span: Span, instruction: str, loaded: LoadedPolicy) -> Mask:
-    """Words of an instruction left out of the attention, as long as that instruction is given."""
-    hidden = span.tokens(token_offsets(loaded.prepare.steps, instruction))
-
-    def hide(prepared: Batch) -> Batch:
-        if prepared.get("task") not in (None, [instruction]):
+    def hide(prepared: Batch, instruction: str) -> Batch:
+        span = words(instruction)
+        if span is None:
             return prepared
-        mask = prepared[OBS_LANGUAGE_ATTENTION_MASK].clone()
-        mask[:, : len(hidden)] &= ~hidden.to(mask.device)
-        return {**prepared, OBS_LANGUAGE_ATTENTION_MASK: mask}
+        return policy.hide_in(prepared, span.tokens(token_offsets(loaded.prepare.steps, instruction)))
 
     return Mask(change_prepared=hide)
 
@@ -95,8 +90,9 @@ def masks_of(watched: Watched, loaded: LoadedPolicy, fill: str) -> dict[str, Mas
     }
     if any(isinstance(step, TOKENIZERS) for step in loaded.prepare.steps):
         for span in named_spans(watched.instruction, watched.instructions):
-            masks[f"words: {span.name}"] = without_words(span, watched.instruction, loaded)
-        masks["the whole instruction"] = with_instruction("")
+            by_instruction = {watched.instruction: span}
+            masks[f"words: {span.name}"] = without_words(loaded, by_instruction.get)
+        masks["the whole instruction"] = without_words(loaded, whole)
     return masks
 
 
@@ -112,7 +108,7 @@ def _play(viewed: Viewed, loaded: LoadedPolicy, mask: Mask) -> MaskedEpisode:
         def act(observation: dict[str, Any], instruction: str) -> np.ndarray:
             batch = mask.change(loaded.observe([observation], [instruction]), env)
             with torch.inference_mode():
-                prepared = mask.change_prepared(loaded.prepare(batch))
+                prepared = mask.change_prepared(loaded.prepare(batch), instruction)
             return loaded.act(prepared)[0]
 
         trace = [moment.observation[AGENT_POS][:3] for moment in play(env, viewed.spec, act)]

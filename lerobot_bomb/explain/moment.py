@@ -58,7 +58,7 @@ class Explanation:
     clean_score: float
     patches: dict[str, Tensor]  # (G, G) by key of the image
     objects: dict[str, dict[str, float]]  # by key of the image, or ALL, and object
-    words: dict[str, float]  # of each span left out of the attention
+    words: dict[str, float]  # of each span that no other token reads
     others: dict[str, float]  # of each other instruction
     restored: list[Restored]
 
@@ -190,16 +190,19 @@ def _corruptions(
     if others:
         other = max(others, key=lambda each: others[each])
         rows = question.encode({"task": [asked.others[other]]}, 1)
-        if _has_shape_of(rows, question.rows):
+        if _has_columns_of(rows, question.rows):
             found.append((f"{OTHER_INSTRUCTION}: {asked.others[other]!r}", rows))
     if asked.other_scene:
         found.append((OTHER_SCENE, question.encode(asked.other_scene, 1)))
     return found
 
 
-def _has_shape_of(rows: Rows, others: Rows) -> bool:
-    """Tokens are put back one by one, so there must be as many."""
-    return all(rows[key].shape == others[key].shape for key in rows)
+def _has_columns_of(rows: Rows, others: Rows) -> bool:
+    """Tokens are put back one by one, so there must be as many, and padding where there is padding."""
+    return all(
+        value.shape == others[key].shape and (value.dtype != torch.bool or value.equal(others[key]))
+        for key, value in rows.items()
+    )
 
 
 def _places(question: Question, asked: Asked, rows: Rows) -> dict[str, Place]:
@@ -209,7 +212,7 @@ def _places(question: Question, asked: Asked, rows: Rows) -> dict[str, Place]:
         return {}
     places = explained.places(rows)
     first, *later = places.get(INSTRUCTION, (None,))
-    if not isinstance(first, Tensor) or len(first) != len(asked.offsets):  # some of it is hidden
+    if not isinstance(first, Tensor):
         return places
     words = {span.name: span.tokens(asked.offsets) for span in asked.spans}
     return places | {name: (first[tokens], *later) for name, tokens in words.items()}

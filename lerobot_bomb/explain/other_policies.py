@@ -48,6 +48,9 @@ class _ExplainedByBatch(Explained):
         hidden_BS = pad(hidden_BS, (0, mask_BS.shape[1] - hidden_BS.shape[1])).to(mask_BS.device)
         return rows | {OBS_LANGUAGE_ATTENTION_MASK: mask_BS & ~hidden_BS}
 
+    def hide_in(self, batch: Batch, hidden_S: Tensor) -> Batch:
+        return {**batch, **self.hide(self.encode(batch), hidden_S[None])}
+
 
 class ExplainedByLoss(_ExplainedByBatch):
     """A flow policy whose model draws noise and time by itself: ``smolvla``, ``pi0``.

@@ -60,7 +60,7 @@ class Question:
         return torch.cat([self.effects_of_images({key: each}) for each in images])
 
     def effects_of_hidden(self, hidden_MS: Tensor) -> Tensor:
-        """(M,) of tokens of the instruction that are left out of the attention."""
+        """(M,) of tokens of the instruction that no other token reads."""
         return self.effects(self.explained.hide(self.rows, hidden_MS))
 
     def effects_of_instructions(self, instructions: Sequence[str]) -> Tensor:

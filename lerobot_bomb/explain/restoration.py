@@ -53,7 +53,6 @@ class Corruption:
     def __init__(self, question: Question, rows: Rows):
         """``rows``: one, what is read in place of the observation."""
         self._question, self.rows = question, rows
-        self._removed = question.explained.removed(question.rows, rows)
         self._layers = question.explained.layers
         self.clean = self._record(question.rows)
         self.score = float(self._score(rows))
@@ -87,6 +86,6 @@ class Corruption:
         for start in range(0, len(units_of_rows), batch_size):
             part = units_of_rows[start : start + batch_size]
             rows = {key: value.expand(len(part), *value.shape[1:]) for key, value in self.rows.items()}
-            with restoring(self._layers, kept, part, self._removed):
+            with restoring(self._layers, kept, part):
                 scores.append(self._score(rows))
         return Restoration(self._question.clean_score, self.score, torch.cat(scores))

@@ -48,6 +48,11 @@ def span_of(words: str, instruction: str) -> Span:
     return Span(words, tuple(found))
 
 
+def whole(instruction: str) -> Span:
+    """All of an instruction."""
+    return Span("instruction", ((0, len(instruction)),))
+
+
 def spans_of_words(instruction: str) -> list[Span]:
     """A span of each word and number; one that stands there twice is told apart: "0", "0 (2)"."""
     spans: list[Span] = []

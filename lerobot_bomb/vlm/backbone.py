@@ -25,6 +25,7 @@ from transformers import (
 
 from lerobot_bomb.files import read_json
 from lerobot_bomb.finite import require_finite_weights
+from lerobot_bomb.vlm.attention import attention_bias, causal_reads
 from lerobot_bomb.vlm.images import resized_pixels
 from lerobot_bomb.vlm.memory import check_memory
 from lerobot_bomb.vlm.presets import INITIALIZER_RANGE, changed, nano_config
@@ -125,12 +126,18 @@ class SmolVLMBackbone(Backbone):
         """(C,) columns of a sequence, from 0 -> (C,) positions, whichever of them hold images."""
         return column_C
 
-    def hidden_states(self, embeds_BLH: Tensor, image_columns: Tensor | None = None) -> Tensor:
+    def hidden_states(
+        self, embeds_BLH: Tensor, image_columns: Tensor | None = None, hidden_BL: Tensor | None = None
+    ) -> Tensor:
         """Embeddings of rows that start with their tokens -> (B, L, H) states after the last layer.
 
-        Attention is causal, so what follows a row's end changes nothing before it.
+        Attention is causal, so what follows a row's end changes nothing before it. ``hidden_BL``: tokens that
+        no other reads.
         """
-        return self.text_model(inputs_embeds=embeds_BLH, use_cache=False).last_hidden_state
+        bias = None if hidden_BL is None else attention_bias(causal_reads(~hidden_BL), embeds_BLH.dtype)
+        return self.text_model(
+            inputs_embeds=embeds_BLH, attention_mask=bias, use_cache=False
+        ).last_hidden_state
 
 
 def in_float32[T](module: Callable[[Tensor], T], hidden: Tensor) -> T:

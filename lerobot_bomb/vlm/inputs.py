@@ -7,6 +7,8 @@ from torch import Tensor
 from lerobot_bomb.actions.text import TokenRows
 from lerobot_bomb.finite import require_finite_batch
 
+# (B, S) bool, tokens of the instruction that no other token reads; their positions stay theirs
+OBS_LANGUAGE_HIDDEN = f"{OBS_LANGUAGE_TOKENS}.hidden"
 # on CUDA, instructions of any length up to a multiple share what is recorded
 TEXT_COLUMNS = 16
 
@@ -42,7 +44,10 @@ def read_task(batch: dict[str, Tensor], policy_type: str, device: torch.device) 
         read_tensor(batch, key, policy_type, device)
         for key in (OBS_LANGUAGE_TOKENS, OBS_LANGUAGE_ATTENTION_MASK)
     )
-    task = TokenRows(ids_BL, mask_BL.bool())
+    hidden_BL = None
+    if OBS_LANGUAGE_HIDDEN in batch:
+        hidden_BL = read_tensor(batch, OBS_LANGUAGE_HIDDEN, policy_type, device)
+    task = TokenRows(ids_BL, mask_BL.bool(), hidden_BL)
     return task.rounded(TEXT_COLUMNS) if ids_BL.is_cuda else task
 
 

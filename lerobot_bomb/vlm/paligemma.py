@@ -16,6 +16,7 @@ from transformers import PaliGemmaConfig, PaliGemmaForConditionalGeneration
 
 from lerobot_bomb.actions.text import SYMBOL_TEXTS
 from lerobot_bomb.finite import require_finite_weights
+from lerobot_bomb.vlm.attention import attention_bias
 from lerobot_bomb.vlm.backbone import Backbone, random_model, read_vlm_config, spread_images, weights_errors
 from lerobot_bomb.vlm.memory import check_memory
 from lerobot_bomb.vlm.presets import changed, nano_paligemma_config
@@ -102,8 +103,7 @@ class PaliGemmaBackbone(Backbone):
 
         ``columns_BL``: places in the sequence, from 0; ``reads_BLL``: whether a token (row) reads another.
         """
-        bias_BLL = torch.where(reads_BLL, 0.0, torch.finfo(embeds_BLH.dtype).min).to(embeds_BLH.dtype)
-        mask = bias_BLL[:, None]
+        mask = attention_bias(reads_BLL, embeds_BLH.dtype)
         return self.text_model(
             inputs_embeds=embeds_BLH,
             attention_mask={"full_attention": mask, "sliding_attention": mask},

@@ -20,6 +20,7 @@ from transformers import Qwen2_5_VLConfig, Qwen2_5_VLForConditionalGeneration
 from transformers.utils.constants import OPENAI_CLIP_MEAN, OPENAI_CLIP_STD
 
 from lerobot_bomb.finite import require_finite_weights
+from lerobot_bomb.vlm.attention import causal_reads
 from lerobot_bomb.vlm.backbone import (
     CHECKPOINTING,
     Backbone,
@@ -73,7 +74,7 @@ class Prefix:
     """What the model keeps of images and text that it has read."""
 
     hidden: Tensor  # (B, L, H) after the last layer
-    mask: Tensor  # (B, L) bool, False: padding
+    readable: Tensor  # (B, L) bool, False: padding, or a hidden token
     next_position: Tensor  # (B, 1) int64, of what follows
     layers: list[KeysValues]
 
@@ -81,7 +82,7 @@ class Prefix:
         """All of it, as `of` takes it."""
         return [
             self.hidden,
-            self.mask,
+            self.readable,
             self.next_position,
             *(part for layer in self.layers for part in layer),
         ]
@@ -89,14 +90,14 @@ class Prefix:
     @classmethod
     def of(cls, tensors: Sequence[Tensor]) -> "Prefix":
         """The inverse of `tensors`."""
-        hidden, written, next_position, *layers = tensors
-        return cls(hidden, written, next_position, list(zip(layers[::2], layers[1::2], strict=True)))
+        hidden, readable, next_position, *layers = tensors
+        return cls(hidden, readable, next_position, list(zip(layers[::2], layers[1::2], strict=True)))
 
     def repeated(self, times: int) -> "Prefix":
         """Every row so many times, beside each other."""
         repeat = partial(torch.repeat_interleave, repeats=times, dim=0)
         layers = [(repeat(keys), repeat(values)) for keys, values in self.layers]
-        return Prefix(repeat(self.hidden), repeat(self.mask), repeat(self.next_position), layers)
+        return Prefix(repeat(self.hidden), repeat(self.readable), repeat(self.next_position), layers)
 
 
 class _Reader:
@@ -180,22 +181,30 @@ class QwenBackbone(Backbone):
         is_image_1C = torch.isin(column_C, image_columns.to(column_C.device))[None]
         return self._positions(is_image_1C, torch.ones_like(is_image_1C))[0][:, 0]
 
-    def hidden_states(self, embeds_BLH: Tensor, image_columns: Tensor) -> Tensor:
+    def hidden_states(
+        self, embeds_BLH: Tensor, image_columns: Tensor, hidden_BL: Tensor | None = None
+    ) -> Tensor:
         """Embeddings of rows that start with their tokens -> (B, L, H) states after the last layer.
 
         ``image_columns``: where the images stand, in every row. Attention is causal, so what follows a row's
-        end changes nothing before it.
+        end changes nothing before it. ``hidden_BL``: tokens that no other reads.
         """
         column_L = torch.arange(embeds_BLH.shape[1], device=embeds_BLH.device)
         is_image_BL = torch.isin(column_L, image_columns).expand(len(embeds_BLH), -1)
-        return self.read_prefix(embeds_BLH, is_image_BL, torch.ones_like(is_image_BL)).hidden
+        mask_BL = torch.ones_like(is_image_BL)
+        return self.read_prefix(embeds_BLH, is_image_BL, mask_BL, hidden_BL).hidden
 
-    def read_prefix(self, embeds_BLH: Tensor, is_image_BL: Tensor, mask_BL: Tensor) -> Prefix:
-        """Read rows whose first column is written; ``is_image_BL``: which tokens are parts of images."""
+    def read_prefix(
+        self, embeds_BLH: Tensor, is_image_BL: Tensor, mask_BL: Tensor, hidden_BL: Tensor | None = None
+    ) -> Prefix:
+        """Read rows whose first column is written; ``is_image_BL``: which tokens are parts of images.
+
+        ``hidden_BL``: tokens that no other reads. They keep their positions.
+        """
         positions_3BL, next_B1 = self._positions(is_image_BL, mask_BL)
-        causal_LL = torch.ones_like(mask_BL[0]).expand(mask_BL.shape[1], -1).tril()
-        hidden_BLH, layers = self._read(embeds_BLH, positions_3BL, causal_LL & mask_BL[:, None])
-        return Prefix(hidden_BLH, mask_BL, next_B1, layers)
+        readable_BL = mask_BL if hidden_BL is None else mask_BL & ~hidden_BL
+        hidden_BLH, layers = self._read(embeds_BLH, positions_3BL, causal_reads(readable_BL))
+        return Prefix(hidden_BLH, readable_BL, next_B1, layers)
 
     def read_segment(self, prefix: Prefix, embeds_BTH: Tensor, reads_BTT: Tensor) -> Tensor:
         """(B, T, H) states after the last layer of tokens that follow a prefix and read all of it.
@@ -203,7 +212,7 @@ class QwenBackbone(Backbone):
         ``reads_BTT``: whether a token of the segment (row) reads another.
         """
         positions_BT = prefix.next_position + torch.arange(embeds_BTH.shape[1], device=embeds_BTH.device)
-        prefix_BTL = prefix.mask[:, None].expand(-1, embeds_BTH.shape[1], -1)
+        prefix_BTL = prefix.readable[:, None].expand(-1, embeds_BTH.shape[1], -1)
         reads_BTX = torch.cat([prefix_BTL, reads_BTT], dim=2)
         return self._read(embeds_BTH, positions_BT.expand(3, -1, -1), reads_BTX, prefix.layers)[0]
 

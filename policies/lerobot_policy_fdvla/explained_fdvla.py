@@ -8,7 +8,6 @@ from typing import TYPE_CHECKING, ClassVar
 import torch
 from torch import Tensor
 
-from lerobot_bomb.actions.text import TokenRows
 from lerobot_bomb.explain.explained import (
     ANSWER,
     INSTRUCTION,
@@ -57,9 +56,10 @@ class ExplainedFdvla(PromptExplained):
             noise_JKD.repeat(num_rows, 1, 1),
             tau_J.repeat(num_rows),
         )
-        is_task_BL = rows["mask"] & self.of_part(rows, INSTRUCTION)
+        prompt = self.tokens(rows)
+        is_task_BL = prompt.readable & self.of_part(rows, INSTRUCTION)
         with policy._autocast():
-            context = policy._context(TokenRows(rows["ids"], rows["mask"]), is_task_BL, rows["embeds"])
+            context = policy._context(prompt, is_task_BL, rows["embeds"])
             predicted = policy._heads(context.repeated(NUM_DRAWS))(point.actions, point.tau)
         velocity_BKD, noise_BKD = (None if values is None else values.float() for values in predicted)
         loss_B, _ = joint_loss(

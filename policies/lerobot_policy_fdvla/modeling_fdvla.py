@@ -327,24 +327,25 @@ class FdvlaPolicy(RelativeVlaPolicy):
 
     def _context(self, rows: TokenRows, is_task_BL: Tensor, embeds_BLH: Tensor) -> Context:
         """What `_prompt` and `_embeds` made of a batch, read by the language model."""
-        prefix = self.backbone.read_prefix(embeds_BLH, rows.ids == self.tokens.image, rows.mask)
-        return Context(prefix, masked_mean_pool(prefix.hidden, self._pooled(rows.mask, is_task_BL)))
+        is_image_BL = rows.ids == self.tokens.image
+        prefix = self.backbone.read_prefix(embeds_BLH, is_image_BL, rows.mask, rows.hidden)
+        return Context(prefix, masked_mean_pool(prefix.hidden, self._pooled(rows.readable, is_task_BL)))
 
-    def _pooled(self, mask_BL: Tensor, is_task_BL: Tensor) -> Tensor:
+    def _pooled(self, readable_BL: Tensor, is_task_BL: Tensor) -> Tensor:
         """(B, L) bool: the tokens that are pooled; all of them where there is no instruction."""
         if self.config.reasoning_pool == "text":
-            return torch.where(is_task_BL.any(dim=1, keepdim=True), is_task_BL, mask_BL)
+            return torch.where(is_task_BL.any(dim=1, keepdim=True), is_task_BL, readable_BL)
         if self.config.reasoning_pool == "all_prefix":
-            return mask_BL
-        index_L = torch.arange(mask_BL.shape[1], device=mask_BL.device)
-        return (index_L == mask_BL.shape[1] - 1).expand_as(mask_BL)
+            return readable_BL
+        index_L = torch.arange(readable_BL.shape[1], device=readable_BL.device)
+        return (index_L == readable_BL.shape[1] - 1).expand_as(readable_BL)
 
     # Prompt: start, images, task (with padding), a place for the state, end
 
     def _prompt(self, batch: dict[str, Tensor]) -> tuple[TokenRows, Tensor]:
-        """Its tokens, and which of them (B, L) are the task's."""
+        """Its tokens, and which of them (B, L) are the task's, without hidden ones."""
         parts = self._prompt_parts(batch)
-        is_task = [part.mask & (name == "instruction") for name, part in parts.items()]
+        is_task = [part.readable & (name == "instruction") for name, part in parts.items()]
         return TokenRows.join([*parts.values()]), torch.cat(is_task, dim=1)
 
     def _prompt_parts(self, batch: dict[str, Tensor]) -> dict[str, TokenRows]:

@@ -45,7 +45,7 @@ class ExplainedSpatialvlaGrid(PromptExplained):
         policy = self._policy.eval()
         cells_BTG = answer.expand(len(rows["embeds"]), -1, -1)
         with policy._autocast():
-            hidden_BTGH = policy._hidden_after(rows["mask"], rows["embeds"], cells_BTG)
+            hidden_BTGH = policy._hidden_after(self.tokens(rows), rows["embeds"], cells_BTG)
             chosen = [
                 policy._cell_logits(group, hidden_BTGH[:, :, group])
                 .float()

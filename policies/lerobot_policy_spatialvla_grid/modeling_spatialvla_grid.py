@@ -245,22 +245,23 @@ class SpatialvlaGridPolicy(TokenVlaPolicy):
     def _hidden(self, batch: dict[str, Tensor], cells_BTG: Tensor) -> Tensor:
         """(B, T, G, H) teacher-forced states that predict the cells."""
         prompt = self._prompt(batch)
-        return self._hidden_after(prompt.mask, self._embeds(batch, prompt.ids), cells_BTG)
+        return self._hidden_after(prompt, self._embeds(batch, prompt.ids), cells_BTG)
 
-    def _hidden_after(self, mask_BL: Tensor, embeds_BLH: Tensor, cells_BTG: Tensor) -> Tensor:
+    def _hidden_after(self, prompt: TokenRows, embeds_BLH: Tensor, cells_BTG: Tensor) -> Tensor:
         """The same, after a prompt that was embedded before."""
         cells_BS = (cells_BTG + self.first_cells).flatten(1)
         embeds_BXH = torch.cat([embeds_BLH, self._embed_cells(cells_BS[:, :-1])], dim=1)
-        mask_BX = torch.cat([mask_BL, torch.ones_like(cells_BS[:, 1:], dtype=torch.bool)], dim=1)
-        index_X = torch.arange(mask_BX.shape[1], device=mask_BX.device)
+        answer = TokenRows(cells_BS[:, 1:], torch.ones_like(cells_BS[:, 1:], dtype=torch.bool))
+        rows = TokenRows.join([prompt, answer])
+        index_X = torch.arange(rows.mask.shape[1], device=cells_BS.device)
         reads_XX = index_X <= index_X[:, None]
         if self._prompt_reads_all:
-            is_prompt_X = index_X < mask_BL.shape[1]
+            is_prompt_X = index_X < prompt.mask.shape[1]
             reads_XX |= is_prompt_X & is_prompt_X[:, None]
         hidden_BXH = self.backbone.hidden_states(
             embeds_BXH,
-            (mask_BX.cumsum(dim=1) - 1).clamp(min=0),
-            reads_XX & mask_BX[:, None],
+            (rows.mask.cumsum(dim=1) - 1).clamp(min=0),
+            reads_XX & rows.readable[:, None],
         )
         return hidden_BXH[:, -cells_BS.shape[1] :].unflatten(1, cells_BTG.shape[1:])
 
@@ -310,7 +311,7 @@ class SpatialvlaGridPolicy(TokenVlaPolicy):
             prompt = self._prompt(batch)
             embeds_BLH = self._embeds(batch, prompt.ids)
             cells_BS = self._writer(
-                Prompt(embeds_BLH, prompt.mask),
+                Prompt(embeds_BLH, prompt.mask, prompt.hidden),
                 self._group_rows,
                 num_steps,
                 self.cell_embedding.weight * self.backbone.embed_scale,

@@ -7,7 +7,6 @@ from typing import TYPE_CHECKING, ClassVar
 
 from torch import Tensor
 
-from lerobot_bomb.actions.text import TokenRows
 from lerobot_bomb.explain.explained import (
     ANSWER,
     Batch,
@@ -45,8 +44,7 @@ class ExplainedVla0Smol(PromptExplained):
         numbers_BN = answer.expand(len(rows["ids"]), -1)
         written = policy._answer(policy._to_tokens(numbers_BN, policy.config.n_action_bins)).rows
         with policy._autocast():
-            prompt = TokenRows(rows["ids"], rows["mask"])
-            hidden_BAH = policy._answer_hidden(rows["features"], prompt, written)
+            hidden_BAH = policy._answer_hidden(rows["features"], self.tokens(rows), written)
             logits_BAS = policy.backbone.head(policy.symbol_ids)(hidden_BAH)
         symbol_BA = (written.ids[..., None] == policy.symbol_ids).long().argmax(dim=-1)
         grammar = policy.grammar
@@ -62,7 +60,3 @@ class ExplainedVla0Smol(PromptExplained):
         places: dict[str, Place] = {name: (index_L[each],) for name, each in self.columns(rows).items()}
         # the prompt's last token predicts the answer's first; rows of one answer have no padding
         return places | {ANSWER: (slice(int(index_L[-1]), None),)}
-
-    def removed(self, clean: Rows, rows: Rows) -> Tensor | None:
-        is_clean_L, is_left_L = clean["mask"][0], rows["mask"][0]
-        return (is_clean_L.cumsum(dim=0) - 1)[is_clean_L & ~is_left_L]

@@ -152,10 +152,11 @@ class Vla0SmolPolicy(RelativeVlaPolicy, TokenVlaPolicy):
 
     def _answer_hidden(self, features_BPH: Tensor, prompt: TokenRows, answer: TokenRows) -> Tensor:
         """Teacher-forced states that predict every answer token: (B, A, H)."""
-        ids_BL = TokenRows.join([prompt, answer]).without_padding().ids
+        rows = TokenRows.join([prompt, answer]).without_padding()
+        ids_BL = rows.ids
         check_positions(self.backbone.text_config, ids_BL.shape[1])
         hidden_BLH = self.backbone.hidden_states(
-            self._with_images(features_BPH, ids_BL), self._image_columns(ids_BL.device)
+            self._with_images(features_BPH, ids_BL), self._image_columns(ids_BL.device), rows.hidden
         )
         offsets_A = torch.arange(answer.ids.shape[1], device=ids_BL.device)
         # a token is predicted one column earlier; columns beyond a short row carry no label
@@ -218,7 +219,7 @@ class Vla0SmolPolicy(RelativeVlaPolicy, TokenVlaPolicy):
             num_numbers = num_steps * self._action_dim
             noise_shape = self.grammar.max_symbols(num_numbers), NUM_SYMBOLS
             self._decoded = decoded = self._writer(
-                Prompt(embeds_BLH, prompt.mask),
+                Prompt(embeds_BLH, prompt.mask, prompt.hidden),
                 self.symbol_ids,
                 num_numbers,
                 self._choice_noise(len(embeds_BLH), noise_shape),
