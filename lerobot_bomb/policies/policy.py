@@ -23,7 +23,7 @@ from lerobot_bomb.hub.policy import HubPolicy
 from lerobot_bomb.policies.config import ChunkConfig, RelativeVlaConfig, TokenVlaConfig, VlaConfig
 from lerobot_bomb.training.distributed import SavesTiedWeightsOnce
 from lerobot_bomb.training.policy_flags import check_as_trained, check_weights_fit, trained_with
-from lerobot_bomb.vlm.inputs import read_tensor
+from lerobot_bomb.vlm.inputs import read_state, read_tensor
 from lerobot_bomb.vlm.prompt import task_ids, task_text
 from lerobot_bomb.vlm.tokenizer import load_tokenizer
 
@@ -123,6 +123,12 @@ class ChunkPolicy(HubPolicy, SavesTiedWeightsOnce, PreTrainedPolicy):
 
     def _of_batch(self, batch: dict[str, Tensor], key: str) -> Tensor:
         return read_tensor(batch, key, self.config.type, self._device)
+
+    def _state(self, batch: dict[str, Tensor]) -> Tensor:
+        """(B, S) normalised."""
+        assert self.config.robot_state_feature is not None
+        (num_dims,) = self.config.robot_state_feature.shape
+        return read_state(batch, self.config.type, self._device, num_dims)
 
     @property
     def _cameras(self) -> list[str]:
@@ -327,13 +333,13 @@ class RelativeVlaPolicy(VlaPolicy):
         """Normalised actions -> what is trained on and predicted, (B, T, D) both."""
         if self.relative is None:
             return actions_BTD
-        return self.relative.encode(actions_BTD, self._of_batch(batch, OBS_STATE))
+        return self.relative.encode(actions_BTD, self._state(batch))
 
     def _to_absolute(self, predicted_BTD: Tensor, batch: dict[str, Tensor]) -> Tensor:
         """The inverse of `_to_relative`."""
         if self.relative is None:
             return predicted_BTD
-        return self.relative.decode(predicted_BTD, self._of_batch(batch, OBS_STATE))
+        return self.relative.decode(predicted_BTD, self._state(batch))
 
     @property
     def _unit(self) -> Tensor:

@@ -13,11 +13,7 @@ from typing import Any, ClassVar
 
 import torch
 from lerobot.datasets import LeRobotDatasetMetadata
-from lerobot.utils.constants import (
-    ACTION,
-    OBS_IMAGES,
-    OBS_STATE,
-)
+from lerobot.utils.constants import ACTION, OBS_IMAGES
 from torch import Tensor, nn
 from torch.nn.functional import cross_entropy, linear
 
@@ -362,7 +358,7 @@ class SpatialvlaGridPolicy(TokenVlaPolicy):
         parts = {camera: TokenRows.constant(image, task.ids) for camera in self._cameras}
         parts |= {"start": TokenRows.constant(tokens.start, task.ids), "instruction": task}
         if self.config.use_state:
-            numbers_BN = self.state_bins.encode(self._of_batch(batch, OBS_STATE))
+            numbers_BN = self.state_bins.encode(self._state(batch))
             symbols_BNC, mask_BNC = number_symbols(
                 numbers_BN, digits_needed(NUM_STATE_BINS), zero_padded=False
             )
