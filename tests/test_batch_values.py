@@ -10,13 +10,14 @@ from lerobot.datasets import LeRobotDataset
 from lerobot.policies.factory import make_policy, make_pre_post_processors
 from policy_cases import CASES, save_checkpoint
 from safetensors.torch import load_file, save_file
+from small_datasets import write_dataset
 from torch import Tensor
 from torch.utils.data import DataLoader
 
 from lerobot_bomb.data.columns import read_columns
 
 WRIST, STATE, ACTION = "observation.images.wrist", "observation.state", "action"
-SIZE, NUM_FRAMES = 32, 6
+NUM_FRAMES = 6
 KINDS = [("int64", 2), ("bool", 2), ("float32", 1), ("int64", 1)]
 RANGES = [(lambda x: 255 * x, "from 0 to 255"), (lambda x: 2 * x - 1, "from -1 to 1")]
 
@@ -25,23 +26,12 @@ RANGES = [(lambda x: 255 * x, "from 0 to 255"), (lambda x: 2 * x - 1, "from -1 t
 def dataset(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory) -> Any:
     """Two episodes; actions 0 and 1 of a type, states 0.1, 0.2, ..."""
     dtype, num_dims = request.param
-    names = [f"joint_{dim}" for dim in range(num_dims)]
-    features = {
-        WRIST: {"dtype": "image", "shape": (SIZE, SIZE, 3), "names": ["height", "width", "channels"]},
-        STATE: {"dtype": "float32", "shape": (num_dims,), "names": names},
-        ACTION: {"dtype": dtype, "shape": (num_dims,), "names": names},
-    }
-    root = tmp_path_factory.mktemp("batch_values") / "dataset"
-    made = LeRobotDataset.create("test/values", fps=10, features=features, root=root, use_videos=False)
-    for _ in range(2):
-        for frame in range(NUM_FRAMES):
-            image = np.full((SIZE, SIZE, 3), 20 * frame, dtype=np.uint8)
-            state = np.full(num_dims, 0.1 * (frame + 1), dtype=np.float32)
-            action = (np.arange(num_dims) + frame) % 2
-            made.add_frame({WRIST: image, STATE: state, ACTION: action.astype(dtype), "task": "go"})
-        made.save_episode()
-    made.finalize()
-    return LeRobotDataset("test/values", root=root)
+
+    def numbers(frame: int) -> tuple[np.ndarray, np.ndarray]:
+        state = np.full(num_dims, 0.1 * (frame + 1), dtype=np.float32)
+        return state, ((np.arange(num_dims) + frame) % 2).astype(dtype)
+
+    return write_dataset(tmp_path_factory.mktemp("batch_values") / "values", numbers, num_frames=NUM_FRAMES)
 
 
 def policy_for(dataset: LeRobotDataset, policy_type: str, **options: Any) -> Any:
@@ -97,25 +87,14 @@ def test_whole_numbers_and_one_dimension_train_and_act(
     np.testing.assert_allclose(saved[f"{STATE}.max"], np.full(num_dims, 0.6), rtol=1e-6)
 
 
-@pytest.mark.parametrize("dtype", [torch.int64, torch.bool])
-def test_relative_actions_of_whole_numbers(dtype: torch.dtype, tmp_path: Path) -> None:
+@pytest.mark.parametrize("dtype", ["int64", "bool"])
+def test_relative_actions_of_whole_numbers(dtype: str, tmp_path: Path) -> None:
     """What is fitted has fractions: a state of 0 and 1, and an action that is the next one."""
-    name, column = str(dtype).removeprefix("torch."), {"shape": (1,), "names": ["j"]}
-    features = {
-        WRIST: {"dtype": "image", "shape": (SIZE, SIZE, 3), "names": ["height", "width", "channels"]},
-        STATE: {"dtype": name, **column},
-        ACTION: {"dtype": name, **column},
-    }
-    made = LeRobotDataset.create(
-        "test/toggle", fps=10, features=features, root=tmp_path / "d", use_videos=False
-    )
-    for frame in range(8):
-        image = np.zeros((SIZE, SIZE, 3), dtype=np.uint8)
-        now, after = (np.array([step % 8 > 3]).astype(name) for step in (frame, frame + 1))
-        made.add_frame({WRIST: image, STATE: now, ACTION: after, "task": "go"})
-    made.save_episode()
-    made.finalize()
-    dataset = LeRobotDataset("test/toggle", root=root)
+
+    def numbers(frame: int) -> list[np.ndarray]:
+        return [np.array([step % 6 > 2]).astype(dtype) for step in (frame, frame + 1)]
+
+    dataset = write_dataset(tmp_path / "toggle", lambda frame: tuple(numbers(frame)))
     policy = policy_for(dataset, "fdvla", relative_actions=True, chunk_size=1, n_action_steps=1)
     preprocess, _ = make_pre_post_processors(policy.config, dataset_stats=dataset.meta.stats)  # pyright: ignore
     loss, _ = policy(preprocess(first_batch(dataset, 1)))

@@ -33,6 +33,10 @@ class ConfigWithEnvironment(PreTrainedConfig):
         """What a checkpoint with this config lacks and what it would need instead; None: nothing."""
         return None
 
+    def methods_used(self) -> str:
+        """Of all that its type can do, what a checkpoint with this config does; empty: there is no choice."""
+        return ""
+
     def check_action_size(self, size: int) -> None:
         """Raise a ValueError unless an action here has as many numbers as where it was trained."""
         if self.environment is None or self.environment.action_size == size:

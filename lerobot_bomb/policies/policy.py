@@ -4,6 +4,7 @@ from abc import abstractmethod
 from collections import deque
 from collections.abc import Iterator
 from contextlib import contextmanager, nullcontext, suppress
+from pathlib import Path
 from typing import Any, ClassVar, Self
 
 import torch
@@ -16,6 +17,7 @@ from torch.nn.attention import SDPBackend, sdpa_kernel
 from lerobot_bomb.actions.ensemble import TemporalEnsemble
 from lerobot_bomb.actions.relative import RelativeActions, bounds, named_dims
 from lerobot_bomb.checkpoints.adapters import check_buffers_are_the_bases, frozen_buffers
+from lerobot_bomb.checkpoints.starting import check_start
 from lerobot_bomb.data.columns import dim_names, episode_bounds, present_episodes, read_columns
 from lerobot_bomb.decoding.kv_cache import check_positions
 from lerobot_bomb.flow.noise import SamplingNoise, gumbel
@@ -59,21 +61,32 @@ class ChunkPolicy(HubPolicy, SavesTiedWeightsOnce, PreTrainedPolicy):
 
     @classmethod
     def from_pretrained(
-        cls, *args, config: Any = None, dataset_meta: LeRobotDatasetMetadata | None = None, **kwargs
+        cls,
+        pretrained_name_or_path: str | Path,
+        *,
+        config: Any = None,
+        dataset_meta: LeRobotDatasetMetadata | None = None,
+        **kwargs,
     ) -> Self:
         """As LeRobot's, but a missing or unexpected tensor is an error; fits the data that it is given."""
         if config is not None:
-            if dataset_meta is None:
-                check_as_trained(config)
-            else:
-                check_weights_fit(config, cls.shapes)
+            check_start(pretrained_name_or_path, config, dataset_meta)
+            cls._prepare(config, dataset_meta)
         policy = super().from_pretrained(
-            *args, config=config, dataset_meta=dataset_meta, **{**kwargs, "strict": True}
+            pretrained_name_or_path, config=config, dataset_meta=dataset_meta, **{**kwargs, "strict": True}
         )
         if dataset_meta is not None:
             policy._base_buffers = frozen_buffers(policy)
             policy._fit(dataset_meta)
         return policy
+
+    @classmethod
+    def _prepare(cls, config: Any, meta: LeRobotDatasetMetadata | None) -> None:
+        """Check and complete the config of a checkpoint that is loaded, to be trained on if there is data."""
+        if meta is None:
+            check_as_trained(config)
+        else:
+            check_weights_fit(config, cls.shapes)
 
     def _fit(self, meta: LeRobotDatasetMetadata) -> None:
         """Take from a dataset what a checkpoint that is trained on needs to know of it."""
@@ -163,12 +176,10 @@ class VlaPolicy(ChunkPolicy):
         super().__init__(config, dataset_meta)
 
     @classmethod
-    def from_pretrained(
-        cls, *args, config: Any = None, dataset_meta: LeRobotDatasetMetadata | None = None, **kwargs
-    ) -> Self:
+    def _prepare(cls, config: Any, meta: LeRobotDatasetMetadata | None) -> None:
         """As `ChunkPolicy`'s; takes the names of the data's action dimensions."""
-        _take_action_names(config, dataset_meta)
-        return super().from_pretrained(*args, config=config, dataset_meta=dataset_meta, **kwargs)
+        _take_action_names(config, meta)
+        super()._prepare(config, meta)
 
     def _check_length(
         self, text_config: Any, num_fixed: int, template: str, meta: LeRobotDatasetMetadata | None
@@ -277,12 +288,10 @@ class RelativeVlaPolicy(VlaPolicy):
             self._fit_relative(dataset_meta)
 
     @classmethod
-    def from_pretrained(
-        cls, *args, config: Any = None, dataset_meta: LeRobotDatasetMetadata | None = None, **kwargs
-    ) -> Self:
+    def from_pretrained(cls, *args: Any, **kwargs: Any) -> Self:
         """As `VlaPolicy`'s; relative actions fit the new data."""
         try:
-            return super().from_pretrained(*args, config=config, dataset_meta=dataset_meta, **kwargs)
+            return super().from_pretrained(*args, **kwargs)
         except ValueError as error:
             if " relative." in str(error):
                 raise ValueError(

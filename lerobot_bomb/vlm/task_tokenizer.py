@@ -4,7 +4,6 @@ It turns only the task into tokens; everything else of a prompt depends on a pol
 together inside the policy.
 """
 
-import re
 from abc import abstractmethod
 from collections.abc import Mapping
 from dataclasses import dataclass, field
@@ -34,7 +33,7 @@ from tokenizers import Tokenizer
 from torch import Tensor
 
 from lerobot_bomb.finite import require_finite_batch, require_finite_statistics
-from lerobot_bomb.vlm.prompt import task_ids
+from lerobot_bomb.vlm.prompt import check_template, task_ids
 from lerobot_bomb.vlm.tokenizer import tokenizer_from_tensor, tokenizer_to_tensor
 
 MAX_KEPT_TASKS = 4096
@@ -122,10 +121,7 @@ class TaskTokenizerStep(TaskStep):
     _ids: dict[str, Tensor] = field(default_factory=dict, init=False, repr=False)
 
     def __post_init__(self) -> None:
-        if not isinstance(self.template, str) or re.findall(r"[{}]+", self.template) != ["{}"]:
-            raise ValueError(
-                f"template={self.template!r} must hold {{}} once, for the task, and no other brace"
-            )
+        check_template(self.template, "template")
         if not isinstance(self.tokenizer, Tokenizer | None):
             raise ValueError(
                 f"tokenizer={self.tokenizer!r} must be a Tokenizer; a checkpoint has it as state"

@@ -99,7 +99,9 @@ class SpatialvlaGridPolicy(TokenVlaPolicy):
             config.ego3d_no_depth_vector,
         ).requires_grad_(config.has_positions)
         self.grids = make_grids(config, dataset_meta)
-        self._check_length(self.backbone.text_config, self._num_fixed_tokens(), "{}", dataset_meta)
+        self._check_length(
+            self.backbone.text_config, self._num_fixed_tokens(), config.prompt_template, dataset_meta
+        )
         self._num_cells_of_base: list[int] | None = None  # if the grids are other than the checkpoint's
         self.register_buffer("first_cells", torch.tensor(self.grids.offsets), persistent=False)
         hidden_size = self.backbone.text_config.hidden_size
@@ -119,18 +121,12 @@ class SpatialvlaGridPolicy(TokenVlaPolicy):
         self.reset()
 
     @classmethod
-    def from_pretrained(
-        cls,
-        *args,
-        config: SpatialvlaGridConfig | None = None,
-        dataset_meta: LeRobotDatasetMetadata | None = None,
-        **kwargs,
-    ) -> "SpatialvlaGridPolicy":
-        """As LeRobot's, but a missing or unexpected tensor is an error; the grids adapt to the new data."""
-        if config is not None:
-            complete_depth(config, dataset_meta)
-            config.check_grid_as_trained(is_refitted=dataset_meta is not None and config.adapt_embeddings)
-        return super().from_pretrained(*args, config=config, dataset_meta=dataset_meta, **kwargs)
+    def _prepare(cls, config: SpatialvlaGridConfig, meta: LeRobotDatasetMetadata | None) -> None:
+        """As the others'; grids are as they were, or adapt to the new data."""
+        complete_depth(config, meta)
+        config.check_template_as_trained()
+        config.check_grid_as_trained(is_refitted=meta is not None and config.adapt_embeddings)
+        super()._prepare(config, meta)
 
     @classmethod
     def _load_as_safetensor(
