@@ -112,7 +112,7 @@ def require_finite_batch(values: Mapping[str, Tensor], frames: Mapping[str, Tens
     ends = torch.stack([_ends(key, of_key).to(device, torch.float32) for key, of_key in values.items()])
     for (key, of_key), (low, high) in zip(values.items(), ends.tolist(), strict=True):
         if not (math.isfinite(low) and math.isfinite(high)):
-            _require_finite_rows(key, of_key, frames)
+            _refuse_infinite(key, of_key, frames)
         elif _is_image(key, of_key) and not _is_unit(low, high):
             _refuse_range(key, of_key, frames, low, high)
 
@@ -127,13 +127,14 @@ def _is_unit(low: float, high: float) -> bool:
 
 
 def _ends(key: str, values: Tensor) -> Tensor:
-    """(2,) least and greatest value of an image; of other numbers their sum, twice: one pass over them."""
+    """(2,) least and greatest value of an image, NaN if one is; of other numbers their sum, twice."""
     if _is_image(key, values) and values.numel():
         return torch.stack(torch.aminmax(_readable(values)))
     return values.sum().expand(2)
 
 
-def _require_finite_rows(key: str, values: Tensor, frames: Mapping[str, Tensor]) -> None:
+def _refuse_infinite(key: str, values: Tensor, frames: Mapping[str, Tensor]) -> None:
+    """Unless it is but the sum of the values that is infinite."""
     bad = _bad(values)
     if not bool(bad.any()):
         return

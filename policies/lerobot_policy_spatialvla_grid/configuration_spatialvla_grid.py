@@ -145,7 +145,8 @@ class SpatialvlaGridConfig(TokenVlaConfig):
         return super().missing_parts()
 
     def methods(self) -> list[str]:
-        edges = "even edges" if self.grid_distribution == "uniform" else f"{self.grid_distribution} edges"
+        kind = self.grid_distribution
+        edges = "uniform edges" if kind == "uniform" else f"adaptive edges ({kind})"
         has_depth = self.depth_source != "none"
         return [
             f"{_cells_text(self.grid_settings().groups)}, {edges}",

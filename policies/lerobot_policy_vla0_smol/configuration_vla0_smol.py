@@ -104,7 +104,9 @@ class Vla0SmolConfig(RelativeVlaConfig, TokenVlaConfig):
         return [
             f"numbers of {self.n_action_bins} bins",
             *super().methods(),
-            f"masking up to {self.mask_max_fraction:.0%} ({self.mask_level})" if is_masked else "no masking",
+            f"masking up to {100 * self.mask_max_fraction:g} % ({self.mask_level})"
+            if is_masked
+            else "no masking",
             "colour jitter" if self.color_jitter else "no colour jitter",
         ]
 
