@@ -91,10 +91,11 @@ def test_whole_numbers_and_one_dimension_train_and_act(
 def test_relative_actions_of_whole_numbers(dtype: str, tmp_path: Path) -> None:
     """What is fitted has fractions: a state of 0 and 1, and an action that is the next one."""
 
-    def numbers(frame: int) -> list[np.ndarray]:
-        return [np.array([step % 6 > 2]).astype(dtype) for step in (frame, frame + 1)]
+    def numbers(frame: int) -> tuple[np.ndarray, np.ndarray]:
+        now, after = (np.array([step % 6 > 2]).astype(dtype) for step in (frame, frame + 1))
+        return now, after
 
-    dataset = write_dataset(tmp_path / "toggle", lambda frame: tuple(numbers(frame)))
+    dataset = write_dataset(tmp_path / "toggle", numbers)
     policy = policy_for(dataset, "fdvla", relative_actions=True, chunk_size=1, n_action_steps=1)
     preprocess, _ = make_pre_post_processors(policy.config, dataset_stats=dataset.meta.stats)  # pyright: ignore
     loss, _ = policy(preprocess(first_batch(dataset, 1)))
