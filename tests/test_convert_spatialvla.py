@@ -85,7 +85,7 @@ QUESTION = "What action should the robot take to {}?"
 def test_the_slides_question_is_a_flag_that_the_checkpoint_keeps(
     authors: tuple[Path, Path], tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    """Logits tell another prompt, which chooses nearly all of the same cells."""
+    """Logits tell another prompt, which cells need not."""
     folder, bare = authors
     asked = converted(folder, tmp_path / "asked", task_template=QUESTION)
     assert f"prompt: {QUESTION!r} around the instruction, as --task_template asks" in capsys.readouterr().out

@@ -7,6 +7,7 @@ from contextlib import contextmanager
 from contextvars import ContextVar
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any, ClassVar
 
 from lerobot.configs import PreTrainedConfig
 
@@ -23,6 +24,9 @@ _to_be_built: ContextVar[PreTrainedConfig | None] = ContextVar("to_be_built", de
 @dataclass
 class ConfigWithEnvironment(PreTrainedConfig):
     """What the configs of all our policies have in common."""
+
+    # fields that a release added -> the value with which a policy acts as before, and is the same in results
+    LATER_FIELDS: ClassVar[dict[str, Any]] = {}
 
     # that of the recording it was trained on; filled in
     environment: Environment | None = None

@@ -48,6 +48,7 @@ class SpatialvlaGridConfig(TokenVlaConfig):
         "draft": DRAFTS,
     }
     STATE_IS_OF_WEIGHTS: ClassVar[bool] = False
+    LATER_FIELDS: ClassVar[dict[str, Any]] = {"task_template": BARE_TASK}
 
     # Hub id, path of a local folder, or "nano": a small model with random weights, built in code
     vlm_model_name: str = "google/paligemma2-3b-pt-224"
