@@ -1,12 +1,16 @@
-"""Numbers that are NaN or infinite are an error that says where they are; one definition for all of us."""
+"""Numbers that are NaN, infinite or no image's are an error that says where; one definition for all of us."""
 
+import math
 from collections.abc import Mapping
-from typing import Any
+from typing import Any, NoReturn
 
 import numpy as np
 import torch
-from lerobot.utils.constants import ACTION, OBS_PREFIX
+from lerobot.utils.constants import ACTION, OBS_IMAGE, OBS_PREFIX
 from torch import Tensor, nn
+
+# how far outside [0, 1] an image may be: rounding of whoever resized it, a quarter of a grey level
+IMAGE_TOLERANCE = 1e-3
 
 
 def is_finite(values: Tensor) -> bool:
@@ -96,7 +100,7 @@ def require_finite_answers(finite_B: Tensor, rows_B: Tensor | None = None) -> No
 
 
 def require_finite_batch(values: Mapping[str, Tensor], frames: Mapping[str, Tensor]) -> None:
-    """Raise a ValueError with key, row and frame unless the values (B, ...) of a batch are finite.
+    """Raise a ValueError with key, row and frame unless a batch (B, ...) is finite, its images in [0, 1].
 
     On CUDA the host waits for the device once. ``frames``: each row's `episode_index` and `index` in the
     dataset, if it has any; actions (B, T, D) are those of the row's frame and the following ones.
@@ -105,19 +109,55 @@ def require_finite_batch(values: Mapping[str, Tensor], frames: Mapping[str, Tens
     if not values:
         return
     device = next(iter(values.values())).device
-    sums = torch.stack([of_key.sum().to(device, torch.float32) for of_key in values.values()])
-    if bool(sums.isfinite().all()):
+    ends = torch.stack([_ends(key, of_key).to(device, torch.float32) for key, of_key in values.items()])
+    for (key, of_key), (low, high) in zip(values.items(), ends.tolist(), strict=True):
+        if not (math.isfinite(low) and math.isfinite(high)):
+            _refuse_infinite(key, of_key, frames)
+        elif _is_image(key, of_key) and not _is_unit(low, high):
+            _refuse_range(key, of_key, frames, low, high)
+
+
+def _is_image(key: str, values: Tensor) -> bool:
+    """Whether it is a camera's (B, 3, H, W); depth, which datasets name alike, has one channel."""
+    return key.startswith(OBS_IMAGE) and values.ndim == 4 and values.shape[1] == 3
+
+
+def _is_unit(low: float, high: float) -> bool:
+    return low >= -IMAGE_TOLERANCE and high <= 1 + IMAGE_TOLERANCE
+
+
+def _ends(key: str, values: Tensor) -> Tensor:
+    """(2,) least and greatest value of an image, NaN if one is; of other numbers their sum, twice."""
+    if _is_image(key, values) and values.numel():
+        return torch.stack(torch.aminmax(_readable(values)))
+    return values.sum().expand(2)
+
+
+def _refuse_infinite(key: str, values: Tensor, frames: Mapping[str, Tensor]) -> None:
+    """Unless it is but the sum of the values that is infinite."""
+    bad = _bad(values)
+    if not bool(bad.any()):
         return
-    for key, of_key in values.items():
-        bad = _bad(of_key)
-        if bool(bad.any()):
-            row, *place = bad.nonzero()[0].tolist()
-            ahead = place[0] if key == ACTION and len(place) == 2 else 0
-            where, advice = _frame(frames, row, ahead)
-            raise ValueError(
-                f"{key!r} is not finite in {where}row {row} of the batch: {int(bad[row].sum())} of "
-                f"{bad[row].numel()} values there are NaN or infinite, the first at {place}{advice}"
-            )
+    row, *place = bad.nonzero()[0].tolist()
+    ahead = place[0] if key == ACTION and len(place) == 2 else 0
+    where, advice = _frame(frames, row, ahead)
+    raise ValueError(
+        f"{key!r} is not finite in {where}row {row} of the batch: {int(bad[row].sum())} of "
+        f"{bad[row].numel()} values there are NaN or infinite, the first at {place}{advice}"
+    )
+
+
+def _refuse_range(
+    key: str, values: Tensor, frames: Mapping[str, Tensor], low: float, high: float
+) -> NoReturn:
+    is_outside_B = torch.tensor([not _is_unit(*_ends(key, row[None]).tolist()) for row in values])
+    row = int(is_outside_B.nonzero()[0])
+    where, _ = _frame(frames, row, 0)
+    raise ValueError(
+        f"{key!r} has values from {low:.4g} to {high:.4g}, the first such image in {where}row {row} of the "
+        "batch; images must lie in [0, 1], as LeRobot's datasets and environments give them: divide 0..255 "
+        "by 255"
+    )
 
 
 def _frame(frames: Mapping[str, Tensor], row: int, ahead: int) -> tuple[str, str]:

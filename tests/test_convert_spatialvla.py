@@ -29,6 +29,7 @@ from safetensors import safe_open
 from safetensors.torch import load_file, save_file
 
 from lerobot_bomb.actions.grid_settings import ActionGroup
+from lerobot_bomb.vlm.tokenizer import nano_tokenizer
 from lerobot_policy_spatialvla_grid.modeling_spatialvla_grid import SpatialvlaGridPolicy
 
 
@@ -68,9 +69,38 @@ def test_a_converted_checkpoint_chooses_the_cells_of_the_authors_classes(
         np.testing.assert_array_equal(policy._prompt(batch).ids, arrays["prompt_ids"])
         np.testing.assert_array_equal(cells_of(policy, batch), arrays[expected])
         if not flags:
-            first = policy._hidden(batch, torch.zeros(len(images), 4, 3, dtype=torch.long))[:, 0, 0]
-            logits = policy._cell_logits(0, first).detach()
+            logits = first_logits(policy, batch)
             np.testing.assert_allclose(logits, arrays["first_logits_with_zoedepth"], rtol=0, atol=2e-5)
+
+
+def first_logits(policy: SpatialvlaGridPolicy, batch: dict[str, Any]) -> torch.Tensor:
+    """Of the first step's translation: (B, cells)."""
+    cells = torch.zeros(len(batch[CAMERA]), 4, 3, dtype=torch.long)
+    return policy._cell_logits(0, policy._hidden(batch, cells)[:, 0, 0]).detach()
+
+
+QUESTION = "What action should the robot take to {}?"
+
+
+def test_the_slides_question_is_a_flag_that_the_checkpoint_keeps(
+    authors: tuple[Path, Path], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Logits tell another prompt, which cells need not."""
+    folder, bare = authors
+    asked = converted(folder, tmp_path / "asked", task_template=QUESTION)
+    assert f"prompt: {QUESTION!r} around the instruction, as --task_template asks" in capsys.readouterr().out
+    with np.load(folder / "expected.npz") as arrays:
+        images = torch.from_numpy(arrays["images"]).permute(0, 3, 1, 2) / 255
+        expected, ids = arrays["first_logits_with_zoedepth"], arrays["prompt_ids"]
+    raw = {CAMERA: images, "task": ["pick the cup"] * len(images)}
+    policy, preprocessor, _ = load(asked)
+    assert policy.config.task_template == QUESTION
+    batch = preprocessor(dict(raw))
+    np.testing.assert_array_equal(policy._prompt(batch).ids, ids)
+    np.testing.assert_allclose(first_logits(policy, batch), expected, rtol=0, atol=2e-5)
+    other, preprocessor, _ = load(bare)
+    assert other.config.task_template == "{}"
+    assert np.abs(first_logits(other, preprocessor(dict(raw))).numpy() - expected).max() > 1e-3
 
 
 def test_small_folders_have_the_layout_of_the_authors(
@@ -97,6 +127,25 @@ def test_small_folders_have_the_layout_of_the_authors(
 
 
 # Small ones
+
+
+def test_the_prompt_is_said_kept_and_not_changed(
+    folder: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    plain = converted(folder, tmp_path / "plain")
+    assert (
+        "prompt: the instruction alone, as the original's processor adds nothing" in capsys.readouterr().out
+    )
+    asked = converted(folder, tmp_path / "asked", task_template="Please {} now")
+    _, preprocessor, _ = load(asked)
+    written = preprocessor({**observations(1), "task": ["Pick_it"]})["observation.language.tokens"]
+    assert nano_tokenizer().decode(written[0].tolist()) == "please pick it now"
+    assert convert(folder, tmp_path / "refused", task_template="Please") == 1
+    assert "task_template='Please' must hold {} once" in capsys.readouterr().err
+    older = Path(__file__).parent / "fixtures" / "before_layout" / "spatialvla_grid"
+    for checkpoint, then in ((plain, "{}"), (asked, "Please {} now"), (older, "{}")):
+        with pytest.raises(ValueError, match=re.escape(f"this checkpoint was trained with {then!r}, which")):
+            load(checkpoint, task_template="{}" if then != "{}" else "'now {}'")
 
 
 def actions_as_the_original_decodes(

@@ -11,13 +11,15 @@ from typing import Any
 import numpy as np
 import pytest
 from huggingface_hub import constants
+from lerobot.configs import PreTrainedConfig
 from lerobot.policies import PreTrainedPolicy, make_policy
 from lerobot.policies.act.configuration_act import ACTConfig
 
 import lerobot_policy_bomb  # noqa: F401  the plugin
 from lerobot_bomb import _compat
 from lerobot_bomb._compat import built_policies
-from lerobot_bomb.checkpoints.identity import _of_checkpoint, acting_policy, identity_of
+from lerobot_bomb.checkpoints.identity import _of_checkpoint, acting_policy, identity_of, identity_of_config
+from lerobot_bomb.checkpoints.shipped import checkpoint_path
 from lerobot_bomb.envs.results import PolicyIdentity
 from lerobot_bomb.evaluation.results import read_results
 from lerobot_env_bomb.configuration_bomb import BombEnvConfig
@@ -95,6 +97,19 @@ def test_flags_and_processors_are_part_of_who_acts_and_a_place_is_not(checkpoint
     assert first == again == other_place
     assert len({first, other_flag, other_processor}) == 3
     assert len({who.weights_sha256 for who in seen}) == 1
+
+
+def test_a_flag_that_a_release_added_leaves_who_acts_as_it_was() -> None:
+    """The digest of lines that were written before there was a `task_template`."""
+    folder = checkpoint_path("bomb:spatialvla_grid")
+    config: Any = PreTrainedConfig.from_pretrained(folder)
+    config.pretrained_path = folder
+    before = "886e070da0113fc6e9ccc9126b09dc364ec14fbb49f95cbe1e19a4d0202cf7bf"
+    assert identity_of_config(config).settings_sha256 == before
+    config.trained_with = {**config.trained_with, "task_template": "{}"}  # as a policy that is built adds it
+    assert identity_of_config(config).settings_sha256 == before
+    config.task_template = "what to do to {}?"
+    assert identity_of_config(config).settings_sha256 != before
 
 
 def test_a_policy_in_training_does_not_claim_the_weights_it_started_from(checkpoint: Path) -> None:

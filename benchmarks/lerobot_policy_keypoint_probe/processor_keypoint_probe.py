@@ -5,18 +5,12 @@ from dataclasses import dataclass
 from typing import Any
 
 import torch
-from lerobot.configs import PipelineFeatureType, PolicyFeature
-from lerobot.processor import (
-    ObservationProcessorStep,
-    PolicyAction,
-    PolicyProcessorPipeline,
-    ProcessorStepRegistry,
-    TransitionKey,
-)
+from lerobot.processor import PolicyAction, PolicyProcessorPipeline, ProcessorStepRegistry
 from lerobot.utils.constants import OBS_LANGUAGE_TOKENS
 from torch import Tensor
+from torch.nn.utils.rnn import pad_sequence
 
-from lerobot_bomb.vlm.task_tokenizer import make_task_processors
+from lerobot_bomb.vlm.task_tokenizer import TaskStep, make_task_processors
 from lerobot_policy_keypoint_probe.configuration_keypoint_probe import KeypointProbeConfig
 
 NO_WORD = 0  # fills up short instructions
@@ -33,24 +27,12 @@ def word_ids(instruction: str) -> list[int]:
 
 @ProcessorStepRegistry.register(KeypointProbeConfig.TASK_STEP)
 @dataclass
-class WordsStep(ObservationProcessorStep):
+class WordsStep(TaskStep):
     """``task`` (B texts) -> ``observation.language.tokens`` (B, L) int64, rows filled up with NO_WORD."""
 
-    def observation(self, observation: dict[str, Any]) -> dict[str, Any]:
-        tasks = (self.transition.get(TransitionKey.COMPLEMENTARY_DATA) or {}).get("task")
-        tasks = [tasks] if isinstance(tasks, str) else tasks
-        if not tasks or not all(isinstance(task, str) for task in tasks):
-            raise ValueError(
-                f"keypoint_probe needs the instruction under the key 'task' as text; got {tasks!r}"
-            )
+    def tokens(self, tasks: list[str]) -> dict[str, Tensor]:
         rows = [torch.tensor(word_ids(task), dtype=torch.int64) for task in tasks]
-        tokens_BL = torch.nn.utils.rnn.pad_sequence(rows, batch_first=True, padding_value=NO_WORD)
-        return {**observation, OBS_LANGUAGE_TOKENS: tokens_BL}
-
-    def transform_features(
-        self, features: dict[PipelineFeatureType, dict[str, PolicyFeature]]
-    ) -> dict[PipelineFeatureType, dict[str, PolicyFeature]]:
-        return features
+        return {OBS_LANGUAGE_TOKENS: pad_sequence(rows, batch_first=True, padding_value=NO_WORD)}
 
 
 def make_keypoint_probe_pre_post_processors(

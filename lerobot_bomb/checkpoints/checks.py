@@ -16,7 +16,12 @@ from torch import Tensor
 
 from lerobot_bomb.checkpoints.environment import ConfigWithEnvironment
 from lerobot_bomb.checkpoints.names import CONFIG, WEIGHTS
-from lerobot_bomb.checkpoints.processor_files import refuse_link_out, saved_type, state_files
+from lerobot_bomb.checkpoints.processor_files import (
+    check_float_statistics,
+    refuse_link_out,
+    saved_type,
+    state_files,
+)
 from lerobot_bomb.files import read_json
 from lerobot_bomb.finite import is_finite, require_finite
 
@@ -54,7 +59,8 @@ def processor_files(folder: Path, processor: str) -> list[str]:
     """Names of the files that make up one of `PROCESSORS`, each whole and data only; none is loaded.
 
     Raises:
-        ValueError: one is missing, truncated, not finite or of another format, or a step is not registered.
+        ValueError: one is missing, truncated, not finite, of no floats or of another format, or a step is not
+            registered.
     """
     register_third_party_plugins()  # their steps
     content = read_json(folder / processor)
@@ -64,6 +70,7 @@ def processor_files(folder: Path, processor: str) -> list[str]:
             raise ValueError(f"{folder} holds no {name}, which its {processor} needs")
         refuse_link_out(folder / name)
         check_finite(folder / name)
+    check_float_statistics(content, folder)
     return [processor, *states]
 
 

@@ -7,6 +7,7 @@ from contextlib import contextmanager
 from contextvars import ContextVar
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any, ClassVar
 
 from lerobot.configs import PreTrainedConfig
 
@@ -24,6 +25,9 @@ _to_be_built: ContextVar[PreTrainedConfig | None] = ContextVar("to_be_built", de
 class ConfigWithEnvironment(PreTrainedConfig):
     """What the configs of all our policies have in common."""
 
+    # fields that a release added -> the value with which a policy acts as before, and is the same in results
+    LATER_FIELDS: ClassVar[dict[str, Any]] = {}
+
     # that of the recording it was trained on; filled in
     environment: Environment | None = None
     # whether it acts in another one all the same; no checkpoint keeps this
@@ -32,6 +36,10 @@ class ConfigWithEnvironment(PreTrainedConfig):
     def missing_parts(self) -> str | None:
         """What a checkpoint with this config lacks and what it would need instead; None: nothing."""
         return None
+
+    def methods_used(self) -> str:
+        """Of all that its type can do, what a checkpoint with this config does; empty: there is no choice."""
+        return ""
 
     def check_action_size(self, size: int) -> None:
         """Raise a ValueError unless an action here has as many numbers as where it was trained."""

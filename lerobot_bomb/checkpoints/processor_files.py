@@ -18,6 +18,7 @@ from lerobot.processor import (
     UnnormalizerProcessorStep,
 )
 from lerobot.utils.constants import POLICY_POSTPROCESSOR_DEFAULT_NAME, POLICY_PREPROCESSOR_DEFAULT_NAME
+from safetensors import safe_open
 
 from lerobot_bomb._compat import check_processors_before_use
 from lerobot_bomb.actions.relative import BOUND_STATISTICS, CENTRE_AND_DISTANCE
@@ -45,6 +46,8 @@ NEEDED = {
     POLICY_PREPROCESSOR_DEFAULT_NAME: {"normalizer_processor"},
     POLICY_POSTPROCESSOR_DEFAULT_NAME: {"unnormalizer_processor"},
 }
+# steps that hold statistics
+NORMALIZERS = {step for steps in NEEDED.values() for step in steps}
 # of which values are normalised; none by the identity
 STATISTICS = {**BOUND_STATISTICS, NormalizationMode.MEAN_STD: CENTRE_AND_DISTANCE}
 
@@ -156,8 +159,37 @@ def check_saved_processors() -> None:
 
     check_processors_before_use(
         check,
-        lambda steps, where, config: check_states(steps, where, is_ours(saved_type(config))),
+        _check_loaded,
     )
+
+
+def _check_loaded(steps: Sequence[Any], where: str, config_file: Path) -> None:
+    is_of_us = is_ours(saved_type(config_file))
+    check_states(steps, where, complete=is_of_us)
+    for name in NEEDED if is_of_us else ():
+        path = config_file.with_name(f"{name}.json")
+        if path.is_file():
+            check_float_statistics(read_json(path), path.parent)
+
+
+def check_float_statistics(content: Mapping[str, Any], folder: Path) -> None:
+    """The saved statistics of a processor's JSON are floats; loading would hide that they were rounded.
+
+    Raises:
+        ValueError: names the file and the first that are none.
+    """
+    for step in content["steps"]:
+        path = folder / step.get("state_file", "")
+        if step.get("registry_name") not in NORMALIZERS or not path.is_file():
+            continue
+        with safe_open(path, "pt") as tensors:
+            for name in tensors.keys():  # noqa: SIM118
+                dtype = tensors.get_tensor(name).dtype
+                if not dtype.is_floating_point:
+                    raise ValueError(
+                        f"{path}: {name} is {dtype}, not a float: the checkpoint was trained on whole "
+                        "numbers, to which LeRobot rounded all statistics; train again"
+                    )
 
 
 def check_states(steps: Sequence[Any], where: str, complete: bool) -> None:

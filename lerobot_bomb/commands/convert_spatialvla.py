@@ -48,6 +48,7 @@ ORIGINAL_KEYS = (
     *("text_config", "vision_config", "use_vision_zoe", "ego3d_patch_reso", "n_freqs"),
 )
 PROCESSOR_KEYS = ("statistics", "action_config", "action_chunk_size", "intrinsic_config")
+BARE_TASK = "{}"
 GRIPPER = 6  # of the action's dims
 # least sigma of the published grid, which no file of its folder says
 PUBLISHED_MIN_SIGMA = 0.5
@@ -70,6 +71,11 @@ def add_convert_spatialvla_arguments(parser: argparse.ArgumentParser) -> None:
     add("--grid", type=path_flag, help=grid)
     min_sigma = f"least sigma of --grid (default: the folder's, or the published {PUBLISHED_MIN_SIGMA})"
     add("--min_sigma", type=float, help=min_sigma)
+    template = (
+        "what the prompt says around an instruction, which stands for {}: '{}' (default), as the original's "
+        "processor writes it, or 'What action should the robot take to {}?', as its slides do"
+    )
+    add("--task_template", default=BARE_TASK, help=template)
     point = "what cells decode to: mid, as in the original (default), or cond_mean, the mean by --grid"
     add("--decode_point", default="mid", choices=("mid", "cond_mean"), help=point)
 
@@ -104,8 +110,19 @@ def run_convert_spatialvla(args: argparse.Namespace) -> int:
     pipelines = make_pre_post_processors(config, dataset_stats={ACTION: scales})
     config.vlm_model_name = args.folder.resolve().name  # nothing is read there any more
     write_checkpoint(args.output, policy, pipelines)
-    print(f"written to {args.output}: --policy.path={args.output}")
+    print(f"{_prompt_text(args.task_template)}\nwritten to {args.output}: --policy.path={args.output}")
     return 0
+
+
+def _prompt_text(template: str) -> str:
+    """What the prompt is and why; no file of the folder says it."""
+    if template == BARE_TASK:
+        return (
+            "prompt: the instruction alone, as the original's processor adds nothing to what it is given; "
+            "where the weights were trained on the slides' question: "
+            "--task_template='What action should the robot take to {}?'"
+        )
+    return f"prompt: {template!r} around the instruction, as --task_template asks"
 
 
 def _check_keys(path: Path, values: dict[str, Any], keys: tuple[str, ...]) -> None:
@@ -206,6 +223,7 @@ def _config(
             "vision_config": vision_config,
         },
         prompt_tokens=PaliGemmaPrompt.from_tokenizer(tokenizer, str(args.folder)).to_dict(),
+        task_template=args.task_template,
         chunk_size=chunk_size,
         n_action_steps=chunk_size,
         normalization_mapping={

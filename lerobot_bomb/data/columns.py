@@ -45,6 +45,8 @@ def read_columns(
 ) -> dict[str, np.ndarray]:
     """{key: (N, ...)} of N frames in the dataset's order, `episode_index` (N,) always among them.
 
+    Features of whole numbers or truth values are float64: what is computed of them has fractions.
+
     Reads the data files under ``meta.root``; ``LeRobotDataset`` downloads them if they are not there.
 
     Raises:
@@ -68,6 +70,8 @@ def read_columns(
     table = pa.concat_tables(tables).sort_by("index")
     shapes = {key: () if key in DEFAULT_FEATURES else meta.features[key]["shape"] for key in columns}
     arrays = {key: flat_numbers(table[key]).reshape(len(table), *shapes[key]) for key in columns}
+    whole = [key for key in columns if key not in DEFAULT_FEATURES and arrays[key].dtype.kind != "f"]
+    arrays |= {key: arrays[key].astype(np.float64) for key in whole}
     index_N = flat_numbers(table["index"])
     for key in columns:
         _require_finite(meta, key, arrays[key], arrays[EPISODE_INDEX], index_N)

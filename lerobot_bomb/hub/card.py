@@ -10,6 +10,7 @@ from lerobot.configs import PreTrainedConfig
 from lerobot.configs.train import TrainPipelineConfig
 
 from lerobot_bomb import __version__
+from lerobot_bomb.checkpoints.environment import ConfigWithEnvironment
 from lerobot_bomb.checkpoints.names import is_hub_id
 from lerobot_bomb.data.environment import SUITE, Environment
 from lerobot_bomb.data.facts import DatasetFacts
@@ -128,8 +129,12 @@ class Checkpoint:
         return (
             f"A checkpoint of LeRobot's policy type `{self.config.type}`, which the plugin "
             f"`lerobot_policy_bomb` adds.{start} {self._weights()}{benchmark}"
-            f"\n\nThe policy type: {self.method.summary}"
+            f"\n\nThe policy type: {self.method.summary}{self._methods_used()}"
         )
+
+    def _methods_used(self) -> str:
+        used = self.config.methods_used() if isinstance(self.config, ConfigWithEnvironment) else ""
+        return f"\n\nMethods used in this checkpoint: {used}." if used else ""
 
     def _weights(self) -> str:
         if self.adapters_of:

@@ -47,6 +47,8 @@ class ChunkConfig(ConfigWithEnvironment):
     MODES: ClassVar[tuple[NormalizationMode, ...]] = tuple(NormalizationMode)
     # whether a checkpoint's weights are of actions of one size; text has any
     ACTIONS_ARE_OF_WEIGHTS: ClassVar[bool] = True
+    # the same of the state
+    STATE_IS_OF_WEIGHTS: ClassVar[bool] = True
     # registered name of the processor step that reads the task, which every checkpoint has
     TASK_STEP: ClassVar[str]
 
@@ -112,6 +114,13 @@ class ChunkConfig(ConfigWithEnvironment):
     def _check_action_size(self) -> None:
         if self.ACTIONS_ARE_OF_WEIGHTS and self.action_feature is not None:
             self.check_action_size(self.action_feature.shape[0])
+
+    def methods_used(self) -> str:
+        return ", ".join(self.methods())
+
+    def methods(self) -> list[str]:
+        size = self.chunk_size
+        return ["chunk of 1" if size == 1 else f"chunk of {size}, {self.n_action_steps} executed"]
 
     def get_optimizer_preset(self) -> AdamWConfig:
         return adamw(self)
@@ -189,6 +198,15 @@ class VlaConfig(ChunkConfig):
         check_crop(self)
         check_ensemble(self)
 
+    def methods(self) -> list[str]:
+        size, side = self.temporal_ensemble_size, self.crop_fraction
+        return [
+            *super().methods(),
+            *([f"ensemble of {size} ({self.temporal_ensemble_weighting})"] if size else []),
+            "no crop" if side == 1 else f"crop to {side:g}",
+            "state read" if self.use_state else "no state",
+        ]
+
     @property
     def weights_type(self) -> torch.dtype:
         """Torch's name for it."""
@@ -232,6 +250,9 @@ class RelativeVlaConfig(VlaConfig):
     relative_exclude_joints: list[str] = field(default_factory=list)
     # the state dimension of each relative action dimension; None = the same number
     relative_state_indices: list[int] | None = None
+
+    def methods(self) -> list[str]:
+        return [*super().methods(), "relative actions" if self.relative_actions else "absolute actions"]
 
     def relative_dims(self) -> dict[int, int]:
         """{action dimension that is relative: its state dimension}.

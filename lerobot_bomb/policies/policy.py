@@ -4,6 +4,7 @@ from abc import abstractmethod
 from collections import deque
 from collections.abc import Iterator
 from contextlib import contextmanager, nullcontext, suppress
+from pathlib import Path
 from typing import Any, ClassVar, Self
 
 import torch
@@ -16,6 +17,7 @@ from torch.nn.attention import SDPBackend, sdpa_kernel
 from lerobot_bomb.actions.ensemble import TemporalEnsemble
 from lerobot_bomb.actions.relative import RelativeActions, bounds, named_dims
 from lerobot_bomb.checkpoints.adapters import check_buffers_are_the_bases, frozen_buffers
+from lerobot_bomb.checkpoints.starting import check_start
 from lerobot_bomb.data.columns import dim_names, episode_bounds, present_episodes, read_columns
 from lerobot_bomb.decoding.kv_cache import check_positions
 from lerobot_bomb.flow.noise import SamplingNoise, gumbel
@@ -23,7 +25,7 @@ from lerobot_bomb.hub.policy import HubPolicy
 from lerobot_bomb.policies.config import ChunkConfig, RelativeVlaConfig, TokenVlaConfig, VlaConfig
 from lerobot_bomb.training.distributed import SavesTiedWeightsOnce
 from lerobot_bomb.training.policy_flags import check_as_trained, check_weights_fit, trained_with
-from lerobot_bomb.vlm.inputs import read_tensor
+from lerobot_bomb.vlm.inputs import read_state, read_tensor
 from lerobot_bomb.vlm.prompt import task_ids, task_text
 from lerobot_bomb.vlm.tokenizer import load_tokenizer
 
@@ -59,21 +61,32 @@ class ChunkPolicy(HubPolicy, SavesTiedWeightsOnce, PreTrainedPolicy):
 
     @classmethod
     def from_pretrained(
-        cls, *args, config: Any = None, dataset_meta: LeRobotDatasetMetadata | None = None, **kwargs
+        cls,
+        pretrained_name_or_path: str | Path,
+        *,
+        config: Any = None,
+        dataset_meta: LeRobotDatasetMetadata | None = None,
+        **kwargs,
     ) -> Self:
         """As LeRobot's, but a missing or unexpected tensor is an error; fits the data that it is given."""
         if config is not None:
-            if dataset_meta is None:
-                check_as_trained(config)
-            else:
-                check_weights_fit(config, cls.shapes)
+            check_start(pretrained_name_or_path, config, dataset_meta)
+            cls._prepare(config, dataset_meta)
         policy = super().from_pretrained(
-            *args, config=config, dataset_meta=dataset_meta, **{**kwargs, "strict": True}
+            pretrained_name_or_path, config=config, dataset_meta=dataset_meta, **{**kwargs, "strict": True}
         )
         if dataset_meta is not None:
             policy._base_buffers = frozen_buffers(policy)
             policy._fit(dataset_meta)
         return policy
+
+    @classmethod
+    def _prepare(cls, config: Any, meta: LeRobotDatasetMetadata | None) -> None:
+        """Check and complete the config of a checkpoint that is loaded, to be trained on if there is data."""
+        if meta is None:
+            check_as_trained(config)
+        else:
+            check_weights_fit(config, cls.shapes)
 
     def _fit(self, meta: LeRobotDatasetMetadata) -> None:
         """Take from a dataset what a checkpoint that is trained on needs to know of it."""
@@ -124,6 +137,12 @@ class ChunkPolicy(HubPolicy, SavesTiedWeightsOnce, PreTrainedPolicy):
     def _of_batch(self, batch: dict[str, Tensor], key: str) -> Tensor:
         return read_tensor(batch, key, self.config.type, self._device)
 
+    def _state(self, batch: dict[str, Tensor]) -> Tensor:
+        """(B, S) normalised."""
+        assert self.config.robot_state_feature is not None
+        (num_dims,) = self.config.robot_state_feature.shape
+        return read_state(batch, self.config.type, self._device, num_dims)
+
     @property
     def _cameras(self) -> list[str]:
         return sorted(self.config.image_features)
@@ -157,12 +176,10 @@ class VlaPolicy(ChunkPolicy):
         super().__init__(config, dataset_meta)
 
     @classmethod
-    def from_pretrained(
-        cls, *args, config: Any = None, dataset_meta: LeRobotDatasetMetadata | None = None, **kwargs
-    ) -> Self:
+    def _prepare(cls, config: Any, meta: LeRobotDatasetMetadata | None) -> None:
         """As `ChunkPolicy`'s; takes the names of the data's action dimensions."""
-        _take_action_names(config, dataset_meta)
-        return super().from_pretrained(*args, config=config, dataset_meta=dataset_meta, **kwargs)
+        _take_action_names(config, meta)
+        super()._prepare(config, meta)
 
     def _check_length(
         self, text_config: Any, num_fixed: int, template: str, meta: LeRobotDatasetMetadata | None
@@ -271,12 +288,10 @@ class RelativeVlaPolicy(VlaPolicy):
             self._fit_relative(dataset_meta)
 
     @classmethod
-    def from_pretrained(
-        cls, *args, config: Any = None, dataset_meta: LeRobotDatasetMetadata | None = None, **kwargs
-    ) -> Self:
+    def from_pretrained(cls, *args: Any, **kwargs: Any) -> Self:
         """As `VlaPolicy`'s; relative actions fit the new data."""
         try:
-            return super().from_pretrained(*args, config=config, dataset_meta=dataset_meta, **kwargs)
+            return super().from_pretrained(*args, **kwargs)
         except ValueError as error:
             if " relative." in str(error):
                 raise ValueError(
@@ -327,13 +342,13 @@ class RelativeVlaPolicy(VlaPolicy):
         """Normalised actions -> what is trained on and predicted, (B, T, D) both."""
         if self.relative is None:
             return actions_BTD
-        return self.relative.encode(actions_BTD, self._of_batch(batch, OBS_STATE))
+        return self.relative.encode(actions_BTD, self._state(batch))
 
     def _to_absolute(self, predicted_BTD: Tensor, batch: dict[str, Tensor]) -> Tensor:
         """The inverse of `_to_relative`."""
         if self.relative is None:
             return predicted_BTD
-        return self.relative.decode(predicted_BTD, self._of_batch(batch, OBS_STATE))
+        return self.relative.decode(predicted_BTD, self._state(batch))
 
     @property
     def _unit(self) -> Tensor:

@@ -1,7 +1,7 @@
 """Reading a batch, with errors that say what is amiss."""
 
 import torch
-from lerobot.utils.constants import OBS_LANGUAGE_ATTENTION_MASK, OBS_LANGUAGE_TOKENS
+from lerobot.utils.constants import OBS_LANGUAGE_ATTENTION_MASK, OBS_LANGUAGE_TOKENS, OBS_STATE
 from torch import Tensor
 
 from lerobot_bomb.actions.text import TokenRows
@@ -14,9 +14,9 @@ TEXT_COLUMNS = 16
 
 
 def read_tensor(batch: dict[str, Tensor], key: str, policy_type: str, device: torch.device) -> Tensor:
-    """The batch's value; an error if it is absent, on another device or, on the CPU, not finite.
+    """The batch's value; an error if it is absent, on another device or, on the CPU, not finite or in range.
 
-    On CUDA the host would have to wait; `TaskTokenizerStep` looks at a batch before.
+    On CUDA the host would have to wait; `TaskStep` looks at a batch before.
     """
     if key not in batch:
         raise KeyError(f"{policy_type} needs {key!r}; the batch has {sorted(batch)}")
@@ -38,6 +38,17 @@ def read_image(batch: dict[str, Tensor], key: str, policy_type: str, device: tor
     return image_B3HW
 
 
+def read_state(batch: dict[str, Tensor], policy_type: str, device: torch.device, num_dims: int) -> Tensor:
+    """(B, S) of the robot's normalised state."""
+    state_BS = read_tensor(batch, OBS_STATE, policy_type, device)
+    if state_BS.ndim != 2 or state_BS.shape[1] != num_dims:
+        raise ValueError(
+            f"batch[{OBS_STATE!r}] has shape {tuple(state_BS.shape)}; expected (batch, {num_dims}), as the "
+            f"policy's config says"
+        )
+    return state_BS
+
+
 def read_task(batch: dict[str, Tensor], policy_type: str, device: torch.device) -> TokenRows:
     """The instructions' tokens, with padding."""
     ids_BL, mask_BL = (
@@ -54,10 +65,10 @@ def read_task(batch: dict[str, Tensor], policy_type: str, device: torch.device) 
 def read_actions(
     batch: dict[str, Tensor], key: str, policy_type: str, device: torch.device, shape: tuple[int, int]
 ) -> Tensor:
-    """(B, T, D) of the given ``shape`` (T, D); a chunk of one action may come as (B, D)."""
+    """(B, T, D) of the given ``shape`` (T, D); one action may come as (B, D), one dimension as (B, T)."""
     actions_BTD = read_tensor(batch, key, policy_type, device)
-    if actions_BTD.ndim == 2 and shape[0] == 1:
-        actions_BTD = actions_BTD[:, None]
+    if actions_BTD.ndim == 2 and 1 in shape and actions_BTD.shape[1] == max(shape):
+        actions_BTD = actions_BTD.unflatten(1, shape)
     if actions_BTD.ndim != 3 or actions_BTD.shape[1:] != shape:
         raise ValueError(
             f"batch[{key!r}] has shape {tuple(actions_BTD.shape)}; expected (batch, {shape[0]}, {shape[1]}) "

@@ -206,6 +206,15 @@ def normalize_task(task: str) -> str:
     return re.sub(r"[_\r\n]", " ", task.lower()).strip()
 
 
+def check_template(template: object, name: str) -> None:
+    """Raise a ValueError unless what is written around an instruction holds ``{}`` once, for it.
+
+    ``name``: what the message calls it.
+    """
+    if not isinstance(template, str) or re.findall(r"[{}]+", template) != ["{}"]:
+        raise ValueError(f"{name}={template!r} must hold {{}} once, for the task, and no other brace")
+
+
 def task_text(task: str, template: str = TASK_TEMPLATE) -> str:
     """The prompt's task part; ``{}`` in the template stands for the task."""
     return template.format(normalize_task(task))

@@ -1,10 +1,10 @@
-"""The processor step that turns an instruction into tokens, and the pipelines around it.
+"""The processor step that reads a batch and its instructions, and the pipelines around it.
 
 It turns only the task into tokens; everything else of a prompt depends on a policy's config and is put
 together inside the policy.
 """
 
-import re
+from abc import abstractmethod
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Any
@@ -12,6 +12,7 @@ from typing import Any
 import torch
 from lerobot.configs import PipelineFeatureType, PolicyFeature, PreTrainedConfig
 from lerobot.processor import (
+    EnvTransition,
     ObservationProcessorStep,
     PolicyAction,
     PolicyProcessorPipeline,
@@ -23,6 +24,7 @@ from lerobot.processor import (
 from lerobot.utils.constants import (
     ACTION,
     OBS_IMAGE,
+    OBS_LANGUAGE,
     OBS_LANGUAGE_ATTENTION_MASK,
     OBS_LANGUAGE_TOKENS,
     OBS_STATE,
@@ -31,20 +33,83 @@ from tokenizers import Tokenizer
 from torch import Tensor
 
 from lerobot_bomb.finite import require_finite_batch, require_finite_statistics
-from lerobot_bomb.vlm.prompt import task_ids
+from lerobot_bomb.vlm.prompt import check_template, task_ids
 from lerobot_bomb.vlm.tokenizer import tokenizer_from_tensor, tokenizer_to_tensor
 
 MAX_KEPT_TASKS = 4096
 TOKENIZER_KEY = "tokenizer_json"
 
 
+@dataclass
+class TaskStep(ObservationProcessorStep):
+    """Reads the batch for all that follows: numbers as float32, a row for each instruction, all checked.
+
+    It is in the pipelines of all our checkpoints, before anything is normalised. LeRobot's normaliser casts
+    all its statistics to the type of what it normalised last, and a checkpoint saves them so: of whole
+    numbers nothing but these would be left. Refused are images, state and actions that are not finite,
+    images outside [0, 1], and another number of rows than of instructions. On CUDA the host waits once,
+    before the pass.
+    """
+
+    def __call__(self, transition: EnvTransition) -> EnvTransition:
+        frames = transition.get(TransitionKey.COMPLEMENTARY_DATA) or {}
+        tasks, action = _read_tasks(frames), transition.get(TransitionKey.ACTION)
+        observation = transition.get(TransitionKey.OBSERVATION) or {}
+        observation = {key: _as_floats(key, values, len(tasks)) for key, values in observation.items()}
+        action = _as_floats(ACTION, action, len(tasks))
+        read = _read_by_policies(observation, action)
+        _check_rows(read, len(tasks))
+        require_finite_batch(read, frames)
+        ready = {TransitionKey.OBSERVATION: observation, TransitionKey.ACTION: action}
+        return super().__call__({**transition, **ready})  # pyright: ignore[reportArgumentType]  a TypedDict
+
+    def observation(self, observation: dict[str, Any]) -> dict[str, Any]:
+        tasks = _read_tasks(self.transition.get(TransitionKey.COMPLEMENTARY_DATA) or {})
+        return {**observation, **self.tokens(tasks)}
+
+    @abstractmethod
+    def tokens(self, tasks: list[str]) -> dict[str, Tensor]:
+        """What is added to the observation: ids (B, L) and whatever goes with them, by their keys."""
+
+    def transform_features(
+        self, features: dict[PipelineFeatureType, dict[str, PolicyFeature]]
+    ) -> dict[PipelineFeatureType, dict[str, PolicyFeature]]:
+        return features
+
+
+def _read_tasks(frames: Mapping[str, Any]) -> list[str]:
+    tasks = frames.get("task")
+    tasks = [tasks] if isinstance(tasks, str) else tasks
+    if not tasks or not all(isinstance(task, str) for task in tasks):
+        raise ValueError(f"the policy needs the instruction under the key 'task' as text; got {tasks!r}")
+    return tasks
+
+
+def _as_floats(key: str, values: Any, num_rows: int) -> Any:
+    """Numbers (B, ...) as float32; images and tokens as they are.
+
+    LeRobot reads a feature of one dimension as (B,), and takes that for one vector of B: (1, B).
+    """
+    if not isinstance(values, Tensor) or key.startswith((OBS_IMAGE, OBS_LANGUAGE)) or key.endswith("_is_pad"):
+        return values
+    if num_rows > 1 and values.shape == (1, num_rows):
+        values = values.T
+    return values.float()
+
+
+def _check_rows(values: Mapping[str, Tensor], num_tasks: int) -> None:
+    for key, of_key in values.items():
+        if len(of_key) != num_tasks:
+            raise ValueError(
+                f"the batch has {len(of_key)} rows of {key!r} and {num_tasks} instructions under 'task'; "
+                f"give a text for each row"
+            )
+
+
 @ProcessorStepRegistry.register("bomb_task_tokenizer")
 @dataclass
-class TaskTokenizerStep(ObservationProcessorStep):
+class TaskTokenizerStep(TaskStep):
     """``task`` (B texts) -> ``observation.language.tokens`` (B, L) and their attention mask (B, L) bool.
-
-    As it is in the pipelines of all our checkpoints, before anything is normalised, it also refuses a batch
-    whose images, state or actions are not finite. On CUDA that makes the host wait once, before the pass.
 
     ``template`` is what is written, with ``{}`` for the task. The tokenizer is the step's state, so a
     checkpoint carries it whole. Rows are padded at the end. A dataset has few tasks, so their ids are kept:
@@ -56,28 +121,17 @@ class TaskTokenizerStep(ObservationProcessorStep):
     _ids: dict[str, Tensor] = field(default_factory=dict, init=False, repr=False)
 
     def __post_init__(self) -> None:
-        if not isinstance(self.template, str) or re.findall(r"[{}]+", self.template) != ["{}"]:
-            raise ValueError(
-                f"template={self.template!r} must hold {{}} once, for the task, and no other brace"
-            )
+        check_template(self.template, "template")
         if not isinstance(self.tokenizer, Tokenizer | None):
             raise ValueError(
                 f"tokenizer={self.tokenizer!r} must be a Tokenizer; a checkpoint has it as state"
             )
 
-    def observation(self, observation: dict[str, Any]) -> dict[str, Any]:
-        frames = self.transition.get(TransitionKey.COMPLEMENTARY_DATA) or {}
-        actions = self.transition.get(TransitionKey.ACTION)
-        require_finite_batch(_read_by_policies(observation, actions), frames)
-        tasks = frames.get("task")
-        tasks = [tasks] if isinstance(tasks, str) else tasks
-        if not tasks or not all(isinstance(task, str) for task in tasks):
-            raise ValueError(f"the policy needs the instruction under the key 'task' as text; got {tasks!r}")
+    def tokens(self, tasks: list[str]) -> dict[str, Tensor]:
         rows = [self._ids_of(task) for task in tasks]
         tokens_BL = torch.nn.utils.rnn.pad_sequence(rows, batch_first=True)
         lengths_B1 = torch.tensor([[len(row)] for row in rows])
         return {
-            **observation,
             OBS_LANGUAGE_TOKENS: tokens_BL,
             OBS_LANGUAGE_ATTENTION_MASK: torch.arange(tokens_BL.shape[1]) < lengths_B1,
         }
@@ -105,11 +159,6 @@ class TaskTokenizerStep(ObservationProcessorStep):
         self.tokenizer = tokenizer_from_tensor(state[TOKENIZER_KEY])
         self._ids.clear()
 
-    def transform_features(
-        self, features: dict[PipelineFeatureType, dict[str, PolicyFeature]]
-    ) -> dict[PipelineFeatureType, dict[str, PolicyFeature]]:
-        return features
-
 
 def _read_by_policies(observation: Mapping[str, Any], actions: Any) -> dict[str, Tensor]:
     """Images, state and actions; depth is not finite where there is none."""
@@ -123,7 +172,7 @@ def _read_by_policies(observation: Mapping[str, Any], actions: Any) -> dict[str,
 def make_task_processors(
     config: PreTrainedConfig,
     dataset_stats: dict[str, dict[str, Tensor]] | None,
-    task_step: ObservationProcessorStep,
+    task_step: TaskStep,
 ) -> tuple[
     PolicyProcessorPipeline[dict[str, Any], dict[str, Any]],
     PolicyProcessorPipeline[PolicyAction, PolicyAction],

@@ -183,6 +183,18 @@ class FdvlaConfig(RelativeVlaConfig):
                 "cannot compute again; give one of them up"
             )
 
+    def methods(self) -> list[str]:
+        heads = {"flow": self.use_flow_head, "noise": self.use_denoise_head}
+        modulated = {"flow": self.dualmod_flow, "noise": self.dualmod_denoise}
+        used = [name for name, is_used in heads.items() if is_used]
+        of_used = [name for name in used if modulated[name]]
+        return [
+            f"{' and '.join(used)} {'heads' if len(used) > 1 else 'head'}",
+            f"{'both' if len(of_used) > 1 else ' '.join(of_used) or 'none'} modulated",
+            f"{self.used_sampler} in {self.num_inference_steps} steps",
+            *super().methods(),
+        ]
+
     @property
     def has_energy(self) -> bool:
         """Whether the loss has a term that takes second derivatives."""

@@ -15,7 +15,7 @@ from typing import Any, ClassVar
 import torch
 from lerobot.datasets import LeRobotDatasetMetadata
 from lerobot.policies.rtc import RTCProcessor
-from lerobot.utils.constants import ACTION, OBS_STATE
+from lerobot.utils.constants import ACTION
 from torch import Tensor, nn
 
 from lerobot_bomb.actions.accuracy import means
@@ -374,7 +374,7 @@ class FdvlaPolicy(RelativeVlaPolicy):
         embeds_BLH = embeds_BLH.index_copy(1, self._image_columns(ids_BL.device), features_BPH)
         if self.state_embedding is None:
             return embeds_BLH
-        state_BH = self.state_embedding(self._of_batch(batch, OBS_STATE)).to(embeds_BLH.dtype)
+        state_BH = self.state_embedding(self._state(batch)).to(embeds_BLH.dtype)
         column = ids_BL.shape[1] - len(self.tokens.end) - 1
         return embeds_BLH.index_copy(1, torch.tensor([column], device=ids_BL.device), state_BH[:, None])
 

@@ -21,6 +21,7 @@ from lerobot_bomb.training.policy_flags import (
     check_not_negative,
     check_positive,
 )
+from lerobot_bomb.vlm.prompt import check_template
 
 DEPTH_SOURCES = ("none", "observation", "zoedepth")
 PREFIX_ATTENTIONS = ("bidirectional", "causal")
@@ -30,7 +31,8 @@ NUM_STATE_BINS = 256
 # flags that say what shapes the weights have, beside the grids' own
 SHAPES = ("nano_config", "ego3d_no_depth_vector")
 # the same, and flags that say what the model reads and writes
-AS_TRAINED = ("chunk_size", "use_state", "prefix_attention", *SHAPES)
+AS_TRAINED = ("chunk_size", "use_state", "prefix_attention", "task_template", *SHAPES)
+BARE_TASK = "{}"
 
 
 @PreTrainedConfig.register_subclass("spatialvla_grid")
@@ -45,6 +47,8 @@ class SpatialvlaGridConfig(TokenVlaConfig):
         "loss_vocab": LOSS_VOCABULARIES,
         "draft": DRAFTS,
     }
+    STATE_IS_OF_WEIGHTS: ClassVar[bool] = False
+    LATER_FIELDS: ClassVar[dict[str, Any]] = {"task_template": BARE_TASK}
 
     # Hub id, path of a local folder, or "nano": a small model with random weights, built in code
     vlm_model_name: str = "google/paligemma2-3b-pt-224"
@@ -53,6 +57,9 @@ class SpatialvlaGridConfig(TokenVlaConfig):
     chunk_size: int = 4
     # actions executed before the next prediction
     n_action_steps: int = 4
+    # what the prompt says around the instruction, for which {} stands; in lower case, too. SpatialVLA's
+    # slides have "What action should the robot take to {}?"
+    task_template: str = BARE_TASK
     # whether the robot's state, in 256 bins, is in the prompt
     use_state: bool = False
 
@@ -123,6 +130,7 @@ class SpatialvlaGridConfig(TokenVlaConfig):
             one_of(LAYOUT_FLAG, self.action_layout, LAYOUTS)
         if self.action_feature is not None:
             self._grid_settings(self._given_groups() or ())
+        check_template(self.task_template, "--policy.task_template")
         check_not_negative(self, ("grid_min_sigma",))
         check_positive(self, ("ego3d_patch_reso", "ego3d_n_freqs"))
 
@@ -136,6 +144,30 @@ class SpatialvlaGridConfig(TokenVlaConfig):
         if self.depth_source == "zoedepth" and self.depth_config is None:
             return f"depth_config, so loading it elsewhere would need {self.depth_model_name}"
         return super().missing_parts()
+
+    def methods(self) -> list[str]:
+        kind = self.grid_distribution
+        edges = "uniform edges" if kind == "uniform" else f"adaptive edges ({kind})"
+        has_depth = self.depth_source != "none"
+        return [
+            f"{_cells_text(self.grid_settings().groups)}, {edges}",
+            *super().methods(),
+            f"3-D positions by depth ({self.depth_source})" if has_depth else "no depth, no 3-D positions",
+        ]
+
+    @property
+    def prompt_template(self) -> str:
+        """`task_template` as it is written."""
+        return self.task_template.lower()
+
+    def check_template_as_trained(self) -> None:
+        """Raise where a flag asks for another prompt than the checkpoint's processor writes."""
+        then = (self.trained_with or {}).get("task_template", BARE_TASK)
+        if self.task_template != then:
+            raise ValueError(
+                f"--policy.task_template={self.task_template!r}: this checkpoint was trained with {then!r}, "
+                f"which cannot be changed"
+            )
 
     @property
     def has_positions(self) -> bool:
@@ -227,3 +259,13 @@ class SpatialvlaGridConfig(TokenVlaConfig):
                     f"--policy.{flag}={value!r}: this checkpoint's grids have {then[flag]!r}, which only a "
                     f"training with --policy.adapt_embeddings=true can change"
                 )
+
+
+def _cells_text(groups: Collection[ActionGroup]) -> str:
+    """A token for each group, and how many cells it chooses from."""
+    cells = ", ".join(
+        f"{group.transform} " * (group.transform != "identity") + " x ".join(map(str, group.bins))
+        for group in groups
+    )
+    alone = all(len(group.dims) == 1 for group in groups)
+    return f"a token {'a dimension' if alone else 'a group'} ({cells} cells)"

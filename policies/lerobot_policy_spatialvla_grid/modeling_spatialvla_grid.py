@@ -13,11 +13,7 @@ from typing import Any, ClassVar
 
 import torch
 from lerobot.datasets import LeRobotDatasetMetadata
-from lerobot.utils.constants import (
-    ACTION,
-    OBS_IMAGES,
-    OBS_STATE,
-)
+from lerobot.utils.constants import ACTION, OBS_IMAGES
 from torch import Tensor, nn
 from torch.nn.functional import cross_entropy, linear
 
@@ -103,7 +99,9 @@ class SpatialvlaGridPolicy(TokenVlaPolicy):
             config.ego3d_no_depth_vector,
         ).requires_grad_(config.has_positions)
         self.grids = make_grids(config, dataset_meta)
-        self._check_length(self.backbone.text_config, self._num_fixed_tokens(), "{}", dataset_meta)
+        self._check_length(
+            self.backbone.text_config, self._num_fixed_tokens(), config.prompt_template, dataset_meta
+        )
         self._num_cells_of_base: list[int] | None = None  # if the grids are other than the checkpoint's
         self.register_buffer("first_cells", torch.tensor(self.grids.offsets), persistent=False)
         hidden_size = self.backbone.text_config.hidden_size
@@ -123,18 +121,12 @@ class SpatialvlaGridPolicy(TokenVlaPolicy):
         self.reset()
 
     @classmethod
-    def from_pretrained(
-        cls,
-        *args,
-        config: SpatialvlaGridConfig | None = None,
-        dataset_meta: LeRobotDatasetMetadata | None = None,
-        **kwargs,
-    ) -> "SpatialvlaGridPolicy":
-        """As LeRobot's, but a missing or unexpected tensor is an error; the grids adapt to the new data."""
-        if config is not None:
-            complete_depth(config, dataset_meta)
-            config.check_grid_as_trained(is_refitted=dataset_meta is not None and config.adapt_embeddings)
-        return super().from_pretrained(*args, config=config, dataset_meta=dataset_meta, **kwargs)
+    def _prepare(cls, config: SpatialvlaGridConfig, meta: LeRobotDatasetMetadata | None) -> None:
+        """As the others'; grids are as they were, or adapt to the new data."""
+        complete_depth(config, meta)
+        config.check_template_as_trained()
+        config.check_grid_as_trained(is_refitted=meta is not None and config.adapt_embeddings)
+        super()._prepare(config, meta)
 
     @classmethod
     def _load_as_safetensor(
@@ -363,7 +355,7 @@ class SpatialvlaGridPolicy(TokenVlaPolicy):
         parts = {camera: TokenRows.constant(image, task.ids) for camera in self._cameras}
         parts |= {"start": TokenRows.constant(tokens.start, task.ids), "instruction": task}
         if self.config.use_state:
-            numbers_BN = self.state_bins.encode(self._of_batch(batch, OBS_STATE))
+            numbers_BN = self.state_bins.encode(self._state(batch))
             symbols_BNC, mask_BNC = number_symbols(
                 numbers_BN, digits_needed(NUM_STATE_BINS), zero_padded=False
             )

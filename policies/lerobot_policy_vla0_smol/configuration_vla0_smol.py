@@ -36,6 +36,7 @@ class Vla0SmolConfig(RelativeVlaConfig, TokenVlaConfig):
         "draft": DRAFTS,
     }
     ACTIONS_ARE_OF_WEIGHTS: ClassVar[bool] = False
+    STATE_IS_OF_WEIGHTS: ClassVar[bool] = False
 
     # Hub id, path of a local folder, or "nano": a small model with random weights, built in code
     vlm_model_name: str = "HuggingFaceTB/SmolVLM2-500M-Video-Instruct"
@@ -97,6 +98,17 @@ class Vla0SmolConfig(RelativeVlaConfig, TokenVlaConfig):
         for flag in ("mask_max_fraction", "mask_skip_prob"):
             if not 0 <= getattr(self, flag) <= 1:
                 raise ValueError(f"--policy.{flag}={getattr(self, flag)} must lie in 0..1")
+
+    def methods(self) -> list[str]:
+        is_masked = self.mask_max_fraction > 0 and self.mask_skip_prob < 1
+        return [
+            f"numbers of {self.n_action_bins} bins",
+            *super().methods(),
+            f"masking up to {100 * self.mask_max_fraction:g} % ({self.mask_level})"
+            if is_masked
+            else "no masking",
+            "colour jitter" if self.color_jitter else "no colour jitter",
+        ]
 
     def _check_color_jitter(self) -> None:
         reach, most = self.color_jitter, COLOR_JITTER_MOST

@@ -11,7 +11,7 @@ from typing import Any
 
 import torch
 from lerobot.datasets import LeRobotDatasetMetadata
-from lerobot.utils.constants import ACTION, OBS_STATE
+from lerobot.utils.constants import ACTION
 from torch import Tensor
 from torch.nn.functional import cross_entropy
 
@@ -256,9 +256,7 @@ class Vla0SmolPolicy(RelativeVlaPolicy, TokenVlaPolicy):
         parts |= {camera: TokenRows.constant(image, task.ids) for camera in self._cameras}
         parts["instruction"] = task
         if self.config.use_state:
-            state = self._to_tokens(
-                self.state_bins.encode(self._of_batch(batch, OBS_STATE)), self.config.n_state_bins
-            )
+            state = self._to_tokens(self.state_bins.encode(self._state(batch)), self.config.n_state_bins)
             parts["state"] = TokenRows.join(
                 [
                     TokenRows.constant(tokens.state_start, task.ids),

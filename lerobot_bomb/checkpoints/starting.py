@@ -1,0 +1,77 @@
+"""Whether a training can start from a checkpoint, and what to start from where it cannot."""
+
+import logging
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from lerobot.configs import FeatureType, PolicyFeature, PreTrainedConfig
+from lerobot.utils.constants import ACTION, OBS_STATE
+from lerobot.utils.feature_utils import dataset_to_policy_features
+
+from lerobot_bomb.checkpoints.names import CONFIG, is_hub_id
+
+if TYPE_CHECKING:
+    from lerobot.datasets import LeRobotDatasetMetadata
+
+logger = logging.getLogger(__name__)
+
+
+def way_to_start_otherwise(checkpoint: str | Path, policy_type: str) -> str:
+    """How a checkpoint's vision-language model becomes the start of a policy for other data."""
+    return (
+        "for other cameras, state or action, start from its vision-language model: lerobot-bomb "
+        f"export-backbone --policy.path={checkpoint} --output=FOLDER, then lerobot-train "
+        f"--policy.type={policy_type} --policy.vlm_model_name=FOLDER"
+    )
+
+
+def check_start(checkpoint: str | Path, config: Any, meta: "LeRobotDatasetMetadata | None") -> None:
+    """Raise a ValueError unless a config is a checkpoint's own, and the data that is trained on fits it.
+
+    Of what the weights do not depend on (sizes of images, numbers that are written as text) the config takes
+    the data's shapes.
+    """
+    missing = config.missing_parts()
+    if (missing is None and meta is None) or not _has_config(checkpoint):
+        return
+    saved: Any = PreTrainedConfig.from_pretrained(checkpoint)
+    if missing is not None and saved.missing_parts() is None:
+        raise ValueError(
+            f"--policy.type={config.type} --policy.pretrained_path={checkpoint}: this type goes on from a "
+            f"checkpoint with --policy.path={checkpoint}, which takes its config, too; "
+            f"{way_to_start_otherwise(checkpoint, config.type)}"
+        )
+    if meta is not None:
+        _fit(checkpoint, config, saved, dataset_to_policy_features(meta.features))
+
+
+def _has_config(checkpoint: str | Path) -> bool:
+    return (Path(checkpoint) / CONFIG).is_file() or is_hub_id(checkpoint)
+
+
+def _fit(checkpoint: str | Path, config: Any, saved: Any, of_data: dict[str, PolicyFeature]) -> None:
+    otherwise = way_to_start_otherwise(checkpoint, config.type)
+    of_checkpoint = {**(saved.input_features or {}), **(saved.output_features or {})}
+    for key, is_of_weights in (
+        (ACTION, config.ACTIONS_ARE_OF_WEIGHTS or getattr(config, "relative_actions", False)),
+        (OBS_STATE, config.STATE_IS_OF_WEIGHTS and getattr(config, "use_state", True)),
+    ):
+        there, here = (features.get(key) for features in (of_checkpoint, of_data))
+        if is_of_weights and there and here and tuple(there.shape) != tuple(here.shape):
+            raise ValueError(
+                f"--policy.path={checkpoint} has {key!r} of shape {tuple(there.shape)}, this dataset has it "
+                f"of shape {tuple(here.shape)}; {otherwise}"
+            )
+    cameras = {
+        key for key, feature in (config.input_features or {}).items() if feature.type is FeatureType.VISUAL
+    }
+    if absent := sorted(cameras - of_data.keys()):
+        logger.warning(
+            "--policy.path=%s reads %s; this dataset has %s. Unless --rename_map gives them these names, %s",
+            checkpoint,
+            ", ".join(absent),
+            ", ".join(key for key, feature in of_data.items() if feature.type is FeatureType.VISUAL),
+            otherwise,
+        )
+    shared = {key for key in (*cameras, OBS_STATE) if key in of_data and key in (config.input_features or {})}
+    config.input_features = {**(config.input_features or {}), **{key: of_data[key] for key in shared}}

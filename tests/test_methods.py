@@ -1,0 +1,153 @@
+"""Beside every rate stands what the policy does: by its config, in the pages and on the model card."""
+
+import re
+from pathlib import Path
+from typing import Any
+
+import draccus
+import pytest
+import yaml
+from lerobot.configs import FeatureType, PolicyFeature, PreTrainedConfig
+from lerobot.configs.train import TrainPipelineConfig
+from lerobot.policies.factory import get_policy_class
+from lerobot.utils.import_utils import register_third_party_plugins
+from policy_cases import CASES
+
+from lerobot_bomb.checkpoints.shipped import FOLDER
+from lerobot_bomb.hub.card import Checkpoint
+
+ROOT = Path(__file__).parents[1]
+COLUMN = "methods used"
+# rows below that of a `spatialvla_grid`: what they call it -> its groups
+OTHER_GRIDS = {
+    "64 x 64": [((0, 1), (64, 64)), ((2, 3), (64, 16))],
+    "32 x 32": [((0, 1), (32, 32)), ((2, 3), (32, 8))],
+}
+
+
+@pytest.fixture(scope="module", autouse=True)
+def plugin() -> None:
+    register_third_party_plugins()
+
+
+def of_recipe(policy_type: str, recipe: str = "all_targets", **changes: Any) -> str:
+    written = yaml.safe_load((ROOT / "configs" / f"{recipe}_{policy_type}.yaml").read_text())
+    written["policy"] |= changes
+    config: Any = draccus.decode(TrainPipelineConfig, written).policy
+    config.output_features = {"action": PolicyFeature(FeatureType.ACTION, (4,))}
+    return config.methods_used()
+
+
+def of_grid(name: str) -> str:
+    groups = next(groups for size, groups in OTHER_GRIDS.items() if size in name)
+    written = [{"dims": [*dims], "transform": "identity", "bins": [*bins]} for dims, bins in groups]
+    return of_recipe("spatialvla_grid", action_groups=written)
+
+
+def of_shipped(name: str) -> str:
+    config: Any = PreTrainedConfig.from_pretrained(FOLDER / name)
+    return config.methods_used()
+
+
+def tables(page: str) -> list[list[list[str]]]:
+    """Each as rows of cells, the header first."""
+    found: list[list[list[str]]] = [[]]
+    for line in (ROOT / page).read_text().splitlines():
+        if not line.startswith("|"):
+            found.append([])
+        elif not line.startswith("|---"):
+            found[-1].append([cell.strip() for cell in line.strip("|").split("|")])
+    return [table for table in found if table]
+
+
+def cells(page: str) -> list[tuple[str, str]]:
+    """(first cell, methods used) of every row that has them."""
+    return [
+        (row[0], row[column])
+        for header, *rows in tables(page)
+        for column, title in enumerate(header)
+        if title.startswith(COLUMN)
+        for row in rows
+    ]
+
+
+def names_of(cell: str) -> str:
+    """vla0_smol of [`vla0_smol`](docs/vla0_smol.md)."""
+    match = re.match(r"\[?`((?:bomb:)?\w+)`", cell)
+    return match[1] if match else cell
+
+
+def expected(name: str, above: str) -> str:
+    if name.startswith("bomb:"):
+        return of_shipped(name.removeprefix("bomb:"))
+    if name in CASES:
+        return of_recipe(name)
+    return of_grid(name) if " x " in name else above
+
+
+@pytest.mark.parametrize(("page", "num_rows"), [("README.md", 3), ("docs/results.md", 4 + 7 + 3)])
+def test_the_pages_say_what_the_configs_do(page: str, num_rows: int) -> None:
+    found = cells(page)
+    assert len(found) == num_rows
+    above = ""
+    for cell, written in found:
+        above = expected(names_of(cell), above)
+        assert written == above, cell
+
+
+def test_the_table_of_shipped_checkpoints_says_it_too() -> None:
+    (header, row) = next(
+        (table[0], row) for table in tables("docs/results.md") for row in table if row[0] == COLUMN
+    )
+    written = {
+        names_of(title): cell for title, cell in zip(header, row, strict=True) if cell != COLUMN and cell
+    }
+    nominal = written.pop("vla0_smol")
+    assert nominal == of_recipe("vla0_smol")
+    assert written == {f"bomb:{name}": of_shipped(name) for name in CASES}
+
+
+def test_one_target_and_all_targets_are_of_the_same_methods() -> None:
+    for name in CASES:
+        assert of_recipe(name, "one_target") == of_recipe(name)
+
+
+def test_what_each_type_says() -> None:
+    fdvla, grid, text = (CASES[name].make_config for name in ("fdvla", "spatialvla_grid", "vla0_smol"))
+    jitter, half = [0.2, 0.2, 0.2, 0.05], {"chunk_size": 10, "n_action_steps": 5}
+    assert text(relative_actions=True, color_jitter=jitter, **half).methods()[1:] == [
+        "chunk of 10, 5 executed",
+        "crop to 0.875",
+        "state read",
+        "relative actions",
+        "masking up to 15 % (value)",
+        "colour jitter",
+    ]
+    assert text(mask_skip_prob=1.0, crop_fraction=1.0, use_state=False).methods()[-5:] == [
+        "no crop",
+        "no state",
+        "absolute actions",
+        "no masking",
+        "no colour jitter",
+    ]
+    assert grid(depth_source="observation", n_action_steps=1, temporal_ensemble_size=4).methods() == [
+        "a token a group (polar 16 x 32 x 8, 16 cells), adaptive edges (gaussian)",
+        "chunk of 4, 1 executed",
+        "ensemble of 4 (adaptive)",
+        "crop to 0.9",
+        "no state",
+        "3-D positions by depth (observation)",
+    ]
+    assert fdvla(use_denoise_head=False, dualmod_flow=False).methods()[:3] == [
+        "flow head",
+        "none modulated",
+        "flow in 3 steps",
+    ]
+
+
+def test_the_model_card_says_it() -> None:
+    for name in CASES:
+        config = PreTrainedConfig.from_pretrained(FOLDER / name)
+        method: Any = getattr(get_policy_class(name), "method")  # noqa: B009  LeRobot's class has none
+        card = Checkpoint(config=config, method=method, repo_id="me/x", dataset_id=None).card()
+        assert f"Methods used in this checkpoint: {of_shipped(name)}." in str(card)
