@@ -29,7 +29,7 @@ from lerobot_bomb.checkpoints.queries import last_query
 from lerobot_bomb.conditions import ALL
 from lerobot_bomb.data.environment import Environment
 from lerobot_bomb.envs.results import check_results_path
-from lerobot_bomb.envs.vector import LazyVectorEnv
+from lerobot_bomb.envs.vector import LazyVectorEnv, check_parallel_tasks
 from lerobot_bomb.flag_errors import flag_errors
 from lerobot_env_bomb.fetch_files import check_robot
 
@@ -76,6 +76,7 @@ class BombEnvConfig(EnvConfig):
     def __post_init__(self) -> None:
         with flag_errors():
             # an invalid flag raises here, before anything is built
+            check_parallel_tasks(self.max_parallel_tasks)
             for spec in itertools.chain(*self.groups.values()):
                 find_suite(spec.suite).check(spec)
                 check_robot(spec)

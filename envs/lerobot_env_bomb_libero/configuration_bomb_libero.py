@@ -16,7 +16,7 @@ from lerobot_bomb.checkpoints.interface import Interface
 from lerobot_bomb.checkpoints.libero_orientation import OrientationCheck
 from lerobot_bomb.checkpoints.queries import last_query
 from lerobot_bomb.envs.results import check_results_path
-from lerobot_bomb.envs.vector import LazyVectorEnv
+from lerobot_bomb.envs.vector import LazyVectorEnv, check_parallel_tasks
 from lerobot_bomb.flag_errors import flag_errors
 from lerobot_bomb.flags import one_of
 from lerobot_bomb.libero.assets import SUITES, prepare_libero
@@ -43,6 +43,7 @@ class BombLiberoEnvConfig(LiberoEnv):
     def __post_init__(self) -> None:
         with flag_errors():
             # an invalid flag raises here, before anything is built
+            check_parallel_tasks(self.max_parallel_tasks)
             if not self.init_states:
                 raise ValueError(
                     "--env.init_states=false: episodes start in the task's recorded states; drop it"
