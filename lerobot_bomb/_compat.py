@@ -467,7 +467,7 @@ def _in_turn(evaluate_all: Callable[..., Any], is_needed: Callable[[Any], bool])
             max_parallel_tasks = 1
         return evaluate_all(envs, policy, *args, max_parallel_tasks=max_parallel_tasks, **options)
 
-    evaluate.plays_in_turn = True  # pyright: ignore[reportFunctionMemberAccess]
+    evaluate.plays_in_turn = True  # pyright: ignore[reportAttributeAccessIssue]
     return evaluate
 
 

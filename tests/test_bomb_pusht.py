@@ -339,17 +339,18 @@ def test_observations_lie_in_their_space_whatever_the_actions(condition: str) ->
     for sign, size in itertools.product((1, -1), (512, 1024, 1e6, np.finfo(np.float32).max)):
         observation, _ = env.reset(seed=3)
         for step in range(30):
-            action = np.float32([sign * size, -sign * size]) if step % 10 < 6 else np.float32([0, 512])
+            goal = [sign * size, -sign * size] if step % 10 < 6 else [0, 512]
             assert env.observation_space.contains(observation)
-            observation, *_ = env.step(action)
+            observation, *_ = env.step(np.array(goal, np.float32))
             left_the_board |= bool(((observation["agent_pos"] < 0) | (observation["agent_pos"] > 512)).any())
     assert left_the_board
 
 
 def test_an_action_beyond_the_board_is_executed_as_gym_pusht_does() -> None:
     ours, theirs = vector_envs(1, instruction="none"), stock(1, 300)
-    ours.reset(seed=[5]), theirs.reset(seed=[5])
-    for action in np.float32([[[-512, 1024]], [[600, -3]], [[1000, 513]]]):
+    ours.reset(seed=[5])
+    theirs.reset(seed=[5])
+    for action in np.array([[[-512, 1024]], [[600, -3]], [[1000, 513]]], np.float32):
         (seen, *_), (known, *_) = ours.step(action), theirs.step(action)
         np.testing.assert_array_equal(seen["agent_pos"], known["agent_pos"])
     ours.close()

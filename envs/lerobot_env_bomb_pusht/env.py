@@ -1,10 +1,10 @@
 """PushT with BOMB's perturbation axes, as a Gymnasium environment."""
 
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, cast
 
-import gymnasium
 import numpy as np
+from gymnasium import spaces
 
 from lerobot_bomb.envs.episode_env import EpisodeEnv, Observation, Transition
 from lerobot_bomb.envs.pusht_results import PushTResult
@@ -64,10 +64,10 @@ class BombPushTEnv(EpisodeEnv[PushTSpec, _Run, PushTResult]):
         self._policy = policy
         self._board = Board(image_size)
         self.action_space = self._board.action_space
-        agent_pos = gymnasium.spaces.Box(*map(float, REACH_PX), (2,), np.float64)
-        self.observation_space = gymnasium.spaces.Dict(
-            {**self._board.observation_space.spaces, "agent_pos": agent_pos}
-        )
+        low_px, high_px = REACH_PX
+        pixels = cast("spaces.Dict", self._board.observation_space)["pixels"]
+        agent_pos = spaces.Box(low_px, high_px, (2,), np.float64)
+        self.observation_space = spaces.Dict({"pixels": pixels, "agent_pos": agent_pos})
         self._coverage = self._max_coverage = 0.0
 
     def _begin(self, spec: PushTSpec) -> tuple[Observation, dict[str, Any]]:
