@@ -126,3 +126,30 @@ def test_pyopengl_loaded_for_a_display_is_named() -> None:
     assert "OpenGL had been imported before for another backend (GLXPlatform)" in last_line(run)
     assert "start Python with PYOPENGL_PLATFORM=egl" in last_line(run)
     assert draw_after("import OpenGL.GL", MUJOCO_GL="egl", PYOPENGL_PLATFORM="egl").returncode == 0
+
+
+BESIDE_A_NEIGHBOUR = """
+import contextlib, mujoco
+import numpy as np
+from lerobot_env_bomb.env import BombEnv
+
+env = BombEnv()
+before = env.reset(seed=1)[0]["pixels"]
+model = mujoco.MjModel.from_xml_string("<mujoco><worldbody><geom size='.2'/></worldbody></mujoco>")
+data = mujoco.MjData(model)
+mujoco.mj_forward(model, data)
+with contextlib.suppress(Exception):  # GLFW may find neither a display nor a library
+    neighbour = mujoco.Renderer(model, 32, 32)
+    neighbour.update_scene(data)
+    neighbour.render()
+after = env.reset(seed=1)[0]["pixels"]
+print([bool(np.array_equal(before[camera], after[camera])) for camera in before])
+env.close()
+"""
+
+
+def test_a_neighbour_that_draws_with_mujocos_own_context_changes_no_image() -> None:
+    clean = {key: value for key, value in os.environ.items() if key not in ("MUJOCO_GL", "PYOPENGL_PLATFORM")}
+    code = [sys.executable, "-c", BESIDE_A_NEIGHBOUR]
+    run = subprocess.run(code, env=clean, capture_output=True, text=True, check=False)
+    assert run.stdout.strip() == "[True, True]", run.stderr

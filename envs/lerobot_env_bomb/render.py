@@ -130,6 +130,8 @@ class CameraRenderer:
     def _render(self, data: mujoco.MjData, camera: str, size: int) -> mujoco.MjrRect:
         self._owner.check()
         self._gl.make_current()
+        # anew: after a neighbour has drawn with GLFW, the image of before would be read once more
+        mujoco.mjr_setBuffer(mujoco.mjtFramebuffer.mjFB_OFFSCREEN, self._context)
         self._camera.fixedcamid = self._model.camera(camera).id
         mujoco.mjv_updateScene(
             self._model, data, self._option, None, self._camera, mujoco.mjtCatBit.mjCAT_ALL, self._scene
