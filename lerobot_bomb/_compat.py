@@ -147,7 +147,7 @@ class KeptPolicy:
         self.has_begun = False  # whether the last evaluation came as far as to play
 
     def evaluate(self, flags: Sequence[str], asked: object, first: int = 0) -> None:
-        """Run lerobot-eval, which draws no video.
+        """Run lerobot-eval, which draws no video and plays one task after another.
 
         `asked` is equal where it needs the policy of before, built with the same seed. `first` is the number
         of an episode that is played alone out of a longer evaluation.
@@ -178,7 +178,8 @@ class KeptPolicy:
 
         def without_videos(*args: Any, **options: Any) -> dict[str, Any]:
             self.has_begun = True
-            return evaluate_all(*args, **options | {"max_episodes_rendered": 0, "videos_dir": None})
+            options |= {"max_episodes_rendered": 0, "videos_dir": None, "max_parallel_tasks": 1}
+            return evaluate_all(*args, **options)
 
         self.has_begun = False
         replaced = {"make_env": begun, "make_policy": kept, "eval_policy_all": without_videos}
@@ -463,6 +464,35 @@ def explain_missing_datasets(explain: Callable[[str, Path, Exception], str]) -> 
             raise FileNotFoundError(explain(repo_id, root, error)) from None
 
     LeRobotDatasetMetadata.__init__ = load
+
+
+def play_tasks_in_turn(is_needed: Callable[[Any], bool]) -> None:
+    """Let LeRobot's evaluation of such a policy use no threads, whatever --env.max_parallel_tasks says.
+
+    They would share its queue of actions. Commands that are imported later than this keep the original; doing
+    it again changes nothing.
+    """
+    for name in ("lerobot.scripts.lerobot_eval", "lerobot.scripts.lerobot_train", "__main__"):
+        module: Any = sys.modules.get(name)
+        usual = getattr(module, "eval_policy_all", None)
+        if usual is not None and not hasattr(usual, "plays_in_turn"):
+            module.eval_policy_all = _in_turn(usual, is_needed)
+
+
+def _in_turn(evaluate_all: Callable[..., Any], is_needed: Callable[[Any], bool]) -> Callable[..., Any]:
+    @wraps(evaluate_all)
+    def evaluate(envs: Any, policy: Any, *args: Any, max_parallel_tasks: int = 1, **options: Any) -> Any:
+        if max_parallel_tasks > 1 and is_needed(policy):
+            logging.warning(
+                "--env.max_parallel_tasks=%s: tasks are played one after another; threads would share this "
+                "policy's queue of actions. To play in several processes: lerobot-bomb sweep",
+                max_parallel_tasks,
+            )
+            max_parallel_tasks = 1
+        return evaluate_all(envs, policy, *args, max_parallel_tasks=max_parallel_tasks, **options)
+
+    evaluate.plays_in_turn = True  # pyright: ignore[reportAttributeAccessIssue]
+    return evaluate
 
 
 def built_policies() -> list[PreTrainedPolicy]:

@@ -78,7 +78,78 @@ def test_an_unknown_backend_is_refused() -> None:
     )
 
 
-def test_mujoco_imported_too_early_is_explained() -> None:
-    message = last_line(choose_backend("import mujoco"))
-    assert "mujoco was imported before an OpenGL backend was chosen" in message
-    assert "set MUJOCO_GL=" in message
+DRAWN = """
+import hashlib, os
+{first}
+from lerobot_env_bomb.env import BombEnv
+
+env = BombEnv()
+pixels = env.reset(seed=1)[0]["pixels"]
+env.close()
+digest = hashlib.sha256(b"".join(each.tobytes() for each in pixels.values())).hexdigest()
+print(os.environ["MUJOCO_GL"], digest)
+"""
+
+
+def draw_after(first: str, **environment: str) -> subprocess.CompletedProcess[str]:
+    """Draw an episode's first images in a fresh process, once this has run in it."""
+    clean = {key: value for key, value in os.environ.items() if key not in ("MUJOCO_GL", "PYOPENGL_PLATFORM")}
+    code = DRAWN.format(first=first)
+    return subprocess.run(
+        [sys.executable, "-c", code], env=clean | environment, capture_output=True, text=True, check=False
+    )
+
+
+@pytest.mark.parametrize(
+    "first",
+    [
+        "import mujoco",
+        "os.environ['MUJOCO_GL'] = 'glfw'; import mujoco; del os.environ['MUJOCO_GL']",
+        "os.environ['MUJOCO_GL'] = 'disable'; import mujoco; del os.environ['MUJOCO_GL']",
+    ],
+)
+def test_the_same_images_whoever_has_imported_mujoco(first: str) -> None:
+    expected, run = draw_after(""), draw_after(first)
+    assert run.returncode == 0, run.stderr
+    assert run.stdout == expected.stdout and run.stderr == ""
+
+
+def test_a_backend_chosen_after_mujocos_import_is_the_one_that_draws() -> None:
+    run = draw_after("import mujoco; os.environ['MUJOCO_GL'] = 'egl'")
+    if "libegl1" in run.stderr:
+        pytest.skip("EGL is not installed")
+    assert run.stdout.startswith("egl "), run.stderr
+
+
+def test_pyopengl_loaded_for_a_display_is_named() -> None:
+    run = draw_after("import OpenGL.GL", MUJOCO_GL="egl")
+    assert "OpenGL had been imported before for another backend (GLXPlatform)" in last_line(run)
+    assert "start Python with PYOPENGL_PLATFORM=egl" in last_line(run)
+    assert draw_after("import OpenGL.GL", MUJOCO_GL="egl", PYOPENGL_PLATFORM="egl").returncode == 0
+
+
+BESIDE_A_NEIGHBOUR = """
+import contextlib, mujoco
+import numpy as np
+from lerobot_env_bomb.env import BombEnv
+
+env = BombEnv()
+before = env.reset(seed=1)[0]["pixels"]
+model = mujoco.MjModel.from_xml_string("<mujoco><worldbody><geom size='.2'/></worldbody></mujoco>")
+data = mujoco.MjData(model)
+mujoco.mj_forward(model, data)
+with contextlib.suppress(Exception):  # GLFW may find neither a display nor a library
+    neighbour = mujoco.Renderer(model, 32, 32)
+    neighbour.update_scene(data)
+    neighbour.render()
+after = env.reset(seed=1)[0]["pixels"]
+print([bool(np.array_equal(before[camera], after[camera])) for camera in before])
+env.close()
+"""
+
+
+def test_a_neighbour_that_draws_with_mujocos_own_context_changes_no_image() -> None:
+    clean = {key: value for key, value in os.environ.items() if key not in ("MUJOCO_GL", "PYOPENGL_PLATFORM")}
+    code = [sys.executable, "-c", BESIDE_A_NEIGHBOUR]
+    run = subprocess.run(code, env=clean, capture_output=True, text=True, check=False)
+    assert run.stdout.strip() == "[True, True]", run.stderr

@@ -4,7 +4,9 @@ Needs hf-libero and its assets of one suite; skips without. One environment play
 building one takes seconds.
 """
 
+import copy
 import importlib
+import pickle
 from collections.abc import Iterator
 from dataclasses import replace
 from itertools import pairwise
@@ -13,6 +15,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from gymnasium.error import ResetNeeded
 
 from lerobot_bomb.conditions import MAX_LEVEL, NONE
 from lerobot_bomb.evaluation.result_lines import read_lines
@@ -248,8 +251,44 @@ def test_an_episode_ends_after_its_steps_with_a_line_of_results(env: Any, result
     (row,), damages = read_lines(results)
     assert damages == []
     assert row["spec"]["seed"] == 1001 and row["initial_state"] == 1 and row["levels"] == {"light": 2}
-    with pytest.raises(ValueError, match="7 finite numbers"):
-        env.step(np.zeros(6))
+
+
+@pytest.mark.parametrize(
+    ("action", "message"),
+    [
+        (np.zeros(6), r"action has shape \(6,\), expected \(7,\)"),
+        (np.full(7, np.nan), "is not finite"),
+        (np.full(7, 1e308), "is not finite in float32"),
+        (np.full(7, 1j), "holds complex128, not numbers"),  # the gripper's controller would keep it
+        (np.array(["0"] * 7), "holds <U1, not numbers"),
+    ],
+)
+def test_an_action_that_is_none_is_refused(env: Any, action: np.ndarray, message: str) -> None:
+    if env._current_run is None:
+        begin(env, NONE, 0)
+    with pytest.raises(ValueError, match=message):
+        env.step(action)
+
+
+def test_closing_ends_the_episode_and_a_reset_starts_the_same_anew(libero_with_assets: Libero) -> None:
+    prepare_libero([SUITE])
+    env = make(NONE)
+    copied = pickle.loads(pickle.dumps(env))
+    copied.close()
+    first, _ = env.reset(seed=np.int64(7))
+    with pytest.raises(TypeError, match="a BombLiberoEnv that has been reset cannot be pickled or copied"):
+        copy.deepcopy(env)
+    env.step(ACTIONS[0].astype(bool))  # whole numbers do, as they do elsewhere
+    env.close()
+    env.close()
+    for use in (lambda: env.step(ACTIONS[0]), env.render):
+        with pytest.raises(ResetNeeded):
+            use()
+    again, info = env.reset(seed=7)
+    assert info["seed"] == 7
+    np.testing.assert_array_equal(first["pixels"]["image"], again["pixels"]["image"])
+    assert env.reset()[1]["seed"] == 2029167941  # Gymnasium's generator draws it
+    env.close()
 
 
 @pytest.mark.long

@@ -1,7 +1,10 @@
 """`bomb_pusht` is gym-pusht at level 0, the same everywhere, and tells what became of its episodes."""
 
+import copy
 import hashlib
+import itertools
 import json
+import pickle
 import subprocess
 import sys
 from pathlib import Path
@@ -316,12 +319,84 @@ def test_without_gym_pusht_the_way_out_is_named(monkeypatch: pytest.MonkeyPatch)
         make_env(BombPushTEnvConfig(), n_envs=1)
 
 
-@pytest.mark.parametrize("action", [np.zeros(3), np.array([np.nan, 0.0])])
-def test_an_action_that_is_none_is_refused(action: np.ndarray) -> None:
+@pytest.mark.parametrize(
+    ("action", "message"),
+    [
+        (np.zeros(3), r"action has shape \(3,\), expected \(2,\)"),
+        (np.array([np.nan, 0.0]), "is not finite"),
+        (np.array([1e308, 0.0]), r"action \[1e\+308, 0.0\] is not finite in float32"),
+        (np.array(["1", "2"]), "holds <U1, not numbers"),
+    ],
+)
+def test_an_action_that_is_none_is_refused(action: np.ndarray, message: str) -> None:
     env = pusht_env()
     env.reset(seed=0)
-    with pytest.raises(ValueError, match="must be two finite numbers"):
+    with pytest.raises(ValueError, match=message):
         env.step(action)
+
+
+@pytest.mark.parametrize("condition", ["none", "dynamics:5"])
+def test_observations_lie_in_their_space_whatever_the_actions(condition: str) -> None:
+    env = pusht_env(condition)
+    left_the_board = False
+    for sign, size in itertools.product((1, -1), (512, 1024, 1e6, np.finfo(np.float32).max)):
+        observation, _ = env.reset(seed=3)
+        for step in range(30):
+            goal = [sign * size, -sign * size] if step % 10 < 6 else [0, 512]
+            assert env.observation_space.contains(observation)
+            observation, *_ = env.step(np.array(goal, np.float32))
+            left_the_board |= bool(((observation["agent_pos"] < 0) | (observation["agent_pos"] > 512)).any())
+    assert left_the_board
+
+
+def test_an_action_beyond_the_board_is_executed_as_gym_pusht_does() -> None:
+    ours, theirs = vector_envs(1, instruction="none"), stock(1, 300)
+    ours.reset(seed=[5])
+    theirs.reset(seed=[5])
+    for action in np.array([[[-512, 1024]], [[600, -3]], [[1000, 513]]], np.float32):
+        (seen, *_), (known, *_) = ours.step(action), theirs.step(action)
+        np.testing.assert_array_equal(seen["agent_pos"], known["agent_pos"])
+    ours.close()
+    theirs.close()
+
+
+def test_an_action_that_arrives_late_is_the_one_that_was_given() -> None:
+    ends = []
+    for is_reused in (False, True):
+        env = pusht_env("dynamics:5")
+        env.reset(seed=3)
+        action = np.array([100.0, 400.0])
+        for step in range(8):
+            observation, *_ = env.step(action if is_reused else action.copy())
+            action[:] = 50.0 * step
+        ends.append(observation["agent_pos"])
+    np.testing.assert_array_equal(*ends)
+
+
+def test_it_is_pickled_and_copied_before_its_first_reset_alone() -> None:
+    env = pusht_env("table:3")
+    copies = [copy.copy(env), copy.deepcopy(env), pickle.loads(pickle.dumps(env))]
+    expected = env.reset(seed=2)[0]["pixels"]
+    for each in copies:
+        np.testing.assert_array_equal(each.reset(seed=2)[0]["pixels"], expected)
+        for step in range(3):  # none of them moves another's board
+            each.step(np.array([100.0 * step, 0.0]))
+    np.testing.assert_array_equal(env.step(np.array([256, 256]))[0]["pixels"], _after_one_step())
+    for make_copy in (copy.copy, copy.deepcopy, pickle.dumps):
+        with pytest.raises(TypeError, match="a BombPushTEnv that has been reset cannot be pickled or copied"):
+            make_copy(env)
+
+
+def _after_one_step() -> np.ndarray:
+    env = pusht_env("table:3")
+    env.reset(seed=2)
+    return env.step(np.array([256, 256]))[0]["pixels"]
+
+
+def test_without_seeds_every_environment_plays_an_episode_of_its_own() -> None:
+    envs = vector_envs(3)
+    assert len({*envs.reset()[1]["seed"]}) == 3
+    envs.close()
 
 
 def test_all_without_a_text_leaves_it_empty() -> None:

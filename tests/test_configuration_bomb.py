@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 import yaml
 from lerobot.envs import env_to_policy_features, make_env, make_env_config
+from lerobot.utils.import_utils import register_third_party_plugins
 
 from lerobot_bomb.bomb.perturbations import NUISANCES
 from lerobot_bomb.bomb.suites import SUITES
@@ -111,3 +112,12 @@ def test_an_unwritable_results_folder_is_refused(tmp_path: Path) -> None:
     config = BombEnvConfig(results_path=str(blocker / "results.jsonl"))
     with pytest.raises(ValueError, match=r"--env\.results_path="):
         config.create_envs(n_envs=1)
+
+
+@pytest.mark.parametrize("env_type", ["bomb", "bomb_pusht", "bomb_libero"])
+def test_tasks_in_threads_are_refused_at_once(env_type: str) -> None:
+    register_third_party_plugins()
+    with pytest.raises(FlagError, match=r"--env\.max_parallel_tasks=3 plays tasks in threads") as error:
+        make_env_config(env_type, max_parallel_tasks=3)
+    assert "drop it" in str(error.value) and "lerobot-bomb sweep --workers=3" in str(error.value)
+    assert make_env_config(env_type, max_parallel_tasks=1).max_parallel_tasks == 1

@@ -1,5 +1,7 @@
 import importlib.metadata
+import os
 import sys
+from pathlib import Path
 from types import ModuleType
 
 import pytest
@@ -91,3 +93,18 @@ def test_a_missing_dependency_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(doctor, "DEPENDENCIES", ("no-such-distribution",))
     broken = [finding for finding in doctor.check_versions() if finding.broken]
     assert [finding.name for finding in broken] == ["no-such-distribution"]
+
+
+def test_it_draws_beside_every_installed_plugin(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """One that spoils the drawing as soon as LeRobot imports it."""
+    (tmp_path / "lerobot_env_spoiler.py").write_text("import os\nos.environ['MUJOCO_GL'] = 'vulkan'\n")
+    metadata = tmp_path / "lerobot_env_spoiler-1.0.dist-info" / "METADATA"
+    metadata.parent.mkdir()
+    metadata.write_text("Metadata-Version: 2.1\nName: lerobot_env_spoiler\nVersion: 1.0\n")
+    monkeypatch.syspath_prepend(tmp_path)
+    monkeypatch.setenv("MUJOCO_GL", os.environ.get("MUJOCO_GL", ""))  # restored afterwards
+    monkeypatch.setattr(doctor, "CHECKS", (doctor.check_rendering,))
+    assert main(["doctor"]) == 1
+    assert "BROKEN  opengl: MUJOCO_GL='vulkan' cannot render" in capsys.readouterr().out

@@ -101,7 +101,7 @@ def test_an_env_is_pickled_and_copied_before_its_first_reset_alone(env: BombEnv)
         assert copied.metadata["render_fps"] == 20
     env.reset(seed=SEED)
     for make_copy in (copy.copy, copy.deepcopy, pickle.dumps):
-        with pytest.raises(TypeError, match="has been reset cannot be pickled or copied"):
+        with pytest.raises(TypeError, match="a BombEnv that has been reset cannot be pickled or copied"):
             make_copy(env)
 
 
@@ -146,6 +146,10 @@ def test_actions_beyond_the_space_are_clipped(env: BombEnv) -> None:
         (np.zeros((1, 4)), r"action has shape \(1, 4\), expected \(4,\)"),
         (np.array([0, np.nan, 0, 0]), "is not finite"),
         (np.array([0, np.inf, 0, 0]), "is not finite"),
+        (np.full(4, 1e308), r"action \[1e\+308, .*\] is not finite in float32"),
+        (np.full(4, 1j), "holds complex128, not numbers"),
+        (np.array(["a"] * 4), r"action \['a', .*\] holds <U1, not numbers"),
+        (np.array([None] * 4), "holds object, not numbers"),
     ],
 )
 def test_a_malformed_action_is_refused(env: BombEnv, action: np.ndarray, message: str) -> None:
@@ -172,13 +176,49 @@ def test_step_and_render_need_a_reset() -> None:
     env.close()
 
 
-def test_resets_without_a_seed_start_with_the_specs_and_go_on_with_fresh_ones() -> None:
+def test_resets_without_a_seed_play_fresh_episodes_that_a_seeded_one_reproduces() -> None:
     first, second = (BombEnv(EpisodeSpec(seed=5), SMALL) for _ in range(2))
-    seeds = [[env.reset()[1]["seed"] for _ in range(3)] for env in (first, second)]
+    unseeded = [env.reset()[1]["seed"] for env in (first, second) for _ in range(2)]
+    assert len(set(unseeded)) == 4
+    seeds = [[env.reset(seed=seed)[1]["seed"] for seed in (7, None, None)] for env in (first, second)]
     first.close()
     second.close()
-    assert seeds[0] == seeds[1]
-    assert seeds[0][0] == 5 and len(set(seeds[0])) == 3
+    assert seeds == [[7, 2029167941, 1342382292]] * 2  # of Gymnasium's generator
+
+
+@pytest.mark.parametrize("vectorization_mode", ["sync", "async"])
+def test_gymnasiums_vector_environment_without_a_seed_plays_episodes_of_its_own(
+    vectorization_mode: str,
+) -> None:
+    own: dict = {"context": "forkserver"} if vectorization_mode == "async" else {}
+    envs = gymnasium.make_vec("bomb/place-v0", 2, vectorization_mode, vector_kwargs=own, render_options=SMALL)
+    seeds = envs.reset()[1]["seed"]
+    envs.close()
+    assert seeds[0] != seeds[1]
+
+
+@pytest.mark.parametrize("seed", [np.int64(5), np.uint8(5), np.array(5)])
+def test_a_seed_may_be_any_whole_number(env: BombEnv, seed: object) -> None:
+    found = env.reset(seed=seed)[1]["seed"]  # pyright: ignore[reportArgumentType]
+    assert found == 5 and type(found) is int
+
+
+@pytest.mark.parametrize(
+    ("seed", "error", "message"),
+    [
+        (-1, ValueError, r"--seed=-1 must lie in 0\.\.4294967295"),
+        (2**32, ValueError, "--seed=4294967296 must lie in"),
+        (1.5, TypeError, "seed 1.5 must be a whole number"),
+        ("5", TypeError, "seed '5' must be a whole number"),
+    ],
+)
+def test_a_seed_that_is_none_is_refused_and_leaves_the_episode_as_it_is(
+    env: BombEnv, seed: object, error: type[Exception], message: str
+) -> None:
+    rollout(env, stands_still)
+    with pytest.raises(error, match=message):
+        env.reset(seed=seed)  # pyright: ignore[reportArgumentType]
+    assert env.step(STILL)[3] is True and env.episode_result().steps == 100
 
 
 def test_observations_lie_in_their_space(env: BombEnv) -> None:

@@ -1,13 +1,14 @@
 """Our policies on LeRobot's environment types: docs/other_environments.md says which of them were run."""
 
+import threading
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
 import pytest
 from lerobot.configs import PipelineFeatureType
-from lerobot.envs import EnvConfig, env_to_policy_features, make_env_config
-from lerobot.policies.factory import make_policy_config
+from lerobot.envs import EnvConfig, env_to_policy_features, make_env, make_env_config
+from lerobot.policies.factory import make_policy, make_policy_config, make_pre_post_processors
 from lerobot.utils.constants import ACTION, OBS_STATE
 from lerobot.utils.import_utils import register_third_party_plugins
 
@@ -57,6 +58,27 @@ def test_a_policys_config_takes_the_features(policy_type: str, env_type: str) ->
     assert config.action_feature.shape == (action_dim,)
     if policy_type == "spatialvla_grid":
         assert config.grid_settings().groups
+
+
+@pytest.mark.one_type
+def test_tasks_in_threads_are_played_in_turn(
+    policy_type: str, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    """They would share the policy's queue."""
+    from lerobot.scripts import lerobot_eval
+
+    config = make_env_config("pusht", episode_length=3)
+    own = {"action_layout": None} if policy_type == "spatialvla_grid" else {}
+    policy_config = make_policy_config(policy_type, vlm_model_name="nano", device="cpu", **own)
+    policy = make_policy(policy_config, env_cfg=config)
+    threads = []
+    usual = policy.reset
+    monkeypatch.setattr(policy, "reset", lambda: (threads.append(threading.current_thread().name), usual()))
+    envs = {"pusht": {task: make_env(config, n_envs=1)["pusht"][0] for task in range(2)}}
+    steps = (*config.get_env_processors(), *make_pre_post_processors(policy_config))
+    lerobot_eval.eval_policy_all(envs, policy, *steps, n_episodes=1, start_seed=0, max_parallel_tasks=2)
+    assert threads == ["MainThread"] * 2
+    assert "--env.max_parallel_tasks=2: tasks are played one after another" in caplog.text
 
 
 @pytest.mark.long

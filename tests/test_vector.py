@@ -2,6 +2,7 @@ import sys
 from functools import partial
 
 import numpy as np
+import pytest
 
 from lerobot_bomb.bomb.episode import EpisodeSpec
 from lerobot_bomb.bomb.observation import RenderOptions
@@ -105,6 +106,37 @@ def test_changing_a_frozen_observation_changes_no_later_one() -> None:
     env.reset()[0]["agent_pos"][:] = 0
     np.testing.assert_array_equal(env.reset()[0]["agent_pos"], expected)
     env.close()
+
+
+@pytest.mark.parametrize("use_async", [False, True])
+def test_without_seeds_every_environment_plays_episodes_of_its_own(use_async: bool) -> None:
+    """A reset of the vector environment starts new ones, where the last have ended, too."""
+    envs = LazyVectorEnv([partial(make_one, fps=1)] * 2, use_async)
+    seeds = [*envs.reset()[1]["seed"]]
+    for _ in range(10):
+        _, _, _, truncated, info = envs.step(STILL)
+    assert truncated.all() and [*info["seed"]] == seeds
+    seeds += [*envs.reset()[1]["seed"]]
+    assert len(set(seeds)) == 4
+    repeated = [(envs.reset(seed=seed)[1]["seed"], envs.reset()[1]["seed"]) for seed in (3, np.int64(3))]
+    envs.close()
+    assert repeated[0][0].tolist() == [3, 4] and repeated[0][1][0] != repeated[0][1][1]
+    np.testing.assert_array_equal(repeated[0], repeated[1])
+
+
+@pytest.mark.filterwarnings("ignore")  # Gymnasium's report of the error
+@pytest.mark.parametrize("use_async", [False, True])
+def test_after_an_error_it_can_be_reset(use_async: bool) -> None:
+    envs = LazyVectorEnv([make_one] * 2, use_async)
+    for _ in range(2):
+        assert envs.reset(seed=SEEDS)[1]["seed"].tolist() == SEEDS
+        with pytest.raises(ValueError, match="is not finite"):
+            envs.step(STILL * [[1], [np.nan]])
+    with pytest.raises(TypeError, match="must be a whole number"):
+        envs.reset(seed=[1, 1.5])
+    assert envs.reset(seed=SEEDS)[1]["seed"].tolist() == SEEDS
+    assert envs.step(STILL)[4]["seed"].tolist() == SEEDS
+    envs.close()
 
 
 def test_freezing_uses_lerobots_option_name() -> None:

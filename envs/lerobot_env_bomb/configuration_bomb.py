@@ -30,7 +30,7 @@ from lerobot_bomb.checkpoints.queries import last_query
 from lerobot_bomb.conditions import ALL
 from lerobot_bomb.data.environment import Environment
 from lerobot_bomb.envs.results import check_results_path
-from lerobot_bomb.envs.vector import LazyVectorEnv
+from lerobot_bomb.envs.vector import LazyVectorEnv, check_parallel_tasks
 from lerobot_bomb.flag_errors import flag_errors, refuse_recording_of_several
 from lerobot_env_bomb.fetch_files import check_robot
 
@@ -78,6 +78,7 @@ class BombEnvConfig(EnvConfig):
         check_evaluations(BombEnvConfig, refuse_recording_of_several)
         with flag_errors():
             # an invalid flag raises here, before anything is built
+            check_parallel_tasks(self.max_parallel_tasks)
             for spec in itertools.chain(*self.groups.values()):
                 find_suite(spec.suite).check(spec)
                 check_robot(spec)

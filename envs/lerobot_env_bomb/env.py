@@ -10,7 +10,6 @@ from lerobot_bomb.bomb.episode import DEFAULT_FPS, PHYSICS_HZ, EpisodeSpec
 from lerobot_bomb.bomb.judge import Judge
 from lerobot_bomb.bomb.layout import Snapshot
 from lerobot_bomb.bomb.observation import (
-    ACTION_DIM,
     AGENT_POS,
     CAMERAS,
     ENVIRONMENT_STATE,
@@ -191,23 +190,9 @@ class BombEnv(EpisodeEnv[EpisodeSpec, _Run, EpisodeResult]):
         """Other instructions for this episode, as `lerobot_env_bomb.alternatives` gives them."""
         return alternatives(self._run.episode)
 
-    def __getstate__(self) -> dict[str, Any]:
-        if self._current_run is not None:
-            raise TypeError(
-                "a BombEnv that has been reset cannot be pickled or copied: its simulator and its OpenGL "
-                "context stay in this process. Pickle one before its first reset, or a factory, as "
-                "functools.partial(BombEnv, spec); the same seed replays the episode"
-            )
-        return self.__dict__.copy()
-
     def _check(self, action: np.ndarray) -> np.ndarray:
         """(4,) float64 within the action space."""
-        action = np.asarray(action, dtype=np.float64)
-        if action.shape != (ACTION_DIM,):
-            raise ValueError(f"action has shape {action.shape}, expected ({ACTION_DIM},)")
-        if not np.isfinite(action).all():
-            raise ValueError(f"action {action.tolist()} is not finite")
-        return np.clip(action, self._action_low, self._action_high)
+        return np.clip(super()._check(action).astype(np.float64), self._action_low, self._action_high)
 
     def _observe(self) -> Observation:
         state = self.privileged_state()

@@ -12,7 +12,7 @@ import numpy as np
 from OpenGL.raw.GL.VERSION import GL_1_0
 
 from lerobot_bomb.bomb.observation import RenderOptions
-from lerobot_env_mujoco.mujoco_gl import mujoco
+from lerobot_env_mujoco.mujoco_gl import GLContext, mujoco
 
 SHADOW_MAP_SIZE = 512  # pixels
 CAPTION_LINE_PX, CAPTION_MARGIN_PX = 26, 10
@@ -67,7 +67,7 @@ class CameraRenderer:
         global _drawing_process
         _drawing_process = os.getpid()
         self._owner = _Owner()
-        self._gl = mujoco.GLContext(max_size, max_size)
+        self._gl = GLContext(max_size, max_size)
         self._gl.make_current()
         self.opengl_vendor = _opengl_string(GL_1_0.GL_VENDOR)
         self.opengl_renderer = _opengl_string(GL_1_0.GL_RENDERER)
@@ -130,6 +130,8 @@ class CameraRenderer:
     def _render(self, data: mujoco.MjData, camera: str, size: int) -> mujoco.MjrRect:
         self._owner.check()
         self._gl.make_current()
+        # anew: after a neighbour has drawn with GLFW, the image of before would be read once more
+        mujoco.mjr_setBuffer(mujoco.mjtFramebuffer.mjFB_OFFSCREEN, self._context)
         self._camera.fixedcamid = self._model.camera(camera).id
         mujoco.mjv_updateScene(
             self._model, data, self._option, None, self._camera, mujoco.mjtCatBit.mjCAT_ALL, self._scene
@@ -145,7 +147,7 @@ class CameraRenderer:
         atexit.unregister(self._free)
 
 
-def _free(gl: mujoco.GLContext, context: mujoco.MjrContext, owner: _Owner) -> None:
+def _free(gl: GLContext, context: mujoco.MjrContext, owner: _Owner) -> None:
     if not owner.is_here():
         for kept in (gl, context):  # for ever: here even their destructors would fail or hang
             ctypes.pythonapi.Py_IncRef(ctypes.py_object(kept))

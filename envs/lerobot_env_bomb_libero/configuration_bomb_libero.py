@@ -17,7 +17,7 @@ from lerobot_bomb.checkpoints.interface import Interface
 from lerobot_bomb.checkpoints.libero_orientation import OrientationCheck
 from lerobot_bomb.checkpoints.queries import last_query
 from lerobot_bomb.envs.results import check_results_path
-from lerobot_bomb.envs.vector import LazyVectorEnv
+from lerobot_bomb.envs.vector import LazyVectorEnv, check_parallel_tasks
 from lerobot_bomb.flag_errors import flag_errors, refuse_recording_of_several
 from lerobot_bomb.flags import one_of
 from lerobot_bomb.libero.assets import SUITES, prepare_libero
@@ -45,6 +45,7 @@ class BombLiberoEnvConfig(LiberoEnv):
         check_evaluations(BombLiberoEnvConfig, refuse_recording_of_several)
         with flag_errors():
             # an invalid flag raises here, before anything is built
+            check_parallel_tasks(self.max_parallel_tasks)
             if not self.init_states:
                 raise ValueError(
                     "--env.init_states=false: episodes start in the task's recorded states; drop it"

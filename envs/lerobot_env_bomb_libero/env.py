@@ -8,7 +8,7 @@ import numpy as np
 from lerobot_bomb.envs.episode_env import EpisodeEnv, Observation, Transition
 from lerobot_bomb.envs.libero_results import LiberoResult
 from lerobot_bomb.envs.results import PolicyIdentity
-from lerobot_bomb.libero.episode import ACTION_DIM, LiberoFailure, LiberoSpec, failure_of, initial_state_of
+from lerobot_bomb.libero.episode import LiberoFailure, LiberoSpec, failure_of, initial_state_of
 from lerobot_bomb.libero.perturbations import LiberoCondition
 from lerobot_env_bomb_libero.actuator import LiberoActuator
 from lerobot_env_bomb_libero.axes import LIBERO_TRANSFORMS
@@ -76,12 +76,6 @@ class BombLiberoEnv(EpisodeEnv[LiberoSpec, _Run, LiberoResult]):
         self.task_description = episode.instruction
         return self._sensed(observation), {"is_success": False, "failure": "", "seed": spec.seed}
 
-    def _check(self, action: np.ndarray) -> np.ndarray:
-        action = np.asarray(action)
-        if action.shape != (ACTION_DIM,) or not np.isfinite(action).all():
-            raise ValueError(f"action {action.tolist()} must be {ACTION_DIM} finite numbers in -1..1")
-        return action
-
     def _advance(self, run: _Run, action: np.ndarray) -> Transition:
         command = run.actuator.command(action) if run.actuator else action
         observation, reward, terminated, _, info = self._scene.step(command)
@@ -115,8 +109,9 @@ class BombLiberoEnv(EpisodeEnv[LiberoSpec, _Run, LiberoResult]):
         )
 
     def close(self) -> None:
-        """Free what robosuite holds."""
+        """Free what robosuite holds, and with it the episode."""
         self._scene.close()
+        self._current_run = None  # its simulator is gone; another one would step in its place
 
     @property
     def _failure(self) -> LiberoFailure | None:

@@ -1,6 +1,7 @@
 """gym-pusht's simulation with what the perturbation axes change of it."""
 
 from collections.abc import Callable, Sequence
+from functools import cached_property
 from typing import Any, cast
 
 import numpy as np
@@ -39,7 +40,6 @@ class Board(PushTEnv):
         )
         self._transforms: Sequence[PushTTransform] = ()
         self.background: Callable[[pygame.Surface], None] | None = None  # draws it in place of white
-        self._screen = pygame.Surface((BOARD_PX, BOARD_PX))  # for a board that is not white
         self.outline_px = 0  # width of a line around the target
         self.touched = False  # whether the agent has met the block since the start
 
@@ -79,10 +79,11 @@ class Board(PushTEnv):
     def _draw(self) -> pygame.Surface:
         screen = super()._draw()
         if self.background is not None:
-            self.background(self._screen)
+            behind = self._behind
+            self.background(behind)
             screen.set_colorkey(WHITE)
-            self._screen.blit(screen, (0, 0))
-            screen = self._screen
+            behind.blit(screen, (0, 0))
+            screen = behind
         if self.outline_px:
             self._draw_outline(screen)
         return screen
@@ -97,6 +98,11 @@ class Board(PushTEnv):
 
         rgb = np.frombuffer(pygame.image.tobytes(screen, "RGB"), np.uint8).reshape(BOARD_PX, BOARD_PX, 3)
         return cv2.resize(rgb, (width, height))
+
+    @cached_property
+    def _behind(self) -> pygame.Surface:
+        """What a board that is not white is drawn on."""
+        return pygame.Surface((BOARD_PX, BOARD_PX))
 
     def _draw_outline(self, screen: pygame.Surface) -> None:
         """A line around the target."""

@@ -15,7 +15,7 @@ from lerobot_bomb.checkpoints.identity import policy_of_results
 from lerobot_bomb.checkpoints.interface import Interface
 from lerobot_bomb.checkpoints.queries import last_query
 from lerobot_bomb.envs.results import check_results_path
-from lerobot_bomb.envs.vector import LazyVectorEnv
+from lerobot_bomb.envs.vector import LazyVectorEnv, check_parallel_tasks
 from lerobot_bomb.flag_errors import flag_errors, refuse_recording_of_several
 from lerobot_bomb.flags import one_of
 from lerobot_bomb.pusht.episode import (
@@ -63,6 +63,7 @@ class BombPushTEnvConfig(EnvConfig):
         check_evaluations(BombPushTEnvConfig, refuse_recording_of_several)
         with flag_errors():
             # an invalid flag raises here, before anything is built
+            check_parallel_tasks(self.max_parallel_tasks)
             one_of("--env.task", self.task, TASKS)
             one_of("--env.fps", self.fps, (FPS,))
             check_image_size(self.image_size)

@@ -1,14 +1,16 @@
 """PushT with BOMB's perturbation axes, as a Gymnasium environment."""
 
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
+from gymnasium import spaces
 
 from lerobot_bomb.envs.episode_env import EpisodeEnv, Observation, Transition
 from lerobot_bomb.envs.pusht_results import PushTResult
 from lerobot_bomb.envs.results import PolicyIdentity
 from lerobot_bomb.pusht.episode import (
+    BOARD_PX,
     FPS,
     IMAGE_SIZE,
     PushTFailure,
@@ -21,6 +23,7 @@ from lerobot_env_bomb_pusht.axes.dynamics import PushTDynamics
 from lerobot_env_bomb_pusht.board import Board
 from lerobot_env_bomb_pusht.episode import PushTEpisode, sample_pusht_episode
 
+REACH_PX = (-BOARD_PX, 2 * BOARD_PX)  # of the agent, which passes through the board's walls
 DEFAULT_PUSHT_SPEC = PushTSpec(seed=0)
 
 
@@ -41,7 +44,8 @@ class BombPushTEnv(EpisodeEnv[PushTSpec, _Run, PushTResult]):
     most 1. Both are gym-pusht's, as are images, positions and info; without perturbations an episode is that
     of `gym_pusht/PushT-v0` of the same seed, bit for bit.
 
-    Action: (2,) x and y in pixels of the board where the agent is to go, 0..512; it is not clipped.
+    Action: (2,) x and y in pixels of the board where the agent is to go, 0..512. One outside is executed, as
+    gym-pusht does, up to a board's width away; so is one that `dynamics` leads outside.
     """
 
     metadata = {"render_modes": ["rgb_array"], "render_fps": FPS}  # noqa: RUF012
@@ -60,7 +64,10 @@ class BombPushTEnv(EpisodeEnv[PushTSpec, _Run, PushTResult]):
         self._policy = policy
         self._board = Board(image_size)
         self.action_space = self._board.action_space
-        self.observation_space = self._board.observation_space
+        low_px, high_px = REACH_PX
+        pixels = cast("spaces.Dict", self._board.observation_space)["pixels"]
+        agent_pos = spaces.Box(low_px, high_px, (2,), np.float64)
+        self.observation_space = spaces.Dict({"pixels": pixels, "agent_pos": agent_pos})
         self._coverage = self._max_coverage = 0.0
 
     def _begin(self, spec: PushTSpec) -> tuple[Observation, dict[str, Any]]:
@@ -75,15 +82,11 @@ class BombPushTEnv(EpisodeEnv[PushTSpec, _Run, PushTResult]):
         return self._sensed(observation), info | {"failure": "", "seed": spec.seed}
 
     def _check(self, action: np.ndarray) -> np.ndarray:
-        action = np.asarray(action)
-        if action.shape != (2,) or not np.isfinite(action).all():
-            raise ValueError(f"action {action.tolist()} must be two finite numbers, x and y in 0..512")
-        return action
+        return np.clip(super()._check(action), *REACH_PX)
 
     def _advance(self, run: _Run, action: np.ndarray) -> Transition:
-        observation, reward, terminated, _, info = self._board.step(
-            run.actuator.command(action) if run.actuator else action
-        )
+        command = np.clip(run.actuator.command(action), *REACH_PX) if run.actuator else action
+        observation, reward, terminated, _, info = self._board.step(command)
         self._coverage = float(info["coverage"])
         self._max_coverage = max(self._max_coverage, self._coverage)
         truncated = self._steps >= self._max_episode_steps

@@ -1,4 +1,4 @@
-"""Chooses MuJoCo's OpenGL backend before mujoco is imported."""
+"""Chooses MuJoCo's OpenGL backend, whether or not mujoco has been imported."""
 
 import importlib
 import os
@@ -8,6 +8,7 @@ import sys
 
 BACKENDS = ("egl", "osmesa", "glfw")
 PACKAGES = {"egl": "libegl1 libgl1", "osmesa": "libosmesa6"}  # headless ones, in order of speed
+PYOPENGL = {"egl": "EGLPlatform", "osmesa": "OSMesaPlatform"}  # classes of PyOpenGL
 PROBE_TIMEOUT_S = 60
 _PROBE = """
 import mujoco
@@ -39,11 +40,13 @@ def probe(backend: str) -> str:
 def ensure_gl_backend() -> str:
     """Set MUJOCO_GL (and PYOPENGL_PLATFORM) to a backend that renders and return its name.
 
-    Call it before mujoco is first imported. A backend named by MUJOCO_GL is not probed, so child
-    processes, which inherit it, lose no time. Off Linux, MuJoCo's own default is kept.
+    A backend named by MUJOCO_GL is not probed, so child processes, which inherit it, lose no time. Off
+    Linux, MuJoCo's own default is kept. `mujoco.GLContext` is of this backend unless mujoco had been
+    imported before; `lerobot_env_mujoco.mujoco_gl.GLContext` always is.
 
     Raises:
-        NoOpenGLError: no backend can render; the message names the Debian packages to install.
+        NoOpenGLError: no backend can render; the message names the Debian packages to install. Or PyOpenGL
+            has been loaded for another backend, for which it stays until the process ends.
         ValueError: MUJOCO_GL holds an unknown name.
     """
     chosen = os.environ.get("MUJOCO_GL", "").lower()
@@ -53,23 +56,32 @@ def ensure_gl_backend() -> str:
         raise ValueError(f"MUJOCO_GL={chosen!r} cannot render; choose one of: {', '.join(BACKENDS)}")
     if not chosen:
         chosen = _first_working_backend()
-        if "mujoco" in sys.modules:
-            raise NoOpenGLError(
-                "mujoco was imported before an OpenGL backend was chosen; "
-                f"import lerobot_env_bomb.env first, or set MUJOCO_GL={chosen}"
-            )
+    _check_pyopengl(chosen)
     os.environ["MUJOCO_GL"] = chosen
     # PyOpenGL reads a variable of its own; one left over from another backend makes mujoco raise.
     if chosen in PACKAGES:
         os.environ["PYOPENGL_PLATFORM"] = chosen
     try:
         importlib.import_module("mujoco")
+        importlib.import_module(f"mujoco.{chosen}")
     except (AttributeError, ImportError) as error:
         if isinstance(error.__cause__, KeyboardInterrupt):  # Ctrl-C while its library loads
             raise error.__cause__ from None
         # this is how a missing libEGL or libOSMesa shows
         raise NoOpenGLError(f"{_install_advice({chosen: str(error)})}; or unset MUJOCO_GL") from error
     return chosen
+
+
+def _check_pyopengl(backend: str) -> None:
+    """Raise a NoOpenGLError where PyOpenGL finds the functions of another backend."""
+    loaded = sys.modules.get("OpenGL.platform")
+    needed = PYOPENGL.get(backend)
+    if loaded is None or needed in (None, (found := type(loaded.PLATFORM).__name__)):
+        return
+    raise NoOpenGLError(
+        f"MuJoCo cannot render with {backend}: OpenGL had been imported before for another backend "
+        f"({found}). Import lerobot_env_bomb.env first, or start Python with PYOPENGL_PLATFORM={backend}"
+    )
 
 
 def _first_working_backend() -> str:

@@ -1,10 +1,17 @@
-"""MuJoCo, imported after an OpenGL backend has been chosen; every module here imports it from this one.
+"""MuJoCo and its OpenGL context, of a backend that renders; every module here imports both from this one.
 
 Its names live in C modules that pyright cannot read.
 """
 
+import importlib
+from typing import Any
+
 from lerobot_env_mujoco.backend import ensure_gl_backend
 
-ensure_gl_backend()
+_backend = ensure_gl_backend()
 
 import mujoco as mujoco  # noqa: E402
+
+# mujoco.GLContext is of the backend of mujoco's first import, which may have been another package's
+_module = mujoco if _backend == "default" else importlib.import_module(f"mujoco.{_backend}")
+GLContext: Any = _module.GLContext  # pyright: ignore[reportAttributeAccessIssue]

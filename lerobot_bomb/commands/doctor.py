@@ -79,7 +79,9 @@ def _outside(name: str, version: str) -> str:
 
 
 def check_rendering() -> Iterator[Finding]:
-    """Render one frame of the default scene."""
+    """Render one frame of the default scene, beside all of LeRobot's plugins that are installed."""
+    # any of them may have loaded MuJoCo or OpenGL by the time that an environment draws
+    importlib.import_module("lerobot.utils.import_utils").register_third_party_plugins()
     try:
         backend = importlib.import_module("lerobot_env_mujoco.backend").ensure_gl_backend()
     except (RuntimeError, ValueError) as error:

@@ -3,15 +3,17 @@
 Simulator workers import this module, so it imports neither torch nor LeRobot.
 """
 
+import operator
 from abc import ABC, abstractmethod
 from copy import deepcopy
 from dataclasses import replace
-from typing import Any, ClassVar
+from typing import Any, ClassVar, Self
 
 import gymnasium
 import numpy as np
 from gymnasium.error import ResetNeeded
 
+from lerobot_bomb.bomb.episode import check_seed
 from lerobot_bomb.envs.inference import Inference, Query
 from lerobot_bomb.envs.results import ResultLine, write_result
 from lerobot_bomb.smoothness import MIN_ACTIONS, smoothness
@@ -21,9 +23,10 @@ type Transition = tuple[Observation, float, bool, bool, dict[str, Any]]
 
 
 class EpisodeEnv[SpecT: Any, RunT, ResultT: ResultLine](gymnasium.Env[Observation, np.ndarray], ABC):
-    """Episodes that a frozen spec with a `seed` determines.
+    """Episodes that a frozen spec and a seed determine.
 
-    Once an episode has ended, `step` changes nothing until `reset`, and its reward is 0.
+    The seed is the reset's, whatever the spec's. Once an episode has ended, `step` changes nothing until
+    `reset`, and its reward is 0.
     """
 
     metadata = {"render_modes": ["rgb_array"]}  # noqa: RUF012
@@ -47,14 +50,13 @@ class EpisodeEnv[SpecT: Any, RunT, ResultT: ResultLine](gymnasium.Env[Observatio
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
     ) -> tuple[Observation, dict[str, Any]]:
-        """Start an episode: of `seed`, else of the spec's seed at first, else of a fresh one.
+        """Start an episode: of `seed`, else of one that `np_random` draws.
 
         `options` has no effect; vector environments pass theirs on.
         """
-        if seed is None and self._current_run is None:
-            seed = self._spec.seed
+        seed = None if seed is None else _whole(seed)
         super().reset(seed=seed)
-        self._seed = int(self.np_random.integers(2**31) if seed is None else seed)
+        self._seed = int(self.np_random.integers(2**31)) if seed is None else seed
         self._steps = 0
         self._last_transition = None
         self._actions, self._queries = [], []
@@ -106,6 +108,19 @@ class EpisodeEnv[SpecT: Any, RunT, ResultT: ResultLine](gymnasium.Env[Observatio
         found = smoothness(actions_TD, np.zeros(len(actions_TD)), exclude=self.gripper_dims)
         return found.j2.mean, found.j3.mean
 
+    def __copy__(self) -> Self:
+        return deepcopy(self)  # not two environments on one simulator
+
+    def __getstate__(self) -> dict[str, Any]:
+        if self._current_run is not None:
+            name = type(self).__name__
+            raise TypeError(
+                f"a {name} that has been reset cannot be pickled or copied: its simulator and what it draws "
+                f"with stay in this process. Pickle one before its first reset, or a factory, as "
+                f"functools.partial({name}, spec); the same seed replays the episode"
+            )
+        return self.__dict__.copy()
+
     @property
     def _run(self) -> RunT:
         if self._current_run is None:
@@ -116,9 +131,18 @@ class EpisodeEnv[SpecT: Any, RunT, ResultT: ResultLine](gymnasium.Env[Observatio
     def _begin(self, spec: SpecT) -> tuple[Observation, dict[str, Any]]:
         """Start the spec's episode as `_current_run`; its first observation and info."""
 
-    @abstractmethod
     def _check(self, action: np.ndarray) -> np.ndarray:
-        """The action as it is executed; a ValueError if it is none."""
+        """(D,) floats, a copy that the caller can no longer change; a ValueError if they are no action."""
+        space, given = self.action_space, np.array(action)
+        if given.shape != space.shape:
+            raise ValueError(f"action has shape {given.shape}, expected {space.shape}")
+        if given.dtype.kind not in "fiub":
+            raise ValueError(f"action {given.tolist()} holds {given.dtype}, not numbers")
+        with np.errstate(over="ignore"):
+            is_finite = np.isfinite(given.astype(space.dtype)).all()
+        if not is_finite:
+            raise ValueError(f"action {given.tolist()} is not finite in {space.dtype}")
+        return given if given.dtype.kind == "f" else given.astype(np.float64)
 
     @abstractmethod
     def _advance(self, run: RunT, action: np.ndarray) -> Transition:
@@ -131,3 +155,13 @@ class EpisodeEnv[SpecT: Any, RunT, ResultT: ResultLine](gymnasium.Env[Observatio
     @abstractmethod
     def _result(self, run: RunT) -> ResultT:
         """Of an episode that has ended."""
+
+
+def _whole(seed: Any) -> int:
+    """A seed of any integer type; an error for what is none."""
+    try:
+        number = operator.index(seed)
+    except TypeError:
+        raise TypeError(f"seed {seed!r} must be a whole number") from None
+    check_seed(number)
+    return number

@@ -17,6 +17,16 @@ from lerobot_bomb.envs.inference import Query
 NEW_ROLLOUT_OPTION = "lerobot_new_rollout"
 
 
+def check_parallel_tasks(number: int) -> None:
+    """Raise a ValueError unless LeRobot plays one task after another."""
+    if number > 1:
+        raise ValueError(
+            f"--env.max_parallel_tasks={number} plays tasks in threads, which share the queue and the random "
+            "numbers of one policy, and OpenGL draws in the thread that it began in; drop it. To play in "
+            f"several processes: lerobot-bomb sweep --workers={number}"
+        )
+
+
 class FreezeAfterEnd(gym.Wrapper):
     """Keep returning the last transition after an episode has ended, through autoreset too.
 
@@ -122,8 +132,23 @@ class LazyVectorEnv(VectorEnv):
                 self._envs = SyncVectorEnv(factories, autoreset_mode=AutoresetMode.NEXT_STEP)
         return self._envs
 
+    @contextmanager
+    def _running(self) -> Iterator[SyncVectorEnv | AsyncVectorEnv]:
+        """The envs; after an error, which ends a worker, none is left, and the next use starts them anew."""
+        envs = self._ensure()
+        try:
+            yield envs
+        except Exception:
+            if self._use_async:
+                self.close(terminate=True)
+            raise
+
     def reset(self, *, seed: Any = None, options: dict[str, Any] | None = None) -> tuple[Any, dict[str, Any]]:
-        observations, infos = self._ensure().reset(seed=seed, options=options)
+        """Start new episodes; autoreset, which does not, calls the envs themselves."""
+        options = {NEW_ROLLOUT_OPTION: True, **(options or {})}
+        with self._running() as envs:
+            seed = int(seed) if isinstance(seed, np.integer) else seed
+            observations, infos = envs.reset(seed=seed, options=options)
         if self._on_first_reset is not None:
             self._on_first_reset(observations)
             self._on_first_reset = None
@@ -131,16 +156,18 @@ class LazyVectorEnv(VectorEnv):
         return observations, infos
 
     def step(self, actions: np.ndarray) -> tuple[Any, Any, Any, Any, dict[str, Any]]:
-        envs = self._ensure()
-        if (query := self._last_query()) is not None:
-            envs.call("add_query", query)
-        return envs.step(actions)
+        with self._running() as envs:
+            if (query := self._last_query()) is not None:
+                envs.call("add_query", query)
+            return envs.step(actions)
 
     def call(self, name: str, *args: Any, **kwargs: Any) -> Any:
-        return self._ensure().call(name, *args, **kwargs)
+        with self._running() as envs:
+            return envs.call(name, *args, **kwargs)
 
     def get_attr(self, name: str) -> Any:
-        return self._ensure().get_attr(name)
+        with self._running() as envs:
+            return envs.get_attr(name)
 
     def close(self, **kwargs: Any) -> None:
         if self._envs is not None:

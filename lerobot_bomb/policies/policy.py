@@ -14,6 +14,7 @@ from lerobot.utils.constants import ACTION, OBS_STATE
 from torch import Tensor, nn
 from torch.nn.attention import SDPBackend, sdpa_kernel
 
+from lerobot_bomb._compat import play_tasks_in_turn
 from lerobot_bomb.actions.ensemble import TemporalEnsemble
 from lerobot_bomb.actions.relative import RelativeActions, bounds, named_dims
 from lerobot_bomb.checkpoints.adapters import check_buffers_are_the_bases, frozen_buffers
@@ -28,6 +29,11 @@ from lerobot_bomb.training.policy_flags import check_as_trained, check_weights_f
 from lerobot_bomb.vlm.inputs import read_state, read_tensor
 from lerobot_bomb.vlm.prompt import task_ids, task_text
 from lerobot_bomb.vlm.tokenizer import load_tokenizer
+
+
+def _is_chunk_policy(policy: nn.Module) -> bool:
+    """Also one that adapters are wrapped around."""
+    return any(isinstance(module, ChunkPolicy) for module in policy.modules())
 
 
 class ChunkPolicy(HubPolicy, SavesTiedWeightsOnce, PreTrainedPolicy):
@@ -48,6 +54,7 @@ class ChunkPolicy(HubPolicy, SavesTiedWeightsOnce, PreTrainedPolicy):
 
     def __init__(self, config: Any, dataset_meta: LeRobotDatasetMetadata | None = None, **_: object):
         super().__init__(config, dataset_meta)
+        play_tasks_in_turn(_is_chunk_policy)
         config.validate_features()
         config.trained_with = trained_with(config, self.as_trained)
         # physical size of 1 in normalised actions, and their names; known while training: (D,)
