@@ -1,4 +1,4 @@
-"""What the policy server unpickles: LeRobot's messages, as pickle does, and nothing that harms its process."""
+"""What the policy server unpickles: LeRobot's messages, as pickle does, and nothing that harms it."""
 
 import pickle
 import subprocess

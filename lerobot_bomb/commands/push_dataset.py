@@ -11,7 +11,7 @@ from lerobot_bomb.commands.arguments import add_hub_arguments, path_flag
 from lerobot_bomb.data.dataset_files import check_dataset
 from lerobot_bomb.data.facts import DatasetFacts
 from lerobot_bomb.data.resumable import METADATA_FILE, check_repo_id
-from lerobot_bomb.hub.markdown import command, fenced
+from lerobot_bomb.hub.markdown import code, command, fenced
 from lerobot_bomb.hub.push import CARD
 from lerobot_bomb.hub.upload import check_token, hub_errors, upload
 
@@ -70,7 +70,7 @@ def dataset_card(repo_id: str, facts: DatasetFacts) -> str:
         configs=[{"config_name": "default", "data_files": "data/*/*.parquet"}],
     )
     rows = [
-        f"| `{name}` | {feature['dtype']} | {tuple(feature['shape'])} |"
+        f"| {code(name)} | {feature['dtype']} | {tuple(feature['shape'])} |"
         for name, feature in facts.info["features"].items()
     ]
     train = command(

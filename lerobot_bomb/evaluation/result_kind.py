@@ -8,7 +8,14 @@ import numpy as np
 from lerobot_bomb.conditions import AxisCondition
 from lerobot_bomb.data.environment import Environment
 from lerobot_bomb.envs.results import Row
-from lerobot_bomb.evaluation.line_checks import SHARED_CHECKS, Check, check_fields, refuse_others
+from lerobot_bomb.evaluation.line_checks import (
+    SHARED_CHECKS,
+    Check,
+    check_fields,
+    check_inference,
+    check_levels,
+    refuse_others,
+)
 from lerobot_bomb.stats import bootstrap_interval, format_bounds
 
 NOT_RECORDED = "not recorded"
@@ -75,6 +82,8 @@ class ResultKind:
         check_fields(row["spec"], self.spec_fields | added, "spec.")
         refuse_others(row["spec"], self.spec_fields | added)
         self.check_episode(row)
+        check_levels(row, self.condition)
+        check_inference(row)
 
     def missing_fields(self, version: str) -> list[str]:
         """Of lines of the newest protocol, what those of another version do not have."""

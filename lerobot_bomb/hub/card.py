@@ -18,7 +18,7 @@ from lerobot_bomb.evaluation.result_groups import Group, by_condition, groups_of
 from lerobot_bomb.evaluation.result_lines import KINDS, kind_of
 from lerobot_bomb.evaluation.results import named_counts, summarise
 from lerobot_bomb.hub.evaluations import model_index
-from lerobot_bomb.hub.markdown import command, fenced
+from lerobot_bomb.hub.markdown import code, command, fenced, plain
 from lerobot_bomb.hub.method import Method
 from lerobot_bomb.hub.training import peft_flags, train_command
 from lerobot_bomb.stats import format_rate
@@ -241,7 +241,9 @@ class Checkpoint:
         lines += [f"- dataset: `{self.dataset_id}`"] if self.dataset_id else []
         lines += self.dataset.lines() if self.dataset is not None else []
         features = {**(self.config.input_features or {}), **(self.config.output_features or {})}
-        rows = [f"| `{name}` | {each.type.value} | {tuple(each.shape)} |" for name, each in features.items()]
+        rows = [
+            f"| {code(name)} | {each.type.value} | {tuple(each.shape)} |" for name, each in features.items()
+        ]
         return "\n".join([*lines, "", "| feature | type | shape |", "|---|---|---|", *rows]).lstrip("\n")
 
     def _results(self) -> str:
@@ -262,7 +264,7 @@ def results_table(group: Group) -> str:
     ]
     columns = ["condition", "success (95 % Wilson interval)", *measures, "failures"]
     lines = [
-        f"{group.kind.describe_tasks(group.rows)}; {'; '.join(settings)}:",
+        plain(f"{group.kind.describe_tasks(group.rows)}; {'; '.join(settings)}:"),
         "",
         f"| {' | '.join(columns)} |",
         "|---" * len(columns) + "|",

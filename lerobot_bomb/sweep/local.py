@@ -155,7 +155,7 @@ class Workers:
         if worker.is_refused:
             raise RuntimeError(self._last_line() or end)
         if worker.cell:
-            self._log.write(f"{worker.cell}: {end}\n".encode())
+            self._log.write(f"\n{worker.cell}: {end}\n".encode())
             self._log.flush()
             self._store.lost(self._cells[worker.cell], end)
             return
