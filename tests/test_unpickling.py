@@ -12,6 +12,7 @@ import pytest
 import torch
 from lerobot.async_inference.helpers import RemotePolicyConfig, TimedObservation
 from test_serve_limits import Runs
+from torch._utils import _rebuild_tensor_v2
 
 from lerobot_bomb.serving.unpickling import loads
 
@@ -61,6 +62,7 @@ def test_a_pickle_changes_no_class_of_the_process() -> None:
     assert callable(TimedObservation.get_timestamp)
 
 
+numpy_core: Any = np._core  # pyright: ignore
 OBJECTS = np.dtype("O")
 FLOATS = np.dtype("f4")
 FRAMES = bytes(1 << 20)
@@ -82,11 +84,11 @@ def state(shape: Any, dtype: Any, data: Any) -> tuple:
 
 
 def array(shape: Any, dtype: Any, data: Any) -> Calls:
-    return Calls(np._core.multiarray._reconstruct, np.ndarray, (0,), b"b", state=state(shape, dtype, data))
+    return Calls(numpy_core.multiarray._reconstruct, np.ndarray, (0,), b"b", state=state(shape, dtype, data))
 
 
 def buffer(data: Any, dtype: Any, shape: Any, order: str = "C") -> Calls:
-    return Calls(np._core.numeric._frombuffer, data, dtype, shape, order)
+    return Calls(numpy_core.numeric._frombuffer, data, dtype, shape, order)
 
 
 def dtype_with(*state: Any) -> Calls:
@@ -96,7 +98,7 @@ def dtype_with(*state: Any) -> Calls:
 def tensor(offset: Any, size: Any, stride: Any) -> Calls:
     """Of a storage of six numbers."""
     return Calls(
-        torch._utils._rebuild_tensor_v2,
+        _rebuild_tensor_v2,
         torch.arange(6.0).storage(),
         offset,
         size,
@@ -112,7 +114,7 @@ HOSTILE = {
     "objects": lambda: np.array([None, {}], dtype=object),
     "objects in a buffer": lambda: buffer(b"AAAAAAAA", OBJECTS, (1,)),
     "objects in a state": lambda: array((1,), OBJECTS, b"AAAAAAAA"),
-    "an object as a scalar": lambda: Calls(np._core.multiarray.scalar, OBJECTS, b"AAAAAAAA"),
+    "an object as a scalar": lambda: Calls(numpy_core.multiarray.scalar, OBJECTS, b"AAAAAAAA"),
     "fields": lambda: np.zeros(2, dtype=[("a", "f4"), ("b", "O")]),
     "text": lambda: np.array(["a", "b"]),
     "a subarray": lambda: array((1,), np.dtype(("f4", (4,))), bytes(16)),
@@ -199,7 +201,8 @@ def test_a_hostile_pickle_ends_no_process_and_takes_no_memory(tmp_path: Path) ->
 def test_numbers_are_read_as_pickle_reads_them(value: Any, protocol: int) -> None:
     sent = TimedObservation(0.0, 0, {"a": value, "b": [value, value]})
     read = loads(pickle.dumps(sent, protocol)).get_observation()
-    assert read["a"] is read["b"][0] is read["b"][1] or np.isscalar(value)
+    assert read["a"] is read["b"][0] is read["b"][1] or isinstance(value, np.generic)
+    found: Any
     for found in (read["a"], read["b"][1]):
         assert (type(found), found.dtype, found.shape) == (type(value), value.dtype, value.shape)
         np.testing.assert_array_equal(found, value)
