@@ -93,8 +93,13 @@ def written_whole(*paths: Path) -> Iterator[list[Path]]:
         with tempfile.TemporaryDirectory(prefix=".unfinished-", dir=folder) as temporary:
             unfinished = [Path(temporary) / path.name for path in paths]
             yield unfinished
+            # else a crash of the machine could leave a name with nothing in it
+            for path in (each for source in unfinished for each in (source, *source.rglob("*"))):
+                if not path.is_symlink():
+                    _sync(path)
             for source, path in zip(unfinished, paths, strict=True):
                 source.replace(path)
+            _sync(folder)
     except OSError as error:
         if error.errno not in FULL:
             raise
@@ -103,6 +108,18 @@ def written_whole(*paths: Path) -> Iterator[list[Path]]:
             f"{', '.join(map(str, paths))} could not be written ({error.strerror}); what was there before "
             "stays. Make room, and give the same command again",
         ) from error
+
+
+def _sync(path: Path) -> None:
+    """Have a file, or a folder's list of names, on the disk."""
+    file = os.open(path, os.O_RDONLY)
+    try:
+        os.fsync(file)
+    except OSError as error:
+        if error.errno != errno.EINVAL or not path.is_dir():  # of file systems that cannot sync folders
+            raise
+    finally:
+        os.close(file)
 
 
 def append_line(path: Path | str, line: str) -> None:

@@ -7,6 +7,7 @@ import numpy as np
 
 from lerobot_bomb.envs.pusht_results import PushTResult
 from lerobot_bomb.pusht.episode import PushTSpec
+from lerobot_bomb.pusht.perturbations import PushTCondition
 
 
 def pushing_actions(seed: int, block_xy: np.ndarray, num: int) -> np.ndarray:
@@ -56,8 +57,9 @@ def pusht_row(seed: int, condition: str, max_coverage: float, failure: str | Non
         steps=300,
         is_success=failure is None,
         failure=failure,
-        coverage=max_coverage / 2,
+        coverage=max_coverage if failure is None else max_coverage / 2,
         max_coverage=max_coverage,
+        levels={axis: high for axis, _, high in PushTCondition.parse(condition).ranges},
         simulator_versions={"gym-pusht": "0.1.8"},
     )
     return asdict(result)

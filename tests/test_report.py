@@ -26,12 +26,11 @@ def rows() -> Rows:
         for number, condition in enumerate(("none", "camera:2", "camera:4")):
             for seed in range(12):
                 failure = CLASSES[(seed * (number + 1) + place * number) % len(CLASSES)]
-                levels = {} if condition == "none" else {"camera": int(condition[-1])}
                 other = {} if policy is None else {"policy": policy}
-                line = values(seed, failure, 1.0 + seed, spec={"perturbations": condition}, **other)
-                target = [seed % 5, seed % 3]
-                nearest = [0, 4] if failure == "wrong_intersection" else target
-                made.append(line | {"levels": levels, "target": target, "nearest_intersection": nearest})
+                error = seed / 2 + (40.0 if failure == "wrong_intersection" else 1.0)
+                at = {"target": [seed % 5, seed % 3], "spec": {"perturbations": condition}}
+                at |= {"nearest_intersection": [0, 4]} if failure == "wrong_intersection" else {}
+                made.append(values(seed, failure, error, **at, **other))
     return made
 
 

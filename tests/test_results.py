@@ -5,8 +5,9 @@ from typing import Any
 
 import pytest
 
-from lerobot_bomb.bomb.board import COLORS
+from lerobot_bomb.bomb.board import COLORS, task_id
 from lerobot_bomb.bomb.episode import PROTOCOL_VERSION, EpisodeSpec
+from lerobot_bomb.bomb.perturbations import Condition
 from lerobot_bomb.commands.main import main
 from lerobot_bomb.envs.results import EpisodeResult, PolicyIdentity, ResultLine
 from lerobot_bomb.evaluation.bomb_lines import BOMB_LINES, NEW_CHECKS, SPEC_CHECKS, median_error_mm
@@ -18,24 +19,31 @@ ACT = PolicyIdentity("act", "outputs/act", None, "a" * 64, "b" * 64)
 FDVLA = PolicyIdentity("fdvla", "me/fdvla", "0123456789ab", "c" * 64, "d" * 64)
 
 
-def values(seed: int, failure: str | None = None, error: float = 1.0, **other: Any) -> dict[str, Any]:
+def values(seed: int, failure: str | None = None, error: float | None = None, **other: Any) -> dict[str, Any]:
     """The fields of a line; those of the spec are given as `spec`."""
     spec = {"seed": seed} | other.pop("spec", {})
+    episode = EpisodeSpec(**spec)
+    target = spec.get("target") or other.get("target", (2, 2))
+    color = spec.get("color") or other.get("color", "black")
+    condition = Condition.parse(episode.perturbations)
+    is_placed = failure in (None, "disturbed_others")
+    is_elsewhere = failure == "wrong_intersection" and target is not None
     result = EpisodeResult(
-        spec=EpisodeSpec(**spec),
+        spec=episode,
         instruction="Put it there.",
-        task_id=0,
-        target=spec.get("target") or (2, 2),
-        color=spec.get("color") or "black",
+        task_id=task_id(target, color) if episode.suite == "place" else episode.task_id or 0,
+        target=target,
+        color=color,
         steps=20,
-        progress=1.0,
+        progress=float(is_placed),
         is_success=failure is None,
-        is_success_bomb_v0=failure is None,
+        is_success_bomb_v0=failure is None and target is not None,
         failure=failure,
-        stage="placed",
-        placement_error_mm=error,
-        nearest_intersection=(2, 2),
-        collateral_mm=0.0,
+        stage="placed" if is_placed else "start" if failure == "never_reached" else "lifted",
+        placement_error_mm=(40.0 if is_elsewhere else 1.0) if error is None else error,
+        nearest_intersection=(target[0], (target[1] + 1) % 5) if is_elsewhere else target or (2, 2),
+        collateral_mm=20.0 if failure == "disturbed_others" else 0.0,
+        levels={axis: high for axis, _, high in condition.ranges},
         opengl_vendor="Mesa",
         opengl_renderer="llvmpipe",
         mujoco_version="3.8.1",
@@ -44,7 +52,7 @@ def values(seed: int, failure: str | None = None, error: float = 1.0, **other: A
     return asdict(result) | {"policy": policy and asdict(policy)} | other
 
 
-def row(seed: int, failure: str | None = None, error: float = 1.0, **other: Any) -> str:
+def row(seed: int, failure: str | None = None, error: float | None = None, **other: Any) -> str:
     return json.dumps(values(seed, failure, error, **other)) + "\n"
 
 

@@ -29,9 +29,9 @@ from lerobot_bomb.report.verdicts import (
     TRAIN,
     judge,
 )
+from lerobot_bomb.sweep.claim import claimed
 from lerobot_bomb.sweep.local import play
 from lerobot_bomb.sweep.manifest import Cell, Manifest, check_flags, largest_divisor
-from lerobot_bomb.sweep.store import Store, claim
 from lerobot_bomb.tables import print_table
 
 if TYPE_CHECKING:
@@ -129,12 +129,9 @@ def _play(args: argparse.Namespace, folder: Path, cells: dict[str, Cell]) -> dic
         ValueError: the folder is of another audit.
         RuntimeError: an arm could not be played.
     """
-    manifest = Manifest(tuple(cells.values()))
-    if not claim(folder, manifest):
-        raise ValueError(f"{args.folder} is of another audit; name another folder")
-    store = Store(folder, manifest)
-    play(store, "0/1", args.workers)
-    store.merge()
+    with claimed(folder, Manifest(tuple(cells.values()))) as store:
+        play(store, "0/1", args.workers)
+        store.merge()
     missing = [name for name, cell in cells.items() if not store.is_finished(cell) or store.errors(cell)]
     if missing:
         raise RuntimeError("\n".join([f"no lines of: {', '.join(missing)}", *store.lines()]))

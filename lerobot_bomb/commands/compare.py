@@ -7,6 +7,7 @@ from lerobot_bomb.commands.results_files import read_undamaged
 from lerobot_bomb.envs.results import Row
 from lerobot_bomb.evaluation.comparison import compare, of_policies
 from lerobot_bomb.evaluation.result_groups import describe_policy
+from lerobot_bomb.tables import print_lines
 
 
 def add_compare_arguments(parser: argparse.ArgumentParser) -> None:
@@ -51,7 +52,7 @@ def _two_policies(args: argparse.Namespace) -> tuple[list[Row], list[Row]]:
 def run_compare(args: argparse.Namespace) -> int:
     """Print both rates and their difference, by condition; check what was asked for."""
     comparisons = compare(*_two_policies(args))
-    print(*comparisons.lines(), sep="\n")
+    print_lines(*comparisons.lines())
     low = 100 * comparisons.lowest
     verdicts = []
     if (bar := args.min_difference) is not None:

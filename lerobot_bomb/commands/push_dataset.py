@@ -12,7 +12,7 @@ from lerobot_bomb.data.dataset_files import check_dataset
 from lerobot_bomb.data.facts import DatasetFacts
 from lerobot_bomb.data.resumable import METADATA_FILE, check_repo_id
 from lerobot_bomb.data.statistics import check_statistics
-from lerobot_bomb.hub.markdown import command, fenced
+from lerobot_bomb.hub.markdown import code, command, fenced
 from lerobot_bomb.hub.push import CARD
 from lerobot_bomb.hub.upload import check_token, hub_errors, upload
 
@@ -72,7 +72,7 @@ def dataset_card(repo_id: str, facts: DatasetFacts) -> str:
         configs=[{"config_name": "default", "data_files": "data/*/*.parquet"}],
     )
     rows = [
-        f"| `{name}` | {feature['dtype']} | {tuple(feature['shape'])} |"
+        f"| {code(name)} | {feature['dtype']} | {tuple(feature['shape'])} |"
         for name, feature in facts.info["features"].items()
     ]
     train = command(

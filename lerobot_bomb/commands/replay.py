@@ -16,6 +16,7 @@ from lerobot_bomb.conditions import NONE
 from lerobot_bomb.envs.results import ORIGIN, ResultLine, Row
 from lerobot_bomb.evaluation.result_groups import different_fields, outcome
 from lerobot_bomb.evaluation.result_lines import kind_of
+from lerobot_bomb.tables import print_lines
 from lerobot_bomb.viewing.episode import check_new, paths_of, write_episodes
 from lerobot_bomb.viewing.replay import Replay, line_of
 
@@ -68,7 +69,8 @@ def run_replay(args: argparse.Namespace) -> int:
     results = write_episodes(players, name, *paths)
     for (label, player), result in zip(players.items(), results, strict=True):
         of, values = player.viewed, cast("Any", result)
-        print(f"{label} ({of.spec.perturbations}): {values.instruction}", of.log().describe(result), sep="\n")
+        print_lines(f"{label} ({of.spec.perturbations}): {values.instruction}")
+        print(of.log().describe(result))
     print(*paths, sep="\n")
     return _compare(row, results[0])
 
@@ -93,5 +95,5 @@ def _compare(row: Row, result: ResultLine) -> int:
     print(f"not as recorded: {first} was {row[first]!r} and is {now.get(first)!r}")
     origins = [name for name in row if name in ORIGIN - {"policy", "task_ids"} and row[name] != now.get(name)]
     if origins:
-        print(*(f"  {name}: {row[name]} then, {now.get(name)} now" for name in origins), sep="\n")
+        print_lines(*(f"  {name}: {row[name]} then, {now.get(name)} now" for name in origins))
     return ANSWER_IS_NO

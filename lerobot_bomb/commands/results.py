@@ -8,7 +8,7 @@ from lerobot_bomb.commands.results_files import read_undamaged
 from lerobot_bomb.evaluation.result_groups import by_condition, differing, rate_of
 from lerobot_bomb.evaluation.results import pair_lines, summarise
 from lerobot_bomb.report.arms import Arm, arms_of
-from lerobot_bomb.tables import print_table
+from lerobot_bomb.tables import print_lines, print_table
 
 
 def add_results_arguments(parser: argparse.ArgumentParser) -> None:
@@ -40,7 +40,7 @@ def _print_file(path: Path, arms: list[Arm], num_damaged: int) -> None:
         )
         _print_rates(arms)
     for group in groups:
-        print(*(f"{path}: {line}" for line in group.lines()), sep="\n")
+        print_lines(*(f"{path}: {line}" for line in group.lines()))
         if group.missing_fields:
             version = group.rows[0]["protocol_version"]
             lacking = ", ".join(group.missing_fields)
@@ -51,7 +51,7 @@ def _print_file(path: Path, arms: list[Arm], num_damaged: int) -> None:
         for condition, rows in conditions.items():
             label = f" (perturbations={condition})" if len(conditions) > 1 else ""
             print(f"{path}{label}: {len(rows)} episode{'s' * (len(rows) != 1)}")
-            print(*(f"  {line}" for line in summarise(rows).lines()), sep="\n")
+            print_lines(*(f"  {line}" for line in summarise(rows).lines()))
         against = pair_lines(group, groups)
         if against:
             print(f"{path}: against the same episodes unperturbed", *against, sep="\n")

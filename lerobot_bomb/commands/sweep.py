@@ -9,15 +9,16 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
-from lerobot_bomb.bomb.episode import TEST_SEEDS
+from lerobot_bomb.bomb.episode import MAX_SEED, TEST_SEEDS
 from lerobot_bomb.commands.arguments import check_at_least, parse_conditions, path_flag
 from lerobot_bomb.evaluation.result_kind import ResultKind
 from lerobot_bomb.evaluation.result_lines import KIND_OF_ENV
 from lerobot_bomb.flags import one_of
+from lerobot_bomb.sweep.claim import claimed
 from lerobot_bomb.sweep.cluster import sbatch_script, submit
 from lerobot_bomb.sweep.local import PYTHON, play, progress
 from lerobot_bomb.sweep.manifest import NAME, Cell, Manifest, flag_value, parse_part, plan
-from lerobot_bomb.sweep.store import Store, claim
+from lerobot_bomb.sweep.store import Store
 
 MAX_BATCH = 10
 SCRIPT, SUBMITIT = "sweep.sbatch", "submitit"
@@ -63,16 +64,19 @@ def run_sweep(args: argparse.Namespace) -> int:
     """Play what is missing; exit code 1 where something still is."""
     _check_numbers(args)
     manifest = _manifest(args)
-    store = Store(args.folder, manifest)
-    cells = manifest.part(args.shard)
-    _check_jobs(args, cells)
-    if args.dry_run:
-        print(*(cell.command for cell in cells), sep="\n")
-        return 0
-    if args.retry:
-        store.begin_again(cells)
-    if args.slurm is not None:
-        return _write_slurm(args)
+    with claimed(args.folder, manifest, args.batch_size) as store:
+        cells = _cells(args, store.manifest)
+        if args.dry_run:
+            print(*(cell.command for cell in cells), sep="\n")
+            return 0
+        if args.retry:
+            store.begin_again(cells)
+        if args.slurm is not None:
+            return _write_slurm(args)
+        return _play(args, store, cells)
+
+
+def _play(args: argparse.Namespace, store: Store, cells: list[Cell]) -> int:
     try:
         with interrupted_by_sigterm():
             if args.submitit is None:
@@ -116,19 +120,29 @@ def _check_numbers(args: argparse.Namespace) -> None:
         parse_part(args.shard)
     except ValueError as error:
         raise ValueError(f"--shard: {error}") from None
-
-
-def _check_jobs(args: argparse.Namespace, cells: list[Cell]) -> None:
-    for name in ("slurm", "submitit"):
-        number = getattr(args, name)
-        if number is not None and not 1 <= number <= len(cells):
-            raise ValueError(f"--{name}={number} must be from 1 to the number of cells, {len(cells)}")
+    if args.timeout is not None:
+        check_at_least(args, timeout=1)
+    if args.seed + args.episodes - 1 > MAX_SEED:
+        raise ValueError(f"--seed={args.seed} and --episodes={args.episodes}: the last seed is {MAX_SEED}")
     if args.submitit is None and (args.submitit_cluster or args.submitit_parameters):
         raise ValueError("--submitit_cluster and --submitit_parameters need --submitit=N")
 
 
+def _cells(args: argparse.Namespace, manifest: Manifest) -> list[Cell]:
+    """Of the manifest, those that this command plays."""
+    try:
+        cells = manifest.part(args.shard)
+    except ValueError as error:
+        raise ValueError(f"--shard: {error}") from None
+    for name in ("slurm", "submitit"):
+        number = getattr(args, name)
+        if number is not None and not 1 <= number <= len(cells):
+            raise ValueError(f"--{name}={number} must be from 1 to the number of cells, {len(cells)}")
+    return cells
+
+
 def _manifest(args: argparse.Namespace) -> Manifest:
-    """The folder's, or a new one."""
+    """What is wanted: the flags' or, without --policies, the folder's."""
     if args.policies is None:
         if not (args.folder / NAME).is_file():
             raise ValueError(
@@ -137,18 +151,14 @@ def _manifest(args: argparse.Namespace) -> Manifest:
         if args.rest or args.tasks or args.perturbations:
             raise ValueError(f"{args.folder / NAME} says what is played; drop {(*args.rest, '--tasks')[0]}")
         return Manifest.read(args.folder)
+    if not args.policies:
+        raise ValueError("--policies names none")
     kind = _kind(args.rest)
     for task in args.tasks:
         one_of("--tasks", task, kind.tasks)
     conditions = _expanded(args.perturbations, kind)
-    batch_size = 1 if kind.starts_by_number else args.batch_size
-    manifest = plan(args.policies, args.tasks, conditions, args.seed, args.episodes, batch_size, args.rest)
-    if not claim(args.folder, manifest):
-        raise ValueError(
-            f"{args.folder / NAME} is of another sweep; name another folder, or go on with that one by "
-            f"`lerobot-bomb sweep {args.folder}`"
-        )
-    return manifest
+    args.batch_size = 1 if kind.starts_by_number else args.batch_size
+    return plan(args.policies, args.tasks, conditions, args.seed, args.episodes, args.batch_size, args.rest)
 
 
 def _kind(flags: list[str]) -> ResultKind:

@@ -16,6 +16,7 @@ from lerobot_bomb.bootstrap import bca_interval, format_bounds, sums_by
 from lerobot_bomb.conditions import ALL
 from lerobot_bomb.data.environment import Environment, numbered_tasks
 from lerobot_bomb.envs.results import Row
+from lerobot_bomb.evaluation.bomb_outcomes import check_outcome
 from lerobot_bomb.evaluation.line_checks import (
     Check,
     is_bool,
@@ -173,6 +174,7 @@ def _check_episode(row: Row) -> None:
     for name in ("target", "color"):
         if spec[name] not in (None, row[name]):
             raise ValueError(f"{name}={row[name]}, but spec.{name}={spec[name]}")
+    check_outcome(row)
 
 
 def _settings(row: Row) -> dict[str, str]:

@@ -40,6 +40,9 @@ LIBERO_CHECKS: dict[str, Check] = {
 
 def _check_episode(row: Row) -> None:
     LiberoSpec(**row["spec"])
+    most = row["spec"]["max_steps"]
+    if most is not None and row["steps"] > most:
+        raise ValueError(f"steps={row['steps']} is impossible with spec.max_steps={most}")
 
 
 def _settings(row: Row) -> dict[str, str]:

@@ -6,6 +6,9 @@ import re
 from collections.abc import Callable, Mapping
 from typing import Any
 
+from lerobot_bomb.conditions import AxisCondition
+from lerobot_bomb.tables import printable
+
 SHOWN_CHARACTERS = 80  # of a wrong value
 
 type Check = Callable[[Any], bool]
@@ -112,11 +115,53 @@ RUN_CHECKS: dict[str, Check] = {
 }
 
 
+def check_levels(row: Mapping[str, Any], condition: type[AxisCondition]) -> None:
+    """Raise a ValueError unless a line's levels can be those of its condition."""
+    asked = {axis: (low, high) for axis, low, high in condition.parse(row["spec"]["perturbations"]).ranges}
+    levels = {axis: row["levels"].get(axis, 0) for axis in (*row["levels"], *asked)}
+    off = (0, 0)  # of an axis that is not in the condition
+    for axis, level in levels.items():
+        low, high = asked.get(axis, off)
+        if not low <= level <= high:
+            raise ValueError(
+                f"levels={json.dumps(row['levels'])} with spec.perturbations={row['spec']['perturbations']}"
+            )
+
+
+def check_inference(row: Mapping[str, Any]) -> None:
+    """Raise a ValueError unless an episode can have had such queries."""
+    measured = row.get("inference")
+    if measured is None:
+        return
+    named = {f"inference.{name}": value for name, value in measured.items()} | {"steps": row.get("steps")}
+    is_unordered = measured["latency_p50_ms"] > measured["latency_p95_ms"]
+    refuse_if(is_unordered, named, "inference.latency_p50_ms", "inference.latency_p95_ms")
+    is_too_often = "steps" in row and measured["num_queries"] > row["steps"]
+    refuse_if(is_too_often, named, "inference.num_queries", "steps")
+
+
+def refuse_if(is_impossible: bool, values: Mapping[str, Any], first: str, *others: str) -> None:
+    """Raise a ValueError that shows fields which, each possible, are not so together."""
+    if is_impossible:
+        shown = [f"{name}={json.dumps(values[name])[:SHOWN_CHARACTERS]}" for name in (first, *others)]
+        raise ValueError(f"{shown[0]} is impossible{' with ' * bool(others)}{', '.join(shown[1:])}")
+
+
+def check_text(value: Any) -> None:
+    """Raise a ValueError unless all text of a JSON value can be written again."""
+    try:
+        json.dumps(value, ensure_ascii=False).encode()
+    except UnicodeEncodeError as error:
+        raise ValueError(f"text with half a surrogate pair, {error.object[error.start]!a}") from None
+
+
 def refuse_others(spec: dict[str, Any], checks: Mapping[str, Check]) -> None:
     """Raise a ValueError if a spec has a field that no check is for: then it may be of another episode."""
     unknown = spec.keys() - checks.keys()
     if unknown:
-        raise ValueError(f"spec has {', '.join(sorted(unknown))}, of which this package knows nothing")
+        raise ValueError(
+            f"spec has {', '.join(map(printable, sorted(unknown)))}, of which this package knows nothing"
+        )
 
 
 def check_fields(values: dict[str, Any], checks: Mapping[str, Check], prefix: str = "") -> None:

@@ -18,6 +18,7 @@ from lerobot_bomb.evaluation.line_checks import (
     is_table_of,
     is_text,
     or_none,
+    refuse_if,
 )
 from lerobot_bomb.evaluation.result_kind import (
     Measure,
@@ -27,9 +28,11 @@ from lerobot_bomb.evaluation.result_kind import (
     mean_with_interval,
 )
 from lerobot_bomb.pusht.episode import (
+    ALMOST_COVERAGE,
     MAX_IMAGE_SIZE,
     MIN_IMAGE_SIZE,
     PUSHT_PROTOCOL_VERSION,
+    SUCCESS_COVERAGE,
     PushTFailure,
     PushTSpec,
 )
@@ -69,6 +72,13 @@ PUSHT_CHECKS: dict[str, Check] = {
 
 def _check_episode(row: Row) -> None:
     PushTSpec(**row["spec"])
+    if row["steps"] > row["spec"]["max_steps"]:
+        raise ValueError(f"steps={row['steps']} is impossible with spec.max_steps={row['spec']['max_steps']}")
+    refuse_if(row["coverage"] > row["max_coverage"], row, "coverage", "max_coverage")
+    is_covered = row["coverage"] > SUCCESS_COVERAGE
+    refuse_if(is_covered != row["is_success"], row, "coverage", "is_success")
+    is_almost = row["failure"] == PushTFailure.ALMOST and row["coverage"] < ALMOST_COVERAGE
+    refuse_if(is_almost, row, "coverage", "failure")
 
 
 def _settings(row: Row) -> dict[str, str]:

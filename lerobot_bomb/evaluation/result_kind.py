@@ -10,7 +10,14 @@ from lerobot_bomb.bootstrap import bootstrap_interval, format_bounds, sums_by
 from lerobot_bomb.conditions import AxisCondition
 from lerobot_bomb.data.environment import Environment
 from lerobot_bomb.envs.results import Row
-from lerobot_bomb.evaluation.line_checks import SHARED_CHECKS, Check, check_fields, refuse_others
+from lerobot_bomb.evaluation.line_checks import (
+    SHARED_CHECKS,
+    Check,
+    check_fields,
+    check_inference,
+    check_levels,
+    refuse_others,
+)
 
 NOT_RECORDED = "not recorded"
 NO_VALUE = "-"  # of a measure that these episodes do not have
@@ -78,6 +85,8 @@ class ResultKind:
         check_fields(row["spec"], self.spec_fields | added, "spec.")
         refuse_others(row["spec"], self.spec_fields | added)
         self.check_episode(row)
+        check_levels(row, self.condition)
+        check_inference(row)
 
     def start_of(self, row: Row) -> tuple[Any, ...]:
         """Equal for rows that are not independent."""

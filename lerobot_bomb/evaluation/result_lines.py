@@ -2,6 +2,7 @@
 
 import json
 from pathlib import Path
+from typing import Any
 
 from lerobot_bomb.envs.results import Row
 from lerobot_bomb.evaluation.bomb_lines import BOMB_LINES
@@ -9,6 +10,7 @@ from lerobot_bomb.evaluation.libero_lines import LIBERO_LINES
 from lerobot_bomb.evaluation.line_checks import (
     Check,
     check_fields,
+    check_text,
     is_bool,
     is_int,
     is_sha256,
@@ -38,6 +40,12 @@ ADDED_POLICY_CHECKS: dict[str, Check] = {
     "batch_row": or_none(is_int(0)),
     "interventions": lambda value: isinstance(value, list) and all(map(is_text, value)),
 }
+
+
+def _check_batch(policy: dict[str, Any]) -> None:
+    number, size = policy.get("batch_row"), policy.get("batch_size")
+    if number is not None and size is not None and number >= size:
+        raise ValueError(f"policy.batch_row={number} is impossible with policy.batch_size={size}")
 
 
 def read_lines(path: Path) -> tuple[list[Row], list[str]]:
@@ -87,11 +95,12 @@ def parse_line(line: bytes) -> Row:
         ValueError: the line is not JSON, or a field is missing, mistyped or impossible.
     """
     try:
-        row = json.loads(line)
+        row = json.loads(line.decode())  # of bytes, json reads halves of surrogate pairs, too
     except json.JSONDecodeError as error:
         raise ValueError(f"{error.msg.removesuffix(' at')} at column {error.colno}") from None
     if not isinstance(row, dict):
         raise ValueError("no JSON object")
+    check_text(row)
     version = row.get("protocol_version")
     if version not in list(KIND_OF_VERSION):
         raise ValueError(f"protocol_version {version!r}; this package reads {', '.join(KIND_OF_VERSION)}")
@@ -100,6 +109,7 @@ def parse_line(line: bytes) -> Row:
     if row.get("policy") is not None:
         added = {name: check for name, check in ADDED_POLICY_CHECKS.items() if name in row["policy"]}
         check_fields(row["policy"], POLICY_CHECKS | added, "policy.")
+        _check_batch(row["policy"])
     if row["is_success"] != (row["failure"] is None):
         raise ValueError(f"is_success={row['is_success']} with failure={row['failure']!r}")
     kind.check_spec(row)

@@ -19,7 +19,7 @@ from lerobot_bomb.evaluation.result_groups import Group, by_condition, groups_of
 from lerobot_bomb.evaluation.result_lines import KINDS, kind_of
 from lerobot_bomb.evaluation.results import named_counts, summarise
 from lerobot_bomb.hub.evaluations import model_index
-from lerobot_bomb.hub.markdown import command, fenced
+from lerobot_bomb.hub.markdown import code, command, fenced, plain
 from lerobot_bomb.hub.method import Method
 from lerobot_bomb.hub.training import peft_flags, train_command
 from lerobot_bomb.vlm.tokenizer import NANO
@@ -248,7 +248,9 @@ class Checkpoint:
         lines += [f"- dataset: `{self.dataset_id}`"] if self.dataset_id else []
         lines += self.dataset.lines() if self.dataset is not None else []
         features = {**(self.config.input_features or {}), **(self.config.output_features or {})}
-        rows = [f"| `{name}` | {each.type.value} | {tuple(each.shape)} |" for name, each in features.items()]
+        rows = [
+            f"| {code(name)} | {each.type.value} | {tuple(each.shape)} |" for name, each in features.items()
+        ]
         return "\n".join([*lines, "", "| feature | type | shape |", "|---|---|---|", *rows]).lstrip("\n")
 
     def _results(self) -> str:
@@ -271,7 +273,7 @@ def results_table(group: Group) -> str:
     intervals = ", ".join(dict.fromkeys(summary.rate.method for summary in summaries.values()))
     columns = ["condition", f"success ({intervals})", *measures, "failures"]
     lines = [
-        f"{group.kind.describe_tasks(group.rows)}; {'; '.join(settings)}:",
+        plain(f"{group.kind.describe_tasks(group.rows)}; {'; '.join(settings)}:"),
         "",
         f"| {' | '.join(columns)} |",
         "|---" * len(columns) + "|",

@@ -1,6 +1,10 @@
 """Commands and code as a card shows them."""
 
+import re
 import shlex
+from html import escape
+
+from lerobot_bomb.tables import printable
 
 WIDTH = 100
 
@@ -18,5 +22,24 @@ def command(name: str, *flags: str) -> str:
 
 
 def fenced(text: str, language: str = "") -> str:
-    """A block of code."""
-    return f"```{language}\n{text}\n```"
+    """A block of code, which nothing in it ends."""
+    fence = "`" * max(3, _longest_run(text) + 1)
+    shown = "\n".join(map(printable, text.split("\n")))
+    return f"{fence}{language}\n{shown}\n{fence}"
+
+
+def code(text: str) -> str:
+    """Code within a line, also of a table; nothing in it ends it."""
+    ticks = "`" * (_longest_run(text) + 1)
+    pad = " " * ("`" in text)
+    return f"{ticks}{pad}{printable(text).replace('|', chr(92) + '|')}{pad}{ticks}"
+
+
+def plain(text: str) -> str:
+    """Text that means nothing in Markdown or HTML, also in a table."""
+    return re.sub(r"[\\`*|]|(?<=\])\(", r"\\\g<0>", escape(printable(text), quote=False))
+
+
+def _longest_run(text: str) -> int:
+    """Of backticks."""
+    return max(map(len, re.findall("`+", text)), default=0)

@@ -24,6 +24,7 @@ IMAGE_SIZE = 96  # pixels, gym-pusht's own
 MIN_IMAGE_SIZE, MAX_IMAGE_SIZE = 32, 512
 
 CENTRE_PX = 45.0  # of the T, along its stem, from the point whose position is the block's
+SUCCESS_COVERAGE = 0.95  # gym-pusht's own: above it the episode is a success
 ALMOST_COVERAGE = 0.8
 NEAR_PX = 40.0  # between the T's centre and the target's
 TURNED_RAD = pi / 9

@@ -1,6 +1,7 @@
 """What would be refused in the middle of a sweep, found before it begins."""
 
 import logging
+from collections.abc import Sequence
 
 from lerobot_bomb._compat import eval_config
 from lerobot_bomb.checkpoints.environment import as_if_built
@@ -10,8 +11,10 @@ from lerobot_bomb.sweep.manifest import Cell, Manifest
 RENAMED = {"--env.task=": "--tasks=", "--policy.ignore_environment=": "--env.ignore_checkpoint="}
 
 
-def check(manifest: Manifest) -> None:
+def check(manifest: Manifest, begun: Sequence[Cell] = ()) -> None:
     """LeRobot reads the flags of every cell, and no policy was trained for another environment.
+
+    Whoever has begun a cell has checked those that differ from it in their conditions only.
 
     Raises:
         SystemExit: flags are wrong; LeRobot's parser has said which.
@@ -19,7 +22,9 @@ def check(manifest: Manifest) -> None:
     """
     logging.disable(logging.WARNING)  # the workers' log has them
     try:
-        for cell in {_without_condition(cell): cell for cell in manifest.cells}.values():
+        cells = {_without_condition(cell): cell for cell in manifest.cells}
+        for flags in cells.keys() - set(map(_without_condition, begun)):
+            cell = cells[flags]
             config = eval_config(cell.flags)
             with as_if_built(config.policy):
                 try:

@@ -51,6 +51,11 @@ class Cell:
         return f"{readable[-60:].strip('-')}-{self.seed}-{digest[:8]}"
 
     @property
+    def seeds(self) -> range:
+        """Of its episodes."""
+        return range(self.seed, self.seed + self.num_episodes)
+
+    @property
     def env_type(self) -> str:
         """Of LeRobot's environments; '' where its flags name none."""
         return flag_value(self.env, "--env.type") or ""
@@ -62,9 +67,13 @@ class Cell:
 
 @dataclass(frozen=True)
 class Manifest:
-    """All cells of a sweep, in the order of its lines."""
+    """All cells of a sweep, in the order of its lines; none is there twice."""
 
     cells: tuple[Cell, ...]
+
+    def __post_init__(self) -> None:
+        if len({cell.key for cell in self.cells}) < len(self.cells):
+            raise ValueError("a cell is there twice")
 
     @property
     def num_episodes(self) -> int:
@@ -74,9 +83,13 @@ class Manifest:
         """Every so many cells: '0/4' are the first, the fifth, ...
 
         Raises:
-            ValueError: the text is no such part.
+            ValueError: the text is no such part, or there are too few cells for it to have one.
         """
         first, number = parse_part(text)
+        if first >= len(self.cells):
+            raise ValueError(
+                f"{text} has no cell: there are {len(self.cells)}, so take at most as many parts"
+            )
         return list(self.cells[first::number])
 
     def write(self, folder: Path) -> None:
@@ -98,12 +111,9 @@ class Manifest:
         if values.get("version") != VERSION:
             raise ValueError(f"{path}: version {values.get('version')!r}; this package reads {VERSION}")
         try:
-            cells = tuple(_cell(dict(cell)) for cell in values["cells"])
+            return cls(tuple(_cell(dict(cell)) for cell in values["cells"]))
         except (KeyError, TypeError, ValueError) as error:
             raise ValueError(f"{path}: a cell is damaged: {error}") from None
-        if len({cell.key for cell in cells}) < len(cells):
-            raise ValueError(f"{path}: a cell is there twice")
-        return cls(cells)
 
 
 def _cell(values: dict[str, Any]) -> Cell:
@@ -132,7 +142,7 @@ def parse_part(text: str) -> tuple[int, int]:
         ValueError: it is spelled otherwise, or there is no such part.
     """
     first, _, number = text.partition("/")
-    if not (first.isdigit() and number.isdigit() and int(first) < int(number)):
+    if not (first.isdecimal() and number.isdecimal() and int(first) < int(number)):
         raise ValueError(f"{text} must be PART/PARTS, the parts counted from 0: 0/4 to 3/4")
     return int(first), int(number)
 
@@ -159,7 +169,7 @@ def plan(
     batch_size: int,
     flags: Sequence[str],
 ) -> Manifest:
-    """Every policy on every task under every condition.
+    """Every policy on every task under every condition; what is named twice is played once.
 
     Args:
         policies: checkpoints, or policy types.
@@ -186,7 +196,7 @@ def plan(
         )
         for policy, task, condition in product(policies, tasks or [""], conditions or [""])
     ]
-    return Manifest(tuple(cells))
+    return Manifest(tuple(dict.fromkeys(cells)))
 
 
 def _condition_flags(condition: str) -> list[str]:
@@ -212,4 +222,4 @@ def policy_flag(policy: str) -> str:
 
 def largest_divisor(number: int, most: int) -> int:
     """So that LeRobot, which fills the last batch, plays no more episodes than asked."""
-    return max(size for size in range(1, most + 1) if number % size == 0)
+    return max(size for size in range(1, min(number, most) + 1) if number % size == 0)

@@ -1,8 +1,9 @@
 """What of a sweep is done: a folder that any number of workers share.
 
-A cell is finished where `cells/KEY.jsonl` is; a worker that plays one holds the lock on `cells/KEY.lock`,
-which the system takes from it if it is killed. What such a worker left is played again, three times at most
-in one run: a sweep that was stopped, with workers that may outlive it by moments, is no failed attempt.
+A cell is finished where `cells/KEY.jsonl` holds all its episodes; a worker that plays one holds the lock on
+`cells/KEY.lock`, which the system takes from it if it is killed. What such a worker left is played again,
+three times at most in one run: a sweep that was stopped, with workers that may outlive it by moments, is no
+failed attempt.
 """
 
 import json
@@ -15,7 +16,7 @@ from pathlib import Path
 from uuid import uuid4
 
 from lerobot_bomb.files import append_line, written_whole
-from lerobot_bomb.sweep.manifest import NAME, Cell, Manifest
+from lerobot_bomb.sweep.manifest import Cell, Manifest
 
 MAX_ATTEMPTS = 3
 REFUSED = 3  # exit code of a worker that plays nothing; the last line of its log says why
@@ -33,18 +34,19 @@ class EpisodeError:
     command: str  # plays it again
 
 
-def claim(folder: Path, manifest: Manifest) -> bool:
-    """Whether a folder is this manifest's now; it becomes so unless another's episodes are played there.
+def unplayed_seeds(cell: Cell, lines: Sequence[str | bytes], errors: Sequence[EpisodeError]) -> list[int]:
+    """Seeds of a cell that have neither an error nor as many lines as the others, one for each task.
 
     Raises:
-        ValueError: a manifest that is there is damaged, or of another version of this package.
+        ValueError: a line is no episode.
     """
-    if (folder / NAME).is_file():
-        there = Manifest.read(folder)
-        if there == manifest or not Store(folder, there).is_untouched():
-            return there == manifest
-    manifest.write(folder)
-    return True
+    try:
+        counts = Counter(json.loads(line)["spec"]["seed"] for line in lines)
+    except (KeyError, TypeError, RecursionError) as error:
+        raise ValueError(f"a line is no episode: {error!r}") from None
+    failed = {error.seed for error in errors}
+    most = max(counts.values(), default=1)
+    return [seed for seed in cell.seeds if seed not in failed and counts[seed] < most]
 
 
 class Store:
@@ -58,6 +60,7 @@ class Store:
 
     def __init__(self, folder: Path, manifest: Manifest, run: str | None = None) -> None:
         self.folder, self.manifest, self.run = folder, manifest, run or uuid4().hex
+        self._whole: dict[Path, tuple[int, int]] = {}  # files that were read and found whole
         (folder / CELLS).mkdir(parents=True, exist_ok=True)
 
     def file(self, cell: Cell, ending: str) -> Path:
@@ -65,16 +68,32 @@ class Store:
         return self.folder / CELLS / f"{cell.key}.{ending}"
 
     def is_finished(self, cell: Cell) -> bool:
-        return self.file(cell, "jsonl").is_file()
+        """Whether the file of its lines is there and whole: a crash of the machine can cut it off."""
+        path = self.file(cell, "jsonl")
+        try:
+            state = path.stat()
+        except FileNotFoundError:
+            return False
+        version = (state.st_mtime_ns, state.st_size)
+        if self._whole.get(path) != version and self._is_whole(cell):
+            self._whole[path] = version
+        return self._whole.get(path) == version
+
+    def _is_whole(self, cell: Cell) -> bool:
+        *lines, rest = _read(self.file(cell, "jsonl")).split(b"\n")
+        try:
+            return not rest and not unplayed_seeds(cell, lines, self.errors(cell))
+        except (ValueError, TypeError):  # of either file
+            return False
 
     def is_untouched(self) -> bool:
         """Whether no episode has been played, with a line or with an error, and none is being played."""
-        return not self.has_begun() and all(self._is_free(cell) for cell in self.manifest.cells)
+        cells = self.manifest.cells
+        return not any(map(self.has_begun, cells)) and all(map(self._is_free, cells))
 
-    def has_begun(self) -> bool:
+    def has_begun(self, cell: Cell) -> bool:
         """Whether an episode has been played, with a line or with an error, or is being played."""
-        endings = ("jsonl", "part", "errors")
-        return any(self.file(cell, ending).is_file() for cell in self.manifest.cells for ending in endings)
+        return any(self.file(cell, ending).is_file() for ending in ("jsonl", "part", "errors"))
 
     def _is_free(self, cell: Cell) -> bool:
         with self.claimed(cell) as is_mine:
@@ -83,7 +102,7 @@ class Store:
     def begin(self, cell: Cell) -> bool:
         """Count an attempt; give the cell up, and return False, if there were enough that were killed."""
         if self._num_attempts(cell) >= MAX_ATTEMPTS:
-            self.give_up(cell, f"{MAX_ATTEMPTS} workers were killed while they played it")
+            self.give_up(cell, f"{MAX_ATTEMPTS} workers ended while they played it")
             return False
         append_line(self.file(cell, "attempts"), self.run)
         return True
@@ -92,6 +111,20 @@ class Store:
         """Give the cell up, if the attempt that ended so was the last."""
         if self._num_attempts(cell) >= MAX_ATTEMPTS:
             self.give_up(cell, f"{reason}; {MAX_ATTEMPTS} attempts")
+
+    def lost(self, cell: Cell, reason: str) -> None:
+        """Note why the worker ended that played the cell, unless another has finished it or plays it now."""
+        with self.claimed(cell) as is_mine:
+            if is_mine and not self.is_finished(cell):
+                self.fail(cell, reason)
+
+    def in_turn(self, cells: Sequence[Cell]) -> list[Cell]:
+        """Cells that are to be played, those first that no worker has died of, nor of their policy."""
+        attempts = {cell: self._num_attempts(cell) for cell in cells}
+        of_policy: Counter[tuple[str, ...]] = Counter()
+        for cell, number in attempts.items():
+            of_policy[cell.policy] += number
+        return sorted(cells, key=lambda cell: (of_policy[cell.policy], attempts[cell]))
 
     def _num_attempts(self, cell: Cell) -> int:
         """Of this run."""
@@ -147,7 +180,7 @@ class Store:
         with (self.folder / CELLS / "merge.lock").open("w") as lock:
             flock(lock, LOCK_EX)  # who writes last has read what all that wrote before had finished
             for name, ending in ((RESULTS, "jsonl"), (ERRORS, "errors")):
-                paths = [self.file(cell, ending) for cell in self.manifest.cells]
+                paths = [self.file(cell, ending) for cell in self.manifest.cells if self.is_finished(cell)]
                 with written_whole(self.folder / name) as (path,):
                     path.write_bytes(b"".join(map(_read, paths)))
 

@@ -1,20 +1,20 @@
 """Plays the cells of a sweep that nobody else plays, one after the other, in one process.
 
-`python -m lerobot_bomb.sweep.worker FOLDER PART RUN [TIMEOUT_S]`, which ends with its standard input.
+`python -m lerobot_bomb.sweep.worker FOLDER PART RUN FILE_DESCRIPTOR`, which ends with its standard input.
 """
 
+import faulthandler
 import io
 import json
 import logging
 import os
 import shutil
-import signal
 import sys
 import tempfile
 import threading
 import time
-from collections.abc import Iterator
-from contextlib import contextmanager, redirect_stderr
+from collections.abc import Callable
+from contextlib import redirect_stderr
 from pathlib import Path
 from typing import TextIO
 
@@ -28,14 +28,14 @@ from lerobot_bomb.files import read_json
 from lerobot_bomb.libero.assets import prepare_libero
 from lerobot_bomb.sweep.check import check
 from lerobot_bomb.sweep.manifest import Cell, Manifest, flag_value
-from lerobot_bomb.sweep.store import POLL_S, REFUSED, EpisodeError, Store
+from lerobot_bomb.sweep.store import POLL_S, REFUSED, EpisodeError, Store, unplayed_seeds
 
 
 class RefusedError(Exception):
     """LeRobot's command ended before it played: no attempt can do better."""
 
 
-FATAL = (RefusedError, TimeoutError, OSError)  # for a cell, whichever episode it was
+FATAL = (RefusedError, OSError)  # for a cell, whichever episode it was
 
 
 class Worker:
@@ -43,38 +43,36 @@ class Worker:
 
     Args:
         store: the sweep.
-        timeout_s: of a cell; None: none.
+        tell: is told the key of a cell that begins, and '' when it ends.
     """
 
-    def __init__(self, store: Store, timeout_s: int | None = None) -> None:
-        self._store = store
-        self._timeout_s = timeout_s
+    def __init__(self, store: Store, tell: Callable[[str], None] = lambda key: None) -> None:
+        self._store, self._tell = store, tell
         self._kept = KeptPolicy()
 
     def run(self, cells: list[Cell]) -> None:
         """Play until each is finished or given up, by this worker or by others."""
         while left := [cell for cell in cells if not self._store.is_over(cell)]:
-            for cell in left:
+            for cell in self._store.in_turn(left):
                 with self._store.claimed(cell) as is_mine:
                     if is_mine and not self._store.is_over(cell) and self._store.begin(cell):
+                        self._tell(cell.key)
                         self._attempt(cell)
+                        self._tell("")
             time.sleep(POLL_S)  # others play the rest; what a killed one leaves is for those that remain
 
     def _attempt(self, cell: Cell) -> None:
         try:
-            with time_limit(self._timeout_s):
-                try:
-                    lines, errors = self._evaluate(cell, cell), []
-                except FATAL:
-                    raise
-                except Exception as error:
-                    logging.warning("%s: %s; its episodes are played one by one", cell.key, describe(error))
-                    lines, errors = self._one_by_one(cell)
+            try:
+                lines, errors = self._evaluate(cell, cell), []
+            except FATAL:
+                raise
+            except Exception as error:
+                logging.warning("%s: %s; its episodes are played one by one", cell.key, describe(error))
+                lines, errors = self._one_by_one(cell)
             self._store.finish(cell, lines, errors)
         except RefusedError as error:
             self._store.give_up(cell, str(error))
-        except TimeoutError:
-            self._store.fail(cell, f"not finished after {self._timeout_s} s (--timeout)")
         except OSError as error:
             self._store.fail(cell, describe(error))
 
@@ -108,7 +106,7 @@ class Worker:
             else:
                 lines = self._stock_lines(cell, whole, Path(output_dir))
         except (Exception, SystemExit) as error:
-            if self._kept.has_begun or isinstance(error, TimeoutError | OSError):
+            if self._kept.has_begun or isinstance(error, OSError):
                 raise
             is_told = isinstance(error, SystemExit) and isinstance(error.code, int) and said.line
             raise RefusedError(said.line if is_told else describe(error)) from error
@@ -116,8 +114,8 @@ class Worker:
             shutil.rmtree(output_dir, ignore_errors=True)
             part.unlink(missing_ok=True)
         by_seed = sorted(lines, key=lambda line: json.loads(line)["spec"]["seed"])
-        if len(by_seed) < cell.num_episodes:
-            raise RuntimeError(f"{len(by_seed)} of {cell.num_episodes} episodes ended")
+        if unplayed := unplayed_seeds(cell, by_seed, []):
+            raise RuntimeError(f"{cell.num_episodes - len(unplayed)} of {cell.num_episodes} episodes ended")
         return by_seed
 
     def _stock_lines(self, cell: Cell, whole: Cell, output_dir: Path) -> list[str]:
@@ -176,35 +174,6 @@ def describe(error: BaseException) -> str:
     return f"{type(error).__name__}: {lines[-1]}" if lines else type(error).__name__
 
 
-@contextmanager
-def time_limit(seconds: int | None) -> Iterator[None]:
-    """Raise a TimeoutError in the main thread every so many seconds: one can be lost in a callback.
-
-    Whatever LeRobot's parser made of it on its way is one again.
-    """
-    is_over = False
-
-    def stop(*_: object) -> None:
-        nonlocal is_over
-        is_over = True
-        raise TimeoutError
-
-    if seconds is None:
-        yield
-        return
-    usual = signal.signal(signal.SIGALRM, stop)
-    signal.setitimer(signal.ITIMER_REAL, seconds, seconds)
-    try:
-        yield
-    except Exception as error:
-        if is_over and not isinstance(error, TimeoutError):
-            raise TimeoutError from error
-        raise
-    finally:
-        signal.setitimer(signal.ITIMER_REAL, 0)
-        signal.signal(signal.SIGALRM, usual)
-
-
 def _end_with_parent() -> None:
     """The parent holds this process' standard input; when it is gone, however it ended, so is this one."""
     while os.read(sys.stdin.fileno(), 1):  # sys.stdin.read() would hold a lock that Python's end needs
@@ -212,20 +181,25 @@ def _end_with_parent() -> None:
     os._exit(1)
 
 
-def main(folder: str, part: str, run: str, timeout_s: str | None = None) -> None:
-    """Play a part of the sweep in a folder."""
+def main(folder: str, part: str, run: str, told: str) -> None:
+    """Play a part of the sweep in a folder; which cell is played goes to the file descriptor `told`."""
+    faulthandler.enable()  # a fault of native code says where it was
     logging.basicConfig(level=logging.WARNING)
     threading.Thread(target=_end_with_parent, daemon=True).start()
     manifest = Manifest.read(Path(folder))
     store = Store(Path(folder), manifest, run)
-    if not store.has_begun():  # whoever began has checked
-        try:
-            check(manifest)
-        except (ValueError, SystemExit) as error:
-            if isinstance(error, ValueError):
-                print(error, file=sys.stderr)
-            sys.exit(REFUSED)
-    Worker(store, None if timeout_s is None else int(timeout_s)).run(manifest.part(part))
+    left = Manifest(tuple(cell for cell in manifest.cells if not store.is_over(cell)))
+    try:
+        check(left, [cell for cell in manifest.cells if store.has_begun(cell)])
+    except (ValueError, SystemExit) as error:
+        if isinstance(error, ValueError):
+            print(error, file=sys.stderr)
+        sys.exit(REFUSED)
+    Worker(store, lambda key: _tell(int(told), key)).run(manifest.part(part))
+
+
+def _tell(told: int, key: str) -> None:
+    os.write(told, f"{key}\n".encode())
 
 
 if __name__ == "__main__":

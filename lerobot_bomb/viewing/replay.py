@@ -18,6 +18,8 @@ from lerobot_bomb.evaluation.result_lines import kind_of
 from lerobot_bomb.pusht.episode import PushTSpec
 from lerobot_bomb.viewing.episode import Player, Viewed, bomb_episode, pusht_episode
 
+MAX_BATCH = 1000  # environments at once
+
 
 @dataclass(frozen=True)
 class Replay:
@@ -33,9 +35,15 @@ class Replay:
         """Plays the line's episode; under other perturbations, that of the same seed.
 
         Raises:
-            ValueError: its environment has no recording for Rerun, or, once it plays, the policy is not that
-                of the line or cannot be had.
+            ValueError: its environment has no recording for Rerun, its batch cannot be played again, or, once
+                it plays, the policy is not that of the line or cannot be had.
         """
+        row, size = self._place
+        if size > MAX_BATCH or row >= size or row > self.row["spec"]["seed"]:
+            raise ValueError(
+                f"the line says policy.batch_row={row} of policy.batch_size={size}, and replay plays the "
+                f"others of its batch along: at most {MAX_BATCH}, of seeds from 0 on"
+            )
         viewed = self.viewed(perturbations)
         return Player(viewed, partial(self._agent, viewed))
 
@@ -73,10 +81,15 @@ class Replay:
 
     @contextmanager
     def _agent(self, viewed: Viewed, _: gymnasium.Env) -> Iterator[Agent]:
-        policy = self.row.get("policy") or {}
-        place = {"row": policy.get("batch_row") or 0, "size": policy.get("batch_size") or 1}
-        with one_of_batch(self._batch_agent(viewed), viewed.make_env, viewed.spec.seed, **place) as agent:
+        agents = one_of_batch(self._batch_agent(viewed), viewed.make_env, viewed.spec.seed, *self._place)
+        with agents as agent:
             yield agent
+
+    @property
+    def _place(self) -> tuple[int, int]:
+        """The line's row in its batch, and how many rows that had."""
+        policy = self.row.get("policy") or {}
+        return policy.get("batch_row") or 0, policy.get("batch_size") or 1
 
     def _batch_agent(self, viewed: Viewed) -> BatchAgent:
         from lerobot_bomb._compat import built_policies  # LeRobot and torch: seconds

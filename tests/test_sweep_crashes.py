@@ -1,0 +1,204 @@
+"""``lerobot-bomb sweep`` beside policies that end their process or hang, and files that a crash cut off."""
+
+import json
+import os
+import sys
+import time
+from pathlib import Path
+from typing import IO
+
+import pytest
+from test_sweep import lines_of, small, sweep
+
+from lerobot_bomb import files
+from lerobot_bomb.sweep import local, store
+from lerobot_bomb.sweep.local import Workers, ended
+from lerobot_bomb.sweep.manifest import Cell, Manifest
+from lerobot_bomb.sweep.store import EpisodeError, Store
+
+PLUGINS = Path(__file__).parent / "fixtures" / "plugins"
+FLAGS = ("--env.type=bomb", "--env.image_size=32", "--policy.device=cpu", "--episodes=2", "--seed=7")
+
+# Processes
+
+
+def test_good_policies_play_whatever_becomes_of_those_that_crash(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setenv("PYTHONPATH", str(PLUGINS))
+    monkeypatch.setattr(store, "MAX_ATTEMPTS", 1)  # of this process, which counts how workers end
+    assert sweep(tmp_path, "--policies=segfault,killed,bomb_random", *FLAGS) == 1
+    said = capsys.readouterr().out
+    assert "2 of 6 episodes, 1 of 3 cells" in said
+    assert "ended by SIGSEGV, a fault of native code; 1 attempts" in said
+    assert "ended by SIGKILL, as where memory is short; 1 attempts" in said
+    rows = [json.loads(line) for line in (tmp_path / "results.jsonl").read_text().splitlines()]
+    assert [row["policy"]["type"] for row in rows] == ["bomb_random"] * 2
+    log = (tmp_path / "workers.log").read_text()
+    assert "Fatal Python error: Segmentation fault" in log and "modeling_crashing.py" in log
+
+
+@pytest.mark.long
+def test_good_policies_play_beside_all_that_crash_or_hang(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setenv("PYTHONPATH", str(PLUGINS))
+    policies = "--policies=segfault,killed,hanging,bomb_random,bomb_expert"
+    limits = ("--timeout=120", "--workers=2", "--perturbations=none,light:3")
+    assert sweep(tmp_path, policies, *limits, *FLAGS) == 1
+    said = capsys.readouterr().out
+    assert "8 of 20 episodes, 4 of 10 cells" in said
+    for reason in ("SIGSEGV", "SIGKILL", "not finished after 120 s (--timeout)"):
+        assert said.count(reason) == 2
+    rows = [json.loads(line) for line in (tmp_path / "results.jsonl").read_text().splitlines()]
+    assert {row["policy"]["type"] for row in rows} == {"bomb_random", "bomb_expert"}
+
+
+WORKER = """
+import ctypes, os, sys, time
+os.write(int(sys.argv[1]), b"%s\\n")
+%s
+"""
+
+
+def workers(folder: Path, cell: Cell, then: str, timeout_s: int | None = None) -> tuple[Workers, Store]:
+    """One worker, which begins a cell, and then does what a line of Python says."""
+    played = Store(folder, Manifest((cell,)))
+    assert played.begin(cell)
+    command = [sys.executable, "-c", WORKER % (cell.key, then)]
+    return Workers(played, command, [dict(os.environ)], timeout_s), played
+
+
+@pytest.mark.parametrize(
+    ("then", "timeout_s", "reason"),
+    [
+        # PyDLL keeps Python's lock: no signal handler and no thread of Python's runs
+        ("ctypes.PyDLL(None).sleep(600)", 1, "not finished after 1 s (--timeout); 1 attempts"),
+        ("time.sleep(600)", 1, "not finished after 1 s (--timeout); 1 attempts"),
+        ("ctypes.string_at(0)", None, "its process was ended by SIGSEGV, a fault of native code; 1 attempts"),
+        ("os._exit(7)", None, "its process ended with exit code 7; 1 attempts"),
+    ],
+)
+def test_how_a_worker_ended_is_the_reason(
+    then: str, timeout_s: int | None, reason: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(store, "MAX_ATTEMPTS", 1)
+    (cell,) = small().cells
+    started, played = workers(tmp_path, cell, then, timeout_s)
+    try:
+        end = time.monotonic() + 60
+        while not played.is_over(cell):
+            started.look(has_played=False)
+            time.sleep(0.05)
+            assert time.monotonic() < end
+    finally:
+        started.close()
+    assert played.file(cell, "given_up").read_text() == reason
+
+
+def test_a_worker_that_says_nothing_and_is_killed_is_no_full_disk(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setattr(local, "PYTHON", (sys.executable, "-c", "import os; os.kill(os.getpid(), 9)"))
+    (tmp_path / "workers.log").write_text("of another day\n")
+    assert sweep(tmp_path, "--policies=bomb_random", *FLAGS) == 1
+    assert capsys.readouterr().err.splitlines()[-1] == (
+        "lerobot-bomb sweep: workers end before they play: its process was ended by SIGKILL, as where memory "
+        f"is short; see {tmp_path / 'workers.log'}"
+    )
+
+
+def test_how_a_process_ended_is_told_in_words() -> None:
+    assert ended(0) == "its process ended with exit code 0"
+    assert ended(-6) == "its process was ended by SIGABRT"
+
+
+def test_what_nobody_died_of_is_played_first(tmp_path: Path) -> None:
+    first, second, good, other = small(("bomb:fdvla", "bomb_random"), ("none", "light:3")).cells
+    played = Store(tmp_path, small())
+    assert played.in_turn([first, second, good, other]) == [first, second, good, other]
+    assert played.begin(first)
+    assert played.in_turn([first, second, good, other]) == [good, other, second, first]
+    assert played.begin(good) and played.begin(good)
+    assert played.in_turn([first, second, good, other]) == [second, first, other, good]
+
+
+def test_a_cell_that_another_worker_plays_by_now_is_not_given_up(tmp_path: Path) -> None:
+    (cell,) = small().cells
+    parent, worker = Store(tmp_path, small()), Store(tmp_path, small())
+    for _ in range(store.MAX_ATTEMPTS):
+        assert parent.begin(cell)
+    with worker.claimed(cell):
+        parent.lost(cell, "it was killed")
+        assert not parent.is_over(cell)
+    parent.lost(cell, "it was killed")
+    assert parent.is_over(cell)
+    worker.finish(cell, lines_of(cell), [])
+    parent.lost(cell, "it was killed again")
+    assert parent.file(cell, "given_up").read_text() == "it was killed; 3 attempts"
+
+
+# Files
+
+
+@pytest.mark.parametrize(
+    "damage",
+    [
+        lambda data: b"",
+        lambda data: data[:-1],
+        lambda data: data[: len(data) // 2],
+        lambda data: data[: data.index(b"\n") + 1],
+        lambda data: bytes(len(data)),
+        lambda data: b"[1]\n" + data,
+    ],
+)
+def test_a_cell_whose_file_is_cut_off_is_not_finished(damage, tmp_path: Path) -> None:
+    (cell,) = small().cells
+    played = Store(tmp_path, small())
+    played.finish(cell, lines_of(cell), [])
+    assert played.is_finished(cell)
+    path = played.file(cell, "jsonl")
+    path.write_bytes(damage(path.read_bytes()))
+    assert not played.is_finished(cell) and not played.is_over(cell)
+    played.merge()
+    assert (tmp_path / "results.jsonl").read_bytes() == b""
+    played.finish(cell, lines_of(cell), [])
+    assert played.is_finished(cell)
+
+
+def test_a_finished_cell_has_a_line_or_an_error_of_each_episode(tmp_path: Path) -> None:
+    (cell,) = small().cells  # seeds 7, 8, 9
+    first, _, third = lines_of(cell)
+    error = EpisodeError(cell.key, 8, "ArithmeticError", cell.command)
+    played = Store(tmp_path, small())
+    played.finish(cell, [first, third], [error])
+    assert played.is_finished(cell)
+    played.file(cell, "errors").write_text('{"cell": "')
+    assert not Store(tmp_path, small()).is_finished(cell)
+    played.finish(cell, [first, first, third, third], [error])  # of two tasks
+    assert played.is_finished(cell)
+    played.finish(cell, [first, first, third], [error])
+    assert not played.is_finished(cell)
+
+
+def test_what_is_written_is_on_the_disk_before_it_has_its_name(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    events: list[str] = []
+    fsync, replace = os.fsync, Path.replace
+
+    def synced(file: int | IO) -> None:
+        events.append(Path(os.readlink(f"/proc/self/fd/{file}")).name)
+        fsync(file)
+
+    def replaced(path: Path, target: Path) -> Path:
+        events.append(f"-> {target.name}")
+        return replace(path, target)
+
+    monkeypatch.setattr(os, "fsync", synced)
+    monkeypatch.setattr(Path, "replace", replaced)
+    with files.written_whole(tmp_path / "a.json", tmp_path / "b") as (path, folder):
+        path.write_text("{}")
+        folder.mkdir()
+        (folder / "c").write_text("")
+    assert events == ["a.json", "b", "c", "-> a.json", "-> b", tmp_path.name]
