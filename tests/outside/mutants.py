@@ -1,6 +1,6 @@
 """Change the code that numbers come from, one place at a time, and count the changes that no test notices.
 
-`make mutants` tries a sample (`MUTANTS=400`), `make mutants MUTANTS=all` every one, which takes hours on two cores.
+`make mutants` tries a sample (`MUTANTS=400`); `make mutants MUTANTS=all` tries every one, for hours.
 Which code is changed and which tests run on it stands in pyproject.toml under [tool.mutmut].
 """
 
@@ -38,7 +38,7 @@ def exit_codes() -> dict[str, int | None]:
 
 
 def module_of(name: str) -> str:
-    """Return the part of the package that a mutant is in: `lerobot_bomb.flow.path.x_f__mutmut_1` -> `flow`."""
+    """Return the part of the package that a mutant is in, such as `flow`."""
     parts = name.split(".")
     return parts[1] if parts[1] in ("actions", "evaluation", "flow", "report", "stats") else parts[2]
 
