@@ -1,7 +1,7 @@
 # `make` finds a Python >= 3.12 by itself; name one with `make PYTHON=/path/to/python3.12 ...`.
 SHELL := /bin/bash
 .DEFAULT_GOAL := help
-.PHONY: help setup demo demo-train test test-long test-cuda judges check build docs clean
+.PHONY: help setup demo demo-train test test-long test-cuda judges mutants check build docs clean
 
 BIN := .venv/bin
 STAMP := .venv/.installed
@@ -20,6 +20,7 @@ help:
 	@echo "make test-long  the heavy tests as well"
 	@echo "make test-cuda  checks that need a CUDA device"
 	@echo "make judges     LeRobot's own tests on our types: LEROBOT_SRC=checkout of its tag"
+	@echo "make mutants    changes of the statistics, actions and losses that no test notices: MUTANTS=400"
 	@echo "make check      ruff, format, pyright"
 	@echo "make build      sdist and wheel into dist/, tried in an environment of their own"
 	@echo "make docs       the documentation as a site, into site/"
@@ -58,6 +59,10 @@ test-cuda: setup
 
 judges: setup
 	@$(BIN)/python tests/outside/run_judges.py "$(LEROBOT_SRC)"
+
+mutants: setup
+	@$(BIN)/uv pip install -q -p $(BIN)/python -c constraints.txt --group mutants
+	@$(BIN)/python tests/outside/mutants.py $(MUTANTS)
 
 check: $(STAMP)
 	@$(BIN)/ruff check .
