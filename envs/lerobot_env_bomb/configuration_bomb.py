@@ -26,6 +26,7 @@ from lerobot_bomb.bomb.suites import SUITES
 from lerobot_bomb.checkpoints.environment import check_acting_policy
 from lerobot_bomb.checkpoints.identity import policy_of_results
 from lerobot_bomb.checkpoints.queries import last_query
+from lerobot_bomb.compat.use import use
 from lerobot_bomb.conditions import ALL
 from lerobot_bomb.data.environment import Environment
 from lerobot_bomb.envs.results import check_results_path
@@ -74,6 +75,7 @@ class BombEnvConfig(EnvConfig):
     features_map: dict[str, str] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
+        use()
         with flag_errors():
             # an invalid flag raises here, before anything is built
             for spec in itertools.chain(*self.groups.values()):

@@ -15,6 +15,7 @@ from lerobot_bomb.checkpoints.identity import policy_of_results
 from lerobot_bomb.checkpoints.interface import Interface
 from lerobot_bomb.checkpoints.libero_orientation import OrientationCheck
 from lerobot_bomb.checkpoints.queries import last_query
+from lerobot_bomb.compat.use import use
 from lerobot_bomb.envs.results import check_results_path
 from lerobot_bomb.envs.vector import LazyVectorEnv
 from lerobot_bomb.flag_errors import flag_errors
@@ -41,6 +42,7 @@ class BombLiberoEnvConfig(LiberoEnv):
     ignore_checkpoint: bool = False
 
     def __post_init__(self) -> None:
+        use()
         with flag_errors():
             # an invalid flag raises here, before anything is built
             if not self.init_states:

@@ -13,6 +13,7 @@ from lerobot.utils.constants import ACTION, OBS_IMAGE, OBS_STATE
 from lerobot_bomb.checkpoints.identity import policy_of_results
 from lerobot_bomb.checkpoints.interface import Interface
 from lerobot_bomb.checkpoints.queries import last_query
+from lerobot_bomb.compat.use import use
 from lerobot_bomb.envs.results import check_results_path
 from lerobot_bomb.envs.vector import LazyVectorEnv
 from lerobot_bomb.flag_errors import flag_errors
@@ -59,6 +60,7 @@ class BombPushTEnvConfig(EnvConfig):
     features_map: dict[str, str] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
+        use()
         with flag_errors():
             # an invalid flag raises here, before anything is built
             one_of("--env.task", self.task, TASKS)

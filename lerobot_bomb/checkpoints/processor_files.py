@@ -18,8 +18,8 @@ from lerobot.processor import (
 )
 from lerobot.utils.constants import POLICY_POSTPROCESSOR_DEFAULT_NAME, POLICY_PREPROCESSOR_DEFAULT_NAME
 
-from lerobot_bomb._compat import check_processors_before_use
 from lerobot_bomb.actions.relative import BOUND_STATISTICS, CENTRE_AND_DISTANCE
+from lerobot_bomb.compat.hooks.processors import check_processors_before_use
 from lerobot_bomb.files import read_json
 from lerobot_bomb.finite import require_finite
 from lerobot_bomb.vlm.task_tokenizer import TaskTokenizerStep
@@ -109,6 +109,8 @@ def _check_step(step: Mapping[str, Any], where: str, policy_type: object) -> Non
         raise ValueError(f"{where}: the config of its step {name!r} is no JSON object")
     if "state_file" in step:
         _check_state_file(step["state_file"], where)
+    if "artifacts" in step:
+        _check_artifacts(step["artifacts"], f"{where}: artifacts of its step {name!r}", policy_type)
 
 
 def _name_of_class(path: object, where: str, policy_type: object) -> str | None:
@@ -137,8 +139,18 @@ def _check_state_file(name: object, where: str) -> None:
         )
 
 
+def _check_artifacts(artifacts: object, what: str, policy_type: object) -> None:
+    """Check the folders that take the place of values of a step's config (LeRobot 0.6.2)."""
+    if is_ours(policy_type):
+        raise ValueError(f"{what} are other files, which no {policy_type} needs")
+    paths = list(artifacts.values()) if isinstance(artifacts, dict) else [artifacts]
+    for path in paths:
+        if not isinstance(path, str) or Path(path).is_absolute() or ".." in Path(path).parts:
+            raise ValueError(f"{what}: {path!r} is no path in the checkpoint's folder")
+
+
 def check_saved_processors() -> None:
-    """From now on, whoever loads a processor in this process has it checked: LeRobot's commands too."""
+    """Have whoever loads a processor in this process has it checked: LeRobot's commands too."""
     check_processors_before_use(
         lambda content, where, config: state_files(content, where, saved_type(config)),
         lambda steps, where, config: check_states(steps, where, is_ours(saved_type(config))),

@@ -94,6 +94,10 @@ class ChunkPolicy(HubPolicy, SavesTiedWeightsOnce, PreTrainedPolicy):
         self._queue: deque[Tensor] = deque(maxlen=self.config.n_action_steps)
         self._batch_size: int | None = None  # of the episodes that are under way
 
+    def drop_queued_actions(self) -> None:
+        """Let the next `select_action` predict; LeRobot 0.6.2 asks for it where the instruction changes."""
+        self._queue.clear()
+
     def _check_batch_size(self, batch: dict[str, Tensor]) -> None:
         """Raise unless a batch has as many rows as the one before it since `reset`."""
         batch_size = len(batch[self._cameras[0]])
@@ -224,6 +228,11 @@ class VlaPolicy(ChunkPolicy):
 
     def reset(self) -> None:
         super().reset()
+        if self._ensemble is not None:
+            self._ensemble.reset()
+
+    def drop_queued_actions(self) -> None:
+        super().drop_queued_actions()
         if self._ensemble is not None:
             self._ensemble.reset()
 

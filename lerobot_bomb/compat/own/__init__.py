@@ -1,0 +1,1 @@
+"""What our own commands change, in their own process."""
