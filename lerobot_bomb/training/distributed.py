@@ -9,7 +9,7 @@ from torch import Tensor, distributed, nn
 from torch.distributed.checkpoint.state_dict import StateDictOptions, get_model_state_dict
 from torch.distributed.fsdp import FSDPModule
 
-ONE_FILE = "1PB"  # no checkpoint is larger
+ONE_FILE = "1000TB"  # no checkpoint is larger
 
 
 def process_number() -> int:
