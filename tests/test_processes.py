@@ -160,13 +160,13 @@ def test_a_policy_that_is_sharded_in_place_saves_its_weights_whole_and_once(
     """As LeRobot 0.6.2 shards them; where a module's weights are another's, too, strict loading says so."""
     policy = CASES[policy_type].make_policy()
     before = {name: tensor.clone() for name, tensor in policy.state_dict().items()}
-    distributed.init_process_group("gloo", store=distributed.HashStore(), rank=0, world_size=1)
+    distributed.init_process_group("gloo", f"file://{tmp_path}/meeting", rank=0, world_size=1)
     try:
         fully_shard(policy, mesh=init_device_mesh("cpu", (1,)))
-        policy.save_pretrained(tmp_path)
+        policy.save_pretrained(tmp_path / "saved")
     finally:
         distributed.destroy_process_group()
-    after = get_policy_class(policy_type).from_pretrained(tmp_path).state_dict()
+    after = get_policy_class(policy_type).from_pretrained(tmp_path / "saved").state_dict()
     torch.testing.assert_close(after, before, rtol=0, atol=0)
     named = type(CASES[policy_type].make_policy())._fsdp_wrap_modules  # LeRobot asks the class
     assert named == policy._no_split_modules

@@ -57,6 +57,7 @@ class Vla0SmolPolicy(RelativeVlaPolicy, TokenVlaPolicy):
     config: Vla0SmolConfig
     shapes, as_trained = SHAPES, AS_TRAINED
     symbol_ids: Tensor
+    _fsdp_wrap_modules: list[str]
 
     def __init__(
         self, config: Vla0SmolConfig, dataset_meta: LeRobotDatasetMetadata | None = None, **_: object

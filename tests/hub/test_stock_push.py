@@ -53,8 +53,9 @@ class Training:
 
     def push(self) -> None:
         """As `lerobot_train` does."""
-        if hasattr(train_utils, "publish_trained_model"):  # LeRobot 0.6.2
-            train_utils.publish_trained_model(self.cfg, self.policy, *self.processors, None)
+        publish: Any = getattr(train_utils, "publish_trained_model", None)  # LeRobot 0.6.2
+        if publish is not None:
+            publish(self.cfg, self.policy, *self.processors, None)
             return
         self.policy.push_model_to_hub(self.cfg, state_dict=None, dataset_meta=None)
         for processor in self.processors:
