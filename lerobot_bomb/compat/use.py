@@ -1,4 +1,4 @@
-"""When the hooks are installed: as soon as a type or a command of ours is used.
+"""The moment at which hooks are installed: the first use of a type or a command of ours.
 
 LeRobot imports the plugin in every command of every user, most of whom use something else.
 """
@@ -28,10 +28,10 @@ def use() -> None:
 
 
 def is_ours(kind: type) -> bool:
-    """Whether a class, or one that it builds on, is of a package that was registered."""
+    """Return whether a class, or one that it builds on, is of a package that was registered."""
     return any(base.__module__.partition(".")[0] in _packages for base in kind.__mro__)
 
 
 def is_of_ours(module: str) -> bool:
-    """Whether a module is of a package that was registered."""
+    """Return whether a module is of a package that was registered."""
     return module.partition(".")[0] in _packages

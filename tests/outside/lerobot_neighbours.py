@@ -14,7 +14,7 @@ ENTRY: str = "lerobot_policy_bomb"
 
 
 class Outcomes:
-    """Of every test, the first that is no pass."""
+    """Outcome of every test: the first that is no pass, or passed."""
 
     def __init__(self) -> None:
         self.of: dict[str, str] = {}

@@ -33,7 +33,7 @@ def checkout_version(folder: Path) -> str | None:
 
 
 def is_installed_from(folder: Path) -> bool:
-    """Whether the installed LeRobot is that of this checkout (`make test-lerobot`)."""
+    """Return whether the installed LeRobot is that of this checkout (`make test-lerobot`)."""
     origin = json.loads(distribution("lerobot").read_text("direct_url.json") or "{}")
     return origin.get("url") == folder.as_uri()
 
@@ -62,7 +62,7 @@ def find_checkout(given: str) -> Path:
 
 
 def environment() -> dict[str, str]:
-    """Of a pytest that runs in the checkout, which stays untouched."""
+    """Variables of a pytest that runs in the checkout, which stays untouched."""
     return os.environ | {
         "PYTHONPATH": os.pathsep.join(str(ROOT / folder) for folder in ("tests/outside", "benchmarks")),
         "PYTHONDONTWRITEBYTECODE": "1",

@@ -1,6 +1,6 @@
 """LeRobot's own tests with the plugin installed and without: `python run_neighbours.py CHECKOUT_OF_LEROBOT`.
 
-What they say must be the same: who installed the plugin and uses none of its types notices nothing.
+Their outcomes must be the same: who installed the plugin and uses none of its types notices nothing.
 """
 
 import json

@@ -1,4 +1,4 @@
-"""What our code refuses and what configs cannot be, told by LeRobot's commands in a line."""
+"""Refusals of our code, and configs that cannot be read, told by LeRobot's commands in a line."""
 
 import dis
 import os
@@ -70,7 +70,7 @@ def tell_refusals() -> None:
 
 
 def _is_ours(traceback: TracebackType | None) -> bool:
-    """Whether the error is of a `raise` statement in a module of ours."""
+    """Return whether the error is of a `raise` statement in a module of ours."""
     if traceback is None:
         return False
     while traceback.tb_next is not None:

@@ -1,4 +1,4 @@
-"""What goes to the Hub: no token that a header cannot hold, and a trained policy of ours as one commit."""
+"""Uploads to the Hub: no token that a header cannot hold, and a trained policy of ours as one commit."""
 
 import sys
 from collections.abc import Callable

@@ -1,4 +1,4 @@
-"""Which policies a process has built, and calls of them: LeRobot tells an environment nothing of these."""
+"""The policies that a process has built, and calls of them, of which LeRobot tells an environment nothing."""
 
 import gc
 from collections.abc import Callable, Iterator

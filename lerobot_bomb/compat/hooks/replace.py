@@ -1,4 +1,4 @@
-"""How a hook takes the place of a function or method."""
+"""The one way in which a hook takes the place of a function or method."""
 
 import inspect
 from collections.abc import Callable

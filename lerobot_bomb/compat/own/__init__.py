@@ -1,1 +1,1 @@
-"""What our own commands change, in their own process."""
+"""Changes that our own commands make, in their own process."""

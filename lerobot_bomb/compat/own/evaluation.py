@@ -1,4 +1,4 @@
-"""How our commands run lerobot-eval in their own process."""
+"""lerobot-eval in the process of our commands."""
 
 import gc
 import sys

@@ -1,4 +1,4 @@
-"""What recorder and converters change in LeRobot's writer of datasets, while they write."""
+"""Changes to LeRobot's writer of datasets, while recorder or converters write."""
 
 import shutil
 from collections.abc import Collection, Iterator
