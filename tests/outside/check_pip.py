@@ -1,4 +1,4 @@
-"""The lines for pip users, followed in an empty environment: `python check_pip.py`. It downloads gigabytes."""
+"""The lines for pip users, in an empty environment: `python check_pip.py`. It downloads gigabytes."""
 
 import os
 import re
