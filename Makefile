@@ -1,7 +1,8 @@
 # `make` finds a Python >= 3.12 by itself; name one with `make PYTHON=/path/to/python3.12 ...`.
 SHELL := /bin/bash
 .DEFAULT_GOAL := help
-.PHONY: help setup demo demo-train test test-long test-cuda judges mutants check build docs clean
+.PHONY: help setup demo demo-train test test-long test-cuda judges neighbours test-lerobot mutants check build \
+	docs clean
 
 BIN := .venv/bin
 STAMP := .venv/.installed
@@ -20,6 +21,8 @@ help:
 	@echo "make test-long  the heavy tests as well"
 	@echo "make test-cuda  checks that need a CUDA device"
 	@echo "make judges     LeRobot's own tests on our types: LEROBOT_SRC=checkout of its tag"
+	@echo "make neighbours LeRobot's own tests with the plugin and without: LEROBOT_SRC=the same"
+	@echo "make test-lerobot  tests and judges with another LeRobot: LEROBOT_SRC=a checkout of it"
 	@echo "make mutants    changes of the statistics, actions and losses that no test notices: MUTANTS=400"
 	@echo "make check      ruff, format, pyright"
 	@echo "make build      sdist and wheel into dist/, tried in an environment of their own"
@@ -59,6 +62,13 @@ test-cuda: setup
 
 judges: setup
 	@$(BIN)/python tests/outside/run_judges.py "$(LEROBOT_SRC)"
+
+neighbours: setup
+	@$(BIN)/python tests/outside/run_neighbours.py "$(LEROBOT_SRC)"
+
+# versions are those of constraints.txt where that LeRobot allows them
+test-lerobot: setup
+	@$(BIN)/python tests/outside/try_lerobot.py "$(LEROBOT_SRC)"
 
 mutants: setup
 	@$(BIN)/uv pip install -q -p $(BIN)/python -c constraints.txt --group mutants

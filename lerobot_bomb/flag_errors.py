@@ -1,19 +1,12 @@
 """What our code refuses, said so that LeRobot's commands pass it on in a line."""
 
-import dis
-import os
 import re
-import sys
 from collections.abc import Collection, Iterator, Sequence
 from contextlib import contextmanager
 from difflib import get_close_matches
-from pathlib import Path
-from types import ModuleType, TracebackType
 from typing import Any, NoReturn
 
 from draccus.utils import DecodingError
-
-SHOW_TRACEBACK = "LEROBOT_BOMB_TRACEBACK"  # environment variable
 
 
 class FlagError(DecodingError):
@@ -86,36 +79,3 @@ def refuse_recording_of_several(config: Any) -> None:
             "--eval.n_episodes=1, and --seed=NUMBER for other episodes; each task of --env.task_ids and "
             "condition of --env.perturbations is recorded"
         )
-
-
-def tell_refusals(packages: Collection[ModuleType]) -> None:
-    """Let LeRobot's commands end in one line where one of the packages refuses something, or with Ctrl-C.
-
-    An error that one raises on purpose says what to do, and the traceback before it hides that. With
-    LEROBOT_BOMB_TRACEBACK=1 it is shown.
-    """
-    command, usual = Path(sys.argv[0]).name, sys.excepthook
-    if not command.startswith("lerobot-") or os.environ.get(SHOW_TRACEBACK):
-        return
-    names = {package.__name__ for package in packages}
-
-    def tell(kind: type[BaseException], error: BaseException, traceback: TracebackType | None) -> None:
-        if issubclass(kind, KeyboardInterrupt):
-            print(f"{command}: interrupted", file=sys.stderr)
-        elif issubclass(kind, (ValueError, OSError, RuntimeError)) and _is_raised_by(names, traceback):
-            print(f"{command}: error: {error}", file=sys.stderr)
-        else:
-            usual(kind, error, traceback)
-
-    sys.excepthook = tell
-
-
-def _is_raised_by(packages: Collection[str], traceback: TracebackType | None) -> bool:
-    """Whether the error is of a `raise` statement in a module of these packages."""
-    if traceback is None:
-        return False
-    while traceback.tb_next is not None:
-        traceback = traceback.tb_next
-    frame = traceback.tb_frame
-    is_raise = frame.f_code.co_code[traceback.tb_lasti] == dis.opmap["RAISE_VARARGS"]
-    return is_raise and frame.f_globals.get("__name__", "").partition(".")[0] in packages

@@ -174,7 +174,12 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
 
 
 def pytest_collection_finish() -> None:
-    """What is imported by now stays: no garbage collection need look at it again."""
+    """Register the plugin, as LeRobot's commands do, whichever files are run and in whatever order.
+
+    What is imported by now stays: no garbage collection need look at it again.
+    """
+    if "lerobot" in sys.modules:  # importing it takes seconds, and many tests do without
+        importlib.import_module("lerobot_policy_bomb")
     gc.collect()
     gc.freeze()
 

@@ -10,7 +10,7 @@ from lerobot.policies import PreTrainedPolicy, make_policy
 from lerobot.policies.act.configuration_act import ACTConfig
 
 import lerobot_policy_bomb  # noqa: F401  the plugin
-from lerobot_bomb._compat import built_policies, training_data
+from lerobot_bomb.compat.hooks.policies import built_policies, training_data
 from lerobot_env_bomb.configuration_bomb import BombEnvConfig
 
 

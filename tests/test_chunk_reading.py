@@ -10,7 +10,9 @@ from lerobot.datasets.dataset_reader import DatasetReader
 from PIL import PngImagePlugin
 from pusht_cases import REPO_ID
 
-import lerobot_policy_bomb  # noqa: F401  the plugin
+from lerobot_bomb.compat.use import use
+
+use()
 
 CHUNK = {"action": [step / 10 for step in range(16)]}
 TWO_IMAGES = {"observation.image": [-0.1, 0.0], "observation.state": [-0.1, 0.0]}

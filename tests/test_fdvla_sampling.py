@@ -137,6 +137,17 @@ def test_actions_are_queued_and_forgotten_on_reset() -> None:
     assert torch.equal(action, policy.predict_action_chunk(second, noise)[:, 0])
 
 
+def test_dropped_actions_are_predicted_anew() -> None:
+    policy = make_policy(n_action_steps=2)
+    first, second = make_batch(policy, 2, seed=1), make_batch(policy, 2, seed=2)
+    chunks = [policy.predict_action_chunk(batch) for batch in (first, second)]
+    policy.reset()
+    policy.drop_queued_actions()
+    assert torch.equal(policy.select_action(first), chunks[0][:, 0])
+    policy.drop_queued_actions()
+    assert torch.equal(policy.select_action(second), chunks[1][:, 0])
+
+
 def test_the_prompt_is_read_once_and_the_segment_at_every_step(monkeypatch: pytest.MonkeyPatch) -> None:
     policy = make_policy(num_inference_steps=5)
     shapes: dict[str, list[tuple[int, ...]]] = {"read_prefix": [], "read_segment": []}

@@ -12,12 +12,13 @@ from draccus.utils import DecodingError
 from lerobot.configs.default import EvalConfig
 from lerobot.configs.eval import EvalPipelineConfig
 from lerobot.envs import make_env_config
-from lerobot.utils.import_utils import register_third_party_plugins
 
-import lerobot_bomb
+import lerobot_policy_bomb  # noqa: F401  the plugin
 from lerobot_bomb.commands import main as cli
 from lerobot_bomb.commands.main import main
-from lerobot_bomb.flag_errors import FlagError, nearest_flags, tell_refusals
+from lerobot_bomb.compat.hooks.errors import tell_refusals
+from lerobot_bomb.compat.use import use
+from lerobot_bomb.flag_errors import FlagError, nearest_flags
 from lerobot_bomb.vlm.backbone import build_backbone
 from lerobot_bomb.vlm.paligemma import build_paligemma
 from lerobot_bomb.vlm.presets import nano_config, nano_paligemma_config, nano_qwen_config
@@ -56,7 +57,6 @@ def test_a_wrong_flag_in_a_config_file_is_one_line(
 def test_several_episodes_of_an_environment_are_not_recorded_under_one_instruction(
     env_type: str, stock_cli: Callable[..., None], tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    register_third_party_plugins()
     told = (
         r"^--eval\.recording=true with --eval\.n_episodes=3: .* Give --eval\.n_episodes=1, and --seed=NUMBER"
     )
@@ -74,10 +74,13 @@ def test_several_episodes_of_an_environment_are_not_recorded_under_one_instructi
     assert not (tmp_path / "eval").exists()
 
 
-def test_what_lerobots_parser_does_not_catch_is_one_line_too(capsys: pytest.CaptureFixture[str]) -> None:
+def test_what_lerobots_parser_does_not_catch_is_one_line_too(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
     """lerobot-train reads a checkpoint's config after its parser."""
-    register_third_party_plugins()
-    capsys.readouterr()  # what the registration logs
+    monkeypatch.setattr(sys, "argv", ["src/lerobot/scripts/lerobot_train.py"])
+    monkeypatch.setattr(sys, "excepthook", sys.__excepthook__)
+    tell_refusals()
     error = DecodingError((), "--policy.chunk_size=0 must be at least 1")
     sys.excepthook(DecodingError, error, None)
     assert capsys.readouterr().err == f"error: {error}\n"
@@ -142,6 +145,24 @@ def test_an_unknown_flag_is_one_line_with_the_nearest_and_where_all_are(
     assert errors[0].endswith(f"; {' '.join(types)} --help lists all flags")
 
 
+@pytest.mark.parametrize(
+    ("flag", "message"),
+    [
+        ("--env.tsak=PushT-v0", "unrecognized arguments: --env.tsak=PushT-v0\n"),
+        ("--env.results_path=x", "The fields `results_path` are not valid for PushtEnv\n"),
+    ],
+)
+def test_a_wrong_flag_of_other_types_is_told_as_lerobot_tells_it(
+    flag: str, message: str, stock_cli: Callable[..., None], capsys: pytest.CaptureFixture[str]
+) -> None:
+    use()
+    with pytest.raises(SystemExit):
+        stock_cli("lerobot-eval", "--policy.type=act", "--env.type=pusht", flag)
+    errors = capsys.readouterr().err
+    assert errors.endswith(message)
+    assert ("usage: " in errors) is ("unrecognized" in message)
+
+
 def test_our_commands_name_the_nearest_flag_too(capsys: pytest.CaptureFixture[str]) -> None:
     with pytest.raises(SystemExit):
         main(["view", "--sed=9"])
@@ -176,7 +197,7 @@ def test_a_refusal_is_told_without_a_traceback_and_a_mistake_with_one(
     passed_on: list[type[BaseException]] = []
     monkeypatch.setattr(sys, "argv", ["bin/lerobot-eval"])
     monkeypatch.setattr(sys, "excepthook", lambda kind, error, traceback: passed_on.append(kind))
-    tell_refusals([lerobot_bomb])
+    tell_refusals()
     with pytest.raises(BaseException) as raised:  # any
         exec(code, {"__name__": module})
     sys.excepthook(raised.type, raised.value, raised.tb)
@@ -191,5 +212,5 @@ def test_elsewhere_and_where_asked_tracebacks_are_as_usual(
     usual = sys.excepthook
     monkeypatch.setattr(sys, "argv", [command])
     monkeypatch.setenv("LEROBOT_BOMB_TRACEBACK", variable)
-    tell_refusals([lerobot_bomb])
+    tell_refusals()
     assert sys.excepthook is usual

@@ -23,11 +23,12 @@ NAMES_POLICIES = {
     "demo.py": {"vla0_smol", "bomb_expert", "bomb_random"},  # who plays
 }
 HEAVY = {"torch", "lerobot", "transformers", "rerun", "cv2"}
+NOT_OURS = {"lerobot", "draccus", "argparse", "huggingface_hub", "datasets", "transformers"}
 STOCK = "stock.py"  # an environment of LeRobot's, which ours is
 CORE = "lerobot_bomb"
 # a folder or module of the core imports from those above it in this list
 ORDER = [
-    "__init__", "_compat", "finite", "flag_errors", "flags", "conditions", "stats", "bootstrap",
+    "__init__", "compat", "finite", "flag_errors", "flags", "conditions", "stats", "bootstrap",
     "smoothness", "tables", "files", "cuda_graphs",
     "bomb", "pusht", "libero", "envs", "actions", "flow", "vlm", "decoding", "training", "data",
     "checkpoints", "evaluation", "viewing", "explain", "hub", "policies", "serving", "harness", "sweep",
@@ -156,3 +157,34 @@ def test_what_simulator_workers_import_from_the_core_is_light(name: str) -> None
 def test_the_recorder_checks_its_flags_before_it_imports_anything_heavy() -> None:
     for name in ("commands/record.py", "data/record.py"):
         assert not imported(ROOT / "lerobot_bomb" / name, top_level_only=True) & HEAVY
+
+
+def replaced(path: Path) -> set[str]:
+    """Attributes of modules and classes of LeRobot, and of what it stands on, that a file assigns to."""
+    tree = ast.parse(path.read_text())
+    theirs = set()
+    for node in ast.walk(tree):
+        for alias in node.names if isinstance(node, ast.Import | ast.ImportFrom) else ():
+            module = node.module if isinstance(node, ast.ImportFrom) else alias.name
+            if (module or "").split(".")[0] in NOT_OURS:
+                theirs.add(alias.asname or alias.name.split(".")[0])
+    found = set()
+    for node in ast.walk(tree):
+        targets = node.targets if isinstance(node, ast.Assign) else []
+        found |= {ast.unparse(each) for each in targets if isinstance(each, ast.Attribute | ast.Subscript)}
+        if isinstance(node, ast.Call) and ast.unparse(node.func) == "setattr":
+            found.add(ast.unparse(node.args[0]) + ".")
+    return {text for text in found if re.split(r"[.\[]", text)[0] in theirs or text == "sys.excepthook"}
+
+
+@pytest.mark.parametrize(
+    "path", files(CORE, "envs", "policies"), ids=lambda path: str(path.relative_to(ROOT))
+)
+def test_only_compat_replaces_what_is_lerobots(path: Path) -> None:
+    if path.relative_to(ROOT).parts[:2] != (CORE, "compat"):
+        assert not replaced(path)
+
+
+def test_what_is_replaced_is_found() -> None:
+    found = set().union(*(replaced(path) for path in files("lerobot_bomb/compat")))
+    assert {"sys.excepthook", "dataset_writer.compute_episode_stats", "lerobot_eval."} <= found

@@ -22,11 +22,11 @@ from policy_cases import CASES
 from test_results import values
 
 import lerobot_policy_bomb  # noqa: F401  the plugin
-from lerobot_bomb import _compat
 from lerobot_bomb.bomb.observation import RenderOptions
 from lerobot_bomb.checkpoints import queries
 from lerobot_bomb.checkpoints.queries import last_query, time_queries
 from lerobot_bomb.commands.main import main
+from lerobot_bomb.compat.hooks import policies as built
 from lerobot_bomb.envs.inference import Inference, Query
 from lerobot_bomb.envs.results import MEASURED
 from lerobot_bomb.evaluation.efficiency import efficiencies
@@ -51,7 +51,7 @@ ACT_BATCH = {
 
 @pytest.fixture(autouse=True)
 def no_policy_of_other_tests(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(_compat, "_BUILT", [])
+    monkeypatch.setattr(built, "_BUILT", [])
 
 
 def make_act(**flags: Any) -> PreTrainedPolicy:

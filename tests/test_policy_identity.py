@@ -16,10 +16,10 @@ from lerobot.policies import PreTrainedPolicy, make_policy
 from lerobot.policies.act.configuration_act import ACTConfig
 
 import lerobot_policy_bomb  # noqa: F401  the plugin
-from lerobot_bomb import _compat
-from lerobot_bomb._compat import built_policies
 from lerobot_bomb.checkpoints.identity import _of_checkpoint, acting_policy, identity_of, identity_of_config
 from lerobot_bomb.checkpoints.shipped import checkpoint_path
+from lerobot_bomb.compat.hooks import policies as built
+from lerobot_bomb.compat.hooks.policies import built_policies
 from lerobot_bomb.envs.results import PolicyIdentity
 from lerobot_bomb.evaluation.results import read_results
 from lerobot_env_bomb.configuration_bomb import BombEnvConfig
@@ -30,7 +30,7 @@ ENV = BombEnvConfig(image_size=32, fps=1)
 
 @pytest.fixture(autouse=True)
 def no_policy_of_other_tests(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(_compat, "_BUILT", [])
+    monkeypatch.setattr(built, "_BUILT", [])
 
 
 def act_config(**flags: Any) -> ACTConfig:

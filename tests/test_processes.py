@@ -8,8 +8,12 @@ import pytest
 import torch
 from lerobot.datasets import LeRobotDataset
 from lerobot.policies.factory import get_policy_class
+from lerobot.scripts import lerobot_train
 from policy_cases import CASES
 from recipes import POLICY_TYPES, recipe_path
+from torch import distributed
+from torch.distributed.device_mesh import init_device_mesh
+from torch.distributed.fsdp import fully_shard
 from training_processes import NUM_PROCESSES, Seen, Training, draws_by_sample, in_processes, seen_losses
 from variants import as_flags, small_policy
 
@@ -124,6 +128,9 @@ def test_a_log_line_comes_from_one_process(two: tuple[Path, Seen]) -> None:
 
 
 @pytest.mark.long
+@pytest.mark.skipif(
+    not hasattr(lerobot_train, "gather_fsdp_state_dicts"), reason="LeRobot 0.6.2 has no FSDP1"
+)
 def test_sharded_by_fsdp_they_train_the_same(
     policy_type: str, stock_cli: Callable[..., None], dataset: Path, tmp_path: Path
 ) -> None:
@@ -145,3 +152,21 @@ def test_fsdp_shards_every_layer_by_itself(policy_type: str) -> None:
         for block in module
     }
     assert named == stacks
+
+
+def test_a_policy_that_is_sharded_in_place_saves_its_weights_whole_and_once(
+    policy_type: str, tmp_path: Path
+) -> None:
+    """As LeRobot 0.6.2 shards them; where a module's weights are another's, too, strict loading says so."""
+    policy = CASES[policy_type].make_policy()
+    before = {name: tensor.clone() for name, tensor in policy.state_dict().items()}
+    distributed.init_process_group("gloo", f"file://{tmp_path}/meeting", rank=0, world_size=1)
+    try:
+        fully_shard(policy, mesh=init_device_mesh("cpu", (1,)))
+        policy.save_pretrained(tmp_path / "saved")
+    finally:
+        distributed.destroy_process_group()
+    after = get_policy_class(policy_type).from_pretrained(tmp_path / "saved").state_dict()
+    torch.testing.assert_close(after, before, rtol=0, atol=0)
+    named = type(CASES[policy_type].make_policy())._fsdp_wrap_modules  # LeRobot asks the class
+    assert named == policy._no_split_modules

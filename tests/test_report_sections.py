@@ -375,13 +375,13 @@ def test_videos_that_cannot_be_had_are_told_and_are_no_error(
 def test_failures_are_shown_as_videos_beside_the_page(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    from lerobot_bomb import _compat
+    from lerobot_bomb.compat.hooks import policies as built
     from lerobot_bomb.sweep.manifest import plan
     from lerobot_bomb.sweep.store import Store
     from lerobot_bomb.sweep.worker import Worker
 
     flags = ("--env.type=bomb", "--env.image_size=32", "--env.fps=2", "--policy.device=cpu")
-    monkeypatch.setattr(_compat, "_BUILT", [])  # the policies of other tests do not act here
+    monkeypatch.setattr(built, "_BUILT", [])  # the policies of other tests do not act here
     store = Store(tmp_path / "sweep", plan(("bomb_random",), (), ("none",), 7, 2, 2, flags))
     Worker(store).run(list(store.manifest.cells))
     store.merge()

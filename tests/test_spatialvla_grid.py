@@ -214,6 +214,16 @@ def test_actions_are_queued_and_forgotten_on_reset() -> None:
     assert torch.equal(policy.select_action(first), chunks[0][:, 0])
 
 
+def test_dropped_actions_are_not_averaged_either() -> None:
+    policy = make_policy(n_action_steps=1, temporal_ensemble_size=2)
+    first, second = make_batch(policy, 1, seed=1), make_batch(policy, 1, seed=2)
+    chunks = [policy.predict_action_chunk(batch) for batch in (first, second)]
+    policy.reset()
+    policy.select_action(first)
+    policy.drop_queued_actions()
+    torch.testing.assert_close(policy.select_action(second), chunks[1][:, 0])
+
+
 def test_an_ensemble_weighs_by_agreement_but_for_the_gripper() -> None:
     """As the original's evaluations: exp(0.1 times the cosine with the newest action)."""
     options: dict[str, Any] = {"n_action_steps": 1, "temporal_ensemble_size": 2}

@@ -8,7 +8,10 @@ import pytest
 from lerobot.utils import import_utils
 
 import lerobot_policy_bomb  # noqa: F401  the plugin
-from lerobot_bomb._compat import NO_TORCHCODEC_IN_SHORT
+from lerobot_bomb.compat.hooks.torchcodec import NO_TORCHCODEC_IN_SHORT
+from lerobot_bomb.compat.use import use
+
+use()
 
 
 def test_it_is_one_line(monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture) -> None:

@@ -11,7 +11,6 @@ from lerobot.envs import EnvConfig
 from lerobot.processor import PolicyProcessorPipeline
 from lerobot.utils.constants import ACTION, OBS_IMAGES, OBS_PREFIX, OBS_STATE
 
-from lerobot_bomb._compat import check_evaluations
 from lerobot_bomb.bomb.episode import DEFAULT_FPS, TASK_VERSION, EpisodeSpec
 from lerobot_bomb.bomb.observation import (
     ACTION_DIM,
@@ -27,11 +26,12 @@ from lerobot_bomb.bomb.suites import SUITES
 from lerobot_bomb.checkpoints.environment import check_acting_policy
 from lerobot_bomb.checkpoints.identity import policy_of_results
 from lerobot_bomb.checkpoints.queries import last_query
+from lerobot_bomb.compat.use import use
 from lerobot_bomb.conditions import ALL
 from lerobot_bomb.data.environment import Environment
 from lerobot_bomb.envs.results import check_results_path
 from lerobot_bomb.envs.vector import LazyVectorEnv, check_parallel_tasks
-from lerobot_bomb.flag_errors import flag_errors, refuse_recording_of_several
+from lerobot_bomb.flag_errors import flag_errors
 from lerobot_env_bomb.fetch_files import check_robot
 
 
@@ -75,7 +75,7 @@ class BombEnvConfig(EnvConfig):
     features_map: dict[str, str] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
-        check_evaluations(BombEnvConfig, refuse_recording_of_several)
+        use()
         with flag_errors():
             # an invalid flag raises here, before anything is built
             check_parallel_tasks(self.max_parallel_tasks)

@@ -11,14 +11,14 @@ from lerobot.envs.configs import LiberoEnv
 from lerobot.processor import PolicyProcessorPipeline
 from lerobot.utils.constants import LIBERO_KEY_PIXELS_AGENTVIEW, OBS_IMAGES, OBS_STATE
 
-from lerobot_bomb._compat import check_evaluations
 from lerobot_bomb.checkpoints.identity import policy_of_results
 from lerobot_bomb.checkpoints.interface import Interface
 from lerobot_bomb.checkpoints.libero_orientation import OrientationCheck
 from lerobot_bomb.checkpoints.queries import last_query
+from lerobot_bomb.compat.use import use
 from lerobot_bomb.envs.results import check_results_path
 from lerobot_bomb.envs.vector import LazyVectorEnv, check_parallel_tasks
-from lerobot_bomb.flag_errors import flag_errors, refuse_recording_of_several
+from lerobot_bomb.flag_errors import flag_errors
 from lerobot_bomb.flags import one_of
 from lerobot_bomb.libero.assets import SUITES, prepare_libero
 from lerobot_bomb.libero.episode import STATE_DIM, TASKS_PER_SUITE, LiberoSpec
@@ -42,7 +42,7 @@ class BombLiberoEnvConfig(LiberoEnv):
     ignore_checkpoint: bool = False
 
     def __post_init__(self) -> None:
-        check_evaluations(BombLiberoEnvConfig, refuse_recording_of_several)
+        use()
         with flag_errors():
             # an invalid flag raises here, before anything is built
             check_parallel_tasks(self.max_parallel_tasks)

@@ -10,13 +10,13 @@ from lerobot.envs import EnvConfig, env_to_policy_features
 from lerobot.processor import PolicyProcessorPipeline
 from lerobot.utils.constants import ACTION, OBS_IMAGE, OBS_STATE
 
-from lerobot_bomb._compat import check_evaluations
 from lerobot_bomb.checkpoints.identity import policy_of_results
 from lerobot_bomb.checkpoints.interface import Interface
 from lerobot_bomb.checkpoints.queries import last_query
+from lerobot_bomb.compat.use import use
 from lerobot_bomb.envs.results import check_results_path
 from lerobot_bomb.envs.vector import LazyVectorEnv, check_parallel_tasks
-from lerobot_bomb.flag_errors import flag_errors, refuse_recording_of_several
+from lerobot_bomb.flag_errors import flag_errors
 from lerobot_bomb.flags import one_of
 from lerobot_bomb.pusht.episode import (
     BOARD_PX,
@@ -60,7 +60,7 @@ class BombPushTEnvConfig(EnvConfig):
     features_map: dict[str, str] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
-        check_evaluations(BombPushTEnvConfig, refuse_recording_of_several)
+        use()
         with flag_errors():
             # an invalid flag raises here, before anything is built
             check_parallel_tasks(self.max_parallel_tasks)

@@ -14,6 +14,7 @@ from torch import Tensor
 
 from lerobot_bomb.bomb.observation import ACTION_DIM
 from lerobot_bomb.bomb.privileged_state import PrivilegedState
+from lerobot_bomb.compat.use import use
 
 
 @dataclass
@@ -23,6 +24,7 @@ class ScriptedConfig(PreTrainedConfig):
     push_to_hub: bool = False
 
     def __post_init__(self) -> None:
+        use()
         self.device = self.device or "cpu"
         super().__post_init__()
 

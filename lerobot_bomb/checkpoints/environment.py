@@ -11,8 +11,9 @@ from typing import Any, ClassVar
 
 from lerobot.configs import PreTrainedConfig
 
-from lerobot_bomb._compat import built_policies, training_data
 from lerobot_bomb.checkpoints.training import dataset_of, read_train_config
+from lerobot_bomb.compat.hooks.policies import built_policies, training_data
+from lerobot_bomb.compat.use import use
 from lerobot_bomb.data.environment import IMAGES, Environment
 from lerobot_bomb.data.facts import DatasetFacts
 
@@ -32,6 +33,10 @@ class ConfigWithEnvironment(PreTrainedConfig):
     environment: Environment | None = None
     # whether it acts in another one all the same; no checkpoint keeps this
     ignore_environment: bool = False
+
+    def __post_init__(self) -> None:
+        use()
+        super().__post_init__()
 
     def missing_parts(self) -> str | None:
         """What a checkpoint with this config lacks and what it would need instead; None: nothing."""

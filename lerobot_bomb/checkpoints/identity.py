@@ -13,10 +13,10 @@ import draccus
 from lerobot.configs import PreTrainedConfig
 from lerobot.policies import PreTrainedPolicy
 
-from lerobot_bomb._compat import built_policies, training_data
 from lerobot_bomb.checkpoints.checks import ADAPTERS, PROCESSORS
 from lerobot_bomb.checkpoints.names import BLANK_IMAGES, REPLACE_TASKS, WEIGHTS, local_file
 from lerobot_bomb.checkpoints.queries import time_queries
+from lerobot_bomb.compat.hooks.policies import built_policies, training_data
 from lerobot_bomb.envs.results import PolicyIdentity
 from lerobot_bomb.files import read_json
 

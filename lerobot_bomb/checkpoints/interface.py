@@ -9,9 +9,9 @@ from lerobot.configs import FeatureType, PolicyFeature, PreTrainedConfig
 from lerobot.utils.constants import ACTION, POLICY_POSTPROCESSOR_DEFAULT_NAME
 from safetensors import safe_open
 
-from lerobot_bomb._compat import training_data
 from lerobot_bomb.checkpoints.environment import asked_config, trained_environment
 from lerobot_bomb.checkpoints.identity import weights_file
+from lerobot_bomb.compat.hooks.policies import training_data
 
 # of where actions may lie; what moves over less of it in all demonstrations is in another unit
 LEAST_SPAN = 0.01

@@ -20,8 +20,8 @@ from lerobot.processor import (
 from lerobot.utils.constants import POLICY_POSTPROCESSOR_DEFAULT_NAME, POLICY_PREPROCESSOR_DEFAULT_NAME
 from safetensors import safe_open
 
-from lerobot_bomb._compat import check_processors_before_use
 from lerobot_bomb.actions.relative import BOUND_STATISTICS, CENTRE_AND_DISTANCE
+from lerobot_bomb.compat.hooks.processors import check_processors_before_use
 from lerobot_bomb.files import read_json
 from lerobot_bomb.finite import require_finite
 from lerobot_bomb.vlm.task_tokenizer import TaskTokenizerStep
@@ -113,6 +113,8 @@ def _check_step(step: Mapping[str, Any], where: str, policy_type: object) -> Non
         raise ValueError(f"{where}: the config of its step {name!r} is no JSON object")
     if "state_file" in step:
         _check_state_file(step["state_file"], where)
+    if "artifacts" in step:
+        _check_artifacts(step["artifacts"], f"{where}: artifacts of its step {name!r}", policy_type)
 
 
 def _name_of_class(path: object, where: str, policy_type: object) -> str | None:
@@ -150,8 +152,18 @@ def refuse_link_out(file: Path) -> None:
         raise ValueError(f"{file} is a link to {target}, out of the checkpoint's folder: put the file there")
 
 
+def _check_artifacts(artifacts: object, what: str, policy_type: object) -> None:
+    """Check the folders that take the place of values of a step's config (LeRobot 0.6.2)."""
+    if is_ours(policy_type):
+        raise ValueError(f"{what} are other files, which no {policy_type} needs")
+    paths = list(artifacts.values()) if isinstance(artifacts, dict) else [artifacts]
+    for path in paths:
+        if not isinstance(path, str) or Path(path).is_absolute() or ".." in Path(path).parts:
+            raise ValueError(f"{what}: {path!r} is no path in the checkpoint's folder")
+
+
 def check_saved_processors() -> None:
-    """From now on, whoever loads a processor in this process has it checked: LeRobot's commands too."""
+    """Have whoever loads a processor in this process has it checked: LeRobot's commands too."""
 
     def check(content: dict[str, Any], where: str, config: Path) -> None:
         for name in state_files(content, where, saved_type(config)):

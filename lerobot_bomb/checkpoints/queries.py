@@ -3,23 +3,22 @@
 from collections import deque
 from collections.abc import Callable
 from contextlib import suppress
-from functools import wraps
 from pathlib import Path
 from time import perf_counter
 from typing import Any
-from weakref import WeakKeyDictionary, WeakSet
+from weakref import WeakKeyDictionary
 
 import torch
 from lerobot.policies import PreTrainedPolicy
 from torch import Tensor
 
+from lerobot_bomb.compat.hooks.policies import wrap_select_action
 from lerobot_bomb.envs.inference import Query
 
 PROCESS = Path("/proc/self")  # of Linux
 RESET_PEAK = "5"  # that a process' peak memory is counted anew
 
 _CLOCKS: "WeakKeyDictionary[PreTrainedPolicy, _Clock]" = WeakKeyDictionary()
-_TIMED: WeakSet[Callable[..., Tensor]] = WeakSet()  # those select_action that ask for a clock
 
 
 def time_queries(policy: PreTrainedPolicy) -> None:
@@ -27,9 +26,7 @@ def time_queries(policy: PreTrainedPolicy) -> None:
     if policy in _CLOCKS or next(policy.parameters(), None) is None:
         return
     _CLOCKS[policy] = _Clock(policy)
-    owner: Any = next(each for each in type(policy).__mro__ if "select_action" in vars(each))
-    if owner.select_action not in _TIMED:
-        owner.select_action = _timed(owner.select_action)
+    wrap_select_action(policy, _timed)
 
 
 def last_query() -> Query | None:
@@ -42,14 +39,12 @@ def last_query() -> Query | None:
 
 
 def _timed(select_action: Callable[..., Tensor]) -> Callable[..., Tensor]:
-    @wraps(select_action)
     def timed(self: PreTrainedPolicy, *args: Any, **kwargs: Any) -> Tensor:
         clock = _CLOCKS.get(self)
         if clock is None or clock.is_running:
             return select_action(self, *args, **kwargs)
         return clock.time(self, lambda: select_action(self, *args, **kwargs))
 
-    _TIMED.add(timed)
     return timed
 
 

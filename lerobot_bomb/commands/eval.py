@@ -16,8 +16,8 @@ from draccus.utils import DecodingError
 from gymnasium.vector import VectorEnv
 from lerobot.envs import EnvConfig
 
-from lerobot_bomb._compat import lerobot_eval_with
 from lerobot_bomb.commands.arguments import add_file_and_eval_flags
+from lerobot_bomb.compat.own.evaluation import lerobot_eval_with
 from lerobot_bomb.evaluation.executed import append_episode
 from lerobot_bomb.files import check_writable
 

@@ -4,9 +4,9 @@ import argparse
 from pathlib import Path
 from typing import Any
 
-from lerobot_bomb._compat import eval_config
 from lerobot_bomb.checkpoints.identity import identity_of_config
 from lerobot_bomb.commands.arguments import add_file_and_eval_flags
+from lerobot_bomb.compat.own.evaluation import eval_config
 from lerobot_bomb.envs.results import write_result
 from lerobot_bomb.evaluation.eval_info import EVAL_INFO, results_of
 from lerobot_bomb.evaluation.result_lines import KIND_OF_ENV, KINDS

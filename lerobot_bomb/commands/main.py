@@ -9,6 +9,7 @@ from typing import Any
 from draccus.utils import DecodingError
 
 from lerobot_bomb import __version__
+from lerobot_bomb.compat.use import use
 from lerobot_bomb.flag_errors import nearest
 
 DESCRIPTION = "What lerobot-train and lerobot-eval do not do for BOMB: record, summarise, check."
@@ -82,6 +83,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     """Run one command; what is wrong with its flags or files becomes one line on stderr and exit code 1."""
     argv = sys.argv[1:] if argv is None else list(argv)
     argv = argv or ["--help"]
+    use()
     try:
         parser, commands = build_parser(argv[:1])
         args, unknown = parser.parse_known_args(argv)

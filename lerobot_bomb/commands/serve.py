@@ -12,8 +12,8 @@ from dataclasses import fields
 from ipaddress import ip_address
 from typing import cast
 
-from lerobot_bomb._compat import serve_registered_policies
 from lerobot_bomb.commands.arguments import path_flag, switch
+from lerobot_bomb.compat.own.serving import serve_registered_policies
 
 try:
     from lerobot.async_inference.configs import PolicyServerConfig

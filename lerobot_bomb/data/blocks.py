@@ -25,7 +25,7 @@ from datasets.exceptions import DatasetGenerationError
 from lerobot.datasets import LeRobotDataset, aggregate_datasets
 from lerobot.datasets.utils import DEFAULT_EPISODES_PATH
 
-from lerobot_bomb._compat import (
+from lerobot_bomb.compat.own.recording import (
     abandon,
     datasets_cache,
     mergeable_arrays,

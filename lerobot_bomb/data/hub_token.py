@@ -2,8 +2,6 @@
 
 import os
 
-from lerobot_bomb._compat import check_tokens_before_use
-
 VARIABLES = ("HF_TOKEN", "HUGGING_FACE_HUB_TOKEN")
 LOG_IN = "run `hf auth login`, or set HF_TOKEN"
 
@@ -26,8 +24,3 @@ def check_token_characters(token: str) -> None:
                 f"{source} contains {kind}, after {bad[0]} of its {len(text)} characters, so it is no token "
                 f"of the Hub: {LOG_IN} to the token alone"
             )
-
-
-def refuse_unsendable_tokens() -> None:
-    """From now on, whatever asks the Hub in this process checks its token so: LeRobot's commands too."""
-    check_tokens_before_use(check_token_characters)

@@ -2,7 +2,6 @@
 
 from pathlib import Path
 
-from lerobot_bomb._compat import explain_missing_datasets
 from lerobot_bomb.data.resumable import parameters_file, unfinished_folder
 
 RESUMED_BY = {
@@ -22,8 +21,3 @@ def explain(repo_id: str, root: Path, error: Exception) -> str:
         f"{root} holds no dataset (meta/info.json), and {repo_id} cannot be had from the Hub "
         f"({type(error).__name__}: {reason[0]}); is --dataset.root, or --dataset.repo_id, misspelt?"
     )
-
-
-def tell_missing_datasets() -> None:
-    """From now on in this process, in LeRobot's commands too."""
-    explain_missing_datasets(explain)

@@ -29,6 +29,7 @@ from lerobot_bomb.finite import require_finite_statistics
 from lerobot_bomb.hub.card import Checkpoint
 from lerobot_bomb.hub.method import Method
 from lerobot_bomb.hub.push import publish
+from lerobot_bomb.training.distributed import process_number
 
 # arguments that say how a file of the Hub is had
 DOWNLOAD = {
@@ -182,6 +183,8 @@ class HubPolicy:
             folder = Path(temporary)
             model: Any = self if peft_model is None else peft_model
             model.save_pretrained(folder, state_dict=state_dict)
+            if process_number() > 0:  # LeRobot 0.6.2 calls all, as a sharded policy is gathered from all
+                return
             self.config.save_pretrained(folder)
             cfg.save_pretrained(folder)
             files = {path.name: path for path in folder.iterdir() if path.suffix != ".md"}

@@ -14,11 +14,11 @@ from lerobot.utils.constants import ACTION, OBS_STATE
 from torch import Tensor, nn
 from torch.nn.attention import SDPBackend, sdpa_kernel
 
-from lerobot_bomb._compat import play_tasks_in_turn
 from lerobot_bomb.actions.ensemble import TemporalEnsemble
 from lerobot_bomb.actions.relative import RelativeActions, bounds, named_dims
 from lerobot_bomb.checkpoints.adapters import check_buffers_are_the_bases, frozen_buffers
 from lerobot_bomb.checkpoints.starting import check_start
+from lerobot_bomb.compat.hooks.evaluation import play_tasks_in_turn
 from lerobot_bomb.data.columns import dim_names, episode_bounds, present_episodes, read_columns
 from lerobot_bomb.decoding.kv_cache import check_positions
 from lerobot_bomb.flow.noise import SamplingNoise, gumbel
@@ -113,6 +113,10 @@ class ChunkPolicy(HubPolicy, SavesTiedWeightsOnce, PreTrainedPolicy):
     def reset(self) -> None:
         self._queue: deque[Tensor] = deque(maxlen=self.config.n_action_steps)
         self._batch_size: int | None = None  # of the episodes that are under way
+
+    def drop_queued_actions(self) -> None:
+        """Let the next `select_action` predict; LeRobot 0.6.2 asks for it where the instruction changes."""
+        self._queue.clear()
 
     def _check_batch_size(self, batch: dict[str, Tensor]) -> None:
         """Raise unless a batch has as many rows as the one before it since `reset`."""
@@ -248,6 +252,11 @@ class VlaPolicy(ChunkPolicy):
 
     def reset(self) -> None:
         super().reset()
+        if self._ensemble is not None:
+            self._ensemble.reset()
+
+    def drop_queued_actions(self) -> None:
+        super().drop_queued_actions()
         if self._ensemble is not None:
             self._ensemble.reset()
 

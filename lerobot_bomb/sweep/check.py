@@ -3,8 +3,8 @@
 import logging
 from collections.abc import Sequence
 
-from lerobot_bomb._compat import eval_config
 from lerobot_bomb.checkpoints.environment import as_if_built
+from lerobot_bomb.compat.own.evaluation import eval_config
 from lerobot_bomb.sweep.manifest import Cell, Manifest
 
 # in a sweep the flags that a refusal names are these

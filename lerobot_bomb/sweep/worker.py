@@ -20,8 +20,8 @@ from typing import TextIO
 
 from lerobot.envs.configs import LiberoEnv
 
-from lerobot_bomb._compat import KeptPolicy
 from lerobot_bomb.checkpoints.identity import identity_of
+from lerobot_bomb.compat.own.evaluation import KeptPolicy
 from lerobot_bomb.evaluation.eval_info import EVAL_INFO, results_of
 from lerobot_bomb.evaluation.result_lines import KIND_OF_ENV
 from lerobot_bomb.files import read_json

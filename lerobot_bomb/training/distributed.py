@@ -2,9 +2,14 @@
 
 from collections import defaultdict
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
+from huggingface_hub import save_torch_state_dict
 from torch import Tensor, distributed, nn
+from torch.distributed.checkpoint.state_dict import StateDictOptions, get_model_state_dict
+from torch.distributed.fsdp import FSDPModule
+
+ONE_FILE = "1000TB"  # no checkpoint is larger
 
 
 def process_number() -> int:
@@ -35,16 +40,27 @@ class SavesTiedWeightsOnce(nn.Module):
     FSDP gathers them once for each module. Stands before LeRobot's `PreTrainedPolicy`.
     """
 
+    config: Any
+
     def _save_pretrained(self, save_directory: Path, state_dict: dict[str, Tensor] | None = None) -> None:
-        if state_dict is not None:
-            names = defaultdict(list)
-            for name, parameter in self.named_parameters(remove_duplicate=False):
-                names[parameter].append(name)
-            state_dict = dict(state_dict)
-            for first, *others in names.values():
-                state_dict.update((other, state_dict[first]) for other in others)
-        policy: Any = super()
-        policy._save_pretrained(save_directory, state_dict)
+        """LeRobot 0.6.1 gives what it gathered of a sharded policy; from 0.6.2 on all processes call this."""
+        if state_dict is None and isinstance(self, FSDPModule):
+            whole = StateDictOptions(full_state_dict=True, cpu_offload=True)
+            state_dict = cast("dict[str, Tensor]", get_model_state_dict(self, options=whole))
+        if state_dict is None:
+            policy: Any = super()
+            policy._save_pretrained(save_directory)
+        elif state_dict:  # only the first process has it
+            self.config._save_pretrained(save_directory)
+            save_torch_state_dict(self._tied(state_dict), save_directory, max_shard_size=ONE_FILE)
+
+    def _tied(self, state_dict: dict[str, Tensor]) -> dict[str, Tensor]:
+        names = defaultdict(list)
+        for name, parameter in self.named_parameters(remove_duplicate=False):
+            names[parameter].append(name)
+        return state_dict | {
+            other: state_dict[first] for first, *others in names.values() for other in others
+        }
 
 
 def _are_several() -> bool:

@@ -92,8 +92,8 @@ class Replay:
         return policy.get("batch_row") or 0, policy.get("batch_size") or 1
 
     def _batch_agent(self, viewed: Viewed) -> BatchAgent:
-        from lerobot_bomb._compat import built_policies  # LeRobot and torch: seconds
         from lerobot_bomb.checkpoints.identity import identity_of
+        from lerobot_bomb.compat.hooks.policies import built_policies  # LeRobot and torch: seconds
         from lerobot_bomb.viewing.checkpoint import checkpoint_agent, scripted_agent
 
         # who played is not asked whether it was trained for this

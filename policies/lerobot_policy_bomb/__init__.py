@@ -9,39 +9,49 @@ import lerobot_policy_bomb_random
 import lerobot_policy_fdvla
 import lerobot_policy_spatialvla_grid
 import lerobot_policy_vla0_smol
-from lerobot_bomb._compat import (
-    read_asked_columns,
-    remember_policies,
-    resolve_checkpoints,
-    shorten_torchcodec_warning,
-    tell_wrong_flags,
-)
-from lerobot_bomb.checkpoints.config import tell_config_errors
+from lerobot_bomb.checkpoints.config import config_damage
+from lerobot_bomb.checkpoints.names import is_hub_id
 from lerobot_bomb.checkpoints.processor_files import check_saved_processors
-from lerobot_bomb.checkpoints.shipped import checkpoint_path
-from lerobot_bomb.data.hub_token import refuse_unsendable_tokens
-from lerobot_bomb.data.missing import tell_missing_datasets
-from lerobot_bomb.flag_errors import hint, refuse_unknown, tell_refusals
+from lerobot_bomb.checkpoints.shipped import PREFIX, checkpoint_path
+from lerobot_bomb.compat.hooks.datasets import explain_missing_datasets, read_asked_columns
+from lerobot_bomb.compat.hooks.errors import tell_config_errors, tell_refusals
+from lerobot_bomb.compat.hooks.evaluation import check_evaluations
+from lerobot_bomb.compat.hooks.flags import tell_wrong_flags
+from lerobot_bomb.compat.hooks.hub import check_tokens_before_use, publish_as_the_policy_says
+from lerobot_bomb.compat.hooks.paths import resolve_checkpoints
+from lerobot_bomb.compat.hooks.policies import remember_policies
+from lerobot_bomb.compat.hooks.torchcodec import shorten_torchcodec_warning
+from lerobot_bomb.compat.use import register
+from lerobot_bomb.data.hub_token import check_token_characters
+from lerobot_bomb.data.missing import explain
+from lerobot_bomb.flag_errors import hint, refuse_recording_of_several, refuse_unknown
 
-shorten_torchcodec_warning()
-tell_config_errors()
-remember_policies()
-read_asked_columns()
-refuse_unsendable_tokens()
-tell_missing_datasets()
-check_saved_processors()
-resolve_checkpoints(checkpoint_path)
-tell_wrong_flags(hint, refuse_unknown)
-tell_refusals(
+OURS = (
+    lerobot_bomb,
+    lerobot_env_bomb,
+    lerobot_env_bomb_libero,
+    lerobot_env_bomb_pusht,
+    lerobot_policy_bomb_expert,
+    lerobot_policy_bomb_random,
+    lerobot_policy_fdvla,
+    lerobot_policy_spatialvla_grid,
+    lerobot_policy_vla0_smol,
+)
+
+resolve_checkpoints(PREFIX, checkpoint_path)
+register(
+    [package.__name__ for package in OURS],
     [
-        lerobot_bomb,
-        lerobot_env_bomb,
-        lerobot_env_bomb_libero,
-        lerobot_env_bomb_pusht,
-        lerobot_policy_bomb_expert,
-        lerobot_policy_bomb_random,
-        lerobot_policy_fdvla,
-        lerobot_policy_spatialvla_grid,
-        lerobot_policy_vla0_smol,
-    ]
+        remember_policies,
+        check_saved_processors,
+        lambda: tell_config_errors(is_hub_id, config_damage),
+        tell_refusals,
+        lambda: tell_wrong_flags(hint, refuse_unknown),
+        lambda: explain_missing_datasets(explain),
+        read_asked_columns,
+        lambda: check_evaluations(refuse_recording_of_several),
+        lambda: check_tokens_before_use(check_token_characters),
+        publish_as_the_policy_says,
+        shorten_torchcodec_warning,
+    ],
 )

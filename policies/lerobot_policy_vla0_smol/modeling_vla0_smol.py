@@ -57,6 +57,7 @@ class Vla0SmolPolicy(RelativeVlaPolicy, TokenVlaPolicy):
     config: Vla0SmolConfig
     shapes, as_trained = SHAPES, AS_TRAINED
     symbol_ids: Tensor
+    _fsdp_wrap_modules: list[str]
 
     def __init__(
         self, config: Vla0SmolConfig, dataset_meta: LeRobotDatasetMetadata | None = None, **_: object
@@ -65,9 +66,9 @@ class Vla0SmolPolicy(RelativeVlaPolicy, TokenVlaPolicy):
         if dataset_meta is not None:
             config.check_masking()
         self.tokens, self.backbone = build_model(config)
-        # modules that FSDP shards one by one; accelerate reads the second name
-        self._fsdp_wrap_modules = sorted({type(layer).__name__ for layer in self.backbone.layers})
-        self._no_split_modules = self._fsdp_wrap_modules
+        # modules that FSDP shards one by one; accelerate reads the second name, LeRobot 0.6.2 the class's
+        sharded = sorted({type(layer).__name__ for layer in self.backbone.layers})
+        self._fsdp_wrap_modules = self._no_split_modules = type(self)._fsdp_wrap_modules = sharded
         self.register_buffer("symbol_ids", torch.tensor(self.tokens.symbols), persistent=False)
         self.action_bins = Bins(config.n_action_bins, config.bin_mode)
         self.state_bins = Bins(config.n_state_bins, config.bin_mode)

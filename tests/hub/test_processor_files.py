@@ -36,6 +36,7 @@ from hub.server import LoopbackHub, Repository
 from lerobot_bomb.checkpoints import processor_files
 from lerobot_bomb.checkpoints.adapters import check_adapters
 from lerobot_bomb.checkpoints.folder import load_processors, read_config
+from lerobot_bomb.compat.use import use
 from lerobot_bomb.explain.interventions import intervene
 from lerobot_policy_vla0_smol import Vla0SmolConfig
 
@@ -98,6 +99,9 @@ REFUSED: dict[str, Damage] = {
     ),
     "state_file='/x.safetensors' is no name": change_step(PREPROCESSOR, TASK, state_file="/x.safetensors"),
     "state_file='config.json' is no name": change_step(PREPROCESSOR, TASK, state_file="config.json"),
+    "artifacts of its step 'bomb_task_tokenizer' are other files": change_step(
+        PREPROCESSOR, TASK, artifacts={"tokenizer": "tokenizer"}
+    ),
     "names no state_file, so it has no tokenizer": change_step(PREPROCESSOR, TASK, state_file=None),
     "the config of its step 'bomb_task_tokenizer' is no JSON": change_step(PREPROCESSOR, TASK, config=[]),
     "template='Task: {0.__class__}' must hold {} once": change_step(
@@ -178,6 +182,7 @@ def test_a_state_that_is_a_link_out_of_the_folder_is_refused(name: str, folder: 
 
 def test_stock_types_load_and_run_no_code(tmp_path: Path) -> None:
     register_third_party_plugins()
+    use()
     folder = tmp_path / "act"
     config = act_checkpoint(folder)
     before, after = make_pre_post_processors(config, str(folder))
@@ -189,6 +194,12 @@ def test_stock_types_load_and_run_no_code(tmp_path: Path) -> None:
     insert_step(PREPROCESSOR, {"class": path, "config": {"action_tokenizer_name": "evil/x"}})(folder)
     with pytest.raises(ValueError, match=r"'action_tokenizer_processor' runs code of what its config names"):
         make_pre_post_processors(config, str(folder))
+    for artifacts, told in (({"x": "../x"}, r"'\.\./x'"), ({"x": "/x"}, "'/x'"), (["x"], r"\['x'\]")):
+        (folder / PREPROCESSOR).write_text(saved)
+        step = {"registry_name": "smolvla_new_line_processor", "config": {}, "artifacts": artifacts}
+        insert_step(PREPROCESSOR, step)(folder)
+        with pytest.raises(ValueError, match=rf"artifacts of its step .*: {told} is no path in the"):
+            make_pre_post_processors(config, str(folder))
     (folder / PREPROCESSOR).write_text(saved)
     insert_code(PREPROCESSOR)(folder)
     with pytest.raises(ValueError, match=r"its step 'os\.mkdir' is named"):

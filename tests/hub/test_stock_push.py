@@ -11,6 +11,7 @@ import httpx
 import pytest
 import torch
 from huggingface_hub.errors import HfHubHTTPError
+from lerobot.common import train_utils
 from lerobot.configs.default import DatasetConfig
 from lerobot.configs.train import TrainPipelineConfig
 from lerobot.policies import make_pre_post_processors
@@ -52,6 +53,10 @@ class Training:
 
     def push(self) -> None:
         """As `lerobot_train` does."""
+        publish: Any = getattr(train_utils, "publish_trained_model", None)  # LeRobot 0.6.2
+        if publish is not None:
+            publish(self.cfg, self.policy, *self.processors, None)
+            return
         self.policy.push_model_to_hub(self.cfg, state_dict=None, dataset_meta=None)
         for processor in self.processors:
             processor.push_to_hub(REPO_ID)

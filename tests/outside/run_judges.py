@@ -1,10 +1,11 @@
 """Run LeRobot's own tests on our policy and env types: `python run_judges.py CHECKOUT_OF_LEROBOT`."""
 
+import json
 import os
 import subprocess
 import sys
 import tomllib
-from importlib.metadata import version
+from importlib.metadata import distribution, version
 from pathlib import Path
 
 ROOT = Path(__file__).parents[2]
@@ -31,6 +32,12 @@ def checkout_version(folder: Path) -> str | None:
         return None
 
 
+def is_installed_from(folder: Path) -> bool:
+    """Return whether the installed LeRobot is that of this checkout (`make test-lerobot`)."""
+    origin = json.loads(distribution("lerobot").read_text("direct_url.json") or "{}")
+    return origin.get("url") == folder.as_uri()
+
+
 def find_checkout(given: str) -> Path:
     """The folder that LEROBOT_SRC names; exits unless its tests are those of the installed version."""
     installed = version("lerobot")
@@ -46,7 +53,7 @@ def find_checkout(given: str) -> Path:
         sys.exit(f"LEROBOT_SRC={given} is not a checkout of LeRobot; {way_out}")
     if found != installed:
         sys.exit(f"LEROBOT_SRC={given} is LeRobot {found}, installed is {installed}; {way_out}")
-    if (folder / ".git").exists():
+    if (folder / ".git").exists() and not is_installed_from(folder):
         # the branch main keeps the last release's number
         same = subprocess.run(["git", "-C", folder, "diff", "--quiet", f"v{installed}", "--", "tests"])
         if same.returncode:
@@ -54,10 +61,9 @@ def find_checkout(given: str) -> Path:
     return folder
 
 
-def main() -> int:
-    """Run the judges in the checkout, which stays untouched, and return pytest's exit status."""
-    folder = find_checkout(sys.argv[1] if len(sys.argv) > 1 else "")
-    environment = os.environ | {
+def environment() -> dict[str, str]:
+    """Variables of a pytest that runs in the checkout, which stays untouched."""
+    return os.environ | {
         "PYTHONPATH": os.pathsep.join(str(ROOT / folder) for folder in ("tests/outside", "benchmarks")),
         "PYTHONDONTWRITEBYTECODE": "1",
         # pytest's plugins that happen to be installed, and options meant for other runs
@@ -67,10 +73,15 @@ def main() -> int:
         "OMP_NUM_THREADS": "1",
         "LEROBOT_TEST_DEVICE": "cpu",
     }
+
+
+def main() -> int:
+    """Run the judges in the checkout and return pytest's exit status."""
+    folder = find_checkout(sys.argv[1] if len(sys.argv) > 1 else "")
     judges = [CLASSES, BUILD, SAVE_AND_LOAD, MAKE_ENV, *FILES]
     options = ["-c", "pyproject.toml", "-p", "lerobot_judges", "-p", "no:cacheprovider", "-q", "-ra"]
     return subprocess.run(
-        [sys.executable, "-m", "pytest", *options, *judges], cwd=folder, env=environment
+        [sys.executable, "-m", "pytest", *options, *judges], cwd=folder, env=environment()
     ).returncode
 
 

@@ -1,0 +1,5 @@
+"""All that reaches into LeRobot, draccus or huggingface_hub, and replaces what is theirs.
+
+`hooks` stand in them for a user of our types; but for `hooks.paths` none does before a first use (`use`).
+`own` is for as long as one of our commands runs.
+"""

@@ -1,0 +1,66 @@
+"""The policies that a process has built, and calls of them, of which LeRobot tells an environment nothing."""
+
+import gc
+from collections.abc import Callable, Iterator
+from typing import Any
+from weakref import WeakSet, ref
+
+from lerobot.configs import PreTrainedConfig
+from lerobot.datasets import LeRobotDatasetMetadata
+from lerobot.policies import PreTrainedPolicy
+
+from lerobot_bomb.compat.hooks.replace import replace
+
+_BUILT: list[ref[PreTrainedPolicy]] = []  # by `remember_policies`
+_WRAPPED: WeakSet[Callable[..., Any]] = WeakSet()  # by `wrap_select_action`
+
+
+def remember_policies() -> None:
+    """Let `built_policies` know every policy that this process builds, LeRobot's own types too.
+
+    `lerobot-eval` and `lerobot-train` build it before the first reset of an environment. Those that were
+    built before this call are known by the garbage collector.
+    """
+
+    def around(usual: Callable[..., None]) -> Callable[..., None]:
+        def remembered(self: PreTrainedPolicy, *args: Any, **kwargs: Any) -> None:
+            usual(self, *args, **kwargs)
+            _BUILT.append(ref(self))
+
+        return remembered
+
+    known = {id(policy) for policy in built_policies()}
+    _BUILT[:0] = [ref(policy) for policy in _living_policies() if id(policy) not in known]
+    replace(PreTrainedPolicy, "__init__", around)
+
+
+def _living_policies() -> Iterator[PreTrainedPolicy]:
+    """Oldest first, about."""
+    for generation in (2, 1, 0):
+        for each in gc.get_objects(generation):
+            if issubclass(type(each), PreTrainedPolicy) and "config" in vars(each):
+                yield each
+
+
+def built_policies() -> list[PreTrainedPolicy]:
+    """The policies that this process built and still holds, in that order.
+
+    `config.pretrained_path` and `config.pretrained_revision` say where one was loaded from.
+    """
+    return [policy for built in _BUILT if (policy := built()) is not None]
+
+
+def training_data(config: PreTrainedConfig) -> LeRobotDatasetMetadata | None:
+    """The dataset that this process trains a config's policy on; None: it acts as it was loaded."""
+    return getattr(config, "_runtime_dataset_meta", None)
+
+
+def wrap_select_action(policy: PreTrainedPolicy, around: Callable[[Callable], Callable]) -> None:
+    """Let the `select_action` of a policy's class be `around(it)`; a second call changes nothing.
+
+    Adapters call the class's method on the policy that they wrap.
+    """
+    owner: Any = next(each for each in type(policy).__mro__ if "select_action" in vars(each))
+    if owner.select_action not in _WRAPPED:
+        replace(owner, "select_action", around)
+        _WRAPPED.add(owner.select_action)

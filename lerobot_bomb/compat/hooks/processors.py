@@ -1,0 +1,54 @@
+"""A saved processor is checked before LeRobot imports and calls what it names."""
+
+import re
+from collections.abc import Callable, Sequence
+from contextlib import suppress
+from inspect import signature
+from pathlib import Path
+from typing import Any
+
+from huggingface_hub import hf_hub_download
+from huggingface_hub.constants import CONFIG_NAME
+from lerobot.processor import DataProcessorPipeline
+
+from lerobot_bomb.compat.hooks.replace import replace
+
+
+def check_processors_before_use(
+    check: Callable[[dict[str, Any], str, Path], Any],
+    check_loaded: Callable[[Sequence[Any], str, Path], None],
+) -> None:
+    """Let LeRobot's loader build no step of a saved processor before `check(its JSON, where, config.json)`.
+
+    Here what is checked is what will be built. Then `check_loaded(steps, where, config.json)`. From the Hub,
+    states and config.json, which there may not be, are of the commit that the JSON is of.
+    """
+
+    def around(usual: Callable[..., Any]) -> Callable[..., Any]:
+        def build(cls: type, *args: Any, **kwargs: Any) -> Any:
+            bound = signature(usual).bind(cls, *args, **kwargs)
+            given = bound.arguments
+            content = given["loaded_config"]
+            commits = [part for part in given["base_path"].parts if re.fullmatch("[0-9a-f]{40}", part)]
+            if commits and not given.get("is_local_source"):
+                given["hub_download_kwargs"] = given["hub_download_kwargs"] | {"revision": commits[-1]}
+            where, config_file = f"{given['model_id']}, {content.get('name')}", _config_file(given)
+            check(content, where, config_file)
+            steps, unused = usual(*bound.args, **bound.kwargs)
+            check_loaded(steps, where, config_file)
+            return steps, unused
+
+        return build
+
+    replace(DataProcessorPipeline, "_build_steps_with_overrides", around)
+
+
+def _config_file(given: dict[str, Any]) -> Path:
+    """Where the config.json beside a processor is, or would be."""
+    path = given["base_path"] / CONFIG_NAME
+    if not given.get("is_local_source") and not path.is_file():
+        # LeRobot 0.6.2 says in which folder of the repository; earlier ones read its root
+        name = (Path(given.get("config_filename", "")).parent / CONFIG_NAME).as_posix()
+        with suppress(OSError):
+            return Path(hf_hub_download(given["model_id"], name, **given["hub_download_kwargs"]))
+    return path

@@ -1,0 +1,1 @@
+"""Changes that our own commands make, in their own process."""

@@ -1,0 +1,91 @@
+"""Changes to LeRobot's writer of datasets, while recorder or converters write."""
+
+import shutil
+from collections.abc import Collection, Iterator
+from contextlib import contextmanager
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from datasets import config
+from lerobot.datasets import LeRobotDataset, aggregate, compute_stats, dataset_writer
+from lerobot.datasets.feature_utils import get_hf_features_from_features
+from lerobot.datasets.io_utils import to_parquet_with_hf_images
+from lerobot.utils.constants import DEFAULT_FEATURES
+
+STATISTICS_SIZE = 128  # pixels
+
+
+def sample_pixels(image: np.ndarray) -> np.ndarray:
+    """(C, H, W) -> every n-th pixel of every n-th row, so that about STATISTICS_SIZE of each are left."""
+    stride = max(1, max(image.shape[1:]) // STATISTICS_SIZE)
+    return image[:, ::stride, ::stride]
+
+
+@contextmanager
+def sampled_image_statistics() -> Iterator[None]:
+    """Let LeRobot's video encoder take image statistics from a sample of the pixels.
+
+    It samples so itself from 300 pixels on; all pixels of a 256x256 frame cost 5 ms of one core.
+    """
+    usual = compute_stats.auto_downsample_height_width
+    compute_stats.auto_downsample_height_width = sample_pixels
+    try:
+        yield
+    finally:
+        compute_stats.auto_downsample_height_width = usual
+
+
+@contextmanager
+def without_statistics(keys: Collection[str]) -> Iterator[None]:
+    """Let LeRobot write no statistics of these features, and so normalise none of them.
+
+    It would take them of every pixel apart: gigabytes of histograms for one depth image.
+    """
+    usual = dataset_writer.compute_episode_stats
+
+    def compute(data: dict[str, Any], features: dict[str, dict]) -> dict[str, dict]:
+        return usual({key: values for key, values in data.items() if key not in keys}, features)
+
+    dataset_writer.compute_episode_stats = compute
+    try:
+        yield
+    finally:
+        dataset_writer.compute_episode_stats = usual
+
+
+@contextmanager
+def mergeable_arrays(features: dict[str, dict]) -> Iterator[None]:
+    """Let LeRobot merge tables that hold arrays of two dimensions.
+
+    It can where they hold images too, because it then names their types; elsewhere pyarrow must guess them.
+    """
+    usual = aggregate.to_parquet_one_row_group_per_episode
+    types = get_hf_features_from_features(features | DEFAULT_FEATURES)
+    aggregate.to_parquet_one_row_group_per_episode = partial(to_parquet_with_hf_images, features=types)
+    try:
+        yield
+    finally:
+        aggregate.to_parquet_one_row_group_per_episode = usual
+
+
+def abandon(dataset: LeRobotDataset) -> None:
+    """End the threads of a dataset that is being written, and let none of it be written later.
+
+    When it is garbage collected, LeRobot would write its table of episodes, and make the folder for it anew.
+    """
+    dataset.clear_episode_buffer()
+    dataset.meta._finalized = True
+
+
+@contextmanager
+def datasets_cache(folder: Path) -> Iterator[None]:
+    """Let `datasets` cache what it reads here only; in the user's cache a copy of it would stay."""
+    usual = config.HF_DATASETS_CACHE
+    config.HF_DATASETS_CACHE = folder
+    try:
+        yield
+    finally:
+        config.HF_DATASETS_CACHE = usual
+        shutil.rmtree(folder, ignore_errors=True)
