@@ -179,11 +179,12 @@ def ours(work: DecodeRequest) -> Timed:
 def peer(work: DecodeRequest) -> Timed:
     """The whole answer by `generate`, and one symbol by it: what it takes to read the prompt."""
     generate = XgrammarGenerate(work.backbone, work.symbol_ids, work.grammar)
-    generate(*work.prompt, max_symbols=1)
+    embeds, mask = work.prompt.embeds, work.prompt.mask
+    generate(embeds, mask, max_symbols=1)
     started = time.perf_counter()
-    generate(*work.prompt, max_symbols=1)
+    generate(embeds, mask, max_symbols=1)
     prompt_read = time.perf_counter()
-    numbers, num_passes = generate(*work.prompt)
+    numbers, num_passes = generate(embeds, mask)
     whole_s, prefill_s = time.perf_counter() - prompt_read, prompt_read - started
     return Timed(numbers, prefill_s, whole_s - prefill_s, num_passes)
 

@@ -96,6 +96,7 @@ def test_a_slope_is_that_of_least_squares() -> None:
     values = (rng.random(len(levels)) > levels / 6).astype(float)
     found = slope(levels, values, episodes)
     assert found is not None and found.per_level == pytest.approx(linregress(levels, values)[0])
+    assert found.low is not None and found.high is not None
     assert found.low < found.per_level < found.high
     assert slope(np.full(4, 3), np.ones(4), np.arange(4)) is None
 
@@ -108,7 +109,8 @@ def test_the_interval_of_a_slope_covers_it_with_episodes_that_differ() -> None:
         of_episode = np.repeat(rng.uniform(-0.2, 0.2, 60), 6)
         values = (rng.random(len(levels)) < 0.7 + truth * levels + of_episode).astype(float)
         found = slope(levels, values, episodes)
-        num_covered += found is not None and found.low <= truth <= found.high
+        assert found is not None and found.low is not None and found.high is not None
+        num_covered += found.low <= truth <= found.high
     assert 0.91 <= num_covered / n <= 0.98
 
 

@@ -120,7 +120,7 @@ def test_names_that_resemble_each_other_are_folders_of_their_own(turn: int, tmp_
     ][::turn]
     rates = {"a": 1.0, "b": 0.75, "c": 0.5, "d": 0.25}
     rows = [
-        values(seed, None if seed < 4 * rates[policy.weights_sha256[0]] else "dropped", policy=policy)
+        values(seed, None if seed < 4 * rates[str(policy.weights_sha256)[0]] else "dropped", policy=policy)
         for policy in policies
         for seed in range(4)
     ]

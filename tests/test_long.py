@@ -29,7 +29,7 @@ def test_the_expert_places_100_stones_precisely(
     stock_cli("lerobot-eval", *flags.split(), f"--output_dir={tmp_path / 'eval'}")
     rows = read_results(results)
     assert len(rows) == 100
-    assert summarise(rows).num_successes >= 99
+    assert summarise(rows).rate.successes >= 99
     error_mm = median_error_mm(rows)
     assert error_mm is not None and error_mm <= 2
     assert max(row["collateral_mm"] for row in rows) < 1

@@ -2,7 +2,7 @@
 
 import json
 import shlex
-from collections.abc import Callable
+from collections.abc import Callable, Mapping, Sequence
 from html.parser import HTMLParser
 from pathlib import Path
 from statistics import median
@@ -79,7 +79,7 @@ def test_the_summary_has_the_worst_condition_and_its_success(report: Callable[..
     assert (row["worst condition"], row["its success"]) == ("-", "-")
 
 
-def perturbed(failures: dict[str, list[str | None]], policy: PolicyIdentity = ACT) -> Rows:
+def perturbed(failures: Mapping[str, Sequence[str | None]], policy: PolicyIdentity = ACT) -> Rows:
     """An episode for each seed from 0 on, under each condition."""
     return [
         values(seed, failure, policy=policy, spec={"perturbations": condition})
@@ -154,7 +154,7 @@ def test_the_summary_says_of_what_its_measures_are(report: Callable[..., dict[st
 # Sensitivity
 
 
-def at_levels(condition: str, levels: dict[str, int], failures: list[str | None]) -> Rows:
+def at_levels(condition: str, levels: dict[str, int], failures: Sequence[str | None]) -> Rows:
     return [
         values(seed, failure, spec={"perturbations": condition}, levels=levels)
         for seed, failure in enumerate(failures)

@@ -31,7 +31,7 @@ def values(seed: int, failure: str | None = None, error: float | None = None, **
     result = EpisodeResult(
         spec=episode,
         instruction="Put it there.",
-        task_id=task_id(target, color) if episode.suite == "place" else episode.task_id or 0,
+        task_id=task_id(target, color) if target and episode.suite == "place" else episode.task_id or 0,
         target=target,
         color=color,
         steps=20,
@@ -41,7 +41,9 @@ def values(seed: int, failure: str | None = None, error: float | None = None, **
         failure=failure,
         stage="placed" if is_placed else "start" if failure == "never_reached" else "lifted",
         placement_error_mm=(40.0 if is_elsewhere else 1.0) if error is None else error,
-        nearest_intersection=(target[0], (target[1] + 1) % 5) if is_elsewhere else target or (2, 2),
+        nearest_intersection=(target[0], (target[1] + 1) % 5)
+        if target and is_elsewhere
+        else target or (2, 2),
         collateral_mm=20.0 if failure == "disturbed_others" else 0.0,
         levels={axis: high for axis, _, high in condition.ranges},
         opengl_vendor="Mesa",
@@ -361,8 +363,10 @@ def test_numbered_tasks_of_one_seed_are_clusters(path: Path, capsys: pytest.Capt
     assert expected in printed(path, "".join(lines), capsys)
     expected = "success          3/6 = 50.0 % (no interval: all are of one seed)"
     failures = [None, "dropped"] * 3
-    numbered = {"task_ids": list(range(6))}
-    one = [row(0, failure, spec=spec, **numbered) for failure, spec in zip(failures, specs, strict=True)]
+    one = [
+        row(0, failure, spec=spec, task_ids=list(range(6)))
+        for failure, spec in zip(failures, specs, strict=True)
+    ]
     assert expected in printed(path, "".join(one), capsys)
 
 

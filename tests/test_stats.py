@@ -215,7 +215,7 @@ def test_one_pair_less_is_too_few(counts: PairedCounts) -> None:
         share, second = 1 - (counts.both + counts.neither) / counts.n, counts.only_second
         second = second / (counts.only_first + counts.only_second)
         return sum(
-            binom.pmf(m, n, share) * binom.pmf(k, m, second)
+            float(binom.pmf(m, n, share) * binom.pmf(k, m, second))
             for m in range(n + 1)
             for k in range(m + 1)
             if mcnemar_p_value(m - k, k) < 0.05

@@ -120,8 +120,8 @@ def policy_class(folder: Path) -> type[PreTrainedPolicy]:
         ValueError: the type is not one of ours.
     """
     name = read_json(folder / CONFIG).get("type")
-    is_known = isinstance(name, str) and name in PreTrainedConfig.get_known_choices()
-    found = get_policy_class(name) if is_known else None
+    known = PreTrainedConfig.get_known_choices()
+    found = get_policy_class(name) if isinstance(name, str) and name in known else None
     if found is None or not hasattr(found, "method"):
         raise ValueError(
             f"{folder / CONFIG}: the type {name!r} is not one that lerobot-bomb pushes; "
