@@ -6,6 +6,8 @@ from typing import Any
 
 import pytest
 
+from lerobot_bomb.bomb.suite import task_version
+from lerobot_bomb.bomb.suites import SUITES
 from lerobot_bomb.data.environment import Environment
 
 IMAGE = {"dtype": "video", "shape": [64, 64, 3], "names": ["height", "width", "channels"]}
@@ -78,6 +80,21 @@ def test_flags_of_an_evaluation() -> None:
 def test_another_environment_is_an_error_that_names_the_flags(change: dict[str, Any], message: str) -> None:
     with pytest.raises(ValueError, match=f"^this act was trained .*{re.escape(message)}"):
         ABSOLUTE.check_same(replace(ABSOLUTE, **change), "this act", "insist")
+
+
+def test_what_was_trained_on_all_suites_acts_in_each_of_its_version() -> None:
+    of_all = replace(ABSOLUTE, task="all", task_version=task_version("all"))
+    for suite in SUITES:
+        of_all.check_same(
+            replace(ABSOLUTE, task=suite, task_version=task_version(suite)), "this act", "insist"
+        )
+    earlier = replace(of_all, task_version="1.0")
+    with pytest.raises(
+        ValueError, match=r"task=all, task_version=1\.0; this one has task=goal, task_version=1\.1"
+    ):
+        earlier.check_same(replace(ABSOLUTE, task="goal", task_version="1.1"), "this act", "insist")
+    with pytest.raises(ValueError, match=r"evaluate with --env\.task=place"):
+        ABSOLUTE.check_same(of_all, "this act", "insist")
 
 
 @pytest.mark.parametrize(

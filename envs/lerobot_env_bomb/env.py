@@ -150,6 +150,7 @@ class BombEnv(EpisodeEnv[EpisodeSpec, _Run, EpisodeResult]):
             policy=self._policy,
             opengl_vendor=self._renderer and self._renderer.opengl_vendor,
             opengl_renderer=self._renderer and self._renderer.opengl_renderer,
+            task_version=find_suite(episode.spec.suite).version,
         )
 
     def close(self) -> None:
@@ -164,7 +165,7 @@ class BombEnv(EpisodeEnv[EpisodeSpec, _Run, EpisodeResult]):
         return PrivilegedState(
             gripper_xyz=now.gripper_xyz,
             finger_opening=now.finger_opening,
-            goals=run.episode.goals,
+            goals=run.episode.goals_after(run.judge.num_made),
             stone_xyz=now.stone_xyz,
             stone_is_white=run.episode.layout.stone_is_white,
             stone_in_play=run.episode.layout.stone_in_play,
@@ -180,7 +181,7 @@ class BombEnv(EpisodeEnv[EpisodeSpec, _Run, EpisodeResult]):
     def object_masks(self) -> dict[str, dict[str, np.ndarray]]:
         """{camera: {what: (H, W) bool}} of the observation's images, by what their pixels show."""
         run, size = self._run, self._render_options.image_size
-        goals = run.episode.goals
+        goals = run.episode.goals_after(run.judge.num_made)
         goal = goals[min(run.judge.num_made, len(goals) - 1)]
         return {
             camera: object_masks(run.scene, self._camera_renderer, camera, size, goal.stone, goal.xyz[:2])

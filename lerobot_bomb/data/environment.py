@@ -2,11 +2,13 @@
 
 import re
 from collections.abc import Iterable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 from lerobot_bomb.bomb.board import task_id
 from lerobot_bomb.bomb.observation import ACTION_NAMES
+from lerobot_bomb.bomb.suite import task_version
+from lerobot_bomb.conditions import ALL
 
 IMAGES, DEPTH = "observation.images.", "observation.depth."
 # what an observation or an action means depends on; --env.NAME changes it
@@ -72,12 +74,18 @@ class Environment:
 
     def differences(self, other: "Environment") -> list[str]:
         """Fields in which `other` is one that a policy of this environment cannot act in."""
-        names = [name for name in COMPARED if getattr(self, name) != getattr(other, name)]
+        # what was trained on all suites acts in each of them, as long as none has become another
+        mine = replace(self, task=other.task, task_version=other.task_version) if self._is_of_all else self
+        names = [name for name in COMPARED if getattr(mine, name) != getattr(other, name)]
         if not set(self.cameras) <= set(other.cameras):
             names.append("cameras")
-        if self.task_version != other.task_version:
+        if mine.task_version != other.task_version:
             names.append("task_version")
         return names
+
+    @property
+    def _is_of_all(self) -> bool:
+        return self.task == ALL and self.task_version == task_version(ALL)
 
     def check_same(self, other: "Environment", who: str, insist: str) -> None:
         """Raise a ValueError, which names flags to change, unless `who`, of this one, can act in `other`."""

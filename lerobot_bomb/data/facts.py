@@ -4,6 +4,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from lerobot_bomb.bomb.suite import suites_of
 from lerobot_bomb.data.dataset_files import INFO_FILE
 from lerobot_bomb.data.environment import Environment
 from lerobot_bomb.data.resumable import METADATA_FILE
@@ -74,7 +75,8 @@ class DatasetFacts:
         recording = self.recording
         if not recording:
             return None
-        num_conditions = len(recording["perturbations"]) * max(1, len(recording["task_ids"]))
+        num_tasks = len(suites_of(recording["task"])) * max(1, len(recording["task_ids"]))
+        num_conditions = len(recording["perturbations"]) * num_tasks
         num_tried = self.bomb["num_episodes"] + len(self.bomb["failures"])
         return range(recording["seed"], recording["seed"] + (num_tried - 1) // num_conditions + 1)
 

@@ -6,7 +6,6 @@ from typing import Any
 from lerobot.utils.constants import ACTION, OBS_IMAGES, OBS_PREFIX, OBS_STATE
 
 from lerobot_bomb import __version__
-from lerobot_bomb.bomb.episode import TASK_VERSION
 from lerobot_bomb.bomb.observation import ACTION_NAMES, CAMERAS, STATE_NAMES, geometry_shapes
 from lerobot_bomb.data.blocks import DatasetLayout, RecordedEpisode
 from lerobot_bomb.data.recording import Recording
@@ -32,7 +31,7 @@ def rollout_layout(recording: Recording) -> DatasetLayout:
         **geometry,
     }
     # with the task's version, so that LeRobot refuses to merge datasets of different ones
-    robot_type = f"bomb_{recording.robot}_v{TASK_VERSION}"
+    robot_type = f"bomb_{recording.robot}_v{recording.protocol_version}"
     return DatasetLayout(
         recording.repo_id, recording.fps, robot_type, features, not recording.images, tuple(geometry)
     )
@@ -61,6 +60,6 @@ def _columns(result: EpisodeResult) -> dict[str, Any]:
         "bomb/color": result.color or "",
         "bomb/levels": json.dumps(result.levels),
         "bomb/spec": json.dumps(result.spec.to_dict()),
-        "bomb/protocol_version": TASK_VERSION,
+        "bomb/protocol_version": result.task_version,
         "bomb/package_version": __version__,
     }
