@@ -1,17 +1,24 @@
 """What a dataset's folder says of itself, and how to evaluate on what it shows."""
 
+import json
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+import pyarrow.parquet as pq
+
 from lerobot_bomb.bomb.suite import suites_of
+from lerobot_bomb.conditions import ALL
 from lerobot_bomb.data.dataset_files import INFO_FILE
 from lerobot_bomb.data.environment import Environment
+from lerobot_bomb.data.recording import SCENES
 from lerobot_bomb.data.resumable import METADATA_FILE
 from lerobot_bomb.files import read_json
 
 PUSHT_SOURCE = "pusht-zarr"
 LIBERO_SOURCE = "libero-hdf5"
+EPISODE_TABLES = "meta/episodes/*/*.parquet"
+SPEC_COLUMN = "bomb/spec"
 
 
 @dataclass(frozen=True)
@@ -19,7 +26,8 @@ class DatasetFacts:
     """LeRobot's info.json and, of datasets that this package wrote, bomb.json."""
 
     info: dict[str, Any]
-    bomb: dict[str, Any]  # {} = written by others
+    bomb: dict[str, Any]  # {} = written or changed by others
+    suites: tuple[str, ...] = ()  # of its episodes, where their table alone still says so
 
     @classmethod
     def read(cls, root: Path) -> "DatasetFacts":
@@ -31,7 +39,9 @@ class DatasetFacts:
         if not (root / INFO_FILE).is_file():
             raise ValueError(f"{root} holds no {INFO_FILE}, so it is no LeRobotDataset")
         path = root / METADATA_FILE
-        return cls(read_json(root / INFO_FILE), read_json(path) if path.is_file() else {})
+        if path.is_file():
+            return cls(read_json(root / INFO_FILE), read_json(path))
+        return cls(read_json(root / INFO_FILE), {}, suites_of_episodes(root))
 
     @classmethod
     def find(cls, root: Path | str | None) -> "DatasetFacts | None":
@@ -46,7 +56,10 @@ class DatasetFacts:
     @property
     def environment(self) -> Environment | None:
         """That of the benchmark, which the dataset shows; None: another."""
-        return Environment.of_dataset(self.info, self.recording)
+        known = self.recording
+        if self.suites:
+            known = {"task": self.suites[0] if len(self.suites) == 1 else ALL}
+        return Environment.of_dataset(self.info, known)
 
     def eval_flags(self) -> list[str] | None:
         """Of lerobot-eval, for the environment that the dataset shows; None: not known."""
@@ -78,7 +91,8 @@ class DatasetFacts:
         num_tasks = len(suites_of(recording["task"])) * max(1, len(recording["task_ids"]))
         num_conditions = len(recording["perturbations"]) * num_tasks
         num_tried = self.bomb["num_episodes"] + len(self.bomb["failures"])
-        return range(recording["seed"], recording["seed"] + (num_tried - 1) // num_conditions + 1)
+        num_seeds = -(-num_tried // num_conditions) * (min(recording.get("static", 0), SCENES) or 1)
+        return range(recording["seed"], recording["seed"] + num_seeds)
 
     def _recording_lines(self) -> list[str]:
         recording, seeds = self.recording, self.seeds
@@ -97,3 +111,12 @@ class DatasetFacts:
             f"- recorded with lerobot_bomb {recording['package_version']}, MuJoCo "
             f"{recording.get('mujoco_version', 'of an unknown version')}",
         ]
+
+
+def suites_of_episodes(root: Path) -> tuple[str, ...]:
+    """Suites that a dataset's table of episodes names, sorted; a merge keeps the table."""
+    specs: set[str] = set()
+    for path in sorted(root.glob(EPISODE_TABLES)):
+        if SPEC_COLUMN in pq.read_schema(path).names:
+            specs |= set(pq.read_table(path, columns=[SPEC_COLUMN])[SPEC_COLUMN].drop_null().to_pylist())
+    return tuple(sorted({json.loads(spec)["suite"] for spec in specs}))

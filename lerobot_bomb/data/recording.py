@@ -18,6 +18,7 @@ from lerobot_bomb.data.resumable import check_repo_id
 from lerobot_bomb.envs.results import installed_version
 from lerobot_bomb.flags import flags_without_group, one_of
 
+SCENES = 100  # static ones that are stored as an episode
 MAX_NOISE = 1.0  # beyond it the noise exceeds the largest action
 
 
@@ -47,6 +48,12 @@ class Recording:
     depth: bool = False
     success_tolerance_mm: float = EpisodeSpec.success_tolerance_mm
     noise: float = 0.0
+    # scenes instead of episodes: boards as they may stand midway, a frame each, which belongs to no other
+    static: int = 0
+    # SHA-256 of the weights of the policy that acts in the expert's place, who labels what it sees
+    relabel: str | None = None
+    # whether columns say what the expert points at, for training only
+    pointing: bool = False
     # the suite's version, by the name that recordings of 1.0 have; filled in
     protocol_version: str = ""
     package_version: str = __version__
@@ -55,6 +62,8 @@ class Recording:
 
     def __post_init__(self) -> None:
         check_repo_id(self.repo_id)
+        if self.static:
+            self._of_scenes()
         if self.episodes < 1:
             raise ValueError(f"--episodes={self.episodes} must be at least 1")
         if not self.perturbations:
@@ -75,6 +84,21 @@ class Recording:
             conditions, _ = self.conditions, self.render_options  # they check the remaining flags
         if len(set(conditions)) < len(conditions):
             raise ValueError(f"--perturbations={','.join(self.perturbations)} has a condition twice")
+
+    def _of_scenes(self) -> None:
+        """Take the number of episodes from that of scenes; these are always labelled."""
+        if self.static < 1 or self.static % self.scenes:
+            raise ValueError(f"--static={self.static} must be in 1..{SCENES} or a multiple of {SCENES}")
+        for name, value in {"--relabel": self.relabel, f"--noise={self.noise}": self.noise}.items():
+            if value:
+                raise ValueError(f"{name}: static scenes are not played; leave it out with --static")
+        object.__setattr__(self, "episodes", self.static // self.scenes)
+        object.__setattr__(self, "pointing", True)
+
+    @property
+    def scenes(self) -> int:
+        """Seeds of an episode: scenes that are stored as one, for LeRobot takes its time for each; else 1."""
+        return min(self.static, SCENES) or 1
 
     @property
     def suite_specs(self) -> list[EpisodeSpec]:
@@ -109,7 +133,7 @@ class Recording:
         conditions = self.conditions
         for tried in itertools.count(num_tried):
             seeds_done, condition = divmod(tried, len(conditions))
-            yield replace(conditions[condition], seed=self.seed + seeds_done)
+            yield replace(conditions[condition], seed=self.seed + seeds_done * self.scenes)
 
     @property
     def render_options(self) -> RenderOptions:
