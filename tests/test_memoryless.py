@@ -106,8 +106,8 @@ def next_move(text: str, view: View) -> Next:
     if found := re.search(r"swap the (\w+) stone .* the (\w+) stone", text):
         return next_of_swap((found[1], found[2]), cells_in(text), view)
     if found := re.search(r"push the (\w+) stone", text):
-        stones = [view.held] if view.color(view.held) == found[1] else view.on_board.values()
-        (stone,) = [stone for stone in stones if view.color(stone) == found[1]]
+        held = [] if view.held is None else [view.held]
+        (stone,) = [stone for stone in [*held, *view.on_board.values()] if view.color(stone) == found[1]]
         return stone, of_cell(cells_in(text)[0])
     if found := re.search(r"bring all (\w+) stones to the left side", text):
         place = next((cell for cell in LEFT_SIDE if cell not in view.on_board), None)
@@ -115,7 +115,7 @@ def next_move(text: str, view: View) -> Next:
         if view.held is None and not left:
             return None
         assert place is not None
-        return view.held if view.held is not None else view.on_board[left[0]], of_cell(place)
+        return view.on_board[left[0]] if view.held is None else view.held, of_cell(place)
     return next_from_tray(text, view)
 
 

@@ -12,9 +12,10 @@ from torch import Tensor
 from transformers import AutoProcessor, AutoTokenizer, Qwen2VLImageProcessor
 
 from lerobot_bomb.vlm.backbone import config_dict
+from lerobot_bomb.vlm.prefix import Prefix
 from lerobot_bomb.vlm.presets import nano_qwen_config
 from lerobot_bomb.vlm.prompt import text_ids
-from lerobot_bomb.vlm.qwen import Prefix, QwenBackbone, QwenPrompt, build_qwen, load_qwen
+from lerobot_bomb.vlm.qwen import QwenBackbone, QwenPrompt, build_qwen, load_qwen
 from lerobot_bomb.vlm.tokenizer import load_tokenizer, nano_tokenizer
 
 SIZE = 112  # 4 x 4 tokens, in 2 x 2 windows of the vision model

@@ -40,7 +40,7 @@ def flags(checkpoint: Path, root: Path, **others: Any) -> list[str]:
 
 def test_what_the_policy_sees_gets_the_experts_actions(checkpoint: Path, tmp_path: Path) -> None:
     assert main(flags(checkpoint, tmp_path / "own")) == 0
-    dataset = LeRobotDataset("test/own", root=tmp_path / "own")
+    dataset: Any = LeRobotDataset("test/own", root=tmp_path / "own")
     assert dataset.num_episodes == 1 and len(dataset) == 100  # it failed, and is kept
     env = make_env(EpisodeSpec(3), RenderOptions(64))
     observation, _ = env.reset(seed=3)

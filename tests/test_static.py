@@ -142,7 +142,7 @@ def test_a_recording_has_a_frame_a_scene_and_its_labels(recorded: dict[str, Path
 
 
 def test_only_the_last_frame_of_a_demonstration_is_done(recorded: dict[str, Path]) -> None:
-    dataset = LeRobotDataset("test/episodes", root=recorded["episodes"])
+    dataset: Any = LeRobotDataset("test/episodes", root=recorded["episodes"])
     done = [bool(dataset[i]["next.done"]) for i in range(len(dataset))]
     assert done == [False] * (len(done) - 1) + [True]
 
@@ -177,7 +177,7 @@ def pointing_policy(meta: LeRobotDatasetMetadata) -> FdvlaPolicy:
 
 
 def test_a_policy_points_as_recorded(recorded: dict[str, Path], tmp_path: Path) -> None:
-    dataset = LeRobotDataset("test/static", root=recorded["scenes"])
+    dataset: Any = LeRobotDataset("test/static", root=recorded["scenes"])
     policy = pointing_policy(dataset.meta)
     assert policy.pointer is not None
     for place in policy.config.pointing_places or []:

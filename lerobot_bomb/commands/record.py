@@ -80,9 +80,9 @@ def run_record(args: argparse.Namespace) -> int:
     flags = vars(args)
     if args.static == 0:
         raise ValueError("--static=0 records nothing; give a number of scenes, or --episodes")
-    number = {"episodes": args.episodes or 0, "static": args.static or 0}
-    given = {f.name: flags[f.name] for f in fields(Recording) if f.name in flags}
-    recording = Recording(**given | number | {"relabel": _acting_weights(args)})
+    given: dict[str, Any] = {f.name: flags[f.name] for f in fields(Recording) if f.name in flags}
+    given |= {"episodes": args.episodes or 0, "static": args.static or 0, "relabel": _acting_weights(args)}
+    recording = Recording(**given)
     if not 1 <= args.workers <= recording.episodes:
         raise ValueError(
             f"--workers={args.workers} must lie in 1..{recording.episodes} (--episodes or --static)"

@@ -39,10 +39,10 @@ class WindowAttention(Qwen2_5_VLVisionAttention):
         assert position_embeddings is not None
         parts = self.qkv(hidden_states).unflatten(1, (3, self.num_heads, -1)).unbind(1)
         queries, keys = apply_rotary_pos_emb_vision(parts[0], parts[1], *position_embeddings)
-        of_windows = [
+        queries, keys, values = (
             part.unflatten(0, (-1, window_length)).transpose(1, 2) for part in (queries, keys, parts[2])
-        ]
-        read = scaled_dot_product_attention(*of_windows, scale=self.scaling)
+        )
+        read = scaled_dot_product_attention(queries, keys, values, scale=self.scaling)
         return self.proj(read.transpose(1, 2).flatten(2).flatten(0, 1))
 
 
