@@ -30,27 +30,7 @@ def add_record_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the arguments of ``lerobot-bomb record``."""
     add_new_dataset_arguments(parser)
     add = parser.add_argument
-    number = parser.add_mutually_exclusive_group(required=True)
-    number.add_argument("--episodes", type=int, help="successful episodes to record")
-    number.add_argument(
-        "--static",
-        type=int,
-        help="scenes to record instead: boards as they may stand midway, the gripper anywhere, with or "
-        "without the stone, a frame each, with --pointing; they teach what an instruction means",
-    )
-    add("--relabel", **switch(), help="let --policy.path act, and store what the expert would have done")
-    add(
-        "--policy.path",
-        dest="policy_path",
-        type=path_flag,
-        help="folder of the checkpoint that acts, with --relabel; whatever becomes of its episodes",
-    )
-    add(
-        "--pointing",
-        **switch(),
-        help="also store which stone goes where and what the expert would do for other places, which "
-        "--policy.pointing=true is trained on; no policy sees it in an evaluation",
-    )
+    _add_what_is_recorded(parser)
     add(
         "--seed",
         type=int,
@@ -72,6 +52,32 @@ def add_record_arguments(parser: argparse.ArgumentParser) -> None:
         "--resume",
         **switch(),
         help=f"continue a recording that was interrupted; its blocks of {BLOCK_EPISODES} episodes are kept",
+    )
+
+
+def _add_what_is_recorded(parser: argparse.ArgumentParser) -> None:
+    """Declare how much of what: episodes, whose, or scenes; with which labels."""
+    add = parser.add_argument
+    number = parser.add_mutually_exclusive_group(required=True)
+    number.add_argument("--episodes", type=int, help="successful episodes to record")
+    number.add_argument(
+        "--static",
+        type=int,
+        help="scenes to record instead: boards as they may stand midway, the gripper anywhere, with or "
+        "without the stone, a frame each, with --pointing; they teach what an instruction means",
+    )
+    add("--relabel", **switch(), help="let --policy.path act, and store what the expert would have done")
+    add(
+        "--policy.path",
+        dest="policy_path",
+        type=path_flag,
+        help="folder of the checkpoint that acts, with --relabel; whatever becomes of its episodes",
+    )
+    add(
+        "--pointing",
+        **switch(),
+        help="also store which stone goes where and what the expert would do for other places, which "
+        "--policy.pointing=true is trained on; no policy sees it in an evaluation",
     )
 
 

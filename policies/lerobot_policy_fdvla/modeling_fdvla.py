@@ -119,12 +119,7 @@ class FdvlaPolicy(RelativeVlaPolicy):
         if self.training:
             begin_batch(self.config, self.generator)
         draws = self.config.draws_per_chunk
-        actions_BKD, kept_BK = self._actions(batch), self._kept(batch)
-        labels = None
-        if self.pointer is not None:
-            labels = self.pointer.draw_labels(batch, self.config, self.generator)
-            other_B1D = self._to_relative(labels.other_actions[:, None], batch)
-            actions_BKD, kept_BK = labels.given_actions(actions_BKD, kept_BK, other_B1D)
+        actions_BKD, kept_BK, labels = self._targets(batch)
         actions_BKD, kept_BK = (each.repeat_interleave(draws, dim=0) for each in (actions_BKD, kept_BK))
         point = self._draw_point(actions_BKD)
         with self._autocast(), second_derivatives(self.config.has_energy):
@@ -155,6 +150,15 @@ class FdvlaPolicy(RelativeVlaPolicy):
             )
             terms[name] = loss_B.detach().mean()
         return loss, self._metrics(loss, terms, velocity_BKD, noise_BKD, point, actions_BKD, kept_BK)
+
+    def _targets(self, batch: dict[str, Tensor]) -> tuple[Tensor, Tensor, Labels | None]:
+        """Actions (B, K, D), which of them are kept (B, K), and what is pointed at."""
+        actions_BKD, kept_BK = self._actions(batch), self._kept(batch)
+        if self.pointer is None:
+            return actions_BKD, kept_BK, None
+        labels = self.pointer.draw_labels(batch, self.config, self.generator)
+        other_B1D = self._to_relative(labels.other_actions[:, None], batch)
+        return *labels.given_actions(actions_BKD, kept_BK, other_B1D), labels
 
     def _read_and_point(
         self, batch: dict[str, Tensor], labels: Labels | None
