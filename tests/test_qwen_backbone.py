@@ -174,7 +174,7 @@ def test_a_start_that_all_rows_share_is_read_once() -> None:
         backbone = load_qwen("nano", 56).train()
         ids, written = padded(prompt_rows(backbone))
         embedded = embed(backbone, ids, as_pixels(draw_images(4, 56)))
-        prefix = backbone.read_prefix(*embedded, written, num_shared)
+        prefix = backbone.read_prefix(*embedded, written, num_shared=num_shared)
         hidden = backbone.read_segment(prefix, torch.ones(2, 3, 128), torch.ones(2, 3, 3, dtype=torch.bool))
         weight_H = torch.linspace(-1, 1, 128)
         (hidden @ weight_H).mean().add((prefix.hidden[:, :-8] @ weight_H).mean()).backward()
