@@ -31,11 +31,10 @@ def check_start(checkpoint: str | Path, config: Any, meta: "LeRobotDatasetMetada
     Of what the weights do not depend on (sizes of images, numbers that are written as text) the config takes
     the data's shapes.
     """
-    missing = config.missing_parts()
-    if (missing is None and meta is None) or not _has_config(checkpoint):
+    if (config.missing_parts() is None and meta is None) or not _has_config(checkpoint):
         return
     saved: Any = PreTrainedConfig.from_pretrained(checkpoint)
-    if missing is not None and saved.missing_parts() is None:
+    if _lacks_architecture(config) and not _lacks_architecture(saved):
         raise ValueError(
             f"--policy.type={config.type} --policy.pretrained_path={checkpoint}: this type goes on from a "
             f"checkpoint with --policy.path={checkpoint}, which takes its config, too; "
@@ -47,6 +46,10 @@ def check_start(checkpoint: str | Path, config: Any, meta: "LeRobotDatasetMetada
 
 def _has_config(checkpoint: str | Path) -> bool:
     return (Path(checkpoint) / CONFIG).is_file() or is_hub_id(checkpoint)
+
+
+def _lacks_architecture(config: Any) -> bool:
+    return getattr(config, "vlm_config", {}) is None
 
 
 def _fit(checkpoint: str | Path, config: Any, saved: Any, of_data: dict[str, PolicyFeature]) -> None:

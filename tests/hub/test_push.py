@@ -29,6 +29,7 @@ from hub.damage import (
     without_state,
 )
 from hub.server import TOKEN, LoopbackHub
+from lerobot_bomb.bomb.board import task_id
 from lerobot_bomb.bomb.episode import EpisodeSpec
 from lerobot_bomb.commands.main import main
 from lerobot_bomb.data.environment import Environment
@@ -43,15 +44,15 @@ def result(seed: int, is_success: bool, policy: PolicyIdentity | None = None) ->
         task_version="1.0",
         spec=EpisodeSpec(seed=seed),
         instruction="Place a black stone on the Go board at row 0, column 1.",
-        task_id=0,
+        task_id=task_id((0, 1), "black"),
         target=(0, 1),
         color="black",
         steps=20,
-        progress=1.0,
+        progress=float(is_success),
         is_success=is_success,
         is_success_bomb_v0=is_success,
         failure=None if is_success else "dropped",
-        stage="placed",
+        stage="placed" if is_success else "lifted",
         placement_error_mm=1.0,
         nearest_intersection=(0, 1),
         collateral_mm=0.0,
