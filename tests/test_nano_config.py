@@ -15,7 +15,8 @@ from lerobot_bomb.training.policy_flags import check_as_trained, check_weights_f
 from lerobot_bomb.vlm.presets import changed
 
 PRESET: dict[str, Any] = {"scale_factor": 2, "image_token_id": 7, "text_config": {"layers": 4, "width": 128}}
-META: Any = SimpleNamespace(features={"action": {"dtype": "float32", "shape": (4,), "names": None}})  # of a dataset to train on
+ACTION: dict[str, Any] = {"dtype": "float32", "shape": (4,), "names": None}
+META: Any = SimpleNamespace(features={"action": ACTION})  # of a dataset to train on
 TWO_LAYERS = {"text_config": {"num_hidden_layers": 2}}
 
 
