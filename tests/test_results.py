@@ -222,7 +222,8 @@ def test_results_of_different_task_versions_are_not_pooled(
 ) -> None:
     of_object: dict[str, Any] = {"spec": {"suite": "object"}}
     new = [row(seed, task_version="1.1", **of_object) for seed in (0, 1)]
-    old = (old_row if "protocol_version" in of_old else row)(2, **of_object | of_old)
+    make_row: Callable[..., str] = old_row if "protocol_version" in of_old else row
+    old = make_row(2, **of_object | of_old)
     output = printed(path, "".join(new) + old, capsys)
     assert f"{path}: 2 episodes" in output and f"{path}: 1 episode" in output
     assert re.search(r"2 groups of episodes, .* they differ in .*task_version", output)
