@@ -150,12 +150,12 @@ def measure(values_RX: np.ndarray, episode_R: np.ndarray) -> Measure:
 
 
 def _is_constant(sums_E: np.ndarray, counts_E: np.ndarray) -> bool:
-    """Whether there are fewer than two episodes, or all have one mean."""
+    """Return whether there are fewer than two episodes, or all have one mean."""
     return len(sums_E) < 2 or _are_equal(sums_E / counts_E)
 
 
 def _are_equal(values: np.ndarray) -> bool:
-    """Whether all are the same but for rounding: resampling them tells nothing."""
+    """Return whether all are equal but for rounding: resampling them tells nothing."""
     return bool(np.ptp(values) <= ROUNDING * np.abs(values).max())
 
 

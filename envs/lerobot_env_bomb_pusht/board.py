@@ -101,7 +101,7 @@ class Board(PushTEnv):
 
     @cached_property
     def _behind(self) -> pygame.Surface:
-        """What a board that is not white is drawn on."""
+        """Return what a board that is not white is drawn on."""
         return pygame.Surface((BOARD_PX, BOARD_PX))
 
     def _draw_outline(self, screen: pygame.Surface) -> None:

@@ -43,7 +43,7 @@ class ConfigWithEnvironment(PreTrainedConfig):
         return None
 
     def methods_used(self) -> str:
-        """Of all that its type can do, what a checkpoint with this config does; empty: there is no choice."""
+        """Return those methods of its type that a checkpoint of this config uses; empty: no choice."""
         return ""
 
     def check_action_size(self, size: int) -> None:

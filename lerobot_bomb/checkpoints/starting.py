@@ -1,4 +1,4 @@
-"""Whether a training can start from a checkpoint, and what to start from where it cannot."""
+"""Starting a training from a checkpoint, and what to start from where it cannot."""
 
 import logging
 from pathlib import Path

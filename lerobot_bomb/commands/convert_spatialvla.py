@@ -115,7 +115,7 @@ def run_convert_spatialvla(args: argparse.Namespace) -> int:
 
 
 def _prompt_text(template: str) -> str:
-    """What the prompt is and why; no file of the folder says it."""
+    """Say what the prompt is and why; no file of the folder says it."""
     if template == BARE_TASK:
         return (
             "prompt: the instruction alone, as the original's processor adds nothing to what it is given; "

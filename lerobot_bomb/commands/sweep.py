@@ -129,7 +129,7 @@ def _check_numbers(args: argparse.Namespace) -> None:
 
 
 def _cells(args: argparse.Namespace, manifest: Manifest) -> list[Cell]:
-    """Of the manifest, those that this command plays."""
+    """Return the manifest's cells that this command plays."""
     try:
         cells = manifest.part(args.shard)
     except ValueError as error:
@@ -142,7 +142,7 @@ def _cells(args: argparse.Namespace, manifest: Manifest) -> list[Cell]:
 
 
 def _manifest(args: argparse.Namespace) -> Manifest:
-    """What is wanted: the flags' or, without --policies, the folder's."""
+    """Return what is wanted: the flags' or, without --policies, the folder's."""
     if args.policies is None:
         if not (args.folder / NAME).is_file():
             raise ValueError(
