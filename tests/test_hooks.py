@@ -1,5 +1,6 @@
 """Which callables of LeRobot and of what it stands on the plugin replaces, and when."""
 
+import gc
 import json
 import re
 import subprocess
@@ -12,9 +13,11 @@ import pytest
 from lerobot.common import train_utils
 from lerobot.configs import parser
 from lerobot.policies import PreTrainedPolicy
+from lerobot.policies.act.modeling_act import ACTPolicy
 
 import lerobot_policy_bomb  # noqa: F401  the plugin
 from lerobot_bomb.compat.hooks.paths import names_ours
+from lerobot_bomb.compat.hooks.policies import _living_policies
 from lerobot_bomb.compat.hooks.replace import replace
 
 ALWAYS = {"lerobot.configs.parser.get_path_arg"}
@@ -111,6 +114,19 @@ def test_the_first_use_of_a_type_of_ours_installs_the_others(seen: list[Any]) ->
 
 def test_a_policy_that_was_built_before_the_first_use_is_known(seen: list[Any]) -> None:
     assert seen[3]
+
+
+def test_a_policy_that_grows_old_while_policies_are_looked_for_is_known() -> None:
+    thresholds = gc.get_threshold()
+    gc.collect()
+    policy = ACTPolicy.__new__(ACTPolicy)
+    vars(policy)["config"] = None
+    gc.set_threshold(1, 1, 1)  # collects again and again while the generations are read
+    try:
+        living = [each is policy for each in _living_policies()]
+    finally:
+        gc.set_threshold(*thresholds)
+    assert any(living)
 
 
 def test_the_documentation_lists_each() -> None:

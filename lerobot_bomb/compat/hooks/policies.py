@@ -35,11 +35,18 @@ def remember_policies() -> None:
 
 
 def _living_policies() -> Iterator[PreTrainedPolicy]:
-    """Oldest first, about."""
-    for generation in (2, 1, 0):
-        for each in gc.get_objects(generation):
-            if issubclass(type(each), PreTrainedPolicy) and "config" in vars(each):
-                yield each
+    """Yield the policies that the garbage collector knows, oldest first, about."""
+    # a collection between two of these calls would move a policy to a generation that was already read
+    was_enabled = gc.isenabled()
+    gc.disable()
+    try:
+        objects = [each for generation in (2, 1, 0) for each in gc.get_objects(generation)]
+    finally:
+        if was_enabled:
+            gc.enable()
+    for each in objects:
+        if issubclass(type(each), PreTrainedPolicy) and "config" in vars(each):
+            yield each
 
 
 def built_policies() -> list[PreTrainedPolicy]:
