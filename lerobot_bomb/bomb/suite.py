@@ -2,6 +2,7 @@
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from functools import cache
 from importlib import import_module
 
 import numpy as np
@@ -93,8 +94,9 @@ class Suite:
     num_goals: int = 1  # of the expert, at most
 
 
+@cache
 def find_suite(name: str) -> Suite:
-    """The suite of a name in SUITES."""
+    """Return the suite of a name in SUITES."""
     return import_module(f"lerobot_bomb.bomb.suites.{name}").SUITE
 
 

@@ -1,6 +1,5 @@
 """Lines of `bomb` in a results file: what each must say, whichever protocol wrote it, and what all say."""
 
-import json
 from collections.abc import Mapping
 from statistics import mean, median
 from typing import Any
@@ -36,6 +35,7 @@ from lerobot_bomb.evaluation.result_kind import (
     Pair,
     ResultKind,
     describe_numbers,
+    json_list,
 )
 
 OLD_VERSION = "1.0"  # whose lines say less
@@ -80,9 +80,12 @@ def other_instructions(rows: list[Row]) -> dict[str, str]:
     return max(map(shifted, range(1, len(instructions))), key=num_others)
 
 
+_is_line = is_int(0, BOARD.num_lines - 1)
+
+
 def is_intersection(value: Any) -> bool:
-    """Whether a value is [row, column] on the board."""
-    return isinstance(value, list) and len(value) == 2 and all(map(is_int(0, BOARD.num_lines - 1), value))
+    """Return True for [row, column] on the board."""
+    return isinstance(value, list) and len(value) == 2 and all(map(_is_line, value))
 
 
 SPEC_CHECKS: dict[str, Check] = {  # the rest is EpisodeSpec's own
@@ -189,11 +192,11 @@ def _settings(row: Row) -> dict[str, str]:
 
 def _tasks_key(row: Row) -> str:
     if row.get("task_ids") is not None:
-        return json.dumps(sorted(row["task_ids"]))
+        return json_list(*sorted(row["task_ids"]))
     target, color = (row["spec"][name] for name in ("target", "color"))
     if row["protocol_version"] == OLD_VERSION and target and color:
         return "fixed"  # lines of one evaluation of numbered tasks do not tell those of the others
-    return json.dumps([target, color])
+    return json_list(target and tuple(target), color)
 
 
 def _describe_simulator(settings: Mapping[str, str]) -> str:

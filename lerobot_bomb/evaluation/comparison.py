@@ -1,13 +1,19 @@
 """Two policies on the same episodes: which is better, by how much, and is it certain?"""
 
-import json
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 
 from lerobot_bomb.checkpoints.shipped import checkpoint_path
 from lerobot_bomb.envs.results import Row
 from lerobot_bomb.evaluation.paired import PairedComparison, compare_pairs, describe_test
-from lerobot_bomb.evaluation.result_groups import Group, describe_policy, groups_of, rate_of, settings_of
+from lerobot_bomb.evaluation.result_groups import (
+    Group,
+    describe_policy,
+    episode_of,
+    groups_of,
+    rate_of,
+    settings_of,
+)
 from lerobot_bomb.evaluation.result_kind import NOT_RECORDED, Pair
 from lerobot_bomb.stats import format_p
 
@@ -95,11 +101,6 @@ def of_policies(rows: list[Row], names: Sequence[str]) -> list[list[Row]]:
 def can_compare(first: Group, second: Group) -> bool:
     """Whether two groups differ in nothing but their policies, as far as their lines say."""
     return not _apart(_values_of([first]), _values_of([second]))
-
-
-def episode_of(row: Row) -> str:
-    """Equal for rows of one episode under one condition, whoever acts."""
-    return json.dumps(row["spec"], sort_keys=True)
 
 
 def compare(first: list[Row], second: list[Row]) -> Comparisons:

@@ -66,7 +66,8 @@ def is_table_of(check: Check) -> Check:
 
 def is_one_of(values: Any) -> Check:
     """Whether a value is one of these texts."""
-    return lambda value: isinstance(value, str) and value in list(values)
+    allowed = frozenset(map(str, values))
+    return lambda value: isinstance(value, str) and value in allowed
 
 
 def is_sha256(value: Any) -> bool:

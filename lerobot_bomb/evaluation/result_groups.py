@@ -1,13 +1,13 @@
 """Episodes that compare: which lines of a results file may be pooled and paired, and what they are of."""
 
-import json
+from collections import Counter
 from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
 
 from lerobot_bomb.conditions import NONE
 from lerobot_bomb.envs.results import ORIGIN, Row, without_measured
-from lerobot_bomb.evaluation.result_kind import NOT_RECORDED, Pair, ResultKind, describe_numbers
+from lerobot_bomb.evaluation.result_kind import NOT_RECORDED, Pair, ResultKind, describe_numbers, json_list
 from lerobot_bomb.evaluation.result_lines import kind_of
 from lerobot_bomb.stats import PairedCounts, Rate
 
@@ -60,16 +60,21 @@ class Group:
 
 def groups_of(rows: list[Row]) -> list[Group]:
     """Lines apart that must not be pooled or paired; of an episode that was run again, the last one."""
-    settings: dict[str, dict[str, str]] = {}
-    episodes: dict[str, dict[str, Row]] = {}
-    counts: dict[str, int] = {}
+    episodes: dict[tuple[tuple[str, str], ...], dict[str, Row]] = {}
+    counts = Counter[tuple[tuple[str, str], ...]]()
     for row in rows:
-        of_row = settings_of(row)
-        key = json.dumps(of_row)
-        settings.setdefault(key, of_row)
-        episodes.setdefault(key, {})[json.dumps(row["spec"], sort_keys=True)] = row
-        counts[key] = counts.get(key, 0) + 1
-    return [Group(settings[key], list(of.values()), counts[key] - len(of)) for key, of in episodes.items()]
+        settings = tuple(settings_of(row).items())
+        episodes.setdefault(settings, {})[episode_of(row)] = row
+        counts[settings] += 1
+    return [
+        Group(dict(settings), list(of.values()), counts[settings] - len(of))
+        for settings, of in episodes.items()
+    ]
+
+
+def episode_of(row: Row) -> str:
+    """Return a text that is equal for rows of one episode under one condition, whoever acts."""
+    return str(sorted(row["spec"].items()))
 
 
 def settings_of(row: Row) -> dict[str, str]:
@@ -165,10 +170,9 @@ def _policy_key(row: Row) -> str:
     names = ["type", "weights_sha256", "settings_sha256", "base", "is_in_training"]
     if policy["weights_sha256"] is None:
         names += ["path", "revision"]
-    return json.dumps([policy[name] for name in names])
+    return json_list(*(policy[name] for name in names))
 
 
 def _episode(row: Row) -> str:
-    """What a row's spec is but for its perturbations."""
-    spec = {name: value for name, value in row["spec"].items() if name != "perturbations"}
-    return json.dumps(spec, sort_keys=True)
+    """Return a text that is equal for rows of one episode under any condition."""
+    return str(sorted(item for item in row["spec"].items() if item[0] != "perturbations"))

@@ -1,7 +1,9 @@
 """What lines of results of one environment are; how they are read and compared is the same for all."""
 
+import json
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
+from functools import lru_cache
 from typing import Any
 
 import numpy as np
@@ -96,6 +98,12 @@ class ResultKind:
         """Of lines of the newest protocol, what those of another version do not have."""
         *_, newest = self.fields.values()
         return [name for name in newest if name not in self.fields[version]]
+
+
+@lru_cache(maxsize=None, typed=True)
+def json_list(*values: Any) -> str:
+    """Return the JSON of hashable values as a list; each is written once, however many rows have it."""
+    return json.dumps(values)
 
 
 def mean_with_interval(rows: list[Row], name: str, start: tuple[str, ...] = ResultKind.start) -> str:

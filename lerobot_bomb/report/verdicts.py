@@ -8,8 +8,7 @@ from dataclasses import dataclass
 from typing import Any
 
 from lerobot_bomb.envs.results import Row
-from lerobot_bomb.evaluation.comparison import episode_of
-from lerobot_bomb.evaluation.result_groups import count_pairs, different_fields, rate_of
+from lerobot_bomb.evaluation.result_groups import count_pairs, different_fields, episode_of, rate_of
 from lerobot_bomb.evaluation.result_kind import Pair
 from lerobot_bomb.report.cells import INTERVALS, rate
 from lerobot_bomb.report.table import Cell, Table

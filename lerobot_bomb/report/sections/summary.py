@@ -4,8 +4,8 @@ from collections.abc import Iterator
 
 from lerobot_bomb.conditions import NONE
 from lerobot_bomb.envs.results import Row
-from lerobot_bomb.evaluation.comparison import can_compare, episode_of
-from lerobot_bomb.evaluation.result_groups import by_condition, rate_of
+from lerobot_bomb.evaluation.comparison import can_compare
+from lerobot_bomb.evaluation.result_groups import by_condition, episode_of, rate_of
 from lerobot_bomb.evaluation.result_kind import NO_VALUE, Measure
 from lerobot_bomb.report.arms import Arm, Report
 from lerobot_bomb.report.cells import INTERVALS, rate
