@@ -109,8 +109,8 @@ def test_flags_of_an_evaluation() -> None:
     ("task", "flag", "text"),
     [
         (None, "--env.task=SUITE", "an unknown suite, robot"),
-        ("object+place", "--env.task=object", "suite `object+place`, robot"),
-        ("goal+long+object+place+spatial", "--env.task=all", "suite `goal+long+object+place+spatial`, robot"),
+        ("object+place", "--env.task=object", "suite object+place, robot"),
+        ("goal+long+object+place+spatial", "--env.task=all", "suite goal+long+object+place+spatial, robot"),
     ],
 )
 def test_what_is_said_of_no_suite_and_of_several(task: str | None, flag: str, text: str) -> None:

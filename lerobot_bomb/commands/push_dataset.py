@@ -12,7 +12,7 @@ from lerobot_bomb.data.dataset_files import check_dataset
 from lerobot_bomb.data.facts import DatasetFacts
 from lerobot_bomb.data.resumable import METADATA_FILE, check_repo_id
 from lerobot_bomb.data.statistics import check_statistics
-from lerobot_bomb.hub.markdown import code, command, fenced
+from lerobot_bomb.hub.markdown import code, command, fenced, plain
 from lerobot_bomb.hub.push import CARD
 from lerobot_bomb.hub.upload import check_token, hub_errors, upload
 
@@ -91,7 +91,7 @@ def dataset_card(repo_id: str, facts: DatasetFacts) -> str:
         "",
         f"A LeRobotDataset {facts.info['codebase_version']}, written by `lerobot-bomb`.",
         "",
-        *facts.lines(),
+        *map(plain, facts.lines()),
         "",
         "## Use",
         "",

@@ -19,6 +19,7 @@ from lerobot_bomb.sweep.cluster import sbatch_script, submit
 from lerobot_bomb.sweep.local import PYTHON, play, progress
 from lerobot_bomb.sweep.manifest import NAME, Cell, Manifest, flag_value, parse_part, plan
 from lerobot_bomb.sweep.store import Store
+from lerobot_bomb.tables import print_lines
 
 MAX_BATCH = 10
 SCRIPT, SUBMITIT = "sweep.sbatch", "submitit"
@@ -86,10 +87,10 @@ def _play(args: argparse.Namespace, store: Store, cells: list[Cell]) -> int:
     except KeyboardInterrupt:
         store.merge()
         to_go_on = f"to go on: lerobot-bomb sweep {args.folder} (a cell that is not finished: from its start)"
-        print(*store.lines(), to_go_on, sep="\n")
+        print_lines(*store.lines(), to_go_on)
         raise
     store.merge()
-    print(*store.lines(), sep="\n")
+    print_lines(*store.lines())
     is_whole = all(store.is_finished(cell) and not store.errors(cell) for cell in cells)
     return 0 if is_whole else 1
 

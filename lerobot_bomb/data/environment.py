@@ -130,10 +130,10 @@ class Environment:
     def __str__(self) -> str:
         depth = " with depth" if self.depth else ""
         tasks = f", tasks {list(self.task_ids)}" if self.task_ids else ""
-        suite = "an unknown suite" if self.task is None else f"suite `{self.task}`"
+        suite = "an unknown suite" if self.task is None else f"suite {self.task}"
         return (
-            f"BOMB, task version {self.task_version}, {suite}{tasks}, robot `{self.robot}`, "
-            f"control `{self.control_mode}` at {self.fps} Hz, cameras `{', '.join(self.cameras)}` of "
+            f"BOMB, task version {self.task_version}, {suite}{tasks}, robot {self.robot}, "
+            f"control {self.control_mode} at {self.fps} Hz, cameras {', '.join(self.cameras)} of "
             f"{self.image_size} px{depth}"
         )
 

@@ -85,7 +85,7 @@ class DatasetFacts:
         return ["--env.type=libero", *([f"--env.task={suite}"] if suite else []), *size]
 
     def lines(self) -> list[str]:
-        """As Markdown's list."""
+        """Return what was recorded, as items of a list; `plain` makes them safe for Markdown."""
         info = self.info
         count = f"{info['total_episodes']} episodes, {info['total_frames']} frames at {info['fps']} Hz"
         return [f"- {count}", *self._recording_lines()]
@@ -108,10 +108,10 @@ class DatasetFacts:
         given = [f"{name} {recording[name]}" for name in ("target", "color") if recording.get(name)]
         tasks = recording["task_ids"] or ", ".join(given) or "drawn per episode"
         return [
-            f"- BOMB, task version {recording['protocol_version']}, suite `{recording['task']}`, robot "
-            f"`{recording['robot']}`, control `{recording['control_mode']}`, split `{recording['split']}`, "
+            f"- BOMB, task version {recording['protocol_version']}, suite {recording['task']}, robot "
+            f"{recording['robot']}, control {recording['control_mode']}, split {recording['split']}, "
             f"{recording['image_size']} px",
-            f"- perturbation axes: `{', '.join(recording['perturbations'])}`; noise on actions: "
+            f"- perturbation axes: {', '.join(recording['perturbations'])}; noise on actions: "
             f"{recording['noise']:g}; tasks: {tasks}",
             f"- seeds {seeds[0]}..{seeds[-1]}; failed episodes that were left out: {num_failed}",
             f"- recorded with lerobot_bomb {recording['package_version']}, MuJoCo "

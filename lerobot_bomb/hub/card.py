@@ -244,9 +244,9 @@ class Checkpoint:
         )
 
     def _data(self) -> str:
-        lines = [f"- environment: {self.environment}"] if self.environment is not None else []
+        lines = [f"- environment: {plain(str(self.environment))}"] if self.environment is not None else []
         lines += [f"- dataset: `{self.dataset_id}`"] if self.dataset_id else []
-        lines += self.dataset.lines() if self.dataset is not None else []
+        lines += map(plain, self.dataset.lines() if self.dataset is not None else [])
         features = {**(self.config.input_features or {}), **(self.config.output_features or {})}
         rows = [
             f"| {code(name)} | {each.type.value} | {tuple(each.shape)} |" for name, each in features.items()

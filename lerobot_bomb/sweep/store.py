@@ -202,7 +202,8 @@ class Store:
             text += [f"  {number} x {cause}" for cause, number in causes.most_common()]
         given_up = [cell for cell in cells if not self.is_finished(cell) and self.is_over(cell)]
         for cell in given_up:
-            text += [f"given up: {cell.command}", f"  {self.file(cell, 'given_up').read_text()}"]
+            why = self.file(cell, "given_up").read_text().splitlines()
+            text += [f"given up: {cell.command}", *(f"  {line}" for line in why)]
         if errors or given_up:
             text.append(f"to play them again: lerobot-bomb sweep {self.folder} --retry")
         if given_up and self.is_untouched():

@@ -128,10 +128,16 @@ def test_a_checkpoint_tells_its_environment_wherever_its_dataset_is() -> None:
         "'--env.task_ids=[7,12]' "
     ) in text
     assert (
-        "- environment: BOMB, task version 1.0, suite `place`, tasks [7, 12], robot `fetch`, control "
-        "`absolute` at 20 Hz, cameras `workspace, wrist` of 64 px\n"
+        "- environment: BOMB, task version 1.0, suite place, tasks [7, 12], robot fetch, control "
+        "absolute at 20 Hz, cameras workspace, wrist of 64 px\n"
     ) in text
     assert "--policy.environment" not in text
+
+
+def test_names_in_an_environment_are_no_markup() -> None:
+    hostile = Environment("scara", "relative", 10, 64, ("a`</p><img src=x>\x1b[2J",), "1.0", "place")
+    text = str(checkpoint(environment=hostile).card())
+    assert r"cameras a\`&lt;/p&gt;&lt;img src=x&gt;\\x1b[2J of 64 px" in text
 
 
 def test_a_suite_that_is_not_known_is_not_made_up() -> None:
@@ -139,7 +145,7 @@ def test_a_suite_that_is_not_known_is_not_made_up() -> None:
     text = str(unknown.card())
     assert "--env.task=SUITE" in text and "place" not in text
     assert "`SUITE` is that of its training, which the dataset does not say." in text
-    assert "- environment: BOMB, task version 1.0, an unknown suite, robot `scara`" in text
+    assert "- environment: BOMB, task version 1.0, an unknown suite, robot scara" in text
     spec = EpisodeSpec(0, "object")
     result = EpisodeResult(
         spec, "Put it there.", 0, (2, 2), "black", 20, 1.0, True, True, None, Stage.PLACED, 1.0, (2, 2), 0.0

@@ -199,7 +199,7 @@ def test_results_on_pusht_are_for_checkpoints_that_were_not_trained_for_bomb(
     assert push(checkpoint, *push_results) == 1
     assert (
         f"--results={results} has an episode of --env.type=bomb_pusht (seed 7); this checkpoint was trained "
-        "for BOMB, task version 1.0, suite `place`"
+        "for BOMB, task version 1.0, suite place"
     ) in capsys.readouterr().err
 
 

@@ -56,8 +56,8 @@ def test_one_commit_tagged_for_lerobot_with_a_card(
     assert set(foreseen[len(card) :].split()) == files.keys() - {"README.md"}
     assert yaml.safe_load(card.split("---\n")[1])["task_categories"] == ["robotics"]
     for part in (
-        "suite `place`",
-        "`camera:2`",
+        "suite place",
+        "camera:2",
         "seeds 7..8",
         "--env.type=bomb",
         f"--dataset.repo_id={REPO_ID}",
