@@ -19,7 +19,7 @@ from lerobot_bomb.commands.results_files import missing_of_sweep
 from lerobot_bomb.envs.results import Row, without_measured
 from lerobot_bomb.evaluation.results import read_results
 from lerobot_bomb.sweep.claim import claimed
-from lerobot_bomb.sweep.local import progress
+from lerobot_bomb.sweep.local import PYTHON, progress
 from lerobot_bomb.sweep.manifest import Cell, Manifest, plan
 from lerobot_bomb.sweep.store import MAX_ATTEMPTS, Store
 
@@ -399,6 +399,16 @@ def test_killed_at_any_moment_the_lines_are_those_of_an_undisturbed_run(tmp_path
         run.wait()
     subprocess.run([*command, tmp_path / "killed", "--retry", "--workers=2"], check=True, capture_output=True)
     assert (tmp_path / "killed" / "results.jsonl").read_text() == expected
+
+
+def test_a_worker_whose_parent_is_gone_imports_nothing(tmp_path: Path) -> None:
+    command = [*PYTHON, "lerobot_bomb.sweep", str(tmp_path), "1/1", "run", "1"]
+    shown = os.environ | {"PYTHONPROFILEIMPORTTIME": "1"}
+    ended = subprocess.run(
+        command, stdin=subprocess.DEVNULL, env=shown, capture_output=True, text=True, check=False
+    )
+    assert ended.returncode == 1
+    assert "threading" in ended.stderr and "lerobot.envs" not in ended.stderr
 
 
 def test_cells_have_names_of_their_own() -> None:

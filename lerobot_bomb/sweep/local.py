@@ -187,7 +187,7 @@ def play(store: Store, part: str, num_workers: int, timeout_s: int | None = None
     cells = store.manifest.part(part)
     num_workers = min(num_workers, len(cells))
     environments = worker_environments(num_workers, os.environ, num_cores(), visible_gpus(os.environ))
-    command = [*PYTHON, "lerobot_bomb.sweep.worker", str(store.folder), part, store.run]
+    command = [*PYTHON, "lerobot_bomb.sweep", str(store.folder), part, store.run]
     workers = Workers(store, command, environments, timeout_s)
     try:
         for has_played in progress(store, cells):

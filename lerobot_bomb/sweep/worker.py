@@ -1,7 +1,4 @@
-"""Plays the cells of a sweep that nobody else plays, one after the other, in one process.
-
-`python -m lerobot_bomb.sweep.worker FOLDER PART RUN FILE_DESCRIPTOR`, which ends with its standard input.
-"""
+"""Plays the cells of a sweep that nobody else plays, one after the other, in one process."""
 
 import faulthandler
 import io
@@ -11,7 +8,6 @@ import os
 import shutil
 import sys
 import tempfile
-import threading
 import time
 from collections.abc import Callable
 from contextlib import redirect_stderr
@@ -174,18 +170,10 @@ def describe(error: BaseException) -> str:
     return f"{type(error).__name__}: {lines[-1]}" if lines else type(error).__name__
 
 
-def _end_with_parent() -> None:
-    """The parent holds this process' standard input; when it is gone, however it ended, so is this one."""
-    while os.read(sys.stdin.fileno(), 1):  # sys.stdin.read() would hold a lock that Python's end needs
-        pass
-    os._exit(1)
-
-
 def main(folder: str, part: str, run: str, told: str) -> None:
     """Play a part of the sweep in a folder; which cell is played goes to the file descriptor `told`."""
     faulthandler.enable()  # a fault of native code says where it was
     logging.basicConfig(level=logging.WARNING)
-    threading.Thread(target=_end_with_parent, daemon=True).start()
     manifest = Manifest.read(Path(folder))
     store = Store(Path(folder), manifest, run)
     left = Manifest(tuple(cell for cell in manifest.cells if not store.is_over(cell)))
@@ -200,7 +188,3 @@ def main(folder: str, part: str, run: str, told: str) -> None:
 
 def _tell(told: int, key: str) -> None:
     os.write(told, f"{key}\n".encode())
-
-
-if __name__ == "__main__":
-    main(*sys.argv[1:])
