@@ -157,7 +157,8 @@ def test_several_policies_in_one_file_are_refused(a: Path, b: Path, capsys: Prin
     write(a, [None] * 3, policy=FDVLA)
     write(b, [None] * 3, policy=ACT)
     assert compare(a, b) == 1
-    assert "the first results are of 2 policies (act outputs/act" in capsys.readouterr().err
+    told = capsys.readouterr().err
+    assert "the first results are of 2 policies (act outputs/act (" in told and "); fdvla " in told
 
 
 def test_two_policies_of_one_file_are_chosen_by_name(a: Path, capsys: Printed) -> None:

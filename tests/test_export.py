@@ -77,6 +77,8 @@ def test_the_table_has_a_line_for_each_condition_and_a_column_for_each_policy(ex
     for row in conditions:
         shares = [int(re.match(r"\d+", cell)[0]) for cell in row[1:]]  # pyright: ignore
         assert shares == [SUCCESSES[policy, row[0]] * 100 // N for policy in ("act", "fdvla")]
+    rules = [line for line in lines if line.startswith("\\") and not line.endswith(r"\\")]
+    assert rules == [r"\begin{tabular}{lrr}", r"\toprule", r"\midrule", r"\bottomrule", r"\end{tabular}"]
     special = "".join(cell for row in body for cell in row)
     assert not re.search(r"(?<!\\)[_%&#$]", special)
     assert set("_%&#${}~^\\") == set(SPECIAL)

@@ -24,6 +24,19 @@ def test_shared_noise_is_the_same_in_every_episode_and_for_every_size_of_the_bat
     assert not first.equal(draws(SamplingNoise(2, is_per_episode=False), [1])[0])
 
 
+def test_shared_noise_is_drawn_once_for_all_rows() -> None:
+    calls = []
+
+    def draw(shape: tuple[int, ...], generator: torch.Generator) -> torch.Tensor:
+        calls.append(generator)
+        return torch.zeros(shape)
+
+    assert SamplingNoise(1, False, draw).draw(3, (2, 4)).shape == (3, 2, 4)
+    assert len(calls) == 1
+    SamplingNoise(1, True, draw).draw(3, (2, 4))
+    assert len(calls) == 4 and len(set(map(id, calls))) == 4
+
+
 def test_an_episodes_own_noise_follows_its_number_whatever_the_batches() -> None:
     singly, together, uneven = (
         draws(SamplingNoise(1, is_per_episode=True), sizes) for sizes in ([1] * 6, [6], [4, 2])

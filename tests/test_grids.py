@@ -12,7 +12,7 @@ from grid_cases import error, fitted, normal_actions
 from torch import Tensor
 
 from lerobot_bomb.actions.grid_edges import from_polar, gaussian_cut, to_polar
-from lerobot_bomb.actions.grid_settings import ActionGroup, GridSettings
+from lerobot_bomb.actions.grid_settings import ActionGroup, GridSettings, default_groups
 from lerobot_bomb.actions.grids import ActionGrids
 
 PI = math.pi
@@ -70,6 +70,12 @@ def test_the_published_bridge_grid(bridge: dict[str, Any]) -> None:
         torch.stack(torch.unravel_index(cells, (16, 32, 8))).tolist() for cells in torch.tensor([69, 880])
     ]
     assert parts == [[0, 8, 5], [3, 14, 0]]
+
+
+def test_the_published_grid_of_other_groups(bridge: dict[str, Any]) -> None:
+    groups = (ActionGroup((0, 1, 2), "polar", (2, 2, 2)), *default_groups(7, layout="pose")[1:])
+    grids = ActionGrids.from_published(bridge, groups=groups)
+    assert grids.num_cells == [8, 4096, 2] and grids.settings.flags()["action_groups"]
 
 
 def test_a_least_sigma_widens_the_published_grid(bridge: dict[str, Any]) -> None:

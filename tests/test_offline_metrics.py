@@ -142,6 +142,10 @@ def test_batches_do_not_matter_and_the_json_holds_it_all(
         assert one[name]["num_frames_measured"] == 8
         assert numbers(five[name]) == pytest.approx(numbers(one[name]), rel=1e-5)
     mean = one["validation"]["l1"]["extrapolate"]["all"]["mean"]
+    labels = [line.split("  ")[0].strip() for line in table.splitlines()]
+    start = labels.index("episodes")
+    assert labels[start : start + 3] == ["episodes", "frames", "loss"]
+    assert any(label.startswith("forward: ") for label in labels) and "forward: loss" not in labels
     assert f"{mean:.4g}" in next(line for line in table.splitlines() if line.startswith("L1, extrapolate"))
     assert [path.name for path in sorted(tmp_path.iterdir())] == ["1.json", "5.json"]
 

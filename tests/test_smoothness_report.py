@@ -14,6 +14,7 @@ from lerobot_bomb.evaluation.smoothness_report import (
     make_units,
     measure_difference,
     measure_row,
+    print_rows,
 )
 
 PARABOLA = np.array([[0.0], [1], [3], [6], [10]])  # second differences 1, third 0
@@ -34,6 +35,15 @@ def test_a_row_by_hand() -> None:
     )
     assert (row.num_skipped, row.num_actions) == (1, {"0": 5, "1": 4})
     assert [of["J2"] for of in row.episodes.values()] == [1, 3]
+
+
+def test_the_printed_row(capsys: pytest.CaptureFixture[str]) -> None:
+    of = executed("a", PARABOLA, 3 * PARABOLA[:4], PARABOLA[:3])
+    print_rows({"a": measure_row(of, make_units(of, ["x"], [], per_second=False))})
+    header, row, note = capsys.readouterr().out.splitlines()
+    assert header.split() == ["episodes", "actions", *" ".join(ORDERS).split()]
+    assert row.split()[:3] == ["a", "2", "9"]
+    assert note == "a: 1 more with fewer than 4 actions do not count"
 
 
 def test_per_second() -> None:

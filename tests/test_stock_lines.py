@@ -14,6 +14,7 @@ from lerobot_bomb.envs.results import PolicyIdentity
 from lerobot_bomb.evaluation.eval_info import results_of
 from lerobot_bomb.evaluation.result_lines import parse_line
 from lerobot_bomb.evaluation.results import read_results
+from lerobot_bomb.evaluation.stock_lines import STOCK_LIBERO_LINES
 from lerobot_bomb.libero.assets import Libero
 from lerobot_bomb.sweep.manifest import Manifest, plan
 from lerobot_bomb.sweep.store import Store
@@ -153,6 +154,10 @@ def test_libero_is_told_apart_by_the_number_that_chooses_the_initial_state() -> 
     ]
     assert [row["failure"] for row in rows] == [None, "failed"]
     assert rows[0]["image_size"] == "360x360" and "task" not in rows[0]["flags"]
+    assert STOCK_LIBERO_LINES.describe_simulator({"simulator": "robosuite 1"}) == "robosuite 1"
+    flags = STOCK_LIBERO_LINES.eval_flags(rows)
+    assert flags[0] == "--env.type=libero" and flags[-1] == "--eval.use_async_envs=false"
+    assert "--env.task=libero_goal" in flags and "--env.task_ids=[3]" in flags
 
 
 @pytest.mark.parametrize(

@@ -310,6 +310,13 @@ def test_a_sweep_that_is_refused_says_why_and_leaves_its_folder_free(
     flags = ["--policies=bomb_expert", "--env.type=bomb", "--episodes=1"]
     assert sweep(tmp_path, *flags, "--env.imgae_size=64", "--workers=2") == 1
     assert "unrecognized arguments: --env.imgae_size=64; nearest: --env.image_size" in capsys.readouterr().err
+    (tmp_path / "train").mkdir()
+    of_train = [f"--policies={tmp_path / 'train'}", *flags[1:], "--workers=2"]
+    assert sweep(tmp_path / "other", *of_train) == 1
+    told = (
+        f"--policy.path={tmp_path / 'train'}: config.json not found in {tmp_path / 'train'}; give the folder"
+    )
+    assert told in capsys.readouterr().err
     assert sweep(tmp_path, *flags, "--env.image_size=64") == 0
 
 

@@ -42,13 +42,17 @@ def run_report(args: argparse.Namespace) -> int:
         raise ValueError(f"--output={output} must be the page's path, .html, or a folder")
     page, tables, rates = (output.with_suffix(suffix) for suffix in (".html", ".json", ".csv"))
     check_outputs(args.paths, (page, tables, rates))
-    files = {path: read_undamaged(path)[0] for path in dict.fromkeys(args.paths)}
+    read = {path: read_undamaged(path) for path in dict.fromkeys(args.paths)}
+    files = {path: rows for path, (rows, _) in read.items()}
     arms = arms_of([row for rows in files.values() for row in rows])
     samples = list(sample_failures(arms, files, max(NUM_SAMPLES, args.videos)))
     folder = page.with_name(f"{page.stem}_videos")
     if args.videos:
         samples = _play(samples, folder, args.videos)
     missing = [told for path, rows in files.items() if (told := missing_of_sweep(path, len(rows)))]
+    missing += [
+        f"{path}: {number} damaged lines are not counted" for path, (_, number) in read.items() if number
+    ]
     sections = build(Report(arms, samples, missing))
     with written_whole(page, tables, rates) as (html, as_json, as_csv):
         html.write_text(render(args.title, sections))

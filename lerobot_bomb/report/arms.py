@@ -79,7 +79,7 @@ class Report:
 
     arms: list[Arm]
     samples: list[Sample] = field(default_factory=list)
-    missing: list[str] = field(default_factory=list)  # what files lack of their sweeps
+    missing: list[str] = field(default_factory=list)  # what files lack, or have damaged
 
 
 def sample_failures(arms: list[Arm], files: Mapping[Path, list[Row]], num_of_class: int) -> Iterator[Sample]:

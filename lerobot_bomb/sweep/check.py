@@ -18,14 +18,20 @@ def check(manifest: Manifest, begun: Sequence[Cell] = ()) -> None:
 
     Raises:
         SystemExit: flags are wrong; LeRobot's parser has said which.
-        ValueError: a policy was trained for another environment; the message names the flags to change.
+        ValueError: a policy's folder holds no checkpoint, or it was trained for another environment; the
+            message names the flags to change.
     """
     logging.disable(logging.WARNING)  # the workers' log has them
     try:
         cells = {_without_condition(cell): cell for cell in manifest.cells}
         for flags in cells.keys() - set(map(_without_condition, begun)):
             cell = cells[flags]
-            config = eval_config(cell.flags)
+            try:
+                config = eval_config(cell.flags)
+            except FileNotFoundError as error:
+                raise ValueError(
+                    f"{cell.policy[0]}: {error}; give the folder that lerobot-train names pretrained_model"
+                ) from None
             with as_if_built(config.policy):
                 try:
                     config.env.get_env_processors()
