@@ -50,6 +50,14 @@ def test_weights_by_age() -> None:
     torch.testing.assert_close(weights / weights[0], torch.tensor([1, 0.5, 0.25]))
 
 
+def test_a_chunk_of_another_mind_counts_less() -> None:
+    ensemble = TemporalEnsemble(2, "adaptive", 1.0)
+    ensemble(torch.tensor([[[9.0, 9.0], [0.0, 2.0]]]))
+    action = ensemble(torch.tensor([[[1.0, 0.0], [9.0, 9.0]]]))  # cosines 1 and 0
+    total = math.e + 1
+    torch.testing.assert_close(action, torch.tensor([[math.e / total, 2 / total]]))
+
+
 def test_no_coefficient_overflows() -> None:
     ensemble = TemporalEnsemble(3, "exponential", 500.0)
     for value in (1.0, 2.0, 4.0):

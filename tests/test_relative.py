@@ -8,7 +8,7 @@ from hypothesis import strategies as st
 from lerobot.configs import NormalizationMode
 
 from lerobot_bomb.actions.bins import Bins
-from lerobot_bomb.actions.relative import RelativeActions, bounds, named_dims
+from lerobot_bomb.actions.relative import RelativeActions, _residuals, bounds, named_dims
 
 
 def fitted(chunk_size: int = 2, **changes: Any) -> RelativeActions:
@@ -55,6 +55,13 @@ def test_chunks_end_with_their_episode() -> None:
     relative.fit(actions, states, np.array([3, 3, 3, 6, 6, 6]), 3, span, span)
     # the largest residual is 20, of 100 a unit; beyond the episode it would be 1000
     assert relative.scale.item() == pytest.approx(0.2)
+
+
+def test_of_many_residuals_those_of_evenly_spaced_frames_count(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("lerobot_bomb.actions.relative.MAX_RESIDUALS", 4)
+    actions, ends = np.arange(6.0) ** 2, np.array([6] * 6)
+    # every fourth frame, 1 + 6 * 2 // 4: 0 and 4, and the actions after them
+    assert _residuals(actions, np.zeros(6), ends, 2).tolist() == [0, 16, 1, 25]
 
 
 def test_one_residual_in_a_thousand_saturates() -> None:

@@ -13,6 +13,8 @@ from scipy.stats import linregress
 from test_results import FDVLA, values
 
 from lerobot_bomb.commands.main import main
+from lerobot_bomb.evaluation.paired import compare_pairs
+from lerobot_bomb.report.cells import points
 
 CLASSES = (None, None, None, "imprecise", "wrong_intersection", "dropped")
 type Rows = list[dict[str, Any]]
@@ -219,6 +221,15 @@ def test_the_output_is_a_page_or_a_folder(
     (tmp_path / "out").mkdir()
     assert main(["report", str(path), f"--output={tmp_path / 'out'}"]) == 0
     assert (tmp_path / "out" / "report.html").is_file()
+
+
+def test_points_as_numbers() -> None:
+    (compared,) = compare_pairs({"none": [(values(seed, "dropped"), values(seed)) for seed in range(6)]})
+    difference, p_value = points(compared)
+    low, high = compared.interval
+    counts = {"both": 0, "only_first": 0, "only_second": 6, "neither": 0}
+    assert difference.value == {"difference": 1, "low": low, "high": high, **counts}
+    assert p_value.value == pytest.approx(2 / 2**6)
 
 
 def test_the_page_says_how_many_lines_are_damaged(rows: Rows, tmp_path: Path) -> None:
