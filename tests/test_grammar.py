@@ -66,6 +66,11 @@ def test_fixed_width() -> None:
     assert after(NumberGrammar(7, 1, fixed_width=2), " ") == "0"
 
 
+def test_the_longest_answer() -> None:
+    assert NumberGrammar(512, 2).max_symbols(2) == len(" 511 511#")
+    assert NumberGrammar(512, 2).max_symbols(1) == len(" 511 ")
+
+
 def test_numbers_that_must_end() -> None:
     grammar = NumberGrammar(512, 1)
     ending = {text for text in ("", "0", "5", "51", "52", "99", "123") if must_end(grammar, text)}

@@ -208,6 +208,7 @@ def test_actions_that_cannot_be_fitted(actions: Tensor, message: str) -> None:
         ([((0, 1), "identity", (4, 4)), ((1, 2, 3), "identity", (4, 4, 4))], r"dims \[0, 1, 1, 2, 3\]"),
         ([((0, 1), "polar", (4, 4))], "polar has 3 of each, binary 1"),
         ([((0, 1), "identity", (4,))], "as many bins as dims"),
+        ([((0, 1), "binary", (2, 2))], "polar has 3 of each, binary 1"),
         ([((0,), "binary", (3,))], r"a binary group has bins \[2\]"),
         ([((0,), "identity", (1,))], r"bins \[1\] must each be in 2..4096"),
         ([((0,), "log", (4,))], "transform='log' is unknown; choose one of: polar, identity, binary"),

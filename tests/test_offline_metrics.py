@@ -146,6 +146,9 @@ def test_batches_do_not_matter_and_the_json_holds_it_all(
     start = labels.index("episodes")
     assert labels[start : start + 3] == ["episodes", "frames", "loss"]
     assert any(label.startswith("forward: ") for label in labels) and "forward: loss" not in labels
+    assert "L1 by step of the chunk, validation" in table.splitlines()
+    steps = [label for label in labels if label.isdecimal()]
+    assert steps == 2 * ["1", "2", "3"]  # of two runs
     assert f"{mean:.4g}" in next(line for line in table.splitlines() if line.startswith("L1, extrapolate"))
     assert [path.name for path in sorted(tmp_path.iterdir())] == ["1.json", "5.json"]
 

@@ -141,6 +141,12 @@ def test_actions_that_are_not_finite_are_errors(
 def test_a_reward_that_is_not_finite_is_named_by_its_seed() -> None:
     with pytest.raises(ValueError, match="the rewards of seed 8 are not finite"):
         list(results_of(info("pusht", 0, [1.0, float("nan")]), PushtEnv(), ACT, 7, 2))
+    told = info("pusht", 0, [1.0])
+    told["per_task"][0]["metrics"]["sum_rewards"] = [float("inf")]  # one of the two is enough
+    with pytest.raises(ValueError, match="the rewards of seed 7 are not finite"):
+        list(results_of(told, PushtEnv(), ACT, 7, 1))
+    (result,) = results_of(info("pusht", 0, [1.0]), PushtEnv(), ACT, 7, 1)
+    assert result.spec.number is None  # its seed alone chooses how an episode starts
 
 
 def test_libero_is_told_apart_by_the_number_that_chooses_the_initial_state() -> None:
