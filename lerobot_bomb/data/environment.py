@@ -7,6 +7,7 @@ from typing import Any
 
 from lerobot_bomb.bomb.board import task_id
 from lerobot_bomb.bomb.observation import ACTION_NAMES
+from lerobot_bomb.bomb.suite import task_version
 from lerobot_bomb.bomb.suites import SUITES
 from lerobot_bomb.conditions import ALL
 
@@ -104,9 +105,15 @@ class Environment:
             names.remove("task")
         if not set(self.cameras) <= set(other.cameras):
             names.append("cameras")
-        if self.task_version != other.task_version:
+        # what was trained on all suites acts in each of them, as long as none has become another
+        version = other.task_version if self._is_of_all else self.task_version
+        if version != other.task_version:
             names.append("task_version")
         return names
+
+    @property
+    def _is_of_all(self) -> bool:
+        return self.suites == frozenset(SUITES) and self.task_version == task_version(ALL)
 
     def check_same(self, other: "Environment", who: str, insist: str) -> None:
         """Raise a ValueError, which names flags to change, unless `who`, of this one, can act in `other`."""

@@ -10,7 +10,7 @@ from typing import Any, ClassVar, Self
 import torch
 from lerobot.datasets import LeRobotDatasetMetadata
 from lerobot.policies import PreTrainedPolicy
-from lerobot.utils.constants import ACTION, OBS_STATE
+from lerobot.utils.constants import ACTION, DONE, OBS_STATE
 from torch import Tensor, nn
 from torch.nn.attention import SDPBackend, sdpa_kernel
 
@@ -129,11 +129,18 @@ class ChunkPolicy(HubPolicy, SavesTiedWeightsOnce, PreTrainedPolicy):
         self._batch_size = batch_size
 
     def _kept(self, batch: dict[str, Tensor]) -> Tensor:
-        """(B, T) bool: which actions are trained on."""
-        if f"{ACTION}_is_pad" in batch and not self.config.loss_on_padded_actions:
-            return ~self._of_batch(batch, f"{ACTION}_is_pad").bool()
+        """(B, T) bool: which actions are trained on; of a frame that is the last one, only its own."""
         shape = len(batch[ACTION]), self.config.chunk_size
-        return torch.ones(shape, dtype=torch.bool, device=self._device)
+        kept_BT = torch.ones(shape, dtype=torch.bool, device=self._device)
+        if self.config.loss_on_padded_actions:
+            return kept_BT
+        if f"{ACTION}_is_pad" in batch:
+            kept_BT = ~self._of_batch(batch, f"{ACTION}_is_pad").bool()
+        if isinstance(done_B1 := batch.get(DONE), Tensor):
+            kept_BT = kept_BT & ~(
+                done_B1.reshape(-1, 1).bool() & (torch.arange(shape[1], device=self._device) > 0)
+            )
+        return kept_BT
 
     def _l1_parts(self, errors_BTD: Tensor, counted_BTD: Tensor) -> dict[str, tuple[Tensor, Tensor]]:
         """Absolute errors as `means` takes them, in all and by dimension; none where units are not known."""

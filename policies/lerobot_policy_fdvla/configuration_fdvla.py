@@ -43,6 +43,7 @@ SHAPES = (
     "dualmod_denoise",
     "head_dim",
     "dualmod_dim",
+    "pointing",
 )
 # the same, and flags that say what the model's tokens mean
 AS_TRAINED = (
@@ -64,6 +65,8 @@ class FdvlaConfig(RelativeVlaConfig):
         "time_sampling": TIME_SAMPLINGS,
         "train_vlm": TRAIN_VLM,
     }
+
+    NEEDS_STATE: ClassVar[tuple[str, ...]] = (*RelativeVlaConfig.NEEDS_STATE, "pointing")
 
     # Hub id, path of a local folder, or "nano": a small model with random weights, built in code
     vlm_model_name: str = "Qwen/Qwen2.5-VL-3B-Instruct"
@@ -111,6 +114,15 @@ class FdvlaConfig(RelativeVlaConfig):
     # times and noises that each chunk of a batch is trained at; the prompt is read once for all
     draws_per_chunk: int = 1
 
+    # whether a place and a stone are predicted first and enter both heads; a dataset's columns are the labels
+    pointing: bool = False
+    # of what is pointed at, beside the heads' losses
+    pointing_loss_weight: float = 1.0
+    # share of the frames that are given another place, and the expert's action for it
+    counterfactual_share: float = 0.5
+    # (x, y) in metres that can be pointed at; filled in
+    pointing_places: list[list[float]] | None = None
+
     # "residual", "flow", "ddim", "sde" or "paper"; None = residual with both heads, else that of the one
     sampler: str | None = None
     # "euler" or "heun"
@@ -148,7 +160,11 @@ class FdvlaConfig(RelativeVlaConfig):
             raise ValueError(
                 "--policy.freeze_vision_encoder=false needs --policy.train_vlm=full: frozen freezes both"
             )
-        check_not_negative(self, ("flow_loss_weight", "denoise_loss_weight", "noise_seed"))
+        check_not_negative(
+            self, ("flow_loss_weight", "denoise_loss_weight", "noise_seed", "pointing_loss_weight")
+        )
+        if not 0 <= self.counterfactual_share <= 1:
+            raise ValueError(f"--policy.counterfactual_share={self.counterfactual_share} must lie in 0..1")
         if self.consistency_loss_weight is not None:
             check_not_negative(self, ("consistency_loss_weight",))
         with _policy_flags():
