@@ -17,7 +17,7 @@ from lerobot_bomb.commands.main import main
 from lerobot_bomb.data.environment import Environment
 from lerobot_bomb.envs.rollout import make_env
 
-HERE = Environment("scara", "relative", 10, 64, ("workspace", "wrist"), "1.0")
+HERE = Environment("scara", "relative", 10, 64, ("workspace", "wrist"), "1.0", "place")
 
 
 @pytest.fixture(scope="module")

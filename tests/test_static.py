@@ -224,7 +224,7 @@ def test_lerobot_merges_scenes_with_demonstrations_and_the_suite_stays_known(
     merged = LeRobotDataset("test/merged", root=tmp_path / "merged")
     assert merged.num_episodes == 5 and set(merged.features) > LABELS
     environment = DatasetFacts.read(tmp_path / "merged").environment
-    assert environment is not None and environment.task == "all"
+    assert environment is not None and environment.task == "goal+long+object+place"  # none is of spatial
 
 
 @pytest.mark.parametrize(

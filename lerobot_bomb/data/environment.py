@@ -97,7 +97,7 @@ class Environment:
     def differences(self, other: "Environment") -> list[str]:
         """Fields in which `other` is one that a policy of this environment cannot act in.
 
-        A suite that is not known is compared with nothing.
+        A suite that is not known is compared with nothing, nor is its version.
         """
         names = [name for name in COMPARED if getattr(self, name) != getattr(other, name)]
         ours, theirs = self.suites, other.suites
@@ -105,15 +105,15 @@ class Environment:
             names.remove("task")
         if not set(self.cameras) <= set(other.cameras):
             names.append("cameras")
-        # what was trained on all suites acts in each of them, as long as none has become another
-        version = other.task_version if self._is_of_all else self.task_version
-        if version != other.task_version:
+        is_same_version = self.task_version == other.task_version or (self._is_current and other._is_current)
+        if ours is not None and not is_same_version:
             names.append("task_version")
         return names
 
     @property
-    def _is_of_all(self) -> bool:
-        return self.suites == frozenset(SUITES) and self.task_version == task_version(ALL)
+    def _is_current(self) -> bool:
+        """Return whether its suites, whose newest version it names, are those that are played today."""
+        return self.suites is not None and self.task_version == max(map(task_version, self.suites))
 
     def check_same(self, other: "Environment", who: str, insist: str) -> None:
         """Raise a ValueError, which names flags to change, unless `who`, of this one, can act in `other`."""
