@@ -32,6 +32,7 @@ from lerobot_bomb.data.record import record
 from lerobot_bomb.data.recording import Recording
 from lerobot_bomb.data.rollout_pool import RolloutSettings, collect
 from lerobot_bomb.envs.rollout import Moment, make_env
+from lerobot_bomb.evaluation.trivial import Demonstrations
 from lerobot_bomb.policies.pointing import places_of
 from lerobot_env_bomb.env import BombEnv
 from lerobot_policy_fdvla import FdvlaConfig
@@ -153,6 +154,33 @@ def test_of_a_scene_a_chunk_is_its_first_action(recorded: dict[str, Path]) -> No
     assert policy._kept(batch).tolist() == [[True] + 3 * [False], 4 * [True], [True] + 3 * [False]]
     batch["action_is_pad"] = torch.tensor(3 * [[False, False, True, True]])
     assert policy._kept(batch).sum(dim=1).tolist() == [1, 2, 1]
+    policy.config.loss_on_padded_actions = (
+        True  # padding repeats an action, and what follows it is another scene's
+    )
+    assert policy._kept(batch).sum(dim=1).tolist() == [3, 4, 3]
+
+
+def test_scenes_are_no_episodes(recorded: dict[str, Path], capsys: pytest.CaptureFixture[str]) -> None:
+    scenes = ["--dataset.repo_id=test/static", f"--dataset.root={recorded['scenes']}"]
+    assert main(["smoothness", *scenes]) == 1
+    told = "episode 0 of test/static holds static scenes, which do not follow each other"
+    assert told in capsys.readouterr().err
+    meta = LeRobotDatasetMetadata("test/static", root=recorded["scenes"])
+    with pytest.raises(ValueError, match=told):
+        Demonstrations.read(meta, [0], [])
+    config = FdvlaConfig(
+        **SMALL_FDVLA | {"chunk_size": 2, "n_action_steps": 2, "relative_actions": True}, push_to_hub=False
+    )
+    with pytest.raises(ValueError, match=told):
+        policy_for(config, ds_meta=meta)
+    assert main(["smoothness", "--dataset.repo_id=t/e", f"--dataset.root={recorded['episodes']}"]) == 0
+
+
+def test_no_chunk_is_longer_than_every_episode(recorded: dict[str, Path]) -> None:
+    meta = LeRobotDatasetMetadata("test/static", root=recorded["scenes"])
+    config = FdvlaConfig(**SMALL_FDVLA | {"chunk_size": 9, "n_action_steps": 1}, push_to_hub=False)
+    with pytest.raises(ValueError, match=r"--policy.chunk_size=9: .* has 2 frames; give at most 2"):
+        policy_for(config, ds_meta=meta)
 
 
 def test_seeds_of_scenes_do_not_repeat() -> None:
@@ -164,7 +192,8 @@ def test_seeds_of_scenes_do_not_repeat() -> None:
 
 def test_a_label_is_no_input_of_a_policy_that_is_trained_on_it(recorded: dict[str, Path]) -> None:
     meta = LeRobotDataset("test/static", root=recorded["scenes"]).meta
-    policy = policy_for(FdvlaConfig(**SMALL_FDVLA, push_to_hub=False), ds_meta=meta)
+    options = SMALL_FDVLA | {"chunk_size": 1, "n_action_steps": 1}
+    policy = policy_for(FdvlaConfig(**options, push_to_hub=False), ds_meta=meta)
     assert not LABELS & set(policy.config.input_features or {})
     assert "observation.state" in (policy.config.input_features or {})
 
