@@ -6,8 +6,8 @@ of the frames it is given another place, and the expert's action for that one.
 Shapes: `B` batch, `P` places, `K` actions of a chunk, `D` action dims.
 """
 
-from dataclasses import dataclass
-from typing import Any
+from dataclasses import dataclass, replace
+from typing import Any, ClassVar
 
 import numpy as np
 import torch
@@ -15,6 +15,7 @@ from lerobot.datasets import LeRobotDatasetMetadata
 from lerobot.utils.constants import OBS_PREFIX, OBS_STATE
 from torch import Tensor
 
+from lerobot_bomb.actions.grid_fit import EQUAL_BOUNDS
 from lerobot_bomb.actions.relative import bounds
 from lerobot_bomb.bomb.pointing import COLUMNS, NUM_OTHERS, PREFIX
 from lerobot_bomb.data.columns import dim_names, present_episodes, read_columns
@@ -24,6 +25,48 @@ LABELS = f"{OBS_PREFIX}{PREFIX}"  # what the keys of a dataset's columns begin w
 PLACE, STONE, OTHER_PLACES, OTHER_ACTIONS = (f"{OBS_PREFIX}{name}" for name in COLUMNS)
 GRIPPER = ("x", "y", "z")  # dimensions of the state
 SAME_PLACE_M = 1e-3
+
+
+@dataclass
+class PointingFlags:
+    """What the config of a policy that can point has beside its other flags."""
+
+    # as `ConfigWithEnvironment` has them
+    LATER_FIELDS: ClassVar[dict[str, Any]] = {
+        "pointing": False,
+        "counterfactual_share": 0.5,
+        "pointing_places": None,
+    }
+
+    # whether a place and a stone are predicted before the action; a dataset's columns are the labels
+    pointing: bool = False
+    # share of the frames that are given another place, and the expert's action for it
+    counterfactual_share: float = 0.5
+    # (x, y) in metres that can be pointed at; filled in
+    pointing_places: list[list[float]] | None = None
+
+    def check_counterfactual_share(self) -> None:
+        if not 0 <= self.counterfactual_share <= 1:
+            raise ValueError(f"--policy.counterfactual_share={self.counterfactual_share} must lie in 0..1")
+
+    def pointing_method(self) -> list[str]:
+        """As `ConfigWithEnvironment.methods`; none where the policy acts as its paper's."""
+        return ["points before it acts"] if self.pointing else []
+
+    def take_places(self, meta: LeRobotDatasetMetadata | None) -> list[list[float]]:
+        """Return the checkpoint's places, or else the dataset's, which are filled in.
+
+        Raises:
+            ValueError: there is neither, or the dataset cannot be trained on.
+        """
+        if meta is not None:
+            self.pointing_places = places_of(meta, self.pointing_places)
+        if self.pointing_places is None:
+            raise ValueError(
+                "--policy.pointing=true takes the places from a dataset, and there is none; train on one "
+                "that lerobot-bomb record --pointing wrote"
+            )
+        return self.pointing_places
 
 
 @dataclass(frozen=True)
@@ -61,6 +104,12 @@ class Labels:
         )
         given_B = torch.where(is_other_B, number_of(other_xy_B2, places_P2), place_B)
         return cls(place_B, stone_B3[:, :2], stone_B3[:, 2], is_other_B, given_B, other_actions_BD)
+
+    def normalised(self, bounds_2D: Tensor) -> "Labels":
+        """Labels whose other actions are as LeRobot normalises them; ``bounds_2D``: what -1 and 1 are."""
+        low_D, high_D = bounds_2D
+        width_D = torch.where(high_D == low_D, EQUAL_BOUNDS, high_D - low_D)
+        return replace(self, other_actions=2 * (self.other_actions - low_D) / width_D - 1)
 
     def given_actions(self, actions_BKD: Tensor, kept_BK: Tensor, other_B1D: Tensor) -> tuple[Tensor, Tensor]:
         """Actions, and which of them are known, for the places that are given.

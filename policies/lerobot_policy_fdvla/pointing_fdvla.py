@@ -5,7 +5,7 @@ The prediction enters the action tokens ahead of both heads, as what they need: 
 Shapes: `B` batch, `P` places, `H` hidden size, `D` action dims, `S` state dims.
 """
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import torch
 from lerobot.datasets import LeRobotDatasetMetadata
@@ -110,8 +110,7 @@ class Pointer(nn.Module):
     ) -> Labels:
         """What a batch points at, and the places that are given; actions as LeRobot normalises them."""
         labels = Labels.draw(batch, self.places, config.counterfactual_share, config.type, generator)
-        low_D, high_D = self.action_bounds
-        return replace(labels, other_actions=2 * (labels.other_actions - low_D) / (high_D - low_D) - 1)
+        return labels.normalised(self.action_bounds)
 
 
 def make_pointer(
@@ -124,15 +123,9 @@ def make_pointer(
     """
     if not config.pointing:
         return None
-    if meta is not None:
-        config.pointing_places = places_of(meta, config.pointing_places)
-    if config.pointing_places is None:
-        raise ValueError(
-            "--policy.pointing=true takes the places from a dataset, and there is none; train on one that "
-            "lerobot-bomb record --pointing wrote"
-        )
+    places = config.take_places(meta)
     assert config.action_feature is not None
-    pointer = Pointer(hidden_size, config.action_feature.shape[0], config.pointing_places)
+    pointer = Pointer(hidden_size, config.action_feature.shape[0], places)
     if meta is not None:
         pointer.fit(meta, config)
     return pointer
