@@ -12,6 +12,8 @@ from lerobot.optim import AdamWConfig, CosineDecayWithWarmupSchedulerConfig
 
 from lerobot_bomb.vlm.tokenizer import NANO
 
+# flags that older checkpoints do not name, and how all of those were trained
+UNNAMED = {"pointing": False}
 MAX_POSITIONS = 128_000  # of Qwen2.5-VL; LeRobot lists a chunk's frames before it builds a policy
 
 
@@ -157,9 +159,15 @@ def trained_with(config: Any, flags: Iterable[str]) -> dict[str, Any]:
     return json.loads(json.dumps({flag: getattr(config, flag) for flag in flags}))
 
 
+def _then(config: Any) -> dict[str, Any]:
+    """The values that a checkpoint was trained with, of flags that its type has."""
+    unnamed = {flag: value for flag, value in UNNAMED.items() if hasattr(config, flag)}
+    return unnamed | (config.trained_with or {})
+
+
 def check_as_trained(config: Any) -> None:
     """A checkpoint's flags still are what its weights were trained with."""
-    then = config.trained_with or {}
+    then = _then(config)
     for flag, value in trained_with(config, then).items():
         if value != then[flag]:
             raise ValueError(
@@ -170,7 +178,7 @@ def check_as_trained(config: Any) -> None:
 
 def check_weights_fit(config: Any, flags: Iterable[str]) -> None:
     """A training goes on from a checkpoint with flags that its weights have the shapes for."""
-    then = config.trained_with or {}
+    then = _then(config)
     for flag, value in trained_with(config, [flag for flag in flags if flag in then]).items():
         if value != then[flag]:
             raise ValueError(

@@ -21,6 +21,7 @@ from lerobot_bomb.flow.samplers import (
     check_sampling,
 )
 from lerobot_bomb.policies.config import RELATIVE_AS_TRAINED, RelativeVlaConfig
+from lerobot_bomb.policies.pointing_config import PointingVlaConfig
 from lerobot_bomb.training.policy_flags import (
     MAX_POSITIONS,
     check_not_negative,
@@ -55,7 +56,7 @@ AS_TRAINED = (
 
 @PreTrainedConfig.register_subclass("fdvla")
 @dataclass
-class FdvlaConfig(RelativeVlaConfig):
+class FdvlaConfig(RelativeVlaConfig, PointingVlaConfig):
     """A Qwen2.5-VL reads noisy actions beside images and text; two heads take them to clean ones."""
 
     CHOICES: ClassVar[dict[str, tuple]] = {
@@ -114,12 +115,8 @@ class FdvlaConfig(RelativeVlaConfig):
     # times and noises that each chunk of a batch is trained at; the prompt is read once for all
     draws_per_chunk: int = 1
 
-    # whether a place and a stone are predicted first and enter both heads; a dataset's columns are the labels
-    pointing: bool = False
     # of what is pointed at, beside the heads' losses
     pointing_loss_weight: float = 1.0
-    # share of the frames that are given another place, and the expert's action for it
-    counterfactual_share: float = 0.5
     # (x, y) in metres that can be pointed at; filled in
     pointing_places: list[list[float]] | None = None
 
@@ -163,8 +160,6 @@ class FdvlaConfig(RelativeVlaConfig):
         check_not_negative(
             self, ("flow_loss_weight", "denoise_loss_weight", "noise_seed", "pointing_loss_weight")
         )
-        if not 0 <= self.counterfactual_share <= 1:
-            raise ValueError(f"--policy.counterfactual_share={self.counterfactual_share} must lie in 0..1")
         if self.consistency_loss_weight is not None:
             check_not_negative(self, ("consistency_loss_weight",))
         with _policy_flags():
