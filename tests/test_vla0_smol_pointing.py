@@ -111,6 +111,10 @@ def test_off_there_is_nothing_of_it() -> None:
     assert torch.equal(*losses)
     assert policy._write(batch, 3).shape == (2, 12)
     assert "points first" not in policy.config.methods_used()
+    # a checkpoint of before keeps its identity
+    later = {name: getattr(policy.config, name) for name in policy.config.LATER_FIELDS}
+    assert later == {"pointing": False, "counterfactual_share": 0.5, "pointing_range_m": 0.3}
+    assert policy.config.LATER_FIELDS == later
 
 
 # Loss

@@ -1,6 +1,7 @@
 """The flags of policies that may point before they act."""
 
 from dataclasses import dataclass
+from typing import Any, ClassVar
 
 from lerobot_bomb.policies.config import VlaConfig
 
@@ -8,6 +9,9 @@ from lerobot_bomb.policies.config import VlaConfig
 @dataclass
 class PointingVlaConfig(VlaConfig):
     """Config of a policy that says which stone goes where, and then acts on what it has said."""
+
+    # as `ConfigWithEnvironment` has them
+    LATER_FIELDS: ClassVar[dict[str, Any]] = {"pointing": False, "counterfactual_share": 0.5}
 
     # whether a place and a stone are predicted first and actions follow; a dataset's columns are the labels
     pointing: bool = False

@@ -99,7 +99,7 @@ class ChunkPolicy(HubPolicy, SavesTiedWeightsOnce, PreTrainedPolicy):
     def _prepare(cls, config: Any, meta: LeRobotDatasetMetadata | None) -> None:
         """Check and complete the config of a checkpoint that is loaded, to be trained on if there is data."""
         if meta is None:
-            check_as_trained(config)
+            check_as_trained(config, cls.as_trained)
         else:
             check_weights_fit(config, cls.shapes)
 

@@ -12,8 +12,6 @@ from lerobot.optim import AdamWConfig, CosineDecayWithWarmupSchedulerConfig
 
 from lerobot_bomb.vlm.tokenizer import NANO
 
-# flags that older checkpoints do not name, and how all of those were trained
-UNNAMED = {"pointing": False}
 MAX_POSITIONS = 128_000  # of Qwen2.5-VL; LeRobot lists a chunk's frames before it builds a policy
 
 
@@ -159,15 +157,12 @@ def trained_with(config: Any, flags: Iterable[str]) -> dict[str, Any]:
     return json.loads(json.dumps({flag: getattr(config, flag) for flag in flags}))
 
 
-def _then(config: Any) -> dict[str, Any]:
-    """The values that a checkpoint was trained with, of flags that its type has."""
-    unnamed = {flag: value for flag, value in UNNAMED.items() if hasattr(config, flag)}
-    return unnamed | (config.trained_with or {})
+def check_as_trained(config: Any, flags: Iterable[str]) -> None:
+    """A checkpoint's flags still are what its weights were trained with.
 
-
-def check_as_trained(config: Any) -> None:
-    """A checkpoint's flags still are what its weights were trained with."""
-    then = _then(config)
+    ``flags``: those that say it now; an older checkpoint names fewer.
+    """
+    then = _then(config, flags)
     for flag, value in trained_with(config, then).items():
         if value != then[flag]:
             raise ValueError(
@@ -178,13 +173,19 @@ def check_as_trained(config: Any) -> None:
 
 def check_weights_fit(config: Any, flags: Iterable[str]) -> None:
     """A training goes on from a checkpoint with flags that its weights have the shapes for."""
-    then = _then(config)
+    then = _then(config, flags)
     for flag, value in trained_with(config, [flag for flag in flags if flag in then]).items():
         if value != then[flag]:
             raise ValueError(
                 f"--policy.{flag}={value!r}: the weights of this checkpoint are made for {then[flag]!r}; "
                 f"only a training without --policy.path can change it"
             )
+
+
+def _then(config: Any, flags: Iterable[str]) -> dict[str, Any]:
+    """What a checkpoint was trained with, also by flags that it is older than."""
+    later = {flag: config.LATER_FIELDS[flag] for flag in flags if flag in config.LATER_FIELDS}
+    return {**later, **(config.trained_with or {})}
 
 
 def action_deltas(config: Any) -> list[int] | None:

@@ -68,6 +68,11 @@ class FdvlaConfig(RelativeVlaConfig, PointingVlaConfig):
     }
 
     NEEDS_STATE: ClassVar[tuple[str, ...]] = (*RelativeVlaConfig.NEEDS_STATE, "pointing")
+    LATER_FIELDS: ClassVar[dict[str, Any]] = {
+        **PointingVlaConfig.LATER_FIELDS,
+        "pointing_loss_weight": 1.0,
+        "pointing_places": None,
+    }
 
     # Hub id, path of a local folder, or "nano": a small model with random weights, built in code
     vlm_model_name: str = "Qwen/Qwen2.5-VL-3B-Instruct"

@@ -2,7 +2,7 @@
 
 import math
 from dataclasses import dataclass
-from typing import ClassVar
+from typing import Any, ClassVar
 
 from lerobot.configs import PreTrainedConfig
 
@@ -40,6 +40,7 @@ class Vla0SmolConfig(RelativeVlaConfig, TokenVlaConfig, PointingVlaConfig):
     }
     ACTIONS_ARE_OF_WEIGHTS: ClassVar[bool] = False
     STATE_IS_OF_WEIGHTS: ClassVar[bool] = False
+    LATER_FIELDS: ClassVar[dict[str, Any]] = {**PointingVlaConfig.LATER_FIELDS, "pointing_range_m": 0.3}
     NEEDS_STATE: ClassVar[tuple[str, ...]] = (*RelativeVlaConfig.NEEDS_STATE, "pointing")
 
     # Hub id, path of a local folder, or "nano": a small model with random weights, built in code
