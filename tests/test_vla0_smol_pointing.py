@@ -114,7 +114,7 @@ def test_off_there_is_nothing_of_it() -> None:
     # a checkpoint of before keeps its identity
     later = {name: getattr(policy.config, name) for name in policy.config.LATER_FIELDS}
     assert later == {"pointing": False, "counterfactual_share": 0.5, "pointing_range_m": 0.3}
-    assert policy.config.LATER_FIELDS == later
+    assert later == policy.config.LATER_FIELDS
 
 
 # Loss
