@@ -21,7 +21,7 @@ from lerobot_bomb.flow.samplers import (
     check_sampling,
 )
 from lerobot_bomb.policies.config import RELATIVE_AS_TRAINED, RelativeVlaConfig
-from lerobot_bomb.policies.pointing import PointingFlags
+from lerobot_bomb.policies.pointing_config import PlacesVlaConfig
 from lerobot_bomb.training.policy_flags import (
     MAX_POSITIONS,
     check_not_negative,
@@ -56,7 +56,7 @@ AS_TRAINED = (
 
 @PreTrainedConfig.register_subclass("fdvla")
 @dataclass
-class FdvlaConfig(PointingFlags, RelativeVlaConfig):
+class FdvlaConfig(RelativeVlaConfig, PlacesVlaConfig):
     """A Qwen2.5-VL reads noisy actions beside images and text; two heads take them to clean ones."""
 
     CHOICES: ClassVar[dict[str, tuple]] = {
@@ -68,7 +68,7 @@ class FdvlaConfig(PointingFlags, RelativeVlaConfig):
     }
 
     NEEDS_STATE: ClassVar[tuple[str, ...]] = (*RelativeVlaConfig.NEEDS_STATE, "pointing")
-    LATER_FIELDS: ClassVar[dict[str, Any]] = {**PointingFlags.LATER_FIELDS, "pointing_loss_weight": 1.0}
+    LATER_FIELDS: ClassVar[dict[str, Any]] = {**PlacesVlaConfig.LATER_FIELDS, "pointing_loss_weight": 1.0}
 
     # Hub id, path of a local folder, or "nano": a small model with random weights, built in code
     vlm_model_name: str = "Qwen/Qwen2.5-VL-3B-Instruct"
@@ -159,7 +159,6 @@ class FdvlaConfig(PointingFlags, RelativeVlaConfig):
         check_not_negative(
             self, ("flow_loss_weight", "denoise_loss_weight", "noise_seed", "pointing_loss_weight")
         )
-        self.check_counterfactual_share()
         if self.consistency_loss_weight is not None:
             check_not_negative(self, ("consistency_loss_weight",))
         with _policy_flags():
@@ -203,7 +202,6 @@ class FdvlaConfig(PointingFlags, RelativeVlaConfig):
             f"{' and '.join(used)} {'heads' if len(used) > 1 else 'head'}",
             f"{'both' if len(of_used) > 1 else ' '.join(of_used) or 'none'} modulated",
             f"{self.used_sampler} in {self.num_inference_steps} steps",
-            *self.pointing_method(),
             *super().methods(),
         ]
 

@@ -5,15 +5,14 @@ The prediction enters the action tokens ahead of both heads, as what they need: 
 Shapes: `B` batch, `P` places, `H` hidden size, `D` action dims, `S` state dims.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import torch
 from lerobot.datasets import LeRobotDatasetMetadata
-from lerobot.utils.constants import ACTION, OBS_STATE
 from torch import Tensor, nn
 from torch.nn.functional import binary_cross_entropy_with_logits, cross_entropy, smooth_l1_loss
 
-from lerobot_bomb.policies.pointing import Labels, gripper_dims, places_of, unit_bounds
+from lerobot_bomb.policies.pointing import DataUnits, Labels, places_of
 from lerobot_policy_fdvla.configuration_fdvla import FdvlaConfig
 
 FEEDBACK_DIM = 128
@@ -32,23 +31,17 @@ class Pointed:
     held_logit: Tensor  # (B,)
 
 
-class Pointer(nn.Module):
+class Pointer(DataUnits):
     """Heads on an action token's state, and what is fed back into the action tokens.
 
     Before training what is fed back is exactly zero.
     """
 
     places: Tensor  # (P, 2) metres
-    state_bounds: Tensor  # (2, 3) metres of the gripper that are -1 and 1 in a normalised state
-    action_bounds: Tensor  # (2, D) the same of the environment's actions
-    gripper_dims: Tensor  # (3,) int64, of the state
 
     def __init__(self, hidden_size: int, action_dim: int, places: list[list[float]]):
-        super().__init__()
+        super().__init__(action_dim)
         self.register_buffer("places", torch.tensor(places))
-        self.register_buffer("state_bounds", torch.tensor([[-1.0], [1.0]]).repeat(1, 3))
-        self.register_buffer("action_bounds", torch.tensor([[-1.0], [1.0]]).repeat(1, action_dim))
-        self.register_buffer("gripper_dims", torch.arange(3))
         self.features = nn.Sequential(nn.Linear(hidden_size, hidden_size), nn.SiLU())
         self.place, self.stone = nn.Linear(hidden_size, len(places)), nn.Linear(hidden_size, 2)
         self.held = nn.Linear(hidden_size, 1)
@@ -59,11 +52,9 @@ class Pointer(nn.Module):
 
     def forward(self, state_BH: Tensor, robot_state_BS: Tensor) -> Pointed:
         """An action token's state and the normalised state of the robot -> what they point at."""
-        low_3, high_3 = self.state_bounds
-        gripper_B3 = low_3 + (robot_state_BS.float()[:, self.gripper_dims] + 1) / 2 * (high_3 - low_3)
         features_BH = self.features(state_BH)
         return Pointed(
-            gripper_B3,
+            self.gripper(robot_state_BS),
             self.place(features_BH).float(),
             NEAR_M * self.stone(features_BH).float(),
             self.held(features_BH).float()[:, 0],
@@ -96,21 +87,17 @@ class Pointer(nn.Module):
             "held_loss": binary_cross_entropy_with_logits(pointed.held_logit, labels.held, reduction="none"),
         }
 
-    @torch.no_grad()
     def fit(self, meta: LeRobotDatasetMetadata, config: FdvlaConfig) -> None:
         """Take from a dataset what its normalised numbers are, and that it points where this can."""
         places_of(meta, config.pointing_places)
-        dims, modes = gripper_dims(meta), config.normalization_mapping
-        self.gripper_dims.copy_(torch.tensor(dims))
-        self.state_bounds.copy_(unit_bounds(meta, OBS_STATE, modes["STATE"])[:, dims])
-        self.action_bounds.copy_(unit_bounds(meta, ACTION, modes["ACTION"]))
+        self.fit_units(meta, config.normalization_mapping)
 
     def draw_labels(
         self, batch: dict[str, Tensor], config: FdvlaConfig, generator: torch.Generator
     ) -> Labels:
         """What a batch points at, and the places that are given; actions as LeRobot normalises them."""
         labels = Labels.draw(batch, self.places, config.counterfactual_share, config.type, generator)
-        return labels.normalised(self.action_bounds)
+        return replace(labels, other_actions=self.normalised(labels.other_actions))
 
 
 def make_pointer(

@@ -19,7 +19,7 @@ from lerobot_bomb.actions.grid_settings import (
 from lerobot_bomb.bomb.observation import WORKSPACE_HIGH_M, WORKSPACE_LOW_M
 from lerobot_bomb.flags import one_of
 from lerobot_bomb.policies.config import TokenVlaConfig
-from lerobot_bomb.policies.pointing import PointingFlags
+from lerobot_bomb.policies.pointing_config import PlacesVlaConfig
 from lerobot_bomb.training.policy_flags import (
     check_not_negative,
     check_positive,
@@ -43,7 +43,7 @@ STONE_CELL_M = 0.005  # a fifth of a stone, and about what a small vision model 
 
 @PreTrainedConfig.register_subclass("spatialvla_grid")
 @dataclass
-class SpatialvlaGridConfig(PointingFlags, TokenVlaConfig):
+class SpatialvlaGridConfig(TokenVlaConfig, PlacesVlaConfig):
     """A PaliGemma 2 chooses one grid cell for each group of action dimensions and step."""
 
     CHOICES: ClassVar[dict[str, tuple]] = {
@@ -55,7 +55,7 @@ class SpatialvlaGridConfig(PointingFlags, TokenVlaConfig):
     }
     STATE_IS_OF_WEIGHTS: ClassVar[bool] = False
     LATER_FIELDS: ClassVar[dict[str, Any]] = {
-        **PointingFlags.LATER_FIELDS,
+        **PlacesVlaConfig.LATER_FIELDS,
         "task_template": BARE_TASK,
         "pointing_area_m": WORKSPACE_M,
         "pointing_cell_m": STONE_CELL_M,
@@ -148,7 +148,6 @@ class SpatialvlaGridConfig(PointingFlags, TokenVlaConfig):
         check_template(self.task_template, "--policy.task_template")
         check_not_negative(self, ("grid_min_sigma",))
         check_positive(self, ("ego3d_patch_reso", "ego3d_n_freqs"))
-        self.check_counterfactual_share()
         self.stone_cells()
 
     def validate_features(self) -> None:
@@ -168,7 +167,6 @@ class SpatialvlaGridConfig(PointingFlags, TokenVlaConfig):
         has_depth = self.depth_source != "none"
         return [
             f"{_cells_text(self.grid_settings().groups)}, {edges}",
-            *self.pointing_method(),
             *super().methods(),
             f"3-D positions by depth ({self.depth_source})" if has_depth else "no depth, no 3-D positions",
         ]

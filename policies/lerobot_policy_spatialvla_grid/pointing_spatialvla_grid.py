@@ -6,7 +6,7 @@ Shapes: `B` batch, `P` places, `D` action dims, `N` tokens ahead of the cells.
 """
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any
 
 import torch
@@ -14,7 +14,7 @@ from lerobot.datasets import LeRobotDatasetMetadata
 from lerobot.utils.constants import ACTION
 from torch import Tensor, nn
 
-from lerobot_bomb.policies.pointing import Labels, unit_bounds
+from lerobot_bomb.policies.pointing import Labels, normalised_actions, unit_bounds
 
 if TYPE_CHECKING:
     from lerobot_policy_spatialvla_grid.configuration_spatialvla_grid import SpatialvlaGridConfig
@@ -114,7 +114,8 @@ class CellPointer(nn.Module):
         labels = Labels.draw(batch, self.places, config.counterfactual_share, config.type, generator)
         tokens_B2 = torch.stack([labels.given, self.stones.number_of(labels.stone_xy)], dim=1)
         kept_B2 = torch.stack([~labels.is_other, torch.ones_like(labels.is_other)], dim=1)
-        return labels.normalised(self.action_bounds), Target(tokens_B2, kept_B2)
+        others_BD = normalised_actions(labels.other_actions, self.action_bounds)
+        return replace(labels, other_actions=others_BD), Target(tokens_B2, kept_B2)
 
 
 def make_pointer(config: "SpatialvlaGridConfig", meta: LeRobotDatasetMetadata | None) -> CellPointer | None:
