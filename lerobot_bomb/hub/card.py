@@ -245,7 +245,7 @@ class Checkpoint:
 
     def _data(self) -> str:
         lines = [f"- environment: {plain(str(self.environment))}"] if self.environment is not None else []
-        lines += [f"- dataset: `{self.dataset_id}`"] if self.dataset_id else []
+        lines += [f"- dataset: {code(self.dataset_id)}"] if self.dataset_id else []
         lines += map(plain, self.dataset.lines() if self.dataset is not None else [])
         features = {**(self.config.input_features or {}), **(self.config.output_features or {})}
         rows = [

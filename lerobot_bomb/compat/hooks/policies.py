@@ -1,7 +1,7 @@
 """The policies that a process has built, and calls of them, of which LeRobot tells an environment nothing."""
 
 import gc
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from typing import Any
 from weakref import WeakSet, ref
 
@@ -34,19 +34,21 @@ def remember_policies() -> None:
     replace(PreTrainedPolicy, "__init__", around)
 
 
-def _living_policies() -> Iterator[PreTrainedPolicy]:
-    """Yield the policies that the garbage collector knows, oldest first, about."""
+def _living_policies() -> list[PreTrainedPolicy]:
+    """Return the policies that the garbage collector knows, oldest first, about."""
     # a collection between two of these calls would move a policy to a generation that was already read
     was_enabled = gc.isenabled()
     gc.disable()
     try:
-        objects = [each for generation in (2, 1, 0) for each in gc.get_objects(generation)]
+        return [
+            each
+            for generation in (2, 1, 0)
+            for each in gc.get_objects(generation)
+            if issubclass(type(each), PreTrainedPolicy) and "config" in vars(each)
+        ]
     finally:
         if was_enabled:
             gc.enable()
-    for each in objects:
-        if issubclass(type(each), PreTrainedPolicy) and "config" in vars(each):
-            yield each
 
 
 def built_policies() -> list[PreTrainedPolicy]:
