@@ -52,6 +52,7 @@ class Task:
     recipe: str | None = None  # the task whose recipes it is learnt by; None: its own
     suite: str = "place"
     is_said_at_once: bool = True  # else the policy is given several instructions, which are not exchanged
+    static: int = 0  # scenes beside the demonstrations; then both are labelled for pointing
 
 
 TASKS = {
@@ -88,6 +89,15 @@ TASKS = {
         is_partial=True,
         recipe="all_targets",
     ),
+    # one policy for all suites; demonstrations are of each in turn, evaluations of each
+    "all_suites": Task(
+        (),
+        episodes=100,
+        trainings={"fdvla": Training(2000, None)},
+        suite=ALL,
+        is_said_at_once=False,
+        static=60_000,
+    ),
     **{
         suite: Task(
             (),
@@ -111,6 +121,13 @@ def shown_pairs() -> list[int]:
         for target in targets_of("train")
         if target not in LEFT_OUT_PAIRS[color]
     ]
+
+
+def by_suite(rows: list[Row]) -> dict[str, list[Row]]:
+    """{suite: its rows} of an evaluation on several; {} on one."""
+    suites = sorted({row["spec"]["suite"] for row in rows})
+    each = {suite: [row for row in rows if row["spec"]["suite"] == suite] for suite in suites}
+    return each if len(suites) > 1 else {}
 
 
 def by_what_is_left_out(rows: list[Row]) -> dict[str, list[Row]]:

@@ -9,6 +9,7 @@ import torch
 from lerobot.policies import PreTrainedPolicy
 from torch import Tensor, nn
 from transformers import PreTrainedModel
+from transformers.modeling_layers import GradientCheckpointingLayer
 
 type Batch = dict[str, Any]
 # tensors in the order of the calls, by kind, module and argument
@@ -16,12 +17,12 @@ type Inputs = dict[str, list[Tensor]]
 
 
 def kind_of_entry(module: nn.Module) -> str | None:
-    """How a module takes in data: pixels, token ids, or as a whole model embeddings, masks, positions."""
+    """How a module takes in data: pixels, token ids, or as a model or a layer of one embeddings and masks."""
     if isinstance(module, nn.Conv2d | nn.Conv3d) and module.in_channels == 3:
         return "pixels"
     if isinstance(module, nn.Embedding):
         return "ids"
-    return "model" if isinstance(module, PreTrainedModel) else None
+    return "model" if isinstance(module, PreTrainedModel | GradientCheckpointingLayer) else None
 
 
 @contextmanager

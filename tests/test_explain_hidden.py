@@ -87,7 +87,9 @@ def qwen(policy: Any, columns: list[int]) -> None:
             inputs_embeds=embeds, attention_mask=bias, position_ids=positions
         ).last_hidden_state
 
-    def read_prefix(embeds: Tensor, is_image: Tensor, mask: Tensor, hidden: Tensor | None = None) -> Prefix:
+    def read_prefix(
+        embeds: Tensor, is_image: Tensor, mask: Tensor, hidden: Tensor | None = None, num_shared: int = 0
+    ) -> Prefix:
         ids = torch.where(is_image, backbone.vlm.config.image_token_id, 0)
         side = backbone.tokens_per_side * 2
         grids = torch.tensor([[1, side, side]] * (int(is_image[0].sum()) // backbone.tokens_per_image))
@@ -96,7 +98,12 @@ def qwen(policy: Any, columns: list[int]) -> None:
         states = run(embeds, bias_of(embeds.shape[1], 0, columns))
         return Prefix(states, mask, torch.zeros(len(embeds), 1, dtype=torch.int64), [])
 
-    def read_segment(prefix: Prefix, embeds: Tensor, reads: Tensor) -> Tensor:
+    def read_segment(prefix: Prefix, embeds: Tensor, reads: Tensor, num_copies: int = 1) -> Tensor:
+        num_new = embeds.shape[1] // num_copies
+        parts = [slice(start, start + num_new) for start in range(0, embeds.shape[1], num_new)]
+        return torch.cat([read_copy(embeds[:, part], reads[:, part, part]) for part in parts], dim=1)
+
+    def read_copy(embeds: Tensor, reads: Tensor) -> Tensor:
         whole = torch.cat([read["embeds"].expand(len(embeds), -1, -1), embeds], dim=1)
         bias = bias_of(whole.shape[1], 0, columns).repeat(len(embeds), 1, 1, 1)
         num_new = embeds.shape[1]

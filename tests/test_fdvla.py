@@ -10,6 +10,7 @@ from torch.nn.functional import scaled_dot_product_attention
 
 from lerobot_bomb.flow.path import PathPoint, path_point
 from lerobot_policy_fdvla.modeling_fdvla import FdvlaPolicy
+from lerobot_policy_fdvla.networks_fdvla import SideBySide
 
 ENERGY: dict[str, Any] = {"consistency": "energy_vjp"}
 
@@ -308,3 +309,26 @@ def test_attention_in_bfloat16_has_plain_gradients_on_a_cpu(dtype: str) -> None:
         attended = scaled_dot_product_attention(query, query, query)
     assert attended.grad_fn is not None
     assert ("FlashAttention" in attended.grad_fn.name()) == (dtype == "float32")
+
+
+def test_draws_side_by_side_read_their_own_tokens() -> None:
+    reads = torch.tensor([[[1, 0], [1, 1]], [[1, 1], [1, 1]]], dtype=torch.bool)
+    assert SideBySide(2).reads(reads).int().tolist() == [
+        [[1, 0, 0, 0], [1, 1, 0, 0], [0, 0, 1, 1], [0, 0, 1, 1]]
+    ]
+    assert torch.equal(SideBySide(1).reads(reads), reads)
+    embeds = torch.arange(8).reshape(2, 2, 2)
+    assert SideBySide(2).joined(embeds).tolist() == [[[0, 1], [2, 3], [4, 5], [6, 7]]]
+
+
+def test_draws_of_a_chunk_are_trained_as_if_each_were_read_alone() -> None:
+    policy = wake_dualmod(make_policy(draws_per_chunk=3))
+    batch = make_batch(policy, 2)
+    context, kept = policy._read(batch), policy._kept(batch).repeat_interleave(3, dim=0)
+    actions, tau = torch.randn(6, 4, 4), torch.rand(6)
+    together = policy._heads(context, kept)(actions, tau)
+    for draw in range(3):
+        alone = policy._heads(context, kept[draw::3])(actions[draw::3], tau[draw::3])
+        for of_all, of_one in zip(together, alone, strict=True):
+            assert of_all is not None and of_one is not None
+            torch.testing.assert_close(of_all[draw::3], of_one, rtol=1e-4, atol=1e-5)

@@ -22,6 +22,7 @@ from fdvla_cases import (
 from lerobot_bomb.checkpoints.environment import ConfigWithEnvironment
 from lerobot_bomb.flag_errors import FlagError
 from lerobot_bomb.policies.config import ChunkConfig, RelativeVlaConfig, VlaConfig
+from lerobot_bomb.policies.pointing_config import PlacesVlaConfig, PointingVlaConfig
 from lerobot_policy_fdvla.configuration_fdvla import FdvlaConfig
 
 
@@ -151,7 +152,15 @@ def test_an_environment_may_name_no_task(tasks: tuple[str, ...]) -> None:
     assert policy.predict_action_chunk(batch).isfinite().all()
 
 
-OURS = (ConfigWithEnvironment, ChunkConfig, VlaConfig, RelativeVlaConfig, FdvlaConfig)
+OURS = (
+    ConfigWithEnvironment,
+    ChunkConfig,
+    VlaConfig,
+    PointingVlaConfig,
+    PlacesVlaConfig,
+    RelativeVlaConfig,
+    FdvlaConfig,
+)
 
 
 def test_the_policys_page_has_every_flag_in_its_table() -> None:

@@ -110,7 +110,7 @@ def test_targets_are_the_recorded_actions(routes: Routes) -> None:
     actions, num_compared = routes.recorded.actions, 0
     for trained, evaluated in routes.frames():
         index = int(trained["index"])
-        written = policy._bins(trained).view(trained[ACTION].shape)
+        written = policy._targets(trained)[0].view(trained[ACTION].shape)
         residuals = policy.action_bins.decode(written)
         chunk = routes.evaluation.postprocessor(policy.relative.decode(residuals, evaluated[OBS_STATE])[0])
         steps = index + np.arange(len(chunk))

@@ -16,7 +16,7 @@ import pyarrow.parquet as pq
 import pytest
 
 from lerobot_bomb import __version__
-from lerobot_bomb.bomb.episode import TASK_VERSION, EpisodeSpec
+from lerobot_bomb.bomb.episode import EpisodeSpec
 from lerobot_bomb.bomb.expert import expert_action
 from lerobot_bomb.bomb.observation import CAMERAS, RenderOptions
 from lerobot_bomb.bomb.perturbations import NUISANCES
@@ -33,6 +33,7 @@ from lerobot_bomb.envs.rollout import make_env
 
 SIZE = 64
 SMALL = RenderOptions(image_size=SIZE)
+TASK_VERSION = "1.0"  # of `place`
 VIDEO = Recording("test/video", episodes=5, seed=3, image_size=SIZE)
 IMAGES = Recording("test/images", episodes=2, image_size=SIZE, control_mode="absolute", images=True)
 FEATURES = {"observation.images.workspace", "observation.images.wrist", "observation.state", "action"}
@@ -181,8 +182,9 @@ def test_image_statistics_are_sampled_and_right(tmp_path: Path) -> None:
     recording = Recording("test/full", episodes=1)
     record(recording, tmp_path / "full")
     statistics = json.loads((tmp_path / "full" / "meta" / "stats.json").read_text())
-    env = make_env(recording.spec, recording.render_options)
-    rollout = collect(env, recording.spec, RolloutSettings(recording.render_options))
+    spec = next(recording.specs(0))
+    env = make_env(spec, recording.render_options)
+    rollout = collect(env, spec, RolloutSettings(recording.render_options))
     env.close()
     for camera, frames in rollout.frames.items():
         found = statistics[f"observation.images.{camera}"]
@@ -260,14 +262,11 @@ def test_every_seed_is_played_under_every_condition_at_the_levels_it_draws(tmp_p
 
 
 def test_lerobot_refuses_to_merge_datasets_of_different_protocol_versions(
-    datasets: dict[str, Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    datasets: dict[str, Path], tmp_path: Path
 ) -> None:
     from lerobot.datasets import aggregate_datasets
 
-    from lerobot_bomb.data import rollout_dataset
-
-    monkeypatch.setattr(rollout_dataset, "TASK_VERSION", "0.0")
-    record(IMAGES, tmp_path / "old")
+    record(replace(IMAGES, protocol_version="0.0"), tmp_path / "old")
     roots = [datasets["images"], tmp_path / "old"]
     with pytest.raises(ValueError, match=f"bomb_scara_v{TASK_VERSION}"):
         aggregate_datasets(["test/images"] * 2, "test/merged", roots=roots, aggr_root=tmp_path / "merged")

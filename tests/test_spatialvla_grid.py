@@ -71,7 +71,7 @@ def test_the_loss_is_the_likelihood_among_a_slots_cells() -> None:
     batch = make_batch(policy, 2)
     loss, _ = policy(batch)
     cells_BTG = policy.grids.encode(batch["action"])
-    logits = policy.backbone.cap(policy.cell_head(policy._hidden(batch, cells_BTG)))
+    logits = policy.backbone.cap(policy.cell_head(policy._hidden(batch, cells_BTG)[1]))
     expected = torch.stack(
         [
             cross_entropy(
@@ -84,7 +84,7 @@ def test_the_loss_is_the_likelihood_among_a_slots_cells() -> None:
     ).mean()
     torch.testing.assert_close(loss, expected)
     policy.config.loss_vocab = "full"
-    words = policy.backbone.vlm.lm_head(policy._hidden(batch, cells_BTG))
+    words = policy.backbone.vlm.lm_head(policy._hidden(batch, cells_BTG)[1])
     whole = torch.cat([logits, policy.backbone.cap(words)], dim=-1).flatten(0, 2)
     labels = (cells_BTG + torch.tensor(policy.grids.offsets)).flatten()
     torch.testing.assert_close(policy(batch)[0], cross_entropy(whole, labels))

@@ -52,9 +52,10 @@ def meant_stones(instruction: str, episode: PerturbedEpisode) -> set[int]:
         distance = {i: float(np.hypot(*(xy[i] - origin))) for i in others}
         best = pick(distance.values())
         return {i for i in others if abs(distance[i] - best) < 0.010}
-    if found := re.search(r"the (left|right)most stone", instruction):
-        edge = (min if found[1] == "left" else max)(xy[i][0] for i in supply)
-        return {i for i in supply if abs(xy[i][0] - edge) < 0.010}
+    if found := re.search(r"the (left|right|front)most stone", instruction):
+        axis = 1 if found[1] == "front" else 0
+        edge = (max if found[1] == "right" else min)(xy[i][axis] for i in supply)
+        return {i for i in supply if abs(xy[i][axis] - edge) < 0.010}
     moved = re.sub(r"(left of|right of|behind|in front of|between) the (two )?\w+ stones?", "", instruction)
     found = re.search(r"\b(?:the|a) (black|white) (?:stone|piece)", moved.lower())
     assert found, instruction

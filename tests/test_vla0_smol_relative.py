@@ -32,7 +32,7 @@ def test_written_numbers_are_the_residuals(tmp_path: Path) -> None:
     batch = make_batch(policy, 1)
     batch["observation.state"] = normalise(state_raw, state)[None]
     batch["action"] = normalise(action_raw, action).expand(1, 3, 4)
-    written = policy.action_bins.decode(policy._bins(batch)).view(3, 4)[0]
+    written = policy.action_bins.decode(policy._targets(batch)[0]).view(3, 4)[0]
     unit = policy.relative.scale.numpy() * (action["max"] - action["min"]) / 2
     np.testing.assert_allclose(
         written.numpy() * unit, (action_raw - state_raw).clip(-unit, unit), atol=unit.max() / 998

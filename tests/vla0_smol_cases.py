@@ -61,7 +61,7 @@ def make_batch(policy: Vla0SmolPolicy, batch_size: int, seed: int = 0) -> dict[s
 
 def numbers_of(policy: Vla0SmolPolicy, batch: dict[str, Any]) -> NumberTokens:
     """The actions of a batch as the policy writes them."""
-    return policy._numbers(batch, policy._bins(batch))
+    return policy._numbers(*policy._targets(batch))
 
 
 def sequence(policy: Vla0SmolPolicy, batch: dict[str, Any]) -> list[list[int]]:

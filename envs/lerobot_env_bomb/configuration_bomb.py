@@ -11,7 +11,7 @@ from lerobot.envs import EnvConfig
 from lerobot.processor import PolicyProcessorPipeline
 from lerobot.utils.constants import ACTION, OBS_IMAGES, OBS_PREFIX, OBS_STATE
 
-from lerobot_bomb.bomb.episode import DEFAULT_FPS, TASK_VERSION, EpisodeSpec
+from lerobot_bomb.bomb.episode import DEFAULT_FPS, EpisodeSpec
 from lerobot_bomb.bomb.observation import (
     ACTION_DIM,
     AGENT_POS,
@@ -21,8 +21,7 @@ from lerobot_bomb.bomb.observation import (
     geometry_shapes,
 )
 from lerobot_bomb.bomb.perturbations import Condition
-from lerobot_bomb.bomb.suite import find_suite, specs_of_tasks
-from lerobot_bomb.bomb.suites import SUITES
+from lerobot_bomb.bomb.suite import find_suite, specs_of_tasks, suites_of, task_version
 from lerobot_bomb.checkpoints.environment import check_acting_policy
 from lerobot_bomb.checkpoints.identity import policy_of_results
 from lerobot_bomb.checkpoints.queries import last_query
@@ -105,7 +104,7 @@ class BombEnvConfig(EnvConfig):
     @property
     def suites(self) -> tuple[str, ...]:
         """Those that are played."""
-        return SUITES if self.task == ALL else (str(self.task),)
+        return suites_of(str(self.task))
 
     @property
     def groups(self) -> dict[str, list[EpisodeSpec]]:
@@ -160,7 +159,7 @@ class BombEnvConfig(EnvConfig):
             fps=self.fps,
             image_size=self.image_size,
             cameras=CAMERAS,
-            task_version=TASK_VERSION,
+            task_version=task_version(str(self.task)),
             task=str(self.task),
             depth=self.depth,
             task_ids=tuple(self.task_ids or ()),

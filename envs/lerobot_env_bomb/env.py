@@ -1,6 +1,6 @@
 """BOMB as a Gymnasium environment."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -17,6 +17,7 @@ from lerobot_bomb.bomb.observation import (
     RenderOptions,
 )
 from lerobot_bomb.bomb.privileged_state import PrivilegedState
+from lerobot_bomb.bomb.streams import Stream, generator
 from lerobot_bomb.bomb.suite import find_suite
 from lerobot_bomb.envs.episode_env import EpisodeEnv, Observation, Transition
 from lerobot_bomb.envs.results import EpisodeResult, PolicyIdentity
@@ -29,6 +30,7 @@ from lerobot_env_bomb.perturb import PerturbedEpisode, sample_episode
 from lerobot_env_bomb.render import CameraRenderer, compose_caption, extrinsics, intrinsics
 from lerobot_env_bomb.scene import Scene
 from lerobot_env_bomb.spaces import action_space, observation_space
+from lerobot_env_bomb.static_scene import StaticScene, draw_static, start_of
 
 DEFAULT_SPEC = EpisodeSpec(seed=0)
 DEFAULT_RENDER_OPTIONS = RenderOptions()
@@ -43,6 +45,12 @@ class _Run:
     episode: PerturbedEpisode
     judge: Judge
     actuator: Actuator
+    moves_before: int = 0  # that a static scene shows as made
+
+    @property
+    def num_made(self) -> int:
+        """Moves that have been made."""
+        return self.moves_before + self.judge.num_made
 
 
 class BombEnv(EpisodeEnv[EpisodeSpec, _Run, EpisodeResult]):
@@ -86,18 +94,34 @@ class BombEnv(EpisodeEnv[EpisodeSpec, _Run, EpisodeResult]):
 
     def _begin(self, spec: EpisodeSpec) -> tuple[Observation, dict[str, Any]]:
         episode = sample_episode(spec)
+        self._set_up(episode, start_of(episode))
+        return self._observe(), self._info()
+
+    def show_static(self, seed: int) -> tuple[Observation, EpisodeResult]:
+        """The board of a seed's episode as it may stand midway, which cannot be played from there.
+
+        The result says which episode it is of; nothing has become of that.
+        """
+        episode = sample_episode(replace(self._spec, seed=seed))
+        self._steps = 0
+        self._set_up(episode, draw_static(episode, generator(seed, Stream.STATIC)))
+        return self._observe(), self._result(self._run)
+
+    def _set_up(self, episode: PerturbedEpisode, start: StaticScene) -> None:
         scene = self._current_run.scene if self._current_run is not None else Scene(self._spec.robot)
-        scene.reset(episode.layout, episode.perturbation.model_edits, episode.pattern)
-        self._now = start = scene.measure()
+        scene.reset(start.layout, episode.perturbation.model_edits, episode.pattern)
+        if start.held is not None:
+            scene.hold(start.held, start.held_xyz, start.opening_m)
+        self._now = now = scene.measure()
         dynamics = episode.perturbation.of(Dynamics)
         self._current_run = _Run(
             scene=scene,
             episode=episode,
-            judge=Judge(episode, self._spec.fps, start),
-            actuator=Actuator(self._spec.control_mode, start.gripper_xyz, dynamics, episode.spec.seed),
+            judge=Judge(episode, self._spec.fps, now),
+            actuator=Actuator(self._spec.control_mode, now.gripper_xyz, dynamics, episode.spec.seed),
+            moves_before=start.num_made,
         )
-        self.task_description = episode.instruction
-        return self._observe(), self._info()
+        self.task_description = episode.instruction_after(start.num_made)
 
     def _advance(self, run: _Run, action: np.ndarray) -> Transition:
         target_xyz, open_fingers = run.actuator.command(action, self._now.gripper_xyz)
@@ -149,6 +173,7 @@ class BombEnv(EpisodeEnv[EpisodeSpec, _Run, EpisodeResult]):
             policy=self._policy,
             opengl_vendor=self._renderer and self._renderer.opengl_vendor,
             opengl_renderer=self._renderer and self._renderer.opengl_renderer,
+            task_version=find_suite(episode.spec.suite).version,
         )
 
     def close(self) -> None:
@@ -163,7 +188,7 @@ class BombEnv(EpisodeEnv[EpisodeSpec, _Run, EpisodeResult]):
         return PrivilegedState(
             gripper_xyz=now.gripper_xyz,
             finger_opening=now.finger_opening,
-            goals=run.episode.goals,
+            goals=run.episode.goals_after(run.num_made),
             stone_xyz=now.stone_xyz,
             stone_is_white=run.episode.layout.stone_is_white,
             stone_in_play=run.episode.layout.stone_in_play,
@@ -179,7 +204,7 @@ class BombEnv(EpisodeEnv[EpisodeSpec, _Run, EpisodeResult]):
     def object_masks(self) -> dict[str, dict[str, np.ndarray]]:
         """{camera: {what: (H, W) bool}} of the observation's images, by what their pixels show."""
         run, size = self._run, self._render_options.image_size
-        goals = run.episode.goals
+        goals = run.episode.goals_after(run.judge.num_made)
         goal = goals[min(run.judge.num_made, len(goals) - 1)]
         return {
             camera: object_masks(run.scene, self._camera_renderer, camera, size, goal.stone, goal.xyz[:2])

@@ -56,7 +56,7 @@ class Drawn:
 
     about: tuple[int, ...]  # numbers of what the command is about: colours, rows, directions
     stones: Stones  # on the board
-    supply: tuple[str, ...] = ()  # colours of the stones in the tray
+    supply: tuple[str, ...] = ()  # colours of the stones in the tray, row by row from the far one
     pattern: Stones = field(default_factory=dict)  # on the small board
 
     def stone_on(self, cell: Cell) -> int:
@@ -120,7 +120,7 @@ def is_heldout(task_id: int, about: tuple[int, ...]) -> bool:
     return (task_id + sum(place * number for place, number in zip(count(1), about))) % NUM_PARTS == 0
 
 
-def command_suite(tasks: Sequence[Task], max_steps: int, num_goals: int) -> Suite:
+def command_suite(tasks: Sequence[Task], max_steps: int, num_goals: int, version: str) -> Suite:
     """A suite whose numbered tasks are verbs."""
     return Suite(
         partial(_sample, tasks),
@@ -129,6 +129,7 @@ def command_suite(tasks: Sequence[Task], max_steps: int, num_goals: int) -> Suit
         forms=FORMS,
         num_tasks=len(tasks),
         num_goals=num_goals,
+        version=version,
     )
 
 
@@ -182,7 +183,7 @@ def _layout(seed: int, drawn: Drawn) -> Layout:
     number = len(drawn.supply)
     places = np.array(SUPPLY_XY_M[:NUM_SUPPLY_BESIDE_PATTERN] if drawn.pattern else SUPPLY_XY_M)
     stone_xy = np.zeros((NUM_STONES, 2))
-    stone_xy[:number] = TRAY_CENTER_XY + places[supply.permutation(len(places))[:number]]
+    stone_xy[:number] = TRAY_CENTER_XY + places[np.sort(supply.permutation(len(places))[:number])]
     stone_xy[:number] += supply.uniform(-SUPPLY_SPREAD_M, SUPPLY_SPREAD_M, (number, 2))
     is_white = np.array([color == "white" for color in drawn.supply] + [False] * (NUM_STONES - number))
     return Layout(gripper_xyz, stone_xy, is_white, np.arange(NUM_STONES) < number)

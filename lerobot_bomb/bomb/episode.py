@@ -10,10 +10,8 @@ from lerobot_bomb.bomb.suites import SUITES
 from lerobot_bomb.conditions import NONE
 from lerobot_bomb.flags import one_of
 
-# Version of task, physics, observation and success rule: what a recording is of, and its robot type says.
-TASK_VERSION = "1.0"
-# Version of how a policy is measured and what a line of results says. 1.1 is the task of 1.0 with lines that
-# name simulator, policy and tasks.
+# Version of how a policy is measured and what a line of results says. 1.1 is 1.0 with lines that name
+# simulator, policy and tasks. A suite has a version of its own, of what its episodes are: `bomb/suite.py`.
 PROTOCOL_VERSION = "1.1"
 
 ROBOTS = ("scara", "fetch")

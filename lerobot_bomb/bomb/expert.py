@@ -76,6 +76,16 @@ def expert_action(state: PrivilegedState) -> np.ndarray:
     return np.array([*xyz, gripper], dtype=np.float32)
 
 
+def current_goal(state: PrivilegedState) -> Goal:
+    """The goal that most of an action is for."""
+    return max(_shares(state), key=lambda each: each[1])[0]
+
+
+def held_share(state: PrivilegedState, stone: int) -> float:
+    """How far the fingers hold a stone, in [0, 1]."""
+    return _held(state, state.stone_xyz[stone])
+
+
 def _shares(state: PrivilegedState) -> list[tuple[Goal, float]]:
     """The goals that an action is for, with their shares of it: the one after the last that is reached.
 

@@ -14,7 +14,10 @@ from lerobot_bomb.bomb.layout import Layout
 from lerobot_bomb.bomb.move import Aim, Plan
 from lerobot_bomb.bomb.privileged_state import Goal
 from lerobot_bomb.bomb.streams import Stream, generator
+from lerobot_bomb.bomb.suites import SUITES
+from lerobot_bomb.conditions import ALL
 
+FIRST_VERSION = "1.0"  # of every suite, and of lines and recordings that name none
 NUM_TRAINED_TEMPLATES = 3  # the first ones of a suite; the others are held out
 
 
@@ -68,11 +71,14 @@ class Episode:
         """Index of the stone that is moved first."""
         return self.aims[0].stone
 
-    @property
-    def goals(self) -> tuple[Goal, ...]:
-        """What the expert aims at: `Suite.num_goals`, the last one again where there are fewer."""
+    def goals_after(self, num_moves: int) -> tuple[Goal, ...]:
+        """What the expert aims at once so many moves have been made: as far as it has been said.
+
+        `Suite.num_goals` of them, the last one again where there are fewer.
+        """
+        aims = self.aims[: num_moves + 1] if len(self.turns) > 1 else self.aims
         height_m = self.layout.rest_height_m
-        goals = tuple(Goal(np.array([*aim.xy, height_m]), aim.stone, aim.is_slid) for aim in self.aims)
+        goals = tuple(Goal(np.array([*aim.xy, height_m]), aim.stone, aim.is_slid) for aim in aims)
         return goals + goals[-1:] * (find_suite(self.spec.suite).num_goals - len(goals))
 
 
@@ -92,12 +98,24 @@ class Suite:
     # a numbered task's spec
     of_task: Callable[[EpisodeSpec, int], EpisodeSpec] = lambda spec, task_id: replace(spec, task_id=task_id)
     num_goals: int = 1  # of the expert, at most
+    # of task, physics, observation and success rule: recordings and results of different ones do not compare
+    version: str = FIRST_VERSION
 
 
 @cache
 def find_suite(name: str) -> Suite:
     """Return the suite of a name in SUITES."""
     return import_module(f"lerobot_bomb.bomb.suites.{name}").SUITE
+
+
+def task_version(name: str) -> str:
+    """The version of a suite; of `all`, the newest of them."""
+    return max(find_suite(each).version for each in suites_of(name))
+
+
+def suites_of(name: str) -> tuple[str, ...]:
+    """The suites that a flag's value names: one, or `all`."""
+    return SUITES if name == ALL else (name,)
 
 
 def of_split[T](split: str, items: Sequence[T], heldout: Sequence[T]) -> tuple[T, ...]:

@@ -114,7 +114,7 @@ def _settings_sha256(config: PreTrainedConfig, folder: Path) -> str:
     settings = {name: value for name, value in settings.items() if name not in NOT_ITS_SETTINGS}
     for name, as_before in getattr(config, "LATER_FIELDS", {}).items():
         for values in (settings, settings.get("trained_with") or {}):
-            if values.get(name) == as_before:
+            if name in values and values[name] == as_before:
                 del values[name]
     digest = hashlib.sha256(json.dumps(settings, sort_keys=True, default=str).encode())
     found = (path for pattern in PROCESSOR_PATTERNS for path in folder.glob(pattern))

@@ -7,6 +7,7 @@ from typing import Any
 
 from lerobot_bomb.bomb.board import task_id
 from lerobot_bomb.bomb.observation import ACTION_NAMES
+from lerobot_bomb.bomb.suite import task_version
 from lerobot_bomb.bomb.suites import SUITES
 from lerobot_bomb.conditions import ALL
 
@@ -96,7 +97,7 @@ class Environment:
     def differences(self, other: "Environment") -> list[str]:
         """Fields in which `other` is one that a policy of this environment cannot act in.
 
-        A suite that is not known is compared with nothing.
+        A suite that is not known is compared with nothing, nor is its version.
         """
         names = [name for name in COMPARED if getattr(self, name) != getattr(other, name)]
         ours, theirs = self.suites, other.suites
@@ -104,9 +105,15 @@ class Environment:
             names.remove("task")
         if not set(self.cameras) <= set(other.cameras):
             names.append("cameras")
-        if self.task_version != other.task_version:
+        is_same_version = self.task_version == other.task_version or (self._is_current and other._is_current)
+        if ours is not None and not is_same_version:
             names.append("task_version")
         return names
+
+    @property
+    def _is_current(self) -> bool:
+        """Return whether its suites, whose newest version it names, are those that are played today."""
+        return self.suites is not None and self.task_version == max(map(task_version, self.suites))
 
     def check_same(self, other: "Environment", who: str, insist: str) -> None:
         """Raise a ValueError, which names flags to change, unless `who`, of this one, can act in `other`."""

@@ -6,8 +6,10 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from lerobot_bomb.bomb.suite import suites_of
 from lerobot_bomb.data.dataset_files import EPISODES_FOLDER, INFO_FILE, read_parquet
 from lerobot_bomb.data.environment import Environment, numbered_tasks
+from lerobot_bomb.data.recording import SCENES
 from lerobot_bomb.data.resumable import METADATA_FILE
 from lerobot_bomb.files import read_json
 
@@ -96,9 +98,11 @@ class DatasetFacts:
         recording = self.recording
         if not recording:
             return None if self.specs is None else sorted({spec["seed"] for spec in self.specs})
-        num_conditions = len(recording["perturbations"]) * max(1, len(recording["task_ids"]))
+        num_tasks = len(suites_of(recording["task"])) * max(1, len(recording["task_ids"]))
+        num_conditions = len(recording["perturbations"]) * num_tasks
         num_tried = self.bomb["num_episodes"] + len(self.bomb["failures"])
-        return range(recording["seed"], recording["seed"] + (num_tried - 1) // num_conditions + 1)
+        num_seeds = -(-num_tried // num_conditions) * (min(recording.get("static", 0), SCENES) or 1)
+        return range(recording["seed"], recording["seed"] + num_seeds)
 
     def _recording_lines(self) -> list[str]:
         recording, seeds = self.recording, self.seeds

@@ -4,7 +4,8 @@ A recording grows in a folder beside its final place (see ``resumable.py``). LeR
 imported only after the flags have been checked and the workers are playing.
 """
 
-from collections.abc import Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator
+from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -15,8 +16,8 @@ from lerobot_bomb.bomb.expert import expert_action
 from lerobot_bomb.data.kept_blocks import Progress, reached
 from lerobot_bomb.data.recording import Recording
 from lerobot_bomb.data.resumable import grow, missing_blocks, write_blocks
-from lerobot_bomb.data.rollout_pool import Rollout, RolloutPool, RolloutSettings
-from lerobot_bomb.envs.rollout import Expert, make_env
+from lerobot_bomb.data.rollout_pool import RelabelledRollouts, Rollout, RolloutPool, RolloutSettings
+from lerobot_bomb.envs.rollout import Agent, Expert, make_env
 
 if TYPE_CHECKING:
     from lerobot_bomb.data.blocks import DatasetLayout, RecordedEpisode
@@ -26,16 +27,26 @@ MIN_TRIED = 20
 MIN_SUCCESS_RATE = 0.1
 
 
+@dataclass(frozen=True)
+class Acting:
+    """A policy that acts in place of the expert."""
+
+    begin: Callable[[], None]  # before each episode
+    agent: Agent
+
+
 def record(
     recording: Recording,
     root: Path,
     num_workers: int = 1,
     resume: bool = False,
     expert: Expert = expert_action,
+    acting: Acting | None = None,
 ) -> Progress:
     """Record into `root`, which must not exist unless `resume` finds the same recording there.
 
-    The dataset depends on `recording` alone, not on the number of workers or on interruptions.
+    The dataset depends on `recording` alone, not on the number of workers or on interruptions. With `acting`,
+    which `recording.relabel` names, that policy acts and the expert says what it would have done.
 
     Raises:
         ValueError: the folder exists, is missing, cannot be written, is in use, or holds another recording.
@@ -45,7 +56,7 @@ def record(
         recording,
         root,
         resume,
-        write=lambda folder: _record_blocks(recording, folder, num_workers, expert),
+        write=lambda folder: _record_blocks(recording, folder, num_workers, expert, acting),
         layout=lambda: _layout(recording),
     )
 
@@ -61,7 +72,9 @@ def describe_failures(failures: list[dict[str, Any]]) -> str:
     return f"{len(failures)} failed and were left out: {classes}"
 
 
-def _record_blocks(recording: Recording, folder: Path, num_workers: int, expert: Expert) -> Progress:
+def _record_blocks(
+    recording: Recording, folder: Path, num_workers: int, expert: Expert, acting: Acting | None
+) -> Progress:
     """Write the blocks that are missing."""
     gaps = missing_blocks(folder, recording.episodes)
     if not gaps:
@@ -70,11 +83,22 @@ def _record_blocks(recording: Recording, folder: Path, num_workers: int, expert:
     with recording.flag_names():
         for spec in recording.conditions:
             make_env(spec, recording.render_options).close()
-    settings = RolloutSettings(recording.render_options, recording.noise, expert)
+    settings = RolloutSettings(
+        recording.render_options,
+        recording.noise,
+        expert,
+        recording.scenes if recording.static else 0,
+        recording.pointing,
+    )
     num_kept = recording.episodes - sum(gap.num_missing for gap in gaps)
     with tqdm(total=recording.episodes, initial=num_kept, unit="episode") as bar:
         for gap in gaps:
-            with RolloutPool(settings, recording.specs(gap.progress.num_tried), num_workers) as pool:
+            specs = recording.specs(gap.progress.num_tried)
+            with (
+                RolloutPool(settings, specs, num_workers)
+                if acting is None
+                else RelabelledRollouts(settings, specs, acting.begin, acting.agent)
+            ) as pool:
                 layout = _layout(recording)  # takes seconds, in which the workers play
                 write_blocks(folder, layout, gap, partial(_successes, pool, bar))
     return reached(folder)
@@ -87,7 +111,7 @@ def _successes(
     from lerobot_bomb.data.rollout_dataset import rollout_episode
 
     for rollout in pool:
-        if rollout.result.is_success:
+        if rollout.num_steps:
             progress.num_episodes += 1
             number -= 1
             yield rollout_episode(rollout)

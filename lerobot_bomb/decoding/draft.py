@@ -29,8 +29,9 @@ class KnownSymbols:
 class LinearDraft:
     """Every action dimension goes on as it went in the last two steps of the answer itself."""
 
-    def __init__(self, grammar: NumberGrammar, num_dims: int):
-        self._grammar, self._num_dims = grammar, num_dims
+    def __init__(self, grammar: NumberGrammar, num_dims: int, num_before: int = 0):
+        """``num_before``: numbers of the answer that precede its actions and follow no line."""
+        self._grammar, self._num_dims, self._num_before = grammar, num_dims, num_before
 
     def __call__(self, number_BN: Tensor, place: Place) -> Tensor:
         """(B, G) guesses."""
@@ -73,14 +74,15 @@ class LinearDraft:
     def _expect(self, number_BN: Tensor, index_BX: Tensor, steps: Tensor | int) -> Tensor:
         """(B, X) the number ``steps`` after an unknown one, on the line through the two steps before that.
 
-        At the answer's start: the middle of the range, then no slope.
+        In the first step, and before: the middle of the range, then no slope.
         """
         middle = (self._grammar.num_values - 1) // 2
         last_BX, before_BX = (
             number_BN.gather(1, (index_BX - back * self._num_dims).clamp(0, number_BN.shape[1] - 1))
             for back in (1, 2)
         )
-        last_BX = torch.where(index_BX >= self._num_dims, last_BX, middle)
-        before_BX = torch.where(index_BX >= 2 * self._num_dims, before_BX, last_BX)
+        second = self._num_before + self._num_dims  # where the second step begins
+        last_BX = torch.where(index_BX >= second, last_BX, middle)
+        before_BX = torch.where(index_BX >= second + self._num_dims, before_BX, last_BX)
         line_BX = last_BX + (last_BX - before_BX) * (steps + 1)
         return line_BX.clamp(0, self._grammar.num_values - 1)

@@ -14,7 +14,7 @@ from pathlib import Path
 from typing import Any
 
 from lerobot_bomb import __version__
-from lerobot_bomb.bomb.episode import PROTOCOL_VERSION, TASK_VERSION, EpisodeSpec
+from lerobot_bomb.bomb.episode import PROTOCOL_VERSION, EpisodeSpec
 from lerobot_bomb.bomb.observation import DEFAULT_IMAGE_SIZE, RenderOptions
 from lerobot_bomb.envs.inference import Inference
 from lerobot_bomb.files import append_line, check_appendable
@@ -130,7 +130,7 @@ class EpisodeResult(ResultLine):
     lerobot_version: str | None = field(default_factory=partial(installed_version, "lerobot"))
     torch_version: str | None = field(default_factory=partial(installed_version, "torch"))
     package_version: str = __version__
-    task_version: str = TASK_VERSION
+    task_version: str = field(kw_only=True)  # of the suite
     protocol_version: str = PROTOCOL_VERSION
 
 

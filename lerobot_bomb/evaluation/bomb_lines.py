@@ -7,9 +7,10 @@ from typing import Any
 import numpy as np
 
 from lerobot_bomb.bomb.board import BOARD, COLORS, task_id
-from lerobot_bomb.bomb.episode import PROTOCOL_VERSION, TASK_VERSION, EpisodeSpec, Failure, Stage
+from lerobot_bomb.bomb.episode import PROTOCOL_VERSION, EpisodeSpec, Failure, Stage
 from lerobot_bomb.bomb.observation import CAMERAS, MAX_IMAGE_SIZE, MIN_IMAGE_SIZE, RENDER_PRESETS
 from lerobot_bomb.bomb.perturbations import Condition
+from lerobot_bomb.bomb.suite import FIRST_VERSION, find_suite
 from lerobot_bomb.bomb.suites import SUITES
 from lerobot_bomb.bootstrap import bca_interval, format_bounds, sums_by
 from lerobot_bomb.conditions import ALL
@@ -37,6 +38,7 @@ from lerobot_bomb.evaluation.result_kind import (
     describe_numbers,
     json_list,
 )
+from lerobot_bomb.flags import one_of
 
 OLD_VERSION = "1.0"  # whose lines say less
 NUM_TASKS = len(COLORS) * BOARD.num_lines**2
@@ -127,7 +129,7 @@ NEW_CHECKS: dict[str, Check] = {  # of what protocol 1.1 added
     "task_ids": or_none(is_list_of(is_int(0, NUM_TASKS - 1))),
     "lerobot_version": or_none(is_text),
     "torch_version": or_none(is_text),
-    "task_version": is_one_of((TASK_VERSION,)),
+    "task_version": is_text,
 }
 
 
@@ -171,9 +173,16 @@ def spec_of(row: Row) -> EpisodeSpec:
     return EpisodeSpec(**row["spec"] | {"target": target and tuple(target)})
 
 
+def task_version_of(row: Row) -> str:
+    """Of a line's suite; lines of protocol 1.0 name none."""
+    return row.get("task_version", FIRST_VERSION)
+
+
 def _check_episode(row: Row) -> None:
     spec_of(row)
     spec = row["spec"]
+    versions = dict.fromkeys((FIRST_VERSION, find_suite(spec["suite"]).version))
+    one_of(f"task_version of suite {spec['suite']}", task_version_of(row), tuple(versions))
     for name in ("target", "color"):
         if spec[name] not in (None, row[name]):
             raise ValueError(f"{name}={row[name]}, but spec.{name}={spec[name]}")
@@ -187,6 +196,7 @@ def _settings(row: Row) -> dict[str, str]:
         "OpenGL": ", ".join(opengl) or NOT_RECORDED,
         "render_preset": row.get("render_preset", NOT_RECORDED),
         "tasks": _tasks_key(row),
+        "task_version": task_version_of(row),
     }
 
 
@@ -224,7 +234,7 @@ def environment_of_episode(row: Row) -> Environment:
         **{name: spec[name] for name in ("robot", "control_mode", "fps")},
         image_size=row["image_size"],
         cameras=CAMERAS,
-        task_version=row.get("task_version", OLD_VERSION),
+        task_version=task_version_of(row),
         task=spec["suite"],
     )
 
@@ -253,7 +263,7 @@ BOMB_LINES = ResultKind(
     settings=_settings,
     describe_simulator=_describe_simulator,
     describe_tasks=_describe_tasks,
-    benchmark=f"BOMB, task version {TASK_VERSION}",
+    benchmark=lambda row: f"BOMB, task version {task_version_of(row)}",
     environment=environment_of_episode,
     eval_flags=eval_flags_of,
     describe_change=_error_change,

@@ -11,7 +11,7 @@ import numpy as np
 from lerobot.datasets import LeRobotDatasetMetadata
 from lerobot.utils.constants import ACTION
 
-from lerobot_bomb.data.columns import EPISODE_INDEX, read_columns, read_meta
+from lerobot_bomb.data.columns import EPISODE_INDEX, read_columns, read_meta, require_motion
 from lerobot_bomb.files import append_line
 
 
@@ -59,6 +59,7 @@ def executed_in_dataset(meta: LeRobotDatasetMetadata, name: str) -> Executed:
     """All recorded actions, each episode under its number."""
     if ACTION not in meta.features:
         raise ValueError(f"dataset {name} has no {ACTION!r}; it has {sorted(meta.features)}")
+    require_motion(meta, "how smoothly they move is not defined")
     columns = read_columns(meta, (ACTION,))
     numbers, starts = np.unique(columns[EPISODE_INDEX], return_index=True)
     of_episodes = np.split(columns[ACTION], starts[1:])

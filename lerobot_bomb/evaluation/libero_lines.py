@@ -92,7 +92,7 @@ LIBERO_LINES = ResultKind(
         f"{settings['control_mode']} control, {settings['fps']} Hz, {settings['simulator']}"
     ),
     describe_tasks=_describe_tasks,
-    benchmark=f"LIBERO with BOMB's axes, protocol {LIBERO_PROTOCOL_VERSION}",
+    benchmark=lambda _: f"LIBERO with BOMB's axes, protocol {LIBERO_PROTOCOL_VERSION}",
     environment=lambda row: None,
     eval_flags=_eval_flags,
     measures=(),

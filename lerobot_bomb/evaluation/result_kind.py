@@ -56,7 +56,7 @@ class ResultKind:
     # of these settings, what simulated and drew
     describe_simulator: Callable[[Mapping[str, str]], str]
     describe_tasks: Callable[[list[Row]], str]
-    benchmark: str  # for a model card, with its version
+    benchmark: Callable[[Row], str]  # for a model card, with its version
     # that an episode was played in; None: checkpoints of our types know of no such environment
     environment: Callable[[Row], Environment | None]
     eval_flags: Callable[[list[Row]], list[str]]  # of lerobot-eval, for the environment and tasks of episodes

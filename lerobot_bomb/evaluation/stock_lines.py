@@ -97,7 +97,7 @@ def _stock_lines(env_type: str, tasks: tuple[str, ...], starts_by_number: bool) 
         settings=_settings,
         describe_simulator=lambda settings: settings["simulator"],
         describe_tasks=_describe_tasks,
-        benchmark=f"LeRobot's {env_type}",
+        benchmark=lambda _: f"LeRobot's {env_type}",
         environment=lambda row: None,
         eval_flags=partial(_eval_flags, env_type),
         measures=[

@@ -120,7 +120,7 @@ class Checkpoint:
         return start + "".join(f"\n## {title}\n\n{text}\n" for title, text in sections.items())
 
     def _introduction(self) -> str:
-        benchmarks = {kind_of(row).benchmark: None for rows in self.results for row in rows}
+        benchmarks = {kind_of(row).benchmark(row): None for rows in self.results for row in rows}
         if self.environment is not None:
             benchmarks = {f"BOMB, task version {self.environment.task_version}": None}
         benchmark = f" Benchmark: {', and '.join(benchmarks)}." if benchmarks else ""

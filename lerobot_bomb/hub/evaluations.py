@@ -20,7 +20,7 @@ def model_index(groups: list[Group]) -> list[EvalResult]:
             task_type="robotics",
             task_name=_task(rows[0]),
             dataset_type=group.kind.env_type,
-            dataset_name=group.kind.benchmark,
+            dataset_name=group.kind.benchmark(group.rows[0]),
             dataset_config=_config(group, condition, rows),  # tells results apart, which their task does not
             metric_type=METRIC,
             metric_name=f"success rate, {_counted(rows)}",

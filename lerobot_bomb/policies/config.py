@@ -13,6 +13,7 @@ from lerobot_bomb.checkpoints.config import INSTALLED, PackageVersion
 from lerobot_bomb.checkpoints.environment import ConfigWithEnvironment
 from lerobot_bomb.flag_errors import flag_errors
 from lerobot_bomb.flags import one_of
+from lerobot_bomb.policies.pointing import LABELS
 from lerobot_bomb.training.policy_flags import (
     action_deltas,
     adamw,
@@ -221,6 +222,9 @@ class VlaConfig(ChunkConfig):
         return list(names) if len(names) == num_dims else [str(dim) for dim in range(num_dims)]
 
     def validate_features(self) -> None:
+        # labels are in a dataset's observations, where LeRobot's pipelines keep them, and are no inputs
+        inputs = self.input_features or {}
+        self.input_features = {key: each for key, each in inputs.items() if not key.startswith(LABELS)}
         super().validate_features()
         check_state(self, self.NEEDS_STATE)
 

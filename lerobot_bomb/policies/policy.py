@@ -10,7 +10,7 @@ from typing import Any, ClassVar, Self
 import torch
 from lerobot.datasets import LeRobotDatasetMetadata
 from lerobot.policies import PreTrainedPolicy
-from lerobot.utils.constants import ACTION, OBS_STATE
+from lerobot.utils.constants import ACTION, DONE, OBS_STATE
 from torch import Tensor, nn
 from torch.nn.attention import SDPBackend, sdpa_kernel
 
@@ -19,7 +19,14 @@ from lerobot_bomb.actions.relative import RelativeActions, bounds, named_dims
 from lerobot_bomb.checkpoints.adapters import check_buffers_are_the_bases, frozen_buffers
 from lerobot_bomb.checkpoints.starting import check_start
 from lerobot_bomb.compat.hooks.evaluation import play_tasks_in_turn
-from lerobot_bomb.data.columns import dim_names, episode_bounds, present_episodes, read_columns
+from lerobot_bomb.data.columns import (
+    check_chunk_length,
+    dim_names,
+    episode_bounds,
+    present_episodes,
+    read_columns,
+    require_motion,
+)
 from lerobot_bomb.decoding.kv_cache import check_positions
 from lerobot_bomb.flow.noise import SamplingNoise, gumbel
 from lerobot_bomb.hub.policy import HubPolicy
@@ -61,6 +68,7 @@ class ChunkPolicy(HubPolicy, SavesTiedWeightsOnce, PreTrainedPolicy):
         self.register_buffer("action_unit", torch.ones(self._action_dim), persistent=False)
         self._action_names: list[str] | None = None
         if dataset_meta is not None:
+            check_chunk_length(config.chunk_size, dataset_meta)
             self._take_units(dataset_meta)
         # of all that is random in training
         self.generator = torch.Generator().manual_seed(torch.initial_seed())
@@ -91,12 +99,13 @@ class ChunkPolicy(HubPolicy, SavesTiedWeightsOnce, PreTrainedPolicy):
     def _prepare(cls, config: Any, meta: LeRobotDatasetMetadata | None) -> None:
         """Check and complete the config of a checkpoint that is loaded, to be trained on if there is data."""
         if meta is None:
-            check_as_trained(config)
+            check_as_trained(config, cls.as_trained)
         else:
             check_weights_fit(config, cls.shapes)
 
     def _fit(self, meta: LeRobotDatasetMetadata) -> None:
         """Take from a dataset what a checkpoint that is trained on needs to know of it."""
+        check_chunk_length(self.config.chunk_size, meta)
         self._take_units(meta)
 
     @torch.no_grad()
@@ -129,11 +138,17 @@ class ChunkPolicy(HubPolicy, SavesTiedWeightsOnce, PreTrainedPolicy):
         self._batch_size = batch_size
 
     def _kept(self, batch: dict[str, Tensor]) -> Tensor:
-        """(B, T) bool: which actions are trained on."""
-        if f"{ACTION}_is_pad" in batch and not self.config.loss_on_padded_actions:
-            return ~self._of_batch(batch, f"{ACTION}_is_pad").bool()
+        """(B, T) bool: which actions are trained on; of a static scene only its own."""
         shape = len(batch[ACTION]), self.config.chunk_size
-        return torch.ones(shape, dtype=torch.bool, device=self._device)
+        is_pad_BT = torch.zeros(shape, dtype=torch.bool, device=self._device)
+        if f"{ACTION}_is_pad" in batch:
+            is_pad_BT = self._of_batch(batch, f"{ACTION}_is_pad").bool()
+        kept_BT = torch.ones_like(is_pad_BT) if self.config.loss_on_padded_actions else ~is_pad_BT
+        if isinstance(done_B1 := batch.get(DONE), Tensor):
+            is_later_T = torch.arange(shape[1], device=self._device) > 0
+            # what follows a frame that is done, and is there, belongs to the next scene
+            kept_BT = kept_BT & ~(done_B1.reshape(-1, 1).bool() & is_later_T & ~is_pad_BT)
+        return kept_BT
 
     def _l1_parts(self, errors_BTD: Tensor, counted_BTD: Tensor) -> dict[str, tuple[Tensor, Tensor]]:
         """Absolute errors as `means` takes them, in all and by dimension; none where units are not known."""
@@ -332,6 +347,8 @@ class RelativeVlaPolicy(VlaPolicy):
                 f"--policy.relative_actions=true needs {OBS_STATE!r} under this name in the dataset; it has "
                 f"{sorted(meta.features)}"
             )
+        if config.chunk_size > 1:
+            require_motion(meta, "--policy.relative_actions=true is fitted to chunks of them")
         columns = read_columns(meta, (ACTION, OBS_STATE), present_episodes(meta))
         action_bounds, state_bounds = (
             bounds(meta.stats[key], config.normalization_mapping[kind], columns[key].shape[1])

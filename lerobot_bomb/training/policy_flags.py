@@ -157,9 +157,12 @@ def trained_with(config: Any, flags: Iterable[str]) -> dict[str, Any]:
     return json.loads(json.dumps({flag: getattr(config, flag) for flag in flags}))
 
 
-def check_as_trained(config: Any) -> None:
-    """A checkpoint's flags still are what its weights were trained with."""
-    then = config.trained_with or {}
+def check_as_trained(config: Any, flags: Iterable[str]) -> None:
+    """A checkpoint's flags still are what its weights were trained with.
+
+    ``flags``: those that say it now; an older checkpoint names fewer.
+    """
+    then = _then(config, flags)
     for flag, value in trained_with(config, then).items():
         if value != then[flag]:
             raise ValueError(
@@ -170,13 +173,19 @@ def check_as_trained(config: Any) -> None:
 
 def check_weights_fit(config: Any, flags: Iterable[str]) -> None:
     """A training goes on from a checkpoint with flags that its weights have the shapes for."""
-    then = config.trained_with or {}
+    then = _then(config, flags)
     for flag, value in trained_with(config, [flag for flag in flags if flag in then]).items():
         if value != then[flag]:
             raise ValueError(
                 f"--policy.{flag}={value!r}: the weights of this checkpoint are made for {then[flag]!r}; "
                 f"only a training without --policy.path can change it"
             )
+
+
+def _then(config: Any, flags: Iterable[str]) -> dict[str, Any]:
+    """What a checkpoint was trained with, also by flags that it is older than."""
+    later = {flag: config.LATER_FIELDS[flag] for flag in flags if flag in config.LATER_FIELDS}
+    return {**later, **(config.trained_with or {})}
 
 
 def action_deltas(config: Any) -> list[int] | None:

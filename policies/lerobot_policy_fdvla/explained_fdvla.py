@@ -6,6 +6,7 @@ Shapes as in `modeling_fdvla`; `J` draws of noise and time.
 from typing import TYPE_CHECKING, ClassVar
 
 import torch
+from lerobot.utils.constants import OBS_STATE
 from torch import Tensor
 
 from lerobot_bomb.explain.explained import (
@@ -45,7 +46,8 @@ class ExplainedFdvla(PromptExplained):
         policy = self._policy.eval()
         with policy._autocast():
             rows = self.prompt(policy._prompt_parts(batch))
-            return rows | {"embeds": policy._embeds(batch, rows["ids"])}
+            state = {} if policy.pointer is None else {OBS_STATE: policy._of_batch(batch, OBS_STATE)}
+            return rows | state | {"embeds": policy._embeds(batch, rows["ids"])}
 
     def score(self, rows: Rows, answer: Tensor) -> Tensor:
         policy, config = self._policy.eval(), self._policy.config
@@ -60,13 +62,16 @@ class ExplainedFdvla(PromptExplained):
         is_task_BL = prompt.readable & self.of_part(rows, INSTRUCTION)
         with policy._autocast():
             context = policy._context(prompt, is_task_BL, rows["embeds"])
-            predicted = policy._heads(context.repeated(NUM_DRAWS))(point.actions, point.tau)
+            if policy.pointer is not None:
+                context = policy._pointing(context, rows[OBS_STATE])
+            kept = torch.ones(point.actions.shape[:2], dtype=torch.bool, device=answer.device)
+            predicted = policy._heads(context, kept)(point.actions, point.tau)
         velocity_BKD, noise_BKD = (None if values is None else values.float() for values in predicted)
         loss_B, _ = joint_loss(
             velocity_BKD,
             noise_BKD,
             point,
-            torch.ones(point.actions.shape[:2], dtype=torch.bool, device=answer.device),
+            kept,
             flow_loss_weight=config.flow_loss_weight,
             denoise_loss_weight=config.denoise_loss_weight,
             consistency="none",

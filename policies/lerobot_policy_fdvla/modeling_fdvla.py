@@ -7,15 +7,14 @@ Shapes: `B` batch, `K` actions of a chunk, `D` action dims, `L` tokens of a prom
 """
 
 import logging
-from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import replace
 from functools import partial
 from typing import Any, ClassVar
 
 import torch
 from lerobot.datasets import LeRobotDatasetMetadata
 from lerobot.policies.rtc import RTCProcessor
-from lerobot.utils.constants import ACTION
+from lerobot.utils.constants import ACTION, OBS_STATE
 from torch import Tensor, nn
 
 from lerobot_bomb.actions.accuracy import means
@@ -29,43 +28,24 @@ from lerobot_bomb.flow.noise import SamplingNoise
 from lerobot_bomb.flow.path import PathPoint, draw_tau, path_point
 from lerobot_bomb.flow.real_time import guided, without_padding
 from lerobot_bomb.flow.samplers import SAMPLERS, Heads, num_evaluations, sample
+from lerobot_bomb.policies.pointing import Labels
 from lerobot_bomb.policies.policy import RelativeVlaPolicy
 from lerobot_bomb.training.distributed import weighed
 from lerobot_bomb.training.randomness import begin_batch
 from lerobot_bomb.vlm.images import draw_windows, resize
 from lerobot_bomb.vlm.inputs import read_actions, read_image, read_task
-from lerobot_bomb.vlm.qwen import Prefix
 from lerobot_policy_fdvla.building_fdvla import build_model
 from lerobot_policy_fdvla.card_fdvla import METHOD
 from lerobot_policy_fdvla.configuration_fdvla import AS_TRAINED, SHAPES, FdvlaConfig
+from lerobot_policy_fdvla.context_fdvla import Context
 from lerobot_policy_fdvla.explained_fdvla import ExplainedFdvla
-from lerobot_policy_fdvla.networks_fdvla import NUM_MARKS, ActionSegment, Head
+from lerobot_policy_fdvla.networks_fdvla import NUM_MARKS, ActionSegment, Head, SideBySide
+from lerobot_policy_fdvla.pointing_fdvla import Pointed, make_pointer
 
 logger = logging.getLogger(__name__)
 
 # not of the base model: trained whole beside its adapters
-NEW_PARTS = ("segment", "state_embedding", "flow_head", "denoise_head")
-
-
-@dataclass(frozen=True)
-class Context:
-    """An observation as every sampling step reads it."""
-
-    prefix: Prefix
-    pooled: Tensor  # (B, H)
-
-    def repeated(self, times: int) -> "Context":
-        """Every row so many times, beside each other."""
-        return Context(self.prefix.repeated(times), self.pooled.repeat_interleave(times, dim=0))
-
-    def tensors(self) -> list[Tensor]:
-        """All of it, as `of` takes it."""
-        return [self.pooled, *self.prefix.tensors()]
-
-    @classmethod
-    def of(cls, tensors: Sequence[Tensor]) -> "Context":
-        """The inverse of `tensors`."""
-        return cls(Prefix.of(tensors[1:]), tensors[0])
+NEW_PARTS = ("segment", "state_embedding", "pointer", "flow_head", "denoise_head")
 
 
 class FdvlaPolicy(RelativeVlaPolicy):
@@ -92,6 +72,7 @@ class FdvlaPolicy(RelativeVlaPolicy):
         flow_dim, denoise_dim = (config.dualmod_dim if of_head else None for of_head in modulated)
         self.flow_head = make_head(flow_dim) if config.use_flow_head else None
         self.denoise_head = make_head(denoise_dim) if config.use_denoise_head else None
+        self.pointer = make_pointer(config, hidden_size, dataset_meta)
         logger.info("fdvla: %s", self.parameter_counts)
         heads = [head for head in (self.flow_head, self.denoise_head) if head is not None]
         self._captured = GraphedModel(self._sample, [self.backbone.text_model, self.segment, *heads])
@@ -105,6 +86,11 @@ class FdvlaPolicy(RelativeVlaPolicy):
             return None
         assert self.config.robot_state_feature is not None
         return nn.Linear(self.config.robot_state_feature.shape[0], hidden_size)
+
+    def _fit(self, meta: LeRobotDatasetMetadata) -> None:
+        super()._fit(meta)
+        if self.pointer is not None:
+            self.pointer.fit(meta, self.config)
 
     @property
     def parameter_counts(self) -> dict[str, int]:
@@ -133,13 +119,14 @@ class FdvlaPolicy(RelativeVlaPolicy):
         if self.training:
             begin_batch(self.config, self.generator)
         draws = self.config.draws_per_chunk
-        actions_BKD = self._actions(batch).repeat_interleave(draws, dim=0)
-        kept_BK = self._kept(batch).repeat_interleave(draws, dim=0)
+        actions_BKD, kept_BK, labels = self._targets(batch)
+        actions_BKD, kept_BK = (each.repeat_interleave(draws, dim=0) for each in (actions_BKD, kept_BK))
         point = self._draw_point(actions_BKD)
         with self._autocast(), second_derivatives(self.config.has_energy):
             if self.config.has_energy:
                 point.actions.requires_grad_()
-            heads = self._heads(self._read(batch).repeated(draws), kept_BK)
+            context, pointing = self._read_and_point(batch, labels)
+            heads = self._heads(context, kept_BK)
             velocity_BKD, noise_BKD = heads(point.actions, point.tau)
             loss, terms = joint_loss(
                 None if velocity_BKD is None else velocity_BKD.float(),
@@ -157,7 +144,32 @@ class FdvlaPolicy(RelativeVlaPolicy):
             loss = loss.unflatten(0, (-1, draws)).mean(dim=1)
         elif self.training:
             loss = weighed(loss, kept_BK)
+        for name, loss_B in pointing.items():
+            loss = loss + self.config.pointing_loss_weight * (
+                loss_B if reduction == "none" else loss_B.mean()
+            )
+            terms[name] = loss_B.detach().mean()
         return loss, self._metrics(loss, terms, velocity_BKD, noise_BKD, point, actions_BKD, kept_BK)
+
+    def _targets(self, batch: dict[str, Tensor]) -> tuple[Tensor, Tensor, Labels | None]:
+        """Actions (B, K, D), which of them are kept (B, K), and what is pointed at."""
+        actions_BKD, kept_BK = self._actions(batch), self._kept(batch)
+        if self.pointer is None:
+            return actions_BKD, kept_BK, None
+        labels = self.pointer.draw_labels(batch, self.config, self.generator)
+        other_B1D = self._to_relative(labels.other_actions[:, None], batch)
+        return *labels.given_actions(actions_BKD, kept_BK, other_B1D), labels
+
+    def _read_and_point(
+        self, batch: dict[str, Tensor], labels: Labels | None
+    ) -> tuple[Context, dict[str, Tensor]]:
+        """The observation, with the places that heads are given, and losses (B,) of what is pointed at."""
+        context = self._read(batch)
+        if self.pointer is None or labels is None:
+            return context, {}
+        pointed = self._point(context, self._of_batch(batch, OBS_STATE))
+        context = replace(context, feedback=self.pointer.feed_back(pointed, labels.given))
+        return context, self.pointer.losses(pointed, labels)
 
     def _actions(self, batch: dict[str, Tensor]) -> Tensor:
         """(B, K, D) as the heads predict them: normalised, and relative where they are."""
@@ -227,6 +239,8 @@ class FdvlaPolicy(RelativeVlaPolicy):
         # real-time chunking takes gradients, and what is captured is written over
         with torch.inference_mode(False), torch.no_grad(), self._autocast():
             context = self._read(batch)
+            if self.pointer is not None:
+                context = self._pointing(context, self._of_batch(batch, OBS_STATE))
             shape = len(context.pooled), self.config.chunk_size, self._action_dim
             noises = self._noise(noise, shape), self._step_noise(shape)
             if self.rtc_processor is not None and prev_chunk_left_over is not None:
@@ -256,7 +270,8 @@ class FdvlaPolicy(RelativeVlaPolicy):
 
     def _sample(self, noise_BKD: Tensor, step_noise: Tensor, *context: Tensor) -> tuple[Tensor]:
         """All sampling steps, as a function of tensors."""
-        return (self._denoise(self._heads(Context.of(context)), noise_BKD, step_noise),)
+        heads = self._heads(Context.of(context, has_feedback=self.pointer is not None))
+        return (self._denoise(heads, noise_BKD, step_noise),)
 
     def _denoise(self, heads: Heads, noise_BKD: Tensor, step_noise: Tensor) -> Tensor:
         step_noise_BNKD = step_noise if self.config.used_sampler == "sde" else None
@@ -299,19 +314,21 @@ class FdvlaPolicy(RelativeVlaPolicy):
     def _heads(self, context: Context, kept_BK: Tensor | None = None) -> Heads:
         """Noisy actions and times -> velocity and noise (B, K, D); None for a missing head.
 
-        A call is one pass over the segment. Its shapes are static, and nothing in it waits for the device.
+        ``B`` may be a multiple of the observations: draws of one stand beside each other. A call is one pass
+        over the segment. Its shapes are static, and nothing in it waits for the device.
         """
         if kept_BK is None:
             shape = len(context.pooled), self.config.chunk_size
             kept_BK = torch.ones(shape, dtype=torch.bool, device=context.pooled.device)
         reads_BTT = self.segment.reads(kept_BK, causal=self.config.segment_attention == "causal")
         heads = self.flow_head, self.denoise_head
-        modulations = [None if head is None else head.modulation(context.pooled) for head in heads]
+        of_draws = context.of_draws(len(kept_BK) // len(context.pooled))
+        modulations = [None if head is None else head.modulation(of_draws.pooled) for head in heads]
 
         def predict(actions_BKD: Tensor, tau_B: Tensor) -> tuple[Tensor | None, Tensor | None]:
-            embeds_BTH = self.segment(actions_BKD, tau_B)
-            states_BTH = self.backbone.read_segment(context.prefix, embeds_BTH, reads_BTT)
-            states_BKH = self.segment.of_actions(states_BTH)
+            states_BKH = self._action_states(context, actions_BKD, tau_B, reads_BTT)
+            if of_draws.feedback is not None:
+                states_BKH = states_BKH + of_draws.feedback[:, None]
             velocity_BKD, noise_BKD = (
                 None if head is None else head(states_BKH, modulation)
                 for head, modulation in zip(heads, modulations, strict=True)
@@ -320,16 +337,45 @@ class FdvlaPolicy(RelativeVlaPolicy):
 
         return predict
 
+    def _action_states(
+        self, context: Context, actions_BKD: Tensor, tau_B: Tensor, reads_BTT: Tensor
+    ) -> Tensor:
+        """(B, K, H) of the tokens of noisy actions; draws of one observation read it and not each other."""
+        embeds_BTH = self.segment(actions_BKD, tau_B)
+        draws = SideBySide(len(embeds_BTH) // len(context.pooled))
+        states = self.backbone.read_segment(
+            context.prefix, draws.joined(embeds_BTH), draws.reads(reads_BTT), draws.number
+        )
+        return self.segment.of_actions(states.reshape(embeds_BTH.shape))
+
+    def _pointing(self, context: Context, state_BS: Tensor) -> Context:
+        """The same, with the feedback of what it points at."""
+        assert self.pointer is not None
+        return replace(context, feedback=self.pointer.feed_back(self._point(context, state_BS)))
+
+    def _point(self, context: Context, state_BS: Tensor) -> Pointed:
+        """Read off the first action's token, of a chunk of zeros where all is noise."""
+        assert self.pointer is not None
+        shape, device = (len(context.pooled), self.config.chunk_size, self._action_dim), self._device
+        kept_BK = torch.ones(shape[:2], dtype=torch.bool, device=device)
+        reads_BTT = self.segment.reads(kept_BK, causal=self.config.segment_attention == "causal")
+        zeros = torch.zeros(shape, device=device), torch.zeros(shape[0], device=device)
+        states_BKH = self._action_states(context, *zeros, reads_BTT)
+        return self.pointer(states_BKH[:, 0], state_BS)
+
     def _read(self, batch: dict[str, Tensor]) -> Context:
         """The prompt, once for all sampling steps."""
         rows, is_task_BL = self._prompt(batch)
-        return self._context(rows, is_task_BL, self._embeds(batch, rows.ids))
+        return self._context(rows, is_task_BL, self._embeds(batch, rows.ids), len(self.tokens.start))
 
-    def _context(self, rows: TokenRows, is_task_BL: Tensor, embeds_BLH: Tensor) -> Context:
+    def _context(
+        self, rows: TokenRows, is_task_BL: Tensor, embeds_BLH: Tensor, num_shared: int = 0
+    ) -> Context:
         """What `_prompt` and `_embeds` made of a batch, read by the language model."""
         is_image_BL = rows.ids == self.tokens.image
-        prefix = self.backbone.read_prefix(embeds_BLH, is_image_BL, rows.mask, rows.hidden)
-        return Context(prefix, masked_mean_pool(prefix.hidden, self._pooled(rows.readable, is_task_BL)))
+        prefix = self.backbone.read_prefix(embeds_BLH, is_image_BL, rows.mask, rows.hidden, num_shared)
+        pooled_BH = masked_mean_pool(prefix.hidden, self._pooled(rows.readable, is_task_BL))
+        return Context(prefix, pooled_BH, feedback=None)
 
     def _pooled(self, readable_BL: Tensor, is_task_BL: Tensor) -> Tensor:
         """(B, L) bool: the tokens that are pooled; all of them where there is no instruction."""

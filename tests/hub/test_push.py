@@ -41,6 +41,7 @@ REPO_ID = "me/x"
 
 def result(seed: int, is_success: bool, policy: PolicyIdentity | None = None) -> str:
     return EpisodeResult(
+        task_version="1.0",
         spec=EpisodeSpec(seed=seed),
         instruction="Place a black stone on the Go board at row 0, column 1.",
         task_id=task_id((0, 1), "black"),
