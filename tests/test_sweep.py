@@ -385,6 +385,8 @@ def test_readers_say_what_a_sweep_that_was_stopped_lacks(tmp_path: Path) -> None
     errors = f"an error ended 2: {tmp_path / 'errors.jsonl'}"
     assert missing_of_sweep(results, 4) == f"{results}: 2 of 6 episodes are missing; {errors}"
     assert missing_of_sweep(tmp_path / "other.jsonl", 2) == ""
+    (tmp_path / "manifest.json").write_text('{"version"')
+    assert "whether episodes are missing cannot be said: " in missing_of_sweep(results, 2)
 
 
 @pytest.mark.long

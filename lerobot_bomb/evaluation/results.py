@@ -56,7 +56,7 @@ def read_results(path: Path) -> list[Row]:
     if damages:
         raise ValueError(damages[0])
     check_any(path, rows, damages)
-    return [row for group in groups_of(rows) for row in group.rows]
+    return [row for group in groups_of([*rows.values()]) for row in group.rows]
 
 
 def summarise(rows: list[Row]) -> Summary:

@@ -56,7 +56,7 @@ class Sample:
     arm: str
     row: Row
     path: Path  # of its file
-    line: int  # of the file's episodes, from 1 on
+    line: int  # of the file, from 1 on
     video: str | None = None  # link from the page
     note: str = ""  # why there is none, or what is to be known of it
 
@@ -82,12 +82,14 @@ class Report:
     missing: list[str] = field(default_factory=list)  # what files lack, or have damaged
 
 
-def sample_failures(arms: list[Arm], files: Mapping[Path, list[Row]], num_of_class: int) -> Iterator[Sample]:
+def sample_failures(
+    arms: list[Arm], files: Mapping[Path, Mapping[int, Row]], num_of_class: int
+) -> Iterator[Sample]:
     """Of each arm and class of failure so many episodes at most, always the same ones of the same files.
 
-    `files` are those that the arms' rows are from.
+    `files`: by path and line, those that the arms' rows are from.
     """
-    places = {id(row): (path, line) for path, rows in files.items() for line, row in enumerate(rows, start=1)}
+    places = {id(row): (path, line) for path, rows in files.items() for line, row in rows.items()}
     for arm in arms:
         classes = Counter(row["failure"] for row in arm.rows if row["failure"] is not None)
         for name, number in classes.most_common():
