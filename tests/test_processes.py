@@ -119,7 +119,10 @@ def test_going_on_is_exact_and_only_the_first_process_writes(
     of = folder / policy_type
     resumed, whole = (weights(policy_type, of / name) for name in ("resumed0", "process0"))
     torch.testing.assert_close(resumed, whole, rtol=0, atol=0)
-    assert not (of / "process1").exists() and not (of / "resumed1").exists()
+    # LeRobot 0.6.2 makes the folders in every process
+    assert not [
+        path for name in ("process1", "resumed1") for path in (of / name).rglob("*") if path.is_file()
+    ]
 
 
 def test_a_log_line_comes_from_one_process(two: tuple[Path, Seen]) -> None:
