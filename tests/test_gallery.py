@@ -1,6 +1,7 @@
 """`lerobot-bomb gallery`: the sheets show the environment, the page says what the table says."""
 
 import re
+from collections.abc import Mapping
 from pathlib import Path
 
 import numpy as np
@@ -23,11 +24,12 @@ from lerobot_bomb.commands.gallery import (
     suite_sheet,
     tiles_sheet,
 )
-from lerobot_bomb.conditions import ALL
+from lerobot_bomb.conditions import ALL, Axis
 from lerobot_bomb.envs.rollout import make_env, make_pusht_env
+from lerobot_bomb.libero.perturbations import LIBERO_AXES
 from lerobot_bomb.pusht.episode import PushTSpec
 from lerobot_bomb.pusht.perturbations import PUSHT_AXES
-from lerobot_bomb.viewing.perturbations_page import axis_section, example_instructions, page
+from lerobot_bomb.viewing.perturbations_page import example_instructions, page
 from lerobot_bomb.viewing.sheet import PAPER, Sheet, text_tile
 
 SIZE = 48
@@ -221,8 +223,14 @@ def test_a_flag_that_pusht_does_not_have_is_named(
     assert message in capsys.readouterr().err
 
 
-def test_the_page_of_pusht_has_every_axis_as_the_table_has_it() -> None:
-    text = (DOCS / "bomb_pusht.md").read_text()
-    for name, axis in PUSHT_AXES.items():
-        assert axis_section(name, axis, "media/bomb_pusht") in text
-        assert 10_000 < (DOCS / "media" / "bomb_pusht" / f"{name}.jpg").stat().st_size < 300_000
+@pytest.mark.parametrize(("name", "axes"), [("pusht", PUSHT_AXES), ("libero", LIBERO_AXES)])
+def test_an_environments_page_has_every_axis_with_its_magnitudes(name: str, axes: Mapping[str, Axis]) -> None:
+    text = (DOCS / f"{name}.md").read_text()
+    for axis_name, axis in axes.items():
+        sheet = f"media/bomb_{name}/{axis_name}.jpg"
+        rows = [
+            f"| {quantity} | {', '.join(f'{value:g}' for value in size.levels)} {size.unit} | {size.what} |"
+            for quantity, size in axis.magnitudes.items()
+        ]
+        assert f"| [`{axis_name}`]({sheet}): {', '.join(axis.changes)} " + "\n| ".join(rows) in text
+        assert 10_000 < (DOCS / sheet).stat().st_size < 300_000

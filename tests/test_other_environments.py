@@ -1,4 +1,4 @@
-"""Our policies on LeRobot's environment types: docs/other_environments.md says which of them were run."""
+"""Our policies on LeRobot's environment types: docs/your_policy.md says which of them were run."""
 
 import threading
 from collections.abc import Callable
