@@ -28,8 +28,8 @@ lerobot-bomb gallery --axes=camera,light --seeds=2,3 --output=outputs/gallery
 ```
 
 - An **axis** changes one thing and leaves all others alone.
-- A **level** says how far, from 0 (not at all) to {MAX_LEVEL}. Colours and directions are drawn from the seed,
-  so the levels of one seed differ in size only.
+- A **level** says how far, from 0 (not at all) to {MAX_LEVEL}. Colours and directions are drawn from the
+  seed, so the levels of one seed differ in size only.
 - A **condition** is one or several axes with levels: `none`, `camera:3`, `camera:2+light:3`. The list needs
   its brackets.
 - A **range**, as `camera:1-5`, draws the level from the seed; each axis of `all:1-5` draws its own.
