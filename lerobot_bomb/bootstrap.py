@@ -74,7 +74,7 @@ def format_bounds(interval: tuple[float, float] | None, form: str) -> str:
 
 @dataclass(frozen=True)
 class Slope:
-    """How much a value changes with a level, by least squares; no 95 % interval where all resamples agree."""
+    """Least-squares slope of a value over levels; there is no 95 % interval where all resamples agree."""
 
     per_level: float
     low: float | None

@@ -160,6 +160,6 @@ def check_appendable(path: Path) -> None:
 
 
 def _write_all(file: int, data: bytes) -> None:
-    """As os.write, which on a full disk writes a part and says so in its result only."""
+    """Write all bytes: on a full disk os.write writes a part, and only its result says so."""
     while data:
         data = data[os.write(file, data) :]

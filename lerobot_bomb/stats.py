@@ -64,7 +64,7 @@ def clustered_interval(successes_C: np.ndarray, counts_C: np.ndarray) -> tuple[f
 
 @dataclass(frozen=True)
 class Rate:
-    """How many of n records are counted, with the 95 % interval of their share."""
+    """Share of n records that are counted, with its 95 % interval."""
 
     successes: int
     n: int
@@ -123,7 +123,7 @@ def format_p(p_value: float) -> str:
 
 @dataclass(frozen=True)
 class PairedCounts:
-    """How often which arm of paired episodes succeeded."""
+    """Counts of paired episodes by which of the two groups succeeded."""
 
     both: int
     only_first: int
@@ -132,7 +132,7 @@ class PairedCounts:
 
     @classmethod
     def of(cls, first_E: Sequence[bool], second_E: Sequence[bool]) -> "PairedCounts":
-        """From the successes of the same episodes."""
+        """Count the outcomes of the same episodes in two groups."""
         pairs = Counter(zip(first_E, second_E, strict=True))
         return cls(*(pairs[pair] for pair in ((True, True), (True, False), (False, True), (False, False))))
 

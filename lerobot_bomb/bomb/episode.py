@@ -25,7 +25,7 @@ TEST_SEEDS = range(1000, 1200)  # of evaluations: from LeRobot's default on, as 
 
 
 class Stage(StrEnum):
-    """How far an episode got; each stage includes the ones before it."""
+    """Stage that an episode reached; each stage includes the ones before it."""
 
     START = "start"
     REACHED = "reached"

@@ -141,7 +141,7 @@ class Judge:
         }
 
     def _follow(self, touched: np.ndarray, held: np.ndarray) -> None:
-        """Of several stones that may be moved, the one that is held or touched is."""
+        """Switch to the stone that is held or touched, where several may be moved."""
         if len(self._movable) > 1:
             gripped = sorted(self._movable, key=lambda stone: (not held[stone], not touched[stone]))
             if touched[gripped[0]] and not touched[self._stone]:
@@ -238,10 +238,10 @@ class Judge:
 
 
 def _stones_left(move: Move, made: Made) -> frozenset[int]:
-    """Those that may make a move."""
+    """Return the stones that may still make a move."""
     return move.stones if len(move.stones) == 1 else move.stones - {stone for stone, _ in made.values()}
 
 
 def _places_left(move: Move, made: Made) -> frozenset[Place]:
-    """Those that no move has put a stone on."""
+    """Return the places of a move that no stone has been put on yet."""
     return move.places - {place for _, place in made.values() if place != TRAY}

@@ -1,4 +1,4 @@
-"""What LoRA and other adapters of `peft` change of our policies; LeRobot asks a policy for it."""
+"""Adapters: what LoRA and other methods of `peft` change of our policies; LeRobot asks a policy for it."""
 
 from collections.abc import Iterable
 from pathlib import Path
@@ -101,7 +101,7 @@ def _file(path: str, name: str, revision: str | None) -> Path:
 
 
 def _named(values: Any) -> set[str]:
-    """Which fields of `NAME_OTHERS` are set, at any depth."""
+    """Return the fields of `NAME_OTHERS` that are set, at any depth."""
     if isinstance(values, list):
         return {name for each in values for name in _named(each)}
     if not isinstance(values, dict):

@@ -1,4 +1,4 @@
-"""Whether a checkpoint's folder is whole and works on another machine."""
+"""Checks that a checkpoint's folder is whole and works on another machine."""
 
 from collections.abc import Iterable
 from pathlib import Path
@@ -75,7 +75,7 @@ def processor_files(folder: Path, processor: str) -> list[str]:
 
 
 def tensor_shapes(path: Path) -> Shapes:
-    """Of all tensors in a file, from its header.
+    """Return the shapes of all tensors in a file, from its header.
 
     Raises:
         ValueError: the file is truncated or of another format.
@@ -145,7 +145,7 @@ def check_config(folder: Path, config: PreTrainedConfig) -> None:
 
 
 def _names_code(values: Any, key: str = "") -> bool:
-    """Whether a config of transformers asks for remote code, or for a kernel of the Hub, at any depth."""
+    """Return True if a transformers config asks, at any depth, for remote code or a kernel of the Hub."""
     if isinstance(values, dict):
         return any(_names_code(each, name) for name, each in values.items())
     if isinstance(values, list):
@@ -195,12 +195,12 @@ def check_tensors(path: Path, policy: PreTrainedPolicy) -> list[str]:
 
 
 def holds_module(path: Path, module: str) -> bool:
-    """Whether a file of weights, if there is one, has tensors of a module."""
+    """Return True if a file of weights exists and has tensors of a module."""
     return path.is_file() and any(_is_of(name, [module]) for name in tensor_shapes(path))
 
 
 def _is_of(name: str, modules: Iterable[str]) -> bool:
-    """Whether a tensor is of one of the modules, by its name."""
+    """Return True if a tensor belongs to one of the modules, by its name."""
     return any(name.startswith(f"{module}.") for module in modules)
 
 

@@ -54,7 +54,7 @@ FORMS = (
 
 
 class Task(ABC):
-    """Which place is meant."""
+    """Task whose instruction describes a place by the stones that stand there."""
 
     place: str  # how the instruction names it; {anchor} is the colour of the stones that it refers to
     has_anchor = True
@@ -75,7 +75,7 @@ class Task(ABC):
 
 @dataclass(frozen=True)
 class Beside(Task):
-    """So many rows and columns from the only stone of the anchor's colour."""
+    """Task: the place so many rows and columns from the only stone of the anchor's colour."""
 
     place: str
     rows: int
@@ -160,7 +160,7 @@ NUM_PARTS = 5  # one in so many cases is held out
 
 
 def is_heldout(task_id: int, target: Cell, color: str) -> bool:
-    """Whether a case is held out: every relation, every place and every colour is seen in other cases."""
+    """Return True if a case is held out: every relation, place and colour is seen in other cases."""
     if len(TASKS[task_id].targets) == 1:
         return (task_id + 3 * COLORS.index(color)) % (NUM_PARTS + 1) == NUM_PARTS
     return (task_id + target[0] + 2 * target[1]) % NUM_PARTS == 0
