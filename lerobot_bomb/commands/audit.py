@@ -89,7 +89,7 @@ def _first_arms(args: argparse.Namespace) -> dict[str, Cell]:
 
 
 def _second_arms(args: argparse.Namespace, played: list[Row]) -> dict[str, Cell]:
-    """Those that need the instructions of the first."""
+    """Return the cells of the second arms, which need the instructions of the first."""
     arms = {AGAIN: _cell(args, f"--policy.path={args.policy_path}")}
     others = other_instructions(played)
     if others:

@@ -65,7 +65,7 @@ def check_versions() -> Iterator[Finding]:
 
 
 def _outside(name: str, version: str) -> str:
-    """What is wrong with an installed version that lies outside the range that this package declares."""
+    """Describe the range that this package declares, if an installed version lies outside it; else ""."""
     try:
         declared = [Requirement(text) for text in importlib.metadata.requires(DISTRIBUTION) or []]
     except importlib.metadata.PackageNotFoundError:  # reported as a finding of its own
@@ -98,7 +98,7 @@ def check_rendering() -> Iterator[Finding]:
 
 
 def check_fetch() -> Iterator[Finding]:
-    """Whether the arm that comes from gymnasium-robotics can be used; the other needs nothing."""
+    """Check that the arm from gymnasium-robotics can be used; the other one needs nothing."""
     try:
         importlib.import_module("lerobot_env_bomb.fetch_files").fetch_xml()
         yield Finding("--env.robot=fetch", "can run")
@@ -107,7 +107,7 @@ def check_fetch() -> Iterator[Finding]:
 
 
 def check_libero() -> Iterator[Finding]:
-    """Whether LIBERO is installed and has a config file and assets; nothing else needs it."""
+    """Check that LIBERO is installed and has a config file and assets; nothing else needs it."""
     libero = Libero.find()
     if libero is None:
         yield Finding("libero", f"not installed (for --env.type=libero: {INSTALL})", absent=True)
@@ -158,7 +158,7 @@ def check_gpu() -> Iterator[Finding]:
 
 
 def check_hub() -> Iterator[Finding]:
-    """Whether pretrained backbones can be downloaded; not needed for nano or a local folder."""
+    """Check that pretrained backbones can be downloaded; nano and local folders do not need it."""
     hub = importlib.import_module("huggingface_hub")
     if hub.constants.HF_HUB_OFFLINE:
         detail = "offline by HF_HUB_OFFLINE; nano and local folders work"

@@ -64,7 +64,7 @@ def _is_data(path: str) -> bool:
 
 
 def dataset_card(repo_id: str, facts: DatasetFacts) -> str:
-    """What the dataset shows, and how to train on it."""
+    """Write the dataset's card: what the dataset shows, and how to train on it."""
     metadata = DatasetCardData(
         license="apache-2.0",
         tags=["LeRobot", "lerobot_bomb"],

@@ -21,7 +21,7 @@ def check_outputs(inputs: Sequence[Path], outputs: Iterable[Path]) -> None:
 
 
 def missing_of_sweep(path: Path, num_rows: int) -> str:
-    """How many episodes a sweep's file, which has so many, lacks, and why; "" if none or of another file."""
+    """Say how many episodes a sweep's file of so many rows lacks, and why; "": none, or it is no sweep's."""
     if path.name != RESULTS or not path.with_name(NAME).is_file():
         return ""
     number, errors = Manifest.read(path.parent).num_episodes, path.with_name(ERRORS)

@@ -163,7 +163,7 @@ def _manifest(args: argparse.Namespace) -> Manifest:
 
 
 def _kind(flags: list[str]) -> ResultKind:
-    """Of the environment that the flags name."""
+    """Return the kind of results of the environment that the flags name."""
     env_type = flag_value(flags, "--env.type")
     if env_type is None:
         raise ValueError(f"--env.type is missing: {', '.join(KIND_OF_ENV)}")

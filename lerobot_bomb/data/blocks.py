@@ -40,7 +40,7 @@ IMAGE_WRITER_THREADS = 4
 
 @dataclass(frozen=True)
 class DatasetLayout:
-    """What a block and the merged dataset have in common."""
+    """Settings that a block and the merged dataset have in common."""
 
     repo_id: str
     fps: int
@@ -71,7 +71,7 @@ class DatasetLayout:
 
 @dataclass(frozen=True)
 class RecordedEpisode:
-    """What a block is made of."""
+    """Frames and columns of an episode that a block is made of."""
 
     frames: Iterable[dict[str, Any]]  # as LeRobot's add_frame takes them
     columns: dict[str, Any] = field(default_factory=dict)  # of its row in LeRobot's table of episodes

@@ -1,4 +1,4 @@
-"""Whether the files of a LeRobotDataset v3 are whole and agree with its metadata; imports no torch."""
+"""Checks that a LeRobotDataset v3's files are whole and agree with its metadata; imports no torch."""
 
 from collections.abc import Sequence
 from contextlib import suppress
@@ -203,7 +203,7 @@ def check_finite_columns(path: Path, table: pa.Table) -> None:
 
 
 def flat_numbers(column: pa.ChunkedArray) -> np.ndarray:
-    """All values of a column of scalars or (nested) lists, in one row; what is null among floats is NaN."""
+    """Flatten a column of scalars or (nested) lists into one row of values; null among floats becomes NaN."""
     array = column.combine_chunks()
     while isinstance(array, pa.ExtensionArray):
         array = array.storage
@@ -221,7 +221,7 @@ def _check_tasks(root: Path, info: Info) -> None:
 
 
 def _check_statistics(root: Path, info: Info) -> None:
-    """Of every image, number and vector; no policy normalises arrays."""
+    """Raise unless every image, number and vector has finite statistics; no policy normalises arrays."""
     path = root / STATISTICS_FILE
     statistics = read_json(path)
     for name, feature in info["features"].items():

@@ -86,7 +86,7 @@ class Environment:
         return f"--env.{name}={SUITE if value is None else value}"
 
     def eval_flags(self) -> list[str]:
-        """Of lerobot-eval, for this environment; a suite that is not known is to be filled in for SUITE."""
+        """Return lerobot-eval's flags for this environment; an unknown suite is to be filled in for SUITE."""
         flags = [self._flag(name) for name in COMPARED]
         if self.depth:
             flags.append("--env.depth=true")

@@ -110,7 +110,7 @@ def eval_config(flags: Sequence[str]) -> Any:
 
 
 def _run_lerobot_eval(flags: Sequence[str], **replaced: Any) -> None:
-    """In this process, with other functions of these names."""
+    """Run lerobot-eval in this process, with other functions of these names."""
     from lerobot.scripts import lerobot_eval
 
     usual = {name: getattr(lerobot_eval, name) for name in replaced}
