@@ -1,4 +1,4 @@
-"""What our environments do alike: episodes from seeds, steps after the end, a line of results at the end.
+"""Base of our environments: episodes from seeds, steps after the end, a record of results at the end.
 
 Simulator workers import this module, so it imports neither torch nor LeRobot.
 """
@@ -94,7 +94,7 @@ class EpisodeEnv[SpecT: Any, RunT, ResultT: ResultLine](gymnasium.Env[Observatio
         return self._draw_for_people(run)
 
     def episode_result(self) -> ResultT:
-        """What became of the episode that has just ended."""
+        """Return the result of the episode that has just ended."""
         if self._last_transition is None:
             raise ResetNeeded("the episode has not ended yet")
         j2, j3 = self._smoothness()
@@ -154,7 +154,7 @@ class EpisodeEnv[SpecT: Any, RunT, ResultT: ResultLine](gymnasium.Env[Observatio
 
     @abstractmethod
     def _result(self, run: RunT) -> ResultT:
-        """Of an episode that has ended."""
+        """Return the result of an episode that has ended."""
 
 
 def _whole(seed: Any) -> int:

@@ -1,4 +1,4 @@
-"""What became of an episode of `bomb_pusht`: a line of a results file. As light as `results`."""
+"""Result of an episode of `bomb_pusht`: a record of a results file. As light as `results`."""
 
 from dataclasses import dataclass, field
 from functools import partial

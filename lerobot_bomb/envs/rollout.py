@@ -31,7 +31,7 @@ type Expert = Callable[[PrivilegedState], np.ndarray]
 
 @dataclass(frozen=True)
 class Moment:
-    """What is seen before a step, and what is then done; an episode of T steps has T + 1 moments."""
+    """Observation before a step, and the action that follows; an episode of T steps has T + 1 moments."""
 
     step: int
     instruction: str

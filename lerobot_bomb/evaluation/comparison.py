@@ -24,7 +24,7 @@ type Values = dict[str, set[str]]  # of settings
 
 @dataclass(frozen=True)
 class Comparisons:
-    """All that two sets of episodes have in common."""
+    """Comparison of two sets of episodes, condition by condition."""
 
     policies: tuple[str, str]
     conditions: list[PairedComparison]
@@ -99,7 +99,7 @@ def of_policies(rows: list[Row], names: Sequence[str]) -> list[list[Row]]:
 
 
 def can_compare(first: Group, second: Group) -> bool:
-    """Whether two groups differ in nothing but their policies, as far as their lines say."""
+    """Return True if two groups differ in nothing but their policies, as far as their records say."""
     return not _apart(_values_of([first]), _values_of([second]))
 
 

@@ -1,4 +1,4 @@
-"""What a policy says about recorded frames: its losses, and the actions that it decodes.
+"""Predictions of a policy on recorded frames: its losses, and the actions that it decodes.
 
 Shapes: `R` frames, `B` of them in a batch, `T` actions of a chunk, `D` action dims.
 """
@@ -25,7 +25,7 @@ LOSS = "loss"
 
 @dataclass(frozen=True)
 class Predictions:
-    """What a policy says about R frames."""
+    """Predictions of a policy on R frames."""
 
     losses: dict[str, np.ndarray]  # {name: (R,)}, NaN where a frame has none
     chunks: np.ndarray  # (R, T, D) decoded actions in the dataset's units

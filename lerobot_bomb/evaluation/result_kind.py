@@ -1,4 +1,4 @@
-"""What lines of results of one environment are; how they are read and compared is the same for all."""
+"""Kinds of results, one for each environment; reading and comparing them is the same for all."""
 
 import json
 from collections.abc import Callable, Iterable, Mapping, Sequence
@@ -95,7 +95,7 @@ class ResultKind:
         return tuple(row["spec"][name] for name in self.start)
 
     def missing_fields(self, version: str) -> list[str]:
-        """Of lines of the newest protocol, what those of another version do not have."""
+        """Return the fields that records of the newest protocol have and those of another version do not."""
         *_, newest = self.fields.values()
         return [name for name in newest if name not in self.fields[version]]
 

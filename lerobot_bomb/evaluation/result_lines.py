@@ -84,7 +84,7 @@ def check_any(path: Path, rows: list[Row], damages: list[str]) -> None:
 
 
 def kind_of(row: Row) -> ResultKind:
-    """Of which environment a line is."""
+    """Return the kind of results that a record is of."""
     return KIND_OF_VERSION[row["protocol_version"]]
 
 

@@ -30,7 +30,7 @@ from lerobot_bomb.libero.assets import SUITES
 
 
 class NoCondition(AxisCondition):
-    """Of an environment without perturbation axes: `none` only."""
+    """Condition of an environment without perturbation axes: `none` only."""
 
     axes: ClassVar[Mapping[str, Axis]] = {}
 
