@@ -1,4 +1,4 @@
-"""What a language model computes on the way: recorded, and put back into a pass over something else.
+"""Activations of a language model: recorded, and put back into a pass over something else.
 
 Shapes: `U` units, `N` rows of a pass, `L` tokens, `F` features.
 """
@@ -25,7 +25,7 @@ type Change = Callable[[Tensor], Tensor]
 
 @dataclass(frozen=True)
 class Unit:
-    """What is put back at once."""
+    """Part of a language model whose activations are put back at once."""
 
     layer: int
     part: str
@@ -53,7 +53,7 @@ def restoring(
     clean: Activations,
     units_of_rows: Sequence[Sequence[Unit]],
 ) -> Iterator[None]:
-    """In the passes of one score, put units of ``clean`` back into each row.
+    """Put units of ``clean`` back into each row, in the passes of one score.
 
     ``clean`` is of one row. A pass may have several rows for each of the score's, beside each other.
     """
@@ -120,7 +120,7 @@ def _hook(layer: DecoderLayer, part: str, change: Change) -> Any:
 
 
 def _on_first(change: Change, output: Any) -> Any:
-    """What a module gives may be states, or states and more."""
+    """Change what a module returns, which may be states, or a tuple of states and more."""
     if isinstance(output, tuple):
         return change(output[0]), *output[1:]
     return change(output)

@@ -109,7 +109,7 @@ class ExplainedByDistance(_ExplainedByBatch):
 
 
 def _language_layers(policy: nn.Module) -> list[DecoderLayer]:
-    """Of the first language model among a policy's modules; its parts are taken to be called one by one."""
+    """Return the layers of a policy's first language model; its parts are taken to be called one by one."""
     for module in policy.modules():
         layers = getattr(module, "layers", None)
         first = layers[0] if isinstance(layers, nn.ModuleList) and len(layers) else None

@@ -72,7 +72,7 @@ def _watched(viewed: Viewed, moment: Moment, env: gymnasium.Env) -> Watched:
 
 
 def _phase(moment: Moment) -> str:
-    """Of BOMB."""
+    """Return the phase of a moment of BOMB."""
     stage, state = Stage(moment.info["stage"]), moment.state
     if stage is Stage.START:
         return REACH

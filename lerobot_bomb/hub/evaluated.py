@@ -1,4 +1,4 @@
-"""Whether results are of the checkpoint that is published with them, and of its environment."""
+"""Checks that results are of the checkpoint that is published with them, and of its environment."""
 
 from pathlib import Path
 

@@ -53,7 +53,7 @@ def _is_of_checkpoint(path: str) -> bool:
 def read_checkpoint(
     folder: Path, repo_id: str, dataset: DatasetFacts | None, results: list[list[Row]]
 ) -> "Checkpoint":
-    """What its card is made of, after all checks."""
+    """Read and check a checkpoint, and return what its card is made of."""
     from lerobot.utils.import_utils import register_third_party_plugins
 
     from lerobot_bomb.checkpoints.adapters import check_adapters_fit, check_base
@@ -116,7 +116,7 @@ def portable_json(path: Path) -> str:
 
 
 def portable(value: Any, key: str = "") -> Any:
-    """The same of what it holds."""
+    """Strip local paths from a value and from everything that it holds."""
     if isinstance(value, dict):
         return {name: portable(each, name) for name, each in value.items()}
     if isinstance(value, list):

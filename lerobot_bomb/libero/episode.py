@@ -49,16 +49,16 @@ class LiberoSpec:
 
 
 def initial_state_of(seed: int, count: int) -> int:
-    """Which of a task's recorded initial states an episode starts in.
+    """Return the index of the recorded initial state that an episode of a task starts in.
 
-    `lerobot-eval --env.type=libero` plays them in order, whatever its seed; so episodes are the same here
-    where --seed is a multiple of their number, 50, as its default 1000 is.
+    `lerobot-eval --env.type=libero` goes through them in order, whatever its seed; so episodes are the same
+    here where --seed is a multiple of their number, 50, as its default 1000 is.
     """
     return seed % count
 
 
 def failure_of(touched: set[str], wanted: set[str]) -> LiberoFailure:
-    """Of an episode without success: objects that the gripper met, and those that the task is about."""
+    """Classify an episode without success, by the objects that the gripper met and those of the task."""
     if not touched:
         return LiberoFailure.NEVER_TOUCHED
     return LiberoFailure.UNFINISHED if touched & wanted else LiberoFailure.WRONG_OBJECT
