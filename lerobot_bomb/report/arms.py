@@ -1,4 +1,4 @@
-"""What a report is about: arms, the episodes of one policy under one set of settings."""
+"""Arms of a report: the episodes of one policy under one set of settings."""
 
 import shlex
 from collections import Counter
@@ -41,7 +41,7 @@ class Policy:
 
     @property
     def name(self) -> str:
-        """That of its arm, where it has one: it says the suite, too."""
+        """Name of its arm, where it has only one: it says the suite, too."""
         return self.arms[0].name if len(self.arms) == 1 else self.short_name
 
     @property
@@ -75,7 +75,7 @@ class Sample:
 
 @dataclass(frozen=True)
 class Report:
-    """What the sections are counted from."""
+    """Arms, samples and gaps that the sections are made from."""
 
     arms: list[Arm]
     samples: list[Sample] = field(default_factory=list)
@@ -83,7 +83,7 @@ class Report:
 
 
 def sample_failures(arms: list[Arm], files: Mapping[Path, list[Row]], num_of_class: int) -> Iterator[Sample]:
-    """Of each arm and class of failure so many episodes at most, always the same ones of the same files.
+    """Sample at most so many episodes of each arm and class of failure; the same files give the same ones.
 
     `files` are those that the arms' rows are from.
     """

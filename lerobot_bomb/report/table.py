@@ -1,4 +1,4 @@
-"""What a page shows: sections of tables of cells."""
+"""Parts of a page: sections of tables of cells."""
 
 from dataclasses import dataclass, field
 from typing import Any
@@ -6,7 +6,7 @@ from typing import Any
 
 @dataclass(frozen=True)
 class Cell:
-    """What is shown, what it is as a number or text, and how strongly it is coloured."""
+    """Cell of a table: its text, its value as a number or text, and how strongly it is coloured."""
 
     text: str
     value: Any = None

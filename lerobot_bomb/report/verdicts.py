@@ -1,6 +1,6 @@
-"""What can be wrong with a success rate, asked one by one: verdicts over lines of results.
+"""Verdicts over records: what can be wrong with a success rate, asked one by one.
 
-Arms are lists of lines of the same episodes, but for those of the splits.
+Arms are lists of records of the same episodes, but for those of the splits.
 """
 
 from collections.abc import Mapping, Sequence

@@ -16,7 +16,7 @@ from lerobot_bomb.viewing.replay import Replay, line_of
 
 
 def with_videos(samples: Iterable[Sample], folder: Path, num_of_class: int) -> Iterator[Sample]:
-    """The same samples; the first of each arm's classes with a video in a folder beside the page.
+    """Add a video, beside the page, to the first samples of each arm's classes; yield the others unchanged.
 
     Where an episode cannot be played again, its note says why.
     """

@@ -1,4 +1,4 @@
-"""What would be refused in the middle of a sweep, found before it begins."""
+"""Check of a sweep before it begins: what would be refused in the middle of it."""
 
 import logging
 from collections.abc import Sequence
@@ -42,7 +42,7 @@ def check(manifest: Manifest, begun: Sequence[Cell] = ()) -> None:
 
 
 def renamed(message: str) -> str:
-    """With the flags of a sweep, for all of its policies."""
+    """Return the message with the flags of a sweep, for all of its policies."""
     for usual, name in RENAMED.items():
         message = message.replace(usual, name)
     return message

@@ -42,7 +42,7 @@ def progress(store: Store, cells: Sequence[Cell]) -> Iterator[bool]:
 
 
 def _not_over(store: Store, cells: Sequence[Cell]) -> tuple[list[Cell], int]:
-    """Those that are to be played, and how many episodes of the others have been."""
+    """Return the cells that are to be run, and how many episodes of the others have been."""
     is_over = {cell: store.is_over(cell) for cell in cells}
     over = [cell for cell in cells if is_over[cell]]
     return [cell for cell in cells if not is_over[cell]], store.num_played(over)
@@ -80,7 +80,7 @@ class WorkerProcess:
 
     @property
     def is_refused(self) -> bool:
-        """Whether it ended because flags are wrong."""
+        """True if the process ended because flags are wrong."""
         return self._process.returncode == REFUSED
 
     def kill(self, reason: str = "") -> None:
@@ -97,7 +97,7 @@ class WorkerProcess:
 
 
 def ended(code: int) -> str:
-    """How a process ended, from Popen's return code."""
+    """Describe how a process ended, from Popen's return code."""
     if code >= 0:
         return f"its process ended with exit code {code}"
     cause = {signal.SIGKILL: ", as where memory is short", signal.SIGSEGV: ", a fault of native code"}

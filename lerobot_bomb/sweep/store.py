@@ -1,4 +1,4 @@
-"""What of a sweep is done: a folder that any number of workers share.
+"""Store of what is done in a sweep: a folder that any number of workers share.
 
 A cell is finished where `cells/KEY.jsonl` holds all its episodes; a worker that plays one holds the lock on
 `cells/KEY.lock`, which the system takes from it if it is killed. What such a worker left is played again,
@@ -68,7 +68,7 @@ class Store:
         return self.folder / CELLS / f"{cell.key}.{ending}"
 
     def is_finished(self, cell: Cell) -> bool:
-        """Whether the file of its lines is there and whole: a crash of the machine can cut it off."""
+        """Return True if the file of its records is there and whole; a crash can cut it off."""
         path = self.file(cell, "jsonl")
         try:
             state = path.stat()
@@ -87,12 +87,12 @@ class Store:
             return False
 
     def is_untouched(self) -> bool:
-        """Whether no episode has been played, with a line or with an error, and none is being played."""
+        """Return True if no episode has been run, with a record or with an error, and none is running."""
         cells = self.manifest.cells
         return not any(map(self.has_begun, cells)) and all(map(self._is_free, cells))
 
     def has_begun(self, cell: Cell) -> bool:
-        """Whether an episode has been played, with a line or with an error, or is being played."""
+        """Return True if an episode has been run, with a record or with an error, or is running."""
         return any(self.file(cell, ending).is_file() for ending in ("jsonl", "part", "errors"))
 
     def _is_free(self, cell: Cell) -> bool:
@@ -127,7 +127,7 @@ class Store:
         return sorted(cells, key=lambda cell: (of_policy[cell.policy], attempts[cell]))
 
     def _num_attempts(self, cell: Cell) -> int:
-        """Of this run."""
+        """Count this run's attempts at the cell."""
         return _read(self.file(cell, "attempts")).split().count(self.run.encode())
 
     def give_up(self, cell: Cell, reason: str) -> None:
@@ -136,7 +136,7 @@ class Store:
             path.write_text(reason)
 
     def is_over(self, cell: Cell) -> bool:
-        """Whether it is finished or given up."""
+        """Return True if the cell is finished or given up."""
         return self.is_finished(cell) or self.file(cell, "given_up").is_file()
 
     def begin_again(self, cells: Sequence[Cell]) -> None:
@@ -150,7 +150,7 @@ class Store:
 
     @contextmanager
     def claimed(self, cell: Cell) -> Iterator[bool]:
-        """Whether no other worker plays it; none begins to, as long as this lasts."""
+        """Yield True and keep other workers off the cell; yield False if another one runs it."""
         with self.file(cell, "lock").open("w") as lock:
             try:
                 flock(lock, LOCK_EX | LOCK_NB)
@@ -185,7 +185,7 @@ class Store:
                     path.write_bytes(b"".join(map(_read, paths)))
 
     def lines(self) -> list[str]:
-        """What is finished, and what is missing and why, as text."""
+        """Describe what is finished, and what is missing and why."""
         cells = self.manifest.cells
         finished = [cell for cell in cells if self.is_finished(cell)]
         errors = [error for cell in finished for error in self.errors(cell)]
@@ -214,7 +214,7 @@ class Store:
         return text
 
     def errors(self, cell: Cell) -> list[EpisodeError]:
-        """Of a finished cell."""
+        """Return the errors of a finished cell."""
         return [EpisodeError(**json.loads(line)) for line in _read(self.file(cell, "errors")).splitlines()]
 
     def _of_other_manifests(self) -> list[Path]:

@@ -115,7 +115,7 @@ class Worker:
         return by_seed
 
     def _stock_lines(self, cell: Cell, whole: Cell, output_dir: Path) -> list[str]:
-        """Of an environment of LeRobot's own, which lerobot-eval has just played."""
+        """Return the records of an environment of LeRobot's own, which lerobot-eval has just run."""
         assert self._kept.policy is not None
         results = results_of(
             read_json(output_dir / EVAL_INFO),
@@ -129,12 +129,12 @@ class Worker:
 
 
 def has_results_path(cell: Cell) -> bool:
-    """Whether lerobot-eval writes its lines itself."""
+    """Return True if lerobot-eval writes the cell's records itself."""
     return cell.env_type not in KIND_OF_ENV or KIND_OF_ENV[cell.env_type].has_results_path
 
 
 def starts_by_number(cell: Cell) -> bool:
-    """Whether an episode alone starts otherwise than in the cell."""
+    """Return True if an episode alone starts otherwise than in the cell."""
     return cell.env_type in KIND_OF_ENV and KIND_OF_ENV[cell.env_type].starts_by_number
 
 

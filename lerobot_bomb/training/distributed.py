@@ -13,7 +13,7 @@ ONE_FILE = "1000TB"  # no checkpoint is larger
 
 
 def process_number() -> int:
-    """From 0; where there is one process only, it."""
+    """Return the number of this process, from 0; 0 where there is one only."""
     return distributed.get_rank() if _are_several() else 0
 
 

@@ -37,7 +37,7 @@ def check_model_name_and_precision(config: Any) -> None:
 
 
 def check_architecture(config: Any) -> None:
-    """What describes a checkpoint's backbone is whole: fields that no command line gives."""
+    """Raise unless what describes a checkpoint's backbone is whole: fields that no command line gives."""
     if config.vlm_config is not None and not (config.vlm_config and config.prompt_tokens):
         raise ValueError(
             f"--policy.vlm_config={config.vlm_config}, --policy.prompt_tokens={config.prompt_tokens}: they "
@@ -183,7 +183,7 @@ def check_weights_fit(config: Any, flags: Iterable[str]) -> None:
 
 
 def _then(config: Any, flags: Iterable[str]) -> dict[str, Any]:
-    """What a checkpoint was trained with, also by flags that it is older than."""
+    """Return what a checkpoint was trained with, also by flags that it is older than."""
     later = {flag: config.LATER_FIELDS[flag] for flag in flags if flag in config.LATER_FIELDS}
     return {**later, **(config.trained_with or {})}
 
@@ -197,7 +197,7 @@ def action_deltas(config: Any) -> list[int] | None:
 
 
 def adamw(config: Any) -> AdamWConfig:
-    """Of the fields optimizer_*."""
+    """Build AdamW's config from the fields optimizer_*."""
     return AdamWConfig(
         lr=config.optimizer_lr,
         betas=config.optimizer_betas,
@@ -208,7 +208,7 @@ def adamw(config: Any) -> AdamWConfig:
 
 
 def cosine_decay(config: Any) -> CosineDecayWithWarmupSchedulerConfig:
-    """Of the fields scheduler_*."""
+    """Build the schedule's config from the fields scheduler_*."""
     return CosineDecayWithWarmupSchedulerConfig(
         num_warmup_steps=config.scheduler_warmup_steps,
         num_decay_steps=config.scheduler_decay_steps,

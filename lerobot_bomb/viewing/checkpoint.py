@@ -55,7 +55,7 @@ class LoadedPolicy:
         self.policy.reset()
 
     def observe(self, observations: list[dict[str, Any]], instructions: list[str]) -> dict[str, Any]:
-        """What `prepare` takes: images (B, 3, H, W) in [0, 1] by camera, state, task."""
+        """Return what `prepare` takes: images (B, 3, H, W) in [0, 1] by camera, state, task."""
         batch = {**preprocess_observation(_stacked(observations)), "task": instructions}
         return self._env_processors[0](batch)
 

@@ -44,7 +44,7 @@ class Viewed:
     task: str = ""  # what is fixed of the task: "_task3", "_row3-column2_white"
 
     def name(self, policy: str) -> str:
-        """Of an episode and of its files: "place.camera-3_expert_seed0"."""
+        """Name an episode and its files: "place.camera-3_expert_seed0"."""
         return f"{self.group}{self.task}_{policy}_seed{self.spec.seed}"
 
 

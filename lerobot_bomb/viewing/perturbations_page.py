@@ -101,14 +101,14 @@ def _image(name: str, sheets: str) -> str:
 
 
 def _forms(instructions: list[str]) -> str:
-    """The same goal, said in the form of each level."""
+    """Return the table of one goal, said in the form of each level."""
     rows = [f"| {level} | {instruction} |" for level, instruction in enumerate(instructions)]
     head = f"One goal, a {COLOR} stone on row {TARGET[0]}, column {TARGET[1]}, in the form of each level:"
     return "\n".join(["", head, "", "| level | instruction |", "|---|---|", *rows, ""])
 
 
 def _floors() -> str:
-    """What level 5 must at least be, and is."""
+    """Return the table of what level 5 must at least be, and is."""
     dim, bright = magnitude("light", "dim", MAX_LEVEL), magnitude("light", "bright", MAX_LEVEL)
     floors = [
         ("camera's angle", "15 degrees", f"{magnitude('camera', 'angle', MAX_LEVEL):g} degrees"),

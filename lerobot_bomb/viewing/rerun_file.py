@@ -73,7 +73,7 @@ class EpisodeLog[SpecT, ResultT: ResultLine](ABC):
     @staticmethod
     @abstractmethod
     def layout(prefix: str) -> rrb.Horizontal:
-        """What the viewer shows at first of the entities with this prefix."""
+        """Return what the viewer shows at first of the entities with this prefix."""
 
     @staticmethod
     @abstractmethod

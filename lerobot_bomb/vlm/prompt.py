@@ -42,7 +42,7 @@ TASK_TEMPLATE = "Task: {},"
 
 @dataclass(frozen=True)
 class ChatFormat:
-    """What a family of models puts around a user's texts and its own."""
+    """Format of a chat: what a family of models puts around a user's texts and its own."""
 
     family: str  # of its tokenizers, in messages
     start: str  # of the sequence

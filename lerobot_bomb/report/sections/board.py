@@ -1,4 +1,4 @@
-"""Where on the board stones were asked for, and where they lie."""
+"""Section `board`: where on the board stones were asked for, and where they lie."""
 
 from collections import Counter
 from collections.abc import Callable, Iterable

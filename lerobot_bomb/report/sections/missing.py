@@ -1,4 +1,4 @@
-"""What the episodes have nothing for, and how to get it."""
+"""Section `missing`: what the episodes have nothing for, and how to get it."""
 
 from lerobot_bomb.report.arms import Report
 from lerobot_bomb.report.sections import efficiency, language

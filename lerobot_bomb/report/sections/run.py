@@ -1,4 +1,4 @@
-"""What was run, and the flags that do it again."""
+"""Section `run`: what was run, and the flags that do it again."""
 
 import json
 import shlex
@@ -15,7 +15,7 @@ def section(report: Report) -> Section:
 
 
 def commands(arm: Arm) -> list[str]:
-    """What was evaluated, and the flags that do it again."""
+    """Describe what was evaluated, and the flags that do it again."""
     by = by_condition(arm.rows)
     policy = arm.rows[0].get("policy") or {"type": "TYPE", "path": None}
     who = f"--policy.type={policy['type']}" if policy["path"] is None else f"--policy.path={policy['path']}"
