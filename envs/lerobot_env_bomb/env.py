@@ -39,7 +39,7 @@ PERSON_IMAGE_SIZE = 384  # pixels, either half of render()'s image
 
 @dataclass(frozen=True)
 class _Run:
-    """What exists once an episode has been started."""
+    """State of an episode that has been started."""
 
     scene: Scene
     episode: PerturbedEpisode

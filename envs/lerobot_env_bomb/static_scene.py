@@ -20,7 +20,7 @@ GRIP_ERROR_M = 0.0015  # largest of a held stone between the pads, in x, y and z
 
 @dataclass(frozen=True)
 class StaticScene:
-    """Where everything is, and what has been done before."""
+    """Scene at some time of an episode: where everything is, and what has been done before."""
 
     layout: Layout
     num_made: int  # moves that have been made
@@ -78,7 +78,7 @@ def _slid_xyz(layout: Layout, aim: Aim, rng: np.random.Generator) -> np.ndarray:
 
 
 def _is_nearest(layout: Layout, stone: int, supply: tuple[int, ...], gripper_xyz: np.ndarray) -> bool:
-    """Whether a stone is clearly the nearest to the gripper of those in the tray."""
+    """Return True if a stone is clearly the nearest to the gripper of those in the tray."""
     others = [other for other in supply if other != stone]
     distances = np.linalg.norm(layout.stone_xy - gripper_xyz[:2], axis=1)
     return bool((distances[others] - distances[stone] >= MARGIN_M).all())

@@ -19,7 +19,7 @@ from lerobot_env_bomb_libero.scene import LiberoScene
 
 @dataclass(frozen=True)
 class _Run:
-    """What exists once an episode has been started."""
+    """State of an episode that has been started."""
 
     episode: LiberoEpisode
     actuator: LiberoActuator | None  # None: actions are executed as they are

@@ -27,7 +27,7 @@ HEADLIGHT = ("ambient", "diffuse", "specular")
 
 
 class LiberoTransform(EpisodeTransform):
-    """What one perturbation axis does to an episode of LIBERO; frozen once drawn."""
+    """Effect of one perturbation axis on an episode of LIBERO; frozen once drawn."""
 
     @classmethod
     def add_bodies(cls, worldbody: ElementTree.Element) -> None:
@@ -140,7 +140,7 @@ class LiberoScene(LiberoEnv):
         return np.flatnonzero((self.owners[self.model.geom_bodyid] == 0) & (self.model.geom_group == 1))
 
     def geoms_of(self, bodies: Sequence[int]) -> np.ndarray:
-        """All geoms of objects or fixtures, as indices."""
+        """Return the indices of all geoms of objects or fixtures."""
         return np.flatnonzero(np.isin(self.owners[self.model.geom_bodyid], bodies))
 
     def surfaces(self) -> dict[int, str]:

@@ -17,7 +17,7 @@ PERSON_IMAGE_SIZE = 384  # pixels, of LeRobot's videos of `pusht`
 
 
 class PushTTransform(EpisodeTransform):
-    """What one perturbation axis does to an episode of PushT; frozen once drawn."""
+    """Effect of one perturbation axis on an episode of PushT; frozen once drawn."""
 
     def edit(self, board: "Board") -> None:
         """Change the board that gym-pusht has just set up, before block and agent are placed."""

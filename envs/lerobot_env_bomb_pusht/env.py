@@ -29,7 +29,7 @@ DEFAULT_PUSHT_SPEC = PushTSpec(seed=0)
 
 @dataclass(frozen=True)
 class _Run:
-    """What exists once an episode has been started."""
+    """State of an episode that has been started."""
 
     episode: PushTEpisode
     block_pose: np.ndarray  # (3,)
