@@ -1,4 +1,4 @@
-"""What the decoding benchmarks share: ways to write the same answers, timed in turn, and the verdict."""
+"""Parts of the decoding benchmarks: ways to write the same answers, timed in turn, and the verdict."""
 
 import statistics
 import sys

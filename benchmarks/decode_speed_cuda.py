@@ -131,7 +131,7 @@ def time_decoding(
 
 
 def wait_and_time(run: Callable[[], Any]) -> tuple[Any, float]:
-    """What it gives, and the seconds until the device has done it."""
+    """Return the call's result, and the seconds until the device has computed it."""
     torch.cuda.synchronize()
     started = time.perf_counter()
     result = run()
@@ -214,7 +214,7 @@ def time_policy(repeats: int) -> dict[str, dict[str, float]]:
 
 
 def make_policy(compiled: bool) -> Vla0SmolPolicy:
-    """Of this shape, with random weights."""
+    """Make a policy of this shape, with random weights."""
     image = PolicyFeature(FeatureType.VISUAL, (3, 256, 256))
     config = Vla0SmolConfig(
         vlm_config=config_500m(),

@@ -1,4 +1,4 @@
-"""What a policy could do at each of its checkpoints, from their results files; as a table and a plot."""
+"""Learning curve of a policy: each checkpoint's results file, as a table and a plot."""
 
 from dataclasses import asdict, dataclass
 from pathlib import Path

@@ -40,19 +40,19 @@ POLICIES = sorted(path.stem.removeprefix("play_pusht_") for path in FOLDER.glob(
 
 @dataclass(frozen=True)
 class Seconds:
-    """What a training took by the clock, and of CPU."""
+    """Seconds that a training took, by the clock and of CPU."""
 
     clock: float
     cpu: float
 
     def on(self, device: str) -> float:
-        """What is made equal."""
+        """Return the seconds that are made equal on a device."""
         return self.cpu if device == "cpu" else self.clock
 
 
 @dataclass(frozen=True)
 class Contender:
-    """What one policy was trained with, and how it plays."""
+    """Contender: how one policy was trained, and how it performs."""
 
     name: str
     steps: int

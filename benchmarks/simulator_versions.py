@@ -50,7 +50,7 @@ class Outcome:
 
 @dataclass(frozen=True)
 class Measured:
-    """What one MuJoCo version makes of all episodes."""
+    """Outcomes of all episodes under one MuJoCo version."""
 
     mujoco: str
     renderer: str
@@ -96,7 +96,7 @@ def outcome_of(robot: str, condition: str, seeds: range) -> Outcome:
 
 
 def renderer_name() -> str:
-    """What OpenGL says it draws with."""
+    """Return what OpenGL says it draws with."""
     from lerobot_env_bomb.env import BombEnv
 
     env = BombEnv()

@@ -1,4 +1,4 @@
-"""Where the time of one training step and of one evaluation step goes.
+"""Profile of one training step and of one evaluation step.
 
     OMP_NUM_THREADS=1 python benchmarks/step_profile.py --policy.type=vla0_smol --json step_profile.json
 
