@@ -79,7 +79,7 @@ def libero(tmp_path_factory: pytest.TempPathFactory) -> "Iterator[Libero]":
 
 @pytest.fixture(scope="module")
 def libero_with_assets(libero: "Libero", shared_data: Path) -> "Libero":
-    """The same with the assets of libero_spatial, and of no other suite."""
+    """Return the LIBERO of `libero` with the assets of libero_spatial, and of no other suite."""
     assets = shared_data / "libero" / "assets"
     if not assets.is_dir():
         pytest.skip(f"{assets} is absent")
@@ -156,7 +156,7 @@ def stock_cli(monkeypatch: pytest.MonkeyPatch) -> Callable[..., None]:
 
 @pytest.fixture(scope="module")
 def loaded_policies() -> Iterator[None]:
-    """Those of `explain_cases`; none is left: results name a policy only where a process holds no other."""
+    """Drop the policies of `explain_cases` at the end: results name a policy only if it is the only one."""
     import explain_cases  # loads LeRobot
 
     yield

@@ -115,9 +115,10 @@ def resolution(policy: PreTrainedPolicy) -> float:
 
 
 def tolerance(policy: PreTrainedPolicy) -> float:
-    """Of normalised actions in an episode: one that samples had not all of its noise while it learned.
+    """Return the tolerance of normalised actions in an episode: larger for a policy that samples.
 
-    A gripper that closes or opens a step early or late is off by about 2.
+    While it learned, such a policy had not all of its noise. A gripper that closes or opens a step early or
+    late is off by about 2.
     """
     samples = hasattr(policy.config, "num_inference_steps")
     return 3 * resolution(policy) if samples else resolution(policy)

@@ -91,7 +91,7 @@ OF_ZOEDEPTH = {
 
 
 def gaussians(seed: int) -> dict[str, dict[str, float]]:
-    """As a gs_*.json has them."""
+    """Draw Gaussians as a gs_*.json has them."""
     spread = torch.rand(6, 2, generator=torch.Generator().manual_seed(seed)).tolist()
     centers = {"theta": 1.8, "phi": 0.1, "r": 0.6}
     return {
@@ -222,7 +222,7 @@ def published_config(policy: SpatialvlaGridPolicy) -> dict[str, Any]:
 
 
 def _whole(config: Mapping[str, Any]) -> dict[str, Any]:
-    """As transformers 4.47 writes it."""
+    """Complete a config as transformers 4.47 writes it."""
     later = ("dtype", "transformers_version")
     values = {key: value for key, value in config.items() if key not in later}
     if "backbone_config" in values:

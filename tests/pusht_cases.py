@@ -20,7 +20,7 @@ ENDS = "meta/episode_ends"
 
 @dataclass(frozen=True)
 class Demonstrations:
-    """What the zarr holds, read with zarr alone."""
+    """Demonstrations that the zarr holds, read with zarr alone."""
 
     images: np.ndarray
     states: np.ndarray

@@ -123,7 +123,7 @@ def wait_for_end(pids: list[int]) -> None:
 
 
 def act(action: str, folder: Path) -> None:
-    """What happens at a moment."""
+    """Perform an action at its moment."""
     if action == "kill":
         os.kill(os.getpid(), signal.SIGKILL)
     elif action == "Ctrl-C":

@@ -142,7 +142,7 @@ def write_base(stock_type: str, folder: Path) -> None:
 
 
 def write_folders(folder: Path) -> None:
-    """What the flags name, and the pi0 family's tokenizer, relative to the working directory."""
+    """Write the folders that the flags name, relative to the working directory, and the pi0 tokenizer."""
     tokenizer = PreTrainedTokenizerFast(
         tokenizer_object=nano_tokenizer(),
         bos_token="<|im_start|>",

@@ -224,7 +224,7 @@ def test_success_ends_an_episode_and_nothing_moves_after_it() -> None:
 
 @pytest.fixture(autouse=True)
 def no_policy_of_other_tests(monkeypatch: pytest.MonkeyPatch) -> None:
-    """What other tests of this process hold, and drop at any time, is not what acts here."""
+    """Hide the policies that other tests of this process hold and drop at any time."""
     monkeypatch.setattr("lerobot_bomb.checkpoints.identity.built_policies", list)
 
 

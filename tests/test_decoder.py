@@ -220,7 +220,7 @@ def test_malformed_wishes_become_legal_numbers() -> None:
 
 
 class Broken(Speaker):
-    """What it wants to say, until one row's logits after a column are all ``bad``."""
+    """Speaker until a column, from which one row's logits are all ``bad``."""
 
     def __init__(self, bad: float, column: int, row: int, *texts: str):
         super().__init__(*texts)
@@ -244,7 +244,7 @@ BROKEN = [(bad, column) for bad in (float("nan"), float("inf"), -float("inf")) f
 @pytest.mark.parametrize(("bad", "column"), BROKEN)
 @pytest.mark.parametrize("drafted", [False, True])
 def test_nothing_is_read_from_logits_that_are_not_finite(bad: float, column: int, drafted: bool) -> None:
-    """Whether rows leave the batch when they are done or go on until all are."""
+    """Check rows that leave the batch when they are done, and rows that go on until all are."""
     grammar = NumberGrammar(512, 3)
     guess = LinearDraft(grammar, 1) if drafted else KnownSymbols(grammar)
     texts = " 1 2 3#", " 400 500 300#", " 9 311 77#"

@@ -28,7 +28,7 @@ Run = Callable[..., None]
 
 @pytest.fixture(scope="module")
 def rollouts() -> list[Rollout]:
-    """What the recordings hold, played directly."""
+    """Run the episodes that the recordings hold, directly."""
     spec = EpisodeSpec(seed=SEED)
     env = make_env(spec, OPTIONS)
     played = [

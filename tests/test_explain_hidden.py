@@ -34,7 +34,7 @@ def hidden_word(policy: LoadedPolicy, word: str) -> Tensor:
 
 
 def columns_of(question: Question, hidden_1S: Tensor) -> list[int]:
-    """Of the whole prompt."""
+    """Return the columns of hidden words in the whole prompt."""
     names = question.explained._names  # pyright: ignore[reportAttributeAccessIssue]
     first = int((question.rows["part"][0] == names.index("instruction")).nonzero()[0])
     return (first + hidden_1S[0].nonzero()[:, 0]).tolist()
@@ -146,7 +146,7 @@ def test_the_stock_model_agrees_where_nothing_is_hidden(name: str) -> None:
 
 
 def hidden_batch(policy: LoadedPolicy, word: str) -> dict[str, Any]:
-    """What a whole episode under the mask of a word has in place of this observation."""
+    """Return the batch that an episode under the mask of a word has in place of this observation."""
     observation, instruction, _, _ = moment()
     mask = without_words(policy, {instruction: span_of(word, instruction)}.get)
     prepared = policy.prepare(policy.observe([observation], [instruction]))

@@ -112,7 +112,7 @@ def test_pusht_has_two_coordinates_in_pixels(pusht_dataset: Path, capsys: pytest
 def test_errors_include_what_quantiles_clip(
     root: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    """Of a dimension that is far beyond them, clipping is nearly all of the error."""
+    """Check a dimension far beyond the quantiles, where clipping is nearly all of the error."""
     root = edited(root, tmp_path / "averaged", q01="q10", q99="q90")
     assert fit_grid(root, QUANTILES) == 0
     text = " ".join(capsys.readouterr().out.split())

@@ -154,7 +154,7 @@ def test_batches_do_not_matter_and_the_json_holds_it_all(
 
 
 def numbers(value: Any) -> list[float]:
-    """All numbers of nested dicts and lists."""
+    """Return all numbers of nested dicts and lists."""
     if isinstance(value, dict | list):
         return [x for of in (value.values() if isinstance(value, dict) else value) for x in numbers(of)]
     return [] if value is None else [value]

@@ -1,4 +1,4 @@
-"""What --policy.dtype and --policy.weights_dtype change in all policies, and what they do not."""
+"""Precision: what --policy.dtype and --policy.weights_dtype change in all policies, and what not."""
 
 from pathlib import Path
 from typing import Any

@@ -65,7 +65,7 @@ def flags(policy_type: str, dataset: Path, batch_size: int, output_dir: str) -> 
 
 
 def weights(policy_type: str, output_dir: Path) -> dict[str, torch.Tensor]:
-    """Of the last checkpoint, loaded; FSDP's file holds tied weights twice."""
+    """Load the weights of the last checkpoint; FSDP's file holds tied weights twice."""
     checkpoint = output_dir / "checkpoints" / "last" / "pretrained_model"
     return get_policy_class(policy_type).from_pretrained(checkpoint).state_dict()
 
@@ -157,7 +157,7 @@ def test_fsdp_shards_every_layer_by_itself(policy_type: str) -> None:
 def test_a_policy_that_is_sharded_in_place_saves_its_weights_whole_and_once(
     policy_type: str, tmp_path: Path
 ) -> None:
-    """As LeRobot 0.6.2 shards them; where a module's weights are another's, too, strict loading says so."""
+    """Check sharding as of LeRobot 0.6.2; strict loading finds a module's weights that are another's too."""
     policy = CASES[policy_type].make_policy()
     before = {name: tensor.clone() for name, tensor in policy.state_dict().items()}
     distributed.init_process_group("gloo", f"file://{tmp_path}/meeting", rank=0, world_size=1)

@@ -55,7 +55,7 @@ def base(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def adapted(base: Path, meta: LeRobotDatasetMetadata, **flags: object) -> SpatialvlaGridPolicy:
-    """As `lerobot-train --policy.path` has it before it puts adapters on."""
+    """Load a policy as `lerobot-train --policy.path` has it before it adds adapters."""
     overrides = [f"--{name}={value}" for name, value in flags.items()]
     config: Any = PreTrainedConfig.from_pretrained(base, cli_overrides=overrides)
     config.pretrained_path = base
@@ -98,7 +98,7 @@ def test_adapters_hold_the_cells_of_adapted_grids(
 
 
 def test_adapters_are_where_the_original_has_them(base: Path, meta: LeRobotDatasetMetadata) -> None:
-    """On every linear layer that its fine-tuning names, by their names there."""
+    """Check every linear layer that the original's fine-tuning names, by the names there."""
     theirs = (
         "q_proj k_proj v_proj o_proj gate_proj up_proj down_proj fc1 fc2 out_proj linear layers.0 layers.3"
     )

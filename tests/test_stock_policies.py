@@ -52,7 +52,7 @@ def train(run: Run, stock_type: str, dataset: Path, folder: Path) -> Path:
 
 
 def evaluate(run: Run, checkpoint: Path, folder: Path, *flags: str) -> list[Row]:
-    """Of one perturbed episode of 20 steps."""
+    """Run one perturbed episode of 20 steps."""
     env = "--env.type=bomb --env.image_size=64 --env.fps=2 --env.ignore_checkpoint=true"
     batch = "--eval.n_episodes=1 --eval.batch_size=1 --eval.use_async_envs=false --policy.device=cpu"
     results = folder / "results.jsonl"

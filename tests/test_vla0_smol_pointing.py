@@ -55,7 +55,7 @@ def towards(xy: Tensor) -> Tensor:
 
 
 def labelled(policy: Vla0SmolPolicy, numbers: NumberTokens) -> list[list[bool]]:
-    """Of each row, whether all digits of each number carry loss."""
+    """Return for each row and number whether all of its digits carry loss."""
     return numbers.trained[..., 1:].all(dim=2).tolist()
 
 

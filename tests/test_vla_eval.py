@@ -133,7 +133,7 @@ def test_a_wrong_flag_is_named(flags: dict[str, Any], message: str) -> None:
 
 
 def started(argv: list[str], monkeypatch: pytest.MonkeyPatch) -> tuple[CheckpointServer, str, int]:
-    """What `python -m lerobot_bomb.harness` would serve, and where."""
+    """Return what `python -m lerobot_bomb.harness` would serve, and where."""
     served: list[Any] = []
     monkeypatch.setattr(serve, "serve", lambda server, host, port: served.extend((server, host, port)))
     monkeypatch.setattr(sys, "argv", ["harness", *argv])

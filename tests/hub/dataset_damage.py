@@ -1,4 +1,4 @@
-"""What can be wrong with a recorded dataset's folder of two episodes, by what a refusal says of it."""
+"""Damage to a recorded dataset's folder of two episodes, by what a refusal says of it."""
 
 import json
 import math

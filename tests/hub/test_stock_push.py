@@ -26,7 +26,7 @@ Files = dict[str, bytes]
 
 @dataclass(frozen=True)
 class Training:
-    """What `lerobot-train` holds when it ends."""
+    """Training at its end: what `lerobot-train` holds then."""
 
     cfg: TrainPipelineConfig
     policy: Any
@@ -52,7 +52,7 @@ class Training:
         return cls(cfg, policy, processors)
 
     def push(self) -> None:
-        """As `lerobot_train` does."""
+        """Push as `lerobot_train` does."""
         publish: Any = getattr(train_utils, "publish_trained_model", None)  # LeRobot 0.6.2
         if publish is not None:
             publish(self.cfg, self.policy, *self.processors, None)

@@ -65,7 +65,7 @@ def check_config_file(folder: Path, config: PreTrainedConfig) -> None:
 
 
 def has_libero() -> bool:
-    """Whether LIBERO and its assets are there; says what is missing."""
+    """Return True if LIBERO and its assets are there; otherwise print what is missing."""
     try:
         prepare_libero([SUITES[0]])
     except ValueError as error:
