@@ -82,7 +82,7 @@ class Slope:
 
 
 def slope(levels_N: np.ndarray, values_N: np.ndarray, episode_N: np.ndarray) -> Slope | None:
-    """Least squares of N values over their levels; None where all levels are the same.
+    """Fit the slope of N values over their levels, by least squares; None where all levels are the same.
 
     `episode_N` says which values are of one episode under several conditions: the percentile bootstrap draws
     episodes.

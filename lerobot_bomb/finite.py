@@ -134,7 +134,7 @@ def _ends(key: str, values: Tensor) -> Tensor:
 
 
 def _refuse_infinite(key: str, values: Tensor, frames: Mapping[str, Tensor]) -> None:
-    """Unless it is but the sum of the values that is infinite."""
+    """Raise if a value is infinite, but not if only the sum of the values is."""
     bad = _bad(values)
     if not bool(bad.any()):
         return

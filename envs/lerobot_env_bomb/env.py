@@ -135,7 +135,7 @@ class BombEnv(EpisodeEnv[EpisodeSpec, _Run, EpisodeResult]):
         return self._observe(), float(run.judge.is_success), terminated, truncated, self._info()
 
     def _draw_for_people(self, run: _Run) -> np.ndarray:
-        """Both cameras, the instruction, how the episode stands."""
+        """Draw both cameras, the instruction, and how the episode stands."""
         images = [self._draw(camera, PERSON_IMAGE_SIZE) for camera in CAMERAS]
         episode = run.episode
         error_mm = run.judge.placement_error_mm
@@ -212,7 +212,7 @@ class BombEnv(EpisodeEnv[EpisodeSpec, _Run, EpisodeResult]):
         }
 
     def alternatives(self) -> dict[str, tuple[str, Cell]]:
-        """Other instructions for this episode, as `lerobot_env_bomb.alternatives` gives them."""
+        """Return other instructions for this episode, as `lerobot_env_bomb.alternatives` gives them."""
         return alternatives(self._run.episode)
 
     def _check(self, action: np.ndarray) -> np.ndarray:

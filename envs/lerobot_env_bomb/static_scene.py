@@ -29,7 +29,7 @@ class StaticScene:
 
     @property
     def opening_m(self) -> float:
-        """Between pads that hold a stone."""
+        """Distance in metres between pads that hold a stone."""
         return 2 * self.layout.stone_radius_m - SQUEEZE_M
 
 
@@ -39,7 +39,7 @@ def start_of(episode: Episode) -> StaticScene:
 
 
 def draw_static(episode: Episode, rng: np.random.Generator) -> StaticScene:
-    """Some of the expert's moves made, the gripper anywhere, the next stone in its fingers or not."""
+    """Draw a scene: some of the expert's moves made, the gripper anywhere, the next stone held or not."""
     num_made = int(rng.integers(len(episode.aims)))
     made, aim = episode.aims[:num_made], episode.aims[num_made]
     stone_xy = episode.layout.stone_xy.copy()

@@ -115,7 +115,7 @@ class BombLiberoEnv(EpisodeEnv[LiberoSpec, _Run, LiberoResult]):
 
     @property
     def _failure(self) -> LiberoFailure | None:
-        """Why the episode failed, were it to end now."""
+        """Reason why the episode failed, were it to end now."""
         return None if self._is_success else failure_of(self._run.touched, self._scene.wanted)
 
     def _sensed(self, observation: Observation) -> Observation:

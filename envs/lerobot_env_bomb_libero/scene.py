@@ -44,7 +44,10 @@ class LiberoTransform(EpisodeTransform):
 
 
 class LiberoScene(LiberoEnv):
-    """Without transforms its episodes are LeRobot's, bit for bit; what nobody sees is not drawn."""
+    """LIBERO's environment with transforms; without any, its episodes are LeRobot's, bit for bit.
+
+    Images that nobody sees are not drawn.
+    """
 
     def __init__(self, kinds: Sequence[type[LiberoTransform]], **kwargs: Any):
         super().__init__(**kwargs)

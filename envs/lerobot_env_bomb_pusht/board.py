@@ -28,7 +28,10 @@ class PushTTransform(EpisodeTransform):
 
 
 class Board(PushTEnv):
-    """Without transforms it is gym-pusht, bit for bit: what is overridden only adds to it, or is faster."""
+    """PushT's environment with transforms; without any, it is gym-pusht, bit for bit.
+
+    Overridden methods only add to it, or are faster.
+    """
 
     def __init__(self, image_size: int):
         super().__init__(

@@ -124,7 +124,7 @@ class BombPushTEnv(EpisodeEnv[PushTSpec, _Run, PushTResult]):
 
     @property
     def _failure(self) -> PushTFailure | None:
-        """Why the episode failed, were it to end now."""
+        """Reason why the episode failed, were it to end now."""
         board = self._board
         if self._coverage > board.success_threshold:
             return None

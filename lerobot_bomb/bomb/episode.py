@@ -35,7 +35,7 @@ class Stage(StrEnum):
 
 
 class Failure(StrEnum):
-    """Why an episode failed; exactly one per failed episode."""
+    """Reason why an episode failed; exactly one per failed episode."""
 
     NEVER_REACHED = "never_reached"
     MISSED_GRASP = "missed_grasp"

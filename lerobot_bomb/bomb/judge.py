@@ -131,7 +131,7 @@ class Judge:
         }
 
     def _places(self) -> set[Place]:
-        """To which the followed stone may come."""
+        """Return the places to which the followed stone may come."""
         return {
             place
             for plan, made in self._plans

@@ -35,7 +35,7 @@ class Aim:
 
 
 def aim_at(stone: int, cell: Cell, is_slid: bool = False) -> Aim:
-    """To bring a stone to an intersection."""
+    """Return the aim of bringing a stone to an intersection."""
     x, y = BOARD.intersection_xy(*cell)
     return Aim(stone, (float(x), float(y)), is_slid)
 

@@ -97,7 +97,7 @@ def _choice(name: str, choices: tuple[str, ...]) -> _Part:
 
 
 def _encode_goals(state: PrivilegedState) -> list[float]:
-    """Four numbers each: the place, and the stone's index, to which NUM_STONES is added if it is slid."""
+    """Encode each goal as four numbers: its place, and the stone's index, plus NUM_STONES if it is slid."""
     return [number for goal in state.goals for number in (*goal.xyz, goal.stone + NUM_STONES * goal.is_slid)]
 
 

@@ -88,7 +88,7 @@ def tensor_shapes(path: Path) -> Shapes:
 
 
 def check_finite(path: Path) -> None:
-    """No tensor of a safetensors file holds NaN or infinite values; one at a time is in memory.
+    """Raise if a tensor of a safetensors file holds NaN or infinite values; one at a time is in memory.
 
     Raises:
         ValueError: names the file, the first such tensor, how many of its values are and where; or the file

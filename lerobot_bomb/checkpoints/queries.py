@@ -74,7 +74,7 @@ class _Clock:
         return action
 
     def _wait(self) -> None:
-        """Until the device has done what it was given."""
+        """Wait until the device has done what it was given."""
         if self._device.type != "cpu":
             torch.accelerator.synchronize(self._device)
 

@@ -198,7 +198,7 @@ def pusht_tiles(condition: str, seed: int, image_size: int, changes: set[str]) -
 
 
 def libero_tiles(condition: str, seed: int, image_size: int, changes: set[str]) -> dict[str, np.ndarray]:
-    """Both cameras upright; what dynamics do is seen after the same actions."""
+    """Return tiles of both cameras, upright; dynamics show after the same actions."""
     env = make_libero_env(LiberoSpec(seed, LIBERO_TASK, perturbations=condition), image_size)
     observation, _ = env.reset(seed=seed)
     tiles = {}
@@ -218,7 +218,7 @@ TILES_OF: dict[str, TilesOf] = {"bomb_pusht": pusht_tiles, "bomb_libero": libero
 
 
 def look_at(condition: str, seeds: Sequence[int], options: RenderOptions, played: bool) -> list[Look]:
-    """Each seed's episode under a condition; `played` by the expert to its end, or only begun."""
+    """Show each seed's episode under a condition; `played` by the expert to its end, or only begun."""
     env = make_env(EpisodeSpec(seeds[0], perturbations=condition), options)
     looks = []
     for seed in seeds:

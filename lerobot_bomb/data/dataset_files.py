@@ -26,9 +26,9 @@ type Info = dict[str, Any]
 
 
 def check_dataset(root: Path) -> None:
-    """Every file is there, whole and finite, and all of them hold the episodes and frames of info.json.
+    """Check that every file is there, whole and finite, and holds the episodes and frames of info.json.
 
-    Of each video the first and the last frame are decoded, and its frames counted.
+    The first and the last frame of each video are decoded, and its frames counted.
 
     Raises:
         ValueError: names the file and what is wrong with it.
@@ -241,7 +241,7 @@ def _check_statistics(root: Path, info: Info) -> None:
 
 
 def _check_data(root: Path, info: Info, episodes: pa.Table) -> None:
-    """Each data file holds the frames of its episodes, in order, with finite numbers."""
+    """Check that each data file holds the frames of its episodes, in order, with finite numbers."""
     columns = [
         name
         for name, feature in info["features"].items()

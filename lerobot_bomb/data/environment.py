@@ -73,7 +73,7 @@ class Environment:
 
     @property
     def suites(self) -> frozenset[str] | None:
-        """Every suite that it shows; None: not known."""
+        """Suites that it shows; None: not known."""
         if self.task is None:
             return None
         return frozenset(SUITES if self.task == ALL else self.task.split("+"))
@@ -128,7 +128,7 @@ class Environment:
         )
 
     def text(self, names: Iterable[str]) -> str:
-        """These fields: "control_mode=absolute, fps=20"."""
+        """Write these fields: "control_mode=absolute, fps=20"."""
         values = {name: getattr(self, name) for name in names}
         if "cameras" in values:
             values["cameras"] = "+".join(self.cameras)

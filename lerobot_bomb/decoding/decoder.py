@@ -41,7 +41,7 @@ class Continuation(Protocol):
         ...
 
     def keep(self, row_B: Tensor) -> None:
-        """Only these rows are gone on with, in this order."""
+        """Go on with these rows only, in this order."""
         ...
 
 

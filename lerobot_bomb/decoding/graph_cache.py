@@ -11,9 +11,9 @@ from lerobot_bomb.decoding.kv_cache import CachedText, Positions, same_positions
 
 
 class GraphCache[T]:
-    """Something for each size of batch and prompt, on a copy of a text model's weights.
+    """Cache of what is made for each size of batch and prompt, on a copy of a text model's weights.
 
-    There is one copy for a device and a type that is computed in. Copied or pickled, it has none.
+    There is one copy for each device and type that is computed in. A copied or pickled cache is empty.
     """
 
     def __init__(self, text_model: Any, positions: Positions = same_positions, *, compiled: bool = False):

@@ -119,7 +119,7 @@ class CachedText:
         self._hidden_BC.scatter_(1, columns_BK, hidden_BK & (columns_BK != self.unread_column))
 
     def keep(self, row_B: Tensor) -> None:
-        """Only these rows are gone on with, in this order."""
+        """Go on with these rows only, in this order."""
         self._take(self._cache[:, row_B])
         self._hidden_BC = self._hidden_BC[row_B]
         self._first_slot = self._first_slot[: len(row_B)]

@@ -97,7 +97,7 @@ class RopePairs:
 
     @staticmethod
     def can(attention: Any) -> bool:
-        """Its projections are plain, in float32 or less on a CPU."""
+        """Return True if the projections are plain, in float32 or less on a CPU."""
         parts = _projections(attention)
         return all(
             is_plain(part) and part.weight.dtype.itemsize <= 4 and part.weight.device.type == "cpu"

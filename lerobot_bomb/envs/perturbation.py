@@ -22,7 +22,7 @@ class EpisodeTransform(ABC):
     @classmethod
     @abstractmethod
     def draw(cls, level: int, rng: np.random.Generator, nominal: Any) -> Self:
-        """At a level of 1..5; `nominal` is the episode without perturbations."""
+        """Draw the effect of a level of 1..5; `nominal` is the episode without perturbations."""
 
     def reword(self, instruction: str, nominal: Any) -> str:
         """The instruction after the change; it means the same."""

@@ -93,7 +93,7 @@ def play(
 def one_of_batch(
     agent: BatchAgent, make_env: Callable[[], gymnasium.Env], seed: int, row: int, size: int
 ) -> Iterator[Agent]:
-    """Who acts in the episode of a seed, and at once in the others of its batch, whose seeds stand around it.
+    """Yield the agent of one seed, which acts at once in the other episodes of its batch, of nearby seeds.
 
     lerobot-eval plays consecutive seeds as a batch, in which a policy's arithmetic rounds otherwise than
     alone. The other episodes are played here, unseen.

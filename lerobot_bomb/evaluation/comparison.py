@@ -1,4 +1,4 @@
-"""Two policies on the same episodes: which is better, by how much, and is it certain?"""
+"""Comparison of two policies on the same episodes: which is better, by how much, and is it certain?"""
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
@@ -73,7 +73,7 @@ def _lines(of: PairedComparison) -> list[str]:
 
 
 def of_policies(rows: list[Row], names: Sequence[str]) -> list[list[Row]]:
-    """Apart by policy, those of each name; no name: of all, in the order of their first lines.
+    """Split records by policy: those of each name, or of all without a name, in order of first appearance.
 
     A policy answers to its type, its path, `bomb:NAME`, or any part of what `results` says of it.
 

@@ -75,7 +75,7 @@ def load_policy(config: PreTrainedConfig) -> PreTrainedPolicy:
 def load_dataset(
     config: PreTrainedConfig, meta: LeRobotDatasetMetadata, episodes: list[int]
 ) -> LeRobotDataset:
-    """Some episodes, each frame with the actions that follow it, as lerobot-train reads them."""
+    """Load some episodes, each frame with the actions that follow it, as lerobot-train reads them."""
     return LeRobotDataset(
         meta.repo_id,
         root=meta.root,

@@ -163,7 +163,7 @@ def _fixed(row: Row) -> dict[str, Any]:
 
 
 def _policy_key(row: Row) -> str:
-    """Equal for the same weights with the same settings, wherever they lie."""
+    """Return a key that is equal for the same weights with the same settings, wherever they lie."""
     policy: dict[str, Any] | None = row.get("policy")
     if policy is None:
         return NOT_RECORDED

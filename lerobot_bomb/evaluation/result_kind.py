@@ -91,7 +91,7 @@ class ResultKind:
         check_inference(row)
 
     def start_of(self, row: Row) -> tuple[Any, ...]:
-        """Equal for rows that are not independent."""
+        """Return a key that is equal for rows that are not independent."""
         return tuple(row["spec"][name] for name in self.start)
 
     def missing_fields(self, version: str) -> list[str]:

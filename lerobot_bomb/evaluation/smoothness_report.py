@@ -88,7 +88,7 @@ def check_comparable(compared: list[Executed], per_second: bool) -> None:
 
 
 def measure_row(executed: Executed, units: Units) -> SmoothnessRow:
-    """Every difference within an episode counts the same.
+    """Measure the smoothness of a row; every difference within an episode counts the same.
 
     Raises:
         ValueError: no episode has the actions that a third difference takes.

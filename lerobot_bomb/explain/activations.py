@@ -127,15 +127,15 @@ def _on_first(change: Change, output: Any) -> Any:
 
 
 def all_layers(num_layers: int, place: Place | None = None) -> list[Unit]:
-    """Every layer's output, at a place."""
+    """Return every layer's output, at a place."""
     return [Unit(layer, LAYER, place=place) for layer in range(num_layers)]
 
 
 def all_heads(layers: Sequence[DecoderLayer]) -> list[Unit]:
-    """Every attention head, layer by layer."""
+    """Return every attention head, layer by layer."""
     return [Unit(i, HEADS, head) for i, layer in enumerate(layers) for head in range(layer.num_heads)]
 
 
 def all_mlps(num_layers: int) -> list[Unit]:
-    """Every MLP."""
+    """Return every MLP."""
     return [Unit(layer, MLP) for layer in range(num_layers)]

@@ -13,7 +13,7 @@ from lerobot_bomb.bootstrap import bootstrap_interval
 
 @dataclass(frozen=True)
 class Mean:
-    """Over episodes, with its bootstrap interval; one episode alone has none."""
+    """Mean over episodes, with its bootstrap interval; one episode alone has none."""
 
     value: float
     interval: tuple[float, float] | None

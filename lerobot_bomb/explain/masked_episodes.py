@@ -1,4 +1,4 @@
-"""Whole episodes in which something is hidden from the policy in every step."""
+"""Episodes in which something is hidden from the policy in every step."""
 
 from collections.abc import Callable, Mapping
 from contextlib import closing
@@ -83,7 +83,7 @@ def without_words(loaded: LoadedPolicy, words: Callable[[str], Span | None]) -> 
 
 
 def masks_of(watched: Watched, loaded: LoadedPolicy, fill: str) -> dict[str, Mask]:
-    """Nothing, each kind of object, the words for row, column and colour, the whole instruction."""
+    """Return the masks: nothing, kinds of objects, words for row, column and colour, all words."""
     masks = {"nothing": Mask()}
     masks |= {
         f"object: {name}": without_object(name, fill) for name in next(iter(watched.objects.values()), {})

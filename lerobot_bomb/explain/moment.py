@@ -1,4 +1,4 @@
-"""Everything that is asked of a policy about one moment of an episode.
+"""Explanation of one moment of an episode: everything that is asked of a policy about it.
 
 Shapes: `G` cells along a side of the grid over an image, `L` layers.
 """

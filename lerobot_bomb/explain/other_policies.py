@@ -82,7 +82,7 @@ class ExplainedByLoss(_ExplainedByBatch):
 
 
 class ExplainedByDistance(_ExplainedByBatch):
-    """Any policy: minus the mean distance of the actions that it executes from the clean ones, (1, T, D).
+    """Explanation of any policy: minus the mean distance of executed actions (1, T, D) from the clean ones.
 
     Rows are asked one by one, each from a fresh start and with the same random numbers.
     """

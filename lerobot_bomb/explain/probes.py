@@ -75,7 +75,7 @@ class LayerProbe:
 def probe_layers(
     states: Mapping[str, np.ndarray], classes: Mapping[str, np.ndarray], values: Mapping[str, np.ndarray]
 ) -> list[LayerProbe]:
-    """Every label by the states of every layer.
+    """Probe every label by the states of every layer.
 
     Args:
         states: {place: (N, layers, F)}.

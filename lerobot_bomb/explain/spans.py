@@ -35,7 +35,7 @@ class Span:
 
 
 def span_of(words: str, instruction: str) -> Span:
-    """Everywhere that the words stand; neither part of another word nor of another number.
+    """Return where the words stand, all of them; neither part of another word nor of another number.
 
     Raises:
         ValueError: they are not in the instruction.

@@ -39,7 +39,7 @@ class Watched:
 
 
 def watch(viewed: Viewed, loaded: LoadedPolicy) -> tuple[list[Watched], Any]:
-    """Every moment in which the policy acts, and the line of the episode's results."""
+    """Return every moment in which the policy acts, and the result of the episode."""
     loaded.begin()
     with closing(viewed.make_env()) as env:
 

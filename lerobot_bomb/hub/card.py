@@ -74,7 +74,7 @@ class Checkpoint:
 
     @property
     def backbone(self) -> str | None:
-        """Its Hub id; None: it has none, or not one that is known."""
+        """Hub id of its backbone; None: it has none, or not one that is known."""
         name = getattr(self.config, "vlm_model_name", None)
         return name if name and is_hub_id(name) else None
 

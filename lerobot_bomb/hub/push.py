@@ -46,7 +46,7 @@ def publish(checkpoint: "Checkpoint", files: Mapping[str, Path], private: bool |
 
 
 def _is_of_checkpoint(path: str) -> bool:
-    """Not in a folder: there LeRobot keeps what `--save_checkpoint_to_hub` pushed."""
+    """Return True for a file of the checkpoint itself: LeRobot keeps earlier pushes in folders."""
     return "/" not in path and path.endswith((".json", ".safetensors"))
 
 
@@ -98,7 +98,7 @@ def read_checkpoint(
 
 
 def _check_processors(folder: Path, config: "PreTrainedConfig") -> None:
-    """They load, from the folder alone."""
+    """Check that the processors load, from the folder alone."""
     from lerobot_bomb.checkpoints.folder import load_processors
 
     of_folder = copy(config)

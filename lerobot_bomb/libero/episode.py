@@ -19,7 +19,7 @@ MOTION_DIMS = 6  # change of x, y, z and of orientation; the last is the gripper
 
 
 class LiberoFailure(StrEnum):
-    """Why an episode failed; exactly one per failed episode, the first that holds."""
+    """Reason why an episode failed; exactly one per failed episode, the first that holds."""
 
     NEVER_TOUCHED = "never_touched"  # the gripper met no object
     WRONG_OBJECT = "wrong_object"  # it met objects, none of those that the task is about

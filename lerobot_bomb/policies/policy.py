@@ -39,7 +39,7 @@ from lerobot_bomb.vlm.tokenizer import load_tokenizer
 
 
 def _is_chunk_policy(policy: nn.Module) -> bool:
-    """Also one that adapters are wrapped around."""
+    """Return True for a policy of chunks, and for one that adapters are wrapped around."""
     return any(isinstance(module, ChunkPolicy) for module in policy.modules())
 
 

@@ -225,7 +225,7 @@ def _ratio(value: float) -> Cell:
 
 
 def traces_section(episodes: Mapping[str, MaskedEpisode]) -> Section:
-    """Whole episodes under masks; the first is the one without."""
+    """Write the section of whole episodes under masks; the first is the one without."""
     rows = []
     for name, episode in episodes.items():
         result = episode.result

@@ -14,7 +14,7 @@ WORKERS = 2 * MAX_OPEN
 
 
 class OpenStreams(grpc.ServerInterceptor):
-    """Every request is received within a time, and those received at once are so many at most."""
+    """Limits on requests: the time to receive one, and the number received at once."""
 
     def __init__(self, max_open: int = MAX_OPEN, timeout_s: float = RECEIVE_TIMEOUT_S):
         self.max_open, self.timeout_s = max_open, timeout_s

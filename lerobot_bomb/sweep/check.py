@@ -49,5 +49,5 @@ def renamed(message: str) -> str:
 
 
 def _without_condition(cell: Cell) -> tuple[str, ...]:
-    """Its flags but for perturbations, which were read when the sweep was planned and bind no policy."""
+    """Return the cell's flags without perturbations: those are checked in the plan and bind no policy."""
     return (*cell.policy, *(flag for flag in cell.env if not flag.startswith("--env.perturbations=")))

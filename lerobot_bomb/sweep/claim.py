@@ -1,4 +1,4 @@
-"""Whose a sweep's folder is: one manifest's at a time, which may grow."""
+"""Claim on a sweep's folder, which belongs to one manifest at a time; that may grow."""
 
 import sys
 from collections.abc import Iterator

@@ -20,7 +20,7 @@ MAX_ENDED = 3
 
 
 def progress(store: Store, cells: Sequence[Cell]) -> Iterator[bool]:
-    """Until all cells are over, show how far they are, and say whether they are further than before.
+    """Show how far the cells are until all are over, and yield whether they are further than before.
 
     The lines of cells that have been finished are merged, whatever ends this process later.
     """

@@ -80,7 +80,7 @@ class Manifest:
         return sum(cell.num_episodes for cell in self.cells)
 
     def part(self, text: str) -> list[Cell]:
-        """Every so many cells: '0/4' are the first, the fifth, ...
+        """Return every so many cells: '0/4' are the first, the fifth, ...
 
         Raises:
             ValueError: the text is no such part, or there are too few cells for it to have one.
@@ -169,7 +169,7 @@ def plan(
     batch_size: int,
     flags: Sequence[str],
 ) -> Manifest:
-    """Every policy on every task under every condition; what is named twice is played once.
+    """Plan every policy on every task under every condition; what is named twice is run once.
 
     Args:
         policies: checkpoints, or policy types.

@@ -131,7 +131,7 @@ class Store:
         return _read(self.file(cell, "attempts")).split().count(self.run.encode())
 
     def give_up(self, cell: Cell, reason: str) -> None:
-        """No worker plays it any more."""
+        """Give a cell up: no worker runs it any more."""
         with written_whole(self.file(cell, "given_up")) as (path,):
             path.write_text(reason)
 
@@ -223,7 +223,7 @@ class Store:
 
 
 def _read(path: Path) -> bytes:
-    """Nothing where there is no file: another process may remove it at any moment."""
+    """Read a file; empty where there is none: another process may remove it at any moment."""
     try:
         return path.read_bytes()
     except FileNotFoundError:

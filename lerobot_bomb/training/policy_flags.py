@@ -117,7 +117,7 @@ def check_not_negative(config: Any, flags: Iterable[str]) -> None:
 
 
 def check_positive(config: Any, flags: Iterable[str]) -> None:
-    """Whole numbers of at least 1."""
+    """Raise unless the flags are whole numbers of at least 1."""
     for flag in flags:
         if getattr(config, flag) < 1:
             raise ValueError(f"--policy.{flag}={getattr(config, flag)} must be at least 1")

@@ -104,7 +104,7 @@ def checkpoint_agent(
     seed: int,
     policy_flags: Sequence[str] = (),
 ) -> BatchAgent:
-    """Who acts as the checkpoint in a folder, as `load_policy` takes it."""
+    """Return the agent of the checkpoint in a folder, as `load_policy` takes it."""
     return load_policy(path, device, env_type, env_flags, seed, policy_flags).agent
 
 

@@ -102,7 +102,7 @@ def pusht_episode(spec: PushTSpec, image_size: int) -> Viewed:
 
 @dataclass(frozen=True)
 class Player:
-    """Who plays which episode."""
+    """Player of an episode: the episode, and the agent that acts."""
 
     viewed: Viewed
     make_agent: Callable[[gymnasium.Env], AbstractContextManager[Agent]]
@@ -142,7 +142,7 @@ def write_episodes(players: Mapping[str, Player], name: str, rrd: Path, mp4: Pat
 
 
 def paths_of(output: Path | None, folder: Path, name: str) -> list[Path]:
-    """Both files of a user's `output`: their path without .rrd and .mp4, or a folder; None: in `folder`."""
+    """Return both files of a user's `output`: its path without .rrd and .mp4, or a folder; None: `folder`."""
     stem = output or folder / name
     if stem.is_dir():
         stem = stem / name

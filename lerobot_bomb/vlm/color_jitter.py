@@ -34,7 +34,7 @@ class ColorJitter:
     hue: float
 
     def __call__(self, cameras: Sequence[Tensor], generator: torch.Generator) -> list[Tensor]:
-        """Each camera's (B, 3, H, W) in [0, 1] -> as many; a sample's change is the same in all cameras."""
+        """Change each camera's (B, 3, H, W) in [0, 1]; a sample's change is the same in all cameras."""
         changes = [self._draw(generator) for _ in range(len(cameras[0]))]
         with torch.autocast(cameras[0].device.type, enabled=False):
             return [

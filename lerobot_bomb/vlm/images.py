@@ -80,7 +80,7 @@ def _resized_levels(images_B3HW: Tensor, size: int) -> Tensor:
 
 
 def _round_levels(levels: Tensor) -> Tensor:
-    """To whole numbers in 0..255, upwards from the middle between two; in place."""
+    """Round to whole numbers in 0..255, upwards from the middle between two; in place."""
     return levels.add_(0.5).floor_().clamp_(0, 255)
 
 

@@ -202,7 +202,7 @@ def _check_numbers(
 
 
 def normalize_task(task: str) -> str:
-    """Lower case, underscores and line breaks as spaces, no outer spaces."""
+    """Write a task in lower case, with spaces for underscores and line breaks, and without outer spaces."""
     return re.sub(r"[_\r\n]", " ", task.lower()).strip()
 
 

@@ -99,7 +99,7 @@ class FdvlaPolicy(RelativeVlaPolicy):
         return {**counts, "trained": sum(p.numel() for p in self.get_optim_params())}
 
     def explained(self) -> ExplainedFdvla:
-        """This policy as `lerobot_bomb.explain` asks it."""
+        """Return the policy as `lerobot_bomb.explain` asks it."""
         return ExplainedFdvla(self)
 
     def _get_default_peft_targets(self) -> dict[str, Any]:
@@ -389,13 +389,13 @@ class FdvlaPolicy(RelativeVlaPolicy):
     # Prompt: start, images, task (with padding), a place for the state, end
 
     def _prompt(self, batch: dict[str, Tensor]) -> tuple[TokenRows, Tensor]:
-        """Its tokens, and which of them (B, L) are the task's, without hidden ones."""
+        """Return the prompt's tokens, and which of them (B, L) are the task's, without hidden ones."""
         parts = self._prompt_parts(batch)
         is_task = [part.readable & (name == "instruction") for name, part in parts.items()]
         return TokenRows.join([*parts.values()]), torch.cat(is_task, dim=1)
 
     def _prompt_parts(self, batch: dict[str, Tensor]) -> dict[str, TokenRows]:
-        """Its tokens by what they are of; an image's by its camera."""
+        """Return the prompt's tokens by what they are of; an image's by its camera."""
         task = read_task(batch, self.config.type, self._device)
         parts = {"start": TokenRows.constant(self.tokens.start, task.ids)}
         parts |= {camera: TokenRows.constant(self._image_ids, task.ids) for camera in self._cameras}

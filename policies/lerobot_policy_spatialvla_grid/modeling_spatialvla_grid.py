@@ -145,7 +145,7 @@ class SpatialvlaGridPolicy(TokenVlaPolicy):
 
     @torch.no_grad()
     def _init_cells(self) -> None:
-        """Around the mean of the words' embeddings, as a tokenizer's new tokens are."""
+        """Draw the cells' rows around the mean of the words' embeddings, as a tokenizer's new tokens are."""
         words = self.backbone.vlm.get_input_embeddings().weight
         assert isinstance(words, Tensor)
         for table in (self.cell_embedding.weight, self.cell_head.weight):
@@ -177,7 +177,7 @@ class SpatialvlaGridPolicy(TokenVlaPolicy):
         self.config.grid_params = new.to_dict()
 
     def explained(self) -> ExplainedSpatialvlaGrid:
-        """This policy as `lerobot_bomb.explain` asks it."""
+        """Return the policy as `lerobot_bomb.explain` asks it."""
         return ExplainedSpatialvlaGrid(self)
 
     def _newest_only(self) -> list[int]:
@@ -317,7 +317,7 @@ class SpatialvlaGridPolicy(TokenVlaPolicy):
     def _cell_parts(
         self, chosen_BTG: Tensor, cells_BTG: Tensor, kept_BTG: Tensor
     ) -> dict[str, tuple[Tensor, Tensor]]:
-        """Right cells, absolute errors of what cells decode to in the data's units, as `means` takes them.
+        """Return which cells are right and absolute errors in the data's units, as `means` takes them.
 
         Teacher-forced: every cell is predicted from the true ones before it. Padded actions do not count.
         Errors are known where a dataset was given, that is while training.
@@ -396,7 +396,7 @@ class SpatialvlaGridPolicy(TokenVlaPolicy):
     # Prompt
 
     def _prompt(self, batch: dict[str, Tensor]) -> TokenRows:
-        """Everything before the answer, with padding; its last column has none."""
+        """Return everything before the answer, with padding; its last column has none."""
         return TokenRows.join([*self._prompt_parts(batch).values()])
 
     def _prompt_parts(self, batch: dict[str, Tensor]) -> dict[str, TokenRows]:

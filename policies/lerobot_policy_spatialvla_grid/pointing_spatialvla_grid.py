@@ -75,7 +75,7 @@ class Target:
         return cls(tokens_BN, tokens_BN.bool())
 
     def parts(self, chosen_BN: Tensor) -> dict[str, tuple[Tensor, Tensor]]:
-        """Right tokens, as `means` takes them."""
+        """Return which tokens are right, as `means` takes them."""
         right = zip(NAMES, (chosen_BN == self.tokens).T, self.kept.T, strict=False)
         return {f"{name}_accuracy": (right_B, kept_B) for name, right_B, kept_B in right}
 

@@ -107,7 +107,7 @@ class Vla0SmolPolicy(RelativeVlaPolicy, TokenVlaPolicy):
         return self._num_pointing + num_steps * self._action_dim
 
     def explained(self) -> ExplainedVla0Smol:
-        """This policy as `lerobot_bomb.explain` asks it."""
+        """Return the policy as `lerobot_bomb.explain` asks it."""
         return ExplainedVla0Smol(self)
 
     def _get_default_peft_targets(self) -> dict[str, Any]:
@@ -285,7 +285,7 @@ class Vla0SmolPolicy(RelativeVlaPolicy, TokenVlaPolicy):
     # Prompt
 
     def _prompt(self, batch: dict[str, Tensor]) -> TokenRows:
-        """Everything up to ``Assistant:``, with padding."""
+        """Return everything up to ``Assistant:``, with padding."""
         return TokenRows.join([*self._prompt_parts(batch).values()])
 
     def _prompt_parts(self, batch: dict[str, Tensor]) -> dict[str, TokenRows]:

@@ -72,7 +72,7 @@ class RemoveAt(Task):
 
 @dataclass(frozen=True)
 class Swap(Task):
-    """Two stones change places, one of them by way of the tray or of a free intersection."""
+    """Task: let two stones change places, one of them by way of the tray or of a free intersection."""
 
     def draw(self, rng: np.random.Generator) -> Drawn:
         stones = _draw_board(rng)

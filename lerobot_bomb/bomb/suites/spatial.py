@@ -65,7 +65,7 @@ class Task(ABC):
 
     @abstractmethod
     def referents(self, target: Cell) -> list[list[Cell]]:
-        """Each way for stones to stand so that `target` is meant; none where it cannot be."""
+        """Return each way for stones to stand so that `target` is meant; none where it cannot be."""
 
     @property
     def targets(self) -> tuple[Cell, ...]:
@@ -95,7 +95,7 @@ class Beside(Task):
 
 @dataclass(frozen=True)
 class Between(Task):
-    """Halfway between the only two stones of the anchor's colour, in their row or column."""
+    """Task: the place halfway between the only two stones of the anchor's colour, in their row or column."""
 
     place: str
 
@@ -232,7 +232,7 @@ def _means(task: Task, anchor: str, target: Cell, stones: Stones) -> bool:
 def _sample_opening(
     rng: np.random.Generator, task: Task, target: Cell, color: str, anchor: str, extra_colors: tuple[str, ...]
 ) -> dict[Cell, str]:
-    """Up to 8 stones with which the move is legal and the only one that is meant."""
+    """Draw up to 8 stones with which the move is legal and the only one that is meant."""
     while True:
         ways = task.referents(target)
         cells = ways[rng.integers(len(ways))]

@@ -1,4 +1,4 @@
-"""Why episodes failed."""
+"""Section `failures`: why episodes failed."""
 
 from collections import Counter
 

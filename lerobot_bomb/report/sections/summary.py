@@ -54,7 +54,7 @@ def _perturbed(arm: Arm) -> list[Row]:
 
 
 def _peers(arm: Arm, arms: list[Arm]) -> list[Arm]:
-    """Other arms that differ from this one in the policy only."""
+    """Return the other arms that differ from this one in the policy only."""
     return [other for other in arms if other is not arm and can_compare(arm.group, other.group)]
 
 
