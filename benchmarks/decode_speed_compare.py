@@ -27,7 +27,7 @@ class Timed:
 def compare(
     runs: dict[str, tuple[Callable[[Any], Timed], Sequence[Any]]], *, must_agree: bool = True
 ) -> dict[str, dict[str, float]]:
-    """Every way on every work, in turn, writing the same if they must. Gains are over the first."""
+    """Time every way on every work, in turn, writing the same if they must. Gains are over the first."""
     timed: dict[str, list[Timed]] = {name: [] for name in runs}
     for run, works in runs.values():
         run(works[0])

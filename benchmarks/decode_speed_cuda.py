@@ -70,7 +70,7 @@ def main() -> None:
 
 
 def time_decoding_all(repeats: int, bars: dict[str, bool]) -> dict[str, Any]:
-    """Both precisions, both sizes of batch."""
+    """Time decoding in both precisions and both sizes of batch."""
     figures = {}
     backbone = build_backbone(config_500m()).cuda().eval()
     with torch.inference_mode():
@@ -97,7 +97,7 @@ def time_decoding(
     bars: dict[str, bool],
     name: str,
 ) -> dict[str, dict[str, float]]:
-    """Whole chunks by the peer and by us, without and with drafts."""
+    """Time whole chunks by the peer and by us, without and with drafts."""
     grammar = NumberGrammar(512, NUM_STEPS * NUM_DIMS).cuda()
     written = torch.ones(batch_size, PROMPT_LENGTH, dtype=torch.bool, device="cuda")
     prompts = [
@@ -178,7 +178,7 @@ class Ours:
 
 @contextmanager
 def ends_of_passes() -> Iterator[list[torch.cuda.Event]]:
-    """When the device was done with each captured pass."""
+    """Collect the event at which the device was done with each captured pass."""
     ends: list[torch.cuda.Event] = []
     replay: Callable[..., Any] = GraphedFunction.__call__
 

@@ -1,4 +1,4 @@
-r"""Who pushes the T best? Our policies and LeRobot's `act` and `diffusion`, trained for equal minutes.
+r"""Comparison on PushT: our policies and LeRobot's `act` and `diffusion`, trained for equal minutes.
 
 Each starts from random weights and is trained by the stock `lerobot-train` on the 206 human demonstrations
 and copies of them that are turned, mirrored and shifted; the stock `lerobot-eval --env.type=pusht` plays it

@@ -89,7 +89,7 @@ class Run:
 
     @property
     def times_path(self) -> Path:
-        """Written when the training is complete."""
+        """File that is written when the training is complete."""
         return self.folder / "training.json"
 
     def times(self) -> dict[str, float]:

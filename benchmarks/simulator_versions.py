@@ -1,4 +1,4 @@
-"""Under which MuJoCo versions are episodes the same, bit for bit?
+"""Check of MuJoCo versions: under which are episodes the same, bit for bit?
 
     python benchmarks/simulator_versions.py --work_dir simulators --json simulator_versions.json
 

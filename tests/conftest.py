@@ -98,7 +98,7 @@ def pusht_demonstrations(shared_data: Path) -> "Demonstrations":
 
 @pytest.fixture(scope="session")
 def pusht_zarr(pusht_demonstrations: "Demonstrations", tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """They alone, as a zarr."""
+    """Write these demonstrations as a zarr."""
     path = tmp_path_factory.mktemp("source") / "small.zarr"
     pusht_demonstrations.write(path)
     return path
@@ -106,7 +106,7 @@ def pusht_zarr(pusht_demonstrations: "Demonstrations", tmp_path_factory: pytest.
 
 @pytest.fixture(scope="session")
 def pusht_dataset(pusht_zarr: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """They as a LeRobotDataset, through the command line."""
+    """Convert these demonstrations to a LeRobotDataset, through the command line."""
     from pusht_cases import REPO_ID
 
     from lerobot_bomb.commands import main as cli

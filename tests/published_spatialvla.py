@@ -133,7 +133,7 @@ def make_original(
 
 
 def published_tensors(policy: SpatialvlaGridPolicy) -> dict[str, Tensor]:
-    """Under the original's names; its words' table has unused rows for the cells."""
+    """Return the tensors by the original's names; its words' table has unused rows for the cells."""
     tensors = {}
     for name, tensor in policy.state_dict().items():
         ours = next((each for each in NAMES if name.startswith(each)), None)

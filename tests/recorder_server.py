@@ -167,7 +167,7 @@ def hook(moment: Moment | None, watched: str, operations: int) -> Callable[[str,
 
 
 def run(job: dict) -> None:
-    """Be the recorder that the job describes, and end."""
+    """Run the recorder that the job describes, and end."""
     from lerobot_bomb.commands import main as cli
 
     signal.signal(signal.SIGCHLD, signal.SIG_DFL)

@@ -108,7 +108,7 @@ class ScriptedArm(Device, Robot):  # pyright: ignore[reportIncompatibleMethodOve
 @TeleoperatorConfig.register_subclass("scripted_leader")
 @dataclass
 class ScriptedLeaderConfig(TeleoperatorConfig):
-    """Nothing to choose."""
+    """Config of a leader that has nothing to choose."""
 
 
 class ScriptedLeader(Device, Teleoperator):  # pyright: ignore[reportIncompatibleMethodOverride]

@@ -24,7 +24,7 @@ RANGES = [(lambda x: 255 * x, "from 0 to 255"), (lambda x: 2 * x - 1, "from -1 t
 
 @pytest.fixture(scope="module", params=KINDS, ids=lambda kind: f"{kind[0]}-{kind[1]}")
 def dataset(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory) -> Any:
-    """Two episodes; actions 0 and 1 of a type, states 0.1, 0.2, ..."""
+    """Write two episodes; actions 0 and 1 of a type, states 0.1, 0.2, ..."""
     dtype, num_dims = request.param
 
     def numbers(frame: int) -> tuple[np.ndarray, np.ndarray]:

@@ -229,7 +229,7 @@ def no_policy_of_other_tests(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 def results_file(path: Path) -> list[dict[str, Any]]:
-    """Two seeds under two conditions, as lerobot-eval plays them."""
+    """Run two seeds under two conditions, as lerobot-eval does, and return their records."""
     config = BombPushTEnvConfig(perturbations=["none", "goal:3"], results_path=str(path), max_steps=6)
     for group in make_env(config, n_envs=2).values():
         envs: Any = group[0]

@@ -7,7 +7,8 @@ from pathlib import Path
 ROOT = Path(__file__).parents[1]
 FOLDERS = ("lerobot_bomb", "policies", "envs", "benchmarks", "tests")
 FRAGMENT = re.compile(
-    r"(All|As|By|For|From|How|In|None|Of|On|So|That|The same|Those|What|Where|Whether|Which|With)\b"
+    r"(All|Also|Around|As|At|Between|Both|By|For|From|How|In|None|Of|On|Only|So|That|The same|Their|These|"
+    r"Those|Unless|Until|What|Where|Whether|Which|Who|Whose|With)\b"
 )
 
 

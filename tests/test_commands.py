@@ -122,7 +122,7 @@ def is_done(said: list[str], board: Board, pattern: Board, end: Board) -> bool:
 
 
 def board_at_end(episode: PerturbedEpisode) -> Board:
-    """After the moves of the expert."""
+    """Return the board after the moves of the expert."""
     board = board_at_start(episode)
     stands = {stone: place for stone, place in standing(episode).items() if place in board}
     for aim in episode.aims:

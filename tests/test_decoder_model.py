@@ -215,14 +215,14 @@ def text(request: pytest.FixtureRequest) -> tuple[Any, Positions]:
 
 
 def nine_tokens(model: Any) -> tuple[Tensor, Tensor]:
-    """Their embeddings and columns, of three rows."""
+    """Return the tokens' embeddings and columns, of three rows."""
     generator = torch.Generator().manual_seed(0)
     return torch.randn(3, 9, model.config.hidden_size, generator=generator), torch.arange(9).expand(3, 9)
 
 
 @torch.no_grad()
 def states_of_nine_tokens(model: Any, positions: Positions, *, compiled: bool = False) -> Tensor:
-    """Five as a prompt, two as a pass, two singly."""
+    """Compute the states of five tokens as a prompt, two as a pass, two singly."""
     embeds_BKH, columns_BK = nine_tokens(model)
     text = CachedText(TextLayers(model, compiled=compiled), 3, 20, positions)
     states = [text(embeds_BKH[:, part], columns_BK[:, part]) for part in (slice(5), slice(5, 7))]

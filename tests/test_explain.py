@@ -178,7 +178,7 @@ def test_units_put_back_in_a_batch_give_what_they_give_alone(name: str) -> None:
 
 @pytest.mark.parametrize("name", NAMES)
 def test_nothing_is_put_back_of_an_instruction_of_more_tokens(name: str) -> None:
-    """Though both have as many columns, as on CUDA, where instructions are padded."""
+    """Pad both to as many columns, as on CUDA, where instructions are padded."""
     policy, instruction = loaded(name), moment()[1]
 
     def prepare(batch: dict[str, Any]) -> dict[str, Any]:

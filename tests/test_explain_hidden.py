@@ -199,7 +199,7 @@ def chosen_by_graphs(policy: Any, batch: dict[str, Any]) -> Tensor:
 )
 @pytest.mark.parametrize("word", ["3", "row 1, column 3"])
 def test_captured_passes_hide_the_same(name: str, by_graphs: Callable[..., Tensor], word: str) -> None:
-    """After a prompt of which nothing was hidden."""
+    """Check a pass after a prompt of which nothing was hidden."""
     policy = loaded(name)
     batch = hidden_batch(policy, word)
     answer = explained_by(policy).answer(batch)

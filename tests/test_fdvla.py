@@ -191,7 +191,7 @@ def test_a_head_of_words_that_is_no_embedding_is_frozen() -> None:
 
 @torch.no_grad()
 def test_heads_say_the_same_in_training_and_in_sampling(monkeypatch: pytest.MonkeyPatch) -> None:
-    """At the same noisy actions and time, whatever else is in the batch."""
+    """Compare at the same noisy actions and time, whatever else is in the batch."""
     policy = wake_dualmod(make_policy(draws_per_chunk=1))
     batch = make_batch(policy, 3)
     point = fixed_point(batch)

@@ -39,7 +39,7 @@ QUANTILES = '--policy.normalization_mapping={"ACTION": "QUANTILES"}'
 
 @pytest.fixture(scope="module")
 def root(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Four episodes of BOMB, about 20 frames each."""
+    """Record four episodes of BOMB, about 20 frames each."""
     path = tmp_path_factory.mktemp("grid") / "dataset"
     record(Recording(REPO_ID, episodes=4, seed=0, image_size=32, images=True), path)
     return path

@@ -83,7 +83,7 @@ def test_cropped_pusht_frames_are_the_real_processors(processor: Any, shared_dat
 
 @pytest.mark.parametrize("size", [40, 96, 128])
 def test_resizing_is_pillows(size: int) -> None:
-    """Needs no data: smaller, equal and larger."""
+    """Check smaller, equal and larger sizes; this needs no data."""
     for image in images(96, 60).values():
         expected = Image.fromarray(image).resize((size, size), Image.Resampling.LANCZOS)
         assert_equal_pixels(resize(to_tensor(image), size) * 2, to_tensor(np.array(expected)) * 2)

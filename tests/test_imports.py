@@ -1,4 +1,4 @@
-"""Who may import whom; see docs/architecture.md."""
+"""Rules of who may import whom; see docs/architecture.md."""
 
 import ast
 import re

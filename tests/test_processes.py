@@ -85,7 +85,7 @@ def check_trained_as_one(
 
 @pytest.fixture(scope="module")
 def two(dataset: Path, tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Seen]:
-    """Every policy in two processes, and once more from its first checkpoint on: where, what they saw."""
+    """Train every policy in two processes, and again from its first checkpoint; return folder and `Seen`."""
     folder = tmp_path_factory.mktemp("two")
     trainings = []
     for policy_type in POLICY_TYPES:
@@ -141,7 +141,7 @@ def test_sharded_by_fsdp_they_train_the_same(
 
 
 def test_fsdp_shards_every_layer_by_itself(policy_type: str) -> None:
-    """Named are the repeated blocks of the text and the vision model, and nothing else is repeated."""
+    """Check that the repeated blocks of text and vision model are named, and nothing else is repeated."""
     policy = CASES[policy_type].make_policy()
     named = set(policy._no_split_modules)
     assert policy._fsdp_wrap_modules == policy._no_split_modules

@@ -47,7 +47,7 @@ def small_blocks(monkeypatch: pytest.MonkeyPatch) -> None:
 
 @pytest.fixture(scope="module")
 def datasets(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
-    """Two uninterrupted recordings."""
+    """Make two uninterrupted recordings."""
     roots = {name: tmp_path_factory.mktemp("recorded") / name for name in ("video", "images")}
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(resumable, "BLOCK_EPISODES", 2)

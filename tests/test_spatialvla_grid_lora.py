@@ -65,7 +65,7 @@ def adapted(base: Path, meta: LeRobotDatasetMetadata, **flags: object) -> Spatia
 def test_adapters_hold_the_cells_of_adapted_grids(
     base: Path, meta: LeRobotDatasetMetadata, stock_cli: Callable[..., None], tmp_path: Path
 ) -> None:
-    """Trained, resumed, loaded on the base and merged: the grids are those of the new data everywhere."""
+    """Train, resume, load on the base and merge: the grids are those of the new data everywhere."""
     flags = f"--policy.path={base} --dataset.repo_id={REPO_ID} --dataset.root={meta.root} --batch_size=2"
     flags += " --num_workers=0 --steps=2 --save_freq=1 --peft.method_type=LORA --peft.r=4 --peft.lora_alpha=4"
     flags += " --peft.init_type=gaussian --policy.optimizer_lr=5e-4 --policy.scheduler_warmup_steps=0"

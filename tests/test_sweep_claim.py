@@ -1,4 +1,4 @@
-"""Whose a sweep's folder is, and how a finished sweep grows."""
+"""Claims on a sweep's folder, and how a finished sweep grows."""
 
 from pathlib import Path
 

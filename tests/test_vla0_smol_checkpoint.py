@@ -133,7 +133,7 @@ torch.save(postprocessor(policy.select_action(preprocessor(batch))), sys.argv[3]
 
 
 def test_a_checkpoint_needs_nothing_but_itself(tmp_path: Path) -> None:
-    """Another process, no network, empty Hub cache, and a base model that does not exist any more."""
+    """Load in another process without network, with an empty Hub cache and no base model."""
     policy = make_policy(nano_config=None)  # which changes nano alone
     batch = make_batch(policy, 4)
     save(policy, tmp_path / "model")

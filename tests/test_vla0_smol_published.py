@@ -31,7 +31,7 @@ def published_qwen(shared_data: Path, tmp_path_factory: pytest.TempPathFactory) 
 def test_the_sequence_is_that_of_qwens_real_processor(
     published_qwen: Vla0SmolPolicy, shared_data: Path, system_prompt: str | None
 ) -> None:
-    """Its chat template, its image tokens, its tokenizer."""
+    """Check its chat template, its image tokens, its tokenizer."""
     name = published_qwen.config.vlm_model_name
     policy = make_policy(vlm_model_name=name, system_prompt=system_prompt)
     processor: Any = AutoProcessor.from_pretrained(shared_data / "qwen2_5_vl")

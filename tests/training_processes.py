@@ -38,7 +38,7 @@ class Seen:
     text: str
 
     def mean_losses(self, training: int) -> list[float]:
-        """Over the processes, as LeRobot logs them."""
+        """Average the losses over the processes, as LeRobot logs them."""
         return [sum(of) / len(of) for of in zip(*(losses[training] for losses in self.losses), strict=True)]
 
 

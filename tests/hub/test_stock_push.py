@@ -34,7 +34,7 @@ class Training:
 
     @classmethod
     def ended(cls, folder: Path, scale: float, *, saves: bool = True) -> "Training":
-        """Its statistics and weights are those of `scale`."""
+        """Build an ended training with statistics and weights of `scale`."""
         policy = make_policy(repo_id=REPO_ID, pretrained_path=folder / "base")
         with torch.no_grad():
             for parameter in policy.parameters():

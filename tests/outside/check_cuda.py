@@ -152,7 +152,7 @@ def test_training_goes_on_after_a_prediction(make: Callable[..., Any]) -> None:
 
 
 def test_in_bfloat16_it_answers_nearly_the_same(make_writer: Callable[..., Any]) -> None:
-    """Most of the likeliest choices stay so."""
+    """Check that most of the likeliest choices stay so."""
     host, device = make_writer(), make_writer(dtype="bfloat16").cuda()
     batches = [batch_for(host, 8, seed) for seed in range(4)]
     same = torch.cat([predict(host, batch) == predict(device, batch) for batch in batches])
