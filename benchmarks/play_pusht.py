@@ -63,7 +63,7 @@ class Contender:
 
 
 def main() -> None:
-    """Convert, train all, play all, print the table."""
+    """Convert, train all, evaluate all, print the table."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawTextHelpFormatter)
     parser.add_argument("--source", type=Path, help="the zarr; not needed once it is converted")
     parser.add_argument("--output_dir", type=Path, required=True, help="folder to keep, or to go on with")
@@ -87,7 +87,7 @@ def main() -> None:
 
 
 def compete(args: argparse.Namespace, name: str, dataset: Path) -> Contender:
-    """Train and play one policy."""
+    """Train and evaluate one policy."""
     folder, times_path = args.output_dir / name, args.output_dir / name / "training.json"
     flags = [f"--config_path={recipe_path('play_pusht', name)}", f"--dataset.root={dataset}"]
     flags += [f"--policy.device={args.device}", *ON[args.device]]

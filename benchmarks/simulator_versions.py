@@ -116,7 +116,7 @@ def published_versions() -> list[str]:
 
 
 def measure(version: str, work_dir: Path, conditions: list[str], num_seeds: int) -> Measured:
-    """Play everything under one MuJoCo version, in a virtual environment of its own."""
+    """Run everything under one MuJoCo version, in a virtual environment of its own."""
     folder = (work_dir / version).resolve()
     python = folder / "bin" / "python"
     if not python.exists():

@@ -107,9 +107,9 @@ def format_rate(successes: int, n: int) -> str:
 
 
 def mcnemar_p_value(only_first: int, only_second: int) -> float:
-    """Two-sided exact p-value of the hypothesis that both arms of paired episodes succeed equally often.
+    """Two-sided exact p-value of the hypothesis that both groups of paired episodes succeed equally often.
 
-    Given the pairs in which one arm alone succeeded, either is as likely as a coin's side (McNemar, 1947).
+    Given the pairs in which one group alone succeeded, either is as likely as a coin's side (McNemar, 1947).
     """
     from scipy.special import bdtr
 
@@ -142,17 +142,17 @@ class PairedCounts:
 
     @property
     def first(self) -> int:
-        """Successes of the first arm."""
+        """Successes of the first group."""
         return self.both + self.only_first
 
     @property
     def second(self) -> int:
-        """Successes of the second arm."""
+        """Successes of the second group."""
         return self.both + self.only_second
 
     @property
     def difference(self) -> float:
-        """The second arm's rate minus the first one's."""
+        """The second group's rate minus the first one's."""
         return (self.only_second - self.only_first) / self.n
 
     @property

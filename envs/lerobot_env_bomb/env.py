@@ -98,7 +98,7 @@ class BombEnv(EpisodeEnv[EpisodeSpec, _Run, EpisodeResult]):
         return self._observe(), self._info()
 
     def show_static(self, seed: int) -> tuple[Observation, EpisodeResult]:
-        """The board of a seed's episode as it may stand midway, which cannot be played from there.
+        """The board of a seed's episode as it may stand midway, which cannot be run from there.
 
         The result says which episode it is of; nothing has become of that.
         """

@@ -134,7 +134,7 @@ def command_suite(tasks: Sequence[Task], max_steps: int, num_goals: int, version
 
 
 def draw_command(tasks: Sequence[Task], spec: EpisodeSpec) -> tuple[int, Drawn, Case]:
-    """The number of a task, what it is played on, and what its command means there."""
+    """Return a task's number, the board that is drawn for it, and what its command means there."""
     drawn_id = int(generator(spec.seed, Stream.TARGET).integers(len(tasks)))
     task_id = drawn_id if spec.task_id is None else spec.task_id
     task, rng = tasks[task_id], generator(spec.seed, Stream.OPENING)

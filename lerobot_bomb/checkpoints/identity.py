@@ -57,7 +57,7 @@ def identity_of_config(config: PreTrainedConfig) -> PolicyIdentity:
 
 
 def policy_of_results(results_path: str | None, num_envs: int) -> list[dict[str, PolicyIdentity]]:
-    """Argument of each environment that writes lines of results: the policy, which LeRobot builds later.
+    """Argument of each environment that writes records of results: the policy, which LeRobot builds later.
 
     From now on its queries are timed.
     """

@@ -107,7 +107,7 @@ def _told(policy: PreTrainedPolicy, name: str) -> Any:
 
 
 def _device_name(device: torch.device) -> str:
-    """'NVIDIA H100', 'cpu, 1 thread': the line names the processor."""
+    """'NVIDIA H100', 'cpu, 1 thread': the record names the processor."""
     if device.type == "cuda":
         return torch.cuda.get_device_name(device)
     if device.type == "cpu":

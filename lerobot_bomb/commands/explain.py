@@ -57,7 +57,7 @@ def add_explain_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run_explain(args: argparse.Namespace) -> int:
-    """Play, ask, write a page, its numbers and, of one episode, a recording; print what was found."""
+    """Explain episodes; write a page, its numbers and, of one episode, a recording; print the findings."""
     check_at_least(args, episodes=1, grid=1)
     if args.episodes > 1 and args.step is not None:
         raise ValueError(f"--step={args.step} is of one episode; drop it or --episodes={args.episodes}")

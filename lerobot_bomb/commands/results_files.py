@@ -33,7 +33,7 @@ def missing_of_sweep(path: Path, num_rows: int) -> str:
 
 
 def read_line(path: Path, line: int) -> Row:
-    """The episode of a line, counted from 1.
+    """Return a record by its line, counted from 1.
 
     Raises:
         ValueError: there is no such line, or as `read_undamaged`.
@@ -45,7 +45,7 @@ def read_line(path: Path, line: int) -> Row:
 
 
 def read_undamaged(path: Path) -> tuple[list[Row], int]:
-    """The episodes of a file, and how many damaged lines it has, of which stderr shows the first.
+    """Return a file's records, and the number of its damaged lines, of which stderr shows the first.
 
     It also says there how many episodes of a sweep are missing.
 

@@ -79,7 +79,7 @@ def add_viewed_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run_view(args: argparse.Namespace) -> int:
-    """Play, write both files, print the instruction, the outcome and the paths."""
+    """Run an episode, write both files, print the instruction, the outcome and the paths."""
     viewed = viewed_of(args)
     policy = _policy(args, viewed.policies)
     name = viewed.name(policy)

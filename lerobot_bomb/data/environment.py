@@ -112,7 +112,7 @@ class Environment:
 
     @property
     def _is_current(self) -> bool:
-        """Return whether its suites, whose newest version it names, are those that are played today."""
+        """Return whether its suites, whose newest version it names, are those of today."""
         return self.suites is not None and self.task_version == max(map(task_version, self.suites))
 
     def check_same(self, other: "Environment", who: str, insist: str) -> None:

@@ -19,7 +19,7 @@ SIMULATOR = ("mujoco", "robosuite", "hf-libero", "numpy")
 
 @dataclass(frozen=True)
 class LiberoResult(ResultLine):
-    """Outcome of one episode; one JSON line in a results file."""
+    """Outcome of one episode; one record in a results file."""
 
     spec: LiberoSpec
     instruction: str

@@ -19,7 +19,7 @@ SIMULATOR = ("gym-pusht", "pymunk", "pygame", "opencv-python-headless")
 
 @dataclass(frozen=True)
 class PushTResult(ResultLine):
-    """Outcome of one episode; one JSON line in a results file."""
+    """Outcome of one episode; one record in a results file."""
 
     spec: PushTSpec
     instruction: str

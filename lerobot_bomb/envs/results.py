@@ -86,7 +86,7 @@ class ResultLine:
     inference: Inference | None = None  # None: no network was asked, or it was not measured
 
     def to_json(self) -> str:
-        """One line of JSON, keys in the order of the fields, those that all environments share at the end.
+        """Return the record, a line of JSON: keys in the order of the fields, those of all environments last.
 
         Raises:
             ValueError: a number is not finite.
@@ -98,7 +98,7 @@ class ResultLine:
 
 @dataclass(frozen=True)
 class EpisodeResult(ResultLine):
-    """Outcome of one episode; one JSON line in a results file.
+    """Outcome of one episode; one record in a results file.
 
     `target`, `color` are the episode's; what was asked for is in `spec`, where None means drawn.
     """
@@ -140,7 +140,7 @@ def without_measured(row: Row) -> Row:
 
 
 def check_results_path(path: str | None) -> None:
-    """Raise a ValueError unless lines can be appended to the file of `--env.results_path`."""
+    """Raise a ValueError unless records can be appended to the file of `--env.results_path`."""
     if path is None:
         return
     try:

@@ -28,7 +28,7 @@ class StockSpec:
 
 @dataclass(frozen=True)
 class StockResult(ResultLine):
-    """Outcome of one episode; one JSON line in a results file."""
+    """Outcome of one episode; one record in a results file."""
 
     spec: StockSpec
     sum_reward: float

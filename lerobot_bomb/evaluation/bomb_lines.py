@@ -1,4 +1,4 @@
-"""Lines of `bomb` in a results file: what each must say, whichever protocol wrote it, and what all say."""
+"""Records of `bomb` in a results file: what each must say, whichever protocol wrote it, and what all say."""
 
 from collections.abc import Mapping
 from statistics import mean, median

@@ -46,7 +46,7 @@ def _check_place(row: Row) -> None:
 
 
 def _check_tasks(row: Row) -> None:
-    """The number of the task, which lines of earlier releases do not have."""
+    """Check the number of the task, which records of earlier releases do not have."""
     if "task_id" not in row:
         return
     spec = row["spec"]

@@ -117,7 +117,7 @@ RUN_CHECKS: dict[str, Check] = {
 
 
 def check_levels(row: Mapping[str, Any], condition: type[AxisCondition]) -> None:
-    """Raise a ValueError unless a line's levels can be those of its condition."""
+    """Raise a ValueError unless a record's levels can be those of its condition."""
     asked = {axis: (low, high) for axis, low, high in condition.parse(row["spec"]["perturbations"]).ranges}
     levels = {axis: row["levels"].get(axis, 0) for axis in (*row["levels"], *asked)}
     off = (0, 0)  # of an axis that is not in the condition

@@ -1,4 +1,4 @@
-"""Lines of `bomb_pusht` in a results file: what each must say, and what they say together."""
+"""Records of `bomb_pusht` in a results file: what each must say, and what they say together."""
 
 from functools import partial
 from typing import Any

@@ -1,4 +1,4 @@
-"""Episodes that compare: which lines of a results file may be pooled and paired, and what they are of."""
+"""Episodes that compare: which records of a results file may be pooled and paired, and what they are of."""
 
 from collections import Counter
 from collections.abc import Callable
@@ -59,7 +59,7 @@ class Group:
 
 
 def groups_of(rows: list[Row]) -> list[Group]:
-    """Lines apart that must not be pooled or paired; of an episode that was run again, the last one."""
+    """Split records that must not be pooled or paired; of an episode that was run again, the last one."""
     episodes: dict[tuple[tuple[str, str], ...], dict[str, Row]] = {}
     counts = Counter[tuple[tuple[str, str], ...]]()
     for row in rows:
@@ -129,7 +129,7 @@ def count_pairs(pairs: list[Pair]) -> PairedCounts:
 
 
 def different_fields(row: Row, other: Row) -> list[str]:
-    """Names of what is not the same of two lines of one episode, of their `outcome`."""
+    """Return the names of the fields of `outcome` that differ between two records of one episode."""
     return [name for name, value in outcome(row).items() if value != other.get(name)]
 
 

@@ -39,7 +39,7 @@ class Measure:
 
 @dataclass(frozen=True)
 class ResultKind:
-    """Lines of one environment: how they are known, what each must say, and what they say together."""
+    """Records of one environment: how they are known, what each must say, and what they say together."""
 
     env_type: str
     condition: type[AxisCondition]  # its perturbations
@@ -76,13 +76,13 @@ class ResultKind:
     starts_by_number: bool = False
 
     def check(self, row: Row) -> None:
-        """Raise a ValueError that names a field of a line which is missing or impossible."""
+        """Raise a ValueError that names a field of a record which is missing or impossible."""
         of_later = {**self.added_fields, **SHARED_CHECKS}
         added = {name: check for name, check in of_later.items() if name in row}
         check_fields(row, {**self.fields[row["protocol_version"]], **added})
 
     def check_spec(self, row: Row) -> None:
-        """Raise a ValueError unless a line is of an episode that there can be."""
+        """Raise a ValueError unless a record is of an episode that there can be."""
         added = {name: check for name, check in self.added_spec_fields.items() if name in row["spec"]}
         check_fields(row["spec"], self.spec_fields | added, "spec.")
         refuse_others(row["spec"], self.spec_fields | added)

@@ -1,4 +1,4 @@
-"""Lines of results files, of whichever environment: read and checked."""
+"""Records of results files, of whichever environment: read and checked."""
 
 import json
 from pathlib import Path
@@ -49,7 +49,7 @@ def _check_batch(policy: dict[str, Any]) -> None:
 
 
 def read_lines(path: Path) -> tuple[list[Row], list[str]]:
-    """The episodes of a results file in its order, and what is wrong with its other lines.
+    """Return the records of a results file in its order, and what is wrong with its other lines.
 
     Raises:
         ValueError: there is no such file.
@@ -73,7 +73,7 @@ def read_lines(path: Path) -> tuple[list[Row], list[str]]:
 
 
 def check_any(path: Path, rows: list[Row], damages: list[str]) -> None:
-    """Raise a ValueError unless there are rows of this file; damages: what is wrong with its other lines."""
+    """Raise a ValueError unless this file has records; damages: what is wrong with its other lines."""
     if not rows and damages:
         raise ValueError(f"{path} is no results file; name one that --env.results_path of lerobot-eval wrote")
     if not rows:

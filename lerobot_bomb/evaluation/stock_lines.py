@@ -1,4 +1,4 @@
-"""Lines of LeRobot's own `pusht` and `libero` in a results file: what each must say, and what they say."""
+"""Records of LeRobot's own `pusht` and `libero` in a results file: what each must say, and what they say."""
 
 import json
 from collections.abc import Mapping

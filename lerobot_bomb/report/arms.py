@@ -62,12 +62,12 @@ class Sample:
 
     @property
     def command(self) -> str:
-        """Plays it again."""
+        """Command that runs it again."""
         return shlex.join(["lerobot-bomb", "replay", str(self.path), f"--line={self.line}"])
 
     @property
     def explanation(self) -> str:
-        """The command that asks why; '' where no checkpoint played."""
+        """Command that asks why; '' where no checkpoint acted."""
         if not (self.row.get("policy") or {}).get("path"):
             return ""
         return shlex.join(["lerobot-bomb", "explain", f"--results={self.path}", f"--line={self.line}"])
@@ -97,7 +97,7 @@ def sample_failures(arms: list[Arm], files: Mapping[Path, list[Row]], num_of_cla
 
 
 def arms_of(rows: list[Row]) -> list[Arm]:
-    """Lines apart that must not be pooled, each with a name that no other has."""
+    """Split records that must not be pooled into arms, each with a name that no other has."""
     groups = groups_of(rows)
     first = [group.rows[0] for group in groups]
     return list(map(Arm, _told_apart([_name(row) for row in first], first), groups))

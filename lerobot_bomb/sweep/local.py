@@ -1,4 +1,4 @@
-"""Cells played by worker processes on this machine."""
+"""Cells that worker processes run on this machine."""
 
 import os
 import signal
@@ -22,7 +22,7 @@ MAX_ENDED = 3
 def progress(store: Store, cells: Sequence[Cell]) -> Iterator[bool]:
     """Show how far the cells are until all are over, and yield whether they are further than before.
 
-    The lines of cells that have been finished are merged, whatever ends this process later.
+    The records of cells that have been finished are merged, whatever ends this process later.
     """
     total = sum(cell.num_episodes for cell in cells)
     left, num_before = _not_over(store, cells)  # what is over is not read again
@@ -49,7 +49,7 @@ def _not_over(store: Store, cells: Sequence[Cell]) -> tuple[list[Cell], int]:
 
 
 class WorkerProcess:
-    """A worker, and the cell that it plays, which it says through a pipe."""
+    """A worker, and the cell that it runs, which it says through a pipe."""
 
     def __init__(self, command: Sequence[str], environment: dict[str, str], log: IO[bytes]) -> None:
         said, told = os.pipe()
@@ -70,7 +70,7 @@ class WorkerProcess:
         self.since = time.monotonic()
 
     def look(self) -> str | None:
-        """Read which cell is played; return how the worker ended, None while it runs."""
+        """Read which cell is run; return how the worker ended, None while it runs."""
         code = self._process.poll()
         self._unread += self._said.read() or b""
         *cells, self._unread = self._unread.split(b"\n")
@@ -109,7 +109,7 @@ class Workers:
     """The worker processes of one command, each started anew when it has ended.
 
     Args:
-        store: what is played.
+        store: what is run.
         command: starts a worker.
         environments: of each.
         timeout_s: of a cell; None: none.
@@ -179,7 +179,7 @@ class Workers:
 
 
 def play(store: Store, part: str, num_workers: int, timeout_s: int | None = None) -> None:
-    """Play a part of the cells: start workers, and start those anew that ended.
+    """Run a part of the cells: start workers, and start those anew that ended.
 
     Raises:
         RuntimeError: they end before they play, or refuse to; the message says why.

@@ -1,7 +1,7 @@
 """Store of what is done in a sweep: a folder that any number of workers share.
 
-A cell is finished where `cells/KEY.jsonl` holds all its episodes; a worker that plays one holds the lock on
-`cells/KEY.lock`, which the system takes from it if it is killed. What such a worker left is played again,
+A cell is finished where `cells/KEY.jsonl` holds all its episodes; a worker that runs one holds the lock on
+`cells/KEY.lock`, which the system takes from it if it is killed. What such a worker left is run again,
 three times at most in one run: a sweep that was stopped, with workers that may outlive it by moments, is no
 failed attempt.
 """
@@ -35,10 +35,10 @@ class EpisodeError:
 
 
 def unplayed_seeds(cell: Cell, lines: Sequence[str | bytes], errors: Sequence[EpisodeError]) -> list[int]:
-    """Seeds of a cell that have neither an error nor as many lines as the others, one for each task.
+    """Seeds of a cell that have neither an error nor as many records as the others, one for each task.
 
     Raises:
-        ValueError: a line is no episode.
+        ValueError: a line is no record.
     """
     try:
         counts = Counter(json.loads(line)["spec"]["seed"] for line in lines)
@@ -54,7 +54,7 @@ class Store:
 
     Args:
         folder: where `manifest` lies.
-        manifest: what is played.
+        manifest: what is run.
         run: names the command whose workers' attempts count together; None: a new one.
     """
 
@@ -64,7 +64,7 @@ class Store:
         (folder / CELLS).mkdir(parents=True, exist_ok=True)
 
     def file(self, cell: Cell, ending: str) -> Path:
-        """One of a cell's: lines that are finished (.jsonl) or not (.part), errors, attempts, lock."""
+        """Return a cell's file: finished records (.jsonl) or unfinished (.part), errors, attempts, lock."""
         return self.folder / CELLS / f"{cell.key}.{ending}"
 
     def is_finished(self, cell: Cell) -> bool:
@@ -113,13 +113,13 @@ class Store:
             self.give_up(cell, f"{reason}; {MAX_ATTEMPTS} attempts")
 
     def lost(self, cell: Cell, reason: str) -> None:
-        """Note why the worker ended that played the cell, unless another has finished it or plays it now."""
+        """Note why the worker ended that ran the cell, unless another has finished it or runs it now."""
         with self.claimed(cell) as is_mine:
             if is_mine and not self.is_finished(cell):
                 self.fail(cell, reason)
 
     def in_turn(self, cells: Sequence[Cell]) -> list[Cell]:
-        """Cells that are to be played, those first that no worker has died of, nor of their policy."""
+        """Return the cells to be run, those first that no worker has died of, nor of their policy."""
         attempts = {cell: self._num_attempts(cell) for cell in cells}
         of_policy: Counter[tuple[str, ...]] = Counter()
         for cell, number in attempts.items():
@@ -160,7 +160,7 @@ class Store:
             yield True
 
     def finish(self, cell: Cell, lines: list[str], errors: list[EpisodeError]) -> None:
-        """Keep a cell's lines, by seed, and what had none."""
+        """Keep a cell's records, by seed, and the errors of seeds without one."""
         self.file(cell, "errors").unlink(missing_ok=True)  # of an attempt that could not be written
         if errors:
             with written_whole(self.file(cell, "errors")) as (path,):
@@ -170,13 +170,13 @@ class Store:
         self.file(cell, "part").unlink(missing_ok=True)
 
     def num_played(self, cells: Sequence[Cell]) -> int:
-        """Episodes that have a line or an error, those of cells that are being played too."""
+        """Count episodes that have a record or an error, also in cells that are running."""
         endings = ("jsonl", "part", "errors")
         paths = [self.file(cell, ending) for cell in cells for ending in endings]
         return sum(_read(path).count(b"\n") for path in paths)
 
     def merge(self) -> None:
-        """Write all finished cells' lines in the order of the manifest, and all errors."""
+        """Write all finished cells' records in the order of the manifest, and all errors."""
         with (self.folder / CELLS / "merge.lock").open("w") as lock:
             flock(lock, LOCK_EX)  # who writes last has read what all that wrote before had finished
             for name, ending in ((RESULTS, "jsonl"), (ERRORS, "errors")):

@@ -1,4 +1,4 @@
-"""Episodes played into a recording for Rerun and a video: one, or several side by side."""
+"""Episodes run into a recording for Rerun and a video: one, or several side by side."""
 
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import AbstractContextManager, closing
@@ -31,7 +31,7 @@ SUFFIXES = (".rrd", ".mp4")
 
 @dataclass(frozen=True)
 class Viewed:
-    """An episode of one environment, and how it is played and shown."""
+    """An episode of one environment, and how it is run and shown."""
 
     env_type: str
     spec: EpisodeSpec | PushTSpec
@@ -109,7 +109,7 @@ class Player:
 
 
 def write_episodes(players: Mapping[str, Player], name: str, rrd: Path, mp4: Path) -> list[ResultLine]:
-    """Play one after the other, write what happened, and return what became of each.
+    """Run one after the other, write what happened, and return each result.
 
     With one player, its entities stand at the recording's top; of several, each below its name, and the video
     shows them side by side, the last image of an episode until the others have ended.

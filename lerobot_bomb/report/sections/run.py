@@ -28,7 +28,7 @@ def commands(arm: Arm) -> list[str]:
 
 
 def _as_played(row: Row) -> list[str]:
-    """Device and batch, which outcomes may depend on, as far as the line says."""
+    """Device and batch, which outcomes may depend on, as far as the record says."""
     device, batch_size = (
         (row.get("inference") or {}).get("device", ""),
         (row.get("policy") or {}).get("batch_size"),
