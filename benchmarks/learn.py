@@ -300,7 +300,7 @@ def probe_recipe() -> list[str]:
 
 
 def checkpoints(folder: Path) -> dict[int, Path]:
-    """{training step: folder}."""
+    """Return the checkpoints, {training step: folder}."""
     paths = sorted((folder / "train" / "checkpoints").glob("[0-9]*"))
     return {int(path.name): path / "pretrained_model" for path in paths}
 

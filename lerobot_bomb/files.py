@@ -146,7 +146,7 @@ def append_line(path: Path | str, line: str) -> None:
 
 
 def check_appendable(path: Path) -> None:
-    """Make the file's folder, unless it exists.
+    """Check that a file can be appended to; make its folder, unless it exists.
 
     Raises:
         OSError: `append_line` could not write the file.

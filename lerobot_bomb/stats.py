@@ -64,7 +64,7 @@ def clustered_interval(successes_C: np.ndarray, counts_C: np.ndarray) -> tuple[f
 
 @dataclass(frozen=True)
 class Rate:
-    """Share of n records that are counted, with its 95 % interval."""
+    """Share of n records that count, such as successes, with its 95 % interval."""
 
     successes: int
     n: int

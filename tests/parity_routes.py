@@ -117,8 +117,8 @@ def resolution(policy: PreTrainedPolicy) -> float:
 def tolerance(policy: PreTrainedPolicy) -> float:
     """Return the tolerance of normalised actions in an episode: larger for a policy that samples.
 
-    While it learned, such a policy had not all of its noise. A gripper that closes or opens a step early or
-    late is off by about 2.
+    Such a policy has not seen all of its noise while it learned. A gripper that closes or opens a step
+    early or late is off by about 2.
     """
     samples = hasattr(policy.config, "num_inference_steps")
     return 3 * resolution(policy) if samples else resolution(policy)

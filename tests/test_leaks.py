@@ -59,7 +59,7 @@ def test_where_gripper_and_tray_start_tells_nothing_of_what_is_asked_for(suite: 
 
 
 def assert_uncorrelated(starts: list[np.ndarray], episodes: list[PerturbedEpisode]) -> None:
-    """`starts` and what is asked for: where the first stone goes, in how many turns, by which template."""
+    """Assert that `starts` tell nothing of the request: the first stone's goal, turns, template, task."""
     asked = np.array(
         [
             (*episode.aims[0].xy, len(episode.turns), len(episode.instruction), episode.task_id)

@@ -73,7 +73,7 @@ def weights(policy_type: str, output_dir: Path) -> dict[str, torch.Tensor]:
 def check_trained_as_one(
     policy_type: str, losses: list[float], of: Path, stock_cli: Callable[..., None], dataset: Path
 ) -> None:
-    """Losses and weights agree with those of one process and a batch as large as theirs together."""
+    """Check losses and weights against one process with a batch as large as theirs together."""
     with seen_losses() as in_one, draws_by_sample():
         together = BATCH_SIZE * NUM_PROCESSES
         stock_cli("lerobot-train", *flags(policy_type, dataset, together, f"{of}/one"))

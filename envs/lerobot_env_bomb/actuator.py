@@ -10,7 +10,7 @@ from lerobot_env_bomb.axes.dynamics import Dynamics
 
 
 class Actuator:
-    """Executes actions in one episode; `dynamics` makes it late and imprecise."""
+    """Actuator of one episode; `dynamics` makes it late and imprecise."""
 
     def __init__(self, control_mode: str, gripper_xyz: np.ndarray, dynamics: Dynamics | None, seed: int):
         self._is_absolute = control_mode == "absolute"

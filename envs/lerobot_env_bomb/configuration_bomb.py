@@ -166,7 +166,7 @@ class BombEnvConfig(EnvConfig):
         )
 
     def get_env_processors(self) -> tuple[PolicyProcessorPipeline, PolicyProcessorPipeline]:
-        """Return LeRobot's, which change nothing, after a check of the policy that acts.
+        """Return LeRobot's processors, which change nothing, after a check of the policy that acts.
 
         Every command asks for them once, when its policy is built and no episode has begun.
 

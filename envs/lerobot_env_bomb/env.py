@@ -216,7 +216,7 @@ class BombEnv(EpisodeEnv[EpisodeSpec, _Run, EpisodeResult]):
         return alternatives(self._run.episode)
 
     def _check(self, action: np.ndarray) -> np.ndarray:
-        """(4,) float64 within the action space."""
+        """Return an action as (4,) float64 within the action space."""
         return np.clip(super()._check(action).astype(np.float64), self._action_low, self._action_high)
 
     def _observe(self) -> Observation:

@@ -32,7 +32,7 @@ def normalised_rest(low_D: np.ndarray, high_D: np.ndarray) -> np.ndarray:
 
 
 def check_actions(actions_ND: np.ndarray | Tensor) -> Tensor:
-    """(N, D) float64 on the CPU.
+    """Return checked actions as (N, D) float64 on the CPU.
 
     Raises:
         ValueError: there are none, or some are not finite.

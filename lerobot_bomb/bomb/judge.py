@@ -203,7 +203,7 @@ class Judge:
         return True
 
     def _take_move(self, stone: int) -> bool:
-        """A move has been made; whether it was the last."""
+        """Note that a move has been made, and return whether it was the last."""
         fitting = self._fitting(stone)
         self._is_complete = any(len(made) == len(plan) for plan, made in fitting)
         if self._is_complete:

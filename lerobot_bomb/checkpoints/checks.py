@@ -35,7 +35,7 @@ type Shapes = dict[str, tuple[int, ...]]
 
 
 def checkpoint_files(folder: Path) -> list[str]:
-    """Names of the files that make up a checkpoint, each whole.
+    """Return the names of the files that make up a checkpoint, each whole.
 
     Raises:
         ValueError: one is missing, truncated or of another format.
@@ -131,7 +131,7 @@ def policy_class(folder: Path) -> type[PreTrainedPolicy]:
 
 
 def check_config(folder: Path, config: PreTrainedConfig) -> None:
-    """A checkpoint needs nothing but its own files, and no code.
+    """Check that a checkpoint needs nothing but its own files, and no code.
 
     Raises:
         ValueError: names what it needs.
@@ -156,7 +156,7 @@ def _names_code(values: Any, key: str = "") -> bool:
 
 
 def check_weights(folder: Path, config: PreTrainedConfig, policy_type: type[PreTrainedPolicy]) -> None:
-    """The weights are those of the config's policy, by their names and shapes; no memory is taken.
+    """Check that weights are those of the config's policy, by name and shape, without taking memory.
 
     Raises:
         ValueError: names the first tensor that is missing, not known, or of another shape.
@@ -167,7 +167,7 @@ def check_weights(folder: Path, config: PreTrainedConfig, policy_type: type[PreT
 
 
 def check_tensors(path: Path, policy: PreTrainedPolicy) -> list[str]:
-    """A file's weights are a policy's, by their names and shapes; the names of those that it needs.
+    """Raise unless a file's weights are a policy's, by name and shape; return the names of those needed.
 
     A policy may do without parts of a file (``may_skip``) and have parts of its own that the file lacks as a
     whole (``may_lack``): names of modules.

@@ -63,7 +63,7 @@ class ConfigWithEnvironment(PreTrainedConfig):
 
 
 def check_acting_policy(here: Environment) -> None:
-    """The policy that this process built last was trained for this environment, as far as anyone can know.
+    """Check that the policy that was built last was trained for this environment, as far as is known.
 
     Raises:
         ValueError: it was trained for another one; the message names the flags to change.

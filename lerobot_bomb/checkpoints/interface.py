@@ -29,7 +29,7 @@ class Interface:
     image_flags: Callable[[int, int], str]  # (height, width) -> the flags of images of this size
 
     def check_acting_policy(self) -> None:
-        """The policy that this process built last was trained for such an environment, for all one knows.
+        """Check that the policy that was built last was trained for such an environment, as far as is known.
 
         Raises:
             ValueError: it was trained for another one; the message says what differs and the way out.

@@ -185,7 +185,7 @@ def _check_loaded(steps: Sequence[Any], where: str, config_file: Path) -> None:
 
 
 def check_float_statistics(content: Mapping[str, Any], folder: Path) -> None:
-    """The saved statistics of a processor's JSON are floats; loading would hide that they were rounded.
+    """Check that a processor's saved statistics are floats; loading would hide that they were rounded.
 
     Raises:
         ValueError: names the file and the first that are none.
@@ -205,7 +205,7 @@ def check_float_statistics(content: Mapping[str, Any], folder: Path) -> None:
 
 
 def check_states(steps: Sequence[Any], where: str, complete: bool) -> None:
-    """The steps' loaded states are finite where they are used; `complete`: and they hold all that is used.
+    """Check that the steps' loaded states are finite where used; `complete`: and hold all that is used.
 
     Raises:
         ValueError: names the statistic that is missing, of another shape or not finite.

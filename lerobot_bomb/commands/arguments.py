@@ -33,7 +33,7 @@ def path_flag(text: str) -> Path:
 
 
 def checkpoint_flag(text: str) -> Path:
-    """The folder of a checkpoint that a flag gives, for argparse; `bomb:NAME` is one of the package's.
+    """Return the checkpoint folder of a flag, for argparse; `bomb:NAME` is one of the package's.
 
     Raises:
         argparse.ArgumentTypeError: no checkpoint of this name comes with the package, or it is no path.

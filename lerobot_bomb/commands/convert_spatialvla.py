@@ -131,7 +131,7 @@ def _check_keys(path: Path, values: dict[str, Any], keys: tuple[str, ...]) -> No
 
 
 def _chosen_statistics(statistics: dict[str, Any], name: str | None) -> str:
-    """The data set of that name, or the only one."""
+    """Return the name of the statistics: the given one, or the only one."""
     if name is None and len(statistics) == 1:
         return next(iter(statistics))
     if name not in statistics:

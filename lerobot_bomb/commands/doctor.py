@@ -52,7 +52,7 @@ class Finding:
 
 
 def check_versions() -> Iterator[Finding]:
-    """Python, this package and its main dependencies."""
+    """Check Python, this package and its main dependencies."""
     yield Finding("python", platform.python_version())
     for name in (DISTRIBUTION, *DEPENDENCIES):
         try:
@@ -127,7 +127,7 @@ def check_libero() -> Iterator[Finding]:
 
 
 def check_types() -> Iterator[Finding]:
-    """Env and policy types whose packages the plugin imports: whether LeRobot knows them, and classes."""
+    """Check that LeRobot knows the env and policy types that the plugin imports, and their classes."""
     plugin = importlib.import_module(DISTRIBUTION)
     from lerobot.configs import PreTrainedConfig
     from lerobot.envs import EnvConfig
@@ -148,7 +148,7 @@ def _imported_types(plugin: ModuleType, prefix: str) -> list[str]:
 
 
 def check_gpu() -> Iterator[Finding]:
-    """The accelerator torch would use; none is fine for the nano presets."""
+    """Check the accelerator that torch would use; none is fine for the nano presets."""
     torch = importlib.import_module("torch")
     if torch.cuda.is_available():
         yield Finding("gpu", torch.cuda.get_device_name())

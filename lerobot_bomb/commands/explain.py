@@ -116,7 +116,7 @@ def _of_line(args: argparse.Namespace) -> "_Asked":
 
 @dataclass(frozen=True)
 class _Asked:
-    """Episodes to explain, and the checkpoint that is asked."""
+    """Episodes and checkpoint to explain."""
 
     viewed: Callable[[int], Viewed]  # of a seed
     seed: int

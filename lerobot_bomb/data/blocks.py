@@ -232,7 +232,7 @@ def _add_episode_columns(root: Path, rows: list[dict[str, Any]]) -> None:
 
 
 def _check_videos(root: Path, num_frames: int) -> None:
-    """LeRobot logs frames that its encoder drops or does not finish; here they are an error."""
+    """Raise if the encoder dropped frames or did not finish them, which LeRobot only logs."""
     encoded: dict[str, int] = {}
     for path in sorted(root.glob("videos/*/*/*.mp4")):
         with av.open(str(path)) as video:

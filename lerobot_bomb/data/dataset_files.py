@@ -45,7 +45,7 @@ def check_dataset(root: Path) -> None:
 
 
 def check_metadata(root: Path) -> None:
-    """The files under meta/ can be read, whoever wrote them; of others' datasets no more can be expected.
+    """Check that the files under meta/ can be read; of others' datasets no more can be expected.
 
     Raises:
         ValueError: names the one that is truncated.
@@ -59,7 +59,7 @@ def check_metadata(root: Path) -> None:
 
 
 def check_readable(root: Path) -> None:
-    """The tables of data and the videos that are here are whole; LeRobot downloads what is not.
+    """Check that the tables and videos that are here are whole; LeRobot downloads what is not.
 
     Raises:
         ValueError: names the file that is truncated.
@@ -114,7 +114,7 @@ def read_parquet(path: Path, columns: Sequence[str] | None = None, filters: list
 
 
 def check_video(path: Path, num_frames: int, fps: float) -> None:
-    """A video has so many frames, of which the first and the last can be decoded.
+    """Check that a video has so many frames, of which the first and the last can be decoded.
 
     Raises:
         FileNotFoundError: there is none.
@@ -173,7 +173,7 @@ def read_episodes(root: Path, info: Info) -> pa.Table:
 
 
 def check_videos(root: Path, info: Info, episodes: pa.Table) -> None:
-    """The videos of all cameras hold the frames of the episodes, one episode after the other.
+    """Check that the videos of all cameras hold the episodes' frames, one episode after the other.
 
     Raises:
         OSError, ValueError: names the file.

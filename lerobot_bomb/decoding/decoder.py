@@ -105,7 +105,7 @@ class Answers(NamedTuple):
 
     @classmethod
     def start(cls, grammar: NumberGrammar, batch_size: int, noise: Tensor | None = None) -> "Answers":
-        """The space that every answer begins with is written."""
+        """Start with the space that every answer begins with, which is written."""
         place = grammar.start(batch_size)
         numbers_BN = place.prefix.new_zeros(batch_size, grammar.num_numbers)
         ones_B = torch.ones_like(place.prefix)

@@ -27,7 +27,7 @@ def check_positions(
     num_tokens: int,
     way_out: str = "shorten the instruction or give a smaller --policy.chunk_size",
 ) -> None:
-    """A text model of this config can read so many tokens.
+    """Check that a text model of this config can read so many tokens.
 
     Raises:
         ValueError: it has fewer positions.

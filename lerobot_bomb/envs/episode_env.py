@@ -132,7 +132,7 @@ class EpisodeEnv[SpecT: Any, RunT, ResultT: ResultLine](gymnasium.Env[Observatio
         """Start the spec's episode as `_current_run`; its first observation and info."""
 
     def _check(self, action: np.ndarray) -> np.ndarray:
-        """(D,) floats, a copy that the caller can no longer change; a ValueError if they are no action."""
+        """Return a copy of an action (D,) as floats; raise a ValueError if it is no action."""
         space, given = self.action_space, np.array(action)
         if given.shape != space.shape:
             raise ValueError(f"action has shape {given.shape}, expected {space.shape}")

@@ -125,7 +125,7 @@ def _measures(
 
 
 def measure_difference(first: str, second: str, rows: dict[str, SmoothnessRow]) -> Difference:
-    """The second one's means minus the first one's, episodes drawn as pairs, those of one seed together.
+    """Subtract the first row's means from the second's; pairs of episodes of one seed are drawn together.
 
     Raises:
         ValueError: they have no episode in common.

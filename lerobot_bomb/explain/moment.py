@@ -26,7 +26,7 @@ OBSERVATION = "observation"
 
 @dataclass(frozen=True)
 class Asked:
-    """Changes of a moment that are asked about."""
+    """Changes to make to a moment, one by one, to measure their effects."""
 
     grid: int  # cells along a side of each image
     fill: str  # of FILLINGS

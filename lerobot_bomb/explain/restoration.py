@@ -1,4 +1,4 @@
-"""Restoration of clean activations, one at a time: where in a language model does a changed input tell?
+"""Restoration of clean activations, one at a time: where in a language model does an input matter?
 
 R(u) = (score with unit u put back - corrupt score) / (clean score - corrupt score), as in the study that BOMB
 comes from: 1 where a unit brings back all of the clean answer's score, 0 where nothing of it.

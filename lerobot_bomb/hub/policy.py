@@ -1,4 +1,4 @@
-"""Hub side of our policies: one commit with a card out, clear errors in."""
+"""Policies on the Hub: one commit with a card out, clear errors in."""
 
 import logging
 from collections.abc import Collection

@@ -194,7 +194,7 @@ def _dtype(name: Any, *_: Any) -> _Dtype:
 
 
 def _ordered(name: str, version: int, order: Any, *others: Any) -> np.dtype:
-    """A dtype with the byte order of its state, which for plain numbers says nothing else."""
+    """Return a dtype with the byte order of its state, which for plain numbers says nothing else."""
     if order not in ("<", ">", "|", "=") or others != (None, None, None, -1, -1, 0):
         raise pickle.UnpicklingError("an array of LeRobot's client has plain numbers")
     return np.dtype(name).newbyteorder(order)

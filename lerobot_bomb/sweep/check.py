@@ -12,7 +12,7 @@ RENAMED = {"--env.task=": "--tasks=", "--policy.ignore_environment=": "--env.ign
 
 
 def check(manifest: Manifest, begun: Sequence[Cell] = ()) -> None:
-    """LeRobot reads the flags of every cell, and no policy was trained for another environment.
+    """Check that LeRobot reads every cell's flags, and that no policy was trained for another environment.
 
     Whoever has begun a cell has checked those that differ from it in their conditions only.
 

@@ -78,7 +78,7 @@ def _grown(folder: Path, there: Manifest | None, wanted: Manifest, batch_size: i
 
 
 def _with_rest(cell: Cell, there: Manifest, batch_size: int) -> list[Cell]:
-    """A cell as those that are there from its seed on, and one of the seeds that they lack.
+    """Split a cell into the cells that are there from its seed on, and one of the seeds that they lack.
 
     Raises:
         ValueError: such a cell would start its episodes otherwise.

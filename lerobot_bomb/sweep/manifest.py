@@ -100,7 +100,7 @@ class Manifest:
 
     @classmethod
     def read(cls, folder: Path) -> "Manifest":
-        """The one in a folder.
+        """Read the manifest in a folder.
 
         Raises:
             FileNotFoundError: there is none.

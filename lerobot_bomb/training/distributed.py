@@ -18,7 +18,7 @@ def process_number() -> int:
 
 
 def weighed(mean: Tensor, kept: Tensor) -> Tensor:
-    """A process's mean over its elements (), so that the average over processes is that over all elements.
+    """Weigh a process's mean over its elements (): the average over processes is that over all elements.
 
     Otherwise a word or an action would weigh more beside padding. Every process must call it.
 

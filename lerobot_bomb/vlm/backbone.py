@@ -188,7 +188,7 @@ def _check_image_size(own: int, asked: int | None) -> None:
 
 
 def check_family(vlm_model_name: str, *families: str) -> str:
-    """The family of a policy's base model, one of those that it has a backbone for; ``nano`` is the first.
+    """Return the family of a base model, one that the policy has a backbone for; ``nano`` is the first.
 
     Raises:
         OSError: there is no config; the message names the ways out.

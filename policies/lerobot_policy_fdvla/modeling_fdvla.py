@@ -364,7 +364,7 @@ class FdvlaPolicy(RelativeVlaPolicy):
         return self.pointer(states_BKH[:, 0], state_BS)
 
     def _read(self, batch: dict[str, Tensor]) -> Context:
-        """The prompt, once for all sampling steps."""
+        """Read the prompt, once for all sampling steps."""
         rows, is_task_BL = self._prompt(batch)
         return self._context(rows, is_task_BL, self._embeds(batch, rows.ids), len(self.tokens.start))
 
@@ -395,7 +395,7 @@ class FdvlaPolicy(RelativeVlaPolicy):
         return TokenRows.join([*parts.values()]), torch.cat(is_task, dim=1)
 
     def _prompt_parts(self, batch: dict[str, Tensor]) -> dict[str, TokenRows]:
-        """Return the prompt's tokens by what they are of; an image's by its camera."""
+        """Return the prompt's parts by name; an image's name is its camera."""
         task = read_task(batch, self.config.type, self._device)
         parts = {"start": TokenRows.constant(self.tokens.start, task.ids)}
         parts |= {camera: TokenRows.constant(self._image_ids, task.ids) for camera in self._cameras}

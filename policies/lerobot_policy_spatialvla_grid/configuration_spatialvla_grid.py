@@ -245,7 +245,7 @@ class SpatialvlaGridConfig(TokenVlaConfig, PlacesVlaConfig):
         return self._grid_settings(groups)
 
     def _given_groups(self) -> tuple[ActionGroup, ...] | None:
-        """Return the groups of a flag or of the checkpoint; None: names must tell."""
+        """Return the groups of a flag or of the checkpoint; None: only the dims' names can tell."""
         assert self.action_feature is not None
         (num_dims,) = self.action_feature.shape
         if self.action_groups is not None:

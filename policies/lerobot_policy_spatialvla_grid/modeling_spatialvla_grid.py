@@ -119,7 +119,7 @@ class SpatialvlaGridPolicy(TokenVlaPolicy):
 
     @classmethod
     def _prepare(cls, config: SpatialvlaGridConfig, meta: LeRobotDatasetMetadata | None) -> None:
-        """Prepare as the others do; grids are as they were, or adapt to the new data."""
+        """Prepare as other policies do; grids are as they were, or adapt to the new data."""
         complete_depth(config, meta)
         config.check_template_as_trained()
         config.check_grid_as_trained(is_refitted=meta is not None and config.adapt_embeddings)
@@ -129,7 +129,7 @@ class SpatialvlaGridPolicy(TokenVlaPolicy):
     def _load_as_safetensor(
         cls, model: "SpatialvlaGridPolicy", model_file: str, map_location: str, strict: bool
     ) -> "SpatialvlaGridPolicy":
-        """Load as the others do, and the ZoeDepth of ``depth_model_name`` where the checkpoint has none."""
+        """Load as other policies do, with the ZoeDepth of ``depth_model_name`` where the file has none."""
         if model.zoedepth is not None and not holds_module(Path(model_file), "zoedepth"):
             model.zoedepth = load_zoedepth(model.config.depth_model_name)
             model.may_lack = ("zoedepth",)
@@ -185,7 +185,7 @@ class SpatialvlaGridPolicy(TokenVlaPolicy):
         return sorted({*binary, *super()._newest_only()})
 
     def _get_default_peft_targets(self) -> dict[str, Any]:
-        """The original's: linear layers of text and vision model, projector, Ego3D; and the cells whole."""
+        """Return the original's targets: linear layers of text, vision, projector and Ego3D; cells whole."""
         others = [PROJECTOR]
         if not self.config.freeze_vision_encoder:
             others.append(VISION_LAYERS)
@@ -194,7 +194,7 @@ class SpatialvlaGridPolicy(TokenVlaPolicy):
         return peft_targets(self, "language_model", CELL_TABLES, others)
 
     def _validate_peft_config(self, peft_config: Any) -> None:
-        """Grids that were adapted are in the adapters' config, so the adapters must hold their cells."""
+        """Check that adapters hold the cells of adapted grids, which are in the adapters' config."""
         super()._validate_peft_config(peft_config)
         if self._num_cells_of_base is None:
             return
@@ -400,7 +400,7 @@ class SpatialvlaGridPolicy(TokenVlaPolicy):
         return TokenRows.join([*self._prompt_parts(batch).values()])
 
     def _prompt_parts(self, batch: dict[str, Tensor]) -> dict[str, TokenRows]:
-        """Return the prompt's parts by what they are of; an image's by its camera."""
+        """Return the prompt's parts by name; an image's name is its camera."""
         tokens = self.tokens
         task = read_task(batch, self.config.type, self._device)
         image = self.backbone.tokens_per_image * [tokens.image]

@@ -289,7 +289,7 @@ class Vla0SmolPolicy(RelativeVlaPolicy, TokenVlaPolicy):
         return TokenRows.join([*self._prompt_parts(batch).values()])
 
     def _prompt_parts(self, batch: dict[str, Tensor]) -> dict[str, TokenRows]:
-        """Return the prompt's parts by what they are of; an image's by its camera."""
+        """Return the prompt's parts by name; an image's name is its camera."""
         tokens = self.tokens
         task = read_task(batch, self.config.type, self._device)
         image = [*tokens.image_start, *self._image_span, *tokens.image_end]

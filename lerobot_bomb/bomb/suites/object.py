@@ -69,7 +69,7 @@ class Supply:
 
 @dataclass(frozen=True)
 class Task:
-    """Task that means one stone: `select` returns its index, or None where it is not the only, clear one."""
+    """Task about one stone in the tray: `select` returns its index, None where it is not clear which."""
 
     stone: str
     select: Callable[[Supply], int | None]

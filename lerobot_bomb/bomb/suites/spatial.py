@@ -61,7 +61,7 @@ class Task(ABC):
 
     @abstractmethod
     def select(self, stones: Stones, anchor: str) -> Cell | None:
-        """The place; None where none or several fit, or it is taken."""
+        """Return the place that is meant; None where none or several fit, or it is taken."""
 
     @abstractmethod
     def referents(self, target: Cell) -> list[list[Cell]]:

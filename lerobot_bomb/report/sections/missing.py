@@ -18,7 +18,7 @@ VIDEOS = "Videos: lerobot-bomb report ... --videos=N plays N failures of each cl
 
 
 def section(report: Report) -> Section:
-    """A line for each."""
+    """Write a line for each part that is missing."""
     is_missing = {
         LANGUAGE: not language.section(report).tables,
         EFFICIENCY: not efficiency.is_measured(report),
