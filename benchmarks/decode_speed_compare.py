@@ -56,7 +56,7 @@ def compare(
 
 
 def print_rows(title: str, figures: dict[str, dict[str, float]]) -> None:
-    """A table of rows of figures."""
+    """Print a table of rows of figures."""
     print()
     header = next(iter(figures.values()))
     print_table(

@@ -195,7 +195,7 @@ def measure(variant: str, word: str, meant: tuple[float, float], points_ND: Tens
 
 
 def print_rows(rows: list[Row], cpu_s: dict[str, float]) -> None:
-    """A table, a line for each variant and word."""
+    """Print a table, a row for each variant and word."""
     header = [
         "", "word", "left", "right", "error of means", "error of spreads", "bars", "CPU s",
     ]  # fmt: skip

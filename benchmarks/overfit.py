@@ -114,7 +114,7 @@ def prove(args: argparse.Namespace, folder: Path) -> int:
 
 
 def record(dataset: Path, images: Iterable[str] = PICTURES) -> None:
-    """The expert's episodes: one seed, eight targets; ``images``: flags, without their dashes."""
+    """Record the expert's episodes: one seed, eight targets; ``images``: flags, without their dashes."""
     run_command(
         "lerobot-bomb",
         "record",

@@ -140,7 +140,7 @@ def play(folder: Path, episodes: int) -> tuple[list[float], int]:
 
 
 def print_contenders(contenders: list[Contender]) -> None:
-    """One line each, the best first."""
+    """Print a line for each contender, the best first."""
     print_table(
         ["policy", "mean maximal coverage", "successes", "steps", "minutes", "CPU min"],
         [

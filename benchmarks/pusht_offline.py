@@ -179,7 +179,7 @@ def learn_to_see(policy_type: str, dataset: Path, folder: Path) -> list[str]:
 
 
 def train(run: Run, policy_type: str, dataset: Path, flags: list[str]) -> None:
-    """Stock `lerobot-train`; a training that was killed starts anew."""
+    """Run stock `lerobot-train`; a training that was killed starts anew."""
     if run.times_path.exists():
         return
     shutil.rmtree(run.folder, ignore_errors=True)

@@ -53,7 +53,7 @@ def shared_data() -> Path:
 
 
 def stop_fork_server() -> None:
-    """Worker processes get its environment variables, which are those of its start."""
+    """Stop the fork server, whose workers get the environment variables of its start."""
     from multiprocessing import forkserver
 
     server: Any = forkserver._forkserver
@@ -168,7 +168,7 @@ def pytest_addoption(parser: pytest.Parser) -> None:
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
-    """The slowest files first, the others as they are."""
+    """Sort the slowest files to the front, and leave the others as they are."""
     places = {name: place for place, name in enumerate(SLOWEST_FILES)}
     items.sort(key=lambda item: places.get(item.path.stem, len(places)))
 

@@ -76,7 +76,7 @@ def paligemma(policy: Any, columns: list[int]) -> None:
 
 
 def qwen(policy: Any, columns: list[int]) -> None:
-    """Prompt and noisy actions in one pass, without a cache."""
+    """Let the stock model read prompt and noisy actions in one pass, without a cache."""
     backbone, read = policy.backbone, {}
 
     def run(embeds: Tensor, bias: Tensor) -> Tensor:

@@ -41,7 +41,7 @@ FEATURES = {"observation.images.workspace", "observation.images.wrist", "observa
 
 @pytest.fixture(autouse=True)
 def small_blocks(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Blocks of 2 episodes, so that a short recording is merged from several."""
+    """Write blocks of 2 episodes, so that a short recording is merged from several."""
     monkeypatch.setattr(resumable, "BLOCK_EPISODES", 2)
 
 

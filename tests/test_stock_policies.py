@@ -72,7 +72,7 @@ def evaluate(run: Run, checkpoint: Path, folder: Path, *flags: str) -> list[Row]
 
 
 def check_weights(stock_type: str, checkpoint: Path, folder: Path) -> None:
-    """The base's after one small step, and loaded as saved: some types only print that they could not."""
+    """Check weights: the base's after one small step, and loaded as saved; some types only print failures."""
     trained = load_file(checkpoint / "model.safetensors")
     if stock_type not in FROM_SCRATCH:
         for name, weights in load_file(folder / BASE / "model.safetensors").items():

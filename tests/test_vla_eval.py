@@ -166,7 +166,7 @@ def test_a_missing_checkpoint_ends_it_in_one_line(
 
 
 def write_libero_policy(folder: Path) -> None:
-    """An untrained one of what LIBERO's demonstrations show."""
+    """Write an untrained policy of what LIBERO's demonstrations show."""
     register_third_party_plugins()
     shapes = {key: shape for key, shape in SEEN_IN_LIBERO.items() if key != ACTION}
     kinds = {key: FeatureType.STATE if key == OBS_STATE else FeatureType.VISUAL for key in shapes}

@@ -144,7 +144,7 @@ def train(folder: Path) -> None:
 
 
 def main(folder: Path) -> None:
-    """Import once, then fork."""
+    """Import once, then fork the processes."""
     from accelerate import debug_launcher
     from lerobot.scripts import lerobot_train  # noqa: F401
 

@@ -222,7 +222,7 @@ def _add_marks(spec: mujoco.MjSpec) -> None:
 
 
 def _add_pattern(spec: mujoco.MjSpec) -> None:
-    """The small board in the tray, hidden unless an episode shows a pattern on it."""
+    """Add the small board in the tray, hidden unless an episode shows a pattern on it."""
     half, height_m = PATTERN_HALF_SIZE_M, BOARD.thickness_m + PATTERN_THICKNESS_M
     spec.worldbody.add_geom(
         spec.find_default("visual"),

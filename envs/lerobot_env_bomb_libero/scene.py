@@ -157,7 +157,7 @@ class LiberoScene(LiberoEnv):
         return found
 
     def change_texture(self, texture: int, change: Callable[[np.ndarray], np.ndarray]) -> None:
-        """(H, W, 3) uint8 of a texture -> the same; undone by the next reset."""
+        """Change a texture, (H, W, 3) uint8 -> (H, W, 3) uint8; the next reset undoes it."""
         pixels = self._pixels_of(texture)
         self._textures.setdefault(texture, pixels.copy())
         pixels[:] = change(pixels)
@@ -241,7 +241,7 @@ class LiberoScene(LiberoEnv):
             observable._sensor = self._drawn_if_on(observable._sensor)
 
     def _place(self) -> None:
-        """Robosuite's reset; LIBERO's wrapper around it tries again for ever, whatever goes wrong."""
+        """Reset robosuite itself; LIBERO's wrapper around it tries again for ever, whatever goes wrong."""
         from robosuite.utils.errors import RandomizationError
 
         while True:
@@ -286,7 +286,7 @@ class LiberoScene(LiberoEnv):
             self._draws = True
 
     def _remember(self) -> None:
-        """The model as compiled."""
+        """Remember the model as compiled."""
         model = self.model
         self._compiled = {name: getattr(model, name).copy() for name in EDITED}
         headlight = model.vis.headlight

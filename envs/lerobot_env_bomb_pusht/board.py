@@ -108,7 +108,7 @@ class Board(PushTEnv):
         return pygame.Surface((BOARD_PX, BOARD_PX))
 
     def _draw_outline(self, screen: pygame.Surface) -> None:
-        """A line around the target."""
+        """Draw a line around the target."""
         goal = self.get_goal_pose_body(self.goal_pose)
         bar, stem = (shape.get_vertices() for shape in self._block_shapes)
         corners = tee_outline(np.array(bar), np.array(stem))

@@ -257,7 +257,7 @@ class ActionGrids(nn.Module):
         self._set_centroids(torch.zeros(0, self.num_dims, dtype=torch.float64))
 
     def _set_centroids(self, actions_ND: Tensor) -> None:
-        """Mean action of the samples in each cell; where there are none, what `means` say."""
+        """Set each cell's centroid to the mean of its samples; without samples, to what `means` say."""
         self.centroids.copy_(self._cond_means())
         cells_NG = self.encode(actions_ND.to(self.edges.device)).cpu()
         for i, group in enumerate(self.groups):

@@ -29,7 +29,7 @@ class OrientationCheck:
         self._is_done = False
 
     def compare(self, shown: np.ndarray, task: str) -> None:
-        """Images of the environment, (N, H, W, 3) uint8, in episodes of a task of the suite."""
+        """Compare with images of the environment, (N, H, W, 3) uint8, in episodes of a task of the suite."""
         asked = None if self._is_done else asked_config()
         if asked is None:
             return

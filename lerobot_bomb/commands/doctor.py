@@ -184,7 +184,7 @@ CHECKS: tuple[Callable[[], Iterator[Finding]], ...] = (
 
 
 def add_doctor_arguments(parser: argparse.ArgumentParser) -> None:
-    """``lerobot-bomb doctor`` has no arguments."""
+    """Declare no arguments: ``lerobot-bomb doctor`` has none."""
 
 
 def run_doctor(args: argparse.Namespace) -> int:

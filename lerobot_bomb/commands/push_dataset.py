@@ -111,7 +111,7 @@ def dataset_card(repo_id: str, facts: DatasetFacts) -> str:
 
 
 def _tag(repo_id: str, version: str) -> None:
-    """LeRobot loads the commit that has the version's tag."""
+    """Tag the commit with the version: LeRobot loads the one that has its tag."""
     api = HfApi()
     with suppress(RevisionNotFoundError):
         api.delete_tag(repo_id, tag=version, repo_type="dataset")

@@ -426,6 +426,6 @@ class TokenVlaPolicy(VlaPolicy):
 
 
 def _take_action_names(config: Any, meta: LeRobotDatasetMetadata | None) -> None:
-    """The dataset's names in one row; LeRobot keeps only those of groups where a dataset groups them."""
+    """Take the dataset's names of dims in one row; of grouped names LeRobot keeps only the groups'."""
     if config is not None and meta is not None:
         config.action_feature_names = dim_names(meta.features[ACTION])

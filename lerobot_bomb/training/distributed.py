@@ -43,7 +43,7 @@ class SavesTiedWeightsOnce(nn.Module):
     config: Any
 
     def _save_pretrained(self, save_directory: Path, state_dict: dict[str, Tensor] | None = None) -> None:
-        """LeRobot 0.6.1 gives what it gathered of a sharded policy; from 0.6.2 on all processes call this."""
+        """Save a policy: LeRobot 0.6.1 gives a gathered state; from 0.6.2 on all processes call this."""
         if state_dict is None and isinstance(self, FSDPModule):
             whole = StateDictOptions(full_state_dict=True, cpu_offload=True)
             state_dict = cast("dict[str, Tensor]", get_model_state_dict(self, options=whole))

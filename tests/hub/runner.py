@@ -49,7 +49,7 @@ def run(commands: Sequence[Sequence[str]], endpoint: str, home: Path, token: str
 
 
 def only_loopback(event: str, args: tuple) -> None:
-    """An audit hook: whoever looks up or connects to another machine ends this process."""
+    """End this process when anything looks up or connects to another machine: an audit hook."""
     if event == "socket.getaddrinfo":
         host = args[0]
     elif event == "socket.connect" and isinstance(args[1], tuple):
