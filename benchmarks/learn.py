@@ -214,7 +214,7 @@ def locked(folder: Path) -> Iterator[None]:
 
 
 def record(task: Task, demonstrations: int, dataset: Path) -> None:
-    """The expert's episodes; and static scenes, merged with them."""
+    """Record the expert's episodes, and static scenes, merged with them."""
     if dataset.exists():
         return
     if not task.static:
@@ -239,7 +239,7 @@ def record(task: Task, demonstrations: int, dataset: Path) -> None:
 
 
 def record_part(task: Task, dataset: Path, *number: str) -> None:
-    """One recording of the task."""
+    """Make one recording of the task."""
     task_ids = shown_pairs() if task.is_partial else task.task_ids
     task_flags = [f"--task_ids={list(task_ids)}"] if task_ids else []
     resume = ["--resume"] if dataset.with_name(f"{dataset.name}.recording").exists() else []
@@ -300,7 +300,7 @@ def probe_recipe() -> list[str]:
 
 
 def checkpoints(folder: Path) -> dict[int, Path]:
-    """{training step: folder}."""
+    """Return the checkpoints, {training step: folder}."""
     paths = sorted((folder / "train" / "checkpoints").glob("[0-9]*"))
     return {int(path.name): path / "pretrained_model" for path in paths}
 

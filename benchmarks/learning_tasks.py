@@ -1,4 +1,4 @@
-"""What is to be learnt on one CPU core, and what each policy type gets for it: the tasks of learn.py."""
+"""Tasks of learn.py: what is to be learnt on one CPU core, and what each policy type gets for it."""
 
 from dataclasses import dataclass
 
@@ -24,7 +24,7 @@ LEFT_OUT_PAIRS = {
 
 @dataclass(frozen=True)
 class Bar:
-    """What the last checkpoint must reach."""
+    """Bar that the last checkpoint must reach."""
 
     success: float  # rate
     cpu_minutes: float  # of the training
@@ -32,7 +32,7 @@ class Bar:
 
 @dataclass(frozen=True)
 class Training:
-    """What one policy type gets to learn a task."""
+    """Training that one policy type gets to learn a task."""
 
     demonstrations: int
     bar: Bar | None  # None: it is only measured
@@ -41,7 +41,7 @@ class Training:
 
 @dataclass(frozen=True)
 class Task:
-    """What is to be learnt: which of the tasks, under which perturbations, and what each type gets for it."""
+    """Task to be learnt: its task ids, its perturbations, and the training of each policy type."""
 
     task_ids: tuple[int, ...]  # empty: target and colour are drawn for each episode
     episodes: int  # of each evaluation

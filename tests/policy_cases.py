@@ -1,4 +1,4 @@
-"""Every policy type's own cases: tiny policies (`make_policy`) and batches for them (`make_batch`)."""
+"""Cases of every policy type: tiny policies (`make_policy`) and batches for them (`make_batch`)."""
 
 from pathlib import Path
 from typing import Any

@@ -95,7 +95,7 @@ def fields_of(env: Any) -> dict[str, np.ndarray]:
 
 
 def make_current(stock: Any) -> None:
-    """robosuite draws, and frees what it drew with, in whichever OpenGL context is current."""
+    """Make the context current: robosuite draws, and frees, in whichever OpenGL context is."""
     stock._env.sim._render_context_offscreen.gl_ctx.make_current()
 
 

@@ -72,7 +72,7 @@ def cells_in(text: str) -> list[Cell]:
 
 
 def is_done(said: list[str], board: Board, pattern: Board, end: Board) -> bool:
-    """Whether the end is what a reader of the sentences, who knows nothing of the suites, would make."""
+    """Return True if the end is what a reader of the sentences, who knows no suite, would make."""
     text = " ".join(said).lower()
     if "off the board" in text:
         if found := re.search(r"take the (black|white) stone", text):
@@ -122,7 +122,7 @@ def is_done(said: list[str], board: Board, pattern: Board, end: Board) -> bool:
 
 
 def board_at_end(episode: PerturbedEpisode) -> Board:
-    """After the moves of the expert."""
+    """Return the board after the moves of the expert."""
     board = board_at_start(episode)
     stands = {stone: place for stone, place in standing(episode).items() if place in board}
     for aim in episode.aims:

@@ -1,4 +1,4 @@
-"""What `lerobot-bomb convert pusht-zarr` refuses, before it writes anything, and how it says so."""
+"""Refusals of `lerobot-bomb convert pusht-zarr`, before it writes anything, and how it words them."""
 
 import shutil
 import sys

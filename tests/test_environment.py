@@ -42,7 +42,7 @@ ABSOLUTE = Environment(
 
 
 def write_dataset(root: Path, bomb: dict[str, Any] | None, specs: Sequence[str | None] | None) -> Path:
-    """What LeRobot's tools leave of a recording's metadata: two episodes, with or without our columns."""
+    """Write what LeRobot's tools leave of a recording's metadata: two episodes, our columns or not."""
     (root / "meta" / "episodes").mkdir(parents=True)
     (root / "meta" / "info.json").write_text(json.dumps(INFO))
     if bomb is not None:

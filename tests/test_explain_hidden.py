@@ -34,7 +34,7 @@ def hidden_word(policy: LoadedPolicy, word: str) -> Tensor:
 
 
 def columns_of(question: Question, hidden_1S: Tensor) -> list[int]:
-    """Of the whole prompt."""
+    """Return the columns of hidden words in the whole prompt."""
     names = question.explained._names  # pyright: ignore[reportAttributeAccessIssue]
     first = int((question.rows["part"][0] == names.index("instruction")).nonzero()[0])
     return (first + hidden_1S[0].nonzero()[:, 0]).tolist()
@@ -76,7 +76,7 @@ def paligemma(policy: Any, columns: list[int]) -> None:
 
 
 def qwen(policy: Any, columns: list[int]) -> None:
-    """Prompt and noisy actions in one pass, without a cache."""
+    """Let the stock model read prompt and noisy actions in one pass, without a cache."""
     backbone, read = policy.backbone, {}
 
     def run(embeds: Tensor, bias: Tensor) -> Tensor:
@@ -146,7 +146,7 @@ def test_the_stock_model_agrees_where_nothing_is_hidden(name: str) -> None:
 
 
 def hidden_batch(policy: LoadedPolicy, word: str) -> dict[str, Any]:
-    """What a whole episode under the mask of a word has in place of this observation."""
+    """Return the batch that an episode under the mask of a word has in place of this observation."""
     observation, instruction, _, _ = moment()
     mask = without_words(policy, {instruction: span_of(word, instruction)}.get)
     prepared = policy.prepare(policy.observe([observation], [instruction]))
@@ -199,7 +199,7 @@ def chosen_by_graphs(policy: Any, batch: dict[str, Any]) -> Tensor:
 )
 @pytest.mark.parametrize("word", ["3", "row 1, column 3"])
 def test_captured_passes_hide_the_same(name: str, by_graphs: Callable[..., Tensor], word: str) -> None:
-    """After a prompt of which nothing was hidden."""
+    """Check a pass after a prompt of which nothing was hidden."""
     policy = loaded(name)
     batch = hidden_batch(policy, word)
     answer = explained_by(policy).answer(batch)

@@ -35,7 +35,7 @@ def train_alike(
 
 
 def wake_dualmod(policy: FdvlaPolicy) -> FdvlaPolicy:
-    """As after some training: pooled states do change the features."""
+    """Wake the heads as some training would: pooled states do change the features."""
     torch.manual_seed(1)
     for head in (policy.flow_head, policy.denoise_head):
         if head is not None and head.film is not None:
@@ -191,7 +191,7 @@ def test_a_head_of_words_that_is_no_embedding_is_frozen() -> None:
 
 @torch.no_grad()
 def test_heads_say_the_same_in_training_and_in_sampling(monkeypatch: pytest.MonkeyPatch) -> None:
-    """At the same noisy actions and time, whatever else is in the batch."""
+    """Compare at the same noisy actions and time, whatever else is in the batch."""
     policy = wake_dualmod(make_policy(draws_per_chunk=1))
     batch = make_batch(policy, 3)
     point = fixed_point(batch)
@@ -303,7 +303,7 @@ def test_images_instruction_state_and_time_matter() -> None:
 
 @pytest.mark.parametrize("dtype", ["float32", "bfloat16"])
 def test_attention_in_bfloat16_has_plain_gradients_on_a_cpu(dtype: str) -> None:
-    """Those of torch's fused attention take four to ten times as long there."""
+    """Check that the slow path is avoided: torch's fused attention takes four to ten times as long there."""
     query = torch.ones(1, 1, 2, 8, requires_grad=True)
     with make_policy(dtype=dtype)._autocast():
         attended = scaled_dot_product_attention(query, query, query)

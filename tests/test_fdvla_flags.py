@@ -1,4 +1,4 @@
-"""What `fdvla` refuses, what it does without, and what follows from flags that are not given."""
+"""Flags of `fdvla`: what it refuses, what it does without, what follows from flags that are not given."""
 
 import math
 import re
@@ -145,7 +145,7 @@ def test_every_part_is_counted() -> None:
 
 @pytest.mark.parametrize("tasks", [("", ""), ("", "go")])
 def test_an_environment_may_name_no_task(tasks: tuple[str, ...]) -> None:
-    """As PushT does: its text is empty."""
+    """Check the empty text, which PushT gives."""
     policy = make_policy()
     batch = make_batch(policy, 2, tasks=tasks)
     assert policy(batch)[0].isfinite()

@@ -38,7 +38,7 @@ def pointing_batch(policy: FdvlaPolicy, batch_size: int = 4) -> dict[str, Any]:
 
 
 def wake_feedback(policy: FdvlaPolicy) -> FdvlaPolicy:
-    """As after some training: what is pointed at does change the actions."""
+    """Wake the feedback as some training would: what is pointed at does change the actions."""
     assert policy.pointer is not None
     torch.manual_seed(1)
     torch.nn.init.normal_(policy.pointer.feedback[-1].get_parameter("weight"), std=0.5)

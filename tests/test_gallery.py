@@ -43,7 +43,7 @@ def tile(sheet: Sheet, drawn: np.ndarray, row: int, column: int) -> np.ndarray:
 
 
 def start(axis: str, level: int, seed: int) -> tuple[dict[str, np.ndarray], str]:
-    """Both cameras' images at the start of an episode, and its instruction."""
+    """Return both cameras' images at the start of an episode, and its instruction."""
     env = make_env(EpisodeSpec(seed, perturbations=f"{axis}:{level}"), OPTIONS)
     observation, _ = env.reset(seed=seed)
     instruction = env.get_wrapper_attr("task_description")

@@ -22,7 +22,7 @@ VIDEO = "videos/observation.images.wrist/chunk-000/file-000.mp4"
 
 @pytest.fixture(autouse=True)
 def small_blocks(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Blocks of 2 episodes, so that 5 take three."""
+    """Write blocks of 2 episodes, so that 5 take three."""
     monkeypatch.setattr(resumable, "BLOCK_EPISODES", 2)
 
 

@@ -42,7 +42,7 @@ def make_policy() -> KeypointProbePolicy:
 
 
 def raw_batch(*instructions: str) -> dict[str, Any]:
-    """What the environment gives, true state included."""
+    """Draw what the environment gives, true state included."""
     generator = torch.Generator().manual_seed(1)
     shapes = dict.fromkeys(CAMERAS, (3, SIZE, SIZE))
     shapes |= {OBS_STATE: (4,), "observation.environment_state": (96,)}
@@ -72,7 +72,7 @@ def test_a_keypoint_is_where_the_heat_is(column: int, line: int, x: float, y: fl
 
 
 def test_keypoints_follow_what_moves() -> None:
-    """By a multiple of the strides, far from the edges, the image and its heat maps move alike."""
+    """Check that image and heat maps move alike, by a multiple of the strides, far from the edges."""
     torch.manual_seed(0)
     encoder = KeypointEncoder(num_keypoints=4, num_channels=8, initial_sharpness=5.0)
     image = torch.full((1, 3, 96, 96), 0.5)

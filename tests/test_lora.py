@@ -156,7 +156,7 @@ def test_adapters_are_trained_resumed_and_evaluated_by_stock_commands(
 
 
 def check_merged(adapters: Path, output: Path) -> None:
-    """It acts as they do, and needs no base."""
+    """Check that the merged policy acts as base and adapters do, and needs no base."""
     config = read_config(adapters, "cpu")
     wrapped = make_policy(config, env_cfg=make_env_config("bomb", image_size=64)).eval()
     assert main(["merge", f"--policy.path={adapters}", f"--output={output}"]) == 0

@@ -33,7 +33,7 @@ type Place = tuple[float, float]  # metres
 
 @dataclass
 class View:
-    """What can be seen."""
+    """View of all that can be seen."""
 
     text: str  # what is said
     state: PrivilegedState  # its stones in a drawn order, its goals none
@@ -98,7 +98,7 @@ def cells_in(text: str) -> list[Cell]:
 
 
 def next_move(text: str, view: View) -> Next:
-    """What a reader of an unperturbed instruction does next."""
+    """Return the next move of someone who reads an unperturbed instruction."""
     if re.search(r"clear row|off the board|take back", text):
         return next_removal(text, view)
     if found := re.search(r"capture the (?:\d )?(\w+) stones?.*: play (\w+)", text):
@@ -182,7 +182,7 @@ def next_of_swap(colors: tuple[str, str], cells: list[Cell], view: View) -> Next
 
 
 def named_stone(text: str, view: View) -> int:
-    """Of those in the tray."""
+    """Return the stone in the tray that the instruction names."""
     xy = {stone: view.xyz(stone)[:2] for stone in view.in_tray}
     if "nearest to the gripper" in text:
         return min(xy, key=lambda stone: float(np.hypot(*(xy[stone] - view.state.gripper_xyz[:2]))))
@@ -234,7 +234,7 @@ def goals_of_reader(view: View) -> tuple[Goal, ...]:
 
 
 def own_place(xy: np.ndarray) -> Place:
-    """Where a stone that rests was put: an intersection, a place in the tray, or just there."""
+    """Return the place of a stone that rests: an intersection, a place in the tray, or just there."""
     places = [*map(of_cell, CELLS), *TRAY_XY_M]
     return next((place for place in places if np.hypot(*(xy - place)) < 0.006), (float(xy[0]), float(xy[1])))
 

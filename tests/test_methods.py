@@ -1,4 +1,4 @@
-"""Beside every rate stands what the policy does: by its config, in the pages and on the model card."""
+"""Methods beside every rate: what the policy does by its config, in the pages and on the model card."""
 
 import re
 from pathlib import Path
@@ -38,7 +38,7 @@ def of_shipped(name: str) -> str:
 
 
 def tables(page: str) -> list[list[list[str]]]:
-    """Each as rows of cells, the header first."""
+    """Return each table of a page as rows of cells, the header first."""
     found: list[list[list[str]]] = [[]]
     for line in (ROOT / page).read_text().splitlines():
         if not line.startswith("|"):

@@ -85,7 +85,7 @@ def test_tasks_in_threads_are_played_in_turn(
 def test_metaworld_is_played(
     policy_type: str, stock_cli: Callable[..., None], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Three steps each of two episodes."""
+    """Run three steps each of two episodes."""
     from lerobot_env_mujoco.backend import ensure_gl_backend
 
     ensure_gl_backend()  # before metaworld imports MuJoCo

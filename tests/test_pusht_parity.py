@@ -105,7 +105,7 @@ def test_the_environment_passes_the_recorded_states(routes: Routes) -> None:
 
 
 def test_targets_are_the_recorded_actions(routes: Routes) -> None:
-    """Written as residuals and read with the state of evaluation: what was recorded, within half a bin."""
+    """Check residuals, read with the state of evaluation: they are what was recorded, within half a bin."""
     policy: Any = routes.evaluation.policy
     actions, num_compared = routes.recorded.actions, 0
     for trained, evaluated in routes.frames():

@@ -111,7 +111,7 @@ def test_padding_changes_nothing_wherever_it_is(nano: QwenBackbone) -> None:
 
 @torch.no_grad()
 def test_a_segment_goes_on_as_the_stock_model_would(nano: QwenBackbone) -> None:
-    """In one causal forward pass over prefix and segment, without a cache."""
+    """Compare with one causal forward pass over prefix and segment, without a cache."""
     ids, written = padded(prompt_rows(nano, TASKS[:1]))
     embeds, is_image = embed(nano, ids, as_pixels(draw_images(2)))
     segment = torch.randn(1, 6, 128)

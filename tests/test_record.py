@@ -41,13 +41,13 @@ FEATURES = {"observation.images.workspace", "observation.images.wrist", "observa
 
 @pytest.fixture(autouse=True)
 def small_blocks(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Blocks of 2 episodes, so that a short recording is merged from several."""
+    """Write blocks of 2 episodes, so that a short recording is merged from several."""
     monkeypatch.setattr(resumable, "BLOCK_EPISODES", 2)
 
 
 @pytest.fixture(scope="module")
 def datasets(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
-    """Two uninterrupted recordings."""
+    """Make two uninterrupted recordings."""
     roots = {name: tmp_path_factory.mktemp("recorded") / name for name in ("video", "images")}
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(resumable, "BLOCK_EPISODES", 2)

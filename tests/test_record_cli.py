@@ -90,7 +90,7 @@ def wait_for_moment(process: subprocess.Popen, root: Path, reference: Reference,
 
 
 def check_blocks(root: Path, blocks: dict[str, dict[str, bytes]]) -> None:
-    """Finished blocks stay as they are; updates `blocks`."""
+    """Check that finished blocks stay as they are; update `blocks`."""
     now = {block.name: contents(block) for block in finished_blocks(unfinished_folder(root))}
     assert {name: now.get(name) for name in blocks} == blocks
     blocks.update(now)

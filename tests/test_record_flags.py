@@ -296,7 +296,7 @@ def test_a_target_outside_the_split_is_refused(tmp_path: Path, capsys: pytest.Ca
 
 @pytest.mark.parametrize("command", ["record", "view"])
 def test_an_episode_has_the_flags_of_the_environment(command: str) -> None:
-    """Both commands and --env.type=bomb: one set of names, with the same defaults."""
+    """Check both commands against --env.type=bomb: one set of names, with the same defaults."""
     parser = argparse.ArgumentParser()
     module = importlib.import_module(f"lerobot_bomb.commands.{command}")
     getattr(module, f"add_{command}_arguments")(parser)

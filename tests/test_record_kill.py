@@ -85,7 +85,7 @@ def resume_flag(root: Path) -> list[str]:
 
 
 def check_after_kill(root: Path, blocks: dict[str, dict[str, bytes]], reference: Reference) -> None:
-    """Finished blocks stay as they are, and a dataset appears complete or not at all; updates `blocks`."""
+    """Check that finished blocks stay, and that a dataset appears whole or not at all; update `blocks`."""
     if root.exists():
         assert contents(root) == reference.contents
     else:

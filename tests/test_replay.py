@@ -41,7 +41,7 @@ def results(tmp_path_factory: pytest.TempPathFactory) -> Callable[..., Path]:
 
 
 def rewritten(path: Path, file: Path, **changes: Any) -> Path:
-    """Its first line with other values."""
+    """Write the file's first line with other values."""
     values = json.loads(path.read_text().splitlines()[0])
     file.write_text(json.dumps(values | changes) + "\n")
     return file

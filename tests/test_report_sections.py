@@ -63,7 +63,7 @@ def report(tmp_path: Path) -> Callable[..., dict[str, Any]]:
 
 
 def columns(table: dict[str, Any]) -> list[dict[str, Any]]:
-    """Its rows by the names of their columns."""
+    """Return the table's rows by the names of their columns."""
     return [dict(zip(table["header"], row, strict=True)) for row in table["rows"]]
 
 
@@ -262,7 +262,7 @@ def test_lines_of_before_have_no_such_section_and_are_told_so(report: Callable[.
 
 
 def told_otherwise(num_deaf: int) -> Rows:
-    """Twelve episodes as told, and told otherwise; so many of these end as if nothing had been said."""
+    """Make twelve episodes as told, and told otherwise; of these, `num_deaf` end as if told nothing."""
     rows = []
     for seed in range(12):
         own = values(seed, policy=FDVLA) | {"target": [2, 2], "nearest_intersection": [2, 2]}
@@ -309,7 +309,7 @@ def test_other_weights_or_no_intervention_say_nothing_of_language(
 
 
 def failing(policy: PolicyIdentity = ACT) -> Rows:
-    """Two classes, of which one is rare, under two conditions."""
+    """Make failures of two classes, one of them rare, under two conditions."""
     classes = [None, "dropped", "dropped", "dropped", "dropped", "dropped", "imprecise"]
     return [
         values(seed, failure, policy=policy, spec={"perturbations": condition})

@@ -62,7 +62,7 @@ def row(seed: int, failure: str | None = None, error: float | None = None, **oth
 
 
 def old_row(seed: int, **other: Any) -> str:
-    """As protocol 1.0 wrote it."""
+    """Write a row as protocol 1.0 did."""
     new = values(seed, **other)
     return json.dumps(
         {name: new[name] for name in new if name not in NEW_CHECKS} | {"protocol_version": "1.0"}
@@ -70,7 +70,7 @@ def old_row(seed: int, **other: Any) -> str:
 
 
 def printed(path: Path, text: str, capsys: pytest.CaptureFixture[str]) -> str:
-    """What `lerobot-bomb results` says of a file."""
+    """Return what `lerobot-bomb results` says of a file."""
     path.write_text(text)
     assert main(["results", str(path)]) == 0
     return capsys.readouterr().out

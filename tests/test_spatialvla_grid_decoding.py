@@ -26,7 +26,7 @@ def test_it_chooses_what_generate_chooses(batch_size: int, num_dims: int) -> Non
 @torch.no_grad()
 @pytest.mark.parametrize("prefix_attention", ["bidirectional", "causal"])
 def test_training_and_decoding_agree(prefix_attention: str) -> None:
-    """What the teacher-forced network finds likeliest, given what was chosen, is what was chosen."""
+    """Check that the teacher-forced network finds likeliest what was chosen, given what was chosen."""
     policy = make_policy(1, 7, prefix_attention=prefix_attention, use_state=True)
     batch = make_batch(policy, 3)
     cells = policy._choose(batch, policy.config.chunk_size)

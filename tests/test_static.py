@@ -44,7 +44,7 @@ LABELS = {f"observation.{name}" for name in COLUMNS}
 
 
 def static_recording() -> Recording:
-    """Four episodes of two scenes, of as many suites."""
+    """Return a recording of four episodes of two scenes, of as many suites."""
     return replace(IMAGES, repo_id="test/static", static=8)
 
 

@@ -35,7 +35,7 @@ def stones_on_board(episode: PerturbedEpisode) -> dict[Cell, str]:
 
 
 def meant_stones(instruction: str, episode: PerturbedEpisode) -> set[int]:
-    """What a reader of the sentence, who knows nothing of the suites, takes from the tray."""
+    """Return the stones that a reader of the sentence, who knows no suite, takes from the tray."""
     layout, supply = episode.layout, list(episode.supply)
     xy = {i: layout.stone_xy[i] for i in supply}
     color = {i: "white" if layout.stone_is_white[i] else "black" for i in supply}
@@ -63,7 +63,7 @@ def meant_stones(instruction: str, episode: PerturbedEpisode) -> set[int]:
 
 
 def meant_places(instruction: str, episode: PerturbedEpisode) -> set[Cell]:
-    """Where that reader puts it."""
+    """Return the places where that reader puts a stone."""
     stones = stones_on_board(episode)
     free = {(row, column) for row in range(5) for column in range(5)} - set(stones)
     if found := re.search(

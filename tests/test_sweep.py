@@ -34,7 +34,7 @@ def small(
 
 
 def lines_of(cell: Cell) -> list[str]:
-    """As many as it has episodes."""
+    """Return as many lines as the cell has episodes."""
     return [json.dumps({"spec": {"seed": seed}}) for seed in cell.seeds]
 
 
@@ -160,7 +160,7 @@ def play(tmp_path: Path) -> Callable[[Manifest], Store]:
 
 
 def by_seed(rows: list[Row]) -> list[Row]:
-    """What is the same whoever plays the episodes."""
+    """Return what is the same whoever runs the episodes."""
     return sorted(map(without_measured, rows), key=lambda row: row["spec"]["seed"])
 
 

@@ -35,7 +35,7 @@ def sweep(*flags: str | Path) -> int:
 
 @pytest.fixture(scope="module")
 def expected_lines(tmp_path_factory: pytest.TempPathFactory) -> str:
-    """Of all cells, played in this process."""
+    """Return the lines of all cells, run in this process."""
     from lerobot_bomb.sweep.worker import Worker
 
     manifest = plan(("bomb_expert",), (), CONDITIONS, seed=7, num_episodes=2, batch_size=2, flags=FLAGS)

@@ -52,7 +52,7 @@ def folder(family: str, tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def policy_of(folder: Path, family: str, **options: Any) -> Vla0SmolPolicy:
-    """It sees whole images, which the batches below have in its own size, and hides nothing."""
+    """Make a policy that sees whole images, whose size the batches below have, and hides nothing."""
     fixed: dict[str, Any] = {"crop_fraction": 1.0, "mask_max_fraction": 0.0}
     return make_policy(vlm_model_name=str(folder), **{**fixed, **options_of(family), **options})
 

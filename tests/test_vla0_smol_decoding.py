@@ -192,7 +192,7 @@ def test_another_size_of_batch_needs_a_reset(options: dict[str, Any]) -> None:
 
 
 def test_in_bfloat16_no_two_digits_are_equally_likely() -> None:
-    """In bfloat16's own head a digit in a dozen is, and argmax takes the lower."""
+    """Check ties: in bfloat16's own head a digit in a dozen has one, and argmax takes the lower."""
     policy = make_policy(dtype="bfloat16", chunk_size=40)
     seen: list[Tensor] = []
 

@@ -55,7 +55,7 @@ def towards(xy: Tensor) -> Tensor:
 
 
 def labelled(policy: Vla0SmolPolicy, numbers: NumberTokens) -> list[list[bool]]:
-    """Of each row, whether all digits of each number carry loss."""
+    """Return for each row and number whether all of its digits carry loss."""
     return numbers.trained[..., 1:].all(dim=2).tolist()
 
 
@@ -258,7 +258,7 @@ def test_an_explanation_is_of_the_whole_answer() -> None:
 
 
 def pointing_dataset(root: Path) -> LeRobotDatasetMetadata:
-    """Two frames; the gripper is in the middle of what the state covers, then at its end."""
+    """Write three frames, their gripper at the low end, in the middle and at the high end of its range."""
     sizes = {PLACE: 2, STONE: 3, OTHER_PLACES: 4, OTHER_ACTIONS: 8}
     features: dict[str, Any] = {
         key: {"dtype": "float32", "shape": (size,), "names": None} for key, size in sizes.items()

@@ -103,7 +103,7 @@ class BombEnvConfig(EnvConfig):
 
     @property
     def suites(self) -> tuple[str, ...]:
-        """Those that are played."""
+        """Suites that are run."""
         return suites_of(str(self.task))
 
     @property
@@ -152,7 +152,7 @@ class BombEnvConfig(EnvConfig):
 
     @property
     def environment(self) -> Environment:
-        """What a policy must have been trained for to act here."""
+        """Environment that a policy must have been trained for to act here."""
         return Environment(
             robot=self.robot,
             control_mode=self.control_mode,
@@ -166,7 +166,9 @@ class BombEnvConfig(EnvConfig):
         )
 
     def get_env_processors(self) -> tuple[PolicyProcessorPipeline, PolicyProcessorPipeline]:
-        """None; every command asks for them once, when its policy is built and nothing has been played.
+        """Return LeRobot's processors, which change nothing, after a check of the policy that acts.
+
+        Every command asks for them once, when its policy is built and no episode has begun.
 
         Raises:
             ValueError: that policy was trained for another environment.

@@ -39,7 +39,7 @@ PERSON_IMAGE_SIZE = 384  # pixels, either half of render()'s image
 
 @dataclass(frozen=True)
 class _Run:
-    """What exists once an episode has been started."""
+    """State of an episode that has been started."""
 
     scene: Scene
     episode: PerturbedEpisode
@@ -98,7 +98,7 @@ class BombEnv(EpisodeEnv[EpisodeSpec, _Run, EpisodeResult]):
         return self._observe(), self._info()
 
     def show_static(self, seed: int) -> tuple[Observation, EpisodeResult]:
-        """The board of a seed's episode as it may stand midway, which cannot be played from there.
+        """The board of a seed's episode as it may stand midway, which cannot be run from there.
 
         The result says which episode it is of; nothing has become of that.
         """
@@ -135,7 +135,7 @@ class BombEnv(EpisodeEnv[EpisodeSpec, _Run, EpisodeResult]):
         return self._observe(), float(run.judge.is_success), terminated, truncated, self._info()
 
     def _draw_for_people(self, run: _Run) -> np.ndarray:
-        """Both cameras, the instruction, how the episode stands."""
+        """Draw both cameras, the instruction, and how the episode stands."""
         images = [self._draw(camera, PERSON_IMAGE_SIZE) for camera in CAMERAS]
         episode = run.episode
         error_mm = run.judge.placement_error_mm
@@ -212,11 +212,11 @@ class BombEnv(EpisodeEnv[EpisodeSpec, _Run, EpisodeResult]):
         }
 
     def alternatives(self) -> dict[str, tuple[str, Cell]]:
-        """Other instructions for this episode, as `lerobot_env_bomb.alternatives` gives them."""
+        """Return other instructions for this episode, as `lerobot_env_bomb.alternatives` gives them."""
         return alternatives(self._run.episode)
 
     def _check(self, action: np.ndarray) -> np.ndarray:
-        """(4,) float64 within the action space."""
+        """Return an action as (4,) float64 within the action space."""
         return np.clip(super()._check(action).astype(np.float64), self._action_low, self._action_high)
 
     def _observe(self) -> Observation:

@@ -20,7 +20,7 @@ GRIP_ERROR_M = 0.0015  # largest of a held stone between the pads, in x, y and z
 
 @dataclass(frozen=True)
 class StaticScene:
-    """Where everything is, and what has been done before."""
+    """Scene at some time of an episode: where everything is, and what has been done before."""
 
     layout: Layout
     num_made: int  # moves that have been made
@@ -29,7 +29,7 @@ class StaticScene:
 
     @property
     def opening_m(self) -> float:
-        """Between pads that hold a stone."""
+        """Distance in metres between pads that hold a stone."""
         return 2 * self.layout.stone_radius_m - SQUEEZE_M
 
 
@@ -39,7 +39,7 @@ def start_of(episode: Episode) -> StaticScene:
 
 
 def draw_static(episode: Episode, rng: np.random.Generator) -> StaticScene:
-    """Some of the expert's moves made, the gripper anywhere, the next stone in its fingers or not."""
+    """Draw a scene: some of the expert's moves made, the gripper anywhere, the next stone held or not."""
     num_made = int(rng.integers(len(episode.aims)))
     made, aim = episode.aims[:num_made], episode.aims[num_made]
     stone_xy = episode.layout.stone_xy.copy()
@@ -78,7 +78,7 @@ def _slid_xyz(layout: Layout, aim: Aim, rng: np.random.Generator) -> np.ndarray:
 
 
 def _is_nearest(layout: Layout, stone: int, supply: tuple[int, ...], gripper_xyz: np.ndarray) -> bool:
-    """Whether a stone is clearly the nearest to the gripper of those in the tray."""
+    """Return True if a stone is clearly the nearest to the gripper of those in the tray."""
     others = [other for other in supply if other != stone]
     distances = np.linalg.norm(layout.stone_xy - gripper_xyz[:2], axis=1)
     return bool((distances[others] - distances[stone] >= MARGIN_M).all())

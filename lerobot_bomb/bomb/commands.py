@@ -52,7 +52,7 @@ FORMS = (
 
 @dataclass(frozen=True)
 class Drawn:
-    """What a task is played on, and with."""
+    """Board, tray and command that are drawn for an episode of a task."""
 
     about: tuple[int, ...]  # numbers of what the command is about: colours, rows, directions
     stones: Stones  # on the board
@@ -66,7 +66,7 @@ class Drawn:
 
 @dataclass(frozen=True)
 class Case:
-    """What a command means: what is said, what is to be done, and what the expert does."""
+    """Meaning of a command: its words, the moves that fulfil it, and what the expert does."""
 
     commands: tuple[str, ...]  # one, or one for each move
     plans: tuple[Plan, ...]
@@ -83,11 +83,11 @@ class Task(ABC):
 
     @abstractmethod
     def case(self, drawn: Drawn) -> Case | None:
-        """What the command means on that board; None where it means nothing, or several things."""
+        """Return what the command means on that board; None where it means nothing, or several things."""
 
 
 def is_graspable(stones: Stones, cell: Cell) -> bool:
-    """Whether nothing stands left or right of an intersection, where the fingers go."""
+    """Return True if nothing stands left or right of an intersection, where the fingers go."""
     row, column = cell
     return not {(row, column - 1), (row, column + 1)} & stones.keys()
 
@@ -98,25 +98,25 @@ def other_color(color: str) -> str:
 
 
 def only(stones: Stones, color: str) -> Cell | None:
-    """Where the only stone of a colour stands; None where there is none, or several."""
+    """Return where the only stone of a colour stands; None where there is none, or several."""
     cells = [cell for cell, other in stones.items() if other == color]
     return cells[0] if len(cells) == 1 else None
 
 
 def draw_cells(rng: np.random.Generator, number: int, cells: Sequence[Cell] = CELLS) -> list[Cell]:
-    """So many different ones of these intersections."""
+    """Draw so many different intersections."""
     return [cells[i] for i in rng.choice(len(cells), size=number, replace=False)]
 
 
 def draw_stones(
     rng: np.random.Generator, number: int, cells: Sequence[Cell] = CELLS, colors: Sequence[str] = COLORS
 ) -> dict[Cell, str]:
-    """So many stones of these colours, each drawn, on these intersections."""
+    """Draw so many stones, each of one of these colours, on different intersections."""
     return {cell: colors[int(rng.integers(len(colors)))] for cell in draw_cells(rng, number, cells)}
 
 
 def is_heldout(task_id: int, about: tuple[int, ...]) -> bool:
-    """Whether a command is held out; each verb, colour, row, ... of it is seen in others."""
+    """Return True if a command is held out; each verb, colour, row, ... of it is seen in others."""
     return (task_id + sum(place * number for place, number in zip(count(1), about))) % NUM_PARTS == 0
 
 
@@ -134,7 +134,7 @@ def command_suite(tasks: Sequence[Task], max_steps: int, num_goals: int, version
 
 
 def draw_command(tasks: Sequence[Task], spec: EpisodeSpec) -> tuple[int, Drawn, Case]:
-    """The number of a task, what it is played on, and what its command means there."""
+    """Return a task's number, the board that is drawn for it, and what its command means there."""
     drawn_id = int(generator(spec.seed, Stream.TARGET).integers(len(tasks)))
     task_id = drawn_id if spec.task_id is None else spec.task_id
     task, rng = tasks[task_id], generator(spec.seed, Stream.OPENING)

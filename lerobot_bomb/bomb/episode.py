@@ -25,7 +25,7 @@ TEST_SEEDS = range(1000, 1200)  # of evaluations: from LeRobot's default on, as 
 
 
 class Stage(StrEnum):
-    """How far an episode got; each stage includes the ones before it."""
+    """Stage that an episode reached; each stage includes the ones before it."""
 
     START = "start"
     REACHED = "reached"
@@ -35,7 +35,7 @@ class Stage(StrEnum):
 
 
 class Failure(StrEnum):
-    """Why an episode failed; exactly one per failed episode."""
+    """Reason why an episode failed; exactly one per failed episode."""
 
     NEVER_REACHED = "never_reached"
     MISSED_GRASP = "missed_grasp"

@@ -122,6 +122,6 @@ magnitude = partial(magnitude_of, AXES)  # (axis, name, level)
 
 @dataclass(frozen=True)
 class Condition(AxisCondition):
-    """Which axes of BOMB are on: "camera:2+light:3"."""
+    """Condition of BOMB, by the axes that are on: "camera:2+light:3"."""
 
     axes: ClassVar[Mapping[str, Axis]] = AXES

@@ -1,4 +1,4 @@
-"""Where the expert points: columns of a recording that only training reads, never an observation.
+"""Pointing of the expert: columns of a recording that only training reads, never an observation.
 
 Which stone goes to which place is what a policy must read before it can act; what the expert would do for
 other places teaches it to act as it has pointed.
@@ -31,7 +31,7 @@ COLUMNS = {
 
 @dataclass(frozen=True)
 class Pointing:
-    """What the expert is about in a state, and what it would do if it were about other places."""
+    """Place and stone of the expert's current move, and what it would do for other places."""
 
     place_xy: np.ndarray  # (2,) metres
     stone_xy: np.ndarray  # (2,) metres

@@ -10,7 +10,7 @@ import numpy as np
 
 
 class Stream(IntEnum):
-    """Which quantity; that of a suite, of the arm, or of what acts."""
+    """Stream of random numbers of one quantity: of a suite, of the arm, or of what acts."""
 
     TARGET = 0
     COLOR = 1

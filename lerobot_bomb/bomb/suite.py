@@ -1,4 +1,4 @@
-"""What a suite is: a kind of episode. Each has a file in `suites/`."""
+"""Suites: each is a kind of episode, and has a file in `suites/`."""
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
@@ -23,7 +23,7 @@ NUM_TRAINED_TEMPLATES = 3  # the first ones of a suite; the others are held out
 
 @dataclass(frozen=True)
 class Turn:
-    """What is said once so many moves have been made."""
+    """Instruction that is given once so many moves have been made."""
 
     instruction: str
     # what stands for the stone, the place or the command in the suite's templates and forms
@@ -32,7 +32,7 @@ class Turn:
 
 @dataclass(frozen=True)
 class Episode:
-    """What an EpisodeSpec stands for."""
+    """Episode that an EpisodeSpec stands for."""
 
     spec: EpisodeSpec
     task_id: int  # which of the suite's numbered tasks it is of
@@ -53,15 +53,15 @@ class Episode:
 
     @property
     def instruction(self) -> str:
-        """What is said at the start."""
+        """Instruction at the start."""
         return self.turns[0].instruction
 
     def instruction_after(self, num_moves: int) -> str:
-        """What is said once so many moves have been made."""
+        """Return the instruction once so many moves have been made."""
         return self.turns[min(num_moves, len(self.turns) - 1)].instruction
 
     def allows(self, stones: Mapping[Cell, str]) -> bool:
-        """Whether the move is legal, and the instruction clear, with these stones on the board."""
+        """Return True if the move is legal, and the instruction clear, with these stones on the board."""
         if self.target is not None and self.color is not None:
             return is_legal_move(dict(stones), self.target, self.color) and self.is_clear(stones)
         return self.is_clear(stones)
@@ -72,9 +72,9 @@ class Episode:
         return self.aims[0].stone
 
     def goals_after(self, num_moves: int) -> tuple[Goal, ...]:
-        """What the expert aims at once so many moves have been made: as far as it has been said.
+        """Return the expert's goals once so many moves have been made, as far as they have been said.
 
-        `Suite.num_goals` of them, the last one again where there are fewer.
+        There are `Suite.num_goals` of them; where there are fewer, the last one is repeated.
         """
         aims = self.aims[: num_moves + 1] if len(self.turns) > 1 else self.aims
         height_m = self.layout.rest_height_m
@@ -84,7 +84,7 @@ class Episode:
 
 @dataclass(frozen=True)
 class Suite:
-    """How its episodes are drawn and how long they may last.
+    """Kind of episode: how its episodes are drawn and how long they may last.
 
     ``check`` raises a ValueError that names the flag for a spec of which no episode can be drawn.
     """
@@ -119,12 +119,12 @@ def suites_of(name: str) -> tuple[str, ...]:
 
 
 def of_split[T](split: str, items: Sequence[T], heldout: Sequence[T]) -> tuple[T, ...]:
-    """What a split draws from: those held out, the others, or all."""
+    """Return what a split draws from: the items that are held out, the others, or all."""
     return tuple(item for item in items if split == "all" or (item in heldout) == (split == "heldout"))
 
 
 def templates_of(split: str, templates: Sequence[str]) -> tuple[str, ...]:
-    """Those of a suite's instruction templates that a split draws from."""
+    """Return the templates that a split draws from, of a suite's instruction templates."""
     return of_split(split, templates, templates[NUM_TRAINED_TEMPLATES:])
 
 

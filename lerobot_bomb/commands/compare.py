@@ -35,7 +35,7 @@ def _points(text: str) -> float:
 
 
 def _two_policies(args: argparse.Namespace) -> tuple[list[Row], list[Row]]:
-    """Their episodes, of two files or of one."""
+    """Return the records of the two policies, of two files or of one."""
     if args.b is not None:
         if args.policies:
             raise ValueError("--policies chooses two of one file; give one, or drop it")

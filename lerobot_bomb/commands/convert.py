@@ -37,7 +37,7 @@ FPS = 10  # of the demonstrations and of LeRobot's environment `pusht`
 
 @dataclass(frozen=True)
 class Conversion:
-    """What determines a converted dataset."""
+    """Parameters that determine a converted dataset."""
 
     kind: ClassVar[str] = "conversion"
 
@@ -164,7 +164,7 @@ def _pusht_layout(repo_id: str) -> "DatasetLayout":
 
 
 def _pusht_episode(source: PushtZarr, task: str, index: int) -> "RecordedEpisode":
-    """All demonstrations by number, then a copy of each, and so on."""
+    """Return an episode: all demonstrations by number, then a copy of each, and so on."""
     from lerobot.utils.constants import ACTION, OBS_IMAGE, OBS_STATE
 
     from lerobot_bomb.data.blocks import RecordedEpisode

@@ -64,7 +64,7 @@ def _is_data(path: str) -> bool:
 
 
 def dataset_card(repo_id: str, facts: DatasetFacts) -> str:
-    """What the dataset shows, and how to train on it."""
+    """Write the dataset's card: what the dataset shows, and how to train on it."""
     metadata = DatasetCardData(
         license="apache-2.0",
         tags=["LeRobot", "lerobot_bomb"],
@@ -111,7 +111,7 @@ def dataset_card(repo_id: str, facts: DatasetFacts) -> str:
 
 
 def _tag(repo_id: str, version: str) -> None:
-    """LeRobot loads the commit that has the version's tag."""
+    """Tag the commit with the version: LeRobot loads the one that has its tag."""
     api = HfApi()
     with suppress(RevisionNotFoundError):
         api.delete_tag(repo_id, tag=version, repo_type="dataset")

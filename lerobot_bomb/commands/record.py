@@ -109,7 +109,7 @@ def run_record(args: argparse.Namespace) -> int:
 
 
 def _acting_weights(args: argparse.Namespace) -> str | None:
-    """Which weights act; None: the expert does."""
+    """Return the SHA-256 of the weights that act; None: the expert does."""
     if args.relabel != (args.policy_path is not None):
         raise ValueError(
             "--relabel and --policy.path=FOLDER come together: a policy acts, and the expert says what it "

@@ -58,7 +58,7 @@ def _print_file(path: Path, arms: list[Arm], num_damaged: int) -> None:
 
 
 def _print_rates(arms: list[Arm]) -> None:
-    """A line for each group and condition, before what else there is to say of them."""
+    """Print a line for each group and condition, before what else there is to say of them."""
     cells = [
         [arm.name, condition, str(rate_of(rows))]
         for arm in arms

@@ -62,7 +62,7 @@ def add_sweep_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run_sweep(args: argparse.Namespace) -> int:
-    """Play what is missing; exit code 1 where something still is."""
+    """Run what is missing; exit code 1 where something still is."""
     _check_numbers(args)
     manifest = _manifest(args)
     with claimed(args.folder, manifest, args.batch_size) as store:
@@ -130,7 +130,7 @@ def _check_numbers(args: argparse.Namespace) -> None:
 
 
 def _cells(args: argparse.Namespace, manifest: Manifest) -> list[Cell]:
-    """Return the manifest's cells that this command plays."""
+    """Return the manifest's cells that this command runs."""
     try:
         cells = manifest.part(args.shard)
     except ValueError as error:
@@ -163,7 +163,7 @@ def _manifest(args: argparse.Namespace) -> Manifest:
 
 
 def _kind(flags: list[str]) -> ResultKind:
-    """Of the environment that the flags name."""
+    """Return the kind of results of the environment that the flags name."""
     env_type = flag_value(flags, "--env.type")
     if env_type is None:
         raise ValueError(f"--env.type is missing: {', '.join(KIND_OF_ENV)}")
@@ -186,7 +186,7 @@ def _expanded(perturbations: tuple[str, ...], kind: ResultKind) -> list[str]:
 
 
 def _job_command(args: argparse.Namespace) -> list[str]:
-    """Plays a part of the folder's cells, with --shard."""
+    """Run a part of the folder's cells, with --shard."""
     command = [*PYTHON, "lerobot_bomb.commands.main", "sweep", str(args.folder.absolute())]
     command += [f"--workers={args.workers}"]
     return command + ([f"--timeout={args.timeout}"] if args.timeout else [])

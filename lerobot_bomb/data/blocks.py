@@ -40,7 +40,7 @@ IMAGE_WRITER_THREADS = 4
 
 @dataclass(frozen=True)
 class DatasetLayout:
-    """What a block and the merged dataset have in common."""
+    """Settings that a block and the merged dataset have in common."""
 
     repo_id: str
     fps: int
@@ -71,7 +71,7 @@ class DatasetLayout:
 
 @dataclass(frozen=True)
 class RecordedEpisode:
-    """What a block is made of."""
+    """Frames and columns of an episode that a block is made of."""
 
     frames: Iterable[dict[str, Any]]  # as LeRobot's add_frame takes them
     columns: dict[str, Any] = field(default_factory=dict)  # of its row in LeRobot's table of episodes
@@ -232,7 +232,7 @@ def _add_episode_columns(root: Path, rows: list[dict[str, Any]]) -> None:
 
 
 def _check_videos(root: Path, num_frames: int) -> None:
-    """LeRobot logs frames that its encoder drops or does not finish; here they are an error."""
+    """Raise if the encoder dropped frames or did not finish them, which LeRobot only logs."""
     encoded: dict[str, int] = {}
     for path in sorted(root.glob("videos/*/*/*.mp4")):
         with av.open(str(path)) as video:

@@ -1,4 +1,4 @@
-"""What all conversions of published demonstrations share: episodes by number, written as blocks."""
+"""Conversions of published demonstrations: episodes by number, written as blocks."""
 
 from collections.abc import Callable, Iterator
 from functools import partial

@@ -73,7 +73,7 @@ class Environment:
 
     @property
     def suites(self) -> frozenset[str] | None:
-        """Every suite that it shows; None: not known."""
+        """Suites that it shows; None: not known."""
         if self.task is None:
             return None
         return frozenset(SUITES if self.task == ALL else self.task.split("+"))
@@ -86,7 +86,7 @@ class Environment:
         return f"--env.{name}={SUITE if value is None else value}"
 
     def eval_flags(self) -> list[str]:
-        """Of lerobot-eval, for this environment; a suite that is not known is to be filled in for SUITE."""
+        """Return lerobot-eval's flags for this environment; an unknown suite is to be filled in for SUITE."""
         flags = [self._flag(name) for name in COMPARED]
         if self.depth:
             flags.append("--env.depth=true")
@@ -112,7 +112,7 @@ class Environment:
 
     @property
     def _is_current(self) -> bool:
-        """Return whether its suites, whose newest version it names, are those that are played today."""
+        """Return whether its suites, whose newest version it names, are those of today."""
         return self.suites is not None and self.task_version == max(map(task_version, self.suites))
 
     def check_same(self, other: "Environment", who: str, insist: str) -> None:
@@ -128,7 +128,7 @@ class Environment:
         )
 
     def text(self, names: Iterable[str]) -> str:
-        """These fields: "control_mode=absolute, fps=20"."""
+        """Write these fields: "control_mode=absolute, fps=20"."""
         values = {name: getattr(self, name) for name in names}
         if "cameras" in values:
             values["cameras"] = "+".join(self.cameras)

@@ -1,4 +1,4 @@
-"""What a dataset's folder says of itself, and how to evaluate on what it shows."""
+"""Facts that a dataset's folder states, and how to evaluate on what it shows."""
 
 import json
 from collections.abc import Sequence
@@ -32,7 +32,7 @@ class DatasetFacts:
 
     @classmethod
     def read(cls, root: Path) -> "DatasetFacts":
-        """Of a dataset's folder.
+        """Read the facts of a dataset's folder.
 
         Raises:
             ValueError: it holds no LeRobotDataset, or a file that is not JSON.
@@ -47,7 +47,7 @@ class DatasetFacts:
 
     @classmethod
     def find(cls, root: Path | str | None) -> "DatasetFacts | None":
-        """Of a folder where a dataset was, if one still is there."""
+        """Read the facts of a folder where a dataset was, if one still is there."""
         return cls.read(Path(root)) if root and (Path(root) / INFO_FILE).is_file() else None
 
     @property
@@ -57,7 +57,7 @@ class DatasetFacts:
 
     @property
     def environment(self) -> Environment | None:
-        """That of the benchmark, which the dataset shows; None: another."""
+        """Environment of BOMB that the dataset shows; None: it shows another."""
         return Environment.of_dataset(self.info, *self._tasks)
 
     @property
@@ -72,7 +72,7 @@ class DatasetFacts:
         return suites[0], numbered_tasks(self.specs or ())
 
     def eval_flags(self) -> list[str] | None:
-        """Of lerobot-eval, for the environment that the dataset shows; None: not known."""
+        """Return lerobot-eval's flags for the environment that the dataset shows; None: not known."""
         conversion = self.bomb.get("conversion", {})
         if conversion.get("source", "").startswith(PUSHT_SOURCE):
             return ["--env.type=pusht", "--eval.use_async_envs=false"]

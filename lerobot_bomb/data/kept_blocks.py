@@ -23,7 +23,7 @@ UNFINISHED = re.compile(rf"({BLOCK.pattern}\.tmp|dataset)(\.files|\.cache)?")
 
 @dataclass
 class Progress:
-    """How far a dataset has grown."""
+    """Progress of a growing dataset."""
 
     num_episodes: int = 0
     num_frames: int = 0
@@ -47,7 +47,7 @@ class Gap:
 
 
 def block_path(folder: Path, number: int) -> Path:
-    """Where a block lies once it is finished."""
+    """Return where a block lies once it is finished."""
     return folder / f"block-{number:05d}"
 
 
@@ -68,7 +68,7 @@ def finish_block(unfinished: Path, block: Path, progress: Progress) -> None:
 
 
 def find_gaps(folder: Path, num_episodes: int, block_episodes: int) -> list[Gap]:
-    """Of a dataset of so many episodes: what lies between, before and after the finished blocks."""
+    """Return the gaps before, between and after the finished blocks of a dataset of so many episodes."""
     gaps: list[Gap] = []
     progress = Progress()
     for number, start in enumerate(range(0, num_episodes, block_episodes)):
@@ -95,7 +95,7 @@ def damaged_blocks(folder: Path, num_episodes: int, block_episodes: int) -> dict
 
 
 def _damage(block: Path, end: int) -> str | None:
-    """What is wrong with a block that ends with this episode of the dataset."""
+    """Describe what is wrong with a block that ends with this episode of the dataset; None: nothing."""
     if not block.exists():
         return "is missing"
     try:

@@ -25,7 +25,7 @@ ACTION_NAMES = [*POSE, "gripper"]
 
 @dataclass(frozen=True)
 class LiberoConversion:
-    """What determines a dataset converted from LIBERO's files."""
+    """Parameters that determine a dataset converted from LIBERO's files."""
 
     kind: ClassVar[str] = "conversion"
 

@@ -11,7 +11,7 @@ RESUMED_BY = {
 
 
 def explain(repo_id: str, root: Path, error: Exception) -> str:
-    """What is missing, and an unfinished dataset of that name if there is one."""
+    """Describe what is missing, and an unfinished dataset of that name if there is one."""
     for kind, command in RESUMED_BY.items():
         folder = unfinished_folder(root, kind)
         if parameters_file(folder).is_file():

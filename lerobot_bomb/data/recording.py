@@ -24,7 +24,7 @@ MAX_NOISE = 1.0  # beyond it the noise exceeds the largest action
 
 @dataclass(frozen=True)
 class Recording:
-    """What determines a recording frame by frame."""
+    """Parameters that determine a recording frame by frame."""
 
     kind: ClassVar[str] = "recording"
 
@@ -102,7 +102,7 @@ class Recording:
 
     @property
     def suite_specs(self) -> list[EpisodeSpec]:
-        """What all episodes of a suite have in common, with the first seed; one for each suite."""
+        """Specs that all episodes of a suite share, with the first seed; one for each suite."""
         return [self._spec_of(suite) for suite in suites_of(self.task)]
 
     def _spec_of(self, suite: str) -> EpisodeSpec:
@@ -119,7 +119,7 @@ class Recording:
         )
 
     def to_dict(self) -> dict[str, Any]:
-        """What its JSON reads back as."""
+        """Return the recording as JSON values."""
         return json.loads(json.dumps(asdict(self)))
 
     @property

@@ -51,12 +51,12 @@ METADATA_FILE = Path("meta") / "bomb.json"  # in the dataset
 
 
 class Parameters(Protocol):
-    """What determines a dataset frame by frame."""
+    """Parameters that determine a dataset frame by frame."""
 
     kind: ClassVar[str]  # "recording": the noun of messages and the ending of the growing folder
 
     def to_dict(self) -> dict[str, Any]:
-        """What its JSON reads back as; the keys are flags."""
+        """Return the parameters as JSON values, whose keys are flags."""
         ...
 
 
@@ -101,7 +101,7 @@ def grow(
 
 
 def missing_blocks(folder: Path, num_episodes: int) -> list[Gap]:
-    """What a dataset of so many episodes still lacks; damaged blocks are deleted and named."""
+    """Return what a dataset of so many episodes still lacks; delete damaged blocks and name them."""
     for block, damage in damaged_blocks(folder, num_episodes, BLOCK_EPISODES).items():
         tqdm.write(f"{block} {damage}; its episodes are made again", file=sys.stderr)
         remove([block])
@@ -165,14 +165,14 @@ def check_repo_id(repo_id: str, flag: str = "--repo_id") -> None:
 
 
 def default_root(repo_id: str) -> Path:
-    """Where LeRobot looks for a dataset."""
+    """Return where LeRobot looks for a dataset."""
     from lerobot.utils.constants import HF_LEROBOT_HOME  # imports torch: seconds
 
     return HF_LEROBOT_HOME / repo_id
 
 
 def unfinished_folder(root: Path, kind: str = "recording") -> Path:
-    """Where a dataset grows until it is complete."""
+    """Return where a dataset grows until it is complete."""
     root = root.absolute()
     return root.with_name(f"{root.name}.{kind}")
 
@@ -305,7 +305,7 @@ def _publish(
 
 
 def _read_whole(dataset: Path) -> Progress:
-    """What was made, which all of a dataset's files hold.
+    """Return the progress that was made, once all of a dataset's files are known to hold it.
 
     Raises:
         RuntimeError: names the file that is damaged, or what differs.

@@ -38,7 +38,7 @@ MAX_ENVS = 8  # that a worker keeps; each holds an OpenGL context
 
 @dataclass(frozen=True)
 class RolloutSettings:
-    """How to play; with a spec it determines a rollout."""
+    """Settings of a rollout; with a spec they determine it."""
 
     render_options: RenderOptions
     noise: float = 0.0  # standard deviation on x, y and z, in units of the largest relative step
@@ -223,7 +223,7 @@ class RolloutPool:
 
 
 def _work(settings: RolloutSettings, pipe: Connection) -> None:
-    """A worker's life: specs come, rollouts or an exception go, until the parent ends."""
+    """Run a worker: specs come, rollouts or an exception go, until the parent ends."""
     worker = _Worker(settings)
     with suppress(EOFError, ConnectionError):
         while True:
@@ -232,7 +232,7 @@ def _work(settings: RolloutSettings, pipe: Connection) -> None:
 
 
 class _Worker:
-    """What a worker keeps between episodes: an environment of each of the last few conditions."""
+    """Worker that keeps an environment of each of the last few conditions between episodes."""
 
     def __init__(self, settings: RolloutSettings, agent: Agent | None = None) -> None:
         self._settings, self._agent = settings, agent

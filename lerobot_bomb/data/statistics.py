@@ -121,7 +121,7 @@ def _is_close(stored: Any, exact_D: np.ndarray, tolerance_D: np.ndarray) -> bool
 
 
 def _numbers(root: Path, info: Info) -> Iterator[tuple[str, np.ndarray]]:
-    """Each vector that a policy may normalise: its name and (N, D) of all frames."""
+    """Yield each vector that a policy may normalise: its name and (N, D) of all frames."""
     paths = sorted((root / "data").rglob("*.parquet"))
     for name, feature in info["features"].items():
         is_text = feature["dtype"] in (*PICTURES, "string", "language")

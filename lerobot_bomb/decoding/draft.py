@@ -27,7 +27,7 @@ class KnownSymbols:
 
 
 class LinearDraft:
-    """Every action dimension goes on as it went in the last two steps of the answer itself."""
+    """Draft in which every action dimension goes on as it went in the last two steps of the answer."""
 
     def __init__(self, grammar: NumberGrammar, num_dims: int, num_before: int = 0):
         """``num_before``: numbers of the answer that precede its actions and follow no line."""
@@ -50,7 +50,7 @@ class LinearDraft:
         return self._spell(grammar.spelling[numbers].flatten(1), mask_BWC.flatten(1)).gather(1, columns_BG)
 
     def _spell(self, symbol_BM: Tensor, mask_BM: Tensor) -> Tensor:
-        """Written symbols without the padding between them, then ends; no row's length has to be known."""
+        """Spell symbols without the padding between them, then ends; no row's length has to be known."""
         num_columns = symbol_BM.shape[1] + MAX_GUESSES + 1
         column_BM = (mask_BM.cumsum(dim=1) - 1).masked_fill(~mask_BM, num_columns)
         spelled = symbol_BM.new_full((len(symbol_BM), num_columns + 1), END)

@@ -102,7 +102,7 @@ class SlotWriter:
 
 @dataclass(frozen=True)
 class SlotHead:
-    """Where the logits of choices come from: rows of the output head and, for samples, noise."""
+    """Source of the logits of choices: rows of the output head and, for samples, noise."""
 
     rows: Tensor  # (C, H)
     noise: Tensor  # (B, T, C), added to the logits; T = 0: the likeliest is chosen
@@ -113,7 +113,7 @@ class SlotHead:
         return self._finish(exact_linear(hidden_BH, self.rows[slot]), step, slot)
 
     def logits_of_tokens(self, hidden_KH: Tensor, places: list[tuple[int, slice]]) -> list[Tensor]:
-        """Of a single row's tokens, and the step and slot of each -> its choices' logits, float32 each."""
+        """Return the float32 logits of the choices of one row's tokens, given each token's step and slot."""
         products = in_float32(partial(self._multiply, [slot for _, slot in places]), hidden_KH)
         return [
             self._finish(of_token, step, slot)
@@ -152,7 +152,7 @@ class GraphSlots:
     def __call__(
         self, prompt: Prompt, embeds_CH: Tensor, head_CH: Tensor, noise_BTC: Tensor
     ) -> tuple[Tensor, Tensor]:
-        """As `choose`; the second is written over by the next call."""
+        """Choose as `choose`; the next call writes over the second result."""
         self._embeds_CH.copy_(embeds_CH)
         self._head_CH.copy_(head_CH)
         choices_BS, finite_B = self._choose(*prompt.tensors, noise_BTC)
@@ -182,7 +182,7 @@ def choose(
     *,
     prompt_reads_all: bool,
 ) -> tuple[Tensor, Tensor]:
-    """As `SlotWriter`, on an empty cache; and (B,) bool, whether all choices are from finite logits."""
+    """Choose as `SlotWriter`, on an empty cache; and (B,) bool: were all choices from finite logits?"""
     last_B1 = prompt.mask.sum(dim=1, keepdim=True) - 1
     columns_BL = text.columns_of(prompt.mask)
     if prompt.hidden is not None:

@@ -1,4 +1,4 @@
-"""Lines of `bomb` in a results file: what each must say, whichever protocol wrote it, and what all say."""
+"""Records of `bomb` in a results file: what each must say, whichever protocol wrote it, and what all say."""
 
 from collections.abc import Mapping
 from statistics import mean, median
@@ -47,12 +47,12 @@ PUT_DOWN = (None, Failure.WRONG_INTERSECTION, Failure.IMPRECISE, Failure.DISTURB
 
 
 def put_down(rows: list[Row]) -> list[Row]:
-    """Those in which the stone was carried and put down on the board."""
+    """Return the records in which the stone was carried and put down on the board."""
     return [row for row in rows if row["failure"] in PUT_DOWN]
 
 
 def is_grounded(row: Row) -> bool:
-    """Whether the stone, put down on the board, lies nearest to the intersection that was named."""
+    """Return True if the stone, put down on the board, lies nearest to the intersection that was named."""
     return row["nearest_intersection"] == row["target"]
 
 
@@ -134,7 +134,7 @@ NEW_CHECKS: dict[str, Check] = {  # of what protocol 1.1 added
 
 
 def median_error_mm(rows: list[Row]) -> float | None:
-    """Of the stones that were put down on the board; None: there are none."""
+    """Return the median error of the stones that were put down on the board; None: there are none."""
     errors = [row["placement_error_mm"] for row in rows if row["failure"] in PUT_DOWN]
     return median(errors) if errors else None
 
@@ -158,13 +158,13 @@ def _error_change(pairs: list[Pair]) -> str:
 
 
 def _progress(rows: list[Row]) -> str:
-    """Of suites whose episodes have several moves."""
+    """Return the mean progress of episodes of several moves, as text."""
     shares = [row["progress"] for row in rows if row["target"] is None]
     return f"{100 * mean(shares):.1f} %" if shares else NO_VALUE
 
 
 def spec_of(row: Row) -> EpisodeSpec:
-    """Of a line's episode.
+    """Rebuild the EpisodeSpec of a record.
 
     Raises:
         ValueError: there can be no such episode.
@@ -174,7 +174,7 @@ def spec_of(row: Row) -> EpisodeSpec:
 
 
 def task_version_of(row: Row) -> str:
-    """Of a line's suite; lines of protocol 1.0 name none."""
+    """Return the task version of a record's suite; records of protocol 1.0 name none."""
     return row.get("task_version", FIRST_VERSION)
 
 
@@ -228,7 +228,7 @@ def _describe_tasks(rows: list[Row]) -> str:
 
 
 def environment_of_episode(row: Row) -> Environment:
-    """That an episode was played in; of its depth and tasks nothing is said."""
+    """Return the environment of a record's episode, without depth and tasks, which no record holds."""
     spec = row["spec"]
     return Environment(
         **{name: spec[name] for name in ("robot", "control_mode", "fps")},
@@ -240,7 +240,7 @@ def environment_of_episode(row: Row) -> Environment:
 
 
 def eval_flags_of(rows: list[Row]) -> list[str]:
-    """Of lerobot-eval, for the environment and the tasks that an evaluation was of."""
+    """Return lerobot-eval's flags for the environment and the tasks of an evaluation."""
     return [*environment_of_episode(rows[0]).eval_flags(), *_task_flags([row["spec"] for row in rows])]
 
 

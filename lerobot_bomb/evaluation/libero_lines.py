@@ -1,4 +1,4 @@
-"""Lines of `bomb_libero` in a results file: what each must say, and what they say together."""
+"""Records of `bomb_libero` in a results file: what each must say, and what they say together."""
 
 from lerobot_bomb.envs.results import Row
 from lerobot_bomb.evaluation.line_checks import (

@@ -1,4 +1,4 @@
-"""Lines of results files, of whichever environment: read and checked."""
+"""Records of results files, of whichever environment: read and checked."""
 
 import json
 from collections.abc import Collection
@@ -86,7 +86,7 @@ def check_any(path: Path, rows: Collection[object], damages: list[str]) -> None:
 
 
 def kind_of(row: Row) -> ResultKind:
-    """Of which environment a line is."""
+    """Return the kind of results that a record is of."""
     return KIND_OF_VERSION[row["protocol_version"]]
 
 

@@ -44,7 +44,7 @@ class Demonstrations:
         )
 
     def recorded(self, rows_R: np.ndarray, chunk_size: int) -> tuple[np.ndarray, np.ndarray]:
-        """Recorded chunks (R, T, D), and which actions lie beyond their episode's end (R, T) bool.
+        """Return recorded chunks (R, T, D), and which actions lie beyond their episode's end (R, T) bool.
 
         Beyond it the last action is repeated, as LeRobot does.
         """

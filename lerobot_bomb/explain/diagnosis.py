@@ -1,4 +1,4 @@
-"""What an explanation of one moment says, in words: what the policy's answer depends on."""
+"""Diagnosis of one moment, in words: what the policy's answer depends on."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -21,7 +21,7 @@ class Finding:
 
     @property
     def names(self) -> tuple[str, ...]:
-        """What has an effect."""
+        """Names of everything that has an effect."""
         return tuple(self.effects)
 
     @property
@@ -37,7 +37,7 @@ class Finding:
 
 
 def diagnose(explanation: Explanation) -> list[Finding]:
-    """What was found, question by question."""
+    """Return the findings on an explained moment, question by question."""
     patches = {
         f"{camera_name(key)} patch {line}, {column}": float(map_GG[line, column])
         for key, map_GG in explanation.patches.items()

@@ -23,7 +23,7 @@ from lerobot_bomb.viewing.checkpoint import LoadedPolicy
 
 @dataclass(frozen=True)
 class Settings:
-    """How moments are asked about."""
+    """Settings with which moments are explained."""
 
     grid: int
     fill: str
@@ -43,7 +43,7 @@ class ExplainedMoment:
 
     @property
     def title(self) -> str:
-        """As "step 12, carry"."""
+        """Title of the moment, such as "step 12, carry"."""
         return ", ".join(part for part in (f"step {self.watched.step}", self.watched.phase) if part)
 
     def as_json(self) -> dict[str, Any]:
@@ -124,7 +124,7 @@ def _asked(loaded: LoadedPolicy, watched: Watched, settings: Settings, instead: 
 
 
 def _spans(watched: Watched, words: Sequence[str]) -> Iterator[Span]:
-    """What the instruction says of row, column and colour; each of its words; those asked for."""
+    """Yield the spans of row, column and colour, of each word of the instruction, and of `words`."""
     yield from named_spans(watched.instruction, watched.instructions)
     for span in spans_of_words(watched.instruction):
         yield Span(f'"{span.name}"', span.ranges)

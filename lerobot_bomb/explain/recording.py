@@ -12,7 +12,7 @@ from lerobot_bomb.viewing.rerun_file import STEP, open_recording, png
 
 
 def write_recording(path: Path, name: str, fps: int, moments: Sequence[ExplainedMoment]) -> None:
-    """A new file, whose timeline has the moments at their control steps."""
+    """Write a new file, whose timeline has the moments at their control steps."""
     with open_recording(path, name, fps, _layout(moments[0])) as recording:
         for each in moments:
             recording.set_time(STEP, sequence=each.watched.step)

@@ -39,7 +39,7 @@ class Watched:
 
 
 def watch(viewed: Viewed, loaded: LoadedPolicy) -> tuple[list[Watched], Any]:
-    """Every moment in which the policy acts, and the line of the episode's results."""
+    """Return every moment in which the policy acts, and the result of the episode."""
     loaded.begin()
     with closing(viewed.make_env()) as env:
 
@@ -72,7 +72,7 @@ def _watched(viewed: Viewed, moment: Moment, env: gymnasium.Env) -> Watched:
 
 
 def _phase(moment: Moment) -> str:
-    """Of BOMB."""
+    """Return the phase of a moment of BOMB."""
     stage, state = Stage(moment.info["stage"]), moment.state
     if stage is Stage.START:
         return REACH

@@ -26,7 +26,7 @@ class PathPoint:
 
 
 def path_point(clean_BKD: Tensor, noise_BKD: Tensor, tau_B: Tensor) -> PathPoint:
-    """Where the paths from noise z to clean actions A0 are at tau."""
+    """Return the points at tau on the paths from noise z to clean actions A0."""
     tau_B11 = tau_B[:, None, None]
     actions_BKD = (1 - tau_B11) * noise_BKD + tau_B11 * clean_BKD
     return PathPoint(actions_BKD, tau_B, clean_BKD - noise_BKD, noise_BKD)

@@ -144,7 +144,7 @@ class ChunkConfig(ConfigWithEnvironment):
 
 @dataclass
 class VlaConfig(ChunkConfig):
-    """Of a policy with a vision-language model: which one, in which precision, what of it is trained.
+    """Config of a policy with a vision-language model: which one, in which precision, what of it is trained.
 
     Its chunks may be executed as an ensemble.
     """
@@ -243,7 +243,7 @@ RELATIVE_AS_TRAINED = ("relative_actions", "relative_exclude_joints", "relative_
 
 @dataclass
 class RelativeVlaConfig(VlaConfig):
-    """Of a policy whose actions may be differences to the state that a chunk starts from."""
+    """Config of a policy whose actions may be differences to the state that a chunk starts from."""
 
     NEEDS_STATE: ClassVar[tuple[str, ...]] = (*VlaConfig.NEEDS_STATE, "relative_actions")
 
@@ -288,7 +288,7 @@ class RelativeVlaConfig(VlaConfig):
 
 @dataclass
 class TokenVlaConfig(VlaConfig):
-    """Of a policy whose actions are tokens: how they are chosen, and compiled."""
+    """Config of a policy whose actions are tokens: how they are chosen, and compiled."""
 
     MODES: ClassVar[tuple[NormalizationMode, ...]] = BOUNDED_MODES
 

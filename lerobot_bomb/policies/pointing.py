@@ -30,7 +30,7 @@ SMALLEST = 1e-8  # difference that LeRobot's normaliser divides by
 
 @dataclass(frozen=True)
 class MetricLabels:
-    """What a batch's frames point at, and the place that is given, in metres."""
+    """Labels of a batch in metres: the stone and place that its frames point at, and the given place."""
 
     place_xy: Tensor  # (B, 2) metres, the place that is meant
     stone_xy: Tensor  # (B, 2) metres
@@ -76,7 +76,7 @@ class MetricLabels:
 
 @dataclass(frozen=True)
 class Labels(MetricLabels):
-    """The same labels, with numbers of places for a policy that has a table of them."""
+    """Labels with numbers of places, for a policy that has a table of them."""
 
     place: Tensor  # (B,) int64, number of the place that is meant
     given: Tensor  # (B,) int64, number of the place that is given
@@ -174,7 +174,7 @@ def places_of(meta: LeRobotDatasetMetadata, known: list[list[float]] | None) -> 
 
 
 def gripper_dims(meta: LeRobotDatasetMetadata) -> list[int]:
-    """Of x, y and z in the state."""
+    """Return the dims of x, y and z in the state."""
     names = dim_names(meta.features[OBS_STATE])
     if missing := [name for name in GRIPPER if name not in names]:
         raise ValueError(

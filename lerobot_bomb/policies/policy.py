@@ -39,12 +39,12 @@ from lerobot_bomb.vlm.tokenizer import load_tokenizer
 
 
 def _is_chunk_policy(policy: nn.Module) -> bool:
-    """Also one that adapters are wrapped around."""
+    """Return True for a policy of chunks, and for one that adapters are wrapped around."""
     return any(isinstance(module, ChunkPolicy) for module in policy.modules())
 
 
 class ChunkPolicy(HubPolicy, SavesTiedWeightsOnce, PreTrainedPolicy):
-    """What a policy has that predicts chunks of actions: queue, units, checkpoints.
+    """Base of policies that predict chunks of actions: queue, units, checkpoints.
 
     Shapes: `B` batch, `T` actions of a chunk, `D` action dims.
     """
@@ -83,7 +83,7 @@ class ChunkPolicy(HubPolicy, SavesTiedWeightsOnce, PreTrainedPolicy):
         dataset_meta: LeRobotDatasetMetadata | None = None,
         **kwargs,
     ) -> Self:
-        """As LeRobot's, but a missing or unexpected tensor is an error; fits the data that it is given."""
+        """Load as LeRobot does, but refuse missing or unexpected tensors; fit to the data that is given."""
         if config is not None:
             check_start(pretrained_name_or_path, config, dataset_meta)
             cls._prepare(config, dataset_meta)
@@ -203,7 +203,7 @@ class VlaPolicy(ChunkPolicy):
 
     @classmethod
     def _prepare(cls, config: Any, meta: LeRobotDatasetMetadata | None) -> None:
-        """As `ChunkPolicy`'s; takes the names of the data's action dimensions."""
+        """Prepare as `ChunkPolicy` does, and take the names of the data's action dimensions."""
         _take_action_names(config, meta)
         super()._prepare(config, meta)
 
@@ -249,7 +249,7 @@ class VlaPolicy(ChunkPolicy):
             yield
 
     def _make_ensemble(self) -> TemporalEnsemble | None:
-        """None: a queue instead."""
+        """Return the temporal ensemble; None: a queue is used instead."""
         config = self.config
         if not config.temporal_ensemble_size:
             return None
@@ -320,7 +320,7 @@ class RelativeVlaPolicy(VlaPolicy):
 
     @classmethod
     def from_pretrained(cls, *args: Any, **kwargs: Any) -> Self:
-        """As `VlaPolicy`'s; relative actions fit the new data."""
+        """Load as `VlaPolicy` does; relative actions fit the new data."""
         try:
             return super().from_pretrained(*args, **kwargs)
         except ValueError as error:
@@ -426,6 +426,6 @@ class TokenVlaPolicy(VlaPolicy):
 
 
 def _take_action_names(config: Any, meta: LeRobotDatasetMetadata | None) -> None:
-    """The dataset's names in one row; LeRobot keeps only those of groups where a dataset groups them."""
+    """Take the dataset's names of dims in one row; of grouped names LeRobot keeps only the groups'."""
     if config is not None and meta is not None:
         config.action_feature_names = dim_names(meta.features[ACTION])

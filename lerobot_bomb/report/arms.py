@@ -1,4 +1,4 @@
-"""What a report is about: arms, the episodes of one policy under one set of settings."""
+"""Arms of a report: the episodes of one policy under one set of settings."""
 
 import shlex
 from collections import Counter
@@ -41,7 +41,7 @@ class Policy:
 
     @property
     def name(self) -> str:
-        """That of its arm, where it has one: it says the suite, too."""
+        """Name of its arm, where it has only one: it says the suite, too."""
         return self.arms[0].name if len(self.arms) == 1 else self.short_name
 
     @property
@@ -62,12 +62,12 @@ class Sample:
 
     @property
     def command(self) -> str:
-        """Plays it again."""
+        """Command that runs it again."""
         return shlex.join(["lerobot-bomb", "replay", str(self.path), f"--line={self.line}"])
 
     @property
     def explanation(self) -> str:
-        """The command that asks why; '' where no checkpoint played."""
+        """Command that asks why; '' where no checkpoint acted."""
         if not (self.row.get("policy") or {}).get("path"):
             return ""
         return shlex.join(["lerobot-bomb", "explain", f"--results={self.path}", f"--line={self.line}"])
@@ -75,7 +75,7 @@ class Sample:
 
 @dataclass(frozen=True)
 class Report:
-    """What the sections are counted from."""
+    """Arms, samples and gaps that the sections are made from."""
 
     arms: list[Arm]
     samples: list[Sample] = field(default_factory=list)
@@ -85,7 +85,7 @@ class Report:
 def sample_failures(
     arms: list[Arm], files: Mapping[Path, Mapping[int, Row]], num_of_class: int
 ) -> Iterator[Sample]:
-    """Of each arm and class of failure so many episodes at most, always the same ones of the same files.
+    """Sample at most so many episodes of each arm and class of failure; the same files give the same ones.
 
     `files`: by path and line, those that the arms' rows are from.
     """
@@ -99,7 +99,7 @@ def sample_failures(
 
 
 def arms_of(rows: list[Row]) -> list[Arm]:
-    """Lines apart that must not be pooled, each with a name that no other has."""
+    """Split records that must not be pooled into arms, each with a name that no other has."""
     groups = groups_of(rows)
     first = [group.rows[0] for group in groups]
     return list(map(Arm, _told_apart([_name(row) for row in first], first), groups))

@@ -36,7 +36,7 @@ TRACE_RANGE_M = 0.24  # either way from the board's centre
 
 
 def overview_section(outcome: str, moments: Sequence[ExplainedMoment], command: str) -> Section:
-    """What the policy was told, what became of the episode, what was found in each moment."""
+    """Write the section of what the policy was told, how the episode ended, and what each moment showed."""
     found = [
         Table(each.title, QUESTIONS, [[Cell(of.question), Cell(of.answer)] for of in each.findings])
         for each in moments
@@ -46,7 +46,7 @@ def overview_section(outcome: str, moments: Sequence[ExplainedMoment], command: 
 
 
 def _not_asked(moment: ExplainedMoment) -> list[str]:
-    """Which parts are not possible with this policy."""
+    """Return a line for each kind of question that cannot be asked of this policy."""
     explanation = moment.explanation
     is_missing = {
         "Words: none are hidden, for this policy reads no instruction.": not explanation.words,
@@ -94,7 +94,7 @@ def moment_sections(moment: ExplainedMoment) -> list[Section]:
 def aggregate_sections(
     results: Sequence[Any], by_phase: Mapping[str, Sequence[ExplainedMoment]], command: str
 ) -> list[Section]:
-    """What matters in which phase, over episodes."""
+    """Write the sections of many episodes: what matters in which phase."""
     num_successes = sum(result.is_success for result in results)
     failures = Counter(result.failure for result in results if not result.is_success)
     reached = [[Cell(phase or MIDDLE), Cell(str(len(each)), len(each))] for phase, each in by_phase.items()]
@@ -126,7 +126,7 @@ def _mean_tables(moments: Sequence[ExplainedMoment]) -> Iterator[Table]:
 
 
 def probes_section(probes: Sequence[LayerProbe]) -> Section:
-    """What can be read off the layers' states."""
+    """Write the section of what can be read off the layers' states."""
     rows = [
         [
             Cell(each.what),
@@ -225,7 +225,7 @@ def _ratio(value: float) -> Cell:
 
 
 def traces_section(episodes: Mapping[str, MaskedEpisode]) -> Section:
-    """Whole episodes under masks; the first is the one without."""
+    """Write the section of whole episodes under masks; the first is the one without."""
     rows = []
     for name, episode in episodes.items():
         result = episode.result

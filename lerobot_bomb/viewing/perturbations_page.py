@@ -95,7 +95,7 @@ def _image(name: str, sheets: str) -> str:
 
 
 def _forms(instructions: list[str]) -> str:
-    """The same goal, said in the form of each level."""
+    """Return the table of one goal, said in the form of each level."""
     rows = [f"| {level} | {instruction} |" for level, instruction in enumerate(instructions)]
     head = f"One goal, a {COLOR} stone on row {TARGET[0]}, column {TARGET[1]}, in the form of each level:"
     return "\n".join(["", head, "", "| level | instruction |", "|---|---|", *rows, ""])

@@ -1,4 +1,4 @@
-"""What a language model keeps of tokens that it has read, for others to go on from.
+"""Prefix: what a language model keeps of tokens that it has read, for others to go on from.
 
 Shapes: `B` batch, `L` tokens of a prefix, `T` of a segment, `H` hidden size, `V` key-value heads, `E` size of
 a head.
@@ -15,7 +15,7 @@ type KeysValues = tuple[Tensor, Tensor]  # (B, V, L, E) each
 
 @dataclass(frozen=True)
 class Prefix:
-    """What the model keeps of images and text that it has read."""
+    """States that the model keeps of images and text that it has read."""
 
     hidden: Tensor  # (B, L, H) after the last layer
     readable: Tensor  # (B, L) bool, False: padding, or a hidden token
@@ -23,7 +23,7 @@ class Prefix:
     layers: list[KeysValues]
 
     def tensors(self) -> list[Tensor]:
-        """All of it, as `of` takes it."""
+        """Return all tensors, as `of` takes them."""
         return [
             self.hidden,
             self.readable,

@@ -105,7 +105,7 @@ class QwenBackbone(Backbone):
 
     @property
     def layers(self) -> list[nn.Module]:
-        """Of the text and the vision model."""
+        """Layers of the text and the vision model."""
         return [*self.text_model.layers, *self.vlm.model.visual.blocks]
 
     def freeze_vision(self) -> None:
@@ -235,7 +235,7 @@ def _expanded(batch_size: int, row: Tensor) -> Tensor:
 
 
 def _tokens_per_side(vision_config: Any, image_size: int) -> int:
-    """How many tokens a line of an image is.
+    """Return how many tokens a line of an image is.
 
     Raises:
         ValueError: not a whole number.

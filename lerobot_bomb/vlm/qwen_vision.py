@@ -15,7 +15,7 @@ from transformers.models.qwen2_5_vl.modeling_qwen2_5_vl import (
 
 
 class WindowAttention(Qwen2_5_VLVisionAttention):
-    """The same with windows of one length, which are read in one call; stock code calls once for each."""
+    """Attention with windows of one length, which are read in one call; stock code calls once for each."""
 
     def forward(
         self,

@@ -207,7 +207,7 @@ class FdvlaConfig(RelativeVlaConfig, PlacesVlaConfig):
 
     @property
     def has_energy(self) -> bool:
-        """Whether the loss has a term that takes second derivatives."""
+        """True if the loss has a term that takes second derivatives."""
         return self.consistency == "energy_vjp" and self.used_consistency_weight > 0
 
     def sampling(self) -> dict[str, Any]:

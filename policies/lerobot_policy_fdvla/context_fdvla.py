@@ -1,4 +1,4 @@
-"""What ``fdvla`` keeps of an observation. Shapes: `B` batch, `H` hidden size."""
+"""Context that ``fdvla`` keeps of an observation. Shapes: `B` batch, `H` hidden size."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -19,7 +19,7 @@ class Context:
     feedback: Tensor | None  # (B, H) of what was pointed at; None: nothing is
 
     def of_draws(self, number: int) -> "Context":
-        """What the heads take, of each observation so many times; the prefix is read as it is."""
+        """Return what the heads take, of each observation so many times; the prefix is read as it is."""
         if number == 1:
             return self
         repeat = partial(torch.repeat_interleave, repeats=number, dim=0)
@@ -27,7 +27,7 @@ class Context:
         return Context(self.prefix, repeat(self.pooled), feedback)
 
     def tensors(self) -> list[Tensor]:
-        """All of it, as `of` takes it."""
+        """Return all tensors, as `of` takes them."""
         return [self.pooled, *([] if self.feedback is None else [self.feedback]), *self.prefix.tensors()]
 
     @classmethod

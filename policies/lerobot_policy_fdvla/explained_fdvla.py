@@ -80,7 +80,7 @@ class ExplainedFdvla(PromptExplained):
         return -loss_B.unflatten(0, (num_rows, NUM_DRAWS)).mean(dim=1)
 
     def places(self, rows: Rows) -> dict[str, Place]:
-        """In two passes: over the prompt, padding included, and over the noisy actions."""
+        """Return the places in two passes: over the prompt, padding included, and over the noisy actions."""
         places: dict[str, Place] = {name: (each, None) for name, each in self.columns(rows).items()}
         return places | {ANSWER: (None, slice(None))}
 

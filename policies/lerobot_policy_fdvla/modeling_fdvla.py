@@ -94,12 +94,12 @@ class FdvlaPolicy(RelativeVlaPolicy):
 
     @property
     def parameter_counts(self) -> dict[str, int]:
-        """Of each part, and of those that are trained in all."""
+        """Number of parameters of each part, and of all that are trained."""
         counts = {name: sum(p.numel() for p in part.parameters()) for name, part in self.named_children()}
         return {**counts, "trained": sum(p.numel() for p in self.get_optim_params())}
 
     def explained(self) -> ExplainedFdvla:
-        """This policy as `lerobot_bomb.explain` asks it."""
+        """Return the policy as `lerobot_bomb.explain` asks it."""
         return ExplainedFdvla(self)
 
     def _get_default_peft_targets(self) -> dict[str, Any]:
@@ -261,7 +261,7 @@ class FdvlaPolicy(RelativeVlaPolicy):
 
     @property
     def last_passes(self) -> int:
-        """Of the text model in a prediction: the prompt's, and those of the sampler's steps."""
+        """Passes of the text model in a prediction: the prompt's, and those of the sampler's steps."""
         return 1 + num_evaluations(self.config.solver, self.config.num_inference_steps)
 
     def _left_over(self, actions_KD: Tensor, batch: dict[str, Tensor]) -> Tensor:
@@ -269,7 +269,7 @@ class FdvlaPolicy(RelativeVlaPolicy):
         return self._to_relative(without_padding(actions_KD).to(self._device), batch)
 
     def _sample(self, noise_BKD: Tensor, step_noise: Tensor, *context: Tensor) -> tuple[Tensor]:
-        """All sampling steps, as a function of tensors."""
+        """Run all sampling steps, as a function of tensors."""
         heads = self._heads(Context.of(context, has_feedback=self.pointer is not None))
         return (self._denoise(heads, noise_BKD, step_noise),)
 
@@ -293,7 +293,7 @@ class FdvlaPolicy(RelativeVlaPolicy):
         return self._sampling_noise.draw(batch_size, shape).to(self._device)
 
     def supports_rtc(self) -> bool:
-        """Whether the sampler follows a velocity, which real-time chunking guides."""
+        """Return True if the sampler follows a velocity, which real-time chunking guides."""
         return "flow" in SAMPLERS[self.config.used_sampler]
 
     def init_rtc_processor(self) -> None:
@@ -349,7 +349,7 @@ class FdvlaPolicy(RelativeVlaPolicy):
         return self.segment.of_actions(states.reshape(embeds_BTH.shape))
 
     def _pointing(self, context: Context, state_BS: Tensor) -> Context:
-        """The same, with the feedback of what it points at."""
+        """Return the context with the feedback of what it points at."""
         assert self.pointer is not None
         return replace(context, feedback=self.pointer.feed_back(self._point(context, state_BS)))
 
@@ -364,14 +364,14 @@ class FdvlaPolicy(RelativeVlaPolicy):
         return self.pointer(states_BKH[:, 0], state_BS)
 
     def _read(self, batch: dict[str, Tensor]) -> Context:
-        """The prompt, once for all sampling steps."""
+        """Read the prompt, once for all sampling steps."""
         rows, is_task_BL = self._prompt(batch)
         return self._context(rows, is_task_BL, self._embeds(batch, rows.ids), len(self.tokens.start))
 
     def _context(
         self, rows: TokenRows, is_task_BL: Tensor, embeds_BLH: Tensor, num_shared: int = 0
     ) -> Context:
-        """What `_prompt` and `_embeds` made of a batch, read by the language model."""
+        """Read what `_prompt` and `_embeds` made of a batch with the language model."""
         is_image_BL = rows.ids == self.tokens.image
         prefix = self.backbone.read_prefix(embeds_BLH, is_image_BL, rows.mask, rows.hidden, num_shared)
         pooled_BH = masked_mean_pool(prefix.hidden, self._pooled(rows.readable, is_task_BL))
@@ -389,13 +389,13 @@ class FdvlaPolicy(RelativeVlaPolicy):
     # Prompt: start, images, task (with padding), a place for the state, end
 
     def _prompt(self, batch: dict[str, Tensor]) -> tuple[TokenRows, Tensor]:
-        """Its tokens, and which of them (B, L) are the task's, without hidden ones."""
+        """Return the prompt's tokens, and which of them (B, L) are the task's, without hidden ones."""
         parts = self._prompt_parts(batch)
         is_task = [part.readable & (name == "instruction") for name, part in parts.items()]
         return TokenRows.join([*parts.values()]), torch.cat(is_task, dim=1)
 
     def _prompt_parts(self, batch: dict[str, Tensor]) -> dict[str, TokenRows]:
-        """Its tokens by what they are of; an image's by its camera."""
+        """Return the prompt's parts by name; an image's name is its camera."""
         task = read_task(batch, self.config.type, self._device)
         parts = {"start": TokenRows.constant(self.tokens.start, task.ids)}
         parts |= {camera: TokenRows.constant(self._image_ids, task.ids) for camera in self._cameras}
@@ -439,7 +439,7 @@ class FdvlaPolicy(RelativeVlaPolicy):
 
     @property
     def _num_fixed_tokens(self) -> int:
-        """Of prompt and segment, without the task."""
+        """Number of tokens of prompt and segment, without the task."""
         of_prompt = len(self.tokens.start) + len(self._cameras) * len(self._image_ids)
         of_prompt += self.config.use_state + len(self.tokens.end)
         return of_prompt + self.config.chunk_size + NUM_MARKS

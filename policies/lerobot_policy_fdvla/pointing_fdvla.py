@@ -1,4 +1,4 @@
-"""What ``fdvla`` points at before it acts: a place, a stone, whether that is held, read off an action token.
+"""Pointing of ``fdvla`` before it acts: a place, a stone, whether that is held, read off an action token.
 
 The prediction enters the action tokens ahead of both heads, as what they need: where the gripper has to go.
 
@@ -95,7 +95,7 @@ class Pointer(DataUnits):
     def draw_labels(
         self, batch: dict[str, Tensor], config: FdvlaConfig, generator: torch.Generator
     ) -> Labels:
-        """What a batch points at, and the places that are given; actions as LeRobot normalises them."""
+        """Read what a batch points at, and the places that are given; actions as LeRobot normalises them."""
         labels = Labels.draw(batch, self.places, config.counterfactual_share, config.type, generator)
         return replace(labels, other_actions=self.normalised(labels.other_actions))
 
@@ -103,7 +103,7 @@ class Pointer(DataUnits):
 def make_pointer(
     config: FdvlaConfig, hidden_size: int, meta: LeRobotDatasetMetadata | None
 ) -> Pointer | None:
-    """None where the config does not point; its places are a checkpoint's or else the dataset's.
+    """Make the pointer; None without `pointing`. Its places are a checkpoint's or else the dataset's.
 
     Raises:
         ValueError: there is neither.

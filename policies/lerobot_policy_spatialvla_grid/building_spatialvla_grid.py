@@ -21,7 +21,7 @@ logger = logging.getLogger(__name__)
 
 
 def build_depth(config: SpatialvlaGridConfig) -> ZoeDepth | None:
-    """As `build_model`: a checkpoint's architecture, else the weights of ``depth_model_name``."""
+    """Build ZoeDepth from a checkpoint's architecture, else from the weights of ``depth_model_name``."""
     if config.depth_source != "zoedepth":
         return None
     if config.depth_config is not None:

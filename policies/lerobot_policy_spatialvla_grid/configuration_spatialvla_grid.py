@@ -195,7 +195,7 @@ class SpatialvlaGridConfig(TokenVlaConfig, PlacesVlaConfig):
 
     @property
     def has_positions(self) -> bool:
-        """Whether patches get anything of Ego3D."""
+        """True if patches get anything of Ego3D."""
         return self.depth_source != "none" or self.ego3d_no_depth_vector
 
     def read_depth_of(self, given: Collection[str] | None) -> None:
@@ -212,7 +212,7 @@ class SpatialvlaGridConfig(TokenVlaConfig, PlacesVlaConfig):
             self.input_features = read | (self.input_features or {})
 
     def _depth_shapes(self) -> dict[str, tuple[int, ...]]:
-        """Of what observed depth consists of; LeRobot takes it for states."""
+        """Return the shapes of the inputs that observed depth consists of; LeRobot takes them for states."""
         shapes: dict[str, tuple[int, ...]] = {}
         for key, feature in self.image_features.items():
             camera = key.removeprefix(f"{OBS_IMAGES}.")
@@ -232,7 +232,7 @@ class SpatialvlaGridConfig(TokenVlaConfig, PlacesVlaConfig):
             )
 
     def grid_settings(self) -> GridSettings:
-        """How grids are made for the dataset's actions.
+        """Return the settings with which grids are made for the dataset's actions.
 
         Raises:
             ValueError: a flag of it is wrong, the groups do not have every action dimension once, or nothing
@@ -245,7 +245,7 @@ class SpatialvlaGridConfig(TokenVlaConfig, PlacesVlaConfig):
         return self._grid_settings(groups)
 
     def _given_groups(self) -> tuple[ActionGroup, ...] | None:
-        """Those of a flag or of the checkpoint; None: names must tell."""
+        """Return the groups of a flag or of the checkpoint; None: only the dims' names can tell."""
         assert self.action_feature is not None
         (num_dims,) = self.action_feature.shape
         if self.action_groups is not None:

@@ -65,7 +65,7 @@ class ExplainedSpatialvlaGrid(PromptExplained):
         return torch.cat(chosen, dim=-1).sum(dim=(1, 2))
 
     def places(self, rows: Rows) -> dict[str, Place]:
-        """In one pass, padding included."""
+        """Return the places in one pass, padding included."""
         num_columns = rows["mask"].shape[1]
         places: dict[str, Place] = {name: (each,) for name, each in self.columns(rows).items()}
         return places | {ANSWER: (slice(num_columns - 1, None),)}

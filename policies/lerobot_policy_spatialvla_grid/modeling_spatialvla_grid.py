@@ -119,7 +119,7 @@ class SpatialvlaGridPolicy(TokenVlaPolicy):
 
     @classmethod
     def _prepare(cls, config: SpatialvlaGridConfig, meta: LeRobotDatasetMetadata | None) -> None:
-        """As the others'; grids are as they were, or adapt to the new data."""
+        """Prepare as other policies do; grids are as they were, or adapt to the new data."""
         complete_depth(config, meta)
         config.check_template_as_trained()
         config.check_grid_as_trained(is_refitted=meta is not None and config.adapt_embeddings)
@@ -129,7 +129,7 @@ class SpatialvlaGridPolicy(TokenVlaPolicy):
     def _load_as_safetensor(
         cls, model: "SpatialvlaGridPolicy", model_file: str, map_location: str, strict: bool
     ) -> "SpatialvlaGridPolicy":
-        """As the others', and with the ZoeDepth of ``depth_model_name`` where the checkpoint has none."""
+        """Load as other policies do, with the ZoeDepth of ``depth_model_name`` where the file has none."""
         if model.zoedepth is not None and not holds_module(Path(model_file), "zoedepth"):
             model.zoedepth = load_zoedepth(model.config.depth_model_name)
             model.may_lack = ("zoedepth",)
@@ -145,7 +145,7 @@ class SpatialvlaGridPolicy(TokenVlaPolicy):
 
     @torch.no_grad()
     def _init_cells(self) -> None:
-        """Around the mean of the words' embeddings, as a tokenizer's new tokens are."""
+        """Draw the cells' rows around the mean of the words' embeddings, as a tokenizer's new tokens are."""
         words = self.backbone.vlm.get_input_embeddings().weight
         assert isinstance(words, Tensor)
         for table in (self.cell_embedding.weight, self.cell_head.weight):
@@ -177,7 +177,7 @@ class SpatialvlaGridPolicy(TokenVlaPolicy):
         self.config.grid_params = new.to_dict()
 
     def explained(self) -> ExplainedSpatialvlaGrid:
-        """This policy as `lerobot_bomb.explain` asks it."""
+        """Return the policy as `lerobot_bomb.explain` asks it."""
         return ExplainedSpatialvlaGrid(self)
 
     def _newest_only(self) -> list[int]:
@@ -185,7 +185,7 @@ class SpatialvlaGridPolicy(TokenVlaPolicy):
         return sorted({*binary, *super()._newest_only()})
 
     def _get_default_peft_targets(self) -> dict[str, Any]:
-        """The original's: linear layers of text and vision model, projector, Ego3D; and the cells whole."""
+        """Return the original's targets: linear layers of text, vision, projector and Ego3D; cells whole."""
         others = [PROJECTOR]
         if not self.config.freeze_vision_encoder:
             others.append(VISION_LAYERS)
@@ -194,7 +194,7 @@ class SpatialvlaGridPolicy(TokenVlaPolicy):
         return peft_targets(self, "language_model", CELL_TABLES, others)
 
     def _validate_peft_config(self, peft_config: Any) -> None:
-        """Grids that were adapted are in the adapters' config, so the adapters must hold their cells."""
+        """Check that adapters hold the cells of adapted grids, which are in the adapters' config."""
         super()._validate_peft_config(peft_config)
         if self._num_cells_of_base is None:
             return
@@ -259,7 +259,7 @@ class SpatialvlaGridPolicy(TokenVlaPolicy):
     def _hidden_after(
         self, prompt: TokenRows, embeds_BLH: Tensor, answer_BS: Tensor
     ) -> tuple[Tensor, Tensor]:
-        """The same, after a prompt that was embedded before."""
+        """Return what `_hidden` returns, after a prompt that was embedded before."""
         pointed_BN, cells_BTG = self._split(answer_BS)
         first_N = [slot.start for slot in self._pointing_rows]
         pointed_BN = pointed_BN + pointed_BN.new_tensor(first_N)
@@ -317,7 +317,7 @@ class SpatialvlaGridPolicy(TokenVlaPolicy):
     def _cell_parts(
         self, chosen_BTG: Tensor, cells_BTG: Tensor, kept_BTG: Tensor
     ) -> dict[str, tuple[Tensor, Tensor]]:
-        """Right cells, absolute errors of what cells decode to in the data's units, as `means` takes them.
+        """Return which cells are right and absolute errors in the data's units, as `means` takes them.
 
         Teacher-forced: every cell is predicted from the true ones before it. Padded actions do not count.
         Errors are known where a dataset was given, that is while training.
@@ -358,7 +358,7 @@ class SpatialvlaGridPolicy(TokenVlaPolicy):
 
     @property
     def last_passes(self) -> int | None:
-        """Of the text model in the last prediction, the prompt's included; None: there was none."""
+        """Passes of the text model in the last prediction, the prompt's included; None: there was none."""
         return self._writer.num_passes
 
     @property
@@ -379,7 +379,7 @@ class SpatialvlaGridPolicy(TokenVlaPolicy):
 
     @property
     def _group_rows(self) -> list[slice]:
-        """Which rows of the tables are each group's cells."""
+        """Rows of the tables that are each group's cells."""
         counts = zip(self.grids.offsets, self.grids.num_cells, strict=True)
         return [slice(first, first + count) for first, count in counts]
 
@@ -390,17 +390,17 @@ class SpatialvlaGridPolicy(TokenVlaPolicy):
 
     @property
     def _num_rows(self) -> int:
-        """Of the tables."""
+        """Number of rows of the tables."""
         return self.grids.num_tokens + (0 if self.pointer is None else self.pointer.num_tokens)
 
     # Prompt
 
     def _prompt(self, batch: dict[str, Tensor]) -> TokenRows:
-        """Everything before the answer, with padding; its last column has none."""
+        """Return everything before the answer, with padding; its last column has none."""
         return TokenRows.join([*self._prompt_parts(batch).values()])
 
     def _prompt_parts(self, batch: dict[str, Tensor]) -> dict[str, TokenRows]:
-        """The same by what it is of; an image's by its camera."""
+        """Return the prompt's parts by name; an image's name is its camera."""
         tokens = self.tokens
         task = read_task(batch, self.config.type, self._device)
         image = self.backbone.tokens_per_image * [tokens.image]
@@ -416,7 +416,7 @@ class SpatialvlaGridPolicy(TokenVlaPolicy):
         return parts | {"end": TokenRows.constant(tokens.task_end, task.ids)}
 
     def _num_fixed_tokens(self) -> int:
-        """Of the longest prompt and answer, without the task."""
+        """Return the number of tokens of the longest prompt and answer, without the task."""
         tokens, config = self.tokens, self.config
         num_tokens = len(self._cameras) * self.backbone.tokens_per_image
         num_tokens += len(tokens.start) + len(tokens.task_end) + len(self._pointing_rows)

@@ -1,4 +1,4 @@
-"""What ``spatialvla_grid`` points at before it acts: two tokens ahead of the cells, for a place and a stone.
+"""Pointing of ``spatialvla_grid`` before it acts: two tokens ahead of the cells, for a place and a stone.
 
 The decoder chooses actions after these tokens, so they follow what is pointed at.
 
@@ -75,13 +75,13 @@ class Target:
         return cls(tokens_BN, tokens_BN.bool())
 
     def parts(self, chosen_BN: Tensor) -> dict[str, tuple[Tensor, Tensor]]:
-        """Right tokens, as `means` takes them."""
+        """Return which tokens are right, as `means` takes them."""
         right = zip(NAMES, (chosen_BN == self.tokens).T, self.kept.T, strict=False)
         return {f"{name}_accuracy": (right_B, kept_B) for name, right_B, kept_B in right}
 
 
 class CellPointer(nn.Module):
-    """Which tokens there are, and what a batch's labels are in them; what it holds is in the config."""
+    """Tokens for places and stones, and a batch's labels in them; what it holds is in the config."""
 
     places: Tensor  # (P, 2) metres
     action_bounds: Tensor  # (2, D) the environment's actions that are -1 and 1; known while training
@@ -107,7 +107,7 @@ class CellPointer(nn.Module):
     def draw(
         self, batch: dict[str, Any], config: "SpatialvlaGridConfig", generator: torch.Generator
     ) -> tuple[Labels, Target]:
-        """What a batch points at, actions as LeRobot normalises them; and the tokens that are given.
+        """Draw what a batch points at, actions as LeRobot normalises them; and the tokens that are given.
 
         There is no loss of another place than the one that is meant.
         """
@@ -119,7 +119,7 @@ class CellPointer(nn.Module):
 
 
 def make_pointer(config: "SpatialvlaGridConfig", meta: LeRobotDatasetMetadata | None) -> CellPointer | None:
-    """None where the config does not point; its places are a checkpoint's or else the dataset's.
+    """Make the pointer; None without `pointing`. Its places are a checkpoint's or else the dataset's.
 
     Raises:
         ValueError: there is neither.

@@ -1,4 +1,4 @@
-"""Where in a camera's frame lies what ``spatialvla_grid`` sees."""
+"""Points in a camera's frame that ``spatialvla_grid`` sees."""
 
 import torch
 from torch import Tensor

@@ -55,7 +55,7 @@ class ExplainedVla0Smol(PromptExplained):
         return chosen_BA1.sum(dim=(1, 2))
 
     def places(self, rows: Rows) -> dict[str, Place]:
-        """In one pass, from which the padding is taken out."""
+        """Return the places in one pass, from which the padding is taken out."""
         index_L = rows["mask"][0].cumsum(dim=0) - 1
         places: dict[str, Place] = {name: (index_L[each],) for name, each in self.columns(rows).items()}
         # the prompt's last token predicts the answer's first; rows of one answer have no padding

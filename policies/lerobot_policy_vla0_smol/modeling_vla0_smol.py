@@ -107,7 +107,7 @@ class Vla0SmolPolicy(RelativeVlaPolicy, TokenVlaPolicy):
         return self._num_pointing + num_steps * self._action_dim
 
     def explained(self) -> ExplainedVla0Smol:
-        """This policy as `lerobot_bomb.explain` asks it."""
+        """Return the policy as `lerobot_bomb.explain` asks it."""
         return ExplainedVla0Smol(self)
 
     def _get_default_peft_targets(self) -> dict[str, Any]:
@@ -271,7 +271,7 @@ class Vla0SmolPolicy(RelativeVlaPolicy, TokenVlaPolicy):
 
     @property
     def last_passes(self) -> int | None:
-        """Of the text model in the last prediction, the prompt's included; None: there was none."""
+        """Passes of the text model in the last prediction, the prompt's included; None: there was none."""
         return None if self._decoded is None else self._decoded.num_passes
 
     @property
@@ -285,11 +285,11 @@ class Vla0SmolPolicy(RelativeVlaPolicy, TokenVlaPolicy):
     # Prompt
 
     def _prompt(self, batch: dict[str, Tensor]) -> TokenRows:
-        """Everything up to ``Assistant:``, with padding."""
+        """Return everything up to ``Assistant:``, with padding."""
         return TokenRows.join([*self._prompt_parts(batch).values()])
 
     def _prompt_parts(self, batch: dict[str, Tensor]) -> dict[str, TokenRows]:
-        """The same by what it is of; an image's by its camera."""
+        """Return the prompt's parts by name; an image's name is its camera."""
         tokens = self.tokens
         task = read_task(batch, self.config.type, self._device)
         image = [*tokens.image_start, *self._image_span, *tokens.image_end]
@@ -308,7 +308,7 @@ class Vla0SmolPolicy(RelativeVlaPolicy, TokenVlaPolicy):
         return parts | {"end": TokenRows.constant(tokens.answer_start, task.ids)}
 
     def _num_fixed_tokens(self) -> int:
-        """Of the longest prompt and answer, without the task."""
+        """Return the number of tokens of the longest prompt and answer, without the task."""
         tokens, config = self.tokens, self.config
         num_tokens = len(tokens.start) + len(tokens.answer_start)
         num_tokens += len(self._cameras) * len([*tokens.image_start, *self._image_span, *tokens.image_end])
@@ -342,7 +342,7 @@ class Vla0SmolPolicy(RelativeVlaPolicy, TokenVlaPolicy):
         return self._with_images(self._see(batch), ids_BL)
 
     def _with_images(self, features_BPH: Tensor, ids_BL: Tensor) -> Tensor:
-        """The same, of features that were computed before."""
+        """Embed a sequence's tokens, with image features that were computed before: (B, L, H)."""
         embeds_BLH = self.backbone.embed_tokens(ids_BL)
         columns = self._image_columns(ids_BL.device)
         return embeds_BLH.index_copy(1, columns, features_BPH.to(embeds_BLH.dtype))

@@ -1,4 +1,4 @@
-"""What ``vla0_smol`` writes before its actions: where the stone is, where the place, and how far that is.
+"""Pointing of ``vla0_smol`` before its actions: where the stone is, where the place, and how far that is.
 
 Shapes: `B` batch, `S` state dims, `J` numbers of what is pointed at.
 """
@@ -41,7 +41,7 @@ class TextPointer(DataUnits):
     def labels(
         self, batch: dict[str, Any], other_share: float, policy_type: str, generator: torch.Generator
     ) -> MetricLabels:
-        """What a batch points at, and the places that are given; actions as LeRobot normalises them."""
+        """Read what a batch points at, and the places that are given; actions as LeRobot normalises them."""
         labels = MetricLabels.read(batch, other_share, policy_type, self.state_bounds.device, generator)
         return replace(labels, other_actions=self.normalised(labels.other_actions))
 
@@ -83,7 +83,7 @@ class TextPointer(DataUnits):
 
 
 def make_pointer(config: Vla0SmolConfig, meta: LeRobotDatasetMetadata | None) -> TextPointer | None:
-    """None where the config does not point."""
+    """Make the pointer; None where the config does not point."""
     if not config.pointing:
         return None
     pointer = TextPointer(config)

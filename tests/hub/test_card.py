@@ -1,4 +1,4 @@
-"""What a card says, by the checkpoint."""
+"""Card of a checkpoint: what it says."""
 
 import json
 from dataclasses import replace

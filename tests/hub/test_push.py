@@ -262,7 +262,7 @@ def test_a_token_that_no_header_can_hold_is_never_shown(
     monkeypatch: pytest.MonkeyPatch,
     capsys: pytest.CaptureFixture[str],
 ) -> None:
-    """By our push, and by what LeRobot's commands ask the Hub."""
+    """Check our push, and what LeRobot's commands ask the Hub."""
     from huggingface_hub import hf_hub_download
 
     monkeypatch.setenv("HF_TOKEN", token)

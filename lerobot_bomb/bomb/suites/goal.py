@@ -30,7 +30,7 @@ def _draw_board(rng: np.random.Generator) -> dict[Cell, str]:
 
 
 def _to_tray(drawn: Drawn, cells: list[Cell]) -> tuple[Plan, tuple[Aim, ...]]:
-    """All of them into the tray, in whichever order."""
+    """Return the plan and the aims that put all of these stones into the tray, in whichever order."""
     stones = [drawn.stone_on(cell) for cell in cells]
     plan = tuple(one_move(stone, [TRAY]) for stone in stones)
     return plan, tuple(Aim(stone, xy) for stone, xy in zip(stones, TRAY_XY_M, strict=False))
@@ -72,7 +72,7 @@ class RemoveAt(Task):
 
 @dataclass(frozen=True)
 class Swap(Task):
-    """Two stones change places, one of them by way of the tray or of a free intersection."""
+    """Task: let two stones change places, one of them by way of the tray or of a free intersection."""
 
     def draw(self, rng: np.random.Generator) -> Drawn:
         stones = _draw_board(rng)
@@ -135,7 +135,7 @@ class Push(Task):
 
 @dataclass(frozen=True)
 class ClearRow(Task):
-    """All stones of a row go into the tray."""
+    """Task: put all stones of a row into the tray."""
 
     def draw(self, rng: np.random.Generator) -> Drawn:
         row, number = int(rng.integers(BOARD.num_lines)), int(rng.integers(1, MAX_MOVED + 1))
@@ -152,7 +152,7 @@ class ClearRow(Task):
 
 @dataclass(frozen=True)
 class Gather(Task):
-    """All stones of a colour that do not stand on the left go there."""
+    """Task: move all stones of a colour that do not stand on the left to the left."""
 
     def draw(self, rng: np.random.Generator) -> Drawn:
         return Drawn((int(rng.integers(len(COLORS))), int(rng.integers(BOARD.num_lines))), _draw_board(rng))

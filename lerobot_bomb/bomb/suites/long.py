@@ -29,7 +29,7 @@ EDGE_COLUMNS = 0, BOARD.num_lines - 1  # of captured stones: fingers go down bes
 
 
 def _in_turn(first: int, number: int) -> tuple[str, ...]:
-    """So many colours, black and white in turn, from the first of COLORS or the second."""
+    """Return so many colours, black and white in turn, from the first or the second of COLORS."""
     return tuple(COLORS[(first + i) % 2] for i in range(number))
 
 
@@ -194,7 +194,7 @@ class TakeBack(Task):
 
 @dataclass(frozen=True)
 class CopyPattern(Task):
-    """What the small board in the tray shows is built on the board."""
+    """Task: build on the board what the small board in the tray shows."""
 
     num_stones: int
 

@@ -69,7 +69,7 @@ class Supply:
 
 @dataclass(frozen=True)
 class Task:
-    """Which stone is meant. `select` gives its index, or None where it is not the only one or not clearly."""
+    """Task about one stone in the tray: `select` returns its index, None where it is not clear which."""
 
     stone: str
     select: Callable[[Supply], int | None]
@@ -92,7 +92,7 @@ def _nearest_to_gripper(supply: Supply) -> int | None:
 
 
 def _by_anchor(supply: Supply, is_white: bool, sign: int) -> int | None:
-    """Of the other stones, at least two, the one nearest to the only stone of a colour, or farthest."""
+    """Return the stone nearest to a colour's only stone, or farthest from it; None with fewer than three."""
     anchor = _only(supply, is_white)
     if anchor is None or len(supply.xy) < 3:
         return None
@@ -122,7 +122,7 @@ NUM_PARTS = 5  # one in so many pairs of a task and an intersection is held out
 
 
 def is_heldout(task_id: int, cell: Cell) -> bool:
-    """Whether a pair is held out; every task and every intersection is seen in other pairs."""
+    """Return True if a pair is held out; every task and every intersection is seen in other pairs."""
     row, column = cell
     return (task_id + row + 2 * column) % NUM_PARTS == 0
 
@@ -135,7 +135,7 @@ def pairs_of(split: str) -> tuple[tuple[int, Cell], ...]:
 
 
 def _pairs(spec: EpisodeSpec) -> list[tuple[int, Cell]]:
-    """Those that a spec draws from."""
+    """Return the pairs of task and intersection that a spec draws from."""
     return [
         (task_id, cell)
         for task_id, cell in pairs_of(spec.split)
