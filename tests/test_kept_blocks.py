@@ -3,6 +3,7 @@
 Simulator workers import this file's head, so LeRobot is imported inside tests.
 """
 
+import json
 import shutil
 from collections.abc import Callable
 from pathlib import Path
@@ -132,3 +133,13 @@ def test_a_tilde_in_a_path_is_the_home_folder(
     (tmp_path / "x").mkdir()
     assert cli.main(["record", "--root=~/x", *FLAGS]) == 1
     assert f"--root={tmp_path}/x exists already" in capsys.readouterr().err
+
+
+def test_a_camera_without_a_video_is_told(recorded: Path) -> None:
+    from lerobot_bomb.data.blocks import check_videos
+
+    wrist, other = "observation.images.wrist", "observation.images.other"
+    num_frames = json.loads((recorded / "meta/info.json").read_text())["total_frames"]
+    check_videos(recorded, [wrist, "observation.images.workspace"], num_frames)
+    with pytest.raises(RuntimeError, match=rf"the video of {other} has 0 frames instead of {num_frames}"):
+        check_videos(recorded, [wrist, "observation.images.workspace", other], num_frames)

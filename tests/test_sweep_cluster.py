@@ -56,6 +56,7 @@ def expected_lines(tmp_path_factory: pytest.TempPathFactory) -> str:
         ("GPU-8f1c,MIG-2a", ["GPU-8f1c", "MIG-2a"]),
         ("", []),
         ("-1", []),
+        ("0,-1,1", ["0"]),
         (None, ["0", "1", "2"]),
     ],
 )

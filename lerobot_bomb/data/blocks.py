@@ -10,7 +10,7 @@ import os
 import shutil
 import tempfile
 import traceback
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Sequence
 from contextlib import contextmanager, nullcontext
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -95,7 +95,7 @@ def write_block(layout: DatasetLayout, root: Path, episodes: Iterable[RecordedEp
         rows = _write_episodes(dataset, episodes)
     _add_episode_columns(root, rows)
     num_frames = dataset.num_frames
-    _check_videos(root, num_frames)
+    check_videos(root, dataset.meta.video_keys, num_frames)
     return num_frames
 
 
@@ -231,13 +231,13 @@ def _add_episode_columns(root: Path, rows: list[dict[str, Any]]) -> None:
     unfinished.replace(path)
 
 
-def _check_videos(root: Path, num_frames: int) -> None:
+def check_videos(root: Path, cameras: Sequence[str], num_frames: int) -> None:
     """Raise if the encoder dropped frames or did not finish them, which LeRobot only logs."""
-    encoded: dict[str, int] = {}
+    encoded = dict.fromkeys(cameras, 0)
     for path in sorted(root.glob("videos/*/*/*.mp4")):
         with av.open(str(path)) as video:
             camera = path.parts[-3]
-            encoded[camera] = encoded.get(camera, 0) + video.streams.video[0].frames
+            encoded[camera] += video.streams.video[0].frames
     for camera, num_encoded in encoded.items():
         if num_encoded != num_frames:
             raise RuntimeError(f"the video of {camera} has {num_encoded} frames instead of {num_frames}")

@@ -2,6 +2,7 @@
 
 import os
 from collections.abc import Mapping, Sequence
+from itertools import takewhile
 from pathlib import Path
 
 GPUS = "CUDA_VISIBLE_DEVICES"
@@ -16,7 +17,8 @@ def num_cores() -> int:
 def visible_gpus(environment: Mapping[str, str], driver: Path = DRIVER) -> list[str]:
     """Return GPUs as CUDA_VISIBLE_DEVICES names them; where it is not set, all that the driver lists."""
     if GPUS in environment:
-        return [gpu for gpu in environment[GPUS].split(",") if gpu not in ("", "-1")]
+        # CUDA sees none from the first -1 on
+        return list(takewhile(lambda gpu: gpu != "-1", filter(None, environment[GPUS].split(","))))
     return [str(number) for number, _ in enumerate(driver.iterdir())] if driver.is_dir() else []
 
 
