@@ -130,7 +130,7 @@ def write_image_statistics(root: Path) -> None:
             for each, shape in shapes.items()
         }
         of_episodes = [dict(zip(columns, row, strict=True)) for row in zip(*columns.values(), strict=True)]
-        merged = aggregate_feature_stats(of_episodes)
+        merged: dict[str, Any] = aggregate_feature_stats(of_episodes)
         stored[name] = {each: values.tolist() for each, values in merged.items()}
     with written_whole(path) as (unfinished,):
         unfinished.write_text(json.dumps(stored, indent=4, sort_keys=True))

@@ -67,7 +67,7 @@ class _Tables:
     def _write(self, default_path: str) -> None:
         table = self._open.pop(default_path)
         frames = pd.concat(table.frames, ignore_index=True) if len(table.frames) > 1 else table.frames[0]
-        write = self.usual["append_or_create_parquet_file"]
+        write: Any = self.usual["append_or_create_parquet_file"]
         write(frames, *table.arguments, default_path, **table.options)
 
     def write_all(self) -> None:
