@@ -12,7 +12,7 @@ from pusht_cases import REPO_ID, Demonstrations, write_zarr
 
 from lerobot_bomb.commands import main as cli
 from lerobot_bomb.commands.convert import convert_pusht
-from lerobot_bomb.data.resumable import lock_folder
+from lerobot_bomb.data.unfinished import lock_folder
 
 
 def overwrite(path: Path, name: str, change: Callable[[np.ndarray], np.ndarray]) -> None:

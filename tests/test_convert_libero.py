@@ -17,9 +17,9 @@ from lerobot_bomb.checkpoints.libero_orientation import images_of_task
 from lerobot_bomb.commands import main as cli
 from lerobot_bomb.data import blocks, resumable
 from lerobot_bomb.data.facts import DatasetFacts
+from lerobot_bomb.data.kept_blocks import finished_blocks
 from lerobot_bomb.data.libero_conversion import KEYS, convert_libero
 from lerobot_bomb.data.libero_hdf5 import instruction, noops
-from lerobot_bomb.data.resumable import finished_blocks
 
 pytest.importorskip("h5py")
 

@@ -4,17 +4,22 @@ Simulator workers import this file's head, so LeRobot is imported inside tests.
 """
 
 import json
+import io
 import shutil
 from collections.abc import Callable
+from contextlib import nullcontext
 from pathlib import Path
 
+import av
 import pytest
 
 from lerobot_bomb.commands import main as cli
 from lerobot_bomb.data import resumable
+from lerobot_bomb.data.kept_blocks import damaged_blocks, find_gaps, finished_blocks
 from lerobot_bomb.data.record import record
+from lerobot_bomb.data.recorded_blocks import recording_layout
 from lerobot_bomb.data.recording import Recording
-from lerobot_bomb.data.resumable import METADATA_FILE, unfinished_folder
+from lerobot_bomb.data.unfinished import METADATA_FILE, unfinished_folder
 
 RECORDING = Recording("test/blocks", episodes=5, seed=3, image_size=32)
 FLAGS = ("--repo_id=test/blocks", "--episodes=5", "--seed=3", "--image_size=32")
@@ -52,6 +57,11 @@ def contents(root: Path) -> dict[str, bytes]:
     return {str(path.relative_to(root)): path.read_bytes() for path in root.rglob("*") if path.is_file()}
 
 
+def packets(video: bytes) -> list[tuple[int | None, int | None, bytes]]:
+    with av.open(io.BytesIO(video), mode="r") as opened:
+        return [(packet.pts, packet.duration, bytes(packet)) for packet in opened.demux(video=0)]
+
+
 def halve(path: Path) -> None:
     path.write_bytes(path.read_bytes()[: path.stat().st_size // 2])
 
@@ -82,12 +92,11 @@ def test_a_lost_block_between_others_is_missed(recorded: Path, tmp_path: Path) -
     folder = tmp_path / "x.recording"
     shutil.copytree(recorded / "x.recording", folder)
     (folder / "block-00001").rename(tmp_path / "lost")
-    assert resumable.damaged_blocks(folder, 5, 2) == {folder / "block-00001": "is missing"}
-    (gap,) = resumable.find_gaps(folder, 5, 2)
-    assert (gap.progress.num_episodes, gap.end, gap.num_missing) == (2, 4, 2)
+    assert damaged_blocks(folder, range(3)) == {folder / "block-00001": "is missing"}
+    assert find_gaps(folder, range(3)) == [range(1, 2)]
+    assert find_gaps(folder, range(9)) == [range(1, 2), range(3, 9)]
     shutil.copytree(folder / "block-00000", folder / "block-00001")
-    damage = {folder / "block-00001": "ends with episode 2 instead of 4"}
-    assert resumable.damaged_blocks(folder, 5, 2) == damage
+    assert damaged_blocks(folder, range(3)) == {folder / "block-00001": "is block 0"}
 
 
 def test_a_merge_that_loses_episodes_is_an_error_and_the_blocks_stay(
@@ -101,6 +110,32 @@ def test_a_merge_that_loses_episodes_is_an_error_and_the_blocks_stay(
     with pytest.raises(RuntimeError, match=r"holds 4 episodes, but 5 were made; 5 episodes are kept"):
         record(RECORDING, tmp_path / "x", resume=True)
     assert not (tmp_path / "x").exists()
+
+
+@pytest.mark.parametrize("file_mb", [100, 0.001])
+def test_a_merge_that_writes_each_file_once_is_lerobots(
+    file_mb: float, recorded: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    from lerobot.datasets import aggregate
+
+    from lerobot_bomb.data import blocks
+
+    for kind in ("DATA", "VIDEO"):
+        monkeypatch.setattr(aggregate, f"DEFAULT_{kind}_FILE_SIZE_IN_MB", file_mb)
+    before = vars(aggregate).copy()
+    layout, there = recording_layout(RECORDING), finished_blocks(recorded / "x.recording")
+    blocks.merge_blocks(layout, there, tmp_path / "once")
+    assert vars(aggregate) == before
+    monkeypatch.setattr(blocks, "merged_at_once", nullcontext)
+    blocks.merge_blocks(layout, there, tmp_path / "again_and_again")
+    once, again = contents(tmp_path / "once"), contents(tmp_path / "again_and_again")
+    assert once.keys() == again.keys()
+    assert len([name for name in once if "file-" in name]) == (4 if file_mb == 100 else 12)
+    for name in once:
+        if name.endswith(".mp4"):  # a header says a bit rate, which a video has from how it was joined
+            assert packets(once[name]) == packets(again[name])
+        else:
+            assert once[name] == again[name], name
 
 
 @pytest.mark.parametrize("name", [VIDEO, "data/chunk-000/file-000.parquet", "meta/tasks.parquet"])

@@ -22,13 +22,14 @@ from lerobot_bomb.bomb.observation import CAMERAS, RenderOptions
 from lerobot_bomb.bomb.perturbations import NUISANCES
 from lerobot_bomb.bomb.privileged_state import PrivilegedState
 from lerobot_bomb.commands.main import main
-from lerobot_bomb.data import record as record_module
-from lerobot_bomb.data import resumable
+from lerobot_bomb.data import recorded_blocks, resumable
 from lerobot_bomb.data.facts import DatasetFacts
-from lerobot_bomb.data.record import describe_failures, record
+from lerobot_bomb.data.kept_blocks import Progress, read_progress
+from lerobot_bomb.data.record import record
+from lerobot_bomb.data.recorded_blocks import describe_failures
 from lerobot_bomb.data.recording import Recording
-from lerobot_bomb.data.resumable import METADATA_FILE, Progress, read_progress, unfinished_folder
 from lerobot_bomb.data.rollout_pool import RolloutSettings, collect
+from lerobot_bomb.data.unfinished import METADATA_FILE, unfinished_folder
 from lerobot_bomb.envs.rollout import make_env
 
 SIZE = 64
@@ -296,7 +297,7 @@ def test_failures_are_described_by_class_and_seed() -> None:
 
 
 def test_a_broken_expert_ends_the_recording(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(record_module, "MIN_TRIED", 3)
+    monkeypatch.setattr(recorded_blocks, "MIN_TRIED", 3)
     with pytest.raises(RuntimeError, match=r"only 0 of 3 episodes succeeded.*never_reached.*0, 1, 2"):
         record(Recording("test/x", episodes=1, image_size=SIZE), tmp_path / "x", expert=stand_still)
     assert list(tmp_path.iterdir()) == []

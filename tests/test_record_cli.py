@@ -13,7 +13,8 @@ from pathlib import Path
 import pytest
 from recorder_server import MARK, TIMEOUT_S, marked_processes, wait_for_end
 
-from lerobot_bomb.data.resumable import finished_blocks, unfinished_folder
+from lerobot_bomb.data.kept_blocks import finished_blocks
+from lerobot_bomb.data.unfinished import unfinished_folder
 
 pytestmark = [
     pytest.mark.long,

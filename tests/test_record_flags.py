@@ -17,17 +17,15 @@ from lerobot.envs import EnvConfig
 from lerobot_bomb.commands import main as cli
 from lerobot_bomb.commands.arguments import parse_conditions
 from lerobot_bomb.conditions import NONE
+from lerobot_bomb.data.kept_blocks import Progress, finish_block, write_json
 from lerobot_bomb.data.recording import Recording
-from lerobot_bomb.data.resumable import (
+from lerobot_bomb.data.resumable import terminated_in_order
+from lerobot_bomb.data.unfinished import (
     METADATA_FILE,
-    Progress,
     check_folders,
-    finish_block,
     lock_folder,
     parameters_file,
-    terminated_in_order,
     unfinished_folder,
-    write_json,
 )
 from lerobot_env_bomb.configuration_bomb import BombEnvConfig
 

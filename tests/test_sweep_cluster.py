@@ -9,7 +9,7 @@ from typing import Any
 
 import pytest
 
-from lerobot_bomb.commands import sweep as command
+from lerobot_bomb.commands import cluster_jobs
 from lerobot_bomb.commands.main import main
 from lerobot_bomb.sweep import local
 from lerobot_bomb.sweep.cluster import sbatch_script
@@ -167,7 +167,7 @@ class Job:
 def test_jobs_that_end_before_they_played_are_told(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    monkeypatch.setattr(command, "submit", lambda *args: [Job(is_done=True)])
+    monkeypatch.setattr(cluster_jobs, "submit", lambda *args: [Job(is_done=True)])
     assert sweep(tmp_path, "--submitit=1", *SWEEP) == 1
     printed = capsys.readouterr().out
     assert f"jobs ended before they had played everything; {tmp_path / 'submitit'} says why" in printed
@@ -181,7 +181,7 @@ def test_ctrl_c_cancels_the_jobs(
         raise KeyboardInterrupt
 
     job = Job(is_done=False)
-    monkeypatch.setattr(command, "submit", lambda *args: [job])
+    monkeypatch.setattr(cluster_jobs, "submit", lambda *args: [job])
     monkeypatch.setattr(time, "sleep", interrupted)
     assert sweep(tmp_path, "--submitit=1", *SWEEP) == 130
     printed = capsys.readouterr()

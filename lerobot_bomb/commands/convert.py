@@ -19,14 +19,13 @@ from lerobot_bomb.data.libero_conversion import convert_libero
 from lerobot_bomb.data.pusht_zarr import BOARD_SIZE, IMAGE_SIZE, PushtZarr
 from lerobot_bomb.data.resumable import (
     BLOCK_EPISODES,
-    check_folders,
     check_repo_id,
     default_root,
     grow,
     terminated_in_order,
-    unfinished_folder,
 )
 from lerobot_bomb.data.rigid_copies import RigidMotion
+from lerobot_bomb.data.unfinished import check_folders, unfinished_folder
 
 if TYPE_CHECKING:
     from lerobot_bomb.data.blocks import DatasetLayout, RecordedEpisode

@@ -10,8 +10,9 @@ from huggingface_hub.errors import RevisionNotFoundError
 from lerobot_bomb.commands.arguments import add_hub_arguments, path_flag
 from lerobot_bomb.data.dataset_files import check_dataset
 from lerobot_bomb.data.facts import DatasetFacts
-from lerobot_bomb.data.resumable import METADATA_FILE, check_repo_id
+from lerobot_bomb.data.resumable import check_repo_id
 from lerobot_bomb.data.statistics import check_statistics
+from lerobot_bomb.data.unfinished import METADATA_FILE
 from lerobot_bomb.hub.markdown import code, command, fenced, plain
 from lerobot_bomb.hub.push import CARD
 from lerobot_bomb.hub.upload import check_token, hub_errors, upload

@@ -1,6 +1,7 @@
 """``lerobot-bomb record``: the scripted expert's episodes as a LeRobotDataset."""
 
 import argparse
+import shlex
 import sys
 from dataclasses import fields
 from pathlib import Path
@@ -16,14 +17,32 @@ from lerobot_bomb.commands.arguments import (
     path_flag,
     switch,
 )
-from lerobot_bomb.data.record import Acting, describe_failures, record
+from lerobot_bomb.commands.cluster_jobs import (
+    SUBMITIT,
+    SUBMITIT_FLAGS,
+    add_job_arguments,
+    check_num_jobs,
+    shard_of,
+    submitted,
+    write_job_array,
+)
+from lerobot_bomb.data.kept_blocks import Progress, read_progress
+from lerobot_bomb.data.parts import Part, check_part, join, num_whole_blocks, record_part, unfinished_parts
+from lerobot_bomb.data.record import record
+from lerobot_bomb.data.recorded_blocks import Acting, Players, describe_failures
 from lerobot_bomb.data.recording import Recording
 from lerobot_bomb.data.resumable import (
     BLOCK_EPISODES,
+    block_episodes,
     default_root,
     terminated_in_order,
 )
+from lerobot_bomb.data.unfinished import METADATA_FILE, unfinished_folder
 from lerobot_bomb.flags import flags_without_group
+from lerobot_bomb.sweep.local import PYTHON
+
+JOBS, SCRIPT = "jobs", "record.sbatch"  # the folder ROOT.jobs, and a file in it
+NOT_OF_JOBS = ("command", "root", "resume", "shard", "join", "slurm", *SUBMITIT_FLAGS)
 
 
 def add_record_arguments(parser: argparse.ArgumentParser) -> None:
@@ -51,8 +70,11 @@ def add_record_arguments(parser: argparse.ArgumentParser) -> None:
     add(
         "--resume",
         **switch(),
-        help=f"continue a recording that was interrupted; its blocks of {BLOCK_EPISODES} episodes are kept",
+        help=f"continue a recording that was interrupted; its blocks of {BLOCK_EPISODES} episodes are kept "
+        "(with --shard and --join, always)",
     )
+    where = add_job_arguments(parser, "episodes", f"ROOT.{JOBS}/{SCRIPT}")
+    where.add_argument("--join", **switch(), help="make the dataset of the parts of --shard, and delete them")
 
 
 def _add_what_is_recorded(parser: argparse.ArgumentParser) -> None:
@@ -83,6 +105,26 @@ def _add_what_is_recorded(parser: argparse.ArgumentParser) -> None:
 
 def run_record(args: argparse.Namespace) -> int:
     """Record; prints which episodes failed and where the dataset is."""
+    recording = _recording(args)
+    root = args.root or default_root(recording.repo_id)
+    shard = shard_of(args)
+    check_num_jobs(args, num_whole_blocks(recording), f"parts of at least {BLOCK_EPISODES} episodes")
+    if num_jobs := args.slurm or args.submitit:
+        return _record_by_jobs(args, [Part(recording, index, num_jobs) for index in range(num_jobs)], root)
+    _warn_of_test_seeds(recording)
+    with terminated_in_order():
+        acting = _acting(recording, args.policy_path) if recording.relabel else None
+        if shard is not None:
+            return _record_part(Part(recording, *shard), root, Players(args.workers, acting=acting))
+        if args.join:
+            progress = join(recording, root, Players(args.workers, acting=acting))
+        else:
+            progress = record(recording, root, num_workers=args.workers, resume=args.resume, acting=acting)
+    _print(recording, progress, root)
+    return 0
+
+
+def _recording(args: argparse.Namespace) -> Recording:
     flags = vars(args)
     if args.static == 0:
         raise ValueError("--static=0 records nothing; give a number of scenes, or --episodes")
@@ -93,19 +135,63 @@ def run_record(args: argparse.Namespace) -> int:
         raise ValueError(
             f"--workers={args.workers} must lie in 1..{recording.episodes} (--episodes or --static)"
         )
-    _warn_of_test_seeds(recording)
-    root = args.root or default_root(recording.repo_id)
-    with terminated_in_order():
-        acting = _acting(recording, args.policy_path) if recording.relabel else None
-        progress = record(recording, root, num_workers=args.workers, resume=args.resume, acting=acting)
-    rounds = -(-progress.num_tried // len(recording.conditions))
-    last_seed = recording.seed + rounds * recording.scenes - 1
-    seeds = f"{recording.seed}..{last_seed}"
+    return recording
+
+
+def _print(recording: Recording, progress: Progress, where: Path, num_before: int = 0) -> None:
+    """Say what was recorded, after so many episodes that others try."""
+    conditions, scenes = len(recording.conditions), recording.scenes
+    first = recording.seed + num_before // conditions * scenes
+    end = recording.seed - (-(num_before + progress.num_tried) // conditions) * scenes
     print(
-        f"{progress.num_episodes} episodes, {progress.num_frames} frames, of the seeds {seeds}: {root}\n"
-        f"{describe_failures(progress.failures)}"
+        f"{progress.num_episodes} episodes, {progress.num_frames} frames, of the seeds {first}..{end - 1}: "
+        f"{where}\n{describe_failures(progress.failures)}"
     )
+
+
+def _record_part(part: Part, root: Path, players: Players) -> int:
+    progress = record_part(part, root, players)
+    if progress is None:
+        print(f"{root} is there, joined")
+    else:
+        num_before = block_episodes(part.blocks.start).start
+        _print(part.recording, progress, part.folder(root), num_before)
     return 0
+
+
+def _record_by_jobs(args: argparse.Namespace, parts: list[Part], root: Path) -> int:
+    """Write the script of jobs and print what is to be done with it; or submit them, and join their parts."""
+    check_part(parts[0], root)
+    command, folder = _job_command(args, root), unfinished_folder(root, JOBS)
+    if args.slurm is not None:
+        write_job_array(command, args.slurm, folder / SCRIPT)
+        print(shlex.join([*command, "--join"]))
+        return 0
+    failed = f"jobs ended before they had recorded everything; {folder / SUBMITIT} says why"
+    if not root.exists():
+        shards = [[*command, f"--shard={part}"] for part in unfinished_parts(parts, root)]
+        with submitted(shards, args, folder):
+            pass
+        if unfinished := unfinished_parts(parts, root):
+            raise RuntimeError(f"{failed}: parts {', '.join(map(str, unfinished))} are not finished")
+    with submitted([[*command, "--join"]], args, folder):
+        pass
+    if not root.exists():
+        raise RuntimeError(f"{failed}: the parts are not joined")
+    _print(parts[0].recording, read_progress(root / METADATA_FILE), root)
+    return 0
+
+
+def _job_command(args: argparse.Namespace, root: Path) -> list[str]:
+    """Records as the given flags say, with --shard a part of it."""
+    flags = [f"--root={root.absolute()}"]
+    for name, value in vars(args).items():
+        if name in NOT_OF_JOBS or value in (None, False, ()):
+            continue
+        flag = "policy.path" if name == "policy_path" else name
+        text = ",".join(map(str, value)) if isinstance(value, tuple) else str(value)
+        flags.append(f"--{flag}={'true' if value is True else text}")
+    return [*PYTHON, "lerobot_bomb.commands.main", "record", *flags]
 
 
 def _acting_weights(args: argparse.Namespace) -> str | None:

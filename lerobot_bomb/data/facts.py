@@ -10,7 +10,7 @@ from lerobot_bomb.bomb.suite import suites_of
 from lerobot_bomb.data.dataset_files import EPISODES_FOLDER, INFO_FILE, read_parquet
 from lerobot_bomb.data.environment import Environment, numbered_tasks
 from lerobot_bomb.data.recording import SCENES
-from lerobot_bomb.data.resumable import METADATA_FILE
+from lerobot_bomb.data.unfinished import METADATA_FILE
 from lerobot_bomb.files import read_json
 
 PUSHT_SOURCE = "pusht-zarr"
