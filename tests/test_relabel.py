@@ -39,7 +39,7 @@ def flags(checkpoint: Path, root: Path, **others: Any) -> list[str]:
 
 
 def test_what_the_policy_sees_gets_the_experts_actions(checkpoint: Path, tmp_path: Path) -> None:
-    assert main(flags(checkpoint, tmp_path / "own")) == 0
+    assert main([*flags(checkpoint, tmp_path / "own"), "--pointing"]) == 0
     dataset: Any = LeRobotDataset("test/own", root=tmp_path / "own")
     assert dataset.num_episodes == 1 and len(dataset) == 100  # it failed, and is kept
     env = make_env(EpisodeSpec(3), RenderOptions(64))
@@ -47,6 +47,7 @@ def test_what_the_policy_sees_gets_the_experts_actions(checkpoint: Path, tmp_pat
     first: Any = dataset[0]
     expected = expert_action(PrivilegedState.from_vector(observation["environment_state"]))
     np.testing.assert_array_equal(first["action"], expected)
+    assert first["observation.pointing.board"].tolist() == 25 * [0]  # the stone is in the tray
     states = np.stack([np.asarray(dataset[i]["observation.state"]) for i in (0, 40, 99)])
     assert abs(np.diff(states[:, :3], axis=0)).max() > 0.01  # it moved, and not as the expert
     env.close()
