@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 import torch
 from fdvla_cases import SMALL as SMALL_FDVLA
-from fdvla_cases import make_batch, make_policy
+from fdvla_cases import make_batch, make_config, make_policy
 from lerobot.datasets import LeRobotDataset, LeRobotDatasetMetadata, aggregate_datasets
 from lerobot.policies.factory import make_policy as policy_for
 from lerobot.policies.factory import make_pre_post_processors
@@ -277,7 +277,7 @@ def test_a_dataset_that_does_not_point_is_refused(recorded: dict[str, Path], tmp
     plain = {key: feature for key, feature in features.items() if key not in LABELS}
     meta = LeRobotDatasetMetadata.create("test/plain", fps=10, features=plain, root=tmp_path / "plain")
     with pytest.raises(ValueError, match=r"observation\.pointing\.place, .* which test/plain lacks"):
-        pointing_policy(meta)
+        make_config(pointing=True).take_places(meta)
 
 
 def test_a_checkpoint_points_at_its_own_places_only(recorded: dict[str, Path]) -> None:
