@@ -235,7 +235,7 @@ def test_seeds_of_scenes_do_not_repeat() -> None:
 
 def test_a_label_is_no_input_of_a_policy_that_is_trained_on_it(recorded: dict[str, Path]) -> None:
     meta = LeRobotDataset("test/static", root=recorded["scenes"]).meta
-    options = SMALL_FDVLA | {"chunk_size": 1, "n_action_steps": 1}
+    options: dict[str, Any] = SMALL_FDVLA | {"chunk_size": 1, "n_action_steps": 1}
     policy = policy_for(FdvlaConfig(**options, push_to_hub=False), ds_meta=meta)
     assert not LABELS & set(policy.config.input_features or {})
     assert "observation.state" in (policy.config.input_features or {})
