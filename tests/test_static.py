@@ -221,7 +221,8 @@ def test_scenes_are_no_episodes(recorded: dict[str, Path], capsys: pytest.Captur
 
 def test_no_chunk_is_longer_than_every_episode(recorded: dict[str, Path]) -> None:
     meta = LeRobotDatasetMetadata("test/static", root=recorded["scenes"])
-    config = FdvlaConfig(**SMALL_FDVLA | {"chunk_size": 9, "n_action_steps": 1}, push_to_hub=False)
+    options: dict[str, Any] = SMALL_FDVLA | {"chunk_size": 9, "n_action_steps": 1}
+    config = FdvlaConfig(**options, push_to_hub=False)
     with pytest.raises(ValueError, match=r"--policy.chunk_size=9: .* has 2 frames; give at most 2"):
         policy_for(config, ds_meta=meta)
 
