@@ -1,10 +1,12 @@
 """What lies on each intersection, read off image tokens: learned beside pointing, by all three policies."""
 
 import math
+from dataclasses import replace
 from pathlib import Path
 from types import ModuleType
 from typing import Any
 
+import numpy as np
 import pytest
 import test_fdvla_pointing
 import test_spatialvla_grid_pointing
@@ -15,10 +17,17 @@ from policy_cases import CASES
 from test_spatialvla_grid_pointing import make_dataset
 from torch import Tensor
 
+from lerobot_bomb.bomb.episode import EpisodeSpec
+from lerobot_bomb.bomb.observation import RenderOptions
+from lerobot_bomb.bomb.pointing import Pointing, colors_on_board
+from lerobot_bomb.bomb.privileged_state import PrivilegedState
+from lerobot_bomb.bomb.suite import find_suite
+from lerobot_bomb.envs.rollout import make_env
 from lerobot_bomb.flag_errors import FlagError
 from lerobot_bomb.policies.board_reader import BoardReader
 from lerobot_bomb.policies.pointing import BOARD_COLORS
 
+SMALL = RenderOptions(image_size=32)
 POINTING: dict[str, ModuleType] = {
     "fdvla": test_fdvla_pointing,
     "spatialvla_grid": test_spatialvla_grid_pointing,
@@ -153,6 +162,52 @@ def test_it_learns_to_read_a_board() -> None:
     moved = policy(batch | images | {BOARD_COLORS: batch[BOARD_COLORS].roll(1, dims=0)})[1]
     assert moved["board_accuracy"] == 1
     assert policy(batch | images)[1]["board_accuracy"] < 0.9
+
+
+# Labels
+
+
+def test_a_stone_counts_that_lies_on_an_intersection() -> None:
+    env: Any = make_env(EpisodeSpec(0), SMALL).unwrapped
+    env.reset(seed=3)
+    state = env.privileged_state()
+    env.close()
+    lies_m, xyz = state.stone_xyz[0, 2], state.stone_xyz.copy()
+    xyz[:6] = [
+        [-0.090, 0.090, lies_m],  # black, far left corner
+        [0.045, 0.007, lies_m],  # white, 7 mm beside (2, 3)
+        [0.090, -0.081, lies_m],  # 9 mm beside the near right corner
+        [0.000, 0.000, lies_m + 0.011],  # lifted
+        [-0.045, 0.000, lies_m],  # not in play
+        [0.170, 0.000, lies_m],  # in the tray
+    ]
+    state = replace(
+        state,
+        stone_xyz=xyz,
+        stone_is_white=np.arange(len(xyz)) == 1,
+        stone_in_play=np.isin(np.arange(len(xyz)), [0, 1, 2, 3, 5]),
+    )
+    expected = np.zeros((5, 5), int)
+    expected[0, 0], expected[2, 3] = 1, 2
+    np.testing.assert_array_equal(colors_on_board(state).reshape(5, 5), expected)
+    board = Pointing.of(state, np.random.default_rng(0)).columns()["pointing.board"]
+    assert board.dtype == np.float32 and board.tolist() == expected.reshape(-1).tolist()
+    nothing = replace(state, stone_in_play=np.zeros(len(xyz), bool))
+    np.testing.assert_array_equal(colors_on_board(nothing), np.zeros(25))
+
+
+@pytest.mark.parametrize("suite", ["spatial", "goal"])
+def test_the_board_of_an_opening_is_read(suite: str) -> None:
+    spec = EpisodeSpec(4, suite)
+    env: Any = make_env(spec, SMALL).unwrapped
+    observation, _ = env.reset(seed=4)
+    env.close()
+    opening = find_suite(suite).sample(spec).opening
+    expected = np.zeros((5, 5), int)
+    for cell, color in opening.items():
+        expected[cell] = {"black": 1, "white": 2}[color]
+    read = colors_on_board(PrivilegedState.from_vector(observation["environment_state"]))
+    assert opening and read.reshape(5, 5).tolist() == expected.tolist()
 
 
 # Checkpoints and data
