@@ -14,7 +14,14 @@ from lerobot_policy_fdvla.modeling_fdvla import FdvlaPolicy
 from lerobot_policy_fdvla.pointing_fdvla import Pointed, Pointer
 
 PLACES = [[-0.09, 0.09], [0.0, 0.0], [0.09, -0.045], [0.17, 0.0]]
-POINTING: dict[str, Any] = {"pointing": True, "pointing_places": PLACES, "chunk_size": 1, "n_action_steps": 1}
+# without reading the board: that is in test_board_reader.py
+POINTING: dict[str, Any] = {
+    "pointing": True,
+    "pointing_places": PLACES,
+    "board_loss_weight": 0.0,
+    "chunk_size": 1,
+    "n_action_steps": 1,
+}
 
 
 def pointing_policy(**options: Any) -> FdvlaPolicy:

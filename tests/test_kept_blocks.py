@@ -3,8 +3,8 @@
 Simulator workers import this file's head, so LeRobot is imported inside tests.
 """
 
-import json
 import io
+import json
 import shutil
 from collections.abc import Callable
 from contextlib import nullcontext

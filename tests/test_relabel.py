@@ -12,6 +12,7 @@ from lerobot.policies.factory import make_pre_post_processors
 from lerobot_bomb.bomb.episode import EpisodeSpec
 from lerobot_bomb.bomb.expert import expert_action
 from lerobot_bomb.bomb.observation import RenderOptions
+from lerobot_bomb.bomb.pointing import colors_on_board
 from lerobot_bomb.bomb.privileged_state import PrivilegedState
 from lerobot_bomb.commands.main import main
 from lerobot_bomb.data.environment import Environment
@@ -39,14 +40,15 @@ def flags(checkpoint: Path, root: Path, **others: Any) -> list[str]:
 
 
 def test_what_the_policy_sees_gets_the_experts_actions(checkpoint: Path, tmp_path: Path) -> None:
-    assert main(flags(checkpoint, tmp_path / "own")) == 0
+    assert main([*flags(checkpoint, tmp_path / "own"), "--pointing"]) == 0
     dataset: Any = LeRobotDataset("test/own", root=tmp_path / "own")
     assert dataset.num_episodes == 1 and len(dataset) == 100  # it failed, and is kept
     env = make_env(EpisodeSpec(3), RenderOptions(64))
     observation, _ = env.reset(seed=3)
     first: Any = dataset[0]
-    expected = expert_action(PrivilegedState.from_vector(observation["environment_state"]))
-    np.testing.assert_array_equal(first["action"], expected)
+    state = PrivilegedState.from_vector(observation["environment_state"])
+    np.testing.assert_array_equal(first["action"], expert_action(state))
+    np.testing.assert_array_equal(first["observation.pointing.board"], colors_on_board(state))
     states = np.stack([np.asarray(dataset[i]["observation.state"]) for i in (0, 40, 99)])
     assert abs(np.diff(states[:, :3], axis=0)).max() > 0.01  # it moved, and not as the expert
     env.close()

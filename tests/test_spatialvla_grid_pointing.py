@@ -27,8 +27,10 @@ SINGLY: dict[str, Any] = {
     "grid_distribution": "uniform",
     "decode_point": "mid",
 }
+# without reading the board: that is in test_board_reader.py
 POINTING: dict[str, Any] = {
     "pointing": True,
+    "board_loss_weight": 0.0,
     "pointing_places": PLACES,
     "pointing_cell_m": STONES.cell_m,
     "crop_fraction": 1.0,
@@ -89,7 +91,7 @@ def test_the_loss_is_the_likelihood_among_a_slots_tokens_of_all_that_is_kept() -
         cells, kept_BT, pointed = policy._targets(batch)
         is_other = ~pointed.kept[:, 0]
         assert 0 < is_other.sum() < 4
-        pointing_BNH, hidden_BTGH = policy._hidden(batch, cells, pointed.tokens)
+        pointing_BNH, hidden_BTGH, _ = policy._hidden(batch, cells, pointed.tokens)
         hidden = torch.cat([pointing_BNH, hidden_BTGH.flatten(1, 2)], dim=1)
         logits = policy.backbone.cap(policy.cell_head(hidden))
         words = policy.backbone.cap(policy.backbone.vlm.lm_head(hidden))
@@ -120,7 +122,7 @@ def test_metrics_of_actions_skip_what_points() -> None:
     metrics = policy(batch)[1]
     assert set(metrics) == {"token_accuracy", "place_accuracy", "stone_accuracy"}
     cells, _, pointed = policy._targets(batch)
-    pointing_BNH, hidden_BTGH = policy._hidden(batch, cells, pointed.tokens)
+    pointing_BNH, hidden_BTGH, _ = policy._hidden(batch, cells, pointed.tokens)
     right = policy._losses(hidden_BTGH, cells)[1] == cells
     assert metrics["token_accuracy"] == pytest.approx(float(right.float().mean()))
     place = policy._pointing_losses(pointing_BNH, pointed.tokens)[1][:, 0]
@@ -164,7 +166,7 @@ def test_at_each_position_all_of_its_tokens_and_no_others_can_win(
 
 def states_of(policy: SpatialvlaGridPolicy, batch: dict[str, Any], answer: Tensor) -> tuple[Tensor, Tensor]:
     pointed, cells = policy._split(answer)
-    return policy._hidden(batch, cells, pointed)
+    return policy._hidden(batch, cells, pointed)[:2]
 
 
 @torch.no_grad()
@@ -176,7 +178,7 @@ def test_actions_alone_come_out_whatever_the_batch(num_dims: int, options: dict[
     pointed, cells = policy._split(answer)
     assert answer.shape[1] == 2 + 2 * len(policy.grids.groups) == policy.last_passes == 2 + policy.last_tokens
     # what the teacher-forced network finds likeliest, given what was written, is what was written
-    pointing_BNH, hidden_BTGH = policy._hidden(batch, cells, pointed)
+    pointing_BNH, hidden_BTGH, _ = policy._hidden(batch, cells, pointed)
     assert torch.equal(policy._pointing_losses(pointing_BNH, pointed)[1], pointed)
     assert torch.equal(policy._losses(hidden_BTGH, cells)[1], cells)
     chunk = policy.predict_action_chunk(batch)
@@ -216,7 +218,7 @@ def test_an_explanation_scores_what_is_pointed_at_and_the_cells() -> None:
     assert torch.equal(answer, policy._write(batch, 2))
     pointed, cells = policy._split(answer)
     with torch.no_grad():
-        pointing_BNH, hidden_BTGH = policy._hidden(batch, cells, pointed)
+        pointing_BNH, hidden_BTGH, _ = policy._hidden(batch, cells, pointed)
         losses = policy._pointing_losses(pointing_BNH, pointed)[0].sum()
         losses += policy._losses(hidden_BTGH, cells)[0].sum()
         torch.testing.assert_close(explained.score(explained.encode(batch), answer), -losses[None])

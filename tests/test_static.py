@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 import torch
 from fdvla_cases import SMALL as SMALL_FDVLA
-from fdvla_cases import make_batch, make_policy
+from fdvla_cases import make_batch, make_config, make_policy
 from lerobot.datasets import LeRobotDataset, LeRobotDatasetMetadata, aggregate_datasets
 from lerobot.policies.factory import make_policy as policy_for
 from lerobot.policies.factory import make_pre_post_processors
@@ -178,7 +178,8 @@ def test_scenes_are_no_episodes(recorded: dict[str, Path], capsys: pytest.Captur
 
 def test_no_chunk_is_longer_than_every_episode(recorded: dict[str, Path]) -> None:
     meta = LeRobotDatasetMetadata("test/static", root=recorded["scenes"])
-    config = FdvlaConfig(**SMALL_FDVLA | {"chunk_size": 9, "n_action_steps": 1}, push_to_hub=False)
+    options: dict[str, Any] = SMALL_FDVLA | {"chunk_size": 9, "n_action_steps": 1}
+    config = FdvlaConfig(**options, push_to_hub=False)
     with pytest.raises(ValueError, match=r"--policy.chunk_size=9: .* has 2 frames; give at most 2"):
         policy_for(config, ds_meta=meta)
 
@@ -192,7 +193,7 @@ def test_seeds_of_scenes_do_not_repeat() -> None:
 
 def test_a_label_is_no_input_of_a_policy_that_is_trained_on_it(recorded: dict[str, Path]) -> None:
     meta = LeRobotDataset("test/static", root=recorded["scenes"]).meta
-    options = SMALL_FDVLA | {"chunk_size": 1, "n_action_steps": 1}
+    options: dict[str, Any] = SMALL_FDVLA | {"chunk_size": 1, "n_action_steps": 1}
     policy = policy_for(FdvlaConfig(**options, push_to_hub=False), ds_meta=meta)
     assert not LABELS & set(policy.config.input_features or {})
     assert "observation.state" in (policy.config.input_features or {})
@@ -222,7 +223,7 @@ def test_a_policy_points_as_recorded(recorded: dict[str, Path], tmp_path: Path) 
         policy.pointer.places[labels.place], raw["observation.pointing.place"], atol=1e-5, rtol=0
     )
     loss, metrics = policy.train()(batch)
-    assert torch.isfinite(loss) and metrics["place_loss"] > 0
+    assert torch.isfinite(loss) and metrics["place_loss"] > 0 and metrics["board_loss"] > 0
     policy.save_pretrained(tmp_path)
     again = FdvlaPolicy.from_pretrained(tmp_path).eval()
     answers = [each.predict_action_chunk(batch) for each in (policy.eval(), again)]
@@ -234,7 +235,7 @@ def test_a_dataset_that_does_not_point_is_refused(recorded: dict[str, Path], tmp
     plain = {key: feature for key, feature in features.items() if key not in LABELS}
     meta = LeRobotDatasetMetadata.create("test/plain", fps=10, features=plain, root=tmp_path / "plain")
     with pytest.raises(ValueError, match=r"observation\.pointing\.place, .* which test/plain lacks"):
-        places_of(meta, None)
+        make_config(pointing=True).take_places(meta)
 
 
 def test_a_checkpoint_points_at_its_own_places_only(recorded: dict[str, Path]) -> None:

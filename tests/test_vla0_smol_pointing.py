@@ -24,8 +24,14 @@ from lerobot_bomb.vlm.tokenizer import load_tokenizer
 from lerobot_policy_vla0_smol.modeling_vla0_smol import Vla0SmolPolicy
 from lerobot_policy_vla0_smol.pointing_vla0_smol import NUM_NUMBERS
 
-# a millimetre a bin, and three digits each
-POINTING: dict[str, Any] = {"pointing": True, "n_action_bins": 601, "bin_mode": "levels", "number_width": 3}
+# a millimetre a bin, and three digits each; without reading the board: that is in test_board_reader.py
+POINTING: dict[str, Any] = {
+    "pointing": True,
+    "board_loss_weight": 0.0,
+    "n_action_bins": 601,
+    "bin_mode": "levels",
+    "number_width": 3,
+}
 PLACES = torch.tensor([[-0.09, 0.09], [0.0, -0.15], [0.09, 0.03], [0.15, -0.06]])
 
 
@@ -113,8 +119,8 @@ def test_off_there_is_nothing_of_it() -> None:
     assert "points before it acts" not in policy.config.methods_used()
     # a checkpoint of before keeps its identity
     later = {name: getattr(policy.config, name) for name in policy.config.LATER_FIELDS}
-    assert later == {"pointing": False, "counterfactual_share": 0.5, "pointing_range_m": 0.3}
-    assert later == policy.config.LATER_FIELDS
+    expected = {"counterfactual_share": 0.5, "board_loss_weight": 1.0, "pointing_range_m": 0.3}
+    assert later == {"pointing": False, **expected} == policy.config.LATER_FIELDS
 
 
 # Loss

@@ -1,7 +1,7 @@
 """Pointing of the expert: columns of a recording that only training reads, never an observation.
 
-Which stone goes to which place is what a policy must read before it can act; what the expert would do for
-other places teaches it to act as it has pointed.
+Which stone goes to which place is what a policy must read before it can act, and what lies on the board what
+it must read before that; what the expert would do for other places teaches it to act as it has pointed.
 """
 
 from dataclasses import dataclass, replace
@@ -11,14 +11,19 @@ import numpy as np
 from lerobot_bomb.bomb.board import BOARD
 from lerobot_bomb.bomb.commands import CELLS, TRAY_XY_M
 from lerobot_bomb.bomb.expert import current_goal, expert_action, held_share
+from lerobot_bomb.bomb.judge import LIFT_M
 from lerobot_bomb.bomb.observation import ACTION_DIM
 from lerobot_bomb.bomb.privileged_state import Goal, PrivilegedState
 
+ON_INTERSECTION_M = 0.008  # a stone this near one lies on it
+LIFTED_M = (
+    BOARD.thickness_m + BOARD.stone_height_m / 2 + LIFT_M
+)  # a stone's centre, off the board from here on
 NUM_OTHERS = 2  # places a frame, beside the one that is meant
 # where the expert puts stones
 PLACES_XY_M = (*(tuple(BOARD.intersection_xy(*cell).tolist()) for cell in CELLS), *TRAY_XY_M)
 PREFIX = "pointing."
-# name -> names of its numbers; metres, shares, actions of the environment
+# name -> names of its numbers; metres, shares, actions of the environment, colours of `colors_on_board`
 COLUMNS = {
     f"{PREFIX}place": ("x", "y"),
     f"{PREFIX}stone": ("x", "y", "held"),
@@ -26,6 +31,7 @@ COLUMNS = {
     f"{PREFIX}other_actions": tuple(
         f"action{i}_{dim}" for i in range(NUM_OTHERS) for dim in range(ACTION_DIM)
     ),
+    f"{PREFIX}board": tuple(f"row{row}_column{column}" for row, column in CELLS),
 }
 
 
@@ -38,6 +44,7 @@ class Pointing:
     held: float  # how far the fingers hold that stone, in [0, 1]
     other_places_xy: np.ndarray  # (NUM_OTHERS, 2) metres
     other_actions: np.ndarray  # (NUM_OTHERS, ACTION_DIM), in the environment's units
+    board: np.ndarray  # (25,) as `colors_on_board` has it
 
     @classmethod
     def of(cls, state: PrivilegedState, rng: np.random.Generator) -> "Pointing":
@@ -50,6 +57,7 @@ class Pointing:
             held=held_share(state, goal.stone),
             other_places_xy=np.array(others),
             other_actions=np.stack([expert_action(_aimed_at(state, goal, xy)) for xy in others]),
+            board=colors_on_board(state),
         )
 
     def columns(self) -> dict[str, np.ndarray]:
@@ -59,10 +67,19 @@ class Pointing:
             np.append(self.stone_xy, self.held),
             self.other_places_xy,
             self.other_actions,
+            self.board,
         )
         return {
             name: value.reshape(-1).astype(np.float32) for name, value in zip(COLUMNS, values, strict=True)
         }
+
+
+def colors_on_board(state: PrivilegedState) -> np.ndarray:
+    """(25,) int64, row by row: 0 for an empty intersection, 1 for a black stone on it, 2 for a white one."""
+    lies = state.stone_in_play & (state.stone_xyz[:, 2] < LIFTED_M)
+    ways = np.array(PLACES_XY_M[: len(CELLS)])[:, None] - state.stone_xyz[lies, :2]
+    is_on = np.linalg.norm(ways, axis=2) <= ON_INTERSECTION_M
+    return (is_on * (1 + state.stone_is_white[lies])).max(axis=1, initial=0)
 
 
 def _aimed_at(state: PrivilegedState, goal: Goal, xy: tuple[float, float]) -> PrivilegedState:

@@ -22,7 +22,7 @@ from lerobot_bomb.data.columns import dim_names, present_episodes, read_columns
 from lerobot_bomb.vlm.inputs import read_tensor
 
 LABELS = f"{OBS_PREFIX}{PREFIX}"  # what the keys of a dataset's columns begin with
-PLACE, STONE, OTHER_PLACES, OTHER_ACTIONS = (f"{OBS_PREFIX}{name}" for name in COLUMNS)
+PLACE, STONE, OTHER_PLACES, OTHER_ACTIONS, BOARD_COLORS = (f"{OBS_PREFIX}{name}" for name in COLUMNS)
 GRIPPER = ("x", "y", "z")  # dimensions of the state
 SAME_PLACE_M = 1e-3
 SMALLEST = 1e-8  # difference that LeRobot's normaliser divides by
@@ -143,13 +143,15 @@ def number_of(xy_B2: Tensor, places_P2: Tensor) -> Tensor:
     return torch.cdist(xy_B2, places_P2).argmin(dim=1)
 
 
-def require_labels(meta: LeRobotDatasetMetadata) -> None:
+def require_labels(meta: LeRobotDatasetMetadata, *, reads_board: bool) -> None:
     """Raise a ValueError unless a dataset has the columns that pointing is trained on."""
-    missing = [key for key in (PLACE, STONE, OTHER_PLACES, OTHER_ACTIONS) if key not in meta.features]
+    wanted = (PLACE, STONE, OTHER_PLACES, OTHER_ACTIONS, *([BOARD_COLORS] if reads_board else []))
+    missing = [key for key in wanted if key not in meta.features]
     if missing:
+        without = "; --policy.board_loss_weight=0 does without" if missing == [BOARD_COLORS] else ""
         raise ValueError(
             f"--policy.pointing=true is trained on the columns {', '.join(missing)}, which {meta.repo_id} "
-            "lacks; lerobot-bomb record --pointing writes them"
+            f"lacks; lerobot-bomb record --pointing writes them{without}"
         )
 
 
@@ -157,9 +159,8 @@ def places_of(meta: LeRobotDatasetMetadata, known: list[list[float]] | None) -> 
     """(P, 2) metres: the places that a dataset points at, or those ``known``, if they are among them.
 
     Raises:
-        ValueError: the dataset does not point, or at places that the checkpoint does not know.
+        ValueError: it points at places that the checkpoint does not know.
     """
-    require_labels(meta)
     columns = read_columns(meta, (PLACE, OTHER_PLACES), present_episodes(meta))
     found = np.unique(np.concatenate([columns[key].reshape(-1, 2) for key in (PLACE, OTHER_PLACES)]), axis=0)
     if known is None:

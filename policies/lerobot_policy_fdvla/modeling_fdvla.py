@@ -29,6 +29,7 @@ from lerobot_bomb.flow.path import PathPoint, draw_tau, path_point
 from lerobot_bomb.flow.real_time import guided, without_padding
 from lerobot_bomb.flow.samplers import SAMPLERS, Heads, num_evaluations, sample
 from lerobot_bomb.policies.pointing import Labels
+from lerobot_bomb.policies.pointing_policy import BOARD_READER, Parts, PointingVlaPolicy, plus
 from lerobot_bomb.policies.policy import RelativeVlaPolicy
 from lerobot_bomb.training.distributed import weighed
 from lerobot_bomb.training.randomness import begin_batch
@@ -45,10 +46,10 @@ from lerobot_policy_fdvla.pointing_fdvla import Pointed, make_pointer
 logger = logging.getLogger(__name__)
 
 # not of the base model: trained whole beside its adapters
-NEW_PARTS = ("segment", "state_embedding", "pointer", "flow_head", "denoise_head")
+NEW_PARTS = ("segment", "state_embedding", "pointer", BOARD_READER, "flow_head", "denoise_head")
 
 
-class FdvlaPolicy(RelativeVlaPolicy):
+class FdvlaPolicy(RelativeVlaPolicy, PointingVlaPolicy):
     """A Qwen2.5-VL that reads noisy actions; two heads predict where they go and what noise is in them."""
 
     config_class = FdvlaConfig  # pyright: ignore[reportAssignmentType]  LeRobot annotates it as None
@@ -73,6 +74,7 @@ class FdvlaPolicy(RelativeVlaPolicy):
         self.flow_head = make_head(flow_dim) if config.use_flow_head else None
         self.denoise_head = make_head(denoise_dim) if config.use_denoise_head else None
         self.pointer = make_pointer(config, hidden_size, dataset_meta)
+        self._add_board_reader(hidden_size, self.backbone.tokens_per_image)
         logger.info("fdvla: %s", self.parameter_counts)
         heads = [head for head in (self.flow_head, self.denoise_head) if head is not None]
         self._captured = GraphedModel(self._sample, [self.backbone.text_model, self.segment, *heads])
@@ -125,7 +127,7 @@ class FdvlaPolicy(RelativeVlaPolicy):
         with self._autocast(), second_derivatives(self.config.has_energy):
             if self.config.has_energy:
                 point.actions.requires_grad_()
-            context, pointing = self._read_and_point(batch, labels)
+            context, pointing, features_BPH = self._read_and_point(batch, labels)
             heads = self._heads(context, kept_BK)
             velocity_BKD, noise_BKD = heads(point.actions, point.tau)
             loss, terms = joint_loss(
@@ -145,11 +147,10 @@ class FdvlaPolicy(RelativeVlaPolicy):
         elif self.training:
             loss = weighed(loss, kept_BK)
         for name, loss_B in pointing.items():
-            loss = loss + self.config.pointing_loss_weight * (
-                loss_B if reduction == "none" else loss_B.mean()
-            )
+            loss = plus(loss, self.config.pointing_loss_weight, loss_B)
             terms[name] = loss_B.detach().mean()
-        return loss, self._metrics(loss, terms, velocity_BKD, noise_BKD, point, actions_BKD, kept_BK)
+        loss, board = self._with_board(loss, batch, features_BPH)
+        return loss, self._metrics(loss, terms, board, velocity_BKD, noise_BKD, point, actions_BKD, kept_BK)
 
     def _targets(self, batch: dict[str, Tensor]) -> tuple[Tensor, Tensor, Labels | None]:
         """Actions (B, K, D), which of them are kept (B, K), and what is pointed at."""
@@ -162,14 +163,18 @@ class FdvlaPolicy(RelativeVlaPolicy):
 
     def _read_and_point(
         self, batch: dict[str, Tensor], labels: Labels | None
-    ) -> tuple[Context, dict[str, Tensor]]:
-        """The observation, with the places that heads are given, and losses (B,) of what is pointed at."""
-        context = self._read(batch)
+    ) -> tuple[Context, dict[str, Tensor], Tensor]:
+        """The observation, with the places that heads are given; losses (B,) of what is pointed at.
+
+        And image features (B, P, H), P of all cameras, as the language model reads them.
+        """
+        context, embeds_BLH = self._read_embeds(batch)
+        features_BPH = embeds_BLH[:, self._image_columns(embeds_BLH.device)]
         if self.pointer is None or labels is None:
-            return context, {}
+            return context, {}, features_BPH
         pointed = self._point(context, self._of_batch(batch, OBS_STATE))
         context = replace(context, feedback=self.pointer.feed_back(pointed, labels.given))
-        return context, self.pointer.losses(pointed, labels)
+        return context, self.pointer.losses(pointed, labels), features_BPH
 
     def _actions(self, batch: dict[str, Tensor]) -> Tensor:
         """(B, K, D) as the heads predict them: normalised, and relative where they are."""
@@ -187,6 +192,7 @@ class FdvlaPolicy(RelativeVlaPolicy):
         self,
         loss: Tensor,
         terms: dict[str, Tensor],
+        board: Parts,
         velocity_BKD: Tensor | None,
         noise_BKD: Tensor | None,
         point: PathPoint,
@@ -198,22 +204,11 @@ class FdvlaPolicy(RelativeVlaPolicy):
         Errors are known where a dataset was given, that is while training. Padded actions do not count.
         """
         parts = {name: (term, torch.ones_like(term, dtype=torch.bool)) for name, term in terms.items()}
-        errors_BKD = self._implied_actions(velocity_BKD, noise_BKD, point) - actions_BKD
+        limits = self.config.denoise_tau_min, self.config.clip_sample_range
+        errors_BKD = point.implied_actions(velocity_BKD, noise_BKD, *limits) - actions_BKD
         errors_BKD = errors_BKD.abs() * self._unit
-        parts |= self._l1_parts(errors_BKD, kept_BK[..., None].expand_as(errors_BKD))
+        parts |= board | self._l1_parts(errors_BKD, kept_BK[..., None].expand_as(errors_BKD))
         return means(parts, loss, self.config.trained_batches)
-
-    def _implied_actions(
-        self, velocity_BKD: Tensor | None, noise_BKD: Tensor | None, point: PathPoint
-    ) -> Tensor:
-        """(B, K, D) where the rest of a straight path leads, by the flow head if there is one."""
-        tau_B11 = point.tau[:, None, None]
-        if velocity_BKD is not None:
-            return point.actions + (1 - tau_B11) * velocity_BKD.float()
-        assert noise_BKD is not None
-        tau_B11 = tau_B11.clamp(min=self.config.denoise_tau_min)
-        clean_BKD = (point.actions - (1 - tau_B11) * noise_BKD.float()) / tau_B11
-        return clean_BKD.clamp(-self.config.clip_sample_range, self.config.clip_sample_range)
 
     # Inference
 
@@ -365,8 +360,13 @@ class FdvlaPolicy(RelativeVlaPolicy):
 
     def _read(self, batch: dict[str, Tensor]) -> Context:
         """Read the prompt, once for all sampling steps."""
+        return self._read_embeds(batch)[0]
+
+    def _read_embeds(self, batch: dict[str, Tensor]) -> tuple[Context, Tensor]:
+        """Read the prompt, and return its embeddings (B, L, H), too."""
         rows, is_task_BL = self._prompt(batch)
-        return self._context(rows, is_task_BL, self._embeds(batch, rows.ids), len(self.tokens.start))
+        embeds_BLH = self._embeds(batch, rows.ids)
+        return self._context(rows, is_task_BL, embeds_BLH, len(self.tokens.start)), embeds_BLH
 
     def _context(
         self, rows: TokenRows, is_task_BL: Tensor, embeds_BLH: Tensor, num_shared: int = 0

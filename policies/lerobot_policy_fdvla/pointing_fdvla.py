@@ -12,7 +12,7 @@ from lerobot.datasets import LeRobotDatasetMetadata
 from torch import Tensor, nn
 from torch.nn.functional import binary_cross_entropy_with_logits, cross_entropy, smooth_l1_loss
 
-from lerobot_bomb.policies.pointing import DataUnits, Labels, places_of
+from lerobot_bomb.policies.pointing import DataUnits, Labels
 from lerobot_policy_fdvla.configuration_fdvla import FdvlaConfig
 
 FEEDBACK_DIM = 128
@@ -89,7 +89,7 @@ class Pointer(DataUnits):
 
     def fit(self, meta: LeRobotDatasetMetadata, config: FdvlaConfig) -> None:
         """Take from a dataset what its normalised numbers are, and that it points where this can."""
-        places_of(meta, config.pointing_places)
+        config.take_places(meta)
         self.fit_units(meta, config.normalization_mapping)
 
     def draw_labels(

@@ -28,6 +28,7 @@ from lerobot_bomb.checkpoints.checks import holds_module
 from lerobot_bomb.data.columns import dim_names
 from lerobot_bomb.decoding.decoder import Prompt
 from lerobot_bomb.decoding.slots import SlotWriter
+from lerobot_bomb.policies.pointing_policy import BOARD_READER, PointingVlaPolicy
 from lerobot_bomb.policies.policy import TokenVlaPolicy
 from lerobot_bomb.training.distributed import weighed
 from lerobot_bomb.training.randomness import begin_batch
@@ -36,6 +37,7 @@ from lerobot_bomb.vlm.ego3d import Ego3D
 from lerobot_bomb.vlm.images import draw_windows, resized_pixels
 from lerobot_bomb.vlm.inputs import read_actions, read_image, read_task
 from lerobot_policy_spatialvla_grid.building_spatialvla_grid import (
+    adapted_layers,
     build_depth,
     build_model,
     complete_depth,
@@ -57,13 +59,9 @@ logger = logging.getLogger(__name__)
 
 # not of the base model: trained whole beside its adapters
 CELL_TABLES = ("cell_embedding", "cell_head")
-# patterns of modules that have adapters beside the text model's
-VISION_LAYERS = r"backbone\.vlm\.model\.vision_tower\..*\.((q|k|v|out)_proj|fc[12])"
-PROJECTOR = r"backbone\.vlm\.model\.multi_modal_projector\.linear"
-EGO3D_LAYERS = r"ego3d\.layers\.[03]"
 
 
-class SpatialvlaGridPolicy(TokenVlaPolicy):
+class SpatialvlaGridPolicy(TokenVlaPolicy, PointingVlaPolicy):
     """A PaliGemma 2 that chooses the next ``chunk_size`` actions, one cell of each grid a step."""
 
     config_class = SpatialvlaGridConfig  # pyright: ignore[reportAssignmentType]  LeRobot annotates it as None
@@ -105,6 +103,7 @@ class SpatialvlaGridPolicy(TokenVlaPolicy):
         self.cell_embedding = nn.Embedding(self._num_rows, hidden_size)
         self.cell_head = nn.Linear(hidden_size, self._num_rows, bias=False)
         self._init_cells()
+        self._add_board_reader(hidden_size, self.backbone.tokens_per_image)
         self._writer = SlotWriter(
             self.backbone.text_model,
             self.backbone.positions,
@@ -132,7 +131,7 @@ class SpatialvlaGridPolicy(TokenVlaPolicy):
         """Load as other policies do, with the ZoeDepth of ``depth_model_name`` where the file has none."""
         if model.zoedepth is not None and not holds_module(Path(model_file), "zoedepth"):
             model.zoedepth = load_zoedepth(model.config.depth_model_name)
-            model.may_lack = ("zoedepth",)
+            model.may_lack = (*model.may_lack, "zoedepth")
         return super()._load_as_safetensor(model, model_file, map_location, strict)
 
     def _fit(self, meta: LeRobotDatasetMetadata) -> None:
@@ -186,12 +185,7 @@ class SpatialvlaGridPolicy(TokenVlaPolicy):
 
     def _get_default_peft_targets(self) -> dict[str, Any]:
         """Return the original's targets: linear layers of text, vision, projector and Ego3D; cells whole."""
-        others = [PROJECTOR]
-        if not self.config.freeze_vision_encoder:
-            others.append(VISION_LAYERS)
-        if self.config.depth_source != "none":
-            others.append(EGO3D_LAYERS)
-        return peft_targets(self, "language_model", CELL_TABLES, others)
+        return peft_targets(self, "language_model", (*CELL_TABLES, BOARD_READER), adapted_layers(self.config))
 
     def _validate_peft_config(self, peft_config: Any) -> None:
         """Check that adapters hold the cells of adapted grids, which are in the adapters' config."""
@@ -222,18 +216,20 @@ class SpatialvlaGridPolicy(TokenVlaPolicy):
             begin_batch(self.config, self.generator)
         cells_BTG, kept_BT, pointed = self._targets(batch)
         with self._autocast():
-            pointing_BNH, hidden_BTGH = self._hidden(batch, cells_BTG, pointed.tokens)
+            pointing_BNH, hidden_BTGH, features_BPH = self._hidden(batch, cells_BTG, pointed.tokens)
             losses_BTG, chosen_BTG = self._losses(hidden_BTGH, cells_BTG)
             losses_BN, chosen_BN = self._pointing_losses(pointing_BNH, pointed.tokens)
         kept_BTG = kept_BT[..., None].expand_as(losses_BTG)
         kept_BS = torch.cat([pointed.kept, kept_BTG.flatten(1)], dim=1)
         losses_BS = torch.cat([losses_BN, losses_BTG.flatten(1)], dim=1) * kept_BS
         parts = self._cell_parts(chosen_BTG, cells_BTG, kept_BTG) | pointed.parts(chosen_BN)
-        metrics = means(parts, losses_BS, self.config.trained_batches)
         if reduction == "none":
-            return losses_BS.sum(dim=1) / kept_BS.sum(dim=1).clamp(min=1), metrics
-        loss = losses_BS.sum() / kept_BS.sum().clamp(min=1)
-        return weighed(loss, kept_BS) if self.training else loss, metrics
+            loss = losses_BS.sum(dim=1) / kept_BS.sum(dim=1).clamp(min=1)
+        else:
+            loss = losses_BS.sum() / kept_BS.sum().clamp(min=1)
+            loss = weighed(loss, kept_BS) if self.training else loss
+        loss, board = self._with_board(loss, batch, features_BPH)
+        return loss, means(parts | board, loss, self.config.trained_batches)
 
     def _targets(self, batch: dict[str, Tensor]) -> tuple[Tensor, Tensor, Target]:
         """Cells (B, T, G), which steps are kept (B, T), and what is pointed at ahead of them."""
@@ -248,13 +244,18 @@ class SpatialvlaGridPolicy(TokenVlaPolicy):
 
     def _hidden(
         self, batch: dict[str, Tensor], cells_BTG: Tensor, pointed_BN: Tensor | None = None
-    ) -> tuple[Tensor, Tensor]:
-        """(B, N, H) and (B, T, G, H) teacher-forced states that predict what is pointed at, and the cells."""
+    ) -> tuple[Tensor, Tensor, Tensor]:
+        """(B, N, H) and (B, T, G, H) teacher-forced states that predict what is pointed at, and the cells.
+
+        And image features (B, P, H), P of all cameras.
+        """
         if pointed_BN is None:
             pointed_BN = cells_BTG.new_empty(len(cells_BTG), 0)
         prompt = self._prompt(batch)
         answer_BS = torch.cat([pointed_BN, cells_BTG.flatten(1)], dim=1)
-        return self._hidden_after(prompt, self._embeds(batch, prompt.ids), answer_BS)
+        embeds_BLH = self._embeds(batch, prompt.ids)
+        num_tokens = len(self._cameras) * self.backbone.tokens_per_image
+        return *self._hidden_after(prompt, embeds_BLH, answer_BS), embeds_BLH[:, :num_tokens]
 
     def _hidden_after(
         self, prompt: TokenRows, embeds_BLH: Tensor, answer_BS: Tensor

@@ -35,6 +35,7 @@ from lerobot_bomb.decoding.draft import KnownSymbols, LinearDraft
 from lerobot_bomb.decoding.grammar import NumberGrammar
 from lerobot_bomb.decoding.kv_cache import check_positions
 from lerobot_bomb.decoding.writer import NumberWriter
+from lerobot_bomb.policies.pointing_policy import BOARD_READER, Parts, PointingVlaPolicy
 from lerobot_bomb.policies.policy import RelativeVlaPolicy, TokenVlaPolicy
 from lerobot_bomb.training.distributed import weighed
 from lerobot_bomb.training.randomness import begin_batch
@@ -49,7 +50,7 @@ from lerobot_policy_vla0_smol.explained_vla0_smol import ExplainedVla0Smol
 from lerobot_policy_vla0_smol.pointing_vla0_smol import NUM_NUMBERS, make_pointer
 
 
-class Vla0SmolPolicy(RelativeVlaPolicy, TokenVlaPolicy):
+class Vla0SmolPolicy(RelativeVlaPolicy, TokenVlaPolicy, PointingVlaPolicy):
     """A stock SmolVLM or Qwen2.5-VL that writes the next ``chunk_size`` actions as integers."""
 
     config_class = Vla0SmolConfig  # pyright: ignore[reportAssignmentType]  LeRobot annotates it as None
@@ -92,6 +93,7 @@ class Vla0SmolPolicy(RelativeVlaPolicy, TokenVlaPolicy):
         self._writer = NumberWriter(
             self.backbone, self.grammar, guess, self._positions, compiled=config.compile_model
         )
+        self._add_board_reader(self.backbone.text_config.hidden_size, self.backbone.tokens_per_image)
         self._color_jitter = None if config.color_jitter is None else ColorJitter(*config.color_jitter)
         self._ensemble = self._make_ensemble()
         self._decoded: Decoded | None = None  # in the last prediction
@@ -111,7 +113,7 @@ class Vla0SmolPolicy(RelativeVlaPolicy, TokenVlaPolicy):
         return ExplainedVla0Smol(self)
 
     def _get_default_peft_targets(self) -> dict[str, Any]:
-        return peft_targets(self, self.backbone.text_model_name, ())
+        return peft_targets(self, self.backbone.text_model_name, (BOARD_READER,))
 
     # Training
 
@@ -126,22 +128,26 @@ class Vla0SmolPolicy(RelativeVlaPolicy, TokenVlaPolicy):
             bins_BN, kept_BN = self._targets(batch)
             numbers = self._numbers(bins_BN, kept_BN)
             answer = self._answer(numbers)
-            logits_BAV = self._answer_logits(batch, prompt, answer.rows)
+            features_BPH = self._see(batch)
+            logits_BAV = self._answer_logits(features_BPH, prompt, answer.rows)
         kept_BA = answer.labels != IGNORED
         losses_BA = cross_entropy(
             logits_BAV.float().flatten(0, 1), answer.labels.flatten(), ignore_index=IGNORED, reduction="none"
         ).view_as(answer.labels)
-        metrics = self._metrics(logits_BAV.detach(), answer, numbers, bins_BN, losses_BA)
         if reduction == "none":
-            return losses_BA.sum(dim=1) / kept_BA.sum(dim=1).clamp(min=1), metrics
-        loss = losses_BA.sum() / kept_BA.sum().clamp(min=1)
-        return weighed(loss, kept_BA) if self.training else loss, metrics
+            loss = losses_BA.sum(dim=1) / kept_BA.sum(dim=1).clamp(min=1)
+        else:
+            loss = losses_BA.sum() / kept_BA.sum().clamp(min=1)
+            loss = weighed(loss, kept_BA) if self.training else loss
+        loss, board = self._with_board(loss, batch, features_BPH)
+        parts = self._metric_parts(logits_BAV.detach(), answer, numbers, bins_BN) | board
+        return loss, means(parts, loss, self.config.trained_batches)
 
     @torch.no_grad()
-    def _metrics(
-        self, logits_BAV: Tensor, answer: Answer, numbers: NumberTokens, bins_BN: Tensor, losses_BA: Tensor
-    ) -> dict[str, float]:
-        """Shares of right tokens and of exact numbers, mean absolute errors in the data's units.
+    def _metric_parts(
+        self, logits_BAV: Tensor, answer: Answer, numbers: NumberTokens, bins_BN: Tensor
+    ) -> Parts:
+        """Right tokens and exact numbers, absolute errors in the data's units, as `means` takes them.
 
         Teacher-forced: every digit is predicted from the true ones before it. Hidden and padded numbers do
         not count. Errors are known where a dataset was given, that is while training.
@@ -165,11 +171,11 @@ class Vla0SmolPolicy(RelativeVlaPolicy, TokenVlaPolicy):
         parts |= self._l1_parts(errors_BTD, counted_BTD)
         if self.pointer is not None:
             parts |= self.pointer.error_parts(errors_BN[:, :before], counted_BN[:, :before])
-        return means(parts, losses_BA, self.config.trained_batches)
+        return parts
 
-    def _answer_logits(self, batch: dict[str, Tensor], prompt: TokenRows, answer: TokenRows) -> Tensor:
+    def _answer_logits(self, features_BPH: Tensor, prompt: TokenRows, answer: TokenRows) -> Tensor:
         """Teacher-forced logits of every answer token: (B, A, V)."""
-        return self.backbone.logits(self._answer_hidden(self._see(batch), prompt, answer))
+        return self.backbone.logits(self._answer_hidden(features_BPH, prompt, answer))
 
     def _answer_hidden(self, features_BPH: Tensor, prompt: TokenRows, answer: TokenRows) -> Tensor:
         """Teacher-forced states that predict every answer token: (B, A, H)."""

@@ -20,7 +20,6 @@ from lerobot_bomb.policies.pointing import (
     STONE,
     DataUnits,
     MetricLabels,
-    require_labels,
 )
 from lerobot_policy_vla0_smol.configuration_vla0_smol import Vla0SmolConfig
 
@@ -70,7 +69,7 @@ class TextPointer(DataUnits):
         Raises:
             ValueError: it does not point, or at what is beyond the range.
         """
-        require_labels(meta)
+        config.require_labels(meta)
         columns = read_columns(meta, (PLACE, STONE, OTHER_PLACES), present_episodes(meta))
         for key, values in {**columns, STONE: columns[STONE][:, :2]}.items():
             farthest_m = float(np.abs(values).max())
