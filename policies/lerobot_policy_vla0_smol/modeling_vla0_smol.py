@@ -111,7 +111,7 @@ class Vla0SmolPolicy(RelativeVlaPolicy, TokenVlaPolicy):
         return ExplainedVla0Smol(self)
 
     def _get_default_peft_targets(self) -> dict[str, Any]:
-        return peft_targets(self, self.backbone.text_model_name, ())
+        return peft_targets(self, self.backbone.text_model_name, ["pointer"])
 
     # Training
 
