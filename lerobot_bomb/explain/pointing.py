@@ -23,7 +23,9 @@ SLACK_SHARE = 0.5  # of the way that the expert's action would go
 MARKED_PX = 448  # side of a picture with marks
 RADIUS_PX, WIDTH_PX, OUTLINE_PX = 15, 2, 4
 # told apart by the colour-blind (Okabe and Ito)
-PLACE_RGB, STONE_RGB, OUTLINE_RGB = (230, 159, 0), (86, 180, 233), (0, 0, 0)
+PLACE_RGB, STONE_RGB = (230, 159, 0), (86, 180, 233)
+BLACK, WHITE = (0, 0, 0), (255, 255, 255)  # outlines; names
+FONT, FONT_SCALE = cv2.FONT_HERSHEY_SIMPLEX, 0.5
 
 
 @dataclass(frozen=True)
@@ -179,11 +181,11 @@ def marked(image: np.ndarray, camera: Camera, marks: list[Mark]) -> np.ndarray:
     scale = MARKED_PX / image.shape[0]
     for mark in marks:
         x, y = ((camera.pixel_of(mark.xyz) + 0.5) * scale - 0.5).round().astype(int).tolist()
-        for width, rgb in ((OUTLINE_PX, OUTLINE_RGB), (WIDTH_PX, mark.rgb)):
+        beside = x + RADIUS_PX + OUTLINE_PX, y + OUTLINE_PX
+        for width, rgb, text_rgb in ((OUTLINE_PX, BLACK, BLACK), (WIDTH_PX, mark.rgb, WHITE)):
             if mark.is_ring:
                 cv2.circle(shown, (x, y), RADIUS_PX, rgb, width, cv2.LINE_AA)
-            else:
-                cv2.drawMarker(shown, (x, y), rgb, cv2.MARKER_CROSS, RADIUS_PX, width, cv2.LINE_AA)
-                at = x + RADIUS_PX + OUTLINE_PX, y + OUTLINE_PX
-                cv2.putText(shown, mark.name, at, cv2.FONT_HERSHEY_SIMPLEX, 0.5, rgb, width - 1, cv2.LINE_AA)
+                continue
+            cv2.drawMarker(shown, (x, y), rgb, cv2.MARKER_CROSS, RADIUS_PX, width, cv2.LINE_AA)
+            cv2.putText(shown, mark.name, beside, FONT, FONT_SCALE, text_rgb, width - 1, cv2.LINE_AA)
     return shown
