@@ -29,6 +29,7 @@ def test_one_episode(name: str, tmp_path: Path, capsys: pytest.CaptureFixture[st
         assert {len(grid) for grid in moment["patches"].values()} == {4}
         assert moment["words"]["row and column"] is not None
         assert {len(each["mlps"]) for each in moment["restored"]} == {2}
+        assert "pointing" not in moment and "It points at:" not in moment["findings"]
     page = (output / "explanation.html").read_text()
     assert page.count("<img ") == 3 * 2 * len(phases) and "<script" not in page and "http" not in page
     masked = found["masked_episodes"]

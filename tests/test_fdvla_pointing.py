@@ -3,11 +3,15 @@
 from dataclasses import replace
 from typing import Any
 
+import numpy as np
 import pytest
 import torch
-from fdvla_cases import make_batch, make_config, make_policy
+from fdvla_cases import WORKSPACE, make_batch, make_config, make_policy
 from torch import Tensor
 
+from lerobot_bomb.explain.activations import all_heads, all_layers, all_mlps
+from lerobot_bomb.explain.question import Question
+from lerobot_bomb.explain.restoration import Corruption
 from lerobot_bomb.flag_errors import FlagError
 from lerobot_bomb.policies.pointing import OTHER_ACTIONS, OTHER_PLACES, PLACE, STONE, number_of
 from lerobot_policy_fdvla.modeling_fdvla import FdvlaPolicy
@@ -177,6 +181,41 @@ def test_the_gripper_is_read_in_metres() -> None:
     pointer.state_bounds.copy_(torch.tensor([[0.0, -0.1, 0.0], [0.2, 0.1, 0.1]]))
     pointed = pointer(torch.zeros(1, 8), torch.tensor([[9.0, 0.0, 1.0, -1.0]]))
     torch.testing.assert_close(pointed.gripper, torch.tensor([[0.1, 0.1, 0.0]]))
+
+
+def test_an_explanation_says_where_it_points() -> None:
+    policy = pointing_policy()
+    assert policy.pointer is not None and make_policy().explained().pointed(make_batch(policy, 1)) is None
+    policy.pointer.state_bounds.copy_(torch.tensor([[0.0, -0.1, 0.0], [0.2, 0.1, 0.1]]))
+    point_at(policy, 2)
+    with torch.no_grad():
+        for of, bias in ((policy.pointer.stone, [0.5, -1.0]), (policy.pointer.held, [2.0])):
+            of.weight.zero_()
+            of.bias.copy_(torch.tensor(bias))
+    batch = make_batch(policy, 1) | {"observation.state": torch.tensor([[0.0, 1.0, 0.0, 0.0]])}
+    found = policy.explained().pointed(batch)
+    assert found is not None and found.place_xy.tolist() == pytest.approx(PLACES[2])
+    # the gripper at (0.1, 0.1); half of 30 mm and minus a whole from there
+    assert found.stone_xy.tolist() == pytest.approx([0.115, 0.07])
+    assert found.held == pytest.approx(0.8808, abs=1e-4)
+    share = 1 / (3 + np.e)
+    assert [*found.probabilities.values()] == pytest.approx([share, share, np.e * share, share])
+    assert [*map(list, found.probabilities)] == [pytest.approx(place) for place in PLACES]
+
+
+def test_what_it_computes_while_it_points_can_be_put_back() -> None:
+    policy = wake_feedback(pointing_policy())
+    batch = make_batch(policy, 1)
+    question = Question(policy.explained(), lambda observed: observed, batch)
+    corruption = Corruption(question, question.encode({WORKSPACE: torch.zeros_like(batch[WORKSPACE])}, 1))
+    num_layers, places = len(policy.explained().layers), question.explained.places(question.rows)
+    assert {len(passes) for passes in places.values()} == {3}
+    assert places["pointing"] == (None, slice(None), None) and places["answer"] == (None, None, slice(None))
+    whole = [*all_layers(num_layers), *all_heads(policy.explained().layers), *all_mlps(num_layers)]
+    score = float(corruption.restore([whole]).scores)
+    assert score == pytest.approx(question.clean_score, abs=1e-5) != pytest.approx(corruption.score, abs=1e-3)
+    pointing = corruption.restore([all_layers(num_layers, places["pointing"])]).scores
+    assert abs(float(pointing) - corruption.score) > 1e-6
 
 
 def test_places_are_the_nearest() -> None:

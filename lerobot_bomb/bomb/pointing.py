@@ -1,10 +1,13 @@
-"""Pointing of the expert: columns of a recording that only training reads, never an observation.
+"""Pointing: which stone goes where, as the expert means it and as a policy says it.
 
-Which stone goes to which place is what a policy must read before it can act, and what lies on the board what
-it must read before that; what the expert would do for other places teaches it to act as it has pointed.
+It is what a policy must read before it can act, and what lies on the board is read before that; what
+the expert would do for other places teaches it to act as it has pointed. A recording has all of it in columns
+that only training reads, never in an observation.
 """
 
-from dataclasses import dataclass, replace
+from collections.abc import Mapping
+from dataclasses import dataclass, field, replace
+from typing import Self
 
 import numpy as np
 
@@ -16,9 +19,9 @@ from lerobot_bomb.bomb.observation import ACTION_DIM
 from lerobot_bomb.bomb.privileged_state import Goal, PrivilegedState
 
 ON_INTERSECTION_M = 0.008  # a stone this near one lies on it
-LIFTED_M = (
-    BOARD.thickness_m + BOARD.stone_height_m / 2 + LIFT_M
-)  # a stone's centre, off the board from here on
+# a stone's centre, off the board from here on
+LIFTED_M = BOARD.thickness_m + BOARD.stone_height_m / 2 + LIFT_M
+HELD = 0.5  # from this share on a stone counts as held
 NUM_OTHERS = 2  # places a frame, beside the one that is meant
 # where the expert puts stones
 PLACES_XY_M = (*(tuple(BOARD.intersection_xy(*cell).tolist()) for cell in CELLS), *TRAY_XY_M)
@@ -36,25 +39,46 @@ COLUMNS = {
 
 
 @dataclass(frozen=True)
-class Pointing:
-    """Place and stone of the expert's current move, and what it would do for other places."""
+class Meant:
+    """A stone and the place where the expert brings it."""
 
     place_xy: np.ndarray  # (2,) metres
     stone_xy: np.ndarray  # (2,) metres
     held: float  # how far the fingers hold that stone, in [0, 1]
+
+    @classmethod
+    def in_state(cls, state: PrivilegedState) -> Self:
+        """Read off the true state."""
+        goal = current_goal(state)
+        return cls(goal.xyz[:2], state.stone_xyz[goal.stone, :2], held_share(state, goal.stone))
+
+
+@dataclass(frozen=True)
+class PointedAt:
+    """A stone and the place where a policy says that it brings it."""
+
+    place_xy: np.ndarray  # (2,) metres
+    stone_xy: np.ndarray  # (2,) metres
+    held: float | None = None  # probability that the fingers hold that stone; None: it says nothing of it
+    # of each place (x, y) of a table, the probability that it is the one; {} where there is no table
+    probabilities: Mapping[tuple[float, float], float] = field(default_factory=dict)
+
+
+@dataclass(frozen=True)
+class Pointing(Meant):
+    """Stone and place in a state, and the expert's actions for other places."""
+
     other_places_xy: np.ndarray  # (NUM_OTHERS, 2) metres
     other_actions: np.ndarray  # (NUM_OTHERS, ACTION_DIM), in the environment's units
     board: np.ndarray  # (25,) as `colors_on_board` has it
 
     @classmethod
-    def of(cls, state: PrivilegedState, rng: np.random.Generator) -> "Pointing":
+    def of(cls, state: PrivilegedState, rng: np.random.Generator) -> Self:
         """Point, and draw other places."""
         goal = current_goal(state)
         others = [PLACES_XY_M[i] for i in rng.integers(len(PLACES_XY_M), size=NUM_OTHERS)]
         return cls(
-            place_xy=goal.xyz[:2],
-            stone_xy=state.stone_xyz[goal.stone, :2],
-            held=held_share(state, goal.stone),
+            **vars(Meant.in_state(state)),
             other_places_xy=np.array(others),
             other_actions=np.stack([expert_action(_aimed_at(state, goal, xy)) for xy in others]),
             board=colors_on_board(state),
@@ -80,6 +104,15 @@ def colors_on_board(state: PrivilegedState) -> np.ndarray:
     ways = np.array(PLACES_XY_M[: len(CELLS)])[:, None] - state.stone_xyz[lies, :2]
     is_on = np.linalg.norm(ways, axis=2) <= ON_INTERSECTION_M
     return (is_on * (1 + state.stone_is_white[lies])).max(axis=1, initial=0)
+
+
+def action_for(state: PrivilegedState, pointed: PointedAt) -> np.ndarray:
+    """(4,) the expert's action if stone and place were where they are pointed at; what it holds, it holds."""
+    goal, stone_xyz = current_goal(state), state.stone_xyz.copy()
+    if held_share(state, goal.stone) < HELD:
+        stone_xyz[goal.stone, :2] = pointed.stone_xy
+    x, y = pointed.place_xy.tolist()
+    return expert_action(_aimed_at(replace(state, stone_xyz=stone_xyz), goal, (x, y)))
 
 
 def _aimed_at(state: PrivilegedState, goal: Goal, xy: tuple[float, float]) -> PrivilegedState:

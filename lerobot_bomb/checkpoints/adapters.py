@@ -42,17 +42,21 @@ def peft_targets(
 
 
 def frozen_buffers(policy: nn.Module) -> dict[str, Tensor]:
-    """Copies of what a checkpoint holds besides parameters; of adapters, none does."""
+    """Copies of what a checkpoint holds besides parameters."""
     parameters = dict(policy.named_parameters(remove_duplicate=False))
     return {name: held.clone() for name, held in policy.state_dict().items() if name not in parameters}
 
 
-def check_buffers_are_the_bases(policy: nn.Module, base: dict[str, Tensor] | None, advice: str) -> None:
+def check_buffers_are_the_bases(
+    policy: nn.Module, base: dict[str, Tensor] | None, saved: Iterable[str], advice: str
+) -> None:
     """Raise a ValueError if the policy was fitted to other data than the checkpoint ``base`` is of.
 
-    Adapters are loaded on that checkpoint again, which would not know of it.
+    Adapters are loaded on that checkpoint again, which would not know of it. They hold the modules that are
+    ``saved`` with them.
     """
-    fitted = frozen_buffers(policy)
+    of_saved = tuple(f"{name}." for name in saved)
+    fitted = {name: held for name, held in frozen_buffers(policy).items() if not name.startswith(of_saved)}
     changed = [name for name in fitted if base is not None and not _equal(fitted[name], base.get(name))]
     if changed:
         raise ValueError(

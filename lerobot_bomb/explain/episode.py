@@ -15,6 +15,7 @@ from lerobot_bomb.explain.explained import ANSWER, INSTRUCTION, Batch
 from lerobot_bomb.explain.following import Following, following
 from lerobot_bomb.explain.moment import OBSERVATION, Asked, Explanation, explain, image_keys
 from lerobot_bomb.explain.other_policies import explained
+from lerobot_bomb.explain.pointing import PointingCheck, check_pointing
 from lerobot_bomb.explain.question import Question
 from lerobot_bomb.explain.spans import Span, named_spans, span_of, spans_of_words, token_offsets
 from lerobot_bomb.explain.watched import Watched
@@ -40,6 +41,7 @@ class ExplainedMoment:
     followings: dict[str, Following]
     images: dict[str, np.ndarray]  # (H, W, 3) uint8 by the keys of the explanation's patches
     states: dict[str, np.ndarray]  # (layers, F) by place, means over its tokens; {}: not to be had
+    pointing: PointingCheck | None  # None: the policy does not point
 
     @property
     def title(self) -> str:
@@ -54,6 +56,7 @@ class ExplainedMoment:
             "instruction": self.watched.instruction,
             "findings": {each.question: each.names for each in self.findings},
             "following": {word: asdict(each) for word, each in self.followings.items()},
+            **({} if self.pointing is None else {"pointing": self.pointing.as_json()}),
             **self.explanation.as_json(),
         }
 
@@ -82,7 +85,9 @@ def explain_moment(
         for key in image_keys(question)
     }
     states = mean_states(question)
-    return ExplainedMoment(watched, explanation, diagnose(explanation), followings, images, states)
+    pointing = check_pointing(loaded, question.explained, observation, watched.state)
+    findings = [*([] if pointing is None else [pointing.finding]), *diagnose(explanation)]
+    return ExplainedMoment(watched, explanation, findings, followings, images, states, pointing)
 
 
 def mean_states(question: Question) -> dict[str, np.ndarray]:

@@ -17,6 +17,7 @@ from torch import Tensor, nn
 from torch.nn.functional import pad
 
 from lerobot_bomb.actions.text import TokenRows
+from lerobot_bomb.bomb.pointing import PointedAt
 from lerobot_bomb.vlm.inputs import OBS_LANGUAGE_HIDDEN
 
 type Batch = dict[str, Any]  # what a policy's preprocessor gives
@@ -84,6 +85,10 @@ class Explained(ABC):
         Raises:
             ValueError: the policy reads no instruction.
         """
+
+    def pointed(self, batch: Batch) -> PointedAt | None:
+        """Return what the policy points at before it answers a batch of one row; None: it does not."""
+        return None
 
     def places(self, rows: Rows) -> dict[str, Place]:
         """Return where a row's images, instruction, state and answer stand in the decoder's sequences.

@@ -8,6 +8,8 @@ import rerun.blueprint as rrb
 
 from lerobot_bomb.explain.episode import ExplainedMoment
 from lerobot_bomb.explain.maps import overlay
+from lerobot_bomb.explain.moment import camera_name
+from lerobot_bomb.explain.pointing import CAMERA
 from lerobot_bomb.viewing.rerun_file import STEP, open_recording, png
 
 
@@ -21,8 +23,24 @@ def write_recording(path: Path, name: str, fps: int, moments: Sequence[Explained
             found = each.explanation
             for key, image in each.images.items():
                 recording.log(f"image/{key}", png(image), strict=True)
+                _log_marks(recording, key, each)
                 effects = overlay(found.patches[key].numpy(), found.largest_patch, image)
                 recording.log(f"effect/{key}", png(effects), strict=True)
+
+
+def _log_marks(recording: rr.RecordingStream, key: str, moment: ExplainedMoment) -> None:
+    """What the policy points at, and what is meant, over the image that shows all of the board."""
+    if moment.pointing is None or camera_name(key) != CAMERA:
+        return
+    camera, marks = moment.watched.cameras[CAMERA], moment.pointing.marks
+    points = rr.Points2D(
+        # corners of pixels are whole numbers there, and centres here
+        [camera.pixel_of(mark.xyz) + 0.5 for mark in marks],
+        colors=[mark.rgb for mark in marks],
+        labels=[mark.name for mark in marks],
+        radii=rr.Radius.ui_points(4),
+    )
+    recording.log(f"image/{key}/pointing", points, strict=True)
 
 
 def _layout(moment: ExplainedMoment) -> rrb.ContainerLike:

@@ -9,6 +9,7 @@ import torch
 from lerobot.utils.constants import OBS_STATE
 from torch import Tensor
 
+from lerobot_bomb.bomb.pointing import PointedAt
 from lerobot_bomb.explain.explained import (
     ANSWER,
     INSTRUCTION,
@@ -26,6 +27,7 @@ if TYPE_CHECKING:
 
 NUM_DRAWS = 8  # of noise and time; times in the middle of as many equal parts of [0, 1]
 SEED = 0
+POINTING = "pointing"  # the pass that points
 
 
 class ExplainedFdvla(PromptExplained):
@@ -79,10 +81,23 @@ class ExplainedFdvla(PromptExplained):
         )
         return -loss_B.unflatten(0, (num_rows, NUM_DRAWS)).mean(dim=1)
 
+    def pointed(self, batch: Batch) -> PointedAt | None:
+        policy = self._policy.eval()
+        if policy.pointer is None:
+            return None
+        with torch.no_grad(), policy._autocast():
+            pointed = policy._point(policy._read(batch), policy._of_batch(batch, OBS_STATE))
+            return policy.pointer.pointed_at(pointed)
+
     def places(self, rows: Rows) -> dict[str, Place]:
-        """Return the places in two passes: over the prompt, padding included, and over the noisy actions."""
-        places: dict[str, Place] = {name: (each, None) for name, each in self.columns(rows).items()}
-        return places | {ANSWER: (None, slice(None))}
+        """Return places in passes over the prompt, padding included, over what points, and noisy actions."""
+        segments = [ANSWER] if self._policy.pointer is None else [POINTING, ANSWER]
+        places: dict[str, Place] = {
+            name: (each, *[None] * len(segments)) for name, each in self.columns(rows).items()
+        }
+        return places | {
+            name: (None, *(slice(None) if each == name else None for each in segments)) for name in segments
+        }
 
     def _noise(self, num_draws: int) -> Tensor:
         """(J, K, D) standard normal, the same in every call."""

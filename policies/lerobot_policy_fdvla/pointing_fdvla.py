@@ -12,6 +12,7 @@ from lerobot.datasets import LeRobotDatasetMetadata
 from torch import Tensor, nn
 from torch.nn.functional import binary_cross_entropy_with_logits, cross_entropy, smooth_l1_loss
 
+from lerobot_bomb.bomb.pointing import PointedAt
 from lerobot_bomb.policies.pointing import DataUnits, Labels
 from lerobot_policy_fdvla.configuration_fdvla import FdvlaConfig
 
@@ -76,6 +77,16 @@ class Pointer(DataUnits):
         between_B2 = (ways[0] - ways[1]) / NEAR_M
         rest = between_B2, pointed.held_logit.sigmoid()[:, None], pointed.gripper[:, 2:]
         return torch.cat([*scaled, *rest], dim=1)
+
+    def pointed_at(self, pointed: Pointed) -> PointedAt:
+        """A prediction for one row -> in metres, and how likely each place is."""
+        (shares,) = pointed.place_logits.softmax(dim=1).tolist()
+        return PointedAt(
+            place_xy=self.places[pointed.place_logits[0].argmax()].double().cpu().numpy(),
+            stone_xy=(pointed.gripper[0, :2] + pointed.stone[0]).double().cpu().numpy(),
+            held=float(pointed.held_logit.sigmoid()),
+            probabilities={(x, y): share for (x, y), share in zip(self.places.tolist(), shares, strict=True)},
+        )
 
     def losses(self, pointed: Pointed, labels: Labels) -> dict[str, Tensor]:
         """(B,) each: of the place, the stone (in units of `NEAR_M`) and whether it is held."""

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, ClassVar
 import torch
 from torch import Tensor
 
+from lerobot_bomb.bomb.pointing import PointedAt
 from lerobot_bomb.explain.explained import (
     ANSWER,
     Batch,
@@ -52,6 +53,17 @@ class ExplainedSpatialvlaGrid(PromptExplained):
                 return score_B
             as_step = pointing_BNH[:, None], pointed_BN[:, None]
             return score_B + self._log_probability(policy._pointing_rows, *as_step)
+
+    def pointed(self, batch: Batch) -> PointedAt | None:
+        policy = self._policy.eval()
+        if policy.pointer is None:
+            return None
+        answer_1S, rows = self.answer(batch), self.encode(batch)
+        with torch.no_grad(), policy._autocast():
+            pointing_1NH, _ = policy._hidden_after(self.tokens(rows), rows["embeds"], answer_1S)
+            logits_1P = policy._logits(policy._pointing_rows[0], pointing_1NH[:, 0]).float()
+        pointed_1N, _ = policy._split(answer_1S)
+        return policy.pointer.pointed_at(pointed_1N[0], logits_1P[0].softmax(dim=0))
 
     def _log_probability(self, rows: list[slice], hidden_BTGH: Tensor, tokens_BTG: Tensor) -> Tensor:
         """(B,) of tokens, whose rows may be chosen in each of G slots."""

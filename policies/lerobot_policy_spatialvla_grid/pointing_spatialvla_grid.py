@@ -9,11 +9,13 @@ import math
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any
 
+import numpy as np
 import torch
 from lerobot.datasets import LeRobotDatasetMetadata
 from lerobot.utils.constants import ACTION
 from torch import Tensor, nn
 
+from lerobot_bomb.bomb.pointing import PointedAt
 from lerobot_bomb.policies.pointing import Labels, normalised_actions, unit_bounds
 
 if TYPE_CHECKING:
@@ -61,6 +63,11 @@ class StoneCells:
         x_B, y_B = torch.minimum(cells_B2, last_2).long().unbind(dim=1)
         return x_B * self.counts[1] + y_B
 
+    def center_of(self, number: int) -> tuple[float, float]:
+        """Return (x, y) in metres of a cell's middle."""
+        x, y = divmod(number, self.counts[1])
+        return self.low_m[0] + (x + 0.5) * self.cell_m, self.low_m[1] + (y + 0.5) * self.cell_m
+
 
 @dataclass(frozen=True)
 class Target:
@@ -98,6 +105,16 @@ class CellPointer(nn.Module):
         """Rows of the tables that may be chosen for each token; ``first``: that of the first place."""
         first_stone = first + len(self.places)
         return [slice(first, first_stone), slice(first_stone, first + self.num_tokens)]
+
+    def pointed_at(self, tokens_N: Tensor, shares_P: Tensor) -> PointedAt:
+        """(N,) tokens that were chosen, and how likely each place was -> in metres."""
+        place, stone = tokens_N.tolist()
+        places = [(x, y) for x, y in self.places.tolist()]
+        return PointedAt(
+            place_xy=np.array(places[place]),
+            stone_xy=np.array(self.stones.center_of(stone)),
+            probabilities=dict(zip(places, shares_P.tolist(), strict=True)),
+        )
 
     @torch.no_grad()
     def fit(self, meta: LeRobotDatasetMetadata, config: "SpatialvlaGridConfig") -> None:

@@ -113,7 +113,7 @@ class Vla0SmolPolicy(RelativeVlaPolicy, TokenVlaPolicy, PointingVlaPolicy):
         return ExplainedVla0Smol(self)
 
     def _get_default_peft_targets(self) -> dict[str, Any]:
-        return peft_targets(self, self.backbone.text_model_name, (BOARD_READER,))
+        return peft_targets(self, self.backbone.text_model_name, ("pointer", BOARD_READER))
 
     # Training
 

@@ -12,6 +12,7 @@ from lerobot.datasets import LeRobotDatasetMetadata
 from torch import Tensor
 
 from lerobot_bomb.actions.bins import Bins
+from lerobot_bomb.bomb.pointing import PointedAt
 from lerobot_bomb.data.columns import present_episodes, read_columns
 from lerobot_bomb.policies.pointing import (
     LABELS,
@@ -48,6 +49,11 @@ class TextPointer(DataUnits):
         """(B, J) int64 of what is given; ways that are longer than the range end with it."""
         way_B2 = labels.given_xy - self.gripper(state_BS)[:, :2]
         return self._bins.encode(torch.cat([labels.stone_xy, labels.given_xy, way_B2], dim=1) / self._range_m)
+
+    def pointed_at(self, bins_J: Tensor) -> PointedAt:
+        """(J,) int64 bins that were written -> in metres."""
+        metres_J = (self._bins.decode(bins_J) * self._range_m).double().cpu().numpy()
+        return PointedAt(place_xy=metres_J[PLACE_NUMBERS], stone_xy=metres_J[STONE_NUMBERS])
 
     @staticmethod
     def kept(labels: MetricLabels) -> Tensor:
