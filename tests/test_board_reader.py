@@ -1,4 +1,4 @@
-"""What lies on each intersection, read off image tokens: learned beside pointing, by all three policies."""
+"""Reading of the board off image tokens, learned beside pointing by all three policies."""
 
 import math
 from dataclasses import replace

@@ -261,7 +261,7 @@ def test_adapters_on_a_checkpoint_with_relative_actions_of_other_data_are_refuse
 
 
 def test_adapters_hold_the_units_of_what_points(policy_type: str, dataset: Path, tmp_path: Path) -> None:
-    """Those of their own data, whatever the base was trained on."""
+    """Check that they are of their own data, whatever the base was trained on."""
     places = {} if policy_type == "vla0_smol" else {"pointing_places": [*map(list, PLACES_XY_M)]}
     policy = CASES[policy_type].make_policy(**POINTING[policy_type] | places)
     policy.save_pretrained(tmp_path / "base")

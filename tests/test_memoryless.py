@@ -264,7 +264,7 @@ def seen(moment: Moment, pattern: dict[Cell, str], rng: np.random.Generator) -> 
 
 
 class UndrawnEnv(BombEnv):
-    """The same episodes without images: the reader needs none of them."""
+    """Environment without images, which the reader does not need."""
 
     def _view(self, camera: str) -> tuple[np.ndarray, dict[str, np.ndarray]]:
         return np.zeros((SMALL.image_size, SMALL.image_size, 3), np.uint8), {}

@@ -79,7 +79,7 @@ def recorded(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture
 def root(recorded: Path, tmp_path: Path) -> Path:
-    """Where a copy of these parts is to be joined."""
+    """Return the place where a copy of these parts is to be joined."""
     shutil.copytree(recorded / "x.parts", tmp_path / "x.parts")
     return tmp_path / "x"
 
@@ -305,7 +305,7 @@ def test_a_dataset_that_lies_in_parts_is_told(root: Path) -> None:
 
 @pytest.mark.long
 def test_submitits_jobs_record_and_join(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """In processes of their own, whose blocks are of 20 episodes."""
+    """Run them in processes of their own, whose blocks are of 20 episodes."""
     monkeypatch.setattr(resumable, "BLOCK_EPISODES", 20)
     flags = ["record", f"--root={tmp_path / 'x'}", *FLAGS[:1], "--episodes=40", *FLAGS[2:]]
     jobs = ["--submitit=2", "--submitit_cluster=local", '--submitit_parameters={"timeout_min": 20}']

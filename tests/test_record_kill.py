@@ -112,7 +112,7 @@ def test_a_recording_killed_before_each_of_its_steps_loses_nothing(
 def test_parts_killed_before_each_of_their_steps_lose_nothing(
     server: RecorderServer, references: dict[str, Reference], tmp_path: Path
 ) -> None:
-    """Of three episodes one part has a block; the join makes the last, short one."""
+    """Record three episodes: one part has a block, and the join makes the last, short one."""
     root = tmp_path / "x"
     part, join = (*FLAGS, "--shard=0/1"), (*FLAGS, "--join")
     of_part = "os.rename .*recording.json", "os.rename .*block-00000.*/block.json", "os.rename .*block-00000$"

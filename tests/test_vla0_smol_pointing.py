@@ -261,7 +261,7 @@ def test_an_explanation_is_of_the_whole_answer() -> None:
 
 
 def test_an_explanation_says_where_it_points() -> None:
-    """In millimetres, of which 300 is the middle."""
+    """Check its millimetres, of which 300 is the middle."""
     policy = pointing_policy()
     batch = make_batch(policy, 1)
     numbers = policy._write(batch, 3)[0].tolist()

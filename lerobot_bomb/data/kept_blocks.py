@@ -23,7 +23,7 @@ UNFINISHED = re.compile(rf"({BLOCK.pattern}\.tmp|dataset)(\.files|\.cache)?")
 
 @dataclass
 class Progress:
-    """What was made of a dataset, or of one of its blocks."""
+    """Progress of a dataset or of one of its blocks."""
 
     num_episodes: int = 0
     num_frames: int = 0

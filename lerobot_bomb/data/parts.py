@@ -44,17 +44,17 @@ class Part:
         return f"{self.index}/{self.number}"
 
     def to_dict(self) -> dict[str, Any]:
-        """What its JSON reads back as."""
+        """Return the values that its JSON reads back as."""
         return {**self.recording.to_dict(), "shard": str(self)}
 
     @property
     def blocks(self) -> range:
-        """Their numbers; the blocks after the last whole one are the join's."""
+        """Return the numbers of its blocks; those after the last whole one are the join's."""
         whole = num_whole_blocks(self.recording)
         return range(whole * self.index // self.number, whole * (self.index + 1) // self.number)
 
     def folder(self, root: Path) -> Path:
-        """Where it grows, and stays until it is joined."""
+        """Return the folder where it grows, and stays until it is joined."""
         return parts_folder(root) / f"{self.index}-of-{self.number}.recording"
 
 
@@ -157,7 +157,7 @@ def unfinished_parts(parts: list[Part], root: Path) -> dict[Part, str]:
 
 
 def _whole_parts(recording: Recording, root: Path) -> list[Part]:
-    """All parts of a recording, which are there and finished."""
+    """Return the parts of a recording, once all of them are there and finished."""
     folder, found = parts_folder(root), _found(root)
     numbers = sorted({number for _, number in found})
     if not numbers:

@@ -39,7 +39,7 @@ class Acting:
 
 @dataclass(frozen=True)
 class Players:
-    """Who plays."""
+    """Workers, expert and policy that make the episodes of a recording."""
 
     num_workers: int = 1
     expert: Expert = expert_action

@@ -120,7 +120,7 @@ def growing(parameters: Parameters, root: Path, folder: Path, parts: Sequence[Pa
 
 
 def block_episodes(number: int) -> range:
-    """Those that a block is made of: of a recording, the ones that it tries."""
+    """Return the episodes of a block: of a recording, the ones that it tries."""
     return range(number * BLOCK_EPISODES, (number + 1) * BLOCK_EPISODES)
 
 

@@ -20,23 +20,23 @@ METADATA_FILE = Path("meta") / "bomb.json"  # in the dataset
 
 
 class Parameters(Protocol):
-    """What determines a dataset frame by frame."""
+    """Parameters that determine a dataset frame by frame."""
 
     kind: ClassVar[str]  # "recording": the noun of messages and the ending of the growing folder
 
     def to_dict(self) -> dict[str, Any]:
-        """What its JSON reads back as; the keys are flags."""
+        """Return the values that its JSON reads back as; the keys are flags."""
         ...
 
 
 def unfinished_folder(root: Path, kind: str = "recording") -> Path:
-    """Where a dataset grows until it is complete."""
+    """Return the folder where a dataset grows until it is complete."""
     root = root.absolute()
     return root.with_name(f"{root.name}.{kind}")
 
 
 def parts_folder(root: Path) -> Path:
-    """Where the parts of a recording lie until they are joined."""
+    """Return the folder where the parts of a recording lie until they are joined."""
     return unfinished_folder(root, "parts")
 
 

@@ -29,7 +29,7 @@ def write_recording(path: Path, name: str, fps: int, moments: Sequence[Explained
 
 
 def _log_marks(recording: rr.RecordingStream, key: str, moment: ExplainedMoment) -> None:
-    """What the policy points at, and what is meant, over the image that shows all of the board."""
+    """Log the places that the policy points at and that are meant, over the image of the whole board."""
     if moment.pointing is None or camera_name(key) != CAMERA:
         return
     camera, marks = moment.watched.cameras[CAMERA], moment.pointing.marks

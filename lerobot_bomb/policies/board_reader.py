@@ -1,4 +1,4 @@
-"""What lies on each intersection, read off image tokens: an objective of training beside pointing.
+"""Reading of the board off image tokens: an objective of training beside pointing.
 
 Instructions name places by the stones around them. A policy that is told actions and places only learns late
 to see the stones, and until then no such place.

@@ -36,7 +36,7 @@ class PointingVlaConfig(VlaConfig):
 
     @property
     def reads_board(self) -> bool:
-        """Whether what lies on the board is read while training."""
+        """Check whether a training reads what lies on the board."""
         return self.pointing and self.board_loss_weight > 0
 
     def require_labels(self, meta: LeRobotDatasetMetadata) -> None:
