@@ -58,8 +58,8 @@ def contents(root: Path) -> dict[str, bytes]:
 
 
 def packets(video: bytes) -> list[tuple[int | None, int | None, bytes]]:
-    with av.open(io.BytesIO(video), mode="r") as opened:
-        return [(packet.pts, packet.duration, bytes(packet)) for packet in opened.demux(video=0)]
+    opened = av.open(io.BytesIO(video), mode="r")
+    return [(packet.pts, packet.duration, bytes(packet)) for packet in opened.demux(video=0)]
 
 
 def halve(path: Path) -> None:
