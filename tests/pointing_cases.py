@@ -4,7 +4,7 @@ from typing import Any
 
 import torch
 
-from lerobot_bomb.policies.pointing import OTHER_ACTIONS, OTHER_PLACES, PLACE, STONE
+from lerobot_bomb.policies.pointing import BOARD_COLORS, OTHER_ACTIONS, OTHER_PLACES, PLACE, STONE
 
 PLACES = [[-0.09, 0.09], [0.0, 0.0], [0.09, -0.045], [0.17, 0.0]]
 POINTING: dict[str, dict[str, Any]] = {
@@ -16,7 +16,7 @@ POINTING: dict[str, dict[str, Any]] = {
 
 
 def with_labels(batch: dict[str, Any]) -> dict[str, Any]:
-    """Places in turn, the next ones as other places; stones opposite."""
+    """Add places in turn, the next ones as other places, stones opposite, and boards of all colours."""
     (batch_size, *_), places = batch["action"].shape, torch.tensor(PLACES)
     number_B = torch.arange(batch_size) % len(places)
     others = places[torch.stack([number_B + 1, number_B + 2], dim=1) % len(places)]
@@ -26,4 +26,5 @@ def with_labels(batch: dict[str, Any]) -> dict[str, Any]:
         STONE: torch.cat([-places[number_B], torch.zeros(batch_size, 1)], dim=1),
         OTHER_PLACES: others.flatten(1),
         OTHER_ACTIONS: torch.cat([5 * others, rest], dim=2).flatten(1),
+        BOARD_COLORS: (number_B[:, None] + torch.arange(25)) % 3.0,
     }

@@ -34,8 +34,12 @@ NEW_PARTS = {
     "spatialvla_grid": {"cell_embedding", "cell_head"},
     "vla0_smol": set(),
 }
-# of those that point; that of `spatialvla_grid` is rows of its tables
-POINTERS = {"fdvla": {"pointer"}, "spatialvla_grid": set(), "vla0_smol": {"pointer"}}
+# what those that point have, too; the pointer of `spatialvla_grid` is rows of its tables
+POINTERS = {
+    "fdvla": {"pointer", "board_reader"},
+    "spatialvla_grid": {"board_reader"},
+    "vla0_smol": {"pointer", "board_reader"},
+}
 LORA = {"method_type": "LORA", "r": 4}
 # with adapters beside the text model's
 OTHER_PARTS = {
@@ -77,10 +81,10 @@ def test_text_layers_get_adapters_and_new_parts_are_trained_whole(policy_type: s
     assert len(of_text) == LAYERS * num_layers and all(".layers." in name for name in of_text)
     assert not any("visi" in name or "visual" in name for name in of_text)
     whole = {name.split(".modules_to_save")[0].split(".")[-1] for name in trained if "lora_" not in name}
-    with_parameters = {"pointer"} if points and policy_type == "fdvla" else set()
-    assert whole == NEW_PARTS[policy_type] | with_parameters
-    saved = {*(wrapped.active_peft_config.modules_to_save or ())}
-    assert saved == NEW_PARTS[policy_type] | (POINTERS[policy_type] if points else set())
+    new_parts = NEW_PARTS[policy_type] | (POINTERS[policy_type] if points else set())
+    without_parameters = {"pointer"} if policy_type == "vla0_smol" else set()
+    assert whole == new_parts - without_parameters
+    assert {*(wrapped.active_peft_config.modules_to_save or ())} == new_parts
 
 
 def test_decoders_see_adapters_as_merged_weights(policy_type: str) -> None:

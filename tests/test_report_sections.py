@@ -338,11 +338,11 @@ def test_each_sampled_failure_has_the_command_that_replays_its_line(
         assert len({row["play it again"] for row in shown}) == len(shown)
 
 
-def test_the_line_is_that_among_the_undamaged_ones_as_replay_counts(tmp_path: Path) -> None:
+def test_the_line_is_that_of_the_file_as_replay_counts(tmp_path: Path) -> None:
     path = tmp_path / "r.jsonl"
     path.write_text("damaged\n" + "".join(json.dumps(row) + "\n" for row in failing()[:2]))
     assert main(["report", str(path), f"--output={tmp_path / 'r.html'}"]) == 0
-    assert f"lerobot-bomb replay {path} --line=2" in (tmp_path / "r.html").read_text()
+    assert f"lerobot-bomb replay {path} --line=3" in (tmp_path / "r.html").read_text()
 
 
 def test_the_sample_is_the_same_each_time(report: Callable[..., dict[str, Any]]) -> None:
