@@ -146,13 +146,13 @@ def main() -> None:
 
 
 def timed[T](call: Callable[[], T]) -> tuple[T, float]:
-    """What it gives, and CPU seconds of this process, which other work on the machine does not stretch."""
+    """Return the call's result, and this process' CPU seconds, which other work does not stretch."""
     started = time.process_time()
     return call(), time.process_time() - started
 
 
 def make_policy(shape: str, text_layers: int | None, in_bfloat16: bool) -> Vla0SmolPolicy:
-    """Of random weights, with nano's tokenizer, whose numbers are among the published one's."""
+    """Make a policy of random weights, with nano's tokenizer, whose numbers are among the published one's."""
     tokenizer = load_tokenizer(NANO)
     is_qwen = shape in QWEN
     vlm_config = nano_qwen_config(tokenizer) if is_qwen else nano_config(tokenizer)

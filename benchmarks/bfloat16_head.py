@@ -1,4 +1,4 @@
-"""What the output head's precision does to a vla0_smol's answers in bfloat16: ties, and rows as in float32.
+"""Precision of the output head in a vla0_smol's answers in bfloat16: ties, and rows as in float32.
 
     python benchmarks/bfloat16_head.py --policy.path=CHECKPOINT --dataset.root=DATASET [--frames=256]
 

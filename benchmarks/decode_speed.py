@@ -170,7 +170,7 @@ def plain_short_head(work: DecodeRequest) -> Timed:
 
 
 def plain(work: DecodeRequest) -> Timed:
-    """The same, and logits of the whole vocabulary."""
+    """Write as `plain_short_head` does, but with logits of the whole vocabulary."""
 
     def whole_head(backbone: SmolVLMBackbone, token_ids: Tensor) -> Callable[[Tensor], Tensor]:
         return lambda hidden: backbone.logits(hidden)[..., token_ids]
@@ -235,7 +235,7 @@ def read_weights_s(backbone: SmolVLMBackbone) -> float:
 
 
 class NoModel(Continuation):
-    """The same logits for every symbol."""
+    """Continuation with the same logits for every symbol."""
 
     def __init__(self) -> None:
         self.logits = torch.randn(1, MAX_GUESSES + 1, NUM_SYMBOLS)
@@ -258,7 +258,7 @@ def time_grammar_s(grammar: NumberGrammar, guess: Guess) -> float:
 
 
 def compare_bfloat16(episodes: Episodes, repeats: int) -> dict[str, float]:
-    """How often ours and the peer write different numbers in bfloat16, and how close the choice was there."""
+    """Count chunks that ours and the peer write differently in bfloat16, and how close the choices were."""
     works = episodes.works(1, repeats)
     num_different, margins = 0, []
     with torch.autocast("cpu", dtype=torch.bfloat16):

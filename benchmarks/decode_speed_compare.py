@@ -1,4 +1,4 @@
-"""What the decoding benchmarks share: ways to write the same answers, timed in turn, and the verdict."""
+"""Parts of the decoding benchmarks: ways to write the same answers, timed in turn, and the verdict."""
 
 import statistics
 import sys
@@ -27,7 +27,7 @@ class Timed:
 def compare(
     runs: dict[str, tuple[Callable[[Any], Timed], Sequence[Any]]], *, must_agree: bool = True
 ) -> dict[str, dict[str, float]]:
-    """Every way on every work, in turn, writing the same if they must. Gains are over the first."""
+    """Time every way on every work, in turn, writing the same if they must. Gains are over the first."""
     timed: dict[str, list[Timed]] = {name: [] for name in runs}
     for run, works in runs.values():
         run(works[0])
@@ -56,7 +56,7 @@ def compare(
 
 
 def print_rows(title: str, figures: dict[str, dict[str, float]]) -> None:
-    """A table of rows of figures."""
+    """Print a table of rows of figures."""
     print()
     header = next(iter(figures.values()))
     print_table(

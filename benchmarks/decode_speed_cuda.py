@@ -70,7 +70,7 @@ def main() -> None:
 
 
 def time_decoding_all(repeats: int, bars: dict[str, bool]) -> dict[str, Any]:
-    """Both precisions, both sizes of batch."""
+    """Time decoding in both precisions and both sizes of batch."""
     figures = {}
     backbone = build_backbone(config_500m()).cuda().eval()
     with torch.inference_mode():
@@ -97,7 +97,7 @@ def time_decoding(
     bars: dict[str, bool],
     name: str,
 ) -> dict[str, dict[str, float]]:
-    """Whole chunks by the peer and by us, without and with drafts."""
+    """Time whole chunks by the peer and by us, without and with drafts."""
     grammar = NumberGrammar(512, NUM_STEPS * NUM_DIMS).cuda()
     written = torch.ones(batch_size, PROMPT_LENGTH, dtype=torch.bool, device="cuda")
     prompts = [
@@ -131,7 +131,7 @@ def time_decoding(
 
 
 def wait_and_time(run: Callable[[], Any]) -> tuple[Any, float]:
-    """What it gives, and the seconds until the device has done it."""
+    """Return the call's result, and the seconds until the device has computed it."""
     torch.cuda.synchronize()
     started = time.perf_counter()
     result = run()
@@ -178,7 +178,7 @@ class Ours:
 
 @contextmanager
 def ends_of_passes() -> Iterator[list[torch.cuda.Event]]:
-    """When the device was done with each captured pass."""
+    """Collect the event at which the device was done with each captured pass."""
     ends: list[torch.cuda.Event] = []
     replay: Callable[..., Any] = GraphedFunction.__call__
 
@@ -214,7 +214,7 @@ def time_policy(repeats: int) -> dict[str, dict[str, float]]:
 
 
 def make_policy(compiled: bool) -> Vla0SmolPolicy:
-    """Of this shape, with random weights."""
+    """Make a policy of this shape, with random weights."""
     image = PolicyFeature(FeatureType.VISUAL, (3, 256, 256))
     config = Vla0SmolConfig(
         vlm_config=config_500m(),

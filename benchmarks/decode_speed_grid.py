@@ -108,7 +108,7 @@ def make_batches(policy: SpatialvlaGridPolicy, batch_size: int, num_batches: int
 def time_decoding(
     name: str, policy: SpatialvlaGridPolicy, batches: list[dict[str, Any]], bars: dict[str, bool]
 ) -> dict[str, dict[str, float]]:
-    """Whole chunks by the peer and by us."""
+    """Time whole chunks by the peer and by us."""
     peer = StockGenerate(policy)
     runs = {f"ours, {draft}": (partial(choose, policy, draft), batches) for draft in DRAFTS}
     figures = compare({"generate": (peer, [peer.inputs(batch) for batch in batches]), **runs})

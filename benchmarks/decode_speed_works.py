@@ -1,4 +1,4 @@
-"""What `decode_speed.py` measures: answers that a trained policy is asked for, and two ways to write them."""
+"""Requests that `decode_speed.py` measures, from a trained policy, and two ways to write the answers."""
 
 import argparse
 import time
@@ -45,7 +45,7 @@ class DecodeRequest:
 
 
 def add_episode_arguments(parser: argparse.ArgumentParser, policy_type: str) -> None:
-    """What `Episodes` needs."""
+    """Add the arguments that `Episodes` needs."""
     parser.add_argument("--policy.path", dest="policy_path", required=True, help=f"trained {policy_type}")
     parser.add_argument("--dataset.repo_id", dest="repo_id", required=True)
     parser.add_argument("--dataset.root", dest="root")
@@ -61,7 +61,7 @@ class Episodes:
         self._dataset = LeRobotDataset(args.repo_id, root=args.root)
 
     def works(self, batch_size: int, num_predictions: int, **options: Any) -> list[DecodeRequest]:
-        """What the policy asks of the decoder, one row an episode, one prediction every `n_action_steps`."""
+        """Return the policy's requests to the decoder, a row per episode, every `n_action_steps`."""
         policy, batches = self.batches(batch_size, num_predictions, **options)
         works: list[DecodeRequest] = []
         for batch in batches:
@@ -80,7 +80,7 @@ class Episodes:
         return policy, [preprocessor(default_collate(rows)) for rows in frames]
 
     def planned(self, num_predictions: int, num_steps: int) -> list[DecodeRequest]:
-        """The same, batch of 1, with guesses from what the last chunk left unexecuted; held at its end."""
+        """Return requests of batch 1 that guess from the last chunk's unexecuted actions, its end held."""
         policy, preprocessor = self._load(n_action_steps=num_steps)
         works: list[DecodeRequest] = []
         plan_BTD = None

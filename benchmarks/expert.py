@@ -1,4 +1,4 @@
-"""How well the scripted expert does on a suite.
+"""Success of the scripted expert on a suite.
 
     python benchmarks/expert.py --task place --episodes 500 --workers 2 --json expert.json
 
@@ -72,7 +72,7 @@ def run_episode(spec: EpisodeSpec, noise: float) -> Outcome:
 
 
 def is_idle(now: Moment, then: Moment, spec: EpisodeSpec) -> bool:
-    """Whether a step, before all is done, neither commands a translation nor moves the fingers."""
+    """Return True if a step, before all is done, neither commands a translation nor moves the fingers."""
     assert now.action is not None
     before, after = now.state, then.state
     xyz = now.action[:3]
@@ -83,7 +83,7 @@ def is_idle(now: Moment, then: Moment, spec: EpisodeSpec) -> bool:
 
 
 def is_done(state: PrivilegedState, tolerance_mm: float) -> bool:
-    """Whether the last stone lies on its target and the fingers, open, have left it."""
+    """Return True if the last stone lies on its target and the fingers, open, have left it."""
     goal = state.goals[-1]
     stone_xyz = state.stone_xyz[goal.stone]
     error_mm = 1e3 * np.linalg.norm((stone_xyz - goal.xyz)[:2])

@@ -1,4 +1,4 @@
-"""What a map of patches costs, and what activation patching saves by encoding a prompt once.
+"""Cost of a map of patches, and what activation patching saves by encoding a prompt once.
 
     OMP_NUM_THREADS=1 python benchmarks/explain_speed.py --policy.path=bomb:fdvla --json explain.json
 

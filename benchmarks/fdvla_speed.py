@@ -126,7 +126,7 @@ def make_batches(policy: FdvlaPolicy, batch_size: int, num_batches: int) -> list
 
 
 def time_queries(policy: FdvlaPolicy, batches: list[dict[str, Any]]) -> dict[str, dict[str, float]]:
-    """Every way on every batch, in turn; the first one's actions are what the others must give."""
+    """Time every way on every batch, in turn; the others must give the first one's actions."""
     ways: dict[str, Callable[[dict[str, Any]], Tensor]] = {
         EVERY_STEP: partial(read_in_every_step, policy, sees_once=False),
         "the same, images seen once": partial(read_in_every_step, policy, sees_once=True),
@@ -160,7 +160,7 @@ def time_queries(policy: FdvlaPolicy, batches: list[dict[str, Any]]) -> dict[str
 
 
 def timed(query: Callable[[], Tensor]) -> tuple[Tensor, float]:
-    """Its actions, and the seconds until the device has them."""
+    """Return the query's actions, and the seconds until the device has them."""
     _wait()
     started = time.perf_counter()
     actions = query()

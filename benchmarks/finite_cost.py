@@ -1,4 +1,4 @@
-"""What looking for NaN and infinite numbers costs, in CPU time: of a training step, and of a predicted chunk.
+"""Cost of looking for NaN and infinite numbers, in CPU time, in a training step and in a predicted chunk.
 
     python benchmarks/finite_cost.py
 

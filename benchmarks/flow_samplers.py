@@ -1,7 +1,7 @@
-"""What each sampler of ``fdvla`` makes of noise when its heads are exact.
+"""Samplers of ``fdvla`` on noise, where the heads are exact.
 
-Of a number that is N(1, 0.5^2), and of one that is N(1, 0.1^2) or N(-1, 0.1^2), conditional means are known
-in closed form; what is wrong is then the sampler's. Its options are the policy's defaults.
+For a number that is N(1, 0.5^2), and for one that is N(1, 0.1^2) or N(-1, 0.1^2), conditional means are
+known in closed form; what is wrong is then the sampler's. Its options are the policy's defaults.
 
     python benchmarks/flow_samplers.py --json flow_samplers.json
 

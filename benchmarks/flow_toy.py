@@ -48,7 +48,7 @@ MEAN_BAR, STD_BAR = 0.1, 0.15  # largest errors of a mode
 
 @dataclass(frozen=True)
 class Variant:
-    """Which parts there are, and the sampler for them."""
+    """Parts that a model has, and the sampler for them."""
 
     sampler: str
     use_flow_head: bool = True
@@ -66,7 +66,7 @@ VARIANTS = {
 
 @dataclass(frozen=True)
 class Row:
-    """What a variant makes of a word, measured on the modes that are meant."""
+    """Result of a variant on a word, measured on the modes that are meant."""
 
     variant: str
     word: str
@@ -195,7 +195,7 @@ def measure(variant: str, word: str, meant: tuple[float, float], points_ND: Tens
 
 
 def print_rows(rows: list[Row], cpu_s: dict[str, float]) -> None:
-    """A table, a line for each variant and word."""
+    """Print a table, a row for each variant and word."""
     header = [
         "", "word", "left", "right", "error of means", "error of spreads", "bars", "CPU s",
     ]  # fmt: skip

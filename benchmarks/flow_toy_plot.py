@@ -67,6 +67,6 @@ def _tile(points_N2: Tensor, modes_M2: Tensor, radius: float, rgb: tuple[int, in
 
 
 def _places(points_N2: Tensor, scale: int = 1) -> list[tuple[float, float]]:
-    """In pixels, x to the right and y downwards; the plane's y counts upwards."""
+    """Return pixels, x to the right and y downwards; the plane's y counts upwards."""
     half = scale * TILE_SIZE / 2
     return [((1 + x / HALF_RANGE) * half, (1 - y / HALF_RANGE) * half) for x, y in points_N2.tolist()]

@@ -28,7 +28,16 @@ from pathlib import Path
 from typing import Any
 
 from learning_curve import Point, as_figures, count, draw, print_points
-from learning_tasks import PROBE, RIVALS, TASKS, Bar, Task, by_what_is_left_out, shown_pairs
+from learning_tasks import (
+    PROBE,
+    RIVALS,
+    TASKS,
+    Bar,
+    Task,
+    by_suite,
+    by_what_is_left_out,
+    shown_pairs,
+)
 from machine import add_machine_arguments, positive, require_idle_machine, write_figures
 from recipes import POLICY_TYPES, last_checkpoint, read_recipe, recipe_path
 
@@ -124,6 +133,7 @@ def run_claimed(args: argparse.Namespace, task: Task, run: dict[str, Any]) -> in
     minutes_per_step = minutes["cpu_minutes"] / run["steps"]
     points = {f"step {step}": count(rows, step, step * minutes_per_step) for step, rows in results.items()}
     others = controls | (by_what_is_left_out(results[run["steps"]]) if task.is_partial else {})
+    others |= by_suite(results[run["steps"]])
     points |= {name: count(rows, run["steps"], minutes["cpu_minutes"]) for name, rows in others.items()}
 
     print_points(points)
@@ -204,9 +214,32 @@ def locked(folder: Path) -> Iterator[None]:
 
 
 def record(task: Task, demonstrations: int, dataset: Path) -> None:
-    """The expert's episodes."""
+    """Record the expert's episodes, and static scenes, merged with them."""
     if dataset.exists():
         return
+    if not task.static:
+        record_part(task, dataset, f"--episodes={demonstrations}", f"--noise={NOISE}")
+        return
+    parts = [dataset.with_name(name) for name in ("shown", "scenes")]
+    numbers = ([f"--episodes={demonstrations}", f"--noise={NOISE}"], [f"--static={task.static}"])
+    for part, number in zip(parts, numbers, strict=True):
+        if not part.exists():
+            record_part(task, part, *number, "--pointing")
+    merged = dataset.with_name("merged")  # not yet whole
+    shutil.rmtree(merged, ignore_errors=True)
+    run_command(
+        "lerobot-edit-dataset",
+        f"--new_repo_id={REPO_ID}",
+        f"--new_root={merged}",
+        "--operation.type=merge",
+        f"--operation.repo_ids={json.dumps([REPO_ID, REPO_ID])}",
+        f"--operation.roots={json.dumps([str(part) for part in parts])}",
+    )
+    merged.rename(dataset)
+
+
+def record_part(task: Task, dataset: Path, *number: str) -> None:
+    """Make one recording of the task."""
     task_ids = shown_pairs() if task.is_partial else task.task_ids
     task_flags = [f"--task_ids={list(task_ids)}"] if task_ids else []
     resume = ["--resume"] if dataset.with_name(f"{dataset.name}.recording").exists() else []
@@ -215,9 +248,8 @@ def record(task: Task, demonstrations: int, dataset: Path) -> None:
         "record",
         f"--repo_id={REPO_ID}",
         f"--root={dataset}",
-        f"--episodes={demonstrations}",
         f"--seed={FIRST_SEED}",
-        f"--noise={NOISE}",
+        *number,
         f"--task={task.suite}",
         f"--perturbations={task.perturbations}",
         f"--split={'train' if task.is_partial else 'all'}",
@@ -268,7 +300,7 @@ def probe_recipe() -> list[str]:
 
 
 def checkpoints(folder: Path) -> dict[int, Path]:
-    """{training step: folder}."""
+    """Return the checkpoints, {training step: folder}."""
     paths = sorted((folder / "train" / "checkpoints").glob("[0-9]*"))
     return {int(path.name): path / "pretrained_model" for path in paths}
 

@@ -1,4 +1,4 @@
-"""What a policy could do at each of its checkpoints, from their results files; as a table and a plot."""
+"""Learning curve of a policy: each checkpoint's results file, as a table and a plot."""
 
 from dataclasses import asdict, dataclass
 from pathlib import Path
@@ -56,7 +56,7 @@ def count(rows: list[Row], step: int, cpu_minutes: float) -> Point:
 
 
 def print_points(points: dict[str, Point]) -> None:
-    """A table of {name: point}; rates with their 95 % Wilson intervals."""
+    """Print a table of {name: point}; rates with their 95 % Wilson intervals."""
     header = [
         "", "training, CPU min", "success", "lifted", f"within {NEAR_MM:.0f} mm", "right intersection",
         "precise there", "median error",

@@ -1,4 +1,4 @@
-"""What is to be learnt on one CPU core, and what each policy type gets for it: the tasks of learn.py."""
+"""Tasks of learn.py: what is to be learnt on one CPU core, and what each policy type gets for it."""
 
 from dataclasses import dataclass
 
@@ -24,7 +24,7 @@ LEFT_OUT_PAIRS = {
 
 @dataclass(frozen=True)
 class Bar:
-    """What the last checkpoint must reach."""
+    """Bar that the last checkpoint must reach."""
 
     success: float  # rate
     cpu_minutes: float  # of the training
@@ -32,7 +32,7 @@ class Bar:
 
 @dataclass(frozen=True)
 class Training:
-    """What one policy type gets to learn a task."""
+    """Training that one policy type gets to learn a task."""
 
     demonstrations: int
     bar: Bar | None  # None: it is only measured
@@ -41,7 +41,7 @@ class Training:
 
 @dataclass(frozen=True)
 class Task:
-    """What is to be learnt: which of the tasks, under which perturbations, and what each type gets for it."""
+    """Task to be learnt: its task ids, its perturbations, and the training of each policy type."""
 
     task_ids: tuple[int, ...]  # empty: target and colour are drawn for each episode
     episodes: int  # of each evaluation
@@ -52,6 +52,7 @@ class Task:
     recipe: str | None = None  # the task whose recipes it is learnt by; None: its own
     suite: str = "place"
     is_said_at_once: bool = True  # else the policy is given several instructions, which are not exchanged
+    static: int = 0  # scenes beside the demonstrations; then both are labelled for pointing
 
 
 TASKS = {
@@ -88,6 +89,15 @@ TASKS = {
         is_partial=True,
         recipe="all_targets",
     ),
+    # one policy for all suites; demonstrations are of each in turn, evaluations of each
+    "all_suites": Task(
+        (),
+        episodes=100,
+        trainings={"fdvla": Training(2000, None)},
+        suite=ALL,
+        is_said_at_once=False,
+        static=60_000,
+    ),
     **{
         suite: Task(
             (),
@@ -111,6 +121,13 @@ def shown_pairs() -> list[int]:
         for target in targets_of("train")
         if target not in LEFT_OUT_PAIRS[color]
     ]
+
+
+def by_suite(rows: list[Row]) -> dict[str, list[Row]]:
+    """{suite: its rows} of an evaluation on several; {} on one."""
+    suites = sorted({row["spec"]["suite"] for row in rows})
+    each = {suite: [row for row in rows if row["spec"]["suite"] == suite] for suite in suites}
+    return each if len(suites) > 1 else {}
 
 
 def by_what_is_left_out(rows: list[Row]) -> dict[str, list[Row]]:

@@ -1,4 +1,4 @@
-"""What the speed benchmarks share: an idle machine, and tables that are also JSON."""
+"""Parts of the speed benchmarks: an idle machine, and tables that are also JSON."""
 
 import argparse
 import json

@@ -114,7 +114,7 @@ def prove(args: argparse.Namespace, folder: Path) -> int:
 
 
 def record(dataset: Path, images: Iterable[str] = PICTURES) -> None:
-    """The expert's episodes: one seed, eight targets; ``images``: flags, without their dashes."""
+    """Record the expert's episodes: one seed, eight targets; ``images``: flags, without their dashes."""
     run_command(
         "lerobot-bomb",
         "record",
@@ -192,13 +192,13 @@ def evaluate(checkpoint: Path, output_dir: Path, images: Iterable[str]) -> dict[
 
 
 def is_on(row: Row, task_id: int) -> bool:
-    """Whether the stone was put down, nearest to this task's intersection, which is not the episode's."""
+    """Return True if the stone was put down nearest to this task's intersection, not the episode's."""
     is_there = tuple(row["nearest_intersection"]) == TARGETS[task_id]
     return is_there and row["failure"] == Failure.WRONG_INTERSECTION
 
 
 def print_episodes(condition: Control, rows: dict[int, Row]) -> None:
-    """What became of each episode."""
+    """Print the outcome of each episode."""
     print(f"\n{condition.name}")
     header = ["target", "stone ends nearest to", "error, mm", "steps", "outcome"]
     cells = [

@@ -1,4 +1,4 @@
-"""What a perturbation costs: a reset, and a step with two 256x256 cameras, beside the unperturbed episode.
+"""Cost of a perturbation: a reset, and a step with two 256x256 cameras, beside the unperturbed episode.
 
     OMP_NUM_THREADS=1 python benchmarks/perturbed_speed.py --json perturbed_speed.json
     OMP_NUM_THREADS=1 python benchmarks/perturbed_speed.py --env.type=bomb_pusht --episodes=300
@@ -192,7 +192,7 @@ def measure_libero(num_episodes: int, json_path: Path | None) -> None:
 
 
 def milliseconds(call: Callable[[], object], clock: Callable[[], float] = time.perf_counter) -> float:
-    """How long a call takes."""
+    """Return how long a call takes."""
     start = clock()
     call()
     return 1e3 * (clock() - start)

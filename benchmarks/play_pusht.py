@@ -1,4 +1,4 @@
-r"""Who pushes the T best? Our policies and LeRobot's `act` and `diffusion`, trained for equal minutes.
+r"""Comparison on PushT: our policies and LeRobot's `act` and `diffusion`, trained for equal minutes.
 
 Each starts from random weights and is trained by the stock `lerobot-train` on the 206 human demonstrations
 and copies of them that are turned, mirrored and shifted; the stock `lerobot-eval --env.type=pusht` plays it
@@ -40,19 +40,19 @@ POLICIES = sorted(path.stem.removeprefix("play_pusht_") for path in FOLDER.glob(
 
 @dataclass(frozen=True)
 class Seconds:
-    """What a training took by the clock, and of CPU."""
+    """Seconds that a training took, by the clock and of CPU."""
 
     clock: float
     cpu: float
 
     def on(self, device: str) -> float:
-        """What is made equal."""
+        """Return the seconds that are made equal on a device."""
         return self.cpu if device == "cpu" else self.clock
 
 
 @dataclass(frozen=True)
 class Contender:
-    """What one policy was trained with, and how it plays."""
+    """Contender: how one policy was trained, and how it performs."""
 
     name: str
     steps: int
@@ -63,7 +63,7 @@ class Contender:
 
 
 def main() -> None:
-    """Convert, train all, play all, print the table."""
+    """Convert, train all, evaluate all, print the table."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawTextHelpFormatter)
     parser.add_argument("--source", type=Path, help="the zarr; not needed once it is converted")
     parser.add_argument("--output_dir", type=Path, required=True, help="folder to keep, or to go on with")
@@ -87,7 +87,7 @@ def main() -> None:
 
 
 def compete(args: argparse.Namespace, name: str, dataset: Path) -> Contender:
-    """Train and play one policy."""
+    """Train and evaluate one policy."""
     folder, times_path = args.output_dir / name, args.output_dir / name / "training.json"
     flags = [f"--config_path={recipe_path('play_pusht', name)}", f"--dataset.root={dataset}"]
     flags += [f"--policy.device={args.device}", *ON[args.device]]
@@ -140,7 +140,7 @@ def play(folder: Path, episodes: int) -> tuple[list[float], int]:
 
 
 def print_contenders(contenders: list[Contender]) -> None:
-    """One line each, the best first."""
+    """Print a line for each contender, the best first."""
     print_table(
         ["policy", "mean maximal coverage", "successes", "steps", "minutes", "CPU min"],
         [

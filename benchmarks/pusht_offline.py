@@ -89,7 +89,7 @@ class Run:
 
     @property
     def times_path(self) -> Path:
-        """Written when the training is complete."""
+        """File that is written when the training is complete."""
         return self.folder / "training.json"
 
     def times(self) -> dict[str, float]:
@@ -179,7 +179,7 @@ def learn_to_see(policy_type: str, dataset: Path, folder: Path) -> list[str]:
 
 
 def train(run: Run, policy_type: str, dataset: Path, flags: list[str]) -> None:
-    """Stock `lerobot-train`; a training that was killed starts anew."""
+    """Run stock `lerobot-train`; a training that was killed starts anew."""
     if run.times_path.exists():
         return
     shutil.rmtree(run.folder, ignore_errors=True)
@@ -200,7 +200,7 @@ def train(run: Run, policy_type: str, dataset: Path, flags: list[str]) -> None:
 
 
 def measure(run: Run, dataset: Path, num_frames: int) -> dict[str, Any]:
-    """What `lerobot-bomb offline-metrics` finds on the episodes that were not trained on."""
+    """Measure with `lerobot-bomb offline-metrics` on the episodes that were not trained on."""
     path = run.folder / f"metrics_{num_frames}.json"
     if not path.exists():
         run_logged(
@@ -241,7 +241,7 @@ def evaluate(checkpoint: Path, output_dir: Path, flags: list[str]) -> list[dict[
 
 
 def max_coverages(metrics: list[dict[str, Any]]) -> list[float]:
-    """Of each episode, from gym-pusht's rewards."""
+    """Return the largest coverage of each episode, from gym-pusht's rewards."""
     return [MAX_COVERAGE_REWARD * reward for each in metrics for reward in each["max_rewards"]]
 
 

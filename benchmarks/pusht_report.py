@@ -82,7 +82,7 @@ def over_episodes(values: Sequence[float]) -> str:
 
 
 def _print_steps(variants: dict[str, list[Seed]]) -> None:
-    """L1 by step of the chunk: of each variant, the mean over seeds; of trivial predictors."""
+    """Print L1 by step of the chunk: of each variant, the mean over seeds; of trivial predictors."""
     first = _any(variants)
     rows = {
         name: (fmean(seed.l1() for seed in seeds), np.mean([seed.l1_by_step() for seed in seeds], axis=0))

@@ -23,5 +23,5 @@ def read_recipe(task: str, policy_type: str) -> dict[str, Any]:
 
 
 def last_checkpoint(train_dir: Path) -> Path:
-    """What `lerobot-train --output_dir=train_dir` leaves as its result."""
+    """Return the folder that `lerobot-train --output_dir=train_dir` leaves as its result."""
     return train_dir / "checkpoints" / "last" / "pretrained_model"

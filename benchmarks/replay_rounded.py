@@ -1,7 +1,7 @@
-"""What do recorded episodes become when their actions are clipped and rounded as a policy's grids do it?
+"""Replay of recorded episodes whose actions are clipped and rounded as a policy's grids do it.
 
-The expert's eight episodes of benchmarks/overfit.py are replayed without looking, action by action, as what
-encoding and decoding makes of them: the best that a policy can do that learned them by heart.
+The expert's eight episodes of benchmarks/overfit.py are replayed without looking, action by action, as
+what encoding and decoding makes of them: the best that a policy can do that learned them by heart.
 
     python benchmarks/replay_rounded.py --json replay_rounded.json
 """

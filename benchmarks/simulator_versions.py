@@ -1,4 +1,4 @@
-"""Under which MuJoCo versions are episodes the same, bit for bit?
+"""Check of MuJoCo versions: under which are episodes the same, bit for bit?
 
     python benchmarks/simulator_versions.py --work_dir simulators --json simulator_versions.json
 
@@ -50,7 +50,7 @@ class Outcome:
 
 @dataclass(frozen=True)
 class Measured:
-    """What one MuJoCo version makes of all episodes."""
+    """Outcomes of all episodes under one MuJoCo version."""
 
     mujoco: str
     renderer: str
@@ -96,7 +96,7 @@ def outcome_of(robot: str, condition: str, seeds: range) -> Outcome:
 
 
 def renderer_name() -> str:
-    """What OpenGL says it draws with."""
+    """Return what OpenGL says it draws with."""
     from lerobot_env_bomb.env import BombEnv
 
     env = BombEnv()
@@ -116,7 +116,7 @@ def published_versions() -> list[str]:
 
 
 def measure(version: str, work_dir: Path, conditions: list[str], num_seeds: int) -> Measured:
-    """Play everything under one MuJoCo version, in a virtual environment of its own."""
+    """Run everything under one MuJoCo version, in a virtual environment of its own."""
     folder = (work_dir / version).resolve()
     python = folder / "bin" / "python"
     if not python.exists():

@@ -1,4 +1,4 @@
-"""Where the time of one training step and of one evaluation step goes.
+"""Profile of one training step and of one evaluation step.
 
     OMP_NUM_THREADS=1 python benchmarks/step_profile.py --policy.type=vla0_smol --json step_profile.json
 
@@ -177,14 +177,14 @@ def profile_evaluation(
 
 
 def print_stages(medians_ms: dict[str, float], repeats: int) -> None:
-    """A table of the stages."""
+    """Print a table of the stages."""
     total = sum(medians_ms.values())
     rows = [[name, f"{ms:.1f}", f"{ms / total:.0%}"] for name, ms in medians_ms.items()]
     print_table(["stage", f"ms (median, {repeats} steps)", "share"], [*rows, ["sum", f"{total:.1f}", ""]])
 
 
 def print_operators(what: str, run: Callable[[], None]) -> None:
-    """The operators that take the most time of their own."""
+    """Print the operators that take the most time of their own."""
     run()
     with profile(activities=[ProfilerActivity.CPU], acc_events=True) as profiler:
         run()

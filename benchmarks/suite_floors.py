@@ -1,11 +1,11 @@
-"""What policies that miss something would reach on a suite, so that a success rate can be read.
+"""Success rates that policies which miss something would reach on a suite, to read a rate by.
 
     python benchmarks/suite_floors.py --json suite_floors.json
 
-Each of them is taken to move perfectly what it has chosen; nothing is simulated. `most likely` neither reads
-nor sees: it does what is right most often. `no instruction` sees the board and takes anything that could be
-asked for there. `no colours` reads and sees everything but the stones' colours: it takes what the instruction
-means under colours drawn at random, such that it means something.
+Each of them is taken to move perfectly what it has chosen; nothing is simulated. `most likely` neither
+reads nor sees: it does what is right most often. `no instruction` sees the board and takes anything that
+could be asked for there. `no colours` reads and sees everything but the stones' colours: it takes what the
+instruction means under colours drawn at random, such that it means something.
 """
 
 import argparse
@@ -64,7 +64,7 @@ def floors_of(suite: str) -> Callable[[Sequence[int]], Floors]:
 
 
 def floors_of_places(suite: str, seeds: Sequence[int]) -> Floors:
-    """Of a suite whose episodes are one stone to one place."""
+    """Return the floors of a suite whose episodes are one stone to one place."""
     sample = find_suite(suite).sample
     known = Counter(sample(EpisodeSpec(seed, suite)).target for seed in KNOWN_SEEDS)
     ((likely, _),) = known.most_common(1)
@@ -84,7 +84,7 @@ def floors_of_places(suite: str, seeds: Sequence[int]) -> Floors:
 
 
 def floors_of_commands(suite: str, tasks: Sequence[Task], seeds: Sequence[int]) -> Floors:
-    """Of a suite whose instructions are commands."""
+    """Return the floors of a suite whose instructions are commands."""
     rng = np.random.default_rng(0)
     shares, colourless = [], []
     for seed in seeds:
@@ -104,7 +104,7 @@ def floors_of_commands(suite: str, tasks: Sequence[Task], seeds: Sequence[int]) 
 
 
 def share_of_guesses(task: Task, drawn: Drawn, case: Case, rng: np.random.Generator) -> float:
-    """How many of the things that a verb could be about there ask for the same; nan: none fits."""
+    """Return the share of a verb's possible meanings there that ask for the same; nan: none fits."""
     abouts = {task.draw(rng).about for _ in range(NUM_GUESSES)}
     guesses = [task.case(replace(drawn, about=about)) for about in sorted(abouts)]
     fitting = [guess for guess in guesses if guess is not None]
@@ -112,7 +112,7 @@ def share_of_guesses(task: Task, drawn: Drawn, case: Case, rng: np.random.Genera
 
 
 def plans_without_colours(task: Task, drawn: Drawn, rng: np.random.Generator) -> tuple | None:
-    """What a command asks for where the stones have other colours; None: nothing under those tried."""
+    """Return what a command asks for under other stone colours; None: nothing under those tried."""
     for _ in range(MAX_TRIES):
         supply = tuple(COLORS[i] for i in rng.integers(2, size=len(drawn.supply)))
         pattern = recoloured(drawn.pattern, rng)
@@ -123,7 +123,7 @@ def plans_without_colours(task: Task, drawn: Drawn, rng: np.random.Generator) ->
 
 
 def legal(episode: Episode, stone: int) -> list[Cell]:
-    """Where a stone of the tray may be put."""
+    """Return the intersections where a stone of the tray may be put."""
     color = COLORS[int(episode.layout.stone_is_white[stone])]
     cells = [cell for cell in ALL_TARGETS if is_legal_move(episode.opening, cell, color)]
     return cells or list(ALL_TARGETS)

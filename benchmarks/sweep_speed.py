@@ -1,7 +1,7 @@
 """Episodes an hour of ``lerobot-bomb sweep`` against stock ``lerobot-eval`` on the same cells, in one run.
 
-The peer plays the manifest's own commands one after the other, and, in a second row, all conditions in one
-command with LeRobot's default of a process an environment. All must give the same lines, or the benchmark
+The peer runs the manifest's own commands one after the other, and, in a second row, all conditions in one
+command with LeRobot's default of a process an environment. All must give the same records, or the benchmark
 stops. Times hold everything, the start of Python and the loading of the policy too.
 
     python benchmarks/sweep_speed.py --json sweep_speed.json
@@ -31,7 +31,7 @@ TARGETS = {ONE: (EACH, 1.5), TWO: (ONE, 1.7)}
 
 
 def main() -> None:
-    """Play the same cells in four ways, print episodes an hour and ratios."""
+    """Run the same cells in four ways, print episodes an hour and ratios."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawTextHelpFormatter)
     add = parser.add_argument
     add("--policy", default="bomb:vla0_smol", help="checkpoint or type (default: bomb:vla0_smol)")
@@ -106,7 +106,7 @@ def run(command: str, flags: Sequence[str]) -> None:
 
 
 def comparable(rows: list[Row]) -> list[Row]:
-    """The lines in one order, without what is measured anew each time."""
+    """Return the records in one order, without what is measured anew each time."""
     return sorted(map(without_measured, rows), key=lambda row: json.dumps(row["spec"]))
 
 

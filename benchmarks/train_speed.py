@@ -104,7 +104,7 @@ class TensorPath:
 
 
 def check_losses(paths: dict[str, Any], items: list[dict]) -> dict[str, float]:
-    """How far each loss is from ours, centre crop; the peer with our pixels must agree."""
+    """Return each loss' difference from ours, centre crop; the peer with our pixels must agree."""
     losses = {}
     for name, path in paths.items():
         path.policy.eval()

@@ -56,7 +56,7 @@ class StringPath:
         ]
 
     def conversation(self, task: str, state: list[int], numbers: list[int]) -> list[dict[str, Any]]:
-        """What the user shows and asks, and what is answered."""
+        """Write the conversation: what the user shows and asks, and what is answered."""
         request = f"Task: {normalize_task(task)}, State: {' '.join(map(str, state))}, Actions: "
         images = [{"type": "image"}] * len(self.policy.config.image_features)
         return [

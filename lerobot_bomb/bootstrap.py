@@ -74,7 +74,7 @@ def format_bounds(interval: tuple[float, float] | None, form: str) -> str:
 
 @dataclass(frozen=True)
 class Slope:
-    """How much a value changes with a level, by least squares; no 95 % interval where all resamples agree."""
+    """Least-squares slope of a value over levels; there is no 95 % interval where all resamples agree."""
 
     per_level: float
     low: float | None
@@ -82,7 +82,7 @@ class Slope:
 
 
 def slope(levels_N: np.ndarray, values_N: np.ndarray, episode_N: np.ndarray) -> Slope | None:
-    """Least squares of N values over their levels; None where all levels are the same.
+    """Fit the slope of N values over their levels, by least squares; None where all levels are the same.
 
     `episode_N` says which values are of one episode under several conditions: the percentile bootstrap draws
     episodes.

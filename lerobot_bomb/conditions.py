@@ -17,7 +17,7 @@ MAX_LEVEL = 5
 
 @dataclass(frozen=True)
 class Magnitude:
-    """How far one quantity of an axis moves at the levels 1..5."""
+    """Magnitude of one quantity of an axis at each of the levels 1..5."""
 
     unit: str
     levels: tuple[float, float, float, float, float]
@@ -35,18 +35,18 @@ class Axis:
 
 
 def magnitude_of(axes: Mapping[str, Axis], axis: str, name: str, level: int) -> float:
-    """How far a quantity of an axis moves at a level of 1..5, in the unit that the table states."""
+    """Return the magnitude of a quantity at a level of 1..5, in the unit that the axis states."""
     return axes[axis].magnitudes[name].levels[level - 1]
 
 
 def nuisances_of(axes: Mapping[str, Axis]) -> tuple[str, ...]:
-    """What `all` stands for."""
+    """Return the axes that `all` stands for: every one that does not help."""
     return tuple(name for name, axis in axes.items() if not axis.is_help)
 
 
 @dataclass(frozen=True)
 class AxisCondition:
-    """Which axes of an environment are on, each at a level or at one drawn per episode from a range.
+    """Axes of an environment that are on, each at one level or at a range to draw from per episode.
 
     A subclass names the environment's table.
     """
@@ -57,7 +57,7 @@ class AxisCondition:
     @classmethod
     @lru_cache(maxsize=64)  # every reset of an environment asks
     def parse(cls, text: str) -> Self:
-        """From "none", "camera:3", "camera:2+light:3" or "all:1-5"; level 0 leaves an axis off.
+        """Parse "none", "camera:3", "camera:2+light:3" or "all:1-5"; level 0 leaves an axis off.
 
         Raises:
             ValueError: names --env.perturbations, what is wrong, and what is allowed.
@@ -117,7 +117,7 @@ class AxisCondition:
         return conditions
 
     def __str__(self) -> str:
-        """As `parse` reads it, the same for all ways to write the same condition."""
+        """Write the condition as `parse` reads it; one condition has one spelling."""
         parts = {axis: f"{low}" if low == high else f"{low}-{high}" for axis, low, high in self.ranges}
         nuisances = nuisances_of(self.axes)
         shared = {parts.get(axis) for axis in nuisances}

@@ -33,7 +33,7 @@ class GraphedFunction:
         return {"_function": self._function, "_graphs": {}, "_pool": None}
 
     def __call__(self, *tensors: Tensor) -> tuple[Tensor, ...]:
-        """What the function returns for these; call it outside of inference mode."""
+        """Run the function on the tensors; call it outside of inference mode."""
         if not tensors[0].is_cuda:
             return self._function(*tensors)
         shapes = tuple((tensor.shape, tensor.dtype) for tensor in tensors)
@@ -75,7 +75,7 @@ class GraphedModel:
         self._captured = GraphedFunction(self._run)
 
     def __call__(self, settings: Any, *tensors: Tensor) -> tuple[Tensor, ...]:
-        """What the function returns; ``settings``: whatever else it reads."""
+        """Run the function on the tensors; ``settings`` holds whatever else it reads."""
         read = [*self._call.parameters(), *self._call.buffers()]
         state = settings, [tensor.data_ptr() for tensor in read]
         if state != self._state:

@@ -146,7 +146,7 @@ def append_line(path: Path | str, line: str) -> None:
 
 
 def check_appendable(path: Path) -> None:
-    """Make the file's folder, unless it exists.
+    """Check that a file can be appended to; make its folder, unless it exists.
 
     Raises:
         OSError: `append_line` could not write the file.
@@ -160,6 +160,6 @@ def check_appendable(path: Path) -> None:
 
 
 def _write_all(file: int, data: bytes) -> None:
-    """As os.write, which on a full disk writes a part and says so in its result only."""
+    """Write all bytes: on a full disk os.write writes a part, and only its result says so."""
     while data:
         data = data[os.write(file, data) :]

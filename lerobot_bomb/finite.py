@@ -14,7 +14,7 @@ IMAGE_TOLERANCE = 1e-3
 
 
 def is_finite(values: Tensor) -> bool:
-    """Whether no value is NaN or infinite; for a tensor on CUDA the host waits.
+    """Return True if no value is NaN or infinite; for a tensor on CUDA the host waits.
 
     A sum of values that are not finite never is, so the values are looked at one by one, which takes 30
     times as long, only where the sum overflows or something is wrong.
@@ -34,7 +34,7 @@ def require_finite(values: Tensor, name: str, advice: str = "") -> None:
 
 
 def _bad(values: Tensor) -> Tensor:
-    """Which are NaN or infinite."""
+    """Return a mask of the values that are NaN or infinite."""
     return ~_readable(values).isfinite()
 
 
@@ -44,19 +44,19 @@ def _readable(values: Tensor) -> Tensor:
 
 
 def require_finite_on_cpu(values: Tensor, name: str) -> None:
-    """The same where that costs no wait."""
+    """Raise unless all values are finite, but only for a tensor on the CPU, where the check costs no wait."""
     if values.device.type == "cpu":
         require_finite(values, name)
 
 
 def require_finite_weights(model: nn.Module, name: str) -> None:
-    """The same of a model's weights and buffers."""
+    """Raise unless all weights and buffers of a model are finite."""
     for key, values in model.state_dict().items():
         require_finite(values, f"{name}: {key}")
 
 
 def require_finite_statistics(statistics: Mapping[str, Mapping[str, Any]] | None) -> None:
-    """The same of a dataset's statistics of actions and observations, by which values are normalised."""
+    """Raise unless the dataset's statistics of actions and observations are finite."""
     for key, of_key in (statistics or {}).items():
         if key == ACTION or key.startswith(OBS_PREFIX):
             for statistic, values in of_key.items():
@@ -118,7 +118,7 @@ def require_finite_batch(values: Mapping[str, Tensor], frames: Mapping[str, Tens
 
 
 def _is_image(key: str, values: Tensor) -> bool:
-    """Whether it is a camera's (B, 3, H, W); depth, which datasets name alike, has one channel."""
+    """Return True for a camera's images (B, 3, H, W); depth, whose keys look the same, has one channel."""
     return key.startswith(OBS_IMAGE) and values.ndim == 4 and values.shape[1] == 3
 
 
@@ -134,7 +134,7 @@ def _ends(key: str, values: Tensor) -> Tensor:
 
 
 def _refuse_infinite(key: str, values: Tensor, frames: Mapping[str, Tensor]) -> None:
-    """Unless it is but the sum of the values that is infinite."""
+    """Raise if a value is infinite, but not if only the sum of the values is."""
     bad = _bad(values)
     if not bool(bad.any()):
         return
@@ -161,7 +161,7 @@ def _refuse_range(
 
 
 def _frame(frames: Mapping[str, Tensor], row: int, ahead: int) -> tuple[str, str]:
-    """Where in its dataset a row's frame is, or the one so many after it, and what to do."""
+    """Describe where in the dataset a row's frame is (or the one `ahead` frames later), and what to do."""
     if not {"episode_index", "index"} <= frames.keys():
         return "", ""
     episode, index = (int(frames[key].reshape(-1)[row]) for key in ("episode_index", "index"))

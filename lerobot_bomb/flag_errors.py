@@ -1,4 +1,4 @@
-"""What our code refuses, said so that LeRobot's commands pass it on in a line."""
+"""Errors in flags, worded so that LeRobot's commands print them as one line."""
 
 import re
 from collections.abc import Collection, Iterator, Sequence
@@ -25,7 +25,7 @@ class FlagError(DecodingError):
 
 
 def hint(words: Sequence[str], flags: Collection[str], argv: Sequence[str]) -> str:
-    """What follows on an error: flags that are spelled much like these words, and how to list all.
+    """Return the end of an error message: flags that are spelled much like these words, and how to list all.
 
     Args:
         words: what is wrong: --env.tsak=place
@@ -43,7 +43,7 @@ def nearest(words: Sequence[str], flags: Collection[str]) -> str:
 
 
 def nearest_flags(word: str, flags: Collection[str]) -> list[str]:
-    """Those spelled much like `--GROUP.NAME=VALUE`, of its group where there is such a group."""
+    """Return the flags spelled much like `--GROUP.NAME=VALUE`, from its group where that exists."""
     flag = word.partition("=")[0]
     group = flag.rpartition(".")[0]
     names = {_name(other): other for other in flags if other.rpartition(".")[0] == group}

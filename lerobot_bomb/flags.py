@@ -1,4 +1,4 @@
-"""What is wrong with a flag: reads paths and choices; light, as the simulator's processes import it."""
+"""Checks of flags that are paths or choices; light, as the simulator's processes import it."""
 
 import re
 from collections.abc import Collection, Iterator, Mapping

@@ -1,4 +1,4 @@
-"""How smooth executed actions are, by their second and third differences.
+"""Smoothness of executed actions, by their second and third differences.
 
 FDVLA's "jerk" is an "average second-order difference", of unknown norm and units: compare variants of a
 policy, not numbers with the paper's. Shapes: `R` executed actions of all episodes, `D` action dims.
@@ -31,7 +31,7 @@ def smoothness(
     std_D: np.ndarray | None = None,
     dt_s: float | None = None,
 ) -> Smoothness:
-    """Of whole episodes as they were executed, so that seams between chunks count.
+    """Measure how smooth the executed actions of whole episodes are, seams between chunks included.
 
     Args:
         actions_RD: in the data's units, in order of time.

@@ -64,7 +64,7 @@ def clustered_interval(successes_C: np.ndarray, counts_C: np.ndarray) -> tuple[f
 
 @dataclass(frozen=True)
 class Rate:
-    """How many of n records are counted, with the 95 % interval of their share."""
+    """Share of n records that count, such as successes, with its 95 % interval."""
 
     successes: int
     n: int
@@ -107,9 +107,9 @@ def format_rate(successes: int, n: int) -> str:
 
 
 def mcnemar_p_value(only_first: int, only_second: int) -> float:
-    """Two-sided exact p-value of the hypothesis that both arms of paired episodes succeed equally often.
+    """Two-sided exact p-value of the hypothesis that both groups of paired episodes succeed equally often.
 
-    Given the pairs in which one arm alone succeeded, either is as likely as a coin's side (McNemar, 1947).
+    Given the pairs in which one group alone succeeded, either is as likely as a coin's side (McNemar, 1947).
     """
     from scipy.special import bdtr
 
@@ -123,7 +123,7 @@ def format_p(p_value: float) -> str:
 
 @dataclass(frozen=True)
 class PairedCounts:
-    """How often which arm of paired episodes succeeded."""
+    """Counts of paired episodes by which of the two groups succeeded."""
 
     both: int
     only_first: int
@@ -132,7 +132,7 @@ class PairedCounts:
 
     @classmethod
     def of(cls, first_E: Sequence[bool], second_E: Sequence[bool]) -> "PairedCounts":
-        """From the successes of the same episodes."""
+        """Count the outcomes of the same episodes in two groups."""
         pairs = Counter(zip(first_E, second_E, strict=True))
         return cls(*(pairs[pair] for pair in ((True, True), (True, False), (False, True), (False, False))))
 
@@ -142,17 +142,17 @@ class PairedCounts:
 
     @property
     def first(self) -> int:
-        """Successes of the first arm."""
+        """Successes of the first group."""
         return self.both + self.only_first
 
     @property
     def second(self) -> int:
-        """Successes of the second arm."""
+        """Successes of the second group."""
         return self.both + self.only_second
 
     @property
     def difference(self) -> float:
-        """The second arm's rate minus the first one's."""
+        """The second group's rate minus the first one's."""
         return (self.only_second - self.only_first) / self.n
 
     @property

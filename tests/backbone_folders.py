@@ -36,7 +36,7 @@ def small_tokenizer(family: str) -> Tokenizer:
 
 
 def small_model(family: str, tokenizer: Tokenizer) -> Any:
-    """Of transformers' own class, with random weights and two layers each of text and vision."""
+    """Build a small model of transformers' own class: random weights, two layers each of text and vision."""
     token_id = tokenizer.token_to_id
     if family == "qwen2_5_vl":
         config = nano_qwen_config(tokenizer)
@@ -78,7 +78,7 @@ def is_qwen(policy: Vla0SmolPolicy) -> bool:
 
 
 def prompt_text(policy: Vla0SmolPolicy, task: str, state: list[int] | None) -> str:
-    """What the family's chat template makes of a question about the images of two cameras."""
+    """Write a question about the images of two cameras as the family's chat template does."""
     num_tokens, system = policy.backbone.tokens_per_image, policy.config.system_prompt
     state_text = "" if state is None else f"State: {' '.join(map(str, state))}, "
     question = f"Task: {normalize_task(task)}, {state_text}Actions: "
@@ -98,7 +98,7 @@ def answer_text(policy: Vla0SmolPolicy, numbers: list[int]) -> str:
 
 
 def stock_inputs(policy: Vla0SmolPolicy, ids_L: Tensor, images_N3SS: Tensor) -> dict[str, Tensor]:
-    """Of the stock model: one sequence and the images in it, (N, 3, S, S) in [0, 1] and of its own size."""
+    """Return the stock model's inputs: a sequence and its images (N, 3, S, S) in [0, 1], of its own size."""
     if not is_qwen(policy):
         return {"input_ids": ids_L[None], "pixel_values": images_N3SS[None] * 2 - 1}
     images = [image.permute(1, 2, 0).mul(255).round().byte().numpy() for image in images_N3SS]

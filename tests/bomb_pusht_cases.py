@@ -1,4 +1,4 @@
-"""What the tests of `bomb_pusht` have in common."""
+"""Cases that the tests of `bomb_pusht` have in common."""
 
 from dataclasses import asdict
 from typing import Any
@@ -38,7 +38,7 @@ def play(env: Any, seed: int, num: int) -> list[dict[str, np.ndarray]]:
 
 
 def seen(observation: dict[str, np.ndarray], info: dict[str, Any], reward: float) -> dict[str, np.ndarray]:
-    """What a moment of an episode shows and is."""
+    """Return what a moment of an episode shows and is."""
     return {
         "pixels": observation["pixels"],
         "agent_pos": observation["agent_pos"],

@@ -53,7 +53,7 @@ def shared_data() -> Path:
 
 
 def stop_fork_server() -> None:
-    """Worker processes get its environment variables, which are those of its start."""
+    """Stop the fork server, whose workers get the environment variables of its start."""
     from multiprocessing import forkserver
 
     server: Any = forkserver._forkserver
@@ -79,7 +79,7 @@ def libero(tmp_path_factory: pytest.TempPathFactory) -> "Iterator[Libero]":
 
 @pytest.fixture(scope="module")
 def libero_with_assets(libero: "Libero", shared_data: Path) -> "Libero":
-    """The same with the assets of libero_spatial, and of no other suite."""
+    """Return the LIBERO of `libero` with the assets of libero_spatial, and of no other suite."""
     assets = shared_data / "libero" / "assets"
     if not assets.is_dir():
         pytest.skip(f"{assets} is absent")
@@ -98,7 +98,7 @@ def pusht_demonstrations(shared_data: Path) -> "Demonstrations":
 
 @pytest.fixture(scope="session")
 def pusht_zarr(pusht_demonstrations: "Demonstrations", tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """They alone, as a zarr."""
+    """Write these demonstrations as a zarr."""
     path = tmp_path_factory.mktemp("source") / "small.zarr"
     pusht_demonstrations.write(path)
     return path
@@ -106,7 +106,7 @@ def pusht_zarr(pusht_demonstrations: "Demonstrations", tmp_path_factory: pytest.
 
 @pytest.fixture(scope="session")
 def pusht_dataset(pusht_zarr: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """They as a LeRobotDataset, through the command line."""
+    """Convert these demonstrations to a LeRobotDataset, through the command line."""
     from pusht_cases import REPO_ID
 
     from lerobot_bomb.commands import main as cli
@@ -156,7 +156,7 @@ def stock_cli(monkeypatch: pytest.MonkeyPatch) -> Callable[..., None]:
 
 @pytest.fixture(scope="module")
 def loaded_policies() -> Iterator[None]:
-    """Those of `explain_cases`; none is left: results name a policy only where a process holds no other."""
+    """Drop the policies of `explain_cases` at the end: results name a policy only if it is the only one."""
     import explain_cases  # loads LeRobot
 
     yield
@@ -168,7 +168,7 @@ def pytest_addoption(parser: pytest.Parser) -> None:
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
-    """The slowest files first, the others as they are."""
+    """Sort the slowest files to the front, and leave the others as they are."""
     places = {name: place for place, name in enumerate(SLOWEST_FILES)}
     items.sort(key=lambda item: places.get(item.path.stem, len(places)))
 

@@ -37,7 +37,7 @@ loaded = cache(fresh)
 
 
 def explained_by(policy: LoadedPolicy) -> Explained:
-    """As the policy says how."""
+    """Explain the policy as it says how."""
     return explained(policy.policy, policy.postprocess)
 
 
@@ -80,6 +80,6 @@ def asked(policy: LoadedPolicy) -> Asked:
 
 
 def without_image(question: Question, key: str = WORKSPACE) -> dict[str, Any]:
-    """What is read of it where one camera shows its mean colour only."""
+    """Encode the question with one camera that shows its mean colour only."""
     (image,) = question.observation[key]
     return question.encode({key: filling(image, "mean", 1.0)[None]}, 1)

@@ -72,7 +72,7 @@ def make_batch(
 
 
 def rows(batch: dict[str, Any], which: slice | list[int]) -> dict[str, Any]:
-    """Some of a batch's rows."""
+    """Take some of a batch's rows."""
     index = list(range(len(batch["task"])))[which] if isinstance(which, slice) else which
     return {
         key: value[index] if isinstance(value, Tensor) else [value[i] for i in index]

@@ -28,7 +28,7 @@ def gaussian_heads(mean: Tensor | float, std: float) -> Callable[[Tensor, Tensor
 
 
 def random_point(batch_size: int, dtype: torch.dtype = torch.float32) -> PathPoint:
-    """Of chunks of 5 actions with 3 dims; actions that can be differentiated by."""
+    """Draw a point for chunks of 5 actions with 3 dims; its actions require gradients."""
     generator = torch.Generator().manual_seed(0)
     clean, noise = torch.randn(2, batch_size, 5, 3, generator=generator, dtype=dtype)
     point = path_point(clean, noise, torch.rand(batch_size, generator=generator, dtype=dtype))

@@ -12,7 +12,7 @@ def spelled(symbols: list[int]) -> str:
 
 
 class GrammarProcessor(LogitsProcessor):
-    """Told by a regular expression's worth of Python."""
+    """Processor of logits by the grammar, as a regular expression's worth of Python tells it."""
 
     def __init__(self, num_values: int, num_numbers: int, prompt_length: int, symbol_ids: Tensor):
         self.num_values, self.num_numbers, self.prompt_length = num_values, num_numbers, prompt_length

@@ -11,7 +11,7 @@ from lerobot_bomb.actions.grids import ActionGrids
 
 
 def fitted(actions: Tensor | np.ndarray, rest: Any = None, **changes: Any) -> ActionGrids:
-    """On normalised actions (N, D), with the default groups (7 dims: of a pose) unless others are given."""
+    """Fit grids to normalised actions (N, D), with the default groups (7 dims: of a pose) unless given."""
     num_dims = actions.shape[1]
     groups = default_groups(num_dims, layout="pose" if num_dims == 7 else None)
     grids = ActionGrids(GridSettings(**{"groups": groups, **changes}), num_dims)

@@ -43,7 +43,7 @@ class Played:
         )
 
     def write(self, group: Any, observed: slice) -> None:
-        """As a demonstration whose rows hold these moments' observations."""
+        """Write a demonstration whose rows hold these moments' observations."""
         moments = np.arange(len(self.actions) + 1)[observed]
         group["actions"] = self.actions
         times = np.arange(len(self.actions) + 1)[:, None]

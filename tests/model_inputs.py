@@ -1,4 +1,4 @@
-"""What the networks of any policy receive."""
+"""Inputs that the networks of any policy receive."""
 
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
@@ -9,6 +9,7 @@ import torch
 from lerobot.policies import PreTrainedPolicy
 from torch import Tensor, nn
 from transformers import PreTrainedModel
+from transformers.modeling_layers import GradientCheckpointingLayer
 
 type Batch = dict[str, Any]
 # tensors in the order of the calls, by kind, module and argument
@@ -16,12 +17,12 @@ type Inputs = dict[str, list[Tensor]]
 
 
 def kind_of_entry(module: nn.Module) -> str | None:
-    """How a module takes in data: pixels, token ids, or as a whole model embeddings, masks, positions."""
+    """Return how a module takes in data: pixels, ids, or ("model") embeddings and masks."""
     if isinstance(module, nn.Conv2d | nn.Conv3d) and module.in_channels == 3:
         return "pixels"
     if isinstance(module, nn.Embedding):
         return "ids"
-    return "model" if isinstance(module, PreTrainedModel) else None
+    return "model" if isinstance(module, PreTrainedModel | GradientCheckpointingLayer) else None
 
 
 @contextmanager
@@ -51,7 +52,7 @@ def probes(policy: PreTrainedPolicy) -> Iterator[Inputs]:
 
 @torch.no_grad()
 def inference_inputs(policy: PreTrainedPolicy, batch: Batch) -> Inputs:
-    """What the networks receive on the way to the next action, and that action."""
+    """Return what the networks receive on the way to the next action, and that action."""
     policy.eval()
     with pytest.MonkeyPatch.context() as patch, probes(policy) as seen:
         patch.setattr(policy.config, "n_action_steps", 1)  # a prediction no longer than necessary
@@ -63,7 +64,7 @@ def inference_inputs(policy: PreTrainedPolicy, batch: Batch) -> Inputs:
 
 
 def first_ids(seen: Inputs) -> dict[str, Tensor]:
-    """What every embedding looks up in its first call, where that is rows of prompts and no choice."""
+    """Return what every embedding looks up in its first call, if that is rows of prompts and no choice."""
     return {name: calls[0] for name, calls in seen.items() if name.startswith("ids") and calls[0].ndim == 2}
 
 

@@ -81,7 +81,7 @@ class Routes:
     evaluation: Route
 
     def frames(self) -> Iterator[tuple[Batch, Batch]]:
-        """Both batches of every frame that training sees, which may be all but each episode's last."""
+        """Yield both batches of every frame that training sees, which may be all but each episode's last."""
         assert len(self.training.batches) >= len(self.recorded.actions) - EPISODES
         for index, batch in sorted(self.training.batches.items()):
             yield batch, self.evaluation.batches[index]
@@ -115,9 +115,10 @@ def resolution(policy: PreTrainedPolicy) -> float:
 
 
 def tolerance(policy: PreTrainedPolicy) -> float:
-    """Of normalised actions in an episode: one that samples had not all of its noise while it learned.
+    """Return the tolerance of normalised actions in an episode: larger for a policy that samples.
 
-    A gripper that closes or opens a step early or late is off by about 2.
+    Such a policy has not seen all of its noise while it learned. A gripper that closes or opens a step
+    early or late is off by about 2.
     """
     samples = hasattr(policy.config, "num_inference_steps")
     return 3 * resolution(policy) if samples else resolution(policy)
@@ -145,7 +146,7 @@ def learn_by_heart(policy: PreTrainedPolicy, batches: list[Batch], bar: float | 
 
 
 def run_routes(recorded: Recorded, folder: Path, flags: list[str], finish: Finish | None) -> Routes:
-    """Both commands; `finish` may change the policy before lerobot-train saves it."""
+    """Run both commands; `finish` may change the policy before lerobot-train saves it."""
     training = run_train(recorded, folder / "train", flags, finish)
     checkpoint = folder / "train" / "checkpoints" / "last" / "pretrained_model"
     return Routes(recorded, training, run_eval(recorded, folder / "eval", checkpoint))

@@ -1,4 +1,4 @@
-"""Every policy type's own cases: tiny policies (`make_policy`) and batches for them (`make_batch`)."""
+"""Cases of every policy type: tiny policies (`make_policy`) and batches for them (`make_batch`)."""
 
 from pathlib import Path
 from typing import Any
@@ -15,10 +15,10 @@ CASES: dict[str, Any] = {
 }
 
 
-def save_checkpoint(policy_type: str, folder: Path) -> PreTrainedPolicy:
+def save_checkpoint(policy_type: str, folder: Path, **options: Any) -> PreTrainedPolicy:
     """Config, weights and processors of a tiny policy, which is returned."""
     cases = CASES[policy_type]
-    policy = cases.make_policy()
+    policy = cases.make_policy(**options)
     policy.save_pretrained(folder)
     stats = cases.STATS if policy_type == "vla0_smol" else cases.stats()
     for processor in make_pre_post_processors(policy.config, dataset_stats=stats):

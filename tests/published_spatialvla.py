@@ -91,7 +91,7 @@ OF_ZOEDEPTH = {
 
 
 def gaussians(seed: int) -> dict[str, dict[str, float]]:
-    """As a gs_*.json has them."""
+    """Draw Gaussians as a gs_*.json has them."""
     spread = torch.rand(6, 2, generator=torch.Generator().manual_seed(seed)).tolist()
     centers = {"theta": 1.8, "phi": 0.1, "r": 0.6}
     return {
@@ -133,7 +133,7 @@ def make_original(
 
 
 def published_tensors(policy: SpatialvlaGridPolicy) -> dict[str, Tensor]:
-    """Under the original's names; its words' table has unused rows for the cells."""
+    """Return the tensors by the original's names; its words' table has unused rows for the cells."""
     tensors = {}
     for name, tensor in policy.state_dict().items():
         ours = next((each for each in NAMES if name.startswith(each)), None)
@@ -222,7 +222,7 @@ def published_config(policy: SpatialvlaGridPolicy) -> dict[str, Any]:
 
 
 def _whole(config: Mapping[str, Any]) -> dict[str, Any]:
-    """As transformers 4.47 writes it."""
+    """Complete a config as transformers 4.47 writes it."""
     later = ("dtype", "transformers_version")
     values = {key: value for key, value in config.items() if key not in later}
     if "backbone_config" in values:

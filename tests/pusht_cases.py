@@ -20,7 +20,7 @@ ENDS = "meta/episode_ends"
 
 @dataclass(frozen=True)
 class Demonstrations:
-    """What the zarr holds, read with zarr alone."""
+    """Demonstrations that the zarr holds, read with zarr alone."""
 
     images: np.ndarray
     states: np.ndarray
@@ -52,7 +52,7 @@ def put(pusht: Any, state: np.ndarray) -> None:
 
 @contextmanager
 def starting_at(state: np.ndarray) -> Iterator[None]:
-    """Every environment `pusht` that is reset meanwhile starts in `state` (5), whatever its seed."""
+    """Start every environment `pusht` that is reset meanwhile in `state` (5), whatever its seed."""
     from gym_pusht.envs.pusht import PushTEnv
 
     with pytest.MonkeyPatch.context() as patch:
@@ -61,7 +61,7 @@ def starting_at(state: np.ndarray) -> Iterator[None]:
 
 
 def convert(demonstrations: Demonstrations, folder: Path) -> Path:
-    """They as a LeRobotDataset in a new folder in `folder`, through the command line."""
+    """Convert demonstrations to a LeRobotDataset in a new folder in `folder`, through the command line."""
     from lerobot_bomb.commands import main as cli
 
     demonstrations.write(folder / "source.zarr")

@@ -123,7 +123,7 @@ def wait_for_end(pids: list[int]) -> None:
 
 
 def act(action: str, folder: Path) -> None:
-    """What happens at a moment."""
+    """Perform an action at its moment."""
     if action == "kill":
         os.kill(os.getpid(), signal.SIGKILL)
     elif action == "Ctrl-C":
@@ -167,7 +167,7 @@ def hook(moment: Moment | None, watched: str, operations: int) -> Callable[[str,
 
 
 def run(job: dict) -> None:
-    """Be the recorder that the job describes, and end."""
+    """Run the recorder that the job describes, and end."""
     from lerobot_bomb.commands import main as cli
 
     signal.signal(signal.SIGCHLD, signal.SIG_DFL)

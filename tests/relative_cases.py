@@ -12,7 +12,7 @@ NAMES = ["x", "y", "z", "grip"]
 def make_dataset(
     root: Path, reach: float, *, delta: bool = False, names: Any = NAMES
 ) -> LeRobotDatasetMetadata:
-    """Two episodes of 30 frames; the action is the state and up to `reach` more, or the state's change."""
+    """Write two episodes of 30 frames; an action is the state and up to `reach` more, or its change."""
     features = {
         key: {"dtype": "float32", "shape": (4,), "names": names} for key in ("observation.state", "action")
     }

@@ -28,13 +28,13 @@ PERIOD = 100  # readings after which the arm is back where it was
 
 
 def position_at(reading: int) -> dict[str, float]:
-    """Of every motor in degrees: each has a range and a speed of its own, and moves whatever it is told."""
+    """Return every motor's degrees: each has its own range and speed, and moves whatever it is told."""
     away = (1 - np.cos(2 * np.pi * reading / PERIOD)) / 2
     return {key: float(15 * i + 8 * (i + 1) * away) for i, key in enumerate(KEYS)}
 
 
 def command_at(reading: int) -> dict[str, float]:
-    """What the leader says then: where the arm is, and a little on."""
+    """Return the leader's command at a reading: the arm's position, and a little on."""
     return {
         key: value + float(np.sin(reading + i)) for i, (key, value) in enumerate(position_at(reading).items())
     }
@@ -50,7 +50,7 @@ class ScriptedArmConfig(RobotConfig):
 
 
 class Device:
-    """What LeRobot asks of every device."""
+    """Device with what LeRobot asks of every one."""
 
     is_connected = False
     is_calibrated = True
@@ -108,7 +108,7 @@ class ScriptedArm(Device, Robot):  # pyright: ignore[reportIncompatibleMethodOve
 @TeleoperatorConfig.register_subclass("scripted_leader")
 @dataclass
 class ScriptedLeaderConfig(TeleoperatorConfig):
-    """Nothing to choose."""
+    """Config of a leader that has nothing to choose."""
 
 
 class ScriptedLeader(Device, Teleoperator):  # pyright: ignore[reportIncompatibleMethodOverride]
@@ -192,7 +192,7 @@ class Loaded:
         return cls(get_policy_class(config.type).from_pretrained(path), *load_processors(config))
 
     def batch(self, seen: dict[str, Any], task: str) -> dict[str, Any]:
-        """What the policy reads of a robot's observation."""
+        """Return what the policy reads of a robot's observation."""
         numbers = [value for value in seen.values() if isinstance(value, float)]
         images = {
             f"observation.images.{name}": value for name, value in seen.items() if hasattr(value, "shape")

@@ -1,4 +1,4 @@
-"""What checkpoints and a dataset in a folder say; `python saved_actions.py FOLDER` writes it beside them.
+"""Answers of checkpoints and a dataset in a folder; `python saved_actions.py FOLDER` writes them beside it.
 
 Only names of LeRobot's, so that it runs with any version of this package.
 """

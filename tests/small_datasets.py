@@ -18,7 +18,7 @@ def write_dataset(
     size: int = 32,
     num_frames: int = 6,
 ) -> LeRobotDataset:
-    """Two episodes; ``numbers``: frame -> its state and action, whose types and sizes are the columns'."""
+    """Write two episodes; ``numbers``: frame -> state and action, whose types and sizes are the columns'."""
     image = {"dtype": "image", "shape": (size, size, 3), "names": ["height", "width", "channels"]}
     features: dict[str, Any] = {f"observation.images.{camera}": image for camera in cameras}
     for key, values in zip((STATE, ACTION), map(np.asarray, numbers(0)), strict=True):

@@ -126,7 +126,7 @@ def flags_of(stock_type: str, **more: Any) -> list[str]:
 
 
 def write_base(stock_type: str, folder: Path) -> None:
-    """A policy of random weights for another robot: cameras, state and actions are not BOMB's."""
+    """Write a policy of random weights for another robot: cameras, state and actions are not BOMB's."""
     inputs = {name: PolicyFeature(FeatureType.VISUAL, (3, 64, 64)) for name in BASE_CAMERAS}
     inputs["observation.state"] = PolicyFeature(FeatureType.STATE, (6,))
     actions = {"action": PolicyFeature(FeatureType.ACTION, (6,))}
@@ -142,7 +142,7 @@ def write_base(stock_type: str, folder: Path) -> None:
 
 
 def write_folders(folder: Path) -> None:
-    """What the flags name, and the pi0 family's tokenizer, relative to the working directory."""
+    """Write the folders that the flags name, relative to the working directory, and the pi0 tokenizer."""
     tokenizer = PreTrainedTokenizerFast(
         tokenizer_object=nano_tokenizer(),
         bos_token="<|im_start|>",

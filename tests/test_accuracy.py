@@ -76,7 +76,7 @@ def told(
     policy: Vla0SmolPolicy, batch: dict, monkeypatch: pytest.MonkeyPatch, off_by: int
 ) -> dict[str, float]:
     """Metrics of a model that writes every number `off_by` bins too high."""
-    numbers = policy._to_tokens(policy._bins(batch) + off_by, policy.config.n_action_bins)
+    numbers = policy._to_tokens(policy._targets(batch)[0] + off_by, policy.config.n_action_bins)
     answer = policy._answer(numbers)
     logits = torch.nn.functional.one_hot(answer.rows.ids, policy.backbone.text_config.vocab_size).float()
     monkeypatch.setattr(policy, "_answer_logits", lambda *_: logits)
@@ -105,7 +105,7 @@ def test_padded_steps_do_not_enter_the_metrics(monkeypatch: pytest.MonkeyPatch) 
     policy = make_policy(n_action_bins=101, bin_mode="levels", number_width=3)
     policy._action_names = policy.config.action_names
     batch = make_batch(policy, 1)
-    right = policy._bins(batch)
+    right = policy._targets(batch)[0]
     batch["action_is_pad"][0, 1:] = True
     batch["action"][0, 1:] = -batch["action"][0, 1:]
     logits = torch.nn.functional.one_hot(

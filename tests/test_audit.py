@@ -39,7 +39,7 @@ def rows(successes: int, shift: float = 0.0, n: int = N, first: int = 0) -> Rows
 
 @pytest.fixture
 def arms() -> dict[str, Rows]:
-    """Of a policy that has nothing to hide."""
+    """Return the arms of a policy that has nothing to hide."""
     return {
         POLICY: rows(36),
         AGAIN: rows(36),

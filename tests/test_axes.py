@@ -1,5 +1,5 @@
 # pyright: reportAttributeAccessIssue=false
-"""What the perturbation axes do to an episode, and what they leave alone."""
+"""Perturbation axes: what they do to an episode, and what they leave alone."""
 
 import itertools
 from dataclasses import fields

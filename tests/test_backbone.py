@@ -213,7 +213,7 @@ def shrunk_real_config(smolvlm2: Path) -> dict[str, Any]:
 
 
 def test_the_real_architecture_shrunk(smolvlm2: Path) -> None:
-    """All odd fields of the published config; bfloat16 in it must not reach the weights."""
+    """Check all odd fields of the published config; bfloat16 in it must not reach the weights."""
     backbone = build_backbone(shrunk_real_config(smolvlm2))
     assert {parameter.dtype for parameter in backbone.parameters()} == {torch.float32}
     assert (backbone.image_size, backbone.tokens_per_image) == (512, 64)

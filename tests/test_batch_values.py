@@ -1,4 +1,4 @@
-"""What a batch may hold: whole numbers, truth values, one dimension; images in [0, 1]; a text a row."""
+"""Batches: whole numbers, truth values, one dimension; images in [0, 1]; a text a row."""
 
 from pathlib import Path
 from typing import Any
@@ -24,7 +24,7 @@ RANGES = [(lambda x: 255 * x, "from 0 to 255"), (lambda x: 2 * x - 1, "from -1 t
 
 @pytest.fixture(scope="module", params=KINDS, ids=lambda kind: f"{kind[0]}-{kind[1]}")
 def dataset(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory) -> Any:
-    """Two episodes; actions 0 and 1 of a type, states 0.1, 0.2, ..."""
+    """Write two episodes; actions 0 and 1 of a type, states 0.1, 0.2, ..."""
     dtype, num_dims = request.param
 
     def numbers(frame: int) -> tuple[np.ndarray, np.ndarray]:
@@ -41,7 +41,7 @@ def policy_for(dataset: LeRobotDataset, policy_type: str, **options: Any) -> Any
 
 
 def first_batch(dataset: LeRobotDataset, chunk_size: int) -> dict[str, Any]:
-    """As LeRobot reads it: of a chunk of 1, the frame's own action."""
+    """Read a batch as LeRobot does; a chunk of 1 is the frame's own action."""
     steps = [step / dataset.fps for step in range(chunk_size)]
     timestamps = {ACTION: steps} if chunk_size > 1 else None
     chunked = LeRobotDataset(dataset.repo_id, root=dataset.root, delta_timestamps=timestamps)
@@ -89,7 +89,7 @@ def test_whole_numbers_and_one_dimension_train_and_act(
 
 @pytest.mark.parametrize("dtype", ["int64", "bool"])
 def test_relative_actions_of_whole_numbers(dtype: str, tmp_path: Path) -> None:
-    """What is fitted has fractions: a state of 0 and 1, and an action that is the next one."""
+    """Check that what is fitted has fractions: a state of 0 and 1, and an action that is the next one."""
 
     def numbers(frame: int) -> tuple[np.ndarray, np.ndarray]:
         now, after = (np.array([step % 6 > 2]).astype(dtype) for step in (frame, frame + 1))

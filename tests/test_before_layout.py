@@ -1,4 +1,4 @@
-"""What was made before the core had folders loads and acts as it did: fixtures/before_layout/README.md."""
+"""Files from before the core had folders load and act as they did: fixtures/before_layout/README.md."""
 
 import shutil
 from pathlib import Path

@@ -44,7 +44,7 @@ INSTRUCTIONS = (
 
 
 def instructions_of(libero: Libero) -> set[str]:
-    """Of all 130 tasks, by their files' names, as LeRobot gives them."""
+    """Return the instructions of all 130 tasks, by their files' names, as LeRobot gives them."""
     names = [path.stem for path in libero.task_folders()["bddl_files"].glob("libero_*/*.bddl")]
     return {re.sub(r"^[A-Z_0-9]*SCENE\d+_", "", name).replace("_", " ") for name in names}
 

@@ -95,7 +95,7 @@ def fields_of(env: Any) -> dict[str, np.ndarray]:
 
 
 def make_current(stock: Any) -> None:
-    """robosuite draws, and frees what it drew with, in whichever OpenGL context is current."""
+    """Make the context current: robosuite draws, and frees, in whichever OpenGL context is."""
     stock._env.sim._render_context_offscreen.gl_ctx.make_current()
 
 
@@ -248,7 +248,8 @@ def test_an_episode_ends_after_its_steps_with_a_line_of_results(env: Any, result
     assert (reward, terminated, truncated, info["failure"]) == (0, False, True, "never_touched")
     again = env.step(ACTIONS[0])
     assert again[1:4] == (0, False, True) and env.episode_result().steps == len(ACTIONS)
-    (row,), damages = read_lines(results)
+    rows, damages = read_lines(results)
+    (row,) = rows.values()
     assert damages == []
     assert row["spec"]["seed"] == 1001 and row["initial_state"] == 1 and row["levels"] == {"light": 2}
 

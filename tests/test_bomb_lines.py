@@ -1,4 +1,4 @@
-"""What lines of `bomb` say together."""
+"""Records of `bomb`: what they say together."""
 
 from test_results import values
 

@@ -224,12 +224,12 @@ def test_success_ends_an_episode_and_nothing_moves_after_it() -> None:
 
 @pytest.fixture(autouse=True)
 def no_policy_of_other_tests(monkeypatch: pytest.MonkeyPatch) -> None:
-    """What other tests of this process hold, and drop at any time, is not what acts here."""
+    """Hide the policies that other tests of this process hold and drop at any time."""
     monkeypatch.setattr("lerobot_bomb.checkpoints.identity.built_policies", list)
 
 
 def results_file(path: Path) -> list[dict[str, Any]]:
-    """Two seeds under two conditions, as lerobot-eval plays them."""
+    """Run two seeds under two conditions, as lerobot-eval does, and return their records."""
     config = BombPushTEnvConfig(perturbations=["none", "goal:3"], results_path=str(path), max_steps=6)
     for group in make_env(config, n_envs=2).values():
         envs: Any = group[0]

@@ -1,4 +1,4 @@
-"""What the perturbation axes of `bomb_pusht` do to an episode, and what they leave alone."""
+"""Perturbation axes of `bomb_pusht`: what they do to an episode, and what they leave alone."""
 
 import re
 from itertools import pairwise

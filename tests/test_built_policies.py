@@ -1,4 +1,4 @@
-"""Which policies a process has built, as an environment asks."""
+"""Policies that a process has built, as an environment asks."""
 
 import gc
 from pathlib import Path
@@ -16,7 +16,7 @@ from lerobot_env_bomb.configuration_bomb import BombEnvConfig
 
 @pytest.fixture
 def before() -> list[PreTrainedPolicy]:
-    """Those that other tests hold."""
+    """Return the policies that other tests hold."""
     gc.collect()
     return built_policies()
 

@@ -52,7 +52,7 @@ def test_episodes_that_do_not_exist_are_named(dataset: LeRobotDataset) -> None:
 def test_frames_that_are_not_finite_are_counted_and_named(
     dataset: LeRobotDataset, tmp_path: Path, bad: float
 ) -> None:
-    """By their place in the dataset, whichever episodes are read."""
+    """Check that frames are named by their place in the dataset, whichever episodes are read."""
     copied = tmp_path / "copied"
     shutil.copytree(dataset.root, copied)
     (file,) = (copied / "data").rglob("*.parquet")

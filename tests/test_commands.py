@@ -32,7 +32,7 @@ SMALL = RenderOptions(image_size=32)
 SEEDS = st.integers(0, 2**31)
 CONDITIONS = ("none", "language:2", "language:3", "language:4", "language:5", "stones:5", "all:5")
 SWAP, PUSH_LEFT, CLEAR_ROW = 2, 3, 7  # tasks of `goal`
-TURNS_OF_4, COPY_2 = 4, 10  # tasks of `long`
+OPENING_OF_4, TURNS_OF_4, COPY_2 = 2, 4, 10  # tasks of `long`
 
 type Board = dict[Cell, str]
 
@@ -72,7 +72,7 @@ def cells_in(text: str) -> list[Cell]:
 
 
 def is_done(said: list[str], board: Board, pattern: Board, end: Board) -> bool:
-    """Whether the end is what a reader of the sentences, who knows nothing of the suites, would make."""
+    """Return True if the end is what a reader of the sentences, who knows no suite, would make."""
     text = " ".join(said).lower()
     if "off the board" in text:
         if found := re.search(r"take the (black|white) stone", text):
@@ -82,12 +82,15 @@ def is_done(said: list[str], board: Board, pattern: Board, end: Board) -> bool:
         return end == {cell: color for cell, color in board.items() if cell != gone}
     if "swap" in text:
         a, b = cells_in(text)
+        assert re.findall(r"the (black|white) stone", text) == [board[a], board[b]]
         return end == board | {a: board[b], b: board[a]}
     if found := re.search(r"push the (black|white) stone one intersection (?:to|towards) the (\w+)", text):
+        (place,) = cells_in(text)
         (cell,) = [cell for cell, color in board.items() if color == found[1]]
         step = {"left": (0, -1), "right": (0, 1), "far": (-1, 0), "near": (1, 0)}[found[2]]
         others = {other: color for other, color in board.items() if other != cell}
-        return end == others | {(cell[0] + step[0], cell[1] + step[1]): found[1]}
+        assert place == (cell[0] + step[0], cell[1] + step[1])
+        return end == others | {place: found[1]}
     if found := re.search(r"clear row (\d)", text):
         return end == {cell: color for cell, color in board.items() if cell[0] != int(found[1])}
     if found := re.search(r"bring all (black|white) stones to the left side", text):
@@ -109,17 +112,17 @@ def is_done(said: list[str], board: Board, pattern: Board, end: Board) -> bool:
         return end == {cell: color for cell, color in board.items() if cell not in cells_in(text)}
     if "copy the pattern" in text:
         return end == board | pattern
-    if found := re.search(r"fill the free intersections of row (\d).*(black|white) first", text):
+    if found := re.search(r"fill the free intersections of row (\d).*(black|white) last", text):
         free = [cell for cell in CELLS if cell[0] == int(found[1]) and cell not in board]
         colors = [found[2], "white" if found[2] == "black" else "black"]
-        return end == board | {cell: colors[i % 2] for i, cell in enumerate(free)}
+        return end == board | {cell: colors[i % 2] for i, cell in enumerate(reversed(free))}
     moves = re.findall(r"(black|white) at row (\d), column (\d)", text)
     assert moves, text
     return end == board | {(int(r), int(c)): color for color, r, c in moves}
 
 
 def board_at_end(episode: PerturbedEpisode) -> Board:
-    """After the moves of the expert."""
+    """Return the board after the moves of the expert."""
     board = board_at_start(episode)
     stands = {stone: place for stone, place in standing(episode).items() if place in board}
     for aim in episode.aims:
@@ -283,7 +286,7 @@ def test_either_stone_of_a_swap_may_go_aside() -> None:
 
 
 def test_moves_in_the_wrong_order_fail() -> None:
-    *_, last = played(EpisodeSpec(0, "long", task_id=TURNS_OF_4), in_another_order)
+    *_, last = played(EpisodeSpec(0, "long", task_id=OPENING_OF_4), in_another_order)
     assert not last.info["is_success"]
     assert last.info["failure"] in ("wrong_stone", "wrong_intersection")
 

@@ -177,7 +177,7 @@ def test_two_policies_of_one_file_are_chosen_by_name(a: Path, capsys: Printed) -
     ("flags", "message"),
     [
         ((), "two policies are compared, not 3 (act outputs/act"),
-        (("--policies=act",), "two policies are compared, not 1"),
+        (("--policies=act",), "two policies are compared, not 1 (act outputs/act"),
         (("--policies=act,pi0",), "pi0 must name one policy of the file, not 0: act outputs/act"),
         (("--policies=act,me/",), "me/ must name one policy of the file, not 2"),
         (("b.jsonl", "--policies=act,fdvla"), "--policies chooses two of one file"),
@@ -205,3 +205,9 @@ def test_points_that_cannot_be_are_refused(a: Path, points: str, capsys: Printed
     with pytest.raises(SystemExit):
         compare(a, a, f"--min_difference={points}")
     assert "must be points of a success rate, 0..100" in capsys.readouterr().err
+
+
+def test_a_file_of_one_policy_asks_for_another_file(a: Path, capsys: Printed) -> None:
+    write(a, [None], policy=ACT)
+    assert compare(a) == 1
+    assert "; name the file of a second one" in capsys.readouterr().err

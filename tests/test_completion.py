@@ -17,7 +17,7 @@ def script(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def completions(script: Path, line: str) -> list[str]:
-    """What bash offers for the last word of a line."""
+    """Return what bash offers for the last word of a line."""
     words = shlex.split(line) + [""] * line.endswith(" ")
     ask = (
         f"source {script}; COMP_WORDS=({' '.join(map(shlex.quote, words))}); COMP_CWORD={len(words) - 1}; "

@@ -1,4 +1,4 @@
-"""What configs/ holds is read by LeRobot's own parser, says what it claims, and trains."""
+"""Files of configs/ are read by LeRobot's own parser, say what they claim, and train."""
 
 from collections.abc import Callable
 from dataclasses import replace
@@ -110,13 +110,13 @@ def name_of(path: Path) -> str:
 
 
 def evaluation(path: Path) -> EvalPipelineConfig:
-    """As lerobot-eval reads it, but for the checkpoint."""
+    """Read a file as lerobot-eval does, but for the checkpoint."""
     register_third_party_plugins()
     return draccus.decode(EvalPipelineConfig, yaml.safe_load(path.read_text()))
 
 
 def policy_side(env: EnvConfig) -> dict[str, PolicyFeature]:
-    """What a policy reads and writes there, behind the environment's own processor."""
+    """Return what a policy reads and writes there, behind the environment's own processor."""
     preprocessor, _ = env.get_env_processors()
     by_kind = preprocessor.transform_features({PipelineFeatureType.OBSERVATION: env_to_policy_features(env)})
     features = {key: feature for of_kind in by_kind.values() for key, feature in of_kind.items()}

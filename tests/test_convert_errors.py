@@ -1,4 +1,4 @@
-"""What `lerobot-bomb convert pusht-zarr` refuses, before it writes anything, and how it says so."""
+"""Refusals of `lerobot-bomb convert pusht-zarr`, before it writes anything, and how it words them."""
 
 import shutil
 import sys
@@ -12,7 +12,7 @@ from pusht_cases import REPO_ID, Demonstrations, write_zarr
 
 from lerobot_bomb.commands import main as cli
 from lerobot_bomb.commands.convert import convert_pusht
-from lerobot_bomb.data.resumable import lock_folder
+from lerobot_bomb.data.unfinished import lock_folder
 
 
 def overwrite(path: Path, name: str, change: Callable[[np.ndarray], np.ndarray]) -> None:

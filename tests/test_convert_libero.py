@@ -17,9 +17,9 @@ from lerobot_bomb.checkpoints.libero_orientation import images_of_task
 from lerobot_bomb.commands import main as cli
 from lerobot_bomb.data import blocks, resumable
 from lerobot_bomb.data.facts import DatasetFacts
+from lerobot_bomb.data.kept_blocks import finished_blocks
 from lerobot_bomb.data.libero_conversion import KEYS, convert_libero
 from lerobot_bomb.data.libero_hdf5 import instruction, noops
-from lerobot_bomb.data.resumable import finished_blocks
 
 pytest.importorskip("h5py")
 
@@ -36,7 +36,7 @@ def source(played: list[Played], tmp_path_factory: pytest.TempPathFactory) -> Pa
 
 @pytest.fixture(scope="module")
 def converted(source: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """With images, through the command line, two episodes a block."""
+    """Convert with images, through the command line, two episodes a block."""
     root = tmp_path_factory.mktemp("converted") / "x"
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(resumable, "BLOCK_EPISODES", 2)
@@ -127,7 +127,7 @@ def test_demonstrations_are_in_the_order_of_their_numbers(tmp_path: Path) -> Non
 
 
 def test_observations_of_before_the_actions_are_recognised(played: list[Played], tmp_path: Path) -> None:
-    """As in copies that were played again, such as OpenVLA's, which name neither task nor convention."""
+    """Check copies that were run again, such as OpenVLA's, which name neither task nor convention."""
     file = write_file(tmp_path / f"{TASK}_demo.hdf5", played[:1], observed=BEFORE)
     assert convert_libero(file, REPO_ID, tmp_path / "x", images=True).num_frames == 6
     rows = rows_of(tmp_path / "x")

@@ -1,4 +1,4 @@
-"""What `lerobot-bomb convert libero-hdf5` refuses, before it writes anything, and how it says so."""
+"""Refusals of `lerobot-bomb convert libero-hdf5`, before it writes anything, and how it words them."""
 
 import importlib.util
 import shutil

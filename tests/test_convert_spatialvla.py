@@ -74,9 +74,9 @@ def test_a_converted_checkpoint_chooses_the_cells_of_the_authors_classes(
 
 
 def first_logits(policy: SpatialvlaGridPolicy, batch: dict[str, Any]) -> torch.Tensor:
-    """Of the first step's translation: (B, cells)."""
+    """Return the logits of the first step's translation: (B, cells)."""
     cells = torch.zeros(len(batch[CAMERA]), 4, 3, dtype=torch.long)
-    return policy._cell_logits(0, policy._hidden(batch, cells)[:, 0, 0]).detach()
+    return policy._logits(policy._group_rows[0], policy._hidden(batch, cells)[1][:, 0, 0]).detach()
 
 
 QUESTION = "What action should the robot take to {}?"

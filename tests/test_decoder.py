@@ -99,7 +99,7 @@ def decode(
 
 
 class Dice(Continuation):
-    """Always the same logits, whatever was said: those of a table (S,)."""
+    """Continuation with the same logits, whatever was said: those of a table (S,)."""
 
     def __init__(self, logits_S: Tensor):
         self.logits_S = logits_S
@@ -193,7 +193,7 @@ def test_as_many_guesses_are_asked_for_as_come_true() -> None:
             return super().__call__(symbol_BK, first_B)
 
     def guess(_: Tensor, place: Place) -> Tensor:
-        """Right up to the 20th number; the space and a 7 in turn."""
+        """Guess right up to the 20th number; then the space and a 7 in turn."""
         after_digit_B1 = place.prefix[:, None] != grammar.START
         guess_BG = torch.where((torch.arange(MAX_GUESSES) % 2 == 0) == after_digit_B1, SPACE, 7)
         return torch.where(place.number[:, None] < 20, guess_BG, 3)
@@ -220,7 +220,7 @@ def test_malformed_wishes_become_legal_numbers() -> None:
 
 
 class Broken(Speaker):
-    """What it wants to say, until one row's logits after a column are all ``bad``."""
+    """Speaker until a column, from which one row's logits are all ``bad``."""
 
     def __init__(self, bad: float, column: int, row: int, *texts: str):
         super().__init__(*texts)
@@ -244,7 +244,7 @@ BROKEN = [(bad, column) for bad in (float("nan"), float("inf"), -float("inf")) f
 @pytest.mark.parametrize(("bad", "column"), BROKEN)
 @pytest.mark.parametrize("drafted", [False, True])
 def test_nothing_is_read_from_logits_that_are_not_finite(bad: float, column: int, drafted: bool) -> None:
-    """Whether rows leave the batch when they are done or go on until all are."""
+    """Check rows that leave the batch when they are done, and rows that go on until all are."""
     grammar = NumberGrammar(512, 3)
     guess = LinearDraft(grammar, 1) if drafted else KnownSymbols(grammar)
     texts = " 1 2 3#", " 400 500 300#", " 9 311 77#"
@@ -266,7 +266,7 @@ def test_one_logit_of_nan_is_enough() -> None:
 
 
 def test_logits_after_a_wrong_guess_may_be_anything() -> None:
-    """Nothing of them is written."""
+    """Check that nothing of them is written."""
     grammar = NumberGrammar(512, 2)
 
     class Shaky(Speaker):
@@ -282,7 +282,7 @@ def test_logits_after_a_wrong_guess_may_be_anything() -> None:
 
 
 def test_symbols_that_cannot_be_otherwise_take_no_pass() -> None:
-    """Three digits a number: the space after them, and the end, are known."""
+    """Check three digits a number: the space after them, and the end, are known."""
     grammar = NumberGrammar(512, 4, fixed_width=3)
     text = " 007 511 100 042#"
     assert grammar.max_symbols(4) == len(text)
@@ -295,7 +295,7 @@ def test_symbols_that_cannot_be_otherwise_take_no_pass() -> None:
     ("text", "num_values", "width"), [(" 100 50 101 48 102 46 103 44#", 512, 0), (" 1 0 3 0 5 0 7 0#", 9, 1)]
 )
 def test_what_goes_on_as_before_takes_few_passes(text: str, num_values: int, width: int) -> None:
-    """Two dimensions: the first two steps are written symbol by symbol, the others are guessed."""
+    """Check two dimensions: the first two steps are written symbol by symbol, the others are guessed."""
     grammar = NumberGrammar(num_values, 8, fixed_width=width)
     first_steps = " ".join(text[:-1].split(" ")[:5])
     undrafted = decode(Speaker(text), NumberGrammar(num_values, 8, fixed_width=width), 1, stop_after=4)

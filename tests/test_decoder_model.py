@@ -117,7 +117,7 @@ def test_adapters_count(backbone: SmolVLMBackbone) -> None:
 
 
 def generated(backbone: SmolVLMBackbone, rows: TokenRows, symbol_ids: Tensor) -> list[list[int]]:
-    """What transformers' own greedy search writes with its own cache, left-padded: 12 numbers below 512."""
+    """Write as transformers' own greedy search with its own cache, left-padded: 12 numbers below 512."""
     lengths = rows.mask.sum(dim=1).tolist()
     longest = max(lengths) + 1
     ids = torch.zeros(len(lengths), longest, dtype=torch.long)
@@ -215,14 +215,14 @@ def text(request: pytest.FixtureRequest) -> tuple[Any, Positions]:
 
 
 def nine_tokens(model: Any) -> tuple[Tensor, Tensor]:
-    """Their embeddings and columns, of three rows."""
+    """Return the tokens' embeddings and columns, of three rows."""
     generator = torch.Generator().manual_seed(0)
     return torch.randn(3, 9, model.config.hidden_size, generator=generator), torch.arange(9).expand(3, 9)
 
 
 @torch.no_grad()
 def states_of_nine_tokens(model: Any, positions: Positions, *, compiled: bool = False) -> Tensor:
-    """Five as a prompt, two as a pass, two singly."""
+    """Compute the states of five tokens as a prompt, two as a pass, two singly."""
     embeds_BKH, columns_BK = nine_tokens(model)
     text = CachedText(TextLayers(model, compiled=compiled), 3, 20, positions)
     states = [text(embeds_BKH[:, part], columns_BK[:, part]) for part in (slice(5), slice(5, 7))]
@@ -251,7 +251,7 @@ def test_fast_layers_compute_what_the_plain_ones_do_and_those_what_the_model_doe
 
 
 def states_of_stock(model: Any, embeds: Tensor, position_L: Tensor, reads_BLL: Tensor) -> Tensor:
-    """By transformers, with a mask of its own for each row."""
+    """Return the states that transformers computes, with a mask of its own for each row."""
     mask = torch.zeros(reads_BLL.shape).masked_fill(~reads_BLL, torch.finfo(torch.float32).min)[:, None]
     is_gemma = model.config.model_type.startswith("gemma2")
     return model(
@@ -289,7 +289,7 @@ def test_a_hidden_token_is_read_by_no_other_and_keeps_its_position(
 def test_singly_and_with_projections_that_are_not_plain_states_are_the_same(
     text: tuple[Any, Positions],
 ) -> None:
-    """As with adapters; such heads are turned another way."""
+    """Check heads with a hook, as adapters have; such heads are turned another way."""
     model, positions = text
     states = states_of_nine_tokens(model, positions)
     together = CachedText(TextLayers(model), 3, 20, positions)

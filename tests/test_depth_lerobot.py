@@ -28,7 +28,7 @@ Run = Callable[..., None]
 
 @pytest.fixture(scope="module")
 def rollouts() -> list[Rollout]:
-    """What the recordings hold, played directly."""
+    """Run the episodes that the recordings hold, directly."""
     spec = EpisodeSpec(seed=SEED)
     env = make_env(spec, OPTIONS)
     played = [
@@ -42,7 +42,7 @@ def rollouts() -> list[Rollout]:
 
 @pytest.fixture(scope="module", params=["--images=false", "--images=true"])
 def dataset(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Recorded by the command, and merged from two blocks."""
+    """Record by the command, and merge from two blocks."""
     root = tmp_path_factory.mktemp("recorded") / "dataset"
     flags = [f"--repo_id={REPO_ID}", f"--root={root}", f"--episodes={EPISODES}", f"--seed={SEED}"]
     with pytest.MonkeyPatch.context() as patch:

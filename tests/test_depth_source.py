@@ -1,4 +1,4 @@
-"""Where a converted checkpoint's depth comes from can be changed, and what gets no gradient is frozen."""
+"""Depth of a converted checkpoint: its source can be changed, and what gets no gradient is frozen."""
 
 from pathlib import Path
 from typing import Any
@@ -52,7 +52,7 @@ def test_depth_may_be_observed_instead(checkpoint: Path, original: SpatialvlaGri
 def test_depth_may_be_estimated_again_after_a_training_without(
     is_known: bool, checkpoint: Path, tmp_path: Path
 ) -> None:
-    """What ``depth_model_name`` names stands in for weights that are not there; its architecture may be."""
+    """Check that ``depth_model_name`` stands in for missing weights; its architecture may be known."""
     blind, preprocessor, _ = load(checkpoint, depth_source="none")
     if not is_known:
         blind.config.depth_config = None

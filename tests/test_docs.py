@@ -46,7 +46,7 @@ def test_the_sites_navigation_is_the_map_of_the_documentation() -> None:
 
 
 def commands(page: Path) -> list[list[str]]:
-    """Of all blocks of a page, as a shell reads them, variables that the page sets in place."""
+    """Return the commands of all blocks of a page, as a shell reads them, with the page's variables set."""
     text = "".join(re.findall(r"^```\n(.*?)^```", page.read_text(), flags=re.DOTALL | re.MULTILINE))
     assignment = re.compile(r"^([A-Z]+)='(.*?)'\n", flags=re.DOTALL | re.MULTILINE)
     variables = {name: " ".join(value.split()) for name, value in assignment.findall(text)}

@@ -50,6 +50,22 @@ def test_the_line_is_drawn_through_the_last_two_steps(written: str, guessed: str
     assert guess.startswith(guessed)
 
 
+@pytest.mark.parametrize(
+    ("written", "guessed"),
+    [
+        ("", "255 255 255 "),  # nothing to go by, before the actions and in the first of them
+        ("400", " 255 255 255 "),
+        ("400 10 20", "9 10 209"),
+        ("400 10 20 13", " 20 16 "),  # as if the actions stood alone
+        ("400 10 20 30 40 50", " 60###"),
+    ],
+)
+def test_numbers_before_the_actions_are_on_no_line(written: str, guessed: str) -> None:
+    grammar = NumberGrammar(512, 7)
+    (guess,) = said(LinearDraft(grammar, 2, num_before=1)(*rows_of(grammar, written)))
+    assert guess.startswith(guessed)
+
+
 def test_rows_are_guessed_for_themselves() -> None:
     grammar = NumberGrammar(999, 4, fixed_width=3)
     guesses = said(LinearDraft(grammar, 1)(*rows_of(grammar, "010 02", "500 400 3", "001 002 003 0")))

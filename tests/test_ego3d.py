@@ -181,7 +181,7 @@ def frames(size: int, name: str) -> Iterator[tuple[dict[str, Any], np.ndarray, n
 def world_points(
     observation: dict[str, Any], name: str, size: int, seed: int
 ) -> tuple[np.ndarray, CropWindows]:
-    """As a policy gets them: (size, size, 3) world points of a random crop, and its window."""
+    """Return world points as a policy gets them: (size, size, 3) of a random crop, and its window."""
     batch = {
         f"observation.{kind}.{name}": torch.from_numpy(observation[f"{kind}.{name}"])[None]
         for kind in ("depth", "intrinsics")
@@ -196,7 +196,7 @@ def world_points(
 
 @pytest.mark.parametrize("name", CAMERAS)
 def test_stone_centres_are_found_at_their_pixels(name: str) -> None:
-    """Where a stone's top is seen in a cropped and resized image, the point is its top, within 2 mm."""
+    """Check that a point is a stone's top, within 2 mm, where a cropped and resized image shows it."""
     errors_mm = []
     top_m = np.array([0, 0, BOARD.stone_height_m / 2])
     for seed, (observation, stone_xyz, labels) in enumerate(frames(256, name)):
@@ -221,7 +221,7 @@ def test_stone_centres_are_found_at_their_pixels(name: str) -> None:
 
 @pytest.mark.parametrize("name", CAMERAS)
 def test_a_policys_points_lie_on_the_stones_that_they_show(name: str) -> None:
-    """All points of 16x16 patches that fall on a stone."""
+    """Check all points of 16x16 patches that fall on a stone."""
     errors_mm = []
     for seed, (observation, stone_xyz, labels) in enumerate(frames(256, name)):
         world, windows = world_points(observation, name, 32, seed)

@@ -12,6 +12,8 @@ import pyarrow.parquet as pq
 import pytest
 
 from lerobot_bomb.bomb.episode import EpisodeSpec
+from lerobot_bomb.bomb.suite import task_version
+from lerobot_bomb.bomb.suites import SUITES
 from lerobot_bomb.data.environment import Environment
 from lerobot_bomb.data.facts import DatasetFacts
 
@@ -40,7 +42,7 @@ ABSOLUTE = Environment(
 
 
 def write_dataset(root: Path, bomb: dict[str, Any] | None, specs: Sequence[str | None] | None) -> Path:
-    """What LeRobot's tools leave of a recording's metadata: two episodes, with or without our columns."""
+    """Write what LeRobot's tools leave of a recording's metadata: two episodes, our columns or not."""
     (root / "meta" / "episodes").mkdir(parents=True)
     (root / "meta" / "info.json").write_text(json.dumps(INFO))
     if bomb is not None:
@@ -165,6 +167,19 @@ def test_a_suite_that_it_was_not_trained_for_is_another_environment(trained: str
 def test_another_environment_is_an_error_that_names_the_flags(change: dict[str, Any], message: str) -> None:
     with pytest.raises(ValueError, match=f"^this act was trained .*{re.escape(message)}"):
         ABSOLUTE.check_same(replace(ABSOLUTE, **change), "this act", "insist")
+
+
+def test_what_was_trained_on_all_suites_acts_in_each_of_its_version() -> None:
+    of_all = replace(ABSOLUTE, task="all", task_version=task_version("all"))
+    for suite in SUITES:
+        of_all.check_same(
+            replace(ABSOLUTE, task=suite, task_version=task_version(suite)), "this act", "insist"
+        )
+    earlier = replace(of_all, task_version="1.0")
+    with pytest.raises(ValueError, match=r"with task_version=1\.0; this one has task_version=1\.1: insist"):
+        earlier.check_same(replace(ABSOLUTE, task="goal", task_version="1.1"), "this act", "insist")
+    with pytest.raises(ValueError, match=r"evaluate with --env\.task=place"):
+        ABSOLUTE.check_same(of_all, "this act", "insist")
 
 
 @pytest.mark.parametrize(

@@ -117,6 +117,7 @@ def test_privileged_state_refuses_another_size() -> None:
 
 def test_a_result_is_one_line_of_json_with_its_seed() -> None:
     result = EpisodeResult(
+        task_version="1.0",
         spec=EpisodeSpec(seed=5),
         instruction="Put it there.",
         task_id=0,

@@ -20,7 +20,7 @@ MAX_STEPS = 4
 
 
 class CountingVectorEnv:
-    """Two environments; the first terminates after two steps, and then in every step that it is given."""
+    """Vector of two environments; the first terminates after two steps, and then in every step."""
 
     num_envs = 2
 

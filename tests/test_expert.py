@@ -209,7 +209,7 @@ def test_it_recovers_from_noise_on_its_actions(env: BombEnv) -> None:
 
 
 def test_it_takes_over_from_a_clumsy_start(env: BombEnv) -> None:
-    """Closed fingers, pressed onto the table beside the stone."""
+    """Start with closed fingers, pressed onto the table beside the stone."""
     env.reset(seed=3)
     for action in (
         [0.3, 0.5, -0.5, -1.0],

@@ -95,7 +95,7 @@ def test_the_clean_answer_is_the_policys(name: str) -> None:
 
 
 def corruptions(name: str) -> list[Corruption]:
-    """By an image, by an instruction of as many tokens."""
+    """Corrupt the question by an image, and by an instruction of as many tokens."""
     question = ask(loaded(name))
     other = moment()[3]["column"][0]
     return [
@@ -105,7 +105,7 @@ def corruptions(name: str) -> list[Corruption]:
 
 
 def with_hidden_word(name: str) -> Corruption:
-    """By the column, which is hidden."""
+    """Corrupt the question by hiding the column."""
     question = ask(loaded(name))
     instruction, others = moment()[1], moment()[3]
     span = difference("column", instruction, others["column"][0])
@@ -142,7 +142,7 @@ def test_what_the_layers_make_of_the_words_that_are_left_is_put_back_token_by_to
 
 
 def layers_decide(name: str) -> bool:
-    """Whether nothing else of the prompt reaches the answer: no mean of its states does."""
+    """Return True if nothing else of the prompt reaches the answer: no mean of its states does."""
     return getattr(loaded(name).config, "reasoning_pool", None) is None
 
 
@@ -178,7 +178,7 @@ def test_units_put_back_in_a_batch_give_what_they_give_alone(name: str) -> None:
 
 @pytest.mark.parametrize("name", NAMES)
 def test_nothing_is_put_back_of_an_instruction_of_more_tokens(name: str) -> None:
-    """Though both have as many columns, as on CUDA, where instructions are padded."""
+    """Pad both to as many columns, as on CUDA, where instructions are padded."""
     policy, instruction = loaded(name), moment()[1]
 
     def prepare(batch: dict[str, Any]) -> dict[str, Any]:

@@ -29,6 +29,7 @@ def test_one_episode(name: str, tmp_path: Path, capsys: pytest.CaptureFixture[st
         assert {len(grid) for grid in moment["patches"].values()} == {4}
         assert moment["words"]["row and column"] is not None
         assert {len(each["mlps"]) for each in moment["restored"]} == {2}
+        assert "pointing" not in moment and "It points at:" not in moment["findings"]
     page = (output / "explanation.html").read_text()
     assert page.count("<img ") == 3 * 2 * len(phases) and "<script" not in page and "http" not in page
     masked = found["masked_episodes"]
@@ -91,7 +92,7 @@ def test_the_episode_of_a_line(
     assert found["moments"][0]["instruction"] == row["instruction"]
     assert found["result"]["spec"] == row["spec"]
     for wrong, message in (
-        ("--line=2", "--line=2 must be in 1..1"),
+        ("--line=2", "--line=2 is no episode of"),
         ("--perturbations=camera:3", "drop --perturbations: the line of --results says it"),
     ):
         assert main(["explain", *flags[:-1], wrong, f"--output={tmp_path / 'other'}"]) == 1

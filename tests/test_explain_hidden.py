@@ -34,7 +34,7 @@ def hidden_word(policy: LoadedPolicy, word: str) -> Tensor:
 
 
 def columns_of(question: Question, hidden_1S: Tensor) -> list[int]:
-    """Of the whole prompt."""
+    """Return the columns of hidden words in the whole prompt."""
     names = question.explained._names  # pyright: ignore[reportAttributeAccessIssue]
     first = int((question.rows["part"][0] == names.index("instruction")).nonzero()[0])
     return (first + hidden_1S[0].nonzero()[:, 0]).tolist()
@@ -76,7 +76,7 @@ def paligemma(policy: Any, columns: list[int]) -> None:
 
 
 def qwen(policy: Any, columns: list[int]) -> None:
-    """Prompt and noisy actions in one pass, without a cache."""
+    """Let the stock model read prompt and noisy actions in one pass, without a cache."""
     backbone, read = policy.backbone, {}
 
     def run(embeds: Tensor, bias: Tensor) -> Tensor:
@@ -87,7 +87,9 @@ def qwen(policy: Any, columns: list[int]) -> None:
             inputs_embeds=embeds, attention_mask=bias, position_ids=positions
         ).last_hidden_state
 
-    def read_prefix(embeds: Tensor, is_image: Tensor, mask: Tensor, hidden: Tensor | None = None) -> Prefix:
+    def read_prefix(
+        embeds: Tensor, is_image: Tensor, mask: Tensor, hidden: Tensor | None = None, num_shared: int = 0
+    ) -> Prefix:
         ids = torch.where(is_image, backbone.vlm.config.image_token_id, 0)
         side = backbone.tokens_per_side * 2
         grids = torch.tensor([[1, side, side]] * (int(is_image[0].sum()) // backbone.tokens_per_image))
@@ -96,7 +98,12 @@ def qwen(policy: Any, columns: list[int]) -> None:
         states = run(embeds, bias_of(embeds.shape[1], 0, columns))
         return Prefix(states, mask, torch.zeros(len(embeds), 1, dtype=torch.int64), [])
 
-    def read_segment(prefix: Prefix, embeds: Tensor, reads: Tensor) -> Tensor:
+    def read_segment(prefix: Prefix, embeds: Tensor, reads: Tensor, num_copies: int = 1) -> Tensor:
+        num_new = embeds.shape[1] // num_copies
+        parts = [slice(start, start + num_new) for start in range(0, embeds.shape[1], num_new)]
+        return torch.cat([read_copy(embeds[:, part], reads[:, part, part]) for part in parts], dim=1)
+
+    def read_copy(embeds: Tensor, reads: Tensor) -> Tensor:
         whole = torch.cat([read["embeds"].expand(len(embeds), -1, -1), embeds], dim=1)
         bias = bias_of(whole.shape[1], 0, columns).repeat(len(embeds), 1, 1, 1)
         num_new = embeds.shape[1]
@@ -139,7 +146,7 @@ def test_the_stock_model_agrees_where_nothing_is_hidden(name: str) -> None:
 
 
 def hidden_batch(policy: LoadedPolicy, word: str) -> dict[str, Any]:
-    """What a whole episode under the mask of a word has in place of this observation."""
+    """Return the batch that an episode under the mask of a word has in place of this observation."""
     observation, instruction, _, _ = moment()
     mask = without_words(policy, {instruction: span_of(word, instruction)}.get)
     prepared = policy.prepare(policy.observe([observation], [instruction]))
@@ -192,7 +199,7 @@ def chosen_by_graphs(policy: Any, batch: dict[str, Any]) -> Tensor:
 )
 @pytest.mark.parametrize("word", ["3", "row 1, column 3"])
 def test_captured_passes_hide_the_same(name: str, by_graphs: Callable[..., Tensor], word: str) -> None:
-    """After a prompt of which nothing was hidden."""
+    """Check a pass after a prompt of which nothing was hidden."""
     policy = loaded(name)
     batch = hidden_batch(policy, word)
     answer = explained_by(policy).answer(batch)

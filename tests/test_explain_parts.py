@@ -1,4 +1,4 @@
-"""What explanations are made of: spans, masks, probes, means, findings."""
+"""Parts of explanations: spans, masks, probes, means, findings."""
 
 import math
 from typing import Any

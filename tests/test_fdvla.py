@@ -10,6 +10,7 @@ from torch.nn.functional import scaled_dot_product_attention
 
 from lerobot_bomb.flow.path import PathPoint, path_point
 from lerobot_policy_fdvla.modeling_fdvla import FdvlaPolicy
+from lerobot_policy_fdvla.networks_fdvla import SideBySide
 
 ENERGY: dict[str, Any] = {"consistency": "energy_vjp"}
 
@@ -34,7 +35,7 @@ def train_alike(
 
 
 def wake_dualmod(policy: FdvlaPolicy) -> FdvlaPolicy:
-    """As after some training: pooled states do change the features."""
+    """Wake the heads as some training would: pooled states do change the features."""
     torch.manual_seed(1)
     for head in (policy.flow_head, policy.denoise_head):
         if head is not None and head.film is not None:
@@ -190,7 +191,7 @@ def test_a_head_of_words_that_is_no_embedding_is_frozen() -> None:
 
 @torch.no_grad()
 def test_heads_say_the_same_in_training_and_in_sampling(monkeypatch: pytest.MonkeyPatch) -> None:
-    """At the same noisy actions and time, whatever else is in the batch."""
+    """Compare at the same noisy actions and time, whatever else is in the batch."""
     policy = wake_dualmod(make_policy(draws_per_chunk=1))
     batch = make_batch(policy, 3)
     point = fixed_point(batch)
@@ -302,9 +303,32 @@ def test_images_instruction_state_and_time_matter() -> None:
 
 @pytest.mark.parametrize("dtype", ["float32", "bfloat16"])
 def test_attention_in_bfloat16_has_plain_gradients_on_a_cpu(dtype: str) -> None:
-    """Those of torch's fused attention take four to ten times as long there."""
+    """Check that the slow path is avoided: torch's fused attention takes four to ten times as long there."""
     query = torch.ones(1, 1, 2, 8, requires_grad=True)
     with make_policy(dtype=dtype)._autocast():
         attended = scaled_dot_product_attention(query, query, query)
     assert attended.grad_fn is not None
     assert ("FlashAttention" in attended.grad_fn.name()) == (dtype == "float32")
+
+
+def test_draws_side_by_side_read_their_own_tokens() -> None:
+    reads = torch.tensor([[[1, 0], [1, 1]], [[1, 1], [1, 1]]], dtype=torch.bool)
+    assert SideBySide(2).reads(reads).int().tolist() == [
+        [[1, 0, 0, 0], [1, 1, 0, 0], [0, 0, 1, 1], [0, 0, 1, 1]]
+    ]
+    assert torch.equal(SideBySide(1).reads(reads), reads)
+    embeds = torch.arange(8).reshape(2, 2, 2)
+    assert SideBySide(2).joined(embeds).tolist() == [[[0, 1], [2, 3], [4, 5], [6, 7]]]
+
+
+def test_draws_of_a_chunk_are_trained_as_if_each_were_read_alone() -> None:
+    policy = wake_dualmod(make_policy(draws_per_chunk=3))
+    batch = make_batch(policy, 2)
+    context, kept = policy._read(batch), policy._kept(batch).repeat_interleave(3, dim=0)
+    actions, tau = torch.randn(6, 4, 4), torch.rand(6)
+    together = policy._heads(context, kept)(actions, tau)
+    for draw in range(3):
+        alone = policy._heads(context, kept[draw::3])(actions[draw::3], tau[draw::3])
+        for of_all, of_one in zip(together, alone, strict=True):
+            assert of_all is not None and of_one is not None
+            torch.testing.assert_close(of_all[draw::3], of_one, rtol=1e-4, atol=1e-5)

@@ -1,4 +1,4 @@
-"""What `fdvla` refuses, what it does without, and what follows from flags that are not given."""
+"""Flags of `fdvla`: what it refuses, what it does without, what follows from flags that are not given."""
 
 import math
 import re
@@ -22,6 +22,7 @@ from fdvla_cases import (
 from lerobot_bomb.checkpoints.environment import ConfigWithEnvironment
 from lerobot_bomb.flag_errors import FlagError
 from lerobot_bomb.policies.config import ChunkConfig, RelativeVlaConfig, VlaConfig
+from lerobot_bomb.policies.pointing_config import PlacesVlaConfig, PointingVlaConfig
 from lerobot_policy_fdvla.configuration_fdvla import FdvlaConfig
 
 
@@ -144,14 +145,22 @@ def test_every_part_is_counted() -> None:
 
 @pytest.mark.parametrize("tasks", [("", ""), ("", "go")])
 def test_an_environment_may_name_no_task(tasks: tuple[str, ...]) -> None:
-    """As PushT does: its text is empty."""
+    """Check the empty text, which PushT gives."""
     policy = make_policy()
     batch = make_batch(policy, 2, tasks=tasks)
     assert policy(batch)[0].isfinite()
     assert policy.predict_action_chunk(batch).isfinite().all()
 
 
-OURS = (ConfigWithEnvironment, ChunkConfig, VlaConfig, RelativeVlaConfig, FdvlaConfig)
+OURS = (
+    ConfigWithEnvironment,
+    ChunkConfig,
+    VlaConfig,
+    PointingVlaConfig,
+    PlacesVlaConfig,
+    RelativeVlaConfig,
+    FdvlaConfig,
+)
 
 
 def test_the_policys_page_has_every_flag_in_its_table() -> None:

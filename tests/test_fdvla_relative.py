@@ -197,7 +197,7 @@ def test_real_time_chunking_goes_on_from_the_absolute_actions_that_are_left(
 
 
 def foreseen(policy: FdvlaPolicy) -> tuple[list[dict[str, Any]], list[Tensor]]:
-    """Three observations, and the chunk of each."""
+    """Return three observations, and the chunk of each."""
     batches = [make_batch(policy, 2, seed=seed) for seed in range(3)]
     policy.reset()
     chunks = [policy.predict_action_chunk(batch) for batch in batches]

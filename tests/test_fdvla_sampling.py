@@ -202,7 +202,7 @@ def test_a_new_chunk_goes_on_from_what_is_left() -> None:
 
 @pytest.mark.parametrize("refine_alpha", [0.3, 1.0])
 def test_guidance_is_not_taken_back(refine_alpha: float) -> None:
-    """Where the heads agree, `residual` is `flow`, guided or not."""
+    """Check that `residual` is `flow` where the heads agree, guided or not."""
     heads, noise, left = gaussian_heads(0.0, 0.5), draw(make_policy(), 1), torch.ones(4, 4)
     processor = RTCProcessor(RTCConfig(execution_horizon=4))
     flow, residual = (

@@ -1,4 +1,4 @@
-"""What is NaN or infinite is named where it is; the policies' part is in test_finite_policies.py."""
+"""Numbers that are NaN or infinite are named where they are; policies are in test_finite_policies.py."""
 
 import math
 from pathlib import Path

@@ -39,7 +39,7 @@ QUANTILES = '--policy.normalization_mapping={"ACTION": "QUANTILES"}'
 
 @pytest.fixture(scope="module")
 def root(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Four episodes of BOMB, about 20 frames each."""
+    """Record four episodes of BOMB, about 20 frames each."""
     path = tmp_path_factory.mktemp("grid") / "dataset"
     record(Recording(REPO_ID, episodes=4, seed=0, image_size=32, images=True), path)
     return path
@@ -112,7 +112,7 @@ def test_pusht_has_two_coordinates_in_pixels(pusht_dataset: Path, capsys: pytest
 def test_errors_include_what_quantiles_clip(
     root: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    """Of a dimension that is far beyond them, clipping is nearly all of the error."""
+    """Check a dimension far beyond the quantiles, where clipping is nearly all of the error."""
     root = edited(root, tmp_path / "averaged", q01="q10", q99="q90")
     assert fit_grid(root, QUANTILES) == 0
     text = " ".join(capsys.readouterr().out.split())

@@ -1,4 +1,4 @@
-"""What is wrong with a config is one line, wherever it was written."""
+"""Errors in a config are one line, wherever the config was written."""
 
 import json
 import re

@@ -1,4 +1,4 @@
-"""How flags are read, before anything heavy is imported."""
+"""Flags as they are read, before anything heavy is imported."""
 
 import argparse
 from pathlib import Path

@@ -1,4 +1,4 @@
-"""What samplers make of noise, with heads that are known exactly.
+"""Samplers on noise, with heads that are known exactly.
 
 A Gaussian's heads are affine, and so is what a sampler makes of the noise: two draws tell mean and spread.
 """
@@ -20,7 +20,7 @@ NOISE = torch.tensor([0.0, 1.0]).view(2, 1, 1)
 
 
 def mean_and_std(num_steps: int, mean: float = MEAN, std: float = STD, **options: Any) -> tuple[float, float]:
-    """Of what the sampler makes of N(0, 1) with exact heads."""
+    """Return mean and deviation of what the sampler makes of N(0, 1) with exact heads."""
     heads = gaussian_heads(mean, std)
     of_zero, of_one = sample(heads, NOISE, num_inference_steps=num_steps, **options).flatten().tolist()
     return of_zero, of_one - of_zero
@@ -132,7 +132,7 @@ def test_the_papers_rule_misses_a_point_mass() -> None:
 
 
 def bimodal_heads(actions_BKD: Tensor, tau_B: Tensor) -> tuple[Tensor, Tensor]:
-    """Of an even mixture of N(1, 0.1^2) and N(-1, 0.1^2)."""
+    """Return the heads of an even mixture of N(1, 0.1^2) and N(-1, 0.1^2)."""
     tau = tau_B[:, None, None]
     share = torch.sigmoid(2 * actions_BKD * tau / (tau**2 * 0.01 + (1 - tau) ** 2))
     (v_up, eps_up), (v_down, eps_down) = (gaussian_heads(of, 0.1)(actions_BKD, tau_B) for of in (1.0, -1.0))

@@ -55,7 +55,7 @@ def test_ddim_is_the_residual_with_alpha_one_over_tau(tau: float) -> None:
 
 
 def test_ddim_agrees_with_the_variance_preserving_one() -> None:
-    """Which is on the same line, sqrt(abar) + sqrt(1 - abar) times as far from zero."""
+    """Check a point on the same line, sqrt(abar) + sqrt(1 - abar) times as far from zero."""
     signal, next_signal = math.sqrt(0.36), math.sqrt(0.81)
     scale, next_scale = signal + math.sqrt(1 - 0.36), next_signal + math.sqrt(1 - 0.81)
     stepped = ddim_step(
@@ -67,7 +67,7 @@ def test_ddim_agrees_with_the_variance_preserving_one() -> None:
 @pytest.mark.parametrize(("tau", "best"), [(0.25, 0.235), (0.5, 0.4), (0.75, 0.48), (1.0, 0.5)])
 def test_best_alpha_for_heads_that_err_alike(tau: float, best: float) -> None:
     def variance(alpha: float) -> float:
-        """Of the slope, where errors of variance 1 are independent; the exact slope is zero here."""
+        """Return the slope's variance under independent errors of variance 1; the exact slope is zero."""
         zero, one = torch.tensor(0.0), torch.tensor(1.0)
         by_flow, by_denoise = (slope("residual", zero, *of, tau, alpha) for of in ((one, zero), (zero, one)))
         return (by_flow**2 + by_denoise**2).item()

@@ -60,7 +60,7 @@ def play(tmp_path: Path, manifest: Manifest) -> Callable[[], Store]:
 
 
 def check_whole(play: Callable[[], Store]) -> None:
-    """Played again once there is room, nothing is missing."""
+    """Check that nothing is missing once there is room and the episodes have run again."""
     store = play()
     store.merge()
     assert [row["spec"]["seed"] for row in read_results(store.folder / "results.jsonl")] == SEEDS

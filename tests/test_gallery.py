@@ -1,6 +1,7 @@
 """`lerobot-bomb gallery`: the sheets show the environment, the page says what the table says."""
 
 import re
+from collections.abc import Mapping
 from pathlib import Path
 
 import numpy as np
@@ -23,11 +24,12 @@ from lerobot_bomb.commands.gallery import (
     suite_sheet,
     tiles_sheet,
 )
-from lerobot_bomb.conditions import ALL
+from lerobot_bomb.conditions import ALL, Axis
 from lerobot_bomb.envs.rollout import make_env, make_pusht_env
+from lerobot_bomb.libero.perturbations import LIBERO_AXES
 from lerobot_bomb.pusht.episode import PushTSpec
 from lerobot_bomb.pusht.perturbations import PUSHT_AXES
-from lerobot_bomb.viewing.perturbations_page import axis_section, example_instructions, page
+from lerobot_bomb.viewing.perturbations_page import example_instructions, page
 from lerobot_bomb.viewing.sheet import PAPER, Sheet, text_tile
 
 SIZE = 48
@@ -41,7 +43,7 @@ def tile(sheet: Sheet, drawn: np.ndarray, row: int, column: int) -> np.ndarray:
 
 
 def start(axis: str, level: int, seed: int) -> tuple[dict[str, np.ndarray], str]:
-    """Both cameras' images at the start of an episode, and its instruction."""
+    """Return both cameras' images at the start of an episode, and its instruction."""
     env = make_env(EpisodeSpec(seed, perturbations=f"{axis}:{level}"), OPTIONS)
     observation, _ = env.reset(seed=seed)
     instruction = env.get_wrapper_attr("task_description")
@@ -170,7 +172,7 @@ def test_the_committed_page_is_the_generated_one() -> None:
 
 def test_the_page_has_every_axis_with_its_magnitudes_and_its_sheet() -> None:
     text = (DOCS / "perturbations.md").read_text()
-    assert re.findall(r"^## (\w+)$", text, re.MULTILINE) == ["Floors", *AXES, ALL]
+    assert re.findall(r"^## (\w+)$", text, re.MULTILINE) == [*AXES, ALL]
     assert "| angle | 3 | 6 | 9 | 12.5 | 16 | degrees | around the board, in a drawn direction |" in text
     links = re.findall(r"\]\((.*?\.jpg)\)", text)
     assert links == [f"media/perturbations/{name}.jpg" for name in SHEETS]
@@ -221,8 +223,14 @@ def test_a_flag_that_pusht_does_not_have_is_named(
     assert message in capsys.readouterr().err
 
 
-def test_the_page_of_pusht_has_every_axis_as_the_table_has_it() -> None:
-    text = (DOCS / "bomb_pusht.md").read_text()
-    for name, axis in PUSHT_AXES.items():
-        assert axis_section(name, axis, "media/bomb_pusht") in text
-        assert 10_000 < (DOCS / "media" / "bomb_pusht" / f"{name}.jpg").stat().st_size < 300_000
+@pytest.mark.parametrize(("name", "axes"), [("pusht", PUSHT_AXES), ("libero", LIBERO_AXES)])
+def test_an_environments_page_has_every_axis_with_its_magnitudes(name: str, axes: Mapping[str, Axis]) -> None:
+    text = (DOCS / f"{name}.md").read_text()
+    for axis_name, axis in axes.items():
+        sheet = f"media/bomb_{name}/{axis_name}.jpg"
+        rows = [
+            f"| {quantity} | {', '.join(f'{value:g}' for value in size.levels)} {size.unit} | {size.what} |"
+            for quantity, size in axis.magnitudes.items()
+        ]
+        assert f"| [`{axis_name}`]({sheet}): {', '.join(axis.changes)} " + "\n| ".join(rows) in text
+        assert 10_000 < (DOCS / sheet).stat().st_size < 300_000

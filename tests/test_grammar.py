@@ -116,7 +116,7 @@ def test_it_accepts_what_an_independent_parser_accepts(
 @settings(max_examples=60, deadline=None)
 @given(form=ALL_FORMS, num_numbers=st.integers(1, 4), seed=st.integers(0, 2**31))
 def test_its_choices_are_those_of_xgrammar(form: tuple[int, int], num_numbers: int, seed: int) -> None:
-    """Along a random walk through the language: the same symbols may follow, step by step."""
+    """Walk through the language at random: the same symbols may follow, step by step."""
     num_values, width = form
     grammar = NumberGrammar(num_values, num_numbers, fixed_width=width)
     values = " | ".join(f'"{str(value).zfill(width)}"' for value in range(num_values))

@@ -1,4 +1,4 @@
-"""What is captured on CUDA, where there is none: `tests/outside/check_cuda.py` is for a GPU."""
+"""Graphs that CUDA captures, where there is no CUDA: `tests/outside/check_cuda.py` is for a GPU."""
 
 import copy
 

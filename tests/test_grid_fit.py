@@ -288,7 +288,7 @@ def test_three_joints_in_a_token_would_be_off_by_degrees() -> None:
 
 
 def joint_errors(groups: tuple[ActionGroup, ...], num_dims: int) -> Tensor:
-    """Of joints that swing, each at a pace of its own: (N, D)."""
+    """Return the errors of joints that swing, each at a pace of its own: (N, D)."""
     seconds = torch.linspace(0, 20, 2000, dtype=torch.float64)[:, None]
     actions = (seconds * (0.5 + 0.1 * torch.arange(num_dims))).sin()
     grids = fitted(actions, groups=groups)

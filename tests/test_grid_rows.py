@@ -71,7 +71,7 @@ def toys(shared_data: Path) -> tuple[ActionGrids, ActionGrids]:
 
 
 def in_the_original_order(old: ActionGrids, new: ActionGrids, rows: Tensor) -> Tensor:
-    """As the original: rows lie in the order theta, phi, rho, the lattice's points in phi, theta, rho."""
+    """Move rows as the original does: their order is theta, phi, rho, the lattice's phi, theta, rho."""
     theta, phi, rho = old.groups[0].bins
     lattice = pad(rows.view(phi, theta, rho, -1).movedim(-1, 0)[None], (1,) * 6, mode="replicate")[0].movedim(
         0, -1

@@ -86,7 +86,7 @@ def test_a_least_sigma_widens_the_published_grid(bridge: dict[str, Any]) -> None
 
 
 def test_bridge_errors_of_both_decode_points(bridge: dict[str, Any]) -> None:
-    """Independent draws with the data's means and deviations; the original decodes to the middle."""
+    """Draw independently with the data's means and deviations; the original decodes to the middle."""
     generator = torch.Generator().manual_seed(0)
     actions = torch.zeros(400_000, 7)
     for dim, key in enumerate(XYZ):

@@ -1,4 +1,4 @@
-"""Which callables of LeRobot and of what it stands on the plugin replaces, and when."""
+"""Callables of LeRobot and of its dependencies that the plugin replaces, and when."""
 
 import gc
 import json

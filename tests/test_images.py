@@ -36,7 +36,7 @@ def images(height: int, width: int) -> dict[str, np.ndarray]:
 
 
 def to_tensor(image: np.ndarray) -> Tensor:
-    """What a dataset delivers: (1, 3, H, W) in [0, 1]."""
+    """Return the image as a dataset delivers it: (1, 3, H, W) in [0, 1]."""
     return torch.from_numpy(image).permute(2, 0, 1)[None] / 255
 
 
@@ -53,7 +53,7 @@ def processed(processor: Any, image: np.ndarray) -> Tensor:
 
 
 def assert_equal_pixels(ours: Tensor, theirs: Tensor) -> None:
-    """In [-1, 1]: nowhere off by more than a level, nearly everywhere by nothing."""
+    """Check pixels in [-1, 1]: nowhere off by more than a level, nearly everywhere by nothing."""
     difference = (ours - theirs).abs() / 2
     assert ours.shape == theirs.shape
     assert difference.max() < 1.001 * LEVEL
@@ -83,7 +83,7 @@ def test_cropped_pusht_frames_are_the_real_processors(processor: Any, shared_dat
 
 @pytest.mark.parametrize("size", [40, 96, 128])
 def test_resizing_is_pillows(size: int) -> None:
-    """Needs no data: smaller, equal and larger."""
+    """Check smaller, equal and larger sizes; this needs no data."""
     for image in images(96, 60).values():
         expected = Image.fromarray(image).resize((size, size), Image.Resampling.LANCZOS)
         assert_equal_pixels(resize(to_tensor(image), size) * 2, to_tensor(np.array(expected)) * 2)

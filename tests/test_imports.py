@@ -1,4 +1,4 @@
-"""Who may import whom; see docs/architecture.md."""
+"""Rules of who may import whom; see docs/architecture.md."""
 
 import ast
 import re
@@ -37,7 +37,7 @@ ORDER = [
 
 
 def imported_modules(path: Path, top_level_only: bool = False) -> set[str]:
-    """What a file imports, modules and what it takes from them: {"lerobot_bomb.flags.one_of"}."""
+    """Return what a file imports, modules and what it takes from them: {"lerobot_bomb.flags.one_of"}."""
     tree = ast.parse(path.read_text())
     nodes = tree.body if top_level_only else ast.walk(tree)
     names = set()

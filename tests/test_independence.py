@@ -98,7 +98,7 @@ def assert_same(observations: Observations, expected: Observations) -> None:
 
 
 def digest(observations: Observations) -> str:
-    """Of every bit of every key."""
+    """Hash every bit of every key."""
     parts = [step[key].tobytes() for step in observations for key in sorted(step)]
     return hashlib.sha256(b"".join(parts)).hexdigest()
 
@@ -185,7 +185,7 @@ def test_vector_envs_give_the_same_bits(
 
 @dataclass(frozen=True)
 class Outcome:
-    """What lerobot-eval made of one seed: its line of results, and the actions (T, 4) that were executed."""
+    """Outcome of one seed in lerobot-eval: its record, and the actions (T, 4) that were executed."""
 
     row: dict[str, Any]
     actions: np.ndarray
@@ -264,7 +264,7 @@ def recorded(tmp_path_factory: pytest.TempPathFactory) -> Any:
 
 @pytest.fixture
 def checkpoint(recorded: Any, tmp_path: Path, policy_type: str) -> Path:
-    """Of lerobot-train without an update: every input tells in the actions of random weights."""
+    """Train without an update: every input tells in the actions of random weights."""
     from lerobot.utils.import_utils import register_third_party_plugins
     from parity_routes import cli_flags, run_train
     from recipes import read_recipe

@@ -1,4 +1,4 @@
-"""How long a policy takes to answer and how smoothly it moves, on the lines of its episodes."""
+"""Latency and smoothness of a policy, on the records of its episodes."""
 
 import gc
 import json
@@ -62,7 +62,7 @@ def make_act(**flags: Any) -> PreTrainedPolicy:
 
 
 def asked(policy: PreTrainedPolicy, batch: dict[str, Any], num_steps: int) -> list[bool]:
-    """Which of so many calls ran the network."""
+    """Return which of so many calls ran the network."""
     policy.reset()
     found = []
     for _ in range(num_steps):
@@ -248,7 +248,7 @@ def test_an_episode_of_three_actions_has_no_smoothness() -> None:
 
 
 def told(**other: Any) -> dict[str, Any]:
-    """What a line has as `inference`."""
+    """Return the values of a record's field `inference`."""
     found = Inference.of([QUERY, QUERY])
     assert found is not None
     return vars(found) | other

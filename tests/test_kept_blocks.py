@@ -3,17 +3,23 @@
 Simulator workers import this file's head, so LeRobot is imported inside tests.
 """
 
+import io
+import json
 import shutil
 from collections.abc import Callable
+from contextlib import nullcontext
 from pathlib import Path
 
+import av
 import pytest
 
 from lerobot_bomb.commands import main as cli
 from lerobot_bomb.data import resumable
+from lerobot_bomb.data.kept_blocks import damaged_blocks, find_gaps, finished_blocks
 from lerobot_bomb.data.record import record
+from lerobot_bomb.data.recorded_blocks import recording_layout
 from lerobot_bomb.data.recording import Recording
-from lerobot_bomb.data.resumable import METADATA_FILE, unfinished_folder
+from lerobot_bomb.data.unfinished import METADATA_FILE, unfinished_folder
 
 RECORDING = Recording("test/blocks", episodes=5, seed=3, image_size=32)
 FLAGS = ("--repo_id=test/blocks", "--episodes=5", "--seed=3", "--image_size=32")
@@ -22,7 +28,7 @@ VIDEO = "videos/observation.images.wrist/chunk-000/file-000.mp4"
 
 @pytest.fixture(autouse=True)
 def small_blocks(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Blocks of 2 episodes, so that 5 take three."""
+    """Write blocks of 2 episodes, so that 5 take three."""
     monkeypatch.setattr(resumable, "BLOCK_EPISODES", 2)
 
 
@@ -49,6 +55,11 @@ def recorded(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 def contents(root: Path) -> dict[str, bytes]:
     return {str(path.relative_to(root)): path.read_bytes() for path in root.rglob("*") if path.is_file()}
+
+
+def packets(video: bytes) -> list[tuple[int | None, int | None, bytes]]:
+    opened = av.open(io.BytesIO(video), mode="r")
+    return [(packet.pts, packet.duration, bytes(packet)) for packet in opened.demux(video=0)]
 
 
 def halve(path: Path) -> None:
@@ -81,12 +92,11 @@ def test_a_lost_block_between_others_is_missed(recorded: Path, tmp_path: Path) -
     folder = tmp_path / "x.recording"
     shutil.copytree(recorded / "x.recording", folder)
     (folder / "block-00001").rename(tmp_path / "lost")
-    assert resumable.damaged_blocks(folder, 5, 2) == {folder / "block-00001": "is missing"}
-    (gap,) = resumable.find_gaps(folder, 5, 2)
-    assert (gap.progress.num_episodes, gap.end, gap.num_missing) == (2, 4, 2)
+    assert damaged_blocks(folder, range(3)) == {folder / "block-00001": "is missing"}
+    assert find_gaps(folder, range(3)) == [range(1, 2)]
+    assert find_gaps(folder, range(9)) == [range(1, 2), range(3, 9)]
     shutil.copytree(folder / "block-00000", folder / "block-00001")
-    damage = {folder / "block-00001": "ends with episode 2 instead of 4"}
-    assert resumable.damaged_blocks(folder, 5, 2) == damage
+    assert damaged_blocks(folder, range(3)) == {folder / "block-00001": "is block 0"}
 
 
 def test_a_merge_that_loses_episodes_is_an_error_and_the_blocks_stay(
@@ -100,6 +110,32 @@ def test_a_merge_that_loses_episodes_is_an_error_and_the_blocks_stay(
     with pytest.raises(RuntimeError, match=r"holds 4 episodes, but 5 were made; 5 episodes are kept"):
         record(RECORDING, tmp_path / "x", resume=True)
     assert not (tmp_path / "x").exists()
+
+
+@pytest.mark.parametrize("file_mb", [100, 0.001])
+def test_a_merge_that_writes_each_file_once_is_lerobots(
+    file_mb: float, recorded: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    from lerobot.datasets import aggregate
+
+    from lerobot_bomb.data import blocks
+
+    for kind in ("DATA", "VIDEO"):
+        monkeypatch.setattr(aggregate, f"DEFAULT_{kind}_FILE_SIZE_IN_MB", file_mb)
+    before = vars(aggregate).copy()
+    layout, there = recording_layout(RECORDING), finished_blocks(recorded / "x.recording")
+    blocks.merge_blocks(layout, there, tmp_path / "once")
+    assert vars(aggregate) == before
+    monkeypatch.setattr(blocks, "merged_at_once", nullcontext)
+    blocks.merge_blocks(layout, there, tmp_path / "again_and_again")
+    once, again = contents(tmp_path / "once"), contents(tmp_path / "again_and_again")
+    assert once.keys() == again.keys()
+    assert len([name for name in once if "file-" in name]) == (4 if file_mb == 100 else 12)
+    for name in once:
+        if name.endswith(".mp4"):  # a header says a bit rate, which a video has from how it was joined
+            assert packets(once[name]) == packets(again[name])
+        else:
+            assert once[name] == again[name], name
 
 
 @pytest.mark.parametrize("name", [VIDEO, "data/chunk-000/file-000.parquet", "meta/tasks.parquet"])
@@ -132,3 +168,14 @@ def test_a_tilde_in_a_path_is_the_home_folder(
     (tmp_path / "x").mkdir()
     assert cli.main(["record", "--root=~/x", *FLAGS]) == 1
     assert f"--root={tmp_path}/x exists already" in capsys.readouterr().err
+
+
+def test_a_camera_without_a_video_is_told(recorded: Path) -> None:
+    from lerobot_bomb.data.blocks import check_videos
+
+    root = recorded / "x"
+    wrist, other = "observation.images.wrist", "observation.images.other"
+    num_frames = json.loads((root / "meta/info.json").read_text())["total_frames"]
+    check_videos(root, [wrist, "observation.images.workspace"], num_frames)
+    with pytest.raises(RuntimeError, match=rf"the video of {other} has 0 frames instead of {num_frames}"):
+        check_videos(root, [wrist, "observation.images.workspace", other], num_frames)

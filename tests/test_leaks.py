@@ -1,4 +1,4 @@
-"""What an episode asks for is told by its instruction, and shows in nothing but board and tray."""
+"""Leaks: an episode's request is told by its instruction, and shows in nothing but board and tray."""
 
 from dataclasses import replace
 
@@ -27,7 +27,7 @@ def suite(request: pytest.FixtureRequest) -> str:
 
 
 def start(spec: EpisodeSpec, asked_seed: int, monkeypatch: pytest.MonkeyPatch) -> dict[str, np.ndarray]:
-    """What is observed at the start where a spec's scene goes with what another seed's episode asks for."""
+    """Return what a spec's scene shows at the start, if it goes with what another seed's episode asks for."""
     other = sample_episode(replace(spec, seed=asked_seed))
     asked = {name: getattr(other, name) for name in ("task_id", "turns", "plans", "aims", "target", "color")}
     episode = replace(sample_episode(spec), **asked)
@@ -59,7 +59,7 @@ def test_where_gripper_and_tray_start_tells_nothing_of_what_is_asked_for(suite: 
 
 
 def assert_uncorrelated(starts: list[np.ndarray], episodes: list[PerturbedEpisode]) -> None:
-    """`starts` and what is asked for: where the first stone goes, in how many turns, by which template."""
+    """Assert that `starts` tell nothing of the request: the first stone's goal, turns, template, task."""
     asked = np.array(
         [
             (*episode.aims[0].xy, len(episode.turns), len(episode.instruction), episode.task_id)

@@ -142,6 +142,34 @@ def test_every_policy_type_has_a_recipe_for_every_task() -> None:
                 assert recipe["policy"]["scheduler_decay_steps"] == recipe["steps"]
 
 
+def test_scenes_are_recorded_beside_demonstrations_and_merged(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    dataset, ran = tmp_path / "dataset", []
+
+    def run(*command: str) -> None:
+        ran.append(command)
+        roots = [flag.split("=")[1] for flag in command if flag.startswith(("--root=", "--new_root="))]
+        Path(roots[0]).mkdir()
+
+    monkeypatch.setattr(learn, "run_command", run)
+    task = learn.Task((), episodes=1, trainings={}, suite="all", static=400)
+    (tmp_path / "shown").mkdir()  # by a run that was stopped
+    learn.record(task, 3, dataset)
+    scenes, merge = ran
+    assert {"--static=400", "--pointing", "--task=all", f"--root={tmp_path / 'scenes'}"} <= set(scenes)
+    assert not any(flag.startswith(("--noise", "--episodes")) for flag in scenes)
+    roots = json.dumps([str(tmp_path / name) for name in ("shown", "scenes")])
+    assert merge[0] == "lerobot-edit-dataset" and f"--operation.roots={roots}" in merge
+    assert dataset.is_dir() and not (tmp_path / "merged").exists()
+
+
+def test_an_evaluation_of_several_suites_has_a_row_for_each() -> None:
+    rows = [{"spec": {"suite": suite}} for suite in ("place", "goal", "place")]
+    assert learn.by_suite(rows) == {"goal": rows[1:2], "place": rows[::2]}
+    assert learn.by_suite(rows[:1]) == {}
+
+
 def test_demonstrations_leave_out_targets_wording_and_colours() -> None:
     shown = specs_of_tasks(EpisodeSpec(seed=0), learning_tasks.shown_pairs())
     # every target of the split, and beside it each row and column in each colour

@@ -186,7 +186,7 @@ def test_a_missing_installation_is_named(monkeypatch: pytest.MonkeyPatch) -> Non
 
 
 def libero_line(capsys: pytest.CaptureFixture[str], patch: pytest.MonkeyPatch) -> str:
-    """What `lerobot-bomb doctor` says of LIBERO."""
+    """Return what `lerobot-bomb doctor` says of LIBERO."""
     patch.setattr(doctor, "CHECKS", (doctor.check_libero,))
     assert main(["doctor"]) == 0  # all else works without it
     (line,) = [line for line in capsys.readouterr().out.splitlines() if "libero:" in line]

@@ -24,7 +24,7 @@ print(os.environ.get("CUDA_VISIBLE_DEVICES"))
 
 
 def draw(**environment: str) -> subprocess.CompletedProcess[str]:
-    """In a new process."""
+    """Draw in a new process."""
     names = ("CUDA_VISIBLE_DEVICES", "MUJOCO_EGL_DEVICE_ID")
     clean = {name: value for name, value in os.environ.items() if name not in names}
     return subprocess.run(

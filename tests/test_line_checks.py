@@ -22,7 +22,7 @@ def path(tmp_path: Path) -> Path:
 
 
 def damage_of(line: dict[str, Any] | str) -> str:
-    """What is wrong with a line; '' where nothing is."""
+    """Return what is wrong with a line; '' if nothing is."""
     text = line if isinstance(line, str) else json.dumps(line)
     try:
         parse_line(text.encode())

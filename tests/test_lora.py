@@ -7,15 +7,18 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 import torch
 from lerobot.datasets import LeRobotDatasetMetadata
 from lerobot.envs import make_env_config
 from lerobot.policies import get_policy_class, make_policy
+from pointing_cases import POINTING, with_labels
 from policy_cases import CASES
 from safetensors.torch import load_file
 from variants import TWO_LAYERS, as_flags
 
+from lerobot_bomb.bomb.pointing import PLACES_XY_M
 from lerobot_bomb.checkpoints.folder import parse_config, read_config
 from lerobot_bomb.commands.main import main
 from lerobot_bomb.data.facts import DatasetFacts
@@ -31,6 +34,13 @@ NEW_PARTS = {
     "spatialvla_grid": {"cell_embedding", "cell_head"},
     "vla0_smol": set(),
 }
+# what those that point have, too; the pointer of `spatialvla_grid` is rows of its tables
+POINTERS = {
+    "fdvla": {"pointer", "board_reader"},
+    "spatialvla_grid": {"board_reader"},
+    "vla0_smol": {"pointer", "board_reader"},
+}
+LORA = {"method_type": "LORA", "r": 4}
 # with adapters beside the text model's
 OTHER_PARTS = {
     "fdvla": (),
@@ -45,11 +55,11 @@ SMALL = {
 LAYERS = 7  # projections of a layer
 
 
-def adapted(policy_type: str) -> tuple[Any, Any]:
+def adapted(policy_type: str, **options: Any) -> tuple[Any, Any]:
     """A policy and a copy of it that has learned, with adapters that are not 0."""
-    policy = CASES[policy_type].make_policy(dtype="float32")
+    policy = CASES[policy_type].make_policy(dtype="float32", **options)
     policy.config.pretrained_path = Path("base")
-    wrapped = copy.deepcopy(policy).wrap_with_peft(peft_cli_overrides={"method_type": "LORA", "r": 4})
+    wrapped = copy.deepcopy(policy).wrap_with_peft(peft_cli_overrides=LORA)
     generator = torch.Generator().manual_seed(0)
     with torch.no_grad():
         for name, parameter in wrapped.named_parameters():
@@ -59,8 +69,9 @@ def adapted(policy_type: str) -> tuple[Any, Any]:
     return policy, wrapped.eval()
 
 
-def test_text_layers_get_adapters_and_new_parts_are_trained_whole(policy_type: str) -> None:
-    policy, wrapped = adapted(policy_type)
+@pytest.mark.parametrize("points", [False, True])
+def test_text_layers_get_adapters_and_new_parts_are_trained_whole(policy_type: str, points: bool) -> None:
+    policy, wrapped = adapted(policy_type, **(POINTING[policy_type] if points else {}))
     trained = [name for name, parameter in wrapped.named_parameters() if parameter.requires_grad]
     num_layers = policy.backbone.text_config.num_hidden_layers
     adapters = [name for name in trained if "lora_A" in name]
@@ -70,7 +81,10 @@ def test_text_layers_get_adapters_and_new_parts_are_trained_whole(policy_type: s
     assert len(of_text) == LAYERS * num_layers and all(".layers." in name for name in of_text)
     assert not any("visi" in name or "visual" in name for name in of_text)
     whole = {name.split(".modules_to_save")[0].split(".")[-1] for name in trained if "lora_" not in name}
-    assert whole == NEW_PARTS[policy_type]
+    new_parts = NEW_PARTS[policy_type] | (POINTERS[policy_type] if points else set())
+    without_parameters = {"pointer"} if policy_type == "vla0_smol" else set()
+    assert whole == new_parts - without_parameters
+    assert {*(wrapped.active_peft_config.modules_to_save or ())} == new_parts
 
 
 def test_decoders_see_adapters_as_merged_weights(policy_type: str) -> None:
@@ -96,8 +110,46 @@ def test_adapters_name_a_folder_that_stays_whatever_the_working_directory(
     monkeypatch.chdir(tmp_path)
     policy = CASES["vla0_smol"].make_policy()
     policy.config.pretrained_path = Path("base")
-    wrapped = policy.wrap_with_peft(peft_cli_overrides={"method_type": "LORA", "r": 4})
+    wrapped = policy.wrap_with_peft(peft_cli_overrides=LORA)
     assert wrapped.active_peft_config.base_model_name_or_path == str(tmp_path / "base")
+
+
+def test_adapters_hold_what_points(policy_type: str, tmp_path: Path) -> None:
+    """Trained, saved and loaded on their base, they point and act as they did, and not as the base does."""
+    cases = CASES[policy_type]
+    policy = cases.make_policy(dtype="float32", **POINTING[policy_type])
+    policy.save_pretrained(tmp_path / "base")
+    base = type(policy).from_pretrained(tmp_path / "base").eval()
+    policy.config.pretrained_path = tmp_path / "base"
+    wrapped = policy.wrap_with_peft(peft_cli_overrides=LORA)
+    batch = with_labels(cases.make_batch(base, 4))
+    trained = {name: each for name, each in wrapped.named_parameters() if each.requires_grad}
+    before = {name: each.detach().clone() for name, each in trained.items()}
+    optimizer = torch.optim.AdamW(trained.values(), lr=1e-2, weight_decay=0.0)
+    losses = []
+    for _ in range(10):
+        optimizer.zero_grad()
+        loss, _ = wrapped.train()(batch)
+        loss.backward()
+        optimizer.step()
+        losses.append(float(loss.detach()))
+    assert losses[-1] < losses[0]
+    still = {name for name, each in trained.items() if torch.equal(each, before[name])}
+    assert not still
+    wrapped.save_pretrained(tmp_path / "adapters")
+    again = peft.PeftModel.from_pretrained(base, tmp_path / "adapters").eval()
+    row = cases.make_batch(policy, 1)
+    found, expected = (each.explained().pointed(row) for each in (again, wrapped.eval()))
+    with again.disable_adapter():
+        of_base = again.explained().pointed(row)
+    for name, value in vars(expected).items():
+        assert np.array_equal(getattr(found, name), value), name
+    assert [*found.place_xy, *found.stone_xy] != [*of_base.place_xy, *of_base.stone_xy]
+    for each in (again, wrapped):
+        each.reset()
+    torch.testing.assert_close(
+        again.predict_action_chunk(row), wrapped.predict_action_chunk(row), atol=1e-5, rtol=0
+    )
 
 
 # The stock commands
@@ -106,14 +158,16 @@ def test_adapters_name_a_folder_that_stays_whatever_the_working_directory(
 @pytest.fixture(scope="module")
 def dataset(tmp_path_factory: pytest.TempPathFactory) -> Path:
     root = tmp_path_factory.mktemp("recorded") / "dataset"
-    recording = Recording(REPO_ID, episodes=1, seed=3, image_size=64, images=True, control_mode="absolute")
+    shape: Any = {"image_size": 64, "images": True, "control_mode": "absolute", "pointing": True}
+    recording = Recording(REPO_ID, episodes=1, seed=3, **shape)
     record(recording, root)
     return root
 
 
-def make_base(policy_type: str, dataset: Path, folder: Path) -> Path:
+def make_base(policy_type: str, dataset: Path, folder: Path, points: bool = False) -> Path:
     own = f"--policy.type={policy_type} --policy.vlm_model_name=nano --policy.device=cpu"
     own += f" --policy.chunk_size=3 --policy.n_action_steps=3 {SMALL[policy_type]}"
+    own += f" --policy.pointing={str(points).lower()}"
     data = f"--dataset.repo_id={REPO_ID} --dataset.root={dataset}"
     assert main(["init", *own.split(), *as_flags(TWO_LAYERS), *data.split(), f"--output={folder}"]) == 0
     return folder
@@ -126,10 +180,11 @@ def train(run: Run, flags: str, output_dir: Path) -> Path:
 
 
 @pytest.mark.one_type
+@pytest.mark.parametrize("points", [False, pytest.param(True, marks=pytest.mark.long)])
 def test_adapters_are_trained_resumed_and_evaluated_by_stock_commands(
-    policy_type: str, dataset: Path, stock_cli: Run, tmp_path: Path
+    policy_type: str, points: bool, dataset: Path, stock_cli: Run, tmp_path: Path
 ) -> None:
-    base = make_base(policy_type, dataset, tmp_path / "base")
+    base = make_base(policy_type, dataset, tmp_path / "base", points)
     flags = f"--policy.path={base} --dataset.repo_id={REPO_ID} --dataset.root={dataset} --batch_size=2"
     flags += " --num_workers=0 --steps=2 --save_freq=1 --peft.method_type=LORA --peft.r=4"
     whole = train(stock_cli, flags, tmp_path / "whole")
@@ -156,7 +211,7 @@ def test_adapters_are_trained_resumed_and_evaluated_by_stock_commands(
 
 
 def check_merged(adapters: Path, output: Path) -> None:
-    """It acts as they do, and needs no base."""
+    """Check that the merged policy acts as base and adapters do, and needs no base."""
     config = read_config(adapters, "cpu")
     wrapped = make_policy(config, env_cfg=make_env_config("bomb", image_size=64)).eval()
     assert main(["merge", f"--policy.path={adapters}", f"--output={output}"]) == 0
@@ -179,7 +234,7 @@ def test_what_cannot_be_merged_is_told(
     assert "is a whole checkpoint: there is nothing to merge" in capsys.readouterr().err
     policy = get_policy_class("vla0_smol").from_pretrained(str(base))
     policy.config.pretrained_path = tmp_path / "elsewhere"
-    wrapped = policy.wrap_with_peft(peft_cli_overrides={"method_type": "LORA", "r": 4})
+    wrapped = policy.wrap_with_peft(peft_cli_overrides=LORA)
     wrapped.save_pretrained(tmp_path / "adapters")
     policy.config.save_pretrained(tmp_path / "adapters")
     for state in base.glob("policy_p*"):
@@ -203,7 +258,27 @@ def test_adapters_on_a_checkpoint_with_relative_actions_of_other_data_are_refuse
     loaded = type(policy).from_pretrained(tmp_path, config=policy.config, dataset_meta=meta)
     loaded.config.pretrained_path = tmp_path
     with pytest.raises(ValueError, match=r"relative\.scale.* lerobot-bomb init writes"):
-        loaded.wrap_with_peft(peft_cli_overrides={"method_type": "LORA", "r": 4})
+        loaded.wrap_with_peft(peft_cli_overrides=LORA)
     loaded.save_pretrained(tmp_path / "fitted")
     fitted = type(policy).from_pretrained(tmp_path / "fitted", config=loaded.config, dataset_meta=meta)
-    assert fitted.wrap_with_peft(peft_cli_overrides={"method_type": "LORA", "r": 4}).config.use_peft
+    assert fitted.wrap_with_peft(peft_cli_overrides=LORA).config.use_peft
+
+
+def test_adapters_hold_the_units_of_what_points(policy_type: str, dataset: Path, tmp_path: Path) -> None:
+    """Check that they are of their own data, whatever the base was trained on."""
+    places = {} if policy_type == "vla0_smol" else {"pointing_places": [*map(list, PLACES_XY_M)]}
+    policy = CASES[policy_type].make_policy(**POINTING[policy_type] | places)
+    policy.save_pretrained(tmp_path / "base")
+    meta = LeRobotDatasetMetadata(REPO_ID, root=dataset)
+    load = type(policy).from_pretrained
+    fitted = load(tmp_path / "base", config=policy.config, dataset_meta=meta)
+    fitted.config.pretrained_path = tmp_path / "base"
+    expected = fitted.pointer
+    wrapped = fitted.wrap_with_peft(peft_cli_overrides=LORA)
+    wrapped.save_pretrained(tmp_path / "adapters")
+    again = peft.PeftModel.from_pretrained(load(tmp_path / "base"), tmp_path / "adapters")
+    if policy_type == "spatialvla_grid":  # whose labels need the dataset alone
+        return
+    for name in ("state_bounds", "action_bounds"):
+        held, of_base = (getattr(each, name) for each in (expected, policy.pointer))
+        assert torch.equal(getattr(again.pointer, name), held) and not torch.equal(held, of_base), name

@@ -1,4 +1,4 @@
-"""Beside every rate stands what the policy does: by its config, in the pages and on the model card."""
+"""Methods beside every rate: what the policy does by its config, in the pages and on the model card."""
 
 import re
 from pathlib import Path
@@ -18,11 +18,6 @@ from lerobot_bomb.hub.card import Checkpoint
 
 ROOT = Path(__file__).parents[1]
 COLUMN = "methods used"
-# rows below that of a `spatialvla_grid`: what they call it -> its groups
-OTHER_GRIDS = {
-    "64 x 64": [((0, 1), (64, 64)), ((2, 3), (64, 16))],
-    "32 x 32": [((0, 1), (32, 32)), ((2, 3), (32, 8))],
-}
 
 
 @pytest.fixture(scope="module", autouse=True)
@@ -30,18 +25,11 @@ def plugin() -> None:
     register_third_party_plugins()
 
 
-def of_recipe(policy_type: str, recipe: str = "all_targets", **changes: Any) -> str:
+def of_recipe(policy_type: str, recipe: str = "all_targets") -> str:
     written = yaml.safe_load((ROOT / "configs" / f"{recipe}_{policy_type}.yaml").read_text())
-    written["policy"] |= changes
     config: Any = draccus.decode(TrainPipelineConfig, written).policy
     config.output_features = {"action": PolicyFeature(FeatureType.ACTION, (4,))}
     return config.methods_used()
-
-
-def of_grid(name: str) -> str:
-    groups = next(groups for size, groups in OTHER_GRIDS.items() if size in name)
-    written = [{"dims": [*dims], "transform": "identity", "bins": [*bins]} for dims, bins in groups]
-    return of_recipe("spatialvla_grid", action_groups=written)
 
 
 def of_shipped(name: str) -> str:
@@ -50,7 +38,7 @@ def of_shipped(name: str) -> str:
 
 
 def tables(page: str) -> list[list[list[str]]]:
-    """Each as rows of cells, the header first."""
+    """Return each table of a page as rows of cells, the header first."""
     found: list[list[list[str]]] = [[]]
     for line in (ROOT / page).read_text().splitlines():
         if not line.startswith("|"):
@@ -73,38 +61,20 @@ def cells(page: str) -> list[tuple[str, str]]:
 
 def names_of(cell: str) -> str:
     """vla0_smol of [`vla0_smol`](docs/vla0_smol.md)."""
-    match = re.match(r"\[?`((?:bomb:)?\w+)`", cell)
-    return match[1] if match else cell
+    (name,) = re.findall(r"^\[?`(?:bomb:)?(\w+)`", cell)
+    return name
 
 
-def expected(name: str, above: str) -> str:
-    if name.startswith("bomb:"):
-        return of_shipped(name.removeprefix("bomb:"))
-    if name in CASES:
-        return of_recipe(name)
-    return of_grid(name) if " x " in name else above
-
-
-@pytest.mark.parametrize(("page", "num_rows"), [("README.md", 3), ("docs/results.md", 4 + 7 + 3)])
-def test_the_pages_say_what_the_configs_do(page: str, num_rows: int) -> None:
-    found = cells(page)
-    assert len(found) == num_rows
-    above = ""
-    for cell, written in found:
-        above = expected(names_of(cell), above)
-        assert written == above, cell
-
-
-def test_the_table_of_shipped_checkpoints_says_it_too() -> None:
-    (header, row) = next(
-        (table[0], row) for table in tables("docs/results.md") for row in table if row[0] == COLUMN
-    )
-    written = {
-        names_of(title): cell for title, cell in zip(header, row, strict=True) if cell != COLUMN and cell
+@pytest.mark.parametrize("page", ["README.md", "docs/results.md"])
+def test_the_pages_say_what_the_configs_do(page: str) -> None:
+    assert {names_of(cell): written for cell, written in cells(page)} == {
+        name: of_recipe(name) for name in CASES
     }
-    nominal = written.pop("vla0_smol")
-    assert nominal == of_recipe("vla0_smol")
-    assert written == {f"bomb:{name}": of_shipped(name) for name in CASES}
+
+
+def test_the_shipped_checkpoints_use_the_same_methods() -> None:
+    for name in CASES:
+        assert of_shipped(name) == of_recipe(name)
 
 
 def test_one_target_and_all_targets_are_of_the_same_methods() -> None:

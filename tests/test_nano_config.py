@@ -75,5 +75,5 @@ def test_only_nano_is_changed(policy_type: str) -> None:
 def test_checkpoints_of_before_the_flag_are_read() -> None:
     config = CASES["vla0_smol"].make_config(nano_config=None)
     config.trained_with = {"chunk_size": 3}
-    check_as_trained(config)
+    check_as_trained(config, ("nano_config",))
     check_weights_fit(config, ("nano_config",))

@@ -26,7 +26,7 @@ CHUNK = 3
 
 @pytest.fixture(scope="module")
 def root(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Five episodes at two steps a second, about ten frames each; no four have the same instruction."""
+    """Record five episodes at 2 steps a second, about ten frames each; no four share an instruction."""
     path = tmp_path_factory.mktemp("offline") / "dataset"
     record(Recording(REPO_ID, episodes=5, seed=3, image_size=32, fps=2, images=True, task_ids=(7,)), path)
     return path
@@ -154,7 +154,7 @@ def test_batches_do_not_matter_and_the_json_holds_it_all(
 
 
 def numbers(value: Any) -> list[float]:
-    """All numbers of nested dicts and lists."""
+    """Return all numbers of nested dicts and lists."""
     if isinstance(value, dict | list):
         return [x for of in (value.values() if isinstance(value, dict) else value) for x in numbers(of)]
     return [] if value is None else [value]

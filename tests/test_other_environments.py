@@ -1,4 +1,4 @@
-"""Our policies on LeRobot's environment types: docs/other_environments.md says which of them were run."""
+"""Our policies on LeRobot's environment types: docs/your_policy.md says which of them were run."""
 
 import threading
 from collections.abc import Callable
@@ -85,7 +85,7 @@ def test_tasks_in_threads_are_played_in_turn(
 def test_metaworld_is_played(
     policy_type: str, stock_cli: Callable[..., None], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Three steps each of two episodes."""
+    """Run three steps each of two episodes."""
     from lerobot_env_mujoco.backend import ensure_gl_backend
 
     ensure_gl_backend()  # before metaworld imports MuJoCo

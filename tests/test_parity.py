@@ -151,7 +151,7 @@ def test_targets_are_the_actions_from_the_frame_on(routes: MakeRoutes, options: 
 
 
 def require_recorded_actions(both: Routes) -> None:
-    """Each action of a policy that learned the turning points, after each call, is what was recorded."""
+    """Require that each action of a policy that learned the turning points is what was recorded."""
     policy, actions = both.evaluation.policy, recorded_as_written(both)
     bar = tolerance(policy) * (actions.max(axis=0) - actions.min(axis=0)) / 2
     for shown in both.recorded.turning_points, both.recorded.turning_points[::-1]:
@@ -197,7 +197,7 @@ def expected_actions(
 
 
 def require_predicted_actions(both: Routes) -> None:
-    """Each action, after each call, is what the policy that was trained foresaw for the frame."""
+    """Require that each action is what the policy that was trained foresaw for the frame."""
     trained, policy = both.training.policy.eval(), both.evaluation.policy
     num_steps = getattr(policy.config, "n_action_steps")  # noqa: B009  a field of every policy's own config
     trained.reset()

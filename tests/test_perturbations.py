@@ -1,4 +1,4 @@
-"""How conditions are written; what they do to an episode is tested in test_axes.py."""
+"""Conditions as they are written; what they do to an episode is tested in test_axes.py."""
 
 import re
 

@@ -1,4 +1,4 @@
-"""What was planted in a policy is what comparison, report and sweep say of it, and nothing else."""
+"""Effects that were planted in a policy: comparison, report and sweep show them, and nothing else."""
 
 import json
 import os

@@ -51,7 +51,7 @@ def absolute(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture(scope="module")
 def relative(absolute: Path) -> LeRobotDatasetMetadata:
-    """The same frames under the names of a relative recording at 20 Hz, as an edited dataset would have."""
+    """Copy the frames with the names of a relative recording at 20 Hz, as an edited dataset would have."""
     root = absolute.with_name("relative")
     shutil.copytree(absolute, root)
     info = json.loads((root / "meta" / "info.json").read_text())
@@ -62,7 +62,7 @@ def relative(absolute: Path) -> LeRobotDatasetMetadata:
 
 
 def new_policy(policy_type: str, dataset: Path) -> PreTrainedPolicy:
-    """As lerobot-train builds it."""
+    """Build a policy as lerobot-train does."""
     options = {"has_depth": False} if policy_type == "spatialvla_grid" else {}
     config = CASES[policy_type].make_config(**options)
     config.input_features = {}
@@ -77,7 +77,7 @@ def write(folder: Path, policy: PreTrainedPolicy) -> Path:
 
 
 def act_in(policy: PreTrainedPolicy, **flags: object) -> None:
-    """What every command does between building the policy that acts and its first episode."""
+    """Do what every command does between building the policy that acts and its first episode."""
     make_env_pre_post_processors(make_env_config("bomb", **flags), policy.config)
 
 
@@ -207,7 +207,7 @@ def test_where_an_action_has_another_size_a_checkpoint_says_where_it_was_trained
 def test_a_recording_that_lost_its_suite_trains_policies_that_say_so(
     policy_type: str, absolute: Path, tmp_path: Path, caplog: pytest.LogCaptureFixture
 ) -> None:
-    """As of `lerobot-edit-dataset`, which keeps neither bomb.json nor our columns of the kept episodes."""
+    """Check what `lerobot-edit-dataset` leaves: neither bomb.json nor our columns of the kept episodes."""
     root = tmp_path / "kept"
     recorded = LeRobotDataset(REPO_ID, root=absolute, video_backend="pyav")
     delete_episodes(recorded, [0], output_dir=root, repo_id=REPO_ID)

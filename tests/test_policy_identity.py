@@ -1,4 +1,4 @@
-"""Which policy a result line names: that which this process built, or none."""
+"""Policy that a record names: the one that this process built, or none."""
 
 import gc
 import hashlib
@@ -55,7 +55,7 @@ def loaded(checkpoint: Path, **flags: Any) -> PreTrainedPolicy:
 
 
 def identity(of: PreTrainedPolicy) -> PolicyIdentity:
-    """What a line says while this policy, which the process holds, acts."""
+    """Return what a record says while this policy, which the process holds, acts."""
     assert acting_policy() is of
     return identity_of(of)
 

@@ -25,7 +25,7 @@ def load(folder: Path) -> PreTrainedPolicy:
 
 
 def act_in(policy: PreTrainedPolicy, **flags: Any) -> None:
-    """What every command does between building the policy that acts and its first episode."""
+    """Do what every command does between building the policy that acts and its first episode."""
     make_env_pre_post_processors(make_env_config("bomb_pusht", **flags), policy.config)
 
 

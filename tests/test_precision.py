@@ -1,4 +1,4 @@
-"""What --policy.dtype and --policy.weights_dtype change in all policies, and what they do not."""
+"""Precision: what --policy.dtype and --policy.weights_dtype change in all policies, and what not."""
 
 from pathlib import Path
 from typing import Any
@@ -53,7 +53,7 @@ def test_weights_in_bfloat16_change_no_answer(policy_type: str, tmp_path: Path) 
 
 @torch.no_grad()
 def test_queries_of_weights_in_bfloat16_are_those_of_autocast(tmp_path: Path) -> None:
-    """Their scale, 32 ** -0.5, is no power of two: a product with it would round weights again."""
+    """Check a scale, 32 ** -0.5, that is no power of two: a product with it would round weights again."""
     save_checkpoint("vla0_smol", tmp_path)
     policies = load(tmp_path, dtype="bfloat16"), load(tmp_path, **BFLOAT16)
     attentions = [policy.backbone.vlm.model.text_model.layers[0].self_attn for policy in policies]

@@ -65,7 +65,7 @@ def flags(policy_type: str, dataset: Path, batch_size: int, output_dir: str) -> 
 
 
 def weights(policy_type: str, output_dir: Path) -> dict[str, torch.Tensor]:
-    """Of the last checkpoint, loaded; FSDP's file holds tied weights twice."""
+    """Load the weights of the last checkpoint; FSDP's file holds tied weights twice."""
     checkpoint = output_dir / "checkpoints" / "last" / "pretrained_model"
     return get_policy_class(policy_type).from_pretrained(checkpoint).state_dict()
 
@@ -73,7 +73,7 @@ def weights(policy_type: str, output_dir: Path) -> dict[str, torch.Tensor]:
 def check_trained_as_one(
     policy_type: str, losses: list[float], of: Path, stock_cli: Callable[..., None], dataset: Path
 ) -> None:
-    """Losses and weights agree with those of one process and a batch as large as theirs together."""
+    """Check losses and weights against one process with a batch as large as theirs together."""
     with seen_losses() as in_one, draws_by_sample():
         together = BATCH_SIZE * NUM_PROCESSES
         stock_cli("lerobot-train", *flags(policy_type, dataset, together, f"{of}/one"))
@@ -85,7 +85,7 @@ def check_trained_as_one(
 
 @pytest.fixture(scope="module")
 def two(dataset: Path, tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Seen]:
-    """Every policy in two processes, and once more from its first checkpoint on: where, what they saw."""
+    """Train every policy in two processes, and again from its first checkpoint; return folder and `Seen`."""
     folder = tmp_path_factory.mktemp("two")
     trainings = []
     for policy_type in POLICY_TYPES:
@@ -119,7 +119,10 @@ def test_going_on_is_exact_and_only_the_first_process_writes(
     of = folder / policy_type
     resumed, whole = (weights(policy_type, of / name) for name in ("resumed0", "process0"))
     torch.testing.assert_close(resumed, whole, rtol=0, atol=0)
-    assert not (of / "process1").exists() and not (of / "resumed1").exists()
+    # LeRobot 0.6.2 makes the folders in every process
+    assert not [
+        path for name in ("process1", "resumed1") for path in (of / name).rglob("*") if path.is_file()
+    ]
 
 
 def test_a_log_line_comes_from_one_process(two: tuple[Path, Seen]) -> None:
@@ -141,7 +144,7 @@ def test_sharded_by_fsdp_they_train_the_same(
 
 
 def test_fsdp_shards_every_layer_by_itself(policy_type: str) -> None:
-    """Named are the repeated blocks of the text and the vision model, and nothing else is repeated."""
+    """Check that the repeated blocks of text and vision model are named, and nothing else is repeated."""
     policy = CASES[policy_type].make_policy()
     named = set(policy._no_split_modules)
     assert policy._fsdp_wrap_modules == policy._no_split_modules
@@ -157,7 +160,7 @@ def test_fsdp_shards_every_layer_by_itself(policy_type: str) -> None:
 def test_a_policy_that_is_sharded_in_place_saves_its_weights_whole_and_once(
     policy_type: str, tmp_path: Path
 ) -> None:
-    """As LeRobot 0.6.2 shards them; where a module's weights are another's, too, strict loading says so."""
+    """Check sharding as of LeRobot 0.6.2; strict loading finds a module's weights that are another's too."""
     policy = CASES[policy_type].make_policy()
     before = {name: tensor.clone() for name, tensor in policy.state_dict().items()}
     distributed.init_process_group("gloo", f"file://{tmp_path}/meeting", rank=0, world_size=1)

@@ -21,7 +21,7 @@ MAX_DRIFT = 1e-3  # pixels; seen: 1.6e-5 over whole episodes
 
 @pytest.fixture(scope="module")
 def vector_env() -> Iterator[SyncVectorEnv]:
-    """As lerobot-eval --env.type=pusht makes it."""
+    """Make the environment as lerobot-eval --env.type=pusht does."""
     env = PushtEnv().create_envs(n_envs=1)["pusht"][0]
     assert isinstance(env, SyncVectorEnv)
     yield env
@@ -35,7 +35,7 @@ def set_state(env: SyncVectorEnv, state: np.ndarray) -> None:
 
 
 def policy_view(env: SyncVectorEnv) -> tuple[np.ndarray, np.ndarray]:
-    """What a policy sees: the image (96, 96, 3) in 0..255 and the state (2)."""
+    """Return what a policy sees: the image (96, 96, 3) in 0..255 and the state (2)."""
     pusht: Any = env.envs[0].unwrapped
     raw = pusht.get_obs()
     observation = preprocess_observation({key: value[None] for key, value in raw.items()})
@@ -75,7 +75,7 @@ def test_recorded_actions_lead_through_the_recorded_states(
 
 
 def test_the_environment_names_no_task(vector_env: SyncVectorEnv) -> None:
-    """So that lerobot-eval gives a policy the empty text, which is what `convert` writes."""
+    """Check why lerobot-eval gives a policy the empty text, which is what `convert` writes."""
     for name in ("task_description", "task"):
         with pytest.raises(AttributeError):
             vector_env.call(name)

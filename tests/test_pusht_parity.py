@@ -105,12 +105,12 @@ def test_the_environment_passes_the_recorded_states(routes: Routes) -> None:
 
 
 def test_targets_are_the_recorded_actions(routes: Routes) -> None:
-    """Written as residuals and read with the state of evaluation: what was recorded, within half a bin."""
+    """Check residuals, read with the state of evaluation: they are what was recorded, within half a bin."""
     policy: Any = routes.evaluation.policy
     actions, num_compared = routes.recorded.actions, 0
     for trained, evaluated in routes.frames():
         index = int(trained["index"])
-        written = policy._bins(trained).view(trained[ACTION].shape)
+        written = policy._targets(trained)[0].view(trained[ACTION].shape)
         residuals = policy.action_bins.decode(written)
         chunk = routes.evaluation.postprocessor(policy.relative.decode(residuals, evaluated[OBS_STATE])[0])
         steps = index + np.arange(len(chunk))

@@ -12,9 +12,10 @@ from torch import Tensor
 from transformers import AutoProcessor, AutoTokenizer, Qwen2VLImageProcessor
 
 from lerobot_bomb.vlm.backbone import config_dict
+from lerobot_bomb.vlm.prefix import Prefix
 from lerobot_bomb.vlm.presets import nano_qwen_config
 from lerobot_bomb.vlm.prompt import text_ids
-from lerobot_bomb.vlm.qwen import Prefix, QwenBackbone, QwenPrompt, build_qwen, load_qwen
+from lerobot_bomb.vlm.qwen import QwenBackbone, QwenPrompt, build_qwen, load_qwen
 from lerobot_bomb.vlm.tokenizer import load_tokenizer, nano_tokenizer
 
 SIZE = 112  # 4 x 4 tokens, in 2 x 2 windows of the vision model
@@ -110,7 +111,7 @@ def test_padding_changes_nothing_wherever_it_is(nano: QwenBackbone) -> None:
 
 @torch.no_grad()
 def test_a_segment_goes_on_as_the_stock_model_would(nano: QwenBackbone) -> None:
-    """In one causal forward pass over prefix and segment, without a cache."""
+    """Compare with one causal forward pass over prefix and segment, without a cache."""
     ids, written = padded(prompt_rows(nano, TASKS[:1]))
     embeds, is_image = embed(nano, ids, as_pixels(draw_images(2)))
     segment = torch.randn(1, 6, 128)
@@ -164,6 +165,38 @@ def test_checkpointed_gradients_are_the_same() -> None:
     assert gradients[0].keys() == gradients[1].keys() and len(gradients[0]) > 50
     for name, gradient in gradients[0].items():
         torch.testing.assert_close(gradient, gradients[1][name], msg=name)
+
+
+def test_a_start_that_all_rows_share_is_read_once() -> None:
+    found = []
+    for num_shared in (0, 5):
+        torch.manual_seed(0)
+        backbone = load_qwen("nano", 56).train()
+        ids, written = padded(prompt_rows(backbone))
+        embedded = embed(backbone, ids, as_pixels(draw_images(4, 56)))
+        prefix = backbone.read_prefix(*embedded, written, num_shared=num_shared)
+        hidden = backbone.read_segment(prefix, torch.ones(2, 3, 128), torch.ones(2, 3, 3, dtype=torch.bool))
+        weight_H = torch.linspace(-1, 1, 128)
+        (hidden @ weight_H).mean().add((prefix.hidden[:, :-8] @ weight_H).mean()).backward()
+        gradients = {name: p.grad for name, p in backbone.named_parameters() if p.grad is not None}
+        found.append(([hidden, *prefix.tensors()], gradients))
+    (plain, gradients), (shared, of_shared) = found
+    for one, other in zip(plain, shared, strict=True):
+        torch.testing.assert_close(one, other)
+    for name, gradient in gradients.items():
+        torch.testing.assert_close(gradient, of_shared[name], rtol=1e-4, atol=1e-5, msg=name)
+
+
+@torch.no_grad()
+def test_copies_of_a_segment_are_read_as_if_alone(nano: QwenBackbone) -> None:
+    ids, written = padded(prompt_rows(nano))
+    prefix = read(nano, ids, written, as_pixels(draw_images(4)))
+    copies = torch.randn(2, 3, 4, 128)  # 3 of each row
+    own = torch.ones(2, 4, 4, dtype=torch.bool).tril()
+    alone = [nano.read_segment(prefix, copies[:, i], own) for i in range(3)]
+    blocks = torch.block_diag(*3 * [own[0].float()]).bool().expand(2, -1, -1)
+    together = nano.read_segment(prefix, copies.flatten(1, 2), blocks, num_copies=3)
+    torch.testing.assert_close(together, torch.cat(alone, dim=1), rtol=1e-4, atol=1e-5)
 
 
 # Models

@@ -41,7 +41,7 @@ def signals() -> Iterator[None]:
 
 @pytest.fixture(scope="module")
 def dataset(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Where `recorded` puts it."""
+    """Return where `recorded` puts the dataset."""
     return tmp_path_factory.mktemp("arm") / "dataset"
 
 
@@ -142,7 +142,7 @@ def test_a_relative_chunk_counts_from_where_the_arm_was_when_it_began(
 
 @dataclass
 class Call:
-    """Of predict_action_chunk by real-time chunking."""
+    """Call of predict_action_chunk by real-time chunking."""
 
     batch: dict[str, Any]
     delay: int
@@ -152,7 +152,7 @@ class Call:
 
 @pytest.fixture
 def calls(monkeypatch: pytest.MonkeyPatch) -> list[Call]:
-    """What LeRobot asks of fdvla, and gets."""
+    """Return what LeRobot asks of fdvla, and gets."""
     policy_class: Any = get_policy_class("fdvla")
     usual, made = policy_class.predict_action_chunk, []
 

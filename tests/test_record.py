@@ -16,23 +16,25 @@ import pyarrow.parquet as pq
 import pytest
 
 from lerobot_bomb import __version__
-from lerobot_bomb.bomb.episode import TASK_VERSION, EpisodeSpec
+from lerobot_bomb.bomb.episode import EpisodeSpec
 from lerobot_bomb.bomb.expert import expert_action
 from lerobot_bomb.bomb.observation import CAMERAS, RenderOptions
 from lerobot_bomb.bomb.perturbations import NUISANCES
 from lerobot_bomb.bomb.privileged_state import PrivilegedState
 from lerobot_bomb.commands.main import main
-from lerobot_bomb.data import record as record_module
-from lerobot_bomb.data import resumable
+from lerobot_bomb.data import recorded_blocks, resumable
 from lerobot_bomb.data.facts import DatasetFacts
-from lerobot_bomb.data.record import describe_failures, record
+from lerobot_bomb.data.kept_blocks import Progress, read_progress
+from lerobot_bomb.data.record import record
+from lerobot_bomb.data.recorded_blocks import describe_failures
 from lerobot_bomb.data.recording import Recording
-from lerobot_bomb.data.resumable import METADATA_FILE, Progress, read_progress, unfinished_folder
 from lerobot_bomb.data.rollout_pool import RolloutSettings, collect
+from lerobot_bomb.data.unfinished import METADATA_FILE, unfinished_folder
 from lerobot_bomb.envs.rollout import make_env
 
 SIZE = 64
 SMALL = RenderOptions(image_size=SIZE)
+TASK_VERSION = "1.0"  # of `place`
 VIDEO = Recording("test/video", episodes=5, seed=3, image_size=SIZE)
 IMAGES = Recording("test/images", episodes=2, image_size=SIZE, control_mode="absolute", images=True)
 FEATURES = {"observation.images.workspace", "observation.images.wrist", "observation.state", "action"}
@@ -40,13 +42,13 @@ FEATURES = {"observation.images.workspace", "observation.images.wrist", "observa
 
 @pytest.fixture(autouse=True)
 def small_blocks(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Blocks of 2 episodes, so that a short recording is merged from several."""
+    """Write blocks of 2 episodes, so that a short recording is merged from several."""
     monkeypatch.setattr(resumable, "BLOCK_EPISODES", 2)
 
 
 @pytest.fixture(scope="module")
 def datasets(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
-    """Two uninterrupted recordings."""
+    """Make two uninterrupted recordings."""
     roots = {name: tmp_path_factory.mktemp("recorded") / name for name in ("video", "images")}
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(resumable, "BLOCK_EPISODES", 2)
@@ -181,8 +183,9 @@ def test_image_statistics_are_sampled_and_right(tmp_path: Path) -> None:
     recording = Recording("test/full", episodes=1)
     record(recording, tmp_path / "full")
     statistics = json.loads((tmp_path / "full" / "meta" / "stats.json").read_text())
-    env = make_env(recording.spec, recording.render_options)
-    rollout = collect(env, recording.spec, RolloutSettings(recording.render_options))
+    spec = next(recording.specs(0))
+    env = make_env(spec, recording.render_options)
+    rollout = collect(env, spec, RolloutSettings(recording.render_options))
     env.close()
     for camera, frames in rollout.frames.items():
         found = statistics[f"observation.images.{camera}"]
@@ -260,14 +263,11 @@ def test_every_seed_is_played_under_every_condition_at_the_levels_it_draws(tmp_p
 
 
 def test_lerobot_refuses_to_merge_datasets_of_different_protocol_versions(
-    datasets: dict[str, Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    datasets: dict[str, Path], tmp_path: Path
 ) -> None:
     from lerobot.datasets import aggregate_datasets
 
-    from lerobot_bomb.data import rollout_dataset
-
-    monkeypatch.setattr(rollout_dataset, "TASK_VERSION", "0.0")
-    record(IMAGES, tmp_path / "old")
+    record(replace(IMAGES, protocol_version="0.0"), tmp_path / "old")
     roots = [datasets["images"], tmp_path / "old"]
     with pytest.raises(ValueError, match=f"bomb_scara_v{TASK_VERSION}"):
         aggregate_datasets(["test/images"] * 2, "test/merged", roots=roots, aggr_root=tmp_path / "merged")
@@ -297,8 +297,8 @@ def test_failures_are_described_by_class_and_seed() -> None:
 
 
 def test_a_broken_expert_ends_the_recording(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(record_module, "MIN_TRIED", 3)
-    with pytest.raises(RuntimeError, match=r"only 0 of 3 episodes succeeded.*never_reached.*0, 1, 2"):
+    monkeypatch.setattr(recorded_blocks, "MIN_TRIED", 2)
+    with pytest.raises(RuntimeError, match=r"only 0 of 2 episodes succeeded.*never_reached.*0, 1"):
         record(Recording("test/x", episodes=1, image_size=SIZE), tmp_path / "x", expert=stand_still)
     assert list(tmp_path.iterdir()) == []
 

@@ -13,7 +13,8 @@ from pathlib import Path
 import pytest
 from recorder_server import MARK, TIMEOUT_S, marked_processes, wait_for_end
 
-from lerobot_bomb.data.resumable import finished_blocks, unfinished_folder
+from lerobot_bomb.data.kept_blocks import finished_blocks
+from lerobot_bomb.data.unfinished import unfinished_folder
 
 pytestmark = [
     pytest.mark.long,
@@ -90,7 +91,7 @@ def wait_for_moment(process: subprocess.Popen, root: Path, reference: Reference,
 
 
 def check_blocks(root: Path, blocks: dict[str, dict[str, bytes]]) -> None:
-    """Finished blocks stay as they are; updates `blocks`."""
+    """Check that finished blocks stay as they are; update `blocks`."""
     now = {block.name: contents(block) for block in finished_blocks(unfinished_folder(root))}
     assert {name: now.get(name) for name in blocks} == blocks
     blocks.update(now)

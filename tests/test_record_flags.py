@@ -17,17 +17,15 @@ from lerobot.envs import EnvConfig
 from lerobot_bomb.commands import main as cli
 from lerobot_bomb.commands.arguments import parse_conditions
 from lerobot_bomb.conditions import NONE
+from lerobot_bomb.data.kept_blocks import Progress, finish_block, write_json
 from lerobot_bomb.data.recording import Recording
-from lerobot_bomb.data.resumable import (
+from lerobot_bomb.data.resumable import terminated_in_order
+from lerobot_bomb.data.unfinished import (
     METADATA_FILE,
-    Progress,
     check_folders,
-    finish_block,
     lock_folder,
     parameters_file,
-    terminated_in_order,
     unfinished_folder,
-    write_json,
 )
 from lerobot_env_bomb.configuration_bomb import BombEnvConfig
 
@@ -296,7 +294,7 @@ def test_a_target_outside_the_split_is_refused(tmp_path: Path, capsys: pytest.Ca
 
 @pytest.mark.parametrize("command", ["record", "view"])
 def test_an_episode_has_the_flags_of_the_environment(command: str) -> None:
-    """Both commands and --env.type=bomb: one set of names, with the same defaults."""
+    """Check both commands against --env.type=bomb: one set of names, with the same defaults."""
     parser = argparse.ArgumentParser()
     module = importlib.import_module(f"lerobot_bomb.commands.{command}")
     getattr(module, f"add_{command}_arguments")(parser)

@@ -15,7 +15,8 @@ import pytest
 from recorder_server import TIMEOUT_S, Moment, RecorderServer
 
 from lerobot_bomb.commands import main as cli
-from lerobot_bomb.data.resumable import METADATA_FILE, finished_blocks, unfinished_folder
+from lerobot_bomb.data.kept_blocks import finished_blocks
+from lerobot_bomb.data.unfinished import METADATA_FILE, unfinished_folder
 
 pytestmark = pytest.mark.skipif(platform.system() != "Linux", reason="processes are watched through /proc")
 
@@ -85,7 +86,7 @@ def resume_flag(root: Path) -> list[str]:
 
 
 def check_after_kill(root: Path, blocks: dict[str, dict[str, bytes]], reference: Reference) -> None:
-    """Finished blocks stay as they are, and a dataset appears complete or not at all; updates `blocks`."""
+    """Check that finished blocks stay, and that a dataset appears whole or not at all; update `blocks`."""
     if root.exists():
         assert contents(root) == reference.contents
     else:
@@ -105,6 +106,31 @@ def test_a_recording_killed_before_each_of_its_steps_loses_nothing(
         check_after_kill(root, blocks, references[mode])
     assert server.record(root, *MODES[mode], "--resume").exit_code == 0
     assert contents(root) == references[mode].contents
+    assert list(tmp_path.iterdir()) == [root]
+
+
+def test_parts_killed_before_each_of_their_steps_lose_nothing(
+    server: RecorderServer, references: dict[str, Reference], tmp_path: Path
+) -> None:
+    """Record three episodes: one part has a block, and the join makes the last, short one."""
+    root = tmp_path / "x"
+    part, join = (*FLAGS, "--shard=0/1"), (*FLAGS, "--join")
+    of_part = "os.rename .*recording.json", "os.rename .*block-00000.*/block.json", "os.rename .*block-00000$"
+    of_join = (
+        "os.rename .*block-00001$",
+        "os.rename .*/meta/bomb.json",
+        "os.rename .*/dataset ",
+        r"os.rmdir \.recording$",
+        r"os.remove \.parts/.*/lock",
+        r"os.rmdir \.parts$",
+    )
+    for flags, steps in ((part, of_part), (join, of_join)):
+        for step in steps:
+            ended = server.record(root, *flags, moment=Moment("kill", step))
+            assert ended.exit_code is None, f"never came to {step}: {ended.messages}"
+            assert not root.exists() or contents(root) == references["video"].contents
+        assert server.record(root, *flags).exit_code == 0
+    assert contents(root) == references["video"].contents
     assert list(tmp_path.iterdir()) == [root]
 
 

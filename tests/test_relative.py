@@ -12,7 +12,7 @@ from lerobot_bomb.actions.relative import RelativeActions, _residuals, bounds, n
 
 
 def fitted(chunk_size: int = 2, **changes: Any) -> RelativeActions:
-    """Two dimensions whose states are swapped; the data's residuals are 10 (dim 0) and 30 and 20 (dim 1)."""
+    """Fit two dims whose states are swapped; the data's residuals are 10 (dim 0), and 30 and 20 (dim 1)."""
     data = {
         # dim 0: 100 + 10 from the state; dim 1 alternates
         "actions_ND": np.array([[110.0, 230.0], [310.0, 430.0], [110.0, 230.0], [310.0, 430.0]]),
@@ -121,7 +121,7 @@ def test_delta_control_is_refused() -> None:
 
 
 def test_an_action_may_lead_its_state_by_a_whole_step() -> None:
-    """At a coarse rate a position is reached one frame later, and jumps far in between."""
+    """Check a coarse rate: a position is reached one frame later, and jumps far in between."""
     actions = np.array([[0.0], [9.0], [1.0], [8.0], [0.0]])
     states = np.array([[5.0], [0.0], [9.0], [1.0], [8.0]])
     span = (np.array([0.0]), np.array([9.0]))

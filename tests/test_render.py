@@ -91,7 +91,7 @@ threading.Thread(target=other.reset).start()
 
 
 def in_another_thread(function) -> Exception | None:
-    """What it raises there."""
+    """Return what a function raises in another thread."""
     raised = []
 
     def call() -> None:

@@ -11,6 +11,7 @@ from rrd_files import read_rrd
 
 from lerobot_bomb.commands.arguments import ANSWER_IS_NO
 from lerobot_bomb.commands.main import main
+from lerobot_bomb.commands.results_files import read_line
 from lerobot_bomb.conditions import NONE
 from lerobot_bomb.envs.results import ORIGIN, EpisodeResult
 
@@ -40,7 +41,7 @@ def results(tmp_path_factory: pytest.TempPathFactory) -> Callable[..., Path]:
 
 
 def rewritten(path: Path, file: Path, **changes: Any) -> Path:
-    """Its first line with other values."""
+    """Write the file's first line with other values."""
     values = json.loads(path.read_text().splitlines()[0])
     file.write_text(json.dumps(values | changes) + "\n")
     return file
@@ -141,8 +142,8 @@ def test_other_weights_are_refused(
 @pytest.mark.parametrize(
     ("flags", "message"),
     [
-        (["--line=4"], "--line=4 must be in 1..3"),
-        (["--line=0"], "--line=0 must be in 1..3"),
+        (["--line=4"], "results.jsonl, whose lines are 1..3"),
+        (["--line=0"], "--line=0 is no episode of"),
         (["--set=fog=3"], "--set: 'fog' is not an axis"),
         (["--set=camera=9"], "--set: the levels of camera must lie in 0..5"),
         (["--env.image_size=32"], "--env.image_size=32 is unknown"),
@@ -158,6 +159,16 @@ def test_wrong_flags_are_told(
     assert main(["replay", str(results("bomb_expert")), f"--output={tmp_path / 'x'}", *flags]) == 1
     assert message in capsys.readouterr().err
     assert list(tmp_path.iterdir()) == []
+
+
+def test_a_line_is_that_of_an_editor(results: Callable[..., Path], tmp_path: Path) -> None:
+    path, kept = tmp_path / "r.jsonl", results("bomb_expert").read_text().splitlines()
+    path.write_text("\n".join([kept[0], kept[1][:40], "", *kept[1:]]) + "\n")
+    assert read_line(path, 1) == json.loads(kept[0])
+    assert read_line(path, 4) == json.loads(kept[1])
+    for line in (2, 3):
+        with pytest.raises(ValueError, match=r", whose lines are 1, 4\.\.5"):
+            read_line(path, line)
 
 
 def test_a_policy_that_was_not_recorded_must_be_named(

@@ -22,7 +22,7 @@ type Rows = list[dict[str, Any]]
 
 @pytest.fixture
 def rows() -> Rows:
-    """Two policies, three conditions, 12 seeds, outcomes that differ."""
+    """Make rows of two policies, three conditions, 12 seeds, and outcomes that differ."""
     made = []
     for place, policy in enumerate((None, FDVLA)):
         for number, condition in enumerate(("none", "camera:2", "camera:4")):

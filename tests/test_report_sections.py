@@ -63,7 +63,7 @@ def report(tmp_path: Path) -> Callable[..., dict[str, Any]]:
 
 
 def columns(table: dict[str, Any]) -> list[dict[str, Any]]:
-    """Its rows by the names of their columns."""
+    """Return the table's rows by the names of their columns."""
     return [dict(zip(table["header"], row, strict=True)) for row in table["rows"]]
 
 
@@ -262,7 +262,7 @@ def test_lines_of_before_have_no_such_section_and_are_told_so(report: Callable[.
 
 
 def told_otherwise(num_deaf: int) -> Rows:
-    """Twelve episodes as told, and told otherwise; so many of these end as if nothing had been said."""
+    """Make twelve episodes as told, and told otherwise; of these, `num_deaf` end as if told nothing."""
     rows = []
     for seed in range(12):
         own = values(seed, policy=FDVLA) | {"target": [2, 2], "nearest_intersection": [2, 2]}
@@ -309,7 +309,7 @@ def test_other_weights_or_no_intervention_say_nothing_of_language(
 
 
 def failing(policy: PolicyIdentity = ACT) -> Rows:
-    """Two classes, of which one is rare, under two conditions."""
+    """Make failures of two classes, one of them rare, under two conditions."""
     classes = [None, "dropped", "dropped", "dropped", "dropped", "dropped", "imprecise"]
     return [
         values(seed, failure, policy=policy, spec={"perturbations": condition})
@@ -338,11 +338,11 @@ def test_each_sampled_failure_has_the_command_that_replays_its_line(
         assert len({row["play it again"] for row in shown}) == len(shown)
 
 
-def test_the_line_is_that_among_the_undamaged_ones_as_replay_counts(tmp_path: Path) -> None:
+def test_the_line_is_that_of_the_file_as_replay_counts(tmp_path: Path) -> None:
     path = tmp_path / "r.jsonl"
     path.write_text("damaged\n" + "".join(json.dumps(row) + "\n" for row in failing()[:2]))
     assert main(["report", str(path), f"--output={tmp_path / 'r.html'}"]) == 0
-    assert f"lerobot-bomb replay {path} --line=2" in (tmp_path / "r.html").read_text()
+    assert f"lerobot-bomb replay {path} --line=3" in (tmp_path / "r.html").read_text()
 
 
 def test_the_sample_is_the_same_each_time(report: Callable[..., dict[str, Any]]) -> None:

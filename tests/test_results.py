@@ -1,4 +1,6 @@
 import json
+import re
+from collections.abc import Callable
 from dataclasses import asdict, fields
 from pathlib import Path
 from typing import Any
@@ -29,6 +31,7 @@ def values(seed: int, failure: str | None = None, error: float | None = None, **
     is_placed = failure in (None, "disturbed_others")
     is_elsewhere = failure == "wrong_intersection" and target is not None
     result = EpisodeResult(
+        task_version="1.0",
         spec=episode,
         instruction="Put it there.",
         task_id=task_id(target, color) if target and episode.suite == "place" else episode.task_id or 0,
@@ -59,7 +62,7 @@ def row(seed: int, failure: str | None = None, error: float | None = None, **oth
 
 
 def old_row(seed: int, **other: Any) -> str:
-    """As protocol 1.0 wrote it."""
+    """Write a row as protocol 1.0 did."""
     new = values(seed, **other)
     return json.dumps(
         {name: new[name] for name in new if name not in NEW_CHECKS} | {"protocol_version": "1.0"}
@@ -67,7 +70,7 @@ def old_row(seed: int, **other: Any) -> str:
 
 
 def printed(path: Path, text: str, capsys: pytest.CaptureFixture[str]) -> str:
-    """What `lerobot-bomb results` says of a file."""
+    """Return what `lerobot-bomb results` says of a file."""
     path.write_text(text)
     assert main(["results", str(path)]) == 0
     return capsys.readouterr().out
@@ -212,6 +215,26 @@ def test_the_command_fails_in_one_line(tmp_path: Path, capsys: pytest.CaptureFix
     error = capsys.readouterr().err
     assert "absent.jsonl: no such results file" in error
     assert error.count("\n") == 1
+
+
+@pytest.mark.parametrize("of_old", [{"task_version": "1.0"}, {"protocol_version": "1.0"}])
+def test_results_of_different_task_versions_are_not_pooled(
+    of_old: dict[str, str], path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    of_object: dict[str, Any] = {"spec": {"suite": "object"}}
+    new = [row(seed, task_version="1.1", **of_object) for seed in (0, 1)]
+    make_row: Callable[..., str] = old_row if "protocol_version" in of_old else row
+    old = make_row(2, **of_object | of_old)
+    output = printed(path, "".join(new) + old, capsys)
+    assert f"{path}: 2 episodes" in output and f"{path}: 1 episode" in output
+    assert re.search(r"2 groups of episodes, .* they differ in .*task_version", output)
+
+
+def test_a_task_version_that_a_suite_never_had_is_refused() -> None:
+    with pytest.raises(
+        ValueError, match=r"task_version of suite place='1\.1' is unknown; choose one of: 1\.0"
+    ):
+        parse_line(row(0, task_version="1.1").encode())
 
 
 OTHER: dict[str, dict[str, Any]] = {

@@ -26,7 +26,7 @@ def dataset(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture
 def losses(monkeypatch: pytest.MonkeyPatch) -> list[float]:
-    """Of every step from now on."""
+    """Collect the loss of every step from now on."""
     from lerobot.scripts import lerobot_train
 
     found, update_policy = [], lerobot_train.update_policy
@@ -41,7 +41,7 @@ def losses(monkeypatch: pytest.MonkeyPatch) -> list[float]:
 
 
 def weights(output_dir: Path, step: int) -> tuple[bytes, bytes]:
-    """Those of the policy and of the optimiser."""
+    """Return the weights of the policy, and the state of the optimiser."""
     folder = output_dir / "checkpoints" / f"{step:06d}"
     files = "pretrained_model/model.safetensors", "training_state/optimizer_state.safetensors"
     policy, optimizer = ((folder / file).read_bytes() for file in files)

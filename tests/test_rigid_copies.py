@@ -21,7 +21,7 @@ def motions(number: int) -> list[RigidMotion]:
 
 
 def agent_in(image: np.ndarray) -> np.ndarray:
-    """Where the image (96, 96, 3) shows the agent, in pixels of the board."""
+    """Return where the image (96, 96, 3) shows the agent, in pixels of the board."""
     distances = np.abs(image.astype(int) - AGENT_RGB).sum(axis=2)
     rows, columns = np.nonzero(distances < 90)
     return (np.array([columns.mean(), rows.mean()]) + 0.5) * BOARD_SIZE / IMAGE_SIZE

@@ -45,7 +45,7 @@ def answers(port: int) -> bool:
 
 @pytest.fixture(scope="module")
 def port(tmp_path_factory: pytest.TempPathFactory) -> Iterator[int]:
-    """Of a server in a process of its own, which Ctrl-C ends."""
+    """Start a server in a process of its own, which Ctrl-C ends, and yield its port."""
     number = free_port()
     command = [
         sys.executable,
@@ -120,7 +120,7 @@ def test_bomb_gets_the_chunks_that_the_policy_foresees_here(
 def tap(
     client: Any, monkeypatch: pytest.MonkeyPatch
 ) -> tuple[dict[int, dict], list[tuple[int, torch.Tensor]]]:
-    """What the client sends by its step, and the chunks (K, D) that it gets, with their first step."""
+    """Tap what the client sends by its step, and the chunks (K, D) that it gets, with their first step."""
     seen, chunks = {}, []
     send, take = client.send_observation, client._aggregate_action_queues
 

@@ -71,7 +71,7 @@ def test_the_loss_is_the_likelihood_among_a_slots_cells() -> None:
     batch = make_batch(policy, 2)
     loss, _ = policy(batch)
     cells_BTG = policy.grids.encode(batch["action"])
-    logits = policy.backbone.cap(policy.cell_head(policy._hidden(batch, cells_BTG)))
+    logits = policy.backbone.cap(policy.cell_head(policy._hidden(batch, cells_BTG)[1]))
     expected = torch.stack(
         [
             cross_entropy(
@@ -84,7 +84,7 @@ def test_the_loss_is_the_likelihood_among_a_slots_cells() -> None:
     ).mean()
     torch.testing.assert_close(loss, expected)
     policy.config.loss_vocab = "full"
-    words = policy.backbone.vlm.lm_head(policy._hidden(batch, cells_BTG))
+    words = policy.backbone.vlm.lm_head(policy._hidden(batch, cells_BTG)[1])
     whole = torch.cat([logits, policy.backbone.cap(words)], dim=-1).flatten(0, 2)
     labels = (cells_BTG + torch.tensor(policy.grids.offsets)).flatten()
     torch.testing.assert_close(policy(batch)[0], cross_entropy(whole, labels))
@@ -144,7 +144,7 @@ def test_cells_are_embedded_at_the_scale_of_words() -> None:
 
 
 def saved_bytes(loss_vocab: str) -> int:
-    """What the loss keeps for the backward pass, at PaliGemma 2's vocabulary and a tiny width."""
+    """Return the bytes that the loss keeps for its backward pass, at PaliGemma 2's vocabulary."""
     policy = make_policy(num_dims=7, loss_vocab=loss_vocab)
     hidden_size = 8
     policy.backbone.vlm.lm_head = nn.Linear(hidden_size, 257_152, bias=False)
@@ -225,7 +225,7 @@ def test_dropped_actions_are_not_averaged_either() -> None:
 
 
 def test_an_ensemble_weighs_by_agreement_but_for_the_gripper() -> None:
-    """As the original's evaluations: exp(0.1 times the cosine with the newest action)."""
+    """Check the weights of the original's evaluations: exp(0.1 times the cosine with the newest action)."""
     options: dict[str, Any] = {"n_action_steps": 1, "temporal_ensemble_size": 2}
     policy = make_policy(num_dims=7, **options)
     first, second = make_batch(policy, 1, seed=1), make_batch(policy, 1, seed=2)
@@ -334,7 +334,7 @@ def test_a_copy_of_the_policy_acts_alike() -> None:
 
 @pytest.mark.parametrize("tasks", [["", ""], ["", "go"]])
 def test_an_environment_may_name_no_task(tasks: list[str]) -> None:
-    """As PushT does: its text is empty."""
+    """Check the empty text, which PushT gives."""
     policy = make_policy()
     preprocessor, _ = make_pre_post_processors(policy.config, dataset_stats=stats())
     batch = make_batch(policy, 2)

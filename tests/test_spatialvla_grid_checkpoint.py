@@ -42,7 +42,7 @@ def meta(tmp_path_factory: pytest.TempPathFactory) -> LeRobotDatasetMetadata:
 
 
 def physical_rms(policy: SpatialvlaGridPolicy, meta: LeRobotDatasetMetadata) -> float:
-    """What the grids round off of a dataset's actions, in normalised units."""
+    """Return what the grids round off of a dataset's actions, in normalised units."""
     assert meta.stats is not None
     actions = read_columns(meta, ("action",))["action"]
     low, high = meta.stats["action"]["min"], meta.stats["action"]["max"]

@@ -55,7 +55,7 @@ def base(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def adapted(base: Path, meta: LeRobotDatasetMetadata, **flags: object) -> SpatialvlaGridPolicy:
-    """As `lerobot-train --policy.path` has it before it puts adapters on."""
+    """Load a policy as `lerobot-train --policy.path` has it before it adds adapters."""
     overrides = [f"--{name}={value}" for name, value in flags.items()]
     config: Any = PreTrainedConfig.from_pretrained(base, cli_overrides=overrides)
     config.pretrained_path = base
@@ -65,7 +65,7 @@ def adapted(base: Path, meta: LeRobotDatasetMetadata, **flags: object) -> Spatia
 def test_adapters_hold_the_cells_of_adapted_grids(
     base: Path, meta: LeRobotDatasetMetadata, stock_cli: Callable[..., None], tmp_path: Path
 ) -> None:
-    """Trained, resumed, loaded on the base and merged: the grids are those of the new data everywhere."""
+    """Train, resume, load on the base and merge: the grids are those of the new data everywhere."""
     flags = f"--policy.path={base} --dataset.repo_id={REPO_ID} --dataset.root={meta.root} --batch_size=2"
     flags += " --num_workers=0 --steps=2 --save_freq=1 --peft.method_type=LORA --peft.r=4 --peft.lora_alpha=4"
     flags += " --peft.init_type=gaussian --policy.optimizer_lr=5e-4 --policy.scheduler_warmup_steps=0"
@@ -98,7 +98,7 @@ def test_adapters_hold_the_cells_of_adapted_grids(
 
 
 def test_adapters_are_where_the_original_has_them(base: Path, meta: LeRobotDatasetMetadata) -> None:
-    """On every linear layer that its fine-tuning names, by their names there."""
+    """Check every linear layer that the original's fine-tuning names, by the names there."""
     theirs = (
         "q_proj k_proj v_proj o_proj gate_proj up_proj down_proj fc1 fc2 out_proj linear layers.0 layers.3"
     )

@@ -1,4 +1,4 @@
-"""What a training can start from: a checkpoint on data like its own, its backbone on any other."""
+"""Starts of a training: a checkpoint on data like its own, its backbone on any other."""
 
 from pathlib import Path
 from typing import Any
@@ -50,14 +50,14 @@ def datasets(tmp_path_factory: pytest.TempPathFactory) -> dict[str, LeRobotDatas
 
 
 def go_on(checkpoint: Path, dataset: LeRobotDataset) -> Any:
-    """As lerobot-train --policy.path does."""
+    """Load a policy as lerobot-train --policy.path does."""
     config = PreTrainedConfig.from_pretrained(checkpoint)
     config.pretrained_path = checkpoint
     return make_policy(config, ds_meta=dataset.meta)
 
 
 def from_flags(policy_type: str, **values: Any) -> Any:
-    """As --policy.type does: features are the dataset's."""
+    """Make a config as --policy.type does: features are the dataset's."""
     config = CASES[policy_type].make_config()
     config.input_features = {}
     for name, value in values.items():

@@ -32,7 +32,7 @@ def recorded(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture
 def averaged(recorded: Path, tmp_path: Path) -> Path:
-    """The same with quantiles of the action as LeRobot has them: means over the episodes'."""
+    """Copy the dataset with quantiles of the action as LeRobot has them: means over the episodes'."""
     root = shutil.copytree(recorded, tmp_path / "averaged")
     (path,) = (root / "meta" / "episodes").rglob("*.parquet")
     episodes = pq.read_table(path)

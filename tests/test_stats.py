@@ -211,7 +211,7 @@ def test_the_number_of_pairs_is_that_of_the_exact_test(
 )
 def test_one_pair_less_is_too_few(counts: PairedCounts) -> None:
     def power(n: int) -> float:
-        """By every outcome of n pairs."""
+        """Return the power over every outcome of n pairs."""
         share, second = 1 - (counts.both + counts.neither) / counts.n, counts.only_second
         second = second / (counts.only_first + counts.only_second)
         return sum(

@@ -27,7 +27,7 @@ ACT = PolicyIdentity("act")
 
 
 def info(suite: str, task_id: int, rewards: list[float]) -> dict[str, Any]:
-    """What lerobot-eval writes of a task, whose episode is a success with a reward of 1."""
+    """Return what lerobot-eval writes of a task, whose episode is a success with a reward of 1."""
     successes = [reward == 1 for reward in rewards]
     metrics = {"sum_rewards": rewards, "max_rewards": rewards, "successes": successes}
     return {"per_task": [{"task_group": suite, "task_id": task_id, "metrics": metrics}]}

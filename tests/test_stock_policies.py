@@ -52,7 +52,7 @@ def train(run: Run, stock_type: str, dataset: Path, folder: Path) -> Path:
 
 
 def evaluate(run: Run, checkpoint: Path, folder: Path, *flags: str) -> list[Row]:
-    """Of one perturbed episode of 20 steps."""
+    """Run one perturbed episode of 20 steps."""
     env = "--env.type=bomb --env.image_size=64 --env.fps=2 --env.ignore_checkpoint=true"
     batch = "--eval.n_episodes=1 --eval.batch_size=1 --eval.use_async_envs=false --policy.device=cpu"
     results = folder / "results.jsonl"
@@ -72,7 +72,7 @@ def evaluate(run: Run, checkpoint: Path, folder: Path, *flags: str) -> list[Row]
 
 
 def check_weights(stock_type: str, checkpoint: Path, folder: Path) -> None:
-    """The base's after one small step, and loaded as saved: some types only print that they could not."""
+    """Check weights: the base's after one small step, and loaded as saved; some types only print failures."""
     trained = load_file(checkpoint / "model.safetensors")
     if stock_type not in FROM_SCRATCH:
         for name, weights in load_file(folder / BASE / "model.safetensors").items():

@@ -35,7 +35,7 @@ def stones_on_board(episode: PerturbedEpisode) -> dict[Cell, str]:
 
 
 def meant_stones(instruction: str, episode: PerturbedEpisode) -> set[int]:
-    """What a reader of the sentence, who knows nothing of the suites, takes from the tray."""
+    """Return the stones that a reader of the sentence, who knows no suite, takes from the tray."""
     layout, supply = episode.layout, list(episode.supply)
     xy = {i: layout.stone_xy[i] for i in supply}
     color = {i: "white" if layout.stone_is_white[i] else "black" for i in supply}
@@ -52,9 +52,10 @@ def meant_stones(instruction: str, episode: PerturbedEpisode) -> set[int]:
         distance = {i: float(np.hypot(*(xy[i] - origin))) for i in others}
         best = pick(distance.values())
         return {i for i in others if abs(distance[i] - best) < 0.010}
-    if found := re.search(r"the (left|right)most stone", instruction):
-        edge = (min if found[1] == "left" else max)(xy[i][0] for i in supply)
-        return {i for i in supply if abs(xy[i][0] - edge) < 0.010}
+    if found := re.search(r"the (left|right|front)most stone", instruction):
+        axis = 1 if found[1] == "front" else 0
+        edge = (max if found[1] == "right" else min)(xy[i][axis] for i in supply)
+        return {i for i in supply if abs(xy[i][axis] - edge) < 0.010}
     moved = re.sub(r"(left of|right of|behind|in front of|between) the (two )?\w+ stones?", "", instruction)
     found = re.search(r"\b(?:the|a) (black|white) (?:stone|piece)", moved.lower())
     assert found, instruction
@@ -62,7 +63,7 @@ def meant_stones(instruction: str, episode: PerturbedEpisode) -> set[int]:
 
 
 def meant_places(instruction: str, episode: PerturbedEpisode) -> set[Cell]:
-    """Where that reader puts it."""
+    """Return the places where that reader puts a stone."""
     stones = stones_on_board(episode)
     free = {(row, column) for row in range(5) for column in range(5)} - set(stones)
     if found := re.search(

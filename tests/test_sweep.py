@@ -34,7 +34,7 @@ def small(
 
 
 def lines_of(cell: Cell) -> list[str]:
-    """As many as it has episodes."""
+    """Return as many lines as the cell has episodes."""
     return [json.dumps({"spec": {"seed": seed}}) for seed in cell.seeds]
 
 
@@ -160,7 +160,7 @@ def play(tmp_path: Path) -> Callable[[Manifest], Store]:
 
 
 def by_seed(rows: list[Row]) -> list[Row]:
-    """What is the same whoever plays the episodes."""
+    """Return what is the same whoever runs the episodes."""
     return sorted(map(without_measured, rows), key=lambda row: row["spec"]["seed"])
 
 
@@ -385,6 +385,8 @@ def test_readers_say_what_a_sweep_that_was_stopped_lacks(tmp_path: Path) -> None
     errors = f"an error ended 2: {tmp_path / 'errors.jsonl'}"
     assert missing_of_sweep(results, 4) == f"{results}: 2 of 6 episodes are missing; {errors}"
     assert missing_of_sweep(tmp_path / "other.jsonl", 2) == ""
+    (tmp_path / "manifest.json").write_text('{"version"')
+    assert "whether episodes are missing cannot be said: " in missing_of_sweep(results, 2)
 
 
 @pytest.mark.long

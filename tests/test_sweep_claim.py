@@ -1,4 +1,4 @@
-"""Whose a sweep's folder is, and how a finished sweep grows."""
+"""Claims on a sweep's folder, and how a finished sweep grows."""
 
 from pathlib import Path
 
@@ -12,7 +12,7 @@ PLAY = ("--dry_run", "--seed=7", "--tasks=place", *FLAGS)
 
 
 def finish(folder: Path, manifest: Manifest) -> None:
-    """As if all had been played."""
+    """Finish every cell as if all had been run."""
     with claimed(folder, manifest) as store:
         for cell in manifest.cells:
             store.finish(cell, lines_of(cell), [])

@@ -9,7 +9,7 @@ from typing import Any
 
 import pytest
 
-from lerobot_bomb.commands import sweep as command
+from lerobot_bomb.commands import cluster_jobs
 from lerobot_bomb.commands.main import main
 from lerobot_bomb.sweep import local
 from lerobot_bomb.sweep.cluster import sbatch_script
@@ -35,7 +35,7 @@ def sweep(*flags: str | Path) -> int:
 
 @pytest.fixture(scope="module")
 def expected_lines(tmp_path_factory: pytest.TempPathFactory) -> str:
-    """Of all cells, played in this process."""
+    """Return the lines of all cells, run in this process."""
     from lerobot_bomb.sweep.worker import Worker
 
     manifest = plan(("bomb_expert",), (), CONDITIONS, seed=7, num_episodes=2, batch_size=2, flags=FLAGS)
@@ -56,6 +56,7 @@ def expected_lines(tmp_path_factory: pytest.TempPathFactory) -> str:
         ("GPU-8f1c,MIG-2a", ["GPU-8f1c", "MIG-2a"]),
         ("", []),
         ("-1", []),
+        ("0,-1,1", ["0"]),
         (None, ["0", "1", "2"]),
     ],
 )
@@ -166,7 +167,7 @@ class Job:
 def test_jobs_that_end_before_they_played_are_told(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    monkeypatch.setattr(command, "submit", lambda *args: [Job(is_done=True)])
+    monkeypatch.setattr(cluster_jobs, "submit", lambda *args: [Job(is_done=True)])
     assert sweep(tmp_path, "--submitit=1", *SWEEP) == 1
     printed = capsys.readouterr().out
     assert f"jobs ended before they had played everything; {tmp_path / 'submitit'} says why" in printed
@@ -180,7 +181,7 @@ def test_ctrl_c_cancels_the_jobs(
         raise KeyboardInterrupt
 
     job = Job(is_done=False)
-    monkeypatch.setattr(command, "submit", lambda *args: [job])
+    monkeypatch.setattr(cluster_jobs, "submit", lambda *args: [job])
     monkeypatch.setattr(time, "sleep", interrupted)
     assert sweep(tmp_path, "--submitit=1", *SWEEP) == 130
     printed = capsys.readouterr()

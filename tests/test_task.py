@@ -116,7 +116,7 @@ def test_the_instruction_names_colour_row_and_column() -> None:
 
 
 def test_the_target_is_where_its_row_and_column_say() -> None:
-    corner = sample_episode(EpisodeSpec(seed=0, target=(0, 4))).goals[0].xyz
+    corner = sample_episode(EpisodeSpec(seed=0, target=(0, 4))).goals_after(0)[0].xyz
     np.testing.assert_allclose(corner, [0.09, 0.09, 0.0095], atol=1e-12)
 
 

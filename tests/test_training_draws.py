@@ -1,4 +1,4 @@
-"""What is random in training follows from the seed, the process and the number of batches before."""
+"""Draws of a training follow from the seed, the process and the number of batches before."""
 
 from collections.abc import Callable
 from typing import Any
@@ -18,7 +18,7 @@ class Counter:
 
 
 def draw(config: Counter, num_batches: int) -> list[list[int]]:
-    """Of each batch the first two numbers."""
+    """Return the first two numbers of each batch."""
     generator, drawn = torch.Generator(), []
     for _ in range(num_batches):
         begin_batch(config, generator)

@@ -1,4 +1,4 @@
-"""What the policy server unpickles: LeRobot's messages, as pickle does, and nothing that harms it."""
+"""Unpickling by the policy server: LeRobot's messages, as pickle reads them, and nothing that harms it."""
 
 import pickle
 import subprocess
@@ -79,7 +79,7 @@ class Calls:
 
 
 def state(shape: Any, dtype: Any, data: Any) -> tuple:
-    """Of an array."""
+    """Return the state of an array."""
     return 1, shape, dtype, False, data
 
 
@@ -96,7 +96,7 @@ def dtype_with(*state: Any) -> Calls:
 
 
 def tensor(offset: Any, size: Any, stride: Any) -> Calls:
-    """Of a storage of six numbers."""
+    """Return the call that makes a tensor of a storage of six numbers."""
     return Calls(
         _rebuild_tensor_v2,
         torch.arange(6.0).storage(),

@@ -52,7 +52,7 @@ def folder(family: str, tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def policy_of(folder: Path, family: str, **options: Any) -> Vla0SmolPolicy:
-    """It sees whole images, which the batches below have in its own size, and hides nothing."""
+    """Make a policy that sees whole images, whose size the batches below have, and hides nothing."""
     fixed: dict[str, Any] = {"crop_fraction": 1.0, "mask_max_fraction": 0.0}
     return make_policy(vlm_model_name=str(folder), **{**fixed, **options_of(family), **options})
 
@@ -115,7 +115,7 @@ def test_a_folders_own_class_and_weights_are_loaded(
 def test_logits_are_the_stock_models_images_and_positions_included(policy: Vla0SmolPolicy) -> None:
     batch = own_size_batch(policy, 3)
     answer = policy._answer(numbers_of(policy, batch)).rows
-    logits = policy._answer_logits(batch, policy._prompt(batch), answer)
+    logits = policy._answer_logits(policy._see(batch), policy._prompt(batch), answer)
     for row, ids in enumerate(sequence(policy, batch)):
         inputs = stock_inputs(policy, torch.tensor(ids), images_of(batch, row))
         expected = policy.backbone.vlm(**inputs).logits[0]
@@ -156,7 +156,7 @@ def test_the_cache_gives_the_logits_of_a_full_pass(policy: Vla0SmolPolicy) -> No
     batch = own_size_batch(policy, 2)
     prompt, numbers = policy._prompt(batch).without_padding(), numbers_of(policy, batch)
     answer = policy._answer(numbers).rows
-    full = policy._answer_logits(batch, prompt, answer)[..., policy.symbol_ids]
+    full = policy._answer_logits(policy._see(batch), prompt, answer)[..., policy.symbol_ids]
     said = (answer.ids[..., None] == policy.symbol_ids).long().argmax(dim=-1)
     embeds = policy._embeds(batch, prompt.ids)
     model = continue_prompt(

@@ -37,7 +37,7 @@ from lerobot_policy_vla0_smol.modeling_vla0_smol import Vla0SmolPolicy
 
 @pytest.fixture(scope="module")
 def meta(tmp_path_factory: pytest.TempPathFactory) -> LeRobotDatasetMetadata:
-    """Of a dataset that a policy is made for."""
+    """Make a dataset that a policy is made for."""
     return make_dataset(tmp_path_factory.mktemp("data") / "small", 0.1)
 
 
@@ -133,7 +133,7 @@ torch.save(postprocessor(policy.select_action(preprocessor(batch))), sys.argv[3]
 
 
 def test_a_checkpoint_needs_nothing_but_itself(tmp_path: Path) -> None:
-    """Another process, no network, empty Hub cache, and a base model that does not exist any more."""
+    """Load in another process without network, with an empty Hub cache and no base model."""
     policy = make_policy(nano_config=None)  # which changes nano alone
     batch = make_batch(policy, 4)
     save(policy, tmp_path / "model")
@@ -325,7 +325,7 @@ def test_an_instruction_beyond_the_positions_is_refused_before_training(
 
 
 def test_an_instruction_beyond_the_positions_is_not_trained_on() -> None:
-    """Where nobody looked before, as without the dataset."""
+    """Check the sequence itself, where nothing has looked before: there is no dataset."""
     policy = make_policy().train()
     batch = make_batch(policy, 2)
     batch[OBS_LANGUAGE_TOKENS] = torch.zeros(2, 4100, dtype=torch.int64)

@@ -55,7 +55,8 @@ def test_decoding_follows_the_teacher_forced_argmax(overfit: tuple[Vla0SmolPolic
     batch = make_batch(policy, 3, seed=9)  # unseen
     batch["action"] = policy.predict_action_chunk(batch)
     answer = policy._answer(numbers_of(policy, batch))
-    logits = policy._answer_logits(batch, policy._prompt(batch), answer.rows)[..., policy.symbol_ids]
+    prompt, features = policy._prompt(batch), policy._see(batch)
+    logits = policy._answer_logits(features, prompt, answer.rows)[..., policy.symbol_ids]
     for row_logits, row_labels in zip(logits, answer.labels, strict=True):
         place = policy.grammar.start(1)
         # every answer begins with a space
@@ -192,7 +193,7 @@ def test_another_size_of_batch_needs_a_reset(options: dict[str, Any]) -> None:
 
 
 def test_in_bfloat16_no_two_digits_are_equally_likely() -> None:
-    """In bfloat16's own head a digit in a dozen is, and argmax takes the lower."""
+    """Check ties: in bfloat16's own head a digit in a dozen has one, and argmax takes the lower."""
     policy = make_policy(dtype="bfloat16", chunk_size=40)
     seen: list[Tensor] = []
 

@@ -31,7 +31,7 @@ def published_qwen(shared_data: Path, tmp_path_factory: pytest.TempPathFactory) 
 def test_the_sequence_is_that_of_qwens_real_processor(
     published_qwen: Vla0SmolPolicy, shared_data: Path, system_prompt: str | None
 ) -> None:
-    """Its chat template, its image tokens, its tokenizer."""
+    """Check its chat template, its image tokens, its tokenizer."""
     name = published_qwen.config.vlm_model_name
     policy = make_policy(vlm_model_name=name, system_prompt=system_prompt)
     processor: Any = AutoProcessor.from_pretrained(shared_data / "qwen2_5_vl")
@@ -63,14 +63,14 @@ def test_qwens_real_tokenizer_trains_and_decodes(published_qwen: Vla0SmolPolicy)
 
 
 def test_a_nano_tokenizer_serves_qwen_too() -> None:
-    """Of a backbone that was exported from an `fdvla` of nano's size."""
+    """Check a backbone that was exported from an `fdvla` of nano's size."""
     tokens = PromptTokens.from_tokenizer(load_tokenizer("nano"), "nano", chat=QWEN_CHAT)
     token_id = load_tokenizer("nano").token_to_id
     assert (tokens.image, tokens.symbols[END]) == (token_id("<image>"), token_id("<|im_end|>"))
 
 
 def test_a_tokenizer_without_tile_tokens_writes_them_as_text(shared_data: Path) -> None:
-    """As that of the first 2.2B, which has three special tokens beside SmolLM2's: 49,155 in all."""
+    """Check a tokenizer as of the first 2.2B: three special tokens beside SmolLM2's, 49,155 in all."""
     stored = json.loads((shared_data / "SmolVLM2-500M-Video-Instruct" / "tokenizer.json").read_text())
     num_words = len(stored["model"]["vocab"])
     kept = [token for token in stored["added_tokens"] if token["id"] < num_words]

@@ -32,7 +32,7 @@ def test_written_numbers_are_the_residuals(tmp_path: Path) -> None:
     batch = make_batch(policy, 1)
     batch["observation.state"] = normalise(state_raw, state)[None]
     batch["action"] = normalise(action_raw, action).expand(1, 3, 4)
-    written = policy.action_bins.decode(policy._bins(batch)).view(3, 4)[0]
+    written = policy.action_bins.decode(policy._targets(batch)[0]).view(3, 4)[0]
     unit = policy.relative.scale.numpy() * (action["max"] - action["min"]) / 2
     np.testing.assert_allclose(
         written.numpy() * unit, (action_raw - state_raw).clip(-unit, unit), atol=unit.max() / 998
@@ -113,7 +113,7 @@ def test_excluded_dimensions_stay_absolute(tmp_path: Path) -> None:
 
 
 def test_names_that_a_dataset_groups_are_found_by_lerobots_factory(tmp_path: Path) -> None:
-    """As those of lerobot/pusht are; from scratch, and from a checkpoint."""
+    """Check names such as lerobot/pusht's, from scratch and from a checkpoint."""
     meta = make_dataset(tmp_path / "data", 0.1, names={"motors": NAMES})
     config = make_config(relative_actions=True, relative_exclude_joints=["grip"])
     for _ in range(2):
@@ -128,7 +128,7 @@ def test_names_that_a_dataset_groups_are_found_by_lerobots_factory(tmp_path: Pat
 def test_the_scale_is_that_of_the_episodes_that_are_here(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Of a dataset on the Hub, LeRobot downloads the data files of --dataset.episodes; streamed, none."""
+    """Check a dataset on the Hub: LeRobot downloads the data files of --dataset.episodes; streamed, none."""
     here = build(make_dataset(tmp_path / "here", 0.1)).relative
     meta = make_dataset(tmp_path / "data", 0.1)
     file = meta.get_data_file_path(0)

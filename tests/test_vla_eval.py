@@ -133,7 +133,7 @@ def test_a_wrong_flag_is_named(flags: dict[str, Any], message: str) -> None:
 
 
 def started(argv: list[str], monkeypatch: pytest.MonkeyPatch) -> tuple[CheckpointServer, str, int]:
-    """What `python -m lerobot_bomb.harness` would serve, and where."""
+    """Return what `python -m lerobot_bomb.harness` would serve, and where."""
     served: list[Any] = []
     monkeypatch.setattr(serve, "serve", lambda server, host, port: served.extend((server, host, port)))
     monkeypatch.setattr(sys, "argv", ["harness", *argv])
@@ -166,7 +166,7 @@ def test_a_missing_checkpoint_ends_it_in_one_line(
 
 
 def write_libero_policy(folder: Path) -> None:
-    """An untrained one of what LIBERO's demonstrations show."""
+    """Write an untrained policy of what LIBERO's demonstrations show."""
     register_third_party_plugins()
     shapes = {key: shape for key, shape in SEEN_IN_LIBERO.items() if key != ACTION}
     kinds = {key: FeatureType.STATE if key == OBS_STATE else FeatureType.VISUAL for key in shapes}

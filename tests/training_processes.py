@@ -38,7 +38,7 @@ class Seen:
     text: str
 
     def mean_losses(self, training: int) -> list[float]:
-        """Over the processes, as LeRobot logs them."""
+        """Average the losses over the processes, as LeRobot logs them."""
         return [sum(of) / len(of) for of in zip(*(losses[training] for losses in self.losses), strict=True)]
 
 
@@ -60,7 +60,7 @@ def in_processes(trainings: Sequence[Training], folder: Path) -> Seen:
 
 @contextmanager
 def seen_losses() -> Iterator[list[float]]:
-    """Of every step of `lerobot-train` in this process from now on."""
+    """Collect the loss of every step of `lerobot-train` in this process from now on."""
     from lerobot.scripts import lerobot_train
 
     found, update_policy = [], lerobot_train.update_policy
@@ -128,7 +128,7 @@ def sharded_on_cpu() -> Iterator[None]:
 
 
 def train(folder: Path) -> None:
-    """In each process, what the file in the folder says."""
+    """Run the file's trainings in each process."""
     from accelerate.state import AcceleratorState
     from lerobot.scripts import lerobot_train
 
@@ -144,7 +144,7 @@ def train(folder: Path) -> None:
 
 
 def main(folder: Path) -> None:
-    """Import once, then fork."""
+    """Import once, then fork the processes."""
     from accelerate import debug_launcher
     from lerobot.scripts import lerobot_train  # noqa: F401
 

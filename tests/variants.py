@@ -62,7 +62,7 @@ PAIRS: dict[str, dict[str, Options]] = {
 
 
 def small_policy(policy_type: str) -> Options:
-    """What configs/overfit_TYPE.yaml sets, for short chunks and the network of configs/one_target_TYPE.yaml.
+    """Return what configs/overfit_TYPE.yaml sets, for short chunks and one_target_TYPE.yaml's network.
 
     That sees fewer patches through fewer layers: learning by heart takes a third of the time.
     """

@@ -61,11 +61,11 @@ def make_batch(policy: Vla0SmolPolicy, batch_size: int, seed: int = 0) -> dict[s
 
 def numbers_of(policy: Vla0SmolPolicy, batch: dict[str, Any]) -> NumberTokens:
     """The actions of a batch as the policy writes them."""
-    return policy._numbers(batch, policy._bins(batch))
+    return policy._numbers(*policy._targets(batch))
 
 
 def sequence(policy: Vla0SmolPolicy, batch: dict[str, Any]) -> list[list[int]]:
-    """Of each row, the ids of question and answer without padding."""
+    """Return each row's ids of question and answer, without padding."""
     prompt, answer = policy._prompt(batch), policy._answer(numbers_of(policy, batch)).rows
     pairs = zip(prompt.ids, prompt.mask, answer.ids, answer.mask, strict=True)
     return [[*ids[keep].tolist(), *said[kept].tolist()] for ids, keep, said, kept in pairs]

@@ -1,4 +1,4 @@
-"""From a policy's action to the gripper's command: control mode, latency, noise."""
+"""Actuator: a policy's action becomes the gripper's command, by control mode, latency and noise."""
 
 from collections import deque
 
@@ -10,7 +10,7 @@ from lerobot_env_bomb.axes.dynamics import Dynamics
 
 
 class Actuator:
-    """What executes actions in one episode; `dynamics` makes it late and imprecise."""
+    """Actuator of one episode; `dynamics` makes it late and imprecise."""
 
     def __init__(self, control_mode: str, gripper_xyz: np.ndarray, dynamics: Dynamics | None, seed: int):
         self._is_absolute = control_mode == "absolute"

@@ -28,7 +28,7 @@ def alternatives(episode: PerturbedEpisode) -> dict[str, tuple[str, Cell]]:
 
 
 def _reworded(episode: PerturbedEpisode, changes: list[dict]) -> Iterator[tuple[str, Cell]]:
-    """Those of which the split has an episode."""
+    """Yield the instructions and targets of the changes for which the split has an episode."""
     suite = find_suite(episode.spec.suite)
     same = {"target": episode.target, "color": episode.color}
     for change in changes:

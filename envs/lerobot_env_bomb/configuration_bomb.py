@@ -11,7 +11,7 @@ from lerobot.envs import EnvConfig
 from lerobot.processor import PolicyProcessorPipeline
 from lerobot.utils.constants import ACTION, OBS_IMAGES, OBS_PREFIX, OBS_STATE
 
-from lerobot_bomb.bomb.episode import DEFAULT_FPS, TASK_VERSION, EpisodeSpec
+from lerobot_bomb.bomb.episode import DEFAULT_FPS, EpisodeSpec
 from lerobot_bomb.bomb.observation import (
     ACTION_DIM,
     AGENT_POS,
@@ -21,8 +21,7 @@ from lerobot_bomb.bomb.observation import (
     geometry_shapes,
 )
 from lerobot_bomb.bomb.perturbations import Condition
-from lerobot_bomb.bomb.suite import find_suite, specs_of_tasks
-from lerobot_bomb.bomb.suites import SUITES
+from lerobot_bomb.bomb.suite import find_suite, specs_of_tasks, suites_of, task_version
 from lerobot_bomb.checkpoints.environment import check_acting_policy
 from lerobot_bomb.checkpoints.identity import policy_of_results
 from lerobot_bomb.checkpoints.queries import last_query
@@ -104,8 +103,8 @@ class BombEnvConfig(EnvConfig):
 
     @property
     def suites(self) -> tuple[str, ...]:
-        """Those that are played."""
-        return SUITES if self.task == ALL else (str(self.task),)
+        """Suites that are run."""
+        return suites_of(str(self.task))
 
     @property
     def groups(self) -> dict[str, list[EpisodeSpec]]:
@@ -153,21 +152,23 @@ class BombEnvConfig(EnvConfig):
 
     @property
     def environment(self) -> Environment:
-        """What a policy must have been trained for to act here."""
+        """Environment that a policy must have been trained for to act here."""
         return Environment(
             robot=self.robot,
             control_mode=self.control_mode,
             fps=self.fps,
             image_size=self.image_size,
             cameras=CAMERAS,
-            task_version=TASK_VERSION,
+            task_version=task_version(str(self.task)),
             task=str(self.task),
             depth=self.depth,
             task_ids=tuple(self.task_ids or ()),
         )
 
     def get_env_processors(self) -> tuple[PolicyProcessorPipeline, PolicyProcessorPipeline]:
-        """None; every command asks for them once, when its policy is built and nothing has been played.
+        """Return LeRobot's processors, which change nothing, after a check of the policy that acts.
+
+        Every command asks for them once, when its policy is built and no episode has begun.
 
         Raises:
             ValueError: that policy was trained for another environment.

@@ -1,11 +1,12 @@
 """BOMB as a Gymnasium environment."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
 
 from lerobot_bomb.bomb.board import Cell
+from lerobot_bomb.bomb.camera import Camera
 from lerobot_bomb.bomb.episode import DEFAULT_FPS, PHYSICS_HZ, EpisodeSpec
 from lerobot_bomb.bomb.judge import Judge
 from lerobot_bomb.bomb.layout import Snapshot
@@ -17,6 +18,7 @@ from lerobot_bomb.bomb.observation import (
     RenderOptions,
 )
 from lerobot_bomb.bomb.privileged_state import PrivilegedState
+from lerobot_bomb.bomb.streams import Stream, generator
 from lerobot_bomb.bomb.suite import find_suite
 from lerobot_bomb.envs.episode_env import EpisodeEnv, Observation, Transition
 from lerobot_bomb.envs.results import EpisodeResult, PolicyIdentity
@@ -29,6 +31,7 @@ from lerobot_env_bomb.perturb import PerturbedEpisode, sample_episode
 from lerobot_env_bomb.render import CameraRenderer, compose_caption, extrinsics, intrinsics
 from lerobot_env_bomb.scene import Scene
 from lerobot_env_bomb.spaces import action_space, observation_space
+from lerobot_env_bomb.static_scene import StaticScene, draw_static, start_of
 
 DEFAULT_SPEC = EpisodeSpec(seed=0)
 DEFAULT_RENDER_OPTIONS = RenderOptions()
@@ -37,12 +40,18 @@ PERSON_IMAGE_SIZE = 384  # pixels, either half of render()'s image
 
 @dataclass(frozen=True)
 class _Run:
-    """What exists once an episode has been started."""
+    """State of an episode that has been started."""
 
     scene: Scene
     episode: PerturbedEpisode
     judge: Judge
     actuator: Actuator
+    moves_before: int = 0  # that a static scene shows as made
+
+    @property
+    def num_made(self) -> int:
+        """Moves that have been made."""
+        return self.moves_before + self.judge.num_made
 
 
 class BombEnv(EpisodeEnv[EpisodeSpec, _Run, EpisodeResult]):
@@ -86,18 +95,34 @@ class BombEnv(EpisodeEnv[EpisodeSpec, _Run, EpisodeResult]):
 
     def _begin(self, spec: EpisodeSpec) -> tuple[Observation, dict[str, Any]]:
         episode = sample_episode(spec)
+        self._set_up(episode, start_of(episode))
+        return self._observe(), self._info()
+
+    def show_static(self, seed: int) -> tuple[Observation, EpisodeResult]:
+        """The board of a seed's episode as it may stand midway, which cannot be run from there.
+
+        The result says which episode it is of; nothing has become of that.
+        """
+        episode = sample_episode(replace(self._spec, seed=seed))
+        self._steps = 0
+        self._set_up(episode, draw_static(episode, generator(seed, Stream.STATIC)))
+        return self._observe(), self._result(self._run)
+
+    def _set_up(self, episode: PerturbedEpisode, start: StaticScene) -> None:
         scene = self._current_run.scene if self._current_run is not None else Scene(self._spec.robot)
-        scene.reset(episode.layout, episode.perturbation.model_edits, episode.pattern)
-        self._now = start = scene.measure()
+        scene.reset(start.layout, episode.perturbation.model_edits, episode.pattern)
+        if start.held is not None:
+            scene.hold(start.held, start.held_xyz, start.opening_m)
+        self._now = now = scene.measure()
         dynamics = episode.perturbation.of(Dynamics)
         self._current_run = _Run(
             scene=scene,
             episode=episode,
-            judge=Judge(episode, self._spec.fps, start),
-            actuator=Actuator(self._spec.control_mode, start.gripper_xyz, dynamics, episode.spec.seed),
+            judge=Judge(episode, self._spec.fps, now),
+            actuator=Actuator(self._spec.control_mode, now.gripper_xyz, dynamics, episode.spec.seed),
+            moves_before=start.num_made,
         )
-        self.task_description = episode.instruction
-        return self._observe(), self._info()
+        self.task_description = episode.instruction_after(start.num_made)
 
     def _advance(self, run: _Run, action: np.ndarray) -> Transition:
         target_xyz, open_fingers = run.actuator.command(action, self._now.gripper_xyz)
@@ -111,7 +136,7 @@ class BombEnv(EpisodeEnv[EpisodeSpec, _Run, EpisodeResult]):
         return self._observe(), float(run.judge.is_success), terminated, truncated, self._info()
 
     def _draw_for_people(self, run: _Run) -> np.ndarray:
-        """Both cameras, the instruction, how the episode stands."""
+        """Draw both cameras, the instruction, and how the episode stands."""
         images = [self._draw(camera, PERSON_IMAGE_SIZE) for camera in CAMERAS]
         episode = run.episode
         error_mm = run.judge.placement_error_mm
@@ -149,6 +174,7 @@ class BombEnv(EpisodeEnv[EpisodeSpec, _Run, EpisodeResult]):
             policy=self._policy,
             opengl_vendor=self._renderer and self._renderer.opengl_vendor,
             opengl_renderer=self._renderer and self._renderer.opengl_renderer,
+            task_version=find_suite(episode.spec.suite).version,
         )
 
     def close(self) -> None:
@@ -163,7 +189,7 @@ class BombEnv(EpisodeEnv[EpisodeSpec, _Run, EpisodeResult]):
         return PrivilegedState(
             gripper_xyz=now.gripper_xyz,
             finger_opening=now.finger_opening,
-            goals=run.episode.goals,
+            goals=run.episode.goals_after(run.num_made),
             stone_xyz=now.stone_xyz,
             stone_is_white=run.episode.layout.stone_is_white,
             stone_in_play=run.episode.layout.stone_in_play,
@@ -179,19 +205,27 @@ class BombEnv(EpisodeEnv[EpisodeSpec, _Run, EpisodeResult]):
     def object_masks(self) -> dict[str, dict[str, np.ndarray]]:
         """{camera: {what: (H, W) bool}} of the observation's images, by what their pixels show."""
         run, size = self._run, self._render_options.image_size
-        goals = run.episode.goals
+        goals = run.episode.goals_after(run.judge.num_made)
         goal = goals[min(run.judge.num_made, len(goals) - 1)]
         return {
             camera: object_masks(run.scene, self._camera_renderer, camera, size, goal.stone, goal.xyz[:2])
             for camera in CAMERAS
         }
 
+    def cameras(self) -> dict[str, Camera]:
+        """Return each camera of the observation's images, as it stands now."""
+        scene, size = self._run.scene, self._render_options.image_size
+        return {
+            camera: Camera(intrinsics(scene.model, camera, size), extrinsics(scene.data, camera))
+            for camera in CAMERAS
+        }
+
     def alternatives(self) -> dict[str, tuple[str, Cell]]:
-        """Other instructions for this episode, as `lerobot_env_bomb.alternatives` gives them."""
+        """Return other instructions for this episode, as `lerobot_env_bomb.alternatives` gives them."""
         return alternatives(self._run.episode)
 
     def _check(self, action: np.ndarray) -> np.ndarray:
-        """(4,) float64 within the action space."""
+        """Return an action as (4,) float64 within the action space."""
         return np.clip(super()._check(action).astype(np.float64), self._action_low, self._action_high)
 
     def _observe(self) -> Observation:

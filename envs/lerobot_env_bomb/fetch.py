@@ -87,7 +87,7 @@ def fetch_joints(gripper_xyz: np.ndarray) -> dict[str, float]:
 
 
 def _add_hand(spec: mujoco.MjSpec, gripper: mujoco.MjsBody) -> None:
-    """Grip point, wrist camera and the weld that drives them."""
+    """Add grip point, wrist camera and the weld that drives them."""
     # The gripper's x points down, its y along the world's x, its z towards the viewer: -y.
     world_in_gripper = [0.5, -0.5, -0.5, 0.5]
     gripper.add_site(name="grip", pos=[FINGERTIP_X_M, 0, 0], quat=world_in_gripper, rgba=[0, 0, 0, 0])

@@ -1,4 +1,4 @@
-"""Where gymnasium-robotics keeps the Fetch arm's model, and whether it can be used here.
+"""Model file of the Fetch arm in gymnasium-robotics, and whether it can be used here.
 
 Imports neither MuJoCo nor gymnasium-robotics, so that flags are checked at once.
 """

@@ -213,7 +213,7 @@ def _add_table_patterns(spec: mujoco.MjSpec) -> None:
 
 
 def _add_marks(spec: mujoco.MjSpec) -> None:
-    """What lies on the board's surface, hidden unless an axis shows it: a lamp's reflection, a dot."""
+    """Add the marks on the board's surface, hidden unless an axis shows them: a lamp's reflection, a dot."""
     surface_m = BOARD.thickness_m + GLARE_HEIGHT_M
     for ring in range(NUM_GLARE_RINGS):
         radius_m = GLARE_RADIUS_M * (ring + 1) / NUM_GLARE_RINGS
@@ -222,7 +222,7 @@ def _add_marks(spec: mujoco.MjSpec) -> None:
 
 
 def _add_pattern(spec: mujoco.MjSpec) -> None:
-    """The small board in the tray, hidden unless an episode shows a pattern on it."""
+    """Add the small board in the tray, hidden unless an episode shows a pattern on it."""
     half, height_m = PATTERN_HALF_SIZE_M, BOARD.thickness_m + PATTERN_THICKNESS_M
     spec.worldbody.add_geom(
         spec.find_default("visual"),

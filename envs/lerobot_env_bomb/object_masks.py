@@ -1,4 +1,4 @@
-"""Which pixels of a camera's image show what."""
+"""Masks of what each pixel of a camera's image shows."""
 
 import numpy as np
 

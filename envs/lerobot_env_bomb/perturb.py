@@ -18,7 +18,7 @@ class Perturbation(EpisodePerturbation[Transform]):
 
     @property
     def model_edits(self) -> tuple[ModelEdit, ...]:
-        """What is done to the compiled model."""
+        """Edits of the compiled model."""
         return tuple(each.edit_model for each in self.transforms.values())
 
     def arrange(self, layout: Layout, supply: tuple[int, ...]) -> Layout:

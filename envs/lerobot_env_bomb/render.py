@@ -96,7 +96,7 @@ class CameraRenderer:
         return rgb[::-1].copy()
 
     def draw_depth(self, data: mujoco.MjData, camera: str, size: int) -> tuple[np.ndarray, np.ndarray]:
-        """The same image, and (size, size) float32 metres along the optical axis to what it shows."""
+        """Draw the image, and (size, size) float32 metres along the optical axis to what it shows."""
         viewport = self._render(data, camera, size)
         rgb = np.empty((size, size, 3), dtype=np.uint8)
         buffer = np.empty((size, size), dtype=np.float32)
@@ -158,7 +158,7 @@ def _free(gl: GLContext, context: mujoco.MjrContext, owner: _Owner) -> None:
 
 
 def _opengl_string(name: int) -> str | None:
-    """What the current context says of itself."""
+    """Return what the current OpenGL context says of itself."""
     pointer: Any = GL_1_0.glGetString(name)
     text = ctypes.cast(pointer, ctypes.c_char_p).value
     return None if text is None else text.decode()

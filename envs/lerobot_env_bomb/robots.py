@@ -1,5 +1,5 @@
 # pyright: reportAttributeAccessIssue=false, reportInvalidTypeForm=false
-"""The arms that BOMB can be played with."""
+"""The arms that BOMB can be run with."""
 
 from collections.abc import Callable
 from dataclasses import dataclass

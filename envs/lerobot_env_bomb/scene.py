@@ -86,6 +86,13 @@ class Scene:
         self.data.mocap_pos[0] = layout.gripper_xyz
         mujoco.mj_forward(self.model, self.data)
 
+    def hold(self, stone: int, stone_xyz: np.ndarray, opening_m: float) -> None:
+        """Put a stone with its centre at (3,) metres between pads that are so far apart."""
+        adr = self._stone_qpos[stone]
+        self.data.qpos[adr : adr + 3] = stone_xyz
+        self.data.qpos[self._fingers] = opening_m / 2
+        mujoco.mj_forward(self.model, self.data)
+
     def move(self, target_xyz: np.ndarray, open_fingers: bool, num_substeps: int) -> None:
         """Move the gripper towards (3,) metres, clipped to the workspace, and open or close it."""
         start = self.data.mocap_pos[0].copy()

@@ -1,4 +1,4 @@
-"""What an environment of BOMB takes and delivers, as Gymnasium spaces."""
+"""Spaces of Gymnasium: what an environment of BOMB takes and delivers."""
 
 import numpy as np
 from gymnasium import spaces

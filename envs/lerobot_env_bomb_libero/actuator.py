@@ -1,4 +1,4 @@
-"""From a policy's action to the arm's: latency and noise."""
+"""Actuator: a policy's action becomes the arm's, by latency and noise."""
 
 from collections import deque
 
@@ -11,7 +11,7 @@ from lerobot_env_bomb_libero.stock import get_libero_dummy_action
 
 
 class LiberoActuator:
-    """What executes actions in one episode under `dynamics`; until the first arrives, the arm holds still."""
+    """Actuator of one episode under `dynamics`; until the first arrives, the arm holds still."""
 
     def __init__(self, dynamics: LiberoDynamics, seed: int):
         self._noise = dynamics.noise

@@ -67,7 +67,9 @@ class BombLiberoEnvConfig(LiberoEnv):
         return [name.strip() for name in str(self.task).split(",")]
 
     def get_env_processors(self) -> tuple[PolicyProcessorPipeline, PolicyProcessorPipeline]:
-        """LeRobot's; every command asks for them once, when its policy is built and nothing has been played.
+        """Return LeRobot's processors, after a check of the policy that acts.
+
+        Every command asks for them once, when its policy is built and no episode has begun.
 
         Raises:
             ValueError: that policy was trained for another environment.

@@ -19,7 +19,7 @@ from lerobot_env_bomb_libero.scene import LiberoScene
 
 @dataclass(frozen=True)
 class _Run:
-    """What exists once an episode has been started."""
+    """State of an episode that has been started."""
 
     episode: LiberoEpisode
     actuator: LiberoActuator | None  # None: actions are executed as they are
@@ -115,7 +115,7 @@ class BombLiberoEnv(EpisodeEnv[LiberoSpec, _Run, LiberoResult]):
 
     @property
     def _failure(self) -> LiberoFailure | None:
-        """Why the episode failed, were it to end now."""
+        """Reason why the episode failed, were it to end now."""
         return None if self._is_success else failure_of(self._run.touched, self._scene.wanted)
 
     def _sensed(self, observation: Observation) -> Observation:

@@ -19,7 +19,7 @@ class LiberoEpisode:
 
 
 def sample_libero_episode(spec: LiberoSpec, instruction: str) -> LiberoEpisode:
-    """The same spec, the same episode; `instruction` is the task's own."""
+    """Draw the episode that the spec determines; `instruction` is the task's own."""
     condition = LiberoCondition.parse(spec.perturbations)
     perturbation = EpisodePerturbation.draw(condition, spec.seed, LIBERO_TRANSFORMS, None)
     return LiberoEpisode(spec, perturbation.reword(instruction, None), perturbation)

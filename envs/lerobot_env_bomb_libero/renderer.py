@@ -16,7 +16,7 @@ GPUS = "CUDA_VISIBLE_DEVICES"
 
 @contextmanager
 def _all_gpus_visible() -> Iterator[None]:
-    """When it is imported, robosuite asserts that MUJOCO_EGL_DEVICE_ID is among those that are."""
+    """Lift CUDA_VISIBLE_DEVICES: robosuite's import asserts that it lists MUJOCO_EGL_DEVICE_ID."""
     visible = os.environ.pop(GPUS, None)
     try:
         yield

@@ -27,7 +27,7 @@ HEADLIGHT = ("ambient", "diffuse", "specular")
 
 
 class LiberoTransform(EpisodeTransform):
-    """What one perturbation axis does to an episode of LIBERO; frozen once drawn."""
+    """Effect of one perturbation axis on an episode of LIBERO; frozen once drawn."""
 
     @classmethod
     def add_bodies(cls, worldbody: ElementTree.Element) -> None:
@@ -44,7 +44,10 @@ class LiberoTransform(EpisodeTransform):
 
 
 class LiberoScene(LiberoEnv):
-    """Without transforms its episodes are LeRobot's, bit for bit; what nobody sees is not drawn."""
+    """LIBERO's environment with transforms; without any, its episodes are LeRobot's, bit for bit.
+
+    Images that nobody sees are not drawn.
+    """
 
     def __init__(self, kinds: Sequence[type[LiberoTransform]], **kwargs: Any):
         super().__init__(**kwargs)
@@ -140,7 +143,7 @@ class LiberoScene(LiberoEnv):
         return np.flatnonzero((self.owners[self.model.geom_bodyid] == 0) & (self.model.geom_group == 1))
 
     def geoms_of(self, bodies: Sequence[int]) -> np.ndarray:
-        """All geoms of objects or fixtures, as indices."""
+        """Return the indices of all geoms of objects or fixtures."""
         return np.flatnonzero(np.isin(self.owners[self.model.geom_bodyid], bodies))
 
     def surfaces(self) -> dict[int, str]:
@@ -154,7 +157,7 @@ class LiberoScene(LiberoEnv):
         return found
 
     def change_texture(self, texture: int, change: Callable[[np.ndarray], np.ndarray]) -> None:
-        """(H, W, 3) uint8 of a texture -> the same; undone by the next reset."""
+        """Change a texture, (H, W, 3) uint8 -> (H, W, 3) uint8; the next reset undoes it."""
         pixels = self._pixels_of(texture)
         self._textures.setdefault(texture, pixels.copy())
         pixels[:] = change(pixels)
@@ -238,7 +241,7 @@ class LiberoScene(LiberoEnv):
             observable._sensor = self._drawn_if_on(observable._sensor)
 
     def _place(self) -> None:
-        """Robosuite's reset; LIBERO's wrapper around it tries again for ever, whatever goes wrong."""
+        """Reset robosuite itself; LIBERO's wrapper around it tries again for ever, whatever goes wrong."""
         from robosuite.utils.errors import RandomizationError
 
         while True:
@@ -283,7 +286,7 @@ class LiberoScene(LiberoEnv):
             self._draws = True
 
     def _remember(self) -> None:
-        """The model as compiled."""
+        """Remember the model as compiled."""
         model = self.model
         self._compiled = {name: getattr(model, name).copy() for name in EDITED}
         headlight = model.vis.headlight

@@ -1,4 +1,4 @@
-"""From a policy's action to where the agent is sent: latency and noise."""
+"""Actuator: a policy's action becomes the place where the agent is sent, by latency and noise."""
 
 from collections import deque
 
@@ -9,7 +9,7 @@ from lerobot_env_bomb_pusht.axes.dynamics import PushTDynamics
 
 
 class PushTActuator:
-    """What executes actions in one episode under `dynamics`; until the first one arrives the agent stays."""
+    """Actuator of one episode under `dynamics`; until the first one arrives the agent stays."""
 
     def __init__(self, agent_xy: np.ndarray, dynamics: PushTDynamics, seed: int):
         self._noise_px = dynamics.noise_px

@@ -17,7 +17,7 @@ PERSON_IMAGE_SIZE = 384  # pixels, of LeRobot's videos of `pusht`
 
 
 class PushTTransform(EpisodeTransform):
-    """What one perturbation axis does to an episode of PushT; frozen once drawn."""
+    """Effect of one perturbation axis on an episode of PushT; frozen once drawn."""
 
     def edit(self, board: "Board") -> None:
         """Change the board that gym-pusht has just set up, before block and agent are placed."""
@@ -28,7 +28,10 @@ class PushTTransform(EpisodeTransform):
 
 
 class Board(PushTEnv):
-    """Without transforms it is gym-pusht, bit for bit: what is overridden only adds to it, or is faster."""
+    """PushT's environment with transforms; without any, it is gym-pusht, bit for bit.
+
+    Overridden methods only add to it, or are faster.
+    """
 
     def __init__(self, image_size: int):
         super().__init__(
@@ -105,7 +108,7 @@ class Board(PushTEnv):
         return pygame.Surface((BOARD_PX, BOARD_PX))
 
     def _draw_outline(self, screen: pygame.Surface) -> None:
-        """A line around the target."""
+        """Draw a line around the target."""
         goal = self.get_goal_pose_body(self.goal_pose)
         bar, stem = (shape.get_vertices() for shape in self._block_shapes)
         corners = tee_outline(np.array(bar), np.array(stem))

@@ -99,7 +99,9 @@ class BombPushTEnvConfig(EnvConfig):
         }
 
     def get_env_processors(self) -> tuple[PolicyProcessorPipeline, PolicyProcessorPipeline]:
-        """None; every command asks for them once, when its policy is built and nothing has been played.
+        """Return LeRobot's processors, which change nothing, after a check of the policy that acts.
+
+        Every command asks for them once, when its policy is built and no episode has begun.
 
         Raises:
             ValueError: that policy was trained for another environment.

@@ -29,7 +29,7 @@ DEFAULT_PUSHT_SPEC = PushTSpec(seed=0)
 
 @dataclass(frozen=True)
 class _Run:
-    """What exists once an episode has been started."""
+    """State of an episode that has been started."""
 
     episode: PushTEpisode
     block_pose: np.ndarray  # (3,)
@@ -124,7 +124,7 @@ class BombPushTEnv(EpisodeEnv[PushTSpec, _Run, PushTResult]):
 
     @property
     def _failure(self) -> PushTFailure | None:
-        """Why the episode failed, were it to end now."""
+        """Reason why the episode failed, were it to end now."""
         board = self._board
         if self._coverage > board.success_threshold:
             return None

@@ -28,7 +28,7 @@ class PushTEpisode:
 
 
 def sample_pusht_episode(spec: PushTSpec) -> PushTEpisode:
-    """The same spec, the same episode."""
+    """Draw the episode that the spec determines."""
     template = TEMPLATES[generator(spec.seed, Stream.TEMPLATE).integers(len(TEMPLATES))]
     condition = PushTCondition.parse(spec.perturbations)
     perturbation = EpisodePerturbation.draw(condition, spec.seed, PUSHT_TRANSFORMS, None)

@@ -1,1 +1,1 @@
-"""What our environments on MuJoCo share: the choice of an OpenGL backend, and rotations."""
+"""Parts that our environments on MuJoCo share: the choice of an OpenGL backend, and rotations."""

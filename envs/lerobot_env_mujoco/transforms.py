@@ -1,5 +1,5 @@
 # pyright: reportAttributeAccessIssue=false
-"""What an axis draws, and does to a compiled model, alike in every environment on MuJoCo."""
+"""Transforms that an axis draws for a compiled model, alike in every environment on MuJoCo."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -82,7 +82,7 @@ def least_distance(
 
 
 def scale_mass(model: mujoco.MjModel, bodies: Sequence[int], factor: float) -> None:
-    """Of bodies that stand free, each of one part: their mass, and all that the compiler computed from it."""
+    """Scale the mass of free bodies of one part each, and all that the compiler computed from it."""
     dofs = np.isin(model.dof_bodyid, bodies)
     for values in (model.body_mass, model.body_inertia, model.body_subtreemass):
         values[bodies] *= factor

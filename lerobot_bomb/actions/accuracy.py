@@ -1,4 +1,4 @@
-"""How well numbers were predicted, token by token, from the true tokens before each (teacher forcing).
+"""Accuracy of predicted numbers, token by token, from the true tokens before each (teacher forcing).
 
 Shapes as in `lerobot_bomb.actions.text`; `M` = N * C + 1 columns, those of all numbers and the end token.
 """

@@ -32,7 +32,7 @@ def normalised_rest(low_D: np.ndarray, high_D: np.ndarray) -> np.ndarray:
 
 
 def check_actions(actions_ND: np.ndarray | Tensor) -> Tensor:
-    """(N, D) float64 on the CPU.
+    """Return checked actions as (N, D) float64 on the CPU.
 
     Raises:
         ValueError: there are none, or some are not finite.
@@ -45,7 +45,7 @@ def check_actions(actions_ND: np.ndarray | Tensor) -> Tensor:
 
 
 def fit_cuts(actions_ND: Tensor, rest_D: np.ndarray, settings: GridSettings) -> list[Cut]:
-    """Of every coordinate, for actions in [-1, 1] (N, D) float64; without samples, about equal widths."""
+    """Fit every coordinate's cuts to actions (N, D) float64 in [-1, 1]; no samples: about equal widths."""
     rest = torch.from_numpy(rest_D)
     cuts = []
     for group in settings.groups:
@@ -63,7 +63,7 @@ def fit_cuts(actions_ND: Tensor, rest_D: np.ndarray, settings: GridSettings) -> 
 
 
 def _polar_cuts(xyz_N3: Tensor, rest: Tensor, group: ActionGroup, settings: GridSettings) -> list[Cut]:
-    """Of theta and phi, in which motions that are too short do not count, and of rho."""
+    """Fit the cuts of theta, phi and rho; motions that are too short do not count for theta and phi."""
     options = (settings.distribution, settings.min_sigma)
     theta_bins, phi_bins, rho_bins = group.bins
     theta, phi, rho = to_polar(xyz_N3 - rest).unbind(dim=-1)
@@ -88,7 +88,7 @@ def _polar_cuts(xyz_N3: Tensor, rest: Tensor, group: ActionGroup, settings: Grid
 
 
 def _shortest_motion(rho_N: Tensor, settings: GridSettings) -> float:
-    """What is shorter is no motion, or has no direction to fit."""
+    """Return the rho below which a motion counts as none, or has no direction to fit."""
     if not settings.zero_radius_bin:
         return MIN_RHO
     return dead_radius(rho_N) if settings.rho_dead is None else settings.rho_dead

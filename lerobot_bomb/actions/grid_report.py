@@ -21,7 +21,7 @@ FEW_SET_RANGE = 10  # times the long motions that the longest is
 
 
 def coordinate_names(grids: ActionGrids, dim_names: Sequence[str]) -> list[str]:
-    """Of all groups."""
+    """Return the names of the coordinates of all groups."""
     return [label for group in grids.groups for label in group.coordinate_names(dim_names)]
 
 
@@ -41,7 +41,7 @@ def edges_text(grids: ActionGrids, dim_names: Sequence[str]) -> str:
 
 
 def clipping_text(actions_ND: np.ndarray, dim_names: Sequence[str]) -> tuple[str, bool]:
-    """What is lost of normalised actions beyond [-1, 1], and whether it is more than quantiles cut off."""
+    """Describe what a clip to [-1, 1] loses of normalised actions, and whether it is much."""
     beyond_ND = (np.abs(actions_ND) - 1).clip(min=0)
     is_clipped_ND = beyond_ND > CLIP_TOLERANCE
     if not is_clipped_ND.any():
@@ -68,9 +68,9 @@ def clipping_text(actions_ND: np.ndarray, dim_names: Sequence[str]) -> tuple[str
 
 
 def rest_text(grids: ActionGrids, actions_ND: np.ndarray, dim_names: Sequence[str]) -> tuple[str, bool]:
-    """How many normalised actions a cell of no motion takes, and whether that needs a remedy.
+    """Describe how many normalised actions a cell of no motion takes, and whether that needs a remedy.
 
-    Empty where there is no such cell.
+    The text is empty where there is no such cell.
     """
     actions = torch.from_numpy(actions_ND)
     cells_NG, coordinates_NC = grids.encode(actions), grids.coordinates(actions.float().clamp(-1, 1))

@@ -1,4 +1,4 @@
-"""How a grid is made: which action dims share a token, in which coordinates, cut where."""
+"""Settings of a grid: which action dims share a token, in which coordinates, cut where."""
 
 import json
 import math
@@ -52,7 +52,7 @@ class ActionGroup:
 
     @classmethod
     def from_dict(cls, group: dict[str, Any]) -> "ActionGroup":
-        """Of JSON."""
+        """Build a group from its JSON."""
         keys = {"dims", "transform", "bins"}
         if set(group) != keys:
             raise ValueError(f"{FLAG}: {group} must have exactly the keys {sorted(keys)}")
@@ -63,7 +63,7 @@ class ActionGroup:
         return math.prod(self.bins)
 
     def coordinate_names(self, dim_names: Sequence[str]) -> list[str]:
-        """Of the coordinates, given the names of all action dims."""
+        """Return the names of the group's coordinates, given the names of all action dims."""
         return [*POLAR_COORDINATES] if self.transform == "polar" else [dim_names[dim] for dim in self.dims]
 
 
@@ -100,7 +100,7 @@ def default_groups(
 
 
 def _named_layout(num_dims: int, names: list[str]) -> str:
-    """What the names say; without any, four dims are a pose, in which no dim becomes binary."""
+    """Return the layout that the names imply; four unnamed dims are a pose, and none becomes binary."""
     if num_dims not in (4, 7):
         return "joints"
     words = [re.findall("[a-z]+", name.lower()) for name in names]
@@ -139,7 +139,7 @@ def check_groups(groups: Sequence[ActionGroup], num_dims: int) -> None:
 
 @dataclass(frozen=True)
 class GridSettings:
-    """How a grid is made; what it became in a fit is in `ActionGrids`."""
+    """Settings that a grid is fitted with; `ActionGrids` holds the result of the fit."""
 
     groups: tuple[ActionGroup, ...]
     # of the edges: equal shares of a Gaussian, equal widths, equal shares of the samples
@@ -168,11 +168,11 @@ class GridSettings:
 
     @classmethod
     def from_dict(cls, settings: dict[str, Any]) -> "GridSettings":
-        """Of `to_dict`."""
+        """Build the settings from what `to_dict` returns."""
         return cls(**{**settings, "groups": tuple(map(ActionGroup.from_dict, settings["groups"]))})
 
     def to_dict(self) -> dict[str, Any]:
-        """For JSON."""
+        """Return the settings as JSON values."""
         return json.loads(json.dumps(asdict(self)))
 
     def flags(self) -> dict[str, Any]:

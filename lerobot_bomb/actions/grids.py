@@ -212,7 +212,7 @@ class ActionGrids(nn.Module):
         return [of[: bins + 1] for of, bins in zip(edges, self.bins[rows], strict=True)]
 
     def to_dict(self) -> dict[str, Any]:
-        """All of it for JSON, to the bit; but the centroids, which are many, only if they are decoded to."""
+        """Return the grid as JSON values, to the bit; centroids, which are many, only if decoded to."""
         fitted = {
             "edges": [row[: bins + 1].tolist() for row, bins in zip(self.edges, self.bins, strict=True)],
             "means": [row[:bins].tolist() for row, bins in zip(self.means, self.bins, strict=True)],
@@ -257,7 +257,7 @@ class ActionGrids(nn.Module):
         self._set_centroids(torch.zeros(0, self.num_dims, dtype=torch.float64))
 
     def _set_centroids(self, actions_ND: Tensor) -> None:
-        """Mean action of the samples in each cell; where there are none, what `means` say."""
+        """Set each cell's centroid to the mean of its samples; without samples, to what `means` say."""
         self.centroids.copy_(self._cond_means())
         cells_NG = self.encode(actions_ND.to(self.edges.device)).cpu()
         for i, group in enumerate(self.groups):
@@ -280,5 +280,5 @@ class ActionGrids(nn.Module):
 
 
 def _slices(lengths: Iterable[int]) -> list[slice]:
-    """Of parts that lie one after the other."""
+    """Return the slices of parts that lie one after the other."""
     return [slice(*ends) for ends in pairwise(accumulate(lengths, initial=0))]

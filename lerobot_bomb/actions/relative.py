@@ -151,7 +151,7 @@ def _require_tracking(
 
 
 def _size(residuals_N: np.ndarray, mode: NormalizationMode) -> float:
-    """What becomes 1."""
+    """Return the size of a residual that is scaled to 1."""
     if mode is NormalizationMode.MEAN_STD:
         return float(np.sqrt(np.square(residuals_N).mean()))
     return float(np.quantile(np.abs(residuals_N), QUANTILE))

@@ -63,7 +63,7 @@ class NumberTokens:
 def draw_hidden(
     eligible_BN: Tensor, max_fraction: float, skip_prob: float, generator: torch.Generator
 ) -> Tensor:
-    """Which of the eligible units to hide: (B, N) bool.
+    """Draw which of the eligible units to hide: (B, N) bool.
 
     A row hides nothing with probability ``skip_prob``; else floor(count * f) distinct units, f uniform
     in [0, max_fraction].
@@ -101,7 +101,7 @@ class TokenRows:
 
     @classmethod
     def constant(cls, ids: list[int], like_BL: Tensor) -> "TokenRows":
-        """The same tokens in every row, as many rows as ``like_BL`` has and on its device."""
+        """Put the same tokens in every row, with as many rows as ``like_BL`` and on its device."""
         ids_BL = torch.tensor(ids, dtype=torch.int64, device=like_BL.device).expand(len(like_BL), -1)
         return cls(ids_BL, torch.ones_like(ids_BL, dtype=torch.bool))
 
@@ -119,7 +119,7 @@ class TokenRows:
         return self.mask if self.hidden is None else self.mask & ~self.hidden
 
     def rounded(self, multiple: int) -> "TokenRows":
-        """With gaps at the end, up to a multiple of so many columns."""
+        """Pad the rows with gaps at the end, to a multiple of so many columns."""
         width = -self.ids.shape[1] % multiple
         return TokenRows(*(nn.functional.pad(columns, (0, width)) for columns in self._columns))
 

@@ -29,7 +29,7 @@ class BoardGeometry:
 
     @property
     def half_size_m(self) -> float:
-        """From the board's centre to its edge."""
+        """Distance from the board's centre to its edge."""
         return (self.num_lines - 1) / 2 * self.pitch_m + self.margin_m
 
     def intersection_xy(self, row: int, column: int) -> np.ndarray:

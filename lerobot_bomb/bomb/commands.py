@@ -52,11 +52,11 @@ FORMS = (
 
 @dataclass(frozen=True)
 class Drawn:
-    """What a task is played on, and with."""
+    """Board, tray and command that are drawn for an episode of a task."""
 
     about: tuple[int, ...]  # numbers of what the command is about: colours, rows, directions
     stones: Stones  # on the board
-    supply: tuple[str, ...] = ()  # colours of the stones in the tray
+    supply: tuple[str, ...] = ()  # colours of the stones in the tray, row by row from the far one
     pattern: Stones = field(default_factory=dict)  # on the small board
 
     def stone_on(self, cell: Cell) -> int:
@@ -66,7 +66,7 @@ class Drawn:
 
 @dataclass(frozen=True)
 class Case:
-    """What a command means: what is said, what is to be done, and what the expert does."""
+    """Meaning of a command: its words, the moves that fulfil it, and what the expert does."""
 
     commands: tuple[str, ...]  # one, or one for each move
     plans: tuple[Plan, ...]
@@ -83,11 +83,11 @@ class Task(ABC):
 
     @abstractmethod
     def case(self, drawn: Drawn) -> Case | None:
-        """What the command means on that board; None where it means nothing, or several things."""
+        """Return what the command means on that board; None where it means nothing, or several things."""
 
 
 def is_graspable(stones: Stones, cell: Cell) -> bool:
-    """Whether nothing stands left or right of an intersection, where the fingers go."""
+    """Return True if nothing stands left or right of an intersection, where the fingers go."""
     row, column = cell
     return not {(row, column - 1), (row, column + 1)} & stones.keys()
 
@@ -98,29 +98,29 @@ def other_color(color: str) -> str:
 
 
 def only(stones: Stones, color: str) -> Cell | None:
-    """Where the only stone of a colour stands; None where there is none, or several."""
+    """Return where the only stone of a colour stands; None where there is none, or several."""
     cells = [cell for cell, other in stones.items() if other == color]
     return cells[0] if len(cells) == 1 else None
 
 
 def draw_cells(rng: np.random.Generator, number: int, cells: Sequence[Cell] = CELLS) -> list[Cell]:
-    """So many different ones of these intersections."""
+    """Draw so many different intersections."""
     return [cells[i] for i in rng.choice(len(cells), size=number, replace=False)]
 
 
 def draw_stones(
     rng: np.random.Generator, number: int, cells: Sequence[Cell] = CELLS, colors: Sequence[str] = COLORS
 ) -> dict[Cell, str]:
-    """So many stones of these colours, each drawn, on these intersections."""
+    """Draw so many stones, each of one of these colours, on different intersections."""
     return {cell: colors[int(rng.integers(len(colors)))] for cell in draw_cells(rng, number, cells)}
 
 
 def is_heldout(task_id: int, about: tuple[int, ...]) -> bool:
-    """Whether a command is held out; each verb, colour, row, ... of it is seen in others."""
+    """Return True if a command is held out; each verb, colour, row, ... of it is seen in others."""
     return (task_id + sum(place * number for place, number in zip(count(1), about))) % NUM_PARTS == 0
 
 
-def command_suite(tasks: Sequence[Task], max_steps: int, num_goals: int) -> Suite:
+def command_suite(tasks: Sequence[Task], max_steps: int, num_goals: int, version: str) -> Suite:
     """A suite whose numbered tasks are verbs."""
     return Suite(
         partial(_sample, tasks),
@@ -129,11 +129,12 @@ def command_suite(tasks: Sequence[Task], max_steps: int, num_goals: int) -> Suit
         forms=FORMS,
         num_tasks=len(tasks),
         num_goals=num_goals,
+        version=version,
     )
 
 
 def draw_command(tasks: Sequence[Task], spec: EpisodeSpec) -> tuple[int, Drawn, Case]:
-    """The number of a task, what it is played on, and what its command means there."""
+    """Return a task's number, the board that is drawn for it, and what its command means there."""
     drawn_id = int(generator(spec.seed, Stream.TARGET).integers(len(tasks)))
     task_id = drawn_id if spec.task_id is None else spec.task_id
     task, rng = tasks[task_id], generator(spec.seed, Stream.OPENING)
@@ -182,7 +183,7 @@ def _layout(seed: int, drawn: Drawn) -> Layout:
     number = len(drawn.supply)
     places = np.array(SUPPLY_XY_M[:NUM_SUPPLY_BESIDE_PATTERN] if drawn.pattern else SUPPLY_XY_M)
     stone_xy = np.zeros((NUM_STONES, 2))
-    stone_xy[:number] = TRAY_CENTER_XY + places[supply.permutation(len(places))[:number]]
+    stone_xy[:number] = TRAY_CENTER_XY + places[np.sort(supply.permutation(len(places))[:number])]
     stone_xy[:number] += supply.uniform(-SUPPLY_SPREAD_M, SUPPLY_SPREAD_M, (number, 2))
     is_white = np.array([color == "white" for color in drawn.supply] + [False] * (NUM_STONES - number))
     return Layout(gripper_xyz, stone_xy, is_white, np.arange(NUM_STONES) < number)

@@ -10,10 +10,8 @@ from lerobot_bomb.bomb.suites import SUITES
 from lerobot_bomb.conditions import NONE
 from lerobot_bomb.flags import one_of
 
-# Version of task, physics, observation and success rule: what a recording is of, and its robot type says.
-TASK_VERSION = "1.0"
-# Version of how a policy is measured and what a line of results says. 1.1 is the task of 1.0 with lines that
-# name simulator, policy and tasks.
+# Version of how a policy is measured and what a line of results says. 1.1 is 1.0 with lines that name
+# simulator, policy and tasks. A suite has a version of its own, of what its episodes are: `bomb/suite.py`.
 PROTOCOL_VERSION = "1.1"
 
 ROBOTS = ("scara", "fetch")
@@ -27,7 +25,7 @@ TEST_SEEDS = range(1000, 1200)  # of evaluations: from LeRobot's default on, as 
 
 
 class Stage(StrEnum):
-    """How far an episode got; each stage includes the ones before it."""
+    """Stage that an episode reached; each stage includes the ones before it."""
 
     START = "start"
     REACHED = "reached"
@@ -37,7 +35,7 @@ class Stage(StrEnum):
 
 
 class Failure(StrEnum):
-    """Why an episode failed; exactly one per failed episode."""
+    """Reason why an episode failed; exactly one per failed episode."""
 
     NEVER_REACHED = "never_reached"
     MISSED_GRASP = "missed_grasp"

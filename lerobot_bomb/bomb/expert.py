@@ -76,6 +76,16 @@ def expert_action(state: PrivilegedState) -> np.ndarray:
     return np.array([*xyz, gripper], dtype=np.float32)
 
 
+def current_goal(state: PrivilegedState) -> Goal:
+    """The goal that most of an action is for."""
+    return max(_shares(state), key=lambda each: each[1])[0]
+
+
+def held_share(state: PrivilegedState, stone: int) -> float:
+    """Return how firmly the fingers hold a stone, in [0, 1]."""
+    return _held(state, state.stone_xyz[stone])
+
+
 def _shares(state: PrivilegedState) -> list[tuple[Goal, float]]:
     """The goals that an action is for, with their shares of it: the one after the last that is reached.
 
@@ -90,7 +100,7 @@ def _shares(state: PrivilegedState) -> list[tuple[Goal, float]]:
 
 
 def _reached(state: PrivilegedState, goal: Goal) -> float:
-    """How far the goal's stone lies on its place and the fingers are off it, in [0, 1]."""
+    """Return how far, in [0, 1], the goal's stone lies on its place with the fingers off it."""
     stone_xyz = state.stone_xyz[goal.stone]
     lateral_m = float(np.linalg.norm((goal.xyz - stone_xyz)[:2]))
     height_m = abs(float(stone_xyz[2] - goal.xyz[2]))
@@ -127,7 +137,7 @@ def _plan(state: PrivilegedState, tempo: float) -> tuple[np.ndarray, float]:
 
 
 def _placed(state: PrivilegedState, stone_xyz: np.ndarray) -> float:
-    """How far the stone lies on the target, in [0, 1]; judged more mildly the wider the fingers are.
+    """Return how well the stone lies on the target, in [0, 1]; the wider the fingers are, the milder.
 
     A release moves the stone a little, and must not make the expert want it back.
     """
@@ -144,19 +154,19 @@ def _placed(state: PrivilegedState, stone_xyz: np.ndarray) -> float:
 
 
 def _held(state: PrivilegedState, stone_xyz: np.ndarray) -> float:
-    """How far the fingers hold the stone, in [0, 1]."""
+    """Return how firmly the fingers hold the stone, in [0, 1]."""
     play_m = state.finger_opening - 2 * state.stone_radius_m
     return _enclosed(state, stone_xyz) * (1 - _openness(state, HELD_SHARE)) * _ramp(play_m, *EMPTY_M)
 
 
 def _openness(state: PrivilegedState, shares: tuple[float, float]) -> float:
-    """How far the fingers are open, in [0, 1], between two shares of their play around a stone."""
+    """Return how far the fingers are open, in [0, 1], between two shares of their play around a stone."""
     diameter_m = 2 * state.stone_radius_m
     return _ramp((state.finger_opening - diameter_m) / (state.max_opening_m - diameter_m), *shares)
 
 
 def _enclosed(state: PrivilegedState, stone_xyz: np.ndarray) -> float:
-    """How far the stone is between the pads, in [0, 1]."""
+    """Return how far the stone is between the pads, in [0, 1]."""
     offset = stone_xyz - state.gripper_xyz
     beside = 1 - _ramp(float(np.linalg.norm(offset[:2])), 0.008, 0.012)
     return beside * _ramp(offset[2], -0.004, -0.002) * (1 - _ramp(offset[2], 0.020, 0.030))

@@ -6,12 +6,12 @@ from lerobot_bomb.bomb.board import BOARD, Cell
 
 
 def is_legal_position(stones: Mapping[Cell, str]) -> bool:
-    """Whether every group in {(row, column): colour} has a liberty."""
+    """Return True if every group in {(row, column): colour} has a liberty."""
     return all(_has_liberty(stones, cell) for cell in stones)
 
 
 def is_legal_move(stones: Mapping[Cell, str], cell: Cell, color: str) -> bool:
-    """Whether `color` may play on `cell`: it is free, and the move captures or is no suicide."""
+    """Return True if `color` may play on `cell`: it is free, and the move captures or is no suicide."""
     if cell in stones:
         return False
     after = {**stones, cell: color}

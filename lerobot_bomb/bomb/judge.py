@@ -131,7 +131,7 @@ class Judge:
         }
 
     def _places(self) -> set[Place]:
-        """To which the followed stone may come."""
+        """Return the places to which the followed stone may come."""
         return {
             place
             for plan, made in self._plans
@@ -141,7 +141,7 @@ class Judge:
         }
 
     def _follow(self, touched: np.ndarray, held: np.ndarray) -> None:
-        """Of several stones that may be moved, the one that is held or touched is."""
+        """Switch to the stone that is held or touched, where several may be moved."""
         if len(self._movable) > 1:
             gripped = sorted(self._movable, key=lambda stone: (not held[stone], not touched[stone]))
             if touched[gripped[0]] and not touched[self._stone]:
@@ -203,7 +203,7 @@ class Judge:
         return True
 
     def _take_move(self, stone: int) -> bool:
-        """A move has been made; whether it was the last."""
+        """Note that a move has been made, and return whether it was the last."""
         fitting = self._fitting(stone)
         self._is_complete = any(len(made) == len(plan) for plan, made in fitting)
         if self._is_complete:
@@ -238,10 +238,10 @@ class Judge:
 
 
 def _stones_left(move: Move, made: Made) -> frozenset[int]:
-    """Those that may make a move."""
+    """Return the stones that may still make a move."""
     return move.stones if len(move.stones) == 1 else move.stones - {stone for stone, _ in made.values()}
 
 
 def _places_left(move: Move, made: Made) -> frozenset[Place]:
-    """Those that no move has put a stone on."""
+    """Return the places of a move that no stone has been put on yet."""
     return move.places - {place for _, place in made.values() if place != TRAY}

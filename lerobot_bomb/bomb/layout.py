@@ -1,4 +1,4 @@
-"""Where everything is: at the start of an episode, and as the simulator measures it."""
+"""Layout at the start of an episode, and the snapshot that the simulator measures after each step."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
@@ -10,7 +10,7 @@ from lerobot_bomb.bomb.board import BOARD, Cell
 
 @dataclass(frozen=True)
 class Layout:
-    """Where everything is when an episode starts. Stones rest flat; those not in play are parked."""
+    """Positions at the start of an episode. Stones rest flat; those not in play are parked."""
 
     gripper_xyz: np.ndarray  # (3,) metres
     stone_xy: np.ndarray  # (NUM_STONES, 2) metres
@@ -38,7 +38,7 @@ def put_on_board(stones: Mapping[Cell, str], layout: Layout) -> Layout:
 
 @dataclass(frozen=True)
 class Snapshot:
-    """What the simulator measures after a control step."""
+    """Measurements of the simulator after a control step."""
 
     gripper_xyz: np.ndarray  # (3,) metres, point between the pads' lower ends
     finger_opening: float  # metres between the pads

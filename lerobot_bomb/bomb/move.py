@@ -1,4 +1,4 @@
-"""What an episode asks for: stones that are moved to places, each by a move of a plan."""
+"""Moves that an episode asks for: each move of a plan takes a stone to a place."""
 
 from collections.abc import Collection
 from dataclasses import dataclass
@@ -27,7 +27,7 @@ type Plan = tuple[Move, ...]  # all of its moves are to be made, each once those
 
 @dataclass(frozen=True)
 class Aim:
-    """What the expert does next: one stone to one place."""
+    """Next move of the expert: one stone to one place."""
 
     stone: int
     xy: tuple[float, float]  # metres
@@ -35,7 +35,7 @@ class Aim:
 
 
 def aim_at(stone: int, cell: Cell, is_slid: bool = False) -> Aim:
-    """To bring a stone to an intersection."""
+    """Return the aim of bringing a stone to an intersection."""
     x, y = BOARD.intersection_xy(*cell)
     return Aim(stone, (float(x), float(y)), is_slid)
 
@@ -53,8 +53,18 @@ def in_order(*moves: Move) -> Plan:
     )
 
 
+def place_name(xy: np.ndarray) -> str:
+    """Return "row 1, column 3", "the tray" or "beside the board" for (2,) metres."""
+    if distance_m(xy, TRAY) == 0:
+        return "the tray"
+    if np.abs(xy).max() > BOARD.half_size_m:
+        return "beside the board"
+    row, column = BOARD.nearest_intersection(xy)
+    return f"row {row}, column {column}"
+
+
 def distance_m(xy: np.ndarray, place: Place) -> float:
-    """How far a stone at (2,) metres is from a place; 0 anywhere in the tray, if that is the place."""
+    """Return how far a stone at (2,) metres is from a place; 0 anywhere in the tray, if that is the place."""
     if isinstance(place, str):
         outside = np.maximum(abs(xy - np.array(TRAY_CENTER_XY)) - np.array(TRAY_HALF_SIZE_XY), 0.0)
         return float(np.linalg.norm(outside))

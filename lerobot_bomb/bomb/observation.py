@@ -1,4 +1,4 @@
-"""What goes into a policy and comes out of it: names, shapes, units."""
+"""Observations and actions of a policy: names, shapes, units."""
 
 from dataclasses import dataclass
 
@@ -28,7 +28,7 @@ WORKSPACE_HIGH_M = (0.21, 0.13, 0.16)
 
 @dataclass(frozen=True)
 class RenderOptions:
-    """What the cameras deliver; it changes the observation, never the physics."""
+    """Options of the cameras' images; they change the observation, never the physics."""
 
     image_size: int = DEFAULT_IMAGE_SIZE  # width and height in pixels
     preset: str = "fast"

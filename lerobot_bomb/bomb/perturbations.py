@@ -11,6 +11,8 @@ from typing import ClassVar
 from lerobot_bomb.conditions import Axis, AxisCondition, Magnitude, magnitude_of, nuisances_of
 
 # Append only: an axis' place in this dict numbers its stream of random numbers.
+# Level 5 must be hard, which an expert that ignores images cannot tell. So it has floors: camera 15 degrees
+# and 20 % of the field of view, light x4 between its extremes, mass x2, latency 1 step, start 80 mm.
 AXES = {
     "table": Axis(
         "colour and pattern of the table, colour of the tray",
@@ -120,6 +122,6 @@ magnitude = partial(magnitude_of, AXES)  # (axis, name, level)
 
 @dataclass(frozen=True)
 class Condition(AxisCondition):
-    """Which axes of BOMB are on: "camera:2+light:3"."""
+    """Condition of BOMB, by the axes that are on: "camera:2+light:3"."""
 
     axes: ClassVar[Mapping[str, Axis]] = AXES

@@ -12,7 +12,7 @@ from lerobot_bomb.bomb.episode import CONTROL_MODES, DEFAULT_FPS, Stage
 
 @dataclass(frozen=True)
 class Goal:
-    """Where one stone is to lie."""
+    """Goal of the expert: a stone, and where it is to lie."""
 
     xyz: np.ndarray  # (3,) metres, centre of the stone at rest there
     stone: int  # its index
@@ -97,7 +97,7 @@ def _choice(name: str, choices: tuple[str, ...]) -> _Part:
 
 
 def _encode_goals(state: PrivilegedState) -> list[float]:
-    """Four numbers each: the place, and the stone's index, to which NUM_STONES is added if it is slid."""
+    """Encode each goal as four numbers: its place, and the stone's index, plus NUM_STONES if it is slid."""
     return [number for goal in state.goals for number in (*goal.xyz, goal.stone + NUM_STONES * goal.is_slid)]
 
 

@@ -58,7 +58,7 @@ class ScriptedConfig(PreTrainedConfig):
             )
 
     def refuse_training(self) -> NoReturn:
-        """Say that there is nothing to train."""
+        """Refuse: there is nothing to train."""
         raise ValueError(
             f"--policy.type={self.type} is scripted and has nothing to train; evaluate it with lerobot-eval"
         )

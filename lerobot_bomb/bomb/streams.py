@@ -10,7 +10,7 @@ import numpy as np
 
 
 class Stream(IntEnum):
-    """Which quantity; that of a suite, of the arm, or of what acts."""
+    """Stream of random numbers of one quantity: of a suite, of the arm, or of what acts."""
 
     TARGET = 0
     COLOR = 1
@@ -20,6 +20,8 @@ class Stream(IntEnum):
     START = 5
     SUPPLY = 6
     LEVEL = 100  # plus the axis' place in AXES: the level, where the condition gives a range
+    STATIC = 7  # how a static scene stands, beside its episode's start
+    POINTING = 8  # places beside those that are meant
     AXIS = 200  # plus the axis' place in AXES: everything else that the axis draws
     ACTUATOR_NOISE = 300
     EXPERT_NOISE = 1000  # of benchmarks/expert.py

@@ -1,4 +1,4 @@
-"""What a suite is: a kind of episode. Each has a file in `suites/`."""
+"""Suites: each is a kind of episode, and has a file in `suites/`."""
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
@@ -14,13 +14,16 @@ from lerobot_bomb.bomb.layout import Layout
 from lerobot_bomb.bomb.move import Aim, Plan
 from lerobot_bomb.bomb.privileged_state import Goal
 from lerobot_bomb.bomb.streams import Stream, generator
+from lerobot_bomb.bomb.suites import SUITES
+from lerobot_bomb.conditions import ALL
 
+FIRST_VERSION = "1.0"  # of every suite, and of lines and recordings that name none
 NUM_TRAINED_TEMPLATES = 3  # the first ones of a suite; the others are held out
 
 
 @dataclass(frozen=True)
 class Turn:
-    """What is said once so many moves have been made."""
+    """Instruction that is given once so many moves have been made."""
 
     instruction: str
     # what stands for the stone, the place or the command in the suite's templates and forms
@@ -29,7 +32,7 @@ class Turn:
 
 @dataclass(frozen=True)
 class Episode:
-    """What an EpisodeSpec stands for."""
+    """Episode that an EpisodeSpec stands for."""
 
     spec: EpisodeSpec
     task_id: int  # which of the suite's numbered tasks it is of
@@ -50,15 +53,15 @@ class Episode:
 
     @property
     def instruction(self) -> str:
-        """What is said at the start."""
+        """Instruction at the start."""
         return self.turns[0].instruction
 
     def instruction_after(self, num_moves: int) -> str:
-        """What is said once so many moves have been made."""
+        """Return the instruction once so many moves have been made."""
         return self.turns[min(num_moves, len(self.turns) - 1)].instruction
 
     def allows(self, stones: Mapping[Cell, str]) -> bool:
-        """Whether the move is legal, and the instruction clear, with these stones on the board."""
+        """Return True if the move is legal, and the instruction clear, with these stones on the board."""
         if self.target is not None and self.color is not None:
             return is_legal_move(dict(stones), self.target, self.color) and self.is_clear(stones)
         return self.is_clear(stones)
@@ -68,17 +71,20 @@ class Episode:
         """Index of the stone that is moved first."""
         return self.aims[0].stone
 
-    @property
-    def goals(self) -> tuple[Goal, ...]:
-        """What the expert aims at: `Suite.num_goals`, the last one again where there are fewer."""
+    def goals_after(self, num_moves: int) -> tuple[Goal, ...]:
+        """Return the expert's goals once so many moves have been made, as far as they have been said.
+
+        There are `Suite.num_goals` of them; where there are fewer, the last one is repeated.
+        """
+        aims = self.aims[: num_moves + 1] if len(self.turns) > 1 else self.aims
         height_m = self.layout.rest_height_m
-        goals = tuple(Goal(np.array([*aim.xy, height_m]), aim.stone, aim.is_slid) for aim in self.aims)
+        goals = tuple(Goal(np.array([*aim.xy, height_m]), aim.stone, aim.is_slid) for aim in aims)
         return goals + goals[-1:] * (find_suite(self.spec.suite).num_goals - len(goals))
 
 
 @dataclass(frozen=True)
 class Suite:
-    """How its episodes are drawn and how long they may last.
+    """Kind of episode: how its episodes are drawn and how long they may last.
 
     ``check`` raises a ValueError that names the flag for a spec of which no episode can be drawn.
     """
@@ -92,6 +98,8 @@ class Suite:
     # a numbered task's spec
     of_task: Callable[[EpisodeSpec, int], EpisodeSpec] = lambda spec, task_id: replace(spec, task_id=task_id)
     num_goals: int = 1  # of the expert, at most
+    # of task, physics, observation and success rule: recordings and results of different ones do not compare
+    version: str = FIRST_VERSION
 
 
 @cache
@@ -100,13 +108,23 @@ def find_suite(name: str) -> Suite:
     return import_module(f"lerobot_bomb.bomb.suites.{name}").SUITE
 
 
+def task_version(name: str) -> str:
+    """The version of a suite; of `all`, the newest of them."""
+    return max(find_suite(each).version for each in suites_of(name))
+
+
+def suites_of(name: str) -> tuple[str, ...]:
+    """The suites that a flag's value names: one, or `all`."""
+    return SUITES if name == ALL else (name,)
+
+
 def of_split[T](split: str, items: Sequence[T], heldout: Sequence[T]) -> tuple[T, ...]:
-    """What a split draws from: those held out, the others, or all."""
+    """Return what a split draws from: the items that are held out, the others, or all."""
     return tuple(item for item in items if split == "all" or (item in heldout) == (split == "heldout"))
 
 
 def templates_of(split: str, templates: Sequence[str]) -> tuple[str, ...]:
-    """Those of a suite's instruction templates that a split draws from."""
+    """Return the templates that a split draws from, of a suite's instruction templates."""
     return of_split(split, templates, templates[NUM_TRAINED_TEMPLATES:])
 
 

@@ -1,4 +1,4 @@
-"""What LoRA and other adapters of `peft` change of our policies; LeRobot asks a policy for it."""
+"""Adapters: what LoRA and other methods of `peft` change of our policies; LeRobot asks a policy for it."""
 
 from collections.abc import Iterable
 from pathlib import Path
@@ -42,17 +42,21 @@ def peft_targets(
 
 
 def frozen_buffers(policy: nn.Module) -> dict[str, Tensor]:
-    """Copies of what a checkpoint holds besides parameters; of adapters, none does."""
+    """Copies of what a checkpoint holds besides parameters."""
     parameters = dict(policy.named_parameters(remove_duplicate=False))
     return {name: held.clone() for name, held in policy.state_dict().items() if name not in parameters}
 
 
-def check_buffers_are_the_bases(policy: nn.Module, base: dict[str, Tensor] | None, advice: str) -> None:
+def check_buffers_are_the_bases(
+    policy: nn.Module, base: dict[str, Tensor] | None, saved: Iterable[str], advice: str
+) -> None:
     """Raise a ValueError if the policy was fitted to other data than the checkpoint ``base`` is of.
 
-    Adapters are loaded on that checkpoint again, which would not know of it.
+    Adapters are loaded on that checkpoint again, which would not know of it. They hold the modules that are
+    ``saved`` with them.
     """
-    fitted = frozen_buffers(policy)
+    of_saved = tuple(f"{name}." for name in saved)
+    fitted = {name: held for name, held in frozen_buffers(policy).items() if not name.startswith(of_saved)}
     changed = [name for name in fitted if base is not None and not _equal(fitted[name], base.get(name))]
     if changed:
         raise ValueError(
@@ -68,7 +72,7 @@ def check_base(base: str) -> None:
 
 
 def check_adapters(path: str, revision: str | None) -> Path:
-    """The file of adapters in a folder or on the Hub, which is whole, finite and all that `peft` will read.
+    """Return the file of adapters, from a folder or the Hub; it is whole, finite and all that `peft` reads.
 
     They are safetensors; in their place `peft` would read a pickle.
 
@@ -101,7 +105,7 @@ def _file(path: str, name: str, revision: str | None) -> Path:
 
 
 def _named(values: Any) -> set[str]:
-    """Which fields of `NAME_OTHERS` are set, at any depth."""
+    """Return the fields of `NAME_OTHERS` that are set, at any depth."""
     if isinstance(values, list):
         return {name for each in values for name in _named(each)}
     if not isinstance(values, dict):
@@ -111,7 +115,7 @@ def _named(values: Any) -> set[str]:
 
 
 def check_adapters_fit(policy_type: Any, config: Any, path: str, revision: str | None) -> None:
-    """Adapters, as above, are all that their config puts on a policy; `peft` would only warn.
+    """Check that adapters are all that their config puts on a policy; `peft` would only warn.
 
     Raises:
         ValueError: they are another policy's, or only a part of them is there.

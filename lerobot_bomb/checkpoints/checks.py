@@ -1,4 +1,4 @@
-"""Whether a checkpoint's folder is whole and works on another machine."""
+"""Checks that a checkpoint's folder is whole and works on another machine."""
 
 from collections.abc import Iterable
 from pathlib import Path
@@ -35,7 +35,7 @@ type Shapes = dict[str, tuple[int, ...]]
 
 
 def checkpoint_files(folder: Path) -> list[str]:
-    """Names of the files that make up a checkpoint, each whole.
+    """Return the names of the files that make up a checkpoint, each whole.
 
     Raises:
         ValueError: one is missing, truncated or of another format.
@@ -75,7 +75,7 @@ def processor_files(folder: Path, processor: str) -> list[str]:
 
 
 def tensor_shapes(path: Path) -> Shapes:
-    """Of all tensors in a file, from its header.
+    """Return the shapes of all tensors in a file, from its header.
 
     Raises:
         ValueError: the file is truncated or of another format.
@@ -88,7 +88,7 @@ def tensor_shapes(path: Path) -> Shapes:
 
 
 def check_finite(path: Path) -> None:
-    """No tensor of a safetensors file holds NaN or infinite values; one at a time is in memory.
+    """Raise if a tensor of a safetensors file holds NaN or infinite values; one at a time is in memory.
 
     Raises:
         ValueError: names the file, the first such tensor, how many of its values are and where; or the file
@@ -131,7 +131,7 @@ def policy_class(folder: Path) -> type[PreTrainedPolicy]:
 
 
 def check_config(folder: Path, config: PreTrainedConfig) -> None:
-    """A checkpoint needs nothing but its own files, and no code.
+    """Check that a checkpoint needs nothing but its own files, and no code.
 
     Raises:
         ValueError: names what it needs.
@@ -145,7 +145,7 @@ def check_config(folder: Path, config: PreTrainedConfig) -> None:
 
 
 def _names_code(values: Any, key: str = "") -> bool:
-    """Whether a config of transformers asks for remote code, or for a kernel of the Hub, at any depth."""
+    """Return True if a transformers config asks, at any depth, for remote code or a kernel of the Hub."""
     if isinstance(values, dict):
         return any(_names_code(each, name) for name, each in values.items())
     if isinstance(values, list):
@@ -156,7 +156,7 @@ def _names_code(values: Any, key: str = "") -> bool:
 
 
 def check_weights(folder: Path, config: PreTrainedConfig, policy_type: type[PreTrainedPolicy]) -> None:
-    """The weights are those of the config's policy, by their names and shapes; no memory is taken.
+    """Check that weights are those of the config's policy, by name and shape, without taking memory.
 
     Raises:
         ValueError: names the first tensor that is missing, not known, or of another shape.
@@ -167,7 +167,7 @@ def check_weights(folder: Path, config: PreTrainedConfig, policy_type: type[PreT
 
 
 def check_tensors(path: Path, policy: PreTrainedPolicy) -> list[str]:
-    """A file's weights are a policy's, by their names and shapes; the names of those that it needs.
+    """Raise unless a file's weights are a policy's, by name and shape; return the names of those needed.
 
     A policy may do without parts of a file (``may_skip``) and have parts of its own that the file lacks as a
     whole (``may_lack``): names of modules.
@@ -195,12 +195,12 @@ def check_tensors(path: Path, policy: PreTrainedPolicy) -> list[str]:
 
 
 def holds_module(path: Path, module: str) -> bool:
-    """Whether a file of weights, if there is one, has tensors of a module."""
+    """Return True if a file of weights exists and has tensors of a module."""
     return path.is_file() and any(_is_of(name, [module]) for name in tensor_shapes(path))
 
 
 def _is_of(name: str, modules: Iterable[str]) -> bool:
-    """Whether a tensor is of one of the modules, by its name."""
+    """Return True if a tensor belongs to one of the modules, by its name."""
     return any(name.startswith(f"{module}.") for module in modules)
 
 

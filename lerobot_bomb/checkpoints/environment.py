@@ -1,4 +1,4 @@
-"""Which environment a policy was trained for, and whether it is the one that it is about to act in."""
+"""Environment that a policy was trained for, and whether it is the one that the policy is about to act in."""
 
 import copy
 import logging
@@ -24,7 +24,7 @@ _to_be_built: ContextVar[PreTrainedConfig | None] = ContextVar("to_be_built", de
 
 @dataclass
 class ConfigWithEnvironment(PreTrainedConfig):
-    """What the configs of all our policies have in common."""
+    """Base of our policies' configs: the environment of the training, and what a checkpoint needs."""
 
     # fields that a release added -> the value with which a policy acts as before, and is the same in results
     LATER_FIELDS: ClassVar[dict[str, Any]] = {}
@@ -39,7 +39,7 @@ class ConfigWithEnvironment(PreTrainedConfig):
         super().__post_init__()
 
     def missing_parts(self) -> str | None:
-        """What a checkpoint with this config lacks and what it would need instead; None: nothing."""
+        """Describe what a checkpoint with this config lacks and what it would need instead; None: nothing."""
         return None
 
     def methods_used(self) -> str:
@@ -63,7 +63,7 @@ class ConfigWithEnvironment(PreTrainedConfig):
 
 
 def check_acting_policy(here: Environment) -> None:
-    """The policy that this process built last was trained for this environment, as far as anyone can know.
+    """Check that the policy that was built last was trained for this environment, as far as is known.
 
     Raises:
         ValueError: it was trained for another one; the message names the flags to change.
@@ -84,7 +84,7 @@ def as_if_built(config: PreTrainedConfig) -> Iterator[None]:
 
 
 def asked_config() -> tuple[PreTrainedConfig, str, str] | None:
-    """Of the policy that this process built last, its name and how to insist on it; None: nothing to ask."""
+    """Return config and name of the last built policy, and how to override its check; None: no check."""
     policies = built_policies()
     config = _to_be_built.get() or (policies[-1].config if policies else None)
     if config is None or getattr(config, "ignore_environment", False):
@@ -102,7 +102,11 @@ def _name(config: PreTrainedConfig) -> str:
 
 
 def trained_environment(config: PreTrainedConfig) -> Environment | None:
-    """By the dataset it is being trained on, by its config, or by the dataset that its training names."""
+    """Return the environment that a policy was trained for.
+
+    It is taken from the dataset that the policy is being trained on, else from its config, else from the
+    dataset that its training names.
+    """
     if training_data(config) is None:
         environment = getattr(config, "environment", None)
         if environment is not None:
@@ -111,7 +115,7 @@ def trained_environment(config: PreTrainedConfig) -> Environment | None:
 
 
 def environment_of_dataset(root: Path | str | None) -> Environment | None:
-    """None: the folder is gone, or holds no recording of BOMB."""
+    """Return the environment of a dataset; None: the folder is gone, or holds no recording of BOMB."""
     facts = DatasetFacts.find(root)
     return None if facts is None else facts.environment
 
@@ -148,7 +152,7 @@ def _check(config: PreTrainedConfig, who: str, insist: str, here: Environment) -
 
 
 def _check_image_size(config: PreTrainedConfig, here: Environment, who: str, insist: str) -> None:
-    """By the config's inputs, of the cameras that are here: features of (3, H, W)."""
+    """Raise if the config's inputs (3, H, W) are of another size than the images of the cameras here."""
     for camera in here.cameras:
         feature = (config.input_features or {}).get(f"{IMAGES}{camera}")
         if feature is None or tuple(feature.shape[1:]) == (here.image_size,) * 2:

@@ -86,7 +86,7 @@ def load_processors(config: PreTrainedConfig) -> tuple[Preprocessor, Postprocess
 def write_checkpoint(
     path: Path, policy: PreTrainedPolicy, processors: Iterable[PolicyProcessorPipeline[Any, Any]]
 ) -> None:
-    """Config, weights and processors in a new folder, which appears complete."""
+    """Write config, weights and processors to a new folder, which appears complete."""
     with written_whole(path) as (folder,):
         policy.save_pretrained(folder)
         for processor in processors:

@@ -1,4 +1,4 @@
-"""Which policy this process built: LeRobot tells an environment nothing of it."""
+"""Identity of the policy that this process built: LeRobot tells an environment nothing of it."""
 
 import gc
 import hashlib
@@ -45,19 +45,19 @@ def acting_policy() -> PreTrainedPolicy | None:
 
 
 def identity_of(policy: PreTrainedPolicy) -> PolicyIdentity:
-    """Which policy this is."""
+    """Return the identity of a policy."""
     if training_data(policy.config) is not None:
         return PolicyIdentity(policy.config.type, is_in_training=True)
     return identity_of_config(policy.config)
 
 
 def identity_of_config(config: PreTrainedConfig) -> PolicyIdentity:
-    """Which policy is built from this config."""
+    """Return the identity of the policy that is built from this config."""
     return PolicyIdentity(config.type) if config.pretrained_path is None else _of_checkpoint(config)
 
 
 def policy_of_results(results_path: str | None, num_envs: int) -> list[dict[str, PolicyIdentity]]:
-    """Argument of each environment that writes lines of results: the policy, which LeRobot builds later.
+    """Argument of each environment that writes records of results: the policy, which LeRobot builds later.
 
     From now on its queries are timed.
     """
@@ -70,12 +70,12 @@ def policy_of_results(results_path: str | None, num_envs: int) -> list[dict[str,
 
 
 def weights_file(checkpoint: Path | str, revision: str | None, has_adapters: bool) -> Path | None:
-    """Of a folder, or of a repository on the Hub as it was downloaded; None: it has none of this name."""
+    """Return the weights of a folder or of a downloaded Hub repository; None: it has no file of this name."""
     return local_file(checkpoint, revision, ADAPTERS[1] if has_adapters else WEIGHTS)
 
 
 def sha256_of(path: Path) -> str:
-    """Of a file's bytes, as 64 hexadecimal digits; read once as long as the file does not change."""
+    """Return the SHA-256 of a file's bytes, 64 hexadecimal digits; unchanged files are read only once."""
     status = path.stat()
     return _sha256(path.resolve(), status.st_mtime_ns, status.st_size)
 
@@ -109,12 +109,12 @@ def _interventions(folder: Path) -> tuple[str, ...]:
 
 
 def _settings_sha256(config: PreTrainedConfig, folder: Path) -> str:
-    """Of what the same weights may differ in: flags of this evaluation, and processors."""
+    """Return the SHA-256 of what the same weights may differ in: flags of this evaluation, and processors."""
     settings: Any = draccus.encode(config)
     settings = {name: value for name, value in settings.items() if name not in NOT_ITS_SETTINGS}
     for name, as_before in getattr(config, "LATER_FIELDS", {}).items():
         for values in (settings, settings.get("trained_with") or {}):
-            if values.get(name) == as_before:
+            if name in values and values[name] == as_before:
                 del values[name]
     digest = hashlib.sha256(json.dumps(settings, sort_keys=True, default=str).encode())
     found = (path for pattern in PROCESSOR_PATTERNS for path in folder.glob(pattern))

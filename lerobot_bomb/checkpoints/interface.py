@@ -1,4 +1,4 @@
-"""Whether a policy can act in an environment of which datasets say no more than shapes and statistics."""
+"""Fit of a policy to an environment whose datasets say no more than shapes and statistics."""
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
@@ -20,7 +20,7 @@ UNNORMALIZER = f"{POLICY_POSTPROCESSOR_DEFAULT_NAME}_step_*_unnormalizer_process
 
 @dataclass(frozen=True)
 class Interface:
-    """What an environment shows a policy and takes from it."""
+    """Interface of an environment: what it shows a policy and takes from it."""
 
     env_type: str
     features: Mapping[str, PolicyFeature]  # by the policy's names
@@ -29,7 +29,7 @@ class Interface:
     image_flags: Callable[[int, int], str]  # (height, width) -> the flags of images of this size
 
     def check_acting_policy(self) -> None:
-        """The policy that this process built last was trained for such an environment, for all one knows.
+        """Check that the policy that was built last was trained for such an environment, as far as is known.
 
         Raises:
             ValueError: it was trained for another one; the message says what differs and the way out.
@@ -65,7 +65,7 @@ class Interface:
             )
 
     def _check_actions(self, config: PreTrainedConfig, who: str, insist: str) -> None:
-        """By the least and the greatest action of its training."""
+        """Raise unless the least and the greatest action of the training suit the environment."""
         trained = trained_actions(config)
         if trained is None or self.action_range is None:
             return

@@ -1,4 +1,4 @@
-"""Whether a policy was trained on images of LIBERO in the orientation that its environment shows."""
+"""Check that a policy was trained on LIBERO's images in the orientation that its environment shows."""
 
 import logging
 from functools import cache
@@ -29,7 +29,7 @@ class OrientationCheck:
         self._is_done = False
 
     def compare(self, shown: np.ndarray, task: str) -> None:
-        """Images of the environment, (N, H, W, 3) uint8, in episodes of a task of the suite."""
+        """Compare with images of the environment, (N, H, W, 3) uint8, in episodes of a task of the suite."""
         asked = None if self._is_done else asked_config()
         if asked is None:
             return
@@ -74,7 +74,7 @@ def images_of_task(root: Path, key: str, task: str) -> np.ndarray | None:
 
 
 def _files_of(meta: LeRobotDatasetMetadata, number: int) -> list[Path]:
-    """Of an episode's frames, below the dataset's folder."""
+    """Return the files of an episode's frames, below the dataset's folder."""
     return [
         meta.get_data_file_path(number),
         *(meta.get_video_file_path(number, key) for key in meta.video_keys),

@@ -19,7 +19,7 @@ TO_PUBLISH = (
 
 
 def is_hub_id(name: object) -> bool:
-    """Whether it has the form USER/NAME and is no folder here."""
+    """Return True if the text has the form USER/NAME and is no folder here."""
     text = str(name)
     return re.fullmatch(r"\w[\w.-]*/[\w.-]+", text) is not None and not Path(text).exists()
 
@@ -34,7 +34,7 @@ def local_file(checkpoint: Path | str, revision: str | None, name: str) -> Path 
 
 
 def is_local_path(value: object) -> bool:
-    """Whether a text names a place on this machine."""
+    """Return True if a text names a place on this machine."""
     if not isinstance(value, str | Path) or not str(value):
         return False
     text = str(value)
@@ -42,7 +42,7 @@ def is_local_path(value: object) -> bool:
 
 
 def has_local_path(value: Any) -> bool:
-    """The same, of anything inside lists and dicts."""
+    """Return True if anything inside lists and dicts names a place on this machine."""
     if isinstance(value, dict):
         return any(map(has_local_path, value.values()))
     if isinstance(value, list | tuple):

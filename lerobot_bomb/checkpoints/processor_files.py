@@ -1,4 +1,4 @@
-"""Whether a checkpoint's processors are data: which steps they may name, and that those have all they need.
+"""Checks that a checkpoint's processors are data: they name known steps, which have all they need.
 
 LeRobot imports and calls whatever `class` a step names, before it looks at what came out.
 """
@@ -53,7 +53,7 @@ STATISTICS = {**BOUND_STATISTICS, NormalizationMode.MEAN_STD: CENTRE_AND_DISTANC
 
 
 def saved_type(config_file: Path) -> object:
-    """What a checkpoint's config.json says it is; None: whoever reads the config will say why not."""
+    """Return the type in a checkpoint's config.json; None: whoever reads the config will say why not."""
     try:
         return read_json(config_file).get("type")
     except (OSError, ValueError):
@@ -61,7 +61,7 @@ def saved_type(config_file: Path) -> object:
 
 
 def is_ours(policy_type: object) -> bool:
-    """Whether checkpoints of this type, as config.json names it, hold all that they need."""
+    """Return True if checkpoints of this type, as config.json names it, hold all that they need."""
     known = PreTrainedConfig.get_known_choices()
     return isinstance(policy_type, str) and hasattr(known.get(policy_type), "package_version")
 
@@ -185,7 +185,7 @@ def _check_loaded(steps: Sequence[Any], where: str, config_file: Path) -> None:
 
 
 def check_float_statistics(content: Mapping[str, Any], folder: Path) -> None:
-    """The saved statistics of a processor's JSON are floats; loading would hide that they were rounded.
+    """Check that a processor's saved statistics are floats; loading would hide that they were rounded.
 
     Raises:
         ValueError: names the file and the first that are none.
@@ -205,7 +205,7 @@ def check_float_statistics(content: Mapping[str, Any], folder: Path) -> None:
 
 
 def check_states(steps: Sequence[Any], where: str, complete: bool) -> None:
-    """The steps' loaded states are finite where they are used; `complete`: and they hold all that is used.
+    """Check that the steps' loaded states are finite where used; `complete`: and hold all that is used.
 
     Raises:
         ValueError: names the statistic that is missing, of another shape or not finite.

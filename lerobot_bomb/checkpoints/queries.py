@@ -1,4 +1,4 @@
-"""How long the policy of this process takes to answer, whatever its type."""
+"""Time that the policy of this process takes to answer, whatever its type."""
 
 from collections import deque
 from collections.abc import Callable
@@ -22,7 +22,7 @@ _CLOCKS: "WeakKeyDictionary[PreTrainedPolicy, _Clock]" = WeakKeyDictionary()
 
 
 def time_queries(policy: PreTrainedPolicy) -> None:
-    """From now on `last_query` tells of this policy, unless it has no network."""
+    """Time the policy's queries for `last_query`, unless it has no network."""
     if policy in _CLOCKS or next(policy.parameters(), None) is None:
         return
     _CLOCKS[policy] = _Clock(policy)
@@ -74,7 +74,7 @@ class _Clock:
         return action
 
     def _wait(self) -> None:
-        """Until the device has done what it was given."""
+        """Wait until the device has done what it was given."""
         if self._device.type != "cpu":
             torch.accelerator.synchronize(self._device)
 
@@ -90,7 +90,7 @@ class _Clock:
 
 
 def _queue_lengths(policy: PreTrainedPolicy) -> dict[tuple[str, ...], int]:
-    """Of all queues of a policy: a call that leaves one shorter has only taken an action from it."""
+    """Return the lengths of a policy's queues; a call that leaves one shorter only took an action from it."""
     lengths: dict[tuple[str, ...], int] = {}
     for name, value in vars(policy).items():
         if isinstance(value, deque):
@@ -101,13 +101,13 @@ def _queue_lengths(policy: PreTrainedPolicy) -> dict[tuple[str, ...], int]:
 
 
 def _told(policy: PreTrainedPolicy, name: str) -> Any:
-    """What a policy says of its last query; None: it says nothing of the kind."""
+    """Return a number that a policy tells of its last query; None: it tells none of this name."""
     value = getattr(policy, name, None)
     return value if type(value) in (int, float) else None
 
 
 def _device_name(device: torch.device) -> str:
-    """'NVIDIA H100', 'cpu, 1 thread': the line names the processor."""
+    """'NVIDIA H100', 'cpu, 1 thread': the record names the processor."""
     if device.type == "cuda":
         return torch.cuda.get_device_name(device)
     if device.type == "cpu":
@@ -125,7 +125,7 @@ def _reset_peak_memory(device: torch.device) -> None:
 
 
 def _peak_memory_bytes(device: torch.device) -> int | None:
-    """On CUDA of tensors, on a CPU of the whole process; None: the system does not tell."""
+    """Return the peak memory, on a CPU of the whole process, on CUDA of tensors; None: it is not known."""
     if device.type == "cuda":
         return torch.cuda.max_memory_allocated(device)
     if device.type != "cpu" or not (PROCESS / "status").is_file():

@@ -12,12 +12,12 @@ PREFIX = "bomb:"
 
 
 def shipped_names() -> list[str]:
-    """What can stand behind `bomb:`."""
+    """Return the names that can stand behind `bomb:`."""
     return sorted(path.parent.name for path in FOLDER.glob(f"*/{CONFIG}"))
 
 
 def shipped_checkpoint(name: str) -> Path:
-    """The folder of one, as lerobot-train's `pretrained_model`; it is not to be written to.
+    """Return a shipped checkpoint's folder, as lerobot-train's `pretrained_model`; do not write to it.
 
     Raises:
         ValueError: there is none of this name.
@@ -30,7 +30,7 @@ def shipped_checkpoint(name: str) -> Path:
 
 
 def checkpoint_path(text: str) -> str:
-    """The path of a checkpoint that someone gave: the folder that `bomb:NAME` means, all else as it is.
+    """Return a given checkpoint's path: the folder that `bomb:NAME` means, all else as it is.
 
     Raises:
         ValueError: no checkpoint of this name comes with the package.

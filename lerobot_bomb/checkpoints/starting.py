@@ -17,7 +17,7 @@ logger = logging.getLogger(__name__)
 
 
 def way_to_start_otherwise(checkpoint: str | Path, policy_type: str) -> str:
-    """How a checkpoint's vision-language model becomes the start of a policy for other data."""
+    """Describe how a checkpoint's vision-language model becomes the start of a policy for other data."""
     return (
         "for other cameras, state or action, start from its vision-language model: lerobot-bomb "
         f"export-backbone --policy.path={checkpoint} --output=FOLDER, then lerobot-train "

@@ -1,4 +1,4 @@
-"""What a checkpoint says of its training."""
+"""Training of a checkpoint, as its files tell it."""
 
 from pathlib import Path
 from typing import Any
@@ -9,7 +9,7 @@ from lerobot_bomb.files import read_json
 
 
 def read_train_config(checkpoint: Path) -> dict[str, Any]:
-    """What lerobot-train was given; empty if the checkpoint does not say."""
+    """Return what lerobot-train was given; empty if the checkpoint does not say."""
     path = checkpoint / TRAIN_CONFIG
     return read_json(path) if path.is_file() else {}
 

@@ -33,7 +33,7 @@ def path_flag(text: str) -> Path:
 
 
 def checkpoint_flag(text: str) -> Path:
-    """The folder of a checkpoint that a flag gives, for argparse; `bomb:NAME` is one of the package's.
+    """Return the checkpoint folder of a flag, for argparse; `bomb:NAME` is one of the package's.
 
     Raises:
         argparse.ArgumentTypeError: no checkpoint of this name comes with the package, or it is no path.
@@ -108,7 +108,7 @@ def add_new_dataset_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def add_episode_arguments(parser: argparse.ArgumentParser) -> None:
-    """Declare what a command that plays episodes is told of them beside the seed, as --env.type=bomb is."""
+    """Declare what a command that runs episodes is told of them beside the seed, as --env.type=bomb is."""
     add = parser.add_argument
     lines = f"0..{BOARD.num_lines - 1}"
     tolerance = EpisodeSpec.success_tolerance_mm

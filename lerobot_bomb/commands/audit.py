@@ -55,7 +55,7 @@ def add_audit_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run_audit(args: argparse.Namespace) -> int:
-    """Play all arms, write what they show, print the verdicts; exit code 3 where one is no."""
+    """Run all arms, write what they show, print the verdicts; exit code 3 where one is no."""
     check_at_least(args, episodes=2, seed=0, workers=1)
     check_flags(args.rest)
     arms = _play(args, args.folder / "first", _first_arms(args))
@@ -89,7 +89,7 @@ def _first_arms(args: argparse.Namespace) -> dict[str, Cell]:
 
 
 def _second_arms(args: argparse.Namespace, played: list[Row]) -> dict[str, Cell]:
-    """Those that need the instructions of the first."""
+    """Return the cells of the second arms, which need the instructions of the first."""
     arms = {AGAIN: _cell(args, f"--policy.path={args.policy_path}")}
     others = other_instructions(played)
     if others:
@@ -123,11 +123,11 @@ def _cell(args: argparse.Namespace, policy: str, split: str = "", batch_size: in
 
 
 def _play(args: argparse.Namespace, folder: Path, cells: dict[str, Cell]) -> dict[str, list[Row]]:
-    """{arm: its lines}.
+    """Return {arm: its records}.
 
     Raises:
         ValueError: the folder is of another audit.
-        RuntimeError: an arm could not be played.
+        RuntimeError: an arm could not be run.
     """
     with claimed(folder, Manifest(tuple(cells.values()))) as store:
         play(store, "0/1", args.workers)

@@ -35,17 +35,19 @@ def _points(text: str) -> float:
 
 
 def _two_policies(args: argparse.Namespace) -> tuple[list[Row], list[Row]]:
-    """Their episodes, of two files or of one."""
+    """Return the records of the two policies, of two files or of one."""
     if args.b is not None:
         if args.policies:
             raise ValueError("--policies chooses two of one file; give one, or drop it")
-        (first, _), (second, _) = map(read_undamaged, (args.a, args.b))
+        first, second = (read_undamaged(path).rows for path in (args.a, args.b))
         return first, second
-    rows, _ = read_undamaged(args.a)
+    rows = read_undamaged(args.a).rows
     both = of_policies(rows, args.policies)
     if len(both) != 2:
         names = "; ".join(describe_policy(of[0]) for of in both)
-        raise ValueError(f"{args.a}: two policies are compared, not {len(both)} ({names}): --policies=A,B")
+        is_alone = len(both) == 1 and not args.policies
+        remedy = "name the file of a second one" if is_alone else "choose two with --policies=A,B"
+        raise ValueError(f"{args.a}: two policies are compared, not {len(both)} ({names}); {remedy}")
     return both[0], both[1]
 
 

@@ -19,14 +19,13 @@ from lerobot_bomb.data.libero_conversion import convert_libero
 from lerobot_bomb.data.pusht_zarr import BOARD_SIZE, IMAGE_SIZE, PushtZarr
 from lerobot_bomb.data.resumable import (
     BLOCK_EPISODES,
-    check_folders,
     check_repo_id,
     default_root,
     grow,
     terminated_in_order,
-    unfinished_folder,
 )
 from lerobot_bomb.data.rigid_copies import RigidMotion
+from lerobot_bomb.data.unfinished import check_folders, unfinished_folder
 
 if TYPE_CHECKING:
     from lerobot_bomb.data.blocks import DatasetLayout, RecordedEpisode
@@ -37,7 +36,7 @@ FPS = 10  # of the demonstrations and of LeRobot's environment `pusht`
 
 @dataclass(frozen=True)
 class Conversion:
-    """What determines a converted dataset."""
+    """Parameters that determine a converted dataset."""
 
     kind: ClassVar[str] = "conversion"
 
@@ -164,7 +163,7 @@ def _pusht_layout(repo_id: str) -> "DatasetLayout":
 
 
 def _pusht_episode(source: PushtZarr, task: str, index: int) -> "RecordedEpisode":
-    """All demonstrations by number, then a copy of each, and so on."""
+    """Return an episode: all demonstrations by number, then a copy of each, and so on."""
     from lerobot.utils.constants import ACTION, OBS_IMAGE, OBS_STATE
 
     from lerobot_bomb.data.blocks import RecordedEpisode

@@ -131,7 +131,7 @@ def _check_keys(path: Path, values: dict[str, Any], keys: tuple[str, ...]) -> No
 
 
 def _chosen_statistics(statistics: dict[str, Any], name: str | None) -> str:
-    """The data set of that name, or the only one."""
+    """Return the name of the statistics: the given one, or the only one."""
     if name is None and len(statistics) == 1:
         return next(iter(statistics))
     if name not in statistics:
@@ -141,9 +141,9 @@ def _chosen_statistics(statistics: dict[str, Any], name: str | None) -> str:
 
 
 def _action_scales(action: dict[str, Any]) -> dict[str, Tensor]:
-    """What the normalised actions -1 and 1 stand for, where the original scales by q01 and q99.
+    """Return what the normalised actions -1 and 1 stand for, where the original scales by q01 and q99.
 
-    It does so where ``mask`` says so; and its gripper is 0 or 1 before, where ours is -1 or 1.
+    It does so where ``mask`` says so. Its gripper is 0 or 1 before, where ours is -1 or 1.
     """
     low, high = (torch.tensor(action[key], dtype=torch.float32) for key in ("q01", "q99"))
     scaled = torch.tensor(action.get("mask", [True] * len(low)))
@@ -153,7 +153,7 @@ def _action_scales(action: dict[str, Any]) -> dict[str, Tensor]:
 
 
 def _grids(args: argparse.Namespace, processor: dict[str, Any]) -> ActionGrids:
-    """Of the folder's own edges, and the Gaussians of --grid, which must be those that they were made of."""
+    """Build grids from the folder's own edges and the Gaussians of --grid, which those must be made of."""
     counts, policy = processor["action_config"]["num_bins"], processor.get("bin_policy")
     if policy is None:
         raise ValueError(f"{args.folder}: processor_config.json has no bin_policy, the edges of its cells")
@@ -249,7 +249,7 @@ def _config(
 def _intrinsics(
     cameras: dict[str, Any], statistics: str, camera: str, side: int
 ) -> dict[str, list[list[float]]]:
-    """What the folder says of the data set's camera, for images of ``side``; {}: what is assumed of any."""
+    """Return the camera's intrinsics from the folder, for images of ``side``; {}: the default ones."""
     of = cameras.get(statistics) or cameras["default"]
     # the original counts from the image's edge, the flag from the first pixel's centre
     K = torch.tensor([of["intrinsic"]], dtype=torch.float32)
@@ -282,7 +282,7 @@ def _weights(folder: Path, original: dict[str, Any], ours: dict[str, Tensor]) ->
 
 
 def _renamed(tensors: dict[str, Tensor]) -> Iterator[tuple[str, Tensor]]:
-    """Those that the policy has, under its names; of another, loading strictly tells the name."""
+    """Yield the policy's tensors under its names; of an unknown one, strict loading tells the name."""
     for name, tensor in tensors.items():
         if not name.startswith(POOLING_HEAD):
             begins = next((begins for begins in RENAMED if name.startswith(begins)), "")

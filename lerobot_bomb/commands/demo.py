@@ -30,7 +30,7 @@ SUITE = "place"
 
 @dataclass(frozen=True)
 class Player:
-    """Who acts, and under which conditions."""
+    """Policy that acts in the demo, and the conditions that it acts under."""
 
     policy_flag: str
     conditions: tuple[str, ...] = CONDITIONS
@@ -156,7 +156,7 @@ def _write_sheet(output_dir: Path, rows: list[Row]) -> Path:
 
 
 def _tile(video: Path, row: Row) -> np.ndarray:
-    """Both cameras without the video's caption, which is of a step before the end."""
+    """Return both cameras with a caption; the video's own is of a step before the end."""
     from PIL import Image
 
     from lerobot_bomb.viewing.sheet import caption

@@ -52,7 +52,7 @@ class Finding:
 
 
 def check_versions() -> Iterator[Finding]:
-    """Python, this package and its main dependencies."""
+    """Check Python, this package and its main dependencies."""
     yield Finding("python", platform.python_version())
     for name in (DISTRIBUTION, *DEPENDENCIES):
         try:
@@ -65,7 +65,7 @@ def check_versions() -> Iterator[Finding]:
 
 
 def _outside(name: str, version: str) -> str:
-    """What is wrong with an installed version that lies outside the range that this package declares."""
+    """Describe the range that this package declares, if an installed version lies outside it; else ""."""
     try:
         declared = [Requirement(text) for text in importlib.metadata.requires(DISTRIBUTION) or []]
     except importlib.metadata.PackageNotFoundError:  # reported as a finding of its own
@@ -98,7 +98,7 @@ def check_rendering() -> Iterator[Finding]:
 
 
 def check_fetch() -> Iterator[Finding]:
-    """Whether the arm that comes from gymnasium-robotics can be used; the other needs nothing."""
+    """Check that the arm from gymnasium-robotics can be used; the other one needs nothing."""
     try:
         importlib.import_module("lerobot_env_bomb.fetch_files").fetch_xml()
         yield Finding("--env.robot=fetch", "can run")
@@ -107,7 +107,7 @@ def check_fetch() -> Iterator[Finding]:
 
 
 def check_libero() -> Iterator[Finding]:
-    """Whether LIBERO is installed and has a config file and assets; nothing else needs it."""
+    """Check that LIBERO is installed and has a config file and assets; nothing else needs it."""
     libero = Libero.find()
     if libero is None:
         yield Finding("libero", f"not installed (for --env.type=libero: {INSTALL})", absent=True)
@@ -127,7 +127,7 @@ def check_libero() -> Iterator[Finding]:
 
 
 def check_types() -> Iterator[Finding]:
-    """Env and policy types whose packages the plugin imports: whether LeRobot knows them, and classes."""
+    """Check that LeRobot knows the env and policy types that the plugin imports, and their classes."""
     plugin = importlib.import_module(DISTRIBUTION)
     from lerobot.configs import PreTrainedConfig
     from lerobot.envs import EnvConfig
@@ -148,7 +148,7 @@ def _imported_types(plugin: ModuleType, prefix: str) -> list[str]:
 
 
 def check_gpu() -> Iterator[Finding]:
-    """The accelerator torch would use; none is fine for the nano presets."""
+    """Check the accelerator that torch would use; none is fine for the nano presets."""
     torch = importlib.import_module("torch")
     if torch.cuda.is_available():
         yield Finding("gpu", torch.cuda.get_device_name())
@@ -158,7 +158,7 @@ def check_gpu() -> Iterator[Finding]:
 
 
 def check_hub() -> Iterator[Finding]:
-    """Whether pretrained backbones can be downloaded; not needed for nano or a local folder."""
+    """Check that pretrained backbones can be downloaded; nano and local folders do not need it."""
     hub = importlib.import_module("huggingface_hub")
     if hub.constants.HF_HUB_OFFLINE:
         detail = "offline by HF_HUB_OFFLINE; nano and local folders work"
@@ -184,7 +184,7 @@ CHECKS: tuple[Callable[[], Iterator[Finding]], ...] = (
 
 
 def add_doctor_arguments(parser: argparse.ArgumentParser) -> None:
-    """``lerobot-bomb doctor`` has no arguments."""
+    """Declare no arguments: ``lerobot-bomb doctor`` has none."""
 
 
 def run_doctor(args: argparse.Namespace) -> int:

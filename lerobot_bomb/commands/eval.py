@@ -85,7 +85,7 @@ def run_eval(args: argparse.Namespace) -> int:
 
 
 def logged(path: Path, config: EnvConfig, envs: Envs) -> Envs:
-    """The same environments, whose executed actions go to a file."""
+    """Wrap the environments so that their executed actions go to a file."""
     return {
         group: {
             task_id: cast("VectorEnv", LoggedVectorEnv(env, _log_to(path, group, task_id, config.fps)))

@@ -57,7 +57,7 @@ def add_explain_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run_explain(args: argparse.Namespace) -> int:
-    """Play, ask, write a page, its numbers and, of one episode, a recording; print what was found."""
+    """Explain episodes; write a page, its numbers and, of one episode, a recording; print the findings."""
     check_at_least(args, episodes=1, grid=1)
     if args.episodes > 1 and args.step is not None:
         raise ValueError(f"--step={args.step} is of one episode; drop it or --episodes={args.episodes}")
@@ -116,7 +116,7 @@ def _of_line(args: argparse.Namespace) -> "_Asked":
 
 @dataclass(frozen=True)
 class _Asked:
-    """Which episodes of whom."""
+    """Episodes and checkpoint to explain."""
 
     viewed: Callable[[int], Viewed]  # of a seed
     seed: int
@@ -135,7 +135,7 @@ class _Asked:
 def _moments(
     args: argparse.Namespace, asked: _Asked, seed: int, loaded: "LoadedPolicy"
 ) -> "tuple[list[ExplainedMoment], Any]":
-    """Those of an episode that are asked about, and what became of it."""
+    """Explain an episode's moments that are asked about; return them with the episode's result."""
     from lerobot_bomb.explain.episode import Settings, explain_moment
     from lerobot_bomb.explain.watched import at_step, middle_of_phases, watch
 
@@ -207,7 +207,7 @@ def _explain_several(args: argparse.Namespace, asked: _Asked) -> int:
 
 
 def _probes(moments: "Sequence[ExplainedMoment]") -> "list[LayerProbe]":
-    """Of the destination and the stone, where they and the layers' states are known in enough episodes."""
+    """Probe layers for destination and stone, where enough episodes hold them and the layers' states."""
     from lerobot_bomb.explain.probes import MIN_EPISODES, probe_layers
 
     known = [each for each in moments if each.states and each.watched.target is not None]

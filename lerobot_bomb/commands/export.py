@@ -39,7 +39,7 @@ def run_export(args: argparse.Namespace) -> int:
     # huggingface_hub takes a second
     from lerobot_bomb.hub.evaluations import check_one_rate_each, eval_results_yaml, model_index_yaml
 
-    arms = arms_of([row for path in args.paths for row in read_undamaged(path)[0]])
+    arms = arms_of([row for path in args.paths for row in read_undamaged(path).rows])
     contents = {args.output / LATEX: table(arms)}
     policies = policies_of(arms)
     _, *names = file_names([LATEX, *(each.short_name for each in policies)])

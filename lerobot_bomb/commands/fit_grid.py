@@ -178,7 +178,7 @@ def print_errors(unit: str, errors: dict[str, np.ndarray], names: list[str]) -> 
 
 
 def plot_rows(grids: ActionGrids, actions_ND: np.ndarray, names: list[str]) -> list[PlotRow]:
-    """What a plot shows of every coordinate."""
+    """Return the rows of a plot, one for each coordinate."""
     values_CN = grids.coordinates(torch.from_numpy(actions_ND).float()).T.numpy()
     rows = zip(
         coordinate_names(grids, names),

@@ -111,7 +111,7 @@ def run_gallery(args: argparse.Namespace) -> int:
 
 @dataclass(frozen=True)
 class Look:
-    """How an episode looks under one condition."""
+    """Look of an episode under one condition."""
 
     images: dict[str, np.ndarray]  # camera -> (S, S, 3) uint8, at the start
     instruction: str
@@ -163,7 +163,7 @@ def suite_sheet(suite: str, seeds: Sequence[int], options: RenderOptions) -> She
 def tiles_sheet(
     table: Mapping[str, Axis], tiles_of: TilesOf, axis: str, seeds: Sequence[int], image_size: int
 ) -> Sheet:
-    """The same of another environment, whose axes are a table; a row for each kind of tile, per seed."""
+    """Return the sheet of another environment with a table of axes: a row per kind of tile and seed."""
     axes = nuisances_of(table) if axis == ALL else (axis,)
     helps = ", ".join(sorted(table.keys() - set(nuisances_of(table))))
     changes = {change for name in axes for change in table[name].changes}
@@ -179,7 +179,7 @@ def tiles_sheet(
 
 
 def pusht_tiles(condition: str, seed: int, image_size: int, changes: set[str]) -> dict[str, np.ndarray]:
-    """What dynamics do is seen after some steps through the block."""
+    """Return tiles of the start of a PushT episode; dynamics show after some steps through the block."""
     spec = PushTSpec(seed, perturbations=condition)
     env = make_pusht_env(spec, image_size)
     observation, info = env.reset(seed=seed)
@@ -198,7 +198,7 @@ def pusht_tiles(condition: str, seed: int, image_size: int, changes: set[str]) -
 
 
 def libero_tiles(condition: str, seed: int, image_size: int, changes: set[str]) -> dict[str, np.ndarray]:
-    """Both cameras upright; what dynamics do is seen after the same actions."""
+    """Return tiles of both cameras, upright; dynamics show after the same actions."""
     env = make_libero_env(LiberoSpec(seed, LIBERO_TASK, perturbations=condition), image_size)
     observation, _ = env.reset(seed=seed)
     tiles = {}
@@ -218,7 +218,7 @@ TILES_OF: dict[str, TilesOf] = {"bomb_pusht": pusht_tiles, "bomb_libero": libero
 
 
 def look_at(condition: str, seeds: Sequence[int], options: RenderOptions, played: bool) -> list[Look]:
-    """Each seed's episode under a condition; `played` by the expert to its end, or only begun."""
+    """Show each seed's episode under a condition; `played` by the expert to its end, or only begun."""
     env = make_env(EpisodeSpec(seeds[0], perturbations=condition), options)
     looks = []
     for seed in seeds:
@@ -232,7 +232,7 @@ def look_at(condition: str, seeds: Sequence[int], options: RenderOptions, played
 
 
 def magnitude_rows(axis: Axis) -> dict[str, list[str]]:
-    """What the table says of an axis, as rows of words under the columns."""
+    """Return an axis' magnitudes by level, as rows of words under the columns."""
     return {
         f"{name}, {magnitude.unit}": ["", *(f"{value:g}" for value in magnitude.levels)]
         for name, magnitude in axis.magnitudes.items()

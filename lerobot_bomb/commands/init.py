@@ -27,7 +27,7 @@ PREFIX = "--policy."
 
 @dataclass
 class _Flags:
-    """Around the policy's, so that LeRobot's parser names them as lerobot-train does."""
+    """Flags around the policy's config, so that LeRobot's parser names them as lerobot-train does."""
 
     policy: PreTrainedConfig
 

@@ -21,7 +21,7 @@ def add_lines_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run_lines(args: argparse.Namespace) -> int:
-    """Append the lines of an evaluation; the flags are those of its command."""
+    """Append the records of an evaluation; the flags are those of its command."""
     if not flag_value(args.flags, "--output_dir"):
         raise ValueError(f"--output_dir=... is missing: the folder that lerobot-eval wrote {EVAL_INFO} to")
     config = eval_config(args.flags)

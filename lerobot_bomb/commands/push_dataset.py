@@ -10,8 +10,9 @@ from huggingface_hub.errors import RevisionNotFoundError
 from lerobot_bomb.commands.arguments import add_hub_arguments, path_flag
 from lerobot_bomb.data.dataset_files import check_dataset
 from lerobot_bomb.data.facts import DatasetFacts
-from lerobot_bomb.data.resumable import METADATA_FILE, check_repo_id
+from lerobot_bomb.data.resumable import check_repo_id
 from lerobot_bomb.data.statistics import check_statistics
+from lerobot_bomb.data.unfinished import METADATA_FILE
 from lerobot_bomb.hub.markdown import code, command, fenced, plain
 from lerobot_bomb.hub.push import CARD
 from lerobot_bomb.hub.upload import check_token, hub_errors, upload
@@ -64,7 +65,7 @@ def _is_data(path: str) -> bool:
 
 
 def dataset_card(repo_id: str, facts: DatasetFacts) -> str:
-    """What the dataset shows, and how to train on it."""
+    """Write the dataset's card: what the dataset shows, and how to train on it."""
     metadata = DatasetCardData(
         license="apache-2.0",
         tags=["LeRobot", "lerobot_bomb"],
@@ -111,7 +112,7 @@ def dataset_card(repo_id: str, facts: DatasetFacts) -> str:
 
 
 def _tag(repo_id: str, version: str) -> None:
-    """LeRobot loads the commit that has the version's tag."""
+    """Tag the commit with the version: LeRobot loads the one that has its tag."""
     api = HfApi()
     with suppress(RevisionNotFoundError):
         api.delete_tag(repo_id, tag=version, repo_type="dataset")

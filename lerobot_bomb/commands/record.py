@@ -1,29 +1,55 @@
 """``lerobot-bomb record``: the scripted expert's episodes as a LeRobotDataset."""
 
 import argparse
+import shlex
 import sys
 from dataclasses import fields
+from pathlib import Path
+from typing import Any
+
+import numpy as np
 
 from lerobot_bomb.bomb.episode import TEST_SEEDS
+from lerobot_bomb.checkpoints.names import WEIGHTS
 from lerobot_bomb.commands.arguments import (
     add_episode_arguments,
     add_new_dataset_arguments,
+    path_flag,
     switch,
 )
-from lerobot_bomb.data.record import describe_failures, record
+from lerobot_bomb.commands.cluster_jobs import (
+    SUBMITIT,
+    SUBMITIT_FLAGS,
+    add_job_arguments,
+    check_num_jobs,
+    shard_of,
+    submitted,
+    write_job_array,
+)
+from lerobot_bomb.data.kept_blocks import Progress, read_progress
+from lerobot_bomb.data.parts import Part, check_part, join, num_whole_blocks, record_part, unfinished_parts
+from lerobot_bomb.data.record import record
+from lerobot_bomb.data.recorded_blocks import Acting, Players, describe_failures
 from lerobot_bomb.data.recording import Recording
 from lerobot_bomb.data.resumable import (
     BLOCK_EPISODES,
+    block_episodes,
     default_root,
     terminated_in_order,
 )
+from lerobot_bomb.data.unfinished import METADATA_FILE, unfinished_folder
+from lerobot_bomb.flags import flags_without_group
+from lerobot_bomb.sweep.local import PYTHON
+
+JOBS, SCRIPT = "jobs", "record.sbatch"  # the folder ROOT.jobs, and a file in it
+NOT_OF_JOBS = ("command", "root", "resume", "shard", "join", "slurm", *SUBMITIT_FLAGS)
 
 
 def add_record_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the arguments of ``lerobot-bomb record``."""
     add_new_dataset_arguments(parser)
     add = parser.add_argument
-    add("--episodes", type=int, required=True, help="successful episodes to record")
+    _add_what_is_recorded(parser)
     add(
         "--seed",
         type=int,
@@ -44,31 +70,177 @@ def add_record_arguments(parser: argparse.ArgumentParser) -> None:
     add(
         "--resume",
         **switch(),
-        help=f"continue a recording that was interrupted; its blocks of {BLOCK_EPISODES} episodes are kept",
+        help=f"continue a recording that was interrupted; its blocks of {BLOCK_EPISODES} episodes are kept "
+        "(with --shard and --join, always)",
+    )
+    where = add_job_arguments(parser, "episodes", f"ROOT.{JOBS}/{SCRIPT}")
+    where.add_argument("--join", **switch(), help="make the dataset of the parts of --shard, and delete them")
+
+
+def _add_what_is_recorded(parser: argparse.ArgumentParser) -> None:
+    """Declare how much of what: episodes, whose, or scenes; with which labels."""
+    add = parser.add_argument
+    number = parser.add_mutually_exclusive_group(required=True)
+    number.add_argument("--episodes", type=int, help="successful episodes to record")
+    number.add_argument(
+        "--static",
+        type=int,
+        help="scenes to record instead: boards as they may stand midway, the gripper anywhere, with or "
+        "without the stone, a frame each, with --pointing; they teach what an instruction means",
+    )
+    add("--relabel", **switch(), help="let --policy.path act, and store what the expert would have done")
+    add(
+        "--policy.path",
+        dest="policy_path",
+        type=path_flag,
+        help="folder of the checkpoint that acts, with --relabel; whatever becomes of its episodes",
+    )
+    add(
+        "--pointing",
+        **switch(),
+        help="also store which stone goes where and what the expert would do for other places, which "
+        "--policy.pointing=true is trained on; no policy sees it in an evaluation",
     )
 
 
 def run_record(args: argparse.Namespace) -> int:
     """Record; prints which episodes failed and where the dataset is."""
-    flags = vars(args)
-    recording = Recording(**{f.name: flags[f.name] for f in fields(Recording) if f.name in flags})
-    if not 1 <= args.workers <= recording.episodes:
-        raise ValueError(f"--workers={args.workers} must lie in 1..{recording.episodes} (--episodes)")
-    _warn_of_test_seeds(recording)
+    recording = _recording(args)
     root = args.root or default_root(recording.repo_id)
+    shard = shard_of(args)
+    check_num_jobs(args, num_whole_blocks(recording), f"parts of at least {BLOCK_EPISODES} episodes")
+    if num_jobs := args.slurm or args.submitit:
+        return _record_by_jobs(args, [Part(recording, index, num_jobs) for index in range(num_jobs)], root)
+    _warn_of_test_seeds(recording)
     with terminated_in_order():
-        progress = record(recording, root, num_workers=args.workers, resume=args.resume)
-    last_seed = recording.seed + (progress.num_tried - 1) // len(recording.conditions)
-    seeds = f"{recording.seed}..{last_seed}"
-    print(
-        f"{progress.num_episodes} episodes, {progress.num_frames} frames, of the seeds {seeds}: {root}\n"
-        f"{describe_failures(progress.failures)}"
-    )
+        acting = _acting(recording, args.policy_path) if recording.relabel else None
+        if shard is not None:
+            return _record_part(Part(recording, *shard), root, Players(args.workers, acting=acting))
+        if args.join:
+            progress = join(recording, root, Players(args.workers, acting=acting))
+        else:
+            progress = record(recording, root, num_workers=args.workers, resume=args.resume, acting=acting)
+    _print(recording, progress, root)
     return 0
 
 
+def _recording(args: argparse.Namespace) -> Recording:
+    flags = vars(args)
+    if args.static == 0:
+        raise ValueError("--static=0 records nothing; give a number of scenes, or --episodes")
+    given: dict[str, Any] = {f.name: flags[f.name] for f in fields(Recording) if f.name in flags}
+    given |= {"episodes": args.episodes or 0, "static": args.static or 0, "relabel": _acting_weights(args)}
+    recording = Recording(**given)
+    if not 1 <= args.workers <= recording.episodes:
+        raise ValueError(
+            f"--workers={args.workers} must lie in 1..{recording.episodes} (--episodes or --static)"
+        )
+    return recording
+
+
+def _print(recording: Recording, progress: Progress, where: Path, num_before: int = 0) -> None:
+    """Say what was recorded, after so many episodes that others try."""
+    conditions, scenes = len(recording.conditions), recording.scenes
+    first = recording.seed + num_before // conditions * scenes
+    end = recording.seed - (-(num_before + progress.num_tried) // conditions) * scenes
+    print(
+        f"{progress.num_episodes} episodes, {progress.num_frames} frames, of the seeds {first}..{end - 1}: "
+        f"{where}\n{describe_failures(progress.failures)}"
+    )
+
+
+def _record_part(part: Part, root: Path, players: Players) -> int:
+    progress = record_part(part, root, players)
+    if progress is None:
+        print(f"{root} is there, joined")
+    else:
+        num_before = block_episodes(part.blocks.start).start
+        _print(part.recording, progress, part.folder(root), num_before)
+    return 0
+
+
+def _record_by_jobs(args: argparse.Namespace, parts: list[Part], root: Path) -> int:
+    """Write the script of jobs and print what is to be done with it; or submit them, and join their parts."""
+    check_part(parts[0], root)
+    command, folder = _job_command(args, root), unfinished_folder(root, JOBS)
+    if args.slurm is not None:
+        write_job_array(command, args.slurm, folder / SCRIPT)
+        print(shlex.join([*command, "--join"]))
+        return 0
+    failed = f"jobs ended before they had recorded everything; {folder / SUBMITIT} says why"
+    if not root.exists():
+        shards = [[*command, f"--shard={part}"] for part in unfinished_parts(parts, root)]
+        with submitted(shards, args, folder):
+            pass
+        if unfinished := unfinished_parts(parts, root):
+            raise RuntimeError(f"{failed}: parts {', '.join(map(str, unfinished))} are not finished")
+    with submitted([[*command, "--join"]], args, folder):
+        pass
+    if not root.exists():
+        raise RuntimeError(f"{failed}: the parts are not joined")
+    _print(parts[0].recording, read_progress(root / METADATA_FILE), root)
+    return 0
+
+
+def _job_command(args: argparse.Namespace, root: Path) -> list[str]:
+    """Records as the given flags say, with --shard a part of it."""
+    flags = [f"--root={root.absolute()}"]
+    for name, value in vars(args).items():
+        if name in NOT_OF_JOBS or value in (None, False, ()):
+            continue
+        flag = "policy.path" if name == "policy_path" else name
+        text = ",".join(map(str, value)) if isinstance(value, tuple) else str(value)
+        flags.append(f"--{flag}={'true' if value is True else text}")
+    return [*PYTHON, "lerobot_bomb.commands.main", "record", *flags]
+
+
+def _acting_weights(args: argparse.Namespace) -> str | None:
+    """Return the SHA-256 of the weights that act; None: the expert does."""
+    if args.relabel != (args.policy_path is not None):
+        raise ValueError(
+            "--relabel and --policy.path=FOLDER come together: a policy acts, and the expert says what it "
+            "would have done"
+        )
+    if not args.relabel:
+        return None
+    if args.workers != 1:
+        raise ValueError(
+            f"--workers={args.workers}: with --relabel the policy acts in one process; leave it out"
+        )
+    from lerobot_bomb.checkpoints.identity import sha256_of
+
+    weights = args.policy_path / WEIGHTS
+    if not weights.is_file():
+        raise ValueError(f"--policy.path={args.policy_path} holds no {WEIGHTS}, so it is no checkpoint")
+    return sha256_of(weights)
+
+
+def _acting(recording: Recording, policy_path: Path) -> Acting:
+    """The checkpoint, as lerobot-eval lets it act.
+
+    Raises:
+        ValueError: it was trained for another environment.
+    """
+    from lerobot_bomb.viewing.checkpoint import load_policy  # LeRobot and torch: seconds
+
+    names = ("task", "robot", "control_mode", "fps", "image_size", "render_preset", "depth", "split")
+    env_flags = {name: getattr(recording, name) for name in names}
+    insist = "insist with --{}=true"
+    ways_out = dict.fromkeys(
+        map(insist.format, ("policy.ignore_environment", "env.ignore_checkpoint")), "train one for this"
+    )
+    with flags_without_group({"evaluate with": "record with", **ways_out}):
+        loaded = load_policy(policy_path, None, "bomb", env_flags, recording.seed)
+
+    def agent(observation: dict[str, Any], instruction: str) -> np.ndarray:
+        return loaded.agent([observation], [instruction])[0]
+
+    return Acting(loaded.begin, agent)
+
+
 def _warn_of_test_seeds(recording: Recording) -> None:
-    seeds = range(recording.seed, recording.seed - (-recording.episodes // len(recording.conditions)))
+    rounds = -(-recording.episodes // len(recording.conditions))
+    seeds = range(recording.seed, recording.seed + rounds * recording.scenes)
     if seeds[0] <= TEST_SEEDS[-1] and seeds[-1] >= TEST_SEEDS[0]:
         print(
             f"the seeds {seeds[0]}..{seeds[-1]} have episodes that evaluations play, {TEST_SEEDS[0]} to "

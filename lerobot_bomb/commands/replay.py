@@ -52,7 +52,7 @@ def _levels(text: str) -> dict[str, int]:
 
 
 def run_replay(args: argparse.Namespace) -> int:
-    """Play, write both files, print what became of it and whether it is what the line says."""
+    """Run the episode, write both files, print its result and whether the record says the same."""
     if unknown := [flag for flag in args.rest if not flag.startswith("--policy.")]:
         raise ValueError(f"{unknown[0]} is unknown; see `lerobot-bomb replay --help`")
     row = read_line(args.path, args.line)

@@ -10,7 +10,7 @@ from pathlib import Path
 from tqdm import tqdm
 
 from lerobot_bomb.commands.arguments import check_at_least, path_flag
-from lerobot_bomb.commands.results_files import check_outputs, missing_of_sweep, read_undamaged
+from lerobot_bomb.commands.results_files import check_outputs, read_undamaged
 from lerobot_bomb.files import written_whole
 from lerobot_bomb.report.arms import Report, Sample, arms_of, sample_failures
 from lerobot_bomb.report.page import render
@@ -42,16 +42,18 @@ def run_report(args: argparse.Namespace) -> int:
         raise ValueError(f"--output={output} must be the page's path, .html, or a folder")
     page, tables, rates = (output.with_suffix(suffix) for suffix in (".html", ".json", ".csv"))
     check_outputs(args.paths, (page, tables, rates))
-    read = {path: read_undamaged(path) for path in dict.fromkeys(args.paths)}
-    files = {path: rows for path, (rows, _) in read.items()}
-    arms = arms_of([row for rows in files.values() for row in rows])
-    samples = list(sample_failures(arms, files, max(NUM_SAMPLES, args.videos)))
+    files = {path: read_undamaged(path) for path in dict.fromkeys(args.paths)}
+    arms = arms_of([row for file in files.values() for row in file.rows])
+    numbered = {path: file.numbered for path, file in files.items()}
+    samples = list(sample_failures(arms, numbered, max(NUM_SAMPLES, args.videos)))
     folder = page.with_name(f"{page.stem}_videos")
     if args.videos:
         samples = _play(samples, folder, args.videos)
-    missing = [told for path, rows in files.items() if (told := missing_of_sweep(path, len(rows)))]
+    missing = [file.missing for file in files.values() if file.missing]
     missing += [
-        f"{path}: {number} damaged lines are not counted" for path, (_, number) in read.items() if number
+        f"{path}: {file.num_damaged} damaged lines are not counted"
+        for path, file in files.items()
+        if file.num_damaged
     ]
     sections = build(Report(arms, samples, missing))
     with written_whole(page, tables, rates) as (html, as_json, as_csv):

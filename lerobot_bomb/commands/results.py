@@ -22,10 +22,10 @@ def add_results_arguments(parser: argparse.ArgumentParser) -> None:
 def run_results(args: argparse.Namespace) -> int:
     """Print, of each file, what compares: rates by condition, and what perturbations changed in pairs."""
     for path in args.paths:
-        rows, num_damaged = read_undamaged(path)
-        if args.strict and num_damaged:
-            raise ValueError(f"{path}: damaged lines, which --strict refuses: {num_damaged}")
-        _print_file(path, arms_of(rows), num_damaged)
+        file = read_undamaged(path)
+        if args.strict and file.num_damaged:
+            raise ValueError(f"{path}: damaged lines, which --strict refuses: {file.num_damaged}")
+        _print_file(path, arms_of(file.rows), file.num_damaged)
     return 0
 
 
@@ -58,7 +58,7 @@ def _print_file(path: Path, arms: list[Arm], num_damaged: int) -> None:
 
 
 def _print_rates(arms: list[Arm]) -> None:
-    """A line for each group and condition, before what else there is to say of them."""
+    """Print a line for each group and condition, before what else there is to say of them."""
     cells = [
         [arm.name, condition, str(rate_of(rows))]
         for arm in arms

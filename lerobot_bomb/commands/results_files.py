@@ -2,6 +2,7 @@
 
 import sys
 from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 
 from lerobot_bomb.envs.results import Row
@@ -21,10 +22,14 @@ def check_outputs(inputs: Sequence[Path], outputs: Iterable[Path]) -> None:
 
 
 def missing_of_sweep(path: Path, num_rows: int) -> str:
-    """How many episodes a sweep's file, which has so many, lacks, and why; "" if none or of another file."""
+    """Say how many episodes a sweep's file of ``num_rows`` lacks, and why; "" if none or of another file."""
     if path.name != RESULTS or not path.with_name(NAME).is_file():
         return ""
-    number, errors = Manifest.read(path.parent).num_episodes, path.with_name(ERRORS)
+    try:
+        number = Manifest.read(path.parent).num_episodes
+    except ValueError as error:  # the episodes can be read all the same
+        return f"{path}: whether episodes are missing cannot be said: {error}"
+    errors = path.with_name(ERRORS)
     missing = number - num_rows
     num_errors = errors.read_bytes().count(b"\n") if errors.is_file() else 0
     reasons = [f"an error ended {num_errors}: {errors}"] if num_errors else []
@@ -32,32 +37,55 @@ def missing_of_sweep(path: Path, num_rows: int) -> str:
     return f"{path}: {missing} of {number} episodes are missing; {'; '.join(reasons)}" if missing > 0 else ""
 
 
+@dataclass(frozen=True)
+class ResultsFile:
+    """A results file as it was read, without the lines that are damaged."""
+
+    numbered: dict[int, Row]  # by line, from 1
+    num_damaged: int
+    missing: str  # the episodes of its sweep that it lacks; "": none
+
+    @property
+    def rows(self) -> list[Row]:
+        return [*self.numbered.values()]
+
+
 def read_line(path: Path, line: int) -> Row:
-    """The episode of a line, counted from 1.
+    """Return the episode of a line, counted from 1 as an editor counts.
 
     Raises:
-        ValueError: there is no such line, or as `read_undamaged`.
+        ValueError: there is no episode on that line, or as `read_undamaged`.
     """
-    rows, _ = read_undamaged(path)
-    if not 1 <= line <= len(rows):
-        raise ValueError(f"--line={line} must be in 1..{len(rows)}, the episodes of {path}")
-    return rows[line - 1]
+    numbered = read_undamaged(path).numbered
+    if line not in numbered:
+        raise ValueError(f"--line={line} is no episode of {path}, whose lines are {_spans(numbered)}")
+    return numbered[line]
 
 
-def read_undamaged(path: Path) -> tuple[list[Row], int]:
-    """The episodes of a file, and how many damaged lines it has, of which stderr shows the first.
+def _spans(numbers: Iterable[int]) -> str:
+    """Return '1..3, 5' of rising numbers."""
+    spans: list[list[int]] = []
+    for number in numbers:
+        if spans and number == spans[-1][-1] + 1:
+            spans[-1][1:] = [number]
+        else:
+            spans.append([number])
+    return ", ".join("..".join(map(str, span)) for span in spans)
 
-    It also says there how many episodes of a sweep are missing.
+
+def read_undamaged(path: Path) -> ResultsFile:
+    """Read the episodes of a file; stderr shows its first damaged lines and what its sweep lacks.
 
     Raises:
         ValueError: there is no such file, or no episode in it.
     """
-    rows, damages = read_lines(path)
+    numbered, damages = read_lines(path)
     for damage in damages[:MAX_SHOWN_DAMAGES]:
         print(f"{damage}; not counted", file=sys.stderr)
     if len(damages) > MAX_SHOWN_DAMAGES:
         print(f"{path}: ... and {len(damages) - MAX_SHOWN_DAMAGES} more such lines", file=sys.stderr)
-    check_any(path, rows, damages)
-    if missing := missing_of_sweep(path, len(rows)):
+    check_any(path, numbered, damages)
+    missing = missing_of_sweep(path, len(numbered))
+    if missing:
         print(missing, file=sys.stderr)
-    return rows, len(damages)
+    return ResultsFile(numbered, len(damages), missing)

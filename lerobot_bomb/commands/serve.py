@@ -65,7 +65,7 @@ def run_serve(args: argparse.Namespace) -> int:
 
 @contextmanager
 def _address(args: argparse.Namespace) -> Iterator[str]:
-    """Where to listen, as gRPC names it; a socket is gone afterwards.
+    """Yield the address to listen on, as gRPC names it; a socket is removed afterwards.
 
     Raises:
         ValueError: it is in use, or other machines would reach it.

@@ -1,28 +1,32 @@
 """``lerobot-bomb sweep``: policies x tasks x conditions, over processes or jobs, going on after a kill."""
 
 import argparse
-import json
-import shlex
 import signal
 from collections.abc import Iterator
 from contextlib import contextmanager
-from pathlib import Path
-from typing import Any
 
 from lerobot_bomb.bomb.episode import MAX_SEED, TEST_SEEDS
 from lerobot_bomb.commands.arguments import check_at_least, parse_conditions, path_flag
+from lerobot_bomb.commands.cluster_jobs import (
+    SUBMITIT,
+    add_job_arguments,
+    check_num_jobs,
+    shard_of,
+    submitted,
+    write_job_array,
+)
 from lerobot_bomb.evaluation.result_kind import ResultKind
 from lerobot_bomb.evaluation.result_lines import KIND_OF_ENV
 from lerobot_bomb.flags import one_of
 from lerobot_bomb.sweep.claim import claimed
-from lerobot_bomb.sweep.cluster import sbatch_script, submit
 from lerobot_bomb.sweep.local import PYTHON, play, progress
-from lerobot_bomb.sweep.manifest import NAME, Cell, Manifest, flag_value, parse_part, plan
+from lerobot_bomb.sweep.manifest import NAME, Cell, Manifest, flag_value, plan
 from lerobot_bomb.sweep.store import Store
 from lerobot_bomb.tables import print_lines
 
 MAX_BATCH = 10
-SCRIPT, SUBMITIT = "sweep.sbatch", "submitit"
+SCRIPT = "sweep.sbatch"
+ALL = "0/1"  # the only part
 
 
 def add_sweep_arguments(parser: argparse.ArgumentParser) -> None:
@@ -44,13 +48,7 @@ def add_sweep_arguments(parser: argparse.ArgumentParser) -> None:
     add("--seed", type=int, default=TEST_SEEDS[0], help=f"the first one (default: {TEST_SEEDS[0]})")
     add("--batch_size", type=int, default=MAX_BATCH, help=f"at most (default: {MAX_BATCH})")
     add("--workers", type=int, default=1, help="processes, each on a GPU in turn (default: 1)")
-    where = parser.add_mutually_exclusive_group().add_argument
-    where("--shard", default="0/1", help="this machine's part of the cells: 0/4 is the first of four")
-    where("--slurm", type=int, metavar="N", help=f"write FOLDER/{SCRIPT}, a job array of N parts, only")
-    where("--submitit", type=int, metavar="N", help="submit N parts as jobs through submitit; wait for them")
-    add("--submitit_cluster", help="local or slurm (default: slurm where there is srun, else local)")
-    parameters = 'of its AutoExecutor, as {"gpus_per_node": 1, "slurm_partition": "gpu"}'
-    add("--submitit_parameters", type=_json_object, default={}, metavar="JSON", help=parameters)
+    add_job_arguments(parser, "cells", f"FOLDER/{SCRIPT}")
     add("--timeout", type=int, help="seconds that a cell may take (default: no limit)")
     add("--retry", action="store_true", help="play again what was given up or ended in errors")
     add(
@@ -62,7 +60,7 @@ def add_sweep_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run_sweep(args: argparse.Namespace) -> int:
-    """Play what is missing; exit code 1 where something still is."""
+    """Run what is missing; exit code 1 where something still is."""
     _check_numbers(args)
     manifest = _manifest(args)
     with claimed(args.folder, manifest, args.batch_size) as store:
@@ -73,7 +71,8 @@ def run_sweep(args: argparse.Namespace) -> int:
         if args.retry:
             store.begin_again(cells)
         if args.slurm is not None:
-            return _write_slurm(args)
+            write_job_array(_job_command(args), args.slurm, args.folder / SCRIPT)
+            return 0
         return _play(args, store, cells)
 
 
@@ -81,7 +80,7 @@ def _play(args: argparse.Namespace, store: Store, cells: list[Cell]) -> int:
     try:
         with interrupted_by_sigterm():
             if args.submitit is None:
-                play(store, args.shard, args.workers, args.timeout)
+                play(store, args.shard or ALL, args.workers, args.timeout)
             else:
                 _play_by_jobs(args, store)
     except KeyboardInterrupt:
@@ -105,40 +104,22 @@ def interrupted_by_sigterm() -> Iterator[None]:
         signal.signal(signal.SIGTERM, usual)
 
 
-def _json_object(text: str) -> dict[str, Any]:
-    try:
-        values = json.loads(text)
-    except ValueError:
-        values = None
-    if not isinstance(values, dict):
-        raise argparse.ArgumentTypeError(f"{text!r} must be a JSON object")
-    return values
-
-
 def _check_numbers(args: argparse.Namespace) -> None:
     check_at_least(args, episodes=1, batch_size=1, seed=0, workers=1)
-    try:
-        parse_part(args.shard)
-    except ValueError as error:
-        raise ValueError(f"--shard: {error}") from None
+    shard_of(args)
     if args.timeout is not None:
         check_at_least(args, timeout=1)
     if args.seed + args.episodes - 1 > MAX_SEED:
         raise ValueError(f"--seed={args.seed} and --episodes={args.episodes}: the last seed is {MAX_SEED}")
-    if args.submitit is None and (args.submitit_cluster or args.submitit_parameters):
-        raise ValueError("--submitit_cluster and --submitit_parameters need --submitit=N")
 
 
 def _cells(args: argparse.Namespace, manifest: Manifest) -> list[Cell]:
-    """Return the manifest's cells that this command plays."""
+    """Return the manifest's cells that this command runs."""
     try:
-        cells = manifest.part(args.shard)
+        cells = manifest.part(args.shard or ALL)
     except ValueError as error:
         raise ValueError(f"--shard: {error}") from None
-    for name in ("slurm", "submitit"):
-        number = getattr(args, name)
-        if number is not None and not 1 <= number <= len(cells):
-            raise ValueError(f"--{name}={number} must be from 1 to the number of cells, {len(cells)}")
+    check_num_jobs(args, len(cells), "cells")
     return cells
 
 
@@ -163,7 +144,7 @@ def _manifest(args: argparse.Namespace) -> Manifest:
 
 
 def _kind(flags: list[str]) -> ResultKind:
-    """Of the environment that the flags name."""
+    """Return the kind of results of the environment that the flags name."""
     env_type = flag_value(flags, "--env.type")
     if env_type is None:
         raise ValueError(f"--env.type is missing: {', '.join(KIND_OF_ENV)}")
@@ -186,18 +167,10 @@ def _expanded(perturbations: tuple[str, ...], kind: ResultKind) -> list[str]:
 
 
 def _job_command(args: argparse.Namespace) -> list[str]:
-    """Plays a part of the folder's cells, with --shard."""
+    """Run a part of the folder's cells, with --shard."""
     command = [*PYTHON, "lerobot_bomb.commands.main", "sweep", str(args.folder.absolute())]
     command += [f"--workers={args.workers}"]
     return command + ([f"--timeout={args.timeout}"] if args.timeout else [])
-
-
-def _write_slurm(args: argparse.Namespace) -> int:
-    """Write the script, and print what submits it."""
-    path = args.folder / SCRIPT
-    path.write_text(sbatch_script(_job_command(args), args.slurm, Path.cwd()))
-    print(shlex.join(["sbatch", str(path)]))
-    return 0
 
 
 def _play_by_jobs(args: argparse.Namespace, store: Store) -> None:
@@ -205,18 +178,10 @@ def _play_by_jobs(args: argparse.Namespace, store: Store) -> None:
     cells = list(store.manifest.cells)
     parts = [f"{number}/{args.submitit}" for number in range(args.submitit)]
     left = [part for part in parts if not all(map(store.is_over, store.manifest.part(part)))]
-    logs = args.folder / SUBMITIT
     commands = [[*_job_command(args), f"--shard={part}"] for part in left]
-    jobs = submit(commands, logs, args.submitit_cluster, args.submitit_parameters) if left else []
-    try:
+    with submitted(commands, args, args.folder) as jobs:
         for _ in progress(store, cells):
             if all(job.done() for job in jobs):
                 break
-        for job in jobs:
-            job.wait()
-    except KeyboardInterrupt:
-        for job in jobs:
-            job.cancel(check=False)
-        raise
     if not all(store.is_over(cell) for cell in cells):
-        print(f"jobs ended before they had played everything; {logs} says why")
+        print(f"jobs ended before they had played everything; {args.folder / SUBMITIT} says why")

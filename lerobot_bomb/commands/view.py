@@ -79,7 +79,7 @@ def add_viewed_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run_view(args: argparse.Namespace) -> int:
-    """Play, write both files, print the instruction, the outcome and the paths."""
+    """Run an episode, write both files, print the instruction, the outcome and the paths."""
     viewed = viewed_of(args)
     policy = _policy(args, viewed.policies)
     name = viewed.name(policy)
@@ -109,7 +109,7 @@ def _refuse_flags_of_others(args: argparse.Namespace) -> None:
 
 
 def _policy(args: argparse.Namespace, policies: tuple[str, ...]) -> str:
-    """Who acts, as a word for names: one of the policies, or a checkpoint's type."""
+    """Return a word for the policy that acts: one of the policies, or a checkpoint's type."""
     if args.policy_path is None:
         if args.policy_device is not None:
             raise ValueError(f"--policy.device={args.policy_device} needs a checkpoint, --policy.path=FOLDER")
@@ -172,7 +172,7 @@ def _condition(args: argparse.Namespace) -> str:
 def _agent(
     args: argparse.Namespace, policy: str, viewed: Viewed, paths: list[Path], env: gymnasium.Env
 ) -> Iterator[Agent]:
-    """Who acts; whatever else is wrong is told before that the files exist."""
+    """Yield the agent that acts; other errors are told before that of files that exist."""
     with _accepted_agent(args, policy, viewed, env) as agent:
         check_new(paths)
         yield agent

@@ -10,9 +10,10 @@ import os
 import shutil
 import tempfile
 import traceback
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Sequence
 from contextlib import contextmanager, nullcontext
 from dataclasses import dataclass, field
+from itertools import chain
 from pathlib import Path
 from typing import Any
 
@@ -25,6 +26,7 @@ from datasets.exceptions import DatasetGenerationError
 from lerobot.datasets import LeRobotDataset, aggregate_datasets
 from lerobot.datasets.utils import DEFAULT_EPISODES_PATH
 
+from lerobot_bomb.compat.own.merging import merged_at_once
 from lerobot_bomb.compat.own.recording import (
     abandon,
     datasets_cache,
@@ -32,7 +34,7 @@ from lerobot_bomb.compat.own.recording import (
     sampled_image_statistics,
     without_statistics,
 )
-from lerobot_bomb.data.statistics import write_statistics
+from lerobot_bomb.data.statistics import write_image_statistics, write_statistics
 
 ENCODER_THREADS = 1  # per camera, which keeps two cores busy; see benchmarks/record_speed.py
 IMAGE_WRITER_THREADS = 4
@@ -40,7 +42,7 @@ IMAGE_WRITER_THREADS = 4
 
 @dataclass(frozen=True)
 class DatasetLayout:
-    """What a block and the merged dataset have in common."""
+    """Settings that a block and the merged dataset have in common."""
 
     repo_id: str
     fps: int
@@ -71,19 +73,24 @@ class DatasetLayout:
 
 @dataclass(frozen=True)
 class RecordedEpisode:
-    """What a block is made of."""
+    """Frames and columns of an episode that a block is made of."""
 
     frames: Iterable[dict[str, Any]]  # as LeRobot's add_frame takes them
     columns: dict[str, Any] = field(default_factory=dict)  # of its row in LeRobot's table of episodes
 
 
 def write_block(layout: DatasetLayout, root: Path, episodes: Iterable[RecordedEpisode]) -> int:
-    """Write episodes as a finished LeRobotDataset and return its number of frames.
+    """Write episodes as a finished LeRobotDataset and return its number of frames; of none, a folder.
 
     Raises:
         RuntimeError: a video lacks frames, or a thread of LeRobot could not write an image or a video.
         OSError: the disk is full.
     """
+    remaining = iter(episodes)
+    first = next(remaining, None)
+    if first is None:
+        root.mkdir()
+        return 0
     with (
         _quiet_libraries(),
         _logged_errors(),
@@ -92,10 +99,10 @@ def write_block(layout: DatasetLayout, root: Path, episodes: Iterable[RecordedEp
         without_statistics(layout.arrays),
     ):
         dataset = layout.create(root)
-        rows = _write_episodes(dataset, episodes)
+        rows = _write_episodes(dataset, chain([first], remaining))
     _add_episode_columns(root, rows)
     num_frames = dataset.num_frames
-    _check_videos(root, num_frames)
+    check_videos(root, dataset.meta.video_keys, num_frames)
     return num_frames
 
 
@@ -103,8 +110,8 @@ def merge_blocks(layout: DatasetLayout, blocks: list[Path], root: Path) -> None:
     """Merge finished blocks, in their order, into one dataset.
 
     Videos and tables are joined up to LeRobot's file sizes. Tables that hold images or depth stay one per
-    block: to join them LeRobot would read and write all earlier images again for every block. Statistics of
-    numbers are those of all frames.
+    block: they are large, and LeRobot holds a table in memory as Python objects. Statistics of numbers are
+    those of all frames; of images, what follows from those of all episodes.
 
     Raises:
         OSError: the disk is full.
@@ -112,7 +119,7 @@ def merge_blocks(layout: DatasetLayout, blocks: list[Path], root: Path) -> None:
     repo_ids = [layout.repo_id] * len(blocks)
     cache = datasets_cache(root.with_name(f"{root.name}.cache"))
     arrays = mergeable_arrays(layout.features) if layout.arrays else nullcontext()
-    with _quiet_libraries(), _temporary_files_beside(root), cache, arrays:
+    with _quiet_libraries(), _temporary_files_beside(root), cache, arrays, merged_at_once():
         try:
             aggregate_datasets(
                 repo_ids,
@@ -124,6 +131,7 @@ def merge_blocks(layout: DatasetLayout, blocks: list[Path], root: Path) -> None:
         except DatasetGenerationError as error:
             raise OSError(f"the blocks could not be read: {error.__cause__}") from error
     # LeRobot's are means over the blocks, and its keys in the order of a set, which differs from run to run
+    write_image_statistics(root)
     write_statistics(root)
 
 
@@ -231,13 +239,13 @@ def _add_episode_columns(root: Path, rows: list[dict[str, Any]]) -> None:
     unfinished.replace(path)
 
 
-def _check_videos(root: Path, num_frames: int) -> None:
-    """LeRobot logs frames that its encoder drops or does not finish; here they are an error."""
-    encoded: dict[str, int] = {}
+def check_videos(root: Path, cameras: Sequence[str], num_frames: int) -> None:
+    """Raise if the encoder dropped frames or did not finish them, which LeRobot only logs."""
+    encoded = dict.fromkeys(cameras, 0)
     for path in sorted(root.glob("videos/*/*/*.mp4")):
         with av.open(str(path)) as video:
             camera = path.parts[-3]
-            encoded[camera] = encoded.get(camera, 0) + video.streams.video[0].frames
+            encoded[camera] += video.streams.video[0].frames
     for camera, num_encoded in encoded.items():
         if num_encoded != num_frames:
             raise RuntimeError(f"the video of {camera} has {num_encoded} frames instead of {num_frames}")

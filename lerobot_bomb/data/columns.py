@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 import pyarrow as pa
 from lerobot.datasets import LeRobotDatasetMetadata
-from lerobot.utils.constants import DEFAULT_FEATURES, HF_LEROBOT_HOME
+from lerobot.utils.constants import DEFAULT_FEATURES, DONE, HF_LEROBOT_HOME
 
 from lerobot_bomb.compat.hooks.datasets import explain_missing_datasets
 from lerobot_bomb.compat.hooks.hub import check_tokens_before_use
@@ -40,6 +40,34 @@ def present_episodes(meta: LeRobotDatasetMetadata) -> list[int]:
             f"{meta.repo_id}; a dataset that is streamed (--dataset.streaming=true) must be downloaded first"
         )
     return present
+
+
+def check_chunk_length(chunk_size: int, meta: LeRobotDatasetMetadata) -> None:
+    """Raise a ValueError unless an episode of a dataset is as long as a chunk."""
+    lengths = [] if meta.episodes is None else meta.episodes["length"]
+    longest = max(lengths, default=chunk_size)
+    if chunk_size > longest:
+        raise ValueError(
+            f"--policy.chunk_size={chunk_size}: the longest episode of {meta.repo_id} has {longest} frames; "
+            f"give at most {longest}"
+        )
+
+
+def require_motion(meta: LeRobotDatasetMetadata, use: str) -> None:
+    """Raise a ValueError, which names the use, if frames of a dataset do not follow each other.
+
+    They are static scenes, which `lerobot-bomb record --static` writes: `next.done` holds before the end.
+    """
+    if DONE not in meta.features:
+        return
+    columns = read_columns(meta, (DONE,), present_episodes(meta))
+    episode_N, is_done_N = columns[EPISODE_INDEX], columns[DONE].reshape(-1) > 0
+    is_scene_N = is_done_N[:-1] & (episode_N[1:] == episode_N[:-1])
+    if is_scene_N.any():
+        raise ValueError(
+            f"episode {int(episode_N[is_scene_N.argmax()])} of {meta.repo_id} holds static scenes, which do "
+            f"not follow each other: {use}; take the demonstrations alone, before they are merged"
+        )
 
 
 def read_columns(

@@ -1,4 +1,4 @@
-"""What all conversions of published demonstrations share: episodes by number, written as blocks."""
+"""Conversions of published demonstrations: episodes by number, written as blocks."""
 
 from collections.abc import Callable, Iterator
 from functools import partial
@@ -7,8 +7,8 @@ from typing import TYPE_CHECKING
 
 from tqdm import tqdm
 
-from lerobot_bomb.data.kept_blocks import Progress, reached
-from lerobot_bomb.data.resumable import missing_blocks, write_blocks
+from lerobot_bomb.data.kept_blocks import Progress
+from lerobot_bomb.data.resumable import add_block, block_episodes, missing_blocks, num_blocks
 
 if TYPE_CHECKING:
     from lerobot_bomb.data.blocks import DatasetLayout, RecordedEpisode
@@ -16,22 +16,18 @@ if TYPE_CHECKING:
 
 def write_missing(
     folder: Path, layout: "DatasetLayout", num_episodes: int, episode: Callable[[int], "RecordedEpisode"]
-) -> Progress:
+) -> None:
     """Write the blocks that a dataset of so many episodes lacks; `episode` is called by number, in order."""
-    gaps = missing_blocks(folder, num_episodes)
-    num_kept = num_episodes - sum(gap.num_missing for gap in gaps)
-    with tqdm(total=num_episodes, initial=num_kept, unit="episode") as bar:
-        for gap in gaps:
-            write_blocks(folder, layout, gap, partial(_next_episodes, episode, bar))
-    return reached(folder)
+    numbers = [number for gap in missing_blocks(folder, range(num_blocks(num_episodes))) for number in gap]
+    missing = [[index for index in block_episodes(number) if index < num_episodes] for number in numbers]
+    with tqdm(total=num_episodes, initial=num_episodes - sum(map(len, missing)), unit="episode") as bar:
 
+        def episodes(indices: list[int], progress: Progress) -> "Iterator[RecordedEpisode]":
+            for index in indices:
+                made = episode(index)
+                progress.num_episodes += 1
+                yield made
+                bar.update()
 
-def _next_episodes(
-    episode: Callable[[int], "RecordedEpisode"], bar: tqdm, progress: Progress, number: int
-) -> "Iterator[RecordedEpisode]":
-    """Yield the next `number` episodes and count them."""
-    for index in range(progress.num_episodes, progress.num_episodes + number):
-        made = episode(index)
-        progress.num_episodes += 1
-        yield made
-        bar.update()
+        for number, indices in zip(numbers, missing, strict=True):
+            add_block(folder, layout, number, partial(episodes, indices))

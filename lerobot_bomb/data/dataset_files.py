@@ -1,4 +1,4 @@
-"""Whether the files of a LeRobotDataset v3 are whole and agree with its metadata; imports no torch."""
+"""Checks that a LeRobotDataset v3's files are whole and agree with its metadata; imports no torch."""
 
 from collections.abc import Sequence
 from contextlib import suppress
@@ -26,9 +26,9 @@ type Info = dict[str, Any]
 
 
 def check_dataset(root: Path) -> None:
-    """Every file is there, whole and finite, and all of them hold the episodes and frames of info.json.
+    """Check that every file is there, whole and finite, and holds the episodes and frames of info.json.
 
-    Of each video the first and the last frame are decoded, and its frames counted.
+    The first and the last frame of each video are decoded, and its frames counted.
 
     Raises:
         ValueError: names the file and what is wrong with it.
@@ -45,7 +45,7 @@ def check_dataset(root: Path) -> None:
 
 
 def check_metadata(root: Path) -> None:
-    """The files under meta/ can be read, whoever wrote them; of others' datasets no more can be expected.
+    """Check that the files under meta/ can be read; of others' datasets no more can be expected.
 
     Raises:
         ValueError: names the one that is truncated.
@@ -59,7 +59,7 @@ def check_metadata(root: Path) -> None:
 
 
 def check_readable(root: Path) -> None:
-    """The tables of data and the videos that are here are whole; LeRobot downloads what is not.
+    """Check that the tables and videos that are here are whole; LeRobot downloads what is not.
 
     Raises:
         ValueError: names the file that is truncated.
@@ -114,7 +114,7 @@ def read_parquet(path: Path, columns: Sequence[str] | None = None, filters: list
 
 
 def check_video(path: Path, num_frames: int, fps: float) -> None:
-    """A video has so many frames, of which the first and the last can be decoded.
+    """Check that a video has so many frames, of which the first and the last can be decoded.
 
     Raises:
         FileNotFoundError: there is none.
@@ -173,7 +173,7 @@ def read_episodes(root: Path, info: Info) -> pa.Table:
 
 
 def check_videos(root: Path, info: Info, episodes: pa.Table) -> None:
-    """The videos of all cameras hold the frames of the episodes, one episode after the other.
+    """Check that the videos of all cameras hold the episodes' frames, one episode after the other.
 
     Raises:
         OSError, ValueError: names the file.
@@ -203,7 +203,7 @@ def check_finite_columns(path: Path, table: pa.Table) -> None:
 
 
 def flat_numbers(column: pa.ChunkedArray) -> np.ndarray:
-    """All values of a column of scalars or (nested) lists, in one row; what is null among floats is NaN."""
+    """Flatten a column of scalars or (nested) lists into one row of values; null among floats becomes NaN."""
     array = column.combine_chunks()
     while isinstance(array, pa.ExtensionArray):
         array = array.storage
@@ -221,7 +221,7 @@ def _check_tasks(root: Path, info: Info) -> None:
 
 
 def _check_statistics(root: Path, info: Info) -> None:
-    """Of every image, number and vector; no policy normalises arrays."""
+    """Raise unless every image, number and vector has finite statistics; no policy normalises arrays."""
     path = root / STATISTICS_FILE
     statistics = read_json(path)
     for name, feature in info["features"].items():
@@ -241,7 +241,7 @@ def _check_statistics(root: Path, info: Info) -> None:
 
 
 def _check_data(root: Path, info: Info, episodes: pa.Table) -> None:
-    """Each data file holds the frames of its episodes, in order, with finite numbers."""
+    """Check that each data file holds the frames of its episodes, in order, with finite numbers."""
     columns = [
         name
         for name, feature in info["features"].items()

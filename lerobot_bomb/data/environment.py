@@ -7,6 +7,7 @@ from typing import Any
 
 from lerobot_bomb.bomb.board import task_id
 from lerobot_bomb.bomb.observation import ACTION_NAMES
+from lerobot_bomb.bomb.suite import task_version
 from lerobot_bomb.bomb.suites import SUITES
 from lerobot_bomb.conditions import ALL
 
@@ -72,7 +73,7 @@ class Environment:
 
     @property
     def suites(self) -> frozenset[str] | None:
-        """Every suite that it shows; None: not known."""
+        """Suites that it shows; None: not known."""
         if self.task is None:
             return None
         return frozenset(SUITES if self.task == ALL else self.task.split("+"))
@@ -85,7 +86,7 @@ class Environment:
         return f"--env.{name}={SUITE if value is None else value}"
 
     def eval_flags(self) -> list[str]:
-        """Of lerobot-eval, for this environment; a suite that is not known is to be filled in for SUITE."""
+        """Return lerobot-eval's flags for this environment; an unknown suite is to be filled in for SUITE."""
         flags = [self._flag(name) for name in COMPARED]
         if self.depth:
             flags.append("--env.depth=true")
@@ -96,7 +97,7 @@ class Environment:
     def differences(self, other: "Environment") -> list[str]:
         """Fields in which `other` is one that a policy of this environment cannot act in.
 
-        A suite that is not known is compared with nothing.
+        A suite that is not known is compared with nothing, nor is its version.
         """
         names = [name for name in COMPARED if getattr(self, name) != getattr(other, name)]
         ours, theirs = self.suites, other.suites
@@ -104,9 +105,15 @@ class Environment:
             names.remove("task")
         if not set(self.cameras) <= set(other.cameras):
             names.append("cameras")
-        if self.task_version != other.task_version:
+        is_same_version = self.task_version == other.task_version or (self._is_current and other._is_current)
+        if ours is not None and not is_same_version:
             names.append("task_version")
         return names
+
+    @property
+    def _is_current(self) -> bool:
+        """Return whether its suites, whose newest version it names, are those of today."""
+        return self.suites is not None and self.task_version == max(map(task_version, self.suites))
 
     def check_same(self, other: "Environment", who: str, insist: str) -> None:
         """Raise a ValueError, which names flags to change, unless `who`, of this one, can act in `other`."""
@@ -121,7 +128,7 @@ class Environment:
         )
 
     def text(self, names: Iterable[str]) -> str:
-        """These fields: "control_mode=absolute, fps=20"."""
+        """Write these fields: "control_mode=absolute, fps=20"."""
         values = {name: getattr(self, name) for name in names}
         if "cameras" in values:
             values["cameras"] = "+".join(self.cameras)

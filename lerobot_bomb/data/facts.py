@@ -1,4 +1,4 @@
-"""What a dataset's folder says of itself, and how to evaluate on what it shows."""
+"""Facts that a dataset's folder states, and how to evaluate on what it shows."""
 
 import json
 from collections.abc import Sequence
@@ -6,9 +6,11 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from lerobot_bomb.bomb.suite import suites_of
 from lerobot_bomb.data.dataset_files import EPISODES_FOLDER, INFO_FILE, read_parquet
 from lerobot_bomb.data.environment import Environment, numbered_tasks
-from lerobot_bomb.data.resumable import METADATA_FILE
+from lerobot_bomb.data.recording import SCENES
+from lerobot_bomb.data.unfinished import METADATA_FILE
 from lerobot_bomb.files import read_json
 
 PUSHT_SOURCE = "pusht-zarr"
@@ -30,7 +32,7 @@ class DatasetFacts:
 
     @classmethod
     def read(cls, root: Path) -> "DatasetFacts":
-        """Of a dataset's folder.
+        """Read the facts of a dataset's folder.
 
         Raises:
             ValueError: it holds no LeRobotDataset, or a file that is not JSON.
@@ -45,7 +47,7 @@ class DatasetFacts:
 
     @classmethod
     def find(cls, root: Path | str | None) -> "DatasetFacts | None":
-        """Of a folder where a dataset was, if one still is there."""
+        """Read the facts of a folder where a dataset was, if one still is there."""
         return cls.read(Path(root)) if root and (Path(root) / INFO_FILE).is_file() else None
 
     @property
@@ -55,7 +57,7 @@ class DatasetFacts:
 
     @property
     def environment(self) -> Environment | None:
-        """That of the benchmark, which the dataset shows; None: another."""
+        """Environment of BOMB that the dataset shows; None: it shows another."""
         return Environment.of_dataset(self.info, *self._tasks)
 
     @property
@@ -70,7 +72,7 @@ class DatasetFacts:
         return suites[0], numbered_tasks(self.specs or ())
 
     def eval_flags(self) -> list[str] | None:
-        """Of lerobot-eval, for the environment that the dataset shows; None: not known."""
+        """Return lerobot-eval's flags for the environment that the dataset shows; None: not known."""
         conversion = self.bomb.get("conversion", {})
         if conversion.get("source", "").startswith(PUSHT_SOURCE):
             return ["--env.type=pusht", "--eval.use_async_envs=false"]
@@ -96,9 +98,11 @@ class DatasetFacts:
         recording = self.recording
         if not recording:
             return None if self.specs is None else sorted({spec["seed"] for spec in self.specs})
-        num_conditions = len(recording["perturbations"]) * max(1, len(recording["task_ids"]))
+        num_tasks = len(suites_of(recording["task"])) * max(1, len(recording["task_ids"]))
+        num_conditions = len(recording["perturbations"]) * num_tasks
         num_tried = self.bomb["num_episodes"] + len(self.bomb["failures"])
-        return range(recording["seed"], recording["seed"] + (num_tried - 1) // num_conditions + 1)
+        num_seeds = -(-num_tried // num_conditions) * (min(recording.get("static", 0), SCENES) or 1)
+        return range(recording["seed"], recording["seed"] + num_seeds)
 
     def _recording_lines(self) -> list[str]:
         recording, seeds = self.recording, self.seeds

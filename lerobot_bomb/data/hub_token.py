@@ -7,7 +7,7 @@ LOG_IN = "run `hf auth login`, or set HF_TOKEN"
 
 
 class TokenError(ValueError):
-    """What is wrong with a token, without the token."""
+    """Error that says what is wrong with a token, without the token."""
 
 
 def check_token_characters(token: str) -> None:

@@ -9,21 +9,21 @@ import re
 import shutil
 from collections.abc import Iterable
 from contextlib import suppress
-from dataclasses import asdict, dataclass, field, fields, replace
+from dataclasses import asdict, dataclass, field, fields
 from pathlib import Path
 from typing import Any
 
 from lerobot_bomb.files import read_json
 
-BLOCK_FILE = "block.json"  # in each block: the progress up to its end, and the SHA-256 of its other files
-DIGESTS = "sha256"
+BLOCK_FILE = "block.json"  # in each block: its number and progress, and the SHA-256 of its other files
+NUMBER, DIGESTS = "number", "sha256"
 BLOCK = re.compile(r"block-\d{5,}")
 UNFINISHED = re.compile(rf"({BLOCK.pattern}\.tmp|dataset)(\.files|\.cache)?")
 
 
 @dataclass
 class Progress:
-    """How far a dataset has grown."""
+    """Progress of a dataset or of one of its blocks."""
 
     num_episodes: int = 0
     num_frames: int = 0
@@ -33,78 +33,71 @@ class Progress:
     def num_tried(self) -> int:
         return self.num_episodes + len(self.failures)
 
-
-@dataclass(frozen=True)
-class Gap:
-    """Blocks in a row that are still to be made."""
-
-    progress: Progress  # up to where they begin; grows with them
-    end: int  # episodes of the dataset up to their end
-
-    @property
-    def num_missing(self) -> int:
-        return self.end - self.progress.num_episodes
+    def __add__(self, other: "Progress") -> "Progress":
+        """Return that of both, one after the other."""
+        num_frames = self.num_frames + other.num_frames
+        return Progress(self.num_episodes + other.num_episodes, num_frames, self.failures + other.failures)
 
 
 def block_path(folder: Path, number: int) -> Path:
-    """Where a block lies once it is finished."""
+    """Return where a block lies once it is finished."""
     return folder / f"block-{number:05d}"
 
 
-def finished_blocks(folder: Path) -> list[Path]:
-    """Folders of the finished blocks, in order; none where the folder itself is missing."""
-    return sorted(path for path in folder.glob("block-*") if BLOCK.fullmatch(path.name))
+def finished_blocks(*folders: Path) -> list[Path]:
+    """Folders of the finished blocks, by their numbers; none where a folder itself is missing."""
+    paths = (path for folder in folders for path in folder.glob("block-*"))
+    return sorted((path for path in paths if BLOCK.fullmatch(path.name)), key=_number)
 
 
-def reached(folder: Path) -> Progress:
-    """Progress up to the end of the last finished block."""
-    return read_progress(finished_blocks(folder)[-1] / BLOCK_FILE)
+def _number(block: Path) -> int:
+    return int(block.name.removeprefix("block-"))
+
+
+def reached(*folders: Path) -> Progress:
+    """Progress of all finished blocks."""
+    return sum((read_progress(block / BLOCK_FILE) for block in finished_blocks(*folders)), start=Progress())
+
+
+def episodes_before(folder: Path, number: int) -> int:
+    """Return how many are in a folder's finished blocks of smaller numbers."""
+    blocks = [block for block in finished_blocks(folder) if _number(block) < number]
+    return sum(read_progress(block / BLOCK_FILE).num_episodes for block in blocks)
 
 
 def finish_block(unfinished: Path, block: Path, progress: Progress) -> None:
-    """Give a block its name, with the progress up to its end and what its files are."""
-    write_json(unfinished / BLOCK_FILE, {**asdict(progress), DIGESTS: _digests(unfinished)})
+    """Give a block its name, with what it holds."""
+    said = {NUMBER: _number(block), **asdict(progress), DIGESTS: _digests(unfinished)}
+    write_json(unfinished / BLOCK_FILE, said)
     unfinished.rename(block)
 
 
-def find_gaps(folder: Path, num_episodes: int, block_episodes: int) -> list[Gap]:
-    """Of a dataset of so many episodes: what lies between, before and after the finished blocks."""
-    gaps: list[Gap] = []
-    progress = Progress()
-    for number, start in enumerate(range(0, num_episodes, block_episodes)):
-        end = min(start + block_episodes, num_episodes)
-        block = block_path(folder, number)
-        if block.exists():
-            progress = read_progress(block / BLOCK_FILE)
-        elif gaps and gaps[-1].end == start:
-            gaps[-1] = replace(gaps[-1], end=end)
-        else:
-            gaps.append(Gap(progress, end))
-    return gaps
+def find_gaps(folder: Path, numbers: range) -> list[range]:
+    """Return those of the numbers whose blocks are not there, each range as long as can be."""
+    there = [number for number in map(_number, finished_blocks(folder)) if number in numbers]
+    starts, ends = [numbers.start, *(number + 1 for number in there)], [*there, numbers.stop]
+    return [range(start, end) for start, end in zip(starts, ends, strict=True) if start < end]
 
 
-def damaged_blocks(folder: Path, num_episodes: int, block_episodes: int) -> dict[Path, str]:
+def damaged_blocks(folder: Path, numbers: range) -> dict[Path, str]:
     """{block: what is wrong with it} of those up to the last one that is there."""
-    numbers = [int(block.name.removeprefix("block-")) for block in finished_blocks(folder)]
-    damaged = {}
-    for number in range(max(numbers, default=-1) + 1):
-        block = block_path(folder, number)
-        if damage := _damage(block, min((number + 1) * block_episodes, num_episodes)):
-            damaged[block] = damage
-    return damaged
+    last = max(map(_number, finished_blocks(folder)), default=-1)
+    blocks = (block_path(folder, number) for number in range(numbers.start, last + 1))
+    return {block: damage for block in blocks if (damage := block_damage(block))}
 
 
-def _damage(block: Path, end: int) -> str | None:
-    """What is wrong with a block that ends with this episode of the dataset."""
+def block_damage(block: Path) -> str | None:
+    """Return what is wrong with a block; None: nothing."""
     if not block.exists():
         return "is missing"
     try:
         values = read_json(block / BLOCK_FILE)
-        num_episodes, expected = Progress(**_of_progress(values)).num_episodes, dict(values[DIGESTS])
+        Progress(**_of_progress(values))
+        number, expected = int(values[NUMBER]), dict(values[DIGESTS])
     except (FileNotFoundError, ValueError, KeyError, TypeError):
         return f"holds no {BLOCK_FILE} that can be read"
-    if num_episodes != end:
-        return f"ends with episode {num_episodes} instead of {end}"
+    if number != _number(block):
+        return f"is block {number}"
     found = _digests(block)
     for name, digest in expected.items():
         if found.get(name) != digest:

@@ -1,4 +1,4 @@
-"""What a file of LIBERO's demonstrations must hold, and what its rows mean.
+"""Checks of a file of LIBERO's demonstrations, and the timing of its rows.
 
 data/demo_N of each: actions (T, 7), x, y, z, three of rotation and gripper, each in -1..1; states (T, n), the
 simulator's before each action; obs/agentview_rgb and obs/eye_in_hand_rgb (T, H, W, 3) uint8; obs/ee_pos
@@ -25,7 +25,7 @@ MAX_JOINT_DIFFERENCE_RAD = 0.05  # replays of recorded actions depart a little
 
 @dataclass(frozen=True)
 class Timing:
-    """What tells whether a row's observation is of before or of after its action, and what +1 does."""
+    """Timing of a demonstration: is an observation of before or after its row's action; what does +1 do?"""
 
     # largest difference of any joint from the simulator's state of the same row, of the next; median of rows
     same_row_rad: float
@@ -36,7 +36,7 @@ class Timing:
 
     @classmethod
     def of(cls, values: dict[str, np.ndarray]) -> "Timing":
-        """Of a demonstration's `checked_values`."""
+        """Measure the timing of a demonstration from its `checked_values`."""
         joints, fingers = values[f"obs/{JOINTS}"], values["obs/gripper_states"]
         # from the second state on: the first of some copies is of before the arm came to rest
         recorded = values["states"][1:, 1 : 1 + NUM_JOINTS]
@@ -50,7 +50,7 @@ class Timing:
 
 
 def are_after(file: Path, timings: Sequence[Timing]) -> bool:
-    """Whether a file's observations are of after the action in their row, as those of the published files.
+    """Return True if observations are of after their row's action, as in the published files.
 
     Raises:
         ValueError: its observations are of no row of the simulator's states, or +1 opens the gripper.
@@ -73,7 +73,7 @@ def are_after(file: Path, timings: Sequence[Timing]) -> bool:
 
 
 def checked_values(where: str, demo: Any, image_shape: Sequence[int]) -> dict[str, np.ndarray]:
-    """All numbers of a demonstration; of its images only that they are there."""
+    """Return all numbers of a demonstration, checked; of its images, only check that they are there."""
     widths = {"actions": ACTION_DIM, "states": None, f"obs/{JOINTS}": NUM_JOINTS}
     widths |= {f"obs/{name}": width for name, width in STATE.items()}
     for name in (*widths, *(f"obs/{camera}" for camera in CAMERAS)):

@@ -9,7 +9,8 @@ from lerobot_bomb.data.conversion import write_missing
 from lerobot_bomb.data.facts import LIBERO_SOURCE
 from lerobot_bomb.data.kept_blocks import Progress
 from lerobot_bomb.data.libero_hdf5 import CONVENTIONS, LiberoHdf5
-from lerobot_bomb.data.resumable import check_folders, check_repo_id, grow, unfinished_folder
+from lerobot_bomb.data.resumable import check_repo_id, grow
+from lerobot_bomb.data.unfinished import check_folders, unfinished_folder
 from lerobot_bomb.flags import one_of
 
 if TYPE_CHECKING:
@@ -25,7 +26,7 @@ ACTION_NAMES = [*POSE, "gripper"]
 
 @dataclass(frozen=True)
 class LiberoConversion:
-    """What determines a dataset converted from LIBERO's files."""
+    """Parameters that determine a dataset converted from LIBERO's files."""
 
     kind: ClassVar[str] = "conversion"
 

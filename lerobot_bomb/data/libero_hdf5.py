@@ -91,7 +91,7 @@ class LiberoHdf5:
 
     @cached_property
     def sha256(self) -> str:
-        """Of all files."""
+        """SHA-256 of all files."""
         digest = hashlib.sha256()
         for file in tqdm(self.files, desc="reading", unit="file"):
             with file.open("rb") as opened:
@@ -199,7 +199,7 @@ def _import_h5py() -> Any:
 
 
 def _demo_names(file: Path, data: Any) -> list[str]:
-    """In the order of their numbers."""
+    """Return the names of the demonstrations, in the order of their numbers."""
     names = [name for name in data if re.fullmatch(r"demo_\d+", name)]
     if not names:
         raise ValueError(f"{file}: data holds no demo_0, demo_1, ..., so it is not of LIBERO")
@@ -210,7 +210,7 @@ def _demo_names(file: Path, data: Any) -> list[str]:
 
 
 def _way_out(data: Any) -> str:
-    """Of a file that holds states and actions only."""
+    """Describe the way out for a file that holds states and actions only."""
     if "problem_info" in data.attrs:
         return "LIBERO's scripts/create_dataset.py plays such a recording and writes a file with images"
     env = data.attrs.get("env", "unknown")

@@ -2,7 +2,7 @@
 
 from pathlib import Path
 
-from lerobot_bomb.data.resumable import parameters_file, unfinished_folder
+from lerobot_bomb.data.unfinished import parameters_file, parts_folder, unfinished_folder
 
 RESUMED_BY = {
     "recording": "lerobot-bomb record",
@@ -11,11 +11,16 @@ RESUMED_BY = {
 
 
 def explain(repo_id: str, root: Path, error: Exception) -> str:
-    """What is missing, and an unfinished dataset of that name if there is one."""
+    """Describe what is missing, and an unfinished dataset of that name if there is one."""
     for kind, command in RESUMED_BY.items():
         folder = unfinished_folder(root, kind)
         if parameters_file(folder).is_file():
             return f"the {kind} {root} is not finished ({folder}): go on with `{command} ... --resume`"
+    if parts_folder(root).is_dir():
+        return (
+            f"the recording {root} lies in parts ({parts_folder(root)}): join them with "
+            "`lerobot-bomb record ... --join`"
+        )
     reason = str(error).strip().splitlines() or [""]
     return (
         f"{root} holds no dataset (meta/info.json), and {repo_id} cannot be had from the Hub "

@@ -23,7 +23,7 @@ BOARD_SIZE = float(BOARD_PX)  # the unit of state and action
 
 @dataclass(frozen=True)
 class _Layout:
-    """What an array must look like."""
+    """Layout that an array must have."""
 
     shape: tuple[int, ...]  # without the frames
     allowed: str
@@ -82,7 +82,7 @@ class PushtZarr:
 
     @cached_property
     def sha256(self) -> str:
-        """Of all files that are read."""
+        """SHA-256 of all files that are read."""
         digest = hashlib.sha256()
         for name in (*ARRAYS, ENDS):
             for file in sorted(path for path in (self.path / name).rglob("*") if path.is_file()):

@@ -9,20 +9,22 @@ from functools import partial
 from typing import Any, ClassVar
 
 from lerobot_bomb import __version__
-from lerobot_bomb.bomb.episode import DEFAULT_FPS, TASK_VERSION, EpisodeSpec
+from lerobot_bomb.bomb.episode import DEFAULT_FPS, EpisodeSpec
 from lerobot_bomb.bomb.observation import DEFAULT_IMAGE_SIZE, RenderOptions
-from lerobot_bomb.bomb.suite import specs_of_tasks
-from lerobot_bomb.conditions import NONE
+from lerobot_bomb.bomb.suite import specs_of_tasks, suites_of, task_version
+from lerobot_bomb.bomb.suites import SUITES
+from lerobot_bomb.conditions import ALL, NONE
 from lerobot_bomb.data.resumable import check_repo_id
 from lerobot_bomb.envs.results import installed_version
-from lerobot_bomb.flags import flags_without_group
+from lerobot_bomb.flags import flags_without_group, one_of
 
+SCENES = 100  # static ones that are stored as an episode
 MAX_NOISE = 1.0  # beyond it the noise exceeds the largest action
 
 
 @dataclass(frozen=True)
 class Recording:
-    """What determines a recording frame by frame."""
+    """Parameters that determine a recording frame by frame."""
 
     kind: ClassVar[str] = "recording"
 
@@ -46,13 +48,22 @@ class Recording:
     depth: bool = False
     success_tolerance_mm: float = EpisodeSpec.success_tolerance_mm
     noise: float = 0.0
-    protocol_version: str = TASK_VERSION  # the name that recordings of 1.0 have
+    # scenes instead of episodes: boards as they may stand midway, a frame each, which belongs to no other
+    static: int = 0
+    # SHA-256 of the weights of the policy that acts in the expert's place, who labels what it sees
+    relabel: str | None = None
+    # whether columns say what the expert points at, for training only
+    pointing: bool = False
+    # the suite's version, by the name that recordings of 1.0 have; filled in
+    protocol_version: str = ""
     package_version: str = __version__
     # another one plays other bits
     mujoco_version: str | None = field(default_factory=partial(installed_version, "mujoco"))
 
     def __post_init__(self) -> None:
         check_repo_id(self.repo_id)
+        if self.static:
+            self._of_scenes()
         if self.episodes < 1:
             raise ValueError(f"--episodes={self.episodes} must be at least 1")
         if not self.perturbations:
@@ -62,17 +73,42 @@ class Recording:
                 f"--noise={self.noise} must lie in 0..{MAX_NOISE:g}; "
                 "it is a standard deviation in units of the largest step, 40 mm"
             )
+        one_of("--task", self.task, (*SUITES, ALL))
+        if self.task_ids and self.task == ALL:
+            raise ValueError(
+                f"--task_ids={list(self.task_ids)} are numbers in a suite; --task={ALL} is of all"
+            )
+        if not self.protocol_version:
+            object.__setattr__(self, "protocol_version", task_version(self.task))
         with self.flag_names():
             conditions, _ = self.conditions, self.render_options  # they check the remaining flags
         if len(set(conditions)) < len(conditions):
             raise ValueError(f"--perturbations={','.join(self.perturbations)} has a condition twice")
 
+    def _of_scenes(self) -> None:
+        """Take the number of episodes from that of scenes; these are always labelled."""
+        if self.static < 1 or self.static % self.scenes:
+            raise ValueError(f"--static={self.static} must be in 1..{SCENES} or a multiple of {SCENES}")
+        for name, value in {"--relabel": self.relabel, f"--noise={self.noise}": self.noise}.items():
+            if value:
+                raise ValueError(f"{name}: static scenes are not played; leave it out with --static")
+        object.__setattr__(self, "episodes", self.static // self.scenes)
+        object.__setattr__(self, "pointing", True)
+
     @property
-    def spec(self) -> EpisodeSpec:
-        """What all episodes have in common, with the first seed."""
+    def scenes(self) -> int:
+        """Seeds of an episode: scenes that are stored as one, for LeRobot takes its time for each; else 1."""
+        return min(self.static, SCENES) or 1
+
+    @property
+    def suite_specs(self) -> list[EpisodeSpec]:
+        """Specs that all episodes of a suite share, with the first seed; one for each suite."""
+        return [self._spec_of(suite) for suite in suites_of(self.task)]
+
+    def _spec_of(self, suite: str) -> EpisodeSpec:
         return EpisodeSpec(
             seed=self.seed,
-            suite=self.task,
+            suite=suite,
             robot=self.robot,
             split=self.split,
             control_mode=self.control_mode,
@@ -83,13 +119,13 @@ class Recording:
         )
 
     def to_dict(self) -> dict[str, Any]:
-        """What its JSON reads back as."""
+        """Return the recording as JSON values."""
         return json.loads(json.dumps(asdict(self)))
 
     @property
     def conditions(self) -> list[EpisodeSpec]:
         """The specs that every seed is played with, with the first seed."""
-        tasks = specs_of_tasks(self.spec, self.task_ids)
+        tasks = [task for spec in self.suite_specs for task in specs_of_tasks(spec, self.task_ids)]
         return [replace(task, perturbations=text) for task in tasks for text in self.perturbations]
 
     def specs(self, num_tried: int) -> Iterator[EpisodeSpec]:
@@ -97,7 +133,7 @@ class Recording:
         conditions = self.conditions
         for tried in itertools.count(num_tried):
             seeds_done, condition = divmod(tried, len(conditions))
-            yield replace(conditions[condition], seed=self.seed + seeds_done)
+            yield replace(conditions[condition], seed=self.seed + seeds_done * self.scenes)
 
     @property
     def render_options(self) -> RenderOptions:

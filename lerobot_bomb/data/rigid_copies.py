@@ -24,7 +24,7 @@ class RigidMotion:
 
     @classmethod
     def drawn(cls, generator: np.random.Generator, board_size: float) -> "RigidMotion":
-        """Any angle, mirrored or not, and a shift by MAX_SHIFT at most along x and along y."""
+        """Draw any angle, mirrored or not, and a shift by MAX_SHIFT at most along x and along y."""
         angle_rad = np.radians(generator.uniform(-180, 180))
         is_mirrored = generator.random() < 0.5
         shift = generator.uniform(-MAX_SHIFT, MAX_SHIFT, 2)

@@ -3,11 +3,12 @@
 import json
 from typing import Any
 
-from lerobot.utils.constants import ACTION, OBS_IMAGES, OBS_PREFIX, OBS_STATE
+import numpy as np
+from lerobot.utils.constants import ACTION, DONE, OBS_IMAGES, OBS_PREFIX, OBS_STATE
 
 from lerobot_bomb import __version__
-from lerobot_bomb.bomb.episode import TASK_VERSION
 from lerobot_bomb.bomb.observation import ACTION_NAMES, CAMERAS, STATE_NAMES, geometry_shapes
+from lerobot_bomb.bomb.pointing import COLUMNS
 from lerobot_bomb.data.blocks import DatasetLayout, RecordedEpisode
 from lerobot_bomb.data.recording import Recording
 from lerobot_bomb.data.rollout_pool import Rollout
@@ -25,29 +26,40 @@ def rollout_layout(recording: Recording) -> DatasetLayout:
         f"{OBS_PREFIX}{key}": {"dtype": "float32", "shape": shape, "names": ["row", "column"]}
         for key, shape in geometry_shapes(recording.render_options).items()
     }
+    pointing = {
+        f"{OBS_PREFIX}{name}": {"dtype": "float32", "shape": (len(numbers),), "names": list(numbers)}
+        for name, numbers in (COLUMNS if recording.pointing else {}).items()
+    }
     features = {
         **{f"{OBS_IMAGES}.{camera}": dict(image) for camera in CAMERAS},
         OBS_STATE: {"dtype": "float32", "shape": (len(STATE_NAMES),), "names": list(STATE_NAMES)},
         ACTION: {"dtype": "float32", "shape": (len(action_names),), "names": list(action_names)},
         **geometry,
+        **pointing,
+        # after which frames no action of the same episode follows: a scene belongs to no other
+        **({DONE: {"dtype": "bool", "shape": (1,), "names": None}} if recording.pointing else {}),
     }
     # with the task's version, so that LeRobot refuses to merge datasets of different ones
-    robot_type = f"bomb_{recording.robot}_v{TASK_VERSION}"
+    robot_type = f"bomb_{recording.robot}_v{recording.protocol_version}"
     return DatasetLayout(
         recording.repo_id, recording.fps, robot_type, features, not recording.images, tuple(geometry)
     )
 
 
 def rollout_episode(rollout: Rollout) -> RecordedEpisode:
-    """What the dataset stores of one rollout."""
-    frames = (_frame(rollout, step) for step in range(rollout.result.steps))
+    """Convert a rollout to the episode that the dataset stores."""
+    is_scene = rollout.result.steps == 0  # nothing has been played
+    frames = (_frame(rollout, step, is_scene) for step in range(rollout.num_steps))
     return RecordedEpisode(frames, _columns(rollout.result))
 
 
-def _frame(rollout: Rollout, step: int) -> dict[str, Any]:
+def _frame(rollout: Rollout, step: int, is_scene: bool) -> dict[str, Any]:
+    is_last = is_scene or step == rollout.num_steps - 1
     return {
+        **({DONE: np.array([is_last])} if rollout.pointing else {}),
         **{f"{OBS_IMAGES}.{camera}": frames[step] for camera, frames in rollout.frames.items()},
         **{f"{OBS_PREFIX}{key}": values[step] for key, values in rollout.geometry.items()},
+        **{f"{OBS_PREFIX}{key}": values[step] for key, values in rollout.pointing.items()},
         OBS_STATE: rollout.states[step],
         ACTION: rollout.actions[step],
         "task": rollout.instructions[step],
@@ -61,6 +73,6 @@ def _columns(result: EpisodeResult) -> dict[str, Any]:
         "bomb/color": result.color or "",
         "bomb/levels": json.dumps(result.levels),
         "bomb/spec": json.dumps(result.spec.to_dict()),
-        "bomb/protocol_version": TASK_VERSION,
+        "bomb/protocol_version": result.task_version,
         "bomb/package_version": __version__,
     }

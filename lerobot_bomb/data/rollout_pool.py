@@ -6,37 +6,50 @@ The workers import this module, so it imports neither torch nor LeRobot.
 import itertools
 import multiprocessing
 import signal
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import suppress
 from dataclasses import dataclass, replace
 from multiprocessing import resource_tracker
 from multiprocessing.connection import Connection
 from multiprocessing.context import SpawnProcess
-from typing import Self
+from typing import Any, Self
 
 import gymnasium
 import numpy as np
 
 from lerobot_bomb.bomb.episode import EpisodeSpec
 from lerobot_bomb.bomb.expert import expert_action
-from lerobot_bomb.bomb.observation import AGENT_POS, CAMERAS, PIXELS, RenderOptions, geometry_shapes
-from lerobot_bomb.bomb.streams import recorder_noise
+from lerobot_bomb.bomb.observation import (
+    AGENT_POS,
+    CAMERAS,
+    ENVIRONMENT_STATE,
+    PIXELS,
+    RenderOptions,
+    geometry_shapes,
+)
+from lerobot_bomb.bomb.pointing import COLUMNS, Pointing
+from lerobot_bomb.bomb.privileged_state import PrivilegedState
+from lerobot_bomb.bomb.streams import Stream, generator, recorder_noise
 from lerobot_bomb.envs.results import EpisodeResult
-from lerobot_bomb.envs.rollout import Expert, add_noise, expert_agent, make_env, play
+from lerobot_bomb.envs.rollout import Agent, Expert, add_noise, expert_agent, make_env, play
+
+MAX_ENVS = 8  # that a worker keeps; each holds an OpenGL context
 
 
 @dataclass(frozen=True)
 class RolloutSettings:
-    """How to play; with a spec it determines a rollout."""
+    """Settings of a rollout; with a spec they determine it."""
 
     render_options: RenderOptions
     noise: float = 0.0  # standard deviation on x, y and z, in units of the largest relative step
     expert: Expert = expert_action
+    static: int = 0  # so many scenes instead of an episode
+    pointing: bool = False  # label what the expert points at
 
 
 @dataclass(frozen=True)
 class Rollout:
-    """One episode of T steps. A failed one carries its result only: its arrays are empty."""
+    """One episode of T steps, or T static scenes. A failed episode has a result only, and T = 0."""
 
     result: EpisodeResult
     states: np.ndarray  # (T, 4) float32, metres
@@ -44,36 +57,107 @@ class Rollout:
     instructions: list[str]  # T, of each step
     frames: dict[str, np.ndarray]  # camera -> (T, H, W, 3) uint8
     geometry: dict[str, np.ndarray]  # key of `geometry_shapes` -> (T, ...) float32; {} without depth
+    pointing: dict[str, np.ndarray]  # key of `COLUMNS` -> (T, n) float32; {} without labels
+
+    @property
+    def num_steps(self) -> int:
+        """Frames that are stored."""
+        return len(self.instructions)
 
 
-def collect(env: gymnasium.Env, spec: EpisodeSpec, settings: RolloutSettings) -> Rollout:
+def collect(
+    env: gymnasium.Env, spec: EpisodeSpec, settings: RolloutSettings, agent: Agent | None = None
+) -> Rollout:
     """Play a spec's episode in an `env` of that spec, whatever the seed that the `env` was made with.
 
-    The stored actions are clean, the executed ones carry the noise.
+    The stored actions are the expert's clean ones, the executed ones carry the noise. With an ``agent``,
+    which then acts, an episode is kept whatever becomes of it.
     """
+    if settings.static:
+        return collect_static(env, spec, settings)
     rng = recorder_noise(spec.seed)
     moments = list(
         play(
             env,
             spec,
-            expert_agent(settings.expert),
+            agent or expert_agent(settings.expert),
             disturb=lambda action: add_noise(action, settings.noise, spec.control_mode, rng),
         )
     )
     result = env.get_wrapper_attr("episode_result")()
-    if not result.is_success:
-        return Rollout(result, np.empty((0, 4), np.float32), np.empty((0, 4), np.float32), [], {}, {})
-    observations = [moment.observation for moment in moments[:-1]]
+    if agent is None and not result.is_success:
+        return Rollout(result, np.empty((0, 4), np.float32), np.empty((0, 4), np.float32), [], {}, {}, {})
+    shown = moments[:-1]
+    actions = [
+        settings.expert(moment.state) if agent else moment.action
+        for moment in shown
+        if moment.action is not None
+    ]
+    return _rollout(result, [(each.observation, each.instruction) for each in shown], actions, settings)
+
+
+def collect_static(env: gymnasium.Env, spec: EpisodeSpec, settings: RolloutSettings) -> Rollout:
+    """The episodes of a spec from its seed on as they may stand midway, and what the expert would do there.
+
+    The result is of the first one.
+    """
+    shown, results = [], []
+    for seed in range(spec.seed, spec.seed + settings.static):
+        observation, result = env.get_wrapper_attr("show_static")(seed)
+        shown.append((observation, env.get_wrapper_attr("task_description")))
+        results.append(result)
+    states = [PrivilegedState.from_vector(observation[ENVIRONMENT_STATE]) for observation, _ in shown]
+    return _rollout(results[0], shown, list(map(settings.expert, states)), settings)
+
+
+def _rollout(
+    result: EpisodeResult,
+    shown: list[tuple[dict[str, Any], str]],
+    actions: list[np.ndarray],
+    settings: RolloutSettings,
+) -> Rollout:
+    observations = [observation for observation, _ in shown]
     return Rollout(
         result=result,
         states=np.stack([observation[AGENT_POS] for observation in observations]),
-        actions=np.stack([moment.action for moment in moments if moment.action is not None]),
-        instructions=[moment.instruction for moment in moments[:-1]],
+        actions=np.stack(actions),
+        instructions=[instruction for _, instruction in shown],
         frames={camera: np.stack([o[PIXELS][camera] for o in observations]) for camera in CAMERAS},
         geometry={
             key: np.stack([o[key] for o in observations]) for key in geometry_shapes(settings.render_options)
         },
+        pointing=_pointing(result.spec, observations) if settings.pointing else {},
     )
+
+
+def _pointing(spec: EpisodeSpec, observations: list[dict[str, Any]]) -> dict[str, np.ndarray]:
+    rng = generator(spec.seed, Stream.POINTING)
+    states = [PrivilegedState.from_vector(observation[ENVIRONMENT_STATE]) for observation in observations]
+    rows = [Pointing.of(state, rng).columns() for state in states]
+    return {name: np.stack([row[name] for row in rows]) for name in COLUMNS}
+
+
+class RelabelledRollouts:
+    """Episodes of another agent, in this process: what it saw, and what the expert would have done there."""
+
+    def __init__(
+        self, settings: RolloutSettings, specs: Iterator[EpisodeSpec], begin: Callable[[], None], agent: Agent
+    ) -> None:
+        self._worker, self._specs, self._begin = _Worker(settings, agent), specs, begin
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._worker.close()
+
+    def __iter__(self) -> Iterator[Rollout]:
+        for spec in self._specs:
+            self._begin()
+            rollout = self._worker.play(spec)
+            if isinstance(rollout, Exception):
+                raise rollout
+            yield rollout
 
 
 class RolloutPool:
@@ -139,7 +223,7 @@ class RolloutPool:
 
 
 def _work(settings: RolloutSettings, pipe: Connection) -> None:
-    """A worker's life: specs come, rollouts or an exception go, until the parent ends."""
+    """Run a worker: specs come, rollouts or an exception go, until the parent ends."""
     worker = _Worker(settings)
     with suppress(EOFError, ConnectionError):
         while True:
@@ -148,24 +232,28 @@ def _work(settings: RolloutSettings, pipe: Connection) -> None:
 
 
 class _Worker:
-    """What a worker keeps between episodes: the environment, as long as only the seed changes."""
+    """Worker that keeps an environment of each of the last few conditions between episodes."""
 
-    def __init__(self, settings: RolloutSettings) -> None:
-        self._settings = settings
-        self._condition: EpisodeSpec | None = None
-        self._env: gymnasium.Env | None = None
+    def __init__(self, settings: RolloutSettings, agent: Agent | None = None) -> None:
+        self._settings, self._agent = settings, agent
+        self._envs: dict[EpisodeSpec, gymnasium.Env] = {}
 
     def play(self, spec: EpisodeSpec) -> Rollout | Exception:
-        condition = replace(spec, seed=0)
         try:
-            if self._env is None or condition != self._condition:
-                self.close()
-                self._env = make_env(spec, self._settings.render_options)
-                self._condition = condition
-            return collect(self._env, spec, self._settings)
+            return collect(self._env_of(spec), spec, self._settings, self._agent)
         except Exception as error:
             return error
 
+    def _env_of(self, spec: EpisodeSpec) -> gymnasium.Env:
+        condition = replace(spec, seed=0)
+        env = self._envs.pop(condition, None)
+        if env is None:
+            if len(self._envs) == MAX_ENVS:
+                self._envs.pop(next(iter(self._envs))).close()
+            env = make_env(spec, self._settings.render_options)
+        self._envs[condition] = env  # the last one
+        return env
+
     def close(self) -> None:
-        if self._env is not None:
-            self._env.close()
+        for env in self._envs.values():
+            env.close()

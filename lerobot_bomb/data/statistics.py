@@ -20,6 +20,7 @@ from lerobot_bomb.data.dataset_files import (
     Info,
     check_finite_columns,
     flat_numbers,
+    read_episodes,
     read_info,
     read_parquet,
 )
@@ -109,6 +110,32 @@ def write_statistics(root: Path) -> None:
         unfinished.write_text(json.dumps(stored, indent=4, sort_keys=True))
 
 
+def write_image_statistics(root: Path) -> None:
+    """Let stats.json say of a dataset's images what follows from all episodes, in whatever parts they came.
+
+    Raises:
+        OSError, ValueError: a file is missing or damaged.
+    """
+    from lerobot.datasets.compute_stats import aggregate_feature_stats  # imports torch: seconds
+
+    path, info = root / STATISTICS_FILE, read_info(root)
+    stored: dict[str, Any] = read_json(path)
+    episodes = read_episodes(root, info)
+    for name, feature in info["features"].items():
+        if feature["dtype"] not in PICTURES:
+            continue
+        shapes = {each: np.shape(values) for each, values in stored[name].items()}
+        columns = {
+            each: flat_numbers(episodes[f"stats/{name}/{each}"]).reshape(len(episodes), *shape)
+            for each, shape in shapes.items()
+        }
+        of_episodes = [dict(zip(columns, row, strict=True)) for row in zip(*columns.values(), strict=True)]
+        merged: dict[str, Any] = aggregate_feature_stats(of_episodes)
+        stored[name] = {each: values.tolist() for each, values in merged.items()}
+    with written_whole(path) as (unfinished,):
+        unfinished.write_text(json.dumps(stored, indent=4, sort_keys=True))
+
+
 def _tolerance(exact: Statistics) -> np.ndarray:
     """(D,) what LeRobot's histograms and float32 may be off by."""
     size_D = np.maximum(np.abs(exact["min"]), np.abs(exact["max"]))
@@ -121,7 +148,7 @@ def _is_close(stored: Any, exact_D: np.ndarray, tolerance_D: np.ndarray) -> bool
 
 
 def _numbers(root: Path, info: Info) -> Iterator[tuple[str, np.ndarray]]:
-    """Each vector that a policy may normalise: its name and (N, D) of all frames."""
+    """Yield each vector that a policy may normalise: its name and (N, D) of all frames."""
     paths = sorted((root / "data").rglob("*.parquet"))
     for name, feature in info["features"].items():
         is_text = feature["dtype"] in (*PICTURES, "string", "language")

@@ -41,7 +41,7 @@ class Continuation(Protocol):
         ...
 
     def keep(self, row_B: Tensor) -> None:
-        """Only these rows are gone on with, in this order."""
+        """Go on with these rows only, in this order."""
         ...
 
 
@@ -54,7 +54,7 @@ class Prompt(NamedTuple):
 
     @property
     def tensors(self) -> tuple[Tensor, Tensor, Tensor]:
-        """The same without a None."""
+        """Prompt as tensors, without a None."""
         return self.embeds, self.mask, torch.zeros_like(self.mask) if self.hidden is None else self.hidden
 
 
@@ -93,7 +93,7 @@ class CachedContinuation(Continuation):
 
 
 class Answers(NamedTuple):
-    """How far rows of symbols are written."""
+    """Rows of symbols, as far as they are written."""
 
     numbers: Tensor  # (B, N) int64 those that are complete, else 0
     last: Tensor  # (B,) int64, the symbol written last
@@ -105,7 +105,7 @@ class Answers(NamedTuple):
 
     @classmethod
     def start(cls, grammar: NumberGrammar, batch_size: int, noise: Tensor | None = None) -> "Answers":
-        """The space that every answer begins with is written."""
+        """Start with the space that every answer begins with, which is written."""
         place = grammar.start(batch_size)
         numbers_BN = place.prefix.new_zeros(batch_size, grammar.num_numbers)
         ones_B = torch.ones_like(place.prefix)
@@ -133,13 +133,13 @@ class Answers(NamedTuple):
         return self.numbers.scatter_add(1, self.number[:, None], grammar.value[self.prefix][:, None])
 
     def keep(self, row_B: Tensor) -> "Answers":
-        """Those of these rows."""
+        """Keep these rows only."""
         return Answers(*(tensor[row_B] for tensor in self))
 
 
 @dataclass(frozen=True)
 class Decoded:
-    """What was written, and in how many passes, the prompt's included."""
+    """Numbers that were written, and the passes it took, the prompt's included."""
 
     numbers: Tensor  # (B, stop_after) int64
     num_passes: int

@@ -27,7 +27,7 @@ MAX_COMPILED = 64
 
 @dataclass(frozen=True)
 class Columns:
-    """Where the tokens of a pass stand, as the layers need it."""
+    """Columns of the tokens of a pass, as the layers need them."""
 
     shape: tuple[int, int, int, int, int]  # B, K, V, G, E
     slots: Tensor  # (N, 2 * V) int64 rows of a layer's flat cache, keys' before values'
@@ -97,9 +97,9 @@ class TextLayers:
 
 
 def _rope_scale(attention: Any) -> float:
-    """Of rotary positions, so that the products of rotated queries and keys are ``p`` of `_Layer._read`.
+    """Return the factor of rotary positions with which rotated queries and keys give ``p`` of `_Layer._read`.
 
-    A factor of the tables costs nothing, one of the products an operation in every layer and pass.
+    Scaling the tables costs nothing; scaling the products costs an operation in every layer and pass.
     """
     softcap = softcap_of(attention)
     return 1.0 if softcap is None else (2 * attention.scaling / softcap) ** 0.5
@@ -141,7 +141,7 @@ class _Layer:
 
     @property
     def norms(self) -> "list[_RMSNorm]":
-        """All of them, none twice."""
+        """Norms of the layer, each once."""
         norms = self._before_attention, self._after_attention, self._before_mlp, self._after_mlp
         return [norm for norm in norms if norm is not None]
 
@@ -162,7 +162,7 @@ class _Layer:
         return self._out(read.view(query_BVKGE.shape).transpose(1, 2).reshape(len(x_NH), -1))
 
     def _read(self, query_BVKGE: Tensor, keys_ZCE: Tensor, values_ZCE: Tensor, bias_B1XC: Tensor) -> Tensor:
-        """What queries read, of as many numbers."""
+        """Return what queries read, as many numbers as they have."""
         batch_size, num_keys, *_, size = query_BVKGE.shape
         if self._softcap is None:
             keys_BVCE = keys_ZCE.view(batch_size, num_keys, -1, size)
@@ -207,7 +207,7 @@ class _RMSNorm:
         self.scale, self._least_length = self._weight * width**0.5, torch.tensor((width * self._eps) ** 0.5)
 
     def refresh(self) -> None:
-        """The module has another weight; off the CPU, where the scale is not used."""
+        """Take the module's weight as it is now; only for use off the CPU, where the scale is not read."""
         if self._is_gemma:
             torch.add(self._source, 1, out=self._weight)
 
@@ -225,7 +225,7 @@ class _RMSNorm:
 
 
 def _add(x: Tensor, new: Tensor, norm: _RMSNorm | None) -> Tensor:
-    """Of the same shape: x and what a part of a layer adds to it."""
+    """Add to x what a part of a layer adds to it, of the same shape."""
     if norm is None:
         return x + new
     if norm.is_on_host and x.dtype == new.dtype == torch.float32:

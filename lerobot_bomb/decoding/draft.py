@@ -27,10 +27,11 @@ class KnownSymbols:
 
 
 class LinearDraft:
-    """Every action dimension goes on as it went in the last two steps of the answer itself."""
+    """Draft in which every action dimension goes on as it went in the last two steps of the answer."""
 
-    def __init__(self, grammar: NumberGrammar, num_dims: int):
-        self._grammar, self._num_dims = grammar, num_dims
+    def __init__(self, grammar: NumberGrammar, num_dims: int, num_before: int = 0):
+        """``num_before``: numbers of the answer that precede its actions and follow no line."""
+        self._grammar, self._num_dims, self._num_before = grammar, num_dims, num_before
 
     def __call__(self, number_BN: Tensor, place: Place) -> Tensor:
         """(B, G) guesses."""
@@ -49,7 +50,7 @@ class LinearDraft:
         return self._spell(grammar.spelling[numbers].flatten(1), mask_BWC.flatten(1)).gather(1, columns_BG)
 
     def _spell(self, symbol_BM: Tensor, mask_BM: Tensor) -> Tensor:
-        """Written symbols without the padding between them, then ends; no row's length has to be known."""
+        """Spell symbols without the padding between them, then ends; no row's length has to be known."""
         num_columns = symbol_BM.shape[1] + MAX_GUESSES + 1
         column_BM = (mask_BM.cumsum(dim=1) - 1).masked_fill(~mask_BM, num_columns)
         spelled = symbol_BM.new_full((len(symbol_BM), num_columns + 1), END)
@@ -73,14 +74,15 @@ class LinearDraft:
     def _expect(self, number_BN: Tensor, index_BX: Tensor, steps: Tensor | int) -> Tensor:
         """(B, X) the number ``steps`` after an unknown one, on the line through the two steps before that.
 
-        At the answer's start: the middle of the range, then no slope.
+        In the first step, and before: the middle of the range, then no slope.
         """
         middle = (self._grammar.num_values - 1) // 2
         last_BX, before_BX = (
             number_BN.gather(1, (index_BX - back * self._num_dims).clamp(0, number_BN.shape[1] - 1))
             for back in (1, 2)
         )
-        last_BX = torch.where(index_BX >= self._num_dims, last_BX, middle)
-        before_BX = torch.where(index_BX >= 2 * self._num_dims, before_BX, last_BX)
+        second = self._num_before + self._num_dims  # where the second step begins
+        last_BX = torch.where(index_BX >= second, last_BX, middle)
+        before_BX = torch.where(index_BX >= second + self._num_dims, before_BX, last_BX)
         line_BX = last_BX + (last_BX - before_BX) * (steps + 1)
         return line_BX.clamp(0, self._grammar.num_values - 1)

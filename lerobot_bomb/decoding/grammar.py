@@ -15,7 +15,7 @@ from lerobot_bomb.actions.text import END, NUM_SYMBOLS, SPACE, digits_needed, nu
 
 @dataclass(frozen=True)
 class Place:
-    """Where in an answer rows of symbols stand; both of the same shape, int64."""
+    """Places in an answer where rows of symbols stand; both fields have the same shape, int64."""
 
     prefix: Tensor  # state of `NumberGrammar`: the digits of the number so far
     number: Tensor  # which number they belong to, from 0
@@ -88,7 +88,7 @@ class NumberGrammar(nn.Module):
         return self.fixed_width or digits_needed(self.num_values)
 
     def _prefixes(self) -> list[str]:
-        """All beginnings of all numbers, the empty one first."""
+        """Return all beginnings of all numbers, the empty one first."""
         numbers = [str(value).zfill(self.fixed_width) for value in range(self.num_values)]
         beginnings = {number[:length] for number in numbers for length in range(len(number) + 1)}
         return sorted(beginnings, key=lambda prefix: (len(prefix), prefix))
@@ -97,7 +97,7 @@ class NumberGrammar(nn.Module):
         return len(prefix) == self.fixed_width if self.fixed_width else prefix != ""
 
     def max_symbols(self, num_numbers: int) -> int:
-        """Of the longest answer that begins with so many numbers, up to the symbol after them."""
+        """Return the most symbols that so many numbers take, with the symbol after them."""
         return num_numbers * (1 + self.width) + 1
 
     def start(self, batch_size: int) -> Place:
@@ -118,7 +118,7 @@ class NumberGrammar(nn.Module):
         return Place(torch.stack(prefixes, dim=1), place.number[:, None] + num_spaces_BK)
 
     def is_last(self, place: Place) -> Tensor:
-        """Whether the number is the answer's last, which the end follows instead of a space."""
+        """Return True where the number is the answer's last, which the end follows instead of a space."""
         return place.number == self.num_numbers - 1
 
     def logit_bias(self, place: Place) -> Tensor:

@@ -1,4 +1,4 @@
-"""What CUDA graphs need to be used again: weights and caches that stay where they are."""
+"""Cache for CUDA graphs: weights and caches that stay where they are, so that graphs can be used again."""
 
 from collections.abc import Callable
 from typing import Any
@@ -11,9 +11,9 @@ from lerobot_bomb.decoding.kv_cache import CachedText, Positions, same_positions
 
 
 class GraphCache[T]:
-    """Something for each size of batch and prompt, on a copy of a text model's weights.
+    """Cache of what is made for each size of batch and prompt, on a copy of a text model's weights.
 
-    There is one copy for a device and a type that is computed in. Copied or pickled, it has none.
+    There is one copy for each device and type that is computed in. A copied or pickled cache is empty.
     """
 
     def __init__(self, text_model: Any, positions: Positions = same_positions, *, compiled: bool = False):
@@ -30,7 +30,7 @@ class GraphCache[T]:
         self._made: dict[Any, T] = {}
 
     def find(self, prompt_BLH: Tensor, num_new: int, make: Callable[[CachedText], T]) -> T:
-        """What was made for such prompts and so many new tokens, with the weights that the model has now."""
+        """Return what was made for such prompts and so many new tokens, with the model's current weights."""
         modules = list(self._text_model.modules())
         if modules != self._modules:  # such as an adapter that was added
             self._forget()

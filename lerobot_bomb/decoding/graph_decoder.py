@@ -50,7 +50,7 @@ class GraphDecoder:
         stop_after: int,
         noise: Tensor | None = None,
     ) -> Decoded:
-        """As `decode_numbers`, with the rows as they are now."""
+        """Decode as `decode_numbers`, with the rows as they are now."""
         self._embeds_SH.copy_(embeds_SH)
         self._head_SH.copy_(head_SH)
         return decode_ahead(self._passes(prompt, noise), self._grammar, stop_after)
@@ -80,7 +80,7 @@ class GraphDecoder:
 
 
 def decode_ahead(passes: Iterator[Answers], grammar: NumberGrammar, stop_after: int) -> Decoded:
-    """As `decode_numbers`; while a pass runs, the host hears of the last: are all rows done, and finite?"""
+    """Decode as `decode_numbers`; during a pass the host hears if the last left all rows done, and finite."""
     hear = None
     for num_passes, answers in enumerate(passes, 1):
         if hear is not None:

@@ -18,7 +18,7 @@ Positions = Callable[[Tensor], Tensor]
 
 
 def same_positions(column_C: Tensor) -> Tensor:
-    """Of a model that counts as columns are counted."""
+    """Return the positions of a model that counts as columns are counted."""
     return column_C
 
 
@@ -27,7 +27,7 @@ def check_positions(
     num_tokens: int,
     way_out: str = "shorten the instruction or give a smaller --policy.chunk_size",
 ) -> None:
-    """A text model of this config can read so many tokens.
+    """Check that a text model of this config can read so many tokens.
 
     Raises:
         ValueError: it has fewer positions.
@@ -92,11 +92,11 @@ class CachedText:
         return self.read(embeds_BKH, columns)
 
     def read(self, embeds_BKH: Tensor, columns: Columns) -> Tensor:
-        """As a call, of tokens at columns that `singly` located."""
+        """Read as a call does, tokens at columns that `singly` located."""
         return self._layers(embeds_BKH, columns, self._layer_caches)
 
     def singly(self, columns_BK: Tensor) -> list[Columns]:
-        """Of K passes, each of a token a row which reads up to its own column; faster than one by one."""
+        """Locate K passes, each of a token a row which reads up to its own column; faster than one by one."""
         counts = self._counts_of_columns(columns_BK)
         together = self._locate(columns_BK, columns_BK, max(counts, default=0))
         parts = zip(
@@ -110,7 +110,7 @@ class CachedText:
         return [Columns(shape, slots, rope, bias[..., :count]) for slots, rope, bias, count in parts]
 
     def columns_of(self, mask_BL: Tensor) -> Tensor:
-        """Which columns of rows hold a token -> (B, L) its column in the cache, padding out of the way."""
+        """Return the cache column (B, L) of each token that the mask holds; padding goes out of the way."""
         return (mask_BL.cumsum(dim=1) - 1).masked_fill(~mask_BL, self.unread_column)
 
     def hide(self, columns_BK: Tensor, hidden_BK: Tensor) -> None:
@@ -119,7 +119,7 @@ class CachedText:
         self._hidden_BC.scatter_(1, columns_BK, hidden_BK & (columns_BK != self.unread_column))
 
     def keep(self, row_B: Tensor) -> None:
-        """Only these rows are gone on with, in this order."""
+        """Go on with these rows only, in this order."""
         self._take(self._cache[:, row_B])
         self._hidden_BC = self._hidden_BC[row_B]
         self._first_slot = self._first_slot[: len(row_B)]
@@ -147,7 +147,7 @@ class CachedText:
         )
 
     def _counts_of_columns(self, columns_BK: Tensor) -> list[int]:
-        """How many columns attention has to look at for each token; all where the host would have to wait."""
+        """Return how many columns attention reads for each token; all where the host would have to wait."""
         if columns_BK.is_cuda:
             return [len(self._columns_C)] * columns_BK.shape[1]
         return [last + 1 for last in (columns_BK % self.unread_column).amax(dim=0).tolist()]

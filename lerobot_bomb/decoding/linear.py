@@ -37,7 +37,7 @@ def multiply(weight: Tensor, bias: Tensor | None = None) -> Callable[[Tensor], T
 
 
 def is_plain(module: nn.Module) -> TypeGuard[nn.Linear]:
-    """It has nothing but a weight, perhaps a bias."""
+    """Return True if a module is a linear layer with nothing but a weight and perhaps a bias."""
     return type(module) is nn.Linear and not (module._forward_hooks or module._forward_pre_hooks)
 
 

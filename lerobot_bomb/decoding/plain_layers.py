@@ -73,7 +73,7 @@ def softcap(attention: Any, logits: Tensor) -> Tensor:
 
 
 def mlp(module: Any, x_BLH: Tensor) -> Tensor:
-    """The gated MLP."""
+    """Compute a gated MLP."""
     return module.down_proj(module.act_fn(module.gate_proj(x_BLH)) * module.up_proj(x_BLH))
 
 

@@ -1,4 +1,4 @@
-"""What the tokens of a pass ask for and what they can be asked for: queries, keys and values of a layer.
+"""Queries, keys and values of a layer: what the tokens of a pass ask for and can be asked for.
 
 Shapes: `N` tokens of a pass, `C` columns of a cache, `H` hidden size, `V` key-value heads, `G` query heads
 for each, `E` size of a head, `A` = 3 axes that a position has in M-RoPE: time, line and column.
@@ -36,7 +36,7 @@ def rotary_tables(model: Any, position_C: Tensor) -> tuple[Tensor, Tensor]:
 
 
 class RopeHalves:
-    """Of any projections; rotary positions rotate the first half of a head against the second."""
+    """Heads of any projections; rotary positions rotate the first half of a head against the second."""
 
     def __init__(self, attention: Any, *, is_copy: bool):
         self._linears = make_linears(_projections(attention), are_copies=is_copy)
@@ -44,7 +44,7 @@ class RopeHalves:
         self._num_keys = attention.config.num_key_value_heads
 
     def __call__(self, x_NH: Tensor, rope_N12E: Tensor) -> tuple[Tensor, Tensor]:
-        """As `Heads`; cosines stand before sines, which are negative in the first half."""
+        """Compute as `Heads`; cosines stand before sines, which are negative in the first half."""
         parts = self._linears(x_NH)
         joined = parts[0] if len(parts) == 1 else torch.cat(parts, dim=-1)
         heads = cast(joined, rope_N12E.dtype).view(len(x_NH), -1, self._size)
@@ -62,10 +62,10 @@ class RopeHalves:
 
 
 class RopePairs:
-    """Of plain projections on a CPU, where this is faster.
+    """Heads of plain projections on a CPU, where this is faster.
 
-    Weights are copied, their rows stand so that numbers which are rotated together are neighbours:
-    the parts of a complex one. Attention logits do not depend on their order.
+    Weights are copied. Their rows stand so that numbers which are rotated together, the parts of a complex
+    one, are neighbours. Attention logits do not depend on their order.
     """
 
     def __init__(self, attention: Any):
@@ -81,7 +81,7 @@ class RopePairs:
         return part.detach().unflatten(0, (-1, 2, self._size // 2)).transpose(1, 2).flatten(0, 2)
 
     def __call__(self, x_NH: Tensor, rope_N1E: Tensor) -> tuple[Tensor, Tensor]:
-        """As `Heads`, of complex rotary positions."""
+        """Compute as `Heads`, with complex rotary positions."""
         shape = len(x_NH), -1, self._size // 2, 2
         query = cast(self._query(x_NH), torch.float32).view(shape)
         new = cast(self._new(x_NH), torch.float32).view(shape)
@@ -97,7 +97,7 @@ class RopePairs:
 
     @staticmethod
     def can(attention: Any) -> bool:
-        """Its projections are plain, in float32 or less on a CPU."""
+        """Return True if the projections are plain, in float32 or less on a CPU."""
         parts = _projections(attention)
         return all(
             is_plain(part) and part.weight.dtype.itemsize <= 4 and part.weight.device.type == "cpu"

@@ -1,13 +1,13 @@
 """Decoding of answers with one choice a slot, one pass of the model each, or less.
 
-An answer has steps of the same slots. What may stand in a slot does not depend on what stands before it, so
-the language needs no automaton: the output head has only the slot's rows.
+An answer has steps of the same slots, and may have others ahead of them. What may stand in a slot does not
+depend on what stands before it, so the language needs no automaton: the output head has only the slot's rows.
 
 Shapes: `B` batch, `L` tokens of a prompt, `H` hidden size, `T` steps of an answer, `G` slots of a step, `S`
 of an answer, `C` choices of all kinds of slots, `K` tokens of a pass.
 """
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import partial
 from itertools import accumulate
@@ -59,23 +59,26 @@ class SlotWriter:
         embeds_CH: Tensor,
         head_CH: Tensor,
         noise: Tensor | None = None,
+        ahead: Sequence[slice] = (),
     ) -> Tensor:
         """(B, S) the likeliest choice in every slot, given those before it, or with ``noise`` a sampled one.
 
         ``slots``: of a step, which of the choices come into question, counted from the first of them;
+        ``ahead``: the same of what is chosen once, before the steps; its noise is that of the first one;
         ``embeds_CH`` and ``head_CH``: the choices' rows of the embedding and of the output head; ``noise``
         (B, T, C): added to the choices' logits.
 
         Raises:
             ValueError: a row's logits are not finite. On CUDA the host waits for the answers to learn of it.
         """
-        self.num_passes = num_slots = num_steps * len(slots)
+        places = _places(ahead, slots, num_steps)
+        self.num_passes = num_slots = len(places)
         if noise is None:
             noise = prompt.embeds.new_empty(len(prompt.embeds), 0, len(head_CH))
         if prompt.embeds.is_cuda:
             with torch.inference_mode(False), torch.no_grad():
                 settings = slots, num_steps, self._reads_all, self._cap
-                make = partial(GraphSlots, *settings, embeds_CH, head_CH)
+                make = partial(GraphSlots, *settings, embeds_CH, head_CH, ahead=ahead)
                 captured = self._graphs.find(prompt.embeds, num_slots, make)
                 choices_BS, finite_B = captured(prompt, embeds_CH, head_CH, noise)
             require_finite_answers(finite_B)
@@ -86,22 +89,20 @@ class SlotWriter:
         head = SlotHead(head_CH, noise, self._cap)
         # rows that agree on how far guesses are right are rare
         is_drafted = self.drafted and batch_size == 1
-        singly = 1 if is_drafted else num_steps
-        choices_BS, finite_B = choose(
-            text, prompt, slots, singly, embeds_CH, head, prompt_reads_all=self._reads_all
-        )
+        singly = places[: len(ahead) + len(slots)] if is_drafted else places
+        choices_BS, finite_B = choose(text, prompt, singly, embeds_CH, head, prompt_reads_all=self._reads_all)
         require_finite_answers(finite_B)
         if not is_drafted:
             return choices_BS
         length = int(prompt.mask.sum())
-        answer_BS, num_more = repeat(text, length, slots, num_slots, choices_BS, embeds_CH, head)
-        self.num_passes = len(slots) + num_more
+        answer_BS, num_more = repeat(text, length, places, len(slots), choices_BS, embeds_CH, head)
+        self.num_passes = len(singly) + num_more
         return answer_BS
 
 
 @dataclass(frozen=True)
 class SlotHead:
-    """Where the logits of choices come from: rows of the output head and, for samples, noise."""
+    """Source of the logits of choices: rows of the output head and, for samples, noise."""
 
     rows: Tensor  # (C, H)
     noise: Tensor  # (B, T, C), added to the logits; T = 0: the likeliest is chosen
@@ -112,7 +113,7 @@ class SlotHead:
         return self._finish(exact_linear(hidden_BH, self.rows[slot]), step, slot)
 
     def logits_of_tokens(self, hidden_KH: Tensor, places: list[tuple[int, slice]]) -> list[Tensor]:
-        """Of a single row's tokens, and the step and slot of each -> its choices' logits, float32 each."""
+        """Return the float32 logits of the choices of one row's tokens, given each token's step and slot."""
         products = in_float32(partial(self._multiply, [slot for _, slot in places]), hidden_KH)
         return [
             self._finish(of_token, step, slot)
@@ -141,8 +142,9 @@ class GraphSlots:
         embeds_CH: Tensor,
         head_CH: Tensor,
         text: CachedText,
+        ahead: Sequence[slice] = (),
     ):
-        self._text, self._slots, self._num_steps = text, slots, num_steps
+        self._text, self._places = text, _places(ahead, slots, num_steps)
         self._reads_all, self._cap = reads_all, cap
         self._embeds_CH, self._head_CH = embeds_CH.clone(), head_CH.clone()
         self._choose = GraphedFunction(self._choose_all)
@@ -150,7 +152,7 @@ class GraphSlots:
     def __call__(
         self, prompt: Prompt, embeds_CH: Tensor, head_CH: Tensor, noise_BTC: Tensor
     ) -> tuple[Tensor, Tensor]:
-        """As `choose`; the second is written over by the next call."""
+        """Choose as `choose`; the next call writes over the second result."""
         self._embeds_CH.copy_(embeds_CH)
         self._head_CH.copy_(head_CH)
         choices_BS, finite_B = self._choose(*prompt.tensors, noise_BTC)
@@ -162,31 +164,34 @@ class GraphSlots:
         self._text.clear()
         prompt = Prompt(embeds_BLH, mask_BL, hidden_BL)
         head = SlotHead(self._head_CH, noise_BTC, self._cap)
-        answer = self._slots, self._num_steps, self._embeds_CH, head
+        answer = self._places, self._embeds_CH, head
         return choose(self._text, prompt, *answer, prompt_reads_all=self._reads_all)
+
+
+def _places(ahead: Sequence[slice], slots: Sequence[slice], num_steps: int) -> list[tuple[int, slice]]:
+    """The step and the slot of every choice of an answer."""
+    return [(0, slot) for slot in ahead] + [(step, slot) for step in range(num_steps) for slot in slots]
 
 
 def choose(
     text: CachedText,
     prompt: Prompt,
-    slots: list[slice],
-    num_steps: int,
+    places: list[tuple[int, slice]],
     embeds_CH: Tensor,
     head: SlotHead,
     *,
     prompt_reads_all: bool,
 ) -> tuple[Tensor, Tensor]:
-    """As `SlotWriter`, on an empty cache; and (B,) bool, whether all choices are from finite logits."""
+    """Choose as `SlotWriter`, on an empty cache; and (B,) bool: were all choices from finite logits?"""
     last_B1 = prompt.mask.sum(dim=1, keepdim=True) - 1
     columns_BL = text.columns_of(prompt.mask)
     if prompt.hidden is not None:
         text.hide(columns_BL, prompt.hidden)
     reach_BL = last_B1.expand_as(columns_BL) if prompt_reads_all else columns_BL
     hidden_BH = text(prompt.embeds, columns_BL, reach_BL)[:, -1]
-    steps = [(step, slot) for step in range(num_steps) for slot in slots]
-    chosen = [likeliest(head.logits(hidden_BH, *steps[0]))]
-    passes = text.singly(last_B1 + torch.arange(1, len(steps), device=last_B1.device))
-    for columns, (_, before), place in zip(passes, steps[:-1], steps[1:], strict=True):
+    chosen = [likeliest(head.logits(hidden_BH, *places[0]))]
+    passes = text.singly(last_B1 + torch.arange(1, len(places), device=last_B1.device))
+    for columns, (_, before), place in zip(passes, places[:-1], places[1:], strict=True):
         embeds_BH = embedding(chosen[-1][0], embeds_CH[before])
         hidden_BH = text.read(embeds_BH[:, None], columns)[:, 0]
         chosen.append(likeliest(head.logits(hidden_BH, *place)))
@@ -197,34 +202,34 @@ def choose(
 def repeat(
     text: CachedText,
     length: int,
-    slots: list[slice],
-    num_slots: int,
-    step_1G: Tensor,
+    places: list[tuple[int, slice]],
+    num_kinds: int,
+    first_1S: Tensor,
     embeds_CH: Tensor,
     head: SlotHead,
 ) -> tuple[Tensor, int]:
-    """(1, S) the same as one choice a pass, after a prompt of this length and the first step; and the passes.
+    """(1, S) the same as one choice a pass, after a prompt of this length; and the passes.
+
+    ``first_1S``: what is chosen up to the end of the first step, which has ``num_kinds`` slots.
 
     A pass reads the choice made last and guesses that go on as the step before. As far as guesses are the
     likeliest choices they are right, and so is the first choice that differs from its guess.
     """
-    num_kinds = len(slots)
-    chosen: list[int] = step_1G[0].tolist()
+    chosen: list[int] = first_1S[0].tolist()
     num_tokens, num_passes = 1, 0
-    while len(chosen) < num_slots:
+    while len(chosen) < len(places):
         num_passes += 1
-        indices = range(len(chosen), len(chosen) + num_tokens)
-        places = [(index // num_kinds, slots[index % num_kinds]) for index in indices]
+        asked = places[len(chosen) : len(chosen) + num_tokens]
         guesses = [chosen[ahead % num_kinds - num_kinds] for ahead in range(num_tokens)]
-        read = [chosen[-1] + slots[(len(chosen) - 1) % num_kinds].start]
-        read += [guess + slot.start for guess, (_, slot) in zip(guesses[:-1], places, strict=False)]
-        column_K = torch.arange(num_tokens, device=step_1G.device) + length + len(chosen) - 1
+        read = [chosen[-1] + places[len(chosen) - 1][1].start]
+        read += [guess + slot.start for guess, (_, slot) in zip(guesses[:-1], asked, strict=False)]
+        column_K = torch.arange(num_tokens, device=first_1S.device) + length + len(chosen) - 1
         (hidden_KH,) = text(embeds_CH[read][None], column_K[None])
-        logits = head.logits_of_tokens(hidden_KH, places)
+        logits = head.logits_of_tokens(hidden_KH, asked)
         require_finite_answers(torch.cat(logits, dim=-1).isfinite().all()[None])
         picks = [int(of_slot.argmax()) for of_slot in logits]
         # one that was not read may be right, too: it says how many to read in the next pass
         num_right = sum(accumulate(map(eq, picks, guesses), and_))
         chosen += picks[: num_right + 1]
-        num_tokens = min(MAX_GUESSES, 1 + 2 * num_right, num_slots - len(chosen))
-    return step_1G.new_tensor([chosen]), num_passes
+        num_tokens = min(MAX_GUESSES, 1 + 2 * num_right, len(places) - len(chosen))
+    return first_1S.new_tensor([chosen]), num_passes

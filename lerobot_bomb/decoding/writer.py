@@ -1,4 +1,4 @@
-"""What a policy asks for numbers: the decoder that suits the device.
+"""Writer of numbers for a policy: the decoder that suits the device.
 
 Shapes: `B` batch, `L` tokens of a prompt, `H` hidden size, `S` symbols.
 """

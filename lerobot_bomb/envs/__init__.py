@@ -1,1 +1,1 @@
-"""What every environment of ours shares; light, as simulator processes import it."""
+"""Parts that all our environments share; light, as simulator processes import it."""

@@ -1,4 +1,4 @@
-"""What our environments do alike: episodes from seeds, steps after the end, a line of results at the end.
+"""Base of our environments: episodes from seeds, steps after the end, a record of results at the end.
 
 Simulator workers import this module, so it imports neither torch nor LeRobot.
 """
@@ -94,7 +94,7 @@ class EpisodeEnv[SpecT: Any, RunT, ResultT: ResultLine](gymnasium.Env[Observatio
         return self._draw_for_people(run)
 
     def episode_result(self) -> ResultT:
-        """What became of the episode that has just ended."""
+        """Return the result of the episode that has just ended."""
         if self._last_transition is None:
             raise ResetNeeded("the episode has not ended yet")
         j2, j3 = self._smoothness()
@@ -132,7 +132,7 @@ class EpisodeEnv[SpecT: Any, RunT, ResultT: ResultLine](gymnasium.Env[Observatio
         """Start the spec's episode as `_current_run`; its first observation and info."""
 
     def _check(self, action: np.ndarray) -> np.ndarray:
-        """(D,) floats, a copy that the caller can no longer change; a ValueError if they are no action."""
+        """Return a copy of an action (D,) as floats; raise a ValueError if it is no action."""
         space, given = self.action_space, np.array(action)
         if given.shape != space.shape:
             raise ValueError(f"action has shape {given.shape}, expected {space.shape}")
@@ -154,7 +154,7 @@ class EpisodeEnv[SpecT: Any, RunT, ResultT: ResultLine](gymnasium.Env[Observatio
 
     @abstractmethod
     def _result(self, run: RunT) -> ResultT:
-        """Of an episode that has ended."""
+        """Return the result of an episode that has ended."""
 
 
 def _whole(seed: Any) -> int:

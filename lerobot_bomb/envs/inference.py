@@ -1,4 +1,4 @@
-"""How long a policy takes to answer: measured in its process, written on the lines of its episodes.
+"""Latency of a policy: measured in its process, written to the records of its episodes.
 
 Simulator workers import this module, so it imports neither torch nor LeRobot.
 """
@@ -37,7 +37,7 @@ class Inference:
 
     @classmethod
     def of(cls, queries: Sequence[Query]) -> "Inference | None":
-        """None of no queries: a policy without a network, or one that was not measured."""
+        """Summarise the queries; None without any: the policy has no network, or was not measured."""
         if not queries:
             return None
         seconds = np.array([query.seconds for query in queries])

@@ -1,4 +1,4 @@
-"""What became of an episode of `bomb_libero`: a line of a results file. As light as `results`."""
+"""Result of an episode of `bomb_libero`: a record of a results file. As light as `results`."""
 
 from dataclasses import dataclass, field
 from functools import partial
@@ -19,7 +19,7 @@ SIMULATOR = ("mujoco", "robosuite", "hf-libero", "numpy")
 
 @dataclass(frozen=True)
 class LiberoResult(ResultLine):
-    """Outcome of one episode; one JSON line in a results file."""
+    """Outcome of one episode; one record in a results file."""
 
     spec: LiberoSpec
     instruction: str

@@ -1,4 +1,4 @@
-"""What an environment's perturbation axes are to an episode: a frozen transform for each that is on."""
+"""Perturbation axes in an episode: a frozen transform for each axis that is on."""
 
 from abc import ABC, abstractmethod
 from collections.abc import Mapping
@@ -13,7 +13,7 @@ from lerobot_bomb.envs.photometric import Photometric
 
 
 class EpisodeTransform(ABC):
-    """What one axis does to an episode; a method that it does not override leaves things as they are.
+    """Effect of one axis on an episode; a method that it does not override leaves things as they are.
 
     The level sets how far it goes, the random generator only where to, so that the same seed at a higher
     level goes further the same way. An environment's own base adds what its axes change in the simulator.
@@ -22,7 +22,7 @@ class EpisodeTransform(ABC):
     @classmethod
     @abstractmethod
     def draw(cls, level: int, rng: np.random.Generator, nominal: Any) -> Self:
-        """At a level of 1..5; `nominal` is the episode without perturbations."""
+        """Draw the effect of a level of 1..5; `nominal` is the episode without perturbations."""
 
     def reword(self, instruction: str, nominal: Any) -> str:
         """The instruction after the change; it means the same."""

@@ -1,4 +1,4 @@
-"""What became of an episode of `bomb_pusht`: a line of a results file. As light as `results`."""
+"""Result of an episode of `bomb_pusht`: a record of a results file. As light as `results`."""
 
 from dataclasses import dataclass, field
 from functools import partial
@@ -19,7 +19,7 @@ SIMULATOR = ("gym-pusht", "pymunk", "pygame", "opencv-python-headless")
 
 @dataclass(frozen=True)
 class PushTResult(ResultLine):
-    """Outcome of one episode; one JSON line in a results file."""
+    """Outcome of one episode; one record in a results file."""
 
     spec: PushTSpec
     instruction: str

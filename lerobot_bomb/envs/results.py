@@ -1,4 +1,4 @@
-"""What became of an episode and where that comes from: a line of a results file.
+"""Result of an episode and where it comes from: a record of a results file.
 
 Simulator workers import this module, so it imports neither torch nor LeRobot.
 """
@@ -14,7 +14,7 @@ from pathlib import Path
 from typing import Any
 
 from lerobot_bomb import __version__
-from lerobot_bomb.bomb.episode import PROTOCOL_VERSION, TASK_VERSION, EpisodeSpec
+from lerobot_bomb.bomb.episode import PROTOCOL_VERSION, EpisodeSpec
 from lerobot_bomb.bomb.observation import DEFAULT_IMAGE_SIZE, RenderOptions
 from lerobot_bomb.envs.inference import Inference
 from lerobot_bomb.files import append_line, check_appendable
@@ -22,7 +22,7 @@ from lerobot_bomb.files import append_line, check_appendable
 
 @cache
 def installed_version(distribution: str) -> str | None:
-    """Of a Python package; None where it has no metadata."""
+    """Return the version of a Python package; None where it has no metadata."""
     try:
         return version(distribution)
     except PackageNotFoundError:
@@ -49,7 +49,7 @@ def machine_name() -> str:
 
 @dataclass(frozen=True)
 class PolicyIdentity:
-    """Which policy acted. One without weights, or built from its config alone, has a type only."""
+    """Policy that acted. One without weights, or built from its config alone, has a type only."""
 
     type: str
     path: str | None = None  # the checkpoint's folder as it was given, or USER/NAME on the Hub
@@ -78,7 +78,7 @@ type Row = dict[str, Any]  # a line read back: the fields of a ResultLine
 
 @dataclass(frozen=True, kw_only=True)
 class ResultLine:
-    """What became of an episode; the fields of its dataclass are the keys of its line."""
+    """Result of an episode; the fields of its dataclass are the keys of its record."""
 
     # mean differences of the executed actions, per step and without the gripper; None: fewer than four
     action_j2: float | None = None
@@ -86,7 +86,7 @@ class ResultLine:
     inference: Inference | None = None  # None: no network was asked, or it was not measured
 
     def to_json(self) -> str:
-        """One line of JSON, keys in the order of the fields, those that all environments share at the end.
+        """Return the record, a line of JSON: keys in the order of the fields, those of all environments last.
 
         Raises:
             ValueError: a number is not finite.
@@ -98,7 +98,7 @@ class ResultLine:
 
 @dataclass(frozen=True)
 class EpisodeResult(ResultLine):
-    """Outcome of one episode; one JSON line in a results file.
+    """Outcome of one episode; one record in a results file.
 
     `target`, `color` are the episode's; what was asked for is in `spec`, where None means drawn.
     """
@@ -130,17 +130,17 @@ class EpisodeResult(ResultLine):
     lerobot_version: str | None = field(default_factory=partial(installed_version, "lerobot"))
     torch_version: str | None = field(default_factory=partial(installed_version, "torch"))
     package_version: str = __version__
-    task_version: str = TASK_VERSION
+    task_version: str = field(kw_only=True)  # of the suite
     protocol_version: str = PROTOCOL_VERSION
 
 
 def without_measured(row: Row) -> Row:
-    """What is the same of an episode that is played again."""
+    """Return the fields of a record that stay the same when its episode is run again."""
     return {name: value for name, value in row.items() if name not in MEASURED}
 
 
 def check_results_path(path: str | None) -> None:
-    """Raise a ValueError unless lines can be appended to the file of `--env.results_path`."""
+    """Raise a ValueError unless records can be appended to the file of `--env.results_path`."""
     if path is None:
         return
     try:

@@ -1,4 +1,4 @@
-"""One episode, step by step, played by whatever acts. It imports neither torch nor LeRobot."""
+"""One episode, step by step, by whatever acts. It imports neither torch nor LeRobot."""
 
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
@@ -31,7 +31,7 @@ type Expert = Callable[[PrivilegedState], np.ndarray]
 
 @dataclass(frozen=True)
 class Moment:
-    """What is seen before a step, and what is then done; an episode of T steps has T + 1 moments."""
+    """Observation before a step, and the action that follows; an episode of T steps has T + 1 moments."""
 
     step: int
     instruction: str
@@ -72,7 +72,7 @@ def play(
     agent: Agent,
     disturb: Callable[[np.ndarray], np.ndarray] | None = None,
 ) -> Iterator[Moment]:
-    """Play a spec's episode in an `env` of that spec; while a moment is looked at, `env` is in it.
+    """Run a spec's episode in an `env` of that spec; while a moment is looked at, `env` is in it.
 
     What is executed is the agent's action as `disturb` changes it. The last moment is what the last action
     led to, which lerobot-eval's videos cut off.
@@ -93,10 +93,10 @@ def play(
 def one_of_batch(
     agent: BatchAgent, make_env: Callable[[], gymnasium.Env], seed: int, row: int, size: int
 ) -> Iterator[Agent]:
-    """Who acts in the episode of a seed, and at once in the others of its batch, whose seeds stand around it.
+    """Yield the agent of one seed, which acts at once in the other episodes of its batch, of nearby seeds.
 
     lerobot-eval plays consecutive seeds as a batch, in which a policy's arithmetic rounds otherwise than
-    alone. The other episodes are played here, unseen.
+    alone. The other episodes run here, unseen.
     """
     others = {i: FreezeAfterEnd(make_env()) for i in range(size) if i != row}
     seen = {i: env.reset(seed=seed - row + i)[0] for i, env in others.items()}

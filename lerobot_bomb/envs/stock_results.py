@@ -1,4 +1,4 @@
-"""What became of an episode of LeRobot's own `pusht` and `libero`: a line of a results file.
+"""Result of an episode of LeRobot's own `pusht` and `libero`: a record of a results file.
 
 lerobot-eval itself tells little of it.
 """
@@ -17,7 +17,7 @@ FAILED = "failed"  # the only class: why is not known
 
 @dataclass(frozen=True)
 class StockSpec:
-    """Which episode of an evaluation it was."""
+    """Episode of an evaluation, as far as LeRobot tells which one it was."""
 
     seed: int
     suite: str  # what LeRobot calls a group of tasks
@@ -28,7 +28,7 @@ class StockSpec:
 
 @dataclass(frozen=True)
 class StockResult(ResultLine):
-    """Outcome of one episode; one JSON line in a results file."""
+    """Outcome of one episode; one record in a results file."""
 
     spec: StockSpec
     sum_reward: float

@@ -1,1 +1,1 @@
-"""From episode results to rates with intervals."""
+"""Evaluation: from episode results to rates with intervals."""

@@ -1,4 +1,4 @@
-"""Lines of `bomb` in a results file: what each must say, whichever protocol wrote it, and what all say."""
+"""Records of `bomb` in a results file: what each must say, whichever protocol wrote it, and what all say."""
 
 from collections.abc import Mapping
 from statistics import mean, median
@@ -7,9 +7,10 @@ from typing import Any
 import numpy as np
 
 from lerobot_bomb.bomb.board import BOARD, COLORS, task_id
-from lerobot_bomb.bomb.episode import PROTOCOL_VERSION, TASK_VERSION, EpisodeSpec, Failure, Stage
+from lerobot_bomb.bomb.episode import PROTOCOL_VERSION, EpisodeSpec, Failure, Stage
 from lerobot_bomb.bomb.observation import CAMERAS, MAX_IMAGE_SIZE, MIN_IMAGE_SIZE, RENDER_PRESETS
 from lerobot_bomb.bomb.perturbations import Condition
+from lerobot_bomb.bomb.suite import FIRST_VERSION, find_suite
 from lerobot_bomb.bomb.suites import SUITES
 from lerobot_bomb.bootstrap import bca_interval, format_bounds, sums_by
 from lerobot_bomb.conditions import ALL
@@ -37,6 +38,7 @@ from lerobot_bomb.evaluation.result_kind import (
     describe_numbers,
     json_list,
 )
+from lerobot_bomb.flags import one_of
 
 OLD_VERSION = "1.0"  # whose lines say less
 NUM_TASKS = len(COLORS) * BOARD.num_lines**2
@@ -45,12 +47,12 @@ PUT_DOWN = (None, Failure.WRONG_INTERSECTION, Failure.IMPRECISE, Failure.DISTURB
 
 
 def put_down(rows: list[Row]) -> list[Row]:
-    """Those in which the stone was carried and put down on the board."""
+    """Return the records in which the stone was carried and put down on the board."""
     return [row for row in rows if row["failure"] in PUT_DOWN]
 
 
 def is_grounded(row: Row) -> bool:
-    """Whether the stone, put down on the board, lies nearest to the intersection that was named."""
+    """Return True if the stone, put down on the board, lies nearest to the intersection that was named."""
     return row["nearest_intersection"] == row["target"]
 
 
@@ -127,12 +129,12 @@ NEW_CHECKS: dict[str, Check] = {  # of what protocol 1.1 added
     "task_ids": or_none(is_list_of(is_int(0, NUM_TASKS - 1))),
     "lerobot_version": or_none(is_text),
     "torch_version": or_none(is_text),
-    "task_version": is_one_of((TASK_VERSION,)),
+    "task_version": is_text,
 }
 
 
 def median_error_mm(rows: list[Row]) -> float | None:
-    """Of the stones that were put down on the board; None: there are none."""
+    """Return the median error of the stones that were put down on the board; None: there are none."""
     errors = [row["placement_error_mm"] for row in rows if row["failure"] in PUT_DOWN]
     return median(errors) if errors else None
 
@@ -156,13 +158,13 @@ def _error_change(pairs: list[Pair]) -> str:
 
 
 def _progress(rows: list[Row]) -> str:
-    """Of suites whose episodes have several moves."""
+    """Return the mean progress of episodes of several moves, as text."""
     shares = [row["progress"] for row in rows if row["target"] is None]
     return f"{100 * mean(shares):.1f} %" if shares else NO_VALUE
 
 
 def spec_of(row: Row) -> EpisodeSpec:
-    """Of a line's episode.
+    """Rebuild the EpisodeSpec of a record.
 
     Raises:
         ValueError: there can be no such episode.
@@ -171,9 +173,16 @@ def spec_of(row: Row) -> EpisodeSpec:
     return EpisodeSpec(**row["spec"] | {"target": target and tuple(target)})
 
 
+def task_version_of(row: Row) -> str:
+    """Return the task version of a record's suite; records of protocol 1.0 name none."""
+    return row.get("task_version", FIRST_VERSION)
+
+
 def _check_episode(row: Row) -> None:
     spec_of(row)
     spec = row["spec"]
+    versions = dict.fromkeys((FIRST_VERSION, find_suite(spec["suite"]).version))
+    one_of(f"task_version of suite {spec['suite']}", task_version_of(row), tuple(versions))
     for name in ("target", "color"):
         if spec[name] not in (None, row[name]):
             raise ValueError(f"{name}={row[name]}, but spec.{name}={spec[name]}")
@@ -187,6 +196,7 @@ def _settings(row: Row) -> dict[str, str]:
         "OpenGL": ", ".join(opengl) or NOT_RECORDED,
         "render_preset": row.get("render_preset", NOT_RECORDED),
         "tasks": _tasks_key(row),
+        "task_version": task_version_of(row),
     }
 
 
@@ -218,19 +228,19 @@ def _describe_tasks(rows: list[Row]) -> str:
 
 
 def environment_of_episode(row: Row) -> Environment:
-    """That an episode was played in; of its depth and tasks nothing is said."""
+    """Return the environment of a record's episode, without depth and tasks, which no record holds."""
     spec = row["spec"]
     return Environment(
         **{name: spec[name] for name in ("robot", "control_mode", "fps")},
         image_size=row["image_size"],
         cameras=CAMERAS,
-        task_version=row.get("task_version", OLD_VERSION),
+        task_version=task_version_of(row),
         task=spec["suite"],
     )
 
 
 def eval_flags_of(rows: list[Row]) -> list[str]:
-    """Of lerobot-eval, for the environment and the tasks that an evaluation was of."""
+    """Return lerobot-eval's flags for the environment and the tasks of an evaluation."""
     return [*environment_of_episode(rows[0]).eval_flags(), *_task_flags([row["spec"] for row in rows])]
 
 
@@ -253,7 +263,7 @@ BOMB_LINES = ResultKind(
     settings=_settings,
     describe_simulator=_describe_simulator,
     describe_tasks=_describe_tasks,
-    benchmark=f"BOMB, task version {TASK_VERSION}",
+    benchmark=lambda row: f"BOMB, task version {task_version_of(row)}",
     environment=environment_of_episode,
     eval_flags=eval_flags_of,
     describe_change=_error_change,

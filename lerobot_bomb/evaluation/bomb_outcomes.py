@@ -1,4 +1,4 @@
-"""Which outcomes of an episode of `bomb` there can be: its fields say the same thing several times."""
+"""Outcomes that an episode of `bomb` can have: its fields say the same thing several times."""
 
 from lerobot_bomb.bomb.board import BOARD, task_id
 from lerobot_bomb.bomb.episode import Failure, Stage
@@ -30,7 +30,7 @@ def check_outcome(row: Row) -> None:
 
 
 def _check_place(row: Row) -> None:
-    """Where the stone lies; nothing is known of it where there is not one move to one intersection."""
+    """Check where the stone lies; nothing is known of it unless there is one move to one intersection."""
     if row["target"] is None:
         refuse_if(row["is_success_bomb_v0"], row, "is_success_bomb_v0", "target")
         return
@@ -46,7 +46,7 @@ def _check_place(row: Row) -> None:
 
 
 def _check_tasks(row: Row) -> None:
-    """The number of the task, which lines of earlier releases do not have."""
+    """Check the number of the task, which records of earlier releases do not have."""
     if "task_id" not in row:
         return
     spec = row["spec"]

@@ -1,4 +1,4 @@
-"""Two policies on the same episodes: which is better, by how much, and is it certain?"""
+"""Comparison of two policies on the same episodes: which is better, by how much, and is it certain?"""
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
@@ -24,7 +24,7 @@ type Values = dict[str, set[str]]  # of settings
 
 @dataclass(frozen=True)
 class Comparisons:
-    """All that two sets of episodes have in common."""
+    """Comparison of two sets of episodes, condition by condition."""
 
     policies: tuple[str, str]
     conditions: list[PairedComparison]
@@ -73,7 +73,7 @@ def _lines(of: PairedComparison) -> list[str]:
 
 
 def of_policies(rows: list[Row], names: Sequence[str]) -> list[list[Row]]:
-    """Apart by policy, those of each name; no name: of all, in the order of their first lines.
+    """Split records by policy: those of each name, or of all without a name, in order of first appearance.
 
     A policy answers to its type, its path, `bomb:NAME`, or any part of what `results` says of it.
 
@@ -99,7 +99,7 @@ def of_policies(rows: list[Row], names: Sequence[str]) -> list[list[Row]]:
 
 
 def can_compare(first: Group, second: Group) -> bool:
-    """Whether two groups differ in nothing but their policies, as far as their lines say."""
+    """Return True if two groups differ in nothing but their policies, as far as their records say."""
     return not _apart(_values_of([first]), _values_of([second]))
 
 

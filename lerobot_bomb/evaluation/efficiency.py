@@ -1,4 +1,4 @@
-"""How fast a policy answers and how smoothly it moves, in lines of results that say so."""
+"""Latency and smoothness of a policy, from records of results that hold them."""
 
 from dataclasses import dataclass
 from statistics import median
@@ -12,7 +12,7 @@ from lerobot_bomb.evaluation.result_groups import starts_of
 
 @dataclass(frozen=True)
 class Efficiency:
-    """Of episodes of one policy that were played in batches of one size, on one device."""
+    """Efficiency in episodes of one policy that were run in batches of one size, on one device."""
 
     device: str
     batch_size: int | None  # episodes that a query answers at once; None: not recorded
@@ -27,7 +27,7 @@ class Efficiency:
 
 
 def efficiencies(rows: list[Row]) -> list[Efficiency]:
-    """Of the rows that were measured, by device and size of the batch."""
+    """Measure the efficiency of the records that hold it, by device and size of the batch."""
     groups: dict[tuple[str, int | None], list[Row]] = {}
     for row in rows:
         if row.get("inference") is not None:

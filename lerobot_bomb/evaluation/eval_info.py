@@ -38,8 +38,8 @@ def results_of(
         env: the environment's flags.
         policy: who acted.
         seed: of the first episode.
-        batch_size: episodes that were played at once.
-        first: number of the first episode, where it was played alone out of a longer evaluation.
+        batch_size: episodes that were run at once.
+        first: number of the first episode, where it was run alone out of a longer evaluation.
 
     Raises:
         ValueError: an episode's rewards are not finite: its actions or the simulation were not.

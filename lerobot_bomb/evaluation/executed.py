@@ -11,7 +11,7 @@ import numpy as np
 from lerobot.datasets import LeRobotDatasetMetadata
 from lerobot.utils.constants import ACTION
 
-from lerobot_bomb.data.columns import EPISODE_INDEX, read_columns, read_meta
+from lerobot_bomb.data.columns import EPISODE_INDEX, read_columns, read_meta, require_motion
 from lerobot_bomb.files import append_line
 
 
@@ -41,7 +41,7 @@ class Executed:
 
 
 def read_executed(path: Path) -> Executed:
-    """Of a file of ``lerobot-bomb eval`` or of a LeRobotDataset's folder.
+    """Read a file of ``lerobot-bomb eval`` or a LeRobotDataset's folder.
 
     Raises:
         ValueError: it is neither, or holds no whole episodes.
@@ -56,9 +56,10 @@ def read_executed(path: Path) -> Executed:
 
 
 def executed_in_dataset(meta: LeRobotDatasetMetadata, name: str) -> Executed:
-    """All recorded actions, each episode under its number."""
+    """Read all recorded actions, each episode under its number."""
     if ACTION not in meta.features:
         raise ValueError(f"dataset {name} has no {ACTION!r}; it has {sorted(meta.features)}")
+    require_motion(meta, "how smoothly they move is not defined")
     columns = read_columns(meta, (ACTION,))
     numbers, starts = np.unique(columns[EPISODE_INDEX], return_index=True)
     of_episodes = np.split(columns[ACTION], starts[1:])

@@ -1,4 +1,4 @@
-"""Lines of `bomb_libero` in a results file: what each must say, and what they say together."""
+"""Records of `bomb_libero` in a results file: what each must say, and what they say together."""
 
 from lerobot_bomb.envs.results import Row
 from lerobot_bomb.evaluation.line_checks import (
@@ -92,7 +92,7 @@ LIBERO_LINES = ResultKind(
         f"{settings['control_mode']} control, {settings['fps']} Hz, {settings['simulator']}"
     ),
     describe_tasks=_describe_tasks,
-    benchmark=f"LIBERO with BOMB's axes, protocol {LIBERO_PROTOCOL_VERSION}",
+    benchmark=lambda _: f"LIBERO with BOMB's axes, protocol {LIBERO_PROTOCOL_VERSION}",
     environment=lambda row: None,
     eval_flags=_eval_flags,
     measures=(),

@@ -1,4 +1,4 @@
-"""What a field of a results file's line can be."""
+"""Checks of the fields of a record."""
 
 import json
 import math
@@ -15,68 +15,68 @@ type Check = Callable[[Any], bool]
 
 
 def is_int(low: int, high: float = math.inf) -> Check:
-    """Whether a value is a whole number in low..high; true and false are none."""
+    """Return a check for a whole number in low..high; true and false are none."""
     return lambda value: type(value) is int and low <= value <= high
 
 
 def is_bool(value: Any) -> bool:
-    """Whether a value is true or false."""
+    """Return True for true and false."""
     return type(value) is bool
 
 
 def is_text(value: Any) -> bool:
-    """Whether a value is a text."""
+    """Return True for a text."""
     return isinstance(value, str)
 
 
 def is_number(value: Any) -> bool:
-    """Whether a value is a finite number."""
+    """Return True for a finite number."""
     return type(value) in (int, float) and math.isfinite(value)
 
 
 def is_quantity(value: Any) -> bool:
-    """Whether a value is a finite number, not negative."""
+    """Return True for a finite number that is not negative."""
     return is_number(value) and value >= 0
 
 
 def is_positive(value: Any) -> bool:
-    """Whether a value is a finite number above 0."""
+    """Return True for a finite number above 0."""
     return is_quantity(value) and value > 0
 
 
 def is_share(value: Any) -> bool:
-    """Whether a value is a number in 0..1."""
+    """Return True for a number in 0..1."""
     return is_quantity(value) and value <= 1
 
 
 def or_none(check: Check) -> Check:
-    """Whether a value is null or passes."""
+    """Return a check for null or a value that passes."""
     return lambda value: value is None or check(value)
 
 
 def is_list_of(check: Check) -> Check:
-    """Whether a value is a list, not empty, of values that pass."""
+    """Return a check for a list, not empty, of values that pass."""
     return lambda value: isinstance(value, list) and bool(value) and all(map(check, value))
 
 
 def is_table_of(check: Check) -> Check:
-    """Whether a value is an object whose values pass."""
+    """Return a check for an object whose values pass."""
     return lambda value: isinstance(value, dict) and all(map(check, value.values()))
 
 
 def is_one_of(values: Any) -> Check:
-    """Whether a value is one of these texts."""
+    """Return a check for one of these texts."""
     allowed = frozenset(map(str, values))
     return lambda value: isinstance(value, str) and value in allowed
 
 
 def is_sha256(value: Any) -> bool:
-    """Whether a value is 64 hexadecimal digits."""
+    """Return True for a text of 64 hexadecimal digits."""
     return isinstance(value, str) and re.fullmatch("[0-9a-f]{64}", value) is not None
 
 
 def is_object_of(checks: Mapping[str, Check]) -> Check:
-    """Whether a value is an object with these keys, of which each passes; others are not looked at."""
+    """Return a check for an object with these keys, each of which passes; others are not looked at."""
 
     def is_possible(value: Any) -> bool:
         has_all = isinstance(value, dict) and checks.keys() <= value.keys()
@@ -117,7 +117,7 @@ RUN_CHECKS: dict[str, Check] = {
 
 
 def check_levels(row: Mapping[str, Any], condition: type[AxisCondition]) -> None:
-    """Raise a ValueError unless a line's levels can be those of its condition."""
+    """Raise a ValueError unless a record's levels can be those of its condition."""
     asked = {axis: (low, high) for axis, low, high in condition.parse(row["spec"]["perturbations"]).ranges}
     levels = {axis: row["levels"].get(axis, 0) for axis in (*row["levels"], *asked)}
     off = (0, 0)  # of an axis that is not in the condition

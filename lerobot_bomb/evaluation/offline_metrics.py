@@ -58,7 +58,7 @@ def measure_columns(
 
 
 def evenly_spaced(rows_N: np.ndarray, max_rows: int) -> np.ndarray:
-    """At most ``max_rows`` of the rows, from the first to the last; 0 means all."""
+    """Return at most ``max_rows`` of the rows, from the first to the last; 0 means all."""
     if max_rows == 0 or len(rows_N) <= max_rows:
         return rows_N
     return rows_N[np.linspace(0, len(rows_N) - 1, max_rows).round().astype(int)]

@@ -43,7 +43,7 @@ class PairedComparison:
         return len(set(starts_of([first for first, _ in self.pairs])))
 
     def describe_change(self) -> str:
-        """What the second rows have beside other successes, as text; '' where there is nothing to say."""
+        """Describe what the second records have beside other successes; '' where there is nothing to say."""
         describe = kind_of(self.pairs[0][0]).describe_change
         return describe(self.pairs) if describe else ""
 

@@ -1,4 +1,4 @@
-"""What a policy says about recorded frames: its losses, and the actions that it decodes.
+"""Predictions of a policy on recorded frames: its losses, and the actions that it decodes.
 
 Shapes: `R` frames, `B` of them in a batch, `T` actions of a chunk, `D` action dims.
 """
@@ -25,7 +25,7 @@ LOSS = "loss"
 
 @dataclass(frozen=True)
 class Predictions:
-    """What a policy says about R frames."""
+    """Predictions of a policy on R frames."""
 
     losses: dict[str, np.ndarray]  # {name: (R,)}, NaN where a frame has none
     chunks: np.ndarray  # (R, T, D) decoded actions in the dataset's units
@@ -75,7 +75,7 @@ def load_policy(config: PreTrainedConfig) -> PreTrainedPolicy:
 def load_dataset(
     config: PreTrainedConfig, meta: LeRobotDatasetMetadata, episodes: list[int]
 ) -> LeRobotDataset:
-    """Some episodes, each frame with the actions that follow it, as lerobot-train reads them."""
+    """Load some episodes, each frame with the actions that follow it, as lerobot-train reads them."""
     return LeRobotDataset(
         meta.repo_id,
         root=meta.root,

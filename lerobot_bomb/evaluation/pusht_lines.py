@@ -1,4 +1,4 @@
-"""Lines of `bomb_pusht` in a results file: what each must say, and what they say together."""
+"""Records of `bomb_pusht` in a results file: what each must say, and what they say together."""
 
 from functools import partial
 from typing import Any
@@ -40,12 +40,12 @@ from lerobot_bomb.pusht.perturbations import PushTCondition
 
 
 def is_share(value: Any) -> bool:
-    """Whether a value is a number in 0..1; rounding may take a covered area past the target's."""
+    """Return True for a number in 0..1; rounding may take a covered area past the target's."""
     return is_quantity(value) and value <= 1 + 1e-9
 
 
 def is_pose(value: Any) -> bool:
-    """Whether a value is [x, y, angle]."""
+    """Return True for [x, y, angle]."""
     return isinstance(value, list) and len(value) == 3 and all(map(is_number, value))
 
 
@@ -112,7 +112,7 @@ PUSHT_LINES = ResultKind(
     settings=_settings,
     describe_simulator=lambda settings: settings["simulator"],
     describe_tasks=lambda rows: "task pusht",
-    benchmark=f"PushT with BOMB's axes, protocol {PUSHT_PROTOCOL_VERSION}",
+    benchmark=lambda _: f"PushT with BOMB's axes, protocol {PUSHT_PROTOCOL_VERSION}",
     environment=lambda row: None,
     eval_flags=_eval_flags,
     measures=[

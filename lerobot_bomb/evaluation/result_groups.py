@@ -1,4 +1,4 @@
-"""Episodes that compare: which lines of a results file may be pooled and paired, and what they are of."""
+"""Episodes that compare: which records of a results file may be pooled and paired, and what they are of."""
 
 from collections import Counter
 from collections.abc import Callable
@@ -37,11 +37,11 @@ class Group:
 
     @property
     def missing_fields(self) -> list[str]:
-        """What its lines do not have, but those of the newest protocol do."""
+        """Fields of the newest protocol that the group's records do not have."""
         return self.kind.missing_fields(self.rows[0]["protocol_version"])
 
     def lines(self) -> list[str]:
-        """What was evaluated, a line each: who and what, on which machine, with what."""
+        """Describe what was evaluated, a line each: who and what, on which machine, with what."""
         first, kind = self.rows[0], self.kind
         asked = [f"{name}={value}" for name, value in _fixed(first).items()]
         conditions = {row["spec"]["perturbations"] for row in self.rows}
@@ -59,7 +59,7 @@ class Group:
 
 
 def groups_of(rows: list[Row]) -> list[Group]:
-    """Lines apart that must not be pooled or paired; of an episode that was run again, the last one."""
+    """Split records that must not be pooled or paired; of an episode that was run again, the last one."""
     episodes: dict[tuple[tuple[str, str], ...], dict[str, Row]] = {}
     counts = Counter[tuple[tuple[str, str], ...]]()
     for row in rows:
@@ -78,7 +78,7 @@ def episode_of(row: Row) -> str:
 
 
 def settings_of(row: Row) -> dict[str, str]:
-    """All that must be equal in episodes that are pooled or paired."""
+    """Return the settings that must be equal in episodes that are pooled or paired."""
     return {
         "policy": _policy_key(row),
         "protocol": row["protocol_version"],
@@ -124,17 +124,17 @@ def rate_of(rows: list[Row], is_counted: Callable[[Row], bool] = lambda row: row
 
 
 def count_pairs(pairs: list[Pair]) -> PairedCounts:
-    """How often which row of the pairs is a success."""
+    """Count the pairs by which of their records are successes."""
     return PairedCounts.of([a["is_success"] for a, _ in pairs], [b["is_success"] for _, b in pairs])
 
 
 def different_fields(row: Row, other: Row) -> list[str]:
-    """Names of what is not the same of two lines of one episode, of their `outcome`."""
+    """Return the names of the fields of `outcome` that differ between two records of one episode."""
     return [name for name, value in outcome(row).items() if value != other.get(name)]
 
 
 def outcome(row: Row) -> Row:
-    """What was asked and what became of it: not who played it, where, and how long that took."""
+    """Return what was asked and its outcome: not which policy ran it, where, and how long that took."""
     return {name: value for name, value in without_measured(row).items() if name not in ORIGIN}
 
 
@@ -157,13 +157,13 @@ def describe_policy(row: Row) -> str:
 
 
 def _fixed(row: Row) -> dict[str, Any]:
-    """What a row's spec fixes for all episodes that it is pooled with."""
+    """Return the fields that a record's spec fixes for all episodes that it is pooled with."""
     drawn = (*DRAWN, *kind_of(row).drawn)
     return {name: value for name, value in row["spec"].items() if name not in drawn}
 
 
 def _policy_key(row: Row) -> str:
-    """Equal for the same weights with the same settings, wherever they lie."""
+    """Return a key that is equal for the same weights with the same settings, wherever they lie."""
     policy: dict[str, Any] | None = row.get("policy")
     if policy is None:
         return NOT_RECORDED

@@ -1,4 +1,4 @@
-"""What lines of results of one environment are; how they are read and compared is the same for all."""
+"""Kinds of results, one for each environment; reading and comparing them is the same for all."""
 
 import json
 from collections.abc import Callable, Iterable, Mapping, Sequence
@@ -39,7 +39,7 @@ class Measure:
 
 @dataclass(frozen=True)
 class ResultKind:
-    """Lines of one environment: how they are known, what each must say, and what they say together."""
+    """Records of one environment: how they are known, what each must say, and what they say together."""
 
     env_type: str
     condition: type[AxisCondition]  # its perturbations
@@ -56,7 +56,7 @@ class ResultKind:
     # of these settings, what simulated and drew
     describe_simulator: Callable[[Mapping[str, str]], str]
     describe_tasks: Callable[[list[Row]], str]
-    benchmark: str  # for a model card, with its version
+    benchmark: Callable[[Row], str]  # for a model card, with its version
     # that an episode was played in; None: checkpoints of our types know of no such environment
     environment: Callable[[Row], Environment | None]
     eval_flags: Callable[[list[Row]], list[str]]  # of lerobot-eval, for the environment and tasks of episodes
@@ -76,13 +76,13 @@ class ResultKind:
     starts_by_number: bool = False
 
     def check(self, row: Row) -> None:
-        """Raise a ValueError that names a field of a line which is missing or impossible."""
+        """Raise a ValueError that names a field of a record which is missing or impossible."""
         of_later = {**self.added_fields, **SHARED_CHECKS}
         added = {name: check for name, check in of_later.items() if name in row}
         check_fields(row, {**self.fields[row["protocol_version"]], **added})
 
     def check_spec(self, row: Row) -> None:
-        """Raise a ValueError unless a line is of an episode that there can be."""
+        """Raise a ValueError unless a record is of an episode that there can be."""
         added = {name: check for name, check in self.added_spec_fields.items() if name in row["spec"]}
         check_fields(row["spec"], self.spec_fields | added, "spec.")
         refuse_others(row["spec"], self.spec_fields | added)
@@ -91,11 +91,11 @@ class ResultKind:
         check_inference(row)
 
     def start_of(self, row: Row) -> tuple[Any, ...]:
-        """Equal for rows that are not independent."""
+        """Return a key that is equal for rows that are not independent."""
         return tuple(row["spec"][name] for name in self.start)
 
     def missing_fields(self, version: str) -> list[str]:
-        """Of lines of the newest protocol, what those of another version do not have."""
+        """Return the fields that records of the newest protocol have and those of another version do not."""
         *_, newest = self.fields.values()
         return [name for name in newest if name not in self.fields[version]]
 

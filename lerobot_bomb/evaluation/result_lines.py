@@ -1,6 +1,7 @@
-"""Lines of results files, of whichever environment: read and checked."""
+"""Records of results files, of whichever environment: read and checked."""
 
 import json
+from collections.abc import Collection
 from pathlib import Path
 from typing import Any
 
@@ -48,8 +49,8 @@ def _check_batch(policy: dict[str, Any]) -> None:
         raise ValueError(f"policy.batch_row={number} is impossible with policy.batch_size={size}")
 
 
-def read_lines(path: Path) -> tuple[list[Row], list[str]]:
-    """The episodes of a results file in its order, and what is wrong with its other lines.
+def read_lines(path: Path) -> tuple[dict[int, Row], list[str]]:
+    """Return {line number, from 1: episode} of a results file, and what is wrong with its other lines.
 
     Raises:
         ValueError: there is no such file.
@@ -61,18 +62,19 @@ def read_lines(path: Path) -> tuple[list[Row], list[str]]:
         raise ValueError(
             f"{path}: no such results file; lerobot-eval writes it with --env.results_path={path}"
         )
-    rows, damages = [], []
+    rows: dict[int, Row] = {}
+    damages = []
     for number, line in enumerate(path.read_bytes().split(b"\n"), start=1):
         if not line.strip():
             continue
         try:
-            rows.append(parse_line(line))
+            rows[number] = parse_line(line)
         except (ValueError, RecursionError) as error:
             damages.append(f"{path}:{number}: not an episode result: {error}")
     return rows, damages
 
 
-def check_any(path: Path, rows: list[Row], damages: list[str]) -> None:
+def check_any(path: Path, rows: Collection[object], damages: list[str]) -> None:
     """Raise a ValueError unless there are rows of this file; damages: what is wrong with its other lines."""
     if not rows and damages:
         raise ValueError(f"{path} is no results file; name one that --env.results_path of lerobot-eval wrote")
@@ -84,7 +86,7 @@ def check_any(path: Path, rows: list[Row], damages: list[str]) -> None:
 
 
 def kind_of(row: Row) -> ResultKind:
-    """Of which environment a line is."""
+    """Return the kind of results that a record is of."""
     return KIND_OF_VERSION[row["protocol_version"]]
 
 

@@ -22,7 +22,7 @@ from lerobot_bomb.stats import Rate, format_p
 
 @dataclass(frozen=True)
 class Summary:
-    """What episodes of one environment come to."""
+    """Summary of episodes of one environment."""
 
     rate: Rate
     measures: dict[Measure, str]  # and their values
@@ -56,11 +56,11 @@ def read_results(path: Path) -> list[Row]:
     if damages:
         raise ValueError(damages[0])
     check_any(path, rows, damages)
-    return [row for group in groups_of(rows) for row in group.rows]
+    return [row for group in groups_of([*rows.values()]) for row in group.rows]
 
 
 def summarise(rows: list[Row]) -> Summary:
-    """What episodes of one environment come to."""
+    """Summarise episodes of one environment."""
     return Summary(
         rate=rate_of(rows),
         measures={measure: measure.value(rows) for measure in kind_of(rows[0]).measures},
@@ -78,7 +78,7 @@ def _pair_line(of: PairedComparison) -> str:
 
 
 def pair_lines(group: Group, groups: list[Group]) -> list[str]:
-    """What perturbations took away and brought in a group; or why there is nothing to compare with."""
+    """Describe how perturbations changed a group's successes, or why there is nothing to compare with."""
     perturbed = [row for row in group.rows if row["spec"]["perturbations"] != NONE]
     pairs = pair_with_nominal(group.rows)
     lines = list(map(_pair_line, compare_pairs(pairs)))

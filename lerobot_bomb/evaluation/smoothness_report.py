@@ -1,4 +1,4 @@
-"""How smoothly people and policies moved, side by side.
+"""Smoothness of people's and policies' motions, side by side.
 
 Shapes: `R` executed actions of all episodes, `D` action dims, `E` episodes.
 """
@@ -19,7 +19,7 @@ ORDERS = {"J2": 2, "J3": 3, "J2, normalised": 2, "J3, normalised": 3}  # of the 
 
 @dataclass(frozen=True)
 class Units:
-    """What everything that is compared is measured in."""
+    """Units in which everything that is compared is measured."""
 
     exclude: list[int]  # dims that do not count
     std: np.ndarray  # (D,) standard deviations, which are 1 in normalised units
@@ -39,14 +39,14 @@ class SmoothnessRow:
 
 @dataclass(frozen=True)
 class Difference:
-    """How much rougher an evaluation is than another one, on the episodes that both have."""
+    """Difference in smoothness between two evaluations, on the episodes that both have."""
 
     num_pairs: int
     measures: dict[str, Measure]
 
 
 def make_units(dataset: Executed, names: list[str], exclude: list[str] | None, per_second: bool) -> Units:
-    """Those of a dataset.
+    """Return the units of a dataset.
 
     Raises:
         ValueError: a name in `exclude` is unknown, no dim is left, or one of those left never changes.
@@ -88,7 +88,7 @@ def check_comparable(compared: list[Executed], per_second: bool) -> None:
 
 
 def measure_row(executed: Executed, units: Units) -> SmoothnessRow:
-    """Every difference within an episode counts the same.
+    """Measure the smoothness of a row; every difference within an episode counts the same.
 
     Raises:
         ValueError: no episode has the actions that a third difference takes.
@@ -125,7 +125,7 @@ def _measures(
 
 
 def measure_difference(first: str, second: str, rows: dict[str, SmoothnessRow]) -> Difference:
-    """The second one's means minus the first one's, episodes drawn as pairs, those of one seed together.
+    """Subtract the first row's means from the second's; pairs of episodes of one seed are drawn together.
 
     Raises:
         ValueError: they have no episode in common.

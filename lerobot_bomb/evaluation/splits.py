@@ -1,4 +1,4 @@
-"""Which episodes of a dataset a checkpoint was trained on, and which it is judged by."""
+"""Split of a dataset's episodes: those that a checkpoint was trained on, and those that judge it."""
 
 import math
 import re

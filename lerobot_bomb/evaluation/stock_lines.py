@@ -1,4 +1,4 @@
-"""Lines of LeRobot's own `pusht` and `libero` in a results file: what each must say, and what they say."""
+"""Records of LeRobot's own `pusht` and `libero` in a results file: what each must say, and what they say."""
 
 import json
 from collections.abc import Mapping
@@ -30,7 +30,7 @@ from lerobot_bomb.libero.assets import SUITES
 
 
 class NoCondition(AxisCondition):
-    """Of an environment without perturbation axes: `none` only."""
+    """Condition of an environment without perturbation axes: `none` only."""
 
     axes: ClassVar[Mapping[str, Axis]] = {}
 
@@ -97,7 +97,7 @@ def _stock_lines(env_type: str, tasks: tuple[str, ...], starts_by_number: bool) 
         settings=_settings,
         describe_simulator=lambda settings: settings["simulator"],
         describe_tasks=_describe_tasks,
-        benchmark=f"LeRobot's {env_type}",
+        benchmark=lambda _: f"LeRobot's {env_type}",
         environment=lambda row: None,
         eval_flags=partial(_eval_flags, env_type),
         measures=[

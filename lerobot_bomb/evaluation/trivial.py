@@ -9,7 +9,7 @@ import numpy as np
 from lerobot.datasets import LeRobotDatasetMetadata
 from lerobot.utils.constants import ACTION, OBS_STATE
 
-from lerobot_bomb.data.columns import EPISODE_INDEX, episode_bounds, read_columns
+from lerobot_bomb.data.columns import EPISODE_INDEX, episode_bounds, read_columns, require_motion
 
 HOLD, REPEAT, EXTRAPOLATE, MEAN = "hold", "repeat", "extrapolate", "mean"
 
@@ -27,7 +27,12 @@ class Demonstrations:
     def read(
         cls, meta: LeRobotDatasetMetadata, episodes: list[int], train_episodes: list[int]
     ) -> "Demonstrations":
-        """These episodes of a dataset; mean and range of all of them if none is a training episode."""
+        """Read these episodes; mean and range are of all of them if none is a training episode.
+
+        Raises:
+            ValueError: the dataset holds static scenes, which do not follow each other.
+        """
+        require_motion(meta, "a trivial predictor repeats the action before")
         shapes = [tuple(meta.features.get(key, {}).get("shape", ())) for key in (ACTION, OBS_STATE)]
         keys = [ACTION, OBS_STATE] if shapes[0] == shapes[1] else [ACTION]
         columns = read_columns(meta, keys, episodes)
@@ -39,7 +44,7 @@ class Demonstrations:
         )
 
     def recorded(self, rows_R: np.ndarray, chunk_size: int) -> tuple[np.ndarray, np.ndarray]:
-        """Recorded chunks (R, T, D), and which actions lie beyond their episode's end (R, T) bool.
+        """Return recorded chunks (R, T, D), and which actions lie beyond their episode's end (R, T) bool.
 
         Beyond it the last action is repeated, as LeRobot does.
         """

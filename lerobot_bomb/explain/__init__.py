@@ -1,1 +1,1 @@
-"""Why a policy does what it does."""
+"""Explanations: why a policy does what it does."""

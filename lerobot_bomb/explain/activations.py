@@ -1,4 +1,4 @@
-"""What a language model computes on the way: recorded, and put back into a pass over something else.
+"""Activations of a language model: recorded, and put back into a pass over something else.
 
 Shapes: `U` units, `N` rows of a pass, `L` tokens, `F` features.
 """
@@ -25,7 +25,7 @@ type Change = Callable[[Tensor], Tensor]
 
 @dataclass(frozen=True)
 class Unit:
-    """What is put back at once."""
+    """Part of a language model whose activations are put back at once."""
 
     layer: int
     part: str
@@ -53,7 +53,7 @@ def restoring(
     clean: Activations,
     units_of_rows: Sequence[Sequence[Unit]],
 ) -> Iterator[None]:
-    """In the passes of one score, put units of ``clean`` back into each row.
+    """Put units of ``clean`` back into each row, in the passes of one score.
 
     ``clean`` is of one row. A pass may have several rows for each of the score's, beside each other.
     """
@@ -120,22 +120,22 @@ def _hook(layer: DecoderLayer, part: str, change: Change) -> Any:
 
 
 def _on_first(change: Change, output: Any) -> Any:
-    """What a module gives may be states, or states and more."""
+    """Change what a module returns, which may be states, or a tuple of states and more."""
     if isinstance(output, tuple):
         return change(output[0]), *output[1:]
     return change(output)
 
 
 def all_layers(num_layers: int, place: Place | None = None) -> list[Unit]:
-    """Every layer's output, at a place."""
+    """Return every layer's output, at a place."""
     return [Unit(layer, LAYER, place=place) for layer in range(num_layers)]
 
 
 def all_heads(layers: Sequence[DecoderLayer]) -> list[Unit]:
-    """Every attention head, layer by layer."""
+    """Return every attention head, layer by layer."""
     return [Unit(i, HEADS, head) for i, layer in enumerate(layers) for head in range(layer.num_heads)]
 
 
 def all_mlps(num_layers: int) -> list[Unit]:
-    """Every MLP."""
+    """Return every MLP."""
     return [Unit(layer, MLP) for layer in range(num_layers)]

@@ -13,7 +13,7 @@ from lerobot_bomb.bootstrap import bootstrap_interval
 
 @dataclass(frozen=True)
 class Mean:
-    """Over episodes, with its bootstrap interval; one episode alone has none."""
+    """Mean over episodes, with its bootstrap interval; one episode alone has none."""
 
     value: float
     interval: tuple[float, float] | None
@@ -21,7 +21,7 @@ class Mean:
 
 
 def mean_of(values: Sequence[float]) -> Mean | None:
-    """Of the values that are numbers; None where there are none."""
+    """Average the values that are numbers; None where there are none."""
     sample = np.array([value for value in values if np.isfinite(value)])
     if not len(sample):
         return None
@@ -29,7 +29,7 @@ def mean_of(values: Sequence[float]) -> Mean | None:
 
 
 def means_of(effects: Sequence[Mapping[str, float]]) -> dict[str, Mean]:
-    """By name, of the episodes that have it."""
+    """Average each effect by name, over the episodes that have it."""
     names = list(dict.fromkeys(name for each in effects for name in each))
     found = {name: mean_of([each[name] for each in effects if name in each]) for name in names}
     return {name: mean for name, mean in found.items() if mean is not None}

@@ -1,7 +1,8 @@
-"""What an explanation of one moment says, in words: what the policy's answer depends on."""
+"""Diagnosis of one moment, in words: what the policy's answer depends on."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass
+from typing import Self
 
 from lerobot_bomb.explain.moment import ALL, Explanation, Restored, camera_name
 from lerobot_bomb.explain.restoration import smallest_drop
@@ -13,31 +14,29 @@ RESTORES = 0.5  # what a head alone must bring back to be named
 
 @dataclass(frozen=True)
 class Finding:
-    """A question and its answer: effects by name, the largest first; {} where there is none."""
+    """A question and its answer."""
 
     question: str
-    effects: Mapping[str, float]
-    is_weak: bool = False  # the largest is below a SHARE of what has the largest effect of all
+    answer: str
+    names: tuple[str, ...]  # what the answer names
 
-    @property
-    def names(self) -> tuple[str, ...]:
-        """What has an effect."""
-        return tuple(self.effects)
+    @classmethod
+    def of_effects(cls, question: str, effects: Mapping[str, float], *, is_weak: bool) -> Self:
+        """Name what has an effect, the largest first, with as many effects as one reads.
 
-    @property
-    def answer(self) -> str:
-        """The names with their effects, as many as one reads."""
-        shown = [f"{name} ({effect:.2g})" for name, effect in self.effects.items()]
+        ``is_weak``: the largest is below a SHARE of what has the largest effect of all.
+        """
+        shown = [f"{name} ({effect:.2g})" for name, effect in effects.items()]
         more = len(shown) - MAX_NAMES
         names = "; ".join(shown[:MAX_NAMES]) + (f" and {more} more" if more > 0 else "") or "nothing"
-        return f"weakly, {names}" if self.is_weak and shown else names
+        return cls(question, f"weakly, {names}" if is_weak and shown else names, tuple(effects))
 
     def __str__(self) -> str:
         return f"{self.question} {self.answer}"
 
 
 def diagnose(explanation: Explanation) -> list[Finding]:
-    """What was found, question by question."""
+    """Return the findings on an explained moment, question by question."""
     patches = {
         f"{camera_name(key)} patch {line}, {column}": float(map_GG[line, column])
         for key, map_GG in explanation.patches.items()
@@ -53,7 +52,7 @@ def diagnose(explanation: Explanation) -> list[Finding]:
         kinds["Changed words"] = explanation.others
     weak = SHARE * max(map(_largest, kinds.values()))
     findings = [
-        Finding(
+        Finding.of_effects(
             f"{kind} that the answer depends on:",
             used(effects, explanation.clean_score),
             is_weak=_largest(effects) < weak,
@@ -61,7 +60,7 @@ def diagnose(explanation: Explanation) -> list[Finding]:
         for kind, effects in kinds.items()
     ]
     findings += [
-        Finding(
+        Finding.of_effects(
             f"Heads that alone restore it, {restored.corruption}:",
             _heads(restored),
             is_weak=abs(restored.drop) < weak,

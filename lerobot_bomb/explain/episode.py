@@ -15,6 +15,7 @@ from lerobot_bomb.explain.explained import ANSWER, INSTRUCTION, Batch
 from lerobot_bomb.explain.following import Following, following
 from lerobot_bomb.explain.moment import OBSERVATION, Asked, Explanation, explain, image_keys
 from lerobot_bomb.explain.other_policies import explained
+from lerobot_bomb.explain.pointing import PointingCheck, check_pointing
 from lerobot_bomb.explain.question import Question
 from lerobot_bomb.explain.spans import Span, named_spans, span_of, spans_of_words, token_offsets
 from lerobot_bomb.explain.watched import Watched
@@ -23,7 +24,7 @@ from lerobot_bomb.viewing.checkpoint import LoadedPolicy
 
 @dataclass(frozen=True)
 class Settings:
-    """How moments are asked about."""
+    """Settings with which moments are explained."""
 
     grid: int
     fill: str
@@ -40,10 +41,11 @@ class ExplainedMoment:
     followings: dict[str, Following]
     images: dict[str, np.ndarray]  # (H, W, 3) uint8 by the keys of the explanation's patches
     states: dict[str, np.ndarray]  # (layers, F) by place, means over its tokens; {}: not to be had
+    pointing: PointingCheck | None  # None: the policy does not point
 
     @property
     def title(self) -> str:
-        """As "step 12, carry"."""
+        """Title of the moment, such as "step 12, carry"."""
         return ", ".join(part for part in (f"step {self.watched.step}", self.watched.phase) if part)
 
     def as_json(self) -> dict[str, Any]:
@@ -54,6 +56,7 @@ class ExplainedMoment:
             "instruction": self.watched.instruction,
             "findings": {each.question: each.names for each in self.findings},
             "following": {word: asdict(each) for word, each in self.followings.items()},
+            **({} if self.pointing is None else {"pointing": self.pointing.as_json()}),
             **self.explanation.as_json(),
         }
 
@@ -82,7 +85,9 @@ def explain_moment(
         for key in image_keys(question)
     }
     states = mean_states(question)
-    return ExplainedMoment(watched, explanation, diagnose(explanation), followings, images, states)
+    pointing = check_pointing(loaded, question.explained, observation, watched.state)
+    findings = [*([] if pointing is None else [pointing.finding]), *diagnose(explanation)]
+    return ExplainedMoment(watched, explanation, findings, followings, images, states, pointing)
 
 
 def mean_states(question: Question) -> dict[str, np.ndarray]:
@@ -124,7 +129,7 @@ def _asked(loaded: LoadedPolicy, watched: Watched, settings: Settings, instead: 
 
 
 def _spans(watched: Watched, words: Sequence[str]) -> Iterator[Span]:
-    """What the instruction says of row, column and colour; each of its words; those asked for."""
+    """Yield the spans of row, column and colour, of each word of the instruction, and of `words`."""
     yield from named_spans(watched.instruction, watched.instructions)
     for span in spans_of_words(watched.instruction):
         yield Span(f'"{span.name}"', span.ranges)

@@ -17,6 +17,7 @@ from torch import Tensor, nn
 from torch.nn.functional import pad
 
 from lerobot_bomb.actions.text import TokenRows
+from lerobot_bomb.bomb.pointing import PointedAt
 from lerobot_bomb.vlm.inputs import OBS_LANGUAGE_HIDDEN
 
 type Batch = dict[str, Any]  # what a policy's preprocessor gives
@@ -39,7 +40,7 @@ class DecoderLayer:
 
 
 def decoder_layers(text_model: Any, *, called_whole: bool = True) -> list[DecoderLayer]:
-    """Of a text model whose layers are named as Llama's."""
+    """Return the layers of a text model whose layers are named as Llama's."""
     num_heads = text_model.config.num_attention_heads
     return [
         DecoderLayer(layer if called_whole else None, layer.self_attn.o_proj, num_heads, layer.mlp)
@@ -59,11 +60,11 @@ class Explained(ABC):
 
     @abstractmethod
     def answer(self, batch: Batch) -> Tensor:
-        """What the policy answers to a batch of one row, (1, ...)."""
+        """Return the policy's answer to a batch of one row, (1, ...)."""
 
     @abstractmethod
     def encode(self, batch: Batch) -> Rows:
-        """What the decoder reads; images have gone through the vision model."""
+        """Return what the decoder reads; images have gone through the vision model."""
 
     @abstractmethod
     def score(self, rows: Rows, answer: Tensor) -> Tensor:
@@ -85,8 +86,12 @@ class Explained(ABC):
             ValueError: the policy reads no instruction.
         """
 
+    def pointed(self, batch: Batch) -> PointedAt | None:
+        """Return what the policy points at before it answers a batch of one row; None: it does not."""
+        return None
+
     def places(self, rows: Rows) -> dict[str, Place]:
-        """Where in the decoder's sequences a row's images, instruction, state and answer stand; all of it.
+        """Return where a row's images, instruction, state and answer stand in the decoder's sequences.
 
         ``instruction`` has a column for each of its tokens. {} where it is not known.
         """
@@ -102,7 +107,7 @@ class PromptExplained(Explained):
     _names: Sequence[str] = ()  # of the parts
 
     def prompt(self, parts: Mapping[str, TokenRows]) -> Rows:
-        """What rows hold; ``part`` is the number of the part that a column belongs to."""
+        """Join the parts to a prompt's rows; ``part`` is the number of the part that a column belongs to."""
         self._names = [*parts]
         numbers = [torch.full_like(part.ids, number) for number, part in enumerate(parts.values())]
         prompt = TokenRows.join([*parts.values()])
@@ -131,7 +136,7 @@ class PromptExplained(Explained):
         return {**batch, OBS_LANGUAGE_HIDDEN: hidden_1S}
 
     def columns(self, rows: Rows) -> dict[str, Tensor]:
-        """Of one row's prompt, those of each part, without padding."""
+        """Return the columns of each part in one row's prompt, without padding."""
         mask_L = rows["mask"][0]
         return {name: (self.of_part(rows, name)[0] & mask_L).nonzero()[:, 0] for name in self._names}
 

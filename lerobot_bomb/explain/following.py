@@ -1,4 +1,4 @@
-"""Whether a policy's next actions follow a changed word of the instruction, and by how many millimetres."""
+"""Following of a changed word of the instruction by a policy's next actions, in millimetres."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -13,7 +13,7 @@ from lerobot_bomb.viewing.checkpoint import LoadedPolicy
 
 @dataclass(frozen=True)
 class Following:
-    """What another instruction does to the actions that are executed before the policy looks again."""
+    """Effect of another instruction on the actions that are executed before the policy looks again."""
 
     instruction: str
     asked_mm: float  # from the target to the other one
@@ -28,7 +28,7 @@ def following(
     target: Cell,
     control_mode: str,
 ) -> dict[str, Following]:
-    """Of each other instruction and the intersection that it names, from the same observation and noise."""
+    """Measure how actions follow each other instruction to its place, from the same observation and noise."""
     clean = _end_xy(loaded, observation, control_mode)
     found = {}
     for word, (instruction, cell) in others.items():

@@ -34,7 +34,7 @@ type Features = dict[PipelineFeatureType, dict[str, PolicyFeature]]
 @ProcessorStepRegistry.register(BLANK_IMAGES)
 @dataclass
 class BlankImages(ObservationProcessorStep):
-    """Every camera shows black."""
+    """Intervention in which every camera shows black."""
 
     def observation(self, observation: dict[str, Any]) -> dict[str, Any]:
         return {

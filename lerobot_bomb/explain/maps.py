@@ -3,6 +3,8 @@
 Shapes: `G` cells along a side of a grid, `H`, `W` of an image in pixels.
 """
 
+import base64
+
 import cv2
 import numpy as np
 
@@ -32,3 +34,8 @@ def png_bytes(image: np.ndarray) -> bytes:
     """(H, W, 3) uint8 RGB as a file."""
     _, content = cv2.imencode(".png", cv2.cvtColor(image, cv2.COLOR_RGB2BGR))
     return content.tobytes()
+
+
+def data_url(image: np.ndarray) -> str:
+    """(H, W, 3) uint8 RGB as a page holds it."""
+    return f"data:image/png;base64,{base64.b64encode(png_bytes(image)).decode()}"

@@ -1,4 +1,4 @@
-"""Whole episodes in which something is hidden from the policy in every step."""
+"""Episodes in which something is hidden from the policy in every step."""
 
 from collections.abc import Callable, Mapping
 from contextlib import closing
@@ -30,13 +30,13 @@ BLURS = 16  # of an image's side, a blur's standard deviation
 
 
 def nothing(batch: Batch, _: gymnasium.Env | str) -> Batch:
-    """All as it is."""
+    """Change nothing."""
     return batch
 
 
 @dataclass(frozen=True)
 class Mask:
-    """What is hidden, before and after the preprocessor."""
+    """Changes that hide something from the policy, before and after the preprocessor."""
 
     change: Change = nothing
     change_prepared: PreparedChange = nothing
@@ -83,7 +83,7 @@ def without_words(loaded: LoadedPolicy, words: Callable[[str], Span | None]) -> 
 
 
 def masks_of(watched: Watched, loaded: LoadedPolicy, fill: str) -> dict[str, Mask]:
-    """Nothing, each kind of object, the words for row, column and colour, the whole instruction."""
+    """Return the masks: nothing, kinds of objects, words for row, column and colour, all words."""
     masks = {"nothing": Mask()}
     masks |= {
         f"object: {name}": without_object(name, fill) for name in next(iter(watched.objects.values()), {})
@@ -97,7 +97,7 @@ def masks_of(watched: Watched, loaded: LoadedPolicy, fill: str) -> dict[str, Mas
 
 
 def play_masked(viewed: Viewed, loaded: LoadedPolicy, masks: Mapping[str, Mask]) -> dict[str, MaskedEpisode]:
-    """The same episode under each mask, from the same random state of the policy."""
+    """Run the same episode under each mask, from the same random state of the policy."""
     return {name: _play(viewed, loaded, mask) for name, mask in masks.items()}
 
 

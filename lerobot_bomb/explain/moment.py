@@ -1,4 +1,4 @@
-"""Everything that is asked of a policy about one moment of an episode.
+"""Explanation of one moment of an episode: everything that is asked of a policy about it.
 
 Shapes: `G` cells along a side of the grid over an image, `L` layers.
 """
@@ -26,7 +26,7 @@ OBSERVATION = "observation"
 
 @dataclass(frozen=True)
 class Asked:
-    """What is taken away or changed."""
+    """Changes to make to a moment, one by one, to measure their effects."""
 
     grid: int  # cells along a side of each image
     fill: str  # of FILLINGS
@@ -107,7 +107,7 @@ def explain(question: Question, asked: Asked) -> Explanation:
 
 
 def image_keys(question: Question) -> list[str]:
-    """Of the images that the policy sees."""
+    """Return the keys of the images that the policy sees."""
     return [
         key
         for key, value in sorted(question.observation.items())
@@ -133,7 +133,7 @@ def _patches(question: Question, grid: int, key: str, filling_3HW: Tensor) -> Te
 
 
 def _objects(question: Question, asked: Asked, fillings: Mapping[str, Tensor]) -> dict[str, dict[str, float]]:
-    """In each camera, and in all at once; what no camera shows is left out."""
+    """Measure each object's effect in each camera and in all at once, for objects that a camera shows."""
     effects: dict[str, dict[str, float]] = {}
     names = list(dict.fromkeys(name for masks in asked.objects.values() for name in masks))
     for name in names:
@@ -206,7 +206,7 @@ def _has_columns_of(rows: Rows, others: Rows) -> bool:
 
 
 def _places(question: Question, asked: Asked, rows: Rows) -> dict[str, Place]:
-    """Those of the sequence, and of the words in it; {} where the layers' states cannot be put back."""
+    """Return the places of the sequence and of its words; {} where the layers' states cannot be put back."""
     explained = question.explained
     if any(layer.layer is None for layer in explained.layers):
         return {}

@@ -82,7 +82,7 @@ class ExplainedByLoss(_ExplainedByBatch):
 
 
 class ExplainedByDistance(_ExplainedByBatch):
-    """Any policy: minus the mean distance of the actions that it executes from the clean ones, (1, T, D).
+    """Explanation of any policy: minus the mean distance of executed actions (1, T, D) from the clean ones.
 
     Rows are asked one by one, each from a fresh start and with the same random numbers.
     """
@@ -109,7 +109,7 @@ class ExplainedByDistance(_ExplainedByBatch):
 
 
 def _language_layers(policy: nn.Module) -> list[DecoderLayer]:
-    """Of the first language model among a policy's modules; its parts are taken to be called one by one."""
+    """Return the layers of a policy's first language model; its parts are taken to be called one by one."""
     for module in policy.modules():
         layers = getattr(module, "layers", None)
         first = layers[0] if isinstance(layers, nn.ModuleList) and len(layers) else None

@@ -1,4 +1,4 @@
-"""What can be read off a layer's states by a linear map: where is the destination known?
+"""Probes of a layer's states by a linear map: where is the destination known?
 
 A probe is a ridge regression; it is judged on episodes that it was not fitted to, beside the same with
 shuffled labels, which is what a probe of so many features finds in nothing.
@@ -19,7 +19,7 @@ PENALTY = 1.0  # times the number of episodes that are fitted, on features of un
 
 @dataclass(frozen=True)
 class Probe:
-    """How well labels were read, on episodes that were held out."""
+    """Accuracy of labels that were read off states, on episodes that were held out."""
 
     score: float  # share of right classes, or the share of variance that is explained (R squared)
     floor: float  # the same with shuffled labels, mean of NUM_SHUFFLES
@@ -28,7 +28,7 @@ class Probe:
 
 
 def probe_classes(features_NF: np.ndarray, labels_N: np.ndarray, seed: int = 0) -> Probe:
-    """Whether a number is known, such as the target's row.
+    """Probe whether a number is known, such as the target's row.
 
     Raises:
         ValueError: there are fewer than MIN_EPISODES.
@@ -48,7 +48,7 @@ def probe_classes(features_NF: np.ndarray, labels_N: np.ndarray, seed: int = 0) 
 
 
 def probe_values(features_NF: np.ndarray, values_NC: np.ndarray, seed: int = 0) -> Probe:
-    """Whether a place is known, such as the stone's; raises as `probe_classes`."""
+    """Probe whether a place is known, such as the stone's; raises as `probe_classes`."""
 
     def explained(targets_NC: np.ndarray, train: np.ndarray, test: np.ndarray) -> float:
         errors = _predict(features_NF, targets_NC, train, test) - targets_NC[test]
@@ -75,7 +75,7 @@ class LayerProbe:
 def probe_layers(
     states: Mapping[str, np.ndarray], classes: Mapping[str, np.ndarray], values: Mapping[str, np.ndarray]
 ) -> list[LayerProbe]:
-    """Every label by the states of every layer.
+    """Probe every label by the states of every layer.
 
     Args:
         states: {place: (N, layers, F)}.

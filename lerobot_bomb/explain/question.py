@@ -1,4 +1,4 @@
-"""What a policy sees in one moment, and how far its hold on its answer drops when some of it changes.
+"""Question about one moment: how far does a policy's hold on its answer drop when some of it changes?
 
 The effect of a change is the score of the clean answer before minus after it (seed study of BOMB, E_patch and
 E_text): positive where what was changed spoke for the answer.

@@ -8,11 +8,13 @@ import rerun.blueprint as rrb
 
 from lerobot_bomb.explain.episode import ExplainedMoment
 from lerobot_bomb.explain.maps import overlay
+from lerobot_bomb.explain.moment import camera_name
+from lerobot_bomb.explain.pointing import CAMERA
 from lerobot_bomb.viewing.rerun_file import STEP, open_recording, png
 
 
 def write_recording(path: Path, name: str, fps: int, moments: Sequence[ExplainedMoment]) -> None:
-    """A new file, whose timeline has the moments at their control steps."""
+    """Write a new file, whose timeline has the moments at their control steps."""
     with open_recording(path, name, fps, _layout(moments[0])) as recording:
         for each in moments:
             recording.set_time(STEP, sequence=each.watched.step)
@@ -21,8 +23,24 @@ def write_recording(path: Path, name: str, fps: int, moments: Sequence[Explained
             found = each.explanation
             for key, image in each.images.items():
                 recording.log(f"image/{key}", png(image), strict=True)
+                _log_marks(recording, key, each)
                 effects = overlay(found.patches[key].numpy(), found.largest_patch, image)
                 recording.log(f"effect/{key}", png(effects), strict=True)
+
+
+def _log_marks(recording: rr.RecordingStream, key: str, moment: ExplainedMoment) -> None:
+    """Log the places that the policy points at and that are meant, over the image of the whole board."""
+    if moment.pointing is None or camera_name(key) != CAMERA:
+        return
+    camera, marks = moment.watched.cameras[CAMERA], moment.pointing.marks
+    points = rr.Points2D(
+        # corners of pixels are whole numbers there, and centres here
+        [camera.pixel_of(mark.xyz) + 0.5 for mark in marks],
+        colors=[mark.rgb for mark in marks],
+        labels=[mark.name for mark in marks],
+        radii=rr.Radius.ui_points(4),
+    )
+    recording.log(f"image/{key}/pointing", points, strict=True)
 
 
 def _layout(moment: ExplainedMoment) -> rrb.ContainerLike:

@@ -1,4 +1,4 @@
-"""Where in a language model a change of its input tells: clean activations are put back, one at a time.
+"""Restoration of clean activations, one at a time: where in a language model does an input matter?
 
 R(u) = (score with unit u put back - corrupt score) / (clean score - corrupt score), as in the study that BOMB
 comes from: 1 where a unit brings back all of the clean answer's score, 0 where nothing of it.
@@ -22,13 +22,13 @@ SMALLEST_DROP = 1e-4
 
 
 def smallest_drop(clean_score: float) -> float:
-    """What is more than rounding."""
+    """Return the smallest drop of the score that is more than rounding."""
     return SMALLEST_DROP * max(1.0, abs(clean_score))
 
 
 @dataclass(frozen=True)
 class Restoration:
-    """What putting units back into one corrupt input does."""
+    """Scores after units are put back into one corrupt input."""
 
     clean_score: float
     corrupt_score: float
@@ -36,7 +36,7 @@ class Restoration:
 
     @property
     def is_defined(self) -> bool:
-        """Whether the corruption lowered the score by more than rounding does."""
+        """True if the corruption lowered the score by more than rounding does."""
         return abs(self.clean_score - self.corrupt_score) > smallest_drop(self.clean_score)
 
     @property
@@ -76,7 +76,7 @@ class Corruption:
         return self.restore([[unit] for unit in units]).ratios
 
     def restore_corrupt(self, units_of_rows: Sequence[Sequence[Unit]]) -> Restoration:
-        """The same with the corrupt activations in place of the clean ones: every ratio is 0."""
+        """Restore corrupt activations in place of the clean ones: every ratio is 0."""
         return self._restore(self._record(self.rows), units_of_rows, len(units_of_rows))
 
     def _restore(

@@ -35,7 +35,7 @@ class Span:
 
 
 def span_of(words: str, instruction: str) -> Span:
-    """Everywhere that the words stand; neither part of another word nor of another number.
+    """Return where the words stand, all of them; neither part of another word nor of another number.
 
     Raises:
         ValueError: they are not in the instruction.
@@ -49,7 +49,7 @@ def span_of(words: str, instruction: str) -> Span:
 
 
 def whole(instruction: str) -> Span:
-    """All of an instruction."""
+    """Return the span of the whole instruction."""
     return Span("instruction", ((0, len(instruction)),))
 
 
@@ -75,7 +75,7 @@ def difference(name: str, instruction: str, other: str) -> Span | None:
 
 
 def named_spans(instruction: str, others: Mapping[str, str]) -> list[Span]:
-    """What an instruction says of row, column and so on, by other instructions; row and column together."""
+    """Return the spans that differ from other instructions (row, column, ...), and row and column as one."""
     found = [difference(name, instruction, other) for name, other in others.items()]
     spans = [span for span in found if span is not None]
     places = [span for span in spans if span.name in PLACE]
@@ -85,7 +85,7 @@ def named_spans(instruction: str, others: Mapping[str, str]) -> list[Span]:
 
 
 def token_offsets(steps: Iterable[Any], instruction: str) -> list[Range]:
-    """Which of the instruction's characters each token is that a preprocessor's steps make of it.
+    """Return the range of the instruction's characters of each token that a preprocessor's steps make of it.
 
     Those of a template around it lie before its first or behind its last character.
 

@@ -9,7 +9,10 @@ import gymnasium
 import numpy as np
 
 from lerobot_bomb.bomb.board import BOARD, Cell
+from lerobot_bomb.bomb.camera import Camera
 from lerobot_bomb.bomb.episode import Stage
+from lerobot_bomb.bomb.expert import current_goal
+from lerobot_bomb.bomb.privileged_state import PrivilegedState
 from lerobot_bomb.envs.rollout import Moment, play
 from lerobot_bomb.viewing.checkpoint import LoadedPolicy
 from lerobot_bomb.viewing.episode import Viewed
@@ -30,7 +33,13 @@ class Watched:
     objects: Mapping[str, Mapping[str, np.ndarray]]  # {camera: {what: (H, W) bool}}; {}: not known
     others: Mapping[str, tuple[str, Cell]]  # other instructions and what they name, by what they change
     target: Cell | None
-    stone_xyz: np.ndarray | None  # (3,) metres, of the one that is to be moved
+    state: PrivilegedState | None  # of BOMB
+    cameras: Mapping[str, Camera]  # {}: not known
+
+    @property
+    def stone_xyz(self) -> np.ndarray | None:
+        """(3,) metres, of the one that is to be moved."""
+        return None if self.state is None else self.state.stone_xyz[current_goal(self.state).stone]
 
     @property
     def instructions(self) -> dict[str, str]:
@@ -39,7 +48,7 @@ class Watched:
 
 
 def watch(viewed: Viewed, loaded: LoadedPolicy) -> tuple[list[Watched], Any]:
-    """Every moment in which the policy acts, and the line of the episode's results."""
+    """Return every moment in which the policy acts, and the result of the episode."""
     loaded.begin()
     with closing(viewed.make_env()) as env:
 
@@ -58,7 +67,7 @@ def _watched(viewed: Viewed, moment: Moment, env: gymnasium.Env) -> Watched:
     is_bomb = viewed.env_type == "bomb"
     state = moment.state if is_bomb else None
     others = env.get_wrapper_attr("alternatives")() if is_bomb else {}
-    goal = None if state is None else state.goals[0]
+    goal = None if state is None else current_goal(state)
     return Watched(
         step=moment.step,
         phase=_phase(moment) if is_bomb else "",
@@ -67,18 +76,19 @@ def _watched(viewed: Viewed, moment: Moment, env: gymnasium.Env) -> Watched:
         objects=env.get_wrapper_attr("object_masks")() if is_bomb else {},
         others=others,
         target=None if goal is None or not others else BOARD.nearest_intersection(goal.xyz[:2]),
-        stone_xyz=None if state is None or goal is None else state.stone_xyz[goal.stone],
+        state=state,
+        cameras=env.get_wrapper_attr("cameras")() if is_bomb else {},
     )
 
 
 def _phase(moment: Moment) -> str:
-    """Of BOMB."""
+    """Return the phase of a moment of BOMB."""
     stage, state = Stage(moment.info["stage"]), moment.state
     if stage is Stage.START:
         return REACH
     if stage in (Stage.REACHED, Stage.GRASPED):
         return GRASP
-    goal = state.goals[0]
+    goal = current_goal(state)
     distance_m = np.linalg.norm(state.stone_xyz[goal.stone][:2] - goal.xyz[:2])
     return PLACE if distance_m <= NEAR_M else CARRY
 

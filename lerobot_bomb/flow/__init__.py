@@ -1,1 +1,1 @@
-"""From noise to actions along a straight path, by a velocity head, a noise head or both."""
+"""Flow matching from noise to actions along a straight path, by a velocity head, a noise head or both."""

@@ -1,6 +1,6 @@
-"""What a velocity head v and a noise head eps are trained on: a regression each, and that they agree.
+"""Losses of a velocity head v and a noise head eps: a regression each, and a term for their agreement.
 
-Conditional means satisfy eps* = A^tau - tau v* at every tau, so the term that asks for it is zero at the
+Conditional means satisfy eps* = A^tau - tau v* at every tau, so that term is zero at the
 optimum of the others. It replaces equations 5 to 7 of FDVLA, which equate a Jacobian with a velocity.
 Shapes: `B` batch, `K` action steps, `D` action dims.
 """
@@ -83,7 +83,7 @@ def masked_mean(values_BKD: Tensor, kept_BK: Tensor, reduction: str = "mean") ->
 
 
 def consistency_residual(velocity_BKD: Tensor, noise_BKD: Tensor, point: PathPoint) -> Tensor:
-    """What the heads disagree by, (B, K, D): eps + tau v - A^tau, tau times the difference in velocity."""
+    """Return the heads' disagreement (B, K, D): eps + tau v - A^tau, tau times the difference in velocity."""
     return noise_BKD + point.tau[:, None, None] * velocity_BKD - point.actions
 
 

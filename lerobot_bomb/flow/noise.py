@@ -23,7 +23,7 @@ class SamplingNoise:
         self._generators: list[torch.Generator] = []  # of each row; of all, if they share one
 
     def begin(self) -> None:
-        """The rows of the next batch are new episodes."""
+        """Begin new episodes in the rows of the next batch."""
         self._first_episode += len(self._generators)
         self._generators = []
 

@@ -24,9 +24,24 @@ class PathPoint:
     velocity: Tensor  # (B, K, D) A0 - z = (A0 - A^tau) / (1 - tau)
     noise: Tensor  # (B, K, D) z = A^tau - tau * velocity
 
+    def implied_actions(
+        self, velocity_BKD: Tensor | None, noise_BKD: Tensor | None, tau_min: float, clip_range: float
+    ) -> Tensor:
+        """(B, K, D) where the rest of the path leads, by a predicted velocity if there is one, else by noise.
+
+        By noise, ``tau_min`` is the least tau that is divided by, and ``clip_range`` bounds the actions.
+        """
+        tau_B11 = self.tau[:, None, None]
+        if velocity_BKD is not None:
+            return self.actions + (1 - tau_B11) * velocity_BKD.float()
+        assert noise_BKD is not None
+        tau_B11 = tau_B11.clamp(min=tau_min)
+        clean_BKD = (self.actions - (1 - tau_B11) * noise_BKD.float()) / tau_B11
+        return clean_BKD.clamp(-clip_range, clip_range)
+
 
 def path_point(clean_BKD: Tensor, noise_BKD: Tensor, tau_B: Tensor) -> PathPoint:
-    """Where the paths from noise z to clean actions A0 are at tau."""
+    """Return the points at tau on the paths from noise z to clean actions A0."""
     tau_B11 = tau_B[:, None, None]
     actions_BKD = (1 - tau_B11) * noise_BKD + tau_B11 * clean_BKD
     return PathPoint(actions_BKD, tau_B, clean_BKD - noise_BKD, noise_BKD)

@@ -1,4 +1,4 @@
-"""From noise to actions in a few steps along the straight path, tau = 0 to 1.
+"""Sampling of actions from noise in a few steps along the straight path, tau = 0 to 1.
 
 What a step adds, per unit of tau, to actions A at tau, where heads predict a velocity v and a noise eps:
 
@@ -65,7 +65,7 @@ def check_sampling(
 
 
 def num_evaluations(solver: str, num_inference_steps: int) -> int:
-    """How often `sample` calls the heads."""
+    """Return how often `sample` calls the heads."""
     return 2 * num_inference_steps - 1 if solver == "heun" else num_inference_steps
 
 
@@ -79,7 +79,7 @@ def check_heads(sampler: str, use_flow_head: bool, use_denoise_head: bool) -> No
 def slope(
     sampler: str, actions: Tensor, velocity: Tensor, noise: Tensor, tau: float, refine_alpha: float
 ) -> Tensor:
-    """What a step adds per unit of tau, of any sampler but ``ddim``; without the noise of ``sde``."""
+    """Return what a step adds per unit of tau, for any sampler but ``ddim``; without the noise of ``sde``."""
     if sampler == "residual":
         return velocity + refine_alpha * ((actions - tau * velocity) - noise)
     if sampler == "sde":

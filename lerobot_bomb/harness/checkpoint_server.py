@@ -27,7 +27,7 @@ EMPTY_CAMERA = "empty_camera"  # what LeRobot's policies call a camera that none
 
 
 class CheckpointServer(PredictModelServer):
-    """Plays one episode at a time, an action per observation.
+    """Runs one episode at a time, an action per observation.
 
     What a policy keeps of an episode (queue of actions, ensemble, past observations, noise) is its own, so
     another session's observations are refused until the episode has ended: a shard needs a server of its own.

@@ -32,7 +32,7 @@ class PolicyCard(ModelCard):
     """A model card that the Hub in use checks, be it the public one or another."""
 
     def validate(self, repo_type: str | None = None) -> None:
-        """As huggingface_hub's, which asks the public Hub whatever HF_ENDPOINT says.
+        """Validate as huggingface_hub does, which asks the public Hub whatever HF_ENDPOINT says.
 
         Raises:
             ValueError: the Hub does not take the card's metadata.
@@ -49,7 +49,7 @@ class PolicyCard(ModelCard):
 
 @dataclass(frozen=True)
 class Checkpoint:
-    """All that a card tells of one checkpoint."""
+    """Checkpoint with everything that its card tells."""
 
     config: PreTrainedConfig
     method: Method
@@ -68,13 +68,13 @@ class Checkpoint:
 
     @property
     def environment(self) -> Environment | None:
-        """That it was trained for, by its config, or by the dataset if the config is an older one's."""
+        """Environment that it was trained for, by its config, or by the dataset if the config is older."""
         of_dataset = None if self.dataset is None else self.dataset.environment
         return getattr(self.config, "environment", None) or of_dataset
 
     @property
     def backbone(self) -> str | None:
-        """Its Hub id; None: it has none, or not one that is known."""
+        """Hub id of its backbone; None: it has none, or not one that is known."""
         name = getattr(self.config, "vlm_model_name", None)
         return name if name and is_hub_id(name) else None
 
@@ -98,7 +98,7 @@ class Checkpoint:
         )
 
     def _license(self) -> tuple[str | None, str | None]:
-        """What was asked for, or what the backbone's weights have; none where that is not known."""
+        """Return licence and name: as given, else those of the backbone's weights; None: not known."""
         if self.license is not None:
             return self.license, None
         if self.backbone == self.method.backbone:
@@ -120,7 +120,7 @@ class Checkpoint:
         return start + "".join(f"\n## {title}\n\n{text}\n" for title, text in sections.items())
 
     def _introduction(self) -> str:
-        benchmarks = {kind_of(row).benchmark: None for rows in self.results for row in rows}
+        benchmarks = {kind_of(row).benchmark(row): None for rows in self.results for row in rows}
         if self.environment is not None:
             benchmarks = {f"BOMB, task version {self.environment.task_version}": None}
         benchmark = f" Benchmark: {', and '.join(benchmarks)}." if benchmarks else ""
@@ -178,7 +178,7 @@ class Checkpoint:
         return text + f"\n\n`{SUITE}` is that of its training, which the dataset does not say." * is_open
 
     def _eval_flags(self) -> list[str] | None:
-        """Of the environment that it was trained for, or that it was evaluated in; None: not known."""
+        """Return the flags of the environment that it was trained for, or evaluated in; None: not known."""
         knows_suite = self.environment is not None and self.environment.task is not None
         if self.environment is not None and (knows_suite or not self.results):
             return self.environment.eval_flags()

@@ -1,4 +1,4 @@
-"""Whether results are of the checkpoint that is published with them, and of its environment."""
+"""Checks that results are of the checkpoint that is published with them, and of its environment."""
 
 from pathlib import Path
 
@@ -29,7 +29,7 @@ def check_weights_of(path: Path, rows: list[Row], checkpoint: Path) -> None:
 
 
 def check_environment_of(path: Path, rows: list[Row], trained_for: Environment | None) -> None:
-    """Raise a ValueError if episodes were played in another environment than a checkpoint was trained for."""
+    """Raise a ValueError if episodes were run in another environment than a checkpoint was trained for."""
     if trained_for is None:
         return
     for row in rows:

@@ -20,7 +20,7 @@ def model_index(groups: list[Group]) -> list[EvalResult]:
             task_type="robotics",
             task_name=_task(rows[0]),
             dataset_type=group.kind.env_type,
-            dataset_name=group.kind.benchmark,
+            dataset_name=group.kind.benchmark(group.rows[0]),
             dataset_config=_config(group, condition, rows),  # tells results apart, which their task does not
             metric_type=METRIC,
             metric_name=f"success rate, {_counted(rows)}",
@@ -31,13 +31,13 @@ def model_index(groups: list[Group]) -> list[EvalResult]:
 
 
 def model_index_yaml(model_name: str, groups: list[Group]) -> str:
-    """The same as the key `model-index` of a model card's metadata."""
+    """Write `model_index` as YAML: the key `model-index` of a model card's metadata."""
     index = eval_results_to_model_index(model_name, model_index(groups))
     return _yaml({"model-index": index})
 
 
 def eval_results_yaml(benchmark_id: str, groups: list[Group]) -> str:
-    """The same as a file of `.eval_results`; `benchmark_id` is the benchmark's dataset on the Hub."""
+    """Write a file of `.eval_results`; `benchmark_id` is the benchmark's dataset on the Hub."""
     entries = [
         EvalResultEntry(
             dataset_id=benchmark_id,
@@ -69,7 +69,7 @@ def _conditions(groups: list[Group]) -> Iterator[tuple[Group, str, list[Row]]]:
 
 
 def _config(group: Group, condition: str, rows: list[Row]) -> str:
-    """As `place.camera-3`."""
+    """Return the task and condition as `place.camera-3`."""
     return f"{_task(rows[0])}.{group.kind.condition.parse(condition).key}"
 
 

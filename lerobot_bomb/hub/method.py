@@ -1,11 +1,11 @@
-"""What a policy type's model card says whichever checkpoint it is of."""
+"""Methods and papers: what a policy type's model card says whichever checkpoint it is of."""
 
 from dataclasses import dataclass
 
 
 @dataclass(frozen=True)
 class Paper:
-    """What a checkpoint's user should cite."""
+    """Paper that a checkpoint's user should cite."""
 
     key: str  # of the BibTeX entry
     title: str

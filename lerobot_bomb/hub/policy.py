@@ -1,4 +1,4 @@
-"""What our policies do with the Hub and checkpoints: one commit with a card out, clear errors in."""
+"""Policies on the Hub: one commit with a card out, clear errors in."""
 
 import logging
 from collections.abc import Collection
@@ -78,7 +78,7 @@ class HubPolicy:
         dataset_meta: "LeRobotDatasetMetadata | None" = None,
         **kwargs: Any,
     ) -> Any:
-        """As LeRobot's, but files are checked first; errors are a line that names the file.
+        """Load as LeRobot does, but check files first; errors are a line that names the file.
 
         A policy that goes on to be trained on a dataset (`dataset_meta`) is of that one's environment.
 
@@ -139,7 +139,7 @@ class HubPolicy:
         return model
 
     def _validate_peft_config(self, peft_config: Any) -> None:
-        """Where the base is, is written down: its commit, or a folder whatever the working directory.
+        """Write down where the base is: its commit, or a folder whatever the working directory.
 
         Adapters that will be published have a base that others can get.
         """
@@ -158,7 +158,7 @@ class HubPolicy:
         state_dict: dict[str, Tensor] | None = None,
         dataset_meta: "LeRobotDatasetMetadata | None" = None,
     ) -> None:
-        """What `lerobot-train --policy.push_to_hub=true` publishes at its end, in one commit.
+        """Publish, in one commit, what `lerobot-train --policy.push_to_hub=true` publishes at its end.
 
         LeRobot pushes the processors after it, and a kill in between would leave new weights with none or
         with an older push's. The last checkpoint's are the same, so LeRobot then finds nothing to change.

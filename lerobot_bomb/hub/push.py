@@ -46,14 +46,14 @@ def publish(checkpoint: "Checkpoint", files: Mapping[str, Path], private: bool |
 
 
 def _is_of_checkpoint(path: str) -> bool:
-    """Not in a folder: there LeRobot keeps what `--save_checkpoint_to_hub` pushed."""
+    """Return True for a file of the checkpoint itself: LeRobot keeps earlier pushes in folders."""
     return "/" not in path and path.endswith((".json", ".safetensors"))
 
 
 def read_checkpoint(
     folder: Path, repo_id: str, dataset: DatasetFacts | None, results: list[list[Row]]
 ) -> "Checkpoint":
-    """What its card is made of, after all checks."""
+    """Read and check a checkpoint, and return what its card is made of."""
     from lerobot.utils.import_utils import register_third_party_plugins
 
     from lerobot_bomb.checkpoints.adapters import check_adapters_fit, check_base
@@ -98,7 +98,7 @@ def read_checkpoint(
 
 
 def _check_processors(folder: Path, config: "PreTrainedConfig") -> None:
-    """They load, from the folder alone."""
+    """Check that the processors load, from the folder alone."""
     from lerobot_bomb.checkpoints.folder import load_processors
 
     of_folder = copy(config)
@@ -116,7 +116,7 @@ def portable_json(path: Path) -> str:
 
 
 def portable(value: Any, key: str = "") -> Any:
-    """The same of what it holds."""
+    """Strip local paths from a value and from everything that it holds."""
     if isinstance(value, dict):
         return {name: portable(each, name) for name, each in value.items()}
     if isinstance(value, list):

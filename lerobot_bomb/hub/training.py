@@ -1,4 +1,4 @@
-"""How a checkpoint was trained, as a command."""
+"""Training of a checkpoint, as a command."""
 
 import json
 from dataclasses import MISSING, Field, fields
@@ -38,7 +38,7 @@ NOT_FLAGS = {
 
 
 def train_command(config: PreTrainedConfig, training: TrainPipelineConfig | None, dataset_id: str) -> str:
-    """How the checkpoint was trained, but for local paths."""
+    """Return the command that trained the checkpoint, without local paths."""
     start = f"--policy.type={config.type}"
     if config.pretrained_path and is_hub_id(config.pretrained_path):
         start = f"--policy.path={config.pretrained_path}"
@@ -52,7 +52,7 @@ def train_command(config: PreTrainedConfig, training: TrainPipelineConfig | None
 
 
 def peft_flags(training: TrainPipelineConfig | None) -> list[str]:
-    """Of a training of adapters; of another none."""
+    """Return the flags of a training of adapters; none for another training."""
     if training is None or training.peft is None:
         return []
     method = f"--peft.method_type={training.peft.method_type}"
@@ -60,7 +60,7 @@ def peft_flags(training: TrainPipelineConfig | None) -> list[str]:
 
 
 def _flags_of(config: Any, group: str) -> list[str]:
-    """Those that differ from the defaults."""
+    """Return the flags of the fields that differ from their defaults."""
     flags = []
     for each in fields(config):
         value = draccus.encode(getattr(config, each.name))

@@ -1,1 +1,1 @@
-"""What the env type `bomb_libero` is: its axes, its episodes, why they fail; numpy only, no simulator."""
+"""LIBERO with perturbations (`bomb_libero`): axes, episodes, why they fail; numpy only, no simulator."""

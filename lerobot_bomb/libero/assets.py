@@ -53,7 +53,7 @@ class Libero:
 
     @classmethod
     def find(cls) -> "Libero | None":
-        """That of this Python; None: not installed."""
+        """Find the LIBERO of this Python; None: not installed."""
         spec = importlib.util.find_spec("libero")
         for folder in (spec and spec.submodule_search_locations) or []:
             if (Path(folder) / "libero" / "__init__.py").is_file():
@@ -62,13 +62,13 @@ class Libero:
 
     @property
     def config_file(self) -> Path:
-        """Where hf-libero reads it: an environment variable's folder as it is, without ~."""
+        """Path of hf-libero's config: in the folder of an environment variable as it is, without ~."""
         folder = os.environ.get("LIBERO_CONFIG_PATH", os.path.expanduser("~/.libero"))
         return Path(folder) / CONFIG_FILE
 
     @property
     def assets(self) -> Path:
-        """Where hf-libero looks for meshes and textures, and downloads them to."""
+        """Folder where hf-libero looks for meshes and textures, and which it downloads them to."""
         own = self.package / "assets"
         return own if own.exists() else Path(os.path.expanduser("~")) / ".cache" / "libero" / "assets"
 
@@ -155,7 +155,7 @@ class Libero:
         return sorted(missing)
 
     def _missing_of(self, task: str) -> set[str]:
-        """What a task, given as the text of its file, needs and has not."""
+        """Return the files that a task, given as the text of its file, needs and has not."""
         problem = re.search(r"\(problem\s+(\w+)\)", task)
         scene = SCENES.get(problem[1]) if problem else None
         files = [self._object_file(name) for name in _object_names(task) - SCENE_FIXTURES]
@@ -192,7 +192,7 @@ def prepare_libero(suites: Iterable[str] = SUITES) -> Libero:
 
 
 def describe_missing(assets: Path, missing: list[str]) -> str:
-    """In a line: what is missing below a folder of assets, and how to get it."""
+    """Describe in a line what is missing below a folder of assets, and how to get it."""
     way_out = f"hf download lerobot/libero-assets --repo-type=dataset --local-dir={assets}"
     if not assets.exists():
         return f"LIBERO's assets are missing, {assets} does not exist: {way_out}"

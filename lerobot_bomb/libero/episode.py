@@ -19,7 +19,7 @@ MOTION_DIMS = 6  # change of x, y, z and of orientation; the last is the gripper
 
 
 class LiberoFailure(StrEnum):
-    """Why an episode failed; exactly one per failed episode, the first that holds."""
+    """Reason why an episode failed; exactly one per failed episode, the first that holds."""
 
     NEVER_TOUCHED = "never_touched"  # the gripper met no object
     WRONG_OBJECT = "wrong_object"  # it met objects, none of those that the task is about
@@ -49,16 +49,16 @@ class LiberoSpec:
 
 
 def initial_state_of(seed: int, count: int) -> int:
-    """Which of a task's recorded initial states an episode starts in.
+    """Return the index of the recorded initial state that an episode of a task starts in.
 
-    `lerobot-eval --env.type=libero` plays them in order, whatever its seed; so episodes are the same here
-    where --seed is a multiple of their number, 50, as its default 1000 is.
+    `lerobot-eval --env.type=libero` goes through them in order, whatever its seed; so episodes are the same
+    here where --seed is a multiple of their number, 50, as its default 1000 is.
     """
     return seed % count
 
 
 def failure_of(touched: set[str], wanted: set[str]) -> LiberoFailure:
-    """Of an episode without success: objects that the gripper met, and those that the task is about."""
+    """Classify an episode without success, by the objects that the gripper met and those of the task."""
     if not touched:
         return LiberoFailure.NEVER_TOUCHED
     return LiberoFailure.UNFINISHED if touched & wanted else LiberoFailure.WRONG_OBJECT

@@ -1,4 +1,4 @@
-"""In which of four orientations images of LIBERO are, beside what its environment shows.
+"""Orientation of images of LIBERO, one of four, beside what its environment shows.
 
 Nothing in a dataset or a checkpoint says it: LeRobot's environment turns the simulator's images by 180
 degrees, and a policy that was trained on others fails without an error.
@@ -17,9 +17,10 @@ ORIENTATIONS = {
 
 
 def orientation(images: np.ndarray, shown: np.ndarray) -> str:
-    """Of `ORIENTATIONS`: that of images, (N, H, W, 3), beside those that an environment shows, (M, H, W, 3).
+    """Return the one of `ORIENTATIONS` that images (N, H, W, 3) have beside those shown, (M, H, W, 3).
 
-    Both are of one camera and one task, of whatever moments: their means are compared.
+    Both are of one camera and one task, of whatever moments: their means are compared. An environment shows
+    the latter.
 
     Raises:
         ValueError: they are of different sizes.

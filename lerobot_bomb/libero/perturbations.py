@@ -90,6 +90,6 @@ libero_magnitude = partial(magnitude_of, LIBERO_AXES)  # (axis, name, level)
 
 @dataclass(frozen=True)
 class LiberoCondition(AxisCondition):
-    """Which axes of LIBERO are on: "camera:2+light:3"."""
+    """Condition of LIBERO, by the axes that are on: "camera:2+light:3"."""
 
     axes: ClassVar[Mapping[str, Axis]] = LIBERO_AXES

@@ -31,7 +31,7 @@ class Order:
 
     @property
     def outcome(self) -> str:
-        """How it is when it has been done: "the bowl has been put on the plate"."""
+        """State after the order is carried out, in words: "the bowl has been put on the plate"."""
         thing = {"them": "both"}.get(self.thing, self.thing)
         is_plural = thing.startswith("both")
         if self.verb in STATES:
@@ -39,7 +39,7 @@ class Order:
         return f"{thing} {'have' if is_plural else 'has'} been {DONE[self.verb]} {self.place}"
 
     def said(self, verbs: Mapping[str, str]) -> str:
-        """With other verbs: {"put": "set", "turn on": "switch|on"}, the latter around the thing."""
+        """Word it with other verbs: {"put": "set", "turn on": "switch|on"}, the latter around the thing."""
         verb, _, particle = verbs.get(self.verb, self.verb).partition("|")
         if self.verb == "pick up":
             return f"{verb} {self.thing} and {verbs.get('place', 'place')} it {self.place}"
@@ -47,7 +47,7 @@ class Order:
 
 
 def orders_of(instruction: str) -> list[Order]:
-    """What an instruction asks for, in its order.
+    """Return the orders of an instruction, in its order.
 
     Raises:
         ValueError: it has another form than LIBERO's.

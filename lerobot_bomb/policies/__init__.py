@@ -1,1 +1,1 @@
-"""What our policies share."""
+"""Base classes and parts that our policies share."""

@@ -13,6 +13,7 @@ from lerobot_bomb.checkpoints.config import INSTALLED, PackageVersion
 from lerobot_bomb.checkpoints.environment import ConfigWithEnvironment
 from lerobot_bomb.flag_errors import flag_errors
 from lerobot_bomb.flags import one_of
+from lerobot_bomb.policies.pointing import LABELS
 from lerobot_bomb.training.policy_flags import (
     action_deltas,
     adamw,
@@ -143,7 +144,7 @@ class ChunkConfig(ConfigWithEnvironment):
 
 @dataclass
 class VlaConfig(ChunkConfig):
-    """Of a policy with a vision-language model: which one, in which precision, what of it is trained.
+    """Config of a policy with a vision-language model: which one, in which precision, what of it is trained.
 
     Its chunks may be executed as an ensemble.
     """
@@ -221,6 +222,9 @@ class VlaConfig(ChunkConfig):
         return list(names) if len(names) == num_dims else [str(dim) for dim in range(num_dims)]
 
     def validate_features(self) -> None:
+        # labels are in a dataset's observations, where LeRobot's pipelines keep them, and are no inputs
+        inputs = self.input_features or {}
+        self.input_features = {key: each for key, each in inputs.items() if not key.startswith(LABELS)}
         super().validate_features()
         check_state(self, self.NEEDS_STATE)
 
@@ -239,7 +243,7 @@ RELATIVE_AS_TRAINED = ("relative_actions", "relative_exclude_joints", "relative_
 
 @dataclass
 class RelativeVlaConfig(VlaConfig):
-    """Of a policy whose actions may be differences to the state that a chunk starts from."""
+    """Config of a policy whose actions may be differences to the state that a chunk starts from."""
 
     NEEDS_STATE: ClassVar[tuple[str, ...]] = (*VlaConfig.NEEDS_STATE, "relative_actions")
 
@@ -284,7 +288,7 @@ class RelativeVlaConfig(VlaConfig):
 
 @dataclass
 class TokenVlaConfig(VlaConfig):
-    """Of a policy whose actions are tokens: how they are chosen, and compiled."""
+    """Config of a policy whose actions are tokens: how they are chosen, and compiled."""
 
     MODES: ClassVar[tuple[NormalizationMode, ...]] = BOUNDED_MODES
 

@@ -10,7 +10,7 @@ from typing import Any, ClassVar, Self
 import torch
 from lerobot.datasets import LeRobotDatasetMetadata
 from lerobot.policies import PreTrainedPolicy
-from lerobot.utils.constants import ACTION, OBS_STATE
+from lerobot.utils.constants import ACTION, DONE, OBS_STATE
 from torch import Tensor, nn
 from torch.nn.attention import SDPBackend, sdpa_kernel
 
@@ -19,7 +19,14 @@ from lerobot_bomb.actions.relative import RelativeActions, bounds, named_dims
 from lerobot_bomb.checkpoints.adapters import check_buffers_are_the_bases, frozen_buffers
 from lerobot_bomb.checkpoints.starting import check_start
 from lerobot_bomb.compat.hooks.evaluation import play_tasks_in_turn
-from lerobot_bomb.data.columns import dim_names, episode_bounds, present_episodes, read_columns
+from lerobot_bomb.data.columns import (
+    check_chunk_length,
+    dim_names,
+    episode_bounds,
+    present_episodes,
+    read_columns,
+    require_motion,
+)
 from lerobot_bomb.decoding.kv_cache import check_positions
 from lerobot_bomb.flow.noise import SamplingNoise, gumbel
 from lerobot_bomb.hub.policy import HubPolicy
@@ -32,12 +39,12 @@ from lerobot_bomb.vlm.tokenizer import load_tokenizer
 
 
 def _is_chunk_policy(policy: nn.Module) -> bool:
-    """Also one that adapters are wrapped around."""
+    """Return True for a policy of chunks, and for one that adapters are wrapped around."""
     return any(isinstance(module, ChunkPolicy) for module in policy.modules())
 
 
 class ChunkPolicy(HubPolicy, SavesTiedWeightsOnce, PreTrainedPolicy):
-    """What a policy has that predicts chunks of actions: queue, units, checkpoints.
+    """Base of policies that predict chunks of actions: queue, units, checkpoints.
 
     Shapes: `B` batch, `T` actions of a chunk, `D` action dims.
     """
@@ -61,6 +68,7 @@ class ChunkPolicy(HubPolicy, SavesTiedWeightsOnce, PreTrainedPolicy):
         self.register_buffer("action_unit", torch.ones(self._action_dim), persistent=False)
         self._action_names: list[str] | None = None
         if dataset_meta is not None:
+            check_chunk_length(config.chunk_size, dataset_meta)
             self._take_units(dataset_meta)
         # of all that is random in training
         self.generator = torch.Generator().manual_seed(torch.initial_seed())
@@ -75,7 +83,7 @@ class ChunkPolicy(HubPolicy, SavesTiedWeightsOnce, PreTrainedPolicy):
         dataset_meta: LeRobotDatasetMetadata | None = None,
         **kwargs,
     ) -> Self:
-        """As LeRobot's, but a missing or unexpected tensor is an error; fits the data that it is given."""
+        """Load as LeRobot does, but refuse missing or unexpected tensors; fit to the data that is given."""
         if config is not None:
             check_start(pretrained_name_or_path, config, dataset_meta)
             cls._prepare(config, dataset_meta)
@@ -91,12 +99,13 @@ class ChunkPolicy(HubPolicy, SavesTiedWeightsOnce, PreTrainedPolicy):
     def _prepare(cls, config: Any, meta: LeRobotDatasetMetadata | None) -> None:
         """Check and complete the config of a checkpoint that is loaded, to be trained on if there is data."""
         if meta is None:
-            check_as_trained(config)
+            check_as_trained(config, cls.as_trained)
         else:
             check_weights_fit(config, cls.shapes)
 
     def _fit(self, meta: LeRobotDatasetMetadata) -> None:
         """Take from a dataset what a checkpoint that is trained on needs to know of it."""
+        check_chunk_length(self.config.chunk_size, meta)
         self._take_units(meta)
 
     @torch.no_grad()
@@ -129,11 +138,17 @@ class ChunkPolicy(HubPolicy, SavesTiedWeightsOnce, PreTrainedPolicy):
         self._batch_size = batch_size
 
     def _kept(self, batch: dict[str, Tensor]) -> Tensor:
-        """(B, T) bool: which actions are trained on."""
-        if f"{ACTION}_is_pad" in batch and not self.config.loss_on_padded_actions:
-            return ~self._of_batch(batch, f"{ACTION}_is_pad").bool()
+        """(B, T) bool: which actions are trained on; of a static scene only its own."""
         shape = len(batch[ACTION]), self.config.chunk_size
-        return torch.ones(shape, dtype=torch.bool, device=self._device)
+        is_pad_BT = torch.zeros(shape, dtype=torch.bool, device=self._device)
+        if f"{ACTION}_is_pad" in batch:
+            is_pad_BT = self._of_batch(batch, f"{ACTION}_is_pad").bool()
+        kept_BT = torch.ones_like(is_pad_BT) if self.config.loss_on_padded_actions else ~is_pad_BT
+        if isinstance(done_B1 := batch.get(DONE), Tensor):
+            is_later_T = torch.arange(shape[1], device=self._device) > 0
+            # what follows a frame that is done, and is there, belongs to the next scene
+            kept_BT = kept_BT & ~(done_B1.reshape(-1, 1).bool() & is_later_T & ~is_pad_BT)
+        return kept_BT
 
     def _l1_parts(self, errors_BTD: Tensor, counted_BTD: Tensor) -> dict[str, tuple[Tensor, Tensor]]:
         """Absolute errors as `means` takes them, in all and by dimension; none where units are not known."""
@@ -188,7 +203,7 @@ class VlaPolicy(ChunkPolicy):
 
     @classmethod
     def _prepare(cls, config: Any, meta: LeRobotDatasetMetadata | None) -> None:
-        """As `ChunkPolicy`'s; takes the names of the data's action dimensions."""
+        """Prepare as `ChunkPolicy` does, and take the names of the data's action dimensions."""
         _take_action_names(config, meta)
         super()._prepare(config, meta)
 
@@ -234,7 +249,7 @@ class VlaPolicy(ChunkPolicy):
             yield
 
     def _make_ensemble(self) -> TemporalEnsemble | None:
-        """None: a queue instead."""
+        """Return the temporal ensemble; None: a queue is used instead."""
         config = self.config
         if not config.temporal_ensemble_size:
             return None
@@ -305,7 +320,7 @@ class RelativeVlaPolicy(VlaPolicy):
 
     @classmethod
     def from_pretrained(cls, *args: Any, **kwargs: Any) -> Self:
-        """As `VlaPolicy`'s; relative actions fit the new data."""
+        """Load as `VlaPolicy` does; relative actions fit the new data."""
         try:
             return super().from_pretrained(*args, **kwargs)
         except ValueError as error:
@@ -332,6 +347,8 @@ class RelativeVlaPolicy(VlaPolicy):
                 f"--policy.relative_actions=true needs {OBS_STATE!r} under this name in the dataset; it has "
                 f"{sorted(meta.features)}"
             )
+        if config.chunk_size > 1:
+            require_motion(meta, "--policy.relative_actions=true is fitted to chunks of them")
         columns = read_columns(meta, (ACTION, OBS_STATE), present_episodes(meta))
         action_bounds, state_bounds = (
             bounds(meta.stats[key], config.normalization_mapping[kind], columns[key].shape[1])
@@ -350,9 +367,9 @@ class RelativeVlaPolicy(VlaPolicy):
 
     def _validate_peft_config(self, peft_config: Any) -> None:
         super()._validate_peft_config(peft_config)
-        check_buffers_are_the_bases(
-            self, self._base_buffers, "start from one that lerobot-bomb init writes for this dataset"
-        )
+        saved = peft_config.modules_to_save or ()
+        advice = "start from one that lerobot-bomb init writes for this dataset"
+        check_buffers_are_the_bases(self, self._base_buffers, saved, advice)
 
     def _to_relative(self, actions_BTD: Tensor, batch: dict[str, Tensor]) -> Tensor:
         """Normalised actions -> what is trained on and predicted, (B, T, D) both."""
@@ -409,6 +426,6 @@ class TokenVlaPolicy(VlaPolicy):
 
 
 def _take_action_names(config: Any, meta: LeRobotDatasetMetadata | None) -> None:
-    """The dataset's names in one row; LeRobot keeps only those of groups where a dataset groups them."""
+    """Take the dataset's names of dims in one row; of grouped names LeRobot keeps only the groups'."""
     if config is not None and meta is not None:
         config.action_feature_names = dim_names(meta.features[ACTION])

@@ -1,1 +1,1 @@
-"""What the env type `bomb_pusht` is: its axes, its episodes, why they fail; numpy only, no simulator."""
+"""PushT with perturbations (`bomb_pusht`): axes, episodes, why they fail; numpy only, no simulator."""

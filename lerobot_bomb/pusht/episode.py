@@ -32,7 +32,7 @@ AWAY_PX = 10.0  # further than at the start
 
 
 class PushTFailure(StrEnum):
-    """Why an episode failed, by how it ended; exactly one per failed episode, the first that holds."""
+    """Reason why an episode failed, by how it ended; exactly one per failed episode, the first that holds."""
 
     NEVER_TOUCHED = "never_touched"
     ALMOST = "almost"  # at least ALMOST_COVERAGE is covered
@@ -81,7 +81,7 @@ def check_image_size(image_size: int) -> None:
 def failure_of(
     start: np.ndarray, end: np.ndarray, goal: np.ndarray, coverage: float, touched: bool
 ) -> PushTFailure:
-    """Why an episode failed, from (3,) poses x, y in pixels and angle in radians of block and target."""
+    """Classify a failed episode, by (3,) poses x, y in pixels and angle in radians of block and target."""
     if not touched:
         return PushTFailure.NEVER_TOUCHED
     if coverage >= ALMOST_COVERAGE:

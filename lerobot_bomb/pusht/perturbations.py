@@ -73,6 +73,6 @@ pusht_magnitude = partial(magnitude_of, PUSHT_AXES)  # (axis, name, level)
 
 @dataclass(frozen=True)
 class PushTCondition(AxisCondition):
-    """Which axes of PushT are on: "table:2+goal:3"."""
+    """Condition of PushT, by the axes that are on: "table:2+goal:3"."""
 
     axes: ClassVar[Mapping[str, Axis]] = PUSHT_AXES

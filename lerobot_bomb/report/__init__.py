@@ -1,1 +1,1 @@
-"""What files of results say, as a page for people and as tables for programs."""
+"""Reports on files of results: a page for people, and tables for programs."""

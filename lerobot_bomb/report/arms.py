@@ -1,4 +1,4 @@
-"""What a report is about: arms, the episodes of one policy under one set of settings."""
+"""Arms of a report: the episodes of one policy under one set of settings."""
 
 import shlex
 from collections import Counter
@@ -41,7 +41,7 @@ class Policy:
 
     @property
     def name(self) -> str:
-        """That of its arm, where it has one: it says the suite, too."""
+        """Name of its arm, where it has only one: it says the suite, too."""
         return self.arms[0].name if len(self.arms) == 1 else self.short_name
 
     @property
@@ -56,18 +56,18 @@ class Sample:
     arm: str
     row: Row
     path: Path  # of its file
-    line: int  # of the file's episodes, from 1 on
+    line: int  # of the file, from 1 on
     video: str | None = None  # link from the page
     note: str = ""  # why there is none, or what is to be known of it
 
     @property
     def command(self) -> str:
-        """Plays it again."""
+        """Command that runs it again."""
         return shlex.join(["lerobot-bomb", "replay", str(self.path), f"--line={self.line}"])
 
     @property
     def explanation(self) -> str:
-        """The command that asks why; '' where no checkpoint played."""
+        """Command that asks why; '' where no checkpoint acted."""
         if not (self.row.get("policy") or {}).get("path"):
             return ""
         return shlex.join(["lerobot-bomb", "explain", f"--results={self.path}", f"--line={self.line}"])
@@ -75,19 +75,21 @@ class Sample:
 
 @dataclass(frozen=True)
 class Report:
-    """What the sections are counted from."""
+    """Arms, samples and gaps that the sections are made from."""
 
     arms: list[Arm]
     samples: list[Sample] = field(default_factory=list)
     missing: list[str] = field(default_factory=list)  # what files lack, or have damaged
 
 
-def sample_failures(arms: list[Arm], files: Mapping[Path, list[Row]], num_of_class: int) -> Iterator[Sample]:
-    """Of each arm and class of failure so many episodes at most, always the same ones of the same files.
+def sample_failures(
+    arms: list[Arm], files: Mapping[Path, Mapping[int, Row]], num_of_class: int
+) -> Iterator[Sample]:
+    """Sample at most so many episodes of each arm and class of failure; the same files give the same ones.
 
-    `files` are those that the arms' rows are from.
+    `files`: by path and line, those that the arms' rows are from.
     """
-    places = {id(row): (path, line) for path, rows in files.items() for line, row in enumerate(rows, start=1)}
+    places = {id(row): (path, line) for path, rows in files.items() for line, row in rows.items()}
     for arm in arms:
         classes = Counter(row["failure"] for row in arm.rows if row["failure"] is not None)
         for name, number in classes.most_common():
@@ -97,7 +99,7 @@ def sample_failures(arms: list[Arm], files: Mapping[Path, list[Row]], num_of_cla
 
 
 def arms_of(rows: list[Row]) -> list[Arm]:
-    """Lines apart that must not be pooled, each with a name that no other has."""
+    """Split records that must not be pooled into arms, each with a name that no other has."""
     groups = groups_of(rows)
     first = [group.rows[0] for group in groups]
     return list(map(Arm, _told_apart([_name(row) for row in first], first), groups))

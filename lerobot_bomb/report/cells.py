@@ -5,6 +5,7 @@ from collections.abc import Callable
 from lerobot_bomb.envs.results import Row
 from lerobot_bomb.evaluation.paired import PairedComparison
 from lerobot_bomb.evaluation.result_groups import rate_of
+from lerobot_bomb.explain.aggregate import Mean
 from lerobot_bomb.report.table import Cell
 from lerobot_bomb.stats import format_p
 
@@ -28,6 +29,14 @@ def points(of: PairedComparison) -> list[Cell]:
     value = {"difference": counts.difference, "low": low, "high": high, **vars(counts)}
     text = f"{100 * counts.difference:+.0f} [{100 * low:+.0f}, {100 * high:+.0f}]"
     return [Cell(text, value), Cell(format_p(of.p_value).removeprefix("p = "), of.p_value)]
+
+
+def mean_cell(mean: Mean | None, form: str, shade: float | None = None) -> Cell:
+    """'0.12 [0.10, 0.15]' in a format; '-' of none."""
+    if mean is None:
+        return Cell("-")
+    interval = "" if mean.interval is None else f" [{mean.interval[0]:{form}}, {mean.interval[1]:{form}}]"
+    return Cell(f"{mean.value:{form}}{interval}", {"value": mean.value, "interval": mean.interval}, shade)
 
 
 def count(number: int, of: int) -> Cell:

@@ -1,6 +1,5 @@
 """Explanations as sections of a page."""
 
-import base64
 from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
 from html import escape
@@ -13,10 +12,12 @@ from lerobot_bomb.evaluation.results import named_counts
 from lerobot_bomb.explain.aggregate import Mean, mean_of, means_of
 from lerobot_bomb.explain.episode import ExplainedMoment
 from lerobot_bomb.explain.following import Following
-from lerobot_bomb.explain.maps import cells, overlay, png_bytes
+from lerobot_bomb.explain.maps import cells, data_url, overlay
 from lerobot_bomb.explain.masked_episodes import MaskedEpisode
 from lerobot_bomb.explain.moment import ALL, Restored, camera_name
 from lerobot_bomb.explain.probes import LayerProbe
+from lerobot_bomb.report.cells import mean_cell
+from lerobot_bomb.report.explained_pointing import mean_pointing, pointing_figure, pointing_tables
 from lerobot_bomb.report.table import Cell, Section, Table
 from lerobot_bomb.stats import format_rate
 
@@ -36,7 +37,7 @@ TRACE_RANGE_M = 0.24  # either way from the board's centre
 
 
 def overview_section(outcome: str, moments: Sequence[ExplainedMoment], command: str) -> Section:
-    """What the policy was told, what became of the episode, what was found in each moment."""
+    """Write the section of what the policy was told, how the episode ended, and what each moment showed."""
     found = [
         Table(each.title, QUESTIONS, [[Cell(of.question), Cell(of.answer)] for of in each.findings])
         for each in moments
@@ -46,7 +47,7 @@ def overview_section(outcome: str, moments: Sequence[ExplainedMoment], command: 
 
 
 def _not_asked(moment: ExplainedMoment) -> list[str]:
-    """Which parts are not possible with this policy."""
+    """Return a line for each kind of question that cannot be asked of this policy."""
     explanation = moment.explanation
     is_missing = {
         "Words: none are hidden, for this policy reads no instruction.": not explanation.words,
@@ -70,7 +71,8 @@ def moment_sections(moment: ExplainedMoment) -> list[Section]:
     of_words = (
         f"{note} In quotes: single words, (2) where one stands for the second time; else what is named."
     )
-    tables = [
+    tables = [] if moment.pointing is None else [*pointing_tables(moment.pointing)]
+    tables += [
         _effects(f"Objects taken out: {camera_name(key)}", "object", each, note)
         for key, each in explanation.objects.items()
     ]
@@ -83,7 +85,7 @@ def moment_sections(moment: ExplainedMoment) -> list[Section]:
     for restored in explanation.restored:
         tables += _restored(restored)
     largest = explanation.largest_patch
-    figures = "".join(
+    figures = pointing_figure(moment) + "".join(
         _figure(key, image, explanation.patches[key].numpy(), largest) for key, image in moment.images.items()
     )
     figures += f'<p class="note">Dark: no effect or a negative one; bright: {largest:.4g}.</p>'
@@ -94,7 +96,7 @@ def moment_sections(moment: ExplainedMoment) -> list[Section]:
 def aggregate_sections(
     results: Sequence[Any], by_phase: Mapping[str, Sequence[ExplainedMoment]], command: str
 ) -> list[Section]:
-    """What matters in which phase, over episodes."""
+    """Write the sections of many episodes: what matters in which phase."""
     num_successes = sum(result.is_success for result in results)
     failures = Counter(result.failure for result in results if not result.is_success)
     reached = [[Cell(phase or MIDDLE), Cell(str(len(each)), len(each))] for phase, each in by_phase.items()]
@@ -121,12 +123,13 @@ def _mean_tables(moments: Sequence[ExplainedMoment]) -> Iterator[Table]:
     ):
         if found := means_of(effects):
             yield _means(title, of, found, note)
+    yield from mean_pointing(moments)
     if any(each.followings for each in moments):
         yield _mean_followings(moments)
 
 
 def probes_section(probes: Sequence[LayerProbe]) -> Section:
-    """What can be read off the layers' states."""
+    """Write the section of what can be read off the layers' states."""
     rows = [
         [
             Cell(each.what),
@@ -151,19 +154,12 @@ def _means(title: str, of: str, means: Mapping[str, Mean], note: str) -> Table:
     rows = [
         [
             Cell(name),
-            _mean(mean, ".4f", max(0.0, mean.value) / largest),
+            mean_cell(mean, ".4f", max(0.0, mean.value) / largest),
             Cell(str(mean.num_episodes), mean.num_episodes),
         ]
         for name, mean in sorted(means.items(), key=lambda pair: -pair[1].value)
     ]
     return Table(title, [of, "effect", "episodes"], rows, note)
-
-
-def _mean(mean: Mean | None, form: str, shade: float | None = None) -> Cell:
-    if mean is None:
-        return Cell("-")
-    interval = "" if mean.interval is None else f" [{mean.interval[0]:{form}}, {mean.interval[1]:{form}}]"
-    return Cell(f"{mean.value:{form}}{interval}", {"value": mean.value, "interval": mean.interval}, shade)
 
 
 def _mean_followings(moments: Sequence[ExplainedMoment]) -> Table:
@@ -172,7 +168,7 @@ def _mean_followings(moments: Sequence[ExplainedMoment]) -> Table:
     for word in words:
         found = [each.followings[word] for each in moments if word in each.followings]
         values = [[getattr(each, name) for each in found] for name in ("asked_mm", "moved_mm", "along_mm")]
-        rows.append([Cell(word), *(_mean(mean_of(each), ".1f") for each in values)])
+        rows.append([Cell(word), *(mean_cell(mean_of(each), ".1f") for each in values)])
     return Table("Do the next actions follow?", ["changed", *FOLLOWING_COLUMNS], rows, FOLLOWING_NOTE)
 
 
@@ -225,7 +221,7 @@ def _ratio(value: float) -> Cell:
 
 
 def traces_section(episodes: Mapping[str, MaskedEpisode]) -> Section:
-    """Whole episodes under masks; the first is the one without."""
+    """Write the section of whole episodes under masks; the first is the one without."""
     rows = []
     for name, episode in episodes.items():
         result = episode.result
@@ -283,11 +279,7 @@ def _figure(key: str, image: np.ndarray, map_GG: np.ndarray, largest: float) -> 
     }
     size = f'width="{SHOWN_PX}" height="{SHOWN_PX}"'
     tags = "".join(
-        f'<img src="{_data_url(each)}" {size} alt="{escape(f"{camera_name(key)}: {what}")}">'
+        f'<img src="{data_url(each)}" {size} alt="{escape(f"{camera_name(key)}: {what}")}">'
         for what, each in shown.items()
     )
     return f"<figure>{tags}<figcaption>{escape(camera_name(key))}: {'; '.join(shown)}</figcaption></figure>"
-
-
-def _data_url(image: np.ndarray) -> str:
-    return f"data:image/png;base64,{base64.b64encode(png_bytes(image)).decode()}"

@@ -67,7 +67,7 @@ def _table(table: Table, note: str) -> str:
 
 
 def _is_text(table: Table, column: int) -> bool:
-    """Whether a column has words and no numbers."""
+    """Return True if a column has words and no numbers."""
     cells = [row[column] for row in table.rows]
     has_numbers = any(isinstance(cell.value, int | float | dict) for cell in cells)
     return not has_numbers and any(cell.text not in ("", "-") for cell in cells)

@@ -1,4 +1,4 @@
-"""What a page shows: sections of tables of cells."""
+"""Parts of a page: sections of tables of cells."""
 
 from dataclasses import dataclass, field
 from typing import Any
@@ -6,7 +6,7 @@ from typing import Any
 
 @dataclass(frozen=True)
 class Cell:
-    """What is shown, what it is as a number or text, and how strongly it is coloured."""
+    """Cell of a table: its text, its value as a number or text, and how strongly it is coloured."""
 
     text: str
     value: Any = None
@@ -24,7 +24,7 @@ class Table:
     note: str = ""
 
     def as_json(self) -> dict[str, Any]:
-        """Its numbers."""
+        """Return the table's numbers."""
         rows = [[cell.text if cell.value is None else cell.value for cell in row] for row in self.rows]
         return {"title": self.title, "note": self.note, "header": self.header, "rows": rows}
 
@@ -39,5 +39,5 @@ class Section:
     figures: str = ""  # HTML, above the tables
 
     def as_json(self) -> dict[str, Any]:
-        """Its numbers."""
+        """Return the section's numbers."""
         return {"title": self.title, "tables": [each.as_json() for each in self.tables], "lines": self.lines}

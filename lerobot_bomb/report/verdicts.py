@@ -1,6 +1,6 @@
-"""What can be wrong with a success rate, asked one by one: verdicts over lines of results.
+"""Verdicts over records: what can be wrong with a success rate, asked one by one.
 
-Arms are lists of lines of the same episodes, but for those of the splits.
+Arms are lists of records of the same episodes, but for those of the splits.
 """
 
 from collections.abc import Mapping, Sequence
@@ -46,7 +46,7 @@ def table(arms: Mapping[str, list[Row]], verdicts: list[Verdict]) -> list[Table]
 
 
 def judge(arms: Mapping[str, list[Row]], trained_seeds: Sequence[int] | None) -> list[Verdict]:
-    """Every question that the arms have an answer to."""
+    """Judge every question that the arms have an answer to."""
     policy = arms[POLICY]
     found = [_same_again(_pairs(policy, arms[AGAIN])), _same_alone(_pairs(policy, arms[ALONE]))]
     for name, question in ((BLANK, "looks at the images"), (OTHER_INSTRUCTION, "reads the instruction")):

@@ -16,9 +16,9 @@ from lerobot_bomb.viewing.replay import Replay, line_of
 
 
 def with_videos(samples: Iterable[Sample], folder: Path, num_of_class: int) -> Iterator[Sample]:
-    """The same samples; the first of each arm's classes with a video in a folder beside the page.
+    """Add a video, beside the page, to the first samples of each arm's classes; yield the others unchanged.
 
-    Where an episode cannot be played again, its note says why.
+    Where an episode cannot be run again, its note says why.
     """
     numbers = Counter[tuple[str, str]]()
     for sample in samples:
@@ -41,7 +41,7 @@ def _with_video(sample: Sample, folder: Path) -> Sample:
 
 
 def _play(row: Row, path: Path) -> list[str]:
-    """Write the video of a line's episode; names of what is not as the line says."""
+    """Write the video of a record's episode; return the names of what the record says otherwise."""
     recording = path.with_suffix(".rrd")
     (result,) = write_episodes({"": Replay(row).player()}, path.stem, recording, path)
     recording.unlink()

@@ -1,1 +1,1 @@
-"""What LeRobot's policy server may receive."""
+"""Serving: what LeRobot's policy server may receive."""

@@ -14,7 +14,7 @@ WORKERS = 2 * MAX_OPEN
 
 
 class OpenStreams(grpc.ServerInterceptor):
-    """Every request is received within a time, and those received at once are so many at most."""
+    """Limits on requests: the time to receive one, and the number received at once."""
 
     def __init__(self, max_open: int = MAX_OPEN, timeout_s: float = RECEIVE_TIMEOUT_S):
         self.max_open, self.timeout_s = max_open, timeout_s
@@ -22,7 +22,7 @@ class OpenStreams(grpc.ServerInterceptor):
         self._lock = threading.Lock()
 
     def intercept_service(self, continuation: Callable, handler_call_details: Any) -> Any:
-        """The same method, which is called at once; gRPC would have a worker wait for a single message."""
+        """Replace the method by one that is called at once; gRPC has a worker wait for a single message."""
         handler = continuation(handler_call_details)
         if handler is None:
             return None

@@ -1,4 +1,4 @@
-"""What LeRobot's client sends to its policy server, unpickled without running what a pickle names.
+"""Unpickling of what LeRobot's client sends to its policy server, without running what a pickle names.
 
 A pickle may name any function and have it called, with any arguments; here it may name the two messages, and
 arrays, scalars and tensors of plain numbers, which are made here of bytes that are there. Whatever it does to
@@ -137,7 +137,7 @@ class _Unpickler(PythonUnpickler):
             self.memo[number] = array
 
     def _array(self, data: Any, dtype: Any, shape: Any, order: Any) -> np.ndarray:
-        """As NumPy's own, of numbers that are all there."""
+        """Build an array as NumPy does, of numbers that are all there."""
         size = _size(shape)
         if (
             not isinstance(data, bytes | bytearray)
@@ -156,7 +156,7 @@ class _Unpickler(PythonUnpickler):
         return self._array(data, dtype, (), "C")[()]
 
     def _storage(self, data: Any) -> Any:
-        """As torch's own, which however unpickles what it is given."""
+        """Build a storage as torch does; but torch unpickles whatever it is given."""
         if not isinstance(data, bytes):
             raise pickle.UnpicklingError("a tensor of LeRobot's client has bytes")
         self._use(len(data))
@@ -168,7 +168,7 @@ class _Unpickler(PythonUnpickler):
     def _tensor(
         self, storage: Any, offset: Any, size: Any, stride: Any, requires_grad: Any, hooks: Any
     ) -> torch.Tensor:
-        """As torch's own, of a storage that holds all of it."""
+        """Build a tensor as torch does, of a storage that holds all of it."""
         numel = _size(size)
         _size(stride)
         if not isinstance(storage, torch.TypedStorage) or type(offset) is not int or len(size) != len(stride):
@@ -194,7 +194,7 @@ def _dtype(name: Any, *_: Any) -> _Dtype:
 
 
 def _ordered(name: str, version: int, order: Any, *others: Any) -> np.dtype:
-    """A dtype with the byte order of its state, which for plain numbers says nothing else."""
+    """Return a dtype with the byte order of its state, which for plain numbers says nothing else."""
     if order not in ("<", ">", "|", "=") or others != (None, None, None, -1, -1, 0):
         raise pickle.UnpicklingError("an array of LeRobot's client has plain numbers")
     return np.dtype(name).newbyteorder(order)
@@ -207,12 +207,12 @@ def _reconstruct(of: Any, *_: Any) -> _Array:
 
 
 def _no_hooks() -> OrderedDict[str, Any]:
-    """As a tensor's, which are none."""
+    """Return a tensor's hooks, which are none."""
     return OrderedDict()
 
 
 def _size(shape: Any) -> int:
-    """How many numbers an array of this shape has."""
+    """Return how many numbers an array of this shape has."""
     is_shape = isinstance(shape, tuple) and len(shape) <= MAX_DIMS
     if not is_shape or any(type(length) is not int or length < 0 for length in shape):
         raise pickle.UnpicklingError(f"{shape!r:.80} is no shape of an array")

@@ -1,4 +1,4 @@
-"""What would be refused in the middle of a sweep, found before it begins."""
+"""Check of a sweep before it begins: what would be refused in the middle of it."""
 
 import logging
 from collections.abc import Sequence
@@ -12,7 +12,7 @@ RENAMED = {"--env.task=": "--tasks=", "--policy.ignore_environment=": "--env.ign
 
 
 def check(manifest: Manifest, begun: Sequence[Cell] = ()) -> None:
-    """LeRobot reads the flags of every cell, and no policy was trained for another environment.
+    """Check that LeRobot reads every cell's flags, and that no policy was trained for another environment.
 
     Whoever has begun a cell has checked those that differ from it in their conditions only.
 
@@ -42,12 +42,12 @@ def check(manifest: Manifest, begun: Sequence[Cell] = ()) -> None:
 
 
 def renamed(message: str) -> str:
-    """With the flags of a sweep, for all of its policies."""
+    """Return the message with the flags of a sweep, for all of its policies."""
     for usual, name in RENAMED.items():
         message = message.replace(usual, name)
     return message
 
 
 def _without_condition(cell: Cell) -> tuple[str, ...]:
-    """Its flags but for perturbations, which were read when the sweep was planned and bind no policy."""
+    """Return the cell's flags without perturbations: those are checked in the plan and bind no policy."""
     return (*cell.policy, *(flag for flag in cell.env if not flag.startswith("--env.perturbations=")))

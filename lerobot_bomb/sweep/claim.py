@@ -1,4 +1,4 @@
-"""Whose a sweep's folder is: one manifest's at a time, which may grow."""
+"""Claim on a sweep's folder, which belongs to one manifest at a time; that may grow."""
 
 import sys
 from collections.abc import Iterator
@@ -18,16 +18,16 @@ LOCK = "sweep.lock"  # held by every command that plays the manifest; alone by o
 def claimed(folder: Path, wanted: Manifest, batch_size: int | None = None) -> Iterator[Store]:
     """Hold a folder for a manifest, or for the one there with what the wanted one has more.
 
-    Other commands may play the same manifest at the same time; stderr says so.
+    Other commands may run the same manifest at the same time; stderr says so.
 
     Args:
         folder: made where it is missing.
-        wanted: what is to be played.
+        wanted: what is to be run.
         batch_size: of a cell, at most; where it is given, cells that are there count as the first episodes of
             longer ones.
 
     Raises:
-        ValueError: episodes of other cells are there, or another command plays other cells there.
+        ValueError: episodes of other cells are there, or another command runs other cells there.
     """
     folder.mkdir(parents=True, exist_ok=True)
     with (folder / LOCK).open("a") as lock:
@@ -60,7 +60,7 @@ def _grown(folder: Path, there: Manifest | None, wanted: Manifest, batch_size: i
     """The manifest of a folder from now on: the wanted one, in which cells that are there stay as they are.
 
     Raises:
-        ValueError: cells are there that it does not have, and episodes of that manifest have been played.
+        ValueError: cells are there that it does not have, and episodes of that manifest have been run.
     """
     if there is None or there == wanted or Store(folder, there).is_untouched():
         return wanted
@@ -78,7 +78,7 @@ def _grown(folder: Path, there: Manifest | None, wanted: Manifest, batch_size: i
 
 
 def _with_rest(cell: Cell, there: Manifest, batch_size: int) -> list[Cell]:
-    """A cell as those that are there from its seed on, and one of the seeds that they lack.
+    """Split a cell into the cells that are there from its seed on, and one of the seeds that they lack.
 
     Raises:
         ValueError: such a cell would start its episodes otherwise.

@@ -30,7 +30,7 @@ def sbatch_script(command: Sequence[str], num_jobs: int, cwd: Path) -> str:
 def submit(
     commands: Sequence[Sequence[str]], logs: Path, cluster: str | None, parameters: dict[str, Any]
 ) -> "list[Job[int]]":
-    """Each command as a job of submitit's.
+    """Submit each command as a job of submitit's.
 
     Args:
         commands: run in the folder that this process is in.

@@ -1,4 +1,4 @@
-"""Cells played by worker processes on this machine."""
+"""Cells that worker processes run on this machine."""
 
 import os
 import signal
@@ -20,9 +20,9 @@ MAX_ENDED = 3
 
 
 def progress(store: Store, cells: Sequence[Cell]) -> Iterator[bool]:
-    """Until all cells are over, show how far they are, and say whether they are further than before.
+    """Show how far the cells are until all are over, and yield whether they are further than before.
 
-    The lines of cells that have been finished are merged, whatever ends this process later.
+    The records of cells that have been finished are merged, whatever ends this process later.
     """
     total = sum(cell.num_episodes for cell in cells)
     left, num_before = _not_over(store, cells)  # what is over is not read again
@@ -42,14 +42,14 @@ def progress(store: Store, cells: Sequence[Cell]) -> Iterator[bool]:
 
 
 def _not_over(store: Store, cells: Sequence[Cell]) -> tuple[list[Cell], int]:
-    """Those that are to be played, and how many episodes of the others have been."""
+    """Return the cells that are to be run, and how many episodes of the others have been."""
     is_over = {cell: store.is_over(cell) for cell in cells}
     over = [cell for cell in cells if is_over[cell]]
     return [cell for cell in cells if not is_over[cell]], store.num_played(over)
 
 
 class WorkerProcess:
-    """A worker, and the cell that it plays, which it says through a pipe."""
+    """A worker, and the cell that it runs, which it says through a pipe."""
 
     def __init__(self, command: Sequence[str], environment: dict[str, str], log: IO[bytes]) -> None:
         said, told = os.pipe()
@@ -70,7 +70,7 @@ class WorkerProcess:
         self.since = time.monotonic()
 
     def look(self) -> str | None:
-        """Read which cell is played; return how the worker ended, None while it runs."""
+        """Read which cell is run; return how the worker ended, None while it runs."""
         code = self._process.poll()
         self._unread += self._said.read() or b""
         *cells, self._unread = self._unread.split(b"\n")
@@ -80,7 +80,7 @@ class WorkerProcess:
 
     @property
     def is_refused(self) -> bool:
-        """Whether it ended because flags are wrong."""
+        """True if the process ended because flags are wrong."""
         return self._process.returncode == REFUSED
 
     def kill(self, reason: str = "") -> None:
@@ -97,7 +97,7 @@ class WorkerProcess:
 
 
 def ended(code: int) -> str:
-    """How a process ended, from Popen's return code."""
+    """Describe how a process ended, from Popen's return code."""
     if code >= 0:
         return f"its process ended with exit code {code}"
     cause = {signal.SIGKILL: ", as where memory is short", signal.SIGSEGV: ", a fault of native code"}
@@ -109,7 +109,7 @@ class Workers:
     """The worker processes of one command, each started anew when it has ended.
 
     Args:
-        store: what is played.
+        store: what is run.
         command: starts a worker.
         environments: of each.
         timeout_s: of a cell; None: none.
@@ -179,7 +179,7 @@ class Workers:
 
 
 def play(store: Store, part: str, num_workers: int, timeout_s: int | None = None) -> None:
-    """Play a part of the cells: start workers, and start those anew that ended.
+    """Run a part of the cells: start workers, and start those anew that ended.
 
     Raises:
         RuntimeError: they end before they play, or refuse to; the message says why.

@@ -1,4 +1,4 @@
-"""What a sweep evaluates: cells, each of them one evaluation by LeRobot's command."""
+"""Manifest of a sweep: its cells, each of them one evaluation by LeRobot's command."""
 
 import hashlib
 import json
@@ -32,14 +32,14 @@ class Cell:
 
     @property
     def flags(self) -> list[str]:
-        """Of lerobot-eval; with `--env.results_path` they give the lines of this cell."""
+        """Flags of lerobot-eval; with `--env.results_path` they give the records of this cell."""
         own = (f"--seed={self.seed}", f"--eval.n_episodes={self.num_episodes}")
         batch = (f"--eval.batch_size={self.batch_size}", "--eval.use_async_envs=false")
         return [*self.policy, *self.env, *own, *batch]
 
     @property
     def command(self) -> str:
-        """What a user would type."""
+        """Command that a user would type."""
         return shlex.join(["lerobot-eval", *self.flags])
 
     @property
@@ -52,12 +52,12 @@ class Cell:
 
     @property
     def seeds(self) -> range:
-        """Of its episodes."""
+        """Seeds of its episodes."""
         return range(self.seed, self.seed + self.num_episodes)
 
     @property
     def env_type(self) -> str:
-        """Of LeRobot's environments; '' where its flags name none."""
+        """Type of the environment, as LeRobot names it; '' where the flags name none."""
         return flag_value(self.env, "--env.type") or ""
 
     def episode(self, number: int) -> "Cell":
@@ -67,7 +67,7 @@ class Cell:
 
 @dataclass(frozen=True)
 class Manifest:
-    """All cells of a sweep, in the order of its lines; none is there twice."""
+    """Cells of a sweep, in the order of its records; none is there twice."""
 
     cells: tuple[Cell, ...]
 
@@ -80,7 +80,7 @@ class Manifest:
         return sum(cell.num_episodes for cell in self.cells)
 
     def part(self, text: str) -> list[Cell]:
-        """Every so many cells: '0/4' are the first, the fifth, ...
+        """Return every so many cells: '0/4' are the first, the fifth, ...
 
         Raises:
             ValueError: the text is no such part, or there are too few cells for it to have one.
@@ -93,14 +93,14 @@ class Manifest:
         return list(self.cells[first::number])
 
     def write(self, folder: Path) -> None:
-        """As `NAME` in a folder, which is made."""
+        """Write the manifest as `NAME` to a folder, which is made."""
         cells = [vars(cell) | {"command": cell.command} for cell in self.cells]
         with written_whole(folder / NAME) as (path,):
             path.write_text(json.dumps({"version": VERSION, "cells": cells}, indent=1) + "\n")
 
     @classmethod
     def read(cls, folder: Path) -> "Manifest":
-        """The one in a folder.
+        """Read the manifest in a folder.
 
         Raises:
             FileNotFoundError: there is none.
@@ -169,7 +169,7 @@ def plan(
     batch_size: int,
     flags: Sequence[str],
 ) -> Manifest:
-    """Every policy on every task under every condition; what is named twice is played once.
+    """Plan every policy on every task under every condition; what is named twice is run once.
 
     Args:
         policies: checkpoints, or policy types.
@@ -221,5 +221,5 @@ def policy_flag(policy: str) -> str:
 
 
 def largest_divisor(number: int, most: int) -> int:
-    """So that LeRobot, which fills the last batch, plays no more episodes than asked."""
+    """Return the largest divisor: LeRobot fills the last batch, and then runs no more episodes than asked."""
     return max(size for size in range(1, min(number, most) + 1) if number % size == 0)

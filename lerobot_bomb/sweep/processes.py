@@ -1,7 +1,8 @@
-"""What each of several workers gets of a machine: threads, and one of its GPUs."""
+"""Shares of a machine that each of several workers gets: threads, and one of its GPUs."""
 
 import os
 from collections.abc import Mapping, Sequence
+from itertools import takewhile
 from pathlib import Path
 
 GPUS = "CUDA_VISIBLE_DEVICES"
@@ -9,14 +10,15 @@ DRIVER = Path("/proc/driver/nvidia/gpus")  # has a folder for each GPU
 
 
 def num_cores() -> int:
-    """That this process may use: a cluster gives a job some of a machine's."""
+    """Count the cores that this process may use: a cluster gives a job some of a machine's."""
     return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 
 
 def visible_gpus(environment: Mapping[str, str], driver: Path = DRIVER) -> list[str]:
-    """As CUDA_VISIBLE_DEVICES names them; where it is not set, the numbers of all that the driver lists."""
+    """Return GPUs as CUDA_VISIBLE_DEVICES names them; where it is not set, all that the driver lists."""
     if GPUS in environment:
-        return [gpu for gpu in environment[GPUS].split(",") if gpu not in ("", "-1")]
+        # CUDA sees none from the first -1 on
+        return list(takewhile(lambda gpu: gpu != "-1", filter(None, environment[GPUS].split(","))))
     return [str(number) for number, _ in enumerate(driver.iterdir())] if driver.is_dir() else []
 
 

@@ -1,7 +1,7 @@
-"""What of a sweep is done: a folder that any number of workers share.
+"""Store of what is done in a sweep: a folder that any number of workers share.
 
-A cell is finished where `cells/KEY.jsonl` holds all its episodes; a worker that plays one holds the lock on
-`cells/KEY.lock`, which the system takes from it if it is killed. What such a worker left is played again,
+A cell is finished where `cells/KEY.jsonl` holds all its episodes; a worker that runs one holds the lock on
+`cells/KEY.lock`, which the system takes from it if it is killed. What such a worker left is run again,
 three times at most in one run: a sweep that was stopped, with workers that may outlive it by moments, is no
 failed attempt.
 """
@@ -35,10 +35,10 @@ class EpisodeError:
 
 
 def unplayed_seeds(cell: Cell, lines: Sequence[str | bytes], errors: Sequence[EpisodeError]) -> list[int]:
-    """Seeds of a cell that have neither an error nor as many lines as the others, one for each task.
+    """Seeds of a cell that have neither an error nor as many records as the others, one for each task.
 
     Raises:
-        ValueError: a line is no episode.
+        ValueError: a line is no record.
     """
     try:
         counts = Counter(json.loads(line)["spec"]["seed"] for line in lines)
@@ -54,7 +54,7 @@ class Store:
 
     Args:
         folder: where `manifest` lies.
-        manifest: what is played.
+        manifest: what is run.
         run: names the command whose workers' attempts count together; None: a new one.
     """
 
@@ -64,11 +64,11 @@ class Store:
         (folder / CELLS).mkdir(parents=True, exist_ok=True)
 
     def file(self, cell: Cell, ending: str) -> Path:
-        """One of a cell's: lines that are finished (.jsonl) or not (.part), errors, attempts, lock."""
+        """Return a cell's file: finished records (.jsonl) or unfinished (.part), errors, attempts, lock."""
         return self.folder / CELLS / f"{cell.key}.{ending}"
 
     def is_finished(self, cell: Cell) -> bool:
-        """Whether the file of its lines is there and whole: a crash of the machine can cut it off."""
+        """Return True if the file of its records is there and whole; a crash can cut it off."""
         path = self.file(cell, "jsonl")
         try:
             state = path.stat()
@@ -87,12 +87,12 @@ class Store:
             return False
 
     def is_untouched(self) -> bool:
-        """Whether no episode has been played, with a line or with an error, and none is being played."""
+        """Return True if no episode has been run, with a record or with an error, and none is running."""
         cells = self.manifest.cells
         return not any(map(self.has_begun, cells)) and all(map(self._is_free, cells))
 
     def has_begun(self, cell: Cell) -> bool:
-        """Whether an episode has been played, with a line or with an error, or is being played."""
+        """Return True if an episode has been run, with a record or with an error, or is running."""
         return any(self.file(cell, ending).is_file() for ending in ("jsonl", "part", "errors"))
 
     def _is_free(self, cell: Cell) -> bool:
@@ -113,13 +113,13 @@ class Store:
             self.give_up(cell, f"{reason}; {MAX_ATTEMPTS} attempts")
 
     def lost(self, cell: Cell, reason: str) -> None:
-        """Note why the worker ended that played the cell, unless another has finished it or plays it now."""
+        """Note why the worker ended that ran the cell, unless another has finished it or runs it now."""
         with self.claimed(cell) as is_mine:
             if is_mine and not self.is_finished(cell):
                 self.fail(cell, reason)
 
     def in_turn(self, cells: Sequence[Cell]) -> list[Cell]:
-        """Cells that are to be played, those first that no worker has died of, nor of their policy."""
+        """Return the cells to be run, those first that no worker has died of, nor of their policy."""
         attempts = {cell: self._num_attempts(cell) for cell in cells}
         of_policy: Counter[tuple[str, ...]] = Counter()
         for cell, number in attempts.items():
@@ -127,16 +127,16 @@ class Store:
         return sorted(cells, key=lambda cell: (of_policy[cell.policy], attempts[cell]))
 
     def _num_attempts(self, cell: Cell) -> int:
-        """Of this run."""
+        """Count this run's attempts at the cell."""
         return _read(self.file(cell, "attempts")).split().count(self.run.encode())
 
     def give_up(self, cell: Cell, reason: str) -> None:
-        """No worker plays it any more."""
+        """Give a cell up: no worker runs it any more."""
         with written_whole(self.file(cell, "given_up")) as (path,):
             path.write_text(reason)
 
     def is_over(self, cell: Cell) -> bool:
-        """Whether it is finished or given up."""
+        """Return True if the cell is finished or given up."""
         return self.is_finished(cell) or self.file(cell, "given_up").is_file()
 
     def begin_again(self, cells: Sequence[Cell]) -> None:
@@ -150,7 +150,7 @@ class Store:
 
     @contextmanager
     def claimed(self, cell: Cell) -> Iterator[bool]:
-        """Whether no other worker plays it; none begins to, as long as this lasts."""
+        """Yield True and keep other workers off the cell; yield False if another one runs it."""
         with self.file(cell, "lock").open("w") as lock:
             try:
                 flock(lock, LOCK_EX | LOCK_NB)
@@ -160,7 +160,7 @@ class Store:
             yield True
 
     def finish(self, cell: Cell, lines: list[str], errors: list[EpisodeError]) -> None:
-        """Keep a cell's lines, by seed, and what had none."""
+        """Keep a cell's records, by seed, and the errors of seeds without one."""
         self.file(cell, "errors").unlink(missing_ok=True)  # of an attempt that could not be written
         if errors:
             with written_whole(self.file(cell, "errors")) as (path,):
@@ -170,13 +170,13 @@ class Store:
         self.file(cell, "part").unlink(missing_ok=True)
 
     def num_played(self, cells: Sequence[Cell]) -> int:
-        """Episodes that have a line or an error, those of cells that are being played too."""
+        """Count episodes that have a record or an error, also in cells that are running."""
         endings = ("jsonl", "part", "errors")
         paths = [self.file(cell, ending) for cell in cells for ending in endings]
         return sum(_read(path).count(b"\n") for path in paths)
 
     def merge(self) -> None:
-        """Write all finished cells' lines in the order of the manifest, and all errors."""
+        """Write all finished cells' records in the order of the manifest, and all errors."""
         with (self.folder / CELLS / "merge.lock").open("w") as lock:
             flock(lock, LOCK_EX)  # who writes last has read what all that wrote before had finished
             for name, ending in ((RESULTS, "jsonl"), (ERRORS, "errors")):
@@ -185,7 +185,7 @@ class Store:
                     path.write_bytes(b"".join(map(_read, paths)))
 
     def lines(self) -> list[str]:
-        """What is finished, and what is missing and why, as text."""
+        """Describe what is finished, and what is missing and why."""
         cells = self.manifest.cells
         finished = [cell for cell in cells if self.is_finished(cell)]
         errors = [error for cell in finished for error in self.errors(cell)]
@@ -214,7 +214,7 @@ class Store:
         return text
 
     def errors(self, cell: Cell) -> list[EpisodeError]:
-        """Of a finished cell."""
+        """Return the errors of a finished cell."""
         return [EpisodeError(**json.loads(line)) for line in _read(self.file(cell, "errors")).splitlines()]
 
     def _of_other_manifests(self) -> list[Path]:
@@ -223,7 +223,7 @@ class Store:
 
 
 def _read(path: Path) -> bytes:
-    """Nothing where there is no file: another process may remove it at any moment."""
+    """Read a file; empty where there is none: another process may remove it at any moment."""
     try:
         return path.read_bytes()
     except FileNotFoundError:

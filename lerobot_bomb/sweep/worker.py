@@ -1,4 +1,4 @@
-"""Plays the cells of a sweep that nobody else plays, one after the other, in one process."""
+"""Worker that runs the cells of a sweep that no other worker runs, one by one, in one process."""
 
 import faulthandler
 import io
@@ -28,7 +28,7 @@ from lerobot_bomb.sweep.store import POLL_S, REFUSED, EpisodeError, Store, unpla
 
 
 class RefusedError(Exception):
-    """LeRobot's command ended before it played: no attempt can do better."""
+    """Refusal: LeRobot's command ended before its first episode, so no attempt can do better."""
 
 
 FATAL = (RefusedError, OSError)  # for a cell, whichever episode it was
@@ -47,7 +47,7 @@ class Worker:
         self._kept = KeptPolicy()
 
     def run(self, cells: list[Cell]) -> None:
-        """Play until each is finished or given up, by this worker or by others."""
+        """Run cells until each is finished or given up, by this worker or by others."""
         while left := [cell for cell in cells if not self._store.is_over(cell)]:
             for cell in self._store.in_turn(left):
                 with self._store.claimed(cell) as is_mine:
@@ -86,7 +86,7 @@ class Worker:
         return lines, errors
 
     def _evaluate(self, cell: Cell, whole: Cell) -> list[str]:
-        """The lines of a cell, in the order of their seeds; it is a part of `whole`."""
+        """Run a cell and return its records, in the order of their seeds; it is a part of `whole`."""
         part = self._store.file(cell, "part")
         part.unlink(missing_ok=True)
         check_assets(cell)
@@ -115,7 +115,7 @@ class Worker:
         return by_seed
 
     def _stock_lines(self, cell: Cell, whole: Cell, output_dir: Path) -> list[str]:
-        """Of an environment of LeRobot's own, which lerobot-eval has just played."""
+        """Return the records of an environment of LeRobot's own, which lerobot-eval has just run."""
         assert self._kept.policy is not None
         results = results_of(
             read_json(output_dir / EVAL_INFO),
@@ -129,17 +129,17 @@ class Worker:
 
 
 def has_results_path(cell: Cell) -> bool:
-    """Whether lerobot-eval writes its lines itself."""
+    """Return True if lerobot-eval writes the cell's records itself."""
     return cell.env_type not in KIND_OF_ENV or KIND_OF_ENV[cell.env_type].has_results_path
 
 
 def starts_by_number(cell: Cell) -> bool:
-    """Whether an episode alone starts otherwise than in the cell."""
+    """Return True if an episode alone starts otherwise than in the cell."""
     return cell.env_type in KIND_OF_ENV and KIND_OF_ENV[cell.env_type].starts_by_number
 
 
 def check_assets(cell: Cell) -> None:
-    """Raise a RefusedError where LeRobot's `libero` would ask a question, or download, before it plays."""
+    """Raise a RefusedError where LeRobot's `libero` would ask a question or download before it starts."""
     if cell.env_type == "libero":
         suites = (flag_value(cell.env, "--env.task") or LiberoEnv.task).split(",")
         try:
@@ -171,7 +171,7 @@ def describe(error: BaseException) -> str:
 
 
 def main(folder: str, part: str, run: str, told: str) -> None:
-    """Play a part of the sweep in a folder; which cell is played goes to the file descriptor `told`."""
+    """Run a part of the sweep in a folder; the cell that runs goes to the file descriptor `told`."""
     faulthandler.enable()  # a fault of native code says where it was
     logging.basicConfig(level=logging.WARNING)
     manifest = Manifest.read(Path(folder))

@@ -1,1 +1,1 @@
-"""What trainings share: flags, several processes, randomness."""
+"""Training: flags, several processes, randomness."""

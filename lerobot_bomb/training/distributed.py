@@ -13,12 +13,12 @@ ONE_FILE = "1000TB"  # no checkpoint is larger
 
 
 def process_number() -> int:
-    """From 0; where there is one process only, it."""
+    """Return the number of this process, from 0; 0 where there is one only."""
     return distributed.get_rank() if _are_several() else 0
 
 
 def weighed(mean: Tensor, kept: Tensor) -> Tensor:
-    """A process's mean over its elements (), so that the average over processes is that over all elements.
+    """Weigh a process's mean over its elements (): the average over processes is that over all elements.
 
     Otherwise a word or an action would weigh more beside padding. Every process must call it.
 
@@ -43,7 +43,7 @@ class SavesTiedWeightsOnce(nn.Module):
     config: Any
 
     def _save_pretrained(self, save_directory: Path, state_dict: dict[str, Tensor] | None = None) -> None:
-        """LeRobot 0.6.1 gives what it gathered of a sharded policy; from 0.6.2 on all processes call this."""
+        """Save a policy: LeRobot 0.6.1 gives a gathered state; from 0.6.2 on all processes call this."""
         if state_dict is None and isinstance(self, FSDPModule):
             whole = StateDictOptions(full_state_dict=True, cpu_offload=True)
             state_dict = cast("dict[str, Tensor]", get_model_state_dict(self, options=whole))

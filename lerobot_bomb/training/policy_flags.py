@@ -16,7 +16,7 @@ MAX_POSITIONS = 128_000  # of Qwen2.5-VL; LeRobot lists a chunk's frames before 
 
 
 def check_model_name_and_precision(config: Any) -> None:
-    """A backbone is named, nano alone is changed, and precision is left to ``dtype``."""
+    """Check that a backbone is named, nano alone is changed, and precision is left to ``dtype``."""
     check_architecture(config)
     if not config.vlm_model_name:
         raise ValueError(
@@ -37,7 +37,7 @@ def check_model_name_and_precision(config: Any) -> None:
 
 
 def check_architecture(config: Any) -> None:
-    """What describes a checkpoint's backbone is whole: fields that no command line gives."""
+    """Raise unless what describes a checkpoint's backbone is whole: fields that no command line gives."""
     if config.vlm_config is not None and not (config.vlm_config and config.prompt_tokens):
         raise ValueError(
             f"--policy.vlm_config={config.vlm_config}, --policy.prompt_tokens={config.prompt_tokens}: they "
@@ -47,7 +47,7 @@ def check_architecture(config: Any) -> None:
 
 
 def check_chunk(config: Any) -> None:
-    """One observation step, and of a chunk's actions some are executed."""
+    """Check that there is one observation step, and that some of a chunk's actions are executed."""
     if config.n_obs_steps != 1:
         raise ValueError(f"--policy.n_obs_steps={config.n_obs_steps}: {config.type} reads 1 observation step")
     if config.chunk_size < 1:
@@ -65,7 +65,7 @@ def check_chunk(config: Any) -> None:
 
 
 def check_ensemble(config: Any) -> None:
-    """A temporal ensemble fits the chunk and has no queue beside it."""
+    """Check that a temporal ensemble fits the chunk and has no queue beside it."""
     size = config.temporal_ensemble_size
     if not 0 <= size <= config.chunk_size:
         raise ValueError(
@@ -84,13 +84,13 @@ def check_ensemble(config: Any) -> None:
 
 
 def check_crop(config: Any) -> None:
-    """A part of the image, or all of it."""
+    """Check that the crop is a part of the image, or all of it."""
     if not 0 < config.crop_fraction <= 1:
         raise ValueError(f"--policy.crop_fraction={config.crop_fraction} must lie in (0, 1]")
 
 
 def check_training(config: Any) -> None:
-    """Samples, optimiser and schedule."""
+    """Check the flags of samples, optimiser and schedule."""
     check_not_negative(
         config,
         (
@@ -107,7 +107,7 @@ def check_training(config: Any) -> None:
 
 
 def check_not_negative(config: Any, flags: Iterable[str]) -> None:
-    """Finite numbers of at least 0."""
+    """Raise unless the flags are finite numbers of at least 0."""
     for flag in flags:
         value = getattr(config, flag)
         if not math.isfinite(value):
@@ -117,14 +117,14 @@ def check_not_negative(config: Any, flags: Iterable[str]) -> None:
 
 
 def check_positive(config: Any, flags: Iterable[str]) -> None:
-    """Whole numbers of at least 1."""
+    """Raise unless the flags are whole numbers of at least 1."""
     for flag in flags:
         if getattr(config, flag) < 1:
             raise ValueError(f"--policy.{flag}={getattr(config, flag)} must be at least 1")
 
 
 def check_cameras_and_action(config: Any) -> None:
-    """A camera at least, and one vector of actions."""
+    """Check that there is at least one camera, and one vector of actions."""
     if not config.image_features:
         raise ValueError(
             f"{config.type} needs at least one camera; the dataset has the inputs "
@@ -142,7 +142,7 @@ def check_cameras_and_action(config: Any) -> None:
 
 
 def check_state(config: Any, flags: Iterable[str]) -> None:
-    """The robot's state is there if one of these flags needs it."""
+    """Check that the robot's state is there if one of these flags needs it."""
     state = config.robot_state_feature
     for flag in flags:
         if getattr(config, flag) and (state is None or len(state.shape) != 1):
@@ -157,9 +157,12 @@ def trained_with(config: Any, flags: Iterable[str]) -> dict[str, Any]:
     return json.loads(json.dumps({flag: getattr(config, flag) for flag in flags}))
 
 
-def check_as_trained(config: Any) -> None:
-    """A checkpoint's flags still are what its weights were trained with."""
-    then = config.trained_with or {}
+def check_as_trained(config: Any, flags: Iterable[str]) -> None:
+    """Check that a checkpoint's flags still are what its weights were trained with.
+
+    ``flags``: those that say it now; an older checkpoint names fewer.
+    """
+    then = _then(config, flags)
     for flag, value in trained_with(config, then).items():
         if value != then[flag]:
             raise ValueError(
@@ -169,14 +172,20 @@ def check_as_trained(config: Any) -> None:
 
 
 def check_weights_fit(config: Any, flags: Iterable[str]) -> None:
-    """A training goes on from a checkpoint with flags that its weights have the shapes for."""
-    then = config.trained_with or {}
+    """Check that a training goes on with flags that the checkpoint's weights have the shapes for."""
+    then = _then(config, flags)
     for flag, value in trained_with(config, [flag for flag in flags if flag in then]).items():
         if value != then[flag]:
             raise ValueError(
                 f"--policy.{flag}={value!r}: the weights of this checkpoint are made for {then[flag]!r}; "
                 f"only a training without --policy.path can change it"
             )
+
+
+def _then(config: Any, flags: Iterable[str]) -> dict[str, Any]:
+    """Return what a checkpoint was trained with, also by flags that it is older than."""
+    later = {flag: config.LATER_FIELDS[flag] for flag in flags if flag in config.LATER_FIELDS}
+    return {**later, **(config.trained_with or {})}
 
 
 def action_deltas(config: Any) -> list[int] | None:
@@ -188,7 +197,7 @@ def action_deltas(config: Any) -> list[int] | None:
 
 
 def adamw(config: Any) -> AdamWConfig:
-    """Of the fields optimizer_*."""
+    """Build AdamW's config from the fields optimizer_*."""
     return AdamWConfig(
         lr=config.optimizer_lr,
         betas=config.optimizer_betas,
@@ -199,7 +208,7 @@ def adamw(config: Any) -> AdamWConfig:
 
 
 def cosine_decay(config: Any) -> CosineDecayWithWarmupSchedulerConfig:
-    """Of the fields scheduler_*."""
+    """Build the schedule's config from the fields scheduler_*."""
     return CosineDecayWithWarmupSchedulerConfig(
         num_warmup_steps=config.scheduler_warmup_steps,
         num_decay_steps=config.scheduler_decay_steps,

@@ -1,4 +1,4 @@
-"""What is random in training, as a function of the seed, the process and the number of batches before.
+"""Randomness in training, as a function of the seed, the process and the number of batches before.
 
 LeRobot saves the state of torch's generator, but a resumed training cannot draw from that alone: starting to
 read the data draws from it once more, and every process gets the state of the first.

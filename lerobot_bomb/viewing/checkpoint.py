@@ -55,7 +55,7 @@ class LoadedPolicy:
         self.policy.reset()
 
     def observe(self, observations: list[dict[str, Any]], instructions: list[str]) -> dict[str, Any]:
-        """What `prepare` takes: images (B, 3, H, W) in [0, 1] by camera, state, task."""
+        """Return what `prepare` takes: images (B, 3, H, W) in [0, 1] by camera, state, task."""
         batch = {**preprocess_observation(_stacked(observations)), "task": instructions}
         return self._env_processors[0](batch)
 
@@ -104,7 +104,7 @@ def checkpoint_agent(
     seed: int,
     policy_flags: Sequence[str] = (),
 ) -> BatchAgent:
-    """Who acts as the checkpoint in a folder, as `load_policy` takes it."""
+    """Return the agent of the checkpoint in a folder, as `load_policy` takes it."""
     return load_policy(path, device, env_type, env_flags, seed, policy_flags).agent
 
 

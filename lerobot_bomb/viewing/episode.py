@@ -1,4 +1,4 @@
-"""Episodes played into a recording for Rerun and a video: one, or several side by side."""
+"""Episodes run into a recording for Rerun and a video: one, or several side by side."""
 
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import AbstractContextManager, closing
@@ -31,7 +31,7 @@ SUFFIXES = (".rrd", ".mp4")
 
 @dataclass(frozen=True)
 class Viewed:
-    """An episode of one environment, and how it is played and shown."""
+    """An episode of one environment, and how it is run and shown."""
 
     env_type: str
     spec: EpisodeSpec | PushTSpec
@@ -44,7 +44,7 @@ class Viewed:
     task: str = ""  # what is fixed of the task: "_task3", "_row3-column2_white"
 
     def name(self, policy: str) -> str:
-        """Of an episode and of its files: "place.camera-3_expert_seed0"."""
+        """Name an episode and its files: "place.camera-3_expert_seed0"."""
         return f"{self.group}{self.task}_{policy}_seed{self.spec.seed}"
 
 
@@ -102,14 +102,14 @@ def pusht_episode(spec: PushTSpec, image_size: int) -> Viewed:
 
 @dataclass(frozen=True)
 class Player:
-    """Who plays which episode."""
+    """Player of an episode: the episode, and the agent that acts."""
 
     viewed: Viewed
     make_agent: Callable[[gymnasium.Env], AbstractContextManager[Agent]]
 
 
 def write_episodes(players: Mapping[str, Player], name: str, rrd: Path, mp4: Path) -> list[ResultLine]:
-    """Play one after the other, write what happened, and return what became of each.
+    """Run one after the other, write what happened, and return each result.
 
     With one player, its entities stand at the recording's top; of several, each below its name, and the video
     shows them side by side, the last image of an episode until the others have ended.
@@ -142,7 +142,7 @@ def write_episodes(players: Mapping[str, Player], name: str, rrd: Path, mp4: Pat
 
 
 def paths_of(output: Path | None, folder: Path, name: str) -> list[Path]:
-    """Both files of a user's `output`: their path without .rrd and .mp4, or a folder; None: in `folder`."""
+    """Return both files of a user's `output`: its path without .rrd and .mp4, or a folder; None: `folder`."""
     stem = output or folder / name
     if stem.is_dir():
         stem = stem / name

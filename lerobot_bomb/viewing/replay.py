@@ -1,4 +1,4 @@
-"""An episode of a line of results once more, played by who played it then."""
+"""Replay of a record's episode, by the policy that ran it then."""
 
 import json
 from collections.abc import Iterator, Sequence
@@ -23,7 +23,7 @@ MAX_BATCH = 1000  # environments at once
 
 @dataclass(frozen=True)
 class Replay:
-    """A line, and what it does not say of who played."""
+    """A record, and what it does not say of the policy that ran it."""
 
     row: Row
     policy_path: Path | None = None  # where the checkpoint lies now; None: where it lay then
@@ -32,11 +32,11 @@ class Replay:
     depth: bool = False  # whether the policy was shown depth
 
     def player(self, perturbations: str | None = None) -> Player:
-        """Plays the line's episode; under other perturbations, that of the same seed.
+        """Run the record's episode; under other perturbations, that of the same seed.
 
         Raises:
-            ValueError: its environment has no recording for Rerun, its batch cannot be played again, or, once
-                it plays, the policy is not that of the line or cannot be had.
+            ValueError: its environment has no recording for Rerun, its batch cannot be run again, or, once
+                it runs, the policy is not that of the record or cannot be had.
         """
         row, size = self._place
         if size > MAX_BATCH or row >= size or row > self.row["spec"]["seed"]:
@@ -49,12 +49,12 @@ class Replay:
 
     @property
     def checkpoint(self) -> Path | None:
-        """The folder of who played; None: the line names none."""
+        """Return the folder of the policy that ran; None: the record names none."""
         path = (self.row.get("policy") or {}).get("path")
         return self.policy_path or (Path(path) if path else None)
 
     def viewed(self, perturbations: str | None = None, seed: int | None = None) -> Viewed:
-        """The line's episode; under other perturbations or of another seed.
+        """Return the record's episode; under other perturbations or of another seed.
 
         Raises:
             ValueError: its environment has no recording for Rerun.
@@ -87,7 +87,7 @@ class Replay:
 
     @property
     def _place(self) -> tuple[int, int]:
-        """The line's row in its batch, and how many rows that had."""
+        """Return the record's row in its batch, and how many rows that had."""
         policy = self.row.get("policy") or {}
         return policy.get("batch_row") or 0, policy.get("batch_size") or 1
 
@@ -111,12 +111,12 @@ class Replay:
 
 
 def line_of(result: ResultLine) -> Row:
-    """A result as its line is read back."""
+    """Return a result as its record is read back."""
     return json.loads(result.to_json())
 
 
 def _check_policy(played: dict[str, Any], path: Path, loaded: PolicyIdentity) -> None:
-    """Raise a ValueError if it is another than that which played."""
+    """Raise a ValueError if the loaded policy is another than the one that ran then."""
     if played.get("weights_sha256") not in (None, loaded.weights_sha256):
         raise ValueError(
             f"{path} holds other weights than those that played; name the folder that holds them with "

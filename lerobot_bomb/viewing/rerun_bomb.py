@@ -6,7 +6,7 @@ import rerun.blueprint as rrb
 
 from lerobot_bomb.bomb.board import BOARD, COLORS
 from lerobot_bomb.bomb.episode import EpisodeSpec, Stage
-from lerobot_bomb.bomb.move import TRAY, distance_m
+from lerobot_bomb.bomb.move import place_name
 from lerobot_bomb.bomb.observation import ACTION_NAMES, AGENT_POS, CAMERAS, PIXELS, STATE_NAMES
 from lerobot_bomb.bomb.privileged_state import PrivilegedState
 from lerobot_bomb.envs.results import EpisodeResult
@@ -22,7 +22,7 @@ EYE_M, LOOK_AT_M = (0.05, -0.30, 0.28), (0.05, 0.0, 0.03)  # in front of the boa
 
 
 class BombLog(EpisodeLog[EpisodeSpec, EpisodeResult]):
-    """Both cameras, the scene, what the arm does."""
+    """Log of an episode of BOMB: both cameras, the scene, what the arm does."""
 
     def __init__(self, recording: rr.RecordingStream, prefix: str, spec: EpisodeSpec) -> None:
         super().__init__(recording, prefix, spec)
@@ -135,7 +135,4 @@ class BombLog(EpisodeLog[EpisodeSpec, EpisodeResult]):
 
 def describe_place(xy: np.ndarray) -> str:
     """'target: row 1, column 3', or the tray."""
-    if distance_m(xy, TRAY) == 0:
-        return "target: the tray"
-    row, column = BOARD.nearest_intersection(xy)
-    return f"target: row {row}, column {column}"
+    return f"target: {place_name(xy)}"

@@ -73,7 +73,7 @@ class EpisodeLog[SpecT, ResultT: ResultLine](ABC):
     @staticmethod
     @abstractmethod
     def layout(prefix: str) -> rrb.Horizontal:
-        """What the viewer shows at first of the entities with this prefix."""
+        """Return what the viewer shows at first of the entities with this prefix."""
 
     @staticmethod
     @abstractmethod
@@ -106,12 +106,12 @@ class EpisodeLog[SpecT, ResultT: ResultLine](ABC):
 
 
 def text_views(prefix: str, *entities: str) -> list[rrb.TextDocumentView]:
-    """Each a text that stays until the next."""
+    """Return views of a text each, which stays until the next."""
     return [rrb.TextDocumentView(origin=f"{prefix}{entity}", name=entity) for entity in entities]
 
 
 def curve_views(prefix: str, *entities: str) -> list[rrb.TimeSeriesView]:
-    """Each with the curves below an entity."""
+    """Return views of the curves below an entity each."""
     return [rrb.TimeSeriesView(origin=f"{prefix}{entity}", name=entity) for entity in entities]
 
 

@@ -18,7 +18,7 @@ TILE_PAPER = (244, 244, 240)
 
 @dataclass(frozen=True)
 class Sheet:
-    """What a contact sheet shows; every row has an entry per column."""
+    """Contact sheet; every row has an entry per column."""
 
     title: str
     columns: list[str]

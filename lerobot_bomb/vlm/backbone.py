@@ -102,7 +102,7 @@ class SmolVLMBackbone(Backbone):
 
     @property
     def layers(self) -> list[nn.Module]:
-        """Of the text and the vision model."""
+        """Layers of the text and the vision model."""
         return [*self.text_model.layers, *self.vlm.model.vision_model.encoder.layers]
 
     def freeze_vision(self) -> None:
@@ -141,7 +141,7 @@ class SmolVLMBackbone(Backbone):
 
 
 def in_float32[T](module: Callable[[Tensor], T], hidden: Tensor) -> T:
-    """What a module of float32 weights makes of (..., H), whatever autocast says."""
+    """Run a module of float32 weights on (..., H), whatever autocast says."""
     # entering the context takes longer than a small product
     if not torch.is_autocast_enabled(hidden.device.type):
         return module(hidden.float())
@@ -188,7 +188,7 @@ def _check_image_size(own: int, asked: int | None) -> None:
 
 
 def check_family(vlm_model_name: str, *families: str) -> str:
-    """The family of a policy's base model, one of those that it has a backbone for; ``nano`` is the first.
+    """Return the family of a base model, one that the policy has a backbone for; ``nano`` is the first.
 
     Raises:
         OSError: there is no config; the message names the ways out.
@@ -254,7 +254,7 @@ def spread_images(vision_model: nn.Module) -> None:
 
 @torch.no_grad()
 def spread_filters(filters: Tensor) -> None:
-    """What `spread_images` does to the filters that embed patches, (channels, ...)."""
+    """Change the filters that embed patches, (channels, ...), as `spread_images` does."""
     filters -= filters.flatten(1).mean(dim=1).view(-1, *[1] * (filters.ndim - 1))
     filters /= INITIALIZER_RANGE
 

@@ -22,7 +22,7 @@ UNCHANGED = (1.0, 1.0, 1.0, 0.0)
 
 @dataclass(frozen=True)
 class ColorJitter:
-    """How far colours may change; 0 leaves them.
+    """Colour jitter by factors that say how far colours may change; 0 leaves them.
 
     Factors are drawn from 1 - x to 1 + x, a turn of the hue from -x to x of a whole one. They are applied in
     a random order, as torchvision's class of this name does.
@@ -34,7 +34,7 @@ class ColorJitter:
     hue: float
 
     def __call__(self, cameras: Sequence[Tensor], generator: torch.Generator) -> list[Tensor]:
-        """Each camera's (B, 3, H, W) in [0, 1] -> as many; a sample's change is the same in all cameras."""
+        """Change each camera's (B, 3, H, W) in [0, 1]; a sample's change is the same in all cameras."""
         changes = [self._draw(generator) for _ in range(len(cameras[0]))]
         with torch.autocast(cameras[0].device.type, enabled=False):
             return [
@@ -43,7 +43,7 @@ class ColorJitter:
             ]
 
     def _draw(self, generator: torch.Generator) -> list[tuple[int, float]]:
-        """Which of ADJUST to apply, in this order, and by which factors."""
+        """Draw which of ADJUST to apply, in this order, and by which factors."""
         reach = astuple(self)
         signed = (2 * torch.rand(len(reach), generator=generator) - 1).tolist()
         factors = [base + x * share for base, x, share in zip(UNCHANGED, reach, signed, strict=True)]

@@ -14,7 +14,7 @@ LANCZOS_LOBES = 3
 
 @dataclass(frozen=True)
 class CropWindows:
-    """Where each image of a batch is cut, in its pixels; all windows are equally large."""
+    """Windows in which each image of a batch is cut, in its pixels; all windows are equally large."""
 
     offsets: Tensor  # (B, 2) integers: first line and first column of each window
     height: int
@@ -48,7 +48,7 @@ def draw_windows(images_BxHW: Tensor, crop_fraction: float, generator: torch.Gen
 
 
 def crop(images_BxHW: Tensor, crop_fraction: float, generator: torch.Generator | None) -> Tensor:
-    """What the windows of `draw_windows` show of (B, ..., H, W) images."""
+    """Return what the windows of `draw_windows` show of (B, ..., H, W) images."""
     return draw_windows(images_BxHW, crop_fraction, generator).cut(images_BxHW)
 
 
@@ -80,7 +80,7 @@ def _resized_levels(images_B3HW: Tensor, size: int) -> Tensor:
 
 
 def _round_levels(levels: Tensor) -> Tensor:
-    """To whole numbers in 0..255, upwards from the middle between two; in place."""
+    """Round to whole numbers in 0..255, upwards from the middle between two; in place."""
     return levels.add_(0.5).floor_().clamp_(0, 255)
 
 

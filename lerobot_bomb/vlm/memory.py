@@ -1,4 +1,4 @@
-"""Whether a checkpoint's architecture fits into this machine's memory, asked before it is filled."""
+"""Check that a checkpoint's architecture fits into this machine's memory, before that is filled."""
 
 import os
 from collections.abc import Callable
@@ -11,7 +11,7 @@ GIB = 2**30
 
 
 def check_memory(vlm_config: dict[str, Any], build: Callable[[], nn.Module], dtype: torch.dtype) -> None:
-    """The model that `build` makes of a `vlm_config` has room in this machine's memory.
+    """Check that the model that `build` makes of a `vlm_config` has room in this machine's memory.
 
     ``dtype``: of most of its weights.
 
@@ -37,6 +37,6 @@ def check_memory(vlm_config: dict[str, Any], build: Callable[[], nn.Module], dty
 
 
 def _num_weights(config: dict[str, Any]) -> int:
-    """How many the layers have at least: those of two projections each."""
+    """Count the weights that the layers have at least: those of two projections each."""
     num_layers = config.get("num_hidden_layers") or config.get("depth") or 0
     return num_layers * 2 * config.get("hidden_size", 1) * config.get("intermediate_size", 1)

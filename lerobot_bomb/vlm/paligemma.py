@@ -82,7 +82,7 @@ class PaliGemmaBackbone(Backbone):
 
     @property
     def has_tied_head(self) -> bool:
-        """Whether words are written by the table that they are read by."""
+        """True if words are written by the table that they are read by."""
         return self.vlm.lm_head.weight is self.vlm.get_input_embeddings().weight
 
     def see(self, pixels_B3SS: Tensor) -> Tensor:
@@ -162,6 +162,6 @@ def build_paligemma(vlm_config: dict[str, Any], dtype: torch.dtype = torch.float
 
 
 def _attention(text_config: Any) -> dict[str, str]:
-    """Of transformers' kinds, ``sdpa`` leaves out the soft limit of attention's logits."""
+    """Return the attention of each model; transformers' ``sdpa`` leaves out the soft limit of logits."""
     kind = "sdpa" if text_config.attn_logit_softcapping is None else "eager"
     return {"text_config": kind, "vision_config": "sdpa"}

@@ -42,7 +42,7 @@ TASK_TEMPLATE = "Task: {},"
 
 @dataclass(frozen=True)
 class ChatFormat:
-    """What a family of models puts around a user's texts and its own."""
+    """Format of a chat: what a family of models puts around a user's texts and its own."""
 
     family: str  # of its tokenizers, in messages
     start: str  # of the sequence
@@ -202,7 +202,7 @@ def _check_numbers(
 
 
 def normalize_task(task: str) -> str:
-    """Lower case, underscores and line breaks as spaces, no outer spaces."""
+    """Write a task in lower case, with spaces for underscores and line breaks, and without outer spaces."""
     return re.sub(r"[_\r\n]", " ", task.lower()).strip()
 
 

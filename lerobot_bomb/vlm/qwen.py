@@ -7,7 +7,7 @@ Shapes: `B` batch, `L` tokens of a prefix, `T` of a segment, `H` hidden size, `P
 of an image in pixels, `V` key-value heads, `E` size of a head.
 """
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import asdict, dataclass
 from functools import partial
 from typing import Any
@@ -31,11 +31,11 @@ from lerobot_bomb.vlm.backbone import (
 )
 from lerobot_bomb.vlm.images import resize
 from lerobot_bomb.vlm.memory import check_memory
+from lerobot_bomb.vlm.prefix import KeysValues, Prefix, Reader
 from lerobot_bomb.vlm.presets import changed, nano_qwen_config
 from lerobot_bomb.vlm.prompt import QWEN_CHAT
+from lerobot_bomb.vlm.qwen_vision import embed_patches, read_windows_at_once
 from lerobot_bomb.vlm.tokenizer import NANO, load_tokenizer, single_id
-
-type KeysValues = tuple[Tensor, Tensor]  # (B, V, L, E) each
 
 
 @dataclass(frozen=True)
@@ -69,50 +69,6 @@ class QwenPrompt:
         return asdict(self)
 
 
-@dataclass(frozen=True)
-class Prefix:
-    """What the model keeps of images and text that it has read."""
-
-    hidden: Tensor  # (B, L, H) after the last layer
-    readable: Tensor  # (B, L) bool, False: padding, or a hidden token
-    next_position: Tensor  # (B, 1) int64, of what follows
-    layers: list[KeysValues]
-
-    def tensors(self) -> list[Tensor]:
-        """All of it, as `of` takes it."""
-        return [
-            self.hidden,
-            self.readable,
-            self.next_position,
-            *(part for layer in self.layers for part in layer),
-        ]
-
-    @classmethod
-    def of(cls, tensors: Sequence[Tensor]) -> "Prefix":
-        """The inverse of `tensors`."""
-        hidden, readable, next_position, *layers = tensors
-        return cls(hidden, readable, next_position, list(zip(layers[::2], layers[1::2], strict=True)))
-
-    def repeated(self, times: int) -> "Prefix":
-        """Every row so many times, beside each other."""
-        repeat = partial(torch.repeat_interleave, repeats=times, dim=0)
-        layers = [(repeat(keys), repeat(values)) for keys, values in self.layers]
-        return Prefix(repeat(self.hidden), repeat(self.readable), repeat(self.next_position), layers)
-
-
-class _Reader:
-    """Stands where a layer expects a cache: what is kept is read and not changed."""
-
-    def __init__(self, kept: KeysValues | None):
-        self._kept, self.new = kept, kept
-
-    def update(self, keys_BVTE: Tensor, values_BVTE: Tensor, _: int) -> KeysValues:
-        self.new = keys_BVTE, values_BVTE
-        if self._kept is None:
-            return self.new
-        return torch.cat([self._kept[0], keys_BVTE], dim=2), torch.cat([self._kept[1], values_BVTE], dim=2)
-
-
 class QwenBackbone(Backbone):
     """A stock ``Qwen2_5_VLForConditionalGeneration``, called in parts.
 
@@ -134,6 +90,7 @@ class QwenBackbone(Backbone):
         self.image_size = image_size  # pixels, square
         self.tokens_per_side = _tokens_per_side(vision_config, image_size)
         self._is_checkpointed = False
+        read_windows_at_once(self.vlm.model.visual)
         for name, values in (("pixel_mean", OPENAI_CLIP_MEAN), ("pixel_std", OPENAI_CLIP_STD)):
             self.register_buffer(name, torch.tensor(values)[:, None, None], persistent=False)
 
@@ -148,7 +105,7 @@ class QwenBackbone(Backbone):
 
     @property
     def layers(self) -> list[nn.Module]:
-        """Of the text and the vision model."""
+        """Layers of the text and the vision model."""
         return [*self.text_model.layers, *self.vlm.model.visual.blocks]
 
     def freeze_vision(self) -> None:
@@ -164,9 +121,7 @@ class QwenBackbone(Backbone):
         """(B, 3, S, S) in [0, 1] -> (B, P, H)."""
         patches = self._patches((pixels_B3SS - self.pixel_mean) / self.pixel_std)
         side = self.tokens_per_side * self._merge
-        grid_B3 = torch.tensor([[1, side, side]]).expand(len(pixels_B3SS), 3)
-        features = self.vlm.model.visual(patches, grid_thw=grid_B3).pooler_output
-        return features.unflatten(0, (len(pixels_B3SS), -1))
+        return embed_patches(self.vlm.model.visual, patches, len(pixels_B3SS), side)
 
     def _patches(self, pixels_B3SS: Tensor) -> Tensor:
         """A row of values for each patch, as a film of equal frames; the patches of a token in a row."""
@@ -195,23 +150,47 @@ class QwenBackbone(Backbone):
         return self.read_prefix(embeds_BLH, is_image_BL, mask_BL, hidden_BL).hidden
 
     def read_prefix(
-        self, embeds_BLH: Tensor, is_image_BL: Tensor, mask_BL: Tensor, hidden_BL: Tensor | None = None
+        self,
+        embeds_BLH: Tensor,
+        is_image_BL: Tensor,
+        mask_BL: Tensor,
+        hidden_BL: Tensor | None = None,
+        num_shared: int = 0,
     ) -> Prefix:
         """Read rows whose first column is written; ``is_image_BL``: which tokens are parts of images.
 
-        ``hidden_BL``: tokens that no other reads. They keep their positions.
+        ``hidden_BL``: tokens that no other reads. They keep their positions. ``num_shared``: first columns
+        that are written and the same in all rows; they are read once.
         """
         positions_3BL, next_B1 = self._positions(is_image_BL, mask_BL)
         readable_BL = mask_BL if hidden_BL is None else mask_BL & ~hidden_BL
-        hidden_BLH, layers = self._read(embeds_BLH, positions_3BL, causal_reads(readable_BL))
-        return Prefix(hidden_BLH, readable_BL, next_B1, layers)
+        reads_BLL = causal_reads(readable_BL)
+        if num_shared == 0 or len(embeds_BLH) == 1:
+            hidden_BLH, layers = self._read(embeds_BLH, positions_3BL, reads_BLL)
+            return Prefix(hidden_BLH, readable_BL, next_B1, layers)
+        first, rest = slice(num_shared), slice(num_shared, None)
+        shared = self._read(embeds_BLH[:1, first], positions_3BL[:, :1, first], reads_BLL[:1, first, first])
+        expand = partial(_expanded, len(embeds_BLH))
+        kept = [(expand(keys), expand(values)) for keys, values in shared[1]]
+        hidden_BLH, layers = self._read(
+            embeds_BLH[:, rest], positions_3BL[:, :, rest], reads_BLL[:, rest], kept
+        )
+        layers = [
+            (torch.cat([ks, keys], dim=2), torch.cat([vs, values], dim=2))
+            for (ks, vs), (keys, values) in zip(kept, layers, strict=True)
+        ]
+        return Prefix(torch.cat([expand(shared[0]), hidden_BLH], dim=1), readable_BL, next_B1, layers)
 
-    def read_segment(self, prefix: Prefix, embeds_BTH: Tensor, reads_BTT: Tensor) -> Tensor:
+    def read_segment(
+        self, prefix: Prefix, embeds_BTH: Tensor, reads_BTT: Tensor, num_copies: int = 1
+    ) -> Tensor:
         """(B, T, H) states after the last layer of tokens that follow a prefix and read all of it.
 
-        ``reads_BTT``: whether a token of the segment (row) reads another.
+        ``reads_BTT``: whether a token of the segment (row) reads another. ``num_copies``: equally long parts
+        of the segment, each of which stands right behind the prefix.
         """
-        positions_BT = prefix.next_position + torch.arange(embeds_BTH.shape[1], device=embeds_BTH.device)
+        column_T = torch.arange(embeds_BTH.shape[1], device=embeds_BTH.device)
+        positions_BT = prefix.next_position + column_T % (len(column_T) // num_copies)
         prefix_BTL = prefix.readable[:, None].expand(-1, embeds_BTH.shape[1], -1)
         reads_BTX = torch.cat([prefix_BTL, reads_BTT], dim=2)
         return self._read(embeds_BTH, positions_BT.expand(3, -1, -1), reads_BTX, prefix.layers)[0]
@@ -250,8 +229,13 @@ class QwenBackbone(Backbone):
         return torch.stack([starts_BL, starts_BL + lines_BL, starts_BL + columns_BL]), ends_BL[:, -1:]
 
 
+def _expanded(batch_size: int, row: Tensor) -> Tensor:
+    """One row, again for each of a batch, without a copy."""
+    return row.expand(batch_size, *row.shape[1:])
+
+
 def _tokens_per_side(vision_config: Any, image_size: int) -> int:
-    """How many tokens a line of an image is.
+    """Return how many tokens a line of an image is.
 
     Raises:
         ValueError: not a whole number.
@@ -272,7 +256,7 @@ def _read_layer(
     rotation: tuple[Tensor, Tensor],
     kept: KeysValues | None,
 ) -> tuple[Tensor, KeysValues]:
-    reader: Any = _Reader(kept)
+    reader: Any = Reader(kept)
     x_BTH = layer(x_BTH, attention_mask=reads_B1TX, position_embeddings=rotation, past_key_values=reader)
     return x_BTH, reader.new
 

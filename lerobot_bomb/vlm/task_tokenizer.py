@@ -69,7 +69,7 @@ class TaskStep(ObservationProcessorStep):
 
     @abstractmethod
     def tokens(self, tasks: list[str]) -> dict[str, Tensor]:
-        """What is added to the observation: ids (B, L) and whatever goes with them, by their keys."""
+        """Return what is added to the observation: ids (B, L) and whatever goes with them, by their keys."""
 
     def transform_features(
         self, features: dict[PipelineFeatureType, dict[str, PolicyFeature]]

@@ -1,4 +1,4 @@
-"""What the model card of an ``fdvla`` says of the method."""
+"""Model card of ``fdvla``: what it says of the method."""
 
 from lerobot_bomb.hub.method import Method, Paper
 

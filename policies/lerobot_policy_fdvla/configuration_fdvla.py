@@ -21,6 +21,7 @@ from lerobot_bomb.flow.samplers import (
     check_sampling,
 )
 from lerobot_bomb.policies.config import RELATIVE_AS_TRAINED, RelativeVlaConfig
+from lerobot_bomb.policies.pointing_config import PlacesVlaConfig
 from lerobot_bomb.training.policy_flags import (
     MAX_POSITIONS,
     check_not_negative,
@@ -43,6 +44,7 @@ SHAPES = (
     "dualmod_denoise",
     "head_dim",
     "dualmod_dim",
+    "pointing",
 )
 # the same, and flags that say what the model's tokens mean
 AS_TRAINED = (
@@ -54,7 +56,7 @@ AS_TRAINED = (
 
 @PreTrainedConfig.register_subclass("fdvla")
 @dataclass
-class FdvlaConfig(RelativeVlaConfig):
+class FdvlaConfig(RelativeVlaConfig, PlacesVlaConfig):
     """A Qwen2.5-VL reads noisy actions beside images and text; two heads take them to clean ones."""
 
     CHOICES: ClassVar[dict[str, tuple]] = {
@@ -64,6 +66,9 @@ class FdvlaConfig(RelativeVlaConfig):
         "time_sampling": TIME_SAMPLINGS,
         "train_vlm": TRAIN_VLM,
     }
+
+    NEEDS_STATE: ClassVar[tuple[str, ...]] = (*RelativeVlaConfig.NEEDS_STATE, "pointing")
+    LATER_FIELDS: ClassVar[dict[str, Any]] = {**PlacesVlaConfig.LATER_FIELDS, "pointing_loss_weight": 1.0}
 
     # Hub id, path of a local folder, or "nano": a small model with random weights, built in code
     vlm_model_name: str = "Qwen/Qwen2.5-VL-3B-Instruct"
@@ -111,6 +116,9 @@ class FdvlaConfig(RelativeVlaConfig):
     # times and noises that each chunk of a batch is trained at; the prompt is read once for all
     draws_per_chunk: int = 1
 
+    # of what is pointed at, beside the heads' losses
+    pointing_loss_weight: float = 1.0
+
     # "residual", "flow", "ddim", "sde" or "paper"; None = residual with both heads, else that of the one
     sampler: str | None = None
     # "euler" or "heun"
@@ -148,7 +156,9 @@ class FdvlaConfig(RelativeVlaConfig):
             raise ValueError(
                 "--policy.freeze_vision_encoder=false needs --policy.train_vlm=full: frozen freezes both"
             )
-        check_not_negative(self, ("flow_loss_weight", "denoise_loss_weight", "noise_seed"))
+        check_not_negative(
+            self, ("flow_loss_weight", "denoise_loss_weight", "noise_seed", "pointing_loss_weight")
+        )
         if self.consistency_loss_weight is not None:
             check_not_negative(self, ("consistency_loss_weight",))
         with _policy_flags():
@@ -197,7 +207,7 @@ class FdvlaConfig(RelativeVlaConfig):
 
     @property
     def has_energy(self) -> bool:
-        """Whether the loss has a term that takes second derivatives."""
+        """True if the loss has a term that takes second derivatives."""
         return self.consistency == "energy_vjp" and self.used_consistency_weight > 0
 
     def sampling(self) -> dict[str, Any]:

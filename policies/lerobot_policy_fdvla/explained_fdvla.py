@@ -6,8 +6,10 @@ Shapes as in `modeling_fdvla`; `J` draws of noise and time.
 from typing import TYPE_CHECKING, ClassVar
 
 import torch
+from lerobot.utils.constants import OBS_STATE
 from torch import Tensor
 
+from lerobot_bomb.bomb.pointing import PointedAt
 from lerobot_bomb.explain.explained import (
     ANSWER,
     INSTRUCTION,
@@ -25,6 +27,7 @@ if TYPE_CHECKING:
 
 NUM_DRAWS = 8  # of noise and time; times in the middle of as many equal parts of [0, 1]
 SEED = 0
+POINTING = "pointing"  # the pass that points
 
 
 class ExplainedFdvla(PromptExplained):
@@ -45,7 +48,8 @@ class ExplainedFdvla(PromptExplained):
         policy = self._policy.eval()
         with policy._autocast():
             rows = self.prompt(policy._prompt_parts(batch))
-            return rows | {"embeds": policy._embeds(batch, rows["ids"])}
+            state = {} if policy.pointer is None else {OBS_STATE: policy._of_batch(batch, OBS_STATE)}
+            return rows | state | {"embeds": policy._embeds(batch, rows["ids"])}
 
     def score(self, rows: Rows, answer: Tensor) -> Tensor:
         policy, config = self._policy.eval(), self._policy.config
@@ -60,13 +64,16 @@ class ExplainedFdvla(PromptExplained):
         is_task_BL = prompt.readable & self.of_part(rows, INSTRUCTION)
         with policy._autocast():
             context = policy._context(prompt, is_task_BL, rows["embeds"])
-            predicted = policy._heads(context.repeated(NUM_DRAWS))(point.actions, point.tau)
+            if policy.pointer is not None:
+                context = policy._pointing(context, rows[OBS_STATE])
+            kept = torch.ones(point.actions.shape[:2], dtype=torch.bool, device=answer.device)
+            predicted = policy._heads(context, kept)(point.actions, point.tau)
         velocity_BKD, noise_BKD = (None if values is None else values.float() for values in predicted)
         loss_B, _ = joint_loss(
             velocity_BKD,
             noise_BKD,
             point,
-            torch.ones(point.actions.shape[:2], dtype=torch.bool, device=answer.device),
+            kept,
             flow_loss_weight=config.flow_loss_weight,
             denoise_loss_weight=config.denoise_loss_weight,
             consistency="none",
@@ -74,10 +81,23 @@ class ExplainedFdvla(PromptExplained):
         )
         return -loss_B.unflatten(0, (num_rows, NUM_DRAWS)).mean(dim=1)
 
+    def pointed(self, batch: Batch) -> PointedAt | None:
+        policy = self._policy.eval()
+        if policy.pointer is None:
+            return None
+        with torch.no_grad(), policy._autocast():
+            pointed = policy._point(policy._read(batch), policy._of_batch(batch, OBS_STATE))
+            return policy.pointer.pointed_at(pointed)
+
     def places(self, rows: Rows) -> dict[str, Place]:
-        """In two passes: over the prompt, padding included, and over the noisy actions."""
-        places: dict[str, Place] = {name: (each, None) for name, each in self.columns(rows).items()}
-        return places | {ANSWER: (None, slice(None))}
+        """Return places in passes over the prompt, padding included, over what points, and noisy actions."""
+        segments = [ANSWER] if self._policy.pointer is None else [POINTING, ANSWER]
+        places: dict[str, Place] = {
+            name: (each, *[None] * len(segments)) for name, each in self.columns(rows).items()
+        }
+        return places | {
+            name: (None, *(slice(None) if each == name else None for each in segments)) for name in segments
+        }
 
     def _noise(self, num_draws: int) -> Tensor:
         """(J, K, D) standard normal, the same in every call."""

@@ -7,15 +7,14 @@ Shapes: `B` batch, `K` actions of a chunk, `D` action dims, `L` tokens of a prom
 """
 
 import logging
-from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import replace
 from functools import partial
 from typing import Any, ClassVar
 
 import torch
 from lerobot.datasets import LeRobotDatasetMetadata
 from lerobot.policies.rtc import RTCProcessor
-from lerobot.utils.constants import ACTION
+from lerobot.utils.constants import ACTION, OBS_STATE
 from torch import Tensor, nn
 
 from lerobot_bomb.actions.accuracy import means
@@ -29,46 +28,28 @@ from lerobot_bomb.flow.noise import SamplingNoise
 from lerobot_bomb.flow.path import PathPoint, draw_tau, path_point
 from lerobot_bomb.flow.real_time import guided, without_padding
 from lerobot_bomb.flow.samplers import SAMPLERS, Heads, num_evaluations, sample
+from lerobot_bomb.policies.pointing import Labels
+from lerobot_bomb.policies.pointing_policy import BOARD_READER, Parts, PointingVlaPolicy, plus
 from lerobot_bomb.policies.policy import RelativeVlaPolicy
 from lerobot_bomb.training.distributed import weighed
 from lerobot_bomb.training.randomness import begin_batch
 from lerobot_bomb.vlm.images import draw_windows, resize
 from lerobot_bomb.vlm.inputs import read_actions, read_image, read_task
-from lerobot_bomb.vlm.qwen import Prefix
 from lerobot_policy_fdvla.building_fdvla import build_model
 from lerobot_policy_fdvla.card_fdvla import METHOD
 from lerobot_policy_fdvla.configuration_fdvla import AS_TRAINED, SHAPES, FdvlaConfig
+from lerobot_policy_fdvla.context_fdvla import Context
 from lerobot_policy_fdvla.explained_fdvla import ExplainedFdvla
-from lerobot_policy_fdvla.networks_fdvla import NUM_MARKS, ActionSegment, Head
+from lerobot_policy_fdvla.networks_fdvla import NUM_MARKS, ActionSegment, Head, SideBySide
+from lerobot_policy_fdvla.pointing_fdvla import Pointed, make_pointer
 
 logger = logging.getLogger(__name__)
 
 # not of the base model: trained whole beside its adapters
-NEW_PARTS = ("segment", "state_embedding", "flow_head", "denoise_head")
+NEW_PARTS = ("segment", "state_embedding", "pointer", BOARD_READER, "flow_head", "denoise_head")
 
 
-@dataclass(frozen=True)
-class Context:
-    """An observation as every sampling step reads it."""
-
-    prefix: Prefix
-    pooled: Tensor  # (B, H)
-
-    def repeated(self, times: int) -> "Context":
-        """Every row so many times, beside each other."""
-        return Context(self.prefix.repeated(times), self.pooled.repeat_interleave(times, dim=0))
-
-    def tensors(self) -> list[Tensor]:
-        """All of it, as `of` takes it."""
-        return [self.pooled, *self.prefix.tensors()]
-
-    @classmethod
-    def of(cls, tensors: Sequence[Tensor]) -> "Context":
-        """The inverse of `tensors`."""
-        return cls(Prefix.of(tensors[1:]), tensors[0])
-
-
-class FdvlaPolicy(RelativeVlaPolicy):
+class FdvlaPolicy(RelativeVlaPolicy, PointingVlaPolicy):
     """A Qwen2.5-VL that reads noisy actions; two heads predict where they go and what noise is in them."""
 
     config_class = FdvlaConfig  # pyright: ignore[reportAssignmentType]  LeRobot annotates it as None
@@ -92,6 +73,8 @@ class FdvlaPolicy(RelativeVlaPolicy):
         flow_dim, denoise_dim = (config.dualmod_dim if of_head else None for of_head in modulated)
         self.flow_head = make_head(flow_dim) if config.use_flow_head else None
         self.denoise_head = make_head(denoise_dim) if config.use_denoise_head else None
+        self.pointer = make_pointer(config, hidden_size, dataset_meta)
+        self._add_board_reader(hidden_size, self.backbone.tokens_per_image)
         logger.info("fdvla: %s", self.parameter_counts)
         heads = [head for head in (self.flow_head, self.denoise_head) if head is not None]
         self._captured = GraphedModel(self._sample, [self.backbone.text_model, self.segment, *heads])
@@ -106,14 +89,19 @@ class FdvlaPolicy(RelativeVlaPolicy):
         assert self.config.robot_state_feature is not None
         return nn.Linear(self.config.robot_state_feature.shape[0], hidden_size)
 
+    def _fit(self, meta: LeRobotDatasetMetadata) -> None:
+        super()._fit(meta)
+        if self.pointer is not None:
+            self.pointer.fit(meta, self.config)
+
     @property
     def parameter_counts(self) -> dict[str, int]:
-        """Of each part, and of those that are trained in all."""
+        """Number of parameters of each part, and of all that are trained."""
         counts = {name: sum(p.numel() for p in part.parameters()) for name, part in self.named_children()}
         return {**counts, "trained": sum(p.numel() for p in self.get_optim_params())}
 
     def explained(self) -> ExplainedFdvla:
-        """This policy as `lerobot_bomb.explain` asks it."""
+        """Return the policy as `lerobot_bomb.explain` asks it."""
         return ExplainedFdvla(self)
 
     def _get_default_peft_targets(self) -> dict[str, Any]:
@@ -133,13 +121,14 @@ class FdvlaPolicy(RelativeVlaPolicy):
         if self.training:
             begin_batch(self.config, self.generator)
         draws = self.config.draws_per_chunk
-        actions_BKD = self._actions(batch).repeat_interleave(draws, dim=0)
-        kept_BK = self._kept(batch).repeat_interleave(draws, dim=0)
+        actions_BKD, kept_BK, labels = self._targets(batch)
+        actions_BKD, kept_BK = (each.repeat_interleave(draws, dim=0) for each in (actions_BKD, kept_BK))
         point = self._draw_point(actions_BKD)
         with self._autocast(), second_derivatives(self.config.has_energy):
             if self.config.has_energy:
                 point.actions.requires_grad_()
-            heads = self._heads(self._read(batch).repeated(draws), kept_BK)
+            context, pointing, features_BPH = self._read_and_point(batch, labels)
+            heads = self._heads(context, kept_BK)
             velocity_BKD, noise_BKD = heads(point.actions, point.tau)
             loss, terms = joint_loss(
                 None if velocity_BKD is None else velocity_BKD.float(),
@@ -157,7 +146,35 @@ class FdvlaPolicy(RelativeVlaPolicy):
             loss = loss.unflatten(0, (-1, draws)).mean(dim=1)
         elif self.training:
             loss = weighed(loss, kept_BK)
-        return loss, self._metrics(loss, terms, velocity_BKD, noise_BKD, point, actions_BKD, kept_BK)
+        for name, loss_B in pointing.items():
+            loss = plus(loss, self.config.pointing_loss_weight, loss_B)
+            terms[name] = loss_B.detach().mean()
+        loss, board = self._with_board(loss, batch, features_BPH)
+        return loss, self._metrics(loss, terms, board, velocity_BKD, noise_BKD, point, actions_BKD, kept_BK)
+
+    def _targets(self, batch: dict[str, Tensor]) -> tuple[Tensor, Tensor, Labels | None]:
+        """Actions (B, K, D), which of them are kept (B, K), and what is pointed at."""
+        actions_BKD, kept_BK = self._actions(batch), self._kept(batch)
+        if self.pointer is None:
+            return actions_BKD, kept_BK, None
+        labels = self.pointer.draw_labels(batch, self.config, self.generator)
+        other_B1D = self._to_relative(labels.other_actions[:, None], batch)
+        return *labels.given_actions(actions_BKD, kept_BK, other_B1D), labels
+
+    def _read_and_point(
+        self, batch: dict[str, Tensor], labels: Labels | None
+    ) -> tuple[Context, dict[str, Tensor], Tensor]:
+        """The observation, with the places that heads are given; losses (B,) of what is pointed at.
+
+        And image features (B, P, H), P of all cameras, as the language model reads them.
+        """
+        context, embeds_BLH = self._read_embeds(batch)
+        features_BPH = embeds_BLH[:, self._image_columns(embeds_BLH.device)]
+        if self.pointer is None or labels is None:
+            return context, {}, features_BPH
+        pointed = self._point(context, self._of_batch(batch, OBS_STATE))
+        context = replace(context, feedback=self.pointer.feed_back(pointed, labels.given))
+        return context, self.pointer.losses(pointed, labels), features_BPH
 
     def _actions(self, batch: dict[str, Tensor]) -> Tensor:
         """(B, K, D) as the heads predict them: normalised, and relative where they are."""
@@ -175,6 +192,7 @@ class FdvlaPolicy(RelativeVlaPolicy):
         self,
         loss: Tensor,
         terms: dict[str, Tensor],
+        board: Parts,
         velocity_BKD: Tensor | None,
         noise_BKD: Tensor | None,
         point: PathPoint,
@@ -186,22 +204,11 @@ class FdvlaPolicy(RelativeVlaPolicy):
         Errors are known where a dataset was given, that is while training. Padded actions do not count.
         """
         parts = {name: (term, torch.ones_like(term, dtype=torch.bool)) for name, term in terms.items()}
-        errors_BKD = self._implied_actions(velocity_BKD, noise_BKD, point) - actions_BKD
+        limits = self.config.denoise_tau_min, self.config.clip_sample_range
+        errors_BKD = point.implied_actions(velocity_BKD, noise_BKD, *limits) - actions_BKD
         errors_BKD = errors_BKD.abs() * self._unit
-        parts |= self._l1_parts(errors_BKD, kept_BK[..., None].expand_as(errors_BKD))
+        parts |= board | self._l1_parts(errors_BKD, kept_BK[..., None].expand_as(errors_BKD))
         return means(parts, loss, self.config.trained_batches)
-
-    def _implied_actions(
-        self, velocity_BKD: Tensor | None, noise_BKD: Tensor | None, point: PathPoint
-    ) -> Tensor:
-        """(B, K, D) where the rest of a straight path leads, by the flow head if there is one."""
-        tau_B11 = point.tau[:, None, None]
-        if velocity_BKD is not None:
-            return point.actions + (1 - tau_B11) * velocity_BKD.float()
-        assert noise_BKD is not None
-        tau_B11 = tau_B11.clamp(min=self.config.denoise_tau_min)
-        clean_BKD = (point.actions - (1 - tau_B11) * noise_BKD.float()) / tau_B11
-        return clean_BKD.clamp(-self.config.clip_sample_range, self.config.clip_sample_range)
 
     # Inference
 
@@ -227,6 +234,8 @@ class FdvlaPolicy(RelativeVlaPolicy):
         # real-time chunking takes gradients, and what is captured is written over
         with torch.inference_mode(False), torch.no_grad(), self._autocast():
             context = self._read(batch)
+            if self.pointer is not None:
+                context = self._pointing(context, self._of_batch(batch, OBS_STATE))
             shape = len(context.pooled), self.config.chunk_size, self._action_dim
             noises = self._noise(noise, shape), self._step_noise(shape)
             if self.rtc_processor is not None and prev_chunk_left_over is not None:
@@ -247,7 +256,7 @@ class FdvlaPolicy(RelativeVlaPolicy):
 
     @property
     def last_passes(self) -> int:
-        """Of the text model in a prediction: the prompt's, and those of the sampler's steps."""
+        """Passes of the text model in a prediction: the prompt's, and those of the sampler's steps."""
         return 1 + num_evaluations(self.config.solver, self.config.num_inference_steps)
 
     def _left_over(self, actions_KD: Tensor, batch: dict[str, Tensor]) -> Tensor:
@@ -255,8 +264,9 @@ class FdvlaPolicy(RelativeVlaPolicy):
         return self._to_relative(without_padding(actions_KD).to(self._device), batch)
 
     def _sample(self, noise_BKD: Tensor, step_noise: Tensor, *context: Tensor) -> tuple[Tensor]:
-        """All sampling steps, as a function of tensors."""
-        return (self._denoise(self._heads(Context.of(context)), noise_BKD, step_noise),)
+        """Run all sampling steps, as a function of tensors."""
+        heads = self._heads(Context.of(context, has_feedback=self.pointer is not None))
+        return (self._denoise(heads, noise_BKD, step_noise),)
 
     def _denoise(self, heads: Heads, noise_BKD: Tensor, step_noise: Tensor) -> Tensor:
         step_noise_BNKD = step_noise if self.config.used_sampler == "sde" else None
@@ -278,7 +288,7 @@ class FdvlaPolicy(RelativeVlaPolicy):
         return self._sampling_noise.draw(batch_size, shape).to(self._device)
 
     def supports_rtc(self) -> bool:
-        """Whether the sampler follows a velocity, which real-time chunking guides."""
+        """Return True if the sampler follows a velocity, which real-time chunking guides."""
         return "flow" in SAMPLERS[self.config.used_sampler]
 
     def init_rtc_processor(self) -> None:
@@ -299,19 +309,21 @@ class FdvlaPolicy(RelativeVlaPolicy):
     def _heads(self, context: Context, kept_BK: Tensor | None = None) -> Heads:
         """Noisy actions and times -> velocity and noise (B, K, D); None for a missing head.
 
-        A call is one pass over the segment. Its shapes are static, and nothing in it waits for the device.
+        ``B`` may be a multiple of the observations: draws of one stand beside each other. A call is one pass
+        over the segment. Its shapes are static, and nothing in it waits for the device.
         """
         if kept_BK is None:
             shape = len(context.pooled), self.config.chunk_size
             kept_BK = torch.ones(shape, dtype=torch.bool, device=context.pooled.device)
         reads_BTT = self.segment.reads(kept_BK, causal=self.config.segment_attention == "causal")
         heads = self.flow_head, self.denoise_head
-        modulations = [None if head is None else head.modulation(context.pooled) for head in heads]
+        of_draws = context.of_draws(len(kept_BK) // len(context.pooled))
+        modulations = [None if head is None else head.modulation(of_draws.pooled) for head in heads]
 
         def predict(actions_BKD: Tensor, tau_B: Tensor) -> tuple[Tensor | None, Tensor | None]:
-            embeds_BTH = self.segment(actions_BKD, tau_B)
-            states_BTH = self.backbone.read_segment(context.prefix, embeds_BTH, reads_BTT)
-            states_BKH = self.segment.of_actions(states_BTH)
+            states_BKH = self._action_states(context, actions_BKD, tau_B, reads_BTT)
+            if of_draws.feedback is not None:
+                states_BKH = states_BKH + of_draws.feedback[:, None]
             velocity_BKD, noise_BKD = (
                 None if head is None else head(states_BKH, modulation)
                 for head, modulation in zip(heads, modulations, strict=True)
@@ -320,16 +332,50 @@ class FdvlaPolicy(RelativeVlaPolicy):
 
         return predict
 
-    def _read(self, batch: dict[str, Tensor]) -> Context:
-        """The prompt, once for all sampling steps."""
-        rows, is_task_BL = self._prompt(batch)
-        return self._context(rows, is_task_BL, self._embeds(batch, rows.ids))
+    def _action_states(
+        self, context: Context, actions_BKD: Tensor, tau_B: Tensor, reads_BTT: Tensor
+    ) -> Tensor:
+        """(B, K, H) of the tokens of noisy actions; draws of one observation read it and not each other."""
+        embeds_BTH = self.segment(actions_BKD, tau_B)
+        draws = SideBySide(len(embeds_BTH) // len(context.pooled))
+        states = self.backbone.read_segment(
+            context.prefix, draws.joined(embeds_BTH), draws.reads(reads_BTT), draws.number
+        )
+        return self.segment.of_actions(states.reshape(embeds_BTH.shape))
 
-    def _context(self, rows: TokenRows, is_task_BL: Tensor, embeds_BLH: Tensor) -> Context:
-        """What `_prompt` and `_embeds` made of a batch, read by the language model."""
+    def _pointing(self, context: Context, state_BS: Tensor) -> Context:
+        """Return the context with the feedback of what it points at."""
+        assert self.pointer is not None
+        return replace(context, feedback=self.pointer.feed_back(self._point(context, state_BS)))
+
+    def _point(self, context: Context, state_BS: Tensor) -> Pointed:
+        """Read off the first action's token, of a chunk of zeros where all is noise."""
+        assert self.pointer is not None
+        shape, device = (len(context.pooled), self.config.chunk_size, self._action_dim), self._device
+        kept_BK = torch.ones(shape[:2], dtype=torch.bool, device=device)
+        reads_BTT = self.segment.reads(kept_BK, causal=self.config.segment_attention == "causal")
+        zeros = torch.zeros(shape, device=device), torch.zeros(shape[0], device=device)
+        states_BKH = self._action_states(context, *zeros, reads_BTT)
+        return self.pointer(states_BKH[:, 0], state_BS)
+
+    def _read(self, batch: dict[str, Tensor]) -> Context:
+        """Read the prompt, once for all sampling steps."""
+        return self._read_embeds(batch)[0]
+
+    def _read_embeds(self, batch: dict[str, Tensor]) -> tuple[Context, Tensor]:
+        """Read the prompt, and return its embeddings (B, L, H), too."""
+        rows, is_task_BL = self._prompt(batch)
+        embeds_BLH = self._embeds(batch, rows.ids)
+        return self._context(rows, is_task_BL, embeds_BLH, len(self.tokens.start)), embeds_BLH
+
+    def _context(
+        self, rows: TokenRows, is_task_BL: Tensor, embeds_BLH: Tensor, num_shared: int = 0
+    ) -> Context:
+        """Read what `_prompt` and `_embeds` made of a batch with the language model."""
         is_image_BL = rows.ids == self.tokens.image
-        prefix = self.backbone.read_prefix(embeds_BLH, is_image_BL, rows.mask, rows.hidden)
-        return Context(prefix, masked_mean_pool(prefix.hidden, self._pooled(rows.readable, is_task_BL)))
+        prefix = self.backbone.read_prefix(embeds_BLH, is_image_BL, rows.mask, rows.hidden, num_shared)
+        pooled_BH = masked_mean_pool(prefix.hidden, self._pooled(rows.readable, is_task_BL))
+        return Context(prefix, pooled_BH, feedback=None)
 
     def _pooled(self, readable_BL: Tensor, is_task_BL: Tensor) -> Tensor:
         """(B, L) bool: the tokens that are pooled; all of them where there is no instruction."""
@@ -343,13 +389,13 @@ class FdvlaPolicy(RelativeVlaPolicy):
     # Prompt: start, images, task (with padding), a place for the state, end
 
     def _prompt(self, batch: dict[str, Tensor]) -> tuple[TokenRows, Tensor]:
-        """Its tokens, and which of them (B, L) are the task's, without hidden ones."""
+        """Return the prompt's tokens, and which of them (B, L) are the task's, without hidden ones."""
         parts = self._prompt_parts(batch)
         is_task = [part.readable & (name == "instruction") for name, part in parts.items()]
         return TokenRows.join([*parts.values()]), torch.cat(is_task, dim=1)
 
     def _prompt_parts(self, batch: dict[str, Tensor]) -> dict[str, TokenRows]:
-        """Its tokens by what they are of; an image's by its camera."""
+        """Return the prompt's parts by name; an image's name is its camera."""
         task = read_task(batch, self.config.type, self._device)
         parts = {"start": TokenRows.constant(self.tokens.start, task.ids)}
         parts |= {camera: TokenRows.constant(self._image_ids, task.ids) for camera in self._cameras}
@@ -393,7 +439,7 @@ class FdvlaPolicy(RelativeVlaPolicy):
 
     @property
     def _num_fixed_tokens(self) -> int:
-        """Of prompt and segment, without the task."""
+        """Number of tokens of prompt and segment, without the task."""
         of_prompt = len(self.tokens.start) + len(self._cameras) * len(self._image_ids)
         of_prompt += self.config.use_state + len(self.tokens.end)
         return of_prompt + self.config.chunk_size + NUM_MARKS

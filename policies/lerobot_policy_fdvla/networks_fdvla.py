@@ -1,10 +1,11 @@
-"""What is new in ``fdvla`` beside the vision-language model: noisy actions as tokens, and the heads.
+"""Networks that ``fdvla`` adds to the vision-language model: noisy actions as tokens, and the heads.
 
 Shapes: `B` batch, `K` action steps, `D` action dims, `H` hidden size of the language model, `F` of a head's
-features, `T` = K + 3 tokens of a segment.
+features, `T` = K + 3 tokens of a segment, `O` observations with `J` draws each.
 """
 
 import math
+from dataclasses import dataclass
 
 import torch
 from torch import Tensor, nn
@@ -60,6 +61,24 @@ class ActionSegment(nn.Module):
         return reads_BTT.tril() if causal else reads_BTT
 
 
+@dataclass(frozen=True)
+class SideBySide:
+    """Segments of so many draws of an observation as one, in which none reads another's tokens."""
+
+    number: int
+
+    def joined(self, embeds_BTH: Tensor) -> Tensor:
+        """(B, T, H) -> (B / number, number * T, H)."""
+        return embeds_BTH.reshape(-1, self.number * embeds_BTH.shape[1], embeds_BTH.shape[2])
+
+    def reads(self, reads_BTT: Tensor) -> Tensor:
+        """Spread which tokens each (row) reads: (B, T, T) -> (B / number, number * T, number * T) bool."""
+        is_own_JJ = torch.eye(self.number, dtype=torch.bool, device=reads_BTT.device)
+        reads_OJTT = reads_BTT.unflatten(0, (-1, self.number))
+        reads_OJTJT = reads_OJTT[:, :, :, None] & is_own_JJ[:, None, :, None]
+        return reads_OJTJT.flatten(3).flatten(1, 2)
+
+
 class Head(nn.Module):
     """States of the action tokens -> (B, K, D), modulated by pooled states of the prompt."""
 
@@ -77,5 +96,5 @@ class Head(nn.Module):
         return self.out(features_BKF)
 
     def modulation(self, pooled_BH: Tensor) -> tuple[Tensor, Tensor] | None:
-        """What (B, H) pooled states make of the features, the same in all sampling steps."""
+        """Return what (B, H) pooled states make of the features, the same in all sampling steps."""
         return None if self.film is None else self.film.coefficients(pooled_BH)

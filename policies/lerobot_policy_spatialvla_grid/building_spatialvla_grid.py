@@ -19,9 +19,24 @@ from lerobot_policy_spatialvla_grid.configuration_spatialvla_grid import Spatial
 
 logger = logging.getLogger(__name__)
 
+# patterns of modules that have adapters beside the text model's
+VISION_LAYERS = r"backbone\.vlm\.model\.vision_tower\..*\.((q|k|v|out)_proj|fc[12])"
+PROJECTOR = r"backbone\.vlm\.model\.multi_modal_projector\.linear"
+EGO3D_LAYERS = r"ego3d\.layers\.[03]"
+
+
+def adapted_layers(config: SpatialvlaGridConfig) -> list[str]:
+    """Patterns of these, as far as the config trains them."""
+    others = [PROJECTOR]
+    if not config.freeze_vision_encoder:
+        others.append(VISION_LAYERS)
+    if config.depth_source != "none":
+        others.append(EGO3D_LAYERS)
+    return others
+
 
 def build_depth(config: SpatialvlaGridConfig) -> ZoeDepth | None:
-    """As `build_model`: a checkpoint's architecture, else the weights of ``depth_model_name``."""
+    """Build ZoeDepth from a checkpoint's architecture, else from the weights of ``depth_model_name``."""
     if config.depth_source != "zoedepth":
         return None
     if config.depth_config is not None:

@@ -1,4 +1,4 @@
-"""What the model card of a ``spatialvla_grid`` says of the method."""
+"""Model card of ``spatialvla_grid``: what it says of the method."""
 
 from lerobot_bomb.hub.method import Method, Paper
 

@@ -1,6 +1,7 @@
 """Config of ``spatialvla_grid``."""
 
 from collections.abc import Collection
+from copy import deepcopy
 from dataclasses import dataclass, field
 from typing import Any, ClassVar
 
@@ -15,13 +16,16 @@ from lerobot_bomb.actions.grid_settings import (
     check_groups,
     default_groups,
 )
+from lerobot_bomb.bomb.observation import WORKSPACE_HIGH_M, WORKSPACE_LOW_M
 from lerobot_bomb.flags import one_of
 from lerobot_bomb.policies.config import TokenVlaConfig
+from lerobot_bomb.policies.pointing_config import PlacesVlaConfig
 from lerobot_bomb.training.policy_flags import (
     check_not_negative,
     check_positive,
 )
 from lerobot_bomb.vlm.prompt import check_template
+from lerobot_policy_spatialvla_grid.pointing_spatialvla_grid import StoneCells
 
 DEPTH_SOURCES = ("none", "observation", "zoedepth")
 PREFIX_ATTENTIONS = ("bidirectional", "causal")
@@ -29,15 +33,17 @@ LOSS_VOCABULARIES = ("slot", "full")
 DRAFTS = ("none", "repeat")
 NUM_STATE_BINS = 256
 # flags that say what shapes the weights have, beside the grids' own
-SHAPES = ("nano_config", "ego3d_no_depth_vector")
+SHAPES = ("nano_config", "ego3d_no_depth_vector", "pointing", "pointing_area_m", "pointing_cell_m")
 # the same, and flags that say what the model reads and writes
 AS_TRAINED = ("chunk_size", "use_state", "prefix_attention", "task_template", *SHAPES)
 BARE_TASK = "{}"
+WORKSPACE_M = [list(WORKSPACE_LOW_M[:2]), list(WORKSPACE_HIGH_M[:2])]
+STONE_CELL_M = 0.005  # a fifth of a stone, and about what a small vision model tells apart
 
 
 @PreTrainedConfig.register_subclass("spatialvla_grid")
 @dataclass
-class SpatialvlaGridConfig(TokenVlaConfig):
+class SpatialvlaGridConfig(TokenVlaConfig, PlacesVlaConfig):
     """A PaliGemma 2 chooses one grid cell for each group of action dimensions and step."""
 
     CHOICES: ClassVar[dict[str, tuple]] = {
@@ -48,7 +54,12 @@ class SpatialvlaGridConfig(TokenVlaConfig):
         "draft": DRAFTS,
     }
     STATE_IS_OF_WEIGHTS: ClassVar[bool] = False
-    LATER_FIELDS: ClassVar[dict[str, Any]] = {"task_template": BARE_TASK}
+    LATER_FIELDS: ClassVar[dict[str, Any]] = {
+        **PlacesVlaConfig.LATER_FIELDS,
+        "task_template": BARE_TASK,
+        "pointing_area_m": WORKSPACE_M,
+        "pointing_cell_m": STONE_CELL_M,
+    }
 
     # Hub id, path of a local folder, or "nano": a small model with random weights, built in code
     vlm_model_name: str = "google/paligemma2-3b-pt-224"
@@ -108,6 +119,10 @@ class SpatialvlaGridConfig(TokenVlaConfig):
     # what a cell competes with in the loss: the cells of its "slot", or the "full" vocabulary
     loss_vocab: str = "slot"
 
+    # x and y in metres, from and to, where stones may be pointed at, and the side of their cells
+    pointing_area_m: list[list[float]] = field(default_factory=lambda: deepcopy(WORKSPACE_M))
+    pointing_cell_m: float = STONE_CELL_M
+
     # what a pass guesses beside the next cell: "none", or that a step is as the one before ("repeat"); the
     # cells are the same, up to ties within rounding. Not on CUDA
     draft: str = "repeat"
@@ -133,6 +148,7 @@ class SpatialvlaGridConfig(TokenVlaConfig):
         check_template(self.task_template, "--policy.task_template")
         check_not_negative(self, ("grid_min_sigma",))
         check_positive(self, ("ego3d_patch_reso", "ego3d_n_freqs"))
+        self.stone_cells()
 
     def validate_features(self) -> None:
         """Raise unless the dataset (or environment) has what the policy reads and writes."""
@@ -155,6 +171,14 @@ class SpatialvlaGridConfig(TokenVlaConfig):
             f"3-D positions by depth ({self.depth_source})" if has_depth else "no depth, no 3-D positions",
         ]
 
+    def stone_cells(self) -> StoneCells:
+        """Return where stones may be pointed at.
+
+        Raises:
+            ValueError: flags give no cells.
+        """
+        return StoneCells.of_flags(self.pointing_area_m, self.pointing_cell_m)
+
     @property
     def prompt_template(self) -> str:
         """`task_template` as it is written."""
@@ -171,7 +195,7 @@ class SpatialvlaGridConfig(TokenVlaConfig):
 
     @property
     def has_positions(self) -> bool:
-        """Whether patches get anything of Ego3D."""
+        """True if patches get anything of Ego3D."""
         return self.depth_source != "none" or self.ego3d_no_depth_vector
 
     def read_depth_of(self, given: Collection[str] | None) -> None:
@@ -188,7 +212,7 @@ class SpatialvlaGridConfig(TokenVlaConfig):
             self.input_features = read | (self.input_features or {})
 
     def _depth_shapes(self) -> dict[str, tuple[int, ...]]:
-        """Of what observed depth consists of; LeRobot takes it for states."""
+        """Return the shapes of the inputs that observed depth consists of; LeRobot takes them for states."""
         shapes: dict[str, tuple[int, ...]] = {}
         for key, feature in self.image_features.items():
             camera = key.removeprefix(f"{OBS_IMAGES}.")
@@ -208,7 +232,7 @@ class SpatialvlaGridConfig(TokenVlaConfig):
             )
 
     def grid_settings(self) -> GridSettings:
-        """How grids are made for the dataset's actions.
+        """Return the settings with which grids are made for the dataset's actions.
 
         Raises:
             ValueError: a flag of it is wrong, the groups do not have every action dimension once, or nothing
@@ -221,7 +245,7 @@ class SpatialvlaGridConfig(TokenVlaConfig):
         return self._grid_settings(groups)
 
     def _given_groups(self) -> tuple[ActionGroup, ...] | None:
-        """Those of a flag or of the checkpoint; None: names must tell."""
+        """Return the groups of a flag or of the checkpoint; None: only the dims' names can tell."""
         assert self.action_feature is not None
         (num_dims,) = self.action_feature.shape
         if self.action_groups is not None:

@@ -2,9 +2,9 @@
 
 Sources: SpatialVLA (arXiv 2501.15830); PaliGemma 2 (arXiv 2412.03555).
 
-Shapes: `B` batch, `T` actions of a chunk, `D` action dims, `G` groups of them, `S` = T * G slots of an
-answer, `L` tokens of a prompt, `X` of a prompt and an answer, `H` hidden size, `P` tokens of an image, `C`
-cells of a group.
+Shapes: `B` batch, `T` actions of a chunk, `D` action dims, `G` groups of them, `N` tokens that point (none
+unless the config says so), `S` = N + T * G slots of an answer, `L` tokens of a prompt, `X` of a prompt and an
+answer, `H` hidden size, `P` tokens of an image, `C` cells of a group.
 """
 
 import logging
@@ -28,20 +28,16 @@ from lerobot_bomb.checkpoints.checks import holds_module
 from lerobot_bomb.data.columns import dim_names
 from lerobot_bomb.decoding.decoder import Prompt
 from lerobot_bomb.decoding.slots import SlotWriter
+from lerobot_bomb.policies.pointing_policy import BOARD_READER, PointingVlaPolicy
 from lerobot_bomb.policies.policy import TokenVlaPolicy
 from lerobot_bomb.training.distributed import weighed
 from lerobot_bomb.training.randomness import begin_batch
-from lerobot_bomb.vlm.depth import (
-    lattice_points,
-    load_zoedepth,
-    observed_depth,
-    observed_intrinsics,
-)
+from lerobot_bomb.vlm.depth import load_zoedepth
 from lerobot_bomb.vlm.ego3d import Ego3D
-from lerobot_bomb.vlm.images import CropWindows, draw_windows, resized_pixels
+from lerobot_bomb.vlm.images import draw_windows, resized_pixels
 from lerobot_bomb.vlm.inputs import read_actions, read_image, read_task
-from lerobot_bomb.vlm.intrinsics import crop_intrinsics, default_intrinsics, resize_intrinsics
 from lerobot_policy_spatialvla_grid.building_spatialvla_grid import (
+    adapted_layers,
     build_depth,
     build_model,
     complete_depth,
@@ -56,18 +52,16 @@ from lerobot_policy_spatialvla_grid.configuration_spatialvla_grid import (
     SpatialvlaGridConfig,
 )
 from lerobot_policy_spatialvla_grid.explained_spatialvla_grid import ExplainedSpatialvlaGrid
+from lerobot_policy_spatialvla_grid.pointing_spatialvla_grid import Target, make_pointer
+from lerobot_policy_spatialvla_grid.points_spatialvla_grid import seen_points
 
 logger = logging.getLogger(__name__)
 
 # not of the base model: trained whole beside its adapters
 CELL_TABLES = ("cell_embedding", "cell_head")
-# patterns of modules that have adapters beside the text model's
-VISION_LAYERS = r"backbone\.vlm\.model\.vision_tower\..*\.((q|k|v|out)_proj|fc[12])"
-PROJECTOR = r"backbone\.vlm\.model\.multi_modal_projector\.linear"
-EGO3D_LAYERS = r"ego3d\.layers\.[03]"
 
 
-class SpatialvlaGridPolicy(TokenVlaPolicy):
+class SpatialvlaGridPolicy(TokenVlaPolicy, PointingVlaPolicy):
     """A PaliGemma 2 that chooses the next ``chunk_size`` actions, one cell of each grid a step."""
 
     config_class = SpatialvlaGridConfig  # pyright: ignore[reportAssignmentType]  LeRobot annotates it as None
@@ -85,6 +79,7 @@ class SpatialvlaGridPolicy(TokenVlaPolicy):
         self, config: SpatialvlaGridConfig, dataset_meta: LeRobotDatasetMetadata | None = None, **_: object
     ):
         super().__init__(config, dataset_meta)
+        self.pointer = make_pointer(config, dataset_meta)
         self.tokens, self.backbone = build_model(config)
         self.register_buffer("symbol_ids", torch.tensor(self.tokens.symbols), persistent=False)
         self.zoedepth = build_depth(config)
@@ -105,9 +100,10 @@ class SpatialvlaGridPolicy(TokenVlaPolicy):
         self._num_cells_of_base: list[int] | None = None  # if the grids are other than the checkpoint's
         self.register_buffer("first_cells", torch.tensor(self.grids.offsets), persistent=False)
         hidden_size = self.backbone.text_config.hidden_size
-        self.cell_embedding = nn.Embedding(self.grids.num_tokens, hidden_size)
-        self.cell_head = nn.Linear(hidden_size, self.grids.num_tokens, bias=False)
+        self.cell_embedding = nn.Embedding(self._num_rows, hidden_size)
+        self.cell_head = nn.Linear(hidden_size, self._num_rows, bias=False)
         self._init_cells()
+        self._add_board_reader(hidden_size, self.backbone.tokens_per_image)
         self._writer = SlotWriter(
             self.backbone.text_model,
             self.backbone.positions,
@@ -122,7 +118,7 @@ class SpatialvlaGridPolicy(TokenVlaPolicy):
 
     @classmethod
     def _prepare(cls, config: SpatialvlaGridConfig, meta: LeRobotDatasetMetadata | None) -> None:
-        """As the others'; grids are as they were, or adapt to the new data."""
+        """Prepare as other policies do; grids are as they were, or adapt to the new data."""
         complete_depth(config, meta)
         config.check_template_as_trained()
         config.check_grid_as_trained(is_refitted=meta is not None and config.adapt_embeddings)
@@ -132,20 +128,23 @@ class SpatialvlaGridPolicy(TokenVlaPolicy):
     def _load_as_safetensor(
         cls, model: "SpatialvlaGridPolicy", model_file: str, map_location: str, strict: bool
     ) -> "SpatialvlaGridPolicy":
-        """As the others', and with the ZoeDepth of ``depth_model_name`` where the checkpoint has none."""
+        """Load as other policies do, with the ZoeDepth of ``depth_model_name`` where the file has none."""
         if model.zoedepth is not None and not holds_module(Path(model_file), "zoedepth"):
             model.zoedepth = load_zoedepth(model.config.depth_model_name)
-            model.may_lack = ("zoedepth",)
+            model.may_lack = (*model.may_lack, "zoedepth")
         return super()._load_as_safetensor(model, model_file, map_location, strict)
 
     def _fit(self, meta: LeRobotDatasetMetadata) -> None:
+        if self.pointer is not None:
+            self.config.take_places(meta)
+            self.pointer.fit(meta, self.config)
         if self.config.adapt_embeddings:
             self._adapt(meta)
         super()._fit(meta)
 
     @torch.no_grad()
     def _init_cells(self) -> None:
-        """Around the mean of the words' embeddings, as a tokenizer's new tokens are."""
+        """Draw the cells' rows around the mean of the words' embeddings, as a tokenizer's new tokens are."""
         words = self.backbone.vlm.get_input_embeddings().weight
         assert isinstance(words, Tensor)
         for table in (self.cell_embedding.weight, self.cell_head.weight):
@@ -165,18 +164,19 @@ class SpatialvlaGridPolicy(TokenVlaPolicy):
                 "train on what lerobot-bomb merge makes of them, or give --policy.adapt_embeddings=false"
             )
         for table in (self.cell_embedding, self.cell_head):
-            table.weight = nn.Parameter(interpolate_rows(old, new, table.weight))
-        self.cell_embedding.num_embeddings = self.cell_head.out_features = new.num_tokens
+            cells, others = table.weight.tensor_split([old.num_tokens])
+            table.weight = nn.Parameter(torch.cat([interpolate_rows(old, new, cells), others]))
         names = dim_names(meta.features[ACTION])
         edges = edges_text(old, names), edges_text(new, names)
         logger.info("Action grids adapted.\nOld edges\n%s\nNew edges\n%s", *edges)
         self._num_cells_of_base = old.num_cells
         self.grids = new.to(self._device)
+        self.cell_embedding.num_embeddings = self.cell_head.out_features = self._num_rows
         self.first_cells = torch.tensor(new.offsets, device=self._device)
         self.config.grid_params = new.to_dict()
 
     def explained(self) -> ExplainedSpatialvlaGrid:
-        """This policy as `lerobot_bomb.explain` asks it."""
+        """Return the policy as `lerobot_bomb.explain` asks it."""
         return ExplainedSpatialvlaGrid(self)
 
     def _newest_only(self) -> list[int]:
@@ -184,16 +184,11 @@ class SpatialvlaGridPolicy(TokenVlaPolicy):
         return sorted({*binary, *super()._newest_only()})
 
     def _get_default_peft_targets(self) -> dict[str, Any]:
-        """The original's: linear layers of text and vision model, projector, Ego3D; and the cells whole."""
-        others = [PROJECTOR]
-        if not self.config.freeze_vision_encoder:
-            others.append(VISION_LAYERS)
-        if self.config.depth_source != "none":
-            others.append(EGO3D_LAYERS)
-        return peft_targets(self, "language_model", CELL_TABLES, others)
+        """Return the original's targets: linear layers of text, vision, projector and Ego3D; cells whole."""
+        return peft_targets(self, "language_model", (*CELL_TABLES, BOARD_READER), adapted_layers(self.config))
 
     def _validate_peft_config(self, peft_config: Any) -> None:
-        """Grids that were adapted are in the adapters' config, so the adapters must hold their cells."""
+        """Check that adapters hold the cells of adapted grids, which are in the adapters' config."""
         super()._validate_peft_config(peft_config)
         if self._num_cells_of_base is None:
             return
@@ -214,38 +209,66 @@ class SpatialvlaGridPolicy(TokenVlaPolicy):
     # Training
 
     def forward(self, batch: dict[str, Tensor], reduction: str = "mean") -> tuple[Tensor, dict[str, float]]:
-        """Cross-entropy of the cells, over the kept ones; ``reduction="none"`` gives (B,)."""
+        """Cross-entropy of the answer, over the kept tokens; ``reduction="none"`` gives (B,)."""
         if reduction not in ("mean", "none"):
             raise ValueError(f"reduction={reduction!r} is unknown; choose mean or none")
         if self.training:
             begin_batch(self.config, self.generator)
+        cells_BTG, kept_BT, pointed = self._targets(batch)
+        with self._autocast():
+            pointing_BNH, hidden_BTGH, features_BPH = self._hidden(batch, cells_BTG, pointed.tokens)
+            losses_BTG, chosen_BTG = self._losses(hidden_BTGH, cells_BTG)
+            losses_BN, chosen_BN = self._pointing_losses(pointing_BNH, pointed.tokens)
+        kept_BTG = kept_BT[..., None].expand_as(losses_BTG)
+        kept_BS = torch.cat([pointed.kept, kept_BTG.flatten(1)], dim=1)
+        losses_BS = torch.cat([losses_BN, losses_BTG.flatten(1)], dim=1) * kept_BS
+        parts = self._cell_parts(chosen_BTG, cells_BTG, kept_BTG) | pointed.parts(chosen_BN)
+        if reduction == "none":
+            loss = losses_BS.sum(dim=1) / kept_BS.sum(dim=1).clamp(min=1)
+        else:
+            loss = losses_BS.sum() / kept_BS.sum().clamp(min=1)
+            loss = weighed(loss, kept_BS) if self.training else loss
+        loss, board = self._with_board(loss, batch, features_BPH)
+        return loss, means(parts | board, loss, self.config.trained_batches)
+
+    def _targets(self, batch: dict[str, Tensor]) -> tuple[Tensor, Tensor, Target]:
+        """Cells (B, T, G), which steps are kept (B, T), and what is pointed at ahead of them."""
         shape = self.config.chunk_size, self._action_dim
         actions_BTD = read_actions(batch, ACTION, self.config.type, self._device, shape)
-        cells_BTG = self.grids.encode(actions_BTD)
-        with self._autocast():
-            hidden_BTGH = self._hidden(batch, cells_BTG)
-            losses_BTG, chosen_BTG = self._losses(hidden_BTGH, cells_BTG)
-        kept_BTG = self._kept(batch)[..., None].expand_as(losses_BTG)
-        losses_BTG = losses_BTG * kept_BTG
-        metrics = self._metrics(chosen_BTG, cells_BTG, kept_BTG, losses_BTG)
-        if reduction == "none":
-            losses_B, counts_B = losses_BTG.sum(dim=(1, 2)), kept_BTG.sum(dim=(1, 2))
-            return losses_B / counts_B.clamp(min=1), metrics
-        loss = losses_BTG.sum() / kept_BTG.sum().clamp(min=1)
-        return weighed(loss, kept_BTG) if self.training else loss, metrics
+        kept_BT = self._kept(batch)
+        if self.pointer is None:
+            return self.grids.encode(actions_BTD), kept_BT, Target.nothing(len(kept_BT), self._device)
+        labels, pointed = self.pointer.draw(batch, self.config, self.generator)
+        actions_BTD, kept_BT = labels.given_actions(actions_BTD, kept_BT, labels.other_actions[:, None])
+        return self.grids.encode(actions_BTD), kept_BT, pointed
 
-    def _hidden(self, batch: dict[str, Tensor], cells_BTG: Tensor) -> Tensor:
-        """(B, T, G, H) teacher-forced states that predict the cells."""
+    def _hidden(
+        self, batch: dict[str, Tensor], cells_BTG: Tensor, pointed_BN: Tensor | None = None
+    ) -> tuple[Tensor, Tensor, Tensor]:
+        """(B, N, H) and (B, T, G, H) teacher-forced states that predict what is pointed at, and the cells.
+
+        And image features (B, P, H), P of all cameras.
+        """
+        if pointed_BN is None:
+            pointed_BN = cells_BTG.new_empty(len(cells_BTG), 0)
         prompt = self._prompt(batch)
-        return self._hidden_after(prompt, self._embeds(batch, prompt.ids), cells_BTG)
+        answer_BS = torch.cat([pointed_BN, cells_BTG.flatten(1)], dim=1)
+        embeds_BLH = self._embeds(batch, prompt.ids)
+        num_tokens = len(self._cameras) * self.backbone.tokens_per_image
+        return *self._hidden_after(prompt, embeds_BLH, answer_BS), embeds_BLH[:, :num_tokens]
 
-    def _hidden_after(self, prompt: TokenRows, embeds_BLH: Tensor, cells_BTG: Tensor) -> Tensor:
-        """The same, after a prompt that was embedded before."""
-        cells_BS = (cells_BTG + self.first_cells).flatten(1)
-        embeds_BXH = torch.cat([embeds_BLH, self._embed_cells(cells_BS[:, :-1])], dim=1)
-        answer = TokenRows(cells_BS[:, 1:], torch.ones_like(cells_BS[:, 1:], dtype=torch.bool))
+    def _hidden_after(
+        self, prompt: TokenRows, embeds_BLH: Tensor, answer_BS: Tensor
+    ) -> tuple[Tensor, Tensor]:
+        """Return what `_hidden` returns, after a prompt that was embedded before."""
+        pointed_BN, cells_BTG = self._split(answer_BS)
+        first_N = [slot.start for slot in self._pointing_rows]
+        pointed_BN = pointed_BN + pointed_BN.new_tensor(first_N)
+        rows_BS = torch.cat([pointed_BN, (cells_BTG + self.first_cells).flatten(1)], dim=1)
+        embeds_BXH = torch.cat([embeds_BLH, self._embed_cells(rows_BS[:, :-1])], dim=1)
+        answer = TokenRows(rows_BS[:, 1:], torch.ones_like(rows_BS[:, 1:], dtype=torch.bool))
         rows = TokenRows.join([prompt, answer])
-        index_X = torch.arange(rows.mask.shape[1], device=cells_BS.device)
+        index_X = torch.arange(rows.mask.shape[1], device=rows_BS.device)
         reads_XX = index_X <= index_X[:, None]
         if self._prompt_reads_all:
             is_prompt_X = index_X < prompt.mask.shape[1]
@@ -255,19 +278,36 @@ class SpatialvlaGridPolicy(TokenVlaPolicy):
             (rows.mask.cumsum(dim=1) - 1).clamp(min=0),
             reads_XX & rows.readable[:, None],
         )
-        return hidden_BXH[:, -cells_BS.shape[1] :].unflatten(1, cells_BTG.shape[1:])
+        return self._split(hidden_BXH[:, -rows_BS.shape[1] :])
 
-    def _losses(self, hidden_BTGH: Tensor, cells_BTG: Tensor) -> tuple[Tensor, Tensor]:
-        """(B, T, G) losses and the likeliest cells, group by group."""
+    def _split(self, answer: Tensor) -> tuple[Tensor, Tensor]:
+        """(B, S, ...) of an answer -> (B, N, ...) of what points and (B, T, G, ...) of cells."""
+        pointing, cells = answer.tensor_split([len(self._pointing_rows)], dim=1)
+        return pointing, cells.unflatten(1, (-1, len(self.grids.groups)))
+
+    def _losses(
+        self, hidden_BTGH: Tensor, cells_BTG: Tensor, rows: list[slice] | None = None
+    ) -> tuple[Tensor, Tensor]:
+        """(B, T, G) losses and the likeliest cells, group by group; ``rows``: of other tokens than cells."""
         losses, chosen = [], []
-        for group, hidden_BTH in enumerate(hidden_BTGH.unbind(dim=2)):
-            logits_BTC = self._cell_logits(group, hidden_BTH).float()
+        slots = self._group_rows if rows is None else rows
+        for slot, hidden_BTH, labels_BT in zip(
+            slots, hidden_BTGH.unbind(2), cells_BTG.unbind(2), strict=True
+        ):
+            logits_BTC = self._logits(slot, hidden_BTH).float()
             chosen.append(logits_BTC.detach().argmax(dim=-1))
-            labels_BT = cells_BTG[..., group]
             if self.config.loss_vocab == "full":
-                logits_BTC, labels_BT = self._full_logits(hidden_BTH), labels_BT + self.first_cells[group]
+                logits_BTC, labels_BT = self._full_logits(hidden_BTH), labels_BT + slot.start
             losses.append(cross_entropy(logits_BTC.transpose(1, 2), labels_BT, reduction="none"))
         return torch.stack(losses, dim=2), torch.stack(chosen, dim=2)
+
+    def _pointing_losses(self, hidden_BNH: Tensor, tokens_BN: Tensor) -> tuple[Tensor, Tensor]:
+        """(B, N) losses and the likeliest tokens."""
+        if self.pointer is None:
+            return torch.zeros_like(tokens_BN, dtype=torch.float32), tokens_BN
+        as_step = hidden_BNH[:, None], tokens_BN[:, None], self._pointing_rows
+        losses_B1N, chosen_B1N = self._losses(*as_step)
+        return losses_B1N[:, 0], chosen_B1N[:, 0]
 
     def _full_logits(self, hidden_BTH: Tensor) -> Tensor:
         """(B, T, all cells, then the vocabulary)."""
@@ -275,18 +315,17 @@ class SpatialvlaGridPolicy(TokenVlaPolicy):
         return self.backbone.cap(torch.cat(logits, dim=-1).float())
 
     @torch.no_grad()
-    def _metrics(
-        self, chosen_BTG: Tensor, cells_BTG: Tensor, kept_BTG: Tensor, losses_BTG: Tensor
-    ) -> dict[str, float]:
-        """Share of right cells, mean absolute errors of what cells decode to in the data's units.
+    def _cell_parts(
+        self, chosen_BTG: Tensor, cells_BTG: Tensor, kept_BTG: Tensor
+    ) -> dict[str, tuple[Tensor, Tensor]]:
+        """Return which cells are right and absolute errors in the data's units, as `means` takes them.
 
         Teacher-forced: every cell is predicted from the true ones before it. Padded actions do not count.
         Errors are known where a dataset was given, that is while training.
         """
         parts = {"token_accuracy": (chosen_BTG == cells_BTG, kept_BTG)}
         errors_BTD = (self.grids.decode(chosen_BTG) - self.grids.decode(cells_BTG)).abs() * self.action_unit
-        parts |= self._l1_parts(errors_BTD, kept_BTG[..., :1].expand_as(errors_BTD))
-        return means(parts, losses_BTG, self.config.trained_batches)
+        return parts | self._l1_parts(errors_BTD, kept_BTG[..., :1].expand_as(errors_BTD))
 
     # Inference
 
@@ -294,29 +333,33 @@ class SpatialvlaGridPolicy(TokenVlaPolicy):
         """The first ``num_steps`` actions of the chunk; the model need not choose the rest."""
         return self.grids.decode(self._choose(batch, num_steps))
 
-    @torch.no_grad()
     def _choose(self, batch: dict[str, Tensor], num_steps: int) -> Tensor:
         """(B, num_steps, G) cells."""
+        return self._split(self._write(batch, num_steps))[1]
+
+    @torch.no_grad()
+    def _write(self, batch: dict[str, Tensor], num_steps: int) -> Tensor:
+        """(B, S) answers: what is pointed at, then the cells of so many steps."""
         self.eval()
-        num_groups = len(self.grids.groups)
         with self._autocast():
             prompt = self._prompt(batch)
             embeds_BLH = self._embeds(batch, prompt.ids)
-            cells_BS = self._writer(
+            answer_BS = self._writer(
                 Prompt(embeds_BLH, prompt.mask, prompt.hidden),
                 self._group_rows,
                 num_steps,
                 self.cell_embedding.weight * self.backbone.embed_scale,
                 self.cell_head.weight,
-                self._choice_noise(len(embeds_BLH), (num_steps, self.grids.num_tokens)),
+                self._choice_noise(len(embeds_BLH), (num_steps, self._num_rows)),
+                ahead=self._pointing_rows,
             )
         # casts of weights cached under inference mode cannot be used by a later training step
         torch.clear_autocast_cache()
-        return cells_BS.unflatten(1, (num_steps, num_groups))
+        return answer_BS
 
     @property
     def last_passes(self) -> int | None:
-        """Of the text model in the last prediction, the prompt's included; None: there was none."""
+        """Passes of the text model in the last prediction, the prompt's included; None: there was none."""
         return self._writer.num_passes
 
     @property
@@ -327,28 +370,38 @@ class SpatialvlaGridPolicy(TokenVlaPolicy):
 
     # Cells
 
-    def _embed_cells(self, tokens: Tensor) -> Tensor:
-        """Cells of all groups, numbered on -> (..., H), at the scale of the words' embeddings."""
-        return self.cell_embedding(tokens) * self.backbone.embed_scale
+    def _embed_cells(self, rows: Tensor) -> Tensor:
+        """Numbers of the table's rows -> (..., H), at the scale of the words' embeddings."""
+        return self.cell_embedding(rows) * self.backbone.embed_scale
 
-    def _cell_logits(self, group: int, hidden: Tensor) -> Tensor:
-        """(..., H) -> (..., cells of the group)."""
-        return self.backbone.cap(linear(hidden, self.cell_head.weight[self._group_rows[group]]))
+    def _logits(self, rows: slice, hidden: Tensor) -> Tensor:
+        """(..., H) -> (..., those rows of the table)."""
+        return self.backbone.cap(linear(hidden, self.cell_head.weight[rows]))
 
     @property
     def _group_rows(self) -> list[slice]:
-        """Which rows of the tables are each group's cells."""
+        """Rows of the tables that are each group's cells."""
         counts = zip(self.grids.offsets, self.grids.num_cells, strict=True)
         return [slice(first, first + count) for first, count in counts]
+
+    @property
+    def _pointing_rows(self) -> list[slice]:
+        """N: which rows, after those of the cells, may be chosen for each token that points."""
+        return [] if self.pointer is None else self.pointer.slots(self.grids.num_tokens)
+
+    @property
+    def _num_rows(self) -> int:
+        """Number of rows of the tables."""
+        return self.grids.num_tokens + (0 if self.pointer is None else self.pointer.num_tokens)
 
     # Prompt
 
     def _prompt(self, batch: dict[str, Tensor]) -> TokenRows:
-        """Everything before the answer, with padding; its last column has none."""
+        """Return everything before the answer, with padding; its last column has none."""
         return TokenRows.join([*self._prompt_parts(batch).values()])
 
     def _prompt_parts(self, batch: dict[str, Tensor]) -> dict[str, TokenRows]:
-        """The same by what it is of; an image's by its camera."""
+        """Return the prompt's parts by name; an image's name is its camera."""
         tokens = self.tokens
         task = read_task(batch, self.config.type, self._device)
         image = self.backbone.tokens_per_image * [tokens.image]
@@ -364,10 +417,11 @@ class SpatialvlaGridPolicy(TokenVlaPolicy):
         return parts | {"end": TokenRows.constant(tokens.task_end, task.ids)}
 
     def _num_fixed_tokens(self) -> int:
-        """Of the longest prompt and answer, without the task."""
+        """Return the number of tokens of the longest prompt and answer, without the task."""
         tokens, config = self.tokens, self.config
         num_tokens = len(self._cameras) * self.backbone.tokens_per_image
-        num_tokens += len(tokens.start) + len(tokens.task_end) + config.chunk_size * len(self.grids.groups)
+        num_tokens += len(tokens.start) + len(tokens.task_end) + len(self._pointing_rows)
+        num_tokens += config.chunk_size * len(self.grids.groups)
         if config.use_state:
             assert config.robot_state_feature is not None
             width = 1 + digits_needed(NUM_STATE_BINS)
@@ -386,24 +440,10 @@ class SpatialvlaGridPolicy(TokenVlaPolicy):
         image = read_image(batch, key, self.config.type, self._device)
         windows = draw_windows(image, self.config.crop_fraction, self.generator if self.training else None)
         pixels = resized_pixels(windows.cut(image), self.backbone.image_size)
-        points = self._points(batch, key.removeprefix(f"{OBS_IMAGES}."), windows, pixels)
+        camera, size = key.removeprefix(f"{OBS_IMAGES}."), self.ego3d.lattice_size
+        points = seen_points(self.config, self.zoedepth, batch, camera, windows, pixels, size)
         features_BPE = self.backbone.see(pixels)
         return features_BPE + self.ego3d(points).to(features_BPE.dtype)
-
-    def _points(self, batch: dict[str, Tensor], camera: str, windows: CropWindows, pixels: Tensor) -> Tensor:
-        """(B, R, R, 3) metres in the camera's frame of what the lattice's pixels show; NaN: not known."""
-        config, size = self.config, self.ego3d.lattice_size
-        if config.depth_source == "none":
-            return pixels.new_full((len(pixels), size, size, 3), torch.nan)
-        if self.zoedepth is None:
-            depth, default = windows.cut(observed_depth(batch, camera, windows.image_size)), None
-        else:
-            depth, default = self.zoedepth(pixels), default_intrinsics(*windows.image_size)
-        intrinsics = observed_intrinsics(batch, camera, config.camera_intrinsics, default)
-        intrinsics = crop_intrinsics(intrinsics.to(pixels.device), windows)
-        depth_size = depth.shape[-2], depth.shape[-1]
-        intrinsics = resize_intrinsics(intrinsics, (windows.height, windows.width), depth_size)
-        return lattice_points(depth, intrinsics, size)
 
     @property
     def _prompt_reads_all(self) -> bool:

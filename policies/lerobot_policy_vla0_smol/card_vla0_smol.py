@@ -1,4 +1,4 @@
-"""What the model card of a ``vla0_smol`` says of the method."""
+"""Model card of ``vla0_smol``: what it says of the method."""
 
 from lerobot_bomb.hub.method import Method, Paper
 

@@ -1,24 +1,27 @@
 """Config of ``vla0_smol``."""
 
+import math
 from dataclasses import dataclass
-from typing import ClassVar
+from typing import Any, ClassVar
 
 from lerobot.configs import PreTrainedConfig
 
 from lerobot_bomb.actions.bins import BIN_MODES
 from lerobot_bomb.actions.text import MASK_LEVELS, MAX_DIGITS, digits_needed
 from lerobot_bomb.policies.config import RELATIVE_AS_TRAINED, RelativeVlaConfig, TokenVlaConfig
+from lerobot_bomb.policies.pointing_config import PointingVlaConfig
 from lerobot_bomb.training.policy_flags import check_positive
 
 DRAFTS = ("none", "linear")
 MAX_BINS = 10**MAX_DIGITS
 # of brightness, contrast, saturation and hue
 COLOR_JITTER_MOST = (1.0, 1.0, 1.0, 0.5)
-# flags that say what shapes the weights have
-SHAPES = ("nano_config",)
+# flags that say which weights there are, and their shapes
+SHAPES = ("nano_config", "pointing")
 # the same, and flags that say what the model's tokens mean
 AS_TRAINED = (
     *("chunk_size", "n_action_bins", "n_state_bins", "bin_mode", "number_width", "use_state", "image_size"),
+    "pointing_range_m",
     *RELATIVE_AS_TRAINED,
     *SHAPES,
 )
@@ -26,7 +29,7 @@ AS_TRAINED = (
 
 @PreTrainedConfig.register_subclass("vla0_smol")
 @dataclass
-class Vla0SmolConfig(RelativeVlaConfig, TokenVlaConfig):
+class Vla0SmolConfig(RelativeVlaConfig, TokenVlaConfig, PointingVlaConfig):
     """A model writes ``chunk_size`` actions as integers; ``n_action_steps`` of them are executed."""
 
     CHOICES: ClassVar[dict[str, tuple]] = {
@@ -37,6 +40,8 @@ class Vla0SmolConfig(RelativeVlaConfig, TokenVlaConfig):
     }
     ACTIONS_ARE_OF_WEIGHTS: ClassVar[bool] = False
     STATE_IS_OF_WEIGHTS: ClassVar[bool] = False
+    LATER_FIELDS: ClassVar[dict[str, Any]] = {**PointingVlaConfig.LATER_FIELDS, "pointing_range_m": 0.3}
+    NEEDS_STATE: ClassVar[tuple[str, ...]] = (*RelativeVlaConfig.NEEDS_STATE, "pointing")
 
     # Hub id, path of a local folder, or "nano": a small model with random weights, built in code
     vlm_model_name: str = "HuggingFaceTB/SmolVLM2-500M-Video-Instruct"
@@ -57,6 +62,8 @@ class Vla0SmolConfig(RelativeVlaConfig, TokenVlaConfig):
     bin_mode: str = "centers"
     # digits of every number, zero-padded; 0 = as many as the number has
     number_width: int = 0
+    # metres from -this to this that numbers of what is pointed at divide; from BOMB's gripper to its places
+    pointing_range_m: float = 0.3
     # text of a system message before the prompt; None = none, or Qwen2.5-VL's own
     system_prompt: str | None = None
 
@@ -92,6 +99,10 @@ class Vla0SmolConfig(RelativeVlaConfig, TokenVlaConfig):
                     f"--policy.number_width={self.number_width} must be 0 (no padding) or lie in "
                     f"{digits_needed(bins)}..{MAX_DIGITS} for --policy.{flag}={bins}"
                 )
+        if not 0 < self.pointing_range_m < math.inf:
+            raise ValueError(
+                f"--policy.pointing_range_m={self.pointing_range_m} must be finite and greater than 0"
+            )
         if self.image_size is not None:
             check_positive(self, ("image_size",))
         self._check_color_jitter()

@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING, ClassVar
 
 from torch import Tensor
 
+from lerobot_bomb.bomb.pointing import PointedAt
 from lerobot_bomb.explain.explained import (
     ANSWER,
     Batch,
@@ -16,6 +17,7 @@ from lerobot_bomb.explain.explained import (
     check_greedy,
     decoder_layers,
 )
+from lerobot_policy_vla0_smol.pointing_vla0_smol import NUM_NUMBERS
 
 if TYPE_CHECKING:
     from lerobot_policy_vla0_smol.modeling_vla0_smol import Vla0SmolPolicy
@@ -54,8 +56,12 @@ class ExplainedVla0Smol(PromptExplained):
         chosen_BA1 = logits_BAS.log_softmax(dim=-1).gather(-1, symbol_BA[:, 1:, None])
         return chosen_BA1.sum(dim=(1, 2))
 
+    def pointed(self, batch: Batch) -> PointedAt | None:
+        pointer = self._policy.pointer
+        return None if pointer is None else pointer.pointed_at(self.answer(batch)[0, :NUM_NUMBERS])
+
     def places(self, rows: Rows) -> dict[str, Place]:
-        """In one pass, from which the padding is taken out."""
+        """Return the places in one pass, from which the padding is taken out."""
         index_L = rows["mask"][0].cumsum(dim=0) - 1
         places: dict[str, Place] = {name: (index_L[each],) for name, each in self.columns(rows).items()}
         # the prompt's last token predicts the answer's first; rows of one answer have no padding

@@ -2,7 +2,7 @@
 
 Sources: VLA-0 (arXiv 2510.13054) and the VLA-0-Smol recipe.
 
-Shapes: `B` batch, `T` actions of a chunk, `D` action dims, `N` = T * D numbers, `C` columns a number
+Shapes: `B` batch, `T` actions of a chunk, `D` action dims, `N` numbers of an answer, `C` columns a number
 takes, `L` tokens of a sequence, `A` tokens of an answer, `H` hidden size, `P` tokens of an image.
 """
 
@@ -13,7 +13,7 @@ import torch
 from lerobot.datasets import LeRobotDatasetMetadata
 from lerobot.utils.constants import ACTION
 from torch import Tensor
-from torch.nn.functional import cross_entropy
+from torch.nn.functional import cross_entropy, pad
 
 from lerobot_bomb.actions.accuracy import counted_numbers, exact_numbers, means, read_numbers
 from lerobot_bomb.actions.bins import Bins
@@ -35,6 +35,7 @@ from lerobot_bomb.decoding.draft import KnownSymbols, LinearDraft
 from lerobot_bomb.decoding.grammar import NumberGrammar
 from lerobot_bomb.decoding.kv_cache import check_positions
 from lerobot_bomb.decoding.writer import NumberWriter
+from lerobot_bomb.policies.pointing_policy import BOARD_READER, Parts, PointingVlaPolicy
 from lerobot_bomb.policies.policy import RelativeVlaPolicy, TokenVlaPolicy
 from lerobot_bomb.training.distributed import weighed
 from lerobot_bomb.training.randomness import begin_batch
@@ -46,9 +47,10 @@ from lerobot_policy_vla0_smol.building_vla0_smol import build_model
 from lerobot_policy_vla0_smol.card_vla0_smol import METHOD
 from lerobot_policy_vla0_smol.configuration_vla0_smol import AS_TRAINED, SHAPES, Vla0SmolConfig
 from lerobot_policy_vla0_smol.explained_vla0_smol import ExplainedVla0Smol
+from lerobot_policy_vla0_smol.pointing_vla0_smol import NUM_NUMBERS, make_pointer
 
 
-class Vla0SmolPolicy(RelativeVlaPolicy, TokenVlaPolicy):
+class Vla0SmolPolicy(RelativeVlaPolicy, TokenVlaPolicy, PointingVlaPolicy):
     """A stock SmolVLM or Qwen2.5-VL that writes the next ``chunk_size`` actions as integers."""
 
     config_class = Vla0SmolConfig  # pyright: ignore[reportAssignmentType]  LeRobot annotates it as None
@@ -65,6 +67,9 @@ class Vla0SmolPolicy(RelativeVlaPolicy, TokenVlaPolicy):
         super().__init__(config, dataset_meta)
         if dataset_meta is not None:
             config.check_masking()
+        self.pointer = make_pointer(config, dataset_meta)
+        # numbers of an answer before those of its actions
+        self._num_pointing = 0 if self.pointer is None else NUM_NUMBERS
         self.tokens, self.backbone = build_model(config)
         # modules that FSDP shards one by one; accelerate reads the second name, LeRobot 0.6.2 the class's
         sharded = sorted({type(layer).__name__ for layer in self.backbone.layers})
@@ -73,14 +78,14 @@ class Vla0SmolPolicy(RelativeVlaPolicy, TokenVlaPolicy):
         self.action_bins = Bins(config.n_action_bins, config.bin_mode)
         self.state_bins = Bins(config.n_state_bins, config.bin_mode)
         self.grammar = NumberGrammar(
-            config.n_action_bins, config.chunk_size * self._action_dim, fixed_width=config.number_width
+            config.n_action_bins, self._num_numbers(config.chunk_size), fixed_width=config.number_width
         )
         num_fixed = self._num_fixed_tokens()
         self._check_length(self.backbone.text_config, num_fixed, TASK_TEMPLATE, dataset_meta)
         guess = (
             KnownSymbols(self.grammar)
             if config.draft == "none"
-            else LinearDraft(self.grammar, self._action_dim)
+            else LinearDraft(self.grammar, self._action_dim, self._num_pointing)
         )
         columns = self._image_columns(torch.device("cpu"))
         # of a prompt's and its answer's columns, the same in every row
@@ -88,17 +93,27 @@ class Vla0SmolPolicy(RelativeVlaPolicy, TokenVlaPolicy):
         self._writer = NumberWriter(
             self.backbone, self.grammar, guess, self._positions, compiled=config.compile_model
         )
+        self._add_board_reader(self.backbone.text_config.hidden_size, self.backbone.tokens_per_image)
         self._color_jitter = None if config.color_jitter is None else ColorJitter(*config.color_jitter)
         self._ensemble = self._make_ensemble()
         self._decoded: Decoded | None = None  # in the last prediction
         self.reset()
 
+    def _fit(self, meta: LeRobotDatasetMetadata) -> None:
+        super()._fit(meta)
+        if self.pointer is not None:
+            self.pointer.fit(meta, self.config)
+
+    def _num_numbers(self, num_steps: int) -> int:
+        """Numbers of an answer of so many actions."""
+        return self._num_pointing + num_steps * self._action_dim
+
     def explained(self) -> ExplainedVla0Smol:
-        """This policy as `lerobot_bomb.explain` asks it."""
+        """Return the policy as `lerobot_bomb.explain` asks it."""
         return ExplainedVla0Smol(self)
 
     def _get_default_peft_targets(self) -> dict[str, Any]:
-        return peft_targets(self, self.backbone.text_model_name, ())
+        return peft_targets(self, self.backbone.text_model_name, ("pointer", BOARD_READER))
 
     # Training
 
@@ -110,46 +125,57 @@ class Vla0SmolPolicy(RelativeVlaPolicy, TokenVlaPolicy):
             begin_batch(self.config, self.generator)
         with self._autocast():
             prompt = self._prompt(batch)
-            bins_BN = self._bins(batch)
-            numbers = self._numbers(batch, bins_BN)
+            bins_BN, kept_BN = self._targets(batch)
+            numbers = self._numbers(bins_BN, kept_BN)
             answer = self._answer(numbers)
-            logits_BAV = self._answer_logits(batch, prompt, answer.rows)
+            features_BPH = self._see(batch)
+            logits_BAV = self._answer_logits(features_BPH, prompt, answer.rows)
         kept_BA = answer.labels != IGNORED
         losses_BA = cross_entropy(
             logits_BAV.float().flatten(0, 1), answer.labels.flatten(), ignore_index=IGNORED, reduction="none"
         ).view_as(answer.labels)
-        metrics = self._metrics(logits_BAV.detach(), answer, numbers, bins_BN, losses_BA)
         if reduction == "none":
-            return losses_BA.sum(dim=1) / kept_BA.sum(dim=1).clamp(min=1), metrics
-        loss = losses_BA.sum() / kept_BA.sum().clamp(min=1)
-        return weighed(loss, kept_BA) if self.training else loss, metrics
+            loss = losses_BA.sum(dim=1) / kept_BA.sum(dim=1).clamp(min=1)
+        else:
+            loss = losses_BA.sum() / kept_BA.sum().clamp(min=1)
+            loss = weighed(loss, kept_BA) if self.training else loss
+        loss, board = self._with_board(loss, batch, features_BPH)
+        parts = self._metric_parts(logits_BAV.detach(), answer, numbers, bins_BN) | board
+        return loss, means(parts, loss, self.config.trained_batches)
 
     @torch.no_grad()
-    def _metrics(
-        self, logits_BAV: Tensor, answer: Answer, numbers: NumberTokens, bins_BN: Tensor, losses_BA: Tensor
-    ) -> dict[str, float]:
-        """Shares of right tokens and of exact numbers, mean absolute errors in the data's units.
+    def _metric_parts(
+        self, logits_BAV: Tensor, answer: Answer, numbers: NumberTokens, bins_BN: Tensor
+    ) -> Parts:
+        """Right tokens and exact numbers, absolute errors in the data's units, as `means` takes them.
 
         Teacher-forced: every digit is predicted from the true ones before it. Hidden and padded numbers do
         not count. Errors are known where a dataset was given, that is while training.
         """
-        kept_BA = answer.labels != IGNORED
+        before = self._num_pointing
+        # what is pointed at is no action
+        kept_BA = (answer.labels != IGNORED) & (answer.columns >= before * numbers.mask.shape[2])
         right_BA = logits_BAV.argmax(dim=-1) == answer.labels
         digits_BA = logits_BAV[..., self.symbol_ids[:SPACE]].argmax(dim=-1)
         read_BN = read_numbers(numbers, answer.with_padding(digits_BA, numbers))
         exact_BN = exact_numbers(numbers, answer.with_padding(right_BA, numbers))
         counted_BN = counted_numbers(numbers)
-        bins = self.action_bins
+        bins, actions = self.action_bins, slice(before, None)
         errors_BN = (bins.decode(read_BN.clamp(max=bins.num_bins - 1)) - bins.decode(bins_BN)).abs()
-        errors_BTD = errors_BN.unflatten(1, (-1, self._action_dim)) * self._unit
-        counted_BTD = counted_BN.view_as(errors_BTD)
-        parts = {"token_accuracy": (right_BA, kept_BA), "value_accuracy": (exact_BN, counted_BN)}
+        errors_BTD = errors_BN[:, actions].unflatten(1, (-1, self._action_dim)) * self._unit
+        counted_BTD = counted_BN[:, actions].view_as(errors_BTD)
+        parts = {
+            "token_accuracy": (right_BA, kept_BA),
+            "value_accuracy": (exact_BN[:, actions], counted_BN[:, actions]),
+        }
         parts |= self._l1_parts(errors_BTD, counted_BTD)
-        return means(parts, losses_BA, self.config.trained_batches)
+        if self.pointer is not None:
+            parts |= self.pointer.error_parts(errors_BN[:, :before], counted_BN[:, :before])
+        return parts
 
-    def _answer_logits(self, batch: dict[str, Tensor], prompt: TokenRows, answer: TokenRows) -> Tensor:
+    def _answer_logits(self, features_BPH: Tensor, prompt: TokenRows, answer: TokenRows) -> Tensor:
         """Teacher-forced logits of every answer token: (B, A, V)."""
-        return self.backbone.logits(self._answer_hidden(self._see(batch), prompt, answer))
+        return self.backbone.logits(self._answer_hidden(features_BPH, prompt, answer))
 
     def _answer_hidden(self, features_BPH: Tensor, prompt: TokenRows, answer: TokenRows) -> Tensor:
         """Teacher-forced states that predict every answer token: (B, A, H)."""
@@ -166,32 +192,52 @@ class Vla0SmolPolicy(RelativeVlaPolicy, TokenVlaPolicy):
         index_BAH = columns_BA[..., None].expand(-1, -1, hidden_BLH.shape[-1])
         return hidden_BLH.gather(1, index_BAH)
 
-    def _bins(self, batch: dict[str, Tensor]) -> Tensor:
-        """Actions (B, T, D) in [-1, 1] -> bins of what is written, step by step: (B, N) int64."""
+    def _targets(self, batch: dict[str, Tensor]) -> tuple[Tensor, Tensor]:
+        """(B, N) int64 bins of what is written, actions step by step; (B, N) bool, those trained on."""
         shape = self.config.chunk_size, self._action_dim
         actions_BTD = read_actions(batch, ACTION, self.config.type, self._device, shape)
-        return self.action_bins.encode(self._to_relative(actions_BTD, batch)).flatten(1)
+        actions_BTD, kept_BT = self._to_relative(actions_BTD, batch), self._kept(batch)
+        if self.pointer is None:
+            return self._action_targets(actions_BTD, kept_BT)
+        config = self.config
+        # evaluation is of what is meant
+        share = config.counterfactual_share if self.training else 0.0
+        labels = self.pointer.labels(batch, share, config.type, self.generator)
+        other_B1D = self._to_relative(labels.other_actions[:, None], batch)
+        targets = self._action_targets(*labels.given_actions(actions_BTD, kept_BT, other_B1D))
+        pointing = self.pointer.bins_of(labels, self._state(batch)), self.pointer.kept(labels)
+        bins_BN, kept_BN = (torch.cat(pair, dim=1) for pair in zip(pointing, targets, strict=True))
+        return bins_BN, kept_BN
 
-    def _numbers(self, batch: dict[str, Tensor], bins_BN: Tensor) -> NumberTokens:
+    def _action_targets(self, actions_BTD: Tensor, kept_BT: Tensor) -> tuple[Tensor, Tensor]:
+        """Actions alone, of which the model writes every dimension."""
+        bins_BN = self.action_bins.encode(actions_BTD).flatten(1)
+        return bins_BN, kept_BT.repeat_interleave(self._action_dim, dim=1)
+
+    def _numbers(self, bins_BN: Tensor, kept_BN: Tensor) -> NumberTokens:
         """Bins -> their tokens, some of them hidden while training."""
         numbers = self._to_tokens(bins_BN, self.config.n_action_bins)
-        kept_BN = self._kept(batch).repeat_interleave(self._action_dim, dim=1)
-        numbers = NumberTokens(numbers.ids, numbers.mask, numbers.trained & kept_BN[..., None])
+        trained_BNC = numbers.trained & kept_BN[..., None]
+        # the space after a number says that it ends
+        before = self._num_pointing
+        trained_BNC[:, 1 : before + 1, 0] = kept_BN[:, :before]
+        numbers = NumberTokens(numbers.ids, numbers.mask, trained_BNC)
         return self._hide(numbers) if self.training else numbers
 
     def _hide(self, numbers: NumberTokens) -> NumberTokens:
-        """Hide random numbers, steps or characters from the model."""
+        """Hide random numbers, steps or characters of actions from the model."""
         level = self.config.mask_level
-        mask_BNC = numbers.mask
+        mask_BNC = numbers.mask[:, self._num_pointing :]
         if level == "char":
-            hidden_BM = self._draw_hidden(mask_BNC.flatten(1))
-            return numbers.hide_characters(hidden_BM.view_as(mask_BNC), self.tokens.hidden)
+            hidden_BNC = self._draw_hidden(mask_BNC.flatten(1)).view_as(mask_BNC)
+            hidden_BNC = pad(hidden_BNC, (0, 0, self._num_pointing, 0))
+            return numbers.hide_characters(hidden_BNC, self.tokens.hidden)
         if level == "step":
             hidden_BT = self._draw_hidden(mask_BNC[:, :: self._action_dim, 0])
             hidden_BN = hidden_BT.repeat_interleave(self._action_dim, dim=1)
         else:
             hidden_BN = self._draw_hidden(mask_BNC[..., 0])
-        return numbers.hide_numbers(hidden_BN, self.tokens.hidden)
+        return numbers.hide_numbers(pad(hidden_BN, (self._num_pointing, 0)), self.tokens.hidden)
 
     def _draw_hidden(self, eligible_BM: Tensor) -> Tensor:
         config = self.config
@@ -204,20 +250,20 @@ class Vla0SmolPolicy(RelativeVlaPolicy, TokenVlaPolicy):
 
     def _predict(self, batch: dict[str, Tensor], num_steps: int) -> Tensor:
         """The first ``num_steps`` actions of the chunk, absolute; the model need not write the rest."""
-        numbers_BN = self._write(batch, num_steps)
+        numbers_BN = self._write(batch, num_steps)[:, self._num_pointing :]
         actions_BTD = self.action_bins.decode(numbers_BN).view(-1, num_steps, self._action_dim)
         return self._to_absolute(actions_BTD, batch).clamp(-1, 1)
 
     @torch.no_grad()
     def _write(self, batch: dict[str, Tensor], num_steps: int) -> Tensor:
-        """(B, N) the numbers of so many actions."""
+        """(B, N) the numbers of so many actions, and of what is pointed at before them."""
         self.eval()
         with self._autocast():
             prompt = self._prompt(batch)
             if not prompt.ids.is_cuda:  # prompts of other lengths would be recorded anew there
                 prompt = prompt.without_padding()
             embeds_BLH = self._embeds(batch, prompt.ids)
-            num_numbers = num_steps * self._action_dim
+            num_numbers = self._num_numbers(num_steps)
             noise_shape = self.grammar.max_symbols(num_numbers), NUM_SYMBOLS
             self._decoded = decoded = self._writer(
                 Prompt(embeds_BLH, prompt.mask, prompt.hidden),
@@ -231,7 +277,7 @@ class Vla0SmolPolicy(RelativeVlaPolicy, TokenVlaPolicy):
 
     @property
     def last_passes(self) -> int | None:
-        """Of the text model in the last prediction, the prompt's included; None: there was none."""
+        """Passes of the text model in the last prediction, the prompt's included; None: there was none."""
         return None if self._decoded is None else self._decoded.num_passes
 
     @property
@@ -245,11 +291,11 @@ class Vla0SmolPolicy(RelativeVlaPolicy, TokenVlaPolicy):
     # Prompt
 
     def _prompt(self, batch: dict[str, Tensor]) -> TokenRows:
-        """Everything up to ``Assistant:``, with padding."""
+        """Return everything up to ``Assistant:``, with padding."""
         return TokenRows.join([*self._prompt_parts(batch).values()])
 
     def _prompt_parts(self, batch: dict[str, Tensor]) -> dict[str, TokenRows]:
-        """The same by what it is of; an image's by its camera."""
+        """Return the prompt's parts by name; an image's name is its camera."""
         tokens = self.tokens
         task = read_task(batch, self.config.type, self._device)
         image = [*tokens.image_start, *self._image_span, *tokens.image_end]
@@ -268,7 +314,7 @@ class Vla0SmolPolicy(RelativeVlaPolicy, TokenVlaPolicy):
         return parts | {"end": TokenRows.constant(tokens.answer_start, task.ids)}
 
     def _num_fixed_tokens(self) -> int:
-        """Of the longest prompt and answer, without the task."""
+        """Return the number of tokens of the longest prompt and answer, without the task."""
         tokens, config = self.tokens, self.config
         num_tokens = len(tokens.start) + len(tokens.answer_start)
         num_tokens += len(self._cameras) * len([*tokens.image_start, *self._image_span, *tokens.image_end])
@@ -302,7 +348,7 @@ class Vla0SmolPolicy(RelativeVlaPolicy, TokenVlaPolicy):
         return self._with_images(self._see(batch), ids_BL)
 
     def _with_images(self, features_BPH: Tensor, ids_BL: Tensor) -> Tensor:
-        """The same, of features that were computed before."""
+        """Embed a sequence's tokens, with image features that were computed before: (B, L, H)."""
         embeds_BLH = self.backbone.embed_tokens(ids_BL)
         columns = self._image_columns(ids_BL.device)
         return embeds_BLH.index_copy(1, columns, features_BPH.to(embeds_BLH.dtype))

@@ -20,7 +20,7 @@ def hub() -> Iterator[LoopbackHub]:
 def online(
     hub: LoopbackHub, monkeypatch: pytest.MonkeyPatch, tmp_path_factory: pytest.TempPathFactory
 ) -> LoopbackHub:
-    """This process, too, sees the Hub on this machine alone, with an empty cache."""
+    """Let this process, too, see the Hub on this machine alone, with an empty cache."""
     from huggingface_hub import constants, hf_api
 
     files = f"{hub.endpoint}/{{repo_id}}/resolve/{{revision}}/{{filename}}"

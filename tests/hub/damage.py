@@ -23,7 +23,7 @@ PREPROCESSOR, POSTPROCESSOR = "policy_preprocessor.json", "policy_postprocessor.
 
 
 def write_checkpoint(folder: Path) -> None:
-    """Of a `vla0_smol` whose backbone came from a folder, with what belongs to the training beside it."""
+    """Write a `vla0_smol` whose backbone came from a folder, with what belongs to its training beside it."""
     policy = make_policy(nano_config=None)  # another model has its own layers
     for processor in make_vla0_smol_pre_post_processors(policy.config, STATS):
         processor.save_pretrained(folder)
@@ -82,7 +82,7 @@ def insert_code(name: str) -> Damage:
 
 
 def change_step(name: str, registry_name: str, **values: Any) -> Damage:
-    """None removes a value."""
+    """Return a damage that changes values of a processor's step; None removes a value."""
 
     def damage(folder: Path) -> None:
         content = json.loads((folder / name).read_text())
@@ -96,7 +96,7 @@ def change_step(name: str, registry_name: str, **values: Any) -> Damage:
 
 
 def change_state(name: str, **values: torch.Tensor | None) -> Damage:
-    """None removes a tensor; `__` stands for a dot."""
+    """Return a damage that changes tensors of a state; None removes one, `__` stands for a dot."""
 
     def damage(folder: Path) -> None:
         state: dict[str, Any] = load_file(folder / name) | {
@@ -125,7 +125,7 @@ def change_tensors(name: str, change: Callable[[Tensors], Tensors]) -> Damage:
 
 
 def one_nan(tensors: Tensors) -> Tensors:
-    """Of the first tensor of floats that is neither a scalar nor an image's."""
+    """Put a NaN into the first tensor of floats that is not a scalar."""
     name = min(name for name, tensor in tensors.items() if tensor.is_floating_point() and tensor.ndim)
     tensors[name].view(-1)[1] = torch.nan
     return tensors

@@ -1,4 +1,4 @@
-"""What can be wrong with a recorded dataset's folder of two episodes, by what a refusal says of it."""
+"""Damage to a recorded dataset's folder of two episodes, by what a refusal says of it."""
 
 import json
 import math
@@ -57,7 +57,7 @@ def copy_data(root: Path) -> None:
 
 
 def take_a_shorter_video(root: Path) -> None:
-    """Whole, but of five frames."""
+    """Replace the video by a whole one of five frames only."""
     with av.open(str(root / VIDEO), "w") as video:
         stream = video.add_stream("mpeg4", rate=10)
         stream.width, stream.height, stream.pix_fmt = 32, 32, "yuv420p"

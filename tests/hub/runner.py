@@ -19,14 +19,14 @@ TIMEOUT_S = 280
 
 @dataclass(frozen=True)
 class Ended:
-    """What a process printed, and its exit code."""
+    """Output of a process that ended, and its exit code."""
 
     code: int
     text: str
 
 
 def environment(endpoint: str, home: Path, token: str | None) -> dict[str, str]:
-    """Of a process that knows no other Hub and no other cache."""
+    """Return the environment of a process that knows no other Hub and no other cache."""
     kept = {name: value for name, value in os.environ.items() if not name.startswith("HF_")}
     added = {"HF_ENDPOINT": endpoint, "HF_HOME": str(home), "HF_HUB_DISABLE_XET": "1"}
     added |= {"HF_HUB_DISABLE_TELEMETRY": "1", "OMP_NUM_THREADS": "1"}
@@ -49,7 +49,7 @@ def run(commands: Sequence[Sequence[str]], endpoint: str, home: Path, token: str
 
 
 def only_loopback(event: str, args: tuple) -> None:
-    """An audit hook: whoever looks up or connects to another machine ends this process."""
+    """End this process when anything looks up or connects to another machine: an audit hook."""
     if event == "socket.getaddrinfo":
         host = args[0]
     elif event == "socket.connect" and isinstance(args[1], tuple):

@@ -94,7 +94,7 @@ def git_oid(content: bytes) -> str:
 
 
 def content_id(path: str, content: bytes) -> str:
-    """What a file's content is known by; a client does not send the same again."""
+    """Return the id of a file's content; a client does not send the same content again."""
     return hashlib.sha256(content).hexdigest() if path.endswith(LFS_ENDINGS) else git_oid(content)
 
 

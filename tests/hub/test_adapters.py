@@ -35,7 +35,7 @@ def push_base(folder: Path) -> None:
 
 
 def adapters(base: str, **flags: Any) -> Any:
-    """As `lerobot-train --policy.path=BASE --peft.method_type=LORA` makes them."""
+    """Add adapters to a base as `lerobot-train --policy.path=BASE --peft.method_type=LORA` does."""
     policy = get_policy_class("vla0_smol").from_pretrained(base)
     policy.config.pretrained_path = Path(base)
     for name, value in flags.items():
@@ -44,7 +44,7 @@ def adapters(base: str, **flags: Any) -> Any:
 
 
 def save(wrapped: Any, folder: Path) -> Path:
-    """As `lerobot-train` does."""
+    """Save adapters as `lerobot-train` does."""
     wrapped.save_pretrained(folder)
     wrapped.config.save_pretrained(folder)
     for processor in make_pre_post_processors(make_vla0().config, dataset_stats=STATS):
@@ -171,7 +171,7 @@ def test_a_pickle_does_not_take_the_place_of_adapters(online: LoopbackHub, tmp_p
 
 @pytest.mark.long
 def test_train_push_forget_and_evaluate_adapters(policy_type: str, hub: LoopbackHub, tmp_path: Path) -> None:
-    """By commands alone, on a base that `lerobot-bomb init` wrote."""
+    """Check all of it by commands alone, on a base that `lerobot-bomb init` wrote."""
     data = [f"--dataset.repo_id={DATASET}", f"--dataset.root={tmp_path / 'dataset'}"]
     own = [f"--policy.type={policy_type}", "--policy.vlm_model_name=nano", "--policy.device=cpu"]
     output = f"--output={tmp_path / 'base'}"

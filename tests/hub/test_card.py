@@ -1,4 +1,4 @@
-"""What a card says, by the checkpoint."""
+"""Card of a checkpoint: what it says."""
 
 import json
 from dataclasses import replace
@@ -148,7 +148,21 @@ def test_a_suite_that_is_not_known_is_not_made_up() -> None:
     assert "- environment: BOMB, task version 1.0, an unknown suite, robot scara" in text
     spec = EpisodeSpec(0, "object")
     result = EpisodeResult(
-        spec, "Put it there.", 0, (2, 2), "black", 20, 1.0, True, True, None, Stage.PLACED, 1.0, (2, 2), 0.0
+        spec,
+        "Put it there.",
+        0,
+        (2, 2),
+        "black",
+        20,
+        1.0,
+        True,
+        True,
+        None,
+        Stage.PLACED,
+        1.0,
+        (2, 2),
+        0.0,
+        task_version="1.1",
     )
     played = str(replace(unknown, results=[[json.loads(result.to_json())]]).card())
     assert "--env.task=object" in played and "SUITE" not in played

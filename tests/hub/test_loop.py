@@ -48,7 +48,7 @@ def evaluate(repo_id: str, output_dir: Path, *flags: str) -> list[str]:
 
 
 def check_no_secret(hub: LoopbackHub, ended: Ended, folder: Path) -> None:
-    """Nothing that was printed, published or written tells the token; no path of here is published."""
+    """Check that nothing printed, published or written tells the token, and that no path is published."""
     assert TOKEN not in ended.text
     for repository in hub.repositories.values():
         for files in repository.commits.values():

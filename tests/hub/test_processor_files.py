@@ -59,7 +59,7 @@ def folder(whole: Path, tmp_path: Path) -> Path:
 
 
 def stock_load(folder: Path | str) -> Any:
-    """As LeRobot's commands load processors."""
+    """Load processors as LeRobot's commands do."""
     return make_pre_post_processors(Vla0SmolConfig(device="cpu"), str(folder))
 
 

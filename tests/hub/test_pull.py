@@ -53,7 +53,7 @@ def evaluate(stock_cli: Run, monkeypatch: pytest.MonkeyPatch, tmp_path: Path) ->
 
 
 def told(load: Callable[[], object], capsys: pytest.CaptureFixture[str]) -> str:
-    """What the user reads last."""
+    """Return what the user reads last."""
     capsys.readouterr()
     try:
         load()

@@ -41,6 +41,7 @@ REPO_ID = "me/x"
 
 def result(seed: int, is_success: bool, policy: PolicyIdentity | None = None) -> str:
     return EpisodeResult(
+        task_version="1.0",
         spec=EpisodeSpec(seed=seed),
         instruction="Place a black stone on the Go board at row 0, column 1.",
         task_id=task_id((0, 1), "black"),
@@ -261,7 +262,7 @@ def test_a_token_that_no_header_can_hold_is_never_shown(
     monkeypatch: pytest.MonkeyPatch,
     capsys: pytest.CaptureFixture[str],
 ) -> None:
-    """By our push, and by what LeRobot's commands ask the Hub."""
+    """Check our push, and what LeRobot's commands ask the Hub."""
     from huggingface_hub import hf_hub_download
 
     monkeypatch.setenv("HF_TOKEN", token)

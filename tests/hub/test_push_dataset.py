@@ -83,7 +83,7 @@ def test_nothing_of_a_longer_recording_is_left(
 
 @pytest.fixture(scope="module")
 def filmed(tmp_path_factory: pytest.TempPathFactory) -> Callable[[Path], Path]:
-    """With videos in place of images, as most are."""
+    """Record a dataset with videos in place of images, as most have; return a way to copy it."""
     root = tmp_path_factory.mktemp("filmed") / "dataset"
     flags = ["--episodes=2", "--seed=7", "--image_size=32"]
     assert main(["record", f"--repo_id={REPO_ID}", f"--root={root}", *flags]) == 0

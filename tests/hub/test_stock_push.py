@@ -26,7 +26,7 @@ Files = dict[str, bytes]
 
 @dataclass(frozen=True)
 class Training:
-    """What `lerobot-train` holds when it ends."""
+    """Training at its end: what `lerobot-train` holds then."""
 
     cfg: TrainPipelineConfig
     policy: Any
@@ -34,7 +34,7 @@ class Training:
 
     @classmethod
     def ended(cls, folder: Path, scale: float, *, saves: bool = True) -> "Training":
-        """Its statistics and weights are those of `scale`."""
+        """Build an ended training with statistics and weights of `scale`."""
         policy = make_policy(repo_id=REPO_ID, pretrained_path=folder / "base")
         with torch.no_grad():
             for parameter in policy.parameters():
@@ -52,7 +52,7 @@ class Training:
         return cls(cfg, policy, processors)
 
     def push(self) -> None:
-        """As `lerobot_train` does."""
+        """Push as `lerobot_train` does."""
         publish: Any = getattr(train_utils, "publish_trained_model", None)  # LeRobot 0.6.2
         if publish is not None:
             publish(self.cfg, self.policy, *self.processors, None)

@@ -29,7 +29,7 @@ COMMANDS = (
 
 
 def run(command: list[str | Path], cwd: Path) -> str:
-    """What it prints; exits with that where it fails."""
+    """Run a command and return what it prints; exit with that if it fails."""
     clean = {name: value for name, value in os.environ.items() if name != "PYTHONPATH"}
     ended = subprocess.run(
         command,

@@ -67,7 +67,7 @@ def predict(policy: Any, batch: dict[str, Any]) -> Tensor:
 
 
 def same(actions: Tensor, others: Tensor) -> bool:
-    """The same choices: what they decode to is computed on each device, and neighbours are farther apart."""
+    """Return True for the same choices, decoded on either device; neighbours are farther apart."""
     return torch.allclose(actions, others, rtol=0, atol=2e-4)
 
 
@@ -112,7 +112,7 @@ def test_graphs_follow_weights_and_devices(make: Callable[..., Any]) -> None:
 
 
 def test_what_a_model_gives_that_is_not_finite_is_no_action(make: Callable[..., Any]) -> None:
-    """Of one row, and of another call of the same graph."""
+    """Check one bad row, and another call of the same graph."""
     device = make().cuda()
     batch = on("cuda", batch_for(device, 3))
     device.predict_action_chunk(batch)
@@ -152,7 +152,7 @@ def test_training_goes_on_after_a_prediction(make: Callable[..., Any]) -> None:
 
 
 def test_in_bfloat16_it_answers_nearly_the_same(make_writer: Callable[..., Any]) -> None:
-    """Most of the likeliest choices stay so."""
+    """Check that most of the likeliest choices stay so."""
     host, device = make_writer(), make_writer(dtype="bfloat16").cuda()
     batches = [batch_for(host, 8, seed) for seed in range(4)]
     same = torch.cat([predict(host, batch) == predict(device, batch) for batch in batches])

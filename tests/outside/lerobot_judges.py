@@ -57,7 +57,7 @@ def redraw(policy: PreTrainedPolicy) -> None:
 
 
 def check_config_file(folder: Path, config: PreTrainedConfig) -> None:
-    """LeRobot's test hands its config to loading, where a user has only the file: it must hold everything."""
+    """Check that the file holds everything: LeRobot's test loads with its config, a user without."""
     stored = json.loads((folder / "config.json").read_text())
     lost = {field.name for field in fields(config)} - stored.keys()
     assert not lost, f"config.json of {config.type} has no {sorted(lost)}"
@@ -65,7 +65,7 @@ def check_config_file(folder: Path, config: PreTrainedConfig) -> None:
 
 
 def has_libero() -> bool:
-    """Whether LIBERO and its assets are there; says what is missing."""
+    """Return True if LIBERO and its assets are there; otherwise print what is missing."""
     try:
         prepare_libero([SUITES[0]])
     except ValueError as error:

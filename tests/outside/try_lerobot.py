@@ -38,7 +38,7 @@ def install(checkout: Path) -> Path:
 
 
 def run(command: Sequence[str]) -> None:
-    """In the project's folder; exits where it fails."""
+    """Run a command in the project's folder; exit if it fails."""
     returned = subprocess.run(command, cwd=ROOT, check=False).returncode
     if returned:
         sys.exit(returned)

@@ -41,7 +41,7 @@ class Start(Transform):
 
 
 def _room_m(nominal: Episode) -> tuple[float, float]:
-    """How far the stones in the tray can go along it, down and up."""
+    """Return how far the stones in the tray can go along it, down and up."""
     if not nominal.supply:
         return 0.0, 0.0
     half_m = TRAY_HALF_SIZE_XY[1] - nominal.layout.stone_radius_m

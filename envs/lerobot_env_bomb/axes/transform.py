@@ -1,5 +1,5 @@
 # pyright: reportAttributeAccessIssue=false
-"""What every perturbation axis is: a transform of an episode, frozen once drawn."""
+"""Base of the perturbation axes: a transform of an episode, frozen once drawn."""
 
 from lerobot_bomb.bomb.layout import Layout
 from lerobot_bomb.envs.perturbation import EpisodeTransform
@@ -7,7 +7,7 @@ from lerobot_env_mujoco.mujoco_gl import mujoco
 
 
 class Transform(EpisodeTransform):
-    """What one axis does to an episode of BOMB."""
+    """Effect of one axis on an episode of BOMB."""
 
     def edit_model(self, model: mujoco.MjModel) -> None:
         """Change the compiled model in place."""

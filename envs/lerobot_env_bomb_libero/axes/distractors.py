@@ -84,7 +84,7 @@ def _places() -> np.ndarray:
 
 
 def _is_out_of_the_way(place: np.ndarray, boxes: list[np.ndarray], ends: list[np.ndarray]) -> bool:
-    """Whether (2,) is far from (2, 3) boxes, and from the lines between the places where the task happens."""
+    """Return True if (2,) is far from (2, 3) boxes and from the lines between the places of the task."""
     gap = HALF_SIZE_M + CLEARANCE_M
     if any((place > low[:2] - gap).all() and (place < high[:2] + gap).all() for low, high in boxes):
         return False
@@ -120,7 +120,7 @@ def _is_seen(scene: LiberoScene, spot: np.ndarray) -> bool:
 
 
 def _distance_m(point: np.ndarray, one: np.ndarray, other: np.ndarray) -> float:
-    """From a point to the line between two, (2,) each."""
+    """Return the distance of a point from the line between two others, (2,) each."""
     along = other - one
     share = np.clip((point - one) @ along / max(float(along @ along), 1e-12), 0, 1)
     return float(np.linalg.norm(point - one - share * along))

@@ -45,7 +45,7 @@ class LiberoStart(LiberoTransform):
                 self._move(scene, pile, direction_rad)
 
     def _move(self, scene: LiberoScene, pile: set[int], direction_rad: float) -> None:
-        """In the first direction, from the drawn one on, in which it meets nothing; else not at all."""
+        """Move a pile in the first direction, from the drawn one on, in which it meets nothing, if any."""
         others = [box for body, box in scene.boxes().items() if body not in pile]
         boxes = [box for body, box in scene.boxes().items() if body in pile]
         addresses = [int(scene.model.jnt_qposadr[scene.model.body_jntadr[body]]) for body in sorted(pile)]
@@ -77,7 +77,7 @@ def _piles(scene: LiberoScene) -> list[set[int]]:
 
 
 def _is_free(box: np.ndarray, others: list[np.ndarray]) -> bool:
-    """Whether a (2, 3) box from low to high is on the table and keeps its distance from the others."""
+    """Return True if a (2, 3) box from low to high is on the table and keeps its distance from the others."""
     if abs(box.mean(0)[:2]).max() > REACH_M:
         return False
     low, high = box[0] - CLEARANCE_M, box[1] + CLEARANCE_M

@@ -42,7 +42,7 @@ FORMS = (
 
 @dataclass(frozen=True)
 class PushTWording(PushTTransform):
-    """Another template in place of the episode's."""
+    """Template in place of the episode's."""
 
     template: str
 

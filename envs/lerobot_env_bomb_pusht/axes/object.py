@@ -16,7 +16,7 @@ SHADE_RGB = ((60, 50, 50), (150, 60, 50), (170, 105, 30), (125, 60, 140), (110, 
 
 @dataclass(frozen=True)
 class BlockShade(PushTTransform):
-    """Another colour of the block."""
+    """Colour in place of the block's."""
 
     rgb: tuple[int, int, int]
 

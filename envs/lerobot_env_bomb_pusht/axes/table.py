@@ -57,7 +57,7 @@ class BoardLook(PushTTransform):
 
 @cache
 def pattern_surface(pattern: str) -> pygame.Surface:
-    """Of the board's size, with a palette of two colours, the second for the pattern."""
+    """Draw the pattern in the board's size, with a palette of two colours, the second for the pattern."""
     x, y = np.indices((BOARD_PX, BOARD_PX))
     if pattern == "speckles":
         small = np.random.default_rng(0).random((BOARD_PX // SPECKLE_PX,) * 2) < SPECKLE_SHARE

@@ -1,7 +1,6 @@
 """Suite `goal`: stones stand on the board, and the instruction says what is to be done with them."""
 
 from dataclasses import dataclass
-from itertools import permutations
 
 import numpy as np
 
@@ -31,7 +30,7 @@ def _draw_board(rng: np.random.Generator) -> dict[Cell, str]:
 
 
 def _to_tray(drawn: Drawn, cells: list[Cell]) -> tuple[Plan, tuple[Aim, ...]]:
-    """All of them into the tray, in whichever order."""
+    """Return the plan and the aims that put all of these stones into the tray, in whichever order."""
     stones = [drawn.stone_on(cell) for cell in cells]
     plan = tuple(one_move(stone, [TRAY]) for stone in stones)
     return plan, tuple(Aim(stone, xy) for stone, xy in zip(stones, TRAY_XY_M, strict=False))
@@ -73,7 +72,7 @@ class RemoveAt(Task):
 
 @dataclass(frozen=True)
 class Swap(Task):
-    """Two stones change places, one of them by way of the tray or of a free intersection."""
+    """Task: let two stones change places, one of them by way of the tray or of a free intersection."""
 
     def draw(self, rng: np.random.Generator) -> Drawn:
         stones = _draw_board(rng)
@@ -94,7 +93,11 @@ class Swap(Task):
             for one, other, here, there in ((first, second, a, b), (second, first, b, a))
         )
         aims = (Aim(first, TRAY_XY_M[0]), aim_at(second, a), aim_at(first, b))
-        command = f"swap the stone at row {a[0]}, column {a[1]} and the stone at row {b[0]}, column {b[1]}"
+        # with their colours, for when it is done is seen by them alone
+        command = (
+            f"swap the {stones[a]} stone at row {a[0]}, column {a[1]} and the {stones[b]} stone at "
+            f"row {b[0]}, column {b[1]}"
+        )
         return Case((command,), plans, aims)
 
 
@@ -122,16 +125,17 @@ class Push(Task):
             return None
         stone = drawn.stone_on(cell)
         plan = (Move(frozenset([stone]), frozenset([place]), is_slid=True),)
+        # with the place, for a stone that has been pushed half the way does not show where it stood
         command = (
-            f"push the {color} stone one intersection {self.direction}, along the board and without lifting "
-            "it"
+            f"push the {color} stone one intersection {self.direction}, to row {place[0]}, "
+            f"column {place[1]}, along the board and without lifting it"
         )
         return Case((command,), (plan,), (aim_at(stone, place, is_slid=True),), (other_color(color),))
 
 
 @dataclass(frozen=True)
 class ClearRow(Task):
-    """All stones of a row go into the tray."""
+    """Task: put all stones of a row into the tray."""
 
     def draw(self, rng: np.random.Generator) -> Drawn:
         row, number = int(rng.integers(BOARD.num_lines)), int(rng.integers(1, MAX_MOVED + 1))
@@ -148,7 +152,7 @@ class ClearRow(Task):
 
 @dataclass(frozen=True)
 class Gather(Task):
-    """All stones of a colour that do not stand on the left go there."""
+    """Task: move all stones of a colour that do not stand on the left to the left."""
 
     def draw(self, rng: np.random.Generator) -> Drawn:
         return Drawn((int(rng.integers(len(COLORS))), int(rng.integers(BOARD.num_lines))), _draw_board(rng))
@@ -168,20 +172,10 @@ class Gather(Task):
             return None
         stones = [drawn.stone_on(cell) for cell in cells]
         plan = tuple(one_move(stone, side) for stone in stones)
-        aims = tuple(aim_at(stone, place) for stone, place in zip(stones, _nearest(cells, free), strict=True))
+        # row by row, from the far one: a stone that is held does not show where it stood
+        aims = tuple(aim_at(stone, place) for stone, place in zip(stones, free, strict=False))
         command = f"bring all {color} stones to the left side of the board, into columns 0 and 1"
         return Case((command,), (plan,), aims, (other_color(color),))
-
-
-def _nearest(cells: list[Cell], places: list[Cell]) -> list[Cell]:
-    """A place of its own for each, row by row as near as can be."""
-
-    def cost(chosen: tuple[Cell, ...]) -> int:
-        return sum(
-            abs(r - row) + abs(c - column) for (row, column), (r, c) in zip(cells, chosen, strict=True)
-        )
-
-    return list(min(permutations(places, len(cells)), key=cost))
 
 
 TASKS: tuple[Task, ...] = (
@@ -195,4 +189,5 @@ TASKS: tuple[Task, ...] = (
     ClearRow(),
     Gather(),
 )
-SUITE = command_suite(TASKS, max_steps=170, num_goals=MAX_MOVED)
+# 1.1: a push says its place, a swap its colours; the expert gathers row by row
+SUITE = command_suite(TASKS, max_steps=170, num_goals=MAX_MOVED, version="1.1")

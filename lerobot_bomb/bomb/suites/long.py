@@ -29,14 +29,22 @@ EDGE_COLUMNS = 0, BOARD.num_lines - 1  # of captured stones: fingers go down bes
 
 
 def _in_turn(first: int, number: int) -> tuple[str, ...]:
-    """So many colours, black and white in turn, from the first of COLORS or the second."""
+    """Return so many colours, black and white in turn, from the first or the second of COLORS."""
     return tuple(COLORS[(first + i) % 2] for i in range(number))
+
+
+def _shuffled(rng: np.random.Generator, colors: tuple[str, ...]) -> tuple[str, ...]:
+    """The stones of the tray, row by row: any order of these colours."""
+    return tuple(colors[i] for i in rng.permutation(len(colors)))
 
 
 def _supply_plan(
     drawn: Drawn, moves: list[tuple[str, Cell]], is_ordered: bool
 ) -> tuple[Plan, tuple[Aim, ...]]:
-    """Stones of these colours from the tray to these intersections; any stone of the colour will do."""
+    """Stones of these colours from the tray to these intersections; any stone of the colour will do.
+
+    The expert takes the first of them in the tray, row by row from the far one.
+    """
     of_color = {
         color: frozenset(i for i, other in enumerate(drawn.supply) if other == color) for color in COLORS
     }
@@ -57,7 +65,7 @@ class Opening(Task):
 
     def draw(self, rng: np.random.Generator) -> Drawn:
         first = int(rng.integers(len(COLORS)))
-        supply = _in_turn(first, self.num_moves)
+        supply = _shuffled(rng, _in_turn(first, self.num_moves))
         max_others = min(MAX_OTHERS, NUM_STONES - self.num_moves)
         others = draw_stones(rng, int(rng.integers(max_others + 1)))
         cells = draw_cells(rng, self.num_moves, [cell for cell in CELLS if cell not in others])
@@ -86,18 +94,21 @@ class Opening(Task):
 
 @dataclass(frozen=True)
 class FillRow(Task):
-    """The free intersections of a row get a stone each, the colours in turn from left to right."""
+    """The free intersections of a row get a stone each, the colours in turn from left to right.
+
+    The last one's colour is said: it stays true of what is left, whoever has played there before.
+    """
 
     def draw(self, rng: np.random.Generator) -> Drawn:
-        first, row = int(rng.integers(len(COLORS))), int(rng.integers(BOARD.num_lines))
+        last, row = int(rng.integers(len(COLORS))), int(rng.integers(BOARD.num_lines))
         stones = draw_stones(rng, int(rng.integers(2, 6)))
         free = [cell for cell in CELLS if cell[0] == row and cell not in stones]
-        return Drawn((first, row), stones, _in_turn(first, len(free)))
+        return Drawn((last, row), stones, _shuffled(rng, _in_turn(last, len(free))))
 
     def case(self, drawn: Drawn) -> Case | None:
-        first, row = drawn.about
+        last, row = drawn.about
         cells = [cell for cell in CELLS if cell[0] == row and cell not in drawn.stones]
-        colors = _in_turn(first, len(cells))
+        colors = _in_turn(last, len(cells))[::-1]
         if Counter(drawn.supply) != Counter(colors) or not 2 <= len(cells) <= MAX_FILLED or drawn.pattern:
             return None
         moves = list(zip(colors, cells, strict=True))
@@ -106,7 +117,7 @@ class FillRow(Task):
         plan, aims = _supply_plan(drawn, moves, is_ordered=True)
         command = (
             f"fill the free intersections of row {row} from left to right, the colours in turn, "
-            f"{colors[0]} first"
+            f"{colors[-1]} last"
         )
         return Case((command,), (plan,), aims)
 
@@ -183,7 +194,7 @@ class TakeBack(Task):
 
 @dataclass(frozen=True)
 class CopyPattern(Task):
-    """What the small board in the tray shows is built on the board."""
+    """Task: build on the board what the small board in the tray shows."""
 
     num_stones: int
 
@@ -192,7 +203,7 @@ class CopyPattern(Task):
         colors = _in_turn(first, self.num_stones)
         cells = draw_cells(rng, self.num_stones)
         pattern = dict(zip(cells, colors, strict=True))
-        return Drawn((first, *cells[0]), {}, colors, pattern)
+        return Drawn((first, *cells[0]), {}, _shuffled(rng, colors), pattern)
 
     def case(self, drawn: Drawn) -> Case | None:
         if len(drawn.pattern) != self.num_stones or set(drawn.pattern) & set(drawn.stones):
@@ -201,7 +212,7 @@ class CopyPattern(Task):
             return None
         if not is_legal_position(dict(drawn.stones) | dict(drawn.pattern)):
             return None
-        moves = [(color, cell) for cell, color in drawn.pattern.items()]
+        moves = [(color, cell) for cell, color in sorted(drawn.pattern.items())]
         plan, aims = _supply_plan(drawn, moves, is_ordered=False)
         return Case(("copy the pattern of the small board onto the large one",), (plan,), aims)
 
@@ -214,4 +225,6 @@ TASKS: tuple[Task, ...] = (
     TakeBack(),
     *(CopyPattern(number) for number in (2, 3, 4)),
 )
-SUITE = command_suite(TASKS, max_steps=400, num_goals=MAX_MOVES)
+# 1.1: of equal stones the expert takes the first in the tray, it copies row by row and waits for what has not
+# been said; a row is filled up to the last one's colour
+SUITE = command_suite(TASKS, max_steps=440, num_goals=MAX_MOVES, version="1.1")

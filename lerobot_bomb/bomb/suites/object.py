@@ -22,7 +22,7 @@ CORNER_X_M = (0.023, 0.030)
 CORNER_Y_M = (0.023, 0.026)
 GRIPPER_START_SPREAD_M = 0.030  # of the gripper around the tray's centre, in x and in y
 GRIPPER_START_HEIGHT_M = (0.08, 0.11)
-# by which the stone that is meant is nearer, or further to the left, than any other: it is seen at 64 pixels
+# by which the stone that is meant is nearer, further left, ... than any other: it is seen at 64 pixels
 MARGIN_M = 0.012
 
 TEMPLATES = (
@@ -69,7 +69,7 @@ class Supply:
 
 @dataclass(frozen=True)
 class Task:
-    """Which stone is meant. `select` gives its index, or None where it is not the only one or not clearly."""
+    """Task about one stone in the tray: `select` returns its index, None where it is not clear which."""
 
     stone: str
     select: Callable[[Supply], int | None]
@@ -87,12 +87,12 @@ def _least(values: np.ndarray) -> int | None:
     return int(order[0]) if values[order[1]] - values[order[0]] >= MARGIN_M else None
 
 
-def _by_gripper(supply: Supply, sign: int) -> int | None:
-    return _least(sign * np.linalg.norm(supply.xy - supply.gripper_xy, axis=1))
+def _nearest_to_gripper(supply: Supply) -> int | None:
+    return _least(np.linalg.norm(supply.xy - supply.gripper_xy, axis=1))
 
 
 def _by_anchor(supply: Supply, is_white: bool, sign: int) -> int | None:
-    """Of the other stones, at least two, the one nearest to the only stone of a colour, or farthest."""
+    """Return the stone nearest to a colour's only stone, or farthest from it; None with fewer than three."""
     anchor = _only(supply, is_white)
     if anchor is None or len(supply.xy) < 3:
         return None
@@ -108,8 +108,9 @@ def _by_side(supply: Supply, axis: int, sign: int) -> int | None:
 TASKS = (
     Task("the black stone", partial(_only, is_white=False)),
     Task("the white stone", partial(_only, is_white=True)),
-    Task("the stone nearest to the gripper", partial(_by_gripper, sign=1), gripper_is_named=True),
-    Task("the stone farthest from the gripper", partial(_by_gripper, sign=-1), gripper_is_named=True),
+    # the gripper comes nearer to it and nearer to no other: it is the same stone in every step
+    Task("the stone nearest to the gripper", _nearest_to_gripper, gripper_is_named=True),
+    Task("the frontmost stone in the tray", partial(_by_side, axis=1, sign=1)),
     Task("the stone nearest to the white stone", partial(_by_anchor, is_white=True, sign=1)),
     Task("the stone farthest from the white stone", partial(_by_anchor, is_white=True, sign=-1)),
     Task("the stone nearest to the black stone", partial(_by_anchor, is_white=False, sign=1)),
@@ -121,7 +122,7 @@ NUM_PARTS = 5  # one in so many pairs of a task and an intersection is held out
 
 
 def is_heldout(task_id: int, cell: Cell) -> bool:
-    """Whether a pair is held out; every task and every intersection is seen in other pairs."""
+    """Return True if a pair is held out; every task and every intersection is seen in other pairs."""
     row, column = cell
     return (task_id + row + 2 * column) % NUM_PARTS == 0
 
@@ -134,7 +135,7 @@ def pairs_of(split: str) -> tuple[tuple[int, Cell], ...]:
 
 
 def _pairs(spec: EpisodeSpec) -> list[tuple[int, Cell]]:
-    """Those that a spec draws from."""
+    """Return the pairs of task and intersection that a spec draws from."""
     return [
         (task_id, cell)
         for task_id, cell in pairs_of(spec.split)
@@ -205,4 +206,5 @@ def _layout(supply: Supply, height_m: float) -> Layout:
     return Layout(gripper_xyz, stone_xy, is_white, np.arange(NUM_STONES) < number)
 
 
-SUITE = Suite(sample_episode, check, max_steps=100, forms=FORMS, num_tasks=len(TASKS))
+# 1.1: task 3 names a stone that stays the same while the gripper moves
+SUITE = Suite(sample_episode, check, max_steps=100, forms=FORMS, num_tasks=len(TASKS), version="1.1")

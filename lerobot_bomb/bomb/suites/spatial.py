@@ -54,18 +54,18 @@ FORMS = (
 
 
 class Task(ABC):
-    """Which place is meant."""
+    """Task whose instruction describes a place by the stones that stand there."""
 
     place: str  # how the instruction names it; {anchor} is the colour of the stones that it refers to
     has_anchor = True
 
     @abstractmethod
     def select(self, stones: Stones, anchor: str) -> Cell | None:
-        """The place; None where none or several fit, or it is taken."""
+        """Return the place that is meant; None where none or several fit, or it is taken."""
 
     @abstractmethod
     def referents(self, target: Cell) -> list[list[Cell]]:
-        """Each way for stones to stand so that `target` is meant; none where it cannot be."""
+        """Return each way for stones to stand so that `target` is meant; none where it cannot be."""
 
     @property
     def targets(self) -> tuple[Cell, ...]:
@@ -75,7 +75,7 @@ class Task(ABC):
 
 @dataclass(frozen=True)
 class Beside(Task):
-    """So many rows and columns from the only stone of the anchor's colour."""
+    """Task: the place so many rows and columns from the only stone of the anchor's colour."""
 
     place: str
     rows: int
@@ -95,7 +95,7 @@ class Beside(Task):
 
 @dataclass(frozen=True)
 class Between(Task):
-    """Halfway between the only two stones of the anchor's colour, in their row or column."""
+    """Task: the place halfway between the only two stones of the anchor's colour, in their row or column."""
 
     place: str
 
@@ -160,7 +160,7 @@ NUM_PARTS = 5  # one in so many cases is held out
 
 
 def is_heldout(task_id: int, target: Cell, color: str) -> bool:
-    """Whether a case is held out: every relation, every place and every colour is seen in other cases."""
+    """Return True if a case is held out: every relation, place and colour is seen in other cases."""
     if len(TASKS[task_id].targets) == 1:
         return (task_id + 3 * COLORS.index(color)) % (NUM_PARTS + 1) == NUM_PARTS
     return (task_id + target[0] + 2 * target[1]) % NUM_PARTS == 0
@@ -232,7 +232,7 @@ def _means(task: Task, anchor: str, target: Cell, stones: Stones) -> bool:
 def _sample_opening(
     rng: np.random.Generator, task: Task, target: Cell, color: str, anchor: str, extra_colors: tuple[str, ...]
 ) -> dict[Cell, str]:
-    """Up to 8 stones with which the move is legal and the only one that is meant."""
+    """Draw up to 8 stones with which the move is legal and the only one that is meant."""
     while True:
         ways = task.referents(target)
         cells = ways[rng.integers(len(ways))]

@@ -44,7 +44,7 @@ def check_processors_before_use(
 
 
 def _config_file(given: dict[str, Any]) -> Path:
-    """Where the config.json beside a processor is, or would be."""
+    """Return where the config.json beside a processor is, or would be."""
     path = given["base_path"] / CONFIG_NAME
     if not given.get("is_local_source") and not path.is_file():
         # LeRobot 0.6.2 says in which folder of the repository; earlier ones read its root

@@ -36,7 +36,7 @@ class KeptPolicy:
         """Run lerobot-eval, which draws no video and plays one task after another.
 
         `asked` is equal where it needs the policy of before, built with the same seed. `first` is the number
-        of an episode that is played alone out of a longer evaluation.
+        of an episode that is run alone out of a longer evaluation.
         """
         from lerobot.scripts import lerobot_eval
         from lerobot.utils.random_utils import get_rng_state, set_rng_state
@@ -110,7 +110,7 @@ def eval_config(flags: Sequence[str]) -> Any:
 
 
 def _run_lerobot_eval(flags: Sequence[str], **replaced: Any) -> None:
-    """In this process, with other functions of these names."""
+    """Run lerobot-eval in this process, with other functions of these names."""
     from lerobot.scripts import lerobot_eval
 
     usual = {name: getattr(lerobot_eval, name) for name in replaced}

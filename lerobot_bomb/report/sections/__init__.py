@@ -25,6 +25,6 @@ SECTIONS = (
 
 
 def build(report: Report) -> list[Section]:
-    """Those that the episodes have something for."""
+    """Build the sections that the episodes have something for."""
     sections = [module.section(report) for module in SECTIONS]
     return [section for section in sections if section.tables or section.lines]

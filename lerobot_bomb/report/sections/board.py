@@ -1,4 +1,4 @@
-"""Where on the board stones were asked for, and where they lie."""
+"""Section `board`: where on the board stones were asked for, and where they lie."""
 
 from collections import Counter
 from collections.abc import Callable, Iterable
@@ -10,7 +10,7 @@ from lerobot_bomb.report.table import Cell, Section, Table
 
 
 def section(report: Report) -> Section:
-    """Up to two tables for each arm."""
+    """Write the section: up to two tables for each arm."""
     return Section("The board", [table for arm in report.arms for table in boards(arm)])
 
 

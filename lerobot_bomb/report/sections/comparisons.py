@@ -1,4 +1,4 @@
-"""Two policies on the same episodes."""
+"""Section `comparisons`: two policies on the same episodes."""
 
 from collections.abc import Iterable
 from itertools import combinations
@@ -21,7 +21,7 @@ def section(report: Report) -> Section:
 
 
 def comparisons(arms: list[Arm]) -> Iterable[Table]:
-    """Each pair of policies whose episodes differ in nothing else."""
+    """Yield a table for each pair of policies whose episodes differ in nothing else."""
     for first, second in combinations(policies_of(arms), 2):
         try:
             found = compare(first.rows, second.rows)

@@ -1,4 +1,4 @@
-"""How fast each policy answers, what that takes, and how smoothly it moves."""
+"""Section `efficiency`: how fast each policy answers, what that takes, and how smoothly it moves."""
 
 from lerobot_bomb.evaluation.efficiency import Efficiency, efficiencies, smoothness_of
 from lerobot_bomb.report.arms import Report
@@ -24,7 +24,7 @@ SMOOTHNESS_NOTE = (
 
 
 def section(report: Report) -> Section:
-    """Of queries a line for each arm, device and size of the batch; of smoothness one for each arm."""
+    """Write a row of queries per arm, device and size of the batch, and a row of smoothness per arm."""
     queries = [[Cell(arm.name), *_cells(each)] for arm in report.arms for each in efficiencies(arm.rows)]
     measures = {arm.name: smoothness_of(arm.rows) for arm in report.arms}
     smooth = [
@@ -40,7 +40,7 @@ def section(report: Report) -> Section:
 
 
 def is_measured(report: Report) -> bool:
-    """Whether the section has something to show."""
+    """Return True if the section has something to show."""
     names = ("inference", "action_j2")
     return any(row.get(name) is not None for arm in report.arms for row in arm.rows for name in names)
 

@@ -1,4 +1,4 @@
-"""Why episodes failed."""
+"""Section `failures`: why episodes failed."""
 
 from collections import Counter
 
@@ -15,7 +15,7 @@ def section(report: Report) -> Section:
 
 
 def failures(arm: Arm) -> Table:
-    """How often which class of failure, by condition."""
+    """Count each class of failure, by condition."""
     classes = Counter(row["failure"] for row in arm.rows if row["failure"] is not None)
     names = [name for name, _ in classes.most_common()]
     is_placed = all(row.get("target") is not None for row in arm.rows)

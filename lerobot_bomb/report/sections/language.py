@@ -1,4 +1,4 @@
-"""Whether a policy reads its instruction: the same episodes, told another one."""
+"""Section `language`: the same episodes under another instruction, to see if a policy reads its own."""
 
 from collections.abc import Iterable
 

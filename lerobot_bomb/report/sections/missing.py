@@ -1,4 +1,4 @@
-"""What the episodes have nothing for, and how to get it."""
+"""Section `missing`: what the episodes have nothing for, and how to get it."""
 
 from lerobot_bomb.report.arms import Report
 from lerobot_bomb.report.sections import efficiency, language
@@ -18,7 +18,7 @@ VIDEOS = "Videos: lerobot-bomb report ... --videos=N plays N failures of each cl
 
 
 def section(report: Report) -> Section:
-    """A line for each."""
+    """Write a line for each part that is missing."""
     is_missing = {
         LANGUAGE: not language.section(report).tables,
         EFFICIENCY: not efficiency.is_measured(report),

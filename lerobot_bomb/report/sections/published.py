@@ -1,4 +1,4 @@
-"""What others published of such tasks and models, for orientation: none of it was measured here."""
+"""Section `published`: what others published of such tasks and models; none of it was measured here."""
 
 from dataclasses import dataclass
 

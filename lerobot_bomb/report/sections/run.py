@@ -1,4 +1,4 @@
-"""What was run, and the flags that do it again."""
+"""Section `run`: what was run, and the flags that do it again."""
 
 import json
 import shlex
@@ -15,7 +15,7 @@ def section(report: Report) -> Section:
 
 
 def commands(arm: Arm) -> list[str]:
-    """What was evaluated, and the flags that do it again."""
+    """Describe what was evaluated, and the flags that do it again."""
     by = by_condition(arm.rows)
     policy = arm.rows[0].get("policy") or {"type": "TYPE", "path": None}
     who = f"--policy.type={policy['type']}" if policy["path"] is None else f"--policy.path={policy['path']}"
@@ -28,7 +28,7 @@ def commands(arm: Arm) -> list[str]:
 
 
 def _as_played(row: Row) -> list[str]:
-    """Device and batch, which outcomes may depend on, as far as the line says."""
+    """Device and batch, which outcomes may depend on, as far as the record says."""
     device, batch_size = (
         (row.get("inference") or {}).get("device", ""),
         (row.get("policy") or {}).get("batch_size"),

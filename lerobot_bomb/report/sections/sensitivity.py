@@ -1,4 +1,4 @@
-"""How much each axis matters."""
+"""Section `sensitivity`: how much each axis matters."""
 
 import numpy as np
 

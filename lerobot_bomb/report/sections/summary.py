@@ -1,4 +1,4 @@
-"""What a reviewer reads in a minute."""
+"""Section `summary`: what a reviewer reads in a minute."""
 
 from collections.abc import Iterator
 
@@ -54,7 +54,7 @@ def _perturbed(arm: Arm) -> list[Row]:
 
 
 def _peers(arm: Arm, arms: list[Arm]) -> list[Arm]:
-    """Other arms that differ from this one in the policy only."""
+    """Return the other arms that differ from this one in the policy only."""
     return [other for other in arms if other is not arm and can_compare(arm.group, other.group)]
 
 
@@ -97,6 +97,6 @@ def _other_nominal(arms: list[Arm]) -> Iterator[str]:
 
 
 def _measures(arm: Arm) -> list[tuple[Measure, str]]:
-    """Those that the arm's episodes have a value of."""
+    """Return the measures that the arm's episodes have a value of, with their values."""
     values = [(measure, measure.value(arm.nominal or arm.rows)) for measure in arm.group.kind.measures]
     return [(measure, value) for measure, value in values if value != NO_VALUE]

@@ -1,0 +1,119 @@
+"""Pointing: which stone goes where, as the expert means it and as a policy says it.
+
+It is what a policy must read before it can act, and what lies on the board is read before that; what
+the expert would do for other places teaches it to act as it has pointed. A recording has all of it in columns
+that only training reads, never in an observation.
+"""
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field, replace
+from typing import Self
+
+import numpy as np
+
+from lerobot_bomb.bomb.board import BOARD
+from lerobot_bomb.bomb.commands import CELLS, TRAY_XY_M
+from lerobot_bomb.bomb.expert import current_goal, expert_action, held_share
+from lerobot_bomb.bomb.judge import LIFT_M
+from lerobot_bomb.bomb.observation import ACTION_DIM
+from lerobot_bomb.bomb.privileged_state import Goal, PrivilegedState
+
+ON_INTERSECTION_M = 0.008  # a stone this near one lies on it
+# a stone's centre, off the board from here on
+LIFTED_M = BOARD.thickness_m + BOARD.stone_height_m / 2 + LIFT_M
+HELD = 0.5  # from this share on a stone counts as held
+NUM_OTHERS = 2  # places a frame, beside the one that is meant
+# where the expert puts stones
+PLACES_XY_M = (*(tuple(BOARD.intersection_xy(*cell).tolist()) for cell in CELLS), *TRAY_XY_M)
+PREFIX = "pointing."
+# name -> names of its numbers; metres, shares, actions of the environment, colours of `colors_on_board`
+COLUMNS = {
+    f"{PREFIX}place": ("x", "y"),
+    f"{PREFIX}stone": ("x", "y", "held"),
+    f"{PREFIX}other_places": tuple(f"{axis}{i}" for i in range(NUM_OTHERS) for axis in "xy"),
+    f"{PREFIX}other_actions": tuple(
+        f"action{i}_{dim}" for i in range(NUM_OTHERS) for dim in range(ACTION_DIM)
+    ),
+    f"{PREFIX}board": tuple(f"row{row}_column{column}" for row, column in CELLS),
+}
+
+
+@dataclass(frozen=True)
+class Meant:
+    """A stone and the place where the expert brings it."""
+
+    place_xy: np.ndarray  # (2,) metres
+    stone_xy: np.ndarray  # (2,) metres
+    held: float  # how far the fingers hold that stone, in [0, 1]
+
+    @classmethod
+    def in_state(cls, state: PrivilegedState) -> Self:
+        """Read off the true state."""
+        goal = current_goal(state)
+        return cls(goal.xyz[:2], state.stone_xyz[goal.stone, :2], held_share(state, goal.stone))
+
+
+@dataclass(frozen=True)
+class PointedAt:
+    """A stone and the place where a policy says that it brings it."""
+
+    place_xy: np.ndarray  # (2,) metres
+    stone_xy: np.ndarray  # (2,) metres
+    held: float | None = None  # probability that the fingers hold that stone; None: it says nothing of it
+    # of each place (x, y) of a table, the probability that it is the one; {} where there is no table
+    probabilities: Mapping[tuple[float, float], float] = field(default_factory=dict)
+
+
+@dataclass(frozen=True)
+class Pointing(Meant):
+    """Stone and place in a state, and the expert's actions for other places."""
+
+    other_places_xy: np.ndarray  # (NUM_OTHERS, 2) metres
+    other_actions: np.ndarray  # (NUM_OTHERS, ACTION_DIM), in the environment's units
+    board: np.ndarray  # (25,) as `colors_on_board` has it
+
+    @classmethod
+    def of(cls, state: PrivilegedState, rng: np.random.Generator) -> Self:
+        """Point, and draw other places."""
+        goal = current_goal(state)
+        others = [PLACES_XY_M[i] for i in rng.integers(len(PLACES_XY_M), size=NUM_OTHERS)]
+        return cls(
+            **vars(Meant.in_state(state)),
+            other_places_xy=np.array(others),
+            other_actions=np.stack([expert_action(_aimed_at(state, goal, xy)) for xy in others]),
+            board=colors_on_board(state),
+        )
+
+    def columns(self) -> dict[str, np.ndarray]:
+        """{name: its numbers, (n,) float32}."""
+        values = (
+            self.place_xy,
+            np.append(self.stone_xy, self.held),
+            self.other_places_xy,
+            self.other_actions,
+            self.board,
+        )
+        return {
+            name: value.reshape(-1).astype(np.float32) for name, value in zip(COLUMNS, values, strict=True)
+        }
+
+
+def colors_on_board(state: PrivilegedState) -> np.ndarray:
+    """(25,) int64, row by row: 0 for an empty intersection, 1 for a black stone on it, 2 for a white one."""
+    lies = state.stone_in_play & (state.stone_xyz[:, 2] < LIFTED_M)
+    ways = np.array(PLACES_XY_M[: len(CELLS)])[:, None] - state.stone_xyz[lies, :2]
+    is_on = np.linalg.norm(ways, axis=2) <= ON_INTERSECTION_M
+    return (is_on * (1 + state.stone_is_white[lies])).max(axis=1, initial=0)
+
+
+def action_for(state: PrivilegedState, pointed: PointedAt) -> np.ndarray:
+    """(4,) the expert's action if stone and place were where they are pointed at; what it holds, it holds."""
+    goal, stone_xyz = current_goal(state), state.stone_xyz.copy()
+    if held_share(state, goal.stone) < HELD:
+        stone_xyz[goal.stone, :2] = pointed.stone_xy
+    x, y = pointed.place_xy.tolist()
+    return expert_action(_aimed_at(replace(state, stone_xyz=stone_xyz), goal, (x, y)))
+
+
+def _aimed_at(state: PrivilegedState, goal: Goal, xy: tuple[float, float]) -> PrivilegedState:
+    return replace(state, goals=(replace(goal, xyz=np.array([*xy, goal.xyz[2]])),))

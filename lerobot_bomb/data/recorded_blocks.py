@@ -1,0 +1,154 @@
+"""Blocks of a recording, played and written.
+
+LeRobot and torch are imported only after the flags have been checked and the workers are playing.
+"""
+
+import sys
+from collections.abc import Callable, Iterable, Iterator
+from dataclasses import dataclass
+from functools import partial
+from itertools import islice
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from tqdm import tqdm
+
+from lerobot_bomb.bomb.expert import expert_action
+from lerobot_bomb.data.kept_blocks import Progress, episodes_before, reached
+from lerobot_bomb.data.recording import Recording
+from lerobot_bomb.data.resumable import add_block, block_episodes, missing_blocks
+from lerobot_bomb.data.rollout_pool import RelabelledRollouts, Rollout, RolloutPool, RolloutSettings
+from lerobot_bomb.envs.rollout import Agent, Expert, make_env
+
+if TYPE_CHECKING:
+    from lerobot_bomb.data.blocks import DatasetLayout, RecordedEpisode
+
+ANY_NUMBER = sys.maxsize
+# the expert counts as broken when, after so many seeds, fewer succeed
+MIN_TRIED = 20
+MIN_SUCCESS_RATE = 0.1
+
+
+@dataclass(frozen=True)
+class Acting:
+    """A policy that acts in place of the expert."""
+
+    begin: Callable[[], None]  # before each episode
+    agent: Agent
+
+
+@dataclass(frozen=True)
+class Players:
+    """Workers, expert and policy that make the episodes of a recording."""
+
+    num_workers: int = 1
+    expert: Expert = expert_action
+    acting: Acting | None = None  # the expert says what it would have done
+
+    def rollouts(self, recording: Recording, num_tried: int) -> RolloutPool | RelabelledRollouts:
+        """Return the episodes of a recording that are tried after the first so many."""
+        settings = RolloutSettings(
+            recording.render_options,
+            recording.noise,
+            self.expert,
+            recording.scenes if recording.static else 0,
+            recording.pointing,
+        )
+        specs = recording.specs(num_tried)
+        if self.acting is None:
+            return RolloutPool(settings, specs, self.num_workers)
+        return RelabelledRollouts(settings, specs, self.acting.begin, self.acting.agent)
+
+
+def record_blocks(
+    recording: Recording,
+    folder: Path,
+    players: Players,
+    numbers: range = range(ANY_NUMBER),
+    most: int = ANY_NUMBER,
+) -> None:
+    """Make those of the numbered blocks that a folder lacks, until it holds so many episodes.
+
+    A block has the successful ones of the episodes that are its own to try, whoever makes it.
+    """
+    gaps = [gap for gap in missing_blocks(folder, numbers) if episodes_before(folder, gap.start) < most]
+    if not gaps:
+        return
+    # MuJoCo's backend is chosen here, or its absence reported; the workers inherit the choice
+    with recording.flag_names():
+        for spec in recording.conditions:
+            make_env(spec, recording.render_options).close()
+    run = reached(folder)
+    total = min(most, block_episodes(numbers.stop).start - block_episodes(numbers.start).start)
+    with tqdm(total=total, initial=run.num_episodes, unit="episode") as bar:
+        for gap in gaps:
+            _fill(recording, folder, players, gap, most, partial(_successes, run, bar))
+
+
+def _fill(
+    recording: Recording,
+    folder: Path,
+    players: Players,
+    gap: range,
+    most: int,
+    successes: "Callable[[Iterable[Rollout], int, Progress], Iterator[RecordedEpisode]]",
+) -> None:
+    """Make the blocks of a gap, until the folder holds so many episodes."""
+    left = most - episodes_before(folder, gap.start)
+    if left == 0:
+        return
+    with players.rollouts(recording, block_episodes(gap.start).start) as pool:
+        layout = recording_layout(recording)  # takes seconds, in which the workers play
+        for number in gap:
+            made = add_block(folder, layout, number, partial(successes, pool, left))
+            left -= made.num_episodes
+            if left == 0:
+                return
+
+
+def _successes(
+    run: Progress, bar: tqdm, pool: Iterable[Rollout], most: int, progress: Progress
+) -> "Iterator[RecordedEpisode]":
+    """Yield a block's successful rollouts, at most so many; note the failed ones on the way."""
+    from lerobot_bomb.data.rollout_dataset import rollout_episode
+
+    for rollout in islice(pool, len(block_episodes(0))):
+        if rollout.num_steps:
+            progress.num_episodes += 1
+            run.num_episodes += 1
+            yield rollout_episode(rollout)
+            bar.update()
+        else:
+            failure = {"seed": rollout.result.spec.seed, "failure": rollout.result.failure}
+            progress.failures.append(failure)
+            run.failures.append(failure)
+            bar.set_postfix(failed=len(run.failures))
+            _check_success_rate(run)
+        if progress.num_episodes == most:
+            return
+
+
+def _check_success_rate(progress: Progress) -> None:
+    if progress.num_tried >= MIN_TRIED and progress.num_episodes < MIN_SUCCESS_RATE * progress.num_tried:
+        raise RuntimeError(
+            f"only {progress.num_episodes} of {progress.num_tried} episodes succeeded, too few to go on; "
+            f"a smaller --noise may help. {describe_failures(progress.failures)}"
+        )
+
+
+def describe_failures(failures: list[dict[str, Any]]) -> str:
+    """One line that counts the failed episodes, with their classes and seeds."""
+    if not failures:
+        return "No episode failed."
+    seeds: dict[str, list[str]] = {}
+    for failure in failures:
+        seeds.setdefault(failure["failure"], []).append(str(failure["seed"]))
+    classes = "; ".join(f"{len(of)} {name} (seeds {', '.join(of)})" for name, of in sorted(seeds.items()))
+    return f"{len(failures)} failed and were left out: {classes}"
+
+
+def recording_layout(recording: Recording) -> "DatasetLayout":
+    """Return how the dataset of a recording is laid out."""
+    from lerobot_bomb.data.rollout_dataset import rollout_layout
+
+    return rollout_layout(recording)

@@ -1,0 +1,73 @@
+"""The flags of policies that may point before they act."""
+
+from dataclasses import dataclass
+from typing import Any, ClassVar
+
+from lerobot.datasets import LeRobotDatasetMetadata
+
+from lerobot_bomb.policies.config import VlaConfig
+from lerobot_bomb.policies.pointing import places_of, require_labels
+from lerobot_bomb.training.policy_flags import check_not_negative
+
+
+@dataclass
+class PointingVlaConfig(VlaConfig):
+    """Config of a policy that says which stone goes where, and then acts on what it has said."""
+
+    # as `ConfigWithEnvironment` has them
+    LATER_FIELDS: ClassVar[dict[str, Any]] = {
+        "pointing": False,
+        "counterfactual_share": 0.5,
+        "board_loss_weight": 1.0,
+    }
+
+    # whether a place and a stone are predicted first and actions follow; a dataset's columns are the labels
+    pointing: bool = False
+    # share of the training frames that are given another place, and the expert's action for it
+    counterfactual_share: float = 0.5
+    # of what lies on each intersection, which image tokens have to tell; 0: they need not, nor a dataset
+    board_loss_weight: float = 1.0
+
+    def check_flags(self) -> None:
+        super().check_flags()
+        if not 0 <= self.counterfactual_share <= 1:
+            raise ValueError(f"--policy.counterfactual_share={self.counterfactual_share} must lie in 0..1")
+        check_not_negative(self, ("board_loss_weight",))
+
+    @property
+    def reads_board(self) -> bool:
+        """Check whether a training reads what lies on the board."""
+        return self.pointing and self.board_loss_weight > 0
+
+    def require_labels(self, meta: LeRobotDatasetMetadata) -> None:
+        """Raise a ValueError unless a dataset has the columns that this pointing is trained on."""
+        require_labels(meta, reads_board=self.reads_board)
+
+    def methods(self) -> list[str]:
+        return [*super().methods(), *(["points before it acts"] if self.pointing else [])]
+
+
+@dataclass
+class PlacesVlaConfig(PointingVlaConfig):
+    """Config of one that points at places of a table."""
+
+    LATER_FIELDS: ClassVar[dict[str, Any]] = {**PointingVlaConfig.LATER_FIELDS, "pointing_places": None}
+
+    # (x, y) in metres that can be pointed at; filled in
+    pointing_places: list[list[float]] | None = None
+
+    def take_places(self, meta: LeRobotDatasetMetadata | None) -> list[list[float]]:
+        """Return the checkpoint's places, or else the dataset's, which are filled in.
+
+        Raises:
+            ValueError: there is neither, or the dataset cannot be trained on.
+        """
+        if meta is not None:
+            self.require_labels(meta)
+            self.pointing_places = places_of(meta, self.pointing_places)
+        if self.pointing_places is None:
+            raise ValueError(
+                "--policy.pointing=true takes the places from a dataset, and there is none; train on one "
+                "that lerobot-bomb record --pointing wrote"
+            )
+        return self.pointing_places

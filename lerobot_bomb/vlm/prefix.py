@@ -1,0 +1,51 @@
+"""Prefix: what a language model keeps of tokens that it has read, for others to go on from.
+
+Shapes: `B` batch, `L` tokens of a prefix, `T` of a segment, `H` hidden size, `V` key-value heads, `E` size of
+a head.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+type KeysValues = tuple[Tensor, Tensor]  # (B, V, L, E) each
+
+
+@dataclass(frozen=True)
+class Prefix:
+    """States that the model keeps of images and text that it has read."""
+
+    hidden: Tensor  # (B, L, H) after the last layer
+    readable: Tensor  # (B, L) bool, False: padding, or a hidden token
+    next_position: Tensor  # (B, 1) int64, of what follows
+    layers: list[KeysValues]
+
+    def tensors(self) -> list[Tensor]:
+        """Return all tensors, as `of` takes them."""
+        return [
+            self.hidden,
+            self.readable,
+            self.next_position,
+            *(part for layer in self.layers for part in layer),
+        ]
+
+    @classmethod
+    def of(cls, tensors: Sequence[Tensor]) -> "Prefix":
+        """The inverse of `tensors`."""
+        hidden, readable, next_position, *layers = tensors
+        return cls(hidden, readable, next_position, list(zip(layers[::2], layers[1::2], strict=True)))
+
+
+class Reader:
+    """Stands where a layer expects a cache: what is kept is read and not changed."""
+
+    def __init__(self, kept: KeysValues | None):
+        self._kept, self.new = kept, kept
+
+    def update(self, keys_BVTE: Tensor, values_BVTE: Tensor, _: int) -> KeysValues:
+        self.new = keys_BVTE, values_BVTE
+        if self._kept is None:
+            return self.new
+        return torch.cat([self._kept[0], keys_BVTE], dim=2), torch.cat([self._kept[1], values_BVTE], dim=2)

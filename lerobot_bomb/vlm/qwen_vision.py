@@ -1,0 +1,77 @@
+"""Qwen2.5-VL's vision model on images of one size: what stock code does an image at a time, at once.
+
+Shapes: `B` images, `P` patches of an image, `N` patches of all images, `E` features, `H` hidden size.
+"""
+
+from typing import Any
+
+import torch
+from torch import Tensor, nn
+from torch.nn.functional import scaled_dot_product_attention
+from transformers.models.qwen2_5_vl.modeling_qwen2_5_vl import (
+    Qwen2_5_VLVisionAttention,
+    apply_rotary_pos_emb_vision,
+)
+
+
+class WindowAttention(Qwen2_5_VLVisionAttention):
+    """Attention with windows of one length, which are read in one call; stock code calls once for each."""
+
+    def forward(
+        self,
+        hidden_states: Tensor,
+        cu_seqlens: Tensor,
+        rotary_pos_emb: Tensor | None = None,
+        position_embeddings: tuple[Tensor, Tensor] | None = None,
+        *,
+        window_length: int | None = None,
+        **kwargs: Any,
+    ) -> Tensor:
+        """(N, E) -> (N, E); ``window_length`` None: windows differ, and stock code reads them."""
+        if window_length is None:
+            return super().forward(
+                hidden_states,
+                cu_seqlens=cu_seqlens,
+                rotary_pos_emb=rotary_pos_emb,
+                position_embeddings=position_embeddings,
+                **kwargs,
+            )
+        assert position_embeddings is not None
+        parts = self.qkv(hidden_states).unflatten(1, (3, self.num_heads, -1)).unbind(1)
+        queries, keys = apply_rotary_pos_emb_vision(parts[0], parts[1], *position_embeddings)
+        queries, keys, values = (
+            part.unflatten(0, (-1, window_length)).transpose(1, 2) for part in (queries, keys, parts[2])
+        )
+        read = scaled_dot_product_attention(queries, keys, values, scale=self.scaling)
+        return self.proj(read.transpose(1, 2).flatten(2).flatten(0, 1))
+
+
+def read_windows_at_once(visual: nn.Module) -> None:
+    """Let a vision model read equal windows in one call."""
+    for block in visual.blocks:  # pyright: ignore[reportGeneralTypeIssues]
+        block.attn.__class__ = WindowAttention
+
+
+def embed_patches(visual: Any, patches: Tensor, num_images: int, side: int) -> Tensor:
+    """Patches of square images, so many a side -> features (num_images, P / 4, H) of merged patches.
+
+    Windows and rotations are those of one image, again for each.
+    """
+    grid_13 = torch.tensor([[1, side, side]])
+    window_index, ends = visual.get_window_index(grid_13)
+    lengths = torch.tensor(ends, dtype=torch.int32).unique_consecutive().diff()
+    if len(lengths.unique()) > 1:
+        return visual(patches, grid_thw=grid_13.expand(num_images, 3)).pooler_output.unflatten(
+            0, (num_images, -1)
+        )
+    unit = visual.spatial_merge_unit
+    order = (window_index[:, None] * unit + torch.arange(unit)).flatten().to(patches.device)
+    angles_PE = visual.rot_pos_emb(grid_13)[order].repeat(num_images, 2)
+    position_embeddings = angles_PE.cos(), angles_PE.sin()
+    x_NE = visual.patch_embed(patches).unflatten(0, (num_images, -1))[:, order].flatten(0, 1)
+    for number, block in enumerate(visual.blocks):
+        is_whole = number in visual.fullatt_block_indexes
+        length = side**2 if is_whole else int(lengths[0])
+        x_NE = block(x_NE, cu_seqlens=None, position_embeddings=position_embeddings, window_length=length)
+    merged = visual.merger(x_NE).unflatten(0, (num_images, -1))
+    return merged[:, window_index.argsort().to(patches.device)]

@@ -1,0 +1,140 @@
+"""Pointing of ``fdvla`` before it acts: a place, a stone, whether that is held, read off an action token.
+
+The prediction enters the action tokens ahead of both heads, as what they need: where the gripper has to go.
+
+Shapes: `B` batch, `P` places, `H` hidden size, `D` action dims, `S` state dims.
+"""
+
+from dataclasses import dataclass, replace
+
+import torch
+from lerobot.datasets import LeRobotDatasetMetadata
+from torch import Tensor, nn
+from torch.nn.functional import binary_cross_entropy_with_logits, cross_entropy, smooth_l1_loss
+
+from lerobot_bomb.bomb.pointing import PointedAt
+from lerobot_bomb.policies.pointing import DataUnits, Labels
+from lerobot_policy_fdvla.configuration_fdvla import FdvlaConfig
+
+FEEDBACK_DIM = 128
+NUM_NUMBERS = 20
+# metres: of a way across the board, of the last of it, of a precise end
+FAR_M, NEAR_M, FINE_M = 0.1, 0.03, 0.006
+
+
+@dataclass(frozen=True)
+class Pointed:
+    """A prediction, and where the gripper is."""
+
+    gripper: Tensor  # (B, 3) metres
+    place_logits: Tensor  # (B, P)
+    stone: Tensor  # (B, 2) metres from the gripper
+    held_logit: Tensor  # (B,)
+
+
+class Pointer(DataUnits):
+    """Heads on an action token's state, and what is fed back into the action tokens.
+
+    Before training what is fed back is exactly zero.
+    """
+
+    places: Tensor  # (P, 2) metres
+
+    def __init__(self, hidden_size: int, action_dim: int, places: list[list[float]]):
+        super().__init__(action_dim)
+        self.register_buffer("places", torch.tensor(places))
+        self.features = nn.Sequential(nn.Linear(hidden_size, hidden_size), nn.SiLU())
+        self.place, self.stone = nn.Linear(hidden_size, len(places)), nn.Linear(hidden_size, 2)
+        self.held = nn.Linear(hidden_size, 1)
+        last = nn.Linear(FEEDBACK_DIM, hidden_size)
+        nn.init.zeros_(last.weight)
+        nn.init.zeros_(last.bias)
+        self.feedback = nn.Sequential(nn.Linear(NUM_NUMBERS, FEEDBACK_DIM), nn.SiLU(), last)
+
+    def forward(self, state_BH: Tensor, robot_state_BS: Tensor) -> Pointed:
+        """An action token's state and the normalised state of the robot -> what they point at."""
+        features_BH = self.features(state_BH)
+        return Pointed(
+            self.gripper(robot_state_BS),
+            self.place(features_BH).float(),
+            NEAR_M * self.stone(features_BH).float(),
+            self.held(features_BH).float()[:, 0],
+        )
+
+    def feed_back(self, pointed: Pointed, place_B: Tensor | None = None) -> Tensor:
+        """(B, H) to be added to action tokens, for these places or else the likeliest.
+
+        No gradient reaches the prediction.
+        """
+        place_B = pointed.place_logits.argmax(dim=1) if place_B is None else place_B
+        return self.feedback(self._numbers(pointed, self.places[place_B]).detach())
+
+    @staticmethod
+    def _numbers(pointed: Pointed, place_B2: Tensor) -> Tensor:
+        """(B, NUM_NUMBERS): ways to place and stone, from one to the other, whether it is held, height."""
+        ways = place_B2 - pointed.gripper[:, :2], pointed.stone
+        scaled = [part for way_B2 in ways for part in _at_scales(way_B2)]
+        between_B2 = (ways[0] - ways[1]) / NEAR_M
+        rest = between_B2, pointed.held_logit.sigmoid()[:, None], pointed.gripper[:, 2:]
+        return torch.cat([*scaled, *rest], dim=1)
+
+    def pointed_at(self, pointed: Pointed) -> PointedAt:
+        """A prediction for one row -> in metres, and how likely each place is."""
+        (shares,) = pointed.place_logits.softmax(dim=1).tolist()
+        return PointedAt(
+            place_xy=self.places[pointed.place_logits[0].argmax()].double().cpu().numpy(),
+            stone_xy=(pointed.gripper[0, :2] + pointed.stone[0]).double().cpu().numpy(),
+            held=float(pointed.held_logit.sigmoid()),
+            probabilities={(x, y): share for (x, y), share in zip(self.places.tolist(), shares, strict=True)},
+        )
+
+    def losses(self, pointed: Pointed, labels: Labels) -> dict[str, Tensor]:
+        """(B,) each: of the place, the stone (in units of `NEAR_M`) and whether it is held."""
+        stone_B2 = labels.stone_xy - pointed.gripper[:, :2]
+        errors_B2 = smooth_l1_loss(pointed.stone / NEAR_M, stone_B2 / NEAR_M, reduction="none", beta=0.1)
+        return {
+            "place_loss": cross_entropy(pointed.place_logits, labels.place, reduction="none"),
+            "stone_loss": errors_B2.mean(dim=1),
+            "held_loss": binary_cross_entropy_with_logits(pointed.held_logit, labels.held, reduction="none"),
+        }
+
+    def fit(self, meta: LeRobotDatasetMetadata, config: FdvlaConfig) -> None:
+        """Take from a dataset what its normalised numbers are, and that it points where this can."""
+        config.take_places(meta)
+        self.fit_units(meta, config.normalization_mapping)
+
+    def draw_labels(
+        self, batch: dict[str, Tensor], config: FdvlaConfig, generator: torch.Generator
+    ) -> Labels:
+        """Read what a batch points at, and the places that are given; actions as LeRobot normalises them."""
+        labels = Labels.draw(batch, self.places, config.counterfactual_share, config.type, generator)
+        return replace(labels, other_actions=self.normalised(labels.other_actions))
+
+
+def make_pointer(
+    config: FdvlaConfig, hidden_size: int, meta: LeRobotDatasetMetadata | None
+) -> Pointer | None:
+    """Make the pointer; None without `pointing`. Its places are a checkpoint's or else the dataset's.
+
+    Raises:
+        ValueError: there is neither.
+    """
+    if not config.pointing:
+        return None
+    places = config.take_places(meta)
+    assert config.action_feature is not None
+    pointer = Pointer(hidden_size, config.action_feature.shape[0], places)
+    if meta is not None:
+        pointer.fit(meta, config)
+    return pointer
+
+
+def _at_scales(way_B2: Tensor) -> list[Tensor]:
+    length_B1 = way_B2.norm(dim=1, keepdim=True)
+    return [
+        way_B2 / FAR_M,
+        (0.75 * way_B2 / NEAR_M).clamp(-1, 1),
+        torch.tanh(way_B2 / FINE_M),
+        length_B1 / FAR_M,
+        torch.tanh(length_B1 / FINE_M),
+    ]

@@ -1,0 +1,25 @@
+"""Rules of style that no linter has."""
+
+import ast
+import re
+from pathlib import Path
+
+ROOT = Path(__file__).parents[1]
+FOLDERS = ("lerobot_bomb", "policies", "envs", "benchmarks", "tests")
+FRAGMENT = re.compile(
+    r"(All|Also|Around|As|At|Between|Both|By|For|From|How|In|None|Of|On|Only|So|That|The same|Their|These|"
+    r"Those|Unless|Until|What|Where|Whether|Which|Who|Whose|With)\b"
+)
+
+
+def test_no_docstring_opens_with_a_fragment() -> None:
+    """Check that each starts with a verb or a noun phrase, which a stranger understands alone."""
+    fragments, num_docstrings = [], 0
+    for path in (path for folder in FOLDERS for path in (ROOT / folder).rglob("*.py")):
+        for node in ast.walk(ast.parse(path.read_text())):
+            if isinstance(node, ast.FunctionDef | ast.AsyncFunctionDef | ast.ClassDef | ast.Module):
+                docstring = ast.get_docstring(node)
+                num_docstrings += docstring is not None
+                if docstring and FRAGMENT.match(docstring):
+                    fragments.append(f"{path.relative_to(ROOT)}: {docstring.splitlines()[0]}")
+    assert num_docstrings > 1000 and not fragments

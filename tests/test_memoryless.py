@@ -1,0 +1,328 @@
+"""The expert's next action is a function of what is seen and said: a reader of both alone finds the same.
+
+The reader gets the stones in a drawn order, without their numbers, and no history; what an expert knows that
+the reader cannot find, no policy without memory can learn.
+"""
+
+import re
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+import pytest
+
+from lerobot_bomb.bomb.board import BOARD, COLORS, NUM_STONES, TRAY_CENTER_XY, TRAY_HALF_SIZE_XY, Cell
+from lerobot_bomb.bomb.commands import CELLS, TRAY_XY_M
+from lerobot_bomb.bomb.episode import EpisodeSpec
+from lerobot_bomb.bomb.expert import expert_action
+from lerobot_bomb.bomb.go import group_of, liberties_of
+from lerobot_bomb.bomb.observation import RenderOptions
+from lerobot_bomb.bomb.privileged_state import Goal, PrivilegedState
+from lerobot_bomb.bomb.streams import recorder_noise
+from lerobot_bomb.bomb.suite import find_suite
+from lerobot_bomb.bomb.suites import SUITES
+from lerobot_bomb.envs.rollout import Moment, add_noise, expert_agent, play
+from lerobot_env_bomb.env import BombEnv
+
+SUCCESSES, COMPARED = 0.9, 0.98  # least shares of episodes and of steps
+NOISE = 0.05  # on what is executed, as in recordings
+SMALL = RenderOptions(image_size=32)
+NEAR_M = 0.012  # of the gripper, for a stone between its pads; of a place, for one that lies there
+BOARD_END_M = TRAY_CENTER_XY[0] - TRAY_HALF_SIZE_XY[0]  # x at which the tray begins
+FLAT_M = 0.005  # of its height at rest, for a stone that lies
+REST_M = BOARD.thickness_m + BOARD.stone_height_m / 2
+LEFT_SIDE = [cell for cell in CELLS if cell[1] < 2]
+type Place = tuple[float, float]  # metres
+
+
+@dataclass
+class View:
+    """View of all that can be seen."""
+
+    text: str  # what is said
+    state: PrivilegedState  # its stones in a drawn order, its goals none
+    pattern: dict[Cell, str]  # on the small board
+
+    def __post_init__(self) -> None:
+        self.held: int | None = None
+        self.on_board: dict[Cell, int] = {}
+        self.in_tray: list[int] = []  # row by row
+        for stone in np.flatnonzero(self.state.stone_in_play).tolist():
+            x, y, _ = self.xyz(stone)
+            if self._is_held(stone):
+                self.held = stone
+            elif x < BOARD_END_M:
+                # one that slips out of the fingers is off it for a moment
+                self.on_board[BOARD.nearest_intersection(np.array([x, y]))] = stone
+            else:
+                self.in_tray.append(stone)
+        self.in_tray.sort(key=lambda stone: (-round(self.xyz(stone)[1], 2), self.xyz(stone)[0]))
+
+    def xyz(self, stone: int) -> np.ndarray:
+        return self.state.stone_xyz[stone]
+
+    def color(self, stone: int | None) -> str | None:
+        return None if stone is None else COLORS[int(self.state.stone_is_white[stone])]
+
+    def at(self, cell: Cell) -> str | None:
+        return self.color(self.on_board.get(cell))
+
+    def cells(self, color: str) -> list[Cell]:
+        return sorted(cell for cell in self.on_board if self.at(cell) == color)
+
+    def first_in_tray(self, color: str) -> int:
+        return next(stone for stone in self.in_tray if self.color(stone) == color)
+
+    @property
+    def next_tray_place(self) -> Place:
+        """The first of the expert's places that is free."""
+        taken = [self.xyz(stone)[:2] for stone in self.in_tray]
+        return next(place for place in TRAY_XY_M if all(np.hypot(*(xy - place)) > NEAR_M for xy in taken))
+
+    def resting(self) -> list[int]:
+        return [*self.on_board.values(), *self.in_tray]
+
+    @property
+    def is_settled(self) -> bool:
+        """Tell whether nothing flies or leans, as a stone may that slipped out of the fingers or was hit."""
+        return all(abs(self.xyz(stone)[2] - REST_M) < FLAT_M for stone in self.resting())
+
+    def _is_held(self, stone: int) -> bool:
+        offset = self.xyz(stone) - self.state.gripper_xyz
+        is_between = np.hypot(*offset[:2]) < NEAR_M and -0.004 < offset[2] < 0.03
+        return bool(is_between and self.state.finger_opening < 0.030)
+
+
+type Next = tuple[int, Place] | None  # the stone that is to be moved and where to; None: all is done
+
+
+def of_cell(cell: Cell) -> Place:
+    x, y = BOARD.intersection_xy(*cell)
+    return float(x), float(y)
+
+
+def cells_in(text: str) -> list[Cell]:
+    return [(int(r), int(c)) for r, c in re.findall(r"(?:row |\()(\d),(?: column)? (\d)", text)]
+
+
+def next_move(text: str, view: View) -> Next:
+    """Return the next move of someone who reads an unperturbed instruction."""
+    if re.search(r"clear row|off the board|take back", text):
+        return next_removal(text, view)
+    if found := re.search(r"capture the (?:\d )?(\w+) stones?.*: play (\w+)", text):
+        return next_of_capture(found[1], found[2], view)
+    if found := re.search(r"swap the (\w+) stone .* the (\w+) stone", text):
+        return next_of_swap((found[1], found[2]), cells_in(text), view)
+    if found := re.search(r"push the (\w+) stone", text):
+        held = [] if view.held is None else [view.held]
+        (stone,) = [stone for stone in [*held, *view.on_board.values()] if view.color(stone) == found[1]]
+        return stone, of_cell(cells_in(text)[0])
+    if found := re.search(r"bring all (\w+) stones to the left side", text):
+        place = next((cell for cell in LEFT_SIDE if cell not in view.on_board), None)
+        left = [cell for cell in view.cells(found[1]) if cell[1] > 1]
+        if view.held is None and not left:
+            return None
+        assert place is not None
+        return view.on_board[left[0]] if view.held is None else view.held, of_cell(place)
+    return next_from_tray(text, view)
+
+
+def next_from_tray(text: str, view: View) -> Next:
+    if moves := re.findall(r"(black|white) at row (\d), column (\d)", text):
+        return next_of_moves([(color, (int(r), int(c))) for color, r, c in moves], view)
+    if "copy the pattern" in text:
+        return next_of_moves([(color, cell) for cell, color in sorted(view.pattern.items())], view)
+    if found := re.search(r"free intersections of row (\d).*(black|white) last", text):
+        free = [cell for cell in CELLS if cell[0] == int(found[1]) and cell not in view.on_board]
+        color = COLORS[(COLORS.index(found[2]) + len(free) - 1) % 2]
+        return next_of_moves([(color, cell) for cell in free[:1]], view)
+    place = next(iter(cells_in(text)), None) or named_place(text, view)
+    if place is None or place in view.on_board:
+        return None
+    return named_stone(text, view) if view.held is None else view.held, of_cell(place)
+
+
+def next_of_moves(moves: list[tuple[str, Cell]], view: View) -> Next:
+    for color, cell in moves:
+        if view.at(cell) != color:
+            return view.first_in_tray(color) if view.held is None else view.held, of_cell(cell)
+    return None
+
+
+def next_removal(text: str, view: View) -> Next:
+    if found := re.search(r"clear row (\d)", text):
+        left = sorted(cell for cell in view.on_board if cell[0] == int(found[1]))
+    elif found := re.search(r"take the (black|white) stone", text):
+        left = view.cells(found[1])
+    else:
+        left = [cell for cell in reversed(cells_in(text)) if cell in view.on_board]
+    if view.held is None and not left:
+        return None
+    return view.held if view.held is not None else view.on_board[left[0]], view.next_tray_place
+
+
+def next_of_capture(color: str, by: str, view: View) -> Next:
+    """`by` takes the last liberty, then what has none is taken off."""
+    board = {cell: COLORS[int(view.state.stone_is_white[stone])] for cell, stone in view.on_board.items()}
+    groups = {frozenset(group_of(board, cell)): min(group_of(board, cell)) for cell in view.cells(color)}
+    liberties = {group: liberties_of(board, cell) for group, cell in groups.items()}
+    if view.color(view.held) == by or any(view.color(stone) == by for stone in view.in_tray):
+        (liberty,) = next(places for places in liberties.values() if len(places) == 1)
+        return view.first_in_tray(by) if view.held is None else view.held, of_cell(liberty)
+    if view.held is not None:
+        return view.held, view.next_tray_place
+    # of two, the other one has the first's intersection for a liberty, and the first lies in the tray
+    taken = sorted(cell for group, places in liberties.items() if not places for cell in group)
+    if not taken and view.in_tray and "2 " in view.text:
+        taken = sorted(min(group) for group, places in liberties.items() if len(places) == 1)
+    return (view.on_board[taken[0]], view.next_tray_place) if taken else None
+
+
+def next_of_swap(colors: tuple[str, str], cells: list[Cell], view: View) -> Next:
+    (first, second), (a, b) = colors, cells
+    if view.at(a) == second:  # the first goes where the second stood
+        if view.at(b) == first:
+            return None
+        return view.in_tray[0] if view.held is None else view.held, of_cell(b)
+    if view.in_tray:
+        return view.on_board[b] if view.held is None else view.held, of_cell(a)
+    return view.on_board[a] if view.held is None else view.held, TRAY_XY_M[0]
+
+
+def named_stone(text: str, view: View) -> int:
+    """Return the stone in the tray that the instruction names."""
+    xy = {stone: view.xyz(stone)[:2] for stone in view.in_tray}
+    if "nearest to the gripper" in text:
+        return min(xy, key=lambda stone: float(np.hypot(*(xy[stone] - view.state.gripper_xyz[:2]))))
+    if found := re.search(r"(nearest to|farthest from) the (\w+) stone", text):
+        anchor = view.first_in_tray(found[2])
+        sign = 1 if found[1] == "nearest to" else -1
+        others = [stone for stone in xy if stone != anchor]
+        return min(others, key=lambda stone: sign * float(np.hypot(*(xy[stone] - xy[anchor]))))
+    if found := re.search(r"(left|right|front)most", text):
+        axis, sign = {"left": (0, 1), "right": (0, -1), "front": (1, 1)}[found[1]]
+        return min(xy, key=lambda stone: sign * xy[stone][axis])
+    found = re.search(r"(black|white) (?:stone|piece)", text)
+    assert found
+    return view.first_in_tray(found[1])
+
+
+def named_place(text: str, view: View) -> Cell | None:
+    if found := re.search(r"(left of|right of|behind|in front of|between) the (?:two )?(\w+) stone", text):
+        anchors = view.cells(found[2])
+        if found[1] == "between":
+            (r1, c1), (r2, c2) = anchors
+            return (r1 + r2) // 2, (c1 + c2) // 2
+        (row, column) = anchors[0]
+        rows, columns = {"left of": (0, -1), "right of": (0, 1), "behind": (-1, 0), "in front of": (1, 0)}[
+            found[1]
+        ]
+        return row + rows, column + columns
+    if found := re.search(r"(far|near) (left|right) corner", text):
+        return {"far": 0, "near": 4}[found[1]], {"left": 0, "right": 4}[found[2]]
+    if re.search(r"in the centre|star point", text):
+        return 2, 2
+    rows = [[(row, c) for c in range(5) if (row, c) not in view.on_board] for row in range(5)]
+    return next((free[0] for free in rows if len(free) == 1), None)
+
+
+def goals_of_reader(view: View) -> tuple[Goal, ...]:
+    """The next move, after the stone that the fingers may just have put down."""
+    following = next_move(view.text, view)
+    stone = None if following is None else following[0]
+    gripper_xy = view.state.gripper_xyz[:2]
+    others = [other for other in view.resting() if other != stone]
+    before = min(others, key=lambda other: float(np.hypot(*(view.xyz(other)[:2] - gripper_xy))), default=None)
+    goals = []
+    if before is not None:
+        goals.append((before, own_place(view.xyz(before)[:2])))
+    if following is not None:
+        goals.append(following)
+    return tuple(Goal(np.array([*place, REST_M]), stone, "push" in view.text) for stone, place in goals)
+
+
+def own_place(xy: np.ndarray) -> Place:
+    """Return the place of a stone that rests: an intersection, a place in the tray, or just there."""
+    places = [*map(of_cell, CELLS), *TRAY_XY_M]
+    return next((place for place in places if np.hypot(*(xy - place)) < 0.006), (float(xy[0]), float(xy[1])))
+
+
+def seen(moment: Moment, pattern: dict[Cell, str], rng: np.random.Generator) -> View:
+    state = moment.state
+    order = rng.permutation(NUM_STONES)
+    return View(
+        moment.instruction.lower(),
+        replace(
+            state,
+            goals=(),
+            stone_xyz=state.stone_xyz[order],
+            stone_is_white=state.stone_is_white[order],
+            stone_in_play=state.stone_in_play[order],
+        ),
+        pattern,
+    )
+
+
+class UndrawnEnv(BombEnv):
+    """Environment without images, which the reader does not need."""
+
+    def _view(self, camera: str) -> tuple[np.ndarray, dict[str, np.ndarray]]:
+        return np.zeros((SMALL.image_size, SMALL.image_size, 3), np.uint8), {}
+
+
+@dataclass
+class Played:
+    """An episode of the expert, under noise, and the steps in which the reader acts otherwise."""
+
+    otherwise: list[str]
+    num_steps: int = 0
+    num_compared: int = 0
+    is_success: bool = False
+
+
+def play_and_read(env: BombEnv, spec: EpisodeSpec) -> Played:
+    rng, noise = np.random.default_rng(spec.seed), recorder_noise(spec.seed)
+    played = Played([])
+    pattern = dict(find_suite(spec.suite).sample(spec).pattern)
+    for moment in play(env, spec, expert_agent(), lambda a: add_noise(a, NOISE, "relative", noise)):
+        played.is_success = moment.info["is_success"]
+        if moment.action is None:
+            continue
+        view = seen(moment, pattern, rng)
+        played.num_steps += 1
+        if not view.is_settled:
+            continue
+        played.num_compared += 1
+        action = expert_action(replace(view.state, goals=goals_of_reader(view)))
+        if abs(action - expert_action(moment.state)).max() > 0.02:
+            step = f"{spec.suite} seed {spec.seed} step {moment.step}"
+            played.otherwise.append(f"{step}: {moment.instruction}")
+    return played
+
+
+def check(suite: str, task_id: int | None, seeds: Sequence[int]) -> None:
+    """The reader acts as the expert does in every step of these episodes, which nearly all end in success."""
+    env = UndrawnEnv(EpisodeSpec(0, suite, task_id=task_id), SMALL)
+    played = [play_and_read(env, EpisodeSpec(seed, suite, task_id=task_id)) for seed in seeds]
+    assert [text for each in played for text in each.otherwise] == []
+    assert sum(each.num_compared for each in played) >= COMPARED * sum(each.num_steps for each in played)
+    assert sum(each.is_success for each in played) >= SUCCESSES * len(played)
+
+
+TASKS = [
+    (suite, task_id)
+    for suite in SUITES
+    # a task of `place` is an intersection and a colour, of which each episode draws one
+    for task_id in ([None] if suite == "place" else range(find_suite(suite).num_tasks))
+]
+
+
+@pytest.mark.parametrize(("suite", "task_id"), TASKS)
+def test_the_next_action_is_seen_and_said(suite: str, task_id: int | None) -> None:
+    check(suite, task_id, [7])
+
+
+@pytest.mark.long
+@pytest.mark.parametrize(("suite", "task_id"), TASKS)
+def test_the_next_action_is_seen_and_said_in_200_episodes(suite: str, task_id: int | None) -> None:
+    check(suite, task_id, range(200))

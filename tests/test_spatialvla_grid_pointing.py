@@ -1,0 +1,448 @@
+"""`spatialvla_grid` points, then acts: two tokens ahead of the cells, which are learned and obeyed."""
+
+import json
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+from lerobot.configs import PreTrainedConfig
+from lerobot.datasets import LeRobotDataset, LeRobotDatasetMetadata
+from spatialvla_grid_cases import make_batch, make_config, make_policy, rows
+from torch import Tensor
+from torch.nn.functional import cross_entropy
+
+from lerobot_bomb.flag_errors import FlagError
+from lerobot_bomb.policies.pointing import OTHER_ACTIONS, OTHER_PLACES, PLACE, STONE
+from lerobot_policy_spatialvla_grid.modeling_spatialvla_grid import SpatialvlaGridPolicy
+from lerobot_policy_spatialvla_grid.pointing_spatialvla_grid import StoneCells
+
+PLACES = [[-0.09, 0.09], [0.0, 0.0], [0.09, -0.045], [0.17, 0.0]]
+STONES = StoneCells((-0.13, -0.13), (0.21, 0.13), 0.04)  # 9 x 7
+NUM_STONES = 63
+# a token a dimension
+SINGLY: dict[str, Any] = {
+    "action_groups": [{"dims": [dim], "transform": "identity", "bins": [8]} for dim in range(4)],
+    "grid_distribution": "uniform",
+    "decode_point": "mid",
+}
+# without reading the board: that is in test_board_reader.py
+POINTING: dict[str, Any] = {
+    "pointing": True,
+    "board_loss_weight": 0.0,
+    "pointing_places": PLACES,
+    "pointing_cell_m": STONES.cell_m,
+    "crop_fraction": 1.0,
+    "chunk_size": 2,
+    "n_action_steps": 2,
+}
+
+
+def pointing_policy(seed: int = 0, num_dims: int = 4, **options: Any) -> SpatialvlaGridPolicy:
+    return make_policy(seed, num_dims, **POINTING | options)
+
+
+def pointing_batch(policy: SpatialvlaGridPolicy, batch_size: int = 4) -> dict[str, Any]:
+    """Labels that are a function of the row: places in turn, the next ones as other places."""
+    batch, places = make_batch(policy, batch_size), torch.tensor(PLACES)
+    number_B = torch.arange(batch_size) % len(PLACES)
+    others = torch.stack([places[(number_B + 1) % len(PLACES)], places[(number_B + 2) % len(PLACES)]], dim=1)
+    stone_B3 = torch.tensor([[0.055, -0.025, 0.0], [-0.5, 0.5, 1.0]])[number_B % 2]
+    rest = torch.zeros(batch_size, 2, policy.grids.num_dims - 2)
+    return batch | {
+        PLACE: places[number_B],
+        STONE: stone_B3,
+        OTHER_PLACES: others.flatten(1),
+        # towards the place: what an action for it is
+        OTHER_ACTIONS: torch.cat([5 * others, rest], dim=2).flatten(1),
+    }
+
+
+def test_stones_are_cells_along_y_then_x_and_what_is_beyond_is_in_the_outermost() -> None:
+    assert STONES.counts == (9, 7)
+    xy = torch.tensor([[-0.12, -0.12], [-0.12, 0.12], [0.055, -0.025], [-0.5, 0.5], [9.0, 9.0]])
+    assert STONES.number_of(xy).tolist() == [0, 6, 4 * 7 + 2, 6, 62]
+    assert StoneCells((-0.13, -0.13), (0.21, 0.13), 0.005).counts == (68, 52)
+
+
+@pytest.mark.parametrize("share", [0.0, 1.0])
+def test_an_answer_is_a_place_a_stone_and_then_cells(share: float) -> None:
+    policy = pointing_policy(counterfactual_share=share, **SINGLY)
+    batch = pointing_batch(policy, 2)
+    batch["action"] = torch.tensor([[[-0.9, -0.6, -0.3, -0.1], [0.1, 0.3, 0.6, 0.9]]]).repeat(2, 1, 1)
+    batch |= {OTHER_PLACES: torch.tensor(PLACES)[torch.tensor([[3, 3], [2, 2]])].flatten(1)}
+    batch |= {OTHER_ACTIONS: torch.tensor(2 * [2 * [0.9, 0.9, 0.9, 0.9]])}
+    cells, kept, pointed = policy._targets(batch)
+    meant, other = [[0, 30], [1, 6]], [[3, 30], [2, 6]]
+    assert pointed.tokens.tolist() == (other if share else meant)
+    first, second = [0, 1, 2, 3], [4, 5, 6, 7]
+    assert cells.tolist() == 2 * [[[7, 7, 7, 7] if share else first, second]]
+    # of another place there is no loss, and only the next action is known
+    assert pointed.kept.tolist() == 2 * [[not share, True]]
+    assert kept.tolist() == 2 * [[True, not share]]
+
+
+def test_the_loss_is_the_likelihood_among_a_slots_tokens_of_all_that_is_kept() -> None:
+    for vocab in ("slot", "full"):
+        policy = pointing_policy(counterfactual_share=0.5, loss_vocab=vocab)
+        batch = pointing_batch(policy)
+        policy.generator.manual_seed(1)
+        cells, kept_BT, pointed = policy._targets(batch)
+        is_other = ~pointed.kept[:, 0]
+        assert 0 < is_other.sum() < 4
+        pointing_BNH, hidden_BTGH, _ = policy._hidden(batch, cells, pointed.tokens)
+        hidden = torch.cat([pointing_BNH, hidden_BTGH.flatten(1, 2)], dim=1)
+        logits = policy.backbone.cap(policy.cell_head(hidden))
+        words = policy.backbone.cap(policy.backbone.vlm.lm_head(hidden))
+        (first, num_polar, num_gripper) = 0, *policy.grids.num_cells
+        assert logits.shape[-1] == num_polar + num_gripper + 4 + NUM_STONES
+        starts = [num_polar + num_gripper, num_polar + num_gripper + 4] + 2 * [first, num_polar]
+        counts = [4, NUM_STONES] + 2 * [num_polar, num_gripper]
+        tokens = torch.cat([pointed.tokens, cells.flatten(1)], dim=1)
+        kept = torch.cat([pointed.kept, kept_BT.repeat_interleave(2, dim=1)], dim=1)
+        losses = []
+        for row in range(4):
+            for i in range(6):
+                if kept[row, i]:
+                    slot = slice(starts[i], starts[i] + counts[i])
+                    if vocab == "slot":
+                        losses.append(cross_entropy(logits[row, i, slot], tokens[row, i]))
+                    else:
+                        whole = torch.cat([logits[row, i], words[row, i]])
+                        losses.append(cross_entropy(whole, tokens[row, i] + starts[i]))
+        assert len(losses) == 4 * 6 - int(is_other.sum()) * (1 + 2)
+        policy.generator.manual_seed(1)
+        torch.testing.assert_close(policy(batch)[0], torch.stack(losses).mean())
+
+
+def test_metrics_of_actions_skip_what_points() -> None:
+    policy = pointing_policy(counterfactual_share=0.0, **SINGLY)
+    batch = pointing_batch(policy)
+    metrics = policy(batch)[1]
+    assert set(metrics) == {"token_accuracy", "place_accuracy", "stone_accuracy"}
+    cells, _, pointed = policy._targets(batch)
+    pointing_BNH, hidden_BTGH, _ = policy._hidden(batch, cells, pointed.tokens)
+    right = policy._losses(hidden_BTGH, cells)[1] == cells
+    assert metrics["token_accuracy"] == pytest.approx(float(right.float().mean()))
+    place = policy._pointing_losses(pointing_BNH, pointed.tokens)[1][:, 0]
+    assert metrics["place_accuracy"] == pytest.approx(float((place == torch.arange(4)).float().mean()))
+
+
+def test_no_loss_of_a_place_that_is_not_meant() -> None:
+    policy = pointing_policy(counterfactual_share=1.0)
+    policy(pointing_batch(policy))[0].backward()
+    grad = policy.cell_head.weight.grad
+    assert grad is not None
+    place, stone = policy._pointing_rows
+    assert (grad[place] == 0).all() and (grad[stone] != 0).any()
+    grad = policy.cell_embedding.weight.grad
+    assert grad is not None and (grad[place] != 0).any()
+
+
+@torch.no_grad()
+@pytest.mark.parametrize(("num_dims", "options"), [(4, SINGLY), (7, {})])
+def test_at_each_position_all_of_its_tokens_and_no_others_can_win(
+    num_dims: int, options: dict[str, Any]
+) -> None:
+    policy = pointing_policy(1, num_dims, **options)
+    batch = make_batch(policy, 1)
+    slots = [*policy._pointing_rows, *policy._group_rows, *policy._group_rows]
+    assert [slot.stop - slot.start for slot in slots[:2]] == [4, NUM_STONES]
+    assert [slot.start for slot in slots[:2]] == [policy.grids.num_tokens, policy.grids.num_tokens + 4]
+    answer = policy._write(batch, 2)
+    head = policy.cell_head.weight.clone()
+    for position, slot in enumerate(slots):
+        hidden = torch.cat([states.flatten(1, -2) for states in states_of(policy, batch, answer)], dim=1)
+        liked = hidden[0, position] / hidden[0, position].norm()
+        for token in {0, 1, slot.stop - slot.start - 1}:
+            policy.cell_head.weight.copy_(head)
+            policy.cell_head.weight += 1e3 * liked  # all tokens of the other slots, too
+            policy.cell_head.weight[slot] = head[slot]
+            policy.cell_head.weight[slot.start + token] += 10 * liked
+            assert policy._write(batch, 2)[0, position] == token
+    policy.cell_head.weight.copy_(head)
+
+
+def states_of(policy: SpatialvlaGridPolicy, batch: dict[str, Any], answer: Tensor) -> tuple[Tensor, Tensor]:
+    pointed, cells = policy._split(answer)
+    return policy._hidden(batch, cells, pointed)[:2]
+
+
+@torch.no_grad()
+@pytest.mark.parametrize(("num_dims", "options"), [(4, SINGLY), (7, {})])
+def test_actions_alone_come_out_whatever_the_batch(num_dims: int, options: dict[str, Any]) -> None:
+    policy = pointing_policy(2, num_dims, **options)
+    batch = make_batch(policy, 3)
+    answer = policy._write(batch, 2)
+    pointed, cells = policy._split(answer)
+    assert answer.shape[1] == 2 + 2 * len(policy.grids.groups) == policy.last_passes == 2 + policy.last_tokens
+    # what the teacher-forced network finds likeliest, given what was written, is what was written
+    pointing_BNH, hidden_BTGH, _ = policy._hidden(batch, cells, pointed)
+    assert torch.equal(policy._pointing_losses(pointing_BNH, pointed)[1], pointed)
+    assert torch.equal(policy._losses(hidden_BTGH, cells)[1], cells)
+    chunk = policy.predict_action_chunk(batch)
+    assert chunk.shape == (3, 2, num_dims) and torch.equal(chunk, policy.grids.decode(cells))
+    assert torch.equal(policy.select_action(batch), chunk[:, 0])
+    for row in range(3):  # where steps are guessed
+        assert torch.equal(policy._write(rows(batch, slice(row, row + 1)), 2)[0], answer[row])
+
+
+def test_guesses_go_on_as_the_step_before_and_change_nothing() -> None:
+    policy = pointing_policy(2, 7, nano_config=None, chunk_size=6, n_action_steps=6)
+    batch = make_batch(policy, 1, 2)
+    with torch.no_grad():  # one of three groups is always the same
+        policy.cell_head.weight[policy._group_rows[0]] = 0
+    drafted = policy._write(batch, 6)
+    assert policy.last_passes is not None and 2 + 3 < policy.last_passes < 2 + 6 * 3
+    policy._writer.drafted = False
+    assert torch.equal(policy._write(batch, 6), drafted)
+
+
+def test_an_ensemble_is_of_actions_alone() -> None:
+    policy = pointing_policy(
+        n_action_steps=1, temporal_ensemble_size=2, temporal_ensemble_weighting="uniform", **SINGLY
+    )
+    first, second = (make_batch(policy, 2, seed) for seed in (1, 2))
+    chunks = [policy.predict_action_chunk(batch) for batch in (first, second)]
+    policy.reset()
+    policy.select_action(first)
+    torch.testing.assert_close(policy.select_action(second), (chunks[0][:, 1] + chunks[1][:, 0]) / 2)
+
+
+def test_an_explanation_scores_what_is_pointed_at_and_the_cells() -> None:
+    policy = pointing_policy(**SINGLY)
+    batch = make_batch(policy, 1)
+    explained = policy.explained()
+    answer = explained.answer(batch)
+    assert torch.equal(answer, policy._write(batch, 2))
+    pointed, cells = policy._split(answer)
+    with torch.no_grad():
+        pointing_BNH, hidden_BTGH, _ = policy._hidden(batch, cells, pointed)
+        losses = policy._pointing_losses(pointing_BNH, pointed)[0].sum()
+        losses += policy._losses(hidden_BTGH, cells)[0].sum()
+        torch.testing.assert_close(explained.score(explained.encode(batch), answer), -losses[None])
+
+
+def test_an_explanation_says_where_it_points() -> None:
+    policy = pointing_policy(**SINGLY)
+    batch = make_batch(policy, 1)
+    found = policy.explained().pointed(batch)
+    pointed, cells = policy._split(policy._write(batch, 2))
+    place, stone = pointed[0].tolist()
+    assert (
+        found is not None and found.held is None and found.place_xy.tolist() == pytest.approx(PLACES[place])
+    )
+    x, y = divmod(stone, 7)
+    assert found.stone_xy.tolist() == pytest.approx([-0.13 + 0.04 * (x + 0.5), -0.13 + 0.04 * (y + 0.5)])
+    with torch.no_grad():
+        states = policy._hidden(batch, cells, pointed)[0]
+        losses = [
+            policy._pointing_losses(states, torch.tensor([[each, stone]]))[0][0, 0] for each in range(4)
+        ]
+    shares = [float((-loss).exp()) for loss in losses]
+    assert [*found.probabilities.values()] == pytest.approx(shares, abs=1e-5)
+    assert [*map(list, found.probabilities)] == [pytest.approx(each) for each in PLACES]
+    plain = make_policy()
+    assert plain.explained().pointed(make_batch(plain, 1)) is None
+
+
+def test_labels_are_of_training_only() -> None:
+    policy = pointing_policy()
+    policy.predict_action_chunk(make_batch(policy, 2))
+    with pytest.raises(KeyError, match=r"spatialvla_grid needs 'observation\.pointing\.place'"):
+        policy(make_batch(policy, 2))
+
+
+def test_off_there_are_no_rows_and_no_labels() -> None:
+    policy = make_policy()
+    assert policy.cell_head.weight.shape[0] == policy.cell_embedding.num_embeddings == policy.grids.num_tokens
+    assert {*policy.state_dict()} == {*pointing_policy().state_dict()}
+    assert set(policy(make_batch(policy, 2))[1]) == {"token_accuracy"}
+    method = "points before it acts"
+    assert method not in policy.config.methods() and method in pointing_policy().config.methods()
+
+
+def test_it_learns_to_point_and_then_goes_where_it_points(monkeypatch: pytest.MonkeyPatch) -> None:
+    small = {
+        "text_config": {"num_hidden_layers": 2},
+        "vision_config": {"image_size": 56, "num_hidden_layers": 1},
+    }
+    policy = pointing_policy(chunk_size=1, n_action_steps=1, nano_config=small, **SINGLY)
+    batch, places = pointing_batch(policy, 8), torch.tensor(PLACES)
+    # demonstrations, as the other actions, lead to the place: nothing but the token tells two of them apart
+    batch["action"] = torch.cat([5 * batch[PLACE], torch.zeros(8, 2)], dim=1)[:, None]
+    optimizer = torch.optim.AdamW(policy.get_optim_params(), lr=2e-3, weight_decay=0.0)
+    generator, metrics = torch.Generator().manual_seed(0), {}
+    for _ in range(50):
+        others = places[torch.randint(len(PLACES), (8, 2), generator=generator)]
+        batch[OTHER_PLACES] = others.flatten(1)
+        batch[OTHER_ACTIONS] = torch.cat([5 * others, torch.zeros(8, 2, 2)], dim=2).flatten(1)
+        loss, metrics = policy.train()(batch)
+        optimizer.zero_grad()
+        loss.backward()
+        optimizer.step()
+    assert metrics["stone_accuracy"] == metrics["token_accuracy"] == 1
+    pointed, cells = policy._split(policy._write(batch, 1))
+    assert pointed.tolist() == 2 * [[0, 30], [1, 6], [2, 30], [3, 6]]
+    assert torch.equal(cells, policy.grids.encode(batch["action"]))
+    pointer, slots = policy.pointer, policy._pointing_rows
+    assert pointer is not None
+    for place, (x, y) in enumerate(PLACES):
+        only = slice(slots[0].start + place, slots[0].start + place + 1)
+        monkeypatch.setattr(pointer, "slots", lambda _, only=only: [only, slots[1]])
+        expected = policy.grids.encode(torch.tensor([5 * x, 5 * y, 0.0, 0.0]))
+        assert torch.equal(policy._choose(batch, 1), expected.expand(8, 1, -1)), place
+
+
+# Data and checkpoints
+
+
+NAMES = ["x", "y", "z", "gripper"]
+
+
+@pytest.fixture(scope="module")
+def metas(tmp_path_factory: pytest.TempPathFactory) -> dict[str, LeRobotDatasetMetadata]:
+    folder = tmp_path_factory.mktemp("pointing")
+    return {
+        name: make_dataset(folder / name, PLACES if name == "pointing" else None)
+        for name in ("pointing", "plain")
+    }
+
+
+def make_dataset(root: Path, places: list[list[float]] | None) -> LeRobotDatasetMetadata:
+    """An episode of ten frames, with labels or without."""
+    sizes = {"observation.state": 4, "action": 4}
+    if places is not None:
+        sizes |= {PLACE: 2, STONE: 3, OTHER_PLACES: 4, OTHER_ACTIONS: 8}
+    features: dict[str, Any] = {
+        key: {
+            "dtype": "float32",
+            "shape": (size,),
+            "names": NAMES if size == 4 and key != OTHER_PLACES else None,
+        }
+        for key, size in sizes.items()
+    }
+    dataset = LeRobotDataset.create("test/pointing", fps=10, features=features, root=root, use_videos=False)
+    generator = np.random.default_rng(0)
+    for step in range(10):
+        frame: dict[str, Any] = {
+            key: generator.uniform(-0.5, 2, size).astype(np.float32) for key, size in sizes.items()
+        }
+        if places is not None:
+            xy = np.array(places, np.float32)
+            frame |= {PLACE: xy[step % 4], OTHER_PLACES: xy[[(step + 1) % 4, (step + 2) % 4]].reshape(-1)}
+        dataset.add_frame({**frame, "task": "push"})
+    dataset.save_episode()
+    dataset.finalize()
+    return LeRobotDatasetMetadata("test/pointing", root=root)
+
+
+def changed(checkpoint: Path, **options: Any) -> Any:
+    flags = [f"--{flag}={json.dumps(value)}" for flag, value in options.items()]
+    return PreTrainedConfig.from_pretrained(checkpoint, cli_overrides=flags)
+
+
+def test_places_and_what_other_actions_are_come_from_the_dataset(
+    metas: dict[str, LeRobotDatasetMetadata],
+) -> None:
+    options: dict[str, Any] = {**POINTING, "pointing_places": None}
+    policy = SpatialvlaGridPolicy(make_config(**options), metas["pointing"])
+    assert policy.config.pointing_places is not None
+    assert sorted(policy.config.pointing_places) == sorted(PLACES)
+    assert policy.pointer is not None and metas["pointing"].stats is not None
+    stats = metas["pointing"].stats["action"]
+    highest = torch.from_numpy(np.asarray(stats["max"])).float()
+    batch = pointing_batch(policy) | {OTHER_ACTIONS: highest.repeat(4, 2)}
+    policy.config.counterfactual_share = 1.0
+    cells, _, _ = policy._targets(batch)
+    assert torch.equal(cells[:, 0], policy.grids.encode(torch.ones(4, 4)))
+
+
+def test_grids_adapt_and_what_points_stays(metas: dict[str, LeRobotDatasetMetadata], tmp_path: Path) -> None:
+    old = pointing_policy()
+    old.save_pretrained(tmp_path / "old")
+    loaded = SpatialvlaGridPolicy.from_pretrained(tmp_path / "old")
+    batch = make_batch(old, 2)
+    assert torch.equal(loaded._write(batch, 2), old._write(batch, 2))
+    groups = [
+        {"dims": [0, 1, 2], "transform": "polar", "bins": [4, 8, 6]},
+        {"dims": [3], "transform": "identity", "bins": [16]},
+    ]
+    config = changed(tmp_path / "old", action_groups=groups)
+    new = SpatialvlaGridPolicy.from_pretrained(
+        tmp_path / "old", config=config, dataset_meta=metas["pointing"]
+    )
+    assert new.grids.num_cells == [4 * 8 * 6, 16] != old.grids.num_cells
+    for table in ("cell_embedding.weight", "cell_head.weight"):
+        (of_old, of_new) = (policy.get_parameter(table) for policy in (old, new))
+        assert len(of_new) == 4 * 8 * 6 + 16 + 4 + NUM_STONES
+        assert torch.equal(of_new[-4 - NUM_STONES :], of_old[-4 - NUM_STONES :])
+    new(pointing_batch(new))[0].backward()
+    new.save_pretrained(tmp_path / "new")
+    again = SpatialvlaGridPolicy.from_pretrained(tmp_path / "new")
+    assert torch.equal(again._write(batch, 2), new._write(batch, 2))
+    assert again.config.pointing_places == PLACES
+
+
+# Bad input
+
+
+def test_without_places_there_is_no_policy() -> None:
+    with pytest.raises(ValueError, match=r"--policy\.pointing=true takes the places from a dataset"):
+        make_policy(pointing=True)
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ({"counterfactual_share": 1.5}, r"--policy\.counterfactual_share=1\.5 must lie in 0\.\.1"),
+        ({"pointing_cell_m": 5.0}, r"--policy\.pointing_cell_m=5\.0 must lie in 0\.001\.\.0\.05"),
+        ({"pointing_area_m": [[0, 0], [1]]}, r"--policy\.pointing_area_m=.* must be \[\[x, y\], \[x, y\]\]"),
+        ({"pointing_area_m": [[0, 1], [1, 0]]}, "the second beyond the first"),
+    ],
+)
+def test_wrong_flags_are_named(options: dict[str, Any], message: str) -> None:
+    with pytest.raises(FlagError, match=message):
+        make_config(**POINTING | options)
+
+
+def test_a_start_that_does_not_go_together_is_refused(
+    metas: dict[str, LeRobotDatasetMetadata], tmp_path: Path
+) -> None:
+    make_policy().save_pretrained(tmp_path / "plain")
+    pointing_policy(chunk_size=4, n_action_steps=4).save_pretrained(tmp_path / "pointing")
+    load = SpatialvlaGridPolicy.from_pretrained
+    with pytest.raises(
+        ValueError, match=r"pointing=true is trained on the columns .*which test/pointing lacks"
+    ):
+        load(tmp_path / "pointing", config=changed(tmp_path / "pointing"), dataset_meta=metas["plain"])
+    with pytest.raises(
+        ValueError, match=r"--policy\.pointing=True: the weights of this checkpoint are made for"
+    ):
+        on = changed(tmp_path / "plain", pointing=True)
+        load(tmp_path / "plain", config=on, dataset_meta=metas["pointing"])
+    with pytest.raises(
+        ValueError, match=r"--policy\.pointing=False: the weights of this checkpoint are made"
+    ):
+        off = changed(tmp_path / "pointing", pointing=False)
+        load(tmp_path / "pointing", config=off, dataset_meta=metas["plain"])
+
+
+@pytest.mark.parametrize("with_data", [True, False])
+def test_a_checkpoint_of_before_does_not_point(
+    with_data: bool, metas: dict[str, LeRobotDatasetMetadata], tmp_path: Path
+) -> None:
+    make_policy().save_pretrained(tmp_path)
+    written = json.loads((tmp_path / "config.json").read_text())
+    for name in [name for name in written if name.startswith(("pointing", "counterfactual"))]:
+        del written[name]
+        written["trained_with"].pop(name, None)
+    (tmp_path / "config.json").write_text(json.dumps(written))
+    with pytest.raises(ValueError, match=r"--policy\.pointing=True: .*this checkpoint"):
+        SpatialvlaGridPolicy.from_pretrained(
+            tmp_path,
+            config=changed(tmp_path, pointing=True),
+            dataset_meta=metas["pointing"] if with_data else None,
+        )
+    SpatialvlaGridPolicy.from_pretrained(tmp_path, config=changed(tmp_path))
