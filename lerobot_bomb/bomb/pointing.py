@@ -63,6 +63,11 @@ class PointedAt:
     # of each place (x, y) of a table, the probability that it is the one; {} where there is no table
     probabilities: Mapping[tuple[float, float], float] = field(default_factory=dict)
 
+    @property
+    def likeliest(self) -> list[tuple[tuple[float, float], float]]:
+        """Places with their probabilities, the likeliest first."""
+        return sorted(self.probabilities.items(), key=lambda each: -each[1])
+
 
 @dataclass(frozen=True)
 class Pointing(Meant):

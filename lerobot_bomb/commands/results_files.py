@@ -6,6 +6,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from lerobot_bomb.envs.results import Row
+from lerobot_bomb.evaluation.result_kind import describe_numbers
 from lerobot_bomb.evaluation.result_lines import check_any, read_lines
 from lerobot_bomb.sweep.manifest import NAME, Manifest
 from lerobot_bomb.sweep.store import ERRORS, RESULTS
@@ -58,19 +59,10 @@ def read_line(path: Path, line: int) -> Row:
     """
     numbered = read_undamaged(path).numbered
     if line not in numbered:
-        raise ValueError(f"--line={line} is no episode of {path}, whose lines are {_spans(numbered)}")
+        raise ValueError(
+            f"--line={line} is no episode of {path}, whose lines are {describe_numbers(numbered)}"
+        )
     return numbered[line]
-
-
-def _spans(numbers: Iterable[int]) -> str:
-    """Return '1..3, 5' of rising numbers."""
-    spans: list[list[int]] = []
-    for number in numbers:
-        if spans and number == spans[-1][-1] + 1:
-            spans[-1][1:] = [number]
-        else:
-            spans.append([number])
-    return ", ".join("..".join(map(str, span)) for span in spans)
 
 
 def read_undamaged(path: Path) -> ResultsFile:

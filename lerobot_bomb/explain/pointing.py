@@ -144,7 +144,6 @@ class PointingCheck:
     def as_json(self) -> dict[str, Any]:
         """JSON-ready, in metres and millimetres."""
         pointed, meant = self.pointed, self.meant
-        places = sorted(pointed.probabilities.items(), key=lambda each: -each[1])
         return {
             "place": self.place,
             "place_xy_m": pointed.place_xy.tolist(),
@@ -156,7 +155,7 @@ class PointingCheck:
             "stone_mm": self.stone_mm,
             "held": pointed.held,
             "meant_held": meant.held,
-            "places": [{"xy_m": [*xy], "probability": probability} for xy, probability in places],
+            "places": [{"xy_m": [*xy], "probability": probability} for xy, probability in pointed.likeliest],
             "action_mm": self.way_mm.tolist(),
             "asked_action_mm": self.asked_mm.tolist(),
             "goes_there": self.goes_there,

@@ -25,18 +25,18 @@ NOTE = (
 def pointing_tables(check: PointingCheck) -> Iterator[Table]:
     """Stone, place and next action beside what is meant; the likeliest places of a table."""
     pointed, meant = check.pointed, check.meant
+    stones_mm = 1e3 * pointed.stone_xy, 1e3 * meant.stone_xy
     rows = [
         [Cell("place"), Cell(check.place), Cell(check.meant_place), _millimetres(check.place_mm)],
-        [Cell("stone, mm"), *map(_xy, (1e3 * pointed.stone_xy, 1e3 * meant.stone_xy))],
+        [Cell("stone, mm"), *map(_xy, stones_mm), _millimetres(check.stone_mm)],
         [Cell("next action, mm"), *map(_xy, (check.way_mm, check.asked_mm)), _millimetres(check.apart_mm)],
     ]
-    rows[1].append(_millimetres(check.stone_mm))
     if pointed.held is not None:
         held = [Cell(f"{share:.2f}", share) for share in (pointed.held, meant.held)]
         rows.insert(2, [Cell("held"), *held, Cell("-")])
     note = f"It points at {check.finding.answer}. {NOTE}"
     yield Table("What it points at", ["", "policy", "meant", "apart, mm"], rows, note)
-    likeliest = sorted(pointed.probabilities.items(), key=lambda each: -each[1])[:NUM_PLACES]
+    likeliest = pointed.likeliest[:NUM_PLACES]
     if likeliest:
         places = [
             [Cell(place_name(np.array(xy))), Cell(f"{share:.2f}", share, share)]
