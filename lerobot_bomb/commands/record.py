@@ -108,7 +108,7 @@ def run_record(args: argparse.Namespace) -> int:
     recording = _recording(args)
     root = args.root or default_root(recording.repo_id)
     shard = shard_of(args)
-    check_num_jobs(args, num_whole_blocks(recording), f"parts of at least {BLOCK_EPISODES} episodes")
+    check_num_jobs(args, num_whole_blocks(recording), f"parts of at least {len(block_episodes(0))} episodes")
     if num_jobs := args.slurm or args.submitit:
         return _record_by_jobs(args, [Part(recording, index, num_jobs) for index in range(num_jobs)], root)
     _warn_of_test_seeds(recording)
