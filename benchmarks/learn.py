@@ -33,6 +33,7 @@ from learning_tasks import (
     RIVALS,
     TASKS,
     Bar,
+    Part,
     Task,
     by_suite,
     by_what_is_left_out,
@@ -214,17 +215,16 @@ def locked(folder: Path) -> Iterator[None]:
 
 
 def record(task: Task, demonstrations: int, dataset: Path) -> None:
-    """Record the expert's episodes, and static scenes, merged with them."""
+    """Record the expert's episodes, or the parts of a task, which are merged."""
     if dataset.exists():
         return
-    if not task.static:
-        record_part(task, dataset, f"--episodes={demonstrations}", f"--noise={NOISE}")
+    if not task.parts:
+        run_record(task, dataset, Part(task.suite, demonstrations, task_ids=task_ids_of(task)))
         return
-    parts = [dataset.with_name(name) for name in ("shown", "scenes")]
-    numbers = ([f"--episodes={demonstrations}", f"--noise={NOISE}"], [f"--static={task.static}"])
-    for part, number in zip(parts, numbers, strict=True):
-        if not part.exists():
-            record_part(task, part, *number, "--pointing")
+    folders = [dataset.with_name(part.name) for part in task.parts]
+    for part, folder in zip(task.parts, folders, strict=True):
+        if not folder.exists():
+            run_record(task, folder, part, "--pointing")
     merged = dataset.with_name("merged")  # not yet whole
     shutil.rmtree(merged, ignore_errors=True)
     run_command(
@@ -232,30 +232,38 @@ def record(task: Task, demonstrations: int, dataset: Path) -> None:
         f"--new_repo_id={REPO_ID}",
         f"--new_root={merged}",
         "--operation.type=merge",
-        f"--operation.repo_ids={json.dumps([REPO_ID, REPO_ID])}",
-        f"--operation.roots={json.dumps([str(part) for part in parts])}",
+        f"--operation.repo_ids={json.dumps([REPO_ID] * len(folders))}",
+        f"--operation.roots={json.dumps([str(folder) for folder in folders])}",
     )
     merged.rename(dataset)
 
 
-def record_part(task: Task, dataset: Path, *number: str) -> None:
+def task_ids_of(task: Task) -> tuple[int, ...]:
+    """Task ids that the demonstrations are of; () where they are drawn."""
+    return tuple(shown_pairs()) if task.is_partial else task.task_ids
+
+
+def run_record(task: Task, folder: Path, part: Part, *flags: str) -> None:
     """Make one recording of the task."""
-    task_ids = shown_pairs() if task.is_partial else task.task_ids
-    task_flags = [f"--task_ids={list(task_ids)}"] if task_ids else []
-    resume = ["--resume"] if dataset.with_name(f"{dataset.name}.recording").exists() else []
+    number = (
+        [f"--static={part.number}"] if part.is_static else [f"--episodes={part.number}", f"--noise={NOISE}"]
+    )
+    task_flags = [f"--task_ids={list(part.task_ids)}"] if part.task_ids else []
+    resume = ["--resume"] if folder.with_name(f"{folder.name}.recording").exists() else []
     run_command(
         "lerobot-bomb",
         "record",
         f"--repo_id={REPO_ID}",
-        f"--root={dataset}",
+        f"--root={folder}",
         f"--seed={FIRST_SEED}",
         *number,
-        f"--task={task.suite}",
+        f"--task={part.suite}",
         f"--perturbations={task.perturbations}",
         f"--split={'train' if task.is_partial else 'all'}",
         "--images",
         f"--image_size={IMAGE_SIZE}",
         *task_flags,
+        *flags,
         *resume,
     )
 

@@ -40,6 +40,22 @@ class Training:
 
 
 @dataclass(frozen=True)
+class Part:
+    """Recording that the dataset of a task is merged from: so many demonstrations, or static scenes."""
+
+    suite: str
+    number: int
+    is_static: bool = False
+    task_ids: tuple[int, ...] = ()  # of the suite, each from every seed; empty: drawn for each episode
+
+    @property
+    def name(self) -> str:
+        """Name of its folder."""
+        tasks = f"_tasks_{'_'.join(map(str, self.task_ids))}" if self.task_ids else ""
+        return f"{'scenes' if self.is_static else 'shown'}_{self.suite}{tasks}"
+
+
+@dataclass(frozen=True)
 class Task:
     """Task to be learnt: its task ids, its perturbations, and the training of each policy type."""
 
@@ -52,8 +68,25 @@ class Task:
     recipe: str | None = None  # the task whose recipes it is learnt by; None: its own
     suite: str = "place"
     is_said_at_once: bool = True  # else the policy is given several instructions, which are not exchanged
-    static: int = 0  # scenes beside the demonstrations; then both are labelled for pointing
+    # what is recorded in place of the training's demonstrations; all of it is labelled for pointing
+    parts: tuple[Part, ...] = ()
 
+
+# Places that relations name are read after many boards, those with a name of their own after a few.
+ALL_SUITES = (
+    Part("spatial", 48_000, is_static=True, task_ids=(0, 1, 2, 3, 4, 11)),
+    Part("spatial", 4_000, is_static=True, task_ids=(5, 6, 7, 8, 9, 10)),
+    Part("long", 24_000, is_static=True, task_ids=(0, 1, 2, 6, 7, 10, 11, 12)),
+    Part("long", 12_000, is_static=True),
+    Part("goal", 14_000, is_static=True),
+    Part("object", 14_000, is_static=True),
+    Part("place", 5_000, is_static=True),
+    Part("spatial", 200),
+    Part("object", 150),
+    Part("long", 130),
+    Part("goal", 100),
+    Part("place", 100),
+)
 
 TASKS = {
     "one_target": Task(
@@ -89,14 +122,14 @@ TASKS = {
         is_partial=True,
         recipe="all_targets",
     ),
-    # one policy for all suites; demonstrations are of each in turn, evaluations of each
+    # one policy for all suites, evaluated on each
     "all_suites": Task(
         (),
         episodes=100,
-        trainings={"fdvla": Training(2000, None)},
+        trainings={"fdvla": Training(sum(part.number for part in ALL_SUITES if not part.is_static), None)},
         suite=ALL,
         is_said_at_once=False,
-        static=60_000,
+        parts=ALL_SUITES,
     ),
     **{
         suite: Task(

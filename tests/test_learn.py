@@ -142,9 +142,7 @@ def test_every_policy_type_has_a_recipe_for_every_task() -> None:
                 assert recipe["policy"]["scheduler_decay_steps"] == recipe["steps"]
 
 
-def test_scenes_are_recorded_beside_demonstrations_and_merged(
-    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
-) -> None:
+def test_parts_of_a_task_are_recorded_and_merged(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     dataset, ran = tmp_path / "dataset", []
 
     def run(*command: str) -> None:
@@ -153,13 +151,17 @@ def test_scenes_are_recorded_beside_demonstrations_and_merged(
         Path(roots[0]).mkdir()
 
     monkeypatch.setattr(learn, "run_command", run)
-    task = learn.Task((), episodes=1, trainings={}, suite="all", static=400)
-    (tmp_path / "shown").mkdir()  # by a run that was stopped
+    parts = (learn.Part("goal", 3), learn.Part("spatial", 400, is_static=True, task_ids=(0, 11)))
+    task = learn.Task((), episodes=1, trainings={}, suite="all", parts=parts)
+    (tmp_path / "shown_goal").mkdir()  # by a run that was stopped
     learn.record(task, 3, dataset)
     scenes, merge = ran
-    assert {"--static=400", "--pointing", "--task=all", f"--root={tmp_path / 'scenes'}"} <= set(scenes)
+    folder = tmp_path / "scenes_spatial_tasks_0_11"
+    assert {"--static=400", "--pointing", "--task=spatial", "--task_ids=[0, 11]", f"--root={folder}"} <= set(
+        scenes
+    )
     assert not any(flag.startswith(("--noise", "--episodes")) for flag in scenes)
-    roots = json.dumps([str(tmp_path / name) for name in ("shown", "scenes")])
+    roots = json.dumps([str(tmp_path / "shown_goal"), str(folder)])
     assert merge[0] == "lerobot-edit-dataset" and f"--operation.roots={roots}" in merge
     assert dataset.is_dir() and not (tmp_path / "merged").exists()
 

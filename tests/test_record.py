@@ -376,6 +376,21 @@ def test_an_image_that_is_not_written_is_an_error(tmp_path: Path, monkeypatch: p
     assert list(tmp_path.iterdir()) == []
 
 
+def test_images_put_into_tables_in_batches_are_the_same(
+    datasets: dict[str, Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    from contextlib import nullcontext
+
+    from lerobot_bomb.data import blocks
+
+    monkeypatch.setattr(blocks, "batched_embedding", nullcontext)  # LeRobot's own way, row by row
+    record(IMAGES, tmp_path / "images")
+    files = sorted(path.relative_to(tmp_path) for path in tmp_path.rglob("data/**/*.parquet"))
+    assert files
+    for file in files:
+        assert pq.read_table(tmp_path / file).equals(pq.read_table(datasets["images"].parent / file))
+
+
 def test_resuming_a_complete_recording_changes_nothing(datasets: dict[str, Path]) -> None:
     before = contents(datasets["video"])
     num_frames = json.loads(before["meta/info.json"])["total_frames"]

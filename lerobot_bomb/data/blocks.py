@@ -29,6 +29,7 @@ from lerobot.datasets.utils import DEFAULT_EPISODES_PATH
 from lerobot_bomb.compat.own.merging import merged_at_once
 from lerobot_bomb.compat.own.recording import (
     abandon,
+    batched_embedding,
     datasets_cache,
     mergeable_arrays,
     sampled_image_statistics,
@@ -97,6 +98,7 @@ def write_block(layout: DatasetLayout, root: Path, episodes: Iterable[RecordedEp
         _temporary_files_beside(root),
         sampled_image_statistics(),
         without_statistics(layout.arrays),
+        batched_embedding(),
     ):
         dataset = layout.create(root)
         rows = _write_episodes(dataset, chain([first], remaining))
@@ -119,7 +121,8 @@ def merge_blocks(layout: DatasetLayout, blocks: list[Path], root: Path) -> None:
     repo_ids = [layout.repo_id] * len(blocks)
     cache = datasets_cache(root.with_name(f"{root.name}.cache"))
     arrays = mergeable_arrays(layout.features) if layout.arrays else nullcontext()
-    with _quiet_libraries(), _temporary_files_beside(root), cache, arrays, merged_at_once():
+    embedding = batched_embedding()
+    with _quiet_libraries(), _temporary_files_beside(root), cache, arrays, embedding, merged_at_once():
         try:
             aggregate_datasets(
                 repo_ids,

@@ -8,8 +8,9 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from datasets import config
-from lerobot.datasets import LeRobotDataset, aggregate, compute_stats, dataset_writer
+from datasets import Dataset, config
+from datasets.table import embed_table_storage
+from lerobot.datasets import LeRobotDataset, aggregate, compute_stats, dataset_writer, io_utils
 from lerobot.datasets.feature_utils import get_hf_features_from_features
 from lerobot.datasets.io_utils import to_parquet_with_hf_images
 from lerobot.utils.constants import DEFAULT_FEATURES
@@ -53,6 +54,23 @@ def without_statistics(keys: Collection[str]) -> Iterator[None]:
         yield
     finally:
         dataset_writer.compute_episode_stats = usual
+
+
+def embed_in_batches(dataset: Dataset) -> Dataset:
+    """Put the bytes of image files into a table."""
+    shown_as = dataset.format
+    return dataset.with_format("arrow").map(embed_table_storage, batched=True).with_format(**shown_as)
+
+
+@contextmanager
+def batched_embedding() -> Iterator[None]:
+    """Let LeRobot put images into tables a thousand rows at a time; row by row is a third of recording."""
+    usual = io_utils.embed_images
+    dataset_writer.embed_images = io_utils.embed_images = embed_in_batches
+    try:
+        yield
+    finally:
+        dataset_writer.embed_images = io_utils.embed_images = usual
 
 
 @contextmanager
