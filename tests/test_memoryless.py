@@ -12,10 +12,11 @@ import numpy as np
 import pytest
 
 from lerobot_bomb.bomb.board import BOARD, COLORS, NUM_STONES, TRAY_CENTER_XY, TRAY_HALF_SIZE_XY, Cell
-from lerobot_bomb.bomb.commands import CELLS, TRAY_XY_M
+from lerobot_bomb.bomb.commands import CELLS, SUPPLY_XY_M, TRAY_XY_M
 from lerobot_bomb.bomb.episode import EpisodeSpec
-from lerobot_bomb.bomb.expert import expert_action
+from lerobot_bomb.bomb.expert import OFF_BESIDE_M, REACHED_HEIGHT_M, REACHED_LATERAL_M, expert_action
 from lerobot_bomb.bomb.go import group_of, liberties_of
+from lerobot_bomb.bomb.move import Aim
 from lerobot_bomb.bomb.observation import RenderOptions
 from lerobot_bomb.bomb.privileged_state import Goal, PrivilegedState
 from lerobot_bomb.bomb.streams import recorder_noise
@@ -29,7 +30,9 @@ NOISE = 0.05  # on what is executed, as in recordings
 SMALL = RenderOptions(image_size=32)
 NEAR_M = 0.012  # of the gripper, for a stone between its pads; of a place, for one that lies there
 BOARD_END_M = TRAY_CENTER_XY[0] - TRAY_HALF_SIZE_XY[0]  # x at which the tray begins
-FLAT_M = 0.005  # of its height at rest, for a stone that lies
+TRAY_ROW_M = SUPPLY_XY_M[0][1] - SUPPLY_XY_M[2][1]
+FLAT_M = REACHED_HEIGHT_M[0]  # of its height at rest, for a stone that lies
+HELD_OPENING_M = (0.012, 0.030)  # between pads that hold a stone
 REST_M = BOARD.thickness_m + BOARD.stone_height_m / 2
 LEFT_SIDE = [cell for cell in CELLS if cell[1] < 2]
 type Place = tuple[float, float]  # metres
@@ -47,16 +50,19 @@ class View:
         self.held: int | None = None
         self.on_board: dict[Cell, int] = {}
         self.in_tray: list[int] = []  # row by row
+        self.lying: list[int] = []  # on the board or in the tray
         for stone in np.flatnonzero(self.state.stone_in_play).tolist():
             x, y, _ = self.xyz(stone)
             if self._is_held(stone):
                 self.held = stone
-            elif x < BOARD_END_M:
+                continue
+            self.lying.append(stone)
+            if x < BOARD_END_M:
                 # one that slips out of the fingers is off it for a moment
                 self.on_board[BOARD.nearest_intersection(np.array([x, y]))] = stone
             else:
                 self.in_tray.append(stone)
-        self.in_tray.sort(key=lambda stone: (-round(self.xyz(stone)[1], 2), self.xyz(stone)[0]))
+        self.in_tray.sort(key=lambda stone: (-(self.xyz(stone)[1] // TRAY_ROW_M), self.xyz(stone)[0]))
 
     def xyz(self, stone: int) -> np.ndarray:
         return self.state.stone_xyz[stone]
@@ -79,18 +85,19 @@ class View:
         taken = [self.xyz(stone)[:2] for stone in self.in_tray]
         return next(place for place in TRAY_XY_M if all(np.hypot(*(xy - place)) > NEAR_M for xy in taken))
 
-    def resting(self) -> list[int]:
-        return [*self.on_board.values(), *self.in_tray]
-
     @property
     def is_settled(self) -> bool:
-        """Tell whether nothing flies or leans, as a stone may that slipped out of the fingers or was hit."""
-        return all(abs(self.xyz(stone)[2] - REST_M) < FLAT_M for stone in self.resting())
+        """Tell whether nothing flies or leans, as a stone may that slipped out of the fingers or was hit.
+
+        No two stones lie nearest to one intersection, either.
+        """
+        is_alone = len(self.lying) == len(self.on_board) + len(self.in_tray)
+        return is_alone and all(abs(self.xyz(stone)[2] - REST_M) < FLAT_M for stone in self.lying)
 
     def _is_held(self, stone: int) -> bool:
         offset = self.xyz(stone) - self.state.gripper_xyz
         is_between = np.hypot(*offset[:2]) < NEAR_M and -0.004 < offset[2] < 0.03
-        return bool(is_between and self.state.finger_opening < 0.030)
+        return bool(is_between and HELD_OPENING_M[0] < self.state.finger_opening < HELD_OPENING_M[1])
 
 
 type Next = tuple[int, Place] | None  # the stone that is to be moved and where to; None: all is done
@@ -173,7 +180,7 @@ def next_of_capture(color: str, by: str, view: View) -> Next:
         return view.held, view.next_tray_place
     # of two, the other one has the first's intersection for a liberty, and the first lies in the tray
     taken = sorted(cell for group, places in liberties.items() if not places for cell in group)
-    if not taken and view.in_tray and "2 " in view.text:
+    if not taken and len(view.in_tray) == 1 and "2 " in view.text:
         taken = sorted(min(group) for group, places in liberties.items() if len(places) == 1)
     return (view.on_board[taken[0]], view.next_tray_place) if taken else None
 
@@ -230,9 +237,15 @@ def goals_of_reader(view: View) -> tuple[Goal, ...]:
     """The next move, after the stone that the fingers may just have put down."""
     following = next_move(view.text, view)
     stone = None if following is None else following[0]
-    gripper_xy = view.state.gripper_xyz[:2]
-    others = [other for other in view.resting() if other != stone]
-    before = min(others, key=lambda other: float(np.hypot(*(view.xyz(other)[:2] - gripper_xy))), default=None)
+    away_m = {
+        other: float(np.linalg.norm((view.xyz(other) - view.state.gripper_xyz)[:2]))
+        for other in view.lying
+        if other != stone
+    }
+    before = min(away_m, key=away_m.__getitem__, default=None)
+    is_over = before is not None and view.held is None and away_m[before] <= OFF_BESIDE_M[0]
+    if following is not None and not is_over:
+        before = None  # a neighbour, which the fingers have not just put down
     goals = []
     if before is not None:
         goals.append((before, own_place(view.xyz(before)[:2])))
@@ -244,7 +257,10 @@ def goals_of_reader(view: View) -> tuple[Goal, ...]:
 def own_place(xy: np.ndarray) -> Place:
     """Return the place of a stone that rests: an intersection, a place in the tray, or just there."""
     places = [*map(of_cell, CELLS), *TRAY_XY_M]
-    return next((place for place in places if np.hypot(*(xy - place)) < 0.006), (float(xy[0]), float(xy[1])))
+    return next(
+        (place for place in places if np.hypot(*(xy - place)) < REACHED_LATERAL_M[1]),
+        (float(xy[0]), float(xy[1])),
+    )
 
 
 def seen(moment: Moment, pattern: dict[Cell, str], rng: np.random.Generator) -> View:
@@ -261,6 +277,21 @@ def seen(moment: Moment, pattern: dict[Cell, str], rng: np.random.Generator) -> 
         ),
         pattern,
     )
+
+
+def has_fallen(state: PrivilegedState, start: PrivilegedState, aims: Sequence[Aim]) -> bool:
+    """Tell whether a stone slipped or was hit and lies on the board where nobody put it.
+
+    Whoever has not seen it fall cannot know that it is the one to go on with.
+    """
+    for stone in np.flatnonzero(state.stone_in_play).tolist():
+        x, _, z = state.stone_xyz[stone]
+        places = [start.stone_xyz[stone, :2], *(np.array(aim.xy) for aim in aims if aim.stone == stone)]
+        lies_on_board = x < BOARD_END_M and abs(z - REST_M) < FLAT_M
+        ways_m = [float(np.hypot(*(state.stone_xyz[stone, :2] - place))) for place in places]
+        if lies_on_board and min(ways_m) > NEAR_M and not any(aim.is_slid for aim in aims):
+            return True
+    return False
 
 
 class UndrawnEnv(BombEnv):
@@ -283,14 +314,17 @@ class Played:
 def play_and_read(env: BombEnv, spec: EpisodeSpec) -> Played:
     rng, noise = np.random.default_rng(spec.seed), recorder_noise(spec.seed)
     played = Played([])
-    pattern = dict(find_suite(spec.suite).sample(spec).pattern)
+    episode = find_suite(spec.suite).sample(spec)
+    pattern = dict(episode.pattern)
+    start = None
     for moment in play(env, spec, expert_agent(), lambda a: add_noise(a, NOISE, "relative", noise)):
         played.is_success = moment.info["is_success"]
         if moment.action is None:
             continue
+        start = start or moment.state
         view = seen(moment, pattern, rng)
         played.num_steps += 1
-        if not view.is_settled:
+        if not view.is_settled or has_fallen(moment.state, start, episode.aims):
             continue
         played.num_compared += 1
         action = expert_action(replace(view.state, goals=goals_of_reader(view)))
