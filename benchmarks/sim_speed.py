@@ -21,7 +21,7 @@ import time
 from collections.abc import Callable
 from pathlib import Path
 
-from machine import add_machine_arguments, require_idle_machine, write_figures
+from machine import add_machine_arguments, make_parser, require_idle_machine, write_figures
 
 IMAGE_SIZE = 256
 NUM_FRAMES = 100
@@ -40,7 +40,7 @@ TARGETS = {
 
 def main() -> None:
     """Measure in turn, print medians, ratios and targets."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawTextHelpFormatter)
+    parser = make_parser(__doc__)
     parser.add_argument("--repeats", type=int, default=3, help="processes of each environment (default: 3)")
     parser.add_argument("--robosuite_python", default=sys.executable, help="a Python that has robosuite")
     parser.add_argument("--measure", choices=MEASURES, help=argparse.SUPPRESS)
