@@ -83,7 +83,9 @@ def test_flags_of_the_evaluation_are_given_again(
     assert main(["replay", str(path), f"--output={tmp_path / 'x'}", flag]) == 0
 
 
-@pytest.mark.parametrize("levels", ["camera=0,table=5", "camera:0,table:5"])
+@pytest.mark.parametrize(
+    "levels", ["camera:0,table:5", pytest.param("camera=0,table=5", marks=pytest.mark.long)]
+)
 def test_an_axis_is_changed_side_by_side(
     levels: str, results: Callable[..., Path], tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

@@ -165,7 +165,15 @@ def by_seed(rows: list[Row]) -> list[Row]:
     return sorted(map(without_measured, rows), key=lambda row: row["spec"]["seed"])
 
 
-@pytest.mark.parametrize("policy", ["bomb_random", NANO, "bomb:fdvla", "bomb:spatialvla_grid"])
+@pytest.mark.parametrize(
+    "policy",
+    [
+        "bomb_random",
+        "bomb:fdvla",
+        pytest.param(NANO, marks=pytest.mark.long),
+        pytest.param("bomb:spatialvla_grid", marks=pytest.mark.long),
+    ],
+)
 def test_the_lines_are_those_of_lerobot_eval(
     policy: str, play: Callable[[Manifest], Store], stock_cli: Callable[..., None], tmp_path: Path
 ) -> None:
