@@ -8,23 +8,28 @@ the same numbers. Reading the prompt (prefill) is reported apart; bars are on th
 of this shape, from images to actions.
 """
 
-import argparse
 import copy
 import logging
 import statistics
-import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from typing import Any
 from unittest.mock import patch
 
 import torch
-from backbone_shapes import CAMERAS, INITIALIZER_RANGE, SMOLVLM
-from decode_speed_compare import Timed, compare, finish, print_rows
-from decode_speed_peer import XgrammarGenerate
-from lerobot.configs import FeatureType, PolicyFeature
-from lerobot.policies import make_pre_post_processors
-from machine import add_machine_arguments, positive, require_cuda, require_idle_machine
+from decode_speed_works import Timed, XgrammarGenerate, compare
+from machine import (
+    Rows,
+    add_machine_arguments,
+    finish,
+    make_parser,
+    positive,
+    print_rows,
+    require_cuda,
+    require_idle_machine,
+    wait_and_time,
+)
+from random_policies import features, make_batches
 from torch import Tensor
 
 from lerobot_bomb.cuda_graphs import GraphedFunction
@@ -43,14 +48,33 @@ MIN_RATIO = 8.0  # in bfloat16, one prompt at a time
 PARTS = "decode", "policy"
 BATCH_SIZES = 1, 16
 PROMPT_LENGTH, NUM_STEPS, NUM_DIMS = 190, 10, 7
+INITIALIZER_RANGE = 0.02  # of the published models
 # of SmolVLM2-500M-Video-Instruct
-TEXT_500M = {**SMOLVLM["smolvlm_500m"]["text_config"], "initializer_range": INITIALIZER_RANGE}
-VISION_500M = {**SMOLVLM["smolvlm_500m"]["vision_config"], "initializer_range": INITIALIZER_RANGE}
+TEXT_500M = {
+    "hidden_size": 960,
+    "num_hidden_layers": 32,
+    "num_attention_heads": 15,
+    "num_key_value_heads": 5,
+    "intermediate_size": 2560,
+    "head_dim": 64,
+    "vocab_size": 49_280,
+    "max_position_embeddings": 8192,
+    "initializer_range": INITIALIZER_RANGE,
+}
+VISION_500M = {
+    "hidden_size": 768,
+    "intermediate_size": 3072,
+    "num_hidden_layers": 12,
+    "num_attention_heads": 12,
+    "image_size": 512,
+    "patch_size": 16,
+    "initializer_range": INITIALIZER_RANGE,
+}
 
 
 def main() -> None:
     """Time both, print the tables; exit code 1 where a bar is missed."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawTextHelpFormatter)
+    parser = make_parser(__doc__)
     parser.add_argument("--repeats", type=positive, default=10, help="answers of each (default: 10)")
     parser.add_argument("--parts", nargs="+", choices=PARTS, default=PARTS, help="default: all")
     add_machine_arguments(parser)
@@ -96,7 +120,7 @@ def time_decoding(
     repeats: int,
     bars: dict[str, bool],
     name: str,
-) -> dict[str, dict[str, float]]:
+) -> Rows:
     """Time whole chunks by the peer and by us, without and with drafts."""
     grammar = NumberGrammar(512, NUM_STEPS * NUM_DIMS).cuda()
     written = torch.ones(batch_size, PROMPT_LENGTH, dtype=torch.bool, device="cuda")
@@ -106,6 +130,7 @@ def time_decoding(
     ]
     symbol_ids = torch.arange(30, 42, device="cuda")
     stock = copy.deepcopy(backbone).to(dtype)
+    cast = [Prompt(prompt.embeds.to(dtype), written) for prompt in prompts]
     known, linear = KnownSymbols(grammar), LinearDraft(grammar, NUM_DIMS)
     ways: dict[str, tuple[Guess, bool]] = {
         "ours, no draft": (known, False),
@@ -118,7 +143,7 @@ def time_decoding(
     }
     figures = compare(
         {
-            "generate, xgrammar": (Peer(stock, symbol_ids, grammar, dtype), prompts),
+            "generate, xgrammar": (XgrammarGenerate(stock, symbol_ids, grammar).timed, cast),
             **{way: (write, prompts) for way, write in ours.items()},
         },
         must_agree=dtype == torch.float32,
@@ -128,31 +153,6 @@ def time_decoding(
     if (dtype, batch_size) == (torch.bfloat16, 1):
         bars[f"{name}: decode {gain:.1f} times faster (bar {MIN_RATIO:g})"] = gain >= MIN_RATIO
     return figures
-
-
-def wait_and_time(run: Callable[[], Any]) -> tuple[Any, float]:
-    """Return the call's result, and the seconds until the device has computed it."""
-    torch.cuda.synchronize()
-    started = time.perf_counter()
-    result = run()
-    torch.cuda.synchronize()
-    return result, time.perf_counter() - started
-
-
-class Peer:
-    """The whole answer by `generate`, and one symbol by it: what it takes to read the prompt."""
-
-    def __init__(
-        self, backbone: SmolVLMBackbone, symbol_ids: Tensor, grammar: NumberGrammar, dtype: torch.dtype
-    ):
-        self._generate = XgrammarGenerate(backbone, symbol_ids, grammar)
-        self._dtype = dtype
-
-    def __call__(self, prompt: Prompt) -> Timed:
-        embeds = prompt.embeds.to(self._dtype)
-        _, prefill_s = wait_and_time(lambda: self._generate(embeds, prompt.mask, max_symbols=1))
-        (numbers, num_passes), whole_s = wait_and_time(lambda: self._generate(embeds, prompt.mask))
-        return Timed(numbers, prefill_s, whole_s - prefill_s, num_passes)
 
 
 class Ours:
@@ -192,13 +192,13 @@ def ends_of_passes() -> Iterator[list[torch.cuda.Event]]:
         yield ends
 
 
-def time_policy(repeats: int) -> dict[str, dict[str, float]]:
+def time_policy(repeats: int) -> Rows:
     """Images, instruction and state to a chunk of actions, without what LeRobot does around it."""
     figures = {}
     for compiled in (False, True):
         policy = make_policy(compiled)
         for batch_size in BATCH_SIZES:
-            batch = make_batch(policy, batch_size)
+            (batch,) = make_batches(policy, batch_size, 1)
             with torch.inference_mode():
                 runs = [
                     wait_and_time(lambda policy=policy, batch=batch: policy.predict_action_chunk(batch))[1]
@@ -215,7 +215,6 @@ def time_policy(repeats: int) -> dict[str, dict[str, float]]:
 
 def make_policy(compiled: bool) -> Vla0SmolPolicy:
     """Make a policy of this shape, with random weights."""
-    image = PolicyFeature(FeatureType.VISUAL, (3, 256, 256))
     config = Vla0SmolConfig(
         vlm_config=config_500m(),
         prompt_tokens=PromptTokens.from_tokenizer(load_tokenizer(NANO), NANO).to_dict(),
@@ -224,24 +223,10 @@ def make_policy(compiled: bool) -> Vla0SmolPolicy:
         device="cuda",
         chunk_size=NUM_STEPS,
         n_action_steps=NUM_STEPS,
-        input_features=dict.fromkeys(CAMERAS, image)
-        | {"observation.state": PolicyFeature(FeatureType.STATE, (NUM_DIMS,))},
-        output_features={"action": PolicyFeature(FeatureType.ACTION, (NUM_DIMS,))},
+        **features(NUM_DIMS, 256),
     )
     config.vlm_model_name = NANO  # its tokenizer
     return Vla0SmolPolicy(config).cuda().eval()
-
-
-def make_batch(policy: Vla0SmolPolicy, batch_size: int) -> dict[str, Any]:
-    """Preprocessed observations."""
-    bounds = {"min": -torch.ones(NUM_DIMS), "max": torch.ones(NUM_DIMS)}
-    preprocessor, _ = make_pre_post_processors(
-        policy.config, dataset_stats={"action": bounds, "observation.state": bounds}
-    )
-    return preprocessor(
-        {key: torch.rand(batch_size, 3, 256, 256) for key in CAMERAS}
-        | {"observation.state": torch.zeros(batch_size, NUM_DIMS), "task": batch_size * ["put it down"]}
-    )
 
 
 if __name__ == "__main__":

@@ -10,7 +10,6 @@ Seeing and reading the prompt (prefill) is reported apart; bars are on the rest 
 prefill, cutting the images and putting the prompt together is left out.
 """
 
-import argparse
 import copy
 import logging
 import time
@@ -21,12 +20,18 @@ from typing import Any
 from unittest.mock import patch
 
 import torch
-from decode_speed_compare import Timed, compare, finish, print_rows
-from decode_speed_works import Episodes, add_episode_arguments
-from lerobot.configs import FeatureType, PolicyFeature
-from lerobot.policies import make_pre_post_processors
+from decode_speed_works import Episodes, Timed, add_episode_arguments, compare
 from lerobot.utils.import_utils import register_third_party_plugins
-from machine import add_machine_arguments, positive, require_idle_machine
+from machine import (
+    Rows,
+    add_machine_arguments,
+    finish,
+    make_parser,
+    positive,
+    print_rows,
+    require_idle_machine,
+)
+from random_policies import features, make_batches
 from torch import Tensor, nn
 from transformers import LogitsProcessor
 
@@ -39,14 +44,12 @@ from lerobot_policy_spatialvla_grid.modeling_spatialvla_grid import SpatialvlaGr
 MIN_RATIO = 3.0
 BATCH_SIZES = 1, 16
 ACTION_DIMS = 7, 4  # of the original, and BOMB's
-CAMERAS = "observation.images.workspace", "observation.images.wrist"
 IMAGE_SIZE = 128
-INSTRUCTIONS = "put the black stone on the center", "go", "push the white stone to the left edge"
 
 
 def main() -> None:
     """Time both, print the tables; exit code 1 where a bar is missed."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawTextHelpFormatter)
+    parser = make_parser(__doc__)
     add_episode_arguments(parser, "spatialvla_grid")
     parser.add_argument("--repeats", type=positive, default=20, help="answers of each (default: 20)")
     add_machine_arguments(parser)
@@ -77,37 +80,18 @@ def main() -> None:
 def make_policy(num_dims: int) -> SpatialvlaGridPolicy:
     """Nano, random weights, the default groups of so many action dimensions."""
     torch.manual_seed(0)
-    image = PolicyFeature(FeatureType.VISUAL, (3, IMAGE_SIZE, IMAGE_SIZE))
     config = SpatialvlaGridConfig(
         vlm_model_name="nano",
         device="cpu",
-        input_features=dict.fromkeys(CAMERAS, image),
-        output_features={"action": PolicyFeature(FeatureType.ACTION, (num_dims,))},
         action_layout="pose" if num_dims == 7 else None,
+        **features(num_dims, IMAGE_SIZE, has_state=False),
     )
     return SpatialvlaGridPolicy(config).eval()
 
 
-def make_batches(policy: SpatialvlaGridPolicy, batch_size: int, num_batches: int) -> list[dict[str, Any]]:
-    """Preprocessed, the instructions of different lengths."""
-    bounds = torch.ones(policy.grids.num_dims)
-    preprocessor, _ = make_pre_post_processors(
-        policy.config, dataset_stats={"action": {"min": -bounds, "max": bounds}}
-    )
-    generator = torch.Generator().manual_seed(0)
-    shape = batch_size, 3, IMAGE_SIZE, IMAGE_SIZE
-    return [
-        preprocessor(
-            {key: torch.rand(shape, generator=generator) for key in CAMERAS}
-            | {"task": [INSTRUCTIONS[(first + row) % len(INSTRUCTIONS)] for row in range(batch_size)]}
-        )
-        for first in range(num_batches)
-    ]
-
-
 def time_decoding(
     name: str, policy: SpatialvlaGridPolicy, batches: list[dict[str, Any]], bars: dict[str, bool]
-) -> dict[str, dict[str, float]]:
+) -> Rows:
     """Time whole chunks by the peer and by us."""
     peer = StockGenerate(policy)
     runs = {f"ours, {draft}": (partial(choose, policy, draft), batches) for draft in DRAFTS}

@@ -1,35 +1,73 @@
-"""Requests that `decode_speed.py` measures, from a trained policy, and two ways to write the answers."""
+"""Ways to write the same answers, ours and the public one, and the requests on which they are timed.
+
+The public way is transformers' `generate` with xgrammar's logits processor.
+"""
 
 import argparse
+import statistics
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Any
 from unittest.mock import patch
 
 import torch
-from decode_speed_compare import Timed
-from decode_speed_peer import XgrammarGenerate
+import xgrammar
 from lerobot.configs import PreTrainedConfig
 from lerobot.datasets import LeRobotDataset
 from lerobot.policies import make_policy, make_pre_post_processors
+from machine import Rows, wait_and_time
 from torch import Tensor
 from torch.utils.data import default_collate
+from xgrammar.contrib.hf import LogitsProcessor
 
-from lerobot_bomb.actions.text import END, number_symbols
-from lerobot_bomb.decoding.decoder import (
-    CachedContinuation,
-    Continuation,
-    Decoded,
-    Guess,
-    Prompt,
-    decode_numbers,
-)
-from lerobot_bomb.decoding.draft import LinearDraft
+from lerobot_bomb.actions.text import END, SPACE, SYMBOL_TEXTS
+from lerobot_bomb.decoding.decoder import Continuation, Decoded, Guess, Prompt, decode_numbers
 from lerobot_bomb.decoding.grammar import NumberGrammar
 from lerobot_bomb.decoding.writer import NumberWriter, continue_prompt
 from lerobot_bomb.vlm.backbone import Backbone
+
+
+@dataclass(frozen=True)
+class Timed:
+    """One answer of each row."""
+
+    numbers: Tensor  # (B, N)
+    prefill_s: float
+    decode_s: float
+    num_passes: int  # the prompt's included
+
+
+def compare(
+    runs: dict[str, tuple[Callable[[Any], Timed], Sequence[Any]]], *, must_agree: bool = True
+) -> Rows:
+    """Time every way on every work, in turn, writing the same if they must. Gains are over the first."""
+    timed: dict[str, list[Timed]] = {name: [] for name in runs}
+    for run, works in runs.values():
+        run(works[0])
+    for i in range(max(len(works) for _, works in runs.values())):
+        for name, (run, works) in runs.items():
+            timed[name].append(run(works[i]))
+        expected, *others = (answers[-1].numbers for answers in timed.values())
+        if must_agree and not all(
+            torch.equal(numbers, expected[:, : numbers.shape[1]]) for numbers in others
+        ):
+            raise SystemExit(f"answer {i}: {', '.join(runs)} do not write the same numbers")
+    figures = {
+        name: {
+            "prefill_ms": 1e3 * statistics.median(answer.prefill_s for answer in answers),
+            "decode_ms": 1e3 * statistics.median(answer.decode_s for answer in answers),
+            "passes": statistics.mean(answer.num_passes for answer in answers),
+            "whole_ms": 1e3 * statistics.median(answer.prefill_s + answer.decode_s for answer in answers),
+        }
+        for name, answers in timed.items()
+    }
+    slowest, *_ = figures.values()
+    for row in figures.values():
+        row["decode_gain"] = slowest["decode_ms"] / row["decode_ms"]
+        row["whole_gain"] = slowest["whole_ms"] / row["whole_ms"]
+    return figures
 
 
 @dataclass(frozen=True)
@@ -79,24 +117,6 @@ class Episodes:
         ]
         return policy, [preprocessor(default_collate(rows)) for rows in frames]
 
-    def planned(self, num_predictions: int, num_steps: int) -> list[DecodeRequest]:
-        """Return requests of batch 1 that guess from the last chunk's unexecuted actions, its end held."""
-        policy, preprocessor = self._load(n_action_steps=num_steps)
-        works: list[DecodeRequest] = []
-        plan_BTD = None
-        for prediction in range(num_predictions + 1):
-            batch = preprocessor(default_collate([self._frame(0, prediction * num_steps)]))
-            with _captured(works):
-                chunk_BTD = policy.predict_action_chunk(batch)
-            if plan_BTD is not None:
-                number_BN = policy._bins({**batch, "action": plan_BTD})
-                num_dims = chunk_BTD.shape[2]
-                guess = PlanDraft(policy.grammar, num_dims, number_BN)
-                works[-1] = replace(works[-1], guess=guess, stop_after=num_steps * num_dims)
-            held_BTD = chunk_BTD[:, -1:].expand(-1, num_steps, -1)
-            plan_BTD = torch.cat([chunk_BTD[:, num_steps:], held_BTD], dim=1)
-        return works[1:]
-
     def _load(self, **options: Any) -> tuple[Any, Any]:
         config: Any = PreTrainedConfig.from_pretrained(self._path)
         config.pretrained_path = self._path
@@ -111,18 +131,6 @@ class Episodes:
         first, end = episode["dataset_from_index"], episode["dataset_to_index"]
         item: Any = self._dataset[first + step % (end - first)]
         return item
-
-
-class PlanDraft(LinearDraft):
-    """Numbers that were foreseen; one that is being written becomes the nearest that begins as it does."""
-
-    def __init__(self, grammar: NumberGrammar, num_dims: int, plan_BN: Tensor):
-        super().__init__(grammar, num_dims)
-        self._plan_BN = plan_BN
-
-    def _expect(self, number_BN: Tensor, index_BX: Tensor, steps: Tensor | int) -> Tensor:
-        index_BX = (index_BX + steps * self._num_dims).clamp(max=number_BN.shape[1] - 1)
-        return self._plan_BN.gather(1, index_BX)
 
 
 @contextmanager
@@ -155,16 +163,11 @@ class Timer(Continuation):
         return logits
 
 
-def begin(work: DecodeRequest) -> CachedContinuation:
-    """The model that goes on with the prompts."""
-    max_symbols = work.grammar.max_symbols(work.stop_after)
-    return continue_prompt(work.backbone, work.prompt, work.symbol_ids, max_symbols)
-
-
 def ours(work: DecodeRequest) -> Timed:
     """The decoder; the first pass reads the prompt."""
     started = time.perf_counter()
-    model = Timer(begin(work))
+    max_symbols = work.grammar.max_symbols(work.stop_after)
+    model = Timer(continue_prompt(work.backbone, work.prompt, work.symbol_ids, max_symbols))
     decoded = decode_numbers(
         model, work.grammar, work.guess, batch_size=len(work.prompt.embeds), stop_after=work.stop_after
     )
@@ -177,42 +180,67 @@ def ours(work: DecodeRequest) -> Timed:
 
 
 def peer(work: DecodeRequest) -> Timed:
-    """The whole answer by `generate`, and one symbol by it: what it takes to read the prompt."""
-    generate = XgrammarGenerate(work.backbone, work.symbol_ids, work.grammar)
-    embeds, mask = work.prompt.embeds, work.prompt.mask
-    generate(embeds, mask, max_symbols=1)
-    started = time.perf_counter()
-    generate(embeds, mask, max_symbols=1)
-    prompt_read = time.perf_counter()
-    numbers, num_passes = generate(embeds, mask)
-    whole_s, prefill_s = time.perf_counter() - prompt_read, prompt_read - started
-    return Timed(numbers, prefill_s, whole_s - prefill_s, num_passes)
+    """The public way."""
+    return XgrammarGenerate(work.backbone, work.symbol_ids, work.grammar).timed(work.prompt)
 
 
-def num_symbols(grammar: NumberGrammar, number_BN: Tensor) -> int:
-    """Tokens of the answers, spaces and ends included."""
-    num_digits = grammar.fixed_width * number_BN.numel() or sum(
-        len(str(number)) for number in number_BN.flatten().tolist()
+class XgrammarGenerate:
+    """Greedy search after given prompt embeddings; the language is ours, told to xgrammar."""
+
+    def __init__(self, backbone: Backbone, symbol_ids: Tensor, grammar: NumberGrammar):
+        self._backbone, self._symbol_ids, self._grammar = backbone, symbol_ids, grammar
+        width = grammar.fixed_width
+        values = " | ".join(f'"{str(value).zfill(width)}"' for value in range(grammar.num_values))
+        rules = f'root ::= {" ".join(["value"] * grammar.num_numbers)}\nvalue ::= " " ({values})\n'
+        vocabulary = [f"<{token}>" for token in range(backbone.vlm.lm_head.out_features)]
+        for token, text in zip(symbol_ids[:END].tolist(), SYMBOL_TEXTS, strict=True):
+            vocabulary[token] = text
+        self._end_id = int(symbol_ids[END])
+        tokenizer = xgrammar.TokenizerInfo(
+            vocabulary, vocab_type=xgrammar.VocabType.RAW, stop_token_ids=[self._end_id]
+        )
+        self._grammar_of_peer = xgrammar.GrammarCompiler(tokenizer).compile_grammar(rules)
+
+    def __call__(
+        self, embeds_BLH: Tensor, mask_BL: Tensor, max_symbols: int | None = None
+    ) -> tuple[Tensor, int]:
+        """(B, N) numbers and the passes they took."""
+        embeds_BLH, mask_BL = _padded_left(embeds_BLH, mask_BL)
+        model: Any = self._backbone.vlm
+        ids_BA = model.generate(
+            inputs_embeds=embeds_BLH,
+            attention_mask=mask_BL.long(),
+            max_new_tokens=max_symbols or self._grammar.max_symbols(self._grammar.num_numbers),
+            do_sample=False,
+            logits_processor=[LogitsProcessor(self._grammar_of_peer)],
+            eos_token_id=self._end_id,
+            pad_token_id=self._end_id,
+        )
+        symbols_BA = (ids_BA[..., None] == self._symbol_ids).long().argmax(dim=-1)
+        return read_answer(symbols_BA, self._grammar.num_numbers), symbols_BA.shape[1]
+
+    def timed(self, prompt: Prompt) -> Timed:
+        """The whole answer, and one symbol: what it takes to read the prompt."""
+        self(prompt.embeds, prompt.mask, max_symbols=1)
+        _, prefill_s = wait_and_time(lambda: self(prompt.embeds, prompt.mask, max_symbols=1))
+        (numbers, num_passes), whole_s = wait_and_time(lambda: self(prompt.embeds, prompt.mask))
+        return Timed(numbers, prefill_s, whole_s - prefill_s, num_passes)
+
+
+def read_answer(symbol_BA: Tensor, num_numbers: int) -> Tensor:
+    """(B, num_numbers) the first numbers that rows of symbols spell, the first symbol being a space."""
+    is_digit_BA = symbol_BA < SPACE
+    column_A = torch.arange(symbol_BA.shape[1], device=symbol_BA.device)
+    end_BA = torch.where(is_digit_BA, len(column_A), column_A).flip(1).cummin(dim=1).values.flip(1)
+    value_BA = torch.where(is_digit_BA, symbol_BA * 10 ** (end_BA - 1 - column_A).clamp(min=0), 0)
+    number_BA = ((~is_digit_BA).cumsum(dim=1) - 1).clamp(max=num_numbers)
+    sums_BN = symbol_BA.new_zeros(len(symbol_BA), num_numbers + 1).scatter_add(1, number_BA, value_BA)
+    return sums_BN[:, :num_numbers]
+
+
+def _padded_left(embeds_BLH: Tensor, mask_BL: Tensor) -> tuple[Tensor, Tensor]:
+    order_BL = mask_BL.to(torch.uint8).argsort(dim=1, stable=True)
+    return (
+        embeds_BLH.gather(1, order_BL[..., None].expand_as(embeds_BLH)),
+        mask_BL.gather(1, order_BL),
     )
-    return num_digits + number_BN.numel() + len(number_BN)
-
-
-def margin_at_difference(work: DecodeRequest, written_N: Tensor, theirs_N: Tensor) -> float:
-    """Difference of the two largest allowed logits at the first symbol that differs."""
-    ours_A, theirs_A = (spell(work.grammar, numbers) for numbers in (written_N, theirs_N))
-    at = int((ours_A[: len(theirs_A)] != theirs_A[: len(ours_A)]).nonzero()[0])
-    model = begin(work)
-    logits = model(ours_A[None, :at], torch.zeros(1, dtype=torch.int64))[0, -1].float()
-    place = work.grammar.start(1)
-    for symbol in ours_A[1:at]:
-        place = work.grammar.advance(place, symbol[None])
-    first, second = (logits + work.grammar.logit_bias(place)[0]).topk(2).values
-    return float(first - second)
-
-
-def spell(grammar: NumberGrammar, number_N: Tensor) -> Tensor:
-    """(A,) symbols of an answer, its end included."""
-    symbols_NC, written_NC = number_symbols(
-        number_N[None], grammar.width, zero_padded=grammar.fixed_width > 0
-    )
-    return torch.cat([symbols_NC[written_NC], torch.tensor([END])])

@@ -9,20 +9,26 @@ layers. The bar is over reading the whole prompt, images included, in every step
 model reads it anew stands beside. On CUDA a query's sampling steps are one CUDA graph; a row is without it.
 """
 
-import argparse
 import logging
 import statistics
-import time
 from collections.abc import Callable
 from functools import partial
 from typing import Any
 from unittest.mock import patch
 
 import torch
-from decode_speed_compare import finish, print_rows
-from lerobot.configs import FeatureType, PolicyFeature
-from lerobot.policies import make_pre_post_processors
-from machine import add_machine_arguments, positive, require_cuda, require_idle_machine
+from machine import (
+    Rows,
+    add_machine_arguments,
+    finish,
+    make_parser,
+    positive,
+    print_rows,
+    require_cuda,
+    require_idle_machine,
+    wait_and_time,
+)
+from random_policies import features, make_batches
 from torch import Tensor
 
 from lerobot_bomb.vlm.presets import nano_qwen_config
@@ -35,9 +41,7 @@ MIN_RATIO = 3.0
 EVERY_STEP, ONCE = "prompt read in every step", "prompt read once"
 TOLERANCES = {"float32": 1e-3, "bfloat16": 0.2}  # of actions of unit spread, after all steps
 BATCH_SIZES = {"nano": (1, 8), "0.5B": (1,)}
-CAMERAS = "observation.images.workspace", "observation.images.wrist"
 IMAGE_SIZE, NUM_DIMS = 224, 7
-INSTRUCTIONS = "put the black stone on the center", "go", "push the white stone to the left edge"
 # the text model of Qwen2.5-0.5B
 TEXT_05B = {
     "hidden_size": 896,
@@ -52,7 +56,7 @@ TEXT_05B = {
 
 def main() -> None:
     """Time both, print the tables; exit code 1 where a bar is missed."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawTextHelpFormatter)
+    parser = make_parser(__doc__)
     parser.add_argument("--device", choices=("cpu", "cuda"), default="cpu")
     parser.add_argument("--repeats", type=positive, default=10, help="queries of each (default: 10)")
     parts = tuple(BATCH_SIZES)
@@ -100,32 +104,12 @@ def make_policy(model: str, device: str, dtype: str) -> FdvlaPolicy:
         prompt_tokens=QwenPrompt.from_tokenizer(tokenizer, NANO).to_dict(),
         device=device,
         dtype=dtype,
-        input_features=dict.fromkeys(CAMERAS, PolicyFeature(FeatureType.VISUAL, (3, IMAGE_SIZE, IMAGE_SIZE)))
-        | {"observation.state": PolicyFeature(FeatureType.STATE, (NUM_DIMS,))},
-        output_features={"action": PolicyFeature(FeatureType.ACTION, (NUM_DIMS,))},
+        **features(NUM_DIMS, IMAGE_SIZE),
     )
     return FdvlaPolicy(config).to(device).eval()
 
 
-def make_batches(policy: FdvlaPolicy, batch_size: int, num_batches: int) -> list[dict[str, Any]]:
-    """Preprocessed, the instructions of different lengths."""
-    units = {"mean": torch.zeros(NUM_DIMS), "std": torch.ones(NUM_DIMS)}
-    preprocessor, _ = make_pre_post_processors(
-        policy.config, dataset_stats={"action": units, "observation.state": units}
-    )
-    generator = torch.Generator().manual_seed(0)
-    shape = batch_size, 3, IMAGE_SIZE, IMAGE_SIZE
-    return [
-        preprocessor(
-            {key: torch.rand(shape, generator=generator) for key in CAMERAS}
-            | {"observation.state": torch.randn(batch_size, NUM_DIMS, generator=generator)}
-            | {"task": [INSTRUCTIONS[(first + row) % len(INSTRUCTIONS)] for row in range(batch_size)]}
-        )
-        for first in range(num_batches)
-    ]
-
-
-def time_queries(policy: FdvlaPolicy, batches: list[dict[str, Any]]) -> dict[str, dict[str, float]]:
+def time_queries(policy: FdvlaPolicy, batches: list[dict[str, Any]]) -> Rows:
     """Time every way on every batch, in turn; the others must give the first one's actions."""
     ways: dict[str, Callable[[dict[str, Any]], Tensor]] = {
         EVERY_STEP: partial(read_in_every_step, policy, sees_once=False),
@@ -140,7 +124,7 @@ def time_queries(policy: FdvlaPolicy, batches: list[dict[str, Any]]) -> dict[str
         for name, query in ways.items():
             policy.reset()
             with torch.inference_mode():
-                actions, elapsed_s = timed(partial(query, batch))
+                actions, elapsed_s = wait_and_time(partial(query, batch))
             answers.append(actions)
             if i:  # the first is to get warm
                 seconds[name].append(elapsed_s)
@@ -157,20 +141,6 @@ def time_queries(policy: FdvlaPolicy, batches: list[dict[str, Any]]) -> dict[str
         }
         for name, latency_s in latencies.items()
     }
-
-
-def timed(query: Callable[[], Tensor]) -> tuple[Tensor, float]:
-    """Return the query's actions, and the seconds until the device has them."""
-    _wait()
-    started = time.perf_counter()
-    actions = query()
-    _wait()
-    return actions, time.perf_counter() - started
-
-
-def _wait() -> None:
-    if torch.cuda.is_available():
-        torch.cuda.synchronize()
 
 
 def read_in_every_step(policy: FdvlaPolicy, batch: dict[str, Any], *, sees_once: bool) -> Tensor:

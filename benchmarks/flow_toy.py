@@ -11,14 +11,13 @@ Shapes: `B` points of a batch, each a chunk of K = 1 action with D = 2 dims, `N`
 `H` width.
 """
 
-import argparse
 import time
 from dataclasses import asdict, dataclass
 from functools import partial
 
 import torch
 from flow_toy_plot import draw_plot, near_modes, plot
-from machine import positive, writable, write_figures
+from machine import make_parser, positive, writable, write_figures
 from torch import Tensor, nn
 from torch.optim.lr_scheduler import CosineAnnealingLR
 
@@ -106,7 +105,7 @@ class Toy(nn.Module):
 
 def main() -> None:
     """Train the variants, print what they make of each word."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawTextHelpFormatter)
+    parser = make_parser(__doc__)
     parser.add_argument("--steps", type=positive, default=1000, help="of training, each variant")
     parser.add_argument("--samples", type=positive, default=1000, help="of each word")
     parser.add_argument("--seed", type=int, default=0)

@@ -1,13 +1,23 @@
-"""Parts of the speed benchmarks: an idle machine, and tables that are also JSON."""
+"""Parts of the benchmarks: an idle machine, time, tables that are also JSON, and bars."""
 
 import argparse
 import json
 import os
 import platform
+import sys
+import time
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
 MAX_LOAD_PER_CORE = 0.5  # one-minute load average
+
+type Rows = dict[str, dict[str, float]]
+
+
+def make_parser(doc: str | None) -> argparse.ArgumentParser:
+    """Return a parser that shows a script's docstring as it is written."""
+    return argparse.ArgumentParser(description=doc, formatter_class=argparse.RawDescriptionHelpFormatter)
 
 
 def add_machine_arguments(parser: argparse.ArgumentParser) -> None:
@@ -50,7 +60,45 @@ def require_cuda(instead: str) -> None:
         raise SystemExit(f"No CUDA device is there; {instead}")
 
 
+def milliseconds(call: Callable[[], object], clock: Callable[[], float] = time.perf_counter) -> float:
+    """Return how long a call takes."""
+    start = clock()
+    call()
+    return 1e3 * (clock() - start)
+
+
+def wait_and_time[T](call: Callable[[], T]) -> tuple[T, float]:
+    """Return the call's result, and the seconds until the device, if there is one, has computed it."""
+    import torch
+
+    wait = torch.cuda.synchronize if torch.cuda.is_available() else lambda: None
+    wait()
+    started = time.perf_counter()
+    result = call()
+    wait()
+    return result, time.perf_counter() - started
+
+
+def print_rows(title: str, figures: Rows) -> None:
+    """Print a table of rows of figures."""
+    from lerobot_bomb.tables import print_table  # a peer's Python, which may run a script, lacks it
+
+    header = next(iter(figures.values()))
+    print()
+    print_table(
+        [title, *(name.replace("_", " ") for name in header)],
+        [[name, *(f"{value:.2f}" for value in row.values())] for name, row in figures.items()],
+    )
+
+
 def write_figures(path: Path | None, figures: dict[str, Any]) -> None:
     """Write the figures of a run, with the load under which it ended, as JSON."""
     if path is not None:
         path.write_text(json.dumps({**figures, "load_average": os.getloadavg()[0]}, indent=1) + "\n")
+
+
+def finish(path: Path | None, figures: dict[str, Any], bars: dict[str, bool]) -> None:
+    """Print which bars hold, write the figures, leave; exit code 1 where a bar is missed."""
+    print("\n".join(f"{'ok' if holds else 'MISSED'}: {bar}" for bar, holds in bars.items()))
+    write_figures(path, {**figures, "bars": bars})
+    sys.exit(0 if all(bars.values()) else 1)

@@ -26,7 +26,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from machine import add_machine_arguments, positive, require_idle_machine, write_figures
+from machine import add_machine_arguments, make_parser, positive, require_idle_machine, write_figures
 from recipes import POLICY_TYPES, last_checkpoint, read_recipe, recipe_path
 
 from lerobot_bomb.bomb.episode import EpisodeSpec, Failure
@@ -64,7 +64,7 @@ BLANK = Control("blank images", "successes", at_least=0, at_most=2)
 
 def main() -> None:
     """Record, train, evaluate three times, print what was counted; exit code 1 where a bar is missed."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawTextHelpFormatter)
+    parser = make_parser(__doc__)
     parser.add_argument("--policy.type", dest="policy_type", required=True, choices=POLICY_TYPES)
     parser.add_argument("--output_dir", type=Path, help="new folder to keep (default: a temporary one)")
     parser.add_argument("--steps", type=positive, help="training steps (default: the recipe's)")

@@ -9,18 +9,25 @@ resets stand beside those of gym-pusht itself, `bomb_libero`'s resets and steps 
 `libero`, in CPU time.
 """
 
-import argparse
 import time
-from collections.abc import Callable, Iterable
+from collections.abc import Callable
 from dataclasses import replace
 from functools import partial
-from pathlib import Path
 from statistics import median
 from typing import Any
 
 import gymnasium
 import numpy as np
-from machine import add_machine_arguments, positive, require_idle_machine, write_figures
+from machine import (
+    Rows,
+    add_machine_arguments,
+    make_parser,
+    milliseconds,
+    positive,
+    print_rows,
+    require_idle_machine,
+    write_figures,
+)
 
 from lerobot_bomb.bomb.episode import EpisodeSpec
 from lerobot_bomb.bomb.observation import RenderOptions
@@ -32,108 +39,95 @@ from lerobot_bomb.libero.episode import LiberoSpec
 from lerobot_bomb.libero.perturbations import LIBERO_AXES
 from lerobot_bomb.pusht.episode import IMAGE_SIZE, PushTSpec
 from lerobot_bomb.pusht.perturbations import PUSHT_AXES
-from lerobot_bomb.tables import print_table
 from lerobot_env_bomb.env import BombEnv
 
 NUM_STEPS = 8  # of each episode
-MAX_RESET_RATIO = 1.5
-MAX_STEP_RATIO = 1.1
-MAX_PUSHT_RESET_RATIO = 1.3  # of `bomb_pusht` to gym-pusht, under any axis
-ENV_TYPES = ("bomb", "bomb_pusht", "bomb_libero")
-MAX_LIBERO_RESET_RATIO = 1.3  # of `bomb_libero` to `libero`, under any axis
+TARGETS = {
+    "bomb": "targets: a reset 1.5, a step 1.1",
+    "bomb_pusht": "target: a reset 1.3",
+    "bomb_libero": "target: a reset 1.3",
+}
+ALL = f"all:{MAX_LEVEL}"
 LIBERO_SUITE, LIBERO_IMAGE_SIZE, STOCK = "libero_spatial", 256, "LeRobot's libero"
-LIBERO_CONDITIONS = (NONE, *(f"{axis}:{MAX_LEVEL}" for axis in LIBERO_AXES), f"all:{MAX_LEVEL}")
-CONDITIONS = (*(f"{axis}:{MAX_LEVEL}" for axis in AXES), f"all:{MAX_LEVEL}")
-PUSHT_CONDITIONS = (NONE, *(f"{axis}:{MAX_LEVEL}" for axis in PUSHT_AXES), f"all:{MAX_LEVEL}")
+
+cpu_milliseconds = partial(milliseconds, clock=time.process_time)
+
+
+def conditions(axes: Any) -> list[str]:
+    """Each axis at its highest level, and all of them."""
+    return [*(f"{axis}:{MAX_LEVEL}" for axis in axes), ALL]
 
 
 def main() -> None:
     """Measure each axis at its highest level, print medians and ratios."""
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
-    parser.add_argument(
-        "--env.type", dest="env_type", choices=("bomb", "bomb_pusht", "bomb_libero"), default="bomb"
-    )
+    measures = {"bomb": measure_bomb, "bomb_pusht": measure_pusht, "bomb_libero": measure_libero}
+    parser = make_parser(__doc__)
+    parser.add_argument("--env.type", dest="env_type", choices=[*measures], default="bomb")
     parser.add_argument("--episodes", type=positive, default=60, help="of each condition (default: 60)")
     add_machine_arguments(parser)
     args = parser.parse_args()
     require_idle_machine(args.force)
-    if args.env_type == "bomb_pusht":
-        measure_resets_of_pusht(args.episodes, args.json)
-        return
-    if args.env_type == "bomb_libero":
-        measure_libero(args.episodes, args.json)
-        return
-    figures = {condition: measure(condition, range(args.episodes)) for condition in CONDITIONS}
-    print_table(
-        [
-            f"condition, {args.episodes} episodes",
-            "reset, ms",
-            f"ratio <= {MAX_RESET_RATIO}",
-            "step, ms",
-            f"ratio <= {MAX_STEP_RATIO}",
-        ],
-        [[name, *(f"{value:.2f}" for value in values.values())] for name, values in figures.items()],
-    )
+    figures = measures[args.env_type](args.episodes)
+    print_rows(f"{args.env_type}, {args.episodes} episodes; {TARGETS[args.env_type]}", figures)
     write_figures(args.json, {"episodes": args.episodes, "conditions": figures})
 
 
-def measure(condition: str, seeds: Iterable[int]) -> dict[str, float]:
-    """Median milliseconds of a reset and of a step, each with its ratio to the unperturbed one."""
-    options = RenderOptions()
-    envs = [BombEnv(EpisodeSpec(0), options), BombEnv(EpisodeSpec(0, perturbations=condition), options)]
-    for env in envs:
-        env.reset(seed=0)  # compiles the model, opens OpenGL
-    resets: list[tuple[float, ...]] = []
-    steps: list[tuple[float, ...]] = []
-    for seed in seeds:
-        actions = np.random.default_rng(seed).uniform(-0.3, 0.3, (NUM_STEPS, 4)).astype(np.float32)
-        resets.append(tuple(milliseconds(partial(env.reset, seed=seed)) for env in envs))
-        steps += [tuple(milliseconds(partial(env.step, action)) for env in envs) for action in actions]
-    for env in envs:
-        env.close()
-    (nominal_reset, reset), (nominal_step, step) = (
-        map(median, zip(*of, strict=True)) for of in (resets, steps)
-    )
+def row(resets: list[float], stock_resets: list[float], steps: list[float], stock_steps: list[float]) -> dict:
+    """Medians of a condition, each with its ratio to those beside it."""
+    times = {"reset": (median(resets), median(stock_resets)), "step": (median(steps), median(stock_steps))}
     return {
-        "reset_ms": reset,
-        "reset_ratio": reset / nominal_reset,
-        "step_ms": step,
-        "step_ratio": step / nominal_step,
+        f"{name}_{figure}": value
+        for name, (ms, stock_ms) in times.items()
+        for figure, value in {"ms": ms, "ratio": ms / stock_ms}.items()
     }
 
 
-def measure_resets_of_pusht(num_episodes: int, json_path: Path | None) -> None:
-    """Print, by condition, the median CPU time of a reset and its ratio to gym-pusht's own."""
+def seeded_actions(seed: int, num_dims: int) -> np.ndarray:
+    """(NUM_STEPS, num_dims) of noise."""
+    return np.random.default_rng(seed).uniform(-0.3, 0.3, (NUM_STEPS, num_dims)).astype(np.float32)
+
+
+def measure_bomb(num_episodes: int) -> Rows:
+    """Each condition beside the unperturbed environment, in turn with it."""
+    figures = {}
+    for condition in conditions(AXES):
+        envs = [BombEnv(EpisodeSpec(0, perturbations=name), RenderOptions()) for name in (condition, NONE)]
+        for env in envs:
+            env.reset(seed=0)  # compiles the model, opens OpenGL
+        resets: list[list[float]] = [[], []]
+        steps: list[list[float]] = [[], []]
+        for seed in range(num_episodes):
+            for env, times in zip(envs, resets, strict=True):
+                times.append(milliseconds(partial(env.reset, seed=seed)))
+            for action in seeded_actions(seed, 4):
+                for env, times in zip(envs, steps, strict=True):
+                    times.append(milliseconds(partial(env.step, action)))
+        for env in envs:
+            env.close()
+        figures[condition] = row(*resets, *steps)
+    return figures
+
+
+def measure_pusht(num_episodes: int) -> Rows:
+    """Resets of each condition beside gym-pusht's own."""
     stock = gymnasium.make("gym_pusht:gym_pusht/PushT-v0", obs_type="pixels_agent_pos").unwrapped
-    specs = [PushTSpec(0, perturbations=condition) for condition in PUSHT_CONDITIONS]
-    envs = [make_pusht_env(spec, IMAGE_SIZE).unwrapped for spec in specs]
+    names = [NONE, *conditions(PUSHT_AXES)]
+    envs = [make_pusht_env(PushTSpec(0, perturbations=name), IMAGE_SIZE).unwrapped for name in names]
     for env in (stock, *envs):
         env.reset(seed=0)
-    resets = np.array(
-        [
-            [milliseconds(partial(env.reset, seed=seed), time.process_time) for env in (stock, *envs)]
-            for seed in range(num_episodes)
-        ]
-    )
-    stock_ms, *ours_ms = np.median(resets, axis=0).tolist()
-    figures = {
-        condition: {"reset_ms": ms, "reset_ratio": ms / stock_ms}
-        for condition, ms in zip(PUSHT_CONDITIONS, ours_ms, strict=True)
-    }
-    print_table(
-        [f"condition, {num_episodes} episodes", "reset, CPU ms", f"ratio <= {MAX_PUSHT_RESET_RATIO}"],
-        [
-            ["gym-pusht", f"{stock_ms:.2f}", "1"],
-            *([name, *(f"{value:.2f}" for value in values.values())] for name, values in figures.items()),
-        ],
-    )
-    write_figures(json_path, {"episodes": num_episodes, "stock_ms": stock_ms, "conditions": figures})
+    resets = [
+        [cpu_milliseconds(partial(env.reset, seed=seed)) for env in (stock, *envs)]
+        for seed in range(num_episodes)
+    ]
+    stock_ms, *ours_ms = map(median, zip(*resets, strict=True))
+    figures = {"gym-pusht": {"reset_ms": stock_ms, "reset_ratio": 1.0}}
+    for name, ms in zip(names, ours_ms, strict=True):
+        figures[name] = {"reset_ms": ms, "reset_ratio": ms / stock_ms}
+    return figures
 
 
-def measure_libero(num_episodes: int, json_path: Path | None) -> None:
-    """Print, by condition, the median CPU time of a reset and of a step, and ratios to LeRobot's `libero`."""
+def measure_libero(num_episodes: int) -> Rows:
+    """Each condition beside LeRobot's `libero`."""
     prepare_libero([LIBERO_SUITE])
     from lerobot.envs.factory import make_env as make_stock
     from lerobot.envs.factory import make_env_config
@@ -144,58 +138,33 @@ def measure_libero(num_episodes: int, json_path: Path | None) -> None:
     config = make_env_config("libero", task=LIBERO_SUITE, task_ids=[0], **size)
     vector: Any = make_stock(config, n_envs=1)[LIBERO_SUITE][0]
     stock = vector.envs[0].unwrapped
+    # robosuite draws and frees in whichever OpenGL context is current
+    use_stock: Callable[[], None] = stock._env.sim._render_context_offscreen.gl_ctx.make_current
     scene = size | {"obs_type": "pixels_agent_pos"}
     ours = {
         condition: BombLiberoEnv(LiberoSpec(0, LIBERO_SUITE, perturbations=condition), scene)
-        for condition in (NONE, f"all:{MAX_LEVEL}")
+        for condition in (NONE, ALL)
     }
     for env in (stock, *ours.values()):
         env.reset(seed=0)
-    resets: dict[str, list[float]] = {}
-    steps: dict[str, list[float]] = {}
+    names = [STOCK, NONE, *conditions(LIBERO_AXES)]
+    resets: Any = {name: [] for name in names}
+    steps: Any = {name: [] for name in names}
     for seed in range(num_episodes):
-        for condition in (STOCK, *LIBERO_CONDITIONS):
+        for name in names:
             env: Any = stock
-            if condition != STOCK:
-                env = ours[NONE if condition == NONE else f"all:{MAX_LEVEL}"]
-                env._spec = replace(env._spec, perturbations=condition)
-            else:  # robosuite draws and frees in whichever OpenGL context is current
-                stock._env.sim._render_context_offscreen.gl_ctx.make_current()
-            actions = np.random.default_rng(seed).uniform(-0.3, 0.3, (NUM_STEPS, 7)).astype(np.float32)
-            reset = partial(env.reset, seed=seed)
-            resets.setdefault(condition, []).append(milliseconds(reset, time.process_time))
-            steps.setdefault(condition, []).extend(
-                milliseconds(partial(env.step, action), time.process_time) for action in actions
-            )
-    for env in (*ours.values(), stock):
-        if env is stock:
-            env._env.sim._render_context_offscreen.gl_ctx.make_current()
+            if name == STOCK:
+                use_stock()
+            else:
+                env = ours[NONE if name == NONE else ALL]
+                env._spec = replace(env._spec, perturbations=name)
+            resets[name].append(cpu_milliseconds(partial(env.reset, seed=seed)))
+            steps[name] += [cpu_milliseconds(partial(env.step, action)) for action in seeded_actions(seed, 7)]
+    for env in ours.values():
         env.close()
-    stock_reset, stock_step = median(resets[STOCK]), median(steps[STOCK])
-    figures = {
-        condition: {
-            "reset_ms": median(resets[condition]),
-            "reset_ratio": median(resets[condition]) / stock_reset,
-            "step_ms": median(steps[condition]),
-            "step_ratio": median(steps[condition]) / stock_step,
-        }
-        for condition in resets
-    }
-    print_table(
-        [
-            f"condition, {num_episodes} episodes", "reset, CPU ms", f"ratio <= {MAX_LIBERO_RESET_RATIO}",
-            "step, CPU ms", "ratio",
-        ],
-        [[name, *(f"{value:.2f}" for value in values.values())] for name, values in figures.items()],
-    )  # fmt: skip
-    write_figures(json_path, {"episodes": num_episodes, "conditions": figures})
-
-
-def milliseconds(call: Callable[[], object], clock: Callable[[], float] = time.perf_counter) -> float:
-    """Return how long a call takes."""
-    start = clock()
-    call()
-    return 1e3 * (clock() - start)
+    use_stock()
+    stock.close()
+    return {name: row(resets[name], resets[STOCK], steps[name], steps[STOCK]) for name in names}
 
 
 if __name__ == "__main__":

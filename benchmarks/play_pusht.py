@@ -23,7 +23,7 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from statistics import fmean
 
-from machine import add_machine_arguments, positive, require_idle_machine, write_figures
+from machine import add_machine_arguments, make_parser, positive, require_idle_machine, write_figures
 from pusht_offline import convert, evaluate, max_coverages, run_logged
 from pusht_report import over_episodes
 from recipes import FOLDER, last_checkpoint, read_recipe, recipe_path
@@ -64,7 +64,7 @@ class Contender:
 
 def main() -> None:
     """Convert, train all, evaluate all, print the table."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawTextHelpFormatter)
+    parser = make_parser(__doc__)
     parser.add_argument("--source", type=Path, help="the zarr; not needed once it is converted")
     parser.add_argument("--output_dir", type=Path, required=True, help="folder to keep, or to go on with")
     parser.add_argument("--minutes", type=float, required=True, help="of each training")

@@ -27,7 +27,7 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
-from machine import positive, write_figures
+from machine import make_parser, positive, write_figures
 from pusht_report import Seed, print_report
 from recipes import PUSHT_TYPES, last_checkpoint, recipe_path
 
@@ -99,7 +99,7 @@ class Run:
 
 def main() -> None:
     """Convert, train, measure, print the tables; exit code 1 where the recipe does not beat a predictor."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawTextHelpFormatter)
+    parser = make_parser(__doc__)
     parser.add_argument("--policy.type", dest="policy_type", required=True, choices=PUSHT_TYPES)
     parser.add_argument("--source", type=Path, help="the zarr; not needed once it is converted")
     parser.add_argument("--output_dir", type=Path, required=True, help="folder to keep, or to go on with")

@@ -7,14 +7,13 @@ ready in memory. Two more rows show what one encoder thread per camera and H.264
     OMP_NUM_THREADS=1 python benchmarks/record_speed.py --json record_speed.json
 """
 
-import argparse
 import importlib
 import statistics
 import tempfile
 import time
 from pathlib import Path
 
-from machine import add_machine_arguments, require_idle_machine, write_figures
+from machine import add_machine_arguments, make_parser, require_idle_machine, write_figures
 
 from lerobot_bomb.data.record import record
 from lerobot_bomb.data.recording import Recording
@@ -29,7 +28,7 @@ ONE_THREAD, H264 = f"{PEER}, 1 encoder thread", f"{PEER}, h264"
 
 def main() -> None:
     """Measure in turn, print medians and ratios."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawTextHelpFormatter)
+    parser = make_parser(__doc__)
     parser.add_argument("--episodes", type=int, default=60, help="episodes in each run (default: 60)")
     parser.add_argument("--repeats", type=int, default=3, help="runs of each writer (default: 3)")
     parser.add_argument(

@@ -1,33 +1,30 @@
 """Check of MuJoCo versions: under which are episodes the same, bit for bit?
 
-    python benchmarks/simulator_versions.py --work_dir simulators --json simulator_versions.json
+    python benchmarks/simulator_versions.py 3.8.1 3.9.0 4.0.0 --work_dir simulators
 
-makes a virtual environment per published version from 3.8.0 on, without torch and LeRobot, lets the
-scripted expert play the same seeds in each, and compares with the reference. `--here` measures the Python
-that runs it, and prints JSON.
+makes a virtual environment per version, without torch and LeRobot, lets the scripted expert play the same
+seeds in each, and compares with the first. `--here` measures the Python that runs it, and prints JSON.
 
 States: joint positions and velocities after every control step, float64. Images: both cameras in every
 observation. They depend on the OpenGL library too, which the table names. The processor may matter as well:
 MuJoCo and NumPy choose their instructions by it.
 """
 
-import argparse
 import hashlib
 import importlib.metadata
 import json
 import os
-import re
 import subprocess
 import sys
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from dataclasses import asdict, dataclass, replace
 from itertools import product
 from pathlib import Path
 
+from machine import make_parser, writable, write_figures
+
 ROOT = Path(__file__).resolve().parents[1]
 SOURCE_ROOTS = (ROOT, ROOT / "envs")
-OLDEST = (3, 8, 0)
-REFERENCE = "3.8.1"
 # what the simulator imports, in the versions that the tests run with
 PACKAGES = ("numpy", "gymnasium", "gymnasium-robotics", "opencv-python-headless")
 ROBOTS = ("scara", "fetch")
@@ -107,14 +104,6 @@ def renderer_name() -> str:
     return str(name)
 
 
-def published_versions() -> list[str]:
-    """Versions of MuJoCo from OLDEST on that pip finds, oldest first."""
-    command = [sys.executable, "-m", "pip", "index", "versions", "mujoco"]
-    listed = subprocess.run(command, check=True, capture_output=True, text=True).stdout
-    versions = re.findall(r"\d+\.\d+\.\d+", listed.split("Available versions:")[1])
-    return [name for name in reversed(versions) if tuple(map(int, name.split("."))) >= OLDEST]
-
-
 def measure(version: str, work_dir: Path, conditions: list[str], num_seeds: int) -> Measured:
     """Run everything under one MuJoCo version, in a virtual environment of its own."""
     folder = (work_dir / version).resolve()
@@ -139,8 +128,9 @@ def from_dict(figures: dict) -> Measured:
     return Measured(figures["mujoco"], figures["renderer"], outcomes)
 
 
-def table(measured: Iterable[Measured], reference: Measured) -> list[str]:
-    """Markdown: a row per version and robot; hashes over all conditions, `=` where the reference's."""
+def table(measured: Sequence[Measured]) -> list[str]:
+    """Markdown: a row per version and robot; hashes over all conditions, `=` where the first version's."""
+    reference = measured[0]
     conditions = list(dict.fromkeys(case.split()[1] for case in reference.outcomes))
     lines = [
         f"| MuJoCo | robot | states | images | {' | '.join(conditions)} |",
@@ -171,32 +161,21 @@ def _played(outcome: Outcome | str) -> str:
 
 def main() -> None:
     """Run the benchmark from the command line."""
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
-    parser.add_argument("--versions", nargs="+", help="of MuJoCo; default: all that are published")
-    parser.add_argument("--reference", default=REFERENCE, help="the version to compare with")
+    parser = make_parser(__doc__)
+    parser.add_argument("versions", nargs="*", help="of MuJoCo; the others are compared with the first")
     parser.add_argument("--seeds", type=int, default=NUM_SEEDS, help=f"episodes a case, from {FIRST_SEED} on")
     parser.add_argument("--conditions", nargs="+", default=CONDITIONS, help="as none dynamics:5")
     parser.add_argument("--work_dir", type=Path, default=Path("simulators"), help="for the environments")
     parser.add_argument("--here", action="store_true", help="measure this Python alone and print JSON")
-    parser.add_argument("--json", type=Path, help="write everything here")
+    parser.add_argument("--json", type=writable, help="also write the figures to this file")
     args = parser.parse_args()
     if args.here:
         figures = measure_here(args.conditions, range(FIRST_SEED, FIRST_SEED + args.seeds))
         print(json.dumps(asdict(figures)))
         return
-    versions = args.versions or published_versions()
-    measured = {}
-    for version in dict.fromkeys([args.reference, *versions]):
-        print(f"playing under MuJoCo {version}", file=sys.stderr)
-        measured[version] = measure(version, args.work_dir, args.conditions, args.seeds)
-        if args.json:
-            figures = [asdict(one) for one in measured.values()]
-            args.json.write_text(json.dumps(figures, indent=1) + "\n")
-    reference = measured[args.reference]
-    print("\n".join(table([measured[version] for version in versions], reference)))
-    print(f"drawn by {reference.renderer}")
+    measured = [measure(version, args.work_dir, args.conditions, args.seeds) for version in args.versions]
+    print("\n".join(table(measured)), f"drawn by {measured[0].renderer}", sep="\n")
+    write_figures(args.json, {one.mujoco: asdict(one) for one in measured})
 
 
 if __name__ == "__main__":

@@ -3,12 +3,9 @@
     OMP_NUM_THREADS=1 python benchmarks/step_profile.py --policy.type=vla0_smol --json step_profile.json
 
 The policy is the recipe of configs/overfit_TYPE.yaml with fresh weights, on demonstrations recorded for
-the purpose. Stages are medians over --repeats steps; the operators are torch's own profile of the
-model's share.
+the purpose. Stages are medians over --repeats steps.
 """
 
-import argparse
-import os
 import statistics
 import tempfile
 import time
@@ -17,8 +14,6 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
-os.environ.setdefault("KINETO_LOG_LEVEL", "5")  # torch's profiler reports a missing GPU as an error
-
 import draccus
 import torch
 from lerobot.configs.train import TrainPipelineConfig
@@ -26,16 +21,13 @@ from lerobot.datasets.factory import make_dataset
 from lerobot.envs import make_env, make_env_config, make_env_pre_post_processors, preprocess_observation
 from lerobot.policies import make_policy, make_pre_post_processors
 from lerobot.utils.import_utils import register_third_party_plugins
-from machine import add_machine_arguments, positive, require_idle_machine, write_figures
+from machine import add_machine_arguments, make_parser, positive, require_idle_machine, write_figures
 from overfit import IMAGE_SIZE, record
 from recipes import POLICY_TYPES, read_recipe
-from torch.profiler import ProfilerActivity, profile
 from torch.utils.data import default_collate
 
 from lerobot_bomb.policies.config import DTYPES
 from lerobot_bomb.tables import print_table
-
-NUM_OPERATORS = 8
 
 
 class Stages:
@@ -56,7 +48,7 @@ class Stages:
 
 def main() -> None:
     """Profile both steps and print where their time goes."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawTextHelpFormatter)
+    parser = make_parser(__doc__)
     parser.add_argument("--policy.type", dest="policy_type", required=True, choices=POLICY_TYPES)
     parser.add_argument(
         "--policy.dtype", dest="dtype", choices=DTYPES, default="float32", help="default: float32"
@@ -125,8 +117,6 @@ def profile_training(
         step(indices, stages)
     medians = stages.medians_ms()
     print_stages(medians, len(batches))
-    batch = preprocessor(default_collate([dataset[index] for index in batches[0]]))
-    print_operators("forward and backward", lambda: policy.forward(batch)[0].backward())
     return medians
 
 
@@ -165,13 +155,6 @@ def profile_evaluation(
     per_step_ms = 1e3 * sum(map(sum, stages.runs.values())) / num_steps
     print(f"a step on average, as one in {num_action_steps} predicts: {per_step_ms:.1f} ms")
     medians["a step on average"] = per_step_ms
-
-    def predict() -> None:
-        policy.reset()
-        with torch.inference_mode():
-            policy.select_action(batch)
-
-    print_operators("a prediction", predict)
     env.close()
     return medians
 
@@ -181,26 +164,6 @@ def print_stages(medians_ms: dict[str, float], repeats: int) -> None:
     total = sum(medians_ms.values())
     rows = [[name, f"{ms:.1f}", f"{ms / total:.0%}"] for name, ms in medians_ms.items()]
     print_table(["stage", f"ms (median, {repeats} steps)", "share"], [*rows, ["sum", f"{total:.1f}", ""]])
-
-
-def print_operators(what: str, run: Callable[[], None]) -> None:
-    """Print the operators that take the most time of their own."""
-    run()
-    with profile(activities=[ProfilerActivity.CPU], acc_events=True) as profiler:
-        run()
-    events: list[Any] = sorted(profiler.key_averages(), key=lambda event: -event.self_cpu_time_total)
-    total = sum(event.self_cpu_time_total for event in events)
-    rows = [
-        [
-            event.key,
-            str(event.count),
-            f"{event.self_cpu_time_total / 1e3:.1f}",
-            f"{event.self_cpu_time_total / total:.0%}",
-        ]
-        for event in events[:NUM_OPERATORS]
-    ]
-    print(f"\nof the model's share ({what}), the time of each operator itself")
-    print_table(["operator", "calls", "ms", "share"], rows)
 
 
 if __name__ == "__main__":

@@ -8,7 +8,6 @@ could be asked for there. `no colours` reads and sees everything but the stones'
 instruction means under colours drawn at random, such that it means something.
 """
 
-import argparse
 from collections import Counter
 from collections.abc import Callable, Sequence
 from dataclasses import replace
@@ -16,7 +15,7 @@ from functools import partial
 from pathlib import Path
 
 import numpy as np
-from machine import positive, write_figures
+from machine import make_parser, positive, write_figures
 
 from lerobot_bomb.bomb.board import COLORS, Cell
 from lerobot_bomb.bomb.commands import Case, Drawn, Stones, Task, draw_command
@@ -42,7 +41,7 @@ type Floors = dict[str, float]
 
 def main() -> None:
     """Print a row for each suite; chances in per cent."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawTextHelpFormatter)
+    parser = make_parser(__doc__)
     parser.add_argument("--episodes", type=positive, default=2000, help="of each suite (default: 2000)")
     parser.add_argument("--json", type=Path, help="also write the figures to this file")
     args = parser.parse_args()

@@ -7,7 +7,6 @@ stops. Times hold everything, the start of Python and the loading of the policy 
     python benchmarks/sweep_speed.py --json sweep_speed.json
 """
 
-import argparse
 import json
 import subprocess
 import sys
@@ -16,7 +15,7 @@ import time
 from collections.abc import Callable, Sequence
 from pathlib import Path
 
-from machine import add_machine_arguments, positive, require_idle_machine, write_figures
+from machine import add_machine_arguments, make_parser, positive, require_idle_machine, write_figures
 
 from lerobot_bomb.envs.results import Row, without_measured
 from lerobot_bomb.evaluation.results import read_results
@@ -32,7 +31,7 @@ TARGETS = {ONE: (EACH, 1.5), TWO: (ONE, 1.7)}
 
 def main() -> None:
     """Run the same cells in four ways, print episodes an hour and ratios."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawTextHelpFormatter)
+    parser = make_parser(__doc__)
     add = parser.add_argument
     add("--policy", default="bomb:vla0_smol", help="checkpoint or type (default: bomb:vla0_smol)")
     add("--conditions", default="none,camera:3,light:3,table:3,start:3,language:3", help="joined by commas")

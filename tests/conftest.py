@@ -23,20 +23,22 @@ if TYPE_CHECKING:
 SLOWEST_FILES = (
     "test_long",
     "test_parity",
+    "test_replay",
+    "test_record",
     "test_record_kill",
-    "test_independence",
+    "test_explain_command",
+    "test_bomb_libero_env",
     "test_shipped",
+    "test_sweep",
+    "test_serve",
     "test_axes_env",
     "test_processes",
-    "test_record",
     "test_fdvla",
     "test_lora",
     "test_spatialvla_grid",
-    "test_depth_lerobot",
-    "test_offline_metrics",
 )
 
-# runs the tests that are marked one_type in `make test`, too
+# runs the tests that are marked one_type in `make test`, too, unless the mark names another
 FAST_TYPE = "vla0_smol"
 
 os.environ.setdefault("OMP_NUM_THREADS", "1")
@@ -188,7 +190,7 @@ def pytest_generate_tests(metafunc: pytest.Metafunc) -> None:
     """Run every test that takes a `policy_type` on each policy that learns, or on --policy.type.
 
     A test that takes `options` too runs on the variants of each. One marked `one_type` is about what the
-    types share, and is long on all but one of them.
+    types share, and is long on all but FAST_TYPE, or the one that the mark names.
     """
     if "policy_type" not in metafunc.fixturenames:
         return
@@ -199,7 +201,7 @@ def pytest_generate_tests(metafunc: pytest.Metafunc) -> None:
         variants = [variant for each in types for variant in variants_of(each, is_long=is_long)]
         metafunc.parametrize(("policy_type", "options"), variants)
     else:
-        is_one = not chosen and metafunc.definition.get_closest_marker("one_type") is not None
-        slow = [each for each in types if is_one and each != FAST_TYPE]
+        mark = None if chosen else metafunc.definition.get_closest_marker("one_type")
+        slow = [each for each in types if mark and each not in (mark.args or (FAST_TYPE,))]
         marks = dict.fromkeys(slow, pytest.mark.long)
         metafunc.parametrize("policy_type", [pytest.param(each, marks=marks.get(each, ())) for each in types])

@@ -1,4 +1,4 @@
-"""Scores of a policy with each attention head put back, by nnsight: (layers, heads) as JSON.
+"""Scores of policies with each attention head put back, by nnsight: {name: (layers, heads)} as JSON.
 
 A script, because nnsight adds an attribute to every Python object.
 """
@@ -26,7 +26,8 @@ class Scored(nn.Module):
         return self._question.explained.score(rows, self._question.answer)
 
 
-def main(name: str) -> None:
+def scores_of(name: str) -> list[list[float]]:
+    """(layers, heads)."""
     policy: Any = loaded(name).policy
     question = ask(loaded(name))
     corrupt = without_image(question)
@@ -48,8 +49,8 @@ def main(name: str) -> None:
                     score = model.output.save()
                 of_layer.append(float(score))
             scores.append(of_layer)
-    print(json.dumps(scores))
+    return scores
 
 
 if __name__ == "__main__":
-    main(sys.argv[1])
+    print(json.dumps({name: scores_of(name) for name in sys.argv[1:]}))

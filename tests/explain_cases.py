@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import pytest
 
 from lerobot_bomb.bomb.episode import EpisodeSpec
 from lerobot_bomb.bomb.observation import RenderOptions
@@ -21,6 +22,8 @@ from lerobot_bomb.explain.spans import difference, token_offsets
 from lerobot_bomb.viewing.checkpoint import LoadedPolicy, load_policy
 
 NAMES = shipped_names()
+# for tests that explain a whole moment: fdvla's sampling steps take longest
+FAST_NAMES = [pytest.param(name, marks=pytest.mark.long if name == "fdvla" else ()) for name in NAMES]
 SPEC = EpisodeSpec(seed=100_003, target=(1, 3), color="black")
 OPTIONS = RenderOptions(image_size=64)
 FAR_M = 0.05  # the stone is carried, and where it is to go decides what comes next

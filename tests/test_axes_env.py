@@ -1,6 +1,7 @@
 """Perturbed episodes as a policy meets them: images, motion, and what must not show."""
 
 from collections.abc import Callable, Iterator
+from typing import Any
 
 import numpy as np
 import pytest
@@ -19,21 +20,26 @@ SIZE = 64
 VISUAL = [axis for axis in AXES if "images" in AXES[axis].changes]
 MOTIONS = np.random.default_rng(0).uniform(-0.4, 0.4, (4, 4)).astype(np.float32)  # of the gripper, aimless
 
-type MakeEnv = Callable[..., BombEnv]
+type Under = Callable[..., BombEnv]
 
 
-@pytest.fixture
-def make_env() -> Iterator[MakeEnv]:
-    envs = []
+@pytest.fixture(scope="module")
+def under() -> Iterator[Under]:
+    """Yield under(condition, **spec): an environment whose next reset is under it.
 
-    def make(condition: str = "none", **spec) -> BombEnv:
-        seed = spec.pop("seed", 0)
-        env = BombEnv(EpisodeSpec(seed=seed, perturbations=condition, **spec), RenderOptions(SIZE))
-        envs.append(env)
-        return env
+    There is one for each control mode, as compiling a model and opening OpenGL take longer than a test.
+    """
+    envs: dict[str, BombEnv] = {}
 
-    yield make
-    for env in envs:
+    def use(condition: str = "none", **spec: Any) -> BombEnv:
+        wanted = EpisodeSpec(seed=0, perturbations=condition, **spec)
+        if wanted.control_mode not in envs:
+            envs[wanted.control_mode] = BombEnv(wanted, RenderOptions(SIZE))
+        envs[wanted.control_mode]._spec = wanted
+        return envs[wanted.control_mode]
+
+    yield use
+    for env in envs.values():
         env.close()
 
 
@@ -52,31 +58,30 @@ def episode_of(env: BombEnv, seed: int) -> tuple[np.ndarray, np.ndarray]:
 
 
 @pytest.mark.parametrize("axis", [*VISUAL, "all"])
-def test_each_level_changes_the_images_more_than_the_one_below(make_env: MakeEnv, axis: str) -> None:
-    envs = [make_env(f"{axis}:{level}") for level in range(6)]
+def test_each_level_changes_the_images_more_than_the_one_below(under: Under, axis: str) -> None:
     changes = []
     for seed in range(8):
-        nominal, *perturbed = (images(env, seed) for env in envs)
+        nominal, *perturbed = (images(under(f"{axis}:{level}"), seed) for level in range(6))
         changes.append([abs(image - nominal).mean() for image in perturbed])
     mean = np.mean(changes, axis=0)
     assert mean[0] > 0 and (np.diff(mean) > 0).all(), mean
 
 
 @pytest.mark.parametrize("axis", list(AXES))
-def test_an_axis_changes_images_motion_and_instruction_only_as_it_says(make_env: MakeEnv, axis: str) -> None:
-    nominal, perturbed = make_env(), make_env(f"{axis}:5")
-    states, images = episode_of(nominal, 3)
-    perturbed_states, perturbed_images = episode_of(perturbed, 3)
+def test_an_axis_changes_images_motion_and_instruction_only_as_it_says(under: Under, axis: str) -> None:
+    env = under()
+    (states, images), instruction = episode_of(env, 3), env.task_description
+    perturbed_states, perturbed_images = episode_of(under(f"{axis}:5"), 3)
     changes = AXES[axis].changes
     assert np.array_equal(states, perturbed_states) == (not {"state", "dynamics"} & set(changes))
     assert np.array_equal(images[0], perturbed_images[0]) == ("images" not in changes)
-    assert (nominal.task_description == perturbed.task_description) == ("instruction" not in changes)
+    assert (instruction == env.task_description) == ("instruction" not in changes)
     if changes == ("instruction",):
         np.testing.assert_array_equal(images, perturbed_images)
 
 
 @pytest.mark.parametrize("condition", ["none", *(f"{axis}:5" for axis in AXES), "all:3", "all:5"])
-def test_no_image_tells_the_target_before_a_stone_is_moved(make_env: MakeEnv, condition: str) -> None:
+def test_no_image_tells_the_target_before_a_stone_is_moved(under: Under, condition: str) -> None:
     """Targets that are free and legal on the same board look the same, but where a marker shows them."""
     seed = 3
     boards: dict[bytes, list[tuple[int, int]]] = {}
@@ -86,19 +91,18 @@ def test_no_image_tells_the_target_before_a_stone_is_moved(make_env: MakeEnv, co
         boards.setdefault(layout.stone_xy.tobytes() + layout.stone_is_white.tobytes(), []).append(target)
     targets = max(boards.values(), key=len)
     assert len(targets) >= 5
-    envs = [
-        make_env(condition, seed=seed, target=target, color="white")
+    views = [
+        episode_of(under(condition, target=target, color="white"), seed)[1]
         for target in targets[:: len(targets) // 3]
     ]
-    views = [episode_of(env, seed)[1] for env in envs]
     differ = any(not np.array_equal(views[0], view) for view in views[1:])
     assert differ == (condition == "goal_marker:5")
 
 
 @pytest.mark.parametrize("condition", ["none", *(f"{axis}:5" for axis in NUISANCES), "all:5"])
-def test_the_stone_to_be_moved_can_be_seen(make_env: MakeEnv, condition: str) -> None:
+def test_the_stone_to_be_moved_can_be_seen(under: Under, condition: str) -> None:
     """Images with and without it differ in grey levels, by the clearest dozen pixels."""
-    env = make_env(condition)
+    env = under(condition)
     for seed in range(6):
         shown = images(env, seed)
         scene = env._run.scene
@@ -109,8 +113,8 @@ def test_the_stone_to_be_moved_can_be_seen(make_env: MakeEnv, condition: str) ->
 
 
 @pytest.mark.parametrize("control_mode", ["relative", "absolute"])
-def test_latency_executes_an_action_one_step_late(make_env: MakeEnv, control_mode: str) -> None:
-    env = make_env("dynamics:5", control_mode=control_mode)
+def test_latency_executes_an_action_one_step_late(under: Under, control_mode: str) -> None:
+    env = under("dynamics:5", control_mode=control_mode)
     observation, _ = env.reset(seed=2)
     start = PrivilegedState.from_vector(observation["environment_state"])
     assert start.pending_gripper == 1.0 and not start.pending_motion_m.any()
@@ -129,8 +133,8 @@ def test_latency_executes_an_action_one_step_late(make_env: MakeEnv, control_mod
     np.testing.assert_allclose(after_two.gripper_xyz, above_xyz, atol=2 * noise_m)
 
 
-def test_action_noise_is_the_seed_s_and_as_large_as_stated(make_env: MakeEnv) -> None:
-    env = make_env("dynamics:3", control_mode="absolute")  # no latency yet
+def test_action_noise_is_the_seed_s_and_as_large_as_stated(under: Under) -> None:
+    env = under("dynamics:3", control_mode="absolute")  # no latency yet
     observation, _ = env.reset(seed=0)
     here = np.array([*observation["agent_pos"][:3], 1.0])
     offsets = np.array([env.step(here)[0]["agent_pos"][:3] - here[:3] for _ in range(60)])
@@ -142,10 +146,8 @@ def test_action_noise_is_the_seed_s_and_as_large_as_stated(make_env: MakeEnv) ->
 
 @pytest.mark.parametrize("condition", ["all:5", "dynamics:5", "object:5", "start:5"])
 @pytest.mark.parametrize("control_mode", ["relative", "absolute"])
-def test_the_expert_places_stones_under_perturbation(
-    make_env: MakeEnv, condition: str, control_mode: str
-) -> None:
-    env = make_env(condition, control_mode=control_mode)
+def test_the_expert_places_stones_under_perturbation(under: Under, condition: str, control_mode: str) -> None:
+    env = under(condition, control_mode=control_mode)
     for seed in (1, 29):
         observation, info = env.reset(seed=seed)
         ended = False

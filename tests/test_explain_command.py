@@ -5,12 +5,12 @@ from collections.abc import Callable
 from pathlib import Path
 
 import pytest
-from explain_cases import NAMES
+from explain_cases import FAST_NAMES
 
 from lerobot_bomb.commands.main import main
 
 
-@pytest.mark.parametrize("name", NAMES)
+@pytest.mark.parametrize("name", FAST_NAMES)
 def test_one_episode(name: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     output = tmp_path / "why"
     flags = [f"--policy.path=bomb:{name}", "--seed=100000", "--grid=4", f"--output={output}"]

@@ -19,6 +19,7 @@ from lerobot_bomb.explain.restoration import Corruption
 pytestmark = pytest.mark.usefixtures("loaded_policies")
 
 GRID = 4
+CALLED_ONCE = ("spatialvla_grid", "vla0_smol")  # each layer, in a score
 SCRIPT = Path(__file__).with_name("explain_by_nnsight.py")
 
 
@@ -46,17 +47,23 @@ def test_patches_are_captums_occlusion(name: str) -> None:
     )
 
 
-@pytest.mark.parametrize("name", ["spatialvla_grid", "vla0_smol"])  # each layer is called once in a score
-def test_heads_are_what_nnsight_puts_back(name: str) -> None:
-    question = ask(loaded(name))
-    corruption = Corruption(question, without_image(question))
-    scores = corruption.restore([[unit] for unit in all_heads(question.explained.layers)]).scores
+@pytest.fixture(scope="module")
+def by_nnsight() -> dict[str, list[list[float]]]:
+    """Scores of policies with each head put back: {name: (layers, heads)}."""
     printed = subprocess.run(
-        [sys.executable, SCRIPT, name],
+        [sys.executable, SCRIPT, *CALLED_ONCE],
         check=True,
         capture_output=True,
         text=True,
         env={**os.environ, "PYTHONPATH": str(SCRIPT.parent)},
     ).stdout
-    expected = torch.tensor(json.loads(printed.splitlines()[-1])).flatten()
+    return json.loads(printed.splitlines()[-1])
+
+
+@pytest.mark.parametrize("name", CALLED_ONCE)
+def test_heads_are_what_nnsight_puts_back(name: str, by_nnsight: dict[str, list[list[float]]]) -> None:
+    question = ask(loaded(name))
+    corruption = Corruption(question, without_image(question))
+    scores = corruption.restore([[unit] for unit in all_heads(question.explained.layers)]).scores
+    expected = torch.tensor(by_nnsight[name]).flatten()
     torch.testing.assert_close(scores, expected, rtol=1e-5, atol=1e-5)

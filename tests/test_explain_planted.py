@@ -5,7 +5,7 @@ from typing import Any
 
 import pytest
 import torch
-from explain_cases import GRID, NAMES, WORKSPACE, WRIST, ask, asked, explained_by, fresh, moment
+from explain_cases import FAST_NAMES, GRID, WORKSPACE, WRIST, ask, asked, explained_by, fresh, moment
 
 from lerobot_bomb.actions.text import TokenRows
 from lerobot_bomb.explain.diagnosis import diagnose
@@ -37,7 +37,7 @@ def hide_words(policy: LoadedPolicy, shown: torch.Tensor | None) -> None:
     changed._prompt_parts = parts
 
 
-@pytest.mark.parametrize("name", NAMES)
+@pytest.mark.parametrize("name", FAST_NAMES)
 def test_one_that_ignores_the_text(name: str) -> None:
     policy = fresh(name)
     hide_words(policy, None)
@@ -47,7 +47,7 @@ def test_one_that_ignores_the_text(name: str) -> None:
     assert found["Patches that the answer depends on:"]
 
 
-@pytest.mark.parametrize("name", NAMES)
+@pytest.mark.parametrize("name", FAST_NAMES)
 def test_a_word_that_is_never_read_has_no_effect_at_all(name: str) -> None:
     """It counts where the others stand, all the same: without its token they would be elsewhere."""
     policy = fresh(name)
@@ -61,7 +61,7 @@ def test_a_word_that_is_never_read_has_no_effect_at_all(name: str) -> None:
     assert abs(float(question.effects(removed))) > 1e-4
 
 
-@pytest.mark.parametrize("name", NAMES)
+@pytest.mark.parametrize("name", FAST_NAMES)
 def test_one_that_reads_only_the_column(name: str) -> None:
     policy = fresh(name)
     _, instruction, _, others = moment()
@@ -73,7 +73,7 @@ def test_one_that_reads_only_the_column(name: str) -> None:
     assert found["Changed words that the answer depends on:"] == ("column",)
 
 
-@pytest.mark.parametrize("name", NAMES)
+@pytest.mark.parametrize("name", FAST_NAMES)
 @pytest.mark.parametrize("camera", [WORKSPACE, WRIST])
 def test_one_that_looks_at_one_patch_only(name: str, camera: str) -> None:
     policy = fresh(name)
@@ -94,7 +94,7 @@ def test_one_that_looks_at_one_patch_only(name: str, camera: str) -> None:
     assert found["Patches that the answer depends on:"] == (f"{camera_name(camera)} patch {line}, {column}",)
 
 
-@pytest.mark.parametrize("name", NAMES)
+@pytest.mark.parametrize("name", FAST_NAMES)
 def test_one_that_reads_the_target_through_one_head(name: str) -> None:
     policy, of_target = fresh(name), HEADS[name]
     for module in policy.policy.modules():  # what fdvla's heads read of the prompt beside its layers
@@ -113,7 +113,7 @@ def test_one_that_reads_the_target_through_one_head(name: str) -> None:
     assert named == [("layer {}, head {}".format(*of_target),)]
 
 
-@pytest.mark.parametrize("name", NAMES)
+@pytest.mark.parametrize("name", FAST_NAMES)
 def test_the_scene_of_another_episode_is_a_corruption_too(name: str) -> None:
     policy = fresh(name)
     question = ask(policy)

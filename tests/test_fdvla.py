@@ -50,11 +50,15 @@ def wake_dualmod(policy: FdvlaPolicy) -> FdvlaPolicy:
     ("num_dims", "options"),
     [
         (4, {}),
-        (7, {"cameras": (WORKSPACE,), "dtype": "bfloat16"}),
         (2, {"has_state": False, "use_state": False, **FLOW_ONLY}),
-        (14, {"segment_attention": "causal", "reasoning_pool": "last"}),
+        pytest.param(7, {"cameras": (WORKSPACE,), "dtype": "bfloat16"}, marks=pytest.mark.long),
+        pytest.param(14, {"segment_attention": "causal", "reasoning_pool": "last"}, marks=pytest.mark.long),
         # a noise head alone says little of the actions where there is little but noise
-        (4, {"num_inference_steps": 10, "draws_per_chunk": 16, **DENOISE_ONLY}),
+        pytest.param(
+            4,
+            {"num_inference_steps": 10, "draws_per_chunk": 16, **DENOISE_ONLY},
+            marks=pytest.mark.long,
+        ),
     ],
 )
 def test_chunks_are_learned(num_dims: int, options: dict[str, Any]) -> None:

@@ -52,7 +52,13 @@ def test_residual_shrinks_the_spread_by_the_steps_and_not_by_alpha(
 
 @pytest.mark.parametrize(
     ("alpha", "num_steps", "std"),
-    [(0.1, 10, 0.492825), (0.1, 100, 0.555338), (0.5, 100, 0.895274)],
+    [
+        (0.1, 10, 0.492825),
+        (0.1, 100, 0.555338),
+        (0.3, 10, 0.641302),
+        (0.3, 100, 0.705335),
+        (0.5, 100, 0.895274),
+    ],
 )
 def test_the_papers_rule_spreads_too_widely(alpha: float, num_steps: int, std: float) -> None:
     found = mean_and_std(num_steps, sampler="paper", refine_alpha=alpha)
@@ -95,6 +101,11 @@ def test_sde_draws_noise_in_its_last_step_too() -> None:
 def test_ddim_pays_for_starting_on_the_way(num_steps: int, mean: float, std: float) -> None:
     found = mean_and_std(num_steps, sampler="ddim", denoise_tau_min=0.02)
     assert found == pytest.approx((mean, std), abs=2e-5)  # 1 / tau makes much of float32's errors
+
+
+@pytest.mark.parametrize(("num_steps", "std"), [(10, 0.490813), (100, 0.499923)])
+def test_heun_keeps_the_spread(num_steps: int, std: float) -> None:
+    assert mean_and_std(num_steps, solver="heun") == pytest.approx((1, std), abs=2e-6)
 
 
 @pytest.mark.parametrize("sampler", ["residual", "flow"])

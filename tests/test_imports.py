@@ -2,9 +2,9 @@
 
 import ast
 import re
+from collections.abc import Iterable
+from functools import cache
 from pathlib import Path
-
-import pytest
 
 ROOT = Path(__file__).parents[1]
 SHARED = "lerobot_env_mujoco"  # by environments
@@ -36,10 +36,39 @@ ORDER = [
 ]  # fmt: skip
 
 
+# what LeRobot and torch take seconds for must not be imported by what simulator workers import
+LIGHT = (
+    "bomb/board.py",
+    "bomb/episode.py",
+    "bomb/observation.py",
+    "bomb/expert.py",
+    "envs/results.py",
+    "envs/inference.py",
+    "envs/episode_env.py",
+    "envs/perturbation.py",
+    "envs/pusht_results.py",
+    "pusht/episode.py",
+    "libero/assets.py",
+    "envs/vector.py",
+    "files.py",
+    "stats.py",
+    "bootstrap.py",
+    "smoothness.py",
+    "data/rollout_pool.py",
+    "envs/rollout.py",
+    "data/recording.py",
+)
+
+
+@cache
+def parsed(path: Path) -> ast.Module:
+    return ast.parse(path.read_text())
+
+
+@cache
 def imported_modules(path: Path, top_level_only: bool = False) -> set[str]:
     """Return what a file imports, modules and what it takes from them: {"lerobot_bomb.flags.one_of"}."""
-    tree = ast.parse(path.read_text())
-    nodes = tree.body if top_level_only else ast.walk(tree)
+    nodes = parsed(path).body if top_level_only else ast.walk(parsed(path))
     names = set()
     for node in nodes:
         if isinstance(node, ast.Import):
@@ -55,21 +84,33 @@ def imported(path: Path, top_level_only: bool = False) -> set[str]:
 
 
 def files(*folders: str) -> list[Path]:
-    found = [path for folder in folders for path in (ROOT / folder).rglob("*.py")]
+    found = [path for folder in folders for path in sorted((ROOT / folder).rglob("*.py"))]
     assert found, f"no Python files in {folders}"
     return found
 
 
-@pytest.mark.parametrize("path", files("lerobot_bomb"), ids=lambda path: str(path.relative_to(ROOT)))
-def test_core_imports_no_env_and_no_policy(path: Path) -> None:
-    assert not imported(path) & PACKAGES
+def require_none(what: str, found: Iterable[tuple[Path, set[str]]]) -> None:
+    """Fail with every file that breaks a rule, and how."""
+    lines = [f"{path.relative_to(ROOT)}: {', '.join(sorted(names))}" for path, names in found if names]
+    assert not lines, "\n".join([what, *lines])
 
 
-@pytest.mark.parametrize("path", files(CORE), ids=lambda path: str(path.relative_to(ROOT)))
-def test_the_core_names_no_policy(path: Path) -> None:
+def test_core_imports_no_env_and_no_policy() -> None:
+    found = ((path, imported(path) & PACKAGES) for path in files(CORE))
+    require_none("the core imports environments or policies", found)
+
+
+def policies_named_wrongly(path: Path) -> set[str]:
     named = set(re.findall(rf"\b({'|'.join(POLICY_TYPES)})\b", path.read_text()))
     allowed = NAMES_POLICIES.get(path.name, set()) if path.parent.name == "commands" else set()
-    assert named == allowed
+    return named ^ allowed
+
+
+def test_the_core_names_no_policy() -> None:
+    require_none(
+        "the core names policies, or no more those of NAMES_POLICIES",
+        ((path, policies_named_wrongly(path)) for path in files(CORE)),
+    )
 
 
 def test_the_order_of_the_core_is_complete() -> None:
@@ -81,12 +122,15 @@ def test_the_order_of_the_core_is_complete() -> None:
     assert there == set(ORDER) and len(ORDER) == len(there)
 
 
-@pytest.mark.parametrize("path", files(CORE), ids=lambda path: str(path.relative_to(ROOT)))
-def test_the_core_imports_downwards(path: Path) -> None:
+def imported_from_above(path: Path) -> set[str]:
     part = path.relative_to(ROOT / CORE).parts[0].removesuffix(".py")
     parts = {name.split(".")[1] for name in imported_modules(path) if name.startswith(f"{CORE}.")}
-    allowed = set(ORDER[: ORDER.index(part) + 1])
-    assert parts & set(ORDER) <= allowed
+    return parts & set(ORDER[ORDER.index(part) + 1 :])
+
+
+def test_the_core_imports_downwards() -> None:
+    found = ((path, imported_from_above(path)) for path in files(CORE))
+    require_none("folders of the core import from those above them", found)
 
 
 def test_only_commands_read_a_command_line() -> None:
@@ -94,17 +138,16 @@ def test_only_commands_read_a_command_line() -> None:
     assert readers == {"commands"}
 
 
-@pytest.mark.parametrize("path", files("envs"), ids=lambda path: str(path.relative_to(ROOT)))
-def test_an_env_imports_no_policy_and_no_other_env(path: Path) -> None:
-    own = path.relative_to(ROOT / "envs").parts[0]
-    assert not imported(path) & (PACKAGES - {own})
+def of_others(folder: str, path: Path) -> set[str]:
+    """Environments and policies that a file of `folder` imports beside its own."""
+    own = path.relative_to(ROOT / folder).parts[0]
+    return set() if own == ENTRY else imported(path) & (PACKAGES - {own})
 
 
-@pytest.mark.parametrize("path", files("policies"), ids=lambda path: str(path.relative_to(ROOT)))
-def test_a_policy_imports_no_env_and_no_other_policy(path: Path) -> None:
-    own = path.relative_to(ROOT / "policies").parts[0]
-    if own != ENTRY:
-        assert not imported(path) & (PACKAGES - {own})
+def test_envs_and_policies_import_none_but_their_own() -> None:
+    for folder in ("envs", "policies"):
+        found = ((path, of_others(folder, path)) for path in files(folder))
+        require_none(f"{folder}/ import other environments or policies", found)
 
 
 def test_the_entry_module_imports_every_env_and_policy() -> None:
@@ -117,41 +160,21 @@ def test_nothing_imports_the_entry_module() -> None:
         assert ENTRY not in imported(path), path
 
 
-@pytest.mark.parametrize("path", files("envs"), ids=lambda path: str(path.relative_to(ROOT)))
-def test_the_simulator_imports_nothing_heavy(path: Path) -> None:
-    if path.name.startswith("configuration_") or path.name == STOCK:
-        assert "lerobot" in imported(path)
-    else:
-        assert not imported(path, top_level_only=True) & HEAVY
-        assert not imported(path) & (HEAVY - {"cv2"})
+def heavy_imports(path: Path) -> set[str]:
+    return imported(path, top_level_only=True) & HEAVY | imported(path) & (HEAVY - {"cv2"})
 
 
-@pytest.mark.parametrize(
-    "name",
-    [
-        "bomb/board.py",
-        "bomb/episode.py",
-        "bomb/observation.py",
-        "bomb/expert.py",
-        "envs/results.py",
-        "envs/inference.py",
-        "envs/episode_env.py",
-        "envs/perturbation.py",
-        "envs/pusht_results.py",
-        "pusht/episode.py",
-        "libero/assets.py",
-        "envs/vector.py",
-        "files.py",
-        "stats.py",
-        "bootstrap.py",
-        "smoothness.py",
-        "data/rollout_pool.py",
-        "envs/rollout.py",
-        "data/recording.py",
-    ],
-)
-def test_what_simulator_workers_import_from_the_core_is_light(name: str) -> None:
-    assert not imported(ROOT / "lerobot_bomb" / name) & HEAVY
+def test_the_simulator_imports_nothing_heavy() -> None:
+    ours = files("envs")
+    lerobots = [path for path in ours if path.name.startswith("configuration_") or path.name == STOCK]
+    assert [path for path in lerobots if "lerobot" not in imported(path)] == []
+    found = ((path, heavy_imports(path)) for path in ours if path not in lerobots)
+    require_none("the simulator imports what takes seconds", found)
+
+
+def test_what_simulator_workers_import_is_light() -> None:
+    found = ((ROOT / CORE / name, imported(ROOT / CORE / name) & HEAVY) for name in LIGHT)
+    require_none("simulator workers import what takes seconds", found)
 
 
 def test_the_recorder_checks_its_flags_before_it_imports_anything_heavy() -> None:
@@ -161,7 +184,7 @@ def test_the_recorder_checks_its_flags_before_it_imports_anything_heavy() -> Non
 
 def replaced(path: Path) -> set[str]:
     """Attributes of modules and classes of LeRobot, and of what it stands on, that a file assigns to."""
-    tree = ast.parse(path.read_text())
+    tree = parsed(path)
     theirs = set()
     for node in ast.walk(tree):
         for alias in node.names if isinstance(node, ast.Import | ast.ImportFrom) else ():
@@ -177,12 +200,13 @@ def replaced(path: Path) -> set[str]:
     return {text for text in found if re.split(r"[.\[]", text)[0] in theirs or text == "sys.excepthook"}
 
 
-@pytest.mark.parametrize(
-    "path", files(CORE, "envs", "policies"), ids=lambda path: str(path.relative_to(ROOT))
-)
-def test_only_compat_replaces_what_is_lerobots(path: Path) -> None:
-    if path.relative_to(ROOT).parts[:2] != (CORE, "compat"):
-        assert not replaced(path)
+def test_only_compat_replaces_what_is_lerobots() -> None:
+    ours = [
+        path
+        for path in files(CORE, "envs", "policies")
+        if path.relative_to(ROOT).parts[:2] != (CORE, "compat")
+    ]
+    require_none("files replace what is LeRobot's", ((path, replaced(path)) for path in ours))
 
 
 def test_what_is_replaced_is_found() -> None:

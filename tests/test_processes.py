@@ -1,6 +1,7 @@
 """Two processes train what one does on their batches together; layers that FSDP shards one by one."""
 
 from collections.abc import Callable
+from functools import cache
 from pathlib import Path
 
 import numpy as np
@@ -10,7 +11,7 @@ from lerobot.datasets import LeRobotDataset
 from lerobot.policies.factory import get_policy_class
 from lerobot.scripts import lerobot_train
 from policy_cases import CASES
-from recipes import POLICY_TYPES, recipe_path
+from recipes import recipe_path
 from torch import distributed
 from torch.distributed.device_mesh import init_device_mesh
 from torch.distributed.fsdp import fully_shard
@@ -84,39 +85,43 @@ def check_trained_as_one(
 
 
 @pytest.fixture(scope="module")
-def two(dataset: Path, tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Seen]:
-    """Train every policy in two processes, and again from its first checkpoint; return folder and `Seen`."""
-    folder = tmp_path_factory.mktemp("two")
-    trainings = []
-    for policy_type in POLICY_TYPES:
-        of = folder / policy_type
-        checkpoint = of / "process0" / "checkpoints" / f"{SAVE_FREQ:06d}" / "pretrained_model"
+def two(dataset: Path, tmp_path_factory: pytest.TempPathFactory) -> Callable[[str], tuple[Path, Seen]]:
+    """Train a policy in two processes, and again from its first checkpoint; return folder and `Seen`."""
+
+    @cache
+    def train(policy_type: str) -> tuple[Path, Seen]:
+        folder = tmp_path_factory.mktemp("two")
+        checkpoint = folder / "process0" / "checkpoints" / f"{SAVE_FREQ:06d}" / "pretrained_model"
         resumed = [f"--config_path={checkpoint}/train_config.json", "--resume=true"]
-        trainings += [
-            Training(flags(policy_type, dataset, BATCH_SIZE, f"{of}/process{{rank}}")),
-            Training([*resumed, f"--output_dir={of}/resumed{{rank}}"]),
+        trainings = [
+            Training(flags(policy_type, dataset, BATCH_SIZE, f"{folder}/process{{rank}}")),
+            Training([*resumed, f"--output_dir={folder}/resumed{{rank}}"]),
         ]
-    return folder, in_processes(trainings, folder)
+        return folder, in_processes(trainings, folder)
+
+    return train
 
 
+@pytest.mark.one_type("fdvla")
 def test_two_processes_train_what_one_does(
-    policy_type: str, two: tuple[Path, Seen], stock_cli: Callable[..., None], dataset: Path
+    policy_type: str,
+    two: Callable[[str], tuple[Path, Seen]],
+    stock_cli: Callable[..., None],
+    dataset: Path,
 ) -> None:
-    folder, seen = two
-    training = 2 * POLICY_TYPES.index(policy_type)
-    check_trained_as_one(policy_type, seen.mean_losses(training), folder / policy_type, stock_cli, dataset)
-    theirs, others = (losses[training] for losses in seen.losses)
+    folder, seen = two(policy_type)
+    check_trained_as_one(policy_type, seen.mean_losses(0), folder, stock_cli, dataset)
+    theirs, others = (losses[0] for losses in seen.losses)
     assert all(abs(a - b) > 1e-3 for a, b in zip(theirs, others, strict=True))  # of different samples
 
 
+@pytest.mark.one_type("fdvla")
 def test_going_on_is_exact_and_only_the_first_process_writes(
-    policy_type: str, two: tuple[Path, Seen]
+    policy_type: str, two: Callable[[str], tuple[Path, Seen]]
 ) -> None:
-    folder, seen = two
-    training = 2 * POLICY_TYPES.index(policy_type)
+    of, seen = two(policy_type)
     for losses in seen.losses:
-        assert losses[training + 1] == losses[training][SAVE_FREQ:]
-    of = folder / policy_type
+        assert losses[1] == losses[0][SAVE_FREQ:]
     resumed, whole = (weights(policy_type, of / name) for name in ("resumed0", "process0"))
     torch.testing.assert_close(resumed, whole, rtol=0, atol=0)
     # LeRobot 0.6.2 makes the folders in every process
@@ -125,9 +130,11 @@ def test_going_on_is_exact_and_only_the_first_process_writes(
     ]
 
 
-def test_a_log_line_comes_from_one_process(two: tuple[Path, Seen]) -> None:
-    assert two[1].text.count("fdvla: {'backbone'") == 2  # in a training and in its resumption
-    assert two[1].text.count(f"{REPO_ID}: ") == 2
+@pytest.mark.one_type("fdvla")
+def test_a_log_line_comes_from_one_process(policy_type: str, two: Callable[[str], tuple[Path, Seen]]) -> None:
+    said = {"fdvla": "fdvla: {'backbone'", "spatialvla_grid": f"{REPO_ID}: "}
+    if policy_type in said:
+        assert two(policy_type)[1].text.count(said[policy_type]) == 2  # in a training and in its resumption
 
 
 @pytest.mark.long

@@ -223,7 +223,7 @@ FULL_AT = {
 }
 
 
-@pytest.mark.parametrize("mode", MODES)
+@pytest.mark.parametrize("mode", ["video", pytest.param("images", marks=pytest.mark.long)])
 def test_a_full_disk_is_reported_and_what_was_finished_is_kept(
     mode: str, server: RecorderServer, references: dict[str, Reference], disk: Path
 ) -> None:

@@ -19,7 +19,7 @@ def test_the_table_marks_what_equals_the_reference() -> None:
             },
         }
     )
-    head, _, *rows = table([reference, other], reference)
+    head, _, *rows = table([reference, other])
     assert head == "| MuJoCo | robot | states | images | none |"
     assert [row.strip("| ").split(" | ") for row in rows] == [
         ["3.8.1", "scara", "ca978112 =", "3e23e816 =", "9/10, 0.3 mm"],

@@ -21,7 +21,7 @@ from lerobot_bomb.evaluation.results import Row, read_results
 Run = Callable[..., None]
 REPO_ID = "test/bomb_place"
 NEEDS = {"diffusion": "diffusers", "pi0_fast": "scipy"}  # beyond what this package installs
-LONG = ("pi0", "pi05", "pi0_fast")  # much as smolvla
+LONG = ("diffusion", "pi0", "pi05", "pi0_fast")  # much as act and smolvla
 FROM_SCRATCH = ("act", "diffusion")
 # what xvla's preset says of training, said again for the evaluation
 RENAMED = (

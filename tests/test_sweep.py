@@ -3,6 +3,7 @@
 import json
 import os
 import random
+import re
 import signal
 import subprocess
 import sys
@@ -164,11 +165,20 @@ def by_seed(rows: list[Row]) -> list[Row]:
     return sorted(map(without_measured, rows), key=lambda row: row["spec"]["seed"])
 
 
-@pytest.mark.parametrize("policy", ["bomb_random", NANO, "bomb:fdvla", "bomb:spatialvla_grid"])
+@pytest.mark.parametrize(
+    "policy",
+    [
+        "bomb_random",
+        "bomb:fdvla",
+        pytest.param(NANO, marks=pytest.mark.long),
+        pytest.param("bomb:spatialvla_grid", marks=pytest.mark.long),
+    ],
+)
 def test_the_lines_are_those_of_lerobot_eval(
     policy: str, play: Callable[[Manifest], Store], stock_cli: Callable[..., None], tmp_path: Path
 ) -> None:
-    flags = ("--env.type=bomb", "--env.image_size=64", "--policy.device=cpu")
+    flags = ("--env.type=bomb", "--env.image_size=64", "--env.fps=2", "--policy.device=cpu")
+    flags += ("--env.ignore_checkpoint=true",)  # of 10 Hz, whose episodes are five times as long
     conditions = ("none", "light:3", "camera:2")
     manifest = plan((policy,), ("place",), conditions, seed=7, num_episodes=2, batch_size=2, flags=flags)
     store = play(manifest)
@@ -307,17 +317,18 @@ def test_a_checkpoint_of_another_environment_is_told_before_anything_is_played(
 def test_a_sweep_that_is_refused_says_why_and_leaves_its_folder_free(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    flags = ["--policies=bomb_expert", "--env.type=bomb", "--episodes=1"]
-    assert sweep(tmp_path, *flags, "--env.imgae_size=64", "--workers=2") == 1
+    flags = ["--policies=bomb_expert", "--env.type=bomb", "--episodes=1", "--dry_run"]
+    assert sweep(tmp_path, *flags[:-1], "--env.imgae_size=64") == 1
     assert "unrecognized arguments: --env.imgae_size=64; nearest: --env.image_size" in capsys.readouterr().err
-    (tmp_path / "train").mkdir()
-    of_train = [f"--policies={tmp_path / 'train'}", *flags[1:], "--workers=2"]
-    assert sweep(tmp_path / "other", *of_train) == 1
-    told = (
-        f"--policy.path={tmp_path / 'train'}: config.json not found in {tmp_path / 'train'}; give the folder"
-    )
-    assert told in capsys.readouterr().err
     assert sweep(tmp_path, *flags, "--env.image_size=64") == 0
+
+
+def test_a_folder_that_is_no_checkpoint_is_told(tmp_path: Path) -> None:
+    from lerobot_bomb.sweep.check import check
+
+    told = f"--policy.path={tmp_path}: config.json not found in {tmp_path}; give the folder"
+    with pytest.raises(ValueError, match=re.escape(told)):
+        check(plan((str(tmp_path),), (), ("none",), 7, 1, 1, ("--env.type=bomb",)))
 
 
 def test_files_that_vanish_while_they_are_counted_do_not_matter(

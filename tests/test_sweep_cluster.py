@@ -4,14 +4,16 @@ import os
 import subprocess
 import sys
 import time
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
 import pytest
 
 from lerobot_bomb.commands import cluster_jobs
+from lerobot_bomb.commands import sweep as sweep_command
 from lerobot_bomb.commands.main import main
-from lerobot_bomb.sweep import local
+from lerobot_bomb.sweep import cluster, local
 from lerobot_bomb.sweep.cluster import sbatch_script
 from lerobot_bomb.sweep.manifest import plan
 from lerobot_bomb.sweep.processes import visible_gpus, worker_environments
@@ -43,6 +45,26 @@ def expected_lines(tmp_path_factory: pytest.TempPathFactory) -> str:
     Worker(store).run(list(manifest.cells))
     store.merge()
     return (store.folder / "results.jsonl").read_text()
+
+
+@pytest.fixture
+def jobs(monkeypatch: pytest.MonkeyPatch) -> list[list[str]]:
+    """Let workers and jobs run in this process, as each of their own imports LeRobot; return the commands."""
+    from lerobot_bomb.sweep.worker import Worker
+
+    commands = []
+
+    def run_part(store: Store, part: str, *_: Any) -> None:
+        Worker(store).run(list(store.manifest.part(part)))
+
+    def run_job(command: Sequence[str]) -> int:
+        assert command[: len(local.PYTHON) + 1] == [*local.PYTHON, "lerobot_bomb.commands.main"]
+        commands.append(list(command))
+        return main(command[len(local.PYTHON) + 1 :])
+
+    monkeypatch.setattr(sweep_command, "play", run_part)
+    monkeypatch.setattr(cluster.subprocess, "check_call", run_job)
+    return commands
 
 
 # GPUs
@@ -114,6 +136,38 @@ def test_a_job_of_the_script_runs_its_part_where_the_script_was_written(tmp_path
     assert "#SBATCH --array=0-2\n" in script.read_text()
 
 
+def submit(printed: str) -> None:
+    """Do what a user does with the line that `--slurm` prints."""
+    path = f"{FAKE_SLURM}{os.pathsep}{os.environ['PATH']}"
+    done = subprocess.run(
+        ["bash", "-c", printed], env=os.environ | {"PATH": path}, capture_output=True, text=True
+    )
+    assert done.stdout == "Submitted batch job 1\n", done.stderr
+
+
+def test_commands_of_a_slurm_script_run_everything(
+    expected_lines: str,
+    jobs: list[list[str]],
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    with monkeypatch.context() as patch:
+        patch.setattr(sweep_command, "PYTHON", ("printf", r"%s\0"))  # each job prints its arguments
+        assert sweep("it's a sweep", "--slurm=2", *SWEEP) == 0
+    (printed,) = capsys.readouterr().out.splitlines()
+    submit(printed)
+    for job, said in enumerate(("2 of 4 episodes, 1 of 2 cells", "4 of 4 episodes, 2 of 2 cells")):
+        name, *arguments = (tmp_path / f"slurm-1_{job}.out").read_text().split("\0")[:-1]
+        assert name == "lerobot_bomb.commands.main"
+        assert main(arguments) == 0
+        assert said in capsys.readouterr().out
+    assert (tmp_path / "it's a sweep" / "results.jsonl").read_text() == expected_lines
+    assert jobs == []
+
+
+@pytest.mark.long
 def test_the_slurm_script_gives_the_lines_of_one_process(
     expected_lines: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -121,11 +175,7 @@ def test_the_slurm_script_gives_the_lines_of_one_process(
     assert sweep("it's a sweep", "--slurm=2", *SWEEP) == 0
     subprocess.run(["bash", "-n", tmp_path / "it's a sweep" / "sweep.sbatch"], check=True)
     (printed,) = capsys.readouterr().out.splitlines()
-    path = f"{FAKE_SLURM}{os.pathsep}{os.environ['PATH']}"
-    done = subprocess.run(
-        ["bash", "-c", printed], env=os.environ | {"PATH": path}, capture_output=True, text=True
-    )
-    assert done.stdout == "Submitted batch job 1\n", done.stderr
+    submit(printed)
     assert (tmp_path / "it's a sweep" / "results.jsonl").read_text() == expected_lines
     assert "2 of 4 episodes, 1 of 2 cells" in (tmp_path / "slurm-1_0.out").read_text()
     assert "4 of 4 episodes, 2 of 2 cells" in (tmp_path / "slurm-1_1.out").read_text()
@@ -134,18 +184,27 @@ def test_the_slurm_script_gives_the_lines_of_one_process(
 # submitit
 
 
-def test_submitits_jobs_give_the_lines_of_one_process(
-    expected_lines: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+def submitit(cluster: str) -> tuple[str, ...]:
+    return "--submitit=2", f"--submitit_cluster={cluster}", '--submitit_parameters={"timeout_min": 10}'
+
+
+def test_submitits_jobs_run_everything_once(
+    expected_lines: str, jobs: list[list[str]], tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     folder = tmp_path / "a sweep"
-    flags = ("--submitit=2", "--submitit_cluster=local", '--submitit_parameters={"timeout_min": 10}')
-    assert sweep(folder, *flags, *SWEEP) == 0
+    for flags in (SWEEP, ()):  # nothing is left to be run
+        assert sweep(folder, *submitit("debug"), *flags) == 0
+        assert (folder / "results.jsonl").read_text() == expected_lines
+        assert [job[-1] for job in jobs] == ["--shard=0/2", "--shard=1/2"]
+        assert "4 of 4 episodes, 2 of 2 cells" in capsys.readouterr().out.splitlines()[-1]
+
+
+@pytest.mark.long
+def test_submitits_jobs_give_the_lines_of_one_process(expected_lines: str, tmp_path: Path) -> None:
+    folder = tmp_path / "a sweep"
+    assert sweep(folder, *submitit("local"), *SWEEP) == 0
     assert (folder / "results.jsonl").read_text() == expected_lines
-    num_jobs = len(list((folder / "submitit").glob("*_submitted.pkl")))
-    assert num_jobs == 2
-    assert sweep(folder, *flags) == 0  # nothing is left to be played
-    assert len(list((folder / "submitit").glob("*_submitted.pkl"))) == num_jobs
-    assert "4 of 4 episodes, 2 of 2 cells" in capsys.readouterr().out.splitlines()[-1]
+    assert len(list((folder / "submitit").glob("*_submitted.pkl"))) == 2
 
 
 class Job:

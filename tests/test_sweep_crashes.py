@@ -22,6 +22,7 @@ FLAGS = ("--env.type=bomb", "--env.image_size=32", "--policy.device=cpu", "--epi
 # Processes
 
 
+@pytest.mark.long
 def test_good_policies_play_whatever_becomes_of_those_that_crash(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:

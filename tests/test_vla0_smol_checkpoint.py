@@ -120,7 +120,11 @@ def test_a_missing_or_unexpected_tensor_is_an_error(tmp_path: Path) -> None:
 
 
 LOAD = """
-import sys, torch
+import sys
+from lerobot_bomb.explain.interventions import BlankImages, intervene
+assert "lerobot_policy_bomb" not in sys.modules
+intervene(sys.argv[1], [BlankImages()], sys.argv[1] + "_blank")  # registers the type of what it loads
+import torch
 from lerobot.configs import PreTrainedConfig
 from lerobot.policies.factory import get_policy_class, make_pre_post_processors
 import lerobot_policy_bomb
@@ -133,7 +137,7 @@ torch.save(postprocessor(policy.select_action(preprocessor(batch))), sys.argv[3]
 
 
 def test_a_checkpoint_needs_nothing_but_itself(tmp_path: Path) -> None:
-    """Load in another process without network, with an empty Hub cache and no base model."""
+    """Load, and change, in another process without network, with an empty Hub cache and no base model."""
     policy = make_policy(nano_config=None)  # which changes nano alone
     batch = make_batch(policy, 4)
     save(policy, tmp_path / "model")
@@ -148,6 +152,7 @@ def test_a_checkpoint_needs_nothing_but_itself(tmp_path: Path) -> None:
     )
     expected = policy.predict_action_chunk(batch)[:, 0]
     assert torch.equal(torch.load(tmp_path / "action.pt"), expected)
+    assert (tmp_path / "model_blank" / "model.safetensors").exists()
 
 
 def test_a_checkpoint_keeps_its_system_prompt(tmp_path: Path) -> None:

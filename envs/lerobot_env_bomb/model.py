@@ -2,6 +2,7 @@
 """Builds BOMB's one MjModel: a robot's scene plus board and stones in the sizes of `BOARD`."""
 
 from collections.abc import Mapping
+from functools import cache
 
 import numpy as np
 
@@ -108,6 +109,7 @@ def parked_xyz(index: int) -> np.ndarray:
     return np.array(PARKED_XYZ) + np.array([index * PARKED_SPACING_M, 0, 0])
 
 
+@cache
 def board_texture() -> np.ndarray:
     """(TEXTURE_SIZE, TEXTURE_SIZE, 3) uint8 image of the board: wood, grid lines, star point."""
     metres = (np.arange(TEXTURE_SIZE) + 0.5) / TEXTURE_SIZE * 2 * BOARD_HALF_SIZE_M - BOARD_HALF_SIZE_M

@@ -24,7 +24,6 @@ class Stream(IntEnum):
     POINTING = 8  # places beside those that are meant
     AXIS = 200  # plus the axis' place in AXES: everything else that the axis draws
     ACTUATOR_NOISE = 300
-    EXPERT_NOISE = 1000  # of benchmarks/expert.py
 
 
 RECORDER_NOISE = 0xDA57  # stands before the seed

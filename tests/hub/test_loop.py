@@ -99,6 +99,6 @@ def check_card(card: str, policy_type: str) -> None:
         assert part in card
 
 
-@pytest.mark.one_type
+@pytest.mark.long
 def test_train_push_forget_evaluate_and_fine_tune(policy_type: str, hub: LoopbackHub, tmp_path: Path) -> None:
     check_card(loop(hub, tmp_path, policy_type), policy_type)
