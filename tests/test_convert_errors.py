@@ -11,7 +11,7 @@ import pytest
 from pusht_cases import REPO_ID, Demonstrations, write_zarr
 
 from lerobot_bomb.commands import main as cli
-from lerobot_bomb.commands.convert import convert_pusht
+from lerobot_bomb.data.pusht_conversion import convert_pusht
 from lerobot_bomb.data.unfinished import lock_folder
 
 

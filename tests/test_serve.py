@@ -90,7 +90,7 @@ def test_bomb_gets_the_chunks_that_the_policy_foresees_here(
     flags = f"--policy.type={policy_type} --policy.vlm_model_name=nano --policy.device=cpu"
     flags += f" --policy.chunk_size={CHUNK} --policy.n_action_steps={CHUNK} --policy.dtype=float32"
     data = [f"--dataset.repo_id={REPO_ID}", f"--dataset.root={dataset}", f"--output={path}"]
-    assert cli.main(["init", *flags.split(), *SMALL[policy_type].split(), *data]) == 0
+    assert cli.main(["checkpoint", "init", *flags.split(), *SMALL[policy_type].split(), *data]) == 0
     wait_until(lambda: answers(port))
     monkeypatch.chdir(tmp_path)  # LeRobot makes a folder for logs where it is imported
     from lerobot.async_inference import robot_client

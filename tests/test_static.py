@@ -162,7 +162,7 @@ def test_of_a_scene_a_chunk_is_its_first_action(recorded: dict[str, Path]) -> No
 
 def test_scenes_are_no_episodes(recorded: dict[str, Path], capsys: pytest.CaptureFixture[str]) -> None:
     scenes = ["--dataset.repo_id=test/static", f"--dataset.root={recorded['scenes']}"]
-    assert main(["smoothness", *scenes]) == 1
+    assert main(["results", "smoothness", *scenes]) == 1
     told = "episode 0 of test/static holds static scenes, which do not follow each other"
     assert told in capsys.readouterr().err
     meta = LeRobotDatasetMetadata("test/static", root=recorded["scenes"])
@@ -173,7 +173,10 @@ def test_scenes_are_no_episodes(recorded: dict[str, Path], capsys: pytest.Captur
     )
     with pytest.raises(ValueError, match=told):
         policy_for(config, ds_meta=meta)
-    assert main(["smoothness", "--dataset.repo_id=t/e", f"--dataset.root={recorded['episodes']}"]) == 0
+    assert (
+        main(["results", "smoothness", "--dataset.repo_id=t/e", f"--dataset.root={recorded['episodes']}"])
+        == 0
+    )
 
 
 def test_no_chunk_is_longer_than_every_episode(recorded: dict[str, Path]) -> None:

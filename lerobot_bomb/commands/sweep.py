@@ -6,7 +6,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 
 from lerobot_bomb.bomb.episode import MAX_SEED, TEST_SEEDS
-from lerobot_bomb.commands.arguments import check_at_least, parse_conditions, path_flag
+from lerobot_bomb.commands.arguments import add_env_flag, check_at_least, parse_conditions, path_flag
 from lerobot_bomb.commands.cluster_jobs import (
     SUBMITIT,
     add_job_arguments,
@@ -29,8 +29,8 @@ SCRIPT = "sweep.sbatch"
 ALL = "0/1"  # the only part
 
 
-def add_sweep_arguments(parser: argparse.ArgumentParser) -> None:
-    """Declare the arguments of ``lerobot-bomb sweep``."""
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Declare the arguments."""
     parser.usage = (
         "lerobot-bomb sweep FOLDER [--policies=A,B --env.type=bomb ...] (and flags of lerobot-eval)"
     )
@@ -41,9 +41,10 @@ def add_sweep_arguments(parser: argparse.ArgumentParser) -> None:
         type=parse_conditions,
         help="checkpoints and policy types: outputs/act,bomb:NAME,TYPE",
     )
-    add("--tasks", type=parse_conditions, default=(), help="values of --env.task: place,object")
+    tasks = "values of --env.task: place,object"
+    add("--env.task", "--task", "--tasks", dest="tasks", type=parse_conditions, default=(), help=tasks)
     conditions = "none,camera:3,all:1-5; each:1-5 is every axis at every level"
-    add("--perturbations", type=parse_conditions, default=(), help=conditions)
+    add_env_flag(parser, "perturbations", type=parse_conditions, default=(), help=conditions)
     add("--episodes", type=int, default=20, help="of each cell (default: 20)")
     add("--seed", type=int, default=TEST_SEEDS[0], help=f"the first one (default: {TEST_SEEDS[0]})")
     add("--batch_size", type=int, default=MAX_BATCH, help=f"at most (default: {MAX_BATCH})")
@@ -59,7 +60,7 @@ def add_sweep_arguments(parser: argparse.ArgumentParser) -> None:
     add("rest", nargs="*", metavar="FLAG", help="flags of lerobot-eval for every cell: --env.image_size=64")
 
 
-def run_sweep(args: argparse.Namespace) -> int:
+def run(args: argparse.Namespace) -> int:
     """Run what is missing; exit code 1 where something still is."""
     _check_numbers(args)
     manifest = _manifest(args)
