@@ -2,8 +2,8 @@ r"""Does a policy learn from real data? PushT's human demonstrations, held-out e
 
 The recipe configs/pusht_TYPE.yaml and its variants, each with several seeds, are trained by the stock
 `lerobot-train` on episodes 0-179; `lerobot-bomb checkpoint offline-metrics` measures the decoded actions on
-episodes 180-205, beside predictors that look at no image. With --eval_episodes the recipe's checkpoints also play in
-LeRobot's environment `pusht`.
+episodes 180-205, beside predictors that look at no image. With --eval_episodes the recipe's checkpoints also
+play in LeRobot's environment `pusht`.
 
 All start from one small backbone that has learned to see before, on the same episodes: from random weights, a
 model that may read the state does not look at the image for a long time (docs/pusht.md).

@@ -97,7 +97,8 @@ def read_action_log(path: Path) -> Executed:
             rates.add(float(row["fps"]))
         except (ValueError, KeyError, TypeError) as error:
             raise ValueError(
-                f"{path}:{number}: not the actions of an episode, as `lerobot-bomb results actions` writes them"
+                f"{path}:{number}: not the actions of an episode, as `lerobot-bomb results actions` writes "
+                "them"
             ) from error
         if actions_TD.ndim != 2:
             raise ValueError(f"{path}:{number}: actions have the shape {actions_TD.shape}, not (T, D)")

@@ -40,8 +40,8 @@ lerobot-bomb view gallery --axes=camera,light --seeds=2,3 --output=outputs/galle
 Each condition is a group in `eval_info.json`: `place.camera-2.light-3`, `place.all-1to5`. What is needed to
 solve the episode stays in view, and the instruction always says what is meant.
 
-`lerobot-bomb view gallery --output=docs/media/perturbations --doc=docs/perturbations.md` writes this page. The
-magnitudes are in `lerobot_bomb/bomb/perturbations.py`; what an axis does, in
+`lerobot-bomb view gallery --output=docs/media/perturbations --doc=docs/perturbations.md` writes this page.
+The magnitudes are in `lerobot_bomb/bomb/perturbations.py`; what an axis does, in
 `envs/lerobot_env_bomb/axes/AXIS.py`.
 """
 
