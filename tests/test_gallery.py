@@ -154,7 +154,7 @@ def test_the_command_writes_small_sheets_and_replaces_its_own(tmp_path: Path) ->
     ("flag", "message"),
     [
         ("--axes=camra", "--axes='camra' is unknown; choose one of: table, reflectance"),
-        ("--image_size=8", "--image_size=8 must lie in 32..1024"),
+        ("--image_size=8", "--env.image_size=8 must lie in 32..1024"),
         ("--seeds=99999999999", "--seeds: 99999999999 must lie in 0.."),
     ],
 )

@@ -135,7 +135,7 @@ def test_commands_refuse_before_anything_is_played(
     assert "evaluate with --env.control_mode=absolute" in capsys.readouterr().err
     view = ["view", f"--policy.path={path}", "--control_mode=absolute", f"--output={tmp_path / 'view'}"]
     assert main([*view, "--image_size=128"]) == 1
-    assert "evaluate with --image_size=64, or insist with --policy.ignore" in capsys.readouterr().err
+    assert "evaluate with --env.image_size=64, or insist with --policy.ignore" in capsys.readouterr().err
     assert not results.exists()
     assert not [*tmp_path.rglob("*.mp4"), *tmp_path.rglob("*.rrd")]
 

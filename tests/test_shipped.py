@@ -53,7 +53,6 @@ def test_lerobot_eval_takes_the_name_and_it_places_stones(name: str, stock_cli: 
         f"--policy.path=bomb:{name}",
         "--policy.device=cpu",
         "--env.type=bomb",
-        "--env.image_size=64",
         f"--env.results_path={results}",
         "--eval.n_episodes=6",
         "--eval.batch_size=6",

@@ -268,8 +268,8 @@ def test_lerobot_merges_scenes_with_demonstrations_and_the_suite_stays_known(
         ("--static=3", "--static=3 must be in 1..2 or a multiple of 2"),
         ("--episodes=0", "--episodes=0 must be at least 1"),
         ("--static=2 --noise=0.05", "--noise=0.05: static scenes are not played"),
-        ("--static=2 --task=all --task_ids=[1]", "--task_ids=[1] are numbers in a suite"),
-        ("--static=2 --task=every", "--task='every' is unknown; choose one of: goal, long"),
+        ("--static=2 --task=all --task_ids=[1]", "--env.task_ids=[1] are numbers in a suite"),
+        ("--static=2 --task=every", "--env.task='every' is unknown; choose one of: goal, long"),
     ],
 )
 def test_wrong_flags_are_named(flags: str, message: str, capsys: pytest.CaptureFixture[str]) -> None:

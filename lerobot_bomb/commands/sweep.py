@@ -2,10 +2,12 @@
 
 import argparse
 import signal
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
+from difflib import get_close_matches
 
 from lerobot_bomb.bomb.episode import MAX_SEED, TEST_SEEDS
+from lerobot_bomb.checkpoints.registered import registered_policy_types
 from lerobot_bomb.commands.arguments import add_env_flag, check_at_least, parse_conditions, path_flag
 from lerobot_bomb.commands.cluster_jobs import (
     SUBMITIT,
@@ -20,7 +22,7 @@ from lerobot_bomb.evaluation.result_lines import KIND_OF_ENV
 from lerobot_bomb.flags import one_of
 from lerobot_bomb.sweep.claim import claimed
 from lerobot_bomb.sweep.local import PYTHON, play, progress
-from lerobot_bomb.sweep.manifest import NAME, Cell, Manifest, flag_value, plan
+from lerobot_bomb.sweep.manifest import NAME, Cell, Manifest, flag_value, plan, policy_flag
 from lerobot_bomb.sweep.store import Store
 from lerobot_bomb.tables import print_lines
 
@@ -137,6 +139,7 @@ def _manifest(args: argparse.Namespace) -> Manifest:
     if not args.policies:
         raise ValueError("--policies names none")
     kind = _kind(args.rest)
+    _check_types(args.policies)
     for task in args.tasks:
         one_of("--tasks", task, kind.tasks)
     conditions = _expanded(args.perturbations, kind)
@@ -155,6 +158,15 @@ def _kind(flags: list[str]) -> ResultKind:
             f"{', '.join(KIND_OF_ENV)}"
         )
     return KIND_OF_ENV[env_type]
+
+
+def _check_types(policies: Sequence[str]) -> None:
+    """Raise a ValueError if one is neither a checkpoint nor a type that there is, as far as source says."""
+    known = registered_policy_types()
+    for policy in policies if known else ():
+        if policy_flag(policy).startswith("--policy.type=") and policy not in known:
+            near = "".join(f"; nearest: {name}" for name in get_close_matches(policy, known, n=1))
+            raise ValueError(f"--policies: {policy} is no folder and no policy type{near}")
 
 
 def _expanded(perturbations: tuple[str, ...], kind: ResultKind) -> list[str]:

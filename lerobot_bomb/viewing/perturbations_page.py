@@ -23,7 +23,7 @@ draw the sheets below:
 ```
 lerobot-eval --policy.path=CHECKPOINT --env.type=bomb --eval.n_episodes=100 --eval.batch_size=10 \\
     --env.perturbations='["none","camera:3","camera:2+light:3","all:1-5"]'
-lerobot-bomb view --perturbations=camera:3 --seed=7
+lerobot-bomb view --env.perturbations=camera:3 --seed=7
 lerobot-bomb view gallery --axes=camera,light --seeds=2,3 --output=outputs/gallery
 ```
 
