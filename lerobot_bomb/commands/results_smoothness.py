@@ -33,32 +33,25 @@ def run(args: argparse.Namespace) -> int:
     from lerobot.utils.constants import ACTION
 
     from lerobot_bomb.data.columns import dim_names, read_meta
+    from lerobot_bomb.evaluation import smoothness_report as report
     from lerobot_bomb.evaluation.executed import executed_in_dataset, read_executed
-    from lerobot_bomb.evaluation.smoothness_report import (
-        check_comparable,
-        make_units,
-        measure_difference,
-        measure_row,
-        print_differences,
-        print_rows,
-    )
 
     meta = read_meta(args.repo_id, args.root)
     dataset = executed_in_dataset(meta, args.repo_id)
     names = dim_names(meta.features[ACTION])
-    units = make_units(dataset, names, args.exclude, args.per_second)
+    units = report.make_units(dataset, names, args.exclude, args.per_second)
     compared = [dataset, *map(read_executed, args.paths)]
     if args.fps is not None:
         compared = [replace(executed, fps=args.fps) for executed in compared]
-    check_comparable(compared, args.per_second)
-    rows = {executed.name: measure_row(executed, units) for executed in compared}
+    report.check_comparable(compared, args.per_second)
+    rows = {executed.name: report.measure_row(executed, units) for executed in compared}
     first, *others = [executed.name for executed in compared if executed.is_seeded] or [""]
-    differences = {name: measure_difference(first, name, rows) for name in others}
+    differences = {name: report.measure_difference(first, name, rows) for name in others}
     excluded = [names[dim] for dim in units.exclude]
     print(f"action dims {', '.join(names)}; left out: {', '.join(excluded) or 'none'}")
-    print_rows(rows)
+    report.print_rows(rows)
     if differences:
-        print_differences(first, differences)
+        report.print_differences(first, differences)
     per = "per s^2 and s^3" if units.per_second else "per step"
     print(LEGEND.format(per=per, dataset=args.repo_id))
     if args.json is not None:

@@ -45,22 +45,13 @@ UNIFORM, CLIPPING = "uniform mid", "clipping alone"
 def show_fit(
     repo_id: str,
     root: Path | None,
-    given: Sequence[dict[str, Any]] | None,
+    action_groups: Sequence[dict[str, Any]] | None,
     layout: str | None,
     mapping: dict[str, str],
     options: dict[str, Any],
     plot: Path | None,
 ) -> None:
-    """Fit a grid on a dataset, print the tables, draw the plot.
-
-    Args:
-        repo_id: of the dataset.
-        root: its folder; None: LeRobot's.
-        given: groups of dimensions; None: those of the layout.
-        layout: what the action is; None: what the dimensions' names say.
-        mapping: of normalisation, of which ACTION is read.
-        options: other settings of the grid.
-        plot: file of the plot; None: there is none.
+    """Fit a grid on a dataset, print the tables, draw the plot; the flags' names say what they are.
 
     Raises:
         ValueError: a setting is wrong, or the dataset has no such statistics.
@@ -74,7 +65,9 @@ def show_fit(
     if layout is not None:
         one_of(LAYOUT_FLAG, layout, LAYOUTS)
     groups = (
-        default_groups(num_dims, names, layout) if given is None else tuple(map(ActionGroup.from_dict, given))
+        default_groups(num_dims, names, layout)
+        if action_groups is None
+        else tuple(map(ActionGroup.from_dict, action_groups))
     )
     grids = ActionGrids(GridSettings(groups, **options), num_dims)
     actions_ND = normalised(read_columns(meta, (ACTION,))[ACTION], low_D, high_D)
@@ -89,13 +82,17 @@ def show_fit(
     physical = {name: error_D * (high_D - low_D) / 2 for name, error_D in errors.items()}
     print_errors("in the dataset's units", physical, names)
     if plot is not None:
-        title = (
-            f"{meta.repo_id}: {len(actions_ND)} actions and the {grids.settings.distribution} bins of a grid"
-        )
-        drawn = draw_rows(title, plot_rows(grids, actions_ND.clip(-1, 1), names))
-        with written_whole(plot) as (path,):
-            Image.fromarray(drawn).save(path, format="PNG")
-        print(f"\n{plot}")
+        _write_plot(plot, meta.repo_id, grids, actions_ND, names)
+
+
+def _write_plot(
+    plot: Path, repo_id: str, grids: ActionGrids, actions_ND: np.ndarray, names: list[str]
+) -> None:
+    title = f"{repo_id}: {len(actions_ND)} actions and the {grids.settings.distribution} bins of a grid"
+    drawn = draw_rows(title, plot_rows(grids, actions_ND.clip(-1, 1), names))
+    with written_whole(plot) as (path,):
+        Image.fromarray(drawn).save(path, format="PNG")
+    print(f"\n{plot}")
 
 
 def action_bounds(meta: LeRobotDatasetMetadata, mode: NormalizationMode) -> tuple[np.ndarray, np.ndarray]:
