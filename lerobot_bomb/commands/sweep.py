@@ -162,8 +162,9 @@ def _kind(flags: list[str]) -> ResultKind:
 
 def _check_types(policies: Sequence[str]) -> None:
     """Raise a ValueError if one is neither a checkpoint nor a type that there is, as far as source says."""
-    known = registered_policy_types()
-    for policy in policies if known else ():
+    if (known := registered_policy_types()) is None:
+        return
+    for policy in policies:
         if policy_flag(policy).startswith("--policy.type=") and policy not in known:
             near = "".join(f"; nearest: {name}" for name in get_close_matches(policy, known, n=1))
             raise ValueError(f"--policies: {policy} is no folder and no policy type{near}")
