@@ -1,9 +1,9 @@
 r"""Does a policy learn from real data? PushT's human demonstrations, held-out episodes, predictors to beat.
 
 The recipe configs/pusht_TYPE.yaml and its variants, each with several seeds, are trained by the stock
-`lerobot-train` on episodes 0-179; `lerobot-bomb offline-metrics` measures the decoded actions on episodes
-180-205, beside predictors that look at no image. With --eval_episodes the recipe's checkpoints also play in
-LeRobot's environment `pusht`.
+`lerobot-train` on episodes 0-179; `lerobot-bomb checkpoint offline-metrics` measures the decoded actions on
+episodes 180-205, beside predictors that look at no image. With --eval_episodes the recipe's checkpoints also
+play in LeRobot's environment `pusht`.
 
 All start from one small backbone that has learned to see before, on the same episodes: from random weights, a
 model that may read the state does not look at the image for a long time (docs/pusht.md).
@@ -173,7 +173,7 @@ def learn_to_see(policy_type: str, dataset: Path, folder: Path) -> list[str]:
         backbone = run.folder / "backbone"
         if not backbone.exists():
             export = [f"--policy.path={run.checkpoint}", f"--output={backbone}"]
-            run_logged(run.folder / "export.log", "lerobot-bomb", "export-backbone", *export)
+            run_logged(run.folder / "export.log", "lerobot-bomb", "checkpoint", "export-backbone", *export)
         start = [f"--policy.vlm_model_name={backbone.resolve()}"]
     return start
 
@@ -200,12 +200,13 @@ def train(run: Run, policy_type: str, dataset: Path, flags: list[str]) -> None:
 
 
 def measure(run: Run, dataset: Path, num_frames: int) -> dict[str, Any]:
-    """Measure with `lerobot-bomb offline-metrics` on the episodes that were not trained on."""
+    """Measure with `lerobot-bomb checkpoint offline-metrics` on the episodes that were not trained on."""
     path = run.folder / f"metrics_{num_frames}.json"
     if not path.exists():
         run_logged(
             run.folder / "metrics.log",
             "lerobot-bomb",
+            "checkpoint",
             "offline-metrics",
             f"--policy.path={run.checkpoint}",
             f"--dataset.repo_id={REPO_ID}",

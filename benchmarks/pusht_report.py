@@ -18,7 +18,7 @@ POLICY = "policy"
 
 @dataclass(frozen=True)
 class Seed:
-    """One training: its two columns of `lerobot-bomb offline-metrics`, what it took, how it plays."""
+    """One training: its two columns of `checkpoint offline-metrics`, what it took, how it plays."""
 
     train: dict[str, Any]
     validation: dict[str, Any]

@@ -1,6 +1,5 @@
 """Checks of flags that are paths or choices; light, as the simulator's processes import it."""
 
-import re
 from collections.abc import Collection, Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
@@ -19,15 +18,12 @@ def one_of(flag: str, value: object, allowed: Collection) -> None:
 
 
 @contextmanager
-def flags_without_group(renamed: Mapping[str, str] | None = None) -> Iterator[None]:
-    """Name flags in a ValueError as lerobot-bomb does; LeRobot's commands call them --env.*, as --env.type.
-
-    ``renamed``: other texts, which are replaced first.
-    """
+def reworded(texts: Mapping[str, str]) -> Iterator[None]:
+    """Replace texts in the message of a ValueError: a shared check names a flag that was not given."""
     try:
         yield
     except ValueError as error:
         message = str(error)
-        for usual, name in (renamed or {}).items():
-            message = message.replace(usual, name)
-        raise ValueError(re.sub(r"--env\.(?!type\b)", "--", message)) from None
+        for usual, other in texts.items():
+            message = message.replace(usual, other)
+        raise ValueError(message) from None

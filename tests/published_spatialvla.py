@@ -235,7 +235,7 @@ def _whole(config: Mapping[str, Any]) -> dict[str, Any]:
 
 def convert(folder: Path, output: Path, **options: object) -> int:
     flags = [f"--{name}={value}" for name, value in options.items()]
-    return main(["convert-spatialvla", str(folder), f"--output={output}", *flags])
+    return main(["checkpoint", "convert-spatialvla", str(folder), f"--output={output}", *flags])
 
 
 def converted(folder: Path, output: Path, **options: object) -> Path:

@@ -252,7 +252,7 @@ def test_a_folder_without_weights_is_refused(tmp_path: Path) -> None:
         ({"model_type": "gpt2"}, "is a 'gpt2' model; this policy needs a 'smolvlm' or 'idefics3' one"),
         (
             {"type": "act"},
-            "is a checkpoint of the policy 'act'; `lerobot-bomb export-backbone --policy.path=",
+            "is a checkpoint of the policy 'act'; `lerobot-bomb checkpoint export-backbone --policy.path=",
         ),
     ],
 )

@@ -12,7 +12,7 @@ def script(tmp_path_factory: pytest.TempPathFactory) -> Path:
     path = tmp_path_factory.mktemp("completion") / "lerobot-bomb"
     with pytest.MonkeyPatch.context() as patch, path.open("w") as file:
         patch.setattr("sys.stdout", file)
-        assert main(["completion", "bash"]) == 0
+        assert main(["--completion=bash"]) == 0
     return path
 
 
@@ -36,11 +36,13 @@ def test_bash_reads_the_script(script: Path) -> None:
     ("line", "offered"),
     [
         ("lerobot-bomb rec", ["record"]),
-        ("lerobot-bomb convert", ["convert", "convert-spatialvla"]),
+        ("lerobot-bomb conv", ["convert"]),
         ("lerobot-bomb convert ", ["pusht-zarr", "libero-hdf5"]),
         ("lerobot-bomb record --repo_id=me/x --epi", ["--episodes"]),
         ("lerobot-bomb view --policy.p", ["--policy.path"]),
-        ("lerobot-bomb completion ", ["bash", "zsh"]),
+        ("lerobot-bomb --completion ", ["bash", "zsh"]),
+        ("lerobot-bomb checkpoint merge --out", ["--output"]),
+        ("lerobot-bomb view gal", ["gallery"]),
         ("lerobot-bomb push ler", ["lerobot-bomb"]),  # a file
         ("lerobot-bomb record --root ler", ["lerobot-bomb"]),
     ],
@@ -50,6 +52,6 @@ def test_commands_flags_and_files_are_offered(script: Path, line: str, offered: 
 
 
 def test_zsh_has_a_script_of_its_own(capsys: pytest.CaptureFixture[str]) -> None:
-    assert main(["completion", "zsh"]) == 0
+    assert main(["--completion=zsh"]) == 0
     printed = capsys.readouterr().out
-    assert printed.startswith("#compdef lerobot-bomb") and "--perturbations" in printed
+    assert printed.startswith("#compdef lerobot-bomb") and "--env.perturbations" in printed

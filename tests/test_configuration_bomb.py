@@ -3,7 +3,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 import yaml
+from lerobot.configs import FeatureType, PolicyFeature
 from lerobot.envs import env_to_policy_features, make_env, make_env_config
+from lerobot.policies.act.configuration_act import ACTConfig
 from lerobot.utils.import_utils import register_third_party_plugins
 
 from lerobot_bomb.bomb.perturbations import NUISANCES
@@ -22,6 +24,17 @@ def test_policy_side_features() -> None:
         "observation.images.workspace": ("VISUAL", (3, 64, 64)),
         "observation.images.wrist": ("VISUAL", (3, 64, 64)),
     }
+
+
+def test_images_are_as_large_as_the_policy_was_trained_on_unless_a_flag_says_otherwise() -> None:
+    image = PolicyFeature(FeatureType.VISUAL, (3, 96, 96))
+    trained = ACTConfig(input_features={"observation.images.wrist": image, "observation.images.top": image})
+    cases = ((None, trained, 96), (64, trained, 64), (None, ACTConfig(), 256), (None, None, 256))
+    for given, config, side in cases:
+        env = BombEnvConfig(image_size=given)
+        env.take_image_size(config)
+        assert env.features["observation.images.workspace"].shape == (side, side, 3)
+        assert env.render_options.image_size == env.environment.image_size == side
 
 
 def test_a_suite_maps_task_numbers_to_vector_envs() -> None:

@@ -11,9 +11,9 @@ import pytest
 from lerobot.datasets import LeRobotDataset
 from pusht_cases import NUM_EPISODES, REPO_ID, ZARR, Demonstrations
 
-from lerobot_bomb.commands.convert import convert_pusht
 from lerobot_bomb.data import blocks, resumable
 from lerobot_bomb.data.kept_blocks import finished_blocks
+from lerobot_bomb.data.pusht_conversion import convert_pusht
 
 CHUNK_SIZE = 10  # actions
 

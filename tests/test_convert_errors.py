@@ -11,7 +11,7 @@ import pytest
 from pusht_cases import REPO_ID, Demonstrations, write_zarr
 
 from lerobot_bomb.commands import main as cli
-from lerobot_bomb.commands.convert import convert_pusht
+from lerobot_bomb.data.pusht_conversion import convert_pusht
 from lerobot_bomb.data.unfinished import lock_folder
 
 
@@ -134,11 +134,9 @@ def test_two_conversions_into_one_folder_are_refused(pusht_zarr: Path, tmp_path:
 @pytest.mark.parametrize(
     ("flags", "expected"),
     [
-        (["aloha-hdf5", "x"], "pusht-zarr"),
         (["libero-hdf5", "x"], "--repo_id"),
         (["pusht-zarr", "x"], "--repo_id"),
         (["pusht-zarr", "--repo_id=a/b"], "path"),
-        ([], "SOURCE"),
     ],
 )
 def test_missing_and_unknown_arguments_are_named(
@@ -147,6 +145,11 @@ def test_missing_and_unknown_arguments_are_named(
     with pytest.raises(SystemExit, match="2"):
         cli.main(["convert", *flags])
     assert expected in capsys.readouterr().err.splitlines()[-1]
+
+
+def test_an_unknown_source_is_answered_with_those_that_there_are(capsys: pytest.CaptureFixture[str]) -> None:
+    assert cli.main(["convert", "aloha-hdf5", "x"]) == 2
+    assert "there are pusht-zarr, libero-hdf5" in capsys.readouterr().err
 
 
 def test_a_bad_repo_id_is_named(pusht_zarr: Path, capsys: pytest.CaptureFixture[str]) -> None:

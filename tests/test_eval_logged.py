@@ -1,4 +1,4 @@
-"""``lerobot-bomb eval`` and the file it writes."""
+"""``lerobot-bomb results actions`` and the file it writes."""
 
 import json
 from pathlib import Path
@@ -9,8 +9,8 @@ import pytest
 
 from lerobot_bomb.bomb.episode import EpisodeSpec
 from lerobot_bomb.bomb.observation import RenderOptions
-from lerobot_bomb.commands.eval import LoggedVectorEnv
 from lerobot_bomb.commands.main import main
+from lerobot_bomb.commands.results_actions import LoggedVectorEnv
 from lerobot_bomb.envs.rollout import make_env
 from lerobot_bomb.evaluation.executed import append_episode, read_executed
 from lerobot_bomb.evaluation.results import read_results
@@ -58,7 +58,16 @@ def test_an_episode_is_written_once_when_it_ends() -> None:
 
 
 def evaluate(path: Path, *flags: str) -> int:
-    return main(["eval", str(path), "--policy.device=cpu", f"--output_dir={path.parent / 'eval'}", *flags])
+    return main(
+        [
+            "results",
+            "actions",
+            str(path),
+            "--policy.device=cpu",
+            f"--output_dir={path.parent / 'eval'}",
+            *flags,
+        ]
+    )
 
 
 @pytest.mark.parametrize("is_async", ["true", "false"])
@@ -104,13 +113,13 @@ def test_a_file_holds_one_evaluation(tmp_path: Path, capsys: pytest.CaptureFixtu
     path = tmp_path / "actions.jsonl"
     path.write_text("old")
     assert evaluate(path) == 1
-    assert f"lerobot-bomb eval: {path} exists already" in capsys.readouterr().err
+    assert f"lerobot-bomb results actions: {path} exists already" in capsys.readouterr().err
     assert path.read_text() == "old"
     assert evaluate(tmp_path / "absent" / "actions.jsonl") == 1
     assert "give a file in a folder that exists" in capsys.readouterr().err
     for flags in ([], ["--policy.type=bomb_expert"]):
         with pytest.raises(SystemExit, match="2"):
-            main(["eval", *flags])
+            main(["results", "actions", *flags])
         assert capsys.readouterr().err.endswith("the following arguments are required: FILE\n")
 
 
@@ -143,7 +152,10 @@ def test_lines_are_read_as_they_were_written(tmp_path: Path) -> None:
         ([], "no episode"),
         ([line(), '{"group": "g", "ta'], ":2: not the actions of an episode"),
         (["[1, 2]"], ":1: not the actions of an episode"),
-        ([json.dumps({"seed": 1})], ":1: not the actions of an episode, as `lerobot-bomb eval` writes them$"),
+        (
+            [json.dumps({"seed": 1})],
+            ":1: not the actions of an episode, as `lerobot-bomb results actions` writes them$",
+        ),
         ([line(actions=[[1, 2], [3]])], ":1: not the actions of an episode"),
         ([line(actions=[])], r":1: actions have the shape \(0,\), not \(T, D\)"),
         ([line(), line()], ":2: g, task 0, seed 1 was there already"),

@@ -99,7 +99,12 @@ def test_an_exported_backbone_is_where_another_policy_starts(tmp_path: Path) -> 
     for pipeline in make_pre_post_processors(policy.config, dataset_stats=stats()):
         pipeline.save_pretrained(tmp_path / "checkpoint")
     base = tmp_path / "base"
-    assert main(["export-backbone", f"--policy.path={tmp_path / 'checkpoint'}", f"--output={base}"]) == 0
+    assert (
+        main(
+            ["checkpoint", "export-backbone", f"--policy.path={tmp_path / 'checkpoint'}", f"--output={base}"]
+        )
+        == 0
+    )
     other = make_policy(vlm_model_name=str(base), num_dims=2, image_size=84)
     weights = other.backbone.state_dict()
     assert weights and all(torch.equal(weights[k], w) for k, w in policy.backbone.state_dict().items())

@@ -1,4 +1,4 @@
-"""``lerobot-bomb fit-grid`` on recorded and converted demonstrations."""
+"""``lerobot-bomb checkpoint fit-grid`` on recorded and converted demonstrations."""
 
 import json
 import re
@@ -18,11 +18,11 @@ from pusht_cases import REPO_ID as PUSHT
 from lerobot_bomb.actions.grid_fit import normalised, normalised_rest
 from lerobot_bomb.actions.grid_settings import GridSettings, default_groups
 from lerobot_bomb.actions.grids import ActionGrids
-from lerobot_bomb.commands.fit_grid import CLIPPING, UNIFORM, action_bounds, quantisation_errors
 from lerobot_bomb.commands.main import main
 from lerobot_bomb.data.columns import read_columns
 from lerobot_bomb.data.record import record
 from lerobot_bomb.data.recording import Recording
+from lerobot_bomb.viewing.fitted_grid import CLIPPING, UNIFORM, action_bounds, quantisation_errors
 from lerobot_bomb.viewing.grid_plot import (
     BAR_RGB,
     EDGE_RGB,
@@ -46,7 +46,7 @@ def root(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def fit_grid(root: Path, *flags: str, repo_id: str = REPO_ID) -> int:
-    return main(["fit-grid", f"--dataset.repo_id={repo_id}", f"--dataset.root={root}", *flags])
+    return main(["checkpoint", "fit-grid", f"--dataset.repo_id={repo_id}", f"--dataset.root={root}", *flags])
 
 
 def table(text: str, title: str) -> dict[str, dict[str, float]]:
@@ -117,7 +117,7 @@ def test_errors_include_what_quantiles_clip(
     assert fit_grid(root, QUANTILES) == 0
     text = " ".join(capsys.readouterr().out.split())
     assert "actions are beyond the grid and are clipped to it" in text and "MIN_MAX clips nothing" in text
-    assert "`lerobot-bomb statistics FOLDER --mend` makes them so" in text
+    assert "`lerobot-bomb doctor dataset FOLDER --mend` makes them so" in text
     assert fit_grid(root, QUANTILES) == 0
     text = capsys.readouterr().out
     shown = table(text, "in the dataset's units")
@@ -216,7 +216,7 @@ def test_bad_flags_are_one_line(
 ) -> None:
     assert fit_grid(root, flag) == 1
     error = capsys.readouterr().err
-    assert error.startswith(f"lerobot-bomb fit-grid: {message}")
+    assert error.startswith(f"lerobot-bomb checkpoint fit-grid: {message}")
     assert error.count("\n") == 1
 
 
@@ -241,4 +241,4 @@ def test_quantiles_are_wanted_only_where_they_are_asked_for(
     assert fit_grid(folder, QUANTILES) == 1
     error = capsys.readouterr().err
     assert "QUANTILES needs the statistics q01, q99, which the dataset lacks" in error
-    assert "`lerobot-bomb statistics FOLDER --mend` adds them\n" in error
+    assert "`lerobot-bomb doctor dataset FOLDER --mend` adds them\n" in error

@@ -49,7 +49,7 @@ def test_a_wrong_flag_in_a_config_file_is_one_line(
     assert capsys.readouterr().err.strip().splitlines()[-1] == f"error: {MESSAGES[command]}"
     if command == "lerobot-eval":
         with pytest.raises(SystemExit, match="1"):
-            cli.main(["eval", str(tmp_path / "actions.jsonl"), f"--config_path={path}"])
+            cli.main(["results", "actions", str(tmp_path / "actions.jsonl"), f"--config_path={path}"])
         assert capsys.readouterr().err.strip().splitlines()[-1] == f"error: {MESSAGES[command]}"
 
 

@@ -1,4 +1,4 @@
-"""`lerobot-bomb gallery`: the sheets show the environment, the page says what the table says."""
+"""`lerobot-bomb view gallery`: the sheets show the environment, the page says what the table says."""
 
 import re
 from collections.abc import Mapping
@@ -14,7 +14,7 @@ from lerobot_bomb.bomb.observation import RenderOptions
 from lerobot_bomb.bomb.perturbations import AXES
 from lerobot_bomb.bomb.suite import find_suite, specs_of_tasks
 from lerobot_bomb.commands import main as cli
-from lerobot_bomb.commands.gallery import (
+from lerobot_bomb.commands.view_gallery import (
     COLUMNS,
     PATH_RGB,
     SHEETS,
@@ -139,7 +139,7 @@ def test_a_path_is_drawn_where_it_went() -> None:
 
 def test_the_command_writes_small_sheets_and_replaces_its_own(tmp_path: Path) -> None:
     folder = tmp_path / "sheets"
-    flags = ["gallery", "--axes=[light,language]", "--seeds=[3]", f"--image_size={SIZE}"]
+    flags = ["view", "gallery", "--axes=[light,language]", "--seeds=[3]", f"--image_size={SIZE}"]
     assert cli.main([*flags, f"--output={folder}"]) == 0
     (folder / "light.jpg").write_bytes(b"an older one")
     assert cli.main([*flags, f"--output={folder}"]) == 0
@@ -154,15 +154,15 @@ def test_the_command_writes_small_sheets_and_replaces_its_own(tmp_path: Path) ->
     ("flag", "message"),
     [
         ("--axes=camra", "--axes='camra' is unknown; choose one of: table, reflectance"),
-        ("--image_size=8", "--image_size=8 must lie in 32..1024"),
+        ("--image_size=8", "--env.image_size=8 must lie in 32..1024"),
         ("--seeds=99999999999", "--seeds: 99999999999 must lie in 0.."),
     ],
 )
 def test_a_bad_flag_is_named_and_nothing_is_written(
     flag: str, message: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    assert cli.main(["gallery", flag, f"--output={tmp_path / 'x'}"]) == 1
-    assert capsys.readouterr().err.startswith(f"lerobot-bomb gallery: {message}")
+    assert cli.main(["view", "gallery", flag, f"--output={tmp_path / 'x'}"]) == 1
+    assert capsys.readouterr().err.startswith(f"lerobot-bomb view gallery: {message}")
     assert list(tmp_path.iterdir()) == []
 
 
@@ -190,7 +190,7 @@ def test_a_sheet_of_pusht_shows_its_environment(tmp_path: Path) -> None:
         spec = PushTSpec(3, perturbations=f"goal:{level}")
         env = make_pusht_env(spec, SIZE)
         assert np.array_equal(env.reset(seed=3)[0]["pixels"], image)
-    flags = ["gallery", "--env.type=bomb_pusht", f"--image_size={SIZE}", f"--output={tmp_path}"]
+    flags = ["view", "gallery", "--env.type=bomb_pusht", f"--image_size={SIZE}", f"--output={tmp_path}"]
     assert cli.main([*flags, "--axes=dynamics"]) == 0
     assert [path.name for path in tmp_path.iterdir()] == ["dynamics.jpg"]
 
@@ -219,7 +219,7 @@ def test_a_suites_sheet_shows_every_task_and_what_the_expert_leaves() -> None:
 def test_a_flag_that_pusht_does_not_have_is_named(
     flags: list[str], message: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    assert cli.main(["gallery", "--env.type=bomb_pusht", *flags, f"--output={tmp_path / 'x'}"]) == 1
+    assert cli.main(["view", "gallery", "--env.type=bomb_pusht", *flags, f"--output={tmp_path / 'x'}"]) == 1
     assert message in capsys.readouterr().err
 
 

@@ -16,11 +16,12 @@ POLICY_PREFIX = "lerobot_policy_"
 POLICY_TYPES = {name.removeprefix(POLICY_PREFIX) for name in PACKAGES if name.startswith(POLICY_PREFIX)} - {
     ENTRY.removeprefix(POLICY_PREFIX)
 }
-# commands that are about certain policies
+# what is about certain policies
 NAMES_POLICIES = {
-    "convert_spatialvla.py": {"spatialvla_grid"},  # whose format it writes
-    "audit.py": {"bomb_expert", "bomb_random"},  # ceiling and floor
-    "demo.py": {"vla0_smol", "bomb_expert", "bomb_random"},  # who plays
+    "checkpoints/spatialvla_folder.py": {"spatialvla_grid"},  # whose format it writes
+    "commands/audit.py": {"bomb_expert", "bomb_random"},  # ceiling and floor
+    "commands/demo.py": {"vla0_smol", "bomb_expert", "bomb_random"},  # who plays
+    "commands/table.py": {"vla0_smol", "fdvla", "bomb_expert"},  # examples of commands
 }
 HEAVY = {"torch", "lerobot", "transformers", "rerun", "cv2"}
 NOT_OURS = {"lerobot", "draccus", "argparse", "huggingface_hub", "datasets", "transformers"}
@@ -102,8 +103,7 @@ def test_core_imports_no_env_and_no_policy() -> None:
 
 def policies_named_wrongly(path: Path) -> set[str]:
     named = set(re.findall(rf"\b({'|'.join(POLICY_TYPES)})\b", path.read_text()))
-    allowed = NAMES_POLICIES.get(path.name, set()) if path.parent.name == "commands" else set()
-    return named ^ allowed
+    return named ^ NAMES_POLICIES.get(str(path.relative_to(ROOT / CORE)), set())
 
 
 def test_the_core_names_no_policy() -> None:
@@ -177,9 +177,22 @@ def test_what_simulator_workers_import_is_light() -> None:
     require_none("simulator workers import what takes seconds", found)
 
 
-def test_the_recorder_checks_its_flags_before_it_imports_anything_heavy() -> None:
-    for name in ("commands/record.py", "data/record.py"):
-        assert not imported(ROOT / "lerobot_bomb" / name, top_level_only=True) & HEAVY
+def found_with(path: Path, seen: set[Path]) -> set[str]:
+    """Return the top-level packages that are imported with a file, by it and by what of ours it imports."""
+    found = set[str]()
+    for name in imported_modules(path, top_level_only=True):
+        found.add(name.split(".")[0])
+        for file in (ROOT / f"{name.replace('.', '/')}.py", ROOT / name.replace(".", "/") / "__init__.py"):
+            if file.is_file() and file not in seen:
+                seen.add(file)
+                found |= found_with(file, seen)
+    return found
+
+
+def test_a_command_reads_its_flags_before_anything_heavy_is_imported() -> None:
+    found = ((path, found_with(path, {path}) & HEAVY) for path in files("lerobot_bomb/commands"))
+    require_none("commands import what takes seconds before they have read their flags", found)
+    assert "lerobot" in found_with(ROOT / "lerobot_bomb/viewing/checkpoint.py", set())
 
 
 def replaced(path: Path) -> set[str]:

@@ -1,4 +1,4 @@
-"""`lerobot-bomb init` writes what `lerobot-train --policy.path` starts from."""
+"""`lerobot-bomb checkpoint init` writes what `lerobot-train --policy.path` starts from."""
 
 from collections.abc import Callable
 from pathlib import Path
@@ -45,7 +45,7 @@ def test_a_base_is_what_training_from_scratch_starts_from(
 ) -> None:
     own = f"--policy.type={policy_type} --policy.vlm_model_name=nano --policy.device=cpu"
     own = f"{own} --policy.chunk_size=3 --policy.n_action_steps=2 {SMALL[policy_type]}".split()
-    assert main(["init", *own, *flags]) == 0
+    assert main(["checkpoint", "init", *own, *flags]) == 0
     base = tmp_path / "base"
     config, stats = read_config(base, None), LeRobotDatasetMetadata(REPO_ID, root=dataset).stats
     assert set(config.input_features or {}) >= {"observation.images.wrist", "observation.state"}
@@ -72,8 +72,8 @@ def test_a_base_is_what_training_from_scratch_starts_from(
 def test_a_wrong_flag_is_named(
     own: str, message: str, flags: list[str], capsys: pytest.CaptureFixture[str], tmp_path: Path
 ) -> None:
-    assert main(["init", *own.split(), *flags]) == 1
-    assert capsys.readouterr().err.startswith(f"lerobot-bomb init: {message}")
+    assert main(["checkpoint", "init", *own.split(), *flags]) == 1
+    assert capsys.readouterr().err.startswith(f"lerobot-bomb checkpoint init: {message}")
     assert not (tmp_path / "base").exists()
 
 
@@ -81,5 +81,5 @@ def test_a_folder_is_not_written_over(
     flags: list[str], capsys: pytest.CaptureFixture[str], tmp_path: Path
 ) -> None:
     (tmp_path / "base").mkdir()
-    assert main(["init", "--policy.type=vla0_smol", *flags]) == 1
+    assert main(["checkpoint", "init", "--policy.type=vla0_smol", *flags]) == 1
     assert "exists already; name a new folder" in capsys.readouterr().err

@@ -169,7 +169,10 @@ def make_base(policy_type: str, dataset: Path, folder: Path, points: bool = Fals
     own += f" --policy.chunk_size=3 --policy.n_action_steps=3 {SMALL[policy_type]}"
     own += f" --policy.pointing={str(points).lower()}"
     data = f"--dataset.repo_id={REPO_ID} --dataset.root={dataset}"
-    assert main(["init", *own.split(), *as_flags(TWO_LAYERS), *data.split(), f"--output={folder}"]) == 0
+    assert (
+        main(["checkpoint", "init", *own.split(), *as_flags(TWO_LAYERS), *data.split(), f"--output={folder}"])
+        == 0
+    )
     return folder
 
 
@@ -214,7 +217,7 @@ def check_merged(adapters: Path, output: Path) -> None:
     """Check that the merged policy acts as base and adapters do, and needs no base."""
     config = read_config(adapters, "cpu")
     wrapped = make_policy(config, env_cfg=make_env_config("bomb", image_size=64)).eval()
-    assert main(["merge", f"--policy.path={adapters}", f"--output={output}"]) == 0
+    assert main(["checkpoint", "merge", f"--policy.path={adapters}", f"--output={output}"]) == 0
     base = Path(peft.PeftConfig.from_pretrained(str(adapters)).base_model_name_or_path)
     base.rename(base.with_name("moved"))
     policy = get_policy_class(config.type).from_pretrained(str(output))
@@ -230,7 +233,7 @@ def test_what_cannot_be_merged_is_told(
     dataset: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     base = make_base("vla0_smol", dataset, tmp_path / "base")
-    assert main(["merge", f"--policy.path={base}", f"--output={tmp_path / 'merged'}"]) == 1
+    assert main(["checkpoint", "merge", f"--policy.path={base}", f"--output={tmp_path / 'merged'}"]) == 1
     assert "is a whole checkpoint: there is nothing to merge" in capsys.readouterr().err
     policy = get_policy_class("vla0_smol").from_pretrained(str(base))
     policy.config.pretrained_path = tmp_path / "elsewhere"
@@ -239,7 +242,17 @@ def test_what_cannot_be_merged_is_told(
     policy.config.save_pretrained(tmp_path / "adapters")
     for state in base.glob("policy_p*"):
         shutil.copy(state, tmp_path / "adapters")
-    assert main(["merge", f"--policy.path={tmp_path / 'adapters'}", f"--output={tmp_path / 'merged'}"]) == 1
+    assert (
+        main(
+            [
+                "checkpoint",
+                "merge",
+                f"--policy.path={tmp_path / 'adapters'}",
+                f"--output={tmp_path / 'merged'}",
+            ]
+        )
+        == 1
+    )
     error = capsys.readouterr().err
     assert "elsewhere, as adapter_config.json says, which cannot be loaded: there is no folder" in error
     assert error.count("\n") == 1
@@ -257,7 +270,7 @@ def test_adapters_on_a_checkpoint_with_relative_actions_of_other_data_are_refuse
     meta = LeRobotDatasetMetadata(REPO_ID, root=dataset)
     loaded = type(policy).from_pretrained(tmp_path, config=policy.config, dataset_meta=meta)
     loaded.config.pretrained_path = tmp_path
-    with pytest.raises(ValueError, match=r"relative\.scale.* lerobot-bomb init writes"):
+    with pytest.raises(ValueError, match=r"relative\.scale.* lerobot-bomb checkpoint init writes"):
         loaded.wrap_with_peft(peft_cli_overrides=LORA)
     loaded.save_pretrained(tmp_path / "fitted")
     fitted = type(policy).from_pretrained(tmp_path / "fitted", config=loaded.config, dataset_meta=meta)

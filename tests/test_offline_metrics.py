@@ -133,7 +133,7 @@ def test_batches_do_not_matter_and_the_json_holds_it_all(
         path = tmp_path / f"{batch_size}.json"
         flags = [f"--policy.path={checkpoint}", f"--dataset.repo_id={REPO_ID}", f"--dataset.root={root}"]
         more = ["--max_frames=8", f"--batch_size={batch_size}", f"--json={path}"]
-        assert main(["offline-metrics", *flags, *more]) == 0
+        assert main(["checkpoint", "offline-metrics", *flags, *more]) == 0
         figures.append(json.loads(path.read_text()))
     table = capsys.readouterr().out
     one, five = (of["columns"] for of in figures)
@@ -211,9 +211,9 @@ def test_bad_flags_are_one_line(
     monkeypatch.setattr(torch.cuda, "is_available", lambda: False)
     usual = {"--policy.path": checkpoint, "--dataset.repo_id": REPO_ID, "--dataset.root": root}
     usual |= dict(flag.split("=") for flag in flags.split())
-    assert main(["offline-metrics", *(f"{flag}={value}" for flag, value in usual.items())]) == 1
+    assert main(["checkpoint", "offline-metrics", *(f"{flag}={value}" for flag, value in usual.items())]) == 1
     error = capsys.readouterr().err
-    assert error.startswith("lerobot-bomb offline-metrics: ")
+    assert error.startswith("lerobot-bomb checkpoint offline-metrics: ")
     assert message in error
     assert error.count("\n") == 1
 
@@ -224,9 +224,11 @@ def test_an_absent_dataset_is_one_line(
     monkeypatch.setattr(dataset_metadata, "HF_LEROBOT_HOME", tmp_path)
     monkeypatch.setattr(dataset_metadata, "HF_LEROBOT_HUB_CACHE", tmp_path)
     flags = [f"--policy.path={checkpoint}", "--dataset.repo_id=test/absent"]
-    assert main(["offline-metrics", *flags]) == 1
+    assert main(["checkpoint", "offline-metrics", *flags]) == 1
     error = capsys.readouterr().err
-    assert error.startswith(f"lerobot-bomb offline-metrics: {tmp_path}/test/absent holds no dataset ")
+    assert error.startswith(
+        f"lerobot-bomb checkpoint offline-metrics: {tmp_path}/test/absent holds no dataset "
+    )
     assert "test/absent cannot be had from the Hub (" in error
     assert error.count("\n") == 1
 
@@ -253,7 +255,10 @@ def edited(checkpoint: Path, folder: Path, edit: Callable[[dict[str, Any]], None
             ),
             "the policy needs 'observation.images.top', which dataset test/offline has not",
         ),
-        (lambda config: config.update(use_peft=True), "the checkpoint holds adapters; lerobot-bomb merge"),
+        (
+            lambda config: config.update(use_peft=True),
+            "the checkpoint holds adapters; lerobot-bomb checkpoint merge",
+        ),
     ],
 )
 def test_a_policy_that_does_not_fit_is_refused(
@@ -266,15 +271,15 @@ def test_a_policy_that_does_not_fit_is_refused(
 ) -> None:
     path = edited(checkpoint, tmp_path / "other", edit)
     flags = [f"--policy.path={path}", f"--dataset.repo_id={REPO_ID}", f"--dataset.root={root}"]
-    assert main(["offline-metrics", *flags]) == 1
-    assert capsys.readouterr().err.startswith(f"lerobot-bomb offline-metrics: {message}")
+    assert main(["checkpoint", "offline-metrics", *flags]) == 1
+    assert capsys.readouterr().err.startswith(f"lerobot-bomb checkpoint offline-metrics: {message}")
 
 
 def test_what_was_trained_on_validates_only_when_named_and_with_a_warning(
     checkpoint: Path, root: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     flags = [f"--policy.path={checkpoint}", f"--dataset.repo_id={REPO_ID}", f"--dataset.root={root}"]
-    assert main(["offline-metrics", *flags, "--val_episodes=[1,2]", "--max_frames=1"]) == 0
+    assert main(["checkpoint", "offline-metrics", *flags, "--val_episodes=[1,2]", "--max_frames=1"]) == 0
     assert "warning: 1 of the 2 validation episodes were trained on" in capsys.readouterr().err
 
 
@@ -284,5 +289,5 @@ def test_a_checkpoint_that_does_not_say_what_it_saw_needs_the_flag(
     path = tmp_path / "untold"
     shutil.copytree(checkpoint, path, ignore=shutil.ignore_patterns("train_config.json"))
     flags = [f"--policy.path={path}", f"--dataset.repo_id={REPO_ID}", f"--dataset.root={root}"]
-    assert main(["offline-metrics", *flags]) == 1
+    assert main(["checkpoint", "offline-metrics", *flags]) == 1
     assert "has no train_config.json to tell which episodes" in capsys.readouterr().err

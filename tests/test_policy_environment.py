@@ -131,11 +131,11 @@ def test_commands_refuse_before_anything_is_played(
     flags = [f"--policy.path={path}", *env, "--policy.device=cpu", f"--output_dir={tmp_path / 'eval'}"]
     with pytest.raises(ValueError, match=TO_ABSOLUTE):
         stock_cli("lerobot-eval", *flags)
-    assert main(["eval", str(tmp_path / "actions.jsonl"), *flags]) == 1
+    assert main(["results", "actions", str(tmp_path / "actions.jsonl"), *flags]) == 1
     assert "evaluate with --env.control_mode=absolute" in capsys.readouterr().err
     view = ["view", f"--policy.path={path}", "--control_mode=absolute", f"--output={tmp_path / 'view'}"]
     assert main([*view, "--image_size=128"]) == 1
-    assert "evaluate with --image_size=64, or insist with --policy.ignore" in capsys.readouterr().err
+    assert "evaluate with --env.image_size=64, or insist with --policy.ignore" in capsys.readouterr().err
     assert not results.exists()
     assert not [*tmp_path.rglob("*.mp4"), *tmp_path.rglob("*.rrd")]
 

@@ -31,7 +31,13 @@ def test_one_demonstration_learned_by_heart(
     checkpoint = tmp_path / "train" / "checkpoints" / "last" / "pretrained_model"
 
     figures = tmp_path / "metrics.json"
-    command = ["offline-metrics", f"--policy.path={checkpoint}", "--val_episodes=0", f"--json={figures}"]
+    command = [
+        "checkpoint",
+        "offline-metrics",
+        f"--policy.path={checkpoint}",
+        "--val_episodes=0",
+        f"--json={figures}",
+    ]
     assert main([*command, *data]) == 0
     l1 = json.loads(figures.read_text())["columns"]["validation"]["l1"]
     l1_px = {name: each["all"]["mean"] for name, each in l1.items()}

@@ -68,7 +68,10 @@ def checkpoint(recorded: Path) -> Callable[..., Path]:
         flags += f" --policy.chunk_size={CHUNK} --policy.n_action_steps={EXECUTED} --policy.dtype=float32"
         data = [f"--dataset.repo_id={REPO_ID}", f"--dataset.root={recorded}", f"--output={path}"]
         if not path.exists():
-            assert main(["init", *flags.split(), *SMALL[policy_type].split(), *options, *data]) == 0
+            assert (
+                main(["checkpoint", "init", *flags.split(), *SMALL[policy_type].split(), *options, *data])
+                == 0
+            )
         return path
 
     return make

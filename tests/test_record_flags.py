@@ -15,7 +15,7 @@ import pytest
 from lerobot.envs import EnvConfig
 
 from lerobot_bomb.commands import main as cli
-from lerobot_bomb.commands.arguments import parse_conditions
+from lerobot_bomb.commands.arguments import LONG_FORMS, parse_conditions
 from lerobot_bomb.conditions import NONE
 from lerobot_bomb.data.kept_blocks import Progress, finish_block, write_json
 from lerobot_bomb.data.recording import Recording
@@ -74,7 +74,7 @@ def test_a_bad_flag_is_named_with_what_is_allowed(
     assert cli.main([*FLAGS, f"--root={tmp_path / 'x'}", flag]) == 1
     name, value = flag.split("=")
     message = capsys.readouterr().err
-    assert f" {name}=" in message
+    assert f" {LONG_FORMS.get(name, name)}=" in message
     assert value in message.replace(", ", ",")
     assert allowed in message
     assert message.count("\n") == 1
@@ -252,7 +252,7 @@ def test_a_switch_takes_true_or_false(capsys: pytest.CaptureFixture[str]) -> Non
 
 def test_an_unknown_task_is_refused(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert cli.main([*FLAGS, f"--root={tmp_path / 'x'}", "--task_ids=[0,50]"]) == 1
-    assert "--task_ids has 50; 'place' has tasks 0..49" in capsys.readouterr().err
+    assert "--env.task_ids has 50; 'place' has tasks 0..49" in capsys.readouterr().err
 
 
 @pytest.mark.parametrize("text", ["[one]", "[1", "[[0,1]]", "[]", "1,", "-1"])
@@ -264,12 +264,12 @@ def test_task_ids_are_a_list_of_numbers(text: str, capsys: pytest.CaptureFixture
 
 def test_a_task_is_given_once(capsys: pytest.CaptureFixture[str]) -> None:
     assert cli.main([*FLAGS, "--task_ids=[1,7,1]"]) == 1
-    assert "--task_ids=[1, 7, 1] has a task twice" in capsys.readouterr().err
+    assert "--env.task_ids=[1, 7, 1] has a task twice" in capsys.readouterr().err
 
 
 def test_a_task_outside_the_split_is_refused(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert cli.main([*FLAGS, f"--root={tmp_path / 'x'}", "--task_ids=0,3", "--split=train"]) == 1
-    assert "the target [0, 3] is not in --split=train" in capsys.readouterr().err
+    assert "the target [0, 3] is not in --env.split=train" in capsys.readouterr().err
     assert list(tmp_path.iterdir()) == []
 
 
@@ -279,16 +279,15 @@ def test_numbered_tasks_and_a_target_exclude_each_other(
 ) -> None:
     for command in ([*FLAGS, f"--root={tmp_path / 'x'}"], ["view", f"--output={tmp_path / 'x'}"]):
         assert cli.main([*command, "--task_ids=[7]", flag]) == 1
-        message = (
-            f"lerobot-bomb {command[0]}: --task_ids fixes targets and colours; drop --target and --color\n"
-        )
-        assert capsys.readouterr().err == message
+        error = capsys.readouterr().err
+        assert error.startswith(f"lerobot-bomb {command[0]}: --env.task_ids fixes targets and colours; drop")
+        assert error.endswith("drop --env.target and --env.color\n")
     assert list(tmp_path.iterdir()) == []
 
 
 def test_a_target_outside_the_split_is_refused(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert cli.main([*FLAGS, f"--root={tmp_path / 'x'}", "--target=[0,3]", "--split=train"]) == 1
-    assert "--target=[0, 3] is not in --split=train" in capsys.readouterr().err
+    assert "--env.target=[0, 3] is not in --env.split=train" in capsys.readouterr().err
     assert list(tmp_path.iterdir()) == []
 
 
@@ -297,16 +296,16 @@ def test_an_episode_has_the_flags_of_the_environment(command: str) -> None:
     """Check both commands against --env.type=bomb: one set of names, with the same defaults."""
     parser = argparse.ArgumentParser()
     module = importlib.import_module(f"lerobot_bomb.commands.{command}")
-    getattr(module, f"add_{command}_arguments")(parser)
+    module.add_arguments(parser)
     ours = {action.dest: action.default for action in parser._actions}
+    flags = {action.dest: action.option_strings for action in parser._actions}
     env = BombEnvConfig()
     of_lerobot = {field.name for field in fields(EnvConfig)} - {"task", "fps"}
     names = {field.name for field in fields(env)} - of_lerobot - {"results_path", "ignore_checkpoint"}
     assert names <= ours.keys()
     assert names <= {field.name for field in fields(Recording)}
     several = {"task_ids": (), "perturbations": (NONE,)}  # None: one episode of the environment
-    if command == "view":  # of several environments, each with its own default
-        several["image_size"] = None
+    assert all({f"--env.{name}", f"--{name}"} <= {*flags[name]} for name in names)
     assert {name: ours[name] for name in names} == {name: getattr(env, name) for name in names} | several
 
 

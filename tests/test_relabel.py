@@ -60,7 +60,7 @@ def test_a_policy_of_another_environment_is_refused(
     assert main(flags(checkpoint, tmp_path / "own", task="spatial")) == 1
     error = capsys.readouterr().err
     assert "was trained for an environment with task=place; this one has task=spatial" in error
-    assert "record with --task=place, or train one for this" in error
+    assert "record with --env.task=place, or train one for this" in error
     assert not (tmp_path / "own").exists()
 
 
@@ -68,9 +68,9 @@ def test_a_policy_of_another_environment_is_refused(
     ("arguments", "message"),
     [
         (["--relabel"], "--relabel and --policy.path=FOLDER come together"),
-        (["--policy.path=nowhere"], "--relabel and --policy.path=FOLDER come together"),
-        (["--relabel", "--policy.path=nowhere"], "--policy.path=nowhere holds no model.safetensors"),
-        (["--relabel", "--policy.path=nowhere", "--workers=2"], "--workers=2: with --relabel"),
+        (["--policy.path=bomb:fdvla"], "--relabel and --policy.path=FOLDER come together"),
+        (["--relabel", "--policy.path=nowhere"], "--policy.path=nowhere: there is no such folder"),
+        (["--relabel", "--policy.path=bomb:fdvla", "--workers=2"], "--workers=2: with --relabel"),
     ],
 )
 def test_wrong_flags_are_named(

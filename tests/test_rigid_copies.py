@@ -8,7 +8,7 @@ import pytest
 from lerobot.datasets import LeRobotDataset
 from pusht_cases import NUM_EPISODES, REPO_ID, Demonstrations, put
 
-from lerobot_bomb.commands.convert import convert_pusht
+from lerobot_bomb.data.pusht_conversion import convert_pusht
 from lerobot_bomb.data.pusht_zarr import BOARD_SIZE, IMAGE_SIZE
 from lerobot_bomb.data.rigid_copies import MAX_SHIFT, RigidMotion
 

@@ -6,14 +6,17 @@ import subprocess
 import sys
 import time
 from collections.abc import Callable, Iterator
+from dataclasses import fields
 from pathlib import Path
 from typing import Any
 
 import pytest
 import torch
+from lerobot.async_inference.configs import PolicyServerConfig
 from robot_cases import BombArm, Loaded
 
 from lerobot_bomb.commands import main as cli
+from lerobot_bomb.commands.serve import SERVER_FLAGS
 from lerobot_bomb.data.record import record
 from lerobot_bomb.data.recording import Recording
 
@@ -90,7 +93,7 @@ def test_bomb_gets_the_chunks_that_the_policy_foresees_here(
     flags = f"--policy.type={policy_type} --policy.vlm_model_name=nano --policy.device=cpu"
     flags += f" --policy.chunk_size={CHUNK} --policy.n_action_steps={CHUNK} --policy.dtype=float32"
     data = [f"--dataset.repo_id={REPO_ID}", f"--dataset.root={dataset}", f"--output={path}"]
-    assert cli.main(["init", *flags.split(), *SMALL[policy_type].split(), *data]) == 0
+    assert cli.main(["checkpoint", "init", *flags.split(), *SMALL[policy_type].split(), *data]) == 0
     wait_until(lambda: answers(port))
     monkeypatch.chdir(tmp_path)  # LeRobot makes a folder for logs where it is imported
     from lerobot.async_inference import robot_client
@@ -147,7 +150,7 @@ def wait_until(happened: Callable[[], bool]) -> None:
 @pytest.mark.parametrize(
     ("flag", "message"),
     [
-        ("--port=99999", "Port must be between 1 and 65535, got 99999"),
+        ("--port=99999", "--port=99999 must lie in 1..65535"),
         ("--fps=0", "--fps=0 must be at least 1"),
         ("--host=nowhere.invalid", "--host=nowhere.invalid --port=8080: "),
         ("--host=0.0.0.0", "--host=0.0.0.0 lets other machines in, who need no password"),
@@ -176,11 +179,15 @@ def test_help_names_the_danger_and_the_host(capsys: pytest.CaptureFixture[str]) 
     assert "Host address to bind the server to (default: 127.0.0.1)" in text
 
 
+def test_the_flags_are_those_of_lerobots_server_but_for_the_host() -> None:
+    theirs = {each.name: (each.default, each.metadata["help"]) for each in fields(PolicyServerConfig)}
+    assert theirs | {"host": ("127.0.0.1", theirs["host"][1])} == SERVER_FLAGS
+
+
 def test_the_extra_is_named_where_grpc_is_missing(
     monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    monkeypatch.delitem(sys.modules, "lerobot_bomb.commands.serve", raising=False)
-    monkeypatch.setitem(sys.modules, "lerobot.async_inference.configs", None)
+    monkeypatch.setitem(sys.modules, "grpc", None)
     assert cli.main(["serve"]) == 1
     message = "the server needs grpc: pip install 'lerobot_policy_bomb[async]'"
     assert capsys.readouterr().err == f"lerobot-bomb serve: {message}\n"

@@ -53,7 +53,6 @@ def test_lerobot_eval_takes_the_name_and_it_places_stones(name: str, stock_cli: 
         f"--policy.path=bomb:{name}",
         "--policy.device=cpu",
         "--env.type=bomb",
-        "--env.image_size=64",
         f"--env.results_path={results}",
         "--eval.n_episodes=6",
         "--eval.batch_size=6",
@@ -64,7 +63,8 @@ def test_lerobot_eval_takes_the_name_and_it_places_stones(name: str, stock_cli: 
 
 
 def test_another_environment_is_refused_with_the_flag_to_give(stock_cli: Run, tmp_path: Path) -> None:
-    flags = "--env.type=bomb --eval.n_episodes=1 --eval.batch_size=1 --eval.use_async_envs=false"
+    flags = "--env.type=bomb --env.image_size=96 --eval.n_episodes=1 --eval.batch_size=1"
+    flags += " --eval.use_async_envs=false"
     with pytest.raises(ValueError, match=r"--env\.image_size=64"):
         stock_cli(
             "lerobot-eval", f"--policy.path=bomb:{demo.POLICY}", *flags.split(), f"--output_dir={tmp_path}"
@@ -101,7 +101,7 @@ def test_an_unknown_name_is_one_line_with_the_names(
 ) -> None:
     with pytest.raises(SystemExit, match=rf"--policy\.path=bomb:nobody: no .*: .*{demo.POLICY}"):
         stock_cli("lerobot-eval", "--policy.path=bomb:nobody", "--env.type=bomb")
-    assert main(["checkpoint", "nobody"]) == 1
+    assert main(["checkpoint", "path", "nobody"]) == 1
     assert demo.POLICY in capsys.readouterr().err
     with pytest.raises(SystemExit):
         main(["view", "--policy.path=bomb:nobody"])
@@ -109,9 +109,9 @@ def test_an_unknown_name_is_one_line_with_the_names(
 
 
 def test_the_command_prints_a_folder_or_all(capsys: pytest.CaptureFixture[str]) -> None:
-    assert main(["checkpoint", demo.POLICY]) == 0
+    assert main(["checkpoint", "path", demo.POLICY]) == 0
     assert Path(capsys.readouterr().out.strip()) == FOLDER / demo.POLICY
-    assert main(["checkpoint"]) == 0
+    assert main(["checkpoint", "path"]) == 0
     assert capsys.readouterr().out.split()[::2] == [f"bomb:{name}" for name in NAMES]
     assert checkpoint_path("some/folder") == "some/folder"
 

@@ -1,4 +1,4 @@
-"""``lerobot-bomb smoothness``; tests/test_smoothness.py has the mathematics."""
+"""``lerobot-bomb results smoothness``; tests/test_smoothness.py has the mathematics."""
 
 import json
 from pathlib import Path
@@ -124,7 +124,7 @@ def test_people_and_policies_side_by_side(
 ) -> None:
     path = tmp_path / "figures.json"
     flags = [f"--dataset.repo_id={REPO_ID}", f"--dataset.root={pusht_dataset}", f"--json={path}"]
-    assert main(["smoothness", *flags, *map(str, logs), str(pusht_dataset)]) == 0
+    assert main(["results", "smoothness", *flags, *map(str, logs), str(pusht_dataset)]) == 0
     output = capsys.readouterr()
     assert output.err == ""
     assert output.out.startswith("action dims target_x, target_y; left out: none\n")
@@ -150,7 +150,7 @@ def test_rates_that_differ_are_told(
     append_episode(log, "pusht", 0, 1, 20, np.arange(10.0).reshape(5, 2) ** 2)
     flags = [f"--dataset.repo_id={REPO_ID}", f"--dataset.root={pusht_dataset}", str(log)]
     for more, is_told in ([], True), (["--per_second"], False), (["--fps=10"], False):
-        assert main(["smoothness", *flags, *more]) == 0
+        assert main(["results", "smoothness", *flags, *more]) == 0
         assert ("has 20 actions a second" in capsys.readouterr().err) == is_told
 
 
@@ -163,7 +163,10 @@ def test_rates_that_differ_are_told(
         (["--fps=nan"], "--fps=nan must be a positive number"),
         (["--json=absent/figures.json"], "--json=absent/figures.json cannot be written"),
         (["--json=short.jsonl"], "--json=short.jsonl exists already; name a new file"),
-        (["absent.jsonl"], "absent.jsonl: no such file or folder; `lerobot-bomb eval absent.jsonl"),
+        (
+            ["absent.jsonl"],
+            "absent.jsonl: no such file or folder; `lerobot-bomb results actions absent.jsonl",
+        ),
         (["short.jsonl"], "short.jsonl: no episode has 4 actions"),
         (["three.jsonl"], f"three.jsonl: actions have 3 dims, those of {REPO_ID} 2"),
         (["short.jsonl", "short.jsonl"], "short.jsonl is named twice"),
@@ -183,18 +186,21 @@ def test_bad_input_is_one_line(
     append_episode(Path("short.jsonl"), "pusht", 0, 1, 10, np.zeros((3, 2)))
     append_episode(Path("three.jsonl"), "pusht", 0, 1, 10, np.zeros((5, 3)))
     usual = [f"--dataset.repo_id={REPO_ID}", f"--dataset.root={pusht_dataset}"]
-    assert main(["smoothness", *usual, *flags]) == 1
+    assert main(["results", "smoothness", *usual, *flags]) == 1
     error = capsys.readouterr().err
-    assert error.startswith("lerobot-bomb smoothness: ") and error.count("\n") == 1
+    assert error.startswith("lerobot-bomb results smoothness: ") and error.count("\n") == 1
     with pytest.raises(ValueError, match=message):
         raise ValueError(error)
 
 
 def test_an_unknown_flag_shows_the_commands_own_usage(capsys: pytest.CaptureFixture[str]) -> None:
     with pytest.raises(SystemExit, match="2"):
-        main(["smoothness", f"--dataset.repo_id={REPO_ID}", "--per_seconds_"])
+        main(["results", "smoothness", f"--dataset.repo_id={REPO_ID}", "--per_seconds_"])
     error = capsys.readouterr().err
-    assert error.startswith("usage: lerobot-bomb smoothness") and "unrecognized arguments: --per_sec" in error
+    assert (
+        error.startswith("usage: lerobot-bomb results smoothness")
+        and "unrecognized arguments: --per_sec" in error
+    )
 
 
 def test_a_dim_that_never_changes_has_no_unit() -> None:

@@ -86,14 +86,16 @@ def test_adapters_hold_the_cells_of_adapted_grids(
     config: Any = read_config(folders[0], "cpu")
     assert config.grid_params == expected.config.grid_params
     assert config.grid_params != load(base)[0].config.grid_params
-    assert main(["merge", f"--policy.path={folders[0]}", f"--output={tmp_path / 'merged'}"]) == 0
+    assert (
+        main(["checkpoint", "merge", f"--policy.path={folders[0]}", f"--output={tmp_path / 'merged'}"]) == 0
+    )
     wrapped = make_policy(config, ds_meta=meta).eval()
     merged, preprocessor, _ = load(tmp_path / "merged")
     assert merged.grids.to_dict() == expected.grids.to_dict()
     batch = preprocessor(observations(2))
     actions = wrapped.predict_action_chunk(batch)
     torch.testing.assert_close(merged.predict_action_chunk(batch), actions, atol=1e-4, rtol=0)
-    with pytest.raises(ValueError, match=r"holds adapters and cells of other grids .* lerobot-bomb merge"):
+    with pytest.raises(ValueError, match=r"holds adapters and cells of other grids .* checkpoint merge"):
         make_policy(read_config(folders[0], "cpu"), ds_meta=make_dataset(tmp_path / "other", 0.6))
 
 

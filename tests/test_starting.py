@@ -16,7 +16,7 @@ from torch.utils.data import DataLoader
 from lerobot_bomb.commands.main import main
 
 TRAINED_ON = ("workspace", "wrist")  # of 64 pixels, state and action of 4 numbers
-WAY_OUT = r"lerobot-bomb export-backbone --policy.path=\S+ --output=FOLDER, then lerobot-train"
+WAY_OUT = r"lerobot-bomb checkpoint export-backbone --policy.path=\S+ --output=FOLDER, then lerobot-train"
 
 
 @pytest.fixture(scope="module")
@@ -134,7 +134,7 @@ def test_the_exported_backbone_starts_on_any_data(
     checkpoints: dict[str, Path], datasets: dict[str, LeRobotDataset], policy_type: str, tmp_path: Path
 ) -> None:
     checkpoint, base = checkpoints[policy_type], tmp_path / "base"
-    assert main(["export-backbone", f"--policy.path={checkpoint}", f"--output={base}"]) == 0
+    assert main(["checkpoint", "export-backbone", f"--policy.path={checkpoint}", f"--output={base}"]) == 0
     layout = {"action_layout": "joints"} if policy_type == "spatialvla_grid" else {}
     config = from_flags(policy_type, vlm_model_name=str(base), nano_config=None, **layout)
     policy = make_policy(config, ds_meta=datasets["all"].meta)

@@ -162,7 +162,7 @@ def test_of_a_scene_a_chunk_is_its_first_action(recorded: dict[str, Path]) -> No
 
 def test_scenes_are_no_episodes(recorded: dict[str, Path], capsys: pytest.CaptureFixture[str]) -> None:
     scenes = ["--dataset.repo_id=test/static", f"--dataset.root={recorded['scenes']}"]
-    assert main(["smoothness", *scenes]) == 1
+    assert main(["results", "smoothness", *scenes]) == 1
     told = "episode 0 of test/static holds static scenes, which do not follow each other"
     assert told in capsys.readouterr().err
     meta = LeRobotDatasetMetadata("test/static", root=recorded["scenes"])
@@ -173,7 +173,10 @@ def test_scenes_are_no_episodes(recorded: dict[str, Path], capsys: pytest.Captur
     )
     with pytest.raises(ValueError, match=told):
         policy_for(config, ds_meta=meta)
-    assert main(["smoothness", "--dataset.repo_id=t/e", f"--dataset.root={recorded['episodes']}"]) == 0
+    assert (
+        main(["results", "smoothness", "--dataset.repo_id=t/e", f"--dataset.root={recorded['episodes']}"])
+        == 0
+    )
 
 
 def test_no_chunk_is_longer_than_every_episode(recorded: dict[str, Path]) -> None:
@@ -265,8 +268,8 @@ def test_lerobot_merges_scenes_with_demonstrations_and_the_suite_stays_known(
         ("--static=3", "--static=3 must be in 1..2 or a multiple of 2"),
         ("--episodes=0", "--episodes=0 must be at least 1"),
         ("--static=2 --noise=0.05", "--noise=0.05: static scenes are not played"),
-        ("--static=2 --task=all --task_ids=[1]", "--task_ids=[1] are numbers in a suite"),
-        ("--static=2 --task=every", "--task='every' is unknown; choose one of: goal, long"),
+        ("--static=2 --task=all --task_ids=[1]", "--env.task_ids=[1] are numbers in a suite"),
+        ("--static=2 --task=every", "--env.task='every' is unknown; choose one of: goal, long"),
     ],
 )
 def test_wrong_flags_are_named(flags: str, message: str, capsys: pytest.CaptureFixture[str]) -> None:

@@ -1,4 +1,4 @@
-"""Statistics of all frames: what is compared with them, and `lerobot-bomb statistics`."""
+"""Statistics of all frames: what is compared with them, and `lerobot-bomb doctor dataset`."""
 
 import json
 import logging
@@ -66,7 +66,7 @@ def test_statistics_of_numbers_that_one_can_count() -> None:
 
 def test_a_recording_is_right_and_stays_as_it_is(recorded: Path, capsys: pytest.CaptureFixture[str]) -> None:
     before = (recorded / STATS).read_bytes()
-    assert main(["statistics", str(recorded), "--mend"]) == 0
+    assert main(["doctor", "dataset", str(recorded), "--mend"]) == 0
     assert capsys.readouterr().out == f"{recorded}: the statistics of its numbers are those of all frames\n"
     assert (recorded / STATS).read_bytes() == before
 
@@ -78,23 +78,23 @@ def test_a_conversion_is_right(pusht_dataset: Path) -> None:
 def test_means_over_episodes_are_named_and_mended(
     averaged: Path, recorded: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    assert main(["statistics", str(averaged)]) == 3
+    assert main(["doctor", "dataset", str(averaged)]) == 3
     named, way_out = capsys.readouterr().out.splitlines()
     assert named.startswith("action: q01, q99 are missing or not those of all frames; ")
-    assert way_out == f"`lerobot-bomb statistics {averaged} --mend` writes those of all frames"
-    assert main(["push-dataset", str(averaged), f"--repo_id={REPO_ID}", "--dry_run"]) == 1
+    assert way_out == f"`lerobot-bomb doctor dataset {averaged} --mend` writes those of all frames"
+    assert main(["push", str(averaged), f"--repo_id={REPO_ID}", "--dry_run"]) == 1
     assert f"{averaged / STATS}: {named}; {way_out}\n" in capsys.readouterr().err
-    assert main(["statistics", str(averaged), "--mend"]) == 0
+    assert main(["doctor", "dataset", str(averaged), "--mend"]) == 0
     assert (averaged / STATS).read_bytes() == (recorded / STATS).read_bytes()
 
 
 @pytest.mark.parametrize("name", ["mean", "std", "min", "max", "count", "q50"])
 def test_every_statistic_is_compared(name: str, averaged: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    assert main(["statistics", str(averaged), "--mend"]) == 0
+    assert main(["doctor", "dataset", str(averaged), "--mend"]) == 0
     value = json.loads((averaged / STATS).read_text())["action"][name]
     change(averaged, **{name: [value[0] + 1, *value[1:]]})
     capsys.readouterr()
-    assert main(["statistics", str(averaged)]) == 3
+    assert main(["doctor", "dataset", str(averaged)]) == 3
     assert capsys.readouterr().out.startswith(f"action: {name} are missing")
 
 
@@ -104,10 +104,10 @@ def test_a_dataset_of_which_frames_are_missing_is_not_judged(
     info = json.loads((averaged / "meta" / "info.json").read_text())
     info["total_frames"] += 1
     (averaged / "meta" / "info.json").write_text(json.dumps(info))
-    assert main(["statistics", str(averaged), "--mend"]) == 1
+    assert main(["doctor", "dataset", str(averaged), "--mend"]) == 1
     num_frames = info["total_frames"]
     message = f"{averaged} holds {num_frames - 1} of the dataset's {num_frames} frames\n"
-    assert capsys.readouterr().err == f"lerobot-bomb statistics: {message}"
+    assert capsys.readouterr().err == f"lerobot-bomb doctor dataset: {message}"
 
 
 @pytest.mark.parametrize("mode", [NormalizationMode.QUANTILES, NormalizationMode.MIN_MAX])
@@ -121,4 +121,4 @@ def test_a_training_that_normalises_by_quantiles_says_that_they_are_wrong(
         make_policy(config, ds_meta=LeRobotDatasetMetadata(REPO_ID, root=averaged))
     said = [each for each in caplog.messages if "action: q01, q99 are missing or not those" in each]
     assert len(said) == (mode is NormalizationMode.QUANTILES)
-    assert all(f"`lerobot-bomb statistics {averaged} --mend`" in each for each in said)
+    assert all(f"`lerobot-bomb doctor dataset {averaged} --mend`" in each for each in said)

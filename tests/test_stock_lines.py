@@ -65,7 +65,7 @@ def test_a_sweep_gives_the_lines_that_are_made_of_the_printed_command(
     assert "results_path" not in cell.command
     flags = [*cell.flags, f"--output_dir={tmp_path / 'eval'}"]
     stock_cli("lerobot-eval", *flags)
-    assert main(["lines", str(tmp_path / "stock.jsonl"), *flags]) == 0
+    assert main(["results", "add", str(tmp_path / "stock.jsonl"), *flags]) == 0
     assert (store.folder / "results.jsonl").read_text() == (tmp_path / "stock.jsonl").read_text()
     rows = read_results(tmp_path / "stock.jsonl")
     assert [row["spec"]["seed"] for row in rows] == SEEDS
@@ -196,7 +196,7 @@ def test_what_is_no_such_evaluation_is_told(
     for name, content in (("other", info("pusht", 0, [1.0, 0.0])), ("something", {})):
         (tmp_path / name).mkdir()
         (tmp_path / name / "eval_info.json").write_text(json.dumps(content))
-    assert main(["lines", "lines.jsonl", "--policy.type=bomb_random", *flags]) == 1
+    assert main(["results", "add", "lines.jsonl", "--policy.type=bomb_random", *flags]) == 1
     assert message in capsys.readouterr().err
     assert not (tmp_path / "lines.jsonl").exists()
 

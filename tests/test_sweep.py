@@ -271,7 +271,7 @@ def test_wrong_flags_are_told(
     [
         (["--polices=bomb_expert"], "--polices=bomb_expert; nearest: --policies"),
         (["--policies=bomb_expert", "--epsiodes=3"], "--epsiodes=3; nearest: --episodes"),
-        (["--policies=bomb_expert", "--task=place"], "--task=place; nearest: --tasks"),
+        (["--policies=bomb_expert", "--taks=place"], "--taks=place; nearest: --tasks"),
     ],
 )
 def test_misspelt_flags_of_its_own_are_told(

@@ -241,7 +241,7 @@ def test_a_checkpoint_acts_as_in_lerobot_eval(
     )
     expected, executed[:] = np.array(executed), []
     torch.manual_seed(0)
-    flags = [f"--policy.path={checkpoint}", "--policy.device=cpu", "--fps=2", "--image_size=64", "--seed=3"]
+    flags = [f"--policy.path={checkpoint}", "--policy.device=cpu", "--fps=2", "--seed=3"]
     assert cli.main(["view", *flags, f"--output={tmp_path / 'seen'}"]) == 0
     assert expected.shape == (20, 4)
     assert np.ptp(expected, axis=0).max() > 0.1  # it does not always do the same
@@ -256,19 +256,19 @@ def test_a_checkpoint_acts_as_in_lerobot_eval(
     ("flags", "message"),
     [
         ("--policy=oracle", "--policy='oracle' is unknown; choose expert or random, or --policy.path=FOLDER"),
-        ("--policy=expert --policy.path=x", "--policy=expert and --policy.path=x: give one of them"),
+        ("--policy=expert --policy.path=bomb:fdvla", "--policy=expert and --policy.path="),
         ("--policy.device=cpu", "--policy.device=cpu needs a checkpoint"),
         ("--policy.path=nowhere", "--policy.path=nowhere: there is no such folder"),
-        ("--target=[5,0]", "--target=[5, 0] is off the board"),
-        ("--target=[0,3] --split=train", "--target=[0, 3] is not in --split=train"),
-        ("--color=red", "--color='red' is unknown; choose one of: black, white"),
-        ("--robot=ur5", "--robot='ur5' is unknown"),
-        ("--fps=7", "--fps=7 does not divide"),
-        ("--image_size=8", "--image_size=8 must lie in 32..1024"),
+        ("--target=[5,0]", "--env.target=[5, 0] is off the board"),
+        ("--target=[0,3] --split=train", "--env.target=[0, 3] is not in --env.split=train"),
+        ("--color=red", "--env.color='red' is unknown; choose one of: black, white"),
+        ("--robot=ur5", "--env.robot='ur5' is unknown"),
+        ("--fps=7", "--env.fps=7 does not divide"),
+        ("--image_size=8", "--env.image_size=8 must lie in 32..1024"),
         ("--seed=-1", "--seed=-1 must lie in 0.."),
-        ("--perturbations=camra:3", "--perturbations='camra:3': 'camra' is not an axis"),
-        ("--perturbations=[none,camera:3]", "--perturbations=none,camera:3 must be one condition"),
-        ("--env.perturbations=camera:7", "--perturbations='camera:7': the levels of camera must lie"),
+        ("--perturbations=camra:3", "--env.perturbations='camra:3': 'camra' is not an axis"),
+        ("--perturbations=[none,camera:3]", "--env.perturbations=none,camera:3 must be one condition"),
+        ("--env.perturbations=camera:7", "--env.perturbations='camera:7': the levels of camera must lie"),
     ],
 )
 def test_a_bad_flag_is_named_and_nothing_is_written(
@@ -284,8 +284,8 @@ def test_a_bad_flag_is_named_and_nothing_is_written(
 @pytest.mark.parametrize(
     ("flags", "message"),
     [
-        ("--color=red", "--color='red' is unknown"),
-        ("--target=[0,3] --split=train", "--target=[0, 3] is not in --split=train"),
+        ("--color=red", "--env.color='red' is unknown"),
+        ("--target=[0,3] --split=train", "--env.target=[0, 3] is not in --env.split=train"),
         ("--policy.path=nowhere", "--policy.path=nowhere: there is no such folder"),
         ("", "{path} exists already"),
     ],

@@ -99,14 +99,14 @@ def test_a_checkpoint_acts_as_in_lerobot_eval(
     ("flags", "message"),
     [
         ("--policy=expert", "--policy='expert' is unknown; choose random, or --policy.path=FOLDER"),
-        ("--robot=fetch", "--robot=fetch is a flag of --env.type=bomb only; drop it"),
-        ("--image_size=8", "--image_size=8 must lie in 32..512"),
-        ("--max_steps=0", "--max_steps=0 must lie in 1.."),
-        ("--instruction=some", "--instruction='some' is unknown; choose one of: templates, none"),
-        ("--perturbations=camera:3", "--perturbations='camera:3': 'camera' is not an axis"),
-        ("--perturbations=none,goal:3", "--perturbations=none,goal:3 must be one condition"),
+        ("--robot=fetch", "--env.robot=fetch is a flag of --env.type=bomb only; drop it"),
+        ("--image_size=8", "--env.image_size=8 must lie in 32..512"),
+        ("--max_steps=0", "--env.max_steps=0 must lie in 1.."),
+        ("--instruction=some", "--env.instruction='some' is unknown; choose one of: templates, none"),
+        ("--perturbations=camera:3", "--env.perturbations='camera:3': 'camera' is not an axis"),
+        ("--perturbations=none,goal:3", "--env.perturbations=none,goal:3 must be one condition"),
         ("--env.type=pusht", "--env.type='pusht' is unknown; choose one of: bomb, bomb_pusht"),
-        ("--env.type=bomb", "--max_steps=12 is a flag of --env.type=bomb_pusht only; drop it"),
+        ("--env.type=bomb", "--env.max_steps=12 is a flag of --env.type=bomb_pusht only; drop it"),
     ],
 )
 def test_a_bad_flag_is_named_and_nothing_is_written(
@@ -123,8 +123,10 @@ def test_a_checkpoint_of_other_images_is_told_the_flag(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     policy = f"--policy.path={write_act(tmp_path / 'act', image_size=64)}"
-    assert main([*FLAGS, policy, f"--output={tmp_path / 'x'}"]) == 1
+    assert main([*FLAGS, policy, "--image_size=96", f"--output={tmp_path / 'x'}"]) == 1
     error = capsys.readouterr().err
-    assert "reads images of 64x64 pixels; this environment has --image_size=96: " in error
-    assert "evaluate with --image_size=64, or insist with --ignore_checkpoint=true" in error
-    assert main([*FLAGS, policy, "--ignore_checkpoint", f"--output={tmp_path / 'x'}"]) == 0
+    assert "reads images of 64x64 pixels; this environment has --env.image_size=96: " in error
+    assert "evaluate with --env.image_size=64, or insist with --env.ignore_checkpoint=true" in error
+    wide = ["--image_size=96", "--ignore_checkpoint", f"--output={tmp_path / 'x'}"]
+    assert main([*FLAGS, policy, *wide]) == 0
+    assert main([*FLAGS, policy, f"--output={tmp_path / 'own'}"]) == 0  # images of the size that it reads

@@ -265,7 +265,7 @@ def test_an_exported_backbone_starts_another_policy(folder: Path, family: str, t
     for pipeline in make_vla0_smol_pre_post_processors(policy.config, STATS):
         pipeline.save_pretrained(tmp_path / "model")
     arguments = [f"--policy.path={tmp_path / 'model'}", f"--output={tmp_path / 'base'}"]
-    assert main(["export-backbone", *arguments]) == 0
+    assert main(["checkpoint", "export-backbone", *arguments]) == 0
     again = policy_of(tmp_path / "base", family)
     batch = own_size_batch(policy, 2)
     assert torch.equal(again.predict_action_chunk(batch), policy.predict_action_chunk(batch))

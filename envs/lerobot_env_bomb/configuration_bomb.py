@@ -6,7 +6,7 @@ from functools import partial
 from pathlib import Path
 from typing import Any, cast
 
-from lerobot.configs import FeatureType, PolicyFeature
+from lerobot.configs import FeatureType, PolicyFeature, PreTrainedConfig
 from lerobot.envs import EnvConfig
 from lerobot.processor import PolicyProcessorPipeline
 from lerobot.utils.constants import ACTION, OBS_IMAGES, OBS_PREFIX, OBS_STATE
@@ -16,13 +16,14 @@ from lerobot_bomb.bomb.observation import (
     ACTION_DIM,
     AGENT_POS,
     CAMERAS,
+    DEFAULT_IMAGE_SIZE,
     STATE_DIM,
     RenderOptions,
     geometry_shapes,
 )
 from lerobot_bomb.bomb.perturbations import Condition
 from lerobot_bomb.bomb.suite import find_suite, specs_of_tasks, suites_of, task_version
-from lerobot_bomb.checkpoints.environment import check_acting_policy
+from lerobot_bomb.checkpoints.environment import check_acting_policy, side_of_images
 from lerobot_bomb.checkpoints.identity import policy_of_results
 from lerobot_bomb.checkpoints.queries import last_query
 from lerobot_bomb.compat.use import use
@@ -58,8 +59,8 @@ class BombEnvConfig(EnvConfig):
     color: str | None = None
     # conditions, each evaluated as a group of its own: ["none","camera:3","camera:2+light:3","all:1-5"]
     perturbations: list[str] | str | None = None
-    # width and height of each camera in pixels
-    image_size: int = 256
+    # width and height of each camera in pixels; unset: as the evaluated checkpoint was trained, else 256
+    image_size: int | None = None
     # fast (no shadows) or shadows
     render_preset: str = "fast"
     # also observe each camera's depth in metres, intrinsics and pose
@@ -81,10 +82,21 @@ class BombEnvConfig(EnvConfig):
             for spec in itertools.chain(*self.groups.values()):
                 find_suite(spec.suite).check(spec)
                 check_robot(spec)
-            geometry = geometry_shapes(self.render_options)
+            geometry_shapes(self.render_options)
         if self.results_path is not None:
             self.results_path = str(Path(self.results_path).expanduser())
-        image = PolicyFeature(type=FeatureType.VISUAL, shape=(self.image_size, self.image_size, 3))
+        self._declare_features()
+
+    def take_image_size(self, config: PreTrainedConfig | None) -> None:
+        """Show images of the size that a policy was trained on, unless a flag says another one."""
+        if self.image_size is None and (side := side_of_images(config, CAMERAS)) is not None:
+            self.image_size = side
+            self._declare_features()
+
+    def _declare_features(self) -> None:
+        """Declare what a policy gets here, and the actions that it gives."""
+        side = self.render_options.image_size
+        image = PolicyFeature(type=FeatureType.VISUAL, shape=(side, side, 3))
         cameras = [f"{OBS_IMAGES}.{camera}" for camera in CAMERAS]
         self.features = {
             ACTION: PolicyFeature(type=FeatureType.ACTION, shape=(ACTION_DIM,)),
@@ -92,7 +104,7 @@ class BombEnvConfig(EnvConfig):
             **dict.fromkeys(cameras, image),
         }
         self.features_map = {ACTION: ACTION, AGENT_POS: OBS_STATE, **{key: key for key in cameras}}
-        for key, shape in geometry.items():
+        for key, shape in geometry_shapes(self.render_options).items():
             self.features[key] = PolicyFeature(type=FeatureType.STATE, shape=shape)
             self.features_map[key] = f"{OBS_PREFIX}{key}"  # where LeRobot puts keys it does not know
 
@@ -148,7 +160,8 @@ class BombEnvConfig(EnvConfig):
 
     @property
     def render_options(self) -> RenderOptions:
-        return RenderOptions(image_size=self.image_size, preset=self.render_preset, depth=self.depth)
+        side = DEFAULT_IMAGE_SIZE if self.image_size is None else self.image_size
+        return RenderOptions(image_size=side, preset=self.render_preset, depth=self.depth)
 
     @property
     def environment(self) -> Environment:
@@ -157,7 +170,7 @@ class BombEnvConfig(EnvConfig):
             robot=self.robot,
             control_mode=self.control_mode,
             fps=self.fps,
-            image_size=self.image_size,
+            image_size=self.render_options.image_size,
             cameras=CAMERAS,
             task_version=task_version(str(self.task)),
             task=str(self.task),

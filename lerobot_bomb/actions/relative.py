@@ -38,7 +38,7 @@ def bounds(
         raise ValueError(
             f"--policy.normalization_mapping: {mode.value} needs the statistics {', '.join(missing)}, which "
             f"the dataset lacks; it has {', '.join(sorted(statistics))}. MIN_MAX needs no quantiles, "
-            "`lerobot-bomb statistics FOLDER --mend` adds them"
+            "`lerobot-bomb doctor dataset FOLDER --mend` adds them"
         )
     low, high = (np.asarray(statistics[name], dtype=np.float64) for name in names)
     for name, values in zip(names, (low, high), strict=True):

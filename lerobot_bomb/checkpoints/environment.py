@@ -2,7 +2,7 @@
 
 import copy
 import logging
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
 from contextvars import ContextVar
 from dataclasses import dataclass
@@ -16,6 +16,7 @@ from lerobot_bomb.compat.hooks.policies import built_policies, training_data
 from lerobot_bomb.compat.use import use
 from lerobot_bomb.data.environment import IMAGES, Environment
 from lerobot_bomb.data.facts import DatasetFacts
+from lerobot_bomb.flag_errors import refuse_recording_of_several
 
 logger = logging.getLogger(__name__)
 
@@ -149,6 +150,24 @@ def _check(config: PreTrainedConfig, who: str, insist: str, here: Environment) -
             "compared. --env.control_mode, --env.fps and --env.robot must be those of its training",
             who,
         )
+
+
+def complete_evaluation(config: Any) -> None:
+    """Let the environment of LeRobot's EvalPipelineConfig be what its flags leave open and its policy says.
+
+    Raises:
+        FlagError: it is to record several episodes.
+    """
+    refuse_recording_of_several(config)
+    if hasattr(config.env, "take_image_size"):
+        config.env.take_image_size(config.policy)
+
+
+def side_of_images(config: PreTrainedConfig | None, cameras: Iterable[str]) -> int | None:
+    """Return the side of the square images of cameras that a policy's config declares; None: of none."""
+    features = (config and config.input_features) or {}
+    shapes = (features[IMAGES + camera].shape for camera in cameras if IMAGES + camera in features)
+    return next((height for _, height, width in shapes if height == width), None)
 
 
 def _check_image_size(config: PreTrainedConfig, here: Environment, who: str, insist: str) -> None:

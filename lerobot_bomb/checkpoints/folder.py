@@ -10,16 +10,13 @@ from draccus.utils import DecodingError
 from lerobot.configs import PreTrainedConfig
 from lerobot.policies import PreTrainedPolicy, make_pre_post_processors
 from lerobot.processor import PolicyAction, PolicyProcessorPipeline
-from lerobot.utils.constants import POLICY_PREPROCESSOR_DEFAULT_NAME
 from lerobot.utils.device_utils import get_safe_torch_device, is_torch_device_available
 from lerobot.utils.import_utils import register_third_party_plugins
 
 from lerobot_bomb.checkpoints.checks import PROCESSORS, processor_files
-from lerobot_bomb.checkpoints.names import CONFIG
+from lerobot_bomb.checkpoints.names import CONFIG, check_checkpoint
 from lerobot_bomb.checkpoints.processor_files import check_states
 from lerobot_bomb.files import written_whole
-
-FILES = (CONFIG, f"{POLICY_PREPROCESSOR_DEFAULT_NAME}.json")
 
 Preprocessor = PolicyProcessorPipeline[dict[str, Any], dict[str, Any]]
 Postprocessor = PolicyProcessorPipeline[PolicyAction, PolicyAction]
@@ -33,16 +30,7 @@ def read_config(path: Path, device: str | None, flags: Sequence[str] = ()) -> Pr
     Raises:
         ValueError: the folder holds no checkpoint, or this machine has no such device.
     """
-    if path.is_file():
-        raise ValueError(f"--policy.path={path} is a file; give the folder of a checkpoint")
-    if not path.is_dir():
-        raise ValueError(f"--policy.path={path}: there is no such folder; give one that holds a checkpoint")
-    missing = [name for name in FILES if not (path / name).is_file()]
-    if missing:
-        raise ValueError(
-            f"--policy.path={path} holds no {missing[0]}, so it is no checkpoint of a policy; "
-            "give the folder that lerobot-train names pretrained_model"
-        )
+    check_checkpoint(path)
     if device is not None and not is_torch_device_available(device):
         raise ValueError(f"the device {device} is not available on this machine; cpu is")
     register_third_party_plugins()
@@ -61,7 +49,7 @@ def parse_config(path: Path, device: str | None, flags: Sequence[str] = ()) -> P
     try:
         return PreTrainedConfig.from_pretrained(path, cli_overrides=overrides)
     except DecodingError as error:
-        raise ValueError(f"{path / FILES[0]}: {error}") from None
+        raise ValueError(f"{path / CONFIG}: {error}") from None
 
 
 def load_processors(config: PreTrainedConfig) -> tuple[Preprocessor, Postprocessor]:

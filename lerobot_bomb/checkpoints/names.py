@@ -4,9 +4,8 @@ import re
 from pathlib import Path
 from typing import Any
 
-from huggingface_hub import try_to_load_from_cache
-
 CONFIG, TRAIN_CONFIG, WEIGHTS = "config.json", "train_config.json", "model.safetensors"
+PREPROCESSOR = "policy_preprocessor.json"
 
 # of the steps that change on purpose what a policy is shown
 BLANK_IMAGES, REPLACE_TASKS = "bomb_blank_images", "bomb_replace_tasks"
@@ -14,8 +13,22 @@ BLANK_IMAGES, REPLACE_TASKS = "bomb_blank_images", "bomb_replace_tasks"
 # what to do with adapters whose base is on one machine only
 TO_PUBLISH = (
     "publish that first (lerobot-bomb push) and train with --policy.path of its name, or publish both as one "
-    "checkpoint (lerobot-bomb merge)"
+    "checkpoint (lerobot-bomb checkpoint merge)"
 )
+
+
+def check_checkpoint(path: Path) -> None:
+    """Raise a ValueError unless a folder has the files of a checkpoint, which are not read."""
+    if path.is_file():
+        raise ValueError(f"--policy.path={path} is a file; give the folder of a checkpoint")
+    if not path.is_dir():
+        raise ValueError(f"--policy.path={path}: there is no such folder; give one that holds a checkpoint")
+    missing = [name for name in (CONFIG, PREPROCESSOR) if not (path / name).is_file()]
+    if missing:
+        raise ValueError(
+            f"--policy.path={path} holds no {missing[0]}, so it is no checkpoint of a policy; "
+            "give the folder that lerobot-train names pretrained_model"
+        )
 
 
 def is_hub_id(name: object) -> bool:
@@ -29,6 +42,8 @@ def local_file(checkpoint: Path | str, revision: str | None, name: str) -> Path 
     if Path(checkpoint).is_dir():
         path = Path(checkpoint) / name
         return path if path.is_file() else None
+    from huggingface_hub import try_to_load_from_cache  # a second
+
     cached = try_to_load_from_cache(str(checkpoint), name, revision=revision)
     return Path(cached) if isinstance(cached, str) else None
 

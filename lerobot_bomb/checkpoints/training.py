@@ -3,7 +3,7 @@
 from pathlib import Path
 from typing import Any
 
-from lerobot_bomb.checkpoints.names import TRAIN_CONFIG
+from lerobot_bomb.checkpoints.names import CONFIG, TRAIN_CONFIG
 from lerobot_bomb.data.resumable import default_root
 from lerobot_bomb.files import read_json
 
@@ -29,3 +29,12 @@ def dataset_of(train_config: dict[str, Any]) -> Path | None:
     if dataset.get("root"):
         return Path(dataset["root"])
     return default_root(dataset["repo_id"]) if dataset.get("repo_id") else None
+
+
+def trained_image_size(checkpoint: Path) -> int | None:
+    """Return the side of the images that a checkpoint was trained on; None where its files do not say."""
+    try:
+        features = read_json(checkpoint / CONFIG)["input_features"].values()
+        return next((each["shape"][-1] for each in features if each["type"] == "VISUAL"), None)
+    except (OSError, ValueError, KeyError, TypeError, AttributeError, IndexError):
+        return None  # refused when it is loaded

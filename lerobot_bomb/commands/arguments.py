@@ -2,6 +2,8 @@
 
 import argparse
 import re
+from collections.abc import Sequence
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -12,6 +14,14 @@ from lerobot_bomb.bomb.suites import SUITES
 from lerobot_bomb.checkpoints.shipped import checkpoint_path
 from lerobot_bomb.conditions import NONE
 
+# short form of a flag of the environment -> the flag as LeRobot spells it
+LONG_FORMS = {
+    f"--{name}": f"--env.{name}"
+    for name in (
+        *("task", "robot", "control_mode", "fps", "image_size", "render_preset", "depth", "split", "target"),
+        *("color", "task_ids", "perturbations", "success_tolerance_mm", "instruction", "max_steps"),
+    )
+}
 ANSWER_IS_NO = 3  # exit code of a command that was asked something; 1 is an error, 2 a flag that is unknown
 
 
@@ -51,9 +61,9 @@ def add_checkpoint_arguments(parser: argparse.ArgumentParser, help: str, require
     add("--policy.device", dest="policy_device", help="cpu, cuda, ... (default: as the checkpoint says)")
 
 
-def add_file_and_eval_flags(parser: argparse.ArgumentParser, name: str, help: str) -> None:
+def add_file_and_eval_flags(parser: argparse.ArgumentParser, help: str) -> None:
     """Declare ``FILE FLAG ...``: a file, and the flags of lerobot-eval, which its own parser reads."""
-    parser.usage = f"lerobot-bomb {name} FILE --policy.path=... --env.type=... (all flags of lerobot-eval)"
+    parser.usage = f"{parser.prog} FILE --policy.path=... --env.type=... (all flags of lerobot-eval)"
     parser.add_argument("path", type=path_flag, metavar="FILE", help=help)
     flags = "flags of lerobot-eval"
     rest = parser.add_argument("flags", nargs=argparse.REMAINDER, metavar="FLAG", help=flags)
@@ -100,6 +110,14 @@ def parse_conditions(text: str) -> tuple[str, ...]:
     return tuple(part.strip().strip("\"'") for part in text.strip().strip("[]").split(",") if part.strip())
 
 
+def add_dataset_arguments(parser: argparse.ArgumentParser, about: str = "") -> None:
+    """Declare which dataset is read."""
+    add = parser.add_argument
+    add("--dataset.repo_id", dest="repo_id", required=True, help=f"name of the dataset{about}")
+    root = "folder of the dataset (default: LeRobot's, $HF_LEROBOT_HOME/REPO_ID)"
+    add("--dataset.root", dest="root", type=path_flag, help=root)
+
+
 def add_new_dataset_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare what a dataset that is written is called, and where it lies."""
     parser.add_argument("--repo_id", required=True, help="name of the dataset on the Hub, USER/NAME")
@@ -107,38 +125,52 @@ def add_new_dataset_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--root", type=path_flag, help=root)
 
 
+def add_env_flag(parser: argparse.ArgumentParser, name: str, *others: str, **options: Any) -> None:
+    """Declare a flag of the environment as LeRobot spells it, --env.NAME, and its short form."""
+    parser.add_argument(LONG_FORMS[f"--{name}"], f"--{name}", *others, dest=name, **options)
+
+
+def long_forms(flags: Sequence[str]) -> list[str]:
+    """Return flags of lerobot-eval as it spells them: --env.image_size=64 for --image_size=64."""
+    words = [flag.partition("=") for flag in flags]
+    return [f"{LONG_FORMS.get(name, name)}{sign}{value}" for name, sign, value in words]
+
+
 def add_episode_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare what a command that runs episodes is told of them beside the seed, as --env.type=bomb is."""
-    add = parser.add_argument
+    add = partial(add_env_flag, parser)
     lines = f"0..{BOARD.num_lines - 1}"
     tolerance = EpisodeSpec.success_tolerance_mm
-    add("--task", default="place", help=f"suite: {', '.join(SUITES)} (default: place)")
-    add("--robot", default="scara", help=f"{', '.join(ROBOTS)} (default: scara)")
-    add("--control_mode", default="relative", help=f"{' or '.join(CONTROL_MODES)} (default: relative)")
-    add("--fps", type=int, default=DEFAULT_FPS, help=f"control steps a second (default: {DEFAULT_FPS})")
-    add("--image_size", type=int, default=DEFAULT_IMAGE_SIZE, help=f"pixels (default: {DEFAULT_IMAGE_SIZE})")
-    add("--render_preset", default="fast", help=f"{' or '.join(RENDER_PRESETS)} (default: fast)")
-    add("--depth", **switch(), help="observe each camera's depth (metres), intrinsics and pose too")
-    add("--split", default="all", help=f"draw from {', '.join(SPLITS)} (default: all)")
-    add("--target", type=parse_numbers, help=f"[row, column], each in {lines} (default: drawn)")
-    add("--color", help=f"of the stone to be moved: {' or '.join(COLORS)} (default: drawn)")
+    add("task", default="place", help=f"suite: {', '.join(SUITES)} (default: place)")
+    add("robot", default="scara", help=f"{', '.join(ROBOTS)} (default: scara)")
+    add("control_mode", default="relative", help=f"{' or '.join(CONTROL_MODES)} (default: relative)")
+    add("fps", type=int, default=DEFAULT_FPS, help=f"control steps a second (default: {DEFAULT_FPS})")
     add(
-        "--task_ids",
+        "image_size",
+        type=int,
+        help=f"pixels (default: those that the checkpoint was trained on, else {DEFAULT_IMAGE_SIZE})",
+    )
+    add("render_preset", default="fast", help=f"{' or '.join(RENDER_PRESETS)} (default: fast)")
+    add("depth", **switch(), help="observe each camera's depth (metres), intrinsics and pose too")
+    add("split", default="all", help=f"draw from {', '.join(SPLITS)} (default: all)")
+    add("target", type=parse_numbers, help=f"[row, column], each in {lines} (default: drawn)")
+    add("color", help=f"of the stone to be moved: {' or '.join(COLORS)} (default: drawn)")
+    add(
+        "task_ids",
         type=parse_numbers,
         default=(),
         help="numbered tasks of the suite, as [0,7,12], each played from every seed (of place 25 x colour + "
         "5 x row + column; black = 0, white = 1; default: target and colour as above)",
     )
     add(
-        "--perturbations",
-        "--env.perturbations",
+        "perturbations",
         type=parse_conditions,
         default=(NONE,),
         help='conditions, as ["camera:3","camera:2+light:3"], each played from every seed; a range such as '
         "all:1-5 or camera:0-3 draws a level per episode and axis (default: none)",
     )
     add(
-        "--success_tolerance_mm",
+        "success_tolerance_mm",
         type=float,
         default=tolerance,
         help=f"distance from the intersection within which a placement counts (default: {tolerance:g})",
@@ -150,15 +182,3 @@ def add_folder_arguments(parser: argparse.ArgumentParser, checkpoint: str, outpu
     path = f"folder of {checkpoint} that lerobot-train names pretrained_model"
     parser.add_argument("--policy.path", dest="policy_path", type=checkpoint_flag, required=True, help=path)
     parser.add_argument("--output", type=path_flag, required=True, help=output)
-
-
-def add_hub_arguments(parser: argparse.ArgumentParser, kind: str) -> None:
-    """Declare where and how a model or a dataset is published."""
-    add = parser.add_argument
-    add("--repo_id", required=True, help=f"name of the {kind} on the Hub, USER/NAME")
-    add("--private", **switch(), help="make a new repository that only you see")
-    add(
-        "--dry_run",
-        **switch(),
-        help="print the card, and the names of the files instead of publishing them; no Hub is asked",
-    )

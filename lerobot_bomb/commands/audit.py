@@ -7,9 +7,9 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from lerobot_bomb.bomb.episode import TEST_SEEDS
-from lerobot_bomb.checkpoints.training import dataset_of, read_train_config
+from lerobot_bomb.bomb.observation import DEFAULT_IMAGE_SIZE
+from lerobot_bomb.checkpoints.training import dataset_of, read_train_config, trained_image_size
 from lerobot_bomb.commands.arguments import ANSWER_IS_NO, check_at_least, checkpoint_flag, path_flag
-from lerobot_bomb.data.facts import DatasetFacts
 from lerobot_bomb.envs.results import Row
 from lerobot_bomb.evaluation.bomb_lines import other_instructions
 from lerobot_bomb.evaluation.results import read_results
@@ -31,7 +31,7 @@ from lerobot_bomb.report.verdicts import (
 )
 from lerobot_bomb.sweep.claim import claimed
 from lerobot_bomb.sweep.local import play
-from lerobot_bomb.sweep.manifest import Cell, Manifest, check_flags, largest_divisor
+from lerobot_bomb.sweep.manifest import Cell, Manifest, check_flags, flag_value, largest_divisor
 from lerobot_bomb.tables import print_table
 
 if TYPE_CHECKING:
@@ -40,8 +40,8 @@ if TYPE_CHECKING:
 MAX_BATCH = 10
 
 
-def add_audit_arguments(parser: argparse.ArgumentParser) -> None:
-    """Declare the arguments of ``lerobot-bomb audit``."""
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Declare the arguments."""
     parser.usage = "lerobot-bomb audit FOLDER --policy.path=CHECKPOINT [--env.NAME=VALUE ...]"
     add = parser.add_argument
     add("folder", type=path_flag, metavar="FOLDER", help="new, or of an audit that is to go on")
@@ -54,7 +54,7 @@ def add_audit_arguments(parser: argparse.ArgumentParser) -> None:
     add("rest", nargs="*", metavar="FLAG", help="flags of lerobot-eval, of --env.type=bomb")
 
 
-def run_audit(args: argparse.Namespace) -> int:
+def run(args: argparse.Namespace) -> int:
     """Run all arms, write what they show, print the verdicts; exit code 3 where one is no."""
     check_at_least(args, episodes=2, seed=0, workers=1)
     check_flags(args.rest)
@@ -112,6 +112,9 @@ def _changed(args: argparse.Namespace, name: str, step: "ProcessorStep") -> str:
 def _cell(args: argparse.Namespace, policy: str, split: str = "", batch_size: int = MAX_BATCH) -> Cell:
     of_policy = [flag for flag in args.rest if flag.startswith("--policy.")]
     of_env = [flag for flag in args.rest if not flag.startswith("--policy.")]
+    size = trained_image_size(args.policy_path)  # of the arms without a checkpoint, too
+    if size not in (None, DEFAULT_IMAGE_SIZE) and flag_value(of_env, "--env.image_size") is None:
+        of_env.append(f"--env.image_size={size}")
     is_scripted = policy.startswith("--policy.type")
     return Cell(
         policy=(policy, *([] if is_scripted else of_policy)),
@@ -139,5 +142,7 @@ def _play(args: argparse.Namespace, folder: Path, cells: dict[str, Cell]) -> dic
 
 
 def _trained_seeds(checkpoint: Path) -> Sequence[int] | None:
+    from lerobot_bomb.data.facts import DatasetFacts  # pyarrow and PyAV
+
     facts = DatasetFacts.find(dataset_of(read_train_config(checkpoint)))
     return None if facts is None else facts.seeds

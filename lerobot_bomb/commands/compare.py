@@ -10,8 +10,8 @@ from lerobot_bomb.evaluation.result_groups import describe_policy
 from lerobot_bomb.tables import print_lines
 
 
-def add_compare_arguments(parser: argparse.ArgumentParser) -> None:
-    """Declare the arguments of ``lerobot-bomb compare``."""
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Declare the arguments."""
     add = parser.add_argument
     two = "without a second file: which two of the first one's policies (default: the two that it has)"
     add("a", type=path_flag, metavar="A", help="file of --env.results_path")
@@ -51,7 +51,7 @@ def _two_policies(args: argparse.Namespace) -> tuple[list[Row], list[Row]]:
     return both[0], both[1]
 
 
-def run_compare(args: argparse.Namespace) -> int:
+def run(args: argparse.Namespace) -> int:
     """Print both rates and their difference, by condition; check what was asked for."""
     comparisons = compare(*_two_policies(args))
     print_lines(*comparisons.lines())

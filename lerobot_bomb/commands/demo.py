@@ -57,13 +57,13 @@ Next:
   every perturbation               docs/perturbations.md"""
 
 
-def add_demo_arguments(parser: argparse.ArgumentParser) -> None:
-    """Declare the arguments of ``lerobot-bomb demo``."""
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Declare the arguments."""
     parser.add_argument("--output_dir", type=path_flag, help="new folder (default: outputs/demo/DATE_TIME)")
     parser.add_argument("--episodes", type=int, default=20, help="of each condition (default: 20)")
 
 
-def run_demo(args: argparse.Namespace) -> int:
+def run(args: argparse.Namespace) -> int:
     """Evaluate, replay a failure, print rates; the last line is the contact sheet's path."""
     if args.episodes < 1:
         raise ValueError(f"--episodes={args.episodes} must be at least 1")
@@ -108,9 +108,8 @@ def _replay(output_dir: Path, row: Row) -> None:
         "lerobot-bomb",
         "view",
         PLAYERS[POLICY].policy_flag,
-        f"--image_size={IMAGE_SIZE}",
         f"--seed={row['spec']['seed']}",
-        f"--perturbations={row['spec']['perturbations']}",
+        f"--env.perturbations={row['spec']['perturbations']}",
         f"--output={output_dir / 'replay'}",
     )
 

@@ -183,11 +183,11 @@ CHECKS: tuple[Callable[[], Iterator[Finding]], ...] = (
 )
 
 
-def add_doctor_arguments(parser: argparse.ArgumentParser) -> None:
+def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare no arguments: ``lerobot-bomb doctor`` has none."""
 
 
-def run_doctor(args: argparse.Namespace) -> int:
+def run(args: argparse.Namespace) -> int:
     """Print every finding; exit code 1 and the causes when something is broken."""
     print(f"lerobot_bomb {lerobot_bomb.__version__}, MUJOCO_GL={os.environ.get('MUJOCO_GL', '(unset)')}")
     num_broken, absent = 0, []

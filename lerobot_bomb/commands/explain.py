@@ -14,13 +14,13 @@ import numpy as np
 from tqdm import tqdm
 
 from lerobot_bomb.bomb.episode import TEST_SEEDS
-from lerobot_bomb.checkpoints.names import CONFIG
+from lerobot_bomb.checkpoints.names import check_checkpoint
 from lerobot_bomb.commands.arguments import add_checkpoint_arguments, check_at_least, path_flag
 from lerobot_bomb.commands.results_files import read_line
 from lerobot_bomb.commands.view import add_viewed_arguments, viewed_of
 from lerobot_bomb.conditions import NONE
-from lerobot_bomb.files import check_new_folder, read_json, written_whole
-from lerobot_bomb.flags import flags_without_group, one_of
+from lerobot_bomb.files import check_new_folder, written_whole
+from lerobot_bomb.flags import one_of
 from lerobot_bomb.viewing.episode import Viewed
 from lerobot_bomb.viewing.replay import Replay
 
@@ -35,8 +35,8 @@ DEFAULT_GRID = 8
 PAGE, NUMBERS, RECORDING = "explanation.html", "explanation.json", "explanation.rrd"
 
 
-def add_explain_arguments(parser: argparse.ArgumentParser) -> None:
-    """Declare the arguments of ``lerobot-bomb explain``."""
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Declare the arguments."""
     add = parser.add_argument
     results = "a file of --env.results_path: explain the episode of one of its lines, with who played it"
     add("--results", type=path_flag, metavar="FILE", help=results)
@@ -56,7 +56,7 @@ def add_explain_arguments(parser: argparse.ArgumentParser) -> None:
     add("--output", type=path_flag, default=DEFAULT_FOLDER, help=f"new folder (default: {DEFAULT_FOLDER})")
 
 
-def run_explain(args: argparse.Namespace) -> int:
+def run(args: argparse.Namespace) -> int:
     """Explain episodes; write a page, its numbers and, of one episode, a recording; print the findings."""
     check_at_least(args, episodes=1, grid=1)
     if args.episodes > 1 and args.step is not None:
@@ -64,8 +64,7 @@ def run_explain(args: argparse.Namespace) -> int:
     check_new_folder("output", args.output)
     asked = _of_flags(args) if args.results is None else _of_line(args)
     _check_images(args, asked.viewed(asked.seed).env_flags["image_size"])
-    with flags_without_group():
-        return (_explain_one if args.episodes == 1 else _explain_several)(args, asked)
+    return (_explain_one if args.episodes == 1 else _explain_several)(args, asked)
 
 
 def _check_images(args: argparse.Namespace, image_size: int) -> None:
@@ -76,22 +75,11 @@ def _check_images(args: argparse.Namespace, image_size: int) -> None:
     patch_masks(args.grid, image_size, image_size)
 
 
-def _image_size(checkpoint: Path) -> int | None:
-    """The side of the images that a checkpoint was trained on; None where that is not known."""
-    try:
-        features = read_json(checkpoint / CONFIG)["input_features"].values()
-        return next((each["shape"][-1] for each in features if each["type"] == "VISUAL"), None)
-    except (OSError, ValueError, KeyError, TypeError, AttributeError, IndexError):
-        return None  # refused when it is loaded
-
-
 def _of_flags(args: argparse.Namespace) -> "_Asked":
     if args.policy_path is None:
         raise ValueError("--policy.path is missing: the checkpoint that is explained; or give --results=FILE")
     if args.line is not None:
         raise ValueError(f"--line={args.line} is of --results=FILE; drop it, or name the file")
-    if args.image_size is None:
-        args.image_size = _image_size(args.policy_path)
 
     def viewed(seed: int) -> Viewed:
         return viewed_of(argparse.Namespace(**vars(args) | {"seed": seed}))
@@ -104,10 +92,11 @@ def _of_line(args: argparse.Namespace) -> "_Asked":
     shared = {"image_size": None, "perturbations": (NONE,), "env_type": "bomb"}
     for name, default in (shared | args.own_flags["bomb"] | args.own_flags["bomb_pusht"]).items():
         if getattr(args, name) != default:
-            raise ValueError(f"drop --{name.replace('env_type', 'env.type')}: the line of --results says it")
+            raise ValueError(f"drop --env.{name.removeprefix('env_')}: the line of --results says it")
     replay = Replay(read_line(args.results, args.line or 1), args.policy_path)
     if replay.checkpoint is None:
         raise ValueError("who played has no checkpoint, so there is nothing to explain")
+    check_checkpoint(replay.checkpoint)
     seed = replay.row["spec"]["seed"] if args.seed is None else args.seed
     return _Asked(
         lambda seed: replay.viewed(seed=seed), seed, replay.checkpoint, args.policy_device, has_played=True

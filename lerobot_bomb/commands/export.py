@@ -13,8 +13,8 @@ from lerobot_bomb.report.latex import table
 LATEX, MODEL_INDEX, EVAL_RESULTS = "table.tex", "model-index.yaml", ".eval_results/lerobot_bomb.yaml"
 
 
-def add_export_arguments(parser: argparse.ArgumentParser) -> None:
-    """Declare the arguments of ``lerobot-bomb export``."""
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Declare the arguments."""
     add = parser.add_argument
     add("paths", nargs="+", type=path_flag, metavar="FILE", help="files of --env.results_path")
     add("--output", type=path_flag, default=Path("outputs/export"), help="folder (default: outputs/export)")
@@ -34,7 +34,7 @@ def _hub_id(text: str) -> str:
     return text
 
 
-def run_export(args: argparse.Namespace) -> int:
+def run(args: argparse.Namespace) -> int:
     """Write a table for LaTeX, and of each policy what its repository on the Hub takes; print the paths."""
     # huggingface_hub takes a second
     from lerobot_bomb.hub.evaluations import check_one_rate_each, eval_results_yaml, model_index_yaml

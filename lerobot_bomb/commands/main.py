@@ -3,53 +3,101 @@
 import argparse
 import importlib
 import sys
-from collections.abc import Collection, Sequence
+from collections.abc import Iterator, Sequence
+from difflib import get_close_matches
 from typing import Any
 
-from draccus.utils import DecodingError
-
 from lerobot_bomb import __version__
+from lerobot_bomb.checkpoints.names import check_checkpoint
+from lerobot_bomb.commands.arguments import long_forms
+from lerobot_bomb.commands.table import COMMANDS, FAMILIES, PROGRAM, RENAMED, overview, subcommands
 from lerobot_bomb.compat.use import use
-from lerobot_bomb.flag_errors import nearest
 
-DESCRIPTION = "What lerobot-train and lerobot-eval do not do for BOMB: record, summarise, check."
-
+SHELLS = ("bash", "zsh")
 # of lerobot-eval, those that are of no group as --env.task is
 EVAL_FLAGS = ("--config_path", "--job_name", "--output_dir", "--rename_map", "--seed", "--trust_remote_code")
 
-# command -> help; NAME stands in commands/NAME.py, a hyphen as an underscore, with add_NAME_arguments and
-# run_NAME, and is imported only when called
-COMMANDS = {
-    "record": "record the scripted expert as a LeRobotDataset",
-    "convert": "published demonstrations as a LeRobotDataset",
-    "results": "summarise files written by --env.results_path",
-    "lines": "lines of results of LeRobot's own pusht or libero, from what lerobot-eval wrote",
-    "report": "files of results as one page, with tables as JSON and CSV",
-    "export": "files of results as a LaTeX table, a model-index and the Hub's .eval_results",
-    "sweep": "evaluate policies x tasks x conditions; goes on after a kill",
-    "replay": "play an episode of a file of results again, bit for bit or with other perturbations",
-    "audit": "does a policy read, look, repeat itself: arms and verdicts that a success rate needs",
-    "compare": "two policies on the same episodes: difference, interval, test",
-    "eval": "lerobot-eval, which also writes the executed actions to a file",
-    "smoothness": "second and third differences of executed actions, of demonstrations and evaluations",
-    "offline-metrics": "loss, accuracy and L1 of a checkpoint on recorded frames, beside trivial predictors",
-    "statistics": "compare a dataset's statistics of numbers with all of its frames, and mend them",
-    "fit-grid": "an action grid on a dataset: its fit, its edges and what it rounds off",
-    "init": "a policy before its training, as a checkpoint that adapters can be trained on",
-    "merge": "adapters and their base as one checkpoint",
-    "convert-spatialvla": "a published SpatialVLA folder as a checkpoint for LeRobot",
-    "export-backbone": "a checkpoint's vision-language model as a folder that other policies can start from",
-    "serve": "LeRobot's server of action chunks for a robot elsewhere, for every policy type",
-    "push": "a checkpoint to the Hub, with a card and its evaluation",
-    "push-dataset": "a recorded dataset to the Hub, with a card",
-    "explain": "what a policy's actions depend on: patches, objects, words, layers, heads",
-    "view": "play one episode into a recording for Rerun and a video",
-    "gallery": "draw what every perturbation axis changes",
-    "checkpoint": "the folder of a checkpoint that comes with this package",
-    "demo": "a policy that comes with this package plays, beside expert and random",
-    "doctor": "check this installation",
-    "completion": "a script with which bash or zsh completes these commands and their flags",
-}
+
+class Parser(argparse.ArgumentParser):
+    """A parser whose help begins with what the command is for."""
+
+    opening = ""
+
+    def format_help(self) -> str:
+        return f"{self.opening}\n\n{super().format_help()}"
+
+
+def program_parser() -> Parser:
+    """Build the parser of what stands in place of a command."""
+    parser = Parser(prog=PROGRAM, usage=f"{PROGRAM} COMMAND ...")
+    parser.opening = overview()
+    parser.add_argument("--version", action="version", version=f"{PROGRAM} {__version__}")
+    about = f"print a script with which {' or '.join(SHELLS)} completes commands, flags and paths"
+    parser.add_argument("--completion", choices=SHELLS, metavar="SHELL", help=about)
+    return parser
+
+
+def command_parser(name: str) -> Parser:
+    """Build a command's parser, which imports its module."""
+    command = COMMANDS[name]
+    parser = Parser(
+        prog=f"{PROGRAM} {name}",
+        allow_abbrev=False,
+        epilog="\n".join(_listed(name)),
+        formatter_class=_HelpFormatter,
+    )
+    examples = [f"  {PROGRAM} {name} {flags}".rstrip() for flags in command.examples]
+    parser.opening = "\n".join([*examples, "", f"{command.summary[0].upper()}{command.summary[1:]}."])
+    module_of(name).add_arguments(parser)
+    return parser
+
+
+class _HelpFormatter(argparse.HelpFormatter):
+    """Formatter that keeps the lines of a list of commands."""
+
+    def _fill_text(self, text: str, width: int, indent: str) -> str:
+        return text if "\n" in text else super()._fill_text(text, width, indent)
+
+
+def _listed(word: str) -> Iterator[str]:
+    """List the commands that begin with a word."""
+    others = subcommands(word)
+    width = max(map(len, others), default=0)
+    yield from ("commands:",) * bool(others)
+    for name, command in others.items():
+        yield f"  {PROGRAM} {name:<{width}}  {command.summary}"
+
+
+def module_of(name: str) -> Any:
+    """Import the module of a command."""
+    return importlib.import_module(f"lerobot_bomb.commands.{name.replace(' ', '_').replace('-', '_')}")
+
+
+def _split(argv: Sequence[str]) -> tuple[str, Sequence[str]] | None:
+    """Return a command's name, of two words where there is one, and its flags; None: there is none."""
+    for number in (2, 1):
+        name = " ".join(argv[:number])
+        if name in COMMANDS:
+            return name, argv[number:]
+    return None
+
+
+def _unknown(argv: Sequence[str]) -> int:
+    """Help with words that are no command."""
+    word, *others = argv
+    if word in FAMILIES and (not others or others[0] in ("-h", "--help")):
+        print(*_listed(word), sep="\n")
+        return 0
+    if word in RENAMED:
+        told = f"`{PROGRAM} {word}` is now `{PROGRAM} {RENAMED[word]}`"
+    else:
+        given = " ".join(argv[:2]) if word in FAMILIES else word
+        near = get_close_matches(given, [*COMMANDS, *FAMILIES], n=1)
+        names = [name.partition(" ")[2] for name in subcommands(word)]
+        known = f"; there are {', '.join(names)}" if names else f"; `{PROGRAM} --help` lists all"
+        told = f"{given!r} is no command{f'; nearest: {near[0]}' if near else ''}{known}"
+    print(f"{PROGRAM}: {told}", file=sys.stderr)
+    return 2
 
 
 def _may_be_of_eval(flag: str) -> bool:
@@ -57,49 +105,48 @@ def _may_be_of_eval(flag: str) -> bool:
     return "." in name or name in EVAL_FLAGS
 
 
-def _function(command: str) -> str:
-    return command.replace("-", "_")
+def _parse(name: str, words: Sequence[str]) -> argparse.Namespace:
+    """Read a command's flags, and check the paths of checkpoints among them."""
+    parser = command_parser(name)
+    args, unknown = parser.parse_known_args(words)
+    if "rest" in args:  # of a command that has LeRobot's parser read them
+        args.rest = long_forms(unknown)
+        unknown = [word for word in args.rest if word.startswith("--") and not _may_be_of_eval(word)]
+    if unknown:
+        from lerobot_bomb.flag_errors import nearest  # draccus: half a second
+
+        near = nearest(unknown, parser._option_string_actions)
+        parser.error(f"unrecognized arguments: {' '.join(unknown)}{near}")
+    if (checkpoint := getattr(args, "policy_path", None)) is not None:
+        check_checkpoint(checkpoint)
+    return args
 
 
-def _module(command: str) -> Any:
-    return importlib.import_module(f"lerobot_bomb.commands.{_function(command)}")
-
-
-def build_parser(
-    imported: Collection[str],
-) -> tuple[argparse.ArgumentParser, dict[str, argparse.ArgumentParser]]:
-    """The parser of all commands, and each command's; those that are ``imported`` have their arguments."""
-    parser = argparse.ArgumentParser(prog="lerobot-bomb", description=DESCRIPTION)
-    parser.add_argument("--version", action="version", version=f"lerobot-bomb {__version__}")
-    commands = parser.add_subparsers(dest="command", required=True, metavar="COMMAND")
-    for name, summary in COMMANDS.items():
-        command = commands.add_parser(name, help=summary, description=summary, allow_abbrev=False)
-        if name in imported:
-            getattr(_module(name), f"add_{_function(name)}_arguments")(command)
-    return parser, commands.choices
+def _told() -> tuple[type[Exception], ...]:
+    """Return the errors whose messages are for the user; draccus is there if its own was raised."""
+    draccus = sys.modules.get("draccus.utils")
+    return (ValueError, OSError, RuntimeError, *((draccus.DecodingError,) if draccus else ()))
 
 
 def main(argv: Sequence[str] | None = None) -> int:
     """Run one command; what is wrong with its flags or files becomes one line on stderr and exit code 1."""
     argv = sys.argv[1:] if argv is None else list(argv)
-    argv = argv or ["--help"]
+    if not argv or argv[0].startswith("-"):
+        args = program_parser().parse_args(argv or ["--help"])
+        print(importlib.import_module("lerobot_bomb.commands.completion").script(args.completion))
+        return 0
+    found = _split(argv)
+    if found is None:
+        return _unknown(argv)
+    name, words = found
     use()
     try:
-        parser, commands = build_parser(argv[:1])
-        args, unknown = parser.parse_known_args(argv)
-        if "rest" in args:  # of a command that has LeRobot's parser read them
-            args.rest = unknown
-            unknown = [word for word in unknown if word.startswith("--") and not _may_be_of_eval(word)]
-        if unknown:
-            command = commands[args.command]
-            near = nearest(unknown, command._option_string_actions)
-            command.error(f"unrecognized arguments: {' '.join(unknown)}{near}")
-        return getattr(_module(args.command), f"run_{_function(args.command)}")(args)
-    except (ValueError, OSError, RuntimeError, DecodingError) as error:
-        print(f"lerobot-bomb {argv[0]}: {error}", file=sys.stderr)
+        return module_of(name).run(_parse(name, words))
+    except _told() as error:
+        print(f"{PROGRAM} {name}: {error}", file=sys.stderr)
         return 1
     except KeyboardInterrupt:
-        print(f"lerobot-bomb {argv[0]}: interrupted", file=sys.stderr)
+        print(f"{PROGRAM} {name}: interrupted", file=sys.stderr)
         return 130
 
 

@@ -1,22 +1,22 @@
-"""``lerobot-bomb push``: a checkpoint that was trained earlier, with its card, to the Hub."""
+"""``lerobot-bomb push``: a checkpoint or a recorded dataset, with its card, to the Hub."""
 
 import argparse
 
-from lerobot_bomb.checkpoints.names import TRAIN_CONFIG
-from lerobot_bomb.commands.arguments import add_hub_arguments, path_flag
-from lerobot_bomb.data.facts import DatasetFacts
+from lerobot_bomb.checkpoints.names import CONFIG, TRAIN_CONFIG
+from lerobot_bomb.commands.arguments import path_flag, switch
 from lerobot_bomb.data.resumable import check_repo_id
 from lerobot_bomb.evaluation.results import read_results
-from lerobot_bomb.hub.evaluated import check_environment_of, check_weights_of
-from lerobot_bomb.hub.push import publish, read_checkpoint
 
 
-def add_push_arguments(parser: argparse.ArgumentParser) -> None:
-    """Declare the arguments of ``lerobot-bomb push``."""
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Declare what is published, where and how."""
     add = parser.add_argument
-    folder = "the folder that lerobot-train names pretrained_model"
-    add("checkpoint", type=path_flag, metavar="CHECKPOINT", help=folder)
-    add_hub_arguments(parser, "model")
+    folder = "what lerobot-train names pretrained_model, or a dataset of lerobot-bomb record or convert"
+    add("folder", type=path_flag, metavar="FOLDER", help=folder)
+    add("--repo_id", required=True, help="name of the model or the dataset on the Hub, USER/NAME")
+    add("--private", **switch(), help="make a new repository that only you see")
+    dry_run = "print the card, and the names of the files instead of publishing them; no Hub is asked"
+    add("--dry_run", **switch(), help=dry_run)
     add(
         "--results",
         nargs="+",
@@ -29,27 +29,56 @@ def add_push_arguments(parser: argparse.ArgumentParser) -> None:
         "--dataset.root",
         dest="dataset_root",
         type=path_flag,
-        help="folder of the dataset, if it is no longer where the training found it; the card states what "
-        "it shows",
+        help="folder of the checkpoint's dataset, if it is no longer where the training found it; the card "
+        "states what it shows",
     )
 
 
-def run_push(args: argparse.Namespace) -> int:
-    """Check the checkpoint, then publish all of it in one commit; prints where."""
+def run(args: argparse.Namespace) -> int:
+    """Publish a checkpoint, or a folder that is a dataset."""
     check_repo_id(args.repo_id)
+    if not args.folder.is_dir():
+        raise ValueError(f"{args.folder}: there is no such folder; give a checkpoint's or a dataset's")
+    return (_push_dataset if (args.folder / "meta").is_dir() else _push_checkpoint)(args)
+
+
+def _push_dataset(args: argparse.Namespace) -> int:
+    """Check the dataset, publish all of it in one commit and tag it for LeRobot; prints where."""
+    for flag, value in {"--results": args.results, "--dataset.root": args.dataset_root}.items():
+        if value:
+            raise ValueError(f"{flag} is of a checkpoint, and {args.folder} is a dataset; drop it")
+    from lerobot_bomb.hub.dataset import publish_dataset, read_dataset  # LeRobot: seconds
+
+    dataset = read_dataset(args.folder, args.repo_id)
+    if args.dry_run:
+        print(dataset.card, *dataset.files, sep="\n")
+        return 0
+    print(publish_dataset(dataset, args.private or None).commit_url)
+    return 0
+
+
+def _push_checkpoint(args: argparse.Namespace) -> int:
+    """Check the checkpoint, then publish all of it in one commit; prints where."""
     results = [read_results(path) for path in args.results]
-    dataset = None if args.dataset_root is None else DatasetFacts.read(args.dataset_root)
+    if not (args.folder / CONFIG).is_file():
+        raise ValueError(
+            f"{args.folder} holds neither {CONFIG}, as a checkpoint does, nor meta/, as a dataset does"
+        )
     from lerobot_bomb.checkpoints.checks import checkpoint_files  # imports torch: seconds
+    from lerobot_bomb.data.facts import DatasetFacts
+    from lerobot_bomb.hub.evaluated import check_environment_of, check_weights_of
+    from lerobot_bomb.hub.push import publish, read_checkpoint
     from lerobot_bomb.hub.upload import check_token
 
-    files = {name: args.checkpoint / name for name in checkpoint_files(args.checkpoint)}
+    dataset = None if args.dataset_root is None else DatasetFacts.read(args.dataset_root)
+    files = {name: args.folder / name for name in checkpoint_files(args.folder)}
     for path, rows in zip(args.results, results, strict=True):
-        check_weights_of(path, rows, args.checkpoint)
-    if (args.checkpoint / TRAIN_CONFIG).is_file():
-        files[TRAIN_CONFIG] = args.checkpoint / TRAIN_CONFIG
+        check_weights_of(path, rows, args.folder)
+    if (args.folder / TRAIN_CONFIG).is_file():
+        files[TRAIN_CONFIG] = args.folder / TRAIN_CONFIG
     if not args.dry_run:
         check_token()
-    checkpoint = read_checkpoint(args.checkpoint, args.repo_id, dataset, results)
+    checkpoint = read_checkpoint(args.folder, args.repo_id, dataset, results)
     for path, rows in zip(args.results, results, strict=True):
         check_environment_of(path, rows, checkpoint.environment)
     if args.dry_run:

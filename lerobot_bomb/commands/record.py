@@ -10,11 +10,13 @@ from typing import Any
 import numpy as np
 
 from lerobot_bomb.bomb.episode import TEST_SEEDS
+from lerobot_bomb.bomb.observation import DEFAULT_IMAGE_SIZE
 from lerobot_bomb.checkpoints.names import WEIGHTS
+from lerobot_bomb.checkpoints.training import trained_image_size
 from lerobot_bomb.commands.arguments import (
     add_episode_arguments,
     add_new_dataset_arguments,
-    path_flag,
+    checkpoint_flag,
     switch,
 )
 from lerobot_bomb.commands.cluster_jobs import (
@@ -38,15 +40,15 @@ from lerobot_bomb.data.resumable import (
     terminated_in_order,
 )
 from lerobot_bomb.data.unfinished import METADATA_FILE, unfinished_folder
-from lerobot_bomb.flags import flags_without_group
+from lerobot_bomb.flags import reworded
 from lerobot_bomb.sweep.local import PYTHON
 
 JOBS, SCRIPT = "jobs", "record.sbatch"  # the folder ROOT.jobs, and a file in it
 NOT_OF_JOBS = ("command", "root", "resume", "shard", "join", "slurm", *SUBMITIT_FLAGS)
 
 
-def add_record_arguments(parser: argparse.ArgumentParser) -> None:
-    """Declare the arguments of ``lerobot-bomb record``."""
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Declare the arguments."""
     add_new_dataset_arguments(parser)
     add = parser.add_argument
     _add_what_is_recorded(parser)
@@ -92,7 +94,7 @@ def _add_what_is_recorded(parser: argparse.ArgumentParser) -> None:
     add(
         "--policy.path",
         dest="policy_path",
-        type=path_flag,
+        type=checkpoint_flag,
         help="folder of the checkpoint that acts, with --relabel; whatever becomes of its episodes",
     )
     add(
@@ -103,7 +105,7 @@ def _add_what_is_recorded(parser: argparse.ArgumentParser) -> None:
     )
 
 
-def run_record(args: argparse.Namespace) -> int:
+def run(args: argparse.Namespace) -> int:
     """Record; prints which episodes failed and where the dataset is."""
     recording = _recording(args)
     root = args.root or default_root(recording.repo_id)
@@ -128,6 +130,9 @@ def _recording(args: argparse.Namespace) -> Recording:
     flags = vars(args)
     if args.static == 0:
         raise ValueError("--static=0 records nothing; give a number of scenes, or --episodes")
+    if args.image_size is None:
+        trained = None if args.policy_path is None else trained_image_size(args.policy_path)
+        args.image_size = flags["image_size"] = trained or DEFAULT_IMAGE_SIZE
     given: dict[str, Any] = {f.name: flags[f.name] for f in fields(Recording) if f.name in flags}
     given |= {"episodes": args.episodes or 0, "static": args.static or 0, "relabel": _acting_weights(args)}
     recording = Recording(**given)
@@ -229,7 +234,7 @@ def _acting(recording: Recording, policy_path: Path) -> Acting:
     ways_out = dict.fromkeys(
         map(insist.format, ("policy.ignore_environment", "env.ignore_checkpoint")), "train one for this"
     )
-    with flags_without_group({"evaluate with": "record with", **ways_out}):
+    with reworded({"evaluate with": "record with", **ways_out}):
         loaded = load_policy(policy_path, None, "bomb", env_flags, recording.seed)
 
     def agent(observation: dict[str, Any], instruction: str) -> np.ndarray:

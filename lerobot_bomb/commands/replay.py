@@ -7,6 +7,7 @@ from typing import Any, cast
 from lerobot_bomb.commands.arguments import (
     ANSWER_IS_NO,
     add_checkpoint_arguments,
+    add_env_flag,
     add_episode_files_argument,
     path_flag,
     switch,
@@ -24,8 +25,8 @@ DEFAULT_FOLDER = Path("outputs/replay")
 RECORDED, CHANGED = "recorded", "changed"
 
 
-def add_replay_arguments(parser: argparse.ArgumentParser) -> None:
-    """Declare the arguments of ``lerobot-bomb replay``."""
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Declare the arguments."""
     parser.usage = "lerobot-bomb replay FILE [--line=N] [--set=AXIS=LEVEL,...] (and flags --policy.NAME)"
     add = parser.add_argument
     add("path", type=path_flag, metavar="FILE", help="file of --env.results_path")
@@ -37,7 +38,7 @@ def add_replay_arguments(parser: argparse.ArgumentParser) -> None:
         help="play it a second time, with these axes changed: camera=0,light=3, or camera:0,light:3",
     )
     add_checkpoint_arguments(parser, "the checkpoint's folder, where it lies elsewhere now")
-    add("--depth", **switch(), help="the policy was shown depth")
+    add_env_flag(parser, "depth", **switch(), help="the policy was shown depth")
     add_episode_files_argument(parser, DEFAULT_FOLDER)
     add("rest", nargs="*", metavar="FLAG", help="flags of the policy in that evaluation: --policy.NAME=VALUE")
 
@@ -51,7 +52,7 @@ def _levels(text: str) -> dict[str, int]:
     return {name: int(level) for name, _, level in parts}
 
 
-def run_replay(args: argparse.Namespace) -> int:
+def run(args: argparse.Namespace) -> int:
     """Run the episode, write both files, print its result and whether the record says the same."""
     if unknown := [flag for flag in args.rest if not flag.startswith("--policy.")]:
         raise ValueError(f"{unknown[0]} is unknown; see `lerobot-bomb replay --help`")

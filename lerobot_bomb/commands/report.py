@@ -21,8 +21,8 @@ TITLE, DEFAULT = "Evaluation", Path("report.html")
 NUM_SAMPLES = 3  # of each class of failure, at least
 
 
-def add_report_arguments(parser: argparse.ArgumentParser) -> None:
-    """Declare the arguments of ``lerobot-bomb report``."""
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Declare the arguments."""
     parser.add_argument(
         "paths", nargs="+", type=path_flag, metavar="FILE", help="files of --env.results_path"
     )
@@ -34,7 +34,7 @@ def add_report_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--videos", type=int, metavar="N", default=0, help=videos)
 
 
-def run_report(args: argparse.Namespace) -> int:
+def run(args: argparse.Namespace) -> int:
     """Write FILE.html, FILE.json and FILE.csv, and videos; print their paths."""
     check_at_least(args, videos=0)
     output = args.output / DEFAULT if args.output.is_dir() else args.output

@@ -11,15 +11,15 @@ from lerobot_bomb.report.arms import Arm, arms_of
 from lerobot_bomb.tables import print_lines, print_table
 
 
-def add_results_arguments(parser: argparse.ArgumentParser) -> None:
-    """Declare the arguments of ``lerobot-bomb results``."""
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Declare the arguments."""
     parser.add_argument(
         "paths", nargs="+", type=path_flag, metavar="FILE", help="files of --env.results_path"
     )
     parser.add_argument("--strict", action="store_true", help="a damaged line is an error, not a message")
 
 
-def run_results(args: argparse.Namespace) -> int:
+def run(args: argparse.Namespace) -> int:
     """Print, of each file, what compares: rates by condition, and what perturbations changed in pairs."""
     for path in args.paths:
         file = read_undamaged(path)

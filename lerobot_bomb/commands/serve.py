@@ -8,22 +8,21 @@ import socket
 import sys
 from collections.abc import Iterator
 from contextlib import contextmanager
-from dataclasses import fields
+from importlib.util import find_spec
 from ipaddress import ip_address
-from typing import cast
 
 from lerobot_bomb.commands.arguments import path_flag, switch
 from lerobot_bomb.compat.own.serving import serve_registered_policies
 
-try:
-    from lerobot.async_inference.configs import PolicyServerConfig
-
-    from lerobot_bomb.serving.open_streams import WORKERS, OpenStreams
-    from lerobot_bomb.serving.unpickling import loads
-except ImportError as error:  # LeRobot's own extra, which few need
-    raise RuntimeError("the server needs grpc: pip install 'lerobot_policy_bomb[async]'") from error
-
-LOOPBACK = "127.0.0.1"
+LOOPBACK, MAX_PORT = "127.0.0.1", 65535
+# LeRobot's flags of the server, with its defaults but for the host
+SERVER_FLAGS = {
+    "host": (LOOPBACK, "Host address to bind the server to"),
+    "port": (8080, "Port number to bind the server to"),
+    "fps": (30, "Frames per second"),
+    "inference_latency": (1 / 30, "Target inference latency in seconds"),
+    "obs_queue_timeout": (2.0, "Timeout for observation queue in seconds"),
+}
 WARNING = (
     "The server trusts its network: there is no password and no encryption, and whoever reaches it can have "
     "it load any checkpoint, and reads the actions. It unpickles what it receives: LeRobot's messages, "
@@ -32,28 +31,34 @@ WARNING = (
 )
 
 
-def add_serve_arguments(parser: argparse.ArgumentParser) -> None:
-    """Declare the arguments of ``lerobot-bomb serve``: those of LeRobot's policy_server, and who may come."""
-    parser.description = f"{parser.description}. {WARNING}"
-    for field in fields(PolicyServerConfig):
-        default = LOOPBACK if field.name == "host" else field.default
-        value_type = cast("type", field.type)
-        about = f"{field.metadata['help']} (default: {default})"
-        parser.add_argument(f"--{field.name}", type=value_type, default=default, help=about)
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Declare the flags of LeRobot's policy_server, and who may come."""
+    parser.description = WARNING
+    add = parser.add_argument
+    for name, (default, about) in SERVER_FLAGS.items():
+        add(f"--{name}", type=type(default), default=default, help=f"{about} (default: {default})")
     about = "allow a --host that other machines reach: they can use this server as you can"
-    parser.add_argument("--allow_network", **switch(), help=about)
+    add("--allow_network", **switch(), help=about)
     about = "listen on this Unix socket, which only you can open, in place of a port"
-    parser.add_argument("--socket", type=path_flag, default=None, metavar="PATH", help=about)
+    add("--socket", type=path_flag, default=None, metavar="PATH", help=about)
 
 
-def run_serve(args: argparse.Namespace) -> int:
+def run(args: argparse.Namespace) -> int:
     """Serve until Ctrl-C; a client names the checkpoint."""
     if args.fps < 1:
         raise ValueError(f"--fps={args.fps} must be at least 1")
-    config = PolicyServerConfig(
-        **{field.name: getattr(args, field.name) for field in fields(PolicyServerConfig)}
-    )
+    if not 1 <= args.port <= MAX_PORT:
+        raise ValueError(f"--port={args.port} must lie in 1..{MAX_PORT}")
+    if find_spec("grpc") is None:  # LeRobot's own extra, which few need
+        raise RuntimeError("the server needs grpc: pip install 'lerobot_policy_bomb[async]'")
     with _address(args) as address:
+        # LeRobot and torch: seconds
+        from lerobot.async_inference.configs import PolicyServerConfig
+
+        from lerobot_bomb.serving.open_streams import WORKERS, OpenStreams
+        from lerobot_bomb.serving.unpickling import loads
+
+        config = PolicyServerConfig(**{name: getattr(args, name) for name in SERVER_FLAGS})
         server = serve_registered_policies(config, address, loads, OpenStreams(), WORKERS)
         print(f"Serving on {address}. {WARNING}", file=sys.stderr, flush=True)
         try:

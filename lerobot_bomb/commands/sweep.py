@@ -2,11 +2,13 @@
 
 import argparse
 import signal
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
+from difflib import get_close_matches
 
 from lerobot_bomb.bomb.episode import MAX_SEED, TEST_SEEDS
-from lerobot_bomb.commands.arguments import check_at_least, parse_conditions, path_flag
+from lerobot_bomb.checkpoints.registered import registered_policy_types
+from lerobot_bomb.commands.arguments import add_env_flag, check_at_least, parse_conditions, path_flag
 from lerobot_bomb.commands.cluster_jobs import (
     SUBMITIT,
     add_job_arguments,
@@ -20,7 +22,7 @@ from lerobot_bomb.evaluation.result_lines import KIND_OF_ENV
 from lerobot_bomb.flags import one_of
 from lerobot_bomb.sweep.claim import claimed
 from lerobot_bomb.sweep.local import PYTHON, play, progress
-from lerobot_bomb.sweep.manifest import NAME, Cell, Manifest, flag_value, plan
+from lerobot_bomb.sweep.manifest import NAME, Cell, Manifest, flag_value, plan, policy_flag
 from lerobot_bomb.sweep.store import Store
 from lerobot_bomb.tables import print_lines
 
@@ -29,8 +31,8 @@ SCRIPT = "sweep.sbatch"
 ALL = "0/1"  # the only part
 
 
-def add_sweep_arguments(parser: argparse.ArgumentParser) -> None:
-    """Declare the arguments of ``lerobot-bomb sweep``."""
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Declare the arguments."""
     parser.usage = (
         "lerobot-bomb sweep FOLDER [--policies=A,B --env.type=bomb ...] (and flags of lerobot-eval)"
     )
@@ -41,9 +43,10 @@ def add_sweep_arguments(parser: argparse.ArgumentParser) -> None:
         type=parse_conditions,
         help="checkpoints and policy types: outputs/act,bomb:NAME,TYPE",
     )
-    add("--tasks", type=parse_conditions, default=(), help="values of --env.task: place,object")
+    tasks = "values of --env.task: place,object"
+    add("--env.task", "--task", "--tasks", dest="tasks", type=parse_conditions, default=(), help=tasks)
     conditions = "none,camera:3,all:1-5; each:1-5 is every axis at every level"
-    add("--perturbations", type=parse_conditions, default=(), help=conditions)
+    add_env_flag(parser, "perturbations", type=parse_conditions, default=(), help=conditions)
     add("--episodes", type=int, default=20, help="of each cell (default: 20)")
     add("--seed", type=int, default=TEST_SEEDS[0], help=f"the first one (default: {TEST_SEEDS[0]})")
     add("--batch_size", type=int, default=MAX_BATCH, help=f"at most (default: {MAX_BATCH})")
@@ -59,7 +62,7 @@ def add_sweep_arguments(parser: argparse.ArgumentParser) -> None:
     add("rest", nargs="*", metavar="FLAG", help="flags of lerobot-eval for every cell: --env.image_size=64")
 
 
-def run_sweep(args: argparse.Namespace) -> int:
+def run(args: argparse.Namespace) -> int:
     """Run what is missing; exit code 1 where something still is."""
     _check_numbers(args)
     manifest = _manifest(args)
@@ -136,6 +139,7 @@ def _manifest(args: argparse.Namespace) -> Manifest:
     if not args.policies:
         raise ValueError("--policies names none")
     kind = _kind(args.rest)
+    _check_types(args.policies)
     for task in args.tasks:
         one_of("--tasks", task, kind.tasks)
     conditions = _expanded(args.perturbations, kind)
@@ -154,6 +158,16 @@ def _kind(flags: list[str]) -> ResultKind:
             f"{', '.join(KIND_OF_ENV)}"
         )
     return KIND_OF_ENV[env_type]
+
+
+def _check_types(policies: Sequence[str]) -> None:
+    """Raise a ValueError if one is neither a checkpoint nor a type that there is, as far as source says."""
+    if (known := registered_policy_types()) is None:
+        return
+    for policy in policies:
+        if policy_flag(policy).startswith("--policy.type=") and policy not in known:
+            near = "".join(f"; nearest: {name}" for name in get_close_matches(policy, known, n=1))
+            raise ValueError(f"--policies: {policy} is no folder and no policy type{near}")
 
 
 def _expanded(perturbations: tuple[str, ...], kind: ResultKind) -> list[str]:

@@ -13,15 +13,17 @@ from lerobot_bomb.bomb.episode import EpisodeSpec
 from lerobot_bomb.bomb.observation import DEFAULT_IMAGE_SIZE, RenderOptions
 from lerobot_bomb.bomb.suite import specs_of_tasks
 from lerobot_bomb.checkpoints.names import CONFIG
+from lerobot_bomb.checkpoints.training import trained_image_size
 from lerobot_bomb.commands.arguments import (
     add_checkpoint_arguments,
+    add_env_flag,
     add_episode_arguments,
     add_episode_files_argument,
     switch,
 )
 from lerobot_bomb.envs.rollout import Agent, expert_agent, one_of_batch, random_agent
 from lerobot_bomb.files import read_json
-from lerobot_bomb.flags import flags_without_group, one_of
+from lerobot_bomb.flags import one_of
 from lerobot_bomb.pusht.episode import IMAGE_SIZE, INSTRUCTIONS, MAX_STEPS, PushTSpec
 from lerobot_bomb.viewing.episode import (
     EXPERT,
@@ -39,13 +41,14 @@ DEFAULT_FOLDER = Path("outputs/view")
 PUSHT_FLAGS = {"instruction": None, "max_steps": None}  # and what they are unless given
 
 
-def add_view_arguments(parser: argparse.ArgumentParser) -> None:
-    """Declare the arguments of ``lerobot-bomb view``."""
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Declare the arguments."""
     add = parser.add_argument
     add("--policy", help=f"who acts: {EXPERT} or {RANDOM} (default: {EXPERT}; bomb_pusht has {RANDOM} only)")
     add_checkpoint_arguments(parser, "who acts: the checkpoint in this folder")
     add(
         "--policy.ignore_environment",
+        "--env.ignore_checkpoint",
         "--ignore_checkpoint",
         dest="ignore_environment",
         **switch(),
@@ -58,9 +61,8 @@ def add_view_arguments(parser: argparse.ArgumentParser) -> None:
 
 def add_viewed_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare which episode of which environment is looked at, beside its seed."""
-    add = parser.add_argument
-    env_types = " or ".join(VIEWED)
-    add("--env.type", dest="env_type", default="bomb", help=f"{env_types} (default: bomb)")
+    env_types = f"{' or '.join(VIEWED)} (default: bomb)"
+    parser.add_argument("--env.type", dest="env_type", default="bomb", help=env_types)
     others = vars(parser.parse_args([]))
     add_episode_arguments(parser)
     shared = ("image_size", "perturbations")
@@ -69,24 +71,25 @@ def add_viewed_arguments(parser: argparse.ArgumentParser) -> None:
         for name, value in vars(parser.parse_args([])).items()
         if name not in others and name not in shared
     }
-    add(
-        "--instruction",
-        help=f"of bomb_pusht, which takes --perturbations and --image_size (default: {IMAGE_SIZE}) of the "
-        f"flags above: {' or '.join(INSTRUCTIONS)} (default: {INSTRUCTIONS[0]})",
+    add_env_flag(
+        parser,
+        "instruction",
+        help="of bomb_pusht, which takes --env.perturbations and --env.image_size (default: "
+        f"{IMAGE_SIZE}) of the flags above: {' or '.join(INSTRUCTIONS)} (default: {INSTRUCTIONS[0]})",
     )
-    add("--max_steps", type=int, help=f"of bomb_pusht: control steps (default: {MAX_STEPS})")
-    parser.set_defaults(image_size=None, own_flags={"bomb": of_bomb, "bomb_pusht": PUSHT_FLAGS})
+    max_steps = f"of bomb_pusht: control steps (default: {MAX_STEPS})"
+    add_env_flag(parser, "max_steps", type=int, help=max_steps)
+    parser.set_defaults(own_flags={"bomb": of_bomb, "bomb_pusht": PUSHT_FLAGS})
 
 
-def run_view(args: argparse.Namespace) -> int:
+def run(args: argparse.Namespace) -> int:
     """Run an episode, write both files, print the instruction, the outcome and the paths."""
     viewed = viewed_of(args)
     policy = _policy(args, viewed.policies)
     name = viewed.name(policy)
     paths = paths_of(args.output, DEFAULT_FOLDER, name)
-    with flags_without_group():
-        player = Player(viewed, partial(_agent, args, policy, viewed, paths))
-        (result,) = write_episodes({policy: player}, name, *paths)
+    player = Player(viewed, partial(_agent, args, policy, viewed, paths))
+    (result,) = write_episodes({policy: player}, name, *paths)
     values: Any = result
     print(values.instruction, viewed.log().describe(result), *paths, sep="\n")
     return 0
@@ -96,8 +99,9 @@ def viewed_of(args: argparse.Namespace) -> Viewed:
     """The episode that `add_viewed_arguments` lets a user name."""
     one_of("--env.type", args.env_type, VIEWED)
     _refuse_flags_of_others(args)
-    with flags_without_group():
-        return VIEWED[args.env_type](args)
+    if args.image_size is None and args.policy_path is not None:
+        args.image_size = trained_image_size(args.policy_path)
+    return VIEWED[args.env_type](args)
 
 
 def _refuse_flags_of_others(args: argparse.Namespace) -> None:
@@ -105,7 +109,7 @@ def _refuse_flags_of_others(args: argparse.Namespace) -> None:
         for name, default in defaults.items():
             value = getattr(args, name)
             if env_type != args.env_type and value != default:
-                raise ValueError(f"--{name}={value} is a flag of --env.type={env_type} only; drop it")
+                raise ValueError(f"--env.{name}={value} is a flag of --env.type={env_type} only; drop it")
 
 
 def _policy(args: argparse.Namespace, policies: tuple[str, ...]) -> str:
@@ -129,7 +133,7 @@ def _policy(args: argparse.Namespace, policies: tuple[str, ...]) -> str:
 
 def _bomb(args: argparse.Namespace) -> Viewed:
     if len(args.task_ids) > 1:
-        raise ValueError(f"--task_ids={list(args.task_ids)} must be one task: one episode is played")
+        raise ValueError(f"--env.task_ids={list(args.task_ids)} must be one task: one episode is played")
     spec = EpisodeSpec(
         seed=args.seed,
         suite=args.task,
@@ -163,7 +167,7 @@ VIEWED = {"bomb": _bomb, "bomb_pusht": _pusht}  # by --env.type
 def _condition(args: argparse.Namespace) -> str:
     if len(args.perturbations) != 1:
         raise ValueError(
-            f"--perturbations={','.join(args.perturbations)} must be one condition: one episode is played"
+            f"--env.perturbations={','.join(args.perturbations)} must be one condition: one episode is played"
         )
     return args.perturbations[0]
 

@@ -16,7 +16,7 @@ from lerobot_bomb.bomb.suites import SUITES
 from lerobot_bomb.conditions import ALL, NONE
 from lerobot_bomb.data.resumable import check_repo_id
 from lerobot_bomb.envs.results import installed_version
-from lerobot_bomb.flags import flags_without_group, one_of
+from lerobot_bomb.flags import one_of, reworded
 
 SCENES = 100  # static ones that are stored as an episode
 MAX_NOISE = 1.0  # beyond it the noise exceeds the largest action
@@ -67,23 +67,23 @@ class Recording:
         if self.episodes < 1:
             raise ValueError(f"--episodes={self.episodes} must be at least 1")
         if not self.perturbations:
-            raise ValueError('--perturbations=[] names no condition; leave it out or give ["none"]')
+            raise ValueError('--env.perturbations=[] names no condition; leave it out or give ["none"]')
         if not 0 <= self.noise <= MAX_NOISE:
             raise ValueError(
                 f"--noise={self.noise} must lie in 0..{MAX_NOISE:g}; "
                 "it is a standard deviation in units of the largest step, 40 mm"
             )
-        one_of("--task", self.task, (*SUITES, ALL))
+        one_of("--env.task", self.task, (*SUITES, ALL))
         if self.task_ids and self.task == ALL:
             raise ValueError(
-                f"--task_ids={list(self.task_ids)} are numbers in a suite; --task={ALL} is of all"
+                f"--env.task_ids={list(self.task_ids)} are numbers in a suite; --env.task={ALL} is of all"
             )
         if not self.protocol_version:
             object.__setattr__(self, "protocol_version", task_version(self.task))
         with self.flag_names():
             conditions, _ = self.conditions, self.render_options  # they check the remaining flags
         if len(set(conditions)) < len(conditions):
-            raise ValueError(f"--perturbations={','.join(self.perturbations)} has a condition twice")
+            raise ValueError(f"--env.perturbations={','.join(self.perturbations)} has a condition twice")
 
     def _of_scenes(self) -> None:
         """Take the number of episodes from that of scenes; these are always labelled."""
@@ -140,5 +140,5 @@ class Recording:
         return RenderOptions(self.image_size, self.render_preset, self.depth)
 
     def flag_names(self) -> AbstractContextManager[None]:
-        """Name flags in errors as they were given: a target by --target, or by the number of a task."""
-        return flags_without_group({"--env.target=": "the target "} if self.task_ids else None)
+        """Name flags in errors as they were given: a target by --env.target, or by the number of a task."""
+        return reworded({"--env.target=": "the target "} if self.task_ids else {})

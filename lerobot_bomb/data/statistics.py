@@ -93,7 +93,7 @@ def check_statistics(root: Path) -> None:
 
 def mending(root: Path) -> str:
     """Name the command that mends a dataset's statistics."""
-    return f"`lerobot-bomb statistics {root} --mend` writes those of all frames"
+    return f"`lerobot-bomb doctor dataset {root} --mend` writes those of all frames"
 
 
 def write_statistics(root: Path) -> None:

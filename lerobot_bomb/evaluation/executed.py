@@ -1,4 +1,4 @@
-"""Executed actions, from a dataset or from the file that ``lerobot-bomb eval`` writes.
+"""Executed actions, from a dataset or from the file that ``lerobot-bomb results actions`` writes.
 
 Shapes: `T` actions of an episode, `D` action dims.
 """
@@ -41,7 +41,7 @@ class Executed:
 
 
 def read_executed(path: Path) -> Executed:
-    """Read a file of ``lerobot-bomb eval`` or a LeRobotDataset's folder.
+    """Read a file of ``lerobot-bomb results actions`` or a LeRobotDataset's folder.
 
     Raises:
         ValueError: it is neither, or holds no whole episodes.
@@ -51,7 +51,9 @@ def read_executed(path: Path) -> Executed:
             raise ValueError(f"{path} holds no meta/info.json, so it is no LeRobotDataset")
         return executed_in_dataset(read_meta(path.name, path), str(path))
     if not path.is_file():
-        raise ValueError(f"{path}: no such file or folder; `lerobot-bomb eval {path} ...` writes such a file")
+        raise ValueError(
+            f"{path}: no such file or folder; `lerobot-bomb results actions {path} ...` writes such a file"
+        )
     return read_action_log(path)
 
 
@@ -95,7 +97,8 @@ def read_action_log(path: Path) -> Executed:
             rates.add(float(row["fps"]))
         except (ValueError, KeyError, TypeError) as error:
             raise ValueError(
-                f"{path}:{number}: not the actions of an episode, as `lerobot-bomb eval` writes them"
+                f"{path}:{number}: not the actions of an episode, as `lerobot-bomb results actions` writes "
+                "them"
             ) from error
         if actions_TD.ndim != 2:
             raise ValueError(f"{path}:{number}: actions have the shape {actions_TD.shape}, not (T, D)")

@@ -62,7 +62,8 @@ def check_policy(config: PreTrainedConfig, meta: LeRobotDatasetMetadata, rename_
         )
     if config.use_peft:
         raise ValueError(
-            "the checkpoint holds adapters; lerobot-bomb merge makes a whole one of them and their base"
+            "the checkpoint holds adapters; lerobot-bomb checkpoint merge makes a whole one of them and "
+            "their base"
         )
 
 

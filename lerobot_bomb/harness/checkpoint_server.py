@@ -61,7 +61,9 @@ class CheckpointServer(PredictModelServer):
         flags = [f"--{name}={json.dumps(value)}" for name, value in (policy or {}).items()]
         self._config = config = read_config(Path(checkpoint_path(checkpoint)), device, flags)
         if config.use_peft:
-            raise ValueError(f"{checkpoint} holds adapters; lerobot-bomb merge makes a whole one of them")
+            raise ValueError(
+                f"{checkpoint} holds adapters; lerobot-bomb checkpoint merge makes a whole one of them"
+            )
         set_seed(seed)
         self._policy = get_policy_class(config.type).from_pretrained(
             str(config.pretrained_path), config=config

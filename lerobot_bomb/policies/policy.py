@@ -368,7 +368,7 @@ class RelativeVlaPolicy(VlaPolicy):
     def _validate_peft_config(self, peft_config: Any) -> None:
         super()._validate_peft_config(peft_config)
         saved = peft_config.modules_to_save or ()
-        advice = "start from one that lerobot-bomb init writes for this dataset"
+        advice = "start from one that lerobot-bomb checkpoint init writes for this dataset"
         check_buffers_are_the_bases(self, self._base_buffers, saved, advice)
 
     def _to_relative(self, actions_BTD: Tensor, batch: dict[str, Tensor]) -> Tensor:

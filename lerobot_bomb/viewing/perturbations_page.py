@@ -23,8 +23,8 @@ draw the sheets below:
 ```
 lerobot-eval --policy.path=CHECKPOINT --env.type=bomb --eval.n_episodes=100 --eval.batch_size=10 \\
     --env.perturbations='["none","camera:3","camera:2+light:3","all:1-5"]'
-lerobot-bomb view --perturbations=camera:3 --seed=7
-lerobot-bomb gallery --axes=camera,light --seeds=2,3 --output=outputs/gallery
+lerobot-bomb view --env.perturbations=camera:3 --seed=7
+lerobot-bomb view gallery --axes=camera,light --seeds=2,3 --output=outputs/gallery
 ```
 
 - An **axis** changes one thing and leaves all others alone.
@@ -40,8 +40,8 @@ lerobot-bomb gallery --axes=camera,light --seeds=2,3 --output=outputs/gallery
 Each condition is a group in `eval_info.json`: `place.camera-2.light-3`, `place.all-1to5`. What is needed to
 solve the episode stays in view, and the instruction always says what is meant.
 
-`lerobot-bomb gallery --output=docs/media/perturbations --doc=docs/perturbations.md` writes this page. The
-magnitudes are in `lerobot_bomb/bomb/perturbations.py`; what an axis does, in
+`lerobot-bomb view gallery --output=docs/media/perturbations --doc=docs/perturbations.md` writes this page.
+The magnitudes are in `lerobot_bomb/bomb/perturbations.py`; what an axis does, in
 `envs/lerobot_env_bomb/axes/AXIS.py`.
 """
 

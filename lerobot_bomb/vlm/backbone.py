@@ -206,8 +206,8 @@ def check_family(vlm_model_name: str, *families: str) -> str:
     if family is None and "type" in config:
         raise ValueError(
             f"--policy.vlm_model_name={vlm_model_name} is a checkpoint of the policy {config['type']!r}; "
-            f"`lerobot-bomb export-backbone --policy.path={vlm_model_name} --output=FOLDER` makes a folder "
-            f"to start from. (To train on: --policy.path={vlm_model_name})"
+            f"`lerobot-bomb checkpoint export-backbone --policy.path={vlm_model_name} --output=FOLDER` makes "
+            f"a folder to start from. (To train on: --policy.path={vlm_model_name})"
         )
     if family not in families:
         raise ValueError(

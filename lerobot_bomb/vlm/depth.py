@@ -35,8 +35,8 @@ def observed_depth(batch: Mapping[str, Tensor], camera: str, image_size: tuple[i
     key = f"observation.depth.{camera}"
     if key not in batch:
         raise KeyError(
-            f"--policy.depth_source=observation needs {key!r}; the batch has {sorted(batch)}. Record with "
-            f"--depth and evaluate with --env.depth=true, or choose --policy.depth_source=none"
+            f"--policy.depth_source=observation needs {key!r}; the batch has {sorted(batch)}. Record "
+            f"and evaluate with --env.depth=true, or choose --policy.depth_source=none"
         )
     depth = batch[key]
     depth_BHW = depth[:, 0] if depth.ndim == 4 and depth.shape[1] == 1 else depth

@@ -10,6 +10,7 @@ import lerobot_policy_fdvla
 import lerobot_policy_spatialvla_grid
 import lerobot_policy_vla0_smol
 from lerobot_bomb.checkpoints.config import config_damage
+from lerobot_bomb.checkpoints.environment import complete_evaluation
 from lerobot_bomb.checkpoints.names import is_hub_id
 from lerobot_bomb.checkpoints.processor_files import check_saved_processors
 from lerobot_bomb.checkpoints.shipped import PREFIX, checkpoint_path
@@ -24,7 +25,7 @@ from lerobot_bomb.compat.hooks.torchcodec import shorten_torchcodec_warning
 from lerobot_bomb.compat.use import register
 from lerobot_bomb.data.hub_token import check_token_characters
 from lerobot_bomb.data.missing import explain
-from lerobot_bomb.flag_errors import hint, refuse_recording_of_several, refuse_unknown
+from lerobot_bomb.flag_errors import hint, refuse_unknown
 
 OURS = (
     lerobot_bomb,
@@ -49,7 +50,7 @@ register(
         lambda: tell_wrong_flags(hint, refuse_unknown),
         lambda: explain_missing_datasets(explain),
         read_asked_columns,
-        lambda: check_evaluations(refuse_recording_of_several),
+        lambda: check_evaluations(complete_evaluation),
         lambda: check_tokens_before_use(check_token_characters),
         publish_as_the_policy_says,
         shorten_torchcodec_warning,

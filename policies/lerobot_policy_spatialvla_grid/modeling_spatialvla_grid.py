@@ -161,7 +161,8 @@ class SpatialvlaGridPolicy(TokenVlaPolicy, PointingVlaPolicy):
         if self.config.use_peft:
             raise ValueError(
                 f"{self.config.pretrained_path} holds adapters and cells of other grids than this dataset's; "
-                "train on what lerobot-bomb merge makes of them, or give --policy.adapt_embeddings=false"
+                "train on what lerobot-bomb checkpoint merge makes of them, or give "
+                "--policy.adapt_embeddings=false"
             )
         for table in (self.cell_embedding, self.cell_head):
             cells, others = table.weight.tensor_split([old.num_tokens])

@@ -71,7 +71,9 @@ def test_adapters_of_which_a_part_is_missing_are_refused(
         assert push(folder) == 1
         pushed = capsys.readouterr().err
         assert online.requests == []
-        assert main(["merge", f"--policy.path={folder}", f"--output={tmp_path / 'merged'}"]) == 1
+        assert (
+            main(["checkpoint", "merge", f"--policy.path={folder}", f"--output={tmp_path / 'merged'}"]) == 1
+        )
         merged = capsys.readouterr().err
         config = read_config(folder, "cpu")
         with pytest.raises(ValueError, match=ADAPTERS) as raised:
@@ -135,17 +137,17 @@ def test_adapters_of_a_folder_are_refused_before_training_and_before_any_request
     online: LoopbackHub, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     write_checkpoint(tmp_path / "base")
-    with pytest.raises(ValueError, match=r"base, is on this machine only; .*lerobot-bomb merge"):
+    with pytest.raises(ValueError, match=r"base, is on this machine only; .*lerobot-bomb checkpoint merge"):
         adapters(str(tmp_path / "base"), repo_id=REPO_ID, push_to_hub=True)
     wrapped = adapters(str(tmp_path / "base"), repo_id=REPO_ID)
     folder = save(wrapped, tmp_path / "adapters")
     assert push(folder) == 1
     error = capsys.readouterr().err
     assert "is on this machine only; publish that first" in error
-    assert "lerobot-bomb merge" in error
+    assert "lerobot-bomb checkpoint merge" in error
     assert error.count("\n") == 1
     cfg = TrainPipelineConfig(DatasetConfig("me/d"), policy=wrapped.config, output_dir=tmp_path / "out")
-    with pytest.raises(ValueError, match=r"lerobot-bomb merge"):
+    with pytest.raises(ValueError, match=r"lerobot-bomb checkpoint merge"):
         wrapped.push_model_to_hub(cfg, peft_model=wrapped)
     assert online.requests == []
 
@@ -166,19 +168,19 @@ def test_a_pickle_does_not_take_the_place_of_adapters(online: LoopbackHub, tmp_p
         config.pretrained_path = Path(path)
         with pytest.raises(FileNotFoundError, match=message):
             make_policy(config, env_cfg=make_env_config("bomb", image_size=64))
-    assert main(["merge", f"--policy.path={folder}", f"--output={tmp_path / 'merged'}"]) == 1
+    assert main(["checkpoint", "merge", f"--policy.path={folder}", f"--output={tmp_path / 'merged'}"]) == 1
 
 
 @pytest.mark.long
 def test_train_push_forget_and_evaluate_adapters(policy_type: str, hub: LoopbackHub, tmp_path: Path) -> None:
-    """Check all of it by commands alone, on a base that `lerobot-bomb init` wrote."""
+    """Check all of it by commands alone, on a base that `lerobot-bomb checkpoint init` wrote."""
     data = [f"--dataset.repo_id={DATASET}", f"--dataset.root={tmp_path / 'dataset'}"]
     own = [f"--policy.type={policy_type}", "--policy.vlm_model_name=nano", "--policy.device=cpu"]
     output = f"--output={tmp_path / 'base'}"
     ended = run(
         [
             record(tmp_path / "dataset"),
-            ["lerobot-bomb", "init", *own, *SMALL[policy_type].split(), *data, output],
+            ["lerobot-bomb", "checkpoint", "init", *own, *SMALL[policy_type].split(), *data, output],
             ["lerobot-bomb", "push", str(tmp_path / "base"), f"--repo_id={BASE}"],
             train(
                 *(tmp_path, "lora", f"--policy.path={BASE}", f"--policy.repo_id={REPO_ID}", data[1]),

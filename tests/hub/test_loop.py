@@ -65,7 +65,7 @@ def loop(hub: LoopbackHub, folder: Path, policy_type: str) -> str:
     ended = run(
         [
             record(folder / "dataset"),
-            ["lerobot-bomb", "push-dataset", f"{folder / 'dataset'}", f"--repo_id={DATASET}"],
+            ["lerobot-bomb", "push", f"{folder / 'dataset'}", f"--repo_id={DATASET}"],
             train(folder, "first", *flags, f"--policy.repo_id={FIRST}", root),
             ["python", TAG_CODE],
             FORGET,

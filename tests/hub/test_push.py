@@ -268,7 +268,7 @@ def test_a_token_that_no_header_can_hold_is_never_shown(
     monkeypatch.setenv("HF_TOKEN", token)
     assert push(checkpoint) == 1
     flags = ["--policy.type=vla0_smol", "--dataset.repo_id=me/elsewhere", f"--output={tmp_path / 'new'}"]
-    assert main(["init", *flags]) == 1
+    assert main(["checkpoint", "init", *flags]) == 1
     errors = capsys.readouterr().err.strip().splitlines()
     with pytest.raises(ValueError) as raised:
         hf_hub_download("me/x", "config.json")

@@ -1,4 +1,4 @@
-"""`lerobot-bomb push-dataset`: what is published and what is refused; tests/hub/test_loop.py trains on it."""
+"""`lerobot-bomb push`: what is published and what is refused; tests/hub/test_loop.py trains on it."""
 
 from collections.abc import Callable
 from pathlib import Path
@@ -31,7 +31,7 @@ def copy(root: Path, folder: Path) -> Path:
 
 
 def push(root: Path, *flags: str) -> int:
-    return main(["push-dataset", str(root), f"--repo_id={REPO_ID}", *flags])
+    return main(["push", str(root), f"--repo_id={REPO_ID}", *flags])
 
 
 def test_one_commit_tagged_for_lerobot_with_a_card(
@@ -115,7 +115,6 @@ def test_what_is_no_name_on_the_hub_is_refused_by_every_flag_that_takes_one(
 ) -> None:
     for command in (
         ["push", str(tmp_path)],
-        ["push-dataset", str(tmp_path)],
         ["record", "--episodes=1", f"--root={tmp_path / 'new'}"],
         ["convert", "pusht-zarr", str(tmp_path), f"--root={tmp_path / 'new'}"],
     ):

@@ -1,4 +1,4 @@
-"""``lerobot-bomb gallery``: contact sheets of what each perturbation axis does, or of a suite's tasks."""
+"""``lerobot-bomb view gallery``: what each perturbation axis does, or a suite's tasks, on sheets."""
 
 import argparse
 from collections.abc import Callable, Mapping, Sequence
@@ -15,11 +15,11 @@ from lerobot_bomb.bomb.observation import CAMERAS, PIXELS, WORKSPACE_HIGH_M, WOR
 from lerobot_bomb.bomb.perturbations import AXES, NUISANCES
 from lerobot_bomb.bomb.suite import find_suite, specs_of_tasks
 from lerobot_bomb.bomb.suites import SUITES
-from lerobot_bomb.commands.arguments import parse_numbers, path_flag
+from lerobot_bomb.commands.arguments import add_env_flag, parse_numbers, path_flag
 from lerobot_bomb.conditions import ALL, MAX_LEVEL, NONE, Axis, nuisances_of
 from lerobot_bomb.envs.rollout import expert_agent, make_env, make_libero_env, make_pusht_env, play
 from lerobot_bomb.files import written_whole
-from lerobot_bomb.flags import flags_without_group, one_of
+from lerobot_bomb.flags import one_of, reworded
 from lerobot_bomb.libero.assets import prepare_libero
 from lerobot_bomb.libero.episode import LiberoSpec
 from lerobot_bomb.libero.perturbations import LIBERO_AXES
@@ -44,14 +44,15 @@ type TilesOf = Callable[[str, int, int, set[str]], dict[str, np.ndarray]]
 GRID_RGB, NOMINAL_RGB, PATH_RGB = (200, 185, 160), (165, 165, 165), (210, 40, 30)
 
 
-def add_gallery_arguments(parser: argparse.ArgumentParser) -> None:
-    """Declare the arguments of ``lerobot-bomb gallery``."""
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Declare the arguments."""
     add = parser.add_argument
     add("--env.type", dest="env_type", default="bomb", help=f"{', '.join(AXES_OF)} (default: bomb)")
     add("--axes", type=_parse_names, help="as camera,light (default: every axis and all)")
-    add("--task", help=f"draw a suite's tasks in place of axes: {', '.join(SUITES)}")
+    add_env_flag(parser, "task", help=f"draw a suite's tasks in place of axes: {', '.join(SUITES)}")
     add("--seeds", type=parse_numbers, default=DEFAULT_SEEDS, help="episodes (default: 2,3)")
-    add("--image_size", type=int, default=DEFAULT_TILE_SIZE, help="pixels of a tile (default: %(default)s)")
+    size = "pixels of a tile (default: %(default)s)"
+    add_env_flag(parser, "image_size", type=int, default=DEFAULT_TILE_SIZE, help=size)
     add(
         "--output",
         type=path_flag,
@@ -61,7 +62,7 @@ def add_gallery_arguments(parser: argparse.ArgumentParser) -> None:
     add("--doc", type=path_flag, help="also write the page that explains the axes, with their sheets")
 
 
-def run_gallery(args: argparse.Namespace) -> int:
+def run(args: argparse.Namespace) -> int:
     """Draw the sheets and print their paths."""
     one_of("--env.type", args.env_type, AXES_OF)
     sheets = (*AXES_OF[args.env_type], ALL)
@@ -69,13 +70,13 @@ def run_gallery(args: argparse.Namespace) -> int:
     for axis in axes:
         one_of("--axes", axis, sheets)
     if args.task is not None:
-        one_of("--task", args.task, SUITES)
+        one_of("--env.task", args.task, SUITES)
         for flag, value in {"axes": args.axes, "doc": args.doc}.items():
             if value is not None:
-                raise ValueError(f"--{flag} and --task={args.task}: give one of them")
+                raise ValueError(f"--{flag} and --env.task={args.task}: give one of them")
         if args.env_type != "bomb":
             raise ValueError(
-                f"--task={args.task} is a suite of --env.type=bomb; drop --env.type={args.env_type}"
+                f"--env.task={args.task} is a suite of --env.type=bomb; drop --env.type={args.env_type}"
             )
     if args.env_type != "bomb" and args.doc is not None:
         raise ValueError(f"--doc={args.doc} is written for --env.type=bomb only; drop one of them")
@@ -85,8 +86,8 @@ def run_gallery(args: argparse.Namespace) -> int:
         prepare_libero([LIBERO_TASK])
     if args.output.exists() and not args.output.is_dir():
         raise ValueError(f"--output={args.output} is no folder; name another")
-    with flags_without_group({"--seed=": "--seeds: "}):
-        options = RenderOptions(image_size=args.image_size)
+    options = RenderOptions(image_size=args.image_size)
+    with reworded({"--seed=": "--seeds: "}):
         for seed in args.seeds:
             EpisodeSpec(seed)
     for axis in tqdm(axes if args.task is None else [args.task], unit="sheet"):

@@ -1,38 +1,33 @@
-"""``lerobot-bomb offline-metrics``: a checkpoint's loss, accuracy and L1 on recorded frames."""
+"""``lerobot-bomb checkpoint offline-metrics``: a checkpoint's loss, accuracy and L1 on recorded frames."""
 
 import argparse
 import json
 import sys
 from dataclasses import asdict
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
-from lerobot.datasets import LeRobotDatasetMetadata
-
-from lerobot_bomb.checkpoints.folder import read_config
 from lerobot_bomb.checkpoints.training import read_train_config
-from lerobot_bomb.commands.arguments import checkpoint_flag, path_flag
-from lerobot_bomb.data.columns import read_meta
-from lerobot_bomb.data.dataset_files import check_readable
-from lerobot_bomb.evaluation.offline_metrics import measure_columns, print_columns
-from lerobot_bomb.evaluation.predictions import check_policy
-from lerobot_bomb.evaluation.splits import (
-    Split,
-    make_split,
-    parse_episodes,
-    trained_episodes,
+from lerobot_bomb.commands.arguments import (
+    add_dataset_arguments,
+    check_at_least,
+    checkpoint_flag,
+    path_flag,
 )
 from lerobot_bomb.files import check_writable, written_whole
 
+if TYPE_CHECKING:
+    from lerobot.datasets import LeRobotDatasetMetadata
 
-def add_offline_metrics_arguments(parser: argparse.ArgumentParser) -> None:
-    """Declare the arguments of ``lerobot-bomb offline-metrics``."""
+    from lerobot_bomb.evaluation.splits import Split
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Declare the arguments."""
     add = parser.add_argument
     path = "folder of the checkpoint that lerobot-train names pretrained_model"
     add("--policy.path", dest="policy_path", type=checkpoint_flag, required=True, help=path)
     add("--device", "--policy.device", help="cpu, cuda, ... (default: as the checkpoint says)")
-    add("--dataset.repo_id", dest="repo_id", required=True, help="name of the dataset")
-    root = "folder of the dataset (default: LeRobot's, $HF_LEROBOT_HOME/REPO_ID)"
-    add("--dataset.root", dest="root", type=path_flag, help=root)
+    add_dataset_arguments(parser)
     spelling = "episodes as [180,181], 180-205 or [0-9,20]"
     add("--train_episodes", help=f"{spelling} (default: what the checkpoint was trained on)")
     add("--val_episodes", help=f"{spelling} (default: all others)")
@@ -42,9 +37,16 @@ def add_offline_metrics_arguments(parser: argparse.ArgumentParser) -> None:
     add("--json", type=path_flag, help="also write all figures to this file, those of every step too")
 
 
-def run_offline_metrics(args: argparse.Namespace) -> int:
+def run(args: argparse.Namespace) -> int:
     """Measure, print the tables, write the JSON file."""
     _check_flags(args)
+    # LeRobot and torch: seconds
+    from lerobot_bomb.checkpoints.folder import read_config
+    from lerobot_bomb.data.columns import read_meta
+    from lerobot_bomb.data.dataset_files import check_readable
+    from lerobot_bomb.evaluation.offline_metrics import measure_columns, print_columns
+    from lerobot_bomb.evaluation.predictions import check_policy
+
     config = read_config(args.policy_path, args.device)
     meta = read_meta(args.repo_id, args.root)
     check_readable(meta.root)
@@ -70,14 +72,14 @@ def run_offline_metrics(args: argparse.Namespace) -> int:
 
 
 def _check_flags(args: argparse.Namespace) -> None:
-    for flag, lowest in {"max_frames": 0, "batch_size": 1}.items():
-        if getattr(args, flag) < lowest:
-            raise ValueError(f"--{flag}={getattr(args, flag)} must be at least {lowest}")
+    check_at_least(args, max_frames=0, batch_size=1)
     if args.json is not None:
         check_writable("--json", args.json)
 
 
-def _split(args: argparse.Namespace, meta: LeRobotDatasetMetadata, train_config: dict[str, Any]) -> Split:
+def _split(args: argparse.Namespace, meta: "LeRobotDatasetMetadata", train_config: dict[str, Any]) -> "Split":
+    from lerobot_bomb.evaluation.splits import make_split, parse_episodes, trained_episodes
+
     if not train_config and args.val_episodes is None:
         raise ValueError(
             f"--policy.path={args.policy_path} has no train_config.json to tell which episodes it was "

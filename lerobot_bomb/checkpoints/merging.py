@@ -1,6 +1,5 @@
-"""``lerobot-bomb merge``: adapters and their base as one checkpoint, which needs neither them nor `peft`."""
+"""Adapters and their base as one checkpoint."""
 
-import argparse
 from pathlib import Path
 
 from lerobot.configs import PreTrainedConfig
@@ -9,26 +8,19 @@ from lerobot.policies import PreTrainedPolicy, get_policy_class
 from lerobot_bomb.checkpoints.adapters import check_adapters_fit
 from lerobot_bomb.checkpoints.checks import ADAPTERS
 from lerobot_bomb.checkpoints.folder import load_processors, read_config, write_checkpoint
-from lerobot_bomb.commands.arguments import add_folder_arguments
-from lerobot_bomb.files import check_new_folder
 
 
-def add_merge_arguments(parser: argparse.ArgumentParser) -> None:
-    """Declare the arguments of ``lerobot-bomb merge``."""
-    add_folder_arguments(parser, "the adapters' checkpoint", "new folder for the checkpoint")
+def merge(adapters: Path, output: Path) -> None:
+    """Write a whole checkpoint to a new folder.
 
-
-def run_merge(args: argparse.Namespace) -> int:
-    """Write config, merged weights and processors."""
-    check_new_folder("--output", args.output)
-    config = read_config(args.policy_path, "cpu")
+    Raises:
+        ValueError: there are no adapters in the folder, or their base cannot be loaded.
+    """
+    config = read_config(adapters, "cpu")
     if not config.use_peft:
-        raise ValueError(f"--policy.path={args.policy_path} is a whole checkpoint: there is nothing to merge")
+        raise ValueError(f"--policy.path={adapters} is a whole checkpoint: there is nothing to merge")
     pipelines = load_processors(config)
-    policy = merged(config, args.policy_path)
-    write_checkpoint(args.output, policy, pipelines)
-    print(f"written to {args.output}: --policy.path={args.output}")
-    return 0
+    write_checkpoint(output, merged(config, adapters), pipelines)
 
 
 def merged(config: PreTrainedConfig, adapters: Path) -> PreTrainedPolicy:

@@ -1,30 +1,33 @@
-"""``lerobot-bomb lines``: lines of results of LeRobot's own environments, from its eval_info.json."""
+"""``lerobot-bomb results add``: records of LeRobot's own environments, from its eval_info.json."""
 
 import argparse
 from pathlib import Path
 from typing import Any
 
-from lerobot_bomb.checkpoints.identity import identity_of_config
-from lerobot_bomb.commands.arguments import add_file_and_eval_flags
-from lerobot_bomb.compat.own.evaluation import eval_config
+from lerobot_bomb.commands.arguments import add_file_and_eval_flags, long_forms
 from lerobot_bomb.envs.results import write_result
-from lerobot_bomb.evaluation.eval_info import EVAL_INFO, results_of
 from lerobot_bomb.evaluation.result_lines import KIND_OF_ENV, KINDS
 from lerobot_bomb.files import read_json
 from lerobot_bomb.flags import one_of
 from lerobot_bomb.sweep.manifest import flag_value
 
 
-def add_lines_arguments(parser: argparse.ArgumentParser) -> None:
-    """Declare the arguments of ``lerobot-bomb lines``."""
-    add_file_and_eval_flags(parser, "lines", "of results, which gets a line per episode")
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Declare the arguments."""
+    add_file_and_eval_flags(parser, "of results, which gets a record per episode")
 
 
-def run_lines(args: argparse.Namespace) -> int:
+def run(args: argparse.Namespace) -> int:
     """Append the records of an evaluation; the flags are those of its command."""
-    if not flag_value(args.flags, "--output_dir"):
-        raise ValueError(f"--output_dir=... is missing: the folder that lerobot-eval wrote {EVAL_INFO} to")
-    config = eval_config(args.flags)
+    flags = long_forms(args.flags)
+    if not flag_value(flags, "--output_dir"):
+        raise ValueError("--output_dir=... is missing: the folder that lerobot-eval wrote to")
+    # LeRobot and torch: seconds
+    from lerobot_bomb.checkpoints.identity import identity_of_config
+    from lerobot_bomb.compat.own.evaluation import eval_config
+    from lerobot_bomb.evaluation.eval_info import EVAL_INFO, results_of
+
+    config = eval_config(flags)
     _check_flags(config)
     path = config.output_dir / EVAL_INFO
     info = read_json(path)

@@ -1,4 +1,4 @@
-"""``lerobot-bomb eval``: lerobot-eval, which also writes down what was executed.
+"""``lerobot-bomb results actions``: lerobot-eval, which also writes down what was executed.
 
 Shapes: `B` environments, `T` actions of an episode, `D` action dims.
 """
@@ -9,17 +9,16 @@ import traceback
 from collections.abc import Callable, Sequence
 from functools import partial
 from pathlib import Path
-from typing import Any, cast
+from typing import TYPE_CHECKING, Any, cast
 
 import numpy as np
-from draccus.utils import DecodingError
-from gymnasium.vector import VectorEnv
-from lerobot.envs import EnvConfig
 
-from lerobot_bomb.commands.arguments import add_file_and_eval_flags
-from lerobot_bomb.compat.own.evaluation import lerobot_eval_with
-from lerobot_bomb.evaluation.executed import append_episode
+from lerobot_bomb.commands.arguments import add_file_and_eval_flags, long_forms
 from lerobot_bomb.files import check_writable
+
+if TYPE_CHECKING:
+    from gymnasium.vector import VectorEnv
+    from lerobot.envs import EnvConfig
 
 type Envs = dict[str, dict[int, VectorEnv]]  # {group: {task id: vector env}}, as LeRobot has them
 
@@ -63,18 +62,23 @@ class LoggedVectorEnv:
         return observation, reward, terminated_B, truncated_B, info
 
 
-def add_eval_arguments(parser: argparse.ArgumentParser) -> None:
-    """Declare the arguments of ``lerobot-bomb eval``."""
-    add_file_and_eval_flags(parser, "eval", "new file: a JSON line per finished episode")
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Declare the arguments."""
+    add_file_and_eval_flags(parser, "new file: a JSON line per finished episode")
 
 
-def run_eval(args: argparse.Namespace) -> int:
+def run(args: argparse.Namespace) -> int:
     """Evaluate; a failure of lerobot-eval is shown with its traceback, as it shows it itself."""
     if args.path.exists():
         raise ValueError(f"{args.path} exists already, and a file holds one evaluation; name another")
     check_writable("FILE", args.path)
+    # LeRobot and torch: seconds
+    from draccus.utils import DecodingError
+
+    from lerobot_bomb.compat.own.evaluation import lerobot_eval_with
+
     try:
-        lerobot_eval_with(args.flags, partial(logged, args.path))
+        lerobot_eval_with(long_forms(args.flags), partial(logged, args.path))
     except DecodingError:
         raise  # one line
     except Exception:
@@ -84,7 +88,7 @@ def run_eval(args: argparse.Namespace) -> int:
     return 0
 
 
-def logged(path: Path, config: EnvConfig, envs: Envs) -> Envs:
+def logged(path: Path, config: "EnvConfig", envs: Envs) -> Envs:
     """Wrap the environments so that their executed actions go to a file."""
     return {
         group: {
@@ -96,4 +100,6 @@ def logged(path: Path, config: EnvConfig, envs: Envs) -> Envs:
 
 
 def _log_to(path: Path, group: str, task_id: int, fps: float) -> Callable[[int, np.ndarray], None]:
+    from lerobot_bomb.evaluation.executed import append_episode
+
     return lambda seed, actions_TD: append_episode(path, group, task_id, seed, fps, actions_TD)

@@ -1,11 +1,11 @@
-"""``lerobot-bomb convert-spatialvla``: a published SpatialVLA folder as a checkpoint of ``spatialvla_grid``.
+"""A published SpatialVLA folder as a checkpoint of ``spatialvla_grid``.
 
 The folder is what the original's ``save_pretrained`` writes; values that its config.json leaves out are the
 defaults of transformers' classes.
 """
 
-import argparse
 from collections.abc import Iterator
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -21,8 +21,7 @@ from lerobot_bomb.actions.grid_settings import ActionGroup, GridSettings
 from lerobot_bomb.actions.grids import ActionGrids
 from lerobot_bomb.checkpoints.checks import check_finite
 from lerobot_bomb.checkpoints.folder import write_checkpoint
-from lerobot_bomb.commands.arguments import path_flag
-from lerobot_bomb.files import check_new_folder, read_json
+from lerobot_bomb.files import read_json
 from lerobot_bomb.vlm.backbone import config_dict
 from lerobot_bomb.vlm.intrinsics import default_intrinsics, resize_intrinsics
 from lerobot_bomb.vlm.paligemma import PaliGemmaPrompt
@@ -55,63 +54,53 @@ PUBLISHED_MIN_SIGMA = 0.5
 EDGE_TOLERANCE = 1e-6
 
 
-def add_convert_spatialvla_arguments(parser: argparse.ArgumentParser) -> None:
-    """Declare the arguments of ``lerobot-bomb convert-spatialvla``."""
-    add = parser.add_argument
-    add(
-        "folder",
-        type=path_flag,
-        help="folder with config.json, processor_config.json, tokenizer.json, weights",
-    )
-    add("--output", type=path_flag, required=True, help="new folder for the checkpoint")
-    statistics = "which of the folder's data sets says how actions are scaled, if it has several"
-    add("--statistics", help=statistics)
-    add("--camera", default="image", help="name of the camera, observation.images.NAME (default: image)")
-    grid = "gs_*.json that the folder's edges were made of: for --decode_point=cond_mean"
-    add("--grid", type=path_flag, help=grid)
-    min_sigma = f"least sigma of --grid (default: the folder's, or the published {PUBLISHED_MIN_SIGMA})"
-    add("--min_sigma", type=float, help=min_sigma)
-    template = (
-        "what the prompt says around an instruction, which stands for {}: '{}' (default), as the original's "
-        "processor writes it, or 'What action should the robot take to {}?', as its slides do"
-    )
-    add("--task_template", default=BARE_TASK, help=template)
-    point = "what cells decode to: mid, as in the original (default), or cond_mean, the mean by --grid"
-    add("--decode_point", default="mid", choices=("mid", "cond_mean"), help=point)
+@dataclass(frozen=True)
+class Published:
+    """A published folder, and what its files do not say."""
+
+    folder: Path
+    statistics: str | None = None  # name of those that scale actions; None: it has one only
+    camera: str = "image"
+    grid: Path | None = None  # the authors' file of the Gaussians that its edges were made of
+    min_sigma: float | None = None  # of that grid; None: the folder's, or the published one
+    task_template: str = BARE_TASK  # around an instruction
+    decode_point: str = "mid"
 
 
-def run_convert_spatialvla(args: argparse.Namespace) -> int:
-    """Write the checkpoint."""
-    check_new_folder("--output", args.output)
-    original = read_json(args.folder / "config.json")
+def convert(published: Published, output: Path) -> str:
+    """Write the checkpoint to a new folder; return a sentence on its prompt.
+
+    Raises:
+        ValueError: the folder is not whole, or other than its options say.
+    """
+    original = read_json(published.folder / "config.json")
     if original.get("model_type") != "spatialvla":
         raise ValueError(
-            f"{args.folder}: config.json is of a {original.get('model_type')!r}, not of a SpatialVLA"
+            f"{published.folder}: config.json is of a {original.get('model_type')!r}, not of a SpatialVLA"
         )
-    processor = read_json(args.folder / "processor_config.json")
-    _check_keys(args.folder / "config.json", original, ORIGINAL_KEYS)
-    _check_keys(args.folder / "processor_config.json", processor, PROCESSOR_KEYS)
-    name = _chosen_statistics(processor["statistics"], args.statistics)
-    grids = _grids(args, processor)
+    processor = read_json(published.folder / "processor_config.json")
+    _check_keys(published.folder / "config.json", original, ORIGINAL_KEYS)
+    _check_keys(published.folder / "processor_config.json", processor, PROCESSOR_KEYS)
+    name = _chosen_statistics(processor["statistics"], published.statistics)
+    grids = _grids(published, processor)
     if grids.num_tokens != original["spatial_token_num"]:
         raise ValueError(
-            f"{args.folder} has {original['spatial_token_num']} cells, but processor_config.json describes "
-            f"{grids.num_tokens}"
+            f"{published.folder} has {original['spatial_token_num']} cells, but processor_config.json "
+            f"describes {grids.num_tokens}"
         )
     register_third_party_plugins()
-    config = _config(args, original, processor, name, grids)
+    config = _config(published, original, processor, name, grids)
     policy: Any = get_policy_class(config.type)(config)
-    policy.load_state_dict(_weights(args.folder, original, policy.state_dict()), strict=True)
+    policy.load_state_dict(_weights(published.folder, original, policy.state_dict()), strict=True)
     # whole, whatever the defaults of later transformers are
     config.vlm_config = config_dict(policy.backbone.vlm)
     if policy.zoedepth is not None:
         config.depth_config = config_dict(policy.zoedepth.model)
     scales = _action_scales(processor["statistics"][name][ACTION])
     pipelines = make_pre_post_processors(config, dataset_stats={ACTION: scales})
-    config.vlm_model_name = args.folder.resolve().name  # nothing is read there any more
-    write_checkpoint(args.output, policy, pipelines)
-    print(f"{_prompt_text(args.task_template)}\nwritten to {args.output}: --policy.path={args.output}")
-    return 0
+    config.vlm_model_name = published.folder.resolve().name  # nothing is read there any more
+    write_checkpoint(output, policy, pipelines)
+    return _prompt_text(published.task_template)
 
 
 def _prompt_text(template: str) -> str:
@@ -152,11 +141,13 @@ def _action_scales(action: dict[str, Any]) -> dict[str, Tensor]:
     return {"q01": low, "q99": high}
 
 
-def _grids(args: argparse.Namespace, processor: dict[str, Any]) -> ActionGrids:
+def _grids(published: Published, processor: dict[str, Any]) -> ActionGrids:
     """Build grids from the folder's own edges and the Gaussians of --grid, which those must be made of."""
     counts, policy = processor["action_config"]["num_bins"], processor.get("bin_policy")
     if policy is None:
-        raise ValueError(f"{args.folder}: processor_config.json has no bin_policy, the edges of its cells")
+        raise ValueError(
+            f"{published.folder}: processor_config.json has no bin_policy, the edges of its cells"
+        )
     edges, bins = [], []
     for kind, keys in (("translation", TRANSLATION), ("rotation", ROTATION)):
         bins.append(tuple(counts[kind][key] for key in keys))
@@ -169,28 +160,28 @@ def _grids(args: argparse.Namespace, processor: dict[str, Any]) -> ActionGrids:
     )
     min_sigma = processor.get("min_sigma", 0.0)
     settings = GridSettings(
-        groups, "gaussian", min_sigma, args.decode_point, zero_radius_bin=False, phi_fit="linear"
+        groups, "gaussian", min_sigma, published.decode_point, zero_radius_bin=False, phi_fit="linear"
     )
     edges.append(torch.tensor([-1.0, 0.0, 1.0]))
     grids = ActionGrids.from_edges(edges, settings, GRIPPER + 1)
-    if args.grid is None:
-        if args.decode_point == "cond_mean":
+    if published.grid is None:
+        if published.decode_point == "cond_mean":
             raise ValueError("--decode_point=cond_mean needs --grid: the folder says edges, not Gaussians")
         return grids
-    least = (min_sigma, PUBLISHED_MIN_SIGMA) if args.min_sigma is None else (args.min_sigma,)
+    least = (min_sigma, PUBLISHED_MIN_SIGMA) if published.min_sigma is None else (published.min_sigma,)
     for sigma in least:
-        given = ActionGrids.from_published(read_json(args.grid), sigma, args.decode_point, groups)
+        given = ActionGrids.from_published(read_json(published.grid), sigma, published.decode_point, groups)
         if torch.allclose(given.edges, grids.edges, rtol=0, atol=EDGE_TOLERANCE):
             given.settings = settings
             return given
     raise ValueError(
-        f"--grid={args.grid} with a least sigma of {' or '.join(map(str, least))} (--min_sigma) has other "
-        "edges than the folder's bin_policy, which its weights were trained with; leave --grid out"
+        f"--grid={published.grid} with a least sigma of {' or '.join(map(str, least))} (--min_sigma) has "
+        "other edges than the folder's bin_policy, which its weights were trained with; leave --grid out"
     )
 
 
 def _config(
-    args: argparse.Namespace,
+    published: Published,
     original: dict[str, Any],
     processor: dict[str, Any],
     statistics: str,
@@ -210,9 +201,10 @@ def _config(
         "vision_use_head": False,
     }
     side: Any = SiglipVisionConfig(**vision_config).image_size
-    tokenizer, chunk_size = load_tokenizer(str(args.folder)), processor["action_chunk_size"]
+    image = f"{OBS_IMAGES}.{published.camera}"
+    tokenizer, chunk_size = load_tokenizer(str(published.folder)), processor["action_chunk_size"]
     return PreTrainedConfig.get_choice_class("spatialvla_grid")(
-        vlm_model_name=str(args.folder),
+        vlm_model_name=str(published.folder),
         vlm_config={
             "model_type": "paligemma",
             "image_token_index": original["image_token_index"],
@@ -222,8 +214,8 @@ def _config(
             "text_config": text_config,
             "vision_config": vision_config,
         },
-        prompt_tokens=PaliGemmaPrompt.from_tokenizer(tokenizer, str(args.folder)).to_dict(),
-        task_template=args.task_template,
+        prompt_tokens=PaliGemmaPrompt.from_tokenizer(tokenizer, str(published.folder)).to_dict(),
+        task_template=published.task_template,
         chunk_size=chunk_size,
         n_action_steps=chunk_size,
         normalization_mapping={
@@ -235,12 +227,12 @@ def _config(
         grid_params=grids.to_dict(),
         depth_source="zoedepth" if original["use_vision_zoe"] else "none",
         depth_config=original["vision_zoe_config"] if original["use_vision_zoe"] else None,
-        camera_intrinsics=_intrinsics(processor["intrinsic_config"], statistics, args.camera, side),
+        camera_intrinsics=_intrinsics(processor["intrinsic_config"], statistics, published.camera, side),
         ego3d_patch_reso=original["ego3d_patch_reso"],
         ego3d_n_freqs=original["n_freqs"],
         ego3d_no_depth_vector=False,
         crop_fraction=1.0,
-        input_features={f"{OBS_IMAGES}.{args.camera}": PolicyFeature(FeatureType.VISUAL, (3, side, side))},
+        input_features={image: PolicyFeature(FeatureType.VISUAL, (3, side, side))},
         output_features={ACTION: PolicyFeature(FeatureType.ACTION, (grids.num_dims,))},
         device="cpu",
     )

@@ -1,9 +1,8 @@
-"""``lerobot-bomb convert``: published demonstrations as a LeRobotDataset, frame for frame.
+"""The PushT demonstrations of Diffusion Policy as a LeRobotDataset, frame for frame.
 
 Like a recording, the dataset grows in a folder beside its final place (see ``data/resumable.py``).
 """
 
-import argparse
 from dataclasses import asdict, dataclass
 from functools import partial
 from pathlib import Path
@@ -11,19 +10,11 @@ from typing import TYPE_CHECKING, Any, ClassVar
 
 import numpy as np
 
-from lerobot_bomb.commands.arguments import add_new_dataset_arguments, path_flag, switch
 from lerobot_bomb.data.conversion import write_missing
-from lerobot_bomb.data.facts import LIBERO_SOURCE, PUSHT_SOURCE
+from lerobot_bomb.data.facts import PUSHT_SOURCE
 from lerobot_bomb.data.kept_blocks import Progress
-from lerobot_bomb.data.libero_conversion import convert_libero
 from lerobot_bomb.data.pusht_zarr import BOARD_SIZE, IMAGE_SIZE, PushtZarr
-from lerobot_bomb.data.resumable import (
-    BLOCK_EPISODES,
-    check_repo_id,
-    default_root,
-    grow,
-    terminated_in_order,
-)
+from lerobot_bomb.data.resumable import check_repo_id, grow
 from lerobot_bomb.data.rigid_copies import RigidMotion
 from lerobot_bomb.data.unfinished import check_folders, unfinished_folder
 
@@ -52,72 +43,6 @@ class Conversion:
 
     def to_dict(self) -> dict[str, Any]:
         return asdict(self)
-
-
-def add_convert_arguments(parser: argparse.ArgumentParser) -> None:
-    """Declare the arguments of ``lerobot-bomb convert``."""
-    sources = parser.add_subparsers(dest="source", required=True, metavar="SOURCE")
-    summary = "the PushT demonstrations of Diffusion Policy, pusht_cchi_v7_replay.zarr"
-    _add_pusht_arguments(sources.add_parser(PUSHT_SOURCE, help=summary, description=f"Convert {summary}."))
-    summary = "demonstrations of LIBERO, a file TASK_demo.hdf5 or a folder of them"
-    _add_libero_arguments(sources.add_parser(LIBERO_SOURCE, help=summary, description=f"Convert {summary}."))
-
-
-def _add_pusht_arguments(parser: argparse.ArgumentParser) -> None:
-    add = parser.add_argument
-    add("path", type=path_flag, help="the folder of the zarr")
-    add_new_dataset_arguments(parser)
-    add(
-        "--task",
-        default="",
-        help="instruction of every frame (default: none, which is what lerobot-eval gives a policy on "
-        "--env.type=pusht)",
-    )
-    add(
-        "--copies",
-        type=int,
-        default=0,
-        help="so many copies of each demonstration beside it: turned by any angle, half of them mirrored, "
-        "shifted, the goal with the rest (default: 0)",
-    )
-    _add_resume(parser)
-
-
-def _add_libero_arguments(parser: argparse.ArgumentParser) -> None:
-    add = parser.add_argument
-    add("path", type=path_flag, help="the file, or the folder of a suite's files")
-    add_new_dataset_arguments(parser)
-    add("--images", **switch(), help="store images (lossless) instead of videos")
-    add(
-        "--skip_noops",
-        **switch(),
-        help="leave out frames in which neither arm nor gripper is told to move (default: all are kept)",
-    )
-    add(
-        "--image_convention",
-        help="how the files hold images: opengl, upside down; opencv, upright; lerobot, turned already "
-        "(default: what each file says, else opengl)",
-    )
-    _add_resume(parser)
-
-
-def _add_resume(parser: argparse.ArgumentParser) -> None:
-    summary = f"continue a conversion that was interrupted; its blocks of {BLOCK_EPISODES} episodes are kept"
-    parser.add_argument("--resume", **switch(), help=summary)
-
-
-def run_convert(args: argparse.Namespace) -> int:
-    """Convert; prints where the dataset is."""
-    check_repo_id(args.repo_id)
-    root = args.root or default_root(args.repo_id)
-    with terminated_in_order():
-        if args.source == PUSHT_SOURCE:
-            progress = convert_pusht(args.path, args.repo_id, root, args.task, args.resume, args.copies)
-        else:
-            options = (args.resume, args.images, args.skip_noops, args.image_convention)
-            progress = convert_libero(args.path, args.repo_id, root, *options)
-    print(f"{progress.num_episodes} episodes, {progress.num_frames} frames: {root}")
-    return 0
 
 
 def convert_pusht(

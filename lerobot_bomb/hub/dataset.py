@@ -1,16 +1,14 @@
-"""``lerobot-bomb push-dataset``: a recorded dataset, with its card, to the Hub."""
+"""A recorded dataset, with its card, to the Hub."""
 
-import argparse
 from contextlib import suppress
+from dataclasses import dataclass
 from pathlib import Path
 
-from huggingface_hub import DatasetCardData, HfApi
+from huggingface_hub import CommitInfo, DatasetCardData, HfApi
 from huggingface_hub.errors import RevisionNotFoundError
 
-from lerobot_bomb.commands.arguments import add_hub_arguments, path_flag
 from lerobot_bomb.data.dataset_files import check_dataset
 from lerobot_bomb.data.facts import DatasetFacts
-from lerobot_bomb.data.resumable import check_repo_id
 from lerobot_bomb.data.statistics import check_statistics
 from lerobot_bomb.data.unfinished import METADATA_FILE
 from lerobot_bomb.hub.markdown import code, command, fenced, plain
@@ -20,43 +18,56 @@ from lerobot_bomb.hub.upload import check_token, hub_errors, upload
 FOLDERS = ("meta", "data", "videos")
 
 
-def add_push_dataset_arguments(parser: argparse.ArgumentParser) -> None:
-    """Declare the arguments of ``lerobot-bomb push-dataset``."""
-    help = "folder that lerobot-bomb record or convert wrote"
-    parser.add_argument("root", type=path_flag, metavar="ROOT", help=help)
-    add_hub_arguments(parser, "dataset")
+@dataclass(frozen=True)
+class RecordedDataset:
+    """A dataset that was checked, as it is published."""
+
+    repo_id: str
+    files: dict[str, Path]  # by name on the Hub
+    facts: DatasetFacts
+
+    @property
+    def card(self) -> str:
+        return dataset_card(self.repo_id, self.facts)
 
 
-def run_push_dataset(args: argparse.Namespace) -> int:
-    """Check the dataset, publish all of it in one commit and tag it for LeRobot; prints where."""
-    check_repo_id(args.repo_id)
-    facts = DatasetFacts.read(args.root)
+def read_dataset(root: Path, repo_id: str) -> RecordedDataset:
+    """Read and check the dataset in a folder.
+
+    Raises:
+        ValueError: it is damaged, or lerobot-bomb did not write it.
+    """
+    facts = DatasetFacts.read(root)
     if not facts.bomb:
         raise ValueError(
-            f"{args.root} holds no {METADATA_FILE}, so lerobot-bomb did not write it; "
+            f"{root} holds no {METADATA_FILE}, so lerobot-bomb did not write it; "
             "LeRobotDataset.push_to_hub publishes other datasets"
         )
-    check_dataset(args.root)
-    check_statistics(args.root)
-    if not args.dry_run:
-        check_token()
-    files: dict[str, Path | bytes] = {
-        path.relative_to(args.root).as_posix(): path
+    check_dataset(root)
+    check_statistics(root)
+    files = {
+        path.relative_to(root).as_posix(): path
         for folder in FOLDERS
-        for path in sorted((args.root / folder).rglob("*"))
+        for path in sorted((root / folder).rglob("*"))
         if path.is_file()
     }
-    card = dataset_card(args.repo_id, facts)
-    if args.dry_run:
-        print(card, *files, sep="\n")
-        return 0
-    files[CARD] = card.encode()
-    message = f"{facts.info['total_episodes']} episodes and card"
-    commit = upload(args.repo_id, "dataset", files, _is_data, message, private=args.private or None)
-    with hub_errors(args.repo_id):
-        _tag(args.repo_id, facts.info["codebase_version"])
-    print(commit.commit_url)
-    return 0
+    return RecordedDataset(repo_id, files, facts)
+
+
+def publish_dataset(dataset: RecordedDataset, private: bool | None) -> CommitInfo:
+    """Publish all of a dataset in one commit, and tag it for LeRobot.
+
+    Raises:
+        RuntimeError: the Hub cannot be reached or does not take it.
+    """
+    check_token()
+    info = dataset.facts.info
+    files: dict[str, Path | bytes] = {**dataset.files, CARD: dataset.card.encode()}
+    message = f"{info['total_episodes']} episodes and card"
+    commit = upload(dataset.repo_id, "dataset", files, _is_data, message, private=private)
+    with hub_errors(dataset.repo_id):
+        _tag(dataset.repo_id, info["codebase_version"])
+    return commit
 
 
 def _is_data(path: str) -> bool:

@@ -1,17 +1,17 @@
-"""``lerobot-bomb statistics``: are a dataset's statistics those of its frames?"""
+"""``lerobot-bomb doctor dataset``: are a dataset's statistics those of its frames?"""
 
 import argparse
 
 from lerobot_bomb.commands.arguments import ANSWER_IS_NO, path_flag
 
 
-def add_statistics_arguments(parser: argparse.ArgumentParser) -> None:
-    """Declare the arguments of ``lerobot-bomb statistics``."""
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Declare the arguments."""
     parser.add_argument("root", type=path_flag, metavar="ROOT", help="folder of a LeRobotDataset")
     parser.add_argument("--mend", action="store_true", help="write those of all frames to meta/stats.json")
 
 
-def run_statistics(args: argparse.Namespace) -> int:
+def run(args: argparse.Namespace) -> int:
     """Print which statistics are wrong; exit code 3 where some are and stay so."""
     from lerobot_bomb.data.statistics import mending, write_statistics, wrong_statistics  # LeRobot: seconds
 

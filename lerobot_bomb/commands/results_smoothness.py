@@ -1,24 +1,11 @@
-"""``lerobot-bomb smoothness``: how smoothly people and policies moved, side by side."""
+"""``lerobot-bomb results smoothness``: how smoothly people and policies moved, side by side."""
 
 import argparse
 import json
 import math
 from dataclasses import asdict, replace
 
-from lerobot.utils.constants import ACTION
-
-from lerobot_bomb.commands.arguments import path_flag
-from lerobot_bomb.data.columns import dim_names, read_meta
-from lerobot_bomb.evaluation.executed import executed_in_dataset, read_executed
-from lerobot_bomb.evaluation.smoothness_report import (
-    GRIPPER,
-    check_comparable,
-    make_units,
-    measure_difference,
-    measure_row,
-    print_differences,
-    print_rows,
-)
+from lerobot_bomb.commands.arguments import add_dataset_arguments, path_flag
 from lerobot_bomb.files import check_writable, written_whole
 
 LEGEND = """
@@ -26,40 +13,45 @@ Mean length of second (J2) and third (J3) differences {per}; in the dataset's un
 standard deviations in {dataset} [95 % bootstrap interval over episodes]"""
 
 
-def add_smoothness_arguments(parser: argparse.ArgumentParser) -> None:
-    """Declare the arguments of ``lerobot-bomb smoothness``."""
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Declare the arguments."""
     add = parser.add_argument
-    add("--dataset.repo_id", dest="repo_id", required=True, help="name of the dataset, whose units count")
-    root = "folder of the dataset (default: LeRobot's, $HF_LEROBOT_HOME/REPO_ID)"
-    add("--dataset.root", dest="root", type=path_flag, help=root)
-    paths = "to compare with it: files of `lerobot-bomb eval`, folders of LeRobotDatasets"
+    add_dataset_arguments(parser, ", whose units count")
+    paths = "to compare with it: files of `lerobot-bomb results actions`, folders of LeRobotDatasets"
     add("paths", nargs="*", type=path_flag, metavar="PATH", help=paths)
-    exclude = f"action dims that do not count, as x,y; empty: all count (default: all named {GRIPPER!r})"
+    exclude = "action dims that do not count, as x,y; empty: all count (default: all named 'gripper')"
     add("--exclude", type=lambda text: [name for name in text.split(",") if name], help=exclude)
     add("--per_second", action="store_true", help="differences per s^2 and s^3 instead of per step")
     add("--fps", type=float, help="actions a second (default: as each dataset and file says)")
     add("--json", type=path_flag, help="also write all figures to this new file, those of every episode too")
 
 
-def run_smoothness(args: argparse.Namespace) -> int:
+def run(args: argparse.Namespace) -> int:
     """Measure, print the tables, write the JSON file."""
     _check_flags(args)
+    # LeRobot and torch: seconds
+    from lerobot.utils.constants import ACTION
+
+    from lerobot_bomb.data.columns import dim_names, read_meta
+    from lerobot_bomb.evaluation import smoothness_report as report
+    from lerobot_bomb.evaluation.executed import executed_in_dataset, read_executed
+
     meta = read_meta(args.repo_id, args.root)
     dataset = executed_in_dataset(meta, args.repo_id)
     names = dim_names(meta.features[ACTION])
-    units = make_units(dataset, names, args.exclude, args.per_second)
+    units = report.make_units(dataset, names, args.exclude, args.per_second)
     compared = [dataset, *map(read_executed, args.paths)]
     if args.fps is not None:
         compared = [replace(executed, fps=args.fps) for executed in compared]
-    check_comparable(compared, args.per_second)
-    rows = {executed.name: measure_row(executed, units) for executed in compared}
+    report.check_comparable(compared, args.per_second)
+    rows = {executed.name: report.measure_row(executed, units) for executed in compared}
     first, *others = [executed.name for executed in compared if executed.is_seeded] or [""]
-    differences = {name: measure_difference(first, name, rows) for name in others}
+    differences = {name: report.measure_difference(first, name, rows) for name in others}
     excluded = [names[dim] for dim in units.exclude]
     print(f"action dims {', '.join(names)}; left out: {', '.join(excluded) or 'none'}")
-    print_rows(rows)
+    report.print_rows(rows)
     if differences:
-        print_differences(first, differences)
+        report.print_differences(first, differences)
     per = "per s^2 and s^3" if units.per_second else "per step"
     print(LEGEND.format(per=per, dataset=args.repo_id))
     if args.json is not None:

@@ -1,12 +1,11 @@
-"""``lerobot-bomb fit-grid``: the action grid that a policy would fit on a dataset, and what it rounds off.
+"""The action grid that a policy would fit on a dataset, and what it rounds off.
 
 Shapes: `N` actions, `D` action dims.
 """
 
-import argparse
-import json
-from collections.abc import Callable
+from collections.abc import Sequence
 from dataclasses import replace
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -34,9 +33,8 @@ from lerobot_bomb.actions.grid_settings import (
 )
 from lerobot_bomb.actions.grids import ActionGrids
 from lerobot_bomb.actions.relative import BOUND_STATISTICS, bounds
-from lerobot_bomb.commands.arguments import path_flag
 from lerobot_bomb.data.columns import dim_names, read_columns, read_meta
-from lerobot_bomb.files import check_writable, written_whole
+from lerobot_bomb.files import written_whole
 from lerobot_bomb.flags import one_of
 from lerobot_bomb.tables import print_table
 from lerobot_bomb.viewing.grid_plot import PlotRow, draw_rows
@@ -44,60 +42,33 @@ from lerobot_bomb.viewing.grid_plot import PlotRow, draw_rows
 UNIFORM, CLIPPING = "uniform mid", "clipping alone"
 
 
-def add_fit_grid_arguments(parser: argparse.ArgumentParser) -> None:
-    """Declare the arguments of ``lerobot-bomb fit-grid``."""
-    add, default = parser.add_argument, GridSettings(())
-    add("--dataset.repo_id", dest="repo_id", required=True, help="name of the dataset")
-    root = "folder of the dataset (default: LeRobot's, $HF_LEROBOT_HOME/REPO_ID)"
-    add("--dataset.root", dest="root", type=path_flag, help=root)
-    groups = """as JSON: '[{"dims": [0, 1], "transform": "identity", "bins": [64, 64]}, ...]'"""
-    add("--policy.action_groups", dest="groups", type=json_of(list), help=groups)
-    layout = f"what the action is: {' or '.join(LAYOUTS)} (default: what the dimensions' names say)"
-    add(LAYOUT_FLAG, dest="layout", help=layout)
-    distribution = "of the edges: gaussian, uniform or quantile (default: gaussian)"
-    add("--policy.grid_distribution", dest="distribution", default=default.distribution, help=distribution)
-    sigma = "least standard deviation of a coordinate, in its unit (default: 0)"
-    add("--policy.grid_min_sigma", dest="min_sigma", type=float, default=default.min_sigma, help=sigma)
-    rho_dead = "length below which there is no motion (default: a fiftieth of the data's long motions)"
-    add("--policy.rho_dead", dest="rho_dead", type=float, default=default.rho_dead, help=rho_dead)
-    phi_fit = "where the angle phi is cut: wrapped or linear (default: wrapped)"
-    add("--policy.phi_fit", dest="phi_fit", default=default.phi_fit, help=phi_fit)
-    mapping = """as JSON, of which ACTION is read: '{"ACTION": "QUANTILES"}' (default: MIN_MAX)"""
-    add("--policy.normalization_mapping", dest="mapping", type=json_of(dict), default={}, help=mapping)
-    add("--plot", type=path_flag, help="also draw histograms with the edges into this file, as PNG")
+def show_fit(
+    repo_id: str,
+    root: Path | None,
+    action_groups: Sequence[dict[str, Any]] | None,
+    layout: str | None,
+    mapping: dict[str, str],
+    options: dict[str, Any],
+    plot: Path | None,
+) -> None:
+    """Fit a grid on a dataset, print the tables, draw the plot; the flags' names say what they are.
 
-
-def json_of(kind: type) -> Callable[[str], Any]:
-    """A reader of flags that are JSON of this type."""
-
-    def read(text: str) -> Any:
-        value = json.loads(text)
-        if not isinstance(value, kind):
-            raise ValueError
-        return value
-
-    read.__name__ = f"JSON {kind.__name__}"  # what argparse calls it
-    return read
-
-
-def run_fit_grid(args: argparse.Namespace) -> int:
-    """Fit, print the tables, draw the plot."""
-    if args.plot is not None:
-        check_writable("--plot", args.plot)
-    mode = args.mapping.get("ACTION", NormalizationMode.MIN_MAX)
+    Raises:
+        ValueError: a setting is wrong, or the dataset has no such statistics.
+    """
+    mode = mapping.get("ACTION", NormalizationMode.MIN_MAX)
     one_of("--policy.normalization_mapping[ACTION]", mode, [of.value for of in BOUND_STATISTICS])
     mode = NormalizationMode(mode)
-    meta = read_meta(args.repo_id, args.root)
+    meta = read_meta(repo_id, root)
     low_D, high_D = action_bounds(meta, mode)
     num_dims, names = len(low_D), dim_names(meta.features[ACTION])
-    if args.layout is not None:
-        one_of(LAYOUT_FLAG, args.layout, LAYOUTS)
+    if layout is not None:
+        one_of(LAYOUT_FLAG, layout, LAYOUTS)
     groups = (
-        default_groups(num_dims, names, args.layout)
-        if args.groups is None
-        else tuple(map(ActionGroup.from_dict, args.groups))
+        default_groups(num_dims, names, layout)
+        if action_groups is None
+        else tuple(map(ActionGroup.from_dict, action_groups))
     )
-    options = {name: getattr(args, name) for name in ("distribution", "min_sigma", "rho_dead", "phi_fit")}
     grids = ActionGrids(GridSettings(groups, **options), num_dims)
     actions_ND = normalised(read_columns(meta, (ACTION,))[ACTION], low_D, high_D)
     grids.fit(actions_ND, normalised_rest(low_D, high_D))
@@ -110,15 +81,18 @@ def run_fit_grid(args: argparse.Namespace) -> int:
     print_errors("in normalised units", errors, names)
     physical = {name: error_D * (high_D - low_D) / 2 for name, error_D in errors.items()}
     print_errors("in the dataset's units", physical, names)
-    if args.plot is not None:
-        title = (
-            f"{meta.repo_id}: {len(actions_ND)} actions and the {grids.settings.distribution} bins of a grid"
-        )
-        plot = draw_rows(title, plot_rows(grids, actions_ND.clip(-1, 1), names))
-        with written_whole(args.plot) as (path,):
-            Image.fromarray(plot).save(path, format="PNG")
-        print(f"\n{args.plot}")
-    return 0
+    if plot is not None:
+        _write_plot(plot, meta.repo_id, grids, actions_ND, names)
+
+
+def _write_plot(
+    plot: Path, repo_id: str, grids: ActionGrids, actions_ND: np.ndarray, names: list[str]
+) -> None:
+    title = f"{repo_id}: {len(actions_ND)} actions and the {grids.settings.distribution} bins of a grid"
+    drawn = draw_rows(title, plot_rows(grids, actions_ND.clip(-1, 1), names))
+    with written_whole(plot) as (path,):
+        Image.fromarray(drawn).save(path, format="PNG")
+    print(f"\n{plot}")
 
 
 def action_bounds(meta: LeRobotDatasetMetadata, mode: NormalizationMode) -> tuple[np.ndarray, np.ndarray]:

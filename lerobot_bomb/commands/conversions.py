@@ -1,0 +1,25 @@
+"""Arguments that all conversions share."""
+
+import argparse
+from pathlib import Path
+
+from lerobot_bomb.commands.arguments import add_new_dataset_arguments, path_flag, switch
+from lerobot_bomb.data.resumable import BLOCK_EPISODES, check_repo_id, default_root
+
+
+def add_conversion_arguments(parser: argparse.ArgumentParser, path: str) -> None:
+    """Declare what is converted, and into which dataset."""
+    parser.add_argument("path", type=path_flag, help=path)
+    add_new_dataset_arguments(parser)
+    summary = f"continue a conversion that was interrupted; its blocks of {BLOCK_EPISODES} episodes are kept"
+    parser.add_argument("--resume", **switch(), help=summary)
+
+
+def new_root(args: argparse.Namespace) -> Path:
+    """Return the folder of a dataset that is written.
+
+    Raises:
+        ValueError: its name is none on the Hub.
+    """
+    check_repo_id(args.repo_id)
+    return args.root or default_root(args.repo_id)
