@@ -24,8 +24,8 @@ from lerobot_bomb.bomb.observation import RenderOptions
 from lerobot_bomb.bomb.suite import specs_of_tasks
 from lerobot_bomb.commands.fit_grid import action_bounds
 from lerobot_bomb.data.columns import read_columns, read_meta
-from lerobot_bomb.envs.results import EpisodeResult
 from lerobot_bomb.envs.rollout import make_env
+from lerobot_bomb.results.bomb import EpisodeResult
 from lerobot_bomb.tables import print_table
 
 PAIRS = (ActionGroup((0, 1), "identity", (64, 64)), ActionGroup((2, 3), "identity", (64, 16)))

@@ -6,9 +6,9 @@ from lerobot_bomb.checkpoints.names import TRAIN_CONFIG
 from lerobot_bomb.commands.arguments import add_hub_arguments, path_flag
 from lerobot_bomb.data.facts import DatasetFacts
 from lerobot_bomb.data.resumable import check_repo_id
-from lerobot_bomb.evaluation.results import read_results
 from lerobot_bomb.hub.evaluated import check_environment_of, check_weights_of
 from lerobot_bomb.hub.push import publish, read_checkpoint
+from lerobot_bomb.results.groups import read_results
 
 
 def add_push_arguments(parser: argparse.ArgumentParser) -> None:
