@@ -1,7 +1,6 @@
 """A report: groups of episodes, and failures of them that are shown."""
 
 import shlex
-from collections import Counter
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -57,6 +56,6 @@ def sample_failures(
         for record in group.records:
             if record.failure is not None:
                 failed.setdefault(record.failure, []).append(record)
-        for name, number in Counter({name: len(of) for name, of in failed.items()}).most_common():
-            for record in Random(0).sample(failed[name], min(num_of_class, number)):
+        for records in sorted(failed.values(), key=len, reverse=True):
+            for record in Random(0).sample(records, min(num_of_class, len(records))):
                 yield Sample(group.name, record, *places[id(record)])

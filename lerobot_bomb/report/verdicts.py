@@ -5,14 +5,13 @@ Arms are lists of records of the same episodes, but for those of the splits.
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any
 
 from lerobot_bomb.report.cells import INTERVALS, rate
 from lerobot_bomb.report.table import Cell, Table
 from lerobot_bomb.results.groups import rate_of
 from lerobot_bomb.results.pairs import Pair, count_pairs, pairs_of
 from lerobot_bomb.results.record import Record, different_fields
-from lerobot_bomb.stats import SIGNIFICANT, PairedCounts, format_p
+from lerobot_bomb.stats import SIGNIFICANT, PairedCounts, fisher_p_value, format_p
 
 POLICY, AGAIN, ALONE = "the policy", "again, in another process", "one episode at a time"
 BLANK, OTHER_INSTRUCTION = "with black images", "with another episode's instruction"
@@ -113,20 +112,13 @@ def _can_be_solved(records: list[Record]) -> Verdict:
 
 def _generalises(train: list[Record], heldout: list[Record]) -> Verdict:
     shown, held = (sum(each.is_success for each in records) for records in (train, heldout))
-    p_value = _fisher(shown, len(train), held, len(heldout))
+    p_value = fisher_p_value(shown, len(train), held, len(heldout))
     is_worse = p_value < SIGNIFICANT and held / len(heldout) < shown / len(train)
     evidence = (
         f"{held} of {len(heldout)} held out, {shown} of {len(train)} others "
         f"(Fisher's {format_p(p_value)}, not adjusted)"
     )
     return Verdict("does as well on what is held out", NO if is_worse else YES, evidence)
-
-
-def _fisher(first: int, of_first: int, second: int, of_second: int) -> float:
-    from scipy.stats import fisher_exact
-
-    found: Any = fisher_exact([[first, of_first - first], [second, of_second - second]])
-    return float(found.pvalue)
 
 
 def _new_seeds(records: list[Record], trained: Sequence[int] | None) -> Verdict:
