@@ -46,9 +46,9 @@ from lerobot_bomb.checkpoints.identity import sha256_of
 from lerobot_bomb.checkpoints.names import WEIGHTS
 from lerobot_bomb.commands.run import run_command
 from lerobot_bomb.conditions import NONE
-from lerobot_bomb.envs.results import Row
-from lerobot_bomb.evaluation.bomb_lines import named_targets, other_instructions, put_down
-from lerobot_bomb.evaluation.results import read_results
+from lerobot_bomb.results.bomb import EpisodeResult, put_down
+from lerobot_bomb.results.groups import read_results
+from lerobot_bomb.results.instructions import named_targets, other_instructions
 
 PLUGIN = f"lerobot_policy_{PROBE}"  # not installed: LeRobot finds it by --*.discover_packages_path
 REPO_ID = "learn/bomb_place"
@@ -313,7 +313,9 @@ def checkpoints(folder: Path) -> dict[int, Path]:
     return {int(path.name): path / "pretrained_model" for path in paths}
 
 
-def evaluate_checkpoints(task: Task, folder: Path, first_seed: int, last: int) -> dict[int, list[Row]]:
+def evaluate_checkpoints(
+    task: Task, folder: Path, first_seed: int, last: int
+) -> dict[int, list[EpisodeResult]]:
     """{training step: results}; all but the last are only the curve."""
     return {
         step: evaluate(
@@ -329,7 +331,7 @@ def evaluate_checkpoints(task: Task, folder: Path, first_seed: int, last: int) -
 
 def evaluate_controls(
     task: Task, folder: Path, first_seed: int, given: dict[str, str]
-) -> dict[str, list[Row]]:
+) -> dict[str, list[EpisodeResult]]:
     """{control: results} of the last checkpoint with black cameras, and given other instructions.
 
     Where all episodes have one target there are none.
@@ -361,7 +363,7 @@ def evaluate_conditions(task: Task, folder: Path, first_seed: int) -> dict[str, 
     run_command("lerobot-bomb", "results", f"{output_dir / 'results.jsonl'}")
     successes = dict.fromkeys(task.conditions, 0)
     for row in rows:
-        successes[row["spec"]["perturbations"]] += row["is_success"]
+        successes[row.spec.perturbations] += row.is_success
     return successes
 
 
@@ -372,7 +374,7 @@ def evaluate(
     first_seed: int,
     episodes: int,
     conditions: Sequence[str] = (NONE,),
-) -> list[Row]:
+) -> list[EpisodeResult]:
     """Stock `lerobot-eval` on unseen seeds, so many under each condition; their results."""
     results = output_dir / "results.jsonl"
     finished = output_dir / "finished"  # an evaluation that was killed leaves results of some episodes
@@ -397,12 +399,12 @@ def evaluate(
             f"--output_dir={output_dir / 'eval'}",
         )
         finished.touch()
-    return read_results(results)
+    return read_results(results, EpisodeResult)
 
 
-def count_named(rows: list[Row], given: dict[str, str], targets: dict[str, list[int]]) -> int:
+def count_named(rows: list[EpisodeResult], given: dict[str, str], targets: dict[str, tuple[int, int]]) -> int:
     """Stones put down nearest to the intersection that the policy was given."""
-    return sum(row["nearest_intersection"] == targets[given[row["instruction"]]] for row in put_down(rows))
+    return sum(row.nearest_intersection == targets[given[row.instruction]] for row in put_down(rows))
 
 
 def _children_cpu_s() -> float:

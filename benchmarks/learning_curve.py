@@ -9,8 +9,7 @@ import cv2
 import numpy as np
 
 from lerobot_bomb.bomb.episode import Failure, Stage
-from lerobot_bomb.envs.results import Row
-from lerobot_bomb.evaluation.bomb_lines import is_grounded, put_down
+from lerobot_bomb.results.bomb import EpisodeResult, is_grounded, put_down
 from lerobot_bomb.stats import format_rate, wilson_interval
 from lerobot_bomb.tables import print_table
 
@@ -38,7 +37,7 @@ class Point:
     median_error_mm: float | None  # of the stones that were put down
 
 
-def count(rows: list[Row], step: int, cpu_minutes: float) -> Point:
+def count(rows: list[EpisodeResult], step: int, cpu_minutes: float) -> Point:
     """The episodes of one checkpoint."""
     down = put_down(rows)
     grounded = [row for row in down if is_grounded(row)]
@@ -46,12 +45,12 @@ def count(rows: list[Row], step: int, cpu_minutes: float) -> Point:
         step=step,
         cpu_minutes=cpu_minutes,
         num_episodes=len(rows),
-        num_successes=sum(row["is_success"] for row in rows),
-        num_lifted=sum(row["stage"] in LIFTED for row in rows),
-        num_near=sum(row["placement_error_mm"] <= NEAR_MM for row in down),
+        num_successes=sum(row.is_success for row in rows),
+        num_lifted=sum(row.stage in LIFTED for row in rows),
+        num_near=sum(row.placement_error_mm <= NEAR_MM for row in down),
         num_grounded=len(grounded),
-        num_precise=sum(row["failure"] != Failure.IMPRECISE for row in grounded),
-        median_error_mm=median(row["placement_error_mm"] for row in down) if down else None,
+        num_precise=sum(row.failure != Failure.IMPRECISE for row in grounded),
+        median_error_mm=median(row.placement_error_mm for row in down) if down else None,
     )
 
 

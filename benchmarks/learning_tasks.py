@@ -10,7 +10,7 @@ from lerobot_bomb.bomb.suite import templates_of
 from lerobot_bomb.bomb.suites import SUITES
 from lerobot_bomb.bomb.suites.place import TEMPLATES, targets_of
 from lerobot_bomb.conditions import ALL, NONE
-from lerobot_bomb.envs.results import Row
+from lerobot_bomb.results.bomb import EpisodeResult
 
 PROBE = "keypoint_probe"
 RIVALS = ("act", "diffusion")  # LeRobot's; they read no instruction
@@ -156,25 +156,25 @@ def shown_pairs() -> list[int]:
     ]
 
 
-def by_suite(rows: list[Row]) -> dict[str, list[Row]]:
+def by_suite(rows: list[EpisodeResult]) -> dict[str, list[EpisodeResult]]:
     """{suite: its rows} of an evaluation on several; {} on one."""
-    suites = sorted({row["spec"]["suite"] for row in rows})
-    each = {suite: [row for row in rows if row["spec"]["suite"] == suite] for suite in suites}
+    suites = sorted({row.spec.suite for row in rows})
+    each = {suite: [row for row in rows if row.spec.suite == suite] for suite in suites}
     return each if len(suites) > 1 else {}
 
 
-def by_what_is_left_out(rows: list[Row]) -> dict[str, list[Row]]:
+def by_what_is_left_out(rows: list[EpisodeResult]) -> dict[str, list[EpisodeResult]]:
     """{what of an episode no demonstration showed: its rows}."""
-    groups: dict[str, list[Row]] = {}
+    groups: dict[str, list[EpisodeResult]] = {}
     for row in rows:
-        target, color = tuple(row["target"]), row["color"]
+        target, color = row.target or (), row.color
         wordings = [
             template.format(color=color, row=target[0], column=target[1])
             for template in templates_of("heldout", TEMPLATES)
         ]
         left_out = {
             "target left out": target in targets_of("heldout"),
-            "wording left out": row["instruction"] in wordings,
+            "wording left out": row.instruction in wordings,
             "colour for this target left out": target in LEFT_OUT_PAIRS[color],
         }
         names = [name for name, is_left_out in left_out.items() if is_left_out] or [SHOWN]

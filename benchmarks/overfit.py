@@ -32,8 +32,8 @@ from recipes import POLICY_TYPES, last_checkpoint, read_recipe, recipe_path
 from lerobot_bomb.bomb.episode import EpisodeSpec, Failure
 from lerobot_bomb.bomb.suite import specs_of_tasks
 from lerobot_bomb.commands.run import run_command
-from lerobot_bomb.envs.results import Row
-from lerobot_bomb.evaluation.results import read_results
+from lerobot_bomb.results.bomb import EpisodeResult
+from lerobot_bomb.results.groups import read_results
 from lerobot_bomb.tables import print_table
 
 SEED = 1007  # its board is empty, so nothing but the instruction tells the target
@@ -105,8 +105,7 @@ def prove(args: argparse.Namespace, folder: Path) -> int:
     for condition, path in ((LEARNT, checkpoint), (PERMUTED, shown[PERMUTED]), (BLANK, shown[BLANK])):
         rows = evaluate(path, folder / condition.name.replace(" ", "_"), images)
         counts[condition] = sum(
-            is_on(row, given[task]) if condition is PERMUTED else row["is_success"]
-            for task, row in rows.items()
+            is_on(row, given[task]) if condition is PERMUTED else row.is_success for task, row in rows.items()
         )
         print_episodes(condition, rows)
     minutes = (time.monotonic() - started) / 60
@@ -168,7 +167,7 @@ def change_what_is_shown(checkpoint: Path, replacements: dict[str, str]) -> dict
     return folders
 
 
-def evaluate(checkpoint: Path, output_dir: Path, images: Iterable[str]) -> dict[int, Row]:
+def evaluate(checkpoint: Path, output_dir: Path, images: Iterable[str]) -> dict[int, EpisodeResult]:
     """Stock `lerobot-eval` on the recorded seed, one episode a task; {task id: result}."""
     run_command(
         "lerobot-eval",
@@ -183,7 +182,7 @@ def evaluate(checkpoint: Path, output_dir: Path, images: Iterable[str]) -> dict[
         "--eval.use_async_envs=false",
         f"--output_dir={output_dir / 'eval'}",
     )
-    rows = {tuple(row["target"]): row for row in read_results(output_dir / "results.jsonl")}
+    rows = {row.target: row for row in read_results(output_dir / "results.jsonl", EpisodeResult)}
     if rows.keys() != set(TARGETS.values()):
         raise SystemExit(
             f"{output_dir}: results of the targets {sorted(rows)}, not of {list(TARGETS.values())}"
@@ -191,23 +190,23 @@ def evaluate(checkpoint: Path, output_dir: Path, images: Iterable[str]) -> dict[
     return {task: rows[target] for task, target in TARGETS.items()}
 
 
-def is_on(row: Row, task_id: int) -> bool:
+def is_on(row: EpisodeResult, task_id: int) -> bool:
     """Return True if the stone was put down nearest to this task's intersection, not the episode's."""
-    is_there = tuple(row["nearest_intersection"]) == TARGETS[task_id]
-    return is_there and row["failure"] == Failure.WRONG_INTERSECTION
+    is_there = row.nearest_intersection == TARGETS[task_id]
+    return is_there and row.failure == Failure.WRONG_INTERSECTION
 
 
-def print_episodes(condition: Control, rows: dict[int, Row]) -> None:
+def print_episodes(condition: Control, rows: dict[int, EpisodeResult]) -> None:
     """Print the outcome of each episode."""
     print(f"\n{condition.name}")
     header = ["target", "stone ends nearest to", "error, mm", "steps", "outcome"]
     cells = [
         [
-            str(tuple(row["target"])),
-            str(tuple(row["nearest_intersection"])),
-            f"{row['placement_error_mm']:.1f}",
-            str(row["steps"]),
-            row["failure"] or "success",
+            str(row.target),
+            str(row.nearest_intersection),
+            f"{row.placement_error_mm:.1f}",
+            str(row.steps),
+            row.failure or "success",
         ]
         for row in rows.values()
     ]

@@ -17,8 +17,8 @@ from pathlib import Path
 
 from machine import add_machine_arguments, make_parser, positive, require_idle_machine, write_figures
 
-from lerobot_bomb.envs.results import Row, without_measured
-from lerobot_bomb.evaluation.results import read_results
+from lerobot_bomb.results.groups import read_results
+from lerobot_bomb.results.record import Record, without_measured
 from lerobot_bomb.sweep.manifest import Manifest, plan
 from lerobot_bomb.tables import print_table
 
@@ -104,9 +104,9 @@ def run(command: str, flags: Sequence[str]) -> None:
         raise SystemExit(f"{command} {' '.join(flags)}:\n{done.stderr[-2000:]}")
 
 
-def comparable(rows: list[Row]) -> list[Row]:
+def comparable(rows: list[Record]) -> list[Record]:
     """Return the records in one order, without what is measured anew each time."""
-    return sorted(map(without_measured, rows), key=lambda row: json.dumps(row["spec"]))
+    return sorted(map(without_measured, rows), key=lambda record: repr(record.spec))
 
 
 if __name__ == "__main__":

@@ -8,6 +8,7 @@ from collections.abc import Hashable, Sequence
 from dataclasses import dataclass
 from math import sqrt
 from statistics import NormalDist
+from typing import Any
 
 import numpy as np
 
@@ -114,6 +115,14 @@ def mcnemar_p_value(only_first: int, only_second: int) -> float:
     from scipy.special import bdtr
 
     return min(1.0, 2 * float(bdtr(min(only_first, only_second), only_first + only_second, 0.5)))
+
+
+def fisher_p_value(first: int, of_first: int, second: int, of_second: int) -> float:
+    """Two-sided exact p-value of the hypothesis that two groups of other episodes succeed equally often."""
+    from scipy.stats import fisher_exact
+
+    found: Any = fisher_exact([[first, of_first - first], [second, of_second - second]])
+    return float(found.pvalue)
 
 
 def format_p(p_value: float) -> str:

@@ -5,9 +5,9 @@ from typing import Any
 
 import numpy as np
 
-from lerobot_bomb.envs.pusht_results import PushTResult
 from lerobot_bomb.pusht.episode import PushTSpec
 from lerobot_bomb.pusht.perturbations import PushTCondition
+from lerobot_bomb.results.pusht import PushTResult
 
 
 def pushing_actions(seed: int, block_xy: np.ndarray, num: int) -> np.ndarray:

@@ -2,10 +2,9 @@
 
 import json
 from pathlib import Path
-from typing import Any
 
 import pytest
-from test_results import values
+from test_results import read, values
 
 from lerobot_bomb.commands.arguments import ANSWER_IS_NO
 from lerobot_bomb.commands.main import main
@@ -24,40 +23,41 @@ from lerobot_bomb.report.verdicts import (
     YES,
     judge,
 )
+from lerobot_bomb.results.record import Record
 
 N = 40
-type Rows = list[dict[str, Any]]
+type Records = list[Record]
 
 
-def rows(successes: int, shift: float = 0.0, n: int = N, first: int = 0) -> Rows:
+def records(successes: int, shift: float = 0.0, n: int = N, first: int = 0) -> Records:
     """Episodes of which the first succeed; another shift is another episode, bit for bit."""
     return [
-        values(seed, None if seed - first < successes else "imprecise", 1.0 + shift)
+        read(values(seed, None if seed - first < successes else "imprecise", 1.0 + shift))
         for seed in range(first, first + n)
     ]
 
 
 @pytest.fixture
-def arms() -> dict[str, Rows]:
+def arms() -> dict[str, Records]:
     """Return the arms of a policy that has nothing to hide."""
     return {
-        POLICY: rows(36),
-        AGAIN: rows(36),
-        ALONE: rows(36, 0.01),
-        BLANK: rows(0, 0.5),
-        OTHER_INSTRUCTION: rows(2, 0.5),
-        RANDOM: rows(0, 0.7),
-        EXPERT: rows(N, 0.2),
-        TRAIN: rows(36),
-        HELDOUT: rows(35),
+        POLICY: records(36),
+        AGAIN: records(36),
+        ALONE: records(36, 0.01),
+        BLANK: records(0, 0.5),
+        OTHER_INSTRUCTION: records(2, 0.5),
+        RANDOM: records(0, 0.7),
+        EXPERT: records(N, 0.2),
+        TRAIN: records(36),
+        HELDOUT: records(35),
     }
 
 
-def answers(arms: dict[str, Rows], trained: range | None = range(1000, 2000)) -> dict[str, str]:
+def answers(arms: dict[str, Records], trained: range | None = range(1000, 2000)) -> dict[str, str]:
     return {verdict.question: verdict.answer for verdict in judge(arms, trained)}
 
 
-def test_a_policy_that_has_nothing_to_hide_passes(arms: dict[str, Rows]) -> None:
+def test_a_policy_that_has_nothing_to_hide_passes(arms: dict[str, Records]) -> None:
     found = answers(arms)
     assert len(found) == 8 and set(found.values()) == {YES}
 
@@ -65,35 +65,40 @@ def test_a_policy_that_has_nothing_to_hide_passes(arms: dict[str, Rows]) -> None
 @pytest.mark.parametrize(
     ("question", "planted"),
     [
-        ("reads the instruction", {OTHER_INSTRUCTION: rows(36)}),
-        ("looks at the images", {BLANK: rows(36)}),
-        ("the same flags give the same episodes", {AGAIN: [*rows(36)[:-1], *rows(0, 0.1, 1, N - 1)]}),
-        ("the size of the batch does not decide", {ALONE: rows(20, 0.01)}),
-        ("every episode can be solved", {EXPERT: rows(N - 1)}),
-        ("does as well on what is held out", {HELDOUT: rows(4)}),
+        ("reads the instruction", {OTHER_INSTRUCTION: records(36)}),
+        ("looks at the images", {BLANK: records(36)}),
+        ("the same flags give the same episodes", {AGAIN: [*records(36)[:-1], *records(0, 0.1, 1, N - 1)]}),
+        ("the size of the batch does not decide", {ALONE: records(20, 0.01)}),
+        ("every episode can be solved", {EXPERT: records(N - 1)}),
+        ("does as well on what is held out", {HELDOUT: records(4)}),
     ],
 )
 def test_what_was_planted_is_told_and_nothing_else(
-    question: str, planted: dict[str, Rows], arms: dict[str, Rows]
+    question: str, planted: dict[str, Records], arms: dict[str, Records]
 ) -> None:
     found = answers(arms | planted)
     assert found.pop(question) == NO
     assert set(found.values()) == {YES}
 
 
-def test_what_these_episodes_do_not_show_is_left_open(arms: dict[str, Rows]) -> None:
-    found = answers(arms | {OTHER_INSTRUCTION: rows(34, 0.1), RANDOM: rows(35, 0.7)}, None)
+def test_what_these_episodes_do_not_show_is_left_open(arms: dict[str, Records]) -> None:
+    found = answers(arms | {OTHER_INSTRUCTION: records(34, 0.1), RANDOM: records(35, 0.7)}, None)
     assert [question for question, answer in found.items() if answer == OPEN] == [
         "reads the instruction", "better than random actions", "no episode of the training is evaluated",
     ]  # fmt: skip
 
 
 def test_tasks_that_share_seeds_are_paired_task_by_task() -> None:
-    def tasks(shift: float) -> Rows:
+    def tasks(shift: float) -> Records:
         spec = {"color": "black"}
         return [
-            values(
-                seed, None if target == (0, 0) else "imprecise", 1.0 + shift, spec=spec | {"target": target}
+            read(
+                values(
+                    seed,
+                    None if target == (0, 0) else "imprecise",
+                    1.0 + shift,
+                    spec=spec | {"target": target},
+                )
             )
             for target in ((0, 0), (1, 1))
             for seed in range(20)
@@ -106,7 +111,7 @@ def test_tasks_that_share_seeds_are_paired_task_by_task() -> None:
     assert alone.evidence.startswith("0 of 40 episodes end otherwise (p = 1, not adjusted)")
 
 
-def test_seeds_of_the_training_are_found(arms: dict[str, Rows]) -> None:
+def test_seeds_of_the_training_are_found(arms: dict[str, Records]) -> None:
     verdict = judge(arms, range(30, 60))[-1]
     assert verdict.answer == NO and verdict.evidence == "trained on seeds 30..59, 10 evaluated"
 

@@ -8,7 +8,7 @@ import pytest
 from lerobot.datasets import LeRobotDataset
 from saved_actions import EXPECTED, actions_of, contents_of, read_dataset
 
-from lerobot_bomb.data.environment import Environment
+from lerobot_bomb.bomb.environment import Environment
 from lerobot_bomb.data.facts import DatasetFacts
 
 FOLDER = Path(__file__).parent / "fixtures" / "before_layout"

@@ -8,12 +8,12 @@ import pytest
 
 from lerobot_bomb.commands.main import main
 from lerobot_bomb.conditions import MAX_LEVEL
-from lerobot_bomb.envs.libero_results import LiberoResult
 from lerobot_bomb.flag_errors import FlagError
 from lerobot_bomb.libero.assets import SUITES, Libero
 from lerobot_bomb.libero.episode import LiberoFailure, LiberoSpec, failure_of, initial_state_of
 from lerobot_bomb.libero.perturbations import LIBERO_AXES
 from lerobot_bomb.libero.wording import FORMS, orders_of, reworded
+from lerobot_bomb.results.libero import LiberoResult
 from lerobot_env_bomb_libero.configuration_bomb_libero import BombLiberoEnvConfig
 
 VERBS = {

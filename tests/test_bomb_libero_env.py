@@ -18,10 +18,11 @@ import pytest
 from gymnasium.error import ResetNeeded
 
 from lerobot_bomb.conditions import MAX_LEVEL, NONE
-from lerobot_bomb.evaluation.result_lines import read_lines
 from lerobot_bomb.libero.assets import Libero, prepare_libero
 from lerobot_bomb.libero.episode import LiberoSpec
 from lerobot_bomb.libero.perturbations import LIBERO_AXES, libero_magnitude
+from lerobot_bomb.results.libero import LiberoResult
+from lerobot_bomb.results.reading import read_records
 
 SUITE = "libero_spatial"
 IMAGE_SIZE = 48
@@ -248,10 +249,11 @@ def test_an_episode_ends_after_its_steps_with_a_line_of_results(env: Any, result
     assert (reward, terminated, truncated, info["failure"]) == (0, False, True, "never_touched")
     again = env.step(ACTIONS[0])
     assert again[1:4] == (0, False, True) and env.episode_result().steps == len(ACTIONS)
-    rows, damages = read_lines(results)
-    (row,) = rows.values()
+    records, damages = read_records(results)
+    (record,) = records.values()
     assert damages == []
-    assert row["spec"]["seed"] == 1001 and row["initial_state"] == 1 and row["levels"] == {"light": 2}
+    assert isinstance(record, LiberoResult)
+    assert record.spec.seed == 1001 and record.initial_state == 1 and record.levels == {"light": 2}
 
 
 @pytest.mark.parametrize(

@@ -24,7 +24,8 @@ from lerobot_bomb.bomb.suite import Episode, find_suite, specs_of_tasks
 from lerobot_bomb.bomb.suites import goal as goal_suite
 from lerobot_bomb.bomb.suites import long as long_suite
 from lerobot_bomb.envs.rollout import Moment, expert_agent, make_env, play
-from lerobot_bomb.evaluation.results import read_results
+from lerobot_bomb.results.bomb import EpisodeResult
+from lerobot_bomb.results.groups import read_results
 from lerobot_env_bomb.perturb import PerturbedEpisode, sample_episode
 
 TASKS = {"goal": goal_suite.TASKS, "long": long_suite.TASKS}
@@ -366,8 +367,8 @@ def test_lerobot_eval_gives_a_policy_each_turn_as_it_is_said(
     )
     episode = sample_episode(EpisodeSpec(2, "long", task_id=TURNS_OF_4))
     assert list(dict.fromkeys(text for (text,) in given)) == [turn.instruction for turn in episode.turns]
-    (row,) = read_results(results)
-    assert (row["is_success"], row["progress"], row["target"], row["task_id"]) == (
+    (row,) = read_results(results, EpisodeResult)
+    assert (row.is_success, row.progress, row.target, row.task_id) == (
         True,
         1.0,
         None,

@@ -11,10 +11,10 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
 
+from lerobot_bomb.bomb.environment import Environment
 from lerobot_bomb.bomb.episode import EpisodeSpec
 from lerobot_bomb.bomb.suite import task_version
 from lerobot_bomb.bomb.suites import SUITES
-from lerobot_bomb.data.environment import Environment
 from lerobot_bomb.data.facts import DatasetFacts
 
 IMAGE = {"dtype": "video", "shape": [64, 64, 3], "names": ["height", "width", "channels"]}

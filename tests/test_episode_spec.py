@@ -11,7 +11,7 @@ from lerobot_bomb.bomb.observation import RenderOptions
 from lerobot_bomb.bomb.privileged_state import Goal, PrivilegedState
 from lerobot_bomb.bomb.suite import specs_of_tasks
 from lerobot_bomb.bomb.suites import SUITES
-from lerobot_bomb.envs.results import EpisodeResult
+from lerobot_bomb.results.bomb import EpisodeResult
 
 
 def test_row_0_is_far_and_columns_run_along_x() -> None:

@@ -13,7 +13,8 @@ from lerobot_bomb.commands.main import main
 from lerobot_bomb.commands.results_actions import LoggedVectorEnv
 from lerobot_bomb.envs.rollout import make_env
 from lerobot_bomb.evaluation.executed import append_episode, read_executed
-from lerobot_bomb.evaluation.results import read_results
+from lerobot_bomb.results.bomb import EpisodeResult
+from lerobot_bomb.results.groups import read_results
 from lerobot_bomb.smoothness import smoothness
 
 MAX_STEPS = 4
@@ -78,13 +79,15 @@ def test_executed_actions_lead_to_the_same_result_again(tmp_path: Path, is_async
     assert evaluate(path, "--policy.type=bomb_expert", *env, *flags) == 0
     executed = read_executed(path)
     assert (executed.fps, executed.is_seeded) == (5, True)
-    steps = {f"place, task 0, seed {row['spec']['seed']}": row["steps"] for row in read_results(results)}
+    steps = {
+        f"place, task 0, seed {row.spec.seed}": row.steps for row in read_results(results, EpisodeResult)
+    }
     assert {episode: len(of) for episode, of in executed.episodes.items()} == steps
     assert len(steps) == 4
-    for row in read_results(results):  # each line says how smooth these were
-        actions_TD = executed.episodes[f"place, task 0, seed {row['spec']['seed']}"]
+    for row in read_results(results, EpisodeResult):  # each line says how smooth these were
+        actions_TD = executed.episodes[f"place, task 0, seed {row.spec.seed}"]
         expected = smoothness(actions_TD, np.zeros(len(actions_TD)), exclude=[3])
-        assert (row["action_j2"], row["action_j3"]) == pytest.approx((expected.j2.mean, expected.j3.mean))
+        assert (row.action_j2, row.action_j3) == pytest.approx((expected.j2.mean, expected.j3.mean))
     spec = EpisodeSpec(6, "place", fps=5)
     replayed = make_env(spec, RenderOptions(image_size=32))
     replayed.reset(seed=6)

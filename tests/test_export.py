@@ -9,13 +9,13 @@ import pytest
 import yaml
 from huggingface_hub import ModelCardData, parse_eval_result_entries
 from huggingface_hub.repocard_data import model_index_to_eval_results
-from test_results import FDVLA, values
+from test_results import FDVLA, read, values
 
 from lerobot_bomb.commands.main import main
-from lerobot_bomb.envs.results import PolicyIdentity
-from lerobot_bomb.evaluation.result_groups import groups_of
 from lerobot_bomb.hub.evaluations import model_index, model_index_yaml
 from lerobot_bomb.report.latex import SPECIAL
+from lerobot_bomb.results.groups import groups_of
+from lerobot_bomb.results.origin import PolicyIdentity
 
 SUCCESSES = {("act", "none"): 8, ("act", "all:1-5"): 3, ("fdvla", "none"): 9, ("fdvla", "all:1-5"): 0}
 N = 10
@@ -63,7 +63,7 @@ def test_the_hub_s_own_readers_find_the_rates_of_the_lines(exported: Path, polic
 
 
 def test_a_model_card_takes_the_same(rows: list[dict[str, Any]]) -> None:
-    results = model_index(groups_of([row for row in rows if row["policy"]["type"] == "act"]))
+    results = model_index(groups_of([read(row) for row in rows if row["policy"]["type"] == "act"]))
     card = ModelCardData(model_name="act", eval_results=results)
     assert [each["metrics"][0]["value"] for each in card.to_dict()["model-index"][0]["results"]] == [0.8, 0.3]
 
@@ -175,6 +175,6 @@ def test_rates_of_several_suites_stay_apart() -> None:
         values(0, failure, spec={"suite": suite})
         for suite, failure in (("place", None), ("object", "dropped"))
     ]
-    index = yaml.safe_load(model_index_yaml("x", groups_of(rows)))["model-index"]
+    index = yaml.safe_load(model_index_yaml("x", groups_of(map(read, rows))))["model-index"]
     _, results = model_index_to_eval_results(index)
     assert {each.dataset_config: each.metric_value for each in results} == {"place.none": 1, "object.none": 0}

@@ -18,8 +18,9 @@ from lerobot_bomb.bomb.observation import RenderOptions, action_bounds
 from lerobot_bomb.bomb.privileged_state import PrivilegedState
 from lerobot_bomb.commands import doctor
 from lerobot_bomb.envs.rollout import expert_agent, play
-from lerobot_bomb.evaluation.results import read_results
 from lerobot_bomb.flag_errors import FlagError
+from lerobot_bomb.results.bomb import EpisodeResult
+from lerobot_bomb.results.groups import read_results
 from lerobot_env_bomb import fetch_files
 from lerobot_env_bomb.configuration_bomb import BombEnvConfig
 from lerobot_env_bomb.env import BombEnv
@@ -185,5 +186,5 @@ def test_it_runs_through_lerobot_eval(stock_cli: Callable[..., None], tmp_path: 
     env_flags = f"--env.type=bomb --env.robot=fetch --env.image_size=32 --env.results_path={results}"
     flags = "--policy.type=bomb_expert --policy.device=cpu --eval.n_episodes=1 --eval.batch_size=1"
     stock_cli("lerobot-eval", *env_flags.split(), *flags.split(), f"--output_dir={tmp_path / 'eval'}")
-    (row,) = read_results(results)
-    assert row["is_success"] and row["spec"]["robot"] == "fetch"
+    (row,) = read_results(results, EpisodeResult)
+    assert row.is_success and row.spec.robot == "fetch"

@@ -11,7 +11,7 @@ from test_results import values
 
 from lerobot_bomb import files
 from lerobot_bomb.commands.main import main
-from lerobot_bomb.evaluation.results import read_results
+from lerobot_bomb.results.groups import read_results
 from lerobot_bomb.sweep.manifest import Manifest, plan
 from lerobot_bomb.sweep.store import Store
 
@@ -63,7 +63,7 @@ def check_whole(play: Callable[[], Store]) -> None:
     """Check that nothing is missing once there is room and the episodes have run again."""
     store = play()
     store.merge()
-    assert [row["spec"]["seed"] for row in read_results(store.folder / "results.jsonl")] == SEEDS
+    assert [row.spec.seed for row in read_results(store.folder / "results.jsonl")] == SEEDS
 
 
 def test_a_line_that_finds_no_room_gives_the_cell_up_and_says_so(

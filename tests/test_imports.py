@@ -31,7 +31,7 @@ CORE = "lerobot_bomb"
 ORDER = [
     "__init__", "compat", "finite", "flag_errors", "flags", "conditions", "stats", "bootstrap",
     "smoothness", "tables", "files", "cuda_graphs",
-    "bomb", "pusht", "libero", "envs", "actions", "flow", "vlm", "decoding", "training", "data",
+    "bomb", "pusht", "libero", "results", "envs", "actions", "flow", "vlm", "decoding", "training", "data",
     "checkpoints", "evaluation", "viewing", "explain", "hub", "policies", "serving", "harness", "sweep",
     "report", "commands",
 ]  # fmt: skip
@@ -43,11 +43,8 @@ LIGHT = (
     "bomb/episode.py",
     "bomb/observation.py",
     "bomb/expert.py",
-    "envs/results.py",
-    "envs/inference.py",
     "envs/episode_env.py",
     "envs/perturbation.py",
-    "envs/pusht_results.py",
     "pusht/episode.py",
     "libero/assets.py",
     "envs/vector.py",
@@ -58,6 +55,7 @@ LIGHT = (
     "data/rollout_pool.py",
     "envs/rollout.py",
     "data/recording.py",
+    *(f"results/{path.name}" for path in (ROOT / CORE / "results").glob("*.py")),
 )
 
 

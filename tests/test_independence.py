@@ -18,9 +18,10 @@ from lerobot_bomb.bomb.episode import EpisodeSpec
 from lerobot_bomb.bomb.expert import expert_action
 from lerobot_bomb.bomb.observation import RenderOptions
 from lerobot_bomb.bomb.suites import SUITES
-from lerobot_bomb.envs.results import without_measured
 from lerobot_bomb.envs.vector import NEW_ROLLOUT_OPTION, LazyVectorEnv
-from lerobot_bomb.evaluation.results import read_results
+from lerobot_bomb.results.bomb import EpisodeResult
+from lerobot_bomb.results.groups import read_results
+from lerobot_bomb.results.record import without_measured
 from lerobot_env_bomb.env import BombEnv
 
 SMALL = RenderOptions(image_size=32)
@@ -187,7 +188,7 @@ def test_vector_envs_give_the_same_bits(
 class Outcome:
     """Outcome of one seed in lerobot-eval: its record, and the actions (T, 4) that were executed."""
 
-    row: dict[str, Any]
+    record: EpisodeResult
     actions: np.ndarray
 
 
@@ -214,9 +215,10 @@ def evaluate(
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(lerobot_eval, "rollout", note)
         run("lerobot-eval", *own.split(), *flags)
-    rows = {row["spec"]["seed"]: without_measured(row) for row in read_results(folder / "results.jsonl")}
-    assert rows.keys() == actions.keys() >= set(range(5, 5 + num_episodes))
-    return {seed: Outcome(rows[seed], actions[seed]) for seed in rows}
+    records = read_results(folder / "results.jsonl", EpisodeResult)
+    by_seed = {each.spec.seed: without_measured(each) for each in records}
+    assert by_seed.keys() == actions.keys() >= set(range(5, 5 + num_episodes))
+    return {seed: Outcome(record, actions[seed]) for seed, record in by_seed.items()}
 
 
 def assert_independent(
@@ -235,14 +237,14 @@ def assert_independent(
 def assert_alike(actual: Outcome, expected: Outcome, tolerance: float, message: str) -> None:
     assert len(actual.actions) == len(expected.actions), message
     np.testing.assert_allclose(actual.actions, expected.actions, rtol=0, atol=tolerance, err_msg=message)
-    assert actual.row.keys() == expected.row.keys()
-    for key, value in expected.row.items():
+    found = actual.record.as_json()
+    for key, value in expected.record.as_json().items():
         if key == "policy":
-            in_batch = {name: actual.row[key][name] for name in ("batch_size", "batch_row")}
+            in_batch = {name: found[key][name] for name in ("batch_size", "batch_row")}
             value = value | in_batch
         # floats are millimetres; 1000 times the tolerance of an action, whose unit is 40 mm
         same = pytest.approx(value, rel=0, abs=1e3 * tolerance) if isinstance(value, float) else value
-        assert actual.row[key] == same, f"{key}: {message}"
+        assert found[key] == same, f"{key}: {message}"
 
 
 # random actions use up an episode's 10 s
@@ -251,8 +253,8 @@ def test_scripted_results_do_not_depend_on_batch_or_workers(
     stock_cli: Run, tmp_path: Path, scripted: str, fps: int
 ) -> None:
     outcomes = assert_independent(stock_cli, tmp_path, [f"--policy.type={scripted}", f"--env.fps={fps}"])
-    assert all(outcome.row["is_success"] == (scripted == "bomb_expert") for outcome in outcomes.values())
-    assert len({outcome.row["placement_error_mm"] for outcome in outcomes.values()}) == 4
+    assert all(outcome.record.is_success == (scripted == "bomb_expert") for outcome in outcomes.values())
+    assert len({outcome.record.placement_error_mm for outcome in outcomes.values()}) == 4
 
 
 @pytest.fixture(scope="module")
@@ -289,7 +291,7 @@ def test_a_networks_results_do_not_depend_on_batch_or_workers(
     flags = [f"--policy.path={checkpoint}", "--env.fps=2", "--env.ignore_checkpoint=true"]
     flags.append("--policy.n_action_steps=3")
     outcomes = assert_independent(stock_cli, tmp_path, flags, tolerance_of(checkpoint))
-    assert len({len(outcome.row["instruction"]) for outcome in outcomes.values()}) > 1  # rows are padded
+    assert len({len(outcome.record.instruction) for outcome in outcomes.values()}) > 1  # rows are padded
     assert min(len(np.unique(outcome.actions, axis=0)) for outcome in outcomes.values()) > 3
 
 

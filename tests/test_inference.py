@@ -5,7 +5,7 @@ import json
 import time
 from collections import deque
 from collections.abc import Iterator
-from dataclasses import fields
+from dataclasses import fields, replace
 from math import ceil
 from pathlib import Path
 from types import SimpleNamespace
@@ -19,7 +19,7 @@ from lerobot.policies import PreTrainedPolicy, make_policy
 from lerobot.policies.act.configuration_act import ACTConfig
 from lerobot.policies.act.modeling_act import ACTPolicy
 from policy_cases import CASES
-from test_results import values
+from test_results import read, values
 
 import lerobot_policy_bomb  # noqa: F401  the plugin
 from lerobot_bomb.bomb.observation import RenderOptions
@@ -27,12 +27,11 @@ from lerobot_bomb.checkpoints import queries
 from lerobot_bomb.checkpoints.queries import last_query, time_queries
 from lerobot_bomb.commands.main import main
 from lerobot_bomb.compat.hooks import policies as built
-from lerobot_bomb.envs.inference import Inference, Query
-from lerobot_bomb.envs.results import MEASURED
-from lerobot_bomb.evaluation.efficiency import efficiencies
-from lerobot_bomb.evaluation.result_groups import different_fields
-from lerobot_bomb.evaluation.result_lines import parse_line
-from lerobot_bomb.evaluation.results import read_results
+from lerobot_bomb.results.bomb import EpisodeResult
+from lerobot_bomb.results.efficiency import efficiencies
+from lerobot_bomb.results.groups import read_results
+from lerobot_bomb.results.inference import Inference, Query
+from lerobot_bomb.results.record import MEASURED, different_fields
 from lerobot_bomb.smoothness import smoothness
 from lerobot_env_bomb.configuration_bomb import BombEnvConfig
 from lerobot_env_bomb.env import BombEnv
@@ -182,15 +181,16 @@ def test_a_line_says_what_its_episodes_queries_took(
             _, _, terminated, truncated, _ = envs.step(np.zeros((2, 4), dtype=np.float32))
             is_over |= terminated | truncated
     envs.close()
-    rows = read_results(results)
-    assert [row["spec"]["seed"] for row in sorted(rows, key=lambda row: row["spec"]["seed"])] == [0, 1, 2, 3]
-    for row in rows:
-        told = row["inference"]
-        assert told["num_queries"] == ceil(row["steps"] / 4)
-        assert told["latency_p95_ms"] >= told["latency_p50_ms"] > 30
-        assert told["total_s"] >= 0.03 * told["num_queries"]
-        assert told["passes"] is None and told["tokens"] is None
-        assert told["peak_memory_bytes"] is None or told["peak_memory_bytes"] > 2**20
+    records = read_results(results, EpisodeResult)
+    assert sorted(record.spec.seed for record in records) == [0, 1, 2, 3]
+    for record in records:
+        told = record.inference
+        assert told is not None
+        assert told.num_queries == ceil(record.steps / 4)
+        assert told.latency_p95_ms >= told.latency_p50_ms > 30
+        assert told.total_s >= 0.03 * told.num_queries
+        assert told.passes is None and told.tokens is None
+        assert told.peak_memory_bytes is None or told.peak_memory_bytes > 2**20
 
 
 def test_without_lines_nothing_is_timed() -> None:
@@ -229,11 +229,11 @@ def test_a_line_has_the_smoothness_of_the_executed_actions(tmp_path: Path) -> No
         if terminated or truncated:
             break
     env.close()
-    (row,) = read_results(tmp_path / "r.jsonl")
-    executed = actions[: row["steps"]]
+    (record,) = read_results(tmp_path / "r.jsonl", EpisodeResult)
+    executed = actions[: record.steps]
     expected = smoothness(executed, np.zeros(len(executed)), exclude=[3])
-    assert row["inference"] is None
-    assert (row["action_j2"], row["action_j3"]) == pytest.approx((expected.j2.mean, expected.j3.mean))
+    assert record.inference is None
+    assert (record.action_j2, record.action_j3) == pytest.approx((expected.j2.mean, expected.j3.mean))
 
 
 def test_an_episode_of_three_actions_has_no_smoothness() -> None:
@@ -255,21 +255,21 @@ def told(**other: Any) -> dict[str, Any]:
 
 
 @pytest.mark.parametrize(
-    "planted",
+    ("planted", "damage"),
     [
-        {"action_j2": -0.1},
-        {"action_j3": "rough"},
-        {"inference": {"num_queries": 3}},
-        {"inference": told(num_queries=0)},
-        {"inference": told(latency_p95_ms=-1)},
-        {"inference": told(device=None)},
+        ({"action_j2": -0.1}, "action_j2=-0.1 is impossible"),
+        ({"action_j3": "rough"}, 'action_j3="rough" is impossible'),
+        ({"inference": 3}, "inference=3 is impossible"),
+        ({"inference": {"num_queries": 3}}, "it lacks inference.total_s, inference.latency_p50_ms, "),
+        ({"inference": told(num_queries=0)}, "inference.num_queries=0 is impossible"),
+        ({"inference": told(latency_p95_ms=-1)}, "inference.latency_p95_ms=-1 is impossible"),
+        ({"inference": told(device=None)}, "inference.device=null is impossible"),
     ],
 )
-def test_what_is_impossible_is_damage(planted: dict[str, Any]) -> None:
-    name = next(iter(planted))
-    with pytest.raises(ValueError, match=f"{name}=.* is impossible"):
-        parse_line(json.dumps(values(0) | planted).encode())
-    parse_line(json.dumps(values(0) | {"inference": told()}).encode())
+def test_what_is_impossible_is_damage(planted: dict[str, Any], damage: str) -> None:
+    with pytest.raises(ValueError, match=f"^{damage}"):
+        read(values(0) | planted)
+    assert read(values(0, inference=told())).inference == Inference(**told())
 
 
 def test_lines_of_earlier_releases_are_read_and_show_nothing_of_it(
@@ -296,10 +296,12 @@ def test_results_shows_latency_and_smoothness_where_they_are(
 
 
 def test_what_is_measured_does_not_tell_two_lines_of_an_episode_apart() -> None:
-    row = values(0, inference=told())
+    record = read(values(0, inference=told()))
     assert {"inference"} == MEASURED
-    assert different_fields(row, values(0, inference=told(total_s=9.0))) == []
-    assert different_fields(row | {"action_j2": 0.5}, row | {"action_j2": 0.6}) == ["action_j2"]
+    assert different_fields(record, read(values(0, inference=told(total_s=9.0)))) == []
+    smooth, rough = (replace(record, action_j2=value) for value in (0.5, 0.6))
+    assert different_fields(smooth, rough) == ["action_j2"]
+    assert different_fields(record, rough) == []  # of an earlier release, that does not say it
 
 
 def test_every_field_of_a_query_is_on_the_line() -> None:
@@ -312,7 +314,9 @@ def test_devices_and_batch_sizes_are_not_pooled() -> None:
         row = values(len(rows), inference=told(device=device, latency_p50_ms=p50))
         row["policy"]["batch_size"] = batch_size
         rows.append(row)
-    found = {(each.device, each.batch_size): each for each in efficiencies([*rows, values(9)])}
+    found = {
+        (each.device, each.batch_size): each for each in efficiencies([*map(read, rows), read(values(9))])
+    }
     assert {key: each.latency_p50_ms for key, each in found.items()} == {
         ("cpu", 1): 20.0,
         ("cpu", 10): 50.0,

@@ -7,12 +7,12 @@ from typing import Any
 
 import pytest
 from bomb_pusht_cases import pusht_row
-from test_results import ACT, printed, row, values
+from test_results import ACT, printed, read, row, values
 
 from lerobot_bomb.commands.main import main
-from lerobot_bomb.envs.results import PolicyIdentity
-from lerobot_bomb.evaluation.result_lines import parse_line
 from lerobot_bomb.pusht.episode import SUCCESS_COVERAGE
+from lerobot_bomb.results.origin import PolicyIdentity
+from lerobot_bomb.results.reading import parse_record
 from lerobot_bomb.viewing.replay import MAX_BATCH, Replay
 
 
@@ -25,7 +25,7 @@ def damage_of(line: dict[str, Any] | str) -> str:
     """Return what is wrong with a line; '' if nothing is."""
     text = line if isinstance(line, str) else json.dumps(line)
     try:
-        parse_line(text.encode())
+        parse_record(text.encode())
     except ValueError as error:
         return str(error)
     return ""
@@ -88,7 +88,7 @@ def test_half_a_surrogate_pair_damages_its_line_only(path: Path, capsys: pytest.
     assert f"{path}:2: not an episode result: text with half a surrogate pair, '\\ud800'" in printed_now.err
     assert not damage_of(row(1).replace("Put it there.", "Put it \\ud83d\\ude00."))
     with pytest.raises(ValueError, match="codec can't decode"):
-        parse_line(b'{"a": "\xed\xa0\x80"}')
+        parse_record(b'{"a": "\xed\xa0\x80"}')
 
 
 def written(path: Path, text: str) -> Path:
@@ -158,6 +158,6 @@ def test_a_batch_that_cannot_be_played_again_is_told_before_anything_is_made(
     identity = asdict(PolicyIdentity("bomb_random")) | {"batch_row": number, "batch_size": size}
     line = values(seed) | {"policy": identity}
     with pytest.raises(ValueError, match=f"policy.batch_row={number} of policy.batch_size={size or 1}, and"):
-        Replay(line).player()
+        Replay(read(line)).player()
     assert main(["replay", str(written(path, json.dumps(line) + "\n"))]) == 1
     assert capsys.readouterr().err.count("\n") == 1

@@ -10,8 +10,9 @@ from recipes import recipe_path
 from variants import FLOW_ONLY, as_flags
 
 from lerobot_bomb.commands.main import main
-from lerobot_bomb.evaluation.bomb_lines import median_error_mm
-from lerobot_bomb.evaluation.results import read_results, summarise
+from lerobot_bomb.results.bomb import EpisodeResult, median_error_mm
+from lerobot_bomb.results.groups import read_results
+from lerobot_bomb.results.summary import summarise
 
 pytestmark = pytest.mark.long
 
@@ -27,12 +28,12 @@ def test_the_expert_places_100_stones_precisely(
     flags += f" --env.control_mode={control_mode} --env.results_path={results}"
     flags += " --eval.n_episodes=100 --eval.batch_size=2"
     stock_cli("lerobot-eval", *flags.split(), f"--output_dir={tmp_path / 'eval'}")
-    rows = read_results(results)
+    rows = read_results(results, EpisodeResult)
     assert len(rows) == 100
-    assert summarise(rows).rate.successes >= 99
+    assert summarise([*rows]).rate.successes >= 99
     error_mm = median_error_mm(rows)
     assert error_mm is not None and error_mm <= 2
-    assert max(row["collateral_mm"] for row in rows) < 1
+    assert max(row.collateral_mm for row in rows) < 1
 
 
 def test_two_targets_learned_by_heart_through_the_stock_commands(

@@ -11,7 +11,7 @@ from test_results import FDVLA, values
 
 from lerobot_bomb.commands.arguments import ANSWER_IS_NO
 from lerobot_bomb.commands.main import main
-from lerobot_bomb.evaluation.results import read_results
+from lerobot_bomb.results.groups import read_results
 
 type Printed = pytest.CaptureFixture[str]
 ONLY_A, ONLY_B = 32, 12  # of 400 pairs, in which one of the two alone succeeds
@@ -100,7 +100,7 @@ def test_a_rate_says_how_many_are_missing(
     errors = [json.loads(line) for line in (tmp_path / "errors.jsonl").read_text().splitlines()]
     assert [error["seed"] for error in errors] == [1009]
     results = tmp_path / "results.jsonl"
-    played = [row["spec"]["seed"] for row in read_results(results)]
+    played = [record.spec.seed for record in read_results(results)]
     assert played == [*range(1000, 1009)]
 
     assert run("results", results) == 0

@@ -22,11 +22,11 @@ from lerobot.utils.constants import ACTION, OBS_STATE
 from policy_cases import CASES
 
 import lerobot_policy_bomb  # noqa: F401  the plugin
+from lerobot_bomb.bomb.environment import Environment
 from lerobot_bomb.checkpoints.environment import ConfigWithEnvironment
 from lerobot_bomb.checkpoints.folder import parse_config, write_checkpoint
 from lerobot_bomb.checkpoints.shipped import checkpoint_path
 from lerobot_bomb.commands.main import main
-from lerobot_bomb.data.environment import Environment
 
 Run = Callable[..., None]
 REPO_ID = "test/recording"

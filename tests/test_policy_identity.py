@@ -20,8 +20,9 @@ from lerobot_bomb.checkpoints.identity import _of_checkpoint, acting_policy, ide
 from lerobot_bomb.checkpoints.shipped import checkpoint_path
 from lerobot_bomb.compat.hooks import policies as built
 from lerobot_bomb.compat.hooks.policies import built_policies
-from lerobot_bomb.envs.results import PolicyIdentity
-from lerobot_bomb.evaluation.results import read_results
+from lerobot_bomb.results.bomb import EpisodeResult
+from lerobot_bomb.results.groups import read_results
+from lerobot_bomb.results.origin import PolicyIdentity
 from lerobot_env_bomb.configuration_bomb import BombEnvConfig
 from lerobot_policy_bomb_expert.configuration_bomb_expert import BombExpertConfig
 
@@ -76,15 +77,16 @@ def test_a_line_names_the_checkpoint_that_was_loaded_after_the_environments(
     while not (ends := envs.step(np.zeros((2, 4), dtype=np.float32)))[2].all() and not ends[3].all():
         pass
     envs.close()
-    rows = read_results(results)
-    assert len(rows) == 2
-    for row in rows:
-        assert row["policy"]["type"] == policy.config.type == "act"
-        assert row["policy"]["path"] == str(checkpoint)
-        assert row["policy"]["weights_sha256"] == sha256(checkpoint / "model.safetensors")
-        assert row["task_ids"] == [12, 3]
-        assert row["opengl_renderer"] and row["opengl_vendor"] and row["mujoco_version"]
-        assert row["torch_version"] and row["lerobot_version"]
+    records = read_results(results, EpisodeResult)
+    assert len(records) == 2
+    for record in records:
+        assert record.policy is not None
+        assert record.policy.type == policy.config.type == "act"
+        assert record.policy.path == str(checkpoint)
+        assert record.policy.weights_sha256 == sha256(checkpoint / "model.safetensors")
+        assert record.task_ids == (12, 3)
+        assert record.opengl_renderer and record.opengl_vendor and record.mujoco_version
+        assert record.torch_version and record.lerobot_version
 
 
 def test_flags_and_processors_are_part_of_who_acts_and_a_place_is_not(checkpoint: Path) -> None:

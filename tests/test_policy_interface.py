@@ -12,7 +12,7 @@ from lerobot.policies import PreTrainedPolicy, get_policy_class, make_policy, ma
 from pusht_checkpoints import write_act
 from vla0_smol_cases import make_config
 
-from lerobot_bomb.data.environment import Environment
+from lerobot_bomb.bomb.environment import Environment
 
 BOMB = Environment("scara", "absolute", 10, 64, ("workspace", "wrist"), "1.0", "place")
 INSIST = "or insist with --env.ignore_checkpoint=true"

@@ -9,13 +9,13 @@ from fdvla_cases import make_policy, stats
 from lerobot.datasets import LeRobotDataset
 from lerobot.policies.factory import make_pre_post_processors
 
+from lerobot_bomb.bomb.environment import Environment
 from lerobot_bomb.bomb.episode import EpisodeSpec
 from lerobot_bomb.bomb.expert import expert_action
 from lerobot_bomb.bomb.observation import RenderOptions
 from lerobot_bomb.bomb.pointing import colors_on_board
 from lerobot_bomb.bomb.privileged_state import PrivilegedState
 from lerobot_bomb.commands.main import main
-from lerobot_bomb.data.environment import Environment
 from lerobot_bomb.envs.rollout import make_env
 
 HERE = Environment("scara", "relative", 10, 64, ("workspace", "wrist"), "1.0", "place")

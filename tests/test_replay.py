@@ -13,7 +13,8 @@ from lerobot_bomb.commands.arguments import ANSWER_IS_NO
 from lerobot_bomb.commands.main import main
 from lerobot_bomb.commands.results_files import read_line
 from lerobot_bomb.conditions import NONE
-from lerobot_bomb.envs.results import ORIGIN, EpisodeResult
+from lerobot_bomb.results.bomb import EpisodeResult
+from lerobot_bomb.results.record import ORIGIN
 
 
 @pytest.fixture(scope="module")

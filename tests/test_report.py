@@ -10,11 +10,11 @@ from typing import Any
 
 import pytest
 from scipy.stats import linregress
-from test_results import FDVLA, values
+from test_results import FDVLA, read, values
 
 from lerobot_bomb.commands.main import main
-from lerobot_bomb.evaluation.paired import compare_pairs
 from lerobot_bomb.report.cells import points
+from lerobot_bomb.results.pairs import compare_pairs
 
 CLASSES = (None, None, None, "imprecise", "wrong_intersection", "dropped")
 type Rows = list[dict[str, Any]]
@@ -224,7 +224,9 @@ def test_the_output_is_a_page_or_a_folder(
 
 
 def test_points_as_numbers() -> None:
-    (compared,) = compare_pairs({"none": [(values(seed, "dropped"), values(seed)) for seed in range(6)]})
+    (compared,) = compare_pairs(
+        {"none": [(read(values(seed, "dropped")), read(values(seed))) for seed in range(6)]}
+    )
     difference, p_value = points(compared)
     low, high = compared.interval
     counts = {"both": 0, "only_first": 0, "only_second": 6, "neither": 0}

@@ -1,21 +1,26 @@
 import json
 import re
 from collections.abc import Callable
-from dataclasses import asdict, fields
+from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any, ClassVar
 
 import pytest
+from bomb_pusht_cases import pusht_row
 
 from lerobot_bomb.bomb.board import COLORS, task_id
 from lerobot_bomb.bomb.episode import PROTOCOL_VERSION, EpisodeSpec
 from lerobot_bomb.bomb.perturbations import Condition
 from lerobot_bomb.commands.main import main
-from lerobot_bomb.envs.results import EpisodeResult, PolicyIdentity, ResultLine
-from lerobot_bomb.evaluation.bomb_lines import BOMB_LINES, NEW_CHECKS, SPEC_CHECKS, median_error_mm
-from lerobot_bomb.evaluation.line_checks import SHARED_CHECKS
-from lerobot_bomb.evaluation.result_lines import ADDED_POLICY_CHECKS, KINDS, POLICY_CHECKS, parse_line
-from lerobot_bomb.evaluation.results import read_results, summarise
+from lerobot_bomb.pusht.episode import PUSHT_PROTOCOL_VERSION
+from lerobot_bomb.results.bomb import OLD_VERSION, EpisodeResult, median_error_mm
+from lerobot_bomb.results.groups import read_results
+from lerobot_bomb.results.means import mean_of
+from lerobot_bomb.results.origin import PolicyIdentity
+from lerobot_bomb.results.pusht import PushTResult
+from lerobot_bomb.results.reading import RECORD_OF_VERSION, RECORD_TYPES, parse_record
+from lerobot_bomb.results.record import Record, field_names
+from lerobot_bomb.results.summary import summarise
 
 ACT = PolicyIdentity("act", "outputs/act", None, "a" * 64, "b" * 64)
 FDVLA = PolicyIdentity("fdvla", "me/fdvla", "0123456789ab", "c" * 64, "d" * 64)
@@ -61,11 +66,19 @@ def row(seed: int, failure: str | None = None, error: float | None = None, **oth
     return json.dumps(values(seed, failure, error, **other)) + "\n"
 
 
+def read(values: dict[str, Any]) -> EpisodeResult:
+    """Return the record of these fields."""
+    record = parse_record(json.dumps(values).encode())
+    assert isinstance(record, EpisodeResult)
+    return record
+
+
 def old_row(seed: int, **other: Any) -> str:
     """Write a row as protocol 1.0 did."""
     new = values(seed, **other)
     return json.dumps(
-        {name: new[name] for name in new if name not in NEW_CHECKS} | {"protocol_version": "1.0"}
+        {name: new[name] for name in new if name not in EpisodeResult.versions[OLD_VERSION]}
+        | {"protocol_version": "1.0"}
     )
 
 
@@ -85,10 +98,10 @@ def test_summary_counts_successes_errors_and_failures(path: Path) -> None:
     lines = [row(0), row(1, error=3.0), row(2, "imprecise", 14.0), row(3, "never_reached", 200.0)]
     lines += [row(4, "dropped", 99.0), row(5, "wrong_intersection", 45.0), row(6, "disturbed_others", 2.0)]
     path.write_text("".join(lines))
-    rows = read_results(path)
-    summary = summarise(rows)
+    records = read_results(path, EpisodeResult)
+    summary = summarise([*records])
     assert (summary.rate.n, summary.rate.successes) == (7, 2)
-    assert median_error_mm(rows) == 3.0  # of 1, 2, 3, 14 and 45: only stones that were put down
+    assert median_error_mm(records) == 3.0  # of 1, 2, 3, 14 and 45: only stones that were put down
     assert summary.failures == {
         "imprecise": 1,
         "never_reached": 1,
@@ -103,23 +116,30 @@ def test_an_episode_that_was_run_again_counts_once(path: Path) -> None:
     assert summarise(read_results(path)).rate.successes == 2
 
 
-def test_all_fields_are_checked() -> None:
-    assert {field.name for field in fields(ResultLine)} == SHARED_CHECKS.keys()
-    spec_fields = SPEC_CHECKS.keys() | BOMB_LINES.added_spec_fields.keys()
-    assert spec_fields == {field.name for field in fields(EpisodeSpec)}
-    policy_fields = POLICY_CHECKS.keys() | ADDED_POLICY_CHECKS.keys()
-    assert policy_fields == {field.name for field in fields(PolicyIdentity)}
-    for name in values(0).keys() - BOMB_LINES.added_fields.keys() - SHARED_CHECKS.keys():
-        with pytest.raises(ValueError, match=f"{name}" if name != "protocol_version" else "None"):
-            parse_line(json.dumps({key: value for key, value in values(0).items() if key != name}).encode())
+def test_a_record_is_read_as_it_was_written() -> None:
+    written = EpisodeResult(**{name: getattr(read(values(3)), name) for name in field_names(EpisodeResult)})
+    assert parse_record(written.to_json().encode()) == written
+    assert [*json.loads(written.to_json())] == [*field_names(EpisodeResult)]
+
+
+def test_all_fields_of_a_release_must_be_there() -> None:
+    for name in values(0).keys() - (EpisodeResult.earlier.keys() - {*EpisodeResult.versions[OLD_VERSION]}):
+        with pytest.raises(ValueError, match=f"it lacks {name}$" if name != "protocol_version" else "None"):
+            read({key: value for key, value in values(0).items() if key != name})
+
+
+@pytest.mark.parametrize("record_type", RECORD_TYPES)
+def test_what_records_of_earlier_releases_lack_are_fields(record_type: type[Record]) -> None:
+    nested = {name.partition(".")[0] for name in record_type.earlier}
+    assert nested <= {*field_names(record_type)}
+    assert {name for names in record_type.versions.values() for name in names} <= record_type.earlier.keys()
 
 
 @pytest.mark.parametrize(("name", "value"), [("progress", 1.5), ("progress", None), ("task_id", -1)])
 def test_fields_that_earlier_releases_did_not_write_are_checked_where_they_are(name: str, value: Any) -> None:
-    line = values(0)
-    with pytest.raises(ValueError, match=name):
-        parse_line(json.dumps(line | {name: value}).encode())
-    parse_line(json.dumps({key: of for key, of in line.items() if key != name}).encode())
+    with pytest.raises(ValueError, match=f"{name}={json.dumps(value)} is impossible"):
+        read(values(0) | {name: value})
+    assert getattr(read({key: of for key, of in values(0).items() if key != name}), name) is None
 
 
 def test_moves_made_are_shown_of_episodes_with_several(path: Path) -> None:
@@ -132,9 +152,9 @@ def test_moves_made_are_shown_of_episodes_with_several(path: Path) -> None:
 
 
 def test_a_protocol_version_is_of_one_environment() -> None:
-    versions = [version for kind in KINDS for version in kind.fields]
+    versions = [version for each in RECORD_TYPES for version in each.versions]
     assert len(set(versions)) == len(versions)
-    assert len({kind.env_type for kind in KINDS}) == len(KINDS)
+    assert len({each.env_type for each in RECORD_TYPES}) == len(RECORD_TYPES)
 
 
 DAMAGED: dict[str, Any] = {
@@ -152,7 +172,7 @@ DAMAGED: dict[str, Any] = {
     "task_ids=[50] is impossible": {"task_ids": [50]},
     "policy=[] is impossible": {"policy": []},
     'policy.weights_sha256="a" is impossible': {"policy": asdict(ACT) | {"weights_sha256": "a"}},
-    "spec.seed=-1 is impossible": {"spec": asdict(EpisodeSpec(0)) | {"seed": -1}},
+    "--seed=-1 must lie in 0..4294967295": {"spec": asdict(EpisodeSpec(0)) | {"seed": -1}},
     "seed=4294967296 must lie in 0..4294967295": {"spec": asdict(EpisodeSpec(0)) | {"seed": 2**32}},
     "fps=3 does not divide": {"spec": asdict(EpisodeSpec(0)) | {"fps": 3}},
     "perturbations": {"spec": asdict(EpisodeSpec(0)) | {"perturbations": "camera:9"}},
@@ -234,7 +254,7 @@ def test_a_task_version_that_a_suite_never_had_is_refused() -> None:
     with pytest.raises(
         ValueError, match=r"task_version of suite place='1\.1' is unknown; choose one of: 1\.0"
     ):
-        parse_line(row(0, task_version="1.1").encode())
+        read(values(0, task_version="1.1"))
 
 
 OTHER: dict[str, dict[str, Any]] = {
@@ -404,3 +424,30 @@ def test_a_file_of_something_else_is_told_from_an_unfinished_one(
     path.write_text('{"type": "act"}\nnonsense\n')
     assert main(["results", str(path)]) == 1
     assert "is no results file; name one that --env.results_path" in capsys.readouterr().err
+
+
+@dataclass(frozen=True, kw_only=True)
+class WithPath(PushTResult):
+    """Record of `bomb_pusht` with one measure more."""
+
+    earlier: ClassVar = {**PushTResult.earlier, "path_px": None}
+    measures: ClassVar = (*PushTResult.measures, mean_of("path_px", "path", "mean, in pixels"))
+
+    path_px: Annotated[float | None, lambda value: value is not None and value >= 0] = None
+
+
+def test_a_measure_is_a_field_of_a_record_and_nothing_else(
+    path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setitem(RECORD_OF_VERSION, PUSHT_PROTOCOL_VERSION, WithPath)
+    old, *new = (pusht_row(seed, "none", 0.5, "timeout") for seed in range(3))
+    new = [line | {"path_px": length} for line, length in zip(new, (100.0, 200.0), strict=True)]
+    text = "".join(json.dumps(line) + "\n" for line in (old, *new))
+    assert "path             150.000 [100.000, 200.000] (mean, in pixels)" in printed(path, text, capsys)
+    assert not any(
+        line.startswith("path") for line in summarise([parse_record(json.dumps(old).encode())]).lines()
+    )
+    assert main(["report", str(path), f"--output={path.with_name('r.html')}"]) == 0
+    assert "path 150.000 [100.000, 200.000]" in path.with_name("r.json").read_text()
+    with pytest.raises(ValueError, match="path_px=-1 is impossible"):
+        parse_record(json.dumps(old | {"path_px": -1}).encode())

@@ -15,7 +15,7 @@ from lerobot_bomb.checkpoints.names import CONFIG, TRAIN_CONFIG, WEIGHTS, has_lo
 from lerobot_bomb.checkpoints.shipped import FOLDER, checkpoint_path, shipped_names
 from lerobot_bomb.commands import demo
 from lerobot_bomb.commands.main import main
-from lerobot_bomb.evaluation.results import read_results
+from lerobot_bomb.results.groups import read_results
 
 Run = Callable[..., None]
 NAMES = shipped_names()
@@ -59,7 +59,7 @@ def test_lerobot_eval_takes_the_name_and_it_places_stones(name: str, stock_cli: 
         "--eval.use_async_envs=false",
         f"--output_dir={tmp_path / 'eval'}",
     )
-    assert sum(row["is_success"] for row in read_results(results)) >= 5
+    assert sum(row.is_success for row in read_results(results)) >= 5
 
 
 def test_another_environment_is_refused_with_the_flag_to_give(stock_cli: Run, tmp_path: Path) -> None:
@@ -133,6 +133,6 @@ def test_the_demo_ends_with_rates_and_a_contact_sheet(
     assert match is not None and Path(match[1]).stat().st_size > 10_000
     assert (tmp_path / "demo" / "replay.mp4").stat().st_size > 1000
     rows = read_results(tmp_path / "demo" / "expert.jsonl")
-    assert {row["spec"]["perturbations"] for row in rows} == set(demo.CONDITIONS)
-    assert all(row["is_success"] for row in rows)
+    assert {row.spec.perturbations for row in rows} == set(demo.CONDITIONS)
+    assert all(row.is_success for row in rows)
     assert main(["demo", f"--output_dir={tmp_path / 'demo'}"]) == 1

@@ -9,7 +9,8 @@ import pytest
 from huggingface_hub.utils import validate_repo_id
 
 from lerobot_bomb.commands.main import main
-from lerobot_bomb.evaluation.results import read_results
+from lerobot_bomb.results.bomb import EpisodeResult
+from lerobot_bomb.results.groups import read_results
 
 Run = Callable[..., None]
 REPO_ID = "test/bomb_place"
@@ -47,9 +48,9 @@ def test_the_expert_places_stones_through_lerobot_eval(stock_cli: Run, tmp_path:
     flags = "--policy.type=bomb_expert --eval.n_episodes=4 --eval.batch_size=2 --eval.use_async_envs=true"
     info = evaluate(stock_cli, tmp_path, f"{flags} --seed=5")
     assert info["per_group"]["place"]["pc_success"] == 100.0
-    rows = read_results(tmp_path / "results.jsonl")
-    assert sorted(row["spec"]["seed"] for row in rows) == [5, 6, 7, 8]
-    assert all(row["is_success"] and row["placement_error_mm"] < 10 for row in rows)
+    rows = read_results(tmp_path / "results.jsonl", EpisodeResult)
+    assert sorted(row.spec.seed for row in rows) == [5, 6, 7, 8]
+    assert all(row.is_success and row.placement_error_mm < 10 for row in rows)
     videos = info["overall"]["video_paths"]
     assert len(videos) == 4
     assert all(Path(video).stat().st_size > 1000 for video in videos)
@@ -69,9 +70,9 @@ def test_each_condition_has_a_rate_and_a_recording(stock_cli: Run, tmp_path: Pat
     info = evaluate(stock_cli, tmp_path, flags)
     keys = ["place.none", "place.camera-3", "place.all-5"]
     assert {key: info["per_group"][key]["pc_success"] for key in keys} == dict.fromkeys(keys, 100.0)
-    rows = read_results(tmp_path / "results.jsonl")
-    instructions = {row["spec"]["perturbations"]: row["instruction"] for row in rows}
-    assert sorted(row["spec"]["perturbations"] for row in rows) == ["all:5", "camera:3", "none"]
+    rows = read_results(tmp_path / "results.jsonl", EpisodeResult)
+    instructions = {row.spec.perturbations: row.instruction for row in rows}
+    assert sorted(row.spec.perturbations for row in rows) == ["all:5", "camera:3", "none"]
     recordings = tmp_path / "eval" / "recordings"
     assert {path.name for path in recordings.iterdir()} == {f"{key}_0" for key in keys}
     for key, condition in zip(keys, ("none", "camera:3", "all:5"), strict=True):
@@ -80,11 +81,7 @@ def test_each_condition_has_a_rate_and_a_recording(stock_cli: Run, tmp_path: Pat
         assert tasks["task"].to_pylist() == [instructions[condition]]
     # the nominal arm has the same seeds, targets and colours
     episodes = {
-        condition: [
-            (r["spec"]["seed"], r["target"], r["color"])
-            for r in rows
-            if r["spec"]["perturbations"] == condition
-        ]
+        condition: [(r.spec.seed, r.target, r.color) for r in rows if r.spec.perturbations == condition]
         for condition in ("none", "camera:3", "all:5")
     }
     assert episodes["none"] == episodes["camera:3"] == episodes["all:5"]
@@ -93,7 +90,7 @@ def test_each_condition_has_a_rate_and_a_recording(stock_cli: Run, tmp_path: Pat
 def test_random_actions_fail(stock_cli: Run, tmp_path: Path) -> None:
     flags = "--policy.type=bomb_random --eval.n_episodes=2 --eval.batch_size=2 --eval.use_async_envs=false"
     assert evaluate(stock_cli, tmp_path, f"{flags} --env.fps=2")["overall"]["pc_success"] == 0.0
-    assert all(row["failure"] for row in read_results(tmp_path / "results.jsonl"))
+    assert all(row.failure for row in read_results(tmp_path / "results.jsonl", EpisodeResult))
 
 
 def test_vla0_smol_trains_and_its_checkpoint_acts(stock_cli: Run, dataset: Path, tmp_path: Path) -> None:
@@ -101,8 +98,8 @@ def test_vla0_smol_trains_and_its_checkpoint_acts(stock_cli: Run, dataset: Path,
     checkpoint = train(stock_cli, dataset, tmp_path / "train", flags)
     flags = f"--policy.path={checkpoint} {SHORT} --eval.n_episodes=1 --eval.batch_size=1"
     assert evaluate(stock_cli, tmp_path, flags)["overall"]["n_episodes"] == 1
-    (row,) = read_results(tmp_path / "results.jsonl")
-    assert row["is_success"] or row["failure"]
+    (row,) = read_results(tmp_path / "results.jsonl", EpisodeResult)
+    assert row.is_success or row.failure
 
 
 def test_a_trained_policy_cannot_see_the_true_state(stock_cli: Run, dataset: Path, tmp_path: Path) -> None:

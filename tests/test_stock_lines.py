@@ -10,12 +10,12 @@ from lerobot.envs.configs import LiberoEnv, PushtEnv
 from pusht_checkpoints import write_act
 
 from lerobot_bomb.commands.main import main
-from lerobot_bomb.envs.results import PolicyIdentity
 from lerobot_bomb.evaluation.eval_info import results_of
-from lerobot_bomb.evaluation.result_lines import parse_line
-from lerobot_bomb.evaluation.results import read_results
-from lerobot_bomb.evaluation.stock_lines import STOCK_LIBERO_LINES
 from lerobot_bomb.libero.assets import Libero
+from lerobot_bomb.results.groups import read_results
+from lerobot_bomb.results.origin import PolicyIdentity
+from lerobot_bomb.results.reading import parse_record
+from lerobot_bomb.results.stock import StockLiberoResult, StockPushTResult
 from lerobot_bomb.sweep.manifest import Manifest, plan
 from lerobot_bomb.sweep.store import Store
 
@@ -67,14 +67,14 @@ def test_a_sweep_gives_the_lines_that_are_made_of_the_printed_command(
     stock_cli("lerobot-eval", *flags)
     assert main(["results", "add", str(tmp_path / "stock.jsonl"), *flags]) == 0
     assert (store.folder / "results.jsonl").read_text() == (tmp_path / "stock.jsonl").read_text()
-    rows = read_results(tmp_path / "stock.jsonl")
-    assert [row["spec"]["seed"] for row in rows] == SEEDS
-    assert [row["policy"]["batch_row"] for row in rows] == [0, 1, 0, 1]
+    rows = read_results(tmp_path / "stock.jsonl", StockPushTResult)
+    assert [row.spec.seed for row in rows] == SEEDS
+    assert [row.policy and row.policy.batch_row for row in rows] == [0, 1, 0, 1]
     (task,) = json.loads((tmp_path / "eval" / "eval_info.json").read_text())["per_task"]
-    assert [row["max_reward"] for row in rows] == task["metrics"]["max_rewards"]
-    assert [row["sum_reward"] for row in rows] == task["metrics"]["sum_rewards"]
-    assert all(row["flags"]["episode_length"] == 6 and row["image_size"] == "96x96" for row in rows)
-    assert all(row["policy"]["weights_sha256"] for row in rows)
+    assert [row.max_reward for row in rows] == task["metrics"]["max_rewards"]
+    assert [row.sum_reward for row in rows] == task["metrics"]["sum_rewards"]
+    assert all(row.flags["episode_length"] == 6 and row.image_size == "96x96" for row in rows)
+    assert all(row.policy and row.policy.weights_sha256 for row in rows)
 
 
 def test_results_compare_and_report_read_the_lines(
@@ -119,7 +119,7 @@ def test_an_episode_that_raises_is_an_error_and_no_failure(
     (error,) = store.errors(manifest.cells[0])
     assert (error.seed, error.error) == (9, "RuntimeError: out of memory")
     assert "--seed=9 --eval.n_episodes=1" in error.command
-    assert [row["spec"]["seed"] for row in read_results(store.folder / "results.jsonl")] == [7, 8, 10]
+    assert [row.spec.seed for row in read_results(store.folder / "results.jsonl")] == [7, 8, 10]
     monkeypatch.undo()
     store.begin_again(manifest.cells)
     assert len(read_results(play(manifest).folder / "results.jsonl")) == 4
@@ -153,15 +153,16 @@ def test_libero_is_told_apart_by_the_number_that_chooses_the_initial_state() -> 
     results = results_of(
         info("libero_goal", 3, [1.0, 0.0]), LiberoEnv(task="libero_goal"), ACT, 7, 1, first=2
     )
-    rows = [parse_line(result.to_json().encode()) for result in results]
-    assert [row["spec"] for row in rows] == [
+    rows = [result for result in results if isinstance(result, StockLiberoResult)]
+    assert rows == [parse_record(row.to_json().encode()) for row in rows]
+    assert [vars(row.spec) for row in rows] == [
         {"seed": seed, "suite": "libero_goal", "task_id": 3, "number": number, "perturbations": "none"}
         for seed, number in ((7, 2), (8, 3))
     ]
-    assert [row["failure"] for row in rows] == [None, "failed"]
-    assert rows[0]["image_size"] == "360x360" and "task" not in rows[0]["flags"]
-    assert STOCK_LIBERO_LINES.describe_simulator({"simulator": "robosuite 1"}) == "robosuite 1"
-    flags = STOCK_LIBERO_LINES.eval_flags(rows)
+    assert [row.failure for row in rows] == [None, "failed"]
+    assert rows[0].image_size == "360x360" and "task" not in rows[0].flags
+    assert StockLiberoResult.describe_simulator({"simulator": "robosuite 1"}) == "robosuite 1"
+    flags = StockLiberoResult.eval_flags(rows)
     assert flags[0] == "--env.type=libero" and flags[-1] == "--eval.use_async_envs=false"
     assert "--env.task=libero_goal" in flags and "--env.task_ids=[3]" in flags
 
@@ -230,7 +231,7 @@ def test_libero_is_played_from_the_initial_states_in_order(
     flags += ("--policy.use_state=false",)
     policies = ("vla0_smol",)
     store = play(plan(policies, ("libero_spatial",), (), seed=7, num_episodes=3, batch_size=1, flags=flags))
-    rows = read_results(store.folder / "results.jsonl")
-    assert [(row["spec"]["seed"], row["spec"]["number"]) for row in rows] == [(7, 0), (8, 1), (9, 2)]
+    rows = read_results(store.folder / "results.jsonl", StockLiberoResult)
+    assert [(row.spec.seed, row.spec.number) for row in rows] == [(7, 0), (8, 1), (9, 2)]
     # the third raised in the evaluation of all, then each was played alone
     assert started == [0, 1, 0, 1, 2]

@@ -16,7 +16,8 @@ from safetensors.torch import load_file
 from stock_policies import BASE, FLAGS, flags_of, shrink_gemma, write_base, write_folders
 
 from lerobot_bomb.commands.main import main
-from lerobot_bomb.evaluation.results import Row, read_results
+from lerobot_bomb.results.bomb import EpisodeResult
+from lerobot_bomb.results.groups import read_results
 
 Run = Callable[..., None]
 REPO_ID = "test/bomb_place"
@@ -51,7 +52,7 @@ def train(run: Run, stock_type: str, dataset: Path, folder: Path) -> Path:
     return folder / "train" / "checkpoints" / "last" / "pretrained_model"
 
 
-def evaluate(run: Run, checkpoint: Path, folder: Path, *flags: str) -> list[Row]:
+def evaluate(run: Run, checkpoint: Path, folder: Path, *flags: str) -> list[EpisodeResult]:
     """Run one perturbed episode of 20 steps."""
     env = "--env.type=bomb --env.image_size=64 --env.fps=2 --env.ignore_checkpoint=true"
     batch = "--eval.n_episodes=1 --eval.batch_size=1 --eval.use_async_envs=false --policy.device=cpu"
@@ -68,7 +69,7 @@ def evaluate(run: Run, checkpoint: Path, folder: Path, *flags: str) -> list[Row]
         *where,
         *flags,
     )
-    return read_results(results)
+    return read_results(results, EpisodeResult)
 
 
 def check_weights(stock_type: str, checkpoint: Path, folder: Path) -> None:
@@ -116,8 +117,9 @@ def test_a_stock_policy_is_trained_and_evaluated_by_the_stock_commands(
     checkpoint = train(stock_cli, stock_type, dataset, folder)
     check_weights(stock_type, checkpoint, folder)
     (row,) = evaluate(stock_cli, checkpoint, folder)
-    assert row["spec"]["perturbations"] == "camera:3"
-    assert row["inference"]["num_queries"] == ceil(row["steps"] / FLAGS[stock_type]["n_action_steps"])
+    assert row.spec.perturbations == "camera:3"
+    assert row.inference is not None
+    assert row.inference.num_queries == ceil(row.steps / FLAGS[stock_type]["n_action_steps"])
 
 
 def test_xvla_is_evaluated_once_the_processors_of_libero_are_left_out(
@@ -132,4 +134,4 @@ def test_xvla_is_evaluated_once_the_processors_of_libero_are_left_out(
         lerobot_eval, "make_env_pre_post_processors", lambda env_cfg, policy_cfg: env_cfg.get_env_processors()
     )
     (row,) = evaluate(stock_cli, checkpoint, folder / "without", RENAMED)
-    assert row["spec"]["perturbations"] == "camera:3"
+    assert row.spec.perturbations == "camera:3"

@@ -17,8 +17,8 @@ import pytest
 
 from lerobot_bomb.commands.main import EVAL_FLAGS, main
 from lerobot_bomb.commands.results_files import missing_of_sweep
-from lerobot_bomb.envs.results import Row, without_measured
-from lerobot_bomb.evaluation.results import read_results
+from lerobot_bomb.results.groups import read_results
+from lerobot_bomb.results.record import Record, without_measured
 from lerobot_bomb.sweep.claim import claimed
 from lerobot_bomb.sweep.local import PYTHON, progress
 from lerobot_bomb.sweep.manifest import Cell, Manifest, plan
@@ -160,9 +160,9 @@ def play(tmp_path: Path) -> Callable[[Manifest], Store]:
     return play
 
 
-def by_seed(rows: list[Row]) -> list[Row]:
+def by_seed(rows: list[Record]) -> list[Record]:
     """Return what is the same whoever runs the episodes."""
-    return sorted(map(without_measured, rows), key=lambda row: row["spec"]["seed"])
+    return sorted(map(without_measured, rows), key=lambda row: row.spec.seed)
 
 
 @pytest.mark.parametrize(
@@ -206,7 +206,7 @@ def test_an_episode_that_raises_is_an_error_and_no_failure(
     manifest = small(n=5)  # seeds 7..11
     store = play(manifest)
     rows = read_results(store.folder / "results.jsonl")
-    assert [row["spec"]["seed"] for row in rows] == [7, 8, 10, 11]
+    assert [row.spec.seed for row in rows] == [7, 8, 10, 11]
     (error,) = store.errors(manifest.cells[0])
     assert (error.seed, error.error) == (9, "ArithmeticError: the answer is not finite")
     assert "--seed=9 --eval.n_episodes=1" in error.command

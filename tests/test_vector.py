@@ -6,8 +6,8 @@ import pytest
 
 from lerobot_bomb.bomb.episode import EpisodeSpec
 from lerobot_bomb.bomb.observation import RenderOptions
-from lerobot_bomb.envs.inference import Query
 from lerobot_bomb.envs.vector import NEW_ROLLOUT_OPTION, FreezeAfterEnd, LazyVectorEnv
+from lerobot_bomb.results.inference import Query
 from lerobot_env_bomb.env import BombEnv
 
 SMALL = RenderOptions(image_size=32)

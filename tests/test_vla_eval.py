@@ -27,11 +27,11 @@ from vla_eval.model_servers.base import SessionContext
 
 from lerobot_bomb.bomb.suites import SUITES
 from lerobot_bomb.checkpoints.folder import write_checkpoint
-from lerobot_bomb.envs.results import without_measured
 from lerobot_bomb.harness import __main__ as command
 from lerobot_bomb.harness.benchmark import BombBenchmark
 from lerobot_bomb.harness.checkpoint_server import CheckpointServer
 from lerobot_bomb.libero.assets import Libero, prepare_libero
+from lerobot_bomb.results.record import MEASURED
 
 CONFIGS = Path(__file__).parents[1] / "configs" / "vla_eval"
 CONDITIONS = ["none", "language:5"]  # the checkpoint masters the first, and hardly the second
@@ -60,8 +60,8 @@ def run(server: CheckpointServer, output: Path, num_episodes: int, **params: Any
 
 def lines_of(path: Path) -> list[dict[str, Any]]:
     """Lines of results but for the policy, which the harness neither names nor times."""
-    rows = map(json.loads, path.read_text().splitlines())
-    return [without_measured(row) | {"policy": None} for row in rows]
+    lines = map(json.loads, path.read_text().splitlines())
+    return [line | {"policy": None} | dict.fromkeys(MEASURED) for line in lines]
 
 
 def test_the_harness_plays_the_episodes_of_lerobot_eval(

@@ -11,6 +11,7 @@ from lerobot.envs import EnvConfig
 from lerobot.processor import PolicyProcessorPipeline
 from lerobot.utils.constants import ACTION, OBS_IMAGES, OBS_PREFIX, OBS_STATE
 
+from lerobot_bomb.bomb.environment import Environment
 from lerobot_bomb.bomb.episode import DEFAULT_FPS, EpisodeSpec
 from lerobot_bomb.bomb.observation import (
     ACTION_DIM,
@@ -28,10 +29,9 @@ from lerobot_bomb.checkpoints.identity import policy_of_results
 from lerobot_bomb.checkpoints.queries import last_query
 from lerobot_bomb.compat.use import use
 from lerobot_bomb.conditions import ALL
-from lerobot_bomb.data.environment import Environment
-from lerobot_bomb.envs.results import check_results_path
 from lerobot_bomb.envs.vector import LazyVectorEnv, check_parallel_tasks
 from lerobot_bomb.flag_errors import flag_errors
+from lerobot_bomb.results.writing import check_results_path
 from lerobot_env_bomb.fetch_files import check_robot
 
 

@@ -21,7 +21,8 @@ from lerobot_bomb.bomb.privileged_state import PrivilegedState
 from lerobot_bomb.bomb.streams import Stream, generator
 from lerobot_bomb.bomb.suite import find_suite
 from lerobot_bomb.envs.episode_env import EpisodeEnv, Observation, Transition
-from lerobot_bomb.envs.results import EpisodeResult, PolicyIdentity
+from lerobot_bomb.results.bomb import EpisodeResult
+from lerobot_bomb.results.origin import PolicyIdentity
 from lerobot_env_bomb.actuator import Actuator
 from lerobot_env_bomb.alternatives import alternatives
 from lerobot_env_bomb.axes.dynamics import Dynamics

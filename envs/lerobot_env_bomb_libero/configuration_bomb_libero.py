@@ -16,13 +16,13 @@ from lerobot_bomb.checkpoints.interface import Interface
 from lerobot_bomb.checkpoints.libero_orientation import OrientationCheck
 from lerobot_bomb.checkpoints.queries import last_query
 from lerobot_bomb.compat.use import use
-from lerobot_bomb.envs.results import check_results_path
 from lerobot_bomb.envs.vector import LazyVectorEnv, check_parallel_tasks
 from lerobot_bomb.flag_errors import flag_errors
 from lerobot_bomb.flags import one_of
 from lerobot_bomb.libero.assets import SUITES, prepare_libero
 from lerobot_bomb.libero.episode import STATE_DIM, TASKS_PER_SUITE, LiberoSpec
 from lerobot_bomb.libero.perturbations import LiberoCondition
+from lerobot_bomb.results.writing import check_results_path
 
 CONTROL_MODES = ("relative", "absolute")
 

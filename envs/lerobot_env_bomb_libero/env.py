@@ -6,10 +6,10 @@ from typing import Any
 import numpy as np
 
 from lerobot_bomb.envs.episode_env import EpisodeEnv, Observation, Transition
-from lerobot_bomb.envs.libero_results import LiberoResult
-from lerobot_bomb.envs.results import PolicyIdentity
 from lerobot_bomb.libero.episode import LiberoFailure, LiberoSpec, failure_of, initial_state_of
 from lerobot_bomb.libero.perturbations import LiberoCondition
+from lerobot_bomb.results.libero import LiberoResult
+from lerobot_bomb.results.origin import PolicyIdentity
 from lerobot_env_bomb_libero.actuator import LiberoActuator
 from lerobot_env_bomb_libero.axes import LIBERO_TRANSFORMS
 from lerobot_env_bomb_libero.axes.dynamics import LiberoDynamics

@@ -14,7 +14,6 @@ from lerobot_bomb.checkpoints.identity import policy_of_results
 from lerobot_bomb.checkpoints.interface import Interface
 from lerobot_bomb.checkpoints.queries import last_query
 from lerobot_bomb.compat.use import use
-from lerobot_bomb.envs.results import check_results_path
 from lerobot_bomb.envs.vector import LazyVectorEnv, check_parallel_tasks
 from lerobot_bomb.flag_errors import flag_errors
 from lerobot_bomb.flags import one_of
@@ -29,6 +28,7 @@ from lerobot_bomb.pusht.episode import (
     check_installed,
 )
 from lerobot_bomb.pusht.perturbations import PushTCondition
+from lerobot_bomb.results.writing import check_results_path
 from lerobot_env_bomb_pusht import GYM_ID
 
 TASKS = ("pusht",)

@@ -7,8 +7,6 @@ import numpy as np
 from gymnasium import spaces
 
 from lerobot_bomb.envs.episode_env import EpisodeEnv, Observation, Transition
-from lerobot_bomb.envs.pusht_results import PushTResult
-from lerobot_bomb.envs.results import PolicyIdentity
 from lerobot_bomb.pusht.episode import (
     BOARD_PX,
     FPS,
@@ -18,6 +16,8 @@ from lerobot_bomb.pusht.episode import (
     check_image_size,
     failure_of,
 )
+from lerobot_bomb.results.origin import PolicyIdentity
+from lerobot_bomb.results.pusht import PushTResult
 from lerobot_env_bomb_pusht.actuator import PushTActuator
 from lerobot_env_bomb_pusht.axes.dynamics import PushTDynamics
 from lerobot_env_bomb_pusht.board import Board

@@ -11,10 +11,10 @@ from typing import Any, ClassVar
 
 from lerobot.configs import PreTrainedConfig
 
+from lerobot_bomb.bomb.environment import IMAGES, Environment
 from lerobot_bomb.checkpoints.training import dataset_of, read_train_config
 from lerobot_bomb.compat.hooks.policies import built_policies, training_data
 from lerobot_bomb.compat.use import use
-from lerobot_bomb.data.environment import IMAGES, Environment
 from lerobot_bomb.data.facts import DatasetFacts
 from lerobot_bomb.flag_errors import refuse_recording_of_several
 

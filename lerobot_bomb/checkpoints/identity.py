@@ -17,8 +17,8 @@ from lerobot_bomb.checkpoints.checks import ADAPTERS, PROCESSORS
 from lerobot_bomb.checkpoints.names import BLANK_IMAGES, REPLACE_TASKS, WEIGHTS, local_file
 from lerobot_bomb.checkpoints.queries import time_queries
 from lerobot_bomb.compat.hooks.policies import built_policies, training_data
-from lerobot_bomb.envs.results import PolicyIdentity
 from lerobot_bomb.files import read_json
+from lerobot_bomb.results.origin import PolicyIdentity
 
 PROCESSOR_PATTERNS = ("policy_preprocessor*", "policy_postprocessor*")
 # in a config, but not of what the policy does

@@ -13,7 +13,7 @@ from lerobot.policies import PreTrainedPolicy
 from torch import Tensor
 
 from lerobot_bomb.compat.hooks.policies import wrap_select_action
-from lerobot_bomb.envs.inference import Query
+from lerobot_bomb.results.inference import Query
 
 PROCESS = Path("/proc/self")  # of Linux
 RESET_PEAK = "5"  # that a process' peak memory is counted anew

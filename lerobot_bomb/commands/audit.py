@@ -10,9 +10,6 @@ from lerobot_bomb.bomb.episode import TEST_SEEDS
 from lerobot_bomb.bomb.observation import DEFAULT_IMAGE_SIZE
 from lerobot_bomb.checkpoints.training import dataset_of, read_train_config, trained_image_size
 from lerobot_bomb.commands.arguments import ANSWER_IS_NO, check_at_least, checkpoint_flag, path_flag
-from lerobot_bomb.envs.results import Row
-from lerobot_bomb.evaluation.bomb_lines import other_instructions
-from lerobot_bomb.evaluation.results import read_results
 from lerobot_bomb.files import written_whole
 from lerobot_bomb.report import verdicts
 from lerobot_bomb.report.page import render
@@ -29,6 +26,10 @@ from lerobot_bomb.report.verdicts import (
     TRAIN,
     judge,
 )
+from lerobot_bomb.results.bomb import EpisodeResult
+from lerobot_bomb.results.groups import read_results
+from lerobot_bomb.results.instructions import other_instructions
+from lerobot_bomb.results.record import Record
 from lerobot_bomb.sweep.claim import claimed
 from lerobot_bomb.sweep.local import play
 from lerobot_bomb.sweep.manifest import Cell, Manifest, check_flags, flag_value, largest_divisor
@@ -88,10 +89,10 @@ def _first_arms(args: argparse.Namespace) -> dict[str, Cell]:
     return arms
 
 
-def _second_arms(args: argparse.Namespace, played: list[Row]) -> dict[str, Cell]:
+def _second_arms(args: argparse.Namespace, played: list[Record]) -> dict[str, Cell]:
     """Return the cells of the second arms, which need the instructions of the first."""
     arms = {AGAIN: _cell(args, f"--policy.path={args.policy_path}")}
-    others = other_instructions(played)
+    others = other_instructions([each for each in played if isinstance(each, EpisodeResult)])
     if others:
         from lerobot_bomb.explain.interventions import ReplaceTasks
 
@@ -125,7 +126,7 @@ def _cell(args: argparse.Namespace, policy: str, split: str = "", batch_size: in
     )
 
 
-def _play(args: argparse.Namespace, folder: Path, cells: dict[str, Cell]) -> dict[str, list[Row]]:
+def _play(args: argparse.Namespace, folder: Path, cells: dict[str, Cell]) -> dict[str, list[Record]]:
     """Return {arm: its records}.
 
     Raises:

@@ -1,12 +1,14 @@
 """``lerobot-bomb compare``: two policies on the same episodes."""
 
 import argparse
+from collections.abc import Sequence
 
+from lerobot_bomb.checkpoints.shipped import checkpoint_path
 from lerobot_bomb.commands.arguments import ANSWER_IS_NO, parse_conditions, path_flag
 from lerobot_bomb.commands.results_files import read_undamaged
-from lerobot_bomb.envs.results import Row
-from lerobot_bomb.evaluation.comparison import compare, of_policies
-from lerobot_bomb.evaluation.result_groups import describe_policy
+from lerobot_bomb.results.comparison import compare
+from lerobot_bomb.results.groups import policy_key
+from lerobot_bomb.results.record import Record
 from lerobot_bomb.tables import print_lines
 
 
@@ -34,21 +36,46 @@ def _points(text: str) -> float:
     return points
 
 
-def _two_policies(args: argparse.Namespace) -> tuple[list[Row], list[Row]]:
+def _two_policies(args: argparse.Namespace) -> tuple[list[Record], list[Record]]:
     """Return the records of the two policies, of two files or of one."""
     if args.b is not None:
         if args.policies:
             raise ValueError("--policies chooses two of one file; give one, or drop it")
-        first, second = (read_undamaged(path).rows for path in (args.a, args.b))
+        first, second = (read_undamaged(path).records for path in (args.a, args.b))
         return first, second
-    rows = read_undamaged(args.a).rows
-    both = of_policies(rows, args.policies)
+    both = _by_policy(read_undamaged(args.a).records, args.policies)
     if len(both) != 2:
-        names = "; ".join(describe_policy(of[0]) for of in both)
+        names = "; ".join(of[0].describe_policy() for of in both)
         is_alone = len(both) == 1 and not args.policies
         remedy = "name the file of a second one" if is_alone else "choose two with --policies=A,B"
         raise ValueError(f"{args.a}: two policies are compared, not {len(both)} ({names}); {remedy}")
     return both[0], both[1]
+
+
+def _by_policy(records: list[Record], names: Sequence[str]) -> list[list[Record]]:
+    """Split records by policy: those of each name, or of all without a name, in order of first appearance.
+
+    A policy answers to its type, its path, `bomb:NAME`, or any part of what `results` says of it.
+
+    Raises:
+        ValueError: a name is of no policy, or of several.
+    """
+    by_key: dict[str, list[Record]] = {}
+    for record in records:
+        by_key.setdefault(policy_key(record), []).append(record)
+    described = {key: of[0].describe_policy() for key, of in by_key.items()}
+    if not names:
+        return list(by_key.values())
+    chosen = []
+    for name in names:
+        keys = [key for key, text in described.items() if name in text.split()] or [
+            key for key, text in described.items() if checkpoint_path(name) in text
+        ]
+        if len(keys) != 1:
+            texts = "; ".join(described.values())
+            raise ValueError(f"--policies: {name} must name one policy of the file, not {len(keys)}: {texts}")
+        chosen.append(by_key[keys[0]])
+    return chosen
 
 
 def run(args: argparse.Namespace) -> int:

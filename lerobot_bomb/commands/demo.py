@@ -15,10 +15,9 @@ from lerobot_bomb.checkpoints.shipped import PREFIX
 from lerobot_bomb.commands.arguments import path_flag
 from lerobot_bomb.commands.run import run_command
 from lerobot_bomb.conditions import NONE
-from lerobot_bomb.envs.results import Row
-from lerobot_bomb.evaluation.result_groups import by_condition, rate_of
-from lerobot_bomb.evaluation.results import read_results
 from lerobot_bomb.files import check_new_folder
+from lerobot_bomb.results.bomb import EpisodeResult
+from lerobot_bomb.results.groups import by_condition, rate_of, read_results
 from lerobot_bomb.sweep.manifest import largest_divisor
 from lerobot_bomb.tables import print_table
 
@@ -70,20 +69,20 @@ def run(args: argparse.Namespace) -> int:
     output_dir = args.output_dir or Path("outputs/demo") / f"{datetime.now():%Y-%m-%d_%H-%M-%S}"
     check_new_folder("--output_dir", output_dir)
     started = time.monotonic()
-    rows = {}
+    records = {}
     for number, (name, player) in enumerate(PLAYERS.items(), start=1):
         conditions = ", ".join(player.conditions)
         _say(f"{number}/{len(PLAYERS) + 1}  {name} plays {args.episodes} episodes each of: {conditions}")
-        rows[name] = _evaluate(output_dir, name, player, args.episodes)
-    shown = next((row for row in rows[POLICY] if not row["is_success"]), rows[POLICY][-1])
-    outcome = shown["failure"] or "success"
+        records[name] = _evaluate(output_dir, name, player, args.episodes)
+    shown = next((each for each in records[POLICY] if not each.is_success), records[POLICY][-1])
+    outcome = shown.failure or "success"
     _say(f"{len(PLAYERS) + 1}/{len(PLAYERS) + 1}  Replay an episode of {POLICY}: {outcome}")
     _replay(output_dir, shown)
-    _report(output_dir, rows, time.monotonic() - started)
+    _report(output_dir, records, time.monotonic() - started)
     return 0
 
 
-def _evaluate(output_dir: Path, name: str, player: Player, num_episodes: int) -> list[Row]:
+def _evaluate(output_dir: Path, name: str, player: Player, num_episodes: int) -> list[EpisodeResult]:
     results = output_dir / f"{name}.jsonl"
     run_command(
         "lerobot-eval",
@@ -100,24 +99,24 @@ def _evaluate(output_dir: Path, name: str, player: Player, num_episodes: int) ->
         "--eval.use_async_envs=false",
         f"--output_dir={output_dir / 'eval' / name}",
     )
-    return read_results(results)
+    return read_results(results, EpisodeResult)
 
 
-def _replay(output_dir: Path, row: Row) -> None:
+def _replay(output_dir: Path, record: EpisodeResult) -> None:
     run_command(
         "lerobot-bomb",
         "view",
         PLAYERS[POLICY].policy_flag,
-        f"--seed={row['spec']['seed']}",
-        f"--env.perturbations={row['spec']['perturbations']}",
+        f"--seed={record.spec.seed}",
+        f"--env.perturbations={record.spec.perturbations}",
         f"--output={output_dir / 'replay'}",
     )
 
 
-def _report(output_dir: Path, rows: dict[str, list[Row]], seconds: float) -> None:
+def _report(output_dir: Path, records: dict[str, list[EpisodeResult]], seconds: float) -> None:
     _say(f"Done in {seconds / 60:.1f} minutes: successes, with 95 % Wilson intervals")
     cells = []
-    for name, played in rows.items():
+    for name, played in records.items():
         by = by_condition(played)
         cells.append([name, *(_rate(by.get(condition, [])) for condition in CONDITIONS)])
     print_table(["", *CONDITIONS], cells)
@@ -125,27 +124,27 @@ def _report(output_dir: Path, rows: dict[str, list[Row]], seconds: float) -> Non
     print(f"results        {output_dir}/*.jsonl  (lerobot-bomb results FILE)")
     print(f"videos         {output_dir}/eval/*/videos")
     print(f"replay         {output_dir}/replay.mp4, and .rrd for Rerun")
-    print(f"contact sheet  {_write_sheet(output_dir, rows[POLICY])}")
+    print(f"contact sheet  {_write_sheet(output_dir, records[POLICY])}")
 
 
-def _rate(rows: list[Row]) -> str:
-    return str(rate_of(rows)) if rows else "-"
+def _rate(records: list[EpisodeResult]) -> str:
+    return str(rate_of(records)) if records else "-"
 
 
-def _write_sheet(output_dir: Path, rows: list[Row]) -> Path:
+def _write_sheet(output_dir: Path, records: list[EpisodeResult]) -> Path:
     """The last frames of some episodes of each condition, and what became of each."""
     from PIL import Image
 
     from lerobot_bomb.viewing.sheet import Sheet
 
     tiles: dict[str, list[np.ndarray]] = {}
-    as_played = sorted(rows, key=lambda row: row["spec"]["seed"])
+    as_played = sorted(records, key=lambda record: record.spec.seed)
     for condition, played in by_condition(as_played).items():
         group = f"{SUITE}.{Condition.parse(condition).key}_0"  # of LeRobot's videos
         folder = output_dir / "eval" / POLICY / "videos" / group
         tiles[condition] = [
-            _tile(folder / f"eval_episode_{number}.mp4", row)
-            for number, row in enumerate(played[:SHOWN_EPISODES])
+            _tile(folder / f"eval_episode_{number}.mp4", record)
+            for number, record in enumerate(played[:SHOWN_EPISODES])
         ]
     columns = [f"seed {SEED + number}" for number in range(len(tiles[NONE]))]
     path = output_dir / f"{POLICY}.png"
@@ -154,7 +153,7 @@ def _write_sheet(output_dir: Path, rows: list[Row]) -> Path:
     return path
 
 
-def _tile(video: Path, row: Row) -> np.ndarray:
+def _tile(video: Path, record: EpisodeResult) -> np.ndarray:
     """Return both cameras with a caption; the video's own is of a step before the end."""
     from PIL import Image
 
@@ -163,9 +162,9 @@ def _tile(video: Path, row: Row) -> np.ndarray:
 
     frame = Image.fromarray(last_frame(video))
     cameras = frame.crop((0, 0, frame.width, frame.width // 2)).resize((FRAME_WIDTH, FRAME_WIDTH // 2))
-    outcome = f"{row['failure'] or 'success'}, {row['placement_error_mm']:.1f} mm from the intersection"
-    tile = np.concatenate([np.array(cameras), caption(row["instruction"], outcome, FRAME_WIDTH)])
-    tile[:EDGE] = SUCCESS_RGB if row["is_success"] else FAILURE_RGB
+    outcome = f"{record.failure or 'success'}, {record.placement_error_mm:.1f} mm from the intersection"
+    tile = np.concatenate([np.array(cameras), caption(record.instruction, outcome, FRAME_WIDTH)])
+    tile[:EDGE] = SUCCESS_RGB if record.is_success else FAILURE_RGB
     return tile
 
 

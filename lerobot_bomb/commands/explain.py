@@ -6,7 +6,7 @@ import shlex
 import sys
 from collections import defaultdict
 from collections.abc import Callable, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -97,7 +97,7 @@ def _of_line(args: argparse.Namespace) -> "_Asked":
     if replay.checkpoint is None:
         raise ValueError("who played has no checkpoint, so there is nothing to explain")
     check_checkpoint(replay.checkpoint)
-    seed = replay.row["spec"]["seed"] if args.seed is None else args.seed
+    seed = replay.record.spec.seed if args.seed is None else args.seed
     return _Asked(
         lambda seed: replay.viewed(seed=seed), seed, replay.checkpoint, args.policy_device, has_played=True
     )
@@ -157,9 +157,9 @@ def _explain_one(args: argparse.Namespace, asked: _Asked) -> int:
     sections += [section for each in moments for section in moment_sections(each)]
     sections += [traces_section(episodes)] if episodes else []
     numbers = {
-        "result": asdict(result),
+        "result": result.as_json(),
         "moments": [each.as_json() for each in moments],
-        "masked_episodes": {mask: asdict(episode.result) for mask, episode in episodes.items()},
+        "masked_episodes": {mask: episode.result.as_json() for mask, episode in episodes.items()},
     }
     with written_whole(args.output) as (folder,):
         _write(folder, f"Why: {name}", sections, numbers)
@@ -185,7 +185,7 @@ def _explain_several(args: argparse.Namespace, asked: _Asked) -> int:
     numbers = {
         "sections": [section.as_json() for section in sections],
         "episodes": [
-            {"result": asdict(result), "moments": [each.as_json() for each in moments]}
+            {"result": result.as_json(), "moments": [each.as_json() for each in moments]}
             for moments, result in episodes
         ],
     }

@@ -7,8 +7,8 @@ from lerobot_bomb.commands.arguments import path_flag
 from lerobot_bomb.commands.results_files import check_outputs, read_undamaged
 from lerobot_bomb.data.resumable import check_repo_id
 from lerobot_bomb.files import file_names, written_whole
-from lerobot_bomb.report.arms import arms_of, policies_of
 from lerobot_bomb.report.latex import table
+from lerobot_bomb.results.groups import groups_of, policies_of
 
 LATEX, MODEL_INDEX, EVAL_RESULTS = "table.tex", "model-index.yaml", ".eval_results/lerobot_bomb.yaml"
 
@@ -39,16 +39,15 @@ def run(args: argparse.Namespace) -> int:
     # huggingface_hub takes a second
     from lerobot_bomb.hub.evaluations import check_one_rate_each, eval_results_yaml, model_index_yaml
 
-    arms = arms_of([row for path in args.paths for row in read_undamaged(path).rows])
-    contents = {args.output / LATEX: table(arms)}
-    policies = policies_of(arms)
+    groups = groups_of([record for path in args.paths for record in read_undamaged(path).records])
+    contents = {args.output / LATEX: table(groups)}
+    policies = policies_of(groups)
     _, *names = file_names([LATEX, *(each.short_name for each in policies)])
     for name, policy in zip(names, policies, strict=True):
-        groups = [arm.group for arm in policy.arms]
-        check_one_rate_each(groups)
-        contents[args.output / name / MODEL_INDEX] = model_index_yaml(name, groups)
+        check_one_rate_each(policy.groups)
+        contents[args.output / name / MODEL_INDEX] = model_index_yaml(name, policy.groups)
         if args.benchmark_id is not None:
-            contents[args.output / name / EVAL_RESULTS] = eval_results_yaml(args.benchmark_id, groups)
+            contents[args.output / name / EVAL_RESULTS] = eval_results_yaml(args.benchmark_id, policy.groups)
     check_outputs(args.paths, contents)
     for path, content in contents.items():
         with written_whole(path) as (unfinished,):

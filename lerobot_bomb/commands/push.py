@@ -5,7 +5,7 @@ import argparse
 from lerobot_bomb.checkpoints.names import CONFIG, TRAIN_CONFIG
 from lerobot_bomb.commands.arguments import path_flag, switch
 from lerobot_bomb.data.resumable import check_repo_id
-from lerobot_bomb.evaluation.results import read_results
+from lerobot_bomb.results.groups import read_results
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:

@@ -14,12 +14,10 @@ from lerobot_bomb.commands.arguments import (
 )
 from lerobot_bomb.commands.results_files import read_line
 from lerobot_bomb.conditions import NONE
-from lerobot_bomb.envs.results import ORIGIN, ResultLine, Row
-from lerobot_bomb.evaluation.result_groups import different_fields, outcome
-from lerobot_bomb.evaluation.result_lines import kind_of
+from lerobot_bomb.results.record import ORIGIN, Record, different_fields, outcome_fields
 from lerobot_bomb.tables import print_lines
 from lerobot_bomb.viewing.episode import check_new, paths_of, write_episodes
-from lerobot_bomb.viewing.replay import Replay, line_of
+from lerobot_bomb.viewing.replay import Replay
 
 DEFAULT_FOLDER = Path("outputs/replay")
 RECORDED, CHANGED = "recorded", "changed"
@@ -56,13 +54,13 @@ def run(args: argparse.Namespace) -> int:
     """Run the episode, write both files, print its result and whether the record says the same."""
     if unknown := [flag for flag in args.rest if not flag.startswith("--policy.")]:
         raise ValueError(f"{unknown[0]} is unknown; see `lerobot-bomb replay --help`")
-    row = read_line(args.path, args.line)
+    record = read_line(args.path, args.line)
     policy_flags = [f"--{flag.removeprefix('--policy.')}" for flag in args.rest]
-    replay = Replay(row, args.policy_path, args.policy_device, policy_flags, args.depth)
+    replay = Replay(record, args.policy_path, args.policy_device, policy_flags, args.depth)
     players = {RECORDED: replay.player()}
     if args.set is not None:
-        players[CHANGED] = replay.player(_changed(row, args.set))
-    policy = row["policy"]["type"] if row.get("policy") else "policy"
+        players[CHANGED] = replay.player(_changed(record, args.set))
+    policy = "policy" if record.policy is None else record.policy.type
     name = players[RECORDED].viewed.name(policy)
     name += f"_{players[CHANGED].viewed.group}" if args.set is not None else ""
     paths = paths_of(args.output, DEFAULT_FOLDER, name)
@@ -73,28 +71,29 @@ def run(args: argparse.Namespace) -> int:
         print_lines(f"{label} ({of.spec.perturbations}): {values.instruction}")
         print(of.log().describe(result))
     print(*paths, sep="\n")
-    return _compare(row, results[0])
+    return _compare(record, results[0])
 
 
-def _changed(row: Row, levels: dict[str, int]) -> str:
+def _changed(record: Record, levels: dict[str, int]) -> str:
     """The condition of an episode with other levels; levels that were drawn stay as they were."""
-    merged = row["levels"] | levels
+    merged = record.levels | levels
     text = "+".join(f"{axis}:{level}" for axis, level in merged.items()) or NONE
     try:
-        return str(kind_of(row).condition.parse(text))
+        return str(record.condition.parse(text))
     except ValueError as error:
         raise ValueError(str(error).replace(f"--env.perturbations={text!r}", "--set", 1)) from None
 
 
-def _compare(row: Row, result: ResultLine) -> int:
-    now = line_of(result)
-    different = different_fields(row, now)
+def _compare(record: Record, result: Record) -> int:
+    different = different_fields(record, result)
     if not different:
-        print(f"as recorded, bit for bit: {', '.join(outcome(row))}")
+        print(f"as recorded, bit for bit: {', '.join(outcome_fields(record))}")
         return 0
-    first = different[0]
-    print(f"not as recorded: {first} was {row[first]!r} and is {now.get(first)!r}")
-    origins = [name for name in row if name in ORIGIN - {"policy", "task_ids"} and row[name] != now.get(name)]
+    first, then, now = different[0], record.as_json(), result.as_json()
+    print(f"not as recorded: {first} was {then[first]!r} and is {now.get(first)!r}")
+    origins = [
+        name for name in then if name in ORIGIN - {"policy", "task_ids"} and then[name] != now.get(name)
+    ]
     if origins:
-        print_lines(*(f"  {name}: {row[name]} then, {now.get(name)} now" for name in origins))
+        print_lines(*(f"  {name}: {then[name]} then, {now.get(name)} now" for name in origins))
     return ANSWER_IS_NO

@@ -12,10 +12,11 @@ from tqdm import tqdm
 from lerobot_bomb.commands.arguments import check_at_least, path_flag
 from lerobot_bomb.commands.results_files import check_outputs, read_undamaged
 from lerobot_bomb.files import written_whole
-from lerobot_bomb.report.arms import Report, Sample, arms_of, sample_failures
 from lerobot_bomb.report.page import render
+from lerobot_bomb.report.report import Report, Sample, sample_failures
 from lerobot_bomb.report.sections import build, conditions
 from lerobot_bomb.report.table import Section
+from lerobot_bomb.results.groups import groups_of
 
 TITLE, DEFAULT = "Evaluation", Path("report.html")
 NUM_SAMPLES = 3  # of each class of failure, at least
@@ -43,9 +44,9 @@ def run(args: argparse.Namespace) -> int:
     page, tables, rates = (output.with_suffix(suffix) for suffix in (".html", ".json", ".csv"))
     check_outputs(args.paths, (page, tables, rates))
     files = {path: read_undamaged(path) for path in dict.fromkeys(args.paths)}
-    arms = arms_of([row for file in files.values() for row in file.rows])
+    groups = groups_of([record for file in files.values() for record in file.records])
     numbered = {path: file.numbered for path, file in files.items()}
-    samples = list(sample_failures(arms, numbered, max(NUM_SAMPLES, args.videos)))
+    samples = list(sample_failures(groups, numbered, max(NUM_SAMPLES, args.videos)))
     folder = page.with_name(f"{page.stem}_videos")
     if args.videos:
         samples = _play(samples, folder, args.videos)
@@ -55,7 +56,7 @@ def run(args: argparse.Namespace) -> int:
         for path, file in files.items()
         if file.num_damaged
     ]
-    sections = build(Report(arms, samples, missing))
+    sections = build(Report(groups, samples, missing))
     with written_whole(page, tables, rates) as (html, as_json, as_csv):
         html.write_text(render(args.title, sections))
         as_json.write_text(json.dumps([section.as_json() for section in sections], indent=1) + "\n")

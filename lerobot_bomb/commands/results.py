@@ -5,9 +5,8 @@ from pathlib import Path
 
 from lerobot_bomb.commands.arguments import path_flag
 from lerobot_bomb.commands.results_files import read_undamaged
-from lerobot_bomb.evaluation.result_groups import by_condition, differing, rate_of
-from lerobot_bomb.evaluation.results import pair_lines, summarise
-from lerobot_bomb.report.arms import Arm, arms_of
+from lerobot_bomb.results.groups import Group, by_condition, differing, groups_of, rate_of
+from lerobot_bomb.results.summary import pair_lines, summarise
 from lerobot_bomb.tables import print_lines, print_table
 
 
@@ -25,12 +24,11 @@ def run(args: argparse.Namespace) -> int:
         file = read_undamaged(path)
         if args.strict and file.num_damaged:
             raise ValueError(f"{path}: damaged lines, which --strict refuses: {file.num_damaged}")
-        _print_file(path, arms_of(file.rows), file.num_damaged)
+        _print_file(path, groups_of(file.records), file.num_damaged)
     return 0
 
 
-def _print_file(path: Path, arms: list[Arm], num_damaged: int) -> None:
-    groups = [arm.group for arm in arms]
+def _print_file(path: Path, groups: list[Group], num_damaged: int) -> None:
     if num_damaged:
         print(f"{path}: damaged lines, which are not counted: {num_damaged}")
     if len(groups) > 1:
@@ -38,31 +36,31 @@ def _print_file(path: Path, arms: list[Arm], num_damaged: int) -> None:
             f"{path}: {len(groups)} groups of episodes, neither pooled nor paired with each other; they "
             f"differ in {', '.join(differing(groups))}"
         )
-        _print_rates(arms)
+        _print_rates(groups)
     for group in groups:
         print_lines(*(f"{path}: {line}" for line in group.lines()))
         if group.missing_fields:
-            version = group.rows[0]["protocol_version"]
+            version = group.records[0].protocol_version
             lacking = ", ".join(group.missing_fields)
             print(f"{path}: lines of protocol {version} are incomplete: they lack {lacking}")
         if group.num_replaced:
             print(f"{path}: {group.num_replaced} lines count no more, a later one is of the same episode")
-        conditions = by_condition(group.rows)
-        for condition, rows in conditions.items():
+        conditions = by_condition(group.records)
+        for condition, records in conditions.items():
             label = f" (perturbations={condition})" if len(conditions) > 1 else ""
-            print(f"{path}{label}: {len(rows)} episode{'s' * (len(rows) != 1)}")
-            print_lines(*(f"  {line}" for line in summarise(rows).lines()))
+            print(f"{path}{label}: {len(records)} episode{'s' * (len(records) != 1)}")
+            print_lines(*(f"  {line}" for line in summarise(records).lines()))
         against = pair_lines(group, groups)
         if against:
             print(f"{path}: against the same episodes unperturbed", *against, sep="\n")
 
 
-def _print_rates(arms: list[Arm]) -> None:
+def _print_rates(groups: list[Group]) -> None:
     """Print a line for each group and condition, before what else there is to say of them."""
     cells = [
-        [arm.name, condition, str(rate_of(rows))]
-        for arm in arms
-        for condition, rows in by_condition(arm.rows).items()
+        [group.name, condition, str(rate_of(records))]
+        for group in groups
+        for condition, records in by_condition(group.records).items()
     ]
     print()
     print_table(["policy, suite", "perturbations", "success, 95 % Wilson interval by seed"], cells)

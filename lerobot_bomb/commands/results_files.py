@@ -5,9 +5,8 @@ from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-from lerobot_bomb.envs.results import Row
-from lerobot_bomb.evaluation.result_kind import describe_numbers
-from lerobot_bomb.evaluation.result_lines import check_any, read_lines
+from lerobot_bomb.results.reading import check_any, read_records
+from lerobot_bomb.results.record import Record, describe_numbers
 from lerobot_bomb.sweep.manifest import NAME, Manifest
 from lerobot_bomb.sweep.store import ERRORS, RESULTS
 
@@ -22,8 +21,8 @@ def check_outputs(inputs: Sequence[Path], outputs: Iterable[Path]) -> None:
             raise ValueError(f"--output: {path} is a file of results that is read; name another output")
 
 
-def missing_of_sweep(path: Path, num_rows: int) -> str:
-    """Say how many episodes a sweep's file of ``num_rows`` lacks, and why; "" if none or of another file."""
+def missing_of_sweep(path: Path, num_records: int) -> str:
+    """Say how many episodes a sweep's file lacks, and why; "" if none, or if it is another file."""
     if path.name != RESULTS or not path.with_name(NAME).is_file():
         return ""
     try:
@@ -31,7 +30,7 @@ def missing_of_sweep(path: Path, num_rows: int) -> str:
     except ValueError as error:  # the episodes can be read all the same
         return f"{path}: whether episodes are missing cannot be said: {error}"
     errors = path.with_name(ERRORS)
-    missing = number - num_rows
+    missing = number - num_records
     num_errors = errors.read_bytes().count(b"\n") if errors.is_file() else 0
     reasons = [f"an error ended {num_errors}: {errors}"] if num_errors else []
     reasons += [f"`lerobot-bomb sweep {path.parent}` goes on"] if missing > num_errors else []
@@ -42,16 +41,16 @@ def missing_of_sweep(path: Path, num_rows: int) -> str:
 class ResultsFile:
     """A results file as it was read, without the lines that are damaged."""
 
-    numbered: dict[int, Row]  # by line, from 1
+    numbered: dict[int, Record]  # by line, from 1
     num_damaged: int
     missing: str  # the episodes of its sweep that it lacks; "": none
 
     @property
-    def rows(self) -> list[Row]:
+    def records(self) -> list[Record]:
         return [*self.numbered.values()]
 
 
-def read_line(path: Path, line: int) -> Row:
+def read_line(path: Path, line: int) -> Record:
     """Return the episode of a line, counted from 1 as an editor counts.
 
     Raises:
@@ -71,7 +70,7 @@ def read_undamaged(path: Path) -> ResultsFile:
     Raises:
         ValueError: there is no such file, or no episode in it.
     """
-    numbered, damages = read_lines(path)
+    numbered, damages = read_records(path)
     for damage in damages[:MAX_SHOWN_DAMAGES]:
         print(f"{damage}; not counted", file=sys.stderr)
     if len(damages) > MAX_SHOWN_DAMAGES:

@@ -17,9 +17,9 @@ from lerobot_bomb.commands.cluster_jobs import (
     submitted,
     write_job_array,
 )
-from lerobot_bomb.evaluation.result_kind import ResultKind
-from lerobot_bomb.evaluation.result_lines import KIND_OF_ENV
 from lerobot_bomb.flags import one_of
+from lerobot_bomb.results.reading import RECORD_OF_ENV
+from lerobot_bomb.results.record import Record
 from lerobot_bomb.sweep.claim import claimed
 from lerobot_bomb.sweep.local import PYTHON, play, progress
 from lerobot_bomb.sweep.manifest import NAME, Cell, Manifest, flag_value, plan, policy_flag
@@ -138,26 +138,26 @@ def _manifest(args: argparse.Namespace) -> Manifest:
         return Manifest.read(args.folder)
     if not args.policies:
         raise ValueError("--policies names none")
-    kind = _kind(args.rest)
+    record_type = _record_type(args.rest)
     _check_types(args.policies)
     for task in args.tasks:
-        one_of("--tasks", task, kind.tasks)
-    conditions = _expanded(args.perturbations, kind)
-    args.batch_size = 1 if kind.starts_by_number else args.batch_size
+        one_of("--tasks", task, record_type.tasks)
+    conditions = _expanded(args.perturbations, record_type)
+    args.batch_size = 1 if record_type.starts_by_number else args.batch_size
     return plan(args.policies, args.tasks, conditions, args.seed, args.episodes, args.batch_size, args.rest)
 
 
-def _kind(flags: list[str]) -> ResultKind:
-    """Return the kind of results of the environment that the flags name."""
+def _record_type(flags: list[str]) -> type[Record]:
+    """Return the type of the records of the environment that the flags name."""
     env_type = flag_value(flags, "--env.type")
     if env_type is None:
-        raise ValueError(f"--env.type is missing: {', '.join(KIND_OF_ENV)}")
-    if env_type not in KIND_OF_ENV:
+        raise ValueError(f"--env.type is missing: {', '.join(RECORD_OF_ENV)}")
+    if env_type not in RECORD_OF_ENV:
         raise ValueError(
             f"--env.type={env_type} has no lines of results, which a sweep is made of; those that have: "
-            f"{', '.join(KIND_OF_ENV)}"
+            f"{', '.join(RECORD_OF_ENV)}"
         )
-    return KIND_OF_ENV[env_type]
+    return RECORD_OF_ENV[env_type]
 
 
 def _check_types(policies: Sequence[str]) -> None:
@@ -170,14 +170,15 @@ def _check_types(policies: Sequence[str]) -> None:
             raise ValueError(f"--policies: {policy} is no folder and no policy type{near}")
 
 
-def _expanded(perturbations: tuple[str, ...], kind: ResultKind) -> list[str]:
+def _expanded(perturbations: tuple[str, ...], record_type: type[Record]) -> list[str]:
     """The conditions, checked for the environment."""
-    if perturbations and not kind.condition.axes:
+    if perturbations and not record_type.condition.axes:
         raise ValueError(
-            f"--perturbations={','.join(perturbations)}: --env.type={kind.env_type} is LeRobot's and has "
-            f"none; --env.type=bomb_{kind.env_type} has"
+            f"--perturbations={','.join(perturbations)}: --env.type={record_type.env_type} is LeRobot's and "
+            f"has none; --env.type=bomb_{record_type.env_type} has"
         )
-    return [str(kind.condition.parse(text)) for text in kind.condition.expand(perturbations)]
+    condition = record_type.condition
+    return [str(condition.parse(text)) for text in condition.expand(perturbations)]
 
 
 def _job_command(args: argparse.Namespace) -> list[str]:

@@ -6,9 +6,9 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from lerobot_bomb.bomb.environment import Environment, numbered_tasks
 from lerobot_bomb.bomb.suite import suites_of
 from lerobot_bomb.data.dataset_files import EPISODES_FOLDER, INFO_FILE, read_parquet
-from lerobot_bomb.data.environment import Environment, numbered_tasks
 from lerobot_bomb.data.recording import SCENES
 from lerobot_bomb.data.unfinished import METADATA_FILE
 from lerobot_bomb.files import read_json

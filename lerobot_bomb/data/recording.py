@@ -15,8 +15,8 @@ from lerobot_bomb.bomb.suite import specs_of_tasks, suites_of, task_version
 from lerobot_bomb.bomb.suites import SUITES
 from lerobot_bomb.conditions import ALL, NONE
 from lerobot_bomb.data.resumable import check_repo_id
-from lerobot_bomb.envs.results import installed_version
 from lerobot_bomb.flags import one_of, reworded
+from lerobot_bomb.results.origin import installed_version
 
 SCENES = 100  # static ones that are stored as an episode
 MAX_NOISE = 1.0  # beyond it the noise exceeds the largest action

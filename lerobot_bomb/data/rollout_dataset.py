@@ -12,7 +12,7 @@ from lerobot_bomb.bomb.pointing import COLUMNS
 from lerobot_bomb.data.blocks import DatasetLayout, RecordedEpisode
 from lerobot_bomb.data.recording import Recording
 from lerobot_bomb.data.rollout_pool import Rollout
-from lerobot_bomb.envs.results import EpisodeResult
+from lerobot_bomb.results.bomb import EpisodeResult
 
 
 def rollout_layout(recording: Recording) -> DatasetLayout:

@@ -30,8 +30,8 @@ from lerobot_bomb.bomb.observation import (
 from lerobot_bomb.bomb.pointing import COLUMNS, Pointing
 from lerobot_bomb.bomb.privileged_state import PrivilegedState
 from lerobot_bomb.bomb.streams import Stream, generator, recorder_noise
-from lerobot_bomb.envs.results import EpisodeResult
 from lerobot_bomb.envs.rollout import Agent, Expert, add_noise, expert_agent, make_env, play
+from lerobot_bomb.results.bomb import EpisodeResult
 
 MAX_ENVS = 8  # that a worker keeps; each holds an OpenGL context
 

@@ -14,15 +14,16 @@ import numpy as np
 from gymnasium.error import ResetNeeded
 
 from lerobot_bomb.bomb.episode import check_seed
-from lerobot_bomb.envs.inference import Inference, Query
-from lerobot_bomb.envs.results import ResultLine, write_result
+from lerobot_bomb.results.inference import Inference, Query
+from lerobot_bomb.results.record import Record
+from lerobot_bomb.results.writing import write_record
 from lerobot_bomb.smoothness import MIN_ACTIONS, smoothness
 
 type Observation = dict[str, Any]
 type Transition = tuple[Observation, float, bool, bool, dict[str, Any]]
 
 
-class EpisodeEnv[SpecT: Any, RunT, ResultT: ResultLine](gymnasium.Env[Observation, np.ndarray], ABC):
+class EpisodeEnv[SpecT: Any, RunT, ResultT: Record](gymnasium.Env[Observation, np.ndarray], ABC):
     """Episodes that a frozen spec and a seed determine.
 
     The seed is the reset's, whatever the spec's. Once an episode has ended, `step` changes nothing until
@@ -74,7 +75,7 @@ class EpisodeEnv[SpecT: Any, RunT, ResultT: ResultLine](gymnasium.Env[Observatio
         if terminated or truncated:
             self._last_transition = deepcopy((observation, 0.0, terminated, truncated, info))
             if self._results_path is not None:
-                write_result(self._results_path, self.episode_result(), self._seed)
+                write_record(self._results_path, self.episode_result())
         return observation, reward, terminated, truncated, info
 
     def add_query(self, query: Query) -> None:

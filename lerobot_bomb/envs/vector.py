@@ -11,7 +11,7 @@ import gymnasium as gym
 import numpy as np
 from gymnasium.vector import AsyncVectorEnv, AutoresetMode, SyncVectorEnv, VectorEnv
 
-from lerobot_bomb.envs.inference import Query
+from lerobot_bomb.results.inference import Query
 
 # LeRobot's rollout passes this option with the reset that starts a new episode; autoreset passes none.
 NEW_ROLLOUT_OPTION = "lerobot_new_rollout"

@@ -8,14 +8,14 @@ from typing import Any
 import draccus
 from lerobot.envs import EnvConfig
 
-from lerobot_bomb.envs import libero_results, pusht_results
-from lerobot_bomb.envs.results import PolicyIdentity, installed_versions
-from lerobot_bomb.envs.stock_results import FAILED, STOCK_PROTOCOLS, StockResult, StockSpec
-from lerobot_bomb.evaluation.result_lines import KIND_OF_ENV
 from lerobot_bomb.pusht.episode import IMAGE_SIZE
+from lerobot_bomb.results import libero, pusht
+from lerobot_bomb.results.origin import PolicyIdentity, installed_versions
+from lerobot_bomb.results.stock import FAILED, StockLiberoResult, StockPushTResult, StockResult, StockSpec
 
 EVAL_INFO = "eval_info.json"  # in the folder of --output_dir
-SIMULATORS = {"pusht": pusht_results.SIMULATOR, "libero": libero_results.SIMULATOR}
+SIMULATORS = {"pusht": pusht.SIMULATOR, "libero": libero.SIMULATOR}
+RECORDS = {each.env_type: each for each in (StockPushTResult, StockLiberoResult)}
 # fields of an environment's config that do not decide what an episode is, or that its spec says
 NOT_SETTINGS = {
     "type", "features", "features_map", "render_mode", "visualization_width", "visualization_height",
@@ -45,15 +45,15 @@ def results_of(
         ValueError: an episode's rewards are not finite: its actions or the simulation were not.
     """
     env_type = str(env.type)
-    settings = _settings(env)
+    record_type, settings = RECORDS[env_type], _settings(env)
     for task in info["per_task"]:
         metrics = task["metrics"]
         episodes = zip(metrics["sum_rewards"], metrics["max_rewards"], metrics["successes"], strict=True)
         for i, (sum_reward, max_reward, is_success) in enumerate(episodes):
             if not (isfinite(sum_reward) and isfinite(max_reward)):
                 raise ValueError(f"the rewards of seed {seed + i} are not finite")
-            number = first + i if KIND_OF_ENV[env_type].starts_by_number else None
-            yield StockResult(
+            number = first + i if record_type.starts_by_number else None
+            yield record_type(
                 spec=StockSpec(seed + i, task["task_group"], task["task_id"], number),
                 sum_reward=sum_reward,
                 max_reward=max_reward,
@@ -62,13 +62,12 @@ def results_of(
                 image_size=_image_size(env),
                 flags=settings,
                 simulator_versions=installed_versions(SIMULATORS[env_type]),
-                protocol_version=STOCK_PROTOCOLS[env_type],
                 policy=replace(policy, batch_size=batch_size, batch_row=i % batch_size),
             )
 
 
 def _settings(env: EnvConfig) -> dict[str, Any]:
-    of_spec = {"task"} if KIND_OF_ENV[str(env.type)].starts_by_number else set()
+    of_spec = {"task"} if RECORDS[str(env.type)].starts_by_number else set()
     values: Any = draccus.encode(env)
     return {name: value for name, value in values.items() if name not in NOT_SETTINGS | of_spec}
 

@@ -11,13 +11,13 @@ import torch
 from lerobot.utils.constants import OBS_IMAGES
 
 from lerobot_bomb.bomb.observation import AGENT_POS
-from lerobot_bomb.envs.results import ResultLine
 from lerobot_bomb.envs.rollout import play
 from lerobot_bomb.explain.explained import Batch
 from lerobot_bomb.explain.images import filling, occluded
 from lerobot_bomb.explain.other_policies import explained
 from lerobot_bomb.explain.spans import TOKENIZERS, Span, named_spans, token_offsets, whole
 from lerobot_bomb.explain.watched import Watched
+from lerobot_bomb.results.record import Record
 from lerobot_bomb.viewing.checkpoint import LoadedPolicy
 from lerobot_bomb.viewing.episode import Viewed
 
@@ -112,5 +112,5 @@ def _play(viewed: Viewed, loaded: LoadedPolicy, mask: Mask) -> MaskedEpisode:
             return loaded.act(prepared)[0]
 
         trace = [moment.observation[AGENT_POS][:3] for moment in play(env, viewed.spec, act)]
-        result: ResultLine = env.get_wrapper_attr("episode_result")()
+        result: Record = env.get_wrapper_attr("episode_result")()
     return MaskedEpisode(np.stack(trace), result)

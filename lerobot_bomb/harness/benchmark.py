@@ -16,8 +16,8 @@ from vla_eval.types import Action, EpisodeResult, Observation, Task
 
 from lerobot_bomb.bomb.episode import TEST_SEEDS, EpisodeSpec
 from lerobot_bomb.bomb.observation import ACTION_DIM, ACTION_NAMES, AGENT_POS, CAMERAS, PIXELS, STATE_DIM
-from lerobot_bomb.envs.results import check_results_path
 from lerobot_bomb.envs.rollout import ENV_ID
+from lerobot_bomb.results.writing import check_results_path
 
 ENVIRONMENT = "bomb_environment"  # of a task: `Environment` as JSON, for a server that knows what it needs
 

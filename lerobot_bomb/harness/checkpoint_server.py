@@ -16,11 +16,11 @@ from vla_eval.model_servers.predict import PredictModelServer
 from vla_eval.specs import IMAGE_RGB, LANGUAGE, RAW, DimSpec
 from vla_eval.types import Action, Observation
 
+from lerobot_bomb.bomb.environment import Environment
 from lerobot_bomb.bomb.episode import TEST_SEEDS
 from lerobot_bomb.checkpoints.environment import check_acting_policy
 from lerobot_bomb.checkpoints.folder import autocast, load_processors, read_config
 from lerobot_bomb.checkpoints.shipped import checkpoint_path
-from lerobot_bomb.data.environment import Environment
 from lerobot_bomb.harness.benchmark import ENVIRONMENT
 
 EMPTY_CAMERA = "empty_camera"  # what LeRobot's policies call a camera that none delivers: they fill it in

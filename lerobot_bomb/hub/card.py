@@ -10,18 +10,18 @@ from lerobot.configs import PreTrainedConfig
 from lerobot.configs.train import TrainPipelineConfig
 
 from lerobot_bomb import __version__
+from lerobot_bomb.bomb.environment import SUITE, Environment
 from lerobot_bomb.checkpoints.environment import ConfigWithEnvironment
 from lerobot_bomb.checkpoints.names import is_hub_id
-from lerobot_bomb.data.environment import SUITE, Environment
 from lerobot_bomb.data.facts import DatasetFacts
-from lerobot_bomb.envs.results import Row
-from lerobot_bomb.evaluation.result_groups import Group, by_condition, groups_of
-from lerobot_bomb.evaluation.result_lines import KINDS, kind_of
-from lerobot_bomb.evaluation.results import named_counts, summarise
 from lerobot_bomb.hub.evaluations import model_index
 from lerobot_bomb.hub.markdown import code, command, fenced, plain
 from lerobot_bomb.hub.method import Method
 from lerobot_bomb.hub.training import peft_flags, train_command
+from lerobot_bomb.results.groups import Group, by_condition, groups_of
+from lerobot_bomb.results.reading import RECORD_TYPES
+from lerobot_bomb.results.record import Record
+from lerobot_bomb.results.summary import named_counts, summarise
 from lerobot_bomb.vlm.tokenizer import NANO
 
 NO_REPO_ID = "USER/NAME"
@@ -57,7 +57,7 @@ class Checkpoint:
     dataset_id: str | None
     training: TrainPipelineConfig | None = None
     dataset: DatasetFacts | None = None
-    results: Sequence[list[Row]] = ()  # of each results file
+    results: Sequence[list[Record]] = ()  # of each results file
     license: str | None = None
     tags: list[str] = field(default_factory=list)
     adapters_of: str | None = None  # Hub id of the checkpoint that these are adapters of; None: it is whole
@@ -80,7 +80,7 @@ class Checkpoint:
 
     @property
     def _groups(self) -> list[Group]:
-        return [group for rows in self.results for group in groups_of(rows)]
+        return [group for records in self.results for group in groups_of(records)]
 
     def _metadata(self) -> ModelCardData:
         license, license_name = self._license()
@@ -120,7 +120,7 @@ class Checkpoint:
         return start + "".join(f"\n## {title}\n\n{text}\n" for title, text in sections.items())
 
     def _introduction(self) -> str:
-        benchmarks = {kind_of(row).benchmark(row): None for rows in self.results for row in rows}
+        benchmarks = {each.benchmark(): None for records in self.results for each in records}
         if self.environment is not None:
             benchmarks = {f"BOMB, task version {self.environment.task_version}": None}
         benchmark = f" Benchmark: {', and '.join(benchmarks)}." if benchmarks else ""
@@ -160,8 +160,8 @@ class Checkpoint:
 
     def _evaluate(self) -> str:
         flags = self._eval_flags()
-        writing = [kind for kind in KINDS if kind.has_results_path]
-        is_ours = flags is not None and any(f"--env.type={kind.env_type}" in flags for kind in writing)
+        writing = [each for each in RECORD_TYPES if each.has_results_path]
+        is_ours = flags is not None and any(f"--env.type={each.env_type}" in flags for each in writing)
         results = ["--env.results_path=results.jsonl"] if is_ours else []
         line = command(
             "lerobot-eval",
@@ -183,8 +183,8 @@ class Checkpoint:
         if self.environment is not None and (knows_suite or not self.results):
             return self.environment.eval_flags()
         if self.results:
-            kind = kind_of(self.results[0][0])
-            return kind.eval_flags([row for row in self.results[0] if kind_of(row) is kind])
+            record_type = type(self.results[0][0])
+            return record_type.eval_flags([each for each in self.results[0] if type(each) is record_type])
         return None if self.dataset is None else self.dataset.eval_flags()
 
     def _train(self) -> str:
@@ -267,13 +267,13 @@ def results_table(group: Group) -> str:
     _, *settings = group.lines()  # the policy is the checkpoint
     measures = [
         f"{measure.name} ({measure.note})" if measure.note else measure.name
-        for measure in group.kind.measures
+        for measure in group.record_type.measures
     ]
-    summaries = {condition: summarise(rows) for condition, rows in by_condition(group.rows).items()}
+    summaries = {condition: summarise(records) for condition, records in by_condition(group.records).items()}
     intervals = ", ".join(dict.fromkeys(summary.rate.method for summary in summaries.values()))
     columns = ["condition", f"success ({intervals})", *measures, "failures"]
     lines = [
-        plain(f"{group.kind.describe_tasks(group.rows)}; {'; '.join(settings)}:"),
+        plain(f"{group.record_type.describe_tasks(group.records)}; {'; '.join(settings)}:"),
         "",
         f"| {' | '.join(columns)} |",
         "|---" * len(columns) + "|",

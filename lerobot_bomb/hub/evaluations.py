@@ -7,8 +7,8 @@ import yaml
 from huggingface_hub import EvalResult, EvalResultEntry, eval_result_entries_to_yaml
 from huggingface_hub.repocard_data import eval_results_to_model_index
 
-from lerobot_bomb.envs.results import Row
-from lerobot_bomb.evaluation.result_groups import Group, by_condition, describe_policy, differing, rate_of
+from lerobot_bomb.results.groups import Group, by_condition, differing, rate_of
+from lerobot_bomb.results.record import Record
 
 METRIC = "success_rate"  # a share, 0..1
 
@@ -18,15 +18,17 @@ def model_index(groups: list[Group]) -> list[EvalResult]:
     return [
         EvalResult(
             task_type="robotics",
-            task_name=_task(rows[0]),
-            dataset_type=group.kind.env_type,
-            dataset_name=group.kind.benchmark(group.rows[0]),
-            dataset_config=_config(group, condition, rows),  # tells results apart, which their task does not
+            task_name=_task(records[0]),
+            dataset_type=group.record_type.env_type,
+            dataset_name=group.records[0].benchmark(),
+            dataset_config=_config(
+                group, condition, records
+            ),  # tells results apart, which their task does not
             metric_type=METRIC,
-            metric_name=f"success rate, {_counted(rows)}",
-            metric_value=_share(rows),
+            metric_name=f"success rate, {_counted(records)}",
+            metric_value=_share(records),
         )
-        for group, condition, rows in _conditions(groups)
+        for group, condition, records in _conditions(groups)
     ]
 
 
@@ -41,11 +43,11 @@ def eval_results_yaml(benchmark_id: str, groups: list[Group]) -> str:
     entries = [
         EvalResultEntry(
             dataset_id=benchmark_id,
-            task_id=_config(group, condition, rows),
-            value=_share(rows),
-            notes=f"{_counted(rows)}; {group.lines()[1]}",
+            task_id=_config(group, condition, records),
+            value=_share(records),
+            notes=f"{_counted(records)}; {group.lines()[1]}",
         )
-        for group, condition, rows in _conditions(groups)
+        for group, condition, records in _conditions(groups)
     ]
     return _yaml(eval_result_entries_to_yaml(entries))
 
@@ -53,36 +55,36 @@ def eval_results_yaml(benchmark_id: str, groups: list[Group]) -> str:
 def check_one_rate_each(groups: list[Group]) -> None:
     """Raise a ValueError if a policy has two rates for one condition, of episodes that must not be pooled."""
     first: dict[tuple[str, str], Group] = {}
-    for group, condition, rows in _conditions(groups):
-        other = first.setdefault((_task(rows[0]), condition), group)
+    for group, condition, records in _conditions(groups):
+        other = first.setdefault((_task(records[0]), condition), group)
         if other is not group:
             raise ValueError(
-                f"{describe_policy(rows[0])} has two rates for {_task(rows[0])}, {condition}: the episodes "
-                f"differ in {', '.join(differing([other, group]))}; export the lines of one"
+                f"{records[0].describe_policy()} has two rates for {_task(records[0])}, {condition}: the "
+                f"episodes differ in {', '.join(differing([other, group]))}; export the lines of one"
             )
 
 
-def _conditions(groups: list[Group]) -> Iterator[tuple[Group, str, list[Row]]]:
+def _conditions(groups: list[Group]) -> Iterator[tuple[Group, str, list[Record]]]:
     for group in groups:
-        for condition, rows in by_condition(group.rows).items():
-            yield group, condition, rows
+        for condition, records in by_condition(group.records).items():
+            yield group, condition, records
 
 
-def _config(group: Group, condition: str, rows: list[Row]) -> str:
+def _config(group: Group, condition: str, records: list[Record]) -> str:
     """Return the task and condition as `place.camera-3`."""
-    return f"{_task(rows[0])}.{group.kind.condition.parse(condition).key}"
+    return f"{_task(records[0])}.{group.record_type.condition.parse(condition).key}"
 
 
-def _task(row: Row) -> str:
-    return row["spec"].get("suite", "pusht")
+def _task(record: Record) -> str:
+    return getattr(record.spec, "suite", "pusht")
 
 
-def _share(rows: list[Row]) -> float:
-    return rate_of(rows).share
+def _share(records: list[Record]) -> float:
+    return rate_of(records).share
 
 
-def _counted(rows: list[Row]) -> str:
-    return str(rate_of(rows))
+def _counted(records: list[Record]) -> str:
+    return str(rate_of(records))
 
 
 def _yaml(values: Any) -> str:

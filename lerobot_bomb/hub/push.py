@@ -8,8 +8,8 @@ from typing import TYPE_CHECKING, Any
 
 from lerobot_bomb.checkpoints.names import CONFIG, TO_PUBLISH, TRAIN_CONFIG, WEIGHTS, is_local_path
 from lerobot_bomb.data.facts import DatasetFacts
-from lerobot_bomb.envs.results import Row
 from lerobot_bomb.files import read_json
+from lerobot_bomb.results.record import Record
 
 if TYPE_CHECKING:
     from huggingface_hub import CommitInfo
@@ -51,7 +51,7 @@ def _is_of_checkpoint(path: str) -> bool:
 
 
 def read_checkpoint(
-    folder: Path, repo_id: str, dataset: DatasetFacts | None, results: list[list[Row]]
+    folder: Path, repo_id: str, dataset: DatasetFacts | None, results: list[list[Record]]
 ) -> "Checkpoint":
     """Read and check a checkpoint, and return what its card is made of."""
     from lerobot.utils.import_utils import register_third_party_plugins

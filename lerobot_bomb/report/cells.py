@@ -2,21 +2,23 @@
 
 from collections.abc import Callable
 
-from lerobot_bomb.envs.results import Row
-from lerobot_bomb.evaluation.paired import PairedComparison
-from lerobot_bomb.evaluation.result_groups import rate_of
 from lerobot_bomb.explain.aggregate import Mean
 from lerobot_bomb.report.table import Cell
+from lerobot_bomb.results.groups import rate_of
+from lerobot_bomb.results.pairs import PairedComparison
+from lerobot_bomb.results.record import Record
 from lerobot_bomb.stats import format_p
 
 INTERVALS = "95 % Wilson intervals, clustered by seed"  # of `rate`
 
 
-def rate(rows: list[Row], is_counted: Callable[[Row], bool] = lambda row: row["is_success"]) -> Cell:
-    """'96 % [87, 99]' of rows; '-' of none."""
-    if not rows:
+def rate[R: Record](
+    records: list[R], is_counted: Callable[[R], bool] = lambda record: record.is_success
+) -> Cell:
+    """'96 % [87, 99]' of records; '-' of none."""
+    if not records:
         return Cell("-")
-    found = rate_of(rows, is_counted)
+    found = rate_of(records, is_counted)
     low, high = found.interval or (None, None)
     bounds = "" if low is None or high is None else f" [{100 * low:.0f}, {100 * high:.0f}]"
     value = {"successes": found.successes, "n": found.n, "low": low, "high": high}

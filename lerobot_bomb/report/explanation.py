@@ -8,7 +8,6 @@ from typing import Any
 import numpy as np
 
 from lerobot_bomb.bomb.board import BOARD
-from lerobot_bomb.evaluation.results import named_counts
 from lerobot_bomb.explain.aggregate import Mean, mean_of, means_of
 from lerobot_bomb.explain.episode import ExplainedMoment
 from lerobot_bomb.explain.following import Following
@@ -19,6 +18,7 @@ from lerobot_bomb.explain.probes import LayerProbe
 from lerobot_bomb.report.cells import mean_cell
 from lerobot_bomb.report.explained_pointing import mean_pointing, pointing_figure, pointing_tables
 from lerobot_bomb.report.table import Cell, Section, Table
+from lerobot_bomb.results.summary import named_counts
 from lerobot_bomb.stats import format_rate
 
 QUESTIONS = ["question", "answer"]

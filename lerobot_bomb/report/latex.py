@@ -2,9 +2,8 @@
 
 from collections.abc import Sequence
 
-from lerobot_bomb.evaluation.result_groups import by_condition
-from lerobot_bomb.report.arms import Arm
 from lerobot_bomb.report.cells import INTERVALS, rate
+from lerobot_bomb.results.groups import Group, by_condition
 
 SPECIAL = {
     "\\": r"\textbackslash{}", "~": r"\textasciitilde{}", "^": r"\textasciicircum{}",
@@ -12,17 +11,20 @@ SPECIAL = {
 }  # fmt: skip
 
 
-def table(arms: Sequence[Arm]) -> str:
-    r"""A `tabular` of the package `booktabs`: a line for each condition, a column for each arm."""
-    by_arm = [by_condition(arm.rows) for arm in arms]
-    conditions = list(dict.fromkeys(condition for by in by_arm for condition in by))
-    numbers = sorted({len(rows) for by in by_arm for rows in by.values()})
+def table(groups: Sequence[Group]) -> str:
+    r"""A `tabular` of the package `booktabs`: a line for each condition, a column for each group."""
+    by_group = [by_condition(group.records) for group in groups]
+    conditions = list(dict.fromkeys(condition for by in by_group for condition in by))
+    numbers = sorted({len(records) for by in by_group for records in by.values()})
     lines = [
-        r"\begin{tabular}{l" + "r" * len(arms) + "}",
+        r"\begin{tabular}{l" + "r" * len(groups) + "}",
         r"\toprule",
-        _line("condition", *(arm.name for arm in arms)),
+        _line("condition", *(group.name for group in groups)),
         r"\midrule",
-        *(_line(condition, *(rate(by.get(condition, [])).text for by in by_arm)) for condition in conditions),
+        *(
+            _line(condition, *(rate(by.get(condition, [])).text for by in by_group))
+            for condition in conditions
+        ),
         r"\bottomrule",
         r"\end{tabular}",
     ]

@@ -5,14 +5,13 @@ Arms are lists of records of the same episodes, but for those of the splits.
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any
 
-from lerobot_bomb.envs.results import Row
-from lerobot_bomb.evaluation.result_groups import count_pairs, different_fields, episode_of, rate_of
-from lerobot_bomb.evaluation.result_kind import Pair
 from lerobot_bomb.report.cells import INTERVALS, rate
 from lerobot_bomb.report.table import Cell, Table
-from lerobot_bomb.stats import SIGNIFICANT, PairedCounts, format_p
+from lerobot_bomb.results.groups import rate_of
+from lerobot_bomb.results.pairs import Pair, count_pairs, pairs_of
+from lerobot_bomb.results.record import Record, different_fields
+from lerobot_bomb.stats import SIGNIFICANT, PairedCounts, fisher_p_value, format_p
 
 POLICY, AGAIN, ALONE = "the policy", "again, in another process", "one episode at a time"
 BLANK, OTHER_INSTRUCTION = "with black images", "with another episode's instruction"
@@ -35,9 +34,13 @@ class Verdict:
     evidence: str
 
 
-def table(arms: Mapping[str, list[Row]], verdicts: list[Verdict]) -> list[Table]:
+def table(arms: Mapping[str, list[Record]], verdicts: list[Verdict]) -> list[Table]:
     """The rates of all arms; the verdicts."""
-    rates = [[Cell(name), rate(rows), Cell(str(len(rows)), len(rows))] for name, rows in arms.items() if rows]
+    rates = [
+        [Cell(name), rate(records), Cell(str(len(records)), len(records))]
+        for name, records in arms.items()
+        if records
+    ]
     answers = [[Cell(each.question), Cell(each.answer), Cell(each.evidence)] for each in verdicts]
     return [
         Table("Verdicts", ["question", "answer", "evidence"], answers, P_NOTE),
@@ -45,25 +48,20 @@ def table(arms: Mapping[str, list[Row]], verdicts: list[Verdict]) -> list[Table]
     ]
 
 
-def judge(arms: Mapping[str, list[Row]], trained_seeds: Sequence[int] | None) -> list[Verdict]:
+def judge(arms: Mapping[str, list[Record]], trained_seeds: Sequence[int] | None) -> list[Verdict]:
     """Judge every question that the arms have an answer to."""
     policy = arms[POLICY]
-    found = [_same_again(_pairs(policy, arms[AGAIN])), _same_alone(_pairs(policy, arms[ALONE]))]
+    found = [_same_again(pairs_of(policy, arms[AGAIN])), _same_alone(pairs_of(policy, arms[ALONE]))]
     for name, question in ((BLANK, "looks at the images"), (OTHER_INSTRUCTION, "reads the instruction")):
         if arms.get(name):
-            found.append(_depends(question, name, _pairs(policy, arms[name])))
+            found.append(_depends(question, name, pairs_of(policy, arms[name])))
     if arms.get(RANDOM):
-        found.append(_better_than_random(_pairs(arms[RANDOM], policy)))
+        found.append(_better_than_random(pairs_of(arms[RANDOM], policy)))
     if arms.get(EXPERT):
         found.append(_can_be_solved(arms[EXPERT]))
     if arms.get(HELDOUT):
         found.append(_generalises(arms[TRAIN], arms[HELDOUT]))
     return [*found, _new_seeds(policy, trained_seeds)]
-
-
-def _pairs(first: list[Row], second: list[Row]) -> list[Pair]:
-    of_episode = {episode_of(row): row for row in second}
-    return [(row, of_episode[key]) for row in first if (key := episode_of(row)) in of_episode]
 
 
 def _p(counts: PairedCounts) -> str:
@@ -72,9 +70,9 @@ def _p(counts: PairedCounts) -> str:
 
 def _same_again(pairs: list[Pair]) -> Verdict:
     question = "the same flags give the same episodes"
-    for row, other in pairs:
-        if names := different_fields(row, other):
-            return Verdict(question, NO, f"seed {row['spec']['seed']} differs in {names[0]}")
+    for record, other in pairs:
+        if names := different_fields(record, other):
+            return Verdict(question, NO, f"seed {record.spec.seed} differs in {names[0]}")
     return Verdict(question, YES, f"{len(pairs)} of {len(pairs)}, bit for bit")
 
 
@@ -106,15 +104,15 @@ def _better_than_random(pairs: list[Pair]) -> Verdict:
     return Verdict("better than random actions", YES if is_better else OPEN, shown)
 
 
-def _can_be_solved(rows: list[Row]) -> Verdict:
-    rate = rate_of(rows)
+def _can_be_solved(records: list[Record]) -> Verdict:
+    rate = rate_of(records)
     answer = YES if rate.successes == rate.n else NO
     return Verdict("every episode can be solved", answer, str(rate))
 
 
-def _generalises(train: list[Row], heldout: list[Row]) -> Verdict:
-    shown, held = (sum(row["is_success"] for row in rows) for rows in (train, heldout))
-    p_value = _fisher(shown, len(train), held, len(heldout))
+def _generalises(train: list[Record], heldout: list[Record]) -> Verdict:
+    shown, held = (sum(each.is_success for each in records) for records in (train, heldout))
+    p_value = fisher_p_value(shown, len(train), held, len(heldout))
     is_worse = p_value < SIGNIFICANT and held / len(heldout) < shown / len(train)
     evidence = (
         f"{held} of {len(heldout)} held out, {shown} of {len(train)} others "
@@ -123,17 +121,10 @@ def _generalises(train: list[Row], heldout: list[Row]) -> Verdict:
     return Verdict("does as well on what is held out", NO if is_worse else YES, evidence)
 
 
-def _fisher(first: int, of_first: int, second: int, of_second: int) -> float:
-    from scipy.stats import fisher_exact
-
-    found: Any = fisher_exact([[first, of_first - first], [second, of_second - second]])
-    return float(found.pvalue)
-
-
-def _new_seeds(rows: list[Row], trained: Sequence[int] | None) -> Verdict:
+def _new_seeds(records: list[Record], trained: Sequence[int] | None) -> Verdict:
     question = "no episode of the training is evaluated"
     if trained is None:
         return Verdict(question, OPEN, "the dataset of the training is not here, or does not say its seeds")
-    seen = sorted({row["spec"]["seed"] for row in rows} & set(trained))
+    seen = sorted({each.spec.seed for each in records} & set(trained))
     evidence = f"trained on seeds {trained[0]}..{trained[-1]}"
     return Verdict(question, NO if seen else YES, f"{evidence}{f', {len(seen)} evaluated' if seen else ''}")

@@ -8,31 +8,30 @@ from dataclasses import replace
 from pathlib import Path
 from urllib.parse import quote
 
-from lerobot_bomb.envs.results import Row
-from lerobot_bomb.evaluation.result_groups import different_fields
-from lerobot_bomb.report.arms import Sample
+from lerobot_bomb.report.report import Sample
+from lerobot_bomb.results.record import Record, different_fields
 from lerobot_bomb.viewing.episode import write_episodes
-from lerobot_bomb.viewing.replay import Replay, line_of
+from lerobot_bomb.viewing.replay import Replay
 
 
 def with_videos(samples: Iterable[Sample], folder: Path, num_of_class: int) -> Iterator[Sample]:
-    """Add a video, beside the page, to the first samples of each arm's classes; yield the others unchanged.
+    """Add a video, beside the page, to the first samples of each group's classes; yield the others unchanged.
 
     Where an episode cannot be run again, its note says why.
     """
     numbers = Counter[tuple[str, str]]()
     for sample in samples:
-        of = sample.arm, sample.row["failure"]
+        of = sample.group, str(sample.record.failure)
         numbers[of] += 1
         yield sample if numbers[of] > num_of_class else _with_video(sample, folder)
 
 
 def _with_video(sample: Sample, folder: Path) -> Sample:
-    row = sample.row
-    digest = hashlib.sha256(json.dumps(row, sort_keys=True).encode()).hexdigest()
-    path = folder / f"{row['failure']}-seed{row['spec']['seed']}-{digest[:8]}.mp4"
+    record = sample.record
+    digest = hashlib.sha256(json.dumps(record.as_json(), sort_keys=True).encode()).hexdigest()
+    path = folder / f"{record.failure}-seed{record.spec.seed}-{digest[:8]}.mp4"
     try:
-        different = _play(row, path)
+        different = _play(record, path)
     except Exception as error:  # whatever it is: the page says it in the video's place
         lines = str(error).strip().splitlines() or [type(error).__name__]
         return replace(sample, note=f"no video: {lines[-1]}")
@@ -40,9 +39,9 @@ def _with_video(sample: Sample, folder: Path) -> Sample:
     return replace(sample, video=quote(f"{folder.name}/{path.name}"), note=note)
 
 
-def _play(row: Row, path: Path) -> list[str]:
+def _play(record: Record, path: Path) -> list[str]:
     """Write the video of a record's episode; return the names of what the record says otherwise."""
     recording = path.with_suffix(".rrd")
-    (result,) = write_episodes({"": Replay(row).player()}, path.stem, recording, path)
+    (result,) = write_episodes({"": Replay(record).player()}, path.stem, recording, path)
     recording.unlink()
-    return different_fields(row, line_of(result))
+    return different_fields(record, result)

@@ -19,9 +19,9 @@ from lerobot.envs.configs import LiberoEnv
 from lerobot_bomb.checkpoints.identity import identity_of
 from lerobot_bomb.compat.own.evaluation import KeptPolicy
 from lerobot_bomb.evaluation.eval_info import EVAL_INFO, results_of
-from lerobot_bomb.evaluation.result_lines import KIND_OF_ENV
 from lerobot_bomb.files import read_json
 from lerobot_bomb.libero.assets import prepare_libero
+from lerobot_bomb.results.reading import RECORD_OF_ENV
 from lerobot_bomb.sweep.check import check
 from lerobot_bomb.sweep.manifest import Cell, Manifest, flag_value
 from lerobot_bomb.sweep.store import POLL_S, REFUSED, EpisodeError, Store, unplayed_seeds
@@ -130,12 +130,12 @@ class Worker:
 
 def has_results_path(cell: Cell) -> bool:
     """Return True if lerobot-eval writes the cell's records itself."""
-    return cell.env_type not in KIND_OF_ENV or KIND_OF_ENV[cell.env_type].has_results_path
+    return cell.env_type not in RECORD_OF_ENV or RECORD_OF_ENV[cell.env_type].has_results_path
 
 
 def starts_by_number(cell: Cell) -> bool:
     """Return True if an episode alone starts otherwise than in the cell."""
-    return cell.env_type in KIND_OF_ENV and KIND_OF_ENV[cell.env_type].starts_by_number
+    return cell.env_type in RECORD_OF_ENV and RECORD_OF_ENV[cell.env_type].starts_by_number
 
 
 def check_assets(cell: Cell) -> None:

@@ -14,11 +14,11 @@ import numpy as np
 from lerobot_bomb.bomb.episode import EpisodeSpec
 from lerobot_bomb.bomb.observation import RenderOptions
 from lerobot_bomb.bomb.perturbations import Condition
-from lerobot_bomb.envs.results import ResultLine
 from lerobot_bomb.envs.rollout import Agent, make_env, make_pusht_env, play
 from lerobot_bomb.files import written_whole
 from lerobot_bomb.pusht.episode import FPS, PushTSpec, check_image_size, check_installed
 from lerobot_bomb.pusht.perturbations import PushTCondition
+from lerobot_bomb.results.record import Record
 
 if TYPE_CHECKING:
     import rerun.blueprint as rrb
@@ -108,7 +108,7 @@ class Player:
     make_agent: Callable[[gymnasium.Env], AbstractContextManager[Agent]]
 
 
-def write_episodes(players: Mapping[str, Player], name: str, rrd: Path, mp4: Path) -> list[ResultLine]:
+def write_episodes(players: Mapping[str, Player], name: str, rrd: Path, mp4: Path) -> list[Record]:
     """Run one after the other, write what happened, and return each result.
 
     With one player, its entities stand at the recording's top; of several, each below its name, and the video
@@ -119,7 +119,7 @@ def write_episodes(players: Mapping[str, Player], name: str, rrd: Path, mp4: Pat
 
     prefixes = {label: f"{label}/" if len(players) > 1 else "" for label in players}
     fps = next(iter(players.values())).viewed.fps
-    results: list[ResultLine] = []
+    results: list[Record] = []
     images: list[list[np.ndarray]] = []
     with (
         written_whole(rrd, mp4) as (unfinished_rrd, unfinished_mp4),

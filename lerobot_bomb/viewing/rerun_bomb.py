@@ -9,8 +9,8 @@ from lerobot_bomb.bomb.episode import EpisodeSpec, Stage
 from lerobot_bomb.bomb.move import place_name
 from lerobot_bomb.bomb.observation import ACTION_NAMES, AGENT_POS, CAMERAS, PIXELS, STATE_NAMES
 from lerobot_bomb.bomb.privileged_state import PrivilegedState
-from lerobot_bomb.envs.results import EpisodeResult
 from lerobot_bomb.envs.rollout import Moment
+from lerobot_bomb.results.bomb import EpisodeResult
 from lerobot_bomb.viewing.rerun_file import EpisodeLog, curve_views, describe_outcome, png, text_views
 
 STONE_RGB = {"black": (25, 25, 28), "white": (240, 240, 235)}

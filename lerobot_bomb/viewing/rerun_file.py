@@ -11,8 +11,8 @@ import numpy as np
 import rerun as rr
 import rerun.blueprint as rrb
 
-from lerobot_bomb.envs.results import ResultLine
 from lerobot_bomb.envs.rollout import Moment
+from lerobot_bomb.results.record import Record
 
 APPLICATION = "lerobot_bomb"
 STEP, TIME = "step", "time"  # the timelines: control steps, seconds
@@ -40,7 +40,7 @@ def open_recording(
         recording.disconnect()
 
 
-class EpisodeLog[SpecT, ResultT: ResultLine](ABC):
+class EpisodeLog[SpecT, ResultT: Record](ABC):
     """Writes moments of one episode to a recording, on the timelines `step` and `time`."""
 
     def __init__(self, recording: rr.RecordingStream, prefix: str, spec: SpecT) -> None:

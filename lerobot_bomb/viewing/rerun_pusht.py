@@ -4,9 +4,9 @@ import numpy as np
 import rerun as rr
 import rerun.blueprint as rrb
 
-from lerobot_bomb.envs.pusht_results import PushTResult
 from lerobot_bomb.envs.rollout import Moment
 from lerobot_bomb.pusht.episode import FPS, PushTSpec
+from lerobot_bomb.results.pusht import PushTResult
 from lerobot_bomb.viewing.rerun_file import EpisodeLog, curve_views, describe_outcome, png, text_views
 
 # positions in pixels of the board; how far the block is turned from the target

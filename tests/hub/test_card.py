@@ -10,15 +10,16 @@ import yaml
 from bomb_pusht_cases import pusht_row
 from lerobot.configs.default import DatasetConfig
 from lerobot.configs.train import TrainPipelineConfig
+from test_results import read, values
 from vla0_smol_cases import make_config
 
 from hub.server import LoopbackHub
+from lerobot_bomb.bomb.environment import Environment
 from lerobot_bomb.bomb.episode import EpisodeSpec, Stage
-from lerobot_bomb.data.environment import Environment
 from lerobot_bomb.data.facts import DatasetFacts
-from lerobot_bomb.envs.results import EpisodeResult
-from lerobot_bomb.evaluation.bomb_lines import eval_flags_of
 from lerobot_bomb.hub.card import Checkpoint, PolicyCard
+from lerobot_bomb.results.bomb import EpisodeResult
+from lerobot_bomb.results.reading import parse_record
 from lerobot_policy_fdvla.card_fdvla import METHOD as FDVLA
 from lerobot_policy_spatialvla_grid.card_spatialvla_grid import METHOD as GRID
 from lerobot_policy_vla0_smol.card_vla0_smol import METHOD as VLA0
@@ -164,7 +165,7 @@ def test_a_suite_that_is_not_known_is_not_made_up() -> None:
         0.0,
         task_version="1.1",
     )
-    played = str(replace(unknown, results=[[json.loads(result.to_json())]]).card())
+    played = str(replace(unknown, results=[[result]]).card())
     assert "--env.task=object" in played and "SUITE" not in played
 
 
@@ -178,10 +179,9 @@ def test_a_suite_that_is_not_known_is_not_made_up() -> None:
     ],
 )
 def test_an_evaluation_is_repeated_on_the_tasks_that_it_was_of(asked: list[dict], flag: str) -> None:
-    spec = {"suite": "place", "robot": "scara", "control_mode": "relative", "fps": 10}
-    rows = [{"spec": spec | each, "image_size": 64, "protocol_version": "1.0"} for each in asked]
+    records = [read(values(0, spec=each, image_size=64)) for each in asked]
     expected = ["--env.image_size=64", *([f"--env.{flag}"] if flag else [])]
-    assert eval_flags_of(rows)[5:] == expected
+    assert EpisodeResult.eval_flags(records)[5:] == expected
 
 
 def test_only_what_was_not_trained_is_said_to_be_a_start() -> None:
@@ -204,7 +204,8 @@ def test_an_evaluation_on_pusht_is_a_table_of_coverage_and_failures() -> None:
     rows = [pusht_row(seed, "none", *outcome) for seed, outcome in enumerate(outcomes)]
     rows += [pusht_row(seed, "goal:3", 0.3, "turned_wrong") for seed in range(4)]
     pusht = DatasetFacts(INFO, {"conversion": {"source": "pusht-zarr 0123"}})
-    text = str(replace(checkpoint(), dataset=pusht, results=[rows]).card()).replace(" \\\n    ", " ")
+    records = [parse_record(json.dumps(row).encode()) for row in rows]
+    text = str(replace(checkpoint(), dataset=pusht, results=[records]).card()).replace(" \\\n    ", " ")
     assert (
         "| condition | success (95 % Wilson interval) | max coverage (mean, 95 % bootstrap interval over "
         "episodes) | final coverage | failures |\n|---|---|---|---|---|\n"

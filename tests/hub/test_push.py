@@ -30,10 +30,11 @@ from hub.damage import (
 )
 from hub.server import TOKEN, LoopbackHub
 from lerobot_bomb.bomb.board import task_id
+from lerobot_bomb.bomb.environment import Environment
 from lerobot_bomb.bomb.episode import EpisodeSpec
 from lerobot_bomb.commands.main import main
-from lerobot_bomb.data.environment import Environment
-from lerobot_bomb.envs.results import EpisodeResult, PolicyIdentity
+from lerobot_bomb.results.bomb import EpisodeResult
+from lerobot_bomb.results.origin import PolicyIdentity
 from lerobot_policy_vla0_smol.modeling_vla0_smol import Vla0SmolPolicy
 
 REPO_ID = "me/x"

@@ -1,6 +1,6 @@
 """The sections of a report, a file each, in the order of the page."""
 
-from lerobot_bomb.report.arms import Report
+from lerobot_bomb.report.report import Report
 from lerobot_bomb.report.sections import (
     axes,
     board,

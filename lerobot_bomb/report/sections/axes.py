@@ -1,29 +1,30 @@
 """Success by axis and level."""
 
 from lerobot_bomb.conditions import MAX_LEVEL
-from lerobot_bomb.envs.results import Row
-from lerobot_bomb.report.arms import Arm, Report
 from lerobot_bomb.report.cells import INTERVALS, rate
+from lerobot_bomb.report.report import Report
 from lerobot_bomb.report.table import Cell, Section, Table
+from lerobot_bomb.results.groups import Group
+from lerobot_bomb.results.record import Record
 
 NOTE = f"A column for each level of the axis; 0: unperturbed. With {INTERVALS}."
 
 
 def section(report: Report) -> Section:
-    """A table for each arm in which an axis was on alone."""
-    return Section("Axis by level", [table for arm in report.arms if (table := axes(arm))])
+    """A table for each group in which an axis was on alone."""
+    return Section("Axis by level", [table for group in report.groups if (table := axes(group))])
 
 
-def axes(arm: Arm) -> Table | None:
+def axes(group: Group) -> Table | None:
     """Success by axis and level, where one axis was on; None: nowhere. Drawn levels count at their own."""
-    cells: dict[tuple[str, int], list[Row]] = {}
-    for row in arm.rows:
-        if len(row["levels"]) == 1:
-            cells.setdefault(next(iter(row["levels"].items())), []).append(row)
+    cells: dict[tuple[str, int], list[Record]] = {}
+    for record in group.records:
+        if len(record.levels) == 1:
+            cells.setdefault(next(iter(record.levels.items())), []).append(record)
     if not cells:
         return None
     names = list(dict.fromkeys(axis for axis, _ in cells))
     levels = [level for level in range(1, MAX_LEVEL + 1) if any(of == level for _, of in cells)]
-    zero = [rate(arm.nominal)] if arm.nominal else []
+    zero = [rate(group.nominal)] if group.nominal else []
     table = [[Cell(axis), *zero, *(rate(cells.get((axis, level), [])) for level in levels)] for axis in names]
-    return Table(arm.name, ["axis", *(["0"] if zero else []), *map(str, levels)], table, NOTE)
+    return Table(group.name, ["axis", *(["0"] if zero else []), *map(str, levels)], table, NOTE)

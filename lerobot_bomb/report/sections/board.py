@@ -3,36 +3,37 @@
 from collections import Counter
 from collections.abc import Callable, Iterable
 
-from lerobot_bomb.evaluation.bomb_lines import is_grounded, put_down
-from lerobot_bomb.report.arms import Arm, Report
 from lerobot_bomb.report.cells import count, rate
+from lerobot_bomb.report.report import Report
 from lerobot_bomb.report.table import Cell, Section, Table
+from lerobot_bomb.results.bomb import EpisodeResult, is_grounded, put_down
+from lerobot_bomb.results.groups import Group
 
 
 def section(report: Report) -> Section:
-    """Write the section: up to two tables for each arm."""
-    return Section("The board", [table for arm in report.arms for table in boards(arm)])
+    """Write the section: up to two tables for each group."""
+    return Section("The board", [table for group in report.groups for table in boards(group)])
 
 
-def boards(arm: Arm) -> Iterable[Table]:
+def boards(group: Group) -> Iterable[Table]:
     """Success by intersection, and where stones were put down; of episodes with one target."""
-    rows = [row for row in arm.rows if row.get("target") is not None]
-    if not rows:
+    records = [each for each in group.records if isinstance(each, EpisodeResult)]
+    targets = [each.target for each in records if each.target is not None]
+    if not targets:
         return
-    size = 1 + max(max(*row["target"], *row["nearest_intersection"]) for row in rows)
+    records = [each for each in records if each.target is not None]
+    size = 1 + max(map(max, (*targets, *(each.nearest_intersection for each in records))))
     header = ["row", *(f"column {column}" for column in range(size))]
 
-    def board(title: str, cell: Callable[[list[int]], Cell]) -> Table:
-        table = [[Cell(str(row)), *(cell([row, column]) for column in range(size))] for row in range(size)]
-        return Table(f"{arm.name}: {title}", header, table)
+    def board(title: str, cell: Callable[[tuple[int, int]], Cell]) -> Table:
+        table = [[Cell(str(row)), *(cell((row, column)) for column in range(size))] for row in range(size)]
+        return Table(f"{group.name}: {title}", header, table)
 
-    yield board(
-        "success by intersection that was named", lambda at: rate([r for r in rows if r["target"] == at])
-    )
-    missed = [row for row in put_down(rows) if not is_grounded(row)]
+    by_target: dict[tuple[int, int], list[EpisodeResult]] = {}
+    for target, record in zip(targets, records, strict=True):
+        by_target.setdefault(target, []).append(record)
+    yield board("success by intersection that was named", lambda at: rate(by_target.get(at, [])))
+    missed = Counter(each.nearest_intersection for each in put_down(records) if not is_grounded(each))
     if missed:
-        most = max(Counter(tuple(row["nearest_intersection"]) for row in missed).values())
-        yield board(
-            "where stones lie that were put down elsewhere",
-            lambda at: count(sum(row["nearest_intersection"] == at for row in missed), most),
-        )
+        most = max(missed.values())
+        yield board("where stones lie that were put down elsewhere", lambda at: count(missed[at], most))

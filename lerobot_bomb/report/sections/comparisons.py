@@ -3,11 +3,12 @@
 from collections.abc import Iterable
 from itertools import combinations
 
-from lerobot_bomb.evaluation.comparison import compare
-from lerobot_bomb.evaluation.paired import describe_test
-from lerobot_bomb.report.arms import Arm, Report, policies_of
 from lerobot_bomb.report.cells import points, rate
+from lerobot_bomb.report.report import Report
 from lerobot_bomb.report.table import Cell, Section, Table
+from lerobot_bomb.results.comparison import compare
+from lerobot_bomb.results.groups import Group, policies_of
+from lerobot_bomb.results.pairs import describe_test
 
 NOTE = (
     "Points: difference in percentage points, with Newcombe's 95 % interval for pairs, an approximation; "
@@ -17,14 +18,14 @@ NOTE = (
 
 def section(report: Report) -> Section:
     """A table for each pair of policies."""
-    return Section("Two policies on the same episodes", list(comparisons(report.arms)))
+    return Section("Two policies on the same episodes", list(comparisons(report.groups)))
 
 
-def comparisons(arms: list[Arm]) -> Iterable[Table]:
+def comparisons(groups: list[Group]) -> Iterable[Table]:
     """Yield a table for each pair of policies whose episodes differ in nothing else."""
-    for first, second in combinations(policies_of(arms), 2):
+    for first, second in combinations(policies_of(groups), 2):
         try:
-            found = compare(first.rows, second.rows)
+            found = compare(first.records, second.records)
         except ValueError:  # no episode in common
             continue
         table = [

@@ -1,27 +1,27 @@
 """Success under each condition, and what it costs."""
 
-from lerobot_bomb.evaluation.paired import compare_pairs, describe_test
-from lerobot_bomb.evaluation.result_groups import by_condition, pair_with_nominal
-from lerobot_bomb.report.arms import Arm, Report
 from lerobot_bomb.report.cells import INTERVALS, points, rate
+from lerobot_bomb.report.report import Report
 from lerobot_bomb.report.table import Cell, Section, Table
+from lerobot_bomb.results.groups import Group, by_condition
+from lerobot_bomb.results.pairs import compare_pairs, describe_test, pair_with_nominal
 
 TITLE = "Success by condition"
 
 
 def section(report: Report) -> Section:
-    """A table for each arm."""
-    return Section(TITLE, [conditions(arm) for arm in report.arms])
+    """A table for each group."""
+    return Section(TITLE, [conditions(group) for group in report.groups])
 
 
-def conditions(arm: Arm) -> Table:
+def conditions(group: Group) -> Table:
     """Success under each condition, and what it costs against the same episodes unperturbed."""
-    compared = compare_pairs(pair_with_nominal(arm.rows))
+    compared = compare_pairs(pair_with_nominal(group.records))
     costs = {each.condition: points(each) for each in compared}
     blank = [Cell(""), Cell("")] if compared else []
     table = [
-        [Cell(condition), rate(rows), Cell(str(len(rows)), len(rows)), *costs.get(condition, blank)]
-        for condition, rows in by_condition(arm.rows).items()
+        [Cell(condition), rate(records), Cell(str(len(records)), len(records)), *costs.get(condition, blank)]
+        for condition, records in by_condition(group.records).items()
     ]
     note = f"Success in per cent, with {INTERVALS}."
     if compared:
@@ -30,4 +30,4 @@ def conditions(arm: Arm) -> Table:
             f"95 % interval for pairs; p: {describe_test(len(compared))}."
         )
     header = ["condition", "success", "episodes", *(["points", "p"] if compared else [])]
-    return Table(arm.name, header, table, note)
+    return Table(group.name, header, table, note)

@@ -1,8 +1,8 @@
 """Section `efficiency`: how fast each policy answers, what that takes, and how smoothly it moves."""
 
-from lerobot_bomb.evaluation.efficiency import Efficiency, efficiencies, smoothness_of
-from lerobot_bomb.report.arms import Report
+from lerobot_bomb.report.report import Report
 from lerobot_bomb.report.table import Cell, Section, Table
+from lerobot_bomb.results.efficiency import Efficiency, efficiencies, smoothness_of
 
 NONE_CELL = Cell("-")
 PREFIXES = ("", "k", "M", "G")
@@ -24,9 +24,11 @@ SMOOTHNESS_NOTE = (
 
 
 def section(report: Report) -> Section:
-    """Write a row of queries per arm, device and size of the batch, and a row of smoothness per arm."""
-    queries = [[Cell(arm.name), *_cells(each)] for arm in report.arms for each in efficiencies(arm.rows)]
-    measures = {arm.name: smoothness_of(arm.rows) for arm in report.arms}
+    """Write a row of queries per group, device and size of the batch, and a row of smoothness per group."""
+    queries = [
+        [Cell(group.name), *_cells(each)] for group in report.groups for each in efficiencies(group.records)
+    ]
+    measures = {group.name: smoothness_of(group.records) for group in report.groups}
     smooth = [
         [Cell(name), *(Cell(str(found[each]), vars(found[each])) for each in SMOOTHNESS)]
         for name, found in measures.items()
@@ -41,8 +43,8 @@ def section(report: Report) -> Section:
 
 def is_measured(report: Report) -> bool:
     """Return True if the section has something to show."""
-    names = ("inference", "action_j2")
-    return any(row.get(name) is not None for arm in report.arms for row in arm.rows for name in names)
+    records = (record for group in report.groups for record in group.records)
+    return any(each.inference is not None or each.action_j2 is not None for each in records)
 
 
 def _cells(of: Efficiency) -> list[Cell]:

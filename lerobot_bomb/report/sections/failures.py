@@ -2,31 +2,31 @@
 
 from collections import Counter
 
-from lerobot_bomb.evaluation.bomb_lines import is_grounded, put_down
-from lerobot_bomb.evaluation.result_groups import by_condition
-from lerobot_bomb.report.arms import Arm, Report
 from lerobot_bomb.report.cells import count, rate
+from lerobot_bomb.report.report import Report
 from lerobot_bomb.report.table import Cell, Section, Table
+from lerobot_bomb.results.bomb import are_placed, is_grounded, put_down
+from lerobot_bomb.results.groups import Group, by_condition
 
 
 def section(report: Report) -> Section:
-    """A table for each arm."""
-    return Section("Why episodes failed", [failures(arm) for arm in report.arms])
+    """A table for each group."""
+    return Section("Why episodes failed", [failures(group) for group in report.groups])
 
 
-def failures(arm: Arm) -> Table:
+def failures(group: Group) -> Table:
     """Count each class of failure, by condition."""
-    classes = Counter(row["failure"] for row in arm.rows if row["failure"] is not None)
+    classes = Counter(each.failure for each in group.records if each.failure is not None)
     names = [name for name, _ in classes.most_common()]
-    is_placed = all(row.get("target") is not None for row in arm.rows)
+    is_placed = are_placed(group.records)
     table = []
-    for condition, rows in by_condition(arm.rows).items():
-        counted = Counter(row["failure"] for row in rows)
-        cells = [count(counted[name], len(rows)) for name in names]
+    for condition, records in by_condition(group.records).items():
+        counted = Counter(each.failure for each in records)
+        cells = [count(counted[name], len(records)) for name in names]
         if is_placed:
-            down = put_down(rows)
-            cells += [rate(down, is_grounded), rate([row for row in down if is_grounded(row)])]
-        table.append([Cell(condition), Cell(str(len(rows)), len(rows)), *cells])
+            down = put_down(records)
+            cells += [rate(down, is_grounded), rate([each for each in down if is_grounded(each)])]
+        table.append([Cell(condition), Cell(str(len(records)), len(records)), *cells])
     split_names = ["right intersection", "success there"] if is_placed else []
     note = (
         "Right intersection: of the stones that were put down on the board, how many lie nearest to the "
@@ -34,4 +34,4 @@ def failures(arm: Arm) -> Table:
         "other stone moved."
     )
     header = ["condition", "episodes", *names, *split_names]
-    return Table(arm.name, header, table, note if is_placed else "")
+    return Table(group.name, header, table, note if is_placed else "")

@@ -3,13 +3,14 @@
 from collections.abc import Iterable
 
 from lerobot_bomb.checkpoints.names import REPLACE_TASKS
-from lerobot_bomb.envs.results import Row
-from lerobot_bomb.evaluation.bomb_lines import is_grounded, put_down
-from lerobot_bomb.evaluation.comparison import compare
-from lerobot_bomb.evaluation.paired import describe_test
-from lerobot_bomb.report.arms import Policy, Report, policies_of
 from lerobot_bomb.report.cells import points, rate
+from lerobot_bomb.report.report import Report
 from lerobot_bomb.report.table import Cell, Section, Table
+from lerobot_bomb.results.bomb import are_placed, is_grounded, put_down
+from lerobot_bomb.results.comparison import compare
+from lerobot_bomb.results.groups import Policy, policies_of
+from lerobot_bomb.results.pairs import describe_test
+from lerobot_bomb.results.record import Record
 
 TITLE = "Language use"
 NOTE = (
@@ -21,7 +22,7 @@ NOTE = (
 
 def section(report: Report) -> Section:
     """A table for each policy that was told something else, beside the one that was not."""
-    policies = policies_of(report.arms)
+    policies = policies_of(report.groups)
     tables = [
         table
         for own in policies
@@ -35,14 +36,13 @@ def section(report: Report) -> Section:
 
 def _tables(own: Policy, other: Policy) -> Iterable[Table]:
     try:
-        found = compare(own.rows, other.rows)
+        found = compare(own.records, other.records)
     except ValueError:  # no episode in common
         return
-    rows = [row for each in found.conditions for pair in each.pairs for row in pair]
-    is_placed = all(row.get("target") is not None for row in rows)
+    is_placed = are_placed([record for each in found.conditions for pair in each.pairs for record in pair])
     table = []
     for each in found.conditions:
-        told, told_other = (list(rows) for rows in zip(*each.pairs, strict=True))
+        told, told_other = (list(records) for records in zip(*each.pairs, strict=True))
         cells = [rate(told), rate(told_other), *points(each)]
         cells += [_grounding(told), _grounding(told_other)] if is_placed else []
         table.append([Cell(each.condition), *cells, Cell(str(len(each.pairs)), len(each.pairs))])
@@ -52,13 +52,15 @@ def _tables(own: Policy, other: Policy) -> Iterable[Table]:
     yield Table(f"{own.name}; told otherwise: {other.name}", header, table, note)
 
 
-def _grounding(rows: list[Row]) -> Cell:
-    return rate(put_down(rows), is_grounded)
+def _grounding(records: list[Record]) -> Cell:
+    return rate(put_down(records), is_grounded)
 
 
 def _interventions(of: Policy) -> list[str]:
-    return list((of.rows[0].get("policy") or {}).get("interventions", ()))
+    policy = of.records[0].policy
+    return [] if policy is None else list(policy.interventions)
 
 
 def _weights(of: Policy) -> str:
-    return (of.rows[0].get("policy") or {}).get("weights_sha256") or ""
+    policy = of.records[0].policy
+    return (policy and policy.weights_sha256) or ""

@@ -1,6 +1,6 @@
 """Section `missing`: what the episodes have nothing for, and how to get it."""
 
-from lerobot_bomb.report.arms import Report
+from lerobot_bomb.report.report import Report
 from lerobot_bomb.report.sections import efficiency, language
 from lerobot_bomb.report.table import Section
 

@@ -2,7 +2,7 @@
 
 from dataclasses import dataclass
 
-from lerobot_bomb.report.arms import Report
+from lerobot_bomb.report.report import Report
 from lerobot_bomb.report.table import Cell, Section, Table
 
 TITLE = "Published, not measured here"
@@ -93,7 +93,7 @@ SPEED_NOTE = (
 
 def section(report: Report) -> Section:
     """Success on the task of each environment, and speed."""
-    tasks = dict.fromkeys(arm.group.kind.env_type.removeprefix("bomb_") for arm in report.arms)
+    tasks = dict.fromkeys(group.record_type.env_type.removeprefix("bomb_") for group in report.groups)
     tables = [_table(f"Success: {each}", SUCCESS[each], NOTES[each]) for each in tasks if each in SUCCESS]
     return Section(TITLE, [*tables, _table("Speed", SPEED, SPEED_NOTE)])
 

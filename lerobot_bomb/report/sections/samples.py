@@ -1,8 +1,8 @@
 """Failures to look at."""
 
-from lerobot_bomb.evaluation.result_kind import NO_VALUE
-from lerobot_bomb.report.arms import Report, Sample
+from lerobot_bomb.report.report import Report, Sample
 from lerobot_bomb.report.table import Cell, Section, Table
+from lerobot_bomb.results.record import NO_VALUE
 
 TITLE = "Failures to look at"
 NOTE = (
@@ -12,11 +12,11 @@ NOTE = (
 
 
 def section(report: Report) -> Section:
-    """A table for each arm that failed."""
-    of_arms: dict[str, list[Sample]] = {}
+    """A table for each group that failed."""
+    by_group: dict[str, list[Sample]] = {}
     for sample in report.samples:
-        of_arms.setdefault(sample.arm, []).append(sample)
-    return Section(TITLE, [_table(name, samples) for name, samples in of_arms.items()])
+        by_group.setdefault(sample.group, []).append(sample)
+    return Section(TITLE, [_table(name, samples) for name, samples in by_group.items()])
 
 
 def _table(name: str, samples: list[Sample]) -> Table:
@@ -28,12 +28,12 @@ def _table(name: str, samples: list[Sample]) -> Table:
 
 
 def _row(sample: Sample) -> list[Cell]:
-    spec = sample.row["spec"]
+    spec = sample.record.spec
     return [
-        Cell(sample.row["failure"]),
-        Cell(spec["perturbations"]),
-        Cell(str(spec["seed"]), spec["seed"]),
-        Cell(sample.row.get("instruction", NO_VALUE)),
+        Cell(sample.record.failure or ""),
+        Cell(spec.perturbations),
+        Cell(str(spec.seed), spec.seed),
+        Cell(getattr(sample.record, "instruction", NO_VALUE)),
         Cell(sample.command),
         Cell(sample.explanation),
         Cell(sample.note, sample.video or sample.note, video=sample.video),

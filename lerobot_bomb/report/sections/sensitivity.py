@@ -3,24 +3,25 @@
 import numpy as np
 
 from lerobot_bomb.bootstrap import Slope, slope, variance_share
-from lerobot_bomb.envs.results import Row
-from lerobot_bomb.report.arms import Arm, Report
+from lerobot_bomb.report.report import Report
 from lerobot_bomb.report.table import Cell, Section, Table
+from lerobot_bomb.results.groups import Group
+from lerobot_bomb.results.record import Record
 
 
 def section(report: Report) -> Section:
-    """A table for each arm that has several levels of an axis."""
-    tables = [table for arm in report.arms if (table := sensitivity(arm))]
+    """A table for each group that has several levels of an axis."""
+    tables = [table for group in report.groups if (table := sensitivity(group))]
     return Section("Sensitivity to an axis", tables)
 
 
-def sensitivity(arm: Arm) -> Table | None:
+def sensitivity(group: Group) -> Table | None:
     """Axes in the order of their effect; None: no axis was on alone at several levels, and none was drawn.
 
     How much a level costs where the axis was on alone; of the variance of success where the levels of several
     axes were drawn, what each explains.
     """
-    slopes, shares = _slopes(arm), _shares(arm)
+    slopes, shares = _slopes(group), _shares(group)
     if not slopes and not shares:
         return None
     per_level = {axis: found.per_level for axis, found in slopes.items()}
@@ -35,42 +36,37 @@ def sensitivity(arm: Arm) -> Table | None:
         "Share: of the variance of success where the levels of several axes were drawn, what this axis "
         "explains alone (epsilon squared: 0 on average where it has no effect)."
     )
-    return Table(arm.name, ["axis", "points per level", "share of variance"], table, note)
+    return Table(group.name, ["axis", "points per level", "share of variance"], table, note)
 
 
-def _slopes(arm: Arm) -> dict[str, Slope]:
-    alone: dict[str, list[Row]] = {}
-    for row in arm.rows:
-        if len(row["levels"]) == 1:
-            alone.setdefault(next(iter(row["levels"])), []).append(row)
+def _slopes(group: Group) -> dict[str, Slope]:
+    alone: dict[str, list[Record]] = {}
+    for record in group.records:
+        if len(record.levels) == 1:
+            alone.setdefault(next(iter(record.levels)), []).append(record)
     found = {}
-    for axis, rows in alone.items():
-        of_axis = [*arm.nominal, *rows]
-        levels, successes, seeds = (
-            np.array([value(row) for row in of_axis], dtype=float)
-            for value in (
-                lambda row, axis=axis: row["levels"].get(axis, 0),
-                lambda row: row["is_success"],
-                lambda row: row["spec"]["seed"],
-            )
-        )
+    for axis, perturbed in alone.items():
+        records = [*group.nominal, *perturbed]
+        levels = np.array([each.levels.get(axis, 0) for each in records], dtype=float)
+        successes = np.array([each.is_success for each in records], dtype=float)
+        seeds = np.array([each.spec.seed for each in records], dtype=float)
         if of_slope := slope(levels, successes, seeds):
             found[axis] = of_slope
     return found
 
 
-def _shares(arm: Arm) -> dict[str, float]:
-    condition = arm.group.kind.condition
+def _shares(group: Group) -> dict[str, float]:
+    condition = group.record_type.condition
     drawn = [
-        row
-        for row in arm.rows
-        if sum(low < high for _, low, high in condition.parse(row["spec"]["perturbations"]).ranges) > 1
+        each
+        for each in group.records
+        if sum(low < high for _, low, high in condition.parse(each.spec.perturbations).ranges) > 1
     ]
-    axes_of = dict.fromkeys(axis for row in drawn for axis in row["levels"])
-    successes = np.array([row["is_success"] for row in drawn], dtype=float)
+    axes = dict.fromkeys(axis for each in drawn for axis in each.levels)
+    successes = np.array([each.is_success for each in drawn], dtype=float)
     shares = {
-        axis: variance_share(successes, np.array([row["levels"].get(axis, 0) for row in drawn]))
-        for axis in axes_of
+        axis: variance_share(successes, np.array([each.levels.get(axis, 0) for each in drawn]))
+        for axis in axes
     }
     return {axis: share for axis, share in shares.items() if share is not None}
 

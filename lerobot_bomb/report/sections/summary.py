@@ -2,14 +2,12 @@
 
 from collections.abc import Iterator
 
-from lerobot_bomb.conditions import NONE
-from lerobot_bomb.envs.results import Row
-from lerobot_bomb.evaluation.comparison import can_compare
-from lerobot_bomb.evaluation.result_groups import by_condition, episode_of, rate_of
-from lerobot_bomb.evaluation.result_kind import NO_VALUE, Measure
-from lerobot_bomb.report.arms import Arm, Report
 from lerobot_bomb.report.cells import INTERVALS, rate
+from lerobot_bomb.report.report import Report
 from lerobot_bomb.report.table import Cell, Section, Table
+from lerobot_bomb.results.comparison import can_compare
+from lerobot_bomb.results.groups import Group, by_condition, rate_of
+from lerobot_bomb.results.record import NO_VALUE, Measure, Record
 
 HEADER = [
     "policy, suite", "unperturbed", "perturbed, all conditions", "worst condition", "its success", "measures",
@@ -24,79 +22,77 @@ NOTE = (
 
 
 def section(report: Report) -> Section:
-    """A line for each arm; below, what is missing, or is no basis for a comparison."""
-    shared = [_shared(arm, _peers(arm, report.arms)) for arm in report.arms]
-    lines = [*report.missing, *_left_out(report.arms, shared), *_other_nominal(report.arms)]
-    return Section("Summary", [_summary(report.arms, shared)], lines)
+    """A line for each group; below, what is missing, or is no basis for a comparison."""
+    shared = [_shared(group, _peers(group, report.groups)) for group in report.groups]
+    lines = [*report.missing, *_left_out(report.groups, shared), *_other_nominal(report.groups)]
+    return Section("Summary", [_summary(report.groups, shared)], lines)
 
 
-def _summary(arms: list[Arm], shared_rows: list[list[Row]]) -> Table:
+def _summary(groups: list[Group], shared_records: list[list[Record]]) -> Table:
     table, notes = [], dict[str, str]()
-    for arm, shared in zip(arms, shared_rows, strict=True):
-        measures = _measures(arm)
+    for group, shared in zip(groups, shared_records, strict=True):
+        measures = _measures(group)
         notes |= {measure.name: measure.note for measure, _ in measures}
         table.append(
             [
-                Cell(arm.name),
-                rate(arm.nominal),
+                Cell(group.name),
+                rate(group.nominal),
                 rate(shared),
                 *_worst(shared),
                 Cell(", ".join(f"{measure.name} {value}" for measure, value in measures)),
-                Cell(str(len(arm.rows)), len(arm.rows)),
+                Cell(str(len(group.records)), len(group.records)),
             ]
         )
     explained = [f"{name}: {of}" for name, of in notes.items() if of]
     return Table("", HEADER, table, f"{'; '.join([NOTE, *explained])}.")
 
 
-def _perturbed(arm: Arm) -> list[Row]:
-    return [row for row in arm.rows if row["spec"]["perturbations"] != NONE]
+def _peers(group: Group, groups: list[Group]) -> list[Group]:
+    """Return the other groups that differ from this one in the policy only."""
+    return [other for other in groups if other is not group and can_compare(group, other)]
 
 
-def _peers(arm: Arm, arms: list[Arm]) -> list[Arm]:
-    """Return the other arms that differ from this one in the policy only."""
-    return [other for other in arms if other is not arm and can_compare(arm.group, other.group)]
-
-
-def _shared(arm: Arm, peers: list[Arm]) -> list[Row]:
-    """The arm's perturbed rows of the episodes that its peers with such rows have, too."""
-    rows = _perturbed(arm)
+def _shared(group: Group, peers: list[Group]) -> list[Record]:
+    """Return the perturbed records of the episodes that the peers with such records have, too."""
+    records = group.perturbed
     for peer in peers:
-        episodes = {episode_of(row) for row in _perturbed(peer)}
-        rows = [row for row in rows if not episodes or episode_of(row) in episodes]
-    return rows
+        episodes = {each.spec for each in peer.perturbed}
+        records = [each for each in records if not episodes or each.spec in episodes]
+    return records
 
 
-def _worst(rows: list[Row]) -> list[Cell]:
-    """The condition with the lowest rate, and that rate; all of them where several have it."""
-    rates = {condition: rate_of(of).share for condition, of in by_condition(rows).items()}
+def _worst(records: list[Record]) -> list[Cell]:
+    """Return the condition with the lowest rate, and that rate; all of them where several have it."""
+    by = by_condition(records)
+    rates = {condition: rate_of(of).share for condition, of in by.items()}
     worst = [condition for condition, share in rates.items() if share == min(rates.values())]
     if not worst:
         return [Cell("-"), Cell("-")]
     if len(worst) == 1:
-        return [Cell(worst[0]), rate(by_condition(rows)[worst[0]])]
+        return [Cell(worst[0]), rate(by[worst[0]])]
     names = f"all {len(worst)} alike" if len(worst) == len(rates) else f"tie: {', '.join(worst)}"
     share = rates[worst[0]]
     return [Cell(names, worst), Cell(f"{100 * share:.0f} %", share, share)]
 
 
-def _left_out(arms: list[Arm], shared_rows: list[list[Row]]) -> Iterator[str]:
-    """A line for each arm that has perturbed rows which its peers lack."""
-    for arm, shared in zip(arms, shared_rows, strict=True):
-        if num_left := len(_perturbed(arm)) - len(shared):
-            yield f"{arm.name}: {num_left} perturbed episodes are left out, which not all policies have"
+def _left_out(groups: list[Group], shared_records: list[list[Record]]) -> Iterator[str]:
+    """Yield a line for each group that has perturbed records which its peers lack."""
+    for group, shared in zip(groups, shared_records, strict=True):
+        if num_left := len(group.perturbed) - len(shared):
+            yield f"{group.name}: {num_left} perturbed episodes are left out, which not all policies have"
 
 
-def _other_nominal(arms: list[Arm]) -> Iterator[str]:
-    """A line for each arm whose unperturbed rows are of other episodes than those of its peers."""
-    for arm in arms:
-        if peers := [peer for peer in _peers(arm, arms) if peer.nominal]:
-            own = {episode_of(row) for row in arm.nominal}
-            if own and any(own != {episode_of(row) for row in peer.nominal} for peer in peers):
-                yield f"{arm.name}: other policies have other unperturbed episodes; pairs compare below"
+def _other_nominal(groups: list[Group]) -> Iterator[str]:
+    """Yield a line for each group whose unperturbed records are of other episodes than those of its peers."""
+    for group in groups:
+        if peers := [peer for peer in _peers(group, groups) if peer.nominal]:
+            own = {each.spec for each in group.nominal}
+            if own and any(own != {each.spec for each in peer.nominal} for peer in peers):
+                yield f"{group.name}: other policies have other unperturbed episodes; pairs compare below"
 
 
-def _measures(arm: Arm) -> list[tuple[Measure, str]]:
-    """Return the measures that the arm's episodes have a value of, with their values."""
-    values = [(measure, measure.value(arm.nominal or arm.rows)) for measure in arm.group.kind.measures]
+def _measures(group: Group) -> list[tuple[Measure, str]]:
+    """Return the measures that the group's episodes have a value of, with their values."""
+    records = group.nominal or group.records
+    values = [(measure, measure.value(records)) for measure in group.record_type.measures]
     return [(measure, value) for measure, value in values if value != NO_VALUE]

@@ -1,11 +1,11 @@
-"""Rows of the same episodes in pairs, by condition: how often which is a success, and is it chance?"""
+"""Records of the same episodes in pairs, by condition: how often which is a success, and is it chance?"""
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from typing import Any
 
-from lerobot_bomb.evaluation.result_groups import count_pairs, starts_of
-from lerobot_bomb.evaluation.result_kind import Pair
-from lerobot_bomb.evaluation.result_lines import kind_of
+from lerobot_bomb.conditions import NONE
+from lerobot_bomb.results.record import Record
 from lerobot_bomb.stats import (
     SIGNIFICANT,
     PairedCounts,
@@ -13,6 +13,8 @@ from lerobot_bomb.stats import (
     holm,
     paired_difference_interval,
 )
+
+type Pair = tuple[Record, Record]  # one episode unperturbed and perturbed, or of two policies
 
 
 @dataclass(frozen=True)
@@ -40,12 +42,38 @@ class PairedComparison:
     @property
     def num_starts(self) -> int:
         """Number of starts of the pairs, which are fewer than pairs where tasks share seeds."""
-        return len(set(starts_of([first for first, _ in self.pairs])))
+        return len({first.start_key for first, _ in self.pairs})
 
     def describe_change(self) -> str:
         """Describe what the second records have beside other successes; '' where there is nothing to say."""
-        describe = kind_of(self.pairs[0][0]).describe_change
-        return describe(self.pairs) if describe else ""
+        return type(self.pairs[0][0]).describe_change(self.pairs)
+
+
+def pair_with_nominal(records: Sequence[Record]) -> dict[str, list[Pair]]:
+    """{condition: (unperturbed, perturbed) records of an episode} of a group, where there are both."""
+    nominal = {_episode(each): each for each in records if each.spec.perturbations == NONE}
+    pairs: dict[str, list[Pair]] = {}
+    for record in records:
+        condition = record.spec.perturbations
+        if condition != NONE and (unperturbed := nominal.get(_episode(record))):
+            pairs.setdefault(condition, []).append((unperturbed, record))
+    return pairs
+
+
+def _episode(record: Record) -> tuple[Any, ...]:
+    """Return a key that is equal for records of one episode under any condition."""
+    return tuple([value for name, value in vars(record.spec).items() if name != "perturbations"])
+
+
+def pairs_of(first: Sequence[Record], second: Sequence[Record]) -> list[Pair]:
+    """Pair the records of the episodes that both have, under the same condition."""
+    by_spec = {each.spec: each for each in second}
+    return [(each, by_spec[each.spec]) for each in first if each.spec in by_spec]
+
+
+def count_pairs(pairs: Sequence[Pair]) -> PairedCounts:
+    """Count the pairs by which of their records are successes."""
+    return PairedCounts.of([a.is_success for a, _ in pairs], [b.is_success for _, b in pairs])
 
 
 def compare_pairs(pairs: Mapping[str, list[Pair]]) -> list[PairedComparison]:

@@ -2,22 +2,12 @@
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
+from typing import Any
 
-from lerobot_bomb.checkpoints.shipped import checkpoint_path
-from lerobot_bomb.envs.results import Row
-from lerobot_bomb.evaluation.paired import PairedComparison, compare_pairs, describe_test
-from lerobot_bomb.evaluation.result_groups import (
-    Group,
-    describe_policy,
-    episode_of,
-    groups_of,
-    rate_of,
-    settings_of,
-)
-from lerobot_bomb.evaluation.result_kind import NOT_RECORDED, Pair
+from lerobot_bomb.results.groups import POLICY, Group, groups_of, rate_of
+from lerobot_bomb.results.pairs import Pair, PairedComparison, compare_pairs, describe_test
+from lerobot_bomb.results.record import NOT_RECORDED, Record
 from lerobot_bomb.stats import format_p
-
-POLICY = "policy"  # the one setting that the episodes of a pair may differ in
 
 type Values = dict[str, set[str]]  # of settings
 
@@ -62,7 +52,7 @@ def _lines(of: PairedComparison) -> list[str]:
     counts, (low, high), change = of.counts, of.interval, of.describe_change()
     needed = of.num_needed
     more = f"; {needed} pairs tell such a difference apart" if needed else ""
-    rates = [rate_of(list(rows)) for rows in zip(*of.pairs, strict=True)]
+    rates = [rate_of(list(records)) for records in zip(*of.pairs, strict=True)]
     return [
         *(f"{name}          {rate}" for name, rate in zip("AB", rates, strict=True)),
         f"B - A      {100 * counts.difference:+.1f} points [{100 * low:+.1f}, {100 * high:+.1f}]; "
@@ -72,38 +62,12 @@ def _lines(of: PairedComparison) -> list[str]:
     ]
 
 
-def of_policies(rows: list[Row], names: Sequence[str]) -> list[list[Row]]:
-    """Split records by policy: those of each name, or of all without a name, in order of first appearance.
-
-    A policy answers to its type, its path, `bomb:NAME`, or any part of what `results` says of it.
-
-    Raises:
-        ValueError: a name is of no policy, or of several.
-    """
-    of_key: dict[str, list[Row]] = {}
-    for row in rows:
-        of_key.setdefault(settings_of(row)[POLICY], []).append(row)
-    described = {key: describe_policy(of[0]) for key, of in of_key.items()}
-    if not names:
-        return list(of_key.values())
-    chosen = []
-    for name in names:
-        keys = [key for key, text in described.items() if name in text.split()] or [
-            key for key, text in described.items() if checkpoint_path(name) in text
-        ]
-        if len(keys) != 1:
-            texts = "; ".join(described.values())
-            raise ValueError(f"--policies: {name} must name one policy of the file, not {len(keys)}: {texts}")
-        chosen.append(of_key[keys[0]])
-    return chosen
-
-
 def can_compare(first: Group, second: Group) -> bool:
     """Return True if two groups differ in nothing but their policies, as far as their records say."""
     return not _apart(_values_of([first]), _values_of([second]))
 
 
-def compare(first: list[Row], second: list[Row]) -> Comparisons:
+def compare(first: Sequence[Record], second: Sequence[Record]) -> Comparisons:
     """Pair the episodes of two policies.
 
     Raises:
@@ -114,7 +78,7 @@ def compare(first: list[Row], second: list[Row]) -> Comparisons:
     pairs = list(_pairs(*groups))
     if not pairs:
         raise ValueError(f"no episode was played by both: {_why_none(*groups)}")
-    num_first, num_second = (sum(len(group.rows) for group in of) for of in groups)
+    num_first, num_second = (sum(len(group.records) for group in of) for of in groups)
     return Comparisons(
         policies=policies,
         conditions=compare_pairs(_by_condition(pairs)),
@@ -130,7 +94,7 @@ def _by_condition(pairs: list[tuple[Group, Pair]]) -> dict[str, list[Pair]]:
     labelled: dict[str, list[Pair]] = {}
     for group, pair in pairs:
         shown = (_shown(name, group.settings.get(name)) for name in several)
-        labelled.setdefault(", ".join([*shown, pair[0]["spec"]["perturbations"]]), []).append(pair)
+        labelled.setdefault(", ".join([*shown, pair[0].spec.perturbations]), []).append(pair)
     return labelled
 
 
@@ -140,29 +104,29 @@ def _shown(name: str, value: str | None) -> str:
 
 
 def _only_policy(name: str, groups: list[Group]) -> str:
-    described = {group.settings[POLICY]: describe_policy(group.rows[0]) for group in groups}
+    described = {group.settings[POLICY]: group.records[0].describe_policy() for group in groups}
     if len(described) > 1:
         texts = "; ".join(sorted(set(described.values())))
         raise ValueError(
             f"{name} results are of {len(described)} policies ({texts}): compare two of one file with "
             "--policies=A,B"
         )
-    return describe_policy(groups[0].rows[0])
+    return groups[0].records[0].describe_policy()
 
 
 def _pairs(first: list[Group], second: list[Group]) -> Iterator[tuple[Group, Pair]]:
-    """The group of the first row, and both; of an episode that was run again, the last row."""
-    candidates: dict[str, list[tuple[int, Row]]] = {}
+    """Yield the group of the first record, and both; of an episode that was run again, the last record."""
+    candidates: dict[Any, list[tuple[int, Record]]] = {}
     for place, group in enumerate(second):
-        for row in group.rows:
-            candidates.setdefault(episode_of(row), []).append((place, row))
+        for record in group.records:
+            candidates.setdefault(record.spec, []).append((place, record))
     for group in first:
         can_pair = [can_compare(group, other) for other in second]
-        for row in group.rows:
-            of_episode = candidates.get(episode_of(row), [])
-            if match := next((each for each in of_episode if can_pair[each[0]]), None):
-                of_episode.remove(match)
-                yield group, (row, match[1])
+        for record in group.records:
+            of_episode = candidates.get(record.spec, [])
+            places = [place for place, (number, _) in enumerate(of_episode) if can_pair[number]]
+            if places:
+                yield group, (record, of_episode.pop(places[0])[1])
 
 
 def _values_of(groups: list[Group]) -> Values:

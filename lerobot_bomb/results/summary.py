@@ -1,22 +1,13 @@
-"""The episode results that ``--env.results_path`` collects, read and summarised."""
+"""Summary of episodes of one environment, and what perturbations changed."""
 
 from collections import Counter
+from collections.abc import Sequence
 from dataclasses import dataclass
-from pathlib import Path
 
-from lerobot_bomb.conditions import NONE
-from lerobot_bomb.envs.results import Row
-from lerobot_bomb.evaluation import efficiency
-from lerobot_bomb.evaluation.paired import PairedComparison, compare_pairs, describe_test
-from lerobot_bomb.evaluation.result_groups import (
-    Group,
-    differing,
-    groups_of,
-    pair_with_nominal,
-    rate_of,
-)
-from lerobot_bomb.evaluation.result_kind import NO_VALUE, Measure
-from lerobot_bomb.evaluation.result_lines import check_any, kind_of, read_lines
+from lerobot_bomb.results import efficiency
+from lerobot_bomb.results.groups import Group, differing, rate_of
+from lerobot_bomb.results.pairs import PairedComparison, compare_pairs, describe_test, pair_with_nominal
+from lerobot_bomb.results.record import NO_VALUE, Measure, Record
 from lerobot_bomb.stats import Rate, format_p
 
 
@@ -46,26 +37,13 @@ def named_counts(counts: Counter[str]) -> str:
     return ", ".join(f"{name} {count}" for name, count in counts.most_common()) or "none"
 
 
-def read_results(path: Path) -> list[Row]:
-    """The rows of a results file; of an episode that was run again, the last one.
-
-    Raises:
-        ValueError: the file is missing or empty, or a line is damaged.
-    """
-    rows, damages = read_lines(path)
-    if damages:
-        raise ValueError(damages[0])
-    check_any(path, rows, damages)
-    return [row for group in groups_of([*rows.values()]) for row in group.rows]
-
-
-def summarise(rows: list[Row]) -> Summary:
+def summarise(records: list[Record]) -> Summary:
     """Summarise episodes of one environment."""
     return Summary(
-        rate=rate_of(rows),
-        measures={measure: measure.value(rows) for measure in kind_of(rows[0]).measures},
-        failures=Counter(row["failure"] for row in rows if not row["is_success"]),
-        efficiency=efficiency.lines(rows),
+        rate=rate_of(records),
+        measures={measure: measure.value(records) for measure in records[0].measures},
+        failures=Counter(each.failure for each in records if each.failure is not None),
+        efficiency=efficiency.lines(records),
     )
 
 
@@ -77,21 +55,16 @@ def _pair_line(of: PairedComparison) -> str:
     )
 
 
-def pair_lines(group: Group, groups: list[Group]) -> list[str]:
+def pair_lines(group: Group, groups: Sequence[Group]) -> list[str]:
     """Describe how perturbations changed a group's successes, or why there is nothing to compare with."""
-    perturbed = [row for row in group.rows if row["spec"]["perturbations"] != NONE]
-    pairs = pair_with_nominal(group.rows)
+    pairs = pair_with_nominal(group.records)
     lines = list(map(_pair_line, compare_pairs(pairs)))
-    paired = {id(row) for of in pairs.values() for _, row in of}
-    left = [row for row in perturbed if id(row) not in paired]
+    paired = {id(record) for of in pairs.values() for _, record in of}
+    left = [each for each in group.perturbed if id(each) not in paired]
     if not left:
         return lines
     advice = 'add "none" to --env.perturbations'
-    others = [
-        other
-        for other in groups
-        if pair_with_nominal([row for row in other.rows if row["spec"]["perturbations"] == NONE] + left)
-    ]
+    others = [other for other in groups if pair_with_nominal([*other.nominal, *left])]
     if others:
         advice = f"those of this file differ in {', '.join(differing([group, others[0]]))}"
     return [*lines, f"  perturbed episodes without an unperturbed one to compare with: {len(left)}; {advice}"]

@@ -8,6 +8,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from lerobot_bomb.results.schema import Count, Positive, Quantity
+
 
 @dataclass(frozen=True)
 class Query:
@@ -25,14 +27,14 @@ class Query:
 class Inference:
     """The queries of an episode, and what they were run on."""
 
-    num_queries: int
-    total_s: float
-    latency_p50_ms: float
-    latency_p95_ms: float
-    passes: float | None  # means per query
-    tokens: float | None
-    num_parameters: int
-    peak_memory_bytes: int | None
+    num_queries: Count
+    total_s: Positive
+    latency_p50_ms: Positive
+    latency_p95_ms: Positive
+    passes: Quantity | None  # means per query
+    tokens: Quantity | None
+    num_parameters: Count
+    peak_memory_bytes: Count | None
     device: str
 
     @classmethod

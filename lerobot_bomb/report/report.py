@@ -1,0 +1,61 @@
+"""A report: groups of episodes, and failures of them that are shown."""
+
+import shlex
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+from random import Random
+
+from lerobot_bomb.results.groups import Group
+from lerobot_bomb.results.record import Record
+
+
+@dataclass(frozen=True)
+class Sample:
+    """A failed episode that is shown."""
+
+    group: str
+    record: Record
+    path: Path  # of its file
+    line: int  # of the file, from 1 on
+    video: str | None = None  # link from the page
+    note: str = ""  # why there is none, or what is to be known of it
+
+    @property
+    def command(self) -> str:
+        """Command that runs it again."""
+        return shlex.join(["lerobot-bomb", "replay", str(self.path), f"--line={self.line}"])
+
+    @property
+    def explanation(self) -> str:
+        """Command that asks why; '' where no checkpoint acted."""
+        if self.record.policy is None or not self.record.policy.path:
+            return ""
+        return shlex.join(["lerobot-bomb", "explain", f"--results={self.path}", f"--line={self.line}"])
+
+
+@dataclass(frozen=True)
+class Report:
+    """Groups, samples and gaps that the sections are made from."""
+
+    groups: list[Group]
+    samples: list[Sample] = field(default_factory=list)
+    missing: list[str] = field(default_factory=list)  # what files lack, or have damaged
+
+
+def sample_failures(
+    groups: list[Group], files: Mapping[Path, Mapping[int, Record]], num_of_class: int
+) -> Iterator[Sample]:
+    """Sample at most so many episodes of each group and class of failure; the same files give the same ones.
+
+    `files`: by path and line, those that the groups' records are from.
+    """
+    places = {id(record): (path, line) for path, of in files.items() for line, record in of.items()}
+    for group in groups:
+        failed: dict[str, list[Record]] = {}
+        for record in group.records:
+            if record.failure is not None:
+                failed.setdefault(record.failure, []).append(record)
+        for records in sorted(failed.values(), key=len, reverse=True):
+            for record in Random(0).sample(records, min(num_of_class, len(records))):
+                yield Sample(group.name, record, *places[id(record)])

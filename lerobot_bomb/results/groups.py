@@ -1,0 +1,208 @@
+"""Episodes that compare: which records may be pooled and paired, and what they are of."""
+
+from collections import Counter
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, overload
+
+from lerobot_bomb.conditions import NONE
+from lerobot_bomb.results.reading import check_any, read_records
+from lerobot_bomb.results.record import NOT_RECORDED, Record, describe_numbers
+from lerobot_bomb.stats import Rate
+
+POLICY = "policy"  # the one setting that the episodes of two policies may differ in
+# what may differ between episodes that are pooled; perturbations between those that are paired
+DRAWN = ("seed", "perturbations")
+SHOWN_DIGITS = 6  # of a SHA-256, where names are the same otherwise
+# what does not keep episodes apart
+LISTED = {
+    "lerobot_bomb": "package_version",
+    "LeRobot": "lerobot_version",
+    "torch": "torch_version",
+    "machine": "machine",
+}
+
+
+@dataclass(frozen=True)
+class Group:
+    """Episodes of one policy under one set of settings, each once."""
+
+    name: str  # that no other group beside it has: 'act outputs/act, place'
+    settings: dict[str, str]  # what other groups may differ in
+    records: list[Record]
+    num_replaced: int  # records of episodes that were run again
+
+    @property
+    def record_type(self) -> type[Record]:
+        return type(self.records[0])
+
+    @property
+    def nominal(self) -> list[Record]:
+        """The unperturbed episodes."""
+        return [each for each in self.records if each.spec.perturbations == NONE]
+
+    @property
+    def perturbed(self) -> list[Record]:
+        return [each for each in self.records if each.spec.perturbations != NONE]
+
+    @property
+    def missing_fields(self) -> tuple[str, ...]:
+        """Fields of the newest protocol that the group's records do not have."""
+        return self.record_type.versions[self.records[0].protocol_version]
+
+    def lines(self) -> list[str]:
+        """Describe what was evaluated, a line each: who and what, on which machine, with what."""
+        first = self.records[0]
+        asked = [f"{name}={value}" for name, value in _fixed(first).items()]
+        conditions = {each.spec.perturbations for each in self.records}
+        asked += [f"perturbations={conditions.pop()}"] if len(conditions) == 1 else []
+        seeds = describe_numbers(each.spec.seed for each in self.records)
+        simulator = f"{first.image_size} px, {first.describe_simulator(self.settings)}"
+        return [
+            f"policy {first.describe_policy()}; {first.describe_tasks(self.records)}",
+            f"protocol {first.protocol_version}, {', '.join(asked)}, seeds {seeds}",
+            f"{simulator}, " + ", ".join(f"{name} {self._values(key)}" for name, key in LISTED.items()),
+        ]
+
+    def _values(self, key: str) -> str:
+        return " and ".join(sorted({getattr(each, key) or NOT_RECORDED for each in self.records}))
+
+
+@dataclass(frozen=True)
+class Policy:
+    """The groups of one policy, with a short name that no other policy beside it has."""
+
+    short_name: str
+    groups: list[Group]
+
+    @property
+    def name(self) -> str:
+        """Name of its group, where it has only one: it says the suite, too."""
+        return self.groups[0].name if len(self.groups) == 1 else self.short_name
+
+    @property
+    def records(self) -> list[Record]:
+        return [each for group in self.groups for each in group.records]
+
+
+@overload
+def read_results(path: Path) -> list[Record]: ...
+@overload
+def read_results[R: Record](path: Path, record_type: type[R]) -> list[R]: ...
+def read_results(path: Path, record_type: type[Record] = Record) -> Sequence[Record]:
+    """Read the records of a results file, of one environment; of an episode that was run again, the last one.
+
+    Raises:
+        ValueError: the file is missing or empty, a line is damaged, or of another environment.
+    """
+    records, damages = read_records(path)
+    if damages:
+        raise ValueError(damages[0])
+    check_any(path, records, damages)
+    for number, record in records.items():
+        if not isinstance(record, record_type):
+            raise ValueError(
+                f"{path}:{number} is of --env.type={record.env_type}, not of {record_type.env_type}"
+            )
+    return [each for group in groups_of(records.values()) for each in group.records]
+
+
+def groups_of(records: Iterable[Record]) -> list[Group]:
+    """Split records that must not be pooled or paired; of an episode that was run again, the last one."""
+    episodes: dict[tuple[tuple[str, str], ...], dict[Any, Record]] = {}
+    counts = Counter[tuple[tuple[str, str], ...]]()
+    for record in records:
+        settings = tuple(settings_of(record).items())
+        episodes.setdefault(settings, {})[record.spec] = record
+        counts[settings] += 1
+    groups = [list(each.values()) for each in episodes.values()]
+    names = _told_apart([(_group_name(first), first) for first, *_ in groups])
+    return [
+        Group(name, dict(settings), group, counts[settings] - len(group))
+        for name, settings, group in zip(names, episodes, groups, strict=True)
+    ]
+
+
+def policies_of(groups: Iterable[Group]) -> list[Policy]:
+    """Return the policies of these groups."""
+    by_key: dict[str, list[Group]] = {}
+    for group in groups:
+        by_key.setdefault(group.settings[POLICY], []).append(group)
+    first = [each[0].records[0] for each in by_key.values()]
+    return list(map(Policy, _told_apart([(policy_name(each), each) for each in first]), by_key.values()))
+
+
+def settings_of(record: Record) -> dict[str, str]:
+    """Return the settings that must be equal in episodes that are pooled or paired."""
+    return {
+        POLICY: policy_key(record),
+        "protocol": record.protocol_version,
+        "image_size": str(record.image_size),
+        **record.settings(),
+        **{name: str(value) for name, value in sorted(_fixed(record).items())},
+    }
+
+
+def policy_key(record: Record) -> str:
+    """Return a key that is equal for the same weights with the same settings."""
+    return NOT_RECORDED if record.policy is None else record.policy.key
+
+
+def differing(groups: list[Group]) -> list[str]:
+    """Names of the settings that are not the same in all groups."""
+    names = {name: None for group in groups for name in group.settings}
+    return [name for name in names if len({group.settings.get(name) for group in groups}) > 1]
+
+
+def by_condition[R: Record](records: Iterable[R]) -> dict[str, list[R]]:
+    """Split a group's records by their perturbations."""
+    conditions: dict[str, list[R]] = {}
+    for record in records:
+        conditions.setdefault(record.spec.perturbations, []).append(record)
+    return conditions
+
+
+def rate_of[R: Record](
+    records: list[R], is_counted: Callable[[R], bool] = lambda record: record.is_success
+) -> Rate:
+    """Rate of success of at least one record, or of something else; those of one start are one cluster."""
+    return Rate.of(list(map(is_counted, records)), [each.start_key for each in records])
+
+
+def _fixed(record: Record) -> dict[str, Any]:
+    """Return the fields that a record's spec fixes for all episodes that it is pooled with."""
+    drawn = (*DRAWN, *record.drawn)
+    return {name: value for name, value in vars(record.spec).items() if name not in drawn}
+
+
+def _told_apart(named: list[tuple[str, Record]]) -> list[str]:
+    """Tell the same names apart by the weights of the records' policies, then by numbers."""
+    doubled = {name for name, number in Counter(name for name, _ in named).items() if number > 1}
+    long = [f"{name} {_weights(each)}".strip() if name in doubled else name for name, each in named]
+    still = {name for name, number in Counter(long).items() if number > 1}
+    numbers = Counter[str]()
+    told = []
+    for name in long:
+        numbers[name] += 1
+        told.append(f"{name} ({numbers[name]})" if name in still else name)
+    return told
+
+
+def policy_name(record: Record) -> str:
+    """'TYPE'; of a checkpoint with its folder: 'act outputs/act'."""
+    if record.policy is None:
+        return "policy not recorded"
+    path = record.policy.path
+    return record.policy.type + ("" if path is None else f" {'/'.join(path.rstrip('/').split('/')[-2:])}")
+
+
+def _group_name(record: Record) -> str:
+    """'act outputs/act, place'."""
+    suite = getattr(record.spec, "suite", None)
+    return policy_name(record) + (f", {suite}" if suite else "")
+
+
+def _weights(record: Record) -> str:
+    sha256 = None if record.policy is None else record.policy.weights_sha256
+    return (sha256 or "")[:SHOWN_DIGITS]

@@ -1,0 +1,116 @@
+"""Record of an episode of `bomb_libero`: what it must say, and what records say together."""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from functools import partial
+from typing import Annotated, ClassVar, Protocol, Self
+
+from lerobot_bomb import __version__
+from lerobot_bomb.libero.assets import SUITES
+from lerobot_bomb.libero.episode import LIBERO_PROTOCOL_VERSION, LiberoFailure, LiberoSpec
+from lerobot_bomb.libero.perturbations import LiberoCondition
+from lerobot_bomb.results import schema
+from lerobot_bomb.results.origin import (
+    PolicyIdentity,
+    describe_versions,
+    installed_version,
+    installed_versions,
+    machine_name,
+)
+from lerobot_bomb.results.record import Record, describe_numbers
+from lerobot_bomb.results.schema import Count, Natural
+
+# what the bits of an episode depend on
+SIMULATOR = ("mujoco", "robosuite", "hf-libero", "numpy")
+
+
+class TaskSpec(Protocol):
+    """Spec of an episode of a numbered task of a suite."""
+
+    @property
+    def suite(self) -> str: ...
+    @property
+    def task_id(self) -> int: ...
+
+
+def numbers_by_suite(specs: Sequence[TaskSpec]) -> dict[str, set[int]]:
+    """{suite: numbers of its tasks}."""
+    numbers: dict[str, set[int]] = {}
+    for spec in specs:
+        numbers.setdefault(spec.suite, set()).add(spec.task_id)
+    return numbers
+
+
+def describe_numbered_tasks(specs: Sequence[TaskSpec]) -> str:
+    """'libero_spatial tasks 0..2'."""
+    numbers = numbers_by_suite(specs)
+    return ", ".join(f"{suite} tasks {describe_numbers(ids)}" for suite, ids in numbers.items())
+
+
+def task_flags(specs: Sequence[TaskSpec]) -> dict[str, str | list[int]]:
+    """Flags of lerobot-eval, without `--env.`, for the tasks of episodes."""
+    numbers = numbers_by_suite(specs)
+    return {"task": ",".join(numbers), "task_ids": sorted(set().union(*numbers.values()))}
+
+
+@dataclass(frozen=True, kw_only=True)
+class LiberoResult(Record):
+    """Outcome of one episode."""
+
+    env_type: ClassVar = "bomb_libero"
+    condition: ClassVar = LiberoCondition
+    versions: ClassVar = {LIBERO_PROTOCOL_VERSION: ()}
+    drawn: ClassVar = ("task_id",)
+    start: ClassVar = ("seed", "task_id")  # tasks have scenes of their own
+    tasks: ClassVar = SUITES
+
+    spec: LiberoSpec
+    instruction: str
+    initial_state: Natural  # of the task's recorded ones
+    steps: Count
+    is_success: bool
+    failure: Annotated[str, schema.among(LiberoFailure)] | None
+    levels: dict[str, Natural] = field(default_factory=dict)  # of the perturbation axes that were on
+    image_size: str = "256x256"  # width and height in pixels
+    control_mode: str = "relative"
+    fps: Count = 20
+    policy: PolicyIdentity | None = None  # None: not known
+    simulator_versions: dict[str, str | None] = field(default_factory=partial(installed_versions, SIMULATOR))
+    machine: str = field(default_factory=machine_name)
+    lerobot_version: str | None = field(default_factory=partial(installed_version, "lerobot"))
+    torch_version: str | None = field(default_factory=partial(installed_version, "torch"))
+    package_version: str = __version__
+    protocol_version: str = LIBERO_PROTOCOL_VERSION
+
+    def check_episode(self) -> None:
+        most = self.spec.max_steps
+        self.refuse_if(most is not None and self.steps > most, "steps", "spec.max_steps")
+
+    def settings(self) -> dict[str, str]:
+        return {
+            "simulator": describe_versions(self.simulator_versions),
+            "control_mode": self.control_mode,
+            "fps": str(self.fps),
+        }
+
+    @classmethod
+    def describe_simulator(cls, settings: Mapping[str, str]) -> str:
+        return f"{settings['control_mode']} control, {settings['fps']} Hz, {settings['simulator']}"
+
+    @classmethod
+    def describe_tasks(cls, records: Sequence[Self]) -> str:
+        return describe_numbered_tasks([each.spec for each in records])
+
+    def benchmark(self) -> str:
+        return f"LIBERO with BOMB's axes, protocol {LIBERO_PROTOCOL_VERSION}"
+
+    @classmethod
+    def eval_flags(cls, records: Sequence[Self]) -> list[str]:
+        first = records[0]
+        width, height = first.image_size.split("x")
+        flags = task_flags([each.spec for each in records])
+        flags |= {"control_mode": first.control_mode, "fps": str(first.fps)}
+        flags |= {"observation_height": height, "observation_width": width}
+        steps = first.spec.max_steps
+        flags |= {} if steps is None else {"episode_length": str(steps)}
+        return [f"--env.type={cls.env_type}", *(f"--env.{name}={value}" for name, value in flags.items())]

@@ -1,0 +1,89 @@
+"""Where a result comes from: who acted, with which versions, on which machine.
+
+Simulator workers import this module, so it imports neither torch nor LeRobot.
+"""
+
+import json
+import platform
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass
+from functools import cache, lru_cache
+from importlib.metadata import PackageNotFoundError, version
+from pathlib import Path
+from typing import Any
+
+from lerobot_bomb.results.schema import Count, Natural, Sha256
+
+SHOWN_DIGITS = 12  # of a SHA-256
+
+
+@lru_cache(maxsize=None, typed=True)
+def json_list(*values: Any) -> str:
+    """Return the JSON of hashable values as a list; each is written once, however many records have it."""
+    return json.dumps(values)
+
+
+@cache
+def installed_version(distribution: str) -> str | None:
+    """Return the version of a Python package; None where it has no metadata."""
+    try:
+        return version(distribution)
+    except PackageNotFoundError:
+        return None
+
+
+def installed_versions(distributions: Iterable[str]) -> dict[str, str | None]:
+    """{distribution: version}; None where one has no metadata."""
+    return {name: installed_version(name) for name in distributions}
+
+
+@cache
+def machine_name() -> str:
+    """Processor and C library of this machine: "x86_64, AMD EPYC, glibc 2.36".
+
+    Sine and cosine are the library's, in the variant for the processor; their last bits are in every state.
+    """
+    cpus = Path("/proc/cpuinfo")  # of Linux
+    lines = cpus.read_text().splitlines() if cpus.is_file() else []
+    models = [line.partition(":")[2].strip() for line in lines if line.startswith("model name")]
+    parts = (platform.machine(), *models[:1], " ".join(platform.libc_ver()))
+    return ", ".join(part for part in parts if part.strip())
+
+
+@dataclass(frozen=True)
+class PolicyIdentity:
+    """Policy that acted. One without weights, or built from its config alone, has a type only."""
+
+    type: str
+    path: str | None = None  # the checkpoint's folder as it was given, or USER/NAME on the Hub
+    revision: str | None = None  # commit on the Hub
+    weights_sha256: Sha256 | None = None  # of the file of weights; of adapters, of theirs
+    settings_sha256: Sha256 | None = None  # of the config that it acted with and of the processors' files
+    base: str | None = None  # what adapters are loaded on: a folder or USER/NAME@REVISION
+    is_in_training: bool = False  # its weights are in no file
+    # of episodes that it acted in at once; a policy's arithmetic rounds otherwise in a batch of another size
+    batch_size: Count | None = None
+    batch_row: Natural | None = None  # which of them this one was
+    interventions: tuple[str, ...] = ()  # steps of its preprocessor that change on purpose what it is shown
+
+    def describe(self) -> str:
+        """'act outputs/act (weights 0123456789ab, settings 0123456789ab)', 'act'."""
+        revision = f"@{self.revision}" if self.revision else ""
+        sums = {"weights": self.weights_sha256, "settings": self.settings_sha256}
+        notes = [f"{name} {sha256[:SHOWN_DIGITS]}" for name, sha256 in sums.items() if sha256]
+        notes += [f"adapters of {self.base}"] if self.base else []
+        notes += ["in training"] if self.is_in_training else []
+        notes += [f"with {name}" for name in self.interventions]
+        words = [self.type, *([f"{self.path}{revision}"] if self.path else [])]
+        return " ".join([*words, *([f"({', '.join(notes)})"] if notes else [])])
+
+    @property
+    def key(self) -> str:
+        """Text that is equal for the same weights with the same settings, wherever they lie."""
+        values = (self.type, self.weights_sha256, self.settings_sha256, self.base, self.is_in_training)
+        return json_list(*values, *((self.path, self.revision) if self.weights_sha256 is None else ()))
+
+
+def describe_versions(versions: Mapping[str, str | None]) -> str:
+    """'gym-pusht 0.1.8, pymunk 6.11.1': what the bits of an episode depend on."""
+    return ", ".join(f"{name} {version or '?'}" for name, version in versions.items())

@@ -1,0 +1,106 @@
+"""Record of an episode of `bomb_pusht`: what it must say, and what records say together."""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from functools import partial
+from typing import Annotated, ClassVar, Self
+
+import numpy as np
+
+from lerobot_bomb import __version__
+from lerobot_bomb.bootstrap import bca_interval, format_bounds
+from lerobot_bomb.pusht.episode import (
+    ALMOST_COVERAGE,
+    IMAGE_SIZE,
+    MAX_IMAGE_SIZE,
+    MIN_IMAGE_SIZE,
+    PUSHT_PROTOCOL_VERSION,
+    SUCCESS_COVERAGE,
+    PushTFailure,
+    PushTSpec,
+)
+from lerobot_bomb.pusht.perturbations import PushTCondition
+from lerobot_bomb.results import schema
+from lerobot_bomb.results.means import mean_of
+from lerobot_bomb.results.origin import (
+    PolicyIdentity,
+    describe_versions,
+    installed_version,
+    installed_versions,
+    machine_name,
+)
+from lerobot_bomb.results.record import Record
+from lerobot_bomb.results.schema import Count, Natural
+
+# what the bits of an episode depend on
+SIMULATOR = ("gym-pusht", "pymunk", "pygame", "opencv-python-headless")
+# rounding may take a covered area past the target's
+Coverage = Annotated[float, schema.between(0, 1 + 1e-9)]
+
+
+@dataclass(frozen=True, kw_only=True)
+class PushTResult(Record):
+    """Outcome of one episode."""
+
+    env_type: ClassVar = "bomb_pusht"
+    condition: ClassVar = PushTCondition
+    versions: ClassVar = {PUSHT_PROTOCOL_VERSION: ()}
+    tasks: ClassVar = ("pusht",)
+    measures: ClassVar = (
+        mean_of("max_coverage", "max coverage", "mean, 95 % bootstrap interval over episodes"),
+        mean_of("coverage", "final coverage"),
+    )
+
+    spec: PushTSpec
+    instruction: str
+    goal_pose: tuple[float, float, float]  # x, y in pixels of the board, radians
+    steps: Count
+    is_success: bool
+    failure: Annotated[str, schema.among(PushTFailure)] | None
+    coverage: Coverage  # share of the target that the block covers at the end
+    max_coverage: Coverage  # the largest after any step
+    levels: dict[str, Natural] = field(default_factory=dict)  # of the perturbation axes that were on
+    image_size: Annotated[int, schema.between(MIN_IMAGE_SIZE, MAX_IMAGE_SIZE)] = IMAGE_SIZE
+    policy: PolicyIdentity | None = None  # None: not known
+    simulator_versions: dict[str, str | None] = field(default_factory=partial(installed_versions, SIMULATOR))
+    machine: str = field(default_factory=machine_name)
+    lerobot_version: str | None = field(default_factory=partial(installed_version, "lerobot"))
+    torch_version: str | None = field(default_factory=partial(installed_version, "torch"))
+    package_version: str = __version__
+    protocol_version: str = PUSHT_PROTOCOL_VERSION
+
+    def check_episode(self) -> None:
+        self.refuse_if(self.steps > self.spec.max_steps, "steps", "spec.max_steps")
+        self.refuse_if(self.coverage > self.max_coverage, "coverage", "max_coverage")
+        is_covered = self.coverage > SUCCESS_COVERAGE
+        self.refuse_if(is_covered != self.is_success, "coverage", "is_success")
+        is_almost = self.failure == PushTFailure.ALMOST and self.coverage < ALMOST_COVERAGE
+        self.refuse_if(is_almost, "coverage", "failure")
+
+    def settings(self) -> dict[str, str]:
+        return {"simulator": describe_versions(self.simulator_versions)}
+
+    @classmethod
+    def describe_simulator(cls, settings: Mapping[str, str]) -> str:
+        return settings["simulator"]
+
+    @classmethod
+    def describe_tasks(cls, records: Sequence[Self]) -> str:
+        return "task pusht"
+
+    def benchmark(self) -> str:
+        return f"PushT with BOMB's axes, protocol {PUSHT_PROTOCOL_VERSION}"
+
+    @classmethod
+    def eval_flags(cls, records: Sequence[Self]) -> list[str]:
+        first = records[0]
+        flags = {"instruction": first.spec.instruction, "max_steps": first.spec.max_steps}
+        flags |= {"image_size": first.image_size}
+        return [f"--env.type={cls.env_type}", *(f"--env.{name}={value}" for name, value in flags.items())]
+
+    @classmethod
+    def describe_change(cls, pairs: Sequence[tuple[Self, Self]]) -> str:
+        """'max coverage -0.120 [-0.200, -0.040]': the mean change of (unperturbed, perturbed) pairs."""
+        changes = np.array([after.max_coverage - before.max_coverage for before, after in pairs])
+        interval = bca_interval(changes, np.ones(len(pairs)))
+        return f"max coverage {changes.mean():+.3f}{format_bounds(interval, '+.3f')}"

@@ -1,0 +1,232 @@
+"""Record of an episode in a results file: what those of all environments have.
+
+Simulator workers import this module, so it imports neither torch nor LeRobot.
+"""
+
+import dataclasses
+import json
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import dataclass, replace
+from functools import cache
+from operator import attrgetter
+from typing import Any, ClassVar, Protocol, Self
+
+from lerobot_bomb.bomb.environment import Environment
+from lerobot_bomb.conditions import AxisCondition
+from lerobot_bomb.results.inference import Inference
+from lerobot_bomb.results.origin import PolicyIdentity
+from lerobot_bomb.results.schema import SHOWN_CHARACTERS, Natural, Quantity
+
+NOT_RECORDED = "not recorded"
+NO_VALUE = "-"  # of a measure that these episodes do not have
+MAX_RUNS = 10  # of numbers, in a heading
+
+# of a record: who acted, with which tasks beside, and what simulated; the rest is the episode
+ORIGIN = {
+    "policy", "task_ids", "opengl_vendor", "opengl_renderer", "machine", "mujoco_version",
+    "simulator_versions", "lerobot_version", "torch_version", "package_version", "task_version",
+    "protocol_version",
+}  # fmt: skip
+# of a record: what an episode that is run again, bit for bit, has otherwise
+MEASURED = {"inference"}
+
+
+class Spec(Protocol):
+    """What determines an episode."""
+
+    @property
+    def seed(self) -> int: ...
+    @property
+    def perturbations(self) -> str: ...
+
+
+@dataclass(frozen=True)
+class Measure:
+    """A figure of episodes beside their rate of success."""
+
+    name: str
+    value: Callable[[Sequence[Any]], str]  # of records, with its unit
+    note: str = ""  # what it is of
+
+
+@dataclass(frozen=True, kw_only=True)
+class Record:
+    """Result of an episode.
+
+    A subclass for each environment names all fields, in the order in which they are written; those that it
+    does not name come last. Reading checks a field by its type. A new field goes into `earlier`.
+    """
+
+    env_type: ClassVar[str]
+    condition: ClassVar[type[AxisCondition]]  # its perturbations
+    # {protocol version: fields that its records lack}, the oldest first; it is how records are known, so no
+    # two environments share one
+    versions: ClassVar[Mapping[str, tuple[str, ...]]]
+    # {field that records of earlier releases lack: its value in them}
+    earlier: ClassVar[Mapping[str, Any]] = {
+        "action_j2": None,
+        "action_j3": None,
+        "inference": None,
+        "policy.batch_size": None,
+        "policy.batch_row": None,
+        "policy.interventions": (),
+    }
+    # of a spec, what may differ between episodes that are pooled, beside seed and perturbations
+    drawn: ClassVar[tuple[str, ...]] = ()
+    # of a spec, what episodes have in common that start alike: they are not independent
+    start: ClassVar[tuple[str, ...]] = ("seed",)
+    tasks: ClassVar[Sequence[str]]  # values of --env.task
+    measures: ClassVar[Sequence[Measure]] = ()
+    has_results_path: ClassVar[bool] = True  # lerobot-eval writes the records, with --env.results_path
+    # an episode's number in its evaluation chooses how it starts, not its seed: in batches of one
+    starts_by_number: ClassVar[bool] = False
+
+    spec: Spec
+    is_success: bool
+    failure: str | None
+    levels: dict[str, Natural]
+    image_size: int | str
+    policy: PolicyIdentity | None
+    machine: str
+    lerobot_version: str | None
+    torch_version: str | None
+    package_version: str
+    protocol_version: str
+    # mean differences of the executed actions, per step and without the gripper; None: fewer than four
+    action_j2: Quantity | None = None
+    action_j3: Quantity | None = None
+    inference: Inference | None = None  # None: no network was asked, or it was not measured
+
+    def as_json(self) -> dict[str, Any]:
+        """Return the fields as a record has them, in its order."""
+        values = dataclasses.asdict(self)
+        return {name: values[name] for name in field_names(type(self))}
+
+    def to_json(self) -> str:
+        """Return the record, a line of JSON.
+
+        Raises:
+            ValueError: a number is not finite.
+        """
+        return json.dumps(self.as_json(), allow_nan=False)
+
+    def check(self) -> None:
+        """Raise a ValueError unless there can be such an episode, whose fields are possible one by one."""
+        policy, inference = self.policy, self.inference
+        if policy is not None and policy.batch_row is not None and policy.batch_size is not None:
+            self.refuse_if(policy.batch_row >= policy.batch_size, "policy.batch_row", "policy.batch_size")
+        if self.is_success != (self.failure is None):
+            raise ValueError(f"is_success={self.is_success} with failure={self.failure!r}")
+        self.check_episode()
+        self._check_levels()
+        if inference is not None:
+            p50, p95 = "inference.latency_p50_ms", "inference.latency_p95_ms"
+            self.refuse_if(inference.latency_p50_ms > inference.latency_p95_ms, p50, p95)
+            is_too_often = inference.num_queries > getattr(self, "steps", inference.num_queries)
+            self.refuse_if(is_too_often, "inference.num_queries", "steps")
+
+    def check_episode(self) -> None:
+        """Raise a ValueError that names fields of this environment which contradict each other."""
+
+    def refuse_if(self, is_impossible: bool, first: str, *others: str) -> None:
+        """Raise a ValueError that shows fields which, each possible, are not so together."""
+        if is_impossible:
+            values = {name: json.dumps(attrgetter(name)(self)) for name in (first, *others)}
+            shown = [f"{name}={value[:SHOWN_CHARACTERS]}" for name, value in values.items()]
+            raise ValueError(f"{shown[0]} is impossible{' with ' * bool(others)}{', '.join(shown[1:])}")
+
+    def _check_levels(self) -> None:
+        ranges = self.condition.parse(self.spec.perturbations).ranges
+        asked = {axis: (low, high) for axis, low, high in ranges}
+        off = (0, 0)  # of an axis that is not in the condition
+        for axis in (*self.levels, *asked):
+            low, high = asked.get(axis, off)
+            if not low <= self.levels.get(axis, 0) <= high:
+                raise ValueError(
+                    f"levels={json.dumps(self.levels)} with spec.perturbations={self.spec.perturbations}"
+                )
+
+    def describe_policy(self) -> str:
+        """Describe who acted, as far as the record says it."""
+        return NOT_RECORDED if self.policy is None else self.policy.describe()
+
+    @property
+    def start_key(self) -> tuple[Any, ...]:
+        """Key that is equal for records that are not independent."""
+        return tuple([getattr(self.spec, name) for name in self.start])
+
+    def settings(self) -> dict[str, str]:
+        """Return what must be equal in episodes that are pooled, beside spec, policy, protocol and images."""
+        raise NotImplementedError
+
+    @classmethod
+    def describe_simulator(cls, settings: Mapping[str, str]) -> str:
+        """Describe, of these settings, what simulated and drew."""
+        raise NotImplementedError
+
+    @classmethod
+    def describe_tasks(cls, records: Sequence[Self]) -> str:
+        """Describe the tasks of episodes: 'libero_spatial tasks 0..2'."""
+        raise NotImplementedError
+
+    def environment(self) -> Environment | None:
+        """Return the environment of BOMB that it was; None: checkpoints of our types know of no such one."""
+        return None
+
+    def benchmark(self) -> str:
+        """Name the benchmark with its version, for a model card."""
+        raise NotImplementedError
+
+    @classmethod
+    def eval_flags(cls, records: Sequence[Self]) -> list[str]:
+        """Return lerobot-eval's flags for the environment and tasks of episodes."""
+        raise NotImplementedError
+
+    @classmethod
+    def describe_change(cls, pairs: Sequence[tuple[Self, Self]]) -> str:
+        """Describe what the second records of pairs have beside other successes; '': nothing."""
+        return ""
+
+
+@cache
+def field_names(record_type: type[Record]) -> tuple[str, ...]:
+    """Names of the fields in the order in which they are written."""
+    known = {each.name for each in dataclasses.fields(record_type)}
+    named = (name for base in record_type.__mro__ for name in vars(base).get("__annotations__", ()))
+    return tuple(dict.fromkeys(name for name in named if name in known))
+
+
+def without_measured[R: Record](record: R) -> R:
+    """Return a record without what is another when its episode is run again."""
+    return replace(record, **dict.fromkeys(MEASURED))
+
+
+def outcome_fields(record: Record) -> list[str]:
+    """Names of what was asked and its outcome: not which policy acted, where, and how long that took.
+
+    Without what the record, of an earlier release, does not say.
+    """
+    missing = object()
+    return [
+        name
+        for name in field_names(type(record))
+        if name not in ORIGIN | MEASURED and getattr(record, name) != record.earlier.get(name, missing)
+    ]
+
+
+def different_fields(record: Record, other: Record) -> list[str]:
+    """Return the names of the fields of the outcome that differ between two records of one episode."""
+    return [name for name in outcome_fields(record) if getattr(record, name) != getattr(other, name, None)]
+
+
+def describe_numbers(numbers: Iterable[int]) -> str:
+    """{0, 1, 2, 7} -> '0..2, 7'; of many runs, the first and the last number."""
+    runs: list[list[int]] = []
+    for number in sorted(set(numbers)):
+        if runs and number == runs[-1][-1] + 1:
+            runs[-1].append(number)
+        else:
+            runs.append([number])
+    if len(runs) > MAX_RUNS:
+        return f"{runs[0][0]}..{runs[-1][-1]}, with gaps"
+    return ", ".join(str(run[0]) if len(run) == 1 else f"{run[0]}..{run[-1]}" for run in runs)

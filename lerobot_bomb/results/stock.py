@@ -1,0 +1,118 @@
+"""Records of episodes of LeRobot's own `pusht` and `libero`, of which lerobot-eval itself tells little."""
+
+import json
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from functools import partial
+from typing import Annotated, Any, ClassVar, Self
+
+from lerobot_bomb import __version__
+from lerobot_bomb.conditions import NONE, Axis, AxisCondition
+from lerobot_bomb.libero.assets import SUITES
+from lerobot_bomb.results import schema
+from lerobot_bomb.results.libero import describe_numbered_tasks, task_flags
+from lerobot_bomb.results.means import mean_of
+from lerobot_bomb.results.origin import PolicyIdentity, describe_versions, installed_version, machine_name
+from lerobot_bomb.results.record import Record
+from lerobot_bomb.results.schema import Natural
+
+FAILED = "failed"  # the only class: why is not known
+
+
+class NoCondition(AxisCondition):
+    """Condition of an environment without perturbation axes: `none` only."""
+
+    axes: ClassVar[Mapping[str, Axis]] = {}
+
+
+@dataclass(frozen=True)
+class StockSpec:
+    """Episode of an evaluation, as far as LeRobot tells which one it was."""
+
+    seed: Natural
+    suite: str  # what LeRobot calls a group of tasks
+    task_id: Natural
+    number: Natural | None  # in the evaluation, where that chooses how it starts; None: the seed does
+    perturbations: Annotated[str, schema.among((NONE,))] = NONE  # there are no others
+
+
+@dataclass(frozen=True, kw_only=True)
+class StockResult(Record):
+    """Outcome of one episode; a subclass for each environment."""
+
+    condition: ClassVar = NoCondition
+    drawn: ClassVar = ("task_id", "number")
+    start: ClassVar = ("seed", "task_id")  # tasks have scenes of their own
+    measures: ClassVar = (
+        mean_of("max_reward", "max reward", "mean over episodes"),
+        mean_of("sum_reward", "sum of rewards", "mean over episodes"),
+    )
+    has_results_path: ClassVar = False
+
+    spec: StockSpec
+    sum_reward: float
+    max_reward: float
+    is_success: bool
+    failure: Annotated[str, schema.among((FAILED,))] | None
+    image_size: str  # width and height in pixels
+    flags: dict[str, Any]  # of the environment, that decide what an episode is
+    simulator_versions: dict[str, str | None]
+    protocol_version: str
+    policy: PolicyIdentity | None = None  # None: not known
+    levels: dict[str, Natural] = field(default_factory=dict)  # of perturbation axes: none
+    machine: str = field(default_factory=machine_name)
+    lerobot_version: str | None = field(default_factory=partial(installed_version, "lerobot"))
+    torch_version: str | None = field(default_factory=partial(installed_version, "torch"))
+    package_version: str = __version__
+
+    def settings(self) -> dict[str, str]:
+        flags = {name: json.dumps(value) for name, value in sorted(self.flags.items()) if value is not None}
+        return {"simulator": describe_versions(self.simulator_versions), **flags}
+
+    @classmethod
+    def describe_simulator(cls, settings: Mapping[str, str]) -> str:
+        return settings["simulator"]
+
+    @classmethod
+    def describe_tasks(cls, records: Sequence[Self]) -> str:
+        return describe_numbered_tasks([each.spec for each in records])
+
+    def benchmark(self) -> str:
+        return f"LeRobot's {self.env_type}"
+
+    @classmethod
+    def eval_flags(cls, records: Sequence[Self]) -> list[str]:
+        flags = {name: value for name, value in records[0].flags.items() if value is not None}
+        flags |= task_flags([each.spec for each in records]) if cls.starts_by_number else {}
+        return [
+            f"--env.type={cls.env_type}",
+            *(f"--env.{name}={_flag_value(value)}" for name, value in flags.items()),
+            "--eval.use_async_envs=false",
+        ]
+
+
+def _flag_value(value: Any) -> str:
+    return value if isinstance(value, str) else json.dumps(value)
+
+
+@dataclass(frozen=True, kw_only=True)
+class StockPushTResult(StockResult):
+    """Outcome of one episode of `pusht`."""
+
+    env_type: ClassVar = "pusht"
+    versions: ClassVar = {"lerobot-pusht-1.0": ()}
+    tasks: ClassVar = ("PushT-v0",)
+
+    protocol_version: str = "lerobot-pusht-1.0"
+
+
+@dataclass(frozen=True, kw_only=True)
+class StockLiberoResult(StockResult):
+    """Outcome of one episode of `libero`; its task, not its flags, says the suite."""
+
+    env_type: ClassVar = "libero"
+    versions: ClassVar = {"lerobot-libero-1.0": ()}
+    tasks: ClassVar = SUITES
+    starts_by_number: ClassVar = True
+
+    protocol_version: str = "lerobot-libero-1.0"
