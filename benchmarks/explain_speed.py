@@ -21,11 +21,11 @@ from lerobot_bomb.bomb.observation import RenderOptions
 from lerobot_bomb.commands.arguments import checkpoint_flag
 from lerobot_bomb.envs.rollout import make_env
 from lerobot_bomb.explain.activations import all_heads
-from lerobot_bomb.explain.explained import repeated
 from lerobot_bomb.explain.images import filling, patch_masks
-from lerobot_bomb.explain.other_policies import explained
+from lerobot_bomb.explain.other_policies import scored
 from lerobot_bomb.explain.question import Question
 from lerobot_bomb.explain.restoration import Corruption
+from lerobot_bomb.explain.scored_policy import repeated
 from lerobot_bomb.tables import print_table
 from lerobot_bomb.viewing.checkpoint import load_policy
 
@@ -49,7 +49,7 @@ def main() -> None:
     with closing(make_env(spec, RenderOptions(args.image_size))) as env:
         observed, _ = env.reset(seed=spec.seed)
         raw = policy.observe([observed], [env.get_wrapper_attr("task_description")])
-    asked = explained(policy.policy, policy.postprocess)
+    asked = scored(policy.policy, policy.postprocess)
     keys = [key for key in raw if key.startswith("observation.images.")]
     num_rows = len(keys) * GRID**2
     question = Question(asked, policy.prepare, raw, batch_size=num_rows)

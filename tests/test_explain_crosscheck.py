@@ -30,7 +30,7 @@ def test_patches_are_captums_occlusion(name: str) -> None:
 
     def score(images: Tensor) -> Tensor:
         rows = question.encode({WORKSPACE: images}, len(images))
-        return question.explained.score(rows, question.answer)
+        return question.policy.score(rows, question.answer)
 
     with torch.no_grad():
         expected = Occlusion(score).attribute(
@@ -50,7 +50,7 @@ def test_patches_are_captums_occlusion(name: str) -> None:
 def test_heads_are_what_nnsight_puts_back(name: str) -> None:
     question = ask(loaded(name))
     corruption = Corruption(question, without_image(question))
-    scores = corruption.restore([[unit] for unit in all_heads(question.explained.layers)]).scores
+    scores = corruption.restore([[unit] for unit in all_heads(question.policy.layers)]).scores
     printed = subprocess.run(
         [sys.executable, SCRIPT, name],
         check=True,
