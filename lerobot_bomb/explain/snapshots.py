@@ -1,4 +1,4 @@
-"""An episode as a policy plays it, and the moments of it that are worth an explanation."""
+"""An episode as a policy runs in it, and its moments that are worth an explanation."""
 
 from collections.abc import Mapping
 from contextlib import closing
