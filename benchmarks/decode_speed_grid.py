@@ -109,10 +109,10 @@ def num_slots(policy: SpatialvlaGridPolicy) -> int:
 
 def choose(policy: SpatialvlaGridPolicy, draft: str, batch: dict[str, Any]) -> Timed:
     """The policy's own way."""
-    policy._writer.drafted = draft != "none"
+    policy._decoder.drafted = draft != "none"
     started = time.perf_counter()
     with _moments_of_passes() as moments_s:
-        cells_BTG = policy._choose(batch, policy.config.chunk_size)
+        cells_BTG = policy.choose(batch, policy.config.chunk_size)
         ended = time.perf_counter()
     return Timed(cells_BTG.flatten(1), moments_s[0] - started, ended - moments_s[0], len(moments_s))
 
@@ -151,7 +151,7 @@ class StockGenerate:
 
     def inputs(self, batch: dict[str, Any]) -> dict[str, Tensor]:
         """The policy's prompt, padded on the left, and images, as the stock model reads them."""
-        policy, prompt = self._policy, self._policy._prompt(batch)
+        policy, prompt = self._policy, self._policy.prompt(batch)
         ids, written = torch.zeros_like(prompt.ids), torch.zeros_like(prompt.ids)
         for row, kept in enumerate(prompt.mask):
             ids[row, -int(kept.sum()) :], written[row, -int(kept.sum()) :] = prompt.ids[row, kept], 1

@@ -145,12 +145,12 @@ def time_queries(policy: FdvlaPolicy, batches: list[dict[str, Any]]) -> Rows:
 
 def read_in_every_step(policy: FdvlaPolicy, batch: dict[str, Any], *, sees_once: bool) -> Tensor:
     """The language model reads the prompt anew in every step; the vision model, too, unless it sees once."""
-    embed = policy._embeds
-    with policy._autocast(), torch.no_grad():
+    embed = policy.embed
+    with policy.autocast(), torch.no_grad():
         if sees_once:
-            embeds = embed(batch, policy._prompt(batch)[0].ids)
+            embeds = embed(batch, policy.prompt(batch).ids)
             embed = lambda *_: embeds  # noqa: E731
-        with patch.object(policy, "_embeds", embed):
+        with patch.object(policy, "embed", embed):
 
             def heads(actions: Tensor, tau: Tensor) -> tuple[Tensor | None, Tensor | None]:
                 return policy._heads(policy._read(batch))(actions, tau)

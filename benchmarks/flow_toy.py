@@ -143,7 +143,7 @@ def train(variant: Variant, num_steps: int, seed: int) -> Toy:
     toy, generator = Toy(variant), torch.Generator().manual_seed(seed)
     optimizer = torch.optim.AdamW(toy.parameters(), LEARNING_RATE)
     scheduler = CosineAnnealingLR(optimizer, num_steps)
-    kept_BK = torch.ones(BATCH_SIZE, 1, dtype=torch.bool)
+    loss_mask_BK = torch.ones(BATCH_SIZE, 1, dtype=torch.bool)
     for _ in range(num_steps):
         words_B = torch.randint(len(WORDS), (BATCH_SIZE,), generator=generator)
         z_BKD = torch.randn(BATCH_SIZE, 1, 2, generator=generator)
@@ -151,7 +151,7 @@ def train(variant: Variant, num_steps: int, seed: int) -> Toy:
         point = path_point(draw_points(words_B, generator), z_BKD, tau_B)
         velocity_BKD, noise_BKD = toy(words_B, point.actions, point.tau)
         weight = CONSISTENCY_LOSS_WEIGHT if variant.use_flow_head and variant.use_denoise_head else 0.0
-        loss, _ = joint_loss(velocity_BKD, noise_BKD, point, kept_BK, consistency_loss_weight=weight)
+        loss, _ = joint_loss(velocity_BKD, noise_BKD, point, loss_mask_BK, consistency_loss_weight=weight)
         optimizer.zero_grad()
         loss.backward()
         optimizer.step()

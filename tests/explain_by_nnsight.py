@@ -23,7 +23,7 @@ class Scored(nn.Module):
         self.policy, self._question = policy, question
 
     def forward(self, **rows: Tensor) -> Tensor:
-        return self._question.explained.score(rows, self._question.answer)
+        return self._question.policy.score(rows, self._question.answer)
 
 
 def scores_of(name: str) -> list[list[float]]:
@@ -33,7 +33,7 @@ def scores_of(name: str) -> list[list[float]]:
     corrupt = without_image(question)
     model: Any = NNsight(Scored(question, policy))
     text_model = f"policy.backbone.vlm.model.{policy.backbone.text_model_name}"
-    layers = question.explained.layers
+    layers = question.policy.layers
     scores = []
     with torch.no_grad():
         for number, layer in enumerate(layers):

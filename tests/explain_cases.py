@@ -13,11 +13,11 @@ from lerobot_bomb.bomb.episode import EpisodeSpec
 from lerobot_bomb.bomb.observation import RenderOptions
 from lerobot_bomb.checkpoints.shipped import checkpoint_path, shipped_names
 from lerobot_bomb.envs.rollout import expert_agent, make_env, play
-from lerobot_bomb.explain.explained import Explained
 from lerobot_bomb.explain.images import filling
-from lerobot_bomb.explain.moment import Asked
-from lerobot_bomb.explain.other_policies import explained
+from lerobot_bomb.explain.moment import Query
+from lerobot_bomb.explain.other_policies import scored
 from lerobot_bomb.explain.question import Question
+from lerobot_bomb.explain.scored_policy import ScoredPolicy
 from lerobot_bomb.explain.spans import difference, token_offsets
 from lerobot_bomb.viewing.checkpoint import LoadedPolicy, load_policy
 
@@ -39,9 +39,9 @@ def fresh(name: str, device: str = "cpu") -> LoadedPolicy:
 loaded = cache(fresh)
 
 
-def explained_by(policy: LoadedPolicy) -> Explained:
+def scored_by(policy: LoadedPolicy) -> ScoredPolicy:
     """Explain the policy as it says how."""
-    return explained(policy.policy, policy.postprocess)
+    return scored(policy.policy, policy.postprocess)
 
 
 @cache
@@ -61,19 +61,19 @@ def ask(
     policy: LoadedPolicy,
     prepare: Callable[[dict[str, Any]], dict[str, Any]] | None = None,
     batch_size: int = 64,
-    of: Explained | None = None,
+    of: ScoredPolicy | None = None,
 ) -> Question:
     """The observation, asked of a policy; ``prepare``: what stands for its preprocessor."""
     observation, instruction, _, _ = moment()
     raw = policy.observe([observation], [instruction])
-    return Question(of or explained_by(policy), prepare or policy.prepare, raw, batch_size)
+    return Question(of or scored_by(policy), prepare or policy.prepare, raw, batch_size)
 
 
-def asked(policy: LoadedPolicy) -> Asked:
+def query(policy: LoadedPolicy) -> Query:
     """Patches, the words of the target and of the colour."""
     _, instruction, _, others = moment()
     spans = [difference(word, instruction, other) for word, (other, _) in others.items()]
-    return Asked(
+    return Query(
         grid=GRID,
         fill="mean",
         spans=[span for span in spans if span is not None],

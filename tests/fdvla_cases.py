@@ -57,7 +57,7 @@ def make_batch(
 ) -> dict[str, Any]:
     """Preprocessed, the instructions of different lengths."""
     generator = torch.Generator().manual_seed(seed)
-    num_dims = policy._action_dim
+    num_dims = policy.action_dim
     shape = batch_size, policy.config.chunk_size, num_dims
     raw: dict[str, Any] = {
         "observation.state": torch.randn(batch_size, STATE_DIMS, generator=generator),

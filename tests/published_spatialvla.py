@@ -259,4 +259,4 @@ def observations(num: int, seed: int = 0) -> dict[str, Any]:
 
 def cells_of(policy: SpatialvlaGridPolicy, batch: dict[str, Any]) -> Tensor:
     """(B, 12), as the original numbers them."""
-    return (policy._choose(batch, policy.config.chunk_size) + policy.first_cells).flatten(1)
+    return (policy.choose(batch, policy.config.chunk_size) + policy.first_cells).flatten(1)

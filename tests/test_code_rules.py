@@ -23,3 +23,16 @@ def test_no_docstring_opens_with_a_fragment() -> None:
                 if docstring and FRAGMENT.match(docstring):
                     fragments.append(f"{path.relative_to(ROOT)}: {docstring.splitlines()[0]}")
     assert num_docstrings > 1000 and not fragments
+
+
+def test_scores_of_a_policy_reach_into_none_of_its_private_members() -> None:
+    paths = [*(ROOT / "lerobot_bomb" / "explain").glob("*.py"), *(ROOT / "policies").glob("*/scored_*.py")]
+    reached = [
+        f"{path.relative_to(ROOT)}: {ast.unparse(node)}"
+        for path in paths
+        for node in ast.walk(ast.parse(path.read_text()))
+        if isinstance(node, ast.Attribute)
+        and re.match(r"_(?!_)", node.attr)
+        and ast.unparse(node.value) != "self"
+    ]
+    assert len(paths) > 20 and not reached

@@ -66,7 +66,7 @@ def test_a_converted_checkpoint_chooses_the_cells_of_the_authors_classes(
     with np.load(folder / "expected.npz") as arrays:
         images = torch.from_numpy(arrays["images"]).permute(0, 3, 1, 2) / 255
         batch = preprocessor({CAMERA: images, "task": [TASK] * len(images)})
-        np.testing.assert_array_equal(policy._prompt(batch).ids, arrays["prompt_ids"])
+        np.testing.assert_array_equal(policy.prompt(batch).ids, arrays["prompt_ids"])
         np.testing.assert_array_equal(cells_of(policy, batch), arrays[expected])
         if not flags:
             logits = first_logits(policy, batch)
@@ -96,7 +96,7 @@ def test_the_slides_question_is_a_flag_that_the_checkpoint_keeps(
     policy, preprocessor, _ = load(asked)
     assert policy.config.task_template == QUESTION
     batch = preprocessor(dict(raw))
-    np.testing.assert_array_equal(policy._prompt(batch).ids, ids)
+    np.testing.assert_array_equal(policy.prompt(batch).ids, ids)
     np.testing.assert_allclose(first_logits(policy, batch), expected, rtol=0, atol=2e-5)
     other, preprocessor, _ = load(bare)
     assert other.config.task_template == "{}"

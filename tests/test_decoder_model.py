@@ -250,9 +250,11 @@ def test_fast_layers_compute_what_the_plain_ones_do_and_those_what_the_model_doe
         torch.testing.assert_close(states, plain, rtol=0, atol=1e-4)
 
 
-def states_of_stock(model: Any, embeds: Tensor, position_L: Tensor, reads_BLL: Tensor) -> Tensor:
+def states_of_stock(model: Any, embeds: Tensor, position_L: Tensor, attention_mask_BLL: Tensor) -> Tensor:
     """Return the states that transformers computes, with a mask of its own for each row."""
-    mask = torch.zeros(reads_BLL.shape).masked_fill(~reads_BLL, torch.finfo(torch.float32).min)[:, None]
+    mask = torch.zeros(attention_mask_BLL.shape).masked_fill(
+        ~attention_mask_BLL, torch.finfo(torch.float32).min
+    )[:, None]
     is_gemma = model.config.model_type.startswith("gemma2")
     return model(
         inputs_embeds=embeds,

@@ -5,16 +5,16 @@ from typing import Any
 
 import pytest
 import torch
-from explain_cases import NAMES, WORKSPACE, WRIST, ask, asked, explained_by, loaded, moment, without_image
+from explain_cases import NAMES, WORKSPACE, WRIST, ask, loaded, moment, query, scored_by, without_image
 from torch import Tensor
 from torch.nn.functional import pad
 
 from lerobot_bomb.explain.activations import LAYER, PARTS, Unit, all_heads, all_layers, all_mlps, recording
-from lerobot_bomb.explain.explained import repeated
 from lerobot_bomb.explain.images import filling, occluded, patch_masks
 from lerobot_bomb.explain.moment import OTHER_INSTRUCTION, explain
 from lerobot_bomb.explain.question import Question
 from lerobot_bomb.explain.restoration import Corruption, Restoration
+from lerobot_bomb.explain.scored_policy import repeated
 from lerobot_bomb.explain.spans import difference, span_of, spans_of_words, token_offsets
 
 pytestmark = pytest.mark.usefixtures("loaded_policies")
@@ -75,14 +75,14 @@ def test_the_fast_way_gives_what_the_slow_one_does(name: str) -> None:
     fast = question.effects_of_masks(WORKSPACE, masks, filled)
     for effect, changed in zip(fast, occluded(image, masks, filled), strict=True):
         slow = Question(
-            question.explained, loaded(name).prepare, question.observation | {WORKSPACE: changed[None]}
+            question.policy, loaded(name).prepare, question.observation | {WORKSPACE: changed[None]}
         )
-        score = question.explained.score(slow.rows, question.answer)
+        score = question.policy.score(slow.rows, question.answer)
         assert close(effect, question.clean_score - score, question)
     offsets = token_offsets(loaded(name).prepare.steps, moment()[1])
     hidden = span_of("black", moment()[1]).tokens(offsets)[None]
-    batch = question.explained.hide_in(loaded(name).prepare(question.observation), hidden[0])
-    score = question.explained.score(question.explained.encode(batch), question.answer)
+    batch = question.policy.hide_in(loaded(name).prepare(question.observation), hidden[0])
+    score = question.policy.score(question.policy.encode(batch), question.answer)
     assert close(question.effects_of_hidden(hidden), question.clean_score - score, question)
 
 
@@ -90,7 +90,7 @@ def test_the_fast_way_gives_what_the_slow_one_does(name: str) -> None:
 def test_the_clean_answer_is_the_policys(name: str) -> None:
     policy, question = loaded(name), ask(loaded(name))
     policy.begin()
-    again = question.explained.answer(policy.prepare(question.observation))
+    again = question.policy.answer(policy.prepare(question.observation))
     assert torch.equal(again, question.answer)
 
 
@@ -111,12 +111,12 @@ def with_hidden_word(name: str) -> Corruption:
     span = difference("column", instruction, others["column"][0])
     assert span is not None
     hidden = span.tokens(token_offsets(loaded(name).prepare.steps, instruction))[None]
-    return Corruption(question, question.explained.hide(question.rows, hidden))
+    return Corruption(question, question.policy.hide(question.rows, hidden))
 
 
 @pytest.mark.parametrize("name", NAMES)
 def test_all_layers_put_back_are_the_clean_score_and_corrupt_ones_the_corrupt_score(name: str) -> None:
-    layers = explained_by(loaded(name)).layers
+    layers = scored_by(loaded(name)).layers
     for corruption in corruptions(name):
         everything = [all_layers(len(layers))]
         restored = corruption.restore(everything)
@@ -131,7 +131,7 @@ def test_all_layers_put_back_are_the_clean_score_and_corrupt_ones_the_corrupt_sc
 @pytest.mark.parametrize("name", NAMES)
 def test_what_the_layers_make_of_the_words_that_are_left_is_put_back_token_by_token(name: str) -> None:
     corruption = with_hidden_word(name)
-    layers = explained_by(loaded(name)).layers
+    layers = scored_by(loaded(name)).layers
     restored = corruption.restore([all_layers(len(layers))])
     assert restored.is_defined
     # what is read off the prompt behind the layers does without the hidden word all the same
@@ -148,7 +148,7 @@ def layers_decide(name: str) -> bool:
 
 @pytest.mark.parametrize("name", NAMES)
 def test_any_one_layer_put_back_at_all_tokens_is_the_clean_score(name: str) -> None:
-    layers = explained_by(loaded(name)).layers
+    layers = scored_by(loaded(name)).layers
     for corruption in corruptions(name):
         assert corruption.restore_each(all_layers(len(layers))).tolist() == pytest.approx(
             [1] * len(layers), abs=1e-3
@@ -156,13 +156,13 @@ def test_any_one_layer_put_back_at_all_tokens_is_the_clean_score(name: str) -> N
 
 
 @pytest.mark.parametrize("name", NAMES)
-def test_the_places_are_all_of_the_sequence_but_what_never_changes(name: str) -> None:
+def test_the_spans_are_all_of_the_sequence_but_what_never_changes(name: str) -> None:
     corruption = corruptions(name)[0]
-    explained = explained_by(loaded(name))
+    explained = scored_by(loaded(name))
     rows = explained.encode(loaded(name).prepare(ask(loaded(name)).observation))
-    places = explained.places(rows)
-    assert {WORKSPACE, WRIST, "instruction", "answer"} <= places.keys()
-    units = [Unit(0, LAYER, place=place) for place in places.values()]
+    spans = explained.token_spans(rows)
+    assert {WORKSPACE, WRIST, "instruction", "answer"} <= spans.keys()
+    units = [Unit(0, LAYER, span=span) for span in spans.values()]
     # with the first layer's states put back everywhere, nothing corrupt is left
     assert float(corruption.restore([units]).ratios) == pytest.approx(1, abs=1e-3)
 
@@ -170,7 +170,7 @@ def test_the_places_are_all_of_the_sequence_but_what_never_changes(name: str) ->
 @pytest.mark.parametrize("name", NAMES)
 def test_units_put_back_in_a_batch_give_what_they_give_alone(name: str) -> None:
     corruption = corruptions(name)[1]
-    units = all_heads(explained_by(loaded(name)).layers)
+    units = all_heads(scored_by(loaded(name)).layers)
     alone = torch.cat([corruption.restore([[unit]]).scores for unit in units])
     together = corruption.restore([[unit] for unit in units]).scores
     torch.testing.assert_close(together, alone, rtol=1e-5, atol=1e-5)
@@ -188,7 +188,7 @@ def test_nothing_is_put_back_of_an_instruction_of_more_tokens(name: str) -> None
 
     others = {"longer": f"{instruction} please", "as long": moment()[3]["row"][0]}
     for other, is_put_back in zip(others.values(), (False, True), strict=True):
-        found = explain(ask(policy, prepare), replace(asked(policy), others={"other": other}))
+        found = explain(ask(policy, prepare), replace(query(policy), others={"other": other}))
         assert any(OTHER_INSTRUCTION in each.corruption for each in found.restored) == is_put_back
 
 
@@ -204,7 +204,7 @@ def test_hooks_are_gone_afterwards_also_after_an_error(name: str) -> None:
     before = hooks_of(name)
     corruption = corruptions(name)[0]
     corruption.restore_each(all_mlps(1))
-    layers = explained_by(loaded(name)).layers
+    layers = scored_by(loaded(name)).layers
     with pytest.raises(RuntimeError), recording(layers, PARTS):
         assert hooks_of(name) > before
         raise RuntimeError
@@ -228,6 +228,6 @@ def test_samples_are_not_explained() -> None:
     policy.config.temperature = 0.5
     try:
         with pytest.raises(ValueError, match=r"--policy\.temperature=0"):
-            policy.explained()
+            policy.scored()
     finally:
         policy.config.temperature = 0.0

@@ -31,7 +31,7 @@ def test_patches_are_captums_occlusion(name: str) -> None:
 
     def score(images: Tensor) -> Tensor:
         rows = question.encode({WORKSPACE: images}, len(images))
-        return question.explained.score(rows, question.answer)
+        return question.policy.score(rows, question.answer)
 
     with torch.no_grad():
         expected = Occlusion(score).attribute(
@@ -64,6 +64,6 @@ def by_nnsight() -> dict[str, list[list[float]]]:
 def test_heads_are_what_nnsight_puts_back(name: str, by_nnsight: dict[str, list[list[float]]]) -> None:
     question = ask(loaded(name))
     corruption = Corruption(question, without_image(question))
-    scores = corruption.restore([[unit] for unit in all_heads(question.explained.layers)]).scores
+    scores = corruption.restore([[unit] for unit in all_heads(question.policy.layers)]).scores
     expected = torch.tensor(by_nnsight[name]).flatten()
     torch.testing.assert_close(scores, expected, rtol=1e-5, atol=1e-5)

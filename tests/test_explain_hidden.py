@@ -5,7 +5,7 @@ from typing import Any
 
 import pytest
 import torch
-from explain_cases import NAMES, ask, explained_by, fresh, loaded, moment
+from explain_cases import NAMES, ask, fresh, loaded, moment, scored_by
 from torch import Tensor
 
 from lerobot_bomb.decoding.decoder import Prompt
@@ -16,6 +16,7 @@ from lerobot_bomb.decoding.kv_cache import CachedText
 from lerobot_bomb.decoding.slots import GraphSlots
 from lerobot_bomb.explain.masked_episodes import without_words
 from lerobot_bomb.explain.question import Question
+from lerobot_bomb.explain.scored_policy import ScoredPromptPolicy
 from lerobot_bomb.explain.spans import span_of, token_offsets
 from lerobot_bomb.viewing.checkpoint import LoadedPolicy
 from lerobot_bomb.vlm.qwen import Prefix
@@ -35,8 +36,8 @@ def hidden_word(policy: LoadedPolicy, word: str) -> Tensor:
 
 def columns_of(question: Question, hidden_1S: Tensor) -> list[int]:
     """Return the columns of hidden words in the whole prompt."""
-    names = question.explained._names  # pyright: ignore[reportAttributeAccessIssue]
-    first = int((question.rows["part"][0] == names.index("instruction")).nonzero()[0])
+    assert isinstance(question.policy, ScoredPromptPolicy)
+    first = question.policy.policy.layout.spans(question.rows["ids"].shape[1])["instruction"].start
     return (first + hidden_1S[0].nonzero()[:, 0]).tolist()
 
 
@@ -126,11 +127,11 @@ def test_a_hidden_word_is_masked_for_all_others_and_moves_none(name: str, word: 
     policy = fresh(name)
     question = ask(policy)
     hidden = hidden_word(policy, word)
-    rows = question.explained.hide(question.rows, hidden)
+    rows = question.policy.hide(question.rows, hidden)
     with torch.no_grad():
-        score = question.explained.score(rows, question.answer)
+        score = question.policy.score(rows, question.answer)
         STOCK[name](policy.policy, columns_of(question, hidden))
-        expected = question.explained.score(rows, question.answer)
+        expected = question.policy.score(rows, question.answer)
     assert abs(float(expected) - question.clean_score) > 1e-4
     torch.testing.assert_close(score, expected, rtol=1e-5, atol=1e-5)
 
@@ -141,7 +142,7 @@ def test_the_stock_model_agrees_where_nothing_is_hidden(name: str) -> None:
     question = ask(policy)
     STOCK[name](policy.policy, [])
     with torch.no_grad():
-        expected = question.explained.score(question.rows, question.answer)
+        expected = question.policy.score(question.rows, question.answer)
     assert float(expected) == pytest.approx(question.clean_score, rel=1e-5, abs=1e-5)
 
 
@@ -158,37 +159,39 @@ def hidden_batch(policy: LoadedPolicy, word: str) -> dict[str, Any]:
 def test_in_whole_episodes_the_same_tokens_are_hidden(name: str) -> None:
     policy = loaded(name)
     question = ask(policy)
-    rows = question.explained.encode(hidden_batch(policy, "3"))
-    expected = question.explained.hide(question.rows, hidden_word(policy, "3"))
+    rows = question.policy.encode(hidden_batch(policy, "3"))
+    expected = question.policy.hide(question.rows, hidden_word(policy, "3"))
     assert torch.equal(rows["hidden"], expected["hidden"]) and torch.equal(rows["mask"], expected["mask"])
 
 
 def written_by_graphs(policy: Any, batch: dict[str, Any]) -> Tensor:
     """Numbers by the passes that are recorded on CUDA, one after the other."""
-    prompt, grammar, backbone = policy._prompt(batch), policy.grammar, policy.backbone
+    prompt, grammar, backbone = policy.prompt(batch), policy.grammar, policy.backbone
     num_numbers = grammar.num_numbers
     num_columns = prompt.ids.shape[1] + grammar.max_symbols(num_numbers)
     layers = TextLayers(backbone.text_model, copy_dtype=torch.float32)
     text = CachedText(layers, 1, num_columns, policy._positions)
     rows = backbone.embed_tokens(policy.symbol_ids), backbone.vlm.lm_head.weight[policy.symbol_ids]
     recorded = GraphDecoder(grammar, LinearDraft(grammar, 4), *rows, text)
-    recorded(Prompt(policy._embeds(batch, prompt.ids), prompt.mask), *rows, num_numbers)
+    recorded(Prompt(policy.embed(prompt.ids, policy.encode_images(batch)), prompt.mask), *rows, num_numbers)
     return recorded(
-        Prompt(policy._embeds(batch, prompt.ids), prompt.mask, prompt.hidden), *rows, num_numbers
+        Prompt(policy.embed(prompt.ids, policy.encode_images(batch)), prompt.mask, prompt.hidden),
+        *rows,
+        num_numbers,
     ).numbers
 
 
 def chosen_by_graphs(policy: Any, batch: dict[str, Any]) -> Tensor:
     """Cells in the same way."""
-    prompt, backbone, num_steps = policy._prompt(batch), policy.backbone, policy.config.chunk_size
+    prompt, backbone, num_steps = policy.prompt(batch), policy.backbone, policy.config.chunk_size
     num_slots = num_steps * len(policy.grids.groups)
     layers = TextLayers(backbone.text_model, copy_dtype=torch.float32)
     text = CachedText(layers, 1, prompt.ids.shape[1] + num_slots, backbone.positions)
     rows = policy.cell_embedding.weight * backbone.embed_scale, policy.cell_head.weight
-    settings = policy._group_rows, num_steps, policy._prompt_reads_all, backbone.cap
+    settings = policy._group_rows, num_steps, policy._bidirectional_prompt, backbone.cap
     recorded = GraphSlots(*settings, *rows, text)
     noise = torch.zeros(1, 0, len(rows[1]))
-    embeds = policy._embeds(batch, prompt.ids)
+    embeds = policy.embed(prompt.ids, policy.encode_images(batch))
     recorded(Prompt(embeds, prompt.mask), *rows, noise)
     return recorded(Prompt(embeds, prompt.mask, prompt.hidden), *rows, noise)[0]
 
@@ -202,7 +205,7 @@ def test_captured_passes_hide_the_same(name: str, by_graphs: Callable[..., Tenso
     """Check a pass after a prompt of which nothing was hidden."""
     policy = loaded(name)
     batch = hidden_batch(policy, word)
-    answer = explained_by(policy).answer(batch)
+    answer = scored_by(policy).answer(batch)
     assert torch.equal(by_graphs(policy.policy, batch).flatten(), answer.flatten())
     clean = ask(policy).answer
     assert word == "3" or not torch.equal(answer, clean)

@@ -5,13 +5,13 @@ from typing import Any
 
 import pytest
 import torch
-from explain_cases import FAST_NAMES, GRID, WORKSPACE, WRIST, ask, asked, explained_by, fresh, moment
+from explain_cases import FAST_NAMES, GRID, WORKSPACE, WRIST, ask, fresh, moment, query, scored_by
 
 from lerobot_bomb.actions.text import TokenRows
 from lerobot_bomb.explain.diagnosis import diagnose
-from lerobot_bomb.explain.explained import INSTRUCTION
 from lerobot_bomb.explain.moment import OTHER_SCENE, Explanation, camera_name, explain
 from lerobot_bomb.explain.restoration import smallest_drop
+from lerobot_bomb.explain.scored_policy import INSTRUCTION
 from lerobot_bomb.explain.spans import difference, span_of, token_offsets
 from lerobot_bomb.flow.dual_mod import FiLM
 from lerobot_bomb.viewing.checkpoint import LoadedPolicy
@@ -26,22 +26,22 @@ def findings(explanation: Explanation) -> dict[str, tuple[str, ...]]:
 def hide_words(policy: LoadedPolicy, shown: torch.Tensor | None) -> None:
     """Let a policy read no token of an instruction but these."""
     changed: Any = policy.policy
-    usual = changed._prompt_parts
+    usual = changed.prompt
 
-    def parts(batch: dict[str, Any]) -> dict[str, TokenRows]:
+    def prompt(batch: dict[str, Any]) -> TokenRows:
         found = usual(batch)
-        task = found[INSTRUCTION]
-        hidden = torch.ones_like(task.mask) if shown is None else ~shown.expand_as(task.mask)
-        return found | {INSTRUCTION: TokenRows(task.ids, task.mask, hidden)}
+        hidden = torch.zeros_like(found.mask)
+        hidden[:, changed.layout.spans(found.ids.shape[1])[INSTRUCTION]] = True if shown is None else ~shown
+        return TokenRows(found.ids, found.mask, hidden & found.mask)
 
-    changed._prompt_parts = parts
+    changed.prompt = prompt
 
 
 @pytest.mark.parametrize("name", FAST_NAMES)
 def test_one_that_ignores_the_text(name: str) -> None:
     policy = fresh(name)
     hide_words(policy, None)
-    found = findings(explain(ask(policy), asked(policy)))
+    found = findings(explain(ask(policy), query(policy)))
     assert found["Hidden words that the answer depends on:"] == ()
     assert found["Changed words that the answer depends on:"] == ()
     assert found["Patches that the answer depends on:"]
@@ -55,7 +55,7 @@ def test_a_word_that_is_never_read_has_no_effect_at_all(name: str) -> None:
     word = span_of("black", instruction).tokens(token_offsets(policy.prepare.steps, instruction))
     hide_words(policy, ~word)
     question = ask(policy)
-    hidden = question.explained.hide(question.rows, word[None])
+    hidden = question.policy.hide(question.rows, word[None])
     assert question.effects(hidden).tolist() == [0.0]
     removed = hidden | {"mask": hidden["mask"] & ~hidden["hidden"]}
     assert abs(float(question.effects(removed))) > 1e-4
@@ -68,7 +68,7 @@ def test_one_that_reads_only_the_column(name: str) -> None:
     span = difference("column", instruction, others["column"][0])
     assert span is not None
     hide_words(policy, span.tokens(token_offsets(policy.prepare.steps, instruction)))
-    found = findings(explain(ask(policy), asked(policy)))
+    found = findings(explain(ask(policy), query(policy)))
     assert found["Hidden words that the answer depends on:"] == ("column",)
     assert found["Changed words that the answer depends on:"] == ("column",)
 
@@ -90,7 +90,7 @@ def test_one_that_looks_at_one_patch_only(name: str, camera: str) -> None:
             changed[key] = shown
         return policy.prepare(changed)
 
-    found = findings(explain(ask(policy, prepare), asked(policy)))
+    found = findings(explain(ask(policy, prepare), query(policy)))
     assert found["Patches that the answer depends on:"] == (f"{camera_name(camera)} patch {line}, {column}",)
 
 
@@ -101,14 +101,14 @@ def test_one_that_reads_the_target_through_one_head(name: str) -> None:
         if isinstance(module, FiLM):
             last: Any = module.layers[-1]
             last.weight.data.zero_()
-    layers = explained_by(policy).layers
+    layers = scored_by(policy).layers
     for number, layer in enumerate(layers):
         weight: Any = layer.attention_out.weight
         size = weight.shape[1] // layer.num_heads
         for head in range(layer.num_heads):
             if (number, head) != of_target:
                 weight.data[:, head * size : (head + 1) * size] = 0
-    found = findings(explain(ask(policy), asked(policy)))
+    found = findings(explain(ask(policy), query(policy)))
     named = [names for question, names in found.items() if "other instruction" in question]
     assert named == [("layer {}, head {}".format(*of_target),)]
 
@@ -118,7 +118,7 @@ def test_the_scene_of_another_episode_is_a_corruption_too(name: str) -> None:
     policy = fresh(name)
     question = ask(policy)
     mirrored = {key: question.observation[key].flip(-1) for key in (WORKSPACE, WRIST)}
-    explanation = explain(question, replace(asked(policy), other_scene=mirrored))
+    explanation = explain(question, replace(query(policy), other_scene=mirrored))
     (restored,) = [each for each in explanation.restored if each.corruption == OTHER_SCENE]
     assert abs(restored.drop) > smallest_drop(explanation.clean_score)
     assert restored.drop == pytest.approx(float(question.effects_of_images(mirrored)), abs=1e-5)

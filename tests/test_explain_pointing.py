@@ -24,7 +24,7 @@ from lerobot_bomb.envs.rollout import make_env
 from lerobot_bomb.explain.episode import ExplainedMoment
 from lerobot_bomb.explain.moment import Explanation
 from lerobot_bomb.explain.pointing import MARKED_PX, PLACE_RGB, Mark, PointingCheck, marked
-from lerobot_bomb.explain.watched import Watched
+from lerobot_bomb.explain.snapshots import Snapshot
 from lerobot_bomb.report.explained_pointing import mean_pointing, pointing_tables
 
 REST_M = BOARD.thickness_m + BOARD.stone_height_m / 2
@@ -225,7 +225,7 @@ def test_means_are_of_the_episodes_that_point() -> None:
         None,
     ]
     explanation = Explanation("loss", -1.0, {"image": torch.zeros(1, 1)}, {}, {}, {}, [])
-    watched = Watched(0, "carry", {}, "Place it.", {}, {}, None, CARRYING, {})
+    watched = Snapshot(0, "carry", {}, "Place it.", {}, {}, None, CARRYING, {})
     moments = [ExplainedMoment(watched, explanation, [], {}, {}, {}, each) for each in checks]
     (table,) = mean_pointing(moments)
     means = {row[0].text: row[1].value["value"] for row in table.rows}

@@ -11,7 +11,7 @@ from stock_policies import FLAGS, shrink_gemma, write_folders
 
 from lerobot_bomb.explain.activations import all_heads, all_layers, all_mlps
 from lerobot_bomb.explain.images import filling, patch_masks
-from lerobot_bomb.explain.other_policies import explained
+from lerobot_bomb.explain.other_policies import scored
 from lerobot_bomb.explain.question import Question
 from lerobot_bomb.explain.restoration import Corruption
 from lerobot_bomb.explain.spans import span_of, token_offsets
@@ -49,7 +49,7 @@ def asked(
         "observation.state": torch.zeros(1, 4),
         "task": [TASK],
     }
-    return stock_type, Question(explained(policy, postprocess), prepare, observation), prepare
+    return stock_type, Question(scored(policy, postprocess), prepare, observation), prepare
 
 
 def test_what_is_as_it_was_has_no_effect_and_an_empty_image_has_one(asked: tuple) -> None:
@@ -65,7 +65,7 @@ def test_rows_beside_it_change_no_score(asked: tuple) -> None:
     _, question, prepare = asked
     (image,) = question.observation[KEY]
     masks, filled = patch_masks(2, 64, 64), filling(image, "mean", 1.0)
-    alone = Question(question.explained, prepare, question.observation, batch_size=1)
+    alone = Question(question.policy, prepare, question.observation, batch_size=1)
     torch.testing.assert_close(
         question.effects_of_masks(KEY, masks, filled),
         alone.effects_of_masks(KEY, masks, filled),
@@ -81,7 +81,7 @@ def test_words_can_be_hidden_from_one_that_reads(asked: tuple) -> None:
             question.effects_of_hidden(torch.ones(1, 4, dtype=torch.bool))
         with pytest.raises(ValueError, match="reads no instruction"):
             token_offsets(prepare.steps, TASK)
-        assert not question.explained.layers
+        assert not question.policy.layers
         return
     hidden = span_of("column 2", TASK).tokens(token_offsets(prepare.steps, TASK))
     effects = question.effects_of_hidden(torch.stack([hidden, torch.zeros_like(hidden)]))
@@ -95,7 +95,7 @@ def test_heads_and_mlps_can_be_put_back_but_not_layers(asked: tuple) -> None:
     (image,) = question.observation[KEY]
     corrupt = question.encode({KEY: filling(image, "mean", 1.0)[None]}, 1)
     corruption = Corruption(question, corrupt)
-    layers = question.explained.layers
+    layers = question.policy.layers
     units = [*all_heads(layers), *all_mlps(len(layers))]
     scores = corruption.restore_corrupt([[unit] for unit in units]).scores
     torch.testing.assert_close(scores, torch.full_like(scores, corruption.score), rtol=0, atol=1e-5)
@@ -108,5 +108,5 @@ def test_heads_and_mlps_can_be_put_back_but_not_layers(asked: tuple) -> None:
 def test_what_a_policy_draws_is_its_own_again_afterwards(asked: tuple) -> None:
     stock_type, question, _ = asked
     if stock_type in READ:
-        model = question.explained._policy.model  # pyright: ignore[reportAttributeAccessIssue]
+        model = question.policy._policy.model  # pyright: ignore[reportAttributeAccessIssue]
         assert not {"sample_noise", "sample_time"} & vars(model).keys()

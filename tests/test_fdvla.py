@@ -270,19 +270,22 @@ def test_dualmod_is_the_identity_before_training() -> None:
 def test_what_is_pooled(pool: str) -> None:
     policy = make_policy(reasoning_pool=pool)
     batch = make_batch(policy, 3, tasks=("put the black stone on the center", "go", ""))
-    rows_BL, is_task_BL = policy._prompt(batch)
+    prompt = policy.prompt(batch)
+    span = policy.layout.spans(prompt.ids.shape[1])["instruction"]
+    instruction_BL = torch.zeros_like(prompt.mask)
+    instruction_BL[:, span] = prompt.mask[:, span]
     context = policy._read(batch)
     hidden = context.prefix.hidden
     for row in range(3):
-        kept = rows_BL.mask[row]
-        if pool == "text" and is_task_BL[row].any():
-            kept = is_task_BL[row]
+        kept = prompt.mask[row]
+        if pool == "text" and instruction_BL[row].any():
+            kept = instruction_BL[row]
         expected = hidden[row, -1] if pool == "last" else hidden[row, kept].mean(dim=0)
         torch.testing.assert_close(context.pooled[row], expected)
-    lengths = is_task_BL.sum(dim=1)
+    lengths = instruction_BL.sum(dim=1)
     assert lengths[0] > lengths[1] > lengths[2] == 0
     end = len(policy.tokens.end) + policy.config.use_state
-    assert rows_BL.mask[:, -end:].all() and not is_task_BL[:, -end:].any()
+    assert prompt.mask[:, -end:].all() and not instruction_BL[:, -end:].any()
 
 
 @torch.no_grad()
@@ -309,7 +312,7 @@ def test_images_instruction_state_and_time_matter() -> None:
 def test_attention_in_bfloat16_has_plain_gradients_on_a_cpu(dtype: str) -> None:
     """Check that the slow path is avoided: torch's fused attention takes four to ten times as long there."""
     query = torch.ones(1, 1, 2, 8, requires_grad=True)
-    with make_policy(dtype=dtype)._autocast():
+    with make_policy(dtype=dtype).autocast():
         attended = scaled_dot_product_attention(query, query, query)
     assert attended.grad_fn is not None
     assert ("FlashAttention" in attended.grad_fn.name()) == (dtype == "float32")
@@ -317,10 +320,10 @@ def test_attention_in_bfloat16_has_plain_gradients_on_a_cpu(dtype: str) -> None:
 
 def test_draws_side_by_side_read_their_own_tokens() -> None:
     reads = torch.tensor([[[1, 0], [1, 1]], [[1, 1], [1, 1]]], dtype=torch.bool)
-    assert SideBySide(2).reads(reads).int().tolist() == [
+    assert SideBySide(2).attention_mask(reads).int().tolist() == [
         [[1, 0, 0, 0], [1, 1, 0, 0], [0, 0, 1, 1], [0, 0, 1, 1]]
     ]
-    assert torch.equal(SideBySide(1).reads(reads), reads)
+    assert torch.equal(SideBySide(1).attention_mask(reads), reads)
     embeds = torch.arange(8).reshape(2, 2, 2)
     assert SideBySide(2).joined(embeds).tolist() == [[[0, 1], [2, 3], [4, 5], [6, 7]]]
 
@@ -328,7 +331,7 @@ def test_draws_side_by_side_read_their_own_tokens() -> None:
 def test_draws_of_a_chunk_are_trained_as_if_each_were_read_alone() -> None:
     policy = wake_dualmod(make_policy(draws_per_chunk=3))
     batch = make_batch(policy, 2)
-    context, kept = policy._read(batch), policy._kept(batch).repeat_interleave(3, dim=0)
+    context, kept = policy._read(batch), policy._loss_mask(batch).repeat_interleave(3, dim=0)
     actions, tau = torch.randn(6, 4, 4), torch.rand(6)
     together = policy._heads(context, kept)(actions, tau)
     for draw in range(3):

@@ -96,10 +96,10 @@ def test_heads_are_given_the_place_that_is_meant_or_another_with_its_action(shar
     labels = policy.pointer.draw_labels(batch, policy.config, torch.Generator().manual_seed(0))
     assert labels.place.tolist() == [0, 1, 2, 3]
     assert labels.is_other.tolist() == 4 * [share == 1]
-    actions_BKD, kept_BK = labels.given_actions(
+    actions_BKD, loss_mask_BK = labels.given_actions(
         batch["action"], torch.ones(4, 1).bool(), labels.other_actions[:, None]
     )
-    assert kept_BK.all()
+    assert loss_mask_BK.all()
     if share == 0:
         assert labels.given.tolist() == [0, 1, 2, 3]
         torch.testing.assert_close(actions_BKD, batch["action"])
@@ -114,10 +114,10 @@ def test_of_a_chunk_only_the_next_action_is_known_for_another_place() -> None:
     assert policy.pointer is not None
     batch = pointing_batch(policy)
     labels = policy.pointer.draw_labels(batch, policy.config, torch.Generator().manual_seed(0))
-    actions_BKD, kept_BK = labels.given_actions(
+    actions_BKD, loss_mask_BK = labels.given_actions(
         batch["action"], torch.ones(4, 4).bool(), labels.other_actions[:, None]
     )
-    assert kept_BK.tolist() == 4 * [[True, False, False, False]]
+    assert loss_mask_BK.tolist() == 4 * [[True, False, False, False]]
     torch.testing.assert_close(actions_BKD[:, 1:], batch["action"][:, 1:])
 
 
@@ -185,7 +185,7 @@ def test_the_gripper_is_read_in_metres() -> None:
 
 def test_an_explanation_says_where_it_points() -> None:
     policy = pointing_policy()
-    assert policy.pointer is not None and make_policy().explained().pointed(make_batch(policy, 1)) is None
+    assert policy.pointer is not None and make_policy().scored().pointed(make_batch(policy, 1)) is None
     policy.pointer.state_bounds.copy_(torch.tensor([[0.0, -0.1, 0.0], [0.2, 0.1, 0.1]]))
     point_at(policy, 2)
     with torch.no_grad():
@@ -193,7 +193,7 @@ def test_an_explanation_says_where_it_points() -> None:
             of.weight.zero_()
             of.bias.copy_(torch.tensor(bias))
     batch = make_batch(policy, 1) | {"observation.state": torch.tensor([[0.0, 1.0, 0.0, 0.0]])}
-    found = policy.explained().pointed(batch)
+    found = policy.scored().pointed(batch)
     assert found is not None and found.place_xy.tolist() == pytest.approx(PLACES[2])
     # the gripper at (0.1, 0.1); half of 30 mm and minus a whole from there
     assert found.stone_xy.tolist() == pytest.approx([0.115, 0.07])
@@ -206,12 +206,12 @@ def test_an_explanation_says_where_it_points() -> None:
 def test_what_it_computes_while_it_points_can_be_put_back() -> None:
     policy = wake_feedback(pointing_policy())
     batch = make_batch(policy, 1)
-    question = Question(policy.explained(), lambda observed: observed, batch)
+    question = Question(policy.scored(), lambda observed: observed, batch)
     corruption = Corruption(question, question.encode({WORKSPACE: torch.zeros_like(batch[WORKSPACE])}, 1))
-    num_layers, places = len(policy.explained().layers), question.explained.places(question.rows)
+    num_layers, places = len(policy.scored().layers), question.policy.token_spans(question.rows)
     assert {len(passes) for passes in places.values()} == {3}
     assert places["pointing"] == (None, slice(None), None) and places["answer"] == (None, None, slice(None))
-    whole = [*all_layers(num_layers), *all_heads(policy.explained().layers), *all_mlps(num_layers)]
+    whole = [*all_layers(num_layers), *all_heads(policy.scored().layers), *all_mlps(num_layers)]
     score = float(corruption.restore([whole]).scores)
     assert score == pytest.approx(question.clean_score, abs=1e-5) != pytest.approx(corruption.score, abs=1e-3)
     pointing = corruption.restore([all_layers(num_layers, places["pointing"])]).scores

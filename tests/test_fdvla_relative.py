@@ -65,7 +65,7 @@ def test_what_the_heads_learn_is_the_difference_to_the_state_and_comes_back(
         torch.testing.assert_close(
             relative[row] * policy._unit, torch.from_numpy(residuals), rtol=0, atol=1e-5
         )
-    torch.testing.assert_close(policy._to_absolute(relative, batch), batch["action"], rtol=0, atol=1e-6)
+    torch.testing.assert_close(policy.to_absolute(relative, batch), batch["action"], rtol=0, atol=1e-6)
 
 
 def test_differences_have_the_spread_of_the_noise(meta: LeRobotDatasetMetadata) -> None:

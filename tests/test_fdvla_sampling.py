@@ -28,7 +28,7 @@ def ids(options: dict[str, Any]) -> str:
 
 def draw(policy: FdvlaPolicy, batch_size: int, seed: int = 1) -> Tensor:
     generator = torch.Generator().manual_seed(seed)
-    return torch.randn(batch_size, policy.config.chunk_size, policy._action_dim, generator=generator)
+    return torch.randn(batch_size, policy.config.chunk_size, policy.action_dim, generator=generator)
 
 
 @torch.no_grad()

@@ -114,7 +114,7 @@ def test_a_drafted_answer_is_checked_in_every_pass(monkeypatch: pytest.MonkeyPat
     """A batch of 1, where `spatialvla_grid` reads several cells a pass; only the later ones are spoiled."""
     policy = CASES["spatialvla_grid"].make_policy()
     batch = CASES["spatialvla_grid"].make_batch(policy, 1)
-    assert policy._writer.drafted
+    assert policy._decoder.drafted
     passes, usual = [], CachedText.__call__
 
     def call(self: CachedText, embeds: Tensor, *columns: Tensor) -> Tensor:
@@ -123,7 +123,7 @@ def test_a_drafted_answer_is_checked_in_every_pass(monkeypatch: pytest.MonkeyPat
 
     monkeypatch.setattr(CachedText, "__call__", call)
     with pytest.raises(ValueError, match=r"the rows \[0\] of the batch"):
-        policy._choose(batch, 4)
+        policy.choose(batch, 4)
     assert len(passes) == 2
 
 

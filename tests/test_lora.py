@@ -139,9 +139,9 @@ def test_adapters_hold_what_points(policy_type: str, tmp_path: Path) -> None:
     wrapped.save_pretrained(tmp_path / "adapters")
     again = peft.PeftModel.from_pretrained(base, tmp_path / "adapters").eval()
     row = cases.make_batch(policy, 1)
-    found, expected = (each.explained().pointed(row) for each in (again, wrapped.eval()))
+    found, expected = (each.scored().pointed(row) for each in (again, wrapped.eval()))
     with again.disable_adapter():
-        of_base = again.explained().pointed(row)
+        of_base = again.scored().pointed(row)
     for name, value in vars(expected).items():
         assert np.array_equal(getattr(found, name), value), name
     assert [*found.place_xy, *found.stone_xy] != [*of_base.place_xy, *of_base.stone_xy]

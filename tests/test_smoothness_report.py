@@ -8,7 +8,7 @@ import pytest
 from pusht_cases import REPO_ID, Demonstrations
 
 from lerobot_bomb.commands.main import main
-from lerobot_bomb.evaluation.executed import Executed, append_episode
+from lerobot_bomb.evaluation.executed import ActionLog, append_episode
 from lerobot_bomb.evaluation.smoothness_report import (
     ORDERS,
     make_units,
@@ -21,8 +21,8 @@ PARABOLA = np.array([[0.0], [1], [3], [6], [10]])  # second differences 1, third
 NAMES = ["x", "y", "Gripper.pos"]
 
 
-def executed(name: str, *episodes: np.ndarray, fps: float = 10) -> Executed:
-    return Executed(name, fps, {str(i): of for i, of in enumerate(episodes)}, True)
+def executed(name: str, *episodes: np.ndarray, fps: float = 10) -> ActionLog:
+    return ActionLog(name, fps, {str(i): of for i, of in enumerate(episodes)}, True)
 
 
 def test_a_row_by_hand() -> None:
@@ -67,13 +67,13 @@ def test_grippers_are_left_out_by_name() -> None:
 def test_conditions_of_one_seed_are_drawn_together() -> None:
     rng = np.random.default_rng(0)
     rough = [scale * rng.normal(size=(30, 1)) for scale in (1, 5, 20)]
-    alone = Executed("alone", 10, {f"none, task 0, seed {i}": of for i, of in enumerate(rough)}, True)
+    alone = ActionLog("alone", 10, {f"none, task 0, seed {i}": of for i, of in enumerate(rough)}, True)
     groups = ("none", "light-3", "all-5")
     thrice = {f"{group}, task 0, seed {i}": of for group in groups for i, of in enumerate(rough)}
     units = make_units(alone, ["x"], None, False)
-    rows = {of.name: measure_row(of, units) for of in (alone, Executed("thrice", 10, thrice, True))}
+    rows = {of.name: measure_row(of, units) for of in (alone, ActionLog("thrice", 10, thrice, True))}
     halved = {name: of / (1 + i % 3) for i, (name, of) in enumerate(thrice.items())}
-    rows["halved"] = measure_row(Executed("halved", 10, halved, True), units)
+    rows["halved"] = measure_row(ActionLog("halved", 10, halved, True), units)
     for key in ORDERS:
         first, second = (rows[name].measures[key] for name in ("alone", "thrice"))
         assert (second.low, second.high) == pytest.approx((first.low, first.high))
@@ -97,7 +97,7 @@ def test_differences_are_those_of_pairs() -> None:
         low, high = expected.measures[key].low, expected.measures[key].high
         assert low is not None and high is not None
         assert (of.low, of.high) == pytest.approx((0.1 * low, 0.1 * high))
-    rows["third"] = measure_row(Executed("third", 10, {"other": rough[0]}, True), units)
+    rows["third"] = measure_row(ActionLog("third", 10, {"other": rough[0]}, True), units)
     with pytest.raises(ValueError, match="first and third have no episode of the same group, task and seed"):
         measure_difference("first", "third", rows)
 

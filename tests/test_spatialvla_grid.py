@@ -340,7 +340,7 @@ def test_an_environment_may_name_no_task(tasks: list[str]) -> None:
     batch = make_batch(policy, 2)
     shown = {key: batch[key] for key in (WORKSPACE, WRIST, "observation.state", "action")}
     batch = preprocessor({**shown, "task": tasks})
-    num_tokens = policy._prompt(batch).mask.sum(dim=1)
+    num_tokens = policy.prompt(batch).mask.sum(dim=1)
     assert (num_tokens > num_tokens.min()).tolist() == [False, tasks[1] == "go"]
     assert policy(batch)[0].isfinite()
     assert policy.predict_action_chunk(batch).shape == (2, 4, 4)

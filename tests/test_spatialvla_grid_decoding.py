@@ -19,7 +19,7 @@ def test_it_chooses_what_generate_chooses(batch_size: int, num_dims: int) -> Non
         policy = make_policy(seed, num_dims)
         batch = make_batch(policy, batch_size, seed)
         generate = StockGenerate(policy)
-        cells = policy._choose(batch, policy.config.chunk_size)
+        cells = policy.choose(batch, policy.config.chunk_size)
         assert torch.equal(cells.flatten(1), generate(generate.inputs(batch)).numbers)
 
 
@@ -29,7 +29,7 @@ def test_training_and_decoding_agree(prefix_attention: str) -> None:
     """Check that the teacher-forced network finds likeliest what was chosen, given what was chosen."""
     policy = make_policy(1, 7, prefix_attention=prefix_attention, use_state=True)
     batch = make_batch(policy, 3)
-    cells = policy._choose(batch, policy.config.chunk_size)
+    cells = policy.choose(batch, policy.config.chunk_size)
     assert torch.equal(policy._losses(policy._hidden(batch, cells)[1], cells)[1], cells)
 
 
@@ -59,13 +59,13 @@ def passes(monkeypatch: pytest.MonkeyPatch) -> list[int]:
 def test_a_draft_saves_passes_and_changes_no_cell(passes: list[int]) -> None:
     policy = make_policy(2, 7, nano_config=None)
     batch = make_batch(policy, 1, 2)
-    drafted = policy._choose(batch, 4)
+    drafted = policy.choose(batch, 4)
     # cells of the same group follow each other here, but not always
     assert 0.5 < (drafted[:, 1:] == drafted[:, :-1]).float().mean() < 1
     assert policy.last_passes == len(passes) < 12
     passes.clear()
-    policy._writer.drafted = False
-    assert torch.equal(policy._choose(batch, 4), drafted)
+    policy._decoder.drafted = False
+    assert torch.equal(policy.choose(batch, 4), drafted)
     assert passes[1:] == [1] * 11
 
 
@@ -92,7 +92,7 @@ def test_samples_are_as_frequent_as_the_capped_softmax_of_a_slot() -> None:
     batch = make_batch(policy, 1)
     noise = policy._choice_noise(num_rows, (1, policy.grids.num_tokens))
     assert noise is not None
-    hidden_BH = policy._hidden(batch, policy._choose(batch, 1))[1][:, 0, 0].expand(num_rows, -1)
+    hidden_BH = policy._hidden(batch, policy.choose(batch, 1))[1][:, 0, 0].expand(num_rows, -1)
     slot = policy._group_rows[0]
     head = SlotHead(policy.cell_head.weight, noise, policy.backbone.cap)
     seen = torch.bincount(head.logits(hidden_BH, 0, slot).argmax(dim=1), minlength=slot.stop)
@@ -107,6 +107,6 @@ def test_a_draft_changes_no_sample_and_an_episode_has_its_own() -> None:
     for draft, noise_seed in (("repeat", 0), ("none", 0), ("none", 1)):
         policy = make_policy(2, 7, nano_config=None, temperature=0.5, noise_seed=noise_seed, draft=draft)
         batch = make_batch(policy, 1, 2)
-        cells.append(torch.stack([policy._choose(batch, 4) for _ in range(2)]))
+        cells.append(torch.stack([policy.choose(batch, 4) for _ in range(2)]))
     assert torch.equal(cells[0], cells[1])
     assert not torch.equal(cells[1], cells[2]) and not torch.equal(cells[1][0], cells[1][1])

@@ -79,7 +79,7 @@ def test_an_answer_is_a_place_a_stone_and_then_cells(share: float) -> None:
     first, second = [0, 1, 2, 3], [4, 5, 6, 7]
     assert cells.tolist() == 2 * [[[7, 7, 7, 7] if share else first, second]]
     # of another place there is no loss, and only the next action is known
-    assert pointed.kept.tolist() == 2 * [[not share, True]]
+    assert pointed.loss_mask.tolist() == 2 * [[not share, True]]
     assert kept.tolist() == 2 * [[True, not share]]
 
 
@@ -88,8 +88,8 @@ def test_the_loss_is_the_likelihood_among_a_slots_tokens_of_all_that_is_kept() -
         policy = pointing_policy(counterfactual_share=0.5, loss_vocab=vocab)
         batch = pointing_batch(policy)
         policy.generator.manual_seed(1)
-        cells, kept_BT, pointed = policy._targets(batch)
-        is_other = ~pointed.kept[:, 0]
+        cells, loss_mask_BT, pointed = policy._targets(batch)
+        is_other = ~pointed.loss_mask[:, 0]
         assert 0 < is_other.sum() < 4
         pointing_BNH, hidden_BTGH, _ = policy._hidden(batch, cells, pointed.tokens)
         hidden = torch.cat([pointing_BNH, hidden_BTGH.flatten(1, 2)], dim=1)
@@ -100,7 +100,7 @@ def test_the_loss_is_the_likelihood_among_a_slots_tokens_of_all_that_is_kept() -
         starts = [num_polar + num_gripper, num_polar + num_gripper + 4] + 2 * [first, num_polar]
         counts = [4, NUM_STONES] + 2 * [num_polar, num_gripper]
         tokens = torch.cat([pointed.tokens, cells.flatten(1)], dim=1)
-        kept = torch.cat([pointed.kept, kept_BT.repeat_interleave(2, dim=1)], dim=1)
+        kept = torch.cat([pointed.loss_mask, loss_mask_BT.repeat_interleave(2, dim=1)], dim=1)
         losses = []
         for row in range(4):
             for i in range(6):
@@ -150,7 +150,7 @@ def test_at_each_position_all_of_its_tokens_and_no_others_can_win(
     slots = [*policy._pointing_rows, *policy._group_rows, *policy._group_rows]
     assert [slot.stop - slot.start for slot in slots[:2]] == [4, NUM_STONES]
     assert [slot.start for slot in slots[:2]] == [policy.grids.num_tokens, policy.grids.num_tokens + 4]
-    answer = policy._write(batch, 2)
+    answer = policy.write(batch, 2)
     head = policy.cell_head.weight.clone()
     for position, slot in enumerate(slots):
         hidden = torch.cat([states.flatten(1, -2) for states in states_of(policy, batch, answer)], dim=1)
@@ -160,7 +160,7 @@ def test_at_each_position_all_of_its_tokens_and_no_others_can_win(
             policy.cell_head.weight += 1e3 * liked  # all tokens of the other slots, too
             policy.cell_head.weight[slot] = head[slot]
             policy.cell_head.weight[slot.start + token] += 10 * liked
-            assert policy._write(batch, 2)[0, position] == token
+            assert policy.write(batch, 2)[0, position] == token
     policy.cell_head.weight.copy_(head)
 
 
@@ -174,7 +174,7 @@ def states_of(policy: SpatialvlaGridPolicy, batch: dict[str, Any], answer: Tenso
 def test_actions_alone_come_out_whatever_the_batch(num_dims: int, options: dict[str, Any]) -> None:
     policy = pointing_policy(2, num_dims, **options)
     batch = make_batch(policy, 3)
-    answer = policy._write(batch, 2)
+    answer = policy.write(batch, 2)
     pointed, cells = policy._split(answer)
     assert answer.shape[1] == 2 + 2 * len(policy.grids.groups) == policy.last_passes == 2 + policy.last_tokens
     # what the teacher-forced network finds likeliest, given what was written, is what was written
@@ -185,7 +185,7 @@ def test_actions_alone_come_out_whatever_the_batch(num_dims: int, options: dict[
     assert chunk.shape == (3, 2, num_dims) and torch.equal(chunk, policy.grids.decode(cells))
     assert torch.equal(policy.select_action(batch), chunk[:, 0])
     for row in range(3):  # where steps are guessed
-        assert torch.equal(policy._write(rows(batch, slice(row, row + 1)), 2)[0], answer[row])
+        assert torch.equal(policy.write(rows(batch, slice(row, row + 1)), 2)[0], answer[row])
 
 
 def test_guesses_go_on_as_the_step_before_and_change_nothing() -> None:
@@ -193,10 +193,10 @@ def test_guesses_go_on_as_the_step_before_and_change_nothing() -> None:
     batch = make_batch(policy, 1, 2)
     with torch.no_grad():  # one of three groups is always the same
         policy.cell_head.weight[policy._group_rows[0]] = 0
-    drafted = policy._write(batch, 6)
+    drafted = policy.write(batch, 6)
     assert policy.last_passes is not None and 2 + 3 < policy.last_passes < 2 + 6 * 3
-    policy._writer.drafted = False
-    assert torch.equal(policy._write(batch, 6), drafted)
+    policy._decoder.drafted = False
+    assert torch.equal(policy.write(batch, 6), drafted)
 
 
 def test_an_ensemble_is_of_actions_alone() -> None:
@@ -213,9 +213,9 @@ def test_an_ensemble_is_of_actions_alone() -> None:
 def test_an_explanation_scores_what_is_pointed_at_and_the_cells() -> None:
     policy = pointing_policy(**SINGLY)
     batch = make_batch(policy, 1)
-    explained = policy.explained()
+    explained = policy.scored()
     answer = explained.answer(batch)
-    assert torch.equal(answer, policy._write(batch, 2))
+    assert torch.equal(answer, policy.write(batch, 2))
     pointed, cells = policy._split(answer)
     with torch.no_grad():
         pointing_BNH, hidden_BTGH, _ = policy._hidden(batch, cells, pointed)
@@ -227,8 +227,8 @@ def test_an_explanation_scores_what_is_pointed_at_and_the_cells() -> None:
 def test_an_explanation_says_where_it_points() -> None:
     policy = pointing_policy(**SINGLY)
     batch = make_batch(policy, 1)
-    found = policy.explained().pointed(batch)
-    pointed, cells = policy._split(policy._write(batch, 2))
+    found = policy.scored().pointed(batch)
+    pointed, cells = policy._split(policy.write(batch, 2))
     place, stone = pointed[0].tolist()
     assert (
         found is not None and found.held is None and found.place_xy.tolist() == pytest.approx(PLACES[place])
@@ -244,7 +244,7 @@ def test_an_explanation_says_where_it_points() -> None:
     assert [*found.probabilities.values()] == pytest.approx(shares, abs=1e-5)
     assert [*map(list, found.probabilities)] == [pytest.approx(each) for each in PLACES]
     plain = make_policy()
-    assert plain.explained().pointed(make_batch(plain, 1)) is None
+    assert plain.scored().pointed(make_batch(plain, 1)) is None
 
 
 def test_labels_are_of_training_only() -> None:
@@ -283,7 +283,7 @@ def test_it_learns_to_point_and_then_goes_where_it_points(monkeypatch: pytest.Mo
         loss.backward()
         optimizer.step()
     assert metrics["stone_accuracy"] == metrics["token_accuracy"] == 1
-    pointed, cells = policy._split(policy._write(batch, 1))
+    pointed, cells = policy._split(policy.write(batch, 1))
     assert pointed.tolist() == 2 * [[0, 30], [1, 6], [2, 30], [3, 6]]
     assert torch.equal(cells, policy.grids.encode(batch["action"]))
     pointer, slots = policy.pointer, policy._pointing_rows
@@ -292,7 +292,7 @@ def test_it_learns_to_point_and_then_goes_where_it_points(monkeypatch: pytest.Mo
         only = slice(slots[0].start + place, slots[0].start + place + 1)
         monkeypatch.setattr(pointer, "slots", lambda _, only=only: [only, slots[1]])
         expected = policy.grids.encode(torch.tensor([5 * x, 5 * y, 0.0, 0.0]))
-        assert torch.equal(policy._choose(batch, 1), expected.expand(8, 1, -1)), place
+        assert torch.equal(policy.choose(batch, 1), expected.expand(8, 1, -1)), place
 
 
 # Data and checkpoints
@@ -364,7 +364,7 @@ def test_grids_adapt_and_what_points_stays(metas: dict[str, LeRobotDatasetMetada
     old.save_pretrained(tmp_path / "old")
     loaded = SpatialvlaGridPolicy.from_pretrained(tmp_path / "old")
     batch = make_batch(old, 2)
-    assert torch.equal(loaded._write(batch, 2), old._write(batch, 2))
+    assert torch.equal(loaded.write(batch, 2), old.write(batch, 2))
     groups = [
         {"dims": [0, 1, 2], "transform": "polar", "bins": [4, 8, 6]},
         {"dims": [3], "transform": "identity", "bins": [16]},
@@ -381,7 +381,7 @@ def test_grids_adapt_and_what_points_stays(metas: dict[str, LeRobotDatasetMetada
     new(pointing_batch(new))[0].backward()
     new.save_pretrained(tmp_path / "new")
     again = SpatialvlaGridPolicy.from_pretrained(tmp_path / "new")
-    assert torch.equal(again._write(batch, 2), new._write(batch, 2))
+    assert torch.equal(again.write(batch, 2), new.write(batch, 2))
     assert again.config.pointing_places == PLACES
 
 

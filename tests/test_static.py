@@ -151,13 +151,13 @@ def test_only_the_last_frame_of_a_demonstration_is_done(recorded: dict[str, Path
 def test_of_a_scene_a_chunk_is_its_first_action(recorded: dict[str, Path]) -> None:
     policy = make_policy(chunk_size=4)
     batch = make_batch(policy, 3) | {"next.done": torch.tensor([[True], [False], [True]])}
-    assert policy._kept(batch).tolist() == [[True] + 3 * [False], 4 * [True], [True] + 3 * [False]]
+    assert policy._loss_mask(batch).tolist() == [[True] + 3 * [False], 4 * [True], [True] + 3 * [False]]
     batch["action_is_pad"] = torch.tensor(3 * [[False, False, True, True]])
-    assert policy._kept(batch).sum(dim=1).tolist() == [1, 2, 1]
+    assert policy._loss_mask(batch).sum(dim=1).tolist() == [1, 2, 1]
     policy.config.loss_on_padded_actions = (
         True  # padding repeats an action, and what follows it is another scene's
     )
-    assert policy._kept(batch).sum(dim=1).tolist() == [3, 4, 3]
+    assert policy._loss_mask(batch).sum(dim=1).tolist() == [3, 4, 3]
 
 
 def test_scenes_are_no_episodes(recorded: dict[str, Path], capsys: pytest.CaptureFixture[str]) -> None:

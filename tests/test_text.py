@@ -56,7 +56,7 @@ def tokens_of(number: int) -> NumberTokens:
 def test_a_hidden_number_is_one_token_whatever_its_digits(number: int) -> None:
     hidden = tokens_of(number).hide_numbers(torch.tensor([[True, False]]), hidden_id=77)
     assert hidden.ids[hidden.mask].tolist() == [10, 77, 10, 4, 2]
-    assert hidden.ids[hidden.trained].tolist() == [10, 10, 4, 2]
+    assert hidden.ids[hidden.loss_mask].tolist() == [10, 10, 4, 2]
 
 
 def test_a_hidden_character_keeps_its_place() -> None:
@@ -64,7 +64,7 @@ def test_a_hidden_character_keeps_its_place() -> None:
     columns[0, 0, 2] = columns[0, 1, 0] = True
     hidden = tokens_of(425).hide_characters(columns, hidden_id=77)
     assert hidden.ids[hidden.mask].tolist() == [10, 4, 77, 5, 77, 4, 2]
-    assert hidden.ids[hidden.trained].tolist() == [10, 4, 5, 4, 2]
+    assert hidden.ids[hidden.loss_mask].tolist() == [10, 4, 5, 4, 2]
 
 
 def hidden_counts(rows: int, units: int, max_fraction: float, skip_prob: float) -> torch.Tensor:
@@ -121,10 +121,12 @@ def test_hidden_tokens_keep_their_columns() -> None:
     rows = TokenRows(torch.tensor([[4, 5, 6]]), mask, torch.tensor([[False, False, True]]))
     joined = TokenRows.join([TokenRows(torch.tensor([[3]]), torch.tensor([[True]])), rows]).rounded(6)
     assert joined.ids.tolist() == [[3, 4, 5, 6, 0, 0]]
-    assert joined.readable.tolist() == [[True, True, False, False, False, False]]
+    assert joined.attention_mask.tolist() == [[True, True, False, False, False, False]]
     compacted = joined.without_padding()
     assert compacted.ids.tolist() == [[3, 4, 6]] and compacted.mask.tolist() == [[True, True, True]]
     assert compacted.hidden is not None and compacted.hidden.tolist() == [[False, False, True]]
-    assert TokenRows.join([rows, rows]).without_padding().readable.tolist() == [[True, False, True, False]]
+    assert TokenRows.join([rows, rows]).without_padding().attention_mask.tolist() == [
+        [True, False, True, False]
+    ]
     nothing = TokenRows(rows.ids, mask)
-    assert TokenRows.join([nothing]).hidden is None and nothing.readable is mask
+    assert TokenRows.join([nothing]).hidden is None and nothing.attention_mask is mask

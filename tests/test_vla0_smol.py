@@ -36,7 +36,7 @@ def full_text(policy: Vla0SmolPolicy, task: str, state: list[int] | None, number
 
 def sequence(policy: Vla0SmolPolicy, batch: dict[str, Any]) -> list[list[int]]:
     """Token ids of every row, prompt and answer."""
-    prompt = policy._prompt(batch)
+    prompt = policy.prompt(batch)
     answer = policy._answer(numbers_of(policy, batch)).rows
     pairs = zip(prompt.ids, prompt.mask, answer.ids, answer.mask, strict=True)
     return [[*ids[keep].tolist(), *said[kept].tolist()] for ids, keep, said, kept in pairs]
@@ -229,28 +229,38 @@ def test_training_draws_do_not_touch_the_global_random_state() -> None:
 def test_the_crop_is_random_in_training_and_the_centre_in_evaluation() -> None:
     policy = make_policy(crop_fraction=0.5)
     batch = make_batch(policy, 2)
-    ids = policy._prompt(batch).ids
-    assert torch.equal(policy._embeds(batch, ids), policy._embeds(batch, ids))
+    ids = policy.prompt(batch).ids
+    assert torch.equal(
+        policy.embed(ids, policy.encode_images(batch)), policy.embed(ids, policy.encode_images(batch))
+    )
     border = {**batch, WORKSPACE: batch[WORKSPACE].clone()}
     border[WORKSPACE][..., :16] = 0
-    assert torch.equal(policy._embeds(border, ids), policy._embeds(batch, ids))
+    assert torch.equal(
+        policy.embed(ids, policy.encode_images(border)), policy.embed(ids, policy.encode_images(batch))
+    )
     policy.train()
-    assert not torch.equal(policy._embeds(batch, ids), policy._embeds(batch, ids))
+    assert not torch.equal(
+        policy.embed(ids, policy.encode_images(batch)), policy.embed(ids, policy.encode_images(batch))
+    )
 
 
 def test_colours_are_jittered_in_training_only() -> None:
     plain, jittered = (make_policy(crop_fraction=1.0, color_jitter=reach) for reach in (None, VLA0_JITTER))
     batch = make_batch(plain, 2)
-    ids = plain._prompt(batch).ids
-    assert torch.equal(jittered._embeds(batch, ids), plain._embeds(batch, ids))
+    ids = plain.prompt(batch).ids
+    assert torch.equal(
+        jittered.embed(ids, jittered.encode_images(batch)), plain.embed(ids, plain.encode_images(batch))
+    )
     plain.train()
     jittered.train()
-    assert torch.equal(plain._embeds(batch, ids), plain._embeds(batch, ids))
-    seen = [jittered._embeds(batch, ids) for _ in range(2)]
+    assert torch.equal(
+        plain.embed(ids, plain.encode_images(batch)), plain.embed(ids, plain.encode_images(batch))
+    )
+    seen = [jittered.embed(ids, jittered.encode_images(batch)) for _ in range(2)]
     assert not torch.equal(*seen)
     # nothing but the images' tokens
     same = (seen[0] == seen[1]).all(dim=2).all(dim=0)
-    assert set((~same).nonzero()[:, 0].tolist()) == set(plain._image_columns(ids.device).tolist())
+    assert set((~same).nonzero()[:, 0].tolist()) == set(plain.layout.image_columns(ids.device).tolist())
 
 
 def test_a_resumed_training_jitters_as_the_uninterrupted_one() -> None:

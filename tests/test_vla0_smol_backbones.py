@@ -115,7 +115,7 @@ def test_a_folders_own_class_and_weights_are_loaded(
 def test_logits_are_the_stock_models_images_and_positions_included(policy: Vla0SmolPolicy) -> None:
     batch = own_size_batch(policy, 3)
     answer = policy._answer(numbers_of(policy, batch)).rows
-    logits = policy._answer_logits(policy._see(batch), policy._prompt(batch), answer)
+    logits = policy._answer_logits(policy.encode_images(batch), policy.prompt(batch), answer)
     for row, ids in enumerate(sequence(policy, batch)):
         inputs = stock_inputs(policy, torch.tensor(ids), images_of(batch, row))
         expected = policy.backbone.vlm(**inputs).logits[0]
@@ -129,7 +129,7 @@ def test_logits_are_the_stock_models_images_and_positions_included(policy: Vla0S
 def test_it_writes_what_generate_writes(policy: Vla0SmolPolicy) -> None:
     """Transformers' own greedy search with its own cache, under the same grammar."""
     batch = own_size_batch(policy, 4, seed=1)
-    prompt = policy._prompt(batch)
+    prompt = policy.prompt(batch)
     written = policy.action_bins.encode(policy.predict_action_chunk(batch)).flatten(1).tolist()
     space, end_id = policy.symbol_ids[SPACE : SPACE + 1], int(policy.symbol_ids[END])
     for row in range(4):
@@ -154,11 +154,11 @@ def test_it_writes_what_generate_writes(policy: Vla0SmolPolicy) -> None:
 def test_the_cache_gives_the_logits_of_a_full_pass(policy: Vla0SmolPolicy) -> None:
     """Rows of different lengths; the answer in pieces, one of which is written over."""
     batch = own_size_batch(policy, 2)
-    prompt, numbers = policy._prompt(batch).without_padding(), numbers_of(policy, batch)
+    prompt, numbers = policy.prompt(batch).without_padding(), numbers_of(policy, batch)
     answer = policy._answer(numbers).rows
-    full = policy._answer_logits(policy._see(batch), prompt, answer)[..., policy.symbol_ids]
+    full = policy._answer_logits(policy.encode_images(batch), prompt, answer)[..., policy.symbol_ids]
     said = (answer.ids[..., None] == policy.symbol_ids).long().argmax(dim=-1)
-    embeds = policy._embeds(batch, prompt.ids)
+    embeds = policy.embed(prompt.ids, policy.encode_images(batch))
     model = continue_prompt(
         policy.backbone, Prompt(embeds, prompt.mask), policy.symbol_ids, 60, policy._positions
     )
@@ -191,19 +191,19 @@ def test_on_a_copy_with_padding_it_writes_the_same(policy: Vla0SmolPolicy) -> No
     """The way that is recorded on CUDA, pass by pass."""
     batch = own_size_batch(policy, 3, seed=4)
     expected = policy.action_bins.encode(policy.predict_action_chunk(batch)).flatten(1)
-    prompt, backbone, grammar = policy._prompt(batch), policy.backbone, policy.grammar
+    prompt, backbone, grammar = policy.prompt(batch), policy.backbone, policy.grammar
     assert not prompt.mask.all()
     layers = TextLayers(backbone.text_model, copy_dtype=torch.float32)
     num_columns = prompt.ids.shape[1] + grammar.max_symbols(12)
     text = CachedText(layers, 3, num_columns, policy._positions)
     rows = backbone.embed_tokens(policy.symbol_ids), backbone.vlm.lm_head.weight[policy.symbol_ids]
     recorded = GraphDecoder(grammar, LinearDraft(grammar, 4), *rows, text)
-    written = recorded(Prompt(policy._embeds(batch, prompt.ids), prompt.mask), *rows, 12)
+    written = recorded(Prompt(policy.embed(prompt.ids, policy.encode_images(batch)), prompt.mask), *rows, 12)
     assert torch.equal(written.numbers, expected)
     plain = decode_numbers(
         continue_prompt(
             backbone,
-            Prompt(policy._embeds(batch, prompt.ids), prompt.mask),
+            Prompt(policy.embed(prompt.ids, policy.encode_images(batch)), prompt.mask),
             policy.symbol_ids,
             grammar.max_symbols(12),
             policy._positions,
@@ -251,7 +251,7 @@ def test_a_checkpoint_needs_no_base_folder(folder: Path, family: str, tmp_path: 
     assert torch.equal(loaded.predict_action_chunk(batch), policy.predict_action_chunk(batch))
     preprocessor, _ = make_pre_post_processors(loaded.config, str(tmp_path / "model"))
     again, once = preprocessor(raw_batch(2)), make_batch_of(policy, tmp_path / "model")
-    assert torch.equal(loaded._prompt(again).ids, policy._prompt(once).ids)
+    assert torch.equal(loaded.prompt(again).ids, policy.prompt(once).ids)
 
 
 def make_batch_of(policy: Vla0SmolPolicy, checkpoint: Path) -> Batch:

@@ -160,7 +160,7 @@ def test_a_checkpoint_keeps_its_system_prompt(tmp_path: Path) -> None:
     save(policy, tmp_path)
     loaded = Vla0SmolPolicy.from_pretrained(tmp_path)
     batch = make_batch(policy, 2)
-    assert torch.equal(loaded._prompt(batch).ids, policy._prompt(batch).ids)
+    assert torch.equal(loaded.prompt(batch).ids, policy.prompt(batch).ids)
     loaded.config.system_prompt = "Be quick."
     with pytest.raises(
         ValueError, match=r"--policy.system_prompt='Be quick.': .* trained with 'Be precise.'"

@@ -55,7 +55,7 @@ def test_decoding_follows_the_teacher_forced_argmax(overfit: tuple[Vla0SmolPolic
     batch = make_batch(policy, 3, seed=9)  # unseen
     batch["action"] = policy.predict_action_chunk(batch)
     answer = policy._answer(numbers_of(policy, batch))
-    prompt, features = policy._prompt(batch), policy._see(batch)
+    prompt, features = policy.prompt(batch), policy.encode_images(batch)
     logits = policy._answer_logits(features, prompt, answer.rows)[..., policy.symbol_ids]
     for row_logits, row_labels in zip(logits, answer.labels, strict=True):
         place = policy.grammar.start(1)

@@ -62,7 +62,7 @@ def towards(xy: Tensor) -> Tensor:
 
 def labelled(policy: Vla0SmolPolicy, numbers: NumberTokens) -> list[list[bool]]:
     """Return for each row and number whether all of its digits carry loss."""
-    return numbers.trained[..., 1:].all(dim=2).tolist()
+    return numbers.loss_mask[..., 1:].all(dim=2).tolist()
 
 
 # Sequence
@@ -115,7 +115,7 @@ def test_off_there_is_nothing_of_it() -> None:
         policy.config.trained_batches = 0  # which all that is random in a batch follows from
         losses.append(policy.train()(each)[0])
     assert torch.equal(*losses)
-    assert policy._write(batch, 3).shape == (2, 12)
+    assert policy.write(batch, 3).shape == (2, 12)
     assert "points before it acts" not in policy.config.methods_used()
     # a checkpoint of before keeps its identity
     later = {name: getattr(policy.config, name) for name in policy.config.LATER_FIELDS}
@@ -132,19 +132,19 @@ def test_what_is_meant_is_trained_on() -> None:
     batch["action_is_pad"][0, 2] = True
     numbers = numbers_of(policy, batch)
     assert labelled(policy, numbers) == [14 * [True] + 4 * [False], *3 * [18 * [True]]]
-    assert numbers.trained[1:].all()
+    assert numbers.loss_mask[1:].all()
 
 
 def test_of_another_place_the_stone_and_the_next_action_alone_are() -> None:
     policy = pointing_policy(counterfactual_share=1.0, mask_max_fraction=0.0).train()
     batch = pointing_batch(policy)
-    bins_BN, kept_BN = policy._targets(batch)
-    numbers = policy._numbers(bins_BN, kept_BN)
+    bins_BN, loss_mask_BN = policy._targets(batch)
+    numbers = policy._numbers(bins_BN, loss_mask_BN)
     stone, place, first, later = 2 * [True], 4 * [False], 4 * [True], 8 * [False]
     assert labelled(policy, numbers) == 4 * [stone + place + first + later]
     # a space says that the number before it ends
     ends_stone, of_place, of_first = 3 * [True], 4 * [False], 3 * [True]
-    assert numbers.trained[..., 0].tolist() == 4 * [ends_stone + of_place + of_first + later]
+    assert numbers.loss_mask[..., 0].tolist() == 4 * [ends_stone + of_place + of_first + later]
     labels = policy._answer(numbers).labels
     assert (labels != IGNORED).sum(dim=1).tolist() == 4 * [3 + 3 * 2 + 3 + 3 * 4 + 1]  # and the end
     for row in range(4):
@@ -198,7 +198,7 @@ def test_actions_alone_come_out_whatever_the_decoding() -> None:
     undrafted = pointing_policy(draft="none")
     ensemble = pointing_policy(temporal_ensemble_size=2, n_action_steps=1)
     batch = make_batch(policy, 3)  # no labels
-    written = policy._write(batch, 3)
+    written = policy.write(batch, 3)
     assert written.shape == (3, 18)
     chunk = policy.predict_action_chunk(batch)
     assert torch.equal(chunk, policy.action_bins.decode(written[:, 6:]).view(3, 3, 4))
@@ -222,10 +222,12 @@ def forced(policy: Vla0SmolPolicy, batch: dict[str, Any], given_B2: Tensor) -> T
     labels = replace(labels, given_xy=given_B2)
     tokens = policy._to_tokens(policy.pointer.bins_of(labels, batch["observation.state"]), bins)
     pointed = TokenRows(tokens.ids.flatten(1), tokens.mask.flatten(1))
-    rows = TokenRows.join([policy.eval()._prompt(batch), pointed]).without_padding()
+    rows = TokenRows.join([policy.eval().prompt(batch), pointed]).without_padding()
     grammar = NumberGrammar(bins, 4, fixed_width=policy.config.number_width)
     write = NumberWriter(policy.backbone, grammar, KnownSymbols(grammar), policy._positions)
-    decoded = write(Prompt(policy._embeds(batch, rows.ids), rows.mask), policy.symbol_ids, 4)
+    decoded = write(
+        Prompt(policy.embed(rows.ids, policy.encode_images(batch)), rows.mask), policy.symbol_ids, 4
+    )
     return policy.action_bins.decode(decoded.numbers)
 
 
@@ -243,7 +245,7 @@ def test_it_learns_to_point_and_given_other_places_goes_where_it_points(share: f
         optimizer.step()
     with torch.no_grad():
         policy.eval()
-        assert torch.equal(policy._write(batch, 1), policy._targets(batch)[0])
+        assert torch.equal(policy.write(batch, 1), policy._targets(batch)[0])
         for turn in (1, 2):  # places that other rows mean
             given_B2 = PLACES.roll(-turn, dims=0)
             is_obeyed = (forced(policy, batch, given_B2) - towards(given_B2)).abs().max() < 1e-5
@@ -252,7 +254,7 @@ def test_it_learns_to_point_and_given_other_places_goes_where_it_points(share: f
 
 def test_an_explanation_is_of_the_whole_answer() -> None:
     policy = pointing_policy()
-    explained, batch = policy.explained(), make_batch(policy, 1)
+    explained, batch = policy.scored(), make_batch(policy, 1)
     answer, rows = explained.answer(batch), explained.encode(batch)
     assert answer.shape == (1, 18)
     moved = answer.clone()
@@ -264,14 +266,14 @@ def test_an_explanation_says_where_it_points() -> None:
     """Check its millimetres, of which 300 is the middle."""
     policy = pointing_policy()
     batch = make_batch(policy, 1)
-    numbers = policy._write(batch, 3)[0].tolist()
-    found = policy.explained().pointed(batch)
+    numbers = policy.write(batch, 3)[0].tolist()
+    found = policy.scored().pointed(batch)
     assert found is not None and found.held is None and found.probabilities == {}
     assert len({*numbers[:4]}) > 1
     xy_m = [(number - 300) / 1000 for number in numbers[:4]]
     assert [*found.stone_xy, *found.place_xy] == pytest.approx(xy_m, abs=1e-6)
     plain = make_policy()
-    assert plain.explained().pointed(make_batch(plain, 1)) is None
+    assert plain.scored().pointed(make_batch(plain, 1)) is None
 
 
 # Data

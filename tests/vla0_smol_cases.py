@@ -66,6 +66,6 @@ def numbers_of(policy: Vla0SmolPolicy, batch: dict[str, Any]) -> NumberTokens:
 
 def sequence(policy: Vla0SmolPolicy, batch: dict[str, Any]) -> list[list[int]]:
     """Return each row's ids of question and answer, without padding."""
-    prompt, answer = policy._prompt(batch), policy._answer(numbers_of(policy, batch)).rows
+    prompt, answer = policy.prompt(batch), policy._answer(numbers_of(policy, batch)).rows
     pairs = zip(prompt.ids, prompt.mask, answer.ids, answer.mask, strict=True)
     return [[*ids[keep].tolist(), *said[kept].tolist()] for ids, keep, said, kept in pairs]

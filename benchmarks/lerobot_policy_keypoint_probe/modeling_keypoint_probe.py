@@ -81,7 +81,7 @@ class KeypointProbePolicy(ChunkPolicy):
             nn.ReLU(),
             nn.Linear(hidden, hidden),
             nn.ReLU(),
-            nn.Linear(hidden, self._action_dim),
+            nn.Linear(hidden, self.action_dim),
         )
 
     def forward(self, batch: dict[str, Tensor], reduction: str = "mean") -> tuple[Tensor, dict[str, float]]:

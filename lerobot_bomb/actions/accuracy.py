@@ -14,15 +14,17 @@ from lerobot_bomb.actions.text import NumberTokens
 
 def counted_numbers(numbers: NumberTokens) -> Tensor:
     """(B, N) bool: the loss counts every digit, so the number is neither hidden nor padding."""
-    return (numbers.trained | ~numbers.mask)[..., 1:].all(dim=-1)
+    return (numbers.loss_mask | ~numbers.mask)[..., 1:].all(dim=-1)
 
 
 def exact_numbers(numbers: NumberTokens, right_BM: Tensor) -> Tensor:
     """(B, M) bool, the right token was predicted -> (B, N) bool, all of the number was, and that it ends."""
     right_BNC = right_BM[:, :-1].view_as(numbers.mask)
     # a column after the number there is the next one's space or the end; where untrained, it cannot be wrong
-    trained_BN = torch.cat([numbers.trained[:, 1:, 0], torch.ones_like(numbers.trained[:, :1, 0])], dim=1)
-    ends_BN = right_BM[:, numbers.mask.shape[2] :: numbers.mask.shape[2]] | ~trained_BN
+    loss_mask_BN = torch.cat(
+        [numbers.loss_mask[:, 1:, 0], torch.ones_like(numbers.loss_mask[:, :1, 0])], dim=1
+    )
+    ends_BN = right_BM[:, numbers.mask.shape[2] :: numbers.mask.shape[2]] | ~loss_mask_BN
     return (right_BNC | ~numbers.mask)[..., 1:].all(dim=-1) & ends_BN
 
 

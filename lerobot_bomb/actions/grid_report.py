@@ -4,12 +4,13 @@ Shapes: `N` actions, `D` action dims.
 """
 
 import textwrap
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 
 import numpy as np
 import torch
 
 from lerobot_bomb.actions.grid_fit import LONG_MOTION
+from lerobot_bomb.actions.grid_settings import ActionGroup
 from lerobot_bomb.actions.grids import ActionGrids
 
 CLIP_TOLERANCE = 1e-3  # LeRobot estimates quantiles: an extreme that many actions have may lie a hair beyond
@@ -109,3 +110,13 @@ def _group_rest_text(rho_N: np.ndarray, is_still_N: np.ndarray, dead: float) -> 
         f"--policy.grid_distribution=quantile, or "
         f"--policy.normalization_mapping with ACTION: QUANTILES"
     ), True
+
+
+def cells_text(groups: Collection[ActionGroup]) -> str:
+    """A token for each group, and how many cells it chooses from."""
+    cells = ", ".join(
+        f"{group.transform} " * (group.transform != "identity") + " x ".join(map(str, group.bins))
+        for group in groups
+    )
+    alone = all(len(group.dims) == 1 for group in groups)
+    return f"a token {'a dimension' if alone else 'a group'} ({cells} cells)"

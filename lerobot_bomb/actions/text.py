@@ -4,6 +4,7 @@ A symbol is one of the twelve tokens that an answer consists of: the digits 0-9,
 Shapes: `B` batch, `N` numbers, `W` digits a number may have, `C` = W + 1 columns a number takes.
 """
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import torch
@@ -44,20 +45,20 @@ class NumberTokens:
 
     ids: Tensor  # int64
     mask: Tensor  # bool, whether the column holds a token
-    trained: Tensor  # bool, whether the loss counts it
+    loss_mask: Tensor  # bool
 
     def hide_numbers(self, hidden_BN: Tensor, hidden_id: int) -> "NumberTokens":
         """One ``hidden_id`` in place of all digits of a number; its space stays and is trained on."""
-        ids_BNC, mask_BNC, trained_BNC = self.ids.clone(), self.mask.clone(), self.trained.clone()
+        ids_BNC, mask_BNC, loss_mask_BNC = self.ids.clone(), self.mask.clone(), self.loss_mask.clone()
         mask_BNC[..., 1:-1] &= ~hidden_BN[..., None]
-        trained_BNC[..., 1:] &= ~hidden_BN[..., None]
+        loss_mask_BNC[..., 1:] &= ~hidden_BN[..., None]
         ids_BNC[..., -1] = ids_BNC[..., -1].masked_fill(hidden_BN, hidden_id)
-        return NumberTokens(ids_BNC, mask_BNC, trained_BNC)
+        return NumberTokens(ids_BNC, mask_BNC, loss_mask_BNC)
 
     def hide_characters(self, hidden_BNC: Tensor, hidden_id: int) -> "NumberTokens":
         """``hidden_id`` in place of single digits and spaces."""
         ids_BNC = self.ids.masked_fill(hidden_BNC, hidden_id)
-        return NumberTokens(ids_BNC, self.mask, self.trained & ~hidden_BNC)
+        return NumberTokens(ids_BNC, self.mask, self.loss_mask & ~hidden_BNC)
 
 
 def draw_hidden(
@@ -92,7 +93,7 @@ def compact(mask_BL: Tensor, *columns_BL: Tensor) -> tuple[Tensor, ...]:
 class TokenRows:
     """Rows of tokens with padding: ids (B, L) int64 and which columns hold a token (B, L) bool.
 
-    A hidden token keeps its position, but no other token reads it.
+    A hidden token keeps its position, but no other token attends to it.
     """
 
     ids: Tensor
@@ -100,7 +101,7 @@ class TokenRows:
     hidden: Tensor | None = None  # (B, L) bool; None: no token is
 
     @classmethod
-    def constant(cls, ids: list[int], like_BL: Tensor) -> "TokenRows":
+    def constant(cls, ids: Sequence[int], like_BL: Tensor) -> "TokenRows":
         """Put the same tokens in every row, with as many rows as ``like_BL`` and on its device."""
         ids_BL = torch.tensor(ids, dtype=torch.int64, device=like_BL.device).expand(len(like_BL), -1)
         return cls(ids_BL, torch.ones_like(ids_BL, dtype=torch.bool))
@@ -108,14 +109,14 @@ class TokenRows:
     @classmethod
     def join(cls, parts: "list[TokenRows]") -> "TokenRows":
         if any(part.hidden is not None for part in parts):
-            parts = [cls(part.ids, part.mask, part.mask & ~part.readable) for part in parts]
+            parts = [cls(part.ids, part.mask, part.mask & ~part.attention_mask) for part in parts]
         return cls(
             *(torch.cat(columns, 1) for columns in zip(*(part._columns for part in parts), strict=True))
         )
 
     @property
-    def readable(self) -> Tensor:
-        """(B, L) bool, which columns hold a token that others read."""
+    def attention_mask(self) -> Tensor:
+        """(B, L) bool, which columns hold a token that others attend to."""
         return self.mask if self.hidden is None else self.mask & ~self.hidden
 
     def rounded(self, multiple: int) -> "TokenRows":
@@ -143,16 +144,16 @@ class Answer:
 
     @classmethod
     def of(cls, numbers: NumberTokens, end_id: Tensor) -> "Answer":
-        """Take the padding out, and label what is trained."""
+        """Take the padding out, and label what the loss counts."""
         end_B1 = end_id.expand(len(numbers.ids), 1)
         true_B1 = torch.ones_like(end_B1, dtype=torch.bool)
-        ids_BM, mask_BM, trained_BM = (
+        ids_BM, mask_BM, loss_mask_BM = (
             torch.cat([columns.flatten(1), last], dim=1)
             for columns, last in zip(
-                (numbers.ids, numbers.mask, numbers.trained), (end_B1, true_B1, true_B1), strict=True
+                (numbers.ids, numbers.mask, numbers.loss_mask), (end_B1, true_B1, true_B1), strict=True
             )
         )
-        labels_BM = ids_BM.masked_fill(~(trained_BM & mask_BM), IGNORED)
+        labels_BM = ids_BM.masked_fill(~(loss_mask_BM & mask_BM), IGNORED)
         columns_BM = torch.arange(ids_BM.shape[1], device=ids_BM.device).expand_as(ids_BM)
         mask_BA, ids_BA, labels_BA, columns_BA = compact(mask_BM, ids_BM, labels_BM, columns_BM)
         return cls(TokenRows(ids_BA, mask_BA), labels_BA, columns_BA)

@@ -2,13 +2,14 @@
 
 import re
 from collections.abc import Iterable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from typing import Any
 
 from lerobot_bomb.bomb.board import task_id
 from lerobot_bomb.bomb.observation import ACTION_NAMES
 from lerobot_bomb.bomb.suite import task_version
 from lerobot_bomb.bomb.suites import SUITES
+from lerobot_bomb.compat.help import leave_out_of_help
 from lerobot_bomb.conditions import ALL
 
 SUITE = "SUITE"  # in flags: one that is not known, to be filled in
@@ -143,6 +144,10 @@ class Environment:
             f"control {self.control_mode} at {self.fps} Hz, cameras {', '.join(self.cameras)} of "
             f"{self.image_size} px{depth}"
         )
+
+
+# no command line gives them
+leave_out_of_help(Environment, [each.name for each in fields(Environment)])
 
 
 def numbered_tasks(specs: Iterable[Mapping[str, Any]]) -> tuple[int, ...]:

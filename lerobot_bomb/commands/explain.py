@@ -62,9 +62,9 @@ def run(args: argparse.Namespace) -> int:
     if args.episodes > 1 and args.step is not None:
         raise ValueError(f"--step={args.step} is of one episode; drop it or --episodes={args.episodes}")
     check_new_folder("output", args.output)
-    asked = _of_flags(args) if args.results is None else _of_line(args)
-    _check_images(args, asked.viewed(asked.seed).env_flags["image_size"])
-    return (_explain_one if args.episodes == 1 else _explain_several)(args, asked)
+    query = _of_flags(args) if args.results is None else _of_line(args)
+    _check_images(args, query.viewed(query.seed).env_flags["image_size"])
+    return (_explain_one if args.episodes == 1 else _explain_several)(args, query)
 
 
 def _check_images(args: argparse.Namespace, image_size: int) -> None:
@@ -75,7 +75,7 @@ def _check_images(args: argparse.Namespace, image_size: int) -> None:
     patch_masks(args.grid, image_size, image_size)
 
 
-def _of_flags(args: argparse.Namespace) -> "_Asked":
+def _of_flags(args: argparse.Namespace) -> "_Query":
     if args.policy_path is None:
         raise ValueError("--policy.path is missing: the checkpoint that is explained; or give --results=FILE")
     if args.line is not None:
@@ -85,10 +85,10 @@ def _of_flags(args: argparse.Namespace) -> "_Asked":
         return viewed_of(argparse.Namespace(**vars(args) | {"seed": seed}))
 
     seed = TEST_SEEDS[0] if args.seed is None else args.seed
-    return _Asked(viewed, seed, args.policy_path, args.policy_device)
+    return _Query(viewed, seed, args.policy_path, args.policy_device)
 
 
-def _of_line(args: argparse.Namespace) -> "_Asked":
+def _of_line(args: argparse.Namespace) -> "_Query":
     shared = {"image_size": None, "perturbations": (NONE,), "env_type": "bomb"}
     for name, default in (shared | args.own_flags["bomb"] | args.own_flags["bomb_pusht"]).items():
         if getattr(args, name) != default:
@@ -98,13 +98,13 @@ def _of_line(args: argparse.Namespace) -> "_Asked":
         raise ValueError("who played has no checkpoint, so there is nothing to explain")
     check_checkpoint(replay.checkpoint)
     seed = replay.record.spec.seed if args.seed is None else args.seed
-    return _Asked(
+    return _Query(
         lambda seed: replay.viewed(seed=seed), seed, replay.checkpoint, args.policy_device, has_played=True
     )
 
 
 @dataclass(frozen=True)
-class _Asked:
+class _Query:
     """Episodes and checkpoint to explain."""
 
     viewed: Callable[[int], Viewed]  # of a seed
@@ -122,16 +122,16 @@ class _Asked:
 
 
 def _moments(
-    args: argparse.Namespace, asked: _Asked, seed: int, loaded: "LoadedPolicy"
+    args: argparse.Namespace, query: _Query, seed: int, loaded: "LoadedPolicy"
 ) -> "tuple[list[ExplainedMoment], Any]":
     """Explain an episode's moments that are asked about; return them with the episode's result."""
     from lerobot_bomb.explain.episode import Settings, explain_moment
-    from lerobot_bomb.explain.watched import at_step, middle_of_phases, watch
+    from lerobot_bomb.explain.snapshots import at_step, middle_of_phases, watch
 
-    viewed = asked.viewed(seed)
-    watched, result = watch(viewed, loaded)
-    chosen = middle_of_phases(watched) if args.step is None else [at_step(watched, args.step)]
-    elsewhere = watch(asked.viewed(seed + 1), loaded)[0]
+    viewed = query.viewed(seed)
+    snapshots, result = watch(viewed, loaded)
+    chosen = middle_of_phases(snapshots) if args.step is None else [at_step(snapshots, args.step)]
+    elsewhere = watch(query.viewed(seed + 1), loaded)[0]
     others = {each.phase: each for each in (elsewhere[0], *middle_of_phases(elsewhere))}
     settings = Settings(args.grid, args.fill, tuple(args.words))
     control_mode = getattr(viewed.spec, "control_mode", None)
@@ -142,16 +142,16 @@ def _moments(
     ], result
 
 
-def _explain_one(args: argparse.Namespace, asked: _Asked) -> int:
+def _explain_one(args: argparse.Namespace, query: _Query) -> int:
     from lerobot_bomb.explain.masked_episodes import masks_of, play_masked
     from lerobot_bomb.explain.recording import write_recording
     from lerobot_bomb.report.explanation import moment_sections, overview_section, traces_section
 
-    viewed, loaded = asked.viewed(asked.seed), asked.load()
-    moments, result = _moments(args, asked, asked.seed, loaded)
+    viewed, loaded = query.viewed(query.seed), query.load()
+    moments, result = _moments(args, query, query.seed, loaded)
     episodes = {}
     if viewed.env_type == "bomb" and args.fill != "other":
-        episodes = play_masked(viewed, loaded, masks_of(moments[0].watched, loaded, args.fill))
+        episodes = play_masked(viewed, loaded, masks_of(moments[0].snapshot, loaded, args.fill))
     name = viewed.name(loaded.config.type)
     sections = [overview_section(viewed.log().describe(result), moments, _command())]
     sections += [section for each in moments for section in moment_sections(each)]
@@ -170,15 +170,15 @@ def _explain_one(args: argparse.Namespace, asked: _Asked) -> int:
     return 0
 
 
-def _explain_several(args: argparse.Namespace, asked: _Asked) -> int:
+def _explain_several(args: argparse.Namespace, query: _Query) -> int:
     from lerobot_bomb.report.explanation import aggregate_sections, probes_section
 
-    loaded, seeds = asked.load(), range(asked.seed, asked.seed + args.episodes)
-    episodes = [_moments(args, asked, seed, loaded) for seed in tqdm(seeds, desc="episodes")]
+    loaded, seeds = query.load(), range(query.seed, query.seed + args.episodes)
+    episodes = [_moments(args, query, seed, loaded) for seed in tqdm(seeds, desc="episodes")]
     by_phase: dict[str, list[ExplainedMoment]] = defaultdict(list)
     for moments, _ in episodes:
         for each in moments:
-            by_phase[each.watched.phase].append(each)
+            by_phase[each.snapshot.phase].append(each)
     sections = aggregate_sections([result for _, result in episodes], by_phase, _command())
     if probes := _probes([moments[0] for moments, _ in episodes]):
         sections.append(probes_section(probes))
@@ -190,7 +190,7 @@ def _explain_several(args: argparse.Namespace, asked: _Asked) -> int:
         ],
     }
     with written_whole(args.output) as (folder,):
-        _write(folder, f"Why: {asked.viewed(asked.seed).group}, {args.episodes} episodes", sections, numbers)
+        _write(folder, f"Why: {query.viewed(query.seed).group}, {args.episodes} episodes", sections, numbers)
     print(*(args.output / file for file in (PAGE, NUMBERS)), sep="\n")
     return 0
 
@@ -199,12 +199,12 @@ def _probes(moments: "Sequence[ExplainedMoment]") -> "list[LayerProbe]":
     """Probe layers for destination and stone, where enough episodes hold them and the layers' states."""
     from lerobot_bomb.explain.probes import MIN_EPISODES, probe_layers
 
-    known = [each for each in moments if each.states and each.watched.target is not None]
+    known = [each for each in moments if each.states and each.snapshot.target is not None]
     if len(known) < MIN_EPISODES:
         return []
-    targets = np.array([each.watched.target for each in known])
+    targets = np.array([each.snapshot.target for each in known])
     states = {place: np.stack([each.states[place] for each in known]) for place in known[0].states}
-    stones = np.stack([each.watched.stone_xyz for each in known if each.watched.stone_xyz is not None])
+    stones = np.stack([each.snapshot.stone_xyz for each in known if each.snapshot.stone_xyz is not None])
     classes = {"target's row": targets[:, 0], "target's column": targets[:, 1]}
     return probe_layers(states, classes, {"stone's place on the table": stones[:, :2]})
 

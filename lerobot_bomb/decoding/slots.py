@@ -27,11 +27,11 @@ from lerobot_bomb.finite import require_finite_answers
 from lerobot_bomb.vlm.backbone import exact_linear, in_float32
 
 
-class SlotWriter:
+class SlotDecoder:
     """Choices after prompts; on CUDA captured whole for every shape of prompts that it has met.
 
-    The prompt may have padding, but not in its last column. ``prompt_reads_all``: every token of the prompt
-    reads all of it, not only what stands before.
+    The prompt may have padding, but not in its last column. ``bidirectional_prompt``: every token
+    of the prompt attends to all of it, not only to what stands before.
     """
 
     def __init__(
@@ -39,14 +39,14 @@ class SlotWriter:
         text_model: Any,
         positions: Positions,
         *,
-        prompt_reads_all: bool,
+        bidirectional_prompt: bool,
         cap: Callable[[Tensor], Tensor],
         drafted: bool = False,
         compiled: bool = False,
     ):
         """``cap``: of logits; ``drafted``: guess that a step is as the one before, on a CPU, one row."""
         self._text_model, self._positions, self._cap = text_model, positions, cap
-        self._reads_all, self.drafted = prompt_reads_all, drafted
+        self._bidirectional_prompt, self.drafted = bidirectional_prompt, drafted
         self.num_passes: int | None = None  # of the last answers, the prompt's included
         self._graphs = GraphCache[GraphSlots](text_model, positions, compiled=compiled)
 
@@ -77,7 +77,7 @@ class SlotWriter:
             noise = prompt.embeds.new_empty(len(prompt.embeds), 0, len(head_CH))
         if prompt.embeds.is_cuda:
             with torch.inference_mode(False), torch.no_grad():
-                settings = slots, num_steps, self._reads_all, self._cap
+                settings = slots, num_steps, self._bidirectional_prompt, self._cap
                 make = partial(GraphSlots, *settings, embeds_CH, head_CH, ahead=ahead)
                 captured = self._graphs.find(prompt.embeds, num_slots, make)
                 choices_BS, finite_B = captured(prompt, embeds_CH, head_CH, noise)
@@ -90,7 +90,9 @@ class SlotWriter:
         # rows that agree on how far guesses are right are rare
         is_drafted = self.drafted and batch_size == 1
         singly = places[: len(ahead) + len(slots)] if is_drafted else places
-        choices_BS, finite_B = choose(text, prompt, singly, embeds_CH, head, prompt_reads_all=self._reads_all)
+        choices_BS, finite_B = choose(
+            text, prompt, singly, embeds_CH, head, bidirectional_prompt=self._bidirectional_prompt
+        )
         require_finite_answers(finite_B)
         if not is_drafted:
             return choices_BS
@@ -137,7 +139,7 @@ class GraphSlots:
         self,
         slots: list[slice],
         num_steps: int,
-        reads_all: bool,
+        bidirectional_prompt: bool,
         cap: Callable[[Tensor], Tensor],
         embeds_CH: Tensor,
         head_CH: Tensor,
@@ -145,7 +147,7 @@ class GraphSlots:
         ahead: Sequence[slice] = (),
     ):
         self._text, self._places = text, _places(ahead, slots, num_steps)
-        self._reads_all, self._cap = reads_all, cap
+        self._bidirectional_prompt, self._cap = bidirectional_prompt, cap
         self._embeds_CH, self._head_CH = embeds_CH.clone(), head_CH.clone()
         self._choose = GraphedFunction(self._choose_all)
 
@@ -165,7 +167,7 @@ class GraphSlots:
         prompt = Prompt(embeds_BLH, mask_BL, hidden_BL)
         head = SlotHead(self._head_CH, noise_BTC, self._cap)
         answer = self._places, self._embeds_CH, head
-        return choose(self._text, prompt, *answer, prompt_reads_all=self._reads_all)
+        return choose(self._text, prompt, *answer, bidirectional_prompt=self._bidirectional_prompt)
 
 
 def _places(ahead: Sequence[slice], slots: Sequence[slice], num_steps: int) -> list[tuple[int, slice]]:
@@ -180,14 +182,14 @@ def choose(
     embeds_CH: Tensor,
     head: SlotHead,
     *,
-    prompt_reads_all: bool,
+    bidirectional_prompt: bool,
 ) -> tuple[Tensor, Tensor]:
-    """Choose as `SlotWriter`, on an empty cache; and (B,) bool: were all choices from finite logits?"""
+    """Choose as `SlotDecoder`, on an empty cache; and (B,) bool: were all choices from finite logits?"""
     last_B1 = prompt.mask.sum(dim=1, keepdim=True) - 1
     columns_BL = text.columns_of(prompt.mask)
     if prompt.hidden is not None:
         text.hide(columns_BL, prompt.hidden)
-    reach_BL = last_B1.expand_as(columns_BL) if prompt_reads_all else columns_BL
+    reach_BL = last_B1.expand_as(columns_BL) if bidirectional_prompt else columns_BL
     hidden_BH = text(prompt.embeds, columns_BL, reach_BL)[:, -1]
     chosen = [likeliest(head.logits(hidden_BH, *places[0]))]
     passes = text.singly(last_B1 + torch.arange(1, len(places), device=last_B1.device))

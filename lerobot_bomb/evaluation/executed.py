@@ -16,7 +16,7 @@ from lerobot_bomb.files import append_line
 
 
 @dataclass(frozen=True)
-class Executed:
+class ActionLog:
     """Actions of whole episodes, in order of time."""
 
     name: str  # of the dataset or file
@@ -40,7 +40,7 @@ class Executed:
         return next(iter(self.episodes.values())).shape[1]
 
 
-def read_executed(path: Path) -> Executed:
+def read_executed(path: Path) -> ActionLog:
     """Read a file of ``lerobot-bomb results actions`` or a LeRobotDataset's folder.
 
     Raises:
@@ -57,7 +57,7 @@ def read_executed(path: Path) -> Executed:
     return read_action_log(path)
 
 
-def executed_in_dataset(meta: LeRobotDatasetMetadata, name: str) -> Executed:
+def executed_in_dataset(meta: LeRobotDatasetMetadata, name: str) -> ActionLog:
     """Read all recorded actions, each episode under its number."""
     if ACTION not in meta.features:
         raise ValueError(f"dataset {name} has no {ACTION!r}; it has {sorted(meta.features)}")
@@ -65,7 +65,7 @@ def executed_in_dataset(meta: LeRobotDatasetMetadata, name: str) -> Executed:
     columns = read_columns(meta, (ACTION,))
     numbers, starts = np.unique(columns[EPISODE_INDEX], return_index=True)
     of_episodes = np.split(columns[ACTION], starts[1:])
-    return Executed(name, meta.fps, dict(zip(map(str, numbers), of_episodes, strict=True)), False)
+    return ActionLog(name, meta.fps, dict(zip(map(str, numbers), of_episodes, strict=True)), False)
 
 
 def append_episode(
@@ -81,7 +81,7 @@ def start_of(episode: str) -> str:
     return episode.rpartition(", ")[2]
 
 
-def read_action_log(path: Path) -> Executed:
+def read_action_log(path: Path) -> ActionLog:
     """The episodes that ``append_episode`` wrote.
 
     Raises:
@@ -107,4 +107,4 @@ def read_action_log(path: Path) -> Executed:
         episodes[episode] = actions_TD
     if len(rates) > 1:
         raise ValueError(f"{path}: episodes of different rates, {sorted(rates)} actions a second")
-    return Executed(str(path), rates.pop() if rates else 0.0, episodes, True)
+    return ActionLog(str(path), rates.pop() if rates else 0.0, episodes, True)

@@ -9,7 +9,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from lerobot_bomb.bootstrap import Measure, paired_bootstrap_interval, sums_by
-from lerobot_bomb.evaluation.executed import Executed, start_of
+from lerobot_bomb.evaluation.executed import ActionLog, start_of
 from lerobot_bomb.smoothness import MIN_ACTIONS, smoothness
 from lerobot_bomb.tables import print_table
 
@@ -45,7 +45,7 @@ class Difference:
     measures: dict[str, Measure]
 
 
-def make_units(dataset: Executed, names: list[str], exclude: list[str] | None, per_second: bool) -> Units:
+def make_units(dataset: ActionLog, names: list[str], exclude: list[str] | None, per_second: bool) -> Units:
     """Return the units of a dataset.
 
     Raises:
@@ -67,7 +67,7 @@ def make_units(dataset: Executed, names: list[str], exclude: list[str] | None, p
     return Units([names.index(name) for name in exclude], std_D, per_second)
 
 
-def check_comparable(compared: list[Executed], per_second: bool) -> None:
+def check_comparable(compared: list[ActionLog], per_second: bool) -> None:
     """Raise a ValueError unless all are named once and of one size; warn where their rates differ."""
     dataset, *others = compared
     names = [executed.name for executed in compared]
@@ -87,7 +87,7 @@ def check_comparable(compared: list[Executed], per_second: bool) -> None:
             )
 
 
-def measure_row(executed: Executed, units: Units) -> SmoothnessRow:
+def measure_row(executed: ActionLog, units: Units) -> SmoothnessRow:
     """Measure the smoothness of a row; every difference within an episode counts the same.
 
     Raises:

@@ -12,7 +12,7 @@ from typing import Any
 
 from torch import Tensor, nn
 
-from lerobot_bomb.explain.explained import DecoderLayer, Place
+from lerobot_bomb.explain.scored_policy import DecoderLayer, TokenSpan
 
 # a part of a layer: its output; the heads' outputs, side by side; the output of its MLP
 LAYER, HEADS, MLP = "layer", "heads", "mlp"
@@ -30,7 +30,7 @@ class Unit:
     layer: int
     part: str
     head: int | None = None  # of HEADS; None: all of them
-    place: Place | None = None  # which tokens; None: all of them
+    span: TokenSpan | None = None  # which tokens; None: all of them
 
 
 @contextmanager
@@ -87,7 +87,7 @@ class _Restore:
         size = values_NLF.shape[2] // self.num_heads
         for row, unit in self.units:
             features = slice(None) if unit.head is None else slice(unit.head * size, (unit.head + 1) * size)
-            columns = slice(None) if unit.place is None else unit.place[self.num_passes]
+            columns = slice(None) if unit.span is None else unit.span[self.num_passes]
             if columns is not None:
                 restored[row][:, columns, features] = clean_NLF[:, columns, features]
         self.num_passes += 1
@@ -126,9 +126,9 @@ def _on_first(change: Change, output: Any) -> Any:
     return change(output)
 
 
-def all_layers(num_layers: int, place: Place | None = None) -> list[Unit]:
-    """Return every layer's output, at a place."""
-    return [Unit(layer, LAYER, place=place) for layer in range(num_layers)]
+def all_layers(num_layers: int, span: TokenSpan | None = None) -> list[Unit]:
+    """Return every layer's output, at a span of tokens."""
+    return [Unit(layer, LAYER, span=span) for layer in range(num_layers)]
 
 
 def all_heads(layers: Sequence[DecoderLayer]) -> list[Unit]:

@@ -4,7 +4,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Self
 
-from lerobot_bomb.explain.moment import ALL, Explanation, Restored, camera_name
+from lerobot_bomb.explain.moment import ALL, Explanation, PatchingResult, camera_name
 from lerobot_bomb.explain.restoration import smallest_drop
 
 SHARE = 0.05  # an effect below this share of the largest of its kind is none
@@ -61,11 +61,11 @@ def diagnose(explanation: Explanation) -> list[Finding]:
     ]
     findings += [
         Finding.of_effects(
-            f"Heads that alone restore it, {restored.corruption}:",
-            _heads(restored),
-            is_weak=abs(restored.drop) < weak,
+            f"Heads that alone restore it, {result.corruption}:",
+            _heads(result),
+            is_weak=abs(result.drop) < weak,
         )
-        for restored in explanation.restored
+        for result in explanation.restored
     ]
     return findings
 
@@ -81,10 +81,10 @@ def _largest(effects: Mapping[str, float]) -> float:
     return max(map(abs, effects.values()), default=0.0)
 
 
-def _heads(restored: Restored) -> dict[str, float]:
+def _heads(result: PatchingResult) -> dict[str, float]:
     ratios = {
         f"layer {layer}, head {head}": ratio
-        for layer, of_layer in enumerate(restored.heads)
+        for layer, of_layer in enumerate(result.heads)
         for head, ratio in enumerate(of_layer)
     }
     found = {name: ratio for name, ratio in ratios.items() if ratio >= RESTORES}  # NaN is not

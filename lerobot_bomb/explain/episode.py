@@ -11,14 +11,14 @@ from lerobot.utils.constants import OBS_IMAGES
 from lerobot_bomb.checkpoints.folder import autocast
 from lerobot_bomb.explain.activations import LAYER, recording
 from lerobot_bomb.explain.diagnosis import Finding, diagnose
-from lerobot_bomb.explain.explained import ANSWER, INSTRUCTION, Batch
 from lerobot_bomb.explain.following import Following, following
-from lerobot_bomb.explain.moment import OBSERVATION, Asked, Explanation, explain, image_keys
-from lerobot_bomb.explain.other_policies import explained
+from lerobot_bomb.explain.moment import OBSERVATION, Explanation, Query, explain, image_keys
+from lerobot_bomb.explain.other_policies import scored
 from lerobot_bomb.explain.pointing import PointingCheck, check_pointing
 from lerobot_bomb.explain.question import Question
+from lerobot_bomb.explain.scored_policy import ANSWER, INSTRUCTION, Batch
+from lerobot_bomb.explain.snapshots import Snapshot
 from lerobot_bomb.explain.spans import Span, named_spans, span_of, spans_of_words, token_offsets
-from lerobot_bomb.explain.watched import Watched
 from lerobot_bomb.viewing.checkpoint import LoadedPolicy
 
 
@@ -35,25 +35,25 @@ class Settings:
 class ExplainedMoment:
     """A moment, what was found out about it, and what a person sees of it."""
 
-    watched: Watched
+    snapshot: Snapshot
     explanation: Explanation
     findings: list[Finding]
     followings: dict[str, Following]
     images: dict[str, np.ndarray]  # (H, W, 3) uint8 by the keys of the explanation's patches
-    states: dict[str, np.ndarray]  # (layers, F) by place, means over its tokens; {}: not to be had
+    states: dict[str, np.ndarray]  # (layers, F) by span, means over its tokens; {}: not to be had
     pointing: PointingCheck | None  # None: the policy does not point
 
     @property
     def title(self) -> str:
         """Title of the moment, such as "step 12, carry"."""
-        return ", ".join(part for part in (f"step {self.watched.step}", self.watched.phase) if part)
+        return ", ".join(part for part in (f"step {self.snapshot.step}", self.snapshot.phase) if part)
 
     def as_json(self) -> dict[str, Any]:
         """JSON-ready, without the images."""
         return {
-            "step": self.watched.step,
-            "phase": self.watched.phase,
-            "instruction": self.watched.instruction,
+            "step": self.snapshot.step,
+            "phase": self.snapshot.phase,
+            "instruction": self.snapshot.instruction,
             "findings": {each.question: each.names for each in self.findings},
             "following": {word: asdict(each) for word, each in self.followings.items()},
             **({} if self.pointing is None else {"pointing": self.pointing.as_json()}),
@@ -63,75 +63,75 @@ class ExplainedMoment:
 
 def explain_moment(
     loaded: LoadedPolicy,
-    watched: Watched,
+    snapshot: Snapshot,
     settings: Settings,
     control_mode: str | None,
-    other: Watched,
+    other: Snapshot,
 ) -> ExplainedMoment:
     """Ask everything; ``other``: a moment of another episode, which may stand in place of this one's scene.
 
     ``control_mode``: of BOMB's actions; None elsewhere, where nothing is said of following.
     """
-    observation = loaded.observe([watched.observation], [watched.instruction])
+    observation = loaded.observe([snapshot.observation], [snapshot.instruction])
     instead = loaded.observe([other.observation], [other.instruction])
     with torch.no_grad(), autocast(loaded.config):
-        question = Question(explained(loaded.policy, loaded.postprocess), loaded.prepare, observation)
-        explanation = explain(question, _asked(loaded, watched, settings, instead))
+        question = Question(scored(loaded.policy, loaded.postprocess), loaded.prepare, observation)
+        explanation = explain(question, _query(loaded, snapshot, settings, instead))
     followings = {}
-    if watched.target is not None and control_mode is not None:
-        followings = following(loaded, observation, watched.others, watched.target, control_mode)
+    if snapshot.target is not None and control_mode is not None:
+        followings = following(loaded, observation, snapshot.others, snapshot.target, control_mode)
     images = {
         key: (255 * observation[key][0].permute(1, 2, 0)).round().to(torch.uint8).cpu().numpy()
         for key in image_keys(question)
     }
     states = mean_states(question)
-    pointing = check_pointing(loaded, question.explained, observation, watched.state)
+    pointing = check_pointing(loaded, question.policy, observation, snapshot.state)
     findings = [*([] if pointing is None else [pointing.finding]), *diagnose(explanation)]
-    return ExplainedMoment(watched, explanation, findings, followings, images, states, pointing)
+    return ExplainedMoment(snapshot, explanation, findings, followings, images, states, pointing)
 
 
 def mean_states(question: Question) -> dict[str, np.ndarray]:
     """(layers, F) of instruction and answer: each layer's states, means over tokens and draws."""
-    asked = question.explained
-    if not asked.layers or any(layer.layer is None for layer in asked.layers):
+    policy = question.policy
+    if not policy.layers or any(layer.layer is None for layer in policy.layers):
         return {}
-    places = asked.places(question.rows)
-    with torch.no_grad(), recording(asked.layers, [LAYER]) as activations:
-        asked.score(question.rows, question.answer)
+    spans = policy.token_spans(question.rows)
+    with torch.no_grad(), recording(policy.layers, [LAYER]) as activations:
+        policy.score(question.rows, question.answer)
     found = {}
     for name in (INSTRUCTION, ANSWER):
-        number, columns = next((i, each) for i, each in enumerate(places[name]) if each is not None)
-        states = [activations[layer, LAYER][number][:, columns] for layer in range(len(asked.layers))]
+        number, columns = next((i, each) for i, each in enumerate(spans[name]) if each is not None)
+        states = [activations[layer, LAYER][number][:, columns] for layer in range(len(policy.layers))]
         found[name] = torch.stack([each.float().mean(dim=(0, 1)) for each in states]).cpu().numpy()
     return found
 
 
-def _asked(loaded: LoadedPolicy, watched: Watched, settings: Settings, instead: Batch) -> Asked:
+def _query(loaded: LoadedPolicy, snapshot: Snapshot, settings: Settings, instead: Batch) -> Query:
     try:
-        offsets = token_offsets(loaded.prepare.steps, watched.instruction)
+        offsets = token_offsets(loaded.prepare.steps, snapshot.instruction)
     except ValueError:
         if settings.words:
             raise
         offsets = []  # one that reads no instruction
     objects = {
         f"{OBS_IMAGES}.{camera}": {what: torch.from_numpy(mask) for what, mask in masks.items()}
-        for camera, masks in watched.objects.items()
+        for camera, masks in snapshot.objects.items()
     }
-    return Asked(
+    return Query(
         grid=settings.grid,
         fill=settings.fill,
-        spans=[*_spans(watched, settings.words)] if offsets else [],
+        spans=[*_spans(snapshot, settings.words)] if offsets else [],
         offsets=offsets,
-        others=watched.instructions if offsets else {},
+        others=snapshot.instructions if offsets else {},
         objects=objects,
         other_scene={key: value for key, value in instead.items() if key.startswith(OBSERVATION)},
     )
 
 
-def _spans(watched: Watched, words: Sequence[str]) -> Iterator[Span]:
+def _spans(snapshot: Snapshot, words: Sequence[str]) -> Iterator[Span]:
     """Yield the spans of row, column and colour, of each word of the instruction, and of `words`."""
-    yield from named_spans(watched.instruction, watched.instructions)
-    for span in spans_of_words(watched.instruction):
+    yield from named_spans(snapshot.instruction, snapshot.instructions)
+    for span in spans_of_words(snapshot.instruction):
         yield Span(f'"{span.name}"', span.ranges)
     for each in words:
-        yield span_of(each, watched.instruction)
+        yield span_of(each, snapshot.instruction)

@@ -7,7 +7,7 @@ import numpy as np
 
 from lerobot_bomb.bomb.board import BOARD, Cell
 from lerobot_bomb.bomb.observation import reach_m
-from lerobot_bomb.explain.explained import Batch
+from lerobot_bomb.explain.scored_policy import Batch
 from lerobot_bomb.viewing.checkpoint import LoadedPolicy
 
 

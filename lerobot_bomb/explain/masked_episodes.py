@@ -12,11 +12,11 @@ from lerobot.utils.constants import OBS_IMAGES
 
 from lerobot_bomb.bomb.observation import AGENT_POS
 from lerobot_bomb.envs.rollout import play
-from lerobot_bomb.explain.explained import Batch
 from lerobot_bomb.explain.images import filling, occluded
-from lerobot_bomb.explain.other_policies import explained
+from lerobot_bomb.explain.other_policies import scored
+from lerobot_bomb.explain.scored_policy import Batch
+from lerobot_bomb.explain.snapshots import Snapshot
 from lerobot_bomb.explain.spans import TOKENIZERS, Span, named_spans, token_offsets, whole
-from lerobot_bomb.explain.watched import Watched
 from lerobot_bomb.results.record import Record
 from lerobot_bomb.viewing.checkpoint import LoadedPolicy
 from lerobot_bomb.viewing.episode import Viewed
@@ -71,7 +71,7 @@ def without_object(name: str, fill: str) -> Mask:
 
 def without_words(loaded: LoadedPolicy, words: Callable[[str], Span | None]) -> Mask:
     """Tokens of an instruction that no other token reads; ``words``: which, None: there are none in it."""
-    policy = explained(loaded.policy, loaded.postprocess)
+    policy = scored(loaded.policy, loaded.postprocess)
 
     def hide(prepared: Batch, instruction: str) -> Batch:
         span = words(instruction)
@@ -82,15 +82,15 @@ def without_words(loaded: LoadedPolicy, words: Callable[[str], Span | None]) -> 
     return Mask(change_prepared=hide)
 
 
-def masks_of(watched: Watched, loaded: LoadedPolicy, fill: str) -> dict[str, Mask]:
+def masks_of(snapshot: Snapshot, loaded: LoadedPolicy, fill: str) -> dict[str, Mask]:
     """Return the masks: nothing, kinds of objects, words for row, column and colour, all words."""
     masks = {"nothing": Mask()}
     masks |= {
-        f"object: {name}": without_object(name, fill) for name in next(iter(watched.objects.values()), {})
+        f"object: {name}": without_object(name, fill) for name in next(iter(snapshot.objects.values()), {})
     }
     if any(isinstance(step, TOKENIZERS) for step in loaded.prepare.steps):
-        for span in named_spans(watched.instruction, watched.instructions):
-            by_instruction = {watched.instruction: span}
+        for span in named_spans(snapshot.instruction, snapshot.instructions):
+            by_instruction = {snapshot.instruction: span}
             masks[f"words: {span.name}"] = without_words(loaded, by_instruction.get)
         masks["the whole instruction"] = without_words(loaded, whole)
     return masks

@@ -12,10 +12,10 @@ from lerobot.utils.constants import OBS_IMAGE, OBS_IMAGES
 from torch import Tensor
 
 from lerobot_bomb.explain.activations import all_heads, all_layers, all_mlps
-from lerobot_bomb.explain.explained import INSTRUCTION, Batch, Place, Rows
 from lerobot_bomb.explain.images import filling, occluded, patch_masks
 from lerobot_bomb.explain.question import Question
 from lerobot_bomb.explain.restoration import Corruption
+from lerobot_bomb.explain.scored_policy import INSTRUCTION, Batch, Rows, TokenSpan
 from lerobot_bomb.explain.spans import Range, Span
 
 PATCH, WORDS, OTHER_INSTRUCTION = "patch", "words", "other instruction"
@@ -25,8 +25,8 @@ OBSERVATION = "observation"
 
 
 @dataclass(frozen=True)
-class Asked:
-    """Changes to make to a moment, one by one, to measure their effects."""
+class Query:
+    """Query about a moment: changes to make, one by one, to measure their effects."""
 
     grid: int  # cells along a side of each image
     fill: str  # of FILLINGS
@@ -40,8 +40,8 @@ class Asked:
 
 
 @dataclass(frozen=True)
-class Restored:
-    """R of every unit for one corruption; NaN where it is not defined."""
+class PatchingResult:
+    """Result of activation patching: R of every unit for one corruption; NaN where it is not defined."""
 
     corruption: str
     drop: float  # of the score
@@ -60,7 +60,7 @@ class Explanation:
     objects: dict[str, dict[str, float]]  # by key of the image, or ALL, and object
     words: dict[str, float]  # of each span that no other token reads
     others: dict[str, float]  # of each other instruction
-    restored: list[Restored]
+    restored: list[PatchingResult]
 
     @property
     def largest_patch(self) -> float:
@@ -84,25 +84,25 @@ def _finite(value: Any) -> Any:
     return None if isinstance(value, float) and value != value else value
 
 
-def explain(question: Question, asked: Asked) -> Explanation:
+def explain(question: Question, query: Query) -> Explanation:
     """Ask all of it.
 
     Raises:
         ValueError: the grid does not divide an image, or as `filling`.
     """
-    fillings = {key: _filling(question, asked, key) for key in image_keys(question)}
-    patches = {key: _patches(question, asked.grid, key, each) for key, each in fillings.items()}
-    words = _words(question, asked)
-    others = _others(question, asked)
-    corruptions = _corruptions(question, asked, fillings, patches, words, others)
+    fillings = {key: _filling(question, query, key) for key in image_keys(question)}
+    patches = {key: _patches(question, query.grid, key, each) for key, each in fillings.items()}
+    words = _words(question, query)
+    others = _others(question, query)
+    corruptions = _corruptions(question, query, fillings, patches, words, others)
     return Explanation(
-        unit=question.explained.unit,
+        unit=question.policy.unit,
         clean_score=question.clean_score,
         patches=patches,
-        objects=_objects(question, asked, fillings),
+        objects=_objects(question, query, fillings),
         words=words,
         others=others,
-        restored=[_restore(question, asked, name, rows) for name, rows in corruptions],
+        restored=[_restore(question, query, name, rows) for name, rows in corruptions],
     )
 
 
@@ -120,11 +120,11 @@ def camera_name(key: str) -> str:
     return key.removeprefix(f"{OBS_IMAGES}.").removeprefix(f"{OBSERVATION}.")
 
 
-def _filling(question: Question, asked: Asked, key: str) -> Tensor:
+def _filling(question: Question, query: Query, key: str) -> Tensor:
     (image,) = question.observation[key]
-    blur_px = image.shape[-1] / asked.grid / 2
-    other = asked.other_scene.get(key)
-    return filling(image, asked.fill, blur_px, None if other is None else other[0])
+    blur_px = image.shape[-1] / query.grid / 2
+    other = query.other_scene.get(key)
+    return filling(image, query.fill, blur_px, None if other is None else other[0])
 
 
 def _patches(question: Question, grid: int, key: str, filling_3HW: Tensor) -> Tensor:
@@ -132,13 +132,13 @@ def _patches(question: Question, grid: int, key: str, filling_3HW: Tensor) -> Te
     return question.effects_of_masks(key, masks, filling_3HW).unflatten(0, (grid, grid)).cpu()
 
 
-def _objects(question: Question, asked: Asked, fillings: Mapping[str, Tensor]) -> dict[str, dict[str, float]]:
+def _objects(question: Question, query: Query, fillings: Mapping[str, Tensor]) -> dict[str, dict[str, float]]:
     """Measure each object's effect in each camera and in all at once, for objects that a camera shows."""
     effects: dict[str, dict[str, float]] = {}
-    names = list(dict.fromkeys(name for masks in asked.objects.values() for name in masks))
+    names = list(dict.fromkeys(name for masks in query.objects.values() for name in masks))
     for name in names:
         changed: dict[str, Tensor] = {}
-        for key, masks in asked.objects.items():
+        for key, masks in query.objects.items():
             if not masks[name].any():
                 continue
             (image,) = question.observation[key]
@@ -149,51 +149,51 @@ def _objects(question: Question, asked: Asked, fillings: Mapping[str, Tensor]) -
     return effects
 
 
-def _words(question: Question, asked: Asked) -> dict[str, float]:
-    if not asked.spans:
+def _words(question: Question, query: Query) -> dict[str, float]:
+    if not query.spans:
         return {}
-    hidden = torch.stack([span.tokens(asked.offsets) for span in asked.spans])
+    hidden = torch.stack([span.tokens(query.offsets) for span in query.spans])
     effects = question.effects_of_hidden(hidden).tolist()
-    return {span.name: effect for span, effect in zip(asked.spans, effects, strict=True)}
+    return {span.name: effect for span, effect in zip(query.spans, effects, strict=True)}
 
 
-def _others(question: Question, asked: Asked) -> dict[str, float]:
-    if not asked.others:
+def _others(question: Question, query: Query) -> dict[str, float]:
+    if not query.others:
         return {}
     return dict(
-        zip(asked.others, question.effects_of_instructions([*asked.others.values()]).tolist(), strict=True)
+        zip(query.others, question.effects_of_instructions([*query.others.values()]).tolist(), strict=True)
     )
 
 
 def _corruptions(
     question: Question,
-    asked: Asked,
+    query: Query,
     fillings: Mapping[str, Tensor],
     patches: Mapping[str, Tensor],
     words: Mapping[str, float],
     others: Mapping[str, float],
 ) -> list[tuple[str, Rows]]:
     """The strongest patch, span and other instruction, another episode's scene: name, what is read then."""
-    if not question.explained.layers:
+    if not question.policy.layers:
         return []
     found = []
     key = max(patches, key=lambda name: float(patches[name].max()))
     cell = int(patches[key].argmax())
     (image,) = question.observation[key]
-    mask = patch_masks(asked.grid, *image.shape[1:])[cell : cell + 1].to(image.device)
-    name = f"{camera_name(key)} {PATCH} {cell // asked.grid}, {cell % asked.grid} taken out"
+    mask = patch_masks(query.grid, *image.shape[1:])[cell : cell + 1].to(image.device)
+    name = f"{camera_name(key)} {PATCH} {cell // query.grid}, {cell % query.grid} taken out"
     found.append((name, question.encode({key: occluded(image, mask, fillings[key])}, 1)))
     if words:
-        span = max(asked.spans, key=lambda each: words[each.name])
-        rows = question.explained.hide(question.rows, span.tokens(asked.offsets)[None])
+        span = max(query.spans, key=lambda each: words[each.name])
+        rows = question.policy.hide(question.rows, span.tokens(query.offsets)[None])
         found.append((f"{WORDS} {span.name} hidden", rows))
     if others:
         other = max(others, key=lambda each: others[each])
-        rows = question.encode({"task": [asked.others[other]]}, 1)
+        rows = question.encode({"task": [query.others[other]]}, 1)
         if _has_columns_of(rows, question.rows):
-            found.append((f"{OTHER_INSTRUCTION}: {asked.others[other]!r}", rows))
-    if asked.other_scene:
-        found.append((OTHER_SCENE, question.encode(asked.other_scene, 1)))
+            found.append((f"{OTHER_INSTRUCTION}: {query.others[other]!r}", rows))
+    if query.other_scene:
+        found.append((OTHER_SCENE, question.encode(query.other_scene, 1)))
     return found
 
 
@@ -205,27 +205,26 @@ def _has_columns_of(rows: Rows, others: Rows) -> bool:
     )
 
 
-def _places(question: Question, asked: Asked, rows: Rows) -> dict[str, Place]:
-    """Return the places of the sequence and of its words; {} where the layers' states cannot be put back."""
-    explained = question.explained
-    if any(layer.layer is None for layer in explained.layers):
+def _token_spans(question: Question, query: Query, rows: Rows) -> dict[str, TokenSpan]:
+    """Return the spans of the prompt's parts and words; {} where the layers' states cannot be put back."""
+    if any(layer.layer is None for layer in question.policy.layers):
         return {}
-    places = explained.places(rows)
-    first, *later = places.get(INSTRUCTION, (None,))
+    spans = question.policy.token_spans(rows)
+    first, *later = spans.get(INSTRUCTION, (None,))
     if not isinstance(first, Tensor):
-        return places
-    words = {span.name: span.tokens(asked.offsets) for span in asked.spans}
-    return places | {name: (first[tokens], *later) for name, tokens in words.items()}
+        return spans
+    words = {span.name: span.tokens(query.offsets) for span in query.spans}
+    return spans | {name: (first[tokens], *later) for name, tokens in words.items()}
 
 
-def _restore(question: Question, asked: Asked, name: str, rows: Rows) -> Restored:
+def _restore(question: Question, query: Query, name: str, rows: Rows) -> PatchingResult:
     corruption = Corruption(question, rows)
-    layers = question.explained.layers
-    of_places = {
-        place: corruption.restore_each(all_layers(len(layers), columns)).tolist()
-        for place, columns in _places(question, asked, rows).items()
+    layers = question.policy.layers
+    by_span = {
+        span: corruption.restore_each(all_layers(len(layers), columns)).tolist()
+        for span, columns in _token_spans(question, query, rows).items()
     }
     heads = corruption.restore_each(all_heads(layers)).split([layer.num_heads for layer in layers])
     mlps = corruption.restore_each(all_mlps(len(layers)))
     drop = question.clean_score - corruption.score
-    return Restored(name, drop, of_places, [each.tolist() for each in heads], mlps.tolist())
+    return PatchingResult(name, drop, by_span, [each.tolist() for each in heads], mlps.tolist())

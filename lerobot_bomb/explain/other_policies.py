@@ -12,26 +12,26 @@ from lerobot.utils.constants import ACTION, OBS_LANGUAGE_ATTENTION_MASK
 from torch import Tensor, nn
 from torch.nn.functional import pad
 
-from lerobot_bomb.explain.explained import Batch, DecoderLayer, Explained, Rows, decoder_layers, some
+from lerobot_bomb.explain.scored_policy import Batch, DecoderLayer, Rows, ScoredPolicy, decoder_layers, some
 
 NUM_DRAWS = 8  # of noise and time; times in the middle of as many equal parts of [0, 1]
 SEED = 0
 
 
-def explained(policy: Any, postprocess: Callable[[Tensor], Tensor]) -> Explained:
+def scored(policy: Any, postprocess: Callable[[Tensor], Tensor]) -> ScoredPolicy:
     """One of ours as it explains itself, a flow policy of LeRobot's by its loss, any other by distance.
 
     ``postprocess``: (B, D) actions -> the same in physical units.
     """
-    if hasattr(policy, "explained"):
-        return policy.explained()
+    if hasattr(policy, "scored"):
+        return policy.scored()
     model = getattr(policy, "model", None)
     if hasattr(model, "sample_noise") and hasattr(model, "sample_time"):
-        return ExplainedByLoss(policy)
-    return ExplainedByDistance(policy, postprocess)
+        return ScoredByLoss(policy)
+    return ScoredByDistance(policy, postprocess)
 
 
-class _ExplainedByBatch(Explained):
+class _ScoredByBatch(ScoredPolicy):
     """Rows are the batch's tensors as they are."""
 
     def __init__(self, policy: Any):
@@ -52,7 +52,7 @@ class _ExplainedByBatch(Explained):
         return {**batch, **self.hide(self.encode(batch), hidden_S[None])}
 
 
-class ExplainedByLoss(_ExplainedByBatch):
+class ScoredByLoss(_ScoredByBatch):
     """A flow policy whose model draws noise and time by itself: ``smolvla``, ``pi0``.
 
     The score is minus the loss of the clean chunk, (1, K, D), under the same draws for all rows.
@@ -81,7 +81,7 @@ class ExplainedByLoss(_ExplainedByBatch):
         return -losses.float().unflatten(0, (num_rows, NUM_DRAWS)).mean(dim=1)
 
 
-class ExplainedByDistance(_ExplainedByBatch):
+class ScoredByDistance(_ScoredByBatch):
     """Explanation of any policy: minus the mean distance of executed actions (1, T, D) from the clean ones.
 
     Rows are asked one by one, each from a fresh start and with the same random numbers.

@@ -14,7 +14,7 @@ from lerobot_bomb.bomb.observation import reach_m
 from lerobot_bomb.bomb.pointing import HELD, Meant, PointedAt, action_for
 from lerobot_bomb.bomb.privileged_state import PrivilegedState
 from lerobot_bomb.explain.diagnosis import Finding
-from lerobot_bomb.explain.explained import Batch, Explained
+from lerobot_bomb.explain.scored_policy import Batch, ScoredPolicy
 from lerobot_bomb.viewing.checkpoint import LoadedPolicy
 
 CAMERA = "workspace"  # the one that sees the board as a whole
@@ -163,14 +163,14 @@ class PointingCheck:
 
 
 def check_pointing(
-    loaded: LoadedPolicy, explained: Explained, observation: Batch, state: PrivilegedState | None
+    loaded: LoadedPolicy, scored: ScoredPolicy, observation: Batch, state: PrivilegedState | None
 ) -> PointingCheck | None:
     """Ask what is pointed at, and what is done next; None where nothing is, or the truth is not known."""
     if state is None:
         return None
     loaded.begin()
     prepared = loaded.prepare(observation)
-    pointed = explained.pointed(prepared)
+    pointed = scored.pointed(prepared)
     return None if pointed is None else PointingCheck(pointed, state, loaded.act(prepared)[0])
 
 

@@ -11,8 +11,8 @@ from collections.abc import Callable, Sequence
 import torch
 from torch import Tensor
 
-from lerobot_bomb.explain.explained import Batch, Explained, Rows, repeated, scores_of
 from lerobot_bomb.explain.images import occluded
+from lerobot_bomb.explain.scored_policy import Batch, Rows, ScoredPolicy, repeated, scores_of
 
 BATCH_SIZE = 64  # rows of a forward pass
 
@@ -25,28 +25,28 @@ class Question:
 
     def __init__(
         self,
-        explained: Explained,
+        policy: ScoredPolicy,
         prepare: Callable[[Batch], Batch],
         observation: Batch,
         batch_size: int = BATCH_SIZE,
     ):
         """``observation``: of one row, images in [0, 1], as ``prepare``, the preprocessor, takes it."""
-        self.explained, self.observation = explained, observation
+        self.policy, self.observation = policy, observation
         self._prepare, self._batch_size = prepare, batch_size
         batch = prepare(observation)
-        self.answer = explained.answer(batch)
+        self.answer = policy.answer(batch)
         with torch.no_grad():
-            self.rows = explained.encode(batch)
-        self.clean_score = float(scores_of(explained, self.rows, self.answer, batch_size))
+            self.rows = policy.encode(batch)
+        self.clean_score = float(scores_of(policy, self.rows, self.answer, batch_size))
 
     @torch.no_grad()
     def encode(self, changes: Batch, times: int) -> Rows:
         """The observation so many times, but for these values, as the decoder reads it."""
-        return self.explained.encode(self._prepare({**repeated(self.observation, times), **changes}))
+        return self.policy.encode(self._prepare({**repeated(self.observation, times), **changes}))
 
     def effects(self, rows: Rows) -> Tensor:
         """(M,) of what each row reads in place of the observation."""
-        return self.clean_score - scores_of(self.explained, rows, self.answer, self._batch_size)
+        return self.clean_score - scores_of(self.policy, rows, self.answer, self._batch_size)
 
     def effects_of_images(self, changed: dict[str, Tensor]) -> Tensor:
         """(M,) of other images (M, 3, H, W), by key."""
@@ -61,7 +61,7 @@ class Question:
 
     def effects_of_hidden(self, hidden_MS: Tensor) -> Tensor:
         """(M,) of tokens of the instruction that no other token reads."""
-        return self.effects(self.explained.hide(self.rows, hidden_MS))
+        return self.effects(self.policy.hide(self.rows, hidden_MS))
 
     def effects_of_instructions(self, instructions: Sequence[str]) -> Tensor:
         """(M,) of other instructions."""

@@ -17,8 +17,8 @@ def write_recording(path: Path, name: str, fps: int, moments: Sequence[Explained
     """Write a new file, whose timeline has the moments at their control steps."""
     with open_recording(path, name, fps, _layout(moments[0])) as recording:
         for each in moments:
-            recording.set_time(STEP, sequence=each.watched.step)
-            recording.log("instruction", rr.TextDocument(each.watched.instruction), strict=True)
+            recording.set_time(STEP, sequence=each.snapshot.step)
+            recording.log("instruction", rr.TextDocument(each.snapshot.instruction), strict=True)
             recording.log("findings", rr.TextDocument("\n".join(map(str, each.findings))), strict=True)
             found = each.explanation
             for key, image in each.images.items():
@@ -32,7 +32,7 @@ def _log_marks(recording: rr.RecordingStream, key: str, moment: ExplainedMoment)
     """Log the places that the policy points at and that are meant, over the image of the whole board."""
     if moment.pointing is None or camera_name(key) != CAMERA:
         return
-    camera, marks = moment.watched.cameras[CAMERA], moment.pointing.marks
+    camera, marks = moment.snapshot.cameras[CAMERA], moment.pointing.marks
     points = rr.Points2D(
         # corners of pixels are whole numbers there, and centres here
         [camera.pixel_of(mark.xyz) + 0.5 for mark in marks],

@@ -14,8 +14,8 @@ import torch
 from torch import Tensor
 
 from lerobot_bomb.explain.activations import HEADS, MLP, PARTS, Activations, Unit, recording, restoring
-from lerobot_bomb.explain.explained import Rows
 from lerobot_bomb.explain.question import BATCH_SIZE, Question
+from lerobot_bomb.explain.scored_policy import Rows
 
 # a drop of the score that is no larger than this share of it, or this in its unit, may be rounding
 SMALLEST_DROP = 1e-4
@@ -53,13 +53,13 @@ class Corruption:
     def __init__(self, question: Question, rows: Rows):
         """``rows``: one, what is read in place of the observation."""
         self._question, self.rows = question, rows
-        self._layers = question.explained.layers
+        self._layers = question.policy.layers
         self.clean = self._record(question.rows)
         self.score = float(self._score(rows))
 
     @torch.no_grad()
     def _score(self, rows: Rows) -> Tensor:
-        return self._question.explained.score(rows, self._question.answer)
+        return self._question.policy.score(rows, self._question.answer)
 
     def _record(self, rows: Rows) -> Activations:
         parts = PARTS if all(layer.layer is not None for layer in self._layers) else (HEADS, MLP)

@@ -8,10 +8,10 @@ from torch import Tensor, nn
 from torch.nn.init import zeros_
 
 
-def masked_mean_pool(states_BTR: Tensor, kept_BT: Tensor) -> Tensor:
-    """(B, R) mean of the states at the kept tokens; zeros where none is kept."""
-    kept_BT1 = kept_BT[..., None]
-    return (states_BTR * kept_BT1).sum(dim=1) / kept_BT1.sum(dim=1).clamp(min=1)
+def masked_mean_pool(states_BTR: Tensor, mask_BT: Tensor) -> Tensor:
+    """(B, R) mean of the states in the mask; zeros where it is empty."""
+    mask_BT1 = mask_BT[..., None]
+    return (states_BTR * mask_BT1).sum(dim=1) / mask_BT1.sum(dim=1).clamp(min=1)
 
 
 def modulate(features_BKH: Tensor, gamma_B1H: Tensor, beta_B1H: Tensor) -> Tensor:

@@ -71,15 +71,15 @@ def check_learning(
             )
 
 
-def masked_mean(values_BKD: Tensor, kept_BK: Tensor, reduction: str = "mean") -> Tensor:
-    """Mean over the elements that are kept, () or with ``reduction="none"`` (B,) over each row's own.
+def masked_mean(values_BKD: Tensor, loss_mask_BK: Tensor, reduction: str = "mean") -> Tensor:
+    """Mean over the elements in the loss mask, () or with ``reduction="none"`` (B,) over each row's own.
 
-    Zero where nothing is kept.
+    Zero where the mask is empty.
     """
     one_of("reduction", reduction, REDUCTIONS)
-    kept_BKD = kept_BK[..., None].expand_as(values_BKD)
+    loss_mask_BKD = loss_mask_BK[..., None].expand_as(values_BKD)
     dims = (1, 2) if reduction == "none" else (0, 1, 2)
-    return (values_BKD * kept_BKD).sum(dims) / kept_BKD.sum(dims).clamp(min=1)
+    return (values_BKD * loss_mask_BKD).sum(dims) / loss_mask_BKD.sum(dims).clamp(min=1)
 
 
 def consistency_residual(velocity_BKD: Tensor, noise_BKD: Tensor, point: PathPoint) -> Tensor:
@@ -87,15 +87,17 @@ def consistency_residual(velocity_BKD: Tensor, noise_BKD: Tensor, point: PathPoi
     return noise_BKD + point.tau[:, None, None] * velocity_BKD - point.actions
 
 
-def energy_noise(noise_BKD: Tensor, point: PathPoint, kept_BK: Tensor, differentiable: bool = True) -> Tensor:
+def energy_noise(
+    noise_BKD: Tensor, point: PathPoint, loss_mask_BK: Tensor, differentiable: bool = True
+) -> Tensor:
     """(1 - tau) J^T eps with J the Jacobian of eps by A^tau, (B, K, D); the noise itself if it is eps*.
 
     That holds for a point mass of clean actions only: then eps* = (A^tau - tau A0) / (1 - tau). It is the
-    sound reading of FDVLA's equation 6: the gradient of an energy |eps|^2 / 2, here of the kept elements.
+    sound reading of FDVLA's equation 6: the gradient of an energy |eps|^2 / 2, here within the loss mask.
     ``noise_BKD`` must have been computed from ``point.actions``, which ``requires_grad``. ``differentiable``:
     whether the result can be trained through, by a second backward pass that fused attention lacks.
     """
-    energy = (noise_BKD * kept_BK[..., None]).square().sum() / 2
+    energy = (noise_BKD * loss_mask_BK[..., None]).square().sum() / 2
     (gradient_BKD,) = torch.autograd.grad(
         energy, point.actions, retain_graph=True, create_graph=differentiable
     )
@@ -106,7 +108,7 @@ def joint_loss(
     velocity_BKD: Tensor | None,
     noise_BKD: Tensor | None,
     point: PathPoint,
-    kept_BK: Tensor,
+    loss_mask_BK: Tensor,
     *,
     flow_loss_weight: float = 1.0,
     denoise_loss_weight: float = 1.0,
@@ -123,14 +125,14 @@ def joint_loss(
     Args:
         velocity_BKD: what the flow head predicts, None without one.
         noise_BKD: what the denoising head predicts, None without one.
-        point: of the straight path; its targets at elements that are not kept do not count.
-        kept_BK: bool, the actions to train on.
+        point: of the straight path; its targets do not count outside the loss mask.
+        loss_mask_BK: bool, the actions that the loss counts.
         flow_loss_weight: of the mean square of v - (A0 - z).
         denoise_loss_weight: of the mean square of eps - z.
         consistency_loss_weight: of the mean square of the residual.
         consistency: ``linear``: `consistency_residual`; ``energy_vjp``: the same of `energy_noise`; ``none``.
         consistency_detach: the head that the consistency does not train: ``flow``, ``denoise`` or ``none``.
-        reduction: ``mean`` over the kept elements of the batch, ``none`` for (B,) of each row.
+        reduction: ``mean`` over the batch's loss mask, ``none`` for (B,) of each row.
 
     Raises:
         ValueError: an unknown choice, no head, or a consistency without both heads.
@@ -144,20 +146,20 @@ def joint_loss(
         terms["denoise_loss"] = denoise_loss_weight, noise_BKD - point.noise
     if velocity_BKD is not None and noise_BKD is not None:
         residual_BKD = consistency_residual(velocity_BKD, noise_BKD, point).detach()
-        metrics["consistency_residual_rms"] = masked_mean(residual_BKD.square(), kept_BK).sqrt()
+        metrics["consistency_residual_rms"] = masked_mean(residual_BKD.square(), loss_mask_BK).sqrt()
         if consistency != "none" and consistency_loss_weight > 0:
             if consistency == "energy_vjp":
-                noise_BKD = energy_noise(noise_BKD, point, kept_BK, consistency_detach != "denoise")
+                noise_BKD = energy_noise(noise_BKD, point, loss_mask_BK, consistency_detach != "denoise")
             if consistency_detach == "flow":
                 velocity_BKD = velocity_BKD.detach()
             elif consistency_detach == "denoise":
                 noise_BKD = noise_BKD.detach()
             residual_BKD = consistency_residual(velocity_BKD, noise_BKD, point)
             terms["consistency_loss"] = consistency_loss_weight, residual_BKD
-    loss = torch.zeros((), device=kept_BK.device)
+    loss = torch.zeros((), device=loss_mask_BK.device)
     for name, (weight, error_BKD) in terms.items():
-        loss = loss + weight * masked_mean(error_BKD.square(), kept_BK, reduction)
-        metrics[name] = masked_mean(error_BKD.detach().square(), kept_BK)
+        loss = loss + weight * masked_mean(error_BKD.square(), loss_mask_BK, reduction)
+        metrics[name] = masked_mean(error_BKD.detach().square(), loss_mask_BK)
     return loss, metrics
 
 

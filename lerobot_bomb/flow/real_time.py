@@ -8,7 +8,7 @@ import torch
 from lerobot.policies.rtc import RTCProcessor
 from torch import Tensor
 
-from lerobot_bomb.flow.samplers import Heads
+from lerobot_bomb.flow.samplers import Heads, Predicted
 
 
 def without_padding(leftover_KD: Tensor) -> Tensor:
@@ -36,8 +36,8 @@ def guided(
     if leftover_KD.shape[-2] == 0:
         return heads
 
-    def guided_heads(actions_BKD: Tensor, tau_B: Tensor) -> tuple[Tensor | None, Tensor | None]:
-        predicted: list[tuple[Tensor | None, Tensor | None]] = []
+    def guided_heads(actions_BKD: Tensor, tau_B: Tensor) -> Predicted:
+        predicted: list[Predicted] = []
 
         def velocity_to_noise(actions_BKD: Tensor) -> Tensor:
             with torch.no_grad():  # the guidance is a gradient with respect to the actions alone

@@ -24,8 +24,10 @@ from torch import Tensor
 
 from lerobot_bomb.flags import one_of
 
-# float32 noisy actions (B, K, D) and tau (B,) -> velocity and noise (B, K, D), None for a missing head
-Heads = Callable[[Tensor, Tensor], tuple[Tensor | None, Tensor | None]]
+# velocity and noise (B, K, D); None for a missing head
+type Predicted = tuple[Tensor | None, Tensor | None]
+# float32 noisy actions (B, K, D) and tau (B,) -> what the heads predict
+Heads = Callable[[Tensor, Tensor], Predicted]
 
 # defaults, of the flags of policies too
 SAMPLER, SOLVER = "residual", "euler"

@@ -63,7 +63,9 @@ class MetricLabels:
         given_B2 = torch.where(is_other_B[:, None], other_B2, place_B2)
         return cls(place_B2, stone_B3[:, :2], stone_B3[:, 2], is_other_B, given_B2, other_actions_BD)
 
-    def given_actions(self, actions_BKD: Tensor, kept_BK: Tensor, other_B1D: Tensor) -> tuple[Tensor, Tensor]:
+    def given_actions(
+        self, actions_BKD: Tensor, loss_mask_BK: Tensor, other_B1D: Tensor
+    ) -> tuple[Tensor, Tensor]:
         """Actions, and which of them are known, for the places that are given.
 
         ``other_B1D``: `other_actions`, as ``actions_BKD`` are. Of another place only the next one is known.
@@ -71,7 +73,7 @@ class MetricLabels:
         is_first_K = torch.arange(actions_BKD.shape[1], device=actions_BKD.device) == 0
         is_other_BK = self.is_other[:, None] & is_first_K
         actions_BKD = torch.where(is_other_BK[..., None], other_B1D, actions_BKD)
-        return actions_BKD, kept_BK & (is_first_K | ~self.is_other[:, None])
+        return actions_BKD, loss_mask_BK & (is_first_K | ~self.is_other[:, None])
 
 
 @dataclass(frozen=True)

@@ -16,6 +16,7 @@ from torch.nn.attention import SDPBackend, sdpa_kernel
 
 from lerobot_bomb.actions.ensemble import TemporalEnsemble
 from lerobot_bomb.actions.relative import RelativeActions, bounds, named_dims
+from lerobot_bomb.actions.text import TokenRows
 from lerobot_bomb.checkpoints.adapters import check_buffers_are_the_bases, frozen_buffers
 from lerobot_bomb.checkpoints.starting import check_start
 from lerobot_bomb.compat.hooks.evaluation import play_tasks_in_turn
@@ -33,7 +34,8 @@ from lerobot_bomb.hub.policy import HubPolicy
 from lerobot_bomb.policies.config import ChunkConfig, RelativeVlaConfig, TokenVlaConfig, VlaConfig
 from lerobot_bomb.training.distributed import SavesTiedWeightsOnce
 from lerobot_bomb.training.policy_flags import check_as_trained, check_weights_fit, trained_with
-from lerobot_bomb.vlm.inputs import read_state, read_tensor
+from lerobot_bomb.vlm.inputs import read_state, read_task, read_tensor
+from lerobot_bomb.vlm.layout import INSTRUCTION, PromptLayout
 from lerobot_bomb.vlm.prompt import task_ids, task_text
 from lerobot_bomb.vlm.tokenizer import load_tokenizer
 
@@ -65,7 +67,7 @@ class ChunkPolicy(HubPolicy, SavesTiedWeightsOnce, PreTrainedPolicy):
         config.validate_features()
         config.trained_with = trained_with(config, self.as_trained)
         # physical size of 1 in normalised actions, and their names; known while training: (D,)
-        self.register_buffer("action_unit", torch.ones(self._action_dim), persistent=False)
+        self.register_buffer("action_unit", torch.ones(self.action_dim), persistent=False)
         self._action_names: list[str] | None = None
         if dataset_meta is not None:
             check_chunk_length(config.chunk_size, dataset_meta)
@@ -112,7 +114,7 @@ class ChunkPolicy(HubPolicy, SavesTiedWeightsOnce, PreTrainedPolicy):
     def _take_units(self, meta: LeRobotDatasetMetadata) -> None:
         assert meta.stats is not None
         mode = self.config.normalization_mapping["ACTION"]
-        low, high = bounds(meta.stats[ACTION], mode, self._action_dim)
+        low, high = bounds(meta.stats[ACTION], mode, self.action_dim)
         self.action_unit.copy_(torch.from_numpy(high - low) / 2)
         self._action_names = dim_names(meta.features[ACTION])
 
@@ -137,18 +139,18 @@ class ChunkPolicy(HubPolicy, SavesTiedWeightsOnce, PreTrainedPolicy):
             )
         self._batch_size = batch_size
 
-    def _kept(self, batch: dict[str, Tensor]) -> Tensor:
-        """(B, T) bool: which actions are trained on; of a static scene only its own."""
+    def _loss_mask(self, batch: dict[str, Tensor]) -> Tensor:
+        """(B, T) bool: which actions the loss counts; of a static scene only its own."""
         shape = len(batch[ACTION]), self.config.chunk_size
         is_pad_BT = torch.zeros(shape, dtype=torch.bool, device=self._device)
         if f"{ACTION}_is_pad" in batch:
             is_pad_BT = self._of_batch(batch, f"{ACTION}_is_pad").bool()
-        kept_BT = torch.ones_like(is_pad_BT) if self.config.loss_on_padded_actions else ~is_pad_BT
+        loss_mask_BT = torch.ones_like(is_pad_BT) if self.config.loss_on_padded_actions else ~is_pad_BT
         if isinstance(done_B1 := batch.get(DONE), Tensor):
             is_later_T = torch.arange(shape[1], device=self._device) > 0
             # what follows a frame that is done, and is there, belongs to the next scene
-            kept_BT = kept_BT & ~(done_B1.reshape(-1, 1).bool() & is_later_T & ~is_pad_BT)
-        return kept_BT
+            loss_mask_BT = loss_mask_BT & ~(done_B1.reshape(-1, 1).bool() & is_later_T & ~is_pad_BT)
+        return loss_mask_BT
 
     def _l1_parts(self, errors_BTD: Tensor, counted_BTD: Tensor) -> dict[str, tuple[Tensor, Tensor]]:
         """Absolute errors as `means` takes them, in all and by dimension; none where units are not known."""
@@ -174,7 +176,7 @@ class ChunkPolicy(HubPolicy, SavesTiedWeightsOnce, PreTrainedPolicy):
         return sorted(self.config.image_features)
 
     @property
-    def _action_dim(self) -> int:
+    def action_dim(self) -> int:
         assert self.config.action_feature is not None
         return self.config.action_feature.shape[0]
 
@@ -189,6 +191,7 @@ class VlaPolicy(ChunkPolicy):
     config_class = VlaConfig  # pyright: ignore[reportAssignmentType]
     name = "vla"  # pyright: ignore[reportAssignmentType]
     config: VlaConfig
+    layout: PromptLayout
     _ensemble: TemporalEnsemble | None
 
     def __init__(self, config: Any, dataset_meta: LeRobotDatasetMetadata | None = None, **_: object):
@@ -239,8 +242,17 @@ class VlaPolicy(ChunkPolicy):
                 num_tokens = max(len(task_ids(tokenizer, task, template)) for task in texts)
                 check_positions(text_config, num_fixed + num_tokens, way_out)
 
+    def prompt(self, batch: dict[str, Tensor]) -> TokenRows:
+        """Return the tokens of everything before the answer, with padding; images are still to be put in."""
+        task = read_task(batch, self.config.type, self._device)
+        return self.layout.fill({INSTRUCTION: task, **self._prompt_rows(batch)})
+
+    def _prompt_rows(self, batch: dict[str, Tensor]) -> dict[str, TokenRows]:
+        """Return each row's own tokens beside its instruction's, by part of the prompt."""
+        return {}
+
     @contextmanager
-    def _autocast(self) -> Iterator[None]:
+    def autocast(self) -> Iterator[None]:
         """The precision of ``config.dtype``, whoever calls: training, evaluation or a user's own loop."""
         device, bfloat16 = self._device.type, self.config.dtype == "bfloat16"
         # gradients of torch's fused attention in bfloat16 take four to ten times as long on a CPU
@@ -313,7 +325,7 @@ class RelativeVlaPolicy(VlaPolicy):
     def __init__(self, config: Any, dataset_meta: LeRobotDatasetMetadata | None = None, **_: object):
         super().__init__(config, dataset_meta)
         self.relative = (
-            RelativeActions(self._action_dim, config.relative_dims()) if config.relative_actions else None
+            RelativeActions(self.action_dim, config.relative_dims()) if config.relative_actions else None
         )
         if dataset_meta is not None:
             self._fit_relative(dataset_meta)
@@ -371,14 +383,14 @@ class RelativeVlaPolicy(VlaPolicy):
         advice = "start from one that lerobot-bomb checkpoint init writes for this dataset"
         check_buffers_are_the_bases(self, self._base_buffers, saved, advice)
 
-    def _to_relative(self, actions_BTD: Tensor, batch: dict[str, Tensor]) -> Tensor:
+    def to_relative(self, actions_BTD: Tensor, batch: dict[str, Tensor]) -> Tensor:
         """Normalised actions -> what is trained on and predicted, (B, T, D) both."""
         if self.relative is None:
             return actions_BTD
         return self.relative.encode(actions_BTD, self._state(batch))
 
-    def _to_absolute(self, predicted_BTD: Tensor, batch: dict[str, Tensor]) -> Tensor:
-        """The inverse of `_to_relative`."""
+    def to_absolute(self, predicted_BTD: Tensor, batch: dict[str, Tensor]) -> Tensor:
+        """The inverse of `to_relative`."""
         if self.relative is None:
             return predicted_BTD
         return self.relative.decode(predicted_BTD, self._state(batch))

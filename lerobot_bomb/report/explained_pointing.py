@@ -51,7 +51,7 @@ def pointing_figure(moment: ExplainedMoment) -> str:
     image = next((each for key, each in moment.images.items() if camera_name(key) == CAMERA), None)
     if moment.pointing is None or image is None:
         return ""
-    shown = marked(image, moment.watched.cameras[CAMERA], moment.pointing.marks)
+    shown = marked(image, moment.snapshot.cameras[CAMERA], moment.pointing.marks)
     caption = (
         f"{CAMERA}: rings where it points, crosses where that is; orange: the place "
         f"({moment.pointing.meant_place} is meant), blue: the stone"

@@ -13,7 +13,7 @@ from lerobot_bomb.explain.episode import ExplainedMoment
 from lerobot_bomb.explain.following import Following
 from lerobot_bomb.explain.maps import cells, data_url, overlay
 from lerobot_bomb.explain.masked_episodes import MaskedEpisode
-from lerobot_bomb.explain.moment import ALL, Restored, camera_name
+from lerobot_bomb.explain.moment import ALL, PatchingResult, camera_name
 from lerobot_bomb.explain.probes import LayerProbe
 from lerobot_bomb.report.cells import mean_cell
 from lerobot_bomb.report.explained_pointing import mean_pointing, pointing_figure, pointing_tables
@@ -42,7 +42,7 @@ def overview_section(outcome: str, moments: Sequence[ExplainedMoment], command: 
         Table(each.title, QUESTIONS, [[Cell(of.question), Cell(of.answer)] for of in each.findings])
         for each in moments
     ]
-    told = "\n".join([moments[0].watched.instruction, outcome])
+    told = "\n".join([moments[0].snapshot.instruction, outcome])
     return Section("In short", found, [*_not_asked(moments[0]), command], f"<pre>{escape(told)}</pre>")
 
 
@@ -90,7 +90,7 @@ def moment_sections(moment: ExplainedMoment) -> list[Section]:
     )
     figures += f'<p class="note">Dark: no effect or a negative one; bright: {largest:.4g}.</p>'
     title = moment.title.capitalize()
-    return [Section(title, tables, [moment.watched.instruction], f'<div class="wide">{figures}</div>')]
+    return [Section(title, tables, [moment.snapshot.instruction], f'<div class="wide">{figures}</div>')]
 
 
 def aggregate_sections(
@@ -196,7 +196,7 @@ def _followings(followings: Mapping[str, Following]) -> Table:
     return Table("Do the next actions follow?", header, rows, FOLLOWING_NOTE)
 
 
-def _restored(restored: Restored) -> list[Table]:
+def _restored(restored: PatchingResult) -> list[Table]:
     title = f"Restored after: {restored.corruption}"
     note = f"The score drops by {restored.drop:.4g}. 1: all of that comes back, 0: none; -: it did not drop."
     num_layers = len(restored.mlps)

@@ -1,18 +1,19 @@
-"""Attention masks: which token of a sequence reads which.
+"""Attention masks: which token of a sequence attends to which.
 
-Shapes: `B` batch, `L` tokens that read, `X` tokens that are read.
+Shapes: `B` batch, `L` tokens that attend, `X` tokens that are attended to.
 """
 
 import torch
 from torch import Tensor
 
 
-def causal_reads(readable_BL: Tensor) -> Tensor:
-    """(B, L, L) bool: each token (row) reads itself and those before it, as far as they are readable."""
-    num_tokens = readable_BL.shape[1]
-    return torch.ones_like(readable_BL[0]).expand(num_tokens, -1).tril() & readable_BL[:, None]
+def causal_mask(attention_mask_BL: Tensor) -> Tensor:
+    """(B, L) bool -> (B, L, L): a token (row) attends to itself and those before it that are in the mask."""
+    num_tokens = attention_mask_BL.shape[1]
+    causal_LL = torch.ones_like(attention_mask_BL[0]).expand(num_tokens, -1).tril()
+    return causal_LL & attention_mask_BL[:, None]
 
 
-def attention_bias(reads_BLX: Tensor, dtype: torch.dtype) -> Tensor:
-    """(B, 1, L, X) what is added to the attention logits: nothing where a token (row) reads another."""
-    return torch.where(reads_BLX, 0.0, torch.finfo(dtype).min).to(dtype)[:, None]
+def attention_bias(attention_mask_BLX: Tensor, dtype: torch.dtype) -> Tensor:
+    """(B, 1, L, X) added to the attention logits: 0 where the mask is True, else the type's lowest number."""
+    return torch.where(attention_mask_BLX, 0.0, torch.finfo(dtype).min).to(dtype)[:, None]

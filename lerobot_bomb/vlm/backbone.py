@@ -25,7 +25,7 @@ from transformers import (
 
 from lerobot_bomb.files import read_json
 from lerobot_bomb.finite import require_finite_weights
-from lerobot_bomb.vlm.attention import attention_bias, causal_reads
+from lerobot_bomb.vlm.attention import attention_bias, causal_mask
 from lerobot_bomb.vlm.images import resized_pixels
 from lerobot_bomb.vlm.memory import check_memory
 from lerobot_bomb.vlm.presets import INITIALIZER_RANGE, changed, nano_config
@@ -134,7 +134,7 @@ class SmolVLMBackbone(Backbone):
         Attention is causal, so what follows a row's end changes nothing before it. ``hidden_BL``: tokens that
         no other reads.
         """
-        bias = None if hidden_BL is None else attention_bias(causal_reads(~hidden_BL), embeds_BLH.dtype)
+        bias = None if hidden_BL is None else attention_bias(causal_mask(~hidden_BL), embeds_BLH.dtype)
         return self.text_model(
             inputs_embeds=embeds_BLH, attention_mask=bias, use_cache=False
         ).last_hidden_state

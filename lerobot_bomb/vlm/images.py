@@ -1,15 +1,37 @@
 """Camera images -> what a vision model reads, on tensors.
 
-Shapes: `B` images, `H` and `W` their sides, `S` side of the model's input, all in pixels.
+Shapes: `B` images, `H` and `W` their sides, `S` side of the model's input, all in pixels; `P` tokens of an
+image, `E` size of their embeddings.
 """
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import lru_cache
+from typing import Protocol
 
 import torch
 from torch import Tensor
 
 LANCZOS_LOBES = 3
+
+
+class ImageEncoder(Protocol):
+    """The part of a backbone that turns images into embeddings."""
+
+    def pixels(self, images_B3HW: Tensor) -> Tensor:
+        """(B, 3, H, W) in [0, 1] -> (B, 3, S, S), as `embed_images` takes them."""
+        ...
+
+    def embed_images(self, pixels_B3SS: Tensor) -> Tensor:
+        """(B, 3, S, S) -> (B, P, E)."""
+        ...
+
+
+def encode_images(encoder: ImageEncoder, cameras: Sequence[Tensor]) -> Tensor:
+    """Each camera's images (B, 3, H, W) in [0, 1] -> (B, P of all cameras, E)."""
+    pixels = torch.stack([encoder.pixels(images_B3HW) for images_B3HW in cameras], dim=1)
+    features = encoder.embed_images(pixels.flatten(0, 1))
+    return features.reshape(len(pixels), -1, features.shape[-1])
 
 
 @dataclass(frozen=True)

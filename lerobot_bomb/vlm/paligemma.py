@@ -85,7 +85,7 @@ class PaliGemmaBackbone(Backbone):
         """True if words are written by the table that they are read by."""
         return self.vlm.lm_head.weight is self.vlm.get_input_embeddings().weight
 
-    def see(self, pixels_B3SS: Tensor) -> Tensor:
+    def encode_pixels(self, pixels_B3SS: Tensor) -> Tensor:
         """(B, 3, S, S) in [-1, 1] -> (B, P, E) features of the vision model."""
         return self.vlm.model.vision_tower(pixels_B3SS).last_hidden_state
 
@@ -98,12 +98,12 @@ class PaliGemmaBackbone(Backbone):
         """Places in a sequence, from 0 -> positions as PaliGemma counts them, from 1."""
         return columns + 1
 
-    def hidden_states(self, embeds_BLH: Tensor, columns_BL: Tensor, reads_BLL: Tensor) -> Tensor:
+    def hidden_states(self, embeds_BLH: Tensor, columns_BL: Tensor, attention_mask_BLL: Tensor) -> Tensor:
         """(B, L, H) states after the last layer.
 
-        ``columns_BL``: places in the sequence, from 0; ``reads_BLL``: whether a token (row) reads another.
+        ``columns_BL``: places in the sequence, from 0; ``attention_mask_BLL``: bool, row: who attends.
         """
-        mask = attention_bias(reads_BLL, embeds_BLH.dtype)
+        mask = attention_bias(attention_mask_BLL, embeds_BLH.dtype)
         return self.text_model(
             inputs_embeds=embeds_BLH,
             attention_mask={"full_attention": mask, "sliding_attention": mask},

@@ -18,7 +18,7 @@ class Prefix:
     """States that the model keeps of images and text that it has read."""
 
     hidden: Tensor  # (B, L, H) after the last layer
-    readable: Tensor  # (B, L) bool, False: padding, or a hidden token
+    attention_mask: Tensor  # (B, L) bool, False: padding, or a hidden token
     next_position: Tensor  # (B, 1) int64, of what follows
     layers: list[KeysValues]
 
@@ -26,7 +26,7 @@ class Prefix:
         """Return all tensors, as `of` takes them."""
         return [
             self.hidden,
-            self.readable,
+            self.attention_mask,
             self.next_position,
             *(part for layer in self.layers for part in layer),
         ]
@@ -34,8 +34,8 @@ class Prefix:
     @classmethod
     def of(cls, tensors: Sequence[Tensor]) -> "Prefix":
         """The inverse of `tensors`."""
-        hidden, readable, next_position, *layers = tensors
-        return cls(hidden, readable, next_position, list(zip(layers[::2], layers[1::2], strict=True)))
+        hidden, attention_mask, next_position, *layers = tensors
+        return cls(hidden, attention_mask, next_position, list(zip(layers[::2], layers[1::2], strict=True)))
 
 
 class Reader:

@@ -20,7 +20,7 @@ from transformers import Qwen2_5_VLConfig, Qwen2_5_VLForConditionalGeneration
 from transformers.utils.constants import OPENAI_CLIP_MEAN, OPENAI_CLIP_STD
 
 from lerobot_bomb.finite import require_finite_weights
-from lerobot_bomb.vlm.attention import causal_reads
+from lerobot_bomb.vlm.attention import causal_mask
 from lerobot_bomb.vlm.backbone import (
     CHECKPOINTING,
     Backbone,
@@ -163,43 +163,45 @@ class QwenBackbone(Backbone):
         that are written and the same in all rows; they are read once.
         """
         positions_3BL, next_B1 = self._positions(is_image_BL, mask_BL)
-        readable_BL = mask_BL if hidden_BL is None else mask_BL & ~hidden_BL
-        reads_BLL = causal_reads(readable_BL)
+        attention_mask_BL = mask_BL if hidden_BL is None else mask_BL & ~hidden_BL
+        attention_mask_BLL = causal_mask(attention_mask_BL)
         if num_shared == 0 or len(embeds_BLH) == 1:
-            hidden_BLH, layers = self._read(embeds_BLH, positions_3BL, reads_BLL)
-            return Prefix(hidden_BLH, readable_BL, next_B1, layers)
+            hidden_BLH, layers = self._read(embeds_BLH, positions_3BL, attention_mask_BLL)
+            return Prefix(hidden_BLH, attention_mask_BL, next_B1, layers)
         first, rest = slice(num_shared), slice(num_shared, None)
-        shared = self._read(embeds_BLH[:1, first], positions_3BL[:, :1, first], reads_BLL[:1, first, first])
+        shared = self._read(
+            embeds_BLH[:1, first], positions_3BL[:, :1, first], attention_mask_BLL[:1, first, first]
+        )
         expand = partial(_expanded, len(embeds_BLH))
         kept = [(expand(keys), expand(values)) for keys, values in shared[1]]
         hidden_BLH, layers = self._read(
-            embeds_BLH[:, rest], positions_3BL[:, :, rest], reads_BLL[:, rest], kept
+            embeds_BLH[:, rest], positions_3BL[:, :, rest], attention_mask_BLL[:, rest], kept
         )
         layers = [
             (torch.cat([ks, keys], dim=2), torch.cat([vs, values], dim=2))
             for (ks, vs), (keys, values) in zip(kept, layers, strict=True)
         ]
-        return Prefix(torch.cat([expand(shared[0]), hidden_BLH], dim=1), readable_BL, next_B1, layers)
+        return Prefix(torch.cat([expand(shared[0]), hidden_BLH], dim=1), attention_mask_BL, next_B1, layers)
 
     def read_segment(
-        self, prefix: Prefix, embeds_BTH: Tensor, reads_BTT: Tensor, num_copies: int = 1
+        self, prefix: Prefix, embeds_BTH: Tensor, attention_mask_BTT: Tensor, num_copies: int = 1
     ) -> Tensor:
         """(B, T, H) states after the last layer of tokens that follow a prefix and read all of it.
 
-        ``reads_BTT``: whether a token of the segment (row) reads another. ``num_copies``: equally long parts
+        ``attention_mask_BTT``: of the segment's tokens among themselves. ``num_copies``: equally long parts
         of the segment, each of which stands right behind the prefix.
         """
         column_T = torch.arange(embeds_BTH.shape[1], device=embeds_BTH.device)
         positions_BT = prefix.next_position + column_T % (len(column_T) // num_copies)
-        prefix_BTL = prefix.readable[:, None].expand(-1, embeds_BTH.shape[1], -1)
-        reads_BTX = torch.cat([prefix_BTL, reads_BTT], dim=2)
-        return self._read(embeds_BTH, positions_BT.expand(3, -1, -1), reads_BTX, prefix.layers)[0]
+        prefix_BTL = prefix.attention_mask[:, None].expand(-1, embeds_BTH.shape[1], -1)
+        attention_mask_BTX = torch.cat([prefix_BTL, attention_mask_BTT], dim=2)
+        return self._read(embeds_BTH, positions_BT.expand(3, -1, -1), attention_mask_BTX, prefix.layers)[0]
 
     def _read(
         self,
         x_BTH: Tensor,
         positions_3BT: Tensor,
-        reads_BTX: Tensor,
+        attention_mask_BTX: Tensor,
         kept: list[KeysValues] | None = None,
     ) -> tuple[Tensor, list[KeysValues]]:
         """States after the last layer, and the keys and values of every layer."""
@@ -209,7 +211,7 @@ class QwenBackbone(Backbone):
             read = partial(checkpoint, _read_layer, **CHECKPOINTING)
         layers = []
         for i, layer in enumerate(self.text_model.layers):
-            x_BTH, new = read(layer, x_BTH, reads_BTX[:, None], rotation, kept and kept[i])
+            x_BTH, new = read(layer, x_BTH, attention_mask_BTX[:, None], rotation, kept and kept[i])
             layers.append(new)
         return self.text_model.norm(x_BTH), layers
 
@@ -252,12 +254,14 @@ def _tokens_per_side(vision_config: Any, image_size: int) -> int:
 def _read_layer(
     layer: nn.Module,
     x_BTH: Tensor,
-    reads_B1TX: Tensor,
+    attention_mask_B1TX: Tensor,
     rotation: tuple[Tensor, Tensor],
     kept: KeysValues | None,
 ) -> tuple[Tensor, KeysValues]:
     reader: Any = Reader(kept)
-    x_BTH = layer(x_BTH, attention_mask=reads_B1TX, position_embeddings=rotation, past_key_values=reader)
+    x_BTH = layer(
+        x_BTH, attention_mask=attention_mask_B1TX, position_embeddings=rotation, past_key_values=reader
+    )
     return x_BTH, reader.new
 
 

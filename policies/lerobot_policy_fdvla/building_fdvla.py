@@ -1,6 +1,9 @@
-"""The vision-language model of an ``fdvla``, from its config or a checkpoint's."""
+"""The vision-language model of an ``fdvla``, from its config or a checkpoint's, and its prompt."""
+
+from collections.abc import Sequence
 
 from lerobot_bomb.vlm.backbone import check_family, config_dict
+from lerobot_bomb.vlm.layout import END, INSTRUCTION, START, STATE, Piece, PromptLayout
 from lerobot_bomb.vlm.qwen import QwenBackbone, QwenPrompt, build_qwen, load_qwen
 from lerobot_bomb.vlm.tokenizer import load_tokenizer
 from lerobot_policy_fdvla.configuration_fdvla import FdvlaConfig
@@ -22,6 +25,20 @@ def build_model(config: FdvlaConfig) -> tuple[QwenPrompt, QwenBackbone]:
     if config.gradient_checkpointing:
         backbone.checkpoint_gradients()
     return tokens, backbone
+
+
+def make_layout(
+    config: FdvlaConfig, tokens: QwenPrompt, cameras: Sequence[str], tokens_per_image: int
+) -> PromptLayout:
+    """Make the layout of prompts: images, instruction, a token whose place the state's embedding takes."""
+    image = [tokens.image_start, *tokens_per_image * [tokens.image], tokens.image_end]
+    pieces = [
+        Piece(START, tokens.start),
+        *(Piece(camera, image) for camera in cameras),
+        Piece(INSTRUCTION, None),
+    ]
+    state = [Piece(STATE, [tokens.image_end])] if config.use_state else []
+    return PromptLayout([*pieces, *state, Piece(END, tokens.end)], tokens.image)
 
 
 def _freeze(config: FdvlaConfig, backbone: QwenBackbone) -> None:

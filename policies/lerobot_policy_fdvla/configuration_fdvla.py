@@ -21,6 +21,7 @@ from lerobot_bomb.flow.samplers import (
     check_sampling,
 )
 from lerobot_bomb.policies.config import RELATIVE_AS_TRAINED, RelativeVlaConfig
+from lerobot_bomb.policies.flag_groups import short_help
 from lerobot_bomb.policies.pointing_config import PlacesVlaConfig
 from lerobot_bomb.training.policy_flags import (
     MAX_POSITIONS,
@@ -55,9 +56,13 @@ AS_TRAINED = (
 
 
 @PreTrainedConfig.register_subclass("fdvla")
+@short_help
 @dataclass
 class FdvlaConfig(RelativeVlaConfig, PlacesVlaConfig):
-    """A Qwen2.5-VL reads noisy actions beside images and text; two heads take them to clean ones."""
+    """A Qwen2.5-VL reads noisy actions beside images and text; two heads take them to clean ones.
+
+    More flags, for research: docs/fdvla.md.
+    """
 
     CHOICES: ClassVar[dict[str, tuple]] = {
         **RelativeVlaConfig.CHOICES,
@@ -67,6 +72,13 @@ class FdvlaConfig(RelativeVlaConfig, PlacesVlaConfig):
         "train_vlm": TRAIN_VLM,
     }
 
+    RESEARCH: ClassVar[tuple[str, ...]] = (
+        *("use_flow_head", "use_denoise_head", "dualmod_flow", "dualmod_denoise", "head_dim", "dualmod_dim"),
+        *("reasoning_pool", "segment_attention", "time_sampling", "pointing_loss_weight"),
+        *("flow_loss_weight", "denoise_loss_weight", "consistency_loss_weight"),
+        *("consistency", "consistency_detach", "refine_alpha", "denoise_tau_min", "clip_sample_range"),
+        *("noise_seed", "noise_per_episode"),
+    )
     NEEDS_STATE: ClassVar[tuple[str, ...]] = (*RelativeVlaConfig.NEEDS_STATE, "pointing")
     LATER_FIELDS: ClassVar[dict[str, Any]] = {**PlacesVlaConfig.LATER_FIELDS, "pointing_loss_weight": 1.0}
 

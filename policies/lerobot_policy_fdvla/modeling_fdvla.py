@@ -19,6 +19,7 @@ from torch import Tensor, nn
 
 from lerobot_bomb.actions.accuracy import means
 from lerobot_bomb.actions.text import TokenRows
+from lerobot_bomb.bomb.pointing import PointedAt
 from lerobot_bomb.checkpoints.adapters import peft_targets
 from lerobot_bomb.cuda_graphs import GraphedModel
 from lerobot_bomb.finite import require_finite_answers
@@ -27,21 +28,22 @@ from lerobot_bomb.flow.losses import joint_loss, second_derivatives
 from lerobot_bomb.flow.noise import SamplingNoise
 from lerobot_bomb.flow.path import PathPoint, draw_tau, path_point
 from lerobot_bomb.flow.real_time import guided, without_padding
-from lerobot_bomb.flow.samplers import SAMPLERS, Heads, num_evaluations, sample
+from lerobot_bomb.flow.samplers import SAMPLERS, Heads, Predicted, num_evaluations, sample
 from lerobot_bomb.policies.pointing import Labels
 from lerobot_bomb.policies.pointing_policy import BOARD_READER, Parts, PointingVlaPolicy, plus
 from lerobot_bomb.policies.policy import RelativeVlaPolicy
 from lerobot_bomb.training.distributed import weighed
 from lerobot_bomb.training.randomness import begin_batch
-from lerobot_bomb.vlm.images import draw_windows, resize
-from lerobot_bomb.vlm.inputs import read_actions, read_image, read_task
-from lerobot_policy_fdvla.building_fdvla import build_model
+from lerobot_bomb.vlm.images import crop, encode_images
+from lerobot_bomb.vlm.inputs import read_actions, read_image
+from lerobot_bomb.vlm.layout import INSTRUCTION, STATE
+from lerobot_policy_fdvla.building_fdvla import build_model, make_layout
 from lerobot_policy_fdvla.card_fdvla import METHOD
 from lerobot_policy_fdvla.configuration_fdvla import AS_TRAINED, SHAPES, FdvlaConfig
 from lerobot_policy_fdvla.context_fdvla import Context
-from lerobot_policy_fdvla.explained_fdvla import ExplainedFdvla
 from lerobot_policy_fdvla.networks_fdvla import NUM_MARKS, ActionSegment, Head, SideBySide
 from lerobot_policy_fdvla.pointing_fdvla import Pointed, make_pointer
+from lerobot_policy_fdvla.scored_fdvla import ScoredFdvla
 
 logger = logging.getLogger(__name__)
 
@@ -64,11 +66,13 @@ class FdvlaPolicy(RelativeVlaPolicy, PointingVlaPolicy):
     def __init__(self, config: FdvlaConfig, dataset_meta: LeRobotDatasetMetadata | None = None, **_: object):
         super().__init__(config, dataset_meta)
         self.tokens, self.backbone = build_model(config)
-        self._check_length(self.backbone.text_config, self._num_fixed_tokens, "{}", dataset_meta)
+        self.layout = make_layout(config, self.tokens, self._cameras, self.backbone.tokens_per_image)
+        num_fixed = self.layout.num_tokens + config.chunk_size + NUM_MARKS
+        self._check_length(self.backbone.text_config, num_fixed, "{}", dataset_meta)
         hidden_size = self.backbone.text_config.hidden_size
-        self.segment = ActionSegment(config.chunk_size, self._action_dim, hidden_size)
+        self.segment = ActionSegment(config.chunk_size, self.action_dim, hidden_size)
         self.state_embedding = self._make_state_embedding(hidden_size)
-        make_head = partial(Head, hidden_size, config.head_dim, self._action_dim)
+        make_head = partial(Head, hidden_size, config.head_dim, self.action_dim)
         modulated = config.dualmod_flow, config.dualmod_denoise
         flow_dim, denoise_dim = (config.dualmod_dim if of_head else None for of_head in modulated)
         self.flow_head = make_head(flow_dim) if config.use_flow_head else None
@@ -100,9 +104,9 @@ class FdvlaPolicy(RelativeVlaPolicy, PointingVlaPolicy):
         counts = {name: sum(p.numel() for p in part.parameters()) for name, part in self.named_children()}
         return {**counts, "trained": sum(p.numel() for p in self.get_optim_params())}
 
-    def explained(self) -> ExplainedFdvla:
-        """Return the policy as `lerobot_bomb.explain` asks it."""
-        return ExplainedFdvla(self)
+    def scored(self) -> ScoredFdvla:
+        """Return the policy as `lerobot_bomb.explain` scores its answers."""
+        return ScoredFdvla(self)
 
     def _get_default_peft_targets(self) -> dict[str, Any]:
         return peft_targets(self, "language_model", NEW_PARTS)
@@ -121,45 +125,68 @@ class FdvlaPolicy(RelativeVlaPolicy, PointingVlaPolicy):
         if self.training:
             begin_batch(self.config, self.generator)
         draws = self.config.draws_per_chunk
-        actions_BKD, kept_BK, labels = self._targets(batch)
-        actions_BKD, kept_BK = (each.repeat_interleave(draws, dim=0) for each in (actions_BKD, kept_BK))
+        actions_BKD, loss_mask_BK, labels = self._targets(batch)
+        actions_BKD, loss_mask_BK = (
+            each.repeat_interleave(draws, dim=0) for each in (actions_BKD, loss_mask_BK)
+        )
         point = self._draw_point(actions_BKD)
-        with self._autocast(), second_derivatives(self.config.has_energy):
+        with self.autocast(), second_derivatives(self.config.has_energy):
             if self.config.has_energy:
                 point.actions.requires_grad_()
             context, pointing, features_BPH = self._read_and_point(batch, labels)
-            heads = self._heads(context, kept_BK)
-            velocity_BKD, noise_BKD = heads(point.actions, point.tau)
-            loss, terms = joint_loss(
-                None if velocity_BKD is None else velocity_BKD.float(),
-                None if noise_BKD is None else noise_BKD.float(),
+            heads = self._heads(context, loss_mask_BK)
+            predicted = velocity_BKD, noise_BKD = heads(point.actions, point.tau)
+            loss, terms = self._joint_loss(
+                predicted,
                 point,
-                kept_BK,
-                flow_loss_weight=self.config.flow_loss_weight,
-                denoise_loss_weight=self.config.denoise_loss_weight,
+                loss_mask_BK,
+                reduction=reduction,
                 consistency_loss_weight=self.config.used_consistency_weight,
                 consistency=self.config.consistency,
                 consistency_detach=self.config.consistency_detach,
-                reduction=reduction,
             )
         if reduction == "none":
             loss = loss.unflatten(0, (-1, draws)).mean(dim=1)
         elif self.training:
-            loss = weighed(loss, kept_BK)
+            loss = weighed(loss, loss_mask_BK)
         for name, loss_B in pointing.items():
             loss = plus(loss, self.config.pointing_loss_weight, loss_B)
             terms[name] = loss_B.detach().mean()
         loss, board = self._with_board(loss, batch, features_BPH)
-        return loss, self._metrics(loss, terms, board, velocity_BKD, noise_BKD, point, actions_BKD, kept_BK)
+        return loss, self._metrics(
+            loss, terms, board, velocity_BKD, noise_BKD, point, actions_BKD, loss_mask_BK
+        )
+
+    def _joint_loss(
+        self, predicted: Predicted, point: PathPoint, loss_mask_BK: Tensor, **options: Any
+    ) -> tuple[Tensor, dict[str, Tensor]]:
+        predicted_BKD = (None if values is None else values.float() for values in predicted)
+        weights = {name: getattr(self.config, name) for name in ("flow_loss_weight", "denoise_loss_weight")}
+        return joint_loss(*predicted_BKD, point, loss_mask_BK, **weights, **options)
+
+    def chunk_loss(
+        self, prompt: TokenRows, embeds_BLH: Tensor, state_BS: Tensor | None, point: PathPoint
+    ) -> Tensor:
+        """(B,) losses of both heads, with neither their disagreement nor what is pointed at.
+
+        ``B`` may be a multiple of the prompts', which were embedded before. ``state_BS``: None without
+        pointing.
+        """
+        context = self._context(prompt, embeds_BLH)
+        if state_BS is not None:
+            context = self._pointing(context, state_BS)
+        all_BK = torch.ones(point.actions.shape[:2], dtype=torch.bool, device=point.actions.device)
+        predicted = self._heads(context, all_BK)(point.actions, point.tau)
+        return self._joint_loss(predicted, point, all_BK, reduction="none", consistency="none")[0]
 
     def _targets(self, batch: dict[str, Tensor]) -> tuple[Tensor, Tensor, Labels | None]:
-        """Actions (B, K, D), which of them are kept (B, K), and what is pointed at."""
-        actions_BKD, kept_BK = self._actions(batch), self._kept(batch)
+        """Actions (B, K, D), the loss mask (B, K) over them, and what is pointed at."""
+        actions_BKD, loss_mask_BK = self._actions(batch), self._loss_mask(batch)
         if self.pointer is None:
-            return actions_BKD, kept_BK, None
+            return actions_BKD, loss_mask_BK, None
         labels = self.pointer.draw_labels(batch, self.config, self.generator)
-        other_B1D = self._to_relative(labels.other_actions[:, None], batch)
-        return *labels.given_actions(actions_BKD, kept_BK, other_B1D), labels
+        other_B1D = self.to_relative(labels.other_actions[:, None], batch)
+        return *labels.given_actions(actions_BKD, loss_mask_BK, other_B1D), labels
 
     def _read_and_point(
         self, batch: dict[str, Tensor], labels: Labels | None
@@ -169,7 +196,7 @@ class FdvlaPolicy(RelativeVlaPolicy, PointingVlaPolicy):
         And image features (B, P, H), P of all cameras, as the language model reads them.
         """
         context, embeds_BLH = self._read_embeds(batch)
-        features_BPH = embeds_BLH[:, self._image_columns(embeds_BLH.device)]
+        features_BPH = embeds_BLH[:, self.layout.image_columns(embeds_BLH.device)]
         if self.pointer is None or labels is None:
             return context, {}, features_BPH
         pointed = self._point(context, self._of_batch(batch, OBS_STATE))
@@ -178,9 +205,9 @@ class FdvlaPolicy(RelativeVlaPolicy, PointingVlaPolicy):
 
     def _actions(self, batch: dict[str, Tensor]) -> Tensor:
         """(B, K, D) as the heads predict them: normalised, and relative where they are."""
-        shape = self.config.chunk_size, self._action_dim
+        shape = self.config.chunk_size, self.action_dim
         actions_BKD = read_actions(batch, ACTION, self.config.type, self._device, shape).float()
-        return self._to_relative(actions_BKD, batch)
+        return self.to_relative(actions_BKD, batch)
 
     def _draw_point(self, actions_BKD: Tensor) -> PathPoint:
         tau_B = draw_tau(self.config.time_sampling, len(actions_BKD), self.generator)
@@ -197,7 +224,7 @@ class FdvlaPolicy(RelativeVlaPolicy, PointingVlaPolicy):
         noise_BKD: Tensor | None,
         point: PathPoint,
         actions_BKD: Tensor,
-        kept_BK: Tensor,
+        loss_mask_BK: Tensor,
     ) -> dict[str, float]:
         """The loss's terms, and errors of the actions that A^tau and a head imply, in the data's units.
 
@@ -207,7 +234,7 @@ class FdvlaPolicy(RelativeVlaPolicy, PointingVlaPolicy):
         limits = self.config.denoise_tau_min, self.config.clip_sample_range
         errors_BKD = point.implied_actions(velocity_BKD, noise_BKD, *limits) - actions_BKD
         errors_BKD = errors_BKD.abs() * self._unit
-        parts |= board | self._l1_parts(errors_BKD, kept_BK[..., None].expand_as(errors_BKD))
+        parts |= board | self._l1_parts(errors_BKD, loss_mask_BK[..., None].expand_as(errors_BKD))
         return means(parts, loss, self.config.trained_batches)
 
     # Inference
@@ -232,11 +259,11 @@ class FdvlaPolicy(RelativeVlaPolicy, PointingVlaPolicy):
         """
         self.eval()
         # real-time chunking takes gradients, and what is captured is written over
-        with torch.inference_mode(False), torch.no_grad(), self._autocast():
+        with torch.inference_mode(False), torch.no_grad(), self.autocast():
             context = self._read(batch)
             if self.pointer is not None:
                 context = self._pointing(context, self._of_batch(batch, OBS_STATE))
-            shape = len(context.pooled), self.config.chunk_size, self._action_dim
+            shape = len(context.pooled), self.config.chunk_size, self.action_dim
             noises = self._noise(noise, shape), self._step_noise(shape)
             if self.rtc_processor is not None and prev_chunk_left_over is not None:
                 delay, heads = inference_delay or 0, self._heads(context)
@@ -248,11 +275,20 @@ class FdvlaPolicy(RelativeVlaPolicy, PointingVlaPolicy):
                 actions_BKD = captured[0].clone()
             else:
                 actions_BKD = self._sample(*noises, *context.tensors())[0]
-            actions_BKD = self._to_absolute(actions_BKD, batch)
+            actions_BKD = self.to_absolute(actions_BKD, batch)
         # casts of weights cached under inference mode cannot be used by a later training step
         torch.clear_autocast_cache()
         require_finite_answers(actions_BKD.isfinite().flatten(1).all(dim=1))
         return actions_BKD
+
+    def pointed(self, batch: dict[str, Tensor]) -> PointedAt | None:
+        """Return what is pointed at in a batch of one row; None: nothing is."""
+        if self.pointer is None:
+            return None
+        self.eval()
+        with torch.no_grad(), self.autocast():
+            pointed = self._point(self._read(batch), self._of_batch(batch, OBS_STATE))
+            return self.pointer.pointed_at(pointed)
 
     @property
     def last_passes(self) -> int:
@@ -261,7 +297,7 @@ class FdvlaPolicy(RelativeVlaPolicy, PointingVlaPolicy):
 
     def _left_over(self, actions_KD: Tensor, batch: dict[str, Tensor]) -> Tensor:
         """Normalised actions (K, D) or (B, K, D) of the last chunk, as this one's heads predict them."""
-        return self._to_relative(without_padding(actions_KD).to(self._device), batch)
+        return self.to_relative(without_padding(actions_KD).to(self._device), batch)
 
     def _sample(self, noise_BKD: Tensor, step_noise: Tensor, *context: Tensor) -> tuple[Tensor]:
         """Run all sampling steps, as a function of tensors."""
@@ -306,22 +342,22 @@ class FdvlaPolicy(RelativeVlaPolicy, PointingVlaPolicy):
 
     # Model
 
-    def _heads(self, context: Context, kept_BK: Tensor | None = None) -> Heads:
+    def _heads(self, context: Context, attended_BK: Tensor | None = None) -> Heads:
         """Noisy actions and times -> velocity and noise (B, K, D); None for a missing head.
 
         ``B`` may be a multiple of the observations: draws of one stand beside each other. A call is one pass
         over the segment. Its shapes are static, and nothing in it waits for the device.
         """
-        if kept_BK is None:
+        if attended_BK is None:
             shape = len(context.pooled), self.config.chunk_size
-            kept_BK = torch.ones(shape, dtype=torch.bool, device=context.pooled.device)
-        reads_BTT = self.segment.reads(kept_BK, causal=self.config.segment_attention == "causal")
+            attended_BK = torch.ones(shape, dtype=torch.bool, device=context.pooled.device)
+        attention_mask_BTT = self._attention_mask(attended_BK)
         heads = self.flow_head, self.denoise_head
-        of_draws = context.of_draws(len(kept_BK) // len(context.pooled))
+        of_draws = context.of_draws(len(attended_BK) // len(context.pooled))
         modulations = [None if head is None else head.modulation(of_draws.pooled) for head in heads]
 
-        def predict(actions_BKD: Tensor, tau_B: Tensor) -> tuple[Tensor | None, Tensor | None]:
-            states_BKH = self._action_states(context, actions_BKD, tau_B, reads_BTT)
+        def predict(actions_BKD: Tensor, tau_B: Tensor) -> Predicted:
+            states_BKH = self._action_states(context, actions_BKD, tau_B, attention_mask_BTT)
             if of_draws.feedback is not None:
                 states_BKH = states_BKH + of_draws.feedback[:, None]
             velocity_BKD, noise_BKD = (
@@ -332,14 +368,20 @@ class FdvlaPolicy(RelativeVlaPolicy, PointingVlaPolicy):
 
         return predict
 
+    def _attention_mask(self, attended_BK: Tensor) -> Tensor:
+        return self.segment.attention_mask(attended_BK, causal=self.config.segment_attention == "causal")
+
     def _action_states(
-        self, context: Context, actions_BKD: Tensor, tau_B: Tensor, reads_BTT: Tensor
+        self, context: Context, actions_BKD: Tensor, tau_B: Tensor, attention_mask_BTT: Tensor
     ) -> Tensor:
         """(B, K, H) of the tokens of noisy actions; draws of one observation read it and not each other."""
         embeds_BTH = self.segment(actions_BKD, tau_B)
         draws = SideBySide(len(embeds_BTH) // len(context.pooled))
         states = self.backbone.read_segment(
-            context.prefix, draws.joined(embeds_BTH), draws.reads(reads_BTT), draws.number
+            context.prefix,
+            draws.joined(embeds_BTH),
+            draws.attention_mask(attention_mask_BTT),
+            draws.number,
         )
         return self.segment.of_actions(states.reshape(embeds_BTH.shape))
 
@@ -351,11 +393,11 @@ class FdvlaPolicy(RelativeVlaPolicy, PointingVlaPolicy):
     def _point(self, context: Context, state_BS: Tensor) -> Pointed:
         """Read off the first action's token, of a chunk of zeros where all is noise."""
         assert self.pointer is not None
-        shape, device = (len(context.pooled), self.config.chunk_size, self._action_dim), self._device
-        kept_BK = torch.ones(shape[:2], dtype=torch.bool, device=device)
-        reads_BTT = self.segment.reads(kept_BK, causal=self.config.segment_attention == "causal")
+        shape, device = (len(context.pooled), self.config.chunk_size, self.action_dim), self._device
+        attended_BK = torch.ones(shape[:2], dtype=torch.bool, device=device)
+        attention_mask_BTT = self._attention_mask(attended_BK)
         zeros = torch.zeros(shape, device=device), torch.zeros(shape[0], device=device)
-        states_BKH = self._action_states(context, *zeros, reads_BTT)
+        states_BKH = self._action_states(context, *zeros, attention_mask_BTT)
         return self.pointer(states_BKH[:, 0], state_BS)
 
     def _read(self, batch: dict[str, Tensor]) -> Context:
@@ -364,82 +406,38 @@ class FdvlaPolicy(RelativeVlaPolicy, PointingVlaPolicy):
 
     def _read_embeds(self, batch: dict[str, Tensor]) -> tuple[Context, Tensor]:
         """Read the prompt, and return its embeddings (B, L, H), too."""
-        rows, is_task_BL = self._prompt(batch)
-        embeds_BLH = self._embeds(batch, rows.ids)
-        return self._context(rows, is_task_BL, embeds_BLH, len(self.tokens.start)), embeds_BLH
+        prompt = self.prompt(batch)
+        embeds_BLH = self.embed(batch, prompt.ids)
+        return self._context(prompt, embeds_BLH, len(self.tokens.start)), embeds_BLH
 
-    def _context(
-        self, rows: TokenRows, is_task_BL: Tensor, embeds_BLH: Tensor, num_shared: int = 0
-    ) -> Context:
-        """Read what `_prompt` and `_embeds` made of a batch with the language model."""
-        is_image_BL = rows.ids == self.tokens.image
-        prefix = self.backbone.read_prefix(embeds_BLH, is_image_BL, rows.mask, rows.hidden, num_shared)
-        pooled_BH = masked_mean_pool(prefix.hidden, self._pooled(rows.readable, is_task_BL))
+    def _context(self, prompt: TokenRows, embeds_BLH: Tensor, num_shared: int = 0) -> Context:
+        """Read prompts that were embedded before with the language model."""
+        is_image_BL = prompt.ids == self.layout.image
+        prefix = self.backbone.read_prefix(embeds_BLH, is_image_BL, prompt.mask, prompt.hidden, num_shared)
+        pooled_BH = masked_mean_pool(prefix.hidden, self._pooled(prompt))
         return Context(prefix, pooled_BH, feedback=None)
 
-    def _pooled(self, readable_BL: Tensor, is_task_BL: Tensor) -> Tensor:
+    def _pooled(self, prompt: TokenRows) -> Tensor:
         """(B, L) bool: the tokens that are pooled; all of them where there is no instruction."""
-        if self.config.reasoning_pool == "text":
-            return torch.where(is_task_BL.any(dim=1, keepdim=True), is_task_BL, readable_BL)
+        attention_mask_BL = prompt.attention_mask
         if self.config.reasoning_pool == "all_prefix":
-            return readable_BL
-        index_L = torch.arange(readable_BL.shape[1], device=readable_BL.device)
-        return (index_L == readable_BL.shape[1] - 1).expand_as(readable_BL)
+            return attention_mask_BL
+        index_L = torch.arange(attention_mask_BL.shape[1], device=attention_mask_BL.device)
+        if self.config.reasoning_pool == "last":
+            return (index_L == attention_mask_BL.shape[1] - 1).expand_as(attention_mask_BL)
+        span = self.layout.spans(len(index_L))[INSTRUCTION]
+        instruction_BL = attention_mask_BL & (index_L >= span.start) & (index_L < span.stop)
+        return torch.where(instruction_BL.any(dim=1, keepdim=True), instruction_BL, attention_mask_BL)
 
-    # Prompt: start, images, task (with padding), a place for the state, end
-
-    def _prompt(self, batch: dict[str, Tensor]) -> tuple[TokenRows, Tensor]:
-        """Return the prompt's tokens, and which of them (B, L) are the task's, without hidden ones."""
-        parts = self._prompt_parts(batch)
-        is_task = [part.readable & (name == "instruction") for name, part in parts.items()]
-        return TokenRows.join([*parts.values()]), torch.cat(is_task, dim=1)
-
-    def _prompt_parts(self, batch: dict[str, Tensor]) -> dict[str, TokenRows]:
-        """Return the prompt's parts by name; an image's name is its camera."""
-        task = read_task(batch, self.config.type, self._device)
-        parts = {"start": TokenRows.constant(self.tokens.start, task.ids)}
-        parts |= {camera: TokenRows.constant(self._image_ids, task.ids) for camera in self._cameras}
-        parts["instruction"] = task
-        if self.config.use_state:  # its embedding takes the place of a token
-            parts["state"] = TokenRows.constant([self.tokens.image_end], task.ids)
-        return parts | {"end": TokenRows.constant(self.tokens.end, task.ids)}
-
-    def _embeds(self, batch: dict[str, Tensor], ids_BL: Tensor) -> Tensor:
-        """Embeddings (B, L, H) of a prompt, image features and state in place."""
+    def embed(self, batch: dict[str, Tensor], ids_BL: Tensor) -> Tensor:
+        """(B, L, H) embeddings of a batch's prompts, image features and state in place."""
         generator = self.generator if self.training else None
-        images = [read_image(batch, key, self.config.type, ids_BL.device) for key in self._cameras]
-        pixels = [
-            resize(
-                draw_windows(image, self.config.crop_fraction, generator).cut(image), self.config.image_size
-            )
-            for image in images
-        ]
-        features = self.backbone.embed_images(torch.stack(pixels, dim=1).flatten(0, 1))
-        embeds_BLH = self.backbone.embed_tokens(ids_BL)
-        features_BPH = features.reshape(len(ids_BL), -1, embeds_BLH.shape[-1]).to(embeds_BLH.dtype)
-        embeds_BLH = embeds_BLH.index_copy(1, self._image_columns(ids_BL.device), features_BPH)
+        images = [read_image(batch, key, self.config.type, self._device) for key in self._cameras]
+        images = [crop(image, self.config.crop_fraction, generator) for image in images]
+        features_BPH = encode_images(self.backbone, images)
+        embeds_BLH = self.layout.with_images(self.backbone.embed_tokens(ids_BL), features_BPH)
         if self.state_embedding is None:
             return embeds_BLH
         state_BH = self.state_embedding(self._state(batch)).to(embeds_BLH.dtype)
-        column = ids_BL.shape[1] - len(self.tokens.end) - 1
+        column = self.layout.spans(ids_BL.shape[1])[STATE].start
         return embeds_BLH.index_copy(1, torch.tensor([column], device=ids_BL.device), state_BH[:, None])
-
-    def _image_columns(self, device: torch.device) -> Tensor:
-        """Columns of all image tokens; the same in every row, because only the start precedes them."""
-        num_tokens = self.backbone.tokens_per_image
-        starts = (
-            len(self.tokens.start) + 1 + (num_tokens + 2) * torch.arange(len(self._cameras), device=device)
-        )
-        return (starts[:, None] + torch.arange(num_tokens, device=device)).flatten()
-
-    @property
-    def _image_ids(self) -> list[int]:
-        tokens = self.tokens
-        return [tokens.image_start, *self.backbone.tokens_per_image * [tokens.image], tokens.image_end]
-
-    @property
-    def _num_fixed_tokens(self) -> int:
-        """Number of tokens of prompt and segment, without the task."""
-        of_prompt = len(self.tokens.start) + len(self._cameras) * len(self._image_ids)
-        of_prompt += self.config.use_state + len(self.tokens.end)
-        return of_prompt + self.config.chunk_size + NUM_MARKS

@@ -53,17 +53,17 @@ class ActionSegment(nn.Module):
         return states_BTH[:, NUM_MARKS - 1 : -1]
 
     @staticmethod
-    def reads(kept_BK: Tensor, *, causal: bool) -> Tensor:
-        """(B, T, T) whether a token (row) reads another; an action that is not kept is read by none."""
-        marks_B1 = torch.ones_like(kept_BK[:, :1])
-        keys_BT = torch.cat([marks_B1, marks_B1, kept_BK, marks_B1], dim=1)
-        reads_BTT = keys_BT[:, None].expand(-1, keys_BT.shape[1], -1)
-        return reads_BTT.tril() if causal else reads_BTT
+    def attention_mask(attended_BK: Tensor, *, causal: bool) -> Tensor:
+        """(B, T, T) attention mask of a segment, a row for each token that attends."""
+        marks_B1 = torch.ones_like(attended_BK[:, :1])
+        keys_BT = torch.cat([marks_B1, marks_B1, attended_BK, marks_B1], dim=1)
+        attention_mask_BTT = keys_BT[:, None].expand(-1, keys_BT.shape[1], -1)
+        return attention_mask_BTT.tril() if causal else attention_mask_BTT
 
 
 @dataclass(frozen=True)
 class SideBySide:
-    """Segments of so many draws of an observation as one, in which none reads another's tokens."""
+    """Segments of so many draws of an observation as one, in which none attends to another's tokens."""
 
     number: int
 
@@ -71,12 +71,12 @@ class SideBySide:
         """(B, T, H) -> (B / number, number * T, H)."""
         return embeds_BTH.reshape(-1, self.number * embeds_BTH.shape[1], embeds_BTH.shape[2])
 
-    def reads(self, reads_BTT: Tensor) -> Tensor:
-        """Spread which tokens each (row) reads: (B, T, T) -> (B / number, number * T, number * T) bool."""
-        is_own_JJ = torch.eye(self.number, dtype=torch.bool, device=reads_BTT.device)
-        reads_OJTT = reads_BTT.unflatten(0, (-1, self.number))
-        reads_OJTJT = reads_OJTT[:, :, :, None] & is_own_JJ[:, None, :, None]
-        return reads_OJTJT.flatten(3).flatten(1, 2)
+    def attention_mask(self, attention_mask_BTT: Tensor) -> Tensor:
+        """Join attention masks: (B, T, T) -> (B / number, number * T, number * T) bool."""
+        is_own_JJ = torch.eye(self.number, dtype=torch.bool, device=attention_mask_BTT.device)
+        attention_mask_OJTT = attention_mask_BTT.unflatten(0, (-1, self.number))
+        attention_mask_OJTJT = attention_mask_OJTT[:, :, :, None] & is_own_JJ[:, None, :, None]
+        return attention_mask_OJTJT.flatten(3).flatten(1, 2)
 
 
 class Head(nn.Module):

@@ -1,6 +1,7 @@
 """The parts of a ``spatialvla_grid``, from its config, a checkpoint's or a dataset."""
 
 import logging
+from collections.abc import Sequence
 
 import numpy as np
 from lerobot.datasets import LeRobotDatasetMetadata
@@ -10,15 +11,19 @@ from lerobot_bomb.actions.grid_fit import normalised, normalised_rest
 from lerobot_bomb.actions.grid_report import clipping_text, rest_text
 from lerobot_bomb.actions.grids import ActionGrids
 from lerobot_bomb.actions.relative import bounds
+from lerobot_bomb.actions.text import digits_needed
 from lerobot_bomb.data.columns import dim_names, present_episodes, read_columns
 from lerobot_bomb.vlm.backbone import check_family, config_dict
 from lerobot_bomb.vlm.depth import ZoeDepth, build_zoedepth, load_zoedepth, read_zoedepth_config
+from lerobot_bomb.vlm.layout import END, INSTRUCTION, START, STATE, Piece, PromptLayout
 from lerobot_bomb.vlm.paligemma import PaliGemmaBackbone, PaliGemmaPrompt, build_paligemma, load_paligemma
 from lerobot_bomb.vlm.tokenizer import load_tokenizer
-from lerobot_policy_spatialvla_grid.configuration_spatialvla_grid import SpatialvlaGridConfig
+from lerobot_policy_spatialvla_grid.configuration_spatialvla_grid import NUM_STATE_BINS, SpatialvlaGridConfig
 
 logger = logging.getLogger(__name__)
 
+# not of the base model: trained whole beside its adapters
+CELL_TABLES = ("cell_embedding", "cell_head")
 # patterns of modules that have adapters beside the text model's
 VISION_LAYERS = r"backbone\.vlm\.model\.vision_tower\..*\.((q|k|v|out)_proj|fc[12])"
 PROJECTOR = r"backbone\.vlm\.model\.multi_modal_projector\.linear"
@@ -33,6 +38,26 @@ def adapted_layers(config: SpatialvlaGridConfig) -> list[str]:
     if config.depth_source != "none":
         others.append(EGO3D_LAYERS)
     return others
+
+
+def check_adapted_cells(
+    config: SpatialvlaGridConfig,
+    trained_whole: Sequence[str],
+    num_cells: list[int],
+    num_cells_of_base: list[int],
+) -> None:
+    """Raise a ValueError unless adapters can hold the cells of grids that were adapted to a dataset."""
+    if not {*CELL_TABLES} <= {*trained_whole}:
+        raise ValueError(
+            f"--peft.full_training_modules={trained_whole} leaves out the cells, which were adapted to "
+            f"this dataset; have {' and '.join(CELL_TABLES)} in it, or give "
+            "--policy.adapt_embeddings=false"
+        )
+    if num_cells_of_base != num_cells:
+        raise ValueError(
+            f"--policy.action_groups: adapters cannot be trained on grids of {num_cells} cells, as those of "
+            f"{config.pretrained_path} have {num_cells_of_base}; leave it as it is"
+        )
 
 
 def build_depth(config: SpatialvlaGridConfig) -> ZoeDepth | None:
@@ -82,6 +107,24 @@ def fit_to_data(grids: ActionGrids, config: SpatialvlaGridConfig, meta: LeRobotD
     for text, needs_remedy in (clipping_text(actions_ND, names), rest_text(grids, actions_ND, names)):
         if text:
             logger.log(logging.WARNING if needs_remedy else logging.INFO, "%s: %s", meta.repo_id, text)
+
+
+def make_layout(
+    config: SpatialvlaGridConfig, tokens: PaliGemmaPrompt, cameras: Sequence[str], tokens_per_image: int
+) -> PromptLayout:
+    """Make the layout of prompts: images, instruction, the state's numbers."""
+    image = tokens_per_image * [tokens.image]
+    pieces = [
+        *(Piece(camera, image) for camera in cameras),
+        Piece(START, tokens.start),
+        Piece(INSTRUCTION, None),
+    ]
+    if config.use_state:
+        assert config.robot_state_feature is not None
+        width = 1 + digits_needed(NUM_STATE_BINS)
+        numbers = Piece(STATE, None, width=width * config.robot_state_feature.shape[0])
+        pieces += [Piece(STATE, tokens.state_start), numbers]
+    return PromptLayout([*pieces, Piece(END, tokens.task_end)], tokens.image)
 
 
 def build_model(config: SpatialvlaGridConfig) -> tuple[PaliGemmaPrompt, PaliGemmaBackbone]:

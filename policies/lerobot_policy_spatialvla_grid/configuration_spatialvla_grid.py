@@ -8,6 +8,7 @@ from typing import Any, ClassVar
 from lerobot.configs import FeatureType, PolicyFeature, PreTrainedConfig
 from lerobot.utils.constants import OBS_IMAGES
 
+from lerobot_bomb.actions.grid_report import cells_text
 from lerobot_bomb.actions.grid_settings import (
     LAYOUT_FLAG,
     LAYOUTS,
@@ -19,11 +20,9 @@ from lerobot_bomb.actions.grid_settings import (
 from lerobot_bomb.bomb.observation import WORKSPACE_HIGH_M, WORKSPACE_LOW_M
 from lerobot_bomb.flags import one_of
 from lerobot_bomb.policies.config import TokenVlaConfig
+from lerobot_bomb.policies.flag_groups import short_help
 from lerobot_bomb.policies.pointing_config import PlacesVlaConfig
-from lerobot_bomb.training.policy_flags import (
-    check_not_negative,
-    check_positive,
-)
+from lerobot_bomb.training.policy_flags import check_not_negative, check_positive
 from lerobot_bomb.vlm.prompt import check_template
 from lerobot_policy_spatialvla_grid.pointing_spatialvla_grid import StoneCells
 
@@ -42,9 +41,10 @@ STONE_CELL_M = 0.005  # a fifth of a stone, and about what a small vision model 
 
 
 @PreTrainedConfig.register_subclass("spatialvla_grid")
+@short_help
 @dataclass
 class SpatialvlaGridConfig(TokenVlaConfig, PlacesVlaConfig):
-    """A PaliGemma 2 chooses one grid cell for each group of action dimensions and step."""
+    """A PaliGemma 2 chooses a grid cell per group of dims and step; more flags: docs/spatialvla_grid.md."""
 
     CHOICES: ClassVar[dict[str, tuple]] = {
         **TokenVlaConfig.CHOICES,
@@ -60,6 +60,19 @@ class SpatialvlaGridConfig(TokenVlaConfig, PlacesVlaConfig):
         "pointing_area_m": WORKSPACE_M,
         "pointing_cell_m": STONE_CELL_M,
     }
+    FILLED_IN: ClassVar[tuple[str, ...]] = ("grid_params", "depth_config")
+    RESEARCH: ClassVar[tuple[str, ...]] = (
+        *("grid_distribution", "grid_min_sigma", "decode_point", "zero_radius_bin", "rho_dead", "phi_fit"),
+        *(
+            "ego3d_patch_reso",
+            "ego3d_n_freqs",
+            "ego3d_zero_init",
+            "ego3d_no_depth_vector",
+            "depth_model_name",
+        ),
+        *("prefix_attention", "loss_vocab", "pointing_area_m", "pointing_cell_m", "task_template", "draft"),
+        "freeze_llm_embeddings",
+    )
 
     # Hub id, path of a local folder, or "nano": a small model with random weights, built in code
     vlm_model_name: str = "google/paligemma2-3b-pt-224"
@@ -166,7 +179,7 @@ class SpatialvlaGridConfig(TokenVlaConfig, PlacesVlaConfig):
         edges = "uniform edges" if kind == "uniform" else f"adaptive edges ({kind})"
         has_depth = self.depth_source != "none"
         return [
-            f"{_cells_text(self.grid_settings().groups)}, {edges}",
+            f"{cells_text(self.grid_settings().groups)}, {edges}",
             *super().methods(),
             f"3-D positions by depth ({self.depth_source})" if has_depth else "no depth, no 3-D positions",
         ]
@@ -283,13 +296,3 @@ class SpatialvlaGridConfig(TokenVlaConfig, PlacesVlaConfig):
                     f"--policy.{flag}={value!r}: this checkpoint's grids have {then[flag]!r}, which only a "
                     f"training with --policy.adapt_embeddings=true can change"
                 )
-
-
-def _cells_text(groups: Collection[ActionGroup]) -> str:
-    """A token for each group, and how many cells it chooses from."""
-    cells = ", ".join(
-        f"{group.transform} " * (group.transform != "identity") + " x ".join(map(str, group.bins))
-        for group in groups
-    )
-    alone = all(len(group.dims) == 1 for group in groups)
-    return f"a token {'a dimension' if alone else 'a group'} ({cells} cells)"

@@ -23,11 +23,12 @@ from lerobot_bomb.actions.grid_report import edges_text
 from lerobot_bomb.actions.grid_rows import interpolate_rows
 from lerobot_bomb.actions.grids import ActionGrids
 from lerobot_bomb.actions.text import TokenRows, digits_needed, number_symbols
+from lerobot_bomb.bomb.pointing import PointedAt
 from lerobot_bomb.checkpoints.adapters import peft_targets
 from lerobot_bomb.checkpoints.checks import holds_module
 from lerobot_bomb.data.columns import dim_names
 from lerobot_bomb.decoding.decoder import Prompt
-from lerobot_bomb.decoding.slots import SlotWriter
+from lerobot_bomb.decoding.slots import SlotDecoder
 from lerobot_bomb.policies.pointing_policy import BOARD_READER, PointingVlaPolicy
 from lerobot_bomb.policies.policy import TokenVlaPolicy
 from lerobot_bomb.training.distributed import weighed
@@ -35,14 +36,18 @@ from lerobot_bomb.training.randomness import begin_batch
 from lerobot_bomb.vlm.depth import load_zoedepth
 from lerobot_bomb.vlm.ego3d import Ego3D
 from lerobot_bomb.vlm.images import draw_windows, resized_pixels
-from lerobot_bomb.vlm.inputs import read_actions, read_image, read_task
+from lerobot_bomb.vlm.inputs import read_actions, read_image
+from lerobot_bomb.vlm.layout import STATE
 from lerobot_policy_spatialvla_grid.building_spatialvla_grid import (
+    CELL_TABLES,
     adapted_layers,
     build_depth,
     build_model,
+    check_adapted_cells,
     complete_depth,
     fit_to_data,
     make_grids,
+    make_layout,
 )
 from lerobot_policy_spatialvla_grid.card_spatialvla_grid import METHOD
 from lerobot_policy_spatialvla_grid.configuration_spatialvla_grid import (
@@ -51,14 +56,11 @@ from lerobot_policy_spatialvla_grid.configuration_spatialvla_grid import (
     SHAPES,
     SpatialvlaGridConfig,
 )
-from lerobot_policy_spatialvla_grid.explained_spatialvla_grid import ExplainedSpatialvlaGrid
 from lerobot_policy_spatialvla_grid.pointing_spatialvla_grid import Target, make_pointer
-from lerobot_policy_spatialvla_grid.points_spatialvla_grid import seen_points
+from lerobot_policy_spatialvla_grid.points_spatialvla_grid import camera_points
+from lerobot_policy_spatialvla_grid.scored_spatialvla_grid import ScoredSpatialvlaGrid
 
 logger = logging.getLogger(__name__)
-
-# not of the base model: trained whole beside its adapters
-CELL_TABLES = ("cell_embedding", "cell_head")
 
 
 class SpatialvlaGridPolicy(TokenVlaPolicy, PointingVlaPolicy):
@@ -94,9 +96,10 @@ class SpatialvlaGridPolicy(TokenVlaPolicy, PointingVlaPolicy):
             config.ego3d_no_depth_vector,
         ).requires_grad_(config.has_positions)
         self.grids = make_grids(config, dataset_meta)
-        self._check_length(
-            self.backbone.text_config, self._num_fixed_tokens(), config.prompt_template, dataset_meta
-        )
+        self.layout = make_layout(config, self.tokens, self._cameras, self.backbone.tokens_per_image)
+        num_answer = len(self._pointing_rows) + config.chunk_size * len(self.grids.groups)
+        num_fixed = self.layout.num_tokens + num_answer
+        self._check_length(self.backbone.text_config, num_fixed, config.prompt_template, dataset_meta)
         self._num_cells_of_base: list[int] | None = None  # if the grids are other than the checkpoint's
         self.register_buffer("first_cells", torch.tensor(self.grids.offsets), persistent=False)
         hidden_size = self.backbone.text_config.hidden_size
@@ -104,10 +107,11 @@ class SpatialvlaGridPolicy(TokenVlaPolicy, PointingVlaPolicy):
         self.cell_head = nn.Linear(hidden_size, self._num_rows, bias=False)
         self._init_cells()
         self._add_board_reader(hidden_size, self.backbone.tokens_per_image)
-        self._writer = SlotWriter(
+        self._bidirectional_prompt = config.prefix_attention == "bidirectional"
+        self._decoder = SlotDecoder(
             self.backbone.text_model,
             self.backbone.positions,
-            prompt_reads_all=self._prompt_reads_all,
+            bidirectional_prompt=self._bidirectional_prompt,
             cap=self.backbone.cap,
             drafted=config.draft != "none",
             compiled=config.compile_model,
@@ -154,7 +158,7 @@ class SpatialvlaGridPolicy(TokenVlaPolicy, PointingVlaPolicy):
     @torch.no_grad()
     def _adapt(self, meta: LeRobotDatasetMetadata) -> None:
         """Fit the grids to another dataset; a cell's rows become those of where it lies in the old grids."""
-        old, new = self.grids, ActionGrids(self.config.grid_settings(), self._action_dim)
+        old, new = self.grids, ActionGrids(self.config.grid_settings(), self.action_dim)
         fit_to_data(new, self.config, meta)
         if new.to_dict() == old.to_dict():  # a training that is resumed
             return
@@ -176,9 +180,9 @@ class SpatialvlaGridPolicy(TokenVlaPolicy, PointingVlaPolicy):
         self.first_cells = torch.tensor(new.offsets, device=self._device)
         self.config.grid_params = new.to_dict()
 
-    def explained(self) -> ExplainedSpatialvlaGrid:
-        """Return the policy as `lerobot_bomb.explain` asks it."""
-        return ExplainedSpatialvlaGrid(self)
+    def scored(self) -> ScoredSpatialvlaGrid:
+        """Return the policy as `lerobot_bomb.explain` scores its answers."""
+        return ScoredSpatialvlaGrid(self)
 
     def _newest_only(self) -> list[int]:
         binary = [dim for group in self.grids.groups if group.transform == "binary" for dim in group.dims]
@@ -191,57 +195,51 @@ class SpatialvlaGridPolicy(TokenVlaPolicy, PointingVlaPolicy):
     def _validate_peft_config(self, peft_config: Any) -> None:
         """Check that adapters hold the cells of adapted grids, which are in the adapters' config."""
         super()._validate_peft_config(peft_config)
-        if self._num_cells_of_base is None:
-            return
-        trained_whole = peft_config.modules_to_save or []
-        if not {*CELL_TABLES} <= {*trained_whole}:
-            raise ValueError(
-                f"--peft.full_training_modules={trained_whole} leaves out the cells, which were adapted to "
-                f"this dataset; have {' and '.join(CELL_TABLES)} in it, or give "
-                "--policy.adapt_embeddings=false"
-            )
-        if self._num_cells_of_base != self.grids.num_cells:
-            raise ValueError(
-                f"--policy.action_groups: adapters cannot be trained on grids of {self.grids.num_cells} "
-                f"cells, as those of {self.config.pretrained_path} have {self._num_cells_of_base}; leave it "
-                "as it is"
-            )
+        if self._num_cells_of_base is not None:
+            num_cells = self.grids.num_cells, self._num_cells_of_base
+            check_adapted_cells(self.config, peft_config.modules_to_save or [], *num_cells)
 
     # Training
 
     def forward(self, batch: dict[str, Tensor], reduction: str = "mean") -> tuple[Tensor, dict[str, float]]:
-        """Cross-entropy of the answer, over the kept tokens; ``reduction="none"`` gives (B,)."""
+        """Cross-entropy of the answer, over the loss mask; ``reduction="none"`` gives (B,)."""
         if reduction not in ("mean", "none"):
             raise ValueError(f"reduction={reduction!r} is unknown; choose mean or none")
         if self.training:
             begin_batch(self.config, self.generator)
-        cells_BTG, kept_BT, pointed = self._targets(batch)
-        with self._autocast():
+        cells_BTG, loss_mask_BT, pointed = self._targets(batch)
+        with self.autocast():
             pointing_BNH, hidden_BTGH, features_BPH = self._hidden(batch, cells_BTG, pointed.tokens)
             losses_BTG, chosen_BTG = self._losses(hidden_BTGH, cells_BTG)
             losses_BN, chosen_BN = self._pointing_losses(pointing_BNH, pointed.tokens)
-        kept_BTG = kept_BT[..., None].expand_as(losses_BTG)
-        kept_BS = torch.cat([pointed.kept, kept_BTG.flatten(1)], dim=1)
-        losses_BS = torch.cat([losses_BN, losses_BTG.flatten(1)], dim=1) * kept_BS
-        parts = self._cell_parts(chosen_BTG, cells_BTG, kept_BTG) | pointed.parts(chosen_BN)
+        loss_mask_BTG = loss_mask_BT[..., None].expand_as(losses_BTG)
+        loss_mask_BS = torch.cat([pointed.loss_mask, loss_mask_BTG.flatten(1)], dim=1)
+        losses_BS = torch.cat([losses_BN, losses_BTG.flatten(1)], dim=1) * loss_mask_BS
+        parts = self._cell_parts(chosen_BTG, cells_BTG, loss_mask_BTG) | pointed.parts(chosen_BN)
         if reduction == "none":
-            loss = losses_BS.sum(dim=1) / kept_BS.sum(dim=1).clamp(min=1)
+            loss = losses_BS.sum(dim=1) / loss_mask_BS.sum(dim=1).clamp(min=1)
         else:
-            loss = losses_BS.sum() / kept_BS.sum().clamp(min=1)
-            loss = weighed(loss, kept_BS) if self.training else loss
+            loss = losses_BS.sum() / loss_mask_BS.sum().clamp(min=1)
+            loss = weighed(loss, loss_mask_BS) if self.training else loss
         loss, board = self._with_board(loss, batch, features_BPH)
         return loss, means(parts | board, loss, self.config.trained_batches)
 
     def _targets(self, batch: dict[str, Tensor]) -> tuple[Tensor, Tensor, Target]:
-        """Cells (B, T, G), which steps are kept (B, T), and what is pointed at ahead of them."""
-        shape = self.config.chunk_size, self._action_dim
+        """Cells (B, T, G), the loss mask (B, T) of steps, and what is pointed at ahead of them."""
+        shape = self.config.chunk_size, self.action_dim
         actions_BTD = read_actions(batch, ACTION, self.config.type, self._device, shape)
-        kept_BT = self._kept(batch)
+        loss_mask_BT = self._loss_mask(batch)
         if self.pointer is None:
-            return self.grids.encode(actions_BTD), kept_BT, Target.nothing(len(kept_BT), self._device)
+            return (
+                self.grids.encode(actions_BTD),
+                loss_mask_BT,
+                Target.nothing(len(loss_mask_BT), self._device),
+            )
         labels, pointed = self.pointer.draw(batch, self.config, self.generator)
-        actions_BTD, kept_BT = labels.given_actions(actions_BTD, kept_BT, labels.other_actions[:, None])
-        return self.grids.encode(actions_BTD), kept_BT, pointed
+        actions_BTD, loss_mask_BT = labels.given_actions(
+            actions_BTD, loss_mask_BT, labels.other_actions[:, None]
+        )
+        return self.grids.encode(actions_BTD), loss_mask_BT, pointed
 
     def _hidden(
         self, batch: dict[str, Tensor], cells_BTG: Tensor, pointed_BN: Tensor | None = None
@@ -252,11 +250,11 @@ class SpatialvlaGridPolicy(TokenVlaPolicy, PointingVlaPolicy):
         """
         if pointed_BN is None:
             pointed_BN = cells_BTG.new_empty(len(cells_BTG), 0)
-        prompt = self._prompt(batch)
+        prompt = self.prompt(batch)
         answer_BS = torch.cat([pointed_BN, cells_BTG.flatten(1)], dim=1)
-        embeds_BLH = self._embeds(batch, prompt.ids)
-        num_tokens = len(self._cameras) * self.backbone.tokens_per_image
-        return *self._hidden_after(prompt, embeds_BLH, answer_BS), embeds_BLH[:, :num_tokens]
+        embeds_BLH = self.embed(prompt.ids, self.encode_images(batch))
+        features_BPH = embeds_BLH[:, self.layout.image_columns(embeds_BLH.device)]
+        return *self._hidden_after(prompt, embeds_BLH, answer_BS), features_BPH
 
     def _hidden_after(
         self, prompt: TokenRows, embeds_BLH: Tensor, answer_BS: Tensor
@@ -270,14 +268,14 @@ class SpatialvlaGridPolicy(TokenVlaPolicy, PointingVlaPolicy):
         answer = TokenRows(rows_BS[:, 1:], torch.ones_like(rows_BS[:, 1:], dtype=torch.bool))
         rows = TokenRows.join([prompt, answer])
         index_X = torch.arange(rows.mask.shape[1], device=rows_BS.device)
-        reads_XX = index_X <= index_X[:, None]
-        if self._prompt_reads_all:
+        attention_mask_XX = index_X <= index_X[:, None]
+        if self._bidirectional_prompt:
             is_prompt_X = index_X < prompt.mask.shape[1]
-            reads_XX |= is_prompt_X & is_prompt_X[:, None]
+            attention_mask_XX |= is_prompt_X & is_prompt_X[:, None]
         hidden_BXH = self.backbone.hidden_states(
             embeds_BXH,
             (rows.mask.cumsum(dim=1) - 1).clamp(min=0),
-            reads_XX & rows.readable[:, None],
+            attention_mask_XX & rows.attention_mask[:, None],
         )
         return self._split(hidden_BXH[:, -rows_BS.shape[1] :])
 
@@ -285,6 +283,24 @@ class SpatialvlaGridPolicy(TokenVlaPolicy, PointingVlaPolicy):
         """(B, S, ...) of an answer -> (B, N, ...) of what points and (B, T, G, ...) of cells."""
         pointing, cells = answer.tensor_split([len(self._pointing_rows)], dim=1)
         return pointing, cells.unflatten(1, (-1, len(self.grids.groups)))
+
+    def log_probability(self, prompt: TokenRows, embeds_BLH: Tensor, answer_BS: Tensor) -> Tensor:
+        """(B,) of answers after prompts that were embedded before."""
+        pointed_BN, cells_BTG = self._split(answer_BS)
+        pointing_BNH, hidden_BTGH = self._hidden_after(prompt, embeds_BLH, answer_BS)
+        score_B = self._log_probability(self._group_rows, hidden_BTGH, cells_BTG)
+        if self.pointer is None:
+            return score_B
+        as_step = pointing_BNH[:, None], pointed_BN[:, None]
+        return score_B + self._log_probability(self._pointing_rows, *as_step)
+
+    def _log_probability(self, rows: list[slice], hidden_BTGH: Tensor, tokens_BTG: Tensor) -> Tensor:
+        """(B,) of tokens, whose rows of the table may be chosen in each of G slots."""
+        chosen = []
+        for i, slot in enumerate(rows):
+            logits_BTC = self._logits(slot, hidden_BTGH[:, :, i]).float()
+            chosen.append(logits_BTC.log_softmax(dim=-1).gather(-1, tokens_BTG[:, :, i, None]))
+        return torch.cat(chosen, dim=-1).sum(dim=(1, 2))
 
     def _losses(
         self, hidden_BTGH: Tensor, cells_BTG: Tensor, rows: list[slice] | None = None
@@ -317,35 +333,35 @@ class SpatialvlaGridPolicy(TokenVlaPolicy, PointingVlaPolicy):
 
     @torch.no_grad()
     def _cell_parts(
-        self, chosen_BTG: Tensor, cells_BTG: Tensor, kept_BTG: Tensor
+        self, chosen_BTG: Tensor, cells_BTG: Tensor, loss_mask_BTG: Tensor
     ) -> dict[str, tuple[Tensor, Tensor]]:
         """Return which cells are right and absolute errors in the data's units, as `means` takes them.
 
         Teacher-forced: every cell is predicted from the true ones before it. Padded actions do not count.
         Errors are known where a dataset was given, that is while training.
         """
-        parts = {"token_accuracy": (chosen_BTG == cells_BTG, kept_BTG)}
+        parts = {"token_accuracy": (chosen_BTG == cells_BTG, loss_mask_BTG)}
         errors_BTD = (self.grids.decode(chosen_BTG) - self.grids.decode(cells_BTG)).abs() * self.action_unit
-        return parts | self._l1_parts(errors_BTD, kept_BTG[..., :1].expand_as(errors_BTD))
+        return parts | self._l1_parts(errors_BTD, loss_mask_BTG[..., :1].expand_as(errors_BTD))
 
     # Inference
 
     def _predict(self, batch: dict[str, Tensor], num_steps: int) -> Tensor:
         """The first ``num_steps`` actions of the chunk; the model need not choose the rest."""
-        return self.grids.decode(self._choose(batch, num_steps))
+        return self.grids.decode(self.choose(batch, num_steps))
 
-    def _choose(self, batch: dict[str, Tensor], num_steps: int) -> Tensor:
+    def choose(self, batch: dict[str, Tensor], num_steps: int) -> Tensor:
         """(B, num_steps, G) cells."""
-        return self._split(self._write(batch, num_steps))[1]
+        return self._split(self.write(batch, num_steps))[1]
 
     @torch.no_grad()
-    def _write(self, batch: dict[str, Tensor], num_steps: int) -> Tensor:
+    def write(self, batch: dict[str, Tensor], num_steps: int) -> Tensor:
         """(B, S) answers: what is pointed at, then the cells of so many steps."""
         self.eval()
-        with self._autocast():
-            prompt = self._prompt(batch)
-            embeds_BLH = self._embeds(batch, prompt.ids)
-            answer_BS = self._writer(
+        with self.autocast():
+            prompt = self.prompt(batch)
+            embeds_BLH = self.embed(prompt.ids, self.encode_images(batch))
+            answer_BS = self._decoder(
                 Prompt(embeds_BLH, prompt.mask, prompt.hidden),
                 self._group_rows,
                 num_steps,
@@ -358,10 +374,20 @@ class SpatialvlaGridPolicy(TokenVlaPolicy, PointingVlaPolicy):
         torch.clear_autocast_cache()
         return answer_BS
 
+    def pointed(self, batch: dict[str, Tensor]) -> PointedAt | None:
+        """Return what is pointed at in a batch of one row; None: nothing is."""
+        if self.pointer is None:
+            return None
+        pointed_1N, cells_1TG = self._split(self.write(batch, self.config.chunk_size))
+        with torch.no_grad(), self.autocast():
+            pointing_1NH, *_ = self._hidden(batch, cells_1TG, pointed_1N)
+            logits_1P = self._logits(self._pointing_rows[0], pointing_1NH[:, 0]).float()
+        return self.pointer.pointed_at(pointed_1N[0], logits_1P[0].softmax(dim=0))
+
     @property
     def last_passes(self) -> int | None:
         """Passes of the text model in the last prediction, the prompt's included; None: there was none."""
-        return self._writer.num_passes
+        return self._decoder.num_passes
 
     @property
     def last_tokens(self) -> int:
@@ -397,55 +423,28 @@ class SpatialvlaGridPolicy(TokenVlaPolicy, PointingVlaPolicy):
 
     # Prompt
 
-    def _prompt(self, batch: dict[str, Tensor]) -> TokenRows:
-        """Return everything before the answer, with padding; its last column has none."""
-        return TokenRows.join([*self._prompt_parts(batch).values()])
+    def _prompt_rows(self, batch: dict[str, Tensor]) -> dict[str, TokenRows]:
+        if not self.config.use_state:
+            return {}
+        numbers_BN = self.state_bins.encode(self._state(batch))
+        symbols_BNC, mask_BNC = number_symbols(numbers_BN, digits_needed(NUM_STATE_BINS), zero_padded=False)
+        return {STATE: TokenRows(self.symbol_ids[symbols_BNC].flatten(1), mask_BNC.flatten(1))}
 
-    def _prompt_parts(self, batch: dict[str, Tensor]) -> dict[str, TokenRows]:
-        """Return the prompt's parts by name; an image's name is its camera."""
-        tokens = self.tokens
-        task = read_task(batch, self.config.type, self._device)
-        image = self.backbone.tokens_per_image * [tokens.image]
-        parts = {camera: TokenRows.constant(image, task.ids) for camera in self._cameras}
-        parts |= {"start": TokenRows.constant(tokens.start, task.ids), "instruction": task}
-        if self.config.use_state:
-            numbers_BN = self.state_bins.encode(self._state(batch))
-            symbols_BNC, mask_BNC = number_symbols(
-                numbers_BN, digits_needed(NUM_STATE_BINS), zero_padded=False
-            )
-            state = TokenRows(self.symbol_ids[symbols_BNC].flatten(1), mask_BNC.flatten(1))
-            parts["state"] = TokenRows.join([TokenRows.constant(tokens.state_start, task.ids), state])
-        return parts | {"end": TokenRows.constant(tokens.task_end, task.ids)}
+    def embed(self, ids_BL: Tensor, features_BPH: Tensor) -> Tensor:
+        """(B, L, H) embeddings of prompts, image features in place."""
+        return self.layout.with_images(self.backbone.embed_tokens(ids_BL), features_BPH)
 
-    def _num_fixed_tokens(self) -> int:
-        """Return the number of tokens of the longest prompt and answer, without the task."""
-        tokens, config = self.tokens, self.config
-        num_tokens = len(self._cameras) * self.backbone.tokens_per_image
-        num_tokens += len(tokens.start) + len(tokens.task_end) + len(self._pointing_rows)
-        num_tokens += config.chunk_size * len(self.grids.groups)
-        if config.use_state:
-            assert config.robot_state_feature is not None
-            width = 1 + digits_needed(NUM_STATE_BINS)
-            num_tokens += len(tokens.state_start) + width * config.robot_state_feature.shape[0]
-        return num_tokens
+    def encode_images(self, batch: dict[str, Tensor]) -> Tensor:
+        """(B, P of all images, H) image features."""
+        features = [self._encode_image(batch, key) for key in self._cameras]
+        return self.backbone.project(torch.cat(features, dim=1))
 
-    def _embeds(self, batch: dict[str, Tensor], ids_BL: Tensor) -> Tensor:
-        """Embeddings (B, L, H) of a prompt, image features in place."""
-        features = [self._see(batch, key) for key in self._cameras]
-        features_BPH = self.backbone.project(torch.cat(features, dim=1))
-        words_BLH = self.backbone.embed_tokens(ids_BL[:, features_BPH.shape[1] :])
-        return torch.cat([features_BPH.to(words_BLH.dtype), words_BLH], dim=1)
-
-    def _see(self, batch: dict[str, Tensor], key: str) -> Tensor:
+    def _encode_image(self, batch: dict[str, Tensor], key: str) -> Tensor:
         """Features of a camera's patches, which know where they are: (B, P, vision model's hidden size)."""
         image = read_image(batch, key, self.config.type, self._device)
         windows = draw_windows(image, self.config.crop_fraction, self.generator if self.training else None)
         pixels = resized_pixels(windows.cut(image), self.backbone.image_size)
         camera, size = key.removeprefix(f"{OBS_IMAGES}."), self.ego3d.lattice_size
-        points = seen_points(self.config, self.zoedepth, batch, camera, windows, pixels, size)
-        features_BPE = self.backbone.see(pixels)
+        points = camera_points(self.config, self.zoedepth, batch, camera, windows, pixels, size)
+        features_BPE = self.backbone.encode_pixels(pixels)
         return features_BPE + self.ego3d(points).to(features_BPE.dtype)
-
-    @property
-    def _prompt_reads_all(self) -> bool:
-        return self.config.prefix_attention == "bidirectional"

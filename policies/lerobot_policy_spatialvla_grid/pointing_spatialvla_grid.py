@@ -74,7 +74,7 @@ class Target:
     """Tokens ahead of a chunk's cells; without pointing N = 0."""
 
     tokens: Tensor  # (B, N) int64, among those that may stand there
-    kept: Tensor  # (B, N) bool, whether the loss counts them
+    loss_mask: Tensor  # (B, N) bool
 
     @classmethod
     def nothing(cls, batch_size: int, device: torch.device) -> "Target":
@@ -83,8 +83,8 @@ class Target:
 
     def parts(self, chosen_BN: Tensor) -> dict[str, tuple[Tensor, Tensor]]:
         """Return which tokens are right, as `means` takes them."""
-        right = zip(NAMES, (chosen_BN == self.tokens).T, self.kept.T, strict=False)
-        return {f"{name}_accuracy": (right_B, kept_B) for name, right_B, kept_B in right}
+        right = zip(NAMES, (chosen_BN == self.tokens).T, self.loss_mask.T, strict=False)
+        return {f"{name}_accuracy": (right_B, loss_mask_B) for name, right_B, loss_mask_B in right}
 
 
 class CellPointer(nn.Module):
@@ -130,9 +130,9 @@ class CellPointer(nn.Module):
         """
         labels = Labels.draw(batch, self.places, config.counterfactual_share, config.type, generator)
         tokens_B2 = torch.stack([labels.given, self.stones.number_of(labels.stone_xy)], dim=1)
-        kept_B2 = torch.stack([~labels.is_other, torch.ones_like(labels.is_other)], dim=1)
+        loss_mask_B2 = torch.stack([~labels.is_other, torch.ones_like(labels.is_other)], dim=1)
         others_BD = normalised_actions(labels.other_actions, self.action_bounds)
-        return replace(labels, other_actions=others_BD), Target(tokens_B2, kept_B2)
+        return replace(labels, other_actions=others_BD), Target(tokens_B2, loss_mask_B2)
 
 
 def make_pointer(config: "SpatialvlaGridConfig", meta: LeRobotDatasetMetadata | None) -> CellPointer | None:

@@ -9,7 +9,7 @@ from lerobot_bomb.vlm.intrinsics import crop_intrinsics, default_intrinsics, res
 from lerobot_policy_spatialvla_grid.configuration_spatialvla_grid import SpatialvlaGridConfig
 
 
-def seen_points(
+def camera_points(
     config: SpatialvlaGridConfig,
     zoedepth: ZoeDepth | None,
     batch: dict[str, Tensor],

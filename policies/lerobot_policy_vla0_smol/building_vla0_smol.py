@@ -1,7 +1,9 @@
-"""The vision-language model of a ``vla0_smol``, from its config or a checkpoint's."""
+"""The vision-language model of a ``vla0_smol``, from its config or a checkpoint's, and its prompt."""
 
+from collections.abc import Sequence
 from typing import Any
 
+from lerobot_bomb.actions.text import digits_needed
 from lerobot_bomb.vlm.backbone import (
     SmolVLMBackbone,
     build_backbone,
@@ -9,6 +11,7 @@ from lerobot_bomb.vlm.backbone import (
     config_dict,
     load_backbone,
 )
+from lerobot_bomb.vlm.layout import END, INSTRUCTION, START, STATE, Piece, PromptLayout
 from lerobot_bomb.vlm.prompt import QWEN_CHAT, SMOLVLM_CHAT, PromptTokens
 from lerobot_bomb.vlm.qwen import QwenBackbone, build_qwen, load_qwen
 from lerobot_bomb.vlm.tokenizer import load_tokenizer
@@ -38,6 +41,24 @@ def build_model(config: Vla0SmolConfig) -> tuple[PromptTokens, TextBackbone]:
     if config.gradient_checkpointing:
         backbone.checkpoint_gradients()
     return tokens, backbone
+
+
+def make_layout(
+    config: Vla0SmolConfig, tokens: PromptTokens, cameras: Sequence[str], tokens_per_image: int
+) -> PromptLayout:
+    """Make the layout of prompts: images, instruction, the state's numbers."""
+    image = [*tokens.image_start, *tokens_per_image * [tokens.image], *tokens.image_end]
+    pieces = [
+        Piece(START, tokens.start),
+        *(Piece(camera, image) for camera in cameras),
+        Piece(INSTRUCTION, None),
+    ]
+    if config.use_state:
+        assert config.robot_state_feature is not None
+        width = 1 + (config.number_width or digits_needed(config.n_state_bins))
+        numbers = Piece(STATE, None, width=config.robot_state_feature.shape[0] * width)
+        pieces += [Piece(STATE, tokens.state_start), numbers, Piece(STATE, tokens.state_end)]
+    return PromptLayout([*pieces, Piece(END, tokens.answer_start)], tokens.image)
 
 
 def _load(config: Vla0SmolConfig) -> tuple[PromptTokens, TextBackbone]:

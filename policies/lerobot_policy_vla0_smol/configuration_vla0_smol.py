@@ -9,6 +9,7 @@ from lerobot.configs import PreTrainedConfig
 from lerobot_bomb.actions.bins import BIN_MODES
 from lerobot_bomb.actions.text import MASK_LEVELS, MAX_DIGITS, digits_needed
 from lerobot_bomb.policies.config import RELATIVE_AS_TRAINED, RelativeVlaConfig, TokenVlaConfig
+from lerobot_bomb.policies.flag_groups import short_help
 from lerobot_bomb.policies.pointing_config import PointingVlaConfig
 from lerobot_bomb.training.policy_flags import check_positive
 
@@ -28,9 +29,13 @@ AS_TRAINED = (
 
 
 @PreTrainedConfig.register_subclass("vla0_smol")
+@short_help
 @dataclass
 class Vla0SmolConfig(RelativeVlaConfig, TokenVlaConfig, PointingVlaConfig):
-    """A model writes ``chunk_size`` actions as integers; ``n_action_steps`` of them are executed."""
+    """A model writes ``chunk_size`` actions as integers; ``n_action_steps`` of them are executed.
+
+    More flags, for research: docs/vla0_smol.md.
+    """
 
     CHOICES: ClassVar[dict[str, tuple]] = {
         **TokenVlaConfig.CHOICES,
@@ -41,6 +46,10 @@ class Vla0SmolConfig(RelativeVlaConfig, TokenVlaConfig, PointingVlaConfig):
     ACTIONS_ARE_OF_WEIGHTS: ClassVar[bool] = False
     STATE_IS_OF_WEIGHTS: ClassVar[bool] = False
     LATER_FIELDS: ClassVar[dict[str, Any]] = {**PointingVlaConfig.LATER_FIELDS, "pointing_range_m": 0.3}
+    RESEARCH: ClassVar[tuple[str, ...]] = (
+        *("n_state_bins", "pointing_range_m", "system_prompt", "draft", "color_jitter"),
+        *("mask_level", "mask_skip_prob"),
+    )
     NEEDS_STATE: ClassVar[tuple[str, ...]] = (*RelativeVlaConfig.NEEDS_STATE, "pointing")
 
     # Hub id, path of a local folder, or "nano": a small model with random weights, built in code

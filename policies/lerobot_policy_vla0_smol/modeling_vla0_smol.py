@@ -29,6 +29,7 @@ from lerobot_bomb.actions.text import (
     draw_hidden,
     number_symbols,
 )
+from lerobot_bomb.bomb.pointing import PointedAt
 from lerobot_bomb.checkpoints.adapters import peft_targets
 from lerobot_bomb.decoding.decoder import Decoded, Prompt
 from lerobot_bomb.decoding.draft import KnownSymbols, LinearDraft
@@ -40,14 +41,15 @@ from lerobot_bomb.policies.policy import RelativeVlaPolicy, TokenVlaPolicy
 from lerobot_bomb.training.distributed import weighed
 from lerobot_bomb.training.randomness import begin_batch
 from lerobot_bomb.vlm.color_jitter import ColorJitter
-from lerobot_bomb.vlm.images import crop
-from lerobot_bomb.vlm.inputs import read_actions, read_image, read_task
+from lerobot_bomb.vlm.images import crop, encode_images
+from lerobot_bomb.vlm.inputs import read_actions, read_image
+from lerobot_bomb.vlm.layout import STATE
 from lerobot_bomb.vlm.prompt import TASK_TEMPLATE
-from lerobot_policy_vla0_smol.building_vla0_smol import build_model
+from lerobot_policy_vla0_smol.building_vla0_smol import build_model, make_layout
 from lerobot_policy_vla0_smol.card_vla0_smol import METHOD
 from lerobot_policy_vla0_smol.configuration_vla0_smol import AS_TRAINED, SHAPES, Vla0SmolConfig
-from lerobot_policy_vla0_smol.explained_vla0_smol import ExplainedVla0Smol
 from lerobot_policy_vla0_smol.pointing_vla0_smol import NUM_NUMBERS, make_pointer
+from lerobot_policy_vla0_smol.scored_vla0_smol import ScoredVla0Smol
 
 
 class Vla0SmolPolicy(RelativeVlaPolicy, TokenVlaPolicy, PointingVlaPolicy):
@@ -80,14 +82,15 @@ class Vla0SmolPolicy(RelativeVlaPolicy, TokenVlaPolicy, PointingVlaPolicy):
         self.grammar = NumberGrammar(
             config.n_action_bins, self._num_numbers(config.chunk_size), fixed_width=config.number_width
         )
-        num_fixed = self._num_fixed_tokens()
+        self.layout = make_layout(config, self.tokens, self._cameras, self.backbone.tokens_per_image)
+        num_fixed = self.layout.num_tokens + self.grammar.max_symbols(self.grammar.num_numbers)
         self._check_length(self.backbone.text_config, num_fixed, TASK_TEMPLATE, dataset_meta)
         guess = (
             KnownSymbols(self.grammar)
             if config.draft == "none"
-            else LinearDraft(self.grammar, self._action_dim, self._num_pointing)
+            else LinearDraft(self.grammar, self.action_dim, self._num_pointing)
         )
-        columns = self._image_columns(torch.device("cpu"))
+        columns = self.layout.image_columns(torch.device("cpu"))
         # of a prompt's and its answer's columns, the same in every row
         self._positions = partial(self.backbone.positions, image_columns=columns)
         self._writer = NumberWriter(
@@ -106,11 +109,11 @@ class Vla0SmolPolicy(RelativeVlaPolicy, TokenVlaPolicy, PointingVlaPolicy):
 
     def _num_numbers(self, num_steps: int) -> int:
         """Numbers of an answer of so many actions."""
-        return self._num_pointing + num_steps * self._action_dim
+        return self._num_pointing + num_steps * self.action_dim
 
-    def explained(self) -> ExplainedVla0Smol:
-        """Return the policy as `lerobot_bomb.explain` asks it."""
-        return ExplainedVla0Smol(self)
+    def scored(self) -> ScoredVla0Smol:
+        """Return the policy as `lerobot_bomb.explain` scores its answers."""
+        return ScoredVla0Smol(self)
 
     def _get_default_peft_targets(self) -> dict[str, Any]:
         return peft_targets(self, self.backbone.text_model_name, ("pointer", BOARD_READER))
@@ -118,27 +121,27 @@ class Vla0SmolPolicy(RelativeVlaPolicy, TokenVlaPolicy, PointingVlaPolicy):
     # Training
 
     def forward(self, batch: dict[str, Tensor], reduction: str = "mean") -> tuple[Tensor, dict[str, float]]:
-        """Cross-entropy of the answer's tokens, over the kept ones; ``reduction="none"`` gives (B,)."""
+        """Cross-entropy of the answer's tokens, over the loss mask; ``reduction="none"`` gives (B,)."""
         if reduction not in ("mean", "none"):
             raise ValueError(f"reduction={reduction!r} is unknown; choose mean or none")
         if self.training:
             begin_batch(self.config, self.generator)
-        with self._autocast():
-            prompt = self._prompt(batch)
-            bins_BN, kept_BN = self._targets(batch)
-            numbers = self._numbers(bins_BN, kept_BN)
+        with self.autocast():
+            prompt = self.prompt(batch)
+            bins_BN, loss_mask_BN = self._targets(batch)
+            numbers = self._numbers(bins_BN, loss_mask_BN)
             answer = self._answer(numbers)
-            features_BPH = self._see(batch)
+            features_BPH = self.encode_images(batch)
             logits_BAV = self._answer_logits(features_BPH, prompt, answer.rows)
-        kept_BA = answer.labels != IGNORED
+        loss_mask_BA = answer.labels != IGNORED
         losses_BA = cross_entropy(
             logits_BAV.float().flatten(0, 1), answer.labels.flatten(), ignore_index=IGNORED, reduction="none"
         ).view_as(answer.labels)
         if reduction == "none":
-            loss = losses_BA.sum(dim=1) / kept_BA.sum(dim=1).clamp(min=1)
+            loss = losses_BA.sum(dim=1) / loss_mask_BA.sum(dim=1).clamp(min=1)
         else:
-            loss = losses_BA.sum() / kept_BA.sum().clamp(min=1)
-            loss = weighed(loss, kept_BA) if self.training else loss
+            loss = losses_BA.sum() / loss_mask_BA.sum().clamp(min=1)
+            loss = weighed(loss, loss_mask_BA) if self.training else loss
         loss, board = self._with_board(loss, batch, features_BPH)
         parts = self._metric_parts(logits_BAV.detach(), answer, numbers, bins_BN) | board
         return loss, means(parts, loss, self.config.trained_batches)
@@ -154,7 +157,7 @@ class Vla0SmolPolicy(RelativeVlaPolicy, TokenVlaPolicy, PointingVlaPolicy):
         """
         before = self._num_pointing
         # what is pointed at is no action
-        kept_BA = (answer.labels != IGNORED) & (answer.columns >= before * numbers.mask.shape[2])
+        loss_mask_BA = (answer.labels != IGNORED) & (answer.columns >= before * numbers.mask.shape[2])
         right_BA = logits_BAV.argmax(dim=-1) == answer.labels
         digits_BA = logits_BAV[..., self.symbol_ids[:SPACE]].argmax(dim=-1)
         read_BN = read_numbers(numbers, answer.with_padding(digits_BA, numbers))
@@ -162,10 +165,10 @@ class Vla0SmolPolicy(RelativeVlaPolicy, TokenVlaPolicy, PointingVlaPolicy):
         counted_BN = counted_numbers(numbers)
         bins, actions = self.action_bins, slice(before, None)
         errors_BN = (bins.decode(read_BN.clamp(max=bins.num_bins - 1)) - bins.decode(bins_BN)).abs()
-        errors_BTD = errors_BN[:, actions].unflatten(1, (-1, self._action_dim)) * self._unit
+        errors_BTD = errors_BN[:, actions].unflatten(1, (-1, self.action_dim)) * self._unit
         counted_BTD = counted_BN[:, actions].view_as(errors_BTD)
         parts = {
-            "token_accuracy": (right_BA, kept_BA),
+            "token_accuracy": (right_BA, loss_mask_BA),
             "value_accuracy": (exact_BN[:, actions], counted_BN[:, actions]),
         }
         parts |= self._l1_parts(errors_BTD, counted_BTD)
@@ -183,7 +186,7 @@ class Vla0SmolPolicy(RelativeVlaPolicy, TokenVlaPolicy, PointingVlaPolicy):
         ids_BL = rows.ids
         check_positions(self.backbone.text_config, ids_BL.shape[1])
         hidden_BLH = self.backbone.hidden_states(
-            self._with_images(features_BPH, ids_BL), self._image_columns(ids_BL.device), rows.hidden
+            self.embed(ids_BL, features_BPH), self.layout.image_columns(ids_BL.device), rows.hidden
         )
         offsets_A = torch.arange(answer.ids.shape[1], device=ids_BL.device)
         # a token is predicted one column earlier; columns beyond a short row carry no label
@@ -192,36 +195,48 @@ class Vla0SmolPolicy(RelativeVlaPolicy, TokenVlaPolicy, PointingVlaPolicy):
         index_BAH = columns_BA[..., None].expand(-1, -1, hidden_BLH.shape[-1])
         return hidden_BLH.gather(1, index_BAH)
 
+    def log_probability(self, features_BPH: Tensor, prompt: TokenRows, numbers_BN: Tensor) -> Tensor:
+        """(B,) of written numbers, among those that the grammar allows, after prompts and their images."""
+        written = self._answer(self._to_tokens(numbers_BN, self.config.n_action_bins)).rows
+        hidden_BAH = self._answer_hidden(features_BPH, prompt, written)
+        logits_BAS = self.backbone.head(self.symbol_ids)(hidden_BAH)
+        symbol_BA = (written.ids[..., None] == self.symbol_ids).long().argmax(dim=-1)
+        # the space that every answer begins with is not chosen
+        places = self.grammar.walk(self.grammar.start(len(symbol_BA)), symbol_BA[:, 1:-1])
+        logits_BAS = logits_BAS[:, 1:].float() + self.grammar.logit_bias(places)
+        chosen_BA1 = logits_BAS.log_softmax(dim=-1).gather(-1, symbol_BA[:, 1:, None])
+        return chosen_BA1.sum(dim=(1, 2))
+
     def _targets(self, batch: dict[str, Tensor]) -> tuple[Tensor, Tensor]:
-        """(B, N) int64 bins of what is written, actions step by step; (B, N) bool, those trained on."""
-        shape = self.config.chunk_size, self._action_dim
+        """(B, N) int64 bins of what is written, actions step by step; (B, N) bool, the loss mask."""
+        shape = self.config.chunk_size, self.action_dim
         actions_BTD = read_actions(batch, ACTION, self.config.type, self._device, shape)
-        actions_BTD, kept_BT = self._to_relative(actions_BTD, batch), self._kept(batch)
+        actions_BTD, loss_mask_BT = self.to_relative(actions_BTD, batch), self._loss_mask(batch)
         if self.pointer is None:
-            return self._action_targets(actions_BTD, kept_BT)
+            return self._action_targets(actions_BTD, loss_mask_BT)
         config = self.config
         # evaluation is of what is meant
         share = config.counterfactual_share if self.training else 0.0
         labels = self.pointer.labels(batch, share, config.type, self.generator)
-        other_B1D = self._to_relative(labels.other_actions[:, None], batch)
-        targets = self._action_targets(*labels.given_actions(actions_BTD, kept_BT, other_B1D))
-        pointing = self.pointer.bins_of(labels, self._state(batch)), self.pointer.kept(labels)
-        bins_BN, kept_BN = (torch.cat(pair, dim=1) for pair in zip(pointing, targets, strict=True))
-        return bins_BN, kept_BN
+        other_B1D = self.to_relative(labels.other_actions[:, None], batch)
+        targets = self._action_targets(*labels.given_actions(actions_BTD, loss_mask_BT, other_B1D))
+        pointing = self.pointer.bins_of(labels, self._state(batch)), self.pointer.loss_mask(labels)
+        bins_BN, loss_mask_BN = (torch.cat(pair, dim=1) for pair in zip(pointing, targets, strict=True))
+        return bins_BN, loss_mask_BN
 
-    def _action_targets(self, actions_BTD: Tensor, kept_BT: Tensor) -> tuple[Tensor, Tensor]:
+    def _action_targets(self, actions_BTD: Tensor, loss_mask_BT: Tensor) -> tuple[Tensor, Tensor]:
         """Actions alone, of which the model writes every dimension."""
         bins_BN = self.action_bins.encode(actions_BTD).flatten(1)
-        return bins_BN, kept_BT.repeat_interleave(self._action_dim, dim=1)
+        return bins_BN, loss_mask_BT.repeat_interleave(self.action_dim, dim=1)
 
-    def _numbers(self, bins_BN: Tensor, kept_BN: Tensor) -> NumberTokens:
+    def _numbers(self, bins_BN: Tensor, loss_mask_BN: Tensor) -> NumberTokens:
         """Bins -> their tokens, some of them hidden while training."""
         numbers = self._to_tokens(bins_BN, self.config.n_action_bins)
-        trained_BNC = numbers.trained & kept_BN[..., None]
+        loss_mask_BNC = numbers.loss_mask & loss_mask_BN[..., None]
         # the space after a number says that it ends
         before = self._num_pointing
-        trained_BNC[:, 1 : before + 1, 0] = kept_BN[:, :before]
-        numbers = NumberTokens(numbers.ids, numbers.mask, trained_BNC)
+        loss_mask_BNC[:, 1 : before + 1, 0] = loss_mask_BN[:, :before]
+        numbers = NumberTokens(numbers.ids, numbers.mask, loss_mask_BNC)
         return self._hide(numbers) if self.training else numbers
 
     def _hide(self, numbers: NumberTokens) -> NumberTokens:
@@ -233,8 +248,8 @@ class Vla0SmolPolicy(RelativeVlaPolicy, TokenVlaPolicy, PointingVlaPolicy):
             hidden_BNC = pad(hidden_BNC, (0, 0, self._num_pointing, 0))
             return numbers.hide_characters(hidden_BNC, self.tokens.hidden)
         if level == "step":
-            hidden_BT = self._draw_hidden(mask_BNC[:, :: self._action_dim, 0])
-            hidden_BN = hidden_BT.repeat_interleave(self._action_dim, dim=1)
+            hidden_BT = self._draw_hidden(mask_BNC[:, :: self.action_dim, 0])
+            hidden_BN = hidden_BT.repeat_interleave(self.action_dim, dim=1)
         else:
             hidden_BN = self._draw_hidden(mask_BNC[..., 0])
         return numbers.hide_numbers(pad(hidden_BN, (self._num_pointing, 0)), self.tokens.hidden)
@@ -250,19 +265,19 @@ class Vla0SmolPolicy(RelativeVlaPolicy, TokenVlaPolicy, PointingVlaPolicy):
 
     def _predict(self, batch: dict[str, Tensor], num_steps: int) -> Tensor:
         """The first ``num_steps`` actions of the chunk, absolute; the model need not write the rest."""
-        numbers_BN = self._write(batch, num_steps)[:, self._num_pointing :]
-        actions_BTD = self.action_bins.decode(numbers_BN).view(-1, num_steps, self._action_dim)
-        return self._to_absolute(actions_BTD, batch).clamp(-1, 1)
+        numbers_BN = self.write(batch, num_steps)[:, self._num_pointing :]
+        actions_BTD = self.action_bins.decode(numbers_BN).view(-1, num_steps, self.action_dim)
+        return self.to_absolute(actions_BTD, batch).clamp(-1, 1)
 
     @torch.no_grad()
-    def _write(self, batch: dict[str, Tensor], num_steps: int) -> Tensor:
+    def write(self, batch: dict[str, Tensor], num_steps: int) -> Tensor:
         """(B, N) the numbers of so many actions, and of what is pointed at before them."""
         self.eval()
-        with self._autocast():
-            prompt = self._prompt(batch)
+        with self.autocast():
+            prompt = self.prompt(batch)
             if not prompt.ids.is_cuda:  # prompts of other lengths would be recorded anew there
                 prompt = prompt.without_padding()
-            embeds_BLH = self._embeds(batch, prompt.ids)
+            embeds_BLH = self.embed(prompt.ids, self.encode_images(batch))
             num_numbers = self._num_numbers(num_steps)
             noise_shape = self.grammar.max_symbols(num_numbers), NUM_SYMBOLS
             self._decoded = decoded = self._writer(
@@ -274,6 +289,12 @@ class Vla0SmolPolicy(RelativeVlaPolicy, TokenVlaPolicy, PointingVlaPolicy):
         # casts of weights cached under inference mode cannot be used by a later training step
         torch.clear_autocast_cache()
         return decoded.numbers
+
+    def pointed(self, batch: dict[str, Tensor]) -> PointedAt | None:
+        """Return what is pointed at in a batch of one row; None: nothing is."""
+        if self.pointer is None:
+            return None
+        return self.pointer.pointed_at(self.write(batch, self.config.chunk_size)[0, :NUM_NUMBERS])
 
     @property
     def last_passes(self) -> int | None:
@@ -290,40 +311,11 @@ class Vla0SmolPolicy(RelativeVlaPolicy, TokenVlaPolicy, PointingVlaPolicy):
 
     # Prompt
 
-    def _prompt(self, batch: dict[str, Tensor]) -> TokenRows:
-        """Return everything up to ``Assistant:``, with padding."""
-        return TokenRows.join([*self._prompt_parts(batch).values()])
-
-    def _prompt_parts(self, batch: dict[str, Tensor]) -> dict[str, TokenRows]:
-        """Return the prompt's parts by name; an image's name is its camera."""
-        tokens = self.tokens
-        task = read_task(batch, self.config.type, self._device)
-        image = [*tokens.image_start, *self._image_span, *tokens.image_end]
-        parts = {"start": TokenRows.constant(tokens.start, task.ids)}
-        parts |= {camera: TokenRows.constant(image, task.ids) for camera in self._cameras}
-        parts["instruction"] = task
-        if self.config.use_state:
-            state = self._to_tokens(self.state_bins.encode(self._state(batch)), self.config.n_state_bins)
-            parts["state"] = TokenRows.join(
-                [
-                    TokenRows.constant(tokens.state_start, task.ids),
-                    TokenRows(state.ids.flatten(1), state.mask.flatten(1)),
-                    TokenRows.constant(tokens.state_end, task.ids),
-                ]
-            )
-        return parts | {"end": TokenRows.constant(tokens.answer_start, task.ids)}
-
-    def _num_fixed_tokens(self) -> int:
-        """Return the number of tokens of the longest prompt and answer, without the task."""
-        tokens, config = self.tokens, self.config
-        num_tokens = len(tokens.start) + len(tokens.answer_start)
-        num_tokens += len(self._cameras) * len([*tokens.image_start, *self._image_span, *tokens.image_end])
-        if config.use_state:
-            assert config.robot_state_feature is not None
-            width = 1 + (config.number_width or digits_needed(config.n_state_bins))
-            num_tokens += len(tokens.state_start) + len(tokens.state_end)
-            num_tokens += config.robot_state_feature.shape[0] * width
-        return num_tokens + self.grammar.max_symbols(self.grammar.num_numbers)
+    def _prompt_rows(self, batch: dict[str, Tensor]) -> dict[str, TokenRows]:
+        if not self.config.use_state:
+            return {}
+        state = self._to_tokens(self.state_bins.encode(self._state(batch)), self.config.n_state_bins)
+        return {STATE: TokenRows(state.ids.flatten(1), state.mask.flatten(1))}
 
     def _to_tokens(self, numbers_BN: Tensor, num_values: int) -> NumberTokens:
         fixed_width = self.config.number_width
@@ -332,35 +324,15 @@ class Vla0SmolPolicy(RelativeVlaPolicy, TokenVlaPolicy, PointingVlaPolicy):
         )
         return NumberTokens(self.symbol_ids[symbols_BNC], mask_BNC, mask_BNC)
 
-    def _see(self, batch: dict[str, Tensor]) -> Tensor:
+    def encode_images(self, batch: dict[str, Tensor]) -> Tensor:
         """(B, P of all images, H) image features."""
         generator = self.generator if self.training else None
         images = [read_image(batch, key, self.config.type, self._device) for key in self._cameras]
         images = [crop(image, self.config.crop_fraction, generator) for image in images]
         if generator is not None and self._color_jitter is not None:
             images = self._color_jitter(images, generator)
-        pixels = [self.backbone.pixels(image) for image in images]
-        features = self.backbone.embed_images(torch.stack(pixels, dim=1).flatten(0, 1))
-        return features.reshape(len(images[0]), -1, features.shape[-1])
+        return encode_images(self.backbone, images)
 
-    def _embeds(self, batch: dict[str, Tensor], ids_BL: Tensor) -> Tensor:
-        """Embeddings (B, L, H) of a sequence that starts with a prompt, image features in place."""
-        return self._with_images(self._see(batch), ids_BL)
-
-    def _with_images(self, features_BPH: Tensor, ids_BL: Tensor) -> Tensor:
-        """Embed a sequence's tokens, with image features that were computed before: (B, L, H)."""
-        embeds_BLH = self.backbone.embed_tokens(ids_BL)
-        columns = self._image_columns(ids_BL.device)
-        return embeds_BLH.index_copy(1, columns, features_BPH.to(embeds_BLH.dtype))
-
-    def _image_columns(self, device: torch.device) -> Tensor:
-        """Columns of all image tokens; the same in every row, because only the start precedes them."""
-        tokens = self.tokens
-        period = len(tokens.image_start) + len(self._image_span) + len(tokens.image_end)
-        first = len(tokens.start) + len(tokens.image_start)
-        starts = first + period * torch.arange(len(self._cameras), device=device)
-        return (starts[:, None] + torch.arange(len(self._image_span), device=device)).flatten()
-
-    @property
-    def _image_span(self) -> list[int]:
-        return [self.tokens.image] * self.backbone.tokens_per_image
+    def embed(self, ids_BL: Tensor, features_BPH: Tensor) -> Tensor:
+        """(B, L, H) embeddings of a sequence that starts with a prompt, image features in place."""
+        return self.layout.with_images(self.backbone.embed_tokens(ids_BL), features_BPH)

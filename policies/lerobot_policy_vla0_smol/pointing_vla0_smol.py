@@ -56,11 +56,11 @@ class TextPointer(DataUnits):
         return PointedAt(place_xy=metres_J[PLACE_NUMBERS], stone_xy=metres_J[STONE_NUMBERS])
 
     @staticmethod
-    def kept(labels: MetricLabels) -> Tensor:
-        """(B, J) bool: numbers that are trained on. Of another place nothing that is seen tells."""
-        kept_BJ = (~labels.is_other[:, None]).repeat(1, NUM_NUMBERS)
-        kept_BJ[:, STONE_NUMBERS] = True
-        return kept_BJ
+    def loss_mask(labels: MetricLabels) -> Tensor:
+        """(B, J) bool; nothing that is seen tells of another place."""
+        loss_mask_BJ = (~labels.is_other[:, None]).repeat(1, NUM_NUMBERS)
+        loss_mask_BJ[:, STONE_NUMBERS] = True
+        return loss_mask_BJ
 
     def error_parts(self, errors_BJ: Tensor, counted_BJ: Tensor) -> dict[str, tuple[Tensor, Tensor]]:
         """Absolute errors of what the bins decode to -> the same in metres, as `means` takes them."""

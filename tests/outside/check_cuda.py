@@ -176,7 +176,7 @@ def test_sampling_in_bfloat16_is_as_near_as_kernel_by_kernel(train_vlm: str) -> 
 @pytest.mark.parametrize("name", explain_cases.NAMES)
 def test_an_explanation_on_a_gpu_is_that_of_a_cpu(name: str) -> None:
     policies = [explain_cases.fresh(name, device) for device in ("cpu", "cuda")]
-    host, device = (explain(explain_cases.ask(each), explain_cases.asked(each)) for each in policies)
+    host, device = (explain(explain_cases.ask(each), explain_cases.query(each)) for each in policies)
     scores: dict[str, Any] = {"rel": 1e-3, "abs": 1e-3 * abs(host.clean_score)}
     assert device.clean_score == pytest.approx(host.clean_score, **scores)
     for key, map_GG in host.patches.items():

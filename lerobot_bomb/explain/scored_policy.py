@@ -1,15 +1,16 @@
-"""A policy as an explanation asks it: how strongly does it hold to its clean answer?
+"""Scored policy: how strongly does a policy hold to its clean answer?
 
 The answer is the one to what the policy really saw, and stays fixed; what is read, or what is computed on the
 way, is changed. A higher score means that the answer is more likely or closer.
 
-Shapes: `B` rows, `S` tokens of an instruction, `K` actions of a chunk, `D` action dims.
+Shapes: `B` rows, `L` tokens of a prompt, `S` of an instruction, `K` actions of a chunk, `D` action dims.
 """
 
 from abc import ABC, abstractmethod
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
+from contextlib import AbstractContextManager
 from dataclasses import dataclass
-from typing import Any, ClassVar
+from typing import Any, ClassVar, Protocol, Self
 
 import torch
 from lerobot.utils.constants import OBS_LANGUAGE_ATTENTION_MASK
@@ -19,13 +20,14 @@ from torch.nn.functional import pad
 from lerobot_bomb.actions.text import TokenRows
 from lerobot_bomb.bomb.pointing import PointedAt
 from lerobot_bomb.vlm.inputs import OBS_LANGUAGE_HIDDEN
+from lerobot_bomb.vlm.layout import INSTRUCTION, PromptLayout
 
 type Batch = dict[str, Any]  # what a policy's preprocessor gives
-type Rows = dict[str, Tensor]  # what `Explained.encode` makes of it; (B, ...) each
+type Rows = dict[str, Tensor]  # what `ScoredPolicy.encode` makes of it; (B, ...) each
 # columns of a sequence in each pass through the decoder of one score; None: it has none in this pass
-type Place = tuple[Tensor | slice | None, ...]
+type TokenSpan = tuple[Tensor | slice | None, ...]
 
-INSTRUCTION, ANSWER = "instruction", "answer"
+ANSWER = "answer"
 
 
 @dataclass(frozen=True)
@@ -48,7 +50,7 @@ def decoder_layers(text_model: Any, *, called_whole: bool = True) -> list[Decode
     ]
 
 
-class Explained(ABC):
+class ScoredPolicy(ABC):
     """A policy that scores its own answers.
 
     Scores of a row do not depend on the others of its batch, but for rounding.
@@ -90,44 +92,62 @@ class Explained(ABC):
         """Return what the policy points at before it answers a batch of one row; None: it does not."""
         return None
 
-    def places(self, rows: Rows) -> dict[str, Place]:
-        """Return where a row's images, instruction, state and answer stand in the decoder's sequences.
+    def token_spans(self, rows: Rows) -> dict[str, TokenSpan]:
+        """Return the spans of a row's images, instruction, state and answer in the decoder's sequences.
 
-        ``instruction`` has a column for each of its tokens. {} where it is not known.
+        ``instruction`` has a column for each of its tokens. {} where they are not known.
         """
         return {}
 
 
-class PromptExplained(Explained):
-    """One of our policies, whose prompt has parts.
+class PromptPolicy(Protocol):
+    """Members of our policies that a score needs, whichever it is."""
 
-    Rows hold ``ids``, ``mask`` and ``part``, and ``hidden`` where any token is, (B, L) each.
+    layout: PromptLayout
+    backbone: Any
+
+    def prompt(self, batch: Batch) -> TokenRows: ...
+    def pointed(self, batch: Batch) -> PointedAt | None: ...
+    def autocast(self) -> AbstractContextManager[None]: ...
+    def eval(self) -> Self: ...
+
+
+class ScoredPromptPolicy(ScoredPolicy):
+    """One of our policies, whose prompt has a layout.
+
+    Rows hold the prompt as ``ids`` and ``mask``, and ``hidden`` where any token is, (B, L) each.
     """
 
-    _names: Sequence[str] = ()  # of the parts
+    policy: PromptPolicy
 
-    def prompt(self, parts: Mapping[str, TokenRows]) -> Rows:
-        """Join the parts to a prompt's rows; ``part`` is the number of the part that a column belongs to."""
-        self._names = [*parts]
-        numbers = [torch.full_like(part.ids, number) for number, part in enumerate(parts.values())]
-        prompt = TokenRows.join([*parts.values()])
-        rows = {"ids": prompt.ids, "mask": prompt.mask, "part": torch.cat(numbers, dim=1)}
+    def __init__(self, policy: PromptPolicy):
+        self.policy = policy
+        self.layers = decoder_layers(policy.backbone.text_model)
+
+    @abstractmethod
+    def read(self, batch: Batch, ids_BL: Tensor) -> Rows:
+        """Return what the decoder reads of a batch beside its prompt's tokens."""
+
+    def encode(self, batch: Batch) -> Rows:
+        with self.policy.eval().autocast():
+            prompt = self.policy.prompt(batch)
+            rows = {"ids": prompt.ids, "mask": prompt.mask, **self.read(batch, prompt.ids)}
         return rows if prompt.hidden is None else rows | {"hidden": prompt.hidden}
 
+    def pointed(self, batch: Batch) -> PointedAt | None:
+        return self.policy.pointed(batch)
+
     @staticmethod
-    def tokens(rows: Rows) -> TokenRows:
+    def prompt(rows: Rows) -> TokenRows:
         """The prompt of rows."""
         return TokenRows(rows["ids"], rows["mask"], rows.get("hidden"))
 
-    def of_part(self, rows: Rows, name: str) -> Tensor:
-        """(B, L) bool, which columns belong to a part of the prompt, padding included."""
-        return rows["part"] == self._names.index(name)
-
     def hide(self, rows: Rows, hidden_BS: Tensor) -> Rows:
         rows = {key: value.expand(len(hidden_BS), *value.shape[1:]) for key, value in rows.items()}
-        columns = self.of_part(rows, INSTRUCTION)[0].nonzero()[: hidden_BS.shape[1], 0]  # then padding
-        hidden_BL = rows["mask"] & ~self.tokens(rows).readable
-        hidden_BL[:, columns] |= hidden_BS.to(hidden_BL.device)
+        first = self.policy.layout.spans(rows["ids"].shape[1])[INSTRUCTION].start
+        hidden_BL = rows["mask"] & ~self.prompt(rows).attention_mask
+        # the instruction's tokens stand before its padding
+        hidden_BL[:, first : first + hidden_BS.shape[1]] |= hidden_BS.to(hidden_BL.device)
         return rows | {"hidden": hidden_BL}
 
     def hide_in(self, batch: Batch, hidden_S: Tensor) -> Batch:
@@ -138,7 +158,8 @@ class PromptExplained(Explained):
     def columns(self, rows: Rows) -> dict[str, Tensor]:
         """Return the columns of each part in one row's prompt, without padding."""
         mask_L = rows["mask"][0]
-        return {name: (self.of_part(rows, name)[0] & mask_L).nonzero()[:, 0] for name in self._names}
+        spans = self.policy.layout.spans(len(mask_L))
+        return {part: span.start + mask_L[span].nonzero()[:, 0] for part, span in spans.items()}
 
 
 def repeated(values: Batch, times: int) -> Batch:
@@ -159,11 +180,11 @@ def some(rows: Rows, start: int, stop: int) -> Rows:
 
 
 @torch.no_grad()
-def scores_of(explained: Explained, rows: Rows, answer: Tensor, batch_size: int) -> Tensor:
+def scores_of(policy: ScoredPolicy, rows: Rows, answer: Tensor, batch_size: int) -> Tensor:
     """(B,) scores, so many rows at once."""
     num_rows = len(next(iter(rows.values())))
     parts = [
-        explained.score(some(rows, start, start + batch_size), answer)
+        policy.score(some(rows, start, start + batch_size), answer)
         for start in range(0, num_rows, batch_size)
     ]
     return torch.cat(parts)

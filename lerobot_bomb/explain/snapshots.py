@@ -1,4 +1,4 @@
-"""An episode as a policy plays it, and the moments of it that are worth an explanation."""
+"""An episode as a policy runs in it, and its moments that are worth an explanation."""
 
 from collections.abc import Mapping
 from contextlib import closing
@@ -23,7 +23,7 @@ NEAR_M = BOARD.pitch_m  # of the stone from where it is to go: it is being place
 
 
 @dataclass(frozen=True)
-class Watched:
+class Snapshot:
     """A moment, and what the environment knows of it beside what the policy sees."""
 
     step: int
@@ -47,7 +47,7 @@ class Watched:
         return {word: instruction for word, (instruction, _) in self.others.items()}
 
 
-def watch(viewed: Viewed, loaded: LoadedPolicy) -> tuple[list[Watched], Any]:
+def watch(viewed: Viewed, loaded: LoadedPolicy) -> tuple[list[Snapshot], Any]:
     """Return every moment in which the policy acts, and the result of the episode."""
     loaded.begin()
     with closing(viewed.make_env()) as env:
@@ -56,19 +56,19 @@ def watch(viewed: Viewed, loaded: LoadedPolicy) -> tuple[list[Watched], Any]:
             return loaded.agent([observation], [instruction])[0]
 
         moments = [
-            _watched(viewed, moment, env)
+            _snapshot(viewed, moment, env)
             for moment in play(env, viewed.spec, act)
             if moment.action is not None
         ]
         return moments, env.get_wrapper_attr("episode_result")()
 
 
-def _watched(viewed: Viewed, moment: Moment, env: gymnasium.Env) -> Watched:
+def _snapshot(viewed: Viewed, moment: Moment, env: gymnasium.Env) -> Snapshot:
     is_bomb = viewed.env_type == "bomb"
     state = moment.state if is_bomb else None
     others = env.get_wrapper_attr("alternatives")() if is_bomb else {}
     goal = None if state is None else current_goal(state)
-    return Watched(
+    return Snapshot(
         step=moment.step,
         phase=_phase(moment) if is_bomb else "",
         observation=moment.observation,
@@ -93,13 +93,13 @@ def _phase(moment: Moment) -> str:
     return PLACE if distance_m <= NEAR_M else CARRY
 
 
-def middle_of_phases(moments: list[Watched]) -> list[Watched]:
+def middle_of_phases(moments: list[Snapshot]) -> list[Snapshot]:
     """The moment in the middle of each phase that there is; of an episode without any, the middle one."""
     by_phase = [[each for each in moments if each.phase == phase] for phase in (*PHASES, "")]
     return [each[len(each) // 2] for each in by_phase if each]
 
 
-def at_step(moments: list[Watched], step: int) -> Watched:
+def at_step(moments: list[Snapshot], step: int) -> Snapshot:
     """The moment before a control step.
 
     Raises:
