@@ -89,7 +89,7 @@ class Episodes:
             with _captured(works):
                 chunk_BTD = policy.predict_action_chunk(batch)
             if plan_BTD is not None:
-                number_BN = policy._bins({**batch, "action": plan_BTD})
+                number_BN, _ = policy._targets({**batch, "action": plan_BTD})
                 num_dims = chunk_BTD.shape[2]
                 guess = PlanDraft(policy.grammar, num_dims, number_BN)
                 works[-1] = replace(works[-1], guess=guess, stop_after=num_steps * num_dims)
