@@ -93,11 +93,11 @@ class View:
         No two stones lie nearest to one intersection, either. In the tray they may lean on each other.
         """
         is_alone = len(self.lying) == len(self.on_board) + len(self.in_tray)
-        allowed = [
-            *[(stone, FLAT_M) for stone in self.on_board.values()],
-            *[(stone, LEANS_M) for stone in self.in_tray],
-        ]
-        return is_alone and all(abs(self.xyz(stone)[2] - REST_M) < most for stone, most in allowed)
+        is_flat = all(self._off_rest_m(stone) < FLAT_M for stone in self.on_board.values())
+        return is_alone and is_flat and all(self._off_rest_m(stone) < LEANS_M for stone in self.in_tray)
+
+    def _off_rest_m(self, stone: int) -> float:
+        return abs(float(self.xyz(stone)[2]) - REST_M)
 
     def _is_held(self, stone: int) -> bool:
         offset = self.xyz(stone) - self.state.gripper_xyz
@@ -289,12 +289,13 @@ def has_fallen(state: PrivilegedState, start: PrivilegedState, aims: Sequence[Ai
 
     Whoever has not seen it fall cannot know that it is the one to go on with.
     """
+    if any(aim.is_slid for aim in aims):
+        return False  # a stone that is pushed lies on its way
     for stone in np.flatnonzero(state.stone_in_play).tolist():
-        x, _, z = state.stone_xyz[stone]
+        xy, z = state.stone_xyz[stone, :2], state.stone_xyz[stone, 2]
         places = [start.stone_xyz[stone, :2], *(np.array(aim.xy) for aim in aims if aim.stone == stone)]
-        lies_on_board = x < BOARD_END_M and abs(z - REST_M) < FLAT_M
-        ways_m = [float(np.hypot(*(state.stone_xyz[stone, :2] - place))) for place in places]
-        if lies_on_board and min(ways_m) > NEAR_M and not any(aim.is_slid for aim in aims):
+        lies_on_board = xy[0] < BOARD_END_M and abs(z - REST_M) < FLAT_M
+        if lies_on_board and all(np.hypot(*(xy - place)) > NEAR_M for place in places):
             return True
     return False
 
