@@ -32,6 +32,7 @@ NEAR_M = 0.012  # of the gripper, for a stone between its pads; of a place, for 
 BOARD_END_M = TRAY_CENTER_XY[0] - TRAY_HALF_SIZE_XY[0]  # x at which the tray begins
 TRAY_ROW_M = SUPPLY_XY_M[0][1] - SUPPLY_XY_M[2][1]
 FLAT_M = REACHED_HEIGHT_M[0]  # of its height at rest, for a stone that lies
+LEANS_M = BOARD.stone_height_m  # the same in the tray, where one stone may lean on another
 HELD_OPENING_M = (0.012, 0.030)  # between pads that hold a stone
 REST_M = BOARD.thickness_m + BOARD.stone_height_m / 2
 LEFT_SIDE = [cell for cell in CELLS if cell[1] < 2]
@@ -87,12 +88,16 @@ class View:
 
     @property
     def is_settled(self) -> bool:
-        """Tell whether nothing flies or leans, as a stone may that slipped out of the fingers or was hit.
+        """Tell whether nothing flies or leans on the board, where a stone may have slipped or been hit.
 
-        No two stones lie nearest to one intersection, either.
+        No two stones lie nearest to one intersection, either. In the tray they may lean on each other.
         """
         is_alone = len(self.lying) == len(self.on_board) + len(self.in_tray)
-        return is_alone and all(abs(self.xyz(stone)[2] - REST_M) < FLAT_M for stone in self.lying)
+        is_flat = all(self._off_rest_m(stone) < FLAT_M for stone in self.on_board.values())
+        return is_alone and is_flat and all(self._off_rest_m(stone) < LEANS_M for stone in self.in_tray)
+
+    def _off_rest_m(self, stone: int) -> float:
+        return abs(float(self.xyz(stone)[2]) - REST_M)
 
     def _is_held(self, stone: int) -> bool:
         offset = self.xyz(stone) - self.state.gripper_xyz
@@ -243,24 +248,24 @@ def goals_of_reader(view: View) -> tuple[Goal, ...]:
         if other != stone
     }
     before = min(away_m, key=away_m.__getitem__, default=None)
-    is_over = before is not None and view.held is None and away_m[before] <= OFF_BESIDE_M[0]
-    if following is not None and not is_over:
-        before = None  # a neighbour, which the fingers have not just put down
     goals = []
     if before is not None:
-        goals.append((before, own_place(view.xyz(before)[:2])))
+        # a neighbour that the fingers are not over, or that lies where none is put, was not just put down
+        place = put_down_on(view.xyz(before)[:2])
+        is_over = view.held is None and away_m[before] <= OFF_BESIDE_M[0]
+        if following is None:
+            goals.append((before, place or tuple(view.xyz(before)[:2])))
+        elif place is not None and is_over:
+            goals.append((before, place))
     if following is not None:
         goals.append(following)
     return tuple(Goal(np.array([*place, REST_M]), stone, "push" in view.text) for stone, place in goals)
 
 
-def own_place(xy: np.ndarray) -> Place:
-    """Return the place of a stone that rests: an intersection, a place in the tray, or just there."""
+def put_down_on(xy: np.ndarray) -> Place | None:
+    """Return the intersection, or the place in the tray, that a stone was put down on."""
     places = [*map(of_cell, CELLS), *TRAY_XY_M]
-    return next(
-        (place for place in places if np.hypot(*(xy - place)) < REACHED_LATERAL_M[1]),
-        (float(xy[0]), float(xy[1])),
-    )
+    return next((place for place in places if np.hypot(*(xy - place)) < REACHED_LATERAL_M[1]), None)
 
 
 def seen(moment: Moment, pattern: dict[Cell, str], rng: np.random.Generator) -> View:
@@ -284,12 +289,13 @@ def has_fallen(state: PrivilegedState, start: PrivilegedState, aims: Sequence[Ai
 
     Whoever has not seen it fall cannot know that it is the one to go on with.
     """
+    if any(aim.is_slid for aim in aims):
+        return False  # a stone that is pushed lies on its way
     for stone in np.flatnonzero(state.stone_in_play).tolist():
-        x, _, z = state.stone_xyz[stone]
+        xy, z = state.stone_xyz[stone, :2], state.stone_xyz[stone, 2]
         places = [start.stone_xyz[stone, :2], *(np.array(aim.xy) for aim in aims if aim.stone == stone)]
-        lies_on_board = x < BOARD_END_M and abs(z - REST_M) < FLAT_M
-        ways_m = [float(np.hypot(*(state.stone_xyz[stone, :2] - place))) for place in places]
-        if lies_on_board and min(ways_m) > NEAR_M and not any(aim.is_slid for aim in aims):
+        lies_on_board = xy[0] < BOARD_END_M and abs(z - REST_M) < FLAT_M
+        if lies_on_board and all(np.hypot(*(xy - place)) > NEAR_M for place in places):
             return True
     return False
 
