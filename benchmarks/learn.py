@@ -55,7 +55,6 @@ REPO_ID = "learn/bomb_place"
 IMAGE_SIZE = 64  # pixels
 NOISE = 0.05  # on the executed actions, so that recoveries are in the data
 BATCH_SIZE = 64
-FIRST_SEED = 200_000  # of the demonstrations; LeRobot evaluates from 1000 on
 FIRST_UNSEEN_SEED = 100_000
 NUM_CHECKPOINTS = 6
 CURVE_EPISODES = 50  # of every checkpoint but the last
@@ -225,17 +224,22 @@ def record(task: Task, demonstrations: int, dataset: Path) -> None:
     for part, folder in zip(task.parts, folders, strict=True):
         if not folder.exists():
             run_record(task, folder, part, "--pointing")
-    merged = dataset.with_name("merged")  # not yet whole
-    shutil.rmtree(merged, ignore_errors=True)
+    merge(folders, dataset)
+
+
+def merge(folders: Sequence[Path], dataset: Path) -> None:
+    """Merge recordings into one dataset."""
+    merging = dataset.with_name("merging")  # not yet whole
+    shutil.rmtree(merging, ignore_errors=True)
     run_command(
         "lerobot-edit-dataset",
         f"--new_repo_id={REPO_ID}",
-        f"--new_root={merged}",
+        f"--new_root={merging}",
         "--operation.type=merge",
         f"--operation.repo_ids={json.dumps([REPO_ID] * len(folders))}",
         f"--operation.roots={json.dumps([str(folder) for folder in folders])}",
     )
-    merged.rename(dataset)
+    merging.rename(dataset)
 
 
 def task_ids_of(task: Task) -> tuple[int, ...]:
@@ -255,13 +259,14 @@ def run_record(task: Task, folder: Path, part: Part, *flags: str) -> None:
         "record",
         f"--repo_id={REPO_ID}",
         f"--root={folder}",
-        f"--seed={FIRST_SEED}",
+        f"--seed={part.first_seed}",
         *number,
         f"--task={part.suite}",
         f"--perturbations={task.perturbations}",
         f"--split={'train' if task.is_partial else 'all'}",
         "--images",
         f"--image_size={IMAGE_SIZE}",
+        *task.env_flags,
         *task_flags,
         *flags,
         *resume,
@@ -390,6 +395,7 @@ def evaluate(
             f"--env.task={task.suite}",
             f"--env.image_size={IMAGE_SIZE}",
             f"--env.results_path={results}",
+            *task.env_flags,
             *task_flags,
             f"--env.perturbations={json.dumps(conditions)}",
             f"--seed={first_seed}",

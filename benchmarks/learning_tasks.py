@@ -14,6 +14,7 @@ from lerobot_bomb.results.bomb import EpisodeResult
 
 PROBE = "keypoint_probe"
 RIVALS = ("act", "diffusion")  # LeRobot's; they read no instruction
+FIRST_SEED = 200_000  # of the demonstrations; LeRobot evaluates from 1000 on
 SHOWN, SEVERAL = "as in the demonstrations", "several left out"
 # of the targets that the split 'train' has, those that get no stone of a colour: one per row and column
 LEFT_OUT_PAIRS = {
@@ -47,6 +48,7 @@ class Part:
     number: int
     is_static: bool = False
     task_ids: tuple[int, ...] = ()  # of the suite, each from every seed; empty: drawn for each episode
+    first_seed: int = FIRST_SEED
 
     @property
     def name(self) -> str:
@@ -70,6 +72,7 @@ class Task:
     is_said_at_once: bool = True  # else the policy is given several instructions, which are not exchanged
     # what is recorded in place of the training's demonstrations; all of it is labelled for pointing
     parts: tuple[Part, ...] = ()
+    env_flags: tuple[str, ...] = ()  # with which the environment is recorded and played
 
 
 # Places that relations name are read after many boards, those with a name of their own after a few.
@@ -126,7 +129,10 @@ TASKS = {
     "all_suites": Task(
         (),
         episodes=100,
-        trainings={"fdvla": Training(sum(part.number for part in ALL_SUITES if not part.is_static), None)},
+        trainings={
+            name: Training(sum(part.number for part in ALL_SUITES if not part.is_static), None)
+            for name in POLICY_TYPES
+        },
         suite=ALL,
         is_said_at_once=False,
         parts=ALL_SUITES,
