@@ -12,6 +12,7 @@ import learning_tasks
 import numpy as np
 import pytest
 from learning_curve import SUCCESS_BGR, count, draw
+from test_results import read, values
 
 from lerobot_bomb.bomb.board import COLORS
 from lerobot_bomb.bomb.episode import EpisodeSpec
@@ -19,6 +20,7 @@ from lerobot_bomb.bomb.suite import specs_of_tasks, templates_of
 from lerobot_bomb.bomb.suites.place import TEMPLATES, targets_of
 from lerobot_bomb.checkpoints.identity import sha256_of
 from lerobot_bomb.commands.main import main as lerobot_bomb
+from lerobot_bomb.results.bomb import EpisodeResult
 
 SIZE = 32  # pixels
 
@@ -163,12 +165,12 @@ def test_parts_of_a_task_are_recorded_and_merged(monkeypatch: pytest.MonkeyPatch
     assert not any(flag.startswith(("--noise", "--episodes")) for flag in scenes)
     roots = json.dumps([str(tmp_path / "shown_goal"), str(folder)])
     assert merge[0] == "lerobot-edit-dataset" and f"--operation.roots={roots}" in merge
-    assert dataset.is_dir() and not (tmp_path / "merged").exists()
+    assert dataset.is_dir() and not (tmp_path / "merging").exists()
 
 
 def test_an_evaluation_of_several_suites_has_a_row_for_each() -> None:
-    rows = [{"spec": {"suite": suite}} for suite in ("place", "goal", "place")]
-    assert learn.by_suite(rows) == {"goal": rows[1:2], "place": rows[::2]}
+    rows = [row(None, 1.0, spec={"suite": suite}) for suite in ("place", "spatial", "place")]
+    assert learn.by_suite(rows) == {"spatial": rows[1:2], "place": rows[::2]}
     assert learn.by_suite(rows[:1]) == {}
 
 
@@ -181,14 +183,14 @@ def test_demonstrations_leave_out_targets_wording_and_colours() -> None:
         assert len(targets) == 15
         assert {row for row, _ in targets} == {column for _, column in targets} == set(range(5))
 
-    def asked(target: tuple[int, int], color: str, template: str) -> dict[str, Any]:
+    def episode(target: tuple[int, int], color: str, template: str) -> EpisodeResult:
         instruction = template.format(color=color, row=target[0], column=target[1])
-        return row(None, 1.0, target=list(target), color=color, instruction=instruction)
+        return row(None, 1.0, target, target=target, color=color, instruction=instruction)
 
     wordings = [templates_of(split, TEMPLATES)[0] for split in ("train", "heldout")]
     groups = {
         (target, color, wording): next(
-            iter(learning_tasks.by_what_is_left_out([asked(target, color, wording)]))
+            iter(learning_tasks.by_what_is_left_out([episode(target, color, wording)]))
         )
         for target, color, wording in (
             ((0, 0), "white", wordings[0]),
@@ -217,11 +219,11 @@ def test_a_bar_is_of_success_and_of_time() -> None:
 # The curve
 
 
-def row(failure: str | None, error_mm: float, nearest: tuple[int, int] = (2, 2), **other: Any) -> dict:
-    values = {"is_success": failure is None, "failure": failure, "placement_error_mm": error_mm}
-    values |= {"spec": {"suite": "place"}, "nearest_intersection": list(nearest)}
-    stage = "placed" if failure is None else "lifted"
-    return {**values, "target": [2, 2], "stage": stage, **other}
+def row(
+    failure: str | None, error_mm: float, nearest: tuple[int, int] = (2, 2), **other: Any
+) -> EpisodeResult:
+    """Return the record of an episode; a stone that is not placed was lifted."""
+    return read(values(0, failure, error_mm, nearest_intersection=nearest, **other))
 
 
 def test_a_point_counts_grounding_and_precision_apart() -> None:
