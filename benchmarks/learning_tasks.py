@@ -173,7 +173,8 @@ def by_what_is_left_out(rows: list[EpisodeResult]) -> dict[str, list[EpisodeResu
     """{what of an episode no demonstration showed: its rows}."""
     groups: dict[str, list[EpisodeResult]] = {}
     for row in rows:
-        target, color = row.target or (), row.color
+        target, color = row.target, row.color
+        assert target is not None and color is not None  # each episode of `place` has both
         wordings = [
             template.format(color=color, row=target[0], column=target[1])
             for template in templates_of("heldout", TEMPLATES)

@@ -184,9 +184,7 @@ def evaluate(checkpoint: Path, output_dir: Path, images: Iterable[str]) -> dict[
     )
     rows = {row.target: row for row in read_results(output_dir / "results.jsonl", EpisodeResult)}
     if rows.keys() != set(TARGETS.values()):
-        raise SystemExit(
-            f"{output_dir}: results of the targets {sorted(rows)}, not of {list(TARGETS.values())}"
-        )
+        raise SystemExit(f"{output_dir}: results of the targets {[*rows]}, not of {list(TARGETS.values())}")
     return {task: rows[target] for task, target in TARGETS.items()}
 
 

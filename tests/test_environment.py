@@ -15,6 +15,7 @@ from lerobot_bomb.bomb.environment import Environment
 from lerobot_bomb.bomb.episode import EpisodeSpec
 from lerobot_bomb.bomb.suite import task_version
 from lerobot_bomb.bomb.suites import SUITES
+from lerobot_bomb.conditions import ALL
 from lerobot_bomb.data.facts import DatasetFacts
 
 IMAGE = {"dtype": "video", "shape": [64, 64, 3], "names": ["height", "width", "channels"]}
@@ -98,6 +99,20 @@ def test_suite_and_tasks_are_those_of_the_recording_or_of_its_episodes_or_unknow
 )
 def test_of_other_datasets_nothing_is_known(change: dict[str, Any]) -> None:
     assert Environment.of_dataset(INFO | change, "place", ()) is None
+
+
+@pytest.mark.parametrize(
+    ("robot_version", "task", "version"),
+    [
+        *(("1.1", task, "1.0") for task in ("place", "spatial", "place+spatial")),
+        *(("1.1", task, "1.1") for task in ("object", "place+goal", ALL, None)),
+        *(("1.0", task, "1.0") for task in ("place", "object", ALL, None)),
+    ],
+)
+def test_the_version_is_that_of_the_suites(robot_version: str, task: str | None, version: str) -> None:
+    info = INFO | {"robot_type": f"bomb_scara_v{robot_version}"}
+    environment = Environment.of_dataset(info, task, ())
+    assert environment is not None and environment.task_version == version
 
 
 def test_flags_of_an_evaluation() -> None:

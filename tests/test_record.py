@@ -93,7 +93,7 @@ def test_a_dataset_reads_back_through_lerobot(recording: Recording, datasets: di
     assert dataset.features["observation.state"]["names"] == ["x", "y", "z", "finger_opening"]
     first = "x" if recording.control_mode == "absolute" else "dx"
     assert dataset.features["action"]["names"][0] == first
-    assert (dataset.fps, dataset.meta.robot_type) == (10, f"bomb_scara_v{TASK_VERSION}")
+    assert (dataset.fps, dataset.meta.robot_type) == (10, "bomb_scara_v1.1")  # of all suites
     assert dataset.num_episodes == recording.episodes
     progress = read_progress(root / METADATA_FILE)
     assert len(dataset) == progress.num_frames
@@ -262,15 +262,23 @@ def test_every_seed_is_played_under_every_condition_at_the_levels_it_draws(tmp_p
     assert rows[0]["bomb/target"] == rows[1]["bomb/target"]  # a pair
 
 
-def test_lerobot_refuses_to_merge_datasets_of_different_protocol_versions(
-    datasets: dict[str, Path], tmp_path: Path
-) -> None:
+def test_lerobot_merges_suites_but_no_older_tasks(datasets: dict[str, Path], tmp_path: Path) -> None:
     from lerobot.datasets import aggregate_datasets
 
-    record(replace(IMAGES, protocol_version="0.0"), tmp_path / "old")
-    roots = [datasets["images"], tmp_path / "old"]
-    with pytest.raises(ValueError, match=f"bomb_scara_v{TASK_VERSION}"):
-        aggregate_datasets(["test/images"] * 2, "test/merged", roots=roots, aggr_root=tmp_path / "merged")
+    def merge(other: Path, merged: Path) -> None:
+        aggregate_datasets(
+            ["test/a", "test/b"], "test/merged", roots=[datasets["images"], other], aggr_root=merged
+        )
+
+    record(replace(IMAGES, task="object", episodes=1), tmp_path / "object")
+    merge(tmp_path / "object", tmp_path / "merged")
+    environment = DatasetFacts.read(tmp_path / "merged").environment
+    assert environment is not None and environment.suites == {"place", "object"}
+    assert environment.task_version == "1.1"
+    info = tmp_path / "object" / "meta" / "info.json"
+    info.write_text(info.read_text().replace("_v1.1", "_v1.0"))
+    with pytest.raises(ValueError, match="bomb_scara_v1"):
+        merge(tmp_path / "object", tmp_path / "refused")
 
 
 def test_a_recording_of_another_protocol_version_is_not_gone_on_with(

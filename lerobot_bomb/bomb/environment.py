@@ -61,7 +61,7 @@ class Environment:
             fps=int(info["fps"]),
             image_size=int(sizes.pop()),
             cameras=tuple(cameras),
-            task_version=robot[2],
+            task_version=_version(robot[2], task),
             task=task,
             depth=any(key.startswith(DEPTH) for key in features),
             task_ids=task_ids,
@@ -75,9 +75,7 @@ class Environment:
     @property
     def suites(self) -> frozenset[str] | None:
         """Suites that it shows; None: not known."""
-        if self.task is None:
-            return None
-        return frozenset(SUITES if self.task == ALL else self.task.split("+"))
+        return None if self.task is None else _suites(self.task)
 
     def _flag(self, name: str) -> str:
         """A flag of lerobot-eval; of several suites it names the first, unless they are all."""
@@ -114,7 +112,7 @@ class Environment:
     @property
     def _is_current(self) -> bool:
         """Return whether its suites, whose newest version it names, are those of today."""
-        return self.suites is not None and self.task_version == max(map(task_version, self.suites))
+        return self.suites is not None and self.task_version == _current_version(self.suites)
 
     def check_same(self, other: "Environment", who: str, insist: str) -> None:
         """Raise a ValueError, which names flags to change, unless `who`, of this one, can act in `other`."""
@@ -144,6 +142,27 @@ class Environment:
             f"control {self.control_mode} at {self.fps} Hz, cameras {', '.join(self.cameras)} of "
             f"{self.image_size} px{depth}"
         )
+
+
+def robot_type(robot: str) -> str:
+    """Return what a recording's info.json calls a robot: with the newest version of all suites.
+
+    LeRobot merges only datasets of one robot: recordings of several suites, but none of older tasks.
+    """
+    return f"bomb_{robot}_v{task_version(ALL)}"
+
+
+def _suites(task: str) -> frozenset[str]:
+    return frozenset(SUITES if task == ALL else task.split("+"))
+
+
+def _current_version(suites: Iterable[str]) -> str:
+    return max(map(task_version, suites))
+
+
+def _version(of_robot: str, task: str | None) -> str:
+    """Return the version of a dataset's suites, whose last change may be older than its robot's version."""
+    return of_robot if task is None else min(of_robot, _current_version(_suites(task)))
 
 
 # no command line gives them

@@ -7,6 +7,7 @@ import numpy as np
 from lerobot.utils.constants import ACTION, DONE, OBS_IMAGES, OBS_PREFIX, OBS_STATE
 
 from lerobot_bomb import __version__
+from lerobot_bomb.bomb.environment import robot_type
 from lerobot_bomb.bomb.observation import ACTION_NAMES, CAMERAS, STATE_NAMES, geometry_shapes
 from lerobot_bomb.bomb.pointing import COLUMNS
 from lerobot_bomb.data.blocks import DatasetLayout, RecordedEpisode
@@ -39,10 +40,13 @@ def rollout_layout(recording: Recording) -> DatasetLayout:
         # after which frames no action of the same episode follows: a scene belongs to no other
         **({DONE: {"dtype": "bool", "shape": (1,), "names": None}} if recording.pointing else {}),
     }
-    # with the task's version, so that LeRobot refuses to merge datasets of different ones
-    robot_type = f"bomb_{recording.robot}_v{recording.protocol_version}"
     return DatasetLayout(
-        recording.repo_id, recording.fps, robot_type, features, not recording.images, tuple(geometry)
+        recording.repo_id,
+        recording.fps,
+        robot_type(recording.robot),
+        features,
+        not recording.images,
+        tuple(geometry),
     )
 
 

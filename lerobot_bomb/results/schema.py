@@ -118,11 +118,11 @@ class Schema[T]:
         self._prefix = f"{name}." if name else ""
         hints = get_type_hints(cls, include_extras=True)
         names = [each.name for each in dataclasses.fields(cls)]  # pyright: ignore[reportArgumentType]
-        types = {each: hints[each] for each in names}
+        types: dict[str, Any] = {each: hints[each] for each in names}
         self._nested = {
             each: (Schema(some, lacking, closed, self._prefix + each), some is not hint)
             for each, hint in types.items()
-            if dataclasses.is_dataclass(some := _without_none(hint))
+            if dataclasses.is_dataclass(some := _without_none(hint)) and isinstance(some, type)
         }
         flat = {each: hint for each, hint in types.items() if each not in self._nested}
         self._checks = [(each, _types_without_check(hint), check_of(hint)) for each, hint in flat.items()]
@@ -142,7 +142,7 @@ class Schema[T]:
         if not self._needs <= values.keys():
             missing = [f"{self._prefix}{each}" for each in self._required if each not in values]
             raise ValueError(f"it lacks {', '.join(missing)}")
-        found = {**self._start}
+        found: dict[str, Any] = {**self._start}
         for name, passing, is_possible in self._checks:
             if name in values:
                 found[name] = value = values[name]

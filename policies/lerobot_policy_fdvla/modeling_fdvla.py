@@ -160,9 +160,9 @@ class FdvlaPolicy(RelativeVlaPolicy, PointingVlaPolicy):
     def _joint_loss(
         self, predicted: Predicted, point: PathPoint, loss_mask_BK: Tensor, **options: Any
     ) -> tuple[Tensor, dict[str, Tensor]]:
-        predicted_BKD = (None if values is None else values.float() for values in predicted)
+        velocity_BKD, noise_BKD = (None if values is None else values.float() for values in predicted)
         weights = {name: getattr(self.config, name) for name in ("flow_loss_weight", "denoise_loss_weight")}
-        return joint_loss(*predicted_BKD, point, loss_mask_BK, **weights, **options)
+        return joint_loss(velocity_BKD, noise_BKD, point, loss_mask_BK, **weights, **options)
 
     def chunk_loss(
         self, prompt: TokenRows, embeds_BLH: Tensor, state_BS: Tensor | None, point: PathPoint

@@ -15,7 +15,6 @@ from vla0_smol_cases import make_config
 
 from hub.server import LoopbackHub
 from lerobot_bomb.bomb.environment import Environment
-from lerobot_bomb.bomb.episode import EpisodeSpec, Stage
 from lerobot_bomb.data.facts import DatasetFacts
 from lerobot_bomb.hub.card import Checkpoint, PolicyCard
 from lerobot_bomb.results.bomb import EpisodeResult
@@ -147,24 +146,7 @@ def test_a_suite_that_is_not_known_is_not_made_up() -> None:
     assert "--env.task=SUITE" in text and "place" not in text
     assert "`SUITE` is that of its training, which the dataset does not say." in text
     assert "- environment: BOMB, task version 1.0, an unknown suite, robot scara" in text
-    spec = EpisodeSpec(0, "object")
-    result = EpisodeResult(
-        spec,
-        "Put it there.",
-        0,
-        (2, 2),
-        "black",
-        20,
-        1.0,
-        True,
-        True,
-        None,
-        Stage.PLACED,
-        1.0,
-        (2, 2),
-        0.0,
-        task_version="1.1",
-    )
+    result = read(values(0, spec={"suite": "object"}, task_version="1.1", target=None))
     played = str(replace(unknown, results=[[result]]).card())
     assert "--env.task=object" in played and "SUITE" not in played
 
