@@ -1,4 +1,4 @@
-"""What does each part of a method bring, or cost, at equal CPU minutes of training?
+"""Parts of the methods, on and off: what each brings or costs at equal CPU minutes of training.
 
 A version of a policy differs from its base, configs/all_suites_TYPE.yaml, in the flags of one part. All are
 trained by the stock `lerobot-train` for the same CPU minutes on one core, from several seeds, and evaluated

@@ -92,7 +92,7 @@ def test_a_broken_source_is_one_clear_error_and_nothing_is_written(
     command = ["convert", "pusht-zarr", str(path), f"--repo_id={REPO_ID}", f"--root={tmp_path / 'new' / 'x'}"]
     assert cli.main(command) == 1
     *_, error = capsys.readouterr().err.splitlines()
-    assert error.startswith("lerobot-bomb convert: ") and expected in error
+    assert error.startswith("lerobot-bomb convert pusht-zarr: ") and expected in error
     assert list(tmp_path.iterdir()) == [path]
 
 

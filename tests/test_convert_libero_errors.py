@@ -141,7 +141,7 @@ def refusal(path: Path, folder: Path, capsys: pytest.CaptureFixture[str], *flags
         cli.main(["convert", "libero-hdf5", str(path), f"--repo_id={REPO_ID}", f"--root={root}", *flags]) == 1
     )
     *_, error = capsys.readouterr().err.splitlines()
-    assert error.startswith("lerobot-bomb convert: ")
+    assert error.startswith("lerobot-bomb convert libero-hdf5: ")
     return error
 
 

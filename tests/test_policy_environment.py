@@ -23,10 +23,12 @@ from policy_cases import CASES
 
 import lerobot_policy_bomb  # noqa: F401  the plugin
 from lerobot_bomb.bomb.environment import Environment
+from lerobot_bomb.bomb.suite import task_version
 from lerobot_bomb.checkpoints.environment import ConfigWithEnvironment
 from lerobot_bomb.checkpoints.folder import parse_config, write_checkpoint
 from lerobot_bomb.checkpoints.shipped import checkpoint_path
 from lerobot_bomb.commands.main import main
+from lerobot_bomb.conditions import ALL
 
 Run = Callable[..., None]
 REPO_ID = "test/recording"
@@ -216,7 +218,7 @@ def test_a_recording_that_lost_its_suite_trains_policies_that_say_so(
     write(tmp_path / "checkpoint", policy)
     config = parse_config(tmp_path / "checkpoint", "cpu")
     assert isinstance(config, ConfigWithEnvironment)
-    assert config.environment == Environment("scara", "absolute", 10, 64, CAMERAS, "1.0")
+    assert config.environment == Environment("scara", "absolute", 10, 64, CAMERAS, task_version(ALL))
     config.pretrained_path = tmp_path / "checkpoint"
     loaded = make_policy(config, env_cfg=make_env_config("bomb", image_size=64))
     for suite in ("object", "place"):

@@ -16,6 +16,7 @@ from lerobot.transport import services_pb2, services_pb2_grpc
 
 from lerobot_bomb.commands import main as cli
 from lerobot_bomb.commands import serve
+from lerobot_bomb.serving import open_streams
 from lerobot_bomb.serving.open_streams import MAX_OPEN, OpenStreams
 
 CTRL_C = 130
@@ -68,7 +69,7 @@ def test_it_says_whom_it_trusts_and_lets_in_its_owner_only(served: Callable) -> 
 def test_clients_that_send_nothing_do_not_keep_others_out(
     monkeypatch: pytest.MonkeyPatch, served: Callable
 ) -> None:
-    monkeypatch.setattr(serve, "OpenStreams", lambda: OpenStreams(timeout_s=10 * TIMEOUT_S))
+    monkeypatch.setattr(open_streams, "OpenStreams", lambda: OpenStreams(timeout_s=10 * TIMEOUT_S))
 
     def use(stub: Any, path: Path) -> None:
         del path
@@ -93,7 +94,7 @@ def test_clients_that_send_nothing_do_not_keep_others_out(
 
 
 def test_a_request_that_never_ends_is_cancelled(monkeypatch: pytest.MonkeyPatch, served: Callable) -> None:
-    monkeypatch.setattr(serve, "OpenStreams", lambda: OpenStreams(timeout_s=0.2))
+    monkeypatch.setattr(open_streams, "OpenStreams", lambda: OpenStreams(timeout_s=0.2))
 
     def use(stub: Any, path: Path) -> None:
         del path

@@ -298,7 +298,7 @@ def test_wrong_flags_are_told(options: dict[str, Any], message: str) -> None:
 
 def test_depth_that_is_asked_for_must_be_there() -> None:
     """A dataset's features tell before any training, a batch's keys later."""
-    message = r"needs observation\.depth\.\w+, .*Record with --depth and evaluate with --env\.depth=true"
+    message = r"needs observation\.depth\.\w+, .*Record and evaluate with --env\.depth=true"
     with pytest.raises(ValueError, match=message):
         make_policy(depth_source="observation", has_depth=False)
     with pytest.raises(ValueError, match=r"needs observation\.depth\.\w+, observation\.depth\.\w+;"):
@@ -306,7 +306,7 @@ def test_depth_that_is_asked_for_must_be_there() -> None:
         intrinsics = {"workspace": square, "wrist": square}
         make_policy(depth_source="observation", has_depth=False, camera_intrinsics=intrinsics)
     policy = make_policy(depth_source="observation")
-    with pytest.raises(KeyError, match=r"observation\.depth\.\w+'; .*Record with --depth"):
+    with pytest.raises(KeyError, match=r"observation\.depth\.\w+'; .*Record and evaluate with --env\.depth"):
         policy(make_batch(policy, 2))
 
 

@@ -62,7 +62,7 @@ def clipping_text(actions_ND: np.ndarray, dim_names: Sequence[str]) -> tuple[str
     if is_much:
         text += (
             ". LeRobot averages quantiles over episodes, so that they are not the data's: `lerobot-bomb "
-            "statistics FOLDER --mend` makes them so. "
+            "doctor dataset FOLDER --mend` makes them so. "
             "--policy.normalization_mapping with ACTION: MIN_MAX clips nothing"
         )
     return text, is_much

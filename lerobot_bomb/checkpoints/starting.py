@@ -20,7 +20,7 @@ def way_to_start_otherwise(checkpoint: str | Path, policy_type: str) -> str:
     """Describe how a checkpoint's vision-language model becomes the start of a policy for other data."""
     return (
         "for other cameras, state or action, start from its vision-language model: lerobot-bomb "
-        f"export-backbone --policy.path={checkpoint} --output=FOLDER, then lerobot-train "
+        f"checkpoint export-backbone --policy.path={checkpoint} --output=FOLDER, then lerobot-train "
         f"--policy.type={policy_type} --policy.vlm_model_name=FOLDER"
     )
 

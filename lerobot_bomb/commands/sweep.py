@@ -139,7 +139,7 @@ def _manifest(args: argparse.Namespace) -> Manifest:
     if not args.policies:
         raise ValueError("--policies names none")
     record_type = _record_type(args.rest)
-    _check_types(args.policies)
+    _check_types(args.policies, args.rest)
     for task in args.tasks:
         one_of("--tasks", task, record_type.tasks)
     conditions = _expanded(args.perturbations, record_type)
@@ -160,9 +160,10 @@ def _record_type(flags: list[str]) -> type[Record]:
     return RECORD_OF_ENV[env_type]
 
 
-def _check_types(policies: Sequence[str]) -> None:
+def _check_types(policies: Sequence[str], flags: Sequence[str]) -> None:
     """Raise a ValueError if one is neither a checkpoint nor a type that there is, as far as source says."""
-    if (known := registered_policy_types()) is None:
+    adds_types = any("discover_packages_path" in flag for flag in flags)  # of a package that is not read here
+    if adds_types or (known := registered_policy_types()) is None:
         return
     for policy in policies:
         if policy_flag(policy).startswith("--policy.type=") and policy not in known:

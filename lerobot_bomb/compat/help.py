@@ -1,11 +1,12 @@
 """The help of LeRobot's commands, which lists every field of a config as a flag."""
 
 import copy
+from argparse import SUPPRESS
 from collections.abc import Iterable
 from types import MappingProxyType
 
-# argparse's mark of a flag that works and is not listed; draccus passes `custom_args` on to it
-NOT_LISTED = MappingProxyType({"custom_args": {"help": "==SUPPRESS=="}})
+# argparse looks for this very string in flags that work and are not listed; draccus passes `custom_args` on
+NOT_LISTED = MappingProxyType({"custom_args": {"help": SUPPRESS}})
 
 
 def leave_out_of_help(config_class: type, names: Iterable[str]) -> None:

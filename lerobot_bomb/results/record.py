@@ -32,7 +32,7 @@ MEASURED = {"inference"}
 
 
 class Spec(Protocol):
-    """What determines an episode."""
+    """Spec of an episode: all that determines it."""
 
     @property
     def seed(self) -> int: ...

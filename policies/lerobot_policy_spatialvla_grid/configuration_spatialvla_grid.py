@@ -240,7 +240,7 @@ class SpatialvlaGridConfig(TokenVlaConfig, PlacesVlaConfig):
         if missing:
             raise ValueError(
                 f"--policy.depth_source=observation needs {', '.join(missing)}; the inputs are "
-                f"{sorted(given)}. Record with --depth and evaluate with --env.depth=true, or choose "
+                f"{sorted(given)}. Record and evaluate with --env.depth=true, or choose "
                 f"--policy.depth_source=none; --policy.camera_intrinsics stands in for intrinsics"
             )
 
