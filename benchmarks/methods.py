@@ -12,9 +12,8 @@ names the parts that are wanted: --only masking chunk.
 
 import argparse
 import json
-import resource
 import shutil
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from statistics import mean
@@ -24,6 +23,7 @@ import numpy as np
 from learn import FIRST_UNSEEN_SEED, REPO_ID, evaluate, locked, merge, record, run_record
 from learning_tasks import Part, Task
 from machine import add_machine_arguments, make_parser, positive, require_idle_machine, write_figures
+from play_pusht import step_s
 from recipes import last_checkpoint, read_recipe, recipe_path
 
 from lerobot_bomb.bootstrap import format_bounds, paired_bootstrap_interval
@@ -34,7 +34,6 @@ from lerobot_bomb.tables import print_table
 RECIPE = "all_suites"
 SUITES = "place", "spatial"
 FIRST_TRAINING_SEED = 1000
-PACE_STEPS = 20, 60  # of two short trainings, whose difference is free of what starting takes
 SCENES = Part("spatial", 16_000, is_static=True), Part("place", 4_000, is_static=True)
 SHOWN = Part("spatial", 200), Part("place", 100)
 RELABELLED_EPISODES = 60
@@ -207,40 +206,25 @@ class Run:
         """Return how many steps the minutes are enough for, by two short trainings."""
         if not self._pace.exists():
             recipe = f"--config_path={recipe_path(RECIPE, self._version.policy_type)}"
-            folder = self._all / "pace"
-
-            def train(steps: int) -> None:
-                shutil.rmtree(folder, ignore_errors=True)
-                run_command(*_train_command(dataset, folder, steps, 0), recipe, *self._version.flags)
-
-            few_s, many_s = (_cpu_s(lambda steps=steps: train(steps)) for steps in PACE_STEPS)
-            self._pace.write_text(json.dumps((many_s - few_s) / (PACE_STEPS[1] - PACE_STEPS[0])))
+            flags = [recipe, *_data_flags(dataset), *self._version.flags]
+            self._pace.write_text(json.dumps(step_s(self._all / "pace" / self._pace.stem, flags, "cpu")))
         return round(60 * self._minutes / json.loads(self._pace.read_text()))
+
+
+def _data_flags(dataset: Path) -> list[str]:
+    return [f"--dataset.repo_id={REPO_ID}", f"--dataset.root={dataset}"]
 
 
 def _train_command(dataset: Path, folder: Path, steps: int, seed: int) -> list[str]:
     return [
         "lerobot-train",
-        f"--dataset.repo_id={REPO_ID}",
-        f"--dataset.root={dataset}",
+        *_data_flags(dataset),
         f"--output_dir={folder}",
         f"--steps={steps}",
         f"--policy.scheduler_decay_steps={steps}",
         f"--save_freq={max(1, steps // 4)}",
         f"--seed={seed}",
     ]
-
-
-def _cpu_s(run: Callable[[], None]) -> float:
-    """Return the CPU seconds of the commands that are run."""
-
-    def spent_s() -> float:
-        usage = resource.getrusage(resource.RUSAGE_CHILDREN)
-        return usage.ru_utime + usage.ru_stime
-
-    before_s = spent_s()
-    run()
-    return spent_s() - before_s
 
 
 def episode_means(runs: Sequence[Sequence[EpisodeResult]], suite: str) -> dict[int, float]:
