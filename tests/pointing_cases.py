@@ -4,7 +4,8 @@ from typing import Any
 
 import torch
 
-from lerobot_bomb.policies.pointing import BOARD_COLORS, OTHER_ACTIONS, OTHER_PLACES, PLACE, STONE
+from lerobot_bomb.policies.board_reader import NUM_SPOTS
+from lerobot_bomb.policies.pointing import OTHER_ACTIONS, OTHER_PLACES, PLACE, SPOTS, STONE
 
 PLACES = [[-0.09, 0.09], [0.0, 0.0], [0.09, -0.045], [0.17, 0.0]]
 POINTING: dict[str, dict[str, Any]] = {
@@ -26,5 +27,5 @@ def with_labels(batch: dict[str, Any]) -> dict[str, Any]:
         STONE: torch.cat([-places[number_B], torch.zeros(batch_size, 1)], dim=1),
         OTHER_PLACES: others.flatten(1),
         OTHER_ACTIONS: torch.cat([5 * others, rest], dim=2).flatten(1),
-        BOARD_COLORS: (number_B[:, None] + torch.arange(25)) % 3.0,
+        SPOTS: (number_B[:, None] + torch.arange(NUM_SPOTS)) % 3.0,
     }

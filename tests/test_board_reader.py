@@ -19,13 +19,13 @@ from torch import Tensor
 
 from lerobot_bomb.bomb.episode import EpisodeSpec
 from lerobot_bomb.bomb.observation import RenderOptions
-from lerobot_bomb.bomb.pointing import Pointing, colors_on_board
+from lerobot_bomb.bomb.pointing import SPOTS_XY_M, Pointing, colors_on_spots
 from lerobot_bomb.bomb.privileged_state import PrivilegedState
 from lerobot_bomb.bomb.suite import find_suite
 from lerobot_bomb.envs.rollout import make_env
 from lerobot_bomb.flag_errors import FlagError
-from lerobot_bomb.policies.board_reader import BoardReader
-from lerobot_bomb.policies.pointing import BOARD_COLORS
+from lerobot_bomb.policies.board_reader import NUM_SPOTS, BoardReader
+from lerobot_bomb.policies.pointing import SPOTS
 
 SMALL = RenderOptions(image_size=32)
 POINTING: dict[str, ModuleType] = {
@@ -37,7 +37,7 @@ POINTING: dict[str, ModuleType] = {
 VISION = ("vision_model", "vision_tower", "visual")
 TEXT = ("text_model", "language_model")
 # 20 intersections are empty, 3 black, 2 white
-BOARD = torch.tensor(3 * [1] + 2 * [2] + 20 * [0])
+BOARD = torch.tensor([*(3 * [1] + 2 * [2]), *((NUM_SPOTS - 5) * [0])])
 
 
 def reading_policy(policy_type: str, **options: Any) -> Any:
@@ -48,7 +48,7 @@ def board_batch(policy: Any, batch_size: int = 4) -> dict[str, Any]:
     """Labels of pointing, and a board that is turned on a little from row to row."""
     boards = torch.stack([BOARD.roll(row) for row in range(batch_size)])
     batch = POINTING[policy.name].pointing_batch(policy, batch_size)
-    return batch | {BOARD_COLORS: boards.float()}
+    return batch | {SPOTS: boards.float()}
 
 
 def gradients(policy: Any, batch: dict[str, Any], weight: float) -> dict[str, Tensor]:
@@ -80,13 +80,13 @@ def test_its_gradient_reaches_the_vision_model_unless_that_is_frozen(policy_type
 
 
 def says(policy: Any, logits: list[float]) -> None:
-    """Let it read this on every intersection, whatever it sees."""
+    """Let it read this on every spot, whatever it sees."""
     with torch.no_grad():
         policy.board_reader.read[-1].weight.zero_()
-        policy.board_reader.read[-1].bias.copy_(torch.tensor(25 * logits))
+        policy.board_reader.read[-1].bias.copy_(torch.tensor(NUM_SPOTS * logits))
 
 
-def test_the_loss_is_the_mean_over_intersections_and_accuracy_of_the_stones(policy_type: str) -> None:
+def test_the_loss_is_a_sum_and_accuracy_of_the_stones(policy_type: str) -> None:
     policy = reading_policy(policy_type)
     batch = board_batch(policy)
     says(policy, [0.0, math.log(2), 0.0])  # black, by 1/2
@@ -96,7 +96,7 @@ def test_the_loss_is_the_mean_over_intersections_and_accuracy_of_the_stones(poli
         for reduction in ("mean", "none"):
             policy.generator.manual_seed(0)
             losses[weight, reduction], metrics = policy(batch, reduction=reduction)
-            expected = (22 * math.log(4) + 3 * math.log(2)) / 25
+            expected = ((NUM_SPOTS - 3) * math.log(4) + 3 * math.log(2)) / 25
             assert metrics["board_loss"] == pytest.approx(expected)
             assert metrics["board_accuracy"] == pytest.approx(3 / 5)
     for reduction in ("mean", "none"):
@@ -108,7 +108,7 @@ def test_the_loss_is_the_mean_over_intersections_and_accuracy_of_the_stones(poli
 def test_where_a_token_lies_tells() -> None:
     torch.manual_seed(0)
     reader, features = BoardReader(8, 16), torch.randn(2, 8, 16)
-    assert reader(features).shape == (2, 25, 3)
+    assert reader(features).shape == (2, NUM_SPOTS, 3)
     assert not torch.allclose(reader(features), reader(features.flip(1)))
 
 
@@ -117,7 +117,7 @@ def test_it_is_small_with_any_backbone(num_tokens: int, hidden_size: int) -> Non
     """Nano, Qwen2.5-VL, PaliGemma 2, and a dozen images."""
     with torch.device("meta"):
         reader = BoardReader(num_tokens, hidden_size)
-    assert sum(of.numel() for of in reader.parameters()) < max(600_000, 1100 * num_tokens)
+    assert sum(of.numel() for of in reader.parameters()) < max(700_000, 1100 * num_tokens)
 
 
 def test_without_pointing_or_weight_there_is_none(policy_type: str) -> None:
@@ -127,7 +127,7 @@ def test_without_pointing_or_weight_there_is_none(policy_type: str) -> None:
     assert policy.board_reader is None
     assert not any("board" in name for each in (plain, policy) for name in each.state_dict())
     batch = board_batch(policy)
-    del batch[BOARD_COLORS]
+    del batch[SPOTS]
     assert "board_loss" not in policy(batch)[1]
     plain_losses = []
     for weight in (0.0, 1.0):
@@ -139,9 +139,9 @@ def test_without_pointing_or_weight_there_is_none(policy_type: str) -> None:
 def test_labels_are_of_training_only(policy_type: str) -> None:
     policy = reading_policy(policy_type)
     batch = board_batch(policy)
-    del batch[BOARD_COLORS]
+    del batch[SPOTS]
     policy.predict_action_chunk(batch)
-    with pytest.raises(KeyError, match=rf"{policy_type} needs 'observation\.pointing\.board'"):
+    with pytest.raises(KeyError, match=rf"{policy_type} needs 'observation\.pointing\.spots'"):
         policy(batch)
 
 
@@ -159,7 +159,7 @@ def test_it_learns_to_read_a_board() -> None:
     assert metrics["board_loss"] < 0.02 and metrics["board_accuracy"] == 1
     # off the images: another row's are another row's board
     images = {key: batch[key].roll(1, dims=0) for key in batch if key.startswith("observation.images.")}
-    moved = policy(batch | images | {BOARD_COLORS: batch[BOARD_COLORS].roll(1, dims=0)})[1]
+    moved = policy(batch | images | {SPOTS: batch[SPOTS].roll(1, dims=0)})[1]
     assert moved["board_accuracy"] == 1
     assert policy(batch | images)[1]["board_accuracy"] < 0.9
 
@@ -173,27 +173,31 @@ def test_a_stone_counts_that_lies_on_an_intersection() -> None:
     state = env.privileged_state()
     env.close()
     lies_m, xyz = state.stone_xyz[0, 2], state.stone_xyz.copy()
-    xyz[:6] = [
+    xyz[:7] = [
         [-0.090, 0.090, lies_m],  # black, far left corner
         [0.045, 0.007, lies_m],  # white, 7 mm beside (2, 3)
         [0.090, -0.081, lies_m],  # 9 mm beside the near right corner
         [0.000, 0.000, lies_m + 0.011],  # lifted
         [-0.045, 0.000, lies_m],  # not in play
         [0.170, 0.000, lies_m],  # in the tray
+        [0.146, 0.051, lies_m],  # its far left corner: 6 mm from a spot in x and in y
     ]
     state = replace(
         state,
         stone_xyz=xyz,
         stone_is_white=np.arange(len(xyz)) == 1,
-        stone_in_play=np.isin(np.arange(len(xyz)), [0, 1, 2, 3, 5]),
+        stone_in_play=np.isin(np.arange(len(xyz)), [0, 1, 2, 3, 5, 6]),
     )
     expected = np.zeros((5, 5), int)
     expected[0, 0], expected[2, 3] = 1, 2
-    np.testing.assert_array_equal(colors_on_board(state).reshape(5, 5), expected)
-    board = Pointing.of(state, np.random.default_rng(0)).columns()["pointing.board"]
-    assert board.dtype == np.float32 and board.tolist() == expected.reshape(-1).tolist()
+    read = colors_on_spots(state)
+    np.testing.assert_array_equal(read[:25].reshape(5, 5), expected)
+    assert [SPOTS_XY_M[25 + i] for i in np.flatnonzero(read[25:])] == [(0.140, 0.045), (0.170, 0.0)]
+    assert read[25:].max() == read[25:].sum() / 2 == 1
+    column = Pointing.of(state, np.random.default_rng(0)).columns()["pointing.spots"]
+    assert column.dtype == np.float32 and column.tolist() == read.tolist()
     nothing = replace(state, stone_in_play=np.zeros(len(xyz), bool))
-    np.testing.assert_array_equal(colors_on_board(nothing), np.zeros(25))
+    np.testing.assert_array_equal(colors_on_spots(nothing), np.zeros(NUM_SPOTS))
 
 
 @pytest.mark.parametrize("suite", ["spatial", "goal"])
@@ -206,8 +210,8 @@ def test_the_board_of_an_opening_is_read(suite: str) -> None:
     expected = np.zeros((5, 5), int)
     for cell, color in opening.items():
         expected[cell] = {"black": 1, "white": 2}[color]
-    read = colors_on_board(PrivilegedState.from_vector(observation["environment_state"]))
-    assert opening and read.reshape(5, 5).tolist() == expected.tolist()
+    read = colors_on_spots(PrivilegedState.from_vector(observation["environment_state"]))
+    assert opening and read[:25].reshape(5, 5).tolist() == expected.tolist()
 
 
 # Checkpoints and data
@@ -268,7 +272,7 @@ def test_a_dataset_without_boards_is_refused(policy_type: str, tmp_path: Path) -
     config = CASES[policy_type].make_config(**options)
     with pytest.raises(
         ValueError,
-        match=r"--policy\.pointing=true is trained on the columns observation\.pointing\.board, which "
+        match=r"--policy\.pointing=true is trained on the columns observation\.pointing\.spots, which "
         r"test/pointing lacks; lerobot-bomb record --pointing writes them; --policy\.board_loss_weight=0",
     ):
         policy_class(config, dataset_meta=meta)

@@ -9,10 +9,12 @@ import torch
 from fdvla_cases import WORKSPACE, make_batch, make_config, make_policy
 from torch import Tensor
 
+from lerobot_bomb.bomb.pointing import SPOTS_XY_M
 from lerobot_bomb.explain.activations import all_heads, all_layers, all_mlps
 from lerobot_bomb.explain.question import Question
 from lerobot_bomb.explain.restoration import Corruption
 from lerobot_bomb.flag_errors import FlagError
+from lerobot_bomb.policies.board_reader import NUM_SPOTS
 from lerobot_bomb.policies.pointing import OTHER_ACTIONS, OTHER_PLACES, PLACE, STONE, number_of
 from lerobot_policy_fdvla.modeling_fdvla import FdvlaPolicy
 from lerobot_policy_fdvla.pointing_fdvla import Pointed, Pointer
@@ -133,7 +135,7 @@ def gradients(policy: FdvlaPolicy, batch: dict[str, Any], **weights: float) -> d
 def test_no_gradient_of_the_actions_reaches_what_is_pointed_at() -> None:
     policy = wake_feedback(pointing_policy())
     found = gradients(policy, pointing_batch(policy), pointing_loss_weight=0.0)
-    for name in ("place", "stone", "held", "features.0"):
+    for name in ("place", "spot", "stone.2", "held", "features.0"):
         assert (found[f"pointer.{name}.weight"] == 0).all(), name
     assert (found["pointer.feedback.0.weight"] != 0).any()
 
@@ -146,7 +148,12 @@ def test_gradients_of_pointing_reach_the_backbone_and_no_head() -> None:
             name: of.clone() for name, of in gradients(policy, batch, pointing_loss_weight=weight).items()
         }
     changed = {name for name, of in both[1.0].items() if not torch.equal(of, both[0.0][name])}
-    assert {"pointer.place.weight", "pointer.stone.weight", "pointer.held.weight"} <= changed
+    assert {
+        "pointer.place.weight",
+        "pointer.spot.weight",
+        "pointer.stone.2.weight",
+        "pointer.held.weight",
+    } <= changed
     assert any(name.startswith("backbone") for name in changed)
     assert not any(name.startswith(("flow_head", "denoise_head", "pointer.feedback")) for name in changed)
 
@@ -165,8 +172,10 @@ def test_numbers_are_ways_in_metres_at_three_scales() -> None:
     pointed = Pointed(
         gripper=torch.tensor([[0.03, 0.0, 0.05]]),
         place_logits=torch.zeros(1, 4),
+        spot_logits=torch.zeros(1, NUM_SPOTS),
         stone=torch.tensor([[0.006, 0.0]]),
         held_logit=torch.zeros(1),
+        features=torch.zeros(1, 8),
     )
     (numbers,) = pointer._numbers(pointed, torch.tensor([[0.0, 0.04]])).tolist()
     way = [-0.3, 0.4, -0.75, 1.0, -0.99991, 1.0, 0.5, 1.0]
@@ -189,14 +198,16 @@ def test_an_explanation_says_where_it_points() -> None:
     policy.pointer.state_bounds.copy_(torch.tensor([[0.0, -0.1, 0.0], [0.2, 0.1, 0.1]]))
     point_at(policy, 2)
     with torch.no_grad():
-        for of, bias in ((policy.pointer.stone, [0.5, -1.0]), (policy.pointer.held, [2.0])):
+        likeliest = [float(xy == (0.14, 0.045)) for xy in SPOTS_XY_M]
+        pointer = policy.pointer
+        for of, bias in ((pointer.spot, likeliest), (pointer.stone[2], [0.5, -1.0]), (pointer.held, [2.0])):
             of.weight.zero_()
             of.bias.copy_(torch.tensor(bias))
     batch = make_batch(policy, 1) | {"observation.state": torch.tensor([[0.0, 1.0, 0.0, 0.0]])}
     found = policy.scored().pointed(batch)
     assert found is not None and found.place_xy.tolist() == pytest.approx(PLACES[2])
-    # the gripper at (0.1, 0.1); half of 30 mm and minus a whole from there
-    assert found.stone_xy.tolist() == pytest.approx([0.115, 0.07])
+    # half of 30 mm and minus a whole from the spot
+    assert found.stone_xy.tolist() == pytest.approx([0.155, 0.015])
     assert found.held == pytest.approx(0.8808, abs=1e-4)
     share = 1 / (3 + np.e)
     assert [*found.probabilities.values()] == pytest.approx([share, share, np.e * share, share])

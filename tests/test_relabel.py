@@ -13,7 +13,7 @@ from lerobot_bomb.bomb.environment import Environment
 from lerobot_bomb.bomb.episode import EpisodeSpec
 from lerobot_bomb.bomb.expert import expert_action
 from lerobot_bomb.bomb.observation import RenderOptions
-from lerobot_bomb.bomb.pointing import colors_on_board
+from lerobot_bomb.bomb.pointing import colors_on_spots
 from lerobot_bomb.bomb.privileged_state import PrivilegedState
 from lerobot_bomb.commands.main import main
 from lerobot_bomb.envs.rollout import make_env
@@ -48,7 +48,7 @@ def test_what_the_policy_sees_gets_the_experts_actions(checkpoint: Path, tmp_pat
     first: Any = dataset[0]
     state = PrivilegedState.from_vector(observation["environment_state"])
     np.testing.assert_array_equal(first["action"], expert_action(state))
-    np.testing.assert_array_equal(first["observation.pointing.board"], colors_on_board(state))
+    np.testing.assert_array_equal(first["observation.pointing.spots"], colors_on_spots(state))
     states = np.stack([np.asarray(dataset[i]["observation.state"]) for i in (0, 40, 99)])
     assert abs(np.diff(states[:, :3], axis=0)).max() > 0.01  # it moved, and not as the expert
     env.close()

@@ -1,8 +1,8 @@
 """Pointing: which stone goes where, as the expert means it and as a policy says it.
 
-It is what a policy must read before it can act, and what lies on the board is read before that; what
-the expert would do for other places teaches it to act as it has pointed. A recording has all of it in columns
-that only training reads, never in an observation.
+It is what a policy must read before it can act, and the stones are seen before that; what the expert would do
+for other places teaches it to act as it has pointed. A recording has all of it in columns that only training
+reads, never in an observation.
 """
 
 from collections.abc import Mapping
@@ -11,7 +11,7 @@ from typing import Self
 
 import numpy as np
 
-from lerobot_bomb.bomb.board import BOARD
+from lerobot_bomb.bomb.board import BOARD, TRAY_CENTER_XY, TRAY_HALF_SIZE_XY
 from lerobot_bomb.bomb.commands import CELLS, TRAY_XY_M
 from lerobot_bomb.bomb.expert import current_goal, expert_action, held_share
 from lerobot_bomb.bomb.judge import LIFT_M
@@ -19,14 +19,32 @@ from lerobot_bomb.bomb.observation import ACTION_DIM
 from lerobot_bomb.bomb.privileged_state import Goal, PrivilegedState
 
 ON_INTERSECTION_M = 0.008  # a stone this near one lies on it
+TRAY_SPOT_M = 0.015  # side of a square of the tray: smaller than a stone, so that no two lie in one
 # a stone's centre, off the board from here on
 LIFTED_M = BOARD.thickness_m + BOARD.stone_height_m / 2 + LIFT_M
 HELD = 0.5  # from this share on a stone counts as held
 NUM_OTHERS = 2  # places a frame, beside the one that is meant
+
+
+def _middles(half_m: float) -> list[float]:
+    """Return the middles of squares along a side of the tray: metres from its centre, which is one."""
+    number = round(half_m / TRAY_SPOT_M)
+    return [TRAY_SPOT_M * i for i in range(-number, number + 1)]
+
+
 # where the expert puts stones
 PLACES_XY_M = (*(tuple(BOARD.intersection_xy(*cell).tolist()) for cell in CELLS), *TRAY_XY_M)
+# the tray's squares, row by row from the far one
+TRAY_SPOTS_XY_M = tuple(
+    (round(TRAY_CENTER_XY[0] + x, 6), round(TRAY_CENTER_XY[1] - y, 6))
+    for y in _middles(TRAY_HALF_SIZE_XY[1])
+    for x in _middles(TRAY_HALF_SIZE_XY[0])
+)
+# where stones are looked for: intersections, row by row, then the tray; and how near such a stone is
+SPOTS_XY_M = (*PLACES_XY_M[: len(CELLS)], *TRAY_SPOTS_XY_M)
+SPOT_REACH_M = np.repeat([ON_INTERSECTION_M, TRAY_SPOT_M / 2**0.5], [len(CELLS), len(TRAY_SPOTS_XY_M)])
 PREFIX = "pointing."
-# name -> names of its numbers; metres, shares, actions of the environment, colours of `colors_on_board`
+# name -> names of its numbers; metres, shares, actions of the environment, colours of `colors_on_spots`
 COLUMNS = {
     f"{PREFIX}place": ("x", "y"),
     f"{PREFIX}stone": ("x", "y", "held"),
@@ -34,7 +52,10 @@ COLUMNS = {
     f"{PREFIX}other_actions": tuple(
         f"action{i}_{dim}" for i in range(NUM_OTHERS) for dim in range(ACTION_DIM)
     ),
-    f"{PREFIX}board": tuple(f"row{row}_column{column}" for row, column in CELLS),
+    f"{PREFIX}spots": (
+        *(f"row{row}_column{column}" for row, column in CELLS),
+        *(f"tray{i}" for i in range(len(TRAY_SPOTS_XY_M))),
+    ),
 }
 
 
@@ -75,7 +96,7 @@ class Pointing(Meant):
 
     other_places_xy: np.ndarray  # (NUM_OTHERS, 2) metres
     other_actions: np.ndarray  # (NUM_OTHERS, ACTION_DIM), in the environment's units
-    board: np.ndarray  # (25,) as `colors_on_board` has it
+    spots: np.ndarray  # as `colors_on_spots` has them
 
     @classmethod
     def of(cls, state: PrivilegedState, rng: np.random.Generator) -> Self:
@@ -86,7 +107,7 @@ class Pointing(Meant):
             **vars(Meant.in_state(state)),
             other_places_xy=np.array(others),
             other_actions=np.stack([expert_action(_aimed_at(state, goal, xy)) for xy in others]),
-            board=colors_on_board(state),
+            spots=colors_on_spots(state),
         )
 
     def columns(self) -> dict[str, np.ndarray]:
@@ -96,19 +117,23 @@ class Pointing(Meant):
             np.append(self.stone_xy, self.held),
             self.other_places_xy,
             self.other_actions,
-            self.board,
+            self.spots,
         )
         return {
             name: value.reshape(-1).astype(np.float32) for name, value in zip(COLUMNS, values, strict=True)
         }
 
 
-def colors_on_board(state: PrivilegedState) -> np.ndarray:
-    """(25,) int64, row by row: 0 for an empty intersection, 1 for a black stone on it, 2 for a white one."""
+def colors_on_spots(state: PrivilegedState) -> np.ndarray:
+    """(S,) int64 for `SPOTS_XY_M`: 0 where no stone lies, 1 for a black one, 2 for a white one."""
     lies = state.stone_in_play & (state.stone_xyz[:, 2] < LIFTED_M)
-    ways = np.array(PLACES_XY_M[: len(CELLS)])[:, None] - state.stone_xyz[lies, :2]
-    is_on = np.linalg.norm(ways, axis=2) <= ON_INTERSECTION_M
-    return (is_on * (1 + state.stone_is_white[lies])).max(axis=1, initial=0)
+    ways = np.array(SPOTS_XY_M)[:, None] - state.stone_xyz[lies, :2]
+    apart_m = np.linalg.norm(ways, axis=2)
+    nearest = apart_m.argmin(axis=0)
+    is_on = apart_m.min(axis=0) <= SPOT_REACH_M[nearest]
+    colors = np.zeros(len(SPOTS_XY_M), dtype=np.int64)
+    colors[nearest[is_on]] = 1 + state.stone_is_white[lies][is_on]
+    return colors
 
 
 def action_for(state: PrivilegedState, pointed: PointedAt) -> np.ndarray:

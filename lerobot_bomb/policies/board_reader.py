@@ -1,17 +1,17 @@
-"""Reading of the board off image tokens: an objective of training beside pointing.
+"""Reading of board and tray off image tokens: an objective of training beside pointing.
 
-Instructions name places by the stones around them. A policy that is told actions and places only learns late
-to see the stones, and until then no such place.
+Instructions name places, and stones, by the stones around them. A policy that is told actions and places only
+learns late to see the stones, and until then no such place.
 
-Shapes: `B` batch, `P` image tokens of all cameras, `H` hidden size, `N` numbers of a token, `I`
-intersections.
+Shapes: `B` batch, `P` image tokens of all cameras, `H` hidden size, `N` numbers of a token, `S` spots.
 """
 
 from torch import Tensor, nn
 
-from lerobot_bomb.bomb.board import BOARD, COLORS
+from lerobot_bomb.bomb.board import COLORS
+from lerobot_bomb.bomb.pointing import SPOTS_XY_M
 
-NUM_INTERSECTIONS = BOARD.num_lines**2
+NUM_SPOTS = len(SPOTS_XY_M)
 NUM_STATES = 1 + len(COLORS)  # empty, or a stone of a colour
 # of the network's input and its features: what read 88 % of the stones off eight tokens of 128 numbers
 INPUT_DIM = 1024
@@ -33,10 +33,10 @@ class BoardReader(nn.Module):
         self.read = nn.Sequential(
             nn.Linear(num_tokens * token_dim, HIDDEN_DIM),
             nn.SiLU(),
-            nn.Linear(HIDDEN_DIM, NUM_INTERSECTIONS * NUM_STATES),
+            nn.Linear(HIDDEN_DIM, NUM_SPOTS * NUM_STATES),
         )
 
     def forward(self, features_BPH: Tensor) -> Tensor:
-        """(B, P, H) -> (B, I, NUM_STATES) logits."""
+        """(B, P, H) -> (B, S, NUM_STATES) logits."""
         numbers_BPN = self.tokens(features_BPH.float())
-        return self.read(numbers_BPN.flatten(1)).unflatten(1, (NUM_INTERSECTIONS, NUM_STATES))
+        return self.read(numbers_BPN.flatten(1)).unflatten(1, (NUM_SPOTS, NUM_STATES))

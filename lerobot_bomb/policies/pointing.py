@@ -22,7 +22,7 @@ from lerobot_bomb.data.columns import dim_names, present_episodes, read_columns
 from lerobot_bomb.vlm.inputs import read_tensor
 
 LABELS = f"{OBS_PREFIX}{PREFIX}"  # what the keys of a dataset's columns begin with
-PLACE, STONE, OTHER_PLACES, OTHER_ACTIONS, BOARD_COLORS = (f"{OBS_PREFIX}{name}" for name in COLUMNS)
+PLACE, STONE, OTHER_PLACES, OTHER_ACTIONS, SPOTS = (f"{OBS_PREFIX}{name}" for name in COLUMNS)
 GRIPPER = ("x", "y", "z")  # dimensions of the state
 SAME_PLACE_M = 1e-3
 SMALLEST = 1e-8  # difference that LeRobot's normaliser divides by
@@ -147,10 +147,10 @@ def number_of(xy_B2: Tensor, places_P2: Tensor) -> Tensor:
 
 def require_labels(meta: LeRobotDatasetMetadata, *, reads_board: bool) -> None:
     """Raise a ValueError unless a dataset has the columns that pointing is trained on."""
-    wanted = (PLACE, STONE, OTHER_PLACES, OTHER_ACTIONS, *([BOARD_COLORS] if reads_board else []))
+    wanted = (PLACE, STONE, OTHER_PLACES, OTHER_ACTIONS, *([SPOTS] if reads_board else []))
     missing = [key for key in wanted if key not in meta.features]
     if missing:
-        without = "; --policy.board_loss_weight=0 does without" if missing == [BOARD_COLORS] else ""
+        without = "; --policy.board_loss_weight=0 does without" if missing == [SPOTS] else ""
         raise ValueError(
             f"--policy.pointing=true is trained on the columns {', '.join(missing)}, which {meta.repo_id} "
             f"lacks; lerobot-bomb record --pointing writes them{without}"

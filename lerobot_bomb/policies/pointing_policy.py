@@ -4,8 +4,9 @@ import torch
 from torch import Tensor
 from torch.nn.functional import cross_entropy
 
+from lerobot_bomb.bomb.commands import CELLS
 from lerobot_bomb.policies.board_reader import BoardReader
-from lerobot_bomb.policies.pointing import BOARD_COLORS
+from lerobot_bomb.policies.pointing import SPOTS
 from lerobot_bomb.policies.pointing_config import PointingVlaConfig
 from lerobot_bomb.policies.policy import VlaPolicy
 
@@ -16,9 +17,9 @@ BOARD_READER = "board_reader"  # attribute; adapters' `modules_to_save`
 
 
 class PointingVlaPolicy(VlaPolicy):
-    """One whose image tokens have to tell what lies on the board while it learns to point.
+    """Policy whose image tokens have to tell where stones lie while it learns to point.
 
-    Shapes: `B` batch, `P` image tokens of all cameras, `H` hidden size, `I` intersections.
+    Shapes: `B` batch, `P` image tokens of all cameras, `H` hidden size, `S` spots.
     """
 
     config_class = PointingVlaConfig  # pyright: ignore[reportAssignmentType]
@@ -37,16 +38,18 @@ class PointingVlaPolicy(VlaPolicy):
     def _with_board(
         self, loss: Tensor, batch: dict[str, Tensor], features_BPH: Tensor
     ) -> tuple[Tensor, Parts]:
-        """Add to a loss, () or (B,), that of reading the board off image features; return its metrics."""
+        """Add to a loss, () or (B,), that of reading the stones off image features; return its metrics."""
         if self.board_reader is None:
             return loss, {}
-        colors_BI = self._of_batch(batch, BOARD_COLORS).long()
-        logits_BIC = self.board_reader(features_BPH)
-        loss_B = cross_entropy(logits_BIC.transpose(1, 2), colors_BI, reduction="none").mean(dim=1)
-        is_right_BI = logits_BIC.argmax(dim=2) == colors_BI
+        colors_BS = self._of_batch(batch, SPOTS).long()
+        logits_BSC = self.board_reader(features_BPH)
+        losses_BS = cross_entropy(logits_BSC.transpose(1, 2), colors_BS, reduction="none")
+        # the tray's squares are many and nearly all empty: a stone there counts as one on the board
+        loss_B = losses_BS.sum(dim=1) / len(CELLS)
+        is_right_BS = logits_BSC.argmax(dim=2) == colors_BS
         return plus(loss, self.config.board_loss_weight, loss_B), {
             "board_loss": (loss_B.detach(), torch.ones_like(loss_B, dtype=torch.bool)),
-            "board_accuracy": (is_right_BI, colors_BI > 0),  # of the stones
+            "board_accuracy": (is_right_BS, colors_BS > 0),  # of the stones
         }
 
 

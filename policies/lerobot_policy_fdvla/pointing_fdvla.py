@@ -2,7 +2,7 @@
 
 The prediction enters the action tokens ahead of both heads, as what they need: where the gripper has to go.
 
-Shapes: `B` batch, `P` places, `H` hidden size, `D` action dims, `S` state dims.
+Shapes: `B` batch, `P` places, `S` spots where stones lie, `H` hidden size, `D` action dims, `R` state dims.
 """
 
 from dataclasses import dataclass, replace
@@ -12,8 +12,8 @@ from lerobot.datasets import LeRobotDatasetMetadata
 from torch import Tensor, nn
 from torch.nn.functional import binary_cross_entropy_with_logits, cross_entropy, smooth_l1_loss
 
-from lerobot_bomb.bomb.pointing import PointedAt
-from lerobot_bomb.policies.pointing import DataUnits, Labels
+from lerobot_bomb.bomb.pointing import SPOTS_XY_M, PointedAt
+from lerobot_bomb.policies.pointing import DataUnits, Labels, number_of
 from lerobot_policy_fdvla.configuration_fdvla import FdvlaConfig
 
 FEEDBACK_DIM = 128
@@ -28,8 +28,10 @@ class Pointed:
 
     gripper: Tensor  # (B, 3) metres
     place_logits: Tensor  # (B, P)
-    stone: Tensor  # (B, 2) metres from the gripper
+    spot_logits: Tensor  # (B, S) where the stone is: of two that may be meant, the mean is none
+    stone: Tensor  # (B, 2) metres from the gripper, near the likeliest spot
     held_logit: Tensor  # (B,)
+    features: Tensor  # (B, H)
 
 
 class Pointer(DataUnits):
@@ -39,27 +41,43 @@ class Pointer(DataUnits):
     """
 
     places: Tensor  # (P, 2) metres
+    spots: Tensor  # (S, 2) metres
 
     def __init__(self, hidden_size: int, action_dim: int, places: list[list[float]]):
         super().__init__(action_dim)
         self.register_buffer("places", torch.tensor(places))
         self.features = nn.Sequential(nn.Linear(hidden_size, hidden_size), nn.SiLU())
-        self.place, self.stone = nn.Linear(hidden_size, len(places)), nn.Linear(hidden_size, 2)
+        self.register_buffer("spots", torch.tensor(SPOTS_XY_M), persistent=False)
+        self.place, self.spot = nn.Linear(hidden_size, len(places)), nn.Linear(hidden_size, len(SPOTS_XY_M))
         self.held = nn.Linear(hidden_size, 1)
+        # beside a spot, by where that is from the gripper
+        self.stone = nn.Sequential(
+            nn.Linear(hidden_size + 4, hidden_size), nn.SiLU(), nn.Linear(hidden_size, 2)
+        )
         last = nn.Linear(FEEDBACK_DIM, hidden_size)
         nn.init.zeros_(last.weight)
         nn.init.zeros_(last.bias)
         self.feedback = nn.Sequential(nn.Linear(NUM_NUMBERS, FEEDBACK_DIM), nn.SiLU(), last)
 
-    def forward(self, state_BH: Tensor, robot_state_BS: Tensor) -> Pointed:
+    def forward(self, state_BH: Tensor, robot_state_BR: Tensor) -> Pointed:
         """An action token's state and the normalised state of the robot -> what they point at."""
-        features_BH = self.features(state_BH)
+        features_BH, gripper_B3 = self.features(state_BH), self.gripper(robot_state_BR)
+        spot_logits_BS = self.spot(features_BH).float()
         return Pointed(
-            self.gripper(robot_state_BS),
+            gripper_B3,
             self.place(features_BH).float(),
-            NEAR_M * self.stone(features_BH).float(),
+            spot_logits_BS,
+            self._stone(features_BH, gripper_B3, spot_logits_BS.argmax(dim=1)),
             self.held(features_BH).float()[:, 0],
+            features_BH,
         )
+
+    def _stone(self, features_BH: Tensor, gripper_B3: Tensor, spot_B: Tensor) -> Tensor:
+        """(B, 2) metres from the gripper: the stone that lies near a spot."""
+        way_B2 = self.spots[spot_B] - gripper_B3[:, :2]
+        scaled_B4 = torch.cat([way_B2 / FAR_M, torch.tanh(way_B2 / NEAR_M)], dim=1)
+        beside_B2 = self.stone(torch.cat([features_BH, scaled_B4.to(features_BH.dtype)], dim=1))
+        return way_B2 + NEAR_M * beside_B2.float()
 
     def feed_back(self, pointed: Pointed, place_B: Tensor | None = None) -> Tensor:
         """(B, H) to be added to action tokens, for these places or else the likeliest.
@@ -89,11 +107,13 @@ class Pointer(DataUnits):
         )
 
     def losses(self, pointed: Pointed, labels: Labels) -> dict[str, Tensor]:
-        """(B,) each: of the place, the stone (in units of `NEAR_M`) and whether it is held."""
-        stone_B2 = labels.stone_xy - pointed.gripper[:, :2]
-        errors_B2 = smooth_l1_loss(pointed.stone / NEAR_M, stone_B2 / NEAR_M, reduction="none", beta=0.1)
+        """(B,) each: of the place, the spot, the stone in units of `NEAR_M`, and of whether that is held."""
+        way_B2, spot_B = labels.stone_xy - pointed.gripper[:, :2], number_of(labels.stone_xy, self.spots)
+        stone_B2 = self._stone(pointed.features, pointed.gripper, spot_B)
+        errors_B2 = smooth_l1_loss(stone_B2 / NEAR_M, way_B2 / NEAR_M, reduction="none", beta=0.1)
         return {
             "place_loss": cross_entropy(pointed.place_logits, labels.place, reduction="none"),
+            "spot_loss": cross_entropy(pointed.spot_logits, spot_B, reduction="none"),
             "stone_loss": errors_B2.mean(dim=1),
             "held_loss": binary_cross_entropy_with_logits(pointed.held_logit, labels.held, reduction="none"),
         }
