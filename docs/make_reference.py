@@ -27,8 +27,12 @@ from lerobot_bomb.policies.flag_groups import flags_of
 from lerobot_bomb.results.reading import RECORD_TYPES
 from lerobot_bomb.results.record import Record, field_names
 
-FOLDER = Path(__file__).parent / "reference"
-OURS = ("lerobot_bomb", "lerobot_env_", "lerobot_policy_")
+ROOT = Path(__file__).parents[1]
+FOLDER = ROOT / "docs" / "reference"
+OURS = {
+    "lerobot_bomb",
+    *(path.name for folder in ("envs", "policies") for path in (ROOT / folder).iterdir()),
+}  # packages
 JSON_KINDS = {bool: "true or false", int: "whole number", float: "number", str: "text", Any: "any"}
 LEFT_OUT = ("features", "features_map")  # of environments: declared by the code, set by nobody
 
@@ -40,12 +44,17 @@ def table(header: str, rows: Iterable[Iterable[str]]) -> list[str]:
     return [f"| {header} |", f"|{rule}", *(f"| {row} |" for row in cells), ""]
 
 
+def is_ours(cls: type) -> bool:
+    """Return True for a class of this package, also of its environments and policies."""
+    return cls.__module__.partition(".")[0] in OURS
+
+
 @cache
 def comments_of(config_class: type) -> dict[str, str]:
     """{field: the comment above it, or else behind it} of a dataclass and its bases."""
     found: dict[str, str] = {}
     for base in reversed(config_class.__mro__):
-        if base.__module__.startswith(OURS):
+        if is_ours(base):
             found |= _comments_in(textwrap.dedent(inspect.getsource(base)))
     return found
 
@@ -69,7 +78,7 @@ def _comments_in(source: str) -> dict[str, str]:
 
 def own_fields(config_class: type) -> list[dataclasses.Field]:
     """Return the fields that this package declares, not those of LeRobot's bases, in the class's order."""
-    ours = [base for base in config_class.__mro__ if base.__module__.startswith(OURS)]
+    ours = filter(is_ours, config_class.__mro__)
     names = {name for base in ours for name in vars(base).get("__annotations__", ())}
     fields = dataclasses.fields(config_class)
     return [each for each in fields if each.name in names and each.name not in LEFT_OUT]
@@ -140,7 +149,7 @@ def ours_of(registry: Any) -> dict[str, type]:
     """{type: its config} of what this package registered with LeRobot."""
     register_third_party_plugins()
     known = registry.get_known_choices()
-    return {name: each for name, each in sorted(known.items()) if each.__module__.startswith(OURS)}
+    return {name: each for name, each in sorted(known.items()) if is_ours(each)}
 
 
 def environments_page() -> str:

@@ -88,7 +88,7 @@ class SpatialvlaGridConfig(TokenVlaConfig, PlacesVlaConfig):
     use_state: bool = False
 
     # groups of action dimensions, a token each per step: [{"dims": [0, 1, 2], "transform": "polar", "bins":
-    # [16, 32, 8]}, ...]; unset: by action_layout
+    # [16, 32, 8]}, ...]; transforms are polar, identity, binary; unset: by action_layout
     action_groups: list[dict[str, Any]] | None = None
     # kind of action: "pose" (x, y, z, gripper; of 7 with three angles before the gripper) or "joints";
     # unset: by the dimensions' names
@@ -117,7 +117,8 @@ class SpatialvlaGridConfig(TokenVlaConfig, PlacesVlaConfig):
     depth_model_name: str = "Intel/zoedepth-nyu-kitti"
     # architecture of the depth model
     depth_config: dict[str, Any] | None = None
-    # {camera: 3x3 matrix in pixels of its image}, for data without observation.intrinsics.CAMERA
+    # {camera: [[fx, 0, cx], [0, fy, cy], [0, 0, 1]]} in pixels of the whole image, for data without
+    # observation.intrinsics.CAMERA
     camera_intrinsics: dict[str, list[list[float]]] = field(default_factory=dict)
     # 3-D points along a side of a patch
     ego3d_patch_reso: int = 2
