@@ -15,7 +15,7 @@ unexport PYTHONDONTWRITEBYTECODE
 PYTEST := $(BIN)/pytest -n auto --maxprocesses=4 --dist=loadfile --no-loadscope-reorder
 
 help:
-	@echo "make demo       set up; a trained policy plays, and its rates and pictures"
+	@echo "make demo       set up, evaluate a shipped policy, print its rates and pictures"
 	@echo "make demo-train set up, record, train a policy that places stones, evaluate it"
 	@echo "make test       set up and run the tests"
 	@echo "make test-long  the heavy tests as well"

@@ -190,7 +190,7 @@ def test_a_policy_that_was_not_recorded_must_be_named(
 ) -> None:
     path = rewritten(results("bomb_expert"), tmp_path / "r.jsonl", policy=None)
     assert main(["replay", str(path), f"--output={tmp_path / 'x'}"]) == 1
-    assert "does not say who played; name it with --policy.path" in capsys.readouterr().err
+    assert "does not name its policy; give --policy.path" in capsys.readouterr().err
 
 
 def test_a_policy_with_random_weights_cannot_be_had_again(

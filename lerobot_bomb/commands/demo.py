@@ -59,7 +59,7 @@ Next:
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the arguments."""
     parser.add_argument("--output_dir", type=path_flag, help="new folder (default: outputs/demo/DATE_TIME)")
-    parser.add_argument("--episodes", type=int, default=20, help="of each condition (default: 20)")
+    parser.add_argument("--episodes", type=int, default=20, help="episodes of each condition (default: 20)")
 
 
 def run(args: argparse.Namespace) -> int:

@@ -27,11 +27,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "paths", nargs="+", type=path_flag, metavar="FILE", help="files of --env.results_path"
     )
-    parser.add_argument("--output", type=path_flag, default=DEFAULT, help=f"default: {DEFAULT}")
-    parser.add_argument("--title", default=TITLE, help=f"of the page (default: {TITLE})")
-    videos = (
-        "play so many failures of each class again and show them, in a folder beside the page (default: 0)"
-    )
+    parser.add_argument("--output", type=path_flag, default=DEFAULT, help=f"page (default: {DEFAULT})")
+    parser.add_argument("--title", default=TITLE, help=f"title of the page (default: {TITLE})")
+    videos = "replay this many failures of each class, and show their videos (default: 0)"
     parser.add_argument("--videos", type=int, metavar="N", default=0, help=videos)
 
 
@@ -52,7 +50,7 @@ def run(args: argparse.Namespace) -> int:
         samples = _play(samples, folder, args.videos)
     missing = [file.missing for file in files.values() if file.missing]
     missing += [
-        f"{path}: {file.num_damaged} damaged lines are not counted"
+        f"{path}: {file.num_damaged} damaged records are not counted"
         for path, file in files.items()
         if file.num_damaged
     ]

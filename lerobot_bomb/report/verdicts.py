@@ -19,10 +19,7 @@ RANDOM, EXPERT = "random actions", "the scripted expert"
 TRAIN, HELDOUT = "what training shows (split train)", "what is held out (split heldout)"
 
 YES, NO, OPEN = "yes", "NO", "not shown"
-P_NOTE = (
-    "p: exact McNemar test, or Fisher's where it says so; each question is asked alone, and nothing is "
-    "adjusted for their number."
-)
+P_NOTE = "p: exact McNemar test, or Fisher's where it says so; not adjusted for the number of questions."
 
 
 @dataclass(frozen=True)
@@ -44,7 +41,7 @@ def table(arms: Mapping[str, list[Record]], verdicts: list[Verdict]) -> list[Tab
     answers = [[Cell(each.question), Cell(each.answer), Cell(each.evidence)] for each in verdicts]
     return [
         Table("Verdicts", ["question", "answer", "evidence"], answers, P_NOTE),
-        Table("Success", ["who acts", "success", "episodes"], rates, f"With {INTERVALS}; per cent."),
+        Table("Success", ["policy", "success", "episodes"], rates, f"With {INTERVALS}; per cent."),
     ]
 
 
