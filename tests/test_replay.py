@@ -11,7 +11,7 @@ from rrd_files import read_rrd
 
 from lerobot_bomb.commands.arguments import ANSWER_IS_NO
 from lerobot_bomb.commands.main import main
-from lerobot_bomb.commands.results_files import read_line
+from lerobot_bomb.commands.results_files import read_record
 from lerobot_bomb.conditions import NONE
 from lerobot_bomb.results.bomb import EpisodeResult
 from lerobot_bomb.results.record import ORIGIN
@@ -178,11 +178,11 @@ def test_wrong_flags_are_told(
 def test_a_line_is_that_of_an_editor(results: Callable[..., Path], tmp_path: Path) -> None:
     path, kept = tmp_path / "r.jsonl", results("bomb_expert").read_text().splitlines()
     path.write_text("\n".join([kept[0], kept[1][:40], "", *kept[1:]]) + "\n")
-    assert read_line(path, 1) == json.loads(kept[0])
-    assert read_line(path, 4) == json.loads(kept[1])
+    assert read_record(path, 1) == json.loads(kept[0])
+    assert read_record(path, 4) == json.loads(kept[1])
     for line in (2, 3):
         with pytest.raises(ValueError, match=r", whose lines are 1, 4\.\.5"):
-            read_line(path, line)
+            read_record(path, line)
 
 
 def test_a_policy_that_was_not_recorded_must_be_named(

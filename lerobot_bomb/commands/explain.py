@@ -16,7 +16,7 @@ from tqdm import tqdm
 from lerobot_bomb.bomb.episode import TEST_SEEDS
 from lerobot_bomb.checkpoints.names import check_checkpoint
 from lerobot_bomb.commands.arguments import add_checkpoint_arguments, check_at_least, path_flag
-from lerobot_bomb.commands.results_files import read_line
+from lerobot_bomb.commands.results_files import read_record
 from lerobot_bomb.commands.view import add_viewed_arguments, viewed_of
 from lerobot_bomb.conditions import NONE
 from lerobot_bomb.files import check_new_folder, written_whole
@@ -96,7 +96,7 @@ def _of_line(args: argparse.Namespace) -> "_Query":
     for name, default in (shared | args.own_flags["bomb"] | args.own_flags["bomb_pusht"]).items():
         if getattr(args, name) != default:
             raise ValueError(f"drop --env.{name.removeprefix('env_')}: the record of --results says it")
-    replay = Replay(read_line(args.results, args.line or 1), args.policy_path)
+    replay = Replay(read_record(args.results, args.line or 1), args.policy_path)
     if replay.checkpoint is None:
         raise ValueError("this record's policy has no checkpoint, so there is nothing to explain")
     check_checkpoint(replay.checkpoint)
@@ -146,7 +146,7 @@ def _moments(
 
 
 def _explain_one(args: argparse.Namespace, query: _Query) -> int:
-    from lerobot_bomb.explain.masked_episodes import masks_of, play_masked
+    from lerobot_bomb.explain.masked_episodes import masks_of, run_masked
     from lerobot_bomb.explain.recording import write_recording
     from lerobot_bomb.report.explanation import moment_sections, overview_section, traces_section
 
@@ -154,7 +154,7 @@ def _explain_one(args: argparse.Namespace, query: _Query) -> int:
     moments, result = _moments(args, query, query.seed, loaded)
     episodes = {}
     if viewed.env_type == "bomb" and args.fill != "other":
-        episodes = play_masked(viewed, loaded, masks_of(moments[0].snapshot, loaded, args.fill))
+        episodes = run_masked(viewed, loaded, masks_of(moments[0].snapshot, loaded, args.fill))
     name = viewed.name(loaded.config.type)
     sections = [overview_section(viewed.log().describe(result), moments, _command())]
     sections += [section for each in moments for section in moment_sections(each)]

@@ -12,7 +12,7 @@ from lerobot_bomb.commands.arguments import (
     path_flag,
     switch,
 )
-from lerobot_bomb.commands.results_files import read_line
+from lerobot_bomb.commands.results_files import read_record
 from lerobot_bomb.conditions import NONE
 from lerobot_bomb.results.record import ORIGIN, Record, different_fields, outcome_fields
 from lerobot_bomb.tables import print_lines
@@ -54,7 +54,7 @@ def run(args: argparse.Namespace) -> int:
     """Run the episode, write both files, print its result and whether the record says the same."""
     if unknown := [flag for flag in args.rest if not flag.startswith("--policy.")]:
         raise ValueError(f"{unknown[0]} is unknown; see `lerobot-bomb replay --help`")
-    record = read_line(args.path, args.line)
+    record = read_record(args.path, args.line)
     policy_flags = [f"--{flag.removeprefix('--policy.')}" for flag in args.rest]
     replay = Replay(record, args.policy_path, args.policy_device, policy_flags, args.depth)
     players = {RECORDED: replay.player()}

@@ -50,7 +50,7 @@ class ResultsFile:
         return [*self.numbered.values()]
 
 
-def read_line(path: Path, line: int) -> Record:
+def read_record(path: Path, line: int) -> Record:
     """Return the episode of a line, counted from 1 as an editor counts.
 
     Raises:
