@@ -9,7 +9,7 @@ import inspect
 import json
 import textwrap
 from argparse import SUPPRESS, Action
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Sequence
 from enum import Enum
 from functools import cache
 from pathlib import Path
@@ -193,6 +193,11 @@ def policies_page() -> str:
     return "\n".join(lines)
 
 
+def record_types() -> Sequence[type[Record]]:
+    """Return the type of the records of each environment."""
+    return RECORD_TYPES
+
+
 def axes_page() -> str:
     """Every perturbation axis with its levels."""
     levels = " | ".join(map(str, range(1, MAX_LEVEL + 1)))
@@ -203,7 +208,7 @@ def axes_page() -> str:
         "[perturbations](../perturbations.md).",
         "",
     ]
-    for record_type in RECORD_TYPES:
+    for record_type in record_types():
         for name, axis in record_type.condition.axes.items():
             lines += [f"## {record_type.env_type}: {name}", "", *_axis(axis)]
             lines += table(f"quantity | {levels} | unit | meaning", _magnitudes(axis))
@@ -237,7 +242,7 @@ def records_page() -> str:
         "",
     ]
     nested: dict[str, type] = {}
-    for record_type in RECORD_TYPES:
+    for record_type in record_types():
         version = list(record_type.versions)[-1]
         lines += [f"## {record_type.env_type}", "", f"Protocol `{version}`.", ""]
         lines += table("field | JSON | meaning", record_rows(record_type, nested))
@@ -287,7 +292,7 @@ def json_kind(hint: Any) -> str:
         elif get_origin(member) is dict:
             kinds.append("object")
         else:
-            kinds.append(JSON_KINDS[member])
+            kinds.append(JSON_KINDS[str if isinstance(member, type) and issubclass(member, str) else member])
     return " or ".join(kinds)
 
 

@@ -7,11 +7,10 @@ from typing import Any
 import pytest
 from lerobot.configs import PreTrainedConfig
 from lerobot.envs import EnvConfig
-from make_reference import FOLDER, ours_of, pages
+from make_reference import FOLDER, ours_of, pages, record_types
 
 from lerobot_bomb.commands.main import command_parser
 from lerobot_bomb.commands.table import COMMANDS
-from lerobot_bomb.results.reading import RECORD_TYPES
 from lerobot_bomb.results.record import field_names
 
 
@@ -69,7 +68,7 @@ def test_every_field_that_lerobot_does_not_have_is_there(
 
 
 def test_every_axis_is_there(made: dict[str, str]) -> None:
-    axes = {f"{each.env_type}: {axis}" for each in RECORD_TYPES for axis in each.condition.axes}
+    axes = {f"{each.env_type}: {axis}" for each in record_types() for axis in each.condition.axes}
     assert axes == sections(made["axes.md"]).keys() >= {"bomb: camera", "bomb_pusht: goal"}
     assert (
         "| angle | 3 | 6 | 9 | 12.5 | 16 | degrees | around the board, in a drawn direction |"
@@ -79,7 +78,7 @@ def test_every_axis_is_there(made: dict[str, str]) -> None:
 
 def test_every_field_of_a_record_is_there(made: dict[str, str]) -> None:
     found = sections(made["records.md"])
-    for record_type in RECORD_TYPES:
+    for record_type in record_types():
         names = {name.partition(".")[0] for name in first_cells(found[record_type.env_type])}
         assert names == {*field_names(record_type)}
     assert {"policy.weights_sha256", "inference.latency_p50_ms"} <= {*first_cells(made["records.md"])}
