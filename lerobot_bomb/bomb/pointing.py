@@ -12,7 +12,7 @@ from typing import Self
 import numpy as np
 
 from lerobot_bomb.bomb.board import BOARD
-from lerobot_bomb.bomb.commands import CELLS, TRAY_XY_M
+from lerobot_bomb.bomb.commands import INTERSECTIONS, TRAY_XY_M
 from lerobot_bomb.bomb.expert import current_goal, expert_action, held_share
 from lerobot_bomb.bomb.judge import LIFT_M
 from lerobot_bomb.bomb.observation import ACTION_DIM
@@ -24,7 +24,7 @@ LIFTED_M = BOARD.thickness_m + BOARD.stone_height_m / 2 + LIFT_M
 HELD = 0.5  # from this share on a stone counts as held
 NUM_OTHERS = 2  # places a frame, beside the one that is meant
 # where the expert puts stones
-PLACES_XY_M = (*(tuple(BOARD.intersection_xy(*cell).tolist()) for cell in CELLS), *TRAY_XY_M)
+PLACES_XY_M = (*(tuple(BOARD.intersection_xy(*cell).tolist()) for cell in INTERSECTIONS), *TRAY_XY_M)
 PREFIX = "pointing."
 # name -> names of its numbers; metres, shares, actions of the environment, colours of `colors_on_board`
 COLUMNS = {
@@ -34,7 +34,7 @@ COLUMNS = {
     f"{PREFIX}other_actions": tuple(
         f"action{i}_{dim}" for i in range(NUM_OTHERS) for dim in range(ACTION_DIM)
     ),
-    f"{PREFIX}board": tuple(f"row{row}_column{column}" for row, column in CELLS),
+    f"{PREFIX}board": tuple(f"row{row}_column{column}" for row, column in INTERSECTIONS),
 }
 
 
@@ -106,7 +106,7 @@ class Pointing(Meant):
 def colors_on_board(state: PrivilegedState) -> np.ndarray:
     """(25,) int64, row by row: 0 for an empty intersection, 1 for a black stone on it, 2 for a white one."""
     lies = state.stone_in_play & (state.stone_xyz[:, 2] < LIFTED_M)
-    ways = np.array(PLACES_XY_M[: len(CELLS)])[:, None] - state.stone_xyz[lies, :2]
+    ways = np.array(PLACES_XY_M[: len(INTERSECTIONS)])[:, None] - state.stone_xyz[lies, :2]
     is_on = np.linalg.norm(ways, axis=2) <= ON_INTERSECTION_M
     return (is_on * (1 + state.stone_is_white[lies])).max(axis=1, initial=0)
 
