@@ -5,10 +5,10 @@ from dataclasses import fields
 from pathlib import Path
 
 import pytest
+from config_fields import own_fields
 from lerobot.configs import PreTrainedConfig
 from lerobot.configs.parser import print_scoped_help
 from lerobot.configs.train import TrainPipelineConfig
-from make_reference import own_fields
 from policy_cases import CASES
 
 from lerobot_bomb.policies.flag_groups import flags_of
