@@ -116,13 +116,15 @@ def policies_page() -> str:
         groups = {
             "Listed by `--help`": [each for each in names if each not in {*research, *filled_in}],
             "For research, not in `--help`": [each for each in names if each in research],
-            "Filled in by the code": [each for each in names if each in filled_in],
         }
         lines += [f"## {name}", ""]
         for title, members in groups.items():
             if members:
                 rows = flag_rows(config_class, members, "policy")
                 lines += [f"**{title}**", "", *table("flag | default | meaning", rows)]
+        comments = comments_of(config_class)
+        rows = [[f"`{each}`", comments.get(each, "")] for each in names if each in filled_in]
+        lines += ["**Filled in by the code**", "", *table("field | meaning", rows)] if rows else []
     return "\n".join(lines)
 
 

@@ -41,7 +41,9 @@ def test_a_flag_that_is_not_listed_works(tmp_path: Path) -> None:
 def test_the_reference_lists_every_flag_in_its_group(name: str) -> None:
     section = PAGE.read_text().partition(f"\n## {name}\n")[2].partition("\n## ")[0]
     _, *tables = re.split(r"^\*\*.*\*\*$", section, flags=re.MULTILINE)
-    listed, research, filled_in = (set(re.findall(r"^\| `--policy\.(\w+)`", rows, re.M)) for rows in tables)
+    listed, research, filled_in = (
+        set(re.findall(r"^\| `(?:--policy\.)?(\w+)`", rows, re.M)) for rows in tables
+    )
     config_class = PreTrainedConfig.get_choice_class(name)
     assert research == {*flags_of(config_class, "RESEARCH")}
     assert filled_in < {*flags_of(config_class, "FILLED_IN")}  # the others are LeRobot's
