@@ -38,8 +38,9 @@ def flag_rows(config_class: type, names: Iterable[str], prefix: str) -> Iterator
     comments, choices = comments_of(config_class), getattr(config_class, "CHOICES", {})
     fields = {each.name: each for each in dataclasses.fields(config_class)}
     for name in names:
-        allowed = f" ({', '.join(map(str, choices[name]))})" if name in choices else ""
-        yield [f"`--{prefix}.{name}`", default_of(fields[name]), f"{comments.get(name, '')}{allowed}"]
+        meaning, allowed = comments.get(name, ""), [*map(str, choices.get(name, ()))]
+        meaning += "" if all(each in meaning for each in allowed) else f" ({', '.join(allowed)})"
+        yield [f"`--{prefix}.{name}`", default_of(fields[name]), meaning]
 
 
 def argument_rows(parser: Parser) -> Iterator[list[str]]:
