@@ -32,7 +32,7 @@ class Inference:
     # median seconds of a query in ms; a query serves all episodes of the batch
     latency_p50_ms: Positive
     latency_p95_ms: Positive  # 95th percentile of the same
-    # forward passes per query, mean, prompt included; fdvla: one per sampling step; null: unknown
+    # forward passes per query, mean, prompt and sampling steps included; null: unknown
     passes: Quantity | None
     # tokens generated per query for one episode, mean; null: none or unknown
     tokens: Quantity | None
