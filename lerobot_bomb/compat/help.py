@@ -1,11 +1,13 @@
 """The help of LeRobot's commands, which lists every field of a config as a flag."""
 
 import copy
+from argparse import SUPPRESS
 from collections.abc import Iterable
 from types import MappingProxyType
 
-# argparse's mark of a flag that works and is not listed; draccus passes `custom_args` on to it
-NOT_LISTED = MappingProxyType({"custom_args": {"help": "==SUPPRESS=="}})
+# argparse's mark of a flag that works and is not listed; draccus passes `custom_args` on to it. argparse
+# compares by identity, so an equal text would be printed
+NOT_LISTED = MappingProxyType({"custom_args": {"help": SUPPRESS}})
 
 
 def leave_out_of_help(config_class: type, names: Iterable[str]) -> None:
