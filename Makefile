@@ -2,7 +2,7 @@
 SHELL := /bin/bash
 .DEFAULT_GOAL := help
 .PHONY: help setup demo demo-train test test-long test-cuda judges neighbours test-lerobot mutants check build \
-	docs clean
+	reference docs clean
 
 BIN := .venv/bin
 STAMP := .venv/.installed
@@ -15,7 +15,7 @@ unexport PYTHONDONTWRITEBYTECODE
 PYTEST := $(BIN)/pytest -n auto --maxprocesses=4 --dist=loadfile --no-loadscope-reorder
 
 help:
-	@echo "make demo       set up; a trained policy plays, and its rates and pictures"
+	@echo "make demo       set up, evaluate a shipped policy, print its rates and pictures"
 	@echo "make demo-train set up, record, train a policy that places stones, evaluate it"
 	@echo "make test       set up and run the tests"
 	@echo "make test-long  the heavy tests as well"
@@ -26,6 +26,7 @@ help:
 	@echo "make mutants    changes of the statistics, actions and losses that no test notices: MUTANTS=400"
 	@echo "make check      ruff, format, pyright"
 	@echo "make build      sdist and wheel into dist/, tried in an environment of their own"
+	@echo "make reference  docs/reference/, from the code"
 	@echo "make docs       the documentation as a site, into site/"
 	@echo "make setup      only set up .venv"
 
@@ -82,6 +83,9 @@ check: $(STAMP)
 build: setup
 	@$(BIN)/pytest tests/test_packaging.py
 	@$(BIN)/python tests/outside/check_build.py
+
+reference: $(STAMP)
+	@$(BIN)/python docs/make_reference.py
 
 # built strictly: a link to no page or to no heading is an error
 docs: $(STAMP)

@@ -161,9 +161,11 @@ def run_claimed(args: argparse.Namespace, task: Task, run: dict[str, Any]) -> in
         },
     )
     checkpoint = last_checkpoint(folder / "train")
-    task_flag = f" --task_ids={list(task.task_ids)}".replace(" ", "") if task.task_ids else ""
-    task_flag += "" if task.suite == PLACE else f" --task={task.suite}"
-    watch = f"lerobot-bomb view --policy.path={checkpoint} --image_size={IMAGE_SIZE} --seed={args.first_seed}"
+    task_flag = f" --env.task_ids={list(task.task_ids)}".replace(" ", "") if task.task_ids else ""
+    task_flag += "" if task.suite == PLACE else f" --env.task={task.suite}"
+    watch = (
+        f"lerobot-bomb view --policy.path={checkpoint} --env.image_size={IMAGE_SIZE} --seed={args.first_seed}"
+    )
     print(f"The policy: {checkpoint}\nAn episode of it as a video: {watch} {task_flag}".rstrip())
     return 0 if training.bar is None else verdict(points[f"step {run['steps']}"], training.bar)
 

@@ -17,8 +17,8 @@ from pathlib import Path
 import numpy as np
 from machine import make_parser, positive, write_figures
 
-from lerobot_bomb.bomb.board import COLORS, Cell
-from lerobot_bomb.bomb.commands import Case, Drawn, Stones, Task, draw_command
+from lerobot_bomb.bomb.board import COLORS, Intersection
+from lerobot_bomb.bomb.commands import Case, Stones, Task, TaskInstance, draw_command
 from lerobot_bomb.bomb.episode import EpisodeSpec
 from lerobot_bomb.bomb.go import is_legal_move
 from lerobot_bomb.bomb.suite import Episode, find_suite
@@ -102,7 +102,7 @@ def floors_of_commands(suite: str, tasks: Sequence[Task], seeds: Sequence[int]) 
     }
 
 
-def share_of_guesses(task: Task, drawn: Drawn, case: Case, rng: np.random.Generator) -> float:
+def share_of_guesses(task: Task, drawn: TaskInstance, case: Case, rng: np.random.Generator) -> float:
     """Return the share of a verb's possible meanings there that ask for the same; nan: none fits."""
     abouts = {task.draw(rng).about for _ in range(NUM_GUESSES)}
     guesses = [task.case(replace(drawn, about=about)) for about in sorted(abouts)]
@@ -110,7 +110,7 @@ def share_of_guesses(task: Task, drawn: Drawn, case: Case, rng: np.random.Genera
     return float(np.mean([guess.plans == case.plans for guess in fitting])) if fitting else float("nan")
 
 
-def plans_without_colours(task: Task, drawn: Drawn, rng: np.random.Generator) -> tuple | None:
+def plans_without_colours(task: Task, drawn: TaskInstance, rng: np.random.Generator) -> tuple | None:
     """Return what a command asks for under other stone colours; None: nothing under those tried."""
     for _ in range(MAX_TRIES):
         supply = tuple(COLORS[i] for i in rng.integers(2, size=len(drawn.supply)))
@@ -121,14 +121,14 @@ def plans_without_colours(task: Task, drawn: Drawn, rng: np.random.Generator) ->
     return None
 
 
-def legal(episode: Episode, stone: int) -> list[Cell]:
+def legal(episode: Episode, stone: int) -> list[Intersection]:
     """Return the intersections where a stone of the tray may be put."""
     color = COLORS[int(episode.layout.stone_is_white[stone])]
     cells = [cell for cell in ALL_TARGETS if is_legal_move(episode.opening, cell, color)]
     return cells or list(ALL_TARGETS)
 
 
-def answer_without_colours(episode: Episode, rng: np.random.Generator) -> tuple[int, Cell | None]:
+def answer_without_colours(episode: Episode, rng: np.random.Generator) -> tuple[int, Intersection | None]:
     """(stone, place) that the instruction means where the stones have other colours."""
     suite, layout = episode.spec.suite, episode.layout
     if suite == "object":
@@ -149,7 +149,7 @@ def answer_without_colours(episode: Episode, rng: np.random.Generator) -> tuple[
     return episode.stone, episode.target  # one stone, whose place is named by numbers
 
 
-def recoloured(opening: Stones, rng: np.random.Generator) -> dict[Cell, str]:
+def recoloured(opening: Stones, rng: np.random.Generator) -> dict[Intersection, str]:
     """The stones on the board in colours drawn at random."""
     return {cell: COLORS[rng.integers(2)] for cell in opening}
 

@@ -12,8 +12,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from lerobot_bomb.bomb.board import BOARD, TRAY_CENTER_XY, TRAY_HALF_SIZE_XY, Cell
-from lerobot_bomb.bomb.commands import CELLS, draw_command, is_heldout
+from lerobot_bomb.bomb.board import BOARD, TRAY_CENTER_XY, TRAY_HALF_SIZE_XY, Intersection
+from lerobot_bomb.bomb.commands import INTERSECTIONS, draw_command, is_heldout
 from lerobot_bomb.bomb.episode import EpisodeSpec
 from lerobot_bomb.bomb.expert import expert_action
 from lerobot_bomb.bomb.go import is_legal_position
@@ -35,7 +35,7 @@ CONDITIONS = ("none", "language:2", "language:3", "language:4", "language:5", "s
 SWAP, PUSH_LEFT, CLEAR_ROW = 2, 3, 7  # tasks of `goal`
 OPENING_OF_4, TURNS_OF_4, COPY_2 = 2, 4, 10  # tasks of `long`
 
-type Board = dict[Cell, str]
+type Board = dict[Intersection, str]
 
 
 # An independent reader: what the board must look like in the end, from what is said and seen
@@ -51,24 +51,24 @@ def board_at_start(episode: PerturbedEpisode) -> Board:
     return {BOARD.nearest_intersection(layout.stone_xy[i]): color_of(episode, int(i)) for i in on_board}
 
 
-def around(cell: Cell) -> set[Cell]:
+def around(cell: Intersection) -> set[Intersection]:
     row, column = cell
-    return {(row + 1, column), (row - 1, column), (row, column + 1), (row, column - 1)} & set(CELLS)
+    return {(row + 1, column), (row - 1, column), (row, column + 1), (row, column - 1)} & set(INTERSECTIONS)
 
 
-def groups(board: Board) -> list[set[Cell]]:
-    found: list[set[Cell]] = []
+def groups(board: Board) -> list[set[Intersection]]:
+    found: list[set[Intersection]] = []
     for cell, color in board.items():
         touching = [g for g in found if board[next(iter(g))] == color and any(around(c) & {cell} for c in g)]
         found = [g for g in found if g not in touching] + [{cell}.union(*touching)]
     return found
 
 
-def liberties(board: Board, group: set[Cell]) -> set[Cell]:
+def liberties(board: Board, group: set[Intersection]) -> set[Intersection]:
     return set().union(*map(around, group)) - board.keys()
 
 
-def cells_in(text: str) -> list[Cell]:
+def cells_in(text: str) -> list[Intersection]:
     return [(int(r), int(c)) for r, c in re.findall(r"row (\d), column (\d)", text)]
 
 
@@ -114,7 +114,7 @@ def is_done(said: list[str], board: Board, pattern: Board, end: Board) -> bool:
     if "copy the pattern" in text:
         return end == board | pattern
     if found := re.search(r"fill the free intersections of row (\d).*(black|white) last", text):
-        free = [cell for cell in CELLS if cell[0] == int(found[1]) and cell not in board]
+        free = [cell for cell in INTERSECTIONS if cell[0] == int(found[1]) and cell not in board]
         colors = [found[2], "white" if found[2] == "black" else "black"]
         return end == board | {cell: colors[i % 2] for i, cell in enumerate(reversed(free))}
     moves = re.findall(r"(black|white) at row (\d), column (\d)", text)
@@ -134,7 +134,7 @@ def board_at_end(episode: PerturbedEpisode) -> Board:
     return board
 
 
-def standing(episode: Episode) -> dict[int, Cell]:
+def standing(episode: Episode) -> dict[int, Intersection]:
     on_board = [int(i) for i in np.flatnonzero(episode.layout.stone_in_play) if i not in episode.supply]
     return {i: BOARD.nearest_intersection(episode.layout.stone_xy[i]) for i in on_board}
 

@@ -47,7 +47,7 @@ def test_pairs_are_counted_by_condition(a: Path, b: Path, capsys: Printed) -> No
     nominal, perturbed = out.split("camera:3: 10 pairs")
     assert "none: 10 pairs" in nominal and "B - A      -10.0 points" in nominal
     assert "A alone succeeded in 8, B alone in 0 of 10 pairs, p = 0.016" in perturbed  # 2 * 2 / 256
-    assert "not compared, for the other did not play them: 4 episodes of A, 0 of B" in out
+    assert "not compared, since only one has them: 4 episodes of A, 0 of B" in out
     assert "pairs tell such a difference apart" in nominal
 
 

@@ -19,7 +19,7 @@ from lerobot_bomb.commands import main as cli
 from lerobot_bomb.commands.table import COMMANDS
 
 ROOT = Path(__file__).parents[1]
-PAGES = [ROOT / "README.md", *sorted((ROOT / "docs").glob("*.md"))]
+PAGES = [ROOT / "README.md", *sorted((ROOT / "docs").rglob("*.md"))]
 REAL_ROBOT = ROOT / "docs" / "real_robot.md"
 NOT_LEROBOTS = {"pip", "ssh"}
 WITHOUT_CONFIG = {"lerobot-find-port", "lerobot-find-cameras"}  # read no flags, or one word

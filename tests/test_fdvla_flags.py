@@ -1,9 +1,6 @@
 """Flags of `fdvla`: what it refuses, what it does without, what follows from flags that are not given."""
 
 import math
-import re
-from dataclasses import fields
-from pathlib import Path
 from typing import Any
 
 import pytest
@@ -19,12 +16,7 @@ from fdvla_cases import (
     make_policy,
 )
 
-from lerobot_bomb.checkpoints.environment import ConfigWithEnvironment
 from lerobot_bomb.flag_errors import FlagError
-from lerobot_bomb.policies.config import ChunkConfig, RelativeVlaConfig, VlaConfig
-from lerobot_bomb.policies.flag_groups import flags_of
-from lerobot_bomb.policies.pointing_config import PlacesVlaConfig, PointingVlaConfig
-from lerobot_policy_fdvla.configuration_fdvla import FdvlaConfig
 
 
 @pytest.mark.parametrize(
@@ -151,36 +143,3 @@ def test_an_environment_may_name_no_task(tasks: tuple[str, ...]) -> None:
     batch = make_batch(policy, 2, tasks=tasks)
     assert policy(batch)[0].isfinite()
     assert policy.predict_action_chunk(batch).isfinite().all()
-
-
-OURS = (
-    ConfigWithEnvironment,
-    ChunkConfig,
-    VlaConfig,
-    PointingVlaConfig,
-    PlacesVlaConfig,
-    RelativeVlaConfig,
-    FdvlaConfig,
-)
-
-
-def test_the_policys_page_has_every_flag_in_its_table() -> None:
-    page = (Path(__file__).parents[1] / "docs" / "fdvla.md").read_text()
-    table = page.split("## Flags")[1].split("\n## ")[0]
-    listed = {
-        together(name)
-        for row in re.findall(r"^\| (`.*?) \|", table, re.M)
-        for name in re.findall(r"`(\w+\*?)`", row)
-    }
-    flags = {
-        together(field.name)
-        for field in fields(FdvlaConfig)
-        if any(field.name in vars(of)["__annotations__"] for of in OURS)
-        and field.name not in (*flags_of(FdvlaConfig, "FILLED_IN"), "push_to_hub")
-    }
-    assert listed == flags
-
-
-def together(name: str) -> str:
-    """Return a flag as the page names it: those of the optimiser and of the schedule as one."""
-    return re.sub("^(optimizer|scheduler)_.*", r"\1_*", name)

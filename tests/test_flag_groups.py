@@ -5,6 +5,7 @@ from dataclasses import fields
 from pathlib import Path
 
 import pytest
+from config_fields import own_fields
 from lerobot.configs import PreTrainedConfig
 from lerobot.configs.parser import print_scoped_help
 from lerobot.configs.train import TrainPipelineConfig
@@ -12,9 +13,7 @@ from policy_cases import CASES
 
 from lerobot_bomb.policies.flag_groups import flags_of
 
-DOCS = Path(__file__).parents[1] / "docs"
-# of LeRobot, and in every policy
-LEROBOTS = {"type", "device", "push_to_hub", "repo_id", "private", "tags", "license"}
+PAGE = Path(__file__).parents[1] / "docs" / "reference" / "policies.md"
 MAX_LISTED = 33
 
 
@@ -38,26 +37,14 @@ def test_a_flag_that_is_not_listed_works(tmp_path: Path) -> None:
     assert config.mask_level == "step"  # pyright: ignore[reportAttributeAccessIssue]
 
 
-def table(policy_type: str, heading: str) -> set[str]:
-    """Return the flags in a table of a policy's page; `optimizer_*` are those that no table names."""
-    page = (DOCS / f"{policy_type}.md").read_text()
-    flags = page.partition("\n## Flags\n")[2].partition("\n## ")[0]
-    named = set(re.findall(r"`([\w*]+)`", "".join(re.findall(r"^\|([^|]*)\|", flags, re.MULTILINE))))
-    rows = flags.partition(f"| {heading} | |\n|---|---|\n")[2].partition("\n\n")[0].splitlines()
-    names = {name for row in rows for name in re.findall(r"`([\w*]+)`", row.split("|")[1])}
-    for pattern in [name for name in names if name.endswith("*")]:
-        names.remove(pattern)
-        names |= {name for name in names_of(policy_type) if name.startswith(pattern[:-1])} - named
-    return names
-
-
 @pytest.mark.parametrize("name", sorted(CASES))
-def test_a_policys_page_has_every_flag_in_its_group(name: str) -> None:
-    research = set(flags_of(PreTrainedConfig.get_choice_class(name), "RESEARCH"))
-    filled_in = set(flags_of(PreTrainedConfig.get_choice_class(name), "FILLED_IN"))
-    told, told_of_research = table(name, "flag"), table(name, "for research, not in `--help`")
-    if name == "spatialvla_grid":  # "The others are as for vla0_smol"
-        told |= table("vla0_smol", "flag") & {*names_of(name)}
-        told_of_research |= table("vla0_smol", "for research, not in `--help`") & {*names_of(name)}
-    assert told_of_research == research
-    assert told == {*names_of(name)} - research - filled_in - LEROBOTS
+def test_the_reference_lists_every_flag_in_its_group(name: str) -> None:
+    section = PAGE.read_text().partition(f"\n## {name}\n")[2].partition("\n## ")[0]
+    _, *tables = re.split(r"^\*\*.*\*\*$", section, flags=re.MULTILINE)
+    listed, research, filled_in = (
+        set(re.findall(r"^\| `(?:--policy\.)?(\w+)`", rows, re.M)) for rows in tables
+    )
+    config_class = PreTrainedConfig.get_choice_class(name)
+    assert research == {*flags_of(config_class, "RESEARCH")}
+    assert filled_in < {*flags_of(config_class, "FILLED_IN")}  # the others are LeRobot's
+    assert listed == {each.name for each in own_fields(config_class)} - research - filled_in

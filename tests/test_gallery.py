@@ -224,13 +224,9 @@ def test_a_flag_that_pusht_does_not_have_is_named(
 
 
 @pytest.mark.parametrize(("name", "axes"), [("pusht", PUSHT_AXES), ("libero", LIBERO_AXES)])
-def test_an_environments_page_has_every_axis_with_its_magnitudes(name: str, axes: Mapping[str, Axis]) -> None:
-    text = (DOCS / f"{name}.md").read_text()
-    for axis_name, axis in axes.items():
-        sheet = f"media/bomb_{name}/{axis_name}.jpg"
-        rows = [
-            f"| {quantity} | {', '.join(f'{value:g}' for value in size.levels)} {size.unit} | {size.what} |"
-            for quantity, size in axis.magnitudes.items()
-        ]
-        assert f"| [`{axis_name}`]({sheet}): {', '.join(axis.changes)} " + "\n| ".join(rows) in text
+def test_every_axis_of_an_environment_has_its_sheet(name: str, axes: Mapping[str, Axis]) -> None:
+    text = (DOCS / "reference" / "axes.md").read_text()
+    for axis in axes:
+        sheet = f"media/bomb_{name}/{axis}.jpg"
+        assert f"(../{sheet})" in text
         assert 10_000 < (DOCS / sheet).stat().st_size < 300_000

@@ -11,8 +11,8 @@ from dataclasses import dataclass, replace
 import numpy as np
 import pytest
 
-from lerobot_bomb.bomb.board import BOARD, COLORS, NUM_STONES, TRAY_CENTER_XY, TRAY_HALF_SIZE_XY, Cell
-from lerobot_bomb.bomb.commands import CELLS, SUPPLY_XY_M, TRAY_XY_M
+from lerobot_bomb.bomb.board import BOARD, COLORS, NUM_STONES, TRAY_CENTER_XY, TRAY_HALF_SIZE_XY, Intersection
+from lerobot_bomb.bomb.commands import INTERSECTIONS, SUPPLY_XY_M, TRAY_XY_M
 from lerobot_bomb.bomb.episode import EpisodeSpec
 from lerobot_bomb.bomb.expert import OFF_BESIDE_M, REACHED_HEIGHT_M, REACHED_LATERAL_M, expert_action
 from lerobot_bomb.bomb.go import group_of, liberties_of
@@ -35,7 +35,7 @@ FLAT_M = REACHED_HEIGHT_M[0]  # of its height at rest, for a stone that lies
 LEANS_M = BOARD.stone_height_m  # the same in the tray, where one stone may lean on another
 HELD_OPENING_M = (0.012, 0.030)  # between pads that hold a stone
 REST_M = BOARD.thickness_m + BOARD.stone_height_m / 2
-LEFT_SIDE = [cell for cell in CELLS if cell[1] < 2]
+LEFT_SIDE = [cell for cell in INTERSECTIONS if cell[1] < 2]
 type Place = tuple[float, float]  # metres
 
 
@@ -45,11 +45,11 @@ class View:
 
     text: str  # what is said
     state: PrivilegedState  # its stones in a drawn order, its goals none
-    pattern: dict[Cell, str]  # on the small board
+    pattern: dict[Intersection, str]  # on the small board
 
     def __post_init__(self) -> None:
         self.held: int | None = None
-        self.on_board: dict[Cell, int] = {}
+        self.on_board: dict[Intersection, int] = {}
         self.in_tray: list[int] = []  # row by row
         self.lying: list[int] = []  # on the board or in the tray
         for stone in np.flatnonzero(self.state.stone_in_play).tolist():
@@ -71,10 +71,10 @@ class View:
     def color(self, stone: int | None) -> str | None:
         return None if stone is None else COLORS[int(self.state.stone_is_white[stone])]
 
-    def at(self, cell: Cell) -> str | None:
+    def at(self, cell: Intersection) -> str | None:
         return self.color(self.on_board.get(cell))
 
-    def cells(self, color: str) -> list[Cell]:
+    def cells(self, color: str) -> list[Intersection]:
         return sorted(cell for cell in self.on_board if self.at(cell) == color)
 
     def first_in_tray(self, color: str) -> int:
@@ -108,12 +108,12 @@ class View:
 type Next = tuple[int, Place] | None  # the stone that is to be moved and where to; None: all is done
 
 
-def of_cell(cell: Cell) -> Place:
+def of_cell(cell: Intersection) -> Place:
     x, y = BOARD.intersection_xy(*cell)
     return float(x), float(y)
 
 
-def cells_in(text: str) -> list[Cell]:
+def cells_in(text: str) -> list[Intersection]:
     return [(int(r), int(c)) for r, c in re.findall(r"(?:row |\()(\d),(?: column)? (\d)", text)]
 
 
@@ -145,7 +145,7 @@ def next_from_tray(text: str, view: View) -> Next:
     if "copy the pattern" in text:
         return next_of_moves([(color, cell) for cell, color in sorted(view.pattern.items())], view)
     if found := re.search(r"free intersections of row (\d).*(black|white) last", text):
-        free = [cell for cell in CELLS if cell[0] == int(found[1]) and cell not in view.on_board]
+        free = [cell for cell in INTERSECTIONS if cell[0] == int(found[1]) and cell not in view.on_board]
         color = COLORS[(COLORS.index(found[2]) + len(free) - 1) % 2]
         return next_of_moves([(color, cell) for cell in free[:1]], view)
     place = next(iter(cells_in(text)), None) or named_place(text, view)
@@ -154,7 +154,7 @@ def next_from_tray(text: str, view: View) -> Next:
     return named_stone(text, view) if view.held is None else view.held, of_cell(place)
 
 
-def next_of_moves(moves: list[tuple[str, Cell]], view: View) -> Next:
+def next_of_moves(moves: list[tuple[str, Intersection]], view: View) -> Next:
     for color, cell in moves:
         if view.at(cell) != color:
             return view.first_in_tray(color) if view.held is None else view.held, of_cell(cell)
@@ -190,7 +190,7 @@ def next_of_capture(color: str, by: str, view: View) -> Next:
     return (view.on_board[taken[0]], view.next_tray_place) if taken else None
 
 
-def next_of_swap(colors: tuple[str, str], cells: list[Cell], view: View) -> Next:
+def next_of_swap(colors: tuple[str, str], cells: list[Intersection], view: View) -> Next:
     (first, second), (a, b) = colors, cells
     if view.at(a) == second:  # the first goes where the second stood
         if view.at(b) == first:
@@ -219,7 +219,7 @@ def named_stone(text: str, view: View) -> int:
     return view.first_in_tray(found[1])
 
 
-def named_place(text: str, view: View) -> Cell | None:
+def named_place(text: str, view: View) -> Intersection | None:
     if found := re.search(r"(left of|right of|behind|in front of|between) the (?:two )?(\w+) stone", text):
         anchors = view.cells(found[2])
         if found[1] == "between":
@@ -264,11 +264,11 @@ def goals_of_reader(view: View) -> tuple[Goal, ...]:
 
 def put_down_on(xy: np.ndarray) -> Place | None:
     """Return the intersection, or the place in the tray, that a stone was put down on."""
-    places = [*map(of_cell, CELLS), *TRAY_XY_M]
+    places = [*map(of_cell, INTERSECTIONS), *TRAY_XY_M]
     return next((place for place in places if np.hypot(*(xy - place)) < REACHED_LATERAL_M[1]), None)
 
 
-def seen(moment: Moment, pattern: dict[Cell, str], rng: np.random.Generator) -> View:
+def seen(moment: Moment, pattern: dict[Intersection, str], rng: np.random.Generator) -> View:
     state = moment.state
     order = rng.permutation(NUM_STONES)
     return View(

@@ -139,7 +139,7 @@ def test_an_interrupted_part_goes_on(
         patch.setattr(blocks, "_write_episode", write_three)
         assert main(flags) == 130
     folder = parts_folder(tmp_path / "x") / "1-of-2.recording"
-    assert f"2 episodes are kept in {folder}, go on with --resume" in capsys.readouterr().err
+    assert f"2 episodes are kept in {folder}, continue with --resume" in capsys.readouterr().err
     assert [block.name for block in finished_blocks(folder)] == ["block-00001"]
     assert main(flags) == 0
     assert f"4 episodes, 55 frames, of the seeds 5..8: {folder}" in capsys.readouterr().out
@@ -160,7 +160,7 @@ def test_an_interrupted_join_goes_on(
     with monkeypatch.context() as patch:
         patch.setattr(blocks, "merge_blocks", interrupted)
         assert main(flags) == 130
-    assert "stopped; all parts stay, and the same command goes on" in capsys.readouterr().err
+    assert "stopped; all parts stay, and the same command resumes" in capsys.readouterr().err
     kept = finished_blocks(root.with_name("x.recording"))
     assert [block.name for block in kept] == ["block-00003"]
     assert main([*flags[:-1], "--shard=1/2"]) == 0  # submitted again

@@ -149,7 +149,7 @@ def test_a_stopped_recorder_says_how_to_go_on(
         else:
             check_blocks(root, blocks)
             assert process.returncode == code
-            assert ("go on with --resume" if blocks else "nothing is kept") in messages
+            assert ("continue with --resume" if blocks else "nothing is kept") in messages
             assert unfinished_folder(root).exists() == bool(blocks)
     root = tmp_path / f"{recording}"
     assert start(root, "video").wait(TIMEOUT_S) == 0

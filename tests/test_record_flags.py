@@ -107,7 +107,7 @@ def test_an_unfinished_recording_needs_resume(tmp_path: Path, capsys: pytest.Cap
     folder.mkdir()
     write_json(parameters_file(folder), {"recording": RECORDING.to_dict()})
     assert cli.main([*FLAGS, f"--root={tmp_path / 'x'}"]) == 1
-    assert "go on with --resume or delete it" in capsys.readouterr().err
+    assert "continue with --resume or delete it" in capsys.readouterr().err
 
 
 def test_a_folder_of_something_else_is_left_alone(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

@@ -176,7 +176,7 @@ def test_ctrl_c_and_sigterm_say_what_is_kept(
         moment = Moment(action, part, rng.randint(1, 30))
         ended = server.record(root, *FLAGS, *resume_flag(root), moment=moment)
         assert ended.exit_code == code, ended.messages
-        what = f"{kept} episodes are kept in {folder}, go on with --resume"
+        what = f"{kept} episodes are kept in {folder}, continue with --resume"
         assert f"--root={root}: stopped; {what}" in ended.messages
         assert "Traceback" not in "\n".join(ended.messages)
     assert server.record(root, *FLAGS, "--resume").exit_code == 0
@@ -235,7 +235,7 @@ def test_a_full_disk_is_reported_and_what_was_finished_is_kept(
         (disk / "filler").unlink(missing_ok=True)
         assert ended.exit_code == 1, (pattern, ended.messages)
         error = [line for line in ended.messages if FULL in line]
-        what = f"{kept} episodes are kept in {folder}, go on with --resume" if kept else NOTHING
+        what = f"{kept} episodes are kept in {folder}, continue with --resume" if kept else NOTHING
         assert len(error) == 1, ended.messages
         assert error[0].startswith(f"lerobot-bomb record: --root={root}: ")
         assert error[0].endswith(f"; {what}")

@@ -11,7 +11,7 @@ from rrd_files import read_rrd
 
 from lerobot_bomb.commands.arguments import ANSWER_IS_NO
 from lerobot_bomb.commands.main import main
-from lerobot_bomb.commands.results_files import read_line
+from lerobot_bomb.commands.results_files import read_record
 from lerobot_bomb.conditions import NONE
 from lerobot_bomb.results.bomb import EpisodeResult
 from lerobot_bomb.results.record import ORIGIN
@@ -146,7 +146,7 @@ def test_other_weights_are_refused(
     policy = json.loads(path.read_text().splitlines()[0])["policy"]
     other = rewritten(path, tmp_path / "r.jsonl", policy=policy | {"weights_sha256": "0" * 64})
     assert main(["replay", str(other), f"--output={tmp_path / 'x'}"]) == 1
-    assert "holds other weights than those that played" in capsys.readouterr().err
+    assert "holds other weights than those of the record" in capsys.readouterr().err
     moved = rewritten(path, tmp_path / "m.jsonl", policy=policy | {"path": "gone"})
     assert main(["replay", str(moved), f"--output={tmp_path / 'x'}"]) == 1
     assert "--policy.path=gone: there is no such folder" in capsys.readouterr().err
@@ -178,11 +178,11 @@ def test_wrong_flags_are_told(
 def test_a_line_is_that_of_an_editor(results: Callable[..., Path], tmp_path: Path) -> None:
     path, kept = tmp_path / "r.jsonl", results("bomb_expert").read_text().splitlines()
     path.write_text("\n".join([kept[0], kept[1][:40], "", *kept[1:]]) + "\n")
-    assert json.loads(read_line(path, 1).to_json()) == json.loads(kept[0])
-    assert json.loads(read_line(path, 4).to_json()) == json.loads(kept[1])
+    assert json.loads(read_record(path, 1).to_json()) == json.loads(kept[0])
+    assert json.loads(read_record(path, 4).to_json()) == json.loads(kept[1])
     for line in (2, 3):
         with pytest.raises(ValueError, match=r", whose lines are 1, 4\.\.5"):
-            read_line(path, line)
+            read_record(path, line)
 
 
 def test_a_policy_that_was_not_recorded_must_be_named(
@@ -190,7 +190,7 @@ def test_a_policy_that_was_not_recorded_must_be_named(
 ) -> None:
     path = rewritten(results("bomb_expert"), tmp_path / "r.jsonl", policy=None)
     assert main(["replay", str(path), f"--output={tmp_path / 'x'}"]) == 1
-    assert "does not say who played; name it with --policy.path" in capsys.readouterr().err
+    assert "does not name its policy; give --policy.path" in capsys.readouterr().err
 
 
 def test_a_policy_with_random_weights_cannot_be_had_again(

@@ -238,7 +238,7 @@ def test_the_page_says_how_many_lines_are_damaged(rows: Rows, tmp_path: Path) ->
     path = tmp_path / "r.jsonl"
     path.write_text("".join(json.dumps(row) + "\n" for row in rows) + "rubbish\n{}\n")
     assert main(["report", str(path), f"--output={tmp_path / 'page.html'}"]) == 0
-    assert f"{path}: 2 damaged lines are not counted" in (tmp_path / "page.html").read_text()
+    assert f"{path}: 2 damaged records are not counted" in (tmp_path / "page.html").read_text()
 
 
 def test_the_command_that_is_given_plays_the_same_again(rows: Rows, written: Path) -> None:

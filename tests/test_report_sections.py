@@ -330,13 +330,13 @@ def test_each_sampled_failure_has_the_command_that_replays_its_line(
         numbers = [row["failure"] for row in shown]
         assert numbers == ["dropped"] * NUM_SAMPLES + ["imprecise"] * 2
         for row in shown:
-            command, replay, path, line = shlex.split(row["play it again"])
+            command, replay, path, line = shlex.split(row["replay"])
             assert (command, replay) == ("lerobot-bomb", "replay")
             named = json.loads(Path(path).read_text().splitlines()[int(line.removeprefix("--line=")) - 1])
             assert named in json.loads(json.dumps(rows))
             assert (named["failure"], named["spec"]["seed"]) == (row["failure"], row["seed"])
             assert named["spec"]["perturbations"] == row["condition"]
-        assert len({row["play it again"] for row in shown}) == len(shown)
+        assert len({row["replay"] for row in shown}) == len(shown)
 
 
 def test_the_line_is_that_of_the_file_as_replay_counts(tmp_path: Path) -> None:

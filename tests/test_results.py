@@ -193,7 +193,7 @@ def test_a_damaged_line_is_named_and_the_others_count(
     assert f"{path}:2: not an episode result: " in error
     assert message in error
     assert error.count("\n") == 1
-    assert "damaged lines, which are not counted: 1" in out
+    assert "damaged records, which are not counted: 1" in out
     assert "2 episodes" in out
     assert main(["results", str(path), "--strict"]) == 1
     assert message in capsys.readouterr().err
@@ -361,7 +361,7 @@ def test_a_heading_says_what_was_asked(path: Path, capsys: pytest.CaptureFixture
     )
     assert "perturbations=camera:3, seeds 4, 7" in output
     assert "256 px, render_preset fast, OpenGL Mesa, llvmpipe, MuJoCo 3.8.1, lerobot_bomb " in output
-    assert "1 lines count no more, a later one is of the same episode" in output
+    assert "1 records are replaced by later ones of the same episode" in output
     assert 'without an unperturbed one to compare with: 2; add "none" to --env.perturbations' in output
 
 
@@ -371,7 +371,7 @@ def test_lines_of_1_0_are_read_and_said_to_be_incomplete(
     output = printed(path, "\n".join(old_row(seed) for seed in range(3)), capsys)
     assert ": 3 episodes" in output
     assert "protocol 1.0, suite=place" in output
-    assert "lines of protocol 1.0 are incomplete: they lack policy, mujoco_version, opengl_vendor, " in output
+    assert "records of protocol 1.0 lack policy, mujoco_version, opengl_vendor, " in output
     assert "policy not recorded" in output
     assert main(["results", str(path), "--strict"]) == 0
 

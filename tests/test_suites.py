@@ -9,7 +9,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from lerobot_bomb.bomb.board import BOARD, TRAY_CENTER_XY, TRAY_HALF_SIZE_XY, Cell
+from lerobot_bomb.bomb.board import BOARD, TRAY_CENTER_XY, TRAY_HALF_SIZE_XY, Intersection
 from lerobot_bomb.bomb.episode import EpisodeSpec
 from lerobot_bomb.bomb.go import is_legal_position
 from lerobot_bomb.bomb.observation import RenderOptions
@@ -25,7 +25,7 @@ SEEDS = st.integers(0, 2**31)
 CONDITIONS = ("none", "language:1", "language:2", "language:3", "stones:5", "start:5", "all:5")
 
 
-def stones_on_board(episode: PerturbedEpisode) -> dict[Cell, str]:
+def stones_on_board(episode: PerturbedEpisode) -> dict[Intersection, str]:
     layout = episode.layout
     on_board = [i for i in np.flatnonzero(layout.stone_in_play) if i not in episode.supply]
     return {
@@ -62,7 +62,7 @@ def meant_stones(instruction: str, episode: PerturbedEpisode) -> set[int]:
     return {i for i in supply if color[i] == found[1]}
 
 
-def meant_places(instruction: str, episode: PerturbedEpisode) -> set[Cell]:
+def meant_places(instruction: str, episode: PerturbedEpisode) -> set[Intersection]:
     """Return the places where that reader puts a stone."""
     stones = stones_on_board(episode)
     free = {(row, column) for row in range(5) for column in range(5)} - set(stones)

@@ -390,7 +390,7 @@ def test_readers_say_what_a_sweep_that_was_stopped_lacks(tmp_path: Path) -> None
     results = tmp_path / "results.jsonl"
     assert missing_of_sweep(results, 6) == ""
     assert missing_of_sweep(results, 2) == (
-        f"{results}: 4 of 6 episodes are missing; `lerobot-bomb sweep {tmp_path}` goes on"
+        f"{results}: 4 of 6 episodes are missing; `lerobot-bomb sweep {tmp_path}` resumes"
     )
     (tmp_path / "errors.jsonl").write_text("{}\n{}\n")
     errors = f"an error ended 2: {tmp_path / 'errors.jsonl'}"

@@ -3,13 +3,13 @@
 from collections.abc import Iterator
 from dataclasses import replace
 
-from lerobot_bomb.bomb.board import BOARD, COLORS, Cell
+from lerobot_bomb.bomb.board import BOARD, COLORS, Intersection
 from lerobot_bomb.bomb.episode import EpisodeSpec
 from lerobot_bomb.bomb.suite import find_suite
 from lerobot_env_bomb.perturb import PerturbedEpisode
 
 
-def alternatives(episode: PerturbedEpisode) -> dict[str, tuple[str, Cell]]:
+def alternatives(episode: PerturbedEpisode) -> dict[str, tuple[str, Intersection]]:
     """{row, column or color: (another instruction, the intersection that it names)}, in the same words.
 
     {} for an episode whose instruction names no intersection.
@@ -27,7 +27,7 @@ def alternatives(episode: PerturbedEpisode) -> dict[str, tuple[str, Cell]]:
     return {word: other for word, other in found.items() if other is not None}
 
 
-def _reworded(episode: PerturbedEpisode, changes: list[dict]) -> Iterator[tuple[str, Cell]]:
+def _reworded(episode: PerturbedEpisode, changes: list[dict]) -> Iterator[tuple[str, Intersection]]:
     """Yield the instructions and targets of the changes for which the split has an episode."""
     suite = find_suite(episode.spec.suite)
     same = {"target": episode.target, "color": episode.color}

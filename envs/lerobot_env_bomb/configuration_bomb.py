@@ -69,7 +69,7 @@ class BombEnvConfig(EnvConfig):
     success_tolerance_mm: float = 10.0
     # file that gets one JSON line per finished episode: seed, target, error, failure class
     results_path: str | None = None
-    # let a checkpoint act that was trained for another environment
+    # run a checkpoint that was trained for another environment
     ignore_checkpoint: bool = False
     features: dict[str, PolicyFeature] = field(default_factory=dict)
     features_map: dict[str, str] = field(default_factory=dict)

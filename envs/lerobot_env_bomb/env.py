@@ -5,7 +5,7 @@ from typing import Any
 
 import numpy as np
 
-from lerobot_bomb.bomb.board import Cell
+from lerobot_bomb.bomb.board import Intersection
 from lerobot_bomb.bomb.camera import Camera
 from lerobot_bomb.bomb.episode import DEFAULT_FPS, PHYSICS_HZ, EpisodeSpec
 from lerobot_bomb.bomb.judge import Judge
@@ -221,7 +221,7 @@ class BombEnv(EpisodeEnv[EpisodeSpec, _Run, EpisodeResult]):
             for camera in CAMERAS
         }
 
-    def alternatives(self) -> dict[str, tuple[str, Cell]]:
+    def alternatives(self) -> dict[str, tuple[str, Intersection]]:
         """Return other instructions for this episode, as `lerobot_env_bomb.alternatives` gives them."""
         return alternatives(self._run.episode)
 

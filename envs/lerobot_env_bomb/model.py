@@ -14,7 +14,7 @@ from lerobot_bomb.bomb.board import (
     PATTERN_PITCH_M,
     TRAY_CENTER_XY,
     TRAY_HALF_SIZE_XY,
-    Cell,
+    Intersection,
 )
 from lerobot_bomb.bomb.perturbations import magnitude
 from lerobot_bomb.conditions import MAX_LEVEL
@@ -255,7 +255,7 @@ def _add_pattern(spec: mujoco.MjSpec) -> None:
         _add_disc(spec, name, 1.4 * radius_m, height_m + PATTERN_STONE_HEIGHT_M, (0, 0, 0, HIDDEN))
 
 
-def show_pattern(model: mujoco.MjModel, stones: Mapping[Cell, str]) -> None:
+def show_pattern(model: mujoco.MjModel, stones: Mapping[Intersection, str]) -> None:
     """Show the small board with these stones on it."""
     for geom in range(model.ngeom):
         if model.geom(geom).name.startswith(("pattern_board", "pattern_line")):

@@ -5,7 +5,7 @@ from collections.abc import Callable, Mapping, Sequence
 
 import numpy as np
 
-from lerobot_bomb.bomb.board import NUM_STONES, Cell
+from lerobot_bomb.bomb.board import NUM_STONES, Intersection
 from lerobot_bomb.bomb.layout import Layout, Snapshot
 from lerobot_bomb.bomb.observation import WORKSPACE_HIGH_M, WORKSPACE_LOW_M
 from lerobot_env_bomb.model import (
@@ -62,7 +62,10 @@ class Scene:
         self._nominal = [(array, array.copy()) for array in arrays]
 
     def reset(
-        self, layout: Layout, edits: Sequence[ModelEdit] = (), pattern: Mapping[Cell, str] | None = None
+        self,
+        layout: Layout,
+        edits: Sequence[ModelEdit] = (),
+        pattern: Mapping[Intersection, str] | None = None,
     ) -> None:
         """Start from the layout, at rest, with the fingers open, in a model with these edits only.
 

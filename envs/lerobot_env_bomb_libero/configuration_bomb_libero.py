@@ -38,7 +38,7 @@ class BombLiberoEnvConfig(LiberoEnv):
     perturbations: list[str] | str | None = None
     # file that gets one JSON line per finished episode: seed, success, failure class
     results_path: str | None = None
-    # let a checkpoint act that was trained for another environment
+    # run a checkpoint that was trained for another environment
     ignore_checkpoint: bool = False
 
     def __post_init__(self) -> None:

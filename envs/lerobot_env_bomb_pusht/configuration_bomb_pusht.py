@@ -54,7 +54,7 @@ class BombPushTEnvConfig(EnvConfig):
     image_size: int = IMAGE_SIZE
     # file that gets one JSON line per finished episode: seed, coverage, failure class
     results_path: str | None = None
-    # let a checkpoint act that was trained for another environment
+    # run a checkpoint that was trained for another environment
     ignore_checkpoint: bool = False
     features: dict[str, PolicyFeature] = field(default_factory=dict)
     features_map: dict[str, str] = field(default_factory=dict)

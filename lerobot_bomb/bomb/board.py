@@ -6,7 +6,7 @@ from dataclasses import dataclass
 import numpy as np
 
 COLORS = ("black", "white")
-Cell = tuple[int, int]  # row, column of an intersection
+Intersection = tuple[int, int]  # row, column of an intersection
 TRAY_CENTER_XY = (0.170, 0.0)  # metres; the tray beside the board from which stones are taken
 TRAY_HALF_SIZE_XY = (0.045, 0.125)  # metres; it touches the board
 # the small board that shows a pattern, at the tray's near end, where the arm does not hide it at the start

@@ -8,7 +8,7 @@ from itertools import count
 
 import numpy as np
 
-from lerobot_bomb.bomb.board import BOARD, COLORS, NUM_STONES, TRAY_CENTER_XY, Cell
+from lerobot_bomb.bomb.board import BOARD, COLORS, NUM_STONES, TRAY_CENTER_XY, Intersection
 from lerobot_bomb.bomb.episode import EpisodeSpec
 from lerobot_bomb.bomb.go import is_legal_position
 from lerobot_bomb.bomb.layout import Layout, put_on_board
@@ -16,9 +16,11 @@ from lerobot_bomb.bomb.move import Aim, Plan
 from lerobot_bomb.bomb.streams import Stream, generator
 from lerobot_bomb.bomb.suite import Episode, Suite, Turn, draw_template, refuse_options
 
-type Stones = Mapping[Cell, str]  # (row, column) -> colour of what stands on the board, as it was put there
+type Stones = Mapping[
+    Intersection, str
+]  # (row, column) -> colour of what stands on the board, as it was put there
 
-CELLS = tuple((row, column) for row in range(BOARD.num_lines) for column in range(BOARD.num_lines))
+INTERSECTIONS = tuple((row, column) for row in range(BOARD.num_lines) for column in range(BOARD.num_lines))
 GRIPPER_START_SPREAD_M = 0.010  # of the gripper around the tray's centre, in x and in y
 GRIPPER_START_HEIGHT_M = (0.08, 0.11)
 # where the stones of the supply lie, from the tray's centre: fingers fit between two of them, and one that
@@ -51,7 +53,7 @@ FORMS = (
 
 
 @dataclass(frozen=True)
-class Drawn:
+class TaskInstance:
     """Board, tray and command that are drawn for an episode of a task."""
 
     about: tuple[int, ...]  # numbers of what the command is about: colours, rows, directions
@@ -59,7 +61,7 @@ class Drawn:
     supply: tuple[str, ...] = ()  # colours of the stones in the tray, row by row from the far one
     pattern: Stones = field(default_factory=dict)  # on the small board
 
-    def stone_on(self, cell: Cell) -> int:
+    def stone_on(self, cell: Intersection) -> int:
         """Index of the stone on an intersection."""
         return len(self.supply) + list(self.stones).index(cell)
 
@@ -78,15 +80,15 @@ class Task(ABC):
     """A verb."""
 
     @abstractmethod
-    def draw(self, rng: np.random.Generator) -> Drawn:
+    def draw(self, rng: np.random.Generator) -> TaskInstance:
         """A board, and what the command is about; it need not make sense there."""
 
     @abstractmethod
-    def case(self, drawn: Drawn) -> Case | None:
+    def case(self, drawn: TaskInstance) -> Case | None:
         """Return what the command means on that board; None where it means nothing, or several things."""
 
 
-def is_graspable(stones: Stones, cell: Cell) -> bool:
+def is_graspable(stones: Stones, cell: Intersection) -> bool:
     """Return True if nothing stands left or right of an intersection, where the fingers go."""
     row, column = cell
     return not {(row, column - 1), (row, column + 1)} & stones.keys()
@@ -97,22 +99,27 @@ def other_color(color: str) -> str:
     return COLORS[1 - COLORS.index(color)]
 
 
-def only(stones: Stones, color: str) -> Cell | None:
+def only(stones: Stones, color: str) -> Intersection | None:
     """Return where the only stone of a colour stands; None where there is none, or several."""
     cells = [cell for cell, other in stones.items() if other == color]
     return cells[0] if len(cells) == 1 else None
 
 
-def draw_cells(rng: np.random.Generator, number: int, cells: Sequence[Cell] = CELLS) -> list[Cell]:
+def draw_intersections(
+    rng: np.random.Generator, number: int, cells: Sequence[Intersection] = INTERSECTIONS
+) -> list[Intersection]:
     """Draw so many different intersections."""
     return [cells[i] for i in rng.choice(len(cells), size=number, replace=False)]
 
 
 def draw_stones(
-    rng: np.random.Generator, number: int, cells: Sequence[Cell] = CELLS, colors: Sequence[str] = COLORS
-) -> dict[Cell, str]:
+    rng: np.random.Generator,
+    number: int,
+    cells: Sequence[Intersection] = INTERSECTIONS,
+    colors: Sequence[str] = COLORS,
+) -> dict[Intersection, str]:
     """Draw so many stones, each of one of these colours, on different intersections."""
-    return {cell: colors[int(rng.integers(len(colors)))] for cell in draw_cells(rng, number, cells)}
+    return {cell: colors[int(rng.integers(len(colors)))] for cell in draw_intersections(rng, number, cells)}
 
 
 def is_heldout(task_id: int, about: tuple[int, ...]) -> bool:
@@ -133,7 +140,7 @@ def command_suite(tasks: Sequence[Task], max_steps: int, num_goals: int, version
     )
 
 
-def draw_command(tasks: Sequence[Task], spec: EpisodeSpec) -> tuple[int, Drawn, Case]:
+def draw_command(tasks: Sequence[Task], spec: EpisodeSpec) -> tuple[int, TaskInstance, Case]:
     """Return a task's number, the board that is drawn for it, and what its command means there."""
     drawn_id = int(generator(spec.seed, Stream.TARGET).integers(len(tasks)))
     task_id = drawn_id if spec.task_id is None else spec.task_id
@@ -171,11 +178,11 @@ def _turn(template: str, command: str) -> Turn:
     return Turn(template.format(**words), words)
 
 
-def _means(task: Task, drawn: Drawn, case: Case, stones: Stones) -> bool:
+def _means(task: Task, drawn: TaskInstance, case: Case, stones: Stones) -> bool:
     return task.case(replace(drawn, stones=stones)) == case
 
 
-def _layout(seed: int, drawn: Drawn) -> Layout:
+def _layout(seed: int, drawn: TaskInstance) -> Layout:
     """The supply in the tray, the gripper above it, and an empty board."""
     gripper, supply = generator(seed, Stream.GRIPPER), generator(seed, Stream.SUPPLY)
     gripper_xyz = np.array([*TRAY_CENTER_XY, gripper.uniform(*GRIPPER_START_HEIGHT_M)])

@@ -58,19 +58,20 @@ def check_seed(seed: int) -> None:
 class EpisodeSpec:
     """Everything that, with the code's version, determines an episode bit for bit."""
 
-    seed: int
-    suite: str = "place"
-    robot: str = "scara"
-    split: str = "all"
-    control_mode: str = "relative"
-    fps: int = DEFAULT_FPS
-    # (row, column) and colour; None draws them from the seed
+    seed: int  # number from which everything random is drawn
+    suite: str = "place"  # --env.task
+    robot: str = "scara"  # --env.robot
+    split: str = "all"  # --env.split
+    control_mode: str = "relative"  # --env.control_mode
+    fps: int = DEFAULT_FPS  # control steps per second
+    # requested row and column; null: drawn
     target: tuple[int, int] | None = None
+    # requested colour of the stone; null: drawn
     color: str | None = None
-    # numbered task of a suite other than place, whose tasks are targets and colours; None draws it
+    # requested task of a suite other than place, whose tasks are target and color; null: drawn
     task_id: int | None = None
-    success_tolerance_mm: float = 10.0
-    perturbations: str = NONE  # a condition such as "camera:2+light:3"; see `Condition`
+    success_tolerance_mm: float = 10.0  # distance from the target within which a placement counts
+    perturbations: str = NONE  # condition, such as camera:2+light:3; a range may be in it
 
     def __post_init__(self) -> None:
         # one spelling, so that equal conditions compare equal

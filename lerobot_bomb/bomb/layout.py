@@ -5,7 +5,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from lerobot_bomb.bomb.board import BOARD, Cell
+from lerobot_bomb.bomb.board import BOARD, Intersection
 
 
 @dataclass(frozen=True)
@@ -25,7 +25,7 @@ class Layout:
         return BOARD.thickness_m + self.stone_height_m / 2
 
 
-def put_on_board(stones: Mapping[Cell, str], layout: Layout) -> Layout:
+def put_on_board(stones: Mapping[Intersection, str], layout: Layout) -> Layout:
     """The layout with the first stones that are not in play on these intersections."""
     stone_xy, stone_is_white = layout.stone_xy.copy(), layout.stone_is_white.copy()
     in_play = layout.stone_in_play.copy()

@@ -5,10 +5,10 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from lerobot_bomb.bomb.board import BOARD, TRAY_CENTER_XY, TRAY_HALF_SIZE_XY, Cell
+from lerobot_bomb.bomb.board import BOARD, TRAY_CENTER_XY, TRAY_HALF_SIZE_XY, Intersection
 
 TRAY = "tray"
-type Place = Cell | str  # an intersection, or TRAY: anywhere in it
+type Place = Intersection | str  # an intersection, or TRAY: anywhere in it
 
 
 @dataclass(frozen=True)
@@ -34,7 +34,7 @@ class Aim:
     is_slid: bool = False
 
 
-def aim_at(stone: int, cell: Cell, is_slid: bool = False) -> Aim:
+def aim_at(stone: int, cell: Intersection, is_slid: bool = False) -> Aim:
     """Return the aim of bringing a stone to an intersection."""
     x, y = BOARD.intersection_xy(*cell)
     return Aim(stone, (float(x), float(y)), is_slid)

@@ -85,7 +85,7 @@ AXES = {
     "language": Axis(
         "how the instruction is worded; what it means is always stated",
         ("instruction",),
-        {"form": Magnitude("number", (1, 2, 3, 4, 5), "see below")},
+        {"form": Magnitude("number", (1, 2, 3, 4, 5), "form of the instruction")},
     ),
     "dynamics": Axis(
         "mass and friction of the stones, noise and latency of the arm",

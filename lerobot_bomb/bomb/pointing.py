@@ -12,7 +12,7 @@ from typing import Self
 import numpy as np
 
 from lerobot_bomb.bomb.board import BOARD, TRAY_CENTER_XY, TRAY_HALF_SIZE_XY
-from lerobot_bomb.bomb.commands import CELLS, TRAY_XY_M
+from lerobot_bomb.bomb.commands import INTERSECTIONS, TRAY_XY_M
 from lerobot_bomb.bomb.expert import current_goal, expert_action, held_share
 from lerobot_bomb.bomb.judge import LIFT_M
 from lerobot_bomb.bomb.observation import ACTION_DIM
@@ -33,7 +33,7 @@ def _middles(half_m: float) -> list[float]:
 
 
 # where the expert puts stones
-PLACES_XY_M = (*(tuple(BOARD.intersection_xy(*cell).tolist()) for cell in CELLS), *TRAY_XY_M)
+PLACES_XY_M = (*(tuple(BOARD.intersection_xy(*cell).tolist()) for cell in INTERSECTIONS), *TRAY_XY_M)
 # the tray's squares, row by row from the far one
 TRAY_SPOTS_XY_M = tuple(
     (round(TRAY_CENTER_XY[0] + x, 6), round(TRAY_CENTER_XY[1] - y, 6))
@@ -41,8 +41,10 @@ TRAY_SPOTS_XY_M = tuple(
     for x in _middles(TRAY_HALF_SIZE_XY[0])
 )
 # where stones are looked for: intersections, row by row, then the tray; and how near such a stone is
-SPOTS_XY_M = (*PLACES_XY_M[: len(CELLS)], *TRAY_SPOTS_XY_M)
-SPOT_REACH_M = np.repeat([ON_INTERSECTION_M, TRAY_SPOT_M / 2**0.5], [len(CELLS), len(TRAY_SPOTS_XY_M)])
+SPOTS_XY_M = (*PLACES_XY_M[: len(INTERSECTIONS)], *TRAY_SPOTS_XY_M)
+SPOT_REACH_M = np.repeat(
+    [ON_INTERSECTION_M, TRAY_SPOT_M / 2**0.5], [len(INTERSECTIONS), len(TRAY_SPOTS_XY_M)]
+)
 PREFIX = "pointing."
 # name -> names of its numbers; metres, shares, actions of the environment, colours of `colors_on_spots`
 COLUMNS = {
@@ -53,7 +55,7 @@ COLUMNS = {
         f"action{i}_{dim}" for i in range(NUM_OTHERS) for dim in range(ACTION_DIM)
     ),
     f"{PREFIX}spots": (
-        *(f"row{row}_column{column}" for row, column in CELLS),
+        *(f"row{row}_column{column}" for row, column in INTERSECTIONS),
         *(f"tray{i}" for i in range(len(TRAY_SPOTS_XY_M))),
     ),
 }

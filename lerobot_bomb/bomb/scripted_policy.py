@@ -21,6 +21,7 @@ from lerobot_bomb.compat.use import use
 class ScriptedConfig(PreTrainedConfig):
     """Config of a policy without weights."""
 
+    # publish the policy on the Hub
     push_to_hub: bool = False
 
     def __post_init__(self) -> None:

@@ -7,7 +7,7 @@ from importlib import import_module
 
 import numpy as np
 
-from lerobot_bomb.bomb.board import COLORS, Cell
+from lerobot_bomb.bomb.board import COLORS, Intersection
 from lerobot_bomb.bomb.episode import EpisodeSpec
 from lerobot_bomb.bomb.go import is_legal_move
 from lerobot_bomb.bomb.layout import Layout
@@ -37,19 +37,21 @@ class Episode:
     spec: EpisodeSpec
     task_id: int  # which of the suite's numbered tasks it is of
     turns: tuple[Turn, ...]  # one, or one for each move
-    opening: Mapping[Cell, str]  # colours of the stones that stand on the board
+    opening: Mapping[Intersection, str]  # colours of the stones that stand on the board
     layout: Layout
     supply: tuple[int, ...]  # indices of the stones that lie in the tray
     plans: tuple[Plan, ...]  # any one of which fulfils the instruction
     aims: tuple[Aim, ...]  # of the expert, in its order
-    target: Cell | None = None  # where there is one move to one intersection
+    target: Intersection | None = None  # where there is one move to one intersection
     color: str | None = None  # of the stone, where it is moved from the tray to the target
     # whether the instruction still means these plans with these stones on the board
-    is_clear: Callable[[Mapping[Cell, str]], bool] = lambda stones: True
+    is_clear: Callable[[Mapping[Intersection, str]], bool] = lambda stones: True
     extra_colors: tuple[str, ...] = COLORS  # of stones that may join the opening
     # whether the instruction names the gripper: it must stay true where the gripper starts elsewhere
     gripper_is_named: bool = False
-    pattern: Mapping[Cell, str] = field(default_factory=dict)  # what the small board in the tray shows
+    pattern: Mapping[Intersection, str] = field(
+        default_factory=dict
+    )  # what the small board in the tray shows
 
     @property
     def instruction(self) -> str:
@@ -60,7 +62,7 @@ class Episode:
         """Return the instruction once so many moves have been made."""
         return self.turns[min(num_moves, len(self.turns) - 1)].instruction
 
-    def allows(self, stones: Mapping[Cell, str]) -> bool:
+    def allows(self, stones: Mapping[Intersection, str]) -> bool:
         """Return True if the move is legal, and the instruction clear, with these stones on the board."""
         if self.target is not None and self.color is not None:
             return is_legal_move(dict(stones), self.target, self.color) and self.is_clear(stones)

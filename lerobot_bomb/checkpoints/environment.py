@@ -30,9 +30,9 @@ class ConfigWithEnvironment(PreTrainedConfig):
     # fields that a release added -> the value with which a policy acts as before, and is the same in results
     LATER_FIELDS: ClassVar[dict[str, Any]] = {}
 
-    # that of the recording it was trained on; filled in
+    # environment of the recording that it was trained on
     environment: Environment | None = None
-    # whether it acts in another one all the same; no checkpoint keeps this
+    # run in an environment that the checkpoint was not trained for; no checkpoint keeps this
     ignore_environment: bool = False
 
     def __post_init__(self) -> None:

@@ -36,7 +36,7 @@ def check_start(checkpoint: str | Path, config: Any, meta: "LeRobotDatasetMetada
     saved: Any = PreTrainedConfig.from_pretrained(checkpoint)
     if _lacks_architecture(config) and not _lacks_architecture(saved):
         raise ValueError(
-            f"--policy.type={config.type} --policy.pretrained_path={checkpoint}: this type goes on from a "
+            f"--policy.type={config.type} --policy.pretrained_path={checkpoint}: this type continues from a "
             f"checkpoint with --policy.path={checkpoint}, which takes its config, too; "
             f"{way_to_start_otherwise(checkpoint, config.type)}"
         )

@@ -159,14 +159,14 @@ def add_episode_arguments(parser: argparse.ArgumentParser) -> None:
         "task_ids",
         type=parse_numbers,
         default=(),
-        help="numbered tasks of the suite, as [0,7,12], each played from every seed (of place 25 x colour + "
+        help="numbered tasks of the suite, as [0,7,12], each run from every seed (of place 25 x colour + "
         "5 x row + column; black = 0, white = 1; default: target and colour as above)",
     )
     add(
         "perturbations",
         type=parse_conditions,
         default=(NONE,),
-        help='conditions, as ["camera:3","camera:2+light:3"], each played from every seed; a range such as '
+        help='conditions, as ["camera:3","camera:2+light:3"], each run from every seed; a range such as '
         "all:1-5 or camera:0-3 draws a level per episode and axis (default: none)",
     )
     add(

@@ -45,12 +45,12 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the arguments."""
     parser.usage = "lerobot-bomb audit FOLDER --policy.path=CHECKPOINT [--env.NAME=VALUE ...]"
     add = parser.add_argument
-    add("folder", type=path_flag, metavar="FOLDER", help="new, or of an audit that is to go on")
+    add("folder", type=path_flag, metavar="FOLDER", help="new folder, or one of an audit to resume")
     add(
         "--policy.path", dest="policy_path", type=checkpoint_flag, required=True, help="a checkpoint's folder"
     )
-    add("--episodes", type=int, default=50, help="of each arm (default: 50)")
-    add("--seed", type=int, default=TEST_SEEDS[0], help=f"the first one (default: {TEST_SEEDS[0]})")
+    add("--episodes", type=int, default=50, help="episodes of each run (default: 50)")
+    add("--seed", type=int, default=TEST_SEEDS[0], help=f"first seed (default: {TEST_SEEDS[0]})")
     add("--workers", type=int, default=1, help="processes (default: 1)")
     add("rest", nargs="*", metavar="FLAG", help="flags of lerobot-eval, of --env.type=bomb")
 
@@ -131,14 +131,14 @@ def _play(args: argparse.Namespace, folder: Path, cells: dict[str, Cell]) -> dic
 
     Raises:
         ValueError: the folder is of another audit.
-        RuntimeError: an arm could not be run.
+        RuntimeError: a run failed.
     """
     with claimed(folder, Manifest(tuple(cells.values()))) as store:
         play(store, "0/1", args.workers)
         store.merge()
     missing = [name for name, cell in cells.items() if not store.is_finished(cell) or store.errors(cell)]
     if missing:
-        raise RuntimeError("\n".join([f"no lines of: {', '.join(missing)}", *store.lines()]))
+        raise RuntimeError("\n".join([f"no records of: {', '.join(missing)}", *store.lines()]))
     return {name: read_results(store.file(cell, "jsonl")) for name, cell in cells.items()}
 
 

@@ -15,18 +15,18 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         help="folder with config.json, processor_config.json, tokenizer.json, weights",
     )
     add("--output", type=path_flag, required=True, help="new folder for the checkpoint")
-    statistics = "which of the folder's data sets says how actions are scaled, if it has several"
+    statistics = "dataset whose statistics scale the actions, if the folder has several"
     add("--statistics", help=statistics)
     add("--camera", default="image", help="name of the camera, observation.images.NAME (default: image)")
-    grid = "gs_*.json that the folder's edges were made of: for --decode_point=cond_mean"
+    grid = "gs_*.json from which the folder's edges were made; for --decode_point=cond_mean"
     add("--grid", type=path_flag, help=grid)
     add("--min_sigma", type=float, help="least sigma of --grid (default: the folder's, or the published 0.5)")
     template = (
-        "what the prompt says around an instruction, which stands for {}: '{}' (default), as the original's "
-        "processor writes it, or 'What action should the robot take to {}?', as its slides do"
+        "text around the instruction, which {} stands for: '{}' (default), as the original's processor "
+        "writes it, or 'What action should the robot take to {}?', as its slides do"
     )
     add("--task_template", default="{}", help=template)
-    point = "what cells decode to: mid, as in the original (default), or cond_mean, the mean by --grid"
+    point = "value of a cell: mid, as in the original (default), or cond_mean, the mean by --grid"
     add("--decode_point", default="mid", choices=("mid", "cond_mean"), help=point)
 
 

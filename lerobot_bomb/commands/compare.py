@@ -15,9 +15,9 @@ from lerobot_bomb.tables import print_lines
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the arguments."""
     add = parser.add_argument
-    two = "without a second file: which two of the first one's policies (default: the two that it has)"
+    two = "without B: two of A's policies (default: the two that it has)"
     add("a", type=path_flag, metavar="A", help="file of --env.results_path")
-    add("b", type=path_flag, metavar="B", nargs="?", help="the same of another policy, on the same seeds")
+    add("b", type=path_flag, metavar="B", nargs="?", help="results file of another policy, on the same seeds")
     add("--policies", type=parse_conditions, default=(), metavar="A,B", help=two)
     unless = (
         f"exit code {ANSWER_IS_NO} unless, under every condition and with 95 %% confidence, B's success is"

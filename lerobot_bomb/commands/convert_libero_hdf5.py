@@ -15,7 +15,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     add(
         "--skip_noops",
         **switch(),
-        help="leave out frames in which neither arm nor gripper is told to move (default: all are kept)",
+        help="leave out frames whose action moves neither arm nor gripper (default: keep all)",
     )
     add(
         "--image_convention",

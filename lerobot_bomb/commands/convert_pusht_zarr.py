@@ -20,8 +20,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "--copies",
         type=int,
         default=0,
-        help="so many copies of each demonstration beside it: turned by any angle, half of them mirrored, "
-        "shifted, the goal with the rest (default: 0)",
+        help="copies of each demonstration to add: rotated by any angle, half of them mirrored, shifted, "
+        "with the goal (default: 0)",
     )
 
 

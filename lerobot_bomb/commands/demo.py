@@ -28,17 +28,17 @@ SUITE = "place"
 
 
 @dataclass(frozen=True)
-class Player:
-    """Policy that acts in the demo, and the conditions that it acts under."""
+class DemoPolicy:
+    """Policy of the demo, and the conditions of its evaluation."""
 
     policy_flag: str
     conditions: tuple[str, ...] = CONDITIONS
 
 
-PLAYERS = {
-    POLICY: Player(f"--policy.path={PREFIX}{POLICY}"),
-    "expert": Player("--policy.type=bomb_expert"),
-    "random": Player("--policy.type=bomb_random", (NONE,)),
+POLICIES = {
+    POLICY: DemoPolicy(f"--policy.path={PREFIX}{POLICY}"),
+    "expert": DemoPolicy("--policy.type=bomb_expert"),
+    "random": DemoPolicy("--policy.type=bomb_random", (NONE,)),
 }
 IMAGE_SIZE = 64  # pixels, as it was trained with
 SEED = TEST_SEEDS[0]  # LeRobot's default; no demonstration had it
@@ -59,7 +59,7 @@ Next:
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the arguments."""
     parser.add_argument("--output_dir", type=path_flag, help="new folder (default: outputs/demo/DATE_TIME)")
-    parser.add_argument("--episodes", type=int, default=20, help="of each condition (default: 20)")
+    parser.add_argument("--episodes", type=int, default=20, help="episodes of each condition (default: 20)")
 
 
 def run(args: argparse.Namespace) -> int:
@@ -70,28 +70,28 @@ def run(args: argparse.Namespace) -> int:
     check_new_folder("--output_dir", output_dir)
     started = time.monotonic()
     records = {}
-    for number, (name, player) in enumerate(PLAYERS.items(), start=1):
-        conditions = ", ".join(player.conditions)
-        _say(f"{number}/{len(PLAYERS) + 1}  {name} plays {args.episodes} episodes each of: {conditions}")
-        records[name] = _evaluate(output_dir, name, player, args.episodes)
+    for number, (name, policy) in enumerate(POLICIES.items(), start=1):
+        conditions = ", ".join(policy.conditions)
+        _say(f"{number}/{len(POLICIES) + 1}  evaluate {name}, {args.episodes} episodes each of: {conditions}")
+        records[name] = _evaluate(output_dir, name, policy, args.episodes)
     shown = next((each for each in records[POLICY] if not each.is_success), records[POLICY][-1])
     outcome = shown.failure or "success"
-    _say(f"{len(PLAYERS) + 1}/{len(PLAYERS) + 1}  Replay an episode of {POLICY}: {outcome}")
+    _say(f"{len(POLICIES) + 1}/{len(POLICIES) + 1}  Replay an episode of {POLICY}: {outcome}")
     _replay(output_dir, shown)
     _report(output_dir, records, time.monotonic() - started)
     return 0
 
 
-def _evaluate(output_dir: Path, name: str, player: Player, num_episodes: int) -> list[EpisodeResult]:
+def _evaluate(output_dir: Path, name: str, policy: DemoPolicy, num_episodes: int) -> list[EpisodeResult]:
     results = output_dir / f"{name}.jsonl"
     run_command(
         "lerobot-eval",
-        player.policy_flag,
+        policy.policy_flag,
         "--policy.device=cpu",
         "--env.type=bomb",
         f"--env.task={SUITE}",
         f"--env.image_size={IMAGE_SIZE}",
-        f"--env.perturbations={json.dumps(player.conditions)}",
+        f"--env.perturbations={json.dumps(policy.conditions)}",
         f"--env.results_path={results}",
         f"--seed={SEED}",
         f"--eval.n_episodes={num_episodes}",
@@ -106,7 +106,7 @@ def _replay(output_dir: Path, record: EpisodeResult) -> None:
     run_command(
         "lerobot-bomb",
         "view",
-        PLAYERS[POLICY].policy_flag,
+        POLICIES[POLICY].policy_flag,
         f"--seed={record.spec.seed}",
         f"--env.perturbations={record.spec.perturbations}",
         f"--output={output_dir / 'replay'}",

@@ -16,7 +16,7 @@ from tqdm import tqdm
 from lerobot_bomb.bomb.episode import TEST_SEEDS
 from lerobot_bomb.checkpoints.names import check_checkpoint
 from lerobot_bomb.commands.arguments import add_checkpoint_arguments, check_at_least, path_flag
-from lerobot_bomb.commands.results_files import read_line
+from lerobot_bomb.commands.results_files import read_record
 from lerobot_bomb.commands.view import add_viewed_arguments, viewed_of
 from lerobot_bomb.conditions import NONE
 from lerobot_bomb.files import check_new_folder, written_whole
@@ -38,21 +38,24 @@ PAGE, NUMBERS, RECORDING = "explanation.html", "explanation.json", "explanation.
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the arguments."""
     add = parser.add_argument
-    results = "a file of --env.results_path: explain the episode of one of its lines, with who played it"
+    results = "results file: explain the episode of one of its records, and that record's policy"
     add("--results", type=path_flag, metavar="FILE", help=results)
-    add("--line", type=int, help="of --results, from 1 on (default: 1)")
-    add("--seed", type=int, help=f"of the episode (default: {TEST_SEEDS[0]}, or the line's)")
+    add("--line", type=int, help="line of the record in --results, from 1 on (default: 1)")
+    add("--seed", type=int, help=f"seed of the episode (default: {TEST_SEEDS[0]}, or the record's)")
     add(
-        "--episodes", type=int, default=1, help="from this seed on; several give a page of means (default: 1)"
+        "--episodes",
+        type=int,
+        default=1,
+        help="number of episodes; several give a page of means (default: 1)",
     )
-    add("--step", type=int, help="the moment before this control step (default: one of each phase)")
+    add("--step", type=int, help="control step to explain (default: one of each phase)")
     add("--grid", type=int, default=DEFAULT_GRID, help=f"patches along a side (default: {DEFAULT_GRID})")
-    add("--fill", default="mean", help="in place of what is taken away: mean, blur or other (default: mean)")
+    add("--fill", default="mean", help="what replaces the hidden part: mean, blur or other (default: mean)")
     add(
         "--words", action="append", default=[], help="other words of the instruction to hide; may be repeated"
     )
     add_viewed_arguments(parser)
-    add_checkpoint_arguments(parser, "the checkpoint that is explained (default: the line's)")
+    add_checkpoint_arguments(parser, "checkpoint to explain (default: the record's)")
     add("--output", type=path_flag, default=DEFAULT_FOLDER, help=f"new folder (default: {DEFAULT_FOLDER})")
 
 
@@ -92,10 +95,10 @@ def _of_line(args: argparse.Namespace) -> "_Query":
     shared = {"image_size": None, "perturbations": (NONE,), "env_type": "bomb"}
     for name, default in (shared | args.own_flags["bomb"] | args.own_flags["bomb_pusht"]).items():
         if getattr(args, name) != default:
-            raise ValueError(f"drop --env.{name.removeprefix('env_')}: the line of --results says it")
-    replay = Replay(read_line(args.results, args.line or 1), args.policy_path)
+            raise ValueError(f"drop --env.{name.removeprefix('env_')}: the record of --results says it")
+    replay = Replay(read_record(args.results, args.line or 1), args.policy_path)
     if replay.checkpoint is None:
-        raise ValueError("who played has no checkpoint, so there is nothing to explain")
+        raise ValueError("this record's policy has no checkpoint, so there is nothing to explain")
     check_checkpoint(replay.checkpoint)
     seed = replay.record.spec.seed if args.seed is None else args.seed
     return _Query(
@@ -143,7 +146,7 @@ def _moments(
 
 
 def _explain_one(args: argparse.Namespace, query: _Query) -> int:
-    from lerobot_bomb.explain.masked_episodes import masks_of, play_masked
+    from lerobot_bomb.explain.masked_episodes import masks_of, run_masked
     from lerobot_bomb.explain.recording import write_recording
     from lerobot_bomb.report.explanation import moment_sections, overview_section, traces_section
 
@@ -151,7 +154,7 @@ def _explain_one(args: argparse.Namespace, query: _Query) -> int:
     moments, result = _moments(args, query, query.seed, loaded)
     episodes = {}
     if viewed.env_type == "bomb" and args.fill != "other":
-        episodes = play_masked(viewed, loaded, masks_of(moments[0].snapshot, loaded, args.fill))
+        episodes = run_masked(viewed, loaded, masks_of(moments[0].snapshot, loaded, args.fill))
     name = viewed.name(loaded.config.type)
     sections = [overview_section(viewed.log().describe(result), moments, _command())]
     sections += [section for each in moments for section in moment_sections(each)]

@@ -11,11 +11,11 @@ from lerobot_bomb.results.groups import read_results
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare what is published, where and how."""
     add = parser.add_argument
-    folder = "what lerobot-train names pretrained_model, or a dataset of lerobot-bomb record or convert"
+    folder = "checkpoint (pretrained_model of lerobot-train), or dataset of lerobot-bomb record or convert"
     add("folder", type=path_flag, metavar="FOLDER", help=folder)
     add("--repo_id", required=True, help="name of the model or the dataset on the Hub, USER/NAME")
     add("--private", **switch(), help="make a new repository that only you see")
-    dry_run = "print the card, and the names of the files instead of publishing them; no Hub is asked"
+    dry_run = "print the card and the names of the files; publish nothing, ask no Hub"
     add("--dry_run", **switch(), help=dry_run)
     add(
         "--results",
@@ -23,14 +23,13 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         type=path_flag,
         default=[],
         metavar="RESULTS.jsonl",
-        help="files that --env.results_path wrote for this checkpoint; the card states their rates",
+        help="results files of this checkpoint, whose rates go into the card",
     )
     add(
         "--dataset.root",
         dest="dataset_root",
         type=path_flag,
-        help="folder of the checkpoint's dataset, if it is no longer where the training found it; the card "
-        "states what it shows",
+        help="folder of the checkpoint's dataset, if it has moved; the card describes it",
     )
 
 

@@ -56,8 +56,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "--seed",
         type=int,
         default=0,
-        help="seed of the first episode; the others count up (default: 0); leave "
-        f"out {TEST_SEEDS[0]} to {TEST_SEEDS[-1]}, of which evaluations are",
+        help="seed of the first episode; the others count up (default: 0); do "
+        f"not record the test episodes, {TEST_SEEDS[0]} to {TEST_SEEDS[-1]}",
     )
     add_episode_arguments(parser)
     add("--images", **switch(), help="store images (lossless) instead of videos")
@@ -67,7 +67,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         type=float,
         default=0.0,
         help="standard deviation of noise on the executed action, in units of the largest step, 40 mm; the "
-        "stored action is clean, so recoveries are in the data; the expert bears 0.05 (default: 0)",
+        "stored action is clean, so the data show recoveries; the expert copes with 0.05 (default: 0)",
     )
     add(
         "--resume",
@@ -87,21 +87,21 @@ def _add_what_is_recorded(parser: argparse.ArgumentParser) -> None:
     number.add_argument(
         "--static",
         type=int,
-        help="scenes to record instead: boards as they may stand midway, the gripper anywhere, with or "
-        "without the stone, a frame each, with --pointing; they teach what an instruction means",
+        help="static scenes to record instead: a board as in mid-episode, the gripper anywhere, with or "
+        "without the stone; a frame each, with the labels of --pointing",
     )
-    add("--relabel", **switch(), help="let --policy.path act, and store what the expert would have done")
+    add("--relabel", **switch(), help="let --policy.path run the episodes, and store the expert's actions")
     add(
         "--policy.path",
         dest="policy_path",
         type=checkpoint_flag,
-        help="folder of the checkpoint that acts, with --relabel; whatever becomes of its episodes",
+        help="checkpoint that runs the episodes of --relabel, failed ones included",
     )
     add(
         "--pointing",
         **switch(),
-        help="also store which stone goes where and what the expert would do for other places, which "
-        "--policy.pointing=true is trained on; no policy sees it in an evaluation",
+        help="also store which stone goes where and the expert's actions for other places: the labels of "
+        "--policy.pointing=true, which no policy sees in an evaluation",
     )
 
 

@@ -12,7 +12,7 @@ from lerobot_bomb.commands.arguments import (
     path_flag,
     switch,
 )
-from lerobot_bomb.commands.results_files import read_line
+from lerobot_bomb.commands.results_files import read_record
 from lerobot_bomb.conditions import NONE
 from lerobot_bomb.results.record import ORIGIN, Record, different_fields, outcome_fields
 from lerobot_bomb.tables import print_lines
@@ -28,15 +28,15 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.usage = "lerobot-bomb replay FILE [--line=N] [--set=AXIS=LEVEL,...] (and flags --policy.NAME)"
     add = parser.add_argument
     add("path", type=path_flag, metavar="FILE", help="file of --env.results_path")
-    add("--line", type=int, default=1, help="the episode's line, from 1 on (default: 1)")
+    add("--line", type=int, default=1, help="line of the record, from 1 on (default: 1)")
     add(
         "--set",
         type=_levels,
         metavar="AXIS=LEVEL,...",
-        help="play it a second time, with these axes changed: camera=0,light=3, or camera:0,light:3",
+        help="run it a second time, with these axes changed: camera=0,light=3, or camera:0,light:3",
     )
-    add_checkpoint_arguments(parser, "the checkpoint's folder, where it lies elsewhere now")
-    add_env_flag(parser, "depth", **switch(), help="the policy was shown depth")
+    add_checkpoint_arguments(parser, "the checkpoint's folder, if it has moved")
+    add_env_flag(parser, "depth", **switch(), help="the evaluation had --env.depth")
     add_episode_files_argument(parser, DEFAULT_FOLDER)
     add("rest", nargs="*", metavar="FLAG", help="flags of the policy in that evaluation: --policy.NAME=VALUE")
 
@@ -54,7 +54,7 @@ def run(args: argparse.Namespace) -> int:
     """Run the episode, write both files, print its result and whether the record says the same."""
     if unknown := [flag for flag in args.rest if not flag.startswith("--policy.")]:
         raise ValueError(f"{unknown[0]} is unknown; see `lerobot-bomb replay --help`")
-    record = read_line(args.path, args.line)
+    record = read_record(args.path, args.line)
     policy_flags = [f"--{flag.removeprefix('--policy.')}" for flag in args.rest]
     replay = Replay(record, args.policy_path, args.policy_device, policy_flags, args.depth)
     players = {RECORDED: replay.player()}

@@ -27,11 +27,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "paths", nargs="+", type=path_flag, metavar="FILE", help="files of --env.results_path"
     )
-    parser.add_argument("--output", type=path_flag, default=DEFAULT, help=f"default: {DEFAULT}")
-    parser.add_argument("--title", default=TITLE, help=f"of the page (default: {TITLE})")
-    videos = (
-        "play so many failures of each class again and show them, in a folder beside the page (default: 0)"
-    )
+    parser.add_argument("--output", type=path_flag, default=DEFAULT, help=f"page (default: {DEFAULT})")
+    parser.add_argument("--title", default=TITLE, help=f"title of the page (default: {TITLE})")
+    videos = "replay this many failures of each class, and show their videos (default: 0)"
     parser.add_argument("--videos", type=int, metavar="N", default=0, help=videos)
 
 
@@ -49,10 +47,10 @@ def run(args: argparse.Namespace) -> int:
     samples = list(sample_failures(groups, numbered, max(NUM_SAMPLES, args.videos)))
     folder = page.with_name(f"{page.stem}_videos")
     if args.videos:
-        samples = _play(samples, folder, args.videos)
+        samples = _add_videos(samples, folder, args.videos)
     missing = [file.missing for file in files.values() if file.missing]
     missing += [
-        f"{path}: {file.num_damaged} damaged lines are not counted"
+        f"{path}: {file.num_damaged} damaged records are not counted"
         for path, file in files.items()
         if file.num_damaged
     ]
@@ -65,24 +63,24 @@ def run(args: argparse.Namespace) -> int:
     return 0
 
 
-def _play(samples: list[Sample], folder: Path, num_of_class: int) -> list[Sample]:
+def _add_videos(samples: list[Sample], folder: Path, num_of_class: int) -> list[Sample]:
     from lerobot_bomb.report.videos import with_videos  # LeRobot and rerun: seconds
 
-    played = list(tqdm(with_videos(samples, folder, num_of_class), total=len(samples), unit=" failures"))
-    missing = [each for each in played if each.note and not each.video]
+    shown = list(tqdm(with_videos(samples, folder, num_of_class), total=len(samples), unit=" failures"))
+    missing = [each for each in shown if each.note and not each.video]
     if missing:
         print(
             f"videos that are missing: {len(missing)}, as {missing[0].command}: {missing[0].note}",
             file=sys.stderr,
         )
-    return played
+    return shown
 
 
 def _csv(sections: list[Section]) -> str:
     """The rates by condition, a line each."""
     text = io.StringIO()
     writer = csv.writer(text)
-    writer.writerow(["arm", "condition", "successes", "n", "low", "high"])
+    writer.writerow(["group", "condition", "successes", "n", "low", "high"])
     for table in (
         table for section in sections if section.title == conditions.TITLE for table in section.tables
     ):

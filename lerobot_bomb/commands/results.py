@@ -15,7 +15,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "paths", nargs="+", type=path_flag, metavar="FILE", help="files of --env.results_path"
     )
-    parser.add_argument("--strict", action="store_true", help="a damaged line is an error, not a message")
+    parser.add_argument("--strict", action="store_true", help="refuse files with damaged records")
 
 
 def run(args: argparse.Namespace) -> int:
@@ -23,14 +23,14 @@ def run(args: argparse.Namespace) -> int:
     for path in args.paths:
         file = read_undamaged(path)
         if args.strict and file.num_damaged:
-            raise ValueError(f"{path}: damaged lines, which --strict refuses: {file.num_damaged}")
+            raise ValueError(f"{path}: damaged records, which --strict refuses: {file.num_damaged}")
         _print_file(path, groups_of(file.records), file.num_damaged)
     return 0
 
 
 def _print_file(path: Path, groups: list[Group], num_damaged: int) -> None:
     if num_damaged:
-        print(f"{path}: damaged lines, which are not counted: {num_damaged}")
+        print(f"{path}: damaged records, which are not counted: {num_damaged}")
     if len(groups) > 1:
         print(
             f"{path}: {len(groups)} groups of episodes, neither pooled nor paired with each other; they "
@@ -42,9 +42,9 @@ def _print_file(path: Path, groups: list[Group], num_damaged: int) -> None:
         if group.missing_fields:
             version = group.records[0].protocol_version
             lacking = ", ".join(group.missing_fields)
-            print(f"{path}: lines of protocol {version} are incomplete: they lack {lacking}")
+            print(f"{path}: records of protocol {version} lack {lacking}")
         if group.num_replaced:
-            print(f"{path}: {group.num_replaced} lines count no more, a later one is of the same episode")
+            print(f"{path}: {group.num_replaced} records are replaced by later ones of the same episode")
         conditions = by_condition(group.records)
         for condition, records in conditions.items():
             label = f" (perturbations={condition})" if len(conditions) > 1 else ""

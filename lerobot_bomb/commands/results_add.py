@@ -45,7 +45,7 @@ def _check_flags(config: Any) -> None:
     record_type = RECORD_OF_ENV.get(config.env.type)
     if record_type is not None and record_type.has_results_path:
         raise ValueError(
-            f"--env.type={record_type.env_type}: lerobot-eval writes its lines itself, with "
+            f"--env.type={record_type.env_type}: lerobot-eval writes its records itself, with "
             "--env.results_path=FILE"
         )
     if record_type is None:
@@ -55,7 +55,7 @@ def _check_flags(config: Any) -> None:
             [each.env_type for each in RECORD_TYPES if not each.has_results_path],
         )
     if config.policy is None:
-        raise ValueError("--policy.path or --policy.type is missing: who played")
+        raise ValueError("--policy.path or --policy.type is missing: the policy that was evaluated")
     if config.seed is None:
         raise ValueError("--seed=null: episodes without a seed cannot be told apart")
     if record_type is not None and record_type.starts_by_number and config.eval.batch_size != 1:

@@ -33,13 +33,13 @@ def missing_of_sweep(path: Path, num_records: int) -> str:
     missing = number - num_records
     num_errors = errors.read_bytes().count(b"\n") if errors.is_file() else 0
     reasons = [f"an error ended {num_errors}: {errors}"] if num_errors else []
-    reasons += [f"`lerobot-bomb sweep {path.parent}` goes on"] if missing > num_errors else []
+    reasons += [f"`lerobot-bomb sweep {path.parent}` resumes"] if missing > num_errors else []
     return f"{path}: {missing} of {number} episodes are missing; {'; '.join(reasons)}" if missing > 0 else ""
 
 
 @dataclass(frozen=True)
 class ResultsFile:
-    """A results file as it was read, without the lines that are damaged."""
+    """A results file as it was read, without the damaged records."""
 
     numbered: dict[int, Record]  # by line, from 1
     num_damaged: int
@@ -50,7 +50,7 @@ class ResultsFile:
         return [*self.numbered.values()]
 
 
-def read_line(path: Path, line: int) -> Record:
+def read_record(path: Path, line: int) -> Record:
     """Return the episode of a line, counted from 1 as an editor counts.
 
     Raises:
@@ -65,7 +65,7 @@ def read_line(path: Path, line: int) -> Record:
 
 
 def read_undamaged(path: Path) -> ResultsFile:
-    """Read the episodes of a file; stderr shows its first damaged lines and what its sweep lacks.
+    """Read the episodes of a file; stderr shows its first damaged records and what its sweep lacks.
 
     Raises:
         ValueError: there is no such file, or no episode in it.

@@ -13,94 +13,94 @@ Datasets and episodes
   record: record the scripted expert as a LeRobotDataset
     $ --repo_id=me/bomb --root=data/bomb --episodes=10 --env.image_size=64 --images
     $ --repo_id=me/all --root=data/all --episodes=10 --env.task=all --env.perturbations=all:1-5
-  convert pusht-zarr: the PushT demonstrations of Diffusion Policy as a LeRobotDataset
+  convert pusht-zarr: make a LeRobotDataset of Diffusion Policy's PushT demonstrations
     $ pusht_cchi_v7_replay.zarr --repo_id=me/pusht --root=data/pusht
     $ pusht_cchi_v7_replay.zarr --repo_id=me/pusht8 --root=data/pusht8 --copies=7 --resume
-  convert libero-hdf5: demonstrations of LIBERO, TASK_demo.hdf5 or a folder of them, as a LeRobotDataset
+  convert libero-hdf5: make a LeRobotDataset of LIBERO's demonstrations, TASK_demo.hdf5 or a folder of them
     $ libero_spatial --repo_id=me/libero --root=data/libero
     $ libero_spatial --repo_id=me/moves --root=data/moves --skip_noops --images
-  view: play one episode into a recording for Rerun and a video
+  view: run one episode; write a recording for Rerun and a video
     $ --policy.path=bomb:vla0_smol
     $ --seed=9 --env.perturbations=camera:3+light:2
-  view gallery: draw what every perturbation axis changes, or a suite's tasks
+  view gallery: draw every perturbation axis, or a suite's tasks
     $ --axes=camera,light --seeds=2,3
     $ --env.task=object --output=outputs/tasks
 Results
   results: summarise files written by --env.results_path
     $ results.jsonl
     $ vla0_smol.jsonl fdvla.jsonl --strict
-  results add: append records of LeRobot's own pusht or libero, from what lerobot-eval wrote
+  results add: append records of LeRobot's own pusht or libero, from the output of lerobot-eval
     $ act.jsonl --policy.path=outputs/act --env.type=pusht --output_dir=outputs/eval/act
     $ results.jsonl --policy.path=me/pi05 --env.type=libero --eval.batch_size=1
       --output_dir=outputs/eval/pi05
-  results actions: lerobot-eval, which also writes the executed actions to a file
+  results actions: run lerobot-eval, and also write the executed actions to a file
     $ actions.jsonl --policy.path=outputs/act --env.type=pusht --eval.use_async_envs=false
     $ expert.jsonl --policy.type=bomb_expert --env.type=bomb --eval.n_episodes=2 --eval.batch_size=2
-  results smoothness: second and third differences of executed actions, of demonstrations and evaluations
+  results smoothness: how smooth the actions of demonstrations and evaluations are
     $ --dataset.repo_id=me/bomb --dataset.root=data/bomb
     $ --dataset.repo_id=me/bomb --dataset.root=data/bomb expert.jsonl --per_second
-  compare: two policies on the same episodes: difference, interval, test
+  compare: compare two policies on the same episodes: difference, interval, test
     $ vla0_smol.jsonl fdvla.jsonl
     $ outputs/sweep/results.jsonl --non_inferior=5
-  report: files of results as one page, with tables as JSON and CSV
+  report: write results files as one page, with tables as JSON and CSV
     $ results.jsonl
     $ vla0_smol.jsonl fdvla.jsonl --output=outputs/report.html --videos=1
-  export: files of results as a LaTeX table, a model-index and the Hub's .eval_results
+  export: write results files as a LaTeX table, a model-index and the Hub's .eval_results
     $ results.jsonl
     $ vla0_smol.jsonl fdvla.jsonl --output=outputs/paper
 Evaluate and diagnose
-  sweep: evaluate policies x tasks x conditions; goes on after a kill
+  sweep: evaluate policies x tasks x conditions; resumes after a kill
     $ outputs/sweep --policies=bomb:vla0_smol,bomb:fdvla --env.type=bomb --env.perturbations=none,all:3
     $ outputs/sweep
-  replay: play an episode of a file of results again, bit for bit or with other perturbations
+  replay: run an episode of a results file again, bit for bit or with other perturbations
     $ results.jsonl --line=26
     $ results.jsonl --line=26 --set=camera=0,light=0
-  audit: does a policy read, look, repeat itself: arms and verdicts that a success rate needs
+  audit: check that a policy reads, looks and repeats itself
     $ outputs/audit --policy.path=bomb:fdvla --episodes=20
     $ outputs/audit2 --policy.path=bomb:vla0_smol --policy.device=cpu --workers=2
-  explain: what a policy's actions depend on: patches, objects, words, layers, heads
+  explain: find what a policy's actions depend on: patches, objects, words, layers, heads
     $ --policy.path=bomb:fdvla --step=3
     $ --results=results.jsonl --line=26 --output=outputs/why
 Checkpoints
-  checkpoint path: the folders of the checkpoints that come with this package
+  checkpoint path: print the folders of the shipped checkpoints
     $
     $ vla0_smol
-  checkpoint init: a policy before its training, as a checkpoint that adapters can be trained on
+  checkpoint init: write a policy before its training, as a base for adapters
     $ --policy.type=fdvla --policy.vlm_model_name=nano --dataset.repo_id=me/bomb --dataset.root=data/bomb
       --output=outputs/base
     $ --policy.type=act --policy.push_to_hub=false --dataset.repo_id=me/bomb --dataset.root=data/bomb
       --output=outputs/act
-  checkpoint merge: adapters and their base as one checkpoint
+  checkpoint merge: make one checkpoint of adapters and their base
     $ --policy.path=outputs/lora/checkpoints/last/pretrained_model --output=outputs/merged
     $ --policy.path=outputs/adapters --output=outputs/whole
-  checkpoint export-backbone: its vision-language model as a folder that other policies can start from
+  checkpoint export-backbone: write its vision-language model to a folder that other policies can start from
     $ --policy.path=bomb:vla0_smol --output=outputs/backbone
     $ --policy.path=outputs/train/checkpoints/last/pretrained_model --output=outputs/trained
-  checkpoint convert-spatialvla: a published SpatialVLA folder as a checkpoint for LeRobot
+  checkpoint convert-spatialvla: make a checkpoint of a published SpatialVLA folder
     $ spatialvla-4b-224-sft-bridge --output=outputs/spatialvla
     $ spatialvla-4b-224-pt --statistics=bridge_orig/1.0.0 --output=outputs/pretrained
-  checkpoint fit-grid: an action grid on a dataset: its fit, its edges and what it rounds off
+  checkpoint fit-grid: fit an action grid to a dataset; print its edges and rounding errors
     $ --dataset.repo_id=me/bomb --dataset.root=data/bomb
     $ --dataset.repo_id=me/bomb --dataset.root=data/bomb --policy.grid_distribution=uniform
       --plot=outputs/grid.png
-  checkpoint offline-metrics: its loss, accuracy and L1 on recorded frames, beside trivial predictors
+  checkpoint offline-metrics: loss, accuracy and L1 on recorded frames, beside trivial predictors
     $ --policy.path=bomb:vla0_smol --dataset.repo_id=me/bomb --dataset.root=data/bomb --val_episodes=0-9
     $ --policy.path=outputs/act --dataset.repo_id=me/bomb --dataset.root=data/bomb --val_episodes=[0,1]
       --json=outputs/metrics.json
-  push: a checkpoint or a recorded dataset to the Hub, with a card
+  push: publish a checkpoint or a recorded dataset on the Hub, with a card
     $ outputs/train/checkpoints/last/pretrained_model --repo_id=me/policy --results results.jsonl
     $ data/bomb --repo_id=me/bomb --dry_run
-  serve: LeRobot's server of action chunks for a robot elsewhere, for every policy type
+  serve: run LeRobot's policy server, for a robot on another machine
     $
     $ --socket=policy.socket
 Installation
-  demo: a policy that comes with this package plays, beside expert and random
+  demo: evaluate a shipped policy beside expert and random actions
     $
     $ --episodes=2 --output_dir=outputs/demo
   doctor: check this installation
     $
     $ dataset data/bomb
-  doctor dataset: compare a dataset's statistics of numbers with all of its frames, and mend them
+  doctor dataset: compare a dataset's statistics with all of its frames, and correct them
     $ data/bomb
     $ data/bomb --mend
 """
@@ -134,7 +134,7 @@ def _read(table: str) -> dict[str, Command]:
 COMMANDS = _read(TABLE)
 # first words that are no command alone
 FAMILIES = {
-    "convert": ("Datasets and episodes", "published demonstrations as a LeRobotDataset"),
+    "convert": ("Datasets and episodes", "make a LeRobotDataset of published demonstrations"),
     "checkpoint": ("Checkpoints", "make, measure and find checkpoints"),
 }
 # what earlier releases called a command

@@ -44,15 +44,15 @@ PUSHT_FLAGS = {"instruction": None, "max_steps": None}  # and what they are unle
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the arguments."""
     add = parser.add_argument
-    add("--policy", help=f"who acts: {EXPERT} or {RANDOM} (default: {EXPERT}; bomb_pusht has {RANDOM} only)")
-    add_checkpoint_arguments(parser, "who acts: the checkpoint in this folder")
+    add("--policy", help=f"scripted policy: {EXPERT} (default) or {RANDOM}; bomb_pusht has {RANDOM} only")
+    add_checkpoint_arguments(parser, "checkpoint to run instead")
     add(
         "--policy.ignore_environment",
         "--env.ignore_checkpoint",
         "--ignore_checkpoint",
         dest="ignore_environment",
         **switch(),
-        help="let a checkpoint act that was trained for another environment",
+        help="run a checkpoint that was trained for another environment",
     )
     add("--seed", type=int, default=0, help="seed of the episode (default: 0)")
     add_viewed_arguments(parser)
@@ -133,7 +133,7 @@ def _policy(args: argparse.Namespace, policies: tuple[str, ...]) -> str:
 
 def _bomb(args: argparse.Namespace) -> Viewed:
     if len(args.task_ids) > 1:
-        raise ValueError(f"--env.task_ids={list(args.task_ids)} must be one task: one episode is played")
+        raise ValueError(f"--env.task_ids={list(args.task_ids)} must be one task: view runs one episode")
     spec = EpisodeSpec(
         seed=args.seed,
         suite=args.task,

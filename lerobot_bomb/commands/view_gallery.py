@@ -48,16 +48,16 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the arguments."""
     add = parser.add_argument
     add("--env.type", dest="env_type", default="bomb", help=f"{', '.join(AXES_OF)} (default: bomb)")
-    add("--axes", type=_parse_names, help="as camera,light (default: every axis and all)")
+    add("--axes", type=_parse_names, help="axes, as camera,light (default: every axis and all)")
     add_env_flag(parser, "task", help=f"draw a suite's tasks in place of axes: {', '.join(SUITES)}")
-    add("--seeds", type=parse_numbers, default=DEFAULT_SEEDS, help="episodes (default: 2,3)")
+    add("--seeds", type=parse_numbers, default=DEFAULT_SEEDS, help="seeds of the episodes (default: 2,3)")
     size = "pixels of a tile (default: %(default)s)"
     add_env_flag(parser, "image_size", type=int, default=DEFAULT_TILE_SIZE, help=size)
     add(
         "--output",
         type=path_flag,
         default=DEFAULT_FOLDER,
-        help="folder of the sheets, AXIS.jpg; those of the same names are replaced (default: %(default)s)",
+        help="folder of the sheets, AXIS.jpg; sheets of the same names are replaced (default: %(default)s)",
     )
     add("--doc", type=path_flag, help="also write the page that explains the axes, with their sheets")
 

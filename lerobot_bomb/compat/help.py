@@ -5,7 +5,8 @@ from argparse import SUPPRESS
 from collections.abc import Iterable
 from types import MappingProxyType
 
-# argparse looks for this very string in flags that work and are not listed; draccus passes `custom_args` on
+# argparse's mark of a flag that works and is not listed; draccus passes `custom_args` on to it. argparse
+# compares by identity, so an equal text would be printed
 NOT_LISTED = MappingProxyType({"custom_args": {"help": SUPPRESS}})
 
 

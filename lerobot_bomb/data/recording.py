@@ -91,7 +91,7 @@ class Recording:
             raise ValueError(f"--static={self.static} must be in 1..{SCENES} or a multiple of {SCENES}")
         for name, value in {"--relabel": self.relabel, f"--noise={self.noise}": self.noise}.items():
             if value:
-                raise ValueError(f"{name}: static scenes are not played; leave it out with --static")
+                raise ValueError(f"{name}: static scenes are no episodes; leave it out with --static")
         object.__setattr__(self, "episodes", self.static // self.scenes)
         object.__setattr__(self, "pointing", True)
 

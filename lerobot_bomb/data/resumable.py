@@ -248,7 +248,7 @@ def _keep_finished(folder: Path, parts: Sequence[Path]) -> str:
     if not blocks:
         remove_folder(folder)
     if parts:
-        return "all parts stay, and the same command goes on"
+        return "all parts stay, and the same command resumes"
     if not blocks:
         return f"no block of {BLOCK_EPISODES} episodes was finished, so nothing is kept"
-    return f"{reached(folder).num_episodes} episodes are kept in {folder}, go on with --resume"
+    return f"{reached(folder).num_episodes} episodes are kept in {folder}, continue with --resume"

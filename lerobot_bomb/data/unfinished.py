@@ -81,7 +81,7 @@ def _check_new(kind: str, root: Path, folder: Path) -> None:
             there = {path.name for path in folder.iterdir()} - {LOCK_FILE}
         path = parameters_file(folder)
         if there & {path.name, path.with_suffix(".tmp").name}:
-            raise ValueError(f"{folder} holds an unfinished {kind}; go on with --resume or delete it")
+            raise ValueError(f"{folder} holds an unfinished {kind}; continue with --resume or delete it")
         if there:
             raise ValueError(
                 f"{folder} holds no {path.name}, so it is no {kind}, but it is where one would grow; give "

@@ -5,7 +5,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from lerobot_bomb.bomb.board import BOARD, Cell
+from lerobot_bomb.bomb.board import BOARD, Intersection
 from lerobot_bomb.bomb.observation import reach_m
 from lerobot_bomb.explain.scored_policy import Batch
 from lerobot_bomb.viewing.checkpoint import LoadedPolicy
@@ -24,8 +24,8 @@ class Following:
 def following(
     loaded: LoadedPolicy,
     observation: Batch,
-    others: Mapping[str, tuple[str, Cell]],
-    target: Cell,
+    others: Mapping[str, tuple[str, Intersection]],
+    target: Intersection,
     control_mode: str,
 ) -> dict[str, Following]:
     """Measure how actions follow each other instruction to its place, from the same observation and noise."""

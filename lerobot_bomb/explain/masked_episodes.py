@@ -96,12 +96,12 @@ def masks_of(snapshot: Snapshot, loaded: LoadedPolicy, fill: str) -> dict[str, M
     return masks
 
 
-def play_masked(viewed: Viewed, loaded: LoadedPolicy, masks: Mapping[str, Mask]) -> dict[str, MaskedEpisode]:
+def run_masked(viewed: Viewed, loaded: LoadedPolicy, masks: Mapping[str, Mask]) -> dict[str, MaskedEpisode]:
     """Run the same episode under each mask, from the same random state of the policy."""
-    return {name: _play(viewed, loaded, mask) for name, mask in masks.items()}
+    return {name: _run(viewed, loaded, mask) for name, mask in masks.items()}
 
 
-def _play(viewed: Viewed, loaded: LoadedPolicy, mask: Mask) -> MaskedEpisode:
+def _run(viewed: Viewed, loaded: LoadedPolicy, mask: Mask) -> MaskedEpisode:
     loaded.begin()
     with closing(viewed.make_env()) as env:
 

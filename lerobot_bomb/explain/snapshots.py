@@ -8,7 +8,7 @@ from typing import Any
 import gymnasium
 import numpy as np
 
-from lerobot_bomb.bomb.board import BOARD, Cell
+from lerobot_bomb.bomb.board import BOARD, Intersection
 from lerobot_bomb.bomb.camera import Camera
 from lerobot_bomb.bomb.episode import Stage
 from lerobot_bomb.bomb.expert import current_goal
@@ -31,8 +31,10 @@ class Snapshot:
     observation: dict[str, Any]
     instruction: str
     objects: Mapping[str, Mapping[str, np.ndarray]]  # {camera: {what: (H, W) bool}}; {}: not known
-    others: Mapping[str, tuple[str, Cell]]  # other instructions and what they name, by what they change
-    target: Cell | None
+    others: Mapping[
+        str, tuple[str, Intersection]
+    ]  # other instructions and what they name, by what they change
+    target: Intersection | None
     state: PrivilegedState | None  # of BOMB
     cameras: Mapping[str, Camera]  # {}: not known
 

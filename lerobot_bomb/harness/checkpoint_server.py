@@ -110,7 +110,7 @@ class CheckpointServer(PredictModelServer):
             RuntimeError: another session's episode is under way.
         """
         if ctx is not self._episode:
-            raise RuntimeError("this server plays another session's episode; start a server for each shard")
+            raise RuntimeError("this server runs another session's episode; start a server for each shard")
         if ctx.is_first:
             if self._environment is not None:
                 check_acting_policy(self._environment)

@@ -60,7 +60,7 @@ def check_one_rate_each(groups: list[Group]) -> None:
         if other is not group:
             raise ValueError(
                 f"{records[0].describe_policy()} has two rates for {_task(records[0])}, {condition}: the "
-                f"episodes differ in {', '.join(differing([other, group]))}; export the lines of one"
+                f"episodes differ in {', '.join(differing([other, group]))}; export the records of one"
             )
 
 

@@ -30,11 +30,11 @@ class LiberoFailure(StrEnum):
 class LiberoSpec:
     """Everything that, with the versions of code and simulator, determines an episode."""
 
-    seed: int
-    suite: str = SUITES[0]
-    task_id: int = 0
-    max_steps: int | None = None  # None: LeRobot's limit of the suite
-    perturbations: str = NONE  # a condition such as "table:2+light:3"; see `LiberoCondition`
+    seed: int  # number from which everything random is drawn
+    suite: str = SUITES[0]  # --env.task
+    task_id: int = 0  # number of the task in its suite
+    max_steps: int | None = None  # control steps after which the episode ends; null: LeRobot's limit
+    perturbations: str = NONE  # condition, such as table:2+light:3
 
     def __post_init__(self) -> None:
         # one spelling, so that equal conditions compare equal

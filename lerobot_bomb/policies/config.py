@@ -53,12 +53,13 @@ class ChunkConfig(ConfigWithEnvironment):
     # registered name of the processor step that reads the task, which every checkpoint has
     TASK_STEP: ClassVar[str]
 
+    # observations per prediction; always 1
     n_obs_steps: int = 1
-    # actions of a chunk
+    # actions predicted at once
     chunk_size: int = 1
     # actions executed before the next prediction
     n_action_steps: int = 1
-    # images stay in [0, 1]
+    # how images, state and action are normalised; images stay in [0, 1]
     normalization_mapping: dict[str, NormalizationMode] = field(
         default_factory=lambda: {
             "VISUAL": NormalizationMode.IDENTITY,
@@ -66,26 +67,36 @@ class ChunkConfig(ConfigWithEnvironment):
             "ACTION": NormalizationMode.MIN_MAX,
         }
     )
-    # whether actions beyond an episode's end (repeats of the last one) are trained on
+    # also train on actions beyond an episode's end, which repeat the last one
     loss_on_padded_actions: bool = False
     # frames at an episode's end that no sample starts at
     drop_n_last_frames: int = 1
-    # values that the checkpoint was trained with; filled in
+    # flags that define what the model's tokens mean, as they were in training
     trained_with: dict[str, Any] | None = None
-    # batches trained on so far; what is random in the next ones follows from it
+    # batches trained on so far; randomness in the next ones follows from this number
     trained_batches: int = 0
-    # of lerobot_bomb, which wrote the checkpoint
+    # version of lerobot_bomb that wrote the checkpoint
     package_version: PackageVersion = INSTALLED
 
+    # AdamW's learning rate after warm-up
     optimizer_lr: float = 2e-5
+    # AdamW's decay rates of the two moments
     optimizer_betas: tuple[float, float] = (0.9, 0.95)
+    # AdamW's epsilon
     optimizer_eps: float = 1e-8
+    # AdamW's weight decay
     optimizer_weight_decay: float = 0.0
+    # largest norm of the gradients
     optimizer_grad_clip_norm: float = 1.0
+    # steps in which the learning rate rises; with fewer --steps LeRobot shortens warm-up and decay, so set
+    # scheduler_decay_steps too
     scheduler_warmup_steps: int = 1_000
+    # steps after which the cosine schedule ends
     scheduler_decay_steps: int = 30_000
+    # learning rate at the end of the schedule
     scheduler_decay_lr: float = 0.0
 
+    # publish the checkpoint when the training ends; needs repo_id
     push_to_hub: bool = False
 
     def __post_init__(self) -> None:
@@ -159,38 +170,40 @@ class VlaConfig(ChunkConfig):
     # flags that need the robot's state
     NEEDS_STATE: ClassVar[tuple[str, ...]] = ("use_state",)
 
-    # Hub id, path of a local folder, or "nano": a small model with random weights, built in code
+    # base model: Hub id, local folder, or "nano", a small model with random weights that needs no network
     vlm_model_name: str = ""
-    # changes of nano's architecture, nested as it is, as {"vision_config": {"num_hidden_layers": 2}}
+    # changes of nano's architecture, nested like it: {"text_config": {"num_hidden_layers": 2}}
     nano_config: dict[str, Any] | None = None
-    # architecture; filled in when the base model is loaded. Set = build this and download nothing:
-    # the weights then come from a checkpoint
+    # architecture of the base model; if it is set, nothing is downloaded and the weights come from a
+    # checkpoint
     vlm_config: dict[str, Any] | None = None
-    # token ids of the fixed parts of the prompt; filled in together with vlm_config
+    # token ids of the fixed parts of the prompt
     prompt_tokens: dict[str, Any] | None = None
 
-    # side of the crop as a fraction of the image: random place while training, centre otherwise
+    # side of the crop as a share of the image's; placed at random in training, centred in evaluation
     crop_fraction: float = 1.0
-    # whether the robot's state is in the prompt
+    # put the robot's state into the prompt
     use_state: bool = True
+    # do not train the vision model
     freeze_vision_encoder: bool = False
-    # "bfloat16" = autocast over float32 weights, in training and in evaluation
+    # "bfloat16": autocast over float32 weights, in training and evaluation
     dtype: str = "float32"
-    # "bfloat16" = what autocast would cast at every call is cast once, when a checkpoint is loaded: half the
-    # memory, the same answers. With ``dtype=bfloat16``, and not for training
+    # "bfloat16": cast the weights once, when a checkpoint is loaded. Half the memory, the same actions; needs
+    # dtype=bfloat16, and not for training
     weights_dtype: str = "float32"
+    # training with less memory and more time
     gradient_checkpointing: bool = False
 
-    # chunks that an executed action is the mean of, one predicted every step; 0 = a queue instead
+    # predict at every step and execute the mean of this many newest chunks; 0: off. Needs n_action_steps=1
     temporal_ensemble_size: int = 0
-    # "uniform", "exponential" (exp(coefficient * age)), "nvlabs" (1 for the newest, 0.5 for others) or
-    # "adaptive" (exp(coefficient * cosine with the newest action))
+    # weights in that mean: "uniform", "exponential" (exp(coefficient * age)), "nvlabs" (1 for the newest, 0.5
+    # for others) or "adaptive" (exp(coefficient * cosine with the newest action))
     temporal_ensemble_weighting: str = "uniform"
-    # "exponential": positive favours old chunks
+    # coefficient of these weights; with "exponential" above 0 favours old chunks
     temporal_ensemble_coefficient: float = 0.01
-    # action dimensions that are not averaged, by (part of) their names
+    # action dimensions that are not averaged, by (part of) their names, such as gripper
     temporal_ensemble_exclude_joints: list[str] = field(default_factory=list)
-    # filled in from the dataset
+    # names of the action dimensions, from the dataset
     action_feature_names: list[str] | None = None
 
     def check_flags(self) -> None:
@@ -247,12 +260,11 @@ class RelativeVlaConfig(VlaConfig):
 
     NEEDS_STATE: ClassVar[tuple[str, ...]] = (*VlaConfig.NEEDS_STATE, "relative_actions")
 
-    # actions as such differences, converted inside the policy. LeRobot's name for it, use_relative_actions,
-    # makes its fine-tuning look for processor steps of its own
+    # predict differences to the state at the chunk's start; the policy still returns absolute actions
     relative_actions: bool = False
     # action dimensions that stay absolute, by (part of) their names
     relative_exclude_joints: list[str] = field(default_factory=list)
-    # the state dimension of each relative action dimension; None = the same number
+    # state dimension that each relative action dimension is the difference to; unset: the same number
     relative_state_indices: list[int] | None = None
 
     def methods(self) -> list[str]:
@@ -292,11 +304,11 @@ class TokenVlaConfig(VlaConfig):
 
     MODES: ClassVar[tuple[NormalizationMode, ...]] = BOUNDED_MODES
 
-    # answers on CUDA by `torch.compile`: some ten seconds for every size of batch, then faster
+    # on CUDA, compile the decoding: ten seconds for each batch size, then faster
     compile_model: bool = False
-    # what is chosen: the likeliest token (0), or a sample of softmax(logits / temperature)
+    # 0: choose the likeliest token; above: sample from softmax(logits / temperature)
     temperature: float = 0.0
-    # of the samples; every episode has its own
+    # seed of the samples; each episode has random numbers of its own
     noise_seed: int = 0
 
     def check_flags(self) -> None:

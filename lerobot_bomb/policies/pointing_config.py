@@ -21,11 +21,11 @@ class PointingVlaConfig(VlaConfig):
         "board_loss_weight": 1.0,
     }
 
-    # whether a place and a stone are predicted first and actions follow; a dataset's columns are the labels
+    # predict a place and a stone first, then the actions; the labels are columns of record --pointing
     pointing: bool = False
-    # share of the training frames that are given another place, and the expert's action for it
+    # share of the training frames that get another place, with the expert's action for it
     counterfactual_share: float = 0.5
-    # of what lies on each intersection, which image tokens have to tell; 0: they need not, nor a dataset
+    # weight of the loss of reading the board off image tokens; 0: off, and the dataset needs no such column
     board_loss_weight: float = 1.0
 
     def check_flags(self) -> None:
@@ -53,7 +53,7 @@ class PlacesVlaConfig(PointingVlaConfig):
 
     LATER_FIELDS: ClassVar[dict[str, Any]] = {**PointingVlaConfig.LATER_FIELDS, "pointing_places": None}
 
-    # (x, y) in metres that can be pointed at; filled in
+    # (x, y) in metres of the places to which it can point
     pointing_places: list[list[float]] | None = None
 
     def take_places(self, meta: LeRobotDatasetMetadata | None) -> list[list[float]]:

@@ -4,7 +4,7 @@ import torch
 from torch import Tensor
 from torch.nn.functional import cross_entropy
 
-from lerobot_bomb.bomb.commands import CELLS
+from lerobot_bomb.bomb.commands import INTERSECTIONS
 from lerobot_bomb.policies.board_reader import BoardReader
 from lerobot_bomb.policies.pointing import SPOTS
 from lerobot_bomb.policies.pointing_config import PointingVlaConfig
@@ -45,7 +45,7 @@ class PointingVlaPolicy(VlaPolicy):
         logits_BSC = self.board_reader(features_BPH)
         losses_BS = cross_entropy(logits_BSC.transpose(1, 2), colors_BS, reduction="none")
         # the tray's squares are many and nearly all empty: a stone there counts as one on the board
-        loss_B = losses_BS.sum(dim=1) / len(CELLS)
+        loss_B = losses_BS.sum(dim=1) / len(INTERSECTIONS)
         is_right_BS = logits_BSC.argmax(dim=2) == colors_BS
         return plus(loss, self.config.board_loss_weight, loss_B), {
             "board_loss": (loss_B.detach(), torch.ones_like(loss_B, dtype=torch.bool)),

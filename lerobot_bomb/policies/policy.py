@@ -19,7 +19,7 @@ from lerobot_bomb.actions.relative import RelativeActions, bounds, named_dims
 from lerobot_bomb.actions.text import TokenRows
 from lerobot_bomb.checkpoints.adapters import check_buffers_are_the_bases, frozen_buffers
 from lerobot_bomb.checkpoints.starting import check_start
-from lerobot_bomb.compat.hooks.evaluation import play_tasks_in_turn
+from lerobot_bomb.compat.hooks.evaluation import run_tasks_in_turn
 from lerobot_bomb.data.columns import (
     check_chunk_length,
     dim_names,
@@ -63,7 +63,7 @@ class ChunkPolicy(HubPolicy, SavesTiedWeightsOnce, PreTrainedPolicy):
 
     def __init__(self, config: Any, dataset_meta: LeRobotDatasetMetadata | None = None, **_: object):
         super().__init__(config, dataset_meta)
-        play_tasks_in_turn(_is_chunk_policy)
+        run_tasks_in_turn(_is_chunk_policy)
         config.validate_features()
         config.trained_with = trained_with(config, self.as_trained)
         # physical size of 1 in normalised actions, and their names; known while training: (D,)

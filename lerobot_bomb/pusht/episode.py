@@ -45,10 +45,10 @@ class PushTFailure(StrEnum):
 class PushTSpec:
     """Everything that, with the code's version, determines an episode bit for bit."""
 
-    seed: int
+    seed: int  # number from which everything random is drawn
     instruction: str = INSTRUCTIONS[0]  # templates, or none: the empty text of LeRobot's `pusht`
-    max_steps: int = MAX_STEPS
-    perturbations: str = NONE  # a condition such as "table:2+goal:3"; see `PushTCondition`
+    max_steps: int = MAX_STEPS  # control steps after which the episode ends
+    perturbations: str = NONE  # condition, such as table:2+goal:3
 
     def __post_init__(self) -> None:
         condition = PushTCondition.parse(self.perturbations)

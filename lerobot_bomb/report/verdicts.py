@@ -1,6 +1,6 @@
-"""Verdicts over records: what can be wrong with a success rate, asked one by one.
+"""Verdicts over records: what can be wrong with a success rate, question by question.
 
-Arms are lists of records of the same episodes, but for those of the splits.
+Runs are lists of records of the same episodes, but for those of the splits.
 """
 
 from collections.abc import Mapping, Sequence
@@ -19,10 +19,7 @@ RANDOM, EXPERT = "random actions", "the scripted expert"
 TRAIN, HELDOUT = "what training shows (split train)", "what is held out (split heldout)"
 
 YES, NO, OPEN = "yes", "NO", "not shown"
-P_NOTE = (
-    "p: exact McNemar test, or Fisher's where it says so; each question is asked alone, and nothing is "
-    "adjusted for their number."
-)
+P_NOTE = "p: exact McNemar test, or Fisher's where it says so; not adjusted for the number of questions."
 
 
 @dataclass(frozen=True)
@@ -34,33 +31,33 @@ class Verdict:
     evidence: str
 
 
-def table(arms: Mapping[str, list[Record]], verdicts: list[Verdict]) -> list[Table]:
-    """The rates of all arms; the verdicts."""
+def table(runs: Mapping[str, list[Record]], verdicts: list[Verdict]) -> list[Table]:
+    """The rates of all runs; the verdicts."""
     rates = [
         [Cell(name), rate(records), Cell(str(len(records)), len(records))]
-        for name, records in arms.items()
+        for name, records in runs.items()
         if records
     ]
     answers = [[Cell(each.question), Cell(each.answer), Cell(each.evidence)] for each in verdicts]
     return [
         Table("Verdicts", ["question", "answer", "evidence"], answers, P_NOTE),
-        Table("Success", ["who acts", "success", "episodes"], rates, f"With {INTERVALS}; per cent."),
+        Table("Success", ["policy", "success", "episodes"], rates, f"With {INTERVALS}; per cent."),
     ]
 
 
-def judge(arms: Mapping[str, list[Record]], trained_seeds: Sequence[int] | None) -> list[Verdict]:
-    """Judge every question that the arms have an answer to."""
-    policy = arms[POLICY]
-    found = [_same_again(pairs_of(policy, arms[AGAIN])), _same_alone(pairs_of(policy, arms[ALONE]))]
+def judge(runs: Mapping[str, list[Record]], trained_seeds: Sequence[int] | None) -> list[Verdict]:
+    """Judge every question that the runs have an answer to."""
+    policy = runs[POLICY]
+    found = [_same_again(pairs_of(policy, runs[AGAIN])), _same_alone(pairs_of(policy, runs[ALONE]))]
     for name, question in ((BLANK, "looks at the images"), (OTHER_INSTRUCTION, "reads the instruction")):
-        if arms.get(name):
-            found.append(_depends(question, name, pairs_of(policy, arms[name])))
-    if arms.get(RANDOM):
-        found.append(_better_than_random(pairs_of(arms[RANDOM], policy)))
-    if arms.get(EXPERT):
-        found.append(_can_be_solved(arms[EXPERT]))
-    if arms.get(HELDOUT):
-        found.append(_generalises(arms[TRAIN], arms[HELDOUT]))
+        if runs.get(name):
+            found.append(_depends(question, name, pairs_of(policy, runs[name])))
+    if runs.get(RANDOM):
+        found.append(_better_than_random(pairs_of(runs[RANDOM], policy)))
+    if runs.get(EXPERT):
+        found.append(_can_be_solved(runs[EXPERT]))
+    if runs.get(HELDOUT):
+        found.append(_generalises(runs[TRAIN], runs[HELDOUT]))
     return [*found, _new_seeds(policy, trained_seeds)]
 
 

@@ -31,7 +31,7 @@ def _with_video(sample: Sample, folder: Path) -> Sample:
     digest = hashlib.sha256(json.dumps(record.as_json(), sort_keys=True).encode()).hexdigest()
     path = folder / f"{record.failure}-seed{record.spec.seed}-{digest[:8]}.mp4"
     try:
-        different = _play(record, path)
+        different = _write_video(record, path)
     except Exception as error:  # whatever it is: the page says it in the video's place
         lines = str(error).strip().splitlines() or [type(error).__name__]
         return replace(sample, note=f"no video: {lines[-1]}")
@@ -39,7 +39,7 @@ def _with_video(sample: Sample, folder: Path) -> Sample:
     return replace(sample, video=quote(f"{folder.name}/{path.name}"), note=note)
 
 
-def _play(record: Record, path: Path) -> list[str]:
+def _write_video(record: Record, path: Path) -> list[str]:
     """Write the video of a record's episode; return the names of what the record says otherwise."""
     recording = path.with_suffix(".rrd")
     (result,) = write_episodes({"": Replay(record).player()}, path.stem, recording, path)

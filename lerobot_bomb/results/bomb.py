@@ -110,35 +110,41 @@ class EpisodeResult(Record):
     )
 
     spec: EpisodeSpec
-    instruction: str
-    task_id: OwnTaskId  # None: not recorded
-    target: tuple[Line, Line] | None  # None: there is not one move to one intersection
+    instruction: str  # text that the policy read
+    task_id: OwnTaskId  # number of the episode's task in its suite; null: not recorded
+    # row and column of the target; null: more than one move
+    target: tuple[Line, Line] | None
+    # colour of the stone to be moved; null: more than one move
     color: Annotated[str, schema.among(COLORS)] | None
-    steps: Count
-    # share of the moves that were made; None: not recorded
+    steps: Count  # control steps
+    # share of the moves that were made; null: not recorded
     progress: Annotated[float | None, lambda value: value is not None and 0 <= value <= 1]
     is_success: bool
-    is_success_bomb_v0: bool
+    is_success_bomb_v0: bool  # success by the original benchmark's rule, within 26 mm
     failure: Annotated[str, schema.among(Failure)] | None
+    # how far the episode got: start, reached, grasped, lifted, placed
     stage: Annotated[str, schema.among(Stage)]
-    placement_error_mm: Quantity
-    nearest_intersection: tuple[Line, Line]
-    collateral_mm: Quantity
-    levels: dict[str, Natural] = field(default_factory=dict)  # of the perturbation axes that were on
+    placement_error_mm: Quantity  # horizontal distance of the stone from the target
+    nearest_intersection: tuple[Line, Line]  # row and column where the stone is
+    collateral_mm: Quantity  # largest distance by which another stone was moved
+    levels: dict[str, Natural] = field(default_factory=dict)
     image_size: Annotated[int, schema.between(MIN_IMAGE_SIZE, MAX_IMAGE_SIZE)] = DEFAULT_IMAGE_SIZE
+    # --env.render_preset
     render_preset: Annotated[str, schema.among(RENDER_PRESETS)] = RenderOptions.preset
-    # of the whole evaluation; None: not asked for by number
+    # --env.task_ids of the whole evaluation; null: not given
     task_ids: Annotated[tuple[TaskId, ...], lambda value: len(value) > 0] | None = None
-    policy: PolicyIdentity | None = None  # None: not known
-    # of the context that drew the observations; None: nothing was drawn
+    policy: PolicyIdentity | None = None
+    # maker of the OpenGL driver that rendered the images; null: nothing was rendered
     opengl_vendor: str | None = None
+    # the driver's renderer
     opengl_renderer: str | None = None
     machine: str = field(default_factory=machine_name)
+    # installed MuJoCo
     mujoco_version: str | None = field(default_factory=partial(installed_version, "mujoco"))
     lerobot_version: str | None = field(default_factory=partial(installed_version, "lerobot"))
     torch_version: str | None = field(default_factory=partial(installed_version, "torch"))
     package_version: str = __version__
-    task_version: str  # of the suite
+    task_version: str  # version of the suite's episodes
     protocol_version: str = PROTOCOL_VERSION
 
     def check_episode(self) -> None:

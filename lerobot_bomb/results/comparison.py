@@ -33,7 +33,7 @@ class Comparisons:
             lines += [f"{each.condition}: {_num_pairs(each)}", *(f"  {line}" for line in _lines(each))]
         if any(self.num_unpaired):
             a, b = self.num_unpaired
-            lines.append(f"not compared, for the other did not play them: {a} episodes of A, {b} of B")
+            lines.append(f"not compared, since only one has them: {a} episodes of A, {b} of B")
         notes = (
             "rates: 95 % Wilson intervals, clustered by seed; B - A: Newcombe's for pairs; p: "
             f"{describe_test(len(self.conditions))}, to be trusted where the two disagree, as with few pairs"
@@ -77,7 +77,7 @@ def compare(first: Sequence[Record], second: Sequence[Record]) -> Comparisons:
     policies = _only_policy("the first", groups[0]), _only_policy("the second", groups[1])
     pairs = list(_pairs(*groups))
     if not pairs:
-        raise ValueError(f"no episode was played by both: {_why_none(*groups)}")
+        raise ValueError(f"no episode is in both: {_why_none(*groups)}")
     num_first, num_second = (sum(len(group.records) for group in of) for of in groups)
     return Comparisons(
         policies=policies,

@@ -27,15 +27,19 @@ class Query:
 class Inference:
     """The queries of an episode, and what they were run on."""
 
-    num_queries: Count
-    total_s: Positive
+    num_queries: Count  # queries of the episode: calls that ran the network
+    total_s: Positive  # seconds of all queries
+    # median seconds of a query in ms; a query serves all episodes of the batch
     latency_p50_ms: Positive
-    latency_p95_ms: Positive
-    passes: Quantity | None  # means per query
+    latency_p95_ms: Positive  # 95th percentile of the same
+    # forward passes per query, mean, prompt and sampling steps included; null: unknown
+    passes: Quantity | None
+    # tokens generated per query for one episode, mean; null: none or unknown
     tokens: Quantity | None
-    num_parameters: Count
+    num_parameters: Count  # parameters of the policy
+    # largest memory in use; on CUDA of tensors, on a CPU of the whole process; null: unknown
     peak_memory_bytes: Count | None
-    device: str
+    device: str  # the GPU's name, or cpu with its number of threads
 
     @classmethod
     def of(cls, queries: Sequence[Query]) -> "Inference | None":

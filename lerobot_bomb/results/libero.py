@@ -65,16 +65,17 @@ class LiberoResult(Record):
     tasks: ClassVar = SUITES
 
     spec: LiberoSpec
-    instruction: str
-    initial_state: Natural  # of the task's recorded ones
-    steps: Count
+    instruction: str  # text that the policy read
+    initial_state: Natural  # number of the task's recorded state in which the episode started
+    steps: Count  # control steps
     is_success: bool
     failure: Annotated[str, schema.among(LiberoFailure)] | None
-    levels: dict[str, Natural] = field(default_factory=dict)  # of the perturbation axes that were on
-    image_size: str = "256x256"  # width and height in pixels
-    control_mode: str = "relative"
-    fps: Count = 20
-    policy: PolicyIdentity | None = None  # None: not known
+    levels: dict[str, Natural] = field(default_factory=dict)
+    image_size: str = "256x256"
+    control_mode: str = "relative"  # --env.control_mode
+    fps: Count = 20  # control steps per second
+    policy: PolicyIdentity | None = None
+    # {package on which the bits of an episode depend: its version}
     simulator_versions: dict[str, str | None] = field(default_factory=partial(installed_versions, SIMULATOR))
     machine: str = field(default_factory=machine_name)
     lerobot_version: str | None = field(default_factory=partial(installed_version, "lerobot"))

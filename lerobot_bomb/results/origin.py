@@ -1,4 +1,4 @@
-"""Origin of a result: who acted, with which versions, on which machine.
+"""Origin of a result: which policy ran, with which versions, on which machine.
 
 Simulator workers import this module, so it imports neither torch nor LeRobot.
 """
@@ -54,17 +54,18 @@ def machine_name() -> str:
 class PolicyIdentity:
     """Policy that acted. One without weights, or built from its config alone, has a type only."""
 
-    type: str
+    type: str  # policy type
     path: str | None = None  # the checkpoint's folder as it was given, or USER/NAME on the Hub
     revision: str | None = None  # commit on the Hub
-    weights_sha256: Sha256 | None = None  # of the file of weights; of adapters, of theirs
-    settings_sha256: Sha256 | None = None  # of the config that it acted with and of the processors' files
-    base: str | None = None  # what adapters are loaded on: a folder or USER/NAME@REVISION
-    is_in_training: bool = False  # its weights are in no file
-    # of episodes that it acted in at once; a policy's arithmetic rounds otherwise in a batch of another size
+    weights_sha256: Sha256 | None = None  # SHA-256 of the weights, or of the adapters' weights
+    # SHA-256 of the config with this evaluation's flags and of the processors
+    settings_sha256: Sha256 | None = None
+    base: str | None = None  # checkpoint under the adapters: a folder or USER/NAME@REVISION
+    is_in_training: bool = False  # evaluated during a training: the weights are in no file
+    # episodes evaluated in one batch; arithmetic rounds differently in a batch of another size
     batch_size: Count | None = None
-    batch_row: Natural | None = None  # which of them this one was
-    interventions: tuple[str, ...] = ()  # steps of its preprocessor that change on purpose what it is shown
+    batch_row: Natural | None = None  # row of this episode in the batch
+    interventions: tuple[str, ...] = ()  # names of the preprocessor's steps that change the input on purpose
 
     def describe(self) -> str:
         """'act outputs/act (weights 0123456789ab, settings 0123456789ab)', 'act'."""

@@ -52,16 +52,17 @@ class PushTResult(Record):
     )
 
     spec: PushTSpec
-    instruction: str
-    goal_pose: tuple[float, float, float]  # x, y in pixels of the board, radians
-    steps: Count
+    instruction: str  # text that the policy read
+    goal_pose: tuple[float, float, float]  # target: x and y in pixels of the board, radians
+    steps: Count  # control steps
     is_success: bool
     failure: Annotated[str, schema.among(PushTFailure)] | None
     coverage: Coverage  # share of the target that the block covers at the end
-    max_coverage: Coverage  # the largest after any step
-    levels: dict[str, Natural] = field(default_factory=dict)  # of the perturbation axes that were on
+    max_coverage: Coverage  # largest coverage after any step
+    levels: dict[str, Natural] = field(default_factory=dict)
     image_size: Annotated[int, schema.between(MIN_IMAGE_SIZE, MAX_IMAGE_SIZE)] = IMAGE_SIZE
-    policy: PolicyIdentity | None = None  # None: not known
+    policy: PolicyIdentity | None = None
+    # {package on which the bits of an episode depend: its version}
     simulator_versions: dict[str, str | None] = field(default_factory=partial(installed_versions, SIMULATOR))
     machine: str = field(default_factory=machine_name)
     lerobot_version: str | None = field(default_factory=partial(installed_version, "lerobot"))

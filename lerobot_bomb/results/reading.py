@@ -67,7 +67,7 @@ def check_any(path: Path, records: Collection[object], damages: list[str]) -> No
         raise ValueError(f"{path} is no results file; name one that --env.results_path of lerobot-eval wrote")
     if not records:
         raise ValueError(
-            f"{path}: no finished episode; lerobot-eval writes a line when one ends: start it (again) with "
+            f"{path}: no finished episode; lerobot-eval writes a record when one ends: start it (again) with "
             f"--env.results_path={path}"
         )
 

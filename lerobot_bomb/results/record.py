@@ -32,7 +32,7 @@ MEASURED = {"inference"}
 
 
 class Spec(Protocol):
-    """Spec of an episode: all that determines it."""
+    """Everything that determines an episode."""
 
     @property
     def seed(self) -> int: ...
@@ -82,20 +82,21 @@ class Record:
     starts_by_number: ClassVar[bool] = False
 
     spec: Spec
-    is_success: bool
-    failure: str | None
-    levels: dict[str, Natural]
-    image_size: int | str
-    policy: PolicyIdentity | None
-    machine: str
-    lerobot_version: str | None
-    torch_version: str | None
-    package_version: str
-    protocol_version: str
-    # mean differences of the executed actions, per step and without the gripper; None: fewer than four
+    is_success: bool  # the episode succeeded
+    failure: str | None  # failure class; null: success
+    levels: dict[str, Natural]  # {perturbation axis that was on: its level}
+    image_size: int | str  # width and height of the images in pixels
+    policy: PolicyIdentity | None  # null: not known
+    machine: str  # processor and C library
+    lerobot_version: str | None  # installed LeRobot
+    torch_version: str | None  # installed torch
+    package_version: str  # version of this package
+    protocol_version: str  # how results are measured and written
+    # mean length of the executed actions' second differences, gripper left out; null: fewer than four actions
     action_j2: Quantity | None = None
+    # mean length of the third differences, likewise
     action_j3: Quantity | None = None
-    inference: Inference | None = None  # None: no network was asked, or it was not measured
+    inference: Inference | None = None  # cost of the policy's queries; null: no network, or not measured
 
     def as_json(self) -> dict[str, Any]:
         """Return the fields as a record has them, in its order."""

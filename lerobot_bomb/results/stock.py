@@ -29,11 +29,12 @@ class NoCondition(AxisCondition):
 class StockSpec:
     """Episode of an evaluation, as far as LeRobot tells which one it was."""
 
-    seed: Natural
-    suite: str  # what LeRobot calls a group of tasks
-    task_id: Natural
-    number: Natural | None  # in the evaluation, where that chooses how it starts; None: the seed does
-    perturbations: Annotated[str, schema.among((NONE,))] = NONE  # there are no others
+    seed: Natural  # the episode's seed
+    suite: str  # LeRobot's name of the group of tasks
+    task_id: Natural  # number of the task in its suite
+    # number of the episode in its evaluation, which chooses its start; null: the seed does
+    number: Natural | None
+    perturbations: Annotated[str, schema.among((NONE,))] = NONE  # always none
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -50,16 +51,16 @@ class StockResult(Record):
     has_results_path: ClassVar = False
 
     spec: StockSpec
-    sum_reward: float
-    max_reward: float
+    sum_reward: float  # sum of the rewards
+    max_reward: float  # largest reward
     is_success: bool
     failure: Annotated[str, schema.among((FAILED,))] | None
-    image_size: str  # width and height in pixels
-    flags: dict[str, Any]  # of the environment, that decide what an episode is
-    simulator_versions: dict[str, str | None]
+    image_size: str
+    flags: dict[str, Any]  # {flag of the environment that decides what an episode is: its value}
+    simulator_versions: dict[str, str | None]  # {package of the simulator: its version}
     protocol_version: str
-    policy: PolicyIdentity | None = None  # None: not known
-    levels: dict[str, Natural] = field(default_factory=dict)  # of perturbation axes: none
+    policy: PolicyIdentity | None = None
+    levels: dict[str, Natural] = field(default_factory=dict)  # always empty: there are no axes
     machine: str = field(default_factory=machine_name)
     lerobot_version: str | None = field(default_factory=partial(installed_version, "lerobot"))
     torch_version: str | None = field(default_factory=partial(installed_version, "torch"))

@@ -40,8 +40,8 @@ class Replay:
         row, size = self._place
         if size > MAX_BATCH or row >= size or row > self.record.spec.seed:
             raise ValueError(
-                f"the line says policy.batch_row={row} of policy.batch_size={size}, and replay plays the "
-                f"others of its batch along: at most {MAX_BATCH}, of seeds from 0 on"
+                f"the record has policy.batch_row={row} of policy.batch_size={size}, and replay runs the "
+                f"whole batch: at most {MAX_BATCH}, of seeds from 0 on"
             )
         viewed = self.viewed(perturbations)
         return Player(viewed, partial(self._agent, viewed))
@@ -74,7 +74,7 @@ class Replay:
             case _:
                 flags = " ".join(record.eval_flags([record]))
                 raise ValueError(
-                    f"--env.type={record.env_type} has no recording for Rerun; lerobot-eval plays the "
+                    f"--env.type={record.env_type} has no recording for Rerun; lerobot-eval runs the "
                     f"episode: {flags} --seed={record.spec.seed} --eval.n_episodes=1 --eval.batch_size=1"
                 )
 
@@ -95,13 +95,13 @@ class Replay:
         from lerobot_bomb.compat.hooks.policies import built_policies  # LeRobot and torch: seconds
         from lerobot_bomb.viewing.checkpoint import checkpoint_agent, scripted_agent
 
-        # who played is not asked whether it was trained for this
+        # the record's policy ran here, whatever it was trained for
         env = viewed.env_type, viewed.env_flags | {"ignore_checkpoint": True}, viewed.spec.seed
         policy, path = self.record.policy, self.checkpoint
         if path is None and policy is not None:
             return scripted_agent(policy.type, *env)
         if path is None:
-            raise ValueError("the line does not say who played; name it with --policy.path=FOLDER")
+            raise ValueError("the record does not name its policy; give --policy.path=FOLDER")
         agent = checkpoint_agent(path, self.policy_device, *env, self.policy_flags)
         if policy is not None and viewed.spec.perturbations == self.record.spec.perturbations:
             _check_policy(policy, path, identity_of(built_policies()[-1]))
@@ -112,11 +112,11 @@ def _check_policy(played: PolicyIdentity, path: Path, loaded: PolicyIdentity) ->
     """Raise a ValueError if the loaded policy is another than the one that ran then."""
     if played.weights_sha256 not in (None, loaded.weights_sha256):
         raise ValueError(
-            f"{path} holds other weights than those that played; name the folder that holds them with "
+            f"{path} holds other weights than those of the record; name the folder that holds them with "
             "--policy.path=FOLDER, or see what these do with `lerobot-bomb view`"
         )
     if played.settings_sha256 not in (None, loaded.settings_sha256):
         raise ValueError(
-            f"{path} holds the weights that played, but other settings; give the flags --policy.NAME=VALUE "
+            f"{path} holds the record's weights, but other settings; give the flags --policy.NAME=VALUE "
             "of that evaluation"
         )

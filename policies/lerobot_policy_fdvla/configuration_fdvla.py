@@ -61,7 +61,7 @@ AS_TRAINED = (
 class FdvlaConfig(RelativeVlaConfig, PlacesVlaConfig):
     """A Qwen2.5-VL reads noisy actions beside images and text; two heads take them to clean ones.
 
-    More flags, for research: docs/fdvla.md.
+    More flags, for research: docs/reference/policies.md.
     """
 
     CHOICES: ClassVar[dict[str, tuple]] = {
@@ -82,14 +82,14 @@ class FdvlaConfig(RelativeVlaConfig, PlacesVlaConfig):
     NEEDS_STATE: ClassVar[tuple[str, ...]] = (*RelativeVlaConfig.NEEDS_STATE, "pointing")
     LATER_FIELDS: ClassVar[dict[str, Any]] = {**PlacesVlaConfig.LATER_FIELDS, "pointing_loss_weight": 1.0}
 
-    # Hub id, path of a local folder, or "nano": a small model with random weights, built in code
+    # base model: Hub id, local folder, or "nano", a small model with random weights that needs no network
     vlm_model_name: str = "Qwen/Qwen2.5-VL-3B-Instruct"
 
-    # actions of a chunk
+    # actions sampled at once
     chunk_size: int = 16
     # actions executed before the next prediction
     n_action_steps: int = 8
-    # images stay in [0, 1]; what noise of N(0, I) becomes should have its spread
+    # how images, state and action are normalised; actions should have the spread of noise of N(0, I)
     normalization_mapping: dict[str, NormalizationMode] = field(
         default_factory=lambda: {
             "VISUAL": NormalizationMode.IDENTITY,
@@ -97,66 +97,72 @@ class FdvlaConfig(RelativeVlaConfig, PlacesVlaConfig):
             "ACTION": NormalizationMode.MEAN_STD,
         }
     )
-    # side in pixels of what the vision model sees; a token stands for 28 x 28 of them
+    # pixels a side that the vision model sees, a multiple of 28; a token stands for 28 x 28 of them
     image_size: int = 224
 
-    # predicts the velocity from noise to actions
+    # have the head that predicts the velocity from noise to actions
     use_flow_head: bool = True
-    # predicts the noise
+    # have the head that predicts the noise
     use_denoise_head: bool = True
-    # whether pooled states of the prompt scale and shift the features of each head
+    # let the instruction's pooled states scale and shift the flow head's features
     dualmod_flow: bool = True
+    # let them scale and shift the denoising head's features
     dualmod_denoise: bool = True
-    # what is pooled: the instruction's "text", "all_prefix", or the "last" token before the actions
+    # states that DualMod pools: the instruction's ("text"), "all_prefix", or the "last" before the actions
     reasoning_pool: str = "text"
-    # "bidirectional": the tokens of a chunk read each other; "causal": what stands before them
+    # tokens of a chunk attend to each other ("bidirectional") or to earlier ones ("causal")
     segment_attention: str = "bidirectional"
-    # widths of the heads' features and of what modulates them
+    # width of the heads' features
     head_dim: int = 1024
+    # width of the network that modulates them
     dualmod_dim: int = 512
 
+    # weight of the flow head's loss
     flow_loss_weight: float = 1.0
+    # weight of the denoising head's loss
     denoise_loss_weight: float = 1.0
-    # of the heads' disagreement; None = 0.1 with both heads, else 0
+    # weight of the heads' disagreement; unset: 0.1 with both heads, else 0
     consistency_loss_weight: float | None = None
-    # what agrees: "linear", "energy_vjp" (second derivatives: small models only) or "none"
+    # how disagreement is measured: "linear", "energy_vjp" (second derivatives: small models only) or "none"
     consistency: str = "linear"
-    # the head that agreeing does not train: "none", "flow" or "denoise"
+    # head that the disagreement does not train: "none", "flow" or "denoise"
     consistency_detach: str = "none"
-    # how much noise training shows: "uniform", or "beta", which shows much of it more often
+    # distribution of tau in training: "uniform", or "beta", more often near the noise
     time_sampling: str = "uniform"
-    # times and noises that each chunk of a batch is trained at; the prompt is read once for all
+    # noise samples on which each chunk of a batch is trained; the prompt is read once for all
     draws_per_chunk: int = 1
 
-    # of what is pointed at, beside the heads' losses
+    # weight of the loss of pointing
     pointing_loss_weight: float = 1.0
 
-    # "residual", "flow", "ddim", "sde" or "paper"; None = residual with both heads, else that of the one
+    # "residual", "flow", "ddim", "sde" or "paper"; unset: residual with both heads, else that of the one
     sampler: str | None = None
-    # "euler" or "heun"
+    # "euler", or "heun" with two evaluations per step
     solver: str = SOLVER
+    # sampling steps
     num_inference_steps: int = NUM_INFERENCE_STEPS
-    # how much of the noise head residual, sde and paper take, in 0..1
+    # share of the denoising head in residual, sde and paper, 0 to 1
     refine_alpha: float = REFINE_ALPHA
-    # where on the way from noise (0) to actions (1) ddim starts
+    # tau at which ddim starts
     denoise_tau_min: float = DENOISE_TAU_MIN
-    # bound of the actions that ddim infers, in normalised units
+    # bound of the actions that ddim infers, normalised
     clip_sample_range: float = CLIP_SAMPLE_RANGE
-    # as in ACT
+    # weights in the ensemble's mean: "uniform", "exponential", "nvlabs" or "adaptive"
     temporal_ensemble_weighting: str = "exponential"
-    # of the noise that actions are sampled from
+    # seed of the noise from which actions are sampled
     noise_seed: int = 0
-    # an episode's own noise, or the same in all episodes
+    # each episode has noise of its own; else all have the same
     noise_per_episode: bool = False
     # LeRobot's real-time chunking; set by lerobot-rollout --inference.type=rtc
     rtc_config: RTCConfig | None = None
 
     # frames at an episode's end that no sample starts at
     drop_n_last_frames: int = 0
-    # "full" or "frozen": the language model
+    # train the whole language model ("full") or nothing of it ("frozen")
     train_vlm: str = "full"
+    # do not train the vision model; a nano model needs false
     freeze_vision_encoder: bool = True
-    # "bfloat16" = autocast over float32 weights, in training and in evaluation
+    # "bfloat16": autocast over float32 weights, in training and evaluation
     dtype: str = "bfloat16"
 
     optimizer_weight_decay: float = 1e-10

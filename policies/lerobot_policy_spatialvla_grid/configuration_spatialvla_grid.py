@@ -44,7 +44,7 @@ STONE_CELL_M = 0.005  # a fifth of a stone, and about what a small vision model 
 @short_help
 @dataclass
 class SpatialvlaGridConfig(TokenVlaConfig, PlacesVlaConfig):
-    """A PaliGemma 2 chooses a grid cell per group of dims and step; more flags: docs/spatialvla_grid.md."""
+    """A PaliGemma 2 chooses a grid cell per group and step; more flags: docs/reference/policies.md."""
 
     CHOICES: ClassVar[dict[str, tuple]] = {
         **TokenVlaConfig.CHOICES,
@@ -74,79 +74,84 @@ class SpatialvlaGridConfig(TokenVlaConfig, PlacesVlaConfig):
         "freeze_llm_embeddings",
     )
 
-    # Hub id, path of a local folder, or "nano": a small model with random weights, built in code
+    # base model: Hub id, local folder, or "nano", a small model with random weights that needs no network
     vlm_model_name: str = "google/paligemma2-3b-pt-224"
 
-    # actions of a chunk
+    # actions predicted at once
     chunk_size: int = 4
     # actions executed before the next prediction
     n_action_steps: int = 4
-    # what the prompt says around the instruction, for which {} stands; in lower case, too. SpatialVLA's
-    # slides have "What action should the robot take to {}?"
+    # text around the instruction, which {} stands for, in lower case. SpatialVLA's slides have "What action
+    # should the robot take to {}?"
     task_template: str = BARE_TASK
-    # whether the robot's state, in 256 bins, is in the prompt
+    # put the robot's state, in 256 bins, into the prompt
     use_state: bool = False
 
-    # [{"dims": [0, 1, 2], "transform": "polar", "bins": [16, 32, 8]}, ...]: one token each a step; None = by
-    # `action_layout`
+    # groups of action dimensions, a token each per step: [{"dims": [0, 1, 2], "transform": "polar", "bins":
+    # [16, 32, 8]}, ...]; transforms are polar, identity, binary; unset: by action_layout
     action_groups: list[dict[str, Any]] | None = None
-    # what the action is: a "pose" (x, y, z, gripper; of 7 with three angles before the gripper) or "joints";
-    # None = what its dimensions' names say
+    # kind of action: "pose" (x, y, z, gripper; of 7 with three angles before the gripper) or "joints";
+    # unset: by the dimensions' names
     action_layout: str | None = None
-    # how edges are placed: by the Gaussian or by the quantiles of the data, or evenly
+    # how edges are placed: by a Gaussian fitted to the data, by its quantiles (quantile), or evenly (uniform)
     grid_distribution: str = "gaussian"
-    # lower limit of the fitted standard deviations, in normalised units
+    # lower limit of the fitted standard deviations, normalised
     grid_min_sigma: float = 0.0
-    # what a cell decodes to: "mid" (bin's middle), "cond_mean" (mean of the data within the bin; without any,
-    # of the fitted Gaussian) or "centroid" (mean of the data within the cell)
+    # value of a cell: "mid" (the bin's middle), "cond_mean" (mean of the data in the bin; without data, of
+    # the fitted Gaussian) or "centroid" (mean of the data in the cell)
     decode_point: str = "cond_mean"
-    # whether a polar group's smallest radius means "no motion" exactly, and up to which it does; None = a
-    # fiftieth of the data's long motions
+    # let the smallest radius of a polar group mean exactly "no motion"
     zero_radius_bin: bool = True
+    # length up to which an action is no motion; unset: a fiftieth of the data's long motions
     rho_dead: float | None = None
-    # whether the angle phi is cut opposite the data's mean direction ("wrapped") or at pi ("linear")
+    # cut the angle phi opposite the data's mean direction ("wrapped") or at pi ("linear")
     phi_fit: str = "wrapped"
-    # edges and all else of the grids; filled in from the training data
+    # edges and all else of the grids, fitted to the training data
     grid_params: dict[str, Any] | None = None
-    # whether a checkpoint's grids are fitted anew to the data it is trained on, its cells' embeddings moved
+    # fit a checkpoint's grids again to new training data, and move the cells' embeddings with them
     adapt_embeddings: bool = True
 
-    # where depth comes from: "none", "observation" (key observation.depth.CAMERA) or "zoedepth"
+    # source of depth: "none", "observation" (key observation.depth.CAMERA) or "zoedepth"
     depth_source: str = "none"
+    # Hub id or folder of ZoeDepth, for checkpoints without their own
     depth_model_name: str = "Intel/zoedepth-nyu-kitti"
-    # architecture of that model; filled in when it is loaded, for checkpoints
+    # architecture of the depth model
     depth_config: dict[str, Any] | None = None
-    # {camera: 3x3 matrix in pixels of its image}, where the batch has no observation.intrinsics.CAMERA
+    # {camera: [[fx, 0, cx], [0, fy, cy], [0, 0, 1]]} in pixels of the whole image, for data without
+    # observation.intrinsics.CAMERA
     camera_intrinsics: dict[str, list[list[float]]] = field(default_factory=dict)
-    # 3-D points of a patch, per side
+    # 3-D points along a side of a patch
     ego3d_patch_reso: int = 2
+    # frequencies by which a 3-D point is encoded
     ego3d_n_freqs: int = 8
-    # whether the 3-D points change nothing before training
+    # let the 3-D points have no effect before training
     ego3d_zero_init: bool = True
-    # whether a learned vector stands for points without depth; false, as in the original: a patch with such a
-    # point gets no 3-D position
+    # use a learned vector for points without depth; false, as in the original: a patch with such a point
+    # gets no 3-D position
     ego3d_no_depth_vector: bool = True
 
-    # "bidirectional": every token of the prompt reads all of it; "causal": what stands before it
+    # tokens of the prompt attend to all of it ("bidirectional") or to earlier tokens ("causal")
     prefix_attention: str = "bidirectional"
-    # what a cell competes with in the loss: the cells of its "slot", or the "full" vocabulary
+    # classes in the loss of a cell: the cells of its "slot", or the "full" vocabulary
     loss_vocab: str = "slot"
 
-    # x and y in metres, from and to, where stones may be pointed at, and the side of their cells
+    # area in which stones may be, in metres: [[x, y] from, [x, y] to]
     pointing_area_m: list[list[float]] = field(default_factory=lambda: deepcopy(WORKSPACE_M))
+    # side of a cell of that area in metres
     pointing_cell_m: float = STONE_CELL_M
 
-    # what a pass guesses beside the next cell: "none", or that a step is as the one before ("repeat"); the
-    # cells are the same, up to ties within rounding. Not on CUDA
+    # guess that a step equals the one before ("repeat"), or guess nothing ("none"). The cells are the same,
+    # up to ties within rounding. Used for batches of 1, not on CUDA
     draft: str = "repeat"
 
-    # as the original's evaluations on LIBERO, which take 4 chunks
+    # weights in the ensemble's mean: "uniform", "exponential", "nvlabs" or "adaptive"
     temporal_ensemble_weighting: str = "adaptive"
+    # coefficient of these weights
     temporal_ensemble_coefficient: float = 0.1
 
-    # side of the crop as a fraction of the image: random place while training, centre otherwise
+    # side of the crop as a share of the image's; placed at random in training, centred in evaluation
     crop_fraction: float = 0.9
-    # the words' embeddings; those of the cells are always trained
+    # do not train the words' embeddings; those of the cells are always trained
     freeze_llm_embeddings: bool = True
 
     optimizer_betas: tuple[float, float] = (0.9, 0.999)

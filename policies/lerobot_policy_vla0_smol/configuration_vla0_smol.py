@@ -34,7 +34,7 @@ AS_TRAINED = (
 class Vla0SmolConfig(RelativeVlaConfig, TokenVlaConfig, PointingVlaConfig):
     """A model writes ``chunk_size`` actions as integers; ``n_action_steps`` of them are executed.
 
-    More flags, for research: docs/vla0_smol.md.
+    More flags, for research: docs/reference/policies.md.
     """
 
     CHOICES: ClassVar[dict[str, tuple]] = {
@@ -52,44 +52,45 @@ class Vla0SmolConfig(RelativeVlaConfig, TokenVlaConfig, PointingVlaConfig):
     )
     NEEDS_STATE: ClassVar[tuple[str, ...]] = (*RelativeVlaConfig.NEEDS_STATE, "pointing")
 
-    # Hub id, path of a local folder, or "nano": a small model with random weights, built in code
+    # base model: Hub id, local folder, or "nano", a small model with random weights that needs no network
     vlm_model_name: str = "HuggingFaceTB/SmolVLM2-500M-Video-Instruct"
 
-    # side in pixels of what the vision model sees; None = SmolVLM's own, 224 for Qwen2.5-VL
+    # pixels a side that the vision model sees; unset: a SmolVLM's own, its only one; 224 for Qwen2.5-VL,
+    # which takes multiples of 28
     image_size: int | None = None
 
-    # actions in the text
+    # actions written at once
     chunk_size: int = 10
     # actions executed before the next prediction
     n_action_steps: int = 5
 
-    # values an action number can take, from 0
+    # values that an action's number can take, 2 to 10000
     n_action_bins: int = 512
-    # values a state number can take, from 0
+    # values that a state's number can take
     n_state_bins: int = 512
-    # "centers" (bins as intervals) or "levels" (bins as points, -1 and 1 included)
+    # a number stands for an interval ("centers") or for a point, -1 and 1 included ("levels")
     bin_mode: str = "centers"
-    # digits of every number, zero-padded; 0 = as many as the number has
+    # digits of every number, zero-padded; 0: as many as it needs
     number_width: int = 0
-    # metres from -this to this that numbers of what is pointed at divide; from BOMB's gripper to its places
+    # bins of the points cover plus and minus this many metres
     pointing_range_m: float = 0.3
-    # text of a system message before the prompt; None = none, or Qwen2.5-VL's own
+    # system message before the prompt; unset: none, or Qwen2.5-VL's own
     system_prompt: str | None = None
 
-    # what a pass of the model guesses and checks beside the next token: "linear" (actions go on as in the
-    # answer's last two steps) or "none". Same actions, fewer passes
+    # guess that actions continue like the last two steps ("linear"), or guess nothing ("none"). The actions
+    # are the same, up to ties within rounding
     draft: str = "linear"
 
-    # side of the crop as a fraction of the image: random place while training, centre otherwise
+    # side of the crop as a share of the image's; placed at random in training, centred in evaluation
     crop_fraction: float = 0.875
 
-    # how far brightness, contrast, saturation and hue change while training, as torchvision's ColorJitter
-    # does it; None = not at all
+    # changes of brightness, contrast, saturation and hue in training, as in torchvision's ColorJitter;
+    # VLA-0's are [0.2, 0.2, 0.2, 0.05]; unset: none
     color_jitter: list[float] | None = None
 
-    # what is hidden as one while training: a number, all numbers of a step, or single characters
+    # unit that is hidden in training: a number ("value"), all numbers of a step, or a character
     mask_level: str = "value"
-    # upper end of the fraction of numbers (steps, characters) that are hidden
+    # hide up to this share of the numbers (steps, characters) in training
     mask_max_fraction: float = 0.15
     # probability that nothing is hidden in a sample
     mask_skip_prob: float = 0.1

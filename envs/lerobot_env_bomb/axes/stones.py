@@ -6,7 +6,7 @@ from typing import Self
 
 import numpy as np
 
-from lerobot_bomb.bomb.board import BOARD, COLORS, NUM_STONES, Cell
+from lerobot_bomb.bomb.board import BOARD, COLORS, NUM_STONES, Intersection
 from lerobot_bomb.bomb.go import is_legal_position
 from lerobot_bomb.bomb.layout import Layout, put_on_board
 from lerobot_bomb.bomb.perturbations import magnitude
@@ -18,7 +18,7 @@ from lerobot_env_bomb.axes.transform import Transform
 class Stones(Transform):
     """Stones beside the episode's on the board, none of them exactly on its intersection."""
 
-    extra: Mapping[Cell, str]  # (row, column) -> colour
+    extra: Mapping[Intersection, str]  # (row, column) -> colour
     directions_rad: tuple[float, ...]  # of the shift of each stone, first those of the opening
     shift_m: float
 
@@ -45,10 +45,10 @@ class Stones(Transform):
 
 
 def _grow(
-    opening: Mapping[Cell, str], num_extra: int, colors: Sequence[str], rng: np.random.Generator
-) -> dict[Cell, str]:
+    opening: Mapping[Intersection, str], num_extra: int, colors: Sequence[str], rng: np.random.Generator
+) -> dict[Intersection, str]:
     """{(row, column): colour} of stones that can join the opening, the colours in turn."""
-    extra: dict[Cell, str] = {}
+    extra: dict[Intersection, str] = {}
     first = int(rng.integers(len(COLORS)))
     for place in rng.permutation(BOARD.num_lines**2):
         row, column = divmod(int(place), BOARD.num_lines)

@@ -4,13 +4,13 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from lerobot_bomb.bomb.board import BOARD, COLORS, Cell
+from lerobot_bomb.bomb.board import BOARD, COLORS, Intersection
 from lerobot_bomb.bomb.commands import (
-    CELLS,
+    INTERSECTIONS,
     TRAY_XY_M,
     Case,
-    Drawn,
     Task,
+    TaskInstance,
     command_suite,
     draw_stones,
     is_graspable,
@@ -25,11 +25,11 @@ SIDE_COLUMNS = 2  # of the left side, to which stones are gathered
 FAR_COLUMN = 3  # from here on stones are gathered: none of them stands beside a place of the left side
 
 
-def _draw_board(rng: np.random.Generator) -> dict[Cell, str]:
+def _draw_board(rng: np.random.Generator) -> dict[Intersection, str]:
     return draw_stones(rng, int(rng.integers(MIN_STONES, MAX_STONES + 1)))
 
 
-def _to_tray(drawn: Drawn, cells: list[Cell]) -> tuple[Plan, tuple[Aim, ...]]:
+def _to_tray(drawn: TaskInstance, cells: list[Intersection]) -> tuple[Plan, tuple[Aim, ...]]:
     """Return the plan and the aims that put all of these stones into the tray, in whichever order."""
     stones = [drawn.stone_on(cell) for cell in cells]
     plan = tuple(one_move(stone, [TRAY]) for stone in stones)
@@ -40,10 +40,12 @@ def _to_tray(drawn: Drawn, cells: list[Cell]) -> tuple[Plan, tuple[Aim, ...]]:
 class RemoveColor(Task):
     """The only stone of a colour goes into the tray."""
 
-    def draw(self, rng: np.random.Generator) -> Drawn:
-        return Drawn((int(rng.integers(len(COLORS))), int(rng.integers(BOARD.num_lines))), _draw_board(rng))
+    def draw(self, rng: np.random.Generator) -> TaskInstance:
+        return TaskInstance(
+            (int(rng.integers(len(COLORS))), int(rng.integers(BOARD.num_lines))), _draw_board(rng)
+        )
 
-    def case(self, drawn: Drawn) -> Case | None:
+    def case(self, drawn: TaskInstance) -> Case | None:
         color, row = COLORS[drawn.about[0]], drawn.about[1]
         cell = only(drawn.stones, color)
         if cell is None or cell[0] != row or not is_graspable(drawn.stones, cell):
@@ -57,11 +59,11 @@ class RemoveColor(Task):
 class RemoveAt(Task):
     """The stone on an intersection goes into the tray."""
 
-    def draw(self, rng: np.random.Generator) -> Drawn:
-        row, column = CELLS[rng.integers(len(CELLS))]
-        return Drawn((row, column), _draw_board(rng))
+    def draw(self, rng: np.random.Generator) -> TaskInstance:
+        row, column = INTERSECTIONS[rng.integers(len(INTERSECTIONS))]
+        return TaskInstance((row, column), _draw_board(rng))
 
-    def case(self, drawn: Drawn) -> Case | None:
+    def case(self, drawn: TaskInstance) -> Case | None:
         row, column = cell = drawn.about[0], drawn.about[1]
         if cell not in drawn.stones or not is_graspable(drawn.stones, cell):
             return None
@@ -74,19 +76,19 @@ class RemoveAt(Task):
 class Swap(Task):
     """Task: let two stones change places, one of them by way of the tray or of a free intersection."""
 
-    def draw(self, rng: np.random.Generator) -> Drawn:
+    def draw(self, rng: np.random.Generator) -> TaskInstance:
         stones = _draw_board(rng)
         (a, b) = [list(stones)[i] for i in rng.permutation(len(stones))[:2]]
-        return Drawn((*a, *b), stones)
+        return TaskInstance((*a, *b), stones)
 
-    def case(self, drawn: Drawn) -> Case | None:
+    def case(self, drawn: TaskInstance) -> Case | None:
         a, b = (drawn.about[0], drawn.about[1]), (drawn.about[2], drawn.about[3])
         stones = drawn.stones
         if not {a, b} <= stones.keys() or stones[a] == stones[b]:
             return None
         if not is_graspable(stones, a) or not is_graspable(stones, b):
             return None
-        others = [cell for cell in CELLS if cell not in (a, b)]  # the free ones of them
+        others = [cell for cell in INTERSECTIONS if cell not in (a, b)]  # the free ones of them
         first, second = drawn.stone_on(a), drawn.stone_on(b)
         plans = tuple(
             in_order(one_move(one, [TRAY, *others]), one_move(other, [here]), one_move(one, [there]))
@@ -109,17 +111,19 @@ class Push(Task):
     rows: int
     columns: int
 
-    def draw(self, rng: np.random.Generator) -> Drawn:
-        return Drawn((int(rng.integers(len(COLORS))), int(rng.integers(BOARD.num_lines))), _draw_board(rng))
+    def draw(self, rng: np.random.Generator) -> TaskInstance:
+        return TaskInstance(
+            (int(rng.integers(len(COLORS))), int(rng.integers(BOARD.num_lines))), _draw_board(rng)
+        )
 
-    def case(self, drawn: Drawn) -> Case | None:
+    def case(self, drawn: TaskInstance) -> Case | None:
         color, row = COLORS[drawn.about[0]], drawn.about[1]
         cell = only(drawn.stones, color)
         if cell is None or cell[0] != row:
             return None
         place = cell[0] + self.rows, cell[1] + self.columns
         others = {other: stone for other, stone in drawn.stones.items() if other != cell}
-        if place not in CELLS or place in others:
+        if place not in INTERSECTIONS or place in others:
             return None
         if not is_graspable(others, cell) or not is_graspable(others, place):
             return None
@@ -137,11 +141,11 @@ class Push(Task):
 class ClearRow(Task):
     """Task: put all stones of a row into the tray."""
 
-    def draw(self, rng: np.random.Generator) -> Drawn:
+    def draw(self, rng: np.random.Generator) -> TaskInstance:
         row, number = int(rng.integers(BOARD.num_lines)), int(rng.integers(1, MAX_MOVED + 1))
-        return Drawn((row, number), _draw_board(rng))
+        return TaskInstance((row, number), _draw_board(rng))
 
-    def case(self, drawn: Drawn) -> Case | None:
+    def case(self, drawn: TaskInstance) -> Case | None:
         row, number = drawn.about
         cells = sorted(cell for cell in drawn.stones if cell[0] == row)
         if len(cells) != number or not all(is_graspable(drawn.stones, cell) for cell in cells):
@@ -154,10 +158,12 @@ class ClearRow(Task):
 class Gather(Task):
     """Task: move all stones of a colour that do not stand on the left to the left."""
 
-    def draw(self, rng: np.random.Generator) -> Drawn:
-        return Drawn((int(rng.integers(len(COLORS))), int(rng.integers(BOARD.num_lines))), _draw_board(rng))
+    def draw(self, rng: np.random.Generator) -> TaskInstance:
+        return TaskInstance(
+            (int(rng.integers(len(COLORS))), int(rng.integers(BOARD.num_lines))), _draw_board(rng)
+        )
 
-    def case(self, drawn: Drawn) -> Case | None:
+    def case(self, drawn: TaskInstance) -> Case | None:
         color, row = COLORS[drawn.about[0]], drawn.about[1]
         cells = sorted(
             cell for cell, other in drawn.stones.items() if other == color and cell[1] >= SIDE_COLUMNS
@@ -166,7 +172,7 @@ class Gather(Task):
             return None
         if not all(column >= FAR_COLUMN and is_graspable(drawn.stones, (r, column)) for r, column in cells):
             return None
-        side = [cell for cell in CELLS if cell[1] < SIDE_COLUMNS]
+        side = [cell for cell in INTERSECTIONS if cell[1] < SIDE_COLUMNS]
         free = [cell for cell in side if cell not in drawn.stones]
         if len(free) < len(cells):
             return None

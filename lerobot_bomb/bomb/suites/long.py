@@ -5,15 +5,15 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from lerobot_bomb.bomb.board import BOARD, COLORS, NUM_STONES, Cell
+from lerobot_bomb.bomb.board import BOARD, COLORS, NUM_STONES, Intersection
 from lerobot_bomb.bomb.commands import (
-    CELLS,
+    INTERSECTIONS,
     TRAY_XY_M,
     Case,
-    Drawn,
     Task,
+    TaskInstance,
     command_suite,
-    draw_cells,
+    draw_intersections,
     draw_stones,
     is_graspable,
     other_color,
@@ -39,7 +39,7 @@ def _shuffled(rng: np.random.Generator, colors: tuple[str, ...]) -> tuple[str, .
 
 
 def _supply_plan(
-    drawn: Drawn, moves: list[tuple[str, Cell]], is_ordered: bool
+    drawn: TaskInstance, moves: list[tuple[str, Intersection]], is_ordered: bool
 ) -> tuple[Plan, tuple[Aim, ...]]:
     """Stones of these colours from the tray to these intersections; any stone of the colour will do.
 
@@ -63,15 +63,17 @@ class Opening(Task):
     num_moves: int
     is_by_turns: bool
 
-    def draw(self, rng: np.random.Generator) -> Drawn:
+    def draw(self, rng: np.random.Generator) -> TaskInstance:
         first = int(rng.integers(len(COLORS)))
         supply = _shuffled(rng, _in_turn(first, self.num_moves))
         max_others = min(MAX_OTHERS, NUM_STONES - self.num_moves)
         others = draw_stones(rng, int(rng.integers(max_others + 1)))
-        cells = draw_cells(rng, self.num_moves, [cell for cell in CELLS if cell not in others])
-        return Drawn((first, *(line for cell in cells for line in cell)), others, supply)
+        cells = draw_intersections(
+            rng, self.num_moves, [cell for cell in INTERSECTIONS if cell not in others]
+        )
+        return TaskInstance((first, *(line for cell in cells for line in cell)), others, supply)
 
-    def case(self, drawn: Drawn) -> Case | None:
+    def case(self, drawn: TaskInstance) -> Case | None:
         lines = drawn.about[1:]
         cells = list(zip(lines[::2], lines[1::2], strict=True))
         colors = _in_turn(drawn.about[0], self.num_moves)
@@ -99,15 +101,15 @@ class FillRow(Task):
     The last one's colour is said: it stays true of what is left, whoever has played there before.
     """
 
-    def draw(self, rng: np.random.Generator) -> Drawn:
+    def draw(self, rng: np.random.Generator) -> TaskInstance:
         last, row = int(rng.integers(len(COLORS))), int(rng.integers(BOARD.num_lines))
         stones = draw_stones(rng, int(rng.integers(2, 6)))
-        free = [cell for cell in CELLS if cell[0] == row and cell not in stones]
-        return Drawn((last, row), stones, _shuffled(rng, _in_turn(last, len(free))))
+        free = [cell for cell in INTERSECTIONS if cell[0] == row and cell not in stones]
+        return TaskInstance((last, row), stones, _shuffled(rng, _in_turn(last, len(free))))
 
-    def case(self, drawn: Drawn) -> Case | None:
+    def case(self, drawn: TaskInstance) -> Case | None:
         last, row = drawn.about
-        cells = [cell for cell in CELLS if cell[0] == row and cell not in drawn.stones]
+        cells = [cell for cell in INTERSECTIONS if cell[0] == row and cell not in drawn.stones]
         colors = _in_turn(last, len(cells))[::-1]
         if Counter(drawn.supply) != Counter(colors) or not 2 <= len(cells) <= MAX_FILLED or drawn.pattern:
             return None
@@ -128,19 +130,19 @@ class Capture(Task):
 
     size: int
 
-    def draw(self, rng: np.random.Generator) -> Drawn:
+    def draw(self, rng: np.random.Generator) -> TaskInstance:
         color = int(rng.integers(len(COLORS)))
         row, column = int(rng.integers(BOARD.num_lines)), EDGE_COLUMNS[rng.integers(len(EDGE_COLUMNS))]
         group = [(row + i, column) for i in range(self.size)]
-        around = [cell for cell in CELLS if cell not in group and any(cell in near(c) for c in group)]
+        around = [cell for cell in INTERSECTIONS if cell not in group and any(cell in near(c) for c in group)]
         liberty = around[rng.integers(len(around))]
-        stones = dict.fromkeys((cell for cell in group if cell in CELLS), COLORS[color])
+        stones = dict.fromkeys((cell for cell in group if cell in INTERSECTIONS), COLORS[color])
         stones |= {cell: other_color(COLORS[color]) for cell in around if cell != liberty}
-        free = [cell for cell in CELLS if cell not in stones and cell != liberty]
+        free = [cell for cell in INTERSECTIONS if cell not in stones and cell != liberty]
         stones |= draw_stones(rng, int(rng.integers(3)), free)
-        return Drawn((color, *group[0]), stones, (other_color(COLORS[color]),))
+        return TaskInstance((color, *group[0]), stones, (other_color(COLORS[color]),))
 
-    def case(self, drawn: Drawn) -> Case | None:
+    def case(self, drawn: TaskInstance) -> Case | None:
         color, stones = COLORS[drawn.about[0]], drawn.stones
         if drawn.supply != (other_color(color),) or (drawn.about[1], drawn.about[2]) not in stones:
             return None
@@ -171,12 +173,12 @@ class Capture(Task):
 class TakeBack(Task):
     """The last two moves are undone, the later one first."""
 
-    def draw(self, rng: np.random.Generator) -> Drawn:
+    def draw(self, rng: np.random.Generator) -> TaskInstance:
         stones = draw_stones(rng, int(rng.integers(2, 7)))
         a, b = [list(stones)[i] for i in rng.permutation(len(stones))[:2]]
-        return Drawn((*a, *b), stones)
+        return TaskInstance((*a, *b), stones)
 
-    def case(self, drawn: Drawn) -> Case | None:
+    def case(self, drawn: TaskInstance) -> Case | None:
         a, b = (drawn.about[0], drawn.about[1]), (drawn.about[2], drawn.about[3])
         stones = drawn.stones
         if drawn.supply or not {a, b} <= stones.keys() or stones[a] == stones[b]:
@@ -198,14 +200,14 @@ class CopyPattern(Task):
 
     num_stones: int
 
-    def draw(self, rng: np.random.Generator) -> Drawn:
+    def draw(self, rng: np.random.Generator) -> TaskInstance:
         first = int(rng.integers(len(COLORS)))
         colors = _in_turn(first, self.num_stones)
-        cells = draw_cells(rng, self.num_stones)
+        cells = draw_intersections(rng, self.num_stones)
         pattern = dict(zip(cells, colors, strict=True))
-        return Drawn((first, *cells[0]), {}, _shuffled(rng, colors), pattern)
+        return TaskInstance((first, *cells[0]), {}, _shuffled(rng, colors), pattern)
 
-    def case(self, drawn: Drawn) -> Case | None:
+    def case(self, drawn: TaskInstance) -> Case | None:
         if len(drawn.pattern) != self.num_stones or set(drawn.pattern) & set(drawn.stones):
             return None
         if Counter(drawn.supply) != Counter(drawn.pattern.values()):

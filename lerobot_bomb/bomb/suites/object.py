@@ -6,7 +6,7 @@ from functools import cache, partial
 
 import numpy as np
 
-from lerobot_bomb.bomb.board import COLORS, NUM_STONES, TRAY_CENTER_XY, Cell
+from lerobot_bomb.bomb.board import COLORS, NUM_STONES, TRAY_CENTER_XY, Intersection
 from lerobot_bomb.bomb.episode import EpisodeSpec
 from lerobot_bomb.bomb.layout import Layout, put_on_board
 from lerobot_bomb.bomb.move import aim_at, one_move
@@ -121,20 +121,20 @@ TASKS = (
 NUM_PARTS = 5  # one in so many pairs of a task and an intersection is held out
 
 
-def is_heldout(task_id: int, cell: Cell) -> bool:
+def is_heldout(task_id: int, cell: Intersection) -> bool:
     """Return True if a pair is held out; every task and every intersection is seen in other pairs."""
     row, column = cell
     return (task_id + row + 2 * column) % NUM_PARTS == 0
 
 
 @cache
-def pairs_of(split: str) -> tuple[tuple[int, Cell], ...]:
+def pairs_of(split: str) -> tuple[tuple[int, Intersection], ...]:
     """(task, target) that a split draws from."""
     pairs = [(task_id, cell) for task_id in range(len(TASKS)) for cell in ALL_TARGETS]
     return of_split(split, pairs, [pair for pair in pairs if is_heldout(*pair)])
 
 
-def _pairs(spec: EpisodeSpec) -> list[tuple[int, Cell]]:
+def _pairs(spec: EpisodeSpec) -> list[tuple[int, Intersection]]:
     """Return the pairs of task and intersection that a spec draws from."""
     return [
         (task_id, cell)

@@ -5,7 +5,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from lerobot_bomb.bomb.board import BOARD, COLORS, NUM_STONES, TRAY_CENTER_XY, Cell, task_id
+from lerobot_bomb.bomb.board import BOARD, COLORS, NUM_STONES, TRAY_CENTER_XY, Intersection, task_id
 from lerobot_bomb.bomb.episode import EpisodeSpec
 from lerobot_bomb.bomb.go import is_legal_move, is_legal_position
 from lerobot_bomb.bomb.layout import Layout, put_on_board
@@ -64,7 +64,7 @@ FORMS = (
 )
 
 
-def targets_of(split: str) -> tuple[Cell, ...]:
+def targets_of(split: str) -> tuple[Intersection, ...]:
     """Intersections (row, column) that a split draws from."""
     return of_split(split, ALL_TARGETS, HELDOUT_TARGETS)
 
@@ -130,8 +130,12 @@ def layout_of_one(seed: int, color: str) -> Layout:
 
 
 def sample_opening(
-    rng: np.random.Generator, target: Cell, color: str, max_stones: int, colors: Sequence[str] = COLORS
-) -> dict[Cell, str]:
+    rng: np.random.Generator,
+    target: Intersection,
+    color: str,
+    max_stones: int,
+    colors: Sequence[str] = COLORS,
+) -> dict[Intersection, str]:
     """{(row, column): colour} of up to so many stones, the colours in turn: a legal position, a legal move.
 
     The candidates do not depend on the move and the first that allows it is taken, so what stands on the

@@ -7,7 +7,7 @@ from functools import cache, partial
 
 import numpy as np
 
-from lerobot_bomb.bomb.board import BOARD, COLORS, Cell
+from lerobot_bomb.bomb.board import BOARD, COLORS, Intersection
 from lerobot_bomb.bomb.episode import EpisodeSpec
 from lerobot_bomb.bomb.go import is_legal_move, is_legal_position
 from lerobot_bomb.bomb.layout import put_on_board
@@ -20,7 +20,7 @@ MAX_OPENING_STONES = 8
 LAST = BOARD.num_lines - 1
 MIDDLE = LAST // 2
 
-type Stones = Mapping[Cell, str]  # (row, column) -> colour of what stands on the board
+type Stones = Mapping[Intersection, str]  # (row, column) -> colour of what stands on the board
 
 TEMPLATES = (
     "Place a {color} stone {place}.",
@@ -60,15 +60,15 @@ class Task(ABC):
     has_anchor = True
 
     @abstractmethod
-    def select(self, stones: Stones, anchor: str) -> Cell | None:
+    def select(self, stones: Stones, anchor: str) -> Intersection | None:
         """Return the place that is meant; None where none or several fit, or it is taken."""
 
     @abstractmethod
-    def referents(self, target: Cell) -> list[list[Cell]]:
+    def referents(self, target: Intersection) -> list[list[Intersection]]:
         """Return each way for stones to stand so that `target` is meant; none where it cannot be."""
 
     @property
-    def targets(self) -> tuple[Cell, ...]:
+    def targets(self) -> tuple[Intersection, ...]:
         """Intersections that can be meant."""
         return tuple(cell for cell in ALL_TARGETS if self.referents(cell))
 
@@ -81,14 +81,14 @@ class Beside(Task):
     rows: int
     columns: int
 
-    def select(self, stones: Stones, anchor: str) -> Cell | None:
+    def select(self, stones: Stones, anchor: str) -> Intersection | None:
         anchors = [cell for cell, color in stones.items() if color == anchor]
         if len(anchors) != 1:
             return None
         place = anchors[0][0] + self.rows, anchors[0][1] + self.columns
         return place if place in ALL_TARGETS and place not in stones else None
 
-    def referents(self, target: Cell) -> list[list[Cell]]:
+    def referents(self, target: Intersection) -> list[list[Intersection]]:
         cell = target[0] - self.rows, target[1] - self.columns
         return [[cell]] if cell in ALL_TARGETS else []
 
@@ -99,12 +99,12 @@ class Between(Task):
 
     place: str
 
-    def select(self, stones: Stones, anchor: str) -> Cell | None:
+    def select(self, stones: Stones, anchor: str) -> Intersection | None:
         anchors = [cell for cell, color in stones.items() if color == anchor]
         places = [cell for cell in ALL_TARGETS if sorted(anchors) in map(sorted, self.referents(cell))]
         return places[0] if places and places[0] not in stones else None
 
-    def referents(self, target: Cell) -> list[list[Cell]]:
+    def referents(self, target: Intersection) -> list[list[Intersection]]:
         row, column = target
         pairs = [[(row, column - 1), (row, column + 1)], [(row - 1, column), (row + 1, column)]]
         return [pair for pair in pairs if set(pair) <= set(ALL_TARGETS)]
@@ -115,13 +115,13 @@ class Fixed(Task):
     """A place that the board itself has."""
 
     place: str
-    cell: Cell
+    cell: Intersection
     has_anchor = False
 
-    def select(self, stones: Stones, anchor: str) -> Cell | None:
+    def select(self, stones: Stones, anchor: str) -> Intersection | None:
         return None if self.cell in stones else self.cell
 
-    def referents(self, target: Cell) -> list[list[Cell]]:
+    def referents(self, target: Intersection) -> list[list[Intersection]]:
         return [[]] if target == self.cell else []
 
 
@@ -132,12 +132,12 @@ class Gap(Task):
     place: str
     has_anchor = False
 
-    def select(self, stones: Stones, anchor: str) -> Cell | None:
+    def select(self, stones: Stones, anchor: str) -> Intersection | None:
         rows = [[(row, column) for column in range(BOARD.num_lines)] for row in range(BOARD.num_lines)]
         gaps = [left for row in rows if len(left := [cell for cell in row if cell not in stones]) == 1]
         return gaps[0][0] if len(gaps) == 1 else None
 
-    def referents(self, target: Cell) -> list[list[Cell]]:
+    def referents(self, target: Intersection) -> list[list[Intersection]]:
         row, column = target
         return [[(row, other) for other in range(BOARD.num_lines) if other != column]]
 
@@ -159,7 +159,7 @@ TASKS: tuple[Task, ...] = (
 NUM_PARTS = 5  # one in so many cases is held out
 
 
-def is_heldout(task_id: int, target: Cell, color: str) -> bool:
+def is_heldout(task_id: int, target: Intersection, color: str) -> bool:
     """Return True if a case is held out: every relation, place and colour is seen in other cases."""
     if len(TASKS[task_id].targets) == 1:
         return (task_id + 3 * COLORS.index(color)) % (NUM_PARTS + 1) == NUM_PARTS
@@ -167,7 +167,7 @@ def is_heldout(task_id: int, target: Cell, color: str) -> bool:
 
 
 @cache
-def cases_of(split: str) -> tuple[tuple[int, Cell, str], ...]:
+def cases_of(split: str) -> tuple[tuple[int, Intersection, str], ...]:
     """(task, target, colour of the stone to be moved) that a split draws from."""
     cases = [
         (task_id, target, color)
@@ -178,9 +178,9 @@ def cases_of(split: str) -> tuple[tuple[int, Cell, str], ...]:
     return of_split(split, cases, [case for case in cases if is_heldout(*case)])
 
 
-def _cases(spec: EpisodeSpec) -> dict[int, list[tuple[Cell, str]]]:
+def _cases(spec: EpisodeSpec) -> dict[int, list[tuple[Intersection, str]]]:
     """{task: targets and colours} that a spec draws from."""
-    cases: dict[int, list[tuple[Cell, str]]] = {}
+    cases: dict[int, list[tuple[Intersection, str]]] = {}
     for task_id, target, color in cases_of(spec.split):
         if spec.task_id in (None, task_id) and spec.color in (None, color):
             cases.setdefault(task_id, []).append((target, color))
@@ -225,13 +225,18 @@ def sample_episode(spec: EpisodeSpec) -> Episode:
     )
 
 
-def _means(task: Task, anchor: str, target: Cell, stones: Stones) -> bool:
+def _means(task: Task, anchor: str, target: Intersection, stones: Stones) -> bool:
     return task.select(stones, anchor) == target
 
 
 def _sample_opening(
-    rng: np.random.Generator, task: Task, target: Cell, color: str, anchor: str, extra_colors: tuple[str, ...]
-) -> dict[Cell, str]:
+    rng: np.random.Generator,
+    task: Task,
+    target: Intersection,
+    color: str,
+    anchor: str,
+    extra_colors: tuple[str, ...],
+) -> dict[Intersection, str]:
     """Draw up to 8 stones with which the move is legal and the only one that is meant."""
     while True:
         ways = task.referents(target)

@@ -27,7 +27,7 @@ def check_evaluations(check: Callable[[Any], None]) -> None:
     replace(EvalPipelineConfig, "__post_init__", around)
 
 
-def play_tasks_in_turn(is_needed: Callable[[Any], bool]) -> None:
+def run_tasks_in_turn(is_needed: Callable[[Any], bool]) -> None:
     """Let LeRobot's evaluation of such a policy use no threads, whatever --env.max_parallel_tasks says.
 
     They would share its queue of actions. Commands that are imported later than this keep the original.

@@ -14,8 +14,8 @@ from lerobot_bomb.results.record import Record
 
 TITLE = "Language use"
 NOTE = (
-    "The same episodes and weights, but the policy is told other words than the episode's. Both are judged "
-    "by what the episode asked for, so a policy that reads loses its success, and puts the stone elsewhere. "
+    "The same episodes and weights, but the policy is given another instruction than the episode's. Both are "
+    "judged by the episode's, so a policy that reads loses its success, and puts the stone elsewhere. "
     "p: {test}."
 )
 
@@ -49,7 +49,7 @@ def _tables(own: Policy, other: Policy) -> Iterable[Table]:
     grounding = ["right intersection, its own", "right intersection, another"] if is_placed else []
     header = ["condition", "its own", "another", "points", "p", *grounding, "pairs"]
     note = NOTE.format(test=describe_test(len(found.conditions)))
-    yield Table(f"{own.name}; told otherwise: {other.name}", header, table, note)
+    yield Table(f"{own.name}; with another instruction: {other.name}", header, table, note)
 
 
 def _grounding(records: list[Record]) -> Cell:

@@ -5,16 +5,16 @@ from lerobot_bomb.report.sections import efficiency, language
 from lerobot_bomb.report.table import Section
 
 LANGUAGE = (
-    "Language use: no line says that its policy was told another instruction than the episode's (lines of "
-    "earlier releases never do). lerobot-bomb audit FOLDER --policy.path=CHECKPOINT plays that on bomb; "
+    "Language use: no policy was given another instruction than the episode's (records of earlier releases "
+    "do not say it). lerobot-bomb audit FOLDER --policy.path=CHECKPOINT does that on bomb; "
     "report on FOLDER/first/results.jsonl and FOLDER/second/results.jsonl together. Elsewhere: evaluate "
     "CHECKPOINT and a copy of it with ReplaceTasks (lerobot_bomb.explain.interventions), and report on both."
 )
 EFFICIENCY = (
-    "Efficiency: these lines do not say what queries took, nor how smooth actions were; earlier releases did "
-    "not measure it. Evaluate again."
+    "Efficiency: these records have neither the cost of queries nor smoothness, which earlier releases did "
+    "not measure. Evaluate again."
 )
-VIDEOS = "Videos: lerobot-bomb report ... --videos=N plays N failures of each class again, and shows them."
+VIDEOS = "Videos: lerobot-bomb report ... --videos=N replays N failures of each class, and shows them."
 
 
 def section(report: Report) -> Section:

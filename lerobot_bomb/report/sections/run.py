@@ -21,7 +21,7 @@ def commands(group: Group) -> list[str]:
     seeds = {each.spec.seed for each in group.records}
     flags = [_policy_flag(first), *first.eval_flags(group.records)]
     flags += [f"--env.perturbations={json.dumps(list(by))}"] if first.condition.axes else []
-    flags += _as_played(first)
+    flags += _as_evaluated(first)
     flags += [f"--seed={min(seeds)}", f"--eval.n_episodes={max(map(len, by.values()))}"]
     return [*(f"  {line}" for line in group.lines()), f"  {shlex.join(['lerobot-eval', *flags])}"]
 
@@ -33,7 +33,7 @@ def _policy_flag(record: Record) -> str:
     return f"--policy.path={policy.path}"
 
 
-def _as_played(record: Record) -> list[str]:
+def _as_evaluated(record: Record) -> list[str]:
     """Device and batch, which outcomes may depend on, as far as the record says."""
     device = "" if record.inference is None else record.inference.device
     batch_size = None if record.policy is None else record.policy.batch_size

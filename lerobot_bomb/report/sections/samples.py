@@ -6,8 +6,8 @@ from lerobot_bomb.results.record import NO_VALUE
 
 TITLE = "Failures to look at"
 NOTE = (
-    "A random sample of each class. 'play it again' writes a video and a recording for Rerun; add the flags "
-    "--policy.NAME=VALUE of the evaluation, if it had any. 'ask why' shows what the policy's actions rest on."
+    "A random sample of each class. 'replay' writes a video and a recording for Rerun; add the flags "
+    "--policy.NAME=VALUE of the evaluation, if it had any. 'explain' shows what its actions depend on."
 )
 
 
@@ -21,7 +21,7 @@ def section(report: Report) -> Section:
 
 def _table(name: str, samples: list[Sample]) -> Table:
     has_videos = any(each.video or each.note for each in samples)
-    header = ["failure", "condition", "seed", "asked for", "play it again", "ask why"]
+    header = ["failure", "condition", "seed", "instruction", "replay", "explain"]
     header += ["video"] if has_videos else []
     rows = [_row(each)[: len(header)] for each in samples]
     return Table(name, header, rows, NOTE)

@@ -1,0 +1,89 @@
+"""The pages of docs/reference/ are those that the code gives, and leave nothing out."""
+
+import dataclasses
+import re
+from typing import Any
+
+import pytest
+from lerobot.configs import PreTrainedConfig
+from lerobot.envs import EnvConfig
+from make_reference import FOLDER, ours_of, pages, record_types
+
+from lerobot_bomb.commands.main import command_parser
+from lerobot_bomb.commands.table import COMMANDS
+from lerobot_bomb.results.record import field_names
+
+
+@pytest.fixture(scope="module")
+def made() -> dict[str, str]:
+    return pages()
+
+
+def sections(page: str, level: str = "##") -> dict[str, str]:
+    """{heading: its text}."""
+    parts = re.split(rf"^{level} (.*)\n", page, flags=re.MULTILINE)
+    return dict(zip(parts[1::2], parts[2::2], strict=True))
+
+
+def first_cells(text: str) -> list[str]:
+    """Return the names in the first cell of each row of tables."""
+    return [name for row in re.findall(r"^\| (`.*?`) \|", text, re.M) for name in re.findall(r"`(.*?)`", row)]
+
+
+def test_the_committed_pages_are_the_generated_ones(made: dict[str, str]) -> None:
+    stale = [name for name, text in made.items() if (FOLDER / name).read_text() != text]
+    assert stale == [], "the code has changed: run `make reference`"
+    assert {path.name for path in FOLDER.iterdir()} == made.keys()
+
+
+def test_every_command_and_argument_is_there(made: dict[str, str]) -> None:
+    found = sections(made["commands.md"], "###")
+    assert found.keys() == COMMANDS.keys()
+    for name, text in found.items():
+        options = [
+            each for each in command_parser(name)._option_string_actions if each not in ("-h", "--help")
+        ]
+        assert {*options} <= {*first_cells(text)}
+        assert all(f"lerobot-bomb {name} {flags}".rstrip() in text for flags in COMMANDS[name].examples)
+
+
+@pytest.mark.parametrize(
+    ("page", "registry", "prefix", "known"),
+    [("policies.md", PreTrainedConfig, "policy", "fdvla"), ("environments.md", EnvConfig, "env", "bomb")],
+)
+def test_every_field_that_lerobot_does_not_have_is_there(
+    page: str, registry: Any, prefix: str, known: str, made: dict[str, str]
+) -> None:
+    types, found = ours_of(registry), sections(made[page])
+    assert known in types and found.keys() == types.keys()
+    for name, config_class in types.items():
+        stock = {
+            each
+            for base in config_class.__mro__
+            if base.__module__.startswith("lerobot.")
+            for each in vars(base).get("__annotations__", ())
+        }
+        names = {each.name for each in dataclasses.fields(config_class)} - stock
+        listed = {each.removeprefix(f"--{prefix}.") for each in first_cells(found[name])}
+        assert names <= listed
+
+
+def test_every_axis_is_there(made: dict[str, str]) -> None:
+    axes = {f"{each.env_type}: {axis}" for each in record_types() for axis in each.condition.axes}
+    assert axes == sections(made["axes.md"]).keys() >= {"bomb: camera", "bomb_pusht: goal"}
+    assert (
+        "| angle | 3 | 6 | 9 | 12.5 | 16 | degrees | around the board, in a drawn direction |"
+        in made["axes.md"]
+    )
+
+
+def test_every_field_of_a_record_is_there(made: dict[str, str]) -> None:
+    found = sections(made["records.md"])
+    for record_type in record_types():
+        names = {name.partition(".")[0] for name in first_cells(found[record_type.env_type])}
+        assert names == {*field_names(record_type)}
+    assert {"policy.weights_sha256", "inference.latency_p50_ms"} <= {*first_cells(made["records.md"])}
+
+
+def test_every_row_has_a_meaning(made: dict[str, str]) -> None:
+    assert [row for text in made.values() for row in re.findall(r"^\| .*\|  \|$", text, re.M)] == []
