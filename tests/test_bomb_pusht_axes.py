@@ -181,4 +181,4 @@ def test_a_range_draws_each_level_and_the_table_is_complete() -> None:
     levels = {episode.perturbation.levels.get("goal", 0) for episode in drawn}
     assert levels == set(range(6))
     assert list(PUSHT_TRANSFORMS) == list(PUSHT_AXES)
-    assert str(PushTCondition.parse("goal_marker:1+all:2")) == "all:2+goal_marker:1"
+    assert str(PushTCondition("goal_marker:1+all:2")) == "all:2+goal_marker:1"

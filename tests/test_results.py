@@ -32,7 +32,7 @@ def values(seed: int, failure: str | None = None, error: float | None = None, **
     episode = EpisodeSpec(**spec)
     target = spec.get("target") or other.get("target", (2, 2))
     color = spec.get("color") or other.get("color", "black")
-    condition = Condition.parse(episode.perturbations)
+    condition = Condition(episode.perturbations)
     is_placed = failure in (None, "disturbed_others")
     is_elsewhere = failure == "wrong_intersection" and target is not None
     result = EpisodeResult(

@@ -7,7 +7,6 @@ import numpy as np
 
 from lerobot_bomb.envs.episode_env import EpisodeEnv, Observation, Transition
 from lerobot_bomb.libero.episode import LiberoFailure, LiberoSpec, failure_of, initial_state_of
-from lerobot_bomb.libero.perturbations import LiberoCondition
 from lerobot_bomb.results.libero import LiberoResult
 from lerobot_bomb.results.origin import PolicyIdentity
 from lerobot_env_bomb_libero.actuator import LiberoActuator
@@ -50,7 +49,7 @@ class BombLiberoEnv(EpisodeEnv[LiberoSpec, _Run, LiberoResult]):
         from libero.libero import benchmark  # slow
 
         suite = benchmark.get_benchmark_dict()[spec.suite]()
-        on = [LIBERO_TRANSFORMS[axis] for axis, _, _ in LiberoCondition.parse(spec.perturbations).ranges]
+        on = [LIBERO_TRANSFORMS[axis] for axis, _, _ in spec.condition.ranges]
         self._scene = LiberoScene(
             on,
             task_suite=suite,

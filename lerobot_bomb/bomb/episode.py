@@ -3,6 +3,7 @@
 import dataclasses
 from dataclasses import dataclass
 from enum import StrEnum
+from typing import cast
 
 from lerobot_bomb.bomb.board import BOARD, COLORS
 from lerobot_bomb.bomb.perturbations import Condition
@@ -73,8 +74,7 @@ class EpisodeSpec:
     perturbations: str = NONE  # a condition such as "camera:2+light:3"; see `Condition`
 
     def __post_init__(self) -> None:
-        # one spelling, so that equal conditions compare equal
-        object.__setattr__(self, "perturbations", str(Condition.parse(self.perturbations)))
+        object.__setattr__(self, "perturbations", Condition(self.perturbations))
         one_of("--env.task", self.suite, SUITES)
         one_of("--env.robot", self.robot, ROBOTS)
         one_of("--env.split", self.split, SPLITS)
@@ -95,6 +95,11 @@ class EpisodeSpec:
                 f"--env.success_tolerance_mm={self.success_tolerance_mm} must lie between 0 and half the "
                 f"pitch, {1000 * BOARD.pitch_m / 2} mm: beyond it a stone would be on two intersections"
             )
+
+    @property
+    def condition(self) -> Condition:
+        """The axes that are on: `perturbations` as it has been parsed."""
+        return cast("Condition", self.perturbations)
 
     @staticmethod
     def _check_target(target: tuple[int, int]) -> None:

@@ -4,7 +4,6 @@ The one definition: the simulator applies it, ``docs/perturbations.md`` is gener
 """
 
 from collections.abc import Mapping
-from dataclasses import dataclass
 from functools import partial
 from typing import ClassVar
 
@@ -120,7 +119,6 @@ NUISANCES = nuisances_of(AXES)  # what `all` stands for
 magnitude = partial(magnitude_of, AXES)  # (axis, name, level)
 
 
-@dataclass(frozen=True)
 class Condition(AxisCondition):
     """Condition of BOMB, by the axes that are on: "camera:2+light:3"."""
 

@@ -10,7 +10,6 @@ from pathlib import Path
 import numpy as np
 
 from lerobot_bomb.bomb.episode import TEST_SEEDS
-from lerobot_bomb.bomb.perturbations import Condition
 from lerobot_bomb.checkpoints.shipped import PREFIX
 from lerobot_bomb.commands.arguments import path_flag
 from lerobot_bomb.commands.run import run_command
@@ -140,7 +139,7 @@ def _write_sheet(output_dir: Path, records: list[EpisodeResult]) -> Path:
     tiles: dict[str, list[np.ndarray]] = {}
     as_played = sorted(records, key=lambda record: record.spec.seed)
     for condition, played in by_condition(as_played).items():
-        group = f"{SUITE}.{Condition.parse(condition).key}_0"  # of LeRobot's videos
+        group = f"{SUITE}.{condition.key}_0"  # of LeRobot's videos
         folder = output_dir / "eval" / POLICY / "videos" / group
         tiles[condition] = [
             _tile(folder / f"eval_episode_{number}.mp4", record)

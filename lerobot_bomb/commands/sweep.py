@@ -170,15 +170,14 @@ def _check_types(policies: Sequence[str]) -> None:
             raise ValueError(f"--policies: {policy} is no folder and no policy type{near}")
 
 
-def _expanded(perturbations: tuple[str, ...], record_type: type[Record]) -> list[str]:
+def _expanded(perturbations: tuple[str, ...], record_type: type[Record]) -> Sequence[str]:
     """The conditions, checked for the environment."""
     if perturbations and not record_type.condition.axes:
         raise ValueError(
             f"--perturbations={','.join(perturbations)}: --env.type={record_type.env_type} is LeRobot's and "
             f"has none; --env.type=bomb_{record_type.env_type} has"
         )
-    condition = record_type.condition
-    return [str(condition.parse(text)) for text in condition.expand(perturbations)]
+    return record_type.condition.expand(perturbations)
 
 
 def _job_command(args: argparse.Namespace) -> list[str]:

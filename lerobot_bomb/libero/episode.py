@@ -2,6 +2,7 @@
 
 from dataclasses import dataclass
 from enum import StrEnum
+from typing import cast
 
 from lerobot_bomb.bomb.episode import check_seed
 from lerobot_bomb.conditions import NONE
@@ -37,8 +38,7 @@ class LiberoSpec:
     perturbations: str = NONE  # a condition such as "table:2+light:3"; see `LiberoCondition`
 
     def __post_init__(self) -> None:
-        # one spelling, so that equal conditions compare equal
-        object.__setattr__(self, "perturbations", str(LiberoCondition.parse(self.perturbations)))
+        object.__setattr__(self, "perturbations", LiberoCondition(self.perturbations))
         one_of("--env.task", self.suite, SUITES)
         count = TASKS_PER_SUITE[self.suite]
         if not 0 <= self.task_id < count:
@@ -46,6 +46,11 @@ class LiberoSpec:
         check_seed(self.seed)
         if self.max_steps is not None and not 1 <= self.max_steps <= MAX_ALLOWED_STEPS:
             raise ValueError(f"--env.episode_length={self.max_steps} must lie in 1..{MAX_ALLOWED_STEPS}")
+
+    @property
+    def condition(self) -> LiberoCondition:
+        """The axes that are on: `perturbations` as it has been parsed."""
+        return cast("LiberoCondition", self.perturbations)
 
 
 def initial_state_of(seed: int, count: int) -> int:

@@ -1,7 +1,6 @@
 """LIBERO's perturbation axes: their names, levels and magnitudes; the one definition."""
 
 from collections.abc import Mapping
-from dataclasses import dataclass
 from functools import partial
 from typing import ClassVar
 
@@ -88,7 +87,6 @@ LIBERO_AXES = {
 libero_magnitude = partial(magnitude_of, LIBERO_AXES)  # (axis, name, level)
 
 
-@dataclass(frozen=True)
 class LiberoCondition(AxisCondition):
     """Condition of LIBERO, by the axes that are on: "camera:2+light:3"."""
 

@@ -4,6 +4,7 @@ from dataclasses import dataclass
 from enum import StrEnum
 from importlib.util import find_spec
 from math import pi
+from typing import cast
 
 import numpy as np
 
@@ -51,19 +52,22 @@ class PushTSpec:
     perturbations: str = NONE  # a condition such as "table:2+goal:3"; see `PushTCondition`
 
     def __post_init__(self) -> None:
-        condition = PushTCondition.parse(self.perturbations)
-        # one spelling, so that equal conditions compare equal
-        object.__setattr__(self, "perturbations", str(condition))
+        object.__setattr__(self, "perturbations", PushTCondition(self.perturbations))
         one_of("--env.instruction", self.instruction, INSTRUCTIONS)
         check_seed(self.seed)
         if not 1 <= self.max_steps <= MAX_ALLOWED_STEPS:
             raise ValueError(f"--env.max_steps={self.max_steps} must lie in 1..{MAX_ALLOWED_STEPS}")
-        on = {axis for axis, _, _ in condition.ranges}
+        on = {axis for axis, _, _ in self.condition.ranges}
         if self.instruction == NONE and "language" in on and not on.issuperset(nuisances_of(PUSHT_AXES)):
             raise ValueError(
                 f"--env.perturbations={self.perturbations!r} rewords the instruction, of which "
                 "--env.instruction=none leaves nothing; drop one of them (all:3 stays allowed)"
             )
+
+    @property
+    def condition(self) -> PushTCondition:
+        """The axes that are on: `perturbations` as it has been parsed."""
+        return cast("PushTCondition", self.perturbations)
 
 
 def check_installed() -> None:

@@ -4,7 +4,6 @@ A pixel is one of the board's 512x512, the unit of positions and actions.
 """
 
 from collections.abc import Mapping
-from dataclasses import dataclass
 from functools import partial
 from typing import ClassVar
 
@@ -71,7 +70,6 @@ PUSHT_AXES = {
 pusht_magnitude = partial(magnitude_of, PUSHT_AXES)  # (axis, name, level)
 
 
-@dataclass(frozen=True)
 class PushTCondition(AxisCondition):
     """Condition of PushT, by the axes that are on: "table:2+goal:3"."""
 

@@ -7,7 +7,7 @@ from functools import partial
 from typing import Annotated, Any, ClassVar, Self
 
 from lerobot_bomb import __version__
-from lerobot_bomb.conditions import NONE, Axis, AxisCondition
+from lerobot_bomb.conditions import NONE, AxisCondition
 from lerobot_bomb.libero.assets import SUITES
 from lerobot_bomb.results import schema
 from lerobot_bomb.results.libero import describe_numbered_tasks, task_flags
@@ -17,12 +17,6 @@ from lerobot_bomb.results.record import Record
 from lerobot_bomb.results.schema import Natural
 
 FAILED = "failed"  # the only class: why is not known
-
-
-class NoCondition(AxisCondition):
-    """Condition of an environment without perturbation axes: `none` only."""
-
-    axes: ClassVar[Mapping[str, Axis]] = {}
 
 
 @dataclass(frozen=True)
@@ -35,12 +29,17 @@ class StockSpec:
     number: Natural | None  # in the evaluation, where that chooses how it starts; None: the seed does
     perturbations: Annotated[str, schema.among((NONE,))] = NONE  # there are no others
 
+    @property
+    def condition(self) -> AxisCondition:
+        """No axes."""
+        return AxisCondition(self.perturbations)
+
 
 @dataclass(frozen=True, kw_only=True)
 class StockResult(Record):
     """Outcome of one episode; a subclass for each environment."""
 
-    condition: ClassVar = NoCondition
+    condition: ClassVar = AxisCondition
     drawn: ClassVar = ("task_id", "number")
     start: ClassVar = ("seed", "task_id")  # tasks have scenes of their own
     measures: ClassVar = (

@@ -13,11 +13,9 @@ import numpy as np
 
 from lerobot_bomb.bomb.episode import EpisodeSpec
 from lerobot_bomb.bomb.observation import RenderOptions
-from lerobot_bomb.bomb.perturbations import Condition
 from lerobot_bomb.envs.rollout import Agent, make_env, make_pusht_env, play
 from lerobot_bomb.files import written_whole
 from lerobot_bomb.pusht.episode import FPS, PushTSpec, check_image_size, check_installed
-from lerobot_bomb.pusht.perturbations import PushTCondition
 from lerobot_bomb.results.record import Record
 
 if TYPE_CHECKING:
@@ -61,7 +59,7 @@ def bomb_episode(spec: EpisodeSpec, options: RenderOptions) -> Viewed:
     return Viewed(
         env_type="bomb",
         spec=spec,
-        group=f"{spec.suite}.{Condition.parse(spec.perturbations).key}",
+        group=f"{spec.suite}.{spec.condition.key}",
         fps=spec.fps,
         policies=(EXPERT, RANDOM),
         env_flags=env_flags,
@@ -91,7 +89,7 @@ def pusht_episode(spec: PushTSpec, image_size: int) -> Viewed:
     return Viewed(
         env_type="bomb_pusht",
         spec=spec,
-        group=f"pusht.{PushTCondition.parse(spec.perturbations).key}",
+        group=f"pusht.{spec.condition.key}",
         fps=FPS,
         policies=(RANDOM,),
         env_flags={"image_size": image_size, "instruction": spec.instruction, "max_steps": spec.max_steps},
