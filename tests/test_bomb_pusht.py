@@ -225,7 +225,7 @@ def test_success_ends_an_episode_and_nothing_moves_after_it() -> None:
 @pytest.fixture(autouse=True)
 def no_policy_of_other_tests(monkeypatch: pytest.MonkeyPatch) -> None:
     """Hide the policies that other tests of this process hold and drop at any time."""
-    monkeypatch.setattr("lerobot_bomb.checkpoints.identity.built_policies", list)
+    monkeypatch.setattr("lerobot_bomb.checkpoints.acting.built_policies", list)
 
 
 def results_file(path: Path) -> list[dict[str, Any]]:

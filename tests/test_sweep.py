@@ -298,7 +298,7 @@ def test_the_flags_that_may_be_lerobots_without_a_group_are_those_that_it_has() 
             (NANO,),
             ("place", "object"),
             ("--env.type=bomb", "--env.image_size=64"),
-            "evaluate with --tasks=place, or",
+            "evaluate with --env.task=place, or",
         ),
         ((NANO,), (), ("--env.type=bomb_pusht",), "this is --env.type=bomb_pusht"),
     ],

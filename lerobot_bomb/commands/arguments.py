@@ -20,6 +20,7 @@ LONG_FORMS = {
     for name in (
         *("task", "robot", "control_mode", "fps", "image_size", "render_preset", "depth", "split", "target"),
         *("color", "task_ids", "perturbations", "success_tolerance_mm", "instruction", "max_steps"),
+        "ignore_checkpoint",
     )
 }
 ANSWER_IS_NO = 3  # exit code of a command that was asked something; 1 is an error, 2 a flag that is unknown

@@ -46,14 +46,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     add = parser.add_argument
     add("--policy", help=f"who acts: {EXPERT} or {RANDOM} (default: {EXPERT}; bomb_pusht has {RANDOM} only)")
     add_checkpoint_arguments(parser, "who acts: the checkpoint in this folder")
-    add(
-        "--policy.ignore_environment",
-        "--env.ignore_checkpoint",
-        "--ignore_checkpoint",
-        dest="ignore_environment",
-        **switch(),
-        help="let a checkpoint act that was trained for another environment",
-    )
+    ignore = "let a checkpoint act that was trained for another environment"
+    add_env_flag(parser, "ignore_checkpoint", **switch(), help=ignore)
     add("--seed", type=int, default=0, help="seed of the episode (default: 0)")
     add_viewed_arguments(parser)
     add_episode_files_argument(parser, DEFAULT_FOLDER)
@@ -189,10 +183,10 @@ def _accepted_agent(
     if policy in (EXPERT, RANDOM):
         yield expert_agent() if policy == EXPERT else random_agent(env, viewed.spec.seed)
         return
-    from lerobot_bomb.viewing.checkpoint import checkpoint_agent  # LeRobot and torch: seconds
+    from lerobot_bomb.viewing.checkpoint import load_policy  # LeRobot and torch: seconds
 
-    flags = viewed.env_flags | {"ignore_checkpoint": args.ignore_environment}
+    flags = viewed.env_flags | {"ignore_checkpoint": args.ignore_checkpoint}
     seed = viewed.spec.seed
-    batch_agent = checkpoint_agent(args.policy_path, args.policy_device, args.env_type, flags, seed)
-    with one_of_batch(batch_agent, viewed.make_env, seed, row=0, size=1) as agent:
+    loaded = load_policy(args.policy_path, args.policy_device, args.env_type, flags, seed)
+    with one_of_batch(loaded.agent, viewed.make_env, seed, row=0, size=1) as agent:
         yield agent

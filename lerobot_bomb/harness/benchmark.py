@@ -52,11 +52,9 @@ class BombBenchmark(StepBenchmark):
         self._name = ""  # of the task that `_env` is of
 
     def get_tasks(self) -> list[Task]:
-        environment = json.dumps(asdict(self._config.environment))
-        return [
-            {"name": name, "suite": spec.suite, ENVIRONMENT: environment}
-            for name, spec in self._specs.items()
-        ]
+        checked = {ENVIRONMENT: json.dumps(asdict(self._config.environment))}
+        checked = {} if self._config.ignore_checkpoint else checked
+        return [{"name": name, "suite": spec.suite, **checked} for name, spec in self._specs.items()]
 
     def reset(self, task: Task) -> dict[str, Any]:
         if self._env is None or self._name != task["name"]:

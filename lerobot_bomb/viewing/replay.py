@@ -91,9 +91,8 @@ class Replay:
         return (0, 1) if policy is None else (policy.batch_row or 0, policy.batch_size or 1)
 
     def _batch_agent(self, viewed: Viewed) -> BatchAgent:
-        from lerobot_bomb.checkpoints.identity import identity_of
-        from lerobot_bomb.compat.hooks.policies import built_policies  # LeRobot and torch: seconds
-        from lerobot_bomb.viewing.checkpoint import checkpoint_agent, scripted_agent
+        from lerobot_bomb.checkpoints.identity import identity_of  # LeRobot and torch: seconds
+        from lerobot_bomb.viewing.checkpoint import load_policy, scripted_agent
 
         # who played is not asked whether it was trained for this
         env = viewed.env_type, viewed.env_flags | {"ignore_checkpoint": True}, viewed.spec.seed
@@ -102,10 +101,10 @@ class Replay:
             return scripted_agent(policy.type, *env)
         if path is None:
             raise ValueError("the line does not say who played; name it with --policy.path=FOLDER")
-        agent = checkpoint_agent(path, self.policy_device, *env, self.policy_flags)
+        loaded = load_policy(path, self.policy_device, *env, self.policy_flags)
         if policy is not None and viewed.spec.perturbations == self.record.spec.perturbations:
-            _check_policy(policy, path, identity_of(built_policies()[-1]))
-        return agent
+            _check_policy(policy, path, identity_of(loaded.policy))
+        return loaded.agent
 
 
 def _check_policy(played: PolicyIdentity, path: Path, loaded: PolicyIdentity) -> None:
