@@ -9,6 +9,8 @@ from dataclasses import dataclass
 from functools import lru_cache
 from typing import ClassVar, Self
 
+from lerobot_bomb.registry import Registry
+
 NONE = "none"
 ALL = "all"
 EACH = "each"
@@ -31,7 +33,13 @@ class Axis:
     summary: str
     changes: tuple[str, ...]  # of a paired episode: images, state, instruction, goal, dynamics
     magnitudes: dict[str, Magnitude]
+    transform: str  # "module:class" of what it does, an `EpisodeTransform`, which only simulators import
     is_help: bool = False  # not a nuisance: no part of `all`
+
+
+def axes_of(env_type: str, own: Mapping[str, Axis]) -> Registry[Axis]:
+    """Return an environment's table of axes, to which other packages add by entry points "ENV_TYPE.AXIS"."""
+    return Registry("lerobot_bomb.axes", own, f"{env_type}.")
 
 
 def magnitude_of(axes: Mapping[str, Axis], axis: str, name: str, level: int) -> float:
@@ -39,9 +47,9 @@ def magnitude_of(axes: Mapping[str, Axis], axis: str, name: str, level: int) -> 
     return axes[axis].magnitudes[name].levels[level - 1]
 
 
-def nuisances_of(axes: Mapping[str, Axis]) -> tuple[str, ...]:
-    """Return the axes that `all` stands for: every one that does not help."""
-    return tuple(name for name, axis in axes.items() if not axis.is_help)
+def nuisances_of(axes: Registry[Axis]) -> tuple[str, ...]:
+    """Return the axes that `all` stands for: every own one that does not help, whatever others have added."""
+    return tuple(name for name in axes.own if not axes[name].is_help)
 
 
 class AxisCondition(str):
@@ -51,7 +59,7 @@ class AxisCondition(str):
     environment's table.
     """
 
-    axes: ClassVar[Mapping[str, Axis]] = {}
+    axes: ClassVar[Registry[Axis]] = Registry("", {})
     ranges: tuple[tuple[str, int, int], ...]  # (axis, lowest, highest level), in the order of `axes`
 
     def __new__(cls, text: str = NONE) -> Self:

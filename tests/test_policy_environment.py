@@ -97,7 +97,7 @@ def test_a_checkpoint_acts_in_its_own_environment_only(
     with pytest.raises(ValueError, match=r"with --env\.fps=10 --env\.image_size=64, or"):
         act_in(policy, control_mode="absolute", fps=20, image_size=128)
     act_in(policy, image_size=64, ignore_checkpoint=True)
-    with pytest.raises(ValueError, match="--policy.ignore_environment=true is now --env.ignore_checkpoint"):
+    with pytest.raises(ValueError, match=r"--policy\.ignore_environment=true is now --env\.ignore"):
         replace(config, ignore_environment=True)
 
 

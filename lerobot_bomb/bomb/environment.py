@@ -8,7 +8,7 @@ from typing import Any
 from lerobot_bomb.bomb.board import task_id
 from lerobot_bomb.bomb.observation import ACTION_NAMES
 from lerobot_bomb.bomb.suite import task_version
-from lerobot_bomb.bomb.suites import SUITES
+from lerobot_bomb.bomb.suites import OWN_SUITES
 from lerobot_bomb.compat.help import leave_out_of_help
 from lerobot_bomb.conditions import ALL
 
@@ -77,13 +77,13 @@ class Environment:
         """Suites that it shows; None: not known."""
         if self.task is None:
             return None
-        return frozenset(SUITES if self.task == ALL else self.task.split("+"))
+        return frozenset(OWN_SUITES if self.task == ALL else self.task.split("+"))
 
     def _flag(self, name: str) -> str:
         """A flag of lerobot-eval; of several suites it names the first, unless they are all."""
         value = getattr(self, name)
         if name == "task" and self.suites is not None:
-            value = ALL if self.suites == frozenset(SUITES) else min(self.suites)
+            value = ALL if self.suites == frozenset(OWN_SUITES) else min(self.suites)
         return f"--env.{name}={SUITE if value is None else value}"
 
     def eval_flags(self) -> list[str]:
