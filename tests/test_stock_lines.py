@@ -172,7 +172,6 @@ def test_libero_is_told_apart_by_the_number_that_chooses_the_initial_state() -> 
     [
         (["--env.type=pusht"], "--output_dir=... is missing"),
         (["--env.type=bomb", "--output_dir=."], "lerobot-eval writes its lines itself"),
-        (["--env.type=aloha", "--output_dir=."], "--env.type='aloha' is unknown; choose one of: pusht"),
         (["--env.type=pusht", "--output_dir=.", "--seed=null"], "--seed=null: episodes without a seed"),
         (
             ["--env.type=libero", "--output_dir=.", "--eval.batch_size=2"],

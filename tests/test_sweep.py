@@ -233,10 +233,9 @@ def test_a_cell_that_cannot_begin_is_given_up_at_once(play: Callable[[Manifest],
         (["--policies=bomb_expert"], "--env.type is missing"),
         (["--policies=bomb_expert", "--env.type=bomb", "--perturbations=fog:3"], "'fog' is not an axis"),
         (["--policies=bomb_expert", "--env.type=bomb", "--perturbations=each:0"], "write each:LEVEL"),
-        (["--policies=bomb_expert", "--env.type=aloha"], "--env.type=aloha has no lines of results"),
         (
             ["--policies=act", "--env.type=pusht", "--perturbations=camera:3"],
-            "--env.type=pusht is LeRobot's and has none; --env.type=bomb_pusht has",
+            "--env.type=pusht has none; --env.type=bomb_pusht has",
         ),
         (
             ["--policies=bomb_expert", "--env.type=bomb", "--tasks=place,plaec"],

@@ -1,4 +1,4 @@
-"""Policy types that LeRobot knows, read from source: importing LeRobot to ask for them takes seconds."""
+"""Types that LeRobot knows, read from source: importing LeRobot to ask for them takes seconds."""
 
 import importlib.metadata
 import pkgutil
@@ -8,21 +8,27 @@ from pathlib import Path
 
 OURS = "lerobot_policy_bomb"
 PLUGIN = re.compile(r"lerobot_(robot|camera|teleoperator|policy|env)_")  # names that LeRobot imports
-TYPE = re.compile(r"""PreTrainedConfig\.register_subclass\(\s*(?:name=)?["'](\w+)["']""")
+# folder of LeRobot's -> its registry, files in that folder, what our packages' names begin with
+KINDS = {
+    "policies": ("PreTrainedConfig", "*/configuration_*.py", "lerobot_policy_"),
+    "envs": ("EnvConfig", "*.py", "lerobot_env_"),
+}
 
 
-def registered_policy_types() -> set[str] | None:
-    """Return the types of LeRobot and of this package; None where another plugin may add some."""
+def registered_types(kind: str) -> set[str] | None:
+    """Return the types of LeRobot and this package, of one of `KINDS`; None: another plugin may add some."""
+    registry, pattern, prefix = KINDS[kind]
     names = {name.lower().replace("-", "_") for name in _distributions()}
     spec = find_spec("lerobot")
     if spec is None or not spec.submodule_search_locations or any(map(PLUGIN.match, names - {OURS})):
         return None
-    folders = [*Path(spec.submodule_search_locations[0], "policies").iterdir()]
+    files = [*Path(spec.submodule_search_locations[0], kind).glob(pattern)]
     for module in pkgutil.iter_modules():
-        if module.name.startswith("lerobot_policy_"):
-            folders.append(Path(module.module_finder.path) / module.name)  # pyright: ignore
-    files = [path for folder in folders for path in folder.glob("configuration_*.py")]
-    return {name for path in files for name in TYPE.findall(path.read_text())}
+        if module.name.startswith(prefix):
+            folder = Path(module.module_finder.path) / module.name  # pyright: ignore
+            files += folder.glob("configuration_*.py")
+    types = re.compile(rf"""{registry}\.register_subclass\(\s*(?:name=)?["'](\w+)["']""")
+    return {name for path in files for name in types.findall(path.read_text())}
 
 
 def _distributions() -> list[str]:

@@ -75,7 +75,7 @@ def _config(condition: AxisCondition, records: list[Record]) -> str:
 
 
 def _task(record: Record) -> str:
-    return getattr(record.spec, "suite", "pusht")
+    return getattr(record.spec, "suite", record.tasks[0])
 
 
 def _share(records: list[Record]) -> float:

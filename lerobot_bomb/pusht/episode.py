@@ -1,5 +1,6 @@
 """An episode of PushT: what determines it, and why it failed."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from enum import StrEnum
 from importlib.util import find_spec
@@ -70,8 +71,8 @@ class PushTSpec:
         return cast("PushTCondition", self.perturbations)
 
 
-def check_installed() -> None:
-    """Raise a ValueError unless gym-pusht is there."""
+def check_installed(tasks: Sequence[str] = ()) -> None:
+    """Raise a ValueError unless gym-pusht is there, whatever the tasks."""
     if find_spec("gym_pusht") is None:
         raise ValueError(f"--env.type=bomb_pusht needs gym-pusht: pip install '{PUSHT_EXTRA}'")
 

@@ -1,16 +1,17 @@
-"""Records of episodes of LeRobot's own `pusht` and `libero`, of which lerobot-eval itself tells little."""
+"""Records of episodes of LeRobot's own env types, of which lerobot-eval itself tells little."""
 
 import json
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
-from functools import partial
+from dataclasses import dataclass, field, make_dataclass
+from functools import cache, partial
 from typing import Annotated, Any, ClassVar, Self
 
 from lerobot_bomb import __version__
 from lerobot_bomb.conditions import NONE, AxisCondition
 from lerobot_bomb.libero.assets import SUITES
-from lerobot_bomb.results import schema
-from lerobot_bomb.results.libero import describe_numbered_tasks, task_flags
+from lerobot_bomb.pusht.episode import IMAGE_SIZE
+from lerobot_bomb.results import pusht, schema
+from lerobot_bomb.results.libero import SIMULATOR, describe_numbered_tasks, task_flags
 from lerobot_bomb.results.means import mean_of
 from lerobot_bomb.results.origin import PolicyIdentity, describe_versions, installed_version, machine_name
 from lerobot_bomb.results.record import Record
@@ -37,8 +38,11 @@ class StockSpec:
 
 @dataclass(frozen=True, kw_only=True)
 class StockResult(Record):
-    """Outcome of one episode; a subclass for each environment."""
+    """Outcome of one episode; a subclass for each env type, which `stock_result` makes."""
 
+    simulator: ClassVar[Sequence[str]]  # packages that the bits of an episode depend on
+    drawn_size: ClassVar[str | None] = None  # width and height of its images, whatever its flags say
+    tasks: ClassVar = ()  # whatever LeRobot takes
     condition: ClassVar = AxisCondition
     drawn: ClassVar = ("task_id", "number")
     start: ClassVar = ("seed", "task_id")  # tasks have scenes of their own
@@ -101,6 +105,8 @@ class StockPushTResult(StockResult):
     env_type: ClassVar = "pusht"
     versions: ClassVar = {"lerobot-pusht-1.0": ()}
     tasks: ClassVar = ("PushT-v0",)
+    simulator: ClassVar = pusht.SIMULATOR
+    drawn_size: ClassVar = f"{IMAGE_SIZE}x{IMAGE_SIZE}"
 
     protocol_version: str = "lerobot-pusht-1.0"
 
@@ -112,6 +118,37 @@ class StockLiberoResult(StockResult):
     env_type: ClassVar = "libero"
     versions: ClassVar = {"lerobot-libero-1.0": ()}
     tasks: ClassVar = SUITES
+    simulator: ClassVar = SIMULATOR
     starts_by_number: ClassVar = True
 
     protocol_version: str = "lerobot-libero-1.0"
+
+
+@dataclass(frozen=True, kw_only=True)
+class StockLiberoPlusResult(StockLiberoResult):
+    """Outcome of one episode of `libero_plus`, which LeRobot runs as `libero`."""
+
+    env_type: ClassVar = "libero_plus"
+    versions: ClassVar = {"lerobot-libero_plus-1.0": ()}
+    tasks: ClassVar = ()
+
+    protocol_version: str = "lerobot-libero_plus-1.0"
+
+
+@cache
+def stock_result(env_type: str) -> type[StockResult]:
+    """Return the type of the records of an env type of which nothing more is known than its name."""
+    version = f"lerobot-{env_type}-1.0"
+    packages = (f"gym-{env_type}", env_type, "gymnasium", "mujoco")
+    return make_dataclass(
+        "NamedStockResult",
+        [("protocol_version", str, version)],
+        bases=(StockResult,),
+        namespace={
+            "env_type": env_type,
+            "versions": {version: ()},
+            "simulator": tuple(filter(installed_version, packages)),
+        },
+        frozen=True,
+        kw_only=True,
+    )
