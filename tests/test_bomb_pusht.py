@@ -410,6 +410,6 @@ def test_the_evaluation_s_file_names_every_axis() -> None:
     path = Path(__file__).parents[1] / "configs" / "eval_bomb_pusht.yaml"
     flags = yaml.safe_load(path.read_text())["env"]
     assert flags.pop("type") == "bomb_pusht"
-    conditions = set(BombPushTEnvConfig(**flags).conditions.values())
+    conditions = {specs[0].perturbations for specs in BombPushTEnvConfig(**flags).groups.values()}
     axes = {f"{axis}:3" for axis in nuisances_of(PUSHT_AXES)}
     assert conditions == {"none", "all:1", "all:3", "all:5", *axes}

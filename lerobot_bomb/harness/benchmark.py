@@ -46,7 +46,7 @@ class BombBenchmark(StepBenchmark):
         self._specs: dict[str, EpisodeSpec] = {
             key if self._config.task_ids is None else f"{key}.{task_id}": spec
             for key, specs in self._config.groups.items()
-            for task_id, spec in zip(self._config.task_ids or [0], specs, strict=True)
+            for task_id, spec in specs.items()
         }
         self._env: gymnasium.Env | None = None
         self._name = ""  # of the task that `_env` is of
