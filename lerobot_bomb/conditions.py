@@ -7,7 +7,7 @@ import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import lru_cache
-from typing import ClassVar, Self
+from typing import ClassVar, Self, cast
 
 from lerobot_bomb.registry import Registry
 
@@ -172,3 +172,14 @@ class AxisCondition(str):
                 f"--env.perturbations={text!r}: the levels of {axis} must lie in 0..{MAX_LEVEL}{order}"
             )
         return nuisances_of(cls.axes) if axis == ALL else (axis,), low, high
+
+
+class PerturbedSpec:
+    """Base of specs, whose `perturbations` is a condition once the spec is made."""
+
+    perturbations: str
+
+    @property
+    def condition(self) -> AxisCondition:
+        """The axes that are on."""
+        return cast(AxisCondition, self.perturbations)

@@ -86,11 +86,6 @@ class BombEnvConfig(EvaluatedEnv, EnvConfig):
             self.features_map[key] = f"{OBS_PREFIX}{key}"  # where LeRobot puts keys it does not know
 
     @property
-    def gym_id(self) -> str:
-        """Gymnasium id of the same environment."""
-        return f"bomb/{self.task}-v0"
-
-    @property
     def suites(self) -> tuple[str, ...]:
         """Suites that are run."""
         return suites_of(str(self.task))
@@ -130,9 +125,8 @@ class BombEnvConfig(EvaluatedEnv, EnvConfig):
 
     @property
     def gym_kwargs(self) -> dict[str, Any]:
-        """Arguments of `BombEnv` for the first task."""
+        """Arguments of `BombEnv` beside the spec."""
         return {
-            "spec": next(spec for specs in self.groups.values() for spec in specs.values()),
             "render_options": self.render_options,
             "results_path": self.results_path,
             "task_ids": None if self.task_ids is None else tuple(self.task_ids),

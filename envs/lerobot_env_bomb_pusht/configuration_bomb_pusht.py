@@ -21,7 +21,6 @@ from lerobot_bomb.pusht.episode import (
     check_installed,
 )
 from lerobot_bomb.pusht.perturbations import PushTCondition
-from lerobot_env_bomb_pusht import GYM_ID
 
 TASKS = ("pusht",)
 AGENT_POS, PIXELS = "agent_pos", "pixels"  # what gym-pusht calls them
@@ -60,11 +59,6 @@ class BombPushTEnvConfig(EvaluatedEnv, EnvConfig):
         self.features_map = {ACTION: ACTION, AGENT_POS: OBS_STATE, PIXELS: OBS_IMAGE}
 
     @property
-    def gym_id(self) -> str:
-        """Gymnasium id of the same environment."""
-        return GYM_ID
-
-    @property
     def groups(self) -> dict[str, dict[int, PushTSpec]]:
         """{task and condition: {0: its spec}}."""
         conditions = PushTCondition.groups(self.perturbations, str(self.task))
@@ -75,9 +69,8 @@ class BombPushTEnvConfig(EvaluatedEnv, EnvConfig):
 
     @property
     def gym_kwargs(self) -> dict[str, Any]:
-        """Arguments of `BombPushTEnv` for the first condition."""
+        """Arguments of `BombPushTEnv` beside the spec."""
         return {
-            "spec": next(iter(self.groups.values()))[0],
             "image_size": self.image_size,
             "results_path": self.results_path,
         }

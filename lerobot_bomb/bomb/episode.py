@@ -3,12 +3,11 @@
 import dataclasses
 from dataclasses import dataclass
 from enum import StrEnum
-from typing import cast
 
 from lerobot_bomb.bomb.board import BOARD, COLORS
 from lerobot_bomb.bomb.perturbations import Condition
 from lerobot_bomb.bomb.suites import SUITES
-from lerobot_bomb.conditions import NONE
+from lerobot_bomb.conditions import NONE, PerturbedSpec
 from lerobot_bomb.flags import one_of
 
 # Version of how a policy is measured and what a line of results says. 1.1 is 1.0 with lines that name
@@ -56,7 +55,7 @@ def check_seed(seed: int) -> None:
 
 
 @dataclass(frozen=True)
-class EpisodeSpec:
+class EpisodeSpec(PerturbedSpec):
     """Everything that, with the code's version, determines an episode bit for bit."""
 
     seed: int
@@ -95,11 +94,6 @@ class EpisodeSpec:
                 f"--env.success_tolerance_mm={self.success_tolerance_mm} must lie between 0 and half the "
                 f"pitch, {1000 * BOARD.pitch_m / 2} mm: beyond it a stone would be on two intersections"
             )
-
-    @property
-    def condition(self) -> Condition:
-        """The axes that are on: `perturbations` as it has been parsed."""
-        return cast("Condition", self.perturbations)
 
     @staticmethod
     def _check_target(target: tuple[int, int]) -> None:

@@ -2,10 +2,9 @@
 
 from dataclasses import dataclass
 from enum import StrEnum
-from typing import cast
 
 from lerobot_bomb.bomb.episode import check_seed
-from lerobot_bomb.conditions import NONE
+from lerobot_bomb.conditions import NONE, PerturbedSpec
 from lerobot_bomb.flags import one_of
 from lerobot_bomb.libero.assets import SUITES
 from lerobot_bomb.libero.perturbations import LiberoCondition
@@ -28,7 +27,7 @@ class LiberoFailure(StrEnum):
 
 
 @dataclass(frozen=True)
-class LiberoSpec:
+class LiberoSpec(PerturbedSpec):
     """Everything that, with the versions of code and simulator, determines an episode."""
 
     seed: int
@@ -46,11 +45,6 @@ class LiberoSpec:
         check_seed(self.seed)
         if self.max_steps is not None and not 1 <= self.max_steps <= MAX_ALLOWED_STEPS:
             raise ValueError(f"--env.episode_length={self.max_steps} must lie in 1..{MAX_ALLOWED_STEPS}")
-
-    @property
-    def condition(self) -> LiberoCondition:
-        """The axes that are on: `perturbations` as it has been parsed."""
-        return cast("LiberoCondition", self.perturbations)
 
 
 def initial_state_of(seed: int, count: int) -> int:

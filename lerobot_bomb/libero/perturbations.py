@@ -53,8 +53,7 @@ _OWN = {
         "lerobot_env_bomb_libero.axes.start:LiberoStart",
     ),
     "photometric": replace(
-        BOMB_AXES["photometric"],
-        transform="lerobot_env_bomb_libero.axes.photometric:LiberoSensor",
+        BOMB_AXES["photometric"], transform="lerobot_env_bomb_libero.axes.photometric:LiberoSensor"
     ),
     "camera": Axis(
         "angle, field of view and distance of the cameras; what was in view stays in view",
@@ -69,13 +68,9 @@ _OWN = {
         },
         "lerobot_env_bomb_libero.axes.camera:LiberoCamera",
     ),
-    "light": replace(
-        BOMB_AXES["light"],
-        transform="lerobot_env_bomb_libero.axes.light:LiberoLight",
-    ),
+    "light": replace(BOMB_AXES["light"], transform="lerobot_env_bomb_libero.axes.light:LiberoLight"),
     "language": replace(
-        BOMB_AXES["language"],
-        transform="lerobot_env_bomb_libero.axes.language:LiberoWording",
+        BOMB_AXES["language"], transform="lerobot_env_bomb_libero.axes.language:LiberoWording"
     ),
     "dynamics": Axis(
         "mass and friction of the objects, noise and latency of the arm",

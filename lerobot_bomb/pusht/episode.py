@@ -5,12 +5,11 @@ from dataclasses import dataclass
 from enum import StrEnum
 from importlib.util import find_spec
 from math import pi
-from typing import cast
 
 import numpy as np
 
 from lerobot_bomb.bomb.episode import check_seed
-from lerobot_bomb.conditions import NONE, nuisances_of
+from lerobot_bomb.conditions import NONE, PerturbedSpec, nuisances_of
 from lerobot_bomb.flags import one_of
 from lerobot_bomb.pusht.perturbations import PUSHT_AXES, PushTCondition
 
@@ -44,7 +43,7 @@ class PushTFailure(StrEnum):
 
 
 @dataclass(frozen=True)
-class PushTSpec:
+class PushTSpec(PerturbedSpec):
     """Everything that, with the code's version, determines an episode bit for bit."""
 
     seed: int
@@ -64,11 +63,6 @@ class PushTSpec:
                 f"--env.perturbations={self.perturbations!r} rewords the instruction, of which "
                 "--env.instruction=none leaves nothing; drop one of them (all:3 stays allowed)"
             )
-
-    @property
-    def condition(self) -> PushTCondition:
-        """The axes that are on: `perturbations` as it has been parsed."""
-        return cast("PushTCondition", self.perturbations)
 
 
 def check_installed(tasks: Sequence[str] = ()) -> None:

@@ -35,13 +35,9 @@ _OWN = {
         "lerobot_env_bomb_pusht.axes.start:PushTStart",
     ),
     "photometric": replace(
-        BOMB_AXES["photometric"],
-        transform="lerobot_env_bomb_pusht.axes.photometric:PushTSensor",
+        BOMB_AXES["photometric"], transform="lerobot_env_bomb_pusht.axes.photometric:PushTSensor"
     ),
-    "language": replace(
-        BOMB_AXES["language"],
-        transform="lerobot_env_bomb_pusht.axes.language:PushTWording",
-    ),
+    "language": replace(BOMB_AXES["language"], transform="lerobot_env_bomb_pusht.axes.language:PushTWording"),
     "dynamics": Axis(
         "damping and friction of the block, latency and noise of the agent",
         ("dynamics",),

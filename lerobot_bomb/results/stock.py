@@ -7,7 +7,7 @@ from functools import cache, partial
 from typing import Annotated, Any, ClassVar, Self
 
 from lerobot_bomb import __version__
-from lerobot_bomb.conditions import NONE, AxisCondition
+from lerobot_bomb.conditions import NONE, AxisCondition, PerturbedSpec
 from lerobot_bomb.libero.assets import SUITES
 from lerobot_bomb.pusht.episode import IMAGE_SIZE
 from lerobot_bomb.results import pusht, schema
@@ -21,7 +21,7 @@ FAILED = "failed"  # the only class: why is not known
 
 
 @dataclass(frozen=True)
-class StockSpec:
+class StockSpec(PerturbedSpec):
     """Episode of an evaluation, as far as LeRobot tells which one it was."""
 
     seed: Natural
@@ -30,10 +30,8 @@ class StockSpec:
     number: Natural | None  # in the evaluation, where that chooses how it starts; None: the seed does
     perturbations: Annotated[str, schema.among((NONE,))] = NONE  # there are no others
 
-    @property
-    def condition(self) -> AxisCondition:
-        """No axes."""
-        return AxisCondition(self.perturbations)
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "perturbations", AxisCondition(self.perturbations))
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -98,57 +96,28 @@ def _flag_value(value: Any) -> str:
     return value if isinstance(value, str) else json.dumps(value)
 
 
-@dataclass(frozen=True, kw_only=True)
-class StockPushTResult(StockResult):
-    """Outcome of one episode of `pusht`."""
-
-    env_type: ClassVar = "pusht"
-    versions: ClassVar = {"lerobot-pusht-1.0": ()}
-    tasks: ClassVar = ("PushT-v0",)
-    simulator: ClassVar = pusht.SIMULATOR
-    drawn_size: ClassVar = f"{IMAGE_SIZE}x{IMAGE_SIZE}"
-
-    protocol_version: str = "lerobot-pusht-1.0"
-
-
-@dataclass(frozen=True, kw_only=True)
-class StockLiberoResult(StockResult):
-    """Outcome of one episode of `libero`; its task, not its flags, says the suite."""
-
-    env_type: ClassVar = "libero"
-    versions: ClassVar = {"lerobot-libero-1.0": ()}
-    tasks: ClassVar = SUITES
-    simulator: ClassVar = SIMULATOR
-    starts_by_number: ClassVar = True
-
-    protocol_version: str = "lerobot-libero-1.0"
-
-
-@dataclass(frozen=True, kw_only=True)
-class StockLiberoPlusResult(StockLiberoResult):
-    """Outcome of one episode of `libero_plus`, which LeRobot runs as `libero`."""
-
-    env_type: ClassVar = "libero_plus"
-    versions: ClassVar = {"lerobot-libero_plus-1.0": ()}
-    tasks: ClassVar = ()
-
-    protocol_version: str = "lerobot-libero_plus-1.0"
-
-
 @cache
-def stock_result(env_type: str) -> type[StockResult]:
-    """Return the type of the records of an env type of which nothing more is known than its name."""
+def stock_result(env_type: str, **facts: Any) -> type[StockResult]:
+    """Return the type of the records of an env type; `facts`: what is known of it, of the class variables."""
     version = f"lerobot-{env_type}-1.0"
     packages = (f"gym-{env_type}", env_type, "gymnasium", "mujoco")
+    known = {
+        "env_type": env_type,
+        "versions": {version: ()},
+        "simulator": [*filter(installed_version, packages)],
+    }
     return make_dataclass(
-        "NamedStockResult",
+        f"{env_type.title()}Result",
         [("protocol_version", str, version)],
         bases=(StockResult,),
-        namespace={
-            "env_type": env_type,
-            "versions": {version: ()},
-            "simulator": tuple(filter(installed_version, packages)),
-        },
+        namespace=known | facts,
         frozen=True,
         kw_only=True,
     )
+
+
+StockPushTResult = stock_result(
+    "pusht", tasks=("PushT-v0",), simulator=pusht.SIMULATOR, drawn_size=f"{IMAGE_SIZE}x{IMAGE_SIZE}"
+)
+StockLiberoResult = stock_result("libero", tasks=SUITES, simulator=SIMULATOR, starts_by_number=True)
+StockLiberoPlusResult = stock_result("libero_plus", simulator=SIMULATOR, starts_by_number=True)

@@ -57,20 +57,16 @@ class BombView(EnvView):
 
 def bomb_episode(spec: EpisodeSpec, options: RenderOptions) -> Viewed:
     """Return an episode as it is shown."""
+    env_flags = {"task": spec.suite} | {
+        name: getattr(spec, name) for name in ("robot", "control_mode", "fps")
+    }
     return Viewed(
         env_type="bomb",
         spec=spec,
         group=f"{spec.suite}.{spec.condition.key}",
         fps=spec.fps,
         policies=(EXPERT, RANDOM),
-        env_flags={
-            "task": spec.suite,
-            "robot": spec.robot,
-            "control_mode": spec.control_mode,
-            "fps": spec.fps,
-            "image_size": options.image_size,
-            "depth": options.depth,
-        },
+        env_flags=env_flags | {"image_size": options.image_size, "depth": options.depth},
         make_env=partial(make_env, spec, options),
         log=_log,
         task="".join(f"_{word}" for word in _fixed_words(spec)),
