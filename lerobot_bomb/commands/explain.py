@@ -92,7 +92,7 @@ def _of_flags(args: argparse.Namespace) -> "_Query":
 def _of_line(args: argparse.Namespace) -> "_Query":
     of_episode = {"image_size": None, "perturbations": (NONE,), "env_type": BOMB.name}
     of_episode |= {"ignore_checkpoint": False}
-    of_episode |= {name: flag.default for name, flag in args.own_flags.items()}
+    of_episode |= {name: default for name, (default, _) in args.own_flags.items()}
     for name, default in of_episode.items():
         if getattr(args, name) != default:
             raise ValueError(f"drop --env.{name.removeprefix('env_')}: the line of --results says it")
@@ -152,7 +152,7 @@ def _explain_one(args: argparse.Namespace, query: _Query) -> int:
     if moments[0].snapshot.objects and args.fill != "other":
         episodes = play_masked(viewed, loaded, masks_of(moments[0].snapshot, loaded, args.fill))
     name = viewed.name(loaded.config.type)
-    sections = [overview_section(viewed.log().describe(result), moments, _command())]
+    sections = [overview_section(viewed.log.describe(result), moments, _command())]
     sections += [section for each in moments for section in moment_sections(each)]
     sections += [traces_section(episodes)] if episodes else []
     numbers = {

@@ -69,7 +69,7 @@ def run(args: argparse.Namespace) -> int:
     for (label, player), result in zip(players.items(), results, strict=True):
         of, values = player.viewed, cast("Any", result)
         print_lines(f"{label} ({of.spec.perturbations}): {values.instruction}")
-        print(of.log().describe(result))
+        print(of.log.describe(result))
     print(*paths, sep="\n")
     return _compare(record, results[0])
 

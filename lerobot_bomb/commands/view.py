@@ -3,7 +3,7 @@
 import argparse
 from collections.abc import Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -56,25 +56,17 @@ def add_viewed_arguments(parser: argparse.ArgumentParser) -> None:
     others = {*vars(parser.parse_args([])), *SHARED_FLAGS}
     add_episode_arguments(parser)
     of_bomb = {name: value for name, value in vars(parser.parse_args([])).items() if name not in others}
-    own = {name: OwnFlag(default, [BOMB.name]) for name, default in of_bomb.items()}
+    own = {name: (default, [BOMB.name]) for name, default in of_bomb.items()}
     for env_type in _viewed_types():
         for name, options in ENVIRONMENTS[env_type].view.flags.items():
             if name not in own:
                 add_env_flag(parser, name, **options | {"help": f"of {env_type}: {options['help']}"})
-            own.setdefault(name, OwnFlag(None, [])).env_types.append(env_type)
-    parser.set_defaults(own_flags=own)
+            own.setdefault(name, (None, []))[1].append(env_type)
+    parser.set_defaults(own_flags=own)  # {flag that only some have: its default, their names}
 
 
 def _viewed_types() -> list[str]:
     return [name for name, each in ENVIRONMENTS.items() if each.view_at]
-
-
-@dataclass(frozen=True)
-class OwnFlag:
-    """Flag that only some environments have."""
-
-    default: Any
-    env_types: list[str]
 
 
 def run(args: argparse.Namespace) -> int:
@@ -86,17 +78,17 @@ def run(args: argparse.Namespace) -> int:
     player = Player(viewed, partial(_agent, args, policy, viewed, paths))
     (result,) = write_episodes({policy: player}, name, *paths)
     values: Any = result
-    print(values.instruction, viewed.log().describe(result), *paths, sep="\n")
+    print(values.instruction, viewed.log.describe(result), *paths, sep="\n")
     return 0
 
 
 def viewed_of(args: argparse.Namespace) -> Viewed:
     """Return the episode that `add_viewed_arguments` lets a user name."""
     one_of("--env.type", args.env_type, _viewed_types())
-    for name, flag in args.own_flags.items():
+    for name, (default, env_types) in args.own_flags.items():
         value = getattr(args, name)
-        if value != flag.default and args.env_type not in flag.env_types:
-            whose = " or ".join(flag.env_types)
+        if value != default and args.env_type not in env_types:
+            whose = " or ".join(env_types)
             raise ValueError(f"--env.{name}={value} is a flag of --env.type={whose} only; drop it")
     if len(args.perturbations) != 1:
         raise ValueError(

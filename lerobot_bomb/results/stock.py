@@ -1,7 +1,7 @@
 """Records of episodes of LeRobot's own env types, of which lerobot-eval itself tells little."""
 
 import json
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, field, make_dataclass
 from functools import cache, partial
 from typing import Annotated, Any, ClassVar, Self
@@ -71,10 +71,6 @@ class StockResult(Record):
         return {"simulator": describe_versions(self.simulator_versions), **flags}
 
     @classmethod
-    def describe_simulator(cls, settings: Mapping[str, str]) -> str:
-        return settings["simulator"]
-
-    @classmethod
     def describe_tasks(cls, records: Sequence[Self]) -> str:
         return describe_numbered_tasks([each.spec for each in records])
 
@@ -101,11 +97,8 @@ def stock_result(env_type: str, **facts: Any) -> type[StockResult]:
     """Return the type of the records of an env type; `facts`: what is known of it, of the class variables."""
     version = f"lerobot-{env_type}-1.0"
     packages = (f"gym-{env_type}", env_type, "gymnasium", "mujoco")
-    known = {
-        "env_type": env_type,
-        "versions": {version: ()},
-        "simulator": [*filter(installed_version, packages)],
-    }
+    known = {"env_type": env_type, "versions": {version: ()}}
+    known |= {"simulator": [*filter(installed_version, packages)]}
     return make_dataclass(
         f"{env_type.title()}Result",
         [("protocol_version", str, version)],

@@ -2,7 +2,7 @@
 
 from collections.abc import Iterator, Mapping
 from functools import lru_cache, partial
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 from PIL import Image, ImageDraw
@@ -24,9 +24,6 @@ from lerobot_bomb.results.bomb import EpisodeResult
 from lerobot_bomb.results.record import NOT_RECORDED
 from lerobot_bomb.viewing.episode import EXPERT, RANDOM, EnvView, Viewed
 from lerobot_bomb.viewing.sheet import FONT_SIZE, GAP, INK, TILE_PAPER, font, text_tile
-
-if TYPE_CHECKING:
-    from lerobot_bomb.viewing.rerun_bomb import BombLog
 
 SPEC_FLAGS = ("robot", "split", "control_mode", "fps", "target", "color", "success_tolerance_mm")
 GRID_RGB, NOMINAL_RGB, PATH_RGB = (200, 185, 160), (165, 165, 165), (210, 40, 30)
@@ -57,18 +54,16 @@ class BombView(EnvView):
 
 def bomb_episode(spec: EpisodeSpec, options: RenderOptions) -> Viewed:
     """Return an episode as it is shown."""
-    env_flags = {"task": spec.suite} | {
-        name: getattr(spec, name) for name in ("robot", "control_mode", "fps")
-    }
+    flags = {"task": spec.suite} | {name: getattr(spec, name) for name in ("robot", "control_mode", "fps")}
     return Viewed(
         env_type="bomb",
         spec=spec,
         group=f"{spec.suite}.{spec.condition.key}",
         fps=spec.fps,
         policies=(EXPERT, RANDOM),
-        env_flags=env_flags | {"image_size": options.image_size, "depth": options.depth},
+        env_flags=flags | {"image_size": options.image_size, "depth": options.depth},
         make_env=partial(make_env, spec, options),
-        log=_log,
+        log_at="lerobot_bomb.viewing.rerun_bomb:BombLog",
         task="".join(f"_{word}" for word in _fixed_words(spec)),
     )
 
@@ -80,12 +75,6 @@ def _fixed_words(spec: EpisodeSpec) -> Iterator[str]:
         yield "row{}-column{}".format(*spec.target)
     if spec.color is not None:
         yield spec.color
-
-
-def _log() -> "type[BombLog]":
-    from lerobot_bomb.viewing.rerun_bomb import BombLog
-
-    return BombLog
 
 
 def bomb_tiles(condition: str, seed: int, image_size: int, changes: set[str]) -> dict[str, np.ndarray]:

@@ -6,6 +6,7 @@ from contextlib import AbstractContextManager, closing
 from dataclasses import dataclass
 from itertools import zip_longest
 from pathlib import Path
+from pkgutil import resolve_name
 from typing import TYPE_CHECKING, Any, ClassVar, cast
 
 import gymnasium
@@ -35,8 +36,13 @@ class Viewed:
     policies: tuple[str, ...]  # who can act without a checkpoint; the first does unless another is named
     env_flags: dict[str, Any]  # of LeRobot's config, for a checkpoint
     make_env: Callable[[], gymnasium.Env]
-    log: "Callable[[], type[EpisodeLog]]"  # rerun takes a second to import
+    log_at: str  # its `EpisodeLog`, "module:class": rerun takes a second to import
     task: str = ""  # what is fixed of the task: "_task3", "_row3-column2_white"
+
+    @property
+    def log(self) -> "type[EpisodeLog]":
+        """The class that writes its recording."""
+        return resolve_name(self.log_at)
 
     def name(self, policy: str) -> str:
         """Name an episode and its files: "place.camera-3_expert_seed0"."""
@@ -84,7 +90,7 @@ def write_episodes(players: Mapping[str, Player], name: str, rrd: Path, mp4: Pat
         open_recording(unfinished_rrd, name, fps, _layout(players, prefixes)) as recording,
     ):
         for label, player in players.items():
-            log = player.viewed.log()(recording, prefixes[label], player.viewed.spec)
+            log = player.viewed.log(recording, prefixes[label], player.viewed.spec)
             images.append([])
             with closing(player.viewed.make_env()) as env, player.make_agent(env) as agent:
                 for moment in play(env, player.viewed.spec, agent):
@@ -119,5 +125,5 @@ def check_new(paths: Iterable[Path]) -> None:
 def _layout(players: Mapping[str, Player], prefixes: Mapping[str, str]) -> "rrb.ContainerLike":
     import rerun.blueprint as rrb
 
-    layouts = [player.viewed.log().layout(prefixes[label]) for label, player in players.items()]
+    layouts = [player.viewed.log.layout(prefixes[label]) for label, player in players.items()]
     return layouts[0] if len(layouts) == 1 else rrb.Vertical(*layouts)

@@ -2,7 +2,7 @@
 
 from collections.abc import Mapping
 from functools import partial
-from typing import TYPE_CHECKING, Any, ClassVar
+from typing import Any, ClassVar
 
 import gymnasium
 import numpy as np
@@ -19,9 +19,6 @@ from lerobot_bomb.pusht.episode import (
 from lerobot_bomb.results.pusht import PushTResult
 from lerobot_bomb.viewing.episode import RANDOM, EnvView, Viewed
 from lerobot_bomb.viewing.sheet import text_tile
-
-if TYPE_CHECKING:
-    from lerobot_bomb.viewing.rerun_pusht import PushTLog
 
 ENV_ID = "lerobot_env_bomb_pusht:bomb_pusht/PushT-v0"
 PUSHED_STEPS = 6  # through the block, for what `dynamics` does
@@ -60,14 +57,8 @@ def _episode(spec: PushTSpec, image_size: int) -> Viewed:
         policies=(RANDOM,),
         env_flags={"image_size": image_size, "instruction": spec.instruction, "max_steps": spec.max_steps},
         make_env=partial(make_pusht_env, spec, image_size),
-        log=_log,
+        log_at="lerobot_bomb.viewing.rerun_pusht:PushTLog",
     )
-
-
-def _log() -> "type[PushTLog]":
-    from lerobot_bomb.viewing.rerun_pusht import PushTLog
-
-    return PushTLog
 
 
 def make_pusht_env(spec: PushTSpec, image_size: int) -> gymnasium.Env:
