@@ -86,11 +86,6 @@ class BombEnvConfig(EvaluatedEnv, EnvConfig):
             self.features_map[key] = f"{OBS_PREFIX}{key}"  # where LeRobot puts keys it does not know
 
     @property
-    def suites(self) -> tuple[str, ...]:
-        """Suites that are run."""
-        return suites_of(str(self.task))
-
-    @property
     def groups(self) -> dict[str, dict[int, EpisodeSpec]]:
         """{suite and condition: {number of a task: its spec}}; {0: ...} where tasks are drawn per episode."""
         return {
@@ -98,7 +93,7 @@ class BombEnvConfig(EvaluatedEnv, EnvConfig):
                 task_id: replace(spec, perturbations=condition)
                 for task_id, spec in zip(self.task_ids or [0], self.specs_of(suite), strict=True)
             }
-            for suite in self.suites
+            for suite in suites_of(str(self.task))
             for key, condition in Condition.groups(self.perturbations, suite).items()
         }
 

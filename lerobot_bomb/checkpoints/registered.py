@@ -18,9 +18,10 @@ KINDS = {
 def registered_types(kind: str) -> set[str] | None:
     """Return the types of LeRobot and this package, of one of `KINDS`; None: another plugin may add some."""
     registry, pattern, prefix = KINDS[kind]
-    names = {name.lower().replace("-", "_") for name in _distributions()}
+    names = {str(each.metadata["Name"]) for each in importlib.metadata.distributions()}
+    others = {name.lower().replace("-", "_") for name in names} - {OURS}
     spec = find_spec("lerobot")
-    if spec is None or not spec.submodule_search_locations or any(map(PLUGIN.match, names - {OURS})):
+    if spec is None or not spec.submodule_search_locations or any(map(PLUGIN.match, others)):
         return None
     files = [*Path(spec.submodule_search_locations[0], kind).glob(pattern)]
     for module in pkgutil.iter_modules():
@@ -29,7 +30,3 @@ def registered_types(kind: str) -> set[str] | None:
             files += folder.glob("configuration_*.py")
     types = re.compile(rf"""{registry}\.register_subclass\(\s*(?:name=)?["'](\w+)["']""")
     return {name for path in files for name in types.findall(path.read_text())}
-
-
-def _distributions() -> list[str]:
-    return [str(each.metadata["Name"]) for each in importlib.metadata.distributions()]
