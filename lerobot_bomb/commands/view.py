@@ -23,15 +23,7 @@ from lerobot_bomb.environments import BOMB, ENVIRONMENTS
 from lerobot_bomb.envs.rollout import Agent, expert_agent, one_of_batch, random_agent
 from lerobot_bomb.files import read_json
 from lerobot_bomb.flags import one_of
-from lerobot_bomb.viewing.episode import (
-    EXPERT,
-    RANDOM,
-    Player,
-    Viewed,
-    check_new,
-    paths_of,
-    write_episodes,
-)
+from lerobot_bomb.viewing.episode import EXPERT, RANDOM, Player, Viewed, check_new, paths_of, write_episodes
 
 DEFAULT_FOLDER = Path("outputs/view")
 SHARED_FLAGS = ("perturbations", "image_size")  # by all environments that are shown
@@ -124,21 +116,14 @@ def _agent(
     args: argparse.Namespace, policy: str, viewed: Viewed, paths: list[Path], env: gymnasium.Env
 ) -> Iterator[Agent]:
     """Yield the agent that acts; other errors are told before that of files that exist."""
-    with _accepted_agent(args, policy, viewed, env) as agent:
-        check_new(paths)
-        yield agent
-
-
-@contextmanager
-def _accepted_agent(
-    args: argparse.Namespace, policy: str, viewed: Viewed, env: gymnasium.Env
-) -> Iterator[Agent]:
+    seed = viewed.spec.seed
     if policy in (EXPERT, RANDOM):
-        yield expert_agent() if policy == EXPERT else random_agent(env, viewed.spec.seed)
+        check_new(paths)
+        yield expert_agent() if policy == EXPERT else random_agent(env, seed)
         return
     from lerobot_bomb.viewing.checkpoint import load_policy  # LeRobot and torch: seconds
 
-    seed = viewed.spec.seed
     loaded = load_policy(args.policy_path, args.policy_device, viewed.env_type, viewed.env_flags, seed)
     with one_of_batch(loaded.agent, viewed.make_env, seed, row=0, size=1) as agent:
+        check_new(paths)
         yield agent

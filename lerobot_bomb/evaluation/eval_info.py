@@ -44,9 +44,7 @@ def results_of(
         ValueError: an episode's rewards are not finite: its actions or the simulation were not.
     """
     record_type: type[StockResult] = env_type(env.type).record
-    of_spec = {"task"} if record_type.starts_by_number else set()
-    values: Any = draccus.encode(env)
-    settings = {name: value for name, value in values.items() if name not in NOT_SETTINGS | of_spec}
+    settings = _settings(env, record_type)
     for task in info["per_task"]:
         metrics = task["metrics"]
         episodes = zip(metrics["sum_rewards"], metrics["max_rewards"], metrics["successes"], strict=True)
@@ -65,6 +63,12 @@ def results_of(
                 simulator_versions=installed_versions(record_type.simulator),
                 policy=replace(policy, batch_size=batch_size, batch_row=i % batch_size),
             )
+
+
+def _settings(env: EnvConfig, record_type: type[StockResult]) -> dict[str, Any]:
+    of_spec = {"task"} if record_type.starts_by_number else set()
+    values: Any = draccus.encode(env)
+    return {name: value for name, value in values.items() if name not in NOT_SETTINGS | of_spec}
 
 
 def _image_size(env: EnvConfig) -> str:

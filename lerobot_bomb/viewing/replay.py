@@ -13,7 +13,7 @@ from lerobot_bomb.environments import env_type
 from lerobot_bomb.envs.rollout import Agent, BatchAgent, one_of_batch
 from lerobot_bomb.results.origin import PolicyIdentity
 from lerobot_bomb.results.record import Record
-from lerobot_bomb.viewing.episode import EnvView, Player, Viewed
+from lerobot_bomb.viewing.episode import Player, Viewed
 
 MAX_BATCH = 1000  # environments at once
 
@@ -61,16 +61,15 @@ class Replay:
             "perturbations": perturbations or record.spec.perturbations,
             "seed": record.spec.seed if seed is None else seed,
         }
-        try:
-            view: EnvView = env_type(record.env_type).view
-        except ValueError as error:
+        env = env_type(record.env_type)
+        if not env.view_at:
             flags = " ".join(record.eval_flags([record]))
             raise ValueError(
-                f"{error}; lerobot-eval plays the episode: {flags} --seed={record.spec.seed} "
-                "--eval.n_episodes=1 --eval.batch_size=1"
-            ) from None
+                f"--env.type={record.env_type} has no recording for Rerun; lerobot-eval plays the "
+                f"episode: {flags} --seed={record.spec.seed} --eval.n_episodes=1 --eval.batch_size=1"
+            )
         spec: Any = record.spec
-        viewed = view.of_record(record, replace(spec, **changed), self.depth)
+        viewed: Viewed = env.view.of_record(record, replace(spec, **changed), self.depth)
         # who played is not asked whether it was trained for this
         return replace(viewed, env_flags=viewed.env_flags | {"ignore_checkpoint": True})
 
