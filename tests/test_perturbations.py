@@ -1,6 +1,10 @@
 """Conditions as they are written; what they do to an episode is tested in test_axes.py."""
 
+import copy
+import json
+import pickle
 import re
+from dataclasses import replace
 
 import pytest
 from hypothesis import given
@@ -41,6 +45,14 @@ def test_conditions_survive_their_spelling_and_keys_are_fit_for_a_suite(ranges: 
     }
     assert Condition(str(condition)) == condition
     assert re.fullmatch(r"[a-z0-9.-]+", condition.key)
+
+
+def test_a_spec_carries_its_condition_as_an_object_that_is_its_text() -> None:
+    spec = EpisodeSpec(seed=0, perturbations="light:3+camera:1-2")
+    for same in (spec, replace(spec, seed=1), copy.deepcopy(spec), pickle.loads(pickle.dumps(spec))):
+        assert same.condition.ranges == (("camera", 1, 2), ("light", 3, 3))
+        assert same.condition is same.perturbations
+    assert '"perturbations": "camera:1-2+light:3"' in json.dumps(spec.to_dict())
 
 
 def test_all_stands_for_every_nuisance_and_no_help() -> None:

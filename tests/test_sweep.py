@@ -265,6 +265,13 @@ def test_wrong_flags_are_told(
     assert list(tmp_path.iterdir()) == []
 
 
+def test_every_env_type_of_lerobots_can_be_swept(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert (
+        sweep(tmp_path, "--policies=act", "--env.type=aloha", "--tasks=AlohaInsertion-v0", "--dry_run") == 0
+    )
+    assert "--env.type=aloha --env.task=AlohaInsertion-v0 --seed=1000" in capsys.readouterr().out
+
+
 @pytest.mark.parametrize(
     ("flags", "message"),
     [
