@@ -1,4 +1,4 @@
-"""Where a result comes from: who acted, with which versions, on which machine.
+"""Origin of a result: who acted, with which versions, on which machine.
 
 Simulator workers import this module, so it imports neither torch nor LeRobot.
 """

@@ -32,7 +32,7 @@ MEASURED = {"inference"}
 
 
 class Spec(Protocol):
-    """What determines an episode."""
+    """Everything that determines an episode."""
 
     @property
     def seed(self) -> int: ...

@@ -100,7 +100,7 @@ def stock_result(env_type: str, **facts: Any) -> type[StockResult]:
     known = {"env_type": env_type, "versions": {version: ()}}
     known |= {"simulator": [*filter(installed_version, packages)]}
     return make_dataclass(
-        f"{env_type.title()}Result",
+        f"Stock{env_type.title()}Result",
         [("protocol_version", str, version)],
         bases=(StockResult,),
         namespace=known | facts,
