@@ -45,8 +45,6 @@ def test_types_are_read_from_source() -> None:
     assert registered_types("envs") == set(EnvConfig.get_known_choices())
     others = set(PreTrainedConfig.get_known_choices()) | {"keypoint_probe"}  # of tests only
     assert (registered_types("policies") or set()) | {"keypoint_probe"} == others
-        PreTrainedConfig.get_known_choices()
-    ) - probe
 
 
 @pytest.mark.parametrize("env_type", ENVS)
