@@ -4,6 +4,7 @@ from collections.abc import Iterator, Mapping
 from functools import cached_property
 from importlib.metadata import EntryPoint, entry_points
 from pkgutil import resolve_name
+from typing import Any
 
 
 class Registry[T](Mapping[str, T]):
@@ -40,7 +41,7 @@ class Registry[T](Mapping[str, T]):
     def __getitem__(self, name: str) -> T:
         if name not in self._found:
             if name in self.own:
-                own = self.own[name]
+                own: Any = self.own[name]
                 self._found[name] = resolve_name(own) if isinstance(own, str) else own
             else:
                 self._found[name] = _load(self._added[name])
@@ -57,7 +58,7 @@ class Registry[T](Mapping[str, T]):
         return len(self.own) + len(self._added)
 
 
-def _load(added: EntryPoint) -> object:
+def _load(added: EntryPoint) -> Any:
     try:
         return added.load()
     except (ImportError, AttributeError) as error:

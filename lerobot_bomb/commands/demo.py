@@ -10,6 +10,7 @@ from pathlib import Path
 import numpy as np
 
 from lerobot_bomb.bomb.episode import TEST_SEEDS
+from lerobot_bomb.bomb.perturbations import Condition
 from lerobot_bomb.checkpoints.shipped import PREFIX
 from lerobot_bomb.commands.arguments import path_flag
 from lerobot_bomb.commands.run import run_command
@@ -22,7 +23,7 @@ from lerobot_bomb.tables import print_table
 
 POLICY = "vla0_smol"
 # one axis, and all ten at once: its training shows both, and the second is where it fails
-CONDITIONS = (NONE, "light:3", "all:3")
+CONDITIONS = (Condition(), Condition("light:3"), Condition("all:3"))
 SUITE = "place"
 
 

@@ -43,7 +43,7 @@ def results_of(
     Raises:
         ValueError: an episode's rewards are not finite: its actions or the simulation were not.
     """
-    record_type: type[StockResult] = env_type(env.type).record
+    record_type = env_type(env.type).record
     settings = _settings(env, record_type)
     for task in info["per_task"]:
         metrics = task["metrics"]
