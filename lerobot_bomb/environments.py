@@ -33,11 +33,6 @@ class EnvType:
         """The view of its episodes."""
         return resolve_name(self.view_at)()
 
-    @property
-    def tiles(self) -> Any:
-        """The function that draws an episode for `view gallery`."""
-        return resolve_name(self.tiles_at)
-
     def check(self, tasks: Iterable[str] = ()) -> None:
         """Raise a ValueError if these values of --env.task cannot be run here."""
         if self.check_at:

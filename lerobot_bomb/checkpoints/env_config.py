@@ -70,9 +70,6 @@ class EvaluatedEnv(_EnvConfig):
         """Return LeRobot's processors, after a check of the policy that acts.
 
         Every command asks for them once, when its policy is built and no episode has begun.
-
-        Raises:
-            ValueError: that policy was trained for another environment.
         """
         if not self.ignore_checkpoint:
             self._check_policy()

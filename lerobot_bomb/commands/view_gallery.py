@@ -4,6 +4,7 @@ import argparse
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
+from pkgutil import resolve_name
 
 import numpy as np
 from PIL import Image
@@ -106,7 +107,9 @@ def axis_sheet(env: EnvType, axis: str, seeds: Sequence[int], image_size: int) -
     images: dict[str, list[np.ndarray]] = {}
     for seed in seeds:
         for level in LEVELS:
-            tiles = env.tiles(f"{axis}:{level}" if level else NONE, seed, image_size, changes)
+            tiles = resolve_name(env.tiles_at)(
+                f"{axis}:{level}" if level else NONE, seed, image_size, changes
+            )
             for name, tile in tiles.items():
                 images.setdefault(f"{name}, seed {seed}", []).append(tile)
     rows = {} if axis == ALL else magnitude_rows(axes[axis])
