@@ -33,12 +33,12 @@ from lerobot_bomb.bomb.episode import EpisodeSpec
 from lerobot_bomb.bomb.observation import RenderOptions
 from lerobot_bomb.bomb.perturbations import AXES
 from lerobot_bomb.conditions import MAX_LEVEL, NONE
-from lerobot_bomb.envs.rollout import make_pusht_env
 from lerobot_bomb.libero.assets import prepare_libero
 from lerobot_bomb.libero.episode import LiberoSpec
 from lerobot_bomb.libero.perturbations import LIBERO_AXES
 from lerobot_bomb.pusht.episode import IMAGE_SIZE, PushTSpec
 from lerobot_bomb.pusht.perturbations import PUSHT_AXES
+from lerobot_bomb.viewing.pusht import make_pusht_env
 from lerobot_env_bomb.env import BombEnv
 
 NUM_STEPS = 8  # of each episode

@@ -5,6 +5,7 @@ import dataclasses
 import inspect
 import json
 import textwrap
+from contextlib import suppress
 from enum import Enum
 from functools import cache
 from pathlib import Path
@@ -26,7 +27,10 @@ def comments_of(config_class: type) -> dict[str, str]:
     found: dict[str, str] = {}
     for base in reversed(config_class.__mro__):
         if is_ours(base):
-            found |= _comments_in(textwrap.dedent(inspect.getsource(base)))
+            with suppress(
+                OSError
+            ):  # a class that was made by a function has no source, and no comments of its own
+                found |= _comments_in(textwrap.dedent(inspect.getsource(base)))
     return found
 
 

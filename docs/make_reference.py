@@ -18,8 +18,8 @@ from lerobot.utils.import_utils import register_third_party_plugins
 from lerobot_bomb.commands.main import Parser, command_parser
 from lerobot_bomb.commands.table import COMMANDS, PROGRAM
 from lerobot_bomb.conditions import MAX_LEVEL, Axis
+from lerobot_bomb.environments import ENVIRONMENTS
 from lerobot_bomb.policies.flag_groups import flags_of
-from lerobot_bomb.results.reading import RECORD_TYPES
 from lerobot_bomb.results.record import Record, field_names
 
 FOLDER = Path(__file__).parent / "reference"
@@ -131,7 +131,7 @@ def policies_page() -> str:
 
 def record_types() -> Sequence[type[Record]]:
     """Return the type of the records of each environment."""
-    return RECORD_TYPES
+    return [each.record for each in ENVIRONMENTS.values()]
 
 
 def axes_page() -> str:

@@ -7,7 +7,9 @@ import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import lru_cache
-from typing import ClassVar, Self
+from typing import ClassVar, Self, cast
+
+from lerobot_bomb.registry import Registry
 
 NONE = "none"
 ALL = "all"
@@ -31,7 +33,13 @@ class Axis:
     summary: str
     changes: tuple[str, ...]  # of a paired episode: images, state, instruction, goal, dynamics
     magnitudes: dict[str, Magnitude]
+    transform: str  # "module:class" of what it does, an `EpisodeTransform`, which only simulators import
     is_help: bool = False  # not a nuisance: no part of `all`
+
+
+def axes_of(env_type: str, own: Mapping[str, Axis]) -> Registry[Axis]:
+    """Return an environment's table of axes, to which other packages add by entry points "ENV_TYPE.AXIS"."""
+    return Registry("lerobot_bomb.axes", own, f"{env_type}.")
 
 
 def magnitude_of(axes: Mapping[str, Axis], axis: str, name: str, level: int) -> float:
@@ -39,48 +47,51 @@ def magnitude_of(axes: Mapping[str, Axis], axis: str, name: str, level: int) -> 
     return axes[axis].magnitudes[name].levels[level - 1]
 
 
-def nuisances_of(axes: Mapping[str, Axis]) -> tuple[str, ...]:
-    """Return the axes that `all` stands for: every one that does not help."""
-    return tuple(name for name, axis in axes.items() if not axis.is_help)
+def nuisances_of(axes: Registry[Axis]) -> tuple[str, ...]:
+    """Return the axes that `all` stands for: every own one that does not help, whatever others have added."""
+    return tuple(name for name in axes.own if not axes[name].is_help)
 
 
-@dataclass(frozen=True)
-class AxisCondition:
+class AxisCondition(str):
     """Axes of an environment that are on, each at one level or at a range to draw from per episode.
 
-    A subclass names the environment's table.
+    It is its own text, in the one spelling that a condition has: "camera:2+light:3". A subclass names the
+    environment's table.
     """
 
-    axes: ClassVar[Mapping[str, Axis]]
-    ranges: tuple[tuple[str, int, int], ...] = ()  # (axis, lowest, highest level), in the order of `axes`
+    axes: ClassVar[Registry[Axis]] = Registry("", {})
+    ranges: tuple[tuple[str, int, int], ...]  # (axis, lowest, highest level), in the order of `axes`
 
-    @classmethod
-    @lru_cache(maxsize=64)  # every reset of an environment asks
-    def parse(cls, text: str) -> Self:
+    def __new__(cls, text: str = NONE) -> Self:
         """Parse "none", "camera:3", "camera:2+light:3" or "all:1-5"; level 0 leaves an axis off.
 
         Raises:
             ValueError: names --env.perturbations, what is wrong, and what is allowed.
         """
-        ranges: dict[str, tuple[int, int]] = {}
-        for part in [] if text == NONE else text.split("+"):
-            axes, low, high = cls._parse_part(part, text)
-            for axis in axes:
-                if axis in ranges:
-                    reason = f"; {ALL} includes it" if ALL in text else ""
-                    raise ValueError(f"--env.perturbations={text!r} names the axis {axis} twice{reason}")
-                ranges[axis] = low, high
-        return cls(tuple((axis, *ranges[axis]) for axis in cls.axes if ranges.get(axis, (0, 0)) != (0, 0)))
+        if type(text) is cls:  # every reset of an environment makes a spec of another one
+            return text
+        ranges = cls._parse(text)
+        condition = super().__new__(cls, cls._spell(ranges))
+        condition.ranges = ranges
+        return condition
+
+    def __deepcopy__(self, memo: object) -> Self:
+        return self
+
+    @property
+    def key(self) -> str:
+        """The condition in lower-case letters, digits, dots and hyphens: "camera-2.light-3", "all-1to5"."""
+        return self.replace("-", "to").replace(":", "-").replace("+", ".").replace("_", "-")
 
     @classmethod
-    def groups(cls, perturbations: Sequence[str] | str | None, task: str) -> dict[str, str]:
+    def groups(cls, perturbations: Sequence[str] | str | None, task: str) -> dict[str, Self]:
         """{key of a group of results: its condition} of --env.perturbations; the task alone where it is None.
 
         Raises:
             ValueError: it is no list, empty, or names a condition twice.
         """
         if perturbations is None:
-            return {task: NONE}
+            return {task: cls()}
         if isinstance(perturbations, str):
             raise ValueError(
                 f"--env.perturbations={perturbations} must be a list, with brackets and quotes: "
@@ -88,22 +99,22 @@ class AxisCondition:
             )
         if not perturbations:
             raise ValueError('--env.perturbations=[] names no condition; leave it out or give ["none"]')
-        conditions = [cls.parse(text) for text in cls.expand(perturbations)]
+        conditions = cls.expand(perturbations)
         if len(set(conditions)) < len(conditions):
             raise ValueError(f"--env.perturbations={perturbations} has a condition twice")
-        return {f"{task}.{condition.key}": str(condition) for condition in conditions}
+        return {f"{task}.{condition.key}": condition for condition in conditions}
 
     @classmethod
-    def expand(cls, perturbations: Sequence[str]) -> list[str]:
-        """Conditions; "each:3" stands for every axis at this level, "each:1-5" for every axis at each.
+    def expand(cls, perturbations: Sequence[str]) -> list[Self]:
+        """Parse conditions; "each:3" stands for every axis at this level, "each:1-5" for every axis at each.
 
         Raises:
-            ValueError: the levels are none of 1..MAX_LEVEL.
+            ValueError: one is malformed, or the levels are none of 1..MAX_LEVEL.
         """
-        conditions: list[str] = []
+        conditions: list[Self] = []
         for text in perturbations:
             if not text.startswith(f"{EACH}:"):
-                conditions.append(text)
+                conditions.append(cls(text))
                 continue
             match = re.fullmatch(rf"{EACH}:(\d)(?:-(\d))?", text)
             low, high = (0, 0) if match is None else (int(match[1]), int(match[2] or match[1]))
@@ -113,22 +124,30 @@ class AxisCondition:
                     f"1..{MAX_LEVEL}, lowest first; it stands for every axis at each of them"
                 )
             levels = range(low, high + 1)
-            conditions += [f"{axis}:{level}" for axis in nuisances_of(cls.axes) for level in levels]
+            conditions += [cls(f"{axis}:{level}") for axis in nuisances_of(cls.axes) for level in levels]
         return conditions
 
-    def __str__(self) -> str:
-        """Write the condition as `parse` reads it; one condition has one spelling."""
-        parts = {axis: f"{low}" if low == high else f"{low}-{high}" for axis, low, high in self.ranges}
-        nuisances = nuisances_of(self.axes)
+    @classmethod
+    @lru_cache(maxsize=1024)  # of the lines of a file, many have the same
+    def _parse(cls, text: str) -> tuple[tuple[str, int, int], ...]:
+        ranges: dict[str, tuple[int, int]] = {}
+        for part in [] if text == NONE else text.split("+"):
+            axes, low, high = cls._parse_part(part, text)
+            for axis in axes:
+                if axis in ranges:
+                    reason = f"; {ALL} includes it" if ALL in text else ""
+                    raise ValueError(f"--env.perturbations={text!r} names the axis {axis} twice{reason}")
+                ranges[axis] = low, high
+        return tuple((axis, *ranges[axis]) for axis in cls.axes if ranges.get(axis, (0, 0)) != (0, 0))
+
+    @classmethod
+    def _spell(cls, ranges: tuple[tuple[str, int, int], ...]) -> str:
+        parts = {axis: f"{low}" if low == high else f"{low}-{high}" for axis, low, high in ranges}
+        nuisances = nuisances_of(cls.axes)
         shared = {parts.get(axis) for axis in nuisances}
         if len(shared) == 1 and shared != {None}:
             parts = {ALL: parts[nuisances[0]], **{a: p for a, p in parts.items() if a not in nuisances}}
         return "+".join(f"{axis}:{levels}" for axis, levels in parts.items()) or NONE
-
-    @property
-    def key(self) -> str:
-        """The condition in lower-case letters, digits, dots and hyphens: "camera-2.light-3", "all-1to5"."""
-        return str(self).replace("-", "to").replace(":", "-").replace("+", ".").replace("_", "-")
 
     @classmethod
     def _parse_part(cls, part: str, text: str) -> tuple[tuple[str, ...], int, int]:
@@ -153,3 +172,14 @@ class AxisCondition:
                 f"--env.perturbations={text!r}: the levels of {axis} must lie in 0..{MAX_LEVEL}{order}"
             )
         return nuisances_of(cls.axes) if axis == ALL else (axis,), low, high
+
+
+class PerturbedSpec:
+    """Base of specs, whose `perturbations` is a condition once the spec is made."""
+
+    perturbations: str
+
+    @property
+    def condition(self) -> AxisCondition:
+        """The axes that are on."""
+        return cast(AxisCondition, self.perturbations)

@@ -59,7 +59,7 @@ def pusht_row(seed: int, condition: str, max_coverage: float, failure: str | Non
         failure=failure,
         coverage=max_coverage if failure is None else max_coverage / 2,
         max_coverage=max_coverage,
-        levels={axis: high for axis, _, high in PushTCondition.parse(condition).ranges},
+        levels={axis: high for axis, _, high in PushTCondition(condition).ranges},
         simulator_versions={"gym-pusht": "0.1.8"},
     )
     return asdict(result)

@@ -118,7 +118,7 @@ def test_groups_of_results_name_suite_and_condition() -> None:
     config = BombLiberoEnvConfig(
         task="libero_spatial,libero_goal", perturbations=["none", "camera:2+light:3"]
     )
-    assert [key for suite in config.suites for key in config._conditions(suite)] == [
+    assert [*config.groups] == [
         f"{suite}.{key}"
         for suite in ("libero_spatial", "libero_goal")
         for key in ("none", "camera-2.light-3")

@@ -225,7 +225,7 @@ def test_success_ends_an_episode_and_nothing_moves_after_it() -> None:
 @pytest.fixture(autouse=True)
 def no_policy_of_other_tests(monkeypatch: pytest.MonkeyPatch) -> None:
     """Hide the policies that other tests of this process hold and drop at any time."""
-    monkeypatch.setattr("lerobot_bomb.checkpoints.identity.built_policies", list)
+    monkeypatch.setattr("lerobot_bomb.checkpoints.acting.built_policies", list)
 
 
 def results_file(path: Path) -> list[dict[str, Any]]:
@@ -410,6 +410,6 @@ def test_the_evaluation_s_file_names_every_axis() -> None:
     path = Path(__file__).parents[1] / "configs" / "eval_bomb_pusht.yaml"
     flags = yaml.safe_load(path.read_text())["env"]
     assert flags.pop("type") == "bomb_pusht"
-    conditions = set(BombPushTEnvConfig(**flags).conditions.values())
+    conditions = {specs[0].perturbations for specs in BombPushTEnvConfig(**flags).groups.values()}
     axes = {f"{axis}:3" for axis in nuisances_of(PUSHT_AXES)}
     assert conditions == {"none", "all:1", "all:3", "all:5", *axes}

@@ -16,7 +16,6 @@ from lerobot_bomb.pusht.perturbations import PUSHT_AXES, PushTCondition, pusht_m
 
 pytest.importorskip("gym_pusht", reason="gym-pusht is not installed: pip install '.[pusht]'")
 
-from lerobot_env_bomb_pusht.axes import PUSHT_TRANSFORMS
 from lerobot_env_bomb_pusht.axes.goal import GoalPose
 from lerobot_env_bomb_pusht.axes.language import FORMS
 from lerobot_env_bomb_pusht.episode import TEMPLATES, sample_pusht_episode
@@ -176,9 +175,8 @@ def test_a_block_glides_on_where_damping_says_so() -> None:
     assert moved[1] == pytest.approx(300 * 0.1 * 0.865, rel=0.06)
 
 
-def test_a_range_draws_each_level_and_the_table_is_complete() -> None:
+def test_a_range_draws_each_level() -> None:
     drawn = [sample_pusht_episode(PushTSpec(seed, perturbations="goal:0-5")) for seed in range(40)]
     levels = {episode.perturbation.levels.get("goal", 0) for episode in drawn}
     assert levels == set(range(6))
-    assert list(PUSHT_TRANSFORMS) == list(PUSHT_AXES)
-    assert str(PushTCondition.parse("goal_marker:1+all:2")) == "all:2+goal_marker:1"
+    assert str(PushTCondition("goal_marker:1+all:2")) == "all:2+goal_marker:1"

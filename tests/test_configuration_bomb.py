@@ -77,7 +77,8 @@ def test_all_is_a_group_for_every_suite_and_condition() -> None:
     config = BombEnvConfig(task="all", perturbations=["none", "camera:3"], image_size=32)
     envs = make_env(config, n_envs=1)
     assert list(envs) == [f"{suite}.{key}" for suite in SUITES for key in ("none", "camera-3")]
-    for key, (spec,) in config.groups.items():
+    for key, specs in config.groups.items():
+        (spec,) = specs.values()
         suite, _, condition = key.partition(".")
         assert (spec.suite, spec.perturbations) == (suite, condition.replace("-", ":"))
 
@@ -86,7 +87,7 @@ def test_the_protocol_s_file_names_every_axis() -> None:
     path = Path(__file__).parents[1] / "configs" / "eval_bomb_place.yaml"
     flags = yaml.safe_load(path.read_text())["env"]
     assert flags.pop("type") == "bomb"
-    conditions = {spec.perturbations for (spec,) in BombEnvConfig(**flags).groups.values()}
+    conditions = {specs[0].perturbations for specs in BombEnvConfig(**flags).groups.values()}
     assert conditions == {"none", "all:1", "all:3", "all:5", *(f"{axis}:3" for axis in NUISANCES)}
 
 

@@ -14,22 +14,16 @@ from lerobot_bomb.bomb.observation import RenderOptions
 from lerobot_bomb.bomb.perturbations import AXES
 from lerobot_bomb.bomb.suite import find_suite, specs_of_tasks
 from lerobot_bomb.commands import main as cli
-from lerobot_bomb.commands.view_gallery import (
-    COLUMNS,
-    PATH_RGB,
-    SHEETS,
-    axis_sheet,
-    path_tile,
-    pusht_tiles,
-    suite_sheet,
-    tiles_sheet,
-)
+from lerobot_bomb.commands.view_gallery import COLUMNS, axis_sheet, suite_sheet
 from lerobot_bomb.conditions import ALL, Axis
-from lerobot_bomb.envs.rollout import make_env, make_pusht_env
+from lerobot_bomb.environments import BOMB, BOMB_PUSHT
+from lerobot_bomb.envs.rollout import make_env
 from lerobot_bomb.libero.perturbations import LIBERO_AXES
 from lerobot_bomb.pusht.episode import PushTSpec
 from lerobot_bomb.pusht.perturbations import PUSHT_AXES
+from lerobot_bomb.viewing.bomb import PATH_RGB, path_tile
 from lerobot_bomb.viewing.perturbations_page import example_instructions, page
+from lerobot_bomb.viewing.pusht import make_pusht_env
 from lerobot_bomb.viewing.sheet import PAPER, Sheet, text_tile
 
 SIZE = 48
@@ -52,7 +46,7 @@ def start(axis: str, level: int, seed: int) -> tuple[dict[str, np.ndarray], str]
 
 
 def test_tiles_are_the_environments_own_images() -> None:
-    sheet = axis_sheet("camera", (3, 9), OPTIONS)
+    sheet = axis_sheet(BOMB, "camera", (3, 9), SIZE)
     drawn = sheet.draw()
     assert list(sheet.images) == [
         f"{camera}, seed {seed}" for seed in (3, 9) for camera in ("workspace", "wrist")
@@ -84,7 +78,7 @@ def test_a_sheet_leaves_paper_between_and_around_its_tiles() -> None:
 
 
 def test_captions_are_the_table() -> None:
-    sheet = axis_sheet("dynamics", (3,), OPTIONS)
+    sheet = axis_sheet(BOMB, "dynamics", (3,), SIZE)
     assert sheet.columns == COLUMNS == ["nominal", "level 1", "level 2", "level 3", "level 4", "level 5"]
     assert sheet.texts["mass, factor"] == ["", "1.15", "1.3", "1.5", "1.75", "2"]
     assert sheet.texts["latency, control steps"] == ["", "0", "0", "0", "1", "1"]
@@ -97,7 +91,7 @@ def test_captions_are_the_table() -> None:
 
 
 def test_language_shows_instructions() -> None:
-    sheet = axis_sheet("language", (3,), OPTIONS)
+    sheet = axis_sheet(BOMB, "language", (3,), SIZE)
     assert list(sheet.images) == ["instruction, seed 3"]
     for level, shown in enumerate(sheet.images["instruction, seed 3"]):
         _, instruction = start("language", level, 3)
@@ -121,7 +115,7 @@ def test_a_long_instruction_is_written_smaller() -> None:
 
 
 def test_all_shows_everything_that_changes() -> None:
-    sheet = axis_sheet(ALL, (3,), OPTIONS)
+    sheet = axis_sheet(BOMB, ALL, (3,), SIZE)
     rows = ["workspace", "wrist", "instruction", "expert's path"]
     assert list(sheet.images) == [f"{row}, seed 3" for row in rows]
     assert sheet.title == "all: every axis but goal_marker"
@@ -144,7 +138,7 @@ def test_the_command_writes_small_sheets_and_replaces_its_own(tmp_path: Path) ->
     (folder / "light.jpg").write_bytes(b"an older one")
     assert cli.main([*flags, f"--output={folder}"]) == 0
     assert sorted(path.name for path in folder.iterdir()) == ["language.jpg", "light.jpg"]
-    expected = axis_sheet("light", (3,), OPTIONS).draw()
+    expected = axis_sheet(BOMB, "light", (3,), SIZE).draw()
     shown = np.asarray(Image.open(folder / "light.jpg"))
     assert shown.shape == expected.shape
     assert np.abs(shown.astype(int) - expected).mean() < 4
@@ -175,7 +169,7 @@ def test_the_page_has_every_axis_with_its_magnitudes_and_its_sheet() -> None:
     assert re.findall(r"^## (\w+)$", text, re.MULTILINE) == [*AXES, ALL]
     assert "| angle | 3 | 6 | 9 | 12.5 | 16 | degrees | around the board, in a drawn direction |" in text
     links = re.findall(r"\]\((.*?\.jpg)\)", text)
-    assert links == [f"media/perturbations/{name}.jpg" for name in SHEETS]
+    assert links == [f"media/perturbations/{name}.jpg" for name in (*AXES, ALL)]
     for link in links:
         assert 10_000 < (DOCS / link).stat().st_size < 300_000
         assert Image.open(DOCS / link).width > 500
@@ -183,7 +177,7 @@ def test_the_page_has_every_axis_with_its_magnitudes_and_its_sheet() -> None:
 
 def test_a_sheet_of_pusht_shows_its_environment(tmp_path: Path) -> None:
     pytest.importorskip("gym_pusht", reason="gym-pusht is not installed: pip install '.[pusht]'")
-    sheet = tiles_sheet(PUSHT_AXES, pusht_tiles, "goal", (3,), SIZE)
+    sheet = axis_sheet(BOMB_PUSHT, "goal", (3,), SIZE)
     assert list(sheet.images) == ["start, seed 3", "instruction, seed 3"]
     assert sheet.texts["turn, degrees"] == ["", "12", "24", "36", "48", "60"]
     for level, image in enumerate(sheet.images["start, seed 3"]):

@@ -6,11 +6,13 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from lerobot.configs import PipelineFeatureType
+from lerobot.configs import PipelineFeatureType, PreTrainedConfig
 from lerobot.envs import EnvConfig, env_to_policy_features, make_env, make_env_config
 from lerobot.policies.factory import make_policy, make_policy_config, make_pre_post_processors
 from lerobot.utils.constants import ACTION, OBS_STATE
 from lerobot.utils.import_utils import register_third_party_plugins
+
+from lerobot_bomb.checkpoints.registered import registered_types
 
 ARENA = {"enable_cameras": True, "camera_keys": "robot_pov_cam_rgb"}
 # what must be said of the environment, what of spatialvla_grid's actions, and what a policy is shown and does
@@ -37,6 +39,12 @@ def plugins() -> None:
 
 def test_the_list_has_every_type() -> None:
     assert {*ENVS} | SHOWN_ELSEWHERE | OF_A_ROBOT == set(EnvConfig.get_known_choices())
+
+
+def test_types_are_read_from_source() -> None:
+    assert registered_types("envs") == set(EnvConfig.get_known_choices())
+    others = set(PreTrainedConfig.get_known_choices()) | {"keypoint_probe"}  # of tests only
+    assert (registered_types("policies") or set()) | {"keypoint_probe"} == others
 
 
 @pytest.mark.parametrize("env_type", ENVS)

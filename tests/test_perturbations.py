@@ -1,6 +1,10 @@
 """Conditions as they are written; what they do to an episode is tested in test_axes.py."""
 
+import copy
+import json
+import pickle
 import re
+from dataclasses import replace
 
 import pytest
 from hypothesis import given
@@ -27,7 +31,7 @@ RANGES = st.tuples(st.integers(0, 5), st.integers(0, 5)).map(sorted)
     ],
 )
 def test_a_condition_has_one_spelling_and_a_key(text: str, canonical: str, key: str) -> None:
-    condition = Condition.parse(text)
+    condition = Condition(text)
     assert (str(condition), condition.key) == (canonical, key)
     assert EpisodeSpec(seed=0, perturbations=text).perturbations == canonical
 
@@ -35,16 +39,24 @@ def test_a_condition_has_one_spelling_and_a_key(text: str, canonical: str, key: 
 @given(st.dictionaries(st.sampled_from(list(AXES)), RANGES))
 def test_conditions_survive_their_spelling_and_keys_are_fit_for_a_suite(ranges: dict[str, list[int]]) -> None:
     text = "+".join(f"{axis}:{low}-{high}" for axis, (low, high) in ranges.items()) or "none"
-    condition = Condition.parse(text)
+    condition = Condition(text)
     assert {axis: [low, high] for axis, low, high in condition.ranges} == {
         axis: levels for axis, levels in ranges.items() if levels != [0, 0]
     }
-    assert Condition.parse(str(condition)) == condition
+    assert Condition(str(condition)) == condition
     assert re.fullmatch(r"[a-z0-9.-]+", condition.key)
 
 
+def test_a_spec_carries_its_condition_as_an_object_that_is_its_text() -> None:
+    spec = EpisodeSpec(seed=0, perturbations="light:3+camera:1-2")
+    for same in (spec, replace(spec, seed=1), copy.deepcopy(spec), pickle.loads(pickle.dumps(spec))):
+        assert same.condition.ranges == (("camera", 1, 2), ("light", 3, 3))
+        assert same.condition is same.perturbations
+    assert '"perturbations": "camera:1-2+light:3"' in json.dumps(spec.to_dict())
+
+
 def test_all_stands_for_every_nuisance_and_no_help() -> None:
-    assert [axis for axis, _, _ in Condition.parse("all:2").ranges] == list(NUISANCES)
+    assert [axis for axis, _, _ in Condition("all:2").ranges] == list(NUISANCES)
     assert "goal_marker" not in NUISANCES
 
 

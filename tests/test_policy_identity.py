@@ -16,7 +16,8 @@ from lerobot.policies import PreTrainedPolicy, make_policy
 from lerobot.policies.act.configuration_act import ACTConfig
 
 import lerobot_policy_bomb  # noqa: F401  the plugin
-from lerobot_bomb.checkpoints.identity import _of_checkpoint, acting_policy, identity_of, identity_of_config
+from lerobot_bomb.checkpoints.acting import acting, acting_config, acting_policy
+from lerobot_bomb.checkpoints.identity import _of_checkpoint, identity_of, identity_of_config
 from lerobot_bomb.checkpoints.shipped import checkpoint_path
 from lerobot_bomb.compat.hooks import policies as built
 from lerobot_bomb.compat.hooks.policies import built_policies
@@ -132,7 +133,9 @@ def test_of_two_policies_none_is_named(checkpoint: Path, caplog: pytest.LogCaptu
     with caplog.at_level(logging.WARNING):
         assert acting_policy() is None
     assert "this process holds 2 of them (act, act)" in caplog.text
-    del both
+    assert acting_config() is None
+    with acting(both[0].config):
+        assert acting_config() is both[0].config
 
 
 def test_a_dropped_policy_that_refers_to_itself_is_not_one_of_two(checkpoint: Path) -> None:

@@ -76,9 +76,8 @@ def test_a_policy_that_was_trained_for_bomb_is_told_its_environment() -> None:
         act_in(policy)
     assert str(error.value).startswith("this vla0_smol was trained for BOMB, task version 1.0, suite place")
     assert "this is --env.type=bomb_pusht: evaluate with --env.type=bomb --env.task=place" in str(error.value)
-    assert str(error.value).endswith("or insist with --policy.ignore_environment=true")
-    policy.config.ignore_environment = True
-    act_in(policy)
+    assert str(error.value).endswith(INSIST)
+    act_in(policy, ignore_checkpoint=True)
 
 
 def test_a_policy_without_training_acts() -> None:

@@ -178,8 +178,8 @@ def test_wrong_flags_are_told(
 def test_a_line_is_that_of_an_editor(results: Callable[..., Path], tmp_path: Path) -> None:
     path, kept = tmp_path / "r.jsonl", results("bomb_expert").read_text().splitlines()
     path.write_text("\n".join([kept[0], kept[1][:40], "", *kept[1:]]) + "\n")
-    assert json.loads(read_record(path, 1).to_json()) == json.loads(kept[0])
-    assert json.loads(read_record(path, 4).to_json()) == json.loads(kept[1])
+    assert read_record(path, 1).to_json() == kept[0]
+    assert read_record(path, 4).to_json() == kept[1]
     for line in (2, 3):
         with pytest.raises(ValueError, match=r", whose lines are 1, 4\.\.5"):
             read_record(path, line)

@@ -12,13 +12,14 @@ from lerobot_bomb.bomb.board import COLORS, task_id
 from lerobot_bomb.bomb.episode import PROTOCOL_VERSION, EpisodeSpec
 from lerobot_bomb.bomb.perturbations import Condition
 from lerobot_bomb.commands.main import main
-from lerobot_bomb.pusht.episode import PUSHT_PROTOCOL_VERSION
+from lerobot_bomb.environments import ENVIRONMENTS
+from lerobot_bomb.results import reading
 from lerobot_bomb.results.bomb import OLD_VERSION, EpisodeResult, median_error_mm
 from lerobot_bomb.results.groups import read_results
 from lerobot_bomb.results.means import mean_of
 from lerobot_bomb.results.origin import PolicyIdentity
 from lerobot_bomb.results.pusht import PushTResult
-from lerobot_bomb.results.reading import RECORD_OF_VERSION, RECORD_TYPES, parse_record
+from lerobot_bomb.results.reading import parse_record
 from lerobot_bomb.results.record import Record, field_names
 from lerobot_bomb.results.summary import summarise
 
@@ -32,7 +33,7 @@ def values(seed: int, failure: str | None = None, error: float | None = None, **
     episode = EpisodeSpec(**spec)
     target = spec.get("target") or other.get("target", (2, 2))
     color = spec.get("color") or other.get("color", "black")
-    condition = Condition.parse(episode.perturbations)
+    condition = Condition(episode.perturbations)
     is_placed = failure in (None, "disturbed_others")
     is_elsewhere = failure == "wrong_intersection" and target is not None
     result = EpisodeResult(
@@ -128,6 +129,9 @@ def test_all_fields_of_a_release_must_be_there() -> None:
             read({key: value for key, value in values(0).items() if key != name})
 
 
+RECORD_TYPES: list[type[Record]] = [each.record for each in ENVIRONMENTS.values()]
+
+
 @pytest.mark.parametrize("record_type", RECORD_TYPES)
 def test_what_records_of_earlier_releases_lack_are_fields(record_type: type[Record]) -> None:
     nested = {name.partition(".")[0] for name in record_type.earlier}
@@ -154,7 +158,7 @@ def test_moves_made_are_shown_of_episodes_with_several(path: Path) -> None:
 def test_a_protocol_version_is_of_one_environment() -> None:
     versions = [version for each in RECORD_TYPES for version in each.versions]
     assert len(set(versions)) == len(versions)
-    assert len({each.env_type for each in RECORD_TYPES}) == len(RECORD_TYPES)
+    assert [each.env_type for each in RECORD_TYPES] == [*ENVIRONMENTS]
 
 
 DAMAGED: dict[str, Any] = {
@@ -439,7 +443,7 @@ class WithPath(PushTResult):
 def test_a_measure_is_a_field_of_a_record_and_nothing_else(
     path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    monkeypatch.setitem(RECORD_OF_VERSION, PUSHT_PROTOCOL_VERSION, WithPath)
+    monkeypatch.setattr(reading, "record_type_of", lambda version: WithPath)
     old, *new = (pusht_row(seed, "none", 0.5, "timeout") for seed in range(3))
     new = [line | {"path_px": length} for line, length in zip(new, (100.0, 200.0), strict=True)]
     text = "".join(json.dumps(line) + "\n" for line in (old, *new))

@@ -6,7 +6,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from lerobot.envs.configs import LiberoEnv, PushtEnv
+from lerobot.envs.configs import AlohaEnv, LiberoEnv, PushtEnv
 from pusht_checkpoints import write_act
 
 from lerobot_bomb.commands.main import main
@@ -167,12 +167,21 @@ def test_libero_is_told_apart_by_the_number_that_chooses_the_initial_state() -> 
     assert "--env.task=libero_goal" in flags and "--env.task_ids=[3]" in flags
 
 
+def test_an_env_type_of_which_nothing_is_known_has_success_and_rewards() -> None:
+    rows = list(results_of(info("aloha", 0, [1.0, 0.0]), AlohaEnv(episode_length=9), ACT, 7, 2))
+    assert rows == [parse_record(row.to_json().encode()) for row in rows]
+    assert [(row.spec.seed, row.max_reward, row.failure) for row in rows] == [(7, 1, None), (8, 0, "failed")]
+    assert {(row.protocol_version, row.image_size) for row in rows} == {("lerobot-aloha-1.0", "640x480")}
+    assert rows[0].simulator_versions["gymnasium"] and "gym_aloha" not in rows[0].simulator_versions
+    flags = rows[0].eval_flags(rows)
+    assert flags[0] == "--env.type=aloha" and "--env.episode_length=9" in flags
+
+
 @pytest.mark.parametrize(
     ("flags", "message"),
     [
         (["--env.type=pusht"], "--output_dir=... is missing"),
         (["--env.type=bomb", "--output_dir=."], "lerobot-eval writes its records itself"),
-        (["--env.type=aloha", "--output_dir=."], "--env.type='aloha' is unknown; choose one of: pusht"),
         (["--env.type=pusht", "--output_dir=.", "--seed=null"], "--seed=null: episodes without a seed"),
         (
             ["--env.type=libero", "--output_dir=.", "--eval.batch_size=2"],

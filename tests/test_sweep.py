@@ -233,10 +233,9 @@ def test_a_cell_that_cannot_begin_is_given_up_at_once(play: Callable[[Manifest],
         (["--policies=bomb_expert"], "--env.type is missing"),
         (["--policies=bomb_expert", "--env.type=bomb", "--perturbations=fog:3"], "'fog' is not an axis"),
         (["--policies=bomb_expert", "--env.type=bomb", "--perturbations=each:0"], "write each:LEVEL"),
-        (["--policies=bomb_expert", "--env.type=aloha"], "--env.type=aloha has no lines of results"),
         (
             ["--policies=act", "--env.type=pusht", "--perturbations=camera:3"],
-            "--env.type=pusht is LeRobot's and has none; --env.type=bomb_pusht has",
+            "--env.type=pusht has none; --env.type=bomb_pusht has",
         ),
         (
             ["--policies=bomb_expert", "--env.type=bomb", "--tasks=place,plaec"],
@@ -264,6 +263,13 @@ def test_wrong_flags_are_told(
     assert sweep(tmp_path, *flags) == 1
     assert message in capsys.readouterr().err
     assert list(tmp_path.iterdir()) == []
+
+
+def test_every_env_type_of_lerobots_can_be_swept(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert (
+        sweep(tmp_path, "--policies=act", "--env.type=aloha", "--tasks=AlohaInsertion-v0", "--dry_run") == 0
+    )
+    assert "--env.type=aloha --env.task=AlohaInsertion-v0 --seed=1000" in capsys.readouterr().out
 
 
 @pytest.mark.parametrize(
@@ -298,7 +304,7 @@ def test_the_flags_that_may_be_lerobots_without_a_group_are_those_that_it_has() 
             (NANO,),
             ("place", "object"),
             ("--env.type=bomb", "--env.image_size=64"),
-            "evaluate with --tasks=place, or",
+            "evaluate with --env.task=place, or",
         ),
         ((NANO,), (), ("--env.type=bomb_pusht",), "this is --env.type=bomb_pusht"),
     ],

@@ -23,7 +23,8 @@ from lerobot_bomb.bomb.observation import ACTION_NAMES, STATE_NAMES, RenderOptio
 from lerobot_bomb.bomb.privileged_state import PrivilegedState
 from lerobot_bomb.commands import main as cli
 from lerobot_bomb.envs.rollout import expert_agent, make_env, play
-from lerobot_bomb.viewing.episode import Player, bomb_episode, write_episodes
+from lerobot_bomb.viewing.bomb import bomb_episode
+from lerobot_bomb.viewing.episode import Player, write_episodes
 from lerobot_env_bomb.env import BombEnv
 
 SPEC = EpisodeSpec(seed=4, target=(3, 2), color="white", fps=5)

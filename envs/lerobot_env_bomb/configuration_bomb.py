@@ -1,14 +1,10 @@
 """LeRobot's env type ``bomb``. The only module of this package that imports LeRobot."""
 
-import itertools
 from dataclasses import dataclass, field, replace
-from functools import partial
-from pathlib import Path
 from typing import Any, cast
 
 from lerobot.configs import FeatureType, PolicyFeature, PreTrainedConfig
 from lerobot.envs import EnvConfig
-from lerobot.processor import PolicyProcessorPipeline
 from lerobot.utils.constants import ACTION, OBS_IMAGES, OBS_PREFIX, OBS_STATE
 
 from lerobot_bomb.bomb.environment import Environment
@@ -24,20 +20,15 @@ from lerobot_bomb.bomb.observation import (
 )
 from lerobot_bomb.bomb.perturbations import Condition
 from lerobot_bomb.bomb.suite import find_suite, specs_of_tasks, suites_of, task_version
+from lerobot_bomb.checkpoints.env_config import EvaluatedEnv
 from lerobot_bomb.checkpoints.environment import check_acting_policy, side_of_images
-from lerobot_bomb.checkpoints.identity import policy_of_results
-from lerobot_bomb.checkpoints.queries import last_query
-from lerobot_bomb.compat.use import use
 from lerobot_bomb.conditions import ALL
-from lerobot_bomb.envs.vector import LazyVectorEnv, check_parallel_tasks
-from lerobot_bomb.flag_errors import flag_errors
-from lerobot_bomb.results.writing import check_results_path
 from lerobot_env_bomb.fetch_files import check_robot
 
 
 @EnvConfig.register_subclass("bomb")
 @dataclass
-class BombEnvConfig(EnvConfig):
+class BombEnvConfig(EvaluatedEnv, EnvConfig):
     """Flags of ``--env.type=bomb``; every check happens before an environment is built."""
 
     # suite: place, object, spatial, goal, long, or all
@@ -57,8 +48,6 @@ class BombEnvConfig(EnvConfig):
     target: list[int] | None = None
     # colour of the stone to be moved: black or white; unset draws one per episode
     color: str | None = None
-    # conditions, each evaluated as a group of its own: ["none","camera:3","camera:2+light:3","all:1-5"]
-    perturbations: list[str] | str | None = None
     # width and height of each camera in pixels; unset: as the evaluated checkpoint was trained, else 256
     image_size: int | None = None
     # fast (no shadows) or shadows
@@ -67,25 +56,14 @@ class BombEnvConfig(EnvConfig):
     depth: bool = False
     # distance from the intersection within which a placement counts
     success_tolerance_mm: float = 10.0
-    # file that gets one JSON line per finished episode: seed, target, error, failure class
-    results_path: str | None = None
-    # run a checkpoint that was trained for another environment
-    ignore_checkpoint: bool = False
     features: dict[str, PolicyFeature] = field(default_factory=dict)
     features_map: dict[str, str] = field(default_factory=dict)
 
-    def __post_init__(self) -> None:
-        use()
-        with flag_errors():
-            # an invalid flag raises here, before anything is built
-            check_parallel_tasks(self.max_parallel_tasks)
-            for spec in itertools.chain(*self.groups.values()):
-                find_suite(spec.suite).check(spec)
-                check_robot(spec)
-            geometry_shapes(self.render_options)
-        if self.results_path is not None:
-            self.results_path = str(Path(self.results_path).expanduser())
-        self._declare_features()
+    def _check(self) -> None:
+        for spec in (spec for specs in self.groups.values() for spec in specs.values()):
+            find_suite(spec.suite).check(spec)
+            check_robot(spec)
+        geometry_shapes(self.render_options)
 
     def take_image_size(self, config: PreTrainedConfig | None) -> None:
         """Show images of the size that a policy was trained on, unless a flag says another one."""
@@ -94,7 +72,6 @@ class BombEnvConfig(EnvConfig):
             self._declare_features()
 
     def _declare_features(self) -> None:
-        """Declare what a policy gets here, and the actions that it gives."""
         side = self.render_options.image_size
         image = PolicyFeature(type=FeatureType.VISUAL, shape=(side, side, 3))
         cameras = [f"{OBS_IMAGES}.{camera}" for camera in CAMERAS]
@@ -109,21 +86,14 @@ class BombEnvConfig(EnvConfig):
             self.features_map[key] = f"{OBS_PREFIX}{key}"  # where LeRobot puts keys it does not know
 
     @property
-    def gym_id(self) -> str:
-        """Gymnasium id of the same environment."""
-        return f"bomb/{self.task}-v0"
-
-    @property
-    def suites(self) -> tuple[str, ...]:
-        """Suites that are run."""
-        return suites_of(str(self.task))
-
-    @property
-    def groups(self) -> dict[str, list[EpisodeSpec]]:
-        """{key of a group of results: a spec for each of its tasks}; one where they are drawn per episode."""
+    def groups(self) -> dict[str, dict[int, EpisodeSpec]]:
+        """{suite and condition: {number of a task: its spec}}; {0: ...} where tasks are drawn per episode."""
         return {
-            key: [replace(spec, perturbations=condition) for spec in self.specs_of(suite)]
-            for suite in self.suites
+            key: {
+                task_id: replace(spec, perturbations=condition)
+                for task_id, spec in zip(self.task_ids or [0], self.specs_of(suite), strict=True)
+            }
+            for suite in suites_of(str(self.task))
             for key, condition in Condition.groups(self.perturbations, suite).items()
         }
 
@@ -150,9 +120,8 @@ class BombEnvConfig(EnvConfig):
 
     @property
     def gym_kwargs(self) -> dict[str, Any]:
-        """Arguments of `BombEnv` for the first task."""
+        """Arguments of `BombEnv` beside the spec."""
         return {
-            "spec": next(iter(self.groups.values()))[0],
             "render_options": self.render_options,
             "results_path": self.results_path,
             "task_ids": None if self.task_ids is None else tuple(self.task_ids),
@@ -178,38 +147,10 @@ class BombEnvConfig(EnvConfig):
             task_ids=tuple(self.task_ids or ()),
         )
 
-    def get_env_processors(self) -> tuple[PolicyProcessorPipeline, PolicyProcessorPipeline]:
-        """Return LeRobot's processors, which change nothing, after a check of the policy that acts.
+    def _check_policy(self) -> None:
+        check_acting_policy(self.environment)
 
-        Every command asks for them once, when its policy is built and no episode has begun.
-
-        Raises:
-            ValueError: that policy was trained for another environment.
-        """
-        if not self.ignore_checkpoint:
-            check_acting_policy(self.environment)
-        return super().get_env_processors()
-
-    def create_envs(self, n_envs: int, use_async_envs: bool = False) -> dict[str, dict[int, LazyVectorEnv]]:
-        """{suite and condition: {task id: vector env of n_envs}}; no worker starts before a first reset.
-
-        Raises:
-            NoOpenGLError: MuJoCo cannot render on this machine.
-            ValueError: --env.results_path cannot be written.
-        """
+    def _import_env(self) -> type:
         from lerobot_env_bomb.env import BombEnv  # chooses an OpenGL backend, imports MuJoCo
 
-        check_results_path(self.results_path)
-        kwargs = self.gym_kwargs
-        return {
-            key: {
-                task_id: LazyVectorEnv(
-                    [partial(BombEnv, **(kwargs | {"spec": spec}))] * n_envs,
-                    use_async=use_async_envs and n_envs > 1,
-                    known_late=partial(policy_of_results, self.results_path),
-                    last_query=last_query,
-                )
-                for task_id, spec in zip(self.task_ids or [0], specs, strict=True)
-            }
-            for key, specs in self.groups.items()
-        }
+        return BombEnv

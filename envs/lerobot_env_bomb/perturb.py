@@ -4,10 +4,8 @@ from dataclasses import dataclass, field, replace
 
 from lerobot_bomb.bomb.episode import EpisodeSpec
 from lerobot_bomb.bomb.layout import Layout
-from lerobot_bomb.bomb.perturbations import Condition
 from lerobot_bomb.bomb.suite import Episode, find_suite
 from lerobot_bomb.envs.perturbation import EpisodePerturbation
-from lerobot_env_bomb.axes import TRANSFORMS
 from lerobot_env_bomb.axes.transform import Transform
 from lerobot_env_bomb.scene import ModelEdit
 
@@ -51,5 +49,4 @@ def sample_episode(spec: EpisodeSpec) -> PerturbedEpisode:
 
 def draw_perturbation(nominal: Episode) -> Perturbation:
     """The axes of the episode's condition, each drawn from a generator of its own."""
-    condition = Condition.parse(nominal.spec.perturbations)
-    return Perturbation.draw(condition, nominal.spec.seed, TRANSFORMS, nominal)
+    return Perturbation.draw(nominal.spec.condition, nominal.spec.seed, nominal)

@@ -6,12 +6,11 @@ from typing import Any
 import numpy as np
 
 from lerobot_bomb.envs.episode_env import EpisodeEnv, Observation, Transition
+from lerobot_bomb.envs.perturbation import transforms_of
 from lerobot_bomb.libero.episode import LiberoFailure, LiberoSpec, failure_of, initial_state_of
-from lerobot_bomb.libero.perturbations import LiberoCondition
 from lerobot_bomb.results.libero import LiberoResult
 from lerobot_bomb.results.origin import PolicyIdentity
 from lerobot_env_bomb_libero.actuator import LiberoActuator
-from lerobot_env_bomb_libero.axes import LIBERO_TRANSFORMS
 from lerobot_env_bomb_libero.axes.dynamics import LiberoDynamics
 from lerobot_env_bomb_libero.episode import LiberoEpisode, sample_libero_episode
 from lerobot_env_bomb_libero.scene import LiberoScene
@@ -50,9 +49,8 @@ class BombLiberoEnv(EpisodeEnv[LiberoSpec, _Run, LiberoResult]):
         from libero.libero import benchmark  # slow
 
         suite = benchmark.get_benchmark_dict()[spec.suite]()
-        on = [LIBERO_TRANSFORMS[axis] for axis, _, _ in LiberoCondition.parse(spec.perturbations).ranges]
         self._scene = LiberoScene(
-            on,
+            list(transforms_of(spec.condition).values()),
             task_suite=suite,
             task_id=spec.task_id,
             task_suite_name=spec.suite,

@@ -4,8 +4,6 @@ from dataclasses import dataclass
 
 from lerobot_bomb.envs.perturbation import EpisodePerturbation
 from lerobot_bomb.libero.episode import LiberoSpec
-from lerobot_bomb.libero.perturbations import LiberoCondition
-from lerobot_env_bomb_libero.axes import LIBERO_TRANSFORMS
 from lerobot_env_bomb_libero.scene import LiberoTransform
 
 
@@ -20,6 +18,5 @@ class LiberoEpisode:
 
 def sample_libero_episode(spec: LiberoSpec, instruction: str) -> LiberoEpisode:
     """Draw the episode that the spec determines; `instruction` is the task's own."""
-    condition = LiberoCondition.parse(spec.perturbations)
-    perturbation = EpisodePerturbation.draw(condition, spec.seed, LIBERO_TRANSFORMS, None)
+    perturbation = EpisodePerturbation.draw(spec.condition, spec.seed, None)
     return LiberoEpisode(spec, perturbation.reword(instruction, None), perturbation)

@@ -6,8 +6,6 @@ from lerobot_bomb.bomb.streams import Stream, generator
 from lerobot_bomb.conditions import NONE
 from lerobot_bomb.envs.perturbation import EpisodePerturbation
 from lerobot_bomb.pusht.episode import PushTSpec
-from lerobot_bomb.pusht.perturbations import PushTCondition
-from lerobot_env_bomb_pusht.axes import PUSHT_TRANSFORMS
 from lerobot_env_bomb_pusht.board import PushTTransform
 
 # The first is the task of LeRobot's published dataset; {where} is the axis `goal`'s.
@@ -30,7 +28,6 @@ class PushTEpisode:
 def sample_pusht_episode(spec: PushTSpec) -> PushTEpisode:
     """Draw the episode that the spec determines."""
     template = TEMPLATES[generator(spec.seed, Stream.TEMPLATE).integers(len(TEMPLATES))]
-    condition = PushTCondition.parse(spec.perturbations)
-    perturbation = EpisodePerturbation.draw(condition, spec.seed, PUSHT_TRANSFORMS, None)
+    perturbation = EpisodePerturbation.draw(spec.condition, spec.seed, None)
     worded = perturbation.reword("" if spec.instruction == NONE else template, None)
     return PushTEpisode(spec, worded.replace("{where}", ""), perturbation)

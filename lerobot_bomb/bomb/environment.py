@@ -8,7 +8,7 @@ from typing import Any
 from lerobot_bomb.bomb.board import task_id
 from lerobot_bomb.bomb.observation import ACTION_NAMES
 from lerobot_bomb.bomb.suite import task_version
-from lerobot_bomb.bomb.suites import SUITES
+from lerobot_bomb.bomb.suites import OWN_SUITES
 from lerobot_bomb.compat.help import leave_out_of_help
 from lerobot_bomb.conditions import ALL
 
@@ -81,7 +81,7 @@ class Environment:
         """A flag of lerobot-eval; of several suites it names the first, unless they are all."""
         value = getattr(self, name)
         if name == "task" and self.suites is not None:
-            value = ALL if self.suites == frozenset(SUITES) else min(self.suites)
+            value = ALL if self.suites == frozenset(OWN_SUITES) else min(self.suites)
         return f"--env.{name}={SUITE if value is None else value}"
 
     def eval_flags(self) -> list[str]:
@@ -144,16 +144,16 @@ class Environment:
         )
 
 
-def robot_type(robot: str) -> str:
-    """Return what a recording's info.json calls a robot: with the newest version of all suites.
+def robot_type(robot: str, task: str) -> str:
+    """Return what a recording's info.json calls a robot: with the newest version of all suites and its own.
 
     LeRobot merges only datasets of one robot: recordings of several suites, but none of older tasks.
     """
-    return f"bomb_{robot}_v{task_version(ALL)}"
+    return f"bomb_{robot}_v{max(map(task_version, (ALL, task)))}"
 
 
 def _suites(task: str) -> frozenset[str]:
-    return frozenset(SUITES if task == ALL else task.split("+"))
+    return frozenset(OWN_SUITES if task == ALL else task.split("+"))
 
 
 def _current_version(suites: Iterable[str]) -> str:

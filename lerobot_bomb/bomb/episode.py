@@ -7,7 +7,7 @@ from enum import StrEnum
 from lerobot_bomb.bomb.board import BOARD, COLORS
 from lerobot_bomb.bomb.perturbations import Condition
 from lerobot_bomb.bomb.suites import SUITES
-from lerobot_bomb.conditions import NONE
+from lerobot_bomb.conditions import NONE, PerturbedSpec
 from lerobot_bomb.flags import one_of
 
 # Version of how a policy is measured and what a line of results says. 1.1 is 1.0 with lines that name
@@ -55,7 +55,7 @@ def check_seed(seed: int) -> None:
 
 
 @dataclass(frozen=True)
-class EpisodeSpec:
+class EpisodeSpec(PerturbedSpec):
     """Everything that, with the code's version, determines an episode bit for bit."""
 
     seed: int  # number from which everything random is drawn
@@ -74,8 +74,7 @@ class EpisodeSpec:
     perturbations: str = NONE  # condition, such as camera:2+light:3; a range may be in it
 
     def __post_init__(self) -> None:
-        # one spelling, so that equal conditions compare equal
-        object.__setattr__(self, "perturbations", str(Condition.parse(self.perturbations)))
+        object.__setattr__(self, "perturbations", Condition(self.perturbations))
         one_of("--env.task", self.suite, SUITES)
         one_of("--env.robot", self.robot, ROBOTS)
         one_of("--env.split", self.split, SPLITS)

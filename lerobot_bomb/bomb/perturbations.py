@@ -3,17 +3,15 @@
 The one definition: the simulator applies it, ``docs/perturbations.md`` is generated from it.
 """
 
-from collections.abc import Mapping
-from dataclasses import dataclass
 from functools import partial
 from typing import ClassVar
 
-from lerobot_bomb.conditions import Axis, AxisCondition, Magnitude, magnitude_of, nuisances_of
+from lerobot_bomb.conditions import Axis, AxisCondition, Magnitude, axes_of, magnitude_of, nuisances_of
 
 # Append only: an axis' place in this dict numbers its stream of random numbers.
 # Level 5 must be hard, which an expert that ignores images cannot tell. So it has floors: camera 15 degrees
 # and 20 % of the field of view, light x4 between its extremes, mass x2, latency 1 step, start 80 mm.
-AXES = {
+_OWN = {
     "table": Axis(
         "colour and pattern of the table, colour of the tray",
         ("images",),
@@ -23,6 +21,7 @@ AXES = {
                 "share", (0.06, 0.12, 0.2, 0.3, 0.45), "contrast of stripes, checks or speckles on the table"
             ),
         },
+        "lerobot_env_bomb.axes.table:Table",
     ),
     "reflectance": Axis(
         "gloss of stones, tray and table; a lamp's reflection on the board",
@@ -35,6 +34,7 @@ AXES = {
                 "share", (0.08, 0.16, 0.24, 0.32, 0.4), "opacity of a lamp's reflection, drawn on the board"
             ),
         },
+        "lerobot_env_bomb.axes.reflectance:Reflectance",
     ),
     "stones": Axis(
         "number of stones on the board, and how exactly they stand",
@@ -43,6 +43,7 @@ AXES = {
             "extra": Magnitude("stones", (1, 1, 2, 2, 3), "more on the board"),
             "shift": Magnitude("mm", (0.8, 1.6, 2.4, 3.2, 4.0), "of each stone, in a drawn direction"),
         },
+        "lerobot_env_bomb.axes.stones:Stones",
     ),
     "start": Axis(
         "where the stone to be moved and the gripper are at the start",
@@ -51,6 +52,7 @@ AXES = {
             "stone": Magnitude("mm", (16, 32, 48, 64, 82), "of the stone along the tray, to a drawn side"),
             "gripper": Magnitude("mm", (16, 32, 48, 64, 82), "of the gripper, in a drawn direction"),
         },
+        "lerobot_env_bomb.axes.start:Start",
     ),
     "photometric": Axis(
         "colour balance, brightness and noise of the camera's sensor",
@@ -60,6 +62,7 @@ AXES = {
             "brightness": Magnitude("share", (0.03, 0.06, 0.09, 0.12, 0.15), "up or down, of all channels"),
             "noise": Magnitude("grey levels", (2, 4, 6, 8, 11), "standard deviation, of each pixel"),
         },
+        "lerobot_env_bomb.axes.photometric:Sensor",
     ),
     "camera": Axis(
         "angle, field of view and distance of the cameras; board, tray and stone stay in view",
@@ -72,6 +75,7 @@ AXES = {
                 "share", (0.03, 0.06, 0.09, 0.12, 0.15), "further or nearer, of the workspace's"
             ),
         },
+        "lerobot_env_bomb.axes.camera:Camera",
     ),
     "light": Axis(
         "intensity and direction of the light",
@@ -81,11 +85,13 @@ AXES = {
             "bright": Magnitude("factor", (1.15, 1.32, 1.52, 1.75, 2.0), "of all light, if it is brightened"),
             "tilt": Magnitude("degrees", (7, 14, 21, 28, 35), "of the lamp, in a drawn direction"),
         },
+        "lerobot_env_bomb.axes.light:Light",
     ),
     "language": Axis(
         "how the instruction is worded; what it means is always stated",
         ("instruction",),
         {"form": Magnitude("number", (1, 2, 3, 4, 5), "form of the instruction")},
+        "lerobot_env_bomb.axes.language:Wording",
     ),
     "dynamics": Axis(
         "mass and friction of the stones, noise and latency of the arm",
@@ -98,6 +104,7 @@ AXES = {
             ),
             "latency": Magnitude("control steps", (0, 0, 0, 1, 1), "before an action is executed"),
         },
+        "lerobot_env_bomb.axes.dynamics:Dynamics",
     ),
     "object": Axis(
         "size, shape and shade of the stones",
@@ -108,20 +115,22 @@ AXES = {
             "shade": Magnitude("share", (0.06, 0.12, 0.19, 0.25, 0.32), "of the way to grey, either colour"),
             "flat": Magnitude("yes", (0, 0, 1, 1, 1), "discs instead of lenses"),
         },
+        "lerobot_env_bomb.axes.object:StoneLook",
     ),
     "goal_marker": Axis(
         "a blue dot on the target, as the original benchmark drew it",
         ("images",),
         {"radius": Magnitude("mm", (3, 4.5, 6, 8, 10), "of the dot")},
+        "lerobot_env_bomb.axes.goal_marker:GoalMarker",
         is_help=True,
     ),
 }
+AXES = axes_of("bomb", _OWN)
 NUISANCES = nuisances_of(AXES)  # what `all` stands for
 magnitude = partial(magnitude_of, AXES)  # (axis, name, level)
 
 
-@dataclass(frozen=True)
 class Condition(AxisCondition):
     """Condition of BOMB, by the axes that are on: "camera:2+light:3"."""
 
-    axes: ClassVar[Mapping[str, Axis]] = AXES
+    axes: ClassVar = AXES

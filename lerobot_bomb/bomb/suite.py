@@ -2,8 +2,6 @@
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from functools import cache
-from importlib import import_module
 
 import numpy as np
 
@@ -14,7 +12,7 @@ from lerobot_bomb.bomb.layout import Layout
 from lerobot_bomb.bomb.move import Aim, Plan
 from lerobot_bomb.bomb.privileged_state import Goal
 from lerobot_bomb.bomb.streams import Stream, generator
-from lerobot_bomb.bomb.suites import SUITES
+from lerobot_bomb.bomb.suites import OWN_SUITES, SUITES
 from lerobot_bomb.conditions import ALL
 
 FIRST_VERSION = "1.0"  # of every suite, and of lines and recordings that name none
@@ -104,10 +102,9 @@ class Suite:
     version: str = FIRST_VERSION
 
 
-@cache
 def find_suite(name: str) -> Suite:
     """Return the suite of a name in SUITES."""
-    return import_module(f"lerobot_bomb.bomb.suites.{name}").SUITE
+    return SUITES[name]
 
 
 def task_version(name: str) -> str:
@@ -117,7 +114,7 @@ def task_version(name: str) -> str:
 
 def suites_of(name: str) -> tuple[str, ...]:
     """The suites that a flag's value names: one, or `all`."""
-    return SUITES if name == ALL else (name,)
+    return OWN_SUITES if name == ALL else (name,)
 
 
 def of_split[T](split: str, items: Sequence[T], heldout: Sequence[T]) -> tuple[T, ...]:

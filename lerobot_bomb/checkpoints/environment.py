@@ -1,10 +1,7 @@
 """Environment that a policy was trained for, and whether it is the one that the policy is about to act in."""
 
-import copy
 import logging
-from collections.abc import Iterable, Iterator
-from contextlib import contextmanager
-from contextvars import ContextVar
+from collections.abc import Iterable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, ClassVar
@@ -12,15 +9,14 @@ from typing import Any, ClassVar
 from lerobot.configs import PreTrainedConfig
 
 from lerobot_bomb.bomb.environment import IMAGES, Environment
+from lerobot_bomb.checkpoints.acting import INSIST, acting_config, name_of
 from lerobot_bomb.checkpoints.training import dataset_of, read_train_config
-from lerobot_bomb.compat.hooks.policies import built_policies, training_data
+from lerobot_bomb.compat.hooks.policies import training_data
 from lerobot_bomb.compat.use import use
 from lerobot_bomb.data.facts import DatasetFacts
-from lerobot_bomb.flag_errors import refuse_recording_of_several
+from lerobot_bomb.flag_errors import FlagError, refuse_recording_of_several
 
 logger = logging.getLogger(__name__)
-
-_to_be_built: ContextVar[PreTrainedConfig | None] = ContextVar("to_be_built", default=None)
 
 
 @dataclass
@@ -32,11 +28,15 @@ class ConfigWithEnvironment(PreTrainedConfig):
 
     # environment of the recording that it was trained on
     environment: Environment | None = None
-    # run in an environment that the checkpoint was not trained for; no checkpoint keeps this
+    # of earlier releases, whose checkpoints have it: now --env.ignore_checkpoint
     ignore_environment: bool = False
 
     def __post_init__(self) -> None:
         use()
+        if self.ignore_environment:
+            raise FlagError(
+                "--policy.ignore_environment=true is now --env.ignore_checkpoint=true, for every policy"
+            )
         super().__post_init__()
 
     def missing_parts(self) -> str | None:
@@ -52,54 +52,20 @@ class ConfigWithEnvironment(PreTrainedConfig):
         if self.environment is None or self.environment.action_size == size:
             return
         raise ValueError(
-            f"{_name(self)} was trained for --env.type=bomb, where an action has "
+            f"{name_of(self)} was trained for --env.type=bomb, where an action has "
             f"{self.environment.action_size} numbers; here it has {size}. Evaluate it there, or train a "
             "policy for this environment"
         )
 
-    def _save_pretrained(self, save_directory: Path) -> None:
-        saved = copy.copy(self)
-        saved.ignore_environment = False
-        PreTrainedConfig._save_pretrained(saved, save_directory)
-
 
 def check_acting_policy(here: Environment) -> None:
-    """Check that the policy that was built last was trained for this environment, as far as is known.
+    """Check that the policy that acts was trained for this environment, as far as is known.
 
     Raises:
         ValueError: it was trained for another one; the message names the flags to change.
     """
-    asked = asked_config()
-    if asked is not None:
-        _check(*asked, here)
-
-
-@contextmanager
-def as_if_built(config: PreTrainedConfig) -> Iterator[None]:
-    """Let environments check the policy that this config's would be, which costs no loading of weights."""
-    token = _to_be_built.set(config)
-    try:
-        yield
-    finally:
-        _to_be_built.reset(token)
-
-
-def asked_config() -> tuple[PreTrainedConfig, str, str] | None:
-    """Return config and name of the last built policy, and how to override its check; None: no check."""
-    policies = built_policies()
-    config = _to_be_built.get() or (policies[-1].config if policies else None)
-    if config is None or getattr(config, "ignore_environment", False):
-        return None
-    flag = (
-        "--policy.ignore_environment"
-        if isinstance(config, ConfigWithEnvironment)
-        else "--env.ignore_checkpoint"
-    )
-    return config, _name(config), f"insist with {flag}=true"
-
-
-def _name(config: PreTrainedConfig) -> str:
-    return f"the checkpoint {config.pretrained_path}" if config.pretrained_path else f"this {config.type}"
+    if (config := acting_config()) is not None:
+        _check(config, name_of(config), here)
 
 
 def trained_environment(config: PreTrainedConfig) -> Environment | None:
@@ -132,10 +98,10 @@ def dataset_of_training(config: PreTrainedConfig) -> Path | None:
     return None if path is None else dataset_of(read_train_config(Path(path)))
 
 
-def _check(config: PreTrainedConfig, who: str, insist: str, here: Environment) -> None:
+def _check(config: PreTrainedConfig, who: str, here: Environment) -> None:
     environment = trained_environment(config)
     if environment is not None:
-        environment.check_same(here, who, insist)
+        environment.check_same(here, who, INSIST)
         if environment.task is None:
             logger.warning(
                 "%s does not know the suite that it was trained for, so none was compared: --env.task must "
@@ -143,7 +109,7 @@ def _check(config: PreTrainedConfig, who: str, insist: str, here: Environment) -
                 who,
             )
         return
-    _check_image_size(config, here, who, insist)
+    _check_image_size(config, here, who)
     if config.pretrained_path:
         logger.warning(
             "%s does not know the environment that it was trained for; only the size of its images could be "
@@ -170,7 +136,7 @@ def side_of_images(config: PreTrainedConfig | None, cameras: Iterable[str]) -> i
     return next((height for _, height, width in shapes if height == width), None)
 
 
-def _check_image_size(config: PreTrainedConfig, here: Environment, who: str, insist: str) -> None:
+def _check_image_size(config: PreTrainedConfig, here: Environment, who: str) -> None:
     """Raise if the config's inputs (3, H, W) are of another size than the images of the cameras here."""
     for camera in here.cameras:
         feature = (config.input_features or {}).get(f"{IMAGES}{camera}")
@@ -179,5 +145,5 @@ def _check_image_size(config: PreTrainedConfig, here: Environment, who: str, ins
         height, width = feature.shape[1:]
         raise ValueError(
             f"{who} reads images of {width}x{height} pixels from the camera {camera}; this environment has "
-            f"--env.image_size={here.image_size}: evaluate with --env.image_size={width}, or {insist}"
+            f"--env.image_size={here.image_size}: evaluate with --env.image_size={width}, or {INSIST}"
         )

@@ -1,9 +1,7 @@
 """Identity of the policy that this process built: LeRobot tells an environment nothing of it."""
 
-import gc
 import hashlib
 import json
-import logging
 from dataclasses import replace
 from functools import cache
 from pathlib import Path
@@ -13,10 +11,11 @@ import draccus
 from lerobot.configs import PreTrainedConfig
 from lerobot.policies import PreTrainedPolicy
 
+from lerobot_bomb.checkpoints.acting import acting_policy
 from lerobot_bomb.checkpoints.checks import ADAPTERS, PROCESSORS
 from lerobot_bomb.checkpoints.names import BLANK_IMAGES, REPLACE_TASKS, WEIGHTS, local_file
 from lerobot_bomb.checkpoints.queries import time_queries
-from lerobot_bomb.compat.hooks.policies import built_policies, training_data
+from lerobot_bomb.compat.hooks.policies import training_data
 from lerobot_bomb.files import read_json
 from lerobot_bomb.results.origin import PolicyIdentity
 
@@ -26,22 +25,6 @@ NOT_ITS_SETTINGS = {
     "device", "pretrained_path", "pretrained_revision", "package_version", "use_peft", "ignore_environment",
     "push_to_hub", "repo_id", "private", "tags", "license",
 }  # fmt: skip
-
-
-def acting_policy() -> PreTrainedPolicy | None:
-    """The one policy that this process built and holds; None: there is none, or it may be any of several."""
-    if len(built_policies()) > 1:
-        gc.collect()  # those that nothing refers to any more; this function must not hold them either
-    policies = built_policies()
-    if len(policies) != 1:
-        if policies:
-            names = ", ".join(policy.config.type for policy in policies)
-            logging.warning(
-                f"results will name no policy: this process holds {len(policies)} of them ({names}); "
-                "drop the others before the environment's first reset"
-            )
-        return None
-    return policies[0]
 
 
 def identity_of(policy: PreTrainedPolicy) -> PolicyIdentity:

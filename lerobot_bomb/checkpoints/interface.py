@@ -9,7 +9,8 @@ from lerobot.configs import FeatureType, PolicyFeature, PreTrainedConfig
 from lerobot.utils.constants import ACTION, POLICY_POSTPROCESSOR_DEFAULT_NAME
 from safetensors import safe_open
 
-from lerobot_bomb.checkpoints.environment import asked_config, trained_environment
+from lerobot_bomb.checkpoints.acting import INSIST, acting_config, name_of
+from lerobot_bomb.checkpoints.environment import trained_environment
 from lerobot_bomb.checkpoints.identity import weights_file
 from lerobot_bomb.compat.hooks.policies import training_data
 
@@ -29,25 +30,24 @@ class Interface:
     image_flags: Callable[[int, int], str]  # (height, width) -> the flags of images of this size
 
     def check_acting_policy(self) -> None:
-        """Check that the policy that was built last was trained for such an environment, as far as is known.
+        """Check that the policy that acts was trained for such an environment, as far as is known.
 
         Raises:
             ValueError: it was trained for another one; the message says what differs and the way out.
         """
-        asked = asked_config()
-        if asked is None:
+        if (config := acting_config()) is None:
             return
-        config, who, insist = asked
+        who = name_of(config)
         trained_for = trained_environment(config)
         if trained_for is not None:
             raise ValueError(
                 f"{who} was trained for {trained_for}; this is --env.type={self.env_type}: evaluate with "
-                f"{' '.join(trained_for.eval_flags())}, or {insist}"
+                f"{' '.join(trained_for.eval_flags())}, or {INSIST}"
             )
-        self._check_features(config, who, insist)
-        self._check_actions(config, who, insist)
+        self._check_features(config, who)
+        self._check_actions(config, who)
 
-    def _check_features(self, config: PreTrainedConfig, who: str, insist: str) -> None:
+    def _check_features(self, config: PreTrainedConfig, who: str) -> None:
         of_policy = {**(config.input_features or {}), **(config.output_features or {})}
         for name in self.features.keys() & of_policy.keys():
             here, there = tuple(self.features[name].shape), tuple(of_policy[name].shape)
@@ -57,14 +57,14 @@ class Interface:
                 evaluate = f"evaluate with {self.image_flags(*there[1:])}"
                 raise ValueError(
                     f"{who} reads images of {there[2]}x{there[1]} pixels; this environment has "
-                    f"{self.image_flags(*here[1:])}: {evaluate}, or {insist}"
+                    f"{self.image_flags(*here[1:])}: {evaluate}, or {INSIST}"
                 )
             raise ValueError(
                 f"{who} has {name} of shape {there}, and --env.type={self.env_type} of shape {here}: "
                 "evaluate it in the environment that it was trained for"
             )
 
-    def _check_actions(self, config: PreTrainedConfig, who: str, insist: str) -> None:
+    def _check_actions(self, config: PreTrainedConfig, who: str) -> None:
         """Raise unless the least and the greatest action of the training suit the environment."""
         trained = trained_actions(config)
         if trained is None or self.action_range is None:
@@ -77,7 +77,7 @@ class Interface:
         raise ValueError(
             f"{who} was trained on actions from {_text(low)} to {_text(high)}; those of "
             f"--env.type={self.env_type} are {self.action_meaning}, {least:g} to {greatest:g}: give a "
-            f"checkpoint of such actions, or {insist}"
+            f"checkpoint of such actions, or {INSIST}"
         )
 
 

@@ -8,7 +8,8 @@ from typing import Any
 import numpy as np
 from lerobot.datasets import LeRobotDataset, LeRobotDatasetMetadata
 
-from lerobot_bomb.checkpoints.environment import asked_config, dataset_of_training
+from lerobot_bomb.checkpoints.acting import acting_config, name_of
+from lerobot_bomb.checkpoints.environment import dataset_of_training
 from lerobot_bomb.data.dataset_files import INFO_FILE
 from lerobot_bomb.libero.orientation import SAME, orientation
 
@@ -30,10 +31,9 @@ class OrientationCheck:
 
     def compare(self, shown: np.ndarray, task: str) -> None:
         """Compare with images of the environment, (N, H, W, 3) uint8, in episodes of a task of the suite."""
-        asked = None if self._is_done else asked_config()
-        if asked is None:
+        config = None if self._is_done else acting_config()
+        if config is None:
             return
-        config, who, _ = asked
         root = dataset_of_training(config)
         images = None if root is None else images_of_task(root, self._key, task)
         if images is None or images.shape[1:] != shown.shape[1:]:
@@ -45,7 +45,7 @@ class OrientationCheck:
                 "%s was trained on images of %s that are %s, beside those of this environment: it cannot "
                 "succeed here. Convert its demonstrations in the other orientation (lerobot-bomb convert "
                 "libero-hdf5 does) and train it on them",
-                who,
+                name_of(config),
                 root,
                 found,
             )

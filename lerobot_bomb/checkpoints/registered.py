@@ -1,4 +1,4 @@
-"""Policy types that LeRobot knows, read from source: importing LeRobot to ask for them takes seconds."""
+"""Types that LeRobot knows, read from source: importing LeRobot to ask for them takes seconds."""
 
 import importlib.metadata
 import pkgutil
@@ -6,24 +6,26 @@ import re
 from importlib.util import find_spec
 from pathlib import Path
 
-OURS = "lerobot_policy_bomb"
 PLUGIN = re.compile(r"lerobot_(robot|camera|teleoperator|policy|env)_")  # names that LeRobot imports
-TYPE = re.compile(r"""PreTrainedConfig\.register_subclass\(\s*(?:name=)?["'](\w+)["']""")
+# folder of LeRobot's -> its registry, and files in that folder
+KINDS = {"policies": ("PreTrainedConfig", "*/configuration_*.py"), "envs": ("EnvConfig", "*.py")}
 
 
-def registered_policy_types() -> set[str] | None:
-    """Return the types of LeRobot and of this package; None where another plugin may add some."""
-    names = {name.lower().replace("-", "_") for name in _distributions()}
+def registered_types(kind: str) -> set[str] | None:
+    """Return the types of LeRobot and its plugins, of one of `KINDS`; None: source does not tell all."""
+    registry, pattern = KINDS[kind]
     spec = find_spec("lerobot")
-    if spec is None or not spec.submodule_search_locations or any(map(PLUGIN.match, names - {OURS})):
+    plugins = {
+        module.name: Path(module.module_finder.path, module.name)  # pyright: ignore
+        for module in pkgutil.iter_modules()
+        if PLUGIN.match(module.name)
+    }
+    installed = {str(each.metadata["Name"]) for each in importlib.metadata.distributions()}
+    is_any_hidden = {name for name in installed if PLUGIN.match(name)} - plugins.keys()
+    if spec is None or not spec.submodule_search_locations or is_any_hidden:
         return None
-    folders = [*Path(spec.submodule_search_locations[0], "policies").iterdir()]
-    for module in pkgutil.iter_modules():
-        if module.name.startswith("lerobot_policy_"):
-            folders.append(Path(module.module_finder.path) / module.name)  # pyright: ignore
-    files = [path for folder in folders for path in folder.glob("configuration_*.py")]
-    return {name for path in files for name in TYPE.findall(path.read_text())}
-
-
-def _distributions() -> list[str]:
-    return [str(each.metadata["Name"]) for each in importlib.metadata.distributions()]
+    files = [*Path(spec.submodule_search_locations[0], kind).glob(pattern)]
+    files += [path for folder in plugins.values() for path in folder.rglob("*.py")]
+    types = re.compile(rf"""{registry}\.register_subclass\(\s*(?:name=)?(?:["'](\w+)["'])?""")
+    found = {name for path in files for name in types.findall(path.read_text())}
+    return None if "" in found else found

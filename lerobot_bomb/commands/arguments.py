@@ -20,6 +20,7 @@ LONG_FORMS = {
     for name in (
         *("task", "robot", "control_mode", "fps", "image_size", "render_preset", "depth", "split", "target"),
         *("color", "task_ids", "perturbations", "success_tolerance_mm", "instruction", "max_steps"),
+        "ignore_checkpoint",
     )
 }
 ANSWER_IS_NO = 3  # exit code of a command that was asked something; 1 is an error, 2 a flag that is unknown
@@ -126,8 +127,9 @@ def add_new_dataset_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def add_env_flag(parser: argparse.ArgumentParser, name: str, *others: str, **options: Any) -> None:
-    """Declare a flag of the environment as LeRobot spells it, --env.NAME, and its short form."""
-    parser.add_argument(LONG_FORMS[f"--{name}"], f"--{name}", *others, dest=name, **options)
+    """Declare a flag of an environment as LeRobot spells it, --env.NAME, and its short form, if any."""
+    short = [f"--{name}"] if f"--{name}" in LONG_FORMS else []
+    parser.add_argument(f"--env.{name}", *short, *others, dest=name, **options)
 
 
 def long_forms(flags: Sequence[str]) -> list[str]:

@@ -23,7 +23,7 @@ from lerobot_bomb.tables import print_table
 
 POLICY = "vla0_smol"
 # one axis, and all ten at once: its training shows both, and the second is where it fails
-CONDITIONS = (NONE, "light:3", "all:3")
+CONDITIONS = (Condition(), Condition("light:3"), Condition("all:3"))
 SUITE = "place"
 
 
@@ -140,7 +140,7 @@ def _write_sheet(output_dir: Path, records: list[EpisodeResult]) -> Path:
     tiles: dict[str, list[np.ndarray]] = {}
     as_played = sorted(records, key=lambda record: record.spec.seed)
     for condition, played in by_condition(as_played).items():
-        group = f"{SUITE}.{Condition.parse(condition).key}_0"  # of LeRobot's videos
+        group = f"{SUITE}.{condition.key}_0"  # of LeRobot's videos
         folder = output_dir / "eval" / POLICY / "videos" / group
         tiles[condition] = [
             _tile(folder / f"eval_episode_{number}.mp4", record)

@@ -16,6 +16,7 @@ from types import ModuleType
 from packaging.requirements import Requirement
 
 import lerobot_bomb
+from lerobot_bomb.environments import ENVIRONMENTS
 from lerobot_bomb.libero.assets import INSTALL, SUITES, Libero, describe_missing
 
 DISTRIBUTION = "lerobot_policy_bomb"
@@ -133,7 +134,7 @@ def check_types() -> Iterator[Finding]:
     from lerobot.envs import EnvConfig
     from lerobot.policies.factory import get_policy_class
 
-    for name in _imported_types(plugin, ENV_PREFIX):
+    for name in dict.fromkeys([*_imported_types(plugin, ENV_PREFIX), *ENVIRONMENTS]):
         known = name in EnvConfig.get_known_choices()
         yield Finding(f"--env.type={name}", "registered" if known else "not registered", broken=not known)
     for name in _imported_types(plugin, POLICY_PREFIX):

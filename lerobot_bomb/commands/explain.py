@@ -19,6 +19,7 @@ from lerobot_bomb.commands.arguments import add_checkpoint_arguments, check_at_l
 from lerobot_bomb.commands.results_files import read_record
 from lerobot_bomb.commands.view import add_viewed_arguments, viewed_of
 from lerobot_bomb.conditions import NONE
+from lerobot_bomb.environments import BOMB
 from lerobot_bomb.files import check_new_folder, written_whole
 from lerobot_bomb.flags import one_of
 from lerobot_bomb.viewing.episode import Viewed
@@ -92,8 +93,10 @@ def _of_flags(args: argparse.Namespace) -> "_Query":
 
 
 def _of_line(args: argparse.Namespace) -> "_Query":
-    shared = {"image_size": None, "perturbations": (NONE,), "env_type": "bomb"}
-    for name, default in (shared | args.own_flags["bomb"] | args.own_flags["bomb_pusht"]).items():
+    of_episode = {"image_size": None, "perturbations": (NONE,), "env_type": BOMB.name}
+    of_episode |= {"ignore_checkpoint": False}
+    of_episode |= {name: default for name, (default, _) in args.own_flags.items()}
+    for name, default in of_episode.items():
         if getattr(args, name) != default:
             raise ValueError(f"drop --env.{name.removeprefix('env_')}: the record of --results says it")
     replay = Replay(read_record(args.results, args.line or 1), args.policy_path)
@@ -101,9 +104,7 @@ def _of_line(args: argparse.Namespace) -> "_Query":
         raise ValueError("this record's policy has no checkpoint, so there is nothing to explain")
     check_checkpoint(replay.checkpoint)
     seed = replay.record.spec.seed if args.seed is None else args.seed
-    return _Query(
-        lambda seed: replay.viewed(seed=seed), seed, replay.checkpoint, args.policy_device, has_played=True
-    )
+    return _Query(lambda seed: replay.viewed(seed=seed), seed, replay.checkpoint, args.policy_device)
 
 
 @dataclass(frozen=True)
@@ -114,14 +115,12 @@ class _Query:
     seed: int
     checkpoint: Path
     device: str | None
-    has_played: bool = False  # then it is not asked whether it was trained for this environment
 
     def load(self) -> "LoadedPolicy":
         from lerobot_bomb.viewing.checkpoint import load_policy  # LeRobot and torch: seconds
 
         viewed = self.viewed(self.seed)
-        env = viewed.env_type, viewed.env_flags | {"ignore_checkpoint": self.has_played}
-        return load_policy(self.checkpoint, self.device, *env, self.seed)
+        return load_policy(self.checkpoint, self.device, viewed.env_type, viewed.env_flags, self.seed)
 
 
 def _moments(
@@ -153,10 +152,10 @@ def _explain_one(args: argparse.Namespace, query: _Query) -> int:
     viewed, loaded = query.viewed(query.seed), query.load()
     moments, result = _moments(args, query, query.seed, loaded)
     episodes = {}
-    if viewed.env_type == "bomb" and args.fill != "other":
+    if moments[0].snapshot.objects and args.fill != "other":
         episodes = run_masked(viewed, loaded, masks_of(moments[0].snapshot, loaded, args.fill))
     name = viewed.name(loaded.config.type)
-    sections = [overview_section(viewed.log().describe(result), moments, _command())]
+    sections = [overview_section(viewed.log.describe(result), moments, _command())]
     sections += [section for each in moments for section in moment_sections(each)]
     sections += [traces_section(episodes)] if episodes else []
     numbers = {

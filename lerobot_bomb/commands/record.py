@@ -226,15 +226,12 @@ def _acting(recording: Recording, policy_path: Path) -> Acting:
     Raises:
         ValueError: it was trained for another environment.
     """
-    from lerobot_bomb.viewing.checkpoint import load_policy  # LeRobot and torch: seconds
+    from lerobot_bomb.checkpoints.acting import INSIST  # LeRobot and torch: seconds
+    from lerobot_bomb.viewing.checkpoint import load_policy
 
     names = ("task", "robot", "control_mode", "fps", "image_size", "render_preset", "depth", "split")
     env_flags = {name: getattr(recording, name) for name in names}
-    insist = "insist with --{}=true"
-    ways_out = dict.fromkeys(
-        map(insist.format, ("policy.ignore_environment", "env.ignore_checkpoint")), "train one for this"
-    )
-    with reworded({"evaluate with": "record with", **ways_out}):
+    with reworded({"evaluate with": "record with", INSIST: "train one for this"}):
         loaded = load_policy(policy_path, None, "bomb", env_flags, recording.seed)
 
     def agent(observation: dict[str, Any], instruction: str) -> np.ndarray:

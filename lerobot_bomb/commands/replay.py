@@ -69,7 +69,7 @@ def run(args: argparse.Namespace) -> int:
     for (label, player), result in zip(players.items(), results, strict=True):
         of, values = player.viewed, cast("Any", result)
         print_lines(f"{label} ({of.spec.perturbations}): {values.instruction}")
-        print(of.log().describe(result))
+        print(of.log.describe(result))
     print(*paths, sep="\n")
     return _compare(record, results[0])
 
@@ -79,7 +79,7 @@ def _changed(record: Record, levels: dict[str, int]) -> str:
     merged = record.levels | levels
     text = "+".join(f"{axis}:{level}" for axis, level in merged.items()) or NONE
     try:
-        return str(record.condition.parse(text))
+        return record.condition(text)
     except ValueError as error:
         raise ValueError(str(error).replace(f"--env.perturbations={text!r}", "--set", 1)) from None
 

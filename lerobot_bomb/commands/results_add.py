@@ -5,9 +5,8 @@ from pathlib import Path
 from typing import Any
 
 from lerobot_bomb.commands.arguments import add_file_and_eval_flags, long_forms
+from lerobot_bomb.environments import env_type
 from lerobot_bomb.files import read_json
-from lerobot_bomb.flags import one_of
-from lerobot_bomb.results.reading import RECORD_OF_ENV, RECORD_TYPES
 from lerobot_bomb.results.writing import write_record
 from lerobot_bomb.sweep.manifest import flag_value
 
@@ -42,23 +41,17 @@ def run(args: argparse.Namespace) -> int:
 
 def _check_flags(config: Any) -> None:
     """Raise a ValueError unless each episode's result can be told."""
-    record_type = RECORD_OF_ENV.get(config.env.type)
-    if record_type is not None and record_type.has_results_path:
+    record_type = env_type(config.env.type).record
+    if record_type.has_results_path:
         raise ValueError(
             f"--env.type={record_type.env_type}: lerobot-eval writes its records itself, with "
             "--env.results_path=FILE"
-        )
-    if record_type is None:
-        one_of(
-            "--env.type",
-            config.env.type,
-            [each.env_type for each in RECORD_TYPES if not each.has_results_path],
         )
     if config.policy is None:
         raise ValueError("--policy.path or --policy.type is missing: the policy that was evaluated")
     if config.seed is None:
         raise ValueError("--seed=null: episodes without a seed cannot be told apart")
-    if record_type is not None and record_type.starts_by_number and config.eval.batch_size != 1:
+    if record_type.starts_by_number and config.eval.batch_size != 1:
         raise ValueError(
             f"--eval.batch_size={config.eval.batch_size}: which initial state an episode of "
             f"--env.type={record_type.env_type} starts in is determined with --eval.batch_size=1 only"

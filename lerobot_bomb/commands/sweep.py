@@ -7,7 +7,7 @@ from contextlib import contextmanager
 from difflib import get_close_matches
 
 from lerobot_bomb.bomb.episode import MAX_SEED, TEST_SEEDS
-from lerobot_bomb.checkpoints.registered import registered_policy_types
+from lerobot_bomb.checkpoints.registered import registered_types
 from lerobot_bomb.commands.arguments import add_env_flag, check_at_least, parse_conditions, path_flag
 from lerobot_bomb.commands.cluster_jobs import (
     SUBMITIT,
@@ -17,8 +17,8 @@ from lerobot_bomb.commands.cluster_jobs import (
     submitted,
     write_job_array,
 )
+from lerobot_bomb.environments import ENVIRONMENTS, env_type
 from lerobot_bomb.flags import one_of
-from lerobot_bomb.results.reading import RECORD_OF_ENV
 from lerobot_bomb.results.record import Record
 from lerobot_bomb.sweep.claim import claimed
 from lerobot_bomb.sweep.local import PYTHON, play, progress
@@ -140,7 +140,7 @@ def _manifest(args: argparse.Namespace) -> Manifest:
         raise ValueError("--policies names none")
     record_type = _record_type(args.rest)
     _check_types(args.policies, args.rest)
-    for task in args.tasks:
+    for task in args.tasks if record_type.tasks else ():
         one_of("--tasks", task, record_type.tasks)
     conditions = _expanded(args.perturbations, record_type)
     args.batch_size = 1 if record_type.starts_by_number else args.batch_size
@@ -149,37 +149,40 @@ def _manifest(args: argparse.Namespace) -> Manifest:
 
 def _record_type(flags: list[str]) -> type[Record]:
     """Return the type of the records of the environment that the flags name."""
-    env_type = flag_value(flags, "--env.type")
-    if env_type is None:
-        raise ValueError(f"--env.type is missing: {', '.join(RECORD_OF_ENV)}")
-    if env_type not in RECORD_OF_ENV:
-        raise ValueError(
-            f"--env.type={env_type} has no lines of results, which a sweep is made of; those that have: "
-            f"{', '.join(RECORD_OF_ENV)}"
-        )
-    return RECORD_OF_ENV[env_type]
+    name = flag_value(flags, "--env.type")
+    if name is None:
+        raise ValueError(f"--env.type is missing: {', '.join(ENVIRONMENTS)}, or another one of LeRobot's")
+    if name not in ENVIRONMENTS:
+        _check_known(f"--env.type={name} is no env type", name, _registered("envs", flags))
+    return env_type(name).record
 
 
 def _check_types(policies: Sequence[str], flags: Sequence[str]) -> None:
     """Raise a ValueError if one is neither a checkpoint nor a type that there is, as far as source says."""
-    adds_types = any("discover_packages_path" in flag for flag in flags)  # of a package that is not read here
-    if adds_types or (known := registered_policy_types()) is None:
-        return
     for policy in policies:
-        if policy_flag(policy).startswith("--policy.type=") and policy not in known:
-            near = "".join(f"; nearest: {name}" for name in get_close_matches(policy, known, n=1))
-            raise ValueError(f"--policies: {policy} is no folder and no policy type{near}")
+        if policy_flag(policy).startswith("--policy.type="):
+            refusal = f"--policies: {policy} is no folder and no policy type"
+            _check_known(refusal, policy, _registered("policies", flags))
 
 
-def _expanded(perturbations: tuple[str, ...], record_type: type[Record]) -> list[str]:
+def _registered(kind: str, flags: Sequence[str]) -> set[str] | None:
+    """Return the types that there are; None where a package that is imported later may add some."""
+    return None if any("discover_packages_path" in flag for flag in flags) else registered_types(kind)
+
+
+def _check_known(refusal: str, name: str, known: set[str] | None) -> None:
+    if known is not None and name not in known:
+        near = "".join(f"; nearest: {each}" for each in get_close_matches(name, known, n=1))
+        raise ValueError(f"{refusal}{near}")
+
+
+def _expanded(perturbations: tuple[str, ...], record_type: type[Record]) -> Sequence[str]:
     """The conditions, checked for the environment."""
+    name = record_type.env_type
     if perturbations and not record_type.condition.axes:
-        raise ValueError(
-            f"--perturbations={','.join(perturbations)}: --env.type={record_type.env_type} is LeRobot's and "
-            f"has none; --env.type=bomb_{record_type.env_type} has"
-        )
-    condition = record_type.condition
-    return [str(condition.parse(text)) for text in condition.expand(perturbations)]
+        others = f"; --env.type=bomb_{name} has" if f"bomb_{name}" in ENVIRONMENTS else ""
+        raise ValueError(f"--perturbations={','.join(perturbations)}: --env.type={name} has none{others}")
+    return record_type.condition.expand(perturbations)
 
 
 def _job_command(args: argparse.Namespace) -> list[str]:

@@ -43,7 +43,7 @@ def rollout_layout(recording: Recording) -> DatasetLayout:
     return DatasetLayout(
         recording.repo_id,
         recording.fps,
-        robot_type(recording.robot),
+        robot_type(recording.robot, recording.task),
         features,
         not recording.images,
         tuple(geometry),

@@ -3,7 +3,10 @@
 from abc import ABC, abstractmethod
 from collections.abc import Mapping
 from dataclasses import dataclass
+from functools import cache
+from pkgutil import resolve_name
 from typing import Any, Self
+from zlib import crc32
 
 import numpy as np
 
@@ -47,6 +50,20 @@ class SensorTransform(EpisodeTransform):
         return self.photometric(rgb, number)
 
 
+def transforms_of(condition: AxisCondition) -> dict[str, Any]:
+    """{axis that is on: its class of transforms}."""
+    return {axis: _transform(condition.axes[axis].transform) for axis, _, _ in condition.ranges}
+
+
+_transform = cache(resolve_name)
+
+
+def _number(condition: AxisCondition, stream: Stream, axis: str) -> int:
+    """Return the number of an axis' stream: by its place or, where another package adds it, by its name."""
+    own = list(condition.axes.own)
+    return stream + own.index(axis) if axis in own else (crc32(axis.encode()) << 32) + stream
+
+
 @dataclass(frozen=True)
 class EpisodePerturbation[T: EpisodeTransform]:
     """An episode's axes that are on, in the order of the environment's table."""
@@ -55,11 +72,12 @@ class EpisodePerturbation[T: EpisodeTransform]:
     transforms: Mapping[str, T]
 
     @classmethod
-    def draw(cls, condition: AxisCondition, seed: int, kinds: Mapping[str, type[T]], nominal: Any) -> Self:
+    def draw(cls, condition: AxisCondition, seed: int, nominal: Any) -> Self:
         """The axes of a condition, each drawn from a generator of its own."""
+        kinds = transforms_of(condition)
 
         def rng(stream: Stream, axis: str) -> np.random.Generator:
-            return generator(seed, stream + list(condition.axes).index(axis))
+            return generator(seed, _number(condition, stream, axis))
 
         levels = {
             axis: level

@@ -13,13 +13,10 @@ from lerobot_bomb.bomb.expert import expert_action
 from lerobot_bomb.bomb.observation import ENVIRONMENT_STATE, MAX_STEP_M, RenderOptions, action_bounds
 from lerobot_bomb.bomb.privileged_state import PrivilegedState
 from lerobot_bomb.envs.vector import FreezeAfterEnd
-from lerobot_bomb.libero.episode import LiberoSpec
-from lerobot_bomb.pusht.episode import PushTSpec
+from lerobot_bomb.results.record import Spec
 
 # Importing the part before the colon registers the id; no module of the core imports an environment.
 ENV_ID = "lerobot_env_bomb:bomb/{suite}-v0"
-LIBERO_ENV_ID = "lerobot_env_bomb_libero:bomb_libero/Libero-v0"
-PUSHT_ENV_ID = "lerobot_env_bomb_pusht:bomb_pusht/PushT-v0"
 
 # (observation of the environment, instruction) -> (D,) action
 type Agent = Callable[[dict[str, Any], str], np.ndarray]
@@ -55,20 +52,9 @@ def make_env(spec: EpisodeSpec, render_options: RenderOptions) -> gymnasium.Env:
     )
 
 
-def make_libero_env(spec: LiberoSpec, image_size: int) -> gymnasium.Env:
-    """`bomb_libero` from Gymnasium's registry; LIBERO must be prepared."""
-    scene = {"observation_height": image_size, "observation_width": image_size}
-    return gymnasium.make(LIBERO_ENV_ID, disable_env_checker=True, spec=spec, scene=scene)
-
-
-def make_pusht_env(spec: PushTSpec, image_size: int) -> gymnasium.Env:
-    """`bomb_pusht` from Gymnasium's registry; gym-pusht must be installed."""
-    return gymnasium.make(PUSHT_ENV_ID, disable_env_checker=True, spec=spec, image_size=image_size)
-
-
 def play(
     env: gymnasium.Env,
-    spec: EpisodeSpec | PushTSpec,
+    spec: Spec,
     agent: Agent,
     disturb: Callable[[np.ndarray], np.ndarray] | None = None,
 ) -> Iterator[Moment]:

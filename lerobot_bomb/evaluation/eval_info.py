@@ -6,16 +6,15 @@ from math import isfinite
 from typing import Any
 
 import draccus
+from lerobot.configs import FeatureType
 from lerobot.envs import EnvConfig
 
-from lerobot_bomb.pusht.episode import IMAGE_SIZE
-from lerobot_bomb.results import libero, pusht
+from lerobot_bomb.environments import env_type
 from lerobot_bomb.results.origin import PolicyIdentity, installed_versions
-from lerobot_bomb.results.stock import FAILED, StockLiberoResult, StockPushTResult, StockResult, StockSpec
+from lerobot_bomb.results.record import NOT_RECORDED
+from lerobot_bomb.results.stock import FAILED, StockResult, StockSpec
 
 EVAL_INFO = "eval_info.json"  # in the folder of --output_dir
-SIMULATORS = {"pusht": pusht.SIMULATOR, "libero": libero.SIMULATOR}
-RECORDS = {each.env_type: each for each in (StockPushTResult, StockLiberoResult)}
 # fields of an environment's config that do not decide what an episode is, or that its spec says
 NOT_SETTINGS = {
     "type", "features", "features_map", "render_mode", "visualization_width", "visualization_height",
@@ -44,8 +43,8 @@ def results_of(
     Raises:
         ValueError: an episode's rewards are not finite: its actions or the simulation were not.
     """
-    env_type = str(env.type)
-    record_type, settings = RECORDS[env_type], _settings(env)
+    record_type = env_type(env.type).record
+    settings = _settings(env, record_type)
     for task in info["per_task"]:
         metrics = task["metrics"]
         episodes = zip(metrics["sum_rewards"], metrics["max_rewards"], metrics["successes"], strict=True)
@@ -59,21 +58,20 @@ def results_of(
                 max_reward=max_reward,
                 is_success=is_success,
                 failure=None if is_success else FAILED,
-                image_size=_image_size(env),
+                image_size=record_type.drawn_size or _image_size(env),
                 flags=settings,
-                simulator_versions=installed_versions(SIMULATORS[env_type]),
+                simulator_versions=installed_versions(record_type.simulator),
                 policy=replace(policy, batch_size=batch_size, batch_row=i % batch_size),
             )
 
 
-def _settings(env: EnvConfig) -> dict[str, Any]:
-    of_spec = {"task"} if RECORDS[str(env.type)].starts_by_number else set()
+def _settings(env: EnvConfig, record_type: type[StockResult]) -> dict[str, Any]:
+    of_spec = {"task"} if record_type.starts_by_number else set()
     values: Any = draccus.encode(env)
     return {name: value for name, value in values.items() if name not in NOT_SETTINGS | of_spec}
 
 
-def _image_size(env: Any) -> str:
-    """gym-pusht draws its own size, whatever the flags say."""
-    if env.type == "pusht":
-        return f"{IMAGE_SIZE}x{IMAGE_SIZE}"
-    return f"{env.observation_width}x{env.observation_height}"
+def _image_size(env: EnvConfig) -> str:
+    """'640x480': width and height of the first camera's images."""
+    sizes = [each.shape[:2] for each in env.features.values() if each.type is FeatureType.VISUAL]
+    return "{1}x{0}".format(*sizes[0]) if sizes else NOT_RECORDED

@@ -12,6 +12,7 @@ from lerobot_bomb.bomb.board import BOARD, Intersection
 from lerobot_bomb.bomb.camera import Camera
 from lerobot_bomb.bomb.episode import Stage
 from lerobot_bomb.bomb.expert import current_goal
+from lerobot_bomb.bomb.observation import ENVIRONMENT_STATE
 from lerobot_bomb.bomb.privileged_state import PrivilegedState
 from lerobot_bomb.envs.rollout import Moment, play
 from lerobot_bomb.viewing.checkpoint import LoadedPolicy
@@ -58,15 +59,13 @@ def watch(viewed: Viewed, loaded: LoadedPolicy) -> tuple[list[Snapshot], Any]:
             return loaded.agent([observation], [instruction])[0]
 
         moments = [
-            _snapshot(viewed, moment, env)
-            for moment in play(env, viewed.spec, act)
-            if moment.action is not None
+            _snapshot(moment, env) for moment in play(env, viewed.spec, act) if moment.action is not None
         ]
         return moments, env.get_wrapper_attr("episode_result")()
 
 
-def _snapshot(viewed: Viewed, moment: Moment, env: gymnasium.Env) -> Snapshot:
-    is_bomb = viewed.env_type == "bomb"
+def _snapshot(moment: Moment, env: gymnasium.Env) -> Snapshot:
+    is_bomb = ENVIRONMENT_STATE in moment.observation
     state = moment.state if is_bomb else None
     others = env.get_wrapper_attr("alternatives")() if is_bomb else {}
     goal = None if state is None else current_goal(state)

@@ -46,17 +46,15 @@ class BombBenchmark(StepBenchmark):
         self._specs: dict[str, EpisodeSpec] = {
             key if self._config.task_ids is None else f"{key}.{task_id}": spec
             for key, specs in self._config.groups.items()
-            for task_id, spec in zip(self._config.task_ids or [0], specs, strict=True)
+            for task_id, spec in specs.items()
         }
         self._env: gymnasium.Env | None = None
         self._name = ""  # of the task that `_env` is of
 
     def get_tasks(self) -> list[Task]:
-        environment = json.dumps(asdict(self._config.environment))
-        return [
-            {"name": name, "suite": spec.suite, ENVIRONMENT: environment}
-            for name, spec in self._specs.items()
-        ]
+        checked = {ENVIRONMENT: json.dumps(asdict(self._config.environment))}
+        checked = {} if self._config.ignore_checkpoint else checked
+        return [{"name": name, "suite": spec.suite, **checked} for name, spec in self._specs.items()]
 
     def reset(self, task: Task) -> dict[str, Any]:
         if self._env is None or self._name != task["name"]:

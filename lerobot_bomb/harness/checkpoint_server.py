@@ -18,6 +18,7 @@ from vla_eval.types import Action, Observation
 
 from lerobot_bomb.bomb.environment import Environment
 from lerobot_bomb.bomb.episode import TEST_SEEDS
+from lerobot_bomb.checkpoints.acting import acting
 from lerobot_bomb.checkpoints.environment import check_acting_policy
 from lerobot_bomb.checkpoints.folder import autocast, load_processors, read_config
 from lerobot_bomb.checkpoints.shipped import checkpoint_path
@@ -113,7 +114,8 @@ class CheckpointServer(PredictModelServer):
             raise RuntimeError("this server runs another session's episode; start a server for each shard")
         if ctx.is_first:
             if self._environment is not None:
-                check_acting_policy(self._environment)
+                with acting(self._config):
+                    check_acting_policy(self._environment)
             self._policy.reset()
         batch = {**self._read_images(obs), **self._read_state(obs), "task": [obs.get("task_description", "")]}
         with torch.inference_mode(), autocast(self._config):

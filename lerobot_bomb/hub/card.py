@@ -14,12 +14,12 @@ from lerobot_bomb.bomb.environment import SUITE, Environment
 from lerobot_bomb.checkpoints.environment import ConfigWithEnvironment
 from lerobot_bomb.checkpoints.names import is_hub_id
 from lerobot_bomb.data.facts import DatasetFacts
+from lerobot_bomb.environments import env_type
 from lerobot_bomb.hub.evaluations import model_index
 from lerobot_bomb.hub.markdown import code, command, fenced, plain
 from lerobot_bomb.hub.method import Method
 from lerobot_bomb.hub.training import peft_flags, train_command
 from lerobot_bomb.results.groups import Group, by_condition, groups_of
-from lerobot_bomb.results.reading import RECORD_TYPES
 from lerobot_bomb.results.record import Record
 from lerobot_bomb.results.summary import named_counts, summarise
 from lerobot_bomb.vlm.tokenizer import NANO
@@ -160,8 +160,8 @@ class Checkpoint:
 
     def _evaluate(self) -> str:
         flags = self._eval_flags()
-        writing = [each for each in RECORD_TYPES if each.has_results_path]
-        is_ours = flags is not None and any(f"--env.type={each.env_type}" in flags for each in writing)
+        types = [flag.partition("=")[2] for flag in flags or () if flag.startswith("--env.type=")]
+        is_ours = any(env_type(each).record.has_results_path for each in types)
         results = ["--env.results_path=results.jsonl"] if is_ours else []
         line = command(
             "lerobot-eval",

@@ -7,6 +7,7 @@ import yaml
 from huggingface_hub import EvalResult, EvalResultEntry, eval_result_entries_to_yaml
 from huggingface_hub.repocard_data import eval_results_to_model_index
 
+from lerobot_bomb.conditions import AxisCondition
 from lerobot_bomb.results.groups import Group, by_condition, differing, rate_of
 from lerobot_bomb.results.record import Record
 
@@ -21,9 +22,7 @@ def model_index(groups: list[Group]) -> list[EvalResult]:
             task_name=_task(records[0]),
             dataset_type=group.record_type.env_type,
             dataset_name=group.records[0].benchmark(),
-            dataset_config=_config(
-                group, condition, records
-            ),  # tells results apart, which their task does not
+            dataset_config=_config(condition, records),  # tells results apart, which their task does not
             metric_type=METRIC,
             metric_name=f"success rate, {_counted(records)}",
             metric_value=_share(records),
@@ -43,7 +42,7 @@ def eval_results_yaml(benchmark_id: str, groups: list[Group]) -> str:
     entries = [
         EvalResultEntry(
             dataset_id=benchmark_id,
-            task_id=_config(group, condition, records),
+            task_id=_config(condition, records),
             value=_share(records),
             notes=f"{_counted(records)}; {group.lines()[1]}",
         )
@@ -54,7 +53,7 @@ def eval_results_yaml(benchmark_id: str, groups: list[Group]) -> str:
 
 def check_one_rate_each(groups: list[Group]) -> None:
     """Raise a ValueError if a policy has two rates for one condition, of episodes that must not be pooled."""
-    first: dict[tuple[str, str], Group] = {}
+    first: dict[tuple[str, AxisCondition], Group] = {}
     for group, condition, records in _conditions(groups):
         other = first.setdefault((_task(records[0]), condition), group)
         if other is not group:
@@ -64,19 +63,19 @@ def check_one_rate_each(groups: list[Group]) -> None:
             )
 
 
-def _conditions(groups: list[Group]) -> Iterator[tuple[Group, str, list[Record]]]:
+def _conditions(groups: list[Group]) -> Iterator[tuple[Group, AxisCondition, list[Record]]]:
     for group in groups:
         for condition, records in by_condition(group.records).items():
             yield group, condition, records
 
 
-def _config(group: Group, condition: str, records: list[Record]) -> str:
+def _config(condition: AxisCondition, records: list[Record]) -> str:
     """Return the task and condition as `place.camera-3`."""
-    return f"{_task(records[0])}.{group.record_type.condition.parse(condition).key}"
+    return f"{_task(records[0])}.{condition.key}"
 
 
 def _task(record: Record) -> str:
-    return getattr(record.spec, "suite", "pusht")
+    return getattr(record.spec, "suite", record.tasks[0])
 
 
 def _share(records: list[Record]) -> float:

@@ -4,7 +4,7 @@ from dataclasses import dataclass
 from enum import StrEnum
 
 from lerobot_bomb.bomb.episode import check_seed
-from lerobot_bomb.conditions import NONE
+from lerobot_bomb.conditions import NONE, PerturbedSpec
 from lerobot_bomb.flags import one_of
 from lerobot_bomb.libero.assets import SUITES
 from lerobot_bomb.libero.perturbations import LiberoCondition
@@ -27,7 +27,7 @@ class LiberoFailure(StrEnum):
 
 
 @dataclass(frozen=True)
-class LiberoSpec:
+class LiberoSpec(PerturbedSpec):
     """Everything that, with the versions of code and simulator, determines an episode."""
 
     seed: int  # number from which everything random is drawn
@@ -37,8 +37,7 @@ class LiberoSpec:
     perturbations: str = NONE  # condition, such as table:2+light:3
 
     def __post_init__(self) -> None:
-        # one spelling, so that equal conditions compare equal
-        object.__setattr__(self, "perturbations", str(LiberoCondition.parse(self.perturbations)))
+        object.__setattr__(self, "perturbations", LiberoCondition(self.perturbations))
         one_of("--env.task", self.suite, SUITES)
         count = TASKS_PER_SUITE[self.suite]
         if not 0 <= self.task_id < count:

@@ -1,15 +1,14 @@
 """LIBERO's perturbation axes: their names, levels and magnitudes; the one definition."""
 
-from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import replace
 from functools import partial
 from typing import ClassVar
 
 from lerobot_bomb.bomb.perturbations import AXES as BOMB_AXES
-from lerobot_bomb.conditions import Axis, AxisCondition, Magnitude, magnitude_of
+from lerobot_bomb.conditions import Axis, AxisCondition, Magnitude, axes_of, magnitude_of
 
 # Append only: an axis' place in this dict numbers its stream of random numbers.
-LIBERO_AXES = {
+_OWN = {
     "table": Axis(
         "colour and pattern of table and floor",
         ("images",),
@@ -19,6 +18,7 @@ LIBERO_AXES = {
                 "share", (0.06, 0.12, 0.2, 0.3, 0.45), "contrast of stripes, checks or speckles"
             ),
         },
+        "lerobot_env_bomb_libero.axes.table:SurfaceLook",
     ),
     "reflectance": Axis(
         "gloss of objects; lamps' reflections on table and floor",
@@ -31,11 +31,13 @@ LIBERO_AXES = {
             ),
             "gloss": Magnitude("share", (0.1, 0.2, 0.3, 0.4, 0.5), "of the way to full specular light"),
         },
+        "lerobot_env_bomb_libero.axes.reflectance:LiberoGloss",
     ),
     "distractors": Axis(
         "boxes, cylinders and balls that stand beside the objects",
         ("images",),
         {"count": Magnitude("bodies", (1, 2, 3, 4, 5), "more in the scene")},
+        "lerobot_env_bomb_libero.axes.distractors:Distractors",
     ),
     "start": Axis(
         "where objects and the arm are at the start",
@@ -48,8 +50,11 @@ LIBERO_AXES = {
                 "radians", (0.04, 0.08, 0.12, 0.16, 0.2), "of its joints, root of sum of squares"
             ),
         },
+        "lerobot_env_bomb_libero.axes.start:LiberoStart",
     ),
-    "photometric": BOMB_AXES["photometric"],
+    "photometric": replace(
+        BOMB_AXES["photometric"], transform="lerobot_env_bomb_libero.axes.photometric:LiberoSensor"
+    ),
     "camera": Axis(
         "angle, field of view and distance of the cameras; what was in view stays in view",
         ("images",),
@@ -61,9 +66,12 @@ LIBERO_AXES = {
                 "share", (0.03, 0.06, 0.09, 0.12, 0.15), "further or nearer, of the scene's camera"
             ),
         },
+        "lerobot_env_bomb_libero.axes.camera:LiberoCamera",
     ),
-    "light": BOMB_AXES["light"],
-    "language": BOMB_AXES["language"],
+    "light": replace(BOMB_AXES["light"], transform="lerobot_env_bomb_libero.axes.light:LiberoLight"),
+    "language": replace(
+        BOMB_AXES["language"], transform="lerobot_env_bomb_libero.axes.language:LiberoWording"
+    ),
     "dynamics": Axis(
         "mass and friction of the objects, noise and latency of the arm",
         ("dynamics",),
@@ -75,6 +83,7 @@ LIBERO_AXES = {
             ),
             "latency": Magnitude("control steps", (0, 0, 1, 1, 2), "before an action is executed"),
         },
+        "lerobot_env_bomb_libero.axes.dynamics:LiberoDynamics",
     ),
     "object": Axis(
         "shade of the objects",
@@ -83,13 +92,14 @@ LIBERO_AXES = {
             "shade": Magnitude("factor", (0.87, 0.75, 0.64, 0.55, 0.47), "of their colour"),
             "tint": Magnitude("share", (0.04, 0.08, 0.12, 0.16, 0.2), "less of a drawn channel"),
         },
+        "lerobot_env_bomb_libero.axes.object:ObjectShade",
     ),
 }
+LIBERO_AXES = axes_of("bomb_libero", _OWN)
 libero_magnitude = partial(magnitude_of, LIBERO_AXES)  # (axis, name, level)
 
 
-@dataclass(frozen=True)
 class LiberoCondition(AxisCondition):
     """Condition of LIBERO, by the axes that are on: "camera:2+light:3"."""
 
-    axes: ClassVar[Mapping[str, Axis]] = LIBERO_AXES
+    axes: ClassVar = LIBERO_AXES

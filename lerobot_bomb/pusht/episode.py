@@ -1,5 +1,6 @@
 """An episode of PushT: what determines it, and why it failed."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from enum import StrEnum
 from importlib.util import find_spec
@@ -8,7 +9,7 @@ from math import pi
 import numpy as np
 
 from lerobot_bomb.bomb.episode import check_seed
-from lerobot_bomb.conditions import NONE, nuisances_of
+from lerobot_bomb.conditions import NONE, PerturbedSpec, nuisances_of
 from lerobot_bomb.flags import one_of
 from lerobot_bomb.pusht.perturbations import PUSHT_AXES, PushTCondition
 
@@ -42,7 +43,7 @@ class PushTFailure(StrEnum):
 
 
 @dataclass(frozen=True)
-class PushTSpec:
+class PushTSpec(PerturbedSpec):
     """Everything that, with the code's version, determines an episode bit for bit."""
 
     seed: int  # number from which everything random is drawn
@@ -51,14 +52,12 @@ class PushTSpec:
     perturbations: str = NONE  # condition, such as table:2+goal:3
 
     def __post_init__(self) -> None:
-        condition = PushTCondition.parse(self.perturbations)
-        # one spelling, so that equal conditions compare equal
-        object.__setattr__(self, "perturbations", str(condition))
+        object.__setattr__(self, "perturbations", PushTCondition(self.perturbations))
         one_of("--env.instruction", self.instruction, INSTRUCTIONS)
         check_seed(self.seed)
         if not 1 <= self.max_steps <= MAX_ALLOWED_STEPS:
             raise ValueError(f"--env.max_steps={self.max_steps} must lie in 1..{MAX_ALLOWED_STEPS}")
-        on = {axis for axis, _, _ in condition.ranges}
+        on = {axis for axis, _, _ in self.condition.ranges}
         if self.instruction == NONE and "language" in on and not on.issuperset(nuisances_of(PUSHT_AXES)):
             raise ValueError(
                 f"--env.perturbations={self.perturbations!r} rewords the instruction, of which "
@@ -66,8 +65,8 @@ class PushTSpec:
             )
 
 
-def check_installed() -> None:
-    """Raise a ValueError unless gym-pusht is there."""
+def check_installed(tasks: Sequence[str] = ()) -> None:
+    """Raise a ValueError unless gym-pusht is there, whatever the tasks."""
     if find_spec("gym_pusht") is None:
         raise ValueError(f"--env.type=bomb_pusht needs gym-pusht: pip install '{PUSHT_EXTRA}'")
 

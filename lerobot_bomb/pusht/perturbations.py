@@ -3,17 +3,16 @@
 A pixel is one of the board's 512x512, the unit of positions and actions.
 """
 
-from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import replace
 from functools import partial
 from typing import ClassVar
 
 from lerobot_bomb.bomb.perturbations import AXES as BOMB_AXES
-from lerobot_bomb.conditions import Axis, AxisCondition, Magnitude, magnitude_of
+from lerobot_bomb.conditions import Axis, AxisCondition, Magnitude, axes_of, magnitude_of
 
 # Append only: an axis' place in this dict numbers its stream of random numbers. `language` stands before
 # `goal`, which adds its words to whatever sentence there is.
-PUSHT_AXES = {
+_OWN = {
     "table": Axis(
         "colour and pattern of the board",
         ("images",),
@@ -23,6 +22,7 @@ PUSHT_AXES = {
                 "share", (0.05, 0.09, 0.13, 0.17, 0.21), "darkness of stripes, checks or speckles"
             ),
         },
+        "lerobot_env_bomb_pusht.axes.table:BoardLook",
     ),
     "start": Axis(
         "where block and agent are at the start",
@@ -32,9 +32,12 @@ PUSHT_AXES = {
             "turn": Magnitude("degrees", (15, 30, 45, 60, 75), "of the block, to a drawn side"),
             "agent": Magnitude("pixels", (20, 40, 60, 80, 100), "of the agent, towards the board's middle"),
         },
+        "lerobot_env_bomb_pusht.axes.start:PushTStart",
     ),
-    "photometric": BOMB_AXES["photometric"],
-    "language": BOMB_AXES["language"],
+    "photometric": replace(
+        BOMB_AXES["photometric"], transform="lerobot_env_bomb_pusht.axes.photometric:PushTSensor"
+    ),
+    "language": replace(BOMB_AXES["language"], transform="lerobot_env_bomb_pusht.axes.language:PushTWording"),
     "dynamics": Axis(
         "damping and friction of the block, latency and noise of the agent",
         ("dynamics",),
@@ -46,11 +49,13 @@ PUSHT_AXES = {
             "noise": Magnitude("pixels", (2, 4, 6, 8, 10), "standard deviation on the executed x and y"),
             "latency": Magnitude("control steps", (0, 0, 1, 1, 2), "before an action is executed"),
         },
+        "lerobot_env_bomb_pusht.axes.dynamics:PushTDynamics",
     ),
     "object": Axis(
         "shade of the block",
         ("images",),
         {"shade": Magnitude("share", (0.2, 0.4, 0.6, 0.8, 1.0), "of the way to a drawn colour")},
+        "lerobot_env_bomb_pusht.axes.object:BlockShade",
     ),
     "goal": Axis(
         "where the target lies, which the instruction then says",
@@ -59,20 +64,22 @@ PUSHT_AXES = {
             "shift": Magnitude("pixels", (16, 32, 48, 64, 80), "of the target, in a drawn direction"),
             "turn": Magnitude("degrees", (12, 24, 36, 48, 60), "of the target, to a drawn side"),
         },
+        "lerobot_env_bomb_pusht.axes.goal:GoalPose",
     ),
     "goal_marker": Axis(
         "the target's outline in red over whatever lies on it",
         ("images",),
         # even steps in an image of 96 pixels
         {"width": Magnitude("pixels", (5, 10, 12, 20, 23), "of the line")},
+        "lerobot_env_bomb_pusht.axes.goal_marker:GoalOutline",
         is_help=True,
     ),
 }
+PUSHT_AXES = axes_of("bomb_pusht", _OWN)
 pusht_magnitude = partial(magnitude_of, PUSHT_AXES)  # (axis, name, level)
 
 
-@dataclass(frozen=True)
 class PushTCondition(AxisCondition):
     """Condition of PushT, by the axes that are on: "table:2+goal:3"."""
 
-    axes: ClassVar[Mapping[str, Axis]] = PUSHT_AXES
+    axes: ClassVar = PUSHT_AXES

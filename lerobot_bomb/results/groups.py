@@ -6,7 +6,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, overload
 
-from lerobot_bomb.conditions import NONE
+from lerobot_bomb.conditions import NONE, AxisCondition
 from lerobot_bomb.results.reading import check_any, read_records
 from lerobot_bomb.results.record import NOT_RECORDED, Record, describe_numbers
 from lerobot_bomb.stats import Rate
@@ -155,11 +155,11 @@ def differing(groups: list[Group]) -> list[str]:
     return [name for name in names if len({group.settings.get(name) for group in groups}) > 1]
 
 
-def by_condition[R: Record](records: Iterable[R]) -> dict[str, list[R]]:
+def by_condition[R: Record](records: Iterable[R]) -> dict[AxisCondition, list[R]]:
     """Split a group's records by their perturbations."""
-    conditions: dict[str, list[R]] = {}
+    conditions: dict[AxisCondition, list[R]] = {}
     for record in records:
-        conditions.setdefault(record.spec.perturbations, []).append(record)
+        conditions.setdefault(record.spec.condition, []).append(record)
     return conditions
 
 

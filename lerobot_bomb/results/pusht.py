@@ -1,6 +1,6 @@
 """Record of an episode of `bomb_pusht`: what it must say, and what records say together."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from functools import partial
 from typing import Annotated, ClassVar, Self
@@ -80,10 +80,6 @@ class PushTResult(Record):
 
     def settings(self) -> dict[str, str]:
         return {"simulator": describe_versions(self.simulator_versions)}
-
-    @classmethod
-    def describe_simulator(cls, settings: Mapping[str, str]) -> str:
-        return settings["simulator"]
 
     @classmethod
     def describe_tasks(cls, records: Sequence[Self]) -> str:

@@ -1,29 +1,26 @@
 """Records of results files, of whichever environment: read and checked."""
 
 import json
+import re
 from collections.abc import Collection
 from functools import cache
 from pathlib import Path
 from typing import Any
 
-from lerobot_bomb.results.bomb import EpisodeResult
-from lerobot_bomb.results.libero import LiberoResult
-from lerobot_bomb.results.pusht import PushTResult
+from lerobot_bomb.environments import ENVIRONMENTS
 from lerobot_bomb.results.record import Record
 from lerobot_bomb.results.schema import Schema
-from lerobot_bomb.results.stock import StockLiberoResult, StockPushTResult
+from lerobot_bomb.results.stock import stock_result
 
-RECORD_TYPES: tuple[type[Record], ...] = (
-    EpisodeResult,
-    PushTResult,
-    LiberoResult,
-    StockPushTResult,
-    StockLiberoResult,
-)
-RECORD_OF_ENV: dict[str, type[Record]] = {each.env_type: each for each in RECORD_TYPES}
-RECORD_OF_VERSION: dict[str, type[Record]] = {
-    version: each for each in RECORD_TYPES for version in each.versions
-}
+STOCK_VERSION = r"lerobot-(\w+)-1\.0"  # of an env type of LeRobot's own
+
+
+@cache
+def record_type_of(version: str) -> type[Record] | None:
+    """Return the type of the records of a protocol version; None: no environment has it."""
+    types = (each.record for each in ENVIRONMENTS.values())
+    stock = re.fullmatch(STOCK_VERSION, version)
+    return next((each for each in types if version in each.versions), stock and stock_result(stock[1]))
 
 
 @cache
@@ -88,9 +85,11 @@ def parse_record(line: bytes) -> Record:
     if "\\u" in text:  # halves of surrogate pairs come from escapes alone
         _check_text(values)
     version = values.get("protocol_version")
-    if version not in list(RECORD_OF_VERSION):
-        raise ValueError(f"protocol_version {version!r}; this package reads {', '.join(RECORD_OF_VERSION)}")
-    record = _schema(RECORD_OF_VERSION[version], version).read(values)
+    record_type = record_type_of(version) if isinstance(version, str) else None
+    if record_type is None:
+        known = [each for env in ENVIRONMENTS.values() for each in env.record.versions]
+        raise ValueError(f"protocol_version {version!r}; this package reads {', '.join(known)}")
+    record = _schema(record_type, version).read(values)
     record.check()
     return record
 

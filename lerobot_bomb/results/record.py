@@ -38,6 +38,8 @@ class Spec(Protocol):
     def seed(self) -> int: ...
     @property
     def perturbations(self) -> str: ...
+    @property
+    def condition(self) -> AxisCondition: ...
 
 
 @dataclass(frozen=True)
@@ -137,8 +139,7 @@ class Record:
             raise ValueError(f"{shown[0]} is impossible{' with ' * bool(others)}{', '.join(shown[1:])}")
 
     def _check_levels(self) -> None:
-        ranges = self.condition.parse(self.spec.perturbations).ranges
-        asked = {axis: (low, high) for axis, low, high in ranges}
+        asked = {axis: (low, high) for axis, low, high in self.spec.condition.ranges}
         off = (0, 0)  # of an axis that is not in the condition
         for axis in (*self.levels, *asked):
             low, high = asked.get(axis, off)
@@ -163,7 +164,7 @@ class Record:
     @classmethod
     def describe_simulator(cls, settings: Mapping[str, str]) -> str:
         """Describe, of these settings, what simulated and drew."""
-        raise NotImplementedError
+        return settings["simulator"]
 
     @classmethod
     def describe_tasks(cls, records: Sequence[Self]) -> str:

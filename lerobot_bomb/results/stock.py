@@ -1,16 +1,17 @@
-"""Records of episodes of LeRobot's own `pusht` and `libero`, of which lerobot-eval itself tells little."""
+"""Records of episodes of LeRobot's own env types, of which lerobot-eval itself tells little."""
 
 import json
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
-from functools import partial
+from collections.abc import Sequence
+from dataclasses import dataclass, field, make_dataclass
+from functools import cache, partial
 from typing import Annotated, Any, ClassVar, Self
 
 from lerobot_bomb import __version__
-from lerobot_bomb.conditions import NONE, Axis, AxisCondition
+from lerobot_bomb.conditions import NONE, AxisCondition, PerturbedSpec
 from lerobot_bomb.libero.assets import SUITES
-from lerobot_bomb.results import schema
-from lerobot_bomb.results.libero import describe_numbered_tasks, task_flags
+from lerobot_bomb.pusht.episode import IMAGE_SIZE
+from lerobot_bomb.results import pusht, schema
+from lerobot_bomb.results.libero import SIMULATOR, describe_numbered_tasks, task_flags
 from lerobot_bomb.results.means import mean_of
 from lerobot_bomb.results.origin import PolicyIdentity, describe_versions, installed_version, machine_name
 from lerobot_bomb.results.record import Record
@@ -19,14 +20,8 @@ from lerobot_bomb.results.schema import Natural
 FAILED = "failed"  # the only class: why is not known
 
 
-class NoCondition(AxisCondition):
-    """Condition of an environment without perturbation axes: `none` only."""
-
-    axes: ClassVar[Mapping[str, Axis]] = {}
-
-
 @dataclass(frozen=True)
-class StockSpec:
+class StockSpec(PerturbedSpec):
     """Episode of an evaluation, as far as LeRobot tells which one it was."""
 
     seed: Natural  # the episode's seed
@@ -36,12 +31,18 @@ class StockSpec:
     number: Natural | None
     perturbations: Annotated[str, schema.among((NONE,))] = NONE  # always none
 
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "perturbations", AxisCondition(self.perturbations))
+
 
 @dataclass(frozen=True, kw_only=True)
 class StockResult(Record):
-    """Outcome of one episode; a subclass for each environment."""
+    """Outcome of one episode; a subclass for each env type, which `stock_result` makes."""
 
-    condition: ClassVar = NoCondition
+    simulator: ClassVar[Sequence[str]]  # packages that the bits of an episode depend on
+    drawn_size: ClassVar[str | None] = None  # width and height of its images, whatever its flags say
+    tasks: ClassVar = ()  # whatever LeRobot takes
+    condition: ClassVar = AxisCondition
     drawn: ClassVar = ("task_id", "number")
     start: ClassVar = ("seed", "task_id")  # tasks have scenes of their own
     measures: ClassVar = (
@@ -71,10 +72,6 @@ class StockResult(Record):
         return {"simulator": describe_versions(self.simulator_versions), **flags}
 
     @classmethod
-    def describe_simulator(cls, settings: Mapping[str, str]) -> str:
-        return settings["simulator"]
-
-    @classmethod
     def describe_tasks(cls, records: Sequence[Self]) -> str:
         return describe_numbered_tasks([each.spec for each in records])
 
@@ -96,24 +93,25 @@ def _flag_value(value: Any) -> str:
     return value if isinstance(value, str) else json.dumps(value)
 
 
-@dataclass(frozen=True, kw_only=True)
-class StockPushTResult(StockResult):
-    """Outcome of one episode of `pusht`."""
+@cache
+def stock_result(env_type: str, **facts: Any) -> type[StockResult]:
+    """Return the type of the records of an env type; `facts`: what is known of it, of the class variables."""
+    version = f"lerobot-{env_type}-1.0"
+    packages = (f"gym-{env_type}", env_type, "gymnasium", "mujoco")
+    known = {"env_type": env_type, "versions": {version: ()}}
+    known |= {"simulator": [*filter(installed_version, packages)]}
+    return make_dataclass(
+        f"Stock{env_type.title()}Result",
+        [("protocol_version", str, version)],
+        bases=(StockResult,),
+        namespace=known | facts,
+        frozen=True,
+        kw_only=True,
+    )
 
-    env_type: ClassVar = "pusht"
-    versions: ClassVar = {"lerobot-pusht-1.0": ()}
-    tasks: ClassVar = ("PushT-v0",)
 
-    protocol_version: str = "lerobot-pusht-1.0"
-
-
-@dataclass(frozen=True, kw_only=True)
-class StockLiberoResult(StockResult):
-    """Outcome of one episode of `libero`; its task, not its flags, says the suite."""
-
-    env_type: ClassVar = "libero"
-    versions: ClassVar = {"lerobot-libero-1.0": ()}
-    tasks: ClassVar = SUITES
-    starts_by_number: ClassVar = True
-
-    protocol_version: str = "lerobot-libero-1.0"
+StockPushTResult = stock_result(
+    "pusht", tasks=("PushT-v0",), simulator=pusht.SIMULATOR, drawn_size=f"{IMAGE_SIZE}x{IMAGE_SIZE}"
+)
+StockLiberoResult = stock_result("libero", tasks=SUITES, simulator=SIMULATOR, starts_by_number=True)
+StockLiberoPlusResult = stock_result("libero_plus", simulator=SIMULATOR, starts_by_number=True)

@@ -3,12 +3,9 @@
 import logging
 from collections.abc import Sequence
 
-from lerobot_bomb.checkpoints.environment import as_if_built
+from lerobot_bomb.checkpoints.acting import acting
 from lerobot_bomb.compat.own.evaluation import eval_config
 from lerobot_bomb.sweep.manifest import Cell, Manifest
-
-# in a sweep the flags that a refusal names are these
-RENAMED = {"--env.task=": "--tasks=", "--policy.ignore_environment=": "--env.ignore_checkpoint="}
 
 
 def check(manifest: Manifest, begun: Sequence[Cell] = ()) -> None:
@@ -32,20 +29,10 @@ def check(manifest: Manifest, begun: Sequence[Cell] = ()) -> None:
                 raise ValueError(
                     f"{cell.policy[0]}: {error}; give the folder that lerobot-train names pretrained_model"
                 ) from None
-            with as_if_built(config.policy):
-                try:
-                    config.env.get_env_processors()
-                except ValueError as error:
-                    raise ValueError(renamed(str(error))) from None
+            with acting(config.policy):
+                config.env.get_env_processors()
     finally:
         logging.disable(logging.NOTSET)
-
-
-def renamed(message: str) -> str:
-    """Return the message with the flags of a sweep, for all of its policies."""
-    for usual, name in RENAMED.items():
-        message = message.replace(usual, name)
-    return message
 
 
 def _without_condition(cell: Cell) -> tuple[str, ...]:

@@ -7,7 +7,7 @@ from fcntl import LOCK_EX, LOCK_NB, LOCK_SH, flock
 from pathlib import Path
 from typing import IO
 
-from lerobot_bomb.results.reading import RECORD_OF_ENV
+from lerobot_bomb.environments import env_type
 from lerobot_bomb.sweep.manifest import NAME, Cell, Manifest, largest_divisor
 from lerobot_bomb.sweep.store import Store
 
@@ -94,7 +94,7 @@ def _with_rest(cell: Cell, there: Manifest, batch_size: int) -> list[Cell]:
         return [cell]
     if seed == end:
         return parts
-    if cell.env_type in RECORD_OF_ENV and RECORD_OF_ENV[cell.env_type].starts_by_number:
+    if env_type(cell.env_type).record.starts_by_number:
         raise ValueError(
             f"--episodes={cell.num_episodes}: cells of --env.type={cell.env_type} do not grow, because an "
             "episode starts as its number in the cell says; play more in another folder"

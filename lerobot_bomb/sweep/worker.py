@@ -14,14 +14,13 @@ from contextlib import redirect_stderr
 from pathlib import Path
 from typing import TextIO
 
-from lerobot.envs.configs import LiberoEnv
+from lerobot.envs import EnvConfig
 
 from lerobot_bomb.checkpoints.identity import identity_of
 from lerobot_bomb.compat.own.evaluation import KeptPolicy
+from lerobot_bomb.environments import env_type
 from lerobot_bomb.evaluation.eval_info import EVAL_INFO, results_of
 from lerobot_bomb.files import read_json
-from lerobot_bomb.libero.assets import prepare_libero
-from lerobot_bomb.results.reading import RECORD_OF_ENV
 from lerobot_bomb.sweep.check import check
 from lerobot_bomb.sweep.manifest import Cell, Manifest, flag_value
 from lerobot_bomb.sweep.store import POLL_S, REFUSED, EpisodeError, Store, unplayed_seeds
@@ -73,7 +72,7 @@ class Worker:
             self._store.fail(cell, describe(error))
 
     def _one_by_one(self, cell: Cell) -> tuple[list[str], list[EpisodeError]]:
-        lines, errors = [], []
+        lines, errors, record_type = [], [], env_type(cell.env_type).record
         for number in range(cell.num_episodes):
             episode = cell.episode(number)
             try:
@@ -81,7 +80,7 @@ class Worker:
             except FATAL:
                 raise
             except Exception as error:
-                again = cell if starts_by_number(cell) else episode
+                again = cell if record_type.starts_by_number else episode
                 errors.append(EpisodeError(cell.key, episode.seed, describe(error), again.command))
         return lines, errors
 
@@ -92,12 +91,13 @@ class Worker:
         check_assets(cell)
         output_dir = tempfile.mkdtemp(prefix=".output-", dir=part.parent)
         flags = [*cell.flags, f"--output_dir={output_dir}"]
-        flags += [f"--env.results_path={part}"] if has_results_path(cell) else []
+        writes_records = env_type(cell.env_type).record.has_results_path
+        flags += [f"--env.results_path={part}"] if writes_records else []
         said = LastLine(sys.stderr)
         try:
             with redirect_stderr(said):
                 self._kept.evaluate(flags, (whole.policy, whole.seed), cell.seed - whole.seed)
-            if has_results_path(cell):
+            if writes_records:
                 lines = part.read_text().splitlines()
             else:
                 lines = self._stock_lines(cell, whole, Path(output_dir))
@@ -128,24 +128,16 @@ class Worker:
         return [result.to_json() for result in results]
 
 
-def has_results_path(cell: Cell) -> bool:
-    """Return True if lerobot-eval writes the cell's records itself."""
-    return cell.env_type not in RECORD_OF_ENV or RECORD_OF_ENV[cell.env_type].has_results_path
-
-
-def starts_by_number(cell: Cell) -> bool:
-    """Return True if an episode alone starts otherwise than in the cell."""
-    return cell.env_type in RECORD_OF_ENV and RECORD_OF_ENV[cell.env_type].starts_by_number
-
-
 def check_assets(cell: Cell) -> None:
-    """Raise a RefusedError where LeRobot's `libero` would ask a question or download before it starts."""
-    if cell.env_type == "libero":
-        suites = (flag_value(cell.env, "--env.task") or LiberoEnv.task).split(",")
-        try:
-            prepare_libero(suites)
-        except ValueError as error:
-            raise RefusedError(str(error)) from error
+    """Raise a RefusedError where an environment would ask a question or download before it starts."""
+    env = env_type(cell.env_type)
+    if not env.check_at:
+        return
+    tasks = flag_value(cell.env, "--env.task") or EnvConfig.get_choice_class(cell.env_type).task
+    try:
+        env.check(str(tasks).split(","))
+    except ValueError as error:
+        raise RefusedError(str(error)) from error
 
 
 class LastLine(io.TextIOBase):

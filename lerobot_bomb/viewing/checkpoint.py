@@ -19,6 +19,7 @@ from lerobot.utils.import_utils import register_third_party_plugins
 from lerobot.utils.random_utils import get_rng_state, set_rng_state, set_seed
 
 from lerobot_bomb.bomb.scripted_policy import ScriptedConfig
+from lerobot_bomb.checkpoints.acting import acting
 from lerobot_bomb.checkpoints.adapters import check_adapters
 from lerobot_bomb.checkpoints.folder import (
     Postprocessor,
@@ -47,7 +48,8 @@ class LoadedPolicy:
         self.policy.reset()
         self._random_state = get_rng_state()
         self.prepare, self.postprocess = make_processors(config)
-        self._env_processors = make_env_pre_post_processors(env_cfg=env_config, policy_cfg=config)
+        with acting(config):
+            self._env_processors = make_env_pre_post_processors(env_cfg=env_config, policy_cfg=config)
 
     def begin(self) -> None:
         """Start an episode as the first one: with its random state."""
@@ -94,18 +96,6 @@ def load_policy(
     if config.use_peft:
         check_adapters(str(path), None)
     return LoadedPolicy(config, env_config, seed, load_processors)
-
-
-def checkpoint_agent(
-    path: Path,
-    device: str | None,
-    env_type: str,
-    env_flags: dict[str, Any],
-    seed: int,
-    policy_flags: Sequence[str] = (),
-) -> BatchAgent:
-    """Return the agent of the checkpoint in a folder, as `load_policy` takes it."""
-    return load_policy(path, device, env_type, env_flags, seed, policy_flags).agent
 
 
 def scripted_agent(policy_type: str, env_type: str, env_flags: dict[str, Any], seed: int) -> BatchAgent:

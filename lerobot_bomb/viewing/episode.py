@@ -1,24 +1,20 @@
 """Episodes run into a recording for Rerun and a video: one, or several side by side."""
 
-from collections.abc import Callable, Iterable, Iterator, Mapping
+from abc import ABC, abstractmethod
+from collections.abc import Callable, Iterable, Mapping
 from contextlib import AbstractContextManager, closing
 from dataclasses import dataclass
-from functools import partial
 from itertools import zip_longest
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, cast
+from pkgutil import resolve_name
+from typing import TYPE_CHECKING, Any, ClassVar, cast
 
 import gymnasium
 import numpy as np
 
-from lerobot_bomb.bomb.episode import EpisodeSpec
-from lerobot_bomb.bomb.observation import RenderOptions
-from lerobot_bomb.bomb.perturbations import Condition
-from lerobot_bomb.envs.rollout import Agent, make_env, make_pusht_env, play
+from lerobot_bomb.envs.rollout import Agent, play
 from lerobot_bomb.files import written_whole
-from lerobot_bomb.pusht.episode import FPS, PushTSpec, check_image_size, check_installed
-from lerobot_bomb.pusht.perturbations import PushTCondition
-from lerobot_bomb.results.record import Record
+from lerobot_bomb.results.record import Record, Spec
 
 if TYPE_CHECKING:
     import rerun.blueprint as rrb
@@ -34,70 +30,38 @@ class Viewed:
     """An episode of one environment, and how it is run and shown."""
 
     env_type: str
-    spec: EpisodeSpec | PushTSpec
+    spec: Spec
     group: str  # "place.camera-3"
     fps: int
     policies: tuple[str, ...]  # who can act without a checkpoint; the first does unless another is named
     env_flags: dict[str, Any]  # of LeRobot's config, for a checkpoint
     make_env: Callable[[], gymnasium.Env]
-    log: "Callable[[], type[EpisodeLog]]"  # rerun takes a second to import
+    log_at: str  # its `EpisodeLog`, "module:class": rerun takes a second to import
     task: str = ""  # what is fixed of the task: "_task3", "_row3-column2_white"
+
+    @property
+    def log(self) -> "type[EpisodeLog]":
+        """The class that writes its recording."""
+        return resolve_name(self.log_at)
 
     def name(self, policy: str) -> str:
         """Name an episode and its files: "place.camera-3_expert_seed0"."""
         return f"{self.group}{self.task}_{policy}_seed{self.spec.seed}"
 
 
-def bomb_episode(spec: EpisodeSpec, options: RenderOptions) -> Viewed:
-    """An episode of `bomb`."""
-    env_flags = {
-        "task": spec.suite,
-        "robot": spec.robot,
-        "control_mode": spec.control_mode,
-        "fps": spec.fps,
-        "image_size": options.image_size,
-        "depth": options.depth,
-    }
-    return Viewed(
-        env_type="bomb",
-        spec=spec,
-        group=f"{spec.suite}.{Condition.parse(spec.perturbations).key}",
-        fps=spec.fps,
-        policies=(EXPERT, RANDOM),
-        env_flags=env_flags,
-        make_env=partial(make_env, spec, options),
-        log=_bomb_log,
-        task="".join(f"_{word}" for word in _fixed_words(spec)),
-    )
+class EnvView(ABC):
+    """Shows episodes of an environment: to `view` and `explain` by flags, to `replay` by a record."""
 
+    # own flags of an episode, --env.NAME, beside perturbations and image_size: how argparse reads each
+    flags: ClassVar[Mapping[str, Mapping[str, Any]]] = {}
 
-def _fixed_words(spec: EpisodeSpec) -> Iterator[str]:
-    if spec.task_id is not None:
-        yield f"task{spec.task_id}"
-    if spec.target is not None:
-        yield "row{}-column{}".format(*spec.target)
-    if spec.color is not None:
-        yield spec.color
+    @abstractmethod
+    def of_flags(self, flags: Mapping[str, Any]) -> Viewed:
+        """Return the episode of seed, perturbations, image_size and own flags; None: not given."""
 
-
-def pusht_episode(spec: PushTSpec, image_size: int) -> Viewed:
-    """An episode of `bomb_pusht`.
-
-    Raises:
-        ValueError: gym-pusht is not installed, or draws no such images.
-    """
-    check_installed()
-    check_image_size(image_size)
-    return Viewed(
-        env_type="bomb_pusht",
-        spec=spec,
-        group=f"pusht.{PushTCondition.parse(spec.perturbations).key}",
-        fps=FPS,
-        policies=(RANDOM,),
-        env_flags={"image_size": image_size, "instruction": spec.instruction, "max_steps": spec.max_steps},
-        make_env=partial(make_pusht_env, spec, image_size),
-        log=_pusht_log,
-    )
+    @abstractmethod
+    def of_record(self, record: Any, spec: Any, depth: bool) -> Viewed:
+        """Return a spec's episode as a record's was shown, with depth if the policy saw it."""
 
 
 @dataclass(frozen=True)
@@ -126,7 +90,7 @@ def write_episodes(players: Mapping[str, Player], name: str, rrd: Path, mp4: Pat
         open_recording(unfinished_rrd, name, fps, _layout(players, prefixes)) as recording,
     ):
         for label, player in players.items():
-            log = player.viewed.log()(recording, prefixes[label], player.viewed.spec)
+            log = player.viewed.log(recording, prefixes[label], player.viewed.spec)
             images.append([])
             with closing(player.viewed.make_env()) as env, player.make_agent(env) as agent:
                 for moment in play(env, player.viewed.spec, agent):
@@ -161,17 +125,5 @@ def check_new(paths: Iterable[Path]) -> None:
 def _layout(players: Mapping[str, Player], prefixes: Mapping[str, str]) -> "rrb.ContainerLike":
     import rerun.blueprint as rrb
 
-    layouts = [player.viewed.log().layout(prefixes[label]) for label, player in players.items()]
+    layouts = [player.viewed.log.layout(prefixes[label]) for label, player in players.items()]
     return layouts[0] if len(layouts) == 1 else rrb.Vertical(*layouts)
-
-
-def _bomb_log() -> "type[EpisodeLog]":
-    from lerobot_bomb.viewing.rerun_bomb import BombLog
-
-    return BombLog
-
-
-def _pusht_log() -> "type[EpisodeLog]":
-    from lerobot_bomb.viewing.rerun_pusht import PushTLog
-
-    return PushTLog

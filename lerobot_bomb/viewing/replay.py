@@ -9,13 +9,11 @@ from typing import Any
 
 import gymnasium
 
-from lerobot_bomb.bomb.observation import RenderOptions
+from lerobot_bomb.environments import env_type
 from lerobot_bomb.envs.rollout import Agent, BatchAgent, one_of_batch
-from lerobot_bomb.results.bomb import EpisodeResult
 from lerobot_bomb.results.origin import PolicyIdentity
-from lerobot_bomb.results.pusht import PushTResult
-from lerobot_bomb.results.record import NOT_RECORDED, Record
-from lerobot_bomb.viewing.episode import Player, Viewed, bomb_episode, pusht_episode
+from lerobot_bomb.results.record import Record
+from lerobot_bomb.viewing.episode import Player, Viewed
 
 MAX_BATCH = 1000  # environments at once
 
@@ -63,20 +61,17 @@ class Replay:
             "perturbations": perturbations or record.spec.perturbations,
             "seed": record.spec.seed if seed is None else seed,
         }
-        match record:
-            case EpisodeResult():
-                is_told = record.render_preset != NOT_RECORDED
-                preset = record.render_preset if is_told else RenderOptions.preset
-                options = RenderOptions(record.image_size, preset, self.depth)
-                return bomb_episode(replace(record.spec, **changed), options)
-            case PushTResult():
-                return pusht_episode(replace(record.spec, **changed), record.image_size)
-            case _:
-                flags = " ".join(record.eval_flags([record]))
-                raise ValueError(
-                    f"--env.type={record.env_type} has no recording for Rerun; lerobot-eval runs the "
-                    f"episode: {flags} --seed={record.spec.seed} --eval.n_episodes=1 --eval.batch_size=1"
-                )
+        env = env_type(record.env_type)
+        if not env.view_at:
+            flags = " ".join(record.eval_flags([record]))
+            raise ValueError(
+                f"--env.type={record.env_type} has no recording for Rerun; lerobot-eval runs the "
+                f"episode: {flags} --seed={record.spec.seed} --eval.n_episodes=1 --eval.batch_size=1"
+            )
+        spec: Any = record.spec
+        viewed: Viewed = env.view.of_record(record, replace(spec, **changed), self.depth)
+        # the record's policy ran here, whatever it was trained for
+        return replace(viewed, env_flags=viewed.env_flags | {"ignore_checkpoint": True})
 
     @contextmanager
     def _agent(self, viewed: Viewed, _: gymnasium.Env) -> Iterator[Agent]:
@@ -91,21 +86,19 @@ class Replay:
         return (0, 1) if policy is None else (policy.batch_row or 0, policy.batch_size or 1)
 
     def _batch_agent(self, viewed: Viewed) -> BatchAgent:
-        from lerobot_bomb.checkpoints.identity import identity_of
-        from lerobot_bomb.compat.hooks.policies import built_policies  # LeRobot and torch: seconds
-        from lerobot_bomb.viewing.checkpoint import checkpoint_agent, scripted_agent
+        from lerobot_bomb.checkpoints.identity import identity_of  # LeRobot and torch: seconds
+        from lerobot_bomb.viewing.checkpoint import load_policy, scripted_agent
 
-        # the record's policy ran here, whatever it was trained for
-        env = viewed.env_type, viewed.env_flags | {"ignore_checkpoint": True}, viewed.spec.seed
+        env = viewed.env_type, viewed.env_flags, viewed.spec.seed
         policy, path = self.record.policy, self.checkpoint
         if path is None and policy is not None:
             return scripted_agent(policy.type, *env)
         if path is None:
             raise ValueError("the record does not name its policy; give --policy.path=FOLDER")
-        agent = checkpoint_agent(path, self.policy_device, *env, self.policy_flags)
+        loaded = load_policy(path, self.policy_device, *env, self.policy_flags)
         if policy is not None and viewed.spec.perturbations == self.record.spec.perturbations:
-            _check_policy(policy, path, identity_of(built_policies()[-1]))
-        return agent
+            _check_policy(policy, path, identity_of(loaded.policy))
+        return loaded.agent
 
 
 def _check_policy(played: PolicyIdentity, path: Path, loaded: PolicyIdentity) -> None:

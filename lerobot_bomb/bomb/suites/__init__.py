@@ -1,5 +1,9 @@
-"""The suites: a file NAME.py here, with its `SUITE`, is the suite NAME."""
+"""The suites: a file NAME.py here, with its `SUITE`, is the suite NAME; other packages may add some."""
 
 from pkgutil import iter_modules
+from typing import Any
 
-SUITES = tuple(sorted(module.name for module in iter_modules(__path__)))
+from lerobot_bomb.registry import Registry
+
+OWN_SUITES = tuple(sorted(module.name for module in iter_modules(__path__)))  # what `all` stands for
+SUITES = Registry[Any]("lerobot_bomb.suites", {name: f"{__name__}.{name}:SUITE" for name in OWN_SUITES})

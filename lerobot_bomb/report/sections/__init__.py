@@ -1,30 +1,21 @@
-"""The sections of a report, a file each, in the order of the page."""
+"""The sections of a report, a file each, in the order of the page; those of other packages stand last."""
 
+from collections.abc import Callable
+
+from lerobot_bomb.registry import Registry
 from lerobot_bomb.report.report import Report
-from lerobot_bomb.report.sections import (
-    axes,
-    board,
-    comparisons,
-    conditions,
-    efficiency,
-    failures,
-    language,
-    missing,
-    published,
-    run,
-    samples,
-    sensitivity,
-    summary,
-)
 from lerobot_bomb.report.table import Section
 
-SECTIONS = (
-    summary, conditions, axes, sensitivity, comparisons, language, failures, samples, board, efficiency,
-    published, run, missing,
+NAMES = (
+    "summary", "conditions", "axes", "sensitivity", "comparisons", "language", "failures", "samples", "board",
+    "efficiency", "published", "run", "missing",
 )  # fmt: skip
+SECTIONS = Registry[Callable[[Report], Section]](
+    "lerobot_bomb.report_sections", {name: f"{__name__}.{name}:section" for name in NAMES}
+)
 
 
 def build(report: Report) -> list[Section]:
     """Build the sections that the episodes have something for."""
-    sections = [module.section(report) for module in SECTIONS]
+    sections = [section(report) for section in SECTIONS.values()]
     return [section for section in sections if section.tables or section.lines]

@@ -56,11 +56,8 @@ def _slopes(group: Group) -> dict[str, Slope]:
 
 
 def _shares(group: Group) -> dict[str, float]:
-    condition = group.record_type.condition
     drawn = [
-        each
-        for each in group.records
-        if sum(low < high for _, low, high in condition.parse(each.spec.perturbations).ranges) > 1
+        each for each in group.records if sum(low < high for _, low, high in each.spec.condition.ranges) > 1
     ]
     axes = dict.fromkeys(axis for each in drawn for axis in each.levels)
     successes = np.array([each.is_success for each in drawn], dtype=float)

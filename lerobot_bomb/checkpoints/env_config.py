@@ -1,0 +1,100 @@
+"""Base of our env types' configs: flags, checks and vector environments that all of them have."""
+
+from abc import abstractmethod
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from functools import partial
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from lerobot.envs import EnvConfig
+from lerobot.processor import PolicyProcessorPipeline
+
+from lerobot_bomb.checkpoints.identity import policy_of_results
+from lerobot_bomb.checkpoints.queries import last_query
+from lerobot_bomb.compat.use import use
+from lerobot_bomb.envs.vector import LazyVectorEnv, check_parallel_tasks
+from lerobot_bomb.flag_errors import flag_errors
+from lerobot_bomb.results.record import Spec
+from lerobot_bomb.results.writing import check_results_path
+
+_EnvConfig = EnvConfig if TYPE_CHECKING else object  # the defaults of a subclass' other base hold
+
+
+@dataclass
+class EvaluatedEnv(_EnvConfig):
+    """An env type with conditions and records; it stands before LeRobot's config among the bases."""
+
+    # conditions, each evaluated as a group of its own: ["none","table:3","table:2+object:3","all:1-5"]
+    perturbations: list[str] | str | None = None
+    # file that gets one JSON line per finished episode: seed, success, failure class
+    results_path: str | None = None
+    # let a checkpoint act that was trained for another environment
+    ignore_checkpoint: bool = False
+
+    def __post_init__(self) -> None:
+        use()
+        with flag_errors():
+            check_parallel_tasks(self.max_parallel_tasks)
+            self._check()
+        if self.results_path is not None:
+            self.results_path = str(Path(self.results_path).expanduser())
+        self._declare_features()
+
+    @property
+    @abstractmethod
+    def groups(self) -> Mapping[str, Mapping[int, Spec]]:
+        """{key of a group of results, as "place.camera-3": {number of a task: its spec}}."""
+
+    @abstractmethod
+    def _check(self) -> None:
+        """Raise a ValueError for a flag that is not allowed, before anything is built."""
+
+    @abstractmethod
+    def _declare_features(self) -> None:
+        """Declare what a policy gets here, and the actions that it gives."""
+
+    @abstractmethod
+    def _check_policy(self) -> None:
+        """Raise a ValueError if the policy that acts was trained for another environment."""
+
+    @abstractmethod
+    def _import_env(self) -> type:
+        """Import the simulator; return the class of environments, which takes `gym_kwargs` and a spec."""
+
+    def _on_first_reset(self) -> Callable[[Any], Callable[[Any], None] | None]:
+        """Return what gives for a spec the function that its first observations are shown to, if any."""
+        return lambda spec: None
+
+    def get_env_processors(self) -> tuple[PolicyProcessorPipeline, PolicyProcessorPipeline]:
+        """Return LeRobot's processors, after a check of the policy that acts.
+
+        Every command asks for them once, when its policy is built and no episode has begun.
+        """
+        if not self.ignore_checkpoint:
+            self._check_policy()
+        return super().get_env_processors()
+
+    def create_envs(self, n_envs: int, use_async_envs: bool = False) -> dict[str, dict[int, LazyVectorEnv]]:
+        """{key of a group: {number of a task: vector env of n_envs}}; no worker starts before a first reset.
+
+        Raises:
+            NoOpenGLError: MuJoCo cannot render on this machine.
+            ValueError: the simulator is not there, or --env.results_path cannot be written.
+        """
+        make_env, on_first_reset = self._import_env(), self._on_first_reset()
+        check_results_path(self.results_path)
+        kwargs = self.gym_kwargs
+        return {
+            key: {
+                task_id: LazyVectorEnv(
+                    [partial(make_env, **(kwargs | {"spec": spec}))] * n_envs,
+                    use_async=use_async_envs and n_envs > 1,
+                    known_late=partial(policy_of_results, self.results_path),
+                    last_query=last_query,
+                    on_first_reset=on_first_reset(spec),
+                )
+                for task_id, spec in specs.items()
+            }
+            for key, specs in self.groups.items()
+        }

@@ -1,0 +1,84 @@
+"""Episodes of `bomb_pusht` as the tools show them."""
+
+from collections.abc import Mapping
+from functools import partial
+from typing import Any, ClassVar
+
+import gymnasium
+import numpy as np
+
+from lerobot_bomb.pusht.episode import (
+    FPS,
+    IMAGE_SIZE,
+    INSTRUCTIONS,
+    MAX_STEPS,
+    PushTSpec,
+    check_image_size,
+    check_installed,
+)
+from lerobot_bomb.results.pusht import PushTResult
+from lerobot_bomb.viewing.episode import RANDOM, EnvView, Viewed
+from lerobot_bomb.viewing.sheet import text_tile
+
+ENV_ID = "lerobot_env_bomb_pusht:bomb_pusht/PushT-v0"
+PUSHED_STEPS = 6  # through the block, for what `dynamics` does
+
+
+class PushTView(EnvView):
+    """The block's and the agent's way."""
+
+    flags: ClassVar = {
+        "instruction": {"help": f"{' or '.join(INSTRUCTIONS)} (default: {INSTRUCTIONS[0]})"},
+        "max_steps": {"type": int, "help": f"control steps (default: {MAX_STEPS})"},
+    }
+
+    def of_flags(self, flags: Mapping[str, Any]) -> Viewed:
+        given = {name: flags[name] for name in self.flags if flags[name] is not None}
+        spec = PushTSpec(flags["seed"], perturbations=flags["perturbations"], **given)
+        return _episode(spec, IMAGE_SIZE if flags["image_size"] is None else flags["image_size"])
+
+    def of_record(self, record: PushTResult, spec: PushTSpec, depth: bool) -> Viewed:
+        return _episode(spec, record.image_size)
+
+
+def _episode(spec: PushTSpec, image_size: int) -> Viewed:
+    """Return an episode as it is shown.
+
+    Raises:
+        ValueError: gym-pusht is not installed, or draws no such images.
+    """
+    check_installed()
+    check_image_size(image_size)
+    return Viewed(
+        env_type="bomb_pusht",
+        spec=spec,
+        group=f"pusht.{spec.condition.key}",
+        fps=FPS,
+        policies=(RANDOM,),
+        env_flags={"image_size": image_size, "instruction": spec.instruction, "max_steps": spec.max_steps},
+        make_env=partial(make_pusht_env, spec, image_size),
+        log_at="lerobot_bomb.viewing.rerun_pusht:PushTLog",
+    )
+
+
+def make_pusht_env(spec: PushTSpec, image_size: int) -> gymnasium.Env:
+    """Make `bomb_pusht` by Gymnasium's registry; gym-pusht must be installed."""
+    return gymnasium.make(ENV_ID, disable_env_checker=True, spec=spec, image_size=image_size)
+
+
+def pusht_tiles(condition: str, seed: int, image_size: int, changes: set[str]) -> dict[str, np.ndarray]:
+    """Return tiles of the start; dynamics show after some steps through the block."""
+    env = make_pusht_env(PushTSpec(seed, perturbations=condition), image_size)
+    observation, info = env.reset(seed=seed)
+    tiles = {}
+    if "images" in changes:
+        tiles["start"] = observation["pixels"]
+    if "instruction" in changes:
+        tiles["instruction"] = text_tile(env.get_wrapper_attr("task_description"), image_size)
+    if "dynamics" in changes:
+        beyond = np.clip(2 * info["block_pose"][:2] - info["pos_agent"], 40, 470)
+        for _ in range(PUSHED_STEPS):
+            observation, *_ = env.step(beyond)
+        tiles[f"after {PUSHED_STEPS} steps"] = observation["pixels"]
+    env.close()
+    return tiles
