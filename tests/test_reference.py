@@ -2,6 +2,7 @@
 
 import dataclasses
 import re
+from difflib import unified_diff
 from typing import Any
 
 import pytest
@@ -31,8 +32,9 @@ def first_cells(text: str) -> list[str]:
 
 
 def test_the_committed_pages_are_the_generated_ones(made: dict[str, str]) -> None:
-    stale = [name for name, text in made.items() if (FOLDER / name).read_text() != text]
-    assert stale == [], "the code has changed: run `make reference`"
+    committed = {name: (FOLDER / name).read_text().splitlines() for name in made}
+    changed = {name: [*unified_diff(committed[name], text.splitlines(), n=0)] for name, text in made.items()}
+    assert not any(changed.values()), f"the code has changed, run `make reference`: {changed}"
     assert {path.name for path in FOLDER.iterdir()} == made.keys()
 
 
