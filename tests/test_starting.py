@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 from lerobot.configs import PreTrainedConfig
 from lerobot.datasets import LeRobotDataset
+from lerobot.envs import make_env_config
 from lerobot.policies.factory import make_policy, make_pre_post_processors
 from policy_cases import CASES, save_checkpoint
 from safetensors.torch import load_file
@@ -128,6 +129,13 @@ def test_dimensions_that_are_text_are_taken(
     features = {**policy.config.input_features, **policy.config.output_features}
     assert features[STATE if key == "state" else ACTION].shape == (6,)
     assert 0 < loss_of(policy, datasets[key]) < 100
+
+
+def test_an_environment_with_other_actions_is_told(policy_type: str, checkpoints: dict[str, Path]) -> None:
+    config = PreTrainedConfig.from_pretrained(checkpoints[policy_type])
+    config.pretrained_path = checkpoints[policy_type]
+    with pytest.raises(ValueError, match=r"--policy\.path=\S+ acts with 4 numbers, this environment takes 2"):
+        make_policy(config, env_cfg=make_env_config("pusht"))
 
 
 def test_the_exported_backbone_starts_on_any_data(

@@ -26,12 +26,12 @@ def way_to_start_otherwise(checkpoint: str | Path, policy_type: str) -> str:
 
 
 def check_start(checkpoint: str | Path, config: Any, meta: "LeRobotDatasetMetadata | None") -> None:
-    """Raise a ValueError unless a config is a checkpoint's own, and the data that is trained on fits it.
+    """Raise a ValueError unless a config is a checkpoint's own, and data or environment have its actions.
 
     Of what the weights do not depend on (sizes of images, numbers that are written as text) the config takes
     the data's shapes.
     """
-    if (config.missing_parts() is None and meta is None) or not _has_config(checkpoint):
+    if not _has_config(checkpoint):
         return
     saved: Any = PreTrainedConfig.from_pretrained(checkpoint)
     if _lacks_architecture(config) and not _lacks_architecture(saved):
@@ -40,7 +40,9 @@ def check_start(checkpoint: str | Path, config: Any, meta: "LeRobotDatasetMetada
             f"checkpoint with --policy.path={checkpoint}, which takes its config, too; "
             f"{way_to_start_otherwise(checkpoint, config.type)}"
         )
-    if meta is not None:
+    if meta is None:
+        _fit_environment(checkpoint, config, saved)
+    else:
         _fit(checkpoint, config, saved, dataset_to_policy_features(meta.features))
 
 
@@ -50,6 +52,17 @@ def _has_config(checkpoint: str | Path) -> bool:
 
 def _lacks_architecture(config: Any) -> bool:
     return getattr(config, "vlm_config", {}) is None
+
+
+def _fit_environment(checkpoint: str | Path, config: Any, saved: Any) -> None:
+    """Raise a ValueError if the environment whose actions LeRobot put into a config has others."""
+    there, here = ((each.output_features or {}).get(ACTION) for each in (saved, config))
+    if there and here and tuple(there.shape) != tuple(here.shape):
+        trained = f"; it was trained for {saved.environment}" if saved.environment else ""
+        raise ValueError(
+            f"--policy.path={checkpoint} acts with {there.shape[0]} numbers, this environment takes "
+            f"{here.shape[0]}{trained}"
+        )
 
 
 def _fit(checkpoint: str | Path, config: Any, saved: Any, of_data: dict[str, PolicyFeature]) -> None:
