@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 import torch
 from fdvla_cases import WORKSPACE, make_batch, make_config, make_policy
-from torch import Tensor
+from torch import Tensor, nn
 
 from lerobot_bomb.bomb.pointing import SPOTS_XY_M
 from lerobot_bomb.explain.activations import all_heads, all_layers, all_mlps
@@ -195,12 +195,14 @@ def test_the_gripper_is_read_in_metres() -> None:
 def test_an_explanation_says_where_it_points() -> None:
     policy = pointing_policy()
     assert policy.pointer is not None and make_policy().scored().pointed(make_batch(policy, 1)) is None
-    policy.pointer.state_bounds.copy_(torch.tensor([[0.0, -0.1, 0.0], [0.2, 0.1, 0.1]]))
+    pointer = policy.pointer
+    pointer.state_bounds.copy_(torch.tensor([[0.0, -0.1, 0.0], [0.2, 0.1, 0.1]]))
     point_at(policy, 2)
     with torch.no_grad():
         likeliest = [float(xy == (0.14, 0.045)) for xy in SPOTS_XY_M]
-        pointer = policy.pointer
-        for of, bias in ((pointer.spot, likeliest), (pointer.stone[2], [0.5, -1.0]), (pointer.held, [2.0])):
+        beside = pointer.stone[2]
+        assert isinstance(beside, nn.Linear)
+        for of, bias in ((pointer.spot, likeliest), (beside, [0.5, -1.0]), (pointer.held, [2.0])):
             of.weight.zero_()
             of.bias.copy_(torch.tensor(bias))
     batch = make_batch(policy, 1) | {"observation.state": torch.tensor([[0.0, 1.0, 0.0, 0.0]])}

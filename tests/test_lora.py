@@ -125,7 +125,7 @@ def test_adapters_hold_what_points(policy_type: str, tmp_path: Path) -> None:
     batch = with_labels(cases.make_batch(base, 4))
     trained = {name: each for name, each in wrapped.named_parameters() if each.requires_grad}
     before = {name: each.detach().clone() for name, each in trained.items()}
-    optimizer = torch.optim.AdamW(trained.values(), lr=1e-2, weight_decay=0.0)
+    optimizer = torch.optim.AdamW(trained.values(), lr=2e-3, weight_decay=0.0)
     losses = []
     for _ in range(10):
         optimizer.zero_grad()

@@ -192,11 +192,11 @@ def test_policies_without_training_act_anywhere(untrained: str, caplog: pytest.L
     assert not [record for record in caplog.records if "does not know" in record.getMessage()]
 
 
-@pytest.mark.parametrize("name", ["fdvla", "spatialvla_grid"])
+@pytest.mark.parametrize("name", ["fdvla", "spatialvla_grid", "vla0_smol"])
 def test_where_an_action_has_another_size_a_checkpoint_says_where_it_was_trained(name: str) -> None:
     config = PreTrainedConfig.from_pretrained(checkpoint_path(f"bomb:{name}"))
     config.pretrained_path, config.device = Path(checkpoint_path(f"bomb:{name}")), "cpu"
-    told = r"was trained for --env\.type=bomb, where an action has 4 numbers; here it has 2"
+    told = "acts with 4 numbers, this environment takes 2; it was trained for BOMB, task version 1.0"
     with pytest.raises(ValueError, match=told):
         make_policy(config, env_cfg=make_env_config("bomb_pusht"))
 

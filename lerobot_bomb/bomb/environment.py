@@ -68,11 +68,6 @@ class Environment:
         )
 
     @property
-    def action_size(self) -> int:
-        """Numbers of an action."""
-        return len(ACTION_NAMES[self.control_mode])
-
-    @property
     def suites(self) -> frozenset[str] | None:
         """Suites that it shows; None: not known."""
         return None if self.task is None else _suites(self.task)

@@ -47,16 +47,6 @@ class ConfigWithEnvironment(PreTrainedConfig):
         """Return those methods of its type that a checkpoint of this config uses; empty: no choice."""
         return ""
 
-    def check_action_size(self, size: int) -> None:
-        """Raise a ValueError unless an action here has as many numbers as where it was trained."""
-        if self.environment is None or self.environment.action_size == size:
-            return
-        raise ValueError(
-            f"{name_of(self)} was trained for --env.type=bomb, where an action has "
-            f"{self.environment.action_size} numbers; here it has {size}. Evaluate it there, or train a "
-            "policy for this environment"
-        )
-
 
 def check_acting_policy(here: Environment) -> None:
     """Check that the policy that acts was trained for this environment, as far as is known.

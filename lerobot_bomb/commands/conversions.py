@@ -4,14 +4,14 @@ import argparse
 from pathlib import Path
 
 from lerobot_bomb.commands.arguments import add_new_dataset_arguments, path_flag, switch
-from lerobot_bomb.data.resumable import BLOCK_EPISODES, check_repo_id, default_root
+from lerobot_bomb.data.resumable import check_repo_id, default_root
 
 
 def add_conversion_arguments(parser: argparse.ArgumentParser, path: str) -> None:
     """Declare what is converted, and into which dataset."""
     parser.add_argument("path", type=path_flag, help=path)
     add_new_dataset_arguments(parser)
-    summary = f"continue a conversion that was interrupted; its blocks of {BLOCK_EPISODES} episodes are kept"
+    summary = "continue a conversion that was interrupted; its finished blocks of episodes are kept"
     parser.add_argument("--resume", **switch(), help=summary)
 
 

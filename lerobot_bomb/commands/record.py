@@ -34,7 +34,6 @@ from lerobot_bomb.data.record import record
 from lerobot_bomb.data.recorded_blocks import Acting, Players, describe_failures
 from lerobot_bomb.data.recording import Recording
 from lerobot_bomb.data.resumable import (
-    BLOCK_EPISODES,
     block_episodes,
     default_root,
     terminated_in_order,
@@ -72,7 +71,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     add(
         "--resume",
         **switch(),
-        help=f"continue a recording that was interrupted; its blocks of {BLOCK_EPISODES} episodes are kept "
+        help="continue a recording that was interrupted; its finished blocks of episodes are kept "
         "(with --shard and --join, always)",
     )
     where = add_job_arguments(parser, "episodes", f"ROOT.{JOBS}/{SCRIPT}")

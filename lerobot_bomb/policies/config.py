@@ -106,7 +106,6 @@ class ChunkConfig(ConfigWithEnvironment):
 
     def check_flags(self) -> None:
         """Raise a ValueError that names the flag unless all values go together."""
-        self._check_action_size()
         for flag, allowed in self.CHOICES.items():
             one_of(f"--policy.{flag}", getattr(self, flag), allowed)
         for kind, allowed in {
@@ -121,11 +120,6 @@ class ChunkConfig(ConfigWithEnvironment):
     def validate_features(self) -> None:
         """Raise unless the dataset (or environment) has what the policy reads and writes."""
         check_cameras_and_action(self)
-        self._check_action_size()
-
-    def _check_action_size(self) -> None:
-        if self.ACTIONS_ARE_OF_WEIGHTS and self.action_feature is not None:
-            self.check_action_size(self.action_feature.shape[0])
 
     def methods_used(self) -> str:
         return ", ".join(self.methods())

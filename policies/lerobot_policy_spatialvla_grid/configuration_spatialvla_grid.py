@@ -289,7 +289,6 @@ class SpatialvlaGridConfig(TokenVlaConfig, PlacesVlaConfig):
 
     def check_grid_as_trained(self, *, is_refitted: bool) -> None:
         """Raise where flags ask for other grids than the checkpoint has, unless new ones are fitted."""
-        self._check_action_size()
         if self.grid_params is None:
             return
         then = GridSettings.from_dict(self.grid_params["settings"]).flags()
