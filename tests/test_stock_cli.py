@@ -108,12 +108,12 @@ def test_a_video_ends_with_the_outcome(
     from lerobot.scripts import lerobot_eval
 
     from lerobot_env_bomb import env
+    from lerobot_env_bomb.render import compose_caption
 
     drawn, filmed = [], []
-    compose = env.compose_caption
 
     def noting(images: list[np.ndarray], lines: list[str]) -> np.ndarray:
-        drawn.append((compose(images, lines), lines[-1]))
+        drawn.append((compose_caption(images, lines), lines[-1]))
         return drawn[-1][0]
 
     monkeypatch.setattr(env, "compose_caption", noting)
