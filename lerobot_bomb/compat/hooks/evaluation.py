@@ -71,10 +71,11 @@ def tell_of_evaluations() -> None:
         return eval_policy
 
     def filming(usual: Callable[..., Any]) -> Callable[..., Any]:
-        def rollout(env: Any, *args: Any, **options: Any) -> Any:
+        def rollout(*args: Any, **options: Any) -> Any:
+            env = options["env"] if "env" in options else args[0]
             if options.get("render_callback") is not None and hasattr(env, BEGIN):
                 options["render_callback"] = _but_first(options["render_callback"])
-            return usual(env, *args, **options)
+            return usual(*args, **options)
 
         return rollout
 
