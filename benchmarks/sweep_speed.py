@@ -13,6 +13,7 @@ import sys
 import tempfile
 import time
 from collections.abc import Callable, Sequence
+from dataclasses import replace
 from pathlib import Path
 
 from machine import add_machine_arguments, make_parser, positive, require_idle_machine, write_figures
@@ -105,8 +106,9 @@ def run(command: str, flags: Sequence[str]) -> None:
 
 
 def comparable(rows: list[Record]) -> list[Record]:
-    """Return the records in one order, without what is measured anew each time."""
-    return sorted(map(without_measured, rows), key=lambda record: repr(record.spec))
+    """Return the records in one order, without what is measured anew, and without which evaluation it was."""
+    same = [replace(without_measured(each), evaluation=None) for each in rows]
+    return sorted(same, key=lambda record: repr(record.spec))
 
 
 if __name__ == "__main__":

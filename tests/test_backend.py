@@ -6,11 +6,16 @@ import sys
 import pytest
 
 pytestmark = pytest.mark.skipif(platform.system() != "Linux", reason="the backend is chosen on Linux only")
+CHOSEN = ("MUJOCO_GL", "PYOPENGL_PLATFORM", "LEROBOT_BOMB_PROBED_GL", "DISPLAY", "WAYLAND_DISPLAY")
+
+
+def without_choice() -> dict[str, str]:
+    """Return this process' environment without a backend that was chosen, and without a display."""
+    return {key: value for key, value in os.environ.items() if key not in CHOSEN}
 
 
 def choose_backend(preamble: str = "", **environment: str) -> subprocess.CompletedProcess[str]:
     """Run ensure_gl_backend() in a fresh process without MUJOCO_GL unless given."""
-    clean = {key: value for key, value in os.environ.items() if key not in ("MUJOCO_GL", "PYOPENGL_PLATFORM")}
     code = f"""
 import os
 from lerobot_env_mujoco import backend
@@ -18,7 +23,11 @@ from lerobot_env_mujoco import backend
 print(backend.ensure_gl_backend(), os.environ["MUJOCO_GL"], os.environ["PYOPENGL_PLATFORM"])
 """
     return subprocess.run(
-        [sys.executable, "-c", code], env=clean | environment, capture_output=True, text=True, check=False
+        [sys.executable, "-c", code],
+        env=without_choice() | environment,
+        capture_output=True,
+        text=True,
+        check=False,
     )
 
 
@@ -51,6 +60,7 @@ def test_a_chosen_backend_without_its_library_names_the_packages() -> None:
     preamble = """
 def broken(name):
     raise AttributeError("'NoneType' object has no attribute 'eglQueryString'")
+backend.probe = lambda name: ""
 backend.importlib.import_module = broken
 """
     run = choose_backend(preamble, MUJOCO_GL="egl")
@@ -61,15 +71,51 @@ def test_ctrl_c_while_mujoco_loads_is_no_missing_library() -> None:
     preamble = """
 def interrupted(name):
     raise ImportError("initialization failed") from KeyboardInterrupt()
+backend.probe = lambda name: ""
 backend.importlib.import_module = interrupted
 """
     assert last_line(choose_backend(preamble, MUJOCO_GL="egl")) == "KeyboardInterrupt"
 
 
 def test_a_stale_pyopengl_platform_does_not_survive() -> None:
-    preamble = "backend.importlib.import_module = lambda name: None"
+    preamble = "backend.probe = lambda name: ''; backend.importlib.import_module = lambda name: None"
     run = choose_backend(preamble, MUJOCO_GL="osmesa", PYOPENGL_PLATFORM="egl")
     assert run.stdout.split() == ["osmesa"] * 3, run.stderr
+
+
+def test_a_chosen_backend_that_cannot_draw_is_told_before_it_draws() -> None:
+    run = choose_backend(MUJOCO_GL="glfw")
+    assert "OpenGL's backend glfw: mujoco.FatalError" in last_line(run)
+    assert "use MUJOCO_GL=egl (Debian, Ubuntu: `apt-get install libegl1 libgl1`)" in last_line(run)
+
+
+def test_a_chosen_backend_is_tried_in_the_first_process_only() -> None:
+    preamble = "backend.probe = lambda name: 'tried'"
+    assert "backend egl: tried. Without" in last_line(choose_backend(preamble, MUJOCO_GL="egl"))
+    child = {"MUJOCO_GL": "osmesa", "LEROBOT_BOMB_PROBED_GL": "osmesa"}
+    preamble += "; backend.importlib.import_module = lambda name: None"
+    assert choose_backend(preamble, **child).stdout.split() == ["osmesa"] * 3
+
+
+@pytest.mark.parametrize("use_async_envs", ["true", "false"])
+def test_lerobots_commands_say_in_a_line_that_nothing_can_be_drawn(use_async_envs: str) -> None:
+    flags = ["--policy.type=bomb_expert", "--env.type=bomb", "--eval.batch_size=2", "--eval.n_episodes=2"]
+    run = subprocess.run(
+        [
+            sys.executable,
+            "-m",
+            "lerobot.scripts.lerobot_eval",
+            *flags,
+            f"--eval.use_async_envs={use_async_envs}",
+        ],
+        env=without_choice() | {"MUJOCO_GL": "glfw"},
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+    assert run.returncode == 1
+    assert last_line(run).startswith("lerobot-eval: error: MuJoCo cannot render on this machine")
+    assert "Traceback" not in run.stderr
 
 
 def test_an_unknown_backend_is_refused() -> None:
@@ -93,10 +139,13 @@ print(os.environ["MUJOCO_GL"], digest)
 
 def draw_after(first: str, **environment: str) -> subprocess.CompletedProcess[str]:
     """Draw an episode's first images in a fresh process, once this has run in it."""
-    clean = {key: value for key, value in os.environ.items() if key not in ("MUJOCO_GL", "PYOPENGL_PLATFORM")}
     code = DRAWN.format(first=first)
     return subprocess.run(
-        [sys.executable, "-c", code], env=clean | environment, capture_output=True, text=True, check=False
+        [sys.executable, "-c", code],
+        env=without_choice() | environment,
+        capture_output=True,
+        text=True,
+        check=False,
     )
 
 
@@ -149,7 +198,6 @@ env.close()
 
 
 def test_a_neighbour_that_draws_with_mujocos_own_context_changes_no_image() -> None:
-    clean = {key: value for key, value in os.environ.items() if key not in ("MUJOCO_GL", "PYOPENGL_PLATFORM")}
     code = [sys.executable, "-c", BESIDE_A_NEIGHBOUR]
-    run = subprocess.run(code, env=clean, capture_output=True, text=True, check=False)
+    run = subprocess.run(code, env=without_choice(), capture_output=True, text=True, check=False)
     assert run.stdout.strip() == "[True, True]", run.stderr

@@ -1,6 +1,7 @@
 """Parts of explanations: spans, masks, probes, means, findings."""
 
 import math
+import re
 from typing import Any
 
 import numpy as np
@@ -12,9 +13,11 @@ from lerobot_bomb.bomb.board import BOARD
 from lerobot_bomb.explain.aggregate import mean_of, means_of
 from lerobot_bomb.explain.diagnosis import used
 from lerobot_bomb.explain.images import filling, occluded, patch_masks, smoothed
+from lerobot_bomb.explain.masked_episodes import MaskedEpisode
 from lerobot_bomb.explain.moment import Explanation
 from lerobot_bomb.explain.probes import probe_classes, probe_values
 from lerobot_bomb.explain.spans import difference, named_spans, span_of, spans_of_words, token_offsets
+from lerobot_bomb.report.explanation import traces_svg
 
 pytestmark = pytest.mark.usefixtures("loaded_policies")
 
@@ -167,3 +170,13 @@ def test_other_instructions_differ_in_one_word_and_name_their_intersection() -> 
             "column": (row, (column + 2) % BOARD.num_lines),
         }
         assert cell == expected.get(word, (row, column))
+
+
+def test_every_trace_has_a_look_of_its_own_which_the_legend_shows() -> None:
+    trace = MaskedEpisode(np.zeros((2, 3)), None)  # pyright: ignore[reportArgumentType]
+    svg = traces_svg({f"mask {number}": trace for number in range(20)})
+    of_traces, of_legend = (
+        re.findall(rf"<{kind} [^>]*(stroke=[^>]*)/>", svg) for kind in ("polyline", "line")
+    )
+    assert len(set(of_legend)) == 20 and of_traces[-20:] == of_legend
+    assert [look for look in of_legend if "currentColor" in look] == of_legend[:1]

@@ -37,6 +37,7 @@ ON_FIRST_USE = {
     "the filters of lerobot.utils.import_utils' logger",
 }
 WITH_OUR_POLICY = "lerobot.scripts.lerobot_eval.eval_policy_all"
+WITH_OUR_ENVS = {f"lerobot.scripts.lerobot_eval.{name}" for name in ("eval_policy", "rollout")}
 PUBLISHING = {f"lerobot.{name}.publish_trained_model" for name in MODULES}
 
 PROGRAM = '''
@@ -86,11 +87,13 @@ policy = make_policy(ACTConfig(**small), env_cfg=PushtEnv())
 assert parser.get_path_arg("policy", ["--policy.path=me/x"]) == "me/x"
 stock = changed()
 from lerobot_env_bomb.configuration_bomb import BombEnvConfig
-BombEnvConfig()
+config = BombEnvConfig()
 used = changed()
+config.create_envs(n_envs=1)
+evaluating = sorted({*changed()} - {*used})
 from lerobot_bomb.compat.hooks.policies import built_policies
 known_before = built_policies() == [policy]
-print("RESULT" + json.dumps([registered, stock, used, known_before]))
+print("RESULT" + json.dumps([registered, stock, used, known_before, evaluating]))
 '''
 
 
@@ -104,12 +107,16 @@ def seen() -> list[Any]:
 
 
 def test_who_does_not_use_the_plugin_has_lerobots_own_functions(seen: list[Any]) -> None:
-    registered, stock, _, _ = seen
+    registered, stock, *_ = seen
     assert set(registered) == set(stock) == ALWAYS
 
 
 def test_the_first_use_of_a_type_of_ours_installs_the_others(seen: list[Any]) -> None:
     assert set(seen[2]) == ALWAYS | ON_FIRST_USE | (PUBLISHING if PUBLISHES else set())
+
+
+def test_environments_of_ours_are_told_of_their_evaluation(seen: list[Any]) -> None:
+    assert set(seen[4]) == WITH_OUR_ENVS
 
 
 def test_a_policy_that_was_built_before_the_first_use_is_known(seen: list[Any]) -> None:
@@ -133,9 +140,8 @@ def test_the_documentation_lists_each() -> None:
     page = (Path(__file__).parents[1] / "docs" / "architecture.md").read_text()
     section = page.partition("\n## Hooks into LeRobot\n")[2].partition("\n## ")[0]
     listed = set(re.findall(r"^\| `([\w.]+)`", section, re.MULTILINE))
-    short = {
-        ".".join(name.split(".")[-2:]) for name in ALWAYS | ON_FIRST_USE | PUBLISHING | {WITH_OUR_POLICY}
-    }
+    later = {WITH_OUR_POLICY} | WITH_OUR_ENVS
+    short = {".".join(name.split(".")[-2:]) for name in ALWAYS | ON_FIRST_USE | PUBLISHING | later}
     assert listed == {name for name in short if "'" not in name} - {"lerobot_train.publish_trained_model"}
 
 

@@ -217,7 +217,7 @@ def evaluate(
         run("lerobot-eval", *own.split(), *flags)
     records = read_results(folder / "results.jsonl", EpisodeResult)
     by_seed = {each.spec.seed: without_measured(each) for each in records}
-    assert by_seed.keys() == actions.keys() >= set(range(5, 5 + num_episodes))
+    assert by_seed.keys() == set(range(5, 5 + num_episodes)) <= actions.keys()
     return {seed: Outcome(record, actions[seed]) for seed, record in by_seed.items()}
 
 

@@ -455,3 +455,43 @@ def test_a_measure_is_a_field_of_a_record_and_nothing_else(
     assert "path 150.000 [100.000, 200.000]" in path.with_name("r.json").read_text()
     with pytest.raises(ValueError, match="path_px=-1 is impossible"):
         parse_record(json.dumps(old | {"path_px": -1}).encode())
+
+
+def of_evaluation(seeds: range, num_episodes: int, seed: int = 0, **other: Any) -> str:
+    """Write rows of these seeds, of an evaluation of so many episodes from `seed` on."""
+    evaluation = {"num_episodes": num_episodes, "seed": seed}
+    return "".join(row(each, evaluation=evaluation, **other) for each in seeds)
+
+
+@pytest.mark.parametrize(
+    ("text", "expected"),
+    [
+        (of_evaluation(range(7), 20), "7 of 20"),
+        (of_evaluation(range(20), 20), ""),
+        ("".join(map(row, range(7))), ""),  # of an earlier release
+        (row(0) + of_evaluation(range(1, 8), 20), "7 of 20"),
+        # begun again: once with another stop, once to the end, once with more episodes
+        (of_evaluation(range(7), 20) + of_evaluation(range(3), 20), "7 of 20"),
+        (of_evaluation(range(7), 20) + of_evaluation(range(20), 20), ""),
+        (of_evaluation(range(7), 20) + of_evaluation(range(50), 50), ""),
+        # of other seeds, of another policy
+        (of_evaluation(range(7), 20) + of_evaluation(range(100, 109), 10, seed=100), "7 of 20 and 9 of 10"),
+        (of_evaluation(range(7), 20) + of_evaluation(range(13), 20, policy=FDVLA), "7 of 20 and 13 of 20"),
+        # several conditions or suites of one evaluation
+        (
+            of_evaluation(range(7), 14) + of_evaluation(range(4), 14, spec={"perturbations": "all:3"}),
+            "11 of 14",
+        ),
+        (of_evaluation(range(7), 14) + of_evaluation(range(4), 14, spec={"suite": "object"}), "11 of 14"),
+    ],
+)
+def test_episodes_that_an_evaluation_lacks_are_told(
+    text: str, expected: str, path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    path.write_text(text)
+    assert main(["results", str(path)]) == 0
+    told = f"{path}: {expected} episodes played; lerobot-eval was stopped, or still runs\n"
+    assert capsys.readouterr().err == (told if expected else "")
+    page = path.with_suffix(".html")
+    assert main(["report", str(path), f"--output={page}"]) == 0
+    assert ("episodes played" in page.read_text()) is bool(expected)

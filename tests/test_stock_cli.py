@@ -4,6 +4,7 @@ import json
 from collections.abc import Callable
 from pathlib import Path
 
+import numpy as np
 import pyarrow.parquet as pq
 import pytest
 from huggingface_hub.utils import validate_repo_id
@@ -11,6 +12,7 @@ from huggingface_hub.utils import validate_repo_id
 from lerobot_bomb.commands.main import main
 from lerobot_bomb.results.bomb import EpisodeResult
 from lerobot_bomb.results.groups import read_results
+from lerobot_bomb.results.origin import Evaluation
 
 Run = Callable[..., None]
 REPO_ID = "test/bomb_place"
@@ -85,6 +87,43 @@ def test_each_condition_has_a_rate_and_a_recording(stock_cli: Run, tmp_path: Pat
         for condition in ("none", "camera:3", "all:5")
     }
     assert episodes["none"] == episodes["camera:3"] == episodes["all:5"]
+
+
+def test_surplus_episodes_of_the_last_batch_are_in_no_file(stock_cli: Run, tmp_path: Path) -> None:
+    flags = "--policy.type=bomb_random --eval.n_episodes=4 --eval.batch_size=3 --eval.use_async_envs=false"
+    info = evaluate(
+        stock_cli, tmp_path, f'{flags} --seed=5 --env.fps=2 --env.perturbations=["none","light:3"]'
+    )
+    assert info["overall"]["n_episodes"] == 8
+    rows = read_results(tmp_path / "results.jsonl", EpisodeResult)
+    assert [(each.spec.perturbations, each.spec.seed) for each in rows] == [
+        (condition, seed) for condition in ("none", "light:3") for seed in (5, 6, 7, 8)
+    ]
+    assert {each.evaluation for each in rows} == {Evaluation(num_episodes=8, seed=5)}
+
+
+def test_a_video_ends_with_the_outcome(
+    stock_cli: Run, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    from lerobot.scripts import lerobot_eval
+
+    from lerobot_env_bomb import env
+    from lerobot_env_bomb.render import compose_caption
+
+    drawn, filmed = [], []
+
+    def noting(images: list[np.ndarray], lines: list[str]) -> np.ndarray:
+        drawn.append((compose_caption(images, lines), lines[-1]))
+        return drawn[-1][0]
+
+    monkeypatch.setattr(env, "compose_caption", noting)
+    monkeypatch.setattr(lerobot_eval, "write_video", lambda path, frames, fps: filmed.append(frames))
+    flags = "--policy.type=bomb_random --eval.n_episodes=2 --eval.batch_size=1"
+    evaluate(stock_cli, tmp_path, f"{flags} --env.fps=2")
+    assert [len(frames) for frames in filmed] == [20, 20]
+    for (image, caption), frames in zip(drawn[19::20], filmed, strict=True):
+        assert caption.endswith("failed: never_reached")
+        np.testing.assert_array_equal(frames[-1], image)
 
 
 def test_random_actions_fail(stock_cli: Run, tmp_path: Path) -> None:

@@ -1,5 +1,6 @@
 import sys
 from functools import partial
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -7,7 +8,10 @@ import pytest
 from lerobot_bomb.bomb.episode import EpisodeSpec
 from lerobot_bomb.bomb.observation import RenderOptions
 from lerobot_bomb.envs.vector import NEW_ROLLOUT_OPTION, FreezeAfterEnd, LazyVectorEnv
+from lerobot_bomb.results.bomb import EpisodeResult
+from lerobot_bomb.results.groups import read_results
 from lerobot_bomb.results.inference import Query
+from lerobot_bomb.results.origin import Evaluation
 from lerobot_env_bomb.env import BombEnv
 
 SMALL = RenderOptions(image_size=32)
@@ -98,6 +102,27 @@ def test_an_ended_episode_stays_frozen_through_autoreset() -> None:
     observation, info = envs.reset(seed=[21, 22], options={NEW_ROLLOUT_OPTION: True})
     assert info["seed"].tolist() == [21, 22]
     envs.close()
+
+
+@pytest.mark.parametrize("use_async", [False, True])
+def test_what_an_evaluation_does_not_count_leaves_no_record(use_async: bool, tmp_path: Path) -> None:
+    path = tmp_path / "results.jsonl"
+    make = partial(BombEnv, EpisodeSpec(seed=0, fps=1), SMALL, str(path))
+    envs = LazyVectorEnv([make] * 2, use_async, num_tasks=4)
+
+    def play(*seeds: int) -> None:
+        envs.reset(seed=list(seeds))
+        for _ in range(10):
+            envs.step(STILL)
+
+    envs.begin_evaluation(num_episodes=3, seed=11)
+    play(11, 12)
+    play(13, 14)
+    play(15, 16)  # of none
+    envs.close()
+    of_evaluation = {each.spec.seed: each.evaluation for each in read_results(path, EpisodeResult)}
+    expected = dict.fromkeys((11, 12, 13), Evaluation(num_episodes=12, seed=11))
+    assert of_evaluation == expected | {15: None, 16: None}
 
 
 def test_changing_a_frozen_observation_changes_no_later_one() -> None:

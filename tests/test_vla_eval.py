@@ -59,9 +59,9 @@ def run(server: CheckpointServer, output: Path, num_episodes: int, **params: Any
 
 
 def lines_of(path: Path) -> list[dict[str, Any]]:
-    """Lines of results but for the policy, which the harness neither names nor times."""
+    """Lines of results but for policy and evaluation, which the harness neither names nor times."""
     lines = map(json.loads, path.read_text().splitlines())
-    return [line | {"policy": None} | dict.fromkeys(MEASURED) for line in lines]
+    return [line | {"policy": None, "evaluation": None} | dict.fromkeys(MEASURED) for line in lines]
 
 
 def test_the_harness_plays_the_episodes_of_lerobot_eval(

@@ -9,12 +9,16 @@ import sys
 BACKENDS = ("egl", "osmesa", "glfw")
 PACKAGES = {"egl": "libegl1 libgl1", "osmesa": "libosmesa6"}  # headless ones, in order of speed
 PYOPENGL = {"egl": "EGLPlatform", "osmesa": "OSMesaPlatform"}  # classes of PyOpenGL
+PROBED = "LEROBOT_BOMB_PROBED_GL"  # environment variable: the backend that a parent process has tried
 PROBE_TIMEOUT_S = 60
+# without a display, GLFW makes a context, of which MuJoCo says only when it loads the functions that it lacks
 _PROBE = """
 import mujoco
-context = mujoco.GLContext(16, 16)
-context.make_current()
+gl = mujoco.GLContext(16, 16)
+gl.make_current()
+context = mujoco.MjrContext(mujoco.MjModel.from_xml_string("<mujoco/>"), mujoco.mjtFontScale.mjFONTSCALE_100)
 context.free()
+gl.free()
 """
 
 
@@ -40,13 +44,14 @@ def probe(backend: str) -> str:
 def ensure_gl_backend() -> str:
     """Set MUJOCO_GL (and PYOPENGL_PLATFORM) to a backend that renders and return its name.
 
-    A backend named by MUJOCO_GL is not probed, so child processes, which inherit it, lose no time. Off
-    Linux, MuJoCo's own default is kept. `mujoco.GLContext` is of this backend unless mujoco had been
-    imported before; `lerobot_env_mujoco.mujoco_gl.GLContext` always is.
+    It is tried once, in the first process: child processes inherit it and lose no time. Off Linux, MuJoCo's
+    own default is kept. `mujoco.GLContext` is of this backend unless mujoco had been imported before;
+    `lerobot_env_mujoco.mujoco_gl.GLContext` always is.
 
     Raises:
-        NoOpenGLError: no backend can render; the message names the Debian packages to install. Or PyOpenGL
-            has been loaded for another backend, for which it stays until the process ends.
+        NoOpenGLError: no backend can render, or the one that MUJOCO_GL names cannot; the message names the
+            Debian packages to install. Or PyOpenGL has been loaded for another backend, for which it stays
+            until the process ends.
         ValueError: MUJOCO_GL holds an unknown name.
     """
     chosen = os.environ.get("MUJOCO_GL", "").lower()
@@ -56,8 +61,10 @@ def ensure_gl_backend() -> str:
         raise ValueError(f"MUJOCO_GL={chosen!r} cannot render; choose one of: {', '.join(BACKENDS)}")
     if not chosen:
         chosen = _first_working_backend()
+    elif chosen != os.environ.get(PROBED) and (cause := probe(chosen)):
+        raise NoOpenGLError(_advice({chosen: cause}))
     _check_pyopengl(chosen)
-    os.environ["MUJOCO_GL"] = chosen
+    os.environ["MUJOCO_GL"] = os.environ[PROBED] = chosen
     # PyOpenGL reads a variable of its own; one left over from another backend makes mujoco raise.
     if chosen in PACKAGES:
         os.environ["PYOPENGL_PLATFORM"] = chosen
@@ -68,7 +75,7 @@ def ensure_gl_backend() -> str:
         if isinstance(error.__cause__, KeyboardInterrupt):  # Ctrl-C while its library loads
             raise error.__cause__ from None
         # this is how a missing libEGL or libOSMesa shows
-        raise NoOpenGLError(f"{_install_advice({chosen: str(error)})}; or unset MUJOCO_GL") from error
+        raise NoOpenGLError(_advice({chosen: str(error)})) from error
     return chosen
 
 
@@ -90,10 +97,16 @@ def _first_working_backend() -> str:
         causes[backend] = probe(backend)
         if not causes[backend]:
             return backend
-    raise NoOpenGLError(_install_advice(causes))
+    raise NoOpenGLError(_advice(causes))
 
 
-def _install_advice(causes: dict[str, str]) -> str:
-    installs = " or ".join(f"`apt-get install {packages}` ({name})" for name, packages in PACKAGES.items())
+def _advice(causes: dict[str, str]) -> str:
+    """Describe what failed and the way out; `causes`: {backend that was tried: why it cannot render}."""
     tried = "; ".join(f"{name}: {cause}" for name, cause in causes.items())
-    return f"MuJoCo found no OpenGL library to render with. On Debian or Ubuntu: {installs}. Tried {tried}"
+    ways = " or ".join(
+        f"MUJOCO_GL={name} (Debian, Ubuntu: `apt-get install {packages}`)"
+        for name, packages in PACKAGES.items()
+    )
+    return (
+        f"MuJoCo cannot render on this machine with OpenGL's backend {tried}. Without a display, use {ways}"
+    )

@@ -12,6 +12,7 @@ from lerobot.processor import PolicyProcessorPipeline
 
 from lerobot_bomb.checkpoints.identity import policy_of_results
 from lerobot_bomb.checkpoints.queries import last_query
+from lerobot_bomb.compat.hooks.evaluation import tell_of_evaluations
 from lerobot_bomb.compat.use import use
 from lerobot_bomb.envs.vector import LazyVectorEnv, check_parallel_tasks
 from lerobot_bomb.flag_errors import flag_errors
@@ -84,7 +85,8 @@ class EvaluatedEnv(_EnvConfig):
         """
         make_env, on_first_reset = self._import_env(), self._on_first_reset()
         check_results_path(self.results_path)
-        kwargs = self.gym_kwargs
+        tell_of_evaluations()
+        kwargs, groups = self.gym_kwargs, self.groups
         return {
             key: {
                 task_id: LazyVectorEnv(
@@ -93,8 +95,9 @@ class EvaluatedEnv(_EnvConfig):
                     known_late=partial(policy_of_results, self.results_path),
                     last_query=last_query,
                     on_first_reset=on_first_reset(spec),
+                    num_tasks=sum(map(len, groups.values())),
                 )
                 for task_id, spec in specs.items()
             }
-            for key, specs in self.groups.items()
+            for key, specs in groups.items()
         }

@@ -154,7 +154,7 @@ def _write_sheet(output_dir: Path, records: list[EpisodeResult]) -> Path:
 
 
 def _tile(video: Path, record: EpisodeResult) -> np.ndarray:
-    """Return both cameras with a caption; the video's own is of a step before the end."""
+    """Return both cameras with a caption that is read at this size, which the video's own is not."""
     from PIL import Image
 
     from lerobot_bomb.viewing.sheet import caption

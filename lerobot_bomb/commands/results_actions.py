@@ -4,6 +4,7 @@ Shapes: `B` environments, `T` actions of an episode, `D` action dims.
 """
 
 import argparse
+import math
 import sys
 import traceback
 from collections.abc import Callable, Sequence
@@ -38,16 +39,24 @@ class LoggedVectorEnv:
         self._actions: list[np.ndarray] = []  # of all steps since the reset, (B, D) each
         self._is_running_B = np.zeros(0, dtype=bool)
         self._max_steps = 0
+        self._num_left = math.inf  # episodes that LeRobot counts and that have not begun
 
     def __getattr__(self, name: str) -> Any:
         return getattr(self._env, name)
+
+    def begin_evaluation(self, num_episodes: int, seed: int | None) -> None:
+        """Take in that LeRobot counts the next so many episodes: what fills its last batch is not logged."""
+        self._num_left = num_episodes
+        if begin := getattr(self._env, "begin_evaluation", None):
+            begin(num_episodes, seed)
 
     def reset(self, *, seed: Sequence[int] | None = None, **options: Any) -> tuple[Any, dict[str, Any]]:
         if seed is None:
             raise ValueError("--seed=null: episodes without a seed cannot be told apart; give a number")
         start = self._env.reset(seed=list(seed), **options)
         self._seeds, self._actions = list(seed), []
-        self._is_running_B = np.ones(len(seed), dtype=bool)
+        self._is_running_B = np.arange(len(seed)) < self._num_left
+        self._num_left -= len(seed)
         self._max_steps = self._env.call("_max_episode_steps")[0]
         return start
 

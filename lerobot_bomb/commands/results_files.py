@@ -5,6 +5,7 @@ from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
+from lerobot_bomb.results.played import describe_missing
 from lerobot_bomb.results.reading import check_any, read_records
 from lerobot_bomb.results.record import Record, describe_numbers
 from lerobot_bomb.sweep.manifest import NAME, Manifest
@@ -37,13 +38,19 @@ def missing_of_sweep(path: Path, num_records: int) -> str:
     return f"{path}: {missing} of {number} episodes are missing; {'; '.join(reasons)}" if missing > 0 else ""
 
 
+def missing_of_evaluations(path: Path, records: Sequence[Record]) -> str:
+    """Say how many episodes of an evaluation a file lacks; "" if none, or if its records do not tell."""
+    missing = describe_missing(records)
+    return missing and f"{path}: {missing}; lerobot-eval was stopped, or still runs"
+
+
 @dataclass(frozen=True)
 class ResultsFile:
     """A results file as it was read, without the damaged records."""
 
     numbered: dict[int, Record]  # by line, from 1
     num_damaged: int
-    missing: str  # the episodes of its sweep that it lacks; "": none
+    missing: str  # the episodes of its sweep or evaluation that it lacks; "": none
 
     @property
     def records(self) -> list[Record]:
@@ -65,7 +72,7 @@ def read_record(path: Path, line: int) -> Record:
 
 
 def read_undamaged(path: Path) -> ResultsFile:
-    """Read the episodes of a file; stderr shows its first damaged records and what its sweep lacks.
+    """Read the episodes of a file; stderr shows its first damaged records and what it lacks.
 
     Raises:
         ValueError: there is no such file, or no episode in it.
@@ -76,7 +83,8 @@ def read_undamaged(path: Path) -> ResultsFile:
     if len(damages) > MAX_SHOWN_DAMAGES:
         print(f"{path}: ... and {len(damages) - MAX_SHOWN_DAMAGES} more such lines", file=sys.stderr)
     check_any(path, numbered, damages)
-    missing = missing_of_sweep(path, len(numbered))
+    records = [*numbered.values()]
+    missing = missing_of_sweep(path, len(records)) or missing_of_evaluations(path, records)
     if missing:
         print(missing, file=sys.stderr)
     return ResultsFile(numbered, len(damages), missing)

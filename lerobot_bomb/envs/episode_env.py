@@ -15,6 +15,7 @@ from gymnasium.error import ResetNeeded
 
 from lerobot_bomb.bomb.episode import check_seed
 from lerobot_bomb.results.inference import Inference, Query
+from lerobot_bomb.results.origin import Evaluation
 from lerobot_bomb.results.record import Record
 from lerobot_bomb.results.writing import write_record
 from lerobot_bomb.smoothness import MIN_ACTIONS, smoothness
@@ -41,6 +42,9 @@ class EpisodeEnv[SpecT: Any, RunT, ResultT: Record](gymnasium.Env[Observation, n
         self.task_description = ""
         self._spec = spec
         self._results_path = results_path
+        # of the episode, told by a vector environment
+        self.evaluation: Evaluation | None = None
+        self.is_counted = True  # else it leaves no record
         self._current_run: RunT | None = None  # what exists once an episode has been started
         self._seed: int = spec.seed  # of the episode
         self._steps = 0
@@ -74,7 +78,7 @@ class EpisodeEnv[SpecT: Any, RunT, ResultT: Record](gymnasium.Env[Observation, n
         observation, reward, terminated, truncated, info = self._advance(run, checked)
         if terminated or truncated:
             self._last_transition = deepcopy((observation, 0.0, terminated, truncated, info))
-            if self._results_path is not None:
+            if self._results_path is not None and self.is_counted:
                 write_record(self._results_path, self.episode_result())
         return observation, reward, terminated, truncated, info
 
@@ -99,8 +103,8 @@ class EpisodeEnv[SpecT: Any, RunT, ResultT: Record](gymnasium.Env[Observation, n
         if self._last_transition is None:
             raise ResetNeeded("the episode has not ended yet")
         j2, j3 = self._smoothness()
-        inference = Inference.of(self._queries)
-        return replace(self._result(self._run), action_j2=j2, action_j3=j3, inference=inference)
+        measured = {"action_j2": j2, "action_j3": j3, "inference": Inference.of(self._queries)}
+        return replace(self._result(self._run), **measured, evaluation=self.evaluation)
 
     def _smoothness(self) -> tuple[float | None, float | None]:
         if len(self._actions) < MIN_ACTIONS:

@@ -12,6 +12,7 @@ import numpy as np
 from gymnasium.vector import AsyncVectorEnv, AutoresetMode, SyncVectorEnv, VectorEnv
 
 from lerobot_bomb.results.inference import Query
+from lerobot_bomb.results.origin import Evaluation
 
 # LeRobot's rollout passes this option with the reset that starts a new episode; autoreset passes none.
 NEW_ROLLOUT_OPTION = "lerobot_new_rollout"
@@ -88,6 +89,7 @@ class LazyVectorEnv(VectorEnv):
         on_first_reset: is given the observations of the first reset, in this process.
         last_query: gives the query that the policy was asked since it was called last, if any; before a step,
             each env's `add_query` is given it.
+        num_tasks: vector envs of the evaluation, this one among them; each plays as many episodes.
     """
 
     def __init__(
@@ -98,6 +100,7 @@ class LazyVectorEnv(VectorEnv):
         known_late: Callable[[int], Sequence[dict[str, Any]]] = lambda num_envs: [{}] * num_envs,
         on_first_reset: Callable[[Any], None] | None = None,
         last_query: Callable[[], Query | None] = lambda: None,
+        num_tasks: int = 1,
     ) -> None:
         probe = make_ones[0]()
         self.num_envs = len(make_ones)
@@ -113,6 +116,9 @@ class LazyVectorEnv(VectorEnv):
         self._known_late = known_late
         self._on_first_reset = on_first_reset
         self._last_query = last_query
+        self._num_tasks = num_tasks
+        self._evaluation: Evaluation | None = None
+        self._num_left = 0  # episodes of the evaluation that have not begun
         self._envs: SyncVectorEnv | AsyncVectorEnv | None = None
 
     def _ensure(self) -> SyncVectorEnv | AsyncVectorEnv:
@@ -143,10 +149,26 @@ class LazyVectorEnv(VectorEnv):
                 self.close(terminate=True)
             raise
 
+    def begin_evaluation(self, num_episodes: int, seed: int | None) -> None:
+        """Take in that the next so many episodes are of an evaluation, which begins with this seed.
+
+        LeRobot fills its last batch, and leaves the surplus out of its rate: of that there are no records.
+        """
+        self._evaluation = Evaluation(num_episodes * self._num_tasks, seed)
+        self._num_left = num_episodes
+
+    def _tell_evaluation(self, envs: SyncVectorEnv | AsyncVectorEnv) -> None:
+        """Tell each env which evaluation its next episode is of, and whether that counts it."""
+        is_over = self._num_left <= 0
+        envs.set_attr("evaluation", None if is_over else self._evaluation)
+        envs.set_attr("is_counted", [is_over or row < self._num_left for row in range(self.num_envs)])
+        self._num_left -= self.num_envs
+
     def reset(self, *, seed: Any = None, options: dict[str, Any] | None = None) -> tuple[Any, dict[str, Any]]:
         """Start new episodes; autoreset, which does not, calls the envs themselves."""
         options = {NEW_ROLLOUT_OPTION: True, **(options or {})}
         with self._running() as envs:
+            self._tell_evaluation(envs)
             seed = int(seed) if isinstance(seed, np.integer) else seed
             observations, infos = envs.reset(seed=seed, options=options)
         if self._on_first_reset is not None:

@@ -29,10 +29,12 @@ FOLLOWING_NOTE = (
     "they lead to where they lead then, and how far of that towards the other target."
 )
 SHOWN_PX = 224  # side of an image on the page
-# told apart by the colour-blind (Okabe and Ito); the first is the episode without a mask
-TRACE_COLORS = ("currentColor", "#e69f00", "#56b4e9", "#009e73", "#d55e00", "#0072b2", "#cc79a7", "#999999")
+# of the masked episodes, told apart by the colour-blind (Okabe and Ito); once all are taken, with dashes
+TRACE_COLORS = ("#e69f00", "#56b4e9", "#009e73", "#d55e00", "#0072b2", "#cc79a7", "#999999")
+TRACE_DASHES = ("none", "6 3", "2 2", "8 2 2 2")
 TRACE_SIZE = 420  # pixels of the plot's side
-LEGEND_WIDTH = 190  # pixels, beside it
+LEGEND_WIDTH = 220  # pixels, beside it
+LEGEND_LINE_PX = 26  # of each trace, before its name
 TRACE_RANGE_M = 0.24  # either way from the board's centre
 
 
@@ -255,19 +257,25 @@ def traces_svg(episodes: Mapping[str, MaskedEpisode]) -> str:
             lines.append(f'<polyline points="{ends}" stroke="#8886" fill="none"/>')
     legend = []
     for i, (name, episode) in enumerate(episodes.items()):
-        stroke = TRACE_COLORS[i % len(TRACE_COLORS)]
-        dash = ' stroke-dasharray="6 3"' if i >= len(TRACE_COLORS) else ""
-        points = " ".join(map(point, episode.gripper_xyz))
-        width = 3 if i == 0 else 1.5
-        look = f'stroke="{stroke}" fill="none" stroke-width="{width}"{dash}'
-        lines.append(f'<polyline points="{points}" {look}/>')
-        y = 14 * (i + 1)
-        at = f'x="{TRACE_SIZE + 8}" y="{y}" font-size="12"'
-        legend.append(f'<text {at} fill="{stroke}">{escape(name)}</text>')
+        look = _trace_look(i)
+        lines.append(f'<polyline points="{" ".join(map(point, episode.gripper_xyz))}" {look}/>')
+        x, y = TRACE_SIZE + 8, 14 * (i + 1)
+        legend.append(f'<line x1="{x}" x2="{x + LEGEND_LINE_PX}" y1="{y - 4}" y2="{y - 4}" {look}/>')
+        at = f'x="{x + LEGEND_LINE_PX + 6}" y="{y}" font-size="12" fill="currentColor"'
+        legend.append(f"<text {at}>{escape(name)}</text>")
     width = TRACE_SIZE + LEGEND_WIDTH
     size = f'viewBox="0 0 {width} {TRACE_SIZE}" width="{width}"'
     label = 'role="img" aria-label="Traces of the gripper from above"'
     return f'<div class="wide"><svg {size} {label}>{"".join(lines)}{"".join(legend)}</svg></div>'
+
+
+def _trace_look(number: int) -> str:
+    """Return the attributes of a trace's line, its own; the first trace is the one without a mask."""
+    if number == 0:
+        return 'stroke="currentColor" fill="none" stroke-width="3"'
+    dashes, color = divmod(number - 1, len(TRACE_COLORS))
+    dash = TRACE_DASHES[dashes % len(TRACE_DASHES)]
+    return f'stroke="{TRACE_COLORS[color]}" fill="none" stroke-width="1.5" stroke-dasharray="{dash}"'
 
 
 def _figure(key: str, image: np.ndarray, map_GG: np.ndarray, largest: float) -> str:

@@ -85,6 +85,14 @@ class PolicyIdentity:
         return json_list(*values, *((self.path, self.revision) if self.weights_sha256 is None else ()))
 
 
+@dataclass(frozen=True)
+class Evaluation:
+    """Evaluation of LeRobot's that an episode is of."""
+
+    num_episodes: Count  # episodes of the whole evaluation: of all its tasks and conditions
+    seed: Natural | None  # --seed: the first episode's; null: not given
+
+
 def describe_versions(versions: Mapping[str, str | None]) -> str:
     """'gym-pusht 0.1.8, pymunk 6.11.1': what the bits of an episode depend on."""
     return ", ".join(f"{name} {version or '?'}" for name, version in versions.items())

@@ -14,7 +14,7 @@ from typing import Any, ClassVar, Protocol, Self
 from lerobot_bomb.bomb.environment import Environment
 from lerobot_bomb.conditions import AxisCondition
 from lerobot_bomb.results.inference import Inference
-from lerobot_bomb.results.origin import PolicyIdentity
+from lerobot_bomb.results.origin import Evaluation, PolicyIdentity
 from lerobot_bomb.results.schema import SHOWN_CHARACTERS, Natural, Quantity
 
 NOT_RECORDED = "not recorded"
@@ -23,7 +23,7 @@ MAX_RUNS = 10  # of numbers, in a heading
 
 # of a record: who acted, with which tasks beside, and what simulated; the rest is the episode
 ORIGIN = {
-    "policy", "task_ids", "opengl_vendor", "opengl_renderer", "machine", "mujoco_version",
+    "policy", "task_ids", "evaluation", "opengl_vendor", "opengl_renderer", "machine", "mujoco_version",
     "simulator_versions", "lerobot_version", "torch_version", "package_version", "task_version",
     "protocol_version",
 }  # fmt: skip
@@ -69,6 +69,7 @@ class Record:
         "action_j2": None,
         "action_j3": None,
         "inference": None,
+        "evaluation": None,
         "policy.batch_size": None,
         "policy.batch_row": None,
         "policy.interventions": (),
@@ -99,6 +100,7 @@ class Record:
     # mean length of the third differences, likewise
     action_j3: Quantity | None = None
     inference: Inference | None = None  # cost of the policy's queries; null: no network, or not measured
+    evaluation: Evaluation | None = None  # evaluation that it is of; null: not recorded, or of none
 
     def as_json(self) -> dict[str, Any]:
         """Return the fields as a record has them, in its order."""

@@ -38,10 +38,11 @@ OURS = (
     lerobot_policy_spatialvla_grid,
     lerobot_policy_vla0_smol,
 )
+SHARED = "lerobot_env_mujoco"  # package of ours, by which environments draw; of no type
 
 resolve_checkpoints(PREFIX, checkpoint_path)
 register(
-    [package.__name__ for package in OURS],
+    [*(package.__name__ for package in OURS), SHARED],
     [
         remember_policies,
         check_saved_processors,

@@ -2,11 +2,15 @@
 
 import logging
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from inspect import signature
+from types import ModuleType
 from typing import Any
 
 from lerobot_bomb.compat.hooks.replace import replace
 from lerobot_bomb.compat.use import is_ours
+
+BEGIN = "begin_evaluation"  # method of our vector environments
 
 
 def check_evaluations(check: Callable[[Any], None]) -> None:
@@ -46,7 +50,56 @@ def run_tasks_in_turn(is_needed: Callable[[Any], bool]) -> None:
 
         return evaluate
 
-    for name in ("lerobot.scripts.lerobot_eval", "lerobot.scripts.lerobot_train", "__main__"):
-        module = sys.modules.get(name)
-        if hasattr(module, "eval_policy_all"):
-            replace(module, "eval_policy_all", around)
+    for module in _loaded_with("eval_policy_all"):
+        replace(module, "eval_policy_all", around)
+
+
+def tell_of_evaluations() -> None:
+    """Let LeRobot's evaluation tell an environment how many episodes it counts, and film each to its end.
+
+    It cuts a video's last image off, which names the outcome, for it has taken one of the start beside one of
+    each step. Both are for environments with `begin_evaluation`; the others are evaluated as ever.
+    """
+
+    def telling(usual: Callable[..., Any]) -> Callable[..., Any]:
+        def eval_policy(*args: Any, **options: Any) -> Any:
+            given = signature(usual).bind(*args, **options).arguments
+            if begin_evaluation := getattr(given["env"], BEGIN, None):
+                begin_evaluation(given["n_episodes"], given.get("start_seed"))
+            return usual(*args, **options)
+
+        return eval_policy
+
+    def filming(usual: Callable[..., Any]) -> Callable[..., Any]:
+        def rollout(*args: Any, **options: Any) -> Any:
+            env = options["env"] if "env" in options else args[0]
+            if options.get("render_callback") is not None and hasattr(env, BEGIN):
+                options["render_callback"] = _but_first(options["render_callback"])
+            return usual(*args, **options)
+
+        return rollout
+
+    for module in _loaded_with("eval_main"):  # where both are looked up
+        replace(module, "eval_policy", telling)
+        replace(module, "rollout", filming)
+
+
+def _but_first(call: Callable[[Any], None]) -> Callable[[Any], None]:
+    """Return a function that does nothing when it is called first."""
+    is_first = True
+
+    def later(argument: Any) -> None:
+        nonlocal is_first
+        if not is_first:
+            call(argument)
+        is_first = False
+
+    return later
+
+
+def _loaded_with(name: str) -> Iterator[ModuleType]:
+    """Yield the modules of LeRobot's commands that evaluate, those which are loaded and hold a function."""
+    names = ("lerobot.scripts.lerobot_eval", "lerobot.scripts.lerobot_train", "__main__")
+    for module in map(sys.modules.get, names):
+        if module is not None and hasattr(module, name):
+            yield module

@@ -9,11 +9,14 @@ from typing import Any
 import numpy as np
 from lerobot.policies import PreTrainedPolicy
 
+from lerobot_bomb.compat.hooks.evaluation import tell_of_evaluations
+
 
 def lerobot_eval_with(flags: Sequence[str], wrap: Callable[[Any, Any], Any]) -> None:
     """Run lerobot-eval with these flags, on what `wrap(config, environments)` makes of its environments."""
     from lerobot.scripts import lerobot_eval
 
+    tell_of_evaluations()
     make_env = lerobot_eval.make_env
     _run_lerobot_eval(flags, make_env=lambda config, **options: wrap(config, make_env(config, **options)))
 
