@@ -31,7 +31,7 @@ def results(tmp_path_factory: pytest.TempPathFactory) -> Callable[..., Path]:
             folder = tmp_path_factory.mktemp("sweep")
             shown = ("--env.type=bomb", "--env.image_size=64", "--policy.device=cpu", *flags)
             store = Store(folder, plan((policy,), (), (condition,), 7, 3, 3, shown))
-            Worker(store).run(list(store.manifest.cells))
+            Worker(store).run(list(store.manifest.jobs))
             store.merge()
             files[policy, flags, condition] = folder / "results.jsonl"
         return files[policy, flags, condition]

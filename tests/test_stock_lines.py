@@ -45,12 +45,12 @@ def manifest(checkpoint: Path) -> Manifest:
 
 @pytest.fixture
 def play(tmp_path: Path) -> Callable[[Manifest], Store]:
-    """Play all cells of a manifest in this process."""
+    """Play all jobs of a manifest in this process."""
     from lerobot_bomb.sweep.worker import Worker
 
     def play(manifest: Manifest) -> Store:
         store = Store(tmp_path / "sweep", manifest)
-        Worker(store).run(list(manifest.cells))
+        Worker(store).run(list(manifest.jobs))
         store.merge()
         return store
 
@@ -61,9 +61,9 @@ def test_a_sweep_gives_the_lines_that_are_made_of_the_printed_command(
     manifest: Manifest, play: Callable[[Manifest], Store], stock_cli: Callable[..., None], tmp_path: Path
 ) -> None:
     store = play(manifest)
-    (cell,) = manifest.cells
-    assert "results_path" not in cell.command
-    flags = [*cell.flags, f"--output_dir={tmp_path / 'eval'}"]
+    (job,) = manifest.jobs
+    assert "results_path" not in job.command
+    flags = [*job.flags, f"--output_dir={tmp_path / 'eval'}"]
     stock_cli("lerobot-eval", *flags)
     assert main(["results", "add", str(tmp_path / "stock.jsonl"), *flags]) == 0
     assert (store.folder / "results.jsonl").read_text() == (tmp_path / "stock.jsonl").read_text()
@@ -116,12 +116,12 @@ def test_an_episode_that_raises_is_an_error_and_no_failure(
 
     monkeypatch.setattr(lerobot_eval, "rollout", raising)
     store = play(manifest)
-    (error,) = store.errors(manifest.cells[0])
+    (error,) = store.errors(manifest.jobs[0])
     assert (error.seed, error.error) == (9, "RuntimeError: out of memory")
     assert "--seed=9 --eval.n_episodes=1" in error.command
     assert [row.spec.seed for row in read_results(store.folder / "results.jsonl")] == [7, 8, 10]
     monkeypatch.undo()
-    store.begin_again(manifest.cells)
+    store.begin_again(manifest.jobs)
     assert len(read_results(play(manifest).folder / "results.jsonl")) == 4
 
 
@@ -133,7 +133,7 @@ def test_actions_that_are_not_finite_are_errors(
     select = ACTPolicy.select_action
     monkeypatch.setattr(ACTPolicy, "select_action", lambda *args: select(*args) * float("nan"))
     store = play(manifest)
-    errors = store.errors(manifest.cells[0])
+    errors = store.errors(manifest.jobs[0])
     assert [error.seed for error in errors] == SEEDS
     assert {error.error for error in errors} == {"ArithmeticError: an action of the policy is not finite"}
 

@@ -13,7 +13,7 @@ from test_sweep import lines_of, small, sweep
 from lerobot_bomb import files
 from lerobot_bomb.sweep import local, store
 from lerobot_bomb.sweep.local import Workers, ended
-from lerobot_bomb.sweep.manifest import Cell, Manifest
+from lerobot_bomb.sweep.manifest import Job, Manifest
 from lerobot_bomb.sweep.store import EpisodeError, Store
 
 PLUGINS = Path(__file__).parent / "fixtures" / "plugins"
@@ -30,7 +30,7 @@ def test_good_policies_play_whatever_becomes_of_those_that_crash(
     monkeypatch.setattr(store, "MAX_ATTEMPTS", 1)  # of this process, which counts how workers end
     assert sweep(tmp_path, "--policies=segfault,killed,bomb_random", *FLAGS) == 1
     said = capsys.readouterr().out
-    assert "2 of 6 episodes, 1 of 3 cells" in said
+    assert "2 of 6 episodes, 1 of 3 jobs" in said
     assert "ended by SIGSEGV, a fault of native code; 1 attempts" in said
     assert "ended by SIGKILL, as where memory is short; 1 attempts" in said
     rows = [json.loads(line) for line in (tmp_path / "results.jsonl").read_text().splitlines()]
@@ -48,7 +48,7 @@ def test_good_policies_play_beside_all_that_crash_or_hang(
     limits = ("--timeout=120", "--workers=2", "--perturbations=none,light:3")
     assert sweep(tmp_path, policies, *limits, *FLAGS) == 1
     said = capsys.readouterr().out
-    assert "8 of 20 episodes, 4 of 10 cells" in said
+    assert "8 of 20 episodes, 4 of 10 jobs" in said
     for reason in ("SIGSEGV", "SIGKILL", "not finished after 120 s (--timeout)"):
         assert said.count(reason) == 2
     rows = [json.loads(line) for line in (tmp_path / "results.jsonl").read_text().splitlines()]
@@ -62,11 +62,11 @@ os.write(int(sys.argv[1]), b"%s\\n")
 """
 
 
-def workers(folder: Path, cell: Cell, then: str, timeout_s: int | None = None) -> tuple[Workers, Store]:
-    """One worker, which begins a cell, and then does what a line of Python says."""
-    played = Store(folder, Manifest((cell,)))
-    assert played.begin(cell)
-    command = [sys.executable, "-c", WORKER % (cell.key, then)]
+def workers(folder: Path, job: Job, then: str, timeout_s: int | None = None) -> tuple[Workers, Store]:
+    """One worker, which begins a job, and then does what a line of Python says."""
+    played = Store(folder, Manifest((job,)))
+    assert played.begin(job)
+    command = [sys.executable, "-c", WORKER % (job.key, then)]
     return Workers(played, command, [dict(os.environ)], timeout_s), played
 
 
@@ -84,17 +84,17 @@ def test_how_a_worker_ended_is_the_reason(
     then: str, timeout_s: int | None, reason: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(store, "MAX_ATTEMPTS", 1)
-    (cell,) = small().cells
-    started, played = workers(tmp_path, cell, then, timeout_s)
+    (job,) = small().jobs
+    started, played = workers(tmp_path, job, then, timeout_s)
     try:
         end = time.monotonic() + 60
-        while not played.is_over(cell):
-            started.look(has_played=False)
+        while not played.is_over(job):
+            started.look(has_progressed=False)
             time.sleep(0.05)
             assert time.monotonic() < end
     finally:
         started.close()
-    assert played.file(cell, "given_up").read_text() == reason
+    assert played.file(job, "given_up").read_text() == reason
 
 
 def test_a_worker_that_says_nothing_and_is_killed_is_no_full_disk(
@@ -115,7 +115,7 @@ def test_how_a_process_ended_is_told_in_words() -> None:
 
 
 def test_what_nobody_died_of_is_played_first(tmp_path: Path) -> None:
-    first, second, good, other = small(("bomb:fdvla", "bomb_random"), ("none", "light:3")).cells
+    first, second, good, other = small(("bomb:fdvla", "bomb_random"), ("none", "light:3")).jobs
     played = Store(tmp_path, small())
     assert played.in_turn([first, second, good, other]) == [first, second, good, other]
     assert played.begin(first)
@@ -124,19 +124,19 @@ def test_what_nobody_died_of_is_played_first(tmp_path: Path) -> None:
     assert played.in_turn([first, second, good, other]) == [second, first, other, good]
 
 
-def test_a_cell_that_another_worker_plays_by_now_is_not_given_up(tmp_path: Path) -> None:
-    (cell,) = small().cells
+def test_a_job_that_another_worker_plays_by_now_is_not_given_up(tmp_path: Path) -> None:
+    (job,) = small().jobs
     parent, worker = Store(tmp_path, small()), Store(tmp_path, small())
     for _ in range(store.MAX_ATTEMPTS):
-        assert parent.begin(cell)
-    with worker.claimed(cell):
-        parent.lost(cell, "it was killed")
-        assert not parent.is_over(cell)
-    parent.lost(cell, "it was killed")
-    assert parent.is_over(cell)
-    worker.finish(cell, lines_of(cell), [])
-    parent.lost(cell, "it was killed again")
-    assert parent.file(cell, "given_up").read_text() == "it was killed; 3 attempts"
+        assert parent.begin(job)
+    with worker.claimed(job):
+        parent.lost(job, "it was killed")
+        assert not parent.is_over(job)
+    parent.lost(job, "it was killed")
+    assert parent.is_over(job)
+    worker.finish(job, lines_of(job), [])
+    parent.lost(job, "it was killed again")
+    assert parent.file(job, "given_up").read_text() == "it was killed; 3 attempts"
 
 
 # Files
@@ -153,33 +153,33 @@ def test_a_cell_that_another_worker_plays_by_now_is_not_given_up(tmp_path: Path)
         lambda data: b"[1]\n" + data,
     ],
 )
-def test_a_cell_whose_file_is_cut_off_is_not_finished(damage, tmp_path: Path) -> None:
-    (cell,) = small().cells
+def test_a_job_whose_file_is_cut_off_is_not_finished(damage, tmp_path: Path) -> None:
+    (job,) = small().jobs
     played = Store(tmp_path, small())
-    played.finish(cell, lines_of(cell), [])
-    assert played.is_finished(cell)
-    path = played.file(cell, "jsonl")
+    played.finish(job, lines_of(job), [])
+    assert played.is_finished(job)
+    path = played.file(job, "jsonl")
     path.write_bytes(damage(path.read_bytes()))
-    assert not played.is_finished(cell) and not played.is_over(cell)
+    assert not played.is_finished(job) and not played.is_over(job)
     played.merge()
     assert (tmp_path / "results.jsonl").read_bytes() == b""
-    played.finish(cell, lines_of(cell), [])
-    assert played.is_finished(cell)
+    played.finish(job, lines_of(job), [])
+    assert played.is_finished(job)
 
 
-def test_a_finished_cell_has_a_line_or_an_error_of_each_episode(tmp_path: Path) -> None:
-    (cell,) = small().cells  # seeds 7, 8, 9
-    first, _, third = lines_of(cell)
-    error = EpisodeError(cell.key, 8, "ArithmeticError", cell.command)
+def test_a_finished_job_has_a_line_or_an_error_of_each_episode(tmp_path: Path) -> None:
+    (job,) = small().jobs  # seeds 7, 8, 9
+    first, _, third = lines_of(job)
+    error = EpisodeError(job.key, 8, "ArithmeticError", job.command)
     played = Store(tmp_path, small())
-    played.finish(cell, [first, third], [error])
-    assert played.is_finished(cell)
-    played.file(cell, "errors").write_text('{"cell": "')
-    assert not Store(tmp_path, small()).is_finished(cell)
-    played.finish(cell, [first, first, third, third], [error])  # of two tasks
-    assert played.is_finished(cell)
-    played.finish(cell, [first, first, third], [error])
-    assert not played.is_finished(cell)
+    played.finish(job, [first, third], [error])
+    assert played.is_finished(job)
+    played.file(job, "errors").write_text('{"cell": "')
+    assert not Store(tmp_path, small()).is_finished(job)
+    played.finish(job, [first, first, third, third], [error])  # of two tasks
+    assert played.is_finished(job)
+    played.finish(job, [first, first, third], [error])
+    assert not played.is_finished(job)
 
 
 def test_what_is_written_is_on_the_disk_before_it_has_its_name(
