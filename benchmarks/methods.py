@@ -43,7 +43,7 @@ SHARE_BEFORE = 0.6  # of the minutes, before a policy's own episodes are relabel
 
 @dataclass(frozen=True)
 class Data:
-    """Recordings that are merged, and the environment's flags with which they are made and played."""
+    """Recordings that are merged, and the environment's flags with which they are made and run."""
 
     parts: tuple[Part, ...] = (*SCENES, *SHOWN)
     env_flags: tuple[str, ...] = ()

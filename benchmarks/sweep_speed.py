@@ -44,19 +44,19 @@ def main() -> None:
     manifest = plan([args.policy], ["place"], conditions, SEED, args.episodes, args.batch_size, FLAGS)
 
     ways: dict[str, Callable[[Path], Path]] = {
-        EACH: lambda folder: play_each(manifest, folder),
-        TOGETHER: lambda folder: play_together(manifest, conditions, folder),
+        EACH: lambda folder: run_each(manifest, folder),
+        TOGETHER: lambda folder: run_together(manifest, conditions, folder),
         ONE: lambda folder: sweep(manifest, folder, 1),
         TWO: lambda folder: sweep(manifest, folder, 2),
     }
-    hourly, played = {}, {}
-    for name, play in ways.items():
+    hourly, records = {}, {}
+    for name, run_way in ways.items():
         with tempfile.TemporaryDirectory() as folder:
             started = time.perf_counter()
-            results = play(Path(folder))
+            results = run_way(Path(folder))
             hourly[name] = 3600 * manifest.num_episodes / (time.perf_counter() - started)
-            played[name] = comparable(read_results(results))
-        if name != TOGETHER and played[name] != played[EACH]:  # its batches are of another kind
+            records[name] = comparable(read_results(results))
+        if name != TOGETHER and records[name] != records[EACH]:  # its batches are of another kind
             raise SystemExit(f"{name} gives other lines than {EACH}")
 
     title = f"{args.policy}, {len(conditions)} conditions of {args.episodes} episodes"
@@ -68,7 +68,7 @@ def main() -> None:
     write_figures(args.json, {"episodes_an_hour": hourly})
 
 
-def play_each(manifest: Manifest, folder: Path) -> Path:
+def run_each(manifest: Manifest, folder: Path) -> Path:
     """Run the command of every job; the file of results."""
     results = folder / "results.jsonl"
     for number, job in enumerate(manifest.jobs):
@@ -79,7 +79,7 @@ def play_each(manifest: Manifest, folder: Path) -> Path:
     return results
 
 
-def play_together(manifest: Manifest, conditions: Sequence[str], folder: Path) -> Path:
+def run_together(manifest: Manifest, conditions: Sequence[str], folder: Path) -> Path:
     """Run one command with all conditions."""
     results, job = folder / "results.jsonl", manifest.jobs[0]
     replaced = ("--env.perturbations=", "--eval.use_async_envs=")

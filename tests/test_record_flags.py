@@ -348,5 +348,5 @@ def test_seeds_that_evaluations_play_are_pointed_out(
     flags = ["record", "--repo_id=test/x", f"--episodes={episodes}", f"--seed={seed}", f"--root={tmp_path}"]
     assert cli.main(flags) == 1  # the folder exists
     last = seed + episodes - 1
-    said = f"the seeds {seed}..{last} have episodes that evaluations play, 1000 to 1199"
+    said = f"the seeds {seed}..{last} have episodes that evaluations run, 1000 to 1199"
     assert (said in capsys.readouterr().err) == is_warned

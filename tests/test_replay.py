@@ -26,7 +26,7 @@ def results(tmp_path_factory: pytest.TempPathFactory) -> Callable[..., Path]:
 
     files: dict[Any, Path] = {}
 
-    def play(policy: str, *flags: str, condition: str = "all:1-5") -> Path:
+    def evaluated(policy: str, *flags: str, condition: str = "all:1-5") -> Path:
         if (policy, flags, condition) not in files:
             folder = tmp_path_factory.mktemp("sweep")
             shown = ("--env.type=bomb", "--env.image_size=64", "--policy.device=cpu", *flags)
@@ -36,7 +36,7 @@ def results(tmp_path_factory: pytest.TempPathFactory) -> Callable[..., Path]:
             files[policy, flags, condition] = folder / "results.jsonl"
         return files[policy, flags, condition]
 
-    return play
+    return evaluated
 
 
 def rewritten(path: Path, file: Path, **changes: Any) -> Path:
@@ -56,7 +56,7 @@ def rewritten(path: Path, file: Path, **changes: Any) -> Path:
         ("bomb_expert", ()),
     ],
 )
-def test_a_line_is_played_again_bit_for_bit(
+def test_a_line_is_run_again_bit_for_bit(
     policy: str,
     flags: tuple[str, ...],
     results: Callable[..., Path],

@@ -267,7 +267,7 @@ def test_lerobot_merges_scenes_with_demonstrations_and_the_suite_stays_known(
         ("--static=-2", "--static=-2 must be in 1..2 or a multiple of 2"),
         ("--static=3", "--static=3 must be in 1..2 or a multiple of 2"),
         ("--episodes=0", "--episodes=0 must be at least 1"),
-        ("--static=2 --noise=0.05", "--noise=0.05: static scenes are not played"),
+        ("--static=2 --noise=0.05", "--noise=0.05: static scenes are no episodes"),
         ("--static=2 --task=all --task_ids=[1]", "--env.task_ids=[1] are numbers in a suite"),
         ("--static=2 --task=every", "--env.task='every' is unknown; choose one of: goal, long"),
     ],

@@ -1,4 +1,4 @@
-"""``lerobot-bomb sweep``: jobs are played once, by anybody, and give the lines of lerobot-eval."""
+"""``lerobot-bomb sweep``: jobs are run once, by anybody, and give the lines of lerobot-eval."""
 
 import json
 import os
@@ -100,7 +100,7 @@ def test_dry_run_prints_the_commands(tmp_path: Path, capsys: pytest.CaptureFixtu
     assert "camera:2" in "".join(commands) and "goal_marker" not in "".join(commands)
 
 
-# Who plays what
+# Who runs what
 
 
 def test_a_job_is_of_one_worker_at_a_time(tmp_path: Path) -> None:
@@ -117,7 +117,7 @@ def test_a_job_whose_workers_are_killed_is_given_up_and_can_be_retried(tmp_path:
     store = Store(tmp_path, small())
     assert [store.begin(job) for _ in range(MAX_ATTEMPTS + 1)] == [True] * MAX_ATTEMPTS + [False]
     assert store.is_over(job) and not store.is_finished(job)
-    assert any("3 workers ended while they played it" in line for line in store.lines())
+    assert any("3 workers ended while they ran it" in line for line in store.lines())
     store.begin_again([job])
     assert not store.is_over(job) and store.begin(job)
 
@@ -143,21 +143,21 @@ def test_a_changed_job_is_another_job(tmp_path: Path) -> None:
     assert any("the manifest has changed: 1 jobs" in line for line in changed.lines())
 
 
-# Playing
+# Running
 
 
 @pytest.fixture
-def play(tmp_path: Path) -> Callable[[Manifest], Store]:
-    """Play all jobs of a manifest in this process."""
+def run_all(tmp_path: Path) -> Callable[[Manifest], Store]:
+    """Run all jobs of a manifest in this process."""
     from lerobot_bomb.sweep.worker import Worker
 
-    def play(manifest: Manifest) -> Store:
+    def run_all(manifest: Manifest) -> Store:
         store = Store(tmp_path / "sweep", manifest)
         Worker(store).run(list(manifest.jobs))
         store.merge()
         return store
 
-    return play
+    return run_all
 
 
 def by_seed(rows: list[Record]) -> list[Record]:
@@ -175,14 +175,14 @@ def by_seed(rows: list[Record]) -> list[Record]:
     ],
 )
 def test_the_lines_are_those_of_lerobot_eval(
-    policy: str, play: Callable[[Manifest], Store], stock_cli: Callable[..., None], tmp_path: Path
+    policy: str, run_all: Callable[[Manifest], Store], stock_cli: Callable[..., None], tmp_path: Path
 ) -> None:
     flags = ("--env.type=bomb", "--env.image_size=64", "--env.fps=2", "--policy.device=cpu")
     flags += ("--env.ignore_checkpoint=true",)  # of 10 Hz, whose episodes are five times as long
     conditions = ("none", "light:3", "camera:2")
     manifest = plan((policy,), ("place",), conditions, seed=7, num_episodes=2, batch_size=2, flags=flags)
-    store = play(manifest)
-    # the last of several that one process played with one policy
+    store = run_all(manifest)
+    # the last of several that one process ran with one policy
     command = [*manifest.jobs[-1].flags, f"--env.results_path={tmp_path / 'stock.jsonl'}"]
     stock_cli("lerobot-eval", *command, f"--output_dir={tmp_path / 'eval'}")
     ours = read_results(store.file(manifest.jobs[-1], "jsonl"))
@@ -191,7 +191,7 @@ def test_the_lines_are_those_of_lerobot_eval(
 
 
 def test_an_episode_that_raises_is_an_error_and_no_failure(
-    play: Callable[[Manifest], Store], monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+    run_all: Callable[[Manifest], Store], monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     from lerobot.scripts import lerobot_eval
 
@@ -204,7 +204,7 @@ def test_an_episode_that_raises_is_an_error_and_no_failure(
 
     monkeypatch.setattr(lerobot_eval, "rollout", raising)
     manifest = small(n=5)  # seeds 7..11
-    store = play(manifest)
+    store = run_all(manifest)
     rows = read_results(store.folder / "results.jsonl")
     assert [row.spec.seed for row in rows] == [7, 8, 10, 11]
     (error,) = store.errors(manifest.jobs[0])
@@ -214,14 +214,14 @@ def test_an_episode_that_raises_is_an_error_and_no_failure(
     assert "4 of 5 episodes" in text and "1 x ArithmeticError: the answer is not finite" in text
     monkeypatch.undo()
     store.begin_again(manifest.jobs)
-    play(manifest)
+    run_all(manifest)
     assert len(read_results(store.folder / "results.jsonl")) == 5 and not store.errors(manifest.jobs[0])
 
 
-def test_a_job_that_cannot_begin_is_given_up_at_once(play: Callable[[Manifest], Store]) -> None:
+def test_a_job_that_cannot_begin_is_given_up_at_once(run_all: Callable[[Manifest], Store]) -> None:
     flags = ("--env.type=bomb", "--env.image_size=48", "--policy.device=cpu")  # of a policy of 64
     manifest = plan((NANO, "bomb_expert"), (), ("none",), seed=7, num_episodes=1, batch_size=1, flags=flags)
-    store = play(manifest)
+    store = run_all(manifest)
     assert [store.is_finished(job) for job in manifest.jobs] == [False, True]
     assert any("image_size=64" in line for line in store.lines())
 
@@ -309,14 +309,14 @@ def test_the_flags_that_may_be_lerobots_without_a_group_are_those_that_it_has() 
         ((NANO,), (), ("--env.type=bomb_pusht",), "this is --env.type=bomb_pusht"),
     ],
 )
-def test_a_checkpoint_of_another_environment_is_told_before_anything_is_played(
+def test_a_checkpoint_of_another_environment_is_told_before_anything_is_run(
     policies: tuple[str, ...], tasks: tuple[str, ...], flags: tuple[str, ...], message: str
 ) -> None:
     from lerobot_bomb.sweep.check import check
 
     with pytest.raises(ValueError, match=message) as error:
         check(plan(policies, tasks, ("none", "all:3"), 7, 1, 1, flags))
-    assert str(error.value).endswith("or insist with --env.ignore_checkpoint=true")
+    assert str(error.value).endswith("or override with --env.ignore_checkpoint=true")
     check(plan(policies, tasks, ("none",), 7, 1, 1, (*flags, "--env.ignore_checkpoint=true")))
 
 
@@ -361,7 +361,8 @@ def test_sigterm_ends_a_sweep_as_ctrl_c_does(
 ) -> None:
     small().write(tmp_path)
     monkeypatch.setattr(
-        "lerobot_bomb.commands.sweep.play", lambda *_: os.kill(os.getpid(), signal.SIGTERM) or time.sleep(9)
+        "lerobot_bomb.commands.sweep.run_part",
+        lambda *_: os.kill(os.getpid(), signal.SIGTERM) or time.sleep(9),
     )
     assert sweep(tmp_path) == 130
     printed = capsys.readouterr()
@@ -378,7 +379,7 @@ def test_a_folder_of_another_sweep_is_left_alone(tmp_path: Path, capsys: pytest.
     assert Manifest.read(tmp_path) == manifest
 
 
-def test_a_folder_where_nothing_was_played_takes_another_sweep(tmp_path: Path) -> None:
+def test_a_folder_where_nothing_was_run_takes_another_sweep(tmp_path: Path) -> None:
     misspelt, other = small(), small(("bomb_random",))
     with claimed(tmp_path, misspelt) as store:
         store.give_up(misspelt.jobs[0], "no such flag")
@@ -443,9 +444,9 @@ def test_jobs_have_names_of_their_own() -> None:
     assert Job(("--policy.type=a/b",), ("--env.type=c d",), 0, 1, 1).key.isascii()
 
 
-def test_what_a_command_said_before_it_exited_is_the_reason(play: Callable[[Manifest], Store]) -> None:
+def test_what_a_command_said_before_it_exited_is_the_reason(run_all: Callable[[Manifest], Store]) -> None:
     flags = (*FLAGS, "--env.tsak=place")
-    store = play(plan(("bomb_expert",), (), ("none",), 7, 1, 1, flags))
+    store = run_all(plan(("bomb_expert",), (), ("none",), 7, 1, 1, flags))
     (reason,) = [line for line in store.lines() if "tsak" in line and "given up" not in line]
     assert "unrecognized arguments" in reason
 

@@ -18,7 +18,7 @@ def finish(folder: Path, manifest: Manifest) -> None:
             store.finish(job, lines_of(job), [])
 
 
-def test_what_is_named_twice_is_played_once(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_what_is_named_twice_is_run_once(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     flags = ("--policies=bomb_expert,bomb_expert", "--perturbations=light:3,each:3,none,none", *PLAY)
     for _ in range(2):
         assert sweep(tmp_path, *flags) == 0
@@ -75,7 +75,7 @@ NONE = ("--perturbations=none",)
         ("--policies=bomb_expert", "--episodes=6", "--seed=8"),
     ],
 )
-def test_what_has_been_played_is_in_what_it_grows_to(
+def test_what_has_been_run_is_in_what_it_grows_to(
     flags: tuple[str, ...], tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     finish(tmp_path, small(n=3))
@@ -103,7 +103,7 @@ def test_a_second_sweep_of_other_jobs_is_told_and_changes_nothing(
 ) -> None:
     with claimed(tmp_path, small()):  # has begun nothing yet
         assert sweep(tmp_path, "--policies=bomb_random", "--episodes=3", *PLAY, *NONE) == 1
-        assert f"another command is playing other jobs in {tmp_path} now" in capsys.readouterr().err
+        assert f"another command is running other jobs in {tmp_path} now" in capsys.readouterr().err
         assert Manifest.read(tmp_path) == small()
     assert sweep(tmp_path, "--policies=bomb_random", "--episodes=3", *PLAY, *NONE) == 0
 
@@ -114,4 +114,4 @@ def test_a_second_sweep_of_the_same_jobs_is_told_that_it_shares_them(
     with claimed(tmp_path, small()):
         assert capsys.readouterr().err == ""
         assert sweep(tmp_path, "--dry_run") == 0
-        assert f"another command plays jobs of {tmp_path} now; both share them" in capsys.readouterr().err
+        assert f"another command runs jobs of {tmp_path} now; both share them" in capsys.readouterr().err

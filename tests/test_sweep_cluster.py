@@ -1,4 +1,4 @@
-"""``lerobot-bomb sweep`` over GPUs and clusters: whoever plays the jobs, the lines are the same."""
+"""``lerobot-bomb sweep`` over GPUs and clusters: whoever runs the jobs, the lines are the same."""
 
 import os
 import subprocess
@@ -62,7 +62,7 @@ def jobs(monkeypatch: pytest.MonkeyPatch) -> list[list[str]]:
         commands.append(list(command))
         return main(command[len(local.PYTHON) + 1 :])
 
-    monkeypatch.setattr(sweep_command, "play", run_part)
+    monkeypatch.setattr(sweep_command, "run_part", run_part)
     monkeypatch.setattr(cluster.subprocess, "check_call", run_job)
     return commands
 
@@ -116,7 +116,7 @@ def test_workers_that_end_at_once_are_started_anew_on_their_gpus_and_then_no_mor
     assert sweep(tmp_path, "--workers=2", *SWEEP) == 1
     log = (tmp_path / "workers.log").read_text().split()
     assert set(log) == {"4", "7"} and log.count("4") >= 3 and log.count("7") >= 3
-    assert "workers end before they play" in capsys.readouterr().err
+    assert "workers end before they run" in capsys.readouterr().err
 
 
 # SLURM
@@ -208,7 +208,7 @@ def test_submitits_jobs_give_the_lines_of_one_process(expected_lines: str, tmp_p
 
 
 class Job:
-    """One of submitit's that never plays."""
+    """One of submitit's that never runs."""
 
     def __init__(self, is_done: bool) -> None:
         self.is_done, self.is_cancelled = is_done, False
@@ -223,7 +223,7 @@ class Job:
         self.is_cancelled = True
 
 
-def test_jobs_that_end_before_they_played_are_told(
+def test_jobs_that_end_before_they_run_are_told(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     monkeypatch.setattr(cluster_jobs, "submit", lambda *args: [Job(is_done=True)])

@@ -61,9 +61,9 @@ class TaskInstance:
     supply: tuple[str, ...] = ()  # colours of the stones in the tray, row by row from the far one
     pattern: Stones = field(default_factory=dict)  # on the small board
 
-    def stone_on(self, cell: Intersection) -> int:
+    def stone_on(self, intersection: Intersection) -> int:
         """Index of the stone on an intersection."""
-        return len(self.supply) + list(self.stones).index(cell)
+        return len(self.supply) + list(self.stones).index(intersection)
 
 
 @dataclass(frozen=True)
@@ -88,9 +88,9 @@ class Task(ABC):
         """Return what the command means on that board; None where it means nothing, or several things."""
 
 
-def is_graspable(stones: Stones, cell: Intersection) -> bool:
+def is_graspable(stones: Stones, intersection: Intersection) -> bool:
     """Return True if nothing stands left or right of an intersection, where the fingers go."""
-    row, column = cell
+    row, column = intersection
     return not {(row, column - 1), (row, column + 1)} & stones.keys()
 
 
@@ -101,25 +101,28 @@ def other_color(color: str) -> str:
 
 def only(stones: Stones, color: str) -> Intersection | None:
     """Return where the only stone of a colour stands; None where there is none, or several."""
-    cells = [cell for cell, other in stones.items() if other == color]
-    return cells[0] if len(cells) == 1 else None
+    intersections = [intersection for intersection, other in stones.items() if other == color]
+    return intersections[0] if len(intersections) == 1 else None
 
 
 def draw_intersections(
-    rng: np.random.Generator, number: int, cells: Sequence[Intersection] = INTERSECTIONS
+    rng: np.random.Generator, number: int, intersections: Sequence[Intersection] = INTERSECTIONS
 ) -> list[Intersection]:
     """Draw so many different intersections."""
-    return [cells[i] for i in rng.choice(len(cells), size=number, replace=False)]
+    return [intersections[i] for i in rng.choice(len(intersections), size=number, replace=False)]
 
 
 def draw_stones(
     rng: np.random.Generator,
     number: int,
-    cells: Sequence[Intersection] = INTERSECTIONS,
+    intersections: Sequence[Intersection] = INTERSECTIONS,
     colors: Sequence[str] = COLORS,
 ) -> dict[Intersection, str]:
     """Draw so many stones, each of one of these colours, on different intersections."""
-    return {cell: colors[int(rng.integers(len(colors)))] for cell in draw_intersections(rng, number, cells)}
+    return {
+        intersection: colors[int(rng.integers(len(colors)))]
+        for intersection in draw_intersections(rng, number, intersections)
+    }
 
 
 def is_heldout(task_id: int, about: tuple[int, ...]) -> bool:

@@ -114,13 +114,13 @@ class Environment:
         """Return whether its suites, whose newest version it names, are those of today."""
         return self.suites is not None and self.task_version == _current_version(self.suites)
 
-    def check_same(self, other: "Environment", who: str, insist: str) -> None:
+    def check_same(self, other: "Environment", who: str, override: str) -> None:
         """Raise a ValueError, which names flags to change, unless `who`, of this one, can act in `other`."""
         names = self.differences(other)
         if not names:
             return
         flags = [self._flag(name) for name in names if name in COMPARED]
-        ways_out = [f"evaluate with {' '.join(flags)}", insist] if flags else [insist]
+        ways_out = [f"evaluate with {' '.join(flags)}", override] if flags else [override]
         raise ValueError(
             f"{who} was trained for an environment with {self.text(names)}; this one has "
             f"{other.text(names)}: {', or '.join(ways_out)}"

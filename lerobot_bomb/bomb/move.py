@@ -34,9 +34,9 @@ class Aim:
     is_slid: bool = False
 
 
-def aim_at(stone: int, cell: Intersection, is_slid: bool = False) -> Aim:
+def aim_at(stone: int, intersection: Intersection, is_slid: bool = False) -> Aim:
     """Return the aim of bringing a stone to an intersection."""
-    x, y = BOARD.intersection_xy(*cell)
+    x, y = BOARD.intersection_xy(*intersection)
     return Aim(stone, (float(x), float(y)), is_slid)
 
 

@@ -33,7 +33,10 @@ def _middles(half_m: float) -> list[float]:
 
 
 # where the expert puts stones
-PLACES_XY_M = (*(tuple(BOARD.intersection_xy(*cell).tolist()) for cell in INTERSECTIONS), *TRAY_XY_M)
+PLACES_XY_M = (
+    *(tuple(BOARD.intersection_xy(*intersection).tolist()) for intersection in INTERSECTIONS),
+    *TRAY_XY_M,
+)
 # the tray's squares, row by row from the far one
 TRAY_SPOTS_XY_M = tuple(
     (round(TRAY_CENTER_XY[0] + x, 6), round(TRAY_CENTER_XY[1] - y, 6))

@@ -11,7 +11,7 @@ from lerobot.policies import PreTrainedPolicy
 
 from lerobot_bomb.compat.hooks.policies import built_policies
 
-INSIST = "insist with --env.ignore_checkpoint=true"  # the one way past a check of who acts
+OVERRIDE = "override with --env.ignore_checkpoint=true"  # the one way past the check of which policy acts
 
 _acting: ContextVar[PreTrainedConfig | None] = ContextVar("acting", default=None)
 

@@ -9,7 +9,7 @@ from typing import Any, ClassVar
 from lerobot.configs import PreTrainedConfig
 
 from lerobot_bomb.bomb.environment import IMAGES, Environment
-from lerobot_bomb.checkpoints.acting import INSIST, acting_config, name_of
+from lerobot_bomb.checkpoints.acting import OVERRIDE, acting_config, name_of
 from lerobot_bomb.checkpoints.training import dataset_of, read_train_config
 from lerobot_bomb.compat.hooks.policies import training_data
 from lerobot_bomb.compat.use import use
@@ -101,7 +101,7 @@ def dataset_of_training(config: PreTrainedConfig) -> Path | None:
 def _check(config: PreTrainedConfig, who: str, here: Environment) -> None:
     environment = trained_environment(config)
     if environment is not None:
-        environment.check_same(here, who, INSIST)
+        environment.check_same(here, who, OVERRIDE)
         if environment.task is None:
             logger.warning(
                 "%s does not know the suite that it was trained for, so none was compared: --env.task must "
@@ -145,5 +145,5 @@ def _check_image_size(config: PreTrainedConfig, here: Environment, who: str) -> 
         height, width = feature.shape[1:]
         raise ValueError(
             f"{who} reads images of {width}x{height} pixels from the camera {camera}; this environment has "
-            f"--env.image_size={here.image_size}: evaluate with --env.image_size={width}, or {INSIST}"
+            f"--env.image_size={here.image_size}: evaluate with --env.image_size={width}, or {OVERRIDE}"
         )

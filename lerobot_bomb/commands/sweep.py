@@ -1,4 +1,4 @@
-"""``lerobot-bomb sweep``: policies x tasks x conditions, over processes or a cluster; resumes after a kill."""
+"""``lerobot-bomb sweep``: policies x tasks x conditions, on processes or a cluster; resumes after a kill."""
 
 import argparse
 import signal
@@ -21,7 +21,7 @@ from lerobot_bomb.environments import ENVIRONMENTS, env_type
 from lerobot_bomb.flags import one_of
 from lerobot_bomb.results.record import Record
 from lerobot_bomb.sweep.claim import claimed
-from lerobot_bomb.sweep.local import PYTHON, play, progress
+from lerobot_bomb.sweep.local import PYTHON, progress, run_part
 from lerobot_bomb.sweep.manifest import NAME, Job, Manifest, flag_value, plan, policy_flag
 from lerobot_bomb.sweep.store import Store
 from lerobot_bomb.tables import print_lines
@@ -53,7 +53,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     add("--workers", type=int, default=1, help="processes, each on a GPU in turn (default: 1)")
     add_job_arguments(parser, "jobs", f"FOLDER/{SCRIPT}")
     add("--timeout", type=int, help="seconds that a job may take (default: no limit)")
-    add("--retry", action="store_true", help="play again what was given up or ended in errors")
+    add("--retry", action="store_true", help="run again what was given up or ended in errors")
     add(
         "--dry_run",
         action="store_true",
@@ -76,14 +76,14 @@ def run(args: argparse.Namespace) -> int:
         if args.slurm is not None:
             write_job_array(_part_command(args), args.slurm, args.folder / SCRIPT)
             return 0
-        return _play(args, store, jobs)
+        return _run_jobs(args, store, jobs)
 
 
-def _play(args: argparse.Namespace, store: Store, jobs: list[Job]) -> int:
+def _run_jobs(args: argparse.Namespace, store: Store, jobs: list[Job]) -> int:
     try:
         with interrupted_by_sigterm():
             if args.submitit is None:
-                play(store, args.shard or ALL, args.workers, args.timeout)
+                run_part(store, args.shard or ALL, args.workers, args.timeout)
             else:
                 _run_on_cluster(args, store)
     except KeyboardInterrupt:
@@ -134,7 +134,7 @@ def _manifest(args: argparse.Namespace) -> Manifest:
                 f"{args.folder} holds no {NAME}: begin a sweep with --policies=... --env.type=..."
             )
         if args.rest or args.tasks or args.perturbations:
-            raise ValueError(f"{args.folder / NAME} says what is played; drop {(*args.rest, '--tasks')[0]}")
+            raise ValueError(f"{args.folder / NAME} says what is run; drop {(*args.rest, '--tasks')[0]}")
         return Manifest.read(args.folder)
     if not args.policies:
         raise ValueError("--policies names none")
@@ -186,14 +186,14 @@ def _expanded(perturbations: tuple[str, ...], record_type: type[Record]) -> Sequ
 
 
 def _part_command(args: argparse.Namespace) -> list[str]:
-    """Run a part of the folder's jobs, with --shard."""
+    """Return the command that runs a part of the folder's jobs, with --shard."""
     command = [*PYTHON, "lerobot_bomb.commands.main", "sweep", str(args.folder.absolute())]
     command += [f"--workers={args.workers}"]
     return command + ([f"--timeout={args.timeout}"] if args.timeout else [])
 
 
 def _run_on_cluster(args: argparse.Namespace, store: Store) -> None:
-    """Submit a cluster job for every part that is not over, and wait for them; they end with this process' Ctrl-C."""
+    """Submit a cluster job for every part that is not over, and wait for them; Ctrl-C ends them."""
     jobs = list(store.manifest.jobs)
     parts = [f"{number}/{args.submitit}" for number in range(args.submitit)]
     left = [part for part in parts if not all(map(store.is_over, store.manifest.part(part)))]

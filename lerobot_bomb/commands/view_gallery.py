@@ -17,7 +17,7 @@ from lerobot_bomb.bomb.suites import SUITES
 from lerobot_bomb.commands.arguments import add_env_flag, parse_numbers, path_flag
 from lerobot_bomb.conditions import ALL, MAX_LEVEL, NONE, Axis, nuisances_of
 from lerobot_bomb.environments import BOMB, ENVIRONMENTS, EnvType
-from lerobot_bomb.envs.rollout import expert_agent, make_env, play
+from lerobot_bomb.envs.rollout import expert_agent, make_env, run_episode
 from lerobot_bomb.files import written_whole
 from lerobot_bomb.flags import one_of, reworded
 from lerobot_bomb.viewing.perturbations_page import write_page
@@ -123,7 +123,7 @@ def suite_sheet(suite: str, seeds: Sequence[int], options: RenderOptions) -> She
         (spec,) = specs_of_tasks(EpisodeSpec(seeds[0], suite), [task_id])
         env = make_env(spec, options)
         for seed in seeds:
-            first, *_, last = play(env, replace(spec, seed=seed), expert_agent())
+            first, *_, last = run_episode(env, replace(spec, seed=seed), expert_agent())
             shown = [moment.observation[PIXELS][CAMERAS[0]] for moment in (first, last)]
             row = images.setdefault(f"task {task_id}", [])
             row += [text_tile(first.instruction, options.image_size), *shown]

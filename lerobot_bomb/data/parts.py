@@ -15,7 +15,7 @@ from pathlib import Path
 from typing import Any, ClassVar
 
 from lerobot_bomb.data.kept_blocks import Progress, block_damage, block_path, find_gaps, reached
-from lerobot_bomb.data.recorded_blocks import ANY_NUMBER, Players, record_blocks, recording_layout
+from lerobot_bomb.data.recorded_blocks import ANY_NUMBER, EpisodeSource, record_blocks, recording_layout
 from lerobot_bomb.data.recording import Recording
 from lerobot_bomb.data.resumable import block_episodes, grow, growing
 from lerobot_bomb.data.unfinished import (
@@ -63,7 +63,7 @@ def num_whole_blocks(recording: Recording) -> int:
     return recording.episodes // len(block_episodes(0))
 
 
-def record_part(part: Part, root: Path, players: Players) -> Progress | None:
+def record_part(part: Part, root: Path, source: EpisodeSource) -> Progress | None:
     """Record a part, or what it still lacks, beside `root`; None: that is there, joined.
 
     Raises:
@@ -76,7 +76,7 @@ def record_part(part: Part, root: Path, players: Players) -> Progress | None:
     folder = part.folder(root)
     try:
         with growing(part, root, folder):
-            record_blocks(part.recording, folder, players, part.blocks)
+            record_blocks(part.recording, folder, source, part.blocks)
     finally:
         with suppress(OSError):
             folder.parent.rmdir()  # unless it holds something
@@ -107,7 +107,7 @@ def check_part(part: Part, root: Path) -> None:
         _check_same(flag, Part(part.recording, index, number), root)
 
 
-def join(recording: Recording, root: Path, players: Players) -> Progress:
+def join(recording: Recording, root: Path, source: EpisodeSource) -> Progress:
     """Join the parts into the dataset at `root`, record what takes the place of failed episodes; delete them.
 
     Raises:
@@ -125,7 +125,7 @@ def join(recording: Recording, root: Path, players: Players) -> Progress:
         recording,
         root,
         resume=root.exists() or unfinished_folder(root).exists(),
-        write=partial(record_blocks, recording, players=players, numbers=numbers, most=most),
+        write=partial(record_blocks, recording, source=source, numbers=numbers, most=most),
         layout=partial(recording_layout, recording),
         parts=folders,
     )

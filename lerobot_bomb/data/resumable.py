@@ -48,7 +48,7 @@ if TYPE_CHECKING:
 
     from lerobot_bomb.data.blocks import DatasetLayout, RecordedEpisode
 
-BLOCK_EPISODES = 20  # what a kill can cost: they are played or written again on --resume
+BLOCK_EPISODES = 20  # what a kill can cost: they are run or written again on --resume
 SEND_AGAIN_S = 0.05  # after a destructor has swallowed a signal
 
 

@@ -52,7 +52,7 @@ def make_env(spec: EpisodeSpec, render_options: RenderOptions) -> gymnasium.Env:
     )
 
 
-def play(
+def run_episode(
     env: gymnasium.Env,
     spec: Spec,
     agent: Agent,
@@ -81,7 +81,7 @@ def one_of_batch(
 ) -> Iterator[Agent]:
     """Yield the agent of one seed, which acts at once in the other episodes of its batch, of nearby seeds.
 
-    lerobot-eval plays consecutive seeds as a batch, in which a policy's arithmetic rounds otherwise than
+    lerobot-eval runs consecutive seeds as a batch, in which a policy's arithmetic rounds otherwise than
     alone. The other episodes run here, unseen.
     """
     others = {i: FreezeAfterEnd(make_env()) for i in range(size) if i != row}

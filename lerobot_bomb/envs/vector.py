@@ -18,11 +18,11 @@ NEW_ROLLOUT_OPTION = "lerobot_new_rollout"
 
 
 def check_parallel_tasks(number: int) -> None:
-    """Raise a ValueError unless LeRobot plays one task after another."""
+    """Raise a ValueError unless LeRobot runs one task after another."""
     if number > 1:
         raise ValueError(
-            f"--env.max_parallel_tasks={number} plays tasks in threads, which share the queue and the random "
-            "numbers of one policy, and OpenGL draws in the thread that it began in; drop it. To play in "
+            f"--env.max_parallel_tasks={number} runs tasks in threads, which share the queue and the random "
+            "numbers of one policy, and OpenGL draws in the thread that it began in; drop it. To run in "
             f"several processes: lerobot-bomb sweep --workers={number}"
         )
 

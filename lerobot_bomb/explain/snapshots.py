@@ -14,7 +14,7 @@ from lerobot_bomb.bomb.episode import Stage
 from lerobot_bomb.bomb.expert import current_goal
 from lerobot_bomb.bomb.observation import ENVIRONMENT_STATE
 from lerobot_bomb.bomb.privileged_state import PrivilegedState
-from lerobot_bomb.envs.rollout import Moment, play
+from lerobot_bomb.envs.rollout import Moment, run_episode
 from lerobot_bomb.viewing.checkpoint import LoadedPolicy
 from lerobot_bomb.viewing.episode import Viewed
 
@@ -59,7 +59,9 @@ def watch(viewed: Viewed, loaded: LoadedPolicy) -> tuple[list[Snapshot], Any]:
             return loaded.agent([observation], [instruction])[0]
 
         moments = [
-            _snapshot(moment, env) for moment in play(env, viewed.spec, act) if moment.action is not None
+            _snapshot(moment, env)
+            for moment in run_episode(env, viewed.spec, act)
+            if moment.action is not None
         ]
         return moments, env.get_wrapper_attr("episode_result")()
 

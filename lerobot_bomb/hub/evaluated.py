@@ -33,15 +33,15 @@ def check_environment_of(path: Path, records: list[Record], trained_for: Environ
     for record in records:
         start = f"--results={path} has an episode "
         end = ": a card states no rate of another setting"
-        played_in = record.environment()
-        if played_in is None:
+        environment = record.environment()
+        if environment is None:
             raise ValueError(
                 f"{start}of --env.type={record.env_type} (seed {record.spec.seed}); this checkpoint "
                 f"was trained for {trained_for}{end}"
             )
-        names = trained_for.differences(played_in)
+        names = trained_for.differences(environment)
         if names:
             raise ValueError(
-                f"{start}with {played_in.text(names)} (seed {record.spec.seed}); this checkpoint was "
+                f"{start}with {environment.text(names)} (seed {record.spec.seed}); this checkpoint was "
                 f"trained for {trained_for.text(names)}{end}"
             )

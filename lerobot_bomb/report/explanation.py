@@ -251,7 +251,7 @@ def traces_svg(episodes: Mapping[str, MaskedEpisode]) -> str:
     last = BOARD.num_lines - 1
     for i in range(BOARD.num_lines):
         for start, end in (((i, 0), (i, last)), ((0, i), (last, i))):
-            ends = " ".join(point(BOARD.intersection_xy(*cell)) for cell in (start, end))
+            ends = " ".join(point(BOARD.intersection_xy(*intersection)) for intersection in (start, end))
             lines.append(f'<polyline points="{ends}" stroke="#8886" fill="none"/>')
     legend = []
     for i, (name, episode) in enumerate(episodes.items()):

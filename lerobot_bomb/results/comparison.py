@@ -18,7 +18,7 @@ class Comparisons:
 
     policies: tuple[str, str]
     conditions: list[PairedComparison]
-    num_unpaired: tuple[int, int]  # episodes that the other policy did not play
+    num_unpaired: tuple[int, int]  # episodes that the other policy did not run
 
     @property
     def lowest(self) -> float:

@@ -11,7 +11,7 @@ from lerobot_bomb.environments import env_type
 from lerobot_bomb.sweep.manifest import NAME, Job, Manifest, largest_divisor
 from lerobot_bomb.sweep.store import Store
 
-LOCK = "sweep.lock"  # held by every command that plays the manifest; alone by one that writes it
+LOCK = "sweep.lock"  # held by every command that runs the manifest; alone by one that writes it
 
 
 @contextmanager
@@ -40,11 +40,11 @@ def claimed(folder: Path, wanted: Manifest, batch_size: int | None = None) -> It
         flock(lock, LOCK_SH)
         if Manifest.read(folder) != manifest:
             raise ValueError(
-                f"another command is playing other jobs in {folder} now; wait for its end, or name another "
+                f"another command is running other jobs in {folder} now; wait for its end, or name another "
                 "folder"
             )
         if not is_alone:
-            print(f"another command plays jobs of {folder} now; both share them", file=sys.stderr)
+            print(f"another command runs jobs of {folder} now; both share them", file=sys.stderr)
         yield Store(folder, manifest)
 
 
@@ -97,6 +97,6 @@ def _with_rest(job: Job, there: Manifest, batch_size: int) -> list[Job]:
     if env_type(job.env_type).record.starts_by_number:
         raise ValueError(
             f"--episodes={job.num_episodes}: jobs of --env.type={job.env_type} do not grow, because an "
-            "episode starts as its number in the job says; play more in another folder"
+            "episode starts as its number in the job says; run more in another folder"
         )
     return [*parts, Job(job.policy, job.env, seed, end - seed, largest_divisor(end - seed, batch_size))]

@@ -129,13 +129,13 @@ class Workers:
         self._log = self._path.open("ab")
         self._start = self._log.tell()  # what is before is of earlier commands
         self._workers: list[WorkerProcess] = []
-        self._num_idle_ends = 0  # of workers that had begun no job, since an episode was played
+        self._num_idle_ends = 0  # of workers that had begun no job, since an episode was run
 
     def look(self, has_progressed: bool) -> None:
         """Start those that are missing, end those whose job takes too long.
 
         Raises:
-            RuntimeError: they end before they play, or refuse to; the message says why.
+            RuntimeError: they end before they run, or refuse to; the message says why.
         """
         self._num_idle_ends = 0 if has_progressed else self._num_idle_ends
         for number, worker in enumerate(self._workers):
@@ -162,7 +162,7 @@ class Workers:
         self._num_idle_ends += 1
         if self._num_idle_ends > MAX_ENDED * len(self._environments):
             reason = "; ".join(filter(None, (end, self._last_line())))
-            raise RuntimeError(f"workers end before they play: {reason}; see {self._path}")
+            raise RuntimeError(f"workers end before they run: {reason}; see {self._path}")
 
     def _last_line(self) -> str:
         """The last line that this command's workers have said, '' where they said nothing."""
@@ -178,11 +178,11 @@ class Workers:
         self._log.close()
 
 
-def play(store: Store, part: str, num_workers: int, timeout_s: int | None = None) -> None:
+def run_part(store: Store, part: str, num_workers: int, timeout_s: int | None = None) -> None:
     """Run a part of the jobs: start workers, and start those anew that ended.
 
     Raises:
-        RuntimeError: they end before they play, or refuse to; the message says why.
+        RuntimeError: they end before they run, or refuse to; the message says why.
     """
     jobs = store.manifest.part(part)
     num_workers = min(num_workers, len(jobs))

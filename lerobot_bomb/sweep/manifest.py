@@ -87,9 +87,7 @@ class Manifest:
         """
         first, number = parse_part(text)
         if first >= len(self.jobs):
-            raise ValueError(
-                f"{text} has no job: there are {len(self.jobs)}, so take at most as many parts"
-            )
+            raise ValueError(f"{text} has no job: there are {len(self.jobs)}, so take at most as many parts")
         return list(self.jobs[first::number])
 
     def write(self, folder: Path) -> None:

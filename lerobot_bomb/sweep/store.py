@@ -19,8 +19,9 @@ from lerobot_bomb.files import append_line, written_whole
 from lerobot_bomb.sweep.manifest import Job, Manifest
 
 MAX_ATTEMPTS = 3
-REFUSED = 3  # exit code of a worker that plays nothing; the last line of its log says why
+REFUSED = 3  # exit code of a worker that runs nothing; the last line of its log says why
 POLL_S = 0.5  # between two looks at what other processes have done
+# the folder and the key keep the name that they have in sweeps of earlier versions
 JOBS, RESULTS, ERRORS = "cells", "results.jsonl", "errors.jsonl"
 
 
@@ -28,10 +29,26 @@ JOBS, RESULTS, ERRORS = "cells", "results.jsonl", "errors.jsonl"
 class EpisodeError:
     """An episode that has no result, which is no failure of the task."""
 
-    job: str
+    job: str  # its key
     seed: int
     error: str
-    command: str  # plays it again
+    command: str  # runs it again
+
+    def to_json(self) -> str:
+        """Return its line in a file, where the job is `cell`."""
+        values = asdict(self)
+        return json.dumps({"cell": values.pop("job"), **values})
+
+    @classmethod
+    def from_json(cls, line: str | bytes) -> "EpisodeError":
+        """Read a line of a file.
+
+        Raises:
+            ValueError, TypeError: it is no error of an episode.
+        """
+        return cls(
+            **{"job" if name == "cell" else name: value for name, value in dict(json.loads(line)).items()}
+        )
 
 
 def missing_seeds(job: Job, lines: Sequence[str | bytes], errors: Sequence[EpisodeError]) -> list[int]:
@@ -102,7 +119,7 @@ class Store:
     def begin(self, job: Job) -> bool:
         """Count an attempt; give the job up, and return False, if there were enough that were killed."""
         if self._num_attempts(job) >= MAX_ATTEMPTS:
-            self.give_up(job, f"{MAX_ATTEMPTS} workers ended while they played it")
+            self.give_up(job, f"{MAX_ATTEMPTS} workers ended while they ran it")
             return False
         append_line(self.file(job, "attempts"), self.run)
         return True
@@ -164,7 +181,7 @@ class Store:
         self.file(job, "errors").unlink(missing_ok=True)  # of an attempt that could not be written
         if errors:
             with written_whole(self.file(job, "errors")) as (path,):
-                path.write_text("".join(json.dumps(asdict(error)) + "\n" for error in errors))
+                path.write_text("".join(f"{error.to_json()}\n" for error in errors))
         with written_whole(self.file(job, "jsonl")) as (path,):
             path.write_text("".join(f"{line}\n" for line in lines))
         self.file(job, "part").unlink(missing_ok=True)
@@ -205,9 +222,9 @@ class Store:
             why = self.file(job, "given_up").read_text().splitlines()
             text += [f"given up: {job.command}", *(f"  {line}" for line in why)]
         if errors or given_up:
-            text.append(f"to play them again: lerobot-bomb sweep {self.folder} --retry")
+            text.append(f"to run them again: lerobot-bomb sweep {self.folder} --retry")
         if given_up and self.is_untouched():
-            text.append("nothing was played, so the folder takes a sweep with other flags, too")
+            text.append("nothing was run, so the folder takes a sweep with other flags, too")
         others = self._of_other_manifests()
         if others:
             text.append(f"not counted, for the manifest has changed: {len(others)} jobs, as {others[0]}")
@@ -215,7 +232,7 @@ class Store:
 
     def errors(self, job: Job) -> list[EpisodeError]:
         """Return the errors of a finished job."""
-        return [EpisodeError(**json.loads(line)) for line in _read(self.file(job, "errors")).splitlines()]
+        return [EpisodeError.from_json(line) for line in _read(self.file(job, "errors")).splitlines()]
 
     def _of_other_manifests(self) -> list[Path]:
         known = {job.key for job in self.manifest.jobs}

@@ -54,7 +54,7 @@ class Worker:
                         self._tell(job.key)
                         self._attempt(job)
                         self._tell("")
-            time.sleep(POLL_S)  # others play the rest; what a killed one leaves is for those that remain
+            time.sleep(POLL_S)  # others run the rest; what a killed one leaves is for those that remain
 
     def _attempt(self, job: Job) -> None:
         try:
@@ -63,7 +63,7 @@ class Worker:
             except FATAL:
                 raise
             except Exception as error:
-                logging.warning("%s: %s; its episodes are played one by one", job.key, describe(error))
+                logging.warning("%s: %s; its episodes are run one by one", job.key, describe(error))
                 lines, errors = self._one_by_one(job)
             self._store.finish(job, lines, errors)
         except RefusedError as error:

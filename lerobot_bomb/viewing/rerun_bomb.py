@@ -87,7 +87,9 @@ class BombLog(EpisodeLog[EpisodeSpec, EpisodeResult]):
             fill_mode="solid",
         )
         self._log("scene/board", wood, static=True)
-        corners = [BOARD.intersection_xy(*cell) for cell in ((0, 0), (BOARD.num_lines - 1,) * 2)]
+        corners = [
+            BOARD.intersection_xy(*intersection) for intersection in ((0, 0), (BOARD.num_lines - 1,) * 2)
+        ]
         (left, far), (right, near) = corners
         strips = []
         for line in range(BOARD.num_lines):

@@ -37,8 +37,8 @@ def run_tasks_in_turn(is_needed: Callable[[Any], bool]) -> None:
         def evaluate(envs: Any, policy: Any, *args: Any, max_parallel_tasks: int = 1, **options: Any) -> Any:
             if max_parallel_tasks > 1 and is_needed(policy):
                 logging.warning(
-                    "--env.max_parallel_tasks=%s: tasks are played one after another; threads would share "
-                    "this policy's queue of actions. To play in several processes: lerobot-bomb sweep",
+                    "--env.max_parallel_tasks=%s: tasks are run one after another; threads would share "
+                    "this policy's queue of actions. To run in several processes: lerobot-bomb sweep",
                     max_parallel_tasks,
                 )
                 max_parallel_tasks = 1

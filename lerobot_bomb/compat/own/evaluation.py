@@ -30,10 +30,10 @@ class KeptPolicy:
         self.policy: PreTrainedPolicy | None = None
         self._random_state: dict[str, Any] = {}
         self.env_config: Any = None  # LeRobot's, of the last evaluation
-        self.has_begun = False  # whether the last evaluation came as far as to play
+        self.has_begun = False  # whether the last evaluation reached its first episode
 
     def evaluate(self, flags: Sequence[str], asked: object, first: int = 0) -> None:
-        """Run lerobot-eval, which draws no video and plays one task after another.
+        """Run lerobot-eval, which draws no video and runs one task after another.
 
         `asked` is equal where it needs the policy of before, built with the same seed. `first` is the number
         of an episode that is run alone out of a longer evaluation.
