@@ -66,7 +66,7 @@ def main() -> None:
     """Convert, train all, evaluate all, print the table."""
     parser = make_parser(__doc__)
     parser.add_argument("--source", type=Path, help="the zarr; not needed once it is converted")
-    parser.add_argument("--output_dir", type=Path, required=True, help="folder to keep, or to go on with")
+    parser.add_argument("--output_dir", type=Path, required=True, help="folder to keep, or to resume in")
     parser.add_argument("--minutes", type=float, required=True, help="of each training")
     parser.add_argument("--device", choices=ON, default="cpu")
     parser.add_argument("--policies", nargs="+", choices=POLICIES, default=POLICIES)

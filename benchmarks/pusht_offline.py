@@ -102,7 +102,7 @@ def main() -> None:
     parser = make_parser(__doc__)
     parser.add_argument("--policy.type", dest="policy_type", required=True, choices=PUSHT_TYPES)
     parser.add_argument("--source", type=Path, help="the zarr; not needed once it is converted")
-    parser.add_argument("--output_dir", type=Path, required=True, help="folder to keep, or to go on with")
+    parser.add_argument("--output_dir", type=Path, required=True, help="folder to keep, or to resume in")
     parser.add_argument("--variants", nargs="+", help="default: all")
     parser.add_argument("--seeds", type=positive, default=3, help="trainings of each (default: 3)")
     parser.add_argument("--jobs", type=positive, default=2, help="trainings at once (default: 2)")

@@ -57,7 +57,7 @@ def main() -> None:
             hourly[name] = 3600 * manifest.num_episodes / (time.perf_counter() - started)
             records[name] = comparable(read_results(results))
         if name != TOGETHER and records[name] != records[EACH]:  # its batches are of another kind
-            raise SystemExit(f"{name} gives other lines than {EACH}")
+            raise SystemExit(f"{name} gives other records than {EACH}")
 
     title = f"{args.policy}, {len(conditions)} conditions of {args.episodes} episodes"
     rows = [[name, f"{value:.0f}", f"{value / hourly[EACH]:.2f}"] for name, value in hourly.items()]

@@ -49,7 +49,7 @@ def seen(observation: dict[str, np.ndarray], info: dict[str, Any], reward: float
 
 
 def pusht_row(seed: int, condition: str, max_coverage: float, failure: str | None) -> dict[str, Any]:
-    """A line of results, read back."""
+    """A record, read back."""
     result = PushTResult(
         spec=PushTSpec(seed, "none", perturbations=condition),
         instruction="",

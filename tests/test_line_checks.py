@@ -1,4 +1,4 @@
-"""Lines of results that cannot be: fields that contradict each other, text that nobody can write or show."""
+"""Records that cannot be: fields that contradict each other, text that nobody can write or show."""
 
 import json
 from dataclasses import asdict

@@ -284,7 +284,7 @@ def test_a_recording_that_was_begun_at_once_takes_no_parts(
     begun, parts = root.with_name("x.recording"), root.with_name("x.parts")
     shutil.copytree(parts / "0-of-2.recording", begun)
     message = (
-        f"{begun} holds a recording that was begun without --shard; go on without it, give another --root"
+        f"{begun} holds a recording that was begun without --shard; resume without it, give another --root"
     )
     assert main(["record", f"--root={root}", *FLAGS, "--join"]) == 1
     assert f"--join: {message}" in capsys.readouterr().err

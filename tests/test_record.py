@@ -281,7 +281,7 @@ def test_lerobot_merges_suites_but_no_older_tasks(datasets: dict[str, Path], tmp
         merge(tmp_path / "object", tmp_path / "refused")
 
 
-def test_a_recording_of_another_protocol_version_is_not_gone_on_with(
+def test_a_recording_of_another_protocol_version_is_not_resumed(
     datasets: dict[str, Path], tmp_path: Path
 ) -> None:
     old = replace(IMAGES, protocol_version="0.0")

@@ -125,7 +125,7 @@ def test_a_folder_of_something_else_is_left_alone(tmp_path: Path, capsys: pytest
 def test_there_must_be_something_to_resume(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert cli.main([*FLAGS, f"--root={tmp_path / 'x'}", "--resume=true"]) == 1
     message = capsys.readouterr().err
-    assert f"--resume: there is no recording to go on with in --root={tmp_path / 'x'}" in message
+    assert f"--resume: there is no recording to resume in --root={tmp_path / 'x'}" in message
 
 
 @pytest.mark.parametrize("is_complete", [True, False])

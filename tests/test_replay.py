@@ -1,4 +1,4 @@
-"""``lerobot-bomb replay``: a line of results once more, bit for bit; and the same with another axis."""
+"""``lerobot-bomb replay``: a record's episode once more, bit for bit; and the same with another axis."""
 
 import json
 from collections.abc import Callable
@@ -56,7 +56,7 @@ def rewritten(path: Path, file: Path, **changes: Any) -> Path:
         ("bomb_expert", ()),
     ],
 )
-def test_a_line_is_run_again_bit_for_bit(
+def test_a_record_is_run_again_bit_for_bit(
     policy: str,
     flags: tuple[str, ...],
     results: Callable[..., Path],

@@ -1,4 +1,4 @@
-"""LeRobot's own `pusht` and `libero` in a sweep, and as lines of results."""
+"""LeRobot's own `pusht` and `libero` in a sweep, and as records."""
 
 import json
 from collections.abc import Callable

@@ -1,4 +1,4 @@
-"""``lerobot-bomb sweep``: jobs are run once, by anybody, and give the lines of lerobot-eval."""
+"""``lerobot-bomb sweep``: jobs are run once, by anybody, and give the records of lerobot-eval."""
 
 import json
 import os
@@ -366,7 +366,7 @@ def test_sigterm_ends_a_sweep_as_ctrl_c_does(
     )
     assert sweep(tmp_path) == 130
     printed = capsys.readouterr()
-    assert f"to go on: lerobot-bomb sweep {tmp_path}" in printed.out and "interrupted" in printed.err
+    assert f"to resume: lerobot-bomb sweep {tmp_path}" in printed.out and "interrupted" in printed.err
     assert (tmp_path / "results.jsonl").read_text() == ""
 
 

@@ -1,4 +1,4 @@
-"""``lerobot-bomb sweep`` over GPUs and clusters: whoever runs the jobs, the lines are the same."""
+"""``lerobot-bomb sweep`` over GPUs and clusters: whoever runs the jobs, the records are the same."""
 
 import os
 import subprocess
@@ -244,7 +244,7 @@ def test_ctrl_c_cancels_the_jobs(
     monkeypatch.setattr(time, "sleep", interrupted)
     assert sweep(tmp_path, "--submitit=1", *SWEEP) == 130
     printed = capsys.readouterr()
-    assert job.is_cancelled and "to go on: " in printed.out and "interrupted" in printed.err
+    assert job.is_cancelled and "to resume: " in printed.out and "interrupted" in printed.err
 
 
 @pytest.mark.parametrize(

@@ -37,7 +37,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "lerobot-bomb sweep FOLDER [--policies=A,B --env.type=bomb ...] (and flags of lerobot-eval)"
     )
     add = parser.add_argument
-    add("folder", type=path_flag, metavar="FOLDER", help="new, or of a sweep that is to go on")
+    add("folder", type=path_flag, metavar="FOLDER", help="new folder, or one of a sweep to resume")
     add(
         "--policies",
         type=parse_conditions,
@@ -88,8 +88,10 @@ def _run_jobs(args: argparse.Namespace, store: Store, jobs: list[Job]) -> int:
                 _run_on_cluster(args, store)
     except KeyboardInterrupt:
         store.merge()
-        to_go_on = f"to go on: lerobot-bomb sweep {args.folder} (a job that is not finished: from its start)"
-        print_lines(*store.lines(), to_go_on)
+        to_resume = (
+            f"to resume: lerobot-bomb sweep {args.folder} (a job that is not finished: from its start)"
+        )
+        print_lines(*store.lines(), to_resume)
         raise
     store.merge()
     print_lines(*store.lines())

@@ -190,6 +190,6 @@ def _check_same(flag: str, part: Part, root: Path) -> None:
 
 def _begun_at_once(flag: str, root: Path) -> ValueError:
     return ValueError(
-        f"{flag}: {unfinished_folder(root)} holds a recording that was begun without --shard; go on without "
+        f"{flag}: {unfinished_folder(root)} holds a recording that was begun without --shard; resume without "
         "it, give another --root, or delete it"
     )

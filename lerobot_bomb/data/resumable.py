@@ -65,7 +65,7 @@ def grow(
     Args:
         parameters: what determines the dataset.
         root: where it appears.
-        resume: go on with what is there, instead of refusing it.
+        resume: continue with what is there, instead of refusing it.
         write: makes the blocks.
         layout: of the dataset.
         parts: folders that hold its first blocks.

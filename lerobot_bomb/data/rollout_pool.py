@@ -190,7 +190,7 @@ class RolloutPool:
         finally:
             signal.pthread_sigmask(signal.SIG_SETMASK, usual)
         self._turns = itertools.cycle(zip(self._processes, self._pipes, strict=True))
-        for pipe in (*self._pipes, *self._pipes):  # an episode to run and one to go on with
+        for pipe in (*self._pipes, *self._pipes):  # an episode to run, and one more for when it is done
             self._submit(pipe)
 
     def __enter__(self) -> Self:

@@ -58,7 +58,7 @@ def check_folders(parameters: Parameters, root: Path, folder: Path, resume: bool
         _check_new(kind, root, folder)
     elif not root.exists() and not folder.exists():
         raise ValueError(
-            f"--resume: there is no {kind} to go on with in --root={root}; begin it without --resume"
+            f"--resume: there is no {kind} to resume in --root={root}; begin it without --resume"
         )
     elif root.exists() and not (root / METADATA_FILE).exists():
         raise ValueError(f"--resume: --root={root} holds no {METADATA_FILE}, so it is no {kind}")

@@ -50,7 +50,7 @@ class Snapshot:
         return {word: instruction for word, (instruction, _) in self.others.items()}
 
 
-def watch(viewed: Viewed, loaded: LoadedPolicy) -> tuple[list[Snapshot], Any]:
+def take_snapshots(viewed: Viewed, loaded: LoadedPolicy) -> tuple[list[Snapshot], Any]:
     """Return every moment in which the policy acts, and the result of the episode."""
     loaded.begin()
     with closing(viewed.make_env()) as env:

@@ -72,7 +72,7 @@ def _grown(folder: Path, there: Manifest | None, wanted: Manifest, batch_size: i
         raise ValueError(
             f"{folder / NAME} is of another sweep: of its jobs these flags lack {len(others)}, as "
             f"{others[0].command}. Name another folder; or give its flags, with more policies, tasks, "
-            f"perturbations or episodes if you like; or go on with it by `lerobot-bomb sweep {folder}`"
+            f"perturbations or episodes if you like; or resume it by `lerobot-bomb sweep {folder}`"
         )
     return Manifest(jobs)
 

@@ -172,7 +172,7 @@ def check_as_trained(config: Any, flags: Iterable[str]) -> None:
 
 
 def check_weights_fit(config: Any, flags: Iterable[str]) -> None:
-    """Check that a training goes on with flags that the checkpoint's weights have the shapes for."""
+    """Check that a training from a checkpoint has flags that fit the shapes of its weights."""
     then = _then(config, flags)
     for flag, value in trained_with(config, [flag for flag in flags if flag in then]).items():
         if value != then[flag]:
