@@ -1,4 +1,4 @@
-"""Intervals of means over episodes, and of what levels do to them, by drawing episodes with replacement.
+"""Bootstrap intervals over episodes, of means and of their slopes over levels.
 
 The draws are always the same. Shapes: `R` frames, `E` episodes, `N` values, `M` sums of each episode.
 """
@@ -18,7 +18,7 @@ ROUNDING = 1e-9  # that makes no two numbers different
 
 
 def sums_by(values_N: np.ndarray, episode_N: Sequence[Hashable]) -> tuple[np.ndarray, np.ndarray]:
-    """(sums_E, counts_E) of values by what tells their episodes apart."""
+    """(sums_E, counts_E) of values, by episode."""
     places: dict[Hashable, int] = {}
     place_N = [places.setdefault(episode, len(places)) for episode in episode_N]
     return np.bincount(place_N, weights=values_N), np.bincount(place_N).astype(float)
@@ -68,13 +68,13 @@ def bca_interval(sums_E: np.ndarray, counts_E: np.ndarray) -> tuple[float, float
 
 
 def format_bounds(interval: tuple[float, float] | None, form: str) -> str:
-    """' [low, high]', each in this form; nothing where there is no interval."""
+    """' [low, high]' in this number format; '' without an interval."""
     return "" if interval is None else f" [{interval[0]:{form}}, {interval[1]:{form}}]"
 
 
 @dataclass(frozen=True)
 class Slope:
-    """Least-squares slope of a value over levels; there is no 95 % interval where all resamples agree."""
+    """Least-squares slope of a value over levels, with its 95 % interval unless all resamples agree."""
 
     per_level: float
     low: float | None
@@ -150,12 +150,12 @@ def measure(values_RX: np.ndarray, episode_R: np.ndarray) -> Measure:
 
 
 def _is_constant(sums_E: np.ndarray, counts_E: np.ndarray) -> bool:
-    """Return whether there are fewer than two episodes, or all have one mean."""
+    """Return True if there are fewer than two episodes, or all have one mean."""
     return len(sums_E) < 2 or _are_equal(sums_E / counts_E)
 
 
 def _are_equal(values: np.ndarray) -> bool:
-    """Return whether all are equal but for rounding: resampling them tells nothing."""
+    """Return True if all are equal up to rounding: resampling them tells nothing."""
     return bool(np.ptp(values) <= ROUNDING * np.abs(values).max())
 
 
@@ -182,7 +182,7 @@ def _resampled_sums(values_EM: np.ndarray, number: int) -> np.ndarray:
 
 
 def _percentiles(means: np.ndarray) -> tuple[float, float] | None:
-    """2.5th and 97.5th percentile; None where all are the same, or there is none."""
+    """2.5th and 97.5th percentile; None if all are the same, or there is none."""
     if not len(means) or _are_equal(means):
         return None
     low, high = np.percentile(means, [2.5, 97.5])

@@ -204,7 +204,7 @@ class BombEnv(EpisodeEnv[EpisodeSpec, _Run, EpisodeResult]):
         )
 
     def object_masks(self) -> dict[str, dict[str, np.ndarray]]:
-        """{camera: {what: (H, W) bool}} of the observation's images, by what their pixels show."""
+        """{camera: {object: (H, W) bool}}: the pixels of each object in the observation's images."""
         run, size = self._run, self._render_options.image_size
         goals = run.episode.goals_after(run.judge.num_made)
         goal = goals[min(run.judge.num_made, len(goals) - 1)]

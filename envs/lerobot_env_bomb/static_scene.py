@@ -20,7 +20,7 @@ GRIP_ERROR_M = 0.0015  # largest of a held stone between the pads, in x, y and z
 
 @dataclass(frozen=True)
 class StaticScene:
-    """Scene at some time of an episode: where everything is, and what has been done before."""
+    """Scene in the middle of an episode: where everything is, and which moves have been made."""
 
     layout: Layout
     num_made: int  # moves that have been made

@@ -119,7 +119,7 @@ class BombPushTEnv(EpisodeEnv[PushTSpec, _Run, PushTResult]):
         )
 
     def close(self) -> None:
-        """Free what gym-pusht holds."""
+        """Free gym-pusht's resources."""
         self._board.close()
 
     @property

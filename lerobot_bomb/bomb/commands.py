@@ -1,4 +1,4 @@
-"""Suites whose instruction is a command: a verb, and what it is about on the board that an episode draws."""
+"""Suites whose instruction is a command: a verb and its arguments, on the board of the episode."""
 
 from abc import ABC, abstractmethod
 from collections.abc import Mapping, Sequence
@@ -68,7 +68,7 @@ class TaskInstance:
 
 @dataclass(frozen=True)
 class Case:
-    """Meaning of a command: its words, the moves that fulfil it, and what the expert does."""
+    """Meaning of a command: its words, the moves that fulfil it, and the expert's aims."""
 
     commands: tuple[str, ...]  # one, or one for each move
     plans: tuple[Plan, ...]
@@ -81,11 +81,11 @@ class Task(ABC):
 
     @abstractmethod
     def draw(self, rng: np.random.Generator) -> TaskInstance:
-        """A board, and what the command is about; it need not make sense there."""
+        """Draw a board and the command's arguments; the command need not make sense on that board."""
 
     @abstractmethod
     def case(self, drawn: TaskInstance) -> Case | None:
-        """Return what the command means on that board; None where it means nothing, or several things."""
+        """Return what the command means on that board; None if it means nothing, or several things."""
 
 
 def is_graspable(stones: Stones, intersection: Intersection) -> bool:
@@ -100,7 +100,7 @@ def other_color(color: str) -> str:
 
 
 def only(stones: Stones, color: str) -> Intersection | None:
-    """Return where the only stone of a colour stands; None where there is none, or several."""
+    """Return where the only stone of a colour stands; None if there is none, or several."""
     intersections = [intersection for intersection, other in stones.items() if other == color]
     return intersections[0] if len(intersections) == 1 else None
 
@@ -108,7 +108,7 @@ def only(stones: Stones, color: str) -> Intersection | None:
 def draw_intersections(
     rng: np.random.Generator, number: int, intersections: Sequence[Intersection] = INTERSECTIONS
 ) -> list[Intersection]:
-    """Draw so many different intersections."""
+    """Draw `number` different intersections."""
     return [intersections[i] for i in rng.choice(len(intersections), size=number, replace=False)]
 
 
@@ -118,7 +118,7 @@ def draw_stones(
     intersections: Sequence[Intersection] = INTERSECTIONS,
     colors: Sequence[str] = COLORS,
 ) -> dict[Intersection, str]:
-    """Draw so many stones, each of one of these colours, on different intersections."""
+    """Draw `number` stones, each of one of these colours, on different intersections."""
     return {
         intersection: colors[int(rng.integers(len(colors)))]
         for intersection in draw_intersections(rng, number, intersections)
@@ -144,7 +144,7 @@ def command_suite(tasks: Sequence[Task], max_steps: int, num_goals: int, version
 
 
 def draw_command(tasks: Sequence[Task], spec: EpisodeSpec) -> tuple[int, TaskInstance, Case]:
-    """Return a task's number, the board that is drawn for it, and what its command means there."""
+    """Draw a task's number and its board; return them with the meaning of its command."""
     drawn_id = int(generator(spec.seed, Stream.TARGET).integers(len(tasks)))
     task_id = drawn_id if spec.task_id is None else spec.task_id
     task, rng = tasks[task_id], generator(spec.seed, Stream.OPENING)

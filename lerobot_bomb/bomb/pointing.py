@@ -142,7 +142,7 @@ def colors_on_spots(state: PrivilegedState) -> np.ndarray:
 
 
 def action_for(state: PrivilegedState, pointed: PointedAt) -> np.ndarray:
-    """(4,) the expert's action if stone and place were where they are pointed at; what it holds, it holds."""
+    """(4,) the expert's action if stone and place were where they are pointed at; the grip stays as it is."""
     goal, stone_xyz = current_goal(state), state.stone_xyz.copy()
     if held_share(state, goal.stone) < HELD:
         stone_xyz[goal.stone, :2] = pointed.stone_xy

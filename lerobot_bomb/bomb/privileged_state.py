@@ -73,7 +73,7 @@ class PrivilegedState:
 
 @dataclass(frozen=True)
 class _Part:
-    """Numbers of the vector that stand together: how they are read from a state, and what they say of it."""
+    """Part of the vector: how it is read from a state, and written back to one."""
 
     size: int  # 0: as many as the goals take
     encode: Callable[[PrivilegedState], Any]

@@ -1,4 +1,4 @@
-"""The policy that acts in an environment, of which LeRobot tells the environment nothing."""
+"""The policy that acts in an environment; LeRobot does not tell the environment which."""
 
 import gc
 import logging
@@ -18,7 +18,7 @@ _acting: ContextVar[PreTrainedConfig | None] = ContextVar("acting", default=None
 
 @contextmanager
 def acting(config: PreTrainedConfig) -> Iterator[None]:
-    """Let the policy of a config be the one that acts, also where none is built of it."""
+    """Let the policy of this config count as the one that acts, even if none has been built."""
     token = _acting.set(config)
     try:
         yield
@@ -33,7 +33,7 @@ def acting_config() -> PreTrainedConfig | None:
 
 
 def acting_policy() -> PreTrainedPolicy | None:
-    """Return the one policy that this process built and holds; None: it holds none, or several.
+    """Return the one policy that this process built and holds; None if it holds none, or several.
 
     LeRobot's commands build it before they ask an environment for anything but its features.
     """

@@ -1,4 +1,4 @@
-"""Environment that a policy was trained for, and whether it is the one that the policy is about to act in."""
+"""Environment that a policy was trained for, and the check that it is the one to act in."""
 
 import logging
 from collections.abc import Iterable
@@ -40,7 +40,7 @@ class ConfigWithEnvironment(PreTrainedConfig):
         super().__post_init__()
 
     def missing_parts(self) -> str | None:
-        """Describe what a checkpoint with this config lacks and what it would need instead; None: nothing."""
+        """Describe what a checkpoint with this config lacks, and what it would need; None if nothing."""
         return None
 
     def methods_used(self) -> str:
@@ -82,7 +82,7 @@ def trained_environment(config: PreTrainedConfig) -> Environment | None:
 
 
 def environment_of_dataset(root: Path | str | None) -> Environment | None:
-    """Return the environment of a dataset; None: the folder is gone, or holds no recording of BOMB."""
+    """Return the environment of a dataset; None if the folder is gone, or holds no recording of BOMB."""
     facts = DatasetFacts.find(root)
     return None if facts is None else facts.environment
 
@@ -90,7 +90,7 @@ def environment_of_dataset(root: Path | str | None) -> Environment | None:
 def dataset_of_training(config: PreTrainedConfig) -> Path | None:
     """Folder of the dataset that it is being trained on, or that its checkpoint's training names.
 
-    It may be gone. None: not known.
+    It may be gone. None if unknown.
     """
     meta, path = training_data(config), config.pretrained_path
     if meta is not None:
@@ -119,7 +119,7 @@ def _check(config: PreTrainedConfig, who: str, here: Environment) -> None:
 
 
 def complete_evaluation(config: Any) -> None:
-    """Let the environment of LeRobot's EvalPipelineConfig be what its flags leave open and its policy says.
+    """Fill in what the flags of LeRobot's EvalPipelineConfig leave open and its policy's checkpoint knows.
 
     Raises:
         FlagError: it is to record several episodes.
@@ -130,14 +130,14 @@ def complete_evaluation(config: Any) -> None:
 
 
 def side_of_images(config: PreTrainedConfig | None, cameras: Iterable[str]) -> int | None:
-    """Return the side of the square images of cameras that a policy's config declares; None: of none."""
+    """Return the side of the square images that a policy's config declares; None if it declares none."""
     features = (config and config.input_features) or {}
     shapes = (features[IMAGES + camera].shape for camera in cameras if IMAGES + camera in features)
     return next((height for _, height, width in shapes if height == width), None)
 
 
 def _check_image_size(config: PreTrainedConfig, here: Environment, who: str) -> None:
-    """Raise if the config's inputs (3, H, W) are of another size than the images of the cameras here."""
+    """Raise if the config's inputs (3, H, W) have another size than the cameras' images here."""
     for camera in here.cameras:
         feature = (config.input_features or {}).get(f"{IMAGES}{camera}")
         if feature is None or tuple(feature.shape[1:]) == (here.image_size,) * 2:

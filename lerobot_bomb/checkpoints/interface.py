@@ -21,7 +21,7 @@ UNNORMALIZER = f"{POLICY_POSTPROCESSOR_DEFAULT_NAME}_step_*_unnormalizer_process
 
 @dataclass(frozen=True)
 class Interface:
-    """Interface of an environment: what it shows a policy and takes from it."""
+    """Interface of an environment: its observations and actions."""
 
     env_type: str
     features: Mapping[str, PolicyFeature]  # by the policy's names
@@ -82,7 +82,7 @@ class Interface:
 
 
 def trained_actions(config: PreTrainedConfig) -> tuple[np.ndarray, np.ndarray] | None:
-    """(D,) least and (D,) greatest value of each dimension in a policy's training; None: not known."""
+    """(D,) least and (D,) greatest value of each dimension in a policy's training; None if unknown."""
     meta = training_data(config)
     if meta is not None:
         of_action = (meta.stats or {}).get(ACTION, {})

@@ -56,7 +56,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(args: argparse.Namespace) -> int:
-    """Run all groups, write what they show, print the verdicts; exit code 3 where one is no."""
+    """Run all groups, write the page, print the verdicts; exit code 3 if one is no."""
     check_at_least(args, episodes=2, seed=0, workers=1)
     check_flags(args.rest)
     groups = _run_jobs(args, args.folder / "first", _first_groups(args))

@@ -8,7 +8,7 @@ from lerobot_bomb.data.resumable import BLOCK_EPISODES, check_repo_id, default_r
 
 
 def add_conversion_arguments(parser: argparse.ArgumentParser, path: str) -> None:
-    """Declare what is converted, and into which dataset."""
+    """Declare source and dataset of a conversion."""
     parser.add_argument("path", type=path_flag, help=path)
     add_new_dataset_arguments(parser)
     summary = f"continue a conversion that was interrupted; its blocks of {BLOCK_EPISODES} episodes are kept"

@@ -1,4 +1,4 @@
-"""``lerobot-bomb demo``: a policy that comes with the package acts, on LeRobot's own commands."""
+"""``lerobot-bomb demo``: evaluate a policy that comes with the package, by LeRobot's own commands."""
 
 import argparse
 import json

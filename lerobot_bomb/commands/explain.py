@@ -61,7 +61,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(args: argparse.Namespace) -> int:
-    """Explain episodes; write a page, its numbers and, of one episode, a recording; print the findings."""
+    """Explain episodes: print the findings; write a page, its numbers and, for one episode, a recording."""
     check_at_least(args, episodes=1, grid=1)
     if args.episodes > 1 and args.step is not None:
         raise ValueError(f"--step={args.step} is of one episode; drop it or --episodes={args.episodes}")

@@ -74,7 +74,7 @@ def module_of(name: str) -> Any:
 
 
 def _split(argv: Sequence[str]) -> tuple[str, Sequence[str]] | None:
-    """Return a command's name, of two words where there is one, and its flags; None: there is none."""
+    """Return a command's name, of two words where there is one, and its flags; None if there is none."""
     for number in (2, 1):
         name = " ".join(argv[:number])
         if name in COMMANDS:

@@ -202,7 +202,7 @@ def _job_command(args: argparse.Namespace, root: Path) -> list[str]:
 
 
 def _acting_weights(args: argparse.Namespace) -> str | None:
-    """Return the SHA-256 of the weights that act; None: the expert does."""
+    """Return the SHA-256 of the weights that act; None if the expert does."""
     if args.relabel != (args.policy_path is not None):
         raise ValueError(
             "--relabel and --policy.path=FOLDER come together: a policy acts, and the expert says what it "

@@ -28,10 +28,10 @@ def use() -> None:
 
 
 def is_ours(kind: type) -> bool:
-    """Return whether a class, or one that it builds on, is of a package that was registered."""
+    """Return True if a class, or one that it builds on, is of a package that was registered."""
     return any(base.__module__.partition(".")[0] in _packages for base in kind.__mro__)
 
 
 def is_of_ours(module: str) -> bool:
-    """Return whether a module is of a package that was registered."""
+    """Return True if a module is of a package that was registered."""
     return module.partition(".")[0] in _packages

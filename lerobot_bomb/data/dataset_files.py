@@ -45,7 +45,7 @@ def check_dataset(root: Path) -> None:
 
 
 def check_metadata(root: Path) -> None:
-    """Check that the files under meta/ can be read; of others' datasets no more can be expected.
+    """Check that the files under meta/ can be read; datasets of other people promise no more.
 
     Raises:
         ValueError: names the one that is truncated.

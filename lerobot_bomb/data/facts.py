@@ -57,7 +57,7 @@ class DatasetFacts:
 
     @property
     def environment(self) -> Environment | None:
-        """Environment of BOMB that the dataset shows; None: it shows another."""
+        """Environment of BOMB that the dataset shows; None if it shows another."""
         return Environment.of_dataset(self.info, *self._tasks)
 
     @property
@@ -72,7 +72,7 @@ class DatasetFacts:
         return suites[0], numbered_tasks(self.specs or ())
 
     def eval_flags(self) -> list[str] | None:
-        """Return lerobot-eval's flags for the environment that the dataset shows; None: not known."""
+        """Return lerobot-eval's flags for the environment that the dataset shows; None if unknown."""
         conversion = self.bomb.get("conversion", {})
         if conversion.get("source", "").startswith(PUSHT_SOURCE):
             return ["--env.type=pusht", "--eval.use_async_envs=false"]
@@ -94,7 +94,7 @@ class DatasetFacts:
 
     @property
     def seeds(self) -> Sequence[int] | None:
-        """Seeds of the episodes that were tried, of an edited recording of those in it; None: not known."""
+        """Seeds of the episodes that were tried, of an edited recording of those in it; None if unknown."""
         recording = self.recording
         if not recording:
             return None if self.specs is None else sorted({spec["seed"] for spec in self.specs})
@@ -124,7 +124,7 @@ class DatasetFacts:
 
 
 def _read_specs(root: Path) -> list[dict[str, Any]] | None:
-    """Return `EpisodeSpec` of each episode as JSON; None: not every episode has one.
+    """Return `EpisodeSpec` of each episode as JSON; None if not every episode has one.
 
     Raises:
         ValueError: a table of episodes is truncated.

@@ -13,7 +13,7 @@ class TokenError(ValueError):
 def check_token_characters(token: str) -> None:
     """Raise a TokenError unless all characters of the token can be sent.
 
-    Of a variable also those that huggingface_hub takes out, as what is left is another token.
+    In a variable, characters that huggingface_hub would strip are refused too: the rest is another token.
     """
     given = {name: os.environ.get(name, "").strip() for name in VARIABLES}
     for source, text in {"your token": token, **given}.items():

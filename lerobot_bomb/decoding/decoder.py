@@ -93,7 +93,7 @@ class CachedContinuation(Continuation):
 
 
 class Answers(NamedTuple):
-    """Rows of symbols, as far as they are written."""
+    """Rows of symbols written so far."""
 
     numbers: Tensor  # (B, N) int64 those that are complete, else 0
     last: Tensor  # (B,) int64, the symbol written last

@@ -1,4 +1,4 @@
-"""Split of a dataset's episodes: those that a checkpoint was trained on, and those that judge it."""
+"""Split of a dataset's episodes: those that a checkpoint was trained on, and those to validate it."""
 
 import math
 import re

@@ -70,7 +70,7 @@ def without_object(name: str, fill: str) -> Mask:
 
 
 def without_words(loaded: LoadedPolicy, words: Callable[[str], Span | None]) -> Mask:
-    """Tokens of an instruction that no other token reads; ``words``: which, None: there are none in it."""
+    """Tokens of an instruction that no other token reads; ``words``: which, None if there are none in it."""
     policy = scored(loaded.policy, loaded.postprocess)
 
     def hide(prepared: Batch, instruction: str) -> Batch:

@@ -53,7 +53,7 @@ def decoder_layers(text_model: Any, *, called_whole: bool = True) -> list[Decode
 class ScoredPolicy(ABC):
     """A policy that scores its own answers.
 
-    Scores of a row do not depend on the others of its batch, but for rounding.
+    A row's scores do not depend on the other rows of its batch, except for rounding.
     """
 
     unit: ClassVar[str]  # of a score
@@ -89,7 +89,7 @@ class ScoredPolicy(ABC):
         """
 
     def pointed(self, batch: Batch) -> PointedAt | None:
-        """Return what the policy points at before it answers a batch of one row; None: it does not."""
+        """Return what the policy points at before it answers a batch of one row; None if it does not."""
         return None
 
     def token_spans(self, rows: Rows) -> dict[str, TokenSpan]:

@@ -97,7 +97,7 @@ def _phase(moment: Moment) -> str:
 
 
 def middle_of_phases(moments: list[Snapshot]) -> list[Snapshot]:
-    """The moment in the middle of each phase that there is; of an episode without any, the middle one."""
+    """Return the middle moment of each phase; of an episode without phases, the middle one."""
     by_phase = [[each for each in moments if each.phase == phase] for phase in (*PHASES, "")]
     return [each[len(each) // 2] for each in by_phase if each]
 

@@ -1,4 +1,4 @@
-"""A checkpoint that was trained earlier, with its card, to the Hub."""
+"""Push of an earlier checkpoint, with its card, to the Hub."""
 
 import json
 from collections.abc import Mapping

@@ -53,7 +53,7 @@ class Libero:
 
     @classmethod
     def find(cls) -> "Libero | None":
-        """Find the LIBERO of this Python; None: not installed."""
+        """Find the LIBERO of this Python; None if not installed."""
         spec = importlib.util.find_spec("libero")
         for folder in (spec and spec.submodule_search_locations) or []:
             if (Path(folder) / "libero" / "__init__.py").is_file():

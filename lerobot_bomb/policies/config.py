@@ -119,7 +119,7 @@ class ChunkConfig(ConfigWithEnvironment):
         check_training(self)
 
     def validate_features(self) -> None:
-        """Raise unless the dataset (or environment) has what the policy reads and writes."""
+        """Raise unless the dataset or environment has all features that the policy reads and writes."""
         check_cameras_and_action(self)
         self._check_action_size()
 

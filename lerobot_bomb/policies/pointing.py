@@ -141,7 +141,7 @@ def normalised_actions(actions_BD: Tensor, bounds_2D: Tensor) -> Tensor:
 
 
 def number_of(xy_B2: Tensor, places_P2: Tensor) -> Tensor:
-    """(B,) int64: the nearest place to each."""
+    """(B,) int64: the number of the place nearest to each."""
     return torch.cdist(xy_B2, places_P2).argmin(dim=1)
 
 

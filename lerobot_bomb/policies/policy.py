@@ -430,7 +430,7 @@ class TokenVlaPolicy(VlaPolicy):
         return super().predict_action_chunk(batch)
 
     def _choice_noise(self, batch_size: int, shape: tuple[int, ...]) -> Tensor | None:
-        """(B, *shape) to be added to logits, so that the likeliest choice is a sample; None: it is greedy."""
+        """(B, *shape) to add to logits, so that the likeliest choice is a sample; None if decoding is greedy."""
         if not self.config.temperature:
             return None
         noise = self._sampling_noise.draw(batch_size, shape)

@@ -1,4 +1,4 @@
-"""Latency and smoothness of a policy, from records of results that hold them."""
+"""Latency and smoothness of a policy, from records that hold them."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass

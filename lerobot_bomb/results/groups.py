@@ -78,7 +78,7 @@ class Policy:
 
     @property
     def name(self) -> str:
-        """Name of its group, where it has only one: it says the suite, too."""
+        """Name of the group if there is only one; it includes the suite."""
         return self.groups[0].name if len(self.groups) == 1 else self.short_name
 
     @property

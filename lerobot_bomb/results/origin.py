@@ -41,7 +41,7 @@ def installed_versions(distributions: Iterable[str]) -> dict[str, str | None]:
 def machine_name() -> str:
     """Processor and C library of this machine: "x86_64, AMD EPYC, glibc 2.36".
 
-    Sine and cosine are the library's, in the variant for the processor; their last bits are in every state.
+    The library has variants of sine and cosine for each processor; their last bits are in every state.
     """
     cpus = Path("/proc/cpuinfo")  # of Linux
     lines = cpus.read_text().splitlines() if cpus.is_file() else []

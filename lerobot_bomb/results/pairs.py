@@ -34,7 +34,7 @@ class PairedComparison:
 
     @property
     def num_needed(self) -> int | None:
-        """Number of pairs in which the same test finds such a difference; None: it did, or never does."""
+        """Number of pairs in which the same test finds such a difference; None if it did, or never does."""
         if self.p_value < SIGNIFICANT:
             return None
         return episodes_to_tell_apart(self.counts, SIGNIFICANT / self.num_conditions)

@@ -158,7 +158,7 @@ class Record:
         return tuple([getattr(self.spec, name) for name in self.start])
 
     def settings(self) -> dict[str, str]:
-        """Return what must be equal in episodes that are pooled, beside spec, policy, protocol and images."""
+        """Return what pooled episodes must agree in, beside spec, policy, protocol and images."""
         raise NotImplementedError
 
     @classmethod

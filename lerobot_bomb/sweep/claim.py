@@ -1,4 +1,4 @@
-"""Claim on a sweep's folder, which belongs to one manifest at a time; that may grow."""
+"""Claim on a sweep's folder, which belongs to one manifest at a time. The manifest may grow."""
 
 import sys
 from collections.abc import Iterator
@@ -16,7 +16,7 @@ LOCK = "sweep.lock"  # held by every command that runs the manifest; alone by on
 
 @contextmanager
 def claimed(folder: Path, wanted: Manifest, batch_size: int | None = None) -> Iterator[Store]:
-    """Hold a folder for a manifest, or for the one there with what the wanted one has more.
+    """Hold a folder for a manifest, or for the one that is there, extended by the wanted one.
 
     Other commands may run the same manifest at the same time; stderr says so.
 
@@ -57,7 +57,7 @@ def _is_alone(lock: IO[str]) -> bool:
 
 
 def _grown(folder: Path, there: Manifest | None, wanted: Manifest, batch_size: int | None) -> Manifest:
-    """The manifest of a folder from now on: the wanted one, in which jobs that are there stay as they are.
+    """Return the folder's manifest from now on: the wanted one, with the jobs that are there unchanged.
 
     Raises:
         ValueError: jobs are there that it does not have, and episodes of that manifest have been run.
@@ -78,7 +78,7 @@ def _grown(folder: Path, there: Manifest | None, wanted: Manifest, batch_size: i
 
 
 def _with_rest(job: Job, there: Manifest, batch_size: int) -> list[Job]:
-    """Split a job into the jobs that are there from its seed on, and one of the seeds that they lack.
+    """Split a job into those that are there from its seed on, and one with the missing seeds.
 
     Raises:
         ValueError: such a job would start its episodes otherwise.

@@ -146,7 +146,7 @@ def parse_part(text: str) -> tuple[int, int]:
 
 
 def flag_value(flags: Sequence[str], name: str) -> str | None:
-    """'bomb' of '--env.type=bomb'; None: it is not among them."""
+    """'bomb' of '--env.type=bomb'; None if it is not among them."""
     return next((flag.partition("=")[2] for flag in flags if flag.startswith(f"{name}=")), None)
 
 

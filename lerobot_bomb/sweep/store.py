@@ -27,7 +27,7 @@ JOBS, RESULTS, ERRORS = "cells", "results.jsonl", "errors.jsonl"
 
 @dataclass(frozen=True)
 class EpisodeError:
-    """An episode that has no result, which is no failure of the task."""
+    """An episode without a result, which does not count as a failure."""
 
     job: str  # its key
     seed: int

@@ -57,7 +57,7 @@ class EnvView(ABC):
 
     @abstractmethod
     def of_flags(self, flags: Mapping[str, Any]) -> Viewed:
-        """Return the episode of seed, perturbations, image_size and own flags; None: not given."""
+        """Return the episode of seed, perturbations, image_size and own flags; None if not given."""
 
     @abstractmethod
     def of_record(self, record: Any, spec: Any, depth: bool) -> Viewed:

@@ -46,7 +46,7 @@ class Replay:
 
     @property
     def checkpoint(self) -> Path | None:
-        """Return the folder of the policy that ran; None: the record names none."""
+        """Return the folder of the policy that ran; None if the record names none."""
         path = None if self.record.policy is None else self.record.policy.path
         return self.policy_path or (Path(path) if path else None)
 

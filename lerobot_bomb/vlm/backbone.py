@@ -63,7 +63,7 @@ class Backbone(nn.Module):
         return self.vlm.model.get_submodule(self.text_model_name)
 
     def checkpoint_gradients(self) -> None:
-        """Compute what is inside a layer again in the backward pass instead of keeping it."""
+        """Recompute a layer's activations in the backward pass instead of keeping them."""
         self.vlm.gradient_checkpointing_enable(CHECKPOINTING)
 
     def embed_tokens(self, tokens_BL: Tensor) -> Tensor:
@@ -106,7 +106,7 @@ class SmolVLMBackbone(Backbone):
         return [*self.text_model.layers, *self.vlm.model.vision_model.encoder.layers]
 
     def freeze_vision(self) -> None:
-        """Train the connector and what follows it only."""
+        """Train only the connector and what follows it."""
         self.vlm.model.vision_model.requires_grad_(False)
 
     def pixels(self, images_B3HW: Tensor) -> Tensor:

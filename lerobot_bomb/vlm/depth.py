@@ -149,10 +149,10 @@ def build_zoedepth(depth_config: dict[str, Any]) -> ZoeDepth:
 
 
 def load_zoedepth(depth_model_name: str) -> ZoeDepth:
-    """Weights of a Hub id or a local folder.
+    """Load the weights of a Hub id or a local folder.
 
     Raises:
-        OSError: they cannot be had; the message names the ways out.
+        OSError: they cannot be read; the message says what to do.
     """
     from transformers import ZoeDepthForDepthEstimation  # only who asks for it pays for it
 

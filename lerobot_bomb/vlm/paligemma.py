@@ -1,4 +1,4 @@
-"""PaliGemma 2 behind the few operations a policy needs.
+"""PaliGemma 2, reduced to the few operations that a policy needs.
 
 Shapes: `B` batch, `L` tokens, `H` hidden size of the text model, `E` of the vision model, `V` vocabulary, `P`
 tokens of an image.

@@ -42,7 +42,7 @@ TASK_TEMPLATE = "Task: {},"
 
 @dataclass(frozen=True)
 class ChatFormat:
-    """Format of a chat: what a family of models puts around a user's texts and its own."""
+    """Chat format of a family of models: the tokens around the user's texts and its own."""
 
     family: str  # of its tokenizers, in messages
     start: str  # of the sequence
@@ -207,7 +207,7 @@ def normalize_task(task: str) -> str:
 
 
 def check_template(template: object, name: str) -> None:
-    """Raise a ValueError unless what is written around an instruction holds ``{}`` once, for it.
+    """Raise a ValueError unless the template holds ``{}`` once, for the instruction.
 
     ``name``: what the message calls it.
     """
@@ -226,7 +226,7 @@ def task_ids(tokenizer: Tokenizer, task: str, template: str = TASK_TEMPLATE) -> 
 
 
 def text_ids(tokenizer: Tokenizer, text: str) -> list[int]:
-    """Tokens of a user's text; what looks like a special token stays text."""
+    """Tokens of a user's text; text that looks like a special token stays text."""
     tokenizer.encode_special_tokens = True
     try:
         return tokenizer.encode(text, add_special_tokens=False).ids

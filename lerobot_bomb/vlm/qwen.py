@@ -40,7 +40,7 @@ from lerobot_bomb.vlm.tokenizer import NANO, load_tokenizer, single_id
 
 @dataclass(frozen=True)
 class QwenPrompt:
-    """Token ids of everything in a prompt but the task: start, images, task, whatever else, end."""
+    """Token ids of all parts of a prompt except the task, in order."""
 
     start: list[int]
     image_start: int
@@ -95,7 +95,7 @@ class QwenBackbone(Backbone):
             self.register_buffer(name, torch.tensor(values)[:, None, None], persistent=False)
 
     def checkpoint_gradients(self) -> None:
-        """Compute what is inside a layer again in the backward pass instead of keeping it."""
+        """Recompute a layer's activations in the backward pass instead of keeping them."""
         self._is_checkpointed = True  # transformers' own kind gives layers no cache
         self.vlm.model.visual.gradient_checkpointing_enable(CHECKPOINTING)
 
@@ -109,7 +109,7 @@ class QwenBackbone(Backbone):
         return [*self.text_model.layers, *self.vlm.model.visual.blocks]
 
     def freeze_vision(self) -> None:
-        """Train the connector and what follows it only."""
+        """Train only the connector and what follows it."""
         self.vlm.model.visual.requires_grad_(False)
         self.vlm.model.visual.merger.requires_grad_(True)
 

@@ -69,7 +69,7 @@ class TaskStep(ObservationProcessorStep):
 
     @abstractmethod
     def tokens(self, tasks: list[str]) -> dict[str, Tensor]:
-        """Return what is added to the observation: ids (B, L) and whatever goes with them, by their keys."""
+        """Return the entries to add to the observation, by key: ids (B, L) and what belongs to them."""
 
     def transform_features(
         self, features: dict[PipelineFeatureType, dict[str, PolicyFeature]]
@@ -161,7 +161,7 @@ class TaskTokenizerStep(TaskStep):
 
 
 def _read_by_policies(observation: Mapping[str, Any], actions: Any) -> dict[str, Tensor]:
-    """Images, state and actions; depth is not finite where there is none."""
+    """Images, state and actions, by key; not depth, which is not finite where it is missing."""
     return {
         key: values
         for key, values in {**observation, ACTION: actions}.items()

@@ -118,7 +118,7 @@ class CellPointer(nn.Module):
 
     @torch.no_grad()
     def fit(self, meta: LeRobotDatasetMetadata, config: "SpatialvlaGridConfig") -> None:
-        """Take from a dataset what its normalised actions are."""
+        """Take the normalisation of actions from a dataset."""
         self.action_bounds.copy_(unit_bounds(meta, ACTION, config.normalization_mapping["ACTION"]))
 
     def draw(

@@ -29,7 +29,7 @@ EDGE_COLUMNS = 0, BOARD.num_lines - 1  # of captured stones: fingers go down bes
 
 
 def _in_turn(first: int, number: int) -> tuple[str, ...]:
-    """Return so many colours, black and white in turn, from the first or the second of COLORS."""
+    """Return this number of colours in turn, beginning with the first or the second of COLORS."""
     return tuple(COLORS[(first + i) % 2] for i in range(number))
 
 
@@ -100,7 +100,7 @@ class Opening(Task):
 
 @dataclass(frozen=True)
 class FillRow(Task):
-    """The free intersections of a row get a stone each, the colours in turn from left to right.
+    """Task: fill the free intersections of a row from left to right, colours in turn.
 
     The last one's colour is said: it stays true of what is left, whoever has played there before.
     """

@@ -129,7 +129,7 @@ def is_heldout(task_id: int, intersection: Intersection) -> bool:
 
 @cache
 def pairs_of(split: str) -> tuple[tuple[int, Intersection], ...]:
-    """(task, target) that a split draws from."""
+    """Return the pairs (task, target) that a split draws from."""
     pairs = [(task_id, intersection) for task_id in range(len(TASKS)) for intersection in ALL_TARGETS]
     return of_split(split, pairs, [pair for pair in pairs if is_heldout(*pair)])
 

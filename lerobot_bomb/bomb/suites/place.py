@@ -136,7 +136,7 @@ def sample_opening(
     max_stones: int,
     colors: Sequence[str] = COLORS,
 ) -> dict[Intersection, str]:
-    """{(row, column): colour} of up to so many stones, the colours in turn: a legal position, a legal move.
+    """{(row, column): colour} of up to this many stones, colours in turn; position and move are legal.
 
     The candidates do not depend on the move and the first that allows it is taken, so what stands on the
     board tells nothing of the target but that it is free and legal.

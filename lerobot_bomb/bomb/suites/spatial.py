@@ -1,4 +1,4 @@
-"""Suite `spatial`: one stone, whose place is named by what stands there, not by numbers."""
+"""Suite `spatial`: one stone, whose place is named by the board or its stones, not by numbers."""
 
 from abc import ABC, abstractmethod
 from collections.abc import Mapping
@@ -61,7 +61,7 @@ class Task(ABC):
 
     @abstractmethod
     def select(self, stones: Stones, anchor: str) -> Intersection | None:
-        """Return the place that is meant; None where none or several fit, or it is taken."""
+        """Return the place that is meant; None if none or several fit, or if it is taken."""
 
     @abstractmethod
     def referents(self, target: Intersection) -> list[list[Intersection]]:
@@ -75,7 +75,7 @@ class Task(ABC):
 
 @dataclass(frozen=True)
 class Beside(Task):
-    """Task: the place so many rows and columns from the only stone of the anchor's colour."""
+    """Task: the place some rows and columns from the only stone of the anchor's colour."""
 
     place: str
     rows: int

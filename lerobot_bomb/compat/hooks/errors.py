@@ -76,7 +76,7 @@ def tell_refusals() -> None:
 
 
 def _is_ours(traceback: TracebackType | None) -> bool:
-    """Return whether the error is of a `raise` statement in a module of ours."""
+    """Return True if the error is of a `raise` statement in a module of ours."""
     if traceback is None:
         return False
     while traceback.tb_next is not None:

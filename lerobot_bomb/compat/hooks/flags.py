@@ -22,7 +22,7 @@ def tell_wrong_flags(
 ) -> None:
     """Let LeRobot's commands say in one line which flag is wrong.
 
-    Their parser prints hundreds of lines of usage first. `hint(words, flags, argv)` follows on what it says;
+    Their parser prints hundreds of lines of usage first. `hint(words, flags, argv)` is added to its message;
     `refuse_unknown(flag, flags, argv)` raises for a flag that only other types than the chosen one have.
     """
 

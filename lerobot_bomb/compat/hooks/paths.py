@@ -45,7 +45,7 @@ def resolve_checkpoints(prefix: str, resolve: Callable[[str], str]) -> None:
 
 
 def names_ours(argv: Sequence[str]) -> bool:
-    """Return whether flags, or the config file or checkpoint that they name, choose a type of ours."""
+    """Return True if flags, or the config file or checkpoint that they name, choose a type of ours."""
     known = {**EnvConfig.get_known_choices(), **PreTrainedConfig.get_known_choices()}
     return any(is_ours(known[name]) for name in _named_types(argv) if name in known)
 

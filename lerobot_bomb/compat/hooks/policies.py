@@ -60,7 +60,7 @@ def built_policies() -> list[PreTrainedPolicy]:
 
 
 def training_data(config: PreTrainedConfig) -> LeRobotDatasetMetadata | None:
-    """The dataset that this process trains a config's policy on; None: it acts as it was loaded."""
+    """The dataset that this process trains a config's policy on; None if it acts as it was loaded."""
     return getattr(config, "_runtime_dataset_meta", None)
 
 

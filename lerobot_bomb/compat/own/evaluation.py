@@ -11,7 +11,7 @@ from lerobot.policies import PreTrainedPolicy
 
 
 def lerobot_eval_with(flags: Sequence[str], wrap: Callable[[Any, Any], Any]) -> None:
-    """Run lerobot-eval with these flags, on what `wrap(config, environments)` makes of its environments."""
+    """Run lerobot-eval with these flags, on its environments as `wrap(config, environments)` returns them."""
     from lerobot.scripts import lerobot_eval
 
     make_env = lerobot_eval.make_env

@@ -92,7 +92,7 @@ SPEED_NOTE = (
 
 
 def section(report: Report) -> Section:
-    """Success on the task of each environment, and speed."""
+    """Write the section: published success rates on each environment's task, and speeds."""
     tasks = dict.fromkeys(group.record_type.env_type.removeprefix("bomb_") for group in report.groups)
     tables = [_table(f"Success: {each}", SUCCESS[each], NOTES[each]) for each in tasks if each in SUCCESS]
     return Section(TITLE, [*tables, _table("Speed", SPEED, SPEED_NOTE)])
