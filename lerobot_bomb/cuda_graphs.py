@@ -94,7 +94,7 @@ class GraphedModel:
 
 
 class _Call(nn.Module):
-    """A function as a module of what it reads."""
+    """Wraps a function as a module that holds the modules it reads."""
 
     def __init__(self, function: Callable[..., tuple[Tensor, ...]], modules: Iterable[nn.Module]):
         super().__init__()

@@ -1,4 +1,4 @@
-"""An episode: what determines it, how far it got, why it failed."""
+"""An episode: its spec, its stages, its failure class."""
 
 import dataclasses
 from dataclasses import dataclass

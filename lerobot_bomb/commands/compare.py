@@ -53,7 +53,7 @@ def _two_policies(args: argparse.Namespace) -> tuple[list[Record], list[Record]]
 
 
 def _by_policy(records: list[Record], names: Sequence[str]) -> list[list[Record]]:
-    """Split records by policy: those of each name, or of all without a name, in order of first appearance.
+    """Split records by policy name, in order of first appearance.
 
     A policy answers to its type, its path, `bomb:NAME`, or any part of what `results` says of it.
 

@@ -132,7 +132,7 @@ def _rate(records: list[EpisodeResult]) -> str:
 
 
 def _write_sheet(output_dir: Path, records: list[EpisodeResult]) -> Path:
-    """The last frames of some episodes of each condition, and what became of each."""
+    """Write the last frames of some episodes of each condition, with their outcomes."""
     from PIL import Image
 
     from lerobot_bomb.viewing.sheet import Sheet
@@ -154,7 +154,7 @@ def _write_sheet(output_dir: Path, records: list[EpisodeResult]) -> Path:
 
 
 def _tile(video: Path, record: EpisodeResult) -> np.ndarray:
-    """Return both cameras with a caption; the video's own is of a step before the end."""
+    """Return both cameras with a caption of the outcome."""
     from PIL import Image
 
     from lerobot_bomb.viewing.sheet import caption

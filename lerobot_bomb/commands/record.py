@@ -80,7 +80,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def _add_what_is_recorded(parser: argparse.ArgumentParser) -> None:
-    """Declare how much of what: episodes, whose, or scenes; with which labels."""
+    """Declare the number of episodes or scenes, who acts in them, and their labels."""
     add = parser.add_argument
     number = parser.add_mutually_exclusive_group(required=True)
     number.add_argument("--episodes", type=int, help="successful episodes to record")
@@ -146,7 +146,7 @@ def _recording(args: argparse.Namespace) -> Recording:
 
 
 def _print(recording: Recording, progress: Progress, where: Path, num_before: int = 0) -> None:
-    """Say what was recorded, after so many episodes that others try."""
+    """Print what was recorded, after `num_before` episodes that others tried."""
     conditions, scenes = len(recording.conditions), recording.scenes
     first = recording.seed + num_before // conditions * scenes
     end = recording.seed - (-(num_before + progress.num_tried) // conditions) * scenes
@@ -167,7 +167,7 @@ def _record_part(part: Part, root: Path, source: EpisodeSource) -> int:
 
 
 def _record_by_jobs(args: argparse.Namespace, parts: list[Part], root: Path) -> int:
-    """Write the script of jobs and print what is to be done with it; or submit them, and join their parts."""
+    """Write the script of a job array and print the next steps; or submit the jobs, and join their parts."""
     check_part(parts[0], root)
     command, folder = _job_command(args, root), unfinished_folder(root, JOBS)
     if args.slurm is not None:

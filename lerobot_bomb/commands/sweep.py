@@ -63,7 +63,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(args: argparse.Namespace) -> int:
-    """Run what is missing; exit code 1 where something still is."""
+    """Run all missing episodes; exit code 1 if some are still missing."""
     _check_numbers(args)
     manifest = _manifest(args)
     with claimed(args.folder, manifest, args.batch_size) as store:
@@ -101,7 +101,7 @@ def _run_jobs(args: argparse.Namespace, store: Store, jobs: list[Job]) -> int:
 
 @contextmanager
 def interrupted_by_sigterm() -> Iterator[None]:
-    """Let a cluster's SIGTERM end this process as Ctrl-C does: with what is finished merged, and said."""
+    """Let a cluster's SIGTERM end this process as Ctrl-C does: finished jobs are merged and printed."""
     usual = signal.signal(signal.SIGTERM, signal.default_int_handler)
     try:
         yield
@@ -129,7 +129,7 @@ def _jobs(args: argparse.Namespace, manifest: Manifest) -> list[Job]:
 
 
 def _manifest(args: argparse.Namespace) -> Manifest:
-    """Return what is wanted: the flags' or, without --policies, the folder's."""
+    """Return the wanted manifest: that of the flags or, without --policies, that of the folder."""
     if args.policies is None:
         if not (args.folder / NAME).is_file():
             raise ValueError(

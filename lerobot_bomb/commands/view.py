@@ -48,7 +48,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def add_viewed_arguments(parser: argparse.ArgumentParser) -> None:
-    """Declare which episode of which environment is looked at, beside its seed."""
+    """Declare the flags that choose an episode and its environment, except the seed."""
     env_types = f"{' or '.join(_viewed_types())} (default: {BOMB.name})"
     parser.add_argument("--env.type", dest="env_type", default=BOMB.name, help=env_types)
     ignore = "let a checkpoint act that was trained for another environment"
@@ -123,7 +123,7 @@ def _policy(args: argparse.Namespace, policies: tuple[str, ...]) -> str:
 def _agent(
     args: argparse.Namespace, policy: str, viewed: Viewed, paths: list[Path], env: gymnasium.Env
 ) -> Iterator[Agent]:
-    """Yield the agent that acts; other errors are told before that of files that exist."""
+    """Yield the agent that acts; an error about existing files comes last."""
     seed = viewed.spec.seed
     if policy in (EXPERT, RANDOM):
         check_new(paths)

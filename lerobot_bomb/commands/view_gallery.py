@@ -96,7 +96,7 @@ def run(args: argparse.Namespace) -> int:
 
 
 def axis_sheet(env: EnvType, axis: str, seeds: Sequence[int], image_size: int) -> Sheet:
-    """A column for every level of an axis, or of all of them, and rows for what it changes, per seed."""
+    """Draw a column for every level of an axis, or of `all`, and rows for each seed."""
     axes = env.record.condition.axes
     names = nuisances_of(axes) if axis == ALL else (axis,)
     changes = {change for name in names for change in axes[name].changes}
@@ -117,7 +117,7 @@ def axis_sheet(env: EnvType, axis: str, seeds: Sequence[int], image_size: int) -
 
 
 def suite_sheet(suite: str, seeds: Sequence[int], options: RenderOptions) -> Sheet:
-    """A row for every numbered task: each seed's instruction, start, and what the expert leaves."""
+    """Draw a row for every numbered task: each seed's instruction, start, and end by the expert."""
     images: dict[str, list[np.ndarray]] = {}
     for task_id in range(find_suite(suite).num_tasks):
         (spec,) = specs_of_tasks(EpisodeSpec(seeds[0], suite), [task_id])

@@ -1,4 +1,4 @@
-"""Facts that a dataset's folder states, and how to evaluate on what it shows."""
+"""Facts about a dataset from its folder, and the flags that evaluate in its environment."""
 
 import json
 from collections.abc import Sequence
@@ -94,7 +94,7 @@ class DatasetFacts:
 
     @property
     def seeds(self) -> Sequence[int] | None:
-        """Seeds of the episodes that were tried, of an edited recording of those in it; None if unknown."""
+        """Seeds of all tried episodes; in an edited recording, of those left in it; None if unknown."""
         recording = self.recording
         if not recording:
             return None if self.specs is None else sorted({spec["seed"] for spec in self.specs})

@@ -1,4 +1,4 @@
-"""A token that no header can hold: said before the HTTP library quotes it in an error."""
+"""Check for a token that no HTTP header can hold, before the HTTP library quotes it in an error."""
 
 import os
 
@@ -7,7 +7,7 @@ LOG_IN = "run `hf auth login`, or set HF_TOKEN"
 
 
 class TokenError(ValueError):
-    """Error that says what is wrong with a token, without the token."""
+    """Error that describes what is wrong with a token, without quoting it."""
 
 
 def check_token_characters(token: str) -> None:

@@ -146,7 +146,7 @@ def instruction(task: str) -> str:
 
 
 def noops(actions: np.ndarray) -> np.ndarray:
-    """(T, 7) -> (T,) where the arm is told to stay and the gripper what the last kept action told it."""
+    """(T, 7) -> (T,) bool: neither arm nor gripper gets a new command."""
     still = np.linalg.norm(actions[:, :-1], axis=1) < NOOP_MAX
     found = np.zeros(len(actions), dtype=bool)
     told = None

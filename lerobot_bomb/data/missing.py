@@ -1,4 +1,4 @@
-"""A dataset that is neither on this machine nor on the Hub: said in a line, with what may be meant."""
+"""Error of one line for a dataset that is neither on this machine nor on the Hub, with likely causes."""
 
 from pathlib import Path
 

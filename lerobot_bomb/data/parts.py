@@ -64,7 +64,7 @@ def num_whole_blocks(recording: Recording) -> int:
 
 
 def record_part(part: Part, root: Path, source: EpisodeSource) -> Progress | None:
-    """Record a part, or what it still lacks, beside `root`; None: that is there, joined.
+    """Record a part, or its missing episodes, beside `root`; return None if the joined dataset is there.
 
     Raises:
         ValueError: what lies there is no part of this recording; or as `record`.
@@ -108,7 +108,7 @@ def check_part(part: Part, root: Path) -> None:
 
 
 def join(recording: Recording, root: Path, source: EpisodeSource) -> Progress:
-    """Join the parts into the dataset at `root`, record what takes the place of failed episodes; delete them.
+    """Join the parts into the dataset at `root`, replace failed episodes, and delete the parts.
 
     Raises:
         ValueError: a part is missing, not finished, damaged, or of another recording; or as `record`.

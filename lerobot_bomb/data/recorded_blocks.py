@@ -46,7 +46,7 @@ class EpisodeSource:
     behavior: BehaviorPolicy | None = None  # the expert says what it would have done
 
     def rollouts(self, recording: Recording, num_tried: int) -> RolloutPool | RelabelledRollouts:
-        """Return the episodes of a recording that are tried after the first so many."""
+        """Return the episodes of a recording after the first `num_tried`."""
         settings = RolloutSettings(
             recording.render_options,
             recording.noise,
@@ -67,7 +67,7 @@ def record_blocks(
     numbers: range = range(ANY_NUMBER),
     most: int = ANY_NUMBER,
 ) -> None:
-    """Make those of the numbered blocks that a folder lacks, until it holds so many episodes.
+    """Make the missing ones of the numbered blocks, until the folder holds `most` episodes.
 
     A block has the successful ones of the episodes that are its own to try, whoever makes it.
     """
@@ -93,7 +93,7 @@ def _fill(
     most: int,
     successes: "Callable[[Iterable[Rollout], int, Progress], Iterator[RecordedEpisode]]",
 ) -> None:
-    """Make the blocks of a gap, until the folder holds so many episodes."""
+    """Make the blocks of a gap, until the folder holds `most` episodes."""
     left = most - episodes_before(folder, gap.start)
     if left == 0:
         return
@@ -109,7 +109,7 @@ def _fill(
 def _successes(
     run: Progress, bar: tqdm, pool: Iterable[Rollout], most: int, progress: Progress
 ) -> "Iterator[RecordedEpisode]":
-    """Yield a block's successful rollouts, at most so many; note the failed ones on the way."""
+    """Yield a block's successful rollouts, at most `most`; note the failed ones on the way."""
     from lerobot_bomb.data.rollout_dataset import rollout_episode
 
     for rollout in islice(pool, len(block_episodes(0))):

@@ -125,7 +125,7 @@ def block_episodes(number: int) -> range:
 
 
 def num_blocks(num_episodes: int) -> int:
-    """Return how many so many episodes are; the last one may be short."""
+    """Return the number of blocks of this many episodes; the last one may be short."""
     return -(-num_episodes // BLOCK_EPISODES)
 
 
@@ -143,7 +143,7 @@ def add_block(
     number: int,
     episodes: Callable[[Progress], Iterator["RecordedEpisode"]],
 ) -> Progress:
-    """Make a block of episodes, which count themselves, and return what it holds."""
+    """Make a block of episodes and return its counts, which the episodes fill in."""
     from lerobot_bomb.data.blocks import write_block
 
     block, progress = block_path(folder, number), Progress()
@@ -242,7 +242,7 @@ def _read_whole(dataset: Path) -> Progress:
 
 
 def _keep_finished(folder: Path, parts: Sequence[Path]) -> str:
-    """Delete what is unfinished, which gives a full disk its space back; return what is kept."""
+    """Delete everything unfinished, which frees disk space; describe the rest."""
     remove_unfinished(folder)
     blocks = finished_blocks(folder)
     if not blocks:

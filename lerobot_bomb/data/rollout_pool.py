@@ -97,7 +97,7 @@ def collect(
 
 
 def collect_static(env: gymnasium.Env, spec: EpisodeSpec, settings: RolloutSettings) -> Rollout:
-    """The episodes of a spec from its seed on as they may stand midway, and what the expert would do there.
+    """Static scenes of a spec's episodes from its seed on, with the expert's actions.
 
     The result is of the first one.
     """

@@ -63,7 +63,7 @@ def exact_statistics(values_ND: np.ndarray) -> Statistics:
 
 
 def wrong_statistics(root: Path) -> list[WrongStatistics]:
-    """Compare what stats.json says of a dataset's numbers with all of its frames.
+    """Compare a dataset's stats.json with all of its frames, images excepted.
 
     Raises:
         OSError, ValueError: a file is missing or damaged, or not all frames are here.
@@ -97,7 +97,7 @@ def mending(root: Path) -> str:
 
 
 def write_statistics(root: Path) -> None:
-    """Let stats.json say of a dataset's numbers what all frames do; what it says of images stays.
+    """Write statistics of all frames to a dataset's stats.json; those of images stay.
 
     Raises:
         OSError, ValueError: a file is missing or damaged, or not all frames are here.
@@ -111,7 +111,7 @@ def write_statistics(root: Path) -> None:
 
 
 def write_image_statistics(root: Path) -> None:
-    """Let stats.json say of a dataset's images what follows from all episodes, in whatever parts they came.
+    """Write image statistics of all episodes to stats.json, whatever the parts they came in.
 
     Raises:
         OSError, ValueError: a file is missing or damaged.

@@ -124,7 +124,7 @@ class Answers(NamedTuple):
         return Place(self.prefix, self.number)
 
     def is_done(self, grammar: NumberGrammar, num_numbers: int) -> Tensor:
-        """(B,) whether so many numbers are written."""
+        """(B,) bool: this number of numbers is written."""
         complete_B = (self.number == num_numbers - 1) & grammar.must_end[self.prefix]
         return complete_B | (self.number >= num_numbers) | (self.prefix == grammar.DONE)
 

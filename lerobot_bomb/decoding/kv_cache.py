@@ -27,7 +27,7 @@ def check_positions(
     num_tokens: int,
     way_out: str = "shorten the instruction or give a smaller --policy.chunk_size",
 ) -> None:
-    """Check that a text model of this config can read so many tokens.
+    """Check that a text model of this config can read this many tokens.
 
     Raises:
         ValueError: it has fewer positions.
@@ -42,7 +42,7 @@ def check_positions(
 
 
 class CachedText:
-    """Hidden states of new tokens, which read what was cached before them.
+    """Text model that returns hidden states of new tokens, which attend to cached ones.
 
     A token's column in the cache says its position, the same in every row (``positions``). One at a column
     that is written already takes its place, so what is no longer wanted is written over. Gaps go to

@@ -1,4 +1,4 @@
-"""One episode, step by step, by whatever acts. It imports neither torch nor LeRobot."""
+"""One episode, step by step, by any agent. This module imports neither torch nor LeRobot."""
 
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
@@ -79,7 +79,7 @@ def run_episode(
 def one_of_batch(
     agent: BatchAgent, make_env: Callable[[], gymnasium.Env], seed: int, row: int, size: int
 ) -> Iterator[Agent]:
-    """Yield the agent of one seed, which acts at once in the other episodes of its batch, of nearby seeds.
+    """Yield the agent of one seed, which at the same time acts in the other episodes of its batch.
 
     lerobot-eval runs consecutive seeds as a batch, in which a policy's arithmetic rounds otherwise than
     alone. The other episodes run here, unseen.

@@ -134,7 +134,7 @@ class LazyVectorEnv(VectorEnv):
 
     @contextmanager
     def _running(self) -> Iterator[SyncVectorEnv | AsyncVectorEnv]:
-        """The envs; after an error, which ends a worker, none is left, and the next use starts them anew."""
+        """Return the envs; after an error, which ends a worker, the next use starts all of them again."""
         envs = self._ensure()
         try:
             yield envs

@@ -51,7 +51,7 @@ class MaskedEpisode:
 
 
 def without_object(name: str, fill: str) -> Mask:
-    """One kind of thing, of `object_masks`, taken out of every camera's image.
+    """Take one object of `object_masks` out of every camera's image.
 
     Raises:
         ValueError: ``fill`` needs another episode.

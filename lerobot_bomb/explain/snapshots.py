@@ -25,7 +25,7 @@ NEAR_M = BOARD.pitch_m  # of the stone from where it is to go: it is being place
 
 @dataclass(frozen=True)
 class Snapshot:
-    """A moment, and what the environment knows of it beside what the policy sees."""
+    """A moment: the policy's observation, and facts that only the environment knows."""
 
     step: int
     phase: str  # of PHASES; "" where the environment has none

@@ -263,7 +263,7 @@ class Checkpoint:
 
 
 def results_table(group: Group) -> str:
-    """Markdown: what was evaluated, and a row for each condition."""
+    """Return Markdown: the evaluation, and a row for each condition."""
     _, *settings = group.lines()  # the policy is the checkpoint
     measures = [
         f"{measure.name} ({measure.note})" if measure.note else measure.name

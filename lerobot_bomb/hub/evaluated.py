@@ -1,4 +1,4 @@
-"""Checks that results are of the checkpoint that is published with them, and of its environment."""
+"""Checks that results belong to the checkpoint published with them, and to its environment."""
 
 from pathlib import Path
 
@@ -7,7 +7,7 @@ from lerobot_bomb.results.record import Record
 
 
 def check_weights_of(path: Path, records: list[Record], checkpoint: Path) -> None:
-    """Raise a ValueError if the records of a results file are of other weights than a checkpoint's folder.
+    """Raise a ValueError if records of a results file belong to other weights than a checkpoint's folder.
 
     Records that name no policy, such as those of protocol 1.0, pass.
     """

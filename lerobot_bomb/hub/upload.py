@@ -1,4 +1,4 @@
-"""Files to a repository in one commit: before it there is nothing, after it everything."""
+"""Upload of files to a repository in one commit: all of them or none."""
 
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
@@ -52,7 +52,7 @@ def upload(
 
 @contextmanager
 def hub_errors(repo_id: str) -> Iterator[None]:
-    """Say in one line what the Hub, or the way to it, has against this."""
+    """Turn errors of the Hub, or of the connection to it, into one line."""
     try:
         yield
     except OfflineModeIsEnabled:

@@ -1,4 +1,4 @@
-"""An episode of LIBERO: what determines it, and why it failed."""
+"""An episode of LIBERO: its spec, and its failure class."""
 
 from dataclasses import dataclass
 from enum import StrEnum

@@ -155,7 +155,7 @@ class ChunkConfig(ConfigWithEnvironment):
 
 @dataclass
 class VlaConfig(ChunkConfig):
-    """Config of a policy with a vision-language model: which one, in which precision, what of it is trained.
+    """Config of a policy with a vision-language model: the model, its precision, its trained parts.
 
     Its chunks may be executed as an ensemble.
     """

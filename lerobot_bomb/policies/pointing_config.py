@@ -12,7 +12,7 @@ from lerobot_bomb.training.policy_flags import check_not_negative
 
 @dataclass
 class PointingVlaConfig(VlaConfig):
-    """Config of a policy that says which stone goes where, and then acts on what it has said."""
+    """Config of a policy that predicts which stone goes where, and then acts on its prediction."""
 
     # as `ConfigWithEnvironment` has them
     LATER_FIELDS: ClassVar[dict[str, Any]] = {

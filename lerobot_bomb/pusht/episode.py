@@ -1,4 +1,4 @@
-"""An episode of PushT: what determines it, and why it failed."""
+"""An episode of PushT: its spec, and its failure class."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass

@@ -1,4 +1,4 @@
-"""Verdicts over records: what can be wrong with a success rate, question by question.
+"""Verdicts over records: ways in which a success rate can be wrong, question by question.
 
 Groups are lists of records of the same episodes, but for those of the splits.
 """
@@ -24,7 +24,7 @@ P_NOTE = "p: exact McNemar test, or Fisher's where it says so; not adjusted for 
 
 @dataclass(frozen=True)
 class Verdict:
-    """A question, its answer, and what it rests on."""
+    """A question, its answer, and its evidence."""
 
     question: str
     answer: str  # YES, NO, or OPEN: these episodes do not show it

@@ -86,5 +86,5 @@ class PolicyIdentity:
 
 
 def describe_versions(versions: Mapping[str, str | None]) -> str:
-    """'gym-pusht 0.1.8, pymunk 6.11.1': what the bits of an episode depend on."""
+    """'gym-pusht 0.1.8, pymunk 6.11.1': the packages that an episode's bits depend on."""
     return ", ".join(f"{name} {version or '?'}" for name, version in versions.items())

@@ -45,7 +45,7 @@ class PairedComparison:
         return len({first.start_key for first, _ in self.pairs})
 
     def describe_change(self) -> str:
-        """Describe what the second records have beside other successes; '' where there is nothing to say."""
+        """Describe how the second records differ, apart from successes; '' if they do not."""
         return type(self.pairs[0][0]).describe_change(self.pairs)
 
 
@@ -87,7 +87,7 @@ def compare_pairs(pairs: Mapping[str, list[Pair]]) -> list[PairedComparison]:
 
 
 def describe_test(num_conditions: int) -> str:
-    """'exact McNemar test, adjusted for 11 conditions (Holm)': what a p-value is of."""
+    """'exact McNemar test, adjusted for 11 conditions (Holm)': the test of a p-value."""
     if num_conditions == 1:
         return "exact McNemar test of one condition, not adjusted"
     return f"exact McNemar test, adjusted for {num_conditions} conditions (Holm)"

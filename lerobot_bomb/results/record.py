@@ -1,4 +1,4 @@
-"""Record of an episode in a results file: what those of all environments have.
+"""Record of an episode in a results file: the fields of all environments.
 
 Simulator workers import this module, so it imports neither torch nor LeRobot.
 """
@@ -163,7 +163,7 @@ class Record:
 
     @classmethod
     def describe_simulator(cls, settings: Mapping[str, str]) -> str:
-        """Describe, of these settings, what simulated and drew."""
+        """Describe simulator and renderer among these settings."""
         return settings["simulator"]
 
     @classmethod
@@ -172,7 +172,7 @@ class Record:
         raise NotImplementedError
 
     def environment(self) -> Environment | None:
-        """Return the environment of BOMB that it was; None: checkpoints of our types know of no such one."""
+        """Return the record's environment of BOMB; None for other environments."""
         return None
 
     def benchmark(self) -> str:
@@ -186,7 +186,7 @@ class Record:
 
     @classmethod
     def describe_change(cls, pairs: Sequence[tuple[Self, Self]]) -> str:
-        """Describe what the second records of pairs have beside other successes; '': nothing."""
+        """Describe how the second records of pairs differ, apart from successes; '' if they do not."""
         return ""
 
 
@@ -199,12 +199,12 @@ def field_names(record_type: type[Record]) -> tuple[str, ...]:
 
 
 def without_measured[R: Record](record: R) -> R:
-    """Return a record without what is another when its episode is run again."""
+    """Return a record without the fields that change when its episode is run again."""
     return replace(record, **dict.fromkeys(MEASURED))
 
 
 def outcome_fields(record: Record) -> list[str]:
-    """Names of what was asked and its outcome: not which policy acted, where, and how long that took.
+    """Names of the fields of spec and outcome: not of policy, machine and latency.
 
     Without what the record, of an earlier release, does not say.
     """

@@ -1,4 +1,4 @@
-"""Records of episodes of LeRobot's own env types, of which lerobot-eval itself tells little."""
+"""Records of episodes of LeRobot's own env types, from the few facts that lerobot-eval writes."""
 
 import json
 from collections.abc import Sequence

@@ -1,4 +1,4 @@
-"""Check of a sweep before it begins: what would be refused in the middle of it."""
+"""Check of a sweep before it begins, for errors that would come in the middle."""
 
 import logging
 from collections.abc import Sequence

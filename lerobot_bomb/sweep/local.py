@@ -106,7 +106,7 @@ def ended(code: int) -> str:
 
 
 class Workers:
-    """The worker processes of one command, each started anew when it has ended.
+    """The worker processes of one command; each is restarted when it has ended.
 
     Args:
         store: what is run.
@@ -179,7 +179,7 @@ class Workers:
 
 
 def run_part(store: Store, part: str, num_workers: int, timeout_s: int | None = None) -> None:
-    """Run a part of the jobs: start workers, and start those anew that ended.
+    """Run a part of the jobs: start workers, and restart those that ended.
 
     Raises:
         RuntimeError: they end before they run, or refuse to; the message says why.

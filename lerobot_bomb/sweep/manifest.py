@@ -80,7 +80,7 @@ class Manifest:
         return sum(job.num_episodes for job in self.jobs)
 
     def part(self, text: str) -> list[Job]:
-        """Return every so many jobs: '0/4' are the first, the fifth, ...
+        """Return every n-th job: for '0/4' the first, the fifth, ...
 
         Raises:
             ValueError: the text is no such part, or there are too few jobs for it to have one.
@@ -167,7 +167,7 @@ def plan(
     batch_size: int,
     flags: Sequence[str],
 ) -> Manifest:
-    """Plan every policy on every task under every condition; what is named twice is run once.
+    """Plan every policy on every task under every condition; duplicates are run once.
 
     Args:
         policies: checkpoints, or policy types.

@@ -1,4 +1,4 @@
-"""Store of what is done in a sweep: a folder that any number of workers share.
+"""Store of a sweep's progress: a folder that any number of workers share.
 
 A job is finished where `cells/KEY.jsonl` holds all its episodes; a worker that runs one holds the lock on
 `cells/KEY.lock`, which the system takes from it if it is killed. What such a worker left is run again,
@@ -157,7 +157,7 @@ class Store:
         return self.is_finished(job) or self.file(job, "given_up").is_file()
 
     def begin_again(self, jobs: Sequence[Job]) -> None:
-        """Forget what became of those that were given up or in which episodes had errors."""
+        """Forget the results of jobs that were given up or had episodes with errors."""
         for job in jobs:
             if any(self.file(job, ending).is_file() for ending in ("given_up", "errors")):
                 with self.claimed(job) as is_mine:
@@ -202,7 +202,7 @@ class Store:
                     path.write_bytes(b"".join(map(_read, paths)))
 
     def lines(self) -> list[str]:
-        """Describe what is finished, and what is missing and why."""
+        """Describe finished and missing episodes, and why some are missing."""
         jobs = self.manifest.jobs
         finished = [job for job in jobs if self.is_finished(job)]
         errors = [error for job in finished for error in self.errors(job)]

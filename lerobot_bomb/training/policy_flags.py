@@ -158,7 +158,7 @@ def trained_with(config: Any, flags: Iterable[str]) -> dict[str, Any]:
 
 
 def check_as_trained(config: Any, flags: Iterable[str]) -> None:
-    """Check that a checkpoint's flags still are what its weights were trained with.
+    """Check that a checkpoint's flags are those that its weights were trained with.
 
     ``flags``: those that say it now; an older checkpoint names fewer.
     """

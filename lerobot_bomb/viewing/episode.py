@@ -73,7 +73,7 @@ class ViewedRun:
 
 
 def write_episodes(runs: Mapping[str, ViewedRun], name: str, rrd: Path, mp4: Path) -> list[Record]:
-    """Run one after the other, write what happened, and return each result.
+    """Run the episodes one after the other, write recording and video, and return each result.
 
     With one run, its entities stand at the recording's top; of several, each below its name, and the video
     shows them side by side, the last image of an episode until the others have ended.

@@ -20,7 +20,7 @@ MAX_BATCH = 1000  # environments at once
 
 @dataclass(frozen=True)
 class Replay:
-    """A record, and what it does not say of the policy that ran it."""
+    """A record, with the flags of its policy that it does not hold."""
 
     record: Record
     policy_path: Path | None = None  # where the checkpoint lies now; None: where it lay then

@@ -22,7 +22,7 @@ EYE_M, LOOK_AT_M = (0.05, -0.30, 0.28), (0.05, 0.0, 0.03)  # in front of the boa
 
 
 class BombLog(EpisodeLog[EpisodeSpec, EpisodeResult]):
-    """Log of an episode of BOMB: both cameras, the scene, what the arm does."""
+    """Log of an episode of BOMB: both cameras, the scene, the arm's motion."""
 
     def __init__(self, recording: rr.RecordingStream, prefix: str, spec: EpisodeSpec) -> None:
         super().__init__(recording, prefix, spec)

@@ -1,4 +1,4 @@
-"""SmolVLM, of both generations, behind the few operations a policy needs, and what other families share.
+"""SmolVLM of both generations, reduced to the operations that a policy needs; base of other families.
 
 Shapes: `B` batch, `L` tokens, `H` hidden size of the text model, `V` vocabulary, `P` tokens of an image.
 """
@@ -48,7 +48,7 @@ CHECKPOINTING: dict[str, Any] = {"use_reentrant": False, "context_fn": as_it_was
 
 
 class Backbone(nn.Module):
-    """A stock vision-language model, called in parts, and what all families have: words in and out."""
+    """A stock vision-language model, called in parts; base of all families."""
 
     # the text model's name among the parts of ``vlm.model``
     text_model_name: ClassVar[str]

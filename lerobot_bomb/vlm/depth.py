@@ -26,7 +26,7 @@ ZOEDEPTH_MARGIN = 3  # the margin is this many times sqrt(size / 2), as the mode
 
 
 def observed_depth(batch: Mapping[str, Tensor], camera: str, image_size: tuple[int, int]) -> Tensor:
-    """(B, H, W) metres of a camera's whole images, NaN where there is none. It may come as (B, 1, H, W).
+    """(B, H, W) metres of a camera's whole images, NaN where unknown. The input may be (B, 1, H, W).
 
     Raises:
         KeyError: it is missing.
@@ -105,7 +105,7 @@ def _nearest_pixels(side: int, num_cells: int, device: torch.device) -> Tensor:
 
 
 def _without_invalid(depth: Tensor) -> Tensor:
-    """NaN wherever there is no depth."""
+    """Set invalid depth to NaN."""
     return depth.where(depth.isfinite() & (depth > 0), torch.nan)
 
 

@@ -43,7 +43,7 @@ class PromptLayout:
         return sum(piece.width if piece.ids is None else len(piece.ids) for piece in self.pieces)
 
     def spans(self, num_columns: int) -> dict[str, slice]:
-        """Return the columns of each part of prompts that have so many, padding included."""
+        """Return the columns of each part of prompts of this width, padding included."""
         spans: dict[str, slice] = {}
         column = 0
         for part, ids, width in self.pieces:

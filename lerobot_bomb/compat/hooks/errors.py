@@ -1,4 +1,4 @@
-"""Refusals of our code, and configs that cannot be read, told by LeRobot's commands in a line."""
+"""Errors of our code, and of configs that cannot be read, as one line of LeRobot's commands."""
 
 import dis
 import os
@@ -76,7 +76,7 @@ def tell_refusals() -> None:
 
 
 def _is_ours(traceback: TracebackType | None) -> bool:
-    """Return True if the error is of a `raise` statement in a module of ours."""
+    """Return True if the error comes from a `raise` statement in a module of ours."""
     if traceback is None:
         return False
     while traceback.tb_next is not None:

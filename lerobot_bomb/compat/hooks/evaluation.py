@@ -1,4 +1,4 @@
-"""LeRobot's evaluation with an environment or a policy of ours: what it would get wrong, without a word."""
+"""LeRobot's evaluation with an environment or a policy of ours: corrections of silent errors."""
 
 import logging
 import sys

@@ -58,7 +58,7 @@ def tell_wrong_flags(
 
 
 def _flags_of_chosen_types(flags: Collection[str], argv: Sequence[str]) -> list[str]:
-    """LeRobot's parser knows those of all types of environments and policies."""
+    """Drop the flags of types that were not chosen: LeRobot's parser knows those of all."""
     left = list(flags)
     registries: dict[str, Any] = {"env": EnvConfig, "policy": PreTrainedConfig}
     for group, registry in registries.items():

@@ -17,7 +17,7 @@ from lerobot_bomb.compat.use import is_ours, use
 
 
 def resolve_checkpoints(prefix: str, resolve: Callable[[str], str]) -> None:
-    """Let `--policy.path` of LeRobot's commands, and of their config files, be what `resolve` makes of it.
+    """Let `resolve` change `--policy.path` of LeRobot's commands and config files.
 
     Other paths than `prefix...` stay as they are. A ValueError of it ends the command in one line.
 

@@ -99,7 +99,7 @@ def abandon(dataset: LeRobotDataset) -> None:
 
 @contextmanager
 def datasets_cache(folder: Path) -> Iterator[None]:
-    """Let `datasets` cache what it reads here only; in the user's cache a copy of it would stay."""
+    """Let `datasets` cache in this folder only; in the user's cache a copy would stay."""
     usual = config.HF_DATASETS_CACHE
     config.HF_DATASETS_CACHE = folder
     try:

@@ -1,4 +1,4 @@
-"""Section `published`: what others published of such tasks and models; none of it was measured here."""
+"""Section `published`: other people's figures on such tasks and models; none was measured here."""
 
 from dataclasses import dataclass
 
@@ -19,7 +19,7 @@ SPATIAL_PAPER = "SpatialVLA (arXiv 2501.15830)"
 
 @dataclass(frozen=True)
 class Figure:
-    """A row: whose, of what, how much."""
+    """A published figure: model, source, values."""
 
     model: str
     setting: str
