@@ -27,7 +27,7 @@ def sums_by(values_N: np.ndarray, episode_N: Sequence[Hashable]) -> tuple[np.nda
 def bootstrap_interval(sums_E: np.ndarray, counts_E: np.ndarray) -> tuple[float, float] | None:
     """95 % percentile bootstrap interval of sum / count over E episodes.
 
-    None for fewer than two, and where all are equal: resampling tells nothing of them. Episodes are drawn,
+    None for fewer than two, and if all are equal: resampling tells nothing about them. Episodes are drawn,
     not frames: the frames of one resemble each other.
     """
     if _is_constant(sums_E, counts_E):
@@ -111,7 +111,7 @@ def variance_share(values_N: np.ndarray, levels_N: np.ndarray) -> float | None:
     """Share of the values' variance that the level alone explains: its first-order sensitivity index.
 
     Corrected for the number of levels, so that it is 0 on average where the level has no effect, and can be
-    negative. None where it is not defined: all values or all levels are the same.
+    negative. None if it is undefined: all values or all levels are the same.
     Source: epsilon squared, Kelley (1935), "An unbiased correlation ratio measure".
     """
     total = float(((values_N - values_N.mean()) ** 2).sum())

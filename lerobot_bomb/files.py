@@ -82,7 +82,7 @@ def check_new_folder(flag: str, path: Path) -> None:
 def written_whole(*paths: Path) -> Iterator[list[Path]]:
     """Yield paths to write to; if nothing is raised, the files get the names `paths`.
 
-    All lie in one folder, which is made. What a kill leaves is in a hidden folder there.
+    All lie in one folder, which is created. What a kill leaves is in a hidden folder there.
 
     Raises:
         OSError: of a full disk, with the way out; what lay at these paths before is still there.

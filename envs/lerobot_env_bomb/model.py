@@ -90,7 +90,7 @@ def pattern_stone_name(index: int) -> str:
 
 
 def foot_name(index: int, foot: int) -> str:
-    """Name of one of the balls that a stone stands on."""
+    """Name of one of the balls under a stone."""
     return f"{stone_name(index)}_foot_{foot}"
 
 

@@ -17,7 +17,7 @@ def object_masks(
 ) -> dict[str, np.ndarray]:
     """{object: (size, size) bool}; every pixel belongs to one.
 
-    ``stone``: index of the one to be moved; ``target_xy``: (2,) metres, where it is to go. The target is as
+    ``stone``: index of the stone to move; ``target_xy``: (2,) metres, its target. The target is as
     much of the board as a stone there would cover; the gripper is all of the arm that is seen.
     """
     model = scene.model

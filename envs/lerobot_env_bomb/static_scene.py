@@ -1,4 +1,4 @@
-"""A board as it stands at the start of an episode, or as it may stand midway, without the way there."""
+"""A board as at the start of an episode or in its middle, without the moves that lead there."""
 
 from dataclasses import dataclass, replace
 

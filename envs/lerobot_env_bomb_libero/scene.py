@@ -34,7 +34,7 @@ class LiberoTransform(EpisodeTransform):
         """Add to the model what an episode at any level may need, before it is compiled."""
 
     def edit(self, scene: "LiberoScene") -> None:
-        """Change the model; objects do not stand where the episode starts yet."""
+        """Change the model; objects are not yet at their starting places."""
 
     def arrange(self, scene: "LiberoScene") -> None:
         """Change where objects and the arm are: `scene.data.qpos`."""
@@ -110,12 +110,12 @@ class LiberoScene(LiberoEnv):
 
     @cached_property
     def movable(self) -> dict[str, int]:
-        """{object that stands free: its body}."""
+        """{free object: its body}."""
         return {name: self._body_of(each) for name, each in self._built.env.objects_dict.items()}
 
     @cached_property
     def fixtures(self) -> dict[str, int]:
-        """{fixture: its body}; table and floor are none."""
+        """{fixture: its body}, without table and floor."""
         fixtures = self._built.env.fixtures_dict.items()
         return {name: self._body_of(each) for name, each in fixtures if self._is_body(each)}
 
@@ -147,7 +147,7 @@ class LiberoScene(LiberoEnv):
         return np.flatnonzero(np.isin(self.owners[self.model.geom_bodyid], bodies))
 
     def surfaces(self) -> dict[int, str]:
-        """{texture of table or floor: a material that has it}; walls are none."""
+        """{texture of table or floor: a material that has it}, without walls."""
         found = {}
         for material in np.unique(self.model.geom_matid[self.scenery]).tolist():
             texture = int(self.model.mat_texid[material, mujoco.mjtTextureRole.mjTEXROLE_RGB])

@@ -71,7 +71,7 @@ def clipping_text(actions_ND: np.ndarray, dim_names: Sequence[str]) -> tuple[str
 def rest_text(grids: ActionGrids, actions_ND: np.ndarray, dim_names: Sequence[str]) -> tuple[str, bool]:
     """Describe how many normalised actions a cell of no motion takes, and whether that needs a remedy.
 
-    The text is empty where there is no such cell.
+    The text is empty if there is no such cell.
     """
     actions = torch.from_numpy(actions_ND)
     cells_NG, coordinates_NC = grids.encode(actions), grids.coordinates(actions.float().clamp(-1, 1))

@@ -100,7 +100,7 @@ def other_color(color: str) -> str:
 
 
 def only(stones: Stones, color: str) -> Intersection | None:
-    """Return where the only stone of a colour stands; None if there is none, or several."""
+    """Return the intersection of the only stone of a colour; None if there is none, or several."""
     intersections = [intersection for intersection, other in stones.items() if other == color]
     return intersections[0] if len(intersections) == 1 else None
 
@@ -126,7 +126,7 @@ def draw_stones(
 
 
 def is_heldout(task_id: int, about: tuple[int, ...]) -> bool:
-    """Return True if a command is held out; each verb, colour, row, ... of it is seen in others."""
+    """Return True if a command is held out; each of its verbs, colours, rows, ... occurs in others."""
     return (task_id + sum(place * number for place, number in zip(count(1), about))) % NUM_PARTS == 0
 
 

@@ -1,4 +1,4 @@
-"""The BOMB environment that a recording shows and that a checkpoint of it acts in."""
+"""The BOMB environment of a recording, in which a checkpoint trained on it acts."""
 
 import re
 from collections.abc import Iterable, Mapping
@@ -94,9 +94,9 @@ class Environment:
         return ["--env.type=bomb", *flags]
 
     def differences(self, other: "Environment") -> list[str]:
-        """Fields in which `other` is one that a policy of this environment cannot act in.
+        """Fields whose values in `other` keep a policy of this environment from acting there.
 
-        A suite that is not known is compared with nothing, nor is its version.
+        An unknown suite, and its version, are not compared.
         """
         names = [name for name in COMPARED if getattr(self, name) != getattr(other, name)]
         ours, theirs = self.suites, other.suites

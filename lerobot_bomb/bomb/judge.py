@@ -1,4 +1,4 @@
-"""Follows an episode and says how it stands and how it ended: stones to the places that a plan names."""
+"""Judge of an episode: follows the moves of its plans, and says how it ended."""
 
 import math
 from collections.abc import Iterator

@@ -46,7 +46,7 @@ def one_move(stone: int, places: Collection[Place]) -> Move:
 
 
 def in_order(*moves: Move) -> Plan:
-    """A plan whose moves come one after the other."""
+    """Return a plan whose moves come one after the other."""
     return tuple(
         Move(move.stones, move.places, frozenset(range(number)), move.is_slid)
         for number, move in enumerate(moves)

@@ -1,4 +1,4 @@
-"""Pointing: which stone goes where, as the expert means it and as a policy says it.
+"""Pointing: which stone goes where, by the expert and by a policy.
 
 It is what a policy must read before it can act, and the stones are seen before that; what the expert would do
 for other places teaches it to act as it has pointed. A recording has all of it in columns that only training
@@ -81,7 +81,7 @@ class Meant:
 
 @dataclass(frozen=True)
 class PointedAt:
-    """A stone and the place where a policy says that it brings it."""
+    """A stone and its place, as a policy predicts them."""
 
     place_xy: np.ndarray  # (2,) metres
     stone_xy: np.ndarray  # (2,) metres

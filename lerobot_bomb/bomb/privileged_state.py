@@ -12,7 +12,7 @@ from lerobot_bomb.bomb.episode import CONTROL_MODES, DEFAULT_FPS, Stage
 
 @dataclass(frozen=True)
 class Goal:
-    """Goal of the expert: a stone, and where it is to lie."""
+    """Goal of the expert: a stone, and its place."""
 
     xyz: np.ndarray  # (3,) metres, centre of the stone at rest there
     stone: int  # its index

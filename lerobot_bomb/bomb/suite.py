@@ -30,7 +30,7 @@ class Turn:
 
 @dataclass(frozen=True)
 class Episode:
-    """Episode that an EpisodeSpec stands for."""
+    """Episode that an EpisodeSpec determines."""
 
     spec: EpisodeSpec
     task_id: int  # which of the suite's numbered tasks it is of
@@ -74,7 +74,7 @@ class Episode:
     def goals_after(self, num_moves: int) -> tuple[Goal, ...]:
         """Return the expert's goals after this number of moves, as far as instructions have named them.
 
-        There are `Suite.num_goals` of them; where there are fewer, the last one is repeated.
+        There are always `Suite.num_goals`: the last one is repeated if need be.
         """
         aims = self.aims[: num_moves + 1] if len(self.turns) > 1 else self.aims
         height_m = self.layout.rest_height_m

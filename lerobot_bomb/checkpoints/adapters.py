@@ -30,7 +30,7 @@ PROJECTIONS = "q|k|v|o|gate|up|down"  # of a layer's attention and MLP
 def peft_targets(
     policy: nn.Module, text_model: str, new_parts: Iterable[str], others: Iterable[str] = ()
 ) -> dict[str, Any]:
-    """Adapters on every projection of the text model's layers; parts that are new are trained as they are.
+    """Adapters on every projection of the text model's layers; new parts are trained whole.
 
     ``others``: patterns of more modules with adapters. Of ``new_parts``, those that the policy has.
     """
@@ -52,8 +52,8 @@ def check_buffers_are_the_bases(
 ) -> None:
     """Raise a ValueError if the policy was fitted to other data than the checkpoint ``base``.
 
-    Adapters are loaded on that checkpoint again, which would not know of it. They hold the modules that are
-    ``saved`` with them.
+    Adapters are loaded on that checkpoint again, which does not have these values. They hold the modules that
+    are ``saved`` with them.
     """
     of_saved = tuple(f"{name}." for name in saved)
     fitted = {name: held for name, held in frozen_buffers(policy).items() if not name.startswith(of_saved)}
@@ -72,7 +72,7 @@ def check_base(base: str) -> None:
 
 
 def check_adapters(path: str, revision: str | None) -> Path:
-    """Return the file of adapters, from a folder or the Hub; it is whole, finite and all that `peft` reads.
+    """Return the file of adapters, from a folder or the Hub, checked: whole, finite, all that `peft` reads.
 
     They are safetensors; in their place `peft` would read a pickle.
 

@@ -167,7 +167,7 @@ def check_weights(folder: Path, config: PreTrainedConfig, policy_type: type[PreT
 
 
 def check_tensors(path: Path, policy: PreTrainedPolicy) -> list[str]:
-    """Raise unless a file's weights are a policy's, by name and shape; return the names of those needed.
+    """Check that a file's weights fit a policy, by name and shape; return the names of those it needs.
 
     A policy may do without parts of a file (``may_skip``) and have parts of its own that the file lacks as a
     whole (``may_lack``): names of modules.

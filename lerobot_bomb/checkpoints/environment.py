@@ -44,11 +44,11 @@ class ConfigWithEnvironment(PreTrainedConfig):
         return None
 
     def methods_used(self) -> str:
-        """Return those methods of its type that a checkpoint of this config uses; empty: no choice."""
+        """Return the methods of its type that a checkpoint of this config uses; '' if there is no choice."""
         return ""
 
     def check_action_size(self, size: int) -> None:
-        """Raise a ValueError unless an action here has as many numbers as where it was trained."""
+        """Raise a ValueError unless an action has as many numbers here as in training."""
         if self.environment is None or self.environment.action_size == size:
             return
         raise ValueError(

@@ -1,4 +1,4 @@
-"""Identity of the policy that this process built: LeRobot tells an environment nothing of it."""
+"""Identity of the policy that this process built, which LeRobot does not tell an environment."""
 
 import hashlib
 import json

@@ -1,4 +1,4 @@
-"""Fit of a policy to an environment whose datasets say no more than shapes and statistics."""
+"""Fit of a policy to an environment whose datasets state only shapes and statistics."""
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
@@ -30,7 +30,7 @@ class Interface:
     image_flags: Callable[[int, int], str]  # (height, width) -> the flags of images of this size
 
     def check_acting_policy(self) -> None:
-        """Check that the policy that acts was trained for such an environment, as far as is known.
+        """Check, as far as is known, that the acting policy was trained for such an environment.
 
         Raises:
             ValueError: it was trained for another one; the message says what differs and the way out.

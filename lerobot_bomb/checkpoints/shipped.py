@@ -12,7 +12,7 @@ PREFIX = "bomb:"
 
 
 def shipped_names() -> list[str]:
-    """Return the names that can stand behind `bomb:`."""
+    """Return the names that can follow `bomb:`."""
     return sorted(path.parent.name for path in FOLDER.glob(f"*/{CONFIG}"))
 
 

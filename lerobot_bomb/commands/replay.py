@@ -51,7 +51,7 @@ def _levels(text: str) -> dict[str, int]:
 
 
 def run(args: argparse.Namespace) -> int:
-    """Run the episode, write both files, print its result and whether the record says the same."""
+    """Run the episode, write both files, print its result and whether it equals the record."""
     if unknown := [flag for flag in args.rest if not flag.startswith("--policy.")]:
         raise ValueError(f"{unknown[0]} is unknown; see `lerobot-bomb replay --help`")
     record = read_record(args.path, args.line)

@@ -137,7 +137,7 @@ class LiberoHdf5:
 
 
 def instruction(task: str) -> str:
-    """A task's sentence after the name of its file: hf-libero's, which LeRobot's environment says.
+    """Return a task's sentence from the name of its file, as LeRobot's environment gives it.
 
     It is not the file's own `language_instruction`, which has `Pick the akita black bowl` where this has
     `pick up the black bowl`.

@@ -71,7 +71,7 @@ def collect(
     """Run a spec's episode in an `env` of that spec, whatever the seed that the `env` was made with.
 
     The stored actions are the expert's clean ones, the executed ones carry the noise. With an ``agent``,
-    which then acts, an episode is kept whatever becomes of it.
+    which then acts, failed episodes are kept, too.
     """
     if settings.static:
         return collect_static(env, spec, settings)

@@ -1,7 +1,7 @@
 """Statistics of a dataset's numbers over all of its frames.
 
 LeRobot averages quantiles over episodes and over datasets that it merges, so that a third of the frames may
-lie beyond q01..q99. Of images, its statistics stay: their quantiles are such means, of sampled pixels.
+lie beyond q01..q99. Its statistics of images stay: their quantiles are means over sampled pixels.
 """
 
 import json

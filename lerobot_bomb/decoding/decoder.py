@@ -124,12 +124,12 @@ class Answers(NamedTuple):
         return Place(self.prefix, self.number)
 
     def is_done(self, grammar: NumberGrammar, num_numbers: int) -> Tensor:
-        """(B,) bool: this number of numbers is written."""
+        """(B,) bool: all numbers are written."""
         complete_B = (self.number == num_numbers - 1) & grammar.must_end[self.prefix]
         return complete_B | (self.number >= num_numbers) | (self.prefix == grammar.DONE)
 
     def answer(self, grammar: NumberGrammar) -> Tensor:
-        """(B, N) the numbers, with the one that stands where rows are."""
+        """(B, N) numbers, with the one that is being written."""
         return self.numbers.scatter_add(1, self.number[:, None], grammar.value[self.prefix][:, None])
 
     def keep(self, row_B: Tensor) -> "Answers":

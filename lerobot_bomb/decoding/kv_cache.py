@@ -18,7 +18,7 @@ Positions = Callable[[Tensor], Tensor]
 
 
 def same_positions(column_C: Tensor) -> Tensor:
-    """Return the positions of a model that counts as columns are counted."""
+    """Return positions equal to the columns' numbers."""
     return column_C
 
 

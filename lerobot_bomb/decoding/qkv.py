@@ -91,7 +91,7 @@ class RopePairs:
 
     @staticmethod
     def rope(cos_CE: Tensor, sin_CE: Tensor) -> Tensor:
-        """(C, 1, E / 2) complex rotary positions from the model's own, whose halves are the same."""
+        """(C, 1, E / 2) complex rotary positions, from the model's own, which repeat each half."""
         half = cos_CE.shape[-1] // 2
         return torch.complex(cos_CE[:, None, :half].float(), sin_CE[:, None, :half].float())
 

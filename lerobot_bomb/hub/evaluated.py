@@ -9,7 +9,7 @@ from lerobot_bomb.results.record import Record
 def check_weights_of(path: Path, records: list[Record], checkpoint: Path) -> None:
     """Raise a ValueError if records of a results file belong to other weights than a checkpoint's folder.
 
-    Records that name no policy, such as those of protocol 1.0, pass.
+    Records that name no policy, such as those of protocol 1.0, are accepted.
     """
     from lerobot_bomb.checkpoints.checks import ADAPTERS  # imports LeRobot: seconds
     from lerobot_bomb.checkpoints.identity import sha256_of, weights_file

@@ -33,7 +33,7 @@ def upload(
 ) -> CommitInfo:
     """Make the repository unless it exists; in one commit add all files and delete others like them.
 
-    ``replaces`` says which paths are like them: an older push's, which would be read beside these.
+    ``replaces`` tells which paths of an older push would be read as well.
     `HfApi.upload_folder` would make several commits where Xet is installed.
 
     Raises:

@@ -62,7 +62,7 @@ class Libero:
 
     @property
     def config_file(self) -> Path:
-        """Path of hf-libero's config: in the folder of an environment variable as it is, without ~."""
+        """Path of hf-libero's config, in the folder of an environment variable; ~ is not expanded."""
         folder = os.environ.get("LIBERO_CONFIG_PATH", os.path.expanduser("~/.libero"))
         return Path(folder) / CONFIG_FILE
 
@@ -174,7 +174,7 @@ class Libero:
 def prepare_libero(suites: Iterable[str] = SUITES) -> Libero:
     """Make sure that LIBERO can be imported and its suites built: without a question, without a download.
 
-    Writes the config file where there is none. To be called before `libero` is imported, in every process.
+    Write the config file if there is none. To be called before `libero` is imported, in every process.
 
     Raises:
         ValueError: LIBERO is not installed, or its config file or assets are missing, partly missing or of

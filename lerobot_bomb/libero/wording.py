@@ -22,7 +22,7 @@ DONE = {"put": "put", "place": "put", "pick up": "put", "push": "pushed", "stack
 class Order:
     """One thing to be done: "put", "the bowl", "on the plate"; without a place: "open", "the microwave".
 
-    The place of what is picked up is where it is to be placed.
+    For an object that is picked up, the place is its target.
     """
 
     verb: str

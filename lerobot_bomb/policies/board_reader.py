@@ -1,7 +1,7 @@
 """Reading of board and tray off image tokens: an objective of training beside pointing.
 
-Instructions name places, and stones, by the stones around them. A policy that is told actions and places only
-learns late to see the stones, and until then no such place.
+Instructions name places, and stones, by the stones around them. A policy that is trained on actions and
+places alone learns late to see the stones, and until then no places that depend on them.
 
 Shapes: `B` batch, `P` image tokens of all cameras, `H` hidden size, `N` numbers of a token, `S` spots.
 """

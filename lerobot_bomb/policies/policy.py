@@ -126,7 +126,7 @@ class ChunkPolicy(HubPolicy, SavesTiedWeightsOnce, PreTrainedPolicy):
         self._batch_size: int | None = None  # of the episodes that are under way
 
     def drop_queued_actions(self) -> None:
-        """Let the next `select_action` predict; LeRobot 0.6.2 asks for it where the instruction changes."""
+        """Let the next `select_action` predict; LeRobot 0.6.2 calls this when the instruction changes."""
         self._queue.clear()
 
     def _check_batch_size(self, batch: dict[str, Tensor]) -> None:

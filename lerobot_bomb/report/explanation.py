@@ -221,7 +221,7 @@ def _ratio(value: float) -> Cell:
 
 
 def traces_section(episodes: Mapping[str, MaskedEpisode]) -> Section:
-    """Write the section of whole episodes under masks; the first is the one without."""
+    """Write the section of whole episodes under masks; the first has no mask."""
     rows = []
     for name, episode in episodes.items():
         result = episode.result

@@ -1,4 +1,4 @@
-"""A report: groups of episodes, and failures of them that are shown."""
+"""A report: groups of episodes, and a sample of their failures."""
 
 import shlex
 from collections.abc import Iterator, Mapping

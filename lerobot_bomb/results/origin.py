@@ -25,7 +25,7 @@ def json_list(*values: Any) -> str:
 
 @cache
 def installed_version(distribution: str) -> str | None:
-    """Return the version of a Python package; None where it has no metadata."""
+    """Return the version of a Python package; None if it has no metadata."""
     try:
         return version(distribution)
     except PackageNotFoundError:
@@ -33,7 +33,7 @@ def installed_version(distribution: str) -> str | None:
 
 
 def installed_versions(distributions: Iterable[str]) -> dict[str, str | None]:
-    """{distribution: version}; None where one has no metadata."""
+    """{distribution: version}; None if one has no metadata."""
     return {name: installed_version(name) for name in distributions}
 
 

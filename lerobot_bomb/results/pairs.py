@@ -34,7 +34,7 @@ class PairedComparison:
 
     @property
     def num_needed(self) -> int | None:
-        """Number of pairs in which the same test finds such a difference; None if it did, or never does."""
+        """Number of pairs for the test to find such a difference; None if it did, or never does."""
         if self.p_value < SIGNIFICANT:
             return None
         return episodes_to_tell_apart(self.counts, SIGNIFICANT / self.num_conditions)
@@ -50,7 +50,7 @@ class PairedComparison:
 
 
 def pair_with_nominal(records: Sequence[Record]) -> dict[str, list[Pair]]:
-    """{condition: (unperturbed, perturbed) records of an episode} of a group, where there are both."""
+    """{condition: pairs of the unperturbed and the perturbed record} of a group, for episodes with both."""
     nominal = {_episode(each): each for each in records if each.spec.perturbations == NONE}
     pairs: dict[str, list[Pair]] = {}
     for record in records:

@@ -114,7 +114,7 @@ class Record:
         return json.dumps(self.as_json(), allow_nan=False)
 
     def check(self) -> None:
-        """Raise a ValueError unless there can be such an episode, whose fields are possible one by one."""
+        """Raise a ValueError if the fields, each possible by itself, contradict each other."""
         policy, inference = self.policy, self.inference
         if policy is not None and policy.batch_row is not None and policy.batch_size is not None:
             self.refuse_if(policy.batch_row >= policy.batch_size, "policy.batch_row", "policy.batch_size")
@@ -149,7 +149,7 @@ class Record:
                 )
 
     def describe_policy(self) -> str:
-        """Describe who acted, as far as the record says it."""
+        """Describe which policy acted, as far as the record says."""
         return NOT_RECORDED if self.policy is None else self.policy.describe()
 
     @property

@@ -49,7 +49,7 @@ def _not_over(store: Store, jobs: Sequence[Job]) -> tuple[list[Job], int]:
 
 
 class WorkerProcess:
-    """A worker, and the job that it runs, which it says through a pipe."""
+    """A worker, and the job that it runs, which it reports through a pipe."""
 
     def __init__(self, command: Sequence[str], environment: dict[str, str], log: IO[bytes]) -> None:
         said, told = os.pipe()

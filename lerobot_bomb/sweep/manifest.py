@@ -91,7 +91,7 @@ class Manifest:
         return list(self.jobs[first::number])
 
     def write(self, folder: Path) -> None:
-        """Write the manifest as `NAME` to a folder, which is made."""
+        """Write the manifest as `NAME` to a folder, which is created."""
         jobs = [vars(job) | {"command": job.command} for job in self.jobs]
         with written_whole(folder / NAME) as (path,):
             path.write_text(json.dumps({"version": VERSION, "cells": jobs}, indent=1) + "\n")
@@ -151,7 +151,7 @@ def flag_value(flags: Sequence[str], name: str) -> str | None:
 
 
 def check_flags(flags: Sequence[str]) -> None:
-    """Raise a ValueError if a flag of lerobot-eval is one that a job has of its own."""
+    """Raise a ValueError if a flag of lerobot-eval is one that each job sets itself."""
     for flag in flags:
         name = flag.partition("=")[0]
         if name in RESERVED or name.startswith(RESERVED_PREFIXES):

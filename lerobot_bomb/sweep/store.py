@@ -1,9 +1,8 @@
 """Store of a sweep's progress: a folder that any number of workers share.
 
 A job is finished where `cells/KEY.jsonl` holds all its episodes; a worker that runs one holds the lock on
-`cells/KEY.lock`, which the system takes from it if it is killed. What such a worker left is run again,
-three times at most in one run: a sweep that was stopped, with workers that may outlive it by moments, is no
-failed attempt.
+`cells/KEY.lock`, which the system takes from it if it is killed. The job of such a worker is run again, at
+most three times in one run. A stopped sweep, whose workers may outlive it by moments, is no failed attempt.
 """
 
 import json
@@ -136,7 +135,7 @@ class Store:
                 self.fail(job, reason)
 
     def in_turn(self, jobs: Sequence[Job]) -> list[Job]:
-        """Return the jobs to be run, those first that no worker has died of, nor of their policy."""
+        """Return the jobs to run; those whose job or policy has killed workers come last."""
         attempts = {job: self._num_attempts(job) for job in jobs}
         of_policy: Counter[tuple[str, ...]] = Counter()
         for job, number in attempts.items():

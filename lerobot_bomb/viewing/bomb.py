@@ -53,7 +53,7 @@ class BombView(EnvView):
 
 
 def bomb_episode(spec: EpisodeSpec, options: RenderOptions) -> Viewed:
-    """Return an episode as it is shown."""
+    """Return an episode to be shown."""
     flags = {"task": spec.suite} | {name: getattr(spec, name) for name in ("robot", "control_mode", "fps")}
     return Viewed(
         env_type="bomb",

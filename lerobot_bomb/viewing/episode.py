@@ -75,8 +75,8 @@ class ViewedRun:
 def write_episodes(runs: Mapping[str, ViewedRun], name: str, rrd: Path, mp4: Path) -> list[Record]:
     """Run the episodes one after the other, write recording and video, and return each result.
 
-    With one run, its entities stand at the recording's top; of several, each below its name, and the video
-    shows them side by side, the last image of an episode until the others have ended.
+    The entities of a single run are at the recording's top; those of several are below their names. The video
+    shows several side by side, and repeats the last image of an episode until the others have ended.
     """
     from lerobot_bomb.viewing.rerun_file import open_recording
     from lerobot_bomb.viewing.video import VideoFile, packed, unpacked

@@ -1,4 +1,4 @@
-"""A plot of a grid: how often each coordinate takes which value, and where it is cut."""
+"""Plot of a grid: a histogram of each coordinate, and its cuts."""
 
 from dataclasses import dataclass
 

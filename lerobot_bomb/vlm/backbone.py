@@ -225,7 +225,7 @@ def read_vlm_config(vlm_model_name: str, *families: str) -> Any:
 
 @contextmanager
 def weights_errors(vlm_model_name: str) -> Iterator[None]:
-    """Tell the ways out where the weights cannot be had."""
+    """Describe what to do if the weights cannot be read."""
     try:
         yield
     except OSError as error:

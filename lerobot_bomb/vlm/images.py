@@ -57,7 +57,7 @@ class CropWindows:
 def draw_windows(images_BxHW: Tensor, crop_fraction: float, generator: torch.Generator | None) -> CropWindows:
     """Windows of ``crop_fraction`` of either side of (B, ..., H, W) images.
 
-    Each at a place of its own drawn from ``generator``, or at the centre where that is None.
+    Each is placed by ``generator``, or at the centre if that is None.
     """
     height, width = images_BxHW.shape[-2:]
     crop_height, crop_width = max(1, round(height * crop_fraction)), max(1, round(width * crop_fraction))

@@ -31,7 +31,7 @@ class Piece(NamedTuple):
 class PromptLayout:
     """Pieces of a prompt, in order.
 
-    No piece of a row's own stands before an image, so an image's columns are the same in every row.
+    No text of its own comes before an image of a row, so an image's columns are the same in every row.
     """
 
     pieces: Sequence[Piece]

@@ -6,7 +6,7 @@ The whole sequence is, in SmolVLM's:
     Assistant: a1 a2 ... an<end_of_utterance>
 
 with IMG = ``<fake_token_around_image><global-img><image>...<image><fake_token_around_image>``. A system
-prompt stands before ``User:`` as ``System: {text}<end_of_utterance>`` and a line break. In Qwen2.5-VL's:
+prompt precedes ``User:`` as ``System: {text}<end_of_utterance>`` and a line break. In Qwen2.5-VL's:
 
     <|im_start|>system
     You are a helpful assistant.<|im_end|>
@@ -60,7 +60,7 @@ class ChatFormat:
     image_label: str = ""  # after an image's start
 
     def opening(self, tokenizer: Tokenizer, vlm_model_name: str, system_prompt: str | None) -> list[int]:
-        """Tokens of all that stands before the user's images; raises as `single_id`."""
+        """Tokens before the user's images; raises like `single_id`."""
         ids = [single_id(tokenizer, vlm_model_name, self.family, self.start)]
         text = self.default_system if system_prompt is None else system_prompt
         if text is not None:

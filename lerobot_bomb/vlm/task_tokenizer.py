@@ -45,10 +45,9 @@ class TaskStep(ObservationProcessorStep):
     """Reads the batch for all that follows: numbers as float32, a row for each instruction, all checked.
 
     It is in the pipelines of all our checkpoints, before anything is normalised. LeRobot's normaliser casts
-    all its statistics to the type of what it normalised last, and a checkpoint saves them so: of whole
-    numbers nothing but these would be left. Refused are images, state and actions that are not finite,
-    images outside [0, 1], and another number of rows than of instructions. On CUDA the host waits once,
-    before the pass.
+    all its statistics to the type of its last input, and a checkpoint saves them like that: whole numbers
+    would truncate them. Refused are images, state and actions that are not finite, images outside [0, 1], and
+    another number of rows than of instructions. On CUDA the host waits once, before the pass.
     """
 
     def __call__(self, transition: EnvTransition) -> EnvTransition:

@@ -52,7 +52,7 @@ NEW_PARTS = ("segment", "state_embedding", "pointer", BOARD_READER, "flow_head",
 
 
 class FdvlaPolicy(RelativeVlaPolicy, PointingVlaPolicy):
-    """A Qwen2.5-VL that reads noisy actions; two heads predict where they go and what noise is in them."""
+    """A Qwen2.5-VL that reads noisy actions; two heads predict their velocity and their noise."""
 
     config_class = FdvlaConfig  # pyright: ignore[reportAssignmentType]  LeRobot annotates it as None
     name = "fdvla"  # pyright: ignore[reportAssignmentType]

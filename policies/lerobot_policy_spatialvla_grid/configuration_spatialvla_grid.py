@@ -219,7 +219,7 @@ class SpatialvlaGridConfig(TokenVlaConfig, PlacesVlaConfig):
     def read_depth_of(self, given: Collection[str] | None) -> None:
         """Let a checkpoint that was trained without observed depth read the observations' depth.
 
-        ``given``: their keys; None: they are not known yet, and a batch will say what is missing.
+        ``given``: their keys; None if they are not known yet, so that a batch reports what is missing.
         """
         if self.depth_source == "observation":
             read = {

@@ -126,7 +126,7 @@ class CellPointer(nn.Module):
     ) -> tuple[Labels, Target]:
         """Draw what a batch points at, actions as LeRobot normalises them; and the tokens that are given.
 
-        There is no loss of another place than the one that is meant.
+        Counterfactual places carry no loss.
         """
         labels = Labels.draw(batch, self.places, config.counterfactual_share, config.type, generator)
         tokens_B2 = torch.stack([labels.given, self.stones.number_of(labels.stone_xy)], dim=1)

@@ -65,7 +65,7 @@ class Task(ABC):
 
     @abstractmethod
     def referents(self, target: Intersection) -> list[list[Intersection]]:
-        """Return each way for stones to stand so that `target` is meant; none where it cannot be."""
+        """Return each arrangement of stones in which `target` is meant; empty if there is none."""
 
     @property
     def targets(self) -> tuple[Intersection, ...]:

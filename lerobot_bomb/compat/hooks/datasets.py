@@ -39,7 +39,7 @@ def read_asked_columns() -> None:
 
 
 def explain_missing_datasets(explain: Callable[[str, Path, Exception], str]) -> None:
-    """Let a dataset that is neither here nor on the Hub be an error with `explain(repo_id, root, error)`.
+    """Turn the error of a dataset that is neither here nor on the Hub into `explain(repo_id, root, error)`.
 
     LeRobot asks the Hub for whatever it does not find, and ends in a hundred lines of the HTTP library.
     """

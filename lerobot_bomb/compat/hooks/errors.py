@@ -24,7 +24,7 @@ def tell_config_errors(
     """Let LeRobot's commands say in one line why they cannot read a config.
 
     Their parser prints DecodingErrors, and turns others into `Couldn't instantiate class EvalPipelineConfig`.
-    `damage(path or name on the Hub, revision)` says what keeps a config.json from being any policy's.
+    `damage(path or name on the Hub, revision)` says why a config.json is no policy's.
     """
 
     def around(usual: Callable[..., PreTrainedConfig]) -> Callable[..., PreTrainedConfig]:
@@ -54,7 +54,7 @@ def tell_config_errors(
 def tell_refusals() -> None:
     """Let LeRobot's commands end in one line where our code refuses something, or with Ctrl-C.
 
-    An error that it raises on purpose says what to do, and the traceback before it hides that. With
+    Such an error says what to do, and a traceback above it would hide that. With
     LEROBOT_BOMB_TRACEBACK=1 it is shown. So is a DecodingError told: lerobot-train reads a checkpoint's
     config after its parser, which would print it.
     """

@@ -1,4 +1,4 @@
-"""Wrong flags of LeRobot's commands, where they choose a type of ours: one line instead of all usage."""
+"""Wrong flags of LeRobot's commands that choose a type of ours: one line instead of all usage."""
 
 import sys
 from collections.abc import Callable, Collection, Sequence

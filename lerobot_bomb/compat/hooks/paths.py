@@ -1,4 +1,4 @@
-"""Checkpoints named `bomb:NAME`, and the first sight of a type of ours: the only hook that always stands."""
+"""Checkpoints named `bomb:NAME`, and the first use of a type of ours: the one hook always installed."""
 
 import re
 import sys
@@ -19,7 +19,7 @@ from lerobot_bomb.compat.use import is_ours, use
 def resolve_checkpoints(prefix: str, resolve: Callable[[str], str]) -> None:
     """Let `resolve` change `--policy.path` of LeRobot's commands and config files.
 
-    Other paths than `prefix...` stay as they are. A ValueError of it ends the command in one line.
+    Other paths than `prefix...` stay as they are. Its ValueError ends the command in one line.
 
     LeRobot's commands ask for a path before they read any other flag. Where these name a type of ours, the
     other hooks are installed, so that wrong flags are told, too.

@@ -21,8 +21,8 @@ def lerobot_eval_with(flags: Sequence[str], wrap: Callable[[Any, Any], Any]) -> 
 class KeptPolicy:
     """Runs lerobot-eval several times in one process; a policy stays as long as the same one is asked for.
 
-    What is random goes on from where it was when the policy had been built, so that an evaluation gives what
-    it gives in a process of its own.
+    Random numbers restart from their state after the policy was built, so an evaluation gives the same as in
+    a process of its own.
     """
 
     def __init__(self) -> None:
@@ -35,7 +35,7 @@ class KeptPolicy:
     def evaluate(self, flags: Sequence[str], asked: object, first: int = 0) -> None:
         """Run lerobot-eval, which draws no video and runs one task after another.
 
-        `asked` is equal where it needs the policy of before, built with the same seed. `first` is the number
+        `asked` is equal if it needs the previous policy, built with the same seed. `first` is the number
         of an episode that is run alone out of a longer evaluation.
         """
         from lerobot.scripts import lerobot_eval

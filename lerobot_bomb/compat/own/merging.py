@@ -15,7 +15,7 @@ from lerobot.datasets.utils import update_chunk_file_indices
 def merged_at_once() -> Iterator[None]:
     """Let LeRobot's merge write each file of the merged dataset once.
 
-    It would write a file again for every dataset that it adds to it.
+    LeRobot's function would rewrite a file for every dataset that it adds.
     """
     tables, videos = _Tables(), _Videos()
     replaced = {
