@@ -31,7 +31,7 @@ class LiberoTransform(EpisodeTransform):
 
     @classmethod
     def add_bodies(cls, worldbody: ElementTree.Element) -> None:
-        """Add to the model what an episode at any level may need, before it is compiled."""
+        """Add all bodies that an episode at any level may need, before the model is compiled."""
 
     def edit(self, scene: "LiberoScene") -> None:
         """Change the model; objects are not yet at their starting places."""

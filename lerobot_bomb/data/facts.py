@@ -47,7 +47,7 @@ class DatasetFacts:
 
     @classmethod
     def find(cls, root: Path | str | None) -> "DatasetFacts | None":
-        """Read the facts of a folder where a dataset was, if one still is there."""
+        """Read the facts of a dataset's folder; None if the dataset is gone."""
         return cls.read(Path(root)) if root and (Path(root) / INFO_FILE).is_file() else None
 
     @property

@@ -45,7 +45,7 @@ def block_path(folder: Path, number: int) -> Path:
 
 
 def finished_blocks(*folders: Path) -> list[Path]:
-    """Folders of the finished blocks, by their numbers; none where a folder itself is missing."""
+    """Folders of the finished blocks, by their numbers; {} if the dataset's folder is missing."""
     paths = (path for folder in folders for path in folder.glob("block-*"))
     return sorted((path for path in paths if BLOCK.fullmatch(path.name)), key=_number)
 

@@ -44,7 +44,7 @@ class Part:
         return f"{self.index}/{self.number}"
 
     def to_dict(self) -> dict[str, Any]:
-        """Return the values that its JSON reads back as."""
+        """Return the values to write as JSON."""
         return {**self.recording.to_dict(), "shard": str(self)}
 
     @property
@@ -145,7 +145,7 @@ def check_no_parts(root: Path) -> None:
 
 
 def unfinished_parts(parts: list[Part], root: Path) -> dict[Part, str]:
-    """{part: which block it lacks, or what is wrong with one} of those that are not whole."""
+    """{part: its missing block, or a block's damage} of the incomplete parts."""
     found = {}
     for part in parts:
         for number in part.blocks:

@@ -1,10 +1,8 @@
 """A dataset that grows in blocks beside its final place: a kill costs little and leaves no half dataset.
 
-While it grows it is a folder, for a recording as follows:
-    NAME.recording/recording.json   the parameters
-    NAME.recording/block-00000/     a finished LeRobotDataset, and block.json: what it holds
-The merged dataset appears under its name at once, complete. What was lost or damaged in the meantime is
-made again (see ``kept_blocks.py``).
+While it grows it is a folder, for a recording as follows: NAME.recording/recording.json the parameters
+NAME.recording/block-00000/ a finished LeRobotDataset, and block.json: what it holds The merged dataset
+appears under its name at once, complete. Lost or damaged blocks are made again (see ``kept_blocks.py``).
 """
 
 import os
@@ -60,7 +58,7 @@ def grow(
     layout: Callable[[], "DatasetLayout"],
     parts: Sequence[Path] = (),
 ) -> Progress:
-    """Let `write` fill a folder with the blocks that it lacks, then merge them into `root`.
+    """Let `write` add the missing blocks to a folder, then merge all into `root`.
 
     Args:
         parameters: what determines the dataset.

@@ -146,7 +146,7 @@ class Decoded:
 
 
 def likeliest(logits: Tensor) -> tuple[Tensor, Tensor]:
-    """(..., S) -> (...) which is largest, and its logit: NaN if any of them is, else inf if any is."""
+    """(..., S) -> (...) index of the largest logit, and that logit: NaN if any is NaN, else inf if any is."""
     choice = logits.argmax(dim=-1)
     return choice, logits.gather(-1, choice[..., None])[..., 0]
 

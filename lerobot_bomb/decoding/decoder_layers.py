@@ -83,7 +83,7 @@ class TextLayers:
         return self._norm(x_NH).view(x_BKH.shape)
 
     def rope(self, position_C: Tensor) -> Tensor:
-        """Positions as `rotary_tables` takes them -> (C, 1, ...) rotary ones as the layers want them."""
+        """Positions as `rotary_tables` takes them -> (C, 1, ...) rotary positions for the layers."""
         return self._rope(*rotary_tables(self.model, position_C)) * self._rope_scale
 
     @torch.no_grad()

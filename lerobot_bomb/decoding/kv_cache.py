@@ -96,7 +96,7 @@ class CachedText:
         return self._layers(embeds_BKH, columns, self._layer_caches)
 
     def singly(self, columns_BK: Tensor) -> list[Columns]:
-        """Locate K passes, each of a token a row which reads up to its own column; faster than one by one."""
+        """Locate K passes of one token per row, each up to its own column; faster than one by one."""
         counts = self._counts_of_columns(columns_BK)
         together = self._locate(columns_BK, columns_BK, max(counts, default=0))
         parts = zip(

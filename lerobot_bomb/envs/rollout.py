@@ -60,8 +60,8 @@ def run_episode(
 ) -> Iterator[Moment]:
     """Run a spec's episode in an `env` of that spec; while a moment is looked at, `env` is in it.
 
-    What is executed is the agent's action as `disturb` changes it. The last moment is what the last action
-    led to, which lerobot-eval's videos cut off.
+    What is executed is the agent's action as `disturb` changes it. The last moment is the one after the last
+    action, which lerobot-eval's videos leave out.
     """
     observation, info = env.reset(seed=spec.seed)
     step, ended = 0, False

@@ -1,4 +1,4 @@
-"""A task's instruction of LIBERO in other words that ask for the same.
+"""Paraphrases of LIBERO's instructions.
 
 LIBERO's 130 instructions are one or two orders joined by "and": pick up and place, put, push, stack, open,
 close, turn on, turn off. Things and places keep their names; verbs and order change.

@@ -1,6 +1,6 @@
 """Checks and presets that the configs of all our policies share; errors name the flag.
 
-A config calls those of the fields that it has.
+Each config calls the checks of the fields that it has.
 """
 
 import json

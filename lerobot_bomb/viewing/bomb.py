@@ -78,7 +78,7 @@ def _fixed_words(spec: EpisodeSpec) -> Iterator[str]:
 
 
 def bomb_tiles(condition: str, seed: int, image_size: int, changes: set[str]) -> dict[str, np.ndarray]:
-    """Return tiles of the start; dynamics show in the expert's path."""
+    """Return tiles of the episode's start; changed dynamics are shown by the expert's path."""
     start, path_xy = _start_and_path(condition, seed, image_size, "dynamics" in changes)
     tiles = {camera: start.observation[PIXELS][camera] for camera in CAMERAS if "images" in changes}
     if "instruction" in changes:

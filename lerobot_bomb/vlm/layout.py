@@ -55,7 +55,7 @@ class PromptLayout:
         return spans
 
     def fill(self, rows: Mapping[str, TokenRows]) -> TokenRows:
-        """Join the pieces of a batch; ``rows``: each row's own tokens, by part."""
+        """Join the parts of a batch's prompts; ``rows``: each row's own tokens, by part."""
         like_BL = rows[INSTRUCTION].ids
         return TokenRows.join(
             [rows[part] if ids is None else TokenRows.constant(ids, like_BL) for part, ids, _ in self.pieces]

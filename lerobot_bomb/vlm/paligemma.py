@@ -82,7 +82,7 @@ class PaliGemmaBackbone(Backbone):
 
     @property
     def has_tied_head(self) -> bool:
-        """True if words are written by the table that they are read by."""
+        """True if input and output embeddings are one table."""
         return self.vlm.lm_head.weight is self.vlm.get_input_embeddings().weight
 
     def encode_pixels(self, pixels_B3SS: Tensor) -> Tensor:

@@ -157,7 +157,7 @@ class QwenBackbone(Backbone):
         hidden_BL: Tensor | None = None,
         num_shared: int = 0,
     ) -> Prefix:
-        """Read rows whose first column is written; ``is_image_BL``: which tokens are parts of images.
+        """Read rows from their first column on; ``is_image_BL``: which tokens belong to images.
 
         ``hidden_BL``: tokens that no other reads. They keep their positions. ``num_shared``: first columns
         that are written and the same in all rows; they are read once.

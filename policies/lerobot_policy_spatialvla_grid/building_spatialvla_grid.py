@@ -31,7 +31,7 @@ EGO3D_LAYERS = r"ego3d\.layers\.[03]"
 
 
 def adapted_layers(config: SpatialvlaGridConfig) -> list[str]:
-    """Patterns of these, as far as the config trains them."""
+    """Return name patterns of the layers with adapters, of the parts that the config trains."""
     others = [PROJECTOR]
     if not config.freeze_vision_encoder:
         others.append(VISION_LAYERS)
@@ -74,7 +74,7 @@ def build_depth(config: SpatialvlaGridConfig) -> ZoeDepth | None:
 def complete_depth(config: SpatialvlaGridConfig, meta: LeRobotDatasetMetadata | None) -> None:
     """Complete a checkpoint's config for its ``depth_source``, if it was trained with another.
 
-    What the dataset ``meta`` lacks is told later; without one, the first batch tells.
+    Features that the dataset ``meta`` lacks are reported later; without a dataset, by the first batch.
     """
     config.read_depth_of(None if meta is None else meta.features)
     if config.depth_source == "zoedepth" and config.depth_config is None:
