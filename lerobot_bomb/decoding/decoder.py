@@ -54,7 +54,7 @@ class Prompt(NamedTuple):
 
     @property
     def tensors(self) -> tuple[Tensor, Tensor, Tensor]:
-        """Prompt as tensors, without a None."""
+        """Prompt as tensors, with defaults in place of None."""
         return self.embeds, self.mask, torch.zeros_like(self.mask) if self.hidden is None else self.hidden
 
 

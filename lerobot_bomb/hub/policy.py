@@ -1,4 +1,4 @@
-"""Policies on the Hub: one commit with a card out, clear errors in."""
+"""Policies on the Hub: publishing in one commit with a card, loading with clear errors."""
 
 import logging
 from collections.abc import Collection

@@ -68,7 +68,7 @@ class Libero:
 
     @property
     def assets(self) -> Path:
-        """Folder where hf-libero looks for meshes and textures, and which it downloads them to."""
+        """Folder in which hf-libero looks for meshes and textures, and to which it downloads them."""
         own = self.package / "assets"
         return own if own.exists() else Path(os.path.expanduser("~")) / ".cache" / "libero" / "assets"
 

@@ -46,8 +46,8 @@ class TaskStep(ObservationProcessorStep):
 
     It is in the pipelines of all our checkpoints, before anything is normalised. LeRobot's normaliser casts
     all its statistics to the type of its last input, and a checkpoint saves them like that: whole numbers
-    would truncate them. Refused are images, state and actions that are not finite, images outside [0, 1], and
-    another number of rows than of instructions. On CUDA the host waits once, before the pass.
+    would truncate them. Images, state and actions must be finite, images in [0, 1], and rows as many as
+    instructions. On CUDA the host waits once, before the pass.
     """
 
     def __call__(self, transition: EnvTransition) -> EnvTransition:

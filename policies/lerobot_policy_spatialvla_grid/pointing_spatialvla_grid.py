@@ -35,7 +35,7 @@ class StoneCells:
 
     @classmethod
     def of_flags(cls, area_m: list[list[float]], cell_m: float) -> "StoneCells":
-        """Raise a ValueError that names the flag unless they are squares of an area."""
+        """Build the cells; raise a ValueError, which names the flag, if their size or the area is wrong."""
         if not CELL_M[0] <= cell_m <= CELL_M[1]:
             raise ValueError(f"--policy.pointing_cell_m={cell_m} must lie in {CELL_M[0]:g}..{CELL_M[1]:g}")
         if [len(corner) for corner in area_m] == [2, 2]:

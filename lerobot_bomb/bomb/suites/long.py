@@ -102,7 +102,7 @@ class Opening(Task):
 class FillRow(Task):
     """Task: fill the free intersections of a row from left to right, colours in turn.
 
-    The last one's colour is said: it stays true of what is left, whoever has played there before.
+    The instruction names the last stone's colour, which stays true however many stones are placed.
     """
 
     def draw(self, rng: np.random.Generator) -> TaskInstance:
