@@ -24,9 +24,10 @@ FLAGS = ("--env.type=bomb", "--env.image_size=32", "--policy.device=cpu", "--epi
 
 
 @pytest.mark.long
-def test_good_policies_play_whatever_becomes_of_those_that_crash(
+def test_good_policies_run_whatever_becomes_of_those_that_crash(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
+    monkeypatch.syspath_prepend(PLUGINS)  # for this process, which reads the types there are
     monkeypatch.setenv("PYTHONPATH", str(PLUGINS))
     monkeypatch.setattr(store_module, "MAX_ATTEMPTS", 1)  # of this process, which counts how workers end
     assert sweep(tmp_path, "--policies=segfault,killed,bomb_random", *FLAGS) == 1
@@ -41,9 +42,10 @@ def test_good_policies_play_whatever_becomes_of_those_that_crash(
 
 
 @pytest.mark.long
-def test_good_policies_play_beside_all_that_crash_or_hang(
+def test_good_policies_run_beside_all_that_crash_or_hang(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
+    monkeypatch.syspath_prepend(PLUGINS)  # for this process, which reads the types there are
     monkeypatch.setenv("PYTHONPATH", str(PLUGINS))
     policies = "--policies=segfault,killed,hanging,bomb_random,bomb_expert"
     limits = ("--timeout=120", "--workers=2", "--perturbations=none,light:3")
