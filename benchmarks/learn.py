@@ -69,7 +69,7 @@ def main() -> None:
     parser.add_argument("task", choices=TASKS)
     types = [PROBE, *POLICY_TYPES, *RIVALS]
     parser.add_argument("--policy.type", dest="policy_type", choices=types, default=PROBE)
-    parser.add_argument("--output_dir", type=Path, required=True, help="folder to keep, or to go on with")
+    parser.add_argument("--output_dir", type=Path, required=True, help="folder to keep, or to resume in")
     parser.add_argument("--demonstrations", type=positive, help="default: the task's")
     parser.add_argument("--steps", type=positive, help="training steps (default: the recipe's)")
     points = f"points of the curve (default: {NUM_CHECKPOINTS})"
@@ -91,10 +91,7 @@ def main() -> None:
     except RuntimeError as error:
         sys.exit(f"learn.py: {error}")
     except KeyboardInterrupt:
-        sys.exit(
-            "learn.py: interrupted; the same command goes on with what is finished (a training that was "
-            "stopped starts anew)"
-        )
+        sys.exit("learn.py: interrupted; the same command resumes (a training that was stopped starts anew)")
 
 
 def run_task(args: argparse.Namespace) -> int:
@@ -163,10 +160,10 @@ def run_claimed(args: argparse.Namespace, task: Task, run: dict[str, Any]) -> in
     checkpoint = last_checkpoint(folder / "train")
     task_flag = f" --env.task_ids={list(task.task_ids)}".replace(" ", "") if task.task_ids else ""
     task_flag += "" if task.suite == PLACE else f" --env.task={task.suite}"
-    watch = (
+    view = (
         f"lerobot-bomb view --policy.path={checkpoint} --env.image_size={IMAGE_SIZE} --seed={args.first_seed}"
     )
-    print(f"The policy: {checkpoint}\nAn episode of it as a video: {watch} {task_flag}".rstrip())
+    print(f"The policy: {checkpoint}\nAn episode of it as a video: {view} {task_flag}".rstrip())
     return 0 if training.bar is None else verdict(points[f"step {run['steps']}"], training.bar)
 
 

@@ -72,7 +72,7 @@ class Task:
     is_said_at_once: bool = True  # else the policy is given several instructions, which are not exchanged
     # what is recorded in place of the training's demonstrations; all of it is labelled for pointing
     parts: tuple[Part, ...] = ()
-    env_flags: tuple[str, ...] = ()  # with which the environment is recorded and played
+    env_flags: tuple[str, ...] = ()  # with which the environment is recorded and run
 
 
 # Places that relations name are read after many boards, those with a name of their own after a few.

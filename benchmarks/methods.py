@@ -43,7 +43,7 @@ SHARE_BEFORE = 0.6  # of the minutes, before a policy's own episodes are relabel
 
 @dataclass(frozen=True)
 class Data:
-    """Recordings that are merged, and the environment's flags with which they are made and played."""
+    """Recordings that are merged, and the environment's flags with which they are made and run."""
 
     parts: tuple[Part, ...] = (*SCENES, *SHOWN)
     env_flags: tuple[str, ...] = ()
@@ -114,7 +114,7 @@ PARTS = {
 def main() -> None:
     """Train and evaluate every version of the wanted parts, and print the table."""
     parser = make_parser(__doc__)
-    parser.add_argument("--output_dir", type=Path, required=True, help="folder to keep, or to go on with")
+    parser.add_argument("--output_dir", type=Path, required=True, help="folder to keep, or to resume in")
     parser.add_argument("--only", nargs="+", choices=PARTS, default=list(PARTS), help="parts of a method")
     parser.add_argument(
         "--minutes", type=positive, default=12, help="CPU minutes of a training (default: 12)"

@@ -1,7 +1,7 @@
 r"""Comparison on PushT: our policies and LeRobot's `act` and `diffusion`, trained for equal minutes.
 
 Each starts from random weights and is trained by the stock `lerobot-train` on the 206 human demonstrations
-and copies of them that are turned, mirrored and shifted; the stock `lerobot-eval --env.type=pusht` plays it
+and copies of them that are turned, mirrored and shifted; the stock `lerobot-eval --env.type=pusht` runs it
 on new seeds. Two short trainings find what a step takes, so that the learning rate ends its decay when the
 minutes do: of CPU on a CPU, by the clock on a GPU.
 
@@ -66,7 +66,7 @@ def main() -> None:
     """Convert, train all, evaluate all, print the table."""
     parser = make_parser(__doc__)
     parser.add_argument("--source", type=Path, help="the zarr; not needed once it is converted")
-    parser.add_argument("--output_dir", type=Path, required=True, help="folder to keep, or to go on with")
+    parser.add_argument("--output_dir", type=Path, required=True, help="folder to keep, or to resume in")
     parser.add_argument("--minutes", type=float, required=True, help="of each training")
     parser.add_argument("--device", choices=ON, default="cpu")
     parser.add_argument("--policies", nargs="+", choices=POLICIES, default=POLICIES)
@@ -97,7 +97,7 @@ def compete(args: argparse.Namespace, name: str, dataset: Path) -> Contender:
         seconds = train(folder / "train", [*flags, *decay(name, steps)], steps)
         minutes = {"minutes": seconds.clock / 60, "cpu_minutes": seconds.cpu / 60}
         times_path.write_text(json.dumps({"steps": steps, **minutes}) + "\n")
-    coverages, num_successes = play(folder, args.episodes)
+    coverages, num_successes = coverages_of(folder, args.episodes)
     return Contender(
         name, max_coverages=coverages, num_successes=num_successes, **json.loads(times_path.read_text())
     )
@@ -130,7 +130,7 @@ def train(output_dir: Path, flags: list[str], steps: int) -> Seconds:
     return Seconds(time.monotonic() - started, cpu)
 
 
-def play(folder: Path, episodes: int) -> tuple[list[float], int]:
+def coverages_of(folder: Path, episodes: int) -> tuple[list[float], int]:
     """Maximal coverage of each episode, and the successes."""
     checkpoint = last_checkpoint(folder / "train")
     flags = [f"--seed={FIRST_UNSEEN_SEED}", f"--eval.n_episodes={episodes}"]

@@ -3,7 +3,7 @@ r"""Does a policy learn from real data? PushT's human demonstrations, held-out e
 The recipe configs/pusht_TYPE.yaml and its variants, each with several seeds, are trained by the stock
 `lerobot-train` on episodes 0-179; `lerobot-bomb checkpoint offline-metrics` measures the decoded actions on
 episodes 180-205, beside predictors that look at no image. With --eval_episodes the recipe's checkpoints also
-play in LeRobot's environment `pusht`.
+run in LeRobot's environment `pusht`.
 
 All start from one small backbone that has learned to see before, on the same episodes: from random weights, a
 model that may read the state does not look at the image for a long time (docs/pusht.md).
@@ -102,7 +102,7 @@ def main() -> None:
     parser = make_parser(__doc__)
     parser.add_argument("--policy.type", dest="policy_type", required=True, choices=PUSHT_TYPES)
     parser.add_argument("--source", type=Path, help="the zarr; not needed once it is converted")
-    parser.add_argument("--output_dir", type=Path, required=True, help="folder to keep, or to go on with")
+    parser.add_argument("--output_dir", type=Path, required=True, help="folder to keep, or to resume in")
     parser.add_argument("--variants", nargs="+", help="default: all")
     parser.add_argument("--seeds", type=positive, default=3, help="trainings of each (default: 3)")
     parser.add_argument("--jobs", type=positive, default=2, help="trainings at once (default: 2)")
@@ -138,7 +138,7 @@ def prove(args: argparse.Namespace, chosen: list[str]) -> dict[str, list[Seed]]:
         train(run, args.policy_type, dataset, [*start, *VARIANTS[args.policy_type][run.variant]])
         columns = measure(run, dataset, args.frames)
         num_episodes = args.eval_episodes if run.variant == RECIPE else None
-        coverages = [] if num_episodes is None else play(run, num_episodes)
+        coverages = [] if num_episodes is None else coverages_of(run, num_episodes)
         return Seed(columns["train"], columns["validation"], max_coverages=coverages, **run.times())
 
     variants: dict[str, list[Seed]] = {}
@@ -218,7 +218,7 @@ def measure(run: Run, dataset: Path, num_frames: int) -> dict[str, Any]:
     return json.loads(path.read_text())["columns"]
 
 
-def play(run: Run, num_episodes: int) -> list[float]:
+def coverages_of(run: Run, num_episodes: int) -> list[float]:
     """Maximal coverage of each episode."""
     flags = [f"--eval.n_episodes={num_episodes}", "--eval.batch_size=10"]
     return max_coverages(evaluate(run.checkpoint, run.folder / f"eval_{num_episodes}", flags))

@@ -18,13 +18,13 @@ POLICY = "policy"
 
 @dataclass(frozen=True)
 class Seed:
-    """One training: its two columns of `checkpoint offline-metrics`, what it took, how it plays."""
+    """One training: its two columns of `checkpoint offline-metrics`, time, coverages."""
 
     train: dict[str, Any]
     validation: dict[str, Any]
     minutes: float
     cpu_minutes: float
-    max_coverages: list[float]  # of each episode in the environment, if it was played
+    max_coverages: list[float]  # of each episode in the environment, if it was run
 
     def l1(self, predictor: str = POLICY) -> float:
         """Held-out L1 in pixels."""

@@ -2,7 +2,7 @@
 
     python benchmarks/simulator_versions.py 3.8.1 3.9.0 4.0.0 --work_dir simulators
 
-makes a virtual environment per version, without torch and LeRobot, lets the scripted expert play the same
+makes a virtual environment per version, without torch and LeRobot, lets the scripted expert run the same
 seeds in each, and compares with the first. `--here` measures the Python that runs it, and prints JSON.
 
 States: joint positions and velocities after every control step, float64. Images: both cameras in every
@@ -55,7 +55,7 @@ class Measured:
 
 
 def measure_here(conditions: Iterable[str], seeds: range) -> Measured:
-    """Play all robots under all conditions in this process."""
+    """Run all robots under all conditions in this process."""
     outcomes: dict[str, Outcome | str] = {}
     for robot, condition in product(ROBOTS, conditions):
         try:
@@ -69,14 +69,14 @@ def outcome_of(robot: str, condition: str, seeds: range) -> Outcome:
     """The expert's episodes of these seeds."""
     from lerobot_bomb.bomb.episode import EpisodeSpec
     from lerobot_bomb.bomb.observation import PIXELS, RenderOptions
-    from lerobot_bomb.envs.rollout import expert_agent, play
+    from lerobot_bomb.envs.rollout import expert_agent, run_episode
     from lerobot_env_bomb.env import BombEnv
 
     states, images, results = hashlib.sha256(), hashlib.sha256(), []
     spec = EpisodeSpec(seed=0, robot=robot, perturbations=condition)
     env = BombEnv(spec, RenderOptions(image_size=IMAGE_SIZE))
     for seed in seeds:
-        for moment in play(env, replace(spec, seed=seed), expert_agent()):
+        for moment in run_episode(env, replace(spec, seed=seed), expert_agent()):
             data = env._run.scene.data
             states.update(data.qpos.tobytes() + data.qvel.tobytes())
             for image in moment.observation[PIXELS].values():
@@ -141,7 +141,7 @@ def table(measured: Sequence[Measured]) -> list[str]:
             outcomes = [one.outcomes[f"{robot} {condition}"] for condition in conditions]
             expected = [reference.outcomes[f"{robot} {condition}"] for condition in conditions]
             hashes = [_hash(outcomes, kind, expected) for kind in ("states", "images")]
-            lines.append(f"| {' | '.join([one.mujoco, robot, *hashes, *map(_played, outcomes)])} |")
+            lines.append(f"| {' | '.join([one.mujoco, robot, *hashes, *map(_outcome_text, outcomes)])} |")
     return lines
 
 
@@ -153,7 +153,7 @@ def _hash(outcomes: list[Outcome | str], kind: str, expected: list[Outcome | str
     return f"{short} =" if digests == wanted else short
 
 
-def _played(outcome: Outcome | str) -> str:
+def _outcome_text(outcome: Outcome | str) -> str:
     if isinstance(outcome, str):
         return "cannot run"
     return f"{outcome.successes}/{outcome.episodes}, {outcome.worst_error_mm:.1f} mm"

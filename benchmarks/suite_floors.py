@@ -124,8 +124,10 @@ def plans_without_colours(task: Task, drawn: TaskInstance, rng: np.random.Genera
 def legal(episode: Episode, stone: int) -> list[Intersection]:
     """Return the intersections where a stone of the tray may be put."""
     color = COLORS[int(episode.layout.stone_is_white[stone])]
-    cells = [cell for cell in ALL_TARGETS if is_legal_move(episode.opening, cell, color)]
-    return cells or list(ALL_TARGETS)
+    intersections = [
+        intersection for intersection in ALL_TARGETS if is_legal_move(episode.opening, intersection, color)
+    ]
+    return intersections or list(ALL_TARGETS)
 
 
 def answer_without_colours(episode: Episode, rng: np.random.Generator) -> tuple[int, Intersection | None]:
@@ -151,7 +153,7 @@ def answer_without_colours(episode: Episode, rng: np.random.Generator) -> tuple[
 
 def recoloured(opening: Stones, rng: np.random.Generator) -> dict[Intersection, str]:
     """The stones on the board in colours drawn at random."""
-    return {cell: COLORS[rng.integers(2)] for cell in opening}
+    return {intersection: COLORS[rng.integers(2)] for intersection in opening}
 
 
 if __name__ == "__main__":

@@ -1,4 +1,4 @@
-"""Episodes an hour of ``lerobot-bomb sweep`` against stock ``lerobot-eval`` on the same cells, in one run.
+"""Episodes an hour of ``lerobot-bomb sweep`` against stock ``lerobot-eval`` on the same jobs, in one run.
 
 The peer runs the manifest's own commands one after the other, and, in a second row, all conditions in one
 command with LeRobot's default of a process an environment. All must give the same records, or the benchmark
@@ -25,18 +25,18 @@ from lerobot_bomb.tables import print_table
 
 FLAGS = ("--env.type=bomb", "--env.image_size=64", "--policy.device=cpu")
 SEED = 1000
-EACH, TOGETHER = "lerobot-eval, a command a cell", "lerobot-eval, all conditions at once"
+EACH, TOGETHER = "lerobot-eval, a command a job", "lerobot-eval, all conditions at once"
 ONE, TWO = "sweep, 1 worker", "sweep, 2 workers"
 TARGETS = {ONE: (EACH, 1.5), TWO: (ONE, 1.7)}
 
 
 def main() -> None:
-    """Run the same cells in four ways, print episodes an hour and ratios."""
+    """Run the same jobs in four ways, print episodes an hour and ratios."""
     parser = make_parser(__doc__)
     add = parser.add_argument
     add("--policy", default="bomb:vla0_smol", help="checkpoint or type (default: bomb:vla0_smol)")
     add("--conditions", default="none,camera:3,light:3,table:3,start:3,language:3", help="joined by commas")
-    add("--episodes", type=positive, default=20, help="of each cell (default: 20)")
+    add("--episodes", type=positive, default=20, help="of each job (default: 20)")
     add("--batch_size", type=positive, default=10, help="default: 10")
     add_machine_arguments(parser)
     args = parser.parse_args()
@@ -45,20 +45,20 @@ def main() -> None:
     manifest = plan([args.policy], ["place"], conditions, SEED, args.episodes, args.batch_size, FLAGS)
 
     ways: dict[str, Callable[[Path], Path]] = {
-        EACH: lambda folder: play_each(manifest, folder),
-        TOGETHER: lambda folder: play_together(manifest, conditions, folder),
+        EACH: lambda folder: run_each(manifest, folder),
+        TOGETHER: lambda folder: run_together(manifest, conditions, folder),
         ONE: lambda folder: sweep(manifest, folder, 1),
         TWO: lambda folder: sweep(manifest, folder, 2),
     }
-    hourly, played = {}, {}
-    for name, play in ways.items():
+    hourly, records = {}, {}
+    for name, run_way in ways.items():
         with tempfile.TemporaryDirectory() as folder:
             started = time.perf_counter()
-            results = play(Path(folder))
+            results = run_way(Path(folder))
             hourly[name] = 3600 * manifest.num_episodes / (time.perf_counter() - started)
-            played[name] = comparable(read_results(results))
-        if name != TOGETHER and played[name] != played[EACH]:  # its batches are of another kind
-            raise SystemExit(f"{name} gives other lines than {EACH}")
+            records[name] = comparable(read_results(results))
+        if name != TOGETHER and records[name] != records[EACH]:  # its batches are of another kind
+            raise SystemExit(f"{name} gives other records than {EACH}")
 
     title = f"{args.policy}, {len(conditions)} conditions of {args.episodes} episodes"
     rows = [[name, f"{value:.0f}", f"{value / hourly[EACH]:.2f}"] for name, value in hourly.items()]
@@ -69,22 +69,22 @@ def main() -> None:
     write_figures(args.json, {"episodes_an_hour": hourly})
 
 
-def play_each(manifest: Manifest, folder: Path) -> Path:
-    """Run the command of every cell; the file of results."""
+def run_each(manifest: Manifest, folder: Path) -> Path:
+    """Run the command of every job; the file of results."""
     results = folder / "results.jsonl"
-    for number, cell in enumerate(manifest.cells):
+    for number, job in enumerate(manifest.jobs):
         run(
             "lerobot-eval",
-            [*cell.flags, f"--env.results_path={results}", f"--output_dir={folder / str(number)}"],
+            [*job.flags, f"--env.results_path={results}", f"--output_dir={folder / str(number)}"],
         )
     return results
 
 
-def play_together(manifest: Manifest, conditions: Sequence[str], folder: Path) -> Path:
+def run_together(manifest: Manifest, conditions: Sequence[str], folder: Path) -> Path:
     """Run one command with all conditions."""
-    results, cell = folder / "results.jsonl", manifest.cells[0]
+    results, job = folder / "results.jsonl", manifest.jobs[0]
     replaced = ("--env.perturbations=", "--eval.use_async_envs=")
-    flags = [flag for flag in cell.flags if not flag.startswith(replaced)]
+    flags = [flag for flag in job.flags if not flag.startswith(replaced)]
     flags += [f"--env.perturbations={json.dumps(conditions)}", f"--env.results_path={results}"]
     run("lerobot-eval", [*flags, f"--output_dir={folder / 'eval'}"])
     return results

@@ -1,4 +1,4 @@
-"""Intervals of means over episodes, and of what levels do to them, by drawing episodes with replacement.
+"""Bootstrap intervals over episodes, of means and of their slopes over levels.
 
 The draws are always the same. Shapes: `R` frames, `E` episodes, `N` values, `M` sums of each episode.
 """
@@ -18,7 +18,7 @@ ROUNDING = 1e-9  # that makes no two numbers different
 
 
 def sums_by(values_N: np.ndarray, episode_N: Sequence[Hashable]) -> tuple[np.ndarray, np.ndarray]:
-    """(sums_E, counts_E) of values by what tells their episodes apart."""
+    """(sums_E, counts_E) of values, by episode."""
     places: dict[Hashable, int] = {}
     place_N = [places.setdefault(episode, len(places)) for episode in episode_N]
     return np.bincount(place_N, weights=values_N), np.bincount(place_N).astype(float)
@@ -27,7 +27,7 @@ def sums_by(values_N: np.ndarray, episode_N: Sequence[Hashable]) -> tuple[np.nda
 def bootstrap_interval(sums_E: np.ndarray, counts_E: np.ndarray) -> tuple[float, float] | None:
     """95 % percentile bootstrap interval of sum / count over E episodes.
 
-    None for fewer than two, and where all are equal: resampling tells nothing of them. Episodes are drawn,
+    None for fewer than two, and if all are equal: resampling tells nothing about them. Episodes are drawn,
     not frames: the frames of one resemble each other.
     """
     if _is_constant(sums_E, counts_E):
@@ -68,13 +68,13 @@ def bca_interval(sums_E: np.ndarray, counts_E: np.ndarray) -> tuple[float, float
 
 
 def format_bounds(interval: tuple[float, float] | None, form: str) -> str:
-    """' [low, high]', each in this form; nothing where there is no interval."""
+    """' [low, high]' in this number format; '' without an interval."""
     return "" if interval is None else f" [{interval[0]:{form}}, {interval[1]:{form}}]"
 
 
 @dataclass(frozen=True)
 class Slope:
-    """Least-squares slope of a value over levels; there is no 95 % interval where all resamples agree."""
+    """Least-squares slope of a value over levels, with its 95 % interval unless all resamples agree."""
 
     per_level: float
     low: float | None
@@ -111,7 +111,7 @@ def variance_share(values_N: np.ndarray, levels_N: np.ndarray) -> float | None:
     """Share of the values' variance that the level alone explains: its first-order sensitivity index.
 
     Corrected for the number of levels, so that it is 0 on average where the level has no effect, and can be
-    negative. None where it is not defined: all values or all levels are the same.
+    negative. None if it is undefined: all values or all levels are the same.
     Source: epsilon squared, Kelley (1935), "An unbiased correlation ratio measure".
     """
     total = float(((values_N - values_N.mean()) ** 2).sum())
@@ -150,12 +150,12 @@ def measure(values_RX: np.ndarray, episode_R: np.ndarray) -> Measure:
 
 
 def _is_constant(sums_E: np.ndarray, counts_E: np.ndarray) -> bool:
-    """Return whether there are fewer than two episodes, or all have one mean."""
+    """Return True if there are fewer than two episodes, or all have one mean."""
     return len(sums_E) < 2 or _are_equal(sums_E / counts_E)
 
 
 def _are_equal(values: np.ndarray) -> bool:
-    """Return whether all are equal but for rounding: resampling them tells nothing."""
+    """Return True if all are equal up to rounding: resampling them tells nothing."""
     return bool(np.ptp(values) <= ROUNDING * np.abs(values).max())
 
 
@@ -182,7 +182,7 @@ def _resampled_sums(values_EM: np.ndarray, number: int) -> np.ndarray:
 
 
 def _percentiles(means: np.ndarray) -> tuple[float, float] | None:
-    """2.5th and 97.5th percentile; None where all are the same, or there is none."""
+    """2.5th and 97.5th percentile; None if all are the same, or there is none."""
     if not len(means) or _are_equal(means):
         return None
     low, high = np.percentile(means, [2.5, 97.5])

@@ -48,7 +48,7 @@ def magnitude_of(axes: Mapping[str, Axis], axis: str, name: str, level: int) -> 
 
 
 def nuisances_of(axes: Registry[Axis]) -> tuple[str, ...]:
-    """Return the axes that `all` stands for: every own one that does not help, whatever others have added."""
+    """Return the axes that `all` stands for: all of this package except those that help."""
     return tuple(name for name in axes.own if not axes[name].is_help)
 
 

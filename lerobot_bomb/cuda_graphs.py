@@ -19,9 +19,9 @@ class _Captured:
 class GraphedFunction:
     """A function of tensors that is captured once for each set of their shapes and types.
 
-    It must be the same work every time: no look at a value, no random number, and what it reads besides its
-    arguments stays where it is. What is returned is written over by the next call of the same shapes. Tensors
-    on other devices than CUDA are given to the function itself. A copy has captured nothing.
+    It must do the same work every time: no branch on a value, no random number, and all else that it reads
+    stays at its address. What is returned is written over by the next call of the same shapes. Tensors on
+    other devices than CUDA are given to the function itself. A copy has captured nothing.
     """
 
     def __init__(self, function: Callable[..., tuple[Tensor, ...]]):
@@ -94,7 +94,7 @@ class GraphedModel:
 
 
 class _Call(nn.Module):
-    """A function as a module of what it reads."""
+    """Wraps a function as a module that holds the modules it reads."""
 
     def __init__(self, function: Callable[..., tuple[Tensor, ...]], modules: Iterable[nn.Module]):
         super().__init__()

@@ -1,4 +1,4 @@
-"""Environments: the env types of LeRobot's of which the tools know more than success and rewards."""
+"""Environments: LeRobot's env types of which the tools know more than success and rewards."""
 
 from collections.abc import Iterable
 from dataclasses import dataclass

@@ -51,7 +51,7 @@ def _check_depth(values: Any, levels: int) -> None:
 
 
 def file_names(texts: Sequence[str]) -> list[str]:
-    """A file's name for each text, of letters, digits, '_', '-' and '.'; no two are the same, in any case.
+    """Return a different file name for each text, of letters, digits, '_', '-' and '.', whatever the case.
 
     None begins with a '.', so that none is hidden, or stands for the folder or the one above.
     """
@@ -80,9 +80,9 @@ def check_new_folder(flag: str, path: Path) -> None:
 
 @contextmanager
 def written_whole(*paths: Path) -> Iterator[list[Path]]:
-    """Give paths to write to; when nothing was raised, what lies there gets the names `paths`.
+    """Yield paths to write to; if nothing is raised, the files get the names `paths`.
 
-    All lie in one folder, which is made. What a kill leaves is in a hidden folder there.
+    All lie in one folder, which is created. What a kill leaves is in a hidden folder there.
 
     Raises:
         OSError: of a full disk, with the way out; what lay at these paths before is still there.

@@ -6,7 +6,7 @@ from pathlib import Path
 
 
 def check_link(flag: str, path: Path) -> None:
-    """Raise a ValueError if what a flag names as new is a link that leads nowhere."""
+    """Raise a ValueError if the new path of a flag is a broken link."""
     if path.is_symlink() and not path.exists():
         raise ValueError(f"{flag}={path} is a link to {path.readlink()}, which does not exist; remove it")
 

@@ -233,7 +233,7 @@ def _power(n: int, counts: PairedCounts, level: float) -> float:
 
 
 def holm(p_values: Sequence[float]) -> list[float]:
-    """P-values adjusted for as many tests (Holm, 1979): that of a family of which none may err at 5 %."""
+    """Adjust the p-values of a family of tests, so that it errs in 5 % of cases at most (Holm, 1979)."""
     order = sorted(range(len(p_values)), key=p_values.__getitem__)
     adjusted, largest = [0.0] * len(p_values), 0.0
     for place, i in enumerate(order):

@@ -26,7 +26,7 @@ def pusht_env(condition: str = "none", **kwargs: Any) -> Any:
     return BombPushTEnv(PushTSpec(0, perturbations=condition, **of_spec), **kwargs)
 
 
-def play(env: Any, seed: int, num: int) -> list[dict[str, np.ndarray]]:
+def run(env: Any, seed: int, num: int) -> list[dict[str, np.ndarray]]:
     """Pictures, poses and rewards of an episode of `num` steps, which an episode's seed determines."""
     observation, info = env.reset(seed=seed)
     actions = pushing_actions(seed, info["block_pose"][:2], num)
@@ -49,7 +49,7 @@ def seen(observation: dict[str, np.ndarray], info: dict[str, Any], reward: float
 
 
 def pusht_row(seed: int, condition: str, max_coverage: float, failure: str | None) -> dict[str, Any]:
-    """A line of results, read back."""
+    """A record, read back."""
     result = PushTResult(
         spec=PushTSpec(seed, "none", perturbations=condition),
         instruction="",

@@ -12,7 +12,7 @@ import pytest
 from lerobot_bomb.bomb.episode import EpisodeSpec
 from lerobot_bomb.bomb.observation import RenderOptions
 from lerobot_bomb.checkpoints.shipped import checkpoint_path, shipped_names
-from lerobot_bomb.envs.rollout import expert_agent, make_env, play
+from lerobot_bomb.envs.rollout import expert_agent, make_env, run_episode
 from lerobot_bomb.explain.images import filling
 from lerobot_bomb.explain.moment import Query
 from lerobot_bomb.explain.other_policies import scored
@@ -48,7 +48,7 @@ def scored_by(policy: LoadedPolicy) -> ScoredPolicy:
 def moment() -> tuple[dict[str, Any], str, dict[str, dict[str, Any]], dict[str, Any]]:
     """An observation, its instruction, the masks of its objects, the other instructions."""
     with closing(make_env(SPEC, OPTIONS)) as env:
-        for each in play(env, SPEC, expert_agent()):
+        for each in run_episode(env, SPEC, expert_agent()):
             goal = each.state.goals[0]
             distance_m = np.linalg.norm(each.state.stone_xyz[goal.stone][:2] - goal.xyz[:2])
             if each.info["stage"] == "lifted" and distance_m > FAR_M:

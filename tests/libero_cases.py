@@ -15,7 +15,7 @@ CAMERAS = ("agentview_rgb", "eye_in_hand_rgb")
 
 
 @dataclass(frozen=True)
-class Played:
+class Demonstration:
     """An episode of T actions as a simulator saw it: before each action, and after the last."""
 
     images: tuple[np.ndarray, np.ndarray]  # each (T + 1, H, W, 3), as OpenGL gives them
@@ -26,7 +26,7 @@ class Played:
     simulator: np.ndarray | None = None  # (T + 1, n) states; None: of the time, joints and fingers only
 
     @classmethod
-    def drawn(cls, seed: int, num_actions: int = 6) -> "Played":
+    def drawn(cls, seed: int, num_actions: int = 6) -> "Demonstration":
         """An arm that wanders and closes its gripper half way."""
         rng = np.random.default_rng(seed)
         actions = rng.uniform(-1, 1, (num_actions, 7))
@@ -63,7 +63,7 @@ AFTER, BEFORE = slice(1, None), slice(None, -1)
 
 
 def write_file(
-    path: Path, played: list[Played], observed: slice = AFTER, task: str = TASK, **attrs: str
+    path: Path, demonstrations: list[Demonstration], observed: slice = AFTER, task: str = TASK, **attrs: str
 ) -> Path:
     """TASK_demo.hdf5 with the published attributes; observed before and without, as OpenVLA's copies are."""
     import h5py
@@ -71,7 +71,7 @@ def write_file(
     path.parent.mkdir(parents=True, exist_ok=True)
     with h5py.File(path, "w") as file:
         data = file.create_group("data")
-        for number, episode in enumerate(played):
+        for number, episode in enumerate(demonstrations):
             episode.write(data.create_group(f"demo_{number}"), observed)
         if observed is AFTER:
             data.attrs["bddl_file_name"] = f"libero/libero/bddl_files/{SUITE}/{task}.bddl"

@@ -32,7 +32,7 @@ MAX_LEARNING_STEPS, CHECK_EVERY = 400, 20
 
 type Finish = Callable[[PreTrainedPolicy, dict[int, Batch]], None]
 # (rollout of a replay, seed) -> (what the rollout returned, the episode's batches by index in the dataset)
-type Play = Callable[[Callable[[Any], dict], int], tuple[dict, dict[int, Batch]]]
+type RunEpisode = Callable[[Callable[[Any], dict], int], tuple[dict, dict[int, Batch]]]
 
 
 @dataclass(frozen=True)
@@ -176,7 +176,7 @@ def run_train(recorded: Recorded, output_dir: Path, flags: list[str], finish: Fi
 
 
 class Replay(nn.Module):
-    """Stands in for a policy: notes the batches and plays recorded actions."""
+    """Stands in for a policy: notes the batches and runs recorded actions."""
 
     def __init__(self, actions: np.ndarray) -> None:
         super().__init__()
@@ -194,7 +194,7 @@ class Replay(nn.Module):
 def run_eval(recorded: Recorded, output_dir: Path, checkpoint: Path) -> Route:
     """lerobot-eval on the recorded seeds."""
 
-    def play(rollout: Callable[[Any], dict], seed: int) -> tuple[dict, dict[int, Batch]]:
+    def run(rollout: Callable[[Any], dict], seed: int) -> tuple[dict, dict[int, Batch]]:
         start, end = recorded.bounds[seed - SEED : seed - SEED + 2]
         replay = Replay(recorded.actions[start:end])
         result = rollout(replay)
@@ -203,11 +203,11 @@ def run_eval(recorded: Recorded, output_dir: Path, checkpoint: Path) -> Route:
 
     flags = f"--env.type=bomb --env.image_size={SIZE} --seed={SEED} --eval.n_episodes={EPISODES}"
     flags += f" --env.control_mode={recorded.control_mode}"
-    return tap_eval(checkpoint, output_dir, flags, play)
+    return tap_eval(checkpoint, output_dir, flags, run)
 
 
-def tap_eval(checkpoint: Path, output_dir: Path, flags: str, play: Play) -> Route:
-    """lerobot-eval, an episode at a time; `play` gets its rollout, in which a replay replaces the policy."""
+def tap_eval(checkpoint: Path, output_dir: Path, flags: str, run: RunEpisode) -> Route:
+    """lerobot-eval, an episode at a time; `run` gets its rollout, in which a replay replaces the policy."""
     route = Route()
     rollout = lerobot_eval.rollout
 
@@ -226,7 +226,7 @@ def tap_eval(checkpoint: Path, output_dir: Path, flags: str, play: Play) -> Rout
             return rollout(env, replay, env_preprocessor, env_postprocessor, preprocessor, as_recorded, seeds)
 
         route.policy, route.postprocessor = policy, postprocessor
-        result, batches = play(of, seeds[0])
+        result, batches = run(of, seeds[0])
         route.batches |= batches
         return result
 

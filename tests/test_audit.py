@@ -120,7 +120,7 @@ def test_seeds_of_the_training_are_found(arms: dict[str, Records]) -> None:
     ("flags", "message"),
     [
         (["--episodes=1"], "--episodes=1 must be at least 2"),
-        (["--eval.n_episodes=3"], "--eval.n_episodes is set for every cell"),
+        (["--eval.n_episodes=3"], "--eval.n_episodes is set for every job"),
     ],
 )
 def test_wrong_flags_are_told(

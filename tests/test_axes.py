@@ -218,17 +218,18 @@ def test_more_stones_keep_the_opening_and_the_move_legal(seed: int, level: int) 
     before, after = nominal.layout, drawn.layout
     assert after.stone_in_play.sum() == before.stone_in_play.sum() + len(stones.extra)
     on_board = np.flatnonzero(after.stone_in_play)[1:]
-    cells = [BOARD.nearest_intersection(after.stone_xy[i]) for i in on_board]
+    intersections = [BOARD.nearest_intersection(after.stone_xy[i]) for i in on_board]
     colors = ["white" if after.stone_is_white[i] else "black" for i in on_board]
-    position = dict(zip(cells, colors, strict=True))
-    assert len(position) == len(cells) and is_legal_position(position)
+    position = dict(zip(intersections, colors, strict=True))
+    assert len(position) == len(intersections) and is_legal_position(position)
     assert drawn.allows(position)
     offsets = [
-        after.stone_xy[i] - BOARD.intersection_xy(*cell) for i, cell in zip(on_board, cells, strict=True)
+        after.stone_xy[i] - BOARD.intersection_xy(*intersection)
+        for i, intersection in zip(on_board, intersections, strict=True)
     ]
     np.testing.assert_allclose(np.linalg.norm(offsets, axis=1), stones.shift_m)
     kept = np.flatnonzero(before.stone_in_play)[1:]
-    assert [BOARD.nearest_intersection(before.stone_xy[i]) for i in kept] == cells[: len(kept)]
+    assert [BOARD.nearest_intersection(before.stone_xy[i]) for i in kept] == intersections[: len(kept)]
 
 
 @pytest.mark.parametrize("seed", range(4))

@@ -208,8 +208,8 @@ def test_the_board_of_an_opening_is_read(suite: str) -> None:
     env.close()
     opening = find_suite(suite).sample(spec).opening
     expected = np.zeros((5, 5), int)
-    for cell, color in opening.items():
-        expected[cell] = {"black": 1, "white": 2}[color]
+    for intersection, color in opening.items():
+        expected[intersection] = {"black": 1, "white": 2}[color]
     read = colors_on_spots(PrivilegedState.from_vector(observation["environment_state"]))
     assert opening and read[:25].reshape(5, 5).tolist() == expected.tolist()
 

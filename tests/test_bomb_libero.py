@@ -1,4 +1,4 @@
-"""`bomb_libero` without a simulator: flags, words, lines of results."""
+"""`bomb_libero` without a simulator: flags, words, records."""
 
 import json
 import re

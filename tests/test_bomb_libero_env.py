@@ -1,6 +1,6 @@
 """`bomb_libero` in its simulator: level 0 is LeRobot's `libero`, and each axis changes only what it names.
 
-Needs hf-libero and its assets of one suite; skips without. One environment plays every condition, since
+Needs hf-libero and its assets of one suite; skips without. One environment runs every condition, since
 building one takes seconds.
 """
 

@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 import pytest
 import yaml
-from bomb_pusht_cases import play, pushing_actions, pusht_env
+from bomb_pusht_cases import pushing_actions, pusht_env, run
 from lerobot.envs import env_to_policy_features, make_env, make_env_config
 from lerobot.envs.utils import preprocess_observation
 
@@ -127,8 +127,8 @@ def test_the_same_bits_in_one_after_the_other_in_sync_and_async_and_in_another_p
         envs.close()
     assert all(digest == digests[0] for digest in digests[1:])
     code = (
-        "import hashlib, sys; sys.path.insert(0, 'tests'); from bomb_pusht_cases import play, pusht_env\n"
-        f"moments = play(pusht_env({CONDITION!r}), 3, 12)\n"
+        "import hashlib, sys; sys.path.insert(0, 'tests'); from bomb_pusht_cases import run, pusht_env\n"
+        f"moments = run(pusht_env({CONDITION!r}), 3, 12)\n"
         "print(hashlib.sha256(b''.join(v.tobytes() for m in moments for v in m.values())).hexdigest())"
     )
     here = subprocess.run(
@@ -138,7 +138,7 @@ def test_the_same_bits_in_one_after_the_other_in_sync_and_async_and_in_another_p
         check=True,
         cwd=Path(__file__).parents[1],
     ).stdout
-    moments = play(pusht_env(CONDITION), 3, 12)
+    moments = run(pusht_env(CONDITION), 3, 12)
     expected = hashlib.sha256(b"".join(v.tobytes() for m in moments for v in m.values())).hexdigest()
     assert here.strip() == expected
 
@@ -393,7 +393,7 @@ def _after_one_step() -> np.ndarray:
     return env.step(np.array([256, 256]))[0]["pixels"]
 
 
-def test_without_seeds_every_environment_plays_an_episode_of_its_own() -> None:
+def test_without_seeds_every_environment_runs_an_episode_of_its_own() -> None:
     envs = vector_envs(3)
     assert len({*envs.reset()[1]["seed"]}) == 3
     envs.close()

@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from bomb_pusht_cases import play, pusht_env
+from bomb_pusht_cases import pusht_env, run
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
@@ -39,7 +39,7 @@ def test_a_pair_differs_only_in_what_its_axis_names_and_in_that_it_does(
     seed: int, axis: str, level: int
 ) -> None:
     changes = PUSHT_AXES[axis].changes
-    nominal, perturbed = (play(pusht_env(condition), seed, 0)[0] for condition in ("none", f"{axis}:{level}"))
+    nominal, perturbed = (run(pusht_env(condition), seed, 0)[0] for condition in ("none", f"{axis}:{level}"))
     for name, change in NAMED.items():
         is_equal = np.array_equal(nominal[name], perturbed[name])
         assert is_equal == (change not in changes), name
@@ -51,7 +51,7 @@ def test_physics_and_reward_change_where_the_axis_says_so(axis: str) -> None:
     changes = PUSHT_AXES[axis].changes
     has_moved, has_other_reward = False, False
     for seed in range(4):
-        nominal, perturbed = play(pusht_env(), seed, 12), play(pusht_env(f"{axis}:5"), seed, 12)
+        nominal, perturbed = run(pusht_env(), seed, 12), run(pusht_env(f"{axis}:5"), seed, 12)
         for name in ("agent_pos", "block_pose"):
             has_moved |= any(
                 not np.array_equal(a[name], b[name]) for a, b in zip(nominal, perturbed, strict=True)

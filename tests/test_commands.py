@@ -23,7 +23,7 @@ from lerobot_bomb.bomb.privileged_state import PrivilegedState
 from lerobot_bomb.bomb.suite import Episode, find_suite, specs_of_tasks
 from lerobot_bomb.bomb.suites import goal as goal_suite
 from lerobot_bomb.bomb.suites import long as long_suite
-from lerobot_bomb.envs.rollout import Moment, expert_agent, make_env, play
+from lerobot_bomb.envs.rollout import Moment, expert_agent, make_env, run_episode
 from lerobot_bomb.results.bomb import EpisodeResult
 from lerobot_bomb.results.groups import read_results
 from lerobot_env_bomb.perturb import PerturbedEpisode, sample_episode
@@ -51,16 +51,18 @@ def board_at_start(episode: PerturbedEpisode) -> Board:
     return {BOARD.nearest_intersection(layout.stone_xy[i]): color_of(episode, int(i)) for i in on_board}
 
 
-def around(cell: Intersection) -> set[Intersection]:
-    row, column = cell
+def around(intersection: Intersection) -> set[Intersection]:
+    row, column = intersection
     return {(row + 1, column), (row - 1, column), (row, column + 1), (row, column - 1)} & set(INTERSECTIONS)
 
 
 def groups(board: Board) -> list[set[Intersection]]:
     found: list[set[Intersection]] = []
-    for cell, color in board.items():
-        touching = [g for g in found if board[next(iter(g))] == color and any(around(c) & {cell} for c in g)]
-        found = [g for g in found if g not in touching] + [{cell}.union(*touching)]
+    for intersection, color in board.items():
+        touching = [
+            g for g in found if board[next(iter(g))] == color and any(around(c) & {intersection} for c in g)
+        ]
+        found = [g for g in found if g not in touching] + [{intersection}.union(*touching)]
     return found
 
 
@@ -68,7 +70,7 @@ def liberties(board: Board, group: set[Intersection]) -> set[Intersection]:
     return set().union(*map(around, group)) - board.keys()
 
 
-def cells_in(text: str) -> list[Intersection]:
+def intersections_in(text: str) -> list[Intersection]:
     return [(int(r), int(c)) for r, c in re.findall(r"row (\d), column (\d)", text)]
 
 
@@ -77,23 +79,25 @@ def is_done(said: list[str], board: Board, pattern: Board, end: Board) -> bool:
     text = " ".join(said).lower()
     if "off the board" in text:
         if found := re.search(r"take the (black|white) stone", text):
-            (gone,) = [cell for cell, color in board.items() if color == found[1]]
+            (gone,) = [intersection for intersection, color in board.items() if color == found[1]]
         else:
-            (gone,) = cells_in(text)
-        return end == {cell: color for cell, color in board.items() if cell != gone}
+            (gone,) = intersections_in(text)
+        return end == {intersection: color for intersection, color in board.items() if intersection != gone}
     if "swap" in text:
-        a, b = cells_in(text)
+        a, b = intersections_in(text)
         assert re.findall(r"the (black|white) stone", text) == [board[a], board[b]]
         return end == board | {a: board[b], b: board[a]}
     if found := re.search(r"push the (black|white) stone one intersection (?:to|towards) the (\w+)", text):
-        (place,) = cells_in(text)
-        (cell,) = [cell for cell, color in board.items() if color == found[1]]
+        (place,) = intersections_in(text)
+        (intersection,) = [intersection for intersection, color in board.items() if color == found[1]]
         step = {"left": (0, -1), "right": (0, 1), "far": (-1, 0), "near": (1, 0)}[found[2]]
-        others = {other: color for other, color in board.items() if other != cell}
-        assert place == (cell[0] + step[0], cell[1] + step[1])
+        others = {other: color for other, color in board.items() if other != intersection}
+        assert place == (intersection[0] + step[0], intersection[1] + step[1])
         return end == others | {place: found[1]}
     if found := re.search(r"clear row (\d)", text):
-        return end == {cell: color for cell, color in board.items() if cell[0] != int(found[1])}
+        return end == {
+            intersection: color for intersection, color in board.items() if intersection[0] != int(found[1])
+        }
     if found := re.search(r"bring all (black|white) stones to the left side", text):
         kept = {c: color for c, color in board.items() if color != found[1] or c[1] <= 1}
         moved = {c: color for c, color in end.items() if c not in kept}
@@ -110,13 +114,21 @@ def is_done(said: list[str], board: Board, pattern: Board, end: Board) -> bool:
         assert f"play {by} there" in text
         return end == {c: color for c, color in board.items() if c not in group} | {point: by}
     if "take back" in text:
-        return end == {cell: color for cell, color in board.items() if cell not in cells_in(text)}
+        return end == {
+            intersection: color
+            for intersection, color in board.items()
+            if intersection not in intersections_in(text)
+        }
     if "copy the pattern" in text:
         return end == board | pattern
     if found := re.search(r"fill the free intersections of row (\d).*(black|white) last", text):
-        free = [cell for cell in INTERSECTIONS if cell[0] == int(found[1]) and cell not in board]
+        free = [
+            intersection
+            for intersection in INTERSECTIONS
+            if intersection[0] == int(found[1]) and intersection not in board
+        ]
         colors = [found[2], "white" if found[2] == "black" else "black"]
-        return end == board | {cell: colors[i % 2] for i, cell in enumerate(reversed(free))}
+        return end == board | {intersection: colors[i % 2] for i, intersection in enumerate(reversed(free))}
     moves = re.findall(r"(black|white) at row (\d), column (\d)", text)
     assert moves, text
     return end == board | {(int(r), int(c)): color for color, r, c in moves}
@@ -219,13 +231,13 @@ def test_target_and_colour_are_refused(suite: str, option: dict[str, Any]) -> No
 # What the judge says
 
 
-def played(
+def moments_of(
     spec: EpisodeSpec, act: Callable[[PrivilegedState, int], np.ndarray] | None = None
 ) -> Iterator[Moment]:
     env = make_env(spec, SMALL)
     count = iter(range(10_000))
     agent = expert_agent() if act is None else expert_agent(lambda state: act(state, next(count)))
-    yield from play(env, spec, agent)
+    yield from run_episode(env, spec, agent)
     env.close()
 
 
@@ -233,7 +245,7 @@ def played(
     ("suite", "task_id"), [(suite, number) for suite, tasks in TASKS.items() for number in range(len(tasks))]
 )
 def test_the_expert_does_every_task_without_an_idle_step(suite: str, task_id: int) -> None:
-    *moments, last = played(EpisodeSpec(task_id, suite, task_id=task_id))
+    *moments, last = moments_of(EpisodeSpec(task_id, suite, task_id=task_id))
     assert last.info["is_success"] and last.info["progress"] == 1
     assert last.info["collateral_mm"] < 1
     assert last.step <= find_suite(suite).max_steps / 2
@@ -261,7 +273,7 @@ def test_moves_that_have_no_order_may_be_made_in_any() -> None:
         goals = state.goals[1::-1]
         return expert_action(replace(state, goals=goals + goals[-1:] * (num_goals - 2)))
 
-    *_, last = played(spec, act)
+    *_, last = moments_of(spec, act)
     assert last.info["is_success"]
 
 
@@ -274,7 +286,10 @@ def test_either_stone_of_a_swap_may_go_aside() -> None:
     def act(state: PrivilegedState, step: int) -> np.ndarray:
         aside, second_there, first_there = state.goals
         height = aside.xyz[2]
-        places = {stone: np.array([*BOARD.intersection_xy(*cell), height]) for stone, cell in xy.items()}
+        places = {
+            stone: np.array([*BOARD.intersection_xy(*intersection), height])
+            for stone, intersection in xy.items()
+        }
         goals = (
             replace(aside, stone=second),
             replace(second_there, stone=first, xyz=places[second]),
@@ -282,12 +297,12 @@ def test_either_stone_of_a_swap_may_go_aside() -> None:
         )
         return expert_action(replace(state, goals=goals))
 
-    *_, last = played(spec, act)
+    *_, last = moments_of(spec, act)
     assert last.info["is_success"]
 
 
 def test_moves_in_the_wrong_order_fail() -> None:
-    *_, last = played(EpisodeSpec(0, "long", task_id=OPENING_OF_4), in_another_order)
+    *_, last = moments_of(EpisodeSpec(0, "long", task_id=OPENING_OF_4), in_another_order)
     assert not last.info["is_success"]
     assert last.info["failure"] in ("wrong_stone", "wrong_intersection")
 
@@ -296,7 +311,7 @@ def test_a_stone_that_is_to_be_pushed_must_not_be_lifted() -> None:
     def act(state: PrivilegedState, step: int) -> np.ndarray:
         return expert_action(replace(state, goals=tuple(replace(g, is_slid=False) for g in state.goals)))
 
-    *_, last = played(EpisodeSpec(0, "goal", task_id=PUSH_LEFT), act)
+    *_, last = moments_of(EpisodeSpec(0, "goal", task_id=PUSH_LEFT), act)
     assert last.info["failure"] == "lifted"
 
 
@@ -311,7 +326,7 @@ def test_any_stone_of_the_colour_will_do() -> None:
             replace(state, goals=tuple(replace(g, stone=other.get(g.stone, g.stone)) for g in state.goals))
         )
 
-    *_, last = played(spec, act)
+    *_, last = moments_of(spec, act)
     assert last.info["is_success"] and len(same) == 2
 
 
@@ -327,7 +342,7 @@ def test_a_stone_that_was_put_down_must_not_be_taken_again() -> None:
         goals = (beside,) * len(state.goals) if len(is_down) > 8 else (first,) * len(state.goals)
         return expert_action(replace(state, goals=goals))
 
-    *_, last = played(EpisodeSpec(0, "long", task_id=COPY_2), act)
+    *_, last = moments_of(EpisodeSpec(0, "long", task_id=COPY_2), act)
     assert (last.info["progress"], last.info["failure"]) == (0.5, "wrong_stone")
 
 
@@ -339,7 +354,7 @@ def test_each_turn_is_said_when_the_move_before_it_has_been_made() -> None:
     episode = sample_episode(spec)
     said = [turn.instruction for turn in episode.turns]
     assert len(set(said)) == 4
-    for moment in played(spec):
+    for moment in moments_of(spec):
         made = round(moment.info["progress"] * 4)
         assert moment.instruction == said[min(made, 3)]
 

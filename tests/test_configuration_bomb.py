@@ -131,7 +131,7 @@ def test_an_unwritable_results_folder_is_refused(tmp_path: Path) -> None:
 @pytest.mark.parametrize("env_type", ["bomb", "bomb_pusht", "bomb_libero"])
 def test_tasks_in_threads_are_refused_at_once(env_type: str) -> None:
     register_third_party_plugins()
-    with pytest.raises(FlagError, match=r"--env\.max_parallel_tasks=3 plays tasks in threads") as error:
+    with pytest.raises(FlagError, match=r"--env\.max_parallel_tasks=3 runs tasks in threads") as error:
         make_env_config(env_type, max_parallel_tasks=3)
     assert "drop it" in str(error.value) and "lerobot-bomb sweep --workers=3" in str(error.value)
     assert make_env_config(env_type, max_parallel_tasks=1).max_parallel_tasks == 1

@@ -119,7 +119,7 @@ def test_resume_refuses_another_source_and_another_flag(
         convert_pusht(tmp_path / "other.zarr", REPO_ID, pusht_dataset, resume=True)
     with pytest.raises(ValueError, match=r"differs in task='Push.' \(it has ''\)"):
         convert_pusht(pusht_zarr, REPO_ID, pusht_dataset, task="Push.", resume=True)
-    with pytest.raises(ValueError, match="there is no conversion to go on with"):
+    with pytest.raises(ValueError, match="there is no conversion to resume"):
         convert_pusht(pusht_zarr, REPO_ID, tmp_path / "x", resume=True)
 
 

@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 import pytest
 from lerobot.datasets import LeRobotDataset
-from libero_cases import BEFORE, INSTRUCTION, REPO_ID, SUITE, TASK, Played, write_file
+from libero_cases import BEFORE, INSTRUCTION, REPO_ID, SUITE, TASK, Demonstration, write_file
 
 from lerobot_bomb.checkpoints.libero_orientation import images_of_task
 from lerobot_bomb.commands import main as cli
@@ -25,13 +25,13 @@ pytest.importorskip("h5py")
 
 
 @pytest.fixture(scope="module")
-def played() -> list[Played]:
-    return [Played.drawn(seed, num_actions=6 + seed) for seed in range(3)]
+def demonstrations() -> list[Demonstration]:
+    return [Demonstration.drawn(seed, num_actions=6 + seed) for seed in range(3)]
 
 
 @pytest.fixture(scope="module")
-def source(played: list[Played], tmp_path_factory: pytest.TempPathFactory) -> Path:
-    return write_file(tmp_path_factory.mktemp("source") / f"{TASK}_demo.hdf5", played)
+def source(demonstrations: list[Demonstration], tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return write_file(tmp_path_factory.mktemp("source") / f"{TASK}_demo.hdf5", demonstrations)
 
 
 @pytest.fixture(scope="module")
@@ -55,9 +55,11 @@ def pixels(row: Any) -> list[np.ndarray]:
     return [np.asarray(row[key]) for key in KEYS]
 
 
-def test_every_action_stands_beside_the_observation_before_it(converted: Path, played: list[Played]) -> None:
+def test_every_action_stands_beside_the_observation_before_it(
+    converted: Path, demonstrations: list[Demonstration]
+) -> None:
     rows = iter(rows_of(converted))
-    for number, episode in enumerate(played):
+    for number, episode in enumerate(demonstrations):
         # the published files hold no observation of before the first action
         for moment in range(1, len(episode.actions)):
             row = next(rows)
@@ -101,17 +103,17 @@ def test_a_dataset_says_how_its_policies_are_evaluated_and_where_an_episode_is_f
     assert dataset.meta.episodes["libero/demo"] == ["demo_0", "demo_1", "demo_2"]
 
 
-def test_videos_are_the_default(source: Path, played: list[Played], tmp_path: Path) -> None:
+def test_videos_are_the_default(source: Path, demonstrations: list[Demonstration], tmp_path: Path) -> None:
     assert convert_libero(source, REPO_ID, tmp_path / "x").num_frames == 5 + 6 + 7
     dataset: Any = LeRobotDataset(REPO_ID, root=tmp_path / "x", video_backend="pyav")
     image = dataset[2][KEYS[0]].numpy().transpose(1, 2, 0) * 255
-    assert np.abs(image - np.rot90(played[0].images[0][3], 2)).mean() < 10
-    assert np.abs(image - played[0].images[0][3]).mean() > 50
+    assert np.abs(image - np.rot90(demonstrations[0].images[0][3], 2)).mean() < 10
+    assert np.abs(image - demonstrations[0].images[0][3]).mean() > 50
 
 
-def test_a_folder_is_converted_file_by_file(played: list[Played], tmp_path: Path) -> None:
+def test_a_folder_is_converted_file_by_file(demonstrations: list[Demonstration], tmp_path: Path) -> None:
     names = ("b_task", "KITCHEN_SCENE3_a_task")
-    for name, episode in zip(names, played, strict=False):
+    for name, episode in zip(names, demonstrations, strict=False):
         write_file(tmp_path / "suite" / f"{name}_demo.hdf5", [episode], task=name)
     assert convert_libero(tmp_path / "suite", REPO_ID, tmp_path / "x", images=True).num_episodes == 2
     dataset: Any = LeRobotDataset(REPO_ID, root=tmp_path / "x", video_backend="pyav")
@@ -119,21 +121,25 @@ def test_a_folder_is_converted_file_by_file(played: list[Played], tmp_path: Path
 
 
 def test_demonstrations_are_in_the_order_of_their_numbers(tmp_path: Path) -> None:
-    episodes = [Played.drawn(seed, num_actions=2) for seed in range(11)]
+    episodes = [Demonstration.drawn(seed, num_actions=2) for seed in range(11)]
     write_file(tmp_path / "task_demo.hdf5", episodes)
     convert_libero(tmp_path / "task_demo.hdf5", REPO_ID, tmp_path / "x", images=True)
     actions = np.array([row["action"] for row in rows_of(tmp_path / "x")], np.float32)
     np.testing.assert_array_equal(actions, np.array([episode.actions[1] for episode in episodes], np.float32))
 
 
-def test_observations_of_before_the_actions_are_recognised(played: list[Played], tmp_path: Path) -> None:
+def test_observations_of_before_the_actions_are_recognised(
+    demonstrations: list[Demonstration], tmp_path: Path
+) -> None:
     """Check copies that were run again, such as OpenVLA's, which name neither task nor convention."""
-    file = write_file(tmp_path / f"{TASK}_demo.hdf5", played[:1], observed=BEFORE)
+    file = write_file(tmp_path / f"{TASK}_demo.hdf5", demonstrations[:1], observed=BEFORE)
     assert convert_libero(file, REPO_ID, tmp_path / "x", images=True).num_frames == 6
     rows = rows_of(tmp_path / "x")
     for moment, row in enumerate(rows):
-        np.testing.assert_array_equal(np.float32(row["action"]), np.float32(played[0].actions[moment]))
-        np.testing.assert_array_equal(pixels(row)[1], np.rot90(played[0].images[1][moment], 2))
+        np.testing.assert_array_equal(
+            np.float32(row["action"]), np.float32(demonstrations[0].actions[moment])
+        )
+        np.testing.assert_array_equal(pixels(row)[1], np.rot90(demonstrations[0].images[1][moment], 2))
     dataset: Any = LeRobotDataset(REPO_ID, root=tmp_path / "x", video_backend="pyav")
     assert dataset[0]["task"] == INSTRUCTION
     assert DatasetFacts.read(tmp_path / "x").eval_flags() == [
@@ -152,15 +158,19 @@ def stored_as(convention: str, image: np.ndarray) -> np.ndarray:
     [("opencv", "file"), ("opengl", "flag"), ("opencv", "flag"), ("lerobot", "flag")],
 )
 def test_images_end_in_one_orientation_however_they_were_stored(
-    convention: str, told_by: str, played: list[Played], tmp_path: Path
+    convention: str, told_by: str, demonstrations: list[Demonstration], tmp_path: Path
 ) -> None:
-    images = [np.stack([stored_as(convention, image) for image in camera]) for camera in played[0].images]
-    stored = replace(played[0], images=(images[0], images[1]))
+    images = [
+        np.stack([stored_as(convention, image) for image in camera]) for camera in demonstrations[0].images
+    ]
+    stored = replace(demonstrations[0], images=(images[0], images[1]))
     said = {"file": convention, "flag": "opencv" if convention == "opengl" else "opengl"}[told_by]
     file = write_file(tmp_path / f"{TASK}_demo.hdf5", [stored], macros_image_convention=said)
     flag = convention if told_by == "flag" else None
     convert_libero(file, REPO_ID, tmp_path / "x", images=True, image_convention=flag)
-    np.testing.assert_array_equal(pixels(rows_of(tmp_path / "x")[0])[0], np.rot90(played[0].images[0][1], 2))
+    np.testing.assert_array_equal(
+        pixels(rows_of(tmp_path / "x")[0])[0], np.rot90(demonstrations[0].images[0][1], 2)
+    )
 
 
 def test_noops_are_frames_in_which_nothing_is_told_to_move() -> None:
@@ -171,11 +181,11 @@ def test_noops_are_frames_in_which_nothing_is_told_to_move() -> None:
     assert noops(actions).tolist() == [True, True, True, False, True, False]
 
 
-def test_noops_are_kept_unless_the_flag_is_given(played: list[Played], tmp_path: Path) -> None:
-    actions = played[0].actions.copy()
+def test_noops_are_kept_unless_the_flag_is_given(demonstrations: list[Demonstration], tmp_path: Path) -> None:
+    actions = demonstrations[0].actions.copy()
     actions[2:4, :6] = 0
     actions[2:4, 6] = actions[1, 6]
-    file = write_file(tmp_path / f"{TASK}_demo.hdf5", [replace(played[0], actions=actions)])
+    file = write_file(tmp_path / f"{TASK}_demo.hdf5", [replace(demonstrations[0], actions=actions)])
     assert convert_libero(file, REPO_ID, tmp_path / "all", images=True).num_frames == 5
     assert convert_libero(file, REPO_ID, tmp_path / "x", images=True, skip_noops=True).num_frames == 3
     left = np.array([row["action"] for row in rows_of(tmp_path / "x")], np.float32)
@@ -220,9 +230,9 @@ def test_a_killed_conversion_resumes_to_the_same_bytes(
 
 
 def test_resume_refuses_another_source_and_other_flags(
-    source: Path, converted: Path, played: list[Played], tmp_path: Path
+    source: Path, converted: Path, demonstrations: list[Demonstration], tmp_path: Path
 ) -> None:
-    other = write_file(tmp_path / source.name, played[::-1])
+    other = write_file(tmp_path / source.name, demonstrations[::-1])
     with pytest.raises(
         ValueError, match=r"--resume: the conversion in .* differs in source='libero-hdf5 \w{64}' "
     ):
@@ -235,11 +245,11 @@ def test_resume_refuses_another_source_and_other_flags(
 
 
 def test_images_of_a_training_are_read_where_all_of_an_episode_is_here(
-    converted: Path, played: list[Played], tmp_path: Path
+    converted: Path, demonstrations: list[Demonstration], tmp_path: Path
 ) -> None:
     """A dataset that was streamed has its metadata here and no frames: then none are fetched."""
     images = images_of_task(converted, KEYS[0], INSTRUCTION)
-    frames = np.concatenate([episode.images[0][1:-1, ::-1, ::-1] for episode in played])
+    frames = np.concatenate([episode.images[0][1:-1, ::-1, ::-1] for episode in demonstrations])
     assert images is not None and len(images) <= len(frames)
     assert all((frames == image).all(axis=(1, 2, 3)).any() for image in images)
     assert images_of_task(converted, KEYS[0], "another task") is None

@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from libero_cases import REPO_ID, TASK, Played, write_file
+from libero_cases import REPO_ID, TASK, Demonstration, write_file
 
 from lerobot_bomb.commands import main as cli
 
@@ -18,8 +18,8 @@ pytest.importorskip("h5py")
 
 @pytest.fixture(scope="module")
 def source(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    played = [Played.drawn(seed) for seed in range(2)]
-    return write_file(tmp_path_factory.mktemp("source") / f"{TASK}_demo.hdf5", played)
+    demonstrations = [Demonstration.drawn(seed) for seed in range(2)]
+    return write_file(tmp_path_factory.mktemp("source") / f"{TASK}_demo.hdf5", demonstrations)
 
 
 def change(edit: Callable[[Any], object]) -> Callable[[Path], None]:

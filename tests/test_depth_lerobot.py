@@ -31,13 +31,13 @@ def rollouts() -> list[Rollout]:
     """Run the episodes that the recordings hold, directly."""
     spec = EpisodeSpec(seed=SEED)
     env = make_env(spec, OPTIONS)
-    played = [
+    rollouts = [
         collect(env, EpisodeSpec(seed=seed), RolloutSettings(OPTIONS))
         for seed in range(SEED, SEED + EPISODES)
     ]
     env.close()
-    assert all(rollout.result.is_success and rollout.geometry.keys() == KEYS for rollout in played)
-    return played
+    assert all(rollout.result.is_success and rollout.geometry.keys() == KEYS for rollout in rollouts)
+    return rollouts
 
 
 @pytest.fixture(scope="module", params=["--images=false", "--images=true"])

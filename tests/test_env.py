@@ -187,7 +187,7 @@ def test_resets_without_a_seed_play_fresh_episodes_that_a_seeded_one_reproduces(
 
 
 @pytest.mark.parametrize("vectorization_mode", ["sync", "async"])
-def test_gymnasiums_vector_environment_without_a_seed_plays_episodes_of_its_own(
+def test_gymnasiums_vector_environment_without_a_seed_runs_episodes_of_its_own(
     vectorization_mode: str,
 ) -> None:
     own: dict = {"context": "forkserver"} if vectorization_mode == "async" else {}

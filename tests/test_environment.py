@@ -160,41 +160,41 @@ def test_a_suite_that_it_was_not_trained_for_is_another_environment(trained: str
         rf"with task={re.escape(trained)}; this one has task={here}: evaluate with --env\.task=[og]\w+, or"
     )
     with pytest.raises(ValueError, match=message):
-        replace(ABSOLUTE, task=trained).check_same(replace(ABSOLUTE, task=here), "this act", "insist")
+        replace(ABSOLUTE, task=trained).check_same(replace(ABSOLUTE, task=here), "this act", "override")
 
 
 @pytest.mark.parametrize(
     ("change", "message"),
     [
         ({"robot": "scara"}, "with robot=fetch; this one has robot=scara: evaluate with --env.robot=fetch"),
-        ({"control_mode": "relative"}, "evaluate with --env.control_mode=absolute, or insist"),
-        ({"fps": 10, "image_size": 256}, "evaluate with --env.fps=20 --env.image_size=64, or insist"),
+        ({"control_mode": "relative"}, "evaluate with --env.control_mode=absolute, or override"),
+        ({"fps": 10, "image_size": 256}, "evaluate with --env.fps=20 --env.image_size=64, or override"),
         (
             {"cameras": ("workspace",)},
-            "with cameras=workspace+wrist; this one has cameras=workspace: insist",
+            "with cameras=workspace+wrist; this one has cameras=workspace: override",
         ),
         (
             {"task_version": "2.0"},
-            "with task_version=1.0; this one has task_version=2.0: insist",
+            "with task_version=1.0; this one has task_version=2.0: override",
         ),
     ],
 )
 def test_another_environment_is_an_error_that_names_the_flags(change: dict[str, Any], message: str) -> None:
     with pytest.raises(ValueError, match=f"^this act was trained .*{re.escape(message)}"):
-        ABSOLUTE.check_same(replace(ABSOLUTE, **change), "this act", "insist")
+        ABSOLUTE.check_same(replace(ABSOLUTE, **change), "this act", "override")
 
 
 def test_what_was_trained_on_all_suites_acts_in_each_of_its_version() -> None:
     of_all = replace(ABSOLUTE, task="all", task_version=task_version("all"))
     for suite in SUITES:
         of_all.check_same(
-            replace(ABSOLUTE, task=suite, task_version=task_version(suite)), "this act", "insist"
+            replace(ABSOLUTE, task=suite, task_version=task_version(suite)), "this act", "override"
         )
     earlier = replace(of_all, task_version="1.0")
-    with pytest.raises(ValueError, match=r"with task_version=1\.0; this one has task_version=1\.1: insist"):
-        earlier.check_same(replace(ABSOLUTE, task="goal", task_version="1.1"), "this act", "insist")
+    with pytest.raises(ValueError, match=r"with task_version=1\.0; this one has task_version=1\.1: override"):
+        earlier.check_same(replace(ABSOLUTE, task="goal", task_version="1.1"), "this act", "override")
     with pytest.raises(ValueError, match=r"evaluate with --env\.task=place"):
-        ABSOLUTE.check_same(of_all, "this act", "insist")
+        ABSOLUTE.check_same(of_all, "this act", "override")
 
 
 @pytest.mark.parametrize(
@@ -207,4 +207,4 @@ def test_what_was_trained_on_all_suites_acts_in_each_of_its_version() -> None:
     ],
 )
 def test_what_makes_no_other_environment(change: dict[str, Any]) -> None:
-    ABSOLUTE.check_same(replace(ABSOLUTE, **change), "this act", "insist")
+    ABSOLUTE.check_same(replace(ABSOLUTE, **change), "this act", "override")

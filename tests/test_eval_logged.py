@@ -107,7 +107,7 @@ def test_another_environment_and_another_policy(tmp_path: Path) -> None:
     assert evaluate(path, *policy.split(), *env.split(), "--eval.n_episodes=3", "--eval.batch_size=2") == 0
     executed = read_executed(path)
     assert executed.fps == 10
-    # LeRobot plays whole batches, and counts three episodes
+    # LeRobot runs whole batches, and counts three episodes
     assert list(executed.episodes) == [f"pusht, task 0, seed {seed}" for seed in range(1000, 1003)]
     assert {of.shape for of in executed.episodes.values()} == {(6, 2)}
 

@@ -8,7 +8,7 @@ from lerobot_bomb.bomb.episode import EpisodeSpec, Stage
 from lerobot_bomb.bomb.expert import FLOOR_M, expert_action
 from lerobot_bomb.bomb.observation import MAX_STEP_M, WORKSPACE_LOW_M, RenderOptions
 from lerobot_bomb.bomb.privileged_state import Goal, PrivilegedState
-from lerobot_bomb.envs.rollout import expert_agent, play
+from lerobot_bomb.envs.rollout import expert_agent, run_episode
 from lerobot_env_bomb.env import BombEnv
 from lerobot_env_bomb.scene import WORKSPACE_HIGH, WORKSPACE_LOW
 
@@ -35,7 +35,7 @@ def expert_episode(
     """States before each action and after the last, the expert's actions, the last info."""
     rng, spec = np.random.default_rng(seed), EpisodeSpec(seed)
     moments = list(
-        play(env, spec, expert_agent(), lambda a: a + noise * np.array([*rng.standard_normal(3), 0]))
+        run_episode(env, spec, expert_agent(), lambda a: a + noise * np.array([*rng.standard_normal(3), 0]))
     )
     actions = [moment.action for moment in moments if moment.action is not None]
     return [moment.state for moment in moments], actions, moments[-1].info

@@ -162,14 +162,14 @@ def test_other_instructions_differ_in_one_word_and_name_their_intersection() -> 
     instruction, others = moment()[1], moment()[3]
     row, column = SPEC.target or (0, 0)
     assert set(others) == {"row", "column", "color"}
-    for word, (other, cell) in others.items():
+    for word, (other, intersection) in others.items():
         span = difference(word, instruction, other)
         assert span is not None and len(span.ranges) == 1
         expected = {
             "row": ((row + 2) % BOARD.num_lines, column),
             "column": (row, (column + 2) % BOARD.num_lines),
         }
-        assert cell == expected.get(word, (row, column))
+        assert intersection == expected.get(word, (row, column))
 
 
 def test_every_trace_has_a_look_of_its_own_which_the_legend_shows() -> None:

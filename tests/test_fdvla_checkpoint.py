@@ -150,7 +150,7 @@ def test_errors_are_told_in_the_datasets_units(options: dict[str, Any], meta: Le
         ({"use_state": False}, "True"),
     ],
 )
-def test_a_training_cannot_go_on_with_other_shapes(
+def test_a_training_cannot_continue_with_other_shapes(
     options: dict[str, Any], then: str, meta: LeRobotDatasetMetadata, tmp_path: Path
 ) -> None:
     make_policy().save_pretrained(tmp_path)
@@ -160,7 +160,7 @@ def test_a_training_cannot_go_on_with_other_shapes(
         FdvlaPolicy.from_pretrained(tmp_path, config=changed(tmp_path, options), dataset_meta=meta)
 
 
-def test_a_training_may_go_on_otherwise(meta: LeRobotDatasetMetadata, tmp_path: Path) -> None:
+def test_a_training_may_continue_otherwise(meta: LeRobotDatasetMetadata, tmp_path: Path) -> None:
     make_policy().save_pretrained(tmp_path)
     options = {"image_size": 84, "segment_attention": "causal", "reasoning_pool": "last"}
     config = changed(tmp_path, options)

@@ -17,7 +17,7 @@ from lerobot_bomb.bomb.layout import Layout
 from lerobot_bomb.bomb.observation import RenderOptions, action_bounds
 from lerobot_bomb.bomb.privileged_state import PrivilegedState
 from lerobot_bomb.commands import doctor
-from lerobot_bomb.envs.rollout import expert_agent, play
+from lerobot_bomb.envs.rollout import expert_agent, run_episode
 from lerobot_bomb.flag_errors import FlagError
 from lerobot_bomb.results.bomb import EpisodeResult
 from lerobot_bomb.results.groups import read_results
@@ -48,7 +48,7 @@ def scene() -> Scene:
 def expert_episode(env: BombEnv, seed: int) -> tuple[str, dict]:
     """Digest of all observations and actions of the expert's episode, its last info."""
     spec = replace(SPEC, seed=seed)
-    *moments, last = play(env, spec, expert_agent())
+    *moments, last = run_episode(env, spec, expert_agent())
     everything = hashlib.sha256()
     for moment in moments:
         seen = moment.observation

@@ -47,27 +47,27 @@ def manifest() -> Manifest:
 
 
 @pytest.fixture
-def play(tmp_path: Path, manifest: Manifest) -> Callable[[], Store]:
-    """Play it in this process."""
+def run_all(tmp_path: Path, manifest: Manifest) -> Callable[[], Store]:
+    """Run it in this process."""
     from lerobot_bomb.sweep.worker import Worker
 
-    def play() -> Store:
+    def run_all() -> Store:
         store = Store(tmp_path / "sweep", manifest)
-        Worker(store).run(list(manifest.cells))
+        Worker(store).run(list(manifest.jobs))
         return store
 
-    return play
+    return run_all
 
 
-def check_whole(play: Callable[[], Store]) -> None:
+def check_whole(run_all: Callable[[], Store]) -> None:
     """Check that nothing is missing once there is room and the episodes have run again."""
-    store = play()
+    store = run_all()
     store.merge()
     assert [row.spec.seed for row in read_results(store.folder / "results.jsonl")] == SEEDS
 
 
-def test_a_line_that_finds_no_room_gives_the_cell_up_and_says_so(
-    play: Callable[[], Store], manifest: Manifest, monkeypatch: pytest.MonkeyPatch
+def test_a_line_that_finds_no_room_gives_the_job_up_and_says_so(
+    run_all: Callable[[], Store], manifest: Manifest, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     write_all = files._write_all
 
@@ -78,33 +78,33 @@ def test_a_line_that_finds_no_room_gives_the_cell_up_and_says_so(
         write_all(file, data)
 
     monkeypatch.setattr(files, "_write_all", full)
-    store = play()
+    store = run_all()
     text = "\n".join(store.lines())
-    assert "0 of 2 episodes, 0 of 1 cells" in text
+    assert "0 of 2 episodes, 0 of 1 jobs" in text
     assert f"the result of seed 7 could not be written ({FULL})" in text and "Make room" in text
-    assert f"to play them again: lerobot-bomb sweep {store.folder} --retry" in text
+    assert f"to run them again: lerobot-bomb sweep {store.folder} --retry" in text
     monkeypatch.undo()
-    store.begin_again(manifest.cells)
-    check_whole(play)
+    store.begin_again(manifest.jobs)
+    check_whole(run_all)
 
 
-def test_a_cell_whose_file_finds_no_room_is_given_up_and_says_so(
-    play: Callable[[], Store], full_for: Plant, manifest: Manifest, monkeypatch: pytest.MonkeyPatch
+def test_a_job_whose_file_finds_no_room_is_given_up_and_says_so(
+    run_all: Callable[[], Store], full_for: Plant, manifest: Manifest, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     full_for(".jsonl")
-    store = play()
+    store = run_all()
     text = "\n".join(store.lines())
-    assert f"{store.file(manifest.cells[0], 'jsonl')} {WAY_OUT}" in text
+    assert f"{store.file(manifest.jobs[0], 'jsonl')} {WAY_OUT}" in text
     assert not list(store.folder.rglob(".unfinished-*"))
     monkeypatch.undo()
-    store.begin_again(manifest.cells)
-    check_whole(play)
+    store.begin_again(manifest.jobs)
+    check_whole(run_all)
 
 
-def test_results_that_find_no_room_stay_in_the_cells(
-    play: Callable[[], Store], full_for: Plant, monkeypatch: pytest.MonkeyPatch
+def test_results_that_find_no_room_stay_in_the_jobs(
+    run_all: Callable[[], Store], full_for: Plant, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    store = play()
+    store = run_all()
     store.merge()
     before = (store.folder / "results.jsonl").read_text()
     full_for("results.jsonl")
@@ -113,7 +113,7 @@ def test_results_that_find_no_room_stay_in_the_cells(
     assert f"{store.folder / 'results.jsonl'} {WAY_OUT}" in str(raised.value)
     assert (store.folder / "results.jsonl").read_text() == before
     monkeypatch.undo()
-    check_whole(play)
+    check_whole(run_all)
 
 
 def test_a_manifest_that_finds_no_room_is_told(
@@ -127,7 +127,7 @@ def test_a_manifest_that_finds_no_room_is_told(
     assert [path.name for path in tmp_path.iterdir()] == ["sweep.lock"]
     monkeypatch.undo()
     assert main(command) == 0
-    assert len(Manifest.read(tmp_path).cells) == 1
+    assert len(Manifest.read(tmp_path).jobs) == 1
 
 
 @pytest.mark.parametrize("ending", [".html", ".json", ".csv"])

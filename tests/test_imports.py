@@ -20,7 +20,7 @@ POLICY_TYPES = {name.removeprefix(POLICY_PREFIX) for name in PACKAGES if name.st
 NAMES_POLICIES = {
     "checkpoints/spatialvla_folder.py": {"spatialvla_grid"},  # whose format it writes
     "commands/audit.py": {"bomb_expert", "bomb_random"},  # ceiling and floor
-    "commands/demo.py": {"vla0_smol", "bomb_expert", "bomb_random"},  # who plays
+    "commands/demo.py": {"vla0_smol", "bomb_expert", "bomb_random"},  # policies that act
     "commands/table.py": {"vla0_smol", "fdvla", "bomb_expert"},  # examples of commands
 }
 HEAVY = {"torch", "lerobot", "transformers", "rerun", "cv2"}

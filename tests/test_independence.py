@@ -64,7 +64,7 @@ def flat(observation: dict[str, Any], instruction: str | tuple[str, ...]) -> dic
     return arrays | {"instruction": np.array(instruction)}
 
 
-def play_expert(env: BombEnv, seed: int) -> tuple[np.ndarray, Observations]:
+def run_expert(env: BombEnv, seed: int) -> tuple[np.ndarray, Observations]:
     """Actions (T, 4) and the T + 1 observations of a whole episode."""
     observation, _ = env.reset(seed=seed)
     observations, actions, ended = [flat(observation, env.task_description)], [], False
@@ -76,7 +76,7 @@ def play_expert(env: BombEnv, seed: int) -> tuple[np.ndarray, Observations]:
     return np.stack(actions), observations
 
 
-def play_together(envs: LazyVectorEnv, actions: list[np.ndarray]) -> list[Observations]:
+def run_together(envs: LazyVectorEnv, actions: list[np.ndarray]) -> list[Observations]:
     """The observations of one episode per env, each as long as its actions."""
     num_steps = max(map(len, actions))
     actions_TED = np.stack([np.pad(of, ((0, num_steps - len(of)), (0, 0))) for of in actions], axis=1)
@@ -107,13 +107,13 @@ def digest(observations: Observations) -> str:
 @pytest.fixture(scope="module")
 def episodes(spec: EpisodeSpec) -> list[tuple[np.ndarray, Observations]]:
     """The expert's episodes of SEEDS, each the first of its env."""
-    played = []
+    episodes_run = []
     for seed in SEEDS:
         env = make_one(spec)
-        played.append(play_expert(env, seed))
+        episodes_run.append(run_expert(env, seed))
         env.close()
-    assert len(played[0][0]) != len(played[1][0])
-    return played
+    assert len(episodes_run[0][0]) != len(episodes_run[1][0])
+    return episodes_run
 
 
 @pytest.fixture
@@ -146,9 +146,9 @@ def test_a_fresh_process_gives_the_same_bits(
     spec: EpisodeSpec, episodes: list[tuple[np.ndarray, Observations]]
 ) -> None:
     script = (
-        "from test_independence import make_one, EpisodeSpec, SEEDS, digest, play_expert\n"
+        "from test_independence import make_one, EpisodeSpec, SEEDS, digest, run_expert\n"
         f"env = make_one({spec!r})\n"
-        "print([digest(play_expert(env, seed)[1]) for seed in reversed(SEEDS)])\n"
+        "print([digest(run_expert(env, seed)[1]) for seed in reversed(SEEDS)])\n"
     )
     run = subprocess.run(
         [sys.executable, "-c", script],
@@ -174,10 +174,10 @@ def test_vector_envs_give_the_same_bits(
 ) -> None:
     envs = LazyVectorEnv([partial(make_one, spec)] * num_envs, use_async=use_async, context=context)
     try:
-        played = play_together(envs, [actions for actions, _ in episodes[:num_envs]])
+        episodes_run = run_together(envs, [actions for actions, _ in episodes[:num_envs]])
     finally:
         envs.close()
-    for observations, (_, expected) in zip(played, episodes, strict=False):
+    for observations, (_, expected) in zip(episodes_run, episodes, strict=False):
         assert_same(observations, expected)
 
 
@@ -195,7 +195,7 @@ class Outcome:
 def evaluate(
     run: Run, folder: Path, flags: list[str], batch_size: int, use_async: bool, num_episodes: int = 4
 ) -> dict[int, Outcome]:
-    """lerobot-eval on the seeds from 5 on; the last batch may play more than asked."""
+    """lerobot-eval on the seeds from 5 on; the last batch may run more than asked."""
     from lerobot.scripts import lerobot_eval
 
     rollout = lerobot_eval.rollout

@@ -79,7 +79,7 @@ def aims_at_the_tray(state: PrivilegedState, step: int) -> np.ndarray:
 
 
 def brushes_a_stone_aside(state: PrivilegedState, step: int) -> np.ndarray:
-    """Pushes stone 1 some 15 mm towards row 0 with closed fingers, then lets the expert play."""
+    """Pushes stone 1 some 15 mm towards row 0 with closed fingers, then lets the expert run."""
     pushed = state.stone_xyz[1]
     home = np.array([*BOARD.intersection_xy(*BOARD.nearest_intersection(pushed[:2])), 0.007])
     if np.linalg.norm(pushed[:2] - home[:2]) > 0.013:

@@ -12,7 +12,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from libero_cases import IMAGE_SIZE, REPO_ID, SUITE, Played, write_file
+from libero_cases import IMAGE_SIZE, REPO_ID, SUITE, Demonstration, write_file
 from stock_policies import flags_of
 
 from lerobot_bomb.commands import main as cli
@@ -36,7 +36,7 @@ ACTIONS = np.array(
 
 @dataclass(frozen=True)
 class Recording:
-    played: Played  # what LIBERO's own script would write
+    demonstration: Demonstration  # what LIBERO's own script would write
     seen: list[dict[str, Any]]  # what lerobot-eval gives a policy at the same moments
     task: str  # the instruction that it gives
     bddl: str  # the name of the task's file
@@ -45,10 +45,10 @@ class Recording:
 @pytest.fixture(scope="module")
 def recording(libero_with_assets: Libero) -> Recording:
     prepare_libero([SUITE])
-    return play()
+    return record()
 
 
-def play() -> Recording:
+def record() -> Recording:
     """LeRobot's environment, and beside it the raw observations of the simulator that it holds."""
     from lerobot.envs.factory import make_env, make_env_config, make_env_pre_post_processors
     from lerobot.envs.utils import preprocess_observation
@@ -69,17 +69,17 @@ def play() -> Recording:
         seen.append(to_policy(preprocess_observation(observation)))
     task, bddl = env.task_description, Path(env._task_bddl_file).stem
     vector.close()
-    return Recording(played_from(raw), seen, task, bddl)
+    return Recording(demonstration_from(raw), seen, task, bddl)
 
 
-def played_from(raw: list[dict[str, Any]]) -> Played:
+def demonstration_from(raw: list[dict[str, Any]]) -> Demonstration:
     from robosuite.utils.transform_utils import quat2axisangle
 
     def stacked(name: str) -> np.ndarray:
         return np.stack([moment[name] for moment in raw])
 
     turns = np.stack([quat2axisangle(moment["robot0_eef_quat"]) for moment in raw])
-    return Played(
+    return Demonstration(
         (stacked("agentview_image"), stacked("robot0_eye_in_hand_image")),
         np.concatenate([stacked("robot0_eef_pos"), turns], axis=1),
         stacked("robot0_joint_pos"),
@@ -95,7 +95,7 @@ def rows(recording: Recording, tmp_path_factory: pytest.TempPathFactory) -> list
     from lerobot.datasets import LeRobotDataset
 
     folder = tmp_path_factory.mktemp("libero")
-    file = write_file(folder / f"{recording.bddl}_demo.hdf5", [recording.played], task=recording.bddl)
+    file = write_file(folder / f"{recording.bddl}_demo.hdf5", [recording.demonstration], task=recording.bddl)
     convert_libero(file, REPO_ID, folder / "x", images=True)
     dataset: Any = LeRobotDataset(REPO_ID, root=folder / "x", video_backend="pyav")
     assert {dataset[index]["task"] for index in range(len(dataset))} == {recording.task}
@@ -138,7 +138,7 @@ def test_the_orientation_that_images_of_other_moments_have_is_told(
 
 
 def test_images_that_were_not_turned_are_told(recording: Recording) -> None:
-    raw = recording.played.images[0]
+    raw = recording.demonstration.images[0]
     expected = np.stack([shown(recording, moment, KEYS[0]) for moment in range(3)])
     assert orientation(raw, expected).startswith("turned by 180 degrees")
     assert orientation(raw[:, ::-1, ::-1], expected) == SAME
@@ -162,7 +162,9 @@ def test_a_policy_that_was_trained_on_the_other_orientation_is_told(
     capsys: pytest.CaptureFixture[str],
 ) -> None:
     """`lerobot` says that the file's images are turned already, which is not so: they stay as they are."""
-    file = write_file(tmp_path / f"{recording.bddl}_demo.hdf5", [recording.played], task=recording.bddl)
+    file = write_file(
+        tmp_path / f"{recording.bddl}_demo.hdf5", [recording.demonstration], task=recording.bddl
+    )
     data, flags = tmp_path / "data", [f"--repo_id={REPO_ID}", f"--image_convention={convention}", "--images"]
     assert cli.main(["convert", "libero-hdf5", str(file), *flags, f"--root={data}"]) == 0
     where = [f"--dataset.repo_id={REPO_ID}", f"--dataset.root={data}", f"--output_dir={tmp_path / 'train'}"]
@@ -177,7 +179,7 @@ def test_a_policy_that_was_trained_on_the_other_orientation_is_told(
     stock_cli("lerobot-eval", *flags, *small)
     told = f"the checkpoint {checkpoint} was trained on images of {data} {TURNED}"
     assert capsys.readouterr().err.count(told) == is_told
-    size = f"evaluate with {' '.join(small)}, or insist with --env.ignore_checkpoint=true"
+    size = f"evaluate with {' '.join(small)}, or override with --env.ignore_checkpoint=true"
     with pytest.raises(ValueError, match=f"{re.escape(size)}$"):
         stock_cli("lerobot-eval", *flags)
 

@@ -1,4 +1,4 @@
-"""Lines of results that cannot be: fields that contradict each other, text that nobody can write or show."""
+"""Records that cannot be: fields that contradict each other, text that nobody can write or show."""
 
 import json
 from dataclasses import asdict
@@ -152,12 +152,12 @@ def test_queries_that_an_episode_cannot_have_had_are_damage() -> None:
 @pytest.mark.parametrize(
     ("seed", "number", "size"), [(1000, 0, MAX_BATCH + 1), (1000, 3, 1_000_000), (2, 3, 4), (9, 1, None)]
 )
-def test_a_batch_that_cannot_be_played_again_is_told_before_anything_is_made(
+def test_a_batch_that_cannot_be_run_again_is_told_before_anything_is_made(
     seed: int, number: int, size: int | None, path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     identity = asdict(PolicyIdentity("bomb_random")) | {"batch_row": number, "batch_size": size}
     line = values(seed) | {"policy": identity}
     with pytest.raises(ValueError, match=f"policy.batch_row={number} of policy.batch_size={size or 1}, and"):
-        Replay(read(line)).player()
+        Replay(read(line)).viewed_run()
     assert main(["replay", str(written(path, json.dumps(line) + "\n"))]) == 1
     assert capsys.readouterr().err.count("\n") == 1

@@ -22,7 +22,7 @@ from lerobot_bomb.bomb.privileged_state import Goal, PrivilegedState
 from lerobot_bomb.bomb.streams import recorder_noise
 from lerobot_bomb.bomb.suite import find_suite
 from lerobot_bomb.bomb.suites import SUITES
-from lerobot_bomb.envs.rollout import Moment, add_noise, expert_agent, play
+from lerobot_bomb.envs.rollout import Moment, add_noise, expert_agent, run_episode
 from lerobot_env_bomb.env import BombEnv
 
 SUCCESSES, COMPARED = 0.9, 0.98  # least shares of episodes and of steps
@@ -35,7 +35,7 @@ FLAT_M = REACHED_HEIGHT_M[0]  # of its height at rest, for a stone that lies
 LEANS_M = BOARD.stone_height_m  # the same in the tray, where one stone may lean on another
 HELD_OPENING_M = (0.012, 0.030)  # between pads that hold a stone
 REST_M = BOARD.thickness_m + BOARD.stone_height_m / 2
-LEFT_SIDE = [cell for cell in INTERSECTIONS if cell[1] < 2]
+LEFT_SIDE = [intersection for intersection in INTERSECTIONS if intersection[1] < 2]
 type Place = tuple[float, float]  # metres
 
 
@@ -71,11 +71,11 @@ class View:
     def color(self, stone: int | None) -> str | None:
         return None if stone is None else COLORS[int(self.state.stone_is_white[stone])]
 
-    def at(self, cell: Intersection) -> str | None:
-        return self.color(self.on_board.get(cell))
+    def at(self, intersection: Intersection) -> str | None:
+        return self.color(self.on_board.get(intersection))
 
-    def cells(self, color: str) -> list[Intersection]:
-        return sorted(cell for cell in self.on_board if self.at(cell) == color)
+    def intersections(self, color: str) -> list[Intersection]:
+        return sorted(intersection for intersection in self.on_board if self.at(intersection) == color)
 
     def first_in_tray(self, color: str) -> int:
         return next(stone for stone in self.in_tray if self.color(stone) == color)
@@ -108,12 +108,12 @@ class View:
 type Next = tuple[int, Place] | None  # the stone that is to be moved and where to; None: all is done
 
 
-def of_cell(cell: Intersection) -> Place:
-    x, y = BOARD.intersection_xy(*cell)
+def place_of(intersection: Intersection) -> Place:
+    x, y = BOARD.intersection_xy(*intersection)
     return float(x), float(y)
 
 
-def cells_in(text: str) -> list[Intersection]:
+def intersections_in(text: str) -> list[Intersection]:
     return [(int(r), int(c)) for r, c in re.findall(r"(?:row |\()(\d),(?: column)? (\d)", text)]
 
 
@@ -124,18 +124,18 @@ def next_move(text: str, view: View) -> Next:
     if found := re.search(r"capture the (?:\d )?(\w+) stones?.*: play (\w+)", text):
         return next_of_capture(found[1], found[2], view)
     if found := re.search(r"swap the (\w+) stone .* the (\w+) stone", text):
-        return next_of_swap((found[1], found[2]), cells_in(text), view)
+        return next_of_swap((found[1], found[2]), intersections_in(text), view)
     if found := re.search(r"push the (\w+) stone", text):
         held = [] if view.held is None else [view.held]
         (stone,) = [stone for stone in [*held, *view.on_board.values()] if view.color(stone) == found[1]]
-        return stone, of_cell(cells_in(text)[0])
+        return stone, place_of(intersections_in(text)[0])
     if found := re.search(r"bring all (\w+) stones to the left side", text):
-        place = next((cell for cell in LEFT_SIDE if cell not in view.on_board), None)
-        left = [cell for cell in view.cells(found[1]) if cell[1] > 1]
+        place = next((intersection for intersection in LEFT_SIDE if intersection not in view.on_board), None)
+        left = [intersection for intersection in view.intersections(found[1]) if intersection[1] > 1]
         if view.held is None and not left:
             return None
         assert place is not None
-        return view.on_board[left[0]] if view.held is None else view.held, of_cell(place)
+        return view.on_board[left[0]] if view.held is None else view.held, place_of(place)
     return next_from_tray(text, view)
 
 
@@ -143,31 +143,39 @@ def next_from_tray(text: str, view: View) -> Next:
     if moves := re.findall(r"(black|white) at row (\d), column (\d)", text):
         return next_of_moves([(color, (int(r), int(c))) for color, r, c in moves], view)
     if "copy the pattern" in text:
-        return next_of_moves([(color, cell) for cell, color in sorted(view.pattern.items())], view)
+        return next_of_moves(
+            [(color, intersection) for intersection, color in sorted(view.pattern.items())], view
+        )
     if found := re.search(r"free intersections of row (\d).*(black|white) last", text):
-        free = [cell for cell in INTERSECTIONS if cell[0] == int(found[1]) and cell not in view.on_board]
+        free = [
+            intersection
+            for intersection in INTERSECTIONS
+            if intersection[0] == int(found[1]) and intersection not in view.on_board
+        ]
         color = COLORS[(COLORS.index(found[2]) + len(free) - 1) % 2]
-        return next_of_moves([(color, cell) for cell in free[:1]], view)
-    place = next(iter(cells_in(text)), None) or named_place(text, view)
+        return next_of_moves([(color, intersection) for intersection in free[:1]], view)
+    place = next(iter(intersections_in(text)), None) or named_place(text, view)
     if place is None or place in view.on_board:
         return None
-    return named_stone(text, view) if view.held is None else view.held, of_cell(place)
+    return named_stone(text, view) if view.held is None else view.held, place_of(place)
 
 
 def next_of_moves(moves: list[tuple[str, Intersection]], view: View) -> Next:
-    for color, cell in moves:
-        if view.at(cell) != color:
-            return view.first_in_tray(color) if view.held is None else view.held, of_cell(cell)
+    for color, intersection in moves:
+        if view.at(intersection) != color:
+            return view.first_in_tray(color) if view.held is None else view.held, place_of(intersection)
     return None
 
 
 def next_removal(text: str, view: View) -> Next:
     if found := re.search(r"clear row (\d)", text):
-        left = sorted(cell for cell in view.on_board if cell[0] == int(found[1]))
+        left = sorted(intersection for intersection in view.on_board if intersection[0] == int(found[1]))
     elif found := re.search(r"take the (black|white) stone", text):
-        left = view.cells(found[1])
+        left = view.intersections(found[1])
     else:
-        left = [cell for cell in reversed(cells_in(text)) if cell in view.on_board]
+        left = [
+            intersection for intersection in reversed(intersections_in(text)) if intersection in view.on_board
+        ]
     if view.held is None and not left:
         return None
     return view.held if view.held is not None else view.on_board[left[0]], view.next_tray_place
@@ -175,29 +183,37 @@ def next_removal(text: str, view: View) -> Next:
 
 def next_of_capture(color: str, by: str, view: View) -> Next:
     """`by` takes the last liberty, then what has none is taken off."""
-    board = {cell: COLORS[int(view.state.stone_is_white[stone])] for cell, stone in view.on_board.items()}
-    groups = {frozenset(group_of(board, cell)): min(group_of(board, cell)) for cell in view.cells(color)}
-    liberties = {group: liberties_of(board, cell) for group, cell in groups.items()}
+    board = {
+        intersection: COLORS[int(view.state.stone_is_white[stone])]
+        for intersection, stone in view.on_board.items()
+    }
+    groups = {
+        frozenset(group_of(board, intersection)): min(group_of(board, intersection))
+        for intersection in view.intersections(color)
+    }
+    liberties = {group: liberties_of(board, intersection) for group, intersection in groups.items()}
     if view.color(view.held) == by or any(view.color(stone) == by for stone in view.in_tray):
         (liberty,) = next(places for places in liberties.values() if len(places) == 1)
-        return view.first_in_tray(by) if view.held is None else view.held, of_cell(liberty)
+        return view.first_in_tray(by) if view.held is None else view.held, place_of(liberty)
     if view.held is not None:
         return view.held, view.next_tray_place
     # of two, the other one has the first's intersection for a liberty, and the first lies in the tray
-    taken = sorted(cell for group, places in liberties.items() if not places for cell in group)
+    taken = sorted(
+        intersection for group, places in liberties.items() if not places for intersection in group
+    )
     if not taken and len(view.in_tray) == 1 and "2 " in view.text:
         taken = sorted(min(group) for group, places in liberties.items() if len(places) == 1)
     return (view.on_board[taken[0]], view.next_tray_place) if taken else None
 
 
-def next_of_swap(colors: tuple[str, str], cells: list[Intersection], view: View) -> Next:
-    (first, second), (a, b) = colors, cells
+def next_of_swap(colors: tuple[str, str], intersections: list[Intersection], view: View) -> Next:
+    (first, second), (a, b) = colors, intersections
     if view.at(a) == second:  # the first goes where the second stood
         if view.at(b) == first:
             return None
-        return view.in_tray[0] if view.held is None else view.held, of_cell(b)
+        return view.in_tray[0] if view.held is None else view.held, place_of(b)
     if view.in_tray:
-        return view.on_board[b] if view.held is None else view.held, of_cell(a)
+        return view.on_board[b] if view.held is None else view.held, place_of(a)
     return view.on_board[a] if view.held is None else view.held, TRAY_XY_M[0]
 
 
@@ -221,7 +237,7 @@ def named_stone(text: str, view: View) -> int:
 
 def named_place(text: str, view: View) -> Intersection | None:
     if found := re.search(r"(left of|right of|behind|in front of|between) the (?:two )?(\w+) stone", text):
-        anchors = view.cells(found[2])
+        anchors = view.intersections(found[2])
         if found[1] == "between":
             (r1, c1), (r2, c2) = anchors
             return (r1 + r2) // 2, (c1 + c2) // 2
@@ -264,7 +280,7 @@ def goals_of_reader(view: View) -> tuple[Goal, ...]:
 
 def put_down_on(xy: np.ndarray) -> Place | None:
     """Return the intersection, or the place in the tray, that a stone was put down on."""
-    places = [*map(of_cell, INTERSECTIONS), *TRAY_XY_M]
+    places = [*map(place_of, INTERSECTIONS), *TRAY_XY_M]
     return next((place for place in places if np.hypot(*(xy - place)) < REACHED_LATERAL_M[1]), None)
 
 
@@ -308,7 +324,7 @@ class UndrawnEnv(BombEnv):
 
 
 @dataclass
-class Played:
+class Reading:
     """An episode of the expert, under noise, and the steps in which the reader acts otherwise."""
 
     otherwise: list[str]
@@ -317,36 +333,36 @@ class Played:
     is_success: bool = False
 
 
-def play_and_read(env: BombEnv, spec: EpisodeSpec) -> Played:
+def run_and_read(env: BombEnv, spec: EpisodeSpec) -> Reading:
     rng, noise = np.random.default_rng(spec.seed), recorder_noise(spec.seed)
-    played = Played([])
+    reading = Reading([])
     episode = find_suite(spec.suite).sample(spec)
     pattern = dict(episode.pattern)
     start = None
-    for moment in play(env, spec, expert_agent(), lambda a: add_noise(a, NOISE, "relative", noise)):
-        played.is_success = moment.info["is_success"]
+    for moment in run_episode(env, spec, expert_agent(), lambda a: add_noise(a, NOISE, "relative", noise)):
+        reading.is_success = moment.info["is_success"]
         if moment.action is None:
             continue
         start = start or moment.state
         view = seen(moment, pattern, rng)
-        played.num_steps += 1
+        reading.num_steps += 1
         if not view.is_settled or has_fallen(moment.state, start, episode.aims):
             continue
-        played.num_compared += 1
+        reading.num_compared += 1
         action = expert_action(replace(view.state, goals=goals_of_reader(view)))
         if abs(action - expert_action(moment.state)).max() > 0.02:
             step = f"{spec.suite} seed {spec.seed} step {moment.step}"
-            played.otherwise.append(f"{step}: {moment.instruction}")
-    return played
+            reading.otherwise.append(f"{step}: {moment.instruction}")
+    return reading
 
 
 def check(suite: str, task_id: int | None, seeds: Sequence[int]) -> None:
     """The reader acts as the expert does in every step of these episodes, which nearly all end in success."""
     env = UndrawnEnv(EpisodeSpec(0, suite, task_id=task_id), SMALL)
-    played = [play_and_read(env, EpisodeSpec(seed, suite, task_id=task_id)) for seed in seeds]
-    assert [text for each in played for text in each.otherwise] == []
-    assert sum(each.num_compared for each in played) >= COMPARED * sum(each.num_steps for each in played)
-    assert sum(each.is_success for each in played) >= SUCCESSES * len(played)
+    reading = [run_and_read(env, EpisodeSpec(seed, suite, task_id=task_id)) for seed in seeds]
+    assert [text for each in reading for text in each.otherwise] == []
+    assert sum(each.num_compared for each in reading) >= COMPARED * sum(each.num_steps for each in reading)
+    assert sum(each.is_success for each in reading) >= SUCCESSES * len(reading)
 
 
 TASKS = [

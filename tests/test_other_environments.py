@@ -69,7 +69,7 @@ def test_a_policys_config_takes_the_features(policy_type: str, env_type: str) ->
 
 
 @pytest.mark.one_type
-def test_tasks_in_threads_are_played_in_turn(
+def test_tasks_in_threads_are_run_in_turn(
     policy_type: str, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
     """They would share the policy's queue."""
@@ -86,11 +86,11 @@ def test_tasks_in_threads_are_played_in_turn(
     steps = (*config.get_env_processors(), *make_pre_post_processors(policy_config))
     lerobot_eval.eval_policy_all(envs, policy, *steps, n_episodes=1, start_seed=0, max_parallel_tasks=2)
     assert threads == ["MainThread"] * 2
-    assert "--env.max_parallel_tasks=2: tasks are played one after another" in caplog.text
+    assert "--env.max_parallel_tasks=2: tasks are run one after another" in caplog.text
 
 
 @pytest.mark.long
-def test_metaworld_is_played(
+def test_metaworld_is_run(
     policy_type: str, stock_cli: Callable[..., None], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Run three steps each of two episodes."""

@@ -25,7 +25,7 @@ from lerobot_bomb.bomb.perturbations import AXES, Condition
 from lerobot_bomb.bomb.suite import suites_of
 from lerobot_bomb.commands.main import main
 from lerobot_bomb.environments import env_type
-from lerobot_bomb.envs.rollout import expert_agent, make_env, play
+from lerobot_bomb.envs.rollout import expert_agent, make_env, run_episode
 from lerobot_bomb.results.writing import write_record
 
 folder, act = sys.argv[1:]
@@ -33,7 +33,7 @@ flags = [f"{folder}/sweep", "--policies=act", "--env.type=plain", "--episodes=4"
 codes = [main(["sweep", *flags])]
 spec = EpisodeSpec(3, "corner", perturbations="fog:2")
 env = make_env(spec, RenderOptions(32))
-first, *_ = play(env, spec, expert_agent())
+first, *_ = run_episode(env, spec, expert_agent())
 result = env.unwrapped.episode_result()
 write_record(f"{folder}/bomb.jsonl", result)
 clear, _ = make_env(replace(spec, perturbations="none"), RenderOptions(32)).reset(seed=3)

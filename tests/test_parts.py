@@ -20,7 +20,7 @@ from lerobot_bomb.data import resumable
 from lerobot_bomb.data.kept_blocks import finished_blocks, read_progress
 from lerobot_bomb.data.parts import Part, join, record_part
 from lerobot_bomb.data.record import record
-from lerobot_bomb.data.recorded_blocks import Acting, Players
+from lerobot_bomb.data.recorded_blocks import BehaviorPolicy, EpisodeSource
 from lerobot_bomb.data.recording import Recording
 from lerobot_bomb.data.unfinished import METADATA_FILE, parts_folder
 
@@ -47,9 +47,9 @@ def go_down(observation: dict[str, Any], instruction: str) -> np.ndarray:
     return np.array([0, 0, -0.1, 1], dtype=np.float32)
 
 
-EXPERT = Players()
-HALF = Players(expert=stand_still_for_white)
-OTHER = Players(acting=Acting(lambda: None, go_down))
+EXPERT = EpisodeSource()
+HALF = EpisodeSource(expert=stand_still_for_white)
+OTHER = EpisodeSource(behavior=BehaviorPolicy(lambda: None, go_down))
 
 
 def contents(root: Path) -> dict[str, bytes]:
@@ -85,21 +85,21 @@ def root(recorded: Path, tmp_path: Path) -> Path:
 
 
 @pytest.mark.parametrize(
-    ("recording", "players"),
+    ("recording", "source"),
     [(VIDEO, HALF), (IMAGES, HALF), (None, EXPERT), (RELABELLED, OTHER)],
     ids=["video", "images", "static", "relabelled"],
 )
 def test_joined_parts_are_the_dataset_of_one_process(
-    recording: Recording | None, players: Players, tmp_path: Path
+    recording: Recording | None, source: EpisodeSource, tmp_path: Path
 ) -> None:
     if recording is None:  # four episodes of two scenes
         recording = Recording("test/parts", 0, static=8, task="spatial", image_size=32, images=True)
-    at_once = record(recording, tmp_path / "whole", expert=players.expert, acting=players.acting)
-    assert bool(at_once.failures) == (players is HALF)
+    at_once = record(recording, tmp_path / "whole", expert=source.expert, behavior=source.behavior)
+    assert bool(at_once.failures) == (source is HALF)
     root = tmp_path / "x"
-    made = [record_part(Part(recording, index, 2), root, players) for index in (1, 0)]
+    made = [record_part(Part(recording, index, 2), root, source) for index in (1, 0)]
     assert all(made) and not root.exists()
-    assert join(recording, root, players) == at_once
+    assert join(recording, root, source) == at_once
     assert contents(root) == contents(tmp_path / "whole")
     assert sorted(path.name for path in tmp_path.iterdir()) == ["whole", "x"]
 
@@ -284,7 +284,7 @@ def test_a_recording_that_was_begun_at_once_takes_no_parts(
     begun, parts = root.with_name("x.recording"), root.with_name("x.parts")
     shutil.copytree(parts / "0-of-2.recording", begun)
     message = (
-        f"{begun} holds a recording that was begun without --shard; go on without it, give another --root"
+        f"{begun} holds a recording that was begun without --shard; resume without it, give another --root"
     )
     assert main(["record", f"--root={root}", *FLAGS, "--join"]) == 1
     assert f"--join: {message}" in capsys.readouterr().err

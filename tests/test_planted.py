@@ -93,15 +93,15 @@ def test_a_rate_says_how_many_are_missing(
     flags += ["--policies=every_tenth", "--env.discover_packages_path=every_tenth"]
     assert run("sweep", tmp_path, "--episodes=10", "--batch_size=1", *flags) == 1
     out = capsys.readouterr().out
-    assert "9 of 10 episodes, 1 of 1 cells" in out
+    assert "9 of 10 episodes, 1 of 1 jobs" in out
     assert "1 episodes have no result, an error ended them" in out
     assert "1 x ArithmeticError: planted in the tenth episode" in out
-    assert f"to play them again: lerobot-bomb sweep {tmp_path} --retry" in out
+    assert f"to run them again: lerobot-bomb sweep {tmp_path} --retry" in out
     errors = [json.loads(line) for line in (tmp_path / "errors.jsonl").read_text().splitlines()]
     assert [error["seed"] for error in errors] == [1009]
     results = tmp_path / "results.jsonl"
-    played = [record.spec.seed for record in read_results(results)]
-    assert played == [*range(1000, 1009)]
+    seeds = [record.spec.seed for record in read_results(results)]
+    assert seeds == [*range(1000, 1009)]
 
     assert run("results", results) == 0
     said = capsys.readouterr()
@@ -110,7 +110,7 @@ def test_a_rate_says_how_many_are_missing(
 
     monkeypatch.setenv("EVERY_TENTH_IS_MENDED", "1")
     assert run("sweep", tmp_path, "--retry") == 0
-    assert "10 of 10 episodes, 1 of 1 cells" in capsys.readouterr().out
+    assert "10 of 10 episodes, 1 of 1 jobs" in capsys.readouterr().out
     assert run("results", results) == 0
     said = capsys.readouterr()
     assert "0/10 = 0.0 %" in said.out and "missing" not in said.err

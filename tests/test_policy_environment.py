@@ -1,4 +1,4 @@
-"""A checkpoint knows the environment that it was trained for, and every command that plays asks it."""
+"""A checkpoint knows the environment that it was trained for, and every command that runs asks it."""
 
 import json
 import logging
@@ -37,7 +37,7 @@ REPO_ID = "test/recording"
 CAMERAS = ("workspace", "wrist")
 ABSOLUTE = Environment("scara", "absolute", 10, 64, CAMERAS, "1.0", task="place", task_ids=(7, 12))
 TO_ABSOLUTE = r"control_mode=absolute; this one has control_mode=relative: evaluate with " + (
-    r"--env\.control_mode=absolute, or insist with "
+    r"--env\.control_mode=absolute, or override with "
 )
 
 
@@ -119,7 +119,7 @@ def test_a_policy_that_goes_on_with_other_data_is_of_their_environment(
     assert tuned.config.environment == expected
 
 
-def test_commands_refuse_before_anything_is_played(
+def test_commands_refuse_before_anything_is_run(
     absolute: Path, stock_cli: Run, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     path = write(tmp_path / "checkpoint", new_policy("vla0_smol", absolute))
@@ -132,7 +132,7 @@ def test_commands_refuse_before_anything_is_played(
     assert "evaluate with --env.control_mode=absolute" in capsys.readouterr().err
     view = ["view", f"--policy.path={path}", "--control_mode=absolute", f"--output={tmp_path / 'view'}"]
     assert main([*view, "--image_size=128"]) == 1
-    assert "evaluate with --env.image_size=64, or insist with --env.ignore" in capsys.readouterr().err
+    assert "evaluate with --env.image_size=64, or override with --env.ignore" in capsys.readouterr().err
     assert not results.exists()
     assert not [*tmp_path.rglob("*.mp4"), *tmp_path.rglob("*.rrd")]
 
@@ -179,7 +179,7 @@ def test_a_checkpoint_of_before_says_that_it_does_not_know(
         "its images could be compared. --env.control_mode, --env.fps and --env.robot must be those of its "
         "training"
     ]
-    with pytest.raises(ValueError, match=r"evaluate with --env\.image_size=64, or insist with --env\."):
+    with pytest.raises(ValueError, match=r"evaluate with --env\.image_size=64, or override with --env\."):
         act_in(policy, image_size=128)
 
 

@@ -15,7 +15,7 @@ from vla0_smol_cases import make_config
 from lerobot_bomb.bomb.environment import Environment
 
 BOMB = Environment("scara", "absolute", 10, 64, ("workspace", "wrist"), "1.0", "place")
-INSIST = "or insist with --env.ignore_checkpoint=true"
+OVERRIDE = "or override with --env.ignore_checkpoint=true"
 
 
 def load(folder: Path) -> PreTrainedPolicy:
@@ -36,7 +36,7 @@ def test_a_checkpoint_of_pusht_acts(tmp_path: Path) -> None:
         act_in(policy, image_size=128)
     assert str(error.value) == (
         f"the checkpoint {tmp_path}/act reads images of 96x96 pixels; this environment has "
-        f"--env.image_size=128: evaluate with --env.image_size=96, {INSIST}"
+        f"--env.image_size=128: evaluate with --env.image_size=96, {OVERRIDE}"
     )
     act_in(policy, image_size=128, ignore_checkpoint=True)
 
@@ -58,7 +58,7 @@ def test_actions_of_another_unit_are_refused(
         act_in(policy)
     assert str(error.value) == (
         f"the checkpoint {tmp_path}/act was trained on actions {shown}; those of --env.type=bomb_pusht are "
-        f"pixels of the 512x512 board, 0 to 512: give a checkpoint of such actions, {INSIST}"
+        f"pixels of the 512x512 board, 0 to 512: give a checkpoint of such actions, {OVERRIDE}"
     )
     act_in(policy, ignore_checkpoint=True)
 
@@ -76,7 +76,7 @@ def test_a_policy_that_was_trained_for_bomb_is_told_its_environment() -> None:
         act_in(policy)
     assert str(error.value).startswith("this vla0_smol was trained for BOMB, task version 1.0, suite place")
     assert "this is --env.type=bomb_pusht: evaluate with --env.type=bomb --env.task=place" in str(error.value)
-    assert str(error.value).endswith(INSIST)
+    assert str(error.value).endswith(OVERRIDE)
     act_in(policy, ignore_checkpoint=True)
 
 
@@ -88,9 +88,7 @@ def test_a_policy_without_training_acts() -> None:
     assert policy.config.type == "act"
 
 
-def test_lerobot_eval_refuses_before_anything_is_played(
-    stock_cli: Callable[..., None], tmp_path: Path
-) -> None:
+def test_lerobot_eval_refuses_before_anything_is_run(stock_cli: Callable[..., None], tmp_path: Path) -> None:
     pytest.importorskip("gym_pusht", reason="gym-pusht is not installed: pip install '.[pusht]'")
     results = tmp_path / "results.jsonl"
     flags = [f"--policy.path={write_act(tmp_path / 'act', low=(-1.0, -1.0), high=(1.0, 1.0))}"]

@@ -68,7 +68,7 @@ def run_pusht_eval(
     """lerobot-eval from the recorded first states, one episode after the other."""
     longest = max(np.diff(recorded.bounds))
 
-    def play(rollout: Callable[[Any], dict], episode: int) -> tuple[dict, dict[int, Batch]]:
+    def run(rollout: Callable[[Any], dict], episode: int) -> tuple[dict, dict[int, Batch]]:
         start, end = recorded.bounds[episode : episode + 2]
         # the environment goes on after the demonstration's end
         held = recorded.actions[end - 1 : end].repeat(longest, axis=0)
@@ -78,7 +78,7 @@ def run_pusht_eval(
         return result, dict(enumerate(replay.batches[: end - start], start))
 
     flags = f"--env.type=pusht --env.episode_length={longest} --seed=0 --eval.n_episodes={len(EPISODES)}"
-    return tap_eval(checkpoint, folder, f"{flags} --eval.use_async_envs=false", play)
+    return tap_eval(checkpoint, folder, f"{flags} --eval.use_async_envs=false", run)
 
 
 def test_both_routes_give_the_same_tokens_and_nearly_the_same_pixels(routes: Routes) -> None:

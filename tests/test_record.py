@@ -211,7 +211,7 @@ def test_failed_episodes_are_left_out_and_counted(tmp_path: Path) -> None:
     assert read_progress(tmp_path / "half" / METADATA_FILE) == progress
 
 
-def test_every_seed_is_played_with_every_task(tmp_path: Path) -> None:
+def test_every_seed_is_run_with_every_task(tmp_path: Path) -> None:
     recording = Recording("test/tasks", episodes=3, seed=6, image_size=SIZE, task_ids=(7, 34), images=True)
     assert [spec.seed for spec, _ in zip(recording.specs(num_tried=3), range(3), strict=False)] == [7, 8, 8]
     record(recording, tmp_path / "tasks")
@@ -227,7 +227,7 @@ def test_every_seed_is_played_with_every_task(tmp_path: Path) -> None:
     assert record(recording, tmp_path / "tasks", resume=True).num_episodes == 3
 
 
-def test_a_given_target_and_colour_are_played_from_every_seed(tmp_path: Path) -> None:
+def test_a_given_target_and_colour_are_run_from_every_seed(tmp_path: Path) -> None:
     root = tmp_path / "x"
     flags = f"--repo_id=test/x --root={root} --episodes=2 --seed=3 --image_size=32 --images"
     of_all = ["--target=[1,2]", "--color=white", "--success_tolerance_mm=9.5"]
@@ -245,7 +245,7 @@ def test_a_given_target_and_colour_are_played_from_every_seed(tmp_path: Path) ->
     assert "--env.task_ids=[32]" in (facts.eval_flags() or ())
 
 
-def test_every_seed_is_played_under_every_condition_at_the_levels_it_draws(tmp_path: Path) -> None:
+def test_every_seed_is_run_under_every_condition_at_the_levels_it_draws(tmp_path: Path) -> None:
     conditions = ("none", "all:1-5")
     recording = Recording(
         "test/perturbed", episodes=4, seed=2, image_size=SIZE, perturbations=conditions, images=True
@@ -281,7 +281,7 @@ def test_lerobot_merges_suites_but_no_older_tasks(datasets: dict[str, Path], tmp
         merge(tmp_path / "object", tmp_path / "refused")
 
 
-def test_a_recording_of_another_protocol_version_is_not_gone_on_with(
+def test_a_recording_of_another_protocol_version_is_not_resumed(
     datasets: dict[str, Path], tmp_path: Path
 ) -> None:
     old = replace(IMAGES, protocol_version="0.0")

@@ -124,7 +124,7 @@ def test_ten_kills_lose_nothing(mode: str, references: dict[str, Reference], tmp
 
 
 @pytest.mark.parametrize(("number", "code"), [(signal.SIGINT, 130), (signal.SIGTERM, 143)])
-def test_a_stopped_recorder_says_how_to_go_on(
+def test_a_stopped_recorder_says_how_to_resume(
     number: int, code: int, references: dict[str, Reference], tmp_path: Path
 ) -> None:
     rng = random.Random(SEED)

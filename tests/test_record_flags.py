@@ -125,7 +125,7 @@ def test_a_folder_of_something_else_is_left_alone(tmp_path: Path, capsys: pytest
 def test_there_must_be_something_to_resume(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert cli.main([*FLAGS, f"--root={tmp_path / 'x'}", "--resume=true"]) == 1
     message = capsys.readouterr().err
-    assert f"--resume: there is no recording to go on with in --root={tmp_path / 'x'}" in message
+    assert f"--resume: there is no recording to resume in --root={tmp_path / 'x'}" in message
 
 
 @pytest.mark.parametrize("is_complete", [True, False])
@@ -348,5 +348,5 @@ def test_seeds_that_evaluations_play_are_pointed_out(
     flags = ["record", "--repo_id=test/x", f"--episodes={episodes}", f"--seed={seed}", f"--root={tmp_path}"]
     assert cli.main(flags) == 1  # the folder exists
     last = seed + episodes - 1
-    said = f"the seeds {seed}..{last} have episodes that evaluations play, 1000 to 1199"
+    said = f"the seeds {seed}..{last} have episodes that evaluations run, 1000 to 1199"
     assert (said in capsys.readouterr().err) == is_warned

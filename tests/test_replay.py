@@ -1,4 +1,4 @@
-"""``lerobot-bomb replay``: a line of results once more, bit for bit; and the same with another axis."""
+"""``lerobot-bomb replay``: a record's episode once more, bit for bit; and the same with another axis."""
 
 import json
 from collections.abc import Callable
@@ -26,17 +26,17 @@ def results(tmp_path_factory: pytest.TempPathFactory) -> Callable[..., Path]:
 
     files: dict[Any, Path] = {}
 
-    def play(policy: str, *flags: str, condition: str = "all:1-5") -> Path:
+    def evaluated(policy: str, *flags: str, condition: str = "all:1-5") -> Path:
         if (policy, flags, condition) not in files:
             folder = tmp_path_factory.mktemp("sweep")
             shown = ("--env.type=bomb", "--env.image_size=64", "--policy.device=cpu", *flags)
             store = Store(folder, plan((policy,), (), (condition,), 7, 3, 3, shown))
-            Worker(store).run(list(store.manifest.cells))
+            Worker(store).run(list(store.manifest.jobs))
             store.merge()
             files[policy, flags, condition] = folder / "results.jsonl"
         return files[policy, flags, condition]
 
-    return play
+    return evaluated
 
 
 def rewritten(path: Path, file: Path, **changes: Any) -> Path:
@@ -56,7 +56,7 @@ def rewritten(path: Path, file: Path, **changes: Any) -> Path:
         ("bomb_expert", ()),
     ],
 )
-def test_a_line_is_played_again_bit_for_bit(
+def test_a_record_is_run_again_bit_for_bit(
     policy: str,
     flags: tuple[str, ...],
     results: Callable[..., Path],

@@ -241,7 +241,7 @@ def test_the_page_says_how_many_lines_are_damaged(rows: Rows, tmp_path: Path) ->
     assert f"{path}: 2 damaged records are not counted" in (tmp_path / "page.html").read_text()
 
 
-def test_the_command_that_is_given_plays_the_same_again(rows: Rows, written: Path) -> None:
+def test_the_command_that_is_given_runs_the_same_again(rows: Rows, written: Path) -> None:
     (section,) = [
         each for each in json.loads((written / "r.json").read_text()) if each["title"] == "What was run"
     ]

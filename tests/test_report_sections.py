@@ -385,7 +385,7 @@ def test_failures_are_shown_as_videos_beside_the_page(
     flags = ("--env.type=bomb", "--env.image_size=32", "--env.fps=2", "--policy.device=cpu")
     monkeypatch.setattr(built, "_BUILT", [])  # the policies of other tests do not act here
     store = Store(tmp_path / "sweep", plan(("bomb_random",), (), ("none",), 7, 2, 2, flags))
-    Worker(store).run(list(store.manifest.cells))
+    Worker(store).run(list(store.manifest.jobs))
     store.merge()
     results, page = store.folder / "results.jsonl", tmp_path / "a b" / "r.html"
     assert main(["report", str(results), f"--output={page}", "--videos=1"]) == 0

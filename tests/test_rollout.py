@@ -1,4 +1,4 @@
-"""Episodes that the recorder plays, and their noise."""
+"""Episodes that the recorder runs, and their noise."""
 
 import itertools
 import multiprocessing
@@ -74,7 +74,7 @@ def test_a_pool_yields_in_the_order_of_the_specs() -> None:
     assert rollouts[0].frames["workspace"].shape == (rollouts[0].result.steps, 64, 64, 3)
 
 
-def test_a_pool_that_is_iterated_block_by_block_goes_on_and_plays_no_further_ahead() -> None:
+def test_a_pool_that_is_iterated_block_by_block_goes_on_and_runs_no_further_ahead() -> None:
     drawn = []
 
     def specs() -> Iterator[EpisodeSpec]:

@@ -12,7 +12,7 @@ from lerobot_env_bomb.render import CameraRenderer
 from lerobot_env_bomb.scene import WORKSPACE_HIGH, WORKSPACE_LOW, Scene
 
 NUM_SUBSTEPS = 20
-BLACK_CELL, WHITE_CELL = (1, 1), (3, 3)
+BLACK_AT, WHITE_AT = (1, 1), (3, 3)
 
 REST_HEIGHT_M = BOARD.thickness_m + BOARD.stone_height_m / 2
 
@@ -28,8 +28,8 @@ def layout() -> Layout:
     stone_xy = np.zeros((NUM_STONES, 2))
     stone_xy[:3] = [
         TRAY_CENTER_XY,
-        BOARD.intersection_xy(*BLACK_CELL),
-        BOARD.intersection_xy(*WHITE_CELL),
+        BOARD.intersection_xy(*BLACK_AT),
+        BOARD.intersection_xy(*WHITE_AT),
     ]
     return Layout(
         gripper_xyz=np.array([*TRAY_CENTER_XY, 0.1]),

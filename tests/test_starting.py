@@ -50,7 +50,7 @@ def datasets(tmp_path_factory: pytest.TempPathFactory) -> dict[str, LeRobotDatas
     }
 
 
-def go_on(checkpoint: Path, dataset: LeRobotDataset) -> Any:
+def started_from(checkpoint: Path, dataset: LeRobotDataset) -> Any:
     """Load a policy as lerobot-train --policy.path does."""
     config = PreTrainedConfig.from_pretrained(checkpoint)
     config.pretrained_path = checkpoint
@@ -91,7 +91,7 @@ def test_other_cameras_are_told_before_lerobot_refuses_them(
     caplog: pytest.LogCaptureFixture,
 ) -> None:
     with pytest.raises(ValueError, match="Feature mismatch"):
-        go_on(checkpoints[policy_type], datasets["cameras"])
+        started_from(checkpoints[policy_type], datasets["cameras"])
     (told,) = (record.getMessage() for record in caplog.records if "--rename_map" in record.getMessage())
     assert "reads observation.images.workspace, observation.images.wrist; this dataset has" in told
     assert "observation.images.front, observation.images.side. Unless --rename_map" in told
@@ -101,7 +101,7 @@ def test_other_cameras_are_told_before_lerobot_refuses_them(
 def test_images_of_another_size_are_taken(
     checkpoints: dict[str, Path], datasets: dict[str, LeRobotDataset], policy_type: str
 ) -> None:
-    policy = go_on(checkpoints[policy_type], datasets["size"])
+    policy = started_from(checkpoints[policy_type], datasets["size"])
     assert {feature.shape for feature in policy.config.image_features.values()} == {(3, 48, 48)}
 
 
@@ -115,7 +115,7 @@ def test_dimensions_that_weights_are_made_for_are_told(
     dataset = datasets["state" if key == STATE else "action"]
     message = rf"has '{key}' of shape \(4,\), this dataset has it of shape \(6,\); .* {WAY_OUT}"
     with pytest.raises(ValueError, match=message):
-        go_on(checkpoints[name], dataset)
+        started_from(checkpoints[name], dataset)
 
 
 @pytest.mark.parametrize(
@@ -125,7 +125,7 @@ def test_dimensions_that_weights_are_made_for_are_told(
 def test_dimensions_that_are_text_are_taken(
     checkpoints: dict[str, Path], datasets: dict[str, LeRobotDataset], name: str, key: str
 ) -> None:
-    policy = go_on(checkpoints[name], datasets[key])
+    policy = started_from(checkpoints[name], datasets[key])
     features = {**policy.config.input_features, **policy.config.output_features}
     assert features[STATE if key == "state" else ACTION].shape == (6,)
     assert 0 < loss_of(policy, datasets[key]) < 100

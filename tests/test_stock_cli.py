@@ -81,7 +81,7 @@ def test_each_condition_has_a_rate_and_a_recording(stock_cli: Run, tmp_path: Pat
         validate_repo_id(f"me/recorded_{key}_0")  # what --eval.recording_repo_id makes of it
         tasks = pq.read_table(recordings / f"{key}_0" / "meta" / "tasks.parquet")
         assert tasks["task"].to_pylist() == [instructions[condition]]
-    # the nominal arm has the same seeds, targets and colours
+    # the nominal condition has the same seeds, targets and colours
     episodes = {
         condition: [(r.spec.seed, r.target, r.color) for r in rows if r.spec.perturbations == condition]
         for condition in ("none", "camera:3", "all:5")

@@ -1,4 +1,4 @@
-"""LeRobot's own `pusht` and `libero` in a sweep, and as lines of results."""
+"""LeRobot's own `pusht` and `libero` in a sweep, and as records."""
 
 import json
 from collections.abc import Callable
@@ -44,26 +44,26 @@ def manifest(checkpoint: Path) -> Manifest:
 
 
 @pytest.fixture
-def play(tmp_path: Path) -> Callable[[Manifest], Store]:
-    """Play all cells of a manifest in this process."""
+def run_all(tmp_path: Path) -> Callable[[Manifest], Store]:
+    """Run all jobs of a manifest in this process."""
     from lerobot_bomb.sweep.worker import Worker
 
-    def play(manifest: Manifest) -> Store:
+    def run_all(manifest: Manifest) -> Store:
         store = Store(tmp_path / "sweep", manifest)
-        Worker(store).run(list(manifest.cells))
+        Worker(store).run(list(manifest.jobs))
         store.merge()
         return store
 
-    return play
+    return run_all
 
 
 def test_a_sweep_gives_the_lines_that_are_made_of_the_printed_command(
-    manifest: Manifest, play: Callable[[Manifest], Store], stock_cli: Callable[..., None], tmp_path: Path
+    manifest: Manifest, run_all: Callable[[Manifest], Store], stock_cli: Callable[..., None], tmp_path: Path
 ) -> None:
-    store = play(manifest)
-    (cell,) = manifest.cells
-    assert "results_path" not in cell.command
-    flags = [*cell.flags, f"--output_dir={tmp_path / 'eval'}"]
+    store = run_all(manifest)
+    (job,) = manifest.jobs
+    assert "results_path" not in job.command
+    flags = [*job.flags, f"--output_dir={tmp_path / 'eval'}"]
     stock_cli("lerobot-eval", *flags)
     assert main(["results", "add", str(tmp_path / "stock.jsonl"), *flags]) == 0
     assert (store.folder / "results.jsonl").read_text() == (tmp_path / "stock.jsonl").read_text()
@@ -79,11 +79,11 @@ def test_a_sweep_gives_the_lines_that_are_made_of_the_printed_command(
 
 def test_results_compare_and_report_read_the_lines(
     manifest: Manifest,
-    play: Callable[[Manifest], Store],
+    run_all: Callable[[Manifest], Store],
     capsys: pytest.CaptureFixture[str],
     tmp_path: Path,
 ) -> None:
-    lines = (play(manifest).folder / "results.jsonl").read_text()
+    lines = (run_all(manifest).folder / "results.jsonl").read_text()
     first, second = tmp_path / "first.jsonl", tmp_path / "second.jsonl"
     first.write_text(lines)
     rows = [json.loads(line) for line in lines.splitlines()]
@@ -103,7 +103,7 @@ def test_results_compare_and_report_read_the_lines(
 
 
 def test_an_episode_that_raises_is_an_error_and_no_failure(
-    manifest: Manifest, play: Callable[[Manifest], Store], monkeypatch: pytest.MonkeyPatch
+    manifest: Manifest, run_all: Callable[[Manifest], Store], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     from lerobot.scripts import lerobot_eval
 
@@ -115,25 +115,25 @@ def test_an_episode_that_raises_is_an_error_and_no_failure(
         return rollout(*args, seeds=seeds, **options)
 
     monkeypatch.setattr(lerobot_eval, "rollout", raising)
-    store = play(manifest)
-    (error,) = store.errors(manifest.cells[0])
+    store = run_all(manifest)
+    (error,) = store.errors(manifest.jobs[0])
     assert (error.seed, error.error) == (9, "RuntimeError: out of memory")
     assert "--seed=9 --eval.n_episodes=1" in error.command
     assert [row.spec.seed for row in read_results(store.folder / "results.jsonl")] == [7, 8, 10]
     monkeypatch.undo()
-    store.begin_again(manifest.cells)
-    assert len(read_results(play(manifest).folder / "results.jsonl")) == 4
+    store.begin_again(manifest.jobs)
+    assert len(read_results(run_all(manifest).folder / "results.jsonl")) == 4
 
 
 def test_actions_that_are_not_finite_are_errors(
-    manifest: Manifest, play: Callable[[Manifest], Store], monkeypatch: pytest.MonkeyPatch
+    manifest: Manifest, run_all: Callable[[Manifest], Store], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     from lerobot.policies.act.modeling_act import ACTPolicy
 
     select = ACTPolicy.select_action
     monkeypatch.setattr(ACTPolicy, "select_action", lambda *args: select(*args) * float("nan"))
-    store = play(manifest)
-    errors = store.errors(manifest.cells[0])
+    store = run_all(manifest)
+    errors = store.errors(manifest.jobs[0])
     assert [error.seed for error in errors] == SEEDS
     assert {error.error for error in errors} == {"ArithmeticError: an action of the policy is not finite"}
 
@@ -212,8 +212,8 @@ def test_what_is_no_such_evaluation_is_told(
 
 
 @pytest.mark.long
-def test_libero_is_played_from_the_initial_states_in_order(
-    libero_with_assets: Libero, play: Callable[[Manifest], Store], monkeypatch: pytest.MonkeyPatch
+def test_libero_is_run_from_the_initial_states_in_order(
+    libero_with_assets: Libero, run_all: Callable[[Manifest], Store], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     from lerobot_env_mujoco.backend import ensure_gl_backend
 
@@ -239,8 +239,10 @@ def test_libero_is_played_from_the_initial_states_in_order(
     flags += ("--env.observation_height=48", "--env.observation_width=48", "--policy.vlm_model_name=nano")
     flags += ("--policy.use_state=false",)
     policies = ("vla0_smol",)
-    store = play(plan(policies, ("libero_spatial",), (), seed=7, num_episodes=3, batch_size=1, flags=flags))
+    store = run_all(
+        plan(policies, ("libero_spatial",), (), seed=7, num_episodes=3, batch_size=1, flags=flags)
+    )
     rows = read_results(store.folder / "results.jsonl", StockLiberoResult)
     assert [(row.spec.seed, row.spec.number) for row in rows] == [(7, 0), (8, 1), (9, 2)]
-    # the third raised in the evaluation of all, then each was played alone
+    # the third raised in the evaluation of all, then each was run alone
     assert started == [0, 1, 0, 1, 2]

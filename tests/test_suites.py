@@ -16,7 +16,7 @@ from lerobot_bomb.bomb.observation import RenderOptions
 from lerobot_bomb.bomb.suite import find_suite, specs_of_tasks
 from lerobot_bomb.bomb.suites import object as object_suite
 from lerobot_bomb.bomb.suites import spatial as spatial_suite
-from lerobot_bomb.envs.rollout import expert_agent, make_env, play
+from lerobot_bomb.envs.rollout import expert_agent, make_env, run_episode
 from lerobot_env_bomb.perturb import PerturbedEpisode, sample_episode
 from lerobot_env_bomb.scene import WORKSPACE_HIGH, WORKSPACE_LOW
 
@@ -78,7 +78,7 @@ def meant_places(instruction: str, episode: PerturbedEpisode) -> set[Intersectio
         d_row, d_column = steps[found[1]]
         return free & {(r + d_row, c + d_column) for (r, c), color in stones.items() if color == found[2]}
     if found := re.search(r"between the two (black|white) stones", instruction):
-        pair = [cell for cell, color in stones.items() if color == found[1]]
+        pair = [intersection for intersection, color in stones.items() if color == found[1]]
         assert len(pair) == 2
         return free & {((pair[0][0] + pair[1][0]) // 2, (pair[0][1] + pair[1][1]) // 2)}
     if found := re.search(r"the (far|near) (left|right) corner", instruction):
@@ -86,8 +86,8 @@ def meant_places(instruction: str, episode: PerturbedEpisode) -> set[Intersectio
     if re.search(r"in the centre|on the star point", instruction):
         return free & {(2, 2)}
     if "only free intersection of a row" in instruction:
-        rows = [{cell for cell in free if cell[0] == row} for row in range(5)]
-        return {cell for row in rows if len(row) == 1 for cell in row}
+        rows = [{intersection for intersection in free if intersection[0] == row} for row in range(5)]
+        return {intersection for row in rows if len(row) == 1 for intersection in row}
     return free & {episode.target}  # coordinates, which tests of `place` read
 
 
@@ -123,7 +123,7 @@ def test_stones_lie_legally_apart_and_within_reach(suite: str, condition: str, s
 
 
 @pytest.mark.parametrize("suite", NEW_SUITES)
-def test_a_numbered_task_is_played_and_all_are_drawn(suite: str) -> None:
+def test_a_numbered_task_is_run_and_all_are_drawn(suite: str) -> None:
     numbers = range(find_suite(suite).num_tasks)
     phrases = {"object": object_suite.TASKS, "spatial": spatial_suite.TASKS}[suite]
     for task_id, spec in zip(numbers, specs_of_tasks(EpisodeSpec(3, suite), numbers), strict=True):
@@ -199,7 +199,7 @@ def test_the_expert_brings_the_stone_that_is_meant(suite: str, condition: str) -
     successes = []
     for task_id in numbers:
         env = make_env(replace(spec, task_id=task_id), RenderOptions(image_size=32))
-        for moment in play(env, replace(spec, seed=task_id), expert_agent()):
+        for moment in run_episode(env, replace(spec, seed=task_id), expert_agent()):
             last = moment
         successes.append(last.info["is_success"])
         env.close()

@@ -1,4 +1,4 @@
-"""``lerobot-bomb sweep``: cells are played once, by anybody, and give the lines of lerobot-eval."""
+"""``lerobot-bomb sweep``: jobs are run once, by anybody, and give the records of lerobot-eval."""
 
 import json
 import os
@@ -21,7 +21,7 @@ from lerobot_bomb.results.groups import read_results
 from lerobot_bomb.results.record import Record, without_measured
 from lerobot_bomb.sweep.claim import claimed
 from lerobot_bomb.sweep.local import PYTHON, progress
-from lerobot_bomb.sweep.manifest import Cell, Manifest, plan
+from lerobot_bomb.sweep.manifest import Job, Manifest, plan
 from lerobot_bomb.sweep.store import MAX_ATTEMPTS, Store
 
 FLAGS = ("--env.type=bomb", "--env.image_size=32", "--policy.device=cpu")
@@ -34,9 +34,9 @@ def small(
     return plan(policies, ("place",), conditions, seed=7, num_episodes=n, batch_size=10, flags=FLAGS)
 
 
-def lines_of(cell: Cell) -> list[str]:
-    """Return as many lines as the cell has episodes."""
-    return [json.dumps({"spec": {"seed": seed}}) for seed in cell.seeds]
+def lines_of(job: Job) -> list[str]:
+    """Return as many lines as the job has episodes."""
+    return [json.dumps({"spec": {"seed": seed}}) for seed in job.seeds]
 
 
 def sweep(*flags: str | Path) -> int:
@@ -48,14 +48,14 @@ def sweep(*flags: str | Path) -> int:
 
 def test_a_plan_is_every_policy_on_every_task_under_every_condition() -> None:
     manifest = plan(("bomb:fdvla", "act"), ("place", "object"), ("none", "light:3"), 5, 20, 8, FLAGS)
-    assert len(manifest.cells) == 8 and manifest.num_episodes == 160
-    first = manifest.cells[0]
+    assert len(manifest.jobs) == 8 and manifest.num_episodes == 160
+    first = manifest.jobs[0]
     assert first.flags == [
         "--policy.path=bomb:fdvla", "--policy.device=cpu", "--env.type=bomb", "--env.image_size=32",
         "--env.task=place", '--env.perturbations=["none"]', "--seed=5", "--eval.n_episodes=20",
         "--eval.batch_size=5", "--eval.use_async_envs=false",
     ]  # fmt: skip
-    assert manifest.cells[-1].policy[0] == "--policy.type=act"
+    assert manifest.jobs[-1].policy[0] == "--policy.type=act"
 
 
 def test_a_manifest_is_read_as_it_was_written(tmp_path: Path) -> None:
@@ -70,7 +70,7 @@ def test_a_manifest_is_read_as_it_was_written(tmp_path: Path) -> None:
         ({"seed": -1}, "seed=-1 must be a whole number from 0 on"),
         ({"num_episodes": "many"}, "num_episodes='many' must be a whole number from 1 on"),
         ({"seed": 8}, "its command is not that of its flags"),
-        ({"env": None}, "a cell is damaged"),
+        ({"env": None}, "a job is damaged"),
     ],
 )
 def test_a_manifest_that_was_damaged_is_refused(tmp_path: Path, change: dict[str, Any], message: str) -> None:
@@ -87,7 +87,7 @@ def test_a_manifest_that_was_damaged_is_refused(tmp_path: Path, change: dict[str
     "flag", ["--seed=3", "--eval.n_episodes=4", "--policy.path=x", "--env.results_path=y"]
 )
 def test_what_the_sweep_sets_itself_is_refused_as_a_flag(flag: str) -> None:
-    with pytest.raises(ValueError, match="is set for every cell"):
+    with pytest.raises(ValueError, match="is set for every job"):
         plan(("act",), (), (), 0, 1, 1, [flag])
 
 
@@ -100,64 +100,64 @@ def test_dry_run_prints_the_commands(tmp_path: Path, capsys: pytest.CaptureFixtu
     assert "camera:2" in "".join(commands) and "goal_marker" not in "".join(commands)
 
 
-# Who plays what
+# Who runs what
 
 
-def test_a_cell_is_of_one_worker_at_a_time(tmp_path: Path) -> None:
-    (cell,) = small().cells
+def test_a_job_is_of_one_worker_at_a_time(tmp_path: Path) -> None:
+    (job,) = small().jobs
     one, other = Store(tmp_path, small()), Store(tmp_path, small())
-    with one.claimed(cell) as mine, other.claimed(cell) as theirs:
+    with one.claimed(job) as mine, other.claimed(job) as theirs:
         assert mine and not theirs
-    with other.claimed(cell) as theirs:
+    with other.claimed(job) as theirs:
         assert theirs
 
 
-def test_a_cell_whose_workers_are_killed_is_given_up_and_can_be_retried(tmp_path: Path) -> None:
-    (cell,) = small().cells
+def test_a_job_whose_workers_are_killed_is_given_up_and_can_be_retried(tmp_path: Path) -> None:
+    (job,) = small().jobs
     store = Store(tmp_path, small())
-    assert [store.begin(cell) for _ in range(MAX_ATTEMPTS + 1)] == [True] * MAX_ATTEMPTS + [False]
-    assert store.is_over(cell) and not store.is_finished(cell)
-    assert any("3 workers ended while they played it" in line for line in store.lines())
-    store.begin_again([cell])
-    assert not store.is_over(cell) and store.begin(cell)
+    assert [store.begin(job) for _ in range(MAX_ATTEMPTS + 1)] == [True] * MAX_ATTEMPTS + [False]
+    assert store.is_over(job) and not store.is_finished(job)
+    assert any("3 workers ended while they ran it" in line for line in store.lines())
+    store.begin_again([job])
+    assert not store.is_over(job) and store.begin(job)
 
 
 def test_a_sweep_that_was_stopped_is_no_failed_attempt(tmp_path: Path) -> None:
-    (cell,) = small().cells
+    (job,) = small().jobs
     stopped = Store(tmp_path, small())
     for _ in range(MAX_ATTEMPTS):
-        assert stopped.begin(cell)
+        assert stopped.begin(job)
     store = Store(tmp_path, small())
     worker = Store(tmp_path, small(), store.run)
     for each in (store, worker, store):
-        assert each.begin(cell)
-    assert not worker.begin(cell) and store.is_over(cell)
+        assert each.begin(job)
+    assert not worker.begin(job) and store.is_over(job)
 
 
-def test_a_changed_cell_is_another_cell(tmp_path: Path) -> None:
+def test_a_changed_job_is_another_job(tmp_path: Path) -> None:
     before, after = small(n=3), small(n=4)
     store = Store(tmp_path, before)
-    store.finish(before.cells[0], lines_of(before.cells[0]), [])
+    store.finish(before.jobs[0], lines_of(before.jobs[0]), [])
     changed = Store(tmp_path, after)
-    assert not changed.is_finished(after.cells[0])
-    assert any("the manifest has changed: 1 cells" in line for line in changed.lines())
+    assert not changed.is_finished(after.jobs[0])
+    assert any("the manifest has changed: 1 jobs" in line for line in changed.lines())
 
 
-# Playing
+# Running
 
 
 @pytest.fixture
-def play(tmp_path: Path) -> Callable[[Manifest], Store]:
-    """Play all cells of a manifest in this process."""
+def run_all(tmp_path: Path) -> Callable[[Manifest], Store]:
+    """Run all jobs of a manifest in this process."""
     from lerobot_bomb.sweep.worker import Worker
 
-    def play(manifest: Manifest) -> Store:
+    def run_all(manifest: Manifest) -> Store:
         store = Store(tmp_path / "sweep", manifest)
-        Worker(store).run(list(manifest.cells))
+        Worker(store).run(list(manifest.jobs))
         store.merge()
         return store
 
-    return play
+    return run_all
 
 
 def by_seed(rows: list[Record]) -> list[Record]:
@@ -175,23 +175,23 @@ def by_seed(rows: list[Record]) -> list[Record]:
     ],
 )
 def test_the_lines_are_those_of_lerobot_eval(
-    policy: str, play: Callable[[Manifest], Store], stock_cli: Callable[..., None], tmp_path: Path
+    policy: str, run_all: Callable[[Manifest], Store], stock_cli: Callable[..., None], tmp_path: Path
 ) -> None:
     flags = ("--env.type=bomb", "--env.image_size=64", "--env.fps=2", "--policy.device=cpu")
     flags += ("--env.ignore_checkpoint=true",)  # of 10 Hz, whose episodes are five times as long
     conditions = ("none", "light:3", "camera:2")
     manifest = plan((policy,), ("place",), conditions, seed=7, num_episodes=2, batch_size=2, flags=flags)
-    store = play(manifest)
-    # the last of several that one process played with one policy
-    command = [*manifest.cells[-1].flags, f"--env.results_path={tmp_path / 'stock.jsonl'}"]
+    store = run_all(manifest)
+    # the last of several that one process ran with one policy
+    command = [*manifest.jobs[-1].flags, f"--env.results_path={tmp_path / 'stock.jsonl'}"]
     stock_cli("lerobot-eval", *command, f"--output_dir={tmp_path / 'eval'}")
-    ours = read_results(store.file(manifest.cells[-1], "jsonl"))
+    ours = read_results(store.file(manifest.jobs[-1], "jsonl"))
     assert by_seed(ours) == by_seed(read_results(tmp_path / "stock.jsonl"))
     assert read_results(store.folder / "results.jsonl")
 
 
 def test_an_episode_that_raises_is_an_error_and_no_failure(
-    play: Callable[[Manifest], Store], monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+    run_all: Callable[[Manifest], Store], monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     from lerobot.scripts import lerobot_eval
 
@@ -204,25 +204,25 @@ def test_an_episode_that_raises_is_an_error_and_no_failure(
 
     monkeypatch.setattr(lerobot_eval, "rollout", raising)
     manifest = small(n=5)  # seeds 7..11
-    store = play(manifest)
+    store = run_all(manifest)
     rows = read_results(store.folder / "results.jsonl")
     assert [row.spec.seed for row in rows] == [7, 8, 10, 11]
-    (error,) = store.errors(manifest.cells[0])
+    (error,) = store.errors(manifest.jobs[0])
     assert (error.seed, error.error) == (9, "ArithmeticError: the answer is not finite")
     assert "--seed=9 --eval.n_episodes=1" in error.command
     text = "\n".join(store.lines())
     assert "4 of 5 episodes" in text and "1 x ArithmeticError: the answer is not finite" in text
     monkeypatch.undo()
-    store.begin_again(manifest.cells)
-    play(manifest)
-    assert len(read_results(store.folder / "results.jsonl")) == 5 and not store.errors(manifest.cells[0])
+    store.begin_again(manifest.jobs)
+    run_all(manifest)
+    assert len(read_results(store.folder / "results.jsonl")) == 5 and not store.errors(manifest.jobs[0])
 
 
-def test_a_cell_that_cannot_begin_is_given_up_at_once(play: Callable[[Manifest], Store]) -> None:
+def test_a_job_that_cannot_begin_is_given_up_at_once(run_all: Callable[[Manifest], Store]) -> None:
     flags = ("--env.type=bomb", "--env.image_size=48", "--policy.device=cpu")  # of a policy of 64
     manifest = plan((NANO, "bomb_expert"), (), ("none",), seed=7, num_episodes=1, batch_size=1, flags=flags)
-    store = play(manifest)
-    assert [store.is_finished(cell) for cell in manifest.cells] == [False, True]
+    store = run_all(manifest)
+    assert [store.is_finished(job) for job in manifest.jobs] == [False, True]
     assert any("image_size=64" in line for line in store.lines())
 
 
@@ -309,14 +309,14 @@ def test_the_flags_that_may_be_lerobots_without_a_group_are_those_that_it_has() 
         ((NANO,), (), ("--env.type=bomb_pusht",), "this is --env.type=bomb_pusht"),
     ],
 )
-def test_a_checkpoint_of_another_environment_is_told_before_anything_is_played(
+def test_a_checkpoint_of_another_environment_is_told_before_anything_is_run(
     policies: tuple[str, ...], tasks: tuple[str, ...], flags: tuple[str, ...], message: str
 ) -> None:
     from lerobot_bomb.sweep.check import check
 
     with pytest.raises(ValueError, match=message) as error:
         check(plan(policies, tasks, ("none", "all:3"), 7, 1, 1, flags))
-    assert str(error.value).endswith("or insist with --env.ignore_checkpoint=true")
+    assert str(error.value).endswith("or override with --env.ignore_checkpoint=true")
     check(plan(policies, tasks, ("none",), 7, 1, 1, (*flags, "--env.ignore_checkpoint=true")))
 
 
@@ -341,19 +341,19 @@ def test_files_that_vanish_while_they_are_counted_do_not_matter(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     manifest = small()
-    (cell,) = manifest.cells
+    (job,) = manifest.jobs
     store = Store(tmp_path, manifest)
-    store.finish(cell, lines_of(cell), [])
-    store.file(cell, "part").write_text("{}\n")
+    store.finish(job, lines_of(job), [])
+    store.file(job, "part").write_text("{}\n")
     is_file = Path.is_file
 
     def then_removed(path: Path) -> bool:
         found = is_file(path)
-        store.file(cell, "part").unlink(missing_ok=True)
+        store.file(job, "part").unlink(missing_ok=True)
         return found
 
     monkeypatch.setattr(Path, "is_file", then_removed)
-    assert store.num_played([cell]) in (3, 4)
+    assert store.num_run([job]) in (3, 4)
 
 
 def test_sigterm_ends_a_sweep_as_ctrl_c_does(
@@ -361,29 +361,30 @@ def test_sigterm_ends_a_sweep_as_ctrl_c_does(
 ) -> None:
     small().write(tmp_path)
     monkeypatch.setattr(
-        "lerobot_bomb.commands.sweep.play", lambda *_: os.kill(os.getpid(), signal.SIGTERM) or time.sleep(9)
+        "lerobot_bomb.commands.sweep.run_part",
+        lambda *_: os.kill(os.getpid(), signal.SIGTERM) or time.sleep(9),
     )
     assert sweep(tmp_path) == 130
     printed = capsys.readouterr()
-    assert f"to go on: lerobot-bomb sweep {tmp_path}" in printed.out and "interrupted" in printed.err
+    assert f"to resume: lerobot-bomb sweep {tmp_path}" in printed.out and "interrupted" in printed.err
     assert (tmp_path / "results.jsonl").read_text() == ""
 
 
 def test_a_folder_of_another_sweep_is_left_alone(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     manifest = small()
     manifest.write(tmp_path)
-    Store(tmp_path, manifest).finish(manifest.cells[0], lines_of(manifest.cells[0]), [])
+    Store(tmp_path, manifest).finish(manifest.jobs[0], lines_of(manifest.jobs[0]), [])
     assert sweep(tmp_path, "--policies=bomb_random", "--dry_run", *FLAGS) == 1
-    assert "is of another sweep: of its cells these flags lack 1, as lerobot-eval" in capsys.readouterr().err
+    assert "is of another sweep: of its jobs these flags lack 1, as lerobot-eval" in capsys.readouterr().err
     assert Manifest.read(tmp_path) == manifest
 
 
-def test_a_folder_where_nothing_was_played_takes_another_sweep(tmp_path: Path) -> None:
+def test_a_folder_where_nothing_was_run_takes_another_sweep(tmp_path: Path) -> None:
     misspelt, other = small(), small(("bomb_random",))
     with claimed(tmp_path, misspelt) as store:
-        store.give_up(misspelt.cells[0], "no such flag")
+        store.give_up(misspelt.jobs[0], "no such flag")
         assert "takes a sweep with other flags" in store.lines()[-1]
-    outliving = Store(tmp_path, misspelt).claimed(misspelt.cells[0])
+    outliving = Store(tmp_path, misspelt).claimed(misspelt.jobs[0])
     with outliving, pytest.raises(ValueError, match="is of another sweep"), claimed(tmp_path, other):
         pass
     with claimed(tmp_path, other) as store:
@@ -437,29 +438,29 @@ def test_a_worker_whose_parent_is_gone_imports_nothing(tmp_path: Path) -> None:
     assert "threading" in ended.stderr and "lerobot.envs" not in ended.stderr
 
 
-def test_cells_have_names_of_their_own() -> None:
-    cells = small(("bomb_expert", "bomb:fdvla"), ("none", "camera:3", "camera:2+light:3")).cells
-    assert len({cell.key for cell in cells}) == 6
-    assert Cell(("--policy.type=a/b",), ("--env.type=c d",), 0, 1, 1).key.isascii()
+def test_jobs_have_names_of_their_own() -> None:
+    jobs = small(("bomb_expert", "bomb:fdvla"), ("none", "camera:3", "camera:2+light:3")).jobs
+    assert len({job.key for job in jobs}) == 6
+    assert Job(("--policy.type=a/b",), ("--env.type=c d",), 0, 1, 1).key.isascii()
 
 
-def test_what_a_command_said_before_it_exited_is_the_reason(play: Callable[[Manifest], Store]) -> None:
+def test_what_a_command_said_before_it_exited_is_the_reason(run_all: Callable[[Manifest], Store]) -> None:
     flags = (*FLAGS, "--env.tsak=place")
-    store = play(plan(("bomb_expert",), (), ("none",), 7, 1, 1, flags))
+    store = run_all(plan(("bomb_expert",), (), ("none",), 7, 1, 1, flags))
     (reason,) = [line for line in store.lines() if "tsak" in line and "given up" not in line]
     assert "unrecognized arguments" in reason
 
 
-def test_lines_of_finished_cells_are_there_before_the_sweep_has_ended(tmp_path: Path) -> None:
+def test_lines_of_finished_jobs_are_there_before_the_sweep_has_ended(tmp_path: Path) -> None:
     manifest = small(conditions=("none", "light:3"))
-    first, second = manifest.cells
+    first, second = manifest.jobs
     store = Store(tmp_path, manifest)
-    states = progress(store, manifest.cells)
+    states = progress(store, manifest.jobs)
     next(states)
     store.finish(first, lines_of(first), [])
     next(states)
     assert (tmp_path / "results.jsonl").read_text().splitlines() == lines_of(first)
     store.file(first, "jsonl").unlink()
-    assert not next(states), "a cell that is over was counted again"
+    assert not next(states), "a job that is over was counted again"
     store.finish(second, lines_of(second), [])
     assert list(states) == []

@@ -1,4 +1,4 @@
-"""``lerobot-bomb sweep`` over GPUs and clusters: whoever plays the cells, the lines are the same."""
+"""``lerobot-bomb sweep`` over GPUs and clusters: whoever runs the jobs, the records are the same."""
 
 import os
 import subprocess
@@ -37,12 +37,12 @@ def sweep(*flags: str | Path) -> int:
 
 @pytest.fixture(scope="module")
 def expected_lines(tmp_path_factory: pytest.TempPathFactory) -> str:
-    """Return the lines of all cells, run in this process."""
+    """Return the lines of all jobs, run in this process."""
     from lerobot_bomb.sweep.worker import Worker
 
     manifest = plan(("bomb_expert",), (), CONDITIONS, seed=7, num_episodes=2, batch_size=2, flags=FLAGS)
     store = Store(tmp_path_factory.mktemp("sweep"), manifest)
-    Worker(store).run(list(manifest.cells))
+    Worker(store).run(list(manifest.jobs))
     store.merge()
     return (store.folder / "results.jsonl").read_text()
 
@@ -62,7 +62,7 @@ def jobs(monkeypatch: pytest.MonkeyPatch) -> list[list[str]]:
         commands.append(list(command))
         return main(command[len(local.PYTHON) + 1 :])
 
-    monkeypatch.setattr(sweep_command, "play", run_part)
+    monkeypatch.setattr(sweep_command, "run_part", run_part)
     monkeypatch.setattr(cluster.subprocess, "check_call", run_job)
     return commands
 
@@ -116,7 +116,7 @@ def test_workers_that_end_at_once_are_started_anew_on_their_gpus_and_then_no_mor
     assert sweep(tmp_path, "--workers=2", *SWEEP) == 1
     log = (tmp_path / "workers.log").read_text().split()
     assert set(log) == {"4", "7"} and log.count("4") >= 3 and log.count("7") >= 3
-    assert "workers end before they play" in capsys.readouterr().err
+    assert "workers end before they run" in capsys.readouterr().err
 
 
 # SLURM
@@ -158,8 +158,8 @@ def test_commands_of_a_slurm_script_run_everything(
         assert sweep("it's a sweep", "--slurm=2", *SWEEP) == 0
     (printed,) = capsys.readouterr().out.splitlines()
     submit(printed)
-    for job, said in enumerate(("2 of 4 episodes, 1 of 2 cells", "4 of 4 episodes, 2 of 2 cells")):
-        name, *arguments = (tmp_path / f"slurm-1_{job}.out").read_text().split("\0")[:-1]
+    for number, said in enumerate(("2 of 4 episodes, 1 of 2 jobs", "4 of 4 episodes, 2 of 2 jobs")):
+        name, *arguments = (tmp_path / f"slurm-1_{number}.out").read_text().split("\0")[:-1]
         assert name == "lerobot_bomb.commands.main"
         assert main(arguments) == 0
         assert said in capsys.readouterr().out
@@ -177,8 +177,8 @@ def test_the_slurm_script_gives_the_lines_of_one_process(
     (printed,) = capsys.readouterr().out.splitlines()
     submit(printed)
     assert (tmp_path / "it's a sweep" / "results.jsonl").read_text() == expected_lines
-    assert "2 of 4 episodes, 1 of 2 cells" in (tmp_path / "slurm-1_0.out").read_text()
-    assert "4 of 4 episodes, 2 of 2 cells" in (tmp_path / "slurm-1_1.out").read_text()
+    assert "2 of 4 episodes, 1 of 2 jobs" in (tmp_path / "slurm-1_0.out").read_text()
+    assert "4 of 4 episodes, 2 of 2 jobs" in (tmp_path / "slurm-1_1.out").read_text()
 
 
 # submitit
@@ -196,7 +196,7 @@ def test_submitits_jobs_run_everything_once(
         assert sweep(folder, *submitit("debug"), *flags) == 0
         assert (folder / "results.jsonl").read_text() == expected_lines
         assert [job[-1] for job in jobs] == ["--shard=0/2", "--shard=1/2"]
-        assert "4 of 4 episodes, 2 of 2 cells" in capsys.readouterr().out.splitlines()[-1]
+        assert "4 of 4 episodes, 2 of 2 jobs" in capsys.readouterr().out.splitlines()[-1]
 
 
 @pytest.mark.long
@@ -208,7 +208,7 @@ def test_submitits_jobs_give_the_lines_of_one_process(expected_lines: str, tmp_p
 
 
 class Job:
-    """One of submitit's that never plays."""
+    """One of submitit's that never runs."""
 
     def __init__(self, is_done: bool) -> None:
         self.is_done, self.is_cancelled = is_done, False
@@ -223,13 +223,13 @@ class Job:
         self.is_cancelled = True
 
 
-def test_jobs_that_end_before_they_played_are_told(
+def test_jobs_that_end_before_they_run_are_told(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     monkeypatch.setattr(cluster_jobs, "submit", lambda *args: [Job(is_done=True)])
     assert sweep(tmp_path, "--submitit=1", *SWEEP) == 1
     printed = capsys.readouterr().out
-    assert f"jobs ended before they had played everything; {tmp_path / 'submitit'} says why" in printed
+    assert f"cluster jobs ended before everything was run; {tmp_path / 'submitit'} says why" in printed
     assert "0 of 4 episodes" in printed
 
 
@@ -244,15 +244,15 @@ def test_ctrl_c_cancels_the_jobs(
     monkeypatch.setattr(time, "sleep", interrupted)
     assert sweep(tmp_path, "--submitit=1", *SWEEP) == 130
     printed = capsys.readouterr()
-    assert job.is_cancelled and "to go on: " in printed.out and "interrupted" in printed.err
+    assert job.is_cancelled and "to resume: " in printed.out and "interrupted" in printed.err
 
 
 @pytest.mark.parametrize(
     ("flags", "message"),
     [
         (["--workers=0"], "--workers=0 must be at least 1"),
-        (["--slurm=0"], "--slurm=0 must be from 1 to the number of cells, 2"),
-        (["--submitit=3"], "--submitit=3 must be from 1 to the number of cells, 2"),
+        (["--slurm=0"], "--slurm=0 must be from 1 to the number of jobs, 2"),
+        (["--submitit=3"], "--submitit=3 must be from 1 to the number of jobs, 2"),
         (["--submitit_cluster=local"], "--submitit_cluster and --submitit_parameters need --submitit=N"),
         (["--submitit=1", "--submitit_cluster=fog"], "doesn't know any executor named fog"),
         (

@@ -11,9 +11,10 @@ import pytest
 from test_sweep import lines_of, small, sweep
 
 from lerobot_bomb import files
-from lerobot_bomb.sweep import local, store
+from lerobot_bomb.sweep import local
+from lerobot_bomb.sweep import store as store_module
 from lerobot_bomb.sweep.local import Workers, ended
-from lerobot_bomb.sweep.manifest import Cell, Manifest
+from lerobot_bomb.sweep.manifest import Job, Manifest
 from lerobot_bomb.sweep.store import EpisodeError, Store
 
 PLUGINS = Path(__file__).parent / "fixtures" / "plugins"
@@ -23,14 +24,15 @@ FLAGS = ("--env.type=bomb", "--env.image_size=32", "--policy.device=cpu", "--epi
 
 
 @pytest.mark.long
-def test_good_policies_play_whatever_becomes_of_those_that_crash(
+def test_good_policies_run_whatever_becomes_of_those_that_crash(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
+    monkeypatch.syspath_prepend(PLUGINS)  # for this process, which reads the types there are
     monkeypatch.setenv("PYTHONPATH", str(PLUGINS))
-    monkeypatch.setattr(store, "MAX_ATTEMPTS", 1)  # of this process, which counts how workers end
+    monkeypatch.setattr(store_module, "MAX_ATTEMPTS", 1)  # of this process, which counts how workers end
     assert sweep(tmp_path, "--policies=segfault,killed,bomb_random", *FLAGS) == 1
     said = capsys.readouterr().out
-    assert "2 of 6 episodes, 1 of 3 cells" in said
+    assert "2 of 6 episodes, 1 of 3 jobs" in said
     assert "ended by SIGSEGV, a fault of native code; 1 attempts" in said
     assert "ended by SIGKILL, as where memory is short; 1 attempts" in said
     rows = [json.loads(line) for line in (tmp_path / "results.jsonl").read_text().splitlines()]
@@ -40,15 +42,16 @@ def test_good_policies_play_whatever_becomes_of_those_that_crash(
 
 
 @pytest.mark.long
-def test_good_policies_play_beside_all_that_crash_or_hang(
+def test_good_policies_run_beside_all_that_crash_or_hang(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
+    monkeypatch.syspath_prepend(PLUGINS)  # for this process, which reads the types there are
     monkeypatch.setenv("PYTHONPATH", str(PLUGINS))
     policies = "--policies=segfault,killed,hanging,bomb_random,bomb_expert"
     limits = ("--timeout=120", "--workers=2", "--perturbations=none,light:3")
     assert sweep(tmp_path, policies, *limits, *FLAGS) == 1
     said = capsys.readouterr().out
-    assert "8 of 20 episodes, 4 of 10 cells" in said
+    assert "8 of 20 episodes, 4 of 10 jobs" in said
     for reason in ("SIGSEGV", "SIGKILL", "not finished after 120 s (--timeout)"):
         assert said.count(reason) == 2
     rows = [json.loads(line) for line in (tmp_path / "results.jsonl").read_text().splitlines()]
@@ -62,12 +65,12 @@ os.write(int(sys.argv[1]), b"%s\\n")
 """
 
 
-def workers(folder: Path, cell: Cell, then: str, timeout_s: int | None = None) -> tuple[Workers, Store]:
-    """One worker, which begins a cell, and then does what a line of Python says."""
-    played = Store(folder, Manifest((cell,)))
-    assert played.begin(cell)
-    command = [sys.executable, "-c", WORKER % (cell.key, then)]
-    return Workers(played, command, [dict(os.environ)], timeout_s), played
+def workers(folder: Path, job: Job, then: str, timeout_s: int | None = None) -> tuple[Workers, Store]:
+    """One worker, which begins a job, and then does what a line of Python says."""
+    store = Store(folder, Manifest((job,)))
+    assert store.begin(job)
+    command = [sys.executable, "-c", WORKER % (job.key, then)]
+    return Workers(store, command, [dict(os.environ)], timeout_s), store
 
 
 @pytest.mark.parametrize(
@@ -83,18 +86,18 @@ def workers(folder: Path, cell: Cell, then: str, timeout_s: int | None = None) -
 def test_how_a_worker_ended_is_the_reason(
     then: str, timeout_s: int | None, reason: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(store, "MAX_ATTEMPTS", 1)
-    (cell,) = small().cells
-    started, played = workers(tmp_path, cell, then, timeout_s)
+    monkeypatch.setattr(store_module, "MAX_ATTEMPTS", 1)
+    (job,) = small().jobs
+    started, store = workers(tmp_path, job, then, timeout_s)
     try:
         end = time.monotonic() + 60
-        while not played.is_over(cell):
-            started.look(has_played=False)
+        while not store.is_over(job):
+            started.look(has_progressed=False)
             time.sleep(0.05)
             assert time.monotonic() < end
     finally:
         started.close()
-    assert played.file(cell, "given_up").read_text() == reason
+    assert store.file(job, "given_up").read_text() == reason
 
 
 def test_a_worker_that_says_nothing_and_is_killed_is_no_full_disk(
@@ -104,7 +107,7 @@ def test_a_worker_that_says_nothing_and_is_killed_is_no_full_disk(
     (tmp_path / "workers.log").write_text("of another day\n")
     assert sweep(tmp_path, "--policies=bomb_random", *FLAGS) == 1
     assert capsys.readouterr().err.splitlines()[-1] == (
-        "lerobot-bomb sweep: workers end before they play: its process was ended by SIGKILL, as where memory "
+        "lerobot-bomb sweep: workers end before they run: its process was ended by SIGKILL, as where memory "
         f"is short; see {tmp_path / 'workers.log'}"
     )
 
@@ -114,29 +117,29 @@ def test_how_a_process_ended_is_told_in_words() -> None:
     assert ended(-6) == "its process was ended by SIGABRT"
 
 
-def test_what_nobody_died_of_is_played_first(tmp_path: Path) -> None:
-    first, second, good, other = small(("bomb:fdvla", "bomb_random"), ("none", "light:3")).cells
-    played = Store(tmp_path, small())
-    assert played.in_turn([first, second, good, other]) == [first, second, good, other]
-    assert played.begin(first)
-    assert played.in_turn([first, second, good, other]) == [good, other, second, first]
-    assert played.begin(good) and played.begin(good)
-    assert played.in_turn([first, second, good, other]) == [second, first, other, good]
+def test_what_nobody_died_of_is_run_first(tmp_path: Path) -> None:
+    first, second, good, other = small(("bomb:fdvla", "bomb_random"), ("none", "light:3")).jobs
+    store = Store(tmp_path, small())
+    assert store.in_turn([first, second, good, other]) == [first, second, good, other]
+    assert store.begin(first)
+    assert store.in_turn([first, second, good, other]) == [good, other, second, first]
+    assert store.begin(good) and store.begin(good)
+    assert store.in_turn([first, second, good, other]) == [second, first, other, good]
 
 
-def test_a_cell_that_another_worker_plays_by_now_is_not_given_up(tmp_path: Path) -> None:
-    (cell,) = small().cells
+def test_a_job_that_another_worker_runs_by_now_is_not_given_up(tmp_path: Path) -> None:
+    (job,) = small().jobs
     parent, worker = Store(tmp_path, small()), Store(tmp_path, small())
-    for _ in range(store.MAX_ATTEMPTS):
-        assert parent.begin(cell)
-    with worker.claimed(cell):
-        parent.lost(cell, "it was killed")
-        assert not parent.is_over(cell)
-    parent.lost(cell, "it was killed")
-    assert parent.is_over(cell)
-    worker.finish(cell, lines_of(cell), [])
-    parent.lost(cell, "it was killed again")
-    assert parent.file(cell, "given_up").read_text() == "it was killed; 3 attempts"
+    for _ in range(store_module.MAX_ATTEMPTS):
+        assert parent.begin(job)
+    with worker.claimed(job):
+        parent.lost(job, "it was killed")
+        assert not parent.is_over(job)
+    parent.lost(job, "it was killed")
+    assert parent.is_over(job)
+    worker.finish(job, lines_of(job), [])
+    parent.lost(job, "it was killed again")
+    assert parent.file(job, "given_up").read_text() == "it was killed; 3 attempts"
 
 
 # Files
@@ -153,33 +156,41 @@ def test_a_cell_that_another_worker_plays_by_now_is_not_given_up(tmp_path: Path)
         lambda data: b"[1]\n" + data,
     ],
 )
-def test_a_cell_whose_file_is_cut_off_is_not_finished(damage, tmp_path: Path) -> None:
-    (cell,) = small().cells
-    played = Store(tmp_path, small())
-    played.finish(cell, lines_of(cell), [])
-    assert played.is_finished(cell)
-    path = played.file(cell, "jsonl")
+def test_a_job_whose_file_is_cut_off_is_not_finished(damage, tmp_path: Path) -> None:
+    (job,) = small().jobs
+    store = Store(tmp_path, small())
+    store.finish(job, lines_of(job), [])
+    assert store.is_finished(job)
+    path = store.file(job, "jsonl")
     path.write_bytes(damage(path.read_bytes()))
-    assert not played.is_finished(cell) and not played.is_over(cell)
-    played.merge()
+    assert not store.is_finished(job) and not store.is_over(job)
+    store.merge()
     assert (tmp_path / "results.jsonl").read_bytes() == b""
-    played.finish(cell, lines_of(cell), [])
-    assert played.is_finished(cell)
+    store.finish(job, lines_of(job), [])
+    assert store.is_finished(job)
 
 
-def test_a_finished_cell_has_a_line_or_an_error_of_each_episode(tmp_path: Path) -> None:
-    (cell,) = small().cells  # seeds 7, 8, 9
-    first, _, third = lines_of(cell)
-    error = EpisodeError(cell.key, 8, "ArithmeticError", cell.command)
-    played = Store(tmp_path, small())
-    played.finish(cell, [first, third], [error])
-    assert played.is_finished(cell)
-    played.file(cell, "errors").write_text('{"cell": "')
-    assert not Store(tmp_path, small()).is_finished(cell)
-    played.finish(cell, [first, first, third, third], [error])  # of two tasks
-    assert played.is_finished(cell)
-    played.finish(cell, [first, first, third], [error])
-    assert not played.is_finished(cell)
+def test_an_error_keeps_its_line() -> None:
+    line = (
+        '{"cell": "act-place-7-0a1b2c3d", "seed": 8, "error": "ArithmeticError", "command": "lerobot-eval"}'
+    )
+    error = EpisodeError("act-place-7-0a1b2c3d", 8, "ArithmeticError", "lerobot-eval")
+    assert EpisodeError.from_json(line) == error and error.to_json() == line
+
+
+def test_a_finished_job_has_a_line_or_an_error_of_each_episode(tmp_path: Path) -> None:
+    (job,) = small().jobs  # seeds 7, 8, 9
+    first, _, third = lines_of(job)
+    error = EpisodeError(job.key, 8, "ArithmeticError", job.command)
+    store = Store(tmp_path, small())
+    store.finish(job, [first, third], [error])
+    assert store.is_finished(job)
+    store.file(job, "errors").write_text('{"cell": "')
+    assert not Store(tmp_path, small()).is_finished(job)
+    store.finish(job, [first, first, third, third], [error])  # of two tasks
+    assert store.is_finished(job)
+    store.finish(job, [first, first, third], [error])
+    assert not store.is_finished(job)
 
 
 def test_what_is_written_is_on_the_disk_before_it_has_its_name(

@@ -26,7 +26,7 @@ def draw(config: Counter, num_batches: int) -> list[list[int]]:
     return drawn
 
 
-def test_every_batch_draws_anew_and_a_count_is_all_it_takes_to_go_on() -> None:
+def test_every_batch_draws_anew_and_a_count_is_all_it_takes_to_resume() -> None:
     torch.manual_seed(5)
     whole, config = draw(Counter(), 4), Counter()
     assert len({tuple(numbers) for numbers in whole}) == 4

@@ -23,7 +23,7 @@ def make_one(**spec: object) -> BombEnv:
     return BombEnv(spec=EpisodeSpec(**{"seed": 0, **spec}), render_options=SMALL)  # pyright: ignore[reportArgumentType]
 
 
-def played_out() -> FreezeAfterEnd:
+def ended_env() -> FreezeAfterEnd:
     """An environment whose episode of seed 1 has ended."""
     env = FreezeAfterEnd(make_one(fps=1))
     env.reset(seed=1)
@@ -126,7 +126,7 @@ def test_what_an_evaluation_does_not_count_leaves_no_record(use_async: bool, tmp
 
 
 def test_changing_a_frozen_observation_changes_no_later_one() -> None:
-    env = played_out()
+    env = ended_env()
     expected = env.reset()[0]["agent_pos"].copy()
     env.reset()[0]["agent_pos"][:] = 0
     np.testing.assert_array_equal(env.reset()[0]["agent_pos"], expected)
@@ -134,7 +134,7 @@ def test_changing_a_frozen_observation_changes_no_later_one() -> None:
 
 
 @pytest.mark.parametrize("use_async", [False, True])
-def test_without_seeds_every_environment_plays_episodes_of_its_own(use_async: bool) -> None:
+def test_without_seeds_every_environment_runs_episodes_of_its_own(use_async: bool) -> None:
     """A reset of the vector environment starts new ones, where the last have ended, too."""
     envs = LazyVectorEnv([partial(make_one, fps=1)] * 2, use_async)
     seeds = [*envs.reset()[1]["seed"]]
@@ -171,7 +171,7 @@ def test_freezing_uses_lerobots_option_name() -> None:
 
 
 def test_a_seed_or_the_option_starts_a_new_episode() -> None:
-    env = played_out()
+    env = ended_env()
     assert env.reset()[1]["seed"] == 1
     assert env.reset(seed=2)[1]["seed"] == 2
     assert env.reset(options={NEW_ROLLOUT_OPTION: True})[1]["seed"] != 1

@@ -22,9 +22,9 @@ from lerobot_bomb.bomb.expert import expert_action
 from lerobot_bomb.bomb.observation import ACTION_NAMES, STATE_NAMES, RenderOptions
 from lerobot_bomb.bomb.privileged_state import PrivilegedState
 from lerobot_bomb.commands import main as cli
-from lerobot_bomb.envs.rollout import expert_agent, make_env, play
+from lerobot_bomb.envs.rollout import expert_agent, make_env, run_episode
 from lerobot_bomb.viewing.bomb import bomb_episode
-from lerobot_bomb.viewing.episode import Player, write_episodes
+from lerobot_bomb.viewing.episode import ViewedRun, write_episodes
 from lerobot_env_bomb.env import BombEnv
 
 SPEC = EpisodeSpec(seed=4, target=(3, 2), color="white", fps=5)
@@ -32,7 +32,7 @@ OPTIONS = RenderOptions(image_size=64)
 FLAGS = ["--seed=4", "--target=[3,2]", "--color=white", "--fps=5", "--image_size=64"]
 
 
-class Played(NamedTuple):
+class Run(NamedTuple):
     """The expert's episode as the environment tells it."""
 
     instruction: str
@@ -44,7 +44,7 @@ class Played(NamedTuple):
 
 
 @pytest.fixture(scope="module")
-def played() -> Played:
+def run() -> Run:
     env = make_env(SPEC, OPTIONS)
     observation, info = env.reset(seed=SPEC.seed)
     instruction = env.get_wrapper_attr("task_description")
@@ -60,7 +60,7 @@ def played() -> Played:
         ended = terminated or truncated
     env.close()
     states = [PrivilegedState.from_vector(o["environment_state"]) for o in observations]
-    return Played(instruction, observations, states, actions, infos, images)
+    return Run(instruction, observations, states, actions, infos, images)
 
 
 @pytest.fixture(scope="module")
@@ -76,27 +76,27 @@ def logged(viewed: Path) -> Logged:
     return read_rrd(Path(f"{viewed}.rrd"))
 
 
-def test_cameras_and_state_are_the_environments_to_the_last_moment(logged: Logged, played: Played) -> None:
+def test_cameras_and_state_are_the_environments_to_the_last_moment(logged: Logged, run: Run) -> None:
     for camera in ("workspace", "wrist"):
         rows = logged[f"/camera/{camera}"]
-        assert rows.keys() == set(range(len(played.actions) + 1))
-        for step, observation in enumerate(played.observations):
+        assert rows.keys() == set(range(len(run.actions) + 1))
+        for step, observation in enumerate(run.observations):
             png = np.asarray(rows[step]["EncodedImage:blob"][0], np.uint8)
             shown = cv2.imdecode(png, cv2.IMREAD_COLOR_RGB)
             assert shown is not None
             np.testing.assert_array_equal(shown, observation["pixels"][camera])
     for i, name in enumerate(STATE_NAMES):
-        assert scalars(logged, f"/state/{name}") == [float(o["agent_pos"][i]) for o in played.observations]
+        assert scalars(logged, f"/state/{name}") == [float(o["agent_pos"][i]) for o in run.observations]
 
 
-def test_actions_have_their_names_and_end_before_the_last_moment(logged: Logged, played: Played) -> None:
+def test_actions_have_their_names_and_end_before_the_last_moment(logged: Logged, run: Run) -> None:
     for i, name in enumerate(ACTION_NAMES["relative"]):
-        assert scalars(logged, f"/action/{name}") == [float(action[i]) for action in played.actions]
+        assert scalars(logged, f"/action/{name}") == [float(action[i]) for action in run.actions]
 
 
-def test_the_scene_shows_stones_trace_and_target(logged: Logged, played: Played) -> None:
-    path = np.array([state.gripper_xyz for state in played.states], np.float32)
-    for step, state in enumerate(played.states):
+def test_the_scene_shows_stones_trace_and_target(logged: Logged, run: Run) -> None:
+    path = np.array([state.gripper_xyz for state in run.states], np.float32)
+    for step, state in enumerate(run.states):
         stones = logged["/scene/stones"][step]
         np.testing.assert_allclose(
             stones["Ellipsoids3D:centers"], state.stone_xyz[state.stone_in_play], atol=1e-6
@@ -115,16 +115,16 @@ def test_the_scene_shows_stones_trace_and_target(logged: Logged, played: Played)
     assert {tuple(np.round(np.ptp(line, axis=0), 4)) for line in lines} == {(0.18, 0, 0), (0, 0.18, 0)}
 
 
-def test_words_say_instruction_stages_and_result(logged: Logged, played: Played) -> None:
-    assert logged["/instruction"][0]["TextDocument:text"] == [played.instruction]
-    stages = [info["stage"] for info in played.infos]
+def test_words_say_instruction_stages_and_result(logged: Logged, run: Run) -> None:
+    assert logged["/instruction"][0]["TextDocument:text"] == [run.instruction]
+    stages = [info["stage"] for info in run.infos]
     changes = {k: stage for k, stage in enumerate(stages) if k == 0 or stage != stages[k - 1]}
     assert {step: row["TextLog:text"][0] for step, row in logged["/stage"].items()} == changes
     assert list(changes.values())[-1] == "placed"
-    errors = [info["placement_error_mm"] for info in played.infos]
+    errors = [info["placement_error_mm"] for info in run.infos]
     assert scalars(logged, "/placement_error_mm") == pytest.approx(errors)
     (result,) = logged["/result"].values()
-    steps = len(played.actions)
+    steps = len(run.actions)
     assert list(logged["/result"]) == [steps]
     assert result["TextDocument:text"][0].startswith(
         f"success after {steps} steps; the stone is {errors[-1]:.1f} mm from the target"
@@ -152,15 +152,15 @@ def test_the_viewer_is_told_what_to_show(viewed: Path) -> None:
     assert timelines == {"step"}
 
 
-def test_the_video_shows_every_moment(viewed: Path, played: Played) -> None:
+def test_the_video_shows_every_moment(viewed: Path, run: Run) -> None:
     with av.open(f"{viewed}.mp4") as video:
         stream = video.streams.video[0]
         assert (stream.codec_context.name, stream.pix_fmt, stream.average_rate) == ("h264", "yuv420p", 5)
         frames = [frame.to_ndarray(format="rgb24") for frame in video.decode(stream)]
-    assert len(frames) == len(played.actions) + 1
-    for frame, image in zip(frames, played.images, strict=True):
+    assert len(frames) == len(run.actions) + 1
+    for frame, image in zip(frames, run.images, strict=True):
         assert psnr(frame, image) > 30
-    assert psnr(frames[-2], played.images[-1]) < psnr(frames[-1], played.images[-1]) - 3
+    assert psnr(frames[-2], run.images[-1]) < psnr(frames[-1], run.images[-1]) - 3
 
 
 def psnr(one: np.ndarray, other: np.ndarray) -> float:
@@ -168,11 +168,11 @@ def psnr(one: np.ndarray, other: np.ndarray) -> float:
 
 
 def test_the_command_tells_the_outcome_and_overwrites_nothing(
-    viewed: Path, played: Played, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+    viewed: Path, run: Run, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     assert cli.main(["view", *FLAGS, f"--output={tmp_path}"]) == 0
     lines = capsys.readouterr().out.splitlines()
-    assert lines[0] == played.instruction
+    assert lines[0] == run.instruction
     assert lines[1].startswith("success after ")
     assert lines[2:] == [
         f"{tmp_path}/place.none_row3-column2_white_expert_seed4{suffix}" for suffix in (".rrd", ".mp4")
@@ -362,8 +362,8 @@ def test_an_error_half_way_leaves_no_file(tmp_path: Path) -> None:
         return expert(observation, instruction)
 
     with pytest.raises(RuntimeError, match="out of order"):
-        player = Player(bomb_episode(SPEC, OPTIONS), lambda env: nullcontext(falters))
-        write_episodes({"faltering": player}, "x", tmp_path / "x.rrd", tmp_path / "x.mp4")
+        run = ViewedRun(bomb_episode(SPEC, OPTIONS), lambda env: nullcontext(falters))
+        write_episodes({"faltering": run}, "x", tmp_path / "x.rrd", tmp_path / "x.mp4")
     assert list(tmp_path.iterdir()) == []
 
 
@@ -380,7 +380,7 @@ def test_a_kill_half_way_leaves_no_file_under_the_final_names(tmp_path: Path) ->
 
 def test_a_moment_is_seen_before_its_action_is_done() -> None:
     env = make_env(SPEC, OPTIONS)
-    moments = play(env, SPEC, expert_agent())
+    moments = run_episode(env, SPEC, expert_agent())
     for moment, _ in zip(moments, range(3), strict=False):
         now = env.get_wrapper_attr("privileged_state")()
         np.testing.assert_array_equal(moment.observation["environment_state"], now.to_vector())

@@ -126,7 +126,7 @@ def test_a_checkpoint_of_other_images_is_told_the_flag(
     assert main([*FLAGS, policy, "--image_size=96", f"--output={tmp_path / 'x'}"]) == 1
     error = capsys.readouterr().err
     assert "reads images of 64x64 pixels; this environment has --env.image_size=96: " in error
-    assert "evaluate with --env.image_size=64, or insist with --env.ignore_checkpoint=true" in error
+    assert "evaluate with --env.image_size=64, or override with --env.ignore_checkpoint=true" in error
     wide = ["--image_size=96", "--ignore_checkpoint", f"--output={tmp_path / 'x'}"]
     assert main([*FLAGS, policy, *wide]) == 0
     assert main([*FLAGS, policy, f"--output={tmp_path / 'own'}"]) == 0  # images of the size that it reads

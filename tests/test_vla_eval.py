@@ -1,4 +1,4 @@
-"""vla-eval plays BOMB with our checkpoints as lerobot-eval does, and says what does not fit."""
+"""vla-eval runs BOMB with our checkpoints as lerobot-eval does, and says what does not fit."""
 
 import asyncio
 import importlib
@@ -64,7 +64,7 @@ def lines_of(path: Path) -> list[dict[str, Any]]:
     return [line | {"policy": None, "evaluation": None} | dict.fromkeys(MEASURED) for line in lines]
 
 
-def test_the_harness_plays_the_episodes_of_lerobot_eval(
+def test_the_harness_runs_the_episodes_of_lerobot_eval(
     server: CheckpointServer, stock_cli: Callable[..., None], tmp_path: Path
 ) -> None:
     harness, lerobot = tmp_path / "harness.jsonl", tmp_path / "lerobot.jsonl"
@@ -190,7 +190,7 @@ def write_libero_policy(folder: Path) -> None:
 
 
 @pytest.mark.long
-def test_its_libero_plays_with_the_file_for_it(
+def test_its_libero_runs_with_the_file_for_it(
     libero_with_assets: Libero, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     prepare_libero([SUITE])

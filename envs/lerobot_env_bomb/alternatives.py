@@ -1,4 +1,4 @@
-"""Instructions that an episode could have had: one word of it means something else."""
+"""Other instructions of an episode, each with one word that means something else."""
 
 from collections.abc import Iterator
 from dataclasses import replace

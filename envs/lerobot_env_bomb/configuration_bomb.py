@@ -66,7 +66,7 @@ class BombEnvConfig(EvaluatedEnv, EnvConfig):
         geometry_shapes(self.render_options)
 
     def take_image_size(self, config: PreTrainedConfig | None) -> None:
-        """Show images of the size that a policy was trained on, unless a flag says another one."""
+        """Show images of the size that a policy was trained on, unless a flag gives another."""
         if self.image_size is None and (side := side_of_images(config, CAMERAS)) is not None:
             self.image_size = side
             self._declare_features()
@@ -98,7 +98,7 @@ class BombEnvConfig(EvaluatedEnv, EnvConfig):
         }
 
     def specs_of(self, suite: str) -> list[EpisodeSpec]:
-        """The unperturbed spec of each numbered task; one where they are drawn per episode."""
+        """Return the unperturbed spec of each numbered task; a single one if tasks are drawn per episode."""
         if self.task_ids == []:
             raise ValueError("--env.task_ids=[] selects no task; leave it out to draw one per episode")
         if self.task_ids and self.task == ALL:

@@ -100,9 +100,9 @@ class BombEnv(EpisodeEnv[EpisodeSpec, _Run, EpisodeResult]):
         return self._observe(), self._info()
 
     def show_static(self, seed: int) -> tuple[Observation, EpisodeResult]:
-        """The board of a seed's episode as it may stand midway, which cannot be run from there.
+        """Draw a board of a seed's episode as in mid-episode; the episode cannot be run from there.
 
-        The result says which episode it is of; nothing has become of that.
+        The result names the episode, which has no outcome.
         """
         episode = sample_episode(replace(self._spec, seed=seed))
         self._steps = 0
@@ -204,7 +204,7 @@ class BombEnv(EpisodeEnv[EpisodeSpec, _Run, EpisodeResult]):
         )
 
     def object_masks(self) -> dict[str, dict[str, np.ndarray]]:
-        """{camera: {what: (H, W) bool}} of the observation's images, by what their pixels show."""
+        """{camera: {object: (H, W) bool}}: the pixels of each object in the observation's images."""
         run, size = self._run, self._render_options.image_size
         goals = run.episode.goals_after(run.judge.num_made)
         goal = goals[min(run.judge.num_made, len(goals) - 1)]
@@ -214,7 +214,7 @@ class BombEnv(EpisodeEnv[EpisodeSpec, _Run, EpisodeResult]):
         }
 
     def cameras(self) -> dict[str, Camera]:
-        """Return each camera of the observation's images, as it stands now."""
+        """Return the current pose of each camera of the observation's images."""
         scene, size = self._run.scene, self._render_options.image_size
         return {
             camera: Camera(intrinsics(scene.model, camera, size), extrinsics(scene.data, camera))

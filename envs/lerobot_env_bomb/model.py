@@ -90,7 +90,7 @@ def pattern_stone_name(index: int) -> str:
 
 
 def foot_name(index: int, foot: int) -> str:
-    """Name of one of the balls that a stone stands on."""
+    """Name of one of the balls under a stone."""
     return f"{stone_name(index)}_foot_{foot}"
 
 
@@ -260,9 +260,9 @@ def show_pattern(model: mujoco.MjModel, stones: Mapping[Intersection, str]) -> N
     for geom in range(model.ngeom):
         if model.geom(geom).name.startswith(("pattern_board", "pattern_line")):
             model.geom_rgba[geom, 3] = 1.0
-    for index, (cell, color) in enumerate(stones.items()):
+    for index, (intersection, color) in enumerate(stones.items()):
         geom = model.geom(pattern_stone_name(index))
-        offset = BOARD.intersection_xy(*cell) * PATTERN_PITCH_M / BOARD.pitch_m
+        offset = BOARD.intersection_xy(*intersection) * PATTERN_PITCH_M / BOARD.pitch_m
         geom.pos[:2] = np.array(PATTERN_CENTER_XY) + offset
         geom.rgba[:] = STONE_RGBA[color == "white"]
 

@@ -15,9 +15,9 @@ BOARD_GEOMS = ("board", "board_surface")
 def object_masks(
     scene: Scene, renderer: CameraRenderer, camera: str, size: int, stone: int, target_xy: np.ndarray
 ) -> dict[str, np.ndarray]:
-    """{what: (size, size) bool}; every pixel is of one of them.
+    """{object: (size, size) bool}; every pixel belongs to one.
 
-    ``stone``: index of the one to be moved; ``target_xy``: (2,) metres, where it is to go. The target is as
+    ``stone``: index of the stone to move; ``target_xy``: (2,) metres, its target. The target is as
     much of the board as a stone there would cover; the gripper is all of the arm that is seen.
     """
     model = scene.model

@@ -48,5 +48,5 @@ def sample_episode(spec: EpisodeSpec) -> PerturbedEpisode:
 
 
 def draw_perturbation(nominal: Episode) -> Perturbation:
-    """The axes of the episode's condition, each drawn from a generator of its own."""
+    """Draw the axes of the episode's condition, each from a generator of its own."""
     return Perturbation.draw(nominal.spec.condition, nominal.spec.seed, nominal)

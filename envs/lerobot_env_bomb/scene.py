@@ -67,9 +67,9 @@ class Scene:
         edits: Sequence[ModelEdit] = (),
         pattern: Mapping[Intersection, str] | None = None,
     ) -> None:
-        """Start from the layout, at rest, with the fingers open, in a model with these edits only.
+        """Start at rest from the layout, with open fingers, in a model with only these edits.
 
-        `pattern`: what the small board in the tray shows; there is none without.
+        `pattern`: shown on the small board in the tray; without it there is no such board.
         """
         mujoco.mj_resetData(self.model, self.data)
         for array, nominal in self._nominal:

@@ -1,4 +1,4 @@
-"""Spaces of Gymnasium: what an environment of BOMB takes and delivers."""
+"""Gymnasium's spaces of BOMB's actions and observations."""
 
 import numpy as np
 from gymnasium import spaces

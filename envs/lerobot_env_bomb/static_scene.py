@@ -1,4 +1,4 @@
-"""A board as it stands at the start of an episode, or as it may stand midway, without the way there."""
+"""A board as at the start of an episode or in its middle, without the moves that lead there."""
 
 from dataclasses import dataclass, replace
 
@@ -20,7 +20,7 @@ GRIP_ERROR_M = 0.0015  # largest of a held stone between the pads, in x, y and z
 
 @dataclass(frozen=True)
 class StaticScene:
-    """Scene at some time of an episode: where everything is, and what has been done before."""
+    """Scene in the middle of an episode: where everything is, and which moves have been made."""
 
     layout: Layout
     num_made: int  # moves that have been made

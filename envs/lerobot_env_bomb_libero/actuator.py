@@ -19,7 +19,7 @@ class LiberoActuator:
         self._pending = deque([np.array(get_libero_dummy_action(), np.float32)] * dynamics.latency)
 
     def command(self, action: np.ndarray) -> np.ndarray:
-        """(7,) action -> (7,) what the arm is told now."""
+        """(7,) action -> (7,) command to the arm."""
         self._pending.append(action)
         command = self._pending.popleft().astype(np.float32)
         noise = self._noise * self._rng.standard_normal(MOTION_DIMS)

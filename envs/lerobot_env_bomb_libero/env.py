@@ -107,7 +107,7 @@ class BombLiberoEnv(EpisodeEnv[LiberoSpec, _Run, LiberoResult]):
         )
 
     def close(self) -> None:
-        """Free what robosuite holds, and with it the episode."""
+        """Free robosuite's resources, and with them the episode."""
         self._scene.close()
         self._current_run = None  # its simulator is gone; another one would step in its place
 

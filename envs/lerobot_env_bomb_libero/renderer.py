@@ -26,7 +26,7 @@ def _all_gpus_visible() -> Iterator[None]:
 
 
 def or_mujocos(of_robosuite: Callable[[int], Any], of_mujoco: Callable[[], Any]) -> Callable[[int], Any]:
-    """EGL's display on the device that robosuite takes, or where it finds none on the one that MuJoCo takes.
+    """Return EGL's display on robosuite's device or, if it finds none, on MuJoCo's.
 
     MuJoCo takes the one of MUJOCO_EGL_DEVICE_ID, else the first that works.
     """

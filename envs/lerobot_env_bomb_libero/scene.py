@@ -31,10 +31,10 @@ class LiberoTransform(EpisodeTransform):
 
     @classmethod
     def add_bodies(cls, worldbody: ElementTree.Element) -> None:
-        """Add to the model what an episode at any level may need, before it is compiled."""
+        """Add all bodies that an episode at any level may need, before the model is compiled."""
 
     def edit(self, scene: "LiberoScene") -> None:
-        """Change the model; objects do not stand where the episode starts yet."""
+        """Change the model; objects are not yet at their starting places."""
 
     def arrange(self, scene: "LiberoScene") -> None:
         """Change where objects and the arm are: `scene.data.qpos`."""
@@ -44,7 +44,7 @@ class LiberoTransform(EpisodeTransform):
 
 
 class LiberoScene(LiberoEnv):
-    """LIBERO's environment with transforms; without any, its episodes are LeRobot's, bit for bit.
+    """LIBERO's environment with transforms; without transforms its episodes are LeRobot's, bit for bit.
 
     Images that nobody sees are not drawn.
     """
@@ -84,7 +84,7 @@ class LiberoScene(LiberoEnv):
         return self._format_raw_obs(observation)
 
     def close(self) -> None:
-        """Free the model and what was drawn with."""
+        """Free the model and its renderer."""
         if self._env is not None:
             # robosuite frees textures and buffers by their numbers in whichever context is current
             self._opengl.gl_ctx.make_current()
@@ -92,7 +92,7 @@ class LiberoScene(LiberoEnv):
 
     @property
     def _built(self) -> Any:
-        """LIBERO's environment, of a library without types."""
+        """LIBERO's environment; its library has no types."""
         return self._env
 
     @property
@@ -110,12 +110,12 @@ class LiberoScene(LiberoEnv):
 
     @cached_property
     def movable(self) -> dict[str, int]:
-        """{object that stands free: its body}."""
+        """{free object: its body}."""
         return {name: self._body_of(each) for name, each in self._built.env.objects_dict.items()}
 
     @cached_property
     def fixtures(self) -> dict[str, int]:
-        """{fixture: its body}; table and floor are none."""
+        """{fixture: its body}, without table and floor."""
         fixtures = self._built.env.fixtures_dict.items()
         return {name: self._body_of(each) for name, each in fixtures if self._is_body(each)}
 
@@ -128,7 +128,7 @@ class LiberoScene(LiberoEnv):
 
     @cached_property
     def owners(self) -> np.ndarray:
-        """(bodies,) what each is a part of: the body of an object, fixture or robot; else 0, the scene's."""
+        """(bodies,) the object, fixture or robot that each is part of; else 0, the scene."""
         roots = {*self.movable.values(), *self.fixtures.values()}
         owners = np.zeros(self.model.nbody, int)
         for body in range(1, self.model.nbody):
@@ -147,7 +147,7 @@ class LiberoScene(LiberoEnv):
         return np.flatnonzero(np.isin(self.owners[self.model.geom_bodyid], bodies))
 
     def surfaces(self) -> dict[int, str]:
-        """{texture of table or floor: a material that has it}; walls are none."""
+        """{texture of table or floor: a material that has it}, without walls."""
         found = {}
         for material in np.unique(self.model.geom_matid[self.scenery]).tolist():
             texture = int(self.model.mat_texid[material, mujoco.mjtTextureRole.mjTEXROLE_RGB])
@@ -171,7 +171,7 @@ class LiberoScene(LiberoEnv):
         return {self._names[other] for other in others.tolist() if other in self._names}
 
     def boxes(self) -> dict[int, np.ndarray]:
-        """{body of an object or fixture: (2, 3) metres, its lowest and highest corner}, of its geoms."""
+        """{body of an object or fixture: (2, 3) metres, lowest and highest corner of its geoms}."""
         model, data = self.model, self.data
         boxes = {}
         for body in (*self.movable.values(), *self.fixtures.values()):
@@ -183,7 +183,7 @@ class LiberoScene(LiberoEnv):
         return boxes
 
     def corners(self) -> np.ndarray:
-        """(n, 3) metres: corners of all objects and of what else the task is about, and the gripper."""
+        """(n, 3) metres: corners of all objects, of the task's other bodies, and the gripper."""
         boxes = self.boxes()
         bodies = {*self.movable.values(), *self.wanted_bodies()}
         corners = [
@@ -206,7 +206,7 @@ class LiberoScene(LiberoEnv):
 
     @cached_property
     def _is_finger(self) -> np.ndarray:
-        """(bodies,) whether each is of the gripper."""
+        """(bodies,) bool: which belong to the gripper."""
         return np.array([self.model.body(body).name.startswith(FINGERS) for body in range(self.model.nbody)])
 
     @cached_property
@@ -241,7 +241,7 @@ class LiberoScene(LiberoEnv):
             observable._sensor = self._drawn_if_on(observable._sensor)
 
     def _place(self) -> None:
-        """Reset robosuite itself; LIBERO's wrapper around it tries again for ever, whatever goes wrong."""
+        """Reset robosuite itself; LIBERO's wrapper would retry for ever, whatever the error."""
         from robosuite.utils.errors import RandomizationError
 
         while True:
@@ -294,7 +294,7 @@ class LiberoScene(LiberoEnv):
         self._textures = {}
 
     def _restore(self) -> None:
-        """Undo what an earlier episode changed, in the model and in what robosuite keeps."""
+        """Undo an earlier episode's changes, in the model and in robosuite."""
         model = self.model
         for name, value in self._compiled.items():
             getattr(model, name)[:] = value

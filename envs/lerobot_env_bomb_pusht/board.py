@@ -28,7 +28,7 @@ class PushTTransform(EpisodeTransform):
 
 
 class Board(PushTEnv):
-    """PushT's environment with transforms; without any, it is gym-pusht, bit for bit.
+    """PushT's environment with transforms; without transforms it is gym-pusht, bit for bit.
 
     Overridden methods only add to it, or are faster.
     """
@@ -104,7 +104,7 @@ class Board(PushTEnv):
 
     @cached_property
     def _behind(self) -> pygame.Surface:
-        """Return what a board that is not white is drawn on."""
+        """Return the image below a board that is not white."""
         return pygame.Surface((BOARD_PX, BOARD_PX))
 
     def _draw_outline(self, screen: pygame.Surface) -> None:
@@ -117,7 +117,7 @@ class Board(PushTEnv):
 
 
 def tee_outline(bar: np.ndarray, stem: np.ndarray) -> np.ndarray:
-    """(4, 2) corners of bar and stem, which lies below it -> (8, 2) corners of the T, in order."""
+    """(4, 2) corners of the bar and of the stem below it -> (8, 2) corners of the T, in order."""
     (left, top), (right, bottom) = bar.min(0), bar.max(0)
     (stem_left, _), (stem_right, end) = stem.min(0), stem.max(0)
     outline = [

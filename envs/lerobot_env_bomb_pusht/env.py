@@ -44,8 +44,8 @@ class BombPushTEnv(EpisodeEnv[PushTSpec, _Run, PushTResult]):
     most 1. Both are gym-pusht's, as are images, positions and info; without perturbations an episode is that
     of `gym_pusht/PushT-v0` of the same seed, bit for bit.
 
-    Action: (2,) x and y in pixels of the board where the agent is to go, 0..512. One outside is executed, as
-    gym-pusht does, up to a board's width away; so is one that `dynamics` leads outside.
+    Action: (2,) x and y in pixels of the board where the agent is to go, 0..512. Actions outside are
+    executed, as by gym-pusht, up to a board's width away; also those that `dynamics` leads outside.
     """
 
     metadata = {"render_modes": ["rgb_array"], "render_fps": FPS}  # noqa: RUF012
@@ -119,7 +119,7 @@ class BombPushTEnv(EpisodeEnv[PushTSpec, _Run, PushTResult]):
         )
 
     def close(self) -> None:
-        """Free what gym-pusht holds."""
+        """Free gym-pusht's resources."""
         self._board.close()
 
     @property

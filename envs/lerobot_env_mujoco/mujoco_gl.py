@@ -1,4 +1,4 @@
-"""MuJoCo and its OpenGL context, of a backend that renders; every module here imports both from this one.
+"""MuJoCo and its OpenGL context, on a backend that renders. Every module here imports both from this one.
 
 Its names live in C modules that pyright cannot read.
 """

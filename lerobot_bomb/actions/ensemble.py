@@ -26,7 +26,7 @@ def age_weights(weighting: str, num_chunks: int, coefficient: float) -> Tensor:
 
 
 class TemporalEnsemble:
-    """Weighted mean over the newest chunks; predicts anew at every step.
+    """Weighted mean over the newest chunks; it predicts at every step.
 
     ``adaptive`` weights an action by exp(coefficient * its cosine with the newest one), so a chunk of another
     mind counts less (CogACT, arXiv 2411.19650). ``newest_only``: dimensions that are not averaged, such as a

@@ -24,7 +24,7 @@ class Cut:
 
 
 def cut(values_N: Tensor, low: float, high: float, num_bins: int, distribution: str, min_sigma: float) -> Cut:
-    """Bins of [low, high] for the samples; without any, of about equal width.
+    """Bins of [low, high] for the samples; without samples, of about equal width.
 
     A standard deviation below `min_sigma` or MIN_WIDTH is raised to it: a coordinate that never changes has
     its finest bins around its value. Means are those of the samples, or of the Gaussian in bins without any.

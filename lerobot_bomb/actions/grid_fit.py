@@ -26,7 +26,7 @@ def normalised(actions_ND: np.ndarray, low_D: np.ndarray, high_D: np.ndarray) ->
 
 
 def normalised_rest(low_D: np.ndarray, high_D: np.ndarray) -> np.ndarray:
-    """(D,) what an action of 0 becomes, the "no motion" of relative actions; 0 where it is out of range."""
+    """(D,) normalised action 0, the "no motion" of relative actions; 0 if it is out of range."""
     inside_D = (low_D < 0) & (high_D > 0)
     return np.where(inside_D, normalised(np.zeros((1, len(low_D))), low_D, high_D)[0], 0.0)
 

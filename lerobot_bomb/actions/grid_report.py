@@ -1,4 +1,4 @@
-"""A grid in words: its coordinates' names and edges, and what it clips.
+"""Report on a grid: its coordinates' names and edges, and what it clips.
 
 Shapes: `N` actions, `D` action dims.
 """
@@ -42,7 +42,7 @@ def edges_text(grids: ActionGrids, dim_names: Sequence[str]) -> str:
 
 
 def clipping_text(actions_ND: np.ndarray, dim_names: Sequence[str]) -> tuple[str, bool]:
-    """Describe what a clip to [-1, 1] loses of normalised actions, and whether it is much."""
+    """Describe what clipping to [-1, 1] takes from normalised actions, and whether that is much."""
     beyond_ND = (np.abs(actions_ND) - 1).clip(min=0)
     is_clipped_ND = beyond_ND > CLIP_TOLERANCE
     if not is_clipped_ND.any():
@@ -71,7 +71,7 @@ def clipping_text(actions_ND: np.ndarray, dim_names: Sequence[str]) -> tuple[str
 def rest_text(grids: ActionGrids, actions_ND: np.ndarray, dim_names: Sequence[str]) -> tuple[str, bool]:
     """Describe how many normalised actions a cell of no motion takes, and whether that needs a remedy.
 
-    The text is empty where there is no such cell.
+    The text is empty if there is no such cell.
     """
     actions = torch.from_numpy(actions_ND)
     cells_NG, coordinates_NC = grids.encode(actions), grids.coordinates(actions.float().clamp(-1, 1))

@@ -15,8 +15,7 @@ def interpolate_rows(old: ActionGrids, new: ActionGrids, rows: Tensor) -> Tensor
     """A row per cell of the old grid (V, H) -> a row per cell of the new one (V', H), in the rows' type.
 
     Linear along each coordinate between the middles of the old bins, constant beyond the outermost; phi goes
-    round. Binary groups stay as they are, and the new cell of "no motion" takes the row of the cell that the
-    old grid has for it.
+    round. Binary groups stay unchanged, and the new cell of "no motion" takes the row of the old one.
 
     Raises:
         ValueError: the groups differ in dims or transform, or there are not as many rows as old cells.

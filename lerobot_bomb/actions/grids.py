@@ -196,7 +196,7 @@ class ActionGrids(nn.Module):
 
     @classmethod
     def from_edges(cls, edges: Sequence[Tensor], settings: GridSettings, num_dims: int) -> Self:
-        """Bins (E + 1,) for each coordinate, of which nothing else is known: means are the bins' middles."""
+        """Build a grid from nothing but edges, (E + 1,) for each coordinate: means are the bins' middles."""
         cuts = []
         for of in edges:
             low, high = float(of[0]), float(of[-1])
@@ -241,7 +241,7 @@ class ActionGrids(nn.Module):
         return grids
 
     def _set(self, cuts: Sequence[Cut], rest_D: np.ndarray) -> None:
-        """Take edges as they are in float32, and what follows from them."""
+        """Set the edges, as they are in float32, and what follows from them."""
         require_finite(torch.as_tensor(rest_D), "the action of a grid that means no motion")
         self.rest.copy_(torch.from_numpy(rest_D))
         for i, (of, bins) in enumerate(zip(cuts, self.bins, strict=True)):
@@ -257,7 +257,7 @@ class ActionGrids(nn.Module):
         self._set_centroids(torch.zeros(0, self.num_dims, dtype=torch.float64))
 
     def _set_centroids(self, actions_ND: Tensor) -> None:
-        """Set each cell's centroid to the mean of its samples; without samples, to what `means` say."""
+        """Set each cell's centroid to the mean of its samples; without samples, to that of `means`."""
         self.centroids.copy_(self._cond_means())
         cells_NG = self.encode(actions_ND.to(self.edges.device)).cpu()
         for i, group in enumerate(self.groups):

@@ -120,7 +120,7 @@ class TokenRows:
         return self.mask if self.hidden is None else self.mask & ~self.hidden
 
     def rounded(self, multiple: int) -> "TokenRows":
-        """Pad the rows with gaps at the end, to a multiple of so many columns."""
+        """Pad the rows at their ends, to a multiple of `multiple` columns."""
         width = -self.ids.shape[1] % multiple
         return TokenRows(*(nn.functional.pad(columns, (0, width)) for columns in self._columns))
 
@@ -144,7 +144,7 @@ class Answer:
 
     @classmethod
     def of(cls, numbers: NumberTokens, end_id: Tensor) -> "Answer":
-        """Take the padding out, and label what the loss counts."""
+        """Remove the padding, and label what the loss counts."""
         end_B1 = end_id.expand(len(numbers.ids), 1)
         true_B1 = torch.ones_like(end_B1, dtype=torch.bool)
         ids_BM, mask_BM, loss_mask_BM = (

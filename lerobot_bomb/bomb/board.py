@@ -54,6 +54,6 @@ BOARD = BoardGeometry()
 
 
 def task_id(target: Sequence[int], color: str) -> int:
-    """The number of a task by its (row, column) and colour; of suite `place`."""
+    """Return the number of a task of suite `place`, by its (row, column) and colour."""
     row, column = target
     return BOARD.num_lines**2 * COLORS.index(color) + BOARD.num_lines * row + column

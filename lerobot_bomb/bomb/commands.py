@@ -1,4 +1,4 @@
-"""Suites whose instruction is a command: a verb, and what it is about on the board that an episode draws."""
+"""Suites whose instruction is a command: a verb and its arguments, on the board of the episode."""
 
 from abc import ABC, abstractmethod
 from collections.abc import Mapping, Sequence
@@ -61,14 +61,14 @@ class TaskInstance:
     supply: tuple[str, ...] = ()  # colours of the stones in the tray, row by row from the far one
     pattern: Stones = field(default_factory=dict)  # on the small board
 
-    def stone_on(self, cell: Intersection) -> int:
+    def stone_on(self, intersection: Intersection) -> int:
         """Index of the stone on an intersection."""
-        return len(self.supply) + list(self.stones).index(cell)
+        return len(self.supply) + list(self.stones).index(intersection)
 
 
 @dataclass(frozen=True)
 class Case:
-    """Meaning of a command: its words, the moves that fulfil it, and what the expert does."""
+    """Meaning of a command: its words, the moves that fulfil it, and the expert's aims."""
 
     commands: tuple[str, ...]  # one, or one for each move
     plans: tuple[Plan, ...]
@@ -81,16 +81,16 @@ class Task(ABC):
 
     @abstractmethod
     def draw(self, rng: np.random.Generator) -> TaskInstance:
-        """A board, and what the command is about; it need not make sense there."""
+        """Draw a board and the command's arguments; the command need not make sense on that board."""
 
     @abstractmethod
     def case(self, drawn: TaskInstance) -> Case | None:
-        """Return what the command means on that board; None where it means nothing, or several things."""
+        """Return what the command means on that board; None if it means nothing, or several things."""
 
 
-def is_graspable(stones: Stones, cell: Intersection) -> bool:
+def is_graspable(stones: Stones, intersection: Intersection) -> bool:
     """Return True if nothing stands left or right of an intersection, where the fingers go."""
-    row, column = cell
+    row, column = intersection
     return not {(row, column - 1), (row, column + 1)} & stones.keys()
 
 
@@ -100,30 +100,33 @@ def other_color(color: str) -> str:
 
 
 def only(stones: Stones, color: str) -> Intersection | None:
-    """Return where the only stone of a colour stands; None where there is none, or several."""
-    cells = [cell for cell, other in stones.items() if other == color]
-    return cells[0] if len(cells) == 1 else None
+    """Return the intersection of the only stone of a colour; None if there is none, or several."""
+    intersections = [intersection for intersection, other in stones.items() if other == color]
+    return intersections[0] if len(intersections) == 1 else None
 
 
 def draw_intersections(
-    rng: np.random.Generator, number: int, cells: Sequence[Intersection] = INTERSECTIONS
+    rng: np.random.Generator, number: int, intersections: Sequence[Intersection] = INTERSECTIONS
 ) -> list[Intersection]:
-    """Draw so many different intersections."""
-    return [cells[i] for i in rng.choice(len(cells), size=number, replace=False)]
+    """Draw `number` different intersections."""
+    return [intersections[i] for i in rng.choice(len(intersections), size=number, replace=False)]
 
 
 def draw_stones(
     rng: np.random.Generator,
     number: int,
-    cells: Sequence[Intersection] = INTERSECTIONS,
+    intersections: Sequence[Intersection] = INTERSECTIONS,
     colors: Sequence[str] = COLORS,
 ) -> dict[Intersection, str]:
-    """Draw so many stones, each of one of these colours, on different intersections."""
-    return {cell: colors[int(rng.integers(len(colors)))] for cell in draw_intersections(rng, number, cells)}
+    """Draw `number` stones, each of one of these colours, on different intersections."""
+    return {
+        intersection: colors[int(rng.integers(len(colors)))]
+        for intersection in draw_intersections(rng, number, intersections)
+    }
 
 
 def is_heldout(task_id: int, about: tuple[int, ...]) -> bool:
-    """Return True if a command is held out; each verb, colour, row, ... of it is seen in others."""
+    """Return True if a command is held out; each of its verbs, colours, rows, ... occurs in others."""
     return (task_id + sum(place * number for place, number in zip(count(1), about))) % NUM_PARTS == 0
 
 
@@ -141,7 +144,7 @@ def command_suite(tasks: Sequence[Task], max_steps: int, num_goals: int, version
 
 
 def draw_command(tasks: Sequence[Task], spec: EpisodeSpec) -> tuple[int, TaskInstance, Case]:
-    """Return a task's number, the board that is drawn for it, and what its command means there."""
+    """Draw a task's number and its board; return them with the meaning of its command."""
     drawn_id = int(generator(spec.seed, Stream.TARGET).integers(len(tasks)))
     task_id = drawn_id if spec.task_id is None else spec.task_id
     task, rng = tasks[task_id], generator(spec.seed, Stream.OPENING)

@@ -1,4 +1,4 @@
-"""The BOMB environment that a recording shows and that a checkpoint of it acts in."""
+"""The BOMB environment of a recording, in which a checkpoint trained on it acts."""
 
 import re
 from collections.abc import Iterable, Mapping
@@ -40,7 +40,7 @@ class Environment:
     def of_dataset(
         cls, info: Mapping[str, Any], task: str | None, task_ids: tuple[int, ...] | None
     ) -> "Environment | None":
-        """Return what a dataset shows; None: it shows no such environment.
+        """Return the environment that a dataset shows; None if it shows no such environment.
 
         Args:
             info: LeRobot's info.json, which stays true when a dataset is merged or edited.
@@ -69,11 +69,11 @@ class Environment:
 
     @property
     def suites(self) -> frozenset[str] | None:
-        """Suites that it shows; None: not known."""
+        """Suites that it shows; None if unknown."""
         return None if self.task is None else _suites(self.task)
 
     def _flag(self, name: str) -> str:
-        """A flag of lerobot-eval; of several suites it names the first, unless they are all."""
+        """Return a flag of lerobot-eval; of several suites it names the first, unless they are all."""
         value = getattr(self, name)
         if name == "task" and self.suites is not None:
             value = ALL if self.suites == frozenset(OWN_SUITES) else min(self.suites)
@@ -89,9 +89,9 @@ class Environment:
         return ["--env.type=bomb", *flags]
 
     def differences(self, other: "Environment") -> list[str]:
-        """Fields in which `other` is one that a policy of this environment cannot act in.
+        """Fields whose values in `other` keep a policy of this environment from acting there.
 
-        A suite that is not known is compared with nothing, nor is its version.
+        An unknown suite, and its version, are not compared.
         """
         names = [name for name in COMPARED if getattr(self, name) != getattr(other, name)]
         ours, theirs = self.suites, other.suites
@@ -106,16 +106,16 @@ class Environment:
 
     @property
     def _is_current(self) -> bool:
-        """Return whether its suites, whose newest version it names, are those of today."""
+        """Return True if its suites are in today's versions."""
         return self.suites is not None and self.task_version == _current_version(self.suites)
 
-    def check_same(self, other: "Environment", who: str, insist: str) -> None:
-        """Raise a ValueError, which names flags to change, unless `who`, of this one, can act in `other`."""
+    def check_same(self, other: "Environment", who: str, override: str) -> None:
+        """Raise a ValueError, which names flags to change, unless `who`, trained here, can act in `other`."""
         names = self.differences(other)
         if not names:
             return
         flags = [self._flag(name) for name in names if name in COMPARED]
-        ways_out = [f"evaluate with {' '.join(flags)}", insist] if flags else [insist]
+        ways_out = [f"evaluate with {' '.join(flags)}", override] if flags else [override]
         raise ValueError(
             f"{who} was trained for an environment with {self.text(names)}; this one has "
             f"{other.text(names)}: {', or '.join(ways_out)}"
@@ -165,7 +165,7 @@ leave_out_of_help(Environment, [each.name for each in fields(Environment)])
 
 
 def numbered_tasks(specs: Iterable[Mapping[str, Any]]) -> tuple[int, ...]:
-    """Numbers of the tasks of episodes; none where those of an episode are drawn.
+    """Numbers of the episodes' tasks; empty if each episode draws its task.
 
     A spec gives its task by number, or by a target and a colour.
     """

@@ -1,4 +1,4 @@
-"""An episode: what determines it, how far it got, why it failed."""
+"""An episode: its spec, its stages, its failure class."""
 
 import dataclasses
 from dataclasses import dataclass
@@ -10,7 +10,7 @@ from lerobot_bomb.bomb.suites import SUITES
 from lerobot_bomb.conditions import NONE, PerturbedSpec
 from lerobot_bomb.flags import one_of
 
-# Version of how a policy is measured and what a line of results says. 1.1 is 1.0 with lines that name
+# Version of how a policy is measured and what a record says. 1.1 is 1.0 with records that name
 # simulator, policy and tasks. A suite has a version of its own, of what its episodes are: `bomb/suite.py`.
 PROTOCOL_VERSION = "1.1"
 

@@ -1,4 +1,4 @@
-"""A scripted expert, which moves stones one by one: memoryless, free of pauses, so that it can be imitated.
+"""A scripted expert that moves stones one by one, without memory or pauses, so that it can be imitated.
 
 Its action is a continuous function of what an observation shows: gripper, measured finger opening,
 stones, target. It keeps no phase and no counter, and never reads `PrivilegedState.stage`.
@@ -57,7 +57,7 @@ OFF_BESIDE_M = (0.022, 0.032)
 
 
 def expert_action(state: PrivilegedState) -> np.ndarray:
-    """(4,) float32 action that brings each goal's stone to its place, as the state's environment reads it.
+    """(4,) float32 action that brings each goal's stone to its place, in the control mode of the state.
 
     Relative: units of `MAX_STEP_M`, within [-1, 1]; absolute: metres within the workspace.
     """
@@ -111,7 +111,7 @@ def _reached(state: PrivilegedState, goal: Goal) -> float:
 
 
 def _anticipate(state: PrivilegedState) -> PrivilegedState:
-    """The state after what the gripper has been given and, for latency, has not done yet."""
+    """Return the state after the commands that latency still holds back."""
     stone, stone_xyz = state.goals[0].stone, state.stone_xyz.copy()
     stone_xyz[stone] += _held(state, stone_xyz[stone]) * state.pending_motion_m
     state = replace(state, gripper_xyz=state.gripper_xyz + state.pending_motion_m, stone_xyz=stone_xyz)

@@ -1,4 +1,4 @@
-"""Follows an episode and says how it stands and how it ended: stones to the places that a plan names."""
+"""Judge of an episode: follows the moves of its plans, and says how it ended."""
 
 import math
 from collections.abc import Iterator
@@ -75,7 +75,7 @@ class Judge:
         return BOARD.nearest_intersection(self._now.stone_xyz[self._stone, :2])
 
     def update(self, now: Snapshot) -> bool:
-        """Take in the state after a control step; whether the episode has ended."""
+        """Take in the state after a control step; return True if the episode has ended."""
         touched = now.stone_touched[:, 0] | now.stone_touched[:, 1]
         held = now.stone_touched[:, 0] & now.stone_touched[:, 1]
         step_m = now.stone_xyz - self._now.stone_xyz

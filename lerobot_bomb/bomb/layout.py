@@ -29,8 +29,8 @@ def put_on_board(stones: Mapping[Intersection, str], layout: Layout) -> Layout:
     """The layout with the first stones that are not in play on these intersections."""
     stone_xy, stone_is_white = layout.stone_xy.copy(), layout.stone_is_white.copy()
     in_play = layout.stone_in_play.copy()
-    for i, (cell, color) in zip(np.flatnonzero(~in_play), stones.items(), strict=False):
-        stone_xy[i] = BOARD.intersection_xy(*cell)
+    for i, (intersection, color) in zip(np.flatnonzero(~in_play), stones.items(), strict=False):
+        stone_xy[i] = BOARD.intersection_xy(*intersection)
         stone_is_white[i] = color == "white"
         in_play[i] = True
     return replace(layout, stone_xy=stone_xy, stone_is_white=stone_is_white, stone_in_play=in_play)

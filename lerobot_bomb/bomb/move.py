@@ -34,9 +34,9 @@ class Aim:
     is_slid: bool = False
 
 
-def aim_at(stone: int, cell: Intersection, is_slid: bool = False) -> Aim:
+def aim_at(stone: int, intersection: Intersection, is_slid: bool = False) -> Aim:
     """Return the aim of bringing a stone to an intersection."""
-    x, y = BOARD.intersection_xy(*cell)
+    x, y = BOARD.intersection_xy(*intersection)
     return Aim(stone, (float(x), float(y)), is_slid)
 
 
@@ -46,7 +46,7 @@ def one_move(stone: int, places: Collection[Place]) -> Move:
 
 
 def in_order(*moves: Move) -> Plan:
-    """A plan whose moves come one after the other."""
+    """Return a plan whose moves come one after the other."""
     return tuple(
         Move(move.stones, move.places, frozenset(range(number)), move.is_slid)
         for number, move in enumerate(moves)

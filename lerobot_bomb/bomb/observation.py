@@ -56,7 +56,7 @@ def action_bounds(control_mode: str) -> tuple[np.ndarray, np.ndarray]:
 
 
 def reach_m(actions: np.ndarray, control_mode: str) -> np.ndarray:
-    """(T, ACTION_DIM) in the environment's units -> (3,) metres where they lead.
+    """(T, ACTION_DIM) in the environment's units -> (3,) metres, where they lead.
 
     Relative ones from where the gripper is, absolute ones in the world's frame; limits are left aside.
     """

@@ -1,4 +1,4 @@
-"""Pointing: which stone goes where, as the expert means it and as a policy says it.
+"""Pointing: which stone goes where, by the expert and by a policy.
 
 It is what a policy must read before it can act, and the stones are seen before that; what the expert would do
 for other places teaches it to act as it has pointed. A recording has all of it in columns that only training
@@ -33,7 +33,10 @@ def _middles(half_m: float) -> list[float]:
 
 
 # where the expert puts stones
-PLACES_XY_M = (*(tuple(BOARD.intersection_xy(*cell).tolist()) for cell in INTERSECTIONS), *TRAY_XY_M)
+PLACES_XY_M = (
+    *(tuple(BOARD.intersection_xy(*intersection).tolist()) for intersection in INTERSECTIONS),
+    *TRAY_XY_M,
+)
 # the tray's squares, row by row from the far one
 TRAY_SPOTS_XY_M = tuple(
     (round(TRAY_CENTER_XY[0] + x, 6), round(TRAY_CENTER_XY[1] - y, 6))
@@ -78,7 +81,7 @@ class Meant:
 
 @dataclass(frozen=True)
 class PointedAt:
-    """A stone and the place where a policy says that it brings it."""
+    """A stone and its place, as a policy predicts them."""
 
     place_xy: np.ndarray  # (2,) metres
     stone_xy: np.ndarray  # (2,) metres
@@ -139,7 +142,7 @@ def colors_on_spots(state: PrivilegedState) -> np.ndarray:
 
 
 def action_for(state: PrivilegedState, pointed: PointedAt) -> np.ndarray:
-    """(4,) the expert's action if stone and place were where they are pointed at; what it holds, it holds."""
+    """(4,) the expert's action if stone and place were where they are pointed at; the grip stays as it is."""
     goal, stone_xyz = current_goal(state), state.stone_xyz.copy()
     if held_share(state, goal.stone) < HELD:
         stone_xyz[goal.stone, :2] = pointed.stone_xy

@@ -12,7 +12,7 @@ from lerobot_bomb.bomb.episode import CONTROL_MODES, DEFAULT_FPS, Stage
 
 @dataclass(frozen=True)
 class Goal:
-    """Goal of the expert: a stone, and where it is to lie."""
+    """Goal of the expert: a stone, and its place."""
 
     xyz: np.ndarray  # (3,) metres, centre of the stone at rest there
     stone: int  # its index
@@ -73,7 +73,7 @@ class PrivilegedState:
 
 @dataclass(frozen=True)
 class _Part:
-    """Numbers of the vector that stand together: how they are read from a state, and what they say of it."""
+    """Part of the vector: how it is read from a state, and written back to one."""
 
     size: int  # 0: as many as the goals take
     encode: Callable[[PrivilegedState], Any]

@@ -1,4 +1,4 @@
-"""Policies that are programs, not networks: what the floor and the ceiling of BOMB share."""
+"""Base of policies that are programs, not networks: BOMB's floor and ceiling."""
 
 from abc import abstractmethod
 from dataclasses import dataclass

@@ -10,7 +10,7 @@ import numpy as np
 
 
 class Stream(IntEnum):
-    """Stream of random numbers of one quantity: of a suite, of the arm, or of what acts."""
+    """Stream of random numbers, one for each quantity that an episode draws."""
 
     TARGET = 0
     COLOR = 1

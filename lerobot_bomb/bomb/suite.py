@@ -21,7 +21,7 @@ NUM_TRAINED_TEMPLATES = 3  # the first ones of a suite; the others are held out
 
 @dataclass(frozen=True)
 class Turn:
-    """Instruction that is given once so many moves have been made."""
+    """Instruction that is given after a number of moves."""
 
     instruction: str
     # what stands for the stone, the place or the command in the suite's templates and forms
@@ -30,7 +30,7 @@ class Turn:
 
 @dataclass(frozen=True)
 class Episode:
-    """Episode that an EpisodeSpec stands for."""
+    """Episode that an EpisodeSpec determines."""
 
     spec: EpisodeSpec
     task_id: int  # which of the suite's numbered tasks it is of
@@ -57,7 +57,7 @@ class Episode:
         return self.turns[0].instruction
 
     def instruction_after(self, num_moves: int) -> str:
-        """Return the instruction once so many moves have been made."""
+        """Return the instruction after this number of moves."""
         return self.turns[min(num_moves, len(self.turns) - 1)].instruction
 
     def allows(self, stones: Mapping[Intersection, str]) -> bool:
@@ -72,9 +72,9 @@ class Episode:
         return self.aims[0].stone
 
     def goals_after(self, num_moves: int) -> tuple[Goal, ...]:
-        """Return the expert's goals once so many moves have been made, as far as they have been said.
+        """Return the expert's goals after this number of moves, as far as instructions have named them.
 
-        There are `Suite.num_goals` of them; where there are fewer, the last one is repeated.
+        There are always `Suite.num_goals`: the last one is repeated if need be.
         """
         aims = self.aims[: num_moves + 1] if len(self.turns) > 1 else self.aims
         height_m = self.layout.rest_height_m
@@ -118,30 +118,30 @@ def suites_of(name: str) -> tuple[str, ...]:
 
 
 def of_split[T](split: str, items: Sequence[T], heldout: Sequence[T]) -> tuple[T, ...]:
-    """Return what a split draws from: the items that are held out, the others, or all."""
+    """Return the items that a split draws from: those held out, the others, or all."""
     return tuple(item for item in items if split == "all" or (item in heldout) == (split == "heldout"))
 
 
 def templates_of(split: str, templates: Sequence[str]) -> tuple[str, ...]:
-    """Return the templates that a split draws from, of a suite's instruction templates."""
+    """Return those of a suite's instruction templates that a split draws from."""
     return of_split(split, templates, templates[NUM_TRAINED_TEMPLATES:])
 
 
 def draw_template(spec: EpisodeSpec, templates: Sequence[str]) -> str:
-    """One of those that the spec's split draws from."""
+    """Draw one of the templates of the spec's split."""
     of_spec = templates_of(spec.split, templates)
     return of_spec[generator(spec.seed, Stream.TEMPLATE).integers(len(of_spec))]
 
 
 def refuse_options(spec: EpisodeSpec, *names: str) -> None:
-    """Raise a ValueError if the spec sets what its suite draws or does not have."""
+    """Raise a ValueError if the spec sets an option that its suite draws or does not have."""
     for name in names:
         if (value := getattr(spec, name)) is not None:
             raise ValueError(f"--env.{name}={value} is not an option of --env.task={spec.suite}; drop it")
 
 
 def specs_of_tasks(spec: EpisodeSpec, task_ids: Sequence[int]) -> list[EpisodeSpec]:
-    """The spec for each of these numbered tasks of its suite; as it is where there are none.
+    """Return the spec for each of these numbered tasks of its suite; without numbers, the spec itself.
 
     Raises:
         ValueError: the suite has no such task, one is there twice, or the spec fixes what a task fixes.

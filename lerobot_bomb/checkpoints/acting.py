@@ -1,4 +1,4 @@
-"""The policy that acts in an environment, of which LeRobot tells the environment nothing."""
+"""The policy that acts in an environment; LeRobot does not tell the environment which."""
 
 import gc
 import logging
@@ -11,14 +11,14 @@ from lerobot.policies import PreTrainedPolicy
 
 from lerobot_bomb.compat.hooks.policies import built_policies
 
-INSIST = "insist with --env.ignore_checkpoint=true"  # the one way past a check of who acts
+OVERRIDE = "override with --env.ignore_checkpoint=true"  # the one way past the check of which policy acts
 
 _acting: ContextVar[PreTrainedConfig | None] = ContextVar("acting", default=None)
 
 
 @contextmanager
 def acting(config: PreTrainedConfig) -> Iterator[None]:
-    """Let the policy of a config be the one that acts, also where none is built of it."""
+    """Let the policy of this config count as the one that acts, even if none has been built."""
     token = _acting.set(config)
     try:
         yield
@@ -33,7 +33,7 @@ def acting_config() -> PreTrainedConfig | None:
 
 
 def acting_policy() -> PreTrainedPolicy | None:
-    """Return the one policy that this process built and holds; None: it holds none, or several.
+    """Return the one policy that this process built and holds; None if it holds none, or several.
 
     LeRobot's commands build it before they ask an environment for anything but its features.
     """

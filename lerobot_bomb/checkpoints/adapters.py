@@ -1,4 +1,4 @@
-"""Adapters: what LoRA and other methods of `peft` change of our policies; LeRobot asks a policy for it."""
+"""Adapters: the parts of our policies that LoRA and other methods of `peft` change."""
 
 from collections.abc import Iterable
 from pathlib import Path
@@ -30,7 +30,7 @@ PROJECTIONS = "q|k|v|o|gate|up|down"  # of a layer's attention and MLP
 def peft_targets(
     policy: nn.Module, text_model: str, new_parts: Iterable[str], others: Iterable[str] = ()
 ) -> dict[str, Any]:
-    """Adapters on every projection of the text model's layers; parts that are new are trained as they are.
+    """Adapters on every projection of the text model's layers; new parts are trained whole.
 
     ``others``: patterns of more modules with adapters. Of ``new_parts``, those that the policy has.
     """
@@ -42,7 +42,7 @@ def peft_targets(
 
 
 def frozen_buffers(policy: nn.Module) -> dict[str, Tensor]:
-    """Copies of what a checkpoint holds besides parameters."""
+    """Copies of all that a policy's state holds besides parameters."""
     parameters = dict(policy.named_parameters(remove_duplicate=False))
     return {name: held.clone() for name, held in policy.state_dict().items() if name not in parameters}
 
@@ -50,10 +50,10 @@ def frozen_buffers(policy: nn.Module) -> dict[str, Tensor]:
 def check_buffers_are_the_bases(
     policy: nn.Module, base: dict[str, Tensor] | None, saved: Iterable[str], advice: str
 ) -> None:
-    """Raise a ValueError if the policy was fitted to other data than the checkpoint ``base`` is of.
+    """Raise a ValueError if the policy was fitted to other data than the checkpoint ``base``.
 
-    Adapters are loaded on that checkpoint again, which would not know of it. They hold the modules that are
-    ``saved`` with them.
+    Adapters are loaded on that checkpoint again, which does not have these values. They hold the modules that
+    are ``saved`` with them.
     """
     of_saved = tuple(f"{name}." for name in saved)
     fitted = {name: held for name, held in frozen_buffers(policy).items() if not name.startswith(of_saved)}
@@ -66,13 +66,13 @@ def check_buffers_are_the_bases(
 
 
 def check_base(base: str) -> None:
-    """Raise a ValueError unless others can get the checkpoint that adapters are of: its name on the Hub."""
+    """Raise a ValueError unless the adapters' base is named by its id on the Hub, where others can get it."""
     if not is_hub_id(base):
         raise ValueError(f"the base of these adapters, {base}, is on this machine only; {TO_PUBLISH}")
 
 
 def check_adapters(path: str, revision: str | None) -> Path:
-    """Return the file of adapters, from a folder or the Hub; it is whole, finite and all that `peft` reads.
+    """Return the file of adapters, from a folder or the Hub, checked: whole, finite, all that `peft` reads.
 
     They are safetensors; in their place `peft` would read a pickle.
 
@@ -143,7 +143,7 @@ def check_adapters_fit(policy_type: Any, config: Any, path: str, revision: str |
 
 
 def base_commit(base: str, revision: str | None) -> str | None:
-    """The commit of the weights that a checkpoint on the Hub was just loaded with; None: it is a folder."""
+    """Return the commit of the weights that were just loaded from the Hub; None for a folder."""
     if not is_hub_id(base):
         return None
     path = try_to_load_from_cache(base, constants.SAFETENSORS_SINGLE_FILE, revision=revision)

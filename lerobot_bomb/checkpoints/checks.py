@@ -107,7 +107,7 @@ def check_finite(path: Path) -> None:
 
 
 def _without_filling(edges: Tensor) -> Tensor:
-    """(C, E) -> the same with 0 for what ends a row as inf, after at least two edges."""
+    """(C, E) -> the same with 0 in place of the inf that ends a row, after at least two edges."""
     is_filling = (edges == torch.inf).flip(1).cumprod(dim=1).flip(1).bool()
     is_filling[:, :2] = False
     return edges.masked_fill(is_filling, 0)
@@ -156,7 +156,7 @@ def _names_code(values: Any, key: str = "") -> bool:
 
 
 def check_weights(folder: Path, config: PreTrainedConfig, policy_type: type[PreTrainedPolicy]) -> None:
-    """Check that weights are those of the config's policy, by name and shape, without taking memory.
+    """Check that weights fit the config's policy, by name and shape, without loading them.
 
     Raises:
         ValueError: names the first tensor that is missing, not known, or of another shape.
@@ -167,7 +167,7 @@ def check_weights(folder: Path, config: PreTrainedConfig, policy_type: type[PreT
 
 
 def check_tensors(path: Path, policy: PreTrainedPolicy) -> list[str]:
-    """Raise unless a file's weights are a policy's, by name and shape; return the names of those needed.
+    """Check that a file's weights fit a policy, by name and shape; return the names of those it needs.
 
     A policy may do without parts of a file (``may_skip``) and have parts of its own that the file lacks as a
     whole (``may_lack``): names of modules.

@@ -1,4 +1,4 @@
-"""The version that wrote a checkpoint's config.json, and what keeps one from being read here."""
+"""Version that wrote a checkpoint's config.json, and the reasons not to read one."""
 
 from collections.abc import Sequence
 from pathlib import Path
@@ -27,7 +27,7 @@ INSTALLED = PackageVersion(__version__)
 
 @draccus.decode.register(PackageVersion)
 def _decode(written_by: str, path: Sequence[str]) -> PackageVersion:
-    """The installed version, as that is what writes the config the next time.
+    """Return the installed version, which writes the config the next time.
 
     Raises:
         DecodingError: the checkpoint is newer; its fields and weights may mean what nobody here knows.
@@ -46,7 +46,7 @@ draccus.encode.register(PackageVersion, str)
 
 
 def config_damage(pretrained: str | Path, revision: str | None) -> str | None:
-    """Say what keeps a config.json from being any policy's; None: nothing, or there is none."""
+    """Say why a config.json is no policy's; None if it is one, or if there is no file."""
     try:
         file = local_file(pretrained, revision, CONFIG)
         policy_type = None if file is None else read_json(file).get("type")

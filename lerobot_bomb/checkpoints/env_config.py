@@ -1,4 +1,4 @@
-"""Base of our env types' configs: flags, checks and vector environments that all of them have."""
+"""Base of our env types' configs: the flags, checks and vector environments they share."""
 
 from abc import abstractmethod
 from collections.abc import Callable, Mapping
@@ -53,7 +53,7 @@ class EvaluatedEnv(_EnvConfig):
 
     @abstractmethod
     def _declare_features(self) -> None:
-        """Declare what a policy gets here, and the actions that it gives."""
+        """Declare the observations that a policy gets here, and the actions that it returns."""
 
     @abstractmethod
     def _check_policy(self) -> None:

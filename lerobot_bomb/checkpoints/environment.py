@@ -1,4 +1,4 @@
-"""Environment that a policy was trained for, and whether it is the one that the policy is about to act in."""
+"""Environment that a policy was trained for, and the check that it is the one to act in."""
 
 import logging
 from collections.abc import Iterable
@@ -9,7 +9,7 @@ from typing import Any, ClassVar
 from lerobot.configs import PreTrainedConfig
 
 from lerobot_bomb.bomb.environment import IMAGES, Environment
-from lerobot_bomb.checkpoints.acting import INSIST, acting_config, name_of
+from lerobot_bomb.checkpoints.acting import OVERRIDE, acting_config, name_of
 from lerobot_bomb.checkpoints.training import dataset_of, read_train_config
 from lerobot_bomb.compat.hooks.policies import training_data
 from lerobot_bomb.compat.use import use
@@ -40,11 +40,11 @@ class ConfigWithEnvironment(PreTrainedConfig):
         super().__post_init__()
 
     def missing_parts(self) -> str | None:
-        """Describe what a checkpoint with this config lacks and what it would need instead; None: nothing."""
+        """Describe what a checkpoint with this config lacks, and what it would need; None if nothing."""
         return None
 
     def methods_used(self) -> str:
-        """Return those methods of its type that a checkpoint of this config uses; empty: no choice."""
+        """Return the methods of its type that a checkpoint of this config uses; '' if there is no choice."""
         return ""
 
 
@@ -72,7 +72,7 @@ def trained_environment(config: PreTrainedConfig) -> Environment | None:
 
 
 def environment_of_dataset(root: Path | str | None) -> Environment | None:
-    """Return the environment of a dataset; None: the folder is gone, or holds no recording of BOMB."""
+    """Return the environment of a dataset; None if the folder is gone, or holds no recording of BOMB."""
     facts = DatasetFacts.find(root)
     return None if facts is None else facts.environment
 
@@ -80,7 +80,7 @@ def environment_of_dataset(root: Path | str | None) -> Environment | None:
 def dataset_of_training(config: PreTrainedConfig) -> Path | None:
     """Folder of the dataset that it is being trained on, or that its checkpoint's training names.
 
-    It may be gone. None: not known.
+    It may be gone. None if unknown.
     """
     meta, path = training_data(config), config.pretrained_path
     if meta is not None:
@@ -91,7 +91,7 @@ def dataset_of_training(config: PreTrainedConfig) -> Path | None:
 def _check(config: PreTrainedConfig, who: str, here: Environment) -> None:
     environment = trained_environment(config)
     if environment is not None:
-        environment.check_same(here, who, INSIST)
+        environment.check_same(here, who, OVERRIDE)
         if environment.task is None:
             logger.warning(
                 "%s does not know the suite that it was trained for, so none was compared: --env.task must "
@@ -109,7 +109,7 @@ def _check(config: PreTrainedConfig, who: str, here: Environment) -> None:
 
 
 def complete_evaluation(config: Any) -> None:
-    """Let the environment of LeRobot's EvalPipelineConfig be what its flags leave open and its policy says.
+    """Fill in what the flags of LeRobot's EvalPipelineConfig leave open and its policy's checkpoint knows.
 
     Raises:
         FlagError: it is to record several episodes.
@@ -120,14 +120,14 @@ def complete_evaluation(config: Any) -> None:
 
 
 def side_of_images(config: PreTrainedConfig | None, cameras: Iterable[str]) -> int | None:
-    """Return the side of the square images of cameras that a policy's config declares; None: of none."""
+    """Return the side of the square images that a policy's config declares; None if it declares none."""
     features = (config and config.input_features) or {}
     shapes = (features[IMAGES + camera].shape for camera in cameras if IMAGES + camera in features)
     return next((height for _, height, width in shapes if height == width), None)
 
 
 def _check_image_size(config: PreTrainedConfig, here: Environment, who: str) -> None:
-    """Raise if the config's inputs (3, H, W) are of another size than the images of the cameras here."""
+    """Raise if the config's inputs (3, H, W) have another size than the cameras' images here."""
     for camera in here.cameras:
         feature = (config.input_features or {}).get(f"{IMAGES}{camera}")
         if feature is None or tuple(feature.shape[1:]) == (here.image_size,) * 2:
@@ -135,5 +135,5 @@ def _check_image_size(config: PreTrainedConfig, here: Environment, who: str) -> 
         height, width = feature.shape[1:]
         raise ValueError(
             f"{who} reads images of {width}x{height} pixels from the camera {camera}; this environment has "
-            f"--env.image_size={here.image_size}: evaluate with --env.image_size={width}, or {INSIST}"
+            f"--env.image_size={here.image_size}: evaluate with --env.image_size={width}, or {OVERRIDE}"
         )

@@ -23,7 +23,7 @@ Postprocessor = PolicyProcessorPipeline[PolicyAction, PolicyAction]
 
 
 def read_config(path: Path, device: str | None, flags: Sequence[str] = ()) -> PreTrainedConfig:
-    """The config in the folder `pretrained_model`; `device` None means the checkpoint's own.
+    """Read the config in the folder `pretrained_model`; `device` None keeps the checkpoint's own.
 
     `flags` change other values: "--n_action_steps=4".
 
@@ -40,7 +40,7 @@ def read_config(path: Path, device: str | None, flags: Sequence[str] = ()) -> Pr
 
 
 def parse_config(path: Path, device: str | None, flags: Sequence[str] = ()) -> PreTrainedConfig:
-    """The config in a folder, of a plugin that is registered.
+    """Read the config in a folder; its type must be registered.
 
     Raises:
         ValueError: it is truncated, of a newer version or of an unknown type.

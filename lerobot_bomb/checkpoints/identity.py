@@ -1,4 +1,4 @@
-"""Identity of the policy that this process built: LeRobot tells an environment nothing of it."""
+"""Identity of the policy that this process built, which LeRobot does not tell an environment."""
 
 import hashlib
 import json
@@ -53,7 +53,7 @@ def policy_of_results(results_path: str | None, num_envs: int) -> list[dict[str,
 
 
 def weights_file(checkpoint: Path | str, revision: str | None, has_adapters: bool) -> Path | None:
-    """Return the weights of a folder or of a downloaded Hub repository; None: it has no file of this name."""
+    """Return the weights of a folder or a downloaded Hub repository; None if there is no such file."""
     return local_file(checkpoint, revision, ADAPTERS[1] if has_adapters else WEIGHTS)
 
 
@@ -92,7 +92,7 @@ def _interventions(folder: Path) -> tuple[str, ...]:
 
 
 def _settings_sha256(config: PreTrainedConfig, folder: Path) -> str:
-    """Return the SHA-256 of what the same weights may differ in: flags of this evaluation, and processors."""
+    """Return the SHA-256 of all that changes what weights do: flags of this evaluation, and processors."""
     settings: Any = draccus.encode(config)
     settings = {name: value for name, value in settings.items() if name not in NOT_ITS_SETTINGS}
     for name, as_before in getattr(config, "LATER_FIELDS", {}).items():
@@ -107,7 +107,7 @@ def _settings_sha256(config: PreTrainedConfig, folder: Path) -> str:
 
 
 def _base(path: str, revision: str | None) -> str | None:
-    """Name of what adapters are loaded on; with its revision, where that is fixed."""
+    """Name of the adapters' base, with its revision if that is fixed."""
     file = local_file(path, revision, ADAPTERS[0])
     adapters = {} if file is None else read_json(file)
     base, of_base = adapters.get("base_model_name_or_path"), adapters.get("revision")

@@ -1,4 +1,4 @@
-"""Fit of a policy to an environment whose datasets say no more than shapes and statistics."""
+"""Fit of a policy to an environment whose datasets state only shapes and statistics."""
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
@@ -9,7 +9,7 @@ from lerobot.configs import FeatureType, PolicyFeature, PreTrainedConfig
 from lerobot.utils.constants import ACTION, POLICY_POSTPROCESSOR_DEFAULT_NAME
 from safetensors import safe_open
 
-from lerobot_bomb.checkpoints.acting import INSIST, acting_config, name_of
+from lerobot_bomb.checkpoints.acting import OVERRIDE, acting_config, name_of
 from lerobot_bomb.checkpoints.environment import trained_environment
 from lerobot_bomb.checkpoints.identity import weights_file
 from lerobot_bomb.compat.hooks.policies import training_data
@@ -21,7 +21,7 @@ UNNORMALIZER = f"{POLICY_POSTPROCESSOR_DEFAULT_NAME}_step_*_unnormalizer_process
 
 @dataclass(frozen=True)
 class Interface:
-    """Interface of an environment: what it shows a policy and takes from it."""
+    """Interface of an environment: its observations and actions."""
 
     env_type: str
     features: Mapping[str, PolicyFeature]  # by the policy's names
@@ -30,7 +30,7 @@ class Interface:
     image_flags: Callable[[int, int], str]  # (height, width) -> the flags of images of this size
 
     def check_acting_policy(self) -> None:
-        """Check that the policy that acts was trained for such an environment, as far as is known.
+        """Check, as far as is known, that the acting policy was trained for such an environment.
 
         Raises:
             ValueError: it was trained for another one; the message says what differs and the way out.
@@ -42,7 +42,7 @@ class Interface:
         if trained_for is not None:
             raise ValueError(
                 f"{who} was trained for {trained_for}; this is --env.type={self.env_type}: evaluate with "
-                f"{' '.join(trained_for.eval_flags())}, or {INSIST}"
+                f"{' '.join(trained_for.eval_flags())}, or {OVERRIDE}"
             )
         self._check_features(config, who)
         self._check_actions(config, who)
@@ -57,7 +57,7 @@ class Interface:
                 evaluate = f"evaluate with {self.image_flags(*there[1:])}"
                 raise ValueError(
                     f"{who} reads images of {there[2]}x{there[1]} pixels; this environment has "
-                    f"{self.image_flags(*here[1:])}: {evaluate}, or {INSIST}"
+                    f"{self.image_flags(*here[1:])}: {evaluate}, or {OVERRIDE}"
                 )
             raise ValueError(
                 f"{who} has {name} of shape {there}, and --env.type={self.env_type} of shape {here}: "
@@ -77,12 +77,12 @@ class Interface:
         raise ValueError(
             f"{who} was trained on actions from {_text(low)} to {_text(high)}; those of "
             f"--env.type={self.env_type} are {self.action_meaning}, {least:g} to {greatest:g}: give a "
-            f"checkpoint of such actions, or {INSIST}"
+            f"checkpoint of such actions, or {OVERRIDE}"
         )
 
 
 def trained_actions(config: PreTrainedConfig) -> tuple[np.ndarray, np.ndarray] | None:
-    """(D,) least and (D,) greatest value of each dimension in a policy's training; None: not known."""
+    """(D,) least and (D,) greatest value of each dimension in a policy's training; None if unknown."""
     meta = training_data(config)
     if meta is not None:
         of_action = (meta.stats or {}).get(ACTION, {})

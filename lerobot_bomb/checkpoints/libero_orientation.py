@@ -53,7 +53,7 @@ class OrientationCheck:
 
 @cache  # each condition of an evaluation asks for the same
 def images_of_task(root: Path, key: str, task: str) -> np.ndarray | None:
-    """(N, H, W, 3) uint8 of episodes of one task; None: none are here, and nothing is downloaded."""
+    """(N, H, W, 3) uint8 images of one task; None if no dataset is on this machine: nothing is downloaded."""
     if not (root / INFO_FILE).is_file():
         return None
     meta = LeRobotDatasetMetadata(root.name, root=root)

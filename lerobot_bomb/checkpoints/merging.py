@@ -24,7 +24,7 @@ def merge(adapters: Path, output: Path) -> None:
 
 
 def merged(config: PreTrainedConfig, adapters: Path) -> PreTrainedPolicy:
-    """The policy whose weights are those of the base and its adapters; the config is of a whole one then."""
+    """Merge base and adapters into one policy, with the config of a policy without adapters."""
     check_adapters_fit(get_policy_class(config.type), config, str(adapters), None)
     import peft  # pyright: ignore[reportMissingImports]
 

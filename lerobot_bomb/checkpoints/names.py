@@ -38,7 +38,7 @@ def is_hub_id(name: object) -> bool:
 
 
 def local_file(checkpoint: Path | str, revision: str | None, name: str) -> Path | None:
-    """Return a file of a folder, or of a repository on the Hub as it was downloaded; None: it has none."""
+    """Return a file of a folder, or of a repository on the Hub as it was downloaded; None if it has none."""
     if Path(checkpoint).is_dir():
         path = Path(checkpoint) / name
         return path if path.is_file() else None

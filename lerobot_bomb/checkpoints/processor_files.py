@@ -53,7 +53,7 @@ STATISTICS = {**BOUND_STATISTICS, NormalizationMode.MEAN_STD: CENTRE_AND_DISTANC
 
 
 def saved_type(config_file: Path) -> object:
-    """Return the type in a checkpoint's config.json; None: whoever reads the config will say why not."""
+    """Return the type in a checkpoint's config.json; None if it cannot be read, which its reader reports."""
     try:
         return read_json(config_file).get("type")
     except (OSError, ValueError):
@@ -118,7 +118,7 @@ def _check_step(step: Mapping[str, Any], where: str, policy_type: object) -> Non
 
 
 def _name_of_class(path: object, where: str, policy_type: object) -> str | None:
-    """The registered name, if any, of a step that is named by its path; its module is loaded already.
+    """Return the registered name, if any, of a step given by its class path; its module is loaded.
 
     Raises:
         ValueError: it is no such step, or the checkpoint is of our types, whose steps are all registered.
@@ -144,7 +144,7 @@ def _check_state_file(name: object, where: str) -> None:
 
 
 def refuse_link_out(file: Path) -> None:
-    """Raise a ValueError if a file is a link that leaves its folder, but for the Hub's cache of blobs."""
+    """Raise a ValueError if a file is a link out of its folder, except to the blobs of the Hub's cache."""
     folder = Path(os.path.realpath(file.parent))
     allowed = [folder, *([folder.parents[1] / "blobs"] if folder.parent.name == "snapshots" else [])]
     target = Path(os.path.realpath(file))
@@ -163,7 +163,7 @@ def _check_artifacts(artifacts: object, what: str, policy_type: object) -> None:
 
 
 def check_saved_processors() -> None:
-    """Have whoever loads a processor in this process has it checked: LeRobot's commands too."""
+    """Check every processor that is loaded in this process, by LeRobot's commands too."""
 
     def check(content: dict[str, Any], where: str, config: Path) -> None:
         for name in state_files(content, where, saved_type(config)):

@@ -74,7 +74,7 @@ class _Clock:
         return action
 
     def _wait(self) -> None:
-        """Wait until the device has done what it was given."""
+        """Wait until the device is idle."""
         if self._device.type != "cpu":
             torch.accelerator.synchronize(self._device)
 
@@ -101,7 +101,7 @@ def _queue_lengths(policy: PreTrainedPolicy) -> dict[tuple[str, ...], int]:
 
 
 def _told(policy: PreTrainedPolicy, name: str) -> Any:
-    """Return a number that a policy tells of its last query; None: it tells none of this name."""
+    """Return a number that a policy tells of its last query; None if it tells none of this name."""
     value = getattr(policy, name, None)
     return value if type(value) in (int, float) else None
 
@@ -125,7 +125,7 @@ def _reset_peak_memory(device: torch.device) -> None:
 
 
 def _peak_memory_bytes(device: torch.device) -> int | None:
-    """Return the peak memory, on a CPU of the whole process, on CUDA of tensors; None: it is not known."""
+    """Return the peak memory, on a CPU of the whole process, on CUDA of tensors; None if it is not known."""
     if device.type == "cuda":
         return torch.cuda.max_memory_allocated(device)
     if device.type != "cpu" or not (PROCESS / "status").is_file():

@@ -12,7 +12,7 @@ PREFIX = "bomb:"
 
 
 def shipped_names() -> list[str]:
-    """Return the names that can stand behind `bomb:`."""
+    """Return the names that can follow `bomb:`."""
     return sorted(path.parent.name for path in FOLDER.glob(f"*/{CONFIG}"))
 
 
@@ -30,7 +30,7 @@ def shipped_checkpoint(name: str) -> Path:
 
 
 def checkpoint_path(text: str) -> str:
-    """Return a given checkpoint's path: the folder that `bomb:NAME` means, all else as it is.
+    """Return a checkpoint's path: for `bomb:NAME` its folder, anything else unchanged.
 
     Raises:
         ValueError: no checkpoint of this name comes with the package.

@@ -56,7 +56,7 @@ EDGE_TOLERANCE = 1e-6
 
 @dataclass(frozen=True)
 class Published:
-    """A published folder, and what its files do not say."""
+    """A published folder, with the settings that its files lack."""
 
     folder: Path
     statistics: str | None = None  # name of those that scale actions; None: it has one only
@@ -104,7 +104,7 @@ def convert(published: Published, output: Path) -> str:
 
 
 def _prompt_text(template: str) -> str:
-    """Say what the prompt is and why; no file of the folder says it."""
+    """Describe the prompt and its source; no file of the folder has it."""
     if template == BARE_TASK:
         return (
             "prompt: the instruction alone, as the original's processor adds nothing to what it is given; "
@@ -130,7 +130,7 @@ def _chosen_statistics(statistics: dict[str, Any], name: str | None) -> str:
 
 
 def _action_scales(action: dict[str, Any]) -> dict[str, Tensor]:
-    """Return what the normalised actions -1 and 1 stand for, where the original scales by q01 and q99.
+    """Return the actions that -1 and 1 stand for, where the original scales by q01 and q99.
 
     It does so where ``mask`` says so. Its gripper is 0 or 1 before, where ours is -1 or 1.
     """

@@ -1,4 +1,4 @@
-"""Starting a training from a checkpoint, and what to start from where it cannot."""
+"""Start of a training from a checkpoint, and advice where that is impossible."""
 
 import logging
 from pathlib import Path

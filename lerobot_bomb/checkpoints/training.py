@@ -9,13 +9,13 @@ from lerobot_bomb.files import read_json
 
 
 def read_train_config(checkpoint: Path) -> dict[str, Any]:
-    """Return what lerobot-train was given; empty if the checkpoint does not say."""
+    """Return the config of the training; empty if the checkpoint does not have it."""
     path = checkpoint / TRAIN_CONFIG
     return read_json(path) if path.is_file() else {}
 
 
 def dataset_of(train_config: dict[str, Any]) -> Path | None:
-    """Folder of the dataset, which may be gone; None: not known.
+    """Folder of the dataset, which may be gone; None if unknown.
 
     Raises:
         ValueError: the config names no dataset as lerobot-train does.

@@ -27,7 +27,7 @@ ANSWER_IS_NO = 3  # exit code of a command that was asked something; 1 is an err
 
 
 def path_flag(text: str) -> Path:
-    """The path that a flag gives, for argparse; ~ is the home folder wherever it stands: --root=~/x.
+    """Return the path that a flag gives, for argparse; ~ is the home folder, also in --root=~/x.
 
     Raises:
         argparse.ArgumentTypeError: it is empty, of an unknown user, or not UTF-8.
@@ -120,7 +120,7 @@ def add_dataset_arguments(parser: argparse.ArgumentParser, about: str = "") -> N
 
 
 def add_new_dataset_arguments(parser: argparse.ArgumentParser) -> None:
-    """Declare what a dataset that is written is called, and where it lies."""
+    """Declare name and folder of a new dataset."""
     parser.add_argument("--repo_id", required=True, help="name of the dataset on the Hub, USER/NAME")
     root = "new folder of the dataset (default: LeRobot's, $HF_LEROBOT_HOME/REPO_ID)"
     parser.add_argument("--root", type=path_flag, help=root)
@@ -139,7 +139,7 @@ def long_forms(flags: Sequence[str]) -> list[str]:
 
 
 def add_episode_arguments(parser: argparse.ArgumentParser) -> None:
-    """Declare what a command that runs episodes is told of them beside the seed, as --env.type=bomb is."""
+    """Declare the flags of --env.type=bomb, except the seed, for a command that runs episodes."""
     add = partial(add_env_flag, parser)
     lines = f"0..{BOARD.num_lines - 1}"
     tolerance = EpisodeSpec.success_tolerance_mm

@@ -31,8 +31,8 @@ from lerobot_bomb.results.groups import read_results
 from lerobot_bomb.results.instructions import other_instructions
 from lerobot_bomb.results.record import Record
 from lerobot_bomb.sweep.claim import claimed
-from lerobot_bomb.sweep.local import play
-from lerobot_bomb.sweep.manifest import Cell, Manifest, check_flags, flag_value, largest_divisor
+from lerobot_bomb.sweep.local import run_part
+from lerobot_bomb.sweep.manifest import Job, Manifest, check_flags, flag_value, largest_divisor
 from lerobot_bomb.tables import print_table
 
 if TYPE_CHECKING:
@@ -56,13 +56,13 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(args: argparse.Namespace) -> int:
-    """Run all arms, write what they show, print the verdicts; exit code 3 where one is no."""
+    """Run all groups, write the page, print the verdicts; exit code 3 if one is no."""
     check_at_least(args, episodes=2, seed=0, workers=1)
     check_flags(args.rest)
-    arms = _play(args, args.folder / "first", _first_arms(args))
-    arms |= _play(args, args.folder / "second", _second_arms(args, arms[POLICY]))
-    found = judge(arms, _trained_seeds(args.policy_path))
-    section = Section("Audit", verdicts.table(arms, found))
+    groups = _run_jobs(args, args.folder / "first", _first_groups(args))
+    groups |= _run_jobs(args, args.folder / "second", _second_groups(args, groups[POLICY]))
+    found = judge(groups, _trained_seeds(args.policy_path))
+    section = Section("Audit", verdicts.table(groups, found))
     html, tables = (args.folder / f"audit{suffix}" for suffix in (".html", ".json"))
     with written_whole(html, tables) as (page, as_json):
         page.write_text(render(f"Audit of {args.policy_path}", [section]))
@@ -72,32 +72,32 @@ def run(args: argparse.Namespace) -> int:
     return ANSWER_IS_NO if any(each.answer == verdicts.NO for each in found) else 0
 
 
-def _first_arms(args: argparse.Namespace) -> dict[str, Cell]:
+def _first_groups(args: argparse.Namespace) -> dict[str, Job]:
     checkpoint = f"--policy.path={args.policy_path}"
     from lerobot_bomb.explain.interventions import BlankImages  # LeRobot: seconds
 
-    arms = {POLICY: _cell(args, checkpoint)}
-    if arms[POLICY].batch_size > 1:
-        arms[ALONE] = _cell(args, checkpoint, batch_size=1)
-    arms |= {
-        BLANK: _cell(args, _changed(args, "blank_images", BlankImages())),
-        RANDOM: _cell(args, "--policy.type=bomb_random"),
-        EXPERT: _cell(args, "--policy.type=bomb_expert"),
+    groups = {POLICY: _job(args, checkpoint)}
+    if groups[POLICY].batch_size > 1:
+        groups[ALONE] = _job(args, checkpoint, batch_size=1)
+    groups |= {
+        BLANK: _job(args, _changed(args, "blank_images", BlankImages())),
+        RANDOM: _job(args, "--policy.type=bomb_random"),
+        EXPERT: _job(args, "--policy.type=bomb_expert"),
     }
     if not any(flag.startswith(("--env.split", "--env.task_ids", "--env.target")) for flag in args.rest):
-        arms |= {TRAIN: _cell(args, checkpoint, "train"), HELDOUT: _cell(args, checkpoint, "heldout")}
-    return arms
+        groups |= {TRAIN: _job(args, checkpoint, "train"), HELDOUT: _job(args, checkpoint, "heldout")}
+    return groups
 
 
-def _second_arms(args: argparse.Namespace, played: list[Record]) -> dict[str, Cell]:
-    """Return the cells of the second arms, which need the instructions of the first."""
-    arms = {AGAIN: _cell(args, f"--policy.path={args.policy_path}")}
-    others = other_instructions([each for each in played if isinstance(each, EpisodeResult)])
+def _second_groups(args: argparse.Namespace, evaluated: list[Record]) -> dict[str, Job]:
+    """Return the jobs of the second groups, which need the instructions of the first."""
+    groups = {AGAIN: _job(args, f"--policy.path={args.policy_path}")}
+    others = other_instructions([each for each in evaluated if isinstance(each, EpisodeResult)])
     if others:
         from lerobot_bomb.explain.interventions import ReplaceTasks
 
-        arms[OTHER_INSTRUCTION] = _cell(args, _changed(args, "other_instruction", ReplaceTasks(others)))
-    return arms
+        groups[OTHER_INSTRUCTION] = _job(args, _changed(args, "other_instruction", ReplaceTasks(others)))
+    return groups
 
 
 def _changed(args: argparse.Namespace, name: str, step: "ProcessorStep") -> str:
@@ -110,14 +110,14 @@ def _changed(args: argparse.Namespace, name: str, step: "ProcessorStep") -> str:
     return f"--policy.path={folder}"
 
 
-def _cell(args: argparse.Namespace, policy: str, split: str = "", batch_size: int = MAX_BATCH) -> Cell:
+def _job(args: argparse.Namespace, policy: str, split: str = "", batch_size: int = MAX_BATCH) -> Job:
     of_policy = [flag for flag in args.rest if flag.startswith("--policy.")]
     of_env = [flag for flag in args.rest if not flag.startswith("--policy.")]
-    size = trained_image_size(args.policy_path)  # of the arms without a checkpoint, too
+    size = trained_image_size(args.policy_path)  # of the groups without a checkpoint, too
     if size not in (None, DEFAULT_IMAGE_SIZE) and flag_value(of_env, "--env.image_size") is None:
         of_env.append(f"--env.image_size={size}")
     is_scripted = policy.startswith("--policy.type")
-    return Cell(
+    return Job(
         policy=(policy, *([] if is_scripted else of_policy)),
         env=("--env.type=bomb", *of_env, *([f"--env.split={split}"] if split else [])),
         seed=args.seed,
@@ -126,20 +126,20 @@ def _cell(args: argparse.Namespace, policy: str, split: str = "", batch_size: in
     )
 
 
-def _play(args: argparse.Namespace, folder: Path, cells: dict[str, Cell]) -> dict[str, list[Record]]:
-    """Return {arm: its records}.
+def _run_jobs(args: argparse.Namespace, folder: Path, jobs: dict[str, Job]) -> dict[str, list[Record]]:
+    """Return {group: its records}.
 
     Raises:
         ValueError: the folder is of another audit.
         RuntimeError: a run failed.
     """
-    with claimed(folder, Manifest(tuple(cells.values()))) as store:
-        play(store, "0/1", args.workers)
+    with claimed(folder, Manifest(tuple(jobs.values()))) as store:
+        run_part(store, "0/1", args.workers)
         store.merge()
-    missing = [name for name, cell in cells.items() if not store.is_finished(cell) or store.errors(cell)]
+    missing = [name for name, job in jobs.items() if not store.is_finished(job) or store.errors(job)]
     if missing:
         raise RuntimeError("\n".join([f"no records of: {', '.join(missing)}", *store.lines()]))
-    return {name: read_results(store.file(cell, "jsonl")) for name, cell in cells.items()}
+    return {name: read_results(store.file(job, "jsonl")) for name, job in jobs.items()}
 
 
 def _trained_seeds(checkpoint: Path) -> Sequence[int] | None:

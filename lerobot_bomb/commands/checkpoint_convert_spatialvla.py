@@ -7,7 +7,7 @@ from lerobot_bomb.files import check_new_folder
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """Declare the folder, and what its files do not say."""
+    """Declare the folder, and flags for what its files do not say."""
     add = parser.add_argument
     add(
         "folder",

@@ -1,4 +1,4 @@
-"""Parts of a command as jobs of a cluster: flags that several commands share."""
+"""Flags that split a command into cluster jobs, shared by several commands."""
 
 import argparse
 import json

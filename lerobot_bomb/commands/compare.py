@@ -37,7 +37,7 @@ def _points(text: str) -> float:
 
 
 def _two_policies(args: argparse.Namespace) -> tuple[list[Record], list[Record]]:
-    """Return the records of the two policies, of two files or of one."""
+    """Return the records of the two policies, from two files or from one."""
     if args.b is not None:
         if args.policies:
             raise ValueError("--policies chooses two of one file; give one, or drop it")
@@ -53,7 +53,7 @@ def _two_policies(args: argparse.Namespace) -> tuple[list[Record], list[Record]]
 
 
 def _by_policy(records: list[Record], names: Sequence[str]) -> list[list[Record]]:
-    """Split records by policy: those of each name, or of all without a name, in order of first appearance.
+    """Split records by policy name, in order of first appearance.
 
     A policy answers to its type, its path, `bomb:NAME`, or any part of what `results` says of it.
 
@@ -79,7 +79,7 @@ def _by_policy(records: list[Record], names: Sequence[str]) -> list[list[Record]
 
 
 def run(args: argparse.Namespace) -> int:
-    """Print both rates and their difference, by condition; check what was asked for."""
+    """Print both rates and their difference, by condition; check the required difference."""
     comparisons = compare(*_two_policies(args))
     print_lines(*comparisons.lines())
     low = 100 * comparisons.lowest

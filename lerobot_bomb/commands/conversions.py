@@ -8,7 +8,7 @@ from lerobot_bomb.data.resumable import check_repo_id, default_root
 
 
 def add_conversion_arguments(parser: argparse.ArgumentParser, path: str) -> None:
-    """Declare what is converted, and into which dataset."""
+    """Declare source and dataset of a conversion."""
     parser.add_argument("path", type=path_flag, help=path)
     add_new_dataset_arguments(parser)
     summary = "continue a conversion that was interrupted; its finished blocks of episodes are kept"

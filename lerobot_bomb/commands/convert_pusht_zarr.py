@@ -7,7 +7,7 @@ from lerobot_bomb.data.resumable import terminated_in_order
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """Declare the source, the dataset and what becomes of the demonstrations."""
+    """Declare the source, the dataset and the copies."""
     add_conversion_arguments(parser, "the folder of the zarr")
     add = parser.add_argument
     add(

@@ -1,4 +1,4 @@
-"""``lerobot-bomb demo``: a policy that comes with the package plays, on LeRobot's own commands."""
+"""``lerobot-bomb demo``: evaluate a policy that comes with the package, by LeRobot's own commands."""
 
 import argparse
 import json
@@ -116,8 +116,8 @@ def _replay(output_dir: Path, record: EpisodeResult) -> None:
 def _report(output_dir: Path, records: dict[str, list[EpisodeResult]], seconds: float) -> None:
     _say(f"Done in {seconds / 60:.1f} minutes: successes, with 95 % Wilson intervals")
     cells = []
-    for name, played in records.items():
-        by = by_condition(played)
+    for name, evaluated in records.items():
+        by = by_condition(evaluated)
         cells.append([name, *(_rate(by.get(condition, [])) for condition in CONDITIONS)])
     print_table(["", *CONDITIONS], cells)
     print(f"\n{CLOSING.format(policy=POLICY)}\n")
@@ -132,19 +132,19 @@ def _rate(records: list[EpisodeResult]) -> str:
 
 
 def _write_sheet(output_dir: Path, records: list[EpisodeResult]) -> Path:
-    """The last frames of some episodes of each condition, and what became of each."""
+    """Write the last frames of some episodes of each condition, with their outcomes."""
     from PIL import Image
 
     from lerobot_bomb.viewing.sheet import Sheet
 
     tiles: dict[str, list[np.ndarray]] = {}
-    as_played = sorted(records, key=lambda record: record.spec.seed)
-    for condition, played in by_condition(as_played).items():
+    in_order = sorted(records, key=lambda record: record.spec.seed)
+    for condition, evaluated in by_condition(in_order).items():
         group = f"{SUITE}.{condition.key}_0"  # of LeRobot's videos
         folder = output_dir / "eval" / POLICY / "videos" / group
         tiles[condition] = [
             _tile(folder / f"eval_episode_{number}.mp4", record)
-            for number, record in enumerate(played[:SHOWN_EPISODES])
+            for number, record in enumerate(evaluated[:SHOWN_EPISODES])
         ]
     columns = [f"seed {SEED + number}" for number in range(len(tiles[NONE]))]
     path = output_dir / f"{POLICY}.png"

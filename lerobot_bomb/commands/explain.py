@@ -61,12 +61,12 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(args: argparse.Namespace) -> int:
-    """Explain episodes; write a page, its numbers and, of one episode, a recording; print the findings."""
+    """Explain episodes: print the findings; write a page, its numbers and, for one episode, a recording."""
     check_at_least(args, episodes=1, grid=1)
     if args.episodes > 1 and args.step is not None:
         raise ValueError(f"--step={args.step} is of one episode; drop it or --episodes={args.episodes}")
     check_new_folder("output", args.output)
-    query = _of_flags(args) if args.results is None else _of_line(args)
+    query = _of_flags(args) if args.results is None else _of_record(args)
     _check_images(args, query.viewed(query.seed).env_flags["image_size"])
     return (_explain_one if args.episodes == 1 else _explain_several)(args, query)
 
@@ -92,7 +92,7 @@ def _of_flags(args: argparse.Namespace) -> "_Query":
     return _Query(viewed, seed, args.policy_path, args.policy_device)
 
 
-def _of_line(args: argparse.Namespace) -> "_Query":
+def _of_record(args: argparse.Namespace) -> "_Query":
     of_episode = {"image_size": None, "perturbations": (NONE,), "env_type": BOMB.name}
     of_episode |= {"ignore_checkpoint": False}
     of_episode |= {name: default for name, (default, _) in args.own_flags.items()}
@@ -128,12 +128,12 @@ def _moments(
 ) -> "tuple[list[ExplainedMoment], Any]":
     """Explain an episode's moments that are asked about; return them with the episode's result."""
     from lerobot_bomb.explain.episode import Settings, explain_moment
-    from lerobot_bomb.explain.snapshots import at_step, middle_of_phases, watch
+    from lerobot_bomb.explain.snapshots import at_step, middle_of_phases, take_snapshots
 
     viewed = query.viewed(seed)
-    snapshots, result = watch(viewed, loaded)
+    snapshots, result = take_snapshots(viewed, loaded)
     chosen = middle_of_phases(snapshots) if args.step is None else [at_step(snapshots, args.step)]
-    elsewhere = watch(query.viewed(seed + 1), loaded)[0]
+    elsewhere = take_snapshots(query.viewed(seed + 1), loaded)[0]
     others = {each.phase: each for each in (elsewhere[0], *middle_of_phases(elsewhere))}
     settings = Settings(args.grid, args.fill, tuple(args.words))
     control_mode = getattr(viewed.spec, "control_mode", None)

@@ -1,4 +1,4 @@
-"""``lerobot-bomb``: what LeRobot's own commands do not do."""
+"""``lerobot-bomb``: commands beside LeRobot's own."""
 
 import argparse
 import importlib
@@ -19,7 +19,7 @@ EVAL_FLAGS = ("--config_path", "--job_name", "--output_dir", "--rename_map", "--
 
 
 class Parser(argparse.ArgumentParser):
-    """A parser whose help begins with what the command is for."""
+    """A parser whose help begins with the purpose of the command."""
 
     opening = ""
 
@@ -28,7 +28,7 @@ class Parser(argparse.ArgumentParser):
 
 
 def program_parser() -> Parser:
-    """Build the parser of what stands in place of a command."""
+    """Build the parser of flags that stand in place of a command."""
     parser = Parser(prog=PROGRAM, usage=f"{PROGRAM} COMMAND ...")
     parser.opening = overview()
     parser.add_argument("--version", action="version", version=f"{PROGRAM} {__version__}")
@@ -74,7 +74,7 @@ def module_of(name: str) -> Any:
 
 
 def _split(argv: Sequence[str]) -> tuple[str, Sequence[str]] | None:
-    """Return a command's name, of two words where there is one, and its flags; None: there is none."""
+    """Return a command's name, of one or two words, and its flags; None if there is none."""
     for number in (2, 1):
         name = " ".join(argv[:number])
         if name in COMMANDS:
@@ -129,7 +129,7 @@ def _told() -> tuple[type[Exception], ...]:
 
 
 def main(argv: Sequence[str] | None = None) -> int:
-    """Run one command; what is wrong with its flags or files becomes one line on stderr and exit code 1."""
+    """Run one command; an error in its flags or files becomes one line on stderr and exit code 1."""
     argv = sys.argv[1:] if argv is None else list(argv)
     if not argv or argv[0].startswith("-"):
         args = program_parser().parse_args(argv or ["--help"])

@@ -9,7 +9,7 @@ from lerobot_bomb.results.groups import read_results
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """Declare what is published, where and how."""
+    """Declare source, repository and options."""
     add = parser.add_argument
     folder = "checkpoint (pretrained_model of lerobot-train), or dataset of lerobot-bomb record or convert"
     add("folder", type=path_flag, metavar="FOLDER", help=folder)

@@ -31,7 +31,7 @@ from lerobot_bomb.commands.cluster_jobs import (
 from lerobot_bomb.data.kept_blocks import Progress, read_progress
 from lerobot_bomb.data.parts import Part, check_part, join, num_whole_blocks, record_part, unfinished_parts
 from lerobot_bomb.data.record import record
-from lerobot_bomb.data.recorded_blocks import Acting, Players, describe_failures
+from lerobot_bomb.data.recorded_blocks import BehaviorPolicy, EpisodeSource, describe_failures
 from lerobot_bomb.data.recording import Recording
 from lerobot_bomb.data.resumable import (
     block_episodes,
@@ -79,7 +79,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def _add_what_is_recorded(parser: argparse.ArgumentParser) -> None:
-    """Declare how much of what: episodes, whose, or scenes; with which labels."""
+    """Declare the number of episodes or scenes, who acts in them, and their labels."""
     add = parser.add_argument
     number = parser.add_mutually_exclusive_group(required=True)
     number.add_argument("--episodes", type=int, help="successful episodes to record")
@@ -114,13 +114,15 @@ def run(args: argparse.Namespace) -> int:
         return _record_by_jobs(args, [Part(recording, index, num_jobs) for index in range(num_jobs)], root)
     _warn_of_test_seeds(recording)
     with terminated_in_order():
-        acting = _acting(recording, args.policy_path) if recording.relabel else None
+        behavior = _behavior_policy(recording, args.policy_path) if recording.relabel else None
         if shard is not None:
-            return _record_part(Part(recording, *shard), root, Players(args.workers, acting=acting))
+            return _record_part(Part(recording, *shard), root, EpisodeSource(args.workers, behavior=behavior))
         if args.join:
-            progress = join(recording, root, Players(args.workers, acting=acting))
+            progress = join(recording, root, EpisodeSource(args.workers, behavior=behavior))
         else:
-            progress = record(recording, root, num_workers=args.workers, resume=args.resume, acting=acting)
+            progress = record(
+                recording, root, num_workers=args.workers, resume=args.resume, behavior=behavior
+            )
     _print(recording, progress, root)
     return 0
 
@@ -143,7 +145,7 @@ def _recording(args: argparse.Namespace) -> Recording:
 
 
 def _print(recording: Recording, progress: Progress, where: Path, num_before: int = 0) -> None:
-    """Say what was recorded, after so many episodes that others try."""
+    """Print what was recorded, after `num_before` episodes that others tried."""
     conditions, scenes = len(recording.conditions), recording.scenes
     first = recording.seed + num_before // conditions * scenes
     end = recording.seed - (-(num_before + progress.num_tried) // conditions) * scenes
@@ -153,8 +155,8 @@ def _print(recording: Recording, progress: Progress, where: Path, num_before: in
     )
 
 
-def _record_part(part: Part, root: Path, players: Players) -> int:
-    progress = record_part(part, root, players)
+def _record_part(part: Part, root: Path, source: EpisodeSource) -> int:
+    progress = record_part(part, root, source)
     if progress is None:
         print(f"{root} is there, joined")
     else:
@@ -164,7 +166,7 @@ def _record_part(part: Part, root: Path, players: Players) -> int:
 
 
 def _record_by_jobs(args: argparse.Namespace, parts: list[Part], root: Path) -> int:
-    """Write the script of jobs and print what is to be done with it; or submit them, and join their parts."""
+    """Write the script of a job array and print the next steps; or submit the jobs, and join their parts."""
     check_part(parts[0], root)
     command, folder = _job_command(args, root), unfinished_folder(root, JOBS)
     if args.slurm is not None:
@@ -199,7 +201,7 @@ def _job_command(args: argparse.Namespace, root: Path) -> list[str]:
 
 
 def _acting_weights(args: argparse.Namespace) -> str | None:
-    """Return the SHA-256 of the weights that act; None: the expert does."""
+    """Return the SHA-256 of the weights that act; None if the expert does."""
     if args.relabel != (args.policy_path is not None):
         raise ValueError(
             "--relabel and --policy.path=FOLDER come together: a policy acts, and the expert says what it "
@@ -219,24 +221,24 @@ def _acting_weights(args: argparse.Namespace) -> str | None:
     return sha256_of(weights)
 
 
-def _acting(recording: Recording, policy_path: Path) -> Acting:
+def _behavior_policy(recording: Recording, policy_path: Path) -> BehaviorPolicy:
     """The checkpoint, as lerobot-eval lets it act.
 
     Raises:
         ValueError: it was trained for another environment.
     """
-    from lerobot_bomb.checkpoints.acting import INSIST  # LeRobot and torch: seconds
+    from lerobot_bomb.checkpoints.acting import OVERRIDE  # LeRobot and torch: seconds
     from lerobot_bomb.viewing.checkpoint import load_policy
 
     names = ("task", "robot", "control_mode", "fps", "image_size", "render_preset", "depth", "split")
     env_flags = {name: getattr(recording, name) for name in names}
-    with reworded({"evaluate with": "record with", INSIST: "train one for this"}):
+    with reworded({"evaluate with": "record with", OVERRIDE: "train one for this"}):
         loaded = load_policy(policy_path, None, "bomb", env_flags, recording.seed)
 
     def agent(observation: dict[str, Any], instruction: str) -> np.ndarray:
         return loaded.agent([observation], [instruction])[0]
 
-    return Acting(loaded.begin, agent)
+    return BehaviorPolicy(loaded.begin, agent)
 
 
 def _warn_of_test_seeds(recording: Recording) -> None:
@@ -244,7 +246,7 @@ def _warn_of_test_seeds(recording: Recording) -> None:
     seeds = range(recording.seed, recording.seed + rounds * recording.scenes)
     if seeds[0] <= TEST_SEEDS[-1] and seeds[-1] >= TEST_SEEDS[0]:
         print(
-            f"the seeds {seeds[0]}..{seeds[-1]} have episodes that evaluations play, {TEST_SEEDS[0]} to "
+            f"the seeds {seeds[0]}..{seeds[-1]} have episodes that evaluations run, {TEST_SEEDS[0]} to "
             f"{TEST_SEEDS[-1]}: for training begin at --seed=10000",
             file=sys.stderr,
         )

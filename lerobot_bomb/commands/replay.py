@@ -51,23 +51,23 @@ def _levels(text: str) -> dict[str, int]:
 
 
 def run(args: argparse.Namespace) -> int:
-    """Run the episode, write both files, print its result and whether the record says the same."""
+    """Run the episode, write both files, print its result and whether it equals the record."""
     if unknown := [flag for flag in args.rest if not flag.startswith("--policy.")]:
         raise ValueError(f"{unknown[0]} is unknown; see `lerobot-bomb replay --help`")
     record = read_record(args.path, args.line)
     policy_flags = [f"--{flag.removeprefix('--policy.')}" for flag in args.rest]
     replay = Replay(record, args.policy_path, args.policy_device, policy_flags, args.depth)
-    players = {RECORDED: replay.player()}
+    runs = {RECORDED: replay.viewed_run()}
     if args.set is not None:
-        players[CHANGED] = replay.player(_changed(record, args.set))
+        runs[CHANGED] = replay.viewed_run(_changed(record, args.set))
     policy = "policy" if record.policy is None else record.policy.type
-    name = players[RECORDED].viewed.name(policy)
-    name += f"_{players[CHANGED].viewed.group}" if args.set is not None else ""
+    name = runs[RECORDED].viewed.name(policy)
+    name += f"_{runs[CHANGED].viewed.group}" if args.set is not None else ""
     paths = paths_of(args.output, DEFAULT_FOLDER, name)
     check_new(paths)
-    results = write_episodes(players, name, *paths)
-    for (label, player), result in zip(players.items(), results, strict=True):
-        of, values = player.viewed, cast("Any", result)
+    results = write_episodes(runs, name, *paths)
+    for (label, run), result in zip(runs.items(), results, strict=True):
+        of, values = run.viewed, cast("Any", result)
         print_lines(f"{label} ({of.spec.perturbations}): {values.instruction}")
         print(of.log.describe(result))
     print(*paths, sep="\n")

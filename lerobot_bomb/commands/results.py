@@ -1,4 +1,4 @@
-"""``lerobot-bomb results``: what files of ``--env.results_path`` say."""
+"""``lerobot-bomb results``: summary of the files of ``--env.results_path``."""
 
 import argparse
 from pathlib import Path
@@ -19,7 +19,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(args: argparse.Namespace) -> int:
-    """Print, of each file, what compares: rates by condition, and what perturbations changed in pairs."""
+    """Print rates by condition for each file, and the changes under perturbations, in pairs."""
     for path in args.paths:
         file = read_undamaged(path)
         if args.strict and file.num_damaged:
@@ -56,7 +56,7 @@ def _print_file(path: Path, groups: list[Group], num_damaged: int) -> None:
 
 
 def _print_rates(groups: list[Group]) -> None:
-    """Print a line for each group and condition, before what else there is to say of them."""
+    """Print a line for each group and condition, before all details."""
     cells = [
         [group.name, condition, str(rate_of(records))]
         for group in groups

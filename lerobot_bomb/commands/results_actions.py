@@ -1,4 +1,4 @@
-"""``lerobot-bomb results actions``: lerobot-eval, which also writes down what was executed.
+"""``lerobot-bomb results actions``: lerobot-eval that also writes the executed actions.
 
 Shapes: `B` environments, `T` actions of an episode, `D` action dims.
 """

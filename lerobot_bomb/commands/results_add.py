@@ -40,7 +40,7 @@ def run(args: argparse.Namespace) -> int:
 
 
 def _check_flags(config: Any) -> None:
-    """Raise a ValueError unless each episode's result can be told."""
+    """Raise a ValueError unless the flags give each episode a result of its own."""
     record_type = env_type(config.env.type).record
     if record_type.has_results_path:
         raise ValueError(
@@ -59,7 +59,7 @@ def _check_flags(config: Any) -> None:
 
 
 def _check_info(path: Path, info: dict[str, Any], num_episodes: int) -> None:
-    """Raise a ValueError unless a file is of an evaluation of so many episodes of each task."""
+    """Raise a ValueError unless a file holds an evaluation with this number of episodes of each task."""
     try:
         numbers = {len(task["metrics"]["successes"]) for task in info["per_task"]}
     except (KeyError, TypeError):

@@ -15,7 +15,7 @@ MAX_SHOWN_DAMAGES = 10
 
 
 def check_outputs(inputs: Sequence[Path], outputs: Iterable[Path]) -> None:
-    """Raise a ValueError if one of the files that are written is one of those that are read."""
+    """Raise a ValueError if an output file is also an input file."""
     read = {path.resolve() for path in inputs}
     for path in outputs:
         if path.resolve() in read:

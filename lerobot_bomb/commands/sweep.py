@@ -1,4 +1,4 @@
-"""``lerobot-bomb sweep``: policies x tasks x conditions, over processes or jobs, going on after a kill."""
+"""``lerobot-bomb sweep``: policies x tasks x conditions, on processes or a cluster; resumes after a kill."""
 
 import argparse
 import signal
@@ -21,8 +21,8 @@ from lerobot_bomb.environments import ENVIRONMENTS, env_type
 from lerobot_bomb.flags import one_of
 from lerobot_bomb.results.record import Record
 from lerobot_bomb.sweep.claim import claimed
-from lerobot_bomb.sweep.local import PYTHON, play, progress
-from lerobot_bomb.sweep.manifest import NAME, Cell, Manifest, flag_value, plan, policy_flag
+from lerobot_bomb.sweep.local import PYTHON, progress, run_part
+from lerobot_bomb.sweep.manifest import NAME, Job, Manifest, flag_value, plan, policy_flag
 from lerobot_bomb.sweep.store import Store
 from lerobot_bomb.tables import print_lines
 
@@ -37,7 +37,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "lerobot-bomb sweep FOLDER [--policies=A,B --env.type=bomb ...] (and flags of lerobot-eval)"
     )
     add = parser.add_argument
-    add("folder", type=path_flag, metavar="FOLDER", help="new, or of a sweep that is to go on")
+    add("folder", type=path_flag, metavar="FOLDER", help="new folder, or one of a sweep to resume")
     add(
         "--policies",
         type=parse_conditions,
@@ -47,59 +47,61 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     add("--env.task", "--task", "--tasks", dest="tasks", type=parse_conditions, default=(), help=tasks)
     conditions = "none,camera:3,all:1-5; each:1-5 is every axis at every level"
     add_env_flag(parser, "perturbations", type=parse_conditions, default=(), help=conditions)
-    add("--episodes", type=int, default=20, help="of each cell (default: 20)")
+    add("--episodes", type=int, default=20, help="of each job (default: 20)")
     add("--seed", type=int, default=TEST_SEEDS[0], help=f"the first one (default: {TEST_SEEDS[0]})")
     add("--batch_size", type=int, default=MAX_BATCH, help=f"at most (default: {MAX_BATCH})")
     add("--workers", type=int, default=1, help="processes, each on a GPU in turn (default: 1)")
-    add_job_arguments(parser, "cells", f"FOLDER/{SCRIPT}")
-    add("--timeout", type=int, help="seconds that a cell may take (default: no limit)")
-    add("--retry", action="store_true", help="play again what was given up or ended in errors")
+    add_job_arguments(parser, "jobs", f"FOLDER/{SCRIPT}")
+    add("--timeout", type=int, help="seconds that a job may take (default: no limit)")
+    add("--retry", action="store_true", help="run again what was given up or ended in errors")
     add(
         "--dry_run",
         action="store_true",
         help="write the manifest and print its commands only",
     )
-    add("rest", nargs="*", metavar="FLAG", help="flags of lerobot-eval for every cell: --env.image_size=64")
+    add("rest", nargs="*", metavar="FLAG", help="flags of lerobot-eval for every job: --env.image_size=64")
 
 
 def run(args: argparse.Namespace) -> int:
-    """Run what is missing; exit code 1 where something still is."""
+    """Run all missing episodes; exit code 1 if some are still missing."""
     _check_numbers(args)
     manifest = _manifest(args)
     with claimed(args.folder, manifest, args.batch_size) as store:
-        cells = _cells(args, store.manifest)
+        jobs = _jobs(args, store.manifest)
         if args.dry_run:
-            print(*(cell.command for cell in cells), sep="\n")
+            print(*(job.command for job in jobs), sep="\n")
             return 0
         if args.retry:
-            store.begin_again(cells)
+            store.begin_again(jobs)
         if args.slurm is not None:
-            write_job_array(_job_command(args), args.slurm, args.folder / SCRIPT)
+            write_job_array(_part_command(args), args.slurm, args.folder / SCRIPT)
             return 0
-        return _play(args, store, cells)
+        return _run_jobs(args, store, jobs)
 
 
-def _play(args: argparse.Namespace, store: Store, cells: list[Cell]) -> int:
+def _run_jobs(args: argparse.Namespace, store: Store, jobs: list[Job]) -> int:
     try:
         with interrupted_by_sigterm():
             if args.submitit is None:
-                play(store, args.shard or ALL, args.workers, args.timeout)
+                run_part(store, args.shard or ALL, args.workers, args.timeout)
             else:
-                _play_by_jobs(args, store)
+                _run_on_cluster(args, store)
     except KeyboardInterrupt:
         store.merge()
-        to_go_on = f"to go on: lerobot-bomb sweep {args.folder} (a cell that is not finished: from its start)"
-        print_lines(*store.lines(), to_go_on)
+        to_resume = (
+            f"to resume: lerobot-bomb sweep {args.folder} (a job that is not finished: from its start)"
+        )
+        print_lines(*store.lines(), to_resume)
         raise
     store.merge()
     print_lines(*store.lines())
-    is_whole = all(store.is_finished(cell) and not store.errors(cell) for cell in cells)
+    is_whole = all(store.is_finished(job) and not store.errors(job) for job in jobs)
     return 0 if is_whole else 1
 
 
 @contextmanager
 def interrupted_by_sigterm() -> Iterator[None]:
-    """Let a cluster's SIGTERM end this process as Ctrl-C does: with what is finished merged, and said."""
+    """Let a cluster's SIGTERM end this process as Ctrl-C does: finished jobs are merged and printed."""
     usual = signal.signal(signal.SIGTERM, signal.default_int_handler)
     try:
         yield
@@ -116,25 +118,25 @@ def _check_numbers(args: argparse.Namespace) -> None:
         raise ValueError(f"--seed={args.seed} and --episodes={args.episodes}: the last seed is {MAX_SEED}")
 
 
-def _cells(args: argparse.Namespace, manifest: Manifest) -> list[Cell]:
-    """Return the manifest's cells that this command runs."""
+def _jobs(args: argparse.Namespace, manifest: Manifest) -> list[Job]:
+    """Return the manifest's jobs that this command runs."""
     try:
-        cells = manifest.part(args.shard or ALL)
+        jobs = manifest.part(args.shard or ALL)
     except ValueError as error:
         raise ValueError(f"--shard: {error}") from None
-    check_num_jobs(args, len(cells), "cells")
-    return cells
+    check_num_jobs(args, len(jobs), "jobs")
+    return jobs
 
 
 def _manifest(args: argparse.Namespace) -> Manifest:
-    """Return what is wanted: the flags' or, without --policies, the folder's."""
+    """Return the wanted manifest: that of the flags or, without --policies, that of the folder."""
     if args.policies is None:
         if not (args.folder / NAME).is_file():
             raise ValueError(
                 f"{args.folder} holds no {NAME}: begin a sweep with --policies=... --env.type=..."
             )
         if args.rest or args.tasks or args.perturbations:
-            raise ValueError(f"{args.folder / NAME} says what is played; drop {(*args.rest, '--tasks')[0]}")
+            raise ValueError(f"{args.folder / NAME} says what is run; drop {(*args.rest, '--tasks')[0]}")
         return Manifest.read(args.folder)
     if not args.policies:
         raise ValueError("--policies names none")
@@ -185,22 +187,22 @@ def _expanded(perturbations: tuple[str, ...], record_type: type[Record]) -> Sequ
     return record_type.condition.expand(perturbations)
 
 
-def _job_command(args: argparse.Namespace) -> list[str]:
-    """Run a part of the folder's cells, with --shard."""
+def _part_command(args: argparse.Namespace) -> list[str]:
+    """Return the command that runs a part of the folder's jobs, with --shard."""
     command = [*PYTHON, "lerobot_bomb.commands.main", "sweep", str(args.folder.absolute())]
     command += [f"--workers={args.workers}"]
     return command + ([f"--timeout={args.timeout}"] if args.timeout else [])
 
 
-def _play_by_jobs(args: argparse.Namespace, store: Store) -> None:
-    """Submit a job for every part that is not over, and wait for them; they end with this process' Ctrl-C."""
-    cells = list(store.manifest.cells)
+def _run_on_cluster(args: argparse.Namespace, store: Store) -> None:
+    """Submit a cluster job for every part that is not over, and wait for them; Ctrl-C ends them."""
+    jobs = list(store.manifest.jobs)
     parts = [f"{number}/{args.submitit}" for number in range(args.submitit)]
     left = [part for part in parts if not all(map(store.is_over, store.manifest.part(part)))]
-    commands = [[*_job_command(args), f"--shard={part}"] for part in left]
-    with submitted(commands, args, args.folder) as jobs:
-        for _ in progress(store, cells):
-            if all(job.done() for job in jobs):
+    commands = [[*_part_command(args), f"--shard={part}"] for part in left]
+    with submitted(commands, args, args.folder) as submitted_jobs:
+        for _ in progress(store, jobs):
+            if all(job.done() for job in submitted_jobs):
                 break
-    if not all(store.is_over(cell) for cell in cells):
-        print(f"jobs ended before they had played everything; {args.folder / SUBMITIT} says why")
+    if not all(store.is_over(job) for job in jobs):
+        print(f"cluster jobs ended before everything was run; {args.folder / SUBMITIT} says why")

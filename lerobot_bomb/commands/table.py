@@ -1,7 +1,8 @@
 """Commands of ``lerobot-bomb``: group, name, summary and two examples of each.
 
 A command of one word or two, ``checkpoint init``, is the module ``checkpoint_init`` in this folder, with
-``add_arguments`` and ``run``. It is imported when it is called, and imports neither torch nor LeRobot itself.
+``add_arguments`` and ``run``. The module is imported when it is called, and imports neither torch nor LeRobot
+itself.
 """
 
 from dataclasses import dataclass, field

@@ -23,7 +23,15 @@ from lerobot_bomb.environments import BOMB, ENVIRONMENTS
 from lerobot_bomb.envs.rollout import Agent, expert_agent, one_of_batch, random_agent
 from lerobot_bomb.files import read_json
 from lerobot_bomb.flags import one_of
-from lerobot_bomb.viewing.episode import EXPERT, RANDOM, Player, Viewed, check_new, paths_of, write_episodes
+from lerobot_bomb.viewing.episode import (
+    EXPERT,
+    RANDOM,
+    Viewed,
+    ViewedRun,
+    check_new,
+    paths_of,
+    write_episodes,
+)
 
 DEFAULT_FOLDER = Path("outputs/view")
 SHARED_FLAGS = ("perturbations", "image_size")  # by all environments that are shown
@@ -40,7 +48,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def add_viewed_arguments(parser: argparse.ArgumentParser) -> None:
-    """Declare which episode of which environment is looked at, beside its seed."""
+    """Declare the flags that choose an episode and its environment, except the seed."""
     env_types = f"{' or '.join(_viewed_types())} (default: {BOMB.name})"
     parser.add_argument("--env.type", dest="env_type", default=BOMB.name, help=env_types)
     ignore = "let a checkpoint act that was trained for another environment"
@@ -67,8 +75,8 @@ def run(args: argparse.Namespace) -> int:
     policy = _policy(args, viewed.policies)
     name = viewed.name(policy)
     paths = paths_of(args.output, DEFAULT_FOLDER, name)
-    player = Player(viewed, partial(_agent, args, policy, viewed, paths))
-    (result,) = write_episodes({policy: player}, name, *paths)
+    run = ViewedRun(viewed, partial(_agent, args, policy, viewed, paths))
+    (result,) = write_episodes({policy: run}, name, *paths)
     values: Any = result
     print(values.instruction, viewed.log.describe(result), *paths, sep="\n")
     return 0
@@ -84,7 +92,7 @@ def viewed_of(args: argparse.Namespace) -> Viewed:
             raise ValueError(f"--env.{name}={value} is a flag of --env.type={whose} only; drop it")
     if len(args.perturbations) != 1:
         raise ValueError(
-            f"--env.perturbations={','.join(args.perturbations)} must be one condition: one episode is played"
+            f"--env.perturbations={','.join(args.perturbations)} must be one condition: one episode is run"
         )
     if args.image_size is None and args.policy_path is not None:
         args.image_size = trained_image_size(args.policy_path)
@@ -115,7 +123,7 @@ def _policy(args: argparse.Namespace, policies: tuple[str, ...]) -> str:
 def _agent(
     args: argparse.Namespace, policy: str, viewed: Viewed, paths: list[Path], env: gymnasium.Env
 ) -> Iterator[Agent]:
-    """Yield the agent that acts; other errors are told before that of files that exist."""
+    """Yield the agent that acts; an error about existing files comes last."""
     seed = viewed.spec.seed
     if policy in (EXPERT, RANDOM):
         check_new(paths)

@@ -17,7 +17,7 @@ from lerobot_bomb.bomb.suites import SUITES
 from lerobot_bomb.commands.arguments import add_env_flag, parse_numbers, path_flag
 from lerobot_bomb.conditions import ALL, MAX_LEVEL, NONE, Axis, nuisances_of
 from lerobot_bomb.environments import BOMB, ENVIRONMENTS, EnvType
-from lerobot_bomb.envs.rollout import expert_agent, make_env, play
+from lerobot_bomb.envs.rollout import expert_agent, make_env, run_episode
 from lerobot_bomb.files import written_whole
 from lerobot_bomb.flags import one_of, reworded
 from lerobot_bomb.viewing.perturbations_page import write_page
@@ -96,7 +96,7 @@ def run(args: argparse.Namespace) -> int:
 
 
 def axis_sheet(env: EnvType, axis: str, seeds: Sequence[int], image_size: int) -> Sheet:
-    """A column for every level of an axis, or of all of them, and rows for what it changes, per seed."""
+    """Draw a column for every level of an axis, or of `all`, and rows for each seed."""
     axes = env.record.condition.axes
     names = nuisances_of(axes) if axis == ALL else (axis,)
     changes = {change for name in names for change in axes[name].changes}
@@ -117,13 +117,13 @@ def axis_sheet(env: EnvType, axis: str, seeds: Sequence[int], image_size: int) -
 
 
 def suite_sheet(suite: str, seeds: Sequence[int], options: RenderOptions) -> Sheet:
-    """A row for every numbered task: each seed's instruction, start, and what the expert leaves."""
+    """Draw a row for every numbered task: each seed's instruction, start, and end by the expert."""
     images: dict[str, list[np.ndarray]] = {}
     for task_id in range(find_suite(suite).num_tasks):
         (spec,) = specs_of_tasks(EpisodeSpec(seeds[0], suite), [task_id])
         env = make_env(spec, options)
         for seed in seeds:
-            first, *_, last = play(env, replace(spec, seed=seed), expert_agent())
+            first, *_, last = run_episode(env, replace(spec, seed=seed), expert_agent())
             shown = [moment.observation[PIXELS][CAMERAS[0]] for moment in (first, last)]
             row = images.setdefault(f"task {task_id}", [])
             row += [text_tile(first.instruction, options.image_size), *shown]

@@ -19,7 +19,7 @@ def register(packages: Collection[str], hooks: Collection[Callable[[], None]]) -
 
 
 def use() -> None:
-    """Install what is not installed yet; whatever of ours is about to be used calls this first."""
+    """Install the hooks that are not installed yet; every type and command of ours calls this first."""
     global _is_in_use
     _is_in_use = True
     while _waiting:
@@ -28,10 +28,10 @@ def use() -> None:
 
 
 def is_ours(kind: type) -> bool:
-    """Return whether a class, or one that it builds on, is of a package that was registered."""
+    """Return True if a class or a base of it belongs to a registered package."""
     return any(base.__module__.partition(".")[0] in _packages for base in kind.__mro__)
 
 
 def is_of_ours(module: str) -> bool:
-    """Return whether a module is of a package that was registered."""
+    """Return True if a module belongs to a registered package."""
     return module.partition(".")[0] in _packages

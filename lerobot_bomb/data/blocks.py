@@ -81,7 +81,7 @@ class RecordedEpisode:
 
 
 def write_block(layout: DatasetLayout, root: Path, episodes: Iterable[RecordedEpisode]) -> int:
-    """Write episodes as a finished LeRobotDataset and return its number of frames; of none, a folder.
+    """Write episodes as a finished LeRobotDataset, or an empty folder; return the number of frames.
 
     Raises:
         RuntimeError: a video lacks frames, or a thread of LeRobot could not write an image or a video.

@@ -17,7 +17,7 @@ if TYPE_CHECKING:
 def write_missing(
     folder: Path, layout: "DatasetLayout", num_episodes: int, episode: Callable[[int], "RecordedEpisode"]
 ) -> None:
-    """Write the blocks that a dataset of so many episodes lacks; `episode` is called by number, in order."""
+    """Write the missing blocks of a dataset; `episode` is called by number, in order."""
     numbers = [number for gap in missing_blocks(folder, range(num_blocks(num_episodes))) for number in gap]
     missing = [[index for index in block_episodes(number) if index < num_episodes] for number in numbers]
     with tqdm(total=num_episodes, initial=num_episodes - sum(map(len, missing)), unit="episode") as bar:

@@ -45,7 +45,7 @@ def check_dataset(root: Path) -> None:
 
 
 def check_metadata(root: Path) -> None:
-    """Check that the files under meta/ can be read; of others' datasets no more can be expected.
+    """Check that the files under meta/ can be read; datasets of other people promise no more.
 
     Raises:
         ValueError: names the one that is truncated.
@@ -59,7 +59,7 @@ def check_metadata(root: Path) -> None:
 
 
 def check_readable(root: Path) -> None:
-    """Check that the tables and videos that are here are whole; LeRobot downloads what is not.
+    """Check that all tables and videos on this machine are whole; LeRobot downloads the others.
 
     Raises:
         ValueError: names the file that is truncated.
@@ -114,7 +114,7 @@ def read_parquet(path: Path, columns: Sequence[str] | None = None, filters: list
 
 
 def check_video(path: Path, num_frames: int, fps: float) -> None:
-    """Check that a video has so many frames, of which the first and the last can be decoded.
+    """Check that a video has this number of frames, and that the first and the last can be decoded.
 
     Raises:
         FileNotFoundError: there is none.

@@ -1,4 +1,4 @@
-"""Facts that a dataset's folder states, and how to evaluate on what it shows."""
+"""Facts about a dataset from its folder, and the flags that evaluate in its environment."""
 
 import json
 from collections.abc import Sequence
@@ -47,7 +47,7 @@ class DatasetFacts:
 
     @classmethod
     def find(cls, root: Path | str | None) -> "DatasetFacts | None":
-        """Read the facts of a folder where a dataset was, if one still is there."""
+        """Read the facts of a dataset's folder; None if the dataset is gone."""
         return cls.read(Path(root)) if root and (Path(root) / INFO_FILE).is_file() else None
 
     @property
@@ -57,7 +57,7 @@ class DatasetFacts:
 
     @property
     def environment(self) -> Environment | None:
-        """Environment of BOMB that the dataset shows; None: it shows another."""
+        """Environment of BOMB that the dataset shows; None if it shows another."""
         return Environment.of_dataset(self.info, *self._tasks)
 
     @property
@@ -72,7 +72,7 @@ class DatasetFacts:
         return suites[0], numbered_tasks(self.specs or ())
 
     def eval_flags(self) -> list[str] | None:
-        """Return lerobot-eval's flags for the environment that the dataset shows; None: not known."""
+        """Return lerobot-eval's flags for the environment that the dataset shows; None if unknown."""
         conversion = self.bomb.get("conversion", {})
         if conversion.get("source", "").startswith(PUSHT_SOURCE):
             return ["--env.type=pusht", "--eval.use_async_envs=false"]
@@ -94,7 +94,7 @@ class DatasetFacts:
 
     @property
     def seeds(self) -> Sequence[int] | None:
-        """Seeds of the episodes that were tried, of an edited recording of those in it; None: not known."""
+        """Seeds of all tried episodes; in an edited recording, of those left in it; None if unknown."""
         recording = self.recording
         if not recording:
             return None if self.specs is None else sorted({spec["seed"] for spec in self.specs})
@@ -124,7 +124,7 @@ class DatasetFacts:
 
 
 def _read_specs(root: Path) -> list[dict[str, Any]] | None:
-    """Return `EpisodeSpec` of each episode as JSON; None: not every episode has one.
+    """Return `EpisodeSpec` of each episode as JSON; None if not every episode has one.
 
     Raises:
         ValueError: a table of episodes is truncated.

@@ -1,4 +1,4 @@
-"""A token that no header can hold: said before the HTTP library quotes it in an error."""
+"""Check for a token that no HTTP header can hold, before the HTTP library quotes it in an error."""
 
 import os
 
@@ -7,13 +7,13 @@ LOG_IN = "run `hf auth login`, or set HF_TOKEN"
 
 
 class TokenError(ValueError):
-    """Error that says what is wrong with a token, without the token."""
+    """Error that describes what is wrong with a token, without quoting it."""
 
 
 def check_token_characters(token: str) -> None:
     """Raise a TokenError unless all characters of the token can be sent.
 
-    Of a variable also those that huggingface_hub takes out, as what is left is another token.
+    In a variable, characters that huggingface_hub would strip are refused too: the rest is another token.
     """
     given = {name: os.environ.get(name, "").strip() for name in VARIABLES}
     for source, text in {"your token": token, **given}.items():

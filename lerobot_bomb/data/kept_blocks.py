@@ -1,4 +1,4 @@
-"""The finished blocks in a growing folder: what --resume keeps of them, and what is missing.
+"""Finished blocks in a growing folder: those that --resume keeps, and those that are missing.
 
 Nothing else in the folder is touched: a file that another program put there stays.
 """
@@ -45,7 +45,7 @@ def block_path(folder: Path, number: int) -> Path:
 
 
 def finished_blocks(*folders: Path) -> list[Path]:
-    """Folders of the finished blocks, by their numbers; none where a folder itself is missing."""
+    """Folders of the finished blocks, by their numbers; {} if the dataset's folder is missing."""
     paths = (path for folder in folders for path in folder.glob("block-*"))
     return sorted((path for path in paths if BLOCK.fullmatch(path.name)), key=_number)
 
@@ -66,21 +66,21 @@ def episodes_before(folder: Path, number: int) -> int:
 
 
 def finish_block(unfinished: Path, block: Path, progress: Progress) -> None:
-    """Give a block its name, with what it holds."""
+    """Give a finished block its name and its counts."""
     said = {NUMBER: _number(block), **asdict(progress), DIGESTS: _digests(unfinished)}
     write_json(unfinished / BLOCK_FILE, said)
     unfinished.rename(block)
 
 
 def find_gaps(folder: Path, numbers: range) -> list[range]:
-    """Return those of the numbers whose blocks are not there, each range as long as can be."""
+    """Return the numbers of the missing blocks, as the longest ranges."""
     there = [number for number in map(_number, finished_blocks(folder)) if number in numbers]
     starts, ends = [numbers.start, *(number + 1 for number in there)], [*there, numbers.stop]
     return [range(start, end) for start, end in zip(starts, ends, strict=True) if start < end]
 
 
 def damaged_blocks(folder: Path, numbers: range) -> dict[Path, str]:
-    """{block: what is wrong with it} of those up to the last one that is there."""
+    """{block: its damage} of all blocks up to the last one."""
     last = max(map(_number, finished_blocks(folder)), default=-1)
     blocks = (block_path(folder, number) for number in range(numbers.start, last + 1))
     return {block: damage for block in blocks if (damage := block_damage(block))}

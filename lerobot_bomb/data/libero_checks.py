@@ -25,7 +25,7 @@ MAX_JOINT_DIFFERENCE_RAD = 0.05  # replays of recorded actions depart a little
 
 @dataclass(frozen=True)
 class Timing:
-    """Timing of a demonstration: is an observation of before or after its row's action; what does +1 do?"""
+    """Timing of a demonstration: was a row's observation taken before or after its action?"""
 
     # largest difference of any joint from the simulator's state of the same row, of the next; median of rows
     same_row_rad: float
@@ -50,7 +50,7 @@ class Timing:
 
 
 def are_after(file: Path, timings: Sequence[Timing]) -> bool:
-    """Return True if observations are of after their row's action, as in the published files.
+    """Return True if observations were taken after their row's action, as in the published files.
 
     Raises:
         ValueError: its observations are of no row of the simulator's states, or +1 opens the gripper.

@@ -137,7 +137,7 @@ class LiberoHdf5:
 
 
 def instruction(task: str) -> str:
-    """A task's sentence after the name of its file: hf-libero's, which LeRobot's environment says.
+    """Return a task's sentence from the name of its file, as LeRobot's environment gives it.
 
     It is not the file's own `language_instruction`, which has `Pick the akita black bowl` where this has
     `pick up the black bowl`.
@@ -146,7 +146,7 @@ def instruction(task: str) -> str:
 
 
 def noops(actions: np.ndarray) -> np.ndarray:
-    """(T, 7) -> (T,) where the arm is told to stay and the gripper what the last kept action told it."""
+    """(T, 7) -> (T,) bool: neither arm nor gripper gets a new command."""
     still = np.linalg.norm(actions[:, :-1], axis=1) < NOOP_MAX
     found = np.zeros(len(actions), dtype=bool)
     told = None

@@ -1,4 +1,4 @@
-"""A dataset that is neither on this machine nor on the Hub: said in a line, with what may be meant."""
+"""Error of one line for a dataset that is neither on this machine nor on the Hub, with likely causes."""
 
 from pathlib import Path
 
@@ -15,7 +15,7 @@ def explain(repo_id: str, root: Path, error: Exception) -> str:
     for kind, command in RESUMED_BY.items():
         folder = unfinished_folder(root, kind)
         if parameters_file(folder).is_file():
-            return f"the {kind} {root} is not finished ({folder}): go on with `{command} ... --resume`"
+            return f"the {kind} {root} is not finished ({folder}): resume by `{command} ... --resume`"
     if parts_folder(root).is_dir():
         return (
             f"the recording {root} lies in parts ({parts_folder(root)}): join them with "

@@ -15,7 +15,7 @@ from pathlib import Path
 from typing import Any, ClassVar
 
 from lerobot_bomb.data.kept_blocks import Progress, block_damage, block_path, find_gaps, reached
-from lerobot_bomb.data.recorded_blocks import ANY_NUMBER, Players, record_blocks, recording_layout
+from lerobot_bomb.data.recorded_blocks import ANY_NUMBER, EpisodeSource, record_blocks, recording_layout
 from lerobot_bomb.data.recording import Recording
 from lerobot_bomb.data.resumable import block_episodes, grow, growing
 from lerobot_bomb.data.unfinished import (
@@ -44,7 +44,7 @@ class Part:
         return f"{self.index}/{self.number}"
 
     def to_dict(self) -> dict[str, Any]:
-        """Return the values that its JSON reads back as."""
+        """Return the values to write as JSON."""
         return {**self.recording.to_dict(), "shard": str(self)}
 
     @property
@@ -63,8 +63,8 @@ def num_whole_blocks(recording: Recording) -> int:
     return recording.episodes // len(block_episodes(0))
 
 
-def record_part(part: Part, root: Path, players: Players) -> Progress | None:
-    """Record a part, or what it still lacks, beside `root`; None: that is there, joined.
+def record_part(part: Part, root: Path, source: EpisodeSource) -> Progress | None:
+    """Record a part, or its missing episodes, beside `root`; return None if the joined dataset is there.
 
     Raises:
         ValueError: what lies there is no part of this recording; or as `record`.
@@ -76,7 +76,7 @@ def record_part(part: Part, root: Path, players: Players) -> Progress | None:
     folder = part.folder(root)
     try:
         with growing(part, root, folder):
-            record_blocks(part.recording, folder, players, part.blocks)
+            record_blocks(part.recording, folder, source, part.blocks)
     finally:
         with suppress(OSError):
             folder.parent.rmdir()  # unless it holds something
@@ -107,8 +107,8 @@ def check_part(part: Part, root: Path) -> None:
         _check_same(flag, Part(part.recording, index, number), root)
 
 
-def join(recording: Recording, root: Path, players: Players) -> Progress:
-    """Join the parts into the dataset at `root`, record what takes the place of failed episodes; delete them.
+def join(recording: Recording, root: Path, source: EpisodeSource) -> Progress:
+    """Join the parts into the dataset at `root`, replace failed episodes, and delete the parts.
 
     Raises:
         ValueError: a part is missing, not finished, damaged, or of another recording; or as `record`.
@@ -125,7 +125,7 @@ def join(recording: Recording, root: Path, players: Players) -> Progress:
         recording,
         root,
         resume=root.exists() or unfinished_folder(root).exists(),
-        write=partial(record_blocks, recording, players=players, numbers=numbers, most=most),
+        write=partial(record_blocks, recording, source=source, numbers=numbers, most=most),
         layout=partial(recording_layout, recording),
         parts=folders,
     )
@@ -145,7 +145,7 @@ def check_no_parts(root: Path) -> None:
 
 
 def unfinished_parts(parts: list[Part], root: Path) -> dict[Part, str]:
-    """{part: which block it lacks, or what is wrong with one} of those that are not whole."""
+    """{part: its missing block, or a block's damage} of the incomplete parts."""
     found = {}
     for part in parts:
         for number in part.blocks:
@@ -190,6 +190,6 @@ def _check_same(flag: str, part: Part, root: Path) -> None:
 
 def _begun_at_once(flag: str, root: Path) -> ValueError:
     return ValueError(
-        f"{flag}: {unfinished_folder(root)} holds a recording that was begun without --shard; go on without "
+        f"{flag}: {unfinished_folder(root)} holds a recording that was begun without --shard; resume without "
         "it, give another --root, or delete it"
     )

@@ -1,6 +1,6 @@
-"""Blocks of a recording, played and written.
+"""Blocks of a recording, run and written.
 
-LeRobot and torch are imported only after the flags have been checked and the workers are playing.
+LeRobot and torch are imported only after the flags have been checked and the workers are running.
 """
 
 import sys
@@ -30,7 +30,7 @@ MIN_SUCCESS_RATE = 0.1
 
 
 @dataclass(frozen=True)
-class Acting:
+class BehaviorPolicy:
     """A policy that acts in place of the expert."""
 
     begin: Callable[[], None]  # before each episode
@@ -38,15 +38,15 @@ class Acting:
 
 
 @dataclass(frozen=True)
-class Players:
-    """Workers, expert and policy that make the episodes of a recording."""
+class EpisodeSource:
+    """Source of a recording's episodes: workers, expert, and the policy that acts instead of it."""
 
     num_workers: int = 1
     expert: Expert = expert_action
-    acting: Acting | None = None  # the expert says what it would have done
+    behavior: BehaviorPolicy | None = None  # the expert says what it would have done
 
     def rollouts(self, recording: Recording, num_tried: int) -> RolloutPool | RelabelledRollouts:
-        """Return the episodes of a recording that are tried after the first so many."""
+        """Return the episodes of a recording after the first `num_tried`."""
         settings = RolloutSettings(
             recording.render_options,
             recording.noise,
@@ -55,19 +55,19 @@ class Players:
             recording.pointing,
         )
         specs = recording.specs(num_tried)
-        if self.acting is None:
+        if self.behavior is None:
             return RolloutPool(settings, specs, self.num_workers)
-        return RelabelledRollouts(settings, specs, self.acting.begin, self.acting.agent)
+        return RelabelledRollouts(settings, specs, self.behavior.begin, self.behavior.agent)
 
 
 def record_blocks(
     recording: Recording,
     folder: Path,
-    players: Players,
+    source: EpisodeSource,
     numbers: range = range(ANY_NUMBER),
     most: int = ANY_NUMBER,
 ) -> None:
-    """Make those of the numbered blocks that a folder lacks, until it holds so many episodes.
+    """Make the missing ones of the numbered blocks, until the folder holds `most` episodes.
 
     A block has the successful ones of the episodes that are its own to try, whoever makes it.
     """
@@ -82,23 +82,23 @@ def record_blocks(
     total = min(most, block_episodes(numbers.stop).start - block_episodes(numbers.start).start)
     with tqdm(total=total, initial=run.num_episodes, unit="episode") as bar:
         for gap in gaps:
-            _fill(recording, folder, players, gap, most, partial(_successes, run, bar))
+            _fill(recording, folder, source, gap, most, partial(_successes, run, bar))
 
 
 def _fill(
     recording: Recording,
     folder: Path,
-    players: Players,
+    source: EpisodeSource,
     gap: range,
     most: int,
     successes: "Callable[[Iterable[Rollout], int, Progress], Iterator[RecordedEpisode]]",
 ) -> None:
-    """Make the blocks of a gap, until the folder holds so many episodes."""
+    """Make the blocks of a gap, until the folder holds `most` episodes."""
     left = most - episodes_before(folder, gap.start)
     if left == 0:
         return
-    with players.rollouts(recording, block_episodes(gap.start).start) as pool:
-        layout = recording_layout(recording)  # takes seconds, in which the workers play
+    with source.rollouts(recording, block_episodes(gap.start).start) as pool:
+        layout = recording_layout(recording)  # takes seconds, in which the workers run
         for number in gap:
             made = add_block(folder, layout, number, partial(successes, pool, left))
             left -= made.num_episodes
@@ -109,7 +109,7 @@ def _fill(
 def _successes(
     run: Progress, bar: tqdm, pool: Iterable[Rollout], most: int, progress: Progress
 ) -> "Iterator[RecordedEpisode]":
-    """Yield a block's successful rollouts, at most so many; note the failed ones on the way."""
+    """Yield a block's successful rollouts, at most `most`; note the failed ones on the way."""
     from lerobot_bomb.data.rollout_dataset import rollout_episode
 
     for rollout in islice(pool, len(block_episodes(0))):

@@ -40,9 +40,9 @@ class Recording:
     # (row, column) and colour; None = drawn per episode
     target: tuple[int, int] | None = None
     color: str | None = None
-    # numbered tasks, each played from every seed; empty = target and colour as above
+    # numbered tasks, each run from every seed; empty = target and colour as above
     task_ids: tuple[int, ...] = ()
-    perturbations: tuple[str, ...] = (NONE,)  # conditions, each played from every seed, with every task
+    perturbations: tuple[str, ...] = (NONE,)  # conditions, each run from every seed, with every task
     images: bool = False
     render_preset: str = "fast"
     depth: bool = False
@@ -57,7 +57,7 @@ class Recording:
     # the suite's version, by the name that recordings of 1.0 have; filled in
     protocol_version: str = ""
     package_version: str = __version__
-    # another one plays other bits
+    # another one gives other bits
     mujoco_version: str | None = field(default_factory=partial(installed_version, "mujoco"))
 
     def __post_init__(self) -> None:
@@ -124,7 +124,7 @@ class Recording:
 
     @property
     def conditions(self) -> list[EpisodeSpec]:
-        """The specs that every seed is played with, with the first seed."""
+        """The specs that every seed is run with, with the first seed."""
         tasks = [task for spec in self.suite_specs for task in specs_of_tasks(spec, self.task_ids)]
         return [replace(task, perturbations=text) for task in tasks for text in self.perturbations]
 

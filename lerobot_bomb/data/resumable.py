@@ -1,10 +1,8 @@
 """A dataset that grows in blocks beside its final place: a kill costs little and leaves no half dataset.
 
-While it grows it is a folder, for a recording as follows:
-    NAME.recording/recording.json   the parameters
-    NAME.recording/block-00000/     a finished LeRobotDataset, and block.json: what it holds
-The merged dataset appears under its name at once, complete. What was lost or damaged in the meantime is
-made again (see ``kept_blocks.py``).
+While it grows it is a folder, for a recording as follows: NAME.recording/recording.json the parameters
+NAME.recording/block-00000/ a finished LeRobotDataset, and block.json: what it holds The merged dataset
+appears under its name at once, complete. Lost or damaged blocks are made again (see ``kept_blocks.py``).
 """
 
 import os
@@ -48,7 +46,7 @@ if TYPE_CHECKING:
 
     from lerobot_bomb.data.blocks import DatasetLayout, RecordedEpisode
 
-BLOCK_EPISODES = 20  # what a kill can cost: they are played or written again on --resume
+BLOCK_EPISODES = 20  # what a kill can cost: they are run or written again on --resume
 SEND_AGAIN_S = 0.05  # after a destructor has swallowed a signal
 
 
@@ -60,12 +58,12 @@ def grow(
     layout: Callable[[], "DatasetLayout"],
     parts: Sequence[Path] = (),
 ) -> Progress:
-    """Let `write` fill a folder with the blocks that it lacks, then merge them into `root`.
+    """Let `write` add the missing blocks to a folder, then merge all into `root`.
 
     Args:
         parameters: what determines the dataset.
         root: where it appears.
-        resume: go on with what is there, instead of refusing it.
+        resume: continue with what is there, instead of refusing it.
         write: makes the blocks.
         layout: of the dataset.
         parts: folders that hold its first blocks.
@@ -125,7 +123,7 @@ def block_episodes(number: int) -> range:
 
 
 def num_blocks(num_episodes: int) -> int:
-    """Return how many so many episodes are; the last one may be short."""
+    """Return the number of blocks of this many episodes; the last one may be short."""
     return -(-num_episodes // BLOCK_EPISODES)
 
 
@@ -143,7 +141,7 @@ def add_block(
     number: int,
     episodes: Callable[[Progress], Iterator["RecordedEpisode"]],
 ) -> Progress:
-    """Make a block of episodes, which count themselves, and return what it holds."""
+    """Make a block of episodes and return its counts, which the episodes fill in."""
     from lerobot_bomb.data.blocks import write_block
 
     block, progress = block_path(folder, number), Progress()
@@ -242,7 +240,7 @@ def _read_whole(dataset: Path) -> Progress:
 
 
 def _keep_finished(folder: Path, parts: Sequence[Path]) -> str:
-    """Delete what is unfinished, which gives a full disk its space back; return what is kept."""
+    """Delete everything unfinished, which frees disk space; describe the rest."""
     remove_unfinished(folder)
     blocks = finished_blocks(folder)
     if not blocks:

@@ -1,7 +1,7 @@
-"""Demonstrations on a plane, copied: turned, mirrored and shifted, the goal with the rest.
+"""Copies of demonstrations on a plane: rotated, mirrored and shifted, together with the goal.
 
-Pushing does not depend on where north is, so a copy is as good a demonstration as what it is made from, for a
-policy that sees the goal (as in Zeng et al., Transporter Networks, arXiv 2010.14406).
+Pushing does not depend on where north is, so a copy is as good as its original for a policy that sees the
+goal (as in Zeng et al., Transporter Networks, arXiv 2010.14406).
 """
 
 from dataclasses import dataclass

@@ -52,7 +52,7 @@ def rollout_layout(recording: Recording) -> DatasetLayout:
 
 def rollout_episode(rollout: Rollout) -> RecordedEpisode:
     """Convert a rollout to the episode that the dataset stores."""
-    is_scene = rollout.result.steps == 0  # nothing has been played
+    is_scene = rollout.result.steps == 0  # nothing has been run
     frames = (_frame(rollout, step, is_scene) for step in range(rollout.num_steps))
     return RecordedEpisode(frames, _columns(rollout.result))
 

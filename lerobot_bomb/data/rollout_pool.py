@@ -1,4 +1,4 @@
-"""Episodes of the scripted expert, played in worker processes.
+"""Episodes of the scripted expert, run in worker processes.
 
 The workers import this module, so it imports neither torch nor LeRobot.
 """
@@ -30,7 +30,7 @@ from lerobot_bomb.bomb.observation import (
 from lerobot_bomb.bomb.pointing import COLUMNS, Pointing
 from lerobot_bomb.bomb.privileged_state import PrivilegedState
 from lerobot_bomb.bomb.streams import Stream, generator, recorder_noise
-from lerobot_bomb.envs.rollout import Agent, Expert, add_noise, expert_agent, make_env, play
+from lerobot_bomb.envs.rollout import Agent, Expert, add_noise, expert_agent, make_env, run_episode
 from lerobot_bomb.results.bomb import EpisodeResult
 
 MAX_ENVS = 8  # that a worker keeps; each holds an OpenGL context
@@ -68,16 +68,16 @@ class Rollout:
 def collect(
     env: gymnasium.Env, spec: EpisodeSpec, settings: RolloutSettings, agent: Agent | None = None
 ) -> Rollout:
-    """Play a spec's episode in an `env` of that spec, whatever the seed that the `env` was made with.
+    """Run a spec's episode in an `env` of that spec, whatever the seed that the `env` was made with.
 
     The stored actions are the expert's clean ones, the executed ones carry the noise. With an ``agent``,
-    which then acts, an episode is kept whatever becomes of it.
+    which then acts, failed episodes are kept, too.
     """
     if settings.static:
         return collect_static(env, spec, settings)
     rng = recorder_noise(spec.seed)
     moments = list(
-        play(
+        run_episode(
             env,
             spec,
             agent or expert_agent(settings.expert),
@@ -97,7 +97,7 @@ def collect(
 
 
 def collect_static(env: gymnasium.Env, spec: EpisodeSpec, settings: RolloutSettings) -> Rollout:
-    """The episodes of a spec from its seed on as they may stand midway, and what the expert would do there.
+    """Static scenes of a spec's episodes from its seed on, with the expert's actions.
 
     The result is of the first one.
     """
@@ -154,14 +154,14 @@ class RelabelledRollouts:
     def __iter__(self) -> Iterator[Rollout]:
         for spec in self._specs:
             self._begin()
-            rollout = self._worker.play(spec)
+            rollout = self._worker.rollout(spec)
             if isinstance(rollout, Exception):
                 raise rollout
             yield rollout
 
 
 class RolloutPool:
-    """Worker processes that play an endless stream of episodes ahead of the writer.
+    """Worker processes that run an endless stream of episodes ahead of the writer.
 
     An iterator over the rollouts in the order of the specs, whatever the number of workers: they take
     turns. Each has a pipe of its own and no thread or lock is shared, so none can hang another.
@@ -190,7 +190,7 @@ class RolloutPool:
         finally:
             signal.pthread_sigmask(signal.SIG_SETMASK, usual)
         self._turns = itertools.cycle(zip(self._processes, self._pipes, strict=True))
-        for pipe in (*self._pipes, *self._pipes):  # an episode to play and one to go on with
+        for pipe in (*self._pipes, *self._pipes):  # an episode to run, and one more for when it is done
             self._submit(pipe)
 
     def __enter__(self) -> Self:
@@ -227,7 +227,7 @@ def _work(settings: RolloutSettings, pipe: Connection) -> None:
     worker = _Worker(settings)
     with suppress(EOFError, ConnectionError):
         while True:
-            pipe.send(worker.play(pipe.recv()))
+            pipe.send(worker.rollout(pipe.recv()))
     worker.close()
 
 
@@ -238,7 +238,7 @@ class _Worker:
         self._settings, self._agent = settings, agent
         self._envs: dict[EpisodeSpec, gymnasium.Env] = {}
 
-    def play(self, spec: EpisodeSpec) -> Rollout | Exception:
+    def rollout(self, spec: EpisodeSpec) -> Rollout | Exception:
         try:
             return collect(self._env_of(spec), spec, self._settings, self._agent)
         except Exception as error:

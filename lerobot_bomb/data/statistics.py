@@ -1,7 +1,7 @@
 """Statistics of a dataset's numbers over all of its frames.
 
 LeRobot averages quantiles over episodes and over datasets that it merges, so that a third of the frames may
-lie beyond q01..q99. Of images, its statistics stay: their quantiles are such means, of sampled pixels.
+lie beyond q01..q99. Its statistics of images stay: their quantiles are means over sampled pixels.
 """
 
 import json
@@ -63,7 +63,7 @@ def exact_statistics(values_ND: np.ndarray) -> Statistics:
 
 
 def wrong_statistics(root: Path) -> list[WrongStatistics]:
-    """Compare what stats.json says of a dataset's numbers with all of its frames.
+    """Compare a dataset's stats.json with all of its frames, images excepted.
 
     Raises:
         OSError, ValueError: a file is missing or damaged, or not all frames are here.
@@ -97,7 +97,7 @@ def mending(root: Path) -> str:
 
 
 def write_statistics(root: Path) -> None:
-    """Let stats.json say of a dataset's numbers what all frames do; what it says of images stays.
+    """Write statistics of all frames to a dataset's stats.json; those of images stay.
 
     Raises:
         OSError, ValueError: a file is missing or damaged, or not all frames are here.
@@ -111,7 +111,7 @@ def write_statistics(root: Path) -> None:
 
 
 def write_image_statistics(root: Path) -> None:
-    """Let stats.json say of a dataset's images what follows from all episodes, in whatever parts they came.
+    """Write image statistics of all episodes to stats.json, whatever the parts they came in.
 
     Raises:
         OSError, ValueError: a file is missing or damaged.

@@ -1,4 +1,4 @@
-"""The folder in which a dataset grows: where it is, whose it is, and what in it is ours to delete."""
+"""The folder in which a dataset grows: its place, its owner, and the files that we may delete."""
 
 import errno
 import os
@@ -41,7 +41,7 @@ def parts_folder(root: Path) -> Path:
 
 
 def parameters_file(folder: Path) -> Path:
-    """The file that says what grows in a folder: recording.json in NAME.recording."""
+    """Return the file with the parameters of a growing dataset: recording.json in NAME.recording."""
     return folder / f"{folder.suffix[1:]}.json"
 
 
@@ -58,7 +58,7 @@ def check_folders(parameters: Parameters, root: Path, folder: Path, resume: bool
         _check_new(kind, root, folder)
     elif not root.exists() and not folder.exists():
         raise ValueError(
-            f"--resume: there is no {kind} to go on with in --root={root}; begin it without --resume"
+            f"--resume: there is no {kind} to resume in --root={root}; begin it without --resume"
         )
     elif root.exists() and not (root / METADATA_FILE).exists():
         raise ValueError(f"--resume: --root={root} holds no {METADATA_FILE}, so it is no {kind}")

@@ -54,7 +54,7 @@ class Prompt(NamedTuple):
 
     @property
     def tensors(self) -> tuple[Tensor, Tensor, Tensor]:
-        """Prompt as tensors, without a None."""
+        """Prompt as tensors, with defaults in place of None."""
         return self.embeds, self.mask, torch.zeros_like(self.mask) if self.hidden is None else self.hidden
 
 
@@ -93,7 +93,7 @@ class CachedContinuation(Continuation):
 
 
 class Answers(NamedTuple):
-    """Rows of symbols, as far as they are written."""
+    """Rows of symbols written so far."""
 
     numbers: Tensor  # (B, N) int64 those that are complete, else 0
     last: Tensor  # (B,) int64, the symbol written last
@@ -124,12 +124,12 @@ class Answers(NamedTuple):
         return Place(self.prefix, self.number)
 
     def is_done(self, grammar: NumberGrammar, num_numbers: int) -> Tensor:
-        """(B,) whether so many numbers are written."""
+        """(B,) bool: all numbers are written."""
         complete_B = (self.number == num_numbers - 1) & grammar.must_end[self.prefix]
         return complete_B | (self.number >= num_numbers) | (self.prefix == grammar.DONE)
 
     def answer(self, grammar: NumberGrammar) -> Tensor:
-        """(B, N) the numbers, with the one that stands where rows are."""
+        """(B, N) numbers, with the one that is being written."""
         return self.numbers.scatter_add(1, self.number[:, None], grammar.value[self.prefix][:, None])
 
     def keep(self, row_B: Tensor) -> "Answers":
@@ -146,7 +146,7 @@ class Decoded:
 
 
 def likeliest(logits: Tensor) -> tuple[Tensor, Tensor]:
-    """(..., S) -> (...) which is largest, and its logit: NaN if any of them is, else inf if any is."""
+    """(..., S) -> (...) index of the largest logit, and that logit: NaN if any is NaN, else inf if any is."""
     choice = logits.argmax(dim=-1)
     return choice, logits.gather(-1, choice[..., None])[..., 0]
 

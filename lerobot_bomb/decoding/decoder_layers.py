@@ -83,7 +83,7 @@ class TextLayers:
         return self._norm(x_NH).view(x_BKH.shape)
 
     def rope(self, position_C: Tensor) -> Tensor:
-        """Positions as `rotary_tables` takes them -> (C, 1, ...) rotary ones as the layers want them."""
+        """Positions as `rotary_tables` takes them -> (C, 1, ...) rotary positions for the layers."""
         return self._rope(*rotary_tables(self.model, position_C)) * self._rope_scale
 
     @torch.no_grad()
@@ -207,7 +207,7 @@ class _RMSNorm:
         self.scale, self._least_length = self._weight * width**0.5, torch.tensor((width * self._eps) ** 0.5)
 
     def refresh(self) -> None:
-        """Take the module's weight as it is now; only for use off the CPU, where the scale is not read."""
+        """Take the module's current weight; only off the CPU, where the scale is not read."""
         if self._is_gemma:
             torch.add(self._source, 1, out=self._weight)
 

@@ -1,4 +1,4 @@
-"""Guesses of what an answer goes on with; right or wrong, they change only how many passes it takes.
+"""Guesses of an answer's next tokens; right or wrong, they change only the number of passes.
 
 Shapes: `B` batch, `N` numbers, `W` those that guesses can reach, `C` columns a number may take,
 `M` = (1 + W) * C, `G` guesses.

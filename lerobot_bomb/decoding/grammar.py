@@ -97,7 +97,7 @@ class NumberGrammar(nn.Module):
         return len(prefix) == self.fixed_width if self.fixed_width else prefix != ""
 
     def max_symbols(self, num_numbers: int) -> int:
-        """Return the most symbols that so many numbers take, with the symbol after them."""
+        """Return the most symbols that this number of numbers takes, with the symbol after them."""
         return num_numbers * (1 + self.width) + 1
 
     def start(self, batch_size: int) -> Place:

@@ -18,7 +18,7 @@ Positions = Callable[[Tensor], Tensor]
 
 
 def same_positions(column_C: Tensor) -> Tensor:
-    """Return the positions of a model that counts as columns are counted."""
+    """Return positions equal to the columns' numbers."""
     return column_C
 
 
@@ -27,7 +27,7 @@ def check_positions(
     num_tokens: int,
     way_out: str = "shorten the instruction or give a smaller --policy.chunk_size",
 ) -> None:
-    """Check that a text model of this config can read so many tokens.
+    """Check that a text model of this config can read this many tokens.
 
     Raises:
         ValueError: it has fewer positions.
@@ -42,7 +42,7 @@ def check_positions(
 
 
 class CachedText:
-    """Hidden states of new tokens, which read what was cached before them.
+    """Text model that returns hidden states of new tokens, which attend to cached ones.
 
     A token's column in the cache says its position, the same in every row (``positions``). One at a column
     that is written already takes its place, so what is no longer wanted is written over. Gaps go to
@@ -96,7 +96,7 @@ class CachedText:
         return self._layers(embeds_BKH, columns, self._layer_caches)
 
     def singly(self, columns_BK: Tensor) -> list[Columns]:
-        """Locate K passes, each of a token a row which reads up to its own column; faster than one by one."""
+        """Locate K passes of one token per row, each up to its own column; faster than one by one."""
         counts = self._counts_of_columns(columns_BK)
         together = self._locate(columns_BK, columns_BK, max(counts, default=0))
         parts = zip(

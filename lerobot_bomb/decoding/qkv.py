@@ -1,4 +1,4 @@
-"""Queries, keys and values of a layer: what the tokens of a pass ask for and can be asked for.
+"""Queries, keys and values of a layer, for the tokens of a pass.
 
 Shapes: `N` tokens of a pass, `C` columns of a cache, `H` hidden size, `V` key-value heads, `G` query heads
 for each, `E` size of a head, `A` = 3 axes that a position has in M-RoPE: time, line and column.
@@ -91,7 +91,7 @@ class RopePairs:
 
     @staticmethod
     def rope(cos_CE: Tensor, sin_CE: Tensor) -> Tensor:
-        """(C, 1, E / 2) complex rotary positions from the model's own, whose halves are the same."""
+        """(C, 1, E / 2) complex rotary positions, from the model's own, which repeat each half."""
         half = cos_CE.shape[-1] // 2
         return torch.complex(cos_CE[:, None, :half].float(), sin_CE[:, None, :half].float())
 
@@ -106,7 +106,7 @@ class RopePairs:
 
 
 def softcap_of(attention: Any) -> float | None:
-    """Limit of the attention logits, of families that have one."""
+    """Return the cap of the attention logits, in families that have one."""
     return getattr(attention, "attn_logit_softcapping", None)
 
 

@@ -1,7 +1,7 @@
 """Decoding of answers with one choice a slot, one pass of the model each, or less.
 
-An answer has steps of the same slots, and may have others ahead of them. What may stand in a slot does not
-depend on what stands before it, so the language needs no automaton: the output head has only the slot's rows.
+An answer has steps of the same slots, and may have others ahead of them. The choices of a slot do not depend
+on those before it, so no automaton is needed: the output head has only the slot's rows.
 
 Shapes: `B` batch, `L` tokens of a prompt, `H` hidden size, `T` steps of an answer, `G` slots of a step, `S`
 of an answer, `C` choices of all kinds of slots, `K` tokens of a pass.

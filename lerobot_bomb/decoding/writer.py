@@ -64,7 +64,7 @@ def continue_prompt(
     max_symbols: int,
     positions: Positions = same_positions,
 ) -> CachedContinuation:
-    """A continuation by a backbone as it is now."""
+    """Continue a prompt by a backbone's current weights."""
     layers = TextLayers(backbone.text_model)
     return CachedContinuation(
         CachedText(layers, len(prompt.embeds), prompt.embeds.shape[1] + max_symbols, positions),

@@ -83,7 +83,7 @@ class EpisodeEnv[SpecT: Any, RunT, ResultT: Record](gymnasium.Env[Observation, n
         return observation, reward, terminated, truncated, info
 
     def add_query(self, query: Query) -> None:
-        """Note that the policy was asked for the next action; of no effect once the episode has ended."""
+        """Note that the policy is to give the next action; without effect once the episode has ended."""
         if self._last_transition is None:
             self._queries.append(query)
 
@@ -163,7 +163,7 @@ class EpisodeEnv[SpecT: Any, RunT, ResultT: Record](gymnasium.Env[Observation, n
 
 
 def _whole(seed: Any) -> int:
-    """A seed of any integer type; an error for what is none."""
+    """Return a seed of any integer type; raise an error for anything else."""
     try:
         number = operator.index(seed)
     except TypeError:

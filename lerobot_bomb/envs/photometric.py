@@ -1,4 +1,4 @@
-"""Perturbation axis `photometric`: what a camera's sensor does to an image."""
+"""Perturbation axis `photometric`: effects of a camera's sensor on an image."""
 
 from dataclasses import dataclass
 from functools import lru_cache

@@ -1,4 +1,4 @@
-"""One episode, step by step, by whatever acts. It imports neither torch nor LeRobot."""
+"""One episode, step by step, by any agent. This module imports neither torch nor LeRobot."""
 
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
@@ -52,7 +52,7 @@ def make_env(spec: EpisodeSpec, render_options: RenderOptions) -> gymnasium.Env:
     )
 
 
-def play(
+def run_episode(
     env: gymnasium.Env,
     spec: Spec,
     agent: Agent,
@@ -79,9 +79,9 @@ def play(
 def one_of_batch(
     agent: BatchAgent, make_env: Callable[[], gymnasium.Env], seed: int, row: int, size: int
 ) -> Iterator[Agent]:
-    """Yield the agent of one seed, which acts at once in the other episodes of its batch, of nearby seeds.
+    """Yield the agent of one seed, which at the same time acts in the other episodes of its batch.
 
-    lerobot-eval plays consecutive seeds as a batch, in which a policy's arithmetic rounds otherwise than
+    lerobot-eval runs consecutive seeds as a batch, in which a policy's arithmetic rounds otherwise than
     alone. The other episodes run here, unseen.
     """
     others = {i: FreezeAfterEnd(make_env()) for i in range(size) if i != row}

@@ -19,11 +19,11 @@ NEW_ROLLOUT_OPTION = "lerobot_new_rollout"
 
 
 def check_parallel_tasks(number: int) -> None:
-    """Raise a ValueError unless LeRobot plays one task after another."""
+    """Raise a ValueError unless LeRobot runs one task after another."""
     if number > 1:
         raise ValueError(
-            f"--env.max_parallel_tasks={number} plays tasks in threads, which share the queue and the random "
-            "numbers of one policy, and OpenGL draws in the thread that it began in; drop it. To play in "
+            f"--env.max_parallel_tasks={number} runs tasks in threads, which share the queue and the random "
+            "numbers of one policy, and OpenGL draws in the thread that it began in; drop it. To run in "
             f"several processes: lerobot-bomb sweep --workers={number}"
         )
 
@@ -140,7 +140,7 @@ class LazyVectorEnv(VectorEnv):
 
     @contextmanager
     def _running(self) -> Iterator[SyncVectorEnv | AsyncVectorEnv]:
-        """The envs; after an error, which ends a worker, none is left, and the next use starts them anew."""
+        """Return the envs; after an error, which ends a worker, the next use starts all of them again."""
         envs = self._ensure()
         try:
             yield envs

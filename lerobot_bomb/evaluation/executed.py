@@ -77,7 +77,7 @@ def append_episode(
 
 
 def start_of(episode: str) -> str:
-    """Seed of an episode that `read_action_log` named: those of one seed start alike. Else its own name."""
+    """Return the seed of an episode that `read_action_log` named, else its name."""
     return episode.rpartition(", ")[2]
 
 

@@ -72,7 +72,7 @@ def _measure(
     batch_size: int,
     name: str,
 ) -> tuple[dict[str, Measure], dict[str, L1]]:
-    """Losses, and L1 of the policy and of what it must beat."""
+    """Measure losses, and L1 of the policy and of the trivial predictors."""
     predictions = predict(policy, dataset, rows_R, batch_size, name)
     chunk_size = predictions.chunks.shape[1]
     recorded_RTD, is_pad_RT = demonstrations.recorded(rows_R, chunk_size)

@@ -32,7 +32,7 @@ class Predictions:
 
 
 def check_policy(config: PreTrainedConfig, meta: LeRobotDatasetMetadata, rename_map: dict[str, str]) -> None:
-    """Raise a ValueError unless the dataset has what the policy reads, and the policy writes chunks."""
+    """Raise a ValueError unless the dataset has all that the policy reads, and the policy predicts chunks."""
     features = {
         rename_map.get(key, key): feature
         for key, feature in dataset_to_policy_features(meta.features).items()

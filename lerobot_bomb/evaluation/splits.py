@@ -1,4 +1,4 @@
-"""Split of a dataset's episodes: those that a checkpoint was trained on, and those that judge it."""
+"""Split of a dataset's episodes: those that a checkpoint was trained on, and those to validate it."""
 
 import math
 import re
@@ -12,7 +12,7 @@ from lerobot_bomb.checkpoints.training import dataset_of
 
 @dataclass(frozen=True)
 class Split:
-    """Episodes of the two columns; `seen` are those of the validation that were trained on."""
+    """Episodes of the two columns; `seen` are validation episodes that were trained on."""
 
     train: list[int]
     validation: list[int]
@@ -72,7 +72,7 @@ def make_split(
     train: list[int] | None,
     validation: list[int] | None,
 ) -> Split:
-    """Default what was not asked for: train on what was trained on, validate on all that is left.
+    """Split by the flags; by default, the episodes that were trained on, and all others.
 
     Raises:
         ValueError: an episode is asked for in both, or no episode is held out.

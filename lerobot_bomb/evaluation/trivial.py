@@ -1,4 +1,4 @@
-"""Predictors of action chunks that look at no image: what a policy must beat.
+"""Predictors of action chunks that look at no image, which a policy must beat.
 
 Shapes: `N` recorded frames, `R` of them that are predicted from, `T` actions of a chunk, `D` action dims.
 """

@@ -1,1 +1,1 @@
-"""Explanations: why a policy does what it does."""
+"""Explanations of a policy's actions."""

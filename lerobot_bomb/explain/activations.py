@@ -35,7 +35,7 @@ class Unit:
 
 @contextmanager
 def recording(layers: Sequence[DecoderLayer], parts: Sequence[str] = PARTS) -> Iterator[Activations]:
-    """Keep what the layers' parts give in the passes until the end of the block."""
+    """Keep the outputs of the layers' parts, in all passes until the end of the block."""
     kept: Activations = defaultdict(list)
 
     def keep(key: tuple[int, str], values: Tensor) -> Tensor:
@@ -96,7 +96,7 @@ class _Restore:
 
 @contextmanager
 def _changed(layers: Sequence[DecoderLayer], changes: Mapping[tuple[int, str], Change]) -> Iterator[None]:
-    """Let what parts give be changed; the hooks are gone afterwards, whatever happens.
+    """Change the outputs of parts; the hooks are removed afterwards, whatever happens.
 
     Raises:
         ValueError: the layers' own outputs cannot be had.

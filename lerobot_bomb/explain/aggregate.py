@@ -21,7 +21,7 @@ class Mean:
 
 
 def mean_of(values: Sequence[float]) -> Mean | None:
-    """Average the values that are numbers; None where there are none."""
+    """Average the values that are numbers; None if there are none."""
     sample = np.array([value for value in values if np.isfinite(value)])
     if not len(sample):
         return None

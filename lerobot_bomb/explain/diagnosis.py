@@ -22,7 +22,7 @@ class Finding:
 
     @classmethod
     def of_effects(cls, question: str, effects: Mapping[str, float], *, is_weak: bool) -> Self:
-        """Name what has an effect, the largest first, with as many effects as one reads.
+        """Name the parts with an effect, the largest first, at most a few.
 
         ``is_weak``: the largest is below a SHARE of what has the largest effect of all.
         """

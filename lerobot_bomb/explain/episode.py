@@ -1,4 +1,4 @@
-"""An episode, its moments and what is found out about them."""
+"""An episode, its moments and the findings about them."""
 
 from collections.abc import Iterator, Sequence
 from dataclasses import asdict, dataclass
@@ -33,7 +33,7 @@ class Settings:
 
 @dataclass(frozen=True)
 class ExplainedMoment:
-    """A moment, what was found out about it, and what a person sees of it."""
+    """A moment, the findings about it, and its images."""
 
     snapshot: Snapshot
     explanation: Explanation

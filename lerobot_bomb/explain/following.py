@@ -31,9 +31,9 @@ def following(
     """Measure how actions follow each other instruction to its place, from the same observation and noise."""
     clean = _end_xy(loaded, observation, control_mode)
     found = {}
-    for word, (instruction, cell) in others.items():
+    for word, (instruction, intersection) in others.items():
         moved = _end_xy(loaded, {**observation, "task": [instruction]}, control_mode) - clean
-        asked = BOARD.intersection_xy(*cell) - BOARD.intersection_xy(*target)
+        asked = BOARD.intersection_xy(*intersection) - BOARD.intersection_xy(*target)
         asked_m = float(np.linalg.norm(asked))
         along_m = float(moved @ asked) / asked_m if asked_m else np.nan
         found[word] = Following(instruction, 1e3 * asked_m, 1e3 * float(np.linalg.norm(moved)), 1e3 * along_m)

@@ -29,7 +29,7 @@ def patch_masks(grid: int, height: int, width: int) -> Tensor:
 
 
 def filling(image_3HW: Tensor, kind: str, blur_px: float, other_3HW: Tensor | None = None) -> Tensor:
-    """(3, H, W) what stands in an image where something is taken away.
+    """(3, H, W) pixels that replace those taken out of an image.
 
     ``mean``: the image's mean colour. ``blur``: the image, blurred by a Gaussian of this standard deviation.
     ``other``: another image.
@@ -50,7 +50,7 @@ def filling(image_3HW: Tensor, kind: str, blur_px: float, other_3HW: Tensor | No
 
 
 def occluded(image_3HW: Tensor, masks_MHW: Tensor, filling_3HW: Tensor) -> Tensor:
-    """(M, 3, H, W) the image without what each mask covers."""
+    """(M, 3, H, W) copies of the image, each without the pixels of one mask."""
     return torch.where(masks_MHW[:, None], filling_3HW, image_3HW)
 
 

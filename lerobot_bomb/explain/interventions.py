@@ -1,4 +1,4 @@
-"""Interventions: what a policy is shown is changed on purpose, to see what its actions depend on.
+"""Interventions: deliberate changes of a policy's inputs, to see what its actions depend on.
 
 An intervention is a processor step at the head of a checkpoint's preprocessor. LeRobot's own commands
 run the changed checkpoint, so it works for every policy type and every environment.

@@ -11,7 +11,7 @@ import torch
 from lerobot.utils.constants import OBS_IMAGES
 
 from lerobot_bomb.bomb.observation import AGENT_POS
-from lerobot_bomb.envs.rollout import play
+from lerobot_bomb.envs.rollout import run_episode
 from lerobot_bomb.explain.images import filling, occluded
 from lerobot_bomb.explain.other_policies import scored
 from lerobot_bomb.explain.scored_policy import Batch
@@ -44,14 +44,14 @@ class Mask:
 
 @dataclass(frozen=True)
 class MaskedEpisode:
-    """An episode that was played under a mask."""
+    """An episode that was run under a mask."""
 
     gripper_xyz: np.ndarray  # (T + 1, 3) metres, before each step and at the end
     result: Any  # the line of its results
 
 
 def without_object(name: str, fill: str) -> Mask:
-    """One kind of thing, of `object_masks`, taken out of every camera's image.
+    """Take one object of `object_masks` out of every camera's image.
 
     Raises:
         ValueError: ``fill`` needs another episode.
@@ -70,7 +70,7 @@ def without_object(name: str, fill: str) -> Mask:
 
 
 def without_words(loaded: LoadedPolicy, words: Callable[[str], Span | None]) -> Mask:
-    """Tokens of an instruction that no other token reads; ``words``: which, None: there are none in it."""
+    """Tokens of an instruction that no other token reads; ``words``: which, None if there are none in it."""
     policy = scored(loaded.policy, loaded.postprocess)
 
     def hide(prepared: Batch, instruction: str) -> Batch:
@@ -111,6 +111,6 @@ def _run(viewed: Viewed, loaded: LoadedPolicy, mask: Mask) -> MaskedEpisode:
                 prepared = mask.change_prepared(loaded.prepare(batch), instruction)
             return loaded.act(prepared)[0]
 
-        trace = [moment.observation[AGENT_POS][:3] for moment in play(env, viewed.spec, act)]
+        trace = [moment.observation[AGENT_POS][:3] for moment in run_episode(env, viewed.spec, act)]
         result: Record = env.get_wrapper_attr("episode_result")()
     return MaskedEpisode(np.stack(trace), result)

@@ -1,4 +1,4 @@
-"""Explanation of one moment of an episode: everything that is asked of a policy about it.
+"""Explanation of one moment of an episode: all questions to a policy about it.
 
 Shapes: `G` cells along a side of the grid over an image, `L` layers.
 """

@@ -127,7 +127,7 @@ def _seeded() -> Iterator[None]:
 
 @contextmanager
 def _same_draws(model: Any, num_rows: int) -> Iterator[None]:
-    """Let a flow model draw the same for each of so many rows, of which each stands there NUM_DRAWS times."""
+    """Let a flow model draw the same noise for each row; each stands there NUM_DRAWS times."""
 
     def sample_noise(shape: tuple[int, ...], device: torch.device | str) -> Tensor:
         draws = torch.randn((NUM_DRAWS, *shape[1:]), generator=torch.Generator().manual_seed(SEED))

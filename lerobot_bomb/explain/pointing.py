@@ -88,7 +88,7 @@ class PointingCheck:
 
     @property
     def asked_mm(self) -> np.ndarray:
-        """(2,) way of the expert's, if all were as it is pointed at."""
+        """(2,) motion of the expert if stone and place were where the policy points."""
         return self._way_mm(action_for(self.state, self.pointed))
 
     @property
@@ -98,7 +98,7 @@ class PointingCheck:
 
     @property
     def goes_there(self) -> bool:
-        """Tell whether the next action is for what is pointed at, but for noise and tempo."""
+        """Return True if the next action goes where the policy points, apart from noise and speed."""
         return self.apart_mm <= max(SLACK_MM, SLACK_SHARE * float(np.linalg.norm(self.asked_mm)))
 
     def _way_mm(self, action: np.ndarray) -> np.ndarray:
@@ -165,7 +165,7 @@ class PointingCheck:
 def check_pointing(
     loaded: LoadedPolicy, scored: ScoredPolicy, observation: Batch, state: PrivilegedState | None
 ) -> PointingCheck | None:
-    """Ask what is pointed at, and what is done next; None where nothing is, or the truth is not known."""
+    """Compare pointing and next action with the truth; None if the policy does not point or it is unknown."""
     if state is None:
         return None
     loaded.begin()

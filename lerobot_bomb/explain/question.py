@@ -41,7 +41,7 @@ class Question:
 
     @torch.no_grad()
     def encode(self, changes: Batch, times: int) -> Rows:
-        """The observation so many times, but for these values, as the decoder reads it."""
+        """Encode copies of the observation with these values replaced, as the decoder reads them."""
         return self.policy.encode(self._prepare({**repeated(self.observation, times), **changes}))
 
     def effects(self, rows: Rows) -> Tensor:

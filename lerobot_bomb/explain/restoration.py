@@ -68,7 +68,7 @@ class Corruption:
         return activations
 
     def restore(self, units_of_rows: Sequence[Sequence[Unit]], batch_size: int = BATCH_SIZE) -> Restoration:
-        """Put what each row names back, so many rows at once; nothing is encoded again."""
+        """Put back the activations that each row names, in batches; nothing is encoded again."""
         return self._restore(self.clean, units_of_rows, batch_size)
 
     def restore_each(self, units: Sequence[Unit]) -> Tensor:

@@ -53,7 +53,7 @@ def decoder_layers(text_model: Any, *, called_whole: bool = True) -> list[Decode
 class ScoredPolicy(ABC):
     """A policy that scores its own answers.
 
-    Scores of a row do not depend on the others of its batch, but for rounding.
+    A row's scores do not depend on the other rows of its batch, except for rounding.
     """
 
     unit: ClassVar[str]  # of a score
@@ -66,11 +66,11 @@ class ScoredPolicy(ABC):
 
     @abstractmethod
     def encode(self, batch: Batch) -> Rows:
-        """Return what the decoder reads; images have gone through the vision model."""
+        """Return the decoder's inputs; images have gone through the vision model."""
 
     @abstractmethod
     def score(self, rows: Rows, answer: Tensor) -> Tensor:
-        """(B,) float32 of one answer, (1, ...), given what each row reads."""
+        """(B,) float32 scores of one answer (1, ...), given the inputs of each row."""
 
     @abstractmethod
     def hide(self, rows: Rows, hidden_BS: Tensor) -> Rows:
@@ -89,7 +89,7 @@ class ScoredPolicy(ABC):
         """
 
     def pointed(self, batch: Batch) -> PointedAt | None:
-        """Return what the policy points at before it answers a batch of one row; None: it does not."""
+        """Return what the policy points at before it answers a batch of one row; None if it does not."""
         return None
 
     def token_spans(self, rows: Rows) -> dict[str, TokenSpan]:
@@ -126,7 +126,7 @@ class ScoredPromptPolicy(ScoredPolicy):
 
     @abstractmethod
     def read(self, batch: Batch, ids_BL: Tensor) -> Rows:
-        """Return what the decoder reads of a batch beside its prompt's tokens."""
+        """Return the decoder's inputs from a batch, except the prompt's tokens."""
 
     def encode(self, batch: Batch) -> Rows:
         with self.policy.eval().autocast():
@@ -163,7 +163,7 @@ class ScoredPromptPolicy(ScoredPolicy):
 
 
 def repeated(values: Batch, times: int) -> Batch:
-    """A batch of one row -> the same row so many times."""
+    """A batch of one row -> the same row `times` times."""
     return {
         key: value.expand(times, *value.shape[1:])
         if isinstance(value, Tensor) and value.ndim and len(value) == 1
@@ -181,7 +181,7 @@ def some(rows: Rows, start: int, stop: int) -> Rows:
 
 @torch.no_grad()
 def scores_of(policy: ScoredPolicy, rows: Rows, answer: Tensor, batch_size: int) -> Tensor:
-    """(B,) scores, so many rows at once."""
+    """(B,) scores, computed in batches."""
     num_rows = len(next(iter(rows.values())))
     parts = [
         policy.score(some(rows, start, start + batch_size), answer)

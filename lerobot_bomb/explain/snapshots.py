@@ -14,7 +14,7 @@ from lerobot_bomb.bomb.episode import Stage
 from lerobot_bomb.bomb.expert import current_goal
 from lerobot_bomb.bomb.observation import ENVIRONMENT_STATE
 from lerobot_bomb.bomb.privileged_state import PrivilegedState
-from lerobot_bomb.envs.rollout import Moment, play
+from lerobot_bomb.envs.rollout import Moment, run_episode
 from lerobot_bomb.viewing.checkpoint import LoadedPolicy
 from lerobot_bomb.viewing.episode import Viewed
 
@@ -25,7 +25,7 @@ NEAR_M = BOARD.pitch_m  # of the stone from where it is to go: it is being place
 
 @dataclass(frozen=True)
 class Snapshot:
-    """A moment, and what the environment knows of it beside what the policy sees."""
+    """A moment: the policy's observation, and facts that only the environment knows."""
 
     step: int
     phase: str  # of PHASES; "" where the environment has none
@@ -50,7 +50,7 @@ class Snapshot:
         return {word: instruction for word, (instruction, _) in self.others.items()}
 
 
-def watch(viewed: Viewed, loaded: LoadedPolicy) -> tuple[list[Snapshot], Any]:
+def take_snapshots(viewed: Viewed, loaded: LoadedPolicy) -> tuple[list[Snapshot], Any]:
     """Return every moment in which the policy acts, and the result of the episode."""
     loaded.begin()
     with closing(viewed.make_env()) as env:
@@ -59,7 +59,9 @@ def watch(viewed: Viewed, loaded: LoadedPolicy) -> tuple[list[Snapshot], Any]:
             return loaded.agent([observation], [instruction])[0]
 
         moments = [
-            _snapshot(moment, env) for moment in play(env, viewed.spec, act) if moment.action is not None
+            _snapshot(moment, env)
+            for moment in run_episode(env, viewed.spec, act)
+            if moment.action is not None
         ]
         return moments, env.get_wrapper_attr("episode_result")()
 
@@ -95,7 +97,7 @@ def _phase(moment: Moment) -> str:
 
 
 def middle_of_phases(moments: list[Snapshot]) -> list[Snapshot]:
-    """The moment in the middle of each phase that there is; of an episode without any, the middle one."""
+    """Return the middle moment of each phase; of an episode without phases, the middle one."""
     by_phase = [[each for each in moments if each.phase == phase] for phase in (*PHASES, "")]
     return [each[len(each) // 2] for each in by_phase if each]
 

@@ -1,4 +1,4 @@
-"""The straight path from noise to actions, and what two heads learn on it.
+"""The straight path from noise to actions, and the targets of two heads on it.
 
 A^tau = (1 - tau) z + tau A0: noise z ~ N(0, I) at tau = 0, clean actions A0 at tau = 1 (flow matching, Lipman
 et al. 2022, arXiv 2210.02747). Shapes: `B` batch, `K` action steps, `D` action dims.

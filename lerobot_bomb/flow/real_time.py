@@ -1,4 +1,4 @@
-"""LeRobot's real-time chunking on our samplers: a new chunk goes on from what is left of the last one.
+"""LeRobot's real-time chunking on our samplers: a new chunk continues the rest of the last one.
 
 LeRobot's time runs from 1 (noise) to 0 (actions), and its velocity points to the noise.
 Shapes: `B` batch, `K` action steps, `D` action dims.

@@ -81,7 +81,7 @@ def check_heads(sampler: str, use_flow_head: bool, use_denoise_head: bool) -> No
 def slope(
     sampler: str, actions: Tensor, velocity: Tensor, noise: Tensor, tau: float, refine_alpha: float
 ) -> Tensor:
-    """Return what a step adds per unit of tau, for any sampler but ``ddim``; without the noise of ``sde``."""
+    """Return a step's change per unit of tau, for any sampler but ``ddim``; without the noise of ``sde``."""
     if sampler == "residual":
         return velocity + refine_alpha * ((actions - tau * velocity) - noise)
     if sampler == "sde":

@@ -16,7 +16,7 @@ CTRL_C = 130  # exit status, as shells have it
 
 
 def main() -> None:
-    """Serve until Ctrl-C; a checkpoint that cannot be served is told in one line."""
+    """Serve until Ctrl-C; a checkpoint that cannot be served is an error of one line."""
     sys.argv.insert(1, f"--host={LOOPBACK}")  # a later flag, or the file, prevails
     logging.getLogger("vla_eval").setLevel(logging.INFO)  # where it listens, and who comes
     try:

@@ -79,7 +79,7 @@ class CheckpointServer(PredictModelServer):
         self._resize = resize
         self._observation_params = observation_params or {}
         self._episode: SessionContext | None = None  # the one under way
-        self._environment: Environment | None = None  # where it is played, if that is BOMB
+        self._environment: Environment | None = None  # where it acts, if that is BOMB
 
     def get_observation_params(self) -> dict[str, Any]:
         return self._observation_params

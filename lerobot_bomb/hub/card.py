@@ -74,7 +74,7 @@ class Checkpoint:
 
     @property
     def backbone(self) -> str | None:
-        """Hub id of its backbone; None: it has none, or not one that is known."""
+        """Hub id of its backbone; None if it has none, or not one that is known."""
         name = getattr(self.config, "vlm_model_name", None)
         return name if name and is_hub_id(name) else None
 
@@ -98,7 +98,7 @@ class Checkpoint:
         )
 
     def _license(self) -> tuple[str | None, str | None]:
-        """Return licence and name: as given, else those of the backbone's weights; None: not known."""
+        """Return licence and name: as given, else those of the backbone's weights; None if unknown."""
         if self.license is not None:
             return self.license, None
         if self.backbone == self.method.backbone:
@@ -178,7 +178,7 @@ class Checkpoint:
         return text + f"\n\n`{SUITE}` is that of its training, which the dataset does not say." * is_open
 
     def _eval_flags(self) -> list[str] | None:
-        """Return the flags of the environment that it was trained for, or evaluated in; None: not known."""
+        """Return the flags of the environment that it was trained for, or evaluated in; None if unknown."""
         knows_suite = self.environment is not None and self.environment.task is not None
         if self.environment is not None and (knows_suite or not self.results):
             return self.environment.eval_flags()
@@ -263,7 +263,7 @@ class Checkpoint:
 
 
 def results_table(group: Group) -> str:
-    """Markdown: what was evaluated, and a row for each condition."""
+    """Return Markdown: the evaluation, and a row for each condition."""
     _, *settings = group.lines()  # the policy is the checkpoint
     measures = [
         f"{measure.name} ({measure.note})" if measure.note else measure.name

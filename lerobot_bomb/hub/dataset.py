@@ -20,7 +20,7 @@ FOLDERS = ("meta", "data", "videos")
 
 @dataclass(frozen=True)
 class RecordedDataset:
-    """A dataset that was checked, as it is published."""
+    """A checked dataset, as it is published."""
 
     repo_id: str
     files: dict[str, Path]  # by name on the Hub
@@ -76,7 +76,7 @@ def _is_data(path: str) -> bool:
 
 
 def dataset_card(repo_id: str, facts: DatasetFacts) -> str:
-    """Write the dataset's card: what the dataset shows, and how to train on it."""
+    """Write the dataset's card: its content, and how to train on it."""
     metadata = DatasetCardData(
         license="apache-2.0",
         tags=["LeRobot", "lerobot_bomb"],

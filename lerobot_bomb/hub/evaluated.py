@@ -1,4 +1,4 @@
-"""Checks that results are of the checkpoint that is published with them, and of its environment."""
+"""Checks that results belong to the checkpoint published with them, and to its environment."""
 
 from pathlib import Path
 
@@ -7,9 +7,9 @@ from lerobot_bomb.results.record import Record
 
 
 def check_weights_of(path: Path, records: list[Record], checkpoint: Path) -> None:
-    """Raise a ValueError if the records of a results file are of other weights than a checkpoint's folder.
+    """Raise a ValueError if records of a results file belong to other weights than a checkpoint's folder.
 
-    Records that name no policy, as those of protocol 1.0, may be of any.
+    Records that name no policy, such as those of protocol 1.0, are accepted.
     """
     from lerobot_bomb.checkpoints.checks import ADAPTERS  # imports LeRobot: seconds
     from lerobot_bomb.checkpoints.identity import sha256_of, weights_file
@@ -33,15 +33,15 @@ def check_environment_of(path: Path, records: list[Record], trained_for: Environ
     for record in records:
         start = f"--results={path} has an episode "
         end = ": a card states no rate of another setting"
-        played_in = record.environment()
-        if played_in is None:
+        environment = record.environment()
+        if environment is None:
             raise ValueError(
                 f"{start}of --env.type={record.env_type} (seed {record.spec.seed}); this checkpoint "
                 f"was trained for {trained_for}{end}"
             )
-        names = trained_for.differences(played_in)
+        names = trained_for.differences(environment)
         if names:
             raise ValueError(
-                f"{start}with {played_in.text(names)} (seed {record.spec.seed}); this checkpoint was "
+                f"{start}with {environment.text(names)} (seed {record.spec.seed}); this checkpoint was "
                 f"trained for {trained_for.text(names)}{end}"
             )

@@ -10,7 +10,7 @@ WIDTH = 100
 
 
 def command(name: str, *flags: str) -> str:
-    """A command line, broken where it is long."""
+    """Return a command line, broken if it is long."""
     lines, line = [], name
     for flag in map(shlex.quote, flags):
         if len(line) + len(flag) > WIDTH:

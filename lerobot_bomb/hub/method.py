@@ -1,4 +1,4 @@
-"""Methods and papers: what a policy type's model card says whichever checkpoint it is of."""
+"""Methods and papers: text of a policy type's model card that is the same for all checkpoints."""
 
 from dataclasses import dataclass
 
@@ -26,7 +26,7 @@ class Paper:
 
 @dataclass(frozen=True)
 class Method:
-    """A policy type in words, its sources, and the backbone that it starts from unless told otherwise."""
+    """A policy type in words, its sources, and its default backbone."""
 
     summary: str
     papers: tuple[Paper, ...]

@@ -1,4 +1,4 @@
-"""Policies on the Hub: one commit with a card out, clear errors in."""
+"""Policies on the Hub: publishing in one commit with a card, loading with clear errors."""
 
 import logging
 from collections.abc import Collection
@@ -49,7 +49,7 @@ if TYPE_CHECKING:
 
 
 class HubPolicy:
-    """Stands before LeRobot's `PreTrainedPolicy` and overrides what it does with checkpoints."""
+    """Overrides how LeRobot's `PreTrainedPolicy` loads, saves and publishes checkpoints."""
 
     method: ClassVar[Method]
     # modules whose tensors in a checkpoint are not needed; that a checkpoint may lack, as they have weights
@@ -139,7 +139,7 @@ class HubPolicy:
         return model
 
     def _validate_peft_config(self, peft_config: Any) -> None:
-        """Write down where the base is: its commit, or a folder whatever the working directory.
+        """Store where the base is: its commit, or the absolute path of its folder.
 
         Adapters that will be published have a base that others can get.
         """
@@ -158,7 +158,7 @@ class HubPolicy:
         state_dict: dict[str, Tensor] | None = None,
         dataset_meta: "LeRobotDatasetMetadata | None" = None,
     ) -> None:
-        """Publish, in one commit, what `lerobot-train --policy.push_to_hub=true` publishes at its end.
+        """Publish in one commit, at the end of `lerobot-train --policy.push_to_hub=true`.
 
         LeRobot pushes the processors after it, and a kill in between would leave new weights with none or
         with an older push's. The last checkpoint's are the same, so LeRobot then finds nothing to change.
@@ -203,7 +203,7 @@ def _require_finite_statistics_of(meta: "LeRobotDatasetMetadata | None") -> None
 
 
 def _tell_wrong_quantiles(meta: "LeRobotDatasetMetadata", modes: Collection[NormalizationMode]) -> None:
-    """Warn where a policy is normalised by quantiles that are not those of its frames, if these are here."""
+    """Warn if a policy is normalised by quantiles that its dataset's frames do not have."""
     if not {NormalizationMode.QUANTILES, NormalizationMode.QUANTILE10} & set(modes):
         return
     try:

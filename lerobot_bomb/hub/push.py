@@ -1,4 +1,4 @@
-"""A checkpoint that was trained earlier, with its card, to the Hub."""
+"""Push of an earlier checkpoint, with its card, to the Hub."""
 
 import json
 from collections.abc import Mapping
@@ -53,7 +53,7 @@ def _is_of_checkpoint(path: str) -> bool:
 def read_checkpoint(
     folder: Path, repo_id: str, dataset: DatasetFacts | None, results: list[list[Record]]
 ) -> "Checkpoint":
-    """Read and check a checkpoint, and return what its card is made of."""
+    """Read and check a checkpoint, and return the facts for its card."""
     from lerobot.utils.import_utils import register_third_party_plugins
 
     from lerobot_bomb.checkpoints.adapters import check_adapters_fit, check_base

@@ -1,4 +1,4 @@
-"""Files to a repository in one commit: before it there is nothing, after it everything."""
+"""Upload of files to a repository in one commit: all of them or none."""
 
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
@@ -33,7 +33,7 @@ def upload(
 ) -> CommitInfo:
     """Make the repository unless it exists; in one commit add all files and delete others like them.
 
-    ``replaces`` says which paths are like them: an older push's, which would be read beside these.
+    ``replaces`` tells which paths of an older push would be read as well.
     `HfApi.upload_folder` would make several commits where Xet is installed.
 
     Raises:
@@ -52,7 +52,7 @@ def upload(
 
 @contextmanager
 def hub_errors(repo_id: str) -> Iterator[None]:
-    """Say in one line what the Hub, or the way to it, has against this."""
+    """Turn errors of the Hub, or of the connection to it, into one line."""
     try:
         yield
     except OfflineModeIsEnabled:

@@ -53,7 +53,7 @@ class Libero:
 
     @classmethod
     def find(cls) -> "Libero | None":
-        """Find the LIBERO of this Python; None: not installed."""
+        """Find the LIBERO of this Python; None if not installed."""
         spec = importlib.util.find_spec("libero")
         for folder in (spec and spec.submodule_search_locations) or []:
             if (Path(folder) / "libero" / "__init__.py").is_file():
@@ -62,13 +62,13 @@ class Libero:
 
     @property
     def config_file(self) -> Path:
-        """Path of hf-libero's config: in the folder of an environment variable as it is, without ~."""
+        """Path of hf-libero's config, in the folder of an environment variable; ~ is not expanded."""
         folder = os.environ.get("LIBERO_CONFIG_PATH", os.path.expanduser("~/.libero"))
         return Path(folder) / CONFIG_FILE
 
     @property
     def assets(self) -> Path:
-        """Folder where hf-libero looks for meshes and textures, and which it downloads them to."""
+        """Folder in which hf-libero looks for meshes and textures, and to which it downloads them."""
         own = self.package / "assets"
         return own if own.exists() else Path(os.path.expanduser("~")) / ".cache" / "libero" / "assets"
 
@@ -174,7 +174,7 @@ class Libero:
 def prepare_libero(suites: Iterable[str] = SUITES) -> Libero:
     """Make sure that LIBERO can be imported and its suites built: without a question, without a download.
 
-    Writes the config file where there is none. To be called before `libero` is imported, in every process.
+    Write the config file if there is none. To be called before `libero` is imported, in every process.
 
     Raises:
         ValueError: LIBERO is not installed, or its config file or assets are missing, partly missing or of

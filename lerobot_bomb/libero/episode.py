@@ -1,4 +1,4 @@
-"""An episode of LIBERO: what determines it, and why it failed."""
+"""An episode of LIBERO: its spec, and its failure class."""
 
 from dataclasses import dataclass
 from enum import StrEnum
@@ -9,7 +9,7 @@ from lerobot_bomb.flags import one_of
 from lerobot_bomb.libero.assets import SUITES
 from lerobot_bomb.libero.perturbations import LiberoCondition
 
-# Of the axes and how a policy is measured; a line of results says it.
+# Of the axes and how a policy is measured; its records say it.
 LIBERO_PROTOCOL_VERSION = "libero-1.0"
 TASKS_PER_SUITE = {suite: 90 if suite == "libero_90" else 10 for suite in SUITES}
 MAX_ALLOWED_STEPS = 10_000

@@ -1,7 +1,7 @@
 """Orientation of images of LIBERO, one of four, beside what its environment shows.
 
-Nothing in a dataset or a checkpoint says it: LeRobot's environment turns the simulator's images by 180
-degrees, and a policy that was trained on others fails without an error.
+No dataset or checkpoint states it. LeRobot's environment turns the simulator's images by 180 degrees, and a
+policy that was trained on others fails without an error.
 """
 
 import numpy as np
@@ -17,7 +17,7 @@ ORIENTATIONS = {
 
 
 def orientation(images: np.ndarray, shown: np.ndarray) -> str:
-    """Return the one of `ORIENTATIONS` that images (N, H, W, 3) have beside those shown, (M, H, W, 3).
+    """Return the one of `ORIENTATIONS` of images (N, H, W, 3), relative to those shown, (M, H, W, 3).
 
     Both are of one camera and one task, of whatever moments: their means are compared. An environment shows
     the latter.

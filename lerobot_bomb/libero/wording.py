@@ -1,4 +1,4 @@
-"""A task's instruction of LIBERO in other words that ask for the same.
+"""Paraphrases of LIBERO's instructions.
 
 LIBERO's 130 instructions are one or two orders joined by "and": pick up and place, put, push, stack, open,
 close, turn on, turn off. Things and places keep their names; verbs and order change.
@@ -22,7 +22,7 @@ DONE = {"put": "put", "place": "put", "pick up": "put", "push": "pushed", "stack
 class Order:
     """One thing to be done: "put", "the bowl", "on the plate"; without a place: "open", "the microwave".
 
-    The place of what is picked up is where it is to be placed.
+    For an object that is picked up, the place is its target.
     """
 
     verb: str

@@ -1,7 +1,7 @@
 """Reading of board and tray off image tokens: an objective of training beside pointing.
 
-Instructions name places, and stones, by the stones around them. A policy that is told actions and places only
-learns late to see the stones, and until then no such place.
+Instructions name places, and stones, by the stones around them. A policy that is trained on actions and
+places alone learns late to see the stones, and until then no places that depend on them.
 
 Shapes: `B` batch, `P` image tokens of all cameras, `H` hidden size, `N` numbers of a token, `S` spots.
 """
@@ -22,8 +22,8 @@ LEAST_TOKEN_DIM = 4
 class BoardReader(nn.Module):
     """A small network on image tokens, as the language model gets them.
 
-    The more tokens there are, the fewer numbers each gives: it is about as small with any backbone, and no
-    token is averaged with others, which would blur where its stone lies.
+    The more tokens there are, the fewer numbers each gives, so its size hardly depends on the backbone.
+    Tokens are not averaged, which would blur where a stone lies.
     """
 
     def __init__(self, num_tokens: int, hidden_size: int):

@@ -118,7 +118,7 @@ class ChunkConfig(ConfigWithEnvironment):
         check_training(self)
 
     def validate_features(self) -> None:
-        """Raise unless the dataset (or environment) has what the policy reads and writes."""
+        """Raise unless the dataset or environment has all features that the policy reads and writes."""
         check_cameras_and_action(self)
 
     def methods_used(self) -> str:
@@ -149,7 +149,7 @@ class ChunkConfig(ConfigWithEnvironment):
 
 @dataclass
 class VlaConfig(ChunkConfig):
-    """Config of a policy with a vision-language model: which one, in which precision, what of it is trained.
+    """Config of a policy with a vision-language model: the model, its precision, its trained parts.
 
     Its chunks may be executed as an ensemble.
     """

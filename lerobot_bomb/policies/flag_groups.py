@@ -32,6 +32,6 @@ def flags_of(config_class: type, group: str) -> list[str]:
 
 
 def short_help[T: type](config_class: T) -> T:
-    """Keep what is filled in and what is for research out of a config's help; all flags stay."""
+    """Leave fields for research, and those that the code fills in, out of a config's help; all flags work."""
     leave_out_of_help(config_class, [name for group in SHARED for name in flags_of(config_class, group)])
     return config_class

@@ -141,7 +141,7 @@ def normalised_actions(actions_BD: Tensor, bounds_2D: Tensor) -> Tensor:
 
 
 def number_of(xy_B2: Tensor, places_P2: Tensor) -> Tensor:
-    """(B,) int64: the nearest place to each."""
+    """(B,) int64: the number of the place nearest to each."""
     return torch.cdist(xy_B2, places_P2).argmin(dim=1)
 
 
@@ -158,7 +158,7 @@ def require_labels(meta: LeRobotDatasetMetadata, *, reads_board: bool) -> None:
 
 
 def places_of(meta: LeRobotDatasetMetadata, known: list[list[float]] | None) -> list[list[float]]:
-    """(P, 2) metres: the places that a dataset points at, or those ``known``, if they are among them.
+    """(P, 2) metres: the places of a dataset's labels, or ``known`` ones if they include all of these.
 
     Raises:
         ValueError: it points at places that the checkpoint does not know.

@@ -12,7 +12,7 @@ from lerobot_bomb.training.policy_flags import check_not_negative
 
 @dataclass
 class PointingVlaConfig(VlaConfig):
-    """Config of a policy that says which stone goes where, and then acts on what it has said."""
+    """Config of a policy that predicts which stone goes where, and then acts on its prediction."""
 
     # as `ConfigWithEnvironment` has them
     LATER_FIELDS: ClassVar[dict[str, Any]] = {
@@ -40,7 +40,7 @@ class PointingVlaConfig(VlaConfig):
         return self.pointing and self.board_loss_weight > 0
 
     def require_labels(self, meta: LeRobotDatasetMetadata) -> None:
-        """Raise a ValueError unless a dataset has the columns that this pointing is trained on."""
+        """Raise a ValueError unless a dataset has the columns for training this pointing."""
         require_labels(meta, reads_board=self.reads_board)
 
     def methods(self) -> list[str]:
@@ -49,7 +49,7 @@ class PointingVlaConfig(VlaConfig):
 
 @dataclass
 class PlacesVlaConfig(PointingVlaConfig):
-    """Config of one that points at places of a table."""
+    """Config of a policy that points at places of a table."""
 
     LATER_FIELDS: ClassVar[dict[str, Any]] = {**PointingVlaConfig.LATER_FIELDS, "pointing_places": None}
 

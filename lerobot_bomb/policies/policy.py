@@ -106,7 +106,7 @@ class ChunkPolicy(HubPolicy, SavesTiedWeightsOnce, PreTrainedPolicy):
             check_weights_fit(config, cls.shapes)
 
     def _fit(self, meta: LeRobotDatasetMetadata) -> None:
-        """Take from a dataset what a checkpoint that is trained on needs to know of it."""
+        """Take the dataset's facts that a checkpoint keeps."""
         check_chunk_length(self.config.chunk_size, meta)
         self._take_units(meta)
 
@@ -126,7 +126,7 @@ class ChunkPolicy(HubPolicy, SavesTiedWeightsOnce, PreTrainedPolicy):
         self._batch_size: int | None = None  # of the episodes that are under way
 
     def drop_queued_actions(self) -> None:
-        """Let the next `select_action` predict; LeRobot 0.6.2 asks for it where the instruction changes."""
+        """Let the next `select_action` predict; LeRobot 0.6.2 calls this when the instruction changes."""
         self._queue.clear()
 
     def _check_batch_size(self, batch: dict[str, Tensor]) -> None:
@@ -261,7 +261,7 @@ class VlaPolicy(ChunkPolicy):
             yield
 
     def _make_ensemble(self) -> TemporalEnsemble | None:
-        """Return the temporal ensemble; None: a queue is used instead."""
+        """Return the temporal ensemble; None if a queue is used."""
         config = self.config
         if not config.temporal_ensemble_size:
             return None
@@ -384,7 +384,7 @@ class RelativeVlaPolicy(VlaPolicy):
         check_buffers_are_the_bases(self, self._base_buffers, saved, advice)
 
     def to_relative(self, actions_BTD: Tensor, batch: dict[str, Tensor]) -> Tensor:
-        """Normalised actions -> what is trained on and predicted, (B, T, D) both."""
+        """Normalised actions (B, T, D) -> the actions that are predicted, (B, T, D)."""
         if self.relative is None:
             return actions_BTD
         return self.relative.encode(actions_BTD, self._state(batch))
@@ -397,12 +397,12 @@ class RelativeVlaPolicy(VlaPolicy):
 
     @property
     def _unit(self) -> Tensor:
-        """(D,) physical size of 1 in what is predicted."""
+        """(D,) physical size of 1 in predicted actions."""
         return self.action_unit if self.relative is None else self.action_unit * self.relative.scale
 
 
 class TokenVlaPolicy(VlaPolicy):
-    """One whose actions are tokens, which it need not write beyond those that are executed."""
+    """Policy whose actions are tokens; it writes only those that are executed."""
 
     config_class = TokenVlaConfig  # pyright: ignore[reportAssignmentType]
     name = "token_vla"  # pyright: ignore[reportAssignmentType]
@@ -430,7 +430,7 @@ class TokenVlaPolicy(VlaPolicy):
         return super().predict_action_chunk(batch)
 
     def _choice_noise(self, batch_size: int, shape: tuple[int, ...]) -> Tensor | None:
-        """(B, *shape) to be added to logits, so that the likeliest choice is a sample; None: it is greedy."""
+        """(B, *shape) to add to logits, so that the likeliest choice is a sample; None: greedy."""
         if not self.config.temperature:
             return None
         noise = self._sampling_noise.draw(batch_size, shape)

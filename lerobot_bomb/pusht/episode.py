@@ -1,4 +1,4 @@
-"""An episode of PushT: what determines it, and why it failed."""
+"""An episode of PushT: its spec, and its failure class."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -13,7 +13,7 @@ from lerobot_bomb.conditions import NONE, PerturbedSpec, nuisances_of
 from lerobot_bomb.flags import one_of
 from lerobot_bomb.pusht.perturbations import PUSHT_AXES, PushTCondition
 
-# Of the task, its axes and how a policy is measured; a line of results says it.
+# Of the task, its axes and how a policy is measured; its records say it.
 PUSHT_PROTOCOL_VERSION = "pusht-1.0"
 PUSHT_EXTRA = "lerobot_policy_bomb[pusht]"  # what pip installs gym-pusht with
 INSTRUCTIONS = ("templates", NONE)

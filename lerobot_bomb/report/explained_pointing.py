@@ -1,4 +1,4 @@
-"""Tables and pictures of what a policy points at, for the page of an explanation."""
+"""Tables and pictures of a policy's pointing, for the page of an explanation."""
 
 from collections.abc import Iterator, Sequence
 from html import escape
@@ -23,7 +23,7 @@ NOTE = (
 
 
 def pointing_tables(check: PointingCheck) -> Iterator[Table]:
-    """Stone, place and next action beside what is meant; the likeliest places of a table."""
+    """Return tables of predicted and true stone, place and next action; and of the likeliest places."""
     pointed, meant = check.pointed, check.meant
     stones_mm = 1e3 * pointed.stone_xy, 1e3 * meant.stone_xy
     rows = [
@@ -47,7 +47,7 @@ def pointing_tables(check: PointingCheck) -> Iterator[Table]:
 
 
 def pointing_figure(moment: ExplainedMoment) -> str:
-    """HTML of the camera's image with marks; empty where there is neither."""
+    """Return HTML of the camera's image with marks; empty without image or marks."""
     image = next((each for key, each in moment.images.items() if camera_name(key) == CAMERA), None)
     if moment.pointing is None or image is None:
         return ""
@@ -62,7 +62,7 @@ def pointing_figure(moment: ExplainedMoment) -> str:
 
 
 def mean_pointing(moments: Sequence[ExplainedMoment]) -> Iterator[Table]:
-    """Tell how often it points at what is meant, how far off, and how often the next action goes there."""
+    """Return how often pointing is right, its error, and how often the next action goes there."""
     checks = [each.pointing for each in moments if each.pointing is not None]
     if not checks:
         return

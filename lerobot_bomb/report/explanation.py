@@ -39,7 +39,7 @@ TRACE_RANGE_M = 0.24  # either way from the board's centre
 
 
 def overview_section(outcome: str, moments: Sequence[ExplainedMoment], command: str) -> Section:
-    """Write the section of what the policy was told, how the episode ended, and what each moment showed."""
+    """Write the section of instruction, outcome, and findings of each moment."""
     found = [
         Table(each.title, QUESTIONS, [[Cell(of.question), Cell(of.answer)] for of in each.findings])
         for each in moments
@@ -98,7 +98,7 @@ def moment_sections(moment: ExplainedMoment) -> list[Section]:
 def aggregate_sections(
     results: Sequence[Any], by_phase: Mapping[str, Sequence[ExplainedMoment]], command: str
 ) -> list[Section]:
-    """Write the sections of many episodes: what matters in which phase."""
+    """Write the sections of many episodes, by phase."""
     num_successes = sum(result.is_success for result in results)
     failures = Counter(result.failure for result in results if not result.is_success)
     reached = [[Cell(phase or MIDDLE), Cell(str(len(each)), len(each))] for phase, each in by_phase.items()]
@@ -131,7 +131,7 @@ def _mean_tables(moments: Sequence[ExplainedMoment]) -> Iterator[Table]:
 
 
 def probes_section(probes: Sequence[LayerProbe]) -> Section:
-    """Write the section of what can be read off the layers' states."""
+    """Write the section of probes of the layers' states."""
     rows = [
         [
             Cell(each.what),
@@ -223,7 +223,7 @@ def _ratio(value: float) -> Cell:
 
 
 def traces_section(episodes: Mapping[str, MaskedEpisode]) -> Section:
-    """Write the section of whole episodes under masks; the first is the one without."""
+    """Write the section of whole episodes under masks; the first has no mask."""
     rows = []
     for name, episode in episodes.items():
         result = episode.result
@@ -253,7 +253,7 @@ def traces_svg(episodes: Mapping[str, MaskedEpisode]) -> str:
     last = BOARD.num_lines - 1
     for i in range(BOARD.num_lines):
         for start, end in (((i, 0), (i, last)), ((0, i), (last, i))):
-            ends = " ".join(point(BOARD.intersection_xy(*cell)) for cell in (start, end))
+            ends = " ".join(point(BOARD.intersection_xy(*intersection)) for intersection in (start, end))
             lines.append(f'<polyline points="{ends}" stroke="#8886" fill="none"/>')
     legend = []
     for i, (name, episode) in enumerate(episodes.items()):

@@ -1,4 +1,4 @@
-"""A report: groups of episodes, and failures of them that are shown."""
+"""A report: groups of episodes, and a sample of their failures."""
 
 import shlex
 from collections.abc import Iterator, Mapping
@@ -46,7 +46,7 @@ class Report:
 def sample_failures(
     groups: list[Group], files: Mapping[Path, Mapping[int, Record]], num_of_class: int
 ) -> Iterator[Sample]:
-    """Sample at most so many episodes of each group and class of failure; the same files give the same ones.
+    """Sample episodes of each group and class of failure; the same files give the same ones.
 
     `files`: by path and line, those that the groups' records are from.
     """

@@ -1,6 +1,6 @@
-"""Verdicts over records: what can be wrong with a success rate, question by question.
+"""Verdicts over records: ways in which a success rate can be wrong, question by question.
 
-Runs are lists of records of the same episodes, but for those of the splits.
+Groups are lists of records of the same episodes, but for those of the splits.
 """
 
 from collections.abc import Mapping, Sequence
@@ -24,18 +24,18 @@ P_NOTE = "p: exact McNemar test, or Fisher's where it says so; not adjusted for 
 
 @dataclass(frozen=True)
 class Verdict:
-    """A question, its answer, and what it rests on."""
+    """A question, its answer, and its evidence."""
 
     question: str
     answer: str  # YES, NO, or OPEN: these episodes do not show it
     evidence: str
 
 
-def table(runs: Mapping[str, list[Record]], verdicts: list[Verdict]) -> list[Table]:
-    """The rates of all runs; the verdicts."""
+def table(groups: Mapping[str, list[Record]], verdicts: list[Verdict]) -> list[Table]:
+    """Return the verdicts, and the rates of all groups."""
     rates = [
         [Cell(name), rate(records), Cell(str(len(records)), len(records))]
-        for name, records in runs.items()
+        for name, records in groups.items()
         if records
     ]
     answers = [[Cell(each.question), Cell(each.answer), Cell(each.evidence)] for each in verdicts]
@@ -45,19 +45,19 @@ def table(runs: Mapping[str, list[Record]], verdicts: list[Verdict]) -> list[Tab
     ]
 
 
-def judge(runs: Mapping[str, list[Record]], trained_seeds: Sequence[int] | None) -> list[Verdict]:
-    """Judge every question that the runs have an answer to."""
-    policy = runs[POLICY]
-    found = [_same_again(pairs_of(policy, runs[AGAIN])), _same_alone(pairs_of(policy, runs[ALONE]))]
+def judge(groups: Mapping[str, list[Record]], trained_seeds: Sequence[int] | None) -> list[Verdict]:
+    """Judge every question that the groups have an answer to."""
+    policy = groups[POLICY]
+    found = [_same_again(pairs_of(policy, groups[AGAIN])), _same_alone(pairs_of(policy, groups[ALONE]))]
     for name, question in ((BLANK, "looks at the images"), (OTHER_INSTRUCTION, "reads the instruction")):
-        if runs.get(name):
-            found.append(_depends(question, name, pairs_of(policy, runs[name])))
-    if runs.get(RANDOM):
-        found.append(_better_than_random(pairs_of(runs[RANDOM], policy)))
-    if runs.get(EXPERT):
-        found.append(_can_be_solved(runs[EXPERT]))
-    if runs.get(HELDOUT):
-        found.append(_generalises(runs[TRAIN], runs[HELDOUT]))
+        if groups.get(name):
+            found.append(_depends(question, name, pairs_of(policy, groups[name])))
+    if groups.get(RANDOM):
+        found.append(_better_than_random(pairs_of(groups[RANDOM], policy)))
+    if groups.get(EXPERT):
+        found.append(_can_be_solved(groups[EXPERT]))
+    if groups.get(HELDOUT):
+        found.append(_generalises(groups[TRAIN], groups[HELDOUT]))
     return [*found, _new_seeds(policy, trained_seeds)]
 
 

@@ -40,8 +40,8 @@ def _with_video(sample: Sample, folder: Path) -> Sample:
 
 
 def _write_video(record: Record, path: Path) -> list[str]:
-    """Write the video of a record's episode; return the names of what the record says otherwise."""
+    """Write the video of a record's episode; return the names of fields that differ from the record."""
     recording = path.with_suffix(".rrd")
-    (result,) = write_episodes({"": Replay(record).player()}, path.stem, recording, path)
+    (result,) = write_episodes({"": Replay(record).viewed_run()}, path.stem, recording, path)
     recording.unlink()
     return different_fields(record, result)

@@ -1,1 +1,1 @@
-"""Results of episodes: typed records, read and written; which of them compare, and what they say together."""
+"""Results of episodes: typed records, read, written, grouped and summarised."""

@@ -1,4 +1,4 @@
-"""Record of an episode of `bomb`: what it must say, and what records say together."""
+"""Record of an episode of `bomb`: its fields, its checks, and its measures."""
 
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
@@ -60,7 +60,7 @@ def are_placed(records: Iterable[Record]) -> bool:
 
 
 def median_error_mm(records: "Iterable[EpisodeResult]") -> float | None:
-    """Return the median error of the stones that were put down on the board; None: there are none."""
+    """Return the median error of the stones that were put down on the board; None if there are none."""
     errors = [each.placement_error_mm for each in put_down(records)]
     return median(errors) if errors else None
 

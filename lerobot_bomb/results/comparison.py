@@ -18,7 +18,7 @@ class Comparisons:
 
     policies: tuple[str, str]
     conditions: list[PairedComparison]
-    num_unpaired: tuple[int, int]  # episodes that the other policy did not play
+    num_unpaired: tuple[int, int]  # episodes that the other policy did not run
 
     @property
     def lowest(self) -> float:
@@ -136,7 +136,7 @@ def _values_of(groups: list[Group]) -> Values:
 
 
 def _apart(first: Values, second: Values) -> list[str]:
-    """Names of the settings of which the two have no value in common.
+    """Names of the settings in which the two have no value in common.
 
     What was not recorded keeps no episodes apart: an expert is shown no image, so OpenGL drew none.
     """

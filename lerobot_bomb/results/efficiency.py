@@ -1,4 +1,4 @@
-"""Latency and smoothness of a policy, from records of results that hold them."""
+"""Latency and smoothness of a policy, from records that hold them."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -40,7 +40,7 @@ def efficiencies(records: Sequence[Record]) -> list[Efficiency]:
 
 
 def smoothness_of(records: Sequence[Record]) -> dict[str, Measure]:
-    """{"J2": ..., "J3": ...}: every difference of every episode counts the same; {} where none says it."""
+    """{"J2": ..., "J3": ...}, with equal weight for each difference of each episode; {} without any."""
     told = [each for each in records if each.action_j2 is not None and each.action_j3 is not None]
     return {f"J{order}": _mean_difference(told, order) for order in (2, 3)} if told else {}
 

@@ -1,4 +1,4 @@
-"""Episodes that compare: which records may be pooled and paired, and what they are of."""
+"""Groups of records that may be pooled and paired."""
 
 from collections import Counter
 from collections.abc import Callable, Iterable, Sequence
@@ -52,7 +52,7 @@ class Group:
         return self.record_type.versions[self.records[0].protocol_version]
 
     def lines(self) -> list[str]:
-        """Describe what was evaluated, a line each: who and what, on which machine, with what."""
+        """Describe the evaluation in lines: policy, task, machine, versions."""
         first = self.records[0]
         asked = [f"{name}={value}" for name, value in _fixed(first).items()]
         conditions = {each.spec.perturbations for each in self.records}
@@ -78,7 +78,7 @@ class Policy:
 
     @property
     def name(self) -> str:
-        """Name of its group, where it has only one: it says the suite, too."""
+        """Name of the group if there is only one; it includes the suite."""
         return self.groups[0].name if len(self.groups) == 1 else self.short_name
 
     @property
@@ -166,7 +166,7 @@ def by_condition[R: Record](records: Iterable[R]) -> dict[AxisCondition, list[R]
 def rate_of[R: Record](
     records: list[R], is_counted: Callable[[R], bool] = lambda record: record.is_success
 ) -> Rate:
-    """Rate of success of at least one record, or of something else; those of one start are one cluster."""
+    """Rate of successes, or of another property, of at least one record; one start is one cluster."""
     return Rate.of(list(map(is_counted, records)), [each.start_key for each in records])
 
 

@@ -25,7 +25,7 @@ class Query:
 
 @dataclass(frozen=True)
 class Inference:
-    """The queries of an episode, and what they were run on."""
+    """Queries of an episode, and the device that ran them."""
 
     num_queries: Count  # queries of the episode: calls that ran the network
     total_s: Positive  # seconds of all queries

@@ -1,4 +1,4 @@
-"""Instructions of episodes of `bomb`: what they ask for, and others that ask for something else."""
+"""Instructions of episodes of `bomb`: their targets, and other instructions to exchange them for."""
 
 from collections.abc import Sequence
 from typing import Any
@@ -7,14 +7,14 @@ from lerobot_bomb.results.bomb import EpisodeResult
 
 
 def named_targets(records: Sequence[EpisodeResult]) -> dict[str, Any]:
-    """{instruction: what it asks for}: in `place` its intersection; elsewhere that depends on the board."""
+    """{instruction: its target}: in `place` the intersection; elsewhere it depends on the board."""
     return {
         each.instruction: each.target if each.spec.suite == "place" else each.instruction for each in records
     }
 
 
 def other_instructions(records: Sequence[EpisodeResult]) -> dict[str, str]:
-    """{instruction: another, which asks for something else where there is one}; {} where all ask the same."""
+    """{instruction: another with another target}; {} if all have the same target."""
     targets = named_targets(records)
     first, *others = targets.values()
     if all(other == first for other in others):

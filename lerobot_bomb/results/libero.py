@@ -1,4 +1,4 @@
-"""Record of an episode of `bomb_libero`: what it must say, and what records say together."""
+"""Record of an episode of `bomb_libero`: its fields, its checks, and its measures."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field

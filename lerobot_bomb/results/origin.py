@@ -25,7 +25,7 @@ def json_list(*values: Any) -> str:
 
 @cache
 def installed_version(distribution: str) -> str | None:
-    """Return the version of a Python package; None where it has no metadata."""
+    """Return the version of a Python package; None if it has no metadata."""
     try:
         return version(distribution)
     except PackageNotFoundError:
@@ -33,7 +33,7 @@ def installed_version(distribution: str) -> str | None:
 
 
 def installed_versions(distributions: Iterable[str]) -> dict[str, str | None]:
-    """{distribution: version}; None where one has no metadata."""
+    """{distribution: version}; None if one has no metadata."""
     return {name: installed_version(name) for name in distributions}
 
 
@@ -41,7 +41,7 @@ def installed_versions(distributions: Iterable[str]) -> dict[str, str | None]:
 def machine_name() -> str:
     """Processor and C library of this machine: "x86_64, AMD EPYC, glibc 2.36".
 
-    Sine and cosine are the library's, in the variant for the processor; their last bits are in every state.
+    The library has variants of sine and cosine for each processor; their last bits are in every state.
     """
     cpus = Path("/proc/cpuinfo")  # of Linux
     lines = cpus.read_text().splitlines() if cpus.is_file() else []
@@ -94,5 +94,5 @@ class Evaluation:
 
 
 def describe_versions(versions: Mapping[str, str | None]) -> str:
-    """'gym-pusht 0.1.8, pymunk 6.11.1': what the bits of an episode depend on."""
+    """'gym-pusht 0.1.8, pymunk 6.11.1': the packages that an episode's bits depend on."""
     return ", ".join(f"{name} {version or '?'}" for name, version in versions.items())

@@ -34,7 +34,7 @@ class PairedComparison:
 
     @property
     def num_needed(self) -> int | None:
-        """Number of pairs in which the same test finds such a difference; None: it did, or never does."""
+        """Number of pairs for the test to find such a difference; None if it did, or never does."""
         if self.p_value < SIGNIFICANT:
             return None
         return episodes_to_tell_apart(self.counts, SIGNIFICANT / self.num_conditions)
@@ -45,12 +45,12 @@ class PairedComparison:
         return len({first.start_key for first, _ in self.pairs})
 
     def describe_change(self) -> str:
-        """Describe what the second records have beside other successes; '' where there is nothing to say."""
+        """Describe how the second records differ, apart from successes; '' if they do not."""
         return type(self.pairs[0][0]).describe_change(self.pairs)
 
 
 def pair_with_nominal(records: Sequence[Record]) -> dict[str, list[Pair]]:
-    """{condition: (unperturbed, perturbed) records of an episode} of a group, where there are both."""
+    """{condition: pairs of the unperturbed and the perturbed record} of a group, for episodes with both."""
     nominal = {_episode(each): each for each in records if each.spec.perturbations == NONE}
     pairs: dict[str, list[Pair]] = {}
     for record in records:
@@ -87,7 +87,7 @@ def compare_pairs(pairs: Mapping[str, list[Pair]]) -> list[PairedComparison]:
 
 
 def describe_test(num_conditions: int) -> str:
-    """'exact McNemar test, adjusted for 11 conditions (Holm)': what a p-value is of."""
+    """'exact McNemar test, adjusted for 11 conditions (Holm)': the test of a p-value."""
     if num_conditions == 1:
         return "exact McNemar test of one condition, not adjusted"
     return f"exact McNemar test, adjusted for {num_conditions} conditions (Holm)"

@@ -1,4 +1,4 @@
-"""Record of an episode of `bomb_pusht`: what it must say, and what records say together."""
+"""Record of an episode of `bomb_pusht`: its fields, its checks, and its measures."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field

@@ -25,7 +25,7 @@ def record_type_of(version: str) -> type[Record] | None:
 
 @cache
 def _schema(record_type: type[Record], version: str) -> Schema[Record]:
-    """Schema of the records of a protocol version; what only other versions lack must be there."""
+    """Schema of the records of a protocol version; fields that only other versions lack are required."""
     of_others = {name for names in record_type.versions.values() for name in names}
     must_have = of_others - set(record_type.versions[version])
     lacking = {name: value for name, value in record_type.earlier.items() if name not in must_have}
@@ -33,7 +33,7 @@ def _schema(record_type: type[Record], version: str) -> Schema[Record]:
 
 
 def read_records(path: Path) -> tuple[dict[int, Record], list[str]]:
-    """Return {line number, from 1: record} of a results file, and what is wrong with its other lines.
+    """Return {line number, from 1: record} of a results file, and the damage of its other lines.
 
     Raises:
         ValueError: there is no such file.
@@ -59,7 +59,7 @@ def read_records(path: Path) -> tuple[dict[int, Record], list[str]]:
 
 
 def check_any(path: Path, records: Collection[object], damages: list[str]) -> None:
-    """Raise a ValueError unless a file has records; damages: what is wrong with its other lines."""
+    """Raise a ValueError unless a file has records; `damages` are those of its other lines."""
     if not records and damages:
         raise ValueError(f"{path} is no results file; name one that --env.results_path of lerobot-eval wrote")
     if not records:

@@ -1,4 +1,4 @@
-"""Record of an episode in a results file: what those of all environments have.
+"""Record of an episode in a results file: the fields of all environments.
 
 Simulator workers import this module, so it imports neither torch nor LeRobot.
 """
@@ -116,7 +116,7 @@ class Record:
         return json.dumps(self.as_json(), allow_nan=False)
 
     def check(self) -> None:
-        """Raise a ValueError unless there can be such an episode, whose fields are possible one by one."""
+        """Raise a ValueError if the fields, each possible by itself, contradict each other."""
         policy, inference = self.policy, self.inference
         if policy is not None and policy.batch_row is not None and policy.batch_size is not None:
             self.refuse_if(policy.batch_row >= policy.batch_size, "policy.batch_row", "policy.batch_size")
@@ -151,7 +151,7 @@ class Record:
                 )
 
     def describe_policy(self) -> str:
-        """Describe who acted, as far as the record says it."""
+        """Describe which policy acted, as far as the record says."""
         return NOT_RECORDED if self.policy is None else self.policy.describe()
 
     @property
@@ -160,12 +160,12 @@ class Record:
         return tuple([getattr(self.spec, name) for name in self.start])
 
     def settings(self) -> dict[str, str]:
-        """Return what must be equal in episodes that are pooled, beside spec, policy, protocol and images."""
+        """Return what pooled episodes must agree in, beside spec, policy, protocol and images."""
         raise NotImplementedError
 
     @classmethod
     def describe_simulator(cls, settings: Mapping[str, str]) -> str:
-        """Describe, of these settings, what simulated and drew."""
+        """Describe simulator and renderer among these settings."""
         return settings["simulator"]
 
     @classmethod
@@ -174,7 +174,7 @@ class Record:
         raise NotImplementedError
 
     def environment(self) -> Environment | None:
-        """Return the environment of BOMB that it was; None: checkpoints of our types know of no such one."""
+        """Return the record's environment of BOMB; None for other environments."""
         return None
 
     def benchmark(self) -> str:
@@ -188,7 +188,7 @@ class Record:
 
     @classmethod
     def describe_change(cls, pairs: Sequence[tuple[Self, Self]]) -> str:
-        """Describe what the second records of pairs have beside other successes; '': nothing."""
+        """Describe how the second records of pairs differ, apart from successes; '' if they do not."""
         return ""
 
 
@@ -201,12 +201,12 @@ def field_names(record_type: type[Record]) -> tuple[str, ...]:
 
 
 def without_measured[R: Record](record: R) -> R:
-    """Return a record without what is another when its episode is run again."""
+    """Return a record without the fields that change when its episode is run again."""
     return replace(record, **dict.fromkeys(MEASURED))
 
 
 def outcome_fields(record: Record) -> list[str]:
-    """Names of what was asked and its outcome: not which policy acted, where, and how long that took.
+    """Names of the fields of spec and outcome: not of policy, machine and latency.
 
     Without what the record, of an earlier release, does not say.
     """

@@ -1,4 +1,4 @@
-"""Reading of JSON objects as dataclasses: what each field must be follows from its type."""
+"""Reading of JSON objects as dataclasses; the type of each field says how it is checked."""
 
 import dataclasses
 import json

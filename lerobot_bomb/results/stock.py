@@ -1,4 +1,4 @@
-"""Records of episodes of LeRobot's own env types, of which lerobot-eval itself tells little."""
+"""Records of episodes of LeRobot's own env types, from the few facts that lerobot-eval writes."""
 
 import json
 from collections.abc import Sequence
@@ -95,7 +95,7 @@ def _flag_value(value: Any) -> str:
 
 @cache
 def stock_result(env_type: str, **facts: Any) -> type[StockResult]:
-    """Return the type of the records of an env type; `facts`: what is known of it, of the class variables."""
+    """Return the type of the records of an env type; `facts` are its class variables."""
     version = f"lerobot-{env_type}-1.0"
     packages = (f"gym-{env_type}", env_type, "gymnasium", "mujoco")
     known = {"env_type": env_type, "versions": {version: ()}}

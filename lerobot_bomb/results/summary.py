@@ -1,4 +1,4 @@
-"""Summary of episodes of one environment, and what perturbations changed."""
+"""Summary of episodes of one environment, and of the changes under perturbations."""
 
 from collections import Counter
 from collections.abc import Sequence

@@ -1,1 +1,1 @@
-"""Serving: what LeRobot's policy server may receive."""
+"""Serving: checks of the messages to LeRobot's policy server."""

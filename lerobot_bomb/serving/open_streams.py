@@ -22,7 +22,7 @@ class OpenStreams(grpc.ServerInterceptor):
         self._lock = threading.Lock()
 
     def intercept_service(self, continuation: Callable, handler_call_details: Any) -> Any:
-        """Replace the method by one that is called at once; gRPC has a worker wait for a single message."""
+        """Replace the method by one that is called at once; gRPC would let a worker wait for the message."""
         handler = continuation(handler_call_details)
         if handler is None:
             return None

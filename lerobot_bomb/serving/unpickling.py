@@ -1,4 +1,4 @@
-"""Unpickling of what LeRobot's client sends to its policy server, without running what a pickle names.
+"""Unpickling of the messages of LeRobot's client, without running the code that a pickle names.
 
 A pickle may name any function and have it called, with any arguments; here it may name the two messages, and
 arrays, scalars and tensors of plain numbers, which are made here of bytes that are there. Whatever it does to

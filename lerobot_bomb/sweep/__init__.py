@@ -1,1 +1,1 @@
-"""Many evaluations as one job that can be killed, split and gone on with."""
+"""Sweep of many evaluations, which can be killed, split and resumed."""

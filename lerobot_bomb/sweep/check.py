@@ -1,17 +1,17 @@
-"""Check of a sweep before it begins: what would be refused in the middle of it."""
+"""Check of a sweep before it begins, for errors that would come in the middle."""
 
 import logging
 from collections.abc import Sequence
 
 from lerobot_bomb.checkpoints.acting import acting
 from lerobot_bomb.compat.own.evaluation import eval_config
-from lerobot_bomb.sweep.manifest import Cell, Manifest
+from lerobot_bomb.sweep.manifest import Job, Manifest
 
 
-def check(manifest: Manifest, begun: Sequence[Cell] = ()) -> None:
-    """Check that LeRobot reads every cell's flags, and that no policy was trained for another environment.
+def check(manifest: Manifest, begun: Sequence[Job] = ()) -> None:
+    """Check that LeRobot reads every job's flags, and that no policy was trained for another environment.
 
-    Whoever has begun a cell has checked those that differ from it in their conditions only.
+    Whoever has begun a job has checked those that differ from it in their conditions only.
 
     Raises:
         SystemExit: flags are wrong; LeRobot's parser has said which.
@@ -20,14 +20,14 @@ def check(manifest: Manifest, begun: Sequence[Cell] = ()) -> None:
     """
     logging.disable(logging.WARNING)  # the workers' log has them
     try:
-        cells = {_without_condition(cell): cell for cell in manifest.cells}
-        for flags in cells.keys() - set(map(_without_condition, begun)):
-            cell = cells[flags]
+        jobs = {_without_condition(job): job for job in manifest.jobs}
+        for flags in jobs.keys() - set(map(_without_condition, begun)):
+            job = jobs[flags]
             try:
-                config = eval_config(cell.flags)
+                config = eval_config(job.flags)
             except FileNotFoundError as error:
                 raise ValueError(
-                    f"{cell.policy[0]}: {error}; give the folder that lerobot-train names pretrained_model"
+                    f"{job.policy[0]}: {error}; give the folder that lerobot-train names pretrained_model"
                 ) from None
             with acting(config.policy):
                 config.env.get_env_processors()
@@ -35,6 +35,6 @@ def check(manifest: Manifest, begun: Sequence[Cell] = ()) -> None:
         logging.disable(logging.NOTSET)
 
 
-def _without_condition(cell: Cell) -> tuple[str, ...]:
-    """Return the cell's flags without perturbations: those are checked in the plan and bind no policy."""
-    return (*cell.policy, *(flag for flag in cell.env if not flag.startswith("--env.perturbations=")))
+def _without_condition(job: Job) -> tuple[str, ...]:
+    """Return the job's flags without perturbations: those are checked in the plan and bind no policy."""
+    return (*job.policy, *(flag for flag in job.env if not flag.startswith("--env.perturbations=")))

@@ -1,4 +1,4 @@
-"""Claim on a sweep's folder, which belongs to one manifest at a time; that may grow."""
+"""Claim on a sweep's folder, which belongs to one manifest at a time. The manifest may grow."""
 
 import sys
 from collections.abc import Iterator
@@ -8,26 +8,26 @@ from pathlib import Path
 from typing import IO
 
 from lerobot_bomb.environments import env_type
-from lerobot_bomb.sweep.manifest import NAME, Cell, Manifest, largest_divisor
+from lerobot_bomb.sweep.manifest import NAME, Job, Manifest, largest_divisor
 from lerobot_bomb.sweep.store import Store
 
-LOCK = "sweep.lock"  # held by every command that plays the manifest; alone by one that writes it
+LOCK = "sweep.lock"  # held by every command that runs the manifest; alone by one that writes it
 
 
 @contextmanager
 def claimed(folder: Path, wanted: Manifest, batch_size: int | None = None) -> Iterator[Store]:
-    """Hold a folder for a manifest, or for the one there with what the wanted one has more.
+    """Hold a folder for a manifest, or for the one that is there, extended by the wanted one.
 
     Other commands may run the same manifest at the same time; stderr says so.
 
     Args:
         folder: made where it is missing.
         wanted: what is to be run.
-        batch_size: of a cell, at most; where it is given, cells that are there count as the first episodes of
+        batch_size: of a job, at most; where it is given, jobs that are there count as the first episodes of
             longer ones.
 
     Raises:
-        ValueError: episodes of other cells are there, or another command runs other cells there.
+        ValueError: episodes of other jobs are there, or another command runs other jobs there.
     """
     folder.mkdir(parents=True, exist_ok=True)
     with (folder / LOCK).open("a") as lock:
@@ -40,11 +40,11 @@ def claimed(folder: Path, wanted: Manifest, batch_size: int | None = None) -> It
         flock(lock, LOCK_SH)
         if Manifest.read(folder) != manifest:
             raise ValueError(
-                f"another command is playing other cells in {folder} now; wait for its end, or name another "
+                f"another command is running other jobs in {folder} now; wait for its end, or name another "
                 "folder"
             )
         if not is_alone:
-            print(f"another command plays cells of {folder} now; both share them", file=sys.stderr)
+            print(f"another command runs jobs of {folder} now; both share them", file=sys.stderr)
         yield Store(folder, manifest)
 
 
@@ -57,46 +57,46 @@ def _is_alone(lock: IO[str]) -> bool:
 
 
 def _grown(folder: Path, there: Manifest | None, wanted: Manifest, batch_size: int | None) -> Manifest:
-    """The manifest of a folder from now on: the wanted one, in which cells that are there stay as they are.
+    """Return the folder's manifest from now on: the wanted one, with the jobs that are there unchanged.
 
     Raises:
-        ValueError: cells are there that it does not have, and episodes of that manifest have been run.
+        ValueError: jobs are there that it does not have, and episodes of that manifest have been run.
     """
     if there is None or there == wanted or Store(folder, there).is_untouched():
         return wanted
-    cells = wanted.cells
+    jobs = wanted.jobs
     if batch_size is not None:
-        cells = tuple(part for cell in cells for part in _with_rest(cell, there, batch_size))
-    others = [cell for cell in there.cells if cell not in cells]
+        jobs = tuple(part for job in jobs for part in _with_rest(job, there, batch_size))
+    others = [job for job in there.jobs if job not in jobs]
     if others:
         raise ValueError(
-            f"{folder / NAME} is of another sweep: of its cells these flags lack {len(others)}, as "
+            f"{folder / NAME} is of another sweep: of its jobs these flags lack {len(others)}, as "
             f"{others[0].command}. Name another folder; or give its flags, with more policies, tasks, "
-            f"perturbations or episodes if you like; or go on with it by `lerobot-bomb sweep {folder}`"
+            f"perturbations or episodes if you like; or resume it by `lerobot-bomb sweep {folder}`"
         )
-    return Manifest(cells)
+    return Manifest(jobs)
 
 
-def _with_rest(cell: Cell, there: Manifest, batch_size: int) -> list[Cell]:
-    """Split a cell into the cells that are there from its seed on, and one of the seeds that they lack.
+def _with_rest(job: Job, there: Manifest, batch_size: int) -> list[Job]:
+    """Split a job into those that are there from its seed on, and one with the missing seeds.
 
     Raises:
-        ValueError: such a cell would start its episodes otherwise.
+        ValueError: such a job would start its episodes otherwise.
     """
-    of_same = {each.seed: each for each in there.cells if (each.policy, each.env) == (cell.policy, cell.env)}
-    parts: list[Cell] = []
-    seed, end = cell.seeds.start, cell.seeds.stop
+    of_same = {each.seed: each for each in there.jobs if (each.policy, each.env) == (job.policy, job.env)}
+    parts: list[Job] = []
+    seed, end = job.seeds.start, job.seeds.stop
     while seed in of_same:
         parts.append(of_same[seed])
         seed = parts[-1].seeds.stop
     are_alike = all(part.batch_size == largest_divisor(part.num_episodes, batch_size) for part in parts)
     if seed > end or not parts or not are_alike:
-        return [cell]
+        return [job]
     if seed == end:
         return parts
-    if env_type(cell.env_type).record.starts_by_number:
+    if env_type(job.env_type).record.starts_by_number:
         raise ValueError(
-            f"--episodes={cell.num_episodes}: cells of --env.type={cell.env_type} do not grow, because an "
-            "episode starts as its number in the cell says; play more in another folder"
+            f"--episodes={job.num_episodes}: jobs of --env.type={job.env_type} do not grow, because an "
+            "episode starts as its number in the job says; run more in another folder"
         )
-    return [*parts, Cell(cell.policy, cell.env, seed, end - seed, largest_divisor(end - seed, batch_size))]
+    return [*parts, Job(job.policy, job.env, seed, end - seed, largest_divisor(end - seed, batch_size))]

@@ -21,7 +21,7 @@ cd {cwd} && exec {command} --shard="$SLURM_ARRAY_TASK_ID/{num_jobs}"
 
 
 def sbatch_script(command: Sequence[str], num_jobs: int, cwd: Path) -> str:
-    """A job array each of whose jobs runs the command with its `--shard`."""
+    """Return the script of a job array; each job runs the command with its `--shard`."""
     return _ARRAY.format(
         last=num_jobs - 1, cwd=shlex.quote(str(cwd)), command=shlex.join(command), num_jobs=num_jobs
     )

@@ -1,4 +1,4 @@
-"""Cells that worker processes run on this machine."""
+"""Jobs that worker processes run on this machine."""
 
 import os
 import signal
@@ -10,7 +10,7 @@ from typing import IO
 
 from tqdm import tqdm
 
-from lerobot_bomb.sweep.manifest import Cell
+from lerobot_bomb.sweep.manifest import Job
 from lerobot_bomb.sweep.processes import num_cores, visible_gpus, worker_environments
 from lerobot_bomb.sweep.store import POLL_S, REFUSED, Store
 
@@ -19,37 +19,37 @@ PYTHON = (sys.executable, "-P", "-m")
 MAX_ENDED = 3
 
 
-def progress(store: Store, cells: Sequence[Cell]) -> Iterator[bool]:
-    """Show how far the cells are until all are over, and yield whether they are further than before.
+def progress(store: Store, jobs: Sequence[Job]) -> Iterator[bool]:
+    """Show how far the jobs are until all are over, and yield whether they are further than before.
 
-    The records of cells that have been finished are merged, whatever ends this process later.
+    The records of jobs that have been finished are merged, whatever ends this process later.
     """
-    total = sum(cell.num_episodes for cell in cells)
-    left, num_before = _not_over(store, cells)  # what is over is not read again
-    has_played, num_unmerged = False, len(cells)
-    with tqdm(total=total, initial=num_before + store.num_played(left), unit=" episodes") as bar:
+    total = sum(job.num_episodes for job in jobs)
+    left, num_before = _not_over(store, jobs)  # what is over is not read again
+    has_progressed, num_unmerged = False, len(jobs)
+    with tqdm(total=total, initial=num_before + store.num_run(left), unit=" episodes") as bar:
         while left:
-            yield has_played
+            yield has_progressed
             time.sleep(POLL_S)
             left, num_more = _not_over(store, left)
             num_before += num_more
-            more = num_before + store.num_played(left) - bar.n
-            if has_played := more != 0:
+            more = num_before + store.num_run(left) - bar.n
+            if has_progressed := more != 0:
                 bar.update(more)
             if len(left) != num_unmerged:
                 num_unmerged = len(left)
                 store.merge()
 
 
-def _not_over(store: Store, cells: Sequence[Cell]) -> tuple[list[Cell], int]:
-    """Return the cells that are to be run, and how many episodes of the others have been."""
-    is_over = {cell: store.is_over(cell) for cell in cells}
-    over = [cell for cell in cells if is_over[cell]]
-    return [cell for cell in cells if not is_over[cell]], store.num_played(over)
+def _not_over(store: Store, jobs: Sequence[Job]) -> tuple[list[Job], int]:
+    """Return the jobs that are to be run, and how many episodes of the others have been."""
+    is_over = {job: store.is_over(job) for job in jobs}
+    over = [job for job in jobs if is_over[job]]
+    return [job for job in jobs if not is_over[job]], store.num_run(over)
 
 
 class WorkerProcess:
-    """A worker, and the cell that it runs, which it says through a pipe."""
+    """A worker, and the job that it runs, which it reports through a pipe."""
 
     def __init__(self, command: Sequence[str], environment: dict[str, str], log: IO[bytes]) -> None:
         said, told = os.pipe()
@@ -66,16 +66,16 @@ class WorkerProcess:
         os.close(told)
         self._unread = b""
         self._end = ""  # how it was ended from here
-        self.cell = ""  # its key; "": none
+        self.job = ""  # its key; "": none
         self.since = time.monotonic()
 
     def look(self) -> str | None:
-        """Read which cell is run; return how the worker ended, None while it runs."""
+        """Read which job is run; return how the worker ended, None while it runs."""
         code = self._process.poll()
         self._unread += self._said.read() or b""
-        *cells, self._unread = self._unread.split(b"\n")
-        if cells:
-            self.cell, self.since = cells[-1].decode(), time.monotonic()
+        *jobs, self._unread = self._unread.split(b"\n")
+        if jobs:
+            self.job, self.since = jobs[-1].decode(), time.monotonic()
         return None if code is None else self._end or ended(code)
 
     @property
@@ -106,13 +106,13 @@ def ended(code: int) -> str:
 
 
 class Workers:
-    """The worker processes of one command, each started anew when it has ended.
+    """The worker processes of one command; each is restarted when it has ended.
 
     Args:
         store: what is run.
         command: starts a worker.
         environments: of each.
-        timeout_s: of a cell; None: none.
+        timeout_s: of a job; None: none.
     """
 
     def __init__(
@@ -124,26 +124,26 @@ class Workers:
     ) -> None:
         self._store, self._command, self._environments = store, command, environments
         self._timeout_s = timeout_s
-        self._cells = {cell.key: cell for cell in store.manifest.cells}
+        self._jobs = {job.key: job for job in store.manifest.jobs}
         self._path = store.folder / "workers.log"
         self._log = self._path.open("ab")
         self._start = self._log.tell()  # what is before is of earlier commands
         self._workers: list[WorkerProcess] = []
-        self._num_idle_ends = 0  # of workers that had begun no cell, since an episode was played
+        self._num_idle_ends = 0  # of workers that had begun no job, since an episode was run
 
-    def look(self, has_played: bool) -> None:
-        """Start those that are missing, end those whose cell takes too long.
+    def look(self, has_progressed: bool) -> None:
+        """Start those that are missing, end those whose job takes too long.
 
         Raises:
-            RuntimeError: they end before they play, or refuse to; the message says why.
+            RuntimeError: they end before they run, or refuse to; the message says why.
         """
-        self._num_idle_ends = 0 if has_played else self._num_idle_ends
+        self._num_idle_ends = 0 if has_progressed else self._num_idle_ends
         for number, worker in enumerate(self._workers):
             end = worker.look()
             if end is not None:
                 self._end(worker, end)
                 self._workers[number] = self._started(number)
-            elif worker.cell and self._timeout_s and time.monotonic() - worker.since > self._timeout_s:
+            elif worker.job and self._timeout_s and time.monotonic() - worker.since > self._timeout_s:
                 worker.kill(f"not finished after {self._timeout_s} s (--timeout)")
         self._workers += map(self._started, range(len(self._workers), len(self._environments)))
 
@@ -154,15 +154,15 @@ class Workers:
         worker.close()
         if worker.is_refused:
             raise RuntimeError(self._last_line() or end)
-        if worker.cell:
-            self._log.write(f"\n{worker.cell}: {end}\n".encode())
+        if worker.job:
+            self._log.write(f"\n{worker.job}: {end}\n".encode())
             self._log.flush()
-            self._store.lost(self._cells[worker.cell], end)
+            self._store.lost(self._jobs[worker.job], end)
             return
         self._num_idle_ends += 1
         if self._num_idle_ends > MAX_ENDED * len(self._environments):
             reason = "; ".join(filter(None, (end, self._last_line())))
-            raise RuntimeError(f"workers end before they play: {reason}; see {self._path}")
+            raise RuntimeError(f"workers end before they run: {reason}; see {self._path}")
 
     def _last_line(self) -> str:
         """The last line that this command's workers have said, '' where they said nothing."""
@@ -178,19 +178,19 @@ class Workers:
         self._log.close()
 
 
-def play(store: Store, part: str, num_workers: int, timeout_s: int | None = None) -> None:
-    """Run a part of the cells: start workers, and start those anew that ended.
+def run_part(store: Store, part: str, num_workers: int, timeout_s: int | None = None) -> None:
+    """Run a part of the jobs: start workers, and restart those that ended.
 
     Raises:
-        RuntimeError: they end before they play, or refuse to; the message says why.
+        RuntimeError: they end before they run, or refuse to; the message says why.
     """
-    cells = store.manifest.part(part)
-    num_workers = min(num_workers, len(cells))
+    jobs = store.manifest.part(part)
+    num_workers = min(num_workers, len(jobs))
     environments = worker_environments(num_workers, os.environ, num_cores(), visible_gpus(os.environ))
     command = [*PYTHON, "lerobot_bomb.sweep", str(store.folder), part, store.run]
     workers = Workers(store, command, environments, timeout_s)
     try:
-        for has_played in progress(store, cells):
-            workers.look(has_played)
+        for has_progressed in progress(store, jobs):
+            workers.look(has_progressed)
     finally:
         workers.close()

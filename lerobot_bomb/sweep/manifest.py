@@ -1,4 +1,4 @@
-"""Manifest of a sweep: its cells, each of them one evaluation by LeRobot's command."""
+"""Manifest of a sweep: its jobs, each of them one evaluation by LeRobot's command."""
 
 import hashlib
 import json
@@ -21,7 +21,7 @@ RESERVED_PREFIXES = ("--eval.", "--policy.path", "--policy.type")
 
 
 @dataclass(frozen=True)
-class Cell:
+class Job:
     """One policy under one condition on consecutive seeds."""
 
     policy: tuple[str, ...]  # flags of lerobot-eval
@@ -32,7 +32,7 @@ class Cell:
 
     @property
     def flags(self) -> list[str]:
-        """Flags of lerobot-eval; with `--env.results_path` they give the records of this cell."""
+        """Flags of lerobot-eval; with `--env.results_path` they give the records of this job."""
         own = (f"--seed={self.seed}", f"--eval.n_episodes={self.num_episodes}")
         batch = (f"--eval.batch_size={self.batch_size}", "--eval.use_async_envs=false")
         return [*self.policy, *self.env, *own, *batch]
@@ -44,7 +44,7 @@ class Cell:
 
     @property
     def key(self) -> str:
-        """The flags in a form for file names; equal for equal cells only."""
+        """The flags in a form for file names; equal for equal jobs only."""
         words = "-".join(flag.partition("=")[2] for flag in (*self.policy[:1], *self.env))
         readable = re.sub(r"[^a-z0-9_.]+", "-", words.lower()).strip("-")
         digest = hashlib.sha256(json.dumps(self.flags).encode()).hexdigest()
@@ -60,43 +60,41 @@ class Cell:
         """Type of the environment, as LeRobot names it; '' where the flags name none."""
         return flag_value(self.env, "--env.type") or ""
 
-    def episode(self, number: int) -> "Cell":
+    def episode(self, number: int) -> "Job":
         """One of its episodes, alone."""
-        return Cell(self.policy, self.env, self.seed + number, 1, 1)
+        return Job(self.policy, self.env, self.seed + number, 1, 1)
 
 
 @dataclass(frozen=True)
 class Manifest:
-    """Cells of a sweep, in the order of its records; none is there twice."""
+    """Jobs of a sweep, in the order of its records; none is there twice."""
 
-    cells: tuple[Cell, ...]
+    jobs: tuple[Job, ...]
 
     def __post_init__(self) -> None:
-        if len({cell.key for cell in self.cells}) < len(self.cells):
-            raise ValueError("a cell is there twice")
+        if len({job.key for job in self.jobs}) < len(self.jobs):
+            raise ValueError("a job is there twice")
 
     @property
     def num_episodes(self) -> int:
-        return sum(cell.num_episodes for cell in self.cells)
+        return sum(job.num_episodes for job in self.jobs)
 
-    def part(self, text: str) -> list[Cell]:
-        """Return every so many cells: '0/4' are the first, the fifth, ...
+    def part(self, text: str) -> list[Job]:
+        """Return every n-th job: for '0/4' the first, the fifth, ...
 
         Raises:
-            ValueError: the text is no such part, or there are too few cells for it to have one.
+            ValueError: the text is no such part, or there are too few jobs for it to have one.
         """
         first, number = parse_part(text)
-        if first >= len(self.cells):
-            raise ValueError(
-                f"{text} has no cell: there are {len(self.cells)}, so take at most as many parts"
-            )
-        return list(self.cells[first::number])
+        if first >= len(self.jobs):
+            raise ValueError(f"{text} has no job: there are {len(self.jobs)}, so take at most as many parts")
+        return list(self.jobs[first::number])
 
     def write(self, folder: Path) -> None:
-        """Write the manifest as `NAME` to a folder, which is made."""
-        cells = [vars(cell) | {"command": cell.command} for cell in self.cells]
+        """Write the manifest as `NAME` to a folder, which is created."""
+        jobs = [vars(job) | {"command": job.command} for job in self.jobs]
         with written_whole(folder / NAME) as (path,):
-            path.write_text(json.dumps({"version": VERSION, "cells": cells}, indent=1) + "\n")
+            path.write_text(json.dumps({"version": VERSION, "cells": jobs}, indent=1) + "\n")
 
     @classmethod
     def read(cls, folder: Path) -> "Manifest":
@@ -111,22 +109,22 @@ class Manifest:
         if values.get("version") != VERSION:
             raise ValueError(f"{path}: version {values.get('version')!r}; this package reads {VERSION}")
         try:
-            return cls(tuple(_cell(dict(cell)) for cell in values["cells"]))
+            return cls(tuple(_job(dict(job)) for job in values["cells"]))
         except (KeyError, TypeError, ValueError) as error:
-            raise ValueError(f"{path}: a cell is damaged: {error}") from None
+            raise ValueError(f"{path}: a job is damaged: {error}") from None
 
 
-def _cell(values: dict[str, Any]) -> Cell:
-    cell = Cell(
+def _job(values: dict[str, Any]) -> Job:
+    job = Job(
         policy=tuple(map(str, values["policy"])),
         env=tuple(map(str, values["env"])),
         seed=_at_least(0, values, "seed"),
         num_episodes=_at_least(1, values, "num_episodes"),
         batch_size=_at_least(1, values, "batch_size"),
     )
-    if values.get("command", cell.command) != cell.command:
-        raise ValueError(f"its command is not that of its flags, {cell.command}; change both, or drop it")
-    return cell
+    if values.get("command", job.command) != job.command:
+        raise ValueError(f"its command is not that of its flags, {job.command}; change both, or drop it")
+    return job
 
 
 def _at_least(lowest: int, values: dict[str, Any], name: str) -> int:
@@ -148,16 +146,16 @@ def parse_part(text: str) -> tuple[int, int]:
 
 
 def flag_value(flags: Sequence[str], name: str) -> str | None:
-    """'bomb' of '--env.type=bomb'; None: it is not among them."""
+    """'bomb' of '--env.type=bomb'; None if it is not among them."""
     return next((flag.partition("=")[2] for flag in flags if flag.startswith(f"{name}=")), None)
 
 
 def check_flags(flags: Sequence[str]) -> None:
-    """Raise a ValueError if a flag of lerobot-eval is one that a cell has of its own."""
+    """Raise a ValueError if a flag of lerobot-eval is one that each job sets itself."""
     for flag in flags:
         name = flag.partition("=")[0]
         if name in RESERVED or name.startswith(RESERVED_PREFIXES):
-            raise ValueError(f"{flag}: {name} is set for every cell; see --help")
+            raise ValueError(f"{flag}: {name} is set for every job; see --help")
 
 
 def plan(
@@ -169,15 +167,15 @@ def plan(
     batch_size: int,
     flags: Sequence[str],
 ) -> Manifest:
-    """Plan every policy on every task under every condition; what is named twice is run once.
+    """Plan every policy on every task under every condition; duplicates are run once.
 
     Args:
         policies: checkpoints, or policy types.
         tasks: values of `--env.task`; none: LeRobot's default.
-        conditions: each of a cell of its own; none: an environment without perturbations.
-        seed: the first one of each cell.
-        num_episodes: of each cell.
-        batch_size: of each cell, at most.
+        conditions: each of a job of its own; none: an environment without perturbations.
+        seed: the first one of each job.
+        num_episodes: of each job.
+        batch_size: of each job, at most.
         flags: of lerobot-eval, for all.
 
     Raises:
@@ -186,8 +184,8 @@ def plan(
     check_flags(flags)
     of_policy = [flag for flag in flags if flag.startswith("--policy.")]
     of_env = [flag for flag in flags if not flag.startswith("--policy.")]
-    cells = [
-        Cell(
+    jobs = [
+        Job(
             policy=(policy_flag(policy), *of_policy),
             env=(*of_env, *([f"--env.task={task}"] if task else []), *_condition_flags(condition)),
             seed=seed,
@@ -196,7 +194,7 @@ def plan(
         )
         for policy, task, condition in product(policies, tasks or [""], conditions or [""])
     ]
-    return Manifest(tuple(dict.fromkeys(cells)))
+    return Manifest(tuple(dict.fromkeys(jobs)))
 
 
 def _condition_flags(condition: str) -> list[str]:

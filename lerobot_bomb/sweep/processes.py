@@ -15,7 +15,7 @@ def num_cores() -> int:
 
 
 def visible_gpus(environment: Mapping[str, str], driver: Path = DRIVER) -> list[str]:
-    """Return GPUs as CUDA_VISIBLE_DEVICES names them; where it is not set, all that the driver lists."""
+    """Return GPUs as CUDA_VISIBLE_DEVICES names them; if it is not set, all that the driver lists."""
     if GPUS in environment:
         # CUDA sees none from the first -1 on
         return list(takewhile(lambda gpu: gpu != "-1", filter(None, environment[GPUS].split(","))))

@@ -1,4 +1,4 @@
-"""Worker that runs the cells of a sweep that no other worker runs, one by one, in one process."""
+"""Worker that runs the jobs of a sweep that no other worker runs, one by one, in one process."""
 
 import faulthandler
 import io
@@ -22,15 +22,15 @@ from lerobot_bomb.environments import env_type
 from lerobot_bomb.evaluation.eval_info import EVAL_INFO, results_of
 from lerobot_bomb.files import read_json
 from lerobot_bomb.sweep.check import check
-from lerobot_bomb.sweep.manifest import Cell, Manifest, flag_value
-from lerobot_bomb.sweep.store import POLL_S, REFUSED, EpisodeError, Store, unplayed_seeds
+from lerobot_bomb.sweep.manifest import Job, Manifest, flag_value
+from lerobot_bomb.sweep.store import POLL_S, REFUSED, EpisodeError, Store, missing_seeds
 
 
 class RefusedError(Exception):
     """Refusal: LeRobot's command ended before its first episode, so no attempt can do better."""
 
 
-FATAL = (RefusedError, OSError)  # for a cell, whichever episode it was
+FATAL = (RefusedError, OSError)  # for a job, whichever episode it was
 
 
 class Worker:
@@ -38,69 +38,69 @@ class Worker:
 
     Args:
         store: the sweep.
-        tell: is told the key of a cell that begins, and '' when it ends.
+        tell: is told the key of a job that begins, and '' when it ends.
     """
 
     def __init__(self, store: Store, tell: Callable[[str], None] = lambda key: None) -> None:
         self._store, self._tell = store, tell
         self._kept = KeptPolicy()
 
-    def run(self, cells: list[Cell]) -> None:
-        """Run cells until each is finished or given up, by this worker or by others."""
-        while left := [cell for cell in cells if not self._store.is_over(cell)]:
-            for cell in self._store.in_turn(left):
-                with self._store.claimed(cell) as is_mine:
-                    if is_mine and not self._store.is_over(cell) and self._store.begin(cell):
-                        self._tell(cell.key)
-                        self._attempt(cell)
+    def run(self, jobs: list[Job]) -> None:
+        """Run jobs until each is finished or given up, by this worker or by others."""
+        while left := [job for job in jobs if not self._store.is_over(job)]:
+            for job in self._store.in_turn(left):
+                with self._store.claimed(job) as is_mine:
+                    if is_mine and not self._store.is_over(job) and self._store.begin(job):
+                        self._tell(job.key)
+                        self._attempt(job)
                         self._tell("")
-            time.sleep(POLL_S)  # others play the rest; what a killed one leaves is for those that remain
+            time.sleep(POLL_S)  # others run the rest; what a killed one leaves is for those that remain
 
-    def _attempt(self, cell: Cell) -> None:
+    def _attempt(self, job: Job) -> None:
         try:
             try:
-                lines, errors = self._evaluate(cell, cell), []
+                lines, errors = self._evaluate(job, job), []
             except FATAL:
                 raise
             except Exception as error:
-                logging.warning("%s: %s; its episodes are played one by one", cell.key, describe(error))
-                lines, errors = self._one_by_one(cell)
-            self._store.finish(cell, lines, errors)
+                logging.warning("%s: %s; its episodes are run one by one", job.key, describe(error))
+                lines, errors = self._one_by_one(job)
+            self._store.finish(job, lines, errors)
         except RefusedError as error:
-            self._store.give_up(cell, str(error))
+            self._store.give_up(job, str(error))
         except OSError as error:
-            self._store.fail(cell, describe(error))
+            self._store.fail(job, describe(error))
 
-    def _one_by_one(self, cell: Cell) -> tuple[list[str], list[EpisodeError]]:
-        lines, errors, record_type = [], [], env_type(cell.env_type).record
-        for number in range(cell.num_episodes):
-            episode = cell.episode(number)
+    def _one_by_one(self, job: Job) -> tuple[list[str], list[EpisodeError]]:
+        lines, errors, record_type = [], [], env_type(job.env_type).record
+        for number in range(job.num_episodes):
+            episode = job.episode(number)
             try:
-                lines += self._evaluate(episode, cell)
+                lines += self._evaluate(episode, job)
             except FATAL:
                 raise
             except Exception as error:
-                again = cell if record_type.starts_by_number else episode
-                errors.append(EpisodeError(cell.key, episode.seed, describe(error), again.command))
+                again = job if record_type.starts_by_number else episode
+                errors.append(EpisodeError(job.key, episode.seed, describe(error), again.command))
         return lines, errors
 
-    def _evaluate(self, cell: Cell, whole: Cell) -> list[str]:
-        """Run a cell and return its records, in the order of their seeds; it is a part of `whole`."""
-        part = self._store.file(cell, "part")
+    def _evaluate(self, job: Job, whole: Job) -> list[str]:
+        """Run a job and return its records, in the order of their seeds; it is a part of `whole`."""
+        part = self._store.file(job, "part")
         part.unlink(missing_ok=True)
-        check_assets(cell)
+        check_assets(job)
         output_dir = tempfile.mkdtemp(prefix=".output-", dir=part.parent)
-        flags = [*cell.flags, f"--output_dir={output_dir}"]
-        writes_records = env_type(cell.env_type).record.has_results_path
+        flags = [*job.flags, f"--output_dir={output_dir}"]
+        writes_records = env_type(job.env_type).record.has_results_path
         flags += [f"--env.results_path={part}"] if writes_records else []
         said = LastLine(sys.stderr)
         try:
             with redirect_stderr(said):
-                self._kept.evaluate(flags, (whole.policy, whole.seed), cell.seed - whole.seed)
+                self._kept.evaluate(flags, (whole.policy, whole.seed), job.seed - whole.seed)
             if writes_records:
                 lines = part.read_text().splitlines()
             else:
-                lines = self._stock_lines(cell, whole, Path(output_dir))
+                lines = self._stock_lines(job, whole, Path(output_dir))
         except (Exception, SystemExit) as error:
             if self._kept.has_begun or isinstance(error, OSError):
                 raise
@@ -110,30 +110,30 @@ class Worker:
             shutil.rmtree(output_dir, ignore_errors=True)
             part.unlink(missing_ok=True)
         by_seed = sorted(lines, key=lambda line: json.loads(line)["spec"]["seed"])
-        if unplayed := unplayed_seeds(cell, by_seed, []):
-            raise RuntimeError(f"{cell.num_episodes - len(unplayed)} of {cell.num_episodes} episodes ended")
+        if missing := missing_seeds(job, by_seed, []):
+            raise RuntimeError(f"{job.num_episodes - len(missing)} of {job.num_episodes} episodes ended")
         return by_seed
 
-    def _stock_lines(self, cell: Cell, whole: Cell, output_dir: Path) -> list[str]:
+    def _stock_lines(self, job: Job, whole: Job, output_dir: Path) -> list[str]:
         """Return the records of an environment of LeRobot's own, which lerobot-eval has just run."""
         assert self._kept.policy is not None
         results = results_of(
             read_json(output_dir / EVAL_INFO),
             self._kept.env_config,
             identity_of(self._kept.policy),
-            cell.seed,
-            cell.batch_size,
-            cell.seed - whole.seed,
+            job.seed,
+            job.batch_size,
+            job.seed - whole.seed,
         )
         return [result.to_json() for result in results]
 
 
-def check_assets(cell: Cell) -> None:
+def check_assets(job: Job) -> None:
     """Raise a RefusedError where an environment would ask a question or download before it starts."""
-    env = env_type(cell.env_type)
+    env = env_type(job.env_type)
     if not env.check_at:
         return
-    tasks = flag_value(cell.env, "--env.task") or EnvConfig.get_choice_class(cell.env_type).task
+    tasks = flag_value(job.env, "--env.task") or EnvConfig.get_choice_class(job.env_type).task
     try:
         env.check(str(tasks).split(","))
     except ValueError as error:
@@ -163,14 +163,14 @@ def describe(error: BaseException) -> str:
 
 
 def main(folder: str, part: str, run: str, told: str) -> None:
-    """Run a part of the sweep in a folder; the cell that runs goes to the file descriptor `told`."""
+    """Run a part of the sweep in a folder; the job that runs goes to the file descriptor `told`."""
     faulthandler.enable()  # a fault of native code says where it was
     logging.basicConfig(level=logging.WARNING)
     manifest = Manifest.read(Path(folder))
     store = Store(Path(folder), manifest, run)
-    left = Manifest(tuple(cell for cell in manifest.cells if not store.is_over(cell)))
+    left = Manifest(tuple(job for job in manifest.jobs if not store.is_over(job)))
     try:
-        check(left, [cell for cell in manifest.cells if store.has_begun(cell)])
+        check(left, [job for job in manifest.jobs if store.has_begun(job)])
     except (ValueError, SystemExit) as error:
         if isinstance(error, ValueError):
             print(error, file=sys.stderr)

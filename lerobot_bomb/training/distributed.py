@@ -13,7 +13,7 @@ ONE_FILE = "1000TB"  # no checkpoint is larger
 
 
 def process_number() -> int:
-    """Return the number of this process, from 0; 0 where there is one only."""
+    """Return the number of this process, from 0; 0 if there is only one."""
     return distributed.get_rank() if _are_several() else 0
 
 

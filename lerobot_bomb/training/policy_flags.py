@@ -1,6 +1,6 @@
 """Checks and presets that the configs of all our policies share; errors name the flag.
 
-A config calls those of the fields that it has.
+Each config calls the checks of the fields that it has.
 """
 
 import json
@@ -37,7 +37,7 @@ def check_model_name_and_precision(config: Any) -> None:
 
 
 def check_architecture(config: Any) -> None:
-    """Raise unless what describes a checkpoint's backbone is whole: fields that no command line gives."""
+    """Raise unless a checkpoint describes its backbone fully; no command line gives these fields."""
     if config.vlm_config is not None and not (config.vlm_config and config.prompt_tokens):
         raise ValueError(
             f"--policy.vlm_config={config.vlm_config}, --policy.prompt_tokens={config.prompt_tokens}: they "
@@ -84,7 +84,7 @@ def check_ensemble(config: Any) -> None:
 
 
 def check_crop(config: Any) -> None:
-    """Check that the crop is a part of the image, or all of it."""
+    """Check that the crop is part of the image, or all of it."""
     if not 0 < config.crop_fraction <= 1:
         raise ValueError(f"--policy.crop_fraction={config.crop_fraction} must lie in (0, 1]")
 
@@ -158,9 +158,9 @@ def trained_with(config: Any, flags: Iterable[str]) -> dict[str, Any]:
 
 
 def check_as_trained(config: Any, flags: Iterable[str]) -> None:
-    """Check that a checkpoint's flags still are what its weights were trained with.
+    """Check that a checkpoint's flags are those that its weights were trained with.
 
-    ``flags``: those that say it now; an older checkpoint names fewer.
+    ``flags``: today's; an older checkpoint names fewer.
     """
     then = _then(config, flags)
     for flag, value in trained_with(config, then).items():
@@ -172,7 +172,7 @@ def check_as_trained(config: Any, flags: Iterable[str]) -> None:
 
 
 def check_weights_fit(config: Any, flags: Iterable[str]) -> None:
-    """Check that a training goes on with flags that the checkpoint's weights have the shapes for."""
+    """Check that a training from a checkpoint has flags that fit the shapes of its weights."""
     then = _then(config, flags)
     for flag, value in trained_with(config, [flag for flag in flags if flag in then]).items():
         if value != then[flag]:

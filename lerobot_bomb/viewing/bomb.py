@@ -19,7 +19,7 @@ from lerobot_bomb.bomb.observation import (
 )
 from lerobot_bomb.bomb.suite import specs_of_tasks
 from lerobot_bomb.conditions import NONE
-from lerobot_bomb.envs.rollout import Moment, expert_agent, make_env, play
+from lerobot_bomb.envs.rollout import Moment, expert_agent, make_env, run_episode
 from lerobot_bomb.results.bomb import EpisodeResult
 from lerobot_bomb.results.record import NOT_RECORDED
 from lerobot_bomb.viewing.episode import EXPERT, RANDOM, EnvView, Viewed
@@ -35,7 +35,7 @@ class BombView(EnvView):
     def of_flags(self, flags: Mapping[str, Any]) -> Viewed:
         task_ids, size = flags["task_ids"], flags["image_size"]
         if len(task_ids) > 1:
-            raise ValueError(f"--env.task_ids={list(task_ids)} must be one task: one episode is played")
+            raise ValueError(f"--env.task_ids={list(task_ids)} must be one task: one episode is run")
         spec = EpisodeSpec(
             flags["seed"],
             flags["task"],
@@ -53,7 +53,7 @@ class BombView(EnvView):
 
 
 def bomb_episode(spec: EpisodeSpec, options: RenderOptions) -> Viewed:
-    """Return an episode as it is shown."""
+    """Return an episode to be shown."""
     flags = {"task": spec.suite} | {name: getattr(spec, name) for name in ("robot", "control_mode", "fps")}
     return Viewed(
         env_type="bomb",
@@ -78,23 +78,25 @@ def _fixed_words(spec: EpisodeSpec) -> Iterator[str]:
 
 
 def bomb_tiles(condition: str, seed: int, image_size: int, changes: set[str]) -> dict[str, np.ndarray]:
-    """Return tiles of the start; dynamics show in the expert's path."""
-    start, path_xy = _played(condition, seed, image_size, "dynamics" in changes)
+    """Return tiles of the episode's start; changed dynamics are shown by the expert's path."""
+    start, path_xy = _start_and_path(condition, seed, image_size, "dynamics" in changes)
     tiles = {camera: start.observation[PIXELS][camera] for camera in CAMERAS if "images" in changes}
     if "instruction" in changes:
         tiles["instruction"] = text_tile(start.instruction, image_size)
     if "dynamics" in changes:
-        _, nominal_xy = _played(NONE, seed, image_size, True)
+        _, nominal_xy = _start_and_path(NONE, seed, image_size, True)
         tiles["expert's path"] = path_tile(path_xy, nominal_xy, image_size)
     return tiles
 
 
 @lru_cache(maxsize=2)  # one of them the nominal episode
-def _played(condition: str, seed: int, image_size: int, to_its_end: bool) -> tuple[Moment, np.ndarray]:
+def _start_and_path(
+    condition: str, seed: int, image_size: int, to_its_end: bool
+) -> tuple[Moment, np.ndarray]:
     """Return an episode's first moment and the gripper's path (T, 2) in metres."""
     spec = EpisodeSpec(seed, perturbations=condition)
     env = make_env(spec, RenderOptions(image_size))
-    moments = play(env, spec, expert_agent())
+    moments = run_episode(env, spec, expert_agent())
     first = next(moments)
     path = [moment.state.gripper_xyz[:2] for moment in (first, *(moments if to_its_end else ()))]
     env.close()

@@ -32,7 +32,7 @@ from lerobot_bomb.envs.rollout import BatchAgent
 
 
 class LoadedPolicy:
-    """A policy, and what stands between it and an environment."""
+    """A policy, with the processors between it and an environment."""
 
     def __init__(
         self,
@@ -57,12 +57,12 @@ class LoadedPolicy:
         self.policy.reset()
 
     def observe(self, observations: list[dict[str, Any]], instructions: list[str]) -> dict[str, Any]:
-        """Return what `prepare` takes: images (B, 3, H, W) in [0, 1] by camera, state, task."""
+        """Return the input of `prepare`: images (B, 3, H, W) in [0, 1] by camera, state, task."""
         batch = {**preprocess_observation(_stacked(observations)), "task": instructions}
         return self._env_processors[0](batch)
 
     def act(self, batch: dict[str, Any]) -> np.ndarray:
-        """(B, D) actions of the environment for what `prepare` gave."""
+        """(B, D) actions of the environment, for the output of `prepare`."""
         with torch.inference_mode(), autocast(self.config):
             action = self.postprocess(self.policy.select_action(batch))
         return self._env_processors[1]({ACTION: action})[ACTION].to("cpu").numpy()
@@ -124,7 +124,7 @@ def _check_shapes(path: Path, config: PreTrainedConfig, env_config: EnvConfig) -
 
 
 def _stacked(rows: list[Any]) -> Any:
-    """Arrays in nested dicts, stacked along a first axis: what a vector environment gives."""
+    """Stack arrays in nested dicts along a first axis, as a vector environment does."""
     if isinstance(rows[0], dict):
         return {key: _stacked([row[key] for row in rows]) for key in rows[0]}
     return np.stack(rows)

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any, ClassVar, cast
 import gymnasium
 import numpy as np
 
-from lerobot_bomb.envs.rollout import Agent, play
+from lerobot_bomb.envs.rollout import Agent, run_episode
 from lerobot_bomb.files import written_whole
 from lerobot_bomb.results.record import Record, Spec
 
@@ -57,7 +57,7 @@ class EnvView(ABC):
 
     @abstractmethod
     def of_flags(self, flags: Mapping[str, Any]) -> Viewed:
-        """Return the episode of seed, perturbations, image_size and own flags; None: not given."""
+        """Return the episode of seed, perturbations, image_size and own flags; None if not given."""
 
     @abstractmethod
     def of_record(self, record: Any, spec: Any, depth: bool) -> Viewed:
@@ -65,35 +65,35 @@ class EnvView(ABC):
 
 
 @dataclass(frozen=True)
-class Player:
-    """Player of an episode: the episode, and the agent that acts."""
+class ViewedRun:
+    """Run of a viewed episode: the episode, and the agent that acts."""
 
     viewed: Viewed
     make_agent: Callable[[gymnasium.Env], AbstractContextManager[Agent]]
 
 
-def write_episodes(players: Mapping[str, Player], name: str, rrd: Path, mp4: Path) -> list[Record]:
-    """Run one after the other, write what happened, and return each result.
+def write_episodes(runs: Mapping[str, ViewedRun], name: str, rrd: Path, mp4: Path) -> list[Record]:
+    """Run the episodes one after the other, write recording and video, and return each result.
 
-    With one player, its entities stand at the recording's top; of several, each below its name, and the video
-    shows them side by side, the last image of an episode until the others have ended.
+    The entities of a single run are at the recording's top; those of several are below their names. The video
+    shows several side by side, and repeats the last image of an episode until the others have ended.
     """
     from lerobot_bomb.viewing.rerun_file import open_recording
     from lerobot_bomb.viewing.video import VideoFile, packed, unpacked
 
-    prefixes = {label: f"{label}/" if len(players) > 1 else "" for label in players}
-    fps = next(iter(players.values())).viewed.fps
+    prefixes = {label: f"{label}/" if len(runs) > 1 else "" for label in runs}
+    fps = next(iter(runs.values())).viewed.fps
     results: list[Record] = []
     images: list[list[np.ndarray]] = []
     with (
         written_whole(rrd, mp4) as (unfinished_rrd, unfinished_mp4),
-        open_recording(unfinished_rrd, name, fps, _layout(players, prefixes)) as recording,
+        open_recording(unfinished_rrd, name, fps, _layout(runs, prefixes)) as recording,
     ):
-        for label, player in players.items():
-            log = player.viewed.log(recording, prefixes[label], player.viewed.spec)
+        for label, run in runs.items():
+            log = run.viewed.log(recording, prefixes[label], run.viewed.spec)
             images.append([])
-            with closing(player.viewed.make_env()) as env, player.make_agent(env) as agent:
-                for moment in play(env, player.viewed.spec, agent):
+            with closing(run.viewed.make_env()) as env, run.make_agent(env) as agent:
+                for moment in run_episode(env, run.viewed.spec, agent):
                     log.add(moment)
                     images[-1].append(packed(cast("np.ndarray", env.render())))
                 results.append(env.get_wrapper_attr("episode_result")())
@@ -122,8 +122,8 @@ def check_new(paths: Iterable[Path]) -> None:
             raise ValueError(f"{path} exists already; name other files with --output=PATH")
 
 
-def _layout(players: Mapping[str, Player], prefixes: Mapping[str, str]) -> "rrb.ContainerLike":
+def _layout(runs: Mapping[str, ViewedRun], prefixes: Mapping[str, str]) -> "rrb.ContainerLike":
     import rerun.blueprint as rrb
 
-    layouts = [player.viewed.log.layout(prefixes[label]) for label, player in players.items()]
+    layouts = [run.viewed.log.layout(prefixes[label]) for label, run in runs.items()]
     return layouts[0] if len(layouts) == 1 else rrb.Vertical(*layouts)

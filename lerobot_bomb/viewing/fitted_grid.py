@@ -1,4 +1,4 @@
-"""The action grid that a policy would fit on a dataset, and what it rounds off.
+"""The action grid that a policy would fit on a dataset, and its rounding errors.
 
 Shapes: `N` actions, `D` action dims.
 """

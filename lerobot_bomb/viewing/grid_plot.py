@@ -1,4 +1,4 @@
-"""A plot of a grid: how often each coordinate takes which value, and where it is cut."""
+"""Plot of a grid: a histogram of each coordinate, and its cuts."""
 
 from dataclasses import dataclass
 
@@ -16,7 +16,7 @@ BAR_RGB, EDGE_RGB = (150, 160, 175), (210, 40, 30)
 
 @dataclass(frozen=True)
 class PlotRow:
-    """Row of the plot: what it shows of one coordinate."""
+    """Row of the plot: one coordinate."""
 
     label: list[str]  # lines
     values: np.ndarray  # (N,)

@@ -17,8 +17,7 @@ LEVELS = range(1, MAX_LEVEL + 1)
 INTRODUCTION = f"""\
 # Perturbations
 
-How an episode may differ from the nominal one, and by how much. Evaluate under conditions, look at one, or
-draw the sheets below:
+How an episode may differ from the nominal one, and by how much:
 
 ```
 lerobot-eval --policy.path=CHECKPOINT --env.type=bomb --eval.n_episodes=100 --eval.batch_size=10 \\
@@ -34,8 +33,6 @@ lerobot-bomb view gallery --axes=camera,light --seeds=2,3 --output=outputs/galle
   its brackets.
 - A **range**, as `camera:1-5`, draws the level from the seed; each axis of `all:1-5` draws its own.
 - `{ALL}:k` is every axis at level k but `goal_marker`, which helps.
-- A perturbed episode is paired with the unperturbed one of the same seed. The difference between the two
-  success rates is what the condition costs.
 
 Each condition is a group in `eval_info.json`: `place.camera-2.light-3`, `place.all-1to5`. What is needed to
 solve the episode stays in view, and the instruction always says what is meant.

@@ -42,7 +42,7 @@ class PushTView(EnvView):
 
 
 def _episode(spec: PushTSpec, image_size: int) -> Viewed:
-    """Return an episode as it is shown.
+    """Return an episode to be shown.
 
     Raises:
         ValueError: gym-pusht is not installed, or draws no such images.

@@ -13,14 +13,14 @@ from lerobot_bomb.environments import env_type
 from lerobot_bomb.envs.rollout import Agent, BatchAgent, one_of_batch
 from lerobot_bomb.results.origin import PolicyIdentity
 from lerobot_bomb.results.record import Record
-from lerobot_bomb.viewing.episode import Player, Viewed
+from lerobot_bomb.viewing.episode import Viewed, ViewedRun
 
 MAX_BATCH = 1000  # environments at once
 
 
 @dataclass(frozen=True)
 class Replay:
-    """A record, and what it does not say of the policy that ran it."""
+    """A record, with the flags of its policy that it does not hold."""
 
     record: Record
     policy_path: Path | None = None  # where the checkpoint lies now; None: where it lay then
@@ -28,7 +28,7 @@ class Replay:
     policy_flags: Sequence[str] = ()  # of the evaluation: "--n_action_steps=4"
     depth: bool = False  # whether the policy was shown depth
 
-    def player(self, perturbations: str | None = None) -> Player:
+    def viewed_run(self, perturbations: str | None = None) -> ViewedRun:
         """Run the record's episode; under other perturbations, that of the same seed.
 
         Raises:
@@ -42,11 +42,11 @@ class Replay:
                 f"whole batch: at most {MAX_BATCH}, of seeds from 0 on"
             )
         viewed = self.viewed(perturbations)
-        return Player(viewed, partial(self._agent, viewed))
+        return ViewedRun(viewed, partial(self._agent, viewed))
 
     @property
     def checkpoint(self) -> Path | None:
-        """Return the folder of the policy that ran; None: the record names none."""
+        """Return the folder of the policy that ran; None if the record names none."""
         path = None if self.record.policy is None else self.record.policy.path
         return self.policy_path or (Path(path) if path else None)
 
@@ -101,14 +101,14 @@ class Replay:
         return loaded.agent
 
 
-def _check_policy(played: PolicyIdentity, path: Path, loaded: PolicyIdentity) -> None:
+def _check_policy(recorded: PolicyIdentity, path: Path, loaded: PolicyIdentity) -> None:
     """Raise a ValueError if the loaded policy is another than the one that ran then."""
-    if played.weights_sha256 not in (None, loaded.weights_sha256):
+    if recorded.weights_sha256 not in (None, loaded.weights_sha256):
         raise ValueError(
             f"{path} holds other weights than those of the record; name the folder that holds them with "
             "--policy.path=FOLDER, or see what these do with `lerobot-bomb view`"
         )
-    if played.settings_sha256 not in (None, loaded.settings_sha256):
+    if recorded.settings_sha256 not in (None, loaded.settings_sha256):
         raise ValueError(
             f"{path} holds the record's weights, but other settings; give the flags --policy.NAME=VALUE "
             "of that evaluation"

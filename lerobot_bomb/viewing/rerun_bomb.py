@@ -22,7 +22,7 @@ EYE_M, LOOK_AT_M = (0.05, -0.30, 0.28), (0.05, 0.0, 0.03)  # in front of the boa
 
 
 class BombLog(EpisodeLog[EpisodeSpec, EpisodeResult]):
-    """Log of an episode of BOMB: both cameras, the scene, what the arm does."""
+    """Log of an episode of BOMB: both cameras, the scene, the arm's motion."""
 
     def __init__(self, recording: rr.RecordingStream, prefix: str, spec: EpisodeSpec) -> None:
         super().__init__(recording, prefix, spec)
@@ -87,7 +87,9 @@ class BombLog(EpisodeLog[EpisodeSpec, EpisodeResult]):
             fill_mode="solid",
         )
         self._log("scene/board", wood, static=True)
-        corners = [BOARD.intersection_xy(*cell) for cell in ((0, 0), (BOARD.num_lines - 1,) * 2)]
+        corners = [
+            BOARD.intersection_xy(*intersection) for intersection in ((0, 0), (BOARD.num_lines - 1,) * 2)
+        ]
         (left, far), (right, near) = corners
         strips = []
         for line in range(BOARD.num_lines):

@@ -53,7 +53,7 @@ class EpisodeLog[SpecT, ResultT: Record](ABC):
                 self._log(f"{entity}/{of}", rr.SeriesLines(colors=[color], names=[of]), static=True)
 
     def add(self, moment: Moment) -> None:
-        """Log one moment; what stays with the first, the instruction when it changes."""
+        """Log one moment; with the first, everything that stays; the instruction when it changes."""
         if moment.step == 0:
             self._log_still(moment)
         self._set_step(moment.step)
@@ -65,7 +65,7 @@ class EpisodeLog[SpecT, ResultT: Record](ABC):
             self._log_values("action", moment.action)
 
     def add_result(self, result: ResultT) -> None:
-        """Log, at the last step, what became of the episode."""
+        """Log the episode's outcome, at the last step."""
         values: Any = result
         self._set_step(values.steps)
         self._log("result", rr.TextDocument(self.describe(result)))
@@ -87,7 +87,7 @@ class EpisodeLog[SpecT, ResultT: Record](ABC):
 
     @abstractmethod
     def _log_still(self, moment: Moment) -> None:
-        """Log, from the first moment, what does not move."""
+        """Log everything that does not move, from the first moment."""
 
     @abstractmethod
     def _log_moment(self, moment: Moment) -> None:

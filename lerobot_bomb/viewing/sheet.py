@@ -27,7 +27,7 @@ class Sheet:
     label_width: int = LABEL_WIDTH  # pixels
 
     def draw(self) -> np.ndarray:
-        """(H, W, 3) uint8; the tiles are in it as they are, at `tile_origin`."""
+        """(H, W, 3) uint8 with the unchanged tiles, each at its `tile_origin`."""
         tile_height, tile_width = self._tile_shape
         width = self.label_width + len(self.columns) * (tile_width + GAP)
         height = self._top + len(self.images) * (tile_height + GAP)
@@ -64,7 +64,7 @@ class Sheet:
 
 
 def text_tile(text: str, size: int) -> np.ndarray:
-    """(size, size, 3) uint8: an instruction, broken into lines, in type that is smaller where it is long.
+    """(size, size, 3) uint8: an instruction, broken into lines, in smaller type if it is long.
 
     What does not fit at MIN_FONT_SIZE is cut off.
     """
@@ -80,7 +80,7 @@ def text_tile(text: str, size: int) -> np.ndarray:
 
 
 def caption(text: str, last_line: str, width: int) -> np.ndarray:
-    """(H, width, 3) uint8: a text in two lines at most, smaller where it is long, and a line below."""
+    """(H, width, 3) uint8: a text in at most two lines, smaller if it is long, and a line below."""
     bar = Image.new("RGB", (width, GAP + 3 * LINE_HEIGHT), TILE_PAPER)
     pen = ImageDraw.Draw(bar)
     lines, face = _fitted(text, width - 2 * GAP, lambda lines, _: lines.count("\n") < 2)

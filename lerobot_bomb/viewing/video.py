@@ -15,7 +15,7 @@ PIXEL_FORMAT = "yuv420p"  # the one that all browsers play; width and height mus
 
 
 def packed(image: np.ndarray) -> np.ndarray:
-    """(H, W, 3) uint8 -> a PNG, a fiftieth of its size where it is drawn."""
+    """(H, W, 3) uint8 -> a PNG; drawn images shrink to a fiftieth."""
     return cv2.imencode(".png", image)[1]
 
 

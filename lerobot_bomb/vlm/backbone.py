@@ -1,4 +1,4 @@
-"""SmolVLM, of both generations, behind the few operations a policy needs, and what other families share.
+"""SmolVLM of both generations, reduced to the operations that a policy needs; base of other families.
 
 Shapes: `B` batch, `L` tokens, `H` hidden size of the text model, `V` vocabulary, `P` tokens of an image.
 """
@@ -48,7 +48,7 @@ CHECKPOINTING: dict[str, Any] = {"use_reentrant": False, "context_fn": as_it_was
 
 
 class Backbone(nn.Module):
-    """A stock vision-language model, called in parts, and what all families have: words in and out."""
+    """A stock vision-language model, called in parts; base of all families."""
 
     # the text model's name among the parts of ``vlm.model``
     text_model_name: ClassVar[str]
@@ -63,7 +63,7 @@ class Backbone(nn.Module):
         return self.vlm.model.get_submodule(self.text_model_name)
 
     def checkpoint_gradients(self) -> None:
-        """Compute what is inside a layer again in the backward pass instead of keeping it."""
+        """Recompute a layer's activations in the backward pass instead of keeping them."""
         self.vlm.gradient_checkpointing_enable(CHECKPOINTING)
 
     def embed_tokens(self, tokens_BL: Tensor) -> Tensor:
@@ -106,7 +106,7 @@ class SmolVLMBackbone(Backbone):
         return [*self.text_model.layers, *self.vlm.model.vision_model.encoder.layers]
 
     def freeze_vision(self) -> None:
-        """Train the connector and what follows it only."""
+        """Train only the connector and what follows it."""
         self.vlm.model.vision_model.requires_grad_(False)
 
     def pixels(self, images_B3HW: Tensor) -> Tensor:
@@ -225,7 +225,7 @@ def read_vlm_config(vlm_model_name: str, *families: str) -> Any:
 
 @contextmanager
 def weights_errors(vlm_model_name: str) -> Iterator[None]:
-    """Tell the ways out where the weights cannot be had."""
+    """Describe what to do if the weights cannot be read."""
     try:
         yield
     except OSError as error:

@@ -26,7 +26,7 @@ ZOEDEPTH_MARGIN = 3  # the margin is this many times sqrt(size / 2), as the mode
 
 
 def observed_depth(batch: Mapping[str, Tensor], camera: str, image_size: tuple[int, int]) -> Tensor:
-    """(B, H, W) metres of a camera's whole images, NaN where there is none. It may come as (B, 1, H, W).
+    """(B, H, W) metres of a camera's whole images, NaN where unknown. The input may be (B, 1, H, W).
 
     Raises:
         KeyError: it is missing.
@@ -63,8 +63,8 @@ def observed_intrinsics(
 ) -> Tensor:
     """K, (B, 3, 3) or (1, 3, 3), of a camera's whole images, counted from their edges.
 
-    What the configuration says in ``camera_intrinsics`` goes before the observation's, and that before
-    ``default_K_133``. The former two count from the centre of the top left pixel.
+    ``camera_intrinsics`` of the config come first, then the observation's, then ``default_K_133``. The former
+    two count from the centre of the top left pixel.
 
     Raises:
         KeyError: none of them is there.
@@ -89,7 +89,7 @@ def observed_intrinsics(
 def lattice_points(depth_BHW: Tensor, K_B33: Tensor, size: int) -> Tensor:
     """Depth and K of the same images -> (B, R, R, 3) metres at the centres of R = ``size`` cells a side.
 
-    NaN where there is no depth. Each point takes the depth of the pixel that it lies in. The original
+    NaN where depth is missing. Each point takes the depth of the pixel that it lies in. The original
     pools, which blends near and far at edges: that puts 7 % of BOMB's points more than 10 mm off, this 0.6 %.
     """
     height, width = depth_BHW.shape[-2:]
@@ -105,7 +105,7 @@ def _nearest_pixels(side: int, num_cells: int, device: torch.device) -> Tensor:
 
 
 def _without_invalid(depth: Tensor) -> Tensor:
-    """NaN wherever there is no depth."""
+    """Set invalid depth to NaN."""
     return depth.where(depth.isfinite() & (depth > 0), torch.nan)
 
 
@@ -149,10 +149,10 @@ def build_zoedepth(depth_config: dict[str, Any]) -> ZoeDepth:
 
 
 def load_zoedepth(depth_model_name: str) -> ZoeDepth:
-    """Weights of a Hub id or a local folder.
+    """Load the weights of a Hub id or a local folder.
 
     Raises:
-        OSError: they cannot be had; the message names the ways out.
+        OSError: they cannot be read; the message says what to do.
     """
     from transformers import ZoeDepthForDepthEstimation  # only who asks for it pays for it
 

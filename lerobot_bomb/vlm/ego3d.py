@@ -29,7 +29,7 @@ class Ego3D(nn.Module):
     """(B, R, R, 3) points of the camera's frame, metres, NaN without depth -> (B, P, H) to add to features.
 
     R = patches_per_side * patch_reso. Points lie at the centres of R x R cells of the image, as
-    `lattice_points` gives them. Where there is no depth, a learned vector stands for a point's encoding; so a
+    `lattice_points` gives them. Where depth is missing, a learned vector replaces a point's encoding; an
     image without depth is NaN everywhere. Without that vector (``no_depth_vector``), as in the original, a
     patch that has such a point gets zeros. With ``zero_init`` the result is exactly zero before training.
     """

@@ -1,4 +1,4 @@
-"""Camera images -> what a vision model reads, on tensors.
+"""Camera images -> inputs of a vision model, on tensors.
 
 Shapes: `B` images, `H` and `W` their sides, `S` side of the model's input, all in pixels; `P` tokens of an
 image, `E` size of their embeddings.
@@ -57,7 +57,7 @@ class CropWindows:
 def draw_windows(images_BxHW: Tensor, crop_fraction: float, generator: torch.Generator | None) -> CropWindows:
     """Windows of ``crop_fraction`` of either side of (B, ..., H, W) images.
 
-    Each at a place of its own drawn from ``generator``, or at the centre where that is None.
+    Each is placed by ``generator``, or at the centre if that is None.
     """
     height, width = images_BxHW.shape[-2:]
     crop_height, crop_width = max(1, round(height * crop_fraction)), max(1, round(width * crop_fraction))
@@ -70,7 +70,7 @@ def draw_windows(images_BxHW: Tensor, crop_fraction: float, generator: torch.Gen
 
 
 def crop(images_BxHW: Tensor, crop_fraction: float, generator: torch.Generator | None) -> Tensor:
-    """Return what the windows of `draw_windows` show of (B, ..., H, W) images."""
+    """Crop (B, ..., H, W) images to the windows of `draw_windows`."""
     return draw_windows(images_BxHW, crop_fraction, generator).cut(images_BxHW)
 
 

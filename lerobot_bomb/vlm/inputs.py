@@ -1,4 +1,4 @@
-"""Reading a batch, with errors that say what is amiss."""
+"""Reading of a batch, with errors that name the fault."""
 
 import torch
 from lerobot.utils.constants import OBS_LANGUAGE_ATTENTION_MASK, OBS_LANGUAGE_TOKENS, OBS_STATE

@@ -31,7 +31,7 @@ class Piece(NamedTuple):
 class PromptLayout:
     """Pieces of a prompt, in order.
 
-    No piece of a row's own stands before an image, so an image's columns are the same in every row.
+    No text of its own comes before an image of a row, so an image's columns are the same in every row.
     """
 
     pieces: Sequence[Piece]
@@ -43,7 +43,7 @@ class PromptLayout:
         return sum(piece.width if piece.ids is None else len(piece.ids) for piece in self.pieces)
 
     def spans(self, num_columns: int) -> dict[str, slice]:
-        """Return the columns of each part of prompts that have so many, padding included."""
+        """Return the columns of each part of prompts of this width, padding included."""
         spans: dict[str, slice] = {}
         column = 0
         for part, ids, width in self.pieces:
@@ -55,7 +55,7 @@ class PromptLayout:
         return spans
 
     def fill(self, rows: Mapping[str, TokenRows]) -> TokenRows:
-        """Join the pieces of a batch; ``rows``: each row's own tokens, by part."""
+        """Join the parts of a batch's prompts; ``rows``: each row's own tokens, by part."""
         like_BL = rows[INSTRUCTION].ids
         return TokenRows.join(
             [rows[part] if ids is None else TokenRows.constant(ids, like_BL) for part, ids, _ in self.pieces]

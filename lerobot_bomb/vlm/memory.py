@@ -11,7 +11,7 @@ GIB = 2**30
 
 
 def check_memory(vlm_config: dict[str, Any], build: Callable[[], nn.Module], dtype: torch.dtype) -> None:
-    """Check that the model that `build` makes of a `vlm_config` has room in this machine's memory.
+    """Check that the model of a `vlm_config` fits into this machine's memory.
 
     ``dtype``: of most of its weights.
 

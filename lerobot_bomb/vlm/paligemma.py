@@ -1,4 +1,4 @@
-"""PaliGemma 2 behind the few operations a policy needs.
+"""PaliGemma 2, reduced to the few operations that a policy needs.
 
 Shapes: `B` batch, `L` tokens, `H` hidden size of the text model, `E` of the vision model, `V` vocabulary, `P`
 tokens of an image.
@@ -82,7 +82,7 @@ class PaliGemmaBackbone(Backbone):
 
     @property
     def has_tied_head(self) -> bool:
-        """True if words are written by the table that they are read by."""
+        """True if input and output embeddings are one table."""
         return self.vlm.lm_head.weight is self.vlm.get_input_embeddings().weight
 
     def encode_pixels(self, pixels_B3SS: Tensor) -> Tensor:

@@ -1,4 +1,4 @@
-"""Prefix: what a language model keeps of tokens that it has read, for others to go on from.
+"""Prefix: keys and values of tokens that a language model has read, for later tokens to attend to.
 
 Shapes: `B` batch, `L` tokens of a prefix, `T` of a segment, `H` hidden size, `V` key-value heads, `E` size of
 a head.
@@ -39,7 +39,7 @@ class Prefix:
 
 
 class Reader:
-    """Stands where a layer expects a cache: what is kept is read and not changed."""
+    """Stands in for a layer's cache: the kept keys and values are read, not changed."""
 
     def __init__(self, kept: KeysValues | None):
         self._kept, self.new = kept, kept

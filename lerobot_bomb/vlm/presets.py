@@ -36,7 +36,7 @@ FIXED = ("model_type", "vocab_size")
 def changed(
     config: dict[str, Any], changes: Mapping[str, Any] | None, flag: str = "--policy.nano_config"
 ) -> dict[str, Any]:
-    """A preset with other values where ``changes``, nested as the preset is, has some.
+    """Return a preset with the values of ``changes``, which is nested like the preset.
 
     Raises:
         ValueError: the preset has no such value to change.

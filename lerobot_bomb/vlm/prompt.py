@@ -6,7 +6,7 @@ The whole sequence is, in SmolVLM's:
     Assistant: a1 a2 ... an<end_of_utterance>
 
 with IMG = ``<fake_token_around_image><global-img><image>...<image><fake_token_around_image>``. A system
-prompt stands before ``User:`` as ``System: {text}<end_of_utterance>`` and a line break. In Qwen2.5-VL's:
+prompt precedes ``User:`` as ``System: {text}<end_of_utterance>`` and a line break. In Qwen2.5-VL's:
 
     <|im_start|>system
     You are a helpful assistant.<|im_end|>
@@ -42,7 +42,7 @@ TASK_TEMPLATE = "Task: {},"
 
 @dataclass(frozen=True)
 class ChatFormat:
-    """Format of a chat: what a family of models puts around a user's texts and its own."""
+    """Chat format of a family of models: the tokens around the user's texts and its own."""
 
     family: str  # of its tokenizers, in messages
     start: str  # of the sequence
@@ -60,7 +60,7 @@ class ChatFormat:
     image_label: str = ""  # after an image's start
 
     def opening(self, tokenizer: Tokenizer, vlm_model_name: str, system_prompt: str | None) -> list[int]:
-        """Tokens of all that stands before the user's images; raises as `single_id`."""
+        """Tokens before the user's images; raises like `single_id`."""
         ids = [single_id(tokenizer, vlm_model_name, self.family, self.start)]
         text = self.default_system if system_prompt is None else system_prompt
         if text is not None:
@@ -207,7 +207,7 @@ def normalize_task(task: str) -> str:
 
 
 def check_template(template: object, name: str) -> None:
-    """Raise a ValueError unless what is written around an instruction holds ``{}`` once, for it.
+    """Raise a ValueError unless the template holds ``{}`` once, for the instruction.
 
     ``name``: what the message calls it.
     """
@@ -226,7 +226,7 @@ def task_ids(tokenizer: Tokenizer, task: str, template: str = TASK_TEMPLATE) -> 
 
 
 def text_ids(tokenizer: Tokenizer, text: str) -> list[int]:
-    """Tokens of a user's text; what looks like a special token stays text."""
+    """Tokens of a user's text; text that looks like a special token stays text."""
     tokenizer.encode_special_tokens = True
     try:
         return tokenizer.encode(text, add_special_tokens=False).ids

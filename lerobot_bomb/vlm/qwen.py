@@ -40,7 +40,7 @@ from lerobot_bomb.vlm.tokenizer import NANO, load_tokenizer, single_id
 
 @dataclass(frozen=True)
 class QwenPrompt:
-    """Token ids of everything in a prompt but the task: start, images, task, whatever else, end."""
+    """Token ids of all parts of a prompt except the task, in order."""
 
     start: list[int]
     image_start: int
@@ -95,7 +95,7 @@ class QwenBackbone(Backbone):
             self.register_buffer(name, torch.tensor(values)[:, None, None], persistent=False)
 
     def checkpoint_gradients(self) -> None:
-        """Compute what is inside a layer again in the backward pass instead of keeping it."""
+        """Recompute a layer's activations in the backward pass instead of keeping them."""
         self._is_checkpointed = True  # transformers' own kind gives layers no cache
         self.vlm.model.visual.gradient_checkpointing_enable(CHECKPOINTING)
 
@@ -109,7 +109,7 @@ class QwenBackbone(Backbone):
         return [*self.text_model.layers, *self.vlm.model.visual.blocks]
 
     def freeze_vision(self) -> None:
-        """Train the connector and what follows it only."""
+        """Train only the connector and what follows it."""
         self.vlm.model.visual.requires_grad_(False)
         self.vlm.model.visual.merger.requires_grad_(True)
 
@@ -132,7 +132,7 @@ class QwenBackbone(Backbone):
         return frames.flatten(5).flatten(0, 4)
 
     def positions(self, column_C: Tensor, image_columns: Tensor) -> Tensor:
-        """(C,) columns of a sequence, from 0 -> (3, C) time, line and column of what stands there."""
+        """(C,) columns of a sequence, from 0 -> (3, C) time, line and column of their tokens."""
         is_image_1C = torch.isin(column_C, image_columns.to(column_C.device))[None]
         return self._positions(is_image_1C, torch.ones_like(is_image_1C))[0][:, 0]
 
@@ -141,8 +141,8 @@ class QwenBackbone(Backbone):
     ) -> Tensor:
         """Embeddings of rows that start with their tokens -> (B, L, H) states after the last layer.
 
-        ``image_columns``: where the images stand, in every row. Attention is causal, so what follows a row's
-        end changes nothing before it. ``hidden_BL``: tokens that no other reads.
+        ``image_columns``: the images' columns, the same in every row. Attention is causal, so what follows a
+        row's end changes nothing before it. ``hidden_BL``: tokens that no other reads.
         """
         column_L = torch.arange(embeds_BLH.shape[1], device=embeds_BLH.device)
         is_image_BL = torch.isin(column_L, image_columns).expand(len(embeds_BLH), -1)
@@ -157,7 +157,7 @@ class QwenBackbone(Backbone):
         hidden_BL: Tensor | None = None,
         num_shared: int = 0,
     ) -> Prefix:
-        """Read rows whose first column is written; ``is_image_BL``: which tokens are parts of images.
+        """Read rows from their first column on; ``is_image_BL``: which tokens belong to images.
 
         ``hidden_BL``: tokens that no other reads. They keep their positions. ``num_shared``: first columns
         that are written and the same in all rows; they are read once.
@@ -189,7 +189,7 @@ class QwenBackbone(Backbone):
         """(B, T, H) states after the last layer of tokens that follow a prefix and read all of it.
 
         ``attention_mask_BTT``: of the segment's tokens among themselves. ``num_copies``: equally long parts
-        of the segment, each of which stands right behind the prefix.
+        of the segment, each placed right behind the prefix.
         """
         column_T = torch.arange(embeds_BTH.shape[1], device=embeds_BTH.device)
         positions_BT = prefix.next_position + column_T % (len(column_T) // num_copies)

@@ -1,4 +1,4 @@
-"""Qwen2.5-VL's vision model on images of one size: what stock code does an image at a time, at once.
+"""Qwen2.5-VL's vision model on images of one size, computed at once instead of one by one.
 
 Shapes: `B` images, `P` patches of an image, `N` patches of all images, `E` features, `H` hidden size.
 """
@@ -53,7 +53,7 @@ def read_windows_at_once(visual: nn.Module) -> None:
 
 
 def embed_patches(visual: Any, patches: Tensor, num_images: int, side: int) -> Tensor:
-    """Patches of square images, so many a side -> features (num_images, P / 4, H) of merged patches.
+    """Patches of square images -> features (num_images, P / 4, H) of merged patches.
 
     Windows and rotations are those of one image, again for each.
     """

@@ -45,10 +45,9 @@ class TaskStep(ObservationProcessorStep):
     """Reads the batch for all that follows: numbers as float32, a row for each instruction, all checked.
 
     It is in the pipelines of all our checkpoints, before anything is normalised. LeRobot's normaliser casts
-    all its statistics to the type of what it normalised last, and a checkpoint saves them so: of whole
-    numbers nothing but these would be left. Refused are images, state and actions that are not finite,
-    images outside [0, 1], and another number of rows than of instructions. On CUDA the host waits once,
-    before the pass.
+    all its statistics to the type of its last input, and a checkpoint saves them like that: whole numbers
+    would truncate them. Images, state and actions must be finite, images in [0, 1], and rows as many as
+    instructions. On CUDA the host waits once, before the pass.
     """
 
     def __call__(self, transition: EnvTransition) -> EnvTransition:
@@ -69,7 +68,7 @@ class TaskStep(ObservationProcessorStep):
 
     @abstractmethod
     def tokens(self, tasks: list[str]) -> dict[str, Tensor]:
-        """Return what is added to the observation: ids (B, L) and whatever goes with them, by their keys."""
+        """Return the entries to add to the observation, by key: ids (B, L) and what belongs to them."""
 
     def transform_features(
         self, features: dict[PipelineFeatureType, dict[str, PolicyFeature]]
@@ -161,7 +160,7 @@ class TaskTokenizerStep(TaskStep):
 
 
 def _read_by_policies(observation: Mapping[str, Any], actions: Any) -> dict[str, Tensor]:
-    """Images, state and actions; depth is not finite where there is none."""
+    """Images, state and actions, by key; not depth, which is not finite where it is missing."""
     return {
         key: values
         for key, values in {**observation, ACTION: actions}.items()

@@ -10,7 +10,7 @@ from lerobot_policy_fdvla.configuration_fdvla import FdvlaConfig
 
 
 def build_model(config: FdvlaConfig) -> tuple[QwenPrompt, QwenBackbone]:
-    """Base model, or the architecture of a checkpoint; fills in what a checkpoint's config must hold."""
+    """Build the base model, or a checkpoint's architecture; fill in what a checkpoint's config must hold."""
     if config.vlm_config is None:
         name = config.vlm_model_name
         check_family(name, QwenBackbone.family)

@@ -1,4 +1,4 @@
-"""Model card of ``fdvla``: what it says of the method."""
+"""Model card of ``fdvla``: the text about its method."""
 
 from lerobot_bomb.hub.method import Method, Paper
 

@@ -241,7 +241,7 @@ class FdvlaConfig(RelativeVlaConfig, PlacesVlaConfig):
 
     @property
     def used_sampler(self) -> str:
-        """The sampler asked for, or the one for the heads that there are."""
+        """The sampler of the flag, or the default for the heads."""
         if self.sampler is not None:
             return self.sampler
         if self.use_flow_head:
@@ -250,7 +250,7 @@ class FdvlaConfig(RelativeVlaConfig, PlacesVlaConfig):
 
     @property
     def used_consistency_weight(self) -> float:
-        """The weight asked for, or the one for the heads that there are."""
+        """The weight of the flag, or the default for the heads."""
         if self.consistency_loss_weight is not None:
             return self.consistency_loss_weight
         return CONSISTENCY_LOSS_WEIGHT if self.use_flow_head and self.use_denoise_head else 0.0

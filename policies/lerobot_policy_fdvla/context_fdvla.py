@@ -19,7 +19,7 @@ class Context:
     feedback: Tensor | None  # (B, H) of what was pointed at; None: nothing is
 
     def of_draws(self, number: int) -> "Context":
-        """Return what the heads take, of each observation so many times; the prefix is read as it is."""
+        """Return the heads' inputs, each observation repeated; the prefix is shared."""
         if number == 1:
             return self
         repeat = partial(torch.repeat_interleave, repeats=number, dim=0)

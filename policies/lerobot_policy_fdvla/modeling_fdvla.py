@@ -52,7 +52,7 @@ NEW_PARTS = ("segment", "state_embedding", "pointer", BOARD_READER, "flow_head",
 
 
 class FdvlaPolicy(RelativeVlaPolicy, PointingVlaPolicy):
-    """A Qwen2.5-VL that reads noisy actions; two heads predict where they go and what noise is in them."""
+    """A Qwen2.5-VL that reads noisy actions; two heads predict their velocity and their noise."""
 
     config_class = FdvlaConfig  # pyright: ignore[reportAssignmentType]  LeRobot annotates it as None
     name = "fdvla"  # pyright: ignore[reportAssignmentType]
@@ -167,7 +167,7 @@ class FdvlaPolicy(RelativeVlaPolicy, PointingVlaPolicy):
     def chunk_loss(
         self, prompt: TokenRows, embeds_BLH: Tensor, state_BS: Tensor | None, point: PathPoint
     ) -> Tensor:
-        """(B,) losses of both heads, with neither their disagreement nor what is pointed at.
+        """(B,) losses of both heads, without their disagreement and without pointing.
 
         ``B`` may be a multiple of the prompts', which were embedded before. ``state_BS``: None without
         pointing.
@@ -282,7 +282,7 @@ class FdvlaPolicy(RelativeVlaPolicy, PointingVlaPolicy):
         return actions_BKD
 
     def pointed(self, batch: dict[str, Tensor]) -> PointedAt | None:
-        """Return what is pointed at in a batch of one row; None: nothing is."""
+        """Return what the policy points at in a batch of one row; None if it does not point."""
         if self.pointer is None:
             return None
         self.eval()
@@ -386,12 +386,12 @@ class FdvlaPolicy(RelativeVlaPolicy, PointingVlaPolicy):
         return self.segment.of_actions(states.reshape(embeds_BTH.shape))
 
     def _pointing(self, context: Context, state_BS: Tensor) -> Context:
-        """Return the context with the feedback of what it points at."""
+        """Return the context with the feedback of its pointing."""
         assert self.pointer is not None
         return replace(context, feedback=self.pointer.feed_back(self._point(context, state_BS)))
 
     def _point(self, context: Context, state_BS: Tensor) -> Pointed:
-        """Read off the first action's token, of a chunk of zeros where all is noise."""
+        """Predict from the first action's token, for a chunk of zeros at tau = 0."""
         assert self.pointer is not None
         shape, device = (len(context.pooled), self.config.chunk_size, self.action_dim), self._device
         attended_BK = torch.ones(shape[:2], dtype=torch.bool, device=device)
@@ -418,7 +418,7 @@ class FdvlaPolicy(RelativeVlaPolicy, PointingVlaPolicy):
         return Context(prefix, pooled_BH, feedback=None)
 
     def _pooled(self, prompt: TokenRows) -> Tensor:
-        """(B, L) bool: the tokens that are pooled; all of them where there is no instruction."""
+        """(B, L) bool: the tokens that are pooled; all of them without an instruction."""
         attention_mask_BL = prompt.attention_mask
         if self.config.reasoning_pool == "all_prefix":
             return attention_mask_BL

@@ -63,7 +63,7 @@ class ActionSegment(nn.Module):
 
 @dataclass(frozen=True)
 class SideBySide:
-    """Segments of so many draws of an observation as one, in which none attends to another's tokens."""
+    """Segments of several draws of an observation side by side; none attends to another's tokens."""
 
     number: int
 
@@ -89,12 +89,12 @@ class Head(nn.Module):
         self.out = nn.Linear(head_dim, action_dim)
 
     def forward(self, states_BKH: Tensor, modulation: tuple[Tensor, Tensor] | None) -> Tensor:
-        """(B, K, H) states, and what `modulation` gave for the prompt -> (B, K, D)."""
+        """(B, K, H) states and the prompt's `modulation` -> (B, K, D)."""
         features_BKF = self.features(states_BKH)
         if modulation is not None:
             features_BKF = modulate(features_BKF, *modulation)
         return self.out(features_BKF)
 
     def modulation(self, pooled_BH: Tensor) -> tuple[Tensor, Tensor] | None:
-        """Return what (B, H) pooled states make of the features, the same in all sampling steps."""
+        """Return scale and shift of the features from (B, H) pooled states, for all sampling steps."""
         return None if self.film is None else self.film.coefficients(pooled_BH)

@@ -119,7 +119,7 @@ class Pointer(DataUnits):
         }
 
     def fit(self, meta: LeRobotDatasetMetadata, config: FdvlaConfig) -> None:
-        """Take from a dataset what its normalised numbers are, and that it points where this can."""
+        """Take the normalisation from a dataset, and check that its labels are in range."""
         config.take_places(meta)
         self.fit_units(meta, config.normalization_mapping)
 

@@ -47,7 +47,7 @@ class ScoredFdvla(ScoredPromptPolicy):
         return -loss_B.unflatten(0, (num_rows, NUM_DRAWS)).mean(dim=1)
 
     def token_spans(self, rows: Rows) -> dict[str, TokenSpan]:
-        """Return spans in passes over the prompt, padding included, over what points, and noisy actions."""
+        """Return the token spans of the prompt, padding included, of pointing, and of noisy actions."""
         segments = [ANSWER] if self.policy.pointer is None else [POINTING, ANSWER]
         spans: dict[str, TokenSpan] = {
             part: (each, *[None] * len(segments)) for part, each in self.columns(rows).items()

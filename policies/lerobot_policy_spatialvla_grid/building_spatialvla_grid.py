@@ -1,4 +1,4 @@
-"""The parts of a ``spatialvla_grid``, from its config, a checkpoint's or a dataset."""
+"""Parts of a ``spatialvla_grid``, built from its config, a checkpoint or a dataset."""
 
 import logging
 from collections.abc import Sequence
@@ -31,7 +31,7 @@ EGO3D_LAYERS = r"ego3d\.layers\.[03]"
 
 
 def adapted_layers(config: SpatialvlaGridConfig) -> list[str]:
-    """Patterns of these, as far as the config trains them."""
+    """Return name patterns of the layers with adapters, of the parts that the config trains."""
     others = [PROJECTOR]
     if not config.freeze_vision_encoder:
         others.append(VISION_LAYERS)
@@ -72,9 +72,9 @@ def build_depth(config: SpatialvlaGridConfig) -> ZoeDepth | None:
 
 
 def complete_depth(config: SpatialvlaGridConfig, meta: LeRobotDatasetMetadata | None) -> None:
-    """Let a checkpoint's config have what its ``depth_source`` needs, if it was trained with another.
+    """Complete a checkpoint's config for its ``depth_source``, if it was trained with another.
 
-    What the dataset ``meta`` lacks is told later; without one, the first batch tells.
+    Features that the dataset ``meta`` lacks are reported later; without a dataset, by the first batch.
     """
     config.read_depth_of(None if meta is None else meta.features)
     if config.depth_source == "zoedepth" and config.depth_config is None:
@@ -82,7 +82,7 @@ def complete_depth(config: SpatialvlaGridConfig, meta: LeRobotDatasetMetadata | 
 
 
 def make_grids(config: SpatialvlaGridConfig, meta: LeRobotDatasetMetadata | None) -> ActionGrids:
-    """A checkpoint's grids, or those that fit the data, or even ones where there is neither."""
+    """Return a checkpoint's grids, else those fitted to the data, else uniform ones."""
     assert config.action_feature is not None
     num_dims = config.action_feature.shape[0]
     if config.grid_params is not None:
@@ -128,7 +128,7 @@ def make_layout(
 
 
 def build_model(config: SpatialvlaGridConfig) -> tuple[PaliGemmaPrompt, PaliGemmaBackbone]:
-    """Base model, or the architecture of a checkpoint; fills in what a checkpoint's config must hold."""
+    """Build the base model, or a checkpoint's architecture; fill in what a checkpoint's config must hold."""
     if config.vlm_config is None:
         name = config.vlm_model_name
         check_family(name, PaliGemmaBackbone.family)

@@ -1,4 +1,4 @@
-"""Model card of ``spatialvla_grid``: what it says of the method."""
+"""Model card of ``spatialvla_grid``: the text about its method."""
 
 from lerobot_bomb.hub.method import Method, Paper
 

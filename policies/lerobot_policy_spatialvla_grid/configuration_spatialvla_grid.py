@@ -169,7 +169,7 @@ class SpatialvlaGridConfig(TokenVlaConfig, PlacesVlaConfig):
         self.stone_cells()
 
     def validate_features(self) -> None:
-        """Raise unless the dataset (or environment) has what the policy reads and writes."""
+        """Raise unless the dataset or environment has all features that the policy reads and writes."""
         super().validate_features()
         if self.depth_source == "observation":
             self._check_depth()
@@ -199,7 +199,7 @@ class SpatialvlaGridConfig(TokenVlaConfig, PlacesVlaConfig):
 
     @property
     def prompt_template(self) -> str:
-        """`task_template` as it is written."""
+        """`task_template`, verbatim."""
         return self.task_template.lower()
 
     def check_template_as_trained(self) -> None:
@@ -217,9 +217,9 @@ class SpatialvlaGridConfig(TokenVlaConfig, PlacesVlaConfig):
         return self.depth_source != "none" or self.ego3d_no_depth_vector
 
     def read_depth_of(self, given: Collection[str] | None) -> None:
-        """Let a checkpoint that was trained without observed depth read what observations give.
+        """Let a checkpoint that was trained without observed depth read the observations' depth.
 
-        ``given``: their keys; None: they are not known yet, and a batch will say what is missing.
+        ``given``: their keys; None if they are not known yet, so that a batch reports what is missing.
         """
         if self.depth_source == "observation":
             read = {

@@ -157,7 +157,7 @@ class SpatialvlaGridPolicy(TokenVlaPolicy, PointingVlaPolicy):
 
     @torch.no_grad()
     def _adapt(self, meta: LeRobotDatasetMetadata) -> None:
-        """Fit the grids to another dataset; a cell's rows become those of where it lies in the old grids."""
+        """Fit the grids to another dataset; a new cell takes its rows from its position in the old grids."""
         old, new = self.grids, ActionGrids(self.config.grid_settings(), self.action_dim)
         fit_to_data(new, self.config, meta)
         if new.to_dict() == old.to_dict():  # a training that is resumed
@@ -244,7 +244,7 @@ class SpatialvlaGridPolicy(TokenVlaPolicy, PointingVlaPolicy):
     def _hidden(
         self, batch: dict[str, Tensor], cells_BTG: Tensor, pointed_BN: Tensor | None = None
     ) -> tuple[Tensor, Tensor, Tensor]:
-        """(B, N, H) and (B, T, G, H) teacher-forced states that predict what is pointed at, and the cells.
+        """(B, N, H) and (B, T, G, H) teacher-forced states that predict pointing tokens and cells.
 
         And image features (B, P, H), P of all cameras.
         """
@@ -280,7 +280,7 @@ class SpatialvlaGridPolicy(TokenVlaPolicy, PointingVlaPolicy):
         return self._split(hidden_BXH[:, -rows_BS.shape[1] :])
 
     def _split(self, answer: Tensor) -> tuple[Tensor, Tensor]:
-        """(B, S, ...) of an answer -> (B, N, ...) of what points and (B, T, G, ...) of cells."""
+        """(B, S, ...) of an answer -> (B, N, ...) of pointing tokens and (B, T, G, ...) of cells."""
         pointing, cells = answer.tensor_split([len(self._pointing_rows)], dim=1)
         return pointing, cells.unflatten(1, (-1, len(self.grids.groups)))
 
@@ -356,7 +356,7 @@ class SpatialvlaGridPolicy(TokenVlaPolicy, PointingVlaPolicy):
 
     @torch.no_grad()
     def write(self, batch: dict[str, Tensor], num_steps: int) -> Tensor:
-        """(B, S) answers: what is pointed at, then the cells of so many steps."""
+        """(B, S) answers: pointing tokens, then the cells of all steps."""
         self.eval()
         with self.autocast():
             prompt = self.prompt(batch)
@@ -375,7 +375,7 @@ class SpatialvlaGridPolicy(TokenVlaPolicy, PointingVlaPolicy):
         return answer_BS
 
     def pointed(self, batch: dict[str, Tensor]) -> PointedAt | None:
-        """Return what is pointed at in a batch of one row; None: nothing is."""
+        """Return what the policy points at in a batch of one row; None if it does not point."""
         if self.pointer is None:
             return None
         pointed_1N, cells_1TG = self._split(self.write(batch, self.config.chunk_size))
@@ -386,7 +386,7 @@ class SpatialvlaGridPolicy(TokenVlaPolicy, PointingVlaPolicy):
 
     @property
     def last_passes(self) -> int | None:
-        """Passes of the text model in the last prediction, the prompt's included; None: there was none."""
+        """Passes of the text model in the last prediction, the prompt's included; None if there was none."""
         return self._decoder.num_passes
 
     @property

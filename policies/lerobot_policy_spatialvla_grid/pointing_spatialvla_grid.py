@@ -35,7 +35,7 @@ class StoneCells:
 
     @classmethod
     def of_flags(cls, area_m: list[list[float]], cell_m: float) -> "StoneCells":
-        """Raise a ValueError that names the flag unless they are squares of an area."""
+        """Build the cells; raise a ValueError, which names the flag, if their size or the area is wrong."""
         if not CELL_M[0] <= cell_m <= CELL_M[1]:
             raise ValueError(f"--policy.pointing_cell_m={cell_m} must lie in {CELL_M[0]:g}..{CELL_M[1]:g}")
         if [len(corner) for corner in area_m] == [2, 2]:
@@ -118,7 +118,7 @@ class CellPointer(nn.Module):
 
     @torch.no_grad()
     def fit(self, meta: LeRobotDatasetMetadata, config: "SpatialvlaGridConfig") -> None:
-        """Take from a dataset what its normalised actions are."""
+        """Take the normalisation of actions from a dataset."""
         self.action_bounds.copy_(unit_bounds(meta, ACTION, config.normalization_mapping["ACTION"]))
 
     def draw(
@@ -126,7 +126,7 @@ class CellPointer(nn.Module):
     ) -> tuple[Labels, Target]:
         """Draw what a batch points at, actions as LeRobot normalises them; and the tokens that are given.
 
-        There is no loss of another place than the one that is meant.
+        Counterfactual places carry no loss.
         """
         labels = Labels.draw(batch, self.places, config.counterfactual_share, config.type, generator)
         tokens_B2 = torch.stack([labels.given, self.stones.number_of(labels.stone_xy)], dim=1)

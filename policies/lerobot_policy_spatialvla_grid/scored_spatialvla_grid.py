@@ -18,7 +18,7 @@ if TYPE_CHECKING:
 
 
 class ScoredSpatialvlaGrid(ScoredPromptPolicy):
-    """Answers are the tokens of a whole chunk, and what is pointed at ahead of them, (1, S)."""
+    """Answers are the pointing tokens and those of a whole chunk, (1, S)."""
 
     policy: "SpatialvlaGridPolicy"
     unit: ClassVar[str] = "nats"

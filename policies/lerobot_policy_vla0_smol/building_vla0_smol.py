@@ -24,7 +24,7 @@ type TextBackbone = SmolVLMBackbone | QwenBackbone
 
 
 def build_model(config: Vla0SmolConfig) -> tuple[PromptTokens, TextBackbone]:
-    """Base model, or the architecture of a checkpoint; fills in what a checkpoint's config must hold."""
+    """Build the base model, or a checkpoint's architecture; fill in what a checkpoint's config must hold."""
     if config.vlm_config is None:
         tokens, backbone = _load(config)
         config.vlm_config, config.prompt_tokens = config_dict(backbone.vlm), tokens.to_dict()

@@ -1,4 +1,4 @@
-"""Model card of ``vla0_smol``: what it says of the method."""
+"""Model card of ``vla0_smol``: the text about its method."""
 
 from lerobot_bomb.hub.method import Method, Paper
 

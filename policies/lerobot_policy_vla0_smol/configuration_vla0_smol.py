@@ -142,7 +142,7 @@ class Vla0SmolConfig(RelativeVlaConfig, TokenVlaConfig, PointingVlaConfig):
             )
 
     def check_masking(self) -> None:
-        """Raise unless training can hide what it is told to hide.
+        """Raise a ValueError if the masking flags would hide nothing.
 
         Of n units of a chunk a fraction below ``mask_max_fraction`` is hidden, rounded down.
 

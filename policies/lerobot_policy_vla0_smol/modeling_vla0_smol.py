@@ -108,7 +108,7 @@ class Vla0SmolPolicy(RelativeVlaPolicy, TokenVlaPolicy, PointingVlaPolicy):
             self.pointer.fit(meta, self.config)
 
     def _num_numbers(self, num_steps: int) -> int:
-        """Numbers of an answer of so many actions."""
+        """Count the numbers of an answer with this many actions."""
         return self._num_pointing + num_steps * self.action_dim
 
     def scored(self) -> ScoredVla0Smol:
@@ -225,7 +225,7 @@ class Vla0SmolPolicy(RelativeVlaPolicy, TokenVlaPolicy, PointingVlaPolicy):
         return bins_BN, loss_mask_BN
 
     def _action_targets(self, actions_BTD: Tensor, loss_mask_BT: Tensor) -> tuple[Tensor, Tensor]:
-        """Actions alone, of which the model writes every dimension."""
+        """Targets of the actions alone, all dimensions."""
         bins_BN = self.action_bins.encode(actions_BTD).flatten(1)
         return bins_BN, loss_mask_BT.repeat_interleave(self.action_dim, dim=1)
 
@@ -271,7 +271,7 @@ class Vla0SmolPolicy(RelativeVlaPolicy, TokenVlaPolicy, PointingVlaPolicy):
 
     @torch.no_grad()
     def write(self, batch: dict[str, Tensor], num_steps: int) -> Tensor:
-        """(B, N) the numbers of so many actions, and of what is pointed at before them."""
+        """(B, N) numbers: those of pointing, then those of the actions."""
         self.eval()
         with self.autocast():
             prompt = self.prompt(batch)
@@ -291,19 +291,19 @@ class Vla0SmolPolicy(RelativeVlaPolicy, TokenVlaPolicy, PointingVlaPolicy):
         return decoded.numbers
 
     def pointed(self, batch: dict[str, Tensor]) -> PointedAt | None:
-        """Return what is pointed at in a batch of one row; None: nothing is."""
+        """Return what the policy points at in a batch of one row; None if it does not point."""
         if self.pointer is None:
             return None
         return self.pointer.pointed_at(self.write(batch, self.config.chunk_size)[0, :NUM_NUMBERS])
 
     @property
     def last_passes(self) -> int | None:
-        """Passes of the text model in the last prediction, the prompt's included; None: there was none."""
+        """Passes of the text model in the last prediction, the prompt's included; None if there was none."""
         return None if self._decoded is None else self._decoded.num_passes
 
     @property
     def last_tokens(self) -> float | None:
-        """Spaces and digits of the last prediction, the mean over its rows; None: there was none."""
+        """Spaces and digits of the last prediction, the mean over its rows; None if there was none."""
         if self._decoded is None:
             return None
         written = self._to_tokens(self._decoded.numbers, self.config.n_action_bins).mask

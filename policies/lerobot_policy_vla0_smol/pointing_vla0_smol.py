@@ -70,10 +70,10 @@ class TextPointer(DataUnits):
         }
 
     def fit(self, meta: LeRobotDatasetMetadata, config: Vla0SmolConfig) -> None:
-        """Take from a dataset what its normalised numbers are.
+        """Take the normalisation of the numbers from a dataset.
 
         Raises:
-            ValueError: it does not point, or at what is beyond the range.
+            ValueError: it has no pointing labels, or some are out of range.
         """
         config.require_labels(meta)
         columns = read_columns(meta, (PLACE, STONE, OTHER_PLACES), present_episodes(meta))

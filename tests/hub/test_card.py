@@ -147,8 +147,8 @@ def test_a_suite_that_is_not_known_is_not_made_up() -> None:
     assert "`SUITE` is that of its training, which the dataset does not say." in text
     assert "- environment: BOMB, task version 1.0, an unknown suite, robot scara" in text
     result = read(values(0, spec={"suite": "object"}, task_version="1.1", target=None))
-    played = str(replace(unknown, results=[[result]]).card())
-    assert "--env.task=object" in played and "SUITE" not in played
+    card = str(replace(unknown, results=[[result]]).card())
+    assert "--env.task=object" in card and "SUITE" not in card
 
 
 @pytest.mark.parametrize(

@@ -35,7 +35,7 @@ REPO_ID = "me/x"
 
 
 class LoadedError(Exception):
-    """Policy and processors are there; no episode is played."""
+    """Policy and processors are there; no episode is run."""
 
 
 @pytest.fixture

@@ -14,7 +14,7 @@ from lerobot_env_mujoco.mujoco_gl import mujoco
 
 @dataclass(frozen=True)
 class GoalMarker(Transform):
-    """A blue dot on the target; of several, the last."""
+    """A blue dot on the target, or on the last of several."""
 
     level: int
     target_xy: tuple[float, float]  # metres

@@ -47,7 +47,7 @@ class Stones(Transform):
 def _grow(
     opening: Mapping[Intersection, str], num_extra: int, colors: Sequence[str], rng: np.random.Generator
 ) -> dict[Intersection, str]:
-    """{(row, column): colour} of stones that can join the opening, the colours in turn."""
+    """{(row, column): colour} of stones that can join the opening, colours in turn."""
     extra: dict[Intersection, str] = {}
     first = int(rng.integers(len(COLORS)))
     for place in rng.permutation(BOARD.num_lines**2):

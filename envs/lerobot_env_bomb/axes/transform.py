@@ -13,5 +13,5 @@ class Transform(EpisodeTransform):
         """Change the compiled model in place."""
 
     def arrange(self, layout: Layout, supply: tuple[int, ...]) -> Layout:
-        """The layout after the change; `supply`: indices of the stones in the tray."""
+        """Return the changed layout; `supply`: indices of the stones in the tray."""
         return layout

@@ -15,7 +15,7 @@ MAX_RETREAT = 1.6  # times the nominal distance
 
 
 class LiberoCamera(CameraTransform, LiberoTransform):
-    """Pose and field of view of both cameras; what the scene's camera showed of objects it still shows."""
+    """Pose and field of view of both cameras; objects in the scene camera's view stay in view."""
 
     axes = LIBERO_AXES
 

@@ -1,5 +1,5 @@
 # pyright: reportAttributeAccessIssue=false
-"""Perturbation axis `distractors`: bodies beside the objects, which nothing is said about."""
+"""Perturbation axis `distractors`: bodies beside the objects that no instruction mentions."""
 
 from dataclasses import dataclass
 from typing import Any, Self
@@ -29,7 +29,7 @@ IN_VIEW = 0.9  # of the image of the scene's camera, in whose middle they are
 
 @dataclass(frozen=True)
 class Distractors(LiberoTransform):
-    """Bodies that stand fast; one more at each level, the others where they were."""
+    """Fixed bodies: one more at each level, the others in the same places."""
 
     count: int
     order: tuple[float, ...]  # of the places that are free, a number for each that is tried

@@ -19,7 +19,7 @@ REACH_M = 0.36  # from the middle of the table along x and y, that nothing is mo
 
 @dataclass(frozen=True)
 class LiberoStart(LiberoTransform):
-    """Objects that stand free are moved, with what lies on them; the arm's joints are turned a little."""
+    """Free objects are moved, with what lies on them; the arm's joints are turned a little."""
 
     object_m: float
     directions_rad: tuple[float, ...]  # of the objects, in the order of the task's
@@ -45,7 +45,7 @@ class LiberoStart(LiberoTransform):
                 self._move(scene, pile, direction_rad)
 
     def _move(self, scene: LiberoScene, pile: set[int], direction_rad: float) -> None:
-        """Move a pile in the first direction, from the drawn one on, in which it meets nothing, if any."""
+        """Move a pile in the first free direction, beginning with the drawn one, if any is free."""
         others = [box for body, box in scene.boxes().items() if body not in pile]
         boxes = [box for body, box in scene.boxes().items() if body in pile]
         addresses = [int(scene.model.jnt_qposadr[scene.model.body_jntadr[body]]) for body in sorted(pile)]

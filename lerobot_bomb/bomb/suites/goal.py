@@ -29,9 +29,9 @@ def _draw_board(rng: np.random.Generator) -> dict[Intersection, str]:
     return draw_stones(rng, int(rng.integers(MIN_STONES, MAX_STONES + 1)))
 
 
-def _to_tray(drawn: TaskInstance, cells: list[Intersection]) -> tuple[Plan, tuple[Aim, ...]]:
+def _to_tray(drawn: TaskInstance, intersections: list[Intersection]) -> tuple[Plan, tuple[Aim, ...]]:
     """Return the plan and the aims that put all of these stones into the tray, in whichever order."""
-    stones = [drawn.stone_on(cell) for cell in cells]
+    stones = [drawn.stone_on(intersection) for intersection in intersections]
     plan = tuple(one_move(stone, [TRAY]) for stone in stones)
     return plan, tuple(Aim(stone, xy) for stone, xy in zip(stones, TRAY_XY_M, strict=False))
 
@@ -47,10 +47,10 @@ class RemoveColor(Task):
 
     def case(self, drawn: TaskInstance) -> Case | None:
         color, row = COLORS[drawn.about[0]], drawn.about[1]
-        cell = only(drawn.stones, color)
-        if cell is None or cell[0] != row or not is_graspable(drawn.stones, cell):
+        intersection = only(drawn.stones, color)
+        if intersection is None or intersection[0] != row or not is_graspable(drawn.stones, intersection):
             return None
-        plan, aims = _to_tray(drawn, [cell])
+        plan, aims = _to_tray(drawn, [intersection])
         command = f"take the {color} stone off the board and put it in the tray"
         return Case((command,), (plan,), aims, (other_color(color),))
 
@@ -64,10 +64,10 @@ class RemoveAt(Task):
         return TaskInstance((row, column), _draw_board(rng))
 
     def case(self, drawn: TaskInstance) -> Case | None:
-        row, column = cell = drawn.about[0], drawn.about[1]
-        if cell not in drawn.stones or not is_graspable(drawn.stones, cell):
+        row, column = intersection = drawn.about[0], drawn.about[1]
+        if intersection not in drawn.stones or not is_graspable(drawn.stones, intersection):
             return None
-        plan, aims = _to_tray(drawn, [cell])
+        plan, aims = _to_tray(drawn, [intersection])
         command = f"take the stone at row {row}, column {column} off the board and put it in the tray"
         return Case((command,), (plan,), aims)
 
@@ -88,7 +88,8 @@ class Swap(Task):
             return None
         if not is_graspable(stones, a) or not is_graspable(stones, b):
             return None
-        others = [cell for cell in INTERSECTIONS if cell not in (a, b)]  # the free ones of them
+        # the free ones of them
+        others = [intersection for intersection in INTERSECTIONS if intersection not in (a, b)]
         first, second = drawn.stone_on(a), drawn.stone_on(b)
         plans = tuple(
             in_order(one_move(one, [TRAY, *others]), one_move(other, [here]), one_move(one, [there]))
@@ -118,16 +119,16 @@ class Push(Task):
 
     def case(self, drawn: TaskInstance) -> Case | None:
         color, row = COLORS[drawn.about[0]], drawn.about[1]
-        cell = only(drawn.stones, color)
-        if cell is None or cell[0] != row:
+        intersection = only(drawn.stones, color)
+        if intersection is None or intersection[0] != row:
             return None
-        place = cell[0] + self.rows, cell[1] + self.columns
-        others = {other: stone for other, stone in drawn.stones.items() if other != cell}
+        place = intersection[0] + self.rows, intersection[1] + self.columns
+        others = {other: stone for other, stone in drawn.stones.items() if other != intersection}
         if place not in INTERSECTIONS or place in others:
             return None
-        if not is_graspable(others, cell) or not is_graspable(others, place):
+        if not is_graspable(others, intersection) or not is_graspable(others, place):
             return None
-        stone = drawn.stone_on(cell)
+        stone = drawn.stone_on(intersection)
         plan = (Move(frozenset([stone]), frozenset([place]), is_slid=True),)
         # with the place, for a stone that has been pushed half the way does not show where it stood
         command = (
@@ -147,10 +148,12 @@ class ClearRow(Task):
 
     def case(self, drawn: TaskInstance) -> Case | None:
         row, number = drawn.about
-        cells = sorted(cell for cell in drawn.stones if cell[0] == row)
-        if len(cells) != number or not all(is_graspable(drawn.stones, cell) for cell in cells):
+        intersections = sorted(intersection for intersection in drawn.stones if intersection[0] == row)
+        if len(intersections) != number or not all(
+            is_graspable(drawn.stones, intersection) for intersection in intersections
+        ):
             return None
-        plan, aims = _to_tray(drawn, cells)
+        plan, aims = _to_tray(drawn, intersections)
         return Case((f"clear row {row}: put its stones in the tray",), (plan,), aims)
 
 
@@ -165,18 +168,22 @@ class Gather(Task):
 
     def case(self, drawn: TaskInstance) -> Case | None:
         color, row = COLORS[drawn.about[0]], drawn.about[1]
-        cells = sorted(
-            cell for cell, other in drawn.stones.items() if other == color and cell[1] >= SIDE_COLUMNS
+        intersections = sorted(
+            intersection
+            for intersection, other in drawn.stones.items()
+            if other == color and intersection[1] >= SIDE_COLUMNS
         )
-        if not 1 <= len(cells) <= MAX_MOVED or cells[0][0] != row:
+        if not 1 <= len(intersections) <= MAX_MOVED or intersections[0][0] != row:
             return None
-        if not all(column >= FAR_COLUMN and is_graspable(drawn.stones, (r, column)) for r, column in cells):
+        if not all(
+            column >= FAR_COLUMN and is_graspable(drawn.stones, (r, column)) for r, column in intersections
+        ):
             return None
-        side = [cell for cell in INTERSECTIONS if cell[1] < SIDE_COLUMNS]
-        free = [cell for cell in side if cell not in drawn.stones]
-        if len(free) < len(cells):
+        side = [intersection for intersection in INTERSECTIONS if intersection[1] < SIDE_COLUMNS]
+        free = [intersection for intersection in side if intersection not in drawn.stones]
+        if len(free) < len(intersections):
             return None
-        stones = [drawn.stone_on(cell) for cell in cells]
+        stones = [drawn.stone_on(intersection) for intersection in intersections]
         plan = tuple(one_move(stone, side) for stone in stones)
         # row by row, from the far one: a stone that is held does not show where it stood
         aims = tuple(aim_at(stone, place) for stone, place in zip(stones, free, strict=False))

@@ -29,7 +29,7 @@ EDGE_COLUMNS = 0, BOARD.num_lines - 1  # of captured stones: fingers go down bes
 
 
 def _in_turn(first: int, number: int) -> tuple[str, ...]:
-    """Return so many colours, black and white in turn, from the first or the second of COLORS."""
+    """Return this number of colours in turn, beginning with the first or the second of COLORS."""
     return tuple(COLORS[(first + i) % 2] for i in range(number))
 
 
@@ -49,11 +49,11 @@ def _supply_plan(
         color: frozenset(i for i, other in enumerate(drawn.supply) if other == color) for color in COLORS
     }
     plan = tuple(
-        Move(of_color[color], frozenset([cell]), frozenset(range(number if is_ordered else 0)))
-        for number, (color, cell) in enumerate(moves)
+        Move(of_color[color], frozenset([intersection]), frozenset(range(number if is_ordered else 0)))
+        for number, (color, intersection) in enumerate(moves)
     )
     left = {color: sorted(stones) for color, stones in of_color.items()}
-    return plan, tuple(aim_at(left[color].pop(0), cell) for color, cell in moves)
+    return plan, tuple(aim_at(left[color].pop(0), intersection) for color, intersection in moves)
 
 
 @dataclass(frozen=True)
@@ -68,23 +68,27 @@ class Opening(Task):
         supply = _shuffled(rng, _in_turn(first, self.num_moves))
         max_others = min(MAX_OTHERS, NUM_STONES - self.num_moves)
         others = draw_stones(rng, int(rng.integers(max_others + 1)))
-        cells = draw_intersections(
-            rng, self.num_moves, [cell for cell in INTERSECTIONS if cell not in others]
+        intersections = draw_intersections(
+            rng,
+            self.num_moves,
+            [intersection for intersection in INTERSECTIONS if intersection not in others],
         )
-        return TaskInstance((first, *(line for cell in cells for line in cell)), others, supply)
+        return TaskInstance(
+            (first, *(line for intersection in intersections for line in intersection)), others, supply
+        )
 
     def case(self, drawn: TaskInstance) -> Case | None:
         lines = drawn.about[1:]
-        cells = list(zip(lines[::2], lines[1::2], strict=True))
+        intersections = list(zip(lines[::2], lines[1::2], strict=True))
         colors = _in_turn(drawn.about[0], self.num_moves)
         if Counter(drawn.supply) != Counter(colors) or drawn.pattern:
             return None
-        moves = list(zip(colors, cells, strict=True))
+        moves = list(zip(colors, intersections, strict=True))
         stones = dict(drawn.stones)
-        for color, cell in moves:
-            if not is_legal_move(stones, cell, color):
+        for color, intersection in moves:
+            if not is_legal_move(stones, intersection, color):
                 return None
-            stones[cell] = color
+            stones[intersection] = color
             if not is_legal_position(stones):
                 return None  # a capture
         plan, aims = _supply_plan(drawn, moves, is_ordered=True)
@@ -96,25 +100,37 @@ class Opening(Task):
 
 @dataclass(frozen=True)
 class FillRow(Task):
-    """The free intersections of a row get a stone each, the colours in turn from left to right.
+    """Task: fill the free intersections of a row from left to right, colours in turn.
 
-    The last one's colour is said: it stays true of what is left, whoever has played there before.
+    The instruction names the last stone's colour, which stays true however many stones are placed.
     """
 
     def draw(self, rng: np.random.Generator) -> TaskInstance:
         last, row = int(rng.integers(len(COLORS))), int(rng.integers(BOARD.num_lines))
         stones = draw_stones(rng, int(rng.integers(2, 6)))
-        free = [cell for cell in INTERSECTIONS if cell[0] == row and cell not in stones]
+        free = [
+            intersection
+            for intersection in INTERSECTIONS
+            if intersection[0] == row and intersection not in stones
+        ]
         return TaskInstance((last, row), stones, _shuffled(rng, _in_turn(last, len(free))))
 
     def case(self, drawn: TaskInstance) -> Case | None:
         last, row = drawn.about
-        cells = [cell for cell in INTERSECTIONS if cell[0] == row and cell not in drawn.stones]
-        colors = _in_turn(last, len(cells))[::-1]
-        if Counter(drawn.supply) != Counter(colors) or not 2 <= len(cells) <= MAX_FILLED or drawn.pattern:
+        intersections = [
+            intersection
+            for intersection in INTERSECTIONS
+            if intersection[0] == row and intersection not in drawn.stones
+        ]
+        colors = _in_turn(last, len(intersections))[::-1]
+        if (
+            Counter(drawn.supply) != Counter(colors)
+            or not 2 <= len(intersections) <= MAX_FILLED
+            or drawn.pattern
+        ):
             return None
-        moves = list(zip(colors, cells, strict=True))
-        if not is_legal_position(dict(drawn.stones) | {cell: color for color, cell in moves}):
+        moves = list(zip(colors, intersections, strict=True))
+        if not is_legal_position(dict(drawn.stones) | {intersection: color for color, intersection in moves}):
             return None
         plan, aims = _supply_plan(drawn, moves, is_ordered=True)
         command = (
@@ -134,11 +150,23 @@ class Capture(Task):
         color = int(rng.integers(len(COLORS)))
         row, column = int(rng.integers(BOARD.num_lines)), EDGE_COLUMNS[rng.integers(len(EDGE_COLUMNS))]
         group = [(row + i, column) for i in range(self.size)]
-        around = [cell for cell in INTERSECTIONS if cell not in group and any(cell in near(c) for c in group)]
+        around = [
+            intersection
+            for intersection in INTERSECTIONS
+            if intersection not in group and any(intersection in near(c) for c in group)
+        ]
         liberty = around[rng.integers(len(around))]
-        stones = dict.fromkeys((cell for cell in group if cell in INTERSECTIONS), COLORS[color])
-        stones |= {cell: other_color(COLORS[color]) for cell in around if cell != liberty}
-        free = [cell for cell in INTERSECTIONS if cell not in stones and cell != liberty]
+        stones = dict.fromkeys(
+            (intersection for intersection in group if intersection in INTERSECTIONS), COLORS[color]
+        )
+        stones |= {
+            intersection: other_color(COLORS[color]) for intersection in around if intersection != liberty
+        }
+        free = [
+            intersection
+            for intersection in INTERSECTIONS
+            if intersection not in stones and intersection != liberty
+        ]
         stones |= draw_stones(rng, int(rng.integers(3)), free)
         return TaskInstance((color, *group[0]), stones, (other_color(COLORS[color]),))
 
@@ -146,18 +174,22 @@ class Capture(Task):
         color, stones = COLORS[drawn.about[0]], drawn.stones
         if drawn.supply != (other_color(color),) or (drawn.about[1], drawn.about[2]) not in stones:
             return None
-        groups = {frozenset(group_of(dict(stones), cell)) for cell, other in stones.items() if other == color}
+        groups = {
+            frozenset(group_of(dict(stones), intersection))
+            for intersection, other in stones.items()
+            if other == color
+        }
         in_atari = [group for group in groups if len(liberties_of(dict(stones), min(group))) == 1]
         if len(in_atari) != 1 or len(in_atari[0]) != self.size:
             return None
         captured = sorted(in_atari[0])
         if captured[0] != (drawn.about[1], drawn.about[2]) or not {c for _, c in captured} <= {*EDGE_COLUMNS}:
             return None
-        (cell,) = liberties_of(dict(stones), captured[0])
+        (intersection,) = liberties_of(dict(stones), captured[0])
         after = {place: other for place, other in stones.items() if place not in captured}
-        if not is_legal_position(after | {cell: drawn.supply[0]}):
+        if not is_legal_position(after | {intersection: drawn.supply[0]}):
             return None
-        played, aims = _supply_plan(drawn, [(drawn.supply[0], cell)], is_ordered=True)
+        played, aims = _supply_plan(drawn, [(drawn.supply[0], intersection)], is_ordered=True)
         taken = [drawn.stone_on(place) for place in captured]
         plan = (*played, *(Move(frozenset([stone]), frozenset([TRAY]), frozenset([0])) for stone in taken))
         aims += tuple(Aim(stone, xy) for stone, xy in zip(taken, TRAY_XY_M, strict=False))
@@ -185,8 +217,10 @@ class TakeBack(Task):
             return None
         if not is_graspable(stones, a) or not is_graspable(stones, b):
             return None
-        plan = in_order(*(one_move(drawn.stone_on(cell), [TRAY]) for cell in (b, a)))
-        aims = tuple(Aim(drawn.stone_on(cell), xy) for cell, xy in zip((b, a), TRAY_XY_M, strict=False))
+        plan = in_order(*(one_move(drawn.stone_on(intersection), [TRAY]) for intersection in (b, a)))
+        aims = tuple(
+            Aim(drawn.stone_on(intersection), xy) for intersection, xy in zip((b, a), TRAY_XY_M, strict=False)
+        )
         command = (
             f"take back the last two moves, the later one first: {stones[a]} played at row {a[0]}, column "
             f"{a[1]}, then {stones[b]} at row {b[0]}, column {b[1]}; put both stones in the tray"
@@ -203,9 +237,9 @@ class CopyPattern(Task):
     def draw(self, rng: np.random.Generator) -> TaskInstance:
         first = int(rng.integers(len(COLORS)))
         colors = _in_turn(first, self.num_stones)
-        cells = draw_intersections(rng, self.num_stones)
-        pattern = dict(zip(cells, colors, strict=True))
-        return TaskInstance((first, *cells[0]), {}, _shuffled(rng, colors), pattern)
+        intersections = draw_intersections(rng, self.num_stones)
+        pattern = dict(zip(intersections, colors, strict=True))
+        return TaskInstance((first, *intersections[0]), {}, _shuffled(rng, colors), pattern)
 
     def case(self, drawn: TaskInstance) -> Case | None:
         if len(drawn.pattern) != self.num_stones or set(drawn.pattern) & set(drawn.stones):
@@ -214,7 +248,7 @@ class CopyPattern(Task):
             return None
         if not is_legal_position(dict(drawn.stones) | dict(drawn.pattern)):
             return None
-        moves = [(color, cell) for cell, color in sorted(drawn.pattern.items())]
+        moves = [(color, intersection) for intersection, color in sorted(drawn.pattern.items())]
         plan, aims = _supply_plan(drawn, moves, is_ordered=False)
         return Case(("copy the pattern of the small board onto the large one",), (plan,), aims)
 

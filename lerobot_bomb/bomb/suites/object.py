@@ -121,25 +121,25 @@ TASKS = (
 NUM_PARTS = 5  # one in so many pairs of a task and an intersection is held out
 
 
-def is_heldout(task_id: int, cell: Intersection) -> bool:
+def is_heldout(task_id: int, intersection: Intersection) -> bool:
     """Return True if a pair is held out; every task and every intersection is seen in other pairs."""
-    row, column = cell
+    row, column = intersection
     return (task_id + row + 2 * column) % NUM_PARTS == 0
 
 
 @cache
 def pairs_of(split: str) -> tuple[tuple[int, Intersection], ...]:
-    """(task, target) that a split draws from."""
-    pairs = [(task_id, cell) for task_id in range(len(TASKS)) for cell in ALL_TARGETS]
+    """Return the pairs (task, target) that a split draws from."""
+    pairs = [(task_id, intersection) for task_id in range(len(TASKS)) for intersection in ALL_TARGETS]
     return of_split(split, pairs, [pair for pair in pairs if is_heldout(*pair)])
 
 
 def _pairs(spec: EpisodeSpec) -> list[tuple[int, Intersection]]:
     """Return the pairs of task and intersection that a spec draws from."""
     return [
-        (task_id, cell)
-        for task_id, cell in pairs_of(spec.split)
-        if spec.task_id in (None, task_id) and (spec.target is None or tuple(spec.target) == cell)
+        (task_id, intersection)
+        for task_id, intersection in pairs_of(spec.split)
+        if spec.task_id in (None, task_id) and (spec.target is None or tuple(spec.target) == intersection)
     ]
 
 

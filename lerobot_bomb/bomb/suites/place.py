@@ -70,7 +70,7 @@ def targets_of(split: str) -> tuple[Intersection, ...]:
 
 
 def check_target(spec: EpisodeSpec) -> None:
-    """Raise a ValueError unless the spec's target, where it names one, belongs to its split."""
+    """Raise a ValueError if the spec names a target of another split."""
     if spec.task_id is not None:
         raise ValueError("suite 'place' names its tasks by target and colour, not by task_id")
     if spec.target is not None and tuple(spec.target) not in targets_of(spec.split):
@@ -136,10 +136,10 @@ def sample_opening(
     max_stones: int,
     colors: Sequence[str] = COLORS,
 ) -> dict[Intersection, str]:
-    """{(row, column): colour} of up to so many stones, the colours in turn: a legal position, a legal move.
+    """{(row, column): colour} of up to this many stones, colours in turn; position and move are legal.
 
-    The candidates do not depend on the move and the first that allows it is taken, so what stands on the
-    board tells nothing of the target but that it is free and legal.
+    The candidates do not depend on the move, and the first that allows it is taken. So the stones on the
+    board reveal nothing about the target but that it is free and legal.
     """
     num_stones = rng.integers(max_stones + 1)
     while True:

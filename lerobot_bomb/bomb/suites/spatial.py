@@ -1,4 +1,4 @@
-"""Suite `spatial`: one stone, whose place is named by what stands there, not by numbers."""
+"""Suite `spatial`: one stone, whose place is named by the board or its stones, not by numbers."""
 
 from abc import ABC, abstractmethod
 from collections.abc import Mapping
@@ -61,36 +61,36 @@ class Task(ABC):
 
     @abstractmethod
     def select(self, stones: Stones, anchor: str) -> Intersection | None:
-        """Return the place that is meant; None where none or several fit, or it is taken."""
+        """Return the place that is meant; None if none or several fit, or if it is taken."""
 
     @abstractmethod
     def referents(self, target: Intersection) -> list[list[Intersection]]:
-        """Return each way for stones to stand so that `target` is meant; none where it cannot be."""
+        """Return each arrangement of stones in which `target` is meant; empty if there is none."""
 
     @property
     def targets(self) -> tuple[Intersection, ...]:
         """Intersections that can be meant."""
-        return tuple(cell for cell in ALL_TARGETS if self.referents(cell))
+        return tuple(intersection for intersection in ALL_TARGETS if self.referents(intersection))
 
 
 @dataclass(frozen=True)
 class Beside(Task):
-    """Task: the place so many rows and columns from the only stone of the anchor's colour."""
+    """Task: the place some rows and columns from the only stone of the anchor's colour."""
 
     place: str
     rows: int
     columns: int
 
     def select(self, stones: Stones, anchor: str) -> Intersection | None:
-        anchors = [cell for cell, color in stones.items() if color == anchor]
+        anchors = [intersection for intersection, color in stones.items() if color == anchor]
         if len(anchors) != 1:
             return None
         place = anchors[0][0] + self.rows, anchors[0][1] + self.columns
         return place if place in ALL_TARGETS and place not in stones else None
 
     def referents(self, target: Intersection) -> list[list[Intersection]]:
-        cell = target[0] - self.rows, target[1] - self.columns
-        return [[cell]] if cell in ALL_TARGETS else []
+        intersection = target[0] - self.rows, target[1] - self.columns
+        return [[intersection]] if intersection in ALL_TARGETS else []
 
 
 @dataclass(frozen=True)
@@ -100,8 +100,12 @@ class Between(Task):
     place: str
 
     def select(self, stones: Stones, anchor: str) -> Intersection | None:
-        anchors = [cell for cell, color in stones.items() if color == anchor]
-        places = [cell for cell in ALL_TARGETS if sorted(anchors) in map(sorted, self.referents(cell))]
+        anchors = [intersection for intersection, color in stones.items() if color == anchor]
+        places = [
+            intersection
+            for intersection in ALL_TARGETS
+            if sorted(anchors) in map(sorted, self.referents(intersection))
+        ]
         return places[0] if places and places[0] not in stones else None
 
     def referents(self, target: Intersection) -> list[list[Intersection]]:
@@ -115,14 +119,14 @@ class Fixed(Task):
     """A place that the board itself has."""
 
     place: str
-    cell: Intersection
+    intersection: Intersection
     has_anchor = False
 
     def select(self, stones: Stones, anchor: str) -> Intersection | None:
-        return None if self.cell in stones else self.cell
+        return None if self.intersection in stones else self.intersection
 
     def referents(self, target: Intersection) -> list[list[Intersection]]:
-        return [[]] if target == self.cell else []
+        return [[]] if target == self.intersection else []
 
 
 @dataclass(frozen=True)
@@ -134,7 +138,11 @@ class Gap(Task):
 
     def select(self, stones: Stones, anchor: str) -> Intersection | None:
         rows = [[(row, column) for column in range(BOARD.num_lines)] for row in range(BOARD.num_lines)]
-        gaps = [left for row in rows if len(left := [cell for cell in row if cell not in stones]) == 1]
+        gaps = [
+            left
+            for row in rows
+            if len(left := [intersection for intersection in row if intersection not in stones]) == 1
+        ]
         return gaps[0][0] if len(gaps) == 1 else None
 
     def referents(self, target: Intersection) -> list[list[Intersection]]:
@@ -240,15 +248,19 @@ def _sample_opening(
     """Draw up to 8 stones with which the move is legal and the only one that is meant."""
     while True:
         ways = task.referents(target)
-        cells = ways[rng.integers(len(ways))]
+        intersections = ways[rng.integers(len(ways))]
         # stones of a row that is filled are of both colours
         colors = (
-            [anchor] * len(cells)
+            [anchor] * len(intersections)
             if task.has_anchor
-            else [COLORS[i] for i in rng.integers(2, size=len(cells))]
+            else [COLORS[i] for i in rng.integers(2, size=len(intersections))]
         )
-        opening = dict(zip(cells, colors, strict=True))
-        free = [cell for cell in ALL_TARGETS if cell not in opening and cell != target]
+        opening = dict(zip(intersections, colors, strict=True))
+        free = [
+            intersection
+            for intersection in ALL_TARGETS
+            if intersection not in opening and intersection != target
+        ]
         num_others = rng.integers(MAX_OPENING_STONES - len(opening) + 1)
         first = rng.integers(len(extra_colors))
         for i, k in enumerate(rng.permutation(len(free))[:num_others]):

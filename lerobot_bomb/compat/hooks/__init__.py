@@ -1,1 +1,1 @@
-"""Hooks into LeRobot and what it stands on; docs/architecture.md lists them, with the reason of each."""
+"""Hooks into LeRobot and its libraries; docs/architecture.md lists them, with the reason for each."""

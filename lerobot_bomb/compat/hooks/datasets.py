@@ -1,4 +1,4 @@
-"""LeRobot's datasets: fewer images are decoded, and one that is missing is told in a line."""
+"""LeRobot's datasets: fewer images are decoded, and a missing dataset is an error of one line."""
 
 from collections.abc import Callable
 from inspect import signature
@@ -13,7 +13,7 @@ from lerobot_bomb.compat.hooks.replace import replace
 
 
 def read_asked_columns() -> None:
-    """Let LeRobot read of the other frames of a sample only what was asked of them, not their images too.
+    """Let LeRobot read only the requested columns of a sample's other frames, not their images.
 
     A chunk of 16 actions decodes the images of all its 16 frames otherwise, and throws them away.
     """
@@ -39,7 +39,7 @@ def read_asked_columns() -> None:
 
 
 def explain_missing_datasets(explain: Callable[[str, Path, Exception], str]) -> None:
-    """Let a dataset that is neither here nor on the Hub be an error with `explain(repo_id, root, error)`.
+    """Turn the error of a dataset that is neither here nor on the Hub into `explain(repo_id, root, error)`.
 
     LeRobot asks the Hub for whatever it does not find, and ends in a hundred lines of the HTTP library.
     """

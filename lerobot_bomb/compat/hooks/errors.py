@@ -1,4 +1,4 @@
-"""Refusals of our code, and configs that cannot be read, told by LeRobot's commands in a line."""
+"""Errors of our code, and of configs that cannot be read, as one line of LeRobot's commands."""
 
 import dis
 import os
@@ -24,7 +24,7 @@ def tell_config_errors(
     """Let LeRobot's commands say in one line why they cannot read a config.
 
     Their parser prints DecodingErrors, and turns others into `Couldn't instantiate class EvalPipelineConfig`.
-    `damage(path or name on the Hub, revision)` says what keeps a config.json from being any policy's.
+    `damage(path or name on the Hub, revision)` says why a config.json is no policy's.
     """
 
     def around(usual: Callable[..., PreTrainedConfig]) -> Callable[..., PreTrainedConfig]:
@@ -54,7 +54,7 @@ def tell_config_errors(
 def tell_refusals() -> None:
     """Let LeRobot's commands end in one line where our code refuses something, or with Ctrl-C.
 
-    An error that it raises on purpose says what to do, and the traceback before it hides that. With
+    Such an error says what to do, and a traceback above it would hide that. With
     LEROBOT_BOMB_TRACEBACK=1 it is shown. So is a DecodingError told: lerobot-train reads a checkpoint's
     config after its parser, which would print it.
     """
@@ -76,7 +76,7 @@ def tell_refusals() -> None:
 
 
 def _is_ours(traceback: TracebackType | None) -> bool:
-    """Return whether the error is of a `raise` statement in a module of ours."""
+    """Return True if the error comes from a `raise` statement in a module of ours."""
     if traceback is None:
         return False
     while traceback.tb_next is not None:

@@ -1,4 +1,4 @@
-"""LeRobot's evaluation with an environment or a policy of ours: what it would get wrong, without a word."""
+"""LeRobot's evaluation with an environment or a policy of ours: corrections of silent errors."""
 
 import logging
 import sys
@@ -41,8 +41,8 @@ def run_tasks_in_turn(is_needed: Callable[[Any], bool]) -> None:
         def evaluate(envs: Any, policy: Any, *args: Any, max_parallel_tasks: int = 1, **options: Any) -> Any:
             if max_parallel_tasks > 1 and is_needed(policy):
                 logging.warning(
-                    "--env.max_parallel_tasks=%s: tasks are played one after another; threads would share "
-                    "this policy's queue of actions. To play in several processes: lerobot-bomb sweep",
+                    "--env.max_parallel_tasks=%s: tasks are run one after another; threads would share "
+                    "this policy's queue of actions. To run in several processes: lerobot-bomb sweep",
                     max_parallel_tasks,
                 )
                 max_parallel_tasks = 1

@@ -1,4 +1,4 @@
-"""Wrong flags of LeRobot's commands, where they choose a type of ours: one line instead of all usage."""
+"""Wrong flags of LeRobot's commands that choose a type of ours: one line instead of all usage."""
 
 import sys
 from collections.abc import Callable, Collection, Sequence
@@ -22,7 +22,7 @@ def tell_wrong_flags(
 ) -> None:
     """Let LeRobot's commands say in one line which flag is wrong.
 
-    Their parser prints hundreds of lines of usage first. `hint(words, flags, argv)` follows on what it says;
+    Their parser prints hundreds of lines of usage first. `hint(words, flags, argv)` is added to its message;
     `refuse_unknown(flag, flags, argv)` raises for a flag that only other types than the chosen one have.
     """
 
@@ -58,7 +58,7 @@ def tell_wrong_flags(
 
 
 def _flags_of_chosen_types(flags: Collection[str], argv: Sequence[str]) -> list[str]:
-    """LeRobot's parser knows those of all types of environments and policies."""
+    """Drop the flags of types that were not chosen: LeRobot's parser knows those of all."""
     left = list(flags)
     registries: dict[str, Any] = {"env": EnvConfig, "policy": PreTrainedConfig}
     for group, registry in registries.items():

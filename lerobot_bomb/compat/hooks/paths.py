@@ -1,4 +1,4 @@
-"""Checkpoints named `bomb:NAME`, and the first sight of a type of ours: the only hook that always stands."""
+"""Checkpoints named `bomb:NAME`, and the first use of a type of ours: the one hook always installed."""
 
 import re
 import sys
@@ -17,9 +17,9 @@ from lerobot_bomb.compat.use import is_ours, use
 
 
 def resolve_checkpoints(prefix: str, resolve: Callable[[str], str]) -> None:
-    """Let `--policy.path` of LeRobot's commands, and of their config files, be what `resolve` makes of it.
+    """Let `resolve` change `--policy.path` of LeRobot's commands and config files.
 
-    Other paths than `prefix...` stay as they are. A ValueError of it ends the command in one line.
+    Other paths than `prefix...` stay as they are. Its ValueError ends the command in one line.
 
     LeRobot's commands ask for a path before they read any other flag. Where these name a type of ours, the
     other hooks are installed, so that wrong flags are told, too.
@@ -45,7 +45,7 @@ def resolve_checkpoints(prefix: str, resolve: Callable[[str], str]) -> None:
 
 
 def names_ours(argv: Sequence[str]) -> bool:
-    """Return whether flags, or the config file or checkpoint that they name, choose a type of ours."""
+    """Return True if flags, or the config file or checkpoint that they name, choose a type of ours."""
     known = {**EnvConfig.get_known_choices(), **PreTrainedConfig.get_known_choices()}
     return any(is_ours(known[name]) for name in _named_types(argv) if name in known)
 

@@ -1,4 +1,4 @@
-"""The policies that a process has built, and calls of them, of which LeRobot tells an environment nothing."""
+"""The policies that a process has built, and their calls; LeRobot tells an environment neither."""
 
 import gc
 from collections.abc import Callable
@@ -60,7 +60,7 @@ def built_policies() -> list[PreTrainedPolicy]:
 
 
 def training_data(config: PreTrainedConfig) -> LeRobotDatasetMetadata | None:
-    """The dataset that this process trains a config's policy on; None: it acts as it was loaded."""
+    """Return the dataset that this process trains a config's policy on; None if it does not train it."""
     return getattr(config, "_runtime_dataset_meta", None)
 
 

@@ -1,4 +1,4 @@
-"""A saved processor is checked before LeRobot imports and calls what it names."""
+"""Check of a saved processor, before LeRobot imports and calls the code that it names."""
 
 import re
 from collections.abc import Callable, Sequence

@@ -13,7 +13,7 @@ from lerobot_bomb.compat.hooks.evaluation import tell_of_evaluations
 
 
 def lerobot_eval_with(flags: Sequence[str], wrap: Callable[[Any, Any], Any]) -> None:
-    """Run lerobot-eval with these flags, on what `wrap(config, environments)` makes of its environments."""
+    """Run lerobot-eval with these flags, on its environments as `wrap(config, environments)` returns them."""
     from lerobot.scripts import lerobot_eval
 
     tell_of_evaluations()
@@ -24,8 +24,8 @@ def lerobot_eval_with(flags: Sequence[str], wrap: Callable[[Any, Any], Any]) -> 
 class KeptPolicy:
     """Runs lerobot-eval several times in one process; a policy stays as long as the same one is asked for.
 
-    What is random goes on from where it was when the policy had been built, so that an evaluation gives what
-    it gives in a process of its own.
+    Random numbers restart from their state after the policy was built, so an evaluation gives the same as in
+    a process of its own.
     """
 
     def __init__(self) -> None:
@@ -33,12 +33,12 @@ class KeptPolicy:
         self.policy: PreTrainedPolicy | None = None
         self._random_state: dict[str, Any] = {}
         self.env_config: Any = None  # LeRobot's, of the last evaluation
-        self.has_begun = False  # whether the last evaluation came as far as to play
+        self.has_begun = False  # whether the last evaluation reached its first episode
 
     def evaluate(self, flags: Sequence[str], asked: object, first: int = 0) -> None:
-        """Run lerobot-eval, which draws no video and plays one task after another.
+        """Run lerobot-eval, which draws no video and runs one task after another.
 
-        `asked` is equal where it needs the policy of before, built with the same seed. `first` is the number
+        `asked` is equal if it needs the previous policy, built with the same seed. `first` is the number
         of an episode that is run alone out of a longer evaluation.
         """
         from lerobot.scripts import lerobot_eval

@@ -15,7 +15,7 @@ from lerobot.datasets.utils import update_chunk_file_indices
 def merged_at_once() -> Iterator[None]:
     """Let LeRobot's merge write each file of the merged dataset once.
 
-    It would write a file again for every dataset that it adds to it.
+    LeRobot's function would rewrite a file for every dataset that it adds.
     """
     tables, videos = _Tables(), _Videos()
     replaced = {
@@ -85,7 +85,7 @@ class _Table:
 
 
 class _Videos:
-    """Videos that are to be joined, by what they become."""
+    """Videos to join, by the video that they become."""
 
     def __init__(self) -> None:
         self.usual = {
@@ -103,7 +103,7 @@ class _Videos:
         self._sizes_mb[output_video_path] = size_mb
 
     def size_mb(self, path: Path) -> float:
-        """Return what a file has, or will have."""
+        """Return the size of a file, present or future."""
         return self._sizes_mb.get(path) or self.usual["get_file_size_in_mb"](path)
 
     def write_all(self) -> None:

@@ -77,7 +77,7 @@ def batched_embedding() -> Iterator[None]:
 def mergeable_arrays(features: dict[str, dict]) -> Iterator[None]:
     """Let LeRobot merge tables that hold arrays of two dimensions.
 
-    It can where they hold images too, because it then names their types; elsewhere pyarrow must guess them.
+    If they hold images, it names their types itself; otherwise pyarrow must guess them.
     """
     usual = aggregate.to_parquet_one_row_group_per_episode
     types = get_hf_features_from_features(features | DEFAULT_FEATURES)
@@ -99,7 +99,7 @@ def abandon(dataset: LeRobotDataset) -> None:
 
 @contextmanager
 def datasets_cache(folder: Path) -> Iterator[None]:
-    """Let `datasets` cache what it reads here only; in the user's cache a copy of it would stay."""
+    """Let `datasets` cache in this folder only; in the user's cache a copy would stay."""
     usual = config.HF_DATASETS_CACHE
     config.HF_DATASETS_CACHE = folder
     try:

@@ -1,4 +1,4 @@
-"""The sections of a report, a file each, in the order of the page; those of other packages stand last."""
+"""The sections of a report, a file each, in the order of the page; those of other packages come last."""
 
 from collections.abc import Callable
 

@@ -1,4 +1,4 @@
-"""Success under each condition, and what it costs."""
+"""Section `conditions`: success under each condition, and its cost."""
 
 from lerobot_bomb.report.cells import INTERVALS, points, rate
 from lerobot_bomb.report.report import Report
@@ -15,7 +15,7 @@ def section(report: Report) -> Section:
 
 
 def conditions(group: Group) -> Table:
-    """Success under each condition, and what it costs against the same episodes unperturbed."""
+    """Write the table of success under each condition, and its cost against the same episodes unperturbed."""
     compared = compare_pairs(pair_with_nominal(group.records))
     costs = {each.condition: points(each) for each in compared}
     blank = [Cell(""), Cell("")] if compared else []

@@ -1,4 +1,4 @@
-"""Section `efficiency`: how fast each policy answers, what that takes, and how smoothly it moves."""
+"""Section `efficiency`: latency and cost of each policy's queries, and how smoothly it moves."""
 
 from lerobot_bomb.report.report import Report
 from lerobot_bomb.report.table import Cell, Section, Table

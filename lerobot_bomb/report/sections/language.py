@@ -21,7 +21,7 @@ NOTE = (
 
 
 def section(report: Report) -> Section:
-    """A table for each policy that was told something else, beside the one that was not."""
+    """Write a table for each policy with other instructions, beside the policy with its own."""
     policies = policies_of(report.groups)
     tables = [
         table

@@ -1,4 +1,4 @@
-"""Section `missing`: what the episodes have nothing for, and how to get it."""
+"""Section `missing`: what these files lack, and how to get it."""
 
 from lerobot_bomb.report.report import Report
 from lerobot_bomb.report.sections import efficiency, language

@@ -1,4 +1,4 @@
-"""Section `published`: what others published of such tasks and models; none of it was measured here."""
+"""Section `published`: other people's figures on such tasks and models; none was measured here."""
 
 from dataclasses import dataclass
 
@@ -19,7 +19,7 @@ SPATIAL_PAPER = "SpatialVLA (arXiv 2501.15830)"
 
 @dataclass(frozen=True)
 class Figure:
-    """A row: whose, of what, how much."""
+    """A published figure: model, source, values."""
 
     model: str
     setting: str
@@ -92,7 +92,7 @@ SPEED_NOTE = (
 
 
 def section(report: Report) -> Section:
-    """Success on the task of each environment, and speed."""
+    """Write the section: published success rates on each environment's task, and speeds."""
     tasks = dict.fromkeys(group.record_type.env_type.removeprefix("bomb_") for group in report.groups)
     tables = [_table(f"Success: {each}", SUCCESS[each], NOTES[each]) for each in tasks if each in SUCCESS]
     return Section(TITLE, [*tables, _table("Speed", SPEED, SPEED_NOTE)])

@@ -1,4 +1,4 @@
-"""Section `run`: what was run, and the flags that do it again."""
+"""Section `run`: the evaluations, and the flags that repeat them."""
 
 import json
 import shlex
@@ -16,7 +16,7 @@ def section(report: Report) -> Section:
 
 
 def commands(group: Group) -> list[str]:
-    """Describe what was evaluated, and the flags that do it again."""
+    """Describe the evaluations, and the flags that repeat them."""
     by, first = by_condition(group.records), group.records[0]
     seeds = {each.spec.seed for each in group.records}
     flags = [_policy_flag(first), *first.eval_flags(group.records)]

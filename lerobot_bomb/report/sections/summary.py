@@ -1,4 +1,4 @@
-"""Section `summary`: what a reviewer reads in a minute."""
+"""Section `summary`: the results at a glance."""
 
 from collections.abc import Iterator
 
@@ -22,7 +22,7 @@ NOTE = (
 
 
 def section(report: Report) -> Section:
-    """A line for each group; below, what is missing, or is no basis for a comparison."""
+    """Write a line for each group; below, missing episodes and comparisons that do not hold."""
     shared = [_shared(group, _peers(group, report.groups)) for group in report.groups]
     lines = [*report.missing, *_left_out(report.groups, shared), *_other_nominal(report.groups)]
     return Section("Summary", [_summary(report.groups, shared)], lines)
