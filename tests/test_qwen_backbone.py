@@ -65,7 +65,10 @@ def read(backbone: QwenBackbone, ids: Tensor, written: Tensor, pixels: Tensor) -
 
 
 def stock_model(backbone: QwenBackbone) -> Any:
-    return backbone.vlm.model
+    """Return a model of transformers' own with the same weights."""
+    stock = type(backbone.vlm)(backbone.vlm.config)
+    stock.load_state_dict(backbone.vlm.state_dict())
+    return stock.eval().model
 
 
 # Prefix

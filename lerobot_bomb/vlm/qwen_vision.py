@@ -3,6 +3,7 @@
 Shapes: `B` images, `P` patches of an image, `N` patches of all images, `E` features, `H` hidden size.
 """
 
+from collections.abc import Sequence
 from typing import Any
 
 import torch
@@ -15,7 +16,7 @@ from transformers.models.qwen2_5_vl.modeling_qwen2_5_vl import (
 
 
 class WindowAttention(Qwen2_5_VLVisionAttention):
-    """Attention with windows of one length, which are read in one call; stock code calls once for each."""
+    """Attention that reads a window of all images in one call; stock code calls once for each image, too."""
 
     def forward(
         self,
@@ -24,30 +25,31 @@ class WindowAttention(Qwen2_5_VLVisionAttention):
         rotary_pos_emb: Tensor | None = None,
         position_embeddings: tuple[Tensor, Tensor] | None = None,
         *,
-        window_length: int | None = None,
+        window_lengths: Sequence[int],
         **kwargs: Any,
     ) -> Tensor:
-        """(N, E) -> (N, E); ``window_length`` None: windows differ, and stock code reads them."""
-        if window_length is None:
-            return super().forward(
-                hidden_states,
-                cu_seqlens=cu_seqlens,
-                rotary_pos_emb=rotary_pos_emb,
-                position_embeddings=position_embeddings,
-                **kwargs,
-            )
+        """(N, E) -> (N, E); ``window_lengths``: patches of each window of an image, in order."""
         assert position_embeddings is not None
         parts = self.qkv(hidden_states).unflatten(1, (3, self.num_heads, -1)).unbind(1)
         queries, keys = apply_rotary_pos_emb_vision(parts[0], parts[1], *position_embeddings)
-        queries, keys, values = (
-            part.unflatten(0, (-1, window_length)).transpose(1, 2) for part in (queries, keys, parts[2])
-        )
-        read = scaled_dot_product_attention(queries, keys, values, scale=self.scaling)
-        return self.proj(read.transpose(1, 2).flatten(2).flatten(0, 1))
+        return self.proj(self._read_windows(window_lengths, queries, keys, parts[2]).flatten(1))
+
+    def _read_windows(self, lengths: Sequence[int], *parts: Tensor) -> Tensor:
+        """Queries, keys and values (N, heads, size of a head) -> what was read, of the same shape."""
+        if len(set(lengths)) == 1:
+            return self._read(*(part.unflatten(0, (-1, lengths[0])) for part in parts)).flatten(0, 1)
+        of_images = (part.unflatten(0, (-1, sum(lengths))).split(list(lengths), dim=1) for part in parts)
+        windows = [self._read(*window) for window in zip(*of_images, strict=True)]
+        return torch.cat(windows, dim=1).flatten(0, 1)
+
+    def _read(self, *parts: Tensor) -> Tensor:
+        """Queries, keys and values (windows, patches, heads, size of a head) -> what was read."""
+        queries, keys, values = (part.transpose(1, 2) for part in parts)
+        return scaled_dot_product_attention(queries, keys, values, scale=self.scaling).transpose(1, 2)
 
 
 def read_windows_at_once(visual: nn.Module) -> None:
-    """Let a vision model read equal windows in one call."""
+    """Let a vision model read each window of all images in one call."""
     for block in visual.blocks:  # pyright: ignore[reportGeneralTypeIssues]
         block.attn.__class__ = WindowAttention
 
@@ -59,19 +61,14 @@ def embed_patches(visual: Any, patches: Tensor, num_images: int, side: int) -> T
     """
     grid_13 = torch.tensor([[1, side, side]])
     window_index, ends = visual.get_window_index(grid_13)
-    lengths = torch.tensor(ends, dtype=torch.int32).unique_consecutive().diff()
-    if len(lengths.unique()) > 1:
-        return visual(patches, grid_thw=grid_13.expand(num_images, 3)).pooler_output.unflatten(
-            0, (num_images, -1)
-        )
+    lengths = torch.tensor(ends, dtype=torch.int32).unique_consecutive().diff().tolist()
     unit = visual.spatial_merge_unit
     order = (window_index[:, None] * unit + torch.arange(unit)).flatten().to(patches.device)
     angles_PE = visual.rot_pos_emb(grid_13)[order].repeat(num_images, 2)
     position_embeddings = angles_PE.cos(), angles_PE.sin()
     x_NE = visual.patch_embed(patches).unflatten(0, (num_images, -1))[:, order].flatten(0, 1)
     for number, block in enumerate(visual.blocks):
-        is_whole = number in visual.fullatt_block_indexes
-        length = side**2 if is_whole else int(lengths[0])
-        x_NE = block(x_NE, cu_seqlens=None, position_embeddings=position_embeddings, window_length=length)
+        windows = [side**2] if number in visual.fullatt_block_indexes else lengths
+        x_NE = block(x_NE, cu_seqlens=None, position_embeddings=position_embeddings, window_lengths=windows)
     merged = visual.merger(x_NE).unflatten(0, (num_images, -1))
     return merged[:, window_index.argsort().to(patches.device)]
