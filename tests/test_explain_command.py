@@ -37,17 +37,21 @@ def test_one_episode(name: str, tmp_path: Path, capsys: pytest.CaptureFixture[st
     assert masked["nothing"] == found["result"]
 
 
-def test_several_episodes(tmp_path: Path) -> None:
+@pytest.mark.parametrize(
+    ("number", "last"),
+    [(2, "Phase: place"), pytest.param(10, "Where is the destination known?", marks=pytest.mark.long)],
+)
+def test_several_episodes(number: int, last: str, tmp_path: Path) -> None:
     output = tmp_path / "why"
-    flags = ["--policy.path=bomb:fdvla", "--seed=100000", "--grid=2", "--episodes=10", f"--output={output}"]
-    assert main(["explain", *flags]) == 0
+    flags = ["--policy.path=bomb:fdvla", "--seed=100000", "--grid=2", f"--output={output}"]
+    assert main(["explain", *flags, f"--episodes={number}"]) == 0
     assert {path.name for path in output.iterdir()} == {"explanation.html", "explanation.json"}
     found = json.loads((output / "explanation.json").read_text())
     titles = [section["title"] for section in found["sections"]]
-    assert titles[:2] == ["In short", "Phase: reach"] and titles[-1] == "Where is the destination known?"
-    assert len(found["episodes"]) == 10
+    assert titles[:2] == ["In short", "Phase: reach"] and titles[-1] == last
+    assert len(found["episodes"]) == number
     came = found["sections"][0]["tables"][0]["rows"]
-    assert [row[1] for row in came] == [10] * 4 and "failures: none" in found["sections"][0]["lines"]
+    assert [row[1] for row in came] == [number] * 4 and "failures: none" in found["sections"][0]["lines"]
 
 
 @pytest.mark.parametrize(
