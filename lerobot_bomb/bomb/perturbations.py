@@ -100,7 +100,9 @@ _OWN = {
             "mass": Magnitude("factor", (1.15, 1.3, 1.5, 1.75, 2.0), "multiplies or divides"),
             "friction": Magnitude("factor", (1.05, 1.1, 1.2, 1.3, 1.4), "divides or multiplies"),
             "noise": Magnitude(
-                "40 mm", (0.01, 0.02, 0.03, 0.04, 0.05), "standard deviation on the executed x, y and z"
+                "40 mm",
+                (0.01, 0.02, 0.03, 0.04, 0.05),
+                "standard deviation on executed x, y and z, in units of 40 mm",
             ),
             "latency": Magnitude("control steps", (0, 0, 0, 1, 1), "before an action is executed"),
         },
