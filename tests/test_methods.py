@@ -101,7 +101,7 @@ def test_what_each_type_says() -> None:
         "no colour jitter",
     ]
     assert grid(depth_source="observation", n_action_steps=1, temporal_ensemble_size=4).methods() == [
-        "a token a group (polar 16 x 32 x 8, 16 cells), adaptive edges (gaussian)",
+        "one token per group (polar 16 x 32 x 8, 16 cells), adaptive edges (gaussian)",
         "chunk of 4, 1 executed",
         "ensemble of 4 (adaptive)",
         "crop to 0.9",
@@ -111,7 +111,7 @@ def test_what_each_type_says() -> None:
     assert fdvla(use_denoise_head=False, dualmod_flow=False).methods()[:3] == [
         "flow head",
         "none modulated",
-        "flow in 3 steps",
+        "flow sampler (3 steps)",
     ]
 
 

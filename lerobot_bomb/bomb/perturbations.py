@@ -37,16 +37,16 @@ _OWN = {
         "lerobot_env_bomb.axes.reflectance:Reflectance",
     ),
     "stones": Axis(
-        "number of stones on the board, and how exactly they stand",
+        "number of stones on the board, and their shift off the intersections",
         ("images", "state"),
         {
-            "extra": Magnitude("stones", (1, 1, 2, 2, 3), "more on the board"),
+            "extra": Magnitude("stones", (1, 1, 2, 2, 3), "additional on the board"),
             "shift": Magnitude("mm", (0.8, 1.6, 2.4, 3.2, 4.0), "of each stone, in a drawn direction"),
         },
         "lerobot_env_bomb.axes.stones:Stones",
     ),
     "start": Axis(
-        "where the stone to be moved and the gripper are at the start",
+        "where the gripper and the stone to be moved are at the start",
         ("images", "state"),
         {
             "stone": Magnitude("mm", (16, 32, 48, 64, 82), "of the stone along the tray, to a drawn side"),
@@ -58,9 +58,9 @@ _OWN = {
         "colour balance, brightness and noise of the camera's sensor",
         ("images",),
         {
-            "balance": Magnitude("share", (0.04, 0.08, 0.12, 0.17, 0.22), "up or down, of a drawn channel"),
-            "brightness": Magnitude("share", (0.03, 0.06, 0.09, 0.12, 0.15), "up or down, of all channels"),
-            "noise": Magnitude("grey levels", (2, 4, 6, 8, 11), "standard deviation, of each pixel"),
+            "balance": Magnitude("share", (0.04, 0.08, 0.12, 0.17, 0.22), "more or less of a drawn channel"),
+            "brightness": Magnitude("share", (0.03, 0.06, 0.09, 0.12, 0.15), "more or less of all channels"),
+            "noise": Magnitude("grey levels", (2, 4, 6, 8, 11), "standard deviation in each pixel"),
         },
         "lerobot_env_bomb.axes.photometric:Sensor",
     ),
@@ -70,9 +70,9 @@ _OWN = {
         {
             "angle": Magnitude("degrees", (3, 6, 9, 12.5, 16), "around the board, in a drawn direction"),
             "wrist_angle": Magnitude("degrees", (1, 2, 3, 4, 5), "around the grip, in a drawn direction"),
-            "fov": Magnitude("share", (0.04, 0.08, 0.12, 0.16, 0.2), "wider or narrower, of both cameras"),
+            "fov": Magnitude("share", (0.04, 0.08, 0.12, 0.16, 0.2), "wider or narrower, both cameras"),
             "distance": Magnitude(
-                "share", (0.03, 0.06, 0.09, 0.12, 0.15), "further or nearer, of the workspace's"
+                "share", (0.03, 0.06, 0.09, 0.12, 0.15), "further or nearer, the workspace camera"
             ),
         },
         "lerobot_env_bomb.axes.camera:Camera",
@@ -81,14 +81,14 @@ _OWN = {
         "intensity and direction of the light",
         ("images",),
         {
-            "dim": Magnitude("factor", (0.88, 0.77, 0.67, 0.58, 0.5), "of all light, if it is dimmed"),
-            "bright": Magnitude("factor", (1.15, 1.32, 1.52, 1.75, 2.0), "of all light, if it is brightened"),
+            "dim": Magnitude("factor", (0.88, 0.77, 0.67, 0.58, 0.5), "on all light, if it is dimmed"),
+            "bright": Magnitude("factor", (1.15, 1.32, 1.52, 1.75, 2.0), "on all light, if it is brightened"),
             "tilt": Magnitude("degrees", (7, 14, 21, 28, 35), "of the lamp, in a drawn direction"),
         },
         "lerobot_env_bomb.axes.light:Light",
     ),
     "language": Axis(
-        "how the instruction is worded; what it means is always stated",
+        "wording of the instruction; it stays unambiguous",
         ("instruction",),
         {"form": Magnitude("number", (1, 2, 3, 4, 5), "form of the instruction")},
         "lerobot_env_bomb.axes.language:Wording",
@@ -97,10 +97,12 @@ _OWN = {
         "mass and friction of the stones, noise and latency of the arm",
         ("dynamics",),
         {
-            "mass": Magnitude("factor", (1.15, 1.3, 1.5, 1.75, 2.0), "times, or divided by"),
-            "friction": Magnitude("factor", (1.05, 1.1, 1.2, 1.3, 1.4), "divided by, or times"),
+            "mass": Magnitude("factor", (1.15, 1.3, 1.5, 1.75, 2.0), "multiplies or divides"),
+            "friction": Magnitude("factor", (1.05, 1.1, 1.2, 1.3, 1.4), "divides or multiplies"),
             "noise": Magnitude(
-                "40 mm", (0.01, 0.02, 0.03, 0.04, 0.05), "standard deviation on the executed x, y and z"
+                "40 mm",
+                (0.01, 0.02, 0.03, 0.04, 0.05),
+                "standard deviation on executed x, y and z, in units of 40 mm",
             ),
             "latency": Magnitude("control steps", (0, 0, 0, 1, 1), "before an action is executed"),
         },
@@ -110,9 +112,9 @@ _OWN = {
         "size, shape and shade of the stones",
         ("images", "state"),
         {
-            "radius": Magnitude("mm", (0.4, 0.8, 1.2, 1.6, 2.0), "more or less than 13"),
-            "height": Magnitude("mm", (0.5, 1.0, 1.5, 2.0, 2.5), "more or less than 9"),
-            "shade": Magnitude("share", (0.06, 0.12, 0.19, 0.25, 0.32), "of the way to grey, either colour"),
+            "radius": Magnitude("mm", (0.4, 0.8, 1.2, 1.6, 2.0), "more or less than 13 mm"),
+            "height": Magnitude("mm", (0.5, 1.0, 1.5, 2.0, 2.5), "more or less than 9 mm"),
+            "shade": Magnitude("share", (0.06, 0.12, 0.19, 0.25, 0.32), "of the way to grey, both colours"),
             "flat": Magnitude("yes", (0, 0, 1, 1, 1), "discs instead of lenses"),
         },
         "lerobot_env_bomb.axes.object:StoneLook",

@@ -61,9 +61,9 @@ _OWN = {
         {
             "angle": Magnitude("degrees", (4, 8, 12, 16, 20), "around the table, in a drawn direction"),
             "wrist_angle": Magnitude("degrees", (1, 2, 3, 4, 5), "around the gripper, in a drawn direction"),
-            "fov": Magnitude("share", (0.04, 0.08, 0.12, 0.16, 0.2), "wider or narrower, of both cameras"),
+            "fov": Magnitude("share", (0.04, 0.08, 0.12, 0.16, 0.2), "wider or narrower, both cameras"),
             "distance": Magnitude(
-                "share", (0.03, 0.06, 0.09, 0.12, 0.15), "further or nearer, of the scene's camera"
+                "share", (0.03, 0.06, 0.09, 0.12, 0.15), "further or nearer, the scene's camera"
             ),
         },
         "lerobot_env_bomb_libero.axes.camera:LiberoCamera",
@@ -76,8 +76,8 @@ _OWN = {
         "mass and friction of the objects, noise and latency of the arm",
         ("dynamics",),
         {
-            "mass": Magnitude("factor", (1.2, 1.4, 1.7, 2.0, 2.5), "times, or divided by"),
-            "friction": Magnitude("factor", (1.1, 1.2, 1.35, 1.5, 1.7), "divided by, or times"),
+            "mass": Magnitude("factor", (1.2, 1.4, 1.7, 2.0, 2.5), "multiplies or divides"),
+            "friction": Magnitude("factor", (1.1, 1.2, 1.35, 1.5, 1.7), "divides or multiplies"),
             "noise": Magnitude(
                 "share", (0.02, 0.04, 0.06, 0.08, 0.1), "of the range, standard deviation on executed motion"
             ),

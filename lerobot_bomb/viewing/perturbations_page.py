@@ -17,7 +17,7 @@ LEVELS = range(1, MAX_LEVEL + 1)
 INTRODUCTION = f"""\
 # Perturbations
 
-How an episode may differ from the nominal one, and by how much:
+How an episode may differ from the nominal one, and by how much.
 
 ```
 lerobot-eval --policy.path=CHECKPOINT --env.type=bomb --eval.n_episodes=100 --eval.batch_size=10 \\
@@ -27,18 +27,19 @@ lerobot-bomb view gallery --axes=camera,light --seeds=2,3 --output=outputs/galle
 ```
 
 - An **axis** changes one thing and leaves all others alone.
-- A **level** says how far, from 0 (not at all) to {MAX_LEVEL}. Colours and directions are drawn from the
-  seed, so the levels of one seed differ in size only.
-- A **condition** is one or several axes with levels: `none`, `camera:3`, `camera:2+light:3`. The list needs
-  its brackets.
-- A **range**, as `camera:1-5`, draws the level from the seed; each axis of `all:1-5` draws its own.
-- `{ALL}:k` is every axis at level k but `goal_marker`, which helps.
+- A **level** says how strong the change is, from 0 (none) to {MAX_LEVEL}. Colours and directions come from
+  the seed, so the levels of one seed differ only in strength.
+- A **condition** is `none`, or one or several axes with levels: `camera:3`, `camera:2+light:3`. Lists of
+  conditions need brackets.
+- A **range** such as `camera:1-5` draws the level from the seed. Each axis of `all:1-5` draws its own
+  level.
+- `{ALL}:k` is every axis at level k except `goal_marker`, which makes the task easier.
 
-Each condition is a group in `eval_info.json`: `place.camera-2.light-3`, `place.all-1to5`. What is needed to
-solve the episode stays in view, and the instruction always says what is meant.
+Each condition is a group in `eval_info.json`, such as `place.camera-2.light-3` or `place.all-1to5`.
+Everything needed stays in view, and the instruction stays unambiguous.
 
 `lerobot-bomb view gallery --output=docs/media/perturbations --doc=docs/perturbations.md` writes this page.
-The magnitudes are in `lerobot_bomb/bomb/perturbations.py`; what an axis does, in
+The magnitudes are in `lerobot_bomb/bomb/perturbations.py`, the axes' code in
 `envs/lerobot_env_bomb/axes/AXIS.py`.
 """
 

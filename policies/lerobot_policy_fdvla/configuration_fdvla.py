@@ -219,7 +219,7 @@ class FdvlaConfig(RelativeVlaConfig, PlacesVlaConfig):
         return [
             f"{' and '.join(used)} {'heads' if len(used) > 1 else 'head'}",
             f"{'both' if len(of_used) > 1 else ' '.join(of_used) or 'none'} modulated",
-            f"{self.used_sampler} in {self.num_inference_steps} steps",
+            f"{self.used_sampler} sampler ({self.num_inference_steps} steps)",
             *super().methods(),
         ]
 

@@ -123,7 +123,7 @@ class Vla0SmolConfig(RelativeVlaConfig, TokenVlaConfig, PointingVlaConfig):
     def methods(self) -> list[str]:
         is_masked = self.mask_max_fraction > 0 and self.mask_skip_prob < 1
         return [
-            f"numbers of {self.n_action_bins} bins",
+            f"{self.n_action_bins} bins per number",
             *super().methods(),
             f"masking up to {100 * self.mask_max_fraction:g} % ({self.mask_level})"
             if is_masked
