@@ -97,6 +97,7 @@ def test_the_episode_of_a_line(
     assert found["result"]["spec"] == row["spec"]
     for wrong, message in (
         ("--line=2", "--line=2 is no episode of"),
+        ("--line=0", "--line=0 is no episode of"),
         ("--perturbations=camera:3", "drop --env.perturbations: the record of --results says it"),
     ):
         assert main(["explain", *flags[:-1], wrong, f"--output={tmp_path / 'other'}"]) == 1

@@ -20,8 +20,8 @@ from lerobot_bomb.commands.results_files import missing_of_sweep
 from lerobot_bomb.results.groups import read_results
 from lerobot_bomb.results.record import Record, without_measured
 from lerobot_bomb.sweep.claim import claimed
-from lerobot_bomb.sweep.local import PYTHON, progress
-from lerobot_bomb.sweep.manifest import Job, Manifest, plan
+from lerobot_bomb.sweep.local import PYTHON, Workers, progress
+from lerobot_bomb.sweep.manifest import Job, Manifest, plan, policy_flag
 from lerobot_bomb.sweep.store import MAX_ATTEMPTS, Store
 
 FLAGS = ("--env.type=bomb", "--env.image_size=32", "--policy.device=cpu")
@@ -239,7 +239,7 @@ def test_a_job_that_cannot_begin_is_given_up_at_once(run_all: Callable[[Manifest
         ),
         (
             ["--policies=bomb_expert", "--env.type=bomb", "--tasks=place,plaec"],
-            "--tasks='plaec' is unknown; choose one of: goal, long, object, place, spatial, all",
+            "--env.task='plaec' is unknown; choose one of: goal, long, object, place, spatial, all",
         ),
         (["--policies=bomb_expert", "--env.type=bomb", "--episodes=0"], "--episodes=0 must be at least 1"),
         (["--policies=/gone", "--env.type=bomb"], "--policies: /gone is no folder"),
@@ -329,12 +329,28 @@ def test_a_sweep_that_is_refused_says_why_and_leaves_its_folder_free(
     assert sweep(tmp_path, *flags, "--env.image_size=64") == 0
 
 
-def test_a_folder_that_is_no_checkpoint_is_told(tmp_path: Path) -> None:
-    from lerobot_bomb.sweep.check import check
-
-    told = f"--policy.path={tmp_path}: config.json not found in {tmp_path}; give the folder"
+def test_a_folder_is_a_checkpoint_or_told_and_stands_for_no_type(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    told = f"--policies: {tmp_path} holds no config.json; give the folder that lerobot-train names"
     with pytest.raises(ValueError, match=re.escape(told)):
-        check(plan((str(tmp_path),), (), ("none",), 7, 1, 1, ("--env.type=bomb",)))
+        policy_flag(str(tmp_path))
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "act").mkdir()
+    assert policy_flag("act") == "--policy.type=act"
+    (tmp_path / "act" / "config.json").touch()
+    assert policy_flag("act") == "--policy.path=act"
+
+
+def test_what_workers_warned_of_is_told_once(tmp_path: Path) -> None:
+    log, warning = tmp_path / "sweep" / "workers.log", b"WARNING:lerobot_bomb.checkpoints:fps is not known\n"
+    store = Store(log.parent, plan(("bomb_random",), (), ("none",), 7, 1, 1, ("--env.type=bomb",)))
+    log.write_bytes(b"WARNING:lerobot_bomb:of an earlier command\n")
+    workers = Workers(store, [], [], None)
+    with log.open("ab") as file:
+        file.write(warning + b"WARNING:root:of LeRobot\n" + warning)
+    assert workers.warnings() == ["fps is not known"]
+    workers.close()
 
 
 def test_files_that_vanish_while_they_are_counted_do_not_matter(

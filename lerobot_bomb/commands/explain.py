@@ -99,7 +99,7 @@ def _of_record(args: argparse.Namespace) -> "_Query":
     for name, default in of_episode.items():
         if getattr(args, name) != default:
             raise ValueError(f"drop --env.{name.removeprefix('env_')}: the record of --results says it")
-    replay = Replay(read_record(args.results, args.line or 1), args.policy_path)
+    replay = Replay(read_record(args.results, 1 if args.line is None else args.line), args.policy_path)
     if replay.checkpoint is None:
         raise ValueError("this record's policy has no checkpoint, so there is nothing to explain")
     check_checkpoint(replay.checkpoint)

@@ -136,14 +136,14 @@ def _manifest(args: argparse.Namespace) -> Manifest:
                 f"{args.folder} holds no {NAME}: begin a sweep with --policies=... --env.type=..."
             )
         if args.rest or args.tasks or args.perturbations:
-            raise ValueError(f"{args.folder / NAME} says what is run; drop {(*args.rest, '--tasks')[0]}")
+            raise ValueError(f"{args.folder / NAME} says what is run; drop {(*args.rest, '--env.task')[0]}")
         return Manifest.read(args.folder)
     if not args.policies:
         raise ValueError("--policies names none")
     record_type = _record_type(args.rest)
     _check_types(args.policies, args.rest)
     for task in args.tasks if record_type.tasks else ():
-        one_of("--tasks", task, record_type.tasks)
+        one_of("--env.task", task, record_type.tasks)
     conditions = _expanded(args.perturbations, record_type)
     args.batch_size = 1 if record_type.starts_by_number else args.batch_size
     return plan(args.policies, args.tasks, conditions, args.seed, args.episodes, args.batch_size, args.rest)

@@ -1,6 +1,7 @@
 """Jobs that worker processes run on this machine."""
 
 import os
+import re
 import signal
 import subprocess
 import sys
@@ -17,6 +18,7 @@ from lerobot_bomb.sweep.store import POLL_S, REFUSED, Store
 # -P: nothing in the folder that the user is in stands for a module of the same name
 PYTHON = (sys.executable, "-P", "-m")
 MAX_ENDED = 3
+MAX_SHOWN_WARNINGS = 5
 
 
 def progress(store: Store, jobs: Sequence[Job]) -> Iterator[bool]:
@@ -166,8 +168,16 @@ class Workers:
 
     def _last_line(self) -> str:
         """The last line that this command's workers have said, '' where they said nothing."""
-        said = self._path.read_bytes()[self._start :].decode(errors="replace").split("\n")
-        return next((line.strip() for line in reversed(said) if line.strip()), "")
+        return next((line.strip() for line in reversed(self._said()) if line.strip()), "")
+
+    def _said(self) -> list[str]:
+        """Return the lines that this command's workers have said."""
+        return self._path.read_bytes()[self._start :].decode(errors="replace").split("\n")
+
+    def warnings(self) -> list[str]:
+        """Return what this package has warned of in workers, each warning once."""
+        found = (re.match(r"WARNING:lerobot_bomb[\w.]*:(.+)", line) for line in self._said())
+        return list(dict.fromkeys(match[1] for match in found if match))
 
     def close(self) -> None:
         """End all."""
@@ -194,3 +204,5 @@ def run_part(store: Store, part: str, num_workers: int, timeout_s: int | None = 
             workers.look(has_progressed)
     finally:
         workers.close()
+        for warning in workers.warnings()[:MAX_SHOWN_WARNINGS]:
+            print(f"warning: {warning}", file=sys.stderr)

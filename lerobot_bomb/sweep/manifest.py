@@ -10,7 +10,7 @@ from itertools import product
 from pathlib import Path
 from typing import Any
 
-from lerobot_bomb.checkpoints.names import is_hub_id
+from lerobot_bomb.checkpoints.names import CONFIG, is_hub_id
 from lerobot_bomb.checkpoints.shipped import checkpoint_path
 from lerobot_bomb.files import read_json, written_whole
 
@@ -202,16 +202,22 @@ def _condition_flags(condition: str) -> list[str]:
 
 
 def policy_flag(policy: str) -> str:
-    """'--policy.path=bomb:NAME', '--policy.type=act': a path has a slash or a colon, or exists.
+    """'--policy.path=bomb:NAME', '--policy.type=act': a path has a slash or a colon, or holds a checkpoint.
 
     Raises:
         ValueError: it can be neither a checkpoint, here or on the Hub, nor a type.
     """
     path = checkpoint_path(policy)
-    is_path = "/" in policy or path != policy or Path(policy).exists()
+    is_here = Path(policy).is_file() or (Path(policy) / CONFIG).is_file()
+    is_path = is_here or "/" in policy or path != policy
     if is_path and not Path(path).is_dir() and not is_hub_id(policy):
         raise ValueError(
             f"--policies: {policy} is no folder; name a checkpoint's, bomb:NAME, USER/NAME or a type"
+        )
+    if is_path and Path(path).is_dir() and not (Path(path) / CONFIG).is_file():
+        raise ValueError(
+            f"--policies: {policy} holds no {CONFIG}; give the folder that lerobot-train names "
+            "pretrained_model"
         )
     if not is_path and not policy.isidentifier():
         raise ValueError(f"--policies: {policy!r} is no policy type; name one, or a checkpoint's folder")
