@@ -20,9 +20,9 @@ from lerobot_bomb.flow.samplers import (
     check_heads,
     check_sampling,
 )
-from lerobot_bomb.policies.config import RELATIVE_AS_TRAINED, RelativeVlaConfig
 from lerobot_bomb.policies.flag_groups import short_help
 from lerobot_bomb.policies.pointing_config import PlacesVlaConfig
+from lerobot_bomb.policies.relative_config import RELATIVE_AS_TRAINED, RelativeVlaConfig
 from lerobot_bomb.training.policy_flags import (
     MAX_POSITIONS,
     check_not_negative,
