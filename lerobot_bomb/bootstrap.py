@@ -81,7 +81,7 @@ class Slope:
     high: float | None
 
 
-def slope(levels_N: np.ndarray, values_N: np.ndarray, episode_N: np.ndarray) -> Slope | None:
+def fit_slope(levels_N: np.ndarray, values_N: np.ndarray, episode_N: np.ndarray) -> Slope | None:
     """Fit the slope of N values over their levels, by least squares; None where all levels are the same.
 
     `episode_N` says which values are of one episode under several conditions: the percentile bootstrap draws
@@ -124,7 +124,7 @@ def variance_share(values_N: np.ndarray, levels_N: np.ndarray) -> float | None:
 
 
 @dataclass(frozen=True)
-class Measure:
+class Estimate:
     """A mean over frames and its 95 % bootstrap interval over episodes; no interval of one episode."""
 
     mean: float
@@ -136,7 +136,7 @@ class Measure:
         return f"{self.mean:.4g}{interval}"
 
 
-def measure(values_RX: np.ndarray, episode_R: np.ndarray) -> Measure:
+def estimate_mean(values_RX: np.ndarray, episode_R: np.ndarray) -> Estimate:
     """Mean of all finite numbers (R, ...); every one counts the same."""
     values_RX = values_RX.reshape(len(episode_R), -1)
     counts_RX = np.isfinite(values_RX)
@@ -146,7 +146,7 @@ def measure(values_RX: np.ndarray, episode_R: np.ndarray) -> Measure:
     np.add.at(counts_E, place_R, counts_RX.sum(axis=1))
     counted = counts_E > 0
     low, high = bootstrap_interval(sums_E[counted], counts_E[counted]) or (None, None)
-    return Measure(float(sums_E.sum() / counts_E.sum()), low, high)
+    return Estimate(float(sums_E.sum() / counts_E.sum()), low, high)
 
 
 def _is_constant(sums_E: np.ndarray, counts_E: np.ndarray) -> bool:

@@ -18,7 +18,7 @@ def one_of(flag: str, value: object, allowed: Collection) -> None:
 
 
 @contextmanager
-def reworded(texts: Mapping[str, str]) -> Iterator[None]:
+def rewording_errors(texts: Mapping[str, str]) -> Iterator[None]:
     """Replace texts in the message of a ValueError: a shared check names a flag that was not given."""
     try:
         yield

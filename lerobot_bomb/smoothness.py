@@ -9,7 +9,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from lerobot_bomb.bootstrap import Measure, measure
+from lerobot_bomb.bootstrap import Estimate, estimate_mean
 
 MIN_ACTIONS = 4  # that a third difference takes
 
@@ -18,8 +18,8 @@ MIN_ACTIONS = 4  # that a third difference takes
 class Smoothness:
     """Mean Euclidean norms of differences over consecutive actions."""
 
-    j2: Measure  # of a[t+1] - 2 a[t] + a[t-1]: acceleration, where actions are positions
-    j3: Measure  # of a[t+2] - 3 a[t+1] + 3 a[t] - a[t-1]: jerk
+    j2: Estimate  # of a[t+1] - 2 a[t] + a[t-1]: acceleration, where actions are positions
+    j3: Estimate  # of a[t+2] - 3 a[t+1] + 3 a[t] - a[t-1]: jerk
 
 
 def smoothness(
@@ -65,10 +65,10 @@ def smoothness(
 
 def _mean_difference(
     actions_RD: np.ndarray, episode_R: np.ndarray, start_R: np.ndarray, order: int, step: float
-) -> Measure:
+) -> Estimate:
     """Mean of the differences that lie within an episode."""
     within = episode_R[order:] == episode_R[:-order]
     if not within.any():
         raise ValueError(f"no episode has {order + 1} actions, as a difference of order {order} takes")
     norms = np.linalg.norm(np.diff(actions_RD, n=order, axis=0), axis=1) / step**order
-    return measure(norms[within], start_R[order:][within])
+    return estimate_mean(norms[within], start_R[order:][within])

@@ -14,7 +14,7 @@ from lerobot_bomb.bomb.observation import RenderOptions
 from lerobot_bomb.checkpoints.shipped import checkpoint_path, shipped_names
 from lerobot_bomb.envs.rollout import expert_agent, make_env, run_episode
 from lerobot_bomb.explain.images import filling
-from lerobot_bomb.explain.moment import Query
+from lerobot_bomb.explain.moment import MomentQuery
 from lerobot_bomb.explain.other_policies import scored
 from lerobot_bomb.explain.question import Question
 from lerobot_bomb.explain.scored_policy import ScoredPolicy
@@ -69,11 +69,11 @@ def ask(
     return Question(of or scored_by(policy), prepare or policy.prepare, raw, batch_size)
 
 
-def query(policy: LoadedPolicy) -> Query:
+def query(policy: LoadedPolicy) -> MomentQuery:
     """Patches, the words of the target and of the colour."""
     _, instruction, _, others = moment()
     spans = [difference(word, instruction, other) for word, (other, _) in others.items()]
-    return Query(
+    return MomentQuery(
         grid=GRID,
         fill="mean",
         spans=[span for span in spans if span is not None],

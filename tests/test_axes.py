@@ -25,9 +25,9 @@ from lerobot_env_bomb.axes.language import Wording
 from lerobot_env_bomb.axes.light import Light
 from lerobot_env_bomb.axes.object import GREY, StoneLook
 from lerobot_env_bomb.axes.stones import Stones
-from lerobot_env_bomb.axes.table import TABLE_RGB, Table
+from lerobot_env_bomb.axes.table import TABLE_RGB, TableLook
 from lerobot_env_bomb.axes.transform import Transform
-from lerobot_env_bomb.model import BOARD_HALF_SIZE_M, build_model
+from lerobot_env_bomb.model import compile_scene
 from lerobot_env_bomb.perturb import PerturbedEpisode as Episode
 from lerobot_env_bomb.perturb import sample_episode
 from lerobot_env_bomb.robots import ROBOTS
@@ -120,7 +120,7 @@ def test_a_range_draws_all_its_levels_and_the_axes_of_all_draw_apart() -> None:
 
 
 def test_a_nominal_reset_undoes_every_edit(scene: Scene) -> None:
-    fresh = {name: values.copy() for name, values in number_fields(build_model(ROBOTS["scara"])).items()}
+    fresh = {name: values.copy() for name, values in number_fields(compile_scene(ROBOTS["scara"])).items()}
     changed = set()
     for axis in AXES:
         arranged(scene, 1, f"{axis}:5")
@@ -161,7 +161,7 @@ def test_board_tray_and_stone_stay_in_the_image(scene: Scene, seed: int, level: 
     drawn = arranged(scene, seed, f"camera:{level}+start:{level}")
     camera = scene.data.camera(CAMERAS[0])
     signs = np.array([(x, y) for x in (-1, 1) for y in (-1, 1)])
-    corners = [signs * BOARD_HALF_SIZE_M, TRAY_CENTER_XY + signs * np.array(TRAY_HALF_SIZE_XY)]
+    corners = [signs * BOARD.half_size_m, TRAY_CENTER_XY + signs * np.array(TRAY_HALF_SIZE_XY)]
     xy = np.concatenate([*corners, drawn.layout.stone_xy[STONE][None]])
     xyz = np.column_stack([xy, np.full(len(xy), BOARD.thickness_m)])
     x, y, back = camera.xmat.reshape(3, 3).T @ (xyz - camera.xpos).T
@@ -243,7 +243,7 @@ def test_stones_of_any_size_and_mass_rest_where_they_are_put(scene: Scene, seed:
 
 
 def test_mass_and_friction_change_as_if_compiled_so(scene: Scene) -> None:
-    nominal = build_model(ROBOTS["scara"])
+    nominal = compile_scene(ROBOTS["scara"])
     stone = nominal.body("stone_3").id
     factors = set()
     for seed in range(20):
@@ -269,13 +269,13 @@ def test_mass_and_friction_change_as_if_compiled_so(scene: Scene) -> None:
 def test_the_colours_of_the_table_are_split_and_black_and_white_keep_their_sides() -> None:
     assert len(TABLE_RGB) == 8
     drawn = {
-        split: {drawn_of(Table, seed, "table:5", split=split).table_rgb for seed in range(200)}
+        split: {drawn_of(TableLook, seed, "table:5", split=split).table_rgb for seed in range(200)}
         for split in ("train", "heldout")
     }
     train, heldout = drawn.values()
     assert train == set(TABLE_RGB) and len(heldout) == 2 and not train & heldout
     look = drawn_of(StoneLook, 0, "object:5")
-    model = build_model(ROBOTS["scara"])
+    model = compile_scene(ROBOTS["scara"])
     model.geom("stone_0_visual").rgba[:3] = 0.06
     model.geom("stone_1_visual").rgba[:3] = 0.96
     look.edit_model(model)

@@ -10,7 +10,7 @@ from lerobot_bomb.commands.main import main
 from lerobot_bomb.conditions import MAX_LEVEL
 from lerobot_bomb.flag_errors import FlagError
 from lerobot_bomb.libero.assets import SUITES, Libero
-from lerobot_bomb.libero.episode import LiberoFailure, LiberoSpec, failure_of, initial_state_of
+from lerobot_bomb.libero.episode import LiberoFailure, LiberoSpec, initial_state_of, libero_failure_of
 from lerobot_bomb.libero.perturbations import LIBERO_AXES
 from lerobot_bomb.libero.wording import FORMS, orders_of, reworded
 from lerobot_bomb.results.libero import LiberoResult
@@ -87,9 +87,9 @@ def test_the_default_seed_of_lerobot_eval_starts_with_the_first_initial_state() 
 
 def test_an_episode_fails_in_one_way() -> None:
     wanted = {"bowl", "plate"}
-    assert failure_of(set(), wanted) is LiberoFailure.NEVER_TOUCHED
-    assert failure_of({"box"}, wanted) is LiberoFailure.WRONG_OBJECT
-    assert failure_of({"box", "bowl"}, wanted) is LiberoFailure.UNFINISHED
+    assert libero_failure_of(set(), wanted) is LiberoFailure.NEVER_TOUCHED
+    assert libero_failure_of({"box"}, wanted) is LiberoFailure.WRONG_OBJECT
+    assert libero_failure_of({"box", "bowl"}, wanted) is LiberoFailure.UNFINISHED
 
 
 @pytest.mark.parametrize(

@@ -20,7 +20,7 @@ from lerobot.envs.utils import preprocess_observation
 from lerobot_bomb.commands.main import main
 from lerobot_bomb.conditions import nuisances_of
 from lerobot_bomb.flag_errors import FlagError
-from lerobot_bomb.pusht.episode import PushTFailure, PushTSpec, failure_of
+from lerobot_bomb.pusht.episode import PushTFailure, PushTSpec, pusht_failure_of
 from lerobot_bomb.pusht.perturbations import PUSHT_AXES
 from lerobot_env_bomb_pusht.configuration_bomb_pusht import BombPushTEnvConfig
 
@@ -187,7 +187,7 @@ def pose(x: float, y: float, turned_deg: float) -> np.ndarray:
 def test_a_failure_has_the_class_of_how_it_ended(
     end: np.ndarray, coverage: float, touched: bool, failure: str
 ) -> None:
-    assert failure_of(pose(100, 100, 0), end, GOAL, coverage, touched) == failure
+    assert pusht_failure_of(pose(100, 100, 0), end, GOAL, coverage, touched) == failure
 
 
 def test_an_episode_counts_contacts_of_the_agent_only() -> None:

@@ -8,8 +8,8 @@ from lerobot_bomb.bootstrap import (
     Slope,
     bca_interval,
     bootstrap_interval,
+    fit_slope,
     paired_bootstrap_interval,
-    slope,
     sums_by,
     variance_share,
 )
@@ -46,7 +46,7 @@ def test_equal_numbers_or_one_have_no_interval(values: list[float]) -> None:
 
 def test_a_slope_that_all_resamples_have_has_no_interval() -> None:
     levels, values = np.array([0.0, 1, 0, 1]), np.array([1.0, 0, 1, 0])
-    assert slope(levels, values, np.array([7, 7, 8, 8])) == Slope(-1.0, None, None)
+    assert fit_slope(levels, values, np.array([7, 7, 8, 8])) == Slope(-1.0, None, None)
 
 
 # BCa
@@ -94,11 +94,11 @@ def test_a_slope_is_that_of_least_squares() -> None:
     rng = np.random.default_rng(0)
     levels, episodes = drawn_levels(rng)
     values = (rng.random(len(levels)) > levels / 6).astype(float)
-    found = slope(levels, values, episodes)
+    found = fit_slope(levels, values, episodes)
     assert found is not None and found.per_level == pytest.approx(linregress(levels, values)[0])
     assert found.low is not None and found.high is not None
     assert found.low < found.per_level < found.high
-    assert slope(np.full(4, 3), np.ones(4), np.arange(4)) is None
+    assert fit_slope(np.full(4, 3), np.ones(4), np.arange(4)) is None
 
 
 def test_the_interval_of_a_slope_covers_it_with_episodes_that_differ() -> None:
@@ -108,7 +108,7 @@ def test_the_interval_of_a_slope_covers_it_with_episodes_that_differ() -> None:
     for _ in range(n):
         of_episode = np.repeat(rng.uniform(-0.2, 0.2, 60), 6)
         values = (rng.random(len(levels)) < 0.7 + truth * levels + of_episode).astype(float)
-        found = slope(levels, values, episodes)
+        found = fit_slope(levels, values, episodes)
         assert found is not None and found.low is not None and found.high is not None
         num_covered += found.low <= truth <= found.high
     assert 0.91 <= num_covered / n <= 0.98

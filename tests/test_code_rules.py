@@ -25,6 +25,22 @@ def test_no_docstring_opens_with_a_fragment() -> None:
     assert num_docstrings > 1000 and not fragments
 
 
+# names that have one role in each module of a kind: a command, a section of a report, a policy's parts
+FAMILIES = {"add_arguments": "/commands/", "run": "/commands/", "section": "/report/sections/"}
+FAMILIES |= {"build_model": "/building_", "make_layout": "/building_", "make_pointer": "/pointing_"}
+
+
+def test_no_two_public_classes_or_functions_have_one_name() -> None:
+    places: dict[str, set[str]] = {}
+    for path in (path for folder in FOLDERS[:3] for path in (ROOT / folder).rglob("*.py")):
+        for node in ast.parse(path.read_text()).body:
+            if isinstance(node, ast.FunctionDef | ast.ClassDef) and not node.name.startswith("_"):
+                kind = FAMILIES.get(node.name)
+                place = kind if kind and kind in str(path) else str(path.relative_to(ROOT))
+                places.setdefault(node.name, set()).add(place)
+    assert len(places) > 1000 and not {name: each for name, each in places.items() if len(each) > 1}
+
+
 def test_scores_of_a_policy_reach_into_none_of_its_private_members() -> None:
     paths = [*(ROOT / "lerobot_bomb" / "explain").glob("*.py"), *(ROOT / "policies").glob("*/scored_*.py")]
     reached = [

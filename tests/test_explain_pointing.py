@@ -14,7 +14,7 @@ from pointing_cases import PLACES, POINTING
 from policy_cases import save_checkpoint
 
 from lerobot_bomb.bomb.board import BOARD, NUM_STONES
-from lerobot_bomb.bomb.camera import Camera
+from lerobot_bomb.bomb.camera import PinholeCamera
 from lerobot_bomb.bomb.expert import GRASP_DEPTH_M, SQUEEZE_M, expert_action
 from lerobot_bomb.bomb.move import place_name
 from lerobot_bomb.bomb.pointing import PointedAt
@@ -193,7 +193,7 @@ def test_marks_are_drawn_where_they_are_seen() -> None:
     world_from_camera = np.diag([1.0, -1.0, -1.0, 1.0])
     world_from_camera[2, 3] = 0.5
     mark = Mark(np.array([0.5, -0.25, 0.0]), PLACE_RGB, False, "row 1, column 3")
-    shown = marked(np.zeros((64, 64, 3), np.uint8), Camera(intrinsics, world_from_camera), [mark])
+    shown = marked(np.zeros((64, 64, 3), np.uint8), PinholeCamera(intrinsics, world_from_camera), [mark])
     # its pixel (41.5, 36.5) of 64 is here of 448
     assert shown.shape == (MARKED_PX, MARKED_PX, 3)
     cross = shown[..., 0][255:264, 290:299] > 200

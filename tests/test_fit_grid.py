@@ -22,7 +22,7 @@ from lerobot_bomb.commands.main import main
 from lerobot_bomb.data.columns import read_columns
 from lerobot_bomb.data.record import record
 from lerobot_bomb.data.recording import Recording
-from lerobot_bomb.viewing.fitted_grid import CLIPPING, UNIFORM, action_bounds, quantisation_errors
+from lerobot_bomb.viewing.fitted_grid import CLIPPING, UNIFORM, dataset_action_bounds, quantisation_errors
 from lerobot_bomb.viewing.grid_plot import (
     BAR_RGB,
     EDGE_RGB,
@@ -59,7 +59,7 @@ def table(text: str, title: str) -> dict[str, dict[str, float]]:
 
 def fitted(meta: LeRobotDatasetMetadata) -> tuple[ActionGrids, np.ndarray, float | np.ndarray]:
     """The default grid of a dataset, its normalised actions (N, D) and their unit (D,)."""
-    low, high = action_bounds(meta, NormalizationMode.MIN_MAX)
+    low, high = dataset_action_bounds(meta, NormalizationMode.MIN_MAX)
     actions = normalised(read_columns(meta, (ACTION,))[ACTION], low, high)
     grids = ActionGrids(GridSettings(default_groups(len(low))), len(low))
     grids.fit(actions, normalised_rest(low, high))
@@ -102,7 +102,9 @@ def test_pusht_has_two_coordinates_in_pixels(pusht_dataset: Path, capsys: pytest
     assert fit_grid(pusht_dataset, "--policy.grid_distribution=quantile", repo_id=PUSHT) == 0
     text = capsys.readouterr().out
     normal, pixels = (table(text, title) for title in ("in normalised units", "in the dataset's units"))
-    low, high = action_bounds(LeRobotDatasetMetadata(PUSHT, root=pusht_dataset), NormalizationMode.MIN_MAX)
+    low, high = dataset_action_bounds(
+        LeRobotDatasetMetadata(PUSHT, root=pusht_dataset), NormalizationMode.MIN_MAX
+    )
     for dim, name in enumerate(["target_x", "target_y"]):
         ratio = pixels[name]["cond_mean"] / normal[name]["cond_mean"]
         assert ratio == pytest.approx((high - low)[dim] / 2, rel=1e-3)
@@ -122,7 +124,7 @@ def test_errors_include_what_quantiles_clip(
     text = capsys.readouterr().out
     shown = table(text, "in the dataset's units")
     meta = LeRobotDatasetMetadata(REPO_ID, root=root)
-    low, high = action_bounds(meta, NormalizationMode.QUANTILES)
+    low, high = dataset_action_bounds(meta, NormalizationMode.QUANTILES)
     actions = read_columns(meta, (ACTION,))[ACTION].astype(float)
     lost = np.abs(actions - actions.clip(low, high)).mean(axis=0)
     assert lost[0] > 1e-3

@@ -171,11 +171,11 @@ def test_a_tilde_in_a_path_is_the_home_folder(
 
 
 def test_a_camera_without_a_video_is_told(recorded: Path) -> None:
-    from lerobot_bomb.data.blocks import check_videos
+    from lerobot_bomb.data.blocks import check_encoded_frames
 
     root = recorded / "x"
     wrist, other = "observation.images.wrist", "observation.images.other"
     num_frames = json.loads((root / "meta/info.json").read_text())["total_frames"]
-    check_videos(root, [wrist, "observation.images.workspace"], num_frames)
+    check_encoded_frames(root, [wrist, "observation.images.workspace"], num_frames)
     with pytest.raises(RuntimeError, match=rf"the video of {other} has 0 frames instead of {num_frames}"):
-        check_videos(root, [wrist, "observation.images.workspace", other], num_frames)
+        check_encoded_frames(root, [wrist, "observation.images.workspace", other], num_frames)

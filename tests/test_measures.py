@@ -1,7 +1,7 @@
 import numpy as np
 import pytest
 
-from lerobot_bomb.bootstrap import measure
+from lerobot_bomb.bootstrap import estimate_mean
 from lerobot_bomb.evaluation.measures import measure_l1
 
 
@@ -17,15 +17,15 @@ def test_padded_steps_do_not_count() -> None:
 
 def test_the_interval_draws_episodes_not_frames() -> None:
     values, episodes = np.array([0.0] * 50 + [1.0] * 50), np.array([0] * 50 + [1] * 50)
-    found = measure(values, episodes)
+    found = estimate_mean(values, episodes)
     assert (found.mean, found.low, found.high) == (0.5, 0.0, 1.0)  # two episodes tell next to nothing
-    alone = measure(values[:50], episodes[:50])
+    alone = estimate_mean(values[:50], episodes[:50])
     assert (alone.mean, alone.low, alone.high) == (0.0, None, None)
-    many = measure(values, np.arange(100))
+    many = estimate_mean(values, np.arange(100))
     assert many.low == pytest.approx(0.4, abs=0.02)  # 0.5 - 1.96 * 0.05
     assert many.high == pytest.approx(0.6, abs=0.02)
 
 
 def test_a_frame_counts_as_often_as_it_has_numbers() -> None:
     values = np.array([[1.0, 1.0], [4.0, np.nan], [np.nan, np.nan]])
-    assert measure(values, np.array([0, 1, 2])).mean == 2.0
+    assert estimate_mean(values, np.array([0, 1, 2])).mean == 2.0

@@ -110,7 +110,7 @@ def test_what_each_type_says() -> None:
     ]
     assert fdvla(use_denoise_head=False, dualmod_flow=False).methods()[:3] == [
         "flow head",
-        "none modulated",
+        "none modulated by the instruction",
         "flow sampler (3 steps)",
     ]
 

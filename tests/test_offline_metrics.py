@@ -16,7 +16,7 @@ from lerobot_bomb.commands.main import main
 from lerobot_bomb.data.record import record
 from lerobot_bomb.data.recording import Recording
 from lerobot_bomb.evaluation.offline_metrics import evenly_spaced, measure_columns
-from lerobot_bomb.evaluation.predictions import load_dataset, load_policy
+from lerobot_bomb.evaluation.predictions import load_dataset, load_network
 from lerobot_bomb.evaluation.splits import Split, make_split, trained_episodes
 
 REPO_ID = "test/offline"
@@ -59,7 +59,7 @@ def checkpoint(train: Callable[..., Path]) -> Path:
 def by_heart(checkpoint: Path, root: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     """The checkpoint after it learned the first and the last frame of episode 0."""
     config, meta = read_config(checkpoint, None), LeRobotDatasetMetadata(REPO_ID, root=root)
-    policy, dataset = load_policy(config), load_dataset(config, meta, [0])
+    policy, dataset = load_network(config), load_dataset(config, meta, [0])
     raw = torch.utils.data.default_collate([dataset[0], dataset[len(dataset) - 1]])
     batch = load_processors(config)[0](raw)
     optimizer = torch.optim.AdamW(policy.get_optim_params(), lr=2e-3, weight_decay=0.0)
@@ -91,7 +91,7 @@ def test_frames_are_evenly_spaced() -> None:
 
 def test_loss_and_l1_equal_a_plain_loop(checkpoint: Path, root: Path) -> None:
     config, meta = read_config(checkpoint, None), LeRobotDatasetMetadata(REPO_ID, root=root)
-    policy, dataset = load_policy(config), load_dataset(config, meta, [2, 3])
+    policy, dataset = load_network(config), load_dataset(config, meta, [2, 3])
     preprocess, postprocess = load_processors(config)
     losses, accuracies, errors = [], [], []
     for index in range(len(dataset)):

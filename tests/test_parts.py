@@ -295,9 +295,9 @@ def test_a_recording_that_was_begun_at_once_takes_no_parts(
 
 
 def test_a_dataset_that_lies_in_parts_is_told(root: Path) -> None:
-    from lerobot_bomb.data.missing import explain
+    from lerobot_bomb.data.missing import describe_missing_dataset
 
-    said = explain("test/parts", root, FileNotFoundError())
+    said = describe_missing_dataset("test/parts", root, FileNotFoundError())
     assert said == (
         f"the recording {root} lies in parts ({root}.parts): join them with `lerobot-bomb record ... --join`"
     )

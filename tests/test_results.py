@@ -16,7 +16,7 @@ from lerobot_bomb.environments import ENVIRONMENTS
 from lerobot_bomb.results import reading
 from lerobot_bomb.results.bomb import OLD_VERSION, EpisodeResult, median_error_mm
 from lerobot_bomb.results.groups import read_results
-from lerobot_bomb.results.means import mean_of
+from lerobot_bomb.results.means import mean_measure
 from lerobot_bomb.results.origin import PolicyIdentity
 from lerobot_bomb.results.pusht import PushTResult
 from lerobot_bomb.results.reading import parse_record
@@ -435,7 +435,7 @@ class WithPath(PushTResult):
     """Record of `bomb_pusht` with one measure more."""
 
     earlier: ClassVar = {**PushTResult.earlier, "path_px": None}
-    measures: ClassVar = (*PushTResult.measures, mean_of("path_px", "path", "mean, in pixels"))
+    measures: ClassVar = (*PushTResult.measures, mean_measure("path_px", "path", "mean, in pixels"))
 
     path_px: Annotated[float | None, lambda value: value is not None and value >= 0] = None
 

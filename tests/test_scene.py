@@ -6,7 +6,7 @@ from lerobot_bomb.bomb.episode import PHYSICS_HZ, ROBOTS, EpisodeSpec
 from lerobot_bomb.bomb.layout import Layout
 from lerobot_bomb.bomb.observation import CAMERAS, RenderOptions
 from lerobot_bomb.bomb.suites.place import STONE
-from lerobot_env_bomb.model import BOARD_HALF_SIZE_M, parked_xyz
+from lerobot_env_bomb.model import parked_xyz
 from lerobot_env_bomb.perturb import sample_episode
 from lerobot_env_bomb.render import CameraRenderer
 from lerobot_env_bomb.scene import WORKSPACE_HIGH, WORKSPACE_LOW, Scene
@@ -152,7 +152,7 @@ def test_the_workspace_camera_sees_board_tray_stones_and_gripper(
     image = renderer.draw(scene.data, "workspace", size)
     assert image.shape == (size, size, 3) and image.dtype == np.uint8
     edge = np.array([[-1, -1], [-1, 1], [1, -1], [1, 1]])
-    corners = [*(BOARD_HALF_SIZE_M * edge), *(np.array(TRAY_CENTER_XY) + np.array(TRAY_HALF_SIZE_XY) * edge)]
+    corners = [*(BOARD.half_size_m * edge), *(np.array(TRAY_CENTER_XY) + np.array(TRAY_HALF_SIZE_XY) * edge)]
     points = [[*corner, BOARD.thickness_m] for corner in corners] + [list(layout.gripper_xyz)]
     for point in points:
         assert all(0 <= p < size for p in pixel_of(scene, "workspace", point, size)), point

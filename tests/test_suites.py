@@ -136,7 +136,7 @@ def test_a_numbered_task_is_run_and_all_are_drawn(suite: str) -> None:
 
 @pytest.mark.parametrize(
     ("suite", "cases_of", "num_parts"),
-    [("object", object_suite.pairs_of, 2), ("spatial", spatial_suite.cases_of, 3)],
+    [("object", object_suite.pairs_of_split, 2), ("spatial", spatial_suite.cases_of_split, 3)],
 )
 def test_the_split_holds_out_combinations_whose_parts_are_all_seen(
     suite: str, cases_of: Callable[[str], tuple[tuple, ...]], num_parts: int

@@ -13,7 +13,6 @@ from lerobot_bomb.bomb.suites.place import (
     TEMPLATES,
     targets_of,
 )
-from lerobot_env_bomb.model import BOARD_HALF_SIZE_M
 from lerobot_env_bomb.perturb import PerturbedEpisode as Episode
 from lerobot_env_bomb.perturb import sample_episode
 from lerobot_env_bomb.scene import WORKSPACE_HIGH, WORKSPACE_LOW
@@ -68,7 +67,7 @@ def test_no_two_stones_overlap_and_the_one_to_be_moved_is_under_the_gripper(seed
     # wholly on the tray, hence off the board and the target
     to_edge = np.array(TRAY_HALF_SIZE_XY) - abs(layout.stone_xy[STONE] - np.array(TRAY_CENTER_XY))
     assert (to_edge >= BOARD.stone_radius_m).all()
-    assert layout.stone_xy[STONE, 0] - BOARD.stone_radius_m > BOARD_HALF_SIZE_M
+    assert layout.stone_xy[STONE, 0] - BOARD.stone_radius_m > BOARD.half_size_m
     assert (layout.gripper_xyz >= WORKSPACE_LOW).all() and (layout.gripper_xyz <= WORKSPACE_HIGH).all()
 
 

@@ -137,7 +137,7 @@ def started(argv: list[str], monkeypatch: pytest.MonkeyPatch) -> tuple[Checkpoin
     served: list[Any] = []
     monkeypatch.setattr(serve, "serve", lambda server, host, port: served.extend((server, host, port)))
     monkeypatch.setattr(sys, "argv", ["harness", *argv])
-    command.main()
+    command.run_checkpoint_server()
     model_server, host, port = served
     return model_server, host, port
 

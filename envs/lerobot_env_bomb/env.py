@@ -6,10 +6,10 @@ from typing import Any
 import numpy as np
 
 from lerobot_bomb.bomb.board import Intersection
-from lerobot_bomb.bomb.camera import Camera
+from lerobot_bomb.bomb.camera import PinholeCamera
 from lerobot_bomb.bomb.episode import DEFAULT_FPS, PHYSICS_HZ, EpisodeSpec
 from lerobot_bomb.bomb.judge import Judge
-from lerobot_bomb.bomb.layout import Snapshot
+from lerobot_bomb.bomb.layout import SceneState
 from lerobot_bomb.bomb.observation import (
     AGENT_POS,
     CAMERAS,
@@ -32,7 +32,7 @@ from lerobot_env_bomb.perturb import PerturbedEpisode, sample_episode
 from lerobot_env_bomb.render import CameraRenderer, compose_caption, extrinsics, intrinsics
 from lerobot_env_bomb.scene import Scene
 from lerobot_env_bomb.spaces import action_space, observation_space
-from lerobot_env_bomb.static_scene import StaticScene, draw_static, start_of
+from lerobot_env_bomb.static_scene import StaticScene, draw_static, starting_scene
 
 DEFAULT_SPEC = EpisodeSpec(seed=0)
 DEFAULT_RENDER_OPTIONS = RenderOptions()
@@ -91,12 +91,12 @@ class BombEnv(EpisodeEnv[EpisodeSpec, _Run, EpisodeResult]):
         self.action_space = action_space(spec.control_mode)
         self._action_low, self._action_high = self.action_space.low, self.action_space.high
         self.observation_space = observation_space(render_options, suite.num_goals)
-        self._now: Snapshot  # measured after the last control step
+        self._now: SceneState  # measured after the last control step
         self._renderer: CameraRenderer | None = None
 
     def _begin(self, spec: EpisodeSpec) -> tuple[Observation, dict[str, Any]]:
         episode = sample_episode(spec)
-        self._set_up(episode, start_of(episode))
+        self._set_up(episode, starting_scene(episode))
         return self._observe(), self._info()
 
     def show_static(self, seed: int) -> tuple[Observation, EpisodeResult]:
@@ -213,11 +213,11 @@ class BombEnv(EpisodeEnv[EpisodeSpec, _Run, EpisodeResult]):
             for camera in CAMERAS
         }
 
-    def cameras(self) -> dict[str, Camera]:
+    def cameras(self) -> dict[str, PinholeCamera]:
         """Return the current pose of each camera of the observation's images."""
         scene, size = self._run.scene, self._render_options.image_size
         return {
-            camera: Camera(intrinsics(scene.model, camera, size), extrinsics(scene.data, camera))
+            camera: PinholeCamera(intrinsics(scene.model, camera, size), extrinsics(scene.data, camera))
             for camera in CAMERAS
         }
 

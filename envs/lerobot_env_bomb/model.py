@@ -21,8 +21,6 @@ from lerobot_bomb.conditions import MAX_LEVEL
 from lerobot_env_bomb.robots import Robot
 from lerobot_env_mujoco.mujoco_gl import mujoco
 
-BOARD_HALF_SIZE_M = BOARD.half_size_m
-
 # How deep board and tray reach into the table: a stone that is pressed into them comes out at the top.
 SUNK_M = 0.05
 
@@ -55,7 +53,7 @@ STONE_RGBA = {True: (0.96, 0.96, 0.93, 1.0), False: (0.06, 0.06, 0.07, 1.0)}  # 
 HIDDEN = 0.0  # opacity of what only a perturbation shows
 
 
-def build_model(robot: Robot) -> mujoco.MjModel:
+def compile_scene(robot: Robot) -> mujoco.MjModel:
     """Compile the scene; every episode reuses the result."""
     spec = robot.load()
     _add_board(spec)
@@ -112,13 +110,13 @@ def parked_xyz(index: int) -> np.ndarray:
 @cache
 def board_texture() -> np.ndarray:
     """(TEXTURE_SIZE, TEXTURE_SIZE, 3) uint8 image of the board: wood, grid lines, star point."""
-    metres = (np.arange(TEXTURE_SIZE) + 0.5) / TEXTURE_SIZE * 2 * BOARD_HALF_SIZE_M - BOARD_HALF_SIZE_M
+    metres = (np.arange(TEXTURE_SIZE) + 0.5) / TEXTURE_SIZE * 2 * BOARD.half_size_m - BOARD.half_size_m
     x, y = np.meshgrid(metres, metres)
     grain = 0.5 * np.sin(300 * y + 1.5 * np.sin(25 * x) + 6 * np.sin(17 * y)) + 0.5 * np.sin(
         900 * y + 2 * np.sin(13 * x + 40 * y)
     )
     wood = np.array(WOOD_RGB) * (1 + 0.035 * grain[..., None])
-    pixel_m = 2 * BOARD_HALF_SIZE_M / TEXTURE_SIZE
+    pixel_m = 2 * BOARD.half_size_m / TEXTURE_SIZE
     ink = np.zeros_like(x)
     middle = (BOARD.num_lines - 1) / 2
     reach = middle * BOARD.pitch_m + LINE_WIDTH_M / 2
@@ -150,7 +148,7 @@ def _coverage(inside_m: np.ndarray, pixel_m: float) -> np.ndarray:
 
 
 def _add_board(spec: mujoco.MjSpec) -> None:
-    half = BOARD_HALF_SIZE_M
+    half = BOARD.half_size_m
     spec.add_texture(
         name="board",
         type=mujoco.mjtTexture.mjTEXTURE_2D,

@@ -6,12 +6,12 @@ from collections.abc import Callable, Mapping, Sequence
 import numpy as np
 
 from lerobot_bomb.bomb.board import NUM_STONES, Intersection
-from lerobot_bomb.bomb.layout import Layout, Snapshot
+from lerobot_bomb.bomb.layout import Layout, SceneState
 from lerobot_bomb.bomb.observation import WORKSPACE_HIGH_M, WORKSPACE_LOW_M
 from lerobot_env_bomb.model import (
     NUM_FEET,
     STONE_RGBA,
-    build_model,
+    compile_scene,
     foot_name,
     parked_xyz,
     show_pattern,
@@ -42,7 +42,7 @@ class Scene:
 
     def __init__(self, robot: str = "scara"):
         self.robot = ROBOTS[robot]
-        self.model = build_model(self.robot)
+        self.model = compile_scene(self.robot)
         self.data = mujoco.MjData(self.model)
         names = [stone_name(i) for i in range(NUM_STONES)]
         self._stone_bodies = np.array([self.model.body(name).id for name in names])
@@ -110,7 +110,7 @@ class Scene:
         # poses and contacts of the state that the last substep ended in
         mujoco.mj_forward(self.model, self.data)
 
-    def measure(self) -> Snapshot:
+    def measure(self) -> SceneState:
         """Poses and contacts now."""
         touched = np.zeros((NUM_STONES, 2), dtype=bool)
         stone_of_geom = {geom: i for i, geom in enumerate(self._stone_rims)}
@@ -118,7 +118,7 @@ class Scene:
             for pad, geom in ((geom1, geom2), (geom2, geom1)):
                 if pad in self._pads and geom in stone_of_geom:
                     touched[stone_of_geom[geom], self._pads.index(pad)] = True
-        return Snapshot(
+        return SceneState(
             gripper_xyz=self.data.site_xpos[self._grip].copy(),
             finger_opening=float(self.data.qpos[self._fingers].sum()),
             stone_xyz=self.data.xpos[self._stone_bodies].copy(),

@@ -33,7 +33,7 @@ class StaticScene:
         return 2 * self.layout.stone_radius_m - SQUEEZE_M
 
 
-def start_of(episode: Episode) -> StaticScene:
+def starting_scene(episode: Episode) -> StaticScene:
     """The episode as it begins."""
     return StaticScene(episode.layout, num_made=0, held=None, held_xyz=np.zeros(3))
 

@@ -7,7 +7,7 @@ import numpy as np
 
 from lerobot_bomb.envs.episode_env import EpisodeEnv, Observation, Transition
 from lerobot_bomb.envs.perturbation import transforms_of
-from lerobot_bomb.libero.episode import LiberoFailure, LiberoSpec, failure_of, initial_state_of
+from lerobot_bomb.libero.episode import LiberoFailure, LiberoSpec, initial_state_of, libero_failure_of
 from lerobot_bomb.results.libero import LiberoResult
 from lerobot_bomb.results.origin import PolicyIdentity
 from lerobot_env_bomb_libero.actuator import LiberoActuator
@@ -114,7 +114,7 @@ class BombLiberoEnv(EpisodeEnv[LiberoSpec, _Run, LiberoResult]):
     @property
     def _failure(self) -> LiberoFailure | None:
         """Reason why the episode failed, were it to end now."""
-        return None if self._is_success else failure_of(self._run.touched, self._scene.wanted)
+        return None if self._is_success else libero_failure_of(self._run.touched, self._scene.wanted)
 
     def _sensed(self, observation: Observation) -> Observation:
         """LeRobot's observation with its images as the cameras' sensors take them in this step."""

@@ -14,7 +14,7 @@ from lerobot_bomb.pusht.episode import (
     PushTFailure,
     PushTSpec,
     check_image_size,
-    failure_of,
+    pusht_failure_of,
 )
 from lerobot_bomb.results.origin import PolicyIdentity
 from lerobot_bomb.results.pusht import PushTResult
@@ -129,7 +129,7 @@ class BombPushTEnv(EpisodeEnv[PushTSpec, _Run, PushTResult]):
         if self._coverage > board.success_threshold:
             return None
         start = self._run.block_pose
-        return failure_of(start, board.block_pose, board.goal_pose, self._coverage, board.touched)
+        return pusht_failure_of(start, board.block_pose, board.goal_pose, self._coverage, board.touched)
 
     def _sensed(self, observation: Any) -> dict[str, Any]:
         """gym-pusht's observation with its image as the camera's sensor takes it in this step."""

@@ -6,7 +6,7 @@ import numpy as np
 
 
 @dataclass(frozen=True)
-class Camera:
+class PinholeCamera:
     """A pinhole camera of an image."""
 
     intrinsics: np.ndarray  # (3, 3) pixels; the centre of the top left pixel is (0, 0)

@@ -7,7 +7,7 @@ import numpy as np
 
 from lerobot_bomb.bomb.board import BOARD, NUM_STONES
 from lerobot_bomb.bomb.episode import Failure, Stage
-from lerobot_bomb.bomb.layout import Snapshot
+from lerobot_bomb.bomb.layout import SceneState
 from lerobot_bomb.bomb.move import TRAY, Move, Place, Plan, distance_m
 from lerobot_bomb.bomb.suite import Episode
 
@@ -36,7 +36,7 @@ class Judge:
     10 mm from where it stood or was put down.
     """
 
-    def __init__(self, episode: Episode, fps: int, start: Snapshot):
+    def __init__(self, episode: Episode, fps: int, start: SceneState):
         self.stage = Stage.START
         self.failure: Failure | None = None
         self.is_success = False
@@ -74,7 +74,7 @@ class Judge:
         """(row, column) of the intersection nearest to the stone that is moved."""
         return BOARD.nearest_intersection(self._now.stone_xyz[self._stone, :2])
 
-    def update(self, now: Snapshot) -> bool:
+    def update(self, now: SceneState) -> bool:
         """Take in the state after a control step; return True if the episode has ended."""
         touched = now.stone_touched[:, 0] | now.stone_touched[:, 1]
         held = now.stone_touched[:, 0] & now.stone_touched[:, 1]

@@ -37,7 +37,7 @@ def put_on_board(stones: Mapping[Intersection, str], layout: Layout) -> Layout:
 
 
 @dataclass(frozen=True)
-class Snapshot:
+class SceneState:
     """Measurements of the simulator after a control step."""
 
     gripper_xyz: np.ndarray  # (3,) metres, point between the pads' lower ends

@@ -21,7 +21,7 @@ _OWN = {
                 "share", (0.06, 0.12, 0.2, 0.3, 0.45), "contrast of stripes, checks or speckles on the table"
             ),
         },
-        "lerobot_env_bomb.axes.table:Table",
+        "lerobot_env_bomb.axes.table:TableLook",
     ),
     "reflectance": Axis(
         "gloss of stones, tray and table; a lamp's reflection on the board",

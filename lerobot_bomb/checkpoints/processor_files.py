@@ -60,7 +60,7 @@ def saved_type(config_file: Path) -> object:
         return None
 
 
-def is_ours(policy_type: object) -> bool:
+def _is_our_type(policy_type: object) -> bool:
     """Return True if checkpoints of this type, as config.json names it, hold all that they need."""
     known = PreTrainedConfig.get_known_choices()
     return isinstance(policy_type, str) and hasattr(known.get(policy_type), "package_version")
@@ -78,11 +78,11 @@ def state_files(content: Mapping[str, Any], where: str, policy_type: object) -> 
     if not isinstance(steps, list) or not all(isinstance(step, dict) for step in steps):
         raise ValueError(f"{where} holds no list of steps")
     name = content.get("name", "")
-    if not isinstance(name, str) or (is_ours(policy_type) and name not in NEEDED):
+    if not isinstance(name, str) or (_is_our_type(policy_type) and name not in NEEDED):
         raise ValueError(f"{where}: its name {name!r} is none of {sorted(NEEDED)}")
     for step in steps:
         _check_step(step, where, policy_type)
-    if is_ours(policy_type):
+    if _is_our_type(policy_type):
         missing = sorted(_needed(name, policy_type) - {step["registry_name"] for step in steps})
         if missing:
             raise ValueError(f"{where} lacks the step {missing[0]!r} of a {policy_type}")
@@ -107,7 +107,7 @@ def _check_step(step: Mapping[str, Any], where: str, policy_type: object) -> Non
             f"{where}: the step {name!r} runs code of what its config names ({step.get('config')}), which no "
             f"{policy_type or 'checkpoint'} needs"
         )
-    if name in READ_OTHERS and is_ours(policy_type):
+    if name in READ_OTHERS and _is_our_type(policy_type):
         raise ValueError(f"{where}: the step {name!r} reads other files, which no {policy_type} needs")
     if not isinstance(step.get("config", {}), dict):
         raise ValueError(f"{where}: the config of its step {name!r} is no JSON object")
@@ -123,7 +123,7 @@ def _name_of_class(path: object, where: str, policy_type: object) -> str | None:
     Raises:
         ValueError: it is no such step, or the checkpoint is of our types, whose steps are all registered.
     """
-    if isinstance(path, str) and not is_ours(policy_type):
+    if isinstance(path, str) and not _is_our_type(policy_type):
         module, _, name = path.rpartition(".")
         if path == SARM_STEP:
             import_module(module)
@@ -154,7 +154,7 @@ def refuse_link_out(file: Path) -> None:
 
 def _check_artifacts(artifacts: object, what: str, policy_type: object) -> None:
     """Check the folders that take the place of values of a step's config (LeRobot 0.6.2)."""
-    if is_ours(policy_type):
+    if _is_our_type(policy_type):
         raise ValueError(f"{what} are other files, which no {policy_type} needs")
     paths = list(artifacts.values()) if isinstance(artifacts, dict) else [artifacts]
     for path in paths:
@@ -176,7 +176,7 @@ def check_saved_processors() -> None:
 
 
 def _check_loaded(steps: Sequence[Any], where: str, config_file: Path) -> None:
-    is_of_us = is_ours(saved_type(config_file))
+    is_of_us = _is_our_type(saved_type(config_file))
     check_states(steps, where, complete=is_of_us)
     for name in NEEDED if is_of_us else ():
         path = config_file.with_name(f"{name}.json")

@@ -62,7 +62,7 @@ def run(args: argparse.Namespace) -> int:
     groups = _run_jobs(args, args.folder / "first", _first_groups(args))
     groups |= _run_jobs(args, args.folder / "second", _second_groups(args, groups[POLICY]))
     found = judge(groups, _trained_seeds(args.policy_path))
-    section = Section("Audit", verdicts.table(groups, found))
+    section = Section("Audit", verdicts.verdict_tables(groups, found))
     html, tables = (args.folder / f"audit{suffix}" for suffix in (".html", ".json"))
     with written_whole(html, tables) as (page, as_json):
         page.write_text(render(f"Audit of {args.policy_path}", [section]))

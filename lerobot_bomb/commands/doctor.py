@@ -17,7 +17,7 @@ from packaging.requirements import Requirement
 
 import lerobot_bomb
 from lerobot_bomb.environments import ENVIRONMENTS
-from lerobot_bomb.libero.assets import INSTALL, SUITES, Libero, describe_missing
+from lerobot_bomb.libero.assets import INSTALL, SUITES, Libero, describe_missing_assets
 
 DISTRIBUTION = "lerobot_policy_bomb"
 # what the names of packages begin with that register a type each
@@ -39,8 +39,8 @@ HUB_TIMEOUT_S = 5
 
 
 @dataclass(frozen=True)
-class Finding:
-    """One checked thing; only a broken one makes the installation unusable."""
+class Component:
+    """A checked part; only a broken one makes the installation unusable."""
 
     name: str
     detail: str
@@ -52,24 +52,24 @@ class Finding:
         return "BROKEN" if self.broken else "absent" if self.absent else "ok"
 
 
-def check_versions() -> Iterator[Finding]:
+def check_versions() -> Iterator[Component]:
     """Check Python, this package and its main dependencies."""
-    yield Finding("python", platform.python_version())
+    yield Component("python", platform.python_version())
     for name in (DISTRIBUTION, *DEPENDENCIES):
         try:
             version = importlib.metadata.version(name)
             outside = _outside(name, version)
-            yield Finding(name, version + outside, broken=bool(outside))
+            yield Component(name, version + outside, broken=bool(outside))
         except importlib.metadata.PackageNotFoundError:
             hint = "LeRobot finds plugins by this name; pip install it" if name == DISTRIBUTION else ""
-            yield Finding(name, f"not installed. {hint}", broken=True)
+            yield Component(name, f"not installed. {hint}", broken=True)
 
 
 def _outside(name: str, version: str) -> str:
     """Describe the range that this package declares, if an installed version lies outside it; else ""."""
     try:
         declared = [Requirement(text) for text in importlib.metadata.requires(DISTRIBUTION) or []]
-    except importlib.metadata.PackageNotFoundError:  # reported as a finding of its own
+    except importlib.metadata.PackageNotFoundError:  # reported as a component of its own
         return ""
     for requirement in declared:
         if requirement.name == name and not requirement.specifier.contains(version, prereleases=True):
@@ -79,14 +79,14 @@ def _outside(name: str, version: str) -> str:
     return ""
 
 
-def check_rendering() -> Iterator[Finding]:
+def check_rendering() -> Iterator[Component]:
     """Render one frame of the default scene, beside all of LeRobot's plugins that are installed."""
     # any of them may have loaded MuJoCo or OpenGL by the time that an environment draws
     importlib.import_module("lerobot.utils.import_utils").register_third_party_plugins()
     try:
         backend = importlib.import_module("lerobot_env_mujoco.backend").ensure_gl_backend()
     except (RuntimeError, ValueError) as error:
-        yield Finding("opengl", str(error), broken=True)
+        yield Component("opengl", str(error), broken=True)
         return
     from lerobot_bomb.bomb.observation import PIXELS
 
@@ -95,39 +95,39 @@ def check_rendering() -> Iterator[Finding]:
     env.close()
     contrast = max(int(image.max()) - int(image.min()) for image in observation[PIXELS].values())
     detail = f"{backend} renders"
-    yield Finding("opengl", detail if contrast else f"{backend} renders black frames", broken=not contrast)
+    yield Component("opengl", detail if contrast else f"{backend} renders black frames", broken=not contrast)
 
 
-def check_fetch() -> Iterator[Finding]:
+def check_fetch() -> Iterator[Component]:
     """Check that the arm from gymnasium-robotics can be used; the other one needs nothing."""
     try:
         importlib.import_module("lerobot_env_bomb.fetch_files").fetch_xml()
-        yield Finding("--env.robot=fetch", "can run")
+        yield Component("--env.robot=fetch", "can run")
     except ValueError as error:
-        yield Finding("--env.robot=fetch", str(error), absent=True)
+        yield Component("--env.robot=fetch", str(error), absent=True)
 
 
-def check_libero() -> Iterator[Finding]:
+def check_libero() -> Iterator[Component]:
     """Check that LIBERO is installed and has a config file and assets; nothing else needs it."""
     libero = Libero.find()
     if libero is None:
-        yield Finding("libero", f"not installed (for --env.type=libero: {INSTALL})", absent=True)
+        yield Component("libero", f"not installed (for --env.type=libero: {INSTALL})", absent=True)
         return
     try:
         folders = libero.task_folders()
         missing = {suite: libero.missing_assets([suite]) for suite in SUITES}
     except ValueError as error:
-        yield Finding("libero", str(error), absent=True)
+        yield Component("libero", str(error), absent=True)
         return
     whole = [suite for suite in SUITES if not missing[suite]]
     found = f"tasks in {folders['bddl_files']}, assets in {libero.assets}"
     if len(whole) < len(SUITES):
-        found = describe_missing(libero.assets, sorted(set().union(*missing.values())))
+        found = describe_missing_assets(libero.assets, sorted(set().union(*missing.values())))
         found += f"; whole for {', '.join(whole)}" if whole else ""
-    yield Finding("libero", found, absent=not whole)
+    yield Component("libero", found, absent=not whole)
 
 
-def check_types() -> Iterator[Finding]:
+def check_types() -> Iterator[Component]:
     """Check that LeRobot knows the env and policy types that the plugin imports, and their classes."""
     plugin = importlib.import_module(DISTRIBUTION)
     from lerobot.configs import PreTrainedConfig
@@ -136,11 +136,11 @@ def check_types() -> Iterator[Finding]:
 
     for name in dict.fromkeys([*_imported_types(plugin, ENV_PREFIX), *ENVIRONMENTS]):
         known = name in EnvConfig.get_known_choices()
-        yield Finding(f"--env.type={name}", "registered" if known else "not registered", broken=not known)
+        yield Component(f"--env.type={name}", "registered" if known else "not registered", broken=not known)
     for name in _imported_types(plugin, POLICY_PREFIX):
         known = name in PreTrainedConfig.get_known_choices()
         detail = get_policy_class(name).__name__ if known else "not registered"
-        yield Finding(f"--policy.type={name}", detail, broken=not known)
+        yield Component(f"--policy.type={name}", detail, broken=not known)
 
 
 def _imported_types(plugin: ModuleType, prefix: str) -> list[str]:
@@ -148,32 +148,32 @@ def _imported_types(plugin: ModuleType, prefix: str) -> list[str]:
     return [name.removeprefix(prefix) for name in vars(plugin) if name.startswith(prefix)]
 
 
-def check_gpu() -> Iterator[Finding]:
+def check_gpu() -> Iterator[Component]:
     """Check the accelerator that torch would use; none is fine for the nano presets."""
     torch = importlib.import_module("torch")
     if torch.cuda.is_available():
-        yield Finding("gpu", torch.cuda.get_device_name())
+        yield Component("gpu", torch.cuda.get_device_name())
     else:
         detail = "none (policies run on the CPU; use --policy.vlm_model_name=nano)"
-        yield Finding("gpu", detail, absent=True)
+        yield Component("gpu", detail, absent=True)
 
 
-def check_hub() -> Iterator[Finding]:
+def check_hub() -> Iterator[Component]:
     """Check that pretrained backbones can be downloaded; nano and local folders do not need it."""
     hub = importlib.import_module("huggingface_hub")
     if hub.constants.HF_HUB_OFFLINE:
         detail = "offline by HF_HUB_OFFLINE; nano and local folders work"
-        yield Finding("hugging face hub", detail, absent=True)
+        yield Component("hugging face hub", detail, absent=True)
         return
     try:
         hub.get_session().head(hub.constants.ENDPOINT, timeout=HUB_TIMEOUT_S)
-        yield Finding("hugging face hub", "reachable")
+        yield Component("hugging face hub", "reachable")
     except Exception as error:  # the session's own errors differ by transport
         detail = f"not reachable: {type(error).__name__} (nano and local folders work)"
-        yield Finding("hugging face hub", detail, absent=True)
+        yield Component("hugging face hub", detail, absent=True)
 
 
-CHECKS: tuple[Callable[[], Iterator[Finding]], ...] = (
+CHECKS: tuple[Callable[[], Iterator[Component]], ...] = (
     check_versions,
     check_rendering,
     check_fetch,
@@ -189,15 +189,15 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(args: argparse.Namespace) -> int:
-    """Print every finding; exit code 1 and the causes when something is broken."""
+    """Print every component; exit code 1 and the causes when something is broken."""
     print(f"lerobot_bomb {lerobot_bomb.__version__}, MUJOCO_GL={os.environ.get('MUJOCO_GL', '(unset)')}")
     num_broken, absent = 0, []
     for check in CHECKS:
         try:
-            for finding in check():
-                num_broken += finding.broken
-                absent += [finding.name] if finding.absent else []
-                print(f"{finding.mark:>6}  {finding.name}: {finding.detail}", flush=True)
+            for component in check():
+                num_broken += component.broken
+                absent += [component.name] if component.absent else []
+                print(f"{component.mark:>6}  {component.name}: {component.detail}", flush=True)
         except Exception:  # any cause must be shown, and the other checks still run
             num_broken += 1
             name = check.__name__.removeprefix("check_")

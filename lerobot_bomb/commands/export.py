@@ -7,7 +7,7 @@ from lerobot_bomb.commands.arguments import path_flag
 from lerobot_bomb.commands.results_files import check_outputs, read_undamaged
 from lerobot_bomb.data.resumable import check_repo_id
 from lerobot_bomb.files import file_names, written_whole
-from lerobot_bomb.report.latex import table
+from lerobot_bomb.report.latex import latex_table
 from lerobot_bomb.results.groups import groups_of, policies_of
 
 LATEX, MODEL_INDEX, EVAL_RESULTS = "table.tex", "model-index.yaml", ".eval_results/lerobot_bomb.yaml"
@@ -40,7 +40,7 @@ def run(args: argparse.Namespace) -> int:
     from lerobot_bomb.hub.evaluations import check_one_rate_each, eval_results_yaml, model_index_yaml
 
     groups = groups_of([record for path in args.paths for record in read_undamaged(path).records])
-    contents = {args.output / LATEX: table(groups)}
+    contents = {args.output / LATEX: latex_table(groups)}
     policies = policies_of(groups)
     _, *names = file_names([LATEX, *(each.short_name for each in policies)])
     for name, policy in zip(names, policies, strict=True):

@@ -39,7 +39,7 @@ from lerobot_bomb.data.resumable import (
     terminated_in_order,
 )
 from lerobot_bomb.data.unfinished import METADATA_FILE, unfinished_folder
-from lerobot_bomb.flags import reworded
+from lerobot_bomb.flags import rewording_errors
 from lerobot_bomb.sweep.local import PYTHON
 
 JOBS, SCRIPT = "jobs", "record.sbatch"  # the folder ROOT.jobs, and a file in it
@@ -232,7 +232,7 @@ def _behavior_policy(recording: Recording, policy_path: Path) -> BehaviorPolicy:
 
     names = ("task", "robot", "control_mode", "fps", "image_size", "render_preset", "depth", "split")
     env_flags = {name: getattr(recording, name) for name in names}
-    with reworded({"evaluate with": "record with", OVERRIDE: "train one for this"}):
+    with rewording_errors({"evaluate with": "record with", OVERRIDE: "train one for this"}):
         loaded = load_policy(policy_path, None, "bomb", env_flags, recording.seed)
 
     def agent(observation: dict[str, Any], instruction: str) -> np.ndarray:

@@ -5,7 +5,7 @@ from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-from lerobot_bomb.results.played import describe_missing
+from lerobot_bomb.results.played import describe_missing_episodes
 from lerobot_bomb.results.reading import check_any, read_records
 from lerobot_bomb.results.record import Record, describe_numbers
 from lerobot_bomb.sweep.manifest import NAME, Manifest
@@ -40,7 +40,7 @@ def missing_of_sweep(path: Path, num_records: int) -> str:
 
 def missing_of_evaluations(path: Path, records: Sequence[Record]) -> str:
     """Say how many episodes of an evaluation a file lacks; "" if none, or if its records do not tell."""
-    missing = describe_missing(records)
+    missing = describe_missing_episodes(records)
     return missing and f"{path}: {missing}; lerobot-eval was stopped, or still runs"
 
 

@@ -19,7 +19,7 @@ from lerobot_bomb.conditions import ALL, MAX_LEVEL, NONE, Axis, nuisances_of
 from lerobot_bomb.environments import BOMB, ENVIRONMENTS, EnvType
 from lerobot_bomb.envs.rollout import expert_agent, make_env, run_episode
 from lerobot_bomb.files import written_whole
-from lerobot_bomb.flags import one_of, reworded
+from lerobot_bomb.flags import one_of, rewording_errors
 from lerobot_bomb.viewing.perturbations_page import write_page
 from lerobot_bomb.viewing.sheet import Sheet, text_tile
 
@@ -76,7 +76,7 @@ def run(args: argparse.Namespace) -> int:
     if args.output.exists() and not args.output.is_dir():
         raise ValueError(f"--output={args.output} is no folder; name another")
     options = RenderOptions(image_size=args.image_size)
-    with reworded({"--seed=": "--seeds: "}):
+    with rewording_errors({"--seed=": "--seeds: "}):
         for seed in args.seeds:
             EpisodeSpec(seed)
     for axis in tqdm(axes if args.task is None else [args.task], unit="sheet"):

@@ -104,7 +104,7 @@ def write_block(layout: DatasetLayout, root: Path, episodes: Iterable[RecordedEp
         rows = _write_episodes(dataset, chain([first], remaining))
     _add_episode_columns(root, rows)
     num_frames = dataset.num_frames
-    check_videos(root, dataset.meta.video_keys, num_frames)
+    check_encoded_frames(root, dataset.meta.video_keys, num_frames)
     return num_frames
 
 
@@ -242,7 +242,7 @@ def _add_episode_columns(root: Path, rows: list[dict[str, Any]]) -> None:
     unfinished.replace(path)
 
 
-def check_videos(root: Path, cameras: Sequence[str], num_frames: int) -> None:
+def check_encoded_frames(root: Path, cameras: Sequence[str], num_frames: int) -> None:
     """Raise if the encoder dropped frames or did not finish them, which LeRobot only logs."""
     encoded = dict.fromkeys(cameras, 0)
     for path in sorted(root.glob("videos/*/*/*.mp4")):

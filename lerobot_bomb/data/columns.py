@@ -13,7 +13,7 @@ from lerobot_bomb.compat.hooks.datasets import explain_missing_datasets
 from lerobot_bomb.compat.hooks.hub import check_tokens_before_use
 from lerobot_bomb.data.dataset_files import INFO_FILE, check_metadata, flat_numbers, read_parquet
 from lerobot_bomb.data.hub_token import check_token_characters
-from lerobot_bomb.data.missing import explain
+from lerobot_bomb.data.missing import describe_missing_dataset
 from lerobot_bomb.data.resumable import check_repo_id
 
 EPISODE_INDEX = "episode_index"
@@ -24,7 +24,7 @@ def read_meta(repo_id: str, root: Path | None) -> LeRobotDatasetMetadata:
     if root is None:  # else it is but a label
         check_repo_id(repo_id, "--dataset.repo_id")
         check_tokens_before_use(check_token_characters)
-        explain_missing_datasets(explain)
+        explain_missing_datasets(describe_missing_dataset)
     if root is not None and not (root / INFO_FILE).is_file():
         raise ValueError(f"--dataset.root={root} holds no {INFO_FILE}, so it is no LeRobotDataset")
     check_metadata(root or HF_LEROBOT_HOME / repo_id)

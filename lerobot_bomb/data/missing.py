@@ -10,7 +10,7 @@ RESUMED_BY = {
 }
 
 
-def explain(repo_id: str, root: Path, error: Exception) -> str:
+def describe_missing_dataset(repo_id: str, root: Path, error: Exception) -> str:
     """Describe what is missing, and an unfinished dataset of that name if there is one."""
     for kind, command in RESUMED_BY.items():
         folder = unfinished_folder(root, kind)

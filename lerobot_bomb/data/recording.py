@@ -15,7 +15,7 @@ from lerobot_bomb.bomb.suite import specs_of_tasks, suites_of, task_version
 from lerobot_bomb.bomb.suites import SUITES
 from lerobot_bomb.conditions import ALL, NONE
 from lerobot_bomb.data.resumable import check_repo_id
-from lerobot_bomb.flags import one_of, reworded
+from lerobot_bomb.flags import one_of, rewording_errors
 from lerobot_bomb.results.origin import installed_version
 
 SCENES = 100  # static ones that are stored as an episode
@@ -141,4 +141,4 @@ class Recording:
 
     def flag_names(self) -> AbstractContextManager[None]:
         """Name flags in errors as they were given: a target by --env.target, or by the number of a task."""
-        return reworded({"--env.target=": "the target "} if self.task_ids else {})
+        return rewording_errors({"--env.target=": "the target "} if self.task_ids else {})

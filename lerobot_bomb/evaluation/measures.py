@@ -7,16 +7,16 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from lerobot_bomb.bootstrap import Measure, measure
+from lerobot_bomb.bootstrap import Estimate, estimate_mean
 
 
 @dataclass(frozen=True)
 class L1:
     """Mean absolute error of actions in the dataset's units: of all, by dimension, by step of the chunk."""
 
-    all: Measure
-    dims: dict[str, Measure]
-    steps: list[Measure]
+    all: Estimate
+    dims: dict[str, Estimate]
+    steps: list[Estimate]
 
 
 def measure_l1(
@@ -34,7 +34,7 @@ def measure_l1(
     errors_RTD[is_pad_RT] = np.nan
     num_steps = int((~is_pad_RT).any(axis=0).sum())
     return L1(
-        all=measure(errors_RTD, episode_R),
-        dims={name: measure(errors_RTD[..., i], episode_R) for i, name in enumerate(dim_names)},
-        steps=[measure(errors_RTD[:, step], episode_R) for step in range(num_steps)],
+        all=estimate_mean(errors_RTD, episode_R),
+        dims={name: estimate_mean(errors_RTD[..., i], episode_R) for i, name in enumerate(dim_names)},
+        steps=[estimate_mean(errors_RTD[:, step], episode_R) for step in range(num_steps)],
     )

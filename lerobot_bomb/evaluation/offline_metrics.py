@@ -11,10 +11,10 @@ from lerobot.datasets import LeRobotDataset, LeRobotDatasetMetadata
 from lerobot.policies import PreTrainedPolicy
 from lerobot.utils.constants import ACTION
 
-from lerobot_bomb.bootstrap import Measure, measure
+from lerobot_bomb.bootstrap import Estimate, estimate_mean
 from lerobot_bomb.data.columns import dim_names
 from lerobot_bomb.evaluation.measures import L1, measure_l1
-from lerobot_bomb.evaluation.predictions import load_dataset, load_policy, predict
+from lerobot_bomb.evaluation.predictions import load_dataset, load_network, predict
 from lerobot_bomb.evaluation.splits import (
     Split,
 )
@@ -32,7 +32,7 @@ class Column:
     episodes: list[int]
     num_frames: int
     num_frames_measured: int
-    losses: dict[str, Measure]
+    losses: dict[str, Estimate]
     l1: dict[str, L1]
 
 
@@ -44,7 +44,7 @@ def measure_columns(
     batch_size: int,
 ) -> dict[str, Column]:
     """{train, validation: its column}; a split without episodes has none."""
-    policy = load_policy(config)
+    policy = load_network(config)
     dataset = load_dataset(config, meta, sorted({*split.train, *split.validation}))
     demonstrations = Demonstrations.read(meta, sorted({*split.train, *split.validation}), split.train)
     columns = {}
@@ -71,7 +71,7 @@ def _measure(
     rows_R: np.ndarray,
     batch_size: int,
     name: str,
-) -> tuple[dict[str, Measure], dict[str, L1]]:
+) -> tuple[dict[str, Estimate], dict[str, L1]]:
     """Measure losses, and L1 of the policy and of the trivial predictors."""
     predictions = predict(policy, dataset, rows_R, batch_size, name)
     chunk_size = predictions.chunks.shape[1]
@@ -79,7 +79,7 @@ def _measure(
     chunks = {POLICY: predictions.chunks, **demonstrations.trivial(rows_R, chunk_size)}
     episode_R, dims = demonstrations.episode_index[rows_R], dim_names(dataset.features[ACTION])
     return (
-        {key: measure(values_R, episode_R) for key, values_R in predictions.losses.items()},
+        {key: estimate_mean(values_R, episode_R) for key, values_R in predictions.losses.items()},
         {key: measure_l1(of, recorded_RTD, is_pad_RT, episode_R, dims) for key, of in chunks.items()},
     )
 
@@ -110,5 +110,5 @@ def print_columns(columns: dict[str, Column]) -> None:
     print("\n[95 % bootstrap interval over episodes]; L1 of decoded actions, in the dataset's units")
 
 
-def _text(measure: Measure | None) -> str:
-    return "-" if measure is None else str(measure)
+def _text(estimate: Estimate | None) -> str:
+    return "-" if estimate is None else str(estimate)

@@ -67,7 +67,7 @@ def check_policy(config: PreTrainedConfig, meta: LeRobotDatasetMetadata, rename_
         )
 
 
-def load_policy(config: PreTrainedConfig) -> PreTrainedPolicy:
+def load_network(config: PreTrainedConfig) -> PreTrainedPolicy:
     """The checkpoint's network on the config's device, for evaluation."""
     policy = get_policy_class(config.type).from_pretrained(str(config.pretrained_path), config=config)
     return policy.to(str(config.device)).eval()

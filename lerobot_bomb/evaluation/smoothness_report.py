@@ -8,7 +8,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from lerobot_bomb.bootstrap import Measure, paired_bootstrap_interval, sums_by
+from lerobot_bomb.bootstrap import Estimate, paired_bootstrap_interval, sums_by
 from lerobot_bomb.evaluation.executed import ActionLog, start_of
 from lerobot_bomb.smoothness import MIN_ACTIONS, smoothness
 from lerobot_bomb.tables import print_table
@@ -33,7 +33,7 @@ class SmoothnessRow:
     fps: float
     num_skipped: int  # episodes that are too short
     num_actions: dict[str, int]  # of each episode
-    measures: dict[str, Measure]  # of all
+    measures: dict[str, Estimate]  # of all
     episodes: dict[str, dict[str, float]]  # of each
 
 
@@ -42,7 +42,7 @@ class Difference:
     """Difference in smoothness between two evaluations, on the episodes that both have."""
 
     num_pairs: int
-    measures: dict[str, Measure]
+    measures: dict[str, Estimate]
 
 
 def make_units(dataset: ActionLog, names: list[str], exclude: list[str] | None, per_second: bool) -> Units:
@@ -117,7 +117,7 @@ def measure_row(executed: ActionLog, units: Units) -> SmoothnessRow:
 
 def _measures(
     actions_RD: np.ndarray, episode_R: np.ndarray, start_R: np.ndarray, units: Units, dt_s: float | None
-) -> dict[str, Measure]:
+) -> dict[str, Estimate]:
     options = {"start_R": start_R, "exclude": units.exclude, "dt_s": dt_s}
     raw = smoothness(actions_RD, episode_R, **options)
     normalised = smoothness(actions_RD, episode_R, std_D=units.std, **options)
@@ -143,7 +143,7 @@ def measure_difference(first: str, second: str, rows: dict[str, SmoothnessRow]) 
             both.append((sums_E, sums_by(counts_N, starts)[0]))
         before, after = (sums_E.sum() / counts_E.sum() for sums_E, counts_E in both)
         interval = paired_bootstrap_interval(*both)
-        measures[key] = Measure(float(after - before), *(interval or (None, None)))
+        measures[key] = Estimate(float(after - before), *(interval or (None, None)))
     return Difference(len(pairs), measures)
 
 

@@ -12,7 +12,7 @@ from lerobot_bomb.checkpoints.folder import autocast
 from lerobot_bomb.explain.activations import LAYER, recording
 from lerobot_bomb.explain.diagnosis import Finding, diagnose
 from lerobot_bomb.explain.following import Following, following
-from lerobot_bomb.explain.moment import OBSERVATION, Explanation, Query, explain, image_keys
+from lerobot_bomb.explain.moment import OBSERVATION, Explanation, MomentQuery, explain, image_keys
 from lerobot_bomb.explain.other_policies import scored
 from lerobot_bomb.explain.pointing import PointingCheck, check_pointing
 from lerobot_bomb.explain.question import Question
@@ -106,7 +106,7 @@ def mean_states(question: Question) -> dict[str, np.ndarray]:
     return found
 
 
-def _query(loaded: LoadedPolicy, snapshot: Snapshot, settings: Settings, instead: Batch) -> Query:
+def _query(loaded: LoadedPolicy, snapshot: Snapshot, settings: Settings, instead: Batch) -> MomentQuery:
     try:
         offsets = token_offsets(loaded.prepare.steps, snapshot.instruction)
     except ValueError:
@@ -117,7 +117,7 @@ def _query(loaded: LoadedPolicy, snapshot: Snapshot, settings: Settings, instead
         f"{OBS_IMAGES}.{camera}": {what: torch.from_numpy(mask) for what, mask in masks.items()}
         for camera, masks in snapshot.objects.items()
     }
-    return Query(
+    return MomentQuery(
         grid=settings.grid,
         fill=settings.fill,
         spans=[*_spans(snapshot, settings.words)] if offsets else [],

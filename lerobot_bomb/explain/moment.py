@@ -25,7 +25,7 @@ OBSERVATION = "observation"
 
 
 @dataclass(frozen=True)
-class Query:
+class MomentQuery:
     """Query about a moment: changes to make, one by one, to measure their effects."""
 
     grid: int  # cells along a side of each image
@@ -84,7 +84,7 @@ def _finite(value: Any) -> Any:
     return None if isinstance(value, float) and value != value else value
 
 
-def explain(question: Question, query: Query) -> Explanation:
+def explain(question: Question, query: MomentQuery) -> Explanation:
     """Ask all of it.
 
     Raises:
@@ -120,7 +120,7 @@ def camera_name(key: str) -> str:
     return key.removeprefix(f"{OBS_IMAGES}.").removeprefix(f"{OBSERVATION}.")
 
 
-def _filling(question: Question, query: Query, key: str) -> Tensor:
+def _filling(question: Question, query: MomentQuery, key: str) -> Tensor:
     (image,) = question.observation[key]
     blur_px = image.shape[-1] / query.grid / 2
     other = query.other_scene.get(key)
@@ -132,7 +132,9 @@ def _patches(question: Question, grid: int, key: str, filling_3HW: Tensor) -> Te
     return question.effects_of_masks(key, masks, filling_3HW).unflatten(0, (grid, grid)).cpu()
 
 
-def _objects(question: Question, query: Query, fillings: Mapping[str, Tensor]) -> dict[str, dict[str, float]]:
+def _objects(
+    question: Question, query: MomentQuery, fillings: Mapping[str, Tensor]
+) -> dict[str, dict[str, float]]:
     """Measure each object's effect in each camera and in all at once, for objects that a camera shows."""
     effects: dict[str, dict[str, float]] = {}
     names = list(dict.fromkeys(name for masks in query.objects.values() for name in masks))
@@ -149,7 +151,7 @@ def _objects(question: Question, query: Query, fillings: Mapping[str, Tensor]) -
     return effects
 
 
-def _words(question: Question, query: Query) -> dict[str, float]:
+def _words(question: Question, query: MomentQuery) -> dict[str, float]:
     if not query.spans:
         return {}
     hidden = torch.stack([span.tokens(query.offsets) for span in query.spans])
@@ -157,7 +159,7 @@ def _words(question: Question, query: Query) -> dict[str, float]:
     return {span.name: effect for span, effect in zip(query.spans, effects, strict=True)}
 
 
-def _others(question: Question, query: Query) -> dict[str, float]:
+def _others(question: Question, query: MomentQuery) -> dict[str, float]:
     if not query.others:
         return {}
     return dict(
@@ -167,7 +169,7 @@ def _others(question: Question, query: Query) -> dict[str, float]:
 
 def _corruptions(
     question: Question,
-    query: Query,
+    query: MomentQuery,
     fillings: Mapping[str, Tensor],
     patches: Mapping[str, Tensor],
     words: Mapping[str, float],
@@ -205,7 +207,7 @@ def _has_columns_of(rows: Rows, others: Rows) -> bool:
     )
 
 
-def _token_spans(question: Question, query: Query, rows: Rows) -> dict[str, TokenSpan]:
+def _token_spans(question: Question, query: MomentQuery, rows: Rows) -> dict[str, TokenSpan]:
     """Return the spans of the prompt's parts and words; {} where the layers' states cannot be put back."""
     if any(layer.layer is None for layer in question.policy.layers):
         return {}
@@ -217,7 +219,7 @@ def _token_spans(question: Question, query: Query, rows: Rows) -> dict[str, Toke
     return spans | {name: (first[tokens], *later) for name, tokens in words.items()}
 
 
-def _restore(question: Question, query: Query, name: str, rows: Rows) -> PatchingResult:
+def _restore(question: Question, query: MomentQuery, name: str, rows: Rows) -> PatchingResult:
     corruption = Corruption(question, rows)
     layers = question.policy.layers
     by_span = {

@@ -7,7 +7,7 @@ from typing import Any
 import cv2
 import numpy as np
 
-from lerobot_bomb.bomb.camera import Camera
+from lerobot_bomb.bomb.camera import PinholeCamera
 from lerobot_bomb.bomb.expert import current_goal
 from lerobot_bomb.bomb.move import place_name
 from lerobot_bomb.bomb.observation import reach_m
@@ -174,7 +174,7 @@ def check_pointing(
     return None if pointed is None else PointingCheck(pointed, state, loaded.act(prepared)[0])
 
 
-def marked(image: np.ndarray, camera: Camera, marks: list[Mark]) -> np.ndarray:
+def marked(image: np.ndarray, camera: PinholeCamera, marks: list[Mark]) -> np.ndarray:
     """(H, W, 3) uint8 -> the same of MARKED_PX pixels a side, with marks on it; crosses with their names."""
     shown = cv2.resize(image, (MARKED_PX, MARKED_PX), interpolation=cv2.INTER_NEAREST)
     scale = MARKED_PX / image.shape[0]

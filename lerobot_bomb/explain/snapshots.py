@@ -9,7 +9,7 @@ import gymnasium
 import numpy as np
 
 from lerobot_bomb.bomb.board import BOARD, Intersection
-from lerobot_bomb.bomb.camera import Camera
+from lerobot_bomb.bomb.camera import PinholeCamera
 from lerobot_bomb.bomb.episode import Stage
 from lerobot_bomb.bomb.expert import current_goal
 from lerobot_bomb.bomb.observation import ENVIRONMENT_STATE
@@ -37,7 +37,7 @@ class Snapshot:
     ]  # other instructions and what they name, by what they change
     target: Intersection | None
     state: PrivilegedState | None  # of BOMB
-    cameras: Mapping[str, Camera]  # {}: not known
+    cameras: Mapping[str, PinholeCamera]  # {}: not known
 
     @property
     def stone_xyz(self) -> np.ndarray | None:

@@ -15,7 +15,7 @@ LOOPBACK = "127.0.0.1"
 CTRL_C = 130  # exit status, as shells have it
 
 
-def main() -> None:
+def run_checkpoint_server() -> None:
     """Serve until Ctrl-C; a checkpoint that cannot be served is an error of one line."""
     sys.argv.insert(1, f"--host={LOOPBACK}")  # a later flag, or the file, prevails
     logging.getLogger("vla_eval").setLevel(logging.INFO)  # where it listens, and who comes
@@ -28,4 +28,4 @@ def main() -> None:
 
 
 if __name__ == "__main__":
-    main()
+    run_checkpoint_server()

@@ -187,11 +187,11 @@ def prepare_libero(suites: Iterable[str] = SUITES) -> Libero:
     libero.task_folders()
     missing = libero.missing_assets(suites)
     if missing:
-        raise ValueError(describe_missing(libero.assets, missing))
+        raise ValueError(describe_missing_assets(libero.assets, missing))
     return libero
 
 
-def describe_missing(assets: Path, missing: list[str]) -> str:
+def describe_missing_assets(assets: Path, missing: list[str]) -> str:
     """Describe in a line what is missing below a folder of assets, and how to get it."""
     way_out = f"hf download lerobot/libero-assets --repo-type=dataset --local-dir={assets}"
     if not assets.exists():

@@ -56,7 +56,7 @@ def initial_state_of(seed: int, count: int) -> int:
     return seed % count
 
 
-def failure_of(touched: set[str], wanted: set[str]) -> LiberoFailure:
+def libero_failure_of(touched: set[str], wanted: set[str]) -> LiberoFailure:
     """Classify an episode without success, by the objects that the gripper met and those of the task."""
     if not touched:
         return LiberoFailure.NEVER_TOUCHED

@@ -31,7 +31,8 @@ from lerobot_bomb.data.columns import (
 from lerobot_bomb.decoding.kv_cache import check_positions
 from lerobot_bomb.flow.noise import SamplingNoise, gumbel
 from lerobot_bomb.hub.policy import HubPolicy
-from lerobot_bomb.policies.config import ChunkConfig, RelativeVlaConfig, TokenVlaConfig, VlaConfig
+from lerobot_bomb.policies.config import ChunkConfig, TokenVlaConfig, VlaConfig
+from lerobot_bomb.policies.relative_config import RelativeVlaConfig
 from lerobot_bomb.training.distributed import SavesTiedWeightsOnce
 from lerobot_bomb.training.policy_flags import check_as_trained, check_weights_fit, trained_with
 from lerobot_bomb.vlm.inputs import read_state, read_task, read_tensor

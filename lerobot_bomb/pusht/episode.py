@@ -77,7 +77,7 @@ def check_image_size(image_size: int) -> None:
         raise ValueError(f"--env.image_size={image_size} must lie in {MIN_IMAGE_SIZE}..{MAX_IMAGE_SIZE}")
 
 
-def failure_of(
+def pusht_failure_of(
     start: np.ndarray, end: np.ndarray, goal: np.ndarray, coverage: float, touched: bool
 ) -> PushTFailure:
     """Classify a failed episode, by (3,) poses x, y in pixels and angle in radians of block and target."""

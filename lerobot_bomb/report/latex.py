@@ -11,7 +11,7 @@ SPECIAL = {
 }  # fmt: skip
 
 
-def table(groups: Sequence[Group]) -> str:
+def latex_table(groups: Sequence[Group]) -> str:
     r"""A `tabular` of the package `booktabs`: a line for each condition, a column for each group."""
     by_group = [by_condition(group.records) for group in groups]
     conditions = list(dict.fromkeys(condition for by in by_group for condition in by))

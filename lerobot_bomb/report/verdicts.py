@@ -31,7 +31,7 @@ class Verdict:
     evidence: str
 
 
-def table(groups: Mapping[str, list[Record]], verdicts: list[Verdict]) -> list[Table]:
+def verdict_tables(groups: Mapping[str, list[Record]], verdicts: list[Verdict]) -> list[Table]:
     """Return the verdicts, and the rates of all groups."""
     rates = [
         [Cell(name), rate(records), Cell(str(len(records)), len(records))]

@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from lerobot_bomb.bootstrap import Measure, bootstrap_interval, sums_by
+from lerobot_bomb.bootstrap import Estimate, bootstrap_interval, sums_by
 from lerobot_bomb.results.inference import Inference
 from lerobot_bomb.results.record import Record
 
@@ -39,19 +39,19 @@ def efficiencies(records: Sequence[Record]) -> list[Efficiency]:
     return [_efficiency(*key, measured) for key, measured in groups.items()]
 
 
-def smoothness_of(records: Sequence[Record]) -> dict[str, Measure]:
+def smoothness_of(records: Sequence[Record]) -> dict[str, Estimate]:
     """{"J2": ..., "J3": ...}, with equal weight for each difference of each episode; {} without any."""
     told = [each for each in records if each.action_j2 is not None and each.action_j3 is not None]
     return {f"J{order}": _mean_difference(told, order) for order in (2, 3)} if told else {}
 
 
-def _mean_difference(records: Sequence[Any], order: int) -> Measure:
+def _mean_difference(records: Sequence[Any], order: int) -> Estimate:
     counts_N = np.array([each.steps - order for each in records])
     starts = [each.start_key for each in records]
     sums_E, _ = sums_by(counts_N * np.array([getattr(each, f"action_j{order}") for each in records]), starts)
     counts_E, _ = sums_by(counts_N, starts)
     interval = bootstrap_interval(sums_E, counts_E) or (None, None)
-    return Measure(float(sums_E.sum() / counts_E.sum()), *interval)
+    return Estimate(float(sums_E.sum() / counts_E.sum()), *interval)
 
 
 def lines(records: Sequence[Record]) -> list[tuple[str, str, str]]:

@@ -8,7 +8,7 @@ from lerobot_bomb.bootstrap import bootstrap_interval, format_bounds, sums_by
 from lerobot_bomb.results.record import NO_VALUE, Measure, Record
 
 
-def mean_of(field: str, name: str, note: str = "") -> Measure:
+def mean_measure(field: str, name: str, note: str = "") -> Measure:
     """Measure the mean of a field: '0.440 [0.210, 0.670]', with a 95 % bootstrap interval over starts."""
 
     def value(records: Sequence[Record]) -> str:

@@ -10,7 +10,7 @@ from lerobot_bomb.results.record import Record, Spec
 PER_TASK = ("suite", "task_version")
 
 
-def describe_missing(records: Sequence[Record]) -> str:
+def describe_missing_episodes(records: Sequence[Record]) -> str:
     """'7 of 20 episodes played', of each evaluation that lacks some; '': none does, as far as records say it.
 
     An evaluation counts no more once later ones have run each of its episodes again.

@@ -21,7 +21,7 @@ from lerobot_bomb.pusht.episode import (
 )
 from lerobot_bomb.pusht.perturbations import PushTCondition
 from lerobot_bomb.results import schema
-from lerobot_bomb.results.means import mean_of
+from lerobot_bomb.results.means import mean_measure
 from lerobot_bomb.results.origin import (
     PolicyIdentity,
     describe_versions,
@@ -47,8 +47,8 @@ class PushTResult(Record):
     versions: ClassVar = {PUSHT_PROTOCOL_VERSION: ()}
     tasks: ClassVar = ("pusht",)
     measures: ClassVar = (
-        mean_of("max_coverage", "max coverage", "mean, 95 % bootstrap interval over episodes"),
-        mean_of("coverage", "final coverage"),
+        mean_measure("max_coverage", "max coverage", "mean, 95 % bootstrap interval over episodes"),
+        mean_measure("coverage", "final coverage"),
     )
 
     spec: PushTSpec

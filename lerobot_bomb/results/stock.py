@@ -12,7 +12,7 @@ from lerobot_bomb.libero.assets import SUITES
 from lerobot_bomb.pusht.episode import IMAGE_SIZE
 from lerobot_bomb.results import pusht, schema
 from lerobot_bomb.results.libero import SIMULATOR, describe_numbered_tasks, task_flags
-from lerobot_bomb.results.means import mean_of
+from lerobot_bomb.results.means import mean_measure
 from lerobot_bomb.results.origin import PolicyIdentity, describe_versions, installed_version, machine_name
 from lerobot_bomb.results.record import Record
 from lerobot_bomb.results.schema import Natural
@@ -46,8 +46,8 @@ class StockResult(Record):
     drawn: ClassVar = ("task_id", "number")
     start: ClassVar = ("seed", "task_id")  # tasks have scenes of their own
     measures: ClassVar = (
-        mean_of("max_reward", "max reward", "mean over episodes"),
-        mean_of("sum_reward", "sum of rewards", "mean over episodes"),
+        mean_measure("max_reward", "max reward", "mean over episodes"),
+        mean_measure("sum_reward", "sum of rewards", "mean over episodes"),
     )
     has_results_path: ClassVar = False
 

@@ -17,6 +17,6 @@ def _end_with_parent() -> None:
 if __name__ == "__main__":
     # before LeRobot is imported: workers of a command that was killed would first do that, half a minute long
     threading.Thread(target=_end_with_parent, daemon=True).start()
-    from lerobot_bomb.sweep.worker import main
+    from lerobot_bomb.sweep.worker import run_worker
 
-    main(*sys.argv[1:])
+    run_worker(*sys.argv[1:])

@@ -162,7 +162,7 @@ def describe(error: BaseException) -> str:
     return f"{type(error).__name__}: {lines[-1]}" if lines else type(error).__name__
 
 
-def main(folder: str, part: str, run: str, told: str) -> None:
+def run_worker(folder: str, part: str, run: str, told: str) -> None:
     """Run a part of the sweep in a folder; the job that runs goes to the file descriptor `told`."""
     faulthandler.enable()  # a fault of native code says where it was
     logging.basicConfig(level=logging.WARNING)

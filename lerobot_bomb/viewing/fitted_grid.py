@@ -60,7 +60,7 @@ def show_fit(
     one_of("--policy.normalization_mapping[ACTION]", mode, [of.value for of in BOUND_STATISTICS])
     mode = NormalizationMode(mode)
     meta = read_meta(repo_id, root)
-    low_D, high_D = action_bounds(meta, mode)
+    low_D, high_D = dataset_action_bounds(meta, mode)
     num_dims, names = len(low_D), dim_names(meta.features[ACTION])
     if layout is not None:
         one_of(LAYOUT_FLAG, layout, LAYOUTS)
@@ -95,7 +95,9 @@ def _write_plot(
     print(f"\n{plot}")
 
 
-def action_bounds(meta: LeRobotDatasetMetadata, mode: NormalizationMode) -> tuple[np.ndarray, np.ndarray]:
+def dataset_action_bounds(
+    meta: LeRobotDatasetMetadata, mode: NormalizationMode
+) -> tuple[np.ndarray, np.ndarray]:
     """(D,) actions that become -1 and (D,) actions that become 1.
 
     Raises:

@@ -172,8 +172,10 @@ class QwenBackbone(Backbone):
         shared = self._read(
             embeds_BLH[:1, first], positions_3BL[:, :1, first], attention_mask_BLL[:1, first, first]
         )
-        expand = partial(_expanded, len(embeds_BLH))
-        kept = [(expand(keys), expand(values)) for keys, values in shared[1]]
+        size = len(embeds_BLH)
+        kept = [
+            (keys.expand(size, -1, -1, -1), values.expand(size, -1, -1, -1)) for keys, values in shared[1]
+        ]
         hidden_BLH, layers = self._read(
             embeds_BLH[:, rest], positions_3BL[:, :, rest], attention_mask_BLL[:, rest], kept
         )
@@ -181,7 +183,8 @@ class QwenBackbone(Backbone):
             (torch.cat([ks, keys], dim=2), torch.cat([vs, values], dim=2))
             for (ks, vs), (keys, values) in zip(kept, layers, strict=True)
         ]
-        return Prefix(torch.cat([expand(shared[0]), hidden_BLH], dim=1), attention_mask_BL, next_B1, layers)
+        hidden_BLH = torch.cat([shared[0].expand(size, -1, -1), hidden_BLH], dim=1)
+        return Prefix(hidden_BLH, attention_mask_BL, next_B1, layers)
 
     def read_segment(
         self, prefix: Prefix, embeds_BTH: Tensor, attention_mask_BTT: Tensor, num_copies: int = 1
@@ -229,11 +232,6 @@ class QwenBackbone(Backbone):
         starts_BL = ends_BL - steps_BL
         lines_BL, columns_BL = place_BL // side * is_image_BL, place_BL % side * is_image_BL
         return torch.stack([starts_BL, starts_BL + lines_BL, starts_BL + columns_BL]), ends_BL[:, -1:]
-
-
-def _expanded(batch_size: int, row: Tensor) -> Tensor:
-    """One row, again for each of a batch, without a copy."""
-    return row.expand(batch_size, *row.shape[1:])
 
 
 def _tokens_per_side(vision_config: Any, image_size: int) -> int:

@@ -24,7 +24,7 @@ from lerobot_bomb.compat.hooks.policies import remember_policies
 from lerobot_bomb.compat.hooks.torchcodec import shorten_torchcodec_warning
 from lerobot_bomb.compat.use import register
 from lerobot_bomb.data.hub_token import check_token_characters
-from lerobot_bomb.data.missing import explain
+from lerobot_bomb.data.missing import describe_missing_dataset
 from lerobot_bomb.flag_errors import hint, refuse_unknown
 
 OURS = (
@@ -49,7 +49,7 @@ register(
         lambda: tell_config_errors(is_hub_id, config_damage),
         tell_refusals,
         lambda: tell_wrong_flags(hint, refuse_unknown),
-        lambda: explain_missing_datasets(explain),
+        lambda: explain_missing_datasets(describe_missing_dataset),
         read_asked_columns,
         lambda: check_evaluations(complete_evaluation),
         lambda: check_tokens_before_use(check_token_characters),

@@ -20,9 +20,9 @@ from lerobot_bomb.flow.samplers import (
     check_heads,
     check_sampling,
 )
-from lerobot_bomb.policies.config import RELATIVE_AS_TRAINED, RelativeVlaConfig
 from lerobot_bomb.policies.flag_groups import short_help
 from lerobot_bomb.policies.pointing_config import PlacesVlaConfig
+from lerobot_bomb.policies.relative_config import RELATIVE_AS_TRAINED, RelativeVlaConfig
 from lerobot_bomb.training.policy_flags import (
     MAX_POSITIONS,
     check_not_negative,
@@ -215,10 +215,11 @@ class FdvlaConfig(RelativeVlaConfig, PlacesVlaConfig):
         heads = {"flow": self.use_flow_head, "noise": self.use_denoise_head}
         modulated = {"flow": self.dualmod_flow, "noise": self.dualmod_denoise}
         used = [name for name, is_used in heads.items() if is_used]
-        of_used = [name for name in used if modulated[name]]
+        of_used = [f"{name} head" for name in used if modulated[name]]
+        of_heads = "both" if len(of_used) > 1 else (of_used or ["none"])[0]
         return [
             f"{' and '.join(used)} {'heads' if len(used) > 1 else 'head'}",
-            f"{'both' if len(of_used) > 1 else ' '.join(of_used) or 'none'} modulated",
+            f"{of_heads} modulated by the instruction",
             f"{self.used_sampler} sampler ({self.num_inference_steps} steps)",
             *super().methods(),
         ]

@@ -63,15 +63,9 @@ class SpatialvlaGridConfig(TokenVlaConfig, PlacesVlaConfig):
     FILLED_IN: ClassVar[tuple[str, ...]] = ("grid_params", "depth_config")
     RESEARCH: ClassVar[tuple[str, ...]] = (
         *("grid_distribution", "grid_min_sigma", "decode_point", "zero_radius_bin", "rho_dead", "phi_fit"),
-        *(
-            "ego3d_patch_reso",
-            "ego3d_n_freqs",
-            "ego3d_zero_init",
-            "ego3d_no_depth_vector",
-            "depth_model_name",
-        ),
+        *("ego3d_patch_reso", "ego3d_n_freqs", "ego3d_zero_init", "ego3d_no_depth_vector"),
         *("prefix_attention", "loss_vocab", "pointing_area_m", "pointing_cell_m", "task_template", "draft"),
-        "freeze_llm_embeddings",
+        *("depth_model_name", "freeze_llm_embeddings"),
     )
 
     # base model: Hub id, local folder, or "nano", a small model with random weights that needs no network

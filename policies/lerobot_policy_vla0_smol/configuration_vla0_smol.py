@@ -8,9 +8,10 @@ from lerobot.configs import PreTrainedConfig
 
 from lerobot_bomb.actions.bins import BIN_MODES
 from lerobot_bomb.actions.text import MASK_LEVELS, MAX_DIGITS, digits_needed
-from lerobot_bomb.policies.config import RELATIVE_AS_TRAINED, RelativeVlaConfig, TokenVlaConfig
+from lerobot_bomb.policies.config import TokenVlaConfig
 from lerobot_bomb.policies.flag_groups import short_help
 from lerobot_bomb.policies.pointing_config import PointingVlaConfig
+from lerobot_bomb.policies.relative_config import RELATIVE_AS_TRAINED, RelativeVlaConfig
 from lerobot_bomb.training.policy_flags import check_positive
 
 DRAFTS = ("none", "linear")

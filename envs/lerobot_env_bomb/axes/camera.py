@@ -7,7 +7,6 @@ from lerobot_bomb.bomb.board import BOARD, TRAY_CENTER_XY, TRAY_HALF_SIZE_XY
 from lerobot_bomb.bomb.observation import CAMERAS
 from lerobot_bomb.bomb.perturbations import AXES
 from lerobot_env_bomb.axes.transform import Transform
-from lerobot_env_bomb.model import BOARD_HALF_SIZE_M
 from lerobot_env_mujoco.mujoco_gl import mujoco
 from lerobot_env_mujoco.rotations import matrix_of
 from lerobot_env_mujoco.transforms import CameraTransform, least_distance
@@ -38,7 +37,7 @@ class Camera(CameraTransform, Transform):
 def _least_distance(camera_from_world: np.ndarray, pivot: np.ndarray, fovy_deg: float) -> float:
     """Metres from the pivot at which a square image shows board, tray and the gripper over the tray."""
     signs = np.array([(x, y) for x in (-1, 1) for y in (-1, 1)])
-    board = _at_height(signs * BOARD_HALF_SIZE_M, BOARD.thickness_m)
+    board = _at_height(signs * BOARD.half_size_m, BOARD.thickness_m)
     tray = _at_height(TRAY_CENTER_XY + signs * TRAY_HALF_SIZE_XY, BOARD.thickness_m)
     gripper = _at_height(TRAY_CENTER_XY + signs * TRAY_HALF_SIZE_XY[0], START_HEIGHT_M)
     offsets = np.concatenate([board, tray, gripper]) - pivot

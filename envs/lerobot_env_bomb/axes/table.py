@@ -28,7 +28,7 @@ HELDOUT_TABLE_RGB = ((0.62, 0.36, 0.48), (0.34, 0.46, 0.34))
 
 
 @dataclass(frozen=True)
-class Table(Transform):
+class TableLook(Transform):
     """Colour and pattern of the table, colour of the tray."""
 
     level: int

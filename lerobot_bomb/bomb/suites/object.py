@@ -68,7 +68,7 @@ class Supply:
 
 
 @dataclass(frozen=True)
-class Task:
+class StoneTask:
     """Task about one stone in the tray: `select` returns its index, None where it is not clear which."""
 
     stone: str
@@ -106,44 +106,44 @@ def _by_side(supply: Supply, axis: int, sign: int) -> int | None:
 
 
 TASKS = (
-    Task("the black stone", partial(_only, is_white=False)),
-    Task("the white stone", partial(_only, is_white=True)),
+    StoneTask("the black stone", partial(_only, is_white=False)),
+    StoneTask("the white stone", partial(_only, is_white=True)),
     # the gripper comes nearer to it and nearer to no other: it is the same stone in every step
-    Task("the stone nearest to the gripper", _nearest_to_gripper, gripper_is_named=True),
-    Task("the frontmost stone in the tray", partial(_by_side, axis=1, sign=1)),
-    Task("the stone nearest to the white stone", partial(_by_anchor, is_white=True, sign=1)),
-    Task("the stone farthest from the white stone", partial(_by_anchor, is_white=True, sign=-1)),
-    Task("the stone nearest to the black stone", partial(_by_anchor, is_white=False, sign=1)),
-    Task("the stone farthest from the black stone", partial(_by_anchor, is_white=False, sign=-1)),
-    Task("the leftmost stone in the tray", partial(_by_side, axis=0, sign=1)),
-    Task("the rightmost stone in the tray", partial(_by_side, axis=0, sign=-1)),
+    StoneTask("the stone nearest to the gripper", _nearest_to_gripper, gripper_is_named=True),
+    StoneTask("the frontmost stone in the tray", partial(_by_side, axis=1, sign=1)),
+    StoneTask("the stone nearest to the white stone", partial(_by_anchor, is_white=True, sign=1)),
+    StoneTask("the stone farthest from the white stone", partial(_by_anchor, is_white=True, sign=-1)),
+    StoneTask("the stone nearest to the black stone", partial(_by_anchor, is_white=False, sign=1)),
+    StoneTask("the stone farthest from the black stone", partial(_by_anchor, is_white=False, sign=-1)),
+    StoneTask("the leftmost stone in the tray", partial(_by_side, axis=0, sign=1)),
+    StoneTask("the rightmost stone in the tray", partial(_by_side, axis=0, sign=-1)),
 )
 NUM_PARTS = 5  # one in so many pairs of a task and an intersection is held out
 
 
-def is_heldout(task_id: int, intersection: Intersection) -> bool:
+def _is_heldout(task_id: int, intersection: Intersection) -> bool:
     """Return True if a pair is held out; every task and every intersection is seen in other pairs."""
     row, column = intersection
     return (task_id + row + 2 * column) % NUM_PARTS == 0
 
 
 @cache
-def pairs_of(split: str) -> tuple[tuple[int, Intersection], ...]:
+def pairs_of_split(split: str) -> tuple[tuple[int, Intersection], ...]:
     """Return the pairs (task, target) that a split draws from."""
     pairs = [(task_id, intersection) for task_id in range(len(TASKS)) for intersection in ALL_TARGETS]
-    return of_split(split, pairs, [pair for pair in pairs if is_heldout(*pair)])
+    return of_split(split, pairs, [pair for pair in pairs if _is_heldout(*pair)])
 
 
 def _pairs(spec: EpisodeSpec) -> list[tuple[int, Intersection]]:
     """Return the pairs of task and intersection that a spec draws from."""
     return [
         (task_id, intersection)
-        for task_id, intersection in pairs_of(spec.split)
+        for task_id, intersection in pairs_of_split(spec.split)
         if spec.task_id in (None, task_id) and (spec.target is None or tuple(spec.target) == intersection)
     ]
 
 
-def check(spec: EpisodeSpec) -> None:
+def _check(spec: EpisodeSpec) -> None:
     """Raise a ValueError, which names the flag, unless there is an episode of the spec."""
     refuse_options(spec, "color")
     if not _pairs(spec):
@@ -153,9 +153,9 @@ def check(spec: EpisodeSpec) -> None:
         )
 
 
-def sample_episode(spec: EpisodeSpec) -> Episode:
+def _sample_episode(spec: EpisodeSpec) -> Episode:
     """Draw task, target, supply, opening and start; the same spec, the same episode."""
-    check(spec)
+    _check(spec)
     pairs = _pairs(spec)
     task_id, target = pairs[generator(spec.seed, Stream.TARGET).integers(len(pairs))]
     task = TASKS[task_id]
@@ -180,7 +180,7 @@ def sample_episode(spec: EpisodeSpec) -> Episode:
     )
 
 
-def _sample_supply(rng: np.random.Generator, task: Task) -> tuple[Supply, int, float]:
+def _sample_supply(rng: np.random.Generator, task: StoneTask) -> tuple[Supply, int, float]:
     """Stones, gripper and the index of the only stone that is meant; the gripper's height in metres."""
     height_m = rng.uniform(*GRIPPER_START_HEIGHT_M)
     corners = np.array([(x, y) for x in (-1, 1) for y in (-1, 1)])
@@ -207,4 +207,4 @@ def _layout(supply: Supply, height_m: float) -> Layout:
 
 
 # 1.1: task 3 names a stone that stays the same while the gripper moves
-SUITE = Suite(sample_episode, check, max_steps=100, forms=FORMS, num_tasks=len(TASKS), version="1.1")
+SUITE = Suite(_sample_episode, _check, max_steps=100, forms=FORMS, num_tasks=len(TASKS), version="1.1")

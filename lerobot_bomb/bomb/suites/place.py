@@ -80,7 +80,7 @@ def check_target(spec: EpisodeSpec) -> None:
         )
 
 
-def sample_episode(spec: EpisodeSpec) -> Episode:
+def _sample_episode(spec: EpisodeSpec) -> Episode:
     """Draw target, colour, instruction, opening and start; the same spec, the same episode."""
     check_target(spec)
     targets = targets_of(spec.split)
@@ -151,7 +151,7 @@ def sample_opening(
 
 
 SUITE = Suite(
-    sample_episode,
+    _sample_episode,
     check_target,
     max_steps=100,
     forms=FORMS,

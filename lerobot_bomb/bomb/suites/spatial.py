@@ -53,7 +53,7 @@ FORMS = (
 )
 
 
-class Task(ABC):
+class PlaceTask(ABC):
     """Task whose instruction describes a place by the stones that stand there."""
 
     place: str  # how the instruction names it; {anchor} is the colour of the stones that it refers to
@@ -74,7 +74,7 @@ class Task(ABC):
 
 
 @dataclass(frozen=True)
-class Beside(Task):
+class Beside(PlaceTask):
     """Task: the place some rows and columns from the only stone of the anchor's colour."""
 
     place: str
@@ -94,7 +94,7 @@ class Beside(Task):
 
 
 @dataclass(frozen=True)
-class Between(Task):
+class Between(PlaceTask):
     """Task: the place halfway between the only two stones of the anchor's colour, in their row or column."""
 
     place: str
@@ -115,7 +115,7 @@ class Between(Task):
 
 
 @dataclass(frozen=True)
-class Fixed(Task):
+class Fixed(PlaceTask):
     """A place that the board itself has."""
 
     place: str
@@ -130,7 +130,7 @@ class Fixed(Task):
 
 
 @dataclass(frozen=True)
-class Gap(Task):
+class Gap(PlaceTask):
     """The only free intersection of a row; every other row has none or several."""
 
     place: str
@@ -150,7 +150,7 @@ class Gap(Task):
         return [[(row, other) for other in range(BOARD.num_lines) if other != column]]
 
 
-TASKS: tuple[Task, ...] = (
+TASKS: tuple[PlaceTask, ...] = (
     Beside("to the left of the {anchor} stone", rows=0, columns=-1),
     Beside("to the right of the {anchor} stone", rows=0, columns=1),
     Beside("behind the {anchor} stone", rows=-1, columns=0),
@@ -167,7 +167,7 @@ TASKS: tuple[Task, ...] = (
 NUM_PARTS = 5  # one in so many cases is held out
 
 
-def is_heldout(task_id: int, target: Intersection, color: str) -> bool:
+def _is_heldout(task_id: int, target: Intersection, color: str) -> bool:
     """Return True if a case is held out: every relation, place and colour is seen in other cases."""
     if len(TASKS[task_id].targets) == 1:
         return (task_id + 3 * COLORS.index(color)) % (NUM_PARTS + 1) == NUM_PARTS
@@ -175,7 +175,7 @@ def is_heldout(task_id: int, target: Intersection, color: str) -> bool:
 
 
 @cache
-def cases_of(split: str) -> tuple[tuple[int, Intersection, str], ...]:
+def cases_of_split(split: str) -> tuple[tuple[int, Intersection, str], ...]:
     """(task, target, colour of the stone to be moved) that a split draws from."""
     cases = [
         (task_id, target, color)
@@ -183,19 +183,19 @@ def cases_of(split: str) -> tuple[tuple[int, Intersection, str], ...]:
         for target in TASKS[task_id].targets
         for color in COLORS
     ]
-    return of_split(split, cases, [case for case in cases if is_heldout(*case)])
+    return of_split(split, cases, [case for case in cases if _is_heldout(*case)])
 
 
 def _cases(spec: EpisodeSpec) -> dict[int, list[tuple[Intersection, str]]]:
     """{task: targets and colours} that a spec draws from."""
     cases: dict[int, list[tuple[Intersection, str]]] = {}
-    for task_id, target, color in cases_of(spec.split):
+    for task_id, target, color in cases_of_split(spec.split):
         if spec.task_id in (None, task_id) and spec.color in (None, color):
             cases.setdefault(task_id, []).append((target, color))
     return cases
 
 
-def check(spec: EpisodeSpec) -> None:
+def _check(spec: EpisodeSpec) -> None:
     """Raise a ValueError, which names the flag, unless there is an episode of the spec."""
     refuse_options(spec, "target")
     if not _cases(spec):
@@ -205,9 +205,9 @@ def check(spec: EpisodeSpec) -> None:
         )
 
 
-def sample_episode(spec: EpisodeSpec) -> Episode:
+def _sample_episode(spec: EpisodeSpec) -> Episode:
     """Draw task, target, colour, opening and start; the same spec, the same episode."""
-    check(spec)
+    _check(spec)
     cases = _cases(spec)
     rng = generator(spec.seed, Stream.TARGET)
     task_id = list(cases)[rng.integers(len(cases))]  # first the task, so that each is as frequent
@@ -233,13 +233,13 @@ def sample_episode(spec: EpisodeSpec) -> Episode:
     )
 
 
-def _means(task: Task, anchor: str, target: Intersection, stones: Stones) -> bool:
+def _means(task: PlaceTask, anchor: str, target: Intersection, stones: Stones) -> bool:
     return task.select(stones, anchor) == target
 
 
 def _sample_opening(
     rng: np.random.Generator,
-    task: Task,
+    task: PlaceTask,
     target: Intersection,
     color: str,
     anchor: str,
@@ -273,4 +273,4 @@ def _sample_opening(
             return opening
 
 
-SUITE = Suite(sample_episode, check, max_steps=100, forms=FORMS, num_tasks=len(TASKS))
+SUITE = Suite(_sample_episode, _check, max_steps=100, forms=FORMS, num_tasks=len(TASKS))

@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from lerobot_bomb.bootstrap import Slope, slope, variance_share
+from lerobot_bomb.bootstrap import Slope, fit_slope, variance_share
 from lerobot_bomb.report.report import Report
 from lerobot_bomb.report.table import Cell, Section, Table
 from lerobot_bomb.results.groups import Group
@@ -50,7 +50,7 @@ def _slopes(group: Group) -> dict[str, Slope]:
         levels = np.array([each.levels.get(axis, 0) for each in records], dtype=float)
         successes = np.array([each.is_success for each in records], dtype=float)
         seeds = np.array([each.spec.seed for each in records], dtype=float)
-        if of_slope := slope(levels, successes, seeds):
+        if of_slope := fit_slope(levels, successes, seeds):
             found[axis] = of_slope
     return found
 
