@@ -64,7 +64,7 @@ def test_another_package_adds_env_types_axes_suites_and_sections(tmp_path: Path)
         "all": ["all:3+fog:2", "fog", False],
         "tiny": ["lerobot-tiny-1.0"],
     }
-    assert "--tasks='up' is unknown; choose one of: left, right" in ended.stderr
+    assert "--env.task='up' is unknown; choose one of: left, right" in ended.stderr
     rows: list[dict[str, Any]] = [
         json.loads(line) for line in (tmp_path / "sweep" / "results.jsonl").read_text().splitlines()
     ]

@@ -25,10 +25,12 @@ class WindowAttention(Qwen2_5_VLVisionAttention):
         rotary_pos_emb: Tensor | None = None,
         position_embeddings: tuple[Tensor, Tensor] | None = None,
         *,
-        window_lengths: Sequence[int],
+        window_lengths: Sequence[int] | None = None,
         **kwargs: Any,
     ) -> Tensor:
-        """(N, E) -> (N, E); ``window_lengths``: patches of each window of an image, in order."""
+        """(N, E) -> (N, E); ``window_lengths``: patches of each window of an image, in order; None: stock."""
+        if window_lengths is None:
+            return super().forward(hidden_states, cu_seqlens, rotary_pos_emb, position_embeddings, **kwargs)
         assert position_embeddings is not None
         parts = self.qkv(hidden_states).unflatten(1, (3, self.num_heads, -1)).unbind(1)
         queries, keys = apply_rotary_pos_emb_vision(parts[0], parts[1], *position_embeddings)
