@@ -161,10 +161,10 @@ def _record_type(flags: list[str]) -> type[Record]:
 
 def _check_types(policies: Sequence[str], flags: Sequence[str]) -> None:
     """Raise a ValueError if one is neither a checkpoint nor a type that there is, as far as source says."""
-    for policy in policies:
-        if policy_flag(policy).startswith("--policy.type="):
-            refusal = f"--policies: {policy} is no folder and no policy type"
-            _check_known(refusal, policy, _registered("policies", flags))
+    types = [policy for policy in policies if policy_flag(policy).startswith("--policy.type=")]
+    known = _registered("policies", flags) if types else None
+    for name in types:
+        _check_known(f"--policies: {name} is no folder and no policy type", name, known)
 
 
 def _registered(kind: str, flags: Sequence[str]) -> set[str] | None:

@@ -5,6 +5,7 @@ Simulator workers import this module, so it imports neither torch nor LeRobot.
 
 import dataclasses
 import json
+from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cache
@@ -52,7 +53,7 @@ class Measure:
 
 
 @dataclass(frozen=True, kw_only=True)
-class Record:
+class Record(ABC):
     """Result of an episode.
 
     A subclass for each environment names all fields, in the order in which they are written; those that it
@@ -130,7 +131,7 @@ class Record:
             is_too_often = inference.num_queries > getattr(self, "steps", inference.num_queries)
             self.refuse_if(is_too_often, "inference.num_queries", "steps")
 
-    def check_episode(self) -> None:
+    def check_episode(self) -> None:  # noqa: B027  an environment may have none
         """Raise a ValueError that names fields of this environment which contradict each other."""
 
     def refuse_if(self, is_impossible: bool, first: str, *others: str) -> None:
@@ -159,9 +160,9 @@ class Record:
         """Key that is equal for records that are not independent."""
         return tuple([getattr(self.spec, name) for name in self.start])
 
+    @abstractmethod
     def settings(self) -> dict[str, str]:
         """Return what pooled episodes must agree in, beside spec, policy, protocol and images."""
-        raise NotImplementedError
 
     @classmethod
     def describe_simulator(cls, settings: Mapping[str, str]) -> str:
@@ -169,22 +170,22 @@ class Record:
         return settings["simulator"]
 
     @classmethod
+    @abstractmethod
     def describe_tasks(cls, records: Sequence[Self]) -> str:
         """Describe the tasks of episodes: 'libero_spatial tasks 0..2'."""
-        raise NotImplementedError
 
     def environment(self) -> Environment | None:
         """Return the record's environment of BOMB; None for other environments."""
         return None
 
+    @abstractmethod
     def benchmark(self) -> str:
         """Name the benchmark with its version, for a model card."""
-        raise NotImplementedError
 
     @classmethod
+    @abstractmethod
     def eval_flags(cls, records: Sequence[Self]) -> list[str]:
         """Return lerobot-eval's flags for the environment and tasks of episodes."""
-        raise NotImplementedError
 
     @classmethod
     def describe_change(cls, pairs: Sequence[tuple[Self, Self]]) -> str:
