@@ -38,7 +38,7 @@ SLOWEST_FILES = (
     "test_spatialvla_grid",
 )
 
-# runs the tests that are marked one_type in `make test`, too, unless the mark names another
+# runs the tests that are marked one_type in `make test`, too
 FAST_TYPE = "vla0_smol"
 
 os.environ.setdefault("OMP_NUM_THREADS", "1")
@@ -190,7 +190,7 @@ def pytest_generate_tests(metafunc: pytest.Metafunc) -> None:
     """Run every test that takes a `policy_type` on each policy that learns, or on --policy.type.
 
     A test that takes `options` too runs on the variants of each. One marked `one_type` is about what the
-    types share, and is long on all but FAST_TYPE, or the one that the mark names.
+    types share, and is long on all but FAST_TYPE.
     """
     if "policy_type" not in metafunc.fixturenames:
         return
@@ -201,7 +201,9 @@ def pytest_generate_tests(metafunc: pytest.Metafunc) -> None:
         variants = [variant for each in types for variant in variants_of(each, is_long=is_long)]
         metafunc.parametrize(("policy_type", "options"), variants)
     else:
-        mark = None if chosen else metafunc.definition.get_closest_marker("one_type")
-        slow = [each for each in types if mark and each not in (mark.args or (FAST_TYPE,))]
-        marks = dict.fromkeys(slow, pytest.mark.long)
-        metafunc.parametrize("policy_type", [pytest.param(each, marks=marks.get(each, ())) for each in types])
+        one_type = not chosen and metafunc.definition.get_closest_marker("one_type")
+        slow = {each for each in types if one_type and each != FAST_TYPE}
+        metafunc.parametrize(
+            "policy_type",
+            [pytest.param(each, marks=pytest.mark.long if each in slow else ()) for each in types],
+        )

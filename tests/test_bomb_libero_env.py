@@ -273,6 +273,7 @@ def test_an_action_that_is_none_is_refused(env: Any, action: np.ndarray, message
         env.step(action)
 
 
+@pytest.mark.long
 def test_closing_ends_the_episode_and_a_reset_starts_the_same_anew(libero_with_assets: Libero) -> None:
     prepare_libero([SUITE])
     env = make(NONE)

@@ -5,12 +5,14 @@ from collections.abc import Callable
 from pathlib import Path
 
 import pytest
-from explain_cases import FAST_NAMES
+from explain_cases import NAMES
 
 from lerobot_bomb.commands.main import main
 
 
-@pytest.mark.parametrize("name", FAST_NAMES)
+@pytest.mark.parametrize(
+    "name", [pytest.param(name, marks=() if name == "vla0_smol" else pytest.mark.long) for name in NAMES]
+)
 def test_one_episode(name: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     output = tmp_path / "why"
     flags = [f"--policy.path=bomb:{name}", "--seed=100000", "--grid=4", f"--output={output}"]
@@ -37,9 +39,9 @@ def test_one_episode(name: str, tmp_path: Path, capsys: pytest.CaptureFixture[st
     assert masked["nothing"] == found["result"]
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(
-    ("number", "last"),
-    [(2, "Phase: place"), pytest.param(10, "Where is the destination known?", marks=pytest.mark.long)],
+    ("number", "last"), [(2, "Phase: place"), (10, "Where is the destination known?")]
 )
 def test_several_episodes(number: int, last: str, tmp_path: Path) -> None:
     output = tmp_path / "why"

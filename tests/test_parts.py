@@ -86,8 +86,12 @@ def root(recorded: Path, tmp_path: Path) -> Path:
 
 @pytest.mark.parametrize(
     ("recording", "source"),
-    [(VIDEO, HALF), (IMAGES, HALF), (None, EXPERT), (RELABELLED, OTHER)],
-    ids=["video", "images", "static", "relabelled"],
+    [
+        pytest.param(VIDEO, HALF, id="video"),
+        pytest.param(IMAGES, HALF, id="images", marks=pytest.mark.long),
+        pytest.param(None, EXPERT, id="static"),
+        pytest.param(RELABELLED, OTHER, id="relabelled"),
+    ],
 )
 def test_joined_parts_are_the_dataset_of_one_process(
     recording: Recording | None, source: EpisodeSource, tmp_path: Path

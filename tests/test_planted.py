@@ -84,6 +84,7 @@ def test_the_report_says_the_same(tmp_path: Path) -> None:
 # An error in every tenth episode
 
 
+@pytest.mark.long
 def test_a_rate_says_how_many_are_missing(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: Printed
 ) -> None:

@@ -102,7 +102,7 @@ def two(dataset: Path, tmp_path_factory: pytest.TempPathFactory) -> Callable[[st
     return train
 
 
-@pytest.mark.one_type("fdvla")
+@pytest.mark.long
 def test_two_processes_train_what_one_does(
     policy_type: str,
     two: Callable[[str], tuple[Path, Seen]],
@@ -115,7 +115,7 @@ def test_two_processes_train_what_one_does(
     assert all(abs(a - b) > 1e-3 for a, b in zip(theirs, others, strict=True))  # of different samples
 
 
-@pytest.mark.one_type("fdvla")
+@pytest.mark.long
 def test_going_on_is_exact_and_only_the_first_process_writes(
     policy_type: str, two: Callable[[str], tuple[Path, Seen]]
 ) -> None:
@@ -130,7 +130,7 @@ def test_going_on_is_exact_and_only_the_first_process_writes(
     ]
 
 
-@pytest.mark.one_type("fdvla")
+@pytest.mark.long
 def test_a_log_line_comes_from_one_process(policy_type: str, two: Callable[[str], tuple[Path, Seen]]) -> None:
     said = {"fdvla": "fdvla: {'backbone'", "spatialvla_grid": f"{REPO_ID}: "}
     if policy_type in said:

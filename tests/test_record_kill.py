@@ -109,6 +109,7 @@ def test_a_recording_killed_before_each_of_its_steps_loses_nothing(
     assert list(tmp_path.iterdir()) == [root]
 
 
+@pytest.mark.long
 def test_parts_killed_before_each_of_their_steps_lose_nothing(
     server: RecorderServer, references: dict[str, Reference], tmp_path: Path
 ) -> None:

@@ -52,7 +52,7 @@ def rewritten(path: Path, file: Path, **changes: Any) -> Path:
         ("bomb:fdvla", ()),  # whose noise is a sequence that all episodes share
         pytest.param("bomb:vla0_smol", (), marks=pytest.mark.long),
         pytest.param("bomb:spatialvla_grid", (), marks=pytest.mark.long),
-        ("bomb_random", ("--env.fps=2",)),  # uses up an episode's 10 s
+        pytest.param("bomb_random", ("--env.fps=2",), marks=pytest.mark.long),  # uses up an episode's 10 s
         ("bomb_expert", ()),
     ],
 )

@@ -52,9 +52,9 @@ def with_depth(policy: SpatialvlaGridPolicy, batch: dict[str, Any], seed: int = 
     ("num_dims", "options"),
     [
         (4, {}),
-        (7, {"use_state": True, "prefix_attention": "causal"}),
-        (2, {"loss_vocab": "full"}),
-        (14, {"chunk_size": 2, "n_action_steps": 2, "dtype": "bfloat16"}),
+        pytest.param(7, {"use_state": True, "prefix_attention": "causal"}, marks=pytest.mark.long),
+        pytest.param(2, {"loss_vocab": "full"}, marks=pytest.mark.long),
+        pytest.param(14, {"chunk_size": 2, "n_action_steps": 2, "dtype": "bfloat16"}, marks=pytest.mark.long),
         (4, {"depth_source": "observation"}),
     ],
 )

@@ -168,7 +168,7 @@ def by_seed(rows: list[Record]) -> list[Record]:
 @pytest.mark.parametrize(
     "policy",
     [
-        "bomb_random",
+        pytest.param("bomb_random", marks=pytest.mark.long),
         "bomb:fdvla",
         pytest.param(NANO, marks=pytest.mark.long),
         pytest.param("bomb:spatialvla_grid", marks=pytest.mark.long),
