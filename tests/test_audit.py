@@ -4,7 +4,7 @@ import json
 from pathlib import Path
 
 import pytest
-from test_results import read, values
+from result_rows import read, values
 
 from lerobot_bomb.commands.arguments import ANSWER_IS_NO
 from lerobot_bomb.commands.main import main

@@ -1,6 +1,6 @@
 """Records of `bomb`: what they say together."""
 
-from test_results import read, values
+from result_rows import read, values
 
 from lerobot_bomb.results.instructions import named_targets, other_instructions
 

@@ -9,7 +9,7 @@ import pytest
 import yaml
 from huggingface_hub import ModelCardData, parse_eval_result_entries
 from huggingface_hub.repocard_data import model_index_to_eval_results
-from test_results import FDVLA, read, values
+from result_rows import FDVLA, read, values
 
 from lerobot_bomb.commands.main import main
 from lerobot_bomb.hub.evaluations import model_index, model_index_yaml

@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from test_results import values
+from result_rows import values
 
 from lerobot_bomb import files
 from lerobot_bomb.commands.main import main

@@ -19,7 +19,7 @@ from lerobot.policies import PreTrainedPolicy, make_policy
 from lerobot.policies.act.configuration_act import ACTConfig
 from lerobot.policies.act.modeling_act import ACTPolicy
 from policy_cases import CASES
-from test_results import read, values
+from result_rows import read, values
 
 import lerobot_policy_bomb  # noqa: F401  the plugin
 from lerobot_bomb.bomb.observation import RenderOptions

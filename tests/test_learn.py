@@ -12,7 +12,7 @@ import learning_tasks
 import numpy as np
 import pytest
 from learning_curve import SUCCESS_BGR, count, draw
-from test_results import read, values
+from result_rows import read, values
 
 from lerobot_bomb.bomb.board import COLORS
 from lerobot_bomb.bomb.episode import EpisodeSpec

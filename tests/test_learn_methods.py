@@ -3,7 +3,7 @@
 import methods
 import pytest
 from recipes import read_recipe
-from test_results import read, values
+from result_rows import read, values
 
 from lerobot_bomb.results.bomb import EpisodeResult
 

@@ -7,7 +7,7 @@ from typing import Any
 
 import pytest
 from bomb_pusht_cases import pusht_row
-from test_results import ACT, printed, read, row, values
+from result_rows import ACT, printed, read, row, values
 
 from lerobot_bomb.commands.main import main
 from lerobot_bomb.pusht.episode import SUCCESS_COVERAGE

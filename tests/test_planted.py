@@ -6,8 +6,8 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+from result_rows import FDVLA, values
 from scipy.stats import binomtest
-from test_results import FDVLA, values
 
 from lerobot_bomb.commands.arguments import ANSWER_IS_NO
 from lerobot_bomb.commands.main import main

@@ -9,8 +9,8 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+from result_rows import FDVLA, read, values
 from scipy.stats import linregress
-from test_results import FDVLA, read, values
 
 from lerobot_bomb.commands.main import main
 from lerobot_bomb.report.cells import points

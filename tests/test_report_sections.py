@@ -10,7 +10,7 @@ from typing import Any
 
 import av
 import pytest
-from test_results import ACT, FDVLA, values
+from result_rows import ACT, FDVLA, values
 
 from lerobot_bomb.checkpoints.names import REPLACE_TASKS
 from lerobot_bomb.commands.main import main

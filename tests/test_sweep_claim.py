@@ -3,7 +3,7 @@
 from pathlib import Path
 
 import pytest
-from test_sweep import FLAGS, lines_of, small, sweep
+from sweep_cases import FLAGS, lines_of, small, sweep
 
 from lerobot_bomb.sweep.claim import claimed
 from lerobot_bomb.sweep.manifest import Manifest, plan

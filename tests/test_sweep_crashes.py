@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import IO
 
 import pytest
-from test_sweep import lines_of, small, sweep
+from sweep_cases import lines_of, small, sweep
 
 from lerobot_bomb import files
 from lerobot_bomb.sweep import local

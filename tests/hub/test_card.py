@@ -10,7 +10,7 @@ import yaml
 from bomb_pusht_cases import pusht_row
 from lerobot.configs.default import DatasetConfig
 from lerobot.configs.train import TrainPipelineConfig
-from test_results import read, values
+from result_rows import read, values
 from vla0_smol_cases import make_config
 
 from hub.server import LoopbackHub
