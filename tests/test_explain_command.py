@@ -40,9 +40,7 @@ def test_one_episode(name: str, tmp_path: Path, capsys: pytest.CaptureFixture[st
 
 
 @pytest.mark.long
-@pytest.mark.parametrize(
-    ("number", "last"), [(2, "Phase: place"), (10, "Where is the destination known?")]
-)
+@pytest.mark.parametrize(("number", "last"), [(2, "Phase: place"), (10, "Where is the destination known?")])
 def test_several_episodes(number: int, last: str, tmp_path: Path) -> None:
     output = tmp_path / "why"
     flags = ["--policy.path=bomb:fdvla", "--seed=100000", "--grid=2", f"--output={output}"]
