@@ -143,7 +143,7 @@ def test_what_records_of_earlier_releases_lack_are_fields(record_type: type[Reco
 def test_fields_that_earlier_releases_did_not_write_are_checked_where_they_are(name: str, value: Any) -> None:
     with pytest.raises(ValueError, match=f"{name}={json.dumps(value)} is impossible"):
         read(values(0) | {name: value})
-    assert getattr(read({key: of for key, of in values(0).items() if key != name}), name) is None
+    assert getattr(read({key: kept for key, kept in values(0).items() if key != name}), name) is None
 
 
 def test_moves_made_are_shown_of_episodes_with_several(path: Path) -> None:
@@ -386,8 +386,8 @@ def test_a_perturbed_arm_is_compared_with_the_same_episodes_unperturbed(
     outcomes = {"none": "++++++-", "camera:3": "-----++", "all:5": "++"}  # by seed
     lines = [
         row(seed, None if outcome == "+" else "dropped", spec={"perturbations": condition})
-        for condition, of in outcomes.items()
-        for seed, outcome in enumerate(of)
+        for condition, marks in outcomes.items()
+        for seed, outcome in enumerate(marks)
     ]
     lines.append(row(99, spec={"perturbations": "all:5"}))  # has no pair
     output = printed(path, "".join(lines), capsys)
