@@ -72,9 +72,9 @@ def compare_environments(repeats: int, robosuite_python: str) -> dict[str, dict[
             if output is not None:
                 runs[name].append(output)
     return {
-        name: {key: statistics.median(run[key] for run in of) for key in of[0]}
-        for name, of in runs.items()
-        if of
+        name: {key: statistics.median(run[key] for run in outputs) for key in outputs[0]}
+        for name, outputs in runs.items()
+        if outputs
     }
 
 

@@ -119,7 +119,7 @@ def variance_share(values_N: np.ndarray, levels_N: np.ndarray) -> float | None:
     num_within = len(values_N) - len(groups)
     if total == 0 or len(groups) < 2 or num_within == 0:
         return None
-    within = float(sum(((of - of.mean()) ** 2).sum() for of in groups))
+    within = float(sum(((group - group.mean()) ** 2).sum() for group in groups))
     return 1 - within / num_within / (total / (len(values_N) - 1))
 
 

@@ -61,12 +61,11 @@ def ask(
     policy: LoadedPolicy,
     prepare: Callable[[dict[str, Any]], dict[str, Any]] | None = None,
     batch_size: int = 64,
-    of: ScoredPolicy | None = None,
 ) -> Question:
     """The observation, asked of a policy; ``prepare``: what stands for its preprocessor."""
     observation, instruction, _, _ = moment()
     raw = policy.observe([observation], [instruction])
-    return Question(of or scored_by(policy), prepare or policy.prepare, raw, batch_size)
+    return Question(scored_by(policy), prepare or policy.prepare, raw, batch_size)
 
 
 def query(policy: LoadedPolicy) -> MomentQuery:

@@ -221,12 +221,12 @@ def tap_eval(checkpoint: Path, output_dir: Path, flags: str, run: RunEpisode) ->
         seeds: list[int],
         **_: Any,
     ) -> dict:
-        def of(replay: Any) -> dict:
+        def run_replay(replay: Any) -> dict:
             as_recorded: Any = lambda action: action  # noqa: E731
             return rollout(env, replay, env_preprocessor, env_postprocessor, preprocessor, as_recorded, seeds)
 
         route.policy, route.postprocessor = policy, postprocessor
-        result, batches = run(of, seeds[0])
+        result, batches = run(run_replay, seeds[0])
         route.batches |= batches
         return result
 

@@ -155,12 +155,14 @@ def write_published(
     (folder / "config.json").write_text(json.dumps(published_config(policy)))
     edges = {
         kind: {
-            f"{name}_bins": of.tolist()
-            for name, of in zip(BINS[group], policy.grids.group_edges(group), strict=True)
+            f"{name}_bins": axis_edges.tolist()
+            for name, axis_edges in zip(BINS[group], policy.grids.group_edges(group), strict=True)
         }
         for group, kind in enumerate(("translation", "rotation"))
     }
-    counts = {kind: {name: len(of) - 1 for name, of in each.items()} for kind, each in edges.items()}
+    counts = {
+        kind: {name: len(axis_edges) - 1 for name, axis_edges in each.items()} for kind, each in edges.items()
+    }
     content = {
         "action_chunk_size": policy.config.chunk_size,
         "action_config": {

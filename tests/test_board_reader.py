@@ -56,7 +56,7 @@ def gradients(policy: Any, batch: dict[str, Any], weight: float) -> dict[str, Te
     policy.config.trained_batches = 0  # which all that is random in a batch follows from
     policy.config.board_loss_weight = weight
     policy.train()(batch)[0].backward()
-    return {name: of.grad.clone() for name, of in policy.named_parameters() if of.grad is not None}
+    return {name: p.grad.clone() for name, p in policy.named_parameters() if p.grad is not None}
 
 
 def of_vision(name: str) -> bool:
@@ -72,7 +72,7 @@ def test_its_gradient_reaches_the_vision_model_unless_that_is_frozen(policy_type
     policy = reading_policy(policy_type, freeze_vision_encoder=frozen)
     batch = board_batch(policy)
     less, more = (gradients(policy, batch, weight) for weight in (1.0, 3.0))
-    changed = {name for name, of in more.items() if not torch.allclose(of, less[name])}
+    changed = {name for name, grad in more.items() if not torch.allclose(grad, less[name])}
     assert {"board_reader.tokens.weight", "board_reader.read.2.weight"} <= changed
     assert any(map(of_vision, changed)) == (not frozen)
     assert not any(name.startswith(("flow_head", "denoise_head", "pointer", "cell_")) for name in changed)
@@ -117,7 +117,7 @@ def test_it_is_small_with_any_backbone(num_tokens: int, hidden_size: int) -> Non
     """Nano, Qwen2.5-VL, PaliGemma 2, and a dozen images."""
     with torch.device("meta"):
         reader = BoardReader(num_tokens, hidden_size)
-    assert sum(of.numel() for of in reader.parameters()) < max(700_000, 1100 * num_tokens)
+    assert sum(parameter.numel() for parameter in reader.parameters()) < max(700_000, 1100 * num_tokens)
 
 
 def test_without_pointing_or_weight_there_is_none(policy_type: str) -> None:
@@ -257,7 +257,9 @@ def test_adapters_train_it_whole(policy_type: str) -> None:
     wrapped = policy.wrap_with_peft(peft_cli_overrides={"method_type": "LORA", "r": 4})
     loss, metrics = wrapped.train()(board_batch(policy))
     loss.backward()
-    found = {name: of.grad for name, of in wrapped.named_parameters() if ".board_reader." in name}
+    found = {
+        name: parameter.grad for name, parameter in wrapped.named_parameters() if ".board_reader." in name
+    }
     trained = [grad for name, grad in found.items() if "modules_to_save" in name]
     assert len(trained) == 6 and all(grad is not None and grad.any() for grad in trained)
     assert metrics["board_loss"] > 0

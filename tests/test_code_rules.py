@@ -52,3 +52,15 @@ def test_scores_of_a_policy_reach_into_none_of_its_private_members() -> None:
         and ast.unparse(node.value) != "self"
     ]
     assert len(paths) > 20 and not reached
+
+
+def test_no_variable_or_parameter_is_named_of() -> None:
+    """Check that each has a name that says what it holds."""
+    places, num_names = [], 0
+    for path in (path for folder in FOLDERS for path in (ROOT / folder).rglob("*.py")):
+        for node in ast.walk(ast.parse(path.read_text())):
+            if isinstance(node, ast.Name | ast.arg):
+                num_names += 1
+                if (node.id if isinstance(node, ast.Name) else node.arg) == "of":
+                    places.append(f"{path.relative_to(ROOT)}:{node.lineno}")
+    assert num_names > 10_000 and not places

@@ -214,10 +214,10 @@ def test_the_split_holds_out_commands_whose_parts_are_all_seen(suite: str) -> No
             for seed in range(120):
                 spec = EpisodeSpec(seed, suite, split=split, task_id=task_id)
                 drawn_of.append(draw_command(TASKS[suite], spec)[1].about)
-        assert not any(is_heldout(task_id, of) for of in about["train"])
-        assert all(is_heldout(task_id, of) for of in about["heldout"])
+        assert not any(is_heldout(task_id, parts) for parts in about["train"])
+        assert all(is_heldout(task_id, parts) for parts in about["heldout"])
         for number in range(len(about["train"][0])):
-            seen, asked = ({of[number] for of in about[split]} for split in ("train", "heldout"))
+            seen, asked = ({parts[number] for parts in about[split]} for split in ("train", "heldout"))
             assert asked <= seen, f"task {task_id} asks for what no training shows"
 
 

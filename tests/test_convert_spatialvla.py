@@ -156,10 +156,10 @@ def actions_as_the_original_decodes(
     first = 0
     parts = []
     for group, kind in enumerate(("translation", "rotation")):
-        of = [np.array(each) for each in edges[kind].values()]
-        sizes = [len(each) - 1 for each in of]
+        group_edges = [np.array(each) for each in edges[kind].values()]
+        sizes = [len(each) - 1 for each in group_edges]
         bins = np.unravel_index(tokens[..., group] - first, sizes)
-        parts += [(each[i] + each[i + 1]) / 2 for each, i in zip(of, bins, strict=True)]
+        parts += [(each[i] + each[i + 1]) / 2 for each, i in zip(group_edges, bins, strict=True)]
         first += np.prod(sizes)
     theta, phi, rho, *angles = parts
     xyz = rho * np.sin(theta) * np.cos(phi), rho * np.sin(theta) * np.sin(phi), rho * np.cos(theta)
@@ -197,7 +197,7 @@ def test_other_weights_edges_and_statistics_act_as_the_original(
     assert not torch.equal(cells_of(blind, batch), cells)
     processor = json.loads((folder / "processor_config.json").read_text())
     expected = actions_as_the_original_decodes(cells.numpy(), processor, "wanted")
-    actions = [postprocessor(of).numpy() for of in policy.predict_action_chunk(batch).unbind(dim=1)]
+    actions = [postprocessor(step).numpy() for step in policy.predict_action_chunk(batch).unbind(dim=1)]
     np.testing.assert_allclose(np.stack(actions, axis=1), expected, rtol=0, atol=1e-6)
 
 

@@ -82,7 +82,7 @@ def test_executed_actions_lead_to_the_same_result_again(tmp_path: Path, is_async
     steps = {
         f"place, task 0, seed {row.spec.seed}": row.steps for row in read_results(results, EpisodeResult)
     }
-    assert {episode: len(of) for episode, of in executed.episodes.items()} == steps
+    assert {episode: len(actions) for episode, actions in executed.episodes.items()} == steps
     assert len(steps) == 4
     for row in read_results(results, EpisodeResult):  # each line says how smooth these were
         actions_TD = executed.episodes[f"place, task 0, seed {row.spec.seed}"]
@@ -109,7 +109,7 @@ def test_another_environment_and_another_policy(tmp_path: Path) -> None:
     assert executed.fps == 10
     # LeRobot runs whole batches, and counts three episodes
     assert list(executed.episodes) == [f"pusht, task 0, seed {seed}" for seed in range(1000, 1003)]
-    assert {of.shape for of in executed.episodes.values()} == {(6, 2)}
+    assert {actions.shape for actions in executed.episodes.values()} == {(6, 2)}
 
 
 def test_a_file_holds_one_evaluation(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

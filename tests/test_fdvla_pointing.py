@@ -68,7 +68,7 @@ def point_at(policy: FdvlaPolicy, place: int) -> None:
 
 def test_it_acts_as_without_until_it_is_trained() -> None:
     policy, plain = pointing_policy(), make_policy(chunk_size=1, n_action_steps=1)
-    shared = {name: of for name, of in policy.state_dict().items() if not name.startswith("pointer.")}
+    shared = {name: tensor for name, tensor in policy.state_dict().items() if not name.startswith("pointer.")}
     plain.load_state_dict(shared)
     batch = make_batch(policy, 3)
     torch.testing.assert_close(
@@ -129,7 +129,7 @@ def gradients(policy: FdvlaPolicy, batch: dict[str, Any], **weights: float) -> d
     for name, value in weights.items():
         setattr(policy.config, name, value)
     policy.train()(batch)[0].backward()
-    return {name: of.grad for name, of in policy.named_parameters() if of.grad is not None}
+    return {name: p.grad for name, p in policy.named_parameters() if p.grad is not None}
 
 
 def test_no_gradient_of_the_actions_reaches_what_is_pointed_at() -> None:
@@ -145,9 +145,9 @@ def test_gradients_of_pointing_reach_the_backbone_and_no_head() -> None:
     batch, both = pointing_batch(policy), {}
     for weight in (0.0, 1.0):
         both[weight] = {
-            name: of.clone() for name, of in gradients(policy, batch, pointing_loss_weight=weight).items()
+            name: grad.clone() for name, grad in gradients(policy, batch, pointing_loss_weight=weight).items()
         }
-    changed = {name for name, of in both[1.0].items() if not torch.equal(of, both[0.0][name])}
+    changed = {name for name, grad in both[1.0].items() if not torch.equal(grad, both[0.0][name])}
     assert {
         "pointer.place.weight",
         "pointer.spot.weight",
@@ -202,9 +202,9 @@ def test_an_explanation_says_where_it_points() -> None:
         likeliest = [float(xy == (0.14, 0.045)) for xy in SPOTS_XY_M]
         beside = pointer.stone[2]
         assert isinstance(beside, nn.Linear)
-        for of, bias in ((pointer.spot, likeliest), (beside, [0.5, -1.0]), (pointer.held, [2.0])):
-            of.weight.zero_()
-            of.bias.copy_(torch.tensor(bias))
+        for layer, bias in ((pointer.spot, likeliest), (beside, [0.5, -1.0]), (pointer.held, [2.0])):
+            layer.weight.zero_()
+            layer.bias.copy_(torch.tensor(bias))
     batch = make_batch(policy, 1) | {"observation.state": torch.tensor([[0.0, 1.0, 0.0, 0.0]])}
     found = policy.scored().pointed(batch)
     assert found is not None and found.place_xy.tolist() == pytest.approx(PLACES[2])

@@ -172,10 +172,12 @@ def test_the_plot_has_the_edges_where_the_grid_has_them(root: Path, tmp_path: Pa
     assert [path.name for path in tmp_path.iterdir()] == ["grid.png"]
     plot = np.asarray(Image.open(tmp_path / "grid.png"))
     grids, _, _ = fitted(LeRobotDatasetMetadata(REPO_ID, root=root))
-    edges = [of.numpy() for i in range(2) for of in grids.group_edges(i)]
-    for row, of in enumerate(edges):
+    edges = [row_edges.numpy() for i in range(2) for row_edges in grids.group_edges(i)]
+    for row, row_edges in enumerate(edges):
         line = plot[TITLE_HEIGHT + row * ROW_HEIGHT + 10]
-        assert np.flatnonzero((line == EDGE_RGB).all(axis=1)).tolist() == sorted({*edge_x(of).tolist()})
+        assert np.flatnonzero((line == EDGE_RGB).all(axis=1)).tolist() == sorted(
+            {*edge_x(row_edges).tolist()}
+        )
 
 
 def test_bars_of_a_histogram_are_where_the_values_are() -> None:

@@ -146,7 +146,9 @@ def bimodal_heads(actions_BKD: Tensor, tau_B: Tensor) -> tuple[Tensor, Tensor]:
     """Return the heads of an even mixture of N(1, 0.1^2) and N(-1, 0.1^2)."""
     tau = tau_B[:, None, None]
     share = torch.sigmoid(2 * actions_BKD * tau / (tau**2 * 0.01 + (1 - tau) ** 2))
-    (v_up, eps_up), (v_down, eps_down) = (gaussian_heads(of, 0.1)(actions_BKD, tau_B) for of in (1.0, -1.0))
+    (v_up, eps_up), (v_down, eps_down) = (
+        gaussian_heads(mean, 0.1)(actions_BKD, tau_B) for mean in (1.0, -1.0)
+    )
     return share * v_up + (1 - share) * v_down, share * eps_up + (1 - share) * eps_down
 
 

@@ -69,7 +69,9 @@ def test_best_alpha_for_heads_that_err_alike(tau: float, best: float) -> None:
     def variance(alpha: float) -> float:
         """Return the slope's variance under independent errors of variance 1; the exact slope is zero."""
         zero, one = torch.tensor(0.0), torch.tensor(1.0)
-        by_flow, by_denoise = (slope("residual", zero, *of, tau, alpha) for of in ((one, zero), (zero, one)))
+        by_flow, by_denoise = (
+            slope("residual", zero, *errors, tau, alpha) for errors in ((one, zero), (zero, one))
+        )
         return (by_flow**2 + by_denoise**2).item()
 
     alphas = [i / 1000 for i in range(1001)]

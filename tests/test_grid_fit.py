@@ -35,10 +35,10 @@ def test_edges_increase_and_points_stay_in_their_bins(
 ) -> None:
     noise = np.random.default_rng(0).normal(size=200)
     values = torch.from_numpy((mean + std * noise).clip(-1, 1))
-    of = cut(values, -1, 1, num_bins, distribution, min_sigma=0.0)
-    assert (of.edges[0], of.edges[-1]) == (-1, 1)
-    assert of.edges.diff().min() >= MIN_WIDTH * (1 - 1e-9)
-    assert ((of.means > of.edges[:-1]) & (of.means < of.edges[1:])).all()
+    fitted_cut = cut(values, -1, 1, num_bins, distribution, min_sigma=0.0)
+    assert (fitted_cut.edges[0], fitted_cut.edges[-1]) == (-1, 1)
+    assert fitted_cut.edges.diff().min() >= MIN_WIDTH * (1 - 1e-9)
+    assert ((fitted_cut.means > fitted_cut.edges[:-1]) & (fitted_cut.means < fitted_cut.edges[1:])).all()
 
 
 def test_quantile_bins_hold_equal_shares() -> None:
@@ -258,7 +258,9 @@ def test_a_pose_has_a_direction_a_length_and_a_gripper(
 ) -> None:
     groups = default_groups(num_dims, names, layout)
     assert (groups[0].dims, groups[0].transform) == ((0, 1, 2), "polar")
-    assert [of.transform for of in groups[1:]] == (["identity", "binary"] if num_dims == 7 else ["identity"])
+    assert [group.transform for group in groups[1:]] == (
+        ["identity", "binary"] if num_dims == 7 else ["identity"]
+    )
 
 
 @pytest.mark.parametrize(
@@ -276,14 +278,14 @@ def test_no_joint_is_binary_and_each_comes_back_to_a_hundredth_of_its_range(
     names: list[str] | None, layout: str | None, num_dims: int
 ) -> None:
     groups = default_groups(num_dims, names, layout)
-    assert [of.dims for of in groups] == [(dim,) for dim in range(num_dims)]
+    assert [group.dims for group in groups] == [(dim,) for dim in range(num_dims)]
     errors = joint_errors(groups, num_dims)
     assert errors.mean() < 0.0025 and errors.quantile(0.99) < 0.01  # of a range of 2
 
 
 def test_three_joints_in_a_token_would_be_off_by_degrees() -> None:
     groups = [(0, 1, 2), (3, 4, 5), (6,)]
-    errors = joint_errors(tuple(ActionGroup(of, "identity", (16,) * len(of)) for of in groups), 7)
+    errors = joint_errors(tuple(ActionGroup(dims, "identity", (16,) * len(dims)) for dims in groups), 7)
     assert errors.mean() == pytest.approx(0.04, abs=5e-4)
 
 

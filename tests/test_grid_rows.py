@@ -21,13 +21,13 @@ TOY_RANGES = {"theta": (0, math.pi), "phi": (-math.pi, math.pi), "r": (0, math.s
 
 def grid_of_edges(*edges: list[float]) -> ActionGrids:
     """One identity group with these edges."""
-    bins = tuple(len(of) - 1 for of in edges)
+    bins = tuple(len(axis_edges) - 1 for axis_edges in edges)
     grids = ActionGrids(GridSettings((ActionGroup(tuple(range(len(bins))), "identity", bins),)), len(bins))
     return ActionGrids.from_dict({**grids.to_dict(), "edges": list(edges)}, len(bins))
 
 
 def middles(grids: ActionGrids) -> list[Tensor]:
-    return [((of[:-1] + of[1:]) / 2).float() for of in grids.group_edges(0)]
+    return [((edges[:-1] + edges[1:]) / 2).float() for edges in grids.group_edges(0)]
 
 
 def rows_of(grids: ActionGrids, seed: int = 0) -> Tensor:
@@ -63,8 +63,8 @@ def toys(shared_data: Path) -> tuple[ActionGrids, ActionGrids]:
         parameters = json.loads((shared_data / "spatialvla" / name).read_text())
         edges = []
         for (key, (low, high)), bins in zip(TOY_RANGES.items(), TOY_BINS, strict=True):
-            of = gaussian_cut(parameters[key]["mu"], parameters[key]["sigma"], low, high, bins)
-            edges.append((2 * (of.edges - low) / (high - low) - 1).tolist())
+            cut = gaussian_cut(parameters[key]["mu"], parameters[key]["sigma"], low, high, bins)
+            edges.append((2 * (cut.edges - low) / (high - low) - 1).tolist())
         return grid_of_edges(*edges)
 
     return toy("gs_bridge.json"), toy("gs_fractal.json")
@@ -76,7 +76,7 @@ def in_the_original_order(old: ActionGrids, new: ActionGrids, rows: Tensor) -> T
     lattice = pad(rows.view(phi, theta, rho, -1).movedim(-1, 0)[None], (1,) * 6, mode="replicate")[0].movedim(
         0, -1
     )
-    points = [torch.cat([torch.tensor([-1.0]), of, torch.tensor([1.0])]) for of in middles(old)]
+    points = [torch.cat([torch.tensor([-1.0]), inner, torch.tensor([1.0])]) for inner in middles(old)]
     for axis, coordinate in enumerate((1, 0, 2)):
         to, at = middles(new)[coordinate], points[coordinate]
         upper = torch.searchsorted(at, to).clamp(1, len(at) - 1)

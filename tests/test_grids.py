@@ -28,11 +28,11 @@ def bridge(shared_data: Path) -> dict[str, Any]:
 
 
 def test_edges_and_points_of_a_gaussian_by_hand() -> None:
-    of = gaussian_cut(0.0, 0.3, -1.0, 1.0, 4)
-    assert of.edges.tolist() == pytest.approx([-1, -0.202144, 0, 0.202144, 1], abs=1e-6)
-    assert of.means.tolist() == pytest.approx([-0.379981, -0.097309, 0.097309, 0.379981], abs=1e-6)
+    cut = gaussian_cut(0.0, 0.3, -1.0, 1.0, 4)
+    assert cut.edges.tolist() == pytest.approx([-1, -0.202144, 0, 0.202144, 1], abs=1e-6)
+    assert cut.means.tolist() == pytest.approx([-0.379981, -0.097309, 0.097309, 0.379981], abs=1e-6)
     grids = ActionGrids(GridSettings((ActionGroup((0,), "identity", (4,)),), decode_point="mid"), 1)
-    edges = {"edges": [of.edges.tolist()], "means": [of.means.tolist()], "gaussians": [[0.0, 0.3]]}
+    edges = {"edges": [cut.edges.tolist()], "means": [cut.means.tolist()], "gaussians": [[0.0, 0.3]]}
     grids = ActionGrids.from_dict({**grids.to_dict(), **edges}, 1)
     mids = grids.decode(torch.arange(4)[:, None])[:, 0]
     assert mids.tolist() == pytest.approx([-0.601072, -0.101072, 0.101072, 0.601072], abs=1e-6)
@@ -90,8 +90,8 @@ def test_bridge_errors_of_both_decode_points(bridge: dict[str, Any]) -> None:
     generator = torch.Generator().manual_seed(0)
     actions = torch.zeros(400_000, 7)
     for dim, key in enumerate(XYZ):
-        of = bridge[key]
-        actions[:, dim] = of["mu"] + of["sigma"] * torch.randn(len(actions), generator=generator)
+        gaussian = bridge[key]
+        actions[:, dim] = gaussian["mu"] + gaussian["sigma"] * torch.randn(len(actions), generator=generator)
     actions.clamp_(-1, 1)
     grids = ActionGrids.from_published(bridge)
     assert grids.decode_point == "cond_mean"
@@ -183,7 +183,7 @@ def test_json_alone_holds_the_whole_grid(point: str) -> None:
 
 def test_a_grid_of_edges_alone_decodes_to_their_middles(bridge: dict[str, Any]) -> None:
     published = ActionGrids.from_published(bridge)
-    edges = [of for group in range(3) for of in published.group_edges(group)]
+    edges = [row for group in range(3) for row in published.group_edges(group)]
     grids = ActionGrids.from_edges(edges, published.settings, 7)
     actions = normal_actions(3000, 7)
     cells = published.encode(actions)
@@ -209,4 +209,4 @@ def test_a_stored_grid_of_another_action_size_is_refused(bridge: dict[str, Any])
     with pytest.raises(ValueError, match="the action has 4 dims, but the grid was made for 7"):
         ActionGrids.from_published(bridge).encode(torch.zeros(2, 4))
     with pytest.raises(ValueError, match="the published grid lacks roll; it has x"):
-        ActionGrids.from_published({key: of for key, of in bridge.items() if key != "roll"})
+        ActionGrids.from_published({key: gaussian for key, gaussian in bridge.items() if key != "roll"})

@@ -79,15 +79,17 @@ def run_expert(env: BombEnv, seed: int) -> tuple[np.ndarray, Observations]:
 def run_together(envs: LazyVectorEnv, actions: list[np.ndarray]) -> list[Observations]:
     """The observations of one episode per env, each as long as its actions."""
     num_steps = max(map(len, actions))
-    actions_TED = np.stack([np.pad(of, ((0, num_steps - len(of)), (0, 0))) for of in actions], axis=1)
+    actions_TED = np.stack(
+        [np.pad(actions_TD, ((0, num_steps - len(actions_TD)), (0, 0))) for actions_TD in actions], axis=1
+    )
     observation, _ = envs.reset(seed=list(SEEDS[: len(actions)]), options={NEW_ROLLOUT_OPTION: True})
     steps = [flat(observation, envs.call("task_description"))]
     for actions_ED in actions_TED:
         observation = envs.step(actions_ED)[0]
         steps.append(flat(observation, envs.call("task_description")))
     return [
-        [{key: values[i] for key, values in step.items()} for step in steps[: len(of) + 1]]
-        for i, of in enumerate(actions)
+        [{key: values[i] for key, values in step.items()} for step in steps[: len(actions_TD) + 1]]
+        for i, actions_TD in enumerate(actions)
     ]
 
 

@@ -106,7 +106,9 @@ def test_a_merge_that_loses_episodes_is_an_error_and_the_blocks_stay(
 
     merge: Callable = blocks.merge_blocks
     shutil.copytree(recorded / "x.recording", tmp_path / "x.recording")
-    monkeypatch.setattr(blocks, "merge_blocks", lambda layout, of, root: merge(layout, of[:-1], root))
+    monkeypatch.setattr(
+        blocks, "merge_blocks", lambda layout, folders, root: merge(layout, folders[:-1], root)
+    )
     with pytest.raises(RuntimeError, match=r"holds 4 episodes, but 5 were made; 5 episodes are kept"):
         record(RECORDING, tmp_path / "x", resume=True)
     assert not (tmp_path / "x").exists()

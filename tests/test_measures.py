@@ -11,8 +11,8 @@ def test_padded_steps_do_not_count() -> None:
     is_pad = np.array([[False, True, True], [False, False, True]])
     l1 = measure_l1(predicted, recorded, is_pad, np.array([0, 1]), ["x", "y"])
     assert l1.all.mean == 12 / 6
-    assert {name: of.mean for name, of in l1.dims.items()} == {"x": 7 / 3, "y": 5 / 3}
-    assert [of.mean for of in l1.steps] == [2.0, 2.0]
+    assert {name: estimate.mean for name, estimate in l1.dims.items()} == {"x": 7 / 3, "y": 5 / 3}
+    assert [estimate.mean for estimate in l1.steps] == [2.0, 2.0]
 
 
 def test_the_interval_draws_episodes_not_frames() -> None:

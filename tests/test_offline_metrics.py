@@ -110,7 +110,7 @@ def test_loss_and_l1_equal_a_plain_loop(checkpoint: Path, root: Path) -> None:
     assert column.losses["loss"].mean == pytest.approx(np.mean(losses), rel=1e-5)
     assert column.losses["token_accuracy"].mean == pytest.approx(np.mean(accuracies), rel=1e-5)
     assert column.l1["policy"].all.mean == pytest.approx(expected.mean().item(), rel=1e-5)
-    dims = [of.mean for of in column.l1["policy"].dims.values()]
+    dims = [estimate.mean for estimate in column.l1["policy"].dims.values()]
     assert dims == pytest.approx(expected.mean(dim=0).tolist(), rel=1e-5)
 
 
@@ -120,8 +120,8 @@ def test_a_policy_that_knows_the_frames_by_heart(by_heart: Path, root: Path) -> 
     # levels over [-1, 1] of the dataset's range: an action is at most half a distance of two levels off
     stats: Any = LeRobotDatasetMetadata(REPO_ID, root=root).stats
     half_bins = (stats["action"]["max"] - stats["action"]["min"]) / (NUM_BINS - 1) / 2
-    for of, half_bin in zip(column.l1["policy"].dims.values(), half_bins, strict=True):
-        assert of.mean <= half_bin
+    for estimate, half_bin in zip(column.l1["policy"].dims.values(), half_bins, strict=True):
+        assert estimate.mean <= half_bin
     assert column.l1["policy"].all.mean < 0.3 * column.l1["mean"].all.mean
 
 
@@ -136,7 +136,7 @@ def test_batches_do_not_matter_and_the_json_holds_it_all(
         assert main(["checkpoint", "offline-metrics", *flags, *more]) == 0
         figures.append(json.loads(path.read_text()))
     table = capsys.readouterr().out
-    one, five = (of["columns"] for of in figures)
+    one, five = (written["columns"] for written in figures)
     assert one["validation"]["episodes"] == [2, 3, 4]
     for name in ("train", "validation"):
         assert one[name]["num_frames_measured"] == 8
@@ -156,7 +156,7 @@ def test_batches_do_not_matter_and_the_json_holds_it_all(
 def numbers(value: Any) -> list[float]:
     """Return all numbers of nested dicts and lists."""
     if isinstance(value, dict | list):
-        return [x for of in (value.values() if isinstance(value, dict) else value) for x in numbers(of)]
+        return [x for item in (value.values() if isinstance(value, dict) else value) for x in numbers(item)]
     return [] if value is None else [value]
 
 

@@ -56,10 +56,10 @@ def loaded(checkpoint: Path, **flags: Any) -> PreTrainedPolicy:
     return make_policy(config, env_cfg=ENV)
 
 
-def identity(of: PreTrainedPolicy) -> PolicyIdentity:
+def identity(policy: PreTrainedPolicy) -> PolicyIdentity:
     """Return what a record says while this policy, which the process holds, acts."""
-    assert acting_policy() is of
-    return identity_of(of)
+    assert acting_policy() is policy
+    return identity_of(policy)
 
 
 def sha256(path: Path) -> str:

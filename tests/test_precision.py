@@ -22,7 +22,7 @@ def gradients(policy_type: str, **options: Any) -> dict[str, Tensor]:
     policy = cases.make_policy(crop_fraction=1.0, dtype="bfloat16", **options).train()
     policy.generator.manual_seed(0)
     policy(cases.make_batch(policy, 2))[0].backward()
-    return {name: of.grad for name, of in policy.named_parameters() if of.grad is not None}
+    return {name: p.grad for name, p in policy.named_parameters() if p.grad is not None}
 
 
 def test_checkpointing_in_bfloat16_changes_no_gradient(policy_type: str) -> None:

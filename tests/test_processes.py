@@ -72,14 +72,14 @@ def weights(policy_type: str, output_dir: Path) -> dict[str, torch.Tensor]:
 
 
 def check_trained_as_one(
-    policy_type: str, losses: list[float], of: Path, stock_cli: Callable[..., None], dataset: Path
+    policy_type: str, losses: list[float], folder: Path, stock_cli: Callable[..., None], dataset: Path
 ) -> None:
     """Check losses and weights against one process with a batch as large as theirs together."""
     with seen_losses() as in_one, draws_by_sample():
         together = BATCH_SIZE * NUM_PROCESSES
-        stock_cli("lerobot-train", *flags(policy_type, dataset, together, f"{of}/one"))
+        stock_cli("lerobot-train", *flags(policy_type, dataset, together, f"{folder}/one"))
     torch.testing.assert_close(losses, in_one, rtol=1e-5, atol=0)
-    ours, theirs = (weights(policy_type, of / name) for name in ("process0", "one"))
+    ours, theirs = (weights(policy_type, folder / name) for name in ("process0", "one"))
     # steps of Adam went 1e-3 each; it makes some of the sign of a gradient that is nearly 0
     assert max(float((ours[name] - theirs[name]).abs().mean()) for name in ours) < 1e-5
 
@@ -119,14 +119,14 @@ def test_two_processes_train_what_one_does(
 def test_going_on_is_exact_and_only_the_first_process_writes(
     policy_type: str, two: Callable[[str], tuple[Path, Seen]]
 ) -> None:
-    of, seen = two(policy_type)
+    folder, seen = two(policy_type)
     for losses in seen.losses:
         assert losses[1] == losses[0][SAVE_FREQ:]
-    resumed, whole = (weights(policy_type, of / name) for name in ("resumed0", "process0"))
+    resumed, whole = (weights(policy_type, folder / name) for name in ("resumed0", "process0"))
     torch.testing.assert_close(resumed, whole, rtol=0, atol=0)
     # LeRobot 0.6.2 makes the folders in every process
     assert not [
-        path for name in ("process1", "resumed1") for path in (of / name).rglob("*") if path.is_file()
+        path for name in ("process1", "resumed1") for path in (folder / name).rglob("*") if path.is_file()
     ]
 
 

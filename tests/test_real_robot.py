@@ -190,7 +190,9 @@ def test_with_real_time_chunking_each_chunk_goes_on_from_the_last(
             assert call.left_over is not None and len(call.left_over) > CHUNK
             assert torch.equal(left_KD, calls[i - 1].chunk[0, CHUNK - len(left_KD) :])
             firm = min(max(call.delay, 1), len(left_KD))
-            distances = [(of[0, :firm] - left_KD[:firm]).abs().mean() for of in (call.chunk, free_1KD)]
+            distances = [
+                (chunk_1KD[0, :firm] - left_KD[:firm]).abs().mean() for chunk_1KD in (call.chunk, free_1KD)
+            ]
             assert distances[0] < 0.3 * distances[1]
             num_guided += 1
         else:  # the first one, and where a slow machine left nothing

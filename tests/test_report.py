@@ -63,11 +63,11 @@ def test_rates_and_costs_are_those_of_the_lines(rows: Rows, written: Path) -> No
         assert [row[0] for row in table["rows"]] == ["none", "camera:2", "camera:4"]
         nominal = {row["spec"]["seed"]: row["is_success"] for row in recount(rows, policy, "none")}
         for condition, success, n, *cost in table["rows"]:
-            of = recount(rows, policy, condition)
-            assert (success["successes"], success["n"], n) == (sum(r["is_success"] for r in of), 12, 12)
+            episodes = recount(rows, policy, condition)
+            assert (success["successes"], success["n"], n) == (sum(r["is_success"] for r in episodes), 12, 12)
             if condition != "none":
-                lost = sum(nominal[r["spec"]["seed"]] and not r["is_success"] for r in of)
-                won = sum(r["is_success"] and not nominal[r["spec"]["seed"]] for r in of)
+                lost = sum(nominal[r["spec"]["seed"]] and not r["is_success"] for r in episodes)
+                won = sum(r["is_success"] and not nominal[r["spec"]["seed"]] for r in episodes)
                 assert (cost[0]["only_first"], cost[0]["only_second"]) == (lost, won)
                 assert cost[0]["difference"] == pytest.approx((won - lost) / 12)
     with (written / "r.csv").open() as file:
@@ -80,10 +80,12 @@ def test_failures_levels_and_the_board_are_those_of_the_lines(rows: Rows, writte
     for table, policy in zip(tables(written, "Why episodes failed"), ("act", "fdvla"), strict=True):
         names = table["header"][2:-2]
         for condition, _, *counts, right, there in table["rows"]:
-            of = recount(rows, policy, condition)
-            classes = Counter(row["failure"] for row in of)
+            episodes = recount(rows, policy, condition)
+            classes = Counter(row["failure"] for row in episodes)
             assert dict(zip(names, counts, strict=True)) == {name: classes[name] for name in names}
-            put_down = [row for row in of if row["failure"] in (None, "imprecise", "wrong_intersection")]
+            put_down = [
+                row for row in episodes if row["failure"] in (None, "imprecise", "wrong_intersection")
+            ]
             grounded = [row for row in put_down if row["nearest_intersection"] == row["target"]]
             assert (right["successes"], right["n"]) == (len(grounded), len(put_down))
             assert there["n"] == len(grounded)
@@ -178,9 +180,9 @@ def test_without_an_episode_there_is_no_report(tmp_path: Path, capsys: pytest.Ca
 def test_axes_are_ranked_by_what_a_level_costs(rows: Rows, written: Path) -> None:
     for table, policy in zip(tables(written, "Sensitivity to an axis"), ("act", "fdvla"), strict=True):
         ((axis, found, share),) = table["rows"]
-        of = [row for row in rows if row["policy"]["type"] == policy]
-        levels = [row["levels"].get("camera", 0) for row in of]
-        expected = linregress(levels, [float(row["is_success"]) for row in of])[0]
+        episodes = [row for row in rows if row["policy"]["type"] == policy]
+        levels = [row["levels"].get("camera", 0) for row in episodes]
+        expected = linregress(levels, [float(row["is_success"]) for row in episodes])[0]
         assert (axis, share) == ("camera", "") and found["per_level"] == pytest.approx(expected)
 
 

@@ -84,8 +84,8 @@ def perturbed(failures: Mapping[str, Sequence[str | None]], policy: PolicyIdenti
     """An episode for each seed from 0 on, under each condition."""
     return [
         values(seed, failure, policy=policy, spec={"perturbations": condition})
-        for condition, of in failures.items()
-        for seed, failure in enumerate(of)
+        for condition, outcomes in failures.items()
+        for seed, failure in enumerate(outcomes)
     ]
 
 
@@ -235,7 +235,10 @@ def test_the_efficiency_table_equals_a_recount(report: Callable[..., dict[str, A
 
 
 def test_two_devices_are_two_lines(report: Callable[..., dict[str, Any]]) -> None:
-    rows = [values(seed, inference=inference(seed, device=of, tokens=7.0)) for seed, of in enumerate("aabb")]
+    rows = [
+        values(seed, inference=inference(seed, device=device, tokens=7.0))
+        for seed, device in enumerate("aabb")
+    ]
     (table,) = report(rows)["Efficiency"]["tables"]
     assert [(row["device"], row["p50, ms"]) for row in columns(table)] == [("a", 10.5), ("b", 12.5)]
     assert [row["tokens"] for row in columns(table)] == [7, 7]

@@ -53,7 +53,7 @@ def test_what_records_of_earlier_releases_lack_are_fields(record_type: type[Reco
 def test_fields_that_earlier_releases_did_not_write_are_checked_where_they_are(name: str, value: Any) -> None:
     with pytest.raises(ValueError, match=f"{name}={json.dumps(value)} is impossible"):
         read(values(0) | {name: value})
-    assert getattr(read({key: of for key, of in values(0).items() if key != name}), name) is None
+    assert getattr(read({key: kept for key, kept in values(0).items() if key != name}), name) is None
 
 
 def test_a_protocol_version_is_of_one_environment() -> None:

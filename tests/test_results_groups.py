@@ -186,8 +186,8 @@ def test_a_perturbed_arm_is_compared_with_the_same_episodes_unperturbed(
     outcomes = {"none": "++++++-", "camera:3": "-----++", "all:5": "++"}  # by seed
     lines = [
         row(seed, None if outcome == "+" else "dropped", spec={"perturbations": condition})
-        for condition, of in outcomes.items()
-        for seed, outcome in enumerate(of)
+        for condition, marks in outcomes.items()
+        for seed, outcome in enumerate(marks)
     ]
     lines.append(row(99, spec={"perturbations": "all:5"}))  # has no pair
     output = printed(path, "".join(lines), capsys)

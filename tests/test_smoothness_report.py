@@ -22,24 +22,24 @@ NAMES = ["x", "y", "Gripper.pos"]
 
 
 def executed(name: str, *episodes: np.ndarray, fps: float = 10) -> ActionLog:
-    return ActionLog(name, fps, {str(i): of for i, of in enumerate(episodes)}, True)
+    return ActionLog(name, fps, {str(i): actions for i, actions in enumerate(episodes)}, True)
 
 
 def test_a_row_by_hand() -> None:
-    of = executed("a", PARABOLA, 3 * PARABOLA[:4], PARABOLA[:3])
-    units = make_units(of, ["x"], None, per_second=False)
-    row = measure_row(of, units)
+    log = executed("a", PARABOLA, 3 * PARABOLA[:4], PARABOLA[:3])
+    units = make_units(log, ["x"], None, per_second=False)
+    row = measure_row(log, units)
     std = np.concatenate([PARABOLA, 3 * PARABOLA[:4], PARABOLA[:3]]).std()
-    assert {key: of.mean for key, of in row.measures.items()} == pytest.approx(
+    assert {key: estimate.mean for key, estimate in row.measures.items()} == pytest.approx(
         {"J2": (3 * 1 + 2 * 3) / 5, "J3": 0, "J2, normalised": 9 / 5 / std, "J3, normalised": 0}
     )
     assert (row.num_skipped, row.num_actions) == (1, {"0": 5, "1": 4})
-    assert [of["J2"] for of in row.episodes.values()] == [1, 3]
+    assert [measures["J2"] for measures in row.episodes.values()] == [1, 3]
 
 
 def test_the_printed_row(capsys: pytest.CaptureFixture[str]) -> None:
-    of = executed("a", PARABOLA, 3 * PARABOLA[:4], PARABOLA[:3])
-    print_rows({"a": measure_row(of, make_units(of, ["x"], [], per_second=False))})
+    log = executed("a", PARABOLA, 3 * PARABOLA[:4], PARABOLA[:3])
+    print_rows({"a": measure_row(log, make_units(log, ["x"], [], per_second=False))})
     header, row, note = capsys.readouterr().out.splitlines()
     assert header.split() == ["episodes", "actions", *" ".join(ORDERS).split()]
     assert row.split()[:3] == ["a", "2", "9"]
@@ -47,32 +47,36 @@ def test_the_printed_row(capsys: pytest.CaptureFixture[str]) -> None:
 
 
 def test_per_second() -> None:
-    of = executed("a", PARABOLA**2, fps=20)
-    step, second = (measure_row(of, make_units(of, ["x"], None, per_second)) for per_second in (False, True))
+    log = executed("a", PARABOLA**2, fps=20)
+    step, second = (
+        measure_row(log, make_units(log, ["x"], None, per_second)) for per_second in (False, True)
+    )
     for key, order in ORDERS.items():
         assert second.measures[key].mean == pytest.approx(20**order * step.measures[key].mean)
 
 
 def test_grippers_are_left_out_by_name() -> None:
     rng = np.random.default_rng(0)
-    of = executed("a", rng.normal(size=(9, 3)))
-    assert make_units(of, NAMES, None, False).exclude == [2]
-    assert make_units(of, NAMES, [], False).exclude == []
-    assert make_units(of, NAMES, ["y", "x"], False).exclude == [1, 0]
-    without = executed("a", of.episodes["0"][:, :2])
+    log = executed("a", rng.normal(size=(9, 3)))
+    assert make_units(log, NAMES, None, False).exclude == [2]
+    assert make_units(log, NAMES, [], False).exclude == []
+    assert make_units(log, NAMES, ["y", "x"], False).exclude == [1, 0]
+    without = executed("a", log.episodes["0"][:, :2])
     expected = measure_row(without, make_units(without, NAMES[:2], None, False))
-    assert measure_row(of, make_units(of, NAMES, None, False)) == expected
+    assert measure_row(log, make_units(log, NAMES, None, False)) == expected
 
 
 def test_conditions_of_one_seed_are_drawn_together() -> None:
     rng = np.random.default_rng(0)
     rough = [scale * rng.normal(size=(30, 1)) for scale in (1, 5, 20)]
-    alone = ActionLog("alone", 10, {f"none, task 0, seed {i}": of for i, of in enumerate(rough)}, True)
+    alone = ActionLog(
+        "alone", 10, {f"none, task 0, seed {i}": actions for i, actions in enumerate(rough)}, True
+    )
     groups = ("none", "light-3", "all-5")
-    thrice = {f"{group}, task 0, seed {i}": of for group in groups for i, of in enumerate(rough)}
+    thrice = {f"{group}, task 0, seed {i}": actions for group in groups for i, actions in enumerate(rough)}
     units = make_units(alone, ["x"], None, False)
-    rows = {of.name: measure_row(of, units) for of in (alone, ActionLog("thrice", 10, thrice, True))}
-    halved = {name: of / (1 + i % 3) for i, (name, of) in enumerate(thrice.items())}
+    rows = {log.name: measure_row(log, units) for log in (alone, ActionLog("thrice", 10, thrice, True))}
+    halved = {name: actions / (1 + i % 3) for i, (name, actions) in enumerate(thrice.items())}
     rows["halved"] = measure_row(ActionLog("halved", 10, halved, True), units)
     for key in ORDERS:
         first, second = (rows[name].measures[key] for name in ("alone", "thrice"))
@@ -85,18 +89,18 @@ def test_differences_are_those_of_pairs() -> None:
     rng = np.random.default_rng(0)
     rough = [scale * rng.normal(size=(30, 2)) for scale in (1, 5, 20, 100)]  # episodes that differ much
     first = executed("first", *rough, rough[0])
-    second = executed("second", *(1.1 * of for of in rough))
+    second = executed("second", *(1.1 * actions for actions in rough))
     units = make_units(first, ["x", "y"], None, False)
-    rows = {of.name: measure_row(of, units) for of in (first, second)}
+    rows = {log.name: measure_row(log, units) for log in (first, second)}
     difference = measure_difference("first", "second", rows)
     assert difference.num_pairs == 4
     expected = measure_row(executed("of pairs", *rough), units)
-    for key, of in difference.measures.items():
-        assert of.mean == pytest.approx(0.1 * expected.measures[key].mean)
+    for key, estimate in difference.measures.items():
+        assert estimate.mean == pytest.approx(0.1 * expected.measures[key].mean)
         # every pair says the same, so the interval is that of the mean, a tenth as wide
         low, high = expected.measures[key].low, expected.measures[key].high
         assert low is not None and high is not None
-        assert (of.low, of.high) == pytest.approx((0.1 * low, 0.1 * high))
+        assert (estimate.low, estimate.high) == pytest.approx((0.1 * low, 0.1 * high))
     rows["third"] = measure_row(ActionLog("third", 10, {"other": rough[0]}, True), units)
     with pytest.raises(ValueError, match="first and third have no episode of the same group, task and seed"):
         measure_difference("first", "third", rows)
@@ -138,9 +142,11 @@ def test_people_and_policies_side_by_side(
     assert figures["std"] == pytest.approx(std)
     [(name, difference)] = figures["differences"].items()
     assert (name, difference["from"], difference["num_pairs"]) == (str(logs[1]), str(logs[0]), 3)
-    for key, of in difference["measures"].items():
-        assert of["mean"] == pytest.approx(seams["measures"][key]["mean"] - smooth["measures"][key]["mean"])
-        assert 0 < of["low"] < of["mean"] < of["high"]
+    for key, estimate in difference["measures"].items():
+        assert estimate["mean"] == pytest.approx(
+            seams["measures"][key]["mean"] - smooth["measures"][key]["mean"]
+        )
+        assert 0 < estimate["low"] < estimate["mean"] < estimate["high"]
 
 
 def test_rates_that_differ_are_told(
@@ -204,6 +210,6 @@ def test_an_unknown_flag_shows_the_commands_own_usage(capsys: pytest.CaptureFixt
 
 
 def test_a_dim_that_never_changes_has_no_unit() -> None:
-    of = executed("a", np.hstack([PARABOLA, np.ones((5, 1)), PARABOLA]))
+    log = executed("a", np.hstack([PARABOLA, np.ones((5, 1)), PARABOLA]))
     with pytest.raises(ValueError, match=r"'y' never changes.*leave it out with --exclude=Gripper.pos,y"):
-        make_units(of, NAMES, None, False)
+        make_units(log, NAMES, None, False)

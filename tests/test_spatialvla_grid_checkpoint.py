@@ -218,12 +218,14 @@ def test_what_seven_dims_are_is_told_by_names_or_a_flag_and_kept_in_the_checkpoi
 def test_a_datasets_names_make_the_groups(meta: LeRobotDatasetMetadata) -> None:
     renamed = copy.deepcopy(meta)
     renamed.info.features[ACTION]["names"] = ["base", "shoulder", "elbow", "gripper"]
-    assert [len(of.dims) for of in SpatialvlaGridPolicy(make_config(), dataset_meta=meta).grids.groups] == [
+    assert [
+        len(group.dims) for group in SpatialvlaGridPolicy(make_config(), dataset_meta=meta).grids.groups
+    ] == [
         3,
         1,
     ]
     policy = SpatialvlaGridPolicy(make_config(), dataset_meta=renamed)
-    assert [len(of.dims) for of in policy.grids.groups] == [1] * 4
+    assert [len(group.dims) for group in policy.grids.groups] == [1] * 4
 
 
 def test_fine_tuning_may_keep_the_grids(meta: LeRobotDatasetMetadata, tmp_path: Path) -> None:

@@ -116,7 +116,7 @@ def test_adapters_are_where_the_original_has_them(base: Path, meta: LeRobotDatas
         for name, module in policy.named_modules()
         if isinstance(module, torch.nn.Linear)
         and name.startswith((*parts, "backbone.vlm.model.multi_modal_projector", "ego3d"))
-        and name.endswith(tuple(f".{of}" for of in theirs.split()))
+        and name.endswith(tuple(f".{suffix}" for suffix in theirs.split()))
     }
     found = with_adapters()
     assert found == expected and len(expected) == 2 * 7 + 2 * 6 + 1 + 2

@@ -77,7 +77,7 @@ def scenes(suite: str, task_id: int | None, seeds: Iterable[int]) -> Iterator[tu
 def test_a_reader_of_scene_and_sentence_acts_as_its_label(suite: str) -> None:
     rng = np.random.default_rng(0)
     numbers_held, numbers_made = set(), set()
-    for number, task_id in enumerate(task_id for of, task_id in TASKS if of == suite):
+    for number, task_id in enumerate(task_id for task_suite, task_id in TASKS if task_suite == suite):
         for env, observation in scenes(suite, task_id, range(8 * number, 8 * number + 4)):
             moment = Moment(0, env.task_description, observation, {}, None)
             episode = find_suite(suite).sample(replace(env._spec, seed=env._run.episode.spec.seed))

@@ -209,7 +209,8 @@ def test_actions_alone_come_out_whatever_the_decoding() -> None:
     torch.testing.assert_close(ensemble.select_action(batch), (chunk[:, 0] + chunk[:, 1]) / 2)
     for row in range(3):
         one: Any = {
-            key: of[row : row + 1] if isinstance(of, Tensor | list) else of for key, of in batch.items()
+            key: value[row : row + 1] if isinstance(value, Tensor | list) else value
+            for key, value in batch.items()
         }
         assert torch.equal(policy.predict_action_chunk(one)[0], chunk[row])
 

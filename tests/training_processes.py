@@ -39,7 +39,10 @@ class Seen:
 
     def mean_losses(self, training: int) -> list[float]:
         """Average the losses over the processes, as LeRobot logs them."""
-        return [sum(of) / len(of) for of in zip(*(losses[training] for losses in self.losses), strict=True)]
+        return [
+            sum(step_losses) / len(step_losses)
+            for step_losses in zip(*(losses[training] for losses in self.losses), strict=True)
+        ]
 
 
 def in_processes(trainings: Sequence[Training], folder: Path) -> Seen:

@@ -56,8 +56,8 @@ def fit_cuts(actions_ND: Tensor, rest_D: np.ndarray, settings: GridSettings) -> 
             cuts.append(cut(values[:, 0], -1, 1, 2, "uniform", settings.min_sigma))
         else:
             cuts += [
-                cut(of, -1, 1, bins, settings.distribution, settings.min_sigma)
-                for of, bins in zip(values.T, group.bins, strict=True)
+                cut(values_N, -1, 1, bins, settings.distribution, settings.min_sigma)
+                for values_N, bins in zip(values.T, group.bins, strict=True)
             ]
     return cuts
 

@@ -28,15 +28,15 @@ def coordinate_names(grids: ActionGrids, dim_names: Sequence[str]) -> list[str]:
 
 def coordinate_edges(grids: ActionGrids) -> list[np.ndarray]:
     """(bins + 1,) of each coordinate of all groups."""
-    return [of.numpy() for i in range(len(grids.groups)) for of in grids.group_edges(i)]
+    return [edges.numpy() for i in range(len(grids.groups)) for edges in grids.group_edges(i)]
 
 
 def edges_text(grids: ActionGrids, dim_names: Sequence[str]) -> str:
     """Lines of edges, coordinate by coordinate."""
     labels = coordinate_names(grids, dim_names)
     lines = [
-        f"{label}: {' '.join(f'{edge:.4f}' for edge in of)}"
-        for label, of in zip(labels, coordinate_edges(grids), strict=True)
+        f"{label}: {' '.join(f'{edge:.4f}' for edge in edges)}"
+        for label, edges in zip(labels, coordinate_edges(grids), strict=True)
     ]
     return "\n".join(textwrap.fill(line, LINE_WIDTH, subsequent_indent="  ") for line in lines)
 

@@ -20,7 +20,9 @@ def interpolate_rows(old: ActionGrids, new: ActionGrids, rows: Tensor) -> Tensor
     Raises:
         ValueError: the groups differ in dims or transform, or there are not as many rows as old cells.
     """
-    if [(of.dims, of.transform) for of in old.groups] != [(of.dims, of.transform) for of in new.groups]:
+    if [(group.dims, group.transform) for group in old.groups] != [
+        (group.dims, group.transform) for group in new.groups
+    ]:
         raise ValueError(f"{FLAG}: the checkpoint's groups are {list(old.groups)}, not {list(new.groups)}")
     if len(rows) != old.num_tokens:
         raise ValueError(f"the old grid has {old.num_tokens} cells, but there are {len(rows)} rows")
@@ -77,5 +79,5 @@ def _move_axis(lattice: Tensor, axis: int, old: Tensor, new: Tensor) -> Tensor:
     share = ((new - old[lower]) / (old[upper] - old[lower])).nan_to_num(0, 0, 0).clamp(0, 1)
     shape = [-1 if i == axis else 1 for i in range(lattice.ndim)]
     share = share.to(lattice).view(shape)
-    of_lower, of_upper = (lattice.index_select(axis, of.to(lattice.device)) for of in (lower, upper))
+    of_lower, of_upper = (lattice.index_select(axis, index.to(lattice.device)) for index in (lower, upper))
     return (1 - share) * of_lower + share * of_upper

@@ -105,8 +105,8 @@ def _named_layout(num_dims: int, names: list[str]) -> str:
         return "joints"
     words = [re.findall("[a-z]+", name.lower()) for name in names]
     is_position = len(words) == num_dims and all(
-        not {axis, f"d{axis}", f"delta{axis}"}.isdisjoint(of)
-        for axis, of in zip("xyz", words[:3], strict=True)
+        not {axis, f"d{axis}", f"delta{axis}"}.isdisjoint(name_words)
+        for axis, name_words in zip("xyz", words[:3], strict=True)
     )
     if is_position and "grip" in names[-1].lower():
         return "pose"

@@ -110,7 +110,9 @@ class ActionGrids(nn.Module):
             values = self.centroids[self.offsets[index] + cells, : len(rest)]
         else:
             points = self._midpoints() if point == "mid" else self.means
-            values = torch.stack([row[of] for row, of in zip(points[rows], bins, strict=True)], dim=-1)
+            values = torch.stack(
+                [row[indices] for row, indices in zip(points[rows], bins, strict=True)], dim=-1
+            )
             if group.transform == "polar":
                 values = rest + from_polar(values)
         if self._has_zero_bin(group):
@@ -134,8 +136,8 @@ class ActionGrids(nn.Module):
         """(coordinates of a group, N) -> (N,)."""
         group = self.groups[index]
         cells = torch.zeros_like(bins[0])
-        for of, num_bins in zip(bins, group.bins, strict=True):
-            cells = cells * num_bins + of
+        for indices, num_bins in zip(bins, group.bins, strict=True):
+            cells = cells * num_bins + indices
         return torch.where(bins[-1] == 0, 0, cells) if self._has_zero_bin(group) else cells
 
     def _has_zero_bin(self, group: ActionGroup) -> bool:
@@ -186,8 +188,8 @@ class ActionGrids(nn.Module):
         grids = cls(settings, 7)
         lows, highs = [0, -math.pi, 0, -1, -1, -1], [math.pi, math.pi, math.sqrt(3), 1, 1, 1]
         cuts = [
-            gaussian_cut(of["mu"], max(of["sigma"], min_sigma), low, high, num_bins)
-            for of, low, high, num_bins in zip(
+            gaussian_cut(gaussian["mu"], max(gaussian["sigma"], min_sigma), low, high, num_bins)
+            for gaussian, low, high, num_bins in zip(
                 (parameters[key] for key in PUBLISHED_KEYS), lows, highs, grids.bins, strict=False
             )
         ]
@@ -198,9 +200,9 @@ class ActionGrids(nn.Module):
     def from_edges(cls, edges: Sequence[Tensor], settings: GridSettings, num_dims: int) -> Self:
         """Build a grid from nothing but edges, (E + 1,) for each coordinate: means are the bins' middles."""
         cuts = []
-        for of in edges:
-            low, high = float(of[0]), float(of[-1])
-            cuts.append(Cut(of.double(), (of[:-1] + of[1:]).double() / 2, (low + high) / 2, high - low))
+        for row in edges:
+            low, high = float(row[0]), float(row[-1])
+            cuts.append(Cut(row.double(), (row[:-1] + row[1:]).double() / 2, (low + high) / 2, high - low))
         grids = cls(settings, num_dims)
         grids._set(cuts, np.zeros(num_dims))
         return grids
@@ -209,7 +211,7 @@ class ActionGrids(nn.Module):
         """(bins + 1,) float64 on the CPU for each coordinate of one group."""
         rows = self._rows[index]
         edges = self.edges[rows].double().cpu()
-        return [of[: bins + 1] for of, bins in zip(edges, self.bins[rows], strict=True)]
+        return [row[: bins + 1] for row, bins in zip(edges, self.bins[rows], strict=True)]
 
     def to_dict(self) -> dict[str, Any]:
         """Return the grid as JSON values, to the bit; centroids, which are many, only if decoded to."""
@@ -244,16 +246,16 @@ class ActionGrids(nn.Module):
         """Set the edges, as they are in float32, and what follows from them."""
         require_finite(torch.as_tensor(rest_D), "the action of a grid that means no motion")
         self.rest.copy_(torch.from_numpy(rest_D))
-        for i, (of, bins) in enumerate(zip(cuts, self.bins, strict=True)):
-            if of.edges.shape != (bins + 1,) or not (of.edges.diff() > 0).all():
+        for i, (cut, bins) in enumerate(zip(cuts, self.bins, strict=True)):
+            if cut.edges.shape != (bins + 1,) or not (cut.edges.diff() > 0).all():
                 raise ValueError(
-                    f"coordinate {i} of the grid needs {bins + 1} increasing edges: {of.edges.tolist()}"
+                    f"coordinate {i} of the grid needs {bins + 1} increasing edges: {cut.edges.tolist()}"
                 )
-            fitted = torch.cat([of.edges, of.means, torch.tensor([of.mean, of.std])])
+            fitted = torch.cat([cut.edges, cut.means, torch.tensor([cut.mean, cut.std])])
             require_finite(fitted, f"coordinate {i} of the grid (edges, means, mean, standard deviation)")
-            self.edges[i, : bins + 1] = of.edges
-            self.means[i, :bins] = of.means
-            self.gaussians[i] = torch.tensor([of.mean, of.std])
+            self.edges[i, : bins + 1] = cut.edges
+            self.means[i, :bins] = cut.means
+            self.gaussians[i] = torch.tensor([cut.mean, cut.std])
         self._set_centroids(torch.zeros(0, self.num_dims, dtype=torch.float64))
 
     def _set_centroids(self, actions_ND: Tensor) -> None:

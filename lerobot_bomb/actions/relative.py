@@ -139,7 +139,7 @@ def _require_tracking(
     """Raise unless the action varies less around the state, or the state that follows, than by itself."""
     following_N = np.minimum(np.arange(len(states_N)) + 1, episode_ends_N - 1)
     spread = float(actions_N.std())
-    distance = min(float((actions_N - of).std()) for of in (states_N, states_N[following_N]))
+    distance = min(float((actions_N - followed_N).std()) for followed_N in (states_N, states_N[following_N]))
     if not distance < spread:
         raise ValueError(
             f"--policy.relative_actions=true: action dimension {dim} does not follow state dimension "

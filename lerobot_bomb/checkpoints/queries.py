@@ -96,7 +96,9 @@ def _queue_lengths(policy: PreTrainedPolicy) -> dict[tuple[str, ...], int]:
         if isinstance(value, deque):
             lengths[(name,)] = len(value)
         elif isinstance(value, dict):
-            lengths |= {(name, str(key)): len(of) for key, of in value.items() if isinstance(of, deque)}
+            lengths |= {
+                (name, str(key)): len(queue) for key, queue in value.items() if isinstance(queue, deque)
+            }
     return lengths
 
 

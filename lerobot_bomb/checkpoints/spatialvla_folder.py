@@ -242,10 +242,10 @@ def _intrinsics(
     cameras: dict[str, Any], statistics: str, camera: str, side: int
 ) -> dict[str, list[list[float]]]:
     """Return the camera's intrinsics from the folder, for images of ``side``; {}: the default ones."""
-    of = cameras.get(statistics) or cameras["default"]
+    calibration = cameras.get(statistics) or cameras["default"]
     # the original counts from the image's edge, the flag from the first pixel's centre
-    K = torch.tensor([of["intrinsic"]], dtype=torch.float32)
-    K = resize_intrinsics(K, (of["height"], of["width"]), (side, side))
+    K = torch.tensor([calibration["intrinsic"]], dtype=torch.float32)
+    K = resize_intrinsics(K, (calibration["height"], calibration["width"]), (side, side))
     if torch.allclose(K, default_intrinsics(side, side)):
         return {}
     K[:, :2, 2] -= 0.5

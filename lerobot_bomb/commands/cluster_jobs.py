@@ -56,12 +56,12 @@ def shard_of(args: argparse.Namespace) -> tuple[int, int] | None:
         raise ValueError(f"--shard: {error}") from None
 
 
-def check_num_jobs(args: argparse.Namespace, most: int, of: str) -> None:
+def check_num_jobs(args: argparse.Namespace, most: int, parts: str) -> None:
     """Raise a ValueError if more jobs are wanted than there are parts."""
     for name in ("slurm", SUBMITIT):
         number = getattr(args, name)
         if number is not None and not 1 <= number <= most:
-            raise ValueError(f"--{name}={number} must be from 1 to the number of {of}, {most}")
+            raise ValueError(f"--{name}={number} must be from 1 to the number of {parts}, {most}")
 
 
 def write_job_array(command: Sequence[str], num_jobs: int, script: Path) -> None:

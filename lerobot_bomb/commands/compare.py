@@ -45,7 +45,7 @@ def _two_policies(args: argparse.Namespace) -> tuple[list[Record], list[Record]]
         return first, second
     both = _by_policy(read_undamaged(args.a).records, args.policies)
     if len(both) != 2:
-        names = "; ".join(of[0].describe_policy() for of in both)
+        names = "; ".join(records[0].describe_policy() for records in both)
         is_alone = len(both) == 1 and not args.policies
         remedy = "name the file of a second one" if is_alone else "choose two with --policies=A,B"
         raise ValueError(f"{args.a}: two policies are compared, not {len(both)} ({names}); {remedy}")
@@ -63,7 +63,7 @@ def _by_policy(records: list[Record], names: Sequence[str]) -> list[list[Record]
     by_key: dict[str, list[Record]] = {}
     for record in records:
         by_key.setdefault(policy_key(record), []).append(record)
-    described = {key: of[0].describe_policy() for key, of in by_key.items()}
+    described = {key: policy_records[0].describe_policy() for key, policy_records in by_key.items()}
     if not names:
         return list(by_key.values())
     chosen = []

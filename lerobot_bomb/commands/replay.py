@@ -67,9 +67,9 @@ def run(args: argparse.Namespace) -> int:
     check_new(paths)
     results = write_episodes(runs, name, *paths)
     for (label, run), result in zip(runs.items(), results, strict=True):
-        of, values = run.viewed, cast("Any", result)
-        print_lines(f"{label} ({of.spec.perturbations}): {values.instruction}")
-        print(of.log.describe(result))
+        viewed, values = run.viewed, cast("Any", result)
+        print_lines(f"{label} ({viewed.spec.perturbations}): {values.instruction}")
+        print(viewed.log.describe(result))
     print(*paths, sep="\n")
     return _compare(record, results[0])
 

@@ -61,7 +61,7 @@ def run(args: argparse.Namespace) -> int:
             "std": units.std.tolist(),
             "per_second": units.per_second,
             "rows": {name: asdict(row) for name, row in rows.items()},
-            "differences": {name: {"from": first, **asdict(of)} for name, of in differences.items()},
+            "differences": {name: {"from": first, **asdict(change)} for name, change in differences.items()},
         }
         with written_whole(args.json) as (path,):
             path.write_text(json.dumps(figures, indent=1, allow_nan=False) + "\n")

@@ -128,7 +128,7 @@ def read_progress(path: Path) -> Progress:
 
 
 def _of_progress(values: dict[str, Any]) -> dict[str, Any]:
-    return {of.name: values[of.name] for of in fields(Progress)}
+    return {each.name: values[each.name] for each in fields(Progress)}
 
 
 def write_json(path: Path, values: dict[str, Any]) -> None:

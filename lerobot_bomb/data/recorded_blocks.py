@@ -143,7 +143,9 @@ def describe_failures(failures: list[dict[str, Any]]) -> str:
     seeds: dict[str, list[str]] = {}
     for failure in failures:
         seeds.setdefault(failure["failure"], []).append(str(failure["seed"]))
-    classes = "; ".join(f"{len(of)} {name} (seeds {', '.join(of)})" for name, of in sorted(seeds.items()))
+    classes = "; ".join(
+        f"{len(numbers)} {name} (seeds {', '.join(numbers)})" for name, numbers in sorted(seeds.items())
+    )
     return f"{len(failures)} failed and were left out: {classes}"
 
 

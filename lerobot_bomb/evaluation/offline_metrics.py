@@ -80,7 +80,10 @@ def _measure(
     episode_R, dims = demonstrations.episode_index[rows_R], dim_names(dataset.features[ACTION])
     return (
         {key: estimate_mean(values_R, episode_R) for key, values_R in predictions.losses.items()},
-        {key: measure_l1(of, recorded_RTD, is_pad_RT, episode_R, dims) for key, of in chunks.items()},
+        {
+            key: measure_l1(chunks_RTD, recorded_RTD, is_pad_RT, episode_R, dims)
+            for key, chunks_RTD in chunks.items()
+        },
     )
 
 
@@ -105,7 +108,7 @@ def print_columns(columns: dict[str, Column]) -> None:
     print(f"\nL1 by step of the chunk, {list(columns)[-1]}")
     print_table(
         ["step", *l1],
-        [[str(step), *(f"{of.steps[step - 1].mean:.4g}" for of in l1.values())] for step in steps],
+        [[str(step), *(f"{errors.steps[step - 1].mean:.4g}" for errors in l1.values())] for step in steps],
     )
     print("\n[95 % bootstrap interval over episodes]; L1 of decoded actions, in the dataset's units")
 

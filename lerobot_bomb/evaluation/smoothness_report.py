@@ -93,10 +93,12 @@ def measure_row(executed: ActionLog, units: Units) -> SmoothnessRow:
     Raises:
         ValueError: no episode has the actions that a third difference takes.
     """
-    episodes = {name: of for name, of in executed.episodes.items() if len(of) >= MIN_ACTIONS}
+    episodes = {
+        name: actions_TD for name, actions_TD in executed.episodes.items() if len(actions_TD) >= MIN_ACTIONS
+    }
     if not episodes:
         raise ValueError(f"{executed.name}: no episode has {MIN_ACTIONS} actions")
-    num_actions = {name: len(of) for name, of in episodes.items()}
+    num_actions = {name: len(actions_TD) for name, actions_TD in episodes.items()}
     actions_RD = np.concatenate(list(episodes.values()))
     episode_R = np.repeat(np.arange(len(episodes)), list(num_actions.values()))
     places = {start: place for place, start in enumerate(dict.fromkeys(map(start_of, episodes)))}
@@ -108,7 +110,10 @@ def measure_row(executed: ActionLog, units: Units) -> SmoothnessRow:
         num_actions,
         _measures(actions_RD, episode_R, start_R, units, dt_s),
         {
-            name: {key: of.mean for key, of in _measures(actions_TD, zeros, zeros, units, dt_s).items()}
+            name: {
+                key: estimate.mean
+                for key, estimate in _measures(actions_TD, zeros, zeros, units, dt_s).items()
+            }
             for name, actions_TD in episodes.items()
             for zeros in [np.zeros(len(actions_TD))]
         },
@@ -162,5 +167,8 @@ def print_rows(rows: dict[str, SmoothnessRow]) -> None:
 def print_differences(first: str, differences: dict[str, Difference]) -> None:
     """Print a row per evaluation that was compared with the first."""
     print(f"\nDifference from {first} on the same episodes")
-    cells = [[name, str(of.num_pairs), *map(str, of.measures.values())] for name, of in differences.items()]
+    cells = [
+        [name, str(difference.num_pairs), *map(str, difference.measures.values())]
+        for name, difference in differences.items()
+    ]
     print_table(["", "pairs", *ORDERS], cells)

@@ -70,8 +70,8 @@ def _flags_of(config: Any, group: str) -> list[str]:
     return flags
 
 
-def _default(of: Field) -> Any:
-    value = of.default if of.default_factory is MISSING else of.default_factory()
+def _default(field: Field) -> Any:
+    value = field.default if field.default_factory is MISSING else field.default_factory()
     return None if value is MISSING else draccus.encode(value)
 
 

@@ -25,12 +25,12 @@ def rate[R: Record](
     return Cell(f"{100 * found.share:.0f} %{bounds}", value, found.share)
 
 
-def points(of: PairedComparison) -> list[Cell]:
+def points(compared: PairedComparison) -> list[Cell]:
     """'-12 [-20, -5]' per cent, the second rate minus the first; and its p-value."""
-    counts, (low, high) = of.counts, of.interval
+    counts, (low, high) = compared.counts, compared.interval
     value = {"difference": counts.difference, "low": low, "high": high, **vars(counts)}
     text = f"{100 * counts.difference:+.0f} [{100 * low:+.0f}, {100 * high:+.0f}]"
-    return [Cell(text, value), Cell(format_p(of.p_value).removeprefix("p = "), of.p_value)]
+    return [Cell(text, value), Cell(format_p(compared.p_value).removeprefix("p = "), compared.p_value)]
 
 
 def mean_cell(mean: Mean | None, form: str, shade: float | None = None) -> Cell:
@@ -41,6 +41,6 @@ def mean_cell(mean: Mean | None, form: str, shade: float | None = None) -> Cell:
     return Cell(f"{mean.value:{form}}{interval}", {"value": mean.value, "interval": mean.interval}, shade)
 
 
-def count(number: int, of: int) -> Cell:
+def count(number: int, total: int) -> Cell:
     """A number, coloured by its share; nothing of 0."""
-    return Cell(str(number) if number else "", number, number / of if of else 0.0)
+    return Cell(str(number) if number else "", number, number / total if total else 0.0)

@@ -41,7 +41,11 @@ TRACE_RANGE_M = 0.24  # either way from the board's centre
 def overview_section(outcome: str, moments: Sequence[ExplainedMoment], command: str) -> Section:
     """Write the section of instruction, outcome, and findings of each moment."""
     found = [
-        Table(each.title, QUESTIONS, [[Cell(of.question), Cell(of.answer)] for of in each.findings])
+        Table(
+            each.title,
+            QUESTIONS,
+            [[Cell(finding.question), Cell(finding.answer)] for finding in each.findings],
+        )
         for each in moments
     ]
     told = "\n".join([moments[0].snapshot.instruction, outcome])
@@ -118,13 +122,13 @@ def _mean_tables(moments: Sequence[ExplainedMoment]) -> Iterator[Table]:
     )
     # single words differ from one instruction to the next
     words = [{name: each.words[name] for name in each.words if name[0] != '"'} for each in explanations]
-    for title, of, effects in (
+    for title, column, effects in (
         ("Objects taken out of all images", "object", [each.objects.get(ALL, {}) for each in explanations]),
         ("Words left out of the attention", "words", words),
         ("Words changed", "what is changed", [each.others for each in explanations]),
     ):
         if found := means_of(effects):
-            yield _means(title, of, found, note)
+            yield _means(title, column, found, note)
     yield from mean_pointing(moments)
     if any(each.followings for each in moments):
         yield _mean_followings(moments)
@@ -151,7 +155,7 @@ def probes_section(probes: Sequence[LayerProbe]) -> Section:
     return Section("Where is the destination known?", [Table("Probes", header, rows, note)])
 
 
-def _means(title: str, of: str, means: Mapping[str, Mean], note: str) -> Table:
+def _means(title: str, column: str, means: Mapping[str, Mean], note: str) -> Table:
     largest = max((abs(mean.value) for mean in means.values()), default=0.0) or 1.0
     rows = [
         [
@@ -161,7 +165,7 @@ def _means(title: str, of: str, means: Mapping[str, Mean], note: str) -> Table:
         ]
         for name, mean in sorted(means.items(), key=lambda pair: -pair[1].value)
     ]
-    return Table(title, [of, "effect", "episodes"], rows, note)
+    return Table(title, [column, "effect", "episodes"], rows, note)
 
 
 def _mean_followings(moments: Sequence[ExplainedMoment]) -> Table:
@@ -174,13 +178,13 @@ def _mean_followings(moments: Sequence[ExplainedMoment]) -> Table:
     return Table("Do the next actions follow?", ["changed", *FOLLOWING_COLUMNS], rows, FOLLOWING_NOTE)
 
 
-def _effects(title: str, of: str, effects: Mapping[str, float], note: str) -> Table:
+def _effects(title: str, column: str, effects: Mapping[str, float], note: str) -> Table:
     largest = max((abs(effect) for effect in effects.values()), default=0.0) or 1.0
     rows = [
         [Cell(name), Cell(f"{effect:.4f}", effect, max(0.0, effect) / largest)]
         for name, effect in sorted(effects.items(), key=lambda pair: -pair[1])
     ]
-    return Table(title, [of, "effect"], rows, note)
+    return Table(title, [column, "effect"], rows, note)
 
 
 def _followings(followings: Mapping[str, Following]) -> Table:

@@ -50,7 +50,7 @@ def sample_failures(
 
     `files`: by path and line, those that the groups' records are from.
     """
-    places = {id(record): (path, line) for path, of in files.items() for line, record in of.items()}
+    places = {id(record): (path, line) for path, lines in files.items() for line, record in lines.items()}
     for group in groups:
         failed: dict[str, list[Record]] = {}
         for record in group.records:

@@ -21,9 +21,9 @@ def with_videos(samples: Iterable[Sample], folder: Path, num_of_class: int) -> I
     """
     numbers = Counter[tuple[str, str]]()
     for sample in samples:
-        of = sample.group, str(sample.record.failure)
-        numbers[of] += 1
-        yield sample if numbers[of] > num_of_class else _with_video(sample, folder)
+        group_class = sample.group, str(sample.record.failure)
+        numbers[group_class] += 1
+        yield sample if numbers[group_class] > num_of_class else _with_video(sample, folder)
 
 
 def _with_video(sample: Sample, folder: Path) -> Sample:

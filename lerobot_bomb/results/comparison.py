@@ -41,23 +41,25 @@ class Comparisons:
         return [*lines, notes]
 
 
-def _num_pairs(of: PairedComparison) -> str:
-    if of.num_starts == len(of.pairs):
-        return f"{len(of.pairs)} pairs"
-    return f"{len(of.pairs)} pairs of {of.num_starts} seeds, which B - A and p take as independent"
+def _num_pairs(compared: PairedComparison) -> str:
+    if compared.num_starts == len(compared.pairs):
+        return f"{len(compared.pairs)} pairs"
+    return (
+        f"{len(compared.pairs)} pairs of {compared.num_starts} seeds, which B - A and p take as independent"
+    )
 
 
-def _lines(of: PairedComparison) -> list[str]:
+def _lines(compared: PairedComparison) -> list[str]:
     """The pairs of a condition as text, a line each."""
-    counts, (low, high), change = of.counts, of.interval, of.describe_change()
-    needed = of.num_needed
+    counts, (low, high), change = compared.counts, compared.interval, compared.describe_change()
+    needed = compared.num_needed
     more = f"; {needed} pairs tell such a difference apart" if needed else ""
-    rates = [rate_of(list(records)) for records in zip(*of.pairs, strict=True)]
+    rates = [rate_of(list(records)) for records in zip(*compared.pairs, strict=True)]
     return [
         *(f"{name}          {rate}" for name, rate in zip("AB", rates, strict=True)),
         f"B - A      {100 * counts.difference:+.1f} points [{100 * low:+.1f}, {100 * high:+.1f}]; "
         f"A alone succeeded in {counts.only_first}, B alone in {counts.only_second} of {counts.n} pairs, "
-        f"{format_p(of.p_value)}{more}",
+        f"{format_p(compared.p_value)}{more}",
         *([f"           {change}"] if change else []),
     ]
 
@@ -78,7 +80,7 @@ def compare(first: Sequence[Record], second: Sequence[Record]) -> Comparisons:
     pairs = list(_pairs(*groups))
     if not pairs:
         raise ValueError(f"no episode is in both: {_why_none(*groups)}")
-    num_first, num_second = (sum(len(group.records) for group in of) for of in groups)
+    num_first, num_second = (sum(len(group.records) for group in policy_groups) for policy_groups in groups)
     return Comparisons(
         policies=policies,
         conditions=compare_pairs(_by_condition(pairs)),
@@ -88,9 +90,9 @@ def compare(first: Sequence[Record], second: Sequence[Record]) -> Comparisons:
 
 def _by_condition(pairs: list[tuple[Group, Pair]]) -> dict[str, list[Pair]]:
     """Pairs by condition, and by every setting of which they have several, such as the suite."""
-    settings = [dict(of) for of in dict.fromkeys(tuple(group.settings.items()) for group, _ in pairs)]
-    names = dict.fromkeys(name for of in settings for name in of if name != POLICY)
-    several = [name for name in names if len({of.get(name) for of in settings}) > 1]
+    settings = [dict(items) for items in dict.fromkeys(tuple(group.settings.items()) for group, _ in pairs)]
+    names = dict.fromkeys(name for values in settings for name in values if name != POLICY)
+    several = [name for name in names if len({values.get(name) for values in settings}) > 1]
     labelled: dict[str, list[Pair]] = {}
     for group, pair in pairs:
         shown = (_shown(name, group.settings.get(name)) for name in several)

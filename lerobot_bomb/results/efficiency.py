@@ -62,21 +62,21 @@ def lines(records: Sequence[Record]) -> list[tuple[str, str, str]]:
     ]
     smooth = smoothness_of(records)
     if smooth:
-        value = ", ".join(f"{name} {of}" for name, of in smooth.items())
+        value = ", ".join(f"{name} {estimate}" for name, estimate in smooth.items())
         found.append(("smoothness", value, "of the executed actions, per step; less is smoother"))
     return found
 
 
-def _note(of: Efficiency) -> str:
-    batch = "" if of.batch_size is None else f" for {of.batch_size} at once"
-    return f"of a query{batch}, median over episodes; {of.device}"
+def _note(efficiency: Efficiency) -> str:
+    batch = "" if efficiency.batch_size is None else f" for {efficiency.batch_size} at once"
+    return f"of a query{batch}, median over episodes; {efficiency.device}"
 
 
 def _efficiency(device: str, batch_size: int | None, measured: Sequence[tuple[Any, Inference]]) -> Efficiency:
     told = [inference for _, inference in measured]
 
     def mean(name: str) -> float | None:
-        parts = [(value, of.num_queries) for of in told if (value := getattr(of, name)) is not None]
+        parts = [(value, each.num_queries) for each in told if (value := getattr(each, name)) is not None]
         return sum(value * n for value, n in parts) / sum(n for _, n in parts) if parts else None
 
     return Efficiency(

@@ -78,11 +78,11 @@ def count_pairs(pairs: Sequence[Pair]) -> PairedCounts:
 
 def compare_pairs(pairs: Mapping[str, list[Pair]]) -> list[PairedComparison]:
     """Pairs by condition, tested together: the p-values are those of one family (Holm)."""
-    counts = {condition: count_pairs(of) for condition, of in pairs.items()}
+    counts = {condition: count_pairs(condition_pairs) for condition, condition_pairs in pairs.items()}
     adjusted = holm([each.p_value for each in counts.values()])
     return [
-        PairedComparison(condition, of, counts[condition], p_value, len(pairs))
-        for (condition, of), p_value in zip(pairs.items(), adjusted, strict=True)
+        PairedComparison(condition, condition_pairs, counts[condition], p_value, len(pairs))
+        for (condition, condition_pairs), p_value in zip(pairs.items(), adjusted, strict=True)
     ]
 
 

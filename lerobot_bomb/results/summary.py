@@ -47,11 +47,12 @@ def summarise(records: list[Record]) -> Summary:
     )
 
 
-def _pair_line(of: PairedComparison) -> str:
-    counts, change = of.counts, of.describe_change()
+def _pair_line(compared: PairedComparison) -> str:
+    counts, change = compared.counts, compared.describe_change()
     return (
-        f"  {of.condition}: {counts.n} pairs, {counts.only_first} lost, {counts.only_second} won, "
-        f"{format_p(of.p_value)} ({describe_test(of.num_conditions)}){'; ' * bool(change)}{change}"
+        f"  {compared.condition}: {counts.n} pairs, {counts.only_first} lost, {counts.only_second} won, "
+        f"{format_p(compared.p_value)} ({describe_test(compared.num_conditions)})"
+        f"{'; ' * bool(change)}{change}"
     )
 
 
@@ -59,7 +60,7 @@ def pair_lines(group: Group, groups: Sequence[Group]) -> list[str]:
     """Describe how perturbations changed a group's successes, or why there is nothing to compare with."""
     pairs = pair_with_nominal(group.records)
     lines = list(map(_pair_line, compare_pairs(pairs)))
-    paired = {id(record) for of in pairs.values() for _, record in of}
+    paired = {id(record) for condition_pairs in pairs.values() for _, record in condition_pairs}
     left = [each for each in group.perturbed if id(each) not in paired]
     if not left:
         return lines

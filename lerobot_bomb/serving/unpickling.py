@@ -34,7 +34,9 @@ TORCH_DTYPES = (
     torch.bool, torch.uint8, torch.int8, torch.int16, torch.int32, torch.int64,
     torch.float16, torch.bfloat16, torch.float32, torch.float64,
 )  # fmt: skip
-MESSAGES = {f"{of.__module__}.{of.__name__}": of for of in (RemotePolicyConfig, TimedObservation)}
+MESSAGES = {
+    f"{message.__module__}.{message.__name__}": message for message in (RemotePolicyConfig, TimedObservation)
+}
 
 
 def loads(data: bytes | None) -> Any:
@@ -122,9 +124,9 @@ class _Unpickler(PythonUnpickler):
     dispatch = PythonUnpickler.dispatch | {pickle.BUILD[0]: load_build}
 
     def _set_fields(self, built: Any, state: Any) -> None:
-        of = built if isinstance(built, type) else type(built)
-        if of not in self._messages.values():
-            raise pickle.UnpicklingError(f"a {of.__name__} of LeRobot's client has no state")
+        built_class = built if isinstance(built, type) else type(built)
+        if built_class not in self._messages.values():
+            raise pickle.UnpicklingError(f"a {built_class.__name__} of LeRobot's client has no state")
         if any(len(each or ()) > MAX_FIELDS for each in (state if isinstance(state, tuple) else (state,))):
             raise pickle.UnpicklingError(f"a message of LeRobot's client has no {MAX_FIELDS} fields")
         super().load_build()
@@ -200,8 +202,8 @@ def _ordered(name: str, version: int, order: Any, *others: Any) -> np.dtype:
     return np.dtype(name).newbyteorder(order)
 
 
-def _reconstruct(of: Any, *_: Any) -> _Array:
-    if of is not _Array:
+def _reconstruct(array_type: Any, *_: Any) -> _Array:
+    if array_type is not _Array:
         raise pickle.UnpicklingError("an array of LeRobot's client is NumPy's")
     return _Array()
 

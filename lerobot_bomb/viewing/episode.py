@@ -100,7 +100,10 @@ def write_episodes(runs: Mapping[str, ViewedRun], name: str, rrd: Path, mp4: Pat
             log.add_result(results[-1])
         with VideoFile(unfinished_mp4, fps) as video:
             for row in zip_longest(*images):
-                shown = [of[-1] if image is None else image for image, of in zip(row, images, strict=True)]
+                shown = [
+                    run_images[-1] if image is None else image
+                    for image, run_images in zip(row, images, strict=True)
+                ]
                 video.add(np.hstack([unpacked(image) for image in shown]))
     return results
 

@@ -57,7 +57,7 @@ def show_fit(
         ValueError: a setting is wrong, or the dataset has no such statistics.
     """
     mode = mapping.get("ACTION", NormalizationMode.MIN_MAX)
-    one_of("--policy.normalization_mapping[ACTION]", mode, [of.value for of in BOUND_STATISTICS])
+    one_of("--policy.normalization_mapping[ACTION]", mode, [allowed.value for allowed in BOUND_STATISTICS])
     mode = NormalizationMode(mode)
     meta = read_meta(repo_id, root)
     low_D, high_D = dataset_action_bounds(meta, mode)
@@ -137,8 +137,8 @@ def print_fit(grids: ActionGrids, names: list[str]) -> None:
     print_table(
         ["", "mean", "deviation", "bins"],
         [
-            [label, f"{mean:.4g}", f"{std:.4g}", str(len(of) - 1)]
-            for label, of, (mean, std) in zip(labels, edges, grids.gaussians.tolist(), strict=True)
+            [label, f"{mean:.4g}", f"{std:.4g}", str(len(label_edges) - 1)]
+            for label, label_edges, (mean, std) in zip(labels, edges, grids.gaussians.tolist(), strict=True)
         ],
     )
     print(f"\nEdges\n{edges_text(grids, names)}")

@@ -49,8 +49,8 @@ class EpisodeLog[SpecT, ResultT: Record](ABC):
         self._fps, self._curves = self._timing_and_curves(spec)
         self._instruction: str | None = None
         for entity, names in self._curves.items():
-            for of, color in zip(names, CURVE_RGB, strict=False):
-                self._log(f"{entity}/{of}", rr.SeriesLines(colors=[color], names=[of]), static=True)
+            for name, color in zip(names, CURVE_RGB, strict=False):
+                self._log(f"{entity}/{name}", rr.SeriesLines(colors=[color], names=[name]), static=True)
 
     def add(self, moment: Moment) -> None:
         """Log one moment; with the first, everything that stays; the instruction when it changes."""

@@ -90,9 +90,9 @@ def check_published(hub: LoopbackHub) -> None:
     assert len(repository.messages) == 1
     files = repository.files()
     assert "model.safetensors" not in files
-    of = json.loads(files["adapter_config.json"])
-    assert of["base_model_name_or_path"] == BASE
-    assert of["revision"] == hub.model(BASE).refs["main"]
+    adapter_config = json.loads(files["adapter_config.json"])
+    assert adapter_config["base_model_name_or_path"] == BASE
+    assert adapter_config["revision"] == hub.model(BASE).refs["main"]
     metadata = yaml.safe_load(files["README.md"].decode().split("---\n")[1])
     assert (metadata["base_model"], metadata["base_model_relation"]) == (BASE, "adapter")
 

@@ -57,8 +57,8 @@ def checkpoint(name: str = HUB_NAME, **options: Any) -> Checkpoint:
     return Checkpoint(make_config(vlm_model_name=name, **options), VLA0, "me/x", "me/d")
 
 
-def metadata(of: Checkpoint) -> dict[str, Any]:
-    return yaml.safe_load(str(of.card()).split("---\n")[1])
+def metadata(described: Checkpoint) -> dict[str, Any]:
+    return yaml.safe_load(str(described.card()).split("---\n")[1])
 
 
 def test_metadata_of_a_public_backbone() -> None:
@@ -74,8 +74,8 @@ def test_metadata_of_a_public_backbone() -> None:
 
 
 def test_adapters_name_the_checkpoint_that_they_are_of_and_not_its_backbone() -> None:
-    of = metadata(replace(checkpoint(), adapters_of="me/whole"))
-    assert (of["base_model"], of["base_model_relation"]) == ("me/whole", "adapter")
+    hosted = metadata(replace(checkpoint(), adapters_of="me/whole"))
+    assert (hosted["base_model"], hosted["base_model_relation"]) == ("me/whole", "adapter")
     local = metadata(replace(checkpoint("nano"), adapters_of="me/whole"))
     assert (local["base_model"], local["base_model_relation"]) == ("me/whole", "adapter")
     assert "base_model_relation" not in metadata(checkpoint())
@@ -83,9 +83,9 @@ def test_adapters_name_the_checkpoint_that_they_are_of_and_not_its_backbone() ->
 
 @pytest.mark.parametrize(("name", "license"), [("nano", "apache-2.0"), ("/data/models/SmolVLM", None)])
 def test_a_backbone_without_a_name_is_no_base_model(name: str, license: str | None) -> None:
-    of = metadata(checkpoint(name))
-    assert "base_model" not in of
-    assert of.get("license") == license
+    found = metadata(checkpoint(name))
+    assert "base_model" not in found
+    assert found.get("license") == license
     assert "/data" not in str(checkpoint(name).card())
 
 
@@ -101,14 +101,14 @@ def test_commands_are_those_of_the_training_and_of_what_the_dataset_shows(tmp_pa
     training = TrainPipelineConfig(
         DatasetConfig("me/d", root=str(tmp_path), episodes=[0, 1]), batch_size=4, steps=7, seed=3
     )
-    of = replace(checkpoint(temporal_ensemble_size=0), training=training, dataset=BOMB)
-    text = str(of.card()).replace(" \\\n    ", " ")
+    trained = replace(checkpoint(temporal_ensemble_size=0), training=training, dataset=BOMB)
+    text = str(trained.card()).replace(" \\\n    ", " ")
     assert (
         "lerobot-train --policy.type=vla0_smol --policy.chunk_size=3 --policy.n_action_steps=2 "
         "--dataset.repo_id=me/d '--dataset.episodes=[0, 1]' --batch_size=4 --steps=7 --seed=3 "
         "--output_dir=outputs/vla0_smol\n"
     ) in text
-    unseeded = replace(of, training=replace(training, seed=None))
+    unseeded = replace(trained, training=replace(training, seed=None))
     assert " --seed=null " in str(unseeded.card())
     assert (
         "lerobot-eval --policy.path=me/x --env.type=bomb --env.task=place --env.robot=fetch "

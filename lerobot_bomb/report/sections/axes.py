@@ -24,7 +24,7 @@ def axes(group: Group) -> Table | None:
     if not cells:
         return None
     names = list(dict.fromkeys(axis for axis, _ in cells))
-    levels = [level for level in range(1, MAX_LEVEL + 1) if any(of == level for _, of in cells)]
+    levels = [level for level in range(1, MAX_LEVEL + 1) if any(recorded == level for _, recorded in cells)]
     zero = [rate(group.nominal)] if group.nominal else []
     table = [[Cell(axis), *zero, *(rate(cells.get((axis, level), [])) for level in levels)] for axis in names]
     return Table(group.name, ["axis", *(["0"] if zero else []), *map(str, levels)], table, NOTE)

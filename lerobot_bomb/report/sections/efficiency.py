@@ -47,18 +47,18 @@ def is_measured(report: Report) -> bool:
     return any(each.inference is not None or each.action_j2 is not None for each in records)
 
 
-def _cells(of: Efficiency) -> list[Cell]:
-    mebibytes = None if of.peak_memory_bytes is None else of.peak_memory_bytes / 2**20
+def _cells(efficiency: Efficiency) -> list[Cell]:
+    mebibytes = None if efficiency.peak_memory_bytes is None else efficiency.peak_memory_bytes / 2**20
     return [
-        Cell(of.device),
-        _number(of.batch_size, "d"),
-        _number(of.latency_p50_ms, ".3g"),
-        _number(of.latency_p95_ms, ".3g"),
-        _number(of.num_queries, "d"),
-        _number(of.passes, ".3g"),
-        _number(of.tokens, ".3g"),
-        _number(of.actions_per_s, ".3g"),
-        Cell(_short(of.num_parameters), of.num_parameters),
+        Cell(efficiency.device),
+        _number(efficiency.batch_size, "d"),
+        _number(efficiency.latency_p50_ms, ".3g"),
+        _number(efficiency.latency_p95_ms, ".3g"),
+        _number(efficiency.num_queries, "d"),
+        _number(efficiency.passes, ".3g"),
+        _number(efficiency.tokens, ".3g"),
+        _number(efficiency.actions_per_s, ".3g"),
+        Cell(_short(efficiency.num_parameters), efficiency.num_parameters),
         _number(mebibytes, ".0f"),
     ]
 

@@ -56,11 +56,11 @@ def _grounding(records: list[Record]) -> Cell:
     return rate(put_down(records), is_grounded)
 
 
-def _interventions(of: Policy) -> list[str]:
-    policy = of.records[0].policy
+def _interventions(reported: Policy) -> list[str]:
+    policy = reported.records[0].policy
     return [] if policy is None else list(policy.interventions)
 
 
-def _weights(of: Policy) -> str:
-    policy = of.records[0].policy
+def _weights(reported: Policy) -> str:
+    policy = reported.records[0].policy
     return (policy and policy.weights_sha256) or ""

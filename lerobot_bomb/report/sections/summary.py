@@ -43,7 +43,7 @@ def _summary(groups: list[Group], shared_records: list[list[Record]]) -> Table:
                 Cell(str(len(group.records)), len(group.records)),
             ]
         )
-    explained = [f"{name}: {of}" for name, of in notes.items() if of]
+    explained = [f"{name}: {note}" for name, note in notes.items() if note]
     return Table("", HEADER, table, f"{'; '.join([NOTE, *explained])}.")
 
 
@@ -64,7 +64,7 @@ def _shared(group: Group, peers: list[Group]) -> list[Record]:
 def _worst(records: list[Record]) -> list[Cell]:
     """Return the condition with the lowest rate, and that rate; all of them where several have it."""
     by = by_condition(records)
-    rates = {condition: rate_of(of).share for condition, of in by.items()}
+    rates = {condition: rate_of(condition_records).share for condition, condition_records in by.items()}
     worst = [condition for condition, share in rates.items() if share == min(rates.values())]
     if not worst:
         return [Cell("-"), Cell("-")]
