@@ -7,7 +7,7 @@ from typing import Any
 
 import pytest
 from bomb_pusht_cases import pusht_row
-from result_rows import ACT, printed, read, row, values
+from result_rows import ACT, old_row, printed, read, row, values
 
 from lerobot_bomb.commands.main import main
 from lerobot_bomb.pusht.episode import SUCCESS_COVERAGE
@@ -71,6 +71,13 @@ def test_fields_that_contradict_each_other_are_damage(
     assert not damage_of(values(0, failure))
     found = damage_of(values(0, failure, **other))
     assert damage in found and bool(damage) == bool(found)
+
+
+def test_records_from_before_an_axis_lack_its_level_under_all_axes() -> None:
+    spec, levels = {"perturbations": "all:3"}, {"camera": 3, "light": 3}
+    assert not damage_of(json.loads(old_row(0, spec=spec)) | {"levels": levels})
+    assert "levels=" in damage_of(json.loads(old_row(0, spec=spec)) | {"levels": levels | {"light": 4}})
+    assert "levels=" in damage_of(values(0, spec=spec) | {"levels": levels})
 
 
 def test_a_row_that_its_batch_does_not_have_is_damage() -> None:

@@ -143,6 +143,8 @@ class Record(ABC):
 
     def _check_levels(self) -> None:
         asked = {axis: (low, high) for axis, low, high in self.spec.condition.ranges}
+        if self.protocol_version != [*self.versions][-1]:  # `all` had fewer axes
+            asked = {axis: levels for axis, levels in asked.items() if axis in self.levels}
         off = (0, 0)  # of an axis that is not in the condition
         for axis in (*self.levels, *asked):
             low, high = asked.get(axis, off)
