@@ -29,7 +29,7 @@ def bounds(
     """(D,) values that become -1 and (D,) values that become 1 when LeRobot normalises.
 
     Raises:
-        ValueError: the dataset has no such statistics, or they are not finite.
+        ValueError: the dataset lacks the statistics of the mode, or they are not finite.
     """
     if mode is NormalizationMode.IDENTITY:
         return -np.ones(num_dims), np.ones(num_dims)

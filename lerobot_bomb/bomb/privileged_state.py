@@ -43,7 +43,7 @@ class PrivilegedState:
 
     @staticmethod
     def dim(num_goals: int) -> int:
-        """Length of the vector."""
+        """Length of the vector with this number of goals."""
         return sum(part.size for part in _PARTS) + num_goals * Goal.DIM
 
     def to_vector(self) -> np.ndarray:
@@ -55,7 +55,7 @@ class PrivilegedState:
         """Inverse of `to_vector`, in float64.
 
         Raises:
-            ValueError: the vector of no number of goals is as long.
+            ValueError: no number of goals gives a vector of this length.
         """
         vector = np.asarray(vector, dtype=np.float64)
         goals_size = vector.size - cls.dim(0)
