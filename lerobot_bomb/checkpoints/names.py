@@ -1,4 +1,4 @@
-"""Names: of files of a checkpoint, on the Hub, and paths that nobody else has."""
+"""Names of a checkpoint's files and on the Hub, and paths that only this machine has."""
 
 import re
 from pathlib import Path
@@ -38,7 +38,7 @@ def is_hub_id(name: object) -> bool:
 
 
 def local_file(checkpoint: Path | str, revision: str | None, name: str) -> Path | None:
-    """Return a file of a folder, or of a repository on the Hub as it was downloaded; None if it has none."""
+    """Return a file of a folder, or of a downloaded repository of the Hub; None if there is none."""
     if Path(checkpoint).is_dir():
         path = Path(checkpoint) / name
         return path if path.is_file() else None
