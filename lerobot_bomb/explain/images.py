@@ -1,4 +1,4 @@
-"""Parts of an image that are taken away.
+"""Parts of an image that are taken out, and the pixels in their place.
 
 Shapes: `M` masks, `H`, `W` of an image in pixels.
 """
