@@ -130,7 +130,7 @@ class CameraRenderer:
     def _render(self, data: mujoco.MjData, camera: str, size: int) -> mujoco.MjrRect:
         self._owner.check()
         self._gl.make_current()
-        # anew: after a neighbour has drawn with GLFW, the image of before would be read once more
+        # again: after another renderer has drawn with GLFW, the previous image would be read
         mujoco.mjr_setBuffer(mujoco.mjtFramebuffer.mjFB_OFFSCREEN, self._context)
         self._camera.fixedcamid = self._model.camera(camera).id
         mujoco.mjv_updateScene(
@@ -158,7 +158,7 @@ def _free(gl: GLContext, context: mujoco.MjrContext, owner: _Owner) -> None:
 
 
 def _opengl_string(name: int) -> str | None:
-    """Return what the current OpenGL context says of itself."""
+    """Return a string that describes the current OpenGL context; None if it has none."""
     pointer: Any = GL_1_0.glGetString(name)
     text = ctypes.cast(pointer, ctypes.c_char_p).value
     return None if text is None else text.decode()
