@@ -21,7 +21,7 @@ def check_robot(spec: EpisodeSpec) -> None:
 
 
 def fetch_xml() -> Path:
-    """Return the MJCF file of the installed Fetch model."""
+    """Return the MJCF file of the installed Fetch model; a ValueError says why there is none."""
     mujoco_version = importlib.metadata.version("mujoco")
     if int(mujoco_version.split(".")[0]) >= FIRST_MUJOCO_WITHOUT_FETCH:
         raise ValueError(

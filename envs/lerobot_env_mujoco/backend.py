@@ -23,7 +23,7 @@ gl.free()
 
 
 class NoOpenGLError(RuntimeError):
-    """MuJoCo cannot render on this machine."""
+    """Error that MuJoCo cannot render on this machine."""
 
 
 def probe(backend: str) -> str:

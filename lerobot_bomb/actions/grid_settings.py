@@ -72,8 +72,9 @@ def default_groups(
 ) -> tuple[ActionGroup, ...]:
     """Return the default groups of an action.
 
-    A pose has SpatialVLA's: direction and length of x, y, z, then three angles and a binary gripper (7 dims)
-    or a gripper in `LINEAR_BINS` (4). Two dims share a token. Otherwise each dim is a token of `JOINT_BINS`.
+    A pose has SpatialVLA's groups: direction and length of x, y, z, then three angles and a binary gripper
+    (7 dims) or a gripper in `LINEAR_BINS` (4). Two dims share a token. Otherwise each dim is a token of
+    `JOINT_BINS`.
 
     Args:
         num_dims: number of action dims.

@@ -79,8 +79,8 @@ class ActionGrids(nn.Module):
         """Actions (..., D) -> cells (..., G) int64, counted in each group; actions are clipped to [-1, 1].
 
         Raises:
-            ValueError: the number of dims is wrong or, on the CPU, an action is not finite. On CUDA the host
-                would wait.
+            ValueError: the number of dims is wrong or, on the CPU, an action is not finite. On CUDA this is
+                not checked: the host would wait.
         """
         require_finite_on_cpu(actions, "an action that is put into a grid")
         self._check_dims(actions.shape[-1])

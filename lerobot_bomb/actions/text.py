@@ -48,7 +48,7 @@ class NumberTokens:
     loss_mask: Tensor  # bool
 
     def hide_numbers(self, hidden_BN: Tensor, hidden_id: int) -> "NumberTokens":
-        """Put one ``hidden_id`` in place of all digits of a number; its space stays and is trained on."""
+        """Put one ``hidden_id`` in place of a hidden number's digits; its space stays and is trained on."""
         ids_BNC, mask_BNC, loss_mask_BNC = self.ids.clone(), self.mask.clone(), self.loss_mask.clone()
         mask_BNC[..., 1:-1] &= ~hidden_BN[..., None]
         loss_mask_BNC[..., 1:] &= ~hidden_BN[..., None]

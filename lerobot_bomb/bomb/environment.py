@@ -20,7 +20,7 @@ COMPARED = ("task", "robot", "control_mode", "fps", "image_size")
 
 @dataclass(frozen=True)
 class Environment:
-    """A policy may act under another depth, split or numbered task than these; perturbations do not count."""
+    """Settings of BOMB in a recording. A policy may act under another depth, split or numbered task."""
 
     robot: str
     control_mode: str
@@ -140,9 +140,10 @@ class Environment:
 
 
 def robot_type(robot: str, task: str) -> str:
-    """Return `robot_type` of a recording's info.json: robot and newest version of all suites and its own.
+    """Return `robot_type` of a recording's info.json: its robot and a version.
 
-    LeRobot merges only datasets of one `robot_type`: recordings of several suites, but none of older tasks.
+    The version is the newest of our suites and the recording's. LeRobot merges only datasets of one
+    `robot_type`: recordings of several suites, but none of older tasks.
     """
     return f"bomb_{robot}_v{max(map(task_version, (ALL, task)))}"
 

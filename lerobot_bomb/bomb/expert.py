@@ -89,7 +89,7 @@ def held_share(state: PrivilegedState, stone: int) -> float:
 def _shares(state: PrivilegedState) -> list[tuple[Goal, float]]:
     """Return the goals that an action serves, with their shares: the goal after the last one reached.
 
-    While the fingers leave a stone that they have put down, both it and the next one have a share.
+    While the fingers leave a stone that they have put down, its goal and the next one each have a share.
     """
     shares, left = [], 1.0
     for before, goal in reversed(list(pairwise(state.goals))):

@@ -104,7 +104,7 @@ class Judge:
         return bool(ended.any())
 
     def time_out(self) -> None:
-        """Set the failure of an episode whose time is over."""
+        """Set `failure` of an episode that has run out of time."""
         touched = self._now.stone_touched[self._stone]
         was_lifted = bool(self._was_lifted[self._stone])
         if self._was_lifted.any() and not was_lifted:

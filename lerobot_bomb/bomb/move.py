@@ -13,7 +13,7 @@ type Place = Intersection | str  # an intersection, or TRAY: anywhere in it
 
 @dataclass(frozen=True)
 class Move:
-    """A stone that comes to a place."""
+    """Move of one of several stones to one of several places."""
 
     # any one of these, by index; of several, one that no move has taken before
     stones: frozenset[int]

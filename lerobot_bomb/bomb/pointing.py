@@ -27,7 +27,7 @@ NUM_OTHERS = 2  # other places per frame, beside the expert's
 
 
 def _middles(half_m: float) -> list[float]:
-    """Return the middles of squares along a side of the tray: metres from its centre, which is one."""
+    """Return the middles of squares along a side of the tray: metres from its centre, itself a middle."""
     number = round(half_m / TRAY_SPOT_M)
     return [TRAY_SPOT_M * i for i in range(-number, number + 1)]
 

@@ -134,7 +134,7 @@ def check_config(folder: Path, config: PreTrainedConfig) -> None:
     """Check that a checkpoint needs nothing but its own files, and no code.
 
     Raises:
-        ValueError: names what it needs.
+        ValueError: it needs more; the message names what.
     """
     for field, value in vars(config).items():
         if field.endswith("_config") and _names_code(value):
@@ -173,7 +173,7 @@ def check_tensors(path: Path, policy: PreTrainedPolicy) -> list[str]:
     whole (``may_lack``): names of modules.
 
     Raises:
-        ValueError: the file is truncated, or a tensor, which is named, is missing, unknown or misshapen.
+        ValueError: the file is truncated; or names a tensor that is missing, unknown or of another shape.
     """
     may_skip, may_lack = getattr(policy, "may_skip", ()), getattr(policy, "may_lack", ())
     saved = {name: shape for name, shape in tensor_shapes(path).items() if not _is_of(name, may_skip)}

@@ -27,7 +27,7 @@ INSTALLED = PackageVersion(__version__)
 
 @draccus.decode.register(PackageVersion)
 def _decode(written_by: str, path: Sequence[str]) -> PackageVersion:
-    """Return the installed version, which writes the config the next time.
+    """Return the installed version, with which the config would be written next.
 
     Raises:
         DecodingError: the checkpoint is newer, so its fields and weights may mean something else.

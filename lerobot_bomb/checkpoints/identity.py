@@ -28,7 +28,7 @@ NOT_ITS_SETTINGS = {
 
 
 def identity_of(policy: PreTrainedPolicy) -> PolicyIdentity:
-    """Return the identity of a policy."""
+    """Return the identity of a policy; while it is being trained, only its type."""
     if training_data(policy.config) is not None:
         return PolicyIdentity(policy.config.type, is_in_training=True)
     return identity_of_config(policy.config)

@@ -19,7 +19,7 @@ MAX_EPISODES, MAX_IMAGES = 3, 12  # of a dataset, that are read
 
 
 class OrientationCheck:
-    """Warns once per evaluation if the policy's images were turned; their dataset must be on this machine.
+    """Warns once per evaluation if the training's images were turned; their dataset must be on this machine.
 
     Args:
         key: feature of the dataset that holds the images.

@@ -1,4 +1,4 @@
-"""Names of a checkpoint's files and on the Hub, and paths that only this machine has."""
+"""Names of a checkpoint's files, ids on the Hub, and paths that only this machine has."""
 
 import re
 from pathlib import Path

@@ -118,7 +118,7 @@ def _check_step(step: Mapping[str, Any], where: str, policy_type: object) -> Non
 
 
 def _name_of_class(path: object, where: str, policy_type: object) -> str | None:
-    """Return the registered name, if any, of a step given by its class path; its module is loaded.
+    """Return the registered name, if any, of a step given by the path of a class in a loaded module.
 
     Raises:
         ValueError: it is no step, or the checkpoint is of our types, whose steps are all registered.
@@ -163,7 +163,7 @@ def _check_artifacts(artifacts: object, what: str, policy_type: object) -> None:
 
 
 def check_saved_processors() -> None:
-    """From now on, check every processor that this process loads, also in LeRobot's commands."""
+    """Check, from now on, every processor that this process loads, also in LeRobot's commands."""
 
     def check(content: dict[str, Any], where: str, config: Path) -> None:
         for name in state_files(content, where, saved_type(config)):

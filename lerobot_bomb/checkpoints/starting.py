@@ -26,7 +26,7 @@ def way_to_start_otherwise(checkpoint: str | Path, policy_type: str) -> str:
 
 
 def check_start(checkpoint: str | Path, config: Any, meta: "LeRobotDatasetMetadata | None") -> None:
-    """Raise a ValueError unless a config's training can start from a checkpoint, with these data, if any.
+    """Raise a ValueError unless a config can start from a checkpoint on its data or in its environment.
 
     Where weights do not depend on shapes (sizes of images, numbers written as text), the config takes the
     data's.

@@ -82,7 +82,7 @@ def add_episode_files_argument(parser: argparse.ArgumentParser, folder: Path) ->
 
 
 def check_at_least(args: argparse.Namespace, **lowest: int) -> None:
-    """Raise a ValueError if a flag is less than the lowest value of its name."""
+    """Raise a ValueError if a flag is below its lowest value: `episodes=1`."""
     for name, bound in lowest.items():
         if getattr(args, name) < bound:
             raise ValueError(f"--{name}={getattr(args, name)} must be at least {bound}")

@@ -46,7 +46,7 @@ def shard_of(args: argparse.Namespace) -> tuple[int, int] | None:
     """Return (0, 4) for --shard=0/4; None without the flag.
 
     Raises:
-        ValueError: it is no part, or a flag of submitit's stands without --submitit.
+        ValueError: the value is no part, or a flag of submitit's stands without --submitit.
     """
     if args.submitit is None and (args.submitit_cluster or args.submitit_parameters):
         raise ValueError("--submitit_cluster and --submitit_parameters need --submitit=N")

@@ -123,7 +123,7 @@ def _parse(name: str, words: Sequence[str]) -> argparse.Namespace:
 
 
 def _told() -> tuple[type[Exception], ...]:
-    """Return the errors whose messages are for the user; draccus is there if its own was raised."""
+    """Return the errors whose messages are for the user; draccus' own only once it is loaded."""
     draccus = sys.modules.get("draccus.utils")
     return (ValueError, OSError, RuntimeError, *((draccus.DecodingError,) if draccus else ()))
 

@@ -90,7 +90,7 @@ def _address(args: argparse.Namespace) -> Iterator[str]:
 
 
 def _check_port(host: str, port: int, allow_network: bool) -> None:
-    """Raise a ValueError unless the port is free, and reached from this machine only or allowed."""
+    """Raise a ValueError unless the port is free and, without `allow_network`, open to this machine only."""
     try:
         with socket.create_server((host, port)) as listener:
             address = ip_address(listener.getsockname()[0])

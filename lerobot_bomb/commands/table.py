@@ -1,7 +1,8 @@
 """Commands of ``lerobot-bomb``: group, name, summary and two examples of each.
 
-A command, as ``checkpoint init``, is the module ``checkpoint_init`` in this folder, with ``add_arguments``
-and ``run``. The module is imported when the command is called; its own imports are neither torch nor LeRobot.
+A command such as ``checkpoint init`` is the module ``checkpoint_init`` in this folder, with
+``add_arguments`` and ``run``. The module is imported when the command is called; its own imports are neither
+torch nor LeRobot.
 """
 
 from dataclasses import dataclass, field

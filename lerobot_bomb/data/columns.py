@@ -56,7 +56,7 @@ def check_chunk_length(chunk_size: int, meta: LeRobotDatasetMetadata) -> None:
 def require_motion(meta: LeRobotDatasetMetadata, use: str) -> None:
     """Raise a ValueError that names the use if a dataset holds static scenes.
 
-    Frames of `lerobot-bomb record --static` do not follow each other: `next.done` holds before the end.
+    Frames of `lerobot-bomb record --static` do not follow each other; `next.done` is true before the end.
     """
     if DONE not in meta.features:
         return

@@ -73,7 +73,7 @@ def finish_block(unfinished: Path, block: Path, progress: Progress) -> None:
 
 
 def find_gaps(folder: Path, numbers: range) -> list[range]:
-    """Return the numbers of the missing blocks, as the longest ranges."""
+    """Return the missing blocks' numbers, joined into ranges."""
     there = [number for number in map(_number, finished_blocks(folder)) if number in numbers]
     starts, ends = [numbers.start, *(number + 1 for number in there)], [*there, numbers.stop]
     return [range(start, end) for start, end in zip(starts, ends, strict=True) if start < end]

@@ -48,7 +48,7 @@ class LiberoHdf5:
     """The demonstrations of a file or a folder; `check` must have passed before they are read.
 
     Args:
-        path: of TASK_demo.hdf5, or of a folder that holds some.
+        path: a file TASK_demo.hdf5, or a folder of such files.
         convention: one of `CONVENTIONS`, in which images were stored; None: what each file says, else opengl.
         skip_noops: leave frames out in which neither arm nor gripper is told to move.
 
@@ -79,7 +79,7 @@ class LiberoHdf5:
 
     @property
     def suite(self) -> str:
-        """LIBERO's name of the suite that all files are of; empty: several, or not known."""
+        """Name of the suite of all files; empty if there are several, or it is unknown."""
         suite, *others = self._suites
         return suite if not others and suite in SUITES else ""
 
@@ -125,7 +125,7 @@ class LiberoHdf5:
         )
 
     def _check_file(self, file: Path) -> bool:
-        """Check all demonstrations of a file; return True if observations are of after their actions."""
+        """Check all demonstrations of a file; return True if observations were taken after their actions."""
         with _opened(file) as data:
             timings = []
             for name in [source.name for source in self.sources if source.file == file]:

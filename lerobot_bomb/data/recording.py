@@ -86,7 +86,7 @@ class Recording:
             raise ValueError(f"--env.perturbations={','.join(self.perturbations)} has a condition twice")
 
     def _of_scenes(self) -> None:
-        """Take the number of episodes from that of scenes; these are always labelled."""
+        """Set the number of episodes from that of scenes, which are always labelled."""
         if self.static < 1 or self.static % self.scenes:
             raise ValueError(f"--static={self.static} must be in 1..{SCENES} or a multiple of {SCENES}")
         for name, value in {"--relabel": self.relabel, f"--noise={self.noise}": self.noise}.items():

@@ -16,7 +16,7 @@ MIRROR = np.array([[0.0, -1.0], [-1.0, 0.0]])  # across a diagonal
 
 @dataclass(frozen=True)
 class RigidMotion:
-    """Takes a point x of a square board of `board_size` to `centre + shift + linear @ (x - centre)`."""
+    """Motion of a point x of a square board of `board_size` to `centre + shift + linear @ (x - centre)`."""
 
     board_size: float
     linear: np.ndarray  # (2, 2), orthogonal

@@ -223,7 +223,7 @@ class RolloutPool:
 
 
 def _work(settings: RolloutSettings, pipe: Connection) -> None:
-    """Run a worker: specs come, rollouts or an exception go, until the parent ends."""
+    """Run a worker: receive specs, send rollouts or an exception, until the parent ends."""
     worker = _Worker(settings)
     with suppress(EOFError, ConnectionError):
         while True:

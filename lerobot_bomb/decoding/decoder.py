@@ -69,7 +69,7 @@ class CachedContinuation(Continuation):
         length_B: Tensor,
         prompt: Prompt | None = None,
     ):
-        """``embed``: symbols -> (..., H); ``head``: (..., H) -> (..., S); ``length_B``: of the prompts."""
+        """``embed``: symbols -> (..., H); ``head``: (..., H) -> (..., S); ``length_B``: prompts' lengths."""
         self._text, self._embed, self._head = text, embed, head
         self._length_B, self._prompt = length_B, prompt
 

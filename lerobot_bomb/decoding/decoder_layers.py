@@ -146,7 +146,7 @@ class _Layer:
         return [norm for norm in norms if norm is not None]
 
     def __call__(self, x_NH: Tensor, columns: Columns, cache_Z2CE: Tensor) -> Tensor:
-        """(N, H) -> (N, H)."""
+        """States (N, H) -> states (N, H) after the layer."""
         read_NH = self._attend(self._before_attention(x_NH), columns, cache_Z2CE)
         x_NH = _add(x_NH, read_NH, self._after_attention)
         return _add(x_NH, self._mix(self._before_mlp(x_NH)), self._after_mlp)
@@ -212,7 +212,7 @@ class _RMSNorm:
             torch.add(self._source, 1, out=self._weight)
 
     def __call__(self, x: Tensor) -> Tensor:
-        """(..., H) -> (..., H)."""
+        """States (..., H) -> normalised states (..., H)."""
         if self.is_on_host and x.dtype == torch.float32:
             return self.unscaled(x).mul_(self.scale)
         if self._is_gemma:

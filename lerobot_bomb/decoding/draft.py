@@ -74,7 +74,7 @@ class LinearDraft:
     def _expect(self, number_BN: Tensor, index_BX: Tensor, steps: Tensor | int) -> Tensor:
         """(B, X) the number ``steps`` after an unknown one, on the line through the two steps before that.
 
-        In the first step, and before: the middle of the range, then no slope.
+        Without a step before, the middle of the range; without two, no slope.
         """
         middle = (self._grammar.num_values - 1) // 2
         last_BX, before_BX = (

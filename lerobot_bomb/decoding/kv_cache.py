@@ -146,7 +146,7 @@ class CachedText:
         )
 
     def _counts_of_columns(self, columns_BK: Tensor) -> list[int]:
-        """Return how many columns attention reads for each token; all where the host would have to wait."""
+        """Return how many columns attention reads for each token; all if the host would have to wait."""
         if columns_BK.is_cuda:
             return [len(self._columns_C)] * columns_BK.shape[1]
         return [last + 1 for last in (columns_BK % self.unread_column).amax(dim=0).tolist()]

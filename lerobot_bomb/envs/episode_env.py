@@ -155,7 +155,7 @@ class EpisodeEnv[SpecT: Any, RunT, ResultT: Record](gymnasium.Env[Observation, n
 
     @abstractmethod
     def _draw_for_people(self, run: RunT) -> np.ndarray:
-        """(H, W, 3) uint8."""
+        """(H, W, 3) uint8 image for people."""
 
     @abstractmethod
     def _result(self, run: RunT) -> ResultT:

@@ -29,7 +29,7 @@ def check_parallel_tasks(number: int) -> None:
 
 
 class FreezeAfterEnd(gym.Wrapper):
-    """Keep returning the last transition after an episode has ended, through autoreset too.
+    """Wrapper that keeps returning the last transition after an episode has ended, through autoreset too.
 
     LeRobot steps a batch until its slowest episode ends. Without this, the finished ones would be
     reset by the vector env and simulated for nothing. Only a reset that carries ``NEW_ROLLOUT_OPTION``

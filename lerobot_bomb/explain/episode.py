@@ -91,7 +91,7 @@ def explain_moment(
 
 
 def mean_states(question: Question) -> dict[str, np.ndarray]:
-    """{instruction, answer: (layers, F)}: each layer's states, means over tokens and draws; {} if hidden."""
+    """{instruction, answer: (layers, F) states}, means over tokens and draws; {} if not available."""
     policy = question.policy
     if not policy.layers or any(layer.layer is None for layer in policy.layers):
         return {}

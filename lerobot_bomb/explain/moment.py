@@ -41,7 +41,7 @@ class MomentQuery:
 
 @dataclass(frozen=True)
 class PatchingResult:
-    """Result of activation patching: R of every unit for one corruption; NaN where it is not defined."""
+    """Result of activation patching: R (see `restoration`) of all units for a corruption, or NaN."""
 
     corruption: str
     drop: float  # of the score

@@ -19,7 +19,7 @@ SEED = 0
 
 
 def scored(policy: Any, postprocess: Callable[[Tensor], Tensor]) -> ScoredPolicy:
-    """Score a policy of ours by its own method, a flow policy of LeRobot's by loss, any other by distance.
+    """Wrap a policy for scoring: ours by its own method, LeRobot's flow policies by loss, others by distance.
 
     ``postprocess``: (B, D) actions -> the same in physical units.
     """

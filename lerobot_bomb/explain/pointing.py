@@ -165,7 +165,7 @@ class PointingCheck:
 def check_pointing(
     loaded: LoadedPolicy, scored: ScoredPolicy, observation: Batch, state: PrivilegedState | None
 ) -> PointingCheck | None:
-    """Compare pointing and next action with the truth; None if the policy does not point or it is unknown."""
+    """Compare pointing and next action with the truth; None without pointing, or without a known truth."""
     if state is None:
         return None
     loaded.begin()

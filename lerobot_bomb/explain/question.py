@@ -53,7 +53,7 @@ class Question:
         return self.effects(self.encode(changed, len(next(iter(changed.values())))))
 
     def effects_of_masks(self, key: str, masks_MHW: Tensor, filling_3HW: Tensor) -> Tensor:
-        """(M,) effects of the parts of one camera's image."""
+        """(M,) effects of taking parts out of one camera's image."""
         (image_3HW,) = self.observation[key]
         parts = masks_MHW.split(self._batch_size)
         images = (occluded(image_3HW, part, filling_3HW) for part in parts)

@@ -27,7 +27,7 @@ class Span:
     ranges: tuple[Range, ...]  # of the instruction's characters
 
     def tokens(self, offsets: Sequence[Range]) -> Tensor:
-        """(S,) bool: the token, of these characters, holds some of the words."""
+        """(S,) bool: the token with these characters holds some of the words."""
         return torch.tensor(
             [any(first < end and start < last for start, end in self.ranges) for first, last in offsets],
             dtype=torch.bool,
@@ -63,7 +63,7 @@ def spans_of_words(instruction: str) -> list[Span]:
 
 
 def difference(name: str, instruction: str, other: str) -> Span | None:
-    """Return the words that differ in another instruction; None if none do, or it has more or fewer.
+    """Return the words that differ in another instruction; None if none do, or their number differs.
 
     "place it at row 1, column 2", "place it at row 3, column 2" -> "1".
     """

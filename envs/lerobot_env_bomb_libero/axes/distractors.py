@@ -84,7 +84,7 @@ def _places() -> np.ndarray:
 
 
 def _is_out_of_the_way(place: np.ndarray, boxes: list[np.ndarray], ends: list[np.ndarray]) -> bool:
-    """Return True if (2,) is far from (2, 3) boxes and from the lines between the places of the task."""
+    """Return True if a place (2,) is far from (2, 3) boxes and from the lines between the task's places."""
     gap = HALF_SIZE_M + CLEARANCE_M
     if any((place > low[:2] - gap).all() and (place < high[:2] + gap).all() for low, high in boxes):
         return False

@@ -159,7 +159,7 @@ class ClearRow(Task):
 
 @dataclass(frozen=True)
 class Gather(Task):
-    """Task: move all stones of a colour that do not stand on the left to the left."""
+    """Task: move all stones of a colour to the left, unless they stand there."""
 
     def draw(self, rng: np.random.Generator) -> TaskInstance:
         return TaskInstance(

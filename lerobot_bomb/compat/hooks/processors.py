@@ -18,7 +18,7 @@ def check_processors_before_use(
     check: Callable[[dict[str, Any], str, Path], Any],
     check_loaded: Callable[[Sequence[Any], str, Path], None],
 ) -> None:
-    """Check a saved processor before LeRobot's loader builds its steps, and again when they are loaded.
+    """Have saved processors checked before LeRobot's loader builds their steps, and again once loaded.
 
     First `check(its JSON, where, config.json)` sees what will be built, then `check_loaded(steps, where,
     config.json)`. From the Hub, states and config.json, which may be missing, are of the JSON's commit.
