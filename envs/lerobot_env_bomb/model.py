@@ -50,7 +50,7 @@ PATTERN_LINE_WIDTH_M = 0.0010
 PATTERN_STONE_HEIGHT_M = 0.0005
 MAX_PATTERN_STONES = 4
 STONE_RGBA = {True: (0.96, 0.96, 0.93, 1.0), False: (0.06, 0.06, 0.07, 1.0)}  # by "is white"
-HIDDEN = 0.0  # opacity of what only a perturbation shows
+HIDDEN = 0.0  # opacity of geoms that only a perturbation or a pattern shows
 
 
 def compile_scene(robot: Robot) -> mujoco.MjModel:

@@ -270,8 +270,8 @@ class LiberoScene(LiberoEnv):
         def draw(cache: Any) -> Any:
             if not self._draws:
                 return blank
-            # robosuite draws in whichever context is current: with several environments in one process,
-            # in that of the last one that was built
+            # robosuite draws in the current context: with several environments in one process, that of the
+            # last one that was built
             self._opengl.gl_ctx.make_current()
             return sensor(cache)
 

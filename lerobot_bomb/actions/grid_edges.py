@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 
 MIN_WIDTH = 1e-4  # of a bin, in the coordinate's unit
-MARGIN = 0.01  # of a bin's width that a mean keeps from its edges, lest rounding moves it to the next bin
+MARGIN = 0.01  # least distance of a mean from its bin's edges, in bin widths: rounding leaves it inside
 
 
 @dataclass(frozen=True)

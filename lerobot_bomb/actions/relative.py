@@ -19,7 +19,7 @@ BOUND_STATISTICS = {
     NormalizationMode.QUANTILE10: ("q10", "q90"),
 }
 CENTRE_AND_DISTANCE = ("mean", "std")
-QUANTILE = 0.999  # of the residuals' sizes; where normalised values are bounded, what lies beyond saturates
+QUANTILE = 0.999  # of the residuals' sizes; larger ones saturate where normalised values are bounded
 MAX_RESIDUALS = 20_000_000  # a dimension; of more, evenly spaced frames are taken
 
 

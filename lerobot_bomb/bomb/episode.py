@@ -10,8 +10,8 @@ from lerobot_bomb.bomb.suites import SUITES
 from lerobot_bomb.conditions import NONE, PerturbedSpec
 from lerobot_bomb.flags import one_of
 
-# Version of how a policy is measured and what a record says. 1.1 is 1.0 with records that name
-# simulator, policy and tasks. A suite has a version of its own, of what its episodes are: `bomb/suite.py`.
+# Version of the measurement of a policy and of the records. 1.1 is 1.0 with records that name simulator,
+# policy and tasks. A suite has a version of its own, for its episodes: `bomb/suite.py`.
 PROTOCOL_VERSION = "1.1"
 
 ROBOTS = ("scara", "fetch")

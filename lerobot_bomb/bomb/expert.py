@@ -21,7 +21,7 @@ GAIN = 0.75  # share of the remaining way that a step of 0.1 s covers near its g
 GRASP_DEPTH_M = 0.0028  # of the pads' lower ends below the stone's centre
 GRASP_SLACK_M = 0.004  # that a held stone may sit too high between the pads
 FLOOR_M = WORKSPACE_LOW_M[2] + 0.0007  # lowest height commanded to the gripper
-PRESS_M = 0.0015  # how far below its goal a descent aims, lest the last millimetre take for ever
+PRESS_M = 0.0015  # how far below its goal a descent aims, as it slows down near its aim
 RETREAT_HEIGHT_M = 0.11  # of the gripper after the release
 
 # Finger openings.

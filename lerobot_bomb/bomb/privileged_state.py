@@ -37,7 +37,7 @@ class PrivilegedState:
     fps: int = DEFAULT_FPS
     stone_radius_m: float = BOARD.stone_radius_m
     max_opening_m: float = 0.044  # between the pads of open fingers
-    # what the gripper has been given and, for latency, has not done yet: (3,) metres, and its command or 0
+    # commands that latency holds back: motion (3,) in metres, and the gripper's command or 0
     pending_motion_m: np.ndarray = field(default_factory=lambda: np.zeros(3))
     pending_gripper: float = 0.0
 

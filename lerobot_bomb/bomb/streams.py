@@ -20,7 +20,7 @@ class Stream(IntEnum):
     START = 5
     SUPPLY = 6
     LEVEL = 100  # plus the axis' place in AXES: the level, where the condition gives a range
-    STATIC = 7  # how a static scene stands, beside its episode's start
+    STATIC = 7  # what a static scene draws beside its episode's start
     POINTING = 8  # other places, beside the expert's
     AXIS = 200  # plus the axis' place in AXES: everything else that the axis draws
     ACTUATOR_NOISE = 300

@@ -24,7 +24,7 @@ class Turn:
     """Instruction that is given after a number of moves."""
 
     instruction: str
-    # what stands for the stone, the place or the command in the suite's templates and forms
+    # words for the stone, the place or the command in the suite's templates and forms
     words: Mapping[str, str] = field(default_factory=dict)
 
 
@@ -40,7 +40,7 @@ class Episode:
     supply: tuple[int, ...]  # indices of the stones that lie in the tray
     plans: tuple[Plan, ...]  # any one of which fulfils the instruction
     aims: tuple[Aim, ...]  # of the expert, in its order
-    target: Intersection | None = None  # where there is one move to one intersection
+    target: Intersection | None = None  # if there is one move to one intersection
     color: str | None = None  # of the stone, where it is moved from the tray to the target
     # whether the instruction still means these plans with these stones on the board
     is_clear: Callable[[Mapping[Intersection, str]], bool] = lambda stones: True

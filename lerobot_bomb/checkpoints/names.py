@@ -7,7 +7,7 @@ from typing import Any
 CONFIG, TRAIN_CONFIG, WEIGHTS = "config.json", "train_config.json", "model.safetensors"
 PREPROCESSOR = "policy_preprocessor.json"
 
-# of the steps that change on purpose what a policy is shown
+# processor steps that change a policy's inputs on purpose
 BLANK_IMAGES, REPLACE_TASKS = "bomb_blank_images", "bomb_replace_tasks"
 
 # what to do with adapters whose base is on one machine only

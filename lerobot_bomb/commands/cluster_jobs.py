@@ -14,7 +14,7 @@ from lerobot_bomb.sweep.manifest import parse_part
 if TYPE_CHECKING:
     from submitit import Job
 
-SUBMITIT = "submitit"  # the folder of what its jobs print
+SUBMITIT = "submitit"  # folder of its jobs' output
 SUBMITIT_FLAGS = (SUBMITIT, "submitit_cluster", "submitit_parameters")
 
 

@@ -33,7 +33,7 @@ DEPENDENCIES = (
     "rerun-sdk",
     "numpy",
 )
-# what it means that a version lies outside the declared range
+# consequence of a version outside the declared range
 OUTSIDE = {"mujoco": ": episodes and images are not those of the protocol, and results do not compare"}
 HUB_TIMEOUT_S = 5
 

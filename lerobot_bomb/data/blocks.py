@@ -184,7 +184,7 @@ def _logged_errors() -> Iterator[None]:
     try:
         yield
     except (OSError, RuntimeError) as error:
-        # what is raised later may only be its consequence: an image that cannot be read
+        # a later error may only be its consequence: an image that cannot be read
         raise RuntimeError(handler.errors[0] if handler.errors else str(error)) from error
     finally:
         logger.removeHandler(handler)

@@ -50,7 +50,7 @@ class Recording:
     noise: float = 0.0
     # scenes instead of episodes: boards as they may stand midway, a frame each, which belongs to no other
     static: int = 0
-    # SHA-256 of the weights of the policy that acts in the expert's place, who labels what it sees
+    # SHA-256 of the weights of the policy that acts, while the expert labels
     relabel: str | None = None
     # whether columns say what the expert points at, for training only
     pointing: bool = False

@@ -43,7 +43,7 @@ class RolloutSettings:
     render_options: RenderOptions
     noise: float = 0.0  # standard deviation on x, y and z, in units of the largest relative step
     expert: Expert = expert_action
-    static: int = 0  # so many scenes instead of an episode
+    static: int = 0  # number of scenes instead of an episode; 0: an episode
     pointing: bool = False  # label what the expert points at
 
 

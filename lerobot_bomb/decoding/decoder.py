@@ -24,7 +24,7 @@ from lerobot_bomb.decoding.grammar import NumberGrammar, Place
 from lerobot_bomb.decoding.kv_cache import CachedText
 from lerobot_bomb.finite import require_finite_answers
 
-# (B, N) numbers that are complete, and where each row stands -> (B, G) guesses of what comes next, at most
+# (B, N) complete numbers and each row's place -> (B, G) guesses of the symbols that follow, at most
 # MAX_GUESSES
 Guess = Callable[[Tensor, Place], Tensor]
 

@@ -155,7 +155,7 @@ class _Layer:
         query, new = self._heads(x_NH, columns.rope)
         dtype = cache_Z2CE.dtype
         cache_Z2CE.view(-1, new.shape[-1]).index_put_((columns.slots,), cast(new, dtype))
-        # the queries that share a key stand beside each other: one product a key-value head
+        # queries that share a key are adjacent: one product per key-value head
         query_BVKGE = cast(query, dtype).view(columns.shape).transpose(1, 2)
         keys_ZCE, values_ZCE = cache_Z2CE.narrow(2, 0, columns.bias.shape[-1]).unbind(dim=1)
         read = self._read(query_BVKGE, keys_ZCE, values_ZCE, columns.bias)

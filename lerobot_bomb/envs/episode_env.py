@@ -42,10 +42,10 @@ class EpisodeEnv[SpecT: Any, RunT, ResultT: Record](gymnasium.Env[Observation, n
         self.task_description = ""
         self._spec = spec
         self._results_path = results_path
-        # of the episode, told by a vector environment
+        # evaluation of the episode, set by a vector environment
         self.evaluation: Evaluation | None = None
         self.is_counted = True  # else it leaves no record
-        self._current_run: RunT | None = None  # what exists once an episode has been started
+        self._current_run: RunT | None = None  # set once an episode has been started
         self._seed: int = spec.seed  # of the episode
         self._steps = 0
         self._last_transition: Transition | None = None

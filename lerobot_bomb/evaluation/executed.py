@@ -21,7 +21,7 @@ class ActionLog:
 
     name: str  # of the dataset or file
     fps: float  # actions a second
-    episodes: dict[str, np.ndarray]  # {what tells an episode apart: (T, D)}
+    episodes: dict[str, np.ndarray]  # {name of an episode: (T, D)}
     is_seeded: bool  # the same episode of another file has the same start
 
     def __post_init__(self) -> None:

@@ -18,7 +18,7 @@ from lerobot_bomb.explain.scored_policy import DecoderLayer, TokenSpan
 LAYER, HEADS, MLP = "layer", "heads", "mlp"
 PARTS = (LAYER, HEADS, MLP)
 
-# what a part gave in each pass of a score, (N, L, F) each, by layer and part
+# outputs in each pass of a score, (N, L, F) each, by layer and part
 type Activations = dict[tuple[int, str], list[Tensor]]
 type Change = Callable[[Tensor], Tensor]
 
@@ -76,10 +76,10 @@ class _Restore:
     """Puts one part back, in the passes of one score."""
 
     clean: list[Tensor]
-    units: list[tuple[int, Unit]]  # row of the score, what is put back there
+    units: list[tuple[int, Unit]]  # (row of the score, unit put back there)
     num_rows: int  # of the score
     num_heads: int
-    num_passes: int = 0  # that there were
+    num_passes: int = 0  # so far
 
     def __call__(self, values_NLF: Tensor) -> Tensor:
         clean_NLF = self.clean[self.num_passes]

@@ -9,7 +9,7 @@ from lerobot_bomb.explain.restoration import smallest_drop
 
 SHARE = 0.05  # an effect below this share of the largest of its kind is none
 MAX_NAMES = 6  # that are shown
-RESTORES = 0.5  # what a head alone must bring back to be named
+RESTORES = 0.5  # share of the drop that a head alone must restore to be named
 
 
 @dataclass(frozen=True)

@@ -22,7 +22,7 @@ from lerobot_bomb.bomb.pointing import PointedAt
 from lerobot_bomb.vlm.inputs import OBS_LANGUAGE_HIDDEN
 from lerobot_bomb.vlm.layout import INSTRUCTION, PromptLayout
 
-type Batch = dict[str, Any]  # what a policy's preprocessor gives
+type Batch = dict[str, Any]  # output of a policy's preprocessor
 type Rows = dict[str, Tensor]  # what `ScoredPolicy.encode` makes of it; (B, ...) each
 # columns of a sequence in each pass through the decoder of one score; None: it has none in this pass
 type TokenSpan = tuple[Tensor | slice | None, ...]
@@ -34,7 +34,7 @@ ANSWER = "answer"
 class DecoderLayer:
     """A layer of the language model, and its parts."""
 
-    # whose output are the states; None where the policy calls the parts one by one
+    # its output is the states; None where the policy calls the parts one by one
     layer: nn.Module | None
     attention_out: nn.Module  # output projection; its input are the heads' outputs, side by side
     num_heads: int

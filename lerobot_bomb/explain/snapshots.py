@@ -34,7 +34,7 @@ class Snapshot:
     objects: Mapping[str, Mapping[str, np.ndarray]]  # {camera: {what: (H, W) bool}}; {}: not known
     others: Mapping[
         str, tuple[str, Intersection]
-    ]  # other instructions and what they name, by what they change
+    ]  # other instructions and the intersections that they name, by what they change
     target: Intersection | None
     state: PrivilegedState | None  # of BOMB
     cameras: Mapping[str, PinholeCamera]  # {}: not known

@@ -261,6 +261,6 @@ TASKS: tuple[Task, ...] = (
     TakeBack(),
     *(CopyPattern(number) for number in (2, 3, 4)),
 )
-# 1.1: of equal stones the expert takes the first in the tray, it copies row by row and waits for what has not
-# been said; a row is filled up to the last one's colour
+# 1.1: of equal stones the expert takes the first in the tray; it copies row by row, and waits for moves that
+# no instruction has named yet; a row is filled up to the last stone's colour
 SUITE = command_suite(TASKS, max_steps=440, num_goals=MAX_MOVES, version="1.1")

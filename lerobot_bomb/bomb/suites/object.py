@@ -16,8 +16,8 @@ from lerobot_bomb.bomb.suites.place import ALL_TARGETS, sample_opening
 
 MAX_OPENING_STONES = 5
 MIN_SUPPLY, MAX_SUPPLY = 2, 4
-# Each stone of the supply lies in a corner of a rectangle around the tray's centre, somewhere in these ranges
-# from it: fingers fit between two stones, and the axis `start` keeps them all on the tray.
+# Each stone of the supply lies in a corner of a rectangle around the tray's centre, at distances
+# in these ranges: fingers fit between two stones, and the axis `start` keeps them all on the tray.
 CORNER_X_M = (0.023, 0.030)
 CORNER_Y_M = (0.023, 0.026)
 GRIPPER_START_SPREAD_M = 0.030  # of the gripper around the tray's centre, in x and in y

@@ -48,7 +48,7 @@ def explain_missing_datasets(explain: Callable[[str, Path, Exception], str]) -> 
         def load(self: LeRobotDatasetMetadata, *args: Any, **kwargs: Any) -> None:
             try:
                 usual(self, *args, **kwargs)
-            except ValueError:  # of what was given
+            except ValueError:  # the arguments are wrong
                 raise
             except Exception as error:
                 root = getattr(self, "root", None)
