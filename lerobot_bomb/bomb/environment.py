@@ -20,7 +20,7 @@ COMPARED = ("task", "robot", "control_mode", "fps", "image_size")
 
 @dataclass(frozen=True)
 class Environment:
-    """Settings of BOMB in a recording. A policy may act under another depth, split or numbered task."""
+    """BOMB's settings but perturbations. A policy may act under another depth, split or numbered task."""
 
     robot: str
     control_mode: str

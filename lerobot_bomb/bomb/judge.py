@@ -75,7 +75,7 @@ class Judge:
         return BOARD.nearest_intersection(self._now.stone_xyz[self._stone, :2])
 
     def update(self, now: SceneState) -> bool:
-        """Take in the state after a control step; return True if the episode has ended."""
+        """Update with the state after a control step; return True if the episode has ended."""
         touched = now.stone_touched[:, 0] | now.stone_touched[:, 1]
         held = now.stone_touched[:, 0] & now.stone_touched[:, 1]
         step_m = now.stone_xyz - self._now.stone_xyz

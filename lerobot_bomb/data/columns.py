@@ -118,7 +118,7 @@ def dim_names(feature: dict[str, Any]) -> list[str]:
 
 
 def episode_bounds(episode_index_N: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Sorted indices (N,) -> first row of each row's episode and the row after its last one, (N,) each."""
+    """Sorted episodes (N,) of rows -> first row of each's episode and the row after its last, (N,) each."""
     return (
         np.searchsorted(episode_index_N, episode_index_N, side="left"),
         np.searchsorted(episode_index_N, episode_index_N, side="right"),

@@ -27,7 +27,7 @@ MAX_JOINT_DIFFERENCE_RAD = 0.05  # replays of recorded actions depart a little
 class Timing:
     """Timing of a demonstration: was a row's observation taken before or after its action?"""
 
-    # median over rows of the largest difference of a joint from the simulator's state of that row, the next
+    # largest difference of a joint from the simulator's state of the same row, of the next; median over rows
     same_row_rad: float
     next_row_rad: float
     # how far the fingers open under +1 plus how far they close under -1, if observed before it, if after

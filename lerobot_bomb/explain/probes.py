@@ -19,7 +19,7 @@ PENALTY = 1.0  # times the number of episodes that are fitted, on features of un
 
 @dataclass(frozen=True)
 class Probe:
-    """Score of labels that were read off states, on held-out episodes."""
+    """Score of a probe, which reads labels off states, on held-out episodes."""
 
     score: float  # share of right classes, or the share of variance that is explained (R squared)
     floor: float  # the same with shuffled labels, mean of NUM_SHUFFLES

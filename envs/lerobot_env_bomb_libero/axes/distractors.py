@@ -22,7 +22,7 @@ PATH_M = 0.08  # from the straight lines between objects of the task, and from t
 REACH_M = 0.34  # from the middle of the table along x and y
 SPACING_M = 0.03  # of the places that are tried
 ABOVE_M = 2.0  # height from which a place is looked for downwards
-BETWEEN_M = 0.07  # two distractors
+BETWEEN_M = 0.07  # any two distractors
 STEP_M = 0.05  # from the surface that objects stand on, at most
 IN_VIEW = 0.9  # share of the scene camera's image, around its middle, that holds them
 
